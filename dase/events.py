@@ -1,0 +1,112 @@
+"""Events, the currency between sensor, files and comparison."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from dase.errors import InputError
+
+
+@dataclass(frozen=True)
+class Events:
+    """A stream of events of one sensor, sorted by time.
+
+    Args:
+        t: Times [s], float64, shape (N,), not decreasing.
+        x: Columns, uint16, shape (N,).
+        y: Rows, uint16, shape (N,).
+        p: Polarities, bool, shape (N,): True is ON.
+        width: Columns of the sensor.
+        height: Rows of the sensor.
+    """
+
+    t: NDArray[np.float64]
+    x: NDArray[np.uint16]
+    y: NDArray[np.uint16]
+    p: NDArray[np.bool_]
+    width: int
+    height: int
+
+    def __post_init__(self) -> None:
+        sizes = {name: getattr(self, name).shape for name in "txyp"}
+        if len(set(sizes.values())) != 1 or self.t.ndim != 1:
+            raise InputError(f"events: t, x, y and p must have one common shape (N,), got {sizes}")
+        if self.width < 1 or self.height < 1:
+            raise InputError(f"events: sensor size must be at least 1x1, got {self.width}x{self.height}")
+
+    def __len__(self) -> int:
+        return len(self.t)
+
+    @classmethod
+    def empty(cls, width: int, height: int) -> Events:
+        """Return a stream without events."""
+        return cls(
+            np.empty(0, np.float64),
+            np.empty(0, np.uint16),
+            np.empty(0, np.uint16),
+            np.empty(0, np.bool_),
+            width,
+            height,
+        )
+
+    @classmethod
+    def concatenate(cls, parts: Iterable[Events]) -> Events:
+        """Join streams of one sensor that follow each other in time; raises InputError without a part."""
+        parts = list(parts)
+        if not parts:
+            raise InputError("events: nothing to concatenate")
+        first = parts[0]
+        return cls(
+            *(np.concatenate([getattr(part, name) for part in parts]) for name in "txyp"),
+            first.width,
+            first.height,
+        )
+
+    def slice(self, begin: float, end: float) -> Events:
+        """Return the events with begin <= t < end [s]."""
+        i, j = np.searchsorted(self.t, (begin, end))
+        return Events(self.t[i:j], self.x[i:j], self.y[i:j], self.p[i:j], self.width, self.height)
+
+    def counts(self, edges: ArrayLike) -> NDArray[np.int32]:
+        """Count events per time window and pixel.
+
+        Args:
+            edges: Window edges [s], increasing, shape (W + 1,); a window holds edge <= t < next edge.
+
+        Returns:
+            Shape (W, 2, height, width): OFF counts in channel 0, ON counts in channel 1.
+        """
+        edges = np.asarray(edges, np.float64)
+        bounds = np.searchsorted(self.t, edges)
+        out = np.zeros((len(edges) - 1, 2, self.height, self.width), np.int32)
+        size = 2 * self.height * self.width
+        flat = (self.p * self.height + self.y.astype(np.int64)) * self.width + self.x
+        for window, (i, j) in enumerate(zip(bounds[:-1], bounds[1:], strict=True)):
+            out[window] = np.bincount(flat[i:j], minlength=size).reshape(2, self.height, self.width)
+        return out
+
+    def voxel_grid(self, bins: int, begin: float, end: float) -> NDArray[np.float32]:
+        """Spread polarities linearly over time bins (Zhu et al., Unsupervised event-based learning, 2019).
+
+        Args:
+            bins: Number of time bins B.
+            begin: Time of bin 0 [s].
+            end: Time of bin B - 1 [s].
+
+        Returns:
+            Shape (B, height, width): sum over events of ±max(0, 1 - |b - (B - 1)(t - begin)/(end - begin)|).
+        """
+        part = self.slice(begin, np.nextafter(end, np.inf))
+        size = self.height * self.width
+        out = np.zeros((bins + 1) * size)  # one spare bin takes the zero weight of t = end
+        at = (bins - 1) * (part.t - begin) / (end - begin)
+        low = np.floor(at).astype(np.int64)
+        sign = np.where(part.p, 1.0, -1.0)
+        flat = low * size + part.y.astype(np.int64) * self.width + part.x
+        out += np.bincount(flat, sign * (low + 1 - at), minlength=out.size)
+        out += np.bincount(flat + size, sign * (at - low), minlength=out.size)
+        return out[: bins * size].reshape(bins, self.height, self.width).astype(np.float32)

@@ -1,0 +1,88 @@
+"""Where kernels run, and how CPU work is spread over threads.
+
+Warp runs a CPU launch on one thread and releases the GIL meanwhile, so a launch is cut into slabs that a
+thread pool works off. Every kernel that goes through `run` takes the start of its slab as first argument.
+"""
+
+from __future__ import annotations
+
+import os
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any
+
+import warp as wp
+
+wp.config.quiet = True
+
+_pool: ThreadPoolExecutor | None = None
+_threads = int(os.environ.get("DASE_THREADS", "0")) or os.cpu_count() or 1
+
+
+def threads() -> int:
+    """Return the number of CPU threads that `run` uses."""
+    return _threads
+
+
+def set_threads(count: int) -> None:
+    """Use `count` CPU threads from now on; worker processes use one each."""
+    global _pool, _threads
+    if count < 1:
+        raise ValueError(f"threads must be >= 1, got {count}")
+    if _pool is not None:
+        _pool.shutdown()
+    _pool, _threads = None, count
+
+
+def device(name: str) -> wp.Device:
+    """Return the Warp device of a backend name.
+
+    Args:
+        name: `cpu`, `cuda` (the first GPU) or a Warp name such as `cuda:1`.
+
+    Raises:
+        ValueError: There is no such device on this machine.
+    """
+    wp.init()
+    if name.startswith("cuda") and not wp.is_cuda_available():
+        raise ValueError(f"backend '{name}' needs an NVIDIA GPU with a driver, none was found; use 'cpu'")
+    try:
+        return wp.get_device("cuda:0" if name == "cuda" else name)
+    except Exception as error:
+        names = ", ".join(d.alias for d in wp.get_devices())
+        raise ValueError(f"backend '{name}' does not exist, here there are: {names}") from error
+
+
+def run(kernel: wp.Kernel, size: int, inputs: list[Any], device: wp.Device, *, batch: int = 1, align: int = 1) -> None:
+    """Launch `kernel` over (batch, size) threads and wait for it on the CPU.
+
+    Args:
+        kernel: Takes `first: int` before `inputs`, and `row, i = wp.tid()` with i counted from `first`.
+        size: Number of work items.
+        inputs: Arguments after `first`.
+        device: Where the arrays live.
+        batch: Length of the leading axis, which is never cut.
+        align: Slabs begin at multiples of this, so that no two threads share what belongs together.
+    """
+    if size == 0 or batch == 0:
+        return
+    if device.is_cuda:
+        wp.launch(kernel, dim=(batch, size), inputs=[0, *inputs], device=device)
+        return
+    # load before the threads race for it
+    kernel.module.load(device)
+    # several slabs per thread even out rows of different cost
+    pieces = 1 if _threads == 1 else min(4 * _threads, -(-size // align))
+    step = align * -(-size // (align * pieces))
+    starts = range(0, size, step)
+
+    def work(first: int) -> None:
+        wp.launch(kernel, dim=(batch, min(step, size - first)), inputs=[first, *inputs], device=device)
+
+    if len(starts) == 1:
+        work(0)
+        return
+    global _pool
+    if _pool is None:
+        _pool = ThreadPoolExecutor(_threads, thread_name_prefix="dase")
+    for done in _pool.map(work, starts):
+        assert done is None
