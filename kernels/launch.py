@@ -12,7 +12,7 @@ from typing import Any
 
 import warp as wp
 
-wp.config.quiet = True
+wp.config.log_level = wp.LOG_WARNING
 
 _pool: ThreadPoolExecutor | None = None
 _threads = int(os.environ.get("DASE_THREADS", "0")) or os.cpu_count() or 1
@@ -69,7 +69,7 @@ def run(kernel: wp.Kernel, size: int, inputs: list[Any], device: wp.Device, *, b
         wp.launch(kernel, dim=(batch, size), inputs=[0, *inputs], device=device)
         return
     # load before the threads race for it
-    kernel.module.load(device)
+    kernel.module.load(device, block_dim=1)  # the variant that CPU launches use
     # several slabs per thread even out rows of different cost
     pieces = 1 if _threads == 1 else min(4 * _threads, -(-size // align))
     step = align * -(-size // (align * pieces))

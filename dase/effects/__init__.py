@@ -1,0 +1,22 @@
+"""Physical effects, one per file.
+
+To add one: its file with its dataclass and its Warp functions, its line in `EFFECTS`, its twin and its test.
+"""
+
+from __future__ import annotations
+
+from dase.effects.bandwidth import Bandwidth
+from dase.effects.base import Effect as Effect
+from dase.effects.base import Parameter as Parameter
+from dase.effects.base import choice as choice
+from dase.effects.base import parameter as parameter
+from dase.effects.leak import Leak
+from dase.effects.mismatch import Mismatch
+from dase.effects.refractory import Refractory
+from dase.effects.shot import Shot
+from dase.effects.threshold import Threshold
+
+EFFECTS: dict[str, type[Effect]] = {
+    effect.name: effect for effect in (Threshold, Mismatch, Bandwidth, Leak, Shot, Refractory)
+}
+"""Name in sensor files to class, in the order in which they act."""

@@ -1,0 +1,1 @@
+"""Built-in sensors, one TOML file each."""

@@ -1,0 +1,141 @@
+"""What a physical effect is to dase."""
+
+from __future__ import annotations
+
+import dataclasses
+import inspect
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any, ClassVar
+
+from dase.errors import InputError, nearest
+from dase.kernels import pixel
+
+
+@dataclass(frozen=True)
+class Parameter:
+    """One number of an effect.
+
+    Args:
+        name: As in the sensor file.
+        unit: SI, or `1` for a ratio.
+        default: A typical value.
+        off: The value at which the effect is exactly the identity, or None if another parameter switches it off.
+        bounds: Values outside are refused.
+        plausible: Where real cameras lie; a diagnosis looks for the effect in this range.
+        about: One line.
+    """
+
+    name: str
+    unit: str
+    default: float
+    off: float | None
+    bounds: tuple[float, float]
+    plausible: tuple[float, float]
+    about: str
+
+
+def parameter(
+    default: float,
+    *,
+    unit: str,
+    about: str,
+    off: float | None = None,
+    bounds: tuple[float, float] = (0.0, math.inf),
+    plausible: tuple[float, float],
+) -> Any:
+    """Declare a parameter of an effect; see `Parameter`."""
+    facts = dict(unit=unit, default=default, off=off, bounds=bounds, plausible=plausible, about=about)
+    return field(default=default, metadata={"parameter": facts})
+
+
+def choice(default: str, *, among: tuple[str, ...], about: str) -> Any:
+    """Declare an option of an effect that is a word, not a number."""
+    return field(default=default, metadata={"choice": among, "about": about})
+
+
+@dataclass(frozen=True, kw_only=True)
+class Effect:
+    """One physical effect of an event camera, the extension point of dase.
+
+    A subclass is a frozen dataclass whose fields are made by `parameter` (numbers, which may be fitted) and
+    `choice`. Its docstring is the plain-language description. `stages` maps a stage of `dase.kernels.pixel`
+    to a Warp function; the arguments of such a function are resolved by name.
+    """
+
+    name: ClassVar[str]
+    """Name in sensor files and on the command line."""
+    source: ClassVar[str]
+    """Authors, title, year."""
+    stages: ClassVar[Mapping[str, Any]]
+    """Stage name to Warp function."""
+    states: ClassVar[tuple[str, ...]] = ()
+    """What a pixel remembers from sample to sample."""
+
+    def __post_init__(self) -> None:
+        for p in self.parameters():
+            value = getattr(self, p.name)
+            where = f"{self.name}.{p.name}"
+            if isinstance(value, bool) or not isinstance(value, int | float):
+                raise InputError(f"{where} must be a number [{p.unit}], got {value!r}")
+            low, high = p.bounds
+            if math.isnan(value) or not low <= value <= high:
+                raise InputError(f"{where} must lie in [{low:g}, {high:g}] {p.unit}, got {value:g}")
+        for name, among in self.choices().items():
+            if getattr(self, name) not in among:
+                raise InputError(
+                    f"{self.name}.{name} must be one of {', '.join(among)}, got {getattr(self, name)!r}"
+                )
+
+    @classmethod
+    def parameters(cls) -> tuple[Parameter, ...]:
+        """Return the numbers of this effect, in the order of its fields."""
+        return tuple(
+            Parameter(f.name, **f.metadata["parameter"])
+            for f in dataclasses.fields(cls)
+            if "parameter" in f.metadata
+        )
+
+    @classmethod
+    def choices(cls) -> dict[str, tuple[str, ...]]:
+        """Return the words an option of this effect may take."""
+        return {f.name: f.metadata["choice"] for f in dataclasses.fields(cls) if "choice" in f.metadata}
+
+    @classmethod
+    def off(cls) -> Effect:
+        """Return this effect switched off: exactly the identity."""
+        return cls(**{p.name: p.off for p in cls.parameters() if p.off is not None})
+
+    @classmethod
+    def from_table(cls, table: Mapping[str, Any]) -> Effect:
+        """Make the effect from a table of a sensor file; raises InputError for an unknown name."""
+        known = [f.name for f in dataclasses.fields(cls)]
+        for name in table:
+            if name not in known:
+                raise InputError(f"effect '{cls.name}' has no parameter '{name}': {nearest(name, known)}")
+        return cls(**table)
+
+    def delays(self) -> bool:
+        """Whether events that this effect holds back come later instead of being lost."""
+        return False
+
+    def compiled(self) -> pixel.Stages:
+        """Return what the kernel composer needs to know."""
+        for stage in self.stages:
+            if stage not in pixel.STAGES:
+                raise InputError(
+                    f"effect '{self.name}' has a function for stage '{stage}': {nearest(stage, pixel.STAGES)}"
+                )
+        return pixel.Stages(
+            name=self.name,
+            functions=tuple(self.stages.items()),
+            parameters=tuple(p.name for p in self.parameters()),
+            states=self.states,
+            delays=self.delays(),
+        )
+
+    @classmethod
+    def about(cls) -> str:
+        """Return the plain-language description."""
+        return inspect.cleandoc(cls.__doc__ or "")

@@ -1,0 +1,59 @@
+"""Random events of both polarities."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import ClassVar
+
+import warp as wp
+
+from dase.effects.base import Effect, parameter
+
+
+@wp.func
+def rates(intensity: float, rate: float, bright: float, balance: float):
+    """ON and OFF rates of noise events [Hz]."""
+    total = rate * (1.0 - (1.0 - bright) * wp.clamp(intensity, 0.0, 1.0))
+    return total * balance, total * (1.0 - balance)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Shot(Effect):
+    """Random events of both polarities, most of all in the dark.
+
+    Few photons arrive in the dark, and their number fluctuates. Now and then a fluctuation alone crosses a
+    threshold. The events come at random times, independently in each pixel, and each makes the pixel
+    remember the present log intensity, as any event does.
+
+    The rate of both polarities together is `rate` at intensity 0 and falls linearly to `bright * rate` at
+    intensity 1.
+    """
+
+    name: ClassVar[str] = "shot"
+    source: ClassVar[str] = (
+        "Hu, Liu, Delbruck: v2e, from video frames to realistic DVS events, 2021, section 3 (temporal noise)"
+    )
+    stages: ClassVar = {"noise": rates}
+
+    rate: float = parameter(
+        1.0,
+        unit="Hz",
+        off=0.0,
+        bounds=(0.0, 1e5),
+        plausible=(0.02, 100.0),
+        about="events per pixel and second in the dark, both polarities together",
+    )
+    bright: float = parameter(
+        0.25,
+        unit="1",
+        bounds=(0.0, 10.0),
+        plausible=(0.0, 1.0),
+        about="rate at intensity 1 relative to that in the dark",
+    )
+    balance: float = parameter(
+        0.5,
+        unit="1",
+        bounds=(0.0, 1.0),
+        plausible=(0.2, 0.8),
+        about="share of ON events",
+    )

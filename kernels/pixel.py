@@ -1,0 +1,511 @@
+"""The effects of a sensor, composed into one kernel per pixel.
+
+A pixel turns light into events in this order; each effect adds Warp functions at some of these stages:
+
+    light      (intensity, ...)           -> intensity            what reaches the photodiode
+    log        voltage = log(intensity + log_eps)
+    respond    (voltage, intensity, ...)  -> voltage              photoreceptor
+    threshold  (on, off, ...)             -> on, off              once per pixel [log intensity]
+    drift      (intensity, on, off, ...)  -> drift                of the change towards ON [log intensity/s]
+    noise      (intensity, on, off, ...)  -> rate_on, rate_off    of events without a change [Hz]
+    count      exact threshold crossings of the change since the last event
+    gate       (age, ...)                 -> wait                 time the pixel stays dead [s]
+
+A stage function asks for what it needs by the names of its arguments: the quantities above, `t`, `dt`, `x`,
+`y`, parameters and states of its effect, random numbers (`uniform`, `normal`: new ones at every sample;
+`pixel_uniform`, `pixel_normal`: one for each pixel; `_2` and so on for more of them). It returns its quantity, then
+the new values of its states. `compose` writes the kernel that calls all of them, one line each, so that a
+sensor costs one pass over its samples whatever effects it has. Random numbers are counter-based, keyed by
+seed, effect, pixel and sample: they do not depend on the other effects, on chunks, threads or the batch.
+"""
+
+from __future__ import annotations
+
+import inspect
+import linecache
+import re
+import zlib
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Any
+
+import warp as wp
+
+from dase.kernels.scene import Layers, layer_intensity, layers_near
+
+REST = 1e30
+"""Duration of the rest before the first sample [s]: filters start settled."""
+
+STAGES = ("light", "respond", "threshold", "drift", "noise", "gate")
+CORE = ("on", "off", "phase", "log_eps")
+"""Parameters of the change detector itself; they lead the parameter vector."""
+
+QUANTITIES = {
+    "light": ("intensity",),
+    "respond": ("voltage", "intensity"),
+    "threshold": ("on", "off"),
+    "drift": ("intensity", "on", "off"),
+    "noise": ("intensity", "on", "off"),
+    "gate": ("age",),
+}
+"""What the functions of a stage may ask for beside parameters, states, random numbers, x, y, t and dt."""
+
+DRAW = re.compile(r"(pixel_)?(uniform|normal)(_\d)?")
+
+
+@dataclass(frozen=True)
+class Stages:
+    """The part of an effect that the composer sees.
+
+    Args:
+        name: Of the effect, a Python identifier.
+        functions: (stage, Warp function) pairs.
+        parameters: Names, in the order of their places in the parameter vector.
+        states: Names of what a pixel remembers from sample to sample; all zero at the start.
+        delays: Whether the events that `gate` holds back come later; otherwise they are lost.
+    """
+
+    name: str
+    functions: tuple[tuple[str, Any], ...]
+    parameters: tuple[str, ...] = ()
+    states: tuple[str, ...] = ()
+    delays: bool = False
+
+
+@wp.struct
+class Frames:
+    """Stored samples."""
+
+    values: wp.array2d[float]  # (K, N) linear intensity, or log intensity for the `log` source
+
+
+@wp.struct
+class Clock:
+    """Time samples of one chunk; sample k ends the step that begins at sample k - 1."""
+
+    t: wp.array[float]  # (K,) [s]
+    dt: wp.array[float]  # (K,) [s], REST at the first sample of all
+    begin: wp.array[wp.int64]  # (K,) begin of the step [ns since the chunk's begin]
+    length: wp.array[float]  # (K,) duration of the step [ns]
+    window: wp.array[int]  # (K,) window the step is counted in
+
+
+@wp.struct
+class Counts:
+    """Sink that counts events."""
+
+    counts: wp.array4d[int]  # (B, W, 2, N) OFF, ON
+
+
+@wp.struct
+class Keys:
+    """Sink that keeps every event as one sortable 64-bit key: time, place, polarity."""
+
+    keys: wp.array3d[wp.int64]  # (B, slabs, capacity)
+    used: wp.array2d[int]  # (B, slabs) events met; more than the capacity asks for another run
+    slab: int  # pixels per slab
+    bits: int  # of row · N + i
+
+
+@wp.func
+def deposit_counts(sink: Counts, clock: Clock, row: int, i: int, size: int, k: int, at: float, on: int):
+    """Count one event."""
+    window = clock.window[k]
+    if window >= 0:
+        sink.counts[row, window, on, i] = sink.counts[row, window, on, i] + 1
+
+
+@wp.func
+def deposit_keys(sink: Keys, clock: Clock, row: int, i: int, size: int, k: int, at: float, on: int):
+    """Keep one event that happened when the share `at` of step k had passed."""
+    slab = i / sink.slab
+    slot = wp.atomic_add(sink.used, row, slab, 1)
+    if slot < sink.keys.shape[2]:
+        time = clock.begin[k] + wp.int64(wp.min(at * clock.length[k], clock.length[k]))
+        place = wp.int64(row) * wp.int64(size) + wp.int64(i)
+        sink.keys[row, slab, slot] = (((time << wp.int64(sink.bits)) | place) << wp.int64(1)) | wp.int64(on)
+
+
+@wp.func
+def key(seed: int, stream: int, pixel: int) -> int:
+    """Key of one stream of random numbers of one pixel."""
+    return int(wp.rand_init(seed ^ stream, pixel))
+
+
+@wp.func
+def uniform(key: int, index: int) -> float:
+    """Uniform in [0, 1)."""
+    return wp.randf(wp.rand_init(key, index))
+
+
+@wp.func
+def normal(key: int, index: int) -> float:
+    """Standard normal."""
+    return wp.randn(wp.rand_init(key, index))
+
+
+@wp.func
+def waiting(key: int, index: int) -> float:
+    """Exponential with mean 1: the hazard a Poisson process spends before its next event."""
+    return -wp.log(1.0 - uniform(key, index))
+
+
+SOURCES = {
+    "frames": (Frames, "intensity = source.values[k, i]"),
+    "log": (Frames, "voltage = source.values[k, i]"),
+    "layers": (Layers, "intensity = layer_intensity(source, near, k, float(x), float(y))"),
+}
+SINKS = {"counts": (Counts, deposit_counts), "keys": (Keys, deposit_keys)}
+
+
+def stream(name: str) -> int:
+    """Return the number of a named stream of random numbers, a 31-bit hash."""
+    return zlib.crc32(name.encode()) & 0x7FFFFFFF
+
+
+@lru_cache(maxsize=256)
+def compose(stages: tuple[Stages, ...], source: str, sink: str) -> wp.Kernel:
+    """Return the kernel of a sensor.
+
+    Args:
+        stages: Effects, in order.
+        source: `frames`, `log` or `layers`.
+        sink: `counts` or `keys`.
+
+    Returns:
+        A kernel over (B, N) threads; its arguments are listed by `signature`.
+    """
+    writer = _Writer(stages, source, sink)
+    return _compiled(writer.kernel(), "pixel_events", writer.scope)
+
+
+@lru_cache(maxsize=256)
+def compose_thresholds(stages: tuple[Stages, ...]) -> wp.Kernel:
+    """Return a kernel over (B, N) threads that writes the thresholds of every pixel."""
+    writer = _Writer(stages, "frames", "counts")
+    return _compiled(writer.thresholds(), "pixel_thresholds", writer.scope)
+
+
+def _compiled(text: str, name: str, scope: dict[str, Any]) -> wp.Kernel:
+    filename = f"<dase {name} {zlib.crc32(text.encode()):08x}>"
+    # Warp reads the source of a kernel through linecache, and so do tracebacks
+    linecache.cache[filename] = (len(text), None, text.splitlines(keepends=True), filename)
+    scope = dict(scope)
+    exec(compile(text, filename, "exec"), scope)
+    kernel: wp.Kernel = wp.kernel(scope[name], enable_backward=False, module="unique")
+    return kernel
+
+
+def source_text(stages: tuple[Stages, ...], source: str, sink: str) -> str:
+    """Return the text of the kernel that `compose` compiles."""
+    return _Writer(stages, source, sink).kernel()
+
+
+def states(stages: Sequence[Stages]) -> list[str]:
+    """Return the names of what a pixel with these effects remembers, in the order of the state array."""
+    kinds = {stage for effect in stages for stage, _ in effect.functions}
+    names = ["signal", "reference"]
+    names += ["leaked"] if "drift" in kinds else []
+    names += ["age"] if "gate" in kinds else []
+    for effect in stages:
+        if any(stage == "noise" for stage, _ in effect.functions):
+            names += [f"{effect.name}_hazard", f"{effect.name}_events"]
+        names += [f"{effect.name}_{state}" for state in effect.states]
+    return names
+
+
+class _Writer:
+    """Writes the text of one kernel, top to bottom."""
+
+    def __init__(self, stages: tuple[Stages, ...], source: str, sink: str):
+        self.stages, self.source, self.sink = stages, source, sink
+        self.lines: list[str] = []
+        self.depth = 0
+        self.states = states(stages)
+        self.places = {name: i for i, name in enumerate(CORE)}
+        for effect in stages:
+            for parameter in effect.parameters:
+                self.places[f"{effect.name}_{parameter}"] = len(self.places)
+        self.draws: dict[str, str] = {}
+        self.scope: dict[str, Any] = {
+            "wp": wp,
+            "Source": SOURCES[source][0],
+            "Sink": SINKS[sink][0],
+            "Clock": Clock,
+            "deposit": SINKS[sink][1],
+            "key": key,
+            "uniform": uniform,
+            "normal": normal,
+            "waiting": waiting,
+            "layer_intensity": layer_intensity,
+            "layers_near": layers_near,
+        }
+
+    def add(self, *lines: str) -> None:
+        """Append lines at the present depth."""
+        self.lines += ["    " * self.depth + line for line in lines]
+
+    def of(self, stage: str) -> list[tuple[Stages, Any]]:
+        """Return the functions of a stage with their effects."""
+        return [(effect, f) for effect in self.stages for kind, f in effect.functions if kind == stage]
+
+    def call(self, stage: str, effect: Stages, function: Any) -> str:
+        """Return the call of a stage function, arguments resolved by name."""
+        name = f"{effect.name}_{stage}"
+        self.scope[name] = function
+        arguments = [self.argument(stage, effect, a) for a in inspect.signature(function.func).parameters]
+        return f"{name}({', '.join(arguments)})"
+
+    def argument(self, stage: str, effect: Stages, name: str) -> str:
+        """Return what a stage function gets for an argument of this name."""
+        if name in effect.parameters or name in effect.states:
+            return f"{effect.name}_{name}"
+        if name in QUANTITIES[stage] or name in ("t", "dt"):
+            return name
+        if name in ("x", "y"):
+            return f"float({name})"
+        draw = DRAW.fullmatch(name)
+        if draw:
+            local = f"{effect.name}_{stage}_{name}"
+            self.draws[local] = draw.group(2)
+            return f"{local}" if draw.group(1) else f"{draw.group(2)}({local}_key, sample)"
+        known = (
+            *effect.parameters,
+            *effect.states,
+            *QUANTITIES[stage],
+            "x",
+            "y",
+            "t",
+            "dt",
+            "normal",
+            "uniform",
+        )
+        raise ValueError(
+            f"effect '{effect.name}': stage '{stage}' has no quantity '{name}'; there are {', '.join(known)}"
+        )
+
+    def kernel(self) -> str:
+        """Return the whole text."""
+        self.depth = 1
+        self.loop()
+        body, self.lines = self.lines, []
+        self.depth = 0
+        self.add(
+            "def pixel_events(first: int, source: Source, clock: Clock, pixels: wp.array[int], width: int,",
+            "                 begin: int, seed: int, parameters: wp.array2d[float],",
+            "                 state_in: wp.array3d[float], state_out: wp.array3d[float], sink: Sink):",
+        )
+        self.depth = 1
+        self.prologue()
+        return "\n".join([*self.lines, *body]) + "\n"
+
+    def thresholds(self) -> str:
+        """Return the text of the kernel that writes thresholds."""
+        self.add(
+            "def pixel_thresholds(first: int, pixels: wp.array[int], width: int, seed: int,",
+            "                     parameters: wp.array2d[float], out: wp.array3d[float]):",
+        )
+        self.depth = 1
+        # resolves which random numbers the threshold functions ask for
+        calls = [self.call("threshold", effect, function) for effect, function in self.of("threshold")]
+        self.pixel()
+        self.add(*(f"on, off = {call}" for call in calls))
+        self.add("out[row, 0, i] = off", "out[row, 1, i] = on")
+        return "\n".join(self.lines) + "\n"
+
+    def pixel(self) -> None:
+        """Where the pixel is, its parameters and its own random numbers."""
+        self.add("row, i = wp.tid()", "i += first")
+        self.add("pixel = pixels[i]", "x = pixel % width", "y = pixel / width")
+        self.add(*(f"{name} = parameters[row, {at}]" for name, at in self.places.items()))
+        for local, kind in self.draws.items():
+            self.add(f"{local}_key = key(seed, {stream(local)}, pixel)")
+            if re.search("_pixel_(uniform|normal)", local):
+                self.add(f"{local} = {kind}({local}_key, 0)")
+
+    def prologue(self) -> None:
+        """What a pixel knows before its first sample."""
+        calls = [self.call("threshold", effect, function) for effect, function in self.of("threshold")]
+        self.pixel()
+        self.add("size = pixels.shape[0]")
+        if self.source == "layers":
+            self.add("near = layers_near(source, float(x), float(y))")
+        self.add(*(f"on, off = {call}" for call in calls))
+        self.add(*(f"{name} = state_in[{at}, row, i]" for at, name in enumerate(self.states)))
+
+    def loop(self) -> None:
+        """One sample after the other, then the state is kept."""
+        self.add("for k in range(clock.dt.shape[0]):")
+        self.depth += 1
+        self.add("dt = clock.dt[k]", "t = clock.t[k]", "sample = begin + k")
+        self.sense()
+        self.add("if sample == 0:")
+        self.depth += 1
+        self.add("signal = voltage", "reference = voltage")
+        if "age" in self.states:
+            self.add("age = 1.0e6")
+        for effect, _ in self.of("noise"):
+            self.add(
+                f"{effect.name}_hazard = waiting({self.noise_key(effect)}, 0)", f"{effect.name}_events = 1.0"
+            )
+        self.depth -= 1
+        self.add("else:")
+        self.depth += 1
+        self.step()
+        self.depth -= 2
+        self.add(*(f"state_out[{at}, row, i] = {name}" for at, name in enumerate(self.states)))
+
+    def sense(self) -> None:
+        """Light to photoreceptor voltage."""
+        self.add(SOURCES[self.source][1])
+        if self.source == "log":
+            if self.of("light"):
+                raise ValueError("effects on light need intensities, not log intensities")
+            kinds = ("respond", "drift", "noise")
+            if any("intensity" in inspect.signature(f.func).parameters for s in kinds for _, f in self.of(s)):
+                self.add("intensity = wp.exp(voltage) - log_eps")
+        for effect, function in self.of("light"):
+            self.add(f"{self.returns('intensity', effect)} = {self.call('light', effect, function)}")
+        if self.source != "log":
+            self.add("voltage = wp.log(intensity + log_eps)")
+        for effect, function in self.of("respond"):
+            self.add(f"{self.returns('voltage', effect)} = {self.call('respond', effect, function)}")
+
+    @staticmethod
+    def returns(quantity: str, effect: Stages) -> str:
+        """Return the left side of a stage that may change the effect's states."""
+        return ", ".join([quantity, *(f"{effect.name}_{state}" for state in effect.states)])
+
+    def noise_key(self, effect: Stages) -> str:
+        """Name of the random stream of an effect's noise events."""
+        self.draws[f"{effect.name}_noise"] = "uniform"
+        return f"{effect.name}_noise_key"
+
+    def step(self) -> None:
+        """Events of one step, along the straight line from the last sample to this one."""
+        self.add(self.change("signal", "before"))
+        for effect, function in self.of("drift"):
+            self.add(f"leaked += {self.call('drift', effect, function)} * dt")
+        self.add(self.change("voltage", "after"))
+        self.start_phase()
+        noisy = self.of("noise")
+        for effect, function in noisy:
+            n = effect.name
+            self.add(f"{n}_on, {n}_off = {self.call('noise', effect, function)}")
+            self.add(f"{n}_spend = ({n}_on + {n}_off) * dt")
+        busy = ["after >= on", "after <= -off", *(f"{e.name}_spend > {e.name}_hazard" for e, _ in noisy)]
+        self.add(f"if {' or '.join(busy)}:")
+        self.depth += 1
+        self.busy([effect for effect, _ in noisy])
+        self.depth -= 1
+        self.add(*(f"{effect.name}_hazard -= {effect.name}_spend" for effect, _ in noisy))
+        self.add("signal = voltage")
+        if "age" in self.states:
+            self.add("age += dt")
+
+    def change(self, end: str, name: str) -> str:
+        """Return the line that sets `name` to the change since the pixel's last event."""
+        return f"{name} = {end} - reference" + (" + leaked" if "leaked" in self.states else "")
+
+    def start_phase(self) -> None:
+        """Spread the memories at the start as if the first change had been going on before."""
+        self.draws["initial_phase"] = "uniform"
+        self.add("if sample == 1 and phase != 0.0:")
+        self.depth += 1
+        self.add("lead = phase * uniform(initial_phase_key, 0)")
+        self.add("if after < 0.0 or (after == 0.0 and uniform(initial_phase_key, 1) < 0.5):")
+        self.add("    reference += lead * off", "else:", "    reference -= lead * on")
+        self.add(self.change("signal", "before").replace(" + leaked", ""), self.change("voltage", "after"))
+        self.depth -= 1
+
+    def busy(self, noisy: list[Stages]) -> None:
+        """Events of a step that has any: crossings, cut at the noise events between them."""
+        self.add("moved = float(0.0)", "begun = float(0.0)")
+        if not noisy:
+            self.add("stop = 1.0", "value = after")
+            self.crossings()
+        else:
+            self.add("while begun < 1.0:")
+            self.depth += 1
+            self.add("stop = float(1.0)", "cause = int(0)")
+            for number, effect in enumerate(noisy, start=1):
+                n = effect.name
+                self.add(f"if {n}_spend > {n}_hazard and {n}_hazard < stop * {n}_spend:")
+                self.add(f"    stop = {n}_hazard / {n}_spend", f"    cause = {number}")
+            self.add("value = after", "if cause != 0:", "    value = before + (after - before) * stop")
+            self.crossings()
+            for number, effect in enumerate(noisy, start=1):
+                self.noise_event(number, effect)
+            self.add("begun = stop", "if cause == 0:", "    break")
+            self.depth -= 1
+        self.add("reference += moved")
+        if "leaked" in self.states:
+            # keeps `leaked` small, where float32 resolves slow leaks
+            self.add("reference -= leaked", "leaked = 0.0")
+
+    def crossings(self) -> None:
+        """Exact crossings between `begun` and `stop`, times interpolated; Eqs. (2)-(4) of the paper."""
+        delays = any(effect.delays for effect, _ in self.of("gate"))
+        self.add("change = value - moved")
+        self.add(
+            "theta = on", "polarity = int(1)", "if change < 0.0:", "    theta = -off", "    polarity = 0"
+        )
+        self.add("crossed = int(wp.floor(change / theta))", *(["passed = int(0)"] if delays else []))
+        self.add("for n in range(crossed):")
+        self.depth += 1
+        self.add("share = begun", "if after != before:")
+        self.add("    share = (moved + float(n + 1) * theta - before) / (after - before)")
+        self.add("share = wp.clamp(share, begun, stop)")
+        if delays:
+            self.wait("share")
+            self.add(
+                "if wait > 0.0:", "    share += wait / dt", "if share > stop:", "    break", "passed += 1"
+            )
+            self.event("share", "polarity")
+        else:
+            self.gated("share", "polarity")
+        self.depth -= 1
+        self.add(f"moved += float({'passed' if delays else 'crossed'}) * theta")
+
+    def wait(self, share: str) -> None:
+        """Set `wait` to the time the pixel stays dead after `share` of the step."""
+        self.add("wait = float(0.0)", "now = age")
+        self.add(f"age = now + {share} * dt")
+        for effect, function in self.of("gate"):
+            self.add(f"wait = wp.max(wait, {self.call('gate', effect, function)})")
+        self.add("age = now")
+
+    def event(self, share: str, polarity: str) -> None:
+        """Emit an event after `share` of the step."""
+        self.add(f"deposit(sink, clock, row, i, size, k, {share}, {polarity})")
+        if "age" in self.states:
+            self.add(f"age = -{share} * dt")
+
+    def gated(self, share: str, polarity: str, *then: str) -> None:
+        """Emit an event unless the pixel is dead, and do `then`."""
+        if not self.of("gate"):
+            self.event(share, polarity)
+            self.add(*then)
+            return
+        self.wait(share)
+        self.add("if wait <= 0.0:")
+        self.depth += 1
+        self.event(share, polarity)
+        self.add(*then)
+        self.depth -= 1
+
+    def noise_event(self, number: int, effect: Stages) -> None:
+        """Emit the noise event at `stop`; like any event it makes the pixel memorise the present signal."""
+        n = effect.name
+        self.draws[f"{n}_polarity"] = "uniform"
+        self.add(f"if cause == {number}:")
+        self.depth += 1
+        self.add("polarity = int(0)")
+        self.add(
+            f"if uniform({n}_polarity_key, int({n}_events)) * ({n}_on + {n}_off) < {n}_on:",
+            "    polarity = 1",
+        )
+        self.gated("stop", "polarity", "moved = value")
+        self.add(f"{n}_hazard += waiting({self.noise_key(effect)}, int({n}_events))", f"{n}_events += 1.0")
+        self.depth -= 1
