@@ -78,7 +78,9 @@ def _sensor(table: dict[str, Any], effects: Mapping[str, type[Effect]]) -> Senso
         elif name in ("name", "size", "log_eps"):
             plain[name] = value
         else:
-            raise InputError(f"there is no entry '{name}': {nearest(name, ('name', 'size', 'log_eps', *effects))}")
+            raise InputError(
+                f"there is no entry '{name}': {nearest(name, ('name', 'size', 'log_eps', *effects))}"
+            )
     if "size" in plain:
         size = plain["size"]
         if not isinstance(size, list) or len(size) != 2 or not all(type(n) is int for n in size):

@@ -1,7 +1,7 @@
 """What dase raises when its input is wrong.
 
-    ValueError
-    └── InputError          the sentence is meant for the user, as it stands
+ValueError
+└── InputError          the sentence is meant for the user, as it stands
 """
 
 from __future__ import annotations

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -60,11 +61,8 @@ class Events:
         if not parts:
             raise InputError("events: nothing to concatenate")
         first = parts[0]
-        return cls(
-            *(np.concatenate([getattr(part, name) for part in parts]) for name in "txyp"),
-            first.width,
-            first.height,
-        )
+        t, x, y, p = (np.concatenate([getattr(part, name) for part in parts]) for name in "txyp")
+        return cls(t, x, y, p, first.width, first.height)
 
     def slice(self, begin: float, end: float) -> Events:
         """Return the events with begin <= t < end [s]."""
@@ -85,7 +83,7 @@ class Events:
         out = np.zeros((len(edges) - 1, 2, self.height, self.width), np.int32)
         size = 2 * self.height * self.width
         flat = (self.p * self.height + self.y.astype(np.int64)) * self.width + self.x
-        for window, (i, j) in enumerate(zip(bounds[:-1], bounds[1:], strict=True)):
+        for window, (i, j) in enumerate(pairwise(bounds)):
             out[window] = np.bincount(flat[i:j], minlength=size).reshape(2, self.height, self.width)
         return out
 

@@ -17,8 +17,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dase.errors import InputError
+from dase.pictures import SUFFIXES, decode, list_pictures, to_grey
 
-SUFFIXES = ("jpg", "jpeg", "png", "bmp", "tif", "tiff", "webp", "ppm", "pgm")
 LONGEST_SIDE = 1024  # [px] larger pictures are shrunk
 CACHED_PICTURES = 64  # decoded pictures kept per process: at most 4 MiB each, 8 MiB with alpha
 # fmt: off
@@ -94,10 +94,7 @@ def open_images(spec: str) -> ImageSource:
         if not annotations or not directory:
             raise InputError(f"images: write coco:ANNOTATIONS.json,DIR with one comma between, got '{spec}'")
         return CocoImages(spec, Path(annotations), _existing_folder(directory))
-    folder = _existing_folder(spec)
-    suffixed = (path for path in folder.rglob("*") if path.suffix.lower()[1:] in SUFFIXES and path.is_file())
-    names = sorted(path.relative_to(folder).as_posix() for path in suffixed)
-    found = [folder / name for name in names if "/." not in f"/{name}"]  # hidden files are other programs'
+    found = list_pictures(_existing_folder(spec))
     if not found:
         raise InputError(f"images: folder '{spec}' must hold a {', '.join(SUFFIXES)} file, found none")
     return FolderImages(spec, found)
@@ -240,13 +237,7 @@ def _existing_folder(name: str) -> Path:
 @lru_cache(maxsize=CACHED_PICTURES)
 def _read(path: Path) -> Picture:
     """Decode, grey, shrink and median-filter a file; the arrays are shared, hence read-only."""
-    planes = list(np.moveaxis(np.atleast_3d(_decode(path)), 2, 0))
-    full = np.float32(np.iinfo(planes[0].dtype).max)
-    alpha: Grey | None = planes.pop() / full if len(planes) in (2, 4) else None
-    weights = (0.07, 0.72, 0.21) if len(planes) == 3 else (1.0,)  # of BGR; S2R takes luma for intensity
-    grey: Grey = np.zeros(planes[0].shape, np.float32)
-    for weight, plane in zip(weights, planes, strict=True):
-        grey += np.float32(weight) / full * plane
+    grey, alpha = to_grey(decode(path))
     if alpha is not None and (alpha > 0).any():
         grey[alpha == 0] = grey[alpha > 0].mean()  # what is hidden must not leak into edges and backgrounds
     size = _shrunk(*grey.shape[::-1])
@@ -258,25 +249,6 @@ def _read(path: Path) -> Picture:
         return Picture(grey)  # an alpha channel that shows or hides everything is no cut-out
     alpha.flags.writeable = False
     return Picture(grey, alpha)
-
-
-def _decode(path: Path) -> NDArray[Any]:
-    """Return pixels as they are in the file: (H, W) or (H, W, channels), uint8 or uint16, BGR or BGRA."""
-    level = cv2.utils.logging.getLogLevel()
-    cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)  # our sentence is enough
-    try:
-        pixels = cv2.imdecode(np.frombuffer(path.read_bytes(), np.uint8), cv2.IMREAD_UNCHANGED)
-    except OSError as error:
-        raise InputError(f"images: cannot read '{path}': {error.strerror}") from error
-    except cv2.error:  # an empty file, or more pixels than OpenCV takes
-        pixels = None
-    finally:
-        cv2.utils.logging.setLogLevel(level)
-    if pixels is None:
-        raise InputError(f"images: cannot decode '{path}': damaged, cut off or too large")
-    if pixels.dtype not in (np.uint8, np.uint16):
-        raise InputError(f"images: '{path}' must hold 8- or 16-bit values, holds {pixels.dtype}")
-    return np.asarray(pixels)
 
 
 def _shrunk(width: int, height: int) -> tuple[int, int]:

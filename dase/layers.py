@@ -91,7 +91,8 @@ class LayerScene(Scene):
             raise InputError(f"scene duration must be > 0 s, got {duration:g}")
         if not 0 < shortest <= longest or not travel > 0:
             raise InputError(
-                f"sampling needs 0 < shortest <= longest and travel > 0, got {shortest:g}, {longest:g}, {travel:g}"
+                "sampling needs 0 < shortest <= longest and travel > 0, "
+                f"got {shortest:g}, {longest:g} and {travel:g}"
             )
         self.layers = tuple(layers)
         self.width, self.height, self.duration = width, height, duration
@@ -134,7 +135,7 @@ class LayerScene(Scene):
     def velocity(self, times: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return maps from sensor coordinates to velocity [px/s], shape (T, L, 2, 3)."""
         m, d = self.forward(times)
-        return (d @ np.linalg.inv(m))[..., :2, :]
+        return np.asarray((d @ np.linalg.inv(m))[..., :2, :])
 
     def speed(self, times: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the highest speed of any layer inside the picture [px/s], shape (T,).
@@ -145,7 +146,7 @@ class LayerScene(Scene):
         m, d = self.forward(times)
         points, inside = self._corners(m)
         v = np.einsum("tlij,tlpj->tlpi", (d @ np.linalg.inv(m))[..., :2, :], points)
-        return np.where(inside, np.linalg.norm(v, axis=-1), 0.0).max(axis=(1, 2))
+        return np.asarray(np.where(inside, np.linalg.norm(v, axis=-1), 0.0).max(axis=(1, 2)))
 
     def _outlines(self, m: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the corners of all layers on the sensor [px], shape (T, L, 4, 2)."""

@@ -238,8 +238,8 @@ class Pixels:
         clock = pixel.Clock()
         if first:
             dt[0] = pixel.REST
-        begin = np.round((edges[:-1] - previous) * 1e9)
-        length = np.diff(np.round((edges - previous) * 1e9))
+        stamps = np.round(edges * 1e9)
+        begin, length = stamps[:-1] - stamps[0], np.diff(stamps)
         to = self.device
         clock.t = wp.array(times.astype(np.float32), dtype=float, device=to)
         clock.dt = wp.array(dt.astype(np.float32), dtype=float, device=to)
@@ -257,7 +257,7 @@ class Pixels:
         n, to = len(keys), self.device
         out = [wp.empty(n, dtype=d, device=to) for d in (wp.float64, wp.uint16, wp.uint16, wp.uint8)]
         row = wp.empty(n if self.batch > 1 else 0, dtype=int, device=to)
-        inputs = [keys, bits, self.count, self._pixels, self.width, wp.float64(begin), *out, row]
+        inputs = [keys, bits, self.count, self._pixels, self.width, wp.int64(round(begin * 1e9)), *out, row]
         launch.run(ordering.decode, n, inputs, to)
         t, x, y, p = (a.numpy() for a in out)
         events = Events(t, x, y, p.view(np.bool_), self.width, self.height)
@@ -335,13 +335,15 @@ def count(
     )
     total = np.zeros((array.batch, len(edges) - 1, 2, array.count), np.int32)
     for times in chunks(scene.sample_times(), CHUNK["cuda" if array.device.is_cuda else "cpu"]):
-        windows = np.searchsorted(edges, times, side="left") - 1
+        windows = (np.searchsorted(edges, times, side="left") - 1).astype(np.int32)
         windows[(windows < 0) | (windows >= len(edges) - 1)] = -1
         seen = windows[windows >= 0]
         if len(seen) == 0:
             array.count_events(scene, times, windows, 1)
             continue
         low, high = seen.min(), seen.max() + 1
-        part = array.count_events(scene, times, np.where(windows >= 0, windows - low, -1), high - low)
+        part = array.count_events(
+            scene, times, np.where(windows >= 0, windows - low, -1).astype(np.int32), high - low
+        )
         total[:, low:high] += part.numpy()
     return total

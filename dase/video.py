@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import warp as wp
 from numpy.typing import ArrayLike, NDArray
 
 from dase.errors import InputError
 from dase.kernels import pixel
+from dase.pictures import list_pictures, read_grey, to_grey
 from dase.scene import Scene
 
 
@@ -21,8 +24,8 @@ class VideoScene(Scene):
         times: Times of the frames [s], increasing, shape (F,); the scene begins with the first.
     """
 
-    def __init__(self, frames: ArrayLike, times: ArrayLike):
-        self._frames = np.asarray(frames)
+    def __init__(self, frames: ArrayLike | FrameReader, times: ArrayLike):
+        self._frames = frames if isinstance(frames, FrameReader) else np.asarray(frames)
         self._times = np.asarray(times, np.float64)
         if self._frames.ndim != 3 or min(self._frames.shape) < 1:
             raise InputError(f"video: frames must have shape (F, height, width), got {self._frames.shape}")
@@ -30,7 +33,9 @@ class VideoScene(Scene):
             raise InputError(f"video: {len(self._frames)} frames need as many times, got {self._times.shape}")
         if np.any(np.diff(self._times) <= 0):
             raise InputError("video: frame times must increase")
-        if not np.all(np.isfinite(self._frames)) or self._frames.min() < 0:
+        if isinstance(self._frames, np.ndarray) and not (
+            np.all(np.isfinite(self._frames)) and self._frames.min() >= 0
+        ):
             raise InputError("video: intensities must be finite and >= 0")
         self.height, self.width = self._frames.shape[1:]
         self.duration = float(self._times[-1] - self._times[0])
@@ -56,3 +61,96 @@ class VideoScene(Scene):
         if np.any(index >= len(self._times)) or not np.array_equal(self._times[index], times):
             raise InputError("video: asked for a time between its frames")
         return self._frames[index]
+
+
+class FrameReader:
+    """Frames of a file or folder, decoded when they are asked for, so that long videos need no memory.
+
+    Args:
+        path: Video file, or folder of pictures in the order of their names.
+        size: Columns and rows to resize to, or None.
+    """
+
+    def __init__(self, path: Path, size: tuple[int, int] | None = None):
+        self._path, self._size = path, size
+        if not path.exists():
+            raise InputError(f"video {path} does not exist")
+        self._files = list_pictures(path) if path.is_dir() else None
+        self._capture: Any = None
+        self.rate = 0.0
+        self._count = len(self._files) if self._files is not None else self._count_frames()
+        if self._count < 2:
+            raise InputError(f"video {path} must have at least 2 frames, got {self._count}")
+        # the chunk before and the one asked for may overlap by the frames that are stored
+        self._kept: dict[int, NDArray[np.float32]] = {}
+        self._next = 0
+        self.shape = (self._count, *self[np.array([0])].shape[1:])
+        self.ndim = 3
+
+    def __len__(self) -> int:
+        return self._count
+
+    def __getitem__(self, index: NDArray[np.int64]) -> NDArray[np.float32]:
+        """Return the frames of increasing indices, intensity in [0, 1], shape (K, height, width)."""
+        wanted = [int(i) for i in index]
+        if self._files is not None:
+            return np.stack([self._grey(read_grey(self._files[i])) for i in wanted])
+        out = {i: self._kept[i] for i in wanted if i in self._kept}
+        missing = [i for i in wanted if i not in out]
+        if missing and missing[0] < self._next:
+            self._capture, self._next = None, 0
+        for i in range(self._next, missing[-1] + 1 if missing else 0):
+            frame = self._decode(i)
+            if i in missing:
+                out[i] = frame
+        self._kept = {i: out[i] for i in wanted}
+        return np.stack([out[i] for i in wanted])
+
+    def _open(self) -> Any:
+        capture = cv2.VideoCapture(str(self._path))
+        if not capture.isOpened():
+            raise InputError(f"video {self._path} cannot be decoded")
+        return capture
+
+    def _count_frames(self) -> int:
+        # the count in the header is often wrong
+        capture = self._open()
+        self.rate = float(capture.get(cv2.CAP_PROP_FPS))
+        count = 0
+        while capture.grab():
+            count += 1
+        return count
+
+    def _decode(self, index: int) -> NDArray[np.float32]:
+        if self._capture is None:
+            self._capture = self._open()
+        good, frame = self._capture.read()
+        if not good:
+            raise InputError(f"video {self._path}: frame {index} cannot be decoded")
+        self._next = index + 1
+        return self._grey(to_grey(frame)[0])
+
+    def _grey(self, grey: NDArray[np.float32]) -> NDArray[np.float32]:
+        if self._size is not None:
+            grey = cv2.resize(grey, self._size, interpolation=cv2.INTER_AREA)
+        return grey
+
+
+def open_video(path: Path, *, fps: float | None = None, size: tuple[int, int] | None = None) -> VideoScene:
+    """Return the scene of a video file or of a folder of frames.
+
+    Args:
+        path: File or folder.
+        fps: Frames per second; None takes what the file says.
+        size: Columns and rows to resize to; None keeps the video's.
+
+    Raises:
+        InputError: Missing or undecodable, or a folder without a rate.
+    """
+    if fps is not None and not (np.isfinite(fps) and fps > 0):
+        raise InputError(f"fps must be a number > 0, got {fps:g}")
+    reader = FrameReader(Path(path), size)
+    rate = fps or reader.rate
+    if not rate > 0:
+        raise InputError(f"{path} does not say how many frames it has per second: give --fps")
+    return VideoScene(reader, np.arange(len(reader)) / rate)

@@ -34,7 +34,7 @@ def decode(
     size: int,  # pixels per row of the batch
     pixels: wp.array[int],  # (N,)
     width: int,
-    begin: wp.float64,  # [s]
+    begin: wp.int64,  # of the chunk [ns]
     # out
     t_out: wp.array[wp.float64],  # [s]
     x_out: wp.array[wp.uint16],
@@ -48,7 +48,8 @@ def decode(
     key = keys[i]
     place = int((key >> wp.int64(1)) & ((wp.int64(1) << wp.int64(bits)) - wp.int64(1)))
     pixel = pixels[place % size]
-    t_out[i] = begin + wp.float64(1.0e-9) * wp.float64(key >> wp.int64(bits + 1))
+    # from whole nanoseconds, so that times never go back from chunk to chunk
+    t_out[i] = wp.float64(1.0e-9) * wp.float64(begin + (key >> wp.int64(bits + 1)))
     x_out[i] = wp.uint16(pixel % width)
     y_out[i] = wp.uint16(pixel / width)
     p_out[i] = wp.uint8(key & wp.int64(1))

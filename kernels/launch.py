@@ -52,7 +52,9 @@ def device(name: str) -> wp.Device:
         raise ValueError(f"backend '{name}' does not exist, here there are: {names}") from error
 
 
-def run(kernel: wp.Kernel, size: int, inputs: list[Any], device: wp.Device, *, batch: int = 1, align: int = 1) -> None:
+def run(
+    kernel: wp.Kernel, size: int, inputs: list[Any], device: wp.Device, *, batch: int = 1, align: int = 1
+) -> None:
     """Launch `kernel` over (batch, size) threads and wait for it on the CPU.
 
     Args:

@@ -13,9 +13,9 @@ A pixel turns light into events in this order; each effect adds Warp functions a
 
 A stage function asks for what it needs by the names of its arguments: the quantities above, `t`, `dt`, `x`,
 `y`, parameters and states of its effect, random numbers (`uniform`, `normal`: new ones at every sample;
-`pixel_uniform`, `pixel_normal`: one for each pixel; `_2` and so on for more of them). It returns its quantity, then
-the new values of its states. `compose` writes the kernel that calls all of them, one line each, so that a
-sensor costs one pass over its samples whatever effects it has. Random numbers are counter-based, keyed by
+`pixel_uniform`, `pixel_normal`: one for each pixel; `_2` and so on for more). It returns its quantity, then
+the new values of its states. `compose` writes the kernel that calls all of them, one line each, so that
+a sensor costs one pass over its samples whatever effects it has. Random numbers are counter-based, keyed by
 seed, effect, pixel and sample: they do not depend on the other effects, on chunks, threads or the batch.
 """
 

@@ -148,9 +148,8 @@ def flow(
     near = layers_near(layers, x, y)
     top = int(0)
     for layer in range(1, layers.count):
-        if ((near >> layer) & 1) != 0:
-            if foreground_at(layers, layer, k, x, y)[1] > 0.0:
-                top = layer
+        if ((near >> layer) & 1) != 0 and foreground_at(layers, layer, k, x, y)[1] > 0.0:
+            top = layer
     flow_out[k, i] = velocity[k, top] * wp.vec3(x, y, 1.0)
 
 

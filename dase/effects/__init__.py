@@ -15,8 +15,16 @@ from dase.effects.mismatch import Mismatch
 from dase.effects.refractory import Refractory
 from dase.effects.shot import Shot
 from dase.effects.threshold import Threshold
+from dase.errors import InputError, nearest
 
 EFFECTS: dict[str, type[Effect]] = {
     effect.name: effect for effect in (Threshold, Mismatch, Bandwidth, Leak, Shot, Refractory)
 }
 """Name in sensor files to class, in the order in which they act."""
+
+
+def find(name: str) -> type[Effect]:
+    """Return the effect of this name; raises InputError with the nearest known name."""
+    if name not in EFFECTS:
+        raise InputError(f"there is no effect '{name}': {nearest(name, EFFECTS)}")
+    return EFFECTS[name]

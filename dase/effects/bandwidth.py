@@ -39,7 +39,7 @@ class Bandwidth(Effect):
 
     name: ClassVar[str] = "bandwidth"
     source: ClassVar[str] = (
-        "Hu, Liu, Delbruck: v2e, from video frames to realistic DVS events, 2021, section 3 (finite intensity-dependent bandwidth)"
+        "Hu, Liu, Delbruck: v2e, from video frames to realistic DVS events, 2021 (finite bandwidth)"
     )
     stages: ClassVar = {"respond": lowpass}
     states: ClassVar = ("input", "output")

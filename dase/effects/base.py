@@ -21,7 +21,7 @@ class Parameter:
         name: As in the sensor file.
         unit: SI, or `1` for a ratio.
         default: A typical value.
-        off: The value at which the effect is exactly the identity, or None if another parameter switches it off.
+        off: The value at which the effect changes nothing, or None if another parameter switches it off.
         bounds: Values outside are refused.
         plausible: Where real cameras lie; a diagnosis looks for the effect in this range.
         about: One line.
@@ -103,8 +103,8 @@ class Effect:
         return {f.name: f.metadata["choice"] for f in dataclasses.fields(cls) if "choice" in f.metadata}
 
     @classmethod
-    def off(cls) -> Effect:
-        """Return this effect switched off: exactly the identity."""
+    def identity(cls) -> Effect:
+        """Return this effect switched off: it changes nothing, bit for bit."""
         return cls(**{p.name: p.off for p in cls.parameters() if p.off is not None})
 
     @classmethod

@@ -30,7 +30,8 @@ class Mismatch(Effect):
 
     name: ClassVar[str] = "mismatch"
     source: ClassVar[str] = (
-        "Lichtsteiner, Posch, Delbruck: A 128x128 120 dB 15 us latency asynchronous temporal contrast vision sensor, 2008 (2.1 % contrast)"
+        "Lichtsteiner, Posch, Delbruck: A 128x128 120 dB 15 us latency asynchronous "
+        "temporal contrast vision sensor, 2008"
     )
     stages: ClassVar = {"threshold": scatter}
 

@@ -29,7 +29,9 @@ class Refractory(Effect):
 
     name: ClassVar[str] = "refractory"
     source: ClassVar[str] = (
-        "Rebecq, Gehrig, Scaramuzza: ESIM, an open event camera simulator, 2018; Yang, Liu, Delbruck: A dynamic vision sensor with 1 % temporal contrast sensitivity, 2015"
+        "Rebecq, Gehrig, Scaramuzza: ESIM, an open event camera simulator, 2018; "
+        "Lichtsteiner, Posch, Delbruck: A 128x128 120 dB 15 us latency asynchronous "
+        "temporal contrast vision sensor, 2008"
     )
     stages: ClassVar = {"gate": dead}
 

@@ -31,7 +31,7 @@ class Shot(Effect):
 
     name: ClassVar[str] = "shot"
     source: ClassVar[str] = (
-        "Hu, Liu, Delbruck: v2e, from video frames to realistic DVS events, 2021, section 3 (temporal noise)"
+        "Hu, Liu, Delbruck: v2e, from video frames to realistic DVS events, 2021 (temporal noise)"
     )
     stages: ClassVar = {"noise": rates}
 

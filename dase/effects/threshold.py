@@ -23,7 +23,8 @@ class Threshold(Effect):
 
     name: ClassVar[str] = "threshold"
     source: ClassVar[str] = (
-        "Lichtsteiner, Posch, Delbruck: A 128x128 120 dB 15 us latency asynchronous temporal contrast vision sensor, 2008"
+        "Lichtsteiner, Posch, Delbruck: A 128x128 120 dB 15 us latency asynchronous "
+        "temporal contrast vision sensor, 2008"
     )
     stages: ClassVar = {}
 

@@ -1,0 +1,79 @@
+"""The `dase` command. Each command is a file with a click command called `command`, loaded when it is run."""
+
+from __future__ import annotations
+
+import errno
+import importlib
+import os
+import sys
+
+import click
+
+if __name__ != "dase.cli":
+    raise ImportError("import dase.cli, not cli")
+
+COMMANDS = ("demo", "effects", "show", "synth")
+
+
+class LazyGroup(click.Group):
+    """A group that imports a command's file when the command is named, so that `--help` answers at once."""
+
+    def list_commands(self, ctx: click.Context) -> list[str]:
+        """Return the names of all commands."""
+        return sorted(COMMANDS)
+
+    def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
+        """Return the command of this name."""
+        if cmd_name not in COMMANDS:
+            return None
+        command: click.Command = importlib.import_module(f"dase.cli.{cmd_name}").command
+        return command
+
+
+def version(ctx: click.Context, parameter: click.Parameter, value: bool) -> None:
+    """Print the version and exit."""
+    if value and not ctx.resilient_parsing:
+        from importlib.metadata import version as installed
+
+        click.echo(f"dase {installed('dase')}")
+        ctx.exit()
+
+
+@click.group(cls=LazyGroup, context_settings={"help_option_names": ["-h", "--help"]})
+@click.option(
+    "--version", is_flag=True, expose_value=False, is_eager=True, callback=version, help="Print the version."
+)
+def group() -> None:
+    """Simulate event cameras: exact, fast, and like yours."""
+
+
+def main() -> None:
+    """Run the command line; wrong input is one sentence and exit code 2, an interrupt is exit code 130."""
+    from dase.errors import InputError
+
+    try:
+        code = group.main(standalone_mode=False)
+    except click.exceptions.Abort:
+        _leave("interrupted", 130)
+    except KeyboardInterrupt:
+        _leave("interrupted", 130)
+    except click.ClickException as error:
+        error.show()
+        sys.exit(error.exit_code)
+    except InputError as error:
+        _leave(str(error), 2)
+    except BrokenPipeError:
+        # the reader of our output has gone; nothing is left to say to it
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        sys.exit(1)
+    except OSError as error:
+        reason = (
+            "no space left on the disk" if error.errno == errno.ENOSPC else (error.strerror or str(error))
+        )
+        _leave(f"{error.filename}: {reason}" if error.filename else reason, 2)
+    sys.exit(code if isinstance(code, int) else 0)
+
+
+def _leave(message: str, code: int) -> None:
+    click.echo(f"dase: {message}", err=True)
+    sys.exit(code)

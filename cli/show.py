@@ -1,0 +1,44 @@
+"""The command `dase show`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import click
+
+
+@click.command()
+@click.argument("file", type=click.Path(path_type=Path))
+@click.option("-o", "--output", type=click.Path(path_type=Path), help="PNG or MP4.  [default: FILE as .png]")
+@click.option("--at", type=float, metavar="SECONDS", help="Show this time only.")
+@click.option(
+    "--window",
+    type=float,
+    metavar="SECONDS",
+    help="Events per picture.  [default: fits the rate]",
+)
+def command(file: Path, output: Path | None, at: float | None, window: float | None) -> None:
+    """Draw the events of FILE over its frames and print its statistics.
+
+    A PNG is a contact sheet: moments with events in red (ON) and blue (OFF), the event rate, and the
+    intervals between events of one pixel. An MP4 shows all of it, a picture per frame.
+    """
+    from dase import io, show
+    from dase.errors import InputError
+
+    output = output or file.with_suffix(".png")
+    suffix = output.suffix.lower()
+    if suffix not in (".png", ".mp4"):
+        raise InputError(f"output: must end with .png or .mp4, got '{output}'")
+    if suffix == ".mp4" and at is not None:
+        raise InputError("at: shows one moment, which a video cannot; leave it out or write a .png")
+    sequence = io.read(file)
+    if suffix == ".mp4":
+        show.video(sequence, output, window=window)
+    else:
+        figure = show.draw(sequence, title=file.stem, at=at, window=window)
+        with io.replacing(output) as temporary:
+            figure.savefig(temporary)
+    for name, value in show.table(show.statistics(sequence)):
+        click.echo(f"{name:<18}{value}")
+    click.echo(f"{'written':<18}{output}")

@@ -1,0 +1,173 @@
+"""Event sequences from pictures or a video."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+if TYPE_CHECKING:
+    from dase.synth import Report
+
+
+def parse_size(ctx: click.Context, param: click.Parameter, value: str | None) -> tuple[int, int] | None:
+    """Return (columns, rows) of a text such as 640x480."""
+    if value is None:
+        return None
+    try:
+        width, height = (int(part) for part in value.lower().split("x"))
+    except ValueError:
+        raise click.BadParameter(f"{value!r} is not of the form WxH, such as 640x480") from None
+    if width < 1 or height < 1 or max(width, height) > 16384:
+        raise click.BadParameter(f"{value!r} must lie between 1x1 and 16384x16384")
+    return width, height
+
+
+@click.command()
+@click.argument("out", type=click.Path(path_type=Path))
+@click.option(
+    "--images", default="builtin", show_default=True, help="Folder, coco:ANNOTATIONS,FOLDER or builtin."
+)
+@click.option("--sensor", default="davis346", show_default=True, help="Preset or TOML file.")
+@click.option("--sequences", default=10, show_default=True, help="How many sequences.")
+@click.option(
+    "--size", callback=parse_size, metavar="WxH", help="Columns x rows.  [default: the sensor's, or 346x260]"
+)
+@click.option("--duration", default=1.0, show_default=True, help="Of each sequence [s].")
+@click.option(
+    "--regime",
+    default="mixed",
+    show_default=True,
+    help="How things move: background, slow, medium, fast, variety or mixed.",
+)
+@click.option(
+    "--seed", default=0, show_default=True, help="The same seed gives the same bytes, whatever --jobs is."
+)
+@click.option("--jobs", type=int, help="Processes that share the work.  [default: one per core]")
+@click.option(
+    "--format",
+    "format_",
+    type=click.Choice(["h5", "npz"]),
+    default="h5",
+    show_default=True,
+    help="h5 is the layout of S2R.",
+)
+@click.option(
+    "--frame-rate", default=60.0, show_default=True, help="Of the frames and the flow that are stored [Hz]."
+)
+@click.option("--backend", default="cpu", show_default=True, help="cpu or cuda.")
+@click.option(
+    "--video", type=click.Path(path_type=Path), help="Simulate this video file or folder of frames instead."
+)
+@click.option("--fps", type=float, help="Frames per second of --video.  [default: what the file says]")
+@click.option("--resume", is_flag=True, help="Finish what an interrupted run left in OUT.")
+def command(
+    out: Path,
+    images: str,
+    sensor: str,
+    sequences: int,
+    size: tuple[int, int] | None,
+    duration: float,
+    regime: str,
+    seed: int,
+    jobs: int | None,
+    format_: str,
+    frame_rate: float,
+    backend: str,
+    video: Path | None,
+    fps: float | None,
+    resume: bool,
+) -> None:
+    """Simulate event sequences into the folder OUT.
+
+    Pictures move over each other as in S2R's training data; each sequence is one file with events, frames,
+    optical flow, the thresholds used and everything that made it. `dase show FILE` draws it.
+
+    With --video, the events of your own high-speed video are written to the file OUT instead.
+    """
+    if video is not None:
+        _video(out, video, fps, sensor, size, seed, backend, frame_rate)
+        return
+    if fps is not None:
+        raise click.UsageError("--fps goes with --video")
+    from dase import synth
+    from dase.config import dump_sensor, load_sensor
+
+    chosen = load_sensor(sensor)
+    width, height = size or chosen.size or (346, 260)
+    job = synth.Job(
+        images=images,
+        sensor=dump_sensor(chosen),
+        sequences=sequences,
+        width=width,
+        height=height,
+        duration=duration,
+        regime=regime,
+        seed=seed,
+        format=format_,
+        backend=backend,
+        frame_rate=frame_rate,
+    )
+    count = jobs if jobs is not None else (1 if backend.startswith("cuda") else os.cpu_count() or 1)
+    with _bar(sequences, "sequences") as bar:
+        report = synth.run(job, out, jobs=count, resume=resume, progress=lambda done: _advance(bar, done))
+    _summary(report)
+    click.echo(f"Look at one: dase show {job.path(out, 0)}")
+
+
+def _video(
+    out: Path,
+    video: Path,
+    fps: float | None,
+    sensor: str,
+    size: tuple[int, int] | None,
+    seed: int,
+    backend: str,
+    frame_rate: float,
+) -> None:
+    """Simulate one video into the file `out`."""
+    from dase import synth
+    from dase.config import load_sensor
+    from dase.video import open_video
+
+    scene = open_video(video, fps=fps, size=size)
+    with _bar(len(scene.sample_times()), "frames") as bar:
+        report = synth.record_scene(
+            scene,
+            load_sensor(sensor),
+            out,
+            frame_rate=frame_rate,
+            seed=seed,
+            device=backend,
+            progress=lambda done: _advance(bar, done),
+        )
+    _summary(report)
+    click.echo(f"Look at it: dase show {out}")
+
+
+def _bar(total: int, unit: str) -> Any:
+    from tqdm import tqdm
+
+    return tqdm(total=total, unit=f" {unit}", disable=None)
+
+
+def _advance(bar: Any, done: Report) -> None:
+    bar.update(done.sequences if bar.unit == " sequences" else done.samples)
+    bar.events = getattr(bar, "events", 0) + done.events
+    elapsed = bar.format_dict["elapsed"]
+    bar.set_postfix_str(f"{bar.events:.3g} events, {bar.events / max(elapsed, 1e-9):.3g} events/s")
+
+
+def _summary(report: Report) -> None:
+    seconds = max(report.seconds, 1e-9)
+    click.echo(
+        f"{report.events:,} events in {report.sequences} sequence{'s' * (report.sequences != 1)}, "
+        f"{report.seconds:.1f} s: {report.events / seconds / 1e6:.2f} Mevents/s, "
+        f"{report.pixels / seconds / 1e9:.3f} Gsample/s"
+    )
+    if report.sequences:
+        click.echo(
+            f"{report.samples:,} time samples rendered, {report.samples / report.sequences:.0f} per sequence"
+        )
