@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import os
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import click
 
@@ -111,8 +114,8 @@ def command(
         frame_rate=frame_rate,
     )
     count = jobs if jobs is not None else (1 if backend.startswith("cuda") else os.cpu_count() or 1)
-    with _bar(sequences, "sequences") as bar:
-        report = synth.run(job, out, jobs=count, resume=resume, progress=lambda done: _advance(bar, done))
+    with _bar(sequences, "sequences") as advance:
+        report = synth.run(job, out, jobs=count, resume=resume, progress=advance)
     _summary(report)
     click.echo(f"Look at one: dase show {job.path(out, 0)}")
 
@@ -133,7 +136,7 @@ def _video(
     from dase.video import open_video
 
     scene = open_video(video, fps=fps, size=size)
-    with _bar(len(scene.sample_times()), "frames") as bar:
+    with _bar(len(scene.sample_times()), "frames") as advance:
         report = synth.record_scene(
             scene,
             load_sensor(sensor),
@@ -141,23 +144,29 @@ def _video(
             frame_rate=frame_rate,
             seed=seed,
             device=backend,
-            progress=lambda done: _advance(bar, done),
+            progress=advance,
         )
     _summary(report)
     click.echo(f"Look at it: dase show {out}")
 
 
-def _bar(total: int, unit: str) -> Any:
+@contextmanager
+def _bar(total: int, unit: str) -> Iterator[Callable[[Report], None]]:
+    """Show a progress bar on a terminal; give the function that a finished piece of work is reported to."""
     from tqdm import tqdm
 
-    return tqdm(total=total, unit=f" {unit}", disable=None)
+    with tqdm(total=total, unit=f" {unit}", disable=None) as bar:
+        events = 0
+        begin = time.perf_counter()
 
+        def advance(done: Report) -> None:
+            nonlocal events
+            events += done.events
+            rate = events / (time.perf_counter() - begin)
+            bar.set_postfix_str(f"{events:,} events, {rate / 1e6:.2f} Mevents/s", refresh=False)
+            bar.update(done.sequences if unit == "sequences" else done.samples)
 
-def _advance(bar: Any, done: Report) -> None:
-    bar.update(done.sequences if bar.unit == " sequences" else done.samples)
-    bar.events = getattr(bar, "events", 0) + done.events
-    elapsed = bar.format_dict["elapsed"]
-    bar.set_postfix_str(f"{bar.events:.3g} events, {bar.events / max(elapsed, 1e-9):.3g} events/s")
+        yield advance
 
 
 def _summary(report: Report) -> None:

@@ -156,7 +156,7 @@ class Pixels:
         self.samples = 0
         self.begin = 0.0
         self.slab = 256 if self.device.is_cuda else 2048
-        self._capacity = self.slab
+        self._capacity = 4 * self.slab
 
     def count_events(
         self, scene: Scene, times: NDArray[np.float64], windows: NDArray[np.int32], size: int
@@ -166,14 +166,20 @@ class Pixels:
         Args:
             scene: What the pixels see.
             times: Samples [s], shape (K,), following the last ones.
-            windows: Window that the step ending at each sample counts for, shape (K,); -1 for none.
+            windows: Window that the step ending at each sample counts for, shape (K,), not decreasing; -1 for
+                none.
             size: Number of windows W.
 
         Returns:
             Warp array of int32, shape (B, W, 2, N): OFF counts in channel 0, ON counts in channel 1.
         """
         sink = pixel.Counts()
-        sink.counts = wp.zeros((self.batch, size, 2, self.count), dtype=int, device=self.device)
+        if np.any(np.diff(windows[windows >= 0]) < 0):
+            raise InputError("windows must not decrease from sample to sample")
+        shape = (self.batch, size, 2, self.count)
+        # the kernel writes each window it meets, whole
+        new = wp.empty if len(np.unique(windows[windows >= 0])) == size else wp.zeros
+        sink.counts = new(shape, dtype=int, device=self.device)
         self._launch("counts", sink, scene, times, windows, align=16)
         self._advance(times)
         return sink.counts

@@ -5,8 +5,9 @@ from __future__ import annotations
 import os
 import signal
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Generator
 from concurrent.futures import ProcessPoolExecutor, as_completed
+from contextlib import closing
 from dataclasses import asdict, dataclass, replace
 from functools import lru_cache
 from multiprocessing import get_context
@@ -139,9 +140,11 @@ def run(
     Pixels(parse_sensor(job.sensor, "sensor"), 1, 1, device=job.backend)
     todo = _prepare(job, out, resume)
     total = Report()
-    for report in _work(job, out, todo, min(jobs, max(len(todo), 1))):
-        total = total.plus(report)
-        progress(report)
+    # closing ends the processes at once when `progress` raises
+    with closing(_work(job, out, todo, min(jobs, max(len(todo), 1)))) as reports:
+        for report in reports:
+            total = total.plus(report)
+            progress(report)
     return replace(total, seconds=time.perf_counter() - begin)
 
 
@@ -163,7 +166,7 @@ def _prepare(job: Job, out: Path, resume: bool) -> list[int]:
     return [i for i in range(job.sequences) if not job.path(out, i).exists()]
 
 
-def _work(job: Job, out: Path, todo: list[int], jobs: int) -> Iterator[Report]:
+def _work(job: Job, out: Path, todo: list[int], jobs: int) -> Generator[Report, None, None]:
     if jobs == 1:
         for index in todo:
             yield make_sequence(job, out, index)

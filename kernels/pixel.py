@@ -37,6 +37,9 @@ from dase.kernels.scene import Layers, layer_intensity, layers_near
 REST = 1e30
 """Duration of the rest before the first sample [s]: filters start settled."""
 
+AHEAD = 4
+"""Stored samples of a pixel that are under way from memory at a time."""
+
 STAGES = ("light", "respond", "threshold", "drift", "noise", "gate")
 CORE = ("on", "off", "phase", "log_eps")
 """Parameters of the change detector itself; they lead the parameter vector."""
@@ -88,7 +91,7 @@ class Clock:
     dt: wp.array[float]  # (K,) [s], REST at the first sample of all
     begin: wp.array[wp.int64]  # (K,) begin of the step [ns since the chunk's begin]
     length: wp.array[float]  # (K,) duration of the step [ns]
-    window: wp.array[int]  # (K,) window the step is counted in
+    window: wp.array[int]  # (K,) window the step is counted in, not decreasing; -1 for none
 
 
 @wp.struct
@@ -109,15 +112,7 @@ class Keys:
 
 
 @wp.func
-def deposit_counts(sink: Counts, clock: Clock, row: int, i: int, size: int, k: int, at: float, on: int):
-    """Count one event."""
-    window = clock.window[k]
-    if window >= 0:
-        sink.counts[row, window, on, i] = sink.counts[row, window, on, i] + 1
-
-
-@wp.func
-def deposit_keys(sink: Keys, clock: Clock, row: int, i: int, size: int, k: int, at: float, on: int):
+def deposit(sink: Keys, clock: Clock, row: int, i: int, size: int, k: int, at: float, on: int):
     """Keep one event that happened when the share `at` of step k had passed."""
     slab = i / sink.slab
     slot = wp.atomic_add(sink.used, row, slab, 1)
@@ -151,12 +146,8 @@ def waiting(key: int, index: int) -> float:
     return -wp.log(1.0 - uniform(key, index))
 
 
-SOURCES = {
-    "frames": (Frames, "intensity = source.values[k, i]"),
-    "log": (Frames, "voltage = source.values[k, i]"),
-    "layers": (Layers, "intensity = layer_intensity(source, near, k, float(x), float(y))"),
-}
-SINKS = {"counts": (Counts, deposit_counts), "keys": (Keys, deposit_keys)}
+SOURCES = {"frames": Frames, "log": Frames, "layers": Layers}
+SINKS = {"counts": Counts, "keys": Keys}
 
 
 def stream(name: str) -> int:
@@ -230,10 +221,10 @@ class _Writer:
         self.draws: dict[str, str] = {}
         self.scope: dict[str, Any] = {
             "wp": wp,
-            "Source": SOURCES[source][0],
-            "Sink": SINKS[sink][0],
+            "Source": SOURCES[source],
+            "Sink": SINKS[sink],
             "Clock": Clock,
-            "deposit": SINKS[sink][1],
+            "deposit": deposit,
             "key": key,
             "uniform": uniform,
             "normal": normal,
@@ -331,14 +322,26 @@ class _Writer:
         self.add("size = pixels.shape[0]")
         if self.source == "layers":
             self.add("near = layers_near(source, float(x), float(y))")
+        else:
+            self.add("last = source.values.shape[0] - 1")
+            self.add(*(f"ahead_{n} = source.values[wp.min({n}, last), i]" for n in range(AHEAD)))
         self.add(*(f"on, off = {call}" for call in calls))
-        self.add(*(f"{name} = state_in[{at}, row, i]" for at, name in enumerate(self.states)))
+        self.add(*(f"{name} = float(0.0)" for name in self.states), "if begin > 0:")
+        self.add(*(f"    {name} = state_in[{at}, row, i]" for at, name in enumerate(self.states)))
+        if self.sink == "counts":
+            self.add("window = int(-1)", "on_count = int(0)", "off_count = int(0)")
 
     def loop(self) -> None:
         """One sample after the other, then the state is kept."""
         self.add("for k in range(clock.dt.shape[0]):")
         self.depth += 1
         self.add("dt = clock.dt[k]", "t = clock.t[k]", "sample = begin + k")
+        if self.sink == "counts":
+            self.add("if clock.window[k] != window:")
+            self.depth += 1
+            self.keep_counts()
+            self.add("window = clock.window[k]", "on_count = 0", "off_count = 0")
+            self.depth -= 1
         self.sense()
         self.add("if sample == 0:")
         self.depth += 1
@@ -354,11 +357,25 @@ class _Writer:
         self.depth += 1
         self.step()
         self.depth -= 2
+        if self.sink == "counts":
+            self.keep_counts()
         self.add(*(f"state_out[{at}, row, i] = {name}" for at, name in enumerate(self.states)))
+
+    def keep_counts(self) -> None:
+        """Write the counts of a window once, when it is over."""
+        self.add("if window >= 0:", "    sink.counts[row, window, 0, i] = off_count")
+        self.add("    sink.counts[row, window, 1, i] = on_count")
 
     def sense(self) -> None:
         """Light to photoreceptor voltage."""
-        self.add(SOURCES[self.source][1])
+        quantity = "voltage" if self.source == "log" else "intensity"
+        if self.source == "layers":
+            self.add("intensity = layer_intensity(source, near, k, float(x), float(y))")
+        else:
+            # memory is asked for the samples to come while the present one is worked on
+            self.add(f"{quantity} = ahead_0")
+            self.add(*(f"ahead_{n} = ahead_{n + 1}" for n in range(AHEAD - 1)))
+            self.add(f"ahead_{AHEAD - 1} = source.values[wp.min(k + {AHEAD}, last), i]")
         if self.source == "log":
             if self.of("light"):
                 raise ValueError("effects on light need intensities, not log intensities")
@@ -478,7 +495,10 @@ class _Writer:
 
     def event(self, share: str, polarity: str) -> None:
         """Emit an event after `share` of the step."""
-        self.add(f"deposit(sink, clock, row, i, size, k, {share}, {polarity})")
+        if self.sink == "counts":
+            self.add(f"on_count += {polarity}", f"off_count += 1 - {polarity}")
+        else:
+            self.add(f"deposit(sink, clock, row, i, size, k, {share}, {polarity})")
         if "age" in self.states:
             self.add(f"age = -{share} * dt")
 
