@@ -129,7 +129,8 @@ class Pixels:
             self.device = launch.device(device)
         except ValueError as error:
             raise InputError(str(error)) from error
-        self.sensor, self.width, self.height, self.seed = sensor, width, height, seed
+        self.sensor, self.width, self.height = sensor, width, height
+        self.seed = seed & 0x7FFFFFFF  # a key of random numbers has 31 bits
         self.stages = sensor.stages()
         self.pixels = (
             np.arange(width * height, dtype=np.int32) if pixels is None else np.asarray(pixels, np.int32)
@@ -229,7 +230,7 @@ class Pixels:
         kernel = pixel.compose(self.stages, source_name, sink_name)
         clock = self._clock(times, windows)
         inputs = [
-            source, clock, self._pixels, self.width, self.samples, self.seed & 0x7FFFFFFF,
+            source, clock, self._pixels, self.width, self.samples, self.seed,
             self._parameters, self._state, self._next, sink,
         ]  # fmt: skip
         launch.run(kernel, self.count, inputs, self.device, batch=self.batch, align=align)
@@ -239,19 +240,25 @@ class Pixels:
         previous = float(times[0]) if first else self.begin
         edges = np.concatenate([[previous], times])
         dt = np.diff(edges)
-        if np.any(dt[first:] <= 0):
+        if not np.all(dt[first:] > 0) or not np.all(np.isfinite(edges)):
             raise InputError("sample times must increase")
         clock = pixel.Clock()
         if first:
             dt[0] = pixel.REST
         stamps = np.round(edges * 1e9)
         begin, length = stamps[:-1] - stamps[0], np.diff(stamps)
+        # rounded down, so that no event comes after the end of its step
+        short = length.astype(np.float32)
+        short = np.where(short > length, np.nextafter(short, np.float32(0)), short)
         to = self.device
         clock.t = wp.array(times.astype(np.float32), dtype=float, device=to)
         clock.dt = wp.array(dt.astype(np.float32), dtype=float, device=to)
         clock.begin = wp.array(begin.astype(np.int64), dtype=wp.int64, device=to)
-        clock.length = wp.array(length.astype(np.float32), dtype=float, device=to)
-        clock.window = wp.array(windows.astype(np.int32), dtype=int, device=to)
+        clock.length = wp.array(short, dtype=float, device=to)
+        # runs of one window, so that a pixel writes its counts once per window
+        run = np.flatnonzero(np.diff(windows, prepend=windows[0] - 1))
+        clock.run = wp.array(np.append(run, len(windows)).astype(np.int32), dtype=int, device=to)
+        clock.window = wp.array(windows[run].astype(np.int32), dtype=int, device=to)
         return clock
 
     def _advance(self, times: NDArray[np.float64]) -> None:

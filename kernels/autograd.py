@@ -232,13 +232,12 @@ def affine_places(
     """Return the places of `dase.layers.Motion`, differentiable in the motion and the times.
 
     Args:
-        motion: x, y, angle, scale_x and scale_y at the beginning and at the end, shape (L, 5, 2), in widths of
-            the sensor and radians as in `dase.layers.Motion`.
+        motion: Fields of `Motion` in its order and units, at the beginning and at the end, shape (L, 5, 2).
         times: Samples [s], shape (K,).
         sizes: Height and width of the texture of each layer [texel]; the first is the background.
         width: Columns of the sensor [px].
         height: Rows of the sensor [px].
-        duration: When the end is reached [s].
+        duration: Length of the motion [s].
 
     Returns:
         Maps from sensor to texture coordinates [px to texel], shape (K, L, 2, 3) float32.
@@ -247,8 +246,8 @@ def affine_places(
         ValueError: A shape or dtype does not fit.
     """
     _check("motion", motion, ((len(sizes), 5, 2),), None)
-    # double: half a thousand texels in float32 would leave errors above 1e-5
-    begin, end = motion.double().unbind(-1)
+    # float32 would leave errors of 1e-5 and more
+    begin, end = motion.double().unbind(-1)  # each (L, 5)
     share = torch.as_tensor(times, dtype=torch.float64, device=motion.device)[:, None, None] / duration
     x, y, angle, scale_x, scale_y = (begin + share * (end - begin)).unbind(-1)  # each (K, L)
     # texels per unit of the plane: at scale 1 the background covers the sensor, others are as wide as it
@@ -256,7 +255,7 @@ def affine_places(
     zoom = motion.new_tensor(units, dtype=torch.float64) / width
     cosine, sine = zoom * torch.cos(angle), zoom * torch.sin(angle)
     centre_x, centre_y = x * width + (width - 1) / 2, y * width + (height - 1) / 2  # [px]
-    rows = []
+    rows = []  # u, then v
     for a, b, side in ((cosine / scale_x, sine / scale_x, 1), (-sine / scale_y, cosine / scale_y, 0)):
         middle = motion.new_tensor([(size[side] - 1) / 2 for size in sizes], dtype=torch.float64)
         rows.append(torch.stack([a, b, middle - a * centre_x - b * centre_y], -1))
@@ -291,20 +290,14 @@ class _Render(torch.autograd.Function):
         lots = min(threads(), 16)
         stretch = 1 if gradient.is_cuda else -(-gradient.shape[1] // lots)
         wanted = [bool(n) for n in ctx.needs_input_grad[:2]]
-        by_texels = texels.new_zeros(1 if gradient.is_cuda else lots, len(texels) * wanted[0], 2)
-        by_place = place.new_zeros(
-            COPIES if gradient.is_cuda else lots, len(place) * wanted[1], *place.shape[1:]
-        )
+        copies = (1, COPIES) if gradient.is_cuda else (lots, lots)
+        by_texels = texels.new_zeros(copies[0], len(texels) * wanted[0], 2)
+        by_place = place.new_zeros(copies[1], len(place) * wanted[1], *place.shape[1:])
         outputs = [wp.from_torch(by_texels, dtype=wp.vec2), wp.from_torch(by_place, dtype=_scene.Affine)]
         inputs = [_layers(texels, place, ctx.sizes), gradient, ctx.width, stretch]
         _launch(_scene.render_gradient, inputs, outputs, over=gradient, align=stretch)
-        return (
-            by_texels.sum(0) if wanted[0] else None,
-            by_place.sum(0) if wanted[1] else None,
-            None,
-            None,
-            None,
-        )
+        sums = [by.sum(0) if want else None for by, want in zip((by_texels, by_place), wanted, strict=True)]
+        return *sums, None, None, None
 
 
 def _layers(texels: torch.Tensor, place: torch.Tensor, sizes: tuple[tuple[int, int], ...]) -> Any:

@@ -1,4 +1,4 @@
-"""Moving textured layers: bilinear warping, alpha compositing, flow.
+"""Moving textured layers: bilinear warping, alpha compositing, its derivative, flow.
 
 A layer is a texture and, at every time sample, an affine map from sensor to texture coordinates (pixel
 centres at integers). Layer 0 is the opaque background, continued by reflection about its outermost texels
@@ -31,30 +31,50 @@ class Layers:
     count: int  # L
 
 
-@wp.func
-def reflected(u: float, length: int) -> float:
-    """Fold a coordinate into [0, length - 1] as reflect-101 does."""
-    period = wp.max(2.0 * float(length - 1), 1.0)
-    return wp.min(wp.abs(u - period * wp.floor(u / period + 0.5)), float(length - 1))
+@wp.struct
+class Ground:
+    """What every look at the background needs; a thread works it out once."""
+
+    width: int
+    last: wp.vec2  # coordinates of the last texel
+    corner: wp.vec2i  # greatest upper left texel to interpolate from
+    step: wp.vec2i  # from a texel to its right and to its lower neighbour
+    inverse: wp.vec2  # 1 / period of the reflection
 
 
 @wp.func
-def background_at(layers: Layers, k: int, x: float, y: float) -> float:
-    """Intensity of layer 0."""
+def ground_of(layers: Layers) -> Ground:
+    """Geometry of layer 0."""
     size = layers.size[0]
+    ground = Ground()
+    ground.width = size[0]
+    ground.last = wp.vec2(float(size[0] - 1), float(size[1] - 1))
+    ground.corner = wp.vec2i(wp.max(size[0] - 2, 0), wp.max(size[1] - 2, 0))
+    ground.step = wp.vec2i(wp.min(1, size[0] - 1), wp.min(1, size[1] - 1) * size[0])
+    ground.inverse = wp.vec2(1.0 / wp.max(2.0 * ground.last[0], 1.0), 1.0 / wp.max(2.0 * ground.last[1], 1.0))
+    return ground
+
+
+@wp.func
+def reflected(u: float, last: float, inverse: float) -> float:
+    """Fold a coordinate into [0, last] as reflect-101 does; `inverse` is 1 / (2 last)."""
+    return wp.min(wp.abs(u - 2.0 * last * wp.floor(u * inverse + 0.5)), last)
+
+
+@wp.func
+def background_at(layers: Layers, ground: Ground, k: int, x: float, y: float) -> float:
+    """Intensity of layer 0."""
     at = layers.place[k, 0] * wp.vec3(x, y, 1.0)
-    u = reflected(at[0], size[0])
-    v = reflected(at[1], size[1])
-    iu = wp.min(int(u), wp.max(size[0] - 2, 0))
-    iv = wp.min(int(v), wp.max(size[1] - 2, 0))
+    u = reflected(at[0], ground.last[0], ground.inverse[0])
+    v = reflected(at[1], ground.last[1], ground.inverse[1])
+    iu = wp.min(int(u), ground.corner[0])
+    iv = wp.min(int(v), ground.corner[1])
     fu = u - float(iu)
     fv = v - float(iv)
-    right = wp.min(1, size[0] - 1)
-    below = wp.min(1, size[1] - 1) * size[0]
-    i = layers.start[0] + iv * size[0] + iu
-    top = layers.texels[i][0] + fu * (layers.texels[i + right][0] - layers.texels[i][0])
-    i += below
-    bottom = layers.texels[i][0] + fu * (layers.texels[i + right][0] - layers.texels[i][0])
+    i = iv * ground.width + iu  # layer 0 begins at texel 0
+    top = layers.texels[i][0] + fu * (layers.texels[i + ground.step[0]][0] - layers.texels[i][0])
+    i += ground.step[1]
+    bottom = layers.texels[i][0] + fu * (layers.texels[i + ground.step[0]][0] - layers.texels[i][0])
     return top + fv * (bottom - top)
 
 
@@ -97,7 +117,7 @@ def layers_near(layers: Layers, x: float, y: float) -> int:
 
 
 @wp.func
-def layer_intensity(layers: Layers, near: int, k: int, x: float, y: float) -> float:
+def layer_intensity(layers: Layers, ground: Ground, near: int, k: int, x: float, y: float) -> float:
     """Intensity of a pixel at sample k, composited front to back."""
     light = float(0.0)
     through = float(1.0)
@@ -110,7 +130,7 @@ def layer_intensity(layers: Layers, near: int, k: int, x: float, y: float) -> fl
                 through *= 1.0 - front[1]
                 if through == 0.0:
                     return light
-    return light + through * background_at(layers, k, x, y)
+    return light + through * background_at(layers, ground, k, x, y)
 
 
 @wp.kernel(enable_backward=False)
@@ -127,7 +147,7 @@ def render(
     i += first
     x = float(i % width)
     y = float(i / width)
-    intensity_out[k, i] = layer_intensity(layers, layers_near(layers, x, y), k, x, y)
+    intensity_out[k, i] = layer_intensity(layers, ground_of(layers), layers_near(layers, x, y), k, x, y)
 
 
 @wp.kernel(enable_backward=False)
@@ -154,12 +174,11 @@ def flow(
 
 
 @wp.func
-def fold_slope(u: float, length: int) -> float:
+def fold_slope(u: float, last: float, inverse: float) -> float:
     """Derivative of `reflected`: where the fold runs backwards, so does the derivative."""
-    if length == 1:
+    if last == 0.0:
         return 0.0
-    period = 2.0 * float(length - 1)
-    return wp.where(u < period * wp.floor(u / period + 0.5), -1.0, 1.0)
+    return wp.where(u < 2.0 * last * wp.floor(u * inverse + 0.5), -1.0, 1.0)
 
 
 @wp.func
@@ -211,10 +230,14 @@ def spread_layer(
             return wp.vec2(0.0, 0.0)
         corner = wp.vec2i(int(wp.floor(at[0])), int(wp.floor(at[1])))
         return spread(layers, layer, corner, at[0], at[1], gradient, slot, texel_gradient_out)
-    u = reflected(at[0], size[0])
-    v = reflected(at[1], size[1])
-    corner = wp.vec2i(wp.min(int(u), wp.max(size[0] - 2, 0)), wp.min(int(v), wp.max(size[1] - 2, 0)))
-    slope = wp.vec2(fold_slope(at[0], size[0]), fold_slope(at[1], size[1]))
+    ground = ground_of(layers)
+    u = reflected(at[0], ground.last[0], ground.inverse[0])
+    v = reflected(at[1], ground.last[1], ground.inverse[1])
+    corner = wp.vec2i(wp.min(int(u), ground.corner[0]), wp.min(int(v), ground.corner[1]))
+    slope = wp.vec2(
+        fold_slope(at[0], ground.last[0], ground.inverse[0]),
+        fold_slope(at[1], ground.last[1], ground.inverse[1]),
+    )
     return wp.cw_mul(slope, spread(layers, layer, corner, u, v, gradient, slot, texel_gradient_out))
 
 
@@ -232,9 +255,8 @@ def render_gradient(
 ):
     """Differentiate `render`, one pixel and sample per thread.
 
-    light = Σ_l T_l c_l with premultiplied c_l and T_l = Π (1 - alpha) of all layers in front of l; so
-    ∂light/∂c_l = T_l and ∂light/∂alpha_l = -T_l · (composite of all layers behind l). A second dimension of
-    length 0 says that an output is not wanted.
+    light = Σ_l T_l c_l with premultiplied c_l and T_l = Π (1 - alpha) over the layers in front, so that
+    ∂light/∂c_l = T_l and ∂light/∂alpha_l = -T_l · (composite of all behind l). Empty outputs are not wanted.
     """
     k, i = wp.tid()
     i += first
@@ -243,7 +265,7 @@ def render_gradient(
     y = float(i / width)
     behind = PerLayer()
     passes = PerLayer()
-    light = background_at(layers, k, x, y)
+    light = background_at(layers, ground_of(layers), k, x, y)
     for layer in range(1, layers.count):
         front = foreground_at(layers, layer, k, x, y)
         behind[layer] = light
