@@ -92,9 +92,9 @@ def count_events(
         fraction = phase.detach().float().flatten(1)
         on, off = threshold.detach()[:, -1], threshold.detach()[:, 0]
         start = fraction * torch.where(fraction >= 0, on, off)
-    window, count = _window(windows, samples - 1, log.device)
+    run, window, count = _window(windows, samples - 1, log.device)
     flat = log.detach().flatten(2)
-    counts = _Count.apply(flat, threshold, start, window, count, surrogate, step)
+    counts = _Count.apply(flat, threshold, start, run, window, count, surrogate, step)
     return counts.view(batch, count, 2, *space)
 
 
@@ -156,6 +156,7 @@ class _Count(torch.autograd.Function):
         log: torch.Tensor,
         threshold: torch.Tensor,
         phase: torch.Tensor,
+        run: torch.Tensor,
         window: torch.Tensor,
         windows: int,
         surrogate: str,
@@ -164,7 +165,8 @@ class _Count(torch.autograd.Function):
         log, threshold, phase = (t.float().contiguous() for t in (log, threshold, phase))
         batch, _, pixels = log.shape
         counts = torch.zeros(batch, windows, 2, pixels, device=log.device)
-        _launch(_counts.count, [log, threshold, phase, window], [counts])
+        lanes = next(n for n in _counts.LANES if pixels % n == 0)
+        _launch(_counts.count[lanes], [log, threshold, phase, run, window], [counts], lanes=lanes)
         ctx.save_for_backward(log, threshold, phase, window, counts)
         ctx.surrogate, ctx.step = surrogate, step
         return counts
@@ -181,7 +183,7 @@ class _Count(torch.autograd.Function):
             _launch(_counts.interval_gradient, [log, threshold, phase, window, gradient], [out])
         else:
             _launch(_counts.expected_gradient, [log, threshold, phase, window, gradient, ctx.step], [out])
-        return None, out, None, None, None, None, None
+        return None, out, None, None, None, None, None, None
 
 
 def render(textures: Sequence[Texture], place: torch.Tensor, *, width: int, height: int) -> torch.Tensor:
@@ -322,14 +324,28 @@ def _launch(
     *,
     over: torch.Tensor | None = None,
     align: int = 1,
+    lanes: int | None = None,
 ) -> None:
-    """Run `kernel` on a thread for each of the first and last axis of `over`, else of the first output."""
+    """Run `kernel` on a thread for each of the first and last axis of `over`, else of the first output.
+
+    With `lanes`, floating-point tensors are handed over as vectors of that many neighbours.
+    """
     shape = outputs[0] if over is None else over
     # detached: Warp would ask a tensor that requires a gradient for its .grad
-    arguments = [wp.from_torch(a.detach()) if isinstance(a, torch.Tensor) else a for a in (*inputs, *outputs)]
+    arguments: list[Any] = []
+    for a in (*inputs, *outputs):
+        if not isinstance(a, torch.Tensor):
+            arguments.append(a)
+        elif a.is_floating_point() and lanes is not None:
+            vector = wp.types.vector(length=lanes, dtype=wp.float32)
+            # by way of one axis, which gives axes of length 1 the strides that Warp expects
+            flat = a.detach().reshape(-1).view(*a.shape[:-1], -1, lanes)
+            arguments.append(wp.from_torch(flat, dtype=vector))
+        else:
+            arguments.append(wp.from_torch(a.detach()))
     device = wp.device_from_torch(shape.device)
     with _stream(shape.device):
-        run(kernel, shape.shape[-1], arguments, device, batch=shape.shape[0], align=align)
+        run(kernel, shape.shape[-1] // (lanes or 1), arguments, device, batch=shape.shape[0], align=align)
 
 
 def _stream(device: torch.device) -> AbstractContextManager[Any]:
@@ -374,8 +390,10 @@ def _check_textures(textures: Sequence[Texture], device: torch.device) -> None:
 
 def _window(
     windows: Sequence[int] | torch.Tensor | None, intervals: int, device: torch.device
-) -> tuple[torch.Tensor, int]:
-    """Return the window of every interval, shape (K - 1,) int32, and the number of windows.
+) -> tuple[torch.Tensor, torch.Tensor, int]:
+    """Return where runs of one window begin, the window of every interval, and the number of windows.
+
+    The first has shape (R + 1,), ends with K - 1 and is int32, as is the second of shape (K - 1,).
 
     Raises:
         ValueError: Not one index per interval, or an index below 0.
@@ -392,7 +410,9 @@ def _window(
         raise ValueError(f"windows must name one window per interval, {intervals}, got {len(indices)}")
     if min(indices) < 0:
         raise ValueError(f"windows must be >= 0, got {min(indices)}")
-    return _on_device(indices, device), max(indices) + 1
+    changes = [k for k in range(1, intervals) if indices[k] != indices[k - 1]]
+    run = (0, *changes, intervals)
+    return _on_device(run, device), _on_device(indices, device), max(indices) + 1
 
 
 @lru_cache(maxsize=64)

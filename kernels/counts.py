@@ -7,7 +7,8 @@ to Learn a Domain-Adaptive Event Simulator?", 2021):
     d >= 0:  N_on = floor(d / on),     r += N_on on
     d < 0:   N_off = floor(-d / off),  r -= N_off off
 
-all in float32, without contraction to fused multiply-adds, so that CPU, CUDA and NumPy agree to the last bit.
+all in float32, the floor being the greatest n whose product with the threshold fits into the change, without
+contraction to fused multiply-adds, so that CPU, CUDA and NumPy agree to the last bit.
 
 `floor` passes no gradient. Three surrogates stand in for it; `docs/surrogates.md` measures them:
 
@@ -28,11 +29,23 @@ wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 
 
 @wp.func
+def whole(size: float, threshold: float, inverse: float) -> float:
+    """Return the greatest whole n with n threshold <= size.
+
+    A product with the inverse is wrong by at most one, which a comparison mends: unlike a division it needs
+    no branch on a GPU.
+    """
+    n = wp.floor(size * inverse)
+    n = wp.where((n + 1.0) * threshold <= size, n + 1.0, n)
+    return wp.where(n * threshold > size, n - 1.0, n)
+
+
+@wp.func
 def crossings(change: float, on: float, off: float) -> float:
     """Return the events of a change of log intensity: ON positive, OFF negative."""
-    if change >= 0.0:
-        return wp.floor(change / on)
-    return -wp.floor(-change / off)
+    up = change >= 0.0
+    events = whole(wp.abs(change), wp.where(up, on, off), wp.where(up, 1.0 / on, 1.0 / off))
+    return wp.where(up, events, -events)
 
 
 @wp.func
@@ -47,31 +60,52 @@ def weighted(events: float, gradient_on: float, gradient_off: float) -> float:
     return wp.where(events >= 0.0, events * gradient_on, -events * gradient_off)
 
 
-@wp.kernel
-def count(
-    first: int,
-    # in
-    log: wp.array3d[float],  # (B, K, N) [log intensity]
-    threshold: wp.array3d[float],  # (B, P, N) [log intensity], OFF then ON; P = 1 shares one
-    phase: wp.array2d[float],  # (B, N) [log intensity], first sample minus first reference
-    window: wp.array[int],  # (K - 1,) window that an interval counts for
-    # out
-    counts_out: wp.array4d[float],  # (B, W, 2, N) [events], OFF then ON; zero on entry
-):
-    """Count the events of every pixel in every window, one pixel per thread."""
-    b, i = wp.tid()
-    n = first + i
-    off = threshold[b, 0, n]
-    on = threshold[b, threshold.shape[1] - 1, n]
-    reference = log[b, 0, n] - phase[b, n]
-    for k in range(1, log.shape[1]):
-        events = crossings(log[b, k, n] - reference, on, off)
-        if events != 0.0:
-            reference += height(events, on, off)
-            w = window[k - 1]
-            p = wp.where(events > 0.0, 1, 0)
-            # a plain store: += on an array element would be an atomic, and nobody else has this pixel
-            counts_out[b, w, p, n] = counts_out[b, w, p, n] + wp.abs(events)
+def _count(lanes: int) -> wp.Kernel:
+    """Return the counting kernel for `lanes` neighbouring pixels per thread."""
+    Lanes = wp.types.vector(length=lanes, dtype=wp.float32)
+
+    @wp.kernel(enable_backward=False, module="unique", module_options={"fuse_fp": False})
+    def count(
+        first: int,
+        # in
+        log: wp.array3d[Lanes],  # (B, K, N) [log intensity]
+        threshold: wp.array3d[Lanes],  # (B, P, N) [log intensity], OFF then ON; P = 1 shares one
+        phase: wp.array2d[Lanes],  # (B, N) [log intensity], first sample minus first reference
+        run: wp.array[int],  # (R + 1,) intervals at which runs of one window begin, and K - 1
+        window: wp.array[int],  # (K - 1,) window that an interval counts for
+        # out
+        counts_out: wp.array4d[Lanes],  # (B, W, 2, N) [events], OFF then ON; zero on entry
+    ):
+        """Count the events of every pixel in every window."""
+        b, i = wp.tid()
+        n = first + i
+        off = threshold[b, 0, n]
+        on = threshold[b, threshold.shape[1] - 1, n]
+        reference = log[b, 0, n] - phase[b, n]
+        for r in range(run.shape[0] - 1):
+            ons = Lanes()
+            offs = Lanes()
+            # without branches, so that several samples are on their way from memory at once
+            for k in range(run[r], run[r + 1]):
+                sample = log[b, k + 1, n]
+                for lane in range(lanes):
+                    events = crossings(sample[lane] - reference[lane], on[lane], off[lane])
+                    reference[lane] = reference[lane] + height(events, on[lane], off[lane])
+                    ons[lane] = ons[lane] + wp.max(events, 0.0)
+                    offs[lane] = offs[lane] + wp.max(-events, 0.0)
+            w = window[run[r]]
+            # plain stores: += on an array element would be an atomic, and nobody else has these pixels
+            counts_out[b, w, 0, n] = counts_out[b, w, 0, n] + offs
+            counts_out[b, w, 1, n] = counts_out[b, w, 1, n] + ons
+
+    return count
+
+
+LANES = (4, 1)
+"""Pixels per thread, widest first; the widest that divides the number of pixels is the fastest."""
+
+count = {lanes: _count(lanes) for lanes in LANES}
+"""Counting kernels by the number of pixels per thread."""
 
 
 @wp.kernel

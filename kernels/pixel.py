@@ -495,6 +495,11 @@ class _Writer:
             "theta = on", "polarity = int(1)", "if change < 0.0:", "    theta = -off", "    polarity = 0"
         )
         self.add("crossed = int(wp.floor(change / theta))", *(["passed = int(0)"] if delays else []))
+        if self.sink == "counts" and not self.of("gate"):
+            # nobody asks when they happened
+            self.add("on_count += polarity * crossed", "off_count += (1 - polarity) * crossed")
+            self.add("moved += float(crossed) * theta")
+            return
         self.add(*(["if at > stop:", "    crossed = 0"] if delays else []))
         self.add("for n in range(crossed):")
         self.depth += 1

@@ -25,11 +25,20 @@ def recursion(log: np.ndarray, on: np.ndarray, off: np.ndarray, phase: np.ndarra
     counts = []
     for sample in log[1:]:
         change = sample - memory
-        positive = np.floor(np.maximum(change, 0) / on)
-        negative = np.floor(np.maximum(-change, 0) / off)
+        positive = whole(np.maximum(change, 0), on)
+        negative = whole(np.maximum(-change, 0), off)
         memory = memory + positive * on - negative * off
         counts.append(np.stack([negative, positive]))
     return np.stack(counts)
+
+
+def whole(change: np.ndarray, threshold: np.ndarray) -> np.ndarray:
+    """Return the greatest whole n with n threshold <= change, both float32 and change >= 0."""
+    n = np.floor(change.astype(np.float64) / threshold.astype(np.float64)).astype(np.float32)
+    for _ in range(2):  # the product rounds, so the floor of the real quotient may be one off
+        n = np.where((n + 1) * threshold <= change, n + 1, n).astype(np.float32)
+        n = np.where(n * threshold > change, n - 1, n).astype(np.float32)
+    return n
 
 
 def exact(log: Sequence[int], on: int, off: int, phase: int = 0) -> list[tuple[int, int]]:
