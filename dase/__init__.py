@@ -1,23 +1,57 @@
 """A learned, physical event-camera simulator."""
 
+from importlib import import_module
+from importlib.metadata import PackageNotFoundError
 from importlib.metadata import version as _version
+from typing import TYPE_CHECKING, Any
 
-from dase.config import dump_sensor as dump_sensor
-from dase.config import load_sensor as load_sensor
-from dase.effects import EFFECTS as EFFECTS
-from dase.effects import Effect as Effect
-from dase.errors import InputError as InputError
-from dase.events import Events as Events
-from dase.images import Picture as Picture
-from dase.images import open_images as open_images
-from dase.layers import Layer as Layer
-from dase.layers import LayerScene as LayerScene
-from dase.layers import Motion as Motion
-from dase.scene import Scene as Scene
-from dase.sensor import Sensor as Sensor
-from dase.sensor import count as count
-from dase.sensor import simulate as simulate
-from dase.sensor import stream as stream
-from dase.video import VideoScene as VideoScene
+if TYPE_CHECKING:
+    from dase.config import dump_sensor as dump_sensor
+    from dase.config import load_sensor as load_sensor
+    from dase.effects import EFFECTS as EFFECTS
+    from dase.effects import Effect as Effect
+    from dase.errors import InputError as InputError
+    from dase.events import Events as Events
+    from dase.images import Picture as Picture
+    from dase.images import open_images as open_images
+    from dase.layers import Layer as Layer
+    from dase.layers import LayerScene as LayerScene
+    from dase.layers import Motion as Motion
+    from dase.scene import Scene as Scene
+    from dase.sensor import Sensor as Sensor
+    from dase.sensor import count as count
+    from dase.sensor import simulate as simulate
+    from dase.sensor import stream as stream
+    from dase.video import VideoScene as VideoScene
+    from dase.video import open_video as open_video
 
-__version__ = _version("dase")
+try:
+    __version__ = _version("dase")
+except PackageNotFoundError:  # a checkout on the path, not installed
+    __version__ = "0+unknown"
+
+_HOMES = {
+    "dase.config": ("dump_sensor", "load_sensor"),
+    "dase.effects": ("EFFECTS", "Effect"),
+    "dase.errors": ("InputError",),
+    "dase.events": ("Events",),
+    "dase.images": ("Picture", "open_images"),
+    "dase.layers": ("Layer", "LayerScene", "Motion"),
+    "dase.scene": ("Scene",),
+    "dase.sensor": ("Sensor", "count", "simulate", "stream"),
+    "dase.video": ("VideoScene", "open_video"),
+}
+"""Module to the public names it is the home of; loaded when first used, so that `dase --help` is instant."""
+
+_MODULE_OF = {name: module for module, names in _HOMES.items() for name in names}
+__all__ = list(_MODULE_OF)
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _MODULE_OF:
+        raise AttributeError(f"module 'dase' has no attribute '{name}'")
+    return getattr(import_module(_MODULE_OF[name]), name)
+
+
+def __dir__() -> list[str]:
+    return sorted([*globals(), *__all__])

@@ -195,11 +195,13 @@ class LayerScene(Scene):
         grid = np.linspace(0, self.duration, min(cells, 100_000) + 1)
         speed = np.concatenate([self.speed(part) for part in np.array_split(grid, max(len(grid) // 512, 1))])
         held = np.maximum(speed[:-1], speed[1:])
-        step = np.clip(self.travel / np.maximum(held, 1e-9), self.shortest, self.longest)
+        way = np.concatenate([[0.0], np.cumsum(np.maximum(held, 1e-9) * np.diff(grid))])
         times = [0.0]
-        per_cell = self.duration / len(held)
         while times[-1] < self.duration:
-            times.append(times[-1] + step[min(int(times[-1] / per_cell), len(held) - 1)])
+            now = times[-1]
+            # a step may span many cells, and something fast may enter the picture in a later one
+            due = np.interp(np.interp(now, grid, way) + self.travel, way, grid, right=np.inf)
+            times.append(now + float(np.clip(due - now, self.shortest, self.longest)))
         # the last step ends with the scene; a stub shorter than half the bound is not worth a sample
         if len(times) > 2 and self.duration - times[-2] < 0.5 * self.shortest:
             times.pop()

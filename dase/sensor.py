@@ -194,6 +194,11 @@ class Pixels:
         """
         slabs = -(-self.count // self.slab)
         bits = max((self.batch * self.count - 1).bit_length(), 1)
+        span = round((times[-1] - (self.begin if self.samples else times[0])) * 1e9)
+        if bits + 1 + span.bit_length() > 63:
+            raise InputError(
+                f"a chunk of {span * 1e-9:g} s with {self.batch * self.count} pixels is too long"
+            )
         while True:
             sink = pixel.Keys()
             sink.keys = wp.empty((self.batch, slabs, self._capacity), dtype=wp.int64, device=self.device)
@@ -343,6 +348,8 @@ def count(
         Shape (B, W, 2, N): OFF counts in channel 0, ON counts in channel 1.
     """
     edges = np.asarray(edges, np.float64)
+    if edges.ndim != 1 or len(edges) < 2 or not np.all(np.diff(edges) > 0):
+        raise InputError("window edges must increase, and there must be at least 2")
     array = Pixels(
         sensor, scene.width, scene.height, pixels=pixels, parameters=parameters, seed=seed, device=device
     )

@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import os
-import signal
 import time
 from collections.abc import Callable, Generator
-from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures import FIRST_COMPLETED, ProcessPoolExecutor, wait
 from contextlib import closing
 from dataclasses import asdict, dataclass, replace
 from functools import lru_cache
@@ -20,7 +18,8 @@ import tomlkit
 import dase
 from dase import images, io, regimes
 from dase.config import dump_sensor, parse_sensor
-from dase.errors import InputError
+from dase.errors import InputError, nearest
+from dase.interrupt import Deferred, deferred, ignored
 from dase.kernels import launch
 from dase.layers import LayerScene
 from dase.scene import Scene
@@ -69,6 +68,8 @@ class Job:
             value = getattr(self, name)
             if not np.isfinite(value) or value <= 0:
                 raise InputError(f"{name.replace('_', ' ')} must be a number > 0, got {value:g}")
+        if self.regime not in regimes.NAMES:
+            raise InputError(f"there is no regime '{self.regime}': {nearest(self.regime, regimes.NAMES)}")
         if self.seed < 0:
             raise InputError(f"seed must be >= 0, got {self.seed}")
 
@@ -140,8 +141,9 @@ def run(
     Pixels(parse_sensor(job.sensor, "sensor"), 1, 1, device=job.backend)
     todo = _prepare(job, out, resume)
     total = Report()
-    # closing ends the processes at once when `progress` raises
-    with closing(_work(job, out, todo, min(jobs, max(len(todo), 1)))) as reports:
+    jobs = min(jobs, max(len(todo), 1))
+    # closing ends the processes when `progress` raises
+    with deferred() as interrupt, closing(_work(job, out, todo, jobs, interrupt)) as reports:
         for report in reports:
             total = total.plus(report)
             progress(report)
@@ -161,29 +163,36 @@ def _prepare(job: Job, out: Path, resume: bool) -> list[int]:
                 f"{out} was begun with other options (see {record}); --resume needs the same ones"
             )
     out.mkdir(parents=True, exist_ok=True)
+    for stale in out.glob(".sequence_*.tmp.*"):  # of a run that was killed
+        stale.unlink()
     with io.replacing(record) as temporary:
         temporary.write_text(job.text(), "utf-8")
     return [i for i in range(job.sequences) if not job.path(out, i).exists()]
 
 
-def _work(job: Job, out: Path, todo: list[int], jobs: int) -> Generator[Report, None, None]:
+def _work(
+    job: Job, out: Path, todo: list[int], jobs: int, interrupt: Deferred
+) -> Generator[Report, None, None]:
     if jobs == 1:
         for index in todo:
-            yield make_sequence(job, out, index)
+            yield make_sequence(job, out, index, interrupt)
         return
     # compiles the kernels once, before the processes race for it
     _warm_up(job)
-    pool = ProcessPoolExecutor(jobs, mp_context=get_context("spawn"), initializer=_begin_worker)
+    context = get_context("spawn")
+    stop = context.Event()
+    pool = ProcessPoolExecutor(jobs, mp_context=context, initializer=_begin_worker, initargs=(stop,))
     try:
-        futures = [pool.submit(_in_worker, job, out, index) for index in todo]
-        for future in as_completed(futures):
-            yield future.result()
-    except BaseException:
-        for process in list((pool._processes or {}).values()):
-            if process.pid:
-                os.kill(process.pid, signal.SIGINT)
-        raise
+        with ignored():
+            left = {pool.submit(_in_worker, job, out, index) for index in todo}
+        while left:
+            done, left = wait(left, timeout=0.1, return_when=FIRST_COMPLETED)
+            for future in done:
+                yield future.result()
+            interrupt.check()
     finally:
+        if left:
+            stop.set()
         pool.shutdown(cancel_futures=True)
 
 
@@ -199,29 +208,19 @@ def _warm_up(job: Job) -> None:
     array.thresholds()
 
 
-_busy = False
-
-
-def _begin_worker() -> None:
+def _begin_worker(stop: Any) -> None:
+    global _stop
     launch.set_threads(1)
+    _stop = Deferred(stop)
 
-    def interrupt(number: int, frame: Any) -> None:
-        global _busy
-        # a second signal must not break off the clean-up that the first began
-        if _busy:
-            _busy = False
-            raise KeyboardInterrupt
 
-    signal.signal(signal.SIGINT, interrupt)
+_stop: Deferred | None = None
+"""In a worker process: whether the others want it to end."""
 
 
 def _in_worker(job: Job, out: Path, index: int) -> Report:
-    global _busy
-    _busy = True
-    try:
-        return make_sequence(job, out, index)
-    finally:
-        _busy = False
+    assert _stop is not None
+    return make_sequence(job, out, index, _stop)
 
 
 @lru_cache(maxsize=1)
@@ -237,8 +236,8 @@ def make_scene(job: Job, index: int) -> LayerScene:
     )
 
 
-def make_sequence(job: Job, out: Path, index: int) -> Report:
-    """Simulate one sequence and write its file."""
+def make_sequence(job: Job, out: Path, index: int, interrupt: Deferred) -> Report:
+    """Simulate one sequence and write its file; an interrupt leaves nothing and raises KeyboardInterrupt."""
     begin = time.perf_counter()
     sensor = parse_sensor(job.sensor, "sensor")
     scene = make_scene(job, index)
@@ -247,7 +246,9 @@ def make_sequence(job: Job, out: Path, index: int) -> Report:
     with io.create(job.path(out, index)) as writer:
         writer.configuration(job.text() + f"\n[sequence]\nindex = {index}\nsensor_seed = {seed}\n")
         frame_times = np.arange(0, scene.duration, 1 / job.frame_rate)
-        report = _record(scene, sensor, writer, frame_times, seed, job.backend)
+        report = _record(
+            scene, sensor, writer, frame_times, seed, job.backend, lambda done: interrupt.check()
+        )
     return replace(report, seconds=time.perf_counter() - begin)
 
 
@@ -258,7 +259,7 @@ def _record(
     frame_times: np.ndarray,
     seed: int,
     device: str,
-    progress: Callable[[Report], None] = lambda report: None,
+    progress: Callable[[Report], None],
 ) -> Report:
     """Write thresholds, frames, flow and events of a scene, in order of time."""
     array = Pixels(sensor, scene.width, scene.height, seed=seed, device=device)
@@ -313,7 +314,12 @@ def record_scene(
     # the first sample of each frame period; a slack of 1e-6 of it keeps equal rates equal
     period = np.floor((times - times[0]) * frame_rate + 1e-6)
     frame_times = times[np.concatenate([[True], np.diff(period) > 0])]
-    with io.create(path) as writer:
+    with deferred() as interrupt, io.create(path) as writer:
+
+        def advance(done: Report) -> None:
+            interrupt.check()
+            progress(done)
+
         writer.configuration(dump_sensor(sensor) + f'\n[run]\ndase = "{dase.__version__}"\nseed = {seed}\n')
-        report = _record(scene, sensor, writer, frame_times, seed, device, progress)
+        report = _record(scene, sensor, writer, frame_times, seed, device, advance)
     return replace(report, seconds=time.perf_counter() - begin)

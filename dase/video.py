@@ -31,8 +31,8 @@ class VideoScene(Scene):
             raise InputError(f"video: frames must have shape (F, height, width), got {self._frames.shape}")
         if self._times.shape != (len(self._frames),):
             raise InputError(f"video: {len(self._frames)} frames need as many times, got {self._times.shape}")
-        if np.any(np.diff(self._times) <= 0):
-            raise InputError("video: frame times must increase")
+        if not np.all(np.isfinite(self._times)) or not np.all(np.diff(self._times) > 0):
+            raise InputError("video: frame times must be finite and increase")
         if isinstance(self._frames, np.ndarray) and not (
             np.all(np.isfinite(self._frames)) and self._frames.min() >= 0
         ):
@@ -48,7 +48,8 @@ class VideoScene(Scene):
         """Return the stored intensities of these pixels."""
         source = pixel.Frames()
         flat = self._at(times).reshape(len(times), -1)
-        values = flat if len(pixels) == flat.shape[1] else flat[:, pixels]
+        every = np.array_equal(pixels, np.arange(flat.shape[1]))
+        values = flat if every else flat[:, pixels]
         source.values = wp.array(np.ascontiguousarray(values, np.float32), dtype=float, device=device)
         return "frames", source
 
@@ -84,6 +85,7 @@ class FrameReader:
         # the chunk before and the one asked for may overlap by the frames that are stored
         self._kept: dict[int, NDArray[np.float32]] = {}
         self._next = 0
+        self.shape: tuple[int, ...] = (self._count,)
         self.shape = (self._count, *self[np.array([0])].shape[1:])
         self.ndim = 3
 
@@ -94,7 +96,7 @@ class FrameReader:
         """Return the frames of increasing indices, intensity in [0, 1], shape (K, height, width)."""
         wanted = [int(i) for i in index]
         if self._files is not None:
-            return np.stack([self._grey(read_grey(self._files[i])) for i in wanted])
+            return np.stack([self._grey(read_grey(self._files[i]), self._files[i]) for i in wanted])
         out = {i: self._kept[i] for i in wanted if i in self._kept}
         missing = [i for i in wanted if i not in out]
         if missing and missing[0] < self._next:
@@ -128,11 +130,16 @@ class FrameReader:
         if not good:
             raise InputError(f"video {self._path}: frame {index} cannot be decoded")
         self._next = index + 1
-        return self._grey(to_grey(frame)[0])
+        return self._grey(to_grey(frame)[0], self._path)
 
-    def _grey(self, grey: NDArray[np.float32]) -> NDArray[np.float32]:
+    def _grey(self, grey: NDArray[np.float32], path: Path) -> NDArray[np.float32]:
         if self._size is not None:
             grey = cv2.resize(grey, self._size, interpolation=cv2.INTER_AREA)
+        want = self.shape[1:] or grey.shape
+        if grey.shape != want:
+            got = grey.shape
+            sizes = f"{got[1]}x{got[0]}, the frames before {want[1]}x{want[0]}"
+            raise InputError(f"video: all frames must have one size, {path} has {sizes}")
         return grey
 
 

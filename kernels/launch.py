@@ -7,6 +7,8 @@ thread pool works off. Every kernel that goes through `run` takes the start of i
 from __future__ import annotations
 
 import os
+import sys
+import tempfile
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
@@ -42,7 +44,7 @@ def device(name: str) -> wp.Device:
     Raises:
         ValueError: There is no such device on this machine.
     """
-    wp.init()
+    _init()
     if name.startswith("cuda") and not wp.is_cuda_available():
         raise ValueError(f"backend '{name}' needs an NVIDIA GPU with a driver, none was found; use 'cpu'")
     try:
@@ -50,6 +52,26 @@ def device(name: str) -> wp.Device:
     except Exception as error:
         names = ", ".join(d.alias for d in wp.get_devices())
         raise ValueError(f"backend '{name}' does not exist, here there are: {names}") from error
+
+
+def _init() -> None:
+    """Start Warp without its line on standard error that a machine has no NVIDIA driver."""
+    if wp._src.context.runtime is not None:
+        return
+    # the line comes from native code, so only the file descriptor can be held back
+    sys.stderr.flush()
+    kept = os.dup(2)
+    with tempfile.TemporaryFile() as said:
+        os.dup2(said.fileno(), 2)
+        try:
+            wp.init()
+        finally:
+            os.dup2(kept, 2)
+            os.close(kept)
+        said.seek(0)
+        for line in said.read().decode(errors="replace").splitlines():
+            if "Could not find or load the NVIDIA CUDA driver" not in line:
+                print(line, file=sys.stderr)
 
 
 def run(

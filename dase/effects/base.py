@@ -9,6 +9,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any, ClassVar
 
+import numpy as np
+
 from dase.errors import InputError, nearest
 from dase.kernels import pixel
 
@@ -77,7 +79,7 @@ class Effect:
         for p in self.parameters():
             value = getattr(self, p.name)
             where = f"{self.name}.{p.name}"
-            if isinstance(value, bool) or not isinstance(value, int | float):
+            if isinstance(value, bool) or not isinstance(value, int | float | np.number):
                 raise InputError(f"{where} must be a number [{p.unit}], got {value!r}")
             low, high = p.bounds
             if math.isnan(value) or not low <= value <= high:

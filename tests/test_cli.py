@@ -1,0 +1,193 @@
+"""The command line as a user meets it: what is wrong is one sentence, and nothing is left half-written."""
+
+from __future__ import annotations
+
+import os
+import re
+import resource
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from dase import io
+
+SMALL = ("--size", "32x24", "--duration", "0.1", "--sequences", "1", "--jobs", "1", "--regime", "slow")
+
+
+def dase(*arguments: object, **options) -> subprocess.CompletedProcess[str]:
+    command = [sys.executable, "-c", "from dase.cli import main; main()", *map(str, arguments)]
+    return subprocess.run(command, capture_output=True, text=True, timeout=300, **options)
+
+
+def one_sentence(done: subprocess.CompletedProcess[str], code: int = 2) -> str:
+    assert done.returncode == code, done.stderr
+    assert "Traceback" not in done.stderr
+    said = [line for line in done.stderr.splitlines() if not re.match(r"Usage:|Try |$", line)]
+    assert len(said) == 1, done.stderr
+    return said[0]
+
+
+def toml(tmp_path: Path, text: str) -> Path:
+    path = tmp_path / "sensor.toml"
+    path.write_text(text)
+    return path
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (("--images", "nowhere"), "folder 'nowhere' is missing"),
+        (("--size", "0x24"), "0x24"),
+        (("--size", "big"), "WxH"),
+        (("--sequences", "-3"), "sequences must be >= 1, got -3"),
+        (("--duration", "nan"), "duration must be a number > 0, got nan"),
+        (("--duration", "0"), "duration must be a number > 0, got 0"),
+        (("--frame-rate", "-1"), "frame rate must be a number > 0, got -1"),
+        (("--seed", "-1"), "seed must be >= 0, got -1"),
+        (("--jobs", "0"), "jobs must be >= 1, got 0"),
+        (("--regime", "fats"), "did you mean 'fast'?"),
+        (("--sensor", "davis345"), "did you mean 'davis346'?"),
+        (("--sensor", "missing.toml"), "missing.toml does not exist"),
+        (("--backend", "gpu"), "backend 'gpu' does not exist"),
+        (("--fps", "30"), "--fps goes with --video"),
+        (("--video", "nowhere.mp4"), "nowhere.mp4 does not exist"),
+    ],
+)
+def test_wrong_option(options, message, tmp_path):
+    out = tmp_path / "out"
+    assert message in one_sentence(dase("synth", out, *SMALL, *options))
+    assert not out.exists() or not list(out.glob("*"))
+
+
+def test_cuda_without_a_gpu(tmp_path):
+    import warp as wp
+
+    if wp.is_cuda_available():
+        pytest.skip("needs a machine without a GPU")
+    assert "needs an NVIDIA GPU" in one_sentence(dase("synth", tmp_path / "out", *SMALL, "--backend", "cuda"))
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("[threshold]\non = 0.0", "threshold.on must lie in [0.01, 10] log intensity, got 0"),
+        ("[threshold]\non = -0.2", "threshold.on must lie in [0.01, 10] log intensity, got -0.2"),
+        ("[threshold]\nonn = 0.2", "no parameter 'onn': did you mean 'on'?"),
+        ("[threshold]\n[leek]\nrate = 1.0", "no effect 'leek': did you mean 'leak'?"),
+        ("[threshold]\n[leak]\nrate = nan", "leak.rate must lie in [0, 100000] Hz, got nan"),
+        (
+            "[threshold]\n[refractory]\nmode = 'lose'",
+            "refractory.mode must be one of drop, delay, got 'lose'",
+        ),
+        ("[leak]\nrate = 1.0", "needs the effect 'threshold'"),
+        ("size = [0, 3]\n[threshold]", "size must be at least 1x1, got 0x3"),
+        ("not toml at all", "is not TOML"),
+    ],
+)
+def test_wrong_sensor(text, message, tmp_path):
+    said = one_sentence(dase("synth", tmp_path / "out", *SMALL, "--sensor", toml(tmp_path, text)))
+    assert message in said
+    assert "sensor.toml" in said
+
+
+def test_wrong_pictures(tmp_path):
+    folder = tmp_path / "pictures"
+    folder.mkdir()
+    assert "found none" in one_sentence(dase("synth", tmp_path / "out", *SMALL, "--images", folder))
+    (folder / "broken.png").write_bytes(b"\x89PNG\r\n\x1a\n but no picture")
+    said = one_sentence(dase("synth", tmp_path / "out", *SMALL, "--images", folder))
+    assert "broken.png" in said
+    assert not list((tmp_path / "out").glob("*sequence*"))
+
+
+def test_synth_then_show(tmp_path):
+    out = tmp_path / "out"
+    done = dase("synth", out, *SMALL)
+    assert done.returncode == 0, done.stderr
+    assert re.search(r"[\d,]+ events in 1 sequence, ", done.stdout)
+    assert "time samples rendered" in done.stdout
+    sequence = io.read(out / "sequence_00000.h5")
+    assert sequence.frames is not None
+    assert len(sequence.frames) == 6
+    assert sequence.configuration is not None
+    assert 'regime = "slow"' in sequence.configuration
+    shown = dase("show", out / "sequence_00000.h5")
+    assert shown.returncode == 0, shown.stderr
+    assert cv2.imread(str(out / "sequence_00000.png")) is not None
+    # a second run must not overwrite the first
+    assert "--resume" in one_sentence(dase("synth", out, *SMALL))
+    assert "other options" in one_sentence(dase("synth", out, *SMALL, "--resume", "--seed", "9"))
+
+
+def test_video(tmp_path):
+    folder = tmp_path / "frames"
+    folder.mkdir()
+    for i in range(20):
+        picture = np.full((24, 32), 60, np.uint8)
+        picture[:, i : i + 8] = 220
+        cv2.imwrite(str(folder / f"{i:03d}.png"), picture)
+    assert "give --fps" in one_sentence(dase("synth", tmp_path / "v.npz", "--video", folder))
+    done = dase("synth", tmp_path / "v.npz", "--video", folder, "--fps", "100", "--sensor", "ideal")
+    assert done.returncode == 0, done.stderr
+    events = io.read(tmp_path / "v.npz").events
+    assert (events.width, events.height) == (32, 24)
+    # the leading edge of the bar is an ON edge in front of it, the trailing edge OFF
+    steps = np.floor(np.log((220 / 255 + 1e-3) / (60 / 255 + 1e-3)) / 0.2)
+    assert np.count_nonzero(events.p) == 24 * steps * 19
+    assert np.count_nonzero(~events.p) == 24 * steps * 19
+
+
+def test_full_disk(tmp_path):
+    def small_disk():
+        signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+        resource.setrlimit(resource.RLIMIT_FSIZE, (20_000, 20_000))
+
+    done = dase("synth", tmp_path / "out", *SMALL, "--images", "builtin", preexec_fn=small_disk)
+    assert one_sentence(done)
+    assert [p.name for p in (tmp_path / "out").iterdir()] == ["synth.toml"]
+
+
+@pytest.mark.parametrize("jobs", [1, 2])
+def test_interrupt_then_resume(jobs, tmp_path):
+    out, whole = tmp_path / "out", tmp_path / "whole"
+    options = ("--size", "64x48", "--duration", "0.3", "--sequences", "6", "--jobs", jobs, "--regime", "slow")
+    command = [
+        sys.executable,
+        "-c",
+        "from dase.cli import main; main()",
+        "synth",
+        str(out),
+        *map(str, options),
+    ]
+    process = subprocess.Popen(command, stderr=subprocess.PIPE, stdout=subprocess.DEVNULL, text=True)
+    deadline = time.monotonic() + 120
+    while not list(out.glob("sequence_*")) and time.monotonic() < deadline:
+        time.sleep(0.01)
+    os.kill(process.pid, signal.SIGINT)
+    _, said = process.communicate(timeout=120)
+    left = sorted(p.name for p in out.iterdir())
+    assert process.returncode in (0, 130), said  # it may just have finished
+    assert "Traceback" not in said
+    assert all(name == "synth.toml" or re.fullmatch(r"sequence_\d{5}\.h5", name) for name in left)
+    done = dase("synth", out, *options, "--resume")
+    assert done.returncode == 0, done.stderr
+    assert dase("synth", whole, *options[:-4], "--jobs", 3 - jobs, "--regime", "slow").returncode == 0
+    for path in sorted(whole.iterdir()):
+        assert (out / path.name).read_bytes() == path.read_bytes(), path.name
+
+
+def test_effects():
+    listed = dase("effects", "list")
+    assert listed.returncode == 0
+    assert len(listed.stdout.splitlines()) >= 6
+    shown = dase("effects", "show", "leak")
+    assert "Hz" in shown.stdout
+    assert "plausible" in shown.stdout
+    assert "Source: " in shown.stdout
+    assert "did you mean 'leak'?" in one_sentence(dase("effects", "show", "leek"))
