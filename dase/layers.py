@@ -218,7 +218,7 @@ class LayerScene(Scene):
         # only these samples are looked at, so their outlines bound the layer; the pixel is for float32
         box = np.concatenate([quad.min((0, 2)) - 1, quad.max((0, 2)) + 1], -1)
         layers = kernels.Layers()
-        layers.texels, layers.start, layers.size = self._uploaded[device.alias]
+        layers.grey, layers.texels, layers.start, layers.size = self._uploaded[device.alias]
         layers.place = wp.array(
             np.linalg.inv(m)[..., :2, :].astype(np.float32), dtype=kernels.Affine, device=device
         )

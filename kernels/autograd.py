@@ -307,6 +307,7 @@ def _layers(texels: torch.Tensor, place: torch.Tensor, sizes: tuple[tuple[int, i
     starts = (0, *accumulate(w * h for w, h in sizes))
     corner = place.new_full((len(sizes), 2), torch.inf)
     layers = _scene.Layers()
+    layers.grey = wp.from_torch(texels.detach()[: starts[1], 0].contiguous())
     layers.texels = wp.from_torch(texels.detach(), dtype=wp.vec2)
     layers.start = wp.from_torch(_on_device(starts[:-1], place.device))
     flat = _on_device(tuple(side for size in sizes for side in size), place.device)

@@ -23,6 +23,7 @@ PerLayer = wp.types.vector(length=MAX_LAYERS, dtype=wp.float32)
 class Layers:
     """Textures and motion of all layers, L layers at K time samples."""
 
+    grey: wp.array[float]  # intensities of layer 0, which most looks go to, once more on their own
     texels: wp.array[wp.vec2]  # all textures, row by row: (intensity · alpha, alpha)
     start: wp.array[int]  # (L,) first texel of each layer
     size: wp.array[wp.vec2i]  # (L,) width, height [texel]
@@ -71,10 +72,12 @@ def background_at(layers: Layers, ground: Ground, k: int, x: float, y: float) ->
     iv = wp.min(int(v), ground.corner[1])
     fu = u - float(iu)
     fv = v - float(iv)
-    i = iv * ground.width + iu  # layer 0 begins at texel 0
-    top = layers.texels[i][0] + fu * (layers.texels[i + ground.step[0]][0] - layers.texels[i][0])
+    i = iv * ground.width + iu
+    top = layers.grey[i]
+    top += fu * (layers.grey[i + ground.step[0]] - top)
     i += ground.step[1]
-    bottom = layers.texels[i][0] + fu * (layers.texels[i + ground.step[0]][0] - layers.texels[i][0])
+    bottom = layers.grey[i]
+    bottom += fu * (layers.grey[i + ground.step[0]] - bottom)
     return top + fv * (bottom - top)
 
 
@@ -286,7 +289,7 @@ def render_gradient(
 
 def upload(
     textures: list[tuple[np.ndarray, np.ndarray | None]], device: wp.Device
-) -> tuple[wp.array, wp.array, wp.array]:
+) -> tuple[wp.array, wp.array, wp.array, wp.array]:
     """Move textures to `device`.
 
     Args:
@@ -294,7 +297,7 @@ def upload(
         device: Where to.
 
     Returns:
-        texels, start and size of `Layers`.
+        grey, texels, start and size of `Layers`.
     """
     flat, start, size, total = [], [], [], 0
     for grey, alpha in textures:
@@ -304,6 +307,7 @@ def upload(
         size.append(grey.shape[::-1])
         total += grey.size
     return (
+        wp.array(np.ascontiguousarray(flat[0][:, 0]), dtype=float, device=device),
         wp.array(np.concatenate(flat), dtype=wp.vec2, device=device),
         wp.array(start, dtype=int, device=device),
         wp.array(np.array(size), dtype=wp.vec2i, device=device),
