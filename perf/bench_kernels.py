@@ -19,7 +19,7 @@ import warp as wp
 
 from dase.config import load_sensor
 from dase.images import open_images
-from dase.kernels import launch, pixel
+from dase.kernels import counts, launch, pixel
 from dase.layers import Layer, LayerScene, Motion
 from dase.scene import Scene
 from dase.sensor import Pixels, Sensor
@@ -60,15 +60,23 @@ def texture(first: int, width: int, logarithm: int, out: wp.array2d[float]):
 
 
 def median_time(work: Callable[[], object], repeats: int, device: wp.Device) -> float:
-    """Return the median duration of `work` [s] after two runs that do not count."""
+    """Return the median duration of `work` [s] after two runs that do not count; on CUDA by device events."""
     took = []
     for n in range(repeats + 2):
         wp.synchronize_device(device)
         begin = time.perf_counter()
-        work()
-        wp.synchronize_device(device)
+        if device.is_cuda:
+            first, last = (wp.Event(device, enable_timing=True) for _ in range(2))
+            wp.record_event(first)
+            work()
+            wp.record_event(last)
+            wp.synchronize_event(last)
+            seconds = wp.get_event_elapsed_time(first, last) * 1e-3
+        else:
+            work()
+            seconds = time.perf_counter() - begin
         if n >= 2:
-            took.append(time.perf_counter() - begin)
+            took.append(seconds)
     return statistics.median(took)
 
 
@@ -133,6 +141,36 @@ def bench(
     return took, float(events[0].numpy().sum()) if sink == "counts" else events[0]
 
 
+def bench_counts(scene: Stored, repeats: int, device: wp.Device) -> tuple[float, float]:
+    """Return seconds and events of the counting kernel that training uses, four pixels per thread."""
+    lanes = 4
+    vector = wp.types.vector(length=lanes, dtype=wp.float32)
+    samples, pixels = scene.data.values.shape
+
+    def viewed(array: wp.array, *shape: int) -> wp.array:
+        return wp.array(ptr=array.ptr, dtype=vector, shape=shape, device=device)
+
+    threshold = wp.full((1, 1, pixels), 0.2, dtype=float, device=device)
+    phase = wp.zeros((1, pixels), dtype=float, device=device)
+    out = wp.zeros((1, 1, 2, pixels), dtype=float, device=device)
+    arguments = [
+        viewed(scene.data.values, 1, samples, pixels // lanes),
+        viewed(threshold, 1, 1, pixels // lanes),
+        viewed(phase, 1, pixels // lanes),
+        wp.array([0, samples - 1], dtype=int, device=device),
+        wp.zeros(samples - 1, dtype=int, device=device),
+        viewed(out, 1, 1, 2, pixels // lanes),
+    ]
+
+    def work() -> None:
+        launch.run(counts.count[lanes], pixels // lanes, arguments, device)
+
+    took = median_time(work, repeats, device)
+    out.zero_()
+    work()
+    return took, float(out.numpy().sum())
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--device", default="cpu")
@@ -152,8 +190,13 @@ def main() -> None:
     copy = copy_bandwidth(width * height * options.samples, options.repeats, device)
     print(f"copy: {copy / 1e9:.0f} GB/s read plus written\n")
     print("| benchmark | ms | Gsample/s | Mevents/s | samples read, share of copy |\n|---|---|---|---|---|")
-    for name, scene, sensor, sink in cases(width, height, options.samples, device):
-        took, events = bench(scene, sensor, sink, options.samples, options.repeats, device)
+    todo = cases(width, height, options.samples, device)
+    todo.insert(0, ("count stored log frames, training kernel", todo[0][1], None, ""))
+    for name, scene, sensor, sink in todo:
+        if sensor is None:
+            took, events = bench_counts(scene, options.repeats, device)
+        else:
+            took, events = bench(scene, sensor, sink, options.samples, options.repeats, device)
         samples = width * height * options.samples
         share = f"{4 * samples / took / copy:.0%}" if isinstance(scene, Stored) else "-"
         rates = f"{samples / took / 1e9:.2f} | {events / took / 1e6:.0f} | {share}"
