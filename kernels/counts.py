@@ -41,10 +41,10 @@ def whole(size: float, threshold: float, inverse: float) -> float:
 
 
 @wp.func
-def crossings(change: float, on: float, off: float) -> float:
-    """Return the events of a change of log intensity: ON positive, OFF negative."""
+def crossings(change: float, on: float, off: float, per_on: float, per_off: float) -> float:
+    """Return the events of a change of log intensity, ON positive, OFF negative; `per_` are inverses."""
     up = change >= 0.0
-    events = whole(wp.abs(change), wp.where(up, on, off), wp.where(up, 1.0 / on, 1.0 / off))
+    events = whole(wp.abs(change), wp.where(up, on, off), wp.where(up, per_on, per_off))
     return wp.where(up, events, -events)
 
 
@@ -82,6 +82,12 @@ def _count(lanes: int) -> wp.Kernel:
         off = threshold[b, 0, n]
         on = threshold[b, threshold.shape[1] - 1, n]
         reference = log[b, 0, n] - phase[b, n]
+        # out of the loop: on a GPU a division has a branch, which would keep samples from overlapping
+        per_on = Lanes()
+        per_off = Lanes()
+        for lane in range(lanes):
+            per_on[lane] = 1.0 / on[lane]
+            per_off[lane] = 1.0 / off[lane]
         for r in range(run.shape[0] - 1):
             ons = Lanes()
             offs = Lanes()
@@ -89,7 +95,9 @@ def _count(lanes: int) -> wp.Kernel:
             for k in range(run[r], run[r + 1]):
                 sample = log[b, k + 1, n]
                 for lane in range(lanes):
-                    events = crossings(sample[lane] - reference[lane], on[lane], off[lane])
+                    events = crossings(
+                        sample[lane] - reference[lane], on[lane], off[lane], per_on[lane], per_off[lane]
+                    )
                     reference[lane] = reference[lane] + height(events, on[lane], off[lane])
                     ons[lane] = ons[lane] + wp.max(events, 0.0)
                     offs[lane] = offs[lane] + wp.max(-events, 0.0)
@@ -132,7 +140,7 @@ def interval_gradient(
     on = threshold[b, last, n]
     reference = log[b, 0, n] - phase[b, n]
     for k in range(1, log.shape[1]):
-        events = crossings(log[b, k, n] - reference, on, off)
+        events = crossings(log[b, k, n] - reference, on, off, 1.0 / on, 1.0 / off)
         if events != 0.0:
             reference += height(events, on, off)
             p = wp.where(events > 0.0, 1, 0)
@@ -184,13 +192,15 @@ def difference(
     low: wp.vec3f,  # ON, OFF, phase [log intensity]
 ) -> float:
     """Return the objective at `high` minus that at `low`, linear in the counts by `gradient`."""
+    high_inverse = wp.vec2(1.0 / high[0], 1.0 / high[1])
+    low_inverse = wp.vec2(1.0 / low[0], 1.0 / low[1])
     high_reference = log[b, 0, n] - high[2]
     low_reference = log[b, 0, n] - low[2]
     change = float(0.0)
     for k in range(1, log.shape[1]):
         sample = log[b, k, n]
-        high_events = crossings(sample - high_reference, high[0], high[1])
-        low_events = crossings(sample - low_reference, low[0], low[1])
+        high_events = crossings(sample - high_reference, high[0], high[1], high_inverse[0], high_inverse[1])
+        low_events = crossings(sample - low_reference, low[0], low[1], low_inverse[0], low_inverse[1])
         if high_events != 0.0 or low_events != 0.0:
             high_reference += height(high_events, high[0], high[1])
             low_reference += height(low_events, low[0], low[1])

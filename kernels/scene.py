@@ -103,9 +103,31 @@ def foreground_at(layers: Layers, layer: int, k: int, x: float, y: float) -> wp.
     iv = int(wp.floor(v))
     fu = u - float(iu)
     fv = v - float(iv)
-    top = (1.0 - fu) * texel(layers, layer, iu, iv) + fu * texel(layers, layer, iu + 1, iv)
-    bottom = (1.0 - fu) * texel(layers, layer, iu, iv + 1) + fu * texel(layers, layer, iu + 1, iv + 1)
-    return (1.0 - fv) * top + fv * bottom
+    top = wp.vec2()
+    bottom = wp.vec2()
+    if iu >= 0 and iv >= 0 and iu + 1 < size[0] and iv + 1 < size[1]:
+        i = layers.start[layer] + iv * size[0] + iu
+        top = layers.texels[i] + fu * (layers.texels[i + 1] - layers.texels[i])
+        i += size[0]
+        bottom = layers.texels[i] + fu * (layers.texels[i + 1] - layers.texels[i])
+    else:
+        top = (1.0 - fu) * texel(layers, layer, iu, iv) + fu * texel(layers, layer, iu + 1, iv)
+        bottom = (1.0 - fu) * texel(layers, layer, iu, iv + 1) + fu * texel(layers, layer, iu + 1, iv + 1)
+    return top + fv * (bottom - top)
+
+
+@wp.func_native(
+    """
+#ifdef __CUDA_ARCH__
+    return 31 - __clz(bits);
+#else
+    return 31 - __builtin_clz((unsigned int)bits);
+#endif
+"""
+)
+def highest_bit(bits: int) -> int:
+    """Place of the highest set bit; there must be one."""
+    ...
 
 
 @wp.func
@@ -124,15 +146,15 @@ def layer_intensity(layers: Layers, ground: Ground, near: int, k: int, x: float,
     """Intensity of a pixel at sample k, composited front to back."""
     light = float(0.0)
     through = float(1.0)
-    if near != 0:
-        for back in range(1, layers.count):
-            layer = layers.count - back
-            if ((near >> layer) & 1) != 0:
-                front = foreground_at(layers, layer, k, x, y)
-                light += through * front[0]
-                through *= 1.0 - front[1]
-                if through == 0.0:
-                    return light
+    left = int(near)
+    while left != 0:
+        layer = highest_bit(left)
+        left ^= 1 << layer
+        front = foreground_at(layers, layer, k, x, y)
+        light += through * front[0]
+        through *= 1.0 - front[1]
+        if through == 0.0:
+            return light
     return light + through * background_at(layers, ground, k, x, y)
 
 
