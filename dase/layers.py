@@ -228,7 +228,7 @@ class LayerScene(Scene):
 
     def source(self, times: NDArray[np.float64], pixels: NDArray[np.int32], device: Any) -> tuple[str, Any]:
         """Return the layers themselves: the pixel kernel warps, so no frame is ever stored."""
-        return "layers", self.arrays(times, device)
+        return "background" if len(self.layers) == 1 else "layers", self.arrays(times, device)
 
     def frames(self, times: NDArray[np.float64], device: str = "cpu") -> NDArray[np.float32]:
         """Return intensities in [0, 1] at `times` [s], shape (K, height, width)."""

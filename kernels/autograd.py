@@ -165,8 +165,11 @@ class _Count(torch.autograd.Function):
         log, threshold, phase = (t.float().contiguous() for t in (log, threshold, phase))
         batch, _, pixels = log.shape
         counts = torch.zeros(batch, windows, 2, pixels, device=log.device)
-        lanes = next(n for n in _counts.LANES if pixels % n == 0)
-        _launch(_counts.count[lanes], [log, threshold, phase, run, window], [counts], lanes=lanes)
+        # the wide loads want addresses that are multiples of 16 bytes
+        aligned = log.data_ptr() % 16 == 0
+        lanes = next(n for n in _counts.LANES if n == 1 or (pixels % n == 0 and aligned))
+        kernel = _counts.count[lanes, threshold.shape[1] == 1]
+        _launch(kernel, [log, threshold, phase, run, window], [counts], lanes=lanes)
         ctx.save_for_backward(log, threshold, phase, window, counts)
         ctx.surrogate, ctx.step = surrogate, step
         return counts
