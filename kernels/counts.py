@@ -103,6 +103,7 @@ def _count(lanes: int, shared: bool) -> wp.Kernel:
         phase: wp.array2d[Lanes],  # (B, N) [log intensity], first sample minus first reference
         run: wp.array[int],  # (R + 1,) intervals at which runs of one window begin, and K - 1
         window: wp.array[int],  # (K - 1,) window that an interval counts for
+        once: bool,  # whether every window has one run
         # out
         counts_out: wp.array4d[Lanes],  # (B, W, 2, N) [events], OFF then ON; zero on entry
     ):
@@ -139,9 +140,14 @@ def _count(lanes: int, shared: bool) -> wp.Kernel:
                     net[lane] = net[lane] + events
                     reference[lane] = reference[lane] + events * theta
             w = window[run[r]]
-            # plain stores: += on an array element would be an atomic, and nobody else has these pixels
-            counts_out[b, w, 0, n] = counts_out[b, w, 0, n] + 0.5 * (both - net)
-            counts_out[b, w, 1, n] = counts_out[b, w, 1, n] + 0.5 * (both + net)
+            offs = 0.5 * (both - net)
+            ons = 0.5 * (both + net)
+            if not once:
+                # plain loads and stores: nobody else has these pixels, += would be an atomic
+                offs += counts_out[b, w, 0, n]
+                ons += counts_out[b, w, 1, n]
+            counts_out[b, w, 0, n] = offs
+            counts_out[b, w, 1, n] = ons
 
     return count
 

@@ -165,6 +165,7 @@ def bench_counts(scene: Stored, repeats: int, device: wp.Device) -> tuple[float,
         viewed(phase, 1, pixels // lanes),
         wp.array([0, samples - 1], dtype=int, device=device),
         wp.zeros(samples - 1, dtype=int, device=device),
+        True,
         viewed(out, 1, 1, 2, pixels // lanes),
     ]
 
