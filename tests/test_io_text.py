@@ -82,7 +82,7 @@ def test_what_a_written_text_looks_like(tmp_path):
 @pytest.mark.parametrize(
     ("line", "match"),
     [
-        ("0.5 3 4", r"line 4 .*'0\.5 3 4'"),
+        ("0.5 3 4", "line 4 "),
         ("0.5 3 4 1 9 9", "line 4"),
         ("0.5 3 4 2", "line 4"),
         ("0.5 -3 4 1", "line 4"),
@@ -111,7 +111,7 @@ def test_texts_that_are_no_events(tmp_path):
     for content in ("hello world\n", "1 2\n3 4\n", "", "# only\n# comments\n", "x y\n1 2 3 4 5 6\n"):
         with pytest.raises(InputError, match="holds no events"):
             read(tmp_path, content)
-    with pytest.raises(InputError, match="longer than 200 bytes|no events"):
+    with pytest.raises(InputError, match=r"longer than 200 bytes|no events"):
         read(tmp_path, b"0.5 1 1 1\n" + b"1" * (3 << 20))
 
 
