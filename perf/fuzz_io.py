@@ -28,6 +28,8 @@ from dase import io
 from dase.errors import InputError
 
 SLOW = 5.0  # [s] for one file
+HUNG = 60.0  # [s] without a sign of life
+STEP = 100  # files between two signs of life
 MEMORY = 200.0  # [MB] over what the process needed before
 
 
@@ -62,6 +64,7 @@ def run(name: str, files: int, seed: int, keep: Path, results) -> None:
         before, good, slowest = peak(), 0, 0.0
         inner = [sample] if sample.is_file() else sorted(p for p in sample.iterdir() if p.is_file())
         contents = [path.read_bytes() for path in inner]
+        results.put((name, "files", inner))
         for k in range(files):
             which = int(rng.integers(0, len(inner)))
             inner[which].write_bytes(reference_io.mutated(contents[which], rng))
@@ -77,7 +80,7 @@ def run(name: str, files: int, seed: int, keep: Path, results) -> None:
             if spent > max(slowest, SLOW):
                 results.put((name, "error", f"file {k} took {spent:.1f} s"))
             slowest = max(slowest, spent)
-            if k % 500 == 499 or k == files - 1:
+            if k % STEP == STEP - 1 or k == files - 1:
                 results.put((name, "done", (k + 1, good, slowest, peak() - before)))
     finally:
         shutil.rmtree(folder)
@@ -97,21 +100,31 @@ def main() -> int:
         context = multiprocessing.get_context("spawn")
         results = context.SimpleQueue()
         arguments = (name, options.files, options.seed, options.keep, results)
-        failed += watch(context.Process(target=run, args=arguments), name, options.files, results)
+        process = context.Process(target=run, args=arguments)
+        failed += watch(process, name, options.files, options.keep, results)
     return failed
 
 
-def watch(process, name: str, files: int, results) -> int:
+def watch(process, name: str, files: int, keep: Path, results) -> int:
     """Start a process, print its outcome, return 1 where it failed."""
     process.start()
-    errors, last = [], (0, 0, 0.0, 0.0)
+    errors, last, inner, alive = [], (0, 0, 0.0, 0.0), [], time.monotonic()
     while process.is_alive() or not results.empty():
         if results.empty():
             time.sleep(0.05)
+            if time.monotonic() - alive > HUNG:
+                for path in inner:
+                    shutil.copy(path, keep / f"fuzz_{name.replace(' ', '_')}_hung_{path.name}")
+                process.kill()
+                process.join()
+                shutil.rmtree(inner[0].parent, ignore_errors=True)
             continue
         _, kind, value = results.get()
+        alive = time.monotonic()
         if kind == "error":
             errors.append(value)
+        elif kind == "files":
+            inner = value
         else:
             last = value
     process.join()
