@@ -218,7 +218,7 @@ class Pixels:
         """Return the thresholds of each pixel [log intensity], shape (B, 2, N): OFF, ON."""
         kernel = pixel.compose_thresholds(self.stages)
         out = wp.empty((self.batch, 2, self.count), dtype=float, device=self.device)
-        inputs = [self._pixels, self.width, self.seed, self._parameters, out]
+        inputs = [self._pixels, self.width, self.height, self.seed, self._parameters, out]
         launch.run(kernel, self.count, inputs, self.device, batch=self.batch)
         return np.asarray(out.numpy())
 
@@ -235,7 +235,7 @@ class Pixels:
         kernel = pixel.compose(self.stages, source_name, sink_name)
         clock = self._clock(times, windows)
         inputs = [
-            source, clock, self._pixels, self.width, self.samples, self.seed,
+            source, clock, self._pixels, self.width, self.height, self.samples, self.seed,
             self._parameters, self._state, self._next, sink,
         ]  # fmt: skip
         launch.run(kernel, self.count, inputs, self.device, batch=self.batch, align=align)
@@ -257,6 +257,7 @@ class Pixels:
         short = np.where(short > length, np.nextafter(short, np.float32(0)), short)
         to = self.device
         clock.t = wp.array(times.astype(np.float32), dtype=float, device=to)
+        clock.t64 = wp.array(times, dtype=wp.float64, device=to)
         clock.dt = wp.array(dt.astype(np.float32), dtype=float, device=to)
         clock.begin = wp.array(begin.astype(np.int64), dtype=wp.int64, device=to)
         clock.length = wp.array(short, dtype=float, device=to)
