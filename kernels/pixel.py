@@ -4,7 +4,7 @@ A pixel turns light into events in this order; each effect adds Warp functions a
 
     light      (intensity, ...)           -> intensity            what reaches the photodiode
     log        voltage = log(intensity + log_eps)
-    respond    (voltage, intensity, ...)  -> voltage              photoreceptor
+    respond    (voltage, intensity, log_eps, ...) -> voltage      photoreceptor
     threshold  (on, off, ...)             -> on, off              once per pixel [log intensity]
     redraw     (on, off, ...)             -> on, off              anew after each event; random numbers too
     drift      (intensity, on, off, ...)  -> drift                of the change towards ON [log intensity/s]
@@ -48,7 +48,7 @@ CORE = ("on", "off", "phase", "log_eps")
 
 QUANTITIES = {
     "light": ("intensity",),
-    "respond": ("voltage", "intensity"),
+    "respond": ("voltage", "intensity", "log_eps"),
     "threshold": ("on", "off"),
     "redraw": ("on", "off"),
     "drift": ("intensity", "on", "off"),
