@@ -16,9 +16,10 @@ A stage function asks for what it needs by the names of its arguments: the quant
 `y`, `t64` (t in double precision, for phases of long recordings), `radius` (distance from the middle of the
 sensor to its corner is 1), `nominal_on`, `nominal_off` (thresholds before any effect), parameters and states
 of its effect, random numbers (`uniform`, `normal`: new ones at every sample; `pixel_uniform`, `pixel_normal`:
-one for each pixel; `_2` and so on for more). It returns its quantity, then the new values of its states. `compose` writes the kernel that calls all of them, one line each, so that
-a sensor costs one pass over its samples whatever effects it has. Random numbers are counter-based, keyed by
-seed, effect, pixel and sample: they do not depend on the other effects, on chunks, threads or the batch.
+one for each pixel; `_2` and so on for more). It returns its quantity, then the new values of its states.
+`compose` writes the kernel that calls all of them, one line each, so that a sensor costs one pass over its
+samples whatever effects it has. Random numbers are counter-based, keyed by seed, effect, pixel and sample:
+they do not depend on the other effects, on chunks, threads or the batch.
 """
 
 from __future__ import annotations
@@ -340,7 +341,9 @@ class _Writer:
             if re.search("_pixel_(uniform|normal)", local):
                 self.add(f"{local} = {kind}({local}_key, 0)")
         if self.asks("radius"):
-            self.add("middle = wp.vec2(float(x) - 0.5 * float(width - 1), float(y) - 0.5 * float(height - 1))")
+            self.add(
+                "middle = wp.vec2(float(x) - 0.5 * float(width - 1), float(y) - 0.5 * float(height - 1))"
+            )
             self.add("radius = 2.0 * wp.length(middle) / wp.length(wp.vec2(float(width), float(height)))")
         if self.asks("nominal_on") or self.asks("nominal_off"):
             self.add("nominal_on = on", "nominal_off = off")
@@ -543,7 +546,7 @@ class _Writer:
         self.add(f"moved += float({'passed' if delays else 'crossed'}) * theta")
 
     def one_by_one(self, begin: str) -> None:
-        """Crossings whose thresholds are drawn anew; equal ones are counted as without drawing, bit for bit."""
+        """Crossings with thresholds drawn anew; equal ones are counted as without drawing, bit for bit."""
         if not self.delays():
             self.add("passed = int(0)")
         else:

@@ -20,9 +20,9 @@ def drawn(on: float, off: float, spread: float, normal: float, normal_2: float):
 class Jitter(Effect):
     """Thresholds that differ from event to event.
 
-    The comparators of a pixel are noisy, and its reset leaves a random charge behind. So the change that makes
-    the next event is never quite the same: a steady change sends events at uneven intervals. Unlike mismatch,
-    it averages out over the events of a pixel.
+    The comparators of a pixel are noisy, and its reset leaves a random charge behind. So the change that
+    makes the next event is never quite the same: a steady change sends events at uneven intervals. Unlike
+    mismatch, it averages out over the events of a pixel.
 
     After each event of a pixel both thresholds are drawn anew, normally distributed about those of the
     pixel, and never below 0.01.

@@ -56,5 +56,5 @@ class Leak(Effect):
         unit="1",
         bounds=(0.0, 1e4),
         plausible=(0.0, 30.0),
-        about="parasitic photocurrent at intensity 1 relative to the leak in the dark; 0 leaks alike everywhere",
+        about="parasitic photocurrent at intensity 1, relative to the leak in the dark",
     )

@@ -29,9 +29,9 @@ class Linlog(Effect):
     follows the light itself. Relative changes of very dark parts then make fewer events. Simulators use it
     also so that the noise of dark 8-bit pixels does not become large in the logarithm.
 
-    Above `knee` the voltage is log(intensity); below it a straight line in the intensity that meets it there.
-    With `slope` 1 (the default) the two have the same slope at the knee: the response is smooth. v2e draws the
-    line through log(1 / 255) at intensity 0, knee 20 / 255: slope log(20) = 3, which has a kink at the knee.
+    Above `knee` the voltage is log(intensity), below it a straight line in the intensity that meets it there.
+    With `slope` 1 (the default) the two have the same slope at the knee: the response is smooth. v2e draws
+    the line through log(1 / 255) at intensity 0, with the knee at 20 / 255: slope log(20) = 3, a kink.
     """
 
     name: ClassVar[str] = "linlog"

@@ -90,9 +90,9 @@ class SecondOrder(Effect):
     bright light it may overshoot, so that a sharp edge is followed by a few events of the other polarity.
 
     H(s) = ω² / (s² + 2 damping ω s + ω²). The natural frequency ω/2π is `cutoff` at intensity 1 (white) and
-    falls linearly to `dark * cutoff` at intensity 0; the damping is held constant, although in the circuit it
-    changes with the light. The quality factor is Q = 1 / (2 damping); at damping 0.71 the natural frequency is
-    the -3 dB frequency. Exact at any sampling, for under-, over- and critical damping.
+    falls linearly to `dark * cutoff` at intensity 0; the damping is held constant, although in the circuit
+    it changes with the light. The quality factor is Q = 1 / (2 damping); at damping 0.71 the natural
+    frequency is the -3 dB frequency. Exact at any sampling, for under-, over- and critical damping.
     """
 
     name: ClassVar[str] = "second_order"

@@ -37,8 +37,8 @@ class Shot(Effect):
     The rate of both polarities together is `rate` at intensity 0 and falls linearly to `bright * rate` at
     intensity 1. A pixel whose threshold is lower than the nominal one is noisier, in proportion to
     nominal / threshold for each polarity, as in v2e. Real rates fall faster with the threshold, like the tail
-    of a normal distribution, and depend on the bandwidth: `voltage_noise` makes both by itself, at the cost of
-    fine sampling. `rate` belongs to the nominal thresholds, so changing those leaves it as it is.
+    of a normal distribution, and depend on the bandwidth: `voltage_noise` makes both by itself, at the cost
+    of fine sampling. `rate` belongs to the nominal thresholds, so changing those leaves it as it is.
     """
 
     name: ClassVar[str] = "shot"
