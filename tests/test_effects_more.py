@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import importlib.util
+from pathlib import Path
+
 import numpy as np
 import pytest
 import reference
@@ -10,7 +13,7 @@ from test_effects import KS, distance, ramp, static, tracks
 from test_pixel import by_pixel, flicker, rows, same
 
 import dase
-from dase.config import load_sensor, presets
+from dase.config import load_sensor, parse_sensor, presets
 from dase.effects.bandwidth import Bandwidth
 from dase.effects.dark import Dark
 from dase.effects.dead import Dead
@@ -149,7 +152,8 @@ def test_a_lamp_makes_events_of_both_polarities_in_turns(device):
 def test_a_lamp_keeps_its_phase_for_hours(device):
     lamp = every(Threshold(phase=0.0), Flicker(frequency=120.0, depth=0.5, phase=0.1))
     at = [
-        dase.simulate(still([0.5], 0.1, 513, start), lamp, device=device).t - start for start in (0.0, 36000.0)
+        dase.simulate(still([0.5], 0.1, 513, start), lamp, device=device).t - start
+        for start in (0.0, 36000.0)
     ]
     assert len(at[0]) > 50
     # float32 time resolves 4 ms after ten hours; whole nanoseconds, and doubles of 36000 s
@@ -500,3 +504,35 @@ def test_every_preset_simulates(device, rng, name):
     events = dase.simulate(scene, sensor, device=device)
     assert len(events) > 20
     assert 0.2 < events.p.mean() < 0.8
+
+
+def script(path: str):
+    """Return a script of the checkout as a module."""
+    file = Path(__file__).parents[1] / path
+    spec = importlib.util.spec_from_file_location(file.stem, file)
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def test_the_page_of_effects_is_that_of_the_code():
+    page = (Path(__file__).parents[1] / "docs" / "effects.md").read_text("utf-8")
+    assert page == script("docs/effects.py").page(), "run python docs/effects.py"
+
+
+@pytest.mark.parametrize(("level", "pixels"), [("0.1lux", 600), ("161lux", 900), ("3klux", 900)])
+def test_noise_is_like_that_of_a_camera(shared, level, pixels):
+    noise = script("perf/noise.py")
+    sensor = parse_sensor(noise.SENSOR, "sensor")
+    want = noise.measured(shared / "recordings" / "noise_iebcs.npz")[level]
+    got = noise.simulated(sensor, level, pixels=pixels)
+    measured, simulated = noise.summary(want), noise.summary(got)
+    assert simulated["ON share"] == pytest.approx(measured["ON share"], abs=0.06)
+    for polarity in ("ON", "OFF"):
+        share = f"pixels with {polarity} intervals"
+        assert simulated[share] == pytest.approx(measured[share], abs=0.2)
+        rate = f"{polarity} rate, 90 % of pixels below [Hz]"
+        assert simulated[rate] == pytest.approx(measured[rate], rel=0.5)
+    if level == "0.1lux":  # without what makes noise in the dark, there is next to none
+        quiet = noise.simulated(sensor.without("voltage_noise"), level, pixels=pixels)
+        assert quiet.sum() < 0.05 * got.sum()
