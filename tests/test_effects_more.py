@@ -9,11 +9,14 @@ import numpy as np
 import pytest
 import reference
 import reference_effects
+import warp as wp
+from scipy.linalg import expm
 from test_effects import KS, distance, ramp, static, tracks
 from test_pixel import by_pixel, flicker, rows, same
 
 import dase
 from dase.config import load_sensor, parse_sensor, presets
+from dase.effects import second_order
 from dase.effects.bandwidth import Bandwidth
 from dase.effects.dark import Dark
 from dase.effects.dead import Dead
@@ -296,6 +299,32 @@ def test_the_second_order_does_not_depend_on_sampling(device, damping):
     assert want > 0.1
 
 
+@wp.kernel(enable_backward=False)
+def answers(x: wp.array[float], damping: wp.array[float], out: wp.array2d[float]):
+    i = wp.tid()
+    h, dh = second_order.impulse(x[i], damping[i])
+    behind, speed = second_order.lag(x[i], damping[i], h, dh + 2.0 * damping[i] * h)
+    out[i, 0] = h
+    out[i, 1] = dh
+    out[i, 2] = behind
+    out[i, 3] = speed
+
+
+def test_closed_forms_keep_their_digits(device):
+    x, damping = np.meshgrid(np.geomspace(1e-4, 50, 60), [0.05, 0.4, 0.999, 1.0, 1.0001, 1.05, 3.0, 20.0])
+    x, damping = x.ravel().astype(np.float32), damping.ravel().astype(np.float32)
+    out = wp.empty((len(x), 4), dtype=float, device=device)
+    inputs = [wp.array(a, dtype=float, device=device) for a in (x, damping)]
+    wp.launch(answers, len(x), inputs=[*inputs, out], device=device)
+    for got, at, zeta in zip(out.numpy().astype(float), x.astype(float), damping.astype(float), strict=True):
+        # displacement, its speed, the time integral of the displacement
+        flow = expm(at * np.array([[0, 1, 0], [-1, -2 * zeta, 0], [1, 0, 0]]))
+        want = [flow[0, 1], flow[1, 1], flow[2, 0] / at, (1 - flow[0, 0]) / at]
+        # float32 rounds shares of a step of 1 after a division by x
+        slack = 3e-6 + 3e-7 * (2 * zeta / at if 2 * zeta * at > 0.09 else 1)
+        np.testing.assert_allclose(got, want, atol=slack)
+
+
 @pytest.mark.parametrize("damping", [0.05, 1.0, 20.0])
 def test_a_second_order_pixel_starts_settled(device, damping):
     sensor = every(Threshold(on=0.01, off=0.01), SecondOrder(cutoff=0.01, damping=damping, dark=1e-4))
@@ -360,14 +389,15 @@ def test_the_rate_of_voltage_noise_does_not_depend_on_sampling(device):
 @pytest.mark.parametrize("mode", ["drop", "delay"])
 def test_thresholds_are_drawn_anew_after_each_event(device, mode):
     spread, pixels = 0.25, 60
-    scene = ramp(6.0, 1.0, pixels, samples=7)
     sensor = every(Threshold(on=0.3, off=0.1, phase=0.0), Jitter(spread=spread), mode=mode)
-    for pixel, times in enumerate(tracks(dase.simulate(scene, sensor, seed=5, device=device))):
-        stream = reference.Stream("jitter_redraw_normal", 5, pixel)
-        want = [0.3 * (1 + spread * stream.normal(n)) for n in range(len(times))]
-        np.testing.assert_allclose(6.0 * times, np.cumsum(want), atol=2e-5)
-    got = counts(scene, sensor, 1.0, device, seed=5)[1]
-    np.testing.assert_array_equal(got, [len(t) for t in tracks(dase.simulate(scene, sensor, seed=5))])
+    for sign, theta, name in ((1, 0.3, "normal"), (-1, 0.1, "normal_2")):
+        events = dase.simulate(ramp(sign * 6.0, 1.0, pixels, samples=7), sensor, seed=5, device=device)
+        for pixel, times in enumerate(tracks(events)):
+            stream = reference.Stream(f"jitter_redraw_{name}", 5, pixel)
+            want = [theta * (1 + spread * stream.normal(n)) for n in range(len(times))]
+            np.testing.assert_allclose(6.0 * times, np.cumsum(want), atol=2e-5)
+    got = counts(ramp(-6.0, 1.0, pixels, samples=7), sensor, 1.0, device, seed=5)[0]
+    np.testing.assert_array_equal(got, [len(t) for t in tracks(events)])
 
 
 def test_jitter_averages_out_and_mismatch_does_not(device):
