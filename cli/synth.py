@@ -133,13 +133,14 @@ def _video(
     """Simulate one video into the file `out`."""
     from dase import synth
     from dase.config import load_sensor
+    from dase.sensor import sample_times
     from dase.video import open_video
 
-    scene = open_video(video, fps=fps, size=size)
-    with _bar(len(scene.sample_times()), "frames") as advance:
+    scene, model = open_video(video, fps=fps, size=size), load_sensor(sensor)
+    with _bar(len(sample_times(scene, model)), "frames") as advance:
         report = synth.record_scene(
             scene,
-            load_sensor(sensor),
+            model,
             out,
             frame_rate=frame_rate,
             seed=seed,

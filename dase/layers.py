@@ -72,6 +72,8 @@ class LayerScene(Scene):
         longest: Upper bound of it [s]; S2R samples at 72 Hz at least.
     """
 
+    anytime = True
+
     def __init__(
         self,
         layers: Sequence[Layer],

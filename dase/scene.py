@@ -16,11 +16,13 @@ class Scene(ABC):
         width: Columns of the picture [px].
         height: Rows of the picture [px].
         duration: Length [s].
+        anytime: Whether `source` takes any time between the first sample and the last.
     """
 
     width: int
     height: int
     duration: float
+    anytime: bool = False
 
     @abstractmethod
     def sample_times(self) -> NDArray[np.float64]:

@@ -10,6 +10,7 @@ import numpy as np
 import warp as wp
 from numpy.typing import ArrayLike, NDArray
 
+from dase.effects import EFFECTS
 from dase.effects.base import Effect
 from dase.effects.threshold import Threshold
 from dase.errors import InputError
@@ -64,14 +65,21 @@ class Sensor:
         return any(effect.name == name for effect in self.effects)
 
     def with_effect(self, effect: Effect) -> Sensor:
-        """Return the sensor with `effect` added, or in place of the one of the same name."""
+        """Return the sensor with `effect` added where it acts, or in place of the one of the same name."""
         if effect.name in self:
             return replace(self, effects=tuple(effect if e.name == effect.name else e for e in self.effects))
-        return replace(self, effects=(*self.effects, effect))
+        place = {name: i for i, name in enumerate(EFFECTS)}
+        later = [place.get(e.name, 0) > place.get(effect.name, len(place)) for e in self.effects]
+        at = later.index(True) if True in later else len(later)
+        return replace(self, effects=(*self.effects[:at], effect, *self.effects[at:]))
 
     def without(self, name: str) -> Sensor:
         """Return the sensor without the effect `name`."""
         return replace(self, effects=tuple(e for e in self.effects if e.name != name))
+
+    def longest_step(self) -> float:
+        """Return the longest time between samples that still shows all effects [s]."""
+        return min(effect.longest_step() for effect in self.effects)
 
     def stages(self) -> tuple[pixel.Stages, ...]:
         """Return the effects as the kernel composer sees them; the threshold is part of its core."""
@@ -219,7 +227,7 @@ class Pixels:
         """Return the thresholds of each pixel [log intensity], shape (B, 2, N): OFF, ON."""
         kernel = pixel.compose_thresholds(self.stages)
         out = wp.empty((self.batch, 2, self.count), dtype=float, device=self.device)
-        inputs = [self._pixels, self.width, self.seed, self._parameters, out]
+        inputs = [self._pixels, self.width, self.height, self.seed, self._parameters, out]
         launch.run(kernel, self.count, inputs, self.device, batch=self.batch)
         return np.asarray(out.numpy())
 
@@ -236,7 +244,7 @@ class Pixels:
         kernel = pixel.compose(self.stages, source_name, sink_name)
         clock = self._clock(times, windows)
         inputs = [
-            source, clock, self._pixels, self.width, self.samples, self.seed,
+            source, clock, self._pixels, self.width, self.height, self.samples, self.seed,
             self._parameters, self._state, self._next, sink,
         ]  # fmt: skip
         launch.run(kernel, self.count, inputs, self.device, batch=self.batch, align=align)
@@ -258,6 +266,7 @@ class Pixels:
         short = np.where(short > length, np.nextafter(short, np.float32(0)), short)
         to = self.device
         clock.t = wp.array(times.astype(np.float32), dtype=float, device=to)
+        clock.t64 = wp.array(times, dtype=wp.float64, device=to)
         clock.dt = wp.array(dt.astype(np.float32), dtype=float, device=to)
         clock.begin = wp.array(begin.astype(np.int64), dtype=wp.int64, device=to)
         clock.length = wp.array(short, dtype=float, device=to)
@@ -281,6 +290,18 @@ class Pixels:
         t, x, y, p = (a.numpy() for a in out)
         events = Events(t, x, y, p.view(np.bool_), self.width, self.height)
         return events, row.numpy() if self.batch > 1 else None
+
+
+def sample_times(scene: Scene, sensor: Sensor) -> NDArray[np.float64]:
+    """Return when to sample [s]: as the scene asks and, where it can, often enough for all effects."""
+    times, step = scene.sample_times(), sensor.longest_step()
+    if not scene.anytime or not np.isfinite(step):
+        return times
+    pieces = np.maximum(np.ceil(np.diff(times) / step - 1e-9), 1)
+    if np.all(pieces == 1):
+        return times
+    at = np.concatenate([[0], np.cumsum(pieces)])
+    return np.interp(np.arange(at[-1] + 1), at, times)
 
 
 def chunks(times: NDArray[np.float64], size: int) -> Iterator[NDArray[np.float64]]:
@@ -313,7 +334,7 @@ def stream(
     """
     array = Pixels(sensor, scene.width, scene.height, pixels=pixels, seed=seed, device=device)
     size = chunk or CHUNK["cuda" if array.device.is_cuda else "cpu"]
-    for times in chunks(scene.sample_times(), size):
+    for times in chunks(sample_times(scene, sensor), size):
         yield array.emit(scene, times)[0]
 
 
@@ -355,7 +376,7 @@ def count(
         sensor, scene.width, scene.height, pixels=pixels, parameters=parameters, seed=seed, device=device
     )
     total = np.zeros((array.batch, len(edges) - 1, 2, array.count), np.int32)
-    for times in chunks(scene.sample_times(), CHUNK["cuda" if array.device.is_cuda else "cpu"]):
+    for times in chunks(sample_times(scene, sensor), CHUNK["cuda" if array.device.is_cuda else "cpu"]):
         windows = (np.searchsorted(edges, times, side="left") - 1).astype(np.int32)
         windows[(windows < 0) | (windows >= len(edges) - 1)] = -1
         seen = windows[windows >= 0]

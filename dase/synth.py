@@ -23,7 +23,7 @@ from dase.interrupt import Deferred, deferred, ignored
 from dase.kernels import launch
 from dase.layers import LayerScene
 from dase.scene import Scene
-from dase.sensor import CHUNK, Pixels, Sensor, chunks
+from dase.sensor import CHUNK, Pixels, Sensor, chunks, sample_times
 
 RECORD = "synth.toml"
 """File beside the sequences that holds everything that made them."""
@@ -264,7 +264,7 @@ def _record(
     """Write thresholds, frames, flow and events of a scene, in order of time."""
     array = Pixels(sensor, scene.width, scene.height, seed=seed, device=device)
     writer.thresholds(array.thresholds()[0].reshape(2, scene.height, scene.width))
-    times = scene.sample_times()
+    times = sample_times(scene, sensor)
     total, shown = Report(sequences=1), 0
     for part in chunks(times, CHUNK["cuda" if array.device.is_cuda else "cpu"]):
         due = int(np.searchsorted(frame_times, part[-1], side="right"))

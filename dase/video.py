@@ -15,6 +15,9 @@ from dase.kernels import pixel
 from dase.pictures import list_pictures, read_grey, to_grey
 from dase.scene import Scene
 
+EPS = 1e-3
+"""Added to intensities before the logarithm between frames; that of sensors unless they say otherwise."""
+
 
 class VideoScene(Scene):
     """Frames at given times; between two frames the log intensity of a pixel runs straight.
@@ -23,6 +26,8 @@ class VideoScene(Scene):
         frames: Linear intensity in [0, 1], shape (F, height, width).
         times: Times of the frames [s], increasing, shape (F,); the scene begins with the first.
     """
+
+    anytime = True
 
     def __init__(self, frames: ArrayLike | FrameReader, times: ArrayLike):
         self._frames = frames if isinstance(frames, FrameReader) else np.asarray(frames)
@@ -47,7 +52,7 @@ class VideoScene(Scene):
     def source(self, times: NDArray[np.float64], pixels: NDArray[np.int32], device: Any) -> tuple[str, Any]:
         """Return the stored intensities of these pixels."""
         source = pixel.Frames()
-        flat = self._at(times).reshape(len(times), -1)
+        flat = self._between(times).reshape(len(times), -1)
         every = np.array_equal(pixels, np.arange(flat.shape[1]))
         values = flat if every else flat[:, pixels]
         source.values = wp.array(np.ascontiguousarray(values, np.float32), dtype=float, device=device)
@@ -56,6 +61,23 @@ class VideoScene(Scene):
     def frames(self, times: NDArray[np.float64], device: str = "cpu") -> NDArray[np.float32]:
         """Return the frames at `times`, which must be times of frames, shape (K, height, width)."""
         return np.asarray(self._at(times), np.float32)
+
+    def _between(self, times: NDArray[np.float64]) -> NDArray[Any]:
+        above = np.minimum(np.searchsorted(self._times, times), len(self._times) - 1)
+        if np.array_equal(self._times[above], times):
+            return self._frames[above]
+        below = np.maximum(above - 1, 0)
+        if np.any(times < self._times[0]) or np.any(times > self._times[-1]):
+            raise InputError("video: asked for a time outside it")
+        share = ((times - self._times[below]) / np.maximum(self._times[above] - self._times[below], 1e-30))[
+            :, None, None
+        ]
+        needed, at = np.unique(np.concatenate([below, above]), return_inverse=True)
+        frames = np.asarray(self._frames[needed], np.float32)
+        first, second = frames[at[: len(times)]], frames[at[len(times) :]]
+        # straight in log(intensity + 0.001), as sensors see it
+        mixed = (first + EPS) ** (1 - share) * (second + EPS) ** share - EPS
+        return np.where(share == 1, second, np.maximum(mixed, 0))
 
     def _at(self, times: NDArray[np.float64]) -> NDArray[Any]:
         index = np.searchsorted(self._times, times)

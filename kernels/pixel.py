@@ -4,19 +4,22 @@ A pixel turns light into events in this order; each effect adds Warp functions a
 
     light      (intensity, ...)           -> intensity            what reaches the photodiode
     log        voltage = log(intensity + log_eps)
-    respond    (voltage, intensity, ...)  -> voltage              photoreceptor
+    respond    (voltage, intensity, log_eps, ...) -> voltage      photoreceptor
     threshold  (on, off, ...)             -> on, off              once per pixel [log intensity]
+    redraw     (on, off, ...)             -> on, off              anew after each event; random numbers too
     drift      (intensity, on, off, ...)  -> drift                of the change towards ON [log intensity/s]
     noise      (intensity, on, off, ...)  -> rate_on, rate_off    of events without a change [Hz]
     count      exact threshold crossings of the change since the last event
     gate       (age, ...)                 -> wait                 time the pixel stays dead [s]
 
 A stage function asks for what it needs by the names of its arguments: the quantities above, `t`, `dt`, `x`,
-`y`, parameters and states of its effect, random numbers (`uniform`, `normal`: new ones at every sample;
-`pixel_uniform`, `pixel_normal`: one for each pixel; `_2` and so on for more). It returns its quantity, then
-the new values of its states. `compose` writes the kernel that calls all of them, one line each, so that
-a sensor costs one pass over its samples whatever effects it has. Random numbers are counter-based, keyed by
-seed, effect, pixel and sample: they do not depend on the other effects, on chunks, threads or the batch.
+`y`, `t64` (t in double precision, for phases of long recordings), `radius` (distance from the middle of the
+sensor to its corner is 1), `nominal_on`, `nominal_off` (thresholds before any effect), parameters and states
+of its effect, random numbers (`uniform`, `normal`: new ones at every sample; `pixel_uniform`, `pixel_normal`:
+one for each pixel; `_2` and so on for more). It returns its quantity, then the new values of its states.
+`compose` writes the kernel that calls all of them, one line each, so that a sensor costs one pass over its
+samples whatever effects it has. Random numbers are counter-based, keyed by seed, effect, pixel and sample:
+they do not depend on the other effects, on chunks, threads or the batch.
 """
 
 from __future__ import annotations
@@ -40,19 +43,26 @@ REST = 1e30
 AHEAD = 4
 """Stored samples of a pixel that are under way from memory at a time."""
 
-STAGES = ("light", "respond", "threshold", "drift", "noise", "gate")
+STAGES = ("light", "respond", "threshold", "redraw", "drift", "noise", "gate")
 CORE = ("on", "off", "phase", "log_eps")
 """Parameters of the change detector itself; they lead the parameter vector."""
 
 QUANTITIES = {
     "light": ("intensity",),
-    "respond": ("voltage", "intensity"),
+    "respond": ("voltage", "intensity", "log_eps"),
     "threshold": ("on", "off"),
+    "redraw": ("on", "off"),
     "drift": ("intensity", "on", "off"),
     "noise": ("intensity", "on", "off"),
     "gate": ("age",),
 }
-"""What the functions of a stage may ask for beside parameters, states, random numbers, x, y, t and dt."""
+"""What the functions of a stage may ask for beside parameters, states, random numbers and `ANYWHERE`."""
+
+ANYWHERE = ("x", "y", "t", "dt", "t64", "radius", "nominal_on", "nominal_off")
+"""What the functions of every stage may ask for; `t`, `dt` and `t64` only where there are samples."""
+
+COUNT_ON = "{0} = wp.where({0} < 8388608.0, {0} + 1.0, 1.0)"
+"""Counts events in float32 without coming to a halt where it resolves no more; random numbers then repeat."""
 
 DRAW = re.compile(r"(pixel_)?(uniform|normal)(_\d)?")
 
@@ -88,6 +98,7 @@ class Clock:
     """Time samples of one chunk; sample k ends the step that begins at sample k - 1."""
 
     t: wp.array[float]  # (K,) [s]
+    t64: wp.array[wp.float64]  # (K,) [s]
     dt: wp.array[float]  # (K,) [s], REST at the first sample of all
     begin: wp.array[wp.int64]  # (K,) begin of the step [ns since the chunk's begin]
     length: wp.array[float]  # (K,) duration of the step [ns]
@@ -214,6 +225,7 @@ def states(stages: Sequence[Stages]) -> list[str]:
     names = ["signal", "reference"]
     names += ["leaked", "leaked_rest"] if "drift" in kinds else []
     names += ["age"] if "gate" in kinds else []
+    names += ["redraws"] if "redraw" in kinds else []
     for effect in stages:
         if any(stage == "noise" for stage, _ in effect.functions):
             names += [f"{effect.name}_hazard", f"{effect.name}_rest", f"{effect.name}_events"]
@@ -270,7 +282,7 @@ class _Writer:
         """Return what a stage function gets for an argument of this name."""
         if name in effect.parameters or name in effect.states:
             return f"{effect.name}_{name}"
-        if name in QUANTITIES[stage] or name in ("t", "dt"):
+        if name in QUANTITIES[stage] or (name in ANYWHERE and name not in ("x", "y")):
             return name
         if name in ("x", "y"):
             return f"float({name})"
@@ -278,21 +290,18 @@ class _Writer:
         if draw:
             local = f"{effect.name}_{stage}_{name}"
             self.draws[local] = draw.group(2)
-            return f"{local}" if draw.group(1) else f"{draw.group(2)}({local}_key, sample)"
-        known = (
-            *effect.parameters,
-            *effect.states,
-            *QUANTITIES[stage],
-            "x",
-            "y",
-            "t",
-            "dt",
-            "normal",
-            "uniform",
-        )
+            index = "int(redraws)" if stage == "redraw" else "sample"
+            return f"{local}" if draw.group(1) else f"{draw.group(2)}({local}_key, {index})"
+        quantities = *effect.parameters, *effect.states, *QUANTITIES[stage]
+        known = *quantities, *ANYWHERE, "normal", "uniform"
         raise ValueError(
             f"effect '{effect.name}': stage '{stage}' has no quantity '{name}'; there are {', '.join(known)}"
         )
+
+    def asks(self, name: str) -> bool:
+        """Return whether any function asks for the quantity `name`."""
+        functions = (f for effect in self.stages for _, f in effect.functions)
+        return any(name in inspect.signature(f.func).parameters for f in functions)
 
     def kernel(self) -> str:
         """Return the whole text."""
@@ -302,7 +311,7 @@ class _Writer:
         self.depth = 0
         self.add(
             "def pixel_events(first: int, source: Source, clock: Clock, pixels: wp.array[int], width: int,",
-            "                 begin: int, seed: int, parameters: wp.array2d[float],",
+            "                 height: int, begin: int, seed: int, parameters: wp.array2d[float],",
             "                 state_in: wp.array3d[float], state_out: wp.array3d[float], sink: Sink):",
         )
         self.depth = 1
@@ -312,7 +321,7 @@ class _Writer:
     def thresholds(self) -> str:
         """Return the text of the kernel that writes thresholds."""
         self.add(
-            "def pixel_thresholds(first: int, pixels: wp.array[int], width: int, seed: int,",
+            "def pixel_thresholds(first: int, pixels: wp.array[int], width: int, height: int, seed: int,",
             "                     parameters: wp.array2d[float], out: wp.array3d[float]):",
         )
         self.depth = 1
@@ -332,10 +341,18 @@ class _Writer:
             self.add(f"{local}_key = key(seed, {stream(local)}, pixel)")
             if re.search("_pixel_(uniform|normal)", local):
                 self.add(f"{local} = {kind}({local}_key, 0)")
+        if self.asks("radius"):
+            self.add(
+                "middle = wp.vec2(float(x) - 0.5 * float(width - 1), float(y) - 0.5 * float(height - 1))"
+            )
+            self.add("radius = 2.0 * wp.length(middle) / wp.length(wp.vec2(float(width), float(height)))")
+        if self.asks("nominal_on") or self.asks("nominal_off"):
+            self.add("nominal_on = on", "nominal_off = off")
 
     def prologue(self) -> None:
         """What a pixel knows before its first sample."""
         calls = [self.call("threshold", effect, function) for effect, function in self.of("threshold")]
+        anew = self.redrawn()
         self.pixel()
         self.add("size = pixels.shape[0]")
         if self.source == "layers":
@@ -348,6 +365,13 @@ class _Writer:
         self.add(*(f"on, off = {call}" for call in calls))
         self.add(*(f"{name} = float(0.0)" for name in self.states), "if begin > 0:")
         self.add(*(f"    {name} = state_in[{at}, row, i]" for at, name in enumerate(self.states)))
+        if anew:
+            self.add("mean_on = on", "mean_off = off", *anew[2:])
+
+    def redrawn(self) -> list[str]:
+        """Return the lines that draw the thresholds of the next event, none without such an effect."""
+        calls = [self.call("redraw", effect, function) for effect, function in self.of("redraw")]
+        return ["on = mean_on", "off = mean_off", *(f"on, off = {call}" for call in calls)] if calls else []
 
     def loop(self) -> None:
         """One sample after the other, then the state is kept."""
@@ -358,6 +382,7 @@ class _Writer:
         self.add("for k in range(clock.run[part], clock.run[part + 1]):")
         self.depth += 1
         self.add("dt = clock.dt[k]", "t = clock.t[k]", "sample = begin + k")
+        self.add(*(["t64 = clock.t64[k]"] if self.asks("t64") else []))
         self.sense()
         self.add("if sample == 0:")
         self.depth += 1
@@ -500,6 +525,9 @@ class _Writer:
             "theta = on", "polarity = int(1)", "if change < 0.0:", "    theta = -off", "    polarity = 0"
         )
         self.add("crossed = int(wp.floor(change / theta))", *(["passed = int(0)"] if delays else []))
+        if self.of("redraw"):
+            self.one_by_one(begin)
+            return
         if self.sink == "counts" and not self.of("gate"):
             # nobody asks when they happened
             self.add("on_count += polarity * crossed", "off_count += (1 - polarity) * crossed")
@@ -522,6 +550,35 @@ class _Writer:
         self.depth -= 1
         self.add(f"moved += float({'passed' if delays else 'crossed'}) * theta")
 
+    def one_by_one(self, begin: str) -> None:
+        """Crossings with thresholds drawn anew; equal ones are counted as without drawing, bit for bit."""
+        if not self.delays():
+            self.add("passed = int(0)")
+        else:
+            self.add("if at > stop:", "    crossed = 0")
+        self.add("while passed < crossed:")
+        self.depth += 1
+        self.add(f"share = {begin}", "if after != before:")
+        self.add("    share = (moved + float(passed + 1) * theta - before) / (after - before)")
+        self.add(f"share = wp.clamp(share, {begin}, stop)")
+        if self.delays():
+            self.wait("share")
+            self.add("if wait > 0.0:", "    share += wait / dt", "if share > stop:", "    break")
+            self.event("share", "polarity")
+        else:
+            self.gated("share", "polarity")
+        self.add("passed += 1", *self.next_draw())
+        self.add("drawn = on", "if polarity == 0:", "    drawn = -off", "if drawn != theta:")
+        self.add("    moved += float(passed) * theta", "    passed = 0", "    theta = drawn")
+        self.add("    crossed = int(wp.floor((value - moved) / theta))")
+        self.depth -= 1
+        self.add("moved += float(passed) * theta")
+
+    def next_draw(self) -> list[str]:
+        """Return the lines that draw new thresholds after an event."""
+        anew = self.redrawn()
+        return [COUNT_ON.format("redraws"), *anew] if anew else []
+
     def pending(self) -> None:
         """Crossings from before `begun` that still stand when the pixel comes back to life at `at`."""
         self.wait("at")
@@ -533,7 +590,7 @@ class _Writer:
         self.add("if change >= on:", "    theta = on", "    polarity = 1")
         self.add("if change <= -off:", "    theta = -off", "if theta == 0.0:", "    break")
         self.event("at", "polarity")
-        self.add("moved += theta")
+        self.add("moved += theta", *self.next_draw())
         self.wait("at")
         self.depth -= 1
 
@@ -578,6 +635,7 @@ class _Writer:
             f"if uniform({n}_polarity_key, int({n}_events)) * ({n}_on + {n}_off) < {n}_on:",
             "    polarity = 1",
         )
-        self.gated("stop", "polarity", "moved = value")
-        self.add(f"{n}_hazard += waiting({self.noise_key(effect)}, int({n}_events))", f"{n}_events += 1.0")
+        self.gated("stop", "polarity", "moved = value", *self.next_draw())
+        self.add(f"{n}_hazard += waiting({self.noise_key(effect)}, int({n}_events))")
+        self.add(COUNT_ON.format(f"{n}_events"))
         self.depth -= 1

@@ -174,13 +174,13 @@ def detector(sensor: dase.Sensor, index: int, seed: int) -> Detector:
         Stream(name, seed, index)
         for name in ("initial_phase", "shot_noise", "shot_polarity", "leak_drift_pixel_normal")
     )
-    rate = setting(sensor, "leak", "rate", 0.0)
+    rate, nominal_on = setting(sensor, "leak", "rate", 0.0), sensor["threshold"].on
     return Detector(
         on=on,
         off=off,
         lead=sensor["threshold"].phase * start.uniform(0),
         falls=start.uniform(1) < 0.5,
-        leak=max(rate * (1 + setting(sensor, "leak", "spread", 0.0) * leak.normal()), 0.0) * on,
+        leak=max(rate * (1 + setting(sensor, "leak", "spread", 0.0) * leak.normal()), 0.0) * nominal_on,
         period=setting(sensor, "refractory", "period", 0.0),
         delays=setting(sensor, "refractory", "mode", "drop") == "delay",
         waiting=noise.waiting,
@@ -207,15 +207,22 @@ def events(sensor: dase.Sensor, times: np.ndarray, intensity: np.ndarray, seed: 
     balance = setting(sensor, "shot", "balance", 0.5)
     total = rate * (1 + (bright - 1) * light)
     rates = np.stack([total * (1 - balance), total * balance], -1)
+    nominal = np.array([sensor["threshold"].off, sensor["threshold"].on])
+    own = np.array([thresholds(sensor, i, seed) for i in range(intensity.shape[1])])
+    rates *= nominal / own
     return [detector(sensor, i, seed).run(times, level[:, i], rates[:, i]) for i in range(intensity.shape[1])]
 
 
 def only(*effects: dase.Effect, mode: str = "drop", log_eps: float = 1e-3) -> dase.Sensor:
-    """Return a sensor that has every effect, those not given switched off: one kernel serves many tests."""
-    every = {name: effect.identity() for name, effect in dase.EFFECTS.items()}
+    """Return a sensor with these effects and the common ones switched off: one kernel serves many tests."""
+    every = {name: dase.EFFECTS[name].identity() for name in COMMON}
     every["refractory"] = dase.EFFECTS["refractory"](period=0.0, mode=mode)
     every |= {effect.name: effect for effect in effects}
-    return dase.Sensor(effects=tuple(every.values()), log_eps=log_eps)
+    return dase.Sensor(effects=tuple(every[name] for name in dase.EFFECTS if name in every), log_eps=log_eps)
+
+
+COMMON = ("threshold", "mismatch", "bandwidth", "leak", "shot", "refractory")
+"""Effects that the twin knows."""
 
 
 class LogScene(dase.Scene):

@@ -276,11 +276,12 @@ def test_all_effects_switched_off_change_nothing(device, rng):
 
 
 def test_an_effect_leaves_the_random_numbers_of_others(device):
-    # noise events of a static scene stay where they are when thresholds scatter and leak events join in
+    # noise events of a static scene stay where they are when leak events join in
     scene = dase.VideoScene(np.full((20, 6, 7), 0.2, np.float32), np.arange(20) * 0.25)
     alone = rows(dase.simulate(scene, reference.only(Shot(rate=3.0)), device=device))
     others = (Mismatch(spread=0.3), Leak(rate=5.0), Bandwidth())
-    among = rows(dase.simulate(scene, reference.only(Shot(rate=3.0), *others), device=device))
+    # not mismatch, which makes pixels of low threshold noisier
+    among = rows(dase.simulate(scene, reference.only(Shot(rate=3.0), *others[1:]), device=device))
     assert len(alone) > 100
     assert len(among) > 2 * len(alone)
     assert {tuple(row) for row in alone} <= {tuple(row) for row in among}

@@ -10,16 +10,44 @@ from dase.effects.base import Effect as Effect
 from dase.effects.base import Parameter as Parameter
 from dase.effects.base import choice as choice
 from dase.effects.base import parameter as parameter
+from dase.effects.dark import Dark
+from dase.effects.dead import Dead
+from dase.effects.flicker import Flicker
+from dase.effects.hot import Hot
+from dase.effects.jitter import Jitter
 from dase.effects.leak import Leak
+from dase.effects.linlog import Linlog
 from dase.effects.mismatch import Mismatch
 from dase.effects.refractory import Refractory
+from dase.effects.second_order import SecondOrder
 from dase.effects.shot import Shot
 from dase.effects.threshold import Threshold
+from dase.effects.vignetting import Vignetting
+from dase.effects.voltage_noise import VoltageNoise
 from dase.errors import InputError, nearest
 
-EFFECTS: dict[str, type[Effect]] = {
-    effect.name: effect for effect in (Threshold, Mismatch, Bandwidth, Leak, Shot, Refractory)
-}
+_ORDER = (
+    # light
+    Flicker,
+    Vignetting,
+    Dark,
+    # photoreceptor
+    Linlog,
+    Bandwidth,
+    SecondOrder,
+    VoltageNoise,
+    # change detector
+    Threshold,
+    Mismatch,
+    Jitter,
+    Leak,
+    Shot,
+    Hot,
+    Refractory,
+    Dead,
+)
+
+EFFECTS: dict[str, type[Effect]] = {effect.name: effect for effect in _ORDER}
 """Name in sensor files to class, in the order in which they act."""
 
 

@@ -122,6 +122,10 @@ class Effect:
         """Whether events that this effect holds back come later instead of being lost."""
         return False
 
+    def longest_step(self) -> float:
+        """Return the longest time between samples that still shows the effect [s]."""
+        return math.inf
+
     def compiled(self) -> pixel.Stages:
         """Return what the kernel composer needs to know."""
         for stage in self.stages:

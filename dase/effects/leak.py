@@ -11,9 +11,9 @@ from dase.effects.base import Effect, parameter
 
 
 @wp.func
-def drift(on: float, rate: float, spread: float, pixel_normal: float):
+def drift(intensity: float, nominal_on: float, rate: float, spread: float, light: float, pixel_normal: float):
     """Speed at which the pixel's memory leaks away, towards ON [log intensity/s]."""
-    return wp.max(rate * (1.0 + spread * pixel_normal), 0.0) * on
+    return wp.max(rate * (1.0 + spread * pixel_normal), 0.0) * nominal_on * (1.0 + light * intensity)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -23,6 +23,11 @@ class Leak(Effect):
     A pixel keeps its memory on a capacitor whose reset switch leaks. The memory drifts down, so even in a
     static scene a pixel sends ON events at a regular, low rate, and moving scenes have slightly more ON than
     OFF events. The leak differs from pixel to pixel.
+
+    Two currents leak: that of the switch's junction, and a parasitic photocurrent, since light also falls on
+    the switch. The latter grows with the intensity, so bright scenes leak more. Both move the memory at a
+    speed of their own; a pixel of low ON threshold sends more leak events, in proportion to 1 / threshold.
+    (v2e gives every pixel the same rate whatever its threshold.)
     """
 
     name: ClassVar[str] = "leak"
@@ -37,12 +42,19 @@ class Leak(Effect):
         off=0.0,
         bounds=(0.0, 1e5),
         plausible=(0.01, 20.0),
-        about="ON events per pixel and second in a static scene",
+        about="ON events per second of a pixel of nominal ON threshold, in the dark",
     )
     spread: float = parameter(
         0.1,
         unit="1",
         bounds=(0.0, 1.0),
         plausible=(0.0, 0.5),
-        about="standard deviation of the rate over pixels, relative to the rate",
+        about="standard deviation of the current over pixels, relative to it",
+    )
+    light: float = parameter(
+        0.0,
+        unit="1",
+        bounds=(0.0, 1e4),
+        plausible=(0.0, 30.0),
+        about="parasitic photocurrent at intensity 1, relative to the leak in the dark",
     )

@@ -11,10 +11,19 @@ from dase.effects.base import Effect, parameter
 
 
 @wp.func
-def rates(intensity: float, rate: float, bright: float, balance: float):
+def rates(
+    intensity: float,
+    on: float,
+    off: float,
+    nominal_on: float,
+    nominal_off: float,
+    rate: float,
+    bright: float,
+    balance: float,
+):
     """ON and OFF rates of noise events [Hz]."""
     total = rate * (1.0 - (1.0 - bright) * wp.clamp(intensity, 0.0, 1.0))
-    return total * balance, total * (1.0 - balance)
+    return total * balance * (nominal_on / on), total * (1.0 - balance) * (nominal_off / off)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -26,7 +35,10 @@ class Shot(Effect):
     remember the present log intensity, as any event does.
 
     The rate of both polarities together is `rate` at intensity 0 and falls linearly to `bright * rate` at
-    intensity 1.
+    intensity 1. A pixel whose threshold is lower than the nominal one is noisier, in proportion to
+    nominal / threshold for each polarity, as in v2e. Real rates fall faster with the threshold, like the tail
+    of a normal distribution, and depend on the bandwidth: `voltage_noise` makes both by itself, at the cost
+    of fine sampling. `rate` belongs to the nominal thresholds, so changing those leaves it as it is.
     """
 
     name: ClassVar[str] = "shot"
@@ -41,7 +53,7 @@ class Shot(Effect):
         off=0.0,
         bounds=(0.0, 1e5),
         plausible=(0.02, 100.0),
-        about="events per pixel and second in the dark, both polarities together",
+        about="events per second in the dark of a pixel of nominal thresholds, both polarities together",
     )
     bright: float = parameter(
         0.25,

@@ -1,0 +1,44 @@
+"""Corners darker than the middle."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import ClassVar
+
+import warp as wp
+
+from dase.effects.base import Effect, parameter
+
+
+@wp.func
+def falloff(intensity: float, radius: float, loss: float):
+    """Intensity after the cos⁴ law."""
+    # cos²(angle) = 1 / (1 + tan²(angle)), and the tangent grows with the distance from the middle
+    tangent = (1.0 / wp.sqrt(1.0 - loss) - 1.0) * radius * radius
+    return intensity / ((1.0 + tangent) * (1.0 + tangent))
+
+
+@dataclass(frozen=True, kw_only=True)
+class Vignetting(Effect):
+    """Corners darker than the middle.
+
+    Light reaches the corners of a picture at an angle, through a lens that looks narrower from there, and on
+    a smaller part of a pixel. A change of log intensity is the same in a darker corner; but the slower
+    photoreceptor and the stronger noise of dark pixels make corners differ from the middle.
+
+    The intensity follows the cos⁴ law of the angle to the optical axis, which passes through the middle of
+    the sensor; `loss` is the share lost in the corner. Lenses of wide aperture lose more.
+    """
+
+    name: ClassVar[str] = "vignetting"
+    source: ClassVar[str] = "Goldman, Chen: Vignette and exposure calibration and compensation, 2005"
+    stages: ClassVar = {"light": falloff}
+
+    loss: float = parameter(
+        0.4,
+        unit="1",
+        off=0.0,
+        bounds=(0.0, 0.99),
+        plausible=(0.05, 0.8),
+        about="share of the light lost at the corner of the sensor",
+    )

@@ -1,0 +1,118 @@
+"""Noise of the photoreceptor's voltage."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import ClassVar
+
+import warp as wp
+
+from dase.effects.base import Effect, parameter
+
+POLE = wp.constant(2.0 * math.pi / math.sqrt(math.sqrt(2.0) - 1.0))
+"""Frequency of either of two equal poles [rad/s] at which together they lose 3 dB at 1 Hz."""
+
+
+@wp.func
+def fresh(x: float, kept: float):
+    """Variance, covariance and variance of noise and its speed that are new after x time constants.
+
+    In units of the stationary variance; the speed in units of the pole. `kept` is exp(-2x).
+    """
+    y = 2.0 * x
+    mixed = 0.5 * y * y * kept
+    var = 1.0 - kept * (1.0 + y + 0.5 * y * y)
+    if y < 0.2:
+        # the closed form loses digits
+        var = y * y * y * (1.0 / 6.0 - y * (1.0 / 8.0 - y * (1.0 / 20.0 - y / 72.0)))
+    return wp.max(var, 1.0e-30), mixed, 1.0 - kept * (1.0 - y + 0.5 * y * y)
+
+
+@wp.func
+def noisy(
+    voltage: float,
+    intensity: float,
+    dt: float,
+    sigma: float,
+    cutoff: float,
+    knee: float,
+    dark: float,
+    noise: float,
+    speed: float,
+    normal: float,
+    normal_2: float,
+):
+    """Voltage with white noise behind two equal poles, exact at any sampling."""
+    light = wp.max(intensity, 0.0) + dark
+    share = light / (light + knee)
+    # beyond 100 time constants nothing is remembered
+    x = wp.min(POLE * cutoff * share * dt, 100.0)
+    kept = wp.exp(-x)
+    var, mixed, speed_var = fresh(x, kept * kept)
+    first = wp.sqrt(var)
+    cross = mixed / first
+    scale = sigma * wp.sqrt(1.0 - share)
+    now = kept * (noise + x * (noise + speed)) + scale * first * normal
+    then = wp.sqrt(wp.max(speed_var - cross * cross, 0.0))
+    speed_now = kept * (speed - x * (noise + speed)) + scale * (cross * normal + then * normal_2)
+    return voltage + now, now, speed_now
+
+
+@dataclass(frozen=True, kw_only=True)
+class VoltageNoise(Effect):
+    """Noise of the photoreceptor's voltage.
+
+    Photons come at random, so the photocurrent fluctuates, relatively the more the darker it is. The
+    photoreceptor smooths the fluctuations; what is left wanders about, and now and then crosses a threshold.
+    Such noise events often come in pairs of opposite polarity, since the voltage returns.
+
+    Two poles filter the white shot noise: one grows with the photocurrent, the other is fixed by the bias at
+    `cutoff`; they are alike at intensity `knee`. The corner is cutoff · I / (I + knee), the variance
+    sigma² · knee / (I + knee), where I includes the dark current. In light above the knee the amplitude falls
+    with the light, and noise events become rarer; far below it the amplitude is constant, and noise events
+    become rarer with the bandwidth. In between they are most frequent. The spectrum is that of two equal
+    poles which together lose 3 dB at the corner: noise of a single pole would be so rough that its event rate
+    grows with ever finer sampling. Scenes are sampled sixteen times per period of `cutoff` where they can be.
+    """
+
+    name: ClassVar[str] = "voltage_noise"
+    source: ClassVar[str] = (
+        "Graca, Delbruck: Unraveling the paradox of intensity-dependent DVS pixel noise, 2021"
+    )
+    stages: ClassVar = {"respond": noisy}
+    states: ClassVar = ("noise", "speed")
+
+    sigma: float = parameter(
+        0.05,
+        unit="log intensity",
+        off=0.0,
+        bounds=(0.0, 2.0),
+        plausible=(0.01, 0.2),
+        about="standard deviation in the dark",
+    )
+    cutoff: float = parameter(
+        200.0,
+        unit="Hz",
+        bounds=(0.01, 1e6),
+        plausible=(10.0, 3000.0),
+        about="corner frequency in bright light, set by the bias",
+    )
+    knee: float = parameter(
+        0.1,
+        unit="intensity",
+        bounds=(1e-6, 1e6),
+        plausible=(1e-3, 1.0),
+        about="where the corner of the photocurrent equals that of the bias",
+    )
+    dark: float = parameter(
+        0.003,
+        unit="intensity",
+        bounds=(1e-6, 10.0),
+        plausible=(1e-4, 0.1),
+        about="dark current, as the intensity that makes as much; keeps the corner above 0",
+    )
+
+    def longest_step(self) -> float:
+        """Return the longest time between samples that still shows the effect [s]."""
+        return 1 / (16 * self.cutoff) if self.sigma else math.inf
