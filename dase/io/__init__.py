@@ -14,6 +14,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
 from contextlib import AbstractContextManager
+from dataclasses import replace
 from os import PathLike
 from pathlib import Path
 
@@ -189,6 +190,41 @@ def write(path: str | PathLike[str], sequence: Sequence, *, format: str | None =
             writer.thresholds(sequence.thresholds)
         if sequence.configuration is not None and "configuration" in keeps:
             writer.configuration(sequence.configuration)
+
+
+def convert(
+    source: str | PathLike[str],
+    target: str | PathLike[str],
+    *,
+    format: str | None = None,
+    with_frames: bool = True,
+    notes: list[str] | None = None,
+) -> int:
+    """Convert a file and return its number of events.
+
+    Args:
+        source: Any file that `read` takes.
+        target: File to write.
+        format: Name of its format; None goes by its suffix.
+        with_frames: Take frames along where `target` can hold them; the whole file is then held in memory.
+            Otherwise events stream through, whatever the size of the file.
+        notes: Gets sentences about what was skipped, repaired or guessed.
+
+    Raises:
+        InputError: As for `read` and `create`.
+    """
+    if with_frames and "frames" in writable(target, format).keeps:
+        sequence = read(source, notes=notes)
+        if sequence.frames is None or sequence.frame_times is None:
+            sequence = replace(sequence, frames=None, frame_times=None, frame_exposure=None, flow=None)
+        write(target, sequence, format=format)
+        return len(sequence.events)
+    total = 0
+    with create(target, format=format) as writer:
+        for part in stream(source, notes=notes):
+            writer.events(part)
+            total += len(part)
+    return total
 
 
 def _source(path: str | PathLike[str], size: Size | None, notes: list[str] | None) -> Source:
