@@ -10,15 +10,25 @@ from dase.effects.base import Effect as Effect
 from dase.effects.base import Parameter as Parameter
 from dase.effects.base import choice as choice
 from dase.effects.base import parameter as parameter
+from dase.effects.latency import Latency
 from dase.effects.leak import Leak
 from dase.effects.mismatch import Mismatch
+from dase.effects.readout import Readout
 from dase.effects.refractory import Refractory
+from dase.effects.row_scan import RowScan
 from dase.effects.shot import Shot
+from dase.effects.stream import Reader as Reader
+from dase.effects.stream import StreamEffect as StreamEffect
 from dase.effects.threshold import Threshold
+from dase.effects.timestamp import Timestamp
 from dase.errors import InputError, nearest
 
 EFFECTS: dict[str, type[Effect]] = {
-    effect.name: effect for effect in (Threshold, Mismatch, Bandwidth, Leak, Shot, Refractory)
+    effect.name: effect
+    for effect in (
+        *(Threshold, Mismatch, Bandwidth, Leak, Shot, Refractory),
+        *(Latency, RowScan, Readout, Timestamp),
+    )
 }
 """Name in sensor files to class, in the order in which they act."""
 
