@@ -16,7 +16,6 @@ from os import PathLike
 from pathlib import Path
 
 from dase.errors import InputError
-from dase.events import Events
 from dase.io import h5, npz
 from dase.io.sequence import Sequence as Sequence
 from dase.io.sequence import Writer as Writer
@@ -78,9 +77,7 @@ def write(path: str | PathLike[str], sequence: Sequence) -> None:
                 span = 0.0 if exposure is None else float(exposure[index])
                 writer.frame(float(time), grey, None if flow is None else flow[index], exposure=span)
         for i in range(0, max(len(events), 1), PART):
-            k = slice(i, i + PART)
-            part = Events(events.t[k], events.x[k], events.y[k], events.p[k], events.width, events.height)
-            writer.events(part)
+            writer.events(events.select(slice(i, i + PART)))
         if sequence.thresholds is not None:
             writer.thresholds(sequence.thresholds)
         if sequence.configuration is not None:
