@@ -84,6 +84,8 @@ class Events:
 
     def select(self, index: slice | NDArray[Any]) -> Events:
         """Return the events that a slice, a mask or indices choose; they must stay sorted by time."""
+        if not isinstance(index, slice) and index.dtype == np.bool_:
+            index = np.flatnonzero(index)  # once, not for each column
         label = None if self.label is None else self.label[index]
         t, x, y, p = (getattr(self, name)[index] for name in "txyp")
         return Events(t, x, y, p, self.width, self.height, label)

@@ -20,6 +20,10 @@ LONGEST = 4e6
 """Readers reckon in whole picoseconds of 64 bits, which hold times up to this [s]."""
 
 
+PART = 1 << 17
+"""Events that go through the readers at once: few enough to be sorted within the caches."""
+
+
 class Outlet:
     """The way out of a camera: its readout effects in the order in which the sensor has them.
 
@@ -59,6 +63,15 @@ class Outlet:
                 f"readout effects need times within {LONGEST:g} s of 0, "
                 f"got {events.t[0]:g}..{events.t[-1]:g} s"
             )
+        if not self._readers:
+            return events
+        out = []
+        for i in range(0, max(len(events), 1), PART):
+            end = float(events.t[i + PART]) if i + PART < len(events) else until
+            out.append(self._through(events.select(slice(i, i + PART)), end))
+        return Events.concatenate(out)
+
+    def _through(self, events: Events, until: float) -> Events:
         for reader in self._readers:
             events, until = reader.push(events, until)
         return events

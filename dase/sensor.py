@@ -292,6 +292,7 @@ class Pixels:
         clock.t = wp.array(times.astype(np.float32), dtype=float, device=to)
         clock.dt = wp.array(dt.astype(np.float32), dtype=float, device=to)
         clock.begin = wp.array(begin.astype(np.int64), dtype=wp.int64, device=to)
+        clock.span = wp.int64(int(stamps[-1] - stamps[0]))
         clock.length = wp.array(short, dtype=float, device=to)
         # runs of one window, so that a pixel writes its counts once per window
         run = np.flatnonzero(np.diff(windows, prepend=windows[0] - 1))

@@ -101,6 +101,7 @@ class Clock:
     dt: wp.array[float]  # (K,) [s], REST at the first sample of all
     begin: wp.array[wp.int64]  # (K,) begin of the step [ns since the chunk's begin]
     length: wp.array[float]  # (K,) duration of the step [ns]
+    span: wp.int64  # of the chunk [ns]
     run: wp.array[int]  # (R + 1,) samples at which runs of one window begin, and K
     window: wp.array[int]  # (R,) window that a run is counted in; -1 for none
 
@@ -124,13 +125,18 @@ class Keys:
 
 
 @wp.func
-def deposit(sink: Keys, clock: Clock, row: int, i: int, size: int, k: int, at: float, late: float, code: int):
-    """Keep one event that happened when the share `at` of step k had passed and left `late` [s] after."""
+def leaving_time(clock: Clock, k: int, at: float, late: float) -> wp.int64:
+    """When an event of the share `at` of step k leaves, `late` [s] after it [ns since the chunk's begin]."""
+    time = clock.begin[k] + wp.int64(wp.min(at * clock.length[k], clock.length[k]))
+    return time + wp.int64(wp.round(late * 1.0e9))
+
+
+@wp.func
+def deposit(sink: Keys, row: int, i: int, size: int, time: wp.int64, code: int):
+    """Keep one event that leaves its pixel at `time` [ns since the chunk's begin]."""
     slab = i / sink.slab
     slot = wp.atomic_add(sink.used, row, slab, 1)
     if slot < sink.keys.shape[2]:
-        time = clock.begin[k] + wp.int64(wp.min(at * clock.length[k], clock.length[k]))
-        time += wp.int64(wp.round(late * 1.0e9))
         place = wp.int64(row) * wp.int64(size) + wp.int64(i)
         place |= time << wp.int64(sink.bits)
         sink.keys[row, slab, slot] = (place << wp.int64(sink.low)) | wp.int64(code)
@@ -255,6 +261,7 @@ class _Writer:
             "Sink": SINKS[sink],
             "Clock": Clock,
             "deposit": deposit,
+            "leaving_time": leaving_time,
             "key": key,
             "uniform": uniform,
             "normal": normal,
@@ -360,6 +367,9 @@ class _Writer:
         self.add(*(f"on, off = {call}" for call in calls))
         self.add(*(f"{name} = float(0.0)" for name in self.states), "if begin > 0:")
         self.add(*(f"    {name} = state_in[{at}, row, i]" for at, name in enumerate(self.states)))
+        if "leaving" in self.states and self.sink != "counts":
+            # the state holds the bits of whole nanoseconds, which float32 would round
+            self.add("leaves = wp.int64(wp.cast(leaving, wp.int32))")
 
     def loop(self) -> None:
         """One sample after the other, then the state is kept."""
@@ -390,6 +400,8 @@ class _Writer:
             self.add("    sink.counts[row, window, 0, i] = off_count")
             self.add("    sink.counts[row, window, 1, i] = on_count")
         self.depth -= 1
+        if "leaving" in self.states and self.sink != "counts":
+            self.add("leaving = wp.cast(wp.int32(wp.max(leaves - clock.span, wp.int64(0))), float)")
         self.add(*(f"state_out[{at}, row, i] = {name}" for at, name in enumerate(self.states)))
 
     def sense(self) -> None:
@@ -454,8 +466,6 @@ class _Writer:
         self.add("signal = voltage")
         if "age" in self.states:
             self.add("age += dt")
-        if "leaving" in self.states:
-            self.add("leaving -= dt")
 
     def delays(self) -> bool:
         """Whether events that a gate holds back come later."""
@@ -578,15 +588,15 @@ class _Writer:
         """Return the line that begins to count the leak anew, the memory being set where `leaks` looked."""
         return ["drained = -slipped"] if "drained" in self.states else []
 
-    def late(self, share: str) -> str:
-        """Return the time from a crossing to its event's leaving; events of one pixel never overtake."""
+    def leave(self, share: str) -> str:
+        """Return the time at which an event leaves; events of one pixel do not overtake each other."""
         delays = [self.call("delay", effect, function) for effect, function in self.of("delay")]
         if not delays:
-            return "0.0"
+            return f"leaving_time(clock, k, {share}, 0.0)"
         self.add("late = float(0.0)", *(f"late += {call}" for call in delays))
-        self.add(f"late = wp.clamp(wp.max(late, leaving - {share} * dt), 0.0, {LATEST})")
-        self.add(f"leaving = {share} * dt + late")
-        return "late"
+        self.add(f"late = wp.clamp(late, 0.0, {LATEST})")
+        self.add(f"leaves = wp.max(leaves, leaving_time(clock, k, {share}, late))")
+        return "leaves"
 
     def event(self, share: str, polarity: str, label: str) -> None:
         """Emit an event after `share` of the step."""
@@ -594,7 +604,7 @@ class _Writer:
             self.add(f"on_count += {polarity}", f"off_count += 1 - {polarity}")
         else:
             code = f"{polarity} * 4 + {label}" if self.sink == "labels" else polarity
-            self.add(f"deposit(sink, clock, row, i, size, k, {share}, {self.late(share)}, {code})")
+            self.add(f"deposit(sink, row, i, size, {self.leave(share)}, {code})")
         if "age" in self.states:
             self.add(f"age = -{share} * dt")
 

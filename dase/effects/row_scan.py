@@ -33,18 +33,16 @@ class Scan(Reader):
         """Give the events whose line is read before `until`, one for each pixel and scan."""
         waiting = Events.concatenate([self._waiting, events])
         due = np.concatenate([self._due, self.next_line(events)])
-        read = due * self._line // 1000
-        leaves = read < instant(until)
+        leaves = due * self._line // 1000 < instant(until)
         self._waiting, self._due = waiting.select(~leaves), due[~leaves]
-        waiting, due, read = waiting.select(leaves), due[leaves], read[leaves]
+        waiting, due = waiting.select(leaves), due[leaves]
         across = waiting.x if self._direction in ("down", "up") else waiting.y
         index = order(due, across.astype(np.int64))
         line, across = due[index], across[index]
         # a pixel holds its first request until it is read, and does not look at the light meanwhile
         first = np.ones(len(index), np.bool_)
         first[1:] = (line[1:] != line[:-1]) | (across[1:] != across[:-1])
-        index = index[first]
-        return replace(waiting.select(index), t=seconds(read[index])), until
+        return replace(waiting.select(index[first]), t=seconds(line[first] * self._line // 1000)), until
 
     def next_line(self, events: Events) -> NDArray[np.int64]:
         """Return the number of the line at whose reading each event leaves, shape (N,)."""

@@ -9,10 +9,12 @@ from dataclasses import dataclass
 from typing import ClassVar
 
 import numpy as np
+import warp as wp
 from numpy.typing import ArrayLike, NDArray
 
 from dase.effects.base import Effect
 from dase.events import Events
+from dase.kernels import launch
 
 FOREVER = 1 << 62
 """A time that never comes [ns]."""
@@ -82,17 +84,16 @@ def order(*columns: NDArray[np.int64]) -> NDArray[np.int64]:
         columns: Whole numbers, shape (N,) each.
     """
     count = len(columns[0])
-    room = max(count - 1, 1).bit_length()
-    bits = room
-    key = np.zeros(count, np.int64)
+    key, bits = np.zeros(2 * count, np.int64), 0  # the second half is room for the sort
     for column in columns if count else ():
         least = int(column.min())
         width = (int(column.max()) - least).bit_length()
         bits += width
-        if bits > 63:
+        if bits > 62:
             return np.lexsort(columns[::-1])
-        key = (key << width) | (column - least)
-    # one sort of (columns, index) in 64 bits is several times faster than an indirect sort
-    key = (key << room) | np.arange(count)
-    key.sort()
-    return key & ((1 << room) - 1)
+        key[:count] = (key[:count] << width) | (column - least)
+    # 20 ns per event, where np.argsort takes 35 to 60
+    index, cpu = np.arange(2 * count, dtype=np.int32), launch.device("cpu")
+    pairs = (wp.array(a, dtype=d, device=cpu, copy=False) for a, d in ((key, wp.int64), (index, wp.int32)))
+    wp.utils.radix_sort_pairs(*pairs, count, begin_bit=0, end_bit=max(bits, 1))
+    return index[:count].astype(np.int64)

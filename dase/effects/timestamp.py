@@ -53,10 +53,10 @@ class Stamp(Reader):
             events = Events.concatenate([self._waiting, events])
             at = np.concatenate([self._at, at])
         bound = bound if bound == FOREVER else bound - self._reach
-        leaves = at < bound
-        self._waiting, self._at = events.select(~leaves), at[~leaves]
-        index = np.flatnonzero(leaves)
-        index = index[order(at[index])]
+        stays = np.flatnonzero(at >= bound)
+        self._waiting, self._at = events.select(stays), at[stays]
+        leaves = np.flatnonzero(at < bound)
+        index = leaves[order(at[leaves])]
         return events.select(index), at[index], bound
 
 
