@@ -24,7 +24,7 @@ def list_effects() -> None:
 @click.argument("name")
 def show_effect(name: str) -> None:
     """Describe the effect NAME: physics, parameters, source."""
-    from dase.effects import find
+    from dase.effects import StreamEffect, find
 
     effect = find(name)
     click.echo(f"{effect.name}: {effect.about()}\n")
@@ -36,5 +36,6 @@ def show_effect(name: str) -> None:
         click.echo(f"      {p.bounds[0]:g} to {p.bounds[1]:g}, plausible {low:g} to {high:g}{off}")
     for name, among in effect.choices().items():
         click.echo(f"  {name}: {' or '.join(among)}")
-    click.echo(f"\nStages: {', '.join(effect.stages) or 'core of the change detector'}")
+    elsewhere = "readout" if issubclass(effect, StreamEffect) else "core of the change detector"
+    click.echo(f"\nStages: {', '.join(effect.stages) or elsewhere}")
     click.echo(f"Source: {effect.source}")

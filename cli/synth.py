@@ -60,6 +60,7 @@ def parse_size(ctx: click.Context, param: click.Parameter, value: str | None) ->
 @click.option(
     "--frame-rate", default=60.0, show_default=True, help="Of the frames and the flow that are stored [Hz]."
 )
+@click.option("--labels", is_flag=True, help="Mark events as signal, leak, shot noise or hot pixel.")
 @click.option("--backend", default="cpu", show_default=True, help="cpu or cuda.")
 @click.option(
     "--video", type=click.Path(path_type=Path), help="Simulate this video file or folder of frames instead."
@@ -78,6 +79,7 @@ def command(
     jobs: int | None,
     format_: str,
     frame_rate: float,
+    labels: bool,
     backend: str,
     video: Path | None,
     fps: float | None,
@@ -91,7 +93,7 @@ def command(
     With --video, the events of your own high-speed video are written to the file OUT instead.
     """
     if video is not None:
-        _video(out, video, fps, sensor, size, seed, backend, frame_rate)
+        _video(out, video, fps, sensor, size, seed, backend, frame_rate, labels)
         return
     if fps is not None:
         raise click.UsageError("--fps goes with --video")
@@ -112,6 +114,7 @@ def command(
         format=format_,
         backend=backend,
         frame_rate=frame_rate,
+        labels=labels,
     )
     count = jobs if jobs is not None else (1 if backend.startswith("cuda") else os.cpu_count() or 1)
     with _bar(sequences, "sequences") as advance:
@@ -129,6 +132,7 @@ def _video(
     seed: int,
     backend: str,
     frame_rate: float,
+    labels: bool,
 ) -> None:
     """Simulate one video into the file `out`."""
     from dase import synth
@@ -145,6 +149,7 @@ def _video(
             frame_rate=frame_rate,
             seed=seed,
             device=backend,
+            labels=labels,
             progress=advance,
         )
     _summary(report)

@@ -5,11 +5,17 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import dataclass
 from itertools import pairwise
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from dase.errors import InputError
+
+LABELS = ("signal", "leak", "shot", "hot")
+"""What an event came from: a change of light, the leak of the pixel's memory, the noise of few photons, a
+hot pixel. An ON event is the leak's when, since the pixel's memory was last set, the leak brought it nearer
+to the threshold than the light did."""
 
 
 @dataclass(frozen=True)
@@ -23,6 +29,7 @@ class Events:
         p: Polarities, bool, shape (N,): True is ON.
         width: Columns of the sensor.
         height: Rows of the sensor.
+        label: Places in `LABELS`, int8, shape (N,); None where unknown.
     """
 
     t: NDArray[np.float64]
@@ -31,9 +38,14 @@ class Events:
     p: NDArray[np.bool_]
     width: int
     height: int
+    label: NDArray[np.int8] | None = None
 
     def __post_init__(self) -> None:
         sizes = {name: getattr(self, name).shape for name in "txyp"}
+        if self.label is not None and self.label.shape != self.t.shape:
+            raise InputError(
+                f"events: label must have the shape of t, {self.t.shape}, got {self.label.shape}"
+            )
         if len(set(sizes.values())) != 1 or self.t.ndim != 1:
             raise InputError(f"events: t, x, y and p must have one common shape (N,), got {sizes}")
         if self.width < 1 or self.height < 1:
@@ -56,18 +68,32 @@ class Events:
 
     @classmethod
     def concatenate(cls, parts: Iterable[Events]) -> Events:
-        """Join streams of one sensor that follow each other in time; raises InputError without a part."""
+        """Join streams of one sensor that follow each other in time; raises InputError without a part.
+
+        Labels are kept when every part that has events has labels.
+        """
         parts = list(parts)
         if not parts:
             raise InputError("events: nothing to concatenate")
         first = parts[0]
         t, x, y, p = (np.concatenate([getattr(part, name) for part in parts]) for name in "txyp")
-        return cls(t, x, y, p, first.width, first.height)
+        labels = [part.label for part in parts if len(part) or part.label is not None]
+        known = [label for label in labels if label is not None]
+        label = np.concatenate(known) if known and len(known) == len(labels) else None
+        return cls(t, x, y, p, first.width, first.height, label)
+
+    def select(self, index: slice | NDArray[Any]) -> Events:
+        """Return the events that a slice, a mask or indices choose; they must stay sorted by time."""
+        if not isinstance(index, slice) and index.dtype == np.bool_:
+            index = np.flatnonzero(index)  # once, not for each column
+        label = None if self.label is None else self.label[index]
+        t, x, y, p = (getattr(self, name)[index] for name in "txyp")
+        return Events(t, x, y, p, self.width, self.height, label)
 
     def slice(self, begin: float, end: float) -> Events:
         """Return the events with begin <= t < end [s]."""
         i, j = np.searchsorted(self.t, (begin, end))
-        return Events(self.t[i:j], self.x[i:j], self.y[i:j], self.p[i:j], self.width, self.height)
+        return self.select(slice(i, j))
 
     def counts(self, edges: ArrayLike) -> NDArray[np.int32]:
         """Count events per time window and pixel.

@@ -12,11 +12,13 @@ from numpy.typing import ArrayLike, NDArray
 
 from dase.effects import EFFECTS
 from dase.effects.base import Effect
+from dase.effects.stream import StreamEffect
 from dase.effects.threshold import Threshold
 from dase.errors import InputError
 from dase.events import Events
 from dase.kernels import events as ordering
 from dase.kernels import launch, pixel
+from dase.outlet import Outlet, Tally, rows_of
 from dase.scene import Scene
 
 CHUNK = {"cpu": 64, "cuda": 128}
@@ -82,8 +84,14 @@ class Sensor:
         return min(effect.longest_step() for effect in self.effects)
 
     def stages(self) -> tuple[pixel.Stages, ...]:
-        """Return the effects as the kernel composer sees them; the threshold is part of its core."""
-        return tuple(effect.compiled() for effect in self.effects if not isinstance(effect, Threshold))
+        """Return the pixels' effects as the kernel composer sees them; the threshold is part of its core."""
+        apart = (Threshold, StreamEffect)
+        return tuple(effect.compiled() for effect in self.effects if not isinstance(effect, apart))
+
+    def retimes(self) -> bool:
+        """Whether events leave at other times than their crossings', or not all of them leave."""
+        late = (e for e in self.effects if isinstance(e, StreamEffect) or "delay" in e.stages)
+        return not all(effect.is_off() for effect in late)
 
     def parameter_names(self) -> list[str]:
         """Return `effect.parameter` for every place of a parameter vector."""
@@ -121,6 +129,7 @@ class Pixels:
             the sensor's own.
         seed: Of every random number.
         device: `cpu`, `cuda` or a Warp name.
+        labels: Whether events are marked with what they came from.
     """
 
     def __init__(
@@ -133,6 +142,7 @@ class Pixels:
         parameters: ArrayLike | None = None,
         seed: int = 0,
         device: str = "cpu",
+        labels: bool = False,
     ):
         try:
             self.device = launch.device(device)
@@ -159,7 +169,8 @@ class Pixels:
         self.batch, self.count = len(vectors), len(self.pixels)
         self._pixels = wp.array(self.pixels, dtype=int, device=self.device)
         self._parameters = wp.array(vectors, dtype=float, device=self.device)
-        shape = (len(pixel.states(self.stages)), self.batch, self.count)
+        self.sink = "labels" if labels else "keys"
+        shape = (len(pixel.states(self.stages, self.sink)), self.batch, self.count)
         # two copies, so that a chunk whose events overran their buffer can be run again
         self._state = wp.zeros(shape, dtype=float, device=self.device)
         self._next = wp.zeros(shape, dtype=float, device=self.device)
@@ -167,6 +178,11 @@ class Pixels:
         self.begin = 0.0
         self.slab = 256 if self.device.is_cuda else 2048
         self._capacity = 4 * self.slab
+        self._bits = max((self.batch * self.count - 1).bit_length(), 1)
+        self._low = 3 if labels else 1
+        delays = any(stage == "delay" for effect in self.stages for stage, _ in effect.functions)
+        # keys of events that leave after the chunk, counted from its end
+        self._late = np.empty(0, np.int64) if delays else None
 
     def count_events(
         self, scene: Scene, times: NDArray[np.float64], windows: NDArray[np.int32], size: int
@@ -195,33 +211,50 @@ class Pixels:
         return sink.counts
 
     def emit(self, scene: Scene, times: NDArray[np.float64]) -> tuple[Events, NDArray[np.int32] | None]:
-        """Advance over `times` and return the events, and for a batch the row of each event.
+        """Advance over `times` and return the events that leave the pixels, and for a batch the row of each.
+
+        Readout effects come behind this, see `dase.outlet.Outlet`.
 
         Args:
             scene: What the pixels see.
             times: Samples [s], shape (K,), following the last ones.
         """
-        slabs = -(-self.count // self.slab)
-        bits = max((self.batch * self.count - 1).bit_length(), 1)
-        span = round((times[-1] - (self.begin if self.samples else times[0])) * 1e9)
-        if bits + 1 + span.bit_length() > 63:
+        begin = self.begin if self.samples else float(times[0])
+        span = round(float(times[-1]) * 1e9) - round(begin * 1e9)
+        longest = span if self._late is None else span + round(pixel.LATEST * 1e9)
+        if self._bits + self._low + longest.bit_length() > 63:
             raise InputError(
                 f"a chunk of {span * 1e-9:g} s with {self.batch * self.count} pixels is too long"
             )
+        keys, used = self._keys(scene, times)
+        self._advance(times)
+        found = ordering.ordered(keys, used, self._bits, self._low, self.device, self._late)
+        events, row = self._decode(found, begin)
+        if self._late is None:
+            return events, row
+        now = int(np.searchsorted(events.t, 1e-9 * float(round(self.begin * 1e9)), side="right"))
+        self._late = found.numpy()[now:] - (span << (self._bits + self._low))
+        return events.select(slice(now)), None if row is None else row[:now]
+
+    def flush(self) -> tuple[Events, NDArray[np.int32] | None]:
+        """Return the events that have not left the pixels yet, as `emit` does; time is over."""
+        late = np.empty(0, np.int64) if self._late is None else self._late
+        self._late = None if self._late is None else late[:0]
+        return self._decode(wp.array(late, dtype=wp.int64, device=self.device), self.begin)
+
+    def _keys(self, scene: Scene, times: NDArray[np.float64]) -> tuple[Any, NDArray[np.int32]]:
+        """Run the pixels until all their events fit; return the keys and how many there are per slab."""
+        slabs = -(-self.count // self.slab)
         while True:
             sink = pixel.Keys()
             sink.keys = wp.empty((self.batch, slabs, self._capacity), dtype=wp.int64, device=self.device)
             sink.used = wp.zeros((self.batch, slabs), dtype=int, device=self.device)
-            sink.slab, sink.bits = self.slab, bits
-            self._launch("keys", sink, scene, times, np.zeros(len(times), np.int32), align=self.slab)
+            sink.slab, sink.bits, sink.low = self.slab, self._bits, self._low
+            self._launch(self.sink, sink, scene, times, np.zeros(len(times), np.int32), align=self.slab)
             used = sink.used.numpy()
             if used.max() <= self._capacity:
-                break
+                return sink.keys, used
             self._capacity = int(1.25 * used.max()) + 1
-        begin = self.begin if self.samples else float(times[0])
-        self._advance(times)
-        keys = ordering.ordered(sink.keys, used, bits, self.device)
-        return self._decode(keys, bits, begin)
 
     def thresholds(self) -> NDArray[np.float32]:
         """Return the thresholds of each pixel [log intensity], shape (B, 2, N): OFF, ON."""
@@ -269,6 +302,7 @@ class Pixels:
         clock.t64 = wp.array(times, dtype=wp.float64, device=to)
         clock.dt = wp.array(dt.astype(np.float32), dtype=float, device=to)
         clock.begin = wp.array(begin.astype(np.int64), dtype=wp.int64, device=to)
+        clock.span = wp.int64(int(stamps[-1] - stamps[0]))
         clock.length = wp.array(short, dtype=float, device=to)
         # runs of one window, so that a pixel writes its counts once per window
         run = np.flatnonzero(np.diff(windows, prepend=windows[0] - 1))
@@ -281,14 +315,19 @@ class Pixels:
         self.samples += len(times)
         self.begin = float(times[-1])
 
-    def _decode(self, keys: Any, bits: int, begin: float) -> tuple[Events, NDArray[np.int32] | None]:
+    def _decode(self, keys: Any, begin: float) -> tuple[Events, NDArray[np.int32] | None]:
         n, to = len(keys), self.device
         out = [wp.empty(n, dtype=d, device=to) for d in (wp.float64, wp.uint16, wp.uint16, wp.uint8)]
         row = wp.empty(n if self.batch > 1 else 0, dtype=int, device=to)
-        inputs = [keys, bits, self.count, self._pixels, self.width, wp.int64(round(begin * 1e9)), *out, row]
+        label = wp.empty(n if self.sink == "labels" else 0, dtype=wp.int8, device=to)
+        inputs = [
+            keys, self._bits, self._low, self.count, self._pixels, self.width,
+            wp.int64(round(begin * 1e9)), *out, row, label,
+        ]  # fmt: skip
         launch.run(ordering.decode, n, inputs, to)
         t, x, y, p = (a.numpy() for a in out)
-        events = Events(t, x, y, p.view(np.bool_), self.width, self.height)
+        known = label.numpy() if self.sink == "labels" else None
+        events = Events(t, x, y, p.view(np.bool_), self.width, self.height, known)
         return events, row.numpy() if self.batch > 1 else None
 
 
@@ -318,6 +357,7 @@ def stream(
     device: str = "cpu",
     pixels: ArrayLike | None = None,
     chunk: int | None = None,
+    labels: bool = False,
 ) -> Iterator[Events]:
     """Simulate a scene and yield its events chunk after chunk, in memory that does not grow.
 
@@ -328,21 +368,44 @@ def stream(
         device: `cpu`, `cuda` or a Warp name.
         pixels: Row-major indices of the pixels to simulate; None for all.
         chunk: Samples per chunk.
+        labels: Whether events are marked with what they came from.
 
     Yields:
-        Events in order of time.
+        Events in order of time. Those that leave the sensor late come with a later chunk, or in one more part
+        at the end.
     """
-    array = Pixels(sensor, scene.width, scene.height, pixels=pixels, seed=seed, device=device)
+    array = Pixels(sensor, scene.width, scene.height, pixels=pixels, seed=seed, device=device, labels=labels)
+    for parts in _leaving(scene, array, chunk):
+        yield parts[0]
+
+
+def _leaving(scene: Scene, array: Pixels, chunk: int | None = None) -> Iterator[list[Events]]:
+    """Yield what leaves the camera chunk after chunk, a stream for each row of the batch."""
+    outlets = [
+        Outlet(array.sensor, array.width, array.height, pixels=array.count, seed=array.seed)
+        for _ in range(array.batch)
+    ]
     size = chunk or CHUNK["cuda" if array.device.is_cuda else "cpu"]
-    for times in chunks(sample_times(scene, sensor), size):
-        yield array.emit(scene, times)[0]
+    for times in chunks(sample_times(scene, array.sensor), size):
+        parts = rows_of(*array.emit(scene, times), array.batch)
+        yield [outlet.push(part, array.begin) for outlet, part in zip(outlets, parts, strict=True)]
+    rest = zip(outlets, rows_of(*array.flush(), array.batch), strict=True)
+    last = [Events.concatenate([outlet.push(part, array.begin), outlet.flush()]) for outlet, part in rest]
+    if any(len(part) for part in last):
+        yield last
 
 
 def simulate(
-    scene: Scene, sensor: Sensor, *, seed: int = 0, device: str = "cpu", pixels: ArrayLike | None = None
+    scene: Scene,
+    sensor: Sensor,
+    *,
+    seed: int = 0,
+    device: str = "cpu",
+    pixels: ArrayLike | None = None,
+    labels: bool = False,
 ) -> Events:
-    """Simulate a scene: light → photoreceptor → change detector → events; see `stream` for the arguments."""
-    return Events.concatenate(stream(scene, sensor, seed=seed, device=device, pixels=pixels))
+    """Simulate a scene: light → photoreceptor → change detector → readout; see `stream` for the arguments."""
+    return Events.concatenate(stream(scene, sensor, seed=seed, device=device, pixels=pixels, labels=labels))
 
 
 def count(
@@ -355,7 +418,10 @@ def count(
     pixels: ArrayLike | None = None,
     parameters: ArrayLike | None = None,
 ) -> NDArray[np.int32]:
-    """Simulate a scene and count events, without ever storing them or a frame.
+    """Simulate a scene and count events, without ever storing a frame.
+
+    Events are not stored either, but where the sensor has effects that move or lose them behind the change
+    detector, latency and readout effects; then a window holds the events with edge < t <= next edge.
 
     Args:
         scene: What the sensor sees.
@@ -375,6 +441,8 @@ def count(
     array = Pixels(
         sensor, scene.width, scene.height, pixels=pixels, parameters=parameters, seed=seed, device=device
     )
+    if sensor.retimes():
+        return _count_leaving(scene, array, edges)
     total = np.zeros((array.batch, len(edges) - 1, 2, array.count), np.int32)
     for times in chunks(sample_times(scene, sensor), CHUNK["cuda" if array.device.is_cuda else "cpu"]):
         windows = (np.searchsorted(edges, times, side="left") - 1).astype(np.int32)
@@ -389,3 +457,12 @@ def count(
         )
         total[:, low:high] += part.numpy()
     return total
+
+
+def _count_leaving(scene: Scene, array: Pixels, edges: NDArray[np.float64]) -> NDArray[np.int32]:
+    """Count what leaves the camera, shape (B, W, 2, N)."""
+    tallies = [Tally(edges, array.pixels, array.width * array.height) for _ in range(array.batch)]
+    for parts in _leaving(scene, array):
+        for tally, part in zip(tallies, parts, strict=True):
+            tally.add(part)
+    return np.stack([tally.counts for tally in tallies])

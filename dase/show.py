@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dase.errors import InputError
-from dase.events import Events
+from dase.events import LABELS, Events
 from dase.io.sequence import Sequence, replacing
 
 if TYPE_CHECKING:
@@ -54,6 +54,8 @@ class Statistics:
     """Events of the pixel that has most [Hz]."""
     busiest_pixel: tuple[int, int]
     """Its column and row."""
+    label_shares: tuple[float, ...] | None
+    """Share of the events with each of `dase.events.LABELS`; None where events have no labels."""
 
 
 def statistics(sequence: Sequence) -> Statistics:
@@ -89,7 +91,15 @@ def _statistics(sequence: Sequence, between: NDArray[np.float64]) -> Statistics:
         silent_pixels=int(np.count_nonzero(per_pixel == 0)),
         busiest_rate=ratio(int(per_pixel[busiest]), duration),
         busiest_pixel=(busiest % events.width, busiest // events.width),
+        label_shares=_label_shares(events),
     )
+
+
+def _label_shares(events: Events) -> tuple[float, ...] | None:
+    if events.label is None or not len(events):
+        return None
+    counts = np.bincount(events.label, minlength=len(LABELS))
+    return tuple(float(count) / len(events) for count in counts)
 
 
 def intervals(events: Events) -> NDArray[np.float64]:
@@ -111,6 +121,8 @@ def table(statistics: Statistics) -> list[tuple[str, str]]:
     s = statistics
     pixels = s.width * s.height
     x, y = s.busiest_pixel
+    shares = zip(LABELS, s.label_shares or (), strict=False)
+    said = ", ".join(f"{name} {100 * share:.1f} %" for name, share in shares)
     return [
         ("sensor", f"{s.width} x {s.height}"),
         ("duration", seconds(s.duration)),
@@ -124,6 +136,7 @@ def table(statistics: Statistics) -> list[tuple[str, str]]:
         ("interval, 99 %", seconds(s.interval_high)),
         ("silent pixels", f"{grouped(s.silent_pixels)} ({100 * s.silent_pixels / pixels:.1f} %)"),
         ("busiest pixel", f"{_metric(s.busiest_rate, 'Hz')} at ({x}, {y})" if s.events else "none"),
+        *([("labels", said)] if said else []),
     ]
 
 

@@ -22,6 +22,7 @@ from dase.errors import InputError, nearest
 from dase.interrupt import Deferred, deferred, ignored
 from dase.kernels import launch
 from dase.layers import LayerScene
+from dase.outlet import Outlet
 from dase.scene import Scene
 from dase.sensor import CHUNK, Pixels, Sensor, chunks, sample_times
 
@@ -45,6 +46,7 @@ class Job:
         format: Suffix of the files, without the dot.
         backend: `cpu` or `cuda`; they agree to float32 rounding, not to the byte.
         frame_rate: Of frames and flow [Hz].
+        labels: Whether events are marked with what they came from.
     """
 
     images: str
@@ -58,6 +60,7 @@ class Job:
     format: str = "h5"
     backend: str = "cpu"
     frame_rate: float = 60.0
+    labels: bool = False
 
     def __post_init__(self) -> None:
         if self.sequences < 1:
@@ -201,8 +204,8 @@ def _warm_up(job: Job) -> None:
     scene = regimes.draw_scene(
         np.random.default_rng(0), source, "background", width=8, height=8, duration=0.02
     )
-    array = Pixels(parse_sensor(job.sensor, "sensor"), 8, 8, device=job.backend)
-    array.emit(scene, scene.sample_times())
+    array = Pixels(parse_sensor(job.sensor, "sensor"), 8, 8, device=job.backend, labels=job.labels)
+    Outlet(array.sensor, 8, 8).push(array.emit(scene, scene.sample_times())[0], array.begin)
     scene.frames(np.zeros(1), job.backend)
     scene.flow(np.zeros(1), job.backend)
     array.thresholds()
@@ -243,39 +246,39 @@ def make_sequence(job: Job, out: Path, index: int, interrupt: Deferred) -> Repor
     scene = make_scene(job, index)
     # sequences share neither scene nor pixels' random numbers
     seed = int(np.random.default_rng([job.seed, index, 1]).integers(2**31))
+    array = Pixels(sensor, job.width, job.height, seed=seed, device=job.backend, labels=job.labels)
     with io.create(job.path(out, index)) as writer:
         writer.configuration(job.text() + f"\n[sequence]\nindex = {index}\nsensor_seed = {seed}\n")
         frame_times = np.arange(0, scene.duration, 1 / job.frame_rate)
-        report = _record(
-            scene, sensor, writer, frame_times, seed, job.backend, lambda done: interrupt.check()
-        )
+        report = _record(scene, array, writer, frame_times, lambda done: interrupt.check())
     return replace(report, seconds=time.perf_counter() - begin)
 
 
 def _record(
     scene: Scene,
-    sensor: Sensor,
+    array: Pixels,
     writer: io.Writer,
     frame_times: np.ndarray,
-    seed: int,
-    device: str,
     progress: Callable[[Report], None],
 ) -> Report:
     """Write thresholds, frames, flow and events of a scene, in order of time."""
-    array = Pixels(sensor, scene.width, scene.height, seed=seed, device=device)
+    outlet = Outlet(array.sensor, scene.width, scene.height, seed=array.seed)
     writer.thresholds(array.thresholds()[0].reshape(2, scene.height, scene.width))
-    times = sample_times(scene, sensor)
+    times = sample_times(scene, array.sensor)
     total, shown = Report(sequences=1), 0
     for part in chunks(times, CHUNK["cuda" if array.device.is_cuda else "cpu"]):
         due = int(np.searchsorted(frame_times, part[-1], side="right"))
         if due > shown:
-            _write_frames(scene, writer, frame_times[shown:due], device)
+            _write_frames(scene, writer, frame_times[shown:due], array.device.alias)
             shown = due
-        events, _ = array.emit(scene, part)
+        events = outlet.push(array.emit(scene, part)[0], array.begin)
         writer.events(events)
         done = Report(0, len(events), len(part), len(part) * array.count)
         total = total.plus(done)
         progress(done)
+    for events in (outlet.push(array.flush()[0], array.begin), outlet.flush()):
+        writer.events(events)
+        total = total.plus(Report(0, len(events)))
     return total
 
 
@@ -294,6 +297,7 @@ def record_scene(
     frame_rate: float = 60.0,
     seed: int = 0,
     device: str = "cpu",
+    labels: bool = False,
     progress: Callable[[Report], None] = lambda report: None,
 ) -> Report:
     """Simulate any scene into one file.
@@ -305,6 +309,7 @@ def record_scene(
         frame_rate: Highest rate of the samples that are also stored as frames [Hz].
         seed: Of every random number.
         device: `cpu`, `cuda` or a Warp name.
+        labels: Whether events are marked with what they came from.
         progress: Called with the report of each finished chunk.
     """
     begin = time.perf_counter()
@@ -314,6 +319,7 @@ def record_scene(
     # the first sample of each frame period; a slack of 1e-6 of it keeps equal rates equal
     period = np.floor((times - times[0]) * frame_rate + 1e-6)
     frame_times = times[np.concatenate([[True], np.diff(period) > 0])]
+    array = Pixels(sensor, scene.width, scene.height, seed=seed, device=device, labels=labels)
     with deferred() as interrupt, io.create(path) as writer:
 
         def advance(done: Report) -> None:
@@ -321,5 +327,5 @@ def record_scene(
             progress(done)
 
         writer.configuration(dump_sensor(sensor) + f'\n[run]\ndase = "{dase.__version__}"\nseed = {seed}\n')
-        report = _record(scene, sensor, writer, frame_times, seed, device, advance)
+        report = _record(scene, array, writer, frame_times, advance)
     return replace(report, seconds=time.perf_counter() - begin)

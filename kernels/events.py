@@ -30,7 +30,8 @@ def decode(
     # in
     first: int,
     keys: wp.array[wp.int64],
-    bits: int,
+    bits: int,  # of the place
+    low: int,  # bits below the place
     size: int,  # pixels per row of the batch
     pixels: wp.array[int],  # (N,)
     width: int,
@@ -41,38 +42,65 @@ def decode(
     y_out: wp.array[wp.uint16],
     p_out: wp.array[wp.uint8],
     row_out: wp.array[int],  # of the batch; of length 0 when nobody asks
+    label_out: wp.array[wp.int8],  # of length 0 when nobody asks
 ):
-    """Unpack keys: time, pixel and polarity of each event."""
+    """Unpack keys: time, pixel, polarity and label of each event."""
     _, i = wp.tid()
     i += first
     key = keys[i]
-    place = int((key >> wp.int64(1)) & ((wp.int64(1) << wp.int64(bits)) - wp.int64(1)))
+    place = int((key >> wp.int64(low)) & ((wp.int64(1) << wp.int64(bits)) - wp.int64(1)))
     pixel = pixels[place % size]
     # from whole nanoseconds, so that times never go back from chunk to chunk
-    t_out[i] = wp.float64(1.0e-9) * wp.float64(begin + (key >> wp.int64(bits + 1)))
+    t_out[i] = wp.float64(1.0e-9) * wp.float64(begin + (key >> wp.int64(bits + low)))
     x_out[i] = wp.uint16(pixel % width)
     y_out[i] = wp.uint16(pixel / width)
-    p_out[i] = wp.uint8(key & wp.int64(1))
+    p_out[i] = wp.uint8((key >> wp.int64(low - 1)) & wp.int64(1))
     if row_out.shape[0] > 0:
         row_out[i] = place / size
+    if label_out.shape[0] > 0:
+        label_out[i] = wp.int8(key & wp.int64(3))
 
 
-def ordered(keys: wp.array, used: np.ndarray, bits: int, device: wp.Device) -> wp.array:
+def ordered(
+    keys: wp.array, used: np.ndarray, bits: int, low: int, device: wp.Device, late: np.ndarray | None = None
+) -> wp.array:
     """Return all keys in order of time, then place, then polarity.
 
+    Where events leave late, those of one pixel at one time keep the order in which they happened.
+
     Args:
-        keys: Shape (B, slabs, capacity), int64: time [ns] << (bits + 1) | place << 1 | polarity.
+        keys: Shape (B, slabs, capacity), int64: time [ns], place, polarity and label.
         used: Shape (B, slabs), not above the capacity.
         bits: Of the place.
+        low: Bits below the place.
         device: Where `keys` live.
+        late: Keys that earlier chunks have left, shape (L,), or None where no event leaves late.
     """
-    rows, slabs, capacity = keys.shape
-    counts = used.reshape(-1)
-    total = int(counts.sum())
-    out = wp.empty(2 * total, dtype=wp.int64, device=device)  # the second half is room for the sort
+    out = _gathered(keys, used, np.empty(0, np.int64) if late is None else late, device)
+    total = len(out) // 2
     if total == 0:
         return out
-    start = np.concatenate([[0], np.cumsum(counts)[:-1]])
+    # a CPU slab emits its pixels one after the other, so a stable sort by time alone gives the full order
+    begin, end = (bits + low if device.is_cpu else 0), 63
+    if late is not None:
+        begin = low
+    if device.is_cpu:
+        end = max(int(out.numpy()[:total].max()).bit_length(), begin + 1)
+    idle = wp.empty(2 * total, dtype=wp.int32, device=device)
+    wp.utils.radix_sort_pairs(out, idle, total, begin_bit=begin, end_bit=end)
+    return out[:total]
+
+
+def _gathered(keys: wp.array, used: np.ndarray, late: np.ndarray, device: wp.Device) -> wp.array:
+    """Return late and new keys side by side, in the first half of an array that leaves room for the sort."""
+    rows, slabs, capacity = keys.shape
+    counts = used.reshape(-1)
+    out = wp.empty(2 * (len(late) + int(counts.sum())), dtype=wp.int64, device=device)
+    if len(late):
+        out[: len(late)].assign(late)
+    if not counts.any():
+        return out
+    start = len(late) + np.concatenate([[0], np.cumsum(counts)[:-1]])
     flat = keys.reshape((rows * slabs, capacity))
     if device.is_cpu:
         source, target = flat.numpy(), out.numpy()
@@ -81,11 +109,4 @@ def ordered(keys: wp.array, used: np.ndarray, bits: int, device: wp.Device) -> w
     else:
         arguments = [flat, *(wp.array(a, dtype=int, device=device) for a in (counts, start)), out]
         launch.run(gather, rows * slabs, arguments, device, batch=int(counts.max()))
-    # a CPU slab emits its pixels one after the other, so a stable sort by time alone gives the full order
-    low = bits + 1 if device.is_cpu else 0
-    high = 63
-    if device.is_cpu:
-        high = max(int(out.numpy()[:total].max()).bit_length(), low + 1)
-    idle = wp.empty(2 * total, dtype=wp.int32, device=device)
-    wp.utils.radix_sort_pairs(out, idle, total, begin_bit=low, end_bit=high)
-    return out[:total]
+    return out

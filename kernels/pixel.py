@@ -11,6 +11,7 @@ A pixel turns light into events in this order; each effect adds Warp functions a
     noise      (intensity, on, off, ...)  -> rate_on, rate_off    of events without a change [Hz]
     count      exact threshold crossings of the change since the last event
     gate       (age, ...)                 -> wait                 time the pixel stays dead [s]
+    delay      (intensity, polarity, ...) -> delay                until the event leaves the pixel [s]
 
 A stage function asks for what it needs by the names of its arguments: the quantities above, `t`, `dt`, `x`,
 `y`, `t64` (t in double precision, for phases of long recordings), `radius` (distance from the middle of the
@@ -43,7 +44,13 @@ REST = 1e30
 AHEAD = 4
 """Stored samples of a pixel that are under way from memory at a time."""
 
-STAGES = ("light", "respond", "threshold", "redraw", "drift", "noise", "gate")
+LATEST = 1.0
+"""Longest time from a crossing to its event's leaving the pixel [s]."""
+
+SIGNAL, LEAK, SHOT = 0, 1, 2
+"""Labels of events: places in `dase.events.LABELS`."""
+
+STAGES = ("light", "respond", "threshold", "redraw", "drift", "noise", "gate", "delay")
 CORE = ("on", "off", "phase", "log_eps")
 """Parameters of the change detector itself; they lead the parameter vector."""
 
@@ -55,6 +62,7 @@ QUANTITIES = {
     "drift": ("intensity", "on", "off"),
     "noise": ("intensity", "on", "off"),
     "gate": ("age",),
+    "delay": ("intensity", "polarity"),
 }
 """What the functions of a stage may ask for beside parameters, states, random numbers and `ANYWHERE`."""
 
@@ -77,6 +85,7 @@ class Stages:
         parameters: Names, in the order of their places in the parameter vector.
         states: Names of what a pixel remembers from sample to sample; all zero at the start.
         delays: Whether the events that `gate` holds back come later; otherwise they are lost.
+        label: Of the events that `noise` makes.
     """
 
     name: str
@@ -84,6 +93,7 @@ class Stages:
     parameters: tuple[str, ...] = ()
     states: tuple[str, ...] = ()
     delays: bool = False
+    label: int = SHOT
 
 
 @wp.struct
@@ -102,6 +112,7 @@ class Clock:
     dt: wp.array[float]  # (K,) [s], REST at the first sample of all
     begin: wp.array[wp.int64]  # (K,) begin of the step [ns since the chunk's begin]
     length: wp.array[float]  # (K,) duration of the step [ns]
+    span: wp.int64  # of the chunk [ns]
     run: wp.array[int]  # (R + 1,) samples at which runs of one window begin, and K
     window: wp.array[int]  # (R,) window that a run is counted in; -1 for none
 
@@ -115,23 +126,31 @@ class Counts:
 
 @wp.struct
 class Keys:
-    """Sink that keeps every event as one sortable 64-bit key: time, place, polarity."""
+    """Sink that keeps every event as one sortable 64-bit key: time, place, polarity, label if asked for."""
 
     keys: wp.array3d[wp.int64]  # (B, slabs, capacity)
     used: wp.array2d[int]  # (B, slabs) events met; more than the capacity asks for another run
     slab: int  # pixels per slab
     bits: int  # of row · N + i
+    low: int  # bits below: 1 of the polarity, 2 more of the label
 
 
 @wp.func
-def deposit(sink: Keys, clock: Clock, row: int, i: int, size: int, k: int, at: float, on: int):
-    """Keep one event that happened when the share `at` of step k had passed."""
+def leaving_time(clock: Clock, k: int, at: float, late: float) -> wp.int64:
+    """When an event of the share `at` of step k leaves, `late` [s] after it [ns since the chunk's begin]."""
+    time = clock.begin[k] + wp.int64(wp.min(at * clock.length[k], clock.length[k]))
+    return time + wp.int64(wp.round(late * 1.0e9))
+
+
+@wp.func
+def deposit(sink: Keys, row: int, i: int, size: int, time: wp.int64, code: int):
+    """Keep one event that leaves its pixel at `time` [ns since the chunk's begin]."""
     slab = i / sink.slab
     slot = wp.atomic_add(sink.used, row, slab, 1)
     if slot < sink.keys.shape[2]:
-        time = clock.begin[k] + wp.int64(wp.min(at * clock.length[k], clock.length[k]))
         place = wp.int64(row) * wp.int64(size) + wp.int64(i)
-        sink.keys[row, slab, slot] = (((time << wp.int64(sink.bits)) | place) << wp.int64(1)) | wp.int64(on)
+        place |= time << wp.int64(sink.bits)
+        sink.keys[row, slab, slot] = (place << wp.int64(sink.low)) | wp.int64(code)
 
 
 @wp.func_native(
@@ -173,7 +192,7 @@ def waiting(key: int, index: int) -> float:
 
 
 SOURCES = {"frames": Frames, "log": Frames, "layers": Layers, "background": Layers}
-SINKS = {"counts": Counts, "keys": Keys}
+SINKS = {"counts": Counts, "keys": Keys, "labels": Keys}
 
 
 def stream(name: str) -> int:
@@ -188,7 +207,7 @@ def compose(stages: tuple[Stages, ...], source: str, sink: str) -> wp.Kernel:
     Args:
         stages: Effects, in order.
         source: `frames`, `log`, `layers`, or `background` for a scene of one layer.
-        sink: `counts` or `keys`.
+        sink: `counts`, `keys`, or `labels` for keys with labels.
 
     Returns:
         A kernel over (B, N) threads; its arguments are listed by `signature`.
@@ -219,13 +238,15 @@ def source_text(stages: tuple[Stages, ...], source: str, sink: str) -> str:
     return _Writer(stages, source, sink).kernel()
 
 
-def states(stages: Sequence[Stages]) -> list[str]:
+def states(stages: Sequence[Stages], sink: str = "keys") -> list[str]:
     """Return the names of what a pixel with these effects remembers, in the order of the state array."""
     kinds = {stage for effect in stages for stage, _ in effect.functions}
     names = ["signal", "reference"]
     names += ["leaked", "leaked_rest"] if "drift" in kinds else []
     names += ["age"] if "gate" in kinds else []
     names += ["redraws"] if "redraw" in kinds else []
+    names += ["leaving"] if "delay" in kinds else []
+    names += ["drained"] if "drift" in kinds and sink == "labels" else []
     for effect in stages:
         if any(stage == "noise" for stage, _ in effect.functions):
             names += [f"{effect.name}_hazard", f"{effect.name}_rest", f"{effect.name}_events"]
@@ -240,7 +261,7 @@ class _Writer:
         self.stages, self.source, self.sink = stages, source, sink
         self.lines: list[str] = []
         self.depth = 0
-        self.states = states(stages)
+        self.states = states(stages, sink)
         self.places = {name: i for i, name in enumerate(CORE)}
         for effect in stages:
             for parameter in effect.parameters:
@@ -252,6 +273,7 @@ class _Writer:
             "Sink": SINKS[sink],
             "Clock": Clock,
             "deposit": deposit,
+            "leaving_time": leaving_time,
             "key": key,
             "uniform": uniform,
             "normal": normal,
@@ -273,7 +295,7 @@ class _Writer:
 
     def call(self, stage: str, effect: Stages, function: Any) -> str:
         """Return the call of a stage function, arguments resolved by name."""
-        name = f"{effect.name}_{stage}"
+        name = f"{stage}_of_{effect.name}"  # no name of a parameter
         self.scope[name] = function
         arguments = [self.argument(stage, effect, a) for a in inspect.signature(function.func).parameters]
         return f"{name}({', '.join(arguments)})"
@@ -368,6 +390,10 @@ class _Writer:
         if anew:
             self.add("mean_on = on", "mean_off = off", *anew[2:])
 
+        if "leaving" in self.states and self.sink != "counts":
+            # the state holds the bits of whole nanoseconds, which float32 would round
+            self.add("leaves = wp.int64(wp.cast(leaving, wp.int32))")
+
     def redrawn(self) -> list[str]:
         """Return the lines that draw the thresholds of the next event, none without such an effect."""
         calls = [self.call("redraw", effect, function) for effect, function in self.of("redraw")]
@@ -403,6 +429,8 @@ class _Writer:
             self.add("    sink.counts[row, window, 0, i] = off_count")
             self.add("    sink.counts[row, window, 1, i] = on_count")
         self.depth -= 1
+        if "leaving" in self.states and self.sink != "counts":
+            self.add("leaving = wp.cast(wp.int32(wp.max(leaves - clock.span, wp.int64(0))), float)")
         self.add(*(f"state_out[{at}, row, i] = {name}" for at, name in enumerate(self.states)))
 
     def sense(self) -> None:
@@ -420,7 +448,7 @@ class _Writer:
         if self.source == "log":
             if self.of("light"):
                 raise ValueError("effects on light need intensities, not log intensities")
-            kinds = ("respond", "drift", "noise")
+            kinds = ("respond", "drift", "noise", "delay")
             if any("intensity" in inspect.signature(f.func).parameters for s in kinds for _, f in self.of(s)):
                 self.add("intensity = wp.exp(voltage) - log_eps")
         for effect, function in self.of("light"):
@@ -443,6 +471,7 @@ class _Writer:
     def step(self) -> None:
         """Events of one step, along the straight line from the last sample to this one."""
         self.add(self.change("signal", "before"))
+        self.add(*(["leaked_before = leaked + 0.0"] if "drained" in self.states else []))
         for effect, function in self.of("drift"):
             # what rounding loses of a short step is kept for the next (Kahan), or slow leaks would stall
             self.add(f"leak = {self.call('drift', effect, function)} * dt + leaked_rest")
@@ -484,7 +513,11 @@ class _Writer:
         self.depth += 1
         self.add("lead = phase * uniform(initial_phase_key, 0)")
         self.add("if after < 0.0 or (after == 0.0 and uniform(initial_phase_key, 1) < 0.5):")
-        self.add("    reference += lead * off", "else:", "    reference -= lead * on")
+        labelled = "drained" in self.states
+        # a pixel that starts half way is done with half of the way, whatever of it the leak will make
+        self.add("    reference += lead * off", *(["    drained -= 0.5 * lead * off"] if labelled else []))
+        self.add("else:", "    reference -= lead * on")
+        self.add(*(["    drained += 0.5 * lead * on"] if labelled else []))
         self.add(self.change("signal", "before").replace(" + leaked", ""), self.change("voltage", "after"))
         self.depth -= 1
 
@@ -510,6 +543,7 @@ class _Writer:
             self.depth -= 1
         self.add("reference += moved")
         if "leaked" in self.states:
+            self.add(*(["drained += leaked"] if "drained" in self.states else []))
             # keeps `leaked` small, where float32 resolves slow leaks
             self.add("reference -= leaked", "leaked = 0.0")
 
@@ -544,9 +578,12 @@ class _Writer:
             self.add(
                 "if wait > 0.0:", "    share += wait / dt", "if share > stop:", "    break", "passed += 1"
             )
-            self.event("share", "polarity")
+            label = self.leaks("share")
+            self.event("share", "polarity", label)
         else:
-            self.gated("share", "polarity")
+            label = self.leaks("share")
+            self.gated("share", "polarity", label)
+        self.add(*self.memorise())
         self.depth -= 1
         self.add(f"moved += float({'passed' if delays else 'crossed'}) * theta")
 
@@ -564,10 +601,10 @@ class _Writer:
         if self.delays():
             self.wait("share")
             self.add("if wait > 0.0:", "    share += wait / dt", "if share > stop:", "    break")
-            self.event("share", "polarity")
+            self.event("share", "polarity", self.leaks("share"))
         else:
-            self.gated("share", "polarity")
-        self.add("passed += 1", *self.next_draw())
+            self.gated("share", "polarity", self.leaks("share"))
+        self.add("passed += 1", *self.memorise(), *self.next_draw())
         self.add("drawn = on", "if polarity == 0:", "    drawn = -off", "if drawn != theta:")
         self.add("    moved += float(passed) * theta", "    passed = 0", "    theta = drawn")
         self.add("    crossed = int(wp.floor((value - moved) / theta))")
@@ -589,8 +626,8 @@ class _Writer:
         self.add("theta = float(0.0)", "polarity = int(0)")
         self.add("if change >= on:", "    theta = on", "    polarity = 1")
         self.add("if change <= -off:", "    theta = -off", "if theta == 0.0:", "    break")
-        self.event("at", "polarity")
-        self.add("moved += theta", *self.next_draw())
+        self.event("at", "polarity", self.leaks("at"))
+        self.add("moved += theta", *self.memorise(), *self.next_draw())
         self.wait("at")
         self.depth -= 1
 
@@ -602,25 +639,48 @@ class _Writer:
             self.add(f"wait = wp.max(wait, {self.call('gate', effect, function)})")
         self.add("age = now")
 
-    def event(self, share: str, polarity: str) -> None:
+    def leaks(self, share: str) -> str:
+        """Return the label of a crossing: whether the leak did more for it than the light did."""
+        if "drained" not in self.states:
+            return str(SIGNAL)
+        self.add(f"slipped = leaked_before + (leaked - leaked_before) * {share}", f"label = int({SIGNAL})")
+        self.add("if polarity == 1 and drained + slipped > 0.5 * on:", f"    label = {LEAK}")
+        return "label"
+
+    def memorise(self) -> list[str]:
+        """Return the line that begins to count the leak anew, the memory being set where `leaks` looked."""
+        return ["drained = -slipped"] if "drained" in self.states else []
+
+    def leave(self, share: str) -> str:
+        """Return the time at which an event leaves; events of one pixel do not overtake each other."""
+        delays = [self.call("delay", effect, function) for effect, function in self.of("delay")]
+        if not delays:
+            return f"leaving_time(clock, k, {share}, 0.0)"
+        self.add("late = float(0.0)", *(f"late += {call}" for call in delays))
+        self.add(f"late = wp.clamp(late, 0.0, {LATEST})")
+        self.add(f"leaves = wp.max(leaves, leaving_time(clock, k, {share}, late))")
+        return "leaves"
+
+    def event(self, share: str, polarity: str, label: str) -> None:
         """Emit an event after `share` of the step."""
         if self.sink == "counts":
             self.add(f"on_count += {polarity}", f"off_count += 1 - {polarity}")
         else:
-            self.add(f"deposit(sink, clock, row, i, size, k, {share}, {polarity})")
+            code = f"{polarity} * 4 + {label}" if self.sink == "labels" else polarity
+            self.add(f"deposit(sink, row, i, size, {self.leave(share)}, {code})")
         if "age" in self.states:
             self.add(f"age = -{share} * dt")
 
-    def gated(self, share: str, polarity: str, *then: str) -> None:
+    def gated(self, share: str, polarity: str, label: str, *then: str) -> None:
         """Emit an event unless the pixel is dead, and do `then`."""
         if not self.of("gate"):
-            self.event(share, polarity)
+            self.event(share, polarity, label)
             self.add(*then)
             return
         self.wait(share)
         self.add("if wait <= 0.0:")
         self.depth += 1
-        self.event(share, polarity)
+        self.event(share, polarity, label)
         self.add(*then)
         self.depth -= 1
 
@@ -635,7 +695,10 @@ class _Writer:
             f"if uniform({n}_polarity_key, int({n}_events)) * ({n}_on + {n}_off) < {n}_on:",
             "    polarity = 1",
         )
-        self.gated("stop", "polarity", "moved = value", *self.next_draw())
+        if "drained" in self.states:
+            self.add("slipped = leaked_before + (leaked - leaked_before) * stop")
+        then = ["moved = value", *self.memorise(), *self.next_draw()]
+        self.gated("stop", "polarity", str(effect.label), *then)
         self.add(f"{n}_hazard += waiting({self.noise_key(effect)}, int({n}_events))")
         self.add(COUNT_ON.format(f"{n}_events"))
         self.depth -= 1

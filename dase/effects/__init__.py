@@ -15,13 +15,19 @@ from dase.effects.dead import Dead
 from dase.effects.flicker import Flicker
 from dase.effects.hot import Hot
 from dase.effects.jitter import Jitter
+from dase.effects.latency import Latency
 from dase.effects.leak import Leak
 from dase.effects.linlog import Linlog
 from dase.effects.mismatch import Mismatch
+from dase.effects.readout import Readout
 from dase.effects.refractory import Refractory
+from dase.effects.row_scan import RowScan
 from dase.effects.second_order import SecondOrder
 from dase.effects.shot import Shot
+from dase.effects.stream import Reader as Reader
+from dase.effects.stream import StreamEffect as StreamEffect
 from dase.effects.threshold import Threshold
+from dase.effects.timestamp import Timestamp
 from dase.effects.vignetting import Vignetting
 from dase.effects.voltage_noise import VoltageNoise
 from dase.errors import InputError, nearest
@@ -45,6 +51,11 @@ _ORDER = (
     Hot,
     Refractory,
     Dead,
+    # readout
+    Latency,
+    RowScan,
+    Readout,
+    Timestamp,
 )
 
 EFFECTS: dict[str, type[Effect]] = {effect.name: effect for effect in _ORDER}

@@ -12,6 +12,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 from dase.errors import InputError, nearest
+from dase.events import LABELS
 from dase.kernels import pixel
 
 
@@ -74,6 +75,8 @@ class Effect:
     """Stage name to Warp function."""
     states: ClassVar[tuple[str, ...]] = ()
     """What a pixel remembers from sample to sample."""
+    label: ClassVar[str] = "shot"
+    """What the events of its `noise` stage are marked as, one of `dase.events.LABELS`."""
 
     def __post_init__(self) -> None:
         for p in self.parameters():
@@ -109,6 +112,10 @@ class Effect:
         """Return this effect switched off: it changes nothing, bit for bit."""
         return cls(**{p.name: p.off for p in cls.parameters() if p.off is not None})
 
+    def is_off(self) -> bool:
+        """Whether this effect changes nothing."""
+        return all(getattr(self, p.name) == p.off for p in self.parameters() if p.off is not None)
+
     @classmethod
     def from_table(cls, table: Mapping[str, Any]) -> Effect:
         """Make the effect from a table of a sensor file; raises InputError for an unknown name."""
@@ -139,6 +146,7 @@ class Effect:
             parameters=tuple(p.name for p in self.parameters()),
             states=self.states,
             delays=self.delays(),
+            label=LABELS.index(self.label),
         )
 
     @classmethod

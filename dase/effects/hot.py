@@ -38,6 +38,7 @@ class Hot(Effect):
         "(log-normal noise rates over pixels); Stoffregen et al.: Reducing the sim-to-real gap for event "
         "cameras, 2020 (shares of hot pixels)"
     )
+    label: ClassVar[str] = "hot"
     stages: ClassVar = {"noise": rates}
 
     share: float = parameter(

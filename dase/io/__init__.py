@@ -183,9 +183,7 @@ def write(path: str | PathLike[str], sequence: Sequence, *, format: str | None =
                 span = 0.0 if exposure is None else float(exposure[index])
                 writer.frame(float(time), grey, None if flow is None else flow[index], exposure=span)
         for i in range(0, max(len(events), 1), PART):
-            k = slice(i, i + PART)
-            part = Events(events.t[k], events.x[k], events.y[k], events.p[k], events.width, events.height)
-            writer.events(part)
+            writer.events(events.select(slice(i, i + PART)))
         if sequence.thresholds is not None and "thresholds" in keeps:
             writer.thresholds(sequence.thresholds)
         if sequence.configuration is not None and "configuration" in keeps:

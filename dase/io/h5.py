@@ -1,14 +1,15 @@
 """HDF5 files in the layout of S2R (Stoffregen et al., Reducing the sim-to-real gap for event cameras, 2020).
 
     events/xs, ys (int16), ts (float64 [s]), ps (bool)       shape (N,)
+    events/labels (int8, where known)                        shape (N,), places in `dase.events.LABELS`
     images/image%09d (uint8, H x W)                          attributes size, timestamp, type, event_idx
     flow/flow%09d (float32 [px/s], 2 x H x W, x then y)      attributes size, timestamp, event_idx
     dase/thresholds (float32, 2 x H x W), attribute configuration
     root attributes num_events, num_pos, num_neg, duration, t0, tk, num_imgs, num_flow,
     sensor_resolution (height, width)
 
-`event_idx` is the index of the last event before the frame, 0 where there is none. `exposure` [s] is our
-addition to the attributes of an image that was not taken in an instant.
+`event_idx` is the index of the last event before the frame, 0 where there is none. `labels` are our addition
+to the events, and `exposure` [s] to the attributes of an image that was not taken in an instant.
 """
 
 from __future__ import annotations
@@ -41,7 +42,13 @@ COMPRESSION: dict[str, Any] = {"compression": "gzip", "compression_opts": 1, "sh
 
 LATE = -1  # marks a frame that came after later events had been written
 
-EVENT_TYPES = {"ts": np.float64, "xs": np.int16, "ys": np.int16, "ps": np.bool_}
+EVENT_TYPES: dict[str, type[np.generic]] = {
+    "ts": np.float64,
+    "xs": np.int16,
+    "ys": np.int16,
+    "ps": np.bool_,
+}
+LABEL_TYPE: dict[str, type[np.generic]] = {"labels": np.int8}
 
 
 class _Disk:
@@ -106,10 +113,9 @@ class _Writer(Writer):
         super().__init__()
         self._disk = _Disk(path)
         self._file = h5py.File(self._disk, "w")
-        for name, kind in EVENT_TYPES.items():
-            self._file.create_dataset(
-                f"events/{name}", (0,), kind, maxshape=(None,), chunks=(CHUNK,), **COMPRESSION
-            )
+        self._types = dict(EVENT_TYPES)
+        for name in EVENT_TYPES:
+            self._create(name)
         self._file.create_group("images")  # readers list it even where it is empty
         self._parts: list[tuple[NDArray[Any], ...]] = []
         self._waiting = 0
@@ -119,12 +125,21 @@ class _Writer(Writer):
         self._times: list[float] = []  # of frames
         self._before: list[int] = []  # events in the file before each frame; LATE where it must be looked up
 
+    def _create(self, name: str) -> None:
+        kind = self._types[name]
+        self._file.create_dataset(
+            f"events/{name}", (0,), kind, maxshape=(None,), chunks=(CHUNK,), **COMPRESSION
+        )
+
     def _put_events(self, part: Events) -> None:
         if max(part.width, part.height) > 32767:
             raise InputError(f"HDF5: the sensor must be at most 32767 wide, got {part.width}x{part.height}")
-        columns = (part.t, part.x, part.y, part.p)
+        columns = [part.t, part.x, part.y, part.p]
+        if part.label is not None:
+            self._types = EVENT_TYPES | LABEL_TYPE
+            columns.append(part.label)
         self._parts.append(
-            tuple(np.asarray(a).astype(kind) for a, kind in zip(columns, EVENT_TYPES.values(), strict=True))
+            tuple(np.asarray(a).astype(kind) for a, kind in zip(columns, self._types.values(), strict=True))
         )
         self._on += int(np.count_nonzero(part.p))
         self._waiting += len(part)
@@ -139,7 +154,9 @@ class _Writer(Writer):
         end = self._written + count
         for index, more in enumerate(np.searchsorted(columns[0][:count], self._times)):
             self._before[index] += int(more) if self._before[index] != LATE else 0
-        for name, column in zip(EVENT_TYPES, columns, strict=True):
+        for name, column in zip(self._types, columns, strict=True):
+            if f"events/{name}" not in self._file:
+                self._create(name)
             dataset = self._file[f"events/{name}"]
             dataset.resize((end,))
             dataset[self._written : end] = column[:count]
@@ -184,6 +201,9 @@ class _Writer(Writer):
     def finish(self) -> None:
         """Write the rest of the events, the index of every frame and the totals."""
         self._flush(self._waiting)
+        if self._with_labels and not self._written:
+            self._types = EVENT_TYPES | LABEL_TYPE
+            self._create("labels")
         ts, written = self._file["events/ts"], self._written
         if LATE in self._before:
             self._before = sum(
@@ -226,6 +246,7 @@ def read(path: Path) -> Sequence:
 
 def _parse(file: Any) -> Sequence:
     events = {name: _dataset(file, f"events/{name}")[:] for name in EVENT_TYPES}
+    label = file["events/labels"][:] if "events/labels" in file else None
     images, flows = _members(file, "images"), _members(file, "flow")
     frames = _stack(images, np.uint8, 2) if images else None
     flow = _flow(images, flows)
@@ -241,6 +262,7 @@ def _parse(file: Any) -> Sequence:
             events["ps"],
             size=None if size is None else (int(size[0]), int(size[1])),
             maps=(frames, flow, thresholds),
+            label=label,
         ),
         frames,
         np.array([_attribute(image, "timestamp") for image in images.values()]) if images else None,

@@ -1,6 +1,7 @@
 """NumPy archives of one sequence: small enough for memory, readable without this package.
 
     t_us (int32 [us]), x, y (uint16), p (uint8, 1 = ON)      shape (N,), sorted by time
+    label (int8, where known)                                shape (N,), places in `dase.events.LABELS`
     wh                                                       [width, height]
     frames (uint8)                                           shape (F, H, W)
     frame_begin_us, frame_end_us (int32 [us])                shape (F,), begin and end of the exposure
@@ -32,7 +33,7 @@ LEVEL = 1
 
 EVENT_KEYS = ("t_us", "x", "y", "p")
 FRAME_KEYS = ("frames", "frame_begin_us", "frame_end_us", "frame_us")
-KEYS = (*EVENT_KEYS, "wh", *FRAME_KEYS, "flow", "thresholds", "configuration")
+KEYS = (*EVENT_KEYS, "label", "wh", *FRAME_KEYS, "flow", "thresholds", "configuration")
 
 
 class _Writer(Writer):
@@ -42,6 +43,7 @@ class _Writer(Writer):
         super().__init__()
         self._path = path
         self._parts: list[tuple[NDArray[Any], ...]] = []
+        self._labels: list[NDArray[np.int8]] = []
         self._grey: list[NDArray[np.uint8]] = []
         self._flow: list[NDArray[np.float32]] = []
         self._begin_us: list[NDArray[np.int32]] = []
@@ -51,6 +53,8 @@ class _Writer(Writer):
 
     def _put_events(self, part: Events) -> None:
         self._parts.append(_columns(part))
+        if part.label is not None:
+            self._labels.append(part.label.astype(np.int8))
 
     def _put_frame(
         self,
@@ -79,6 +83,8 @@ class _Writer(Writer):
         with zipfile.ZipFile(self._path, "w", zipfile.ZIP_DEFLATED, compresslevel=LEVEL) as archive:
             for name, column in zip(EVENT_KEYS, zip(*parts, strict=True), strict=True):
                 _store(archive, name, np.concatenate(column))
+            if self._with_labels:
+                _store(archive, "label", np.concatenate([np.empty(0, np.int8), *self._labels]))
             _store(archive, "wh", np.array(self.size[::-1], np.int64))
             if self._grey:
                 _store(archive, "frames", np.stack(self._grey))
@@ -92,6 +98,7 @@ class _Writer(Writer):
     def abandon(self) -> None:
         """Let go of the parts."""
         self._parts.clear()
+        self._labels.clear()
 
 
 def _columns(part: Events) -> tuple[NDArray[Any], ...]:
@@ -173,6 +180,7 @@ def _events(content: dict[str, NDArray[Any]], maps: tuple[NDArray[Any] | None, .
         content["p"],
         size=None if wh is None else (int(wh[1]), int(wh[0])),
         maps=maps,
+        label=content.get("label"),
     )
 
 

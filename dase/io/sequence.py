@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dase.errors import InputError
-from dase.events import Events
+from dase.events import LABELS, Events
 
 
 @dataclass(frozen=True)
@@ -81,6 +81,7 @@ class Writer(ABC):
         self._last_event = -math.inf
         self._last_frame = -math.inf
         self._with_flow: bool | None = None
+        self._with_labels: bool | None = None
         self._frames = 0
         self._once: set[str] = set()
 
@@ -91,9 +92,14 @@ class Writer(ABC):
             part: Events that follow those written before; may be empty, which still tells the size.
 
         Raises:
-            InputError: They go back in time, lie outside the sensor, or the sensor's size changed.
+            InputError: They go back in time, lie outside the sensor, have labels where others have none, or
+                the sensor's size changed.
         """
         self._same_size((part.height, part.width), "events")
+        if len(part) or part.label is not None:
+            if self._with_labels not in (None, part.label is not None):
+                raise InputError("events: labels must come with all events or with none")
+            self._with_labels = part.label is not None
         if not len(part):
             return
         begin, end = float(part.t[0]), float(part.t[-1])
@@ -260,6 +266,7 @@ def sensor_events(
     *,
     size: tuple[int, int] | None,
     maps: tuple[NDArray[Any] | None, ...] = (),
+    label: NDArray[Any] | None = None,
 ) -> Events:
     """Build events from what a file holds, sorting them by time where they are not.
 
@@ -270,9 +277,10 @@ def sensor_events(
         p: Polarities, shape (N,); above zero is ON.
         size: Height and width as the file says; writers of such files are known to swap the two.
         maps: Arrays (..., H, W); the first that is there decides the size over `size`.
+        label: Places in `LABELS`, shape (N,), or None.
 
     Raises:
-        InputError: The size is unknown, or events lie outside the sensor.
+        InputError: The size is unknown, events lie outside the sensor, or labels are not of `LABELS`.
     """
     for array in maps:
         if array is not None and array.ndim >= 2:
@@ -285,11 +293,14 @@ def sensor_events(
         raise InputError("does not say how large the sensor is")
     if len({len(t), len(x), len(y), len(p)}) == 1 and len(x) and not _inside(x, y, size):
         raise InputError(f"events reach to column {x.max()}, row {y.max()}: outside {size[1]}x{size[0]}")
-    on = p > 0
+    if label is not None:
+        if label.dtype.kind not in "iu" or np.any((label < 0) | (label >= len(LABELS))):
+            raise InputError(f"labels must be whole numbers in 0..{len(LABELS) - 1}: {', '.join(LABELS)}")
+        label = label.astype(np.int8, copy=False)
+    events = Events(t, x, y, p > 0, size[1], size[0], label)
     if len(t) and not np.all(t[1:] >= t[:-1]):
-        order = np.argsort(t, kind="stable")
-        t, x, y, on = t[order], x[order], y[order], on[order]
-    return Events(t, x, y, on, size[1], size[0])
+        return events.select(np.argsort(t, kind="stable"))
+    return events
 
 
 def _inside(x: NDArray[np.uint16], y: NDArray[np.uint16], size: tuple[int, int]) -> bool:

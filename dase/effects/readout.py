@@ -1,0 +1,83 @@
+"""The bus from the pixels to the world, which takes one event at a time."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from typing import ClassVar
+
+import numpy as np
+import warp as wp
+
+from dase.effects.base import choice, parameter
+from dase.effects.stream import Reader, StreamEffect, nanoseconds, seconds
+from dase.events import Events
+from dase.kernels import launch
+from dase.kernels.readout import NEVER, queue
+
+
+class Bus(Reader):
+    """Sends events one after the other."""
+
+    def __init__(self, service: int, patience: int):
+        self._service, self._patience = service, patience  # [ps]
+        self._cpu = launch.device("cpu")
+        self._busy = np.array([NEVER], np.int64)  # until when [ps]
+
+    def push(self, events: Events, until: float) -> tuple[Events, float]:
+        """Give all events that find room, at the times at which they are through, be it after `until`."""
+        arrival, through = 1000 * nanoseconds(events.t), np.empty(len(events), np.int64)
+        arrays = [wp.array(a, dtype=wp.int64, device=self._cpu, copy=False) for a in (arrival, through)]
+        busy = wp.array(self._busy, dtype=wp.int64, device=self._cpu, copy=False)
+        inputs = [arrays[0], wp.int64(self._service), wp.int64(self._patience), busy, arrays[1]]
+        wp.launch(queue, dim=1, inputs=inputs, device=self._cpu)
+        lost = through == NEVER
+        if lost.any():
+            events, through = events.select(~lost), through[~lost]
+        return replace(events, t=seconds(through // 1000)), until
+
+
+@dataclass(frozen=True, kw_only=True)
+class Readout(StreamEffect):
+    """A bus of limited bandwidth between the pixels and the file.
+
+    All pixels share one way out, which takes one event at a time. When many ask at once, as when the whole
+    scene moves or flickers, events queue up and come late, and when the queue is full they are lost. Then
+    the event rate stays at its limit whatever happens in the scene.
+
+    Sending an event takes 1/`rate`, and its time is that at which it is through. With `mode = "delay"`, up
+    to `depth` events are in the queue, the one being sent among them; an event that finds no place is lost.
+    With `mode = "drop"` there is no queue: an event that finds the bus busy is lost.
+    """
+
+    name: ClassVar[str] = "readout"
+    source: ClassVar[str] = (
+        "Boahen: Point-to-point connectivity between neuromorphic chips using address events, 2000; "
+        "Finateu et al.: A 1280x720 back-illuminated stacked temporal contrast event-based vision sensor "
+        "with 4.86 um pixels, 1.066 GEPS readout, programmable event-rate controller and compressive "
+        "data-formatting pipeline, 2020"
+    )
+    per_pixel: ClassVar[bool] = False
+
+    rate: float = parameter(
+        1e7,
+        unit="Hz",
+        off=math.inf,
+        bounds=(1.0, math.inf),
+        plausible=(5e5, 1e9),
+        about="most events per second, of the whole sensor",
+    )
+    depth: float = parameter(
+        4096.0,
+        unit="1",
+        bounds=(1.0, math.inf),
+        plausible=(1.0, 1e6),
+        about="events that the queue holds in mode delay",
+    )
+    mode: str = choice("delay", among=("delay", "drop"), about="what becomes of events while the bus is busy")
+
+    def reader(self, width: int, height: int, seed: int) -> Bus:
+        """Return the bus of one sensor."""
+        service = 0 if self.rate == math.inf else round(1e12 / self.rate)
+        room = 0.0 if self.mode == "drop" else self.depth - 1
+        return Bus(service, round(min(room * service, 2.0**61)) if service else 0)

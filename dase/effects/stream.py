@@ -1,0 +1,99 @@
+"""What a readout effect is to dase: it acts on the stream of events between the pixels and the file."""
+
+from __future__ import annotations
+
+import math
+import zlib
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
+from typing import ClassVar
+
+import numpy as np
+import warp as wp
+from numpy.typing import ArrayLike, NDArray
+
+from dase.effects.base import Effect
+from dase.events import Events
+from dase.kernels import launch
+
+FOREVER = 1 << 62
+"""A time that never comes [ns]."""
+
+
+class Reader(ABC):
+    """One readout effect at work on one stream; remembers what it needs from part to part."""
+
+    @abstractmethod
+    def push(self, events: Events, until: float) -> tuple[Events, float]:
+        """Take a part of the stream and return what can leave.
+
+        Args:
+            events: Sorted by time; they follow those of the parts before.
+            until: No later part begins earlier [s]; infinity after the last one, when everything must leave.
+
+        Returns:
+            Events in order of time, none earlier than any returned before, and the time before which none
+            will come any more [s].
+        """
+
+
+@dataclass(frozen=True, kw_only=True)
+class StreamEffect(Effect):
+    """A physical effect between the pixels and the file.
+
+    Its stages are empty; `reader` gives the object that works on the stream. What comes out must not depend
+    on how the stream is cut into parts. Its parameters have no place in a parameter vector, for the pixels of
+    a batch do not know of them.
+    """
+
+    stages: ClassVar = {}
+    per_pixel: ClassVar[bool] = True
+    """Whether what becomes of an event does not depend on other pixels, so that some of them can be
+    simulated alone."""
+
+    @abstractmethod
+    def reader(self, width: int, height: int, seed: int) -> Reader:
+        """Return a reader for one stream of a sensor of `width` columns and `height` rows."""
+
+
+def random_numbers(seed: int, name: str) -> np.random.Generator:
+    """Return the random numbers of the readout effect `name`; they come in the order of the events."""
+    return np.random.default_rng([seed & 0x7FFFFFFF, zlib.crc32(name.encode())])
+
+
+def nanoseconds(seconds: ArrayLike) -> NDArray[np.int64]:
+    """Return times as whole nanoseconds, in which readers reckon, so that nothing depends on rounding."""
+    return np.rint(np.multiply(seconds, 1e9)).astype(np.int64)
+
+
+def instant(seconds: float) -> int:
+    """Return a time in whole nanoseconds; infinity becomes `FOREVER`."""
+    return FOREVER if seconds == math.inf else round(seconds * 1e9)
+
+
+def seconds(nanoseconds: NDArray[np.int64]) -> NDArray[np.float64]:
+    """Return whole nanoseconds as the pixels do, to the bit."""
+    out: NDArray[np.float64] = 1e-9 * nanoseconds.astype(np.float64)
+    return out
+
+
+def order(*columns: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Return the indices that sort by the first column, then the second and so on, then the index.
+
+    Args:
+        columns: Whole numbers, shape (N,) each.
+    """
+    count = len(columns[0])
+    key, bits = np.zeros(2 * count, np.int64), 0  # the second half is room for the sort
+    for column in columns if count else ():
+        least = int(column.min())
+        width = (int(column.max()) - least).bit_length()
+        bits += width
+        if bits > 62:
+            return np.lexsort(columns[::-1])
+        key[:count] = (key[:count] << width) | (column - least)
+    # 20 ns per event, where np.argsort takes 35 to 60
+    index, cpu = np.arange(2 * count, dtype=np.int32), launch.device("cpu")
+    pairs = (wp.array(a, dtype=d, device=cpu, copy=False) for a, d in ((key, wp.int64), (index, wp.int32)))
+    wp.utils.radix_sort_pairs(*pairs, count, begin_bit=0, end_bit=max(bits, 1))
+    return index[:count].astype(np.int64)
