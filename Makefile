@@ -7,7 +7,7 @@ BIN := .venv/bin
 .venv/ready: pyproject.toml constraints.txt
 	$(PYTHON) -m venv .venv
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt torch
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt --editable ".[learn,coco,dev]"
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt --editable ".[learn,coco,hdf5,aedat,ros,dev]"
 	touch $@
 
 demo: .venv/ready
@@ -22,7 +22,7 @@ lint: .venv/ready
 	$(BIN)/mypy
 
 perf: .venv/ready
-	$(BIN)/python perf/run.py
+	$(BIN)/python perf/bench_kernels.py
 
 clean:
 	rm -rf .venv build dist *.egg-info out

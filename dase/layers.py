@@ -220,7 +220,7 @@ class LayerScene(Scene):
         # only these samples are looked at, so their outlines bound the layer; the pixel is for float32
         box = np.concatenate([quad.min((0, 2)) - 1, quad.max((0, 2)) + 1], -1)
         layers = kernels.Layers()
-        layers.texels, layers.start, layers.size = self._uploaded[device.alias]
+        layers.grey, layers.texels, layers.start, layers.size = self._uploaded[device.alias]
         layers.place = wp.array(
             np.linalg.inv(m)[..., :2, :].astype(np.float32), dtype=kernels.Affine, device=device
         )
@@ -230,7 +230,7 @@ class LayerScene(Scene):
 
     def source(self, times: NDArray[np.float64], pixels: NDArray[np.int32], device: Any) -> tuple[str, Any]:
         """Return the layers themselves: the pixel kernel warps, so no frame is ever stored."""
-        return "layers", self.arrays(times, device)
+        return "background" if len(self.layers) == 1 else "layers", self.arrays(times, device)
 
     def frames(self, times: NDArray[np.float64], device: str = "cpu") -> NDArray[np.float32]:
         """Return intensities in [0, 1] at `times` [s], shape (K, height, width)."""

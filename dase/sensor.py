@@ -30,7 +30,8 @@ class Sensor:
     Args:
         effects: At most one of each kind; a `Threshold` among them.
         name: For the user.
-        size: Columns and rows [px], or None to take the size of the scene.
+        size: Columns and rows of the camera [px], for work that has no size of its own; a scene brings its
+            own size. None leaves it open.
         log_eps: Added to intensities before the logarithm, so that black is finite (ESIM: 0.001).
     """
 

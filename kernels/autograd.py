@@ -92,9 +92,9 @@ def count_events(
         fraction = phase.detach().float().flatten(1)
         on, off = threshold.detach()[:, -1], threshold.detach()[:, 0]
         start = fraction * torch.where(fraction >= 0, on, off)
-    run, window, count = _window(windows, samples - 1, log.device)
+    run, window, count, once = _window(windows, samples - 1, log.device)
     flat = log.detach().flatten(2)
-    counts = _Count.apply(flat, threshold, start, run, window, count, surrogate, step)
+    counts = _Count.apply(flat, threshold, start, run, window, count, once, surrogate, step)
     return counts.view(batch, count, 2, *space)
 
 
@@ -159,14 +159,18 @@ class _Count(torch.autograd.Function):
         run: torch.Tensor,
         window: torch.Tensor,
         windows: int,
+        once: bool,
         surrogate: str,
         step: float,
     ) -> torch.Tensor:
         log, threshold, phase = (t.float().contiguous() for t in (log, threshold, phase))
         batch, _, pixels = log.shape
         counts = torch.zeros(batch, windows, 2, pixels, device=log.device)
-        lanes = next(n for n in _counts.LANES if pixels % n == 0)
-        _launch(_counts.count[lanes], [log, threshold, phase, run, window], [counts], lanes=lanes)
+        # the wide loads want addresses that are multiples of 16 bytes
+        aligned = log.data_ptr() % 16 == 0
+        lanes = next(n for n in _counts.LANES if n == 1 or (pixels % n == 0 and aligned))
+        kernel = _counts.count[lanes, threshold.shape[1] == 1]
+        _launch(kernel, [log, threshold, phase, run, window, once], [counts], lanes=lanes)
         ctx.save_for_backward(log, threshold, phase, window, counts)
         ctx.surrogate, ctx.step = surrogate, step
         return counts
@@ -183,7 +187,7 @@ class _Count(torch.autograd.Function):
             _launch(_counts.interval_gradient, [log, threshold, phase, window, gradient], [out])
         else:
             _launch(_counts.expected_gradient, [log, threshold, phase, window, gradient, ctx.step], [out])
-        return None, out, None, None, None, None, None, None
+        return None, out, None, None, None, None, None, None, None
 
 
 def render(textures: Sequence[Texture], place: torch.Tensor, *, width: int, height: int) -> torch.Tensor:
@@ -307,6 +311,7 @@ def _layers(texels: torch.Tensor, place: torch.Tensor, sizes: tuple[tuple[int, i
     starts = (0, *accumulate(w * h for w, h in sizes))
     corner = place.new_full((len(sizes), 2), torch.inf)
     layers = _scene.Layers()
+    layers.grey = wp.from_torch(texels.detach()[: starts[1], 0].contiguous())
     layers.texels = wp.from_torch(texels.detach(), dtype=wp.vec2)
     layers.start = wp.from_torch(_on_device(starts[:-1], place.device))
     flat = _on_device(tuple(side for size in sizes for side in size), place.device)
@@ -390,8 +395,10 @@ def _check_textures(textures: Sequence[Texture], device: torch.device) -> None:
 
 def _window(
     windows: Sequence[int] | torch.Tensor | None, intervals: int, device: torch.device
-) -> tuple[torch.Tensor, torch.Tensor, int]:
-    """Return where runs of one window begin, the window of every interval, and the number of windows.
+) -> tuple[torch.Tensor, torch.Tensor, int, bool]:
+    """Return where runs of one window begin, the window of every interval, and how many windows there are.
+
+    The last says whether no window has two runs.
 
     The first has shape (R + 1,), ends with K - 1 and is int32, as is the second of shape (K - 1,).
 
@@ -412,7 +419,8 @@ def _window(
         raise ValueError(f"windows must be >= 0, got {min(indices)}")
     changes = [k for k in range(1, intervals) if indices[k] != indices[k - 1]]
     run = (0, *changes, intervals)
-    return _on_device(run, device), _on_device(indices, device), max(indices) + 1
+    once = len({indices[k] for k in run[:-1]}) == len(run) - 1
+    return _on_device(run, device), _on_device(indices, device), max(indices) + 1, once
 
 
 @lru_cache(maxsize=64)

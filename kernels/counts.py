@@ -41,10 +41,10 @@ def whole(size: float, threshold: float, inverse: float) -> float:
 
 
 @wp.func
-def crossings(change: float, on: float, off: float) -> float:
-    """Return the events of a change of log intensity: ON positive, OFF negative."""
+def crossings(change: float, on: float, off: float, per_on: float, per_off: float) -> float:
+    """Return the events of a change of log intensity, ON positive, OFF negative; `per_` are inverses."""
     up = change >= 0.0
-    events = whole(wp.abs(change), wp.where(up, on, off), wp.where(up, 1.0 / on, 1.0 / off))
+    events = whole(wp.abs(change), wp.where(up, on, off), wp.where(up, per_on, per_off))
     return wp.where(up, events, -events)
 
 
@@ -60,9 +60,39 @@ def weighted(events: float, gradient_on: float, gradient_off: float) -> float:
     return wp.where(events >= 0.0, events * gradient_on, -events * gradient_off)
 
 
-def _count(lanes: int) -> wp.Kernel:
-    """Return the counting kernel for `lanes` neighbouring pixels per thread."""
+Four = wp.types.vector(length=4, dtype=wp.float32)
+
+
+@wp.func_native(
+    """
+#ifdef __CUDA_ARCH__
+    const float4 q = __ldg(reinterpret_cast<const float4*>(&wp::index(samples, k, n)));
+    return wp::vec_t<4, wp::float32>(q.x, q.y, q.z, q.w);
+#else
+    return wp::index(samples, k, n);
+#endif
+"""
+)
+def wide(samples: wp.array2d[Four], k: int, n: int) -> Four:
+    """Return four samples by one load of 16 bytes; Warp's own would be four loads of 4 bytes each."""
+    ...
+
+
+@wp.func
+def narrow(samples: wp.array2d[wp.types.vector(length=1, dtype=wp.float32)], k: int, n: int):
+    """Return one sample."""
+    return samples[k, n]
+
+
+def _count(lanes: int, shared: bool) -> wp.Kernel:
+    """Return the counting kernel for `lanes` neighbouring pixels per thread.
+
+    It has no branches, so that several samples are on their way from memory at once. Both polarities are
+    counted by the sum and by the difference of their events; with a `shared` threshold nothing else has to be
+    chosen by polarity.
+    """
     Lanes = wp.types.vector(length=lanes, dtype=wp.float32)
+    load = wide if lanes == 4 else narrow
 
     @wp.kernel(enable_backward=False, module="unique", module_options={"fuse_fp": False})
     def count(
@@ -73,6 +103,7 @@ def _count(lanes: int) -> wp.Kernel:
         phase: wp.array2d[Lanes],  # (B, N) [log intensity], first sample minus first reference
         run: wp.array[int],  # (R + 1,) intervals at which runs of one window begin, and K - 1
         window: wp.array[int],  # (K - 1,) window that an interval counts for
+        once: bool,  # whether every window has one run
         # out
         counts_out: wp.array4d[Lanes],  # (B, W, 2, N) [events], OFF then ON; zero on entry
     ):
@@ -81,22 +112,42 @@ def _count(lanes: int) -> wp.Kernel:
         n = first + i
         off = threshold[b, 0, n]
         on = threshold[b, threshold.shape[1] - 1, n]
-        reference = log[b, 0, n] - phase[b, n]
+        samples = log[b]
+        reference = samples[0, n] - phase[b, n]
+        per_on = Lanes()
+        per_off = Lanes()
+        for lane in range(lanes):
+            per_on[lane] = 1.0 / on[lane]
+            per_off[lane] = 1.0 / off[lane]
+        last = samples.shape[0] - 1
+        ahead = load(samples, 1, n)
         for r in range(run.shape[0] - 1):
-            ons = Lanes()
-            offs = Lanes()
-            # without branches, so that several samples are on their way from memory at once
+            both = Lanes()
+            net = Lanes()
             for k in range(run[r], run[r + 1]):
-                sample = log[b, k + 1, n]
+                sample = ahead
+                ahead = load(samples, wp.min(k + 2, last), n)
                 for lane in range(lanes):
-                    events = crossings(sample[lane] - reference[lane], on[lane], off[lane])
-                    reference[lane] = reference[lane] + height(events, on[lane], off[lane])
-                    ons[lane] = ons[lane] + wp.max(events, 0.0)
-                    offs[lane] = offs[lane] + wp.max(-events, 0.0)
+                    change = sample[lane] - reference[lane]
+                    theta = on[lane]
+                    inverse = per_on[lane]
+                    if wp.static(not shared):
+                        theta = wp.where(change >= 0.0, on[lane], off[lane])
+                        inverse = wp.where(change >= 0.0, per_on[lane], per_off[lane])
+                    events = whole(wp.abs(change), theta, inverse)
+                    both[lane] = both[lane] + events
+                    events = wp.where(change >= 0.0, events, -events)
+                    net[lane] = net[lane] + events
+                    reference[lane] = reference[lane] + events * theta
             w = window[run[r]]
-            # plain stores: += on an array element would be an atomic, and nobody else has these pixels
-            counts_out[b, w, 0, n] = counts_out[b, w, 0, n] + offs
-            counts_out[b, w, 1, n] = counts_out[b, w, 1, n] + ons
+            offs = 0.5 * (both - net)
+            ons = 0.5 * (both + net)
+            if not once:
+                # plain loads and stores: nobody else has these pixels, += would be an atomic
+                offs += counts_out[b, w, 0, n]
+                ons += counts_out[b, w, 1, n]
+            counts_out[b, w, 0, n] = offs
+            counts_out[b, w, 1, n] = ons
 
     return count
 
@@ -104,8 +155,8 @@ def _count(lanes: int) -> wp.Kernel:
 LANES = (4, 1)
 """Pixels per thread, widest first; the widest that divides the number of pixels is the fastest."""
 
-count = {lanes: _count(lanes) for lanes in LANES}
-"""Counting kernels by the number of pixels per thread."""
+count = {(lanes, shared): _count(lanes, shared) for lanes in LANES for shared in (False, True)}
+"""Counting kernels by the number of pixels per thread and whether the polarities share a threshold."""
 
 
 @wp.kernel
@@ -132,7 +183,7 @@ def interval_gradient(
     on = threshold[b, last, n]
     reference = log[b, 0, n] - phase[b, n]
     for k in range(1, log.shape[1]):
-        events = crossings(log[b, k, n] - reference, on, off)
+        events = crossings(log[b, k, n] - reference, on, off, 1.0 / on, 1.0 / off)
         if events != 0.0:
             reference += height(events, on, off)
             p = wp.where(events > 0.0, 1, 0)
@@ -184,13 +235,15 @@ def difference(
     low: wp.vec3f,  # ON, OFF, phase [log intensity]
 ) -> float:
     """Return the objective at `high` minus that at `low`, linear in the counts by `gradient`."""
+    high_inverse = wp.vec2(1.0 / high[0], 1.0 / high[1])
+    low_inverse = wp.vec2(1.0 / low[0], 1.0 / low[1])
     high_reference = log[b, 0, n] - high[2]
     low_reference = log[b, 0, n] - low[2]
     change = float(0.0)
     for k in range(1, log.shape[1]):
         sample = log[b, k, n]
-        high_events = crossings(sample - high_reference, high[0], high[1])
-        low_events = crossings(sample - low_reference, low[0], low[1])
+        high_events = crossings(sample - high_reference, high[0], high[1], high_inverse[0], high_inverse[1])
+        low_events = crossings(sample - low_reference, low[0], low[1], low_inverse[0], low_inverse[1])
         if high_events != 0.0 or low_events != 0.0:
             high_reference += height(high_events, high[0], high[1])
             low_reference += height(low_events, low[0], low[1])

@@ -35,7 +35,7 @@ from typing import Any
 
 import warp as wp
 
-from dase.kernels.scene import Layers, ground_of, layer_intensity, layers_near
+from dase.kernels.scene import Layers, background_at, ground_of, layer_intensity, layers_near
 
 REST = 1e30
 """Duration of the rest before the first sample [s]: filters start settled."""
@@ -172,7 +172,7 @@ def waiting(key: int, index: int) -> float:
     return -wp.log(1.0 - uniform(key, index))
 
 
-SOURCES = {"frames": Frames, "log": Frames, "layers": Layers}
+SOURCES = {"frames": Frames, "log": Frames, "layers": Layers, "background": Layers}
 SINKS = {"counts": Counts, "keys": Keys}
 
 
@@ -187,7 +187,7 @@ def compose(stages: tuple[Stages, ...], source: str, sink: str) -> wp.Kernel:
 
     Args:
         stages: Effects, in order.
-        source: `frames`, `log` or `layers`.
+        source: `frames`, `log`, `layers`, or `background` for a scene of one layer.
         sink: `counts` or `keys`.
 
     Returns:
@@ -259,6 +259,7 @@ class _Writer:
             "layer_intensity": layer_intensity,
             "layers_near": layers_near,
             "ground_of": ground_of,
+            "background_at": background_at,
             "logarithm": logarithm,
         }
 
@@ -356,6 +357,8 @@ class _Writer:
         self.add("size = pixels.shape[0]")
         if self.source == "layers":
             self.add("near = layers_near(source, float(x), float(y))", "ground = ground_of(source)")
+        elif self.source == "background":
+            self.add("ground = ground_of(source)")
         else:
             self.add("last = source.values.shape[0] - 1")
             self.add(*(f"ahead_{n} = source.values[wp.min({n}, last), i]" for n in range(AHEAD)))
@@ -390,11 +393,11 @@ class _Writer:
             self.add(
                 f"{effect.name}_hazard = waiting({self.noise_key(effect)}, 0)", f"{effect.name}_events = 1.0"
             )
+        # rest ends here: no time passes in which anything could leak or fire
+        self.add("dt = 0.0")
         self.depth -= 1
-        self.add("else:")
-        self.depth += 1
         self.step()
-        self.depth -= 2
+        self.depth -= 1
         if self.sink == "counts":
             self.add("window = clock.window[part]", "if window >= 0:")
             self.add("    sink.counts[row, window, 0, i] = off_count")
@@ -407,6 +410,8 @@ class _Writer:
         quantity = "voltage" if self.source == "log" else "intensity"
         if self.source == "layers":
             self.add("intensity = layer_intensity(source, ground, near, k, float(x), float(y))")
+        elif self.source == "background":
+            self.add("intensity = background_at(source, ground, k, float(x), float(y))")
         else:
             # memory is asked for the samples to come while the present one is worked on
             self.add(f"{quantity} = ahead_0")

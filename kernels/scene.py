@@ -24,6 +24,7 @@ PerLayer = wp.types.vector(length=MAX_LAYERS, dtype=wp.float32)
 class Layers:
     """Textures and motion of all layers, L layers at K time samples."""
 
+    grey: wp.array[float]  # intensities of layer 0, which most looks go to, once more on their own
     texels: wp.array[wp.vec2]  # all textures, row by row: (intensity · alpha, alpha)
     start: wp.array[int]  # (L,) first texel of each layer
     size: wp.array[wp.vec2i]  # (L,) width, height [texel]
@@ -72,10 +73,12 @@ def background_at(layers: Layers, ground: Ground, k: int, x: float, y: float) ->
     iv = wp.min(int(v), ground.corner[1])
     fu = u - float(iu)
     fv = v - float(iv)
-    i = iv * ground.width + iu  # layer 0 begins at texel 0
-    top = layers.texels[i][0] + fu * (layers.texels[i + ground.step[0]][0] - layers.texels[i][0])
+    i = iv * ground.width + iu
+    top = layers.grey[i]
+    top += fu * (layers.grey[i + ground.step[0]] - top)
     i += ground.step[1]
-    bottom = layers.texels[i][0] + fu * (layers.texels[i + ground.step[0]][0] - layers.texels[i][0])
+    bottom = layers.grey[i]
+    bottom += fu * (layers.grey[i + ground.step[0]] - bottom)
     return top + fv * (bottom - top)
 
 
@@ -101,9 +104,31 @@ def foreground_at(layers: Layers, layer: int, k: int, x: float, y: float) -> wp.
     iv = int(wp.floor(v))
     fu = u - float(iu)
     fv = v - float(iv)
-    top = (1.0 - fu) * texel(layers, layer, iu, iv) + fu * texel(layers, layer, iu + 1, iv)
-    bottom = (1.0 - fu) * texel(layers, layer, iu, iv + 1) + fu * texel(layers, layer, iu + 1, iv + 1)
-    return (1.0 - fv) * top + fv * bottom
+    top = wp.vec2()
+    bottom = wp.vec2()
+    if iu >= 0 and iv >= 0 and iu + 1 < size[0] and iv + 1 < size[1]:
+        i = layers.start[layer] + iv * size[0] + iu
+        top = layers.texels[i] + fu * (layers.texels[i + 1] - layers.texels[i])
+        i += size[0]
+        bottom = layers.texels[i] + fu * (layers.texels[i + 1] - layers.texels[i])
+    else:
+        top = (1.0 - fu) * texel(layers, layer, iu, iv) + fu * texel(layers, layer, iu + 1, iv)
+        bottom = (1.0 - fu) * texel(layers, layer, iu, iv + 1) + fu * texel(layers, layer, iu + 1, iv + 1)
+    return top + fv * (bottom - top)
+
+
+@wp.func_native(
+    """
+#ifdef __CUDA_ARCH__
+    return 31 - __clz(bits);
+#else
+    return 31 - __builtin_clz((unsigned int)bits);
+#endif
+"""
+)
+def highest_bit(bits: int) -> int:
+    """Place of the highest set bit; there must be one."""
+    ...
 
 
 @wp.func
@@ -122,15 +147,15 @@ def layer_intensity(layers: Layers, ground: Ground, near: int, k: int, x: float,
     """Intensity of a pixel at sample k, composited front to back."""
     light = float(0.0)
     through = float(1.0)
-    if near != 0:
-        for back in range(1, layers.count):
-            layer = layers.count - back
-            if ((near >> layer) & 1) != 0:
-                front = foreground_at(layers, layer, k, x, y)
-                light += through * front[0]
-                through *= 1.0 - front[1]
-                if through == 0.0:
-                    return light
+    left = int(near)
+    while left != 0:
+        layer = highest_bit(left)
+        left ^= 1 << layer
+        front = foreground_at(layers, layer, k, x, y)
+        light += through * front[0]
+        through *= 1.0 - front[1]
+        if through == 0.0:
+            return light
     return light + through * background_at(layers, ground, k, x, y)
 
 
@@ -287,7 +312,7 @@ def render_gradient(
 
 def upload(
     textures: list[tuple[np.ndarray, np.ndarray | None]], device: wp.Device
-) -> tuple[wp.array, wp.array, wp.array]:
+) -> tuple[wp.array, wp.array, wp.array, wp.array]:
     """Move textures to `device`.
 
     Args:
@@ -295,7 +320,7 @@ def upload(
         device: Where to.
 
     Returns:
-        texels, start and size of `Layers`.
+        grey, texels, start and size of `Layers`.
     """
     flat, start, size, total = [], [], [], 0
     for grey, alpha in textures:
@@ -305,6 +330,7 @@ def upload(
         size.append(grey.shape[::-1])
         total += grey.size
     return (
+        wp.array(np.ascontiguousarray(flat[0][:, 0]), dtype=float, device=device),
         wp.array(np.concatenate(flat), dtype=wp.vec2, device=device),
         wp.array(start, dtype=int, device=device),
         wp.array(np.array(size), dtype=wp.vec2i, device=device),

@@ -2,8 +2,8 @@
 
     python perf/bench_kernels.py --device cuda --size 3840x2160 --samples 64
 
-Every figure is the median of warm, synchronised runs of one process. Bandwidths compare with a device copy
-(numpy.copyto on the CPU) of as many bytes in the same run.
+Every figure is the median of warm, synchronised runs of one process, each of four chunks in a row.
+Bandwidths compare with a device copy (numpy.copyto on the CPU) of as many bytes in the same run.
 """
 
 from __future__ import annotations
@@ -13,16 +13,20 @@ import statistics
 import subprocess
 import time
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 import warp as wp
 
 from dase.config import load_sensor
 from dase.images import open_images
-from dase.kernels import launch, pixel
+from dase.kernels import counts, launch, pixel
 from dase.layers import Layer, LayerScene, Motion
 from dase.scene import Scene
 from dase.sensor import Pixels, Sensor
+
+CHUNKS = 4
+"""Chunks per timed run."""
 
 
 class Stored(Scene):
@@ -60,15 +64,23 @@ def texture(first: int, width: int, logarithm: int, out: wp.array2d[float]):
 
 
 def median_time(work: Callable[[], object], repeats: int, device: wp.Device) -> float:
-    """Return the median duration of `work` [s] after two runs that do not count."""
+    """Return the median duration of `work` [s] after two runs that do not count; on CUDA by device events."""
     took = []
     for n in range(repeats + 2):
         wp.synchronize_device(device)
         begin = time.perf_counter()
-        work()
-        wp.synchronize_device(device)
+        if device.is_cuda:
+            first, last = (wp.Event(device, enable_timing=True) for _ in range(2))
+            wp.record_event(first)
+            work()
+            wp.record_event(last)
+            wp.synchronize_event(last)
+            seconds = wp.get_event_elapsed_time(first, last) * 1e-3
+        else:
+            work()
+            seconds = time.perf_counter() - begin
         if n >= 2:
-            took.append(time.perf_counter() - begin)
+            took.append(seconds)
     return statistics.median(took)
 
 
@@ -118,19 +130,52 @@ def bench(
 ) -> tuple[float, float]:
     """Return seconds and events of one chunk of `samples`."""
     times = np.arange(samples) * 1e-3
+    windows = np.zeros(samples, np.int32)
     array = Pixels(sensor, scene.width, scene.height, device=device.alias)
-    array._next = array._state  # every run begins anew: nothing is carried, nothing allocated
-    events = [0]
+    found: list[Any] = []
 
     def work() -> None:
-        array.samples = 0
-        if sink == "counts":
-            events[0] = array.count_events(scene, times, np.zeros(samples, np.int32), 1)
-        else:
-            events[0] = len(array.emit(scene, times)[0])
+        found.clear()
+        for _ in range(CHUNKS):  # one after the other, as a long recording streams
+            array.samples = 0
+            if sink == "counts":
+                found.append(array.count_events(scene, times, windows, 1))
+            else:
+                found.append(len(array.emit(scene, times)[0]))
+
+    took = median_time(work, repeats, device) / CHUNKS
+    return took, float(found[-1].numpy().sum()) if sink == "counts" else found[-1]
+
+
+def bench_counts(scene: Stored, repeats: int, device: wp.Device) -> tuple[float, float]:
+    """Return seconds and events of the counting kernel that training uses, four pixels per thread."""
+    lanes = 4
+    vector = wp.types.vector(length=lanes, dtype=wp.float32)
+    samples, pixels = scene.data.values.shape
+
+    def viewed(array: wp.array, *shape: int) -> wp.array:
+        return wp.array(ptr=array.ptr, dtype=vector, shape=shape, device=device)
+
+    threshold = wp.full((1, 1, pixels), 0.2, dtype=float, device=device)
+    phase = wp.zeros((1, pixels), dtype=float, device=device)
+    out = wp.zeros((1, 1, 2, pixels), dtype=float, device=device)
+    arguments = [
+        viewed(scene.data.values, 1, samples, pixels // lanes),
+        viewed(threshold, 1, 1, pixels // lanes),
+        viewed(phase, 1, pixels // lanes),
+        wp.array([0, samples - 1], dtype=int, device=device),
+        wp.zeros(samples - 1, dtype=int, device=device),
+        True,
+        viewed(out, 1, 1, 2, pixels // lanes),
+    ]
+
+    def work() -> None:
+        launch.run(counts.count[lanes, True], pixels // lanes, arguments, device)
 
     took = median_time(work, repeats, device)
-    return took, float(events[0].numpy().sum()) if sink == "counts" else events[0]
+    out.zero_()
+    work()
+    return took, float(out.numpy().sum())
 
 
 def main() -> None:
@@ -152,8 +197,13 @@ def main() -> None:
     copy = copy_bandwidth(width * height * options.samples, options.repeats, device)
     print(f"copy: {copy / 1e9:.0f} GB/s read plus written\n")
     print("| benchmark | ms | Gsample/s | Mevents/s | samples read, share of copy |\n|---|---|---|---|---|")
-    for name, scene, sensor, sink in cases(width, height, options.samples, device):
-        took, events = bench(scene, sensor, sink, options.samples, options.repeats, device)
+    todo = cases(width, height, options.samples, device)
+    todo.insert(0, ("count stored log frames, training kernel", todo[0][1], None, ""))
+    for name, scene, sensor, sink in todo:
+        if sensor is None:
+            took, events = bench_counts(scene, options.repeats, device)
+        else:
+            took, events = bench(scene, sensor, sink, options.samples, options.repeats, device)
         samples = width * height * options.samples
         share = f"{4 * samples / took / copy:.0%}" if isinstance(scene, Stored) else "-"
         rates = f"{samples / took / 1e9:.2f} | {events / took / 1e6:.0f} | {share}"

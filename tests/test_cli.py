@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 import pytest
 
-from dase import io
+from dase import Events, io
 
 SMALL = ("--size", "32x24", "--duration", "0.1", "--sequences", "1", "--jobs", "1", "--regime", "slow")
 
@@ -191,3 +191,25 @@ def test_effects():
     assert "plausible" in shown.stdout
     assert "Source: " in shown.stdout
     assert "did you mean 'leak'?" in one_sentence(dase("effects", "show", "leek"))
+
+
+@pytest.mark.parametrize("suffix", [".npz", ".raw", ".txt"])
+def test_convert_and_info(suffix, tmp_path, rng):
+    n = 500
+    t = np.sort(rng.integers(0, 10**6, n)) * 1e-6
+    x, y = (rng.integers(0, size, n).astype(np.uint16) for size in (64, 48))
+    x[0], y[0] = 63, 47
+    events = Events(t, x, y, rng.random(n) < 0.5, 64, 48)
+    io.write(tmp_path / "a.h5", io.Sequence(events))
+    target = tmp_path / f"b{suffix}"
+    done = dase("convert", tmp_path / "a.h5", target)
+    assert done.returncode == 0, done.stderr
+    assert "500 events written" in done.stdout
+    back = io.read(target).events
+    for name in "xyp":
+        np.testing.assert_array_equal(getattr(back, name), getattr(events, name))
+    np.testing.assert_allclose(back.t - back.t[0], events.t - events.t[0], atol=1e-9)
+    told = dase("info", target)
+    assert told.returncode == 0, told.stderr
+    assert "64 x 48" in told.stdout
+    assert "unknown format '.xyz'" in one_sentence(dase("convert", tmp_path / "a.h5", tmp_path / "b.xyz"))

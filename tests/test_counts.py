@@ -124,10 +124,11 @@ def test_splitting_an_interval_changes_no_window(device, rng):
     torch.testing.assert_close(parts, whole, rtol=0, atol=0)
 
 
-def test_windows_sum_intervals(device, rng):
+@pytest.mark.parametrize("windows", [None, [0] * 6 + [2] * 6 + [0] * 7, [0] * 9 + [1] * 10])
+def test_windows_sum_intervals(windows, device, rng):
     log = tensor(rng.normal(0, 0.5, (3, 20, 4, 5)).cumsum(1), device)
     mu = tensor(rng.uniform(0.1, 0.3, (3, 4, 5)), device)
-    windows = rng.integers(0, 4, 19).tolist()
+    windows = windows or rng.integers(0, 4, 19).tolist()
     every = count_events(log, mu, 0.0, 0.0, windows=range(19))
     got = count_events(log, mu, 0.0, 0.0, windows=windows)
     assert got.shape == (3, max(windows) + 1, 2, 4, 5)

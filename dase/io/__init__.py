@@ -1,78 +1,183 @@
-"""Sequence files: one module per format, chosen by suffix when writing, by content first when reading.
+"""Files of cameras and of simulations: one module per format, chosen by content first, by suffix second.
 
+    sequence = read("recording.raw")                     all of it
+    for events in stream("recording.aedat4"):            chunks of it, in memory that does not grow
+        ...
     with create("scene.h5") as writer:
         writer.events(part)
         writer.frame(time, grey, flow)
-    sequence = read("scene.h5")
 
-A new format is a module with `create` and `read`, and one line in FORMATS.
+A new format is a module with a `Format`, and one line in FORMATS.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Iterable, Iterator
 from contextlib import AbstractContextManager
+from dataclasses import replace
 from os import PathLike
 from pathlib import Path
 
-from dase.errors import InputError
+from dase.errors import InputError, nearest
 from dase.events import Events
-from dase.io import h5, npz
+from dase.io import (
+    aedat2,
+    aedat4,
+    arrays,
+    dat,
+    dsec,
+    ecf,
+    evt2,
+    evt3,
+    evt21,
+    frames,
+    ijrr,
+    mvsec,
+    ros,
+    s2r,
+    v2e,
+)
+from dase.io import h5 as h5
+from dase.io import npz as npz
 from dase.io.sequence import Sequence as Sequence
 from dase.io.sequence import Writer as Writer
 from dase.io.sequence import replacing as replacing
+from dase.io.source import CHUNK, Size, Source
+from dase.io.source import Format as Format
 
-FORMATS: dict[str, tuple[Callable[[Path], AbstractContextManager[Writer]], Callable[[Path], Sequence]]] = {
-    ".h5": (h5.create, h5.read),
-    ".hdf5": (h5.create, h5.read),
-    ".npz": (npz.create, npz.read),
-}
-"""Suffix to (create, read)."""
+FORMATS: tuple[Format, ...] = (
+    ecf.FORMAT,
+    dsec.FORMAT,
+    mvsec.FORMAT,
+    v2e.FORMAT,
+    s2r.FORMAT,  # any other HDF5
+    arrays.TABLE,
+    ijrr.ZIPPED,
+    arrays.OWN,  # any other zip
+    evt3.FORMAT,
+    evt2.FORMAT,
+    evt21.FORMAT,
+    dat.FORMAT,
+    aedat4.FORMAT,
+    aedat2.FORMAT,
+    ros.FORMAT,
+    ijrr.TEXT,
+    frames.FORMAT,
+)
+"""All formats. Content is asked in this order; of several with one suffix the first that can is taken."""
 
-SIGNATURES = {b"\x89HDF\r\n\x1a\n": ".h5", b"PK\x03\x04": ".npz"}
-"""First bytes of a file to the suffix of its format."""
-
+HEAD = 1 << 16  # [bytes] of a file that formats are told by
 PART = 1 << 20  # events handed to a writer at once
 
 
-def create(path: str | PathLike[str]) -> AbstractContextManager[Writer]:
-    """Open a sequence file for writing, in the format of its suffix.
-
-    The file appears under its name when the block ends well; when it raises, nothing is left behind.
+def find(path: str | PathLike[str]) -> Format:
+    """Return the format of an existing file or folder: by its content, else by its suffix.
 
     Raises:
-        InputError: The suffix is unknown or the folder missing; later, from the writer, on bad content.
-    """
-    path = Path(path)
-    return FORMATS[_known_suffix(path)][0](path)
-
-
-def read(path: str | PathLike[str]) -> Sequence:
-    """Read a sequence file; its first bytes choose the format, then its suffix.
-
-    Raises:
-        InputError: The file is missing, of unknown format, damaged or incomplete.
+        InputError: It is missing, cannot be read, or is of no known format.
     """
     path = Path(path)
     try:
-        with path.open("rb") as file:
-            head = file.read(8)
+        head = b""
+        if not path.is_dir():
+            with path.open("rb") as file:
+                head = file.read(HEAD)
+        found = next((format for format in FORMATS if format.matches(path, head)), None)
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror})") from error
-    for signature, suffix in SIGNATURES.items():
-        if head.startswith(signature):
-            return FORMATS[suffix][1](path)
-    return FORMATS[_known_suffix(path)][1](path)
+    if found is not None:
+        return found
+    if path.is_dir():
+        raise InputError(f"{path}: is a folder with neither events.txt, nor a ROS 2 bag, nor pictures")
+    return _of_suffix(path, (s2r.FORMAT, arrays.OWN, *FORMATS))
 
 
-def write(path: str | PathLike[str], sequence: Sequence) -> None:
-    """Write a whole sequence; raises InputError for frames without times and flow without frames."""
+def read(path: str | PathLike[str], *, size: Size | None = None, notes: list[str] | None = None) -> Sequence:
+    """Read a file or folder whole.
+
+    Args:
+        path: What to read; its content chooses the format, then its suffix.
+        size: Columns and rows of the sensor, where the file does not say or says it wrongly.
+        notes: Gets sentences about what was skipped, repaired or guessed.
+
+    Raises:
+        InputError: It is missing, of unknown format, damaged or incomplete, or needs an optional library.
+    """
+    source = _source(path, size, notes)
+    return find(path).read(source)
+
+
+def stream(
+    path: str | PathLike[str],
+    *,
+    chunk: int = CHUNK,
+    size: Size | None = None,
+    notes: list[str] | None = None,
+) -> Iterator[Events]:
+    """Yield the events of a file in chunks, so that the file may be larger than the memory.
+
+    Chunks are sorted and follow each other in time; all but the last hold `chunk` events. There is at least
+    one, if empty. Joined they are the events of `read`.
+
+    Args:
+        path: What to read; its content chooses the format, then its suffix.
+        chunk: Events in a chunk.
+        size: Columns and rows of the sensor, where the file does not say or says it wrongly.
+        notes: Gets sentences about what was skipped, repaired or guessed; complete after the last chunk.
+
+    Raises:
+        InputError: As for `read`; also where times go back too far to be sorted on the way.
+    """
+    if chunk < 1:
+        raise InputError(f"chunk must be at least 1 event, got {chunk}")
+    source = _source(path, size, notes)
+    return find(path).stream(source, chunk)
+
+
+def create(path: str | PathLike[str], *, format: str | None = None) -> AbstractContextManager[Writer]:
+    """Open a file for writing, in the format of its suffix or of a name.
+
+    The file appears under its name when the block ends well; when it raises, nothing is left behind.
+
+    Args:
+        path: File to write.
+        format: Name of the format, as EVT2, where the suffix does not decide.
+
+    Raises:
+        InputError: The format is unknown or the folder missing; later, from the writer, on bad content.
+    """
+    path = Path(path)
+    found = writable(path, format)
+    assert found.create is not None
+    return found.create(path)
+
+
+def writable(path: str | PathLike[str], format: str | None = None) -> Format:
+    """Return the format that `create` would write; raises InputError where there is none."""
+    writers = [known for known in (s2r.FORMAT, arrays.OWN, *FORMATS) if known.create is not None]
+    if format is None:
+        return _of_suffix(Path(path), writers)
+    for known in writers:
+        if known.name.lower() == format.lower():
+            return known
+    raise InputError(f"format '{format}' cannot be written, {nearest(format, [w.name for w in writers])}")
+
+
+def write(path: str | PathLike[str], sequence: Sequence, *, format: str | None = None) -> None:
+    """Write a whole sequence.
+
+    Thresholds and configuration are left out where the format has no place for them.
+
+    Raises:
+        InputError: Frames have no times, flow has no frames, or the format holds no frames.
+    """
+    keeps = writable(path, format).keeps
     if sequence.frames is not None and sequence.frame_times is None:
         raise InputError(f"{path}: frames cannot be written without their times")
     if sequence.frames is None and sequence.flow is not None:
         raise InputError(f"{path}: flow cannot be written without frames")
     events, flow, exposure = sequence.events, sequence.flow, sequence.frame_exposure
-    with create(path) as writer:
+    with create(path, format=format) as writer:
         if sequence.frames is not None and sequence.frame_times is not None:
             for index, (time, grey) in enumerate(zip(sequence.frame_times, sequence.frames, strict=True)):
                 span = 0.0 if exposure is None else float(exposure[index])
@@ -81,14 +186,57 @@ def write(path: str | PathLike[str], sequence: Sequence) -> None:
             k = slice(i, i + PART)
             part = Events(events.t[k], events.x[k], events.y[k], events.p[k], events.width, events.height)
             writer.events(part)
-        if sequence.thresholds is not None:
+        if sequence.thresholds is not None and "thresholds" in keeps:
             writer.thresholds(sequence.thresholds)
-        if sequence.configuration is not None:
+        if sequence.configuration is not None and "configuration" in keeps:
             writer.configuration(sequence.configuration)
 
 
-def _known_suffix(path: Path) -> str:
+def convert(
+    source: str | PathLike[str],
+    target: str | PathLike[str],
+    *,
+    format: str | None = None,
+    with_frames: bool = True,
+    notes: list[str] | None = None,
+) -> int:
+    """Convert a file and return its number of events.
+
+    Args:
+        source: Any file that `read` takes.
+        target: File to write.
+        format: Name of its format; None goes by its suffix.
+        with_frames: Take frames along where `target` can hold them; the whole file is then held in memory.
+            Otherwise events stream through, whatever the size of the file.
+        notes: Gets sentences about what was skipped, repaired or guessed.
+
+    Raises:
+        InputError: As for `read` and `create`.
+    """
+    if with_frames and "frames" in writable(target, format).keeps:
+        sequence = read(source, notes=notes)
+        if sequence.frames is None or sequence.frame_times is None:
+            sequence = replace(sequence, frames=None, frame_times=None, frame_exposure=None, flow=None)
+        write(target, sequence, format=format)
+        return len(sequence.events)
+    total = 0
+    with create(target, format=format) as writer:
+        for part in stream(source, notes=notes):
+            writer.events(part)
+            total += len(part)
+    return total
+
+
+def _source(path: str | PathLike[str], size: Size | None, notes: list[str] | None) -> Source:
+    return Source(Path(path), size, [] if notes is None else notes)
+
+
+def _of_suffix(path: Path, formats: Iterable[Format]) -> Format:
+    known: dict[str, Format] = {}
+    for format in formats:
+        for suffix in format.suffixes:
+            known.setdefault(suffix, format)
     suffix = path.suffix.lower()
-    if suffix not in FORMATS:
-        raise InputError(f"{path}: unknown format '{path.suffix}', known: {', '.join(sorted(FORMATS))}")
-    return suffix
+    if suffix not in known:
+        raise InputError(f"{path}: unknown format '{path.suffix}', known: {', '.join(known)}")
+    return known[suffix]

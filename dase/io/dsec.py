@@ -1,0 +1,77 @@
+"""HDF5 files of DSEC and of data sets that took its layout over (M3ED, TUM-VIE, eTraM and others).
+
+    events/t, x, y, p       times [us] from the begin, columns, rows, 1 = ON; M3ED: prophesee/left/...
+    t_offset                [us] to add for the clock of the frames
+    ms_to_idx               index of the first event of each millisecond; not needed to read all
+
+The columns are packed with Blosc, which the extra "hdf5" (hdf5plugin) unpacks. Times are those of `events/t`;
+`t_offset` is noted. The size of the sensor is M3ED's `calib/resolution` or found from the events. Frames are
+files of their own, of another size, and are not read. Source: Gehrig et al., DSEC: a stereo event camera
+dataset for driving scenarios, 2021; dsec.ifi.uzh.ch/data-format.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+
+from dase.errors import InputError
+from dase.io.columns import columns, has, largest, opened, reader, scalar
+from dase.io.source import Piece, Size, Source, camera_format
+
+GROUPS = ("events", "prophesee/left")
+
+
+def _group(file: Any) -> str:
+    for group in GROUPS:
+        if f"{group}/t" in file:
+            return group
+    raise InputError("has no 'events/t'")
+
+
+def _names(group: str) -> tuple[str, str, str, str]:
+    t, x, y, p = (f"{group}/{name}" for name in "txyp")
+    return t, x, y, p
+
+
+def _parts(file: Any, source: Source) -> Iterator[Piece]:
+    offset = scalar(file, "t_offset")
+    if offset:
+        source.note(f"t_offset: add {offset / 1e6:.6f} s for the clock of the frames")
+    for t, x, y, p in columns(file, _names(_group(file))):
+        yield Piece(t.astype(np.float64 if t.dtype.kind == "f" else np.int64), x, y, p)
+
+
+def size(source: Source) -> Size | None:
+    """Return columns and rows where the file tells them."""
+    with opened(source.path) as file:
+        found = file.get(f"{_group(file)}/calib/resolution")
+        if isinstance(found, h5py.Dataset) and found.shape == (2,) and found.dtype.kind in "iu":
+            return int(found[0]), int(found[1])
+    return None
+
+
+def extent(source: Source) -> Size:
+    """Return one more than the largest column and row."""
+    with opened(source.path) as file:
+        return largest(file, *_names(_group(file))[1:3])
+
+
+def matches(path: Path, head: bytes) -> bool:
+    """Whether a file holds the four columns."""
+    return any(has(path, head, *_names(group)) for group in GROUPS)
+
+
+FORMAT = camera_format(
+    name="DSEC HDF5",
+    suffixes=(".h5", ".hdf5"),
+    extra="hdf5",
+    matches=matches,
+    pieces=reader(_parts),
+    size=size,
+    extent=extent,
+)

@@ -1,0 +1,113 @@
+"""HDF5 files of MVSEC: `NAME_data.hdf5`, and its ground truth `NAME_gt.hdf5` beside it.
+
+    davis/left/events              [N, 4]: column, row, time [Unix s], polarity -1 or 1
+    davis/left/image_raw           [F, 260, 346] uint8
+    davis/left/image_raw_ts        [F] [Unix s]
+    davis/left/flow_dist, flow_dist_ts     in the ground truth: [K, 2, 260, 346] displacement [px] from each
+                                   time to the next, x then y, not rectified
+
+The left camera is read, the right one where there is no left. Times count from the first event. Flow becomes
+px/s and is given at the frames, by the map whose interval holds the frame, not a number outside; ground truth
+too large for memory is left out, and said. Source: Zhu et al., The multivehicle stereo event camera dataset,
+2018.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dase.errors import InputError
+from dase.io.columns import PART, dataset, has, opened, reader
+from dase.io.frames import LIMIT
+from dase.io.sequence import coordinates
+from dase.io.source import Frames, Piece, Size, Source, camera_format
+
+SIZE = (346, 260)
+CAMERAS = ("davis/left", "davis/right")
+FLOW_LIMIT = 1 << 30  # [bytes] of flow taken into memory
+
+
+def _camera(file: Any) -> str:
+    for camera in CAMERAS:
+        if f"{camera}/events" in file:
+            return camera
+    raise InputError("has no 'davis/left/events'")
+
+
+def _parts(file: Any, source: Source) -> Iterator[Piece]:
+    events = dataset(file, f"{_camera(file)}/events", 2)
+    if events.shape[1] != 4:
+        raise InputError(f"'{events.name}' must have shape (N, 4), got {events.shape}")
+    for i in range(0, len(events), PART):
+        part = events[i : i + PART]
+        x, y = (coordinates(part[:, k].astype(np.int64), f"{events.name}[:, {k}]") for k in (0, 1))
+        yield Piece(part[:, 2].astype(np.float64), x, y, part[:, 3] > 0)
+
+
+def read_frames(source: Source) -> Frames | None:
+    """Read the frames and, from the ground truth beside the file, the flow at them; None without frames."""
+    with opened(source.path) as file:
+        camera = _camera(file)
+        if f"{camera}/image_raw" not in file:
+            return None
+        images, times = dataset(file, f"{camera}/image_raw", 3), dataset(file, f"{camera}/image_raw_ts", 1)
+        if images.dtype != np.uint8 or len(images) != len(times):
+            raise InputError(f"'{images.name}' must be uint8, one for each of the {len(times)} times")
+        if images.size > LIMIT:
+            raise InputError(f"its frames need more than {LIMIT >> 30} GiB of memory: cut it into parts")
+        t = times[:].astype(np.float64)
+        return Frames(images[:], t, flow=_flow(source, camera, t, images.shape[1:]))
+
+
+def _flow(
+    source: Source, camera: str, t: NDArray[np.float64], shape: tuple[int, int]
+) -> NDArray[np.float32] | None:
+    """Return flow [px/s] at the times of frames, (F, 2, H, W), from the ground truth beside the file."""
+    path = source.path.with_name(source.path.name.replace("_data.", "_gt."))
+    if path == source.path or not path.is_file():
+        return None
+    if 8 * len(t) * shape[0] * shape[1] > FLOW_LIMIT:
+        source.note(f"the flow of {path.name} needs more than {FLOW_LIMIT >> 30} GiB of memory: left out")
+        return None
+    with opened(path) as file:
+        if f"{camera}/flow_dist" not in file:
+            return None
+        flow = dataset(file, f"{camera}/flow_dist", 4)
+        begin = dataset(file, f"{camera}/flow_dist_ts", 1)[:].astype(np.float64)
+        if flow.shape != (len(begin), 2, *shape):
+            raise InputError(f"{path.name}: '{flow.name}' must have shape (K, 2, H, W), got {flow.shape}")
+        out = np.full((len(t), 2, *shape), np.nan, np.float32)
+        interval = np.diff(begin)
+        index = np.searchsorted(begin, t, side="right") - 1
+        for frame, k in enumerate(index):
+            if 0 <= k < len(interval) and interval[k] > 0:
+                out[frame] = flow[k] / interval[k]
+        return out
+
+
+def size(source: Source) -> Size | None:
+    """Return the size of the frames, or that of a DAVIS346."""
+    with opened(source.path) as file:
+        images = file.get(f"{_camera(file)}/image_raw")
+        return (images.shape[2], images.shape[1]) if images is not None and images.ndim == 3 else SIZE
+
+
+def matches(path: Path, head: bytes) -> bool:
+    """Whether a file holds the events of a DAVIS of MVSEC."""
+    return any(has(path, head, f"{camera}/events") for camera in CAMERAS)
+
+
+FORMAT = camera_format(
+    name="MVSEC HDF5",
+    suffixes=(".hdf5",),
+    matches=matches,
+    pieces=reader(_parts),
+    size=size,
+    frames=read_frames,
+    ticks=1.0,
+)

@@ -1,0 +1,172 @@
+"""ROS bags: ROS 1 (.bag) and ROS 2 (folder with metadata.yaml, or a single .mcap or .db3).
+
+Read are the first topic of dvs_msgs/EventArray (or prophesee_event_msgs, of the same layout) or of
+event_camera_msgs/EventPacket (before 2023: event_array_msgs/EventArray), and the first topic of images beside
+it. Others are noted. Times count from the first event. The times of images are their stamps: a bag does not
+say how long they were exposed. Bags are opened by `rosbags` (Apache-2.0), the extra "ros"; their messages are
+parsed in `dase.io.ros_messages`.
+"""
+
+from __future__ import annotations
+
+import bz2
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dase.errors import InputError
+from dase.io import frames, ros_messages
+from dase.io.source import Frames, Piece, Size, Source, camera_format, missing_extra
+
+ARRAYS = ("dvs_msgs/msg/EventArray", "prophesee_event_msgs/msg/EventArray")
+PACKETS = ("event_camera_msgs/msg/EventPacket", "event_array_msgs/msg/EventArray")
+IMAGES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
+LARGEST = 1 << 27  # [bytes] of an unpacked chunk
+ROS1 = b"#ROSBAG V"
+MAGICS = (ROS1, b"\x89MCAP0\r\n", b"SQLite format 3\0")
+
+
+@contextmanager
+def _opened(source: Source) -> Iterator[tuple[Any, bool]]:
+    """Open a bag; yield rosbags' reader and whether its messages are CDR."""
+    try:
+        from rosbags import rosbag1, rosbag2
+    except ImportError:
+        raise missing_extra("a ROS bag", "ros") from None
+    cdr = source.path.is_dir() or not _starts(source.path, ROS1)
+    reader: Any = rosbag2.Reader(source.path) if cdr else rosbag1.Reader(source.path)
+    with reader:
+        if not cdr:
+            _bound(reader)
+        yield reader, cdr
+
+
+def _starts(path: Path, magic: bytes) -> bool:
+    with path.open("rb") as file:
+        return file.read(len(magic)) == magic
+
+
+def _bound(reader: Any) -> None:
+    """Replace the unpackers of a ROS 1 bag by ones that stop at `LARGEST`."""
+    from lz4.frame import LZ4FrameDecompressor  # type: ignore[import-untyped]
+    from rosbags.rosbag1.reader import decompressors
+
+    makers = {"bz2": bz2.BZ2Decompressor, "lz4": LZ4FrameDecompressor}
+    bounded = {decompressors[kind]: _unpacker(make) for kind, make in makers.items()}
+    for place, chunk in reader.chunks.items():
+        unpack = bounded.get(chunk.decompressor, chunk.decompressor)
+        reader.chunks[place] = chunk._replace(decompressor=unpack)
+
+
+def _unpacker(make: Callable[[], Any]) -> Callable[[bytes], bytes]:
+    def unpack(data: bytes) -> bytes:
+        unpacker = make()
+        out = bytes(unpacker.decompress(data, max_length=LARGEST))
+        if not unpacker.eof:
+            raise InputError("a chunk is cut short, or larger than it may be")
+        return out
+
+    return unpack
+
+
+def _connections(source: Source, reader: Any, kinds: tuple[str, ...], beside: str = "") -> list[Any]:
+    """Return the connections of the first topic of these types; of several the nearest to `beside`."""
+    found: dict[str, list[Any]] = {}
+    for connection in reader.connections:
+        if connection.msgtype in kinds and connection.msgcount:
+            found.setdefault(connection.topic, []).append(connection)
+    if not found:
+        return []
+
+    def apart(topic: str) -> tuple[int, str]:
+        pairs = zip(topic.split("/"), beside.split("/"), strict=False)
+        return -sum(a == b for a, b in pairs), topic
+
+    topic = min(found, key=apart)
+    if len(found) > 1:
+        source.note(f"holds topics {', '.join(sorted(found))}: {topic} was read")
+    return found[topic]
+
+
+def _events(source: Source, reader: Any) -> list[Any]:
+    found = _connections(source, reader, ARRAYS + PACKETS)
+    if not found:
+        known = sorted(f"{c.topic} ({c.msgtype})" for c in reader.connections)
+        raise InputError(f"has no topic of events, only {', '.join(known[:8]) or 'none'}")
+    return found
+
+
+def pieces(source: Source) -> Iterator[Piece]:
+    """Yield the events [ns]."""
+    with _opened(source) as (reader, cdr):
+        packets = ros_messages.Packets()
+        for connection, _, data in _messages(source, reader, _events(source, reader)):
+            if connection.msgtype in ARRAYS:
+                yield ros_messages.event_array(data, cdr)
+            else:
+                yield from packets(data, cdr)
+        packets.evt3.report(source)
+        packets.evt2.report(source)
+
+
+def _messages(source: Source, reader: Any, connections: list[Any]) -> Iterator[tuple[Any, int, bytes]]:
+    """Yield messages; a damaged part ends the bag, which is noted."""
+    messages = reader.messages(connections)
+    while True:
+        try:
+            message = next(messages)
+        except StopIteration:
+            return
+        except Exception as error:  # rosbags lets pass what its decompressors and its parsers raise
+            why = " ".join(str(error).split()) or type(error).__name__
+            source.note(f"damaged or cut short, read up to there ({why})")
+            return
+        yield message
+
+
+def size(source: Source) -> Size | None:
+    """Return columns and rows as the first message of events tells them."""
+    with _opened(source) as (reader, cdr):
+        for _, _, data in _messages(source, reader, _events(source, reader)):
+            found = ros_messages.dvs_size(data, cdr)
+            return found if all(found) else None
+    return None
+
+
+def read_frames(source: Source) -> Frames | None:
+    """Read the images, or None."""
+    times: list[int] = []
+    with _opened(source) as (reader, cdr):
+        connections = _connections(source, reader, IMAGES, _events(source, reader)[0].topic)
+        if not connections:
+            return None
+
+        def loaded() -> Iterator[NDArray[np.uint8]]:
+            for connection, _, data in _messages(source, reader, connections):
+                time, grey = ros_messages.image(data, cdr, connection.msgtype == IMAGES[1])
+                times.append(time)
+                yield grey
+
+        grey = frames.stack(loaded())
+    return Frames(grey, np.array(times, np.int64)) if times else None
+
+
+def matches(path: Path, head: bytes) -> bool:
+    """Whether a file is a bag, or a folder the bag of ROS 2."""
+    return (path / "metadata.yaml").is_file() if path.is_dir() else head.startswith(MAGICS)
+
+
+FORMAT = camera_format(
+    name="ROS bag",
+    suffixes=(".bag", ".mcap", ".db3"),
+    extra="ros",
+    matches=matches,
+    pieces=pieces,
+    size=size,
+    frames=read_frames,
+    ticks=1e9,
+)

@@ -1,0 +1,66 @@
+"""HDF5 files of v2e (`--dvs_h5`).
+
+    events       [N, 4] uint32: time [us], column, row, 0 or 1
+    frame        [F, H, W] uint8, frame_ts [F] uint32 [us], frame_idx [F]: the frames it was simulated from
+
+The frames are instants, without exposure; without them the size is found from the events. Source: v2e (MIT),
+Hu et al., v2e: from video frames to realistic DVS events, 2021.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from dase.errors import InputError
+from dase.io.columns import PART, dataset, has, opened, reader
+from dase.io.frames import LIMIT
+from dase.io.sequence import coordinates
+from dase.io.source import Frames, Piece, Size, Source, camera_format
+
+
+def _parts(file: Any, source: Source) -> Iterator[Piece]:
+    events = dataset(file, "events", 2)
+    if events.shape[1] != 4 or events.dtype.kind not in "iu":
+        raise InputError(f"'events' must be whole numbers of shape (N, 4), got {events.dtype} {events.shape}")
+    for i in range(0, len(events), PART):
+        t, x, y, p = events[i : i + PART].T
+        yield Piece(t.astype(np.int64), coordinates(x, "events[:, 1]"), coordinates(y, "events[:, 2]"), p > 0)
+
+
+def read_frames(source: Source) -> Frames | None:
+    """Read the frames, or None."""
+    with opened(source.path) as file:
+        if "frame" not in file or "frame_ts" not in file:
+            return None
+        images, times = dataset(file, "frame", 3), dataset(file, "frame_ts", 1)
+        if images.dtype != np.uint8 or len(images) != len(times):
+            raise InputError(f"'frame' must be uint8, one for each of the {len(times)} times of 'frame_ts'")
+        if images.size > LIMIT:
+            raise InputError(f"its frames need more than {LIMIT >> 30} GiB of memory: cut it into parts")
+        return Frames(images[:], times[:].astype(np.int64))
+
+
+def size(source: Source) -> Size | None:
+    """Return the size of the frames, or None."""
+    with opened(source.path) as file:
+        images = file.get("frame")
+        return (images.shape[2], images.shape[1]) if images is not None and images.ndim == 3 else None
+
+
+def matches(path: Path, head: bytes) -> bool:
+    """Whether a file holds a table of events at its root."""
+    return has(path, head, "events")
+
+
+FORMAT = camera_format(
+    name="v2e HDF5",
+    suffixes=(".h5",),
+    matches=matches,
+    pieces=reader(_parts),
+    size=size,
+    frames=read_frames,
+)

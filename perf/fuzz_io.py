@@ -1,0 +1,142 @@
+"""Damage files of every format and read them: no crash, no hang, no error but InputError, little memory.
+
+    python perf/fuzz_io.py                        100 000 files of every format
+    python perf/fuzz_io.py --format EVT3 --files 1000 --seed 7
+
+Every format runs in a process of its own, so that a crash of a library is seen and named. A file that fails
+is kept as `fuzz_FORMAT_N` in the folder named by --keep.
+"""
+
+from __future__ import annotations
+
+import argparse
+import multiprocessing
+import resource
+import shutil
+import sys
+import tempfile
+import time
+import warnings
+from pathlib import Path
+
+import numpy as np
+
+sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
+import reference_io
+
+from dase import io
+from dase.errors import InputError
+
+SLOW = 5.0  # [s] for one file
+HUNG = 60.0  # [s] without a sign of life
+STEP = 100  # files between two signs of life
+MEMORY = 200.0  # [MB] over what the process needed before
+
+
+def peak() -> float:
+    """Return the largest memory this process has had [MB]."""
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+
+
+def read(path: Path) -> bool:
+    """Read a file whole and as a stream; return whether that gave events."""
+    good = False
+    for act in (io.read, lambda path: [len(part) for part in io.stream(path, chunk=1000)]):
+        try:
+            act(path)
+            good = True
+        except InputError as error:
+            if "\n" in str(error) or not str(error).startswith(str(path)):
+                raise AssertionError(f"not one sentence that names the file: {error}") from error
+    return good
+
+
+def run(name: str, files: int, seed: int, keep: Path, results) -> None:
+    """Damage and read files of one format; put what happened into `results` after every file in a while."""
+    warnings.simplefilter("error")
+    rng = np.random.default_rng([seed, *name.encode()])
+    suffix, make = reference_io.SAMPLES[name]
+    folder = Path(tempfile.mkdtemp(dir="/dev/shm" if Path("/dev/shm").is_dir() else None))
+    try:
+        sample = folder / f"sample{suffix}"
+        make(sample, reference_io.events(rng, 300))
+        read(sample)
+        before, good, slowest = peak(), 0, 0.0
+        inner = [sample] if sample.is_file() else sorted(p for p in sample.iterdir() if p.is_file())
+        contents = [path.read_bytes() for path in inner]
+        results.put((name, "files", inner))
+        for k in range(files):
+            which = int(rng.integers(0, len(inner)))
+            inner[which].write_bytes(reference_io.mutated(contents[which], rng))
+            begin = time.perf_counter()
+            try:
+                good += read(sample)
+            except BaseException as error:
+                shutil.copy(inner[which], keep / f"fuzz_{name.replace(' ', '_')}_{k}{inner[which].suffix}")
+                results.put((name, "error", f"file {k}: {type(error).__name__}: {error}"))
+            finally:
+                inner[which].write_bytes(contents[which])
+            spent = time.perf_counter() - begin
+            if spent > max(slowest, SLOW):
+                results.put((name, "error", f"file {k} took {spent:.1f} s"))
+            slowest = max(slowest, spent)
+            if k % STEP == STEP - 1 or k == files - 1:
+                results.put((name, "done", (k + 1, good, slowest, peak() - before)))
+    finally:
+        shutil.rmtree(folder)
+
+
+def main() -> int:
+    """Run all formats; return how many failed."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
+    parser.add_argument("--format", action="append", choices=list(reference_io.SAMPLES))
+    parser.add_argument("--files", type=int, default=100_000)
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--keep", type=Path, default=Path(tempfile.gettempdir()))
+    options = parser.parse_args()
+    failed = 0
+    print(f"{'format':<22}{'files':>8}{'readable':>10}{'slowest':>10}{'memory':>10}")
+    for name in options.format or reference_io.SAMPLES:
+        context = multiprocessing.get_context("spawn")
+        results = context.SimpleQueue()
+        arguments = (name, options.files, options.seed, options.keep, results)
+        process = context.Process(target=run, args=arguments)
+        failed += watch(process, name, options.files, options.keep, results)
+    return failed
+
+
+def watch(process, name: str, files: int, keep: Path, results) -> int:
+    """Start a process, print its outcome, return 1 where it failed."""
+    process.start()
+    errors, last, inner, alive = [], (0, 0, 0.0, 0.0), [], time.monotonic()
+    while process.is_alive() or not results.empty():
+        if results.empty():
+            time.sleep(0.05)
+            if time.monotonic() - alive > HUNG:
+                for path in inner:
+                    shutil.copy(path, keep / f"fuzz_{name.replace(' ', '_')}_hung_{path.name}")
+                process.kill()
+                process.join()
+                shutil.rmtree(inner[0].parent, ignore_errors=True)
+            continue
+        _, kind, value = results.get()
+        alive = time.monotonic()
+        if kind == "error":
+            errors.append(value)
+        elif kind == "files":
+            inner = value
+        else:
+            last = value
+    process.join()
+    if process.exitcode:
+        errors.append(f"the process ended with {process.exitcode} after about {last[0]} files")
+    if last[3] > MEMORY:
+        errors.append(f"took {last[3]:.0f} MB")
+    print(f"{name:<22}{last[0]:>8}{last[1]:>10}{last[2]:>9.2f}s{last[3]:>8.0f} MB", flush=True)
+    for error in errors[:5]:
+        print(f"    {error}", flush=True)
+    return int(bool(errors) or last[0] != files)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,210 @@
+"""The layouts in HDF5: which one it is, frames and flow, filters, ECF, and what is missing."""
+
+from __future__ import annotations
+
+import h5py
+import numpy as np
+import pytest
+from reference_io import H, W, dsec, ecf, ecf_buffer, events, mvsec, v2e, written
+
+from dase import io
+from dase.errors import InputError
+from dase.io import columns
+from dase.io import ecf as ecf_module
+from dase.io.sequence import Sequence
+
+
+def test_dsec_with_blosc(tmp_path, rng):
+    plugin = pytest.importorskip("hdf5plugin")
+    e = events(rng, 5000, 640, 480)
+    dsec(tmp_path / "events.h5", e, **plugin.Blosc(cname="zstd"))
+    notes = []
+    got = io.read(tmp_path / "events.h5", notes=notes).events
+    np.testing.assert_array_equal(got.t, e.t)
+    assert (got.width, got.height) == (640, 480)
+    assert "t_offset: add 49599.300523 s for the clock of the frames" in notes
+
+
+def test_without_the_filter_the_extra_is_named(tmp_path, rng, monkeypatch):
+    plugin = pytest.importorskip("hdf5plugin")
+    dsec(tmp_path / "a.h5", events(rng, 100), **plugin.Blosc())
+    monkeypatch.setattr(columns.h5py.h5z, "filter_avail", lambda number: False)
+    with pytest.raises(InputError, match=r'pip install "dase\[hdf5\]"'):
+        io.read(tmp_path / "a.h5")
+
+
+def test_m3ed_tells_its_size(tmp_path, rng):
+    e = events(rng, 500)
+    dsec(tmp_path / "a.h5", e)
+    with h5py.File(tmp_path / "a.h5", "r+") as file:
+        file["prophesee/left"] = file.pop("events") if hasattr(file, "pop") else file["events"]
+        file["prophesee/left/calib/resolution"] = np.array([1280, 720])
+    got = io.read(tmp_path / "a.h5").events
+    assert (len(got), got.width, got.height) == (500, 1280, 720)
+
+
+@pytest.mark.parametrize("truth", [False, True])
+def test_mvsec_with_frames_and_flow(tmp_path, rng, truth):
+    origin = 1_504_645_177.0
+    e = events(rng, 2000, 346, 260)
+    grey = rng.integers(0, 256, (4, 260, 346), np.uint8)
+    times = np.array([0.01, 0.05, 0.09, 0.13])
+    mvsec(tmp_path / "x_data.hdf5", e, frames=(times, grey), origin=origin)
+    flow = rng.normal(size=(3, 2, 260, 346)).astype(np.float32)
+    if truth:
+        with h5py.File(tmp_path / "x_gt.hdf5", "w") as file:
+            file["davis/left/flow_dist"] = flow
+            file["davis/left/flow_dist_ts"] = np.array([0.04, 0.08, 0.12]) + origin
+    got = io.read(tmp_path / "x_data.hdf5")
+    np.testing.assert_array_equal(got.frames, grey)
+    np.testing.assert_allclose(got.frame_times, times - e.t[0], atol=1e-6)
+    np.testing.assert_array_equal(got.events.p, e.p)
+    if not truth:
+        assert got.flow is None
+        return
+    assert np.isnan(got.flow[[0, 3]]).all()
+    np.testing.assert_allclose(got.flow[1], flow[0] / 0.04, rtol=1e-4)
+    np.testing.assert_allclose(got.flow[2], flow[1] / 0.04, rtol=1e-4)
+
+
+def test_v2e_with_frames(tmp_path, rng):
+    e, grey = events(rng, 500), rng.integers(0, 256, (3, H, W), np.uint8)
+    v2e(tmp_path / "a.h5", e, frames=(np.array([0.0, 0.01, 0.02]), grey))
+    got = io.read(tmp_path / "a.h5")
+    np.testing.assert_array_equal(got.frames, grey)
+    np.testing.assert_allclose(got.frame_times, [0, 0.01, 0.02])
+    assert got.frame_exposure is None
+
+
+@pytest.mark.parametrize("mode", [0, 1, 2])
+def test_ecf_buffers(rng, mode):
+    for trial in range(60):
+        n = int(rng.integers(1, 2000))
+        steps = rng.choice([0, 0, 0, 1, 14, 15, 16, 300, 10**6, 10**10], n)
+        t = 10**12 + np.cumsum(steps if trial % 3 else np.zeros(n, np.int64))
+        x = rng.integers(0, 1280, n) if trial % 2 else np.cumsum(rng.integers(0, 3, n)) % 1280
+        y = np.sort(rng.integers(0, 5, n)) if trial % 2 else rng.integers(0, 720, n)
+        p = (rng.random(n) < 0.5).astype(np.uint8) if trial % 5 else np.arange(n, dtype=np.uint8) // 150 % 2
+        buffer = ecf_buffer(t, x, y, p, mode)
+        got = ecf_module.unpack(buffer)
+        for a, b in zip(got, (t, x, y, p), strict=True):
+            np.testing.assert_array_equal(a, b)
+        for length in rng.integers(0, len(buffer), 20):
+            if mode == 2 or length < len(buffer) - 8:
+                with pytest.raises(InputError):
+                    ecf_module.unpack(buffer[:length])
+
+
+@pytest.mark.parametrize("mode", [0, 1, 2])
+def test_ecf_files(tmp_path, rng, mode):
+    e = events(rng, 5000)
+    ecf(tmp_path / "a.hdf5", e, mode=mode)
+    got = io.read(tmp_path / "a.hdf5").events
+    for name in "txyp":
+        np.testing.assert_array_equal(getattr(got, name), getattr(e, name))
+    assert (got.width, got.height) == (W, H)
+
+
+def test_metavision_without_ecf(tmp_path):
+    kind = np.dtype([("x", "<u2"), ("y", "<u2"), ("p", "<i2"), ("t", "<i8")])
+    with h5py.File(tmp_path / "a.hdf5", "w") as file:
+        file["CD/events"] = np.array([(1, 2, 1, 5), (3, 4, 0, 6)], kind)
+        file.attrs["format"] = "EVT3;height=720;width=1280"
+    got = io.read(tmp_path / "a.hdf5").events
+    assert (got.t * 1e6).round().tolist() == [5, 6]
+    assert (got.width, got.height) == (1280, 720)
+
+
+@pytest.mark.parametrize("make", [ecf, written("HDF5")])
+def test_a_heap_of_texts_with_an_empty_hole_is_no_endless_loop(tmp_path, rng, make):
+    """HDF5 2.0 itself never returns from such a file."""
+    path = tmp_path / "a.h5"
+    make(path, events(rng, 50))
+    if make is not ecf:
+        with h5py.File(path, "r+") as file:
+            file.require_group("dase").attrs["configuration"] = "a = 1\n"
+    content = path.read_bytes()
+    place = content.index(columns.HEAP) + 16  # the first object: its length now leads into the hole
+    path.write_bytes(content[: place + 8] + b"\x2f" + content[place + 9 :])
+    for act in (io.read, lambda path: list(io.stream(path))):
+        with pytest.raises(InputError, match="heap of texts is damaged"):
+            act(path)
+
+
+def test_layouts_nobody_knows(tmp_path):
+    with h5py.File(tmp_path / "a.h5", "w") as file:
+        file["something/else"] = np.zeros(3)
+    with pytest.raises(InputError, match=r"of no known layout .*: holds something, something/else"):
+        io.read(tmp_path / "a.h5")
+    with h5py.File(tmp_path / "b.h5", "w"):
+        pass
+    with pytest.raises(InputError, match="holds nothing"):
+        list(io.stream(tmp_path / "b.h5"))
+
+
+@pytest.mark.parametrize(
+    ("make", "change", "match"),
+    [
+        (dsec, ("events/x", np.zeros(7, np.uint16)), "'events/x' has 7 entries"),
+        (dsec, ("events/x", np.full(500, -1, np.int32)), "must lie in 0..65535"),
+        (dsec, ("events/x", np.zeros(500)), "must be integers"),
+        (dsec, ("events/t", np.zeros((500, 2))), "must have 1 axes"),
+        (dsec, ("events/p", np.array([b"a"] * 500)), "must hold numbers"),
+        (mvsec, ("davis/left/events", np.zeros((5, 3))), r"shape \(N, 4\)"),
+        (mvsec, ("davis/left/events", np.full((5, 4), np.nan)), "not a finite number|0..65535"),
+        (v2e, ("events", np.zeros((5, 4))), "whole numbers of shape"),
+        (v2e, ("events", np.zeros((5, 3), np.uint32)), r"shape \(N, 4\)"),
+        (ecf, ("CD/events", np.zeros(5)), "must have the fields"),
+        (written("HDF5"), ("events/xs", np.zeros(7, np.int16)), "has 7 entries|common shape"),
+    ],
+)
+@pytest.mark.filterwarnings("ignore:invalid value encountered in cast")
+def test_columns_that_do_not_fit(tmp_path, rng, make, change, match):
+    path = tmp_path / "a.hdf5"
+    make(path, events(rng, 500))
+    with h5py.File(path, "r+") as file:
+        del file[change[0]]
+        file[change[0]] = change[1]
+    for act in (io.read, lambda path: list(io.stream(path))):
+        with pytest.raises(InputError, match=match):
+            act(path)
+
+
+@pytest.mark.parametrize(
+    "name", ["events/t", "events/xs", "davis/left/events", "events", "CD/events", "images/image000000000"]
+)
+def test_bombs(tmp_path, rng, name):
+    """A small file whose dataset is declared as large as a disk."""
+    path = tmp_path / "a.h5"
+    with h5py.File(path, "w") as file:
+        shape = (10**9, 4) if name in ("davis/left/events", "events") else (10**10,)
+        if name.startswith("images"):
+            shape = (8000, 8000 * 100)
+        kind = [("x", "<u2"), ("y", "<u2"), ("p", "<i2"), ("t", "<i8")] if name == "CD/events" else "u2"
+        file.create_dataset(name, shape, kind, chunks=True, compression="gzip")
+        for other in ("t", "x", "y", "p") if name == "events/t" else ("xs", "ys", "ts", "ps"):
+            if name.startswith("events/") and f"events/{other}" not in file:
+                file[f"events/{other}"] = np.zeros(3, np.uint16)
+        file.attrs["sensor_resolution"] = np.array([H, W])
+    assert path.stat().st_size < 1 << 20
+    for act in (io.read, lambda path: list(io.stream(path))):
+        with pytest.raises(InputError, match="more than 100 times is refused"):
+            act(path)
+
+
+def test_s2r_streams_with_the_size_either_way_round(tmp_path, rng):
+    e = events(rng, 1000)
+    io.write(tmp_path / "a.h5", Sequence(e))
+    with h5py.File(tmp_path / "a.h5", "r+") as file:
+        file.attrs["sensor_resolution"] = np.array([W, H])
+    got = next(io.stream(tmp_path / "a.h5"))
+    assert (got.width, got.height) == (W, H)
+    frames = np.zeros((1, H, W), np.uint8)
+    io.write(tmp_path / "b.h5", Sequence(e, frames, np.zeros(1)))
+    with h5py.File(tmp_path / "b.h5", "r+") as file:
+        del file.attrs["sensor_resolution"]
+    assert next(io.stream(tmp_path / "b.h5")).width == W
+    with h5py.File(tmp_path / "a.h5", "r+") as file:
+        del file.attrs["sensor_resolution"]
+    with pytest.raises(InputError, match="how large"):
+        list(io.stream(tmp_path / "a.h5"))
