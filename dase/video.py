@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from dase.errors import InputError
 from dase.kernels import pixel
+from dase.kernels.scene import interpolate
 from dase.pictures import list_pictures, read_grey, to_grey
 from dase.scene import Scene
 
@@ -52,32 +53,33 @@ class VideoScene(Scene):
     def source(self, times: NDArray[np.float64], pixels: NDArray[np.int32], device: Any) -> tuple[str, Any]:
         """Return the stored intensities of these pixels."""
         source = pixel.Frames()
-        flat = self._between(times).reshape(len(times), -1)
-        every = np.array_equal(pixels, np.arange(flat.shape[1]))
-        values = flat if every else flat[:, pixels]
-        source.values = wp.array(np.ascontiguousarray(values, np.float32), dtype=float, device=device)
+        above = np.minimum(np.searchsorted(self._times, times), len(self._times) - 1)
+        if np.array_equal(self._times[above], times):
+            source.values = wp.array(self._rows(above, pixels), dtype=float, device=device)
+        else:
+            source.values = self._between(times, above, pixels, device)
         return "frames", source
 
     def frames(self, times: NDArray[np.float64], device: str = "cpu") -> NDArray[np.float32]:
         """Return the frames at `times`, which must be times of frames, shape (K, height, width)."""
         return np.asarray(self._at(times), np.float32)
 
-    def _between(self, times: NDArray[np.float64]) -> NDArray[Any]:
-        above = np.minimum(np.searchsorted(self._times, times), len(self._times) - 1)
-        if np.array_equal(self._times[above], times):
-            return self._frames[above]
-        below = np.maximum(above - 1, 0)
+    def _rows(self, index: NDArray[np.int64], pixels: NDArray[np.int32]) -> NDArray[np.float32]:
+        flat = self._frames[index].reshape(len(index), -1)
+        every = np.array_equal(pixels, np.arange(flat.shape[1]))
+        return np.ascontiguousarray(flat if every else flat[:, pixels], np.float32)
+
+    def _between(
+        self, times: NDArray[np.float64], above: NDArray[np.int64], pixels: NDArray[np.int32], device: Any
+    ) -> Any:
         if np.any(times < self._times[0]) or np.any(times > self._times[-1]):
             raise InputError("video: asked for a time outside it")
-        share = ((times - self._times[below]) / np.maximum(self._times[above] - self._times[below], 1e-30))[
-            :, None, None
-        ]
+        below = np.where(self._times[above] == times, above, above - 1)
+        gap = self._times[above] - self._times[below]
+        share = (times - self._times[below]) / np.where(gap > 0, gap, 1.0)
         needed, at = np.unique(np.concatenate([below, above]), return_inverse=True)
-        frames = np.asarray(self._frames[needed], np.float32)
-        first, second = frames[at[: len(times)]], frames[at[len(times) :]]
-        # straight in log(intensity + 0.001), as sensors see it
-        mixed = (first + EPS) ** (1 - share) * (second + EPS) ** share - EPS
-        return np.where(share == 1, second, np.maximum(mixed, 0))
+        pairs = at.reshape(2, -1).astype(np.int32)
+        return interpolate(self._rows(needed, pixels), pairs, share, EPS, device)
 
     def _at(self, times: NDArray[np.float64]) -> NDArray[Any]:
         index = np.searchsorted(self._times, times)

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import numpy as np
 import warp as wp
+from numpy.typing import NDArray
 
 from dase.kernels import launch
 
@@ -334,6 +335,46 @@ def upload(
         wp.array(start, dtype=int, device=device),
         wp.array(np.array(size), dtype=wp.vec2i, device=device),
     )
+
+
+@wp.kernel(enable_backward=False)
+def mix(
+    first: int,
+    # in
+    frames: wp.array2d[float],  # (F, N) linear intensity
+    at: wp.array2d[int],  # (2, K) frames before and after each sample
+    share: wp.array[float],  # (K,) of the way from one to the other
+    eps: float,
+    # out
+    out: wp.array2d[float],  # (K, N)
+):
+    """Interpolate stored frames; log(intensity + eps) runs straight between two of them."""
+    k, i = wp.tid()
+    i += first
+    before = frames[at[0, k], i]
+    after = frames[at[1, k], i]
+    out[k, i] = before
+    if at[0, k] != at[1, k] and before != after:
+        step = wp.log((after + eps) / (before + eps))
+        out[k, i] = wp.max((before + eps) * wp.exp(share[k] * step) - eps, 0.0)
+
+
+def interpolate(
+    frames: NDArray[np.float32],
+    at: NDArray[np.int32],
+    share: NDArray[np.float64],
+    eps: float,
+    device: wp.Device,
+) -> wp.array:
+    """Return intensities between frames, shape (K, N); see `mix`."""
+    samples, pixels = len(share), frames.shape[1]
+    out = wp.empty((samples, pixels), dtype=float, device=device)
+    arrays = [
+        wp.array(a, dtype=kind, device=device)
+        for a, kind in ((frames, float), (at, int), (share.astype(np.float32), float))
+    ]
+    launch.run(mix, pixels, [*arrays, eps, out], device, batch=samples)
+    return out
 
 
 def render_frames(layers: Layers, width: int, height: int, device: wp.Device) -> wp.array:
