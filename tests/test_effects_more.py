@@ -99,7 +99,7 @@ def test_all_effects_in_chunks_and_counts(device, rng, mode):
     whole = dase.Events.concatenate(dase.stream(scene, sensor, seed=3, device=device, chunk=10**6))
     for chunk in (1, 5, 64):
         same(dase.Events.concatenate(dase.stream(scene, sensor, seed=3, device=device, chunk=chunk)), whole)
-    fine = dase.VideoScene(_between(scene, times), times)
+    fine = dase.VideoScene(_between(scene, times, device), times)
     part = dase.simulate(fine, sensor, seed=3, device=device, pixels=[5, 17, 60])
     assert {tuple(row) for row in rows(part)} <= {tuple(row) for row in rows(whole)}
     got = counts(scene, sensor, 9.0, device, seed=3)
@@ -108,9 +108,9 @@ def test_all_effects_in_chunks_and_counts(device, rng, mode):
         np.testing.assert_array_equal(got[p], np.bincount(place[whole.p == p], minlength=80))
 
 
-def _between(scene: dase.VideoScene, times: np.ndarray) -> np.ndarray:
+def _between(scene: dase.VideoScene, times: np.ndarray, device: str) -> np.ndarray:
     everywhere = np.arange(scene.width * scene.height, dtype=np.int32)
-    source = scene.source(times, everywhere, launch.device("cpu"))[1]
+    source = scene.source(times, everywhere, launch.device(device))[1]
     return source.values.numpy().reshape(len(times), scene.height, scene.width)
 
 
@@ -181,7 +181,7 @@ def test_between_frames_the_log_intensity_runs_straight():
     frames = np.array([0.0, 0.2, 0.9, 0.9], np.float32)[:, None, None]
     scene = dase.VideoScene(frames, [0.0, 1.0, 3.0, 4.0])
     times = np.array([0.0, 0.25, 1.0, 2.0, 2.5, 4.0])
-    got = np.log(_between(scene, times)[:, 0, 0] + 1e-3)
+    got = np.log(_between(scene, times, device)[:, 0, 0] + 1e-3)
     want = np.interp(times, [0, 1, 3, 4], np.log(frames[:, 0, 0] + 1e-3))
     np.testing.assert_allclose(got, want, rtol=1e-5)
     for outside in (-0.1, 4.1):
