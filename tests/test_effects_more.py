@@ -177,7 +177,7 @@ def test_scenes_are_sampled_often_enough(device):
     assert np.diff(sample_times(scene, noisy)).max() <= 1 / 800 + 1e-9
 
 
-def test_between_frames_the_log_intensity_runs_straight():
+def test_between_frames_the_log_intensity_runs_straight(device):
     frames = np.array([0.0, 0.2, 0.9, 0.9], np.float32)[:, None, None]
     scene = dase.VideoScene(frames, [0.0, 1.0, 3.0, 4.0])
     times = np.array([0.0, 0.25, 1.0, 2.0, 2.5, 4.0])
