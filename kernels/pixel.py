@@ -210,7 +210,7 @@ def compose(stages: tuple[Stages, ...], source: str, sink: str) -> wp.Kernel:
         sink: `counts`, `keys`, or `labels` for keys with labels.
 
     Returns:
-        A kernel over (B, N) threads; its arguments are listed by `signature`.
+        A kernel over (B, N) threads; `_Writer.kernel` writes its arguments.
     """
     writer = _Writer(stages, source, sink)
     return _compiled(writer.kernel(), "pixel_events", writer.scope)
