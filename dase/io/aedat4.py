@@ -28,9 +28,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dase.errors import InputError
-from dase.io import frames
 from dase.io.flatbuffer import Table
-from dase.io.source import Frames, Piece, Size, Source, camera_format, join, missing_extra
+from dase.io.format import camera_format
+from dase.io.source import Picture, Piece, Size, Source, join, missing_extra
 
 T = TypeVar("T")
 
@@ -128,7 +128,7 @@ def _packets(source: Source, kind: str, parse: Callable[[Table], T]) -> Iterator
     if stream is None:
         return
     if sum(name == kind for _, name, _ in header.streams) > 1:
-        source.note(f"holds several streams of type {kind}: the first was read")
+        source.note(f"holds several streams of type {kind}: the first was read", "assumed", "streams")
     unpack = _unpacker(header.compression)
     damaged = 0
     with source.path.open("rb") as file:
@@ -138,7 +138,7 @@ def _packets(source: Source, kind: str, parse: Callable[[Table], T]) -> Iterator
             number, size = struct.unpack("<ii", file.read(8))
             place += 8 + size
             if size < 0 or place > header.end:
-                source.note("damaged or cut short: read up to there")
+                source.note("damaged or cut short: read up to there", "refused", "damage", 1)
                 break
             if number == stream[0]:
                 try:
@@ -148,7 +148,7 @@ def _packets(source: Source, kind: str, parse: Callable[[Table], T]) -> Iterator
                     continue
                 yield parsed
     if damaged:
-        source.note(f"{damaged} damaged packets of type {kind}: skipped")
+        source.note(f"{damaged} damaged packets of type {kind}: skipped", "refused", "damage", damaged)
 
 
 def pieces(source: Source) -> Iterator[Piece]:
@@ -179,21 +179,10 @@ def size(source: Source) -> Size | None:
     return stream[1]
 
 
-def read_frames(source: Source) -> Frames | None:
-    """Read the frames with their exposures, or None."""
-    spans: list[tuple[int, int]] = []
-
-    def loaded() -> Iterator[NDArray[np.uint8]]:
-        for pixels, span in _packets(source, "FRME", _frame):
-            spans.append(span)
-            yield pixels
-
-    grey = frames.stack(loaded())
-    if not len(grey):
-        return None
-    begin, end = np.array(spans, np.int64).T
-    exposure = (end - begin) / 1e6
-    return Frames(grey, begin + (end - begin) / 2, exposure if exposure.any() else None)
+def pictures(source: Source) -> Iterator[Picture]:
+    """Yield the frames with their exposures [us]."""
+    for grey, (begin, end) in _packets(source, "FRME", _frame):
+        yield Picture(grey, begin + (end - begin) / 2, (end - begin) / 1e6)
 
 
 def _frame(packet: Table) -> tuple[NDArray[np.uint8], tuple[int, int]]:
@@ -220,5 +209,5 @@ FORMAT = camera_format(
     matches=lambda path, head: head.startswith(MAGIC[:10]),
     pieces=pieces,
     size=size,
-    frames=read_frames,
+    pictures=pictures,
 )

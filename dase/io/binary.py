@@ -32,7 +32,8 @@ def records(source: Source, begin: int, kind: Any) -> Iterator[NDArray[Any]]:
             rest = block[count * size :]
             yield np.frombuffer(block, kind, count)
     if rest:
-        source.note(f"{len(rest)} bytes at the end are no whole record of {size} bytes: skipped")
+        sentence = f"{len(rest)} bytes at the end are no whole record of {size} bytes: skipped"
+        source.note(sentence, "refused", "damage", 1)
 
 
 class Rollover:

@@ -21,7 +21,8 @@ from numpy.typing import NDArray
 from dase.io import raw
 from dase.io.binary import records
 from dase.io.evt2 import HIGH, KNOWN, Decoder
-from dase.io.source import Piece, Source, camera_format
+from dase.io.format import camera_format
+from dase.io.source import Piece, Source
 
 PART = 1 << 14  # words decoded at once: each may hold 32 events
 

@@ -15,12 +15,10 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-from numpy.typing import NDArray
-
 from dase.errors import InputError
-from dase.io import frames, ros_messages
-from dase.io.source import Frames, Piece, Size, Source, camera_format, missing_extra
+from dase.io import ros_messages
+from dase.io.format import camera_format
+from dase.io.source import Picture, Piece, Size, Source, missing_extra
 
 ARRAYS = ("dvs_msgs/msg/EventArray", "prophesee_event_msgs/msg/EventArray")
 PACKETS = ("event_camera_msgs/msg/EventPacket", "event_array_msgs/msg/EventArray")
@@ -88,7 +86,9 @@ def _connections(source: Source, reader: Any, kinds: tuple[str, ...], beside: st
 
     topic = min(found, key=apart)
     if len(found) > 1:
-        source.note(f"holds topics {', '.join(sorted(found))}: {topic} was read")
+        source.note(
+            f"holds topics {', '.join(sorted(found))}: {topic} was read", "assumed", "streams", len(found)
+        )
     return found[topic]
 
 
@@ -123,7 +123,7 @@ def _messages(source: Source, reader: Any, connections: list[Any]) -> Iterator[t
             return
         except Exception as error:  # rosbags lets pass what its decompressors and its parsers raise
             why = " ".join(str(error).split()) or type(error).__name__
-            source.note(f"damaged or cut short, read up to there ({why})")
+            source.note(f"damaged or cut short, read up to there ({why})", "refused", "damage", 1)
             return
         yield message
 
@@ -137,22 +137,15 @@ def size(source: Source) -> Size | None:
     return None
 
 
-def read_frames(source: Source) -> Frames | None:
-    """Read the images, or None."""
-    times: list[int] = []
+def pictures(source: Source) -> Iterator[Picture]:
+    """Yield the images [ns]."""
     with _opened(source) as (reader, cdr):
         connections = _connections(source, reader, IMAGES, _events(source, reader)[0].topic)
         if not connections:
-            return None
-
-        def loaded() -> Iterator[NDArray[np.uint8]]:
-            for connection, _, data in _messages(source, reader, connections):
-                time, grey = ros_messages.image(data, cdr, connection.msgtype == IMAGES[1])
-                times.append(time)
-                yield grey
-
-        grey = frames.stack(loaded())
-    return Frames(grey, np.array(times, np.int64)) if times else None
+            return  # rosbags takes none for all
+        for connection, _, data in _messages(source, reader, connections):
+            time, grey = ros_messages.image(data, cdr, connection.msgtype == IMAGES[1])
+            yield Picture(grey, time)
 
 
 def matches(path: Path, head: bytes) -> bool:
@@ -167,6 +160,6 @@ FORMAT = camera_format(
     matches=matches,
     pieces=pieces,
     size=size,
-    frames=read_frames,
+    pictures=pictures,
     ticks=1e9,
 )

@@ -100,7 +100,7 @@ class Message:
 
 def _dvs_piece(events: NDArray[Any]) -> Piece:
     t = events["s"].astype(np.int64) * 10**9 + events["ns"]
-    return Piece(t, events["x"].copy(), events["y"].copy(), events["p"] > 0)
+    return Piece(t, events["x"].copy(), events["y"].copy(), events["p"])
 
 
 def dvs_size(data: bytes, cdr: bool) -> Size:
