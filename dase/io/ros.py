@@ -9,21 +9,19 @@ parsed in `dase.io.ros_messages`.
 
 from __future__ import annotations
 
-import bz2
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 from dase.errors import InputError
-from dase.io import ros_messages
+from dase.io import packed, ros_messages
 from dase.io.format import camera_format
 from dase.io.source import Picture, Piece, Size, Source, missing_extra
 
 ARRAYS = ("dvs_msgs/msg/EventArray", "prophesee_event_msgs/msg/EventArray")
 PACKETS = ("event_camera_msgs/msg/EventPacket", "event_array_msgs/msg/EventArray")
 IMAGES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
-LARGEST = 1 << 27  # [bytes] of an unpacked chunk
 ROS1 = b"#ROSBAG V"
 MAGICS = (ROS1, b"\x89MCAP0\r\n", b"SQLite format 3\0")
 
@@ -37,38 +35,13 @@ def _opened(source: Source) -> Iterator[tuple[Any, bool]]:
         raise missing_extra("a ROS bag", "ros") from None
     cdr = source.path.is_dir() or not _starts(source.path, ROS1)
     reader: Any = rosbag2.Reader(source.path) if cdr else rosbag1.Reader(source.path)
-    with reader:
-        if not cdr:
-            _bound(reader)
+    with packed.bounded_bags(), reader:
         yield reader, cdr
 
 
 def _starts(path: Path, magic: bytes) -> bool:
     with path.open("rb") as file:
         return file.read(len(magic)) == magic
-
-
-def _bound(reader: Any) -> None:
-    """Replace the unpackers of a ROS 1 bag by ones that stop at `LARGEST`."""
-    from lz4.frame import LZ4FrameDecompressor  # type: ignore[import-untyped]
-    from rosbags.rosbag1.reader import decompressors
-
-    makers = {"bz2": bz2.BZ2Decompressor, "lz4": LZ4FrameDecompressor}
-    bounded = {decompressors[kind]: _unpacker(make) for kind, make in makers.items()}
-    for place, chunk in reader.chunks.items():
-        unpack = bounded.get(chunk.decompressor, chunk.decompressor)
-        reader.chunks[place] = chunk._replace(decompressor=unpack)
-
-
-def _unpacker(make: Callable[[], Any]) -> Callable[[bytes], bytes]:
-    def unpack(data: bytes) -> bytes:
-        unpacker = make()
-        out = bytes(unpacker.decompress(data, max_length=LARGEST))
-        if not unpacker.eof:
-            raise InputError("a chunk is cut short, or larger than it may be")
-        return out
-
-    return unpack
 
 
 def _connections(source: Source, reader: Any, kinds: tuple[str, ...], beside: str = "") -> list[Any]:
