@@ -68,6 +68,16 @@ class Rollover:
         return values
 
 
+def set_bits(octets: NDArray[np.uint8]) -> NDArray[np.intp]:
+    """Return the places of the bits that are set in bytes, the lowest first."""
+    filled = np.flatnonzero(octets != 0)
+    if 2 * len(filled) > len(octets):
+        return np.flatnonzero(np.unpackbits(octets, bitorder="little").view(np.bool_))
+    # where one bit in ten or fewer is set NumPy looks for each on its own, which is slower
+    bits = np.flatnonzero(np.unpackbits(octets[filled], bitorder="little").view(np.bool_))
+    return filled.take(bits >> 3) << 3 | bits & 7
+
+
 def bridges(
     counts: NDArray[np.int64], last: int, step: int, name: str
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:

@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 
 from dase.events import Events
 from dase.io import raw
-from dase.io.binary import EventWriter, Rollover, bridges, records, weave
+from dase.io.binary import EventWriter, Rollover, bridges, records, set_bits, weave
 from dase.io.format import camera_format
 from dase.io.sequence import Writer, writing
 from dase.io.source import Piece, Source
@@ -82,7 +82,7 @@ class Decoder:
         piece = Piece(times.take(place), base, rows.take(known & 0xFFFFFFFF), on)
         if mask is None:
             return piece
-        bits = np.flatnonzero(np.unpackbits(mask.view(np.uint8), bitorder="little").view(np.bool_))
+        bits = set_bits(mask.astype("<u2", copy=False).view(np.uint8))
         count = BITS.take(mask)
         t, x, y, p = (np.repeat(column, count) for column in (piece.t, piece.x, piece.y, piece.p))
         return Piece(t, x + (bits & 15).astype(np.uint16), y, p)

@@ -158,7 +158,7 @@ class Packets:
         elif encoding == "evt21":
             halves = _words(data, "<u8").view("<u4").reshape(-1, 2)
             at, piece = self.evt2.part(halves[:, 1])
-            yield expand(piece._replace(t=piece.t * 1000), halves[at, 0])
+            yield from expand(piece._replace(t=piece.t * 1000), halves[at, 0])
         elif encoding == "mono":
             yield _mono(_words(data, "<u8"), base)
         elif encoding == "libcaer":
