@@ -94,7 +94,7 @@ def test_few_events_outside_are_left_out_and_a_wrong_size_is_refused(tmp_path):
     archive(tmp_path / "a.npz", np.arange(6), x=[9, 9, 9, 9, 1, 0])
     for act in (io.read, lambda path: list(io.stream(path))):
         with pytest.raises(
-            InputError, match=r"4 of 6 events lie outside the 3x3 it claims: give the right size"
+            InputError, match=r"4 of 6 events lie outside the 3x3 it claims: the size is wrong"
         ):
             act(tmp_path / "a.npz")
     for got, _ in both(tmp_path / "a.npz", size=(20, 3)):
