@@ -144,7 +144,8 @@ def inside(source: Source, pieces: Iterable[Piece], size: Size) -> Iterator[Piec
         return
     if 2 * outside > total and source.size is None:
         raise InputError(
-            f"{outside} of {total} events lie outside the {size[0]}x{size[1]} it claims: the size is wrong, or the file is damaged"
+            f"{outside} of {total} events lie outside the {size[0]}x{size[1]} it claims: "
+            "the size is wrong, or the file is damaged"
         )
     sentence = f"{outside} events lie outside the {size[0]}x{size[1]} sensor: skipped"
     source.note(sentence, "refused", "bounds", outside)
