@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import argparse
 import multiprocessing
+import os
 import resource
 import shutil
 import sys
@@ -31,8 +32,9 @@ from dase import io
 from dase.errors import InputError
 from dase.io.sequence import Sequence
 
-SLOW = 5.0  # [s] for one file
-HUNG = 60.0  # [s] without a sign of life
+SLOW = 5.0  # [s] of processor for one file
+HUNG = 60.0  # [s] of processor without a sign of life
+STUCK = 3600.0  # [s] without one, waiting
 STEP = 100  # files between two signs of life
 MEMORY = 200.0  # [MB] over what the process needed before
 
@@ -121,7 +123,7 @@ def run(name: str, files: int, seed: int, keep: Path, results) -> None:
         for k in range(files):
             which = int(rng.integers(0, len(inner)))
             inner[which].write_bytes(reference_io.mutated(contents[which], rng))
-            begin = time.perf_counter()
+            begin = time.process_time()
             try:
                 good += read(sample)
             except BaseException as error:
@@ -129,7 +131,7 @@ def run(name: str, files: int, seed: int, keep: Path, results) -> None:
                 results.put((name, "error", f"file {k}: {type(error).__name__}: {error}"))
             finally:
                 inner[which].write_bytes(contents[which])
-            spent = time.perf_counter() - begin
+            spent = time.process_time() - begin
             if spent > max(slowest, SLOW):
                 results.put((name, "error", f"file {k} took {spent:.1f} s"))
             slowest = max(slowest, spent)
@@ -158,14 +160,23 @@ def main() -> int:
     return failed
 
 
+def processor(pid: int) -> float:
+    """Return the time of the processor that a process has used [s]; 0 once it is gone."""
+    try:
+        fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
+    except OSError:
+        return 0.0
+    return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
+
+
 def watch(process, name: str, files: int, keep: Path, results) -> int:
     """Start a process, print its outcome, return 1 where it failed."""
     process.start()
-    errors, last, inner, alive = [], (0, 0, 0.0, 0.0), [], time.monotonic()
+    errors, last, inner, alive, used = [], (0, 0, 0.0, 0.0), [], time.monotonic(), 0.0
     while process.is_alive() or not results.empty():
         if results.empty():
             time.sleep(0.05)
-            if time.monotonic() - alive > HUNG:
+            if processor(process.pid) - used > HUNG or time.monotonic() - alive > STUCK:
                 for path in inner:
                     shutil.copy(path, keep / f"fuzz_{name.replace(' ', '_')}_hung_{path.name}")
                 process.kill()
@@ -173,7 +184,7 @@ def watch(process, name: str, files: int, keep: Path, results) -> int:
                 shutil.rmtree(inner[0].parent, ignore_errors=True)
             continue
         _, kind, value = results.get()
-        alive = time.monotonic()
+        alive, used = time.monotonic(), processor(process.pid)
         if kind == "error":
             errors.append(value)
         elif kind == "files":

@@ -8,6 +8,7 @@ import subprocess
 import sys
 import zipfile
 
+import h5py
 import numpy as np
 import pytest
 from reference_io import SAMPLES, H, W, events, microseconds, mutated, table
@@ -390,3 +391,31 @@ def test_archives_stream_as_they_read(shared, tmp_path):
         assert (got.width, got.height) == (want.width, want.height)
     table(tmp_path / "a.npy", want)
     np.testing.assert_array_equal(io.read(tmp_path / "a.npy").events.t, want.t)
+
+
+@pytest.mark.parametrize("name", ["davis346_cuke_cradle", "psee_hd_ros_trigger"])
+def test_every_writer_keeps_the_events_of_real_recordings(shared, tmp_path, name):
+    want = io.read(shared / "recordings" / f"{name}.npz").events
+    for format in WRITTEN:
+        if format == "AEDAT2" and want.width > 346:
+            continue  # no such chip
+        path = tmp_path / f"a{SAMPLES[format][0]}"
+        assert io.convert(shared / "recordings" / f"{name}.npz", path, format=format) == len(want)
+        assert_same(io.read(path).events, want, shifted=False)
+
+
+def test_second_libraries_read_what_is_written(tmp_path, rng):
+    """NumPy reads texts and archives, h5py HDF5; evlib and aedat are asked where their formats are tested."""
+    e = events(rng, 2000)
+    for name in ("a.txt", "a.zip", "a.h5", "a.npz"):
+        io.write(tmp_path / name, Sequence(e))
+    rows = [np.loadtxt(tmp_path / "a.txt")]
+    with zipfile.ZipFile(tmp_path / "a.zip") as archive, archive.open("events.txt") as file:
+        assert file.readline() == b"240 180\n"
+        rows.append(np.loadtxt(file))
+    with h5py.File(tmp_path / "a.h5") as file:
+        rows.append(np.stack([file[f"events/{key}"][:].astype(float) for key in ("ts", "xs", "ys", "ps")], 1))
+    with np.load(tmp_path / "a.npz") as archive:
+        rows.append(np.stack([archive["t_us"] / 1e6, archive["x"], archive["y"], archive["p"]], 1))
+    for got in rows:
+        np.testing.assert_array_equal(got, np.stack([e.t, e.x, e.y, e.p], 1))

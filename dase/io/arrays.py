@@ -125,13 +125,13 @@ def _own_pictures(source: Source) -> Iterator[Picture]:
 
 
 def _read_own(source: Source) -> Sequence:
-    with reading(source.path, "a NumPy archive"), zipfile.ZipFile(source.path) as archive:
+    with reading(source.path, "NumPy archive"), zipfile.ZipFile(source.path) as archive:
         _check(archive)
     return npz.read(source)
 
 
 def _beside(source: Source) -> Beside:
-    with reading(source.path, "a NumPy archive"), zipfile.ZipFile(source.path) as archive:
+    with reading(source.path, "NumPy archive"), zipfile.ZipFile(source.path) as archive:
         _check(archive)
         names = (n for n in ("thresholds", "configuration") if f"{n}.npy" in archive.NameToInfo)
         return npz.beside({name: npz.load(archive, name) for name in names})

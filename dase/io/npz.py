@@ -133,7 +133,7 @@ def create(path: Path) -> AbstractContextManager[Writer]:
 
 def read(source: Source) -> Sequence:
     """Read an archive; raises InputError where it is damaged or incomplete. Pickled members are refused."""
-    with reading(source.path, "a NumPy archive"), zipfile.ZipFile(source.path) as archive:
+    with reading(source.path, "NumPy archive"), zipfile.ZipFile(source.path) as archive:
         known = (name for name in KEYS if f"{name}.npy" in archive.namelist())
         return _parse(source, {name: load(archive, name) for name in known})
 
