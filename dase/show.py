@@ -44,7 +44,7 @@ def table(statistics: Statistics) -> list[tuple[str, str]]:
     said = ", ".join(f"{name} {100 * share:.1f} %" for name, share in shares)
     return [
         ("sensor", f"{s.width} x {s.height}"),
-        ("duration", seconds(s.duration) + (f", from {s.begin:.3f} s on" if s.begin else "")),
+        ("duration", seconds(s.duration) + (f", from {s.begin:.3f} s on" if abs(s.begin) >= 1e-3 else "")),
         ("events", grouped(s.events)),
         ("ON rate", f"{s.on_rate:.3g} events/pixel/s"),
         ("OFF rate", f"{s.off_rate:.3g} events/pixel/s"),

@@ -60,7 +60,8 @@ def full(path: Path, e, frames) -> None:
 def aedat4(path: Path, e, frames) -> None:
     spans = np.rint(frames[0] * 1e6).astype(int).tolist()
     frames = [(t, t + 900, grey) for t, grey in zip(spans, frames[1], strict=True)]
-    reference_io.aedat4(path, e, frames=frames, compression=1, compress=lz4.frame.compress)
+    motion = [(1000 * k, (0.0, 0.0, 1.0), (1.0, 2.0, 3.0)) for k in range(5)]
+    reference_io.aedat4(path, e, frames=frames, motion=motion, compression=1, compress=lz4.frame.compress)
 
 
 def avi(path: Path, e, frames) -> None:
@@ -95,7 +96,7 @@ def peak() -> float:
 def read(path: Path) -> bool:
     """Read a file whole and as a stream; return whether that gave events."""
     good = False
-    for act in (io.read, lambda path: [len(part) for part in io.stream(path, chunk=1000)]):
+    for act in (io.read, lambda path: [len(part) for part in io.stream(path, chunk=1000)], io.motion):
         try:
             act(path)
             good = True

@@ -14,12 +14,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from dase.errors import InputError
 from dase.events import Events
 from dase.io import rules
 from dase.io.sequence import Sequence, Writer, reading
-from dase.io.source import Beside, Picture, Piece, Size, Source, checked_size, guess_size, join
+from dase.io.source import Beside, Motion, Picture, Piece, Size, Source, checked_size, guess_size, join
 
 LIMIT = 4 << 30  # [bytes] of frames, or of flow, taken into memory
 
@@ -43,6 +44,8 @@ class Format:
     """Yield its events in chunks; at least one, if empty, for the size of the sensor."""
     pictures: Callable[[Source], Iterator[Picture]] = no_pictures
     """Yield its frames with their times [s], as `read` gives them; not a number where nothing tells them."""
+    motion: Callable[[Source], Motion | None] = lambda source: None
+    """Read the samples of its motion sensor, times [s]; None where there are none."""
     beside: Callable[[Source], Beside] = lambda source: (None, None)
     """Read thresholds and configuration."""
     create: Callable[[Path], AbstractContextManager[Writer]] | None = None
@@ -58,6 +61,7 @@ def camera_format(
     pieces: Callable[[Source], Iterator[Piece]],
     size: Callable[[Source], Size | None],
     pictures: Callable[[Source], Iterator[Picture]] = no_pictures,
+    motion: Callable[[Source], Motion | None] = lambda source: None,
     extent: Callable[[Source], Size] | None = None,
     ticks: float = 1e6,
     **fields: Any,
@@ -68,8 +72,9 @@ def camera_format(
         pieces: Yields the events in the order of the file; called again where the size has to be found.
         size: Tells columns and rows, or None where the file does not say.
         pictures: Yields the frames.
+        motion: Reads the samples of the motion sensor.
         extent: Tells one more than the largest column and row, where that is cheaper than decoding all.
-        ticks: Ticks per second of pieces and frames.
+        ticks: Ticks per second of pieces, frames and motion.
         fields: The other fields of Format.
     """
     name = fields["name"]
@@ -90,17 +95,28 @@ def camera_format(
         with reading(source.path, name):
             yield from _stream(source, pieces(source), sensor(source), ticks, chunk)
 
+    def begin(source: Source, known: Size, without_events: NDArray[Any]) -> Any:
+        settled = rules.settled(source, pieces(source), known, ticks)
+        first = next((piece.t for piece in rules.ordered(source, settled, ticks)), without_events)
+        return rules.origin(source, first, ticks)
+
     def shown(source: Source) -> Iterator[Picture]:
         with reading(source.path, name):
             zero: Any = None
             for picture in _fitting(source, pictures(source), known := sensor(source)):
-                if zero is None:
-                    settled = rules.settled(source, pieces(source), known, ticks)
-                    first = next((p.t for p in rules.ordered(source, settled, ticks)), np.array([picture.t]))
-                    zero = rules.origin(source, first, ticks)
+                zero = begin(source, known, np.array([picture.t])) if zero is None else zero
                 yield picture._replace(t=(picture.t - zero) / ticks)
 
-    return Format(read=read, stream=stream, pictures=shown, **fields)
+    def moved(source: Source) -> Motion | None:
+        with reading(source.path, name):
+            found = motion(source)
+            if found is None:
+                return None
+            first = next(iter(pictures(source)), None)
+            times = found.t if first is None else np.array([first.t])
+            return found._replace(t=(found.t - begin(source, sensor(source), times)) / ticks)
+
+    return Format(read=read, stream=stream, pictures=shown, motion=moved, **fields)
 
 
 def _fitting(source: Source, pictures: Iterable[Picture], size: Size) -> Iterator[Picture]:

@@ -106,6 +106,17 @@ class Picture(NamedTuple):
     flow: NDArray[np.float32] | None = None
 
 
+class Motion(NamedTuple):
+    """Samples of a camera's motion sensor, in the axes of its maker.
+
+    Times [ticks or s] (N,), acceleration with that of gravity [m/s^2] (N, 3), rotation [rad/s] (N, 3).
+    """
+
+    t: NDArray[Any]
+    acceleration: NDArray[np.float64]
+    rotation: NDArray[np.float64]
+
+
 Beside = tuple[NDArray[np.float32] | None, str | None]
 """Thresholds (2, H, W) and configuration of a simulated sequence; None where unknown."""
 
