@@ -3,8 +3,8 @@
     python perf/fuzz_io.py                        100 000 files of every format
     python perf/fuzz_io.py --format EVT3 --files 1000 --seed 7
 
-Files are read whole and as a stream by turns. Every format runs in a process of its own, so that a crash of a library is seen and named. A file that fails
-is kept as `fuzz_FORMAT_N` in the folder named by --keep.
+Files are read whole and as a stream by turns. Every format runs in a process of its own, so that a crash of
+a library is seen and named. A file that fails is kept as `fuzz_FORMAT_N` in the folder named by --keep.
 """
 
 from __future__ import annotations
