@@ -26,9 +26,7 @@ they do not depend on the other effects, on chunks, threads or the batch.
 from __future__ import annotations
 
 import inspect
-import linecache
 import re
-import zlib
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
@@ -36,7 +34,11 @@ from typing import Any
 
 import warp as wp
 
-from dase.kernels.scene import Layers, background_at, ground_of, layer_intensity, layers_near
+from dase.kernels.counts import SOURCES
+from dase.kernels.lanes import compiled, functions, whole
+from dase.kernels.random import key, normal, stream, uniform, waiting
+from dase.kernels.scene import Frames as Frames
+from dase.kernels.scene import background_at, ground_of, layer_intensity, layers_near
 
 REST = 1e30
 """Duration of the rest before the first sample [s]: filters start settled."""
@@ -97,13 +99,6 @@ class Stages:
 
 
 @wp.struct
-class Frames:
-    """Stored samples."""
-
-    values: wp.array2d[float]  # (K, N) linear intensity, or log intensity for the `log` source
-
-
-@wp.struct
 class Clock:
     """Time samples of one chunk; sample k ends the step that begins at sample k - 1."""
 
@@ -153,89 +148,44 @@ def deposit(sink: Keys, row: int, i: int, size: int, time: wp.int64, code: int):
         sink.keys[row, slab, slot] = (place << wp.int64(sink.low)) | wp.int64(code)
 
 
-@wp.func_native(
-    """
-#ifdef __CUDA_ARCH__
-    return __logf(x);
-#else
-    return logf(x);
-#endif
-"""
-)
-def logarithm(x: float) -> float:
-    """Natural logarithm; on CUDA within 4e-7 of it between 0.5 and 2, within 3 ulp elsewhere."""
-    ...
-
-
-@wp.func
-def key(seed: int, stream: int, pixel: int) -> int:
-    """Key of one stream of random numbers of one pixel."""
-    return int(wp.rand_init(seed ^ stream, pixel))
-
-
-@wp.func
-def uniform(key: int, index: int) -> float:
-    """Uniform in [0, 1)."""
-    return wp.randf(wp.rand_init(key, index))
-
-
-@wp.func
-def normal(key: int, index: int) -> float:
-    """Standard normal."""
-    return wp.randn(wp.rand_init(key, index))
-
-
-@wp.func
-def waiting(key: int, index: int) -> float:
-    """Exponential with mean 1: the hazard a Poisson process spends before its next event."""
-    return -wp.log(1.0 - uniform(key, index))
-
-
-SOURCES = {"frames": Frames, "log": Frames, "layers": Layers, "background": Layers}
 SINKS = {"counts": Counts, "keys": Keys, "labels": Keys}
 
 
-def stream(name: str) -> int:
-    """Return the number of a named stream of random numbers, a 31-bit hash."""
-    return zlib.crc32(name.encode()) & 0x7FFFFFFF
-
-
 @lru_cache(maxsize=256)
-def compose(stages: tuple[Stages, ...], source: str, sink: str) -> wp.Kernel:
+def compose(stages: tuple[Stages, ...], source: str, sink: str, *, cuda: bool) -> wp.Kernel:
     """Return the kernel of a sensor.
 
     Args:
         stages: Effects, in order.
-        source: `frames`, `log`, `layers`, or `background` for a scene of one layer.
+        source: `frames`, `log`, `both`, `layers`, or `background` for a scene of one layer.
         sink: `counts`, `keys`, or `labels` for keys with labels.
+        cuda: Whether it is for CUDA, which asks memory for samples ahead.
 
     Returns:
         A kernel over (B, N) threads; `_Writer.kernel` writes its arguments.
     """
-    writer = _Writer(stages, source, sink)
+    writer = _Writer(stages, source, sink, cuda=cuda)
     return _compiled(writer.kernel(), "pixel_events", writer.scope)
 
 
 @lru_cache(maxsize=256)
 def compose_thresholds(stages: tuple[Stages, ...]) -> wp.Kernel:
     """Return a kernel over (B, N) threads that writes the thresholds of every pixel."""
-    writer = _Writer(stages, "frames", "counts")
+    writer = _Writer(stages, "frames", "counts", cuda=True)
     return _compiled(writer.thresholds(), "pixel_thresholds", writer.scope)
 
 
 def _compiled(text: str, name: str, scope: dict[str, Any]) -> wp.Kernel:
-    filename = f"<dase {name} {zlib.crc32(text.encode()):08x}>"
-    # Warp reads the source of a kernel through linecache, and so do tracebacks
-    linecache.cache[filename] = (len(text), None, text.splitlines(keepends=True), filename)
-    scope = dict(scope)
-    exec(compile(text, filename, "exec"), scope)
-    kernel: wp.Kernel = wp.kernel(scope[name], enable_backward=False, module="unique")
+    options = {"fuse_fp": False}  # see dase.kernels.lanes
+    kernel: wp.Kernel = wp.kernel(
+        compiled(text, name, scope), enable_backward=False, module="unique", module_options=options
+    )
     return kernel
 
 
-def source_text(stages: tuple[Stages, ...], source: str, sink: str) -> str:
+def source_text(stages: tuple[Stages, ...], source: str, sink: str, *, cuda: bool) -> str:
     """Return the text of the kernel that `compose` compiles."""
-    return _Writer(stages, source, sink).kernel()
+    return _Writer(stages, source, sink, cuda=cuda).kernel()
 
 
 def states(stages: Sequence[Stages], sink: str = "keys") -> list[str]:
@@ -257,8 +207,9 @@ def states(stages: Sequence[Stages], sink: str = "keys") -> list[str]:
 class _Writer:
     """Writes the text of one kernel, top to bottom."""
 
-    def __init__(self, stages: tuple[Stages, ...], source: str, sink: str):
+    def __init__(self, stages: tuple[Stages, ...], source: str, sink: str, *, cuda: bool):
         self.stages, self.source, self.sink = stages, source, sink
+        self.ahead = cuda and source in ("frames", "log")
         self.lines: list[str] = []
         self.depth = 0
         self.states = states(stages, sink)
@@ -282,7 +233,9 @@ class _Writer:
             "layers_near": layers_near,
             "ground_of": ground_of,
             "background_at": background_at,
-            "logarithm": logarithm,
+            "logarithm": functions(1).logarithm,
+            "Lane": functions(1).Lanes,
+            "whole": whole,
         }
 
     def add(self, *lines: str) -> None:
@@ -381,7 +334,7 @@ class _Writer:
             self.add("near = layers_near(source, float(x), float(y))", "ground = ground_of(source)")
         elif self.source == "background":
             self.add("ground = ground_of(source)")
-        else:
+        elif self.ahead:
             self.add("last = source.values.shape[0] - 1")
             self.add(*(f"ahead_{n} = source.values[wp.min({n}, last), i]" for n in range(AHEAD)))
         self.add(*(f"on, off = {call}" for call in calls))
@@ -440,6 +393,8 @@ class _Writer:
             self.add("intensity = layer_intensity(source, ground, near, k, float(x), float(y))")
         elif self.source == "background":
             self.add("intensity = background_at(source, ground, k, float(x), float(y))")
+        elif not self.ahead:
+            self.add(f"{quantity} = source.values[k, i]")
         else:
             # memory is asked for the samples to come while the present one is worked on
             self.add(f"{quantity} = ahead_0")
@@ -453,8 +408,10 @@ class _Writer:
                 self.add("intensity = wp.exp(voltage) - log_eps")
         for effect, function in self.of("light"):
             self.add(f"{self.returns('intensity', effect)} = {self.call('light', effect, function)}")
-        if self.source != "log":
-            self.add("voltage = logarithm(intensity + log_eps)")
+        if self.source == "both":
+            self.add("voltage = source.logs[k, i]")
+        elif self.source != "log":
+            self.add("voltage = logarithm(Lane(intensity), log_eps)[0]")
         for effect, function in self.of("respond"):
             self.add(f"{self.returns('voltage', effect)} = {self.call('respond', effect, function)}")
 
@@ -558,7 +515,10 @@ class _Writer:
         self.add(
             "theta = on", "polarity = int(1)", "if change < 0.0:", "    theta = -off", "    polarity = 0"
         )
-        self.add("crossed = int(wp.floor(change / theta))", *(["passed = int(0)"] if delays else []))
+        self.add(
+            "crossed = int(whole(wp.abs(change), wp.abs(theta), 1.0 / wp.abs(theta)))",
+            *(["passed = int(0)"] if delays else []),
+        )
         if self.of("redraw"):
             self.one_by_one(begin)
             return
