@@ -50,6 +50,7 @@ class Half:
         scale: What differences are measured by in a fit: sampling errors as they are seen between groups of
             pixels, also where the model is wrong.
         chance: What differences are measured by in a test: sampling errors of the present model.
+        off: What each statistic may be off by.
     """
 
     trials: Trials
@@ -57,6 +58,7 @@ class Half:
     frame: Frame
     scale: Scale = field(init=False)
     chance: Scale = field(init=False)
+    off: Array = field(init=False)
 
     def run(self, sensor: Sensor, vectors: ArrayLike, **options: Any) -> Array:
         """Return the statistics of models, shape (B, J)."""
@@ -81,7 +83,8 @@ class Half:
         off = tolerance(target[0], events[0]) ** 2
         repeats = 2.0 * values.var(0, ddof=1)
         used = compared(events[0])
-        self.chance = Scale(target[0], np.sqrt(repeats + off), used)
+        self.off = np.sqrt(off)
+        self.chance = Scale(target[0], np.sqrt((0.5 + 0.5 / len(values)) * repeats + off), used)
         self.scale = Scale(target[0], np.sqrt(np.maximum(repeats, self._scatter(sums)) + off), used)
         return values
 
