@@ -70,7 +70,7 @@ class Judgement:
     unit: float
 
 
-def judge(repeats: Array, chance: Scale, off: Array, *, seed: int) -> Judgement:
+def judge(repeats: Array, seen: Scale, chance: Scale, off: Array, *, seed: int) -> Judgement:
     """Compare a measurement with repeats of a model.
 
     The model is the mean of its repeats. Each repeat in turn stands in for the measurement and is compared
@@ -79,6 +79,7 @@ def judge(repeats: Array, chance: Scale, off: Array, *, seed: int) -> Judgement:
 
     Args:
         repeats: Statistics of simulations with different seeds, shape (R, J).
+        seen: Sampling errors of the difference between measurement and model.
         chance: Sampling errors of the model.
         off: The tolerance, shape (J,).
         seed: Of the random part of the tolerance.
@@ -91,8 +92,8 @@ def judge(repeats: Array, chance: Scale, off: Array, *, seed: int) -> Judgement:
     null = robust(np.where(chance.used, apart / chance.sigma, 0.0)) @ weights
     unit = float(null.mean())
     gate = max(float(np.quantile(null, 0.99)), unit + 2.6 * float(null.std()))
-    families = {name: value / unit for name, value in chance.families(mean).items()}
-    return Judgement(float(chance.loss(mean)) / unit, gate / unit, families, chance.z(mean), unit)
+    families = {name: value / unit for name, value in seen.families(mean).items()}
+    return Judgement(float(seen.loss(mean)) / unit, gate / unit, families, seen.z(mean), unit)
 
 
 def robust(z: Array) -> Array:

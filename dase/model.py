@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dase.effects.base import Effect
+from dase.error import Judgement
 from dase.evidence import Evidence, Half
 from dase.fitting import Found, screen, search
 from dase.sensor import Sensor
@@ -58,6 +59,14 @@ class Model:
         """Make this the present model of a half; return statistics of its repeats, shape (repeats, J)."""
         return half.rebase(self.space.sensor, self.vector, repeats=repeats, seed=seed)
 
+    def judge(self, half: Half, *, repeats: int, seed: int) -> Judgement:
+        """Make this the present model of a half and return its error there."""
+        return half.judge(self.rebase(half, repeats=repeats, seed=seed), seed=seed)
+
+    def loss_on(self, half: Half, *, seed: int) -> float:
+        """Return the robust distance by the sampling errors of the present model of the half."""
+        return float(half.scale.loss(half.run(self.space.sensor, self.vector, seed=seed))[0])
+
     def search(self, half: Half, *, seed: int, iterations: int = 4, radius: float = 0.2) -> Model:
         """Return the model with its parameters improved."""
         found = self.explore(half, seed=seed, iterations=iterations, radius=radius)
@@ -102,10 +111,7 @@ def settle(evidence: Evidence, model: Model, *, seed: int, rounds: int = 1) -> M
     for _ in range(rounds):
         model.rebase(evidence.train, repeats=16, seed=seed + 100)
         other = with_phase(model, 1.0 - model.space.sensor["threshold"].phase)  # type: ignore[attr-defined]
-        losses = [
-            evidence.train.scale.loss(evidence.train.run(m.space.sensor, m.vector, seed=seed))[0]
-            for m in (model, other)
-        ]
+        losses = [m.loss_on(evidence.train, seed=seed) for m in (model, other)]
         model = other if losses[1] < losses[0] else model
         model = model.search(evidence.train, seed=seed, radius=0.12)
     return model
