@@ -14,7 +14,7 @@ from dase.effects import EFFECTS, Effect
 from dase.error import Judgement
 from dase.events import Events
 from dase.evidence import PIXELS, Evidence, gather
-from dase.intervals import estimates
+from dase.confidence import estimates
 from dase.model import Model, fit_present, model_of, settle
 from dase.results import Cell, Diagnosis, Estimate, Rank, Step, Unexplained
 from dase.scene import Scene
