@@ -90,6 +90,7 @@ class Half:
         self.off = np.sqrt(off)
         self.chance = Scale(target[0], np.sqrt((0.5 + 0.5 / len(values)) * repeats + off), used)
         self.simulated = values.mean(0)
+        self._present = Sums(sums.sums[:1], sums.halves[:1], sums.groups[:1])
         scatter = self._scatter(sums)
         self.scale = Scale(target[0], np.sqrt(np.maximum(repeats, scatter) + off), used)
         # of the difference from the mean of the repeats, which has nearly no sampling error of its own
@@ -102,6 +103,15 @@ class Half:
         measured, simulated = (self._left(one) for one in (self.found, sums))
         out: Array = (len(measured) - 1) * (measured - simulated).var(0)
         return out
+
+    @property
+    def groups(self) -> int:
+        """Number of groups of pixels."""
+        return self.found.groups.shape[1]
+
+    def left(self) -> Array:
+        """Return statistics of the measurement less the model, groups left out one after the other, (G, J)."""
+        return self._left(self.found) - self._left(self._present)
 
     def leave_out(self, models: list[Sums]) -> Array:
         """Return the loss of each model with one group of pixels left out after the other, shape (M, G)."""
