@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -66,7 +68,7 @@ def command(
 
     model = load_sensor(sensor)
     measured = open_measurement(recording, scene, file)
-    with _bar(quiet) as tell:
+    with bar(quiet) as tell:
         found = diagnose(
             measured.events, measured.scene, model, trust=measured.trust, free=free.split(",") if free else None,
             most=MOST if auto else 1, pixels=pixels, seed=seed, device=device, progress=tell,
@@ -80,25 +82,21 @@ def command(
     _print(found, quiet)
 
 
-def _bar(quiet: bool):  # type: ignore[no-untyped-def]
-    from contextlib import contextmanager
-
+@contextmanager
+def bar(quiet: bool) -> Iterator[Callable[[str, float, float], None]]:
+    """Show on a terminal what is being done, how far it is, and the present error."""
     from tqdm import tqdm
 
-    @contextmanager
-    def opened():  # type: ignore[no-untyped-def]
-        layout = "{desc:32.32} |{bar}| {postfix}"
-        with tqdm(total=1.0, disable=True if quiet else None, bar_format=layout, leave=False) as bar:
+    layout = "{desc:32.32} |{bar}| {postfix}"
+    with tqdm(total=1.0, disable=True if quiet else None, bar_format=layout, leave=False) as shown:
 
-            def tell(text: str, share: float, error: float) -> None:
-                bar.n = share
-                bar.set_description_str(text, refresh=False)
-                bar.set_postfix_str("" if error != error else f"error {error:.2f}", refresh=False)
-                bar.refresh()
+        def tell(text: str, share: float, error: float) -> None:
+            shown.n = share
+            shown.set_description_str(text, refresh=False)
+            shown.set_postfix_str("" if error != error else f"error {error:.2f}", refresh=False)
+            shown.refresh()
 
-            yield tell
-
-    return opened()
+        yield tell
 
 
 def _print(found: Diagnosis, quiet: bool) -> None:

@@ -8,10 +8,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from dase.descent import Found, screen
 from dase.effects.base import Effect
 from dase.effects.stream import StreamEffect
 from dase.evidence import Evidence
-from dase.fitting import Found, screen
 from dase.model import Model, added, starts
 from dase.space import variants
 from dase.trials import finer_steps
@@ -66,7 +66,9 @@ def scout(evidence: Evidence, present: Model, effect: Effect, *, seed: int) -> T
     apart = np.flatnonzero((np.abs(places - places[0]).max(1) > 0.8) & (losses < SECOND * losses[0]))
     picks = [0, *apart[: 0 if slow else 1]]
     ends = [
-        replace(model, place=places[n], loss=losses[n]).search(evidence.scout, seed=seed, iterations=3, radius=0.25)
+        replace(model, place=places[n], loss=losses[n]).search(
+            evidence.scout, seed=seed, iterations=3, radius=0.25
+        )
         for n in picks
     ]
     best = min(ends, key=lambda m: m.loss)
@@ -118,7 +120,9 @@ def try_all(
     return [*finalists, *order[FINALISTS:]]
 
 
-def chance_of(evidence: Evidence, tried: Sequence[Tried], repeats: Array, present: Array) -> Callable[[float], float]:
+def chance_of(
+    evidence: Evidence, tried: Sequence[Tried], repeats: Array, present: Array
+) -> Callable[[float], float]:
     """Return the function from a fall of the training loss to its p-value, corrected over all candidates.
 
     Repeats of the present model stand in for the measurement; each takes the best of everything that was

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from dase.descent import PRIOR
 from dase.evidence import Evidence
-from dase.fitting import PRIOR
 from dase.model import Model
 from dase.results import Estimate
 
@@ -29,7 +29,9 @@ def estimates(evidence: Evidence, model: Model, *, seed: int) -> dict[str, Estim
     half = evidence.train
     repeats = model.rebase(half, repeats=REPEATS, seed=seed + 900)
     found = model.explore(half, seed=seed, iterations=2, radius=0.08)
-    gain = gain_matrix(half.scale.sigma, half.scale.used, half.scale.weights(), found.slope, half.scale.z(repeats.mean(0)))
+    gain = gain_matrix(
+        half.scale.sigma, half.scale.used, half.scale.weights(), found.slope, half.scale.z(repeats.mean(0))
+    )
     apart = (repeats - repeats.mean(0)) @ gain.T
     chance = apart.var(0, ddof=1) * (1 + 1 / len(repeats))
     # what the pixels of the measurement make of it, also where the model is not quite right

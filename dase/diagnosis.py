@@ -10,11 +10,11 @@ from typing import Any
 import numpy as np
 
 from dase.candidates import Tried, apart, chance_of, open_to, try_all
+from dase.confidence import estimates
 from dase.effects import EFFECTS, Effect
 from dase.error import Judgement
 from dase.events import Events
 from dase.evidence import PIXELS, Evidence, gather
-from dase.confidence import estimates
 from dase.model import Model, fit_present, model_of, settle
 from dase.results import Cell, Diagnosis, Estimate, Rank, Step, Unexplained
 from dase.scene import Scene
@@ -164,9 +164,7 @@ def _step(search: _Search, model: Model, judgement: Judgement, more: bool) -> tu
     base = float(evidence.train.scale.loss(present))
     finalists = [t for t in tried if np.isfinite(t.held)]
     best, ties = _choose(search, finalists)
-    ranking = tuple(
-        _rank(t, judgement, p_value(base - t.fit) if np.isfinite(t.held) else 1.0) for t in tried
-    )
+    ranking = tuple(_rank(t, judgement, p_value(base - t.fit) if np.isfinite(t.held) else 1.0) for t in tried)
     mine = next(rank for rank in ranking if rank.effect == best.name)
     enough = mine.fall >= MATERIAL and mine.share >= SHARE and mine.p_value <= SIGNIFICANT
     search.alternatives[best.name] = [t for t in finalists if t.name != best.name]
@@ -218,7 +216,13 @@ def _review(search: _Search, model: Model, judgement: Judgement) -> tuple[Model,
 
 
 def _verdict(
-    search: _Search, start: Model, model: Model, judgement: Judgement, errors: list[float], before: float, begin: float
+    search: _Search,
+    start: Model,
+    model: Model,
+    judgement: Judgement,
+    errors: list[float],
+    before: float,
+    begin: float,
 ) -> Diagnosis:
     found = search.added(model)
     order = [s.chosen for s in search.history if s.chosen in found]
@@ -229,9 +233,7 @@ def _verdict(
     if not explained(last):
         unexplained = _unexplained(search, tuple(str(n) for n in order), errors[0], last, cells)
     values = estimates(search.evidence, model, seed=search.seed)
-    ties = {
-        s.chosen: s.ties for s in search.history if s.chosen in found and s.ties and unexplained is None
-    }
+    ties = {s.chosen: s.ties for s in search.history if s.chosen in found and s.ties and unexplained is None}
     kept = unexplained is None
     path = [errors[0]] + [e for s, e in zip(search.history, errors[1:], strict=False) if s.chosen in found]
     if kept and len(path) > 1:

@@ -66,7 +66,9 @@ class Half:
 
     def run(self, sensor: Sensor, vectors: ArrayLike, **options: Any) -> Array:
         """Return the statistics of models, shape (B, J)."""
-        return statistics(self.trials.run(sensor, np.atleast_2d(np.asarray(vectors)), **options), self.frame)[0]
+        return statistics(self.trials.run(sensor, np.atleast_2d(np.asarray(vectors)), **options), self.frame)[
+            0
+        ]
 
     def rebase(self, sensor: Sensor, vector: ArrayLike, *, repeats: int, seed: int) -> Array:
         """Make a model the present one: expectations and sampling errors are its own.
@@ -117,7 +119,10 @@ class Half:
         """Return the loss of each model with one group of pixels left out after the other, shape (M, G)."""
         measured = self._left(self.found)
         weights = self.scale.weights()
-        rows = [robust(np.where(self.scale.used, (self._left(m) - measured) / self.scale.sigma, 0.0)) for m in models]
+        rows = [
+            robust(np.where(self.scale.used, (self._left(m) - measured) / self.scale.sigma, 0.0))
+            for m in models
+        ]
         return np.stack([row @ weights for row in rows])
 
     def _left(self, one: Sums) -> Array:
@@ -126,7 +131,6 @@ class Half:
         pixels = np.minimum(np.arange(len(self.frame.zone)) // GROUP, count - 1)
         expected = self.frame.expected * (np.arange(count)[:, None] != pixels)[..., None]
         return statistics(one.without(pixels), replace(self.frame, expected=expected))[0]
-
 
     def judge(self, repeats: Array, *, seed: int) -> Judgement:
         """Return the error of the present model, whose repeats are given."""

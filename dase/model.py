@@ -9,10 +9,10 @@ from itertools import product
 import numpy as np
 from numpy.typing import NDArray
 
+from dase.descent import Found, screen, search
 from dase.effects.base import Effect
 from dase.error import Judgement
 from dase.evidence import Evidence, Half
-from dase.fitting import Found, screen, search
 from dase.sensor import Sensor
 from dase.space import Axis, Space, axes_of, with_values
 

@@ -65,7 +65,13 @@ class Trials:
         self._pixels = wp.array(self.stimulus.pixels, dtype=int, device=self.device)
 
     def run(
-        self, sensor: Sensor, vectors: NDArray[Any], *, seed: int = 0, reseed: bool = False, finer: int | None = None
+        self,
+        sensor: Sensor,
+        vectors: NDArray[Any],
+        *,
+        seed: int = 0,
+        reseed: bool = False,
+        finer: int | None = None,
     ) -> Sums:
         """Simulate parameter vectors of a sensor.
 
@@ -142,7 +148,11 @@ class Trials:
         out.group = self._group()
         count = len(stimulus.pixels)
         groups = -(-count // out.group)
-        zeros = (("memory", count, kernels.MEMORY), ("sums", groups, kernels.SIZE), ("halves", count, kernels.HALVES))
+        zeros = (
+            ("memory", count, kernels.MEMORY),
+            ("sums", groups, kernels.SIZE),
+            ("halves", count, kernels.HALVES),
+        )
         for name, size, numbers in zeros:
             setattr(out, name, wp.zeros((rows, size, numbers), dtype=float, device=self.device))
         out.clock = wp.zeros((rows, 1, 0), dtype=int, device=self.device)
