@@ -157,7 +157,7 @@ def whole(size: float, threshold: float, inverse: float) -> float:
     return wp.where(n * threshold > size, n - 1.0, n)
 
 
-def compiled(text: str, name: str, scope: Mapping[str, Any]) -> Any:
+def from_text(text: str, name: str, scope: Mapping[str, Any]) -> Any:
     """Return the function `name` of a Python text, made so that Warp and tracebacks find its source."""
     filename = f"<dase {name} {zlib.crc32(text.encode()):08x}>"
     # both read the source through linecache
@@ -170,7 +170,7 @@ def compiled(text: str, name: str, scope: Mapping[str, Any]) -> Any:
 def _native(name: str, snippet: str, scope: dict[str, Any], arguments: str, returns: str) -> Any:
     # Warp looks for the decorator in the text
     text = f"@wp.func_native(snippet)\ndef {name}({arguments}) -> {returns}: ...\n"
-    return compiled(text, name, {**scope, "wp": wp, "snippet": snippet})
+    return from_text(text, name, {**scope, "wp": wp, "snippet": snippet})
 
 
 def _lanewise(
