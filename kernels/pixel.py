@@ -129,7 +129,7 @@ class Keys:
 
     keys: wp.array3d[wp.int64]  # (B, slabs, capacity)
     used: wp.array2d[int]  # (B, slabs) events met; more than the capacity asks for another run
-    slab: int  # pixels per slab
+    slab: int  # pixels per slab, as a power of 2
     bits: int  # of row · N + i
     low: int  # bits below: 1 of the polarity, 2 more of the label
 
@@ -144,7 +144,7 @@ def leaving_time(clock: Clock, k: int, at: float, late: float) -> wp.int64:
 @wp.func
 def deposit(sink: Keys, row: int, i: int, size: int, time: wp.int64, code: int):
     """Keep one event that leaves its pixel at `time` [ns since the chunk's begin]."""
-    slab = i / sink.slab
+    slab = i >> sink.slab
     slot = wp.atomic_add(sink.used, row, slab, 1)
     if slot < sink.keys.shape[2]:
         place = wp.int64(row) * wp.int64(size) + wp.int64(i)
