@@ -6,6 +6,10 @@ Events are taken chunk by chunk, as `dase synth` does, and not kept. Prints thei
 memory after every simulated second, then the peak and the slope of a straight line through all seconds but
 the first, in which buffers grow to their size. Ends with status 1 where the slope is 1 MiB per simulated
 second or more.
+
+The C library keeps some of what was freed and hands it out again, which looks like growth for some seconds.
+So that only what the simulation holds is seen, the script starts itself again with glibc told to give large
+blocks back at once; `--as-it-is` leaves that out.
 """
 
 from __future__ import annotations
@@ -85,6 +89,13 @@ def watch(scene: Scene, sensor: dase.Sensor, device: str) -> list[dict[str, floa
     return rows
 
 
+def give_back_at_once() -> None:
+    """Start this script again with a C library that returns large blocks when they are freed."""
+    if "MALLOC_MMAP_THRESHOLD_" not in os.environ:
+        several = {"MALLOC_MMAP_THRESHOLD_": "262144", "MALLOC_ARENA_MAX": "1"}
+        os.execve(sys.executable, [sys.executable, *sys.argv], {**os.environ, **several})
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--size", default="640x480")
@@ -92,7 +103,10 @@ def main() -> None:
     parser.add_argument("--fps", type=float, default=1000.0)
     parser.add_argument("--device", default="cpu")
     parser.add_argument("--json", type=Path)
+    parser.add_argument("--as-it-is", action="store_true", help="leave the C library as it is")
     options = parser.parse_args()
+    if not options.as_it_is:
+        give_back_at_once()
     width, height = map(int, options.size.split("x"))
     scene, sensor = Swinging(width, height, options.seconds, options.fps), everything()
     samples = len(scene.sample_times())
