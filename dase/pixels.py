@@ -131,7 +131,7 @@ class Pixels:
     def _count(self, out: Any, scene: Scene, times: NDArray[np.float64], windows: NDArray[np.int32]) -> None:
         """Count with nothing but thresholds."""
         self._edges(times)
-        name, source = scene.source(times, self.pixels, self.device)
+        name, source = self.sensor.seen(scene).source(times, self.pixels, self.device)
         on, off, phase, eps = self._vectors[:, :4].T
         level = self._thresholds_of_pixels()
         epses = wp.array(eps, dtype=float, device=self.device)
@@ -235,7 +235,7 @@ class Pixels:
         windows: NDArray[np.int32],
         align: int,
     ) -> None:
-        source_name, source = scene.source(times, self.pixels, self.device)
+        source_name, source = self.sensor.seen(scene).source(times, self.pixels, self.device)
         if source_name == "frames" and self._logs_at_once:
             source_name, source.logs = "both", self._logs(source.values)
         kernel = pixel.compose(self.stages, source_name, sink_name, cuda=self.device.is_cuda)
