@@ -35,6 +35,9 @@ RESAMPLES = 1000
 SURE = 0.99
 """Share of the resamples in which a correction must win to be clear."""
 
+LEAST_SCORE, LEAST_INTERVALS = 0.1, 5
+"""Below this correlation, or with fewer intervals to resample, nothing is clear."""
+
 LEAST_SHIFT = 0.5
 """Shifts below this are not corrected unasked [px]."""
 
@@ -148,7 +151,8 @@ def align(
     A flip or a shift is clear if it wins in 99 % of resamples of the intervals; a shift must also be half a
     pixel, and three times its spread. An offset is clear only if, beyond that, no pixel could cause it:
     events that come before the light changes, or later than `LAG`. Smaller delays belong to the sensor's
-    bandwidth and latency, and taking them away here would hide these.
+    bandwidth and latency, and taking them away here would hide these. Nothing is
+    clear where the correlation stays below 0.1, or with fewer than 5 intervals.
 
     Args:
         events: Events on a clock near that of the frames.
@@ -282,6 +286,8 @@ def _decide(
         clear.add("shift")
     if offset + 3 * late < -EARLY or offset - 3 * late > LAG:
         clear.add("offset")
+    if mean[number].max() < LEAST_SCORE or len(search.changes) < LEAST_INTERVALS:
+        clear.clear()
     as_is, as_is_weight = search.table(0.0, FLIPS[:1])
     return Alignment(
         offset=offset,

@@ -64,11 +64,7 @@ def match(
         usable: Pixels of both frames that are not saturated, each (H, W); None for all.
     """
     a, b = _tones(first, second)
-    # OpenCV's presets begin at half the resolution or less; a finer patch grid costs little on such frames
-    flow = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
-    flow.setFinestScale(0)
-    flow.setPatchStride(2)
-    ahead, back = (_settled(flow.calc(*pair, None)) for pair in ((a, b), (b, a)))
+    ahead, back = _ways(a, b), _ways(b, a)
     logs = [np.log(frame + np.float32(eps)) for frame in (first, second)]
     good = usable or (np.ones(first.shape, np.bool_), np.ones(first.shape, np.bool_))
     doubt = np.stack(
@@ -87,10 +83,34 @@ def _tones(*frames: Map) -> list[NDArray[np.uint8]]:
     return [np.clip((frame - low) * scale, 0, 255).astype(np.uint8) for frame in frames]
 
 
-def _settled(way: Map) -> Map:
-    """Return ways with the shortest set to zero: blending is as exact there, and rest is cheap to render."""
+def _ways(first: NDArray[np.uint8], second: NDArray[np.uint8]) -> Map:
+    """Return the way of each pixel from one frame to another [px], shape (H, W, 2)."""
+    flow = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
+    # the preset stops at half the resolution; going on, on a finer grid of patches, costs little
+    flow.setFinestScale(0)
+    flow.setPatchStride(2)
+    way = flow.calc(first, second, None)
+    # begun anew from what most of the picture does: repeated textures then match the right repetition
+    way = flow.calc(first, second, _dominant(way))
+    # blending over the shortest ways is as exact as following them, and rest is cheap to render
     way[np.hypot(way[..., 0], way[..., 1]) < REST] = 0
-    return way
+    return np.asarray(way)
+
+
+def _dominant(way: Map, rounds: int = 20) -> Map:
+    """Return the affine motion that most of the ways follow, shape (H, W, 2)."""
+    height, width = way.shape[:2]
+    x, y = places(way.shape)
+    design = np.stack([x / width - 0.5, y / height - 0.5, np.ones_like(x)], -1)
+    thin = max(1, min(height, width) // 50)
+    some, wanted = (part[::thin, ::thin].reshape(-1, part.shape[-1]) for part in (design, way))
+    residual = np.hypot(*(wanted - np.median(wanted, axis=0)).T)
+    for _ in range(rounds):  # a Geman-McClure loss by reweighting, from the median
+        weight = 1 / (1 + (residual / max(1.0, float(np.median(residual)))) ** 2) ** 2
+        root = np.sqrt(weight)[:, None]
+        motion = np.linalg.lstsq(some * root, wanted * root, rcond=None)[0]
+        residual = np.hypot(*(wanted - some @ motion).T)
+    return np.ascontiguousarray(design @ motion, np.float32)
 
 
 def places(shape: tuple[int, ...]) -> tuple[Map, Map]:
@@ -174,10 +194,11 @@ def stretches(frames: list[Map] | NDArray[np.float32], *, pull: float = 0.1) -> 
 
 def _line(first: Map, second: Map, rounds: int = 20) -> tuple[float, float]:
     """Return gain and offset from the intensities of `first` to those it has in `second`."""
-    found = match(first, second, eps=1e-3)
+    a8, b8 = _tones(first, second)
+    ahead = _ways(a8, b8)
     x, y = places(first.shape)
-    to = x + found.ahead[..., 0], y + found.ahead[..., 1]
-    returned = found.ahead + look(found.back, *to)
+    to = x + ahead[..., 0], y + ahead[..., 1]
+    returned = ahead + look(_ways(b8, a8), *to)
     same = np.hypot(returned[..., 0], returned[..., 1]) < 1
     a, b = first[same], look(second, *to)[same]
     if len(a) < 100 or np.ptp(a) < 1e-3:
