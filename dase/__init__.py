@@ -8,12 +8,15 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from dase.alignment import align as align
     from dase.camera import CameraScene as CameraScene
+    from dase.comparison import compare as compare
     from dase.config import dump_sensor as dump_sensor
     from dase.config import load_sensor as load_sensor
+    from dase.diagnosis import diagnose as diagnose
     from dase.effects import EFFECTS as EFFECTS
     from dase.effects import Effect as Effect
     from dase.errors import InputError as InputError
     from dase.events import Events as Events
+    from dase.fitting import fit as fit
     from dase.images import Picture as Picture
     from dase.images import open_images as open_images
     from dase.layers import Layer as Layer
@@ -36,10 +39,13 @@ except PackageNotFoundError:  # a checkout on the path, not installed
 _HOMES = {
     "dase.alignment": ("align",),
     "dase.camera": ("CameraScene",),
+    "dase.comparison": ("compare",),
     "dase.config": ("dump_sensor", "load_sensor"),
+    "dase.diagnosis": ("diagnose",),
     "dase.effects": ("EFFECTS", "Effect"),
     "dase.errors": ("InputError",),
     "dase.events": ("Events",),
+    "dase.fitting": ("fit",),
     "dase.images": ("Picture", "open_images"),
     "dase.layers": ("Layer", "LayerScene", "Motion"),
     "dase.scene": ("Scene",),
