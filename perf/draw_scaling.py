@@ -84,6 +84,8 @@ def goal_lines(found: Row) -> list[str]:
         add("counting stored log samples", shown, "90 % of copy", share > 0.9)
         noisy = rate("noisy, stored, counted")
         add("noisy sensor, stored samples, counted", f"{noisy:.3g} Gsample/s", "50 Gsample/s", noisy >= 50)
+        clean = rate("ideal, picture warped, counted")
+        add("fused clean pixel", f"{clean:.3g} Gsample/s", "200 Gsample/s", clean >= 200)
         return lines
     add("counting stored log samples", shown, "1.2 Gsample/s or 35 % of copy", speed >= 1.2 or share >= 0.35)
     for threads in powers(found["threads"]):
