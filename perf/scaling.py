@@ -90,9 +90,13 @@ def chunked(scene: Scene, sensor: Sensor, times: np.ndarray, device: wp.Device, 
     size = min(CHUNK[kind(device)], len(times))
 
     def run() -> list[Any]:
-        array.samples = 0
-        parts = (times[k : k + size] for k in range(0, len(times), size))
-        return [array.count_events(scene, part, np.zeros(len(part), np.int32), 1) for part in parts]
+        found = []
+        for k in range(0, len(times), size):
+            part = times[k : k + size]
+            if array.samples:
+                array.begin = float(part[0]) - 1e-3  # the same once more, as if it came next
+            found.append(array.count_events(scene, part, np.zeros(len(part), np.int32), 1))
+        return found
 
     return run
 

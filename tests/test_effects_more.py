@@ -34,7 +34,8 @@ from dase.effects.threshold import Threshold
 from dase.effects.vignetting import Vignetting
 from dase.effects.voltage_noise import VoltageNoise
 from dase.kernels import launch
-from dase.sensor import Pixels, sample_times
+from dase.pixels import Pixels
+from dase.sensor import sample_times
 
 FURTHER = (Flicker, Vignetting, Dark, Linlog, SecondOrder, VoltageNoise, Jitter, Hot, Dead)
 STRONG = {
