@@ -132,9 +132,9 @@ class Repeated(Stored):
 
 
 @lru_cache
-def stored(width: int, height: int, samples: int, device: wp.Device) -> Repeated:
-    """Return samples that all who read them share."""
-    return Repeated(width, height, samples, device)
+def stored(width: int, height: int, samples: int, alias: str) -> Repeated:
+    """Return samples on a device that all who read them share."""
+    return Repeated(width, height, samples, launch.device(alias))
 
 
 def case_work(
@@ -143,7 +143,7 @@ def case_work(
     """Return one point of a curve of `CASES`."""
     sensor = load_sensor("davis346") if "noisy" in case else load_sensor("ideal")
     times = np.arange(samples) * 1e-3
-    scene = moving_layers(0, *size, samples) if case == WARPED else stored(*size, samples, device)
+    scene = moving_layers(0, *size, samples) if case == WARPED else stored(*size, samples, device.alias)
     batch = more.pop("batch", 1)
     if case == EVENTS:
         run: Callable[[], Any] = streamed(scene, sensor, CHUNK[kind(device)], device)
@@ -173,7 +173,7 @@ def effects(device: wp.Device) -> Iterator[Work]:
     """Yield every effect alone and added to those before it, on stored samples, events made."""
     size = CAMERA if device.is_cpu else (1280, 960)
     samples = CHUNK[kind(device)]
-    scene = stored(*size, samples, device)
+    scene = stored(*size, samples, device.alias)
     total = size[0] * size[1] * samples
     ideal = Sensor((Threshold(),))
     several = ideal
@@ -212,7 +212,7 @@ def goals(device: wp.Device) -> Iterator[Work]:
     yield Work("goal", "NumPy plain", 1, total, plain, summed, threads=1)
     yield case_work("goal", EVENTS, 1, CAMERA, samples, device, threads=1)
     busy = Sensor((Threshold(on=0.01, off=0.01),))
-    frames = stored(*CAMERA, samples, device)
+    frames = stored(*CAMERA, samples, device.alias)
     yield Work("goal", "busy, stored, events", 1, total, streamed(frames, busy, 64, device), float, threads=1)
 
 
