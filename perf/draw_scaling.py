@@ -36,9 +36,9 @@ simulators.
 
 PEERS = """`python perf/peers.py` on one clip, all in turns, each in a process of its own. 8-bit pictures of a
 moving photograph go in, events come out, both in memory; esim_py takes files. `photograph moved` makes the
-pictures itself, `counted` keeps counts only. The settings are v2e's; `as v2e` is dase with v2e's `clean`: its lin-log
-response and its spread of thresholds, for the number of events. OpenEB has no floor below its logarithm, so
-black pixels send more events."""
+pictures itself, `counted` keeps counts only. The settings are v2e's; `as v2e` is dase with v2e's `clean`, its
+lin-log response and its spread of thresholds, for the number of events. OpenEB has no floor below its
+logarithm, so black pixels send more events."""
 
 
 def powers(most: int) -> list[int]:
@@ -260,8 +260,8 @@ def beside(folder: Path) -> list[str]:
         parts += [
             "## All effects on, in flat memory",
             f"`python perf/memory.py`, commit {found['commit']}: {found['effects']} effects, "
-            f"{found['size']}, {last['second']:.0f} s in {found['samples']} samples, {last['events']:,} events.\n"
-            f"Peak {found['peak'] / 2**20:.0f} MiB; the resident memory grows by "
+            f"{found['size']}, {last['second']:.0f} s in {found['samples']} samples, {last['events']:,} "
+            f"events.\nPeak {found['peak'] / 2**20:.0f} MiB; the resident memory grows by "
             f"{found['slope'] / 2**20:.2f} MiB per simulated second.",
         ]
     return parts
