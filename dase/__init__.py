@@ -6,6 +6,8 @@ from importlib.metadata import version as _version
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from dase.alignment import align as align
+    from dase.camera import CameraScene as CameraScene
     from dase.comparison import compare as compare
     from dase.config import dump_sensor as dump_sensor
     from dase.config import load_sensor as load_sensor
@@ -20,11 +22,14 @@ if TYPE_CHECKING:
     from dase.layers import Layer as Layer
     from dase.layers import LayerScene as LayerScene
     from dase.layers import Motion as Motion
+    from dase.recording import Recording as Recording
+    from dase.recording import open_recording as open_recording
     from dase.scene import Scene as Scene
     from dase.sensor import Sensor as Sensor
     from dase.sensor import count as count
     from dase.sensor import simulate as simulate
     from dase.sensor import stream as stream
+    from dase.static import StaticScene as StaticScene
     from dase.video import VideoScene as VideoScene
     from dase.video import open_video as open_video
 
@@ -34,6 +39,8 @@ except PackageNotFoundError:  # a checkout on the path, not installed
     __version__ = "0+unknown"
 
 _HOMES = {
+    "dase.alignment": ("align",),
+    "dase.camera": ("CameraScene",),
     "dase.comparison": ("compare",),
     "dase.config": ("dump_sensor", "load_sensor"),
     "dase.diagnosis": ("diagnose",),
@@ -43,8 +50,10 @@ _HOMES = {
     "dase.fitting": ("fit",),
     "dase.images": ("Picture", "open_images"),
     "dase.layers": ("Layer", "LayerScene", "Motion"),
+    "dase.recording": ("Recording", "open_recording"),
     "dase.scene": ("Scene",),
     "dase.sensor": ("Sensor", "count", "simulate", "stream"),
+    "dase.static": ("StaticScene",),
     "dase.video": ("VideoScene", "open_video"),
 }
 """Module to the public names it is the home of; loaded when first used, so that `dase --help` is instant."""
