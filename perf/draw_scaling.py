@@ -34,6 +34,13 @@ simulators.
 """
 
 
+PEERS = """`python perf/peers.py` on one clip, all in turns, each in a process of its own. 8-bit pictures of a
+moving photograph go in, events come out, both in memory; esim_py takes files. `photograph moved` makes the
+pictures itself, `counted` keeps counts only. The settings are v2e's; `as v2e` is dase with v2e's `clean`, its
+lin-log response and its spread of thresholds, for the number of events. OpenEB has no floor below its
+logarithm, so black pixels send more events."""
+
+
 def powers(most: int) -> list[int]:
     """Return 1, 2, 4 and so on up to `most`, which is always among them."""
     return sorted({*(2**n for n in range(most.bit_length())), most})
@@ -84,6 +91,8 @@ def goal_lines(found: Row) -> list[str]:
         add("counting stored log samples", shown, "90 % of copy", share > 0.9)
         noisy = rate("noisy, stored, counted")
         add("noisy sensor, stored samples, counted", f"{noisy:.3g} Gsample/s", "50 Gsample/s", noisy >= 50)
+        clean = rate("ideal, picture warped, counted")
+        add("fused clean pixel", f"{clean:.3g} Gsample/s", "200 Gsample/s", clean >= 200)
         return lines
     add("counting stored log samples", shown, "1.2 Gsample/s or 35 % of copy", speed >= 1.2 or share >= 0.35)
     for threads in powers(found["threads"]):
@@ -233,10 +242,35 @@ def section(found: Row) -> str:
     return "\n\n".join(parts)
 
 
+def beside(folder: Path) -> list[str]:
+    """Return what `peers.py` and `memory.py` found, if their results are in the folder."""
+    parts = []
+    peers, memory = folder / "peers.json", folder / "memory.json"
+    if peers.exists():
+        found = json.loads(peers.read_text())
+        names = ("simulator", "setting", "threads", "Mpx-samples/s", "Mevents/s", "events", "peak MiB")
+        lines = [f"| {' | '.join(names)} |", "|---" * len(names) + "|"]
+        for row in found["rows"]:
+            cells = [f"{row[n]:.3g}" if isinstance(row[n], float) else str(row[n]) for n in names]
+            lines.append(f"| {' | '.join(cells)} |")
+        parts += ["## Beside other simulators", PEERS, found["about"] + ":", "\n".join(lines)]
+    if memory.exists():
+        found = json.loads(memory.read_text())
+        last = found["rows"][-1]
+        parts += [
+            "## All effects on, in flat memory",
+            f"`python perf/memory.py`, commit {found['commit']}: {found['effects']} effects, "
+            f"{found['size']}, {last['second']:.0f} s in {found['samples']} samples, {last['events']:,} "
+            f"events.\nPeak {found['peak'] / 2**20:.0f} MiB; the resident memory grows by "
+            f"{found['slope'] / 2**20:.2f} MiB per simulated second.",
+        ]
+    return parts
+
+
 def write(folder: Path) -> None:
     """Write `speed.md` and `scaling.png` from what was measured."""
     every = [json.loads((folder / name).read_text()) for name in FILES if (folder / name).exists()]
-    text = TEXT + "\n" + "\n\n".join(section(found) for found in every) + "\n"
+    text = "\n\n".join([TEXT.rstrip(), *map(section, every), *beside(folder)]) + "\n"
     (folder / "speed.md").write_text(text)
     draw(every, folder / "scaling.png")
     for found in every:
