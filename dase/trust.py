@@ -12,7 +12,8 @@ from dase.camera import TOLERANCE, CameraScene
 from dase.errors import InputError
 from dase.events import Events
 from dase.matching import HOPELESS
-from dase.show import OFF, ON, overlay, seconds
+from dase.show import OFF, ON, overlay
+from dase.units import seconds
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
