@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import struct
+import subprocess
+import sys
 from collections.abc import Callable
 from itertools import pairwise
 from pathlib import Path
 
 import h5py
 import numpy as np
+import pytest
 
 from dase import io
 from dase.events import Events
@@ -16,6 +19,23 @@ from dase.io.sequence import Sequence
 
 W, H = 240, 180
 FRAMES = 3
+
+
+PEAK = """
+def peak():
+    # not ru_maxrss, which begins with what the parent had
+    with open("/proc/self/status") as file:
+        return next(int(line.split()[1]) for line in file if line.startswith("VmHWM")) / 1024
+"""
+"""Script that defines `peak`: the largest memory that the process has had [MiB]."""
+
+
+def measured(script: str, *arguments: object) -> list[str]:
+    """Run a script that may call `peak` in a process of its own; return the lines it prints."""
+    if not Path("/proc/self/status").exists():
+        pytest.skip("the memory of a process is told by /proc")
+    command = [sys.executable, "-c", PEAK + script, *map(str, arguments)]
+    return subprocess.run(command, capture_output=True, text=True, check=True).stdout.splitlines()
 
 
 def events(rng, count=3000, width=W, height=H, begin_us=0, step_us=40):

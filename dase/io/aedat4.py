@@ -10,10 +10,9 @@
     u32 size, FlatBuffer IMUS     tables: i64 t [Unix us]; f32 temperature, 3 accelerations [g], 3 rotations
                                   [degrees/s], 3 magnetic fields
 
-Of several streams the first of a kind is read; 16-bit and colour frames become 8-bit grey; triggers are
-skipped. Damaged packets are skipped and counted. Times count from the first event. LZ4 and ZSTD
-come with the extra "aedat". Sources: docs.inivation.com, "AEDAT 4.0"; the schemas of dv-processing
-(Apache-2.0).
+Of several streams the first of a kind is read; colour frames become grey; triggers are skipped. Damaged
+packets are skipped and counted. Times count from the first event. LZ4 and ZSTD come with the extra "aedat".
+Sources: docs.inivation.com, "AEDAT 4.0"; the schemas of dv-processing (Apache-2.0).
 """
 
 from __future__ import annotations
@@ -187,8 +186,8 @@ def _samples(packet: Table) -> list[tuple[int, list[float]]]:
     ]
 
 
-def _frame(packet: Table) -> tuple[NDArray[np.uint8], tuple[int, int]]:
-    """Return the pixels as 8-bit grey, (H, W), and begin and end of the exposure [us]."""
+def _frame(packet: Table) -> tuple[NDArray[Any], tuple[int, int]]:
+    """Return the pixels as grey of 8 or 16 bits, (H, W), and begin and end of the exposure [us]."""
     width, height = packet.number(6, "<h", 0), packet.number(7, "<h", 0)
     name, channels = PIXELS[packet.number(5, "<b", 0)]
     pixels = packet.structs(10, np.dtype("u1"))
@@ -196,12 +195,10 @@ def _frame(packet: Table) -> tuple[NDArray[np.uint8], tuple[int, int]]:
     t, begin, end = (packet.number(k, "<q", 0) for k in (0, 3, 4))
     if not 0 < begin <= end:
         begin, end = t, t + max(packet.number(11, "<q", 0), 0)
-    if values.dtype != np.uint8:
-        values = (values >> 8).astype(np.uint8)
     if channels == 1:
         return values[..., 0], (begin, end)
     weights = np.array([0.07, 0.72, 0.21])  # of blue, green and red
-    return np.rint(values[..., :3] @ weights).astype(np.uint8), (begin, end)
+    return np.rint(values[..., :3] @ weights).astype(values.dtype), (begin, end)
 
 
 FORMAT = camera_format(

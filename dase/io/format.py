@@ -154,6 +154,9 @@ def taken(pictures: Iterable[Picture]) -> list[Picture]:
         if out and picture.grey.shape != out[0].grey.shape:
             a, b = out[0].grey.shape, picture.grey.shape
             raise InputError(f"frame {len(out)} is {b[1]}x{b[0]}, those before are {a[1]}x{a[0]}")
+        if out and picture.grey.dtype != out[0].grey.dtype:
+            kinds = picture.grey.dtype, out[0].grey.dtype
+            raise InputError(f"frame {len(out)} is {kinds[0]}, those before are {kinds[1]}")
         out.append(picture)
     return out
 

@@ -98,9 +98,12 @@ class Piece(NamedTuple):
 
 
 class Picture(NamedTuple):
-    """A frame of a camera: grey (H, W), middle of the exposure [ticks], its duration [s], flow (2, H, W)."""
+    """A frame of a camera.
 
-    grey: NDArray[np.uint8]
+    Grey (H, W), uint8 or uint16; middle of the exposure [ticks], its duration [s]; flow (2, H, W).
+    """
+
+    grey: NDArray[Any]
     t: Any
     exposure: float = 0.0
     flow: NDArray[np.float32] | None = None
