@@ -77,46 +77,63 @@ def camera_format(
         ticks: Ticks per second of pieces, frames and motion.
         fields: The other fields of Format.
     """
-    name = fields["name"]
+    r = _Reader(fields["name"], pieces, size, pictures, motion, extent, ticks)
+    return Format(read=r.read, stream=r.stream, pictures=r.shown, motion=r.moved, **fields)
 
-    def sensor(source: Source) -> Size:
-        known = source.size or size(source)
-        if known is None:
-            found = extent(source) if extent else largest(pieces(source))
-            known = guess_size(source, found)
-        return checked_size(known)
 
-    def read(source: Source) -> Sequence:
-        with reading(source.path, name):
-            frames = taken(_fitting(source, pictures(source), known := sensor(source)))
-            return _read(source, pieces(source), frames, known, ticks)
+@dataclass(frozen=True)
+class _Reader:
+    """The ways to read a file, see `camera_format`."""
 
-    def stream(source: Source, chunk: int) -> Iterator[Events]:
-        with reading(source.path, name):
-            yield from _stream(source, pieces(source), sensor(source), ticks, chunk)
+    name: str
+    pieces: Callable[[Source], Iterator[Piece]]
+    size: Callable[[Source], Size | None]
+    pictures: Callable[[Source], Iterator[Picture]]
+    motion: Callable[[Source], Motion | None]
+    extent: Callable[[Source], Size] | None
+    ticks: float
 
-    def begin(source: Source, known: Size, without_events: NDArray[Any]) -> Any:
-        settled = rules.settled(source, pieces(source), known, ticks)
-        first = next((piece.t for piece in rules.ordered(source, settled, ticks)), without_events)
-        return rules.origin(source, first, ticks)
+    def read(self, source: Source) -> Sequence:
+        with reading(source.path, self.name):
+            size = self._sensor(source)
+            frames = taken(_fitting(source, self.pictures(source), size))
+            return _read(source, self.pieces(source), frames, size, self.ticks)
 
-    def shown(source: Source) -> Iterator[Picture]:
-        with reading(source.path, name):
-            zero: Any = None
-            for picture in _fitting(source, pictures(source), known := sensor(source)):
-                zero = begin(source, known, np.array([picture.t])) if zero is None else zero
-                yield picture._replace(t=(picture.t - zero) / ticks)
+    def stream(self, source: Source, chunk: int) -> Iterator[Events]:
+        with reading(source.path, self.name):
+            yield from _stream(source, self.pieces(source), self._sensor(source), self.ticks, chunk)
 
-    def moved(source: Source) -> Motion | None:
-        with reading(source.path, name):
-            found = motion(source)
+    def shown(self, source: Source) -> Iterator[Picture]:
+        with reading(source.path, self.name):
+            size, zero = self._sensor(source), None
+            for picture in _fitting(source, self.pictures(source), size):
+                zero = self._begin(source, size, np.array([picture.t])) if zero is None else zero
+                yield picture._replace(t=(picture.t - zero) / self.ticks)
+
+    def moved(self, source: Source) -> Motion | None:
+        with reading(source.path, self.name):
+            found = self.motion(source)
             if found is None:
                 return None
-            first = next(iter(pictures(source)), None)
+            first = next(iter(self.pictures(source)), None)
             times = found.t if first is None else np.array([first.t])
-            return found._replace(t=(found.t - begin(source, sensor(source), times)) / ticks)
+            zero = self._begin(source, self._sensor(source), times)
+            return found._replace(t=(found.t - zero) / self.ticks)
 
-    return Format(read=read, stream=stream, pictures=shown, motion=moved, **fields)
+    def _sensor(self, source: Source) -> Size:
+        known = source.size or self.size(source)
+        if known is None:
+            known = guess_size(source, (self.extent or self._extent)(source))
+        return checked_size(known)
+
+    def _extent(self, source: Source) -> Size:
+        return largest(self.pieces(source))
+
+    def _begin(self, source: Source, size: Size, without_events: NDArray[Any]) -> Any:
+        """Return the tick of time zero: of the first event, else of these times."""
+        settled = rules.settled(source, self.pieces(source), size, self.ticks)
+        first = next((piece.t for piece in rules.ordered(source, settled, self.ticks)), without_events)
+        return rules.origin(source, first, self.ticks)
 
 
 def _fitting(source: Source, pictures: Iterable[Picture], size: Size) -> Iterator[Picture]:
