@@ -7,6 +7,8 @@ from typing import TYPE_CHECKING
 
 import click
 
+from dase.cli.options import parse_size
+
 if TYPE_CHECKING:
     from dase.io.sequence import Sequence
 
@@ -21,8 +23,16 @@ if TYPE_CHECKING:
     metavar="SECONDS",
     help="Events per picture.  [default: fits the rate]",
 )
+@click.option("--size", callback=parse_size, metavar="WxH", help="Columns x rows.  [default: as FILE says]")
 @click.option("--trust", is_flag=True, help="Show how far the scene between the frames can be trusted.")
-def command(file: Path, output: Path | None, at: float | None, window: float | None, trust: bool) -> None:
+def command(
+    file: Path,
+    output: Path | None,
+    at: float | None,
+    window: float | None,
+    size: tuple[int, int] | None,
+    trust: bool,
+) -> None:
     """Draw the events of FILE over its frames and print its statistics.
 
     A PNG is a contact sheet: moments with events in red (ON) and blue (OFF), the event rate, and the
@@ -40,7 +50,7 @@ def command(file: Path, output: Path | None, at: float | None, window: float | N
         raise InputError("at: shows one moment, which a video cannot; leave it out or write a .png")
     if trust and (suffix == ".mp4" or at is not None):
         raise InputError("trust: is a picture of several moments, which takes neither --at nor .mp4")
-    sequence = io.read(file)
+    sequence = io.read(file, size=size)
     if trust:
         _draw_trust(sequence, output, file.stem, window)
     elif suffix == ".mp4":

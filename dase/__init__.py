@@ -22,6 +22,8 @@ if TYPE_CHECKING:
     from dase.layers import Layer as Layer
     from dase.layers import LayerScene as LayerScene
     from dase.layers import Motion as Motion
+    from dase.recording import Recording as Recording
+    from dase.recording import open_recording as open_recording
     from dase.scene import Scene as Scene
     from dase.sensor import Sensor as Sensor
     from dase.sensor import count as count
@@ -48,6 +50,7 @@ _HOMES = {
     "dase.fitting": ("fit",),
     "dase.images": ("Picture", "open_images"),
     "dase.layers": ("Layer", "LayerScene", "Motion"),
+    "dase.recording": ("Recording", "open_recording"),
     "dase.scene": ("Scene",),
     "dase.sensor": ("Sensor", "count", "simulate", "stream"),
     "dase.static": ("StaticScene",),

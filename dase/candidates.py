@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from dase.descent import Found, screen
 from dase.effects.base import Effect
+from dase.effects.optics import SceneEffect
 from dase.effects.stream import StreamEffect
 from dase.evidence import Evidence
 from dase.model import Model, added, starts
@@ -54,7 +55,8 @@ Report = Callable[[str, float], None]
 
 def open_to(effects: Mapping[str, type[Effect]], present: Model) -> list[str]:
     """Return the names of the effects that can be tried."""
-    names = [n for n, e in effects.items() if n != "threshold" and not issubclass(e, StreamEffect)]
+    apart = SceneEffect | StreamEffect
+    names = [n for n, e in effects.items() if n != "threshold" and not issubclass(e, apart)]
     return [n for n in names if n not in present.space.sensor or present.space.sensor[n].is_off()]
 
 

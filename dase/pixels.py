@@ -71,6 +71,10 @@ class Pixels:
             raise InputError(f"pixels must be indices of the {width}x{height} sensor, shape (N,), N >= 1")
         self.batch, self.count = len(vectors), len(self.pixels)
         self._pixels = wp.array(self.pixels, dtype=int, device=self.device)
+        self._places = tuple(
+            wp.array(a.astype(np.uint16), dtype=wp.uint16, device=self.device)
+            for a in (self.pixels % width, self.pixels // width)
+        )
         self._parameters = wp.array(vectors, dtype=float, device=self.device)
         self.sink = "labels" if labels else "keys"
         shape = (len(pixel.states(self.stages, self.sink)), self.batch, self.count)
@@ -81,6 +85,7 @@ class Pixels:
         self.begin = 0.0
         self.slab = 256 if self.device.is_cuda else 2048
         self._capacity = 4 * self.slab
+        self._buffer: Any = None  # of keys, kept from chunk to chunk
         # nothing but a change detector: counted by a kernel of its own, several pixels per thread
         self._plain = all(stage == "threshold" for effect in self.stages for stage, _ in effect.functions)
         self._vectors = vectors
@@ -126,7 +131,7 @@ class Pixels:
     def _count(self, out: Any, scene: Scene, times: NDArray[np.float64], windows: NDArray[np.int32]) -> None:
         """Count with nothing but thresholds."""
         self._edges(times)
-        name, source = scene.source(times, self.pixels, self.device)
+        name, source = self.sensor.seen(scene).source(times, self.pixels, self.device)
         on, off, phase, eps = self._vectors[:, :4].T
         level = self._thresholds_of_pixels()
         epses = wp.array(eps, dtype=float, device=self.device)
@@ -172,8 +177,9 @@ class Pixels:
                 f"a chunk of {span * 1e-9:g} s with {self.batch * self.count} pixels is too long"
             )
         keys, used = self._keys(scene, times)
+        top = self._bits + self._low + longest.bit_length()
         self._advance(times)
-        found = ordering.ordered(keys, used, self._bits, self._low, self.device, self._late)
+        found = ordering.ordered(keys, used, self._bits, self._low, top, self.device, self._late)
         events, row = self._decode(found, begin)
         if self._late is None:
             return events, row
@@ -192,9 +198,12 @@ class Pixels:
         slabs = -(-self.count // self.slab)
         while True:
             sink = pixel.Keys()
-            sink.keys = wp.empty((self.batch, slabs, self._capacity), dtype=wp.int64, device=self.device)
+            shape = (self.batch, slabs, self._capacity)
+            if self._buffer is None or self._buffer.shape != shape:
+                self._buffer = wp.empty(shape, dtype=wp.int64, device=self.device)
+            sink.keys = self._buffer
             sink.used = wp.zeros((self.batch, slabs), dtype=int, device=self.device)
-            sink.slab, sink.bits, sink.low = self.slab, self._bits, self._low
+            sink.slab, sink.bits, sink.low = self.slab.bit_length() - 1, self._bits, self._low
             self._launch(self.sink, sink, scene, times, np.zeros(len(times), np.int32), align=self.slab)
             used = sink.used.numpy()
             if used.max() <= self._capacity:
@@ -226,7 +235,7 @@ class Pixels:
         windows: NDArray[np.int32],
         align: int,
     ) -> None:
-        source_name, source = scene.source(times, self.pixels, self.device)
+        source_name, source = self.sensor.seen(scene).source(times, self.pixels, self.device)
         if source_name == "frames" and self._logs_at_once:
             source_name, source.logs = "both", self._logs(source.values)
         kernel = pixel.compose(self.stages, source_name, sink_name, cuda=self.device.is_cuda)
@@ -290,14 +299,15 @@ class Pixels:
 
     def _decode(self, keys: Any, begin: float) -> tuple[Events, NDArray[np.int32] | None]:
         n, to = len(keys), self.device
+        each = ordering.EACH["cuda" if to.is_cuda else "cpu"]
         out = [wp.empty(n, dtype=d, device=to) for d in (wp.float64, wp.uint16, wp.uint16, wp.uint8)]
         row = wp.empty(n if self.batch > 1 else 0, dtype=int, device=to)
         label = wp.empty(n if self.sink == "labels" else 0, dtype=wp.int8, device=to)
         inputs = [
-            keys, self._bits, self._low, self.count, self._pixels, self.width,
-            wp.int64(round(begin * 1e9)), *out, row, label,
+            keys, self._bits, self._low, self.count, *self._places,
+            wp.int64(round(begin * 1e9)), each, *out, row, label,
         ]  # fmt: skip
-        launch.run(ordering.decode, n, inputs, to)
+        launch.run(ordering.decode, -(-n // each), inputs, to)
         t, x, y, p = (a.numpy() for a in out)
         known = label.numpy() if self.sink == "labels" else None
         events = Events(t, x, y, p.view(np.bool_), self.width, self.height, known)

@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from dase.effects import EFFECTS
 from dase.effects.base import Effect
+from dase.effects.optics import SceneEffect
 from dase.effects.stream import StreamEffect
 from dase.effects.threshold import Threshold
 from dase.errors import InputError
@@ -84,8 +85,14 @@ class Sensor:
 
     def stages(self) -> tuple[pixel.Stages, ...]:
         """Return the pixels' effects as the kernel composer sees them; the threshold is part of its core."""
-        apart = (Threshold, StreamEffect)
+        apart = (Threshold, SceneEffect, StreamEffect)
         return tuple(effect.compiled() for effect in self.effects if not isinstance(effect, apart))
+
+    def seen(self, scene: Scene) -> Scene:
+        """Return what the pixels see of `scene`."""
+        for effect in self.effects:
+            scene = effect.seen(scene) if isinstance(effect, SceneEffect) else scene
+        return scene
 
     def retimes(self) -> bool:
         """Whether events leave at other times than their crossings', or not all of them leave."""

@@ -129,9 +129,23 @@ class Keys:
 
     keys: wp.array3d[wp.int64]  # (B, slabs, capacity)
     used: wp.array2d[int]  # (B, slabs) events met; more than the capacity asks for another run
-    slab: int  # pixels per slab
+    slab: int  # pixels per slab, as a power of 2
     bits: int  # of row · N + i
     low: int  # bits below: 1 of the polarity, 2 more of the label
+
+
+@wp.func_native("return a.data[k];")
+def element(a: wp.array[float], k: int) -> float:
+    """Return a[k]; Warp's own look-up asks whether k is negative, in the innermost loop."""
+    ...
+
+
+@wp.func_native(
+    "return *(const float*)((const char*)a.data + (size_t)k * (size_t)a.strides[0] + 4 * (size_t)i);"
+)
+def stored(a: wp.array2d[float], k: int, i: int) -> float:
+    """Return a[k, i], as `element` does."""
+    ...
 
 
 @wp.func
@@ -141,15 +155,29 @@ def leaving_time(clock: Clock, k: int, at: float, late: float) -> wp.int64:
     return time + wp.int64(wp.round(late * 1.0e9))
 
 
+@wp.func_native(
+    """
+    const int slab = i >> shift;
+    int* met = used.data + row * used.shape[1] + slab;
+#ifdef __CUDA_ARCH__
+    const int slot = atomicAdd(met, 1);
+#else
+    const int slot = (*met)++;  // a slab has one thread
+#endif
+    if (slot < keys.shape[2]) keys.data[((size_t)row * keys.shape[1] + slab) * keys.shape[2] + slot] = key;
+"""
+)
+def append(keys: wp.array3d[wp.int64], used: wp.array2d[int], row: int, i: int, shift: int, key: wp.int64):
+    """Append a key to those of the pixel's slab, or only count it where there is no room."""
+    ...
+
+
 @wp.func
 def deposit(sink: Keys, row: int, i: int, size: int, time: wp.int64, code: int):
     """Keep one event that leaves its pixel at `time` [ns since the chunk's begin]."""
-    slab = i / sink.slab
-    slot = wp.atomic_add(sink.used, row, slab, 1)
-    if slot < sink.keys.shape[2]:
-        place = wp.int64(row) * wp.int64(size) + wp.int64(i)
-        place |= time << wp.int64(sink.bits)
-        sink.keys[row, slab, slot] = (place << wp.int64(sink.low)) | wp.int64(code)
+    place = wp.int64(row) * wp.int64(size) + wp.int64(i)
+    place |= time << wp.int64(sink.bits)
+    append(sink.keys, sink.used, row, i, sink.slab, (place << wp.int64(sink.low)) | wp.int64(code))
 
 
 SINKS = {"counts": Counts, "keys": Keys, "labels": Keys}
@@ -229,6 +257,8 @@ class Writer:
             "Sink": SINKS[sink],
             "Clock": Clock,
             "deposit": deposit,
+            "element": element,
+            "stored": stored,
             "leaving_time": leaving_time,
             "key": key,
             "uniform": uniform,
@@ -388,7 +418,8 @@ class Writer:
             self.add("on_count = int(0)", "off_count = int(0)")
         self.add("for k in range(clock.run[part], clock.run[part + 1]):")
         self.depth += 1
-        self.add("dt = clock.dt[k]", "t = clock.t[k]", "sample = begin + k")
+        self.add("dt = element(clock.dt, k)", "sample = begin + k")
+        self.add(*(["t = element(clock.t, k)"] if self.asks("t") else []))
         self.add(*(["t64 = clock.t64[k]"] if self.asks("t64") else []))
         self.sense()
         self.sample()
@@ -426,12 +457,12 @@ class Writer:
         elif self.source == "background":
             self.add("intensity = background_at(source, ground, k, float(x), float(y))")
         elif not self.prefetches:
-            self.add(f"{quantity} = source.values[k, i]")
+            self.add(f"{quantity} = stored(source.values, k, i)")
         else:
             # memory is asked for the samples to come while the present one is worked on
             self.add(f"{quantity} = ahead_0")
             self.add(*(f"ahead_{n} = ahead_{n + 1}" for n in range(AHEAD - 1)))
-            self.add(f"ahead_{AHEAD - 1} = source.values[wp.min(k + {AHEAD}, last), i]")
+            self.add(f"ahead_{AHEAD - 1} = stored(source.values, wp.min(k + {AHEAD}, last), i)")
         if self.source == "log":
             if self.of("light"):
                 raise ValueError("effects on light need intensities, not log intensities")
@@ -440,7 +471,7 @@ class Writer:
                 self.add("intensity = wp.exp(voltage) - log_eps")
         self.light()
         if self.source == "both":
-            self.add("voltage = source.logs[k, i]")
+            self.add("voltage = stored(source.logs, k, i)")
         elif self.source != "log":
             self.add(VOLTAGE)
         self.respond()

@@ -179,6 +179,12 @@ def bench_counts(scene: Stored, repeats: int, device: wp.Device) -> tuple[float,
     return took, float(out.numpy().sum())
 
 
+def commit() -> str:
+    """Return what was measured."""
+    command = ["git", "describe", "--always", "--dirty"]
+    return subprocess.run(command, capture_output=True, text=True).stdout.strip()
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--device", default="cpu")
@@ -190,10 +196,7 @@ def main() -> None:
     width, height = map(int, options.size.split("x"))
     device = launch.device(options.device)
     launch.set_threads(options.threads)
-    commit = subprocess.run(
-        ["git", "describe", "--always", "--dirty"], capture_output=True, text=True
-    ).stdout.strip()
-    where = f"{device.name}, {options.threads} threads, commit {commit}"
+    where = f"{device.name}, {options.threads} threads, commit {commit()}"
     print(f"{where}: {options.size}, {options.samples} samples\n")
     copy = copy_bandwidth(width * height * options.samples, options.repeats, device)
     print(f"copy: {copy / 1e9:.0f} GB/s read plus written\n")
