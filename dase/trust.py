@@ -13,7 +13,8 @@ from dase.errors import InputError
 from dase.events import Events
 from dase.io.sequence import Sequence
 from dase.matching import HOPELESS
-from dase.show import OFF, ON, overlay, seconds
+from dase.show import OFF, ON, overlay
+from dase.units import seconds
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

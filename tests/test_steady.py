@@ -53,8 +53,8 @@ def test_a_slow_drift_and_a_flicker_stay(rng):
     assert np.abs(got.mean((1, 2)) - drift[:, 0, 0]).max() < 3 * SIGMA  # it comes in steps below that
     assert np.ptp(got.mean((1, 2))) > 0.9 * np.ptp(drift)
     flicker = np.tile(0.4, (10, 40, 50))
-    flicker[::2] *= 1.05
-    assert np.abs(np.diff(steady(noisy(rng, flicker)), axis=0)).mean() > 0.015
+    flicker[::2] *= 1.1
+    assert np.abs(np.diff(steady(noisy(rng, flicker)), axis=0)).mean() > 0.035
 
 
 def test_saturation_stays_unknown(rng):
