@@ -132,7 +132,7 @@ class Room:
         """Return an array of `size` keys; what was taken before is overwritten."""
         if self._kept is None or len(self._kept) < size:
             self._kept = wp.empty(size + size // 4, dtype=wp.int64, device=device)
-        return self._kept[:size]
+        return self._kept[:size] if size else wp.empty(0, dtype=wp.int64, device=device)
 
 
 def ordered(
