@@ -6,10 +6,13 @@ import os
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import click
+
+from dase.cli.options import effects_option
 
 if TYPE_CHECKING:
     from dase.synth import Report
@@ -34,6 +37,7 @@ def parse_size(ctx: click.Context, param: click.Parameter, value: str | None) ->
     "--images", default="builtin", show_default=True, help="Folder, coco:ANNOTATIONS,FOLDER or builtin."
 )
 @click.option("--sensor", default="davis346", show_default=True, help="Preset or TOML file.")
+@effects_option
 @click.option("--sequences", default=10, show_default=True, help="How many sequences.")
 @click.option(
     "--size", callback=parse_size, metavar="WxH", help="Columns x rows.  [default: the sensor's, or 346x260]"
@@ -71,6 +75,7 @@ def command(
     out: Path,
     images: str,
     sensor: str,
+    effects: tuple[Path, ...],
     sequences: int,
     size: tuple[int, int] | None,
     duration: float,
@@ -93,14 +98,15 @@ def command(
     With --video, the events of your own high-speed video are written to the file OUT instead.
     """
     if video is not None:
-        _video(out, video, fps, sensor, size, seed, backend, frame_rate, labels)
+        _video(out, video, fps, sensor, effects, size, seed, backend, frame_rate, labels)
         return
     if fps is not None:
         raise click.UsageError("--fps goes with --video")
     from dase import synth
     from dase.config import dump_sensor, load_sensor
+    from dase.effect_files import known_effects
 
-    chosen = load_sensor(sensor)
+    chosen = replace(load_sensor(sensor, known_effects(effects)), history=())
     width, height = size or chosen.size or (346, 260)
     job = synth.Job(
         images=images,
@@ -115,6 +121,7 @@ def command(
         backend=backend,
         frame_rate=frame_rate,
         labels=labels,
+        effects=tuple(map(str, effects)),
     )
     count = jobs if jobs is not None else (1 if backend.startswith("cuda") else os.cpu_count() or 1)
     with _bar(sequences, "sequences") as advance:
@@ -128,6 +135,7 @@ def _video(
     video: Path,
     fps: float | None,
     sensor: str,
+    effects: tuple[Path, ...],
     size: tuple[int, int] | None,
     seed: int,
     backend: str,
@@ -137,10 +145,12 @@ def _video(
     """Simulate one video into the file `out`."""
     from dase import synth
     from dase.config import load_sensor
+    from dase.effect_files import known_effects
     from dase.sensor import sample_times
     from dase.video import open_video
 
-    scene, model = open_video(video, fps=fps, size=size), load_sensor(sensor)
+    model = load_sensor(sensor, known_effects(effects))
+    scene = open_video(video, fps=fps, size=size)
     with _bar(len(sample_times(scene, model)), "frames") as advance:
         report = synth.record_scene(
             scene,

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from dase.config import dump_sensor as dump_sensor
     from dase.config import load_sensor as load_sensor
+    from dase.effect_files import load_effects as load_effects
     from dase.effects import EFFECTS as EFFECTS
     from dase.effects import Effect as Effect
     from dase.errors import InputError as InputError
@@ -32,6 +33,7 @@ except PackageNotFoundError:  # a checkout on the path, not installed
 
 _HOMES = {
     "dase.config": ("dump_sensor", "load_sensor"),
+    "dase.effect_files": ("load_effects",),
     "dase.effects": ("EFFECTS", "Effect"),
     "dase.errors": ("InputError",),
     "dase.events": ("Events",),
