@@ -84,10 +84,10 @@ def _sensor(table: dict[str, Any], effects: Mapping[str, type[Effect]]) -> Senso
             if not isinstance(value, dict):
                 raise InputError(f"'{name}' must be a table [{name}], got {value!r}")
             found.append(effects[name].from_table(value))
-        elif isinstance(value, dict):
-            find(name, effects)  # says what there is instead
         elif name == "history":
             plain[name] = read_history(value)
+        elif isinstance(value, dict):
+            find(name, effects)  # says what there is instead
         elif name in ("name", "size", "log_eps"):
             plain[name] = value
         else:
