@@ -86,6 +86,7 @@ class Stages:
         states: Names of what a pixel remembers from sample to sample; all zero at the start.
         delays: Whether the events that `gate` holds back come later; otherwise they are lost.
         label: Of the events that `noise` makes.
+        off: (parameter, value) pairs; an effect with all of them changes nothing.
     """
 
     name: str
@@ -94,6 +95,7 @@ class Stages:
     states: tuple[str, ...] = ()
     delays: bool = False
     label: int = SHOT
+    off: tuple[tuple[str, float], ...] = ()
 
 
 @wp.struct
@@ -210,20 +212,20 @@ def compose(stages: tuple[Stages, ...], source: str, sink: str) -> wp.Kernel:
         sink: `counts`, `keys`, or `labels` for keys with labels.
 
     Returns:
-        A kernel over (B, N) threads; `_Writer.kernel` writes its arguments.
+        A kernel over (B, N) threads; `Writer.kernel` writes its arguments.
     """
-    writer = _Writer(stages, source, sink)
-    return _compiled(writer.kernel(), "pixel_events", writer.scope)
+    writer = Writer(stages, source, sink)
+    return compiled(writer.kernel(), "pixel_events", writer.scope)
 
 
 @lru_cache(maxsize=256)
 def compose_thresholds(stages: tuple[Stages, ...]) -> wp.Kernel:
     """Return a kernel over (B, N) threads that writes the thresholds of every pixel."""
-    writer = _Writer(stages, "frames", "counts")
-    return _compiled(writer.thresholds(), "pixel_thresholds", writer.scope)
+    writer = Writer(stages, "frames", "counts")
+    return compiled(writer.thresholds(), "pixel_thresholds", writer.scope)
 
 
-def _compiled(text: str, name: str, scope: dict[str, Any]) -> wp.Kernel:
+def compiled(text: str, name: str, scope: dict[str, Any]) -> wp.Kernel:
     filename = f"<dase {name} {zlib.crc32(text.encode()):08x}>"
     # Warp reads the source of a kernel through linecache, and so do tracebacks
     linecache.cache[filename] = (len(text), None, text.splitlines(keepends=True), filename)
@@ -235,7 +237,7 @@ def _compiled(text: str, name: str, scope: dict[str, Any]) -> wp.Kernel:
 
 def source_text(stages: tuple[Stages, ...], source: str, sink: str) -> str:
     """Return the text of the kernel that `compose` compiles."""
-    return _Writer(stages, source, sink).kernel()
+    return Writer(stages, source, sink).kernel()
 
 
 def states(stages: Sequence[Stages], sink: str = "keys") -> list[str]:
@@ -254,7 +256,7 @@ def states(stages: Sequence[Stages], sink: str = "keys") -> list[str]:
     return names
 
 
-class _Writer:
+class Writer:
     """Writes the text of one kernel, top to bottom."""
 
     def __init__(self, stages: tuple[Stages, ...], source: str, sink: str):
@@ -299,6 +301,10 @@ class _Writer:
         self.scope[name] = function
         arguments = [self.argument(stage, effect, a) for a in inspect.signature(function.func).parameters]
         return f"{name}({', '.join(arguments)})"
+
+    def unless_off(self, effect: Stages, *lines: str) -> list[str]:
+        """Return the lines of an effect; off, they change nothing, and a kernel for many models skips them."""
+        return list(lines)
 
     def argument(self, stage: str, effect: Stages, name: str) -> str:
         """Return what a stage function gets for an argument of this name."""
@@ -354,9 +360,13 @@ class _Writer:
         self.add("out[row, 0, i] = off", "out[row, 1, i] = on")
         return "\n".join(self.lines) + "\n"
 
+    def begin(self) -> None:
+        """Which row of the batch and which pixel the thread works on."""
+        self.add("row, i = wp.tid()", "i += first")
+
     def pixel(self) -> None:
         """Where the pixel is, its parameters and its own random numbers."""
-        self.add("row, i = wp.tid()", "i += first")
+        self.begin()
         self.add("pixel = pixels[i]", "x = pixel % width", "y = pixel / width")
         self.add(*(f"{name} = parameters[row, {at}]" for name, at in self.places.items()))
         for local, kind in self.draws.items():
@@ -373,7 +383,7 @@ class _Writer:
 
     def prologue(self) -> None:
         """What a pixel knows before its first sample."""
-        calls = [self.call("threshold", effect, function) for effect, function in self.of("threshold")]
+        calls = [(effect, self.call("threshold", effect, f)) for effect, f in self.of("threshold")]
         anew = self.redrawn()
         self.pixel()
         self.add("size = pixels.shape[0]")
@@ -382,11 +392,10 @@ class _Writer:
         elif self.source == "background":
             self.add("ground = ground_of(source)")
         else:
-            self.add("last = source.values.shape[0] - 1")
-            self.add(*(f"ahead_{n} = source.values[wp.min({n}, last), i]" for n in range(AHEAD)))
-        self.add(*(f"on, off = {call}" for call in calls))
-        self.add(*(f"{name} = float(0.0)" for name in self.states), "if begin > 0:")
-        self.add(*(f"    {name} = state_in[{at}, row, i]" for at, name in enumerate(self.states)))
+            self.ahead()
+        for effect, call in calls:
+            self.add(*self.unless_off(effect, f"on, off = {call}"))
+        self.restore()
         if anew:
             self.add("mean_on = on", "mean_off = off", *anew[2:])
 
@@ -394,10 +403,24 @@ class _Writer:
             # the state holds the bits of whole nanoseconds, which float32 would round
             self.add("leaves = wp.int64(wp.cast(leaving, wp.int32))")
 
+    def ahead(self) -> None:
+        """Ask memory for the first samples."""
+        self.add("last = source.values.shape[0] - 1")
+        self.add(*(f"ahead_{n} = source.values[wp.min({n}, last), i]" for n in range(AHEAD)))
+
+    def restore(self) -> None:
+        """What the pixel remembers from the chunk before."""
+        self.add(*(f"{name} = float(0.0)" for name in self.states), "if begin > 0:")
+        self.add(*(f"    {name} = state_in[{at}, row, i]" for at, name in enumerate(self.states)))
+
     def redrawn(self) -> list[str]:
         """Return the lines that draw the thresholds of the next event, none without such an effect."""
-        calls = [self.call("redraw", effect, function) for effect, function in self.of("redraw")]
-        return ["on = mean_on", "off = mean_off", *(f"on, off = {call}" for call in calls)] if calls else []
+        draws = [
+            line
+            for effect, function in self.of("redraw")
+            for line in self.unless_off(effect, f"on, off = {self.call('redraw', effect, function)}")
+        ]
+        return ["on = mean_on", "off = mean_off", *draws] if draws else []
 
     def loop(self) -> None:
         """One sample after the other, then the state is kept."""
@@ -410,6 +433,19 @@ class _Writer:
         self.add("dt = clock.dt[k]", "t = clock.t[k]", "sample = begin + k")
         self.add(*(["t64 = clock.t64[k]"] if self.asks("t64") else []))
         self.sense()
+        self.sample()
+        self.depth -= 1
+        if self.sink == "counts":
+            self.add("window = clock.window[part]", "if window >= 0:")
+            self.add("    sink.counts[row, window, 0, i] = off_count")
+            self.add("    sink.counts[row, window, 1, i] = on_count")
+        self.depth -= 1
+        if "leaving" in self.states and self.sink != "counts":
+            self.add("leaving = wp.cast(wp.int32(wp.max(leaves - clock.span, wp.int64(0))), float)")
+        self.add(*(f"state_out[{at}, row, i] = {name}" for at, name in enumerate(self.states)))
+
+    def sample(self) -> None:
+        """What follows from one sample."""
         self.add("if sample == 0:")
         self.depth += 1
         self.add("signal = voltage", "reference = voltage")
@@ -423,15 +459,6 @@ class _Writer:
         self.add("dt = 0.0")
         self.depth -= 1
         self.step()
-        self.depth -= 1
-        if self.sink == "counts":
-            self.add("window = clock.window[part]", "if window >= 0:")
-            self.add("    sink.counts[row, window, 0, i] = off_count")
-            self.add("    sink.counts[row, window, 1, i] = on_count")
-        self.depth -= 1
-        if "leaving" in self.states and self.sink != "counts":
-            self.add("leaving = wp.cast(wp.int32(wp.max(leaves - clock.span, wp.int64(0))), float)")
-        self.add(*(f"state_out[{at}, row, i] = {name}" for at, name in enumerate(self.states)))
 
     def sense(self) -> None:
         """Light to photoreceptor voltage."""
@@ -451,12 +478,22 @@ class _Writer:
             kinds = ("respond", "drift", "noise", "delay")
             if any("intensity" in inspect.signature(f.func).parameters for s in kinds for _, f in self.of(s)):
                 self.add("intensity = wp.exp(voltage) - log_eps")
-        for effect, function in self.of("light"):
-            self.add(f"{self.returns('intensity', effect)} = {self.call('light', effect, function)}")
+        self.light()
         if self.source != "log":
             self.add("voltage = logarithm(intensity + log_eps)")
+        self.respond()
+
+    def light(self) -> None:
+        """What becomes of the light before it is sensed."""
+        for effect, function in self.of("light"):
+            line = f"{self.returns('intensity', effect)} = {self.call('light', effect, function)}"
+            self.add(*self.unless_off(effect, line))
+
+    def respond(self) -> None:
+        """What becomes of the voltage."""
         for effect, function in self.of("respond"):
-            self.add(f"{self.returns('voltage', effect)} = {self.call('respond', effect, function)}")
+            line = f"{self.returns('voltage', effect)} = {self.call('respond', effect, function)}"
+            self.add(*self.unless_off(effect, line))
 
     @staticmethod
     def returns(quantity: str, effect: Stages) -> str:
@@ -474,15 +511,17 @@ class _Writer:
         self.add(*(["leaked_before = leaked + 0.0"] if "drained" in self.states else []))
         for effect, function in self.of("drift"):
             # what rounding loses of a short step is kept for the next (Kahan), or slow leaks would stall
-            self.add(f"leak = {self.call('drift', effect, function)} * dt + leaked_rest")
-            self.add("total = leaked + leak", "leaked_rest = leak - (total - leaked)", "leaked = total")
+            leak = f"leak = {self.call('drift', effect, function)} * dt + leaked_rest"
+            rest = "leaked_rest = leak - (total - leaked)"
+            self.add(*self.unless_off(effect, leak, "total = leaked + leak", rest, "leaked = total"))
         self.add(self.change("voltage", "after"))
         self.start_phase()
         noisy = self.of("noise")
         for effect, function in noisy:
             n = effect.name
-            self.add(f"{n}_on, {n}_off = {self.call('noise', effect, function)}")
-            self.add(f"{n}_spend = ({n}_on + {n}_off) * dt + {n}_rest")
+            self.start_noise(effect)
+            rates = f"{n}_on, {n}_off = {self.call('noise', effect, function)}"
+            self.add(*self.unless_off(effect, rates, f"{n}_spend = ({n}_on + {n}_off) * dt + {n}_rest"))
         busy = ["after >= on", "after <= -off", *(f"{e.name}_spend > {e.name}_hazard" for e, _ in noisy)]
         # a crossing that waits for the end of the dead time may come although the signal returns
         busy += ["before >= on", "before <= -off"] if self.delays() else []
@@ -497,6 +536,9 @@ class _Writer:
         self.add("signal = voltage")
         if "age" in self.states:
             self.add("age += dt")
+
+    def start_noise(self, effect: Stages) -> None:
+        """What the noise of an effect is before its rates are known: nothing here, they always are."""
 
     def delays(self) -> bool:
         """Whether events that a gate holds back come later."""
@@ -636,7 +678,7 @@ class _Writer:
         self.add("wait = float(0.0)", "now = age")
         self.add(f"age = now + {share} * dt")
         for effect, function in self.of("gate"):
-            self.add(f"wait = wp.max(wait, {self.call('gate', effect, function)})")
+            self.add(*self.unless_off(effect, f"wait = wp.max(wait, {self.call('gate', effect, function)})"))
         self.add("age = now")
 
     def leaks(self, share: str) -> str:
@@ -653,21 +695,31 @@ class _Writer:
 
     def leave(self, share: str) -> str:
         """Return the time at which an event leaves; events of one pixel do not overtake each other."""
-        delays = [self.call("delay", effect, function) for effect, function in self.of("delay")]
+        delays = self.of("delay")
         if not delays:
-            return f"leaving_time(clock, k, {share}, 0.0)"
-        self.add("late = float(0.0)", *(f"late += {call}" for call in delays))
+            return self.instant(share, "0.0")
+        self.add("late = float(0.0)")
+        for effect, function in delays:
+            self.add(*self.unless_off(effect, f"late += {self.call('delay', effect, function)}"))
         self.add(f"late = wp.clamp(late, 0.0, {LATEST})")
-        self.add(f"leaves = wp.max(leaves, leaving_time(clock, k, {share}, late))")
+        self.add(f"leaves = wp.max(leaves, {self.instant(share, 'late')})")
         return "leaves"
+
+    def instant(self, share: str, late: str) -> str:
+        """Return the time `late` after `share` of the step."""
+        return f"leaving_time(clock, k, {share}, {late})"
+
+    def keep(self, time: str, polarity: str, label: str) -> str:
+        """Return the call that keeps an event."""
+        code = f"{polarity} * 4 + {label}" if self.sink == "labels" else polarity
+        return f"deposit(sink, row, i, size, {time}, {code})"
 
     def event(self, share: str, polarity: str, label: str) -> None:
         """Emit an event after `share` of the step."""
         if self.sink == "counts":
             self.add(f"on_count += {polarity}", f"off_count += 1 - {polarity}")
         else:
-            code = f"{polarity} * 4 + {label}" if self.sink == "labels" else polarity
-            self.add(f"deposit(sink, row, i, size, {self.leave(share)}, {code})")
+            self.add(self.keep(self.leave(share), polarity, label))
         if "age" in self.states:
             self.add(f"age = -{share} * dt")
 
