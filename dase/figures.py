@@ -281,3 +281,42 @@ def _curve(axes: Axes, panel: Curve, colour: str) -> None:
         log_axis(axes, "y")
     elif np.nanmin([measured.min(), simulated.min()]) >= 0:
         axes.set_ylim(bottom=0)
+
+
+def powers(
+    tried: Mapping[str, Sequence[tuple[float, float]]], *, enough: float, names: tuple[str, str]
+) -> Plate:
+    """Draw how soon recordings tell two models apart.
+
+    Args:
+        tried: Recording to the durations tried [s] and the power of each.
+        enough: Power at which two models count as told apart.
+        names: Of the models.
+    """
+    n = len(tried)
+    figure = sheet(
+        1.5 + 0.36 * n, f"Which recording tells {names[0]} from {names[1]}", "share of recordings known"
+    )
+    axes = place(figure, 1.35, 0.8, WIDE - 1.75, 0.36 * n)
+    durations = sorted({seconds for steps in tried.values() for seconds, _ in steps})
+    for row, steps in zip(range(n)[::-1], tried.values(), strict=True):
+        for seconds, power in steps:
+            done = power >= enough
+            at = durations.index(seconds)
+            across, down = (at - 0.48, at + 0.48), (row - 0.42, row + 0.42)
+            axes.fill_between(across, *down, color=BOTH, alpha=1.0 if done else 0.05 + 0.45 * power, lw=0)
+            colour, weight = ("white", "bold") if done else (INK, "normal")
+            _say(axes, f"{100 * power:.0f} %", (at, row), (0, 0), ha="center", color=colour, weight=weight)
+    axes.set(xlim=(-0.55, max(len(durations), 6) - 0.45), ylim=(-0.5, n - 0.5))
+    axes.yaxis.set_major_locator(FixedLocator(list(range(n)[::-1])))
+    axes.set_yticklabels(list(tried), fontsize=9)
+    axes.xaxis.set_major_locator(FixedLocator(list(range(len(durations)))))
+    axes.set_xticklabels([number(seconds) for seconds in durations], fontsize=9)
+    axes.tick_params(length=0)
+    axes.spines[["left", "bottom"]].set_visible(False)
+    label(axes, x="duration of the recording [s]")
+    caption = (
+        f"Share of recordings of {names[1]} that are known when 5 % of those of {names[0]} are mistaken; "
+        f"dark fields are at {100 * enough:.0f} % or more, where the search ends."
+    )
+    return Plate(figure, caption)
