@@ -51,6 +51,51 @@ class Scale:
         return {name: float(rho[part][self.used[part]].mean()) for name, part in used.items()}
 
 
+@dataclass(frozen=True)
+class Judgement:
+    """The error of a model, and what chance makes of a true one.
+
+    Args:
+        error: 1 is what two repeats of one measurement give, each of them off by what is of no concern.
+        gate: Error that 99 of 100 repeats stay below.
+        families: Error per family.
+        z: Difference of each statistic in standard errors, shape (J,).
+        unit: Robust distance that is called 1.
+    """
+
+    error: float
+    gate: float
+    families: dict[str, float]
+    z: Array
+    unit: float
+
+
+def judge(repeats: Array, seen: Scale, chance: Scale, off: Array, *, seed: int) -> Judgement:
+    """Compare a measurement with repeats of a model.
+
+    The model is the mean of its repeats. Each repeat in turn stands in for the measurement and is compared
+    with the others, off by the tolerance at random: what that gives is called 1. So a difference within the
+    tolerance does not count as an error, and a model without any chance in it still has a floor.
+
+    Args:
+        repeats: Statistics of simulations with different seeds, shape (R, J).
+        seen: Sampling errors of the difference between measurement and model.
+        chance: Sampling errors of the model.
+        off: The tolerance, shape (J,).
+        seed: Of the random part of the tolerance.
+    """
+    count = len(repeats)
+    mean = repeats.mean(0)
+    rng = np.random.default_rng([seed, 3])
+    apart = (repeats - mean) * (count / (count - 1)) + off * rng.standard_normal(repeats.shape)
+    weights = chance.weights()
+    null = robust(np.where(chance.used, apart / chance.sigma, 0.0)) @ weights
+    unit = float(null.mean())
+    gate = max(float(np.quantile(null, 0.99)), unit + 2.6 * float(null.std()))
+    families = {name: value / unit for name, value in seen.families(mean).items()}
+    return Judgement(float(seen.loss(mean)) / unit, gate / unit, families, seen.z(mean), unit)
+
+
 def robust(z: Array) -> Array:
     """Return the pseudo-Huber loss: z² for small z, 2 |z| for large; its slope never vanishes."""
     out: Array = 2.0 * (np.sqrt(1.0 + z * z) - 1.0)

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from dase.error import Scale
+from dase.error import Judgement, Scale, judge, robust
 from dase.errors import InputError
 from dase.events import Events
 from dase.kernels import launch
@@ -50,6 +50,9 @@ class Half:
         scale: What differences are measured by in a fit: sampling errors as they are seen between groups of
             pixels, also where the model is wrong.
         chance: What differences are measured by in a test: sampling errors of the present model.
+        seen: As `scale`, for the mean of many repeats of the present model.
+        off: What each statistic may be off by.
+        simulated: Statistics of the present model, the mean over its repeats.
     """
 
     trials: Trials
@@ -57,6 +60,9 @@ class Half:
     frame: Frame
     scale: Scale = field(init=False)
     chance: Scale = field(init=False)
+    seen: Scale = field(init=False)
+    off: Array = field(init=False)
+    simulated: Array = field(init=False)
 
     def run(self, sensor: Sensor, vectors: ArrayLike, **options: Any) -> Array:
         """Return the statistics of models, shape (B, J)."""
@@ -81,22 +87,40 @@ class Half:
         off = tolerance(target[0], events[0]) ** 2
         repeats = 2.0 * values.var(0, ddof=1)
         used = compared(events[0])
-        self.chance = Scale(target[0], np.sqrt(repeats + off), used)
-        self.scale = Scale(target[0], np.sqrt(np.maximum(repeats, self._scatter(sums)) + off), used)
+        self.off = np.sqrt(off)
+        self.chance = Scale(target[0], np.sqrt((0.5 + 0.5 / len(values)) * repeats + off), used)
+        self.simulated = values.mean(0)
+        scatter = self._scatter(sums)
+        self.scale = Scale(target[0], np.sqrt(np.maximum(repeats, scatter) + off), used)
+        # of the difference from the mean of the repeats, which has nearly no sampling error of its own
+        seen = np.maximum((0.5 + 0.5 / len(values)) * repeats, scatter - (0.5 - 0.5 / len(values)) * repeats)
+        self.seen = Scale(target[0], np.sqrt(seen + off), used)
         return values
 
     def _scatter(self, sums: Sums) -> Array:
         """Return the variance of the differences between measurement and model, by groups of pixels, (J,)."""
-        count = self.found.groups.shape[1]
-        pixels = np.minimum(np.arange(self.frame.expected.shape[0]) // GROUP, count - 1)
-        left = []
-        for one in (self.found, sums):
-            parts = one.without(pixels)
-            expected = self.frame.expected * (np.arange(count)[:, None] != pixels)[..., None]
-            left.append(statistics(parts, replace(self.frame, expected=expected))[0])
-        apart = left[0] - left[1]
-        out: Array = (count - 1) * apart.var(0)
+        measured, simulated = (self._left(one) for one in (self.found, sums))
+        out: Array = (len(measured) - 1) * (measured - simulated).var(0)
         return out
+
+    def leave_out(self, models: list[Sums]) -> Array:
+        """Return the loss of each model with one group of pixels left out after the other, shape (M, G)."""
+        measured = self._left(self.found)
+        weights = self.scale.weights()
+        rows = [robust(np.where(self.scale.used, (self._left(m) - measured) / self.scale.sigma, 0.0)) for m in models]
+        return np.stack([row @ weights for row in rows])
+
+    def _left(self, one: Sums) -> Array:
+        """Return statistics without one group of pixels after the other, shape (G, J)."""
+        count = self.found.groups.shape[1]
+        pixels = np.minimum(np.arange(len(self.frame.zone)) // GROUP, count - 1)
+        expected = self.frame.expected * (np.arange(count)[:, None] != pixels)[..., None]
+        return statistics(one.without(pixels), replace(self.frame, expected=expected))[0]
+
+
+    def judge(self, repeats: Array, *, seed: int) -> Judgement:
+        """Return the error of the present model, whose repeats are given."""
+        return judge(repeats, self.seen, self.chance, self.off, seed=seed)
 
 
 @dataclass(eq=False)
