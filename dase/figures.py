@@ -58,7 +58,7 @@ def staircase(
     if len(errors) < 2:
         title = "The error is at the noise floor" if done else "The error is above the noise floor"
     figure = sheet(
-        3.9, title, "on pixels and times that no fit has seen; 1 is what repeats of one measurement give"
+        3.62, title, "on pixels and times that no fit has seen; 1 is what repeats of one measurement give"
     )
     axes = place(figure, 0.85, 0.85, WIDE - 1.2, 2.4)
     n = len(errors)
@@ -72,8 +72,8 @@ def staircase(
         _say(axes, number(error), (i, error), (0, 5), fontsize=10, ha="center", va="bottom", weight="bold")
         above = errors[i - 1] - floor if i else 0.0
         closed = (errors[i - 1] - error) / above if above > 0 else 0.0
-        if closed > 0.2 and n < 7:
-            said = f"{100 * closed:.0f} % of the way\nto the floor"
+        if closed > 0.2 and n < 7 and errors[i - 1] > 1.8 * error:  # else there is no room for words
+            said = f"{100 * min(closed, 1.0):.0f} % of the way\nto the floor"
             _say(axes, said, (i - 0.5, errors[i - 1]), (6, -1), fontsize=7.5, color=QUIET, va="top")
     log_axis(axes, "y")
     axes.xaxis.set_major_locator(FixedLocator(list(range(n))))
@@ -99,7 +99,7 @@ def families(errors: dict[str, float], *, floor: float = 1.0, gate: float | None
     """
     ranked = sorted(errors.items(), key=lambda item: item[1])
     figure = sheet(
-        1.55 + 0.27 * len(ranked), "What the model gets wrong", "error per kind of statistic, worst first"
+        1.4 + 0.27 * len(ranked), "What the model gets wrong", "error per kind of statistic, worst first"
     )
     axes = place(figure, 2.9, 0.8, WIDE - 3.5, 0.27 * len(ranked))
     values = [max(value, 0.0) for _, value in ranked]
@@ -134,6 +134,7 @@ def ranking(
     chosen: Sequence[str] = (),
     ties: Sequence[str] = (),
     floor: float = 1.0,
+    screened: int = 0,
 ) -> Plate:
     """Draw how far each candidate effect brings the error down.
 
@@ -145,10 +146,13 @@ def ranking(
         chosen: Those that were added.
         ties: Those that the data cannot tell apart from the chosen.
         floor: Error of two repeats of one measurement.
+        screened: Candidates beside these that a first look ruled out.
     """
     n = len(effects)
     found = f"Missing: {' and '.join(chosen)}" if chosen else "No candidate explains the error"
-    figure = sheet(1.65 + 0.25 * n, found, "held-out error with one more effect, everything refitted")
+    about = "held-out error with one more effect, everything refitted"
+    about += f"; a first look ruled out {screened} more" if screened else ""
+    figure = sheet(1.42 + 0.25 * n, found, about)
     axes = place(figure, 1.6, 0.85, WIDE - 3.6, 0.25 * n)
     rows = np.arange(n)[::-1]
     low, high = 0.75 * min(floor, *errors), 1.3 * max(present, *errors)
@@ -195,7 +199,7 @@ def parameters(
     """
     n = len(values)
     figure = sheet(
-        1.35 + 0.32 * n, "Fitted parameters", "with 90 % confidence intervals, within their plausible ranges"
+        1.0 + 0.32 * n, "Fitted parameters", "with 90 % confidence intervals, within their plausible ranges"
     )
     axes = place(figure, 2.2, 0.8, 4.3, 0.32 * n)
     axes.set(xlim=(-0.06, 1.06), ylim=(-0.6, n - 0.4))
@@ -244,7 +248,7 @@ def curves(title: str, about: str, panels: Sequence[Curve], caption: str) -> Pla
     columns = min(len(panels), 3 if len(panels) == 3 or len(panels) > 4 else 2)
     rows = math.ceil(len(panels) / columns)
     wide = (WIDE - 0.35) / columns
-    figure = sheet(0.75 + 2.75 * rows, title, about)
+    figure = sheet(0.72 + 2.75 * rows, title, about)
     colours: list[str] = []
     for i, panel in enumerate(panels):
         left, top = 0.2 + 0.65 + (i % columns) * wide, 1.1 + (i // columns) * 2.75
@@ -295,7 +299,7 @@ def powers(
     """
     n = len(tried)
     figure = sheet(
-        1.5 + 0.36 * n, f"Which recording tells {names[0]} from {names[1]}", "share of recordings known"
+        1.36 + 0.36 * n, f"Which recording tells {names[0]} from {names[1]}", "share of recordings known"
     )
     axes = place(figure, 1.35, 0.8, WIDE - 1.75, 0.36 * n)
     durations = sorted({seconds for steps in tried.values() for seconds, _ in steps})

@@ -13,14 +13,57 @@ from matplotlib.image import AxesImage
 from matplotlib.ticker import FixedLocator
 from numpy.typing import NDArray
 
+from dase.errors import InputError
+from dase.events import Events
+from dase.io.sequence import Sequence as Recording
 from dase.plates import INK, LINE, OFF, ON, WIDE, Plate, label, legend, number, place, sheet
-from dase.show import overlay, seconds
+from dase.show import default_window, overlay, seconds
 
 DIVERGING = LinearSegmentedColormap.from_list("dase", ["#1b4f8f", "#86add3", "#f5f5f3", "#dfa67f", "#a23b16"])
 """Too few to too many."""
 
 MOST = 3.0
 """Octaves at which the colours of a map end."""
+
+
+def event_plates(
+    measured: Events,
+    simulated: Events,
+    span: tuple[float, float],
+    *,
+    frames: NDArray[np.uint8] | None = None,
+    frame_times: NDArray[np.float64] | None = None,
+    count: int = 3,
+) -> list[Plate]:
+    """Return the pictures of a comparison: moments side by side, and where too many or too few events come.
+
+    Args:
+        measured: Events of the camera.
+        simulated: Events of the model, on the same clock.
+        span: Begin and end of what is compared [s].
+        frames: What the camera saw, uint8, shape (F, H, W); None where that is unknown.
+        frame_times: Times of the frames [s], shape (F,).
+        count: Number of moments.
+
+    Raises:
+        InputError: The sizes differ.
+    """
+    sizes = {(events.width, events.height) for events in (measured, simulated)}
+    if len(sizes) != 1:
+        raise InputError(f"measured and simulated events must have one size, got {sizes}")
+    begin, end = span
+    parts = [events.slice(begin, end) for events in (measured, simulated)]
+    window = default_window(Recording(parts[0]))
+    times = [begin + (end - begin) * (i + 0.5) / count for i in range(count)]
+    counts = [np.concatenate([p.counts([t - window / 2, t + window / 2]) for t in times]) for p in parts]
+    seen: list[NDArray[np.uint8] | None] = [None] * count
+    if frames is not None and frame_times is not None and len(frames):
+        seen = [frames[int(np.abs(frame_times - t).argmin())] for t in times]
+    whole = [p.counts([begin, np.nextafter(end, math.inf)])[0].astype(np.float64) for p in parts]
+    return [
+        moments(seen, counts[0], counts[1], times, window),
+        residual_maps(whole[0], whole[1], end - begin),
+    ]
 
 
 def moments(

@@ -41,6 +41,11 @@ class Plate:
     figure: Figure
     caption: str
 
+    @property
+    def title(self) -> str:
+        """Title of the figure."""
+        return str(self.figure.texts[0].get_text())
+
     def alone(self) -> Figure:
         """Return the figure with its caption under it, to be shown or saved without a page around it."""
         lines = textwrap.wrap(self.caption, 125)
