@@ -6,13 +6,16 @@ from importlib.metadata import version as _version
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from dase.comparison import compare as compare
     from dase.config import dump_sensor as dump_sensor
     from dase.config import load_sensor as load_sensor
+    from dase.diagnosis import diagnose as diagnose
     from dase.effect_files import load_effects as load_effects
     from dase.effects import EFFECTS as EFFECTS
     from dase.effects import Effect as Effect
     from dase.errors import InputError as InputError
     from dase.events import Events as Events
+    from dase.fitting import fit as fit
     from dase.images import Picture as Picture
     from dase.images import open_images as open_images
     from dase.layers import Layer as Layer
@@ -32,11 +35,14 @@ except PackageNotFoundError:  # a checkout on the path, not installed
     __version__ = "0+unknown"
 
 _HOMES = {
+    "dase.comparison": ("compare",),
     "dase.config": ("dump_sensor", "load_sensor"),
+    "dase.diagnosis": ("diagnose",),
     "dase.effect_files": ("load_effects",),
     "dase.effects": ("EFFECTS", "Effect"),
     "dase.errors": ("InputError",),
     "dase.events": ("Events",),
+    "dase.fitting": ("fit",),
     "dase.images": ("Picture", "open_images"),
     "dase.layers": ("Layer", "LayerScene", "Motion"),
     "dase.scene": ("Scene",),

@@ -8,19 +8,23 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from dase.descent import Found, screen
 from dase.effects.base import Effect
 from dase.effects.stream import StreamEffect
 from dase.evidence import Evidence
-from dase.fitting import Found, screen
 from dase.model import Model, added, starts
 from dase.space import variants
+from dase.trials import finer_steps
 
 Array = NDArray[np.float64]
 
 FINALISTS = 5
 """Candidates that are fitted to all pixels of the training half."""
 
-SEEDS = 3
+SECOND = 1.25
+"""A second start is followed where its loss is below this, relative to the first."""
+
+SEEDS = 6
 """Simulations whose mean loss is taken where candidates are compared."""
 
 
@@ -32,8 +36,8 @@ class Tried:
         name: Of the effect, names joined by ` + ` for a pair.
         model: With the effect, fitted.
         fit: Its loss where it was fitted.
-        held: Its loss on the held-out half, by the sampling errors of the model without it; NaN where it was
-            only screened.
+        held: Its loss on the held-out half, by what is seen of the model without it; NaN where it was only
+            screened.
         bank: Statistics of all that was tried on the training half, shape (M, J).
     """
 
@@ -57,11 +61,14 @@ def open_to(effects: Mapping[str, type[Effect]], present: Model) -> list[str]:
 def scout(evidence: Evidence, present: Model, effect: Effect, *, seed: int) -> Tried:
     """Try one effect on the scout: a look at many places, then a short descent from the best two."""
     model = added(present, effect)
-    places, losses = screen(evidence.scout, model.space, starts(model, effect), seed=seed)
-    apart = np.flatnonzero(np.abs(places - places[0]).max(1) > 0.8)
-    picks = [0, *apart[:1]]
+    slow = finer_steps(model.space.sensor, evidence.scout.trials.stimulus.grid.step) > 0
+    places, losses = screen(evidence.scout, model.space, starts(model, effect, few=slow), seed=seed)
+    apart = np.flatnonzero((np.abs(places - places[0]).max(1) > 0.8) & (losses < SECOND * losses[0]))
+    picks = [0, *apart[: 0 if slow else 1]]
     ends = [
-        replace(model, place=places[n], loss=losses[n]).search(evidence.scout, seed=seed, iterations=3, radius=0.25)
+        replace(model, place=places[n], loss=losses[n]).search(
+            evidence.scout, seed=seed, iterations=3, radius=0.25
+        )
         for n in picks
     ]
     best = min(ends, key=lambda m: m.loss)
@@ -72,8 +79,16 @@ def refine(evidence: Evidence, tried: Tried, *, seed: int) -> Tried:
     """Fit a candidate to all pixels of the training half and look at the held-out one."""
     found: Found = tried.model.explore(evidence.train, seed=seed, iterations=4, radius=0.2)
     model = replace(tried.model, place=found.place, loss=found.loss)
-    held = float(np.mean([model.loss_on(evidence.held, seed=seed + n) for n in range(SEEDS)]))
+    held = held_loss(evidence, model, seed=seed)
     return replace(tried, model=model, fit=found.loss, held=held, bank=found.tried)
+
+
+def held_loss(evidence: Evidence, model: Model, *, seed: int) -> float:
+    """Return the held-out loss of a model as that of the present one is judged: the mean of a few repeats."""
+    half = evidence.held
+    vectors = np.repeat(model.vector, SEEDS, 0)
+    values = half.run(model.space.sensor, vectors, seed=seed + 700, reseed=True)
+    return float(half.seen.loss(values.mean(0)))
 
 
 def try_all(
@@ -105,7 +120,9 @@ def try_all(
     return [*finalists, *order[FINALISTS:]]
 
 
-def chance_of(evidence: Evidence, tried: Sequence[Tried], repeats: Array, present: Array) -> Callable[[float], float]:
+def chance_of(
+    evidence: Evidence, tried: Sequence[Tried], repeats: Array, present: Array
+) -> Callable[[float], float]:
     """Return the function from a fall of the training loss to its p-value, corrected over all candidates.
 
     Repeats of the present model stand in for the measurement; each takes the best of everything that was

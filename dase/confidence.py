@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from dase.descent import PRIOR
 from dase.evidence import Evidence
-from dase.fitting import PRIOR
 from dase.model import Model
 from dase.results import Estimate
 
@@ -24,14 +24,19 @@ def estimates(evidence: Evidence, model: Model, *, seed: int) -> dict[str, Estim
 
     The fit is linearised: statistics run along straight lines in the parameters. What sampling errors of the
     statistics make of the parameters is seen in repeats of the model, correlations between statistics
-    included.
+    included, and in the measurement with one group of pixels left out after the other; the larger counts.
     """
     half = evidence.train
     repeats = model.rebase(half, repeats=REPEATS, seed=seed + 900)
     found = model.explore(half, seed=seed, iterations=2, radius=0.08)
-    gain = gain_matrix(half.scale.sigma, half.scale.used, half.scale.weights(), found.slope, half.scale.z(repeats.mean(0)))
+    gain = gain_matrix(
+        half.scale.sigma, half.scale.used, half.scale.weights(), found.slope, half.scale.z(repeats.mean(0))
+    )
     apart = (repeats - repeats.mean(0)) @ gain.T
-    deviation = np.sqrt(apart.var(0, ddof=1) * (1 + 1 / len(repeats)))
+    chance = apart.var(0, ddof=1) * (1 + 1 / len(repeats))
+    # what the pixels of the measurement make of it, also where the model is not quite right
+    seen = (half.left() @ gain.T).var(0) * (half.groups - 1)
+    deviation = np.sqrt(np.maximum(chance, seen))
     low, high = model.space.bounds()
     out = {}
     for n, axis in enumerate(model.space.axes):

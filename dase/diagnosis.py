@@ -10,11 +10,11 @@ from typing import Any
 import numpy as np
 
 from dase.candidates import Tried, apart, chance_of, open_to, try_all
+from dase.confidence import estimates
 from dase.effects import EFFECTS, Effect
 from dase.error import Judgement
 from dase.events import Events
 from dase.evidence import PIXELS, Evidence, gather
-from dase.confidence import estimates
 from dase.model import Model, fit_present, model_of, settle
 from dase.results import Cell, Diagnosis, Estimate, Rank, Step, Unexplained
 from dase.scene import Scene
@@ -29,8 +29,14 @@ REPEATS = 60
 SIGNIFICANT = 0.02
 """Largest p-value of an effect that is added; 1 / (REPEATS + 1) is the smallest there is."""
 
-MATERIAL = 0.1
-"""Least fall of the held-out error, in units of the floor, and least share of the way to the floor."""
+MATERIAL = 0.3
+"""Least fall of the held-out error, in units of the floor."""
+
+SHARE = 0.1
+"""Least share of the way to the floor."""
+
+CLOSE = 1.5
+"""A model up to this error is said to be at the floor: what is left may be significant but is not material."""
 
 TIE = 2.0
 """Candidates within so many standard errors of the best are not told apart from it."""
@@ -110,11 +116,16 @@ def diagnose(
     before = model_of(sensor, free).judge(evidence.held, repeats=REPEATS // 2, seed=seed + 500).error
     start = fit_present(evidence, sensor, free, seed=seed)
     model, judgement, errors = _greedy(search, start, most)
-    if judgement.error > judgement.gate and most > 0:
+    if not explained(judgement) and most > 0:
         model, judgement = _pairs(search, start, model, judgement)
     if len(search.added(model)) > 1:
         model, judgement = _review(search, model, judgement)
     return _verdict(search, start, model, judgement, errors, before, begin)
+
+
+def explained(judgement: Judgement) -> bool:
+    """Whether a model is at the floor."""
+    return judgement.error <= max(judgement.gate, CLOSE)
 
 
 def _greedy(search: _Search, model: Model, most: int) -> tuple[Model, Judgement, list[float]]:
@@ -137,7 +148,7 @@ def _step(search: _Search, model: Model, judgement: Judgement, more: bool) -> tu
     names = tuple(e.name for e in model.space.sensor.effects)
     cells = worst_cells(evidence, judgement)
     step = Step(names, judgement.error, judgement.gate, judgement.families, (), None, (), cells)
-    if judgement.error <= judgement.gate or not more:
+    if explained(judgement) or not more:
         return step, None
     repeats = model.rebase(evidence.train, repeats=REPEATS, seed=seed + 300)
     model.rebase(evidence.scout, repeats=16, seed=seed + 200)
@@ -151,14 +162,11 @@ def _step(search: _Search, model: Model, judgement: Judgement, more: bool) -> tu
     present = evidence.train.run(model.space.sensor, model.vector, seed=seed)[0]
     p_value = chance_of(evidence, tried, repeats, present)
     base = float(evidence.train.scale.loss(present))
-    held = float(np.mean([model.loss_on(evidence.held, seed=seed + n) for n in range(3)]))
     finalists = [t for t in tried if np.isfinite(t.held)]
     best, ties = _choose(search, finalists)
-    ranking = tuple(
-        _rank(t, judgement, held, p_value(base - t.fit) if np.isfinite(t.held) else 1.0) for t in tried
-    )
+    ranking = tuple(_rank(t, judgement, p_value(base - t.fit) if np.isfinite(t.held) else 1.0) for t in tried)
     mine = next(rank for rank in ranking if rank.effect == best.name)
-    enough = mine.fall >= MATERIAL and mine.share >= MATERIAL and mine.p_value <= SIGNIFICANT
+    enough = mine.fall >= MATERIAL and mine.share >= SHARE and mine.p_value <= SIGNIFICANT
     search.alternatives[best.name] = [t for t in finalists if t.name != best.name]
     step = replace(step, ranking=ranking, chosen=best.name if enough else None, ties=ties if enough else ())
     return step, settle(evidence, best.model, seed=seed) if enough else None
@@ -176,11 +184,10 @@ def _choose(search: _Search, finalists: Sequence[Tried]) -> tuple[Tried, tuple[s
     return best, tuple(t.name for t in like if t.name != best.name)
 
 
-def _rank(tried: Tried, judgement: Judgement, held: float, p_value: float) -> Rank:
+def _rank(tried: Tried, judgement: Judgement, p_value: float) -> Rank:
     """Return a candidate as the user sees it; losses become errors by the unit of the present model."""
     full = bool(np.isfinite(tried.held))
-    share_left = min(1.0, tried.held / held) if full else float("nan")
-    error = judgement.error * share_left
+    error = tried.held / judgement.unit
     fall = judgement.error - error
     share = fall / max(judgement.error - 1.0, 1e-9)
     mine = {
@@ -203,13 +210,19 @@ def _review(search: _Search, model: Model, judgement: Judgement) -> tuple[Model,
         free = [a.name for a in model.space.axes if a.name.split(".")[0] != name]
         less = settle(search.evidence, model_of(sensor, free), seed=search.seed)
         without = search.judge(less)
-        if without.error <= max(without.gate, judgement.error):
+        if explained(without) or without.error <= judgement.error:
             model, judgement = less, without
     return model, judgement
 
 
 def _verdict(
-    search: _Search, start: Model, model: Model, judgement: Judgement, errors: list[float], before: float, begin: float
+    search: _Search,
+    start: Model,
+    model: Model,
+    judgement: Judgement,
+    errors: list[float],
+    before: float,
+    begin: float,
 ) -> Diagnosis:
     found = search.added(model)
     order = [s.chosen for s in search.history if s.chosen in found]
@@ -217,12 +230,10 @@ def _verdict(
     last = search.judge(model)
     cells = worst_cells(search.evidence, last)
     notes = list(search.evidence.notes)
-    if last.error > last.gate:
+    if not explained(last):
         unexplained = _unexplained(search, tuple(str(n) for n in order), errors[0], last, cells)
     values = estimates(search.evidence, model, seed=search.seed)
-    ties = {
-        s.chosen: s.ties for s in search.history if s.chosen in found and s.ties and unexplained is None
-    }
+    ties = {s.chosen: s.ties for s in search.history if s.chosen in found and s.ties and unexplained is None}
     kept = unexplained is None
     path = [errors[0]] + [e for s, e in zip(search.history, errors[1:], strict=False) if s.chosen in found]
     if kept and len(path) > 1:

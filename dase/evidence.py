@@ -66,7 +66,9 @@ class Half:
 
     def run(self, sensor: Sensor, vectors: ArrayLike, **options: Any) -> Array:
         """Return the statistics of models, shape (B, J)."""
-        return statistics(self.trials.run(sensor, np.atleast_2d(np.asarray(vectors)), **options), self.frame)[0]
+        return statistics(self.trials.run(sensor, np.atleast_2d(np.asarray(vectors)), **options), self.frame)[
+            0
+        ]
 
     def rebase(self, sensor: Sensor, vector: ArrayLike, *, repeats: int, seed: int) -> Array:
         """Make a model the present one: expectations and sampling errors are its own.
@@ -90,6 +92,7 @@ class Half:
         self.off = np.sqrt(off)
         self.chance = Scale(target[0], np.sqrt((0.5 + 0.5 / len(values)) * repeats + off), used)
         self.simulated = values.mean(0)
+        self._present = Sums(sums.sums[:1], sums.halves[:1], sums.groups[:1])
         scatter = self._scatter(sums)
         self.scale = Scale(target[0], np.sqrt(np.maximum(repeats, scatter) + off), used)
         # of the difference from the mean of the repeats, which has nearly no sampling error of its own
@@ -103,11 +106,23 @@ class Half:
         out: Array = (len(measured) - 1) * (measured - simulated).var(0)
         return out
 
+    @property
+    def groups(self) -> int:
+        """Number of groups of pixels."""
+        return self.found.groups.shape[1]
+
+    def left(self) -> Array:
+        """Return statistics of the measurement less the model, groups left out one after the other, (G, J)."""
+        return self._left(self.found) - self._left(self._present)
+
     def leave_out(self, models: list[Sums]) -> Array:
         """Return the loss of each model with one group of pixels left out after the other, shape (M, G)."""
         measured = self._left(self.found)
         weights = self.scale.weights()
-        rows = [robust(np.where(self.scale.used, (self._left(m) - measured) / self.scale.sigma, 0.0)) for m in models]
+        rows = [
+            robust(np.where(self.scale.used, (self._left(m) - measured) / self.scale.sigma, 0.0))
+            for m in models
+        ]
         return np.stack([row @ weights for row in rows])
 
     def _left(self, one: Sums) -> Array:
@@ -116,7 +131,6 @@ class Half:
         pixels = np.minimum(np.arange(len(self.frame.zone)) // GROUP, count - 1)
         expected = self.frame.expected * (np.arange(count)[:, None] != pixels)[..., None]
         return statistics(one.without(pixels), replace(self.frame, expected=expected))[0]
-
 
     def judge(self, repeats: Array, *, seed: int) -> Judgement:
         """Return the error of the present model, whose repeats are given."""

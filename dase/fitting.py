@@ -1,138 +1,131 @@
-"""Parameters from statistics: populations of models, a straight-line model of what they give, robust steps."""
+"""The parameters of a sensor from a recording."""
 
 from __future__ import annotations
 
+import time
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
-from dase.error import Scale
-from dase.evidence import Half
-from dase.space import Space
+from dase.confidence import estimates
+from dase.diagnosis import Progress
+from dase.events import Events
+from dase.evidence import PIXELS, gather
+from dase.model import Model, fit_present, model_of, settle
+from dase.results import Estimate, Fit
+from dase.scene import Scene
+from dase.sensor import Sensor
+from dase.space import Axis
+from dase.stimulus import Trust
 
-Array = NDArray[np.float64]
+REPEATS = 60
+"""Simulations with other seeds that tell what chance does."""
 
-RADIUS = 0.25
-"""Of the first population, in the units of `Axis.to_place`."""
+OTHERS = 2
+"""Starts beside the wide look at thresholds."""
 
-SMALLEST = 0.03
-"""Of the last: below it the noise of single events hides the slope."""
+AGREE = 1.5
+"""Starts agree where their ends lie within so many half-widths of the confidence interval, or `NEAR`."""
 
-PRIOR = 2e-3
-"""Weight by which parameters that the data say nothing about are held at their start."""
-
-
-@dataclass(frozen=True)
-class Found:
-    """Where a search ended.
-
-    Args:
-        place: Best place, shape (P,).
-        loss: Of the best place.
-        values: Its statistics, shape (J,).
-        slope: Statistics per unit of place, shape (J, P).
-        places: All places tried, shape (M, P).
-        tried: Their statistics, shape (M, J).
-    """
-
-    place: Array
-    loss: float
-    values: Array
-    slope: Array
-    places: Array
-    tried: Array
+NEAR = 0.03
+"""Of each other, in the units of `Axis.to_place`."""
 
 
-def search(half: Half, space: Space, start: Array, *, seed: int, iterations: int = 5, radius: float = RADIUS) -> Found:
-    """Descend from one start.
-
-    Each iteration simulates a population about the present place, with the random numbers in common, fits a
-    straight line to each statistic, and goes where the robust loss of those lines is least. The slopes come
-    from differences as wide as the population, so the noise of single events does not matter.
+def fit(
+    events: Events,
+    scene: Scene,
+    sensor: Sensor,
+    *,
+    free: Sequence[str] | None = None,
+    trust: Trust | None = None,
+    pixels: int = PIXELS,
+    seed: int = 0,
+    device: str = "cpu",
+    progress: Progress | None = None,
+) -> Fit:
+    """Fit the parameters of a sensor to a measurement.
 
     Args:
-        half: What is fitted.
-        space: Free parameters.
-        start: Where to begin, shape (P,).
-        seed: Of the models' random numbers, and of the populations.
-        iterations: Populations.
-        radius: Of the first.
+        events: What was measured.
+        scene: What the camera saw, on the clock of the events.
+        sensor: Its effects are fitted; nothing is added.
+        free: Effects or `effect.parameter` that are fitted; None for all.
+        trust: Where and when the scene is to be trusted; None for everywhere.
+        pixels: In each half of the measurement.
+        seed: Of every random number.
+        device: Where kernels run.
+        progress: Told how far it is.
+
+    Raises:
+        InputError: Measurement and scene do not fit, or there is too little to say anything.
     """
-    rng = np.random.default_rng([seed, 7])
-    low, high = space.bounds()
-    centre = np.clip(start, low, high)
-    places, tried = np.empty((0, len(centre))), np.empty((0, len(half.scale.target)))
-    best, best_loss = centre, np.inf
-    slope = np.zeros((len(half.scale.target), len(centre)))
-    for _ in range(iterations):
-        population = np.clip(np.concatenate([centre[None], centre + radius * _cross(rng, len(centre))]), low, high)
-        values = half.run(space.sensor, space.vectors(population), seed=seed)
-        places, tried = np.concatenate([places, population]), np.concatenate([tried, values])
-        losses = half.scale.loss(tried) + penalty(places, start)
-        leader = int(np.argmin(losses))
-        improved = losses[leader] < best_loss - 1e-3 * abs(best_loss) if np.isfinite(best_loss) else True
-        best, best_loss = places[leader], float(losses[leader])
-        near = np.abs(places - best).max(1) <= 2.5 * radius
-        slope = slopes(places[near] - best, tried[near] - tried[leader])
-        step = robust_step(half.scale, tried[leader], slope, best - start)
-        length = np.abs(step).max()
-        step *= min(1.0, 2.0 * radius / max(length, 1e-12))
-        centre = np.clip(best + step, low, high)
-        radius = max(radius * (1.0 if improved and length > radius else 0.5), SMALLEST)
-    final = half.run(space.sensor, space.vectors(centre), seed=seed)
-    places, tried = np.concatenate([places, centre[None]]), np.concatenate([tried, final])
-    losses = half.scale.loss(tried) + penalty(places, start)
-    leader = int(np.argmin(losses))
-    return Found(places[leader], float(half.scale.loss(tried[leader])), tried[leader], slope, places, tried)
+    begin = time.perf_counter()
+    tell = progress or (lambda text, share, error: None)
+    model_of(sensor, free)  # refuses names that are not there before anything takes time
+    evidence = gather(
+        events, scene, log_eps=sensor.log_eps, trust=trust, pixels=pixels, seed=seed, device=device
+    )
+    given = model_of(sensor, free)
+    before = given.judge(evidence.held, repeats=REPEATS // 2, seed=seed + 500).error
+    tell("a wide look", 0.1, before)
+    best = settle(evidence, fit_present(evidence, sensor, free, seed=seed), seed=seed)
+    ends = [best]
+    for n in range(OTHERS):
+        tell(f"start {n + 2} of {OTHERS + 1}", 0.3 + 0.25 * n, before)
+        ends.append(settle(evidence, _elsewhere(best, seed + n), seed=seed + n))
+    judged = [(m.judge(evidence.held, repeats=REPEATS, seed=seed + 500), m) for m in ends]
+    judgement, model = min(judged, key=lambda pair: pair[0].error)
+    tell("confidence intervals", 0.9, judgement.error)
+    values = estimates(evidence, model, seed=seed)
+    good = [m for j, m in judged if j.error < judgement.error + 0.1]
+    apart = disagreements(model, good, values)
+    notes = [*evidence.notes, *apart, *outside(model)]
+    if len(good) < 2:
+        notes.append("only one of the starts came to this error: the others ended in worse minima")
+    return Fit(
+        sensor=model.sensor,
+        parameters=values,
+        error=judgement.error,
+        before=before,
+        floor=1.0,
+        gate=judgement.gate,
+        agree=not apart and len(good) > 1,
+        notes=tuple(notes),
+        evaluations=evidence.evaluations,
+        seconds=time.perf_counter() - begin,
+    )
 
 
-def penalty(places: Array, start: Array) -> Array:
-    """Return what it costs to leave the start, shape (...)."""
-    out: Array = PRIOR * ((places - start) ** 2).sum(-1)
+def _elsewhere(model: Model, seed: int) -> Model:
+    """Return the model well away from where it is."""
+    rng = np.random.default_rng([seed, 11])
+    low, high = model.space.bounds()
+    place = np.clip(model.place + rng.choice([-0.5, 0.5], len(model.place)), low, high)
+    return replace(model, place=place)
+
+
+def disagreements(best: Model, ends: Sequence[Model], values: dict[str, Estimate]) -> list[str]:
+    """Return a sentence for each parameter in which equally good ends differ."""
+    out = []
+    for n, axis in enumerate(best.space.axes):
+        places = np.array([m.place[n] for m in ends])
+        low, high = (float(axis.to_place(v)) for v in (values[axis.name].low, values[axis.name].high))
+        if np.ptp(places) > max(AGREE * 0.5 * (high - low), NEAR):
+            found = ", ".join(f"{float(axis.to_value(p)):.3g}" for p in sorted(places))
+            out.append(f"{axis.name}: starts end at {found}; the data do not say which")
     return out
 
 
-def _cross(rng: np.random.Generator, size: int) -> Array:
-    """Return both ways along the axes of a random frame, and some directions more, shape (2 P + 2, P)."""
-    frame, _ = np.linalg.qr(rng.standard_normal((size, size)))
-    frame *= np.sqrt(size) / np.maximum(np.abs(frame).max(1, keepdims=True) * np.sqrt(size), 1e-9)
-    more = rng.standard_normal((1, size))
-    more /= np.abs(more).max()
-    return np.concatenate([frame, -frame, more, -more])
+def outside(model: Model) -> list[str]:
+    """Return a sentence for each parameter beyond its plausible range."""
+    return [
+        f"{axis.name} = {value:.3g} {axis.fact.unit} lies outside its plausible range, "
+        f"{axis.fact.plausible[0]:g} to {axis.fact.plausible[1]:g}"
+        for axis, value in _values(model)
+        if not axis.fact.plausible[0] * 0.999 <= value <= axis.fact.plausible[1] * 1.001
+    ]
 
 
-def slopes(places: Array, values: Array) -> Array:
-    """Return the slopes of straight lines through the origin, shape (J, P)."""
-    size = places.shape[1]
-    ridge = 1e-3 * np.trace(places.T @ places) / size + 1e-12
-    fit = np.linalg.solve(places.T @ places + ridge * np.eye(size), places.T @ values)
-    out: Array = fit.T
-    return out
-
-
-def robust_step(scale: Scale, values: Array, slope: Array, offset: Array) -> Array:
-    """Return the step to the least robust loss of statistics that run along straight lines, shape (P,)."""
-    weights = scale.weights()
-    z0 = scale.z(values)
-    lines = np.where(scale.used[:, None], slope / scale.sigma[:, None], 0.0)
-    step = np.zeros(slope.shape[1])
-    for _ in range(20):
-        z = z0 + lines @ step
-        w = weights / np.sqrt(1.0 + z * z)
-        normal = lines.T @ (w[:, None] * lines) + PRIOR * np.eye(len(step))
-        right = lines.T @ (w * z0) + PRIOR * offset
-        new = -np.linalg.solve(normal + 1e-9 * np.trace(normal) * np.eye(len(step)), right)
-        if np.abs(new - step).max() < 1e-4:
-            return new
-        step = new
-    return step
-
-
-def screen(half: Half, space: Space, starts: Sequence[Array] | Array, *, seed: int) -> tuple[Array, Array]:
-    """Return places in order of their loss, and the losses."""
-    places = np.atleast_2d(np.asarray(starts))
-    losses = half.scale.loss(half.run(space.sensor, space.vectors(places), seed=seed))
-    order = np.argsort(losses)
-    return places[order], losses[order]
+def _values(model: Model) -> list[tuple[Axis, float]]:
+    return [(a, float(a.to_value(p))) for a, p in zip(model.space.axes, model.place, strict=True)]

@@ -9,10 +9,10 @@ from itertools import product
 import numpy as np
 from numpy.typing import NDArray
 
+from dase.descent import Found, screen, search
 from dase.effects.base import Effect
 from dase.error import Judgement
 from dase.evidence import Evidence, Half
-from dase.fitting import Found, screen, search
 from dase.sensor import Sensor
 from dase.space import Axis, Space, axes_of, with_values
 
@@ -103,17 +103,17 @@ def fit_present(evidence: Evidence, sensor: Sensor, free: Sequence[str] | None, 
     best.sort(key=lambda m: m.loss)
     best[0].rebase(evidence.train, repeats=12, seed=seed + 100)
     ends = [m.search(evidence.train, seed=seed) for m in best]
-    return settle(evidence, min(ends, key=lambda m: m.loss), seed=seed)
+    return settle(evidence, min(ends, key=lambda m: m.loss), seed=seed, rounds=1)
 
 
-def settle(evidence: Evidence, model: Model, *, seed: int, rounds: int = 1) -> Model:
-    """Refit a model by its own sampling errors."""
-    for _ in range(rounds):
+def settle(evidence: Evidence, model: Model, *, seed: int, rounds: int = 2) -> Model:
+    """Refit a model by its own sampling errors, which change with it."""
+    for turn in range(rounds):
         model.rebase(evidence.train, repeats=16, seed=seed + 100)
         other = with_phase(model, 1.0 - model.space.sensor["threshold"].phase)  # type: ignore[attr-defined]
         losses = [m.loss_on(evidence.train, seed=seed) for m in (model, other)]
         model = other if losses[1] < losses[0] else model
-        model = model.search(evidence.train, seed=seed, radius=0.12)
+        model = model.search(evidence.train, seed=seed + turn, radius=0.12 / (1 + turn))
     return model
 
 
@@ -137,18 +137,18 @@ def added(present: Model, effect: Effect) -> Model:
     return model_of(sensor, [*old, *mine])
 
 
-def starts(model: Model, effect: Effect) -> Array:
+def starts(model: Model, effect: Effect, *, few: bool = False) -> Array:
     """Return places from which an effect is tried: its strength and its character, at several thresholds."""
     axes = model.space.axes
     columns, choices = [], []
     for n, axis in enumerate(axes):
         if axis.name.split(".")[0] == effect.name:
             columns.append(n)
-            choices.append(_tried(axis, float(model.place[n])))
+            choices.append(_tried(axis, float(model.place[n]))[:: 2 if few and axis.main else 1])
     thresholds = [n for n, axis in enumerate(axes) if axis.name in ("threshold.on", "threshold.off")]
     out = []
     for combination in product(*choices):
-        for shift in SHIFTS:
+        for shift in SHIFTS[1::2] if few else SHIFTS:
             place = model.place.copy()
             place[columns] = combination
             place[thresholds] += shift

@@ -109,7 +109,9 @@ def _layout() -> dict[str, slice]:
         "space": 4 * ZONES,
     }
     ends = np.cumsum(list(sizes.values()))
-    return {name: slice(int(end - size), int(end)) for (name, size), end in zip(sizes.items(), ends, strict=True)}
+    return {
+        name: slice(int(end - size), int(end)) for (name, size), end in zip(sizes.items(), ends, strict=True)
+    }
 
 
 LAYOUT = _layout()

@@ -102,7 +102,8 @@ class Space:
     def at(self, place: Array) -> Sensor:
         """Return the sensor at a place."""
         return with_values(
-            self.sensor, {axis.name: float(axis.to_value(p)) for axis, p in zip(self.axes, place, strict=True)}
+            self.sensor,
+            {axis.name: float(axis.to_value(p)) for axis, p in zip(self.axes, place, strict=True)},
         )
 
 

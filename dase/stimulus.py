@@ -146,7 +146,9 @@ class Stimulus:
         between = level[:, below] * (1 - share) + level[:, below + 1] * share
         light = np.maximum(np.exp(between) - np.float32(self.log_eps), 0)
         start = points * np.arange(count + 1)
-        return self._arrays(start, np.tile(np.arange(points), count), light.reshape(-1), self.grid.step / finer)
+        return self._arrays(
+            start, np.tile(np.arange(points), count), light.reshape(-1), self.grid.step / finer
+        )
 
     def _arrays(
         self, start: NDArray[Any], stamp: NDArray[Any], light: NDArray[np.float32], step: float

@@ -31,6 +31,9 @@ SLACK = 2e-6
 GROUP = 64
 """Pixels whose events are summed up together on a CPU; on a GPU every pixel has a thread."""
 
+FINEST = 2
+"""Samples per step of the grid at most: models that ask for more are simulated a little too coarsely."""
+
 ROOM = 1 << 28
 """Memory for the sums of one launch [bytes]."""
 
@@ -38,7 +41,7 @@ ROOM = 1 << 28
 def finer_steps(sensor: Sensor, step: float) -> int:
     """Return how many samples per step the model needs, 0 where those at changes of the light do."""
     longest = sensor.longest_step()
-    return 0 if longest == np.inf else int(np.clip(np.ceil(step / longest - 1e-6), 1, 16))
+    return 0 if longest == np.inf else int(np.clip(np.ceil(step / longest - 1e-6), 1, FINEST))
 
 
 @dataclass(eq=False)
@@ -62,7 +65,13 @@ class Trials:
         self._pixels = wp.array(self.stimulus.pixels, dtype=int, device=self.device)
 
     def run(
-        self, sensor: Sensor, vectors: NDArray[Any], *, seed: int = 0, reseed: bool = False, finer: int | None = None
+        self,
+        sensor: Sensor,
+        vectors: NDArray[Any],
+        *,
+        seed: int = 0,
+        reseed: bool = False,
+        finer: int | None = None,
     ) -> Sums:
         """Simulate parameter vectors of a sensor.
 
@@ -139,7 +148,11 @@ class Trials:
         out.group = self._group()
         count = len(stimulus.pixels)
         groups = -(-count // out.group)
-        zeros = (("memory", count, kernels.MEMORY), ("sums", groups, kernels.SIZE), ("halves", count, kernels.HALVES))
+        zeros = (
+            ("memory", count, kernels.MEMORY),
+            ("sums", groups, kernels.SIZE),
+            ("halves", count, kernels.HALVES),
+        )
         for name, size, numbers in zeros:
             setattr(out, name, wp.zeros((rows, size, numbers), dtype=float, device=self.device))
         out.clock = wp.zeros((rows, 1, 0), dtype=int, device=self.device)

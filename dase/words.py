@@ -32,7 +32,11 @@ _POLARITY = ("OFF", "ON")
 def band(evidence: Evidence, n: int) -> str:
     """Return a band of intensity in words, in grey values of 8 bits."""
     edges = [f"{255 * e:.0f}" for e in evidence.bands]
-    spans = [f"below {edges[0]} DN", *(f"{a} to {b} DN" for a, b in zip(edges, edges[1:], strict=False)), f"above {edges[-1]} DN"]
+    spans = [
+        f"below {edges[0]} DN",
+        *(f"{a} to {b} DN" for a, b in zip(edges, edges[1:], strict=False)),
+        f"above {edges[-1]} DN",
+    ]
     return f"{_BANDS[n]} pixels ({spans[n]})"
 
 
@@ -40,7 +44,11 @@ def place(evidence: Evidence, family: str, n: int) -> tuple[str, str, str]:
     """Return where the `n`-th statistic of a family is taken, what it is, and its unit."""
     if family == "rate":
         polarity, cell = divmod(n, KINDS * BANDS)
-        return f"{band(evidence, cell % BANDS)}, {_KINDS[cell // BANDS]}", f"{_POLARITY[polarity]} events", "events"
+        return (
+            f"{band(evidence, cell % BANDS)}, {_KINDS[cell // BANDS]}",
+            f"{_POLARITY[polarity]} events",
+            "events",
+        )
     if family == "intervals":
         group, octave = divmod(n, INTERVALS)
         rest, kin = divmod(group, 3)
@@ -48,10 +56,18 @@ def place(evidence: Evidence, family: str, n: int) -> tuple[str, str, str]:
     if family == "lag":
         lag, where = divmod(n, BANDS)
         a, b = 1e3 * LAG_TIMES[lag], 1e3 * LAG_TIMES[lag + 1]
-        return band(evidence, where), f"change of light from {b:g} to {a:g} ms before the event", "log intensity"
+        return (
+            band(evidence, where),
+            f"change of light from {b:g} to {a:g} ms before the event",
+            "log intensity",
+        )
     if family == "repeats":
         third, where = divmod(n, BANDS)
-        return band(evidence, where), f"events that are the {'third' if third else 'second'} in a step", "share"
+        return (
+            band(evidence, where),
+            f"events that are the {'third' if third else 'second'} in a step",
+            "share",
+        )
     if family == "change":
         kind, rest = divmod(n, 4 * CLASSES)
         if kind == 2:
@@ -65,10 +81,18 @@ def place(evidence: Evidence, family: str, n: int) -> tuple[str, str, str]:
                  "shared spread of ON and OFF events", "spread between pixels of OFF events", "spread between pixels of ON events")  # fmt: skip
         return f"{_STATES[state]} pixels", names[what], "events² per event"
     if family == "pixels":
-        return "single pixels", ("silent pixels", "busy pixels at rest", "very busy pixels at rest", "busy pixels")[n], "pixels"
+        return (
+            "single pixels",
+            ("silent pixels", "busy pixels at rest", "very busy pixels at rest", "busy pixels")[n],
+            "pixels",
+        )
     state, ring = divmod(n, ZONES)
     rest, polarity = divmod(state, 2)
-    return f"ring {ring + 1} of {ZONES} from the middle, {_STATES[rest]}", f"{_POLARITY[polarity]} events", "events"
+    return (
+        f"ring {ring + 1} of {ZONES} from the middle, {_STATES[rest]}",
+        f"{_POLARITY[polarity]} events",
+        "events",
+    )
 
 
 def _octave(n: int) -> str:
@@ -79,7 +103,9 @@ def _octave(n: int) -> str:
     return f"up to {2 ** (n - 1)} steps"
 
 
-def worst_cells(evidence: Evidence, judgement: Judgement, half: Half | None = None, *, shown: int = SHOWN) -> tuple[Cell, ...]:
+def worst_cells(
+    evidence: Evidence, judgement: Judgement, half: Half | None = None, *, shown: int = SHOWN
+) -> tuple[Cell, ...]:
     """Return where model and measurement differ most, worst first."""
     half = half or evidence.held
     simulated, measured = half.simulated, half.seen.target

@@ -123,7 +123,9 @@ class _Writer(pixel.Writer):
         """One sample after the other."""
         self.add("for k in range(begin_at, end_at):")
         self.depth += 1
-        self.add("steps = source.stamp[k] - stamp", "dt = float(steps) * source.step", "sample = k - begin_at")
+        self.add(
+            "steps = source.stamp[k] - stamp", "dt = float(steps) * source.step", "sample = k - begin_at"
+        )
         self.add("if sample == 0:", f"    dt = {pixel.REST}")
         if self.asks("t") or self.asks("t64"):
             self.add("t64 = wp.float64(source.stamp[k]) * wp.float64(source.step)", "t = float(t64)")

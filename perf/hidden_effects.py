@@ -76,7 +76,13 @@ class Case:
 
     @property
     def name(self) -> str:
-        parts = [self.kind, "+".join(self.effects) or "nothing", self.strength, str(self.scene), str(self.seed)]
+        parts = [
+            self.kind,
+            "+".join(self.effects) or "nothing",
+            self.strength,
+            str(self.scene),
+            str(self.seed),
+        ]
         return "/".join(parts)
 
 
@@ -101,7 +107,9 @@ def scene_of(number: int) -> Any:
         patch = np.clip(patch * np.exp(rng.uniform(-2.0, 0.3)), 0.004, 1)
         rows, columns = np.mgrid[:size, :size] - (size - 1) / 2
         alpha = (np.hypot(rows, columns) < size / 2 - 1).astype(np.float32)
-        things.append((patch, alpha, speed, rng.uniform(0, 1, 2), rng.uniform(0, 2 * np.pi), rng.uniform(0.2, 0.9)))
+        things.append(
+            (patch, alpha, speed, rng.uniform(0, 1, 2), rng.uniform(0, 2 * np.pi), rng.uniform(0.2, 0.9))
+        )
     frames = np.empty((RATE + 1, HEIGHT, WIDTH), np.float32)
     for k in range(RATE + 1):
         frames[k] = _frame(still, things, k / RATE)
@@ -218,7 +226,9 @@ def right(line: dict[str, Any]) -> bool:
 def named_first(line: dict[str, Any]) -> bool:
     """Whether the first effect named, or one announced as its equal, is the hidden one."""
     selected, want = line["answer"]["selected"], line["case"]["effects"]
-    return bool(selected) and (selected[0] in want or any(w in line["answer"]["ties"].get(selected[0], ()) for w in want))
+    return bool(selected) and (
+        selected[0] in want or any(w in line["answer"]["ties"].get(selected[0], ()) for w in want)
+    )
 
 
 def score_hidden(folder: Path, options: argparse.Namespace) -> None:
@@ -240,7 +250,10 @@ def score_hidden(folder: Path, options: argparse.Namespace) -> None:
         print(f"{path.stem}: {found.seconds:5.1f} s  {summary(found)}", flush=True)
         for step in found.history:
             ranks = ", ".join(f"{r.effect} {r.error:.2f}" for r in step.ranking[:4])
-            print(f"      {step.error:6.2f} gate {step.gate:4.2f} {step.chosen} {step.ties or ''} [{ranks}]", flush=True)
+            print(
+                f"      {step.error:6.2f} gate {step.gate:4.2f} {step.chosen} {step.ties or ''} [{ranks}]",
+                flush=True,
+            )
     print((folder / "truth.json").read_text() if options.truth else "")
     score = hidden_scores(json.loads((folder / "truth.json").read_text()), answers)
     print(f"right: {sum(score.values())} of {len(score)}; wrong: {[k for k, ok in score.items() if not ok]}")
@@ -253,7 +266,11 @@ def hidden_scores(truth: dict[str, Any], answers: dict[str, Any]) -> dict[str, b
         want = true_effects(truth, name)
         ties = {t for e in found.selected for t in found.ties.get(e, ())}
         named = set(found.selected)
-        out[name] = want <= named | ties and named - {"linlog", "timestamp"} - ties <= want and found.unexplained is None
+        out[name] = (
+            want <= named | ties
+            and named - {"linlog", "timestamp"} - ties <= want
+            and found.unexplained is None
+        )
     return out
 
 
@@ -317,14 +334,25 @@ def _safely(job: tuple[Case, str, int]) -> dict[str, Any]:
     except Exception as error:  # one bad run must not end the others
         import traceback
 
-        return {"name": job[0].name, "case": asdict(job[0]), "failed": f"{error!r} {traceback.format_exc()[-600:]}"}
+        return {
+            "name": job[0].name,
+            "case": asdict(job[0]),
+            "failed": f"{error!r} {traceback.format_exc()[-600:]}",
+        }
 
 
 def _short(line: dict[str, Any]) -> str:
     answer = line["answer"]
     errors = " ".join(f"{e:.2f}" for e in answer["errors"])
-    left = "" if answer["unexplained"] is None else f" UNEXPLAINED {answer['unexplained']['error']:.2f} near {answer['unexplained']['nearest']}"
-    ranks = "; ".join(f"{s['error']:.2f}/{s['gate']:.2f}: " + ", ".join(f"{r[0]} {r[1]:.2f}" for r in s["ranking"][:3]) for s in line["steps"])
+    left = (
+        ""
+        if answer["unexplained"] is None
+        else f" UNEXPLAINED {answer['unexplained']['error']:.2f} near {answer['unexplained']['nearest']}"
+    )
+    ranks = "; ".join(
+        f"{s['error']:.2f}/{s['gate']:.2f}: " + ", ".join(f"{r[0]} {r[1]:.2f}" for r in s["ranking"][:3])
+        for s in line["steps"]
+    )
     return f"{answer['selected']} {errors}{left} ties {answer['ties']} | {ranks}"
 
 
