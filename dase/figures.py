@@ -31,6 +31,9 @@ from dase.plates import (
 )
 from dase.results import Curve, Estimate
 
+TINY = 1e-6
+"""Values below this share of the largest are nothing, on a logarithmic axis."""
+
 DENSE = 60
 """Points of a curve that are drawn as a line when there are more."""
 
@@ -245,16 +248,26 @@ def curves(title: str, about: str, panels: Sequence[Curve], caption: str) -> Pla
         panels: At least one; the words ON and OFF in their titles choose the colour.
         caption: What to look for.
     """
-    columns = min(len(panels), 3 if len(panels) == 3 or len(panels) > 4 else 2)
+    columns = {1: 1, 2: 2, 3: 3, 4: 2, 5: 3, 6: 3, 9: 3}.get(len(panels), 4)
     rows = math.ceil(len(panels) / columns)
-    wide = (WIDE - 0.35) / columns
-    figure = sheet(0.72 + 2.75 * rows, title, about)
+    wide = (WIDE - 0.55) / columns
+    same_x, same_y = (len({getattr(p, name) for p in panels}) == 1 for name in ("x_label", "y_label"))
+    figure = sheet(0.95 + 2.55 * rows, title, about)
     colours: list[str] = []
     for i, panel in enumerate(panels):
-        left, top = 0.2 + 0.65 + (i % columns) * wide, 1.1 + (i // columns) * 2.75
-        axes = place(figure, left, top, wide - 0.85, 1.75)
+        row, column = divmod(i, columns)
+        axes = place(figure, 0.85 + column * wide, 1.22 + row * 2.55, wide - 0.55, 1.6)
         colours.append(colour_of(panel.title))
         _curve(axes, panel, colours[-1])
+        words = textwrap.fill(panel.title, round(11.5 * wide))
+        label(axes, "" if same_x else panel.x_label, "" if same_y else panel.y_label, words)
+    # what all panels have in common stands once
+    once = {"fontsize": 9, "color": INK, "ha": "center", "va": "center"}
+    tall = figure.get_figheight()
+    if same_x:
+        figure.text(0.5 + 0.15 / WIDE, 0.22 / tall, panels[0].x_label, once)
+    if same_y:
+        figure.text(0.28 / WIDE, 0.5 - 0.35 / tall, panels[0].y_label, once, rotation=90)
     named = {ON: "model, ON", OFF: "model, OFF", BOTH: "model"}
     entries = [("line", colour, named[colour]) for colour in (ON, OFF, BOTH) if colour in colours]
     dense = any(len(panel.x) > DENSE for panel in panels)
@@ -268,17 +281,17 @@ def _curve(axes: Axes, panel: Curve, colour: str) -> None:
         np.asarray(v, float) for v in (panel.measured, panel.simulated, panel.error)
     )
     if panel.log_y:
-        positive = np.concatenate([measured[measured > 0], simulated[simulated > 0]])
+        both = np.concatenate([measured, simulated])
+        positive = both[both > TINY * max(both.max(), TINY)]
         least = 0.6 * positive.min() if len(positive) else 0.1
         measured, simulated = np.maximum(measured, least), np.maximum(simulated, least)
     low, high = measured - 2 * error, measured + 2 * error
     axes.fill_between(x, np.maximum(low, least) if panel.log_y else low, high, color=INK, alpha=0.13, lw=0)
-    axes.plot(x, simulated, color=colour, lw=2, zorder=3)
+    axes.plot(x, simulated, color=colour, lw=1.2 if len(x) > DENSE else 2, zorder=3)
     if len(x) > DENSE:
         axes.plot(x, measured, color=INK, lw=0.8, alpha=0.8)
     else:
         axes.plot(x, measured, "o", color=INK, ms=3.2, zorder=4, clip_on=False)
-    label(axes, panel.x_label, panel.y_label, panel.title)
     if panel.log_x:
         log_axis(axes, "x")
     if panel.log_y:

@@ -12,15 +12,21 @@ from matplotlib.figure import Figure
 from matplotlib.image import AxesImage
 from matplotlib.ticker import FixedLocator
 from numpy.typing import NDArray
+from scipy.signal import welch
 
 from dase.errors import InputError
 from dase.events import Events
+from dase.figures import curves
 from dase.io.sequence import Sequence as Recording
 from dase.plates import INK, LINE, OFF, ON, WIDE, Plate, label, legend, number, place, sheet
+from dase.results import Curve
 from dase.show import default_window, overlay, seconds
 
 DIVERGING = LinearSegmentedColormap.from_list("dase", ["#1b4f8f", "#86add3", "#f5f5f3", "#dfa67f", "#a23b16"])
 """Too few to too many."""
+
+SLOWEST, FASTEST = 4.0, 1000.0
+"""Resolution and end of spectra [Hz]."""
 
 MOST = 3.0
 """Octaves at which the colours of a map end."""
@@ -35,7 +41,7 @@ def event_plates(
     frame_times: NDArray[np.float64] | None = None,
     count: int = 3,
 ) -> list[Plate]:
-    """Return the pictures of a comparison: moments side by side, and where too many or too few events come.
+    """Return the pictures of a comparison: moments side by side, where events are too many or few, rhythms.
 
     Args:
         measured: Events of the camera.
@@ -63,6 +69,7 @@ def event_plates(
     return [
         moments(seen, counts[0], counts[1], times, window),
         residual_maps(whole[0], whole[1], end - begin),
+        *([spectra(parts[0], parts[1], span)] if end - begin >= 4 / SLOWEST else []),
     ]
 
 
@@ -102,6 +109,34 @@ def moments(
         "measured, below what the model makes of the same scene."
     )
     return Plate(figure, caption)
+
+
+def spectra(measured: Events, simulated: Events, span: tuple[float, float]) -> Plate:
+    """Draw the spectrum of the event rate: flicker and the rhythm of a readout are peaks in it.
+
+    Args:
+        measured: Events of the camera.
+        simulated: Events of the model.
+        span: Begin and end of what is compared [s].
+    """
+    panels = []
+    bins = np.arange(span[0], span[1], 0.5 / FASTEST)
+    for name, on in (("ON events", True), ("OFF events", False)):
+        powers = []
+        for events in (measured, simulated):
+            rate = np.histogram(events.t[events.p == on], bins)[0] * 2 * FASTEST
+            across = min(round(2 * FASTEST / SLOWEST), len(rate))
+            frequency, power = welch(rate, fs=2 * FASTEST, nperseg=across, detrend="constant")
+            # 1 is what independent events of this rate would give
+            powers.append(power[1:] / max(2 * rate.mean(), 1e-9))
+        zero = np.zeros(len(frequency) - 1)
+        words = "frequency [Hz]", "power [1 = by chance]"
+        panels.append(Curve(name, frequency[1:], *words, powers[0], powers[1], zero, True, True))
+    caption = (
+        "Power of the fluctuations of the event rate, in units of what events would give that come independently "
+        "of each other. Peaks are light that flickers or a clock that ticks; slow power is the scene."
+    )
+    return curves("Rhythms of the event rate", f"resolution {SLOWEST:g} Hz", panels, caption)
 
 
 def _calm(frame: NDArray[np.uint8] | None) -> NDArray[np.uint8] | None:

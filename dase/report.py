@@ -9,6 +9,7 @@ from pathlib import Path
 
 from dase import figures, page
 from dase.config import dump_sensor
+from dase.distinguish import WORDS
 from dase.io import replacing
 from dase.plates import Plate, number
 from dase.results import Comparison, Diagnosis, Estimate, Step
@@ -166,14 +167,14 @@ def ranking_of(step: Step, floor: float) -> Plate:
 
 
 def family_words(name: str) -> str:
-    """Return a family of statistics in words."""
-    from dase.probes import FAMILIES
-
-    return FAMILIES.get(name, name).split(",")[0]
+    """Return a family of statistics in a few words."""
+    return WORDS.get(name, name)
 
 
 def _plain(plain: Mapping[str, tuple[float, float]]) -> list[tuple[str, ...]]:
-    return [(name, number(m), number(s), _ratio(m, s)) for name, (m, s) in plain.items()]
+    # what is left of a count after rounding is none
+    whole = {name: [v if abs(v) > 1e-9 else 0.0 for v in pair] for name, pair in plain.items()}
+    return [(name, number(m), number(s), _ratio(m, s)) for name, (m, s) in whole.items()]
 
 
 def _ratio(measured: float, simulated: float) -> str:

@@ -246,12 +246,30 @@ def test_event_plates(rng):
     x, y = (rng.integers(0, size, n).astype(np.uint16) for size in (32, 24))
     events = Events(t, x, y, rng.random(n) < 0.5, 32, 24)
     fewer = events.select(events.p)
-    side, where = maps.event_plates(events, fewer, (0.0, 1.0))
+    side, where, rhythm = maps.event_plates(events, fewer, (0.0, 1.0))
+    assert "Rhythms" in rhythm.title
     assert "measured" in words_of(side)
     rate = np.count_nonzero(~events.p) / (32 * 24)
     assert f"OFF events: {number(rate)} measured, 0 simulated" in words_of(where)
     with pytest.raises(InputError, match="one size"):
         maps.event_plates(events, Events.empty(3, 3), (0.0, 1.0))
+
+
+def test_spectra_show_a_rhythm(rng):
+    """Events that come independently have power 1; those of a lamp have a peak at its frequency."""
+    t = np.sort(rng.uniform(0, 2, 20_000))
+    t = t[rng.random(len(t)) < 0.5 * (1 + np.sin(2 * np.pi * 100 * t))]
+    even = np.sort(rng.uniform(0, 2, len(t)))
+
+    def events(times):
+        zero = np.zeros(len(times), np.uint16)
+        return Events(times, zero, zero, np.ones(len(times), np.bool_), 4, 4)
+
+    plate = maps.spectra(events(t), events(even), (0.0, 2.0))
+    simulated, measured = (line.get_xydata() for line in plate.figure.axes[0].get_lines()[:2])
+    assert abs(measured[measured[:, 1].argmax(), 0] - 100) < 4
+    assert measured[:, 1].max() > 30
+    assert 0.8 < simulated[:, 1].mean() < 1.2
 
 
 def test_results_plot_themselves(tmp_path):
