@@ -5,7 +5,7 @@ from __future__ import annotations
 import datetime
 import re
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -86,6 +86,19 @@ class SensorText:
                 table[name] = value
         return self._checked(tomlkit.dumps(document), after)
 
+    def became(self, sensor: Sensor) -> SensorText:
+        """Return the text that describes another sensor: effects added, removed, or with other values."""
+        text = self
+        for effect in self.sensor().effects:
+            if effect.name not in sensor:
+                text = text.removed(effect.name)
+        for effect in sensor.effects:
+            if effect.name not in text.sensor():
+                text = text.added(effect)
+            elif text.sensor()[effect.name] != effect:
+                text = text.changed(effect)
+        return text
+
     def noted(self, entry: Entry) -> SensorText:
         """Return the text with one more entry of its history."""
         return self._checked("\n".join([*self._body(), "", entry.text()]), self.sensor())
@@ -143,6 +156,14 @@ def write(sensor: SensorText, path: Path | None) -> None:
         return
     with replacing(path) as temporary:
         temporary.write_bytes(sensor.text.encode())
+
+
+def rounded(sensor: Sensor, digits: int = 4) -> Sensor:
+    """Return a fitted sensor with values that people can read."""
+    for effect in sensor.effects:
+        values = {p.name: float(f"{getattr(effect, p.name):.{digits}g}") for p in effect.parameters()}
+        sensor = sensor.with_effect(replace(effect, **values))
+    return sensor
 
 
 def today(did: str, **facts: Any) -> Entry:

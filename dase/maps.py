@@ -133,8 +133,8 @@ def spectra(measured: Events, simulated: Events, span: tuple[float, float]) -> P
         words = "frequency [Hz]", "power [1 = by chance]"
         panels.append(Curve(name, frequency[1:], *words, powers[0], powers[1], zero, True, True))
     caption = (
-        "Power of the fluctuations of the event rate, in units of what events would give that come independently "
-        "of each other. Peaks are light that flickers or a clock that ticks; slow power is the scene."
+        "Power of the fluctuations of the event rate, in units of what events would give that come "
+        "independently. Peaks are light that flickers or a clock that ticks; slow power is the scene."
     )
     return curves("Rhythms of the event rate", f"resolution {SLOWEST:g} Hz", panels, caption)
 

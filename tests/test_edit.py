@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import datetime
 
+import cv2
+import numpy as np
 import pytest
 from test_cli import dase, one_sentence
 
-from dase import InputError, Sensor, dump_sensor, load_sensor
+from dase import InputError, Sensor, VideoScene, dump_sensor, io, load_sensor, simulate
 from dase.config import parse_sensor, presets
-from dase.edit import SensorText, parse_values, today
+from dase.edit import SensorText, parse_values, rounded, today
 from dase.effects import EFFECTS
 from dase.history import Entry
 
@@ -96,6 +98,23 @@ def test_changed_values_keep_their_comments():
     assert "phase = 0.5" in new.text
     old = [line for line in MINE.splitlines() if not line.startswith("on ")]
     assert kept("\n".join(old), new.text)
+
+
+def test_becomes_another_sensor():
+    text = SensorText(MINE, "mine")
+    want = text.sensor().without("leak").with_effect(EFFECTS["shot"](rate=3.0))
+    want = want.with_effect(EFFECTS["refractory"](period=0.002)).with_effect(EFFECTS["threshold"](on=0.3))
+    new = text.became(want)
+    assert new.sensor() == want
+    assert "period = 0.002    # s" in new.text
+    assert "on   = 0.3       # strange spacing" in new.text
+    assert text.became(text.sensor()).text == MINE
+
+
+def test_rounded():
+    sensor = rounded(Sensor().with_effect(EFFECTS["bandwidth"](cutoff=123.456789, dark=1 / 3)))
+    assert (sensor["bandwidth"].cutoff, sensor["bandwidth"].dark) == (123.5, 0.3333)
+    assert rounded(Sensor().with_effect(EFFECTS["bandwidth"](cutoff=float("inf"))))["bandwidth"].is_off()
 
 
 @pytest.mark.parametrize("newline", ["\n", "\r\n"])
@@ -197,3 +216,32 @@ def test_commands(tmp_path):
     printed = dase("add", "dvs128", "flicker", cwd=tmp_path).stdout
     assert parse_sensor(printed, "printed") == load_sensor("dvs128").with_effect(EFFECTS["flicker"]())
     assert sorted(p.name for p in tmp_path.iterdir()) == ["mine.toml", "more.toml"]
+
+
+def test_add_and_fit(tmp_path, rng):
+    """What is added to the model is found in a recording of it, and the fall of the error is written down."""
+    t = np.arange(700) * 1e-3
+    texture = cv2.GaussianBlur(rng.random((40, 400)).astype(np.float32), (0, 0), 2)
+    texture = np.clip((texture - texture.min()) / np.ptp(texture), 0.03, 1)
+    frames = np.stack([texture[:, round(200 * time) :][:, :48] for time in t])
+    frames = np.round(255 * frames).astype(np.uint8)
+    np.savez(tmp_path / "clip.npz", frames=frames, frame_us=np.round(t * 1e6).astype(np.int64))
+    truth = Sensor().with_effect(EFFECTS["leak"](rate=8.0))
+    events = simulate(VideoScene(frames / np.float32(255), t), truth, seed=3)
+    io.write(tmp_path / "recording.h5", io.Sequence(events))
+    (tmp_path / "mine.toml").write_text("[threshold]\non = 0.2 # mine\noff = 0.2\n")
+    options = ("--fit", "recording.h5", "--scene", "clip.npz", "-o", "mine.toml")
+    done = dase("add", "mine.toml", "leak", *options, cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    sensor = load_sensor(tmp_path / "mine.toml")
+    # a share that grows with the light and one that does not are alike where the light is much the same
+    leak = sensor["leak"]
+    assert leak.rate * (1 + leak.light * frames.mean() / 255) == pytest.approx(8.0, rel=0.15)
+    assert sensor["threshold"].on == pytest.approx(0.2, rel=0.05)
+    entry = sensor.history[-1]
+    assert entry.recording == "recording.h5"
+    assert entry.error_before > 2 * entry.error_after
+    assert f"error {entry.error_before:.2f} before" in done.stdout
+    assert "# mine" in (tmp_path / "mine.toml").read_text()
+    wrong = dase("add", "mine.toml", "shot", "--fit", "none.h5", cwd=tmp_path)
+    assert "none.h5" in one_sentence(wrong)
