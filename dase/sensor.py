@@ -91,6 +91,10 @@ class Sensor:
         apart = (Threshold, StreamEffect)
         return tuple(effect.compiled() for effect in self.effects if not isinstance(effect, apart))
 
+    def streams(self) -> tuple[StreamEffect, ...]:
+        """Return the effects behind the pixels that are not off."""
+        return tuple(e for e in self.effects if isinstance(e, StreamEffect) and not e.is_off())
+
     def retimes(self) -> bool:
         """Whether events leave at other times than their crossings', or not all of them leave."""
         late = (e for e in self.effects if isinstance(e, StreamEffect) or "delay" in e.stages)
