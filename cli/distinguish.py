@@ -59,8 +59,6 @@ def command(
     widths = [max(map(len, column)) for column in zip(*table, strict=True)]
     for row in table:
         click.echo("  ".join(f"{cell:{width}}" for cell, width in zip(row, widths, strict=True)).rstrip())
-    for note in found.notes:
-        click.echo(f"note: {note}")
     click.echo(f"\n{found.sentence}")
     if output is not None:
         from dase.io import replacing

@@ -67,7 +67,9 @@ def parse_size(ctx: click.Context, param: click.Parameter, value: str | None) ->
 @click.option("--labels", is_flag=True, help="Mark events as signal, leak, shot noise or hot pixel.")
 @click.option("--backend", default="cpu", show_default=True, help="cpu or cuda.")
 @click.option(
-    "--video", type=click.Path(path_type=Path), help="Simulate this video file or folder of frames instead."
+    "--video",
+    type=click.Path(path_type=Path),
+    help="Simulate this instead: a video, a folder of frames, or a recording with frames.",
 )
 @click.option("--fps", type=float, help="Frames per second of --video.  [default: what the file says]")
 @click.option("--resume", is_flag=True, help="Finish what an interrupted run left in OUT.")

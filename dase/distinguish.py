@@ -5,18 +5,20 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from dase.effects import StreamEffect
+from dase.effects.row_scan import RowScan
+from dase.effects.timestamp import Timestamp
 from dase.errors import InputError
 from dase.evidence import typical_changes
 from dase.kernels import launch
-from dase.probes import LAYOUT, Frame, Sums, compared, statistics, tolerance, zones
+from dase.probes import LAYOUT, Frame, Sums, compared, peak_of, statistics, tolerance, zones
 from dase.sensor import Sensor
 from dase.stimulus import MASKED, Grid, Stimulus, band_edges, sort_into_cells
+from dase.structure import SHORTEST, Structure
 from dase.trials import Trials, finer_steps
 
 if TYPE_CHECKING:
@@ -40,14 +42,16 @@ WORDS = {
     "spread": "how unlike pixels are",
     "pixels": "silent and busy pixels",
     "space": "events in the middle and in the corners",
+    "spectrum": "rhythms of the event rate",
+    "stamps": "the clock of the time stamps",
 }
 """Family of statistics to what differs."""
 
 ALARM, POWER = 0.05, 0.95
 """Two models are told apart when so few recordings of A are taken for B's, and so many of B's are known."""
 
-ROOM = 6e6
-"""Samples of light held at once, pixels times steps."""
+ROOM, ROWS = 6e6, 2e7
+"""Samples of light held at once, pixels times steps, and steps of all parts of recordings."""
 
 CLEAR = 3.0
 """Only statistics that differ by more standard errors have a say; the others would add noise."""
@@ -151,7 +155,6 @@ class Distinction:
         sentence: Advice.
         pixels: Of a recording that were looked at.
         longest: Longest duration that was tried [s].
-        notes: What the user should know.
     """
 
     answers: tuple[Answer, ...]
@@ -159,7 +162,6 @@ class Distinction:
     sentence: str
     pixels: int
     longest: float
-    notes: tuple[str, ...] = ()
 
     def plot(self, names: tuple[str, str] = ("A", "B")) -> Figure:
         """Return a figure of the power of each recording and duration."""
@@ -200,7 +202,7 @@ def distinguish(
     Raises:
         InputError: The models are of cameras that differ in size, or a number is out of range.
     """
-    size, notes = _check(a, b, longest, pixels, repeats)
+    size = _check(a, b, longest, pixels, repeats)
     durations = [t for t in LADDER if t < longest] + [longest]
     answers = []
     for number, standard in enumerate(STANDARDS):
@@ -217,12 +219,10 @@ def distinguish(
     known = [answer for answer in answers if answer.seconds is not None]
     best = min(known, key=lambda answer: answer.seconds or 0.0, default=None)
     sentence = _advice(best, longest, pixels, *(names or (a.name, b.name)))
-    return Distinction(tuple(answers), best, sentence, pixels, longest, tuple(notes))
+    return Distinction(tuple(answers), best, sentence, pixels, longest)
 
 
-def _check(
-    a: Sensor, b: Sensor, longest: float, pixels: int, repeats: int
-) -> tuple[tuple[int, int], list[str]]:
+def _check(a: Sensor, b: Sensor, longest: float, pixels: int, repeats: int) -> tuple[int, int]:
     if not (LADDER[0] <= longest <= 600):
         raise InputError(f"longest must lie in [{LADDER[0]:g}, 600] s, got {longest:g}")
     if pixels < 16:
@@ -234,12 +234,18 @@ def _check(
         raise InputError(f"the models must be of one camera, their sizes are {sizes}")
     if a.log_eps != b.log_eps:
         raise InputError(f"log_eps must be the same in both models, got {a.log_eps:g} and {b.log_eps:g}")
-    readout = [{e for e in s.effects if isinstance(e, StreamEffect) and not e.is_off()} for s in (a, b)]
-    apart = sorted({e.name for e in readout[0] ^ readout[1]})
-    notes = [
-        f"{name}: readout effects are not looked at, nor time stamps finer than 0.5 ms" for name in apart
-    ]
-    return a.size or b.size or (346, 260), notes
+    return a.size or b.size or (346, 260)
+
+
+def _structure(models: tuple[Sensor, Sensor]) -> Structure:
+    """Return the regularity of time stamps that a readout of the models makes, if a file could show it."""
+    for model in models:
+        for effect in model.streams():
+            if isinstance(effect, Timestamp) and effect.step >= SHORTEST:
+                return Structure(step=effect.step)
+            if isinstance(effect, RowScan):
+                return Structure(line=effect.line, direction=effect.direction)
+    return Structure()
 
 
 class _Bench:
@@ -276,7 +282,12 @@ class _Bench:
         cell = sort_into_cells(light, step, bands, log_eps)
         cell[:, 0] = MASKED
         self.finer = finer
-        self.trials = Trials(Stimulus(chosen, width, height, grid, light, cell, log_eps, to))
+        # a readout that both have tells nothing
+        self.readout = set(models[0].streams()) != set(models[1].streams())
+        structure = _structure(models) if self.readout else Structure()
+        stimulus = Stimulus(chosen, width, height, grid, light, cell, log_eps, to)
+        self.trials = Trials(stimulus, structure=structure)
+        self.regular = structure != Structure()
         self.seconds = step * (steps - 1)
         self.zone = np.tile(zones(chosen, width, height), self.parts)
 
@@ -286,9 +297,11 @@ class _Bench:
         self.trials.middle = typical_changes(first)
         found = [self._recordings(number, repeats) for number in range(2)]
         expected = sum(sums.halves.mean(0, dtype=np.float64) for sums in found) / 2
-        frame = Frame(np.asarray(expected), self.zone, self.seconds)
+        step = self.standard.step
+        peak = peak_of(sum(sums.clock.sum(0) for sums in found), step)
+        frame = Frame(np.asarray(expected), self.zone, self.seconds, 0, step, peak, self.regular)
         (a, events), (b, more) = (statistics(sums, frame) for sums in found)
-        used = compared(events.mean(0)) | compared(more.mean(0))
+        used = compared(a.mean(0), events.mean(0)) | compared(b.mean(0), more.mean(0))
         off = tolerance(a.mean(0), np.maximum(events.mean(0), more.mean(0)))
         power, share = separation(a * used, b * used, off)
         told = power >= POWER
@@ -307,12 +320,40 @@ class _Bench:
         )
 
     def _recordings(self, number: int, repeats: int) -> Sums:
-        model = self.models[number]
-        vectors = np.repeat(model.parameters()[None], repeats * self.parts, 0)
+        """Return what recordings of a model sum up to, one per row."""
         seed = self.seed + 1 + number * 500_000
-        sums = self.trials.run(model, vectors, seed=seed, reseed=True, finer=self.finer)
-        joined = sums.sums.reshape(repeats, self.parts, -1).sum(1)
-        return Sums(joined, sums.halves.reshape(repeats, -1, sums.halves.shape[-1]), sums.groups[:0])
+        # rows that are simulated at once: their clocks take memory
+        at_once = max(1, int(ROWS / (self.trials.stimulus.grid.steps * self.parts)))
+        done = []
+        for first in range(0, repeats, at_once):
+            rows = min(at_once, repeats - first) * self.parts
+            done.append(self._joined(self._simulated(self.models[number], rows, seed + first * self.parts)))
+        return Sums.join(done)
+
+    def _simulated(self, model: Sensor, rows: int, seed: int) -> Sums:
+        vector = model.parameters()
+        if not self.readout:
+            vectors = np.repeat(vector[None], rows, 0)
+            return self.trials.run(model, vectors, seed=seed, reseed=True, finer=self.finer)
+        return Sums.join(
+            [self.trials.stream(model, vector, model.streams(), seed=seed + n) for n in range(rows)]
+        )
+
+    def _joined(self, sums: Sums) -> Sums:
+        """Return recordings put together of their parts, whose pixels do not know of each other."""
+
+        def by(a: NDArray[Any]) -> NDArray[Any]:
+            return a.reshape(-1, self.parts, *a.shape[1:])
+
+        halves = by(sums.halves)
+        return Sums(
+            sums=by(sums.sums).sum(1),
+            halves=halves.reshape(len(halves), -1, halves.shape[-1]),
+            groups=by(sums.groups)[:, 0, :0],
+            clock=by(sums.clock).sum(1),
+            teams=by(sums.teams)[:, 0, :0],
+            stamps=by(sums.stamps).mean(1),
+        )
 
 
 def separation(a: Array, b: Array, tolerance: Array) -> tuple[float, Array]:

@@ -105,10 +105,21 @@ def test_identical_models_are_indistinguishable():
     assert len(list(rows(found, "a", "b"))) == 1 + len(STANDARDS)
 
 
-def test_readout_is_not_looked_at_and_said_so():
-    found = distinguish(with_(), with_(timestamp={"jitter": 1e-3}), **QUICK | {"longest": 0.2})
-    assert found.best is None
-    assert "timestamp" in found.notes[0]
+def test_clocks_and_busses_are_seen():
+    """A slow clock tells at once; a bus does where it is full, at fast edges and not at rest."""
+    ticks = distinguish(with_(), with_(timestamp={"step": 1e-4}), **QUICK | {"longest": 0.2})
+    assert of(ticks, "fast edge").seconds == 0.2
+    assert "clock" in of(ticks, "fast edge").differs
+    quiet = {"shot": {"rate": 1.0, "bright": 1.0}}
+    bus = with_(**quiet, readout={"rate": 1e6, "depth": 10.0, "mode": "drop"})
+    found = distinguish(with_(**quiet), bus, **QUICK | {"longest": 0.5})
+    assert of(found, "static dark").seconds is None
+    assert of(found, "fast edge").seconds is not None
+
+
+def test_a_readout_that_both_have_tells_nothing():
+    model = with_(timestamp={"step": 1e-4}, shot={"rate": 1.0})
+    assert distinguish(model, model, **QUICK | {"longest": 0.2}).best is None
 
 
 @pytest.mark.parametrize(
