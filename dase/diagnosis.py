@@ -179,7 +179,7 @@ def _step(search: _Search, model: Model, judgement: Judgement, more: bool) -> tu
     best, ties = _choose(search, finalists)
     ranking = tuple(_rank(t, judgement, p_value(base - t.fit) if np.isfinite(t.held) else 1.0) for t in tried)
     mine = next(rank for rank in ranking if rank.effect == best.name)
-    enough = mine.fall >= MATERIAL and mine.share >= SHARE and mine.p_value <= SIGNIFICANT
+    enough = mine.fall >= MATERIAL and mine.share >= SHARE and mine.p_value <= max(SIGNIFICANT, 1.01 / (1 + len(repeats)))
     if not search.history:
         search.first = sorted(tried, key=lambda t: t.scouted)
         search.first_fit = model.loss_on(evidence.scout, seed=seed)

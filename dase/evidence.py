@@ -17,7 +17,7 @@ from dase.scene import Scene
 from dase.space import Space
 from dase.stimulus import MASKED, Grid, Stimulus, Trust, band_edges, light_of, sort_into_cells
 from dase.structure import Structure, find
-from dase.trials import GROUP, Trials
+from dase.trials import GROUP, Trials, finer_steps
 
 PIXELS = 1500
 """Pixels in each half of the measurement."""
@@ -29,7 +29,7 @@ SPLIT = 0.6
 """Share of the time that is fitted; the rest is held out."""
 
 FEW_REPEATS = 24
-"""Repeats of a model whose events go through a readout, which takes longer."""
+"""Repeats of a model that needs many samples, or whose events go through a readout: both take longer."""
 
 LEAST = 300
 """Events that a half must have for anything to be said."""
@@ -89,7 +89,8 @@ class Half:
         Returns:
             Statistics of `repeats` simulations of it with other seeds, shape (repeats, J).
         """
-        repeats = min(repeats, FEW_REPEATS) if space.streams else repeats
+        slow = space.streams or finer_steps(space.sensor, self.trials.stimulus.grid.step) > 0
+        repeats = min(repeats, FEW_REPEATS) if slow else repeats
         places = np.repeat(np.atleast_2d(place), repeats, 0)
         return self.take(self.simulate(space, places, seed=seed, reseed=True))
 

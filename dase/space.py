@@ -129,8 +129,11 @@ def with_values(sensor: Sensor, values: Mapping[str, float]) -> Sensor:
     return sensor
 
 
+NEARBY = 0.01
+"""Relative range about its start in which the frequency of a lamp is fitted."""
+
 FIXED = (
-    "threshold.phase", "flicker.frequency", "voltage_noise.dark", "row_scan.line", "timestamp.step",
+    "threshold.phase", "voltage_noise.dark", "row_scan.line", "timestamp.step",
     "timestamp.jitter", "readout.depth",
 )  # fmt: skip
 """Parameters that a search by small steps cannot find; they are set by other means."""
@@ -151,6 +154,12 @@ def axes_of(sensor: Sensor, names: Iterable[str] | None = None) -> tuple[Axis, .
         for effect in sensor.effects
         for p in effect.parameters()
     }
+    if "flicker.frequency" in every:
+        # a fit finds it only nearby: elsewhere the phase has turned
+        value = value_of(sensor, "flicker.frequency")
+        every["flicker.frequency"] = replace(
+            every["flicker.frequency"], low=value * (1 - NEARBY), high=value * (1 + NEARBY), log=False
+        )
     if names is None:
         off = {effect.name for effect in sensor.effects if effect.is_off() and effect.name != "threshold"}
         return tuple(a for n, a in every.items() if n not in FIXED and n.split(".")[0] not in off)

@@ -70,15 +70,13 @@ def places(events: Events, direction: str) -> tuple[int, NDArray[np.float64]]:
 def find(events: Events) -> Structure:
     """Return the regularities of a measurement's time stamps, from its first `ENOUGH` events."""
     events = events.select(slice(ENOUGH))
-    step = ticks(events.t)
-    if step:
-        return Structure(step=step)
     best = Structure()
     for direction in DIRECTIONS:
         line = line_time(events, direction)
         if line > best.line:
             best = Structure(line=line, direction=direction)
-    return best
+    # the lines of a scan are read at ticks too
+    return best if best.line else Structure(step=ticks(events.t))
 
 
 def ticks(t: NDArray[np.float64]) -> float:

@@ -27,7 +27,7 @@ import numpy as np
 STRENGTHS = ("weak", "medium", "strong")
 
 HIDDEN: dict[str, tuple[dict[str, Any], ...]] = {
-    "flicker": tuple(dict(frequency=100.0, depth=d) for d in (0.12, 0.25, 0.5)),
+    "flicker": tuple(dict(frequency=100.0, depth=d) for d in (0.08, 0.15, 0.3)),
     "vignetting": tuple(dict(loss=x) for x in (0.3, 0.6, 0.8)),
     "dark": tuple(dict(current=c, spread=0.3) for c in (0.003, 0.01, 0.04)),
     "linlog": tuple(dict(knee=k, slope=2.5) for k in (0.03, 0.08, 0.16)),
