@@ -72,7 +72,7 @@ def search(
         population = np.clip(
             np.concatenate([centre[None], centre + radius * _cross(rng, len(centre))]), low, high
         )
-        values = half.run(space.sensor, space.vectors(population), seed=seed)
+        values = half.run(space, population, seed=seed)
         places, tried = np.concatenate([places, population]), np.concatenate([tried, values])
         losses = half.scale.loss(tried) + penalty(places, start)
         leader = int(np.argmin(losses))
@@ -85,7 +85,7 @@ def search(
         step *= min(1.0, 2.0 * radius / max(length, 1e-12))
         centre = np.clip(best + step, low, high)
         radius = max(radius * (1.0 if improved and length > radius else 0.5), SMALLEST)
-    final = half.run(space.sensor, space.vectors(centre), seed=seed)
+    final = half.run(space, centre, seed=seed)
     places, tried = np.concatenate([places, centre[None]]), np.concatenate([tried, final])
     losses = half.scale.loss(tried) + penalty(places, start)
     leader = int(np.argmin(losses))
@@ -137,6 +137,6 @@ def robust_step(scale: Scale, values: Array, slope: Array, offset: Array) -> Arr
 def screen(half: Half, space: Space, starts: Sequence[Array] | Array, *, seed: int) -> tuple[Array, Array]:
     """Return places in order of their loss, and the losses."""
     places = np.atleast_2d(np.asarray(starts))
-    losses = half.scale.loss(half.run(space.sensor, space.vectors(places), seed=seed))
+    losses = half.scale.loss(half.run(space, places, seed=seed))
     order = np.argsort(losses)
     return places[order], losses[order]

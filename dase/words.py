@@ -7,8 +7,9 @@ import numpy as np
 from dase.error import Judgement
 from dase.evidence import Evidence, Half
 from dase.kernels.probes import BANDS, CLASSES, INTERVALS, KINDS, LAGS
-from dase.probes import LAYOUT, MEANS, ZONES
+from dase.probes import LAYOUT, LOWEST, MEANS, TONES, ZONES
 from dase.results import Cell
+from dase.structure import Structure
 from dase.trials import LAG_TIMES
 
 SHOWN = 24
@@ -86,6 +87,13 @@ def place(evidence: Evidence, family: str, n: int) -> tuple[str, str, str]:
             ("silent pixels", "busy pixels at rest", "very busy pixels at rest", "busy pixels")[n],
             "pixels",
         )
+    if family == "stamps":
+        return "all pixels", Structure.NAMES[n], "share"
+    if family == "spectrum":
+        if n >= TONES:
+            return "all pixels", f"swing of the net rate at {evidence.peak:.4g} Hz", "share"
+        ends = np.geomspace(LOWEST, 0.5 / evidence.held.frame.step, TONES + 1)
+        return "all pixels", f"power of the net rate from {ends[n]:.3g} to {ends[n + 1]:.3g} Hz", "log power"
     state, ring = divmod(n, ZONES)
     rest, polarity = divmod(state, 2)
     return (
@@ -115,7 +123,7 @@ def worst_cells(
             z = judgement.z[j]
             if not half.seen.used[j] or abs(z) < NOTABLE:
                 continue
-            counts = not MEANS[j] and family != "spread"
+            counts = not MEANS[j] and family not in ("spread", "spectrum", "stamps")
             m, s = (np.exp(v[j]) - 3.0 if counts else v[j] for v in (measured, simulated))
             where, what, unit = place(evidence, family, n)
             m, s = (max(0.0, float(v)) if counts else float(v) for v in (m, s))
