@@ -1,0 +1,240 @@
+"""How unlike simulated and real counts are, and which way the thresholds should move.
+
+Two objectives share the images: `Adversarial`, the paper's bank of critics over hashed patches (Eqs. 10 to
+13), and `Moments`, which compares means of fixed features between pixels whose surroundings look alike.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any, Literal, Protocol
+
+import torch
+from torch.nn import functional as F
+
+from dase.kernels import bridge
+from dase.networks import BankShape, CriticBank, sort_into_slots
+from dase.targets import Pairs
+
+TINY = 1e-6
+"""Under the root of gradient magnitudes, whose slope at 0 would be infinite [events²]."""
+
+
+def gradient_magnitude(counts: torch.Tensor) -> torch.Tensor:
+    """Return |∇| of maps (B, C, H, W) by differences to the right and down, 0 past the border."""
+    across = F.pad(counts[..., 1:] - counts[..., :-1], (0, 1))
+    down = F.pad(counts[..., 1:, :] - counts[..., :-1, :], (0, 0, 0, 1))
+    return torch.sqrt(across.square() + down.square() + TINY)
+
+
+def critic_maps(counts: torch.Tensor) -> torch.Tensor:
+    """Return what critics see, log(1 + x)/2 of counts and of their gradient magnitudes, (B, 4, H, W)."""
+    return 0.5 * torch.log1p(torch.cat([counts, gradient_magnitude(counts)], 1))
+
+
+def cut_patches(maps: torch.Tensor, size: int) -> torch.Tensor:
+    """Cut maps (B, C, H, W) into patches without overlap, shape (patches, C · size²); the rest is left out."""
+    batch, channels, height, width = maps.shape
+    rows, columns = height // size, width // size
+    cut = maps[..., : rows * size, : columns * size].reshape(batch, channels, rows, size, columns, size)
+    return cut.permute(0, 2, 4, 1, 3, 5).reshape(batch * rows * columns, channels * size * size)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Hash:
+    """Which attributes patches are told apart by, and into how many levels.
+
+    Args:
+        size: Side of a patch [px].
+        orientations: Bins of angle.
+        coherence: Levels of coherence.
+        contrast: Levels of contrast.
+        contrast_from: `energy` of the image gradient; `events`, Eq. 12 of the paper, see
+            `dase.patches.StructureHash` for why not; `events-ranked`, the same with boundaries of its own for
+            each domain and batch.
+        intensity: Levels of mean intensity.
+    """
+
+    size: int = 40
+    orientations: int = 24
+    coherence: int = 3
+    contrast: int = 3
+    contrast_from: Literal["energy", "events", "events-ranked"] = "energy"
+    intensity: int = 1
+
+    @property
+    def classes(self) -> int:
+        """Number of classes."""
+        return self.orientations * self.coherence * self.contrast * self.intensity
+
+
+class Hasher:
+    """Sends patches to classes; boundaries of levels are quantiles of what `calibrate` was shown."""
+
+    def __init__(self, how: Hash):
+        self.how = how
+        self.boundaries: dict[str, torch.Tensor] = {}
+
+    def calibrate(self, *sets: Pairs) -> None:
+        """Place boundaries so that levels hold equal shares of the patches of all sets."""
+        found = [self._attributes(pairs) for pairs in sets]
+        for name, levels in self._levels():
+            pooled = torch.cat([attributes[name] for attributes in found])
+            self.boundaries[name] = _quantiles(pooled, levels)
+
+    def classes(self, pairs: Pairs) -> torch.Tensor:
+        """Return the class of every patch, int64 (patches,), in the order of `cut_patches`."""
+        found = self._attributes(pairs)
+        bins = torch.floor(found["angle"] * (self.how.orientations / math.pi) + 0.5).long()
+        index = bins % self.how.orientations
+        for name, levels in self._levels():
+            boundaries = self.boundaries[name]
+            if name == "contrast" and self.how.contrast_from == "events-ranked":
+                boundaries = _quantiles(found[name], levels)
+            index = index * levels + torch.bucketize(found[name], boundaries)
+        return index
+
+    def _levels(self) -> tuple[tuple[str, int], ...]:
+        how = self.how
+        return ("coherence", how.coherence), ("contrast", how.contrast), ("intensity", how.intensity)
+
+    def _attributes(self, pairs: Pairs) -> dict[str, torch.Tensor]:
+        size = self.how.size
+        found = bridge.patch_structure(pairs.grey, size=size, stride=size)
+        found = {name: value.flatten() for name, value in found.items()}
+        found["contrast"] = found["energy"]
+        if self.how.contrast_from != "energy":
+            found["contrast"] = bridge.patch_contrast(pairs.counts, size=size, stride=size).flatten()
+        if self.how.intensity > 1:
+            found["intensity"] = cut_patches(pairs.grey[:, None], size).mean(1)
+        return found
+
+
+def _quantiles(values: torch.Tensor, levels: int) -> torch.Tensor:
+    """Return the boundaries between `levels` equal shares."""
+    ordered = torch.sort(values.flatten()).values
+    places = [round(n / levels * (len(ordered) - 1)) for n in range(1, levels)]
+    return ordered[places].contiguous()
+
+
+class Objective(Protocol):
+    """What the loop asks of an objective."""
+
+    def calibrate(self, sets: list[tuple[Pairs, Pairs]]) -> None:
+        """Look at pairs of a fake and a real batch before training."""
+
+    def loss(self, fake: Pairs, real: Pairs, *, move: bool) -> tuple[torch.Tensor, dict[str, torch.Tensor]]:
+        """Learn from both batches; return a loss whose gradient by the fake counts leads towards the real.
+
+        Without `move` the objective alone learns and the loss has no gradient.
+        """
+
+    def state(self) -> dict[str, Any]:
+        """Return all that the next step depends on."""
+
+    def load(self, state: dict[str, Any]) -> None:
+        """Take over what `state` returned."""
+
+
+class Adversarial:
+    """The bank of critics (Eqs. 10, 11 and 13).
+
+    Args:
+        how: The hash of patches.
+        device: PyTorch device.
+        seed: Of weights and shares.
+        rate: Learning rate of the critics.
+        steps: Steps of the critics for each call.
+        penalty: Weight of the gradient penalty.
+        uniform: α of Eq. 13: share of the weights that all classes have alike.
+        image: Whether critics see the image too.
+        room: Most patches of a class in a step; None: from calibration.
+    """
+
+    def __init__(
+        self,
+        how: Hash,
+        *,
+        device: str | torch.device,
+        seed: int = 0,
+        rate: float = 2e-4,
+        steps: int = 1,
+        penalty: float = 1.0,
+        uniform: float = 0.5,
+        image: bool = False,
+        room: int | None = None,
+    ):
+        self.hasher, self.device, self.room = Hasher(how), torch.device(device), room
+        self.rate, self.steps, self.penalty, self.uniform, self.image = rate, steps, penalty, uniform, image
+        self.generator = torch.Generator(self.device).manual_seed(seed)
+        self.seen = torch.zeros(how.classes, device=self.device)
+
+    def calibrate(self, sets: list[tuple[Pairs, Pairs]]) -> None:
+        """Place the boundaries of the hash and make the bank."""
+        self.hasher.calibrate(*(pairs for both in sets for pairs in both))
+        how = self.hasher.how
+        if self.room is None:
+            most = max(
+                int(torch.bincount(self.hasher.classes(pairs)).max()) for both in sets for pairs in both
+            )
+            self.room = 4 * math.ceil(1.5 * most / 4)
+        self._build(how)
+
+    def _build(self, how: Hash) -> None:
+        assert self.room is not None
+        inputs = (4 + self.image) * how.size**2
+        shape = BankShape(classes=how.classes, inputs=inputs, room=self.room)
+        self.bank = CriticBank(shape, device=self.device, generator=self.generator)
+
+    def weights(self) -> torch.Tensor:
+        """Return ω of Eq. 13 times the number of classes, from the real patches seen so far."""
+        share = self.seen / self.seen.sum().clamp_min(1)
+        return (self.uniform / len(share) + (1 - self.uniform) * share) * len(share)
+
+    def _patches(self, pairs: Pairs) -> torch.Tensor:
+        maps = critic_maps(pairs.counts)
+        if self.image:
+            maps = torch.cat([maps, pairs.grey[:, None]], 1)
+        return cut_patches(maps, self.hasher.how.size)
+
+    def loss(self, fake: Pairs, real: Pairs, *, move: bool) -> tuple[torch.Tensor, dict[str, torch.Tensor]]:
+        """Move the critics, then return minus the weighted mean score of the fake patches."""
+        shape = self.bank.shape
+        patches, others = self._patches(fake), self._patches(real)
+        fake_classes, real_classes = self.hasher.classes(fake), self.hasher.classes(real)
+        slots, real_slots = sort_into_slots(fake_classes, shape), sort_into_slots(real_classes, shape)
+        self.seen += real_slots.number
+        weights = self.weights()
+        weights = weights / weights.sum()
+        for _ in range(self.steps):
+            found = self.bank.step(
+                patches, slots, others, real_slots, weights,
+                rate=self.rate, penalty=self.penalty, generator=self.generator,
+            )  # fmt: skip
+        both = (slots.number > 0) & (real_slots.number > 0)
+        values = {"distance": found.distance, "penalty": found.penalty, "dropped": found.dropped}
+        values["classes"] = both.sum()
+        if not move:
+            return fake.counts.new_zeros(()), values
+        gain = torch.where(both, -weights / slots.number.clamp_min(1), 0.0)
+        return (patches * self.bank.input_gradient(patches.detach(), slots, gain)).sum(), values
+
+    def state(self) -> dict[str, Any]:
+        """Return the bank, the hash and the random numbers."""
+        return {
+            "bank": self.bank.state(),
+            "boundaries": self.hasher.boundaries,
+            "room": self.room,
+            "seen": self.seen,
+            "generator": self.generator.get_state(),
+        }
+
+    def load(self, state: dict[str, Any]) -> None:
+        """Take over what `state` returned."""
+        self.room = state["room"]
+        self._build(self.hasher.how)
+        self.bank.load(state["bank"])
+        self.hasher.boundaries = {name: value.to(self.device) for name, value in state["boundaries"].items()}
+        self.seen.copy_(state["seen"])
+        self.generator.set_state(state["generator"].cpu())
