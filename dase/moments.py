@@ -185,7 +185,8 @@ class Moments:
         brightness, contrast = self._attributes(pairs.grey)
         cell = torch.bucketize(brightness, self.boundaries[0]) * self.levels[1]
         cell = cell + torch.bucketize(contrast, self.boundaries[1])
-        member = F.one_hot(cell.flatten(1), self.levels[0] * self.levels[1]).float()  # (B, N, cells)
+        every = torch.arange(self.levels[0] * self.levels[1], device=self.device)
+        member = (cell.flatten(1)[..., None] == every).float()  # (B, N, cells)
         out = {"look": (torch.bmm(member.transpose(1, 2), found.flatten(2).transpose(1, 2)), member.sum(1))}
         if self.pattern:
             batch, _, height, width = found.shape

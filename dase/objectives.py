@@ -97,7 +97,8 @@ class Hasher:
 
     def _levels(self) -> tuple[tuple[str, int], ...]:
         how = self.how
-        return ("coherence", how.coherence), ("contrast", how.contrast), ("intensity", how.intensity)
+        every = ("coherence", how.coherence), ("contrast", how.contrast), ("intensity", how.intensity)
+        return tuple((name, levels) for name, levels in every if levels > 1)
 
     def _attributes(self, pairs: Pairs) -> dict[str, torch.Tensor]:
         size = self.how.size

@@ -4,27 +4,18 @@ from __future__ import annotations
 
 import json
 import math
-import os
-import time
-from collections.abc import Callable, Iterator
-from dataclasses import asdict, dataclass, fields, replace
-from pathlib import Path
+from dataclasses import asdict, dataclass, fields
 from typing import Any, Literal
 
 import numpy as np
 import torch
 
-from dase.errors import InputError
 from dase.moments import Moments
 from dase.networks import NetworkShape, ThresholdNet
 from dase.objectives import Adversarial, Hash, Objective
 from dase.optimizers import AdaBelief
 from dase.scenery import Scenery, middle
 from dase.targets import Pairs, Target, draw_noise, simulate
-
-CHECKPOINT = "checkpoint.pt"
-LOG = "log.csv"
-RECIPE = "recipe.json"
 
 REFERENCE = 0.25, 0.06
 """Threshold and spread at which scenes are counted once more, to tell busy scenes from low thresholds."""
@@ -127,6 +118,7 @@ class Training:
         self.reals = np.random.default_rng([recipe.seed, 2])
         self.step = -recipe.warmup
         self.seconds = 0.0
+        self.best = math.inf
         self.calibrated = False
         self.wants_reference = recipe.objective == "moments"
 
@@ -230,6 +222,7 @@ class Training:
             "reals": self.reals.bit_generator.state,
             "step": self.step,
             "seconds": self.seconds,
+            "best": self.best,
             "calibrated": self.calibrated,
         }
 
@@ -243,7 +236,8 @@ class Training:
         self.target.load(state["target"])
         self.scenes.bit_generator.state = state["scenes"]
         self.reals.bit_generator.state = state["reals"]
-        self.step, self.seconds = state["step"], state["seconds"]
+        self.step, self.seconds, self.best = state["step"], state["seconds"], state["best"]
+        self.recipe = Recipe.parse(state["recipe"])
         self.calibrated = state["calibrated"]
 
 
