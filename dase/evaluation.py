@@ -90,11 +90,9 @@ class HeldOut:
         self.like = Moments(device=scenery.device)
         first = self._fakes(None)
         self.like.calibrate(list(zip(first, self.real, strict=False)))
-        for pairs in self.real:
-            for name, (sums, number) in self.like._sums(pairs).items():
-                self.like.sets[name].see_real(sums, number)
-        for cells in self.like.sets.values():
-            cells.weigh()
+        for fake in first:
+            self.like.see_plain(Pairs(fake.grey, fake.counts, fake.counts))
+        self.like.weigh()
 
     @torch.no_grad()
     def _fakes(self, net: ThresholdNet | None) -> list[Pairs]:

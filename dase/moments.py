@@ -2,10 +2,15 @@
 
 Pixels are put into cells by the brightness and the contrast of the image around them; in every cell the means
 of a dozen features of the counts are compared. What changes with the image is compared where the image is
-alike, so thresholds that depend on brightness or on edges are told from scenes that do. The differences are
-weighted by the inverse of their covariance between scenes, which neighbouring pixels share, so a difference
-counts as much as it stands out from what other scenes would do. Nothing can be learned by heart: there are a
-few hundred numbers whatever the data.
+alike, so thresholds that depend on brightness or on edges are told from scenes that do. Nothing can be
+learned by heart: there are a few hundred numbers whatever the data.
+
+Scenes differ in speed, and that changes counts far more than thresholds do. Two things keep it out. The
+differences of all cells and features are weighted together by the inverse of their covariance between
+scenes (Hansen, Large sample properties of generalized method of moments estimators, 1982), so what speed
+does to all of them counts little, and what it leaves alone, such as the counts at an edge that has passed,
+counts much. And what a simulated scene does at thresholds that never change is known for all scenes ever
+drawn, so its part in how a batch differs from all others is taken out: a control variate.
 """
 
 from __future__ import annotations
@@ -15,12 +20,11 @@ from typing import Any
 import torch
 from torch.nn import functional as F
 
-from dase.objectives import gradient_magnitude
-from dase.scenery import LOG_EPS
+from dase.networks import gradient_magnitude, looks
 from dase.targets import Pairs
 
-RIDGE = 1.0
-"""Added to the variances before they are inverted, as a share."""
+RIDGE = 0.2
+"""Added to the variances before they are inverted, as a share; more while few scenes have been seen."""
 
 FORGET = 0.99
 """Share of the regression on the reference that stays from step to step."""
@@ -29,18 +33,32 @@ ANEW = 25
 """Steps after which the weights are worked out again."""
 
 
-def features(counts: torch.Tensor) -> torch.Tensor:
-    """Return features (B, 13, H, W) of counts (B, 2, H, W).
+def of_pixels(counts: torch.Tensor) -> torch.Tensor:
+    """Return features (B, 7, H, W) that depend on the counts (B, 2, H, W) of the pixel alone.
 
-    Level, its square and the share of busy pixels tell the mean threshold; differences of neighbours, which
-    see the same change, tell its spread.
+    Level, its square, how busy, and how much of both.
     """
     level = torch.log1p(counts)
+    both = level[:, :1] * level[:, 1:]
+    return torch.cat([level, level.square(), counts / (1 + counts), both], 1)
+
+
+def with_neighbours(pixels: torch.Tensor) -> torch.Tensor:
+    """Add features of the level (the first two) between neighbours, which see the same change: (B, 13, H, W).
+
+    Their differences tell the spread of the thresholds.
+    """
+    level = pixels[:, :2]
     rough = gradient_magnitude(level)
     near = F.avg_pool2d(level, 3, stride=1, padding=1, count_include_pad=False)
-    busy = counts / (1 + counts)
-    both = level[:, :1] * level[:, 1:]
-    return torch.cat([level, level.square(), busy, rough, rough.square(), near.square(), both], 1)
+    return torch.cat([pixels, rough, rough.square(), near.square()], 1)
+
+
+def features(pairs: Pairs) -> torch.Tensor:
+    """Return all features (B, 13, H, W), with gradients where the pairs say how counts answer."""
+    if pairs.varied is None:
+        return with_neighbours(of_pixels(pairs.counts))
+    return with_neighbours(pairs.varied.follow(of_pixels, pairs.counts))
 
 
 class Cells:
@@ -51,48 +69,46 @@ class Cells:
         width: Number of features.
         device: PyTorch device.
         memory: Share of the fake means that stays from step to step.
+        joint: Whether the covariance is that of all cells together; else each cell has its own.
     """
 
-    def __init__(self, cells: int, width: int, *, device: torch.device, memory: float):
-        self.memory = memory
-        double = {"dtype": torch.float64, "device": device}
+    def __init__(self, cells: int, width: int, *, device: torch.device, memory: float, joint: bool):
+        self.memory, self.joint = memory, joint
+        blocks, size = (1, cells * width) if joint else (cells, width)
+
+        def zeros(*shape: int) -> torch.Tensor:
+            return torch.zeros(shape, dtype=torch.float64, device=device)
+
         self.kept: dict[str, torch.Tensor] = {
-            "real_sum": torch.zeros(cells, width, **double),  # type: ignore[arg-type]
-            "real_number": torch.zeros(cells, **double),  # type: ignore[arg-type]
-            "fake_sum": torch.zeros(cells, width, **double),  # type: ignore[arg-type]
-            "fake_number": torch.zeros(cells, **double),  # type: ignore[arg-type]
-            "plain_sum": torch.zeros(cells, width, **double),  # type: ignore[arg-type]
-            "plain_number": torch.zeros(cells, **double),  # type: ignore[arg-type]
-            "both": torch.zeros(cells, width, **double),  # type: ignore[arg-type]
-            "square": torch.zeros(cells, width, **double),  # type: ignore[arg-type]
-            "products": torch.zeros(cells, width, width, **double),  # type: ignore[arg-type]
-            "scenes": torch.zeros((), **double),  # type: ignore[arg-type]
-            "weight": torch.zeros(cells, width, width, device=device),
+            name: zeros(cells, width)
+            for name in ("real_sum", "fake_sum", "plain_sum", "both", "square")
         }
+        self.kept |= {name: zeros(cells) for name in ("real_number", "fake_number", "plain_number")}
+        self.kept |= {"products": zeros(blocks, size, size), "scenes": zeros()}
+        self.kept["weight"] = torch.zeros(blocks, size, size, device=device)
 
     def see_real(self, sums: torch.Tensor, number: torch.Tensor) -> None:
         """Add scenes: sums of the features (B, cells, F) over `number` (B, cells) pixels."""
+        self.kept["real_sum"] += sums.double().sum(0)
+        self.kept["real_number"] += number.double().sum(0)
+
+    def see_plain(self, sums: torch.Tensor, number: torch.Tensor) -> torch.Tensor:
+        """Add scenes at the reference thresholds; return by how much each is off the mean of all."""
         kept = self.kept
         sums, number = sums.double(), number.double()
-        kept["real_sum"] += sums.sum(0)
-        kept["real_number"] += number.sum(0)
-        off = sums - number[..., None] * self.real()
-        kept["products"] += torch.einsum("bcf,bcg->cfg", off, off)
-        kept["scenes"] += len(sums)
-
-    def see_fake(self, sums: torch.Tensor, number: torch.Tensor, plain: torch.Tensor) -> None:
-        """Add scenes, and forget a part of earlier ones.
-
-        Scenes differ in speed far more than in what thresholds do to them. What a scene does at thresholds
-        that never change (`plain`) is known for all scenes ever drawn, so its part in the difference between
-        these scenes and all is taken out: a control variate, by regression.
-        """
-        kept = self.kept
-        sums, number, plain = sums.detach().double(), number.double(), plain.double()
-        kept["plain_sum"] += plain.sum(0)
+        kept["plain_sum"] += sums.sum(0)
         kept["plain_number"] += number.sum(0)
         usual = kept["plain_sum"] / kept["plain_number"].clamp_min(1)[:, None]
-        off = plain - number[..., None] * usual
+        off = sums - number[..., None] * usual
+        flat = off.reshape(len(off), *kept["products"].shape[:2])
+        kept["products"] += torch.einsum("bnf,bng->nfg", flat, flat)
+        kept["scenes"] += len(sums)
+        return off
+
+    def see_fake(self, sums: torch.Tensor, number: torch.Tensor, off: torch.Tensor) -> None:
+        """Add scenes that were `off` at the reference thresholds, and forget a part of earlier ones."""
+        kept = self.kept
+        sums, number = sums.detach().double(), number.double()
         mean = sums.sum(0) / number.sum(0).clamp_min(1)[:, None]
         kept["both"].mul_(FORGET).add_((off * (sums - number[..., None] * mean)).sum(0))
         kept["square"].mul_(FORGET).add_(off.square().sum(0))
@@ -100,37 +116,36 @@ class Cells:
         kept["fake_sum"].mul_(self.memory).add_((sums - slope * off).sum(0))
         kept["fake_number"].mul_(self.memory).add_(number.sum(0))
 
-    def real(self) -> torch.Tensor:
-        """Return the real means, shape (cells, F)."""
-        return self.kept["real_sum"] / self.kept["real_number"].clamp_min(1)[:, None]
-
     def off(self) -> torch.Tensor:
         """Return fake minus real means, shape (cells, F); 0 where one has no pixel."""
         kept = self.kept
-        both = (kept["real_number"] > 0) & (kept["fake_number"] > 0)
+        known = (kept["real_number"] > 0) & (kept["fake_number"] > 0)
+        real = kept["real_sum"] / kept["real_number"].clamp_min(1)[:, None]
         fake = kept["fake_sum"] / kept["fake_number"].clamp_min(1)[:, None]
-        return torch.where(both[:, None], fake - self.real(), 0.0)
+        return torch.where(known[:, None], fake - real, 0.0)
 
     def weigh(self) -> None:
         """Set the weights to the inverse covariance of what one scene adds to the means."""
         kept = self.kept
-        total = kept["real_number"].clamp_min(1)[:, None, None]
-        covariance = kept["products"] * kept["scenes"] / total.square()
+        cells, width = kept["plain_sum"].shape
+        total = kept["plain_number"].clamp_min(1)[:, None].expand(cells, width)
+        total = total.reshape(kept["products"].shape[:2]) / kept["scenes"]
+        covariance = kept["products"] / (total[:, :, None] * total[:, None, :] * kept["scenes"])
         diagonal = covariance.diagonal(dim1=-2, dim2=-1)
-        # a feature that never varies in a cell says nothing there
+        # a feature that never varies says nothing
         floor = 1e-6 + 1e-3 * diagonal.mean(-1, keepdim=True)
-        covariance = covariance + torch.diag_embed(RIDGE * diagonal + floor)
-        weight = torch.linalg.inv(covariance)
-        weight = torch.where(kept["real_number"][:, None, None] > 0, weight, 0.0)
-        kept["weight"].copy_(weight / (weight.shape[0] * weight.shape[1]))
+        ridge = RIDGE + diagonal.shape[-1] / kept["scenes"]
+        weight = torch.linalg.inv(covariance + torch.diag_embed(ridge * diagonal + floor))
+        kept["weight"].copy_(weight / (cells * width))
 
-    def slope(self) -> torch.Tensor:
+    def slope(self, off: torch.Tensor) -> torch.Tensor:
         """Return the derivative of half the weighted square difference by the fake means, (cells, F)."""
-        return torch.einsum("cfg,cg->cf", self.kept["weight"], self.off().float())
+        flat = off.float().reshape(self.kept["weight"].shape[:2])
+        return torch.einsum("nfg,ng->nf", self.kept["weight"], flat).reshape(off.shape)
 
-    def distance(self) -> torch.Tensor:
+    def distance(self, off: torch.Tensor) -> torch.Tensor:
         """Return the weighted square difference, in variances of a scene, mean over cells and features."""
-        return (self.slope() * self.off().float()).sum()
+        return (self.slope(off) * off).sum()
 
 
 class Moments:
@@ -158,31 +173,27 @@ class Moments:
 
     def calibrate(self, sets: list[tuple[Pairs, Pairs]]) -> None:
         """Place the boundaries of brightness and contrast at quantiles of both domains."""
-        found = [self._attributes(pairs.grey) for both in sets for pairs in both]
+        found = [looks(pairs.grey) for both in sets for pairs in both]
         for level, values in zip(self.levels, zip(*found, strict=True), strict=True):
             pooled = torch.sort(torch.cat([v.flatten()[:: max(v.numel() // 50_000, 1)] for v in values])).values
             places = [round(n / level * (len(pooled) - 1)) for n in range(1, level)]
             self.boundaries.append(pooled[places].contiguous())
-        width = features(sets[0][0].counts[:1, :, :8, :8]).shape[1]
         height, across = sets[0][0].grey.shape[1:]
+        self._make(across, height)
+
+    def _make(self, across: int, height: int) -> None:
         sizes = {"look": self.levels[0] * self.levels[1]}
         if self.pattern:
             sizes |= {"column": across, "row": height}
         self.sets = {
-            name: Cells(size, width, device=self.device, memory=self.memory) for name, size in sizes.items()
+            name: Cells(size, 13, device=self.device, memory=self.memory, joint=name == "look")
+            for name, size in sizes.items()
         }
 
-    @staticmethod
-    def _attributes(grey: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        """Return brightness and contrast of every pixel, each (B, H, W)."""
-        log = torch.log(grey + LOG_EPS)[:, None]
-        contrast = F.avg_pool2d(gradient_magnitude(log), 3, stride=1, padding=1)[:, 0]
-        return grey, contrast
-
-    def _sums(self, pairs: Pairs) -> dict[str, tuple[torch.Tensor, torch.Tensor]]:
+    def sums(self, pairs: Pairs) -> dict[str, tuple[torch.Tensor, torch.Tensor]]:
         """Return sums (B, cells, F) and numbers of pixels (B, cells) for each set of cells."""
-        found = features(pairs.counts)
-        brightness, contrast = self._attributes(pairs.grey)
+        found = features(pairs)
+        brightness, contrast = looks(pairs.grey)
         cell = torch.bucketize(brightness, self.boundaries[0]) * self.levels[1]
         cell = cell + torch.bucketize(contrast, self.boundaries[1])
         every = torch.arange(self.levels[0] * self.levels[1], device=self.device)
@@ -194,28 +205,41 @@ class Moments:
             out["row"] = found.sum(3).transpose(1, 2), found.new_full((batch, height), width)
         return out
 
+    @torch.no_grad()
+    def see_real(self, real: Pairs) -> None:
+        """Take real pairs in."""
+        for name, (sums, number) in self.sums(real).items():
+            self.sets[name].see_real(sums, number)
+
+    @torch.no_grad()
+    def see_plain(self, fake: Pairs) -> dict[str, torch.Tensor]:
+        """Take the reference counts of simulated pairs in; return how far each scene is off."""
+        assert fake.reference is not None
+        found = self.sums(Pairs(fake.grey, fake.reference))
+        return {name: self.sets[name].see_plain(*both) for name, both in found.items()}
+
+    def weigh(self) -> None:
+        """Work out the weights."""
+        for cells in self.sets.values():
+            cells.weigh()
+
     def loss(self, fake: Pairs, real: Pairs, *, move: bool) -> tuple[torch.Tensor, dict[str, torch.Tensor]]:
         """Take both batches in; return the fake means of this batch along what they are off."""
-        with torch.no_grad():
-            for name, (sums, number) in self._sums(real).items():
-                self.sets[name].see_real(sums, number)
-            assert fake.reference is not None
-            plain = self._sums(Pairs(fake.grey, fake.reference))
-        fakes = self._sums(fake)
+        self.see_real(real)
+        plain = self.see_plain(fake)
         if self.calls % ANEW == 0:
-            for cells in self.sets.values():
-                cells.weigh()
+            self.weigh()
         self.calls += 1
-        total = fake.counts.new_zeros(())
-        distance = fake.counts.new_zeros(())
-        for name, (sums, number) in fakes.items():
+        total, distance = fake.counts.new_zeros(()), fake.counts.new_zeros(())
+        for name, (sums, number) in self.sums(fake).items():
             cells = self.sets[name]
             # earlier batches say how far off the means are, this one which way they go: no bias by its noise
+            off = cells.off()
             if move:
                 means = sums.sum(0) / number.sum(0).clamp_min(1)[:, None]
-                total = total + (cells.slope() * means).sum()
-            distance = distance + cells.distance().detach()
-            cells.see_fake(sums, number, plain[name][0])
+                total = total + (cells.slope(off) * means).sum()
+            distance = distance + cells.distance(off)
+            cells.see_fake(sums, number, plain[name])
         return total, {"distance": distance}
 
     def state(self) -> dict[str, Any]:
@@ -227,23 +251,22 @@ class Moments:
         """Take over what `state` returned."""
         self.boundaries = [b.to(self.device) for b in state["boundaries"]]
         self.calls = state["calls"]
+        sizes = [len(state["sets"][name]["real_sum"]) if self.pattern else 0 for name in ("column", "row")]
+        self._make(*sizes)
         for name, kept in state["sets"].items():
-            cells, width = kept["real_sum"].shape
-            self.sets[name] = Cells(cells, width, device=self.device, memory=self.memory)
             self.sets[name].kept = {key: value.to(self.device) for key, value in kept.items()}
 
 
+@torch.no_grad()
 def discrepancy(fake: list[Pairs], real: list[Pairs], like: Moments) -> float:
-    """Return how far pairs are apart, with the cells and weights of a trained objective: a held-out score."""
+    """Return how far pairs are apart, with the cells and weights of an objective."""
     total = 0.0
-    with torch.no_grad():
-        parts = [[like._sums(pairs) for pairs in side] for side in (fake, real)]
+    parts = [[like.sums(pairs) for pairs in side] for side in (fake, real)]
     for name, cells in like.sets.items():
         means = []
         for side in parts:
             sums = torch.stack([part[name][0].sum(0) for part in side]).sum(0)
             number = torch.stack([part[name][1].sum(0) for part in side]).sum(0)
             means.append(sums / number.clamp_min(1)[:, None])
-        off = means[0] - means[1]
-        total += float(torch.einsum("cf,cfg,cg->", off, cells.kept["weight"], off))
+        total += float(cells.distance(means[0] - means[1]))
     return total

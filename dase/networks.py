@@ -15,9 +15,13 @@ from torch import nn
 from torch.nn import functional as F
 
 from dase.kernels import bridge
+from dase.scenery import LOG_EPS
 
 SLOPE = 0.2
 """Of the leaky rectifiers."""
+
+TINY = 1e-6
+"""Under the root of gradient magnitudes, whose slope at 0 would be infinite."""
 
 GREY_MEAN, GREY_SPREAD = 0.449, 0.226
 """Of natural images; the network sees (grey - mean) / spread."""
@@ -32,6 +36,7 @@ class NetworkShape:
         depth: How often it halves the resolution.
         coordinates: Whether it sees x and y of each pixel.
         pattern: Width and height of a sensor that has an offset for every column and row, or None.
+        table: Nodes of brightness and of contrast of a table that is added, or None.
         split: Whether ON and OFF thresholds differ, by one factor.
         literal: Whether μ and log σ come straight from the network, as in the paper.
     """
@@ -40,6 +45,7 @@ class NetworkShape:
     depth: int = 3
     coordinates: bool = False
     pattern: tuple[int, int] | None = None
+    table: tuple[int, int] | None = None
     split: bool = False
     literal: bool = False
 
@@ -131,6 +137,8 @@ class ThresholdNet(nn.Module):
         self.unet = UNet(3 if shape.coordinates else 1, shape.channels, shape.depth)
         self.level = nn.Parameter(torch.tensor([math.log(mu), math.log(sigma)]))
         self.asymmetry = nn.Parameter(torch.zeros(()), requires_grad=shape.split)
+        if shape.table is not None:
+            self.table = nn.Parameter(torch.zeros(2, *shape.table))
         if shape.pattern is not None:
             self.columns = nn.Parameter(torch.zeros(2, shape.pattern[0]))
             self.rows = nn.Parameter(torch.zeros(2, shape.pattern[1]))
@@ -154,10 +162,20 @@ class ThresholdNet(nn.Module):
         if self.shape.literal:
             return Maps(self.level[0].exp() + u[:, 0], (self.level[1] + u[:, 1]).exp(), ratio, u)
         total = self.level.view(1, 2, 1, 1) + u
+        if self.shape.table is not None:
+            total = total + look_up(self.table, grey)
         if self.shape.pattern is not None:
             total = total + self.columns.view(1, 2, 1, -1) + self.rows.view(1, 2, -1, 1)
         mu, sigma = total.exp().unbind(1)
         return Maps(mu, sigma, ratio, u)
+
+    def roughness(self) -> torch.Tensor:
+        """Return the mean square difference between neighbouring nodes of the table, 0 without one."""
+        if self.shape.table is None:
+            return self.level.new_zeros(())
+        return sum(
+            (torch.diff(self.table, dim=axis).square().mean() for axis in (1, 2)), self.level.new_zeros(())
+        )
 
     def body(self) -> list[nn.Parameter]:
         """Return the parameters of the UNet."""
@@ -166,6 +184,47 @@ class ThresholdNet(nn.Module):
     def scalars(self) -> list[nn.Parameter]:
         """Return all other parameters that are learned."""
         return [p for n, p in self.named_parameters() if not n.startswith("unet.") and p.requires_grad]
+
+
+def look_up(table: torch.Tensor, grey: torch.Tensor) -> torch.Tensor:
+    """Interpolate a table by the brightness and the contrast of every pixel.
+
+    Args:
+        table: Shape (2, nodes of brightness, nodes of contrast). Brightness goes from 0 to 1, contrast c from
+            0 to infinity, evenly in c / (c + 0.1).
+        grey: Images in [0, 1], shape (B, H, W).
+
+    Returns:
+        Shape (B, 2, H, W).
+    """
+    brightness, contrast = looks(grey)
+    high, wide = table.shape[1:]
+    rows = _hats(brightness.clamp(0, 1), high)
+    columns = _hats(contrast / (contrast + 0.1), wide)
+    across = torch.einsum("oij,bjn->boin", table, columns.flatten(2))
+    return (across * rows.flatten(2)[:, None]).sum(2).view(len(grey), 2, *grey.shape[1:])
+
+
+def _hats(share: torch.Tensor, nodes: int) -> torch.Tensor:
+    """Return the weights of linear interpolation between evenly spaced nodes, (B, nodes, H, W)."""
+    place = share[:, None] * (nodes - 1) - torch.arange(nodes, device=share.device).view(1, -1, 1, 1)
+    return (1 - place.abs()).clamp_min(0)
+
+
+def looks(grey: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+    """Return brightness and contrast of every pixel of images (B, H, W), each of their shape.
+
+    Contrast is the mean gradient of the log intensity in 3x3 pixels [log intensity/pixel].
+    """
+    log = torch.log(grey.clamp_min(0) + LOG_EPS)[:, None]
+    return grey, F.avg_pool2d(gradient_magnitude(log), 3, stride=1, padding=1)[:, 0]
+
+
+def gradient_magnitude(maps: torch.Tensor) -> torch.Tensor:
+    """Return |∇| of maps (B, C, H, W) by differences to the right and down, 0 past the border."""
+    across = F.pad(maps[..., 1:] - maps[..., :-1], (0, 1))
+    down = F.pad(maps[..., 1:, :] - maps[..., :-1, :], (0, 0, 0, 1))
+    return torch.sqrt(across.square() + down.square() + TINY)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -11,22 +11,10 @@ from dataclasses import dataclass
 from typing import Any, Literal, Protocol
 
 import torch
-from torch.nn import functional as F
 
 from dase.kernels import bridge
-from dase.networks import BankShape, CriticBank, sort_into_slots
+from dase.networks import BankShape, CriticBank, gradient_magnitude, sort_into_slots
 from dase.targets import Pairs
-
-TINY = 1e-6
-"""Under the root of gradient magnitudes, whose slope at 0 would be infinite [events²]."""
-
-
-def gradient_magnitude(counts: torch.Tensor) -> torch.Tensor:
-    """Return |∇| of maps (B, C, H, W) by differences to the right and down, 0 past the border."""
-    across = F.pad(counts[..., 1:] - counts[..., :-1], (0, 1))
-    down = F.pad(counts[..., 1:, :] - counts[..., :-1, :], (0, 0, 0, 1))
-    return torch.sqrt(across.square() + down.square() + TINY)
-
 
 def critic_maps(counts: torch.Tensor) -> torch.Tensor:
     """Return what critics see, log(1 + x)/2 of counts and of their gradient magnitudes, (B, 4, H, W)."""

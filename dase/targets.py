@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -10,11 +11,39 @@ from typing import Any
 import numpy as np
 import torch
 
-from dase.kernels.autograd import FLOOR, count_events
+from dase.kernels.autograd import FLOOR, STEP, count_events, thresholds
 from dase.scenery import Scenery, middle
 
 Truth = Callable[[torch.Tensor], tuple[torch.Tensor, torch.Tensor]]
 """Images (B, H, W) to μ and σ of their thresholds, each (B, 2, H, W), OFF before ON [log intensity]."""
+
+
+@dataclass
+class Varied:
+    """Counts at thresholds a little higher and lower, to differentiate anything by central differences.
+
+    Args:
+        log: Logarithm of the thresholds, with gradient, (B, P, H, W): shared, or OFF before ON.
+        above: Counts with one of the P thresholds at e^STEP of itself, each (B, 2, H, W).
+        below: Counts with it at e^-STEP of itself.
+    """
+
+    log: torch.Tensor
+    above: list[torch.Tensor]
+    below: list[torch.Tensor]
+
+    def follow(self, value: Callable[[torch.Tensor], torch.Tensor], counts: torch.Tensor) -> torch.Tensor:
+        """Return `value` of the counts, with its gradient by the thresholds: it may be any function of a pixel.
+
+        A surrogate for the count itself, put through a curved function, is off by what the curve does inside
+        the step; the difference of the function's values is not.
+        """
+        out = value(counts.detach())
+        for n, (above, below) in enumerate(zip(self.above, self.below, strict=True)):
+            slope = (value(above) - value(below)) / (2 * math.sinh(STEP))
+            log = self.log[:, n : n + 1]
+            out = out + slope * (log - log.detach())
+        return out
 
 
 @dataclass
@@ -25,11 +54,13 @@ class Pairs:
         grey: Images in [0, 1], shape (B, H, W).
         counts: Shape (B, 2, H, W), OFF before ON.
         reference: Counts of the same scenes and noise at thresholds that never change, where simulated.
+        varied: How the counts answer to the thresholds, where simulated.
     """
 
     grey: torch.Tensor
     counts: torch.Tensor
     reference: torch.Tensor | None = None
+    varied: Varied | None = None
 
     def __len__(self) -> int:
         return len(self.grey)
@@ -188,6 +219,20 @@ def simulate(
     """
     counts = count_events(log, mu, sigma, noise.z, phase=noise.phase, surrogate=surrogate)  # type: ignore[arg-type]
     return counts[:, 0]
+
+
+def vary(log: torch.Tensor, mu: torch.Tensor, sigma: torch.Tensor, noise: Noise) -> Varied:
+    """Return how the counts of `simulate`, with the same arguments, answer to the thresholds."""
+    theta = thresholds(mu, sigma, noise.z, like=log)
+    above, below = [], []
+    with torch.no_grad():
+        for n in range(theta.shape[1]):
+            for factor, kept in ((math.exp(STEP), above), (math.exp(-STEP), below)):
+                moved = theta.detach().clone()
+                moved[:, n] *= factor
+                moved = moved[:, 0] if theta.shape[1] == 1 else moved
+                kept.append(count_events(log, moved, 0.0, 0.0, phase=noise.phase)[:, 0])
+    return Varied(theta.log(), above, below)
 
 
 def uniform(mu: float = 0.2, sigma: float = 0.05) -> Truth:

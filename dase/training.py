@@ -15,7 +15,7 @@ from dase.networks import NetworkShape, ThresholdNet
 from dase.objectives import Adversarial, Hash, Objective
 from dase.optimizers import AdaBelief
 from dase.scenery import Scenery, middle
-from dase.targets import Pairs, Target, draw_noise, simulate
+from dase.targets import Pairs, Target, draw_noise, simulate, vary
 
 REFERENCE = 0.25, 0.06
 """Threshold and spread at which scenes are counted once more, to tell busy scenes from low thresholds."""
@@ -38,6 +38,7 @@ class Recipe:
         ramp: Steps over which the rates rise from 0; a cosine takes them back to 0 at the end.
         average: Decay of the running mean of the weights that is the result; 0 takes the last weights.
         anchor: Weight of the mean square residual.
+        smooth: Weight of the roughness of the table.
         kl: λ of Eq. 9, which is added to the loss.
         surrogate: Of the gradient of counts.
         critic_rate: Learning rate of the critics.
@@ -65,6 +66,7 @@ class Recipe:
     ramp: int = 100
     average: float = 0.995
     anchor: float = 5.0
+    smooth: float = 0.1
     kl: float = 1e-5
     surrogate: str = "expected"
     critic_rate: float = 2e-4
@@ -89,7 +91,8 @@ class Recipe:
         table = json.loads(text)
         table["hash"] = Hash(**table["hash"])
         network = table["network"]
-        network["pattern"] = None if network["pattern"] is None else tuple(network["pattern"])
+        for name in ("pattern", "table"):
+            network[name] = None if network[name] is None else tuple(network[name])
         table["network"] = NetworkShape(**network)
         table["cells"] = tuple(table["cells"])
         return cls(**{f.name: table[f.name] for f in fields(cls) if f.name in table})
@@ -120,7 +123,6 @@ class Training:
         self.seconds = 0.0
         self.best = math.inf
         self.calibrated = False
-        self.wants_reference = recipe.objective == "moments"
 
     def _optimizer(self) -> torch.optim.Optimizer:
         recipe = self.recipe
@@ -166,10 +168,12 @@ class Training:
         noise = draw_noise(log, self.generator)
         counts = simulate(log, mu, sigma, noise, surrogate=self.recipe.surrogate)
         self.maps = maps
+        if self.recipe.objective != "moments":
+            return Pairs(grey, counts), maps.residual
         with torch.no_grad():
             level = torch.full_like(grey, REFERENCE[0])
-            reference = simulate(log, level, REFERENCE[1], noise) if self.wants_reference else None
-        return Pairs(grey, counts, reference), maps.residual
+            reference = simulate(log, level, REFERENCE[1], noise)
+        return Pairs(grey, counts, reference, vary(log, mu, sigma, noise)), maps.residual
 
     def rate(self) -> float:
         """Return the share of the full learning rates at this step."""
@@ -191,6 +195,7 @@ class Training:
         loss, values = self.objective.loss(fake, real, move=move)
         if move:
             loss = loss + recipe.anchor * residual.square().mean() + recipe.kl * prior(self.maps)
+            loss = loss + recipe.smooth * self.net.roughness()
             for group in self.optimizer.param_groups:
                 group["lr"] = share * group["full"]
             self.optimizer.zero_grad(set_to_none=True)
