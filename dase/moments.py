@@ -15,6 +15,7 @@ drawn, so its part in how a batch differs from all others is taken out: a contro
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import torch
@@ -81,16 +82,20 @@ class Cells:
 
         self.kept: dict[str, torch.Tensor] = {
             name: zeros(cells, width)
-            for name in ("real_sum", "fake_sum", "plain_sum", "both", "square")
+            for name in ("real_sum", "held_sum", "fake_sum", "plain_sum", "both", "square")
         }
-        self.kept |= {name: zeros(cells) for name in ("real_number", "fake_number", "plain_number")}
-        self.kept |= {"products": zeros(blocks, size, size), "scenes": zeros()}
+        numbers = ("real_number", "held_number", "fake_number", "plain_number")
+        self.kept |= {name: zeros(cells) for name in numbers}
+        self.kept |= {"products": zeros(blocks, size, size), "scenes": zeros(), "real_scenes": zeros()}
         self.kept["weight"] = torch.zeros(blocks, size, size, device=device)
 
-    def see_real(self, sums: torch.Tensor, number: torch.Tensor) -> None:
+    def see_real(self, sums: torch.Tensor, number: torch.Tensor, *, held_out: bool = False) -> None:
         """Add scenes: sums of the features (B, cells, F) over `number` (B, cells) pixels."""
-        self.kept["real_sum"] += sums.double().sum(0)
-        self.kept["real_number"] += number.double().sum(0)
+        side = "held" if held_out else "real"
+        self.kept[f"{side}_sum"] += sums.double().sum(0)
+        self.kept[f"{side}_number"] += number.double().sum(0)
+        if not held_out:
+            self.kept["real_scenes"] += len(sums)
 
     def see_plain(self, sums: torch.Tensor, number: torch.Tensor) -> torch.Tensor:
         """Add scenes at the reference thresholds; return by how much each is off the mean of all."""
@@ -116,11 +121,15 @@ class Cells:
         kept["fake_sum"].mul_(self.memory).add_((sums - slope * off).sum(0))
         kept["fake_number"].mul_(self.memory).add_(number.sum(0))
 
-    def off(self) -> torch.Tensor:
+    def shift(self, means: torch.Tensor) -> None:
+        """Add to the fake means (cells, F) what a move of the thresholds does to them."""
+        self.kept["fake_sum"] += self.kept["fake_number"][:, None] * means
+
+    def off(self, *, held_out: bool = False) -> torch.Tensor:
         """Return fake minus real means, shape (cells, F); 0 where one has no pixel."""
-        kept = self.kept
-        known = (kept["real_number"] > 0) & (kept["fake_number"] > 0)
-        real = kept["real_sum"] / kept["real_number"].clamp_min(1)[:, None]
+        kept, side = self.kept, "held" if held_out else "real"
+        known = (kept[f"{side}_number"] > 0) & (kept["fake_number"] > 0)
+        real = kept[f"{side}_sum"] / kept[f"{side}_number"].clamp_min(1)[:, None]
         fake = kept["fake_sum"] / kept["fake_number"].clamp_min(1)[:, None]
         return torch.where(known[:, None], fake - real, 0.0)
 
@@ -156,6 +165,7 @@ class Moments:
         levels: Levels of brightness, and of contrast.
         pattern: Whether to compare columns and rows of the sensor as well.
         memory: Share of the fake means that stays from step to step.
+        scenes: How many different real scenes there are.
     """
 
     def __init__(
@@ -165,7 +175,9 @@ class Moments:
         levels: tuple[int, int] = (6, 5),
         pattern: bool = False,
         memory: float = 0.95,
+        scenes: float = math.inf,
     ):
+        self.scenes = scenes
         self.device, self.levels, self.pattern, self.memory = torch.device(device), levels, pattern, memory
         self.boundaries: list[torch.Tensor] = []
         self.sets: dict[str, Cells] = {}
@@ -190,14 +202,17 @@ class Moments:
             for name, size in sizes.items()
         }
 
-    def sums(self, pairs: Pairs) -> dict[str, tuple[torch.Tensor, torch.Tensor]]:
-        """Return sums (B, cells, F) and numbers of pixels (B, cells) for each set of cells."""
-        found = features(pairs)
-        brightness, contrast = looks(pairs.grey)
+    def members(self, grey: torch.Tensor) -> torch.Tensor:
+        """Return 1 where a pixel is in a cell of looks, else 0, shape (B, pixels, cells)."""
+        brightness, contrast = looks(grey)
         cell = torch.bucketize(brightness, self.boundaries[0]) * self.levels[1]
         cell = cell + torch.bucketize(contrast, self.boundaries[1])
         every = torch.arange(self.levels[0] * self.levels[1], device=self.device)
-        member = (cell.flatten(1)[..., None] == every).float()  # (B, N, cells)
+        return (cell.flatten(1)[..., None] == every).float()
+
+    def sums(self, pairs: Pairs) -> dict[str, tuple[torch.Tensor, torch.Tensor]]:
+        """Return sums (B, cells, F) and numbers of pixels (B, cells) for each set of cells."""
+        found, member = features(pairs), self.members(pairs.grey)
         out = {"look": (torch.bmm(member.transpose(1, 2), found.flatten(2).transpose(1, 2)), member.sum(1))}
         if self.pattern:
             batch, _, height, width = found.shape
@@ -206,10 +221,10 @@ class Moments:
         return out
 
     @torch.no_grad()
-    def see_real(self, real: Pairs) -> None:
-        """Take real pairs in."""
+    def see_real(self, real: Pairs, *, held_out: bool = False) -> None:
+        """Take real pairs in, some of them for choosing between priors only."""
         for name, (sums, number) in self.sums(real).items():
-            self.sets[name].see_real(sums, number)
+            self.sets[name].see_real(sums, number, held_out=held_out)
 
     @torch.no_grad()
     def see_plain(self, fake: Pairs) -> dict[str, torch.Tensor]:
@@ -225,7 +240,11 @@ class Moments:
 
     def loss(self, fake: Pairs, real: Pairs, *, move: bool) -> tuple[torch.Tensor, dict[str, torch.Tensor]]:
         """Take both batches in; return the fake means of this batch along what they are off."""
-        self.see_real(real)
+        # the last tenth of a batch is held out where real scenes never come again
+        kept = len(real) - len(real) // 10 if self.scenes == math.inf else len(real)
+        self.see_real(real.select(slice(kept)))
+        if kept < len(real):
+            self.see_real(real.select(slice(kept, None)), held_out=True)
         plain = self.see_plain(fake)
         if self.calls % ANEW == 0:
             self.weigh()

@@ -169,6 +169,13 @@ class ThresholdNet(nn.Module):
         mu, sigma = total.exp().unbind(1)
         return Maps(mu, sigma, ratio, u)
 
+    def basis(self, grey: torch.Tensor) -> torch.Tensor:
+        """Return how much each node of the table counts in each pixel, (B, nodes, H, W); ones without it."""
+        if self.shape.table is None:
+            return torch.ones_like(grey)[:, None]
+        rows, columns = table_weights(grey, self.shape.table)
+        return (rows[:, :, None] * columns[:, None]).flatten(1, 2)
+
     def roughness(self) -> torch.Tensor:
         """Return the mean square difference between neighbouring nodes of the table, 0 without one."""
         if self.shape.table is None:
@@ -197,12 +204,15 @@ def look_up(table: torch.Tensor, grey: torch.Tensor) -> torch.Tensor:
     Returns:
         Shape (B, 2, H, W).
     """
-    brightness, contrast = looks(grey)
-    high, wide = table.shape[1:]
-    rows = _hats(brightness.clamp(0, 1), high)
-    columns = _hats(contrast / (contrast + 0.1), wide)
+    rows, columns = table_weights(grey, (table.shape[1], table.shape[2]))
     across = torch.einsum("oij,bjn->boin", table, columns.flatten(2))
     return (across * rows.flatten(2)[:, None]).sum(2).view(len(grey), 2, *grey.shape[1:])
+
+
+def table_weights(grey: torch.Tensor, nodes: tuple[int, int]) -> tuple[torch.Tensor, torch.Tensor]:
+    """Return the weights of the nodes of brightness and of contrast, (B, nodes, H, W) each; see `look_up`."""
+    brightness, contrast = looks(grey)
+    return _hats(brightness.clamp(0, 1), nodes[0]), _hats(contrast / (contrast + 0.1), nodes[1])
 
 
 def _hats(share: torch.Tensor, nodes: int) -> torch.Tensor:

@@ -55,12 +55,14 @@ class Pairs:
         counts: Shape (B, 2, H, W), OFF before ON.
         reference: Counts of the same scenes and noise at thresholds that never change, where simulated.
         varied: How the counts answer to the thresholds, where simulated.
+        answers: Counts with all μ, σ and ratios at e^STEP and at e^-STEP of themselves, where simulated.
     """
 
     grey: torch.Tensor
     counts: torch.Tensor
     reference: torch.Tensor | None = None
     varied: Varied | None = None
+    answers: dict[str, tuple[torch.Tensor, torch.Tensor]] | None = None
 
     def __len__(self) -> int:
         return len(self.grey)
@@ -75,9 +77,11 @@ class Target(ABC):
 
     Attributes:
         truth: Its thresholds, where they are known.
+        scenes: How many different pairs `draw` has.
     """
 
     truth: Truth | None = None
+    scenes: float = math.inf
 
     @abstractmethod
     def draw(self, rng: np.random.Generator, count: int) -> Pairs:
@@ -140,7 +144,7 @@ class Finite(Target):
         cut = len(pairs) - int(round(held_out * len(pairs)))
         self.pairs = Pairs(pairs.grey[:cut], pairs.counts[:cut])
         self.rest = Pairs(pairs.grey[cut:], pairs.counts[cut:]) if cut < len(pairs) else None
-        self.augment, self.truth = augment, truth
+        self.augment, self.truth, self.scenes = augment, truth, float(cut)
 
     def draw(self, rng: np.random.Generator, count: int) -> Pairs:
         """Return some of the pairs, each turned and mirrored at random where `augment` says so."""
@@ -233,6 +237,32 @@ def vary(log: torch.Tensor, mu: torch.Tensor, sigma: torch.Tensor, noise: Noise)
                 moved = moved[:, 0] if theta.shape[1] == 1 else moved
                 kept.append(count_events(log, moved, 0.0, 0.0, phase=noise.phase)[:, 0])
     return Varied(theta.log(), above, below)
+
+
+@torch.no_grad()
+def answers(
+    log: torch.Tensor, mu: torch.Tensor, sigma: torch.Tensor, noise: Noise
+) -> dict[str, tuple[torch.Tensor, torch.Tensor]]:
+    """Return counts with all means, and with all spreads, a little higher and lower, and likewise the ratio.
+
+    Args:
+        log: Log intensities, shape (B, K, H, W).
+        mu: Mean thresholds, shape (B, H, W), or (B, 2, H, W), which asks for the ratio too.
+        sigma: Their standard deviation, shaped alike.
+        noise: That of the counts themselves.
+    """
+    up, down = math.exp(STEP), math.exp(-STEP)
+    out = {
+        "mu": (simulate(log, up * mu, sigma, noise), simulate(log, down * mu, sigma, noise)),
+        "sigma": (simulate(log, mu, up * sigma, noise), simulate(log, mu, down * sigma, noise)),
+    }
+    if mu.ndim == 4:
+        both = []
+        for half in (math.sqrt(up), math.sqrt(down)):
+            factor = torch.tensor([1 / half, half], device=log.device).view(1, 2, 1, 1)
+            both.append(simulate(log, mu * factor, sigma * factor, noise))
+        out["ratio"] = both[0], both[1]
+    return out
 
 
 def uniform(mu: float = 0.2, sigma: float = 0.05) -> Truth:

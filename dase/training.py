@@ -12,10 +12,11 @@ import torch
 
 from dase.moments import Moments
 from dase.networks import NetworkShape, ThresholdNet
+from dase.newton import Newton
 from dase.objectives import Adversarial, Hash, Objective
 from dase.optimizers import AdaBelief
 from dase.scenery import Scenery, middle
-from dase.targets import Pairs, Target, draw_noise, simulate, vary
+from dase.targets import Pairs, Target, answers, draw_noise, simulate, vary
 
 REFERENCE = 0.25, 0.06
 """Threshold and spread at which scenes are counted once more, to tell busy scenes from low thresholds."""
@@ -50,6 +51,7 @@ class Recipe:
         hash: Of the patches.
         cells: Levels of brightness and contrast of the moments.
         memory: Of the fake moments from step to step.
+        newton: Share of a Gauss-Newton step that is taken with the moments.
         network: Of the generator.
         seed: Of everything random.
     """
@@ -78,6 +80,7 @@ class Recipe:
     hash: Hash = Hash()
     cells: tuple[int, int] = (6, 5)
     memory: float = 0.95
+    newton: float = 0.2
     network: NetworkShape = NetworkShape()
     seed: int = 0
 
@@ -116,6 +119,8 @@ class Training:
         self.mean.load_state_dict(self.net.state_dict())
         self.optimizer = self._optimizer()
         self.objective = self._objective()
+        moments = self.objective
+        self.newton = Newton(moments, self.net) if isinstance(moments, Moments) else None
         self.generator = torch.Generator(self.device).manual_seed(recipe.seed + 1)
         self.scenes = np.random.default_rng([recipe.seed, 1])
         self.reals = np.random.default_rng([recipe.seed, 2])
@@ -128,8 +133,11 @@ class Training:
         recipe = self.recipe
         groups = [
             {"params": self.net.body(), "lr": recipe.rate, "full": recipe.rate},
-            {"params": self.net.scalars(), "lr": recipe.rate_scalars, "full": recipe.rate_scalars},
         ]
+        if recipe.objective == "wgan":
+            groups.append(
+                {"params": self.net.scalars(), "lr": recipe.rate_scalars, "full": recipe.rate_scalars}
+            )
         if recipe.optimizer == "adabelief":
             return AdaBelief(groups, betas=(0.9, 0.999))
         return torch.optim.Adam(groups, betas=(0.5, 0.99), fused=self.device.type == "cuda")
@@ -138,7 +146,13 @@ class Training:
         recipe = self.recipe
         if recipe.objective == "moments":
             pattern = recipe.network.pattern is not None
-            return Moments(device=self.device, levels=recipe.cells, pattern=pattern, memory=recipe.memory)
+            return Moments(
+                device=self.device,
+                levels=recipe.cells,
+                pattern=pattern,
+                memory=recipe.memory,
+                scenes=self.target.scenes,
+            )
         return Adversarial(
             recipe.hash,
             device=self.device,
@@ -157,6 +171,11 @@ class Training:
             with torch.no_grad():
                 sets.append((self._fake()[0], self.target.draw(self.reals, self.recipe.batch)))
         self.objective.calibrate(sets)
+        held_out = self.target.held_out()
+        if held_out is not None and isinstance(self.objective, Moments):
+            for n in range(0, len(held_out), self.recipe.batch):
+                some = held_out.select(slice(n, n + self.recipe.batch))
+                self.objective.see_real(some, held_out=True)
         self.calibrated = True
 
     def _fake(self) -> tuple[Pairs, torch.Tensor]:
@@ -173,7 +192,9 @@ class Training:
         with torch.no_grad():
             level = torch.full_like(grey, REFERENCE[0])
             reference = simulate(log, level, REFERENCE[1], noise)
-        return Pairs(grey, counts, reference, vary(log, mu, sigma, noise)), maps.residual
+        varied = vary(log, mu, sigma, noise) if self.recipe.rate > 0 else None
+        near = answers(log, mu.detach(), sigma.detach(), noise)
+        return Pairs(grey, counts, reference, varied, near), maps.residual
 
     def rate(self) -> float:
         """Return the share of the full learning rates at this step."""
@@ -193,14 +214,19 @@ class Training:
         fake, residual = self._fake()
         real = self.target.draw(self.reals, recipe.batch)
         loss, values = self.objective.loss(fake, real, move=move)
+        if self.newton is not None:
+            self.newton.see(fake)
         if move:
             loss = loss + recipe.anchor * residual.square().mean() + recipe.kl * prior(self.maps)
-            loss = loss + recipe.smooth * self.net.roughness()
+            if recipe.smooth:
+                loss = loss + recipe.smooth * self.net.roughness()
             for group in self.optimizer.param_groups:
                 group["lr"] = share * group["full"]
             self.optimizer.zero_grad(set_to_none=True)
             loss.backward()
             self.optimizer.step()
+            if self.newton is not None:
+                self.newton.step(recipe.newton * share)
             self._average()
         self.step += 1
         values["loss"] = loss.detach()
@@ -220,6 +246,7 @@ class Training:
             "net": self.net.state_dict(),
             "mean": self.mean.state_dict(),
             "optimizer": self.optimizer.state_dict(),
+            "newton": None if self.newton is None else self.newton.state(),
             "objective": self.objective.state(),
             "generator": self.generator.get_state(),
             "target": self.target.state(),
@@ -237,6 +264,8 @@ class Training:
         self.mean.load_state_dict(state["mean"])
         self.optimizer.load_state_dict(state["optimizer"])
         self.objective.load(state["objective"])
+        if self.newton is not None:
+            self.newton.load(state["newton"])
         self.generator.set_state(state["generator"].cpu())
         self.target.load(state["target"])
         self.scenes.bit_generator.state = state["scenes"]
