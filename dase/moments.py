@@ -240,11 +240,8 @@ class Moments:
 
     def loss(self, fake: Pairs, real: Pairs, *, move: bool) -> tuple[torch.Tensor, dict[str, torch.Tensor]]:
         """Take both batches in; return the fake means of this batch along what they are off."""
-        # the last tenth of a batch is held out where real scenes never come again
-        kept = len(real) - len(real) // 10 if self.scenes == math.inf else len(real)
-        self.see_real(real.select(slice(kept)))
-        if kept < len(real):
-            self.see_real(real.select(slice(kept, None)), held_out=True)
+        # where real scenes never come again, some batches are held out
+        self.see_real(real, held_out=self.scenes == math.inf and self.calls % 8 == 7)
         plain = self.see_plain(fake)
         if self.calls % ANEW == 0:
             self.weigh()

@@ -104,7 +104,7 @@ class Newton:
 
     def _scenes(self, cells: Cells) -> torch.Tensor:
         """Return how many different real scenes the means are of."""
-        return cells.kept["real_scenes"].clamp(1, self.moments.scenes)
+        return cells.kept["real_scenes"].clamp(1, min(self.moments.scenes, 1e9))
 
     @torch.no_grad()
     def step(self, share: float) -> None:
