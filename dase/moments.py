@@ -21,11 +21,14 @@ from typing import Any
 import torch
 from torch.nn import functional as F
 
-from dase.networks import gradient_magnitude, looks
+from dase.networks import TINY, gradient_magnitude, looks
 from dase.targets import Pairs
 
 RIDGE = 0.2
 """Added to the variances before they are inverted, as a share; more while few scenes have been seen."""
+
+LONG = 0.99
+"""The same of the moments of columns and rows."""
 
 FORGET = 0.99
 """Share of the regression on the reference that stays from step to step."""
@@ -55,11 +58,21 @@ def with_neighbours(pixels: torch.Tensor) -> torch.Tensor:
     return torch.cat([pixels, rough, rough.square(), near.square()], 1)
 
 
-def features(pairs: Pairs) -> torch.Tensor:
-    """Return all features (B, 13, H, W), with gradients where the pairs say how counts answer."""
+def with_next(pixels: torch.Tensor, axis: int) -> torch.Tensor:
+    """Add differences of the level to the next pixel along `axis` only, shape (B, 11, H, W).
+
+    Those of other columns must not come into what a column is judged by.
+    """
+    last = (0, 0, 0, 1) if axis == -2 else (0, 1)
+    step = F.pad(torch.diff(pixels[:, :2], dim=axis), last)
+    return torch.cat([pixels, torch.sqrt(step.square() + TINY), step.square()], 1)
+
+
+def pixel_features(pairs: Pairs) -> torch.Tensor:
+    """Return features (B, 7, H, W) of pixels, with gradients where the pairs say how counts answer."""
     if pairs.varied is None:
-        return with_neighbours(of_pixels(pairs.counts))
-    return with_neighbours(pairs.varied.follow(of_pixels, pairs.counts))
+        return of_pixels(pairs.counts)
+    return pairs.varied.follow(of_pixels, pairs.counts)
 
 
 class Cells:
@@ -86,7 +99,8 @@ class Cells:
         }
         numbers = ("real_number", "held_number", "fake_number", "plain_number")
         self.kept |= {name: zeros(cells) for name in numbers}
-        self.kept |= {"products": zeros(blocks, size, size), "scenes": zeros(), "real_scenes": zeros()}
+        self.kept |= {"products": zeros(blocks, size, size), "scenes": zeros()}
+        self.kept |= {"real_scenes": zeros(), "fake_scenes": zeros()}
         self.kept["weight"] = torch.zeros(blocks, size, size, device=device)
 
     def see_real(self, sums: torch.Tensor, number: torch.Tensor, *, held_out: bool = False) -> None:
@@ -120,6 +134,7 @@ class Cells:
         slope = kept["both"] / kept["square"].clamp_min(1e-12)
         kept["fake_sum"].mul_(self.memory).add_((sums - slope * off).sum(0))
         kept["fake_number"].mul_(self.memory).add_(number.sum(0))
+        kept["fake_scenes"].mul_(self.memory).add_(len(sums))
 
     def shift(self, means: torch.Tensor) -> None:
         """Add to the fake means (cells, F) what a move of the thresholds does to them."""
@@ -198,7 +213,13 @@ class Moments:
         if self.pattern:
             sizes |= {"column": across, "row": height}
         self.sets = {
-            name: Cells(size, 13, device=self.device, memory=self.memory, joint=name == "look")
+            name: Cells(
+                size,
+                13 if name == "look" else 11,
+                device=self.device,
+                memory=self.memory if name == "look" else LONG,
+                joint=name == "look",
+            )
             for name, size in sizes.items()
         }
 
@@ -212,12 +233,14 @@ class Moments:
 
     def sums(self, pairs: Pairs) -> dict[str, tuple[torch.Tensor, torch.Tensor]]:
         """Return sums (B, cells, F) and numbers of pixels (B, cells) for each set of cells."""
-        found, member = features(pairs), self.members(pairs.grey)
+        pixels, member = pixel_features(pairs), self.members(pairs.grey)
+        found = with_neighbours(pixels)
         out = {"look": (torch.bmm(member.transpose(1, 2), found.flatten(2).transpose(1, 2)), member.sum(1))}
         if self.pattern:
             batch, _, height, width = found.shape
-            out["column"] = found.sum(2).transpose(1, 2), found.new_full((batch, width), height)
-            out["row"] = found.sum(3).transpose(1, 2), found.new_full((batch, height), width)
+            down, across = with_next(pixels, -2).sum(2), with_next(pixels, -1).sum(3)
+            out["column"] = down.transpose(1, 2), found.new_full((batch, width), height)
+            out["row"] = across.transpose(1, 2), found.new_full((batch, height), width)
         return out
 
     @torch.no_grad()

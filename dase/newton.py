@@ -8,17 +8,22 @@ the UNet.
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import torch
 
 from dase.kernels.autograd import STEP
-from dase.moments import Cells, Moments, of_pixels, with_neighbours
+from dase.moments import LONG, Cells, Moments, of_pixels, with_neighbours, with_next
 from dase.networks import ThresholdNet
 from dase.targets import Pairs
 
 LONGEST = 0.1
 """Most that a number moves in a step [in its logarithm]."""
+
+WIDEST = 1.0
+"""Most that a column or row is off [in its logarithm]."""
 
 LOOSE = (0.01, 0.03, 0.1, 0.3, 1.0)
 """Candidates of the prior spread between neighbouring nodes of the table, chosen from by held-out data."""
@@ -42,15 +47,17 @@ class Newton:
     def see(self, fake: Pairs) -> None:
         """Take in how the counts of a batch answer."""
         assert fake.answers is not None
-        slopes = {}
-        for name, (above, below) in fake.answers.items():
-            high, low = (with_neighbours(of_pixels(counts)) for counts in (above, below))
-            slopes[name] = (high - low) / (2 * STEP)
+        ends = {name: [of_pixels(counts) for counts in both] for name, both in fake.answers.items()}
+
+        def slope(name: str, add: Callable[[torch.Tensor], torch.Tensor]) -> torch.Tensor:
+            above, below = ends[name]
+            return (add(above) - add(below)) / (2 * STEP)
+
         member = self.moments.members(fake.grey)
         self._keep("number", member.sum((0, 1)).double())
         weights = self.net.basis(fake.grey).flatten(2).transpose(1, 2)  # (B, N, nodes)
-        for name, slope in slopes.items():
-            flat = slope.flatten(2).transpose(1, 2)  # (B, N, F)
+        for name in ends:
+            flat = slope(name, with_neighbours).flatten(2).transpose(1, 2)  # (B, N, F)
             total: torch.Tensor | int = 0
             for b in range(len(flat)):
                 if name == "ratio":
@@ -61,16 +68,17 @@ class Newton:
             assert isinstance(total, torch.Tensor)
             self._keep(name, total.double().reshape(*total.shape[:2], -1))
             if self.moments.pattern and name != "ratio":
-                self._keep(f"column_{name}", slope.sum((0, 2)).T.double())
-                self._keep(f"row_{name}", slope.sum((0, 3)).T.double())
+                down, across = (slope(name, partial(with_next, axis=axis)) for axis in (-2, -1))
+                self._keep(f"column_{name}", down.sum((0, 2)).T.double(), LONG)
+                self._keep(f"row_{name}", across.sum((0, 3)).T.double(), LONG)
         if self.moments.pattern:
             batch, _, height, width = fake.counts.shape
-            self._keep("column_number", fake.counts.new_full((width,), batch * height).double())
-            self._keep("row_number", fake.counts.new_full((height,), batch * width).double())
+            self._keep("column_number", fake.counts.new_full((width,), batch * height).double(), LONG)
+            self._keep("row_number", fake.counts.new_full((height,), batch * width).double(), LONG)
 
-    def _keep(self, name: str, value: torch.Tensor) -> None:
+    def _keep(self, name: str, value: torch.Tensor, memory: float | None = None) -> None:
         kept = self.kept.get(name)
-        self.kept[name] = value if kept is None else kept.mul_(self.memory).add_(value)
+        self.kept[name] = value if kept is None else kept.mul_(memory or self.memory).add_(value)
 
     def _jacobian(self) -> torch.Tensor:
         """Return derivatives of the means by the shared numbers, (cells · F, p): nodes of μ, of σ, ratio."""
@@ -154,7 +162,10 @@ class Newton:
             net.asymmetry += move[-1].float()
 
     def _patterns(self, share: float, loose: float = 0.3) -> None:
-        """Move the offsets of columns and rows, each by its own moments."""
+        """Move the offsets of columns and rows, each by its own moments.
+
+        One column sees little, so simulated scenes are remembered longer and noise in them counts as well.
+        """
         for axis, offsets in (("column", self.net.columns), ("row", self.net.rows)):
             cells = self.moments.sets[axis]
             number = self.kept[f"{axis}_number"][:, None]
@@ -162,11 +173,13 @@ class Newton:
             weight = cells.kept["weight"].double()
             curve = torch.einsum("cfp,cfg,cgq->cpq", jacobian, weight, jacobian)
             pull = torch.einsum("cfp,cfg,cg->cp", jacobian, weight, cells.off())
-            unit = 1 / (self._scenes(cells) * weight.shape[0] * weight.shape[1] * loose**2)
+            scenes = 1 / (1 / self._scenes(cells) + 1 / cells.kept["fake_scenes"])
+            unit = 1 / (scenes * weight.shape[0] * weight.shape[1] * loose**2)
             eye = torch.eye(2, device=curve.device, dtype=curve.dtype)
             here = offsets.T.double()
             move = -torch.linalg.solve(curve + unit * eye, pull + unit * here)
-            move = (share * (move - move.mean(0))).clamp(-LONGEST, LONGEST)
+            move = (0.5 * share * (move - move.mean(0))).clamp(-LONGEST, LONGEST)
+            move = (here + move).clamp(-WIDEST, WIDEST) - here
             offsets += move.T.float()
             cells.shift(torch.einsum("cfp,cp->cf", jacobian, move))
 
