@@ -1,6 +1,6 @@
 """The objective without an adversary: means of fixed features between pixels whose surroundings look alike.
 
-Pixels are put into cells by the brightness and the contrast of the image around them; in every cell the means
+Pixels are put into cells by brightness and edge strength; in every cell the means
 of a dozen features of the counts are compared. What changes with the image is compared where the image is
 alike, so thresholds that depend on brightness or on edges are told from scenes that do. Nothing can be
 learned by heart: there are a few hundred numbers whatever the data.
@@ -177,7 +177,7 @@ class Moments:
 
     Args:
         device: PyTorch device.
-        levels: Levels of brightness, and of contrast.
+        levels: Levels of brightness, and of edge strength.
         pattern: Whether to compare columns and rows of the sensor as well.
         memory: Share of the fake means that stays from step to step.
         scenes: How many different real scenes there are.
@@ -199,7 +199,7 @@ class Moments:
         self.calls = 0
 
     def calibrate(self, sets: list[tuple[Pairs, Pairs]]) -> None:
-        """Place the boundaries of brightness and contrast at quantiles of both domains."""
+        """Place the boundaries of brightness and edge strength at quantiles of both domains."""
         found = [looks(pairs.grey) for both in sets for pairs in both]
         for level, values in zip(self.levels, zip(*found, strict=True), strict=True):
             pooled = torch.sort(torch.cat([v.flatten()[:: max(v.numel() // 50_000, 1)] for v in values])).values
@@ -225,9 +225,9 @@ class Moments:
 
     def members(self, grey: torch.Tensor) -> torch.Tensor:
         """Return 1 where a pixel is in a cell of looks, else 0, shape (B, pixels, cells)."""
-        brightness, contrast = looks(grey)
+        brightness, edge = looks(grey)
         cell = torch.bucketize(brightness, self.boundaries[0]) * self.levels[1]
-        cell = cell + torch.bucketize(contrast, self.boundaries[1])
+        cell = cell + torch.bucketize(edge, self.boundaries[1])
         every = torch.arange(self.levels[0] * self.levels[1], device=self.device)
         return (cell.flatten(1)[..., None] == every).float()
 

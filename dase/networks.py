@@ -15,13 +15,15 @@ from torch import nn
 from torch.nn import functional as F
 
 from dase.kernels import bridge
-from dase.scenery import LOG_EPS
 
 SLOPE = 0.2
 """Of the leaky rectifiers."""
 
 TINY = 1e-6
 """Under the root of gradient magnitudes, whose slope at 0 would be infinite."""
+
+EDGE = 0.05
+"""Edge strength in the middle of a table [intensity/pixel]."""
 
 GREY_MEAN, GREY_SPREAD = 0.449, 0.226
 """Of natural images; the network sees (grey - mean) / spread."""
@@ -36,7 +38,7 @@ class NetworkShape:
         depth: How often it halves the resolution.
         coordinates: Whether it sees x and y of each pixel.
         pattern: Width and height of a sensor that has an offset for every column and row, or None.
-        table: Nodes of brightness and of contrast of a table that is added, or None.
+        table: Nodes of brightness and of edge strength of a table that is added, or None.
         split: Whether ON and OFF thresholds differ, by one factor.
         literal: Whether μ and log σ come straight from the network, as in the paper.
     """
@@ -194,11 +196,11 @@ class ThresholdNet(nn.Module):
 
 
 def look_up(table: torch.Tensor, grey: torch.Tensor) -> torch.Tensor:
-    """Interpolate a table by the brightness and the contrast of every pixel.
+    """Interpolate a table by the brightness and the edge strength of every pixel.
 
     Args:
-        table: Shape (2, nodes of brightness, nodes of contrast). Brightness goes from 0 to 1, contrast c from
-            0 to infinity, evenly in c / (c + 0.1).
+        table: Shape (2, nodes of brightness, nodes of edge strength). Brightness goes from 0 to 1, edge strength e
+            from 0 to infinity, evenly in e / (e + EDGE).
         grey: Images in [0, 1], shape (B, H, W).
 
     Returns:
@@ -210,9 +212,9 @@ def look_up(table: torch.Tensor, grey: torch.Tensor) -> torch.Tensor:
 
 
 def table_weights(grey: torch.Tensor, nodes: tuple[int, int]) -> tuple[torch.Tensor, torch.Tensor]:
-    """Return the weights of the nodes of brightness and of contrast, (B, nodes, H, W) each; see `look_up`."""
-    brightness, contrast = looks(grey)
-    return _hats(brightness.clamp(0, 1), nodes[0]), _hats(contrast / (contrast + 0.1), nodes[1])
+    """Return the weights of the nodes of brightness and of edge strength, (B, nodes, H, W) each; see `look_up`."""
+    brightness, edge = looks(grey)
+    return _hats(brightness.clamp(0, 1), nodes[0]), _hats(edge / (edge + EDGE), nodes[1])
 
 
 def _hats(share: torch.Tensor, nodes: int) -> torch.Tensor:
@@ -222,12 +224,26 @@ def _hats(share: torch.Tensor, nodes: int) -> torch.Tensor:
 
 
 def looks(grey: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-    """Return brightness and contrast of every pixel of images (B, H, W), each of their shape.
+    """Return brightness and edge strength of every pixel of images (B, H, W), each of their shape.
 
-    Contrast is the mean gradient of the log intensity in 3x3 pixels [log intensity/pixel].
+    Edge strength is the gradient of the image blurred by (1 2 1)/4 along both axes [intensity/pixel].
     """
-    log = torch.log(grey.clamp_min(0) + LOG_EPS)[:, None]
-    return grey, F.avg_pool2d(gradient_magnitude(log), 3, stride=1, padding=1)[:, 0]
+    return grey, edge_strength(grey)
+
+
+def edge_strength(grey: torch.Tensor, blurs: int = 1) -> torch.Tensor:
+    """Return |∇| of images (B, H, W) by central differences, after some blurs by (1 2 1)/4 on both axes."""
+    blurred = grey[:, None]
+    for _ in range(blurs):
+        for side in ((1, 1, 0, 0), (0, 0, 1, 1)):
+            wide = F.pad(blurred, side, mode="replicate")
+            axis = -1 if side[0] else -2
+            first, last = (wide.narrow(axis, n, blurred.shape[axis]) for n in (0, 2))
+            blurred = 0.5 * blurred + 0.25 * (first + last)
+    wide = F.pad(blurred, (1, 1, 1, 1), mode="replicate")
+    across = 0.5 * (wide[..., 1:-1, 2:] - wide[..., 1:-1, :-2])
+    down = 0.5 * (wide[..., 2:, 1:-1] - wide[..., :-2, 1:-1])
+    return torch.sqrt(across.square() + down.square())[:, 0]
 
 
 def gradient_magnitude(maps: torch.Tensor) -> torch.Tensor:

@@ -12,6 +12,7 @@ import numpy as np
 import torch
 
 from dase.kernels.autograd import FLOOR, STEP, count_events, thresholds
+from dase.networks import edge_strength
 from dase.scenery import Scenery, middle
 
 Truth = Callable[[torch.Tensor], tuple[torch.Tensor, torch.Tensor]]
@@ -286,14 +287,14 @@ def by_intensity(low: float = 0.12, slope: float = 0.16, spread: float = 0.25) -
 
 
 def by_edges(low: float = 0.14, gain: float = 0.16, half: float = 0.04, spread: float = 0.25) -> Truth:
-    """Thresholds that are higher at edges: μ = low + gain · g / (g + half), g the gradient of the image."""
+    """Thresholds that are higher at edges: μ = low + gain · e / (e + half), e the gradient of the image.
+
+    The image is blurred twice before, which is not how the networks and cells see edges.
+    """
 
     def truth(grey: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        padded = torch.nn.functional.pad(grey[:, None], (1, 1, 1, 1), mode="replicate")
-        gx = 0.5 * (padded[..., 1:-1, 2:] - padded[..., 1:-1, :-2])
-        gy = 0.5 * (padded[..., 2:, 1:-1] - padded[..., :-2, 1:-1])
-        g = torch.sqrt(gx.square() + gy.square())
-        mu = (low + gain * g / (g + half)).expand(-1, 2, -1, -1)
+        e = edge_strength(grey, blurs=2)[:, None]
+        mu = (low + gain * e / (e + half)).expand(-1, 2, -1, -1)
         return mu, spread * mu
 
     return truth

@@ -72,7 +72,7 @@ class Row:
 
 FULL = Row()
 LOW = dict(mu=0.1, sigma=0.02)
-MOMENTS = Row(recipe=dict(objective="moments", rate=3e-4, anchor=0.1))
+MOMENTS = Row(recipe=dict(objective="moments", rate=1e-4, anchor=1.0), network=dict(table=(6, 5)))
 ATTRIBUTES = {"angle": ("orientations", 24), "contrast": ("contrast", 3), "coherence": ("coherence", 3)}
 
 
@@ -138,10 +138,12 @@ def _maps() -> dict[str, Row]:
     """Targets whose thresholds differ from pixel to pixel, and ways to learn them."""
     ways = {
         "moments": MOMENTS,
-        "moments-anchor1": MOMENTS.but(recipe=dict(anchor=1.0)),
-        "moments-anchor.01": MOMENTS.but(recipe=dict(anchor=0.01)),
-        "moments-rate1e-3": MOMENTS.but(recipe=dict(rate=1e-3)),
+        "moments-table-only": MOMENTS.but(recipe=dict(rate=0.0)),
+        "moments-unet-only": MOMENTS.but(recipe=dict(rate=1e-3, anchor=0.01), network=dict(table=None)),
+        "moments-unet": MOMENTS.but(recipe=dict(rate=1e-3, anchor=0.01)),
         "wgan": FULL.but(recipe=dict(anchor=0.5)),
+        "wgan-table": FULL.but(recipe=dict(anchor=5.0), network=dict(table=(6, 5))),
+        "wgan-image-table": FULL.but(recipe=dict(critic_image=True), network=dict(table=(6, 5))),
         "wgan-image": FULL.but(recipe=dict(anchor=0.5, critic_image=True)),
         "wgan-intensity": FULL.but(
             recipe=dict(anchor=0.5), hash=dict(orientations=8, coherence=1, contrast=3, intensity=6)
@@ -155,8 +157,11 @@ def _maps() -> dict[str, Row]:
         for name, way in ways.items():
             out[f"maps-{truth}-{name}"] = way.but(truth=truth)
     pattern = dict(pattern=(240, 240))
-    for name in ("moments", "moments-anchor.01"):
-        out[f"maps-column-{name}"] = ways[name].but(truth="column", network=pattern)
+    out["maps-column-moments"] = ways["moments"].but(truth="column", network=pattern)
+    out["maps-column-wgan"] = FULL.but(truth="column", network=pattern)
+    out["maps-column-moments-finite600"] = out["maps-column-moments"].but(finite=600, augment=False)
+    for truth in ("intensity", "edges"):
+        out[f"maps-{truth}-moments-finite600"] = MOMENTS.but(truth=truth, finite=600, disjoint=True)
     for name in ("moments", "wgan"):
         out[f"maps-asymmetric-{name}"] = ways[name].but(truth="asymmetric", network=dict(split=True))
     return out
@@ -168,7 +173,7 @@ def prepare(row: Row, *, device: str, pictures: str, small: bool, seconds: float
     recipe: dict[str, Any] = dict(steps=10**6, **row.recipe)
     how, network = dict(row.hash), dict(row.network)
     if small:
-        recipe["batch"] = 4
+        recipe["batch"], recipe["warmup"] = 4, 30
         how["size"] = max(how.get("size", 40) * 2 // 5 // 4 * 4, 4)
         network |= {"channels": 8, "depth": 2}
         if "pattern" in network:
