@@ -6,22 +6,38 @@ from pathlib import Path
 
 import click
 
+from dase.cli.options import parse_size
+
 
 @click.command()
 @click.argument("source", type=click.Path(path_type=Path))
 @click.argument("target", type=click.Path(path_type=Path))
 @click.option("--format", "format_", help="Format of TARGET.  [default: by its suffix]")
-@click.option("--events-only", is_flag=True, help="Stream the events through, in bounded memory.")
-def command(source: Path, target: Path, format_: str | None, events_only: bool) -> None:
+@click.option("--size", callback=parse_size, metavar="WxH", help="Columns x rows.  [default: as SOURCE says]")
+@click.option("--events-only", is_flag=True, help="Leave frames behind.")
+def command(
+    source: Path, target: Path, format_: str | None, size: tuple[int, int] | None, events_only: bool
+) -> None:
     """Convert the events of SOURCE, any file dase reads, to TARGET.
 
-    Formats are known by content, then by suffix. Frames go along where both formats have them; the file is
-    then held in memory.
+    Formats are known by content, then by suffix. Frames go along where both formats have them. Files stream
+    through, whatever their size; only what goes into a .npz waits in memory.
     """
+    from tqdm import tqdm
+
     from dase import io
 
     notes: list[str] = []
-    total = io.convert(source, target, format=format_, with_frames=not events_only, notes=notes)
+    with tqdm(unit=" events", unit_scale=True, delay=1.0, leave=False, disable=None) as bar:
+        total = io.convert(
+            source,
+            target,
+            format=format_,
+            size=size,
+            with_frames=not events_only,
+            notes=notes,
+            progress=bar.update,
+        )
     for note in notes:
-        click.echo(f"note: {note}")
+        click.echo(f"{getattr(note, 'kind', 'note') + ':':<10}{note}")
     click.echo(f"{total:,} events written to {target}")

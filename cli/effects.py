@@ -24,7 +24,7 @@ def list_effects() -> None:
 @click.argument("name")
 def show_effect(name: str) -> None:
     """Describe the effect NAME: physics, parameters, source."""
-    from dase.effects import StreamEffect, find
+    from dase.effects import SceneEffect, StreamEffect, find
 
     effect = find(name)
     click.echo(f"{effect.name}: {effect.about()}\n")
@@ -36,6 +36,8 @@ def show_effect(name: str) -> None:
         click.echo(f"      {p.bounds[0]:g} to {p.bounds[1]:g}, plausible {low:g} to {high:g}{off}")
     for name, among in effect.choices().items():
         click.echo(f"  {name}: {' or '.join(among)}")
-    elsewhere = "readout" if issubclass(effect, StreamEffect) else "core of the change detector"
-    click.echo(f"\nStages: {', '.join(effect.stages) or elsewhere}")
+    places = {SceneEffect: "optics, before the pixels", StreamEffect: "readout"}
+    elsewhere = [place for kind, place in places.items() if issubclass(effect, kind)]
+    stages = effect.stages or elsewhere or ["core of the change detector"]
+    click.echo(f"\nStages: {', '.join(stages)}")
     click.echo(f"Source: {effect.source}")

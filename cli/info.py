@@ -6,18 +6,45 @@ from pathlib import Path
 
 import click
 
+from dase.cli.options import parse_size
+
 
 @click.command()
 @click.argument("file", type=click.Path(path_type=Path))
-def command(file: Path) -> None:
-    """Say what is in FILE: format, sensor, rates, intervals, frames, and what looked odd."""
+@click.option(
+    "--size",
+    callback=parse_size,
+    metavar="WxH",
+    help="Columns x rows.  [default: as FILE says]",
+)
+@click.option("--json", "as_json", is_flag=True, help="Print one JSON object, for programs.")
+def command(file: Path, size: tuple[int, int] | None, as_json: bool) -> None:
+    """Say what is in FILE: rates, intervals, hot pixels, frames, what was repaired and what looks odd.
+
+    FILE streams through, whatever its size. Isolated events are counted on a sample; all else on all events.
+    """
+    import json
+
+    from tqdm import tqdm
+
     from dase import io, show
+    from dase.doubts import doubts
+    from dase.survey import survey_file
 
     notes: list[str] = []
     name = io.find(file).name
-    sequence = io.read(file, notes=notes)
+    with tqdm(unit=" events", unit_scale=True, delay=1.0, leave=False, disable=None) as bar:
+        found = survey_file(file, size=size, notes=notes, progress=bar.update).statistics()
+    said = [note for note in (*notes, *doubts(found)) if isinstance(note, io.Note)]
+    if as_json:
+        return click.echo(json.dumps(show.as_json(name, found, said), indent=1))
     click.echo(f"{'format':<18}{name}")
-    for key, value in show.table(show.statistics(sequence)):
+    for key, value in show.table(found):
         click.echo(f"{key:<18}{value}")
-    for note in notes:
-        click.echo(f"note: {note}")
+    click.echo("\ntime between successive events of one pixel")
+    for line in show.histogram(found):
+        click.echo(line)
+    if said:
+        click.echo()
+    for note in said:
+        click.echo(f"{note.kind + ':':<10}{note}")

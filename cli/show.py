@@ -6,6 +6,8 @@ from pathlib import Path
 
 import click
 
+from dase.cli.options import parse_size
+
 
 @click.command()
 @click.argument("file", type=click.Path(path_type=Path))
@@ -17,7 +19,10 @@ import click
     metavar="SECONDS",
     help="Events per picture.  [default: fits the rate]",
 )
-def command(file: Path, output: Path | None, at: float | None, window: float | None) -> None:
+@click.option("--size", callback=parse_size, metavar="WxH", help="Columns x rows.  [default: as FILE says]")
+def command(
+    file: Path, output: Path | None, at: float | None, window: float | None, size: tuple[int, int] | None
+) -> None:
     """Draw the events of FILE over its frames and print its statistics.
 
     A PNG is a contact sheet: moments with events in red (ON) and blue (OFF), the event rate, and the
@@ -32,7 +37,7 @@ def command(file: Path, output: Path | None, at: float | None, window: float | N
         raise InputError(f"output: must end with .png or .mp4, got '{output}'")
     if suffix == ".mp4" and at is not None:
         raise InputError("at: shows one moment, which a video cannot; leave it out or write a .png")
-    sequence = io.read(file)
+    sequence = io.read(file, size=size)
     if suffix == ".mp4":
         show.video(sequence, output, window=window)
     else:

@@ -13,7 +13,9 @@ from matplotlib.ticker import EngFormatter, NullFormatter
 from numpy.typing import NDArray
 
 from dase.io.sequence import Sequence
-from dase.show import OFF, ON, Statistics, seconds, table
+from dase.show import OFF, ON, table
+from dase.survey import Statistics
+from dase.units import seconds
 
 INK, QUIET = "#2b2b2b", "#8a8a8a"
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -14,6 +13,10 @@ from numpy.typing import NDArray
 from dase.errors import InputError
 from dase.events import LABELS, Events
 from dase.io.sequence import Sequence, replacing
+from dase.io.source import Note
+from dase.survey import Statistics as Statistics
+from dase.survey import statistics as statistics
+from dase.units import grouped, metric, percent, seconds
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -22,98 +25,14 @@ ON, OFF = "#c0392b", "#2f6fb5"
 FRAME_RATE = 30.0  # video frames per second where the sequence does not say better
 
 
-@dataclass(frozen=True, kw_only=True)
-class Statistics:
-    """What people ask about a recording first. Not a number where nothing can be said."""
-
-    width: int
-    """Columns of the sensor."""
-    height: int
-    """Rows of the sensor."""
-    frames: int
-    """Grey frames."""
-    duration: float
-    """From the first event or frame to the last [s]."""
-    events: int
-    """Events of both polarities."""
-    on_rate: float
-    """ON events per pixel [Hz]."""
-    off_rate: float
-    """OFF events per pixel [Hz]."""
-    on_share: float
-    """ON events / events."""
-    interval_low: float
-    """1st percentile of the time between successive events of one pixel [s]."""
-    interval_median: float
-    """Median of it [s]."""
-    interval_high: float
-    """99th percentile of it [s]."""
-    silent_pixels: int
-    """Pixels without an event."""
-    busiest_rate: float
-    """Events of the pixel that has most [Hz]."""
-    busiest_pixel: tuple[int, int]
-    """Its column and row."""
-    label_shares: tuple[float, ...] | None
-    """Share of the events with each of `dase.events.LABELS`; None where events have no labels."""
-
-
-def statistics(sequence: Sequence) -> Statistics:
-    """Compute the statistics of a sequence."""
-    return _statistics(sequence, intervals(sequence.events))
-
-
-def _statistics(sequence: Sequence, between: NDArray[np.float64]) -> Statistics:
-    events = sequence.events
-    pixels = events.width * events.height
-    per_pixel = np.bincount(_flat(events), minlength=pixels)
-    busiest = int(per_pixel.argmax())
-    begin, end = sequence.span
-    duration = end - begin
-    on = int(np.count_nonzero(events.p))
-
-    def ratio(a: float, b: float) -> float:
-        return a / b if b > 0 else math.nan
-
-    low, median, high = np.percentile(between, (1, 50, 99)) if len(between) else (math.nan,) * 3
-    return Statistics(
-        width=events.width,
-        height=events.height,
-        frames=0 if sequence.frames is None else len(sequence.frames),
-        duration=duration,
-        events=len(events),
-        on_rate=ratio(on, pixels * duration),
-        off_rate=ratio(len(events) - on, pixels * duration),
-        on_share=ratio(on, len(events)),
-        interval_low=float(low),
-        interval_median=float(median),
-        interval_high=float(high),
-        silent_pixels=int(np.count_nonzero(per_pixel == 0)),
-        busiest_rate=ratio(int(per_pixel[busiest]), duration),
-        busiest_pixel=(busiest % events.width, busiest // events.width),
-        label_shares=_label_shares(events),
-    )
-
-
-def _label_shares(events: Events) -> tuple[float, ...] | None:
-    if events.label is None or not len(events):
-        return None
-    counts = np.bincount(events.label, minlength=len(LABELS))
-    return tuple(float(count) / len(events) for count in counts)
-
-
 def intervals(events: Events) -> NDArray[np.float64]:
     """Return the times between successive events of one pixel [s], over all pixels, in no useful order."""
     # one sort of (pixel, index) in 64 bits is several times faster than a stable argsort of the pixels
-    key = (_flat(events) << 32) | np.arange(len(events))
+    key = ((events.y.astype(np.int64) * events.width + events.x) << 32) | np.arange(len(events))
     key.sort()
     pixel, time = key >> 32, events.t[key & 0xFFFFFFFF]
     between: NDArray[np.float64] = np.diff(time)[pixel[1:] == pixel[:-1]]
     return between
-
-
-def _flat(events: Events) -> NDArray[np.int64]:
-    return events.y.astype(np.int64) * events.width + events.x
 
 
 def table(statistics: Statistics) -> list[tuple[str, str]]:
@@ -125,39 +44,88 @@ def table(statistics: Statistics) -> list[tuple[str, str]]:
     said = ", ".join(f"{name} {100 * share:.1f} %" for name, share in shares)
     return [
         ("sensor", f"{s.width} x {s.height}"),
-        ("duration", seconds(s.duration)),
-        ("frames", f"{s.frames}"),
+        ("duration", seconds(s.duration) + (f", from {s.begin:.3f} s on" if s.begin else "")),
         ("events", grouped(s.events)),
         ("ON rate", f"{s.on_rate:.3g} events/pixel/s"),
         ("OFF rate", f"{s.off_rate:.3g} events/pixel/s"),
         ("ON share", f"{100 * s.on_share:.1f} %" if s.events else "unknown"),
+        ("polarity flips", f"{percent(s.flip_share)} of successive events of a pixel"),
+        ("isolated events", f"{s.alone_rate:.3g} events/pixel/s" if s.alone_rate >= 0 else "unknown"),
+        ("interval, 0.1 %", seconds(s.interval_shortest)),
         ("interval, 1 %", seconds(s.interval_low)),
         ("interval, median", seconds(s.interval_median)),
         ("interval, 99 %", seconds(s.interval_high)),
+        ("interval, modal", seconds(s.interval_mode)),
+        ("time stamps", _stamps(s)),
+        ("readout period", _period(s)),
         ("silent pixels", f"{grouped(s.silent_pixels)} ({100 * s.silent_pixels / pixels:.1f} %)"),
-        ("busiest pixel", f"{_metric(s.busiest_rate, 'Hz')} at ({x}, {y})" if s.events else "none"),
+        ("busiest pixel", f"{metric(s.busiest_rate, 'Hz')} at ({x}, {y})" if s.events else "none"),
+        ("hot pixels", _hot(s)),
         *([("labels", said)] if said else []),
+        ("frames", _frames(s)),
     ]
 
 
-def grouped(count: int) -> str:
-    """Return a count with its thousands set apart."""
-    return f"{count:,}".replace(",", "\N{NO-BREAK SPACE}")
-
-
-def seconds(value: float) -> str:
-    """Return a time with three digits in a unit that fits: 12.1 s, 3.25 ms, 75 µs."""
-    return _metric(value, "s")
-
-
-def _metric(value: float, unit: str) -> str:
-    if not math.isfinite(value):
+def _stamps(s: Statistics) -> str:
+    if not s.events or not s.quantum > 0:
         return "unknown"
-    scales = ((1e9, "G"), (1e6, "M"), (1e3, "k"), (1.0, ""), (1e-3, "m"), (1e-6, "µ"))
-    scale, prefix = next((pair for pair in scales if abs(value) >= 0.9995 * pair[0]), scales[-1])
-    digits = max(0, 2 - math.floor(math.log10(abs(value) / scale * 1.0005))) if value else 0
-    text = f"{value / scale:.{digits}f}"
-    return f"{text.rstrip('0').rstrip('.') if '.' in text else text} {prefix}{unit}"
+    step = f"multiples of {seconds(s.quantum)}" if s.quantum >= 1e-6 else "finer than 1 µs"
+    return f"{step}, {s.events / s.stamps:.3g} events at each"
+
+
+def _period(s: Statistics) -> str:
+    if not s.period > 0:
+        return "none seen"
+    return f"{seconds(s.period)} ({percent(s.period_share)} of short intervals are multiples)"
+
+
+def _hot(s: Statistics) -> str:
+    if not s.hot_pixels:
+        return "none"
+    share = percent(s.hot_pixels / (s.width * s.height))
+    return f"{grouped(s.hot_pixels)} ({share}), {percent(s.hot_share)} of the events"
+
+
+def _frames(s: Statistics) -> str:
+    if not s.frames:
+        return "none"
+    short, long = s.exposure
+    pace = f", every {seconds(s.frame_interval)}" if s.frame_interval > 0 else ", times unknown"
+    if not long > 0:
+        return f"{grouped(s.frames)}{pace}, exposure unknown"
+    exposed = seconds(long) if long - short < 0.01 * long else f"{seconds(short)} to {seconds(long)}"
+    return f"{grouped(s.frames)}{pace}, exposed {exposed}"
+
+
+def histogram(statistics: Statistics, *, width: int = 40) -> list[str]:
+    """Return lines that draw how long the times between events of one pixel are, two bins per decade."""
+    bins = statistics.intervals
+    total = sum(count for *_, count in bins)
+    most = max((count for *_, count in bins), default=1)
+    out = []
+    for begin, end, count in bins:
+        eighths = max(round(8 * width * count / most), int(count > 0))
+        bar = "█" * (eighths // 8) + " ▏▎▍▌▋▊▉"[eighths % 8].strip()
+        span = f"{seconds(_round(begin)):>7} .. {seconds(_round(end)):<7}"
+        out.append(f"{span} {percent(count / total):>7}  {bar}")
+    return out
+
+
+def as_json(format: str, statistics: Statistics, notes: list[Note]) -> dict[str, Any]:
+    """Return statistics and notes for machines: numbers in SI units, None where nothing can be said."""
+
+    def plain(value: Any) -> Any:
+        if isinstance(value, tuple):
+            return [plain(one) for one in value]
+        return None if isinstance(value, float) and not math.isfinite(value) else value
+
+    said = {name: plain(value) for name, value in vars(statistics).items()}
+    return {"format": format, **said, "notes": [note.fields() for note in notes]}
+
+
+def _round(value: float) -> float:
+    """Round an edge of a bin, 1 or 3.16 times a power of ten, to one digit."""
+    return float(f"{value:.0e}")
 
 
 def default_window(sequence: Sequence) -> float:
@@ -222,7 +190,7 @@ def draw(
     dots = 360 if len(times) > 1 else 1300  # dots across a picture that stay visible on the sheet
     shrink = math.ceil(sequence.events.width / dots)
     panels = [panel(sequence, time, window, shrink=shrink) for time in times]
-    return sheet.draw(sequence, _statistics(sequence, between), between, panels, times, window, title)
+    return sheet.draw(sequence, statistics(sequence), between, panels, times, window, title)
 
 
 def panel(sequence: Sequence, time: float, window: float, *, shrink: int = 1) -> NDArray[np.uint8]:

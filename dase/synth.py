@@ -23,8 +23,9 @@ from dase.interrupt import Deferred, deferred, ignored
 from dase.kernels import launch
 from dase.layers import LayerScene
 from dase.outlet import Outlet
+from dase.pixels import Pixels
 from dase.scene import Scene
-from dase.sensor import CHUNK, Pixels, Sensor, chunks, sample_times
+from dase.sensor import CHUNK, Sensor, chunks, sample_times
 
 RECORD = "synth.toml"
 """File beside the sequences that holds everything that made them."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import dase
-from dase.effects import Effect
+from dase.effects import Effect, SceneEffect, StreamEffect
 
 HEAD = """# Effects
 
@@ -32,13 +32,19 @@ def parameters(effect: type[Effect]) -> str:
     return "<br>".join(lines)
 
 
+def stage(effect: type[Effect]) -> str:
+    """Return where an effect acts."""
+    if issubclass(effect, SceneEffect | StreamEffect):
+        return "optics" if issubclass(effect, SceneEffect) else "readout"
+    return ", ".join(effect.stages) or "count"
+
+
 def page() -> str:
     """Return the page."""
     rows = []
     for name, effect in dase.EFFECTS.items():
         what = effect.about().splitlines()[0]
-        stage = ", ".join(effect.stages) or "count"
-        rows.append(f"| `{name}` | {what} | {stage} | {parameters(effect)} | {effect.source} |")
+        rows.append(f"| `{name}` | {what} | {stage(effect)} | {parameters(effect)} | {effect.source} |")
     return HEAD + "\n".join(rows) + "\n"
 
 

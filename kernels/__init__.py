@@ -4,6 +4,7 @@ In the order of the pipeline:
 
 - `launch`: where work runs, and how CPU work is spread over threads;
 - `scene`: moving textured layers to intensity and flow;
+- `blur`: pictures through a lens;
 - `pixel`: the effects of a sensor composed into one kernel, intensity to counts or events;
 - `events`: sort and decode what `pixel` emitted;
 - `patches`: the structure of image and count-map patches;

@@ -19,6 +19,7 @@ from torch.autograd.function import once_differentiable
 
 from dase.kernels import counts as _counts
 from dase.kernels import scene as _scene
+from dase.kernels import surrogates as _surrogates
 from dase.kernels.launch import run, threads
 
 wp.init()  # a bare wp.from_torch fails without it
@@ -92,10 +93,10 @@ def count_events(
         fraction = phase.detach().float().flatten(1)
         on, off = threshold.detach()[:, -1], threshold.detach()[:, 0]
         start = fraction * torch.where(fraction >= 0, on, off)
-    run, window, count, once = _window(windows, samples - 1, log.device)
+    window = _window(windows, samples - 1)
     flat = log.detach().flatten(2)
-    counts = _Count.apply(flat, threshold, start, run, window, count, once, surrogate, step)
-    return counts.view(batch, count, 2, *space)
+    counts = _Count.apply(flat, threshold, start, window, surrogate, step)
+    return counts.view(batch, max(window) + 1, 2, *space)
 
 
 def thresholds(
@@ -156,22 +157,33 @@ class _Count(torch.autograd.Function):
         log: torch.Tensor,
         threshold: torch.Tensor,
         phase: torch.Tensor,
-        run: torch.Tensor,
-        window: torch.Tensor,
-        windows: int,
-        once: bool,
+        windows: tuple[int, ...],
         surrogate: str,
         step: float,
     ) -> torch.Tensor:
         log, threshold, phase = (t.float().contiguous() for t in (log, threshold, phase))
-        batch, _, pixels = log.shape
-        counts = torch.zeros(batch, windows, 2, pixels, device=log.device)
-        # the wide loads want addresses that are multiples of 16 bytes
-        aligned = log.data_ptr() % 16 == 0
-        lanes = next(n for n in _counts.LANES if n == 1 or (pixels % n == 0 and aligned))
-        kernel = _counts.count[lanes, threshold.shape[1] == 1]
-        _launch(kernel, [log, threshold, phase, run, window, once], [counts], lanes=lanes)
-        ctx.save_for_backward(log, threshold, phase, window, counts)
+        batch, samples, pixels = log.shape
+        # a run of intervals of one window is counted at once; sample k + 1 ends interval k
+        runs = [0, *(k for k in range(1, len(windows)) if windows[k] != windows[k - 1]), len(windows)]
+        window = tuple(windows[k] for k in runs[:-1])
+        once = len(set(window)) == len(window)
+        target = window if once else tuple(range(len(window)))
+        counts = torch.zeros(batch, max(target) + 1, 2, pixels, device=log.device)
+        seen = _scene.Frames()
+        seen.values = wp.from_torch(log.view(batch * samples, pixels))
+        lanes = _counts.widest(pixels, wp.device_from_torch(log.device), "log")
+        kernel = _counts.count(lanes, "log", shared=threshold.shape[1] == 1, mapped=True, states=False)
+        unused = torch.empty(batch, 0, device=log.device)
+        inputs = [
+            seen, samples, wp.empty(0, dtype=int, device=log.device.type), pixels, 1, 1, threshold,
+            torch.zeros(batch, device=log.device), _on_device(tuple(k + 1 for k in runs), log.device),
+            _on_device(target, log.device), log[:, 0] - phase,
+        ]  # fmt: skip
+        _launch(kernel, inputs, [unused, unused, counts], over=log, size=_counts.blocks(pixels, lanes))
+        if not once:
+            sums = counts.new_zeros(batch, max(window) + 1, 2, pixels)
+            counts = sums.index_add_(1, _on_device(window, log.device), counts)
+        ctx.save_for_backward(log, threshold, phase, _on_device(windows, log.device), counts)
         ctx.surrogate, ctx.step = surrogate, step
         return counts
 
@@ -182,12 +194,12 @@ class _Count(torch.autograd.Function):
         gradient = gradient.float().contiguous()
         out = torch.zeros_like(threshold)
         if ctx.surrogate == "events":
-            _launch(_counts.events_gradient, [threshold, counts, gradient], [out])
+            _launch(_surrogates.events_gradient, [threshold, counts, gradient], [out])
         elif ctx.surrogate == "interval":
-            _launch(_counts.interval_gradient, [log, threshold, phase, window, gradient], [out])
+            _launch(_surrogates.interval_gradient, [log, threshold, phase, window, gradient], [out])
         else:
-            _launch(_counts.expected_gradient, [log, threshold, phase, window, gradient, ctx.step], [out])
-        return None, out, None, None, None, None, None, None, None
+            _launch(_surrogates.expected_gradient, [log, threshold, phase, window, gradient, ctx.step], [out])
+        return None, out, None, None, None, None
 
 
 def render(textures: Sequence[Texture], place: torch.Tensor, *, width: int, height: int) -> torch.Tensor:
@@ -329,28 +341,25 @@ def _launch(
     *,
     over: torch.Tensor | None = None,
     align: int = 1,
-    lanes: int | None = None,
+    size: int | None = None,
 ) -> None:
     """Run `kernel` on a thread for each of the first and last axis of `over`, else of the first output.
 
-    With `lanes`, floating-point tensors are handed over as vectors of that many neighbours.
+    `size` stands in for the length of the last axis.
     """
     shape = outputs[0] if over is None else over
     # detached: Warp would ask a tensor that requires a gradient for its .grad
-    arguments: list[Any] = []
-    for a in (*inputs, *outputs):
-        if not isinstance(a, torch.Tensor):
-            arguments.append(a)
-        elif a.is_floating_point() and lanes is not None:
-            vector = wp.types.vector(length=lanes, dtype=wp.float32)
-            # by way of one axis, which gives axes of length 1 the strides that Warp expects
-            flat = a.detach().reshape(-1).view(*a.shape[:-1], -1, lanes)
-            arguments.append(wp.from_torch(flat, dtype=vector))
-        else:
-            arguments.append(wp.from_torch(a.detach()))
+    arguments = [wp.from_torch(a.detach()) if isinstance(a, torch.Tensor) else a for a in (*inputs, *outputs)]
     device = wp.device_from_torch(shape.device)
     with _stream(shape.device):
-        run(kernel, shape.shape[-1] // (lanes or 1), arguments, device, batch=shape.shape[0], align=align)
+        run(
+            kernel,
+            shape.shape[-1] if size is None else size,
+            arguments,
+            device,
+            batch=shape.shape[0],
+            align=align,
+        )
 
 
 def _stream(device: torch.device) -> AbstractContextManager[Any]:
@@ -393,14 +402,8 @@ def _check_textures(textures: Sequence[Texture], device: torch.device) -> None:
             _check(f"alpha of textures[{n}]", alpha, (tuple(grey.shape),), device)
 
 
-def _window(
-    windows: Sequence[int] | torch.Tensor | None, intervals: int, device: torch.device
-) -> tuple[torch.Tensor, torch.Tensor, int, bool]:
-    """Return where runs of one window begin, the window of every interval, and how many windows there are.
-
-    The last says whether no window has two runs.
-
-    The first has shape (R + 1,), ends with K - 1 and is int32, as is the second of shape (K - 1,).
+def _window(windows: Sequence[int] | torch.Tensor | None, intervals: int) -> tuple[int, ...]:
+    """Return the window of every interval, shape (K - 1,).
 
     Raises:
         ValueError: Not one index per interval, or an index below 0.
@@ -417,10 +420,7 @@ def _window(
         raise ValueError(f"windows must name one window per interval, {intervals}, got {len(indices)}")
     if min(indices) < 0:
         raise ValueError(f"windows must be >= 0, got {min(indices)}")
-    changes = [k for k in range(1, intervals) if indices[k] != indices[k - 1]]
-    run = (0, *changes, intervals)
-    once = len({indices[k] for k in run[:-1]}) == len(run) - 1
-    return _on_device(run, device), _on_device(indices, device), max(indices) + 1, once
+    return indices
 
 
 @lru_cache(maxsize=64)

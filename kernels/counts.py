@@ -1,4 +1,4 @@
-"""Exact event counts of stored log-intensity samples, and surrogate gradients of the counts.
+"""Exact event counts of pixels that are nothing but a change detector.
 
 A pixel remembers a reference r [log intensity] and compares every sample s with it (Equations 2 to 4 of "How
 to Learn a Domain-Adaptive Event Simulator?", 2021):
@@ -10,279 +10,286 @@ to Learn a Domain-Adaptive Event Simulator?", 2021):
 all in float32, the floor being the greatest n whose product with the threshold fits into the change, without
 contraction to fused multiply-adds, so that CPU, CUDA and NumPy agree to the last bit.
 
-`floor` passes no gradient. Three surrogates stand in for it; `docs/surrogates.md` measures them:
-
-- `interval`: the floor of Equation 7 passed straight through in every interval in which an event falls,
-  -|s_k - s_{k-1}| / threshold²;
-- `events`: -N / threshold, the derivative of N = |change| / threshold;
-- `expected`: the central difference of the counts at threshold e^h and threshold e^-h.
-
-Pixels are the last axis, so that neighbouring threads read neighbouring addresses.
+Training counts stored log intensities; sensors without effects on single samples count any source. The kernel
+is the composed one of `dase.kernels.pixel` without all that such pixels do not need, several pixels per
+thread, and returns the same counts.
 """
 
-from __future__ import annotations
+# no postponed annotations: those of the kernels made here name types of the functions around them
+from functools import lru_cache
+from typing import Any
 
 import warp as wp
 
-# the adjoints are written by hand; fused multiply-adds would move events between intervals
-wp.set_module_options({"enable_backward": False, "fuse_fp": False})
-
-
-@wp.func
-def whole(size: float, threshold: float, inverse: float) -> float:
-    """Return the greatest whole n with n threshold <= size.
-
-    A product with the inverse is wrong by at most one, which a comparison mends: unlike a division it needs
-    no branch on a GPU.
-    """
-    n = wp.floor(size * inverse)
-    n = wp.where((n + 1.0) * threshold <= size, n + 1.0, n)
-    return wp.where(n * threshold > size, n - 1.0, n)
-
-
-@wp.func
-def crossings(change: float, on: float, off: float, per_on: float, per_off: float) -> float:
-    """Return the events of a change of log intensity, ON positive, OFF negative; `per_` are inverses."""
-    up = change >= 0.0
-    events = whole(wp.abs(change), wp.where(up, on, off), wp.where(up, per_on, per_off))
-    return wp.where(up, events, -events)
-
-
-@wp.func
-def height(events: float, on: float, off: float) -> float:
-    """Return what signed `events` stand for [log intensity]."""
-    return events * wp.where(events >= 0.0, on, off)
-
-
-@wp.func
-def weighted(events: float, gradient_on: float, gradient_off: float) -> float:
-    """Return the objective that signed `events` add: their number times the gradient of their polarity."""
-    return wp.where(events >= 0.0, events * gradient_on, -events * gradient_off)
-
-
-Four = wp.types.vector(length=4, dtype=wp.float32)
-
-
-@wp.func_native(
-    """
-#ifdef __CUDA_ARCH__
-    const float4 q = __ldg(reinterpret_cast<const float4*>(&wp::index(samples, k, n)));
-    return wp::vec_t<4, wp::float32>(q.x, q.y, q.z, q.w);
-#else
-    return wp::index(samples, k, n);
-#endif
-"""
+from dase.kernels.lanes import functions, vector
+from dase.kernels.random import key, uniform
+from dase.kernels.scene import (
+    Frames,
+    Ground,
+    Layers,
+    ground_of,
+    in_front,
+    layers_near,
 )
-def wide(samples: wp.array2d[Four], k: int, n: int) -> Four:
-    """Return four samples by one load of 16 bytes; Warp's own would be four loads of 4 bytes each."""
-    ...
+
+SOURCES = {"frames": Frames, "log": Frames, "both": Frames, "layers": Layers, "background": Layers}
+"""What pixels see, by name: stored intensities, stored log intensities, both, moving layers, one layer."""
 
 
-@wp.func
-def narrow(samples: wp.array2d[wp.types.vector(length=1, dtype=wp.float32)], k: int, n: int):
-    """Return one sample."""
-    return samples[k, n]
+@lru_cache(maxsize=32)
+def _look(lanes: int, source: str) -> Any:
+    """Return the Warp function from a source to the log intensity of `lanes` neighbouring pixels."""
+    f = functions(lanes)
+    Source, Lanes, Bits = SOURCES[source], f.Lanes, vector(lanes, wp.int32)
+    load, logarithm, background = f.load, f.logarithm, f.background
+
+    if source in ("frames", "log"):
+
+        @wp.func
+        def look(
+            seen: Source,
+            ground: Ground,
+            k: int,
+            n: int,
+            x: Lanes,
+            y: Lanes,
+            near: Bits,
+            crowd: int,
+            eps: float,
+        ):
+            if wp.static(source == "log"):
+                return load(seen.values, k, n)
+            else:
+                return logarithm(load(seen.values, k, n), eps)
+
+    else:
+
+        @wp.func
+        def look(
+            seen: Source,
+            ground: Ground,
+            k: int,
+            n: int,
+            x: Lanes,
+            y: Lanes,
+            near: Bits,
+            crowd: int,
+            eps: float,
+        ):
+            light = background(
+                x, y, seen.grey, seen.place[k, 0], ground.last, ground.corner, ground.step, ground.inverse,
+                ground.width,
+            )  # fmt: skip
+            if wp.static(source == "layers"):
+                # a loop that is not unrolled: most lanes are far from all objects
+                for lane in range(crowd):
+                    if near[lane] != 0:
+                        front = in_front(seen, near[lane], k, x[lane], y[lane])
+                        light[lane] = front[0] + front[1] * light[lane]
+            return logarithm(light, eps)
+
+    return look
 
 
-def _count(lanes: int, shared: bool) -> wp.Kernel:
-    """Return the counting kernel for `lanes` neighbouring pixels per thread.
+@lru_cache(maxsize=64)
+def count(lanes: int, source: str, *, shared: bool, mapped: bool, states: bool) -> wp.Kernel:
+    """Return the counting kernel, over (B, blocks of `lanes` pixels) threads.
 
     It has no branches, so that several samples are on their way from memory at once. Both polarities are
-    counted by the sum and by the difference of their events; with a `shared` threshold nothing else has to be
-    chosen by polarity.
+    counted by the sum and by the difference of their events; with a shared threshold nothing else has to be
+    chosen by polarity. The last block ends with the last pixel and may overlap the one before.
+
+    Args:
+        lanes: Neighbouring pixels per thread.
+        source: One of `SOURCES`.
+        shared: Whether ON and OFF have one threshold.
+        mapped: Whether every pixel has its own.
+        states: Whether counts are integers and the last sample is kept, as sensors need it, or floats.
     """
-    Lanes = wp.types.vector(length=lanes, dtype=wp.float32)
-    load = wide if lanes == 4 else narrow
+    f = functions(lanes)
+    Source, Lanes, Bits = SOURCES[source], f.Lanes, vector(lanes, wp.int32)
+    look = _look(lanes, source)
+    load, store, store_whole = f.load, f.store, f.store_whole
+    minus, plus, plus_abs, advanced = f.minus, f.plus, f.plus_abs, f.advanced
+    chosen, inverse, signed_events = f.chosen, f.inverse, f.signed_events
+    half_sum, half_difference = f.half_sum, f.half_difference
+    Number = wp.int32 if states else wp.float32
+    stored, layered = source in ("frames", "log"), source == "layers"
 
     @wp.kernel(enable_backward=False, module="unique", module_options={"fuse_fp": False})
-    def count(
+    def count_events(
         first: int,
         # in
-        log: wp.array3d[Lanes],  # (B, K, N) [log intensity]
-        threshold: wp.array3d[Lanes],  # (B, P, N) [log intensity], OFF then ON; P = 1 shares one
-        phase: wp.array2d[Lanes],  # (B, N) [log intensity], first sample minus first reference
-        run: wp.array[int],  # (R + 1,) intervals at which runs of one window begin, and K - 1
-        window: wp.array[int],  # (K - 1,) window that an interval counts for
-        once: bool,  # whether every window has one run
+        seen: Source,
+        rows: int,  # samples between one row of the batch and the next; 0 where all see the same
+        pixels: wp.array[int],  # (N,) row-major indices
+        size: int,  # N
+        width: int,  # of the sensor
+        begin: int,  # first sample to compare
+        threshold: wp.array3d[float],  # (B, P, N or 1) [log intensity], OFF then ON; P = 1 shares one
+        eps: wp.array[float],  # (B,) added to intensities
+        run: wp.array[int],  # (R + 1,) samples at which runs of one window begin, and K
+        window: wp.array[int],  # (R,) window that a run counts for; -1 for none
+        reference_in: wp.array2d[float],  # (B, N) [log intensity]
         # out
-        counts_out: wp.array4d[Lanes],  # (B, W, 2, N) [events], OFF then ON; zero on entry
+        reference_out: wp.array2d[float],  # (B, N) [log intensity]
+        signal_out: wp.array2d[float],  # (B, N) last sample [log intensity]
+        counts_out: wp.array4d[Number],  # (B, W, 2, N) [events], OFF then ON
     ):
         """Count the events of every pixel in every window."""
         b, i = wp.tid()
-        n = first + i
-        off = threshold[b, 0, n]
-        on = threshold[b, threshold.shape[1] - 1, n]
-        samples = log[b]
-        reference = samples[0, n] - phase[b, n]
-        per_on = Lanes()
-        per_off = Lanes()
-        for lane in range(lanes):
-            per_on[lane] = 1.0 / on[lane]
-            per_off[lane] = 1.0 / off[lane]
-        last = samples.shape[0] - 1
-        ahead = load(samples, 1, n)
+        n = wp.min((first + i) * wp.static(lanes), size - wp.static(lanes))
+        above = threshold.shape[1] - 1
+        off = Lanes()
+        on = Lanes()
+        if wp.static(mapped):
+            off = load(threshold[b], 0, n)
+            on = load(threshold[b], above, n)
+        else:
+            off = Lanes(threshold[b, 0, 0])
+            on = Lanes(threshold[b, above, 0])
+        per_off = inverse(off)
+        per_on = inverse(on)
+        x = Lanes()
+        y = Lanes()
+        near = Bits()
+        crowd = int(0)
+        ground = Ground()
+        if wp.static(not stored):
+            ground = ground_of(seen)
+            for lane in range(wp.static(lanes)):
+                pixel = pixels[n + lane]
+                x[lane] = float(pixel % width)
+                y[lane] = float(pixel / width)
+                if wp.static(layered):
+                    near[lane] = layers_near(seen, x[lane], y[lane])
+                    if near[lane] != 0:
+                        crowd = wp.static(lanes)
+        reference = load(reference_in, b, n)
+        sample = Lanes()
         for r in range(run.shape[0] - 1):
             both = Lanes()
             net = Lanes()
-            for k in range(run[r], run[r + 1]):
-                sample = ahead
-                ahead = load(samples, wp.min(k + 2, last), n)
-                for lane in range(lanes):
-                    change = sample[lane] - reference[lane]
-                    theta = on[lane]
-                    inverse = per_on[lane]
-                    if wp.static(not shared):
-                        theta = wp.where(change >= 0.0, on[lane], off[lane])
-                        inverse = wp.where(change >= 0.0, per_on[lane], per_off[lane])
-                    events = whole(wp.abs(change), theta, inverse)
-                    both[lane] = both[lane] + events
-                    events = wp.where(change >= 0.0, events, -events)
-                    net[lane] = net[lane] + events
-                    reference[lane] = reference[lane] + events * theta
-            w = window[run[r]]
-            offs = 0.5 * (both - net)
-            ons = 0.5 * (both + net)
-            if not once:
-                # plain loads and stores: nobody else has these pixels, += would be an atomic
-                offs += counts_out[b, w, 0, n]
-                ons += counts_out[b, w, 1, n]
-            counts_out[b, w, 0, n] = offs
-            counts_out[b, w, 1, n] = ons
+            for k in range(wp.max(run[r], begin), run[r + 1]):
+                sample = look(seen, ground, k + b * rows, n, x, y, near, crowd, eps[b])
+                change = minus(sample, reference)
+                theta = on
+                per = per_on
+                if wp.static(not shared):
+                    theta = chosen(change, on, off)
+                    per = chosen(change, per_on, per_off)
+                events = signed_events(change, theta, per)
+                both = plus_abs(both, events)
+                net = plus(net, events)
+                reference = advanced(reference, events, theta)
+            w = window[r]
+            if w >= 0:
+                if wp.static(states):
+                    store_whole(counts_out[b, w, 0], n, half_difference(both, net))
+                    store_whole(counts_out[b, w, 1], n, half_sum(both, net))
+                else:
+                    store(counts_out[b, w, 0], n, half_difference(both, net))
+                    store(counts_out[b, w, 1], n, half_sum(both, net))
+        if wp.static(states):
+            store(reference_out[b], n, reference)
+            store(signal_out[b], n, sample)
 
-    return count
-
-
-LANES = (4, 1)
-"""Pixels per thread, widest first; the widest that divides the number of pixels is the fastest."""
-
-count = {(lanes, shared): _count(lanes, shared) for lanes in LANES for shared in (False, True)}
-"""Counting kernels by the number of pixels per thread and whether the polarities share a threshold."""
+    return count_events
 
 
-@wp.kernel
-def interval_gradient(
-    first: int,
-    # in
-    log: wp.array3d[float],  # (B, K, N) [log intensity]
-    threshold: wp.array3d[float],  # (B, P, N) [log intensity]
-    phase: wp.array2d[float],  # (B, N) [log intensity]
-    window: wp.array[int],  # (K - 1,)
-    gradient: wp.array4d[float],  # (B, W, 2, N) of the objective by the counts [1/events]
-    # out
-    threshold_gradient_out: wp.array3d[float],  # (B, P, N) [1/log intensity]; zero on entry
-):
-    """Differentiate by `interval`: -|s_k - s_{k-1}| / threshold² where an event falls, else nothing.
+@lru_cache(maxsize=32)
+def start(source: str) -> wp.Kernel:
+    """Return the kernel that sets memories at the first samples, over (B, N) threads.
 
-    Both polarities have this sign: N_on = max(D, 0) with D falling in the threshold where D > 0, and
-    N_off = max(-D, 0) with -D falling in it where D < 0.
+    The memories are spread as if the first change had been going on before.
     """
-    b, i = wp.tid()
-    n = first + i
-    last = threshold.shape[1] - 1
-    off = threshold[b, 0, n]
-    on = threshold[b, last, n]
-    reference = log[b, 0, n] - phase[b, n]
-    for k in range(1, log.shape[1]):
-        events = crossings(log[b, k, n] - reference, on, off, 1.0 / on, 1.0 / off)
-        if events != 0.0:
-            reference += height(events, on, off)
-            p = wp.where(events > 0.0, 1, 0)
-            c = wp.where(events > 0.0, last, 0)
-            slope = -wp.abs(log[b, k, n] - log[b, k - 1, n]) / (threshold[b, c, n] * threshold[b, c, n])
-            share = gradient[b, window[k - 1], p, n] * slope
-            threshold_gradient_out[b, c, n] = threshold_gradient_out[b, c, n] + share
+    f = functions(1)
+    Source, Bits = SOURCES[source], vector(1, wp.int32)
+    look, Lane = _look(1, source), f.Lanes
+    stored, layered = source in ("frames", "log"), source == "layers"
+
+    @wp.kernel(enable_backward=False, module="unique", module_options={"fuse_fp": False})
+    def start_counting(
+        first: int,
+        # in
+        seen: Source,
+        pixels: wp.array[int],  # (N,) row-major indices
+        width: int,  # of the sensor
+        begin: int,  # samples seen before, 0 or 1
+        samples: int,  # in this chunk
+        seed: int,
+        initial_phase: int,  # stream of random numbers
+        threshold: wp.array3d[float],  # (B, P, N or 1) [log intensity], OFF then ON
+        eps: wp.array[float],  # (B,) added to intensities
+        phase: wp.array[float],  # (B,) spread of the memories
+        signal_in: wp.array2d[float],  # (B, N) [log intensity]
+        # out
+        reference_out: wp.array2d[float],  # (B, N) [log intensity]
+        signal_out: wp.array2d[float],  # (B, N) first sample [log intensity]
+    ):
+        """Take the first sample as reference, led by a random share of the first change's threshold."""
+        b, i = wp.tid()
+        i += first
+        pixel = pixels[i]
+        x = Lane(float(pixel % width))
+        y = Lane(float(pixel / width))
+        near = Bits()
+        ground = Ground()
+        if wp.static(not stored):
+            ground = ground_of(seen)
+            if wp.static(layered):
+                near[0] = layers_near(seen, x[0], y[0])
+        signal = signal_in[b, i]
+        if begin == 0:
+            signal = look(seen, ground, 0, i, x, y, near, 1, eps[b])[0]
+        reference = signal
+        if begin + samples > 1:
+            change = look(seen, ground, 1 - begin, i, x, y, near, 1, eps[b])[0] - signal
+            column = wp.where(threshold.shape[2] == 1, 0, i)
+            stream = key(seed, initial_phase, pixel)
+            lead = phase[b] * uniform(stream, 0)
+            if phase[b] != 0.0:
+                if change < 0.0 or (change == 0.0 and uniform(stream, 1) < 0.5):
+                    reference += lead * threshold[b, 0, column]
+                else:
+                    reference -= lead * threshold[b, threshold.shape[1] - 1, column]
+        signal_out[b, i] = signal
+        reference_out[b, i] = reference
+
+    return start_counting
 
 
-@wp.kernel
-def events_gradient(
-    first: int,
-    # in
-    threshold: wp.array3d[float],  # (B, P, N) [log intensity]
-    counts: wp.array4d[float],  # (B, W, 2, N) [events], as `count` returned them
-    gradient: wp.array4d[float],  # (B, W, 2, N) of the objective by the counts [1/events]
-    # out
-    threshold_gradient_out: wp.array3d[float],  # (B, P, N) [1/log intensity]
-):
-    """Differentiate by `events`: -N / threshold, every polarity by its own threshold."""
-    b, i = wp.tid()
-    n = first + i
-    off_sum = float(0.0)
-    on_sum = float(0.0)
-    for w in range(counts.shape[1]):
-        off_sum += counts[b, w, 0, n] * gradient[b, w, 0, n]
-        on_sum += counts[b, w, 1, n] * gradient[b, w, 1, n]
-    if threshold.shape[1] == 1:
-        threshold_gradient_out[b, 0, n] = -(off_sum + on_sum) / threshold[b, 0, n]
-    else:
-        threshold_gradient_out[b, 0, n] = -off_sum / threshold[b, 0, n]
-        threshold_gradient_out[b, 1, n] = -on_sum / threshold[b, 1, n]
+@lru_cache(maxsize=2)
+def take_logs(lanes: int) -> wp.Kernel:
+    """Return the kernel that takes logarithms of stored intensities, over (K, blocks of pixels) threads."""
+    f = functions(lanes)
+    load, store, logarithm = f.load, f.store, f.logarithm
+
+    @wp.kernel(enable_backward=False, module="unique", module_options={"fuse_fp": False})
+    def take_logs(
+        first: int,
+        # in
+        values: wp.array2d[float],  # (K, N) linear intensity
+        eps: float,
+        # out
+        logs_out: wp.array2d[float],  # (K, N) log intensity
+    ):
+        """Take log(value + eps)."""
+        k, i = wp.tid()
+        n = wp.min((first + i) * wp.static(lanes), values.shape[1] - wp.static(lanes))
+        store(logs_out[k], n, logarithm(load(values, k, n), eps))
+
+    return take_logs
 
 
-@wp.func
-def scaled(on: float, off: float, phase: float, on_scale: float, off_scale: float) -> wp.vec3f:
-    """Return scaled thresholds and the phase at the same fraction of the threshold of its sign."""
-    return wp.vec3f(on_scale * on, off_scale * off, phase * wp.where(phase >= 0.0, on_scale, off_scale))
+def widest(size: int, device: wp.Device, source: str) -> int:
+    """Return how many neighbouring pixels a thread works on."""
+    lanes = 4 if device.is_cuda else 16
+    if device.is_cuda and source == "layers":
+        lanes = 1
+    return lanes if size >= lanes else 1
 
 
-@wp.func
-def difference(
-    b: int,
-    n: int,
-    log: wp.array3d[float],
-    window: wp.array[int],
-    gradient: wp.array4d[float],
-    high: wp.vec3f,  # ON, OFF, phase [log intensity]
-    low: wp.vec3f,  # ON, OFF, phase [log intensity]
-) -> float:
-    """Return the objective at `high` minus that at `low`, linear in the counts by `gradient`."""
-    high_inverse = wp.vec2(1.0 / high[0], 1.0 / high[1])
-    low_inverse = wp.vec2(1.0 / low[0], 1.0 / low[1])
-    high_reference = log[b, 0, n] - high[2]
-    low_reference = log[b, 0, n] - low[2]
-    change = float(0.0)
-    for k in range(1, log.shape[1]):
-        sample = log[b, k, n]
-        high_events = crossings(sample - high_reference, high[0], high[1], high_inverse[0], high_inverse[1])
-        low_events = crossings(sample - low_reference, low[0], low[1], low_inverse[0], low_inverse[1])
-        if high_events != 0.0 or low_events != 0.0:
-            high_reference += height(high_events, high[0], high[1])
-            low_reference += height(low_events, low[0], low[1])
-            w = window[k - 1]
-            g_off = gradient[b, w, 0, n]
-            g_on = gradient[b, w, 1, n]
-            change += weighted(high_events, g_on, g_off) - weighted(low_events, g_on, g_off)
-    return change
-
-
-@wp.kernel
-def expected_gradient(
-    first: int,
-    # in
-    log: wp.array3d[float],  # (B, K, N) [log intensity]
-    threshold: wp.array3d[float],  # (B, P, N) [log intensity]
-    phase: wp.array2d[float],  # (B, N) [log intensity]
-    window: wp.array[int],  # (K - 1,)
-    gradient: wp.array4d[float],  # (B, W, 2, N) of the objective by the counts [1/events]
-    step: float,  # half width h of the difference, in the logarithm of the threshold
-    # out
-    threshold_gradient_out: wp.array3d[float],  # (B, P, N) [1/log intensity]
-):
-    """Differentiate by `expected`: (N(threshold e^h) - N(threshold e^-h)) / (2 threshold sinh h).
-
-    The denominator makes N ∝ 1/threshold exact. Both polarities answer to either threshold.
-    """
-    b, i = wp.tid()
-    n = first + i
-    last = threshold.shape[1] - 1
-    off = threshold[b, 0, n]
-    on = threshold[b, last, n]
-    up = wp.exp(step)
-    down = wp.exp(-step)
-    for c in range(last + 1):
-        # a shared threshold moves both polarities
-        moves_on = c == last
-        moves_off = c == 0
-        high = scaled(on, off, phase[b, n], wp.where(moves_on, up, 1.0), wp.where(moves_off, up, 1.0))
-        low = scaled(on, off, phase[b, n], wp.where(moves_on, down, 1.0), wp.where(moves_off, down, 1.0))
-        change = difference(b, n, log, window, gradient, high, low)
-        threshold_gradient_out[b, c, n] = change / ((up - down) * threshold[b, c, n])
+def blocks(size: int, lanes: int) -> int:
+    """Return how many blocks of `lanes` pixels there are."""
+    return -(-size // lanes)

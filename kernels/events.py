@@ -33,9 +33,10 @@ def decode(
     bits: int,  # of the place
     low: int,  # bits below the place
     size: int,  # pixels per row of the batch
-    pixels: wp.array[int],  # (N,)
-    width: int,
+    x: wp.array[wp.uint16],  # (N,) column of each pixel
+    y: wp.array[wp.uint16],  # (N,) row of each pixel
     begin: wp.int64,  # of the chunk [ns]
+    each: int,  # events per thread
     # out
     t_out: wp.array[wp.float64],  # [s]
     x_out: wp.array[wp.uint16],
@@ -45,24 +46,70 @@ def decode(
     label_out: wp.array[wp.int8],  # of length 0 when nobody asks
 ):
     """Unpack keys: time, pixel, polarity and label of each event."""
-    _, i = wp.tid()
-    i += first
-    key = keys[i]
-    place = int((key >> wp.int64(low)) & ((wp.int64(1) << wp.int64(bits)) - wp.int64(1)))
-    pixel = pixels[place % size]
-    # from whole nanoseconds, so that times never go back from chunk to chunk
-    t_out[i] = wp.float64(1.0e-9) * wp.float64(begin + (key >> wp.int64(bits + low)))
-    x_out[i] = wp.uint16(pixel % width)
-    y_out[i] = wp.uint16(pixel / width)
-    p_out[i] = wp.uint8((key >> wp.int64(low - 1)) & wp.int64(1))
-    if row_out.shape[0] > 0:
-        row_out[i] = place / size
-    if label_out.shape[0] > 0:
-        label_out[i] = wp.int8(key & wp.int64(3))
+    _, n = wp.tid()
+    n += first
+    for i in range(n * each, wp.min((n + 1) * each, keys.shape[0])):
+        key = keys[i]
+        place = int((key >> wp.int64(low)) & ((wp.int64(1) << wp.int64(bits)) - wp.int64(1)))
+        if row_out.shape[0] > 0:
+            row_out[i] = place / size
+            place = place % size
+        # from whole nanoseconds, so that times never go back from chunk to chunk
+        t_out[i] = wp.float64(1.0e-9) * wp.float64(begin + (key >> wp.int64(bits + low)))
+        x_out[i] = x[place]
+        y_out[i] = y[place]
+        p_out[i] = wp.uint8((key >> wp.int64(low - 1)) & wp.int64(1))
+        if label_out.shape[0] > 0:
+            label_out[i] = wp.int8(key & wp.int64(3))
+
+
+EACH = {"cpu": 256, "cuda": 1}
+"""Events that a thread decodes: on the CPU it costs as much to begin a thread as to decode ten."""
+
+RADIX = 9
+"""Bits that a pass of the sort on the CPU looks at: as many write positions as stay in the nearest cache."""
+
+
+@wp.func_native(
+    """
+    long long* from = keys.data;
+    long long* to = other.data;
+    int place[1 << 9];
+    for (int shift = begin; shift < end; shift += 9) {
+        for (int d = 0; d < 512; ++d) place[d] = 0;
+        for (int i = 0; i < count; ++i) ++place[(from[i] >> shift) & 511];
+        int sum = 0;
+        for (int d = 0; d < 512; ++d) {
+            const int here = place[d];
+            place[d] = sum;
+            sum += here;
+        }
+        for (int i = 0; i < count; ++i) to[place[(from[i] >> shift) & 511]++] = from[i];
+        long long* swap = from;
+        from = to;
+        to = swap;
+    }
+"""
+)
+def radix_sort(keys: wp.array[wp.int64], other: wp.array[wp.int64], count: int, begin: int, end: int):
+    """Sort stably by some bits; the result is in `keys` after an even number of passes, else in `other`."""
+    ...
+
+
+@wp.kernel(enable_backward=False)
+def sort(first: int, keys: wp.array[wp.int64], other: wp.array[wp.int64], count: int, begin: int, end: int):
+    """Sort on one thread of a CPU, three times as fast as Warp's sort of pairs."""
+    radix_sort(keys, other, count, begin, end)
 
 
 def ordered(
-    keys: wp.array, used: np.ndarray, bits: int, low: int, device: wp.Device, late: np.ndarray | None = None
+    keys: wp.array,
+    used: np.ndarray,
+    bits: int,
+    low: int,
+    top: int,
+    device: wp.Device,
+    late: np.ndarray | None = None,
 ) -> wp.array:
     """Return all keys in order of time, then place, then polarity.
 
@@ -73,6 +120,7 @@ def ordered(
         used: Shape (B, slabs), not above the capacity.
         bits: Of the place.
         low: Bits below the place.
+        top: Bits of all.
         device: Where `keys` live.
         late: Keys that earlier chunks have left, shape (L,), or None where no event leaves late.
     """
@@ -81,13 +129,15 @@ def ordered(
     if total == 0:
         return out
     # a CPU slab emits its pixels one after the other, so a stable sort by time alone gives the full order
-    begin, end = (bits + low if device.is_cpu else 0), 63
+    begin = bits + low if device.is_cpu else 0
     if late is not None:
         begin = low
     if device.is_cpu:
-        end = max(int(out.numpy()[:total].max()).bit_length(), begin + 1)
+        halves = out[:total], out[total:]
+        launch.run(sort, 1, [*halves, total, begin, top], device)
+        return halves[-(-(top - begin) // RADIX) % 2]
     idle = wp.empty(2 * total, dtype=wp.int32, device=device)
-    wp.utils.radix_sort_pairs(out, idle, total, begin_bit=begin, end_bit=end)
+    wp.utils.radix_sort_pairs(out, idle, total, begin_bit=begin, end_bit=top)
     return out[:total]
 
 

@@ -26,9 +26,7 @@ they do not depend on the other effects, on chunks, threads or the batch.
 from __future__ import annotations
 
 import inspect
-import linecache
 import re
-import zlib
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
@@ -36,7 +34,11 @@ from typing import Any
 
 import warp as wp
 
-from dase.kernels.scene import Layers, background_at, ground_of, layer_intensity, layers_near
+from dase.kernels.counts import SOURCES
+from dase.kernels.lanes import from_text, functions, whole
+from dase.kernels.random import key, normal, stream, uniform, waiting
+from dase.kernels.scene import Frames as Frames
+from dase.kernels.scene import background_at, ground_of, layer_intensity, layers_near
 
 REST = 1e30
 """Duration of the rest before the first sample [s]: filters start settled."""
@@ -72,6 +74,8 @@ ANYWHERE = ("x", "y", "t", "dt", "t64", "radius", "nominal_on", "nominal_off")
 COUNT_ON = "{0} = wp.where({0} < 8388608.0, {0} + 1.0, 1.0)"
 """Counts events in float32 without coming to a halt where it resolves no more; random numbers then repeat."""
 
+VOLTAGE = "voltage = logarithm(Lane(intensity), log_eps)[0]"
+
 DRAW = re.compile(r"(pixel_)?(uniform|normal)(_\d)?")
 
 
@@ -86,6 +90,7 @@ class Stages:
         states: Names of what a pixel remembers from sample to sample; all zero at the start.
         delays: Whether the events that `gate` holds back come later; otherwise they are lost.
         label: Of the events that `noise` makes.
+        off: (parameter, value) pairs; an effect with all of them changes nothing.
     """
 
     name: str
@@ -94,13 +99,7 @@ class Stages:
     states: tuple[str, ...] = ()
     delays: bool = False
     label: int = SHOT
-
-
-@wp.struct
-class Frames:
-    """Stored samples."""
-
-    values: wp.array2d[float]  # (K, N) linear intensity, or log intensity for the `log` source
+    off: tuple[tuple[str, float], ...] = ()
 
 
 @wp.struct
@@ -130,9 +129,23 @@ class Keys:
 
     keys: wp.array3d[wp.int64]  # (B, slabs, capacity)
     used: wp.array2d[int]  # (B, slabs) events met; more than the capacity asks for another run
-    slab: int  # pixels per slab
+    slab: int  # pixels per slab, as a power of 2
     bits: int  # of row · N + i
     low: int  # bits below: 1 of the polarity, 2 more of the label
+
+
+@wp.func_native("return a.data[k];")
+def element(a: wp.array[float], k: int) -> float:
+    """Return a[k]; Warp's own look-up asks whether k is negative, in the innermost loop."""
+    ...
+
+
+@wp.func_native(
+    "return *(const float*)((const char*)a.data + (size_t)k * (size_t)a.strides[0] + 4 * (size_t)i);"
+)
+def stored(a: wp.array2d[float], k: int, i: int) -> float:
+    """Return a[k, i], as `element` does."""
+    ...
 
 
 @wp.func
@@ -145,7 +158,7 @@ def leaving_time(clock: Clock, k: int, at: float, late: float) -> wp.int64:
 @wp.func
 def deposit(sink: Keys, row: int, i: int, size: int, time: wp.int64, code: int):
     """Keep one event that leaves its pixel at `time` [ns since the chunk's begin]."""
-    slab = i / sink.slab
+    slab = i >> sink.slab
     slot = wp.atomic_add(sink.used, row, slab, 1)
     if slot < sink.keys.shape[2]:
         place = wp.int64(row) * wp.int64(size) + wp.int64(i)
@@ -153,89 +166,45 @@ def deposit(sink: Keys, row: int, i: int, size: int, time: wp.int64, code: int):
         sink.keys[row, slab, slot] = (place << wp.int64(sink.low)) | wp.int64(code)
 
 
-@wp.func_native(
-    """
-#ifdef __CUDA_ARCH__
-    return __logf(x);
-#else
-    return logf(x);
-#endif
-"""
-)
-def logarithm(x: float) -> float:
-    """Natural logarithm; on CUDA within 4e-7 of it between 0.5 and 2, within 3 ulp elsewhere."""
-    ...
-
-
-@wp.func
-def key(seed: int, stream: int, pixel: int) -> int:
-    """Key of one stream of random numbers of one pixel."""
-    return int(wp.rand_init(seed ^ stream, pixel))
-
-
-@wp.func
-def uniform(key: int, index: int) -> float:
-    """Uniform in [0, 1)."""
-    return wp.randf(wp.rand_init(key, index))
-
-
-@wp.func
-def normal(key: int, index: int) -> float:
-    """Standard normal."""
-    return wp.randn(wp.rand_init(key, index))
-
-
-@wp.func
-def waiting(key: int, index: int) -> float:
-    """Exponential with mean 1: the hazard a Poisson process spends before its next event."""
-    return -wp.log(1.0 - uniform(key, index))
-
-
-SOURCES = {"frames": Frames, "log": Frames, "layers": Layers, "background": Layers}
 SINKS = {"counts": Counts, "keys": Keys, "labels": Keys}
 
 
-def stream(name: str) -> int:
-    """Return the number of a named stream of random numbers, a 31-bit hash."""
-    return zlib.crc32(name.encode()) & 0x7FFFFFFF
-
-
 @lru_cache(maxsize=256)
-def compose(stages: tuple[Stages, ...], source: str, sink: str) -> wp.Kernel:
+def compose(stages: tuple[Stages, ...], source: str, sink: str, *, cuda: bool) -> wp.Kernel:
     """Return the kernel of a sensor.
 
     Args:
         stages: Effects, in order.
-        source: `frames`, `log`, `layers`, or `background` for a scene of one layer.
+        source: `frames`, `log`, `both`, `layers`, or `background` for a scene of one layer.
         sink: `counts`, `keys`, or `labels` for keys with labels.
+        cuda: Whether it is for CUDA, which asks memory for samples ahead.
 
     Returns:
-        A kernel over (B, N) threads; `_Writer.kernel` writes its arguments.
+        A kernel over (B, N) threads; `Writer.kernel` writes its arguments.
     """
-    writer = _Writer(stages, source, sink)
-    return _compiled(writer.kernel(), "pixel_events", writer.scope)
+    writer = Writer(stages, source, sink, cuda=cuda)
+    return compiled(writer.kernel(), "pixel_events", writer.scope)
 
 
 @lru_cache(maxsize=256)
 def compose_thresholds(stages: tuple[Stages, ...]) -> wp.Kernel:
     """Return a kernel over (B, N) threads that writes the thresholds of every pixel."""
-    writer = _Writer(stages, "frames", "counts")
-    return _compiled(writer.thresholds(), "pixel_thresholds", writer.scope)
+    writer = Writer(stages, "frames", "counts", cuda=True)
+    return compiled(writer.thresholds(), "pixel_thresholds", writer.scope)
 
 
-def _compiled(text: str, name: str, scope: dict[str, Any]) -> wp.Kernel:
-    filename = f"<dase {name} {zlib.crc32(text.encode()):08x}>"
-    # Warp reads the source of a kernel through linecache, and so do tracebacks
-    linecache.cache[filename] = (len(text), None, text.splitlines(keepends=True), filename)
-    scope = dict(scope)
-    exec(compile(text, filename, "exec"), scope)
-    kernel: wp.Kernel = wp.kernel(scope[name], enable_backward=False, module="unique")
+def compiled(text: str, name: str, scope: dict[str, Any]) -> wp.Kernel:
+    """Return the kernel of a text."""
+    options = {"fuse_fp": False}  # see dase.kernels.lanes
+    kernel: wp.Kernel = wp.kernel(
+        from_text(text, name, scope), enable_backward=False, module="unique", module_options=options
+    )
     return kernel
 
 
-def source_text(stages: tuple[Stages, ...], source: str, sink: str) -> str:
+def source_text(stages: tuple[Stages, ...], source: str, sink: str, *, cuda: bool) -> str:
     """Return the text of the kernel that `compose` compiles."""
-    return _Writer(stages, source, sink).kernel()
+    return Writer(stages, source, sink, cuda=cuda).kernel()
 
 
 def states(stages: Sequence[Stages], sink: str = "keys") -> list[str]:
@@ -254,11 +223,12 @@ def states(stages: Sequence[Stages], sink: str = "keys") -> list[str]:
     return names
 
 
-class _Writer:
+class Writer:
     """Writes the text of one kernel, top to bottom."""
 
-    def __init__(self, stages: tuple[Stages, ...], source: str, sink: str):
+    def __init__(self, stages: tuple[Stages, ...], source: str, sink: str, *, cuda: bool):
         self.stages, self.source, self.sink = stages, source, sink
+        self.prefetches = cuda and source in ("frames", "log")
         self.lines: list[str] = []
         self.depth = 0
         self.states = states(stages, sink)
@@ -273,6 +243,8 @@ class _Writer:
             "Sink": SINKS[sink],
             "Clock": Clock,
             "deposit": deposit,
+            "element": element,
+            "stored": stored,
             "leaving_time": leaving_time,
             "key": key,
             "uniform": uniform,
@@ -282,7 +254,9 @@ class _Writer:
             "layers_near": layers_near,
             "ground_of": ground_of,
             "background_at": background_at,
-            "logarithm": logarithm,
+            "logarithm": functions(1).logarithm,
+            "Lane": functions(1).Lanes,
+            "whole": whole,
         }
 
     def add(self, *lines: str) -> None:
@@ -299,6 +273,10 @@ class _Writer:
         self.scope[name] = function
         arguments = [self.argument(stage, effect, a) for a in inspect.signature(function.func).parameters]
         return f"{name}({', '.join(arguments)})"
+
+    def unless_off(self, effect: Stages, *lines: str) -> list[str]:
+        """Return the lines of an effect; off, it changes nothing, and a kernel for many models skips them."""
+        return list(lines)
 
     def argument(self, stage: str, effect: Stages, name: str) -> str:
         """Return what a stage function gets for an argument of this name."""
@@ -354,9 +332,13 @@ class _Writer:
         self.add("out[row, 0, i] = off", "out[row, 1, i] = on")
         return "\n".join(self.lines) + "\n"
 
+    def begin(self) -> None:
+        """Which row of the batch and which pixel the thread works on."""
+        self.add("row, i = wp.tid()", "i += first")
+
     def pixel(self) -> None:
         """Where the pixel is, its parameters and its own random numbers."""
-        self.add("row, i = wp.tid()", "i += first")
+        self.begin()
         self.add("pixel = pixels[i]", "x = pixel % width", "y = pixel / width")
         self.add(*(f"{name} = parameters[row, {at}]" for name, at in self.places.items()))
         for local, kind in self.draws.items():
@@ -373,7 +355,7 @@ class _Writer:
 
     def prologue(self) -> None:
         """What a pixel knows before its first sample."""
-        calls = [self.call("threshold", effect, function) for effect, function in self.of("threshold")]
+        calls = [(effect, self.call("threshold", effect, f)) for effect, f in self.of("threshold")]
         anew = self.redrawn()
         self.pixel()
         self.add("size = pixels.shape[0]")
@@ -382,11 +364,10 @@ class _Writer:
         elif self.source == "background":
             self.add("ground = ground_of(source)")
         else:
-            self.add("last = source.values.shape[0] - 1")
-            self.add(*(f"ahead_{n} = source.values[wp.min({n}, last), i]" for n in range(AHEAD)))
-        self.add(*(f"on, off = {call}" for call in calls))
-        self.add(*(f"{name} = float(0.0)" for name in self.states), "if begin > 0:")
-        self.add(*(f"    {name} = state_in[{at}, row, i]" for at, name in enumerate(self.states)))
+            self.ahead()
+        for effect, call in calls:
+            self.add(*self.unless_off(effect, f"on, off = {call}"))
+        self.restore()
         if anew:
             self.add("mean_on = on", "mean_off = off", *anew[2:])
 
@@ -394,10 +375,26 @@ class _Writer:
             # the state holds the bits of whole nanoseconds, which float32 would round
             self.add("leaves = wp.int64(wp.cast(leaving, wp.int32))")
 
+    def ahead(self) -> None:
+        """Ask memory for the first samples."""
+        if not self.prefetches:
+            return
+        self.add("last = source.values.shape[0] - 1")
+        self.add(*(f"ahead_{n} = source.values[wp.min({n}, last), i]" for n in range(AHEAD)))
+
+    def restore(self) -> None:
+        """What the pixel remembers from the chunk before."""
+        self.add(*(f"{name} = float(0.0)" for name in self.states), "if begin > 0:")
+        self.add(*(f"    {name} = state_in[{at}, row, i]" for at, name in enumerate(self.states)))
+
     def redrawn(self) -> list[str]:
         """Return the lines that draw the thresholds of the next event, none without such an effect."""
-        calls = [self.call("redraw", effect, function) for effect, function in self.of("redraw")]
-        return ["on = mean_on", "off = mean_off", *(f"on, off = {call}" for call in calls)] if calls else []
+        draws = [
+            line
+            for effect, function in self.of("redraw")
+            for line in self.unless_off(effect, f"on, off = {self.call('redraw', effect, function)}")
+        ]
+        return ["on = mean_on", "off = mean_off", *draws] if draws else []
 
     def loop(self) -> None:
         """One sample after the other, then the state is kept."""
@@ -407,9 +404,23 @@ class _Writer:
             self.add("on_count = int(0)", "off_count = int(0)")
         self.add("for k in range(clock.run[part], clock.run[part + 1]):")
         self.depth += 1
-        self.add("dt = clock.dt[k]", "t = clock.t[k]", "sample = begin + k")
+        self.add("dt = element(clock.dt, k)", "sample = begin + k")
+        self.add(*(["t = element(clock.t, k)"] if self.asks("t") else []))
         self.add(*(["t64 = clock.t64[k]"] if self.asks("t64") else []))
         self.sense()
+        self.sample()
+        self.depth -= 1
+        if self.sink == "counts":
+            self.add("window = clock.window[part]", "if window >= 0:")
+            self.add("    sink.counts[row, window, 0, i] = off_count")
+            self.add("    sink.counts[row, window, 1, i] = on_count")
+        self.depth -= 1
+        if "leaving" in self.states and self.sink != "counts":
+            self.add("leaving = wp.cast(wp.int32(wp.max(leaves - clock.span, wp.int64(0))), float)")
+        self.add(*(f"state_out[{at}, row, i] = {name}" for at, name in enumerate(self.states)))
+
+    def sample(self) -> None:
+        """What follows from one sample."""
         self.add("if sample == 0:")
         self.depth += 1
         self.add("signal = voltage", "reference = voltage")
@@ -423,15 +434,6 @@ class _Writer:
         self.add("dt = 0.0")
         self.depth -= 1
         self.step()
-        self.depth -= 1
-        if self.sink == "counts":
-            self.add("window = clock.window[part]", "if window >= 0:")
-            self.add("    sink.counts[row, window, 0, i] = off_count")
-            self.add("    sink.counts[row, window, 1, i] = on_count")
-        self.depth -= 1
-        if "leaving" in self.states and self.sink != "counts":
-            self.add("leaving = wp.cast(wp.int32(wp.max(leaves - clock.span, wp.int64(0))), float)")
-        self.add(*(f"state_out[{at}, row, i] = {name}" for at, name in enumerate(self.states)))
 
     def sense(self) -> None:
         """Light to photoreceptor voltage."""
@@ -440,23 +442,37 @@ class _Writer:
             self.add("intensity = layer_intensity(source, ground, near, k, float(x), float(y))")
         elif self.source == "background":
             self.add("intensity = background_at(source, ground, k, float(x), float(y))")
+        elif not self.prefetches:
+            self.add(f"{quantity} = stored(source.values, k, i)")
         else:
             # memory is asked for the samples to come while the present one is worked on
             self.add(f"{quantity} = ahead_0")
             self.add(*(f"ahead_{n} = ahead_{n + 1}" for n in range(AHEAD - 1)))
-            self.add(f"ahead_{AHEAD - 1} = source.values[wp.min(k + {AHEAD}, last), i]")
+            self.add(f"ahead_{AHEAD - 1} = stored(source.values, wp.min(k + {AHEAD}, last), i)")
         if self.source == "log":
             if self.of("light"):
                 raise ValueError("effects on light need intensities, not log intensities")
             kinds = ("respond", "drift", "noise", "delay")
             if any("intensity" in inspect.signature(f.func).parameters for s in kinds for _, f in self.of(s)):
                 self.add("intensity = wp.exp(voltage) - log_eps")
+        self.light()
+        if self.source == "both":
+            self.add("voltage = stored(source.logs, k, i)")
+        elif self.source != "log":
+            self.add(VOLTAGE)
+        self.respond()
+
+    def light(self) -> None:
+        """What becomes of the light before it is sensed."""
         for effect, function in self.of("light"):
-            self.add(f"{self.returns('intensity', effect)} = {self.call('light', effect, function)}")
-        if self.source != "log":
-            self.add("voltage = logarithm(intensity + log_eps)")
+            line = f"{self.returns('intensity', effect)} = {self.call('light', effect, function)}"
+            self.add(*self.unless_off(effect, line))
+
+    def respond(self) -> None:
+        """What becomes of the voltage."""
         for effect, function in self.of("respond"):
-            self.add(f"{self.returns('voltage', effect)} = {self.call('respond', effect, function)}")
+            line = f"{self.returns('voltage', effect)} = {self.call('respond', effect, function)}"
+            self.add(*self.unless_off(effect, line))
 
     @staticmethod
     def returns(quantity: str, effect: Stages) -> str:
@@ -474,15 +490,17 @@ class _Writer:
         self.add(*(["leaked_before = leaked + 0.0"] if "drained" in self.states else []))
         for effect, function in self.of("drift"):
             # what rounding loses of a short step is kept for the next (Kahan), or slow leaks would stall
-            self.add(f"leak = {self.call('drift', effect, function)} * dt + leaked_rest")
-            self.add("total = leaked + leak", "leaked_rest = leak - (total - leaked)", "leaked = total")
+            leak = f"leak = {self.call('drift', effect, function)} * dt + leaked_rest"
+            rest = "leaked_rest = leak - (total - leaked)"
+            self.add(*self.unless_off(effect, leak, "total = leaked + leak", rest, "leaked = total"))
         self.add(self.change("voltage", "after"))
         self.start_phase()
         noisy = self.of("noise")
         for effect, function in noisy:
             n = effect.name
-            self.add(f"{n}_on, {n}_off = {self.call('noise', effect, function)}")
-            self.add(f"{n}_spend = ({n}_on + {n}_off) * dt + {n}_rest")
+            self.start_noise(effect)
+            rates = f"{n}_on, {n}_off = {self.call('noise', effect, function)}"
+            self.add(*self.unless_off(effect, rates, f"{n}_spend = ({n}_on + {n}_off) * dt + {n}_rest"))
         busy = ["after >= on", "after <= -off", *(f"{e.name}_spend > {e.name}_hazard" for e, _ in noisy)]
         # a crossing that waits for the end of the dead time may come although the signal returns
         busy += ["before >= on", "before <= -off"] if self.delays() else []
@@ -497,6 +515,9 @@ class _Writer:
         self.add("signal = voltage")
         if "age" in self.states:
             self.add("age += dt")
+
+    def start_noise(self, effect: Stages) -> None:
+        """What the noise of an effect is before its rates are known: nothing here, they always are."""
 
     def delays(self) -> bool:
         """Whether events that a gate holds back come later."""
@@ -558,7 +579,10 @@ class _Writer:
         self.add(
             "theta = on", "polarity = int(1)", "if change < 0.0:", "    theta = -off", "    polarity = 0"
         )
-        self.add("crossed = int(wp.floor(change / theta))", *(["passed = int(0)"] if delays else []))
+        self.add(
+            "crossed = int(whole(wp.abs(change), wp.abs(theta), 1.0 / wp.abs(theta)))",
+            *(["passed = int(0)"] if delays else []),
+        )
         if self.of("redraw"):
             self.one_by_one(begin)
             return
@@ -636,7 +660,7 @@ class _Writer:
         self.add("wait = float(0.0)", "now = age")
         self.add(f"age = now + {share} * dt")
         for effect, function in self.of("gate"):
-            self.add(f"wait = wp.max(wait, {self.call('gate', effect, function)})")
+            self.add(*self.unless_off(effect, f"wait = wp.max(wait, {self.call('gate', effect, function)})"))
         self.add("age = now")
 
     def leaks(self, share: str) -> str:
@@ -653,21 +677,31 @@ class _Writer:
 
     def leave(self, share: str) -> str:
         """Return the time at which an event leaves; events of one pixel do not overtake each other."""
-        delays = [self.call("delay", effect, function) for effect, function in self.of("delay")]
+        delays = self.of("delay")
         if not delays:
-            return f"leaving_time(clock, k, {share}, 0.0)"
-        self.add("late = float(0.0)", *(f"late += {call}" for call in delays))
+            return self.instant(share, "0.0")
+        self.add("late = float(0.0)")
+        for effect, function in delays:
+            self.add(*self.unless_off(effect, f"late += {self.call('delay', effect, function)}"))
         self.add(f"late = wp.clamp(late, 0.0, {LATEST})")
-        self.add(f"leaves = wp.max(leaves, leaving_time(clock, k, {share}, late))")
+        self.add(f"leaves = wp.max(leaves, {self.instant(share, 'late')})")
         return "leaves"
+
+    def instant(self, share: str, late: str) -> str:
+        """Return the time `late` after `share` of the step."""
+        return f"leaving_time(clock, k, {share}, {late})"
+
+    def keep(self, time: str, polarity: str, label: str) -> str:
+        """Return the call that keeps an event."""
+        code = f"{polarity} * 4 + {label}" if self.sink == "labels" else polarity
+        return f"deposit(sink, row, i, size, {time}, {code})"
 
     def event(self, share: str, polarity: str, label: str) -> None:
         """Emit an event after `share` of the step."""
         if self.sink == "counts":
             self.add(f"on_count += {polarity}", f"off_count += 1 - {polarity}")
         else:
-            code = f"{polarity} * 4 + {label}" if self.sink == "labels" else polarity
-            self.add(f"deposit(sink, row, i, size, {self.leave(share)}, {code})")
+            self.add(self.keep(self.leave(share), polarity, label))
         if "age" in self.states:
             self.add(f"age = -{share} * dt")
 

@@ -21,6 +21,14 @@ PerLayer = wp.types.vector(length=MAX_LAYERS, dtype=wp.float32)
 
 
 @wp.struct
+class Frames:
+    """Stored samples."""
+
+    values: wp.array2d[float]  # (K, N) linear intensity, or log intensity for the `log` source
+    logs: wp.array2d[float]  # (K, N) log intensity, for the `both` source
+
+
+@wp.struct
 class Layers:
     """Textures and motion of all layers, L layers at K time samples."""
 
@@ -143,8 +151,8 @@ def layers_near(layers: Layers, x: float, y: float) -> int:
 
 
 @wp.func
-def layer_intensity(layers: Layers, ground: Ground, near: int, k: int, x: float, y: float) -> float:
-    """Intensity of a pixel at sample k, composited front to back."""
+def in_front(layers: Layers, near: int, k: int, x: float, y: float) -> wp.vec2:
+    """Intensity of the layers in front of the background, and how much of it they let through."""
     light = float(0.0)
     through = float(1.0)
     left = int(near)
@@ -155,8 +163,17 @@ def layer_intensity(layers: Layers, ground: Ground, near: int, k: int, x: float,
         light += through * front[0]
         through *= 1.0 - front[1]
         if through == 0.0:
-            return light
-    return light + through * background_at(layers, ground, k, x, y)
+            left = 0
+    return wp.vec2(light, through)
+
+
+@wp.func
+def layer_intensity(layers: Layers, ground: Ground, near: int, k: int, x: float, y: float) -> float:
+    """Intensity of a pixel at sample k, composited front to back."""
+    front = in_front(layers, near, k, x, y)
+    if front[1] == 0.0:
+        return front[0]
+    return front[0] + front[1] * background_at(layers, ground, k, x, y)
 
 
 @wp.kernel(enable_backward=False)

@@ -19,6 +19,9 @@ import time
 import warnings
 from pathlib import Path
 
+import cv2
+import hdf5plugin
+import lz4.frame
 import numpy as np
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
@@ -26,11 +29,60 @@ import reference_io
 
 from dase import io
 from dase.errors import InputError
+from dase.io.sequence import Sequence
 
 SLOW = 5.0  # [s] for one file
 HUNG = 60.0  # [s] without a sign of life
 STEP = 100  # files between two signs of life
 MEMORY = 200.0  # [MB] over what the process needed before
+
+
+def with_frames(make):
+    """Return a maker of a file of events and of three frames."""
+
+    def made(path: Path, e) -> None:
+        rng = np.random.default_rng(1)
+        times, grey = np.array([0.001, 0.003, 0.005]), rng.integers(0, 256, (3, H, W), np.uint8)
+        make(path, e, (times, grey))
+
+    return made
+
+
+def full(path: Path, e, frames) -> None:
+    """Everything our own layouts can hold."""
+    flow, thresholds = np.zeros((3, 2, H, W), np.float32), np.full((2, H, W), 0.2, np.float32)
+    exposure = np.full(3, 1e-3)
+    io.write(path, Sequence(e, frames[1], frames[0], flow, thresholds, "a = 1\n" * 40, exposure))
+
+
+def aedat4(path: Path, e, frames) -> None:
+    spans = np.rint(frames[0] * 1e6).astype(int).tolist()
+    frames = [(t, t + 900, grey) for t, grey in zip(spans, frames[1], strict=True)]
+    reference_io.aedat4(path, e, frames=frames, compression=1, compress=lz4.frame.compress)
+
+
+def avi(path: Path, e, frames) -> None:
+    out = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"MJPG"), 25.0, (W, H))
+    for grey in frames[1]:
+        out.write(np.repeat(grey[..., None] // 16, 3, 2))
+    out.release()
+
+
+SAMPLES = reference_io.SAMPLES | {
+    "HDF5 with frames": (".h5", with_frames(full)),
+    "NumPy archive with frames": (".npz", with_frames(full)),
+    "AEDAT4 packed": (".aedat4", with_frames(aedat4)),
+    "MVSEC with frames": (".hdf5", with_frames(lambda path, e, f: reference_io.mvsec(path, e, frames=f))),
+    "v2e with frames": (".h5", with_frames(lambda path, e, f: reference_io.v2e(path, e, frames=f))),
+    "DSEC packed": (".h5", lambda path, e: reference_io.dsec(path, e, **hdf5plugin.Blosc(cname="zstd"))),
+    "ROS 1 packed": (
+        ".bag",
+        with_frames(lambda path, e, f: reference_io.bag(path, e, frames=f, compression="LZ4")),
+    ),
+    "AVI": (".avi", with_frames(avi)),
+}
+"""Those of the tests, and files that hold more; small sensors keep them small."""
+W, H = 48, 36
 
 
 def peak() -> float:
@@ -55,11 +107,12 @@ def run(name: str, files: int, seed: int, keep: Path, results) -> None:
     """Damage and read files of one format; put what happened into `results` after every file in a while."""
     warnings.simplefilter("error")
     rng = np.random.default_rng([seed, *name.encode()])
-    suffix, make = reference_io.SAMPLES[name]
+    suffix, make = SAMPLES[name]
     folder = Path(tempfile.mkdtemp(dir="/dev/shm" if Path("/dev/shm").is_dir() else None))
     try:
         sample = folder / f"sample{suffix}"
-        make(sample, reference_io.events(rng, 300))
+        wide = name in reference_io.SAMPLES and not name.startswith("MVSEC")
+        make(sample, reference_io.events(rng, 300, *((reference_io.W, reference_io.H) if wide else (W, H))))
         read(sample)
         before, good, slowest = peak(), 0, 0.0
         inner = [sample] if sample.is_file() else sorted(p for p in sample.iterdir() if p.is_file())
@@ -89,14 +142,14 @@ def run(name: str, files: int, seed: int, keep: Path, results) -> None:
 def main() -> int:
     """Run all formats; return how many failed."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
-    parser.add_argument("--format", action="append", choices=list(reference_io.SAMPLES))
+    parser.add_argument("--format", action="append", choices=list(SAMPLES))
     parser.add_argument("--files", type=int, default=100_000)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--keep", type=Path, default=Path(tempfile.gettempdir()))
     options = parser.parse_args()
     failed = 0
-    print(f"{'format':<22}{'files':>8}{'readable':>10}{'slowest':>10}{'memory':>10}")
-    for name in options.format or reference_io.SAMPLES:
+    print(f"{'format':<27}{'files':>8}{'readable':>10}{'slowest':>10}{'memory':>10}")
+    for name in options.format or SAMPLES:
         context = multiprocessing.get_context("spawn")
         results = context.SimpleQueue()
         arguments = (name, options.files, options.seed, options.keep, results)
@@ -132,7 +185,7 @@ def watch(process, name: str, files: int, keep: Path, results) -> int:
         errors.append(f"the process ended with {process.exitcode} after about {last[0]} files")
     if last[3] > MEMORY:
         errors.append(f"took {last[3]:.0f} MB")
-    print(f"{name:<22}{last[0]:>8}{last[1]:>10}{last[2]:>9.2f}s{last[3]:>8.0f} MB", flush=True)
+    print(f"{name:<27}{last[0]:>8}{last[1]:>10}{last[2]:>9.2f}s{last[3]:>8.0f} MB", flush=True)
     for error in errors[:5]:
         print(f"    {error}", flush=True)
     return int(bool(errors) or last[0] != files)

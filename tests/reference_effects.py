@@ -107,11 +107,13 @@ def voltage(sensor: dase.Sensor, times: np.ndarray, intensity: np.ndarray, seed:
         omega = 2 * np.pi * slow.cutoff * (slow.dark + (1 - slow.dark) * bright)
         level = second_order(times, level, omega, slow.damping)
     if setting(sensor, "voltage_noise", "sigma", 0.0) > 0:
-        streams = ("voltage_noise_respond_normal", "voltage_noise_respond_normal_2")
+        streams = ("voltage_noise_respond_uniform", "voltage_noise_respond_uniform_2")
         pixels = range(intensity.shape[1])
-        normals = [
-            [[Stream(s, seed, i).normal(k) for i in pixels] for k in range(len(times))] for s in streams
-        ]
+        first, second = np.array(
+            [[[Stream(s, seed, i).uniform(k) for i in pixels] for k in range(len(times))] for s in streams]
+        )
+        radius, angle = np.sqrt(-2 * np.log(1 - first)), 2 * np.pi * second
+        normals = radius * np.cos(angle), radius * np.sin(angle)
         level = level + voltage_noise(times, intensity, sensor, np.array(normals))
     return level
 

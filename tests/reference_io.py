@@ -261,14 +261,20 @@ class Messages:
         return [self.make(name, x=a, y=b, ts=self.stamp(c), polarity=d) for a, b, c, d in rows]
 
 
-def bag(path, e, *, ros=1, packet=500, kind="array", frames=None, origin=1_500_000_000_000_000, **options):
-    """A bag of ROS 1 or 2; `kind` is "array", or an encoding with its encoder."""
+def bag(
+    path, e, *, ros=1, packet=500, kind="array", frames=None, origin=1_500_000_000_000_000, mode="", **options
+):
+    """A bag of ROS 1 or 2; `kind` is "array", or an encoding with its encoder; `mode` is what ROS 2 packs."""
     from rosbags import rosbag1, rosbag2
 
     messages = Messages(ros)
     writer = rosbag1.Writer(path) if ros == 1 else rosbag2.Writer(path, version=9, **options)
     if ros == 1 and "compression" in options:
         writer.set_compression(rosbag1.Writer.CompressionFormat[options["compression"]])
+    if mode:
+        from rosbags.rosbag2 import CompressionFormat, CompressionMode
+
+        writer.set_compression(CompressionMode[mode], CompressionFormat.ZSTD)
     name = "dvs_msgs/msg/EventArray" if kind == "array" else "event_camera_msgs/msg/EventPacket"
     size = {"height": e.height, "width": e.width}
     t = microseconds(e) + origin
@@ -292,6 +298,18 @@ def bag(path, e, *, ros=1, packet=500, kind="array", frames=None, origin=1_500_0
             messages.put(writer, topic, name, time, **size, **fields, data=grey.reshape(-1))
 
 
+def mcap(path, e):
+    """One file of a ROS 2 bag, with packed chunks."""
+    from rosbags.rosbag2 import StoragePlugin
+
+    folder = path.with_name(f"{path.stem}_folder")
+    bag(folder, e, ros=2, mode="STORAGE", storage_plugin=StoragePlugin.MCAP)
+    (single,) = folder.glob("*.mcap")
+    single.replace(path)
+    (folder / "metadata.yaml").unlink()
+    folder.rmdir()
+
+
 SAMPLES: dict[str, tuple[str, Callable[[Path, Events], None]]] = {
     "EVT2": (".raw", written("EVT2")),
     "EVT3": (".raw", written("EVT3")),
@@ -312,6 +330,7 @@ SAMPLES: dict[str, tuple[str, Callable[[Path, Events], None]]] = {
     "array in an archive": (".npz", table),
     "ROS 1": (".bag", bag),
     "ROS 2": (".folder", lambda path, e: bag(path, e, ros=2)),
+    "MCAP": (".mcap", mcap),
 }
 """Name to suffix and a function that writes events to a path."""
 

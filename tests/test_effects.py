@@ -17,7 +17,8 @@ from dase.effects.refractory import Refractory
 from dase.effects.shot import Shot
 from dase.effects.threshold import Threshold
 from dase.kernels import pixel
-from dase.sensor import Pixels, chunks
+from dase.pixels import Pixels
+from dase.sensor import chunks
 
 
 def static(light: np.ndarray, seconds: float, samples: int) -> dase.VideoScene:

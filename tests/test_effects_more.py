@@ -11,12 +11,13 @@ import reference
 import reference_effects
 import warp as wp
 from scipy.linalg import expm
+from scipy.stats import norm
 from test_effects import KS, distance, ramp, static, tracks
 from test_pixel import by_pixel, flicker, rows, same
 
 import dase
 from dase.config import load_sensor, parse_sensor, presets
-from dase.effects import second_order
+from dase.effects import second_order, voltage_noise
 from dase.effects.bandwidth import Bandwidth
 from dase.effects.dark import Dark
 from dase.effects.dead import Dead
@@ -33,7 +34,8 @@ from dase.effects.threshold import Threshold
 from dase.effects.vignetting import Vignetting
 from dase.effects.voltage_noise import VoltageNoise
 from dase.kernels import launch
-from dase.sensor import Pixels, sample_times
+from dase.pixels import Pixels
+from dase.sensor import sample_times
 
 FURTHER = (Flicker, Vignetting, Dark, Linlog, SecondOrder, VoltageNoise, Jitter, Hot, Dead)
 STRONG = {
@@ -340,6 +342,35 @@ def noise_rates(
     scene = still(np.repeat(light, 400), 2.0, samples)
     sensor = every(effect, *others)
     return counts(scene, sensor, 2.0, device).reshape(2, len(light), 400).mean(-1) / 2.0
+
+
+@wp.kernel(enable_backward=False)
+def points(turn: wp.array[float], out: wp.array2d[float]):
+    i = wp.tid()
+    cosine, sine = voltage_noise.circle(turn[i])
+    out[i, 0] = cosine
+    out[i, 1] = sine
+
+
+def test_points_of_the_circle(device):
+    near = np.arange(9) / 8
+    turn = np.r_[np.linspace(0, 1, 4097), near[:-1] + 1e-7, near[1:] - 1e-7].astype(np.float32)
+    out = wp.empty((len(turn), 2), dtype=float, device=device)
+    wp.launch(points, len(turn), inputs=[wp.array(turn, dtype=float, device=device), out], device=device)
+    angle = 2 * np.pi * turn.astype(float)
+    np.testing.assert_allclose(out.numpy(), np.stack([np.cos(angle), np.sin(angle)], -1), atol=4e-7)
+
+
+def test_voltage_noise_is_normal(device):
+    # thresholds so small that the events tell where the voltage is; it begins settled, and half a second is
+    # 24 time constants, so its change is that of two independent values of variance 2
+    pixels, fine = 4000, 0.01
+    effect = VoltageNoise(sigma=2.0, cutoff=10.0, knee=1.0, dark=1e-6)
+    sensor = every(Threshold(on=fine, off=fine, phase=0.0), effect)
+    off, on = counts(still(np.ones(pixels), 0.5, 2), sensor, 0.5, device).astype(float)
+    moved = np.sort(fine * (on - off)) / 2
+    assert distance(moved, norm.cdf(moved)) < KS
+    assert moved.std() == pytest.approx(1, rel=4 / np.sqrt(2 * pixels))
 
 
 def test_voltage_noise_has_the_speed_of_its_spectrum(device):

@@ -11,6 +11,7 @@ from reference_io import AEDAT4_XML, UNIX_US, H, W, aedat4, events, flatbuffer
 from dase import io
 from dase.errors import InputError
 from dase.events import Events
+from dase.io import packed
 from dase.io.flatbuffer import Table
 from dase.io.sequence import Sequence
 
@@ -180,13 +181,11 @@ def test_aedat4_bombs_do_not_unpack(tmp_path):
 
 
 def test_without_the_library_the_extra_is_named(tmp_path, rng, monkeypatch):
-    from dase.io import aedat4 as module
-
     def missing(name):
         raise ImportError(name)
 
     aedat4(tmp_path / "a.aedat4", events(rng, 50), compression=1)
-    monkeypatch.setattr(module, "import_module", missing)
+    monkeypatch.setattr(packed, "import_module", missing)
     with pytest.raises(InputError, match=r'pip install "dase\[aedat\]"'):
         io.read(tmp_path / "a.aedat4")
 

@@ -18,7 +18,7 @@ from dase.events import Events
 from dase.io import arrays, binary, evt2, evt3, evt21, source, text
 from dase.io.sequence import Sequence
 
-NEEDS = {"ROS 1": "rosbags", "ROS 2": "rosbags"}
+NEEDS = {"ROS 1": "rosbags", "ROS 2": "rosbags", "MCAP": "rosbags"}
 WRITTEN = ("EVT2", "EVT3", "DAT", "AEDAT2", "text", "zip of text", "HDF5", "NumPy archive")
 
 
@@ -341,7 +341,7 @@ def test_damaged_files_give_a_sentence_or_events(tmp_path, rng, name):
     path = sample(tmp_path, name, events(rng, 300))
     inner = [path] if path.is_file() else sorted(p for p in path.iterdir() if p.is_file())
     contents = [file.read_bytes() for file in inner]
-    for k in range(60 if name.startswith("ROS") else 150):
+    for k in range(60 if name in NEEDS else 150):
         which = k % len(inner)
         inner[which].write_bytes(mutated(contents[which], rng))
         for act in (io.read, lambda path: list(io.stream(path, chunk=100))):

@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+import contextlib
+import sqlite3
 import struct
+import subprocess
+import sys
 
 import numpy as np
 import pytest
-from reference_io import H, W, bag, events, microseconds
+from reference_io import H, W, bag, events, mcap, microseconds
 
 from dase import io
 from dase.errors import InputError
-from dase.io import evt3, ros, ros_messages
+from dase.io import evt3, packed, ros_messages
 from dase.io.sequence import Sequence
 
 pytest.importorskip("rosbags")
@@ -103,13 +107,105 @@ def test_mcap(tmp_path, rng):
     assert_same(io.read(tmp_path / "a").events, e)
 
 
-def test_packed_bombs_stop(tmp_path, rng, monkeypatch):
-    bag(tmp_path / "a.bag", events(rng, 700), compression="BZ2")
-    monkeypatch.setattr(ros, "LARGEST", 1000)
+@pytest.mark.parametrize("mode", ["FILE", "MESSAGE"])
+def test_packed_bags_of_ros_2(tmp_path, rng, mode):
+    e = events(rng, 700)
+    bag(tmp_path / "a", e, ros=2, mode=mode)
+    assert_same(io.read(tmp_path / "a").events, e)
+
+
+@pytest.mark.parametrize("kind", ["BZ2", "LZ4", "MESSAGE", "STORAGE"])
+def test_what_unpacks_to_too_much_is_not_unpacked(tmp_path, rng, monkeypatch, kind):
+    path, e = tmp_path / "a", events(rng, 700)
+    if kind == "STORAGE":
+        path = tmp_path / "a.mcap"
+        mcap(path, e)
+    else:
+        bag(path, e, **({"ros": 2, "mode": kind} if kind == "MESSAGE" else {"compression": kind}))
+    assert_same(io.read(path).events, e)
+    monkeypatch.setattr(packed, "LARGEST", 1000)
     notes = []
-    got = io.read(tmp_path / "a.bag", size=(W, H), notes=notes).events
+    got = io.read(path, size=(W, H), notes=notes).events
     assert len(got) == 0
-    assert any("damaged or cut short" in note for note in notes)
+    assert any("larger than it may be" in note and note.kind == "refused" for note in notes)
+
+
+def bomb(zstd, count):
+    """Zeros packed to almost nothing."""
+    packer = zstd.ZstdCompressor()
+    out = [packer.compress(bytes(1 << 20)) for _ in range(count)]
+    return b"".join(out) + packer.flush()
+
+
+@pytest.mark.parametrize("mode", ["FILE", "MESSAGE", "STORAGE"])
+def test_bombs_of_ros_2_take_little_memory_and_disk(tmp_path, rng, mode):
+    """400 MB of zeros in 40 KB, in every place where ROS 2 packs."""
+    zstd = pytest.importorskip("backports.zstd")
+    path, e = tmp_path / "a", events(rng, 700)
+    if mode == "STORAGE":
+        path = tmp_path / "a.mcap"
+        mcap(path, e)
+        content = path.read_bytes()
+        packed_at = content.index(zstd.compress(b"")[:4])  # of the chunk: its sizes stand before it
+        (size,) = struct.unpack_from("<Q", content, packed_at - 8)
+        data = bomb(zstd, 400)
+        record = content.rindex(b"\x06", 0, packed_at)
+        head = content[record + 9 : packed_at - 8]
+        head = head[:16] + struct.pack("<Q", 400 << 20) + bytes(4) + head[28:]  # without a check sum
+        body = head + struct.pack("<Q", len(data)) + data
+        whole = content[:record] + b"\x06" + struct.pack("<Q", len(body)) + body
+        path.write_bytes(whole + b"\x02" + struct.pack("<Q", 20) + bytes(20) + content[-8:])
+        assert size < 1 << 20
+    elif mode == "FILE":
+        bag(path, e, ros=2, mode=mode)
+        (single,) = path.glob("*.zstd")
+        single.write_bytes(bomb(zstd, 400))
+    else:
+        bag(path, e, ros=2, mode=mode)
+        (single,) = path.glob("*.db3")
+        with contextlib.closing(sqlite3.connect(single)) as database:
+            database.execute("UPDATE messages SET data = ?", (bomb(zstd, 400),))
+            database.commit()
+    script = """
+import resource, sys
+from dase import io
+from dase.errors import InputError
+peak = lambda: resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+import rosbags.rosbag1, rosbags.rosbag2
+before = peak()
+notes = []
+try:
+    print(len(io.read(sys.argv[1], size=(240, 180), notes=notes).events), *notes)
+except InputError as error:
+    print(error)
+print(peak() - before)
+"""
+    done = subprocess.run(
+        [sys.executable, "-c", script, str(path)], capture_output=True, text=True, check=True
+    )
+    said, memory = done.stdout.splitlines()
+    assert "larger than it may be" in said or "more than 100 times is refused" in said
+    assert float(memory) < 150
+
+
+def test_rosbags_is_left_as_it_was(tmp_path, rng):
+    from rosbags.rosbag1 import reader as first
+    from rosbags.rosbag2 import reader as second
+    from rosbags.rosbag2 import storage_mcap
+
+    def state():
+        return dict(first.decompressors), dict(storage_mcap.DECOMPRESSORS), second.zstd
+
+    before = state()
+    bag(tmp_path / "a.bag", events(rng, 2000, step_us=2000))  # longer than events may come late
+    one, two = io.stream(tmp_path / "a.bag", chunk=100), io.stream(tmp_path / "a.bag", chunk=100)
+    next(one)
+    next(two)
+    assert state() != before
+    one.close()
+    assert state() != before
+    two.close()
+    assert state() == before
 
 
 def test_bags_without_events(tmp_path, rng):

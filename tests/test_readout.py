@@ -27,7 +27,7 @@ from dase.effects.stream import order
 from dase.effects.threshold import Threshold
 from dase.effects.timestamp import Timestamp
 from dase.outlet import Outlet
-from dase.sensor import Pixels
+from dase.pixels import Pixels
 
 WIDTH, HEIGHT = 13, 11
 STREAM = (RowScan, Readout, Timestamp)

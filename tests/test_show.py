@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 
-from dase import io, show
+from dase import io, show, units
 from dase.errors import InputError
 from dase.events import Events
 from dase.io.sequence import Sequence
@@ -95,7 +95,7 @@ def test_nothing_to_count():
     ],
 )
 def test_seconds(value, text):
-    assert show.seconds(value) == text
+    assert units.seconds(value) == text
 
 
 def test_default_window_is_a_round_number(rng):

@@ -19,6 +19,8 @@ from dase.effects.latency import Latency
 from dase.effects.leak import Leak
 from dase.effects.linlog import Linlog
 from dase.effects.mismatch import Mismatch
+from dase.effects.optics import SceneEffect as SceneEffect
+from dase.effects.optics_blur import OpticsBlur
 from dase.effects.readout import Readout
 from dase.effects.refractory import Refractory
 from dase.effects.row_scan import RowScan
@@ -34,6 +36,7 @@ from dase.errors import InputError, nearest
 
 _ORDER = (
     # light
+    OpticsBlur,
     Flicker,
     Vignetting,
     Dark,

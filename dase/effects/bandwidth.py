@@ -9,6 +9,7 @@ from typing import ClassVar
 import warp as wp
 
 from dase.effects.base import Effect, parameter
+from dase.kernels.lanes import exponential
 
 
 @wp.func
@@ -17,7 +18,7 @@ def lowpass(
 ):
     """First-order low-pass, exact for an input that runs straight between samples."""
     x = 2.0 * wp.pi * cutoff * (dark + (1.0 - dark) * wp.clamp(intensity, 0.0, 1.0)) * dt
-    decay = wp.exp(-x)
+    decay = exponential(-x)
     # share of the input's step by which the output lags behind a ramp; (1 - e^-x)/x loses digits near 0
     lag = 1.0 - 0.5 * x
     if x > 1.0e-3:

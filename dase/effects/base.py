@@ -147,6 +147,7 @@ class Effect:
             states=self.states,
             delays=self.delays(),
             label=LABELS.index(self.label),
+            off=tuple((p.name, p.off) for p in self.parameters() if p.off is not None),
         )
 
     @classmethod

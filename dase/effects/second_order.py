@@ -9,6 +9,7 @@ from typing import ClassVar
 import warp as wp
 
 from dase.effects.base import Effect, parameter
+from dase.kernels.lanes import exponential
 
 
 @wp.func
@@ -18,16 +19,16 @@ def impulse(x: float, damping: float):
     dh = float(0.0)
     if damping < 1.0:
         w = wp.sqrt((1.0 - damping) * (1.0 + damping))
-        decay = wp.exp(-damping * x)
+        decay = exponential(-damping * x)
         h = decay * wp.sin(w * x) / w
         dh = decay * wp.cos(w * x) - damping * h
     else:
         w = wp.sqrt((damping - 1.0) * (damping + 1.0))
-        fast = wp.exp(-(damping + w) * x)
-        slow = wp.exp(-x / (damping + w))
+        fast = exponential(-(damping + w) * x)
+        slow = exponential(-x / (damping + w))
         z = w * x
         # the difference of nearly equal numbers loses digits
-        h = wp.exp(-damping * x) * x * (1.0 + z * z / 6.0 * (1.0 + z * z / 20.0))
+        h = exponential(-damping * x) * x * (1.0 + z * z / 6.0 * (1.0 + z * z / 20.0))
         if z > 0.3:
             h = 0.5 * (slow - fast) / w
         dh = 0.5 * (slow + fast) - damping * h

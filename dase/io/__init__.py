@@ -12,9 +12,10 @@ A new format is a module with a `Format`, and one line in FORMATS.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import AbstractContextManager
 from dataclasses import replace
+from math import isfinite
 from os import PathLike
 from pathlib import Path
 
@@ -39,11 +40,14 @@ from dase.io import (
 )
 from dase.io import h5 as h5
 from dase.io import npz as npz
+from dase.io.format import Format as Format
+from dase.io.rules import TooLateError
 from dase.io.sequence import Sequence as Sequence
 from dase.io.sequence import Writer as Writer
 from dase.io.sequence import replacing as replacing
 from dase.io.source import CHUNK, Size, Source
-from dase.io.source import Format as Format
+from dase.io.source import Note as Note
+from dase.io.source import Picture as Picture
 
 FORMATS: tuple[Format, ...] = (
     ecf.FORMAT,
@@ -134,6 +138,24 @@ def stream(
     return find(path).stream(source, chunk)
 
 
+def pictures(
+    path: str | PathLike[str], *, size: Size | None = None, notes: list[str] | None = None
+) -> Iterator[Picture]:
+    """Yield the frames of a file one by one, as `read` gives them.
+
+    Times [s] are not a number where nothing tells them.
+
+    Args:
+        path: What to read; its content chooses the format, then its suffix.
+        size: Columns and rows of the sensor, where the file does not say or says it wrongly.
+        notes: Gets sentences about what was skipped, repaired or guessed.
+
+    Raises:
+        InputError: As for `read`.
+    """
+    return find(path).pictures(_source(path, size, notes))
+
+
 def create(path: str | PathLike[str], *, format: str | None = None) -> AbstractContextManager[Writer]:
     """Open a file for writing, in the format of its suffix or of a name.
 
@@ -195,34 +217,61 @@ def convert(
     target: str | PathLike[str],
     *,
     format: str | None = None,
+    size: Size | None = None,
     with_frames: bool = True,
     notes: list[str] | None = None,
+    progress: Callable[[int], object] = lambda count: None,
 ) -> int:
-    """Convert a file and return its number of events.
+    """Convert a file piece by piece, whatever its size, and return its number of events.
+
+    Only a file whose times go back by more than a moment is held in memory to be sorted, and what goes into
+    an archive of NumPy.
 
     Args:
         source: Any file that `read` takes.
         target: File to write.
         format: Name of its format; None goes by its suffix.
-        with_frames: Take frames along where `target` can hold them; the whole file is then held in memory.
-            Otherwise events stream through, whatever the size of the file.
+        size: Columns and rows of the sensor, where `source` does not say or says it wrongly.
+        with_frames: Take frames along where `target` can hold them.
         notes: Gets sentences about what was skipped, repaired or guessed.
+        progress: Is told how many events were written since it was told last.
 
     Raises:
         InputError: As for `read` and `create`.
     """
-    if with_frames and "frames" in writable(target, format).keeps:
-        sequence = read(source, notes=notes)
-        if sequence.frames is None or sequence.frame_times is None:
-            sequence = replace(sequence, frames=None, frame_times=None, frame_exposure=None, flow=None)
-        write(target, sequence, format=format)
-        return len(sequence.events)
+    notes = [] if notes is None else notes
+    taken, keeps = _source(source, size, notes), writable(target, format).keeps
     total = 0
-    with create(target, format=format) as writer:
-        for part in stream(source, notes=notes):
-            writer.events(part)
-            total += len(part)
+    try:
+        with create(target, format=format) as writer:
+            for part in find(source).stream(taken, CHUNK):
+                writer.events(part)
+                total += len(part)
+                progress(len(part))
+            if with_frames and "frames" in keeps:
+                _add_frames(taken, writer)
+                _add_beside(taken, writer)
+    except TooLateError:
+        sequence = replace(find(source).read(taken), flow=None)
+        keeps_frames = with_frames and "frames" in keeps and sequence.frame_times is not None
+        write(target, sequence if keeps_frames else Sequence(sequence.events), format=format)
+        total = len(sequence.events)
     return total
+
+
+def _add_frames(source: Source, writer: Writer) -> None:
+    for grey, time, exposure, flow in find(source.path).pictures(source):
+        if not isfinite(time):
+            return source.note("frames without times cannot be converted: left out", "refused", "frames")
+        writer.frame(float(time), grey, flow, exposure=exposure)
+
+
+def _add_beside(source: Source, writer: Writer) -> None:
+    thresholds, configuration = find(source.path).beside(source)
+    if thresholds is not None:
+        writer.thresholds(thresholds)
+    if configuration is not None:
+        writer.configuration(configuration)
 
 
 def _source(path: str | PathLike[str], size: Size | None, notes: list[str] | None) -> Source:

@@ -27,8 +27,9 @@ from numpy.typing import NDArray
 from dase.errors import InputError
 from dase.events import Events
 from dase.io.binary import EventWriter, Rollover, records
+from dase.io.format import camera_format
 from dase.io.sequence import Writer, writing
-from dase.io.source import Piece, Size, Source, camera_format, guess_size
+from dase.io.source import Piece, Size, Source, guess_size
 
 LONGEST = 1 << 21  # [bytes] of a header: jAER stores all its preferences
 END = b"#End Of ASCII Header\r\n"
@@ -160,9 +161,11 @@ def pieces(source: Source) -> Iterator[Piece]:
         y = np.uint16(height - 1) - _bits(address, form.y)
         yield Piece(t, x, y, (address >> form.p) & 1 == form.on)
     if samples:
-        source.note(f"{samples} samples of frames and motion sensors: skipped")
+        sentence = f"{samples} samples of frames and motion sensors: skipped"
+        source.note(sentence, "refused", "samples", samples)
     if special:
-        source.note(f"{special} special events (external signals, or noise labelled by v2e): skipped")
+        sentence = f"{special} special events (external signals, or noise labelled by v2e): skipped"
+        source.note(sentence, "refused", "special", special)
 
 
 def _bits(address: NDArray[np.uint32], place: tuple[int, int]) -> NDArray[np.uint16]:

@@ -18,9 +18,7 @@ from __future__ import annotations
 
 import struct
 from collections.abc import Callable, Iterator
-from contextlib import suppress
 from dataclasses import dataclass
-from importlib import import_module
 from typing import Any, TypeVar
 from xml.etree import ElementTree
 
@@ -28,14 +26,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dase.errors import InputError
-from dase.io import frames
+from dase.io import packed
 from dase.io.flatbuffer import Table
-from dase.io.source import Frames, Piece, Size, Source, camera_format, join, missing_extra
+from dase.io.format import camera_format
+from dase.io.source import Picture, Piece, Size, Source, join
 
 T = TypeVar("T")
 
 MAGIC = b"#!AER-DAT4.0\r\n"
-LARGEST = 1 << 26  # [bytes] of an unpacked packet
 LONGEST = 1 << 24  # [bytes] of the header
 PART = 1 << 17  # events joined before they are handed on: packets hold a few hundred
 EVENT = np.dtype([("t", "<i8"), ("x", "<i2"), ("y", "<i2"), ("p", "u1"), ("", "V3")])
@@ -96,29 +94,11 @@ def _streams(text: bytes) -> tuple[tuple[int, str, Size | None], ...]:
 def _unpacker(compression: int) -> Callable[[bytes], bytes]:
     if compression == 0:
         return lambda data: data
-    if compression in (1, 2):
-        make = _library("lz4.frame").LZ4FrameDecompressor
-    elif compression in (3, 4):
-        make = _library("compression.zstd", "backports.zstd").ZstdDecompressor
-    else:
+    make = {1: packed.lz4, 2: packed.lz4, 3: packed.zstd, 4: packed.zstd}.get(compression)
+    if make is None:
         raise InputError(f"its compression has the unknown number {compression}")
-
-    def unpack(data: bytes) -> bytes:
-        unpacker = make()
-        out = bytes(unpacker.decompress(data, max_length=LARGEST))
-        if not unpacker.eof:
-            raise InputError("a packet is cut short, or larger than it may be")
-        return out
-
-    return unpack
-
-
-def _library(*names: str) -> Any:
-    """Return the first of these modules that is installed."""
-    for name in names:
-        with suppress(ImportError):
-            return import_module(name)
-    raise missing_extra("compressed AEDAT 4", "aedat")
+    make()  # what is missing is said once, not for every packet
+    return packed.unpacker(make)
 
 
 def _packets(source: Source, kind: str, parse: Callable[[Table], T]) -> Iterator[T]:
@@ -128,7 +108,7 @@ def _packets(source: Source, kind: str, parse: Callable[[Table], T]) -> Iterator
     if stream is None:
         return
     if sum(name == kind for _, name, _ in header.streams) > 1:
-        source.note(f"holds several streams of type {kind}: the first was read")
+        source.note(f"holds several streams of type {kind}: the first was read", "assumed", "streams")
     unpack = _unpacker(header.compression)
     damaged = 0
     with source.path.open("rb") as file:
@@ -138,7 +118,7 @@ def _packets(source: Source, kind: str, parse: Callable[[Table], T]) -> Iterator
             number, size = struct.unpack("<ii", file.read(8))
             place += 8 + size
             if size < 0 or place > header.end:
-                source.note("damaged or cut short: read up to there")
+                source.note("damaged or cut short: read up to there", "refused", "damage", 1)
                 break
             if number == stream[0]:
                 try:
@@ -148,7 +128,7 @@ def _packets(source: Source, kind: str, parse: Callable[[Table], T]) -> Iterator
                     continue
                 yield parsed
     if damaged:
-        source.note(f"{damaged} damaged packets of type {kind}: skipped")
+        source.note(f"{damaged} damaged packets of type {kind}: skipped", "refused", "damage", damaged)
 
 
 def pieces(source: Source) -> Iterator[Piece]:
@@ -179,21 +159,10 @@ def size(source: Source) -> Size | None:
     return stream[1]
 
 
-def read_frames(source: Source) -> Frames | None:
-    """Read the frames with their exposures, or None."""
-    spans: list[tuple[int, int]] = []
-
-    def loaded() -> Iterator[NDArray[np.uint8]]:
-        for pixels, span in _packets(source, "FRME", _frame):
-            spans.append(span)
-            yield pixels
-
-    grey = frames.stack(loaded())
-    if not len(grey):
-        return None
-    begin, end = np.array(spans, np.int64).T
-    exposure = (end - begin) / 1e6
-    return Frames(grey, begin + (end - begin) / 2, exposure if exposure.any() else None)
+def pictures(source: Source) -> Iterator[Picture]:
+    """Yield the frames with their exposures [us]."""
+    for grey, (begin, end) in _packets(source, "FRME", _frame):
+        yield Picture(grey, begin + (end - begin) / 2, (end - begin) / 1e6)
 
 
 def _frame(packet: Table) -> tuple[NDArray[np.uint8], tuple[int, int]]:
@@ -220,5 +189,5 @@ FORMAT = camera_format(
     matches=lambda path, head: head.startswith(MAGIC[:10]),
     pieces=pieces,
     size=size,
-    frames=read_frames,
+    pictures=pictures,
 )

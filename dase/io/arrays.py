@@ -20,9 +20,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dase.errors import InputError
-from dase.io import npz
+from dase.io import npz, rules
+from dase.io.format import Format, camera_format, largest
 from dase.io.sequence import Sequence, coordinates, reading
-from dase.io.source import Format, Piece, Source, camera_format, refuse_bomb
+from dase.io.source import Beside, Picture, Piece, Source, refuse_bomb
 
 NPY = b"\x93NUMPY"
 ZIP = b"PK\x03\x04"
@@ -54,9 +55,10 @@ def _header(stream: IO[bytes], packed: int, unpacked: int) -> tuple[tuple[int, .
     return shape, kind
 
 
-def _slices(stream: IO[bytes], count: int, kind: np.dtype[Any]) -> Iterator[NDArray[Any]]:
-    for i in range(0, count, PART):
-        size = min(PART, count - i) * kind.itemsize
+def _slices(stream: IO[bytes], count: int, kind: np.dtype[Any], part: int = 0) -> Iterator[NDArray[Any]]:
+    part = part or PART
+    for i in range(0, count, part):
+        size = min(part, count - i) * kind.itemsize
         data = stream.read(size)
         if len(data) != size:
             raise InputError("ends before its events do")
@@ -76,9 +78,10 @@ def _own_pieces(source: Source) -> Iterator[Piece]:
     with zipfile.ZipFile(source.path) as archive, ExitStack() as stack:
         streams: list[Iterator[NDArray[Any]]] = []
         lengths: list[int] = []
-        for name in npz.EVENT_KEYS:
-            if f"{name}.npy" not in archive.NameToInfo:
-                return  # frames alone, or refused by `_own_size`
+        if any(f"{name}.npy" not in archive.NameToInfo for name in npz.EVENT_KEYS):
+            return  # frames alone, or refused by `_own_size`
+        labelled = "label.npy" in archive.NameToInfo
+        for name in (*npz.EVENT_KEYS, "label") if labelled else npz.EVENT_KEYS:
             info = archive.getinfo(f"{name}.npy")
             stream = stack.enter_context(archive.open(info))
             shape, kind = _header(stream, info.compress_size, info.file_size)
@@ -86,15 +89,52 @@ def _own_pieces(source: Source) -> Iterator[Piece]:
                 raise InputError(f"'{name}' must be one number per event, got shape {shape}")
             lengths.append(shape[0])
             streams.append(_slices(stream, shape[0], kind))
-        for t, x, y, p in zip(*streams, strict=True):
+        for t, x, y, p, *label in zip(*streams, strict=True):
             whole = t.astype(np.int64 if t.dtype.kind in "iu" else np.float64)
-            yield Piece(whole, coordinates(x, "x"), coordinates(y, "y"), p > 0)
+            yield Piece(whole, coordinates(x, "x"), coordinates(y, "y"), p, *label)
+
+
+def _maps(archive: zipfile.ZipFile, name: str, stack: ExitStack) -> Iterator[NDArray[Any]]:
+    """Yield the frames, (H, W), or the flow, (2, H, W), of an archive one by one."""
+    info = archive.getinfo(f"{name}.npy")
+    stream = stack.enter_context(archive.open(info))
+    shape, kind = _header(stream, info.compress_size, info.file_size)
+    if len(shape) != (3 if name == "frames" else 4) or (name == "frames" and kind != np.uint8):
+        raise InputError(f"'{name}' must be {'uint8 (F, H, W)' if name == 'frames' else '(F, 2, H, W)'}")
+    count = int(np.prod(shape[1:]))
+    for row in _slices(stream, shape[0] * count, kind, count):
+        yield row.reshape(shape[1:])
+
+
+def _own_pictures(source: Source) -> Iterator[Picture]:
+    """Yield the frames [us], one by one, with the flow at them."""
+    with zipfile.ZipFile(source.path) as archive, ExitStack() as stack:
+        members = {name for name in npz.KEYS if f"{name}.npy" in archive.NameToInfo}
+        if "frames" not in members:
+            return
+        small = {name: npz.load(archive, name) for name in npz.FRAME_KEYS[1:] if name in members}
+        times, exposure = npz.frame_times(small)
+        rows = [_maps(archive, name, stack) for name in ("frames", "flow") if name in members]
+        for k, (grey, *flow) in enumerate(zip(*rows, strict=True)):
+            yield Picture(
+                grey,
+                np.nan if times is None else times[k] * 1e6,
+                0.0 if exposure is None else float(exposure[k]),
+                *flow,
+            )
 
 
 def _read_own(source: Source) -> Sequence:
     with reading(source.path, "a NumPy archive"), zipfile.ZipFile(source.path) as archive:
         _check(archive)
-    return npz.read(source.path)
+    return npz.read(source)
+
+
+def _beside(source: Source) -> Beside:
+    with reading(source.path, "a NumPy archive"), zipfile.ZipFile(source.path) as archive:
+        _check(archive)
+        names = (n for n in ("thresholds", "configuration") if f"{n}.npy" in archive.NameToInfo)
+        return npz.beside({name: npz.load(archive, name) for name in names})
 
 
 def _own_size(source: Source) -> tuple[int, int] | None:
@@ -118,14 +158,7 @@ def _own_size(source: Source) -> tuple[int, int] | None:
     if wh.shape != (2,) or wh.dtype.kind not in "iu":
         raise InputError(f"'wh' must be two integers, got {wh.dtype} of shape {wh.shape}")
     size = int(wh[0]), int(wh[1])
-    if size[0] == size[1]:
-        return size
-    fits = turned = True
-    for piece in _own_pieces(source):
-        if len(piece.t):
-            x, y = int(piece.x.max()), int(piece.y.max())
-            fits, turned = fits and x < size[0] and y < size[1], turned and x < size[1] and y < size[0]
-    return size if fits or not turned else size[::-1]
+    return size if size[0] == size[1] else rules.turned(source, size, largest(_own_pieces(source)))
 
 
 def _fields(kind: np.dtype[Any]) -> list[str] | None:
@@ -167,7 +200,7 @@ def _table_pieces(source: Source) -> Iterator[Piece]:
         for rows in _slices(stream, count, kind):
             t, x, y, p = (rows[name] for name in names)
             time = t.astype(np.float64) if t.dtype.kind == "f" else t.astype(np.int64) / 1e6
-            yield Piece(time, coordinates(x, names[1]), coordinates(y, names[2]), p > 0)
+            yield Piece(time, coordinates(x, names[1]), coordinates(y, names[2]), p)
 
 
 def _matches_table(path: Path, head: bytes) -> bool:
@@ -184,7 +217,12 @@ def _matches_table(path: Path, head: bytes) -> bool:
 
 
 _own = camera_format(
-    name="NumPy archive", suffixes=(), matches=_matches_table, pieces=_own_pieces, size=_own_size
+    name="NumPy archive",
+    suffixes=(),
+    matches=_matches_table,
+    pieces=_own_pieces,
+    size=_own_size,
+    pictures=_own_pictures,
 )
 
 OWN = Format(
@@ -193,6 +231,8 @@ OWN = Format(
     matches=lambda path, head: head.startswith(ZIP),
     read=_read_own,
     stream=_own.stream,
+    pictures=_own.pictures,
+    beside=_beside,
     create=npz.create,
     keeps=frozenset({"events", "frames", "flow", "thresholds", "configuration"}),
 )

@@ -32,7 +32,8 @@ def records(source: Source, begin: int, kind: Any) -> Iterator[NDArray[Any]]:
             rest = block[count * size :]
             yield np.frombuffer(block, kind, count)
     if rest:
-        source.note(f"{len(rest)} bytes at the end are no whole record of {size} bytes: skipped")
+        sentence = f"{len(rest)} bytes at the end are no whole record of {size} bytes: skipped"
+        source.note(sentence, "refused", "damage", 1)
 
 
 class Rollover:
@@ -65,6 +66,16 @@ class Rollover:
         self._last, self._turns = int(values[-1]), int(turns[-1])
         values += turns * self._range
         return values
+
+
+def set_bits(octets: NDArray[np.uint8]) -> NDArray[np.intp]:
+    """Return the places of the bits that are set in bytes, the lowest first."""
+    filled = np.flatnonzero(octets != 0)
+    if 2 * len(filled) > len(octets):
+        return np.flatnonzero(np.unpackbits(octets, bitorder="little").view(np.bool_))
+    # where one bit in ten or fewer is set NumPy looks for each on its own, which is slower
+    bits = np.flatnonzero(np.unpackbits(octets[filled], bitorder="little").view(np.bool_))
+    return filled.take(bits >> 3) << 3 | bits & 7
 
 
 def bridges(

@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import mmap
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 import h5py
 import numpy as np
@@ -19,9 +18,11 @@ from dase.io.source import Piece, Size, Source, missing_extra, refuse_bomb
 HDF5 = b"\x89HDF\r\n\x1a\n"
 HEAP = b"GCOL\x01\0\0\0"
 PART = 1 << 20  # events read at once
+BLOCK = 1 << 24  # [bytes] searched at once
 BLOSC, BLOSC2, ZSTD, LZ4 = 32001, 32026, 32015, 32004  # numbers of filters that hdf5plugin brings
 
 _plugin_tried = False
+_sound: set[tuple[str, int, int]] = set()  # large files whose heaps were checked
 
 
 @contextmanager
@@ -43,19 +44,41 @@ def check_heaps(path: Path) -> None:
     A heap is "GCOL", version 1, three zeros, u64 size with this head; then objects: u16 number, 6 bytes, u64
     length, data padded to 8 bytes; number 0 is the hole at the end, whose length counts its head.
     """
-    with path.open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as content:
-        begin = 0
-        while (begin := content.find(HEAP, begin)) >= 0:
-            end = begin + int.from_bytes(content[begin + 8 : begin + 16], "little")
-            place = begin + 16
-            while place + 16 <= min(end, len(content)):
-                length = int.from_bytes(content[place + 8 : place + 16], "little")
-                hole = content[place : place + 2] == b"\0\0"
-                step = length if hole else 16 + -(-length // 8) * 8
-                if step < 16 or place + step > end:
-                    raise InputError("a heap of texts is damaged")
-                place += step
-            begin += len(HEAP)
+    state = path.stat()
+    key = (str(path.resolve()), state.st_mtime_ns, state.st_size)
+    if key in _sound:
+        return
+    with path.open("rb") as file:
+        for begin in _heaps(file):
+            _check_heap(file, begin, state.st_size)
+    if state.st_size > BLOCK:  # a small one is looked at again sooner than its time tells that it changed
+        _sound.add(key)
+
+
+def _heaps(file: BinaryIO) -> Iterator[int]:
+    """Yield where heaps begin; in blocks, for a file may be larger than the memory."""
+    place, tail = 0, b""
+    while block := file.read(BLOCK):
+        text = tail + block
+        found = -1
+        while (found := text.find(HEAP, found + 1)) >= 0:
+            yield place - len(tail) + found
+        file.seek(place := place + len(block))
+        tail = text[1 - len(HEAP) :]
+
+
+def _check_heap(file: BinaryIO, begin: int, length: int) -> None:
+    file.seek(begin + 8)
+    end = begin + int.from_bytes(file.read(8), "little")
+    place = begin + 16
+    while place + 16 <= min(end, length):
+        file.seek(place)
+        head = file.read(16)
+        size = int.from_bytes(head[8:], "little")
+        step = size if head[:2] == b"\0\0" else 16 + -(-size // 8) * 8
+        if step < 16 or place + step > end:
+            raise InputError("a heap of texts is damaged")
+        place += step
 
 
 def has(path: Path, head: bytes, *names: str) -> bool:
@@ -93,17 +116,17 @@ def _filters(found: Any) -> list[int]:
 
 
 def columns(
-    file: Any, names: tuple[str, str, str, str], part: int = 0
-) -> Iterator[tuple[NDArray[Any], NDArray[np.uint16], NDArray[np.uint16], NDArray[np.bool_]]]:
-    """Yield slices of four columns t, x, y and p; times as the file holds them, ON where p is above zero."""
-    found = [dataset(file, name, 1) for name in names]
+    file: Any, names: tuple[str, str, str, str], beside: tuple[str, ...] = ()
+) -> Iterator[tuple[NDArray[Any], ...]]:
+    """Yield slices of the columns t, x, y, p and others beside; all but x and y as the file holds them."""
+    found = [dataset(file, name, 1) for name in (*names, *beside)]
     length = len(found[0])
-    for name, column in zip(names, found, strict=True):
+    for name, column in zip((*names, *beside), found, strict=True):
         if len(column) != length:
             raise InputError(f"'{name}' has {len(column)} entries, '{names[0]}' {length}")
-    for i in range(0, length, part or PART):
-        t, x, y, p = (column[i : i + (part or PART)] for column in found)
-        yield t, coordinates(x, names[1]), coordinates(y, names[2]), p > 0
+    for i in range(0, length, PART):
+        t, x, y, *others = (column[i : i + PART] for column in found)
+        yield t, coordinates(x, names[1]), coordinates(y, names[2]), *others
 
 
 def largest(file: Any, x: str, y: str) -> Size:

@@ -20,8 +20,9 @@ from dase.errors import InputError
 from dase.events import Events
 from dase.io import raw
 from dase.io.binary import EventWriter, Rollover, records
+from dase.io.format import camera_format
 from dase.io.sequence import Writer, writing
-from dase.io.source import Piece, Source, camera_format
+from dase.io.source import Piece, Source
 
 TYPES = (0, 12)
 RECORD = 8  # [bytes]

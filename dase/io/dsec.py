@@ -21,7 +21,8 @@ import numpy as np
 
 from dase.errors import InputError
 from dase.io.columns import columns, has, largest, opened, reader, scalar
-from dase.io.source import Piece, Size, Source, camera_format
+from dase.io.format import camera_format
+from dase.io.source import Piece, Size, Source
 
 GROUPS = ("events", "prophesee/left")
 
@@ -41,7 +42,7 @@ def _names(group: str) -> tuple[str, str, str, str]:
 def _parts(file: Any, source: Source) -> Iterator[Piece]:
     offset = scalar(file, "t_offset")
     if offset:
-        source.note(f"t_offset: add {offset / 1e6:.6f} s for the clock of the frames")
+        source.note(f"t_offset: add {offset / 1e6:.6f} s for the clock of the frames", "said", "offset")
     for t, x, y, p in columns(file, _names(_group(file))):
         yield Piece(t.astype(np.float64 if t.dtype.kind == "f" else np.int64), x, y, p)
 

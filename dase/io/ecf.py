@@ -26,8 +26,9 @@ from numpy.typing import NDArray
 from dase.errors import InputError
 from dase.io import raw
 from dase.io.columns import PART, has, opened, reader
+from dase.io.format import camera_format
 from dase.io.sequence import coordinates
-from dase.io.source import Piece, Size, Source, camera_format, refuse_bomb
+from dase.io.source import Piece, Size, Source, refuse_bomb
 
 FILTER = 0x8ECF
 MOST = 65535  # events of a buffer
@@ -169,7 +170,7 @@ def _parts(file: Any, source: Source) -> Iterator[Piece]:
         for i in range(0, len(events), PART):
             part = events[i : i + PART]
             t, x, y = part["t"].astype(np.int64), coordinates(part["x"], "x"), coordinates(part["y"], "y")
-            yield Piece(t, x, y, part["p"] > 0)
+            yield Piece(t, x, y, part["p"])
         return
     if filters != [FILTER]:
         raise InputError("'CD/events' is packed with ECF and more, which is not known here")
@@ -179,7 +180,7 @@ def _parts(file: Any, source: Source) -> Iterator[Piece]:
         mask, data = events.id.read_direct_chunk((i,))
         if mask:
             plain = np.frombuffer(data, events.dtype)[: length - i]
-            yield Piece(plain["t"].astype(np.int64), plain["x"], plain["y"], plain["p"] > 0)
+            yield Piece(plain["t"].astype(np.int64), plain["x"], plain["y"], plain["p"])
         else:
             yield unpack(data).take(slice(length - i))
 

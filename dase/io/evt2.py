@@ -21,8 +21,9 @@ from numpy.typing import NDArray
 from dase.events import Events
 from dase.io import raw
 from dase.io.binary import EventWriter, Rollover, bridges, records, weave
+from dase.io.format import camera_format
 from dase.io.sequence import Writer, writing
-from dase.io.source import Piece, Source, camera_format
+from dase.io.source import Piece, Source
 
 PART = 1 << 17  # words decoded at once: their arrays stay in the cache
 HIGH, TRIGGER, OTHERS, CONTINUED = 8, 10, 14, 15
@@ -69,9 +70,10 @@ class Decoder:
     def report(self, source: Source) -> None:
         """Note what was skipped."""
         if self.undated:
-            source.note(f"{self.undated} events before the first time word: skipped")
+            sentence = f"{self.undated} events before the first time word: skipped"
+            source.note(sentence, "refused", "undated", self.undated)
         if self.unknown:
-            source.note(f"{self.unknown} words of unknown type: skipped")
+            source.note(f"{self.unknown} words of unknown type: skipped", "refused", "damage", self.unknown)
 
 
 def pieces(source: Source) -> Iterator[Piece]:

@@ -19,19 +19,25 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dase.io import raw
-from dase.io.binary import records
+from dase.io.binary import records, set_bits
 from dase.io.evt2 import HIGH, KNOWN, Decoder
-from dase.io.source import Piece, Source, camera_format
+from dase.io.format import camera_format
+from dase.io.source import Piece, Source
 
-PART = 1 << 14  # words decoded at once: each may hold 32 events
+PART = 1 << 16  # words decoded at once
+DENSE = 1 << 14  # of them, where each may hold many events: their bits stay in the cache
 
 
-def expand(base: Piece, mask: NDArray[np.uint32]) -> Piece:
-    """Return an event at column x + i for every bit i of `mask` (N,) that is set, in this order."""
-    bits = np.unpackbits(mask.astype("<u4").view(np.uint8), bitorder="little")
-    place = np.flatnonzero(bits.view(np.bool_))
-    out = base.take(place >> 5)
-    return out._replace(x=out.x + (place & 31).astype(np.uint16))
+def expand(base: Piece, mask: NDArray[np.uint32]) -> Iterator[Piece]:
+    """Yield an event at column x + i for every bit i of `mask` (N,) that is set, in this order."""
+    if mask.all() and not np.any(mask & (mask - np.uint32(1))):  # one event in every word
+        exponent = (mask.astype(np.float32).view(np.uint32) >> 23) - 127
+        yield base._replace(x=base.x + exponent.astype(np.uint16))
+        return
+    for i in range(0, len(mask), DENSE):
+        place = set_bits(mask[i : i + DENSE].astype("<u4").view(np.uint8))
+        out = base.take(i + (place >> 5))
+        yield out._replace(x=out.x + (place & 31).astype(np.uint16))
 
 
 def pieces(source: Source) -> Iterator[Piece]:
@@ -45,7 +51,7 @@ def pieces(source: Source) -> Iterator[Piece]:
         word, mask = halves[:, 0 if swapped else 1], halves[:, 1 if swapped else 0]
         for i in range(0, len(word), PART):
             at, base = decoder.part(word[i : i + PART])
-            yield expand(base, mask[i : i + PART][at])
+            yield from expand(base, mask[i : i + PART][at])
     decoder.report(source)
 
 

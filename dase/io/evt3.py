@@ -26,9 +26,10 @@ from numpy.typing import NDArray
 
 from dase.events import Events
 from dase.io import raw
-from dase.io.binary import EventWriter, Rollover, bridges, records, weave
+from dase.io.binary import EventWriter, Rollover, bridges, records, set_bits, weave
+from dase.io.format import camera_format
 from dase.io.sequence import Writer, writing
-from dase.io.source import Piece, Source, camera_format
+from dase.io.source import Piece, Source
 
 PART = 1 << 18  # words decoded at once; three million events if all are full vectors
 ADDR_Y, OTHER_Y, ADDR_X, BASE_X, VECT_12, VECT_8, LOW, HIGH = 0, 1, 2, 3, 4, 5, 6, 8
@@ -81,9 +82,9 @@ class Decoder:
         piece = Piece(times.take(place), base, rows.take(known & 0xFFFFFFFF), on)
         if mask is None:
             return piece
-        bits = np.flatnonzero(np.unpackbits(mask.view(np.uint8), bitorder="little").view(np.bool_))
+        bits = set_bits(mask.astype("<u2", copy=False).view(np.uint8))
         count = BITS.take(mask)
-        t, x, y, p = (np.repeat(column, count) for column in piece)
+        t, x, y, p = (np.repeat(column, count) for column in (piece.t, piece.x, piece.y, piece.p))
         return Piece(t, x + (bits & 15).astype(np.uint16), y, p)
 
     def _rows(self, words: NDArray[np.uint16], kind: NDArray[np.uint8]) -> NDArray[np.uint16]:
@@ -152,9 +153,10 @@ class Decoder:
     def report(self, source: Source) -> None:
         """Note what was skipped."""
         if self.undated:
-            source.note(f"{self.undated} event words before the first time word: skipped")
+            sentence = f"{self.undated} event words before the first time word: skipped"
+            source.note(sentence, "refused", "undated", self.undated)
         if self.unknown:
-            source.note(f"{self.unknown} words of unknown type: skipped")
+            source.note(f"{self.unknown} words of unknown type: skipped", "refused", "damage", self.unknown)
 
 
 def pieces(source: Source) -> Iterator[Piece]:

@@ -9,19 +9,22 @@ Nothing says how long such frames were exposed.
 from __future__ import annotations
 
 import io
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from dase.errors import InputError
 from dase.events import Events
+from dase.io.format import Format, sequence_of, taken
 from dase.io.sequence import Sequence, reading
-from dase.io.source import Format, Source, checked_size
+from dase.io.source import Picture, Source, checked_size
 from dase.pictures import SUFFIXES
 
-LIMIT = 4 << 30  # [bytes] of frames taken into memory
+if TYPE_CHECKING:
+    from dase.video import FrameReader
 
 
 def grey(data: bytes, name: str) -> NDArray[np.uint8]:
@@ -47,21 +50,6 @@ def grey(data: bytes, name: str) -> NDArray[np.uint8]:
     return np.asarray(out, np.uint8)
 
 
-def stack(pictures: Iterable[NDArray[np.uint8]]) -> NDArray[np.uint8]:
-    """Stack pictures of one size, (F, H, W); raises InputError where they differ or fill the memory."""
-    out: list[NDArray[np.uint8]] = []
-    total = 0
-    for picture in pictures:
-        total += picture.nbytes
-        if total > LIMIT:
-            raise InputError(f"its frames need more than {LIMIT >> 30} GiB of memory: cut it into parts")
-        if out and picture.shape != out[0].shape:
-            a, b = out[0].shape, picture.shape
-            raise InputError(f"frame {len(out)} is {b[1]}x{b[0]}, those before are {a[1]}x{a[0]}")
-        out.append(picture)
-    return np.stack(out) if out else np.empty((0, 0, 0), np.uint8)
-
-
 def matches(path: Path, head: bytes) -> bool:
     """Whether a file is a video, or a folder holds pictures."""
     if path.is_dir():
@@ -70,25 +58,38 @@ def matches(path: Path, head: bytes) -> bool:
     return avi or head[4:8] == b"ftyp" or head.startswith(b"\x1aE\xdf\xa3")
 
 
-def read(source: Source) -> Sequence:
-    """Read all frames; times are None where nothing tells them."""
+def pictures(source: Source) -> Iterator[Picture]:
+    """Yield the frames; times [s] are not a number where nothing tells them."""
+    reader = _reader(source)
+    times = _times(source.path / "timestamps.txt", len(reader)) if source.path.is_dir() else None
+    if times is None and 0 < reader.rate < 1e7:
+        times = np.arange(len(reader)) / reader.rate
+    if times is None:
+        source.note("nothing tells the times of the frames", "assumed", "frames")
+        times = np.full(len(reader), np.nan)
+    for index, time in enumerate(times):
+        yield Picture(np.rint(255 * reader[np.array([index])][0]).astype(np.uint8), time)
+
+
+def _reader(source: Source) -> FrameReader:
     from dase.video import FrameReader
 
+    reader = FrameReader(source.path)
+    checked_size((reader.shape[2], reader.shape[1]))
+    return reader
+
+
+def _shown(source: Source) -> Iterator[Picture]:
     with reading(source.path, "frames"):
-        reader = FrameReader(source.path)
-        checked_size((reader.shape[2], reader.shape[1]))
+        yield from pictures(source)
 
-        def decoded() -> Iterator[NDArray[np.uint8]]:
-            for index in range(len(reader)):
-                yield np.rint(255 * reader[np.array([index])][0]).astype(np.uint8)
 
-        out = stack(decoded())
-        times = _times(source.path / "timestamps.txt", len(out)) if source.path.is_dir() else None
-        if times is None and 0 < reader.rate < 1e7:
-            times = np.arange(len(out)) / reader.rate
-        if times is None:
-            source.note("nothing tells the times of the frames")
-        return Sequence(Events.empty(out.shape[2], out.shape[1]), out, times)
+def read(source: Source) -> Sequence:
+    """Read all frames; times are None where nothing tells them."""
+    with reading(source.path, "frames"):
+        found = taken(pictures(source))
+        height, width = found[0].grey.shape
+        return sequence_of(Events.empty(width, height), found)
 
 
 def _times(path: Path, count: int) -> NDArray[np.float64] | None:
@@ -107,7 +108,9 @@ def _times(path: Path, count: int) -> NDArray[np.float64] | None:
 
 def stream(source: Source, chunk: int) -> Iterator[Events]:
     """Yield the one empty chunk of a file without events."""
-    yield read(source).events
+    with reading(source.path, "frames"):
+        shape = _reader(source).shape
+    yield Events.empty(shape[2], shape[1])
 
 
 FORMAT = Format(
@@ -116,5 +119,6 @@ FORMAT = Format(
     matches=matches,
     read=read,
     stream=stream,
+    pictures=_shown,
     keeps=frozenset({"frames"}),
 )

@@ -25,7 +25,9 @@ from numpy.typing import NDArray
 
 from dase.errors import InputError
 from dase.events import Events
-from dase.io.sequence import Sequence, Writer, coordinates, reading, sensor_events, writing
+from dase.io.rules import sensor_events
+from dase.io.sequence import Sequence, Writer, coordinates, reading, writing
+from dase.io.source import Beside, Piece, Source
 
 CHUNK = 1 << 16  # events; 512 KiB of times fit HDF5's default chunk cache of 1 MiB
 BLOCK = 4 * CHUNK  # events gathered before they are written
@@ -238,39 +240,36 @@ def create(path: Path) -> AbstractContextManager[Writer]:
     return writing(path, _Writer)
 
 
-def read(path: Path) -> Sequence:
+def read(source: Source) -> Sequence:
     """Read an HDF5 file of the S2R layout; raises InputError where it is damaged or incomplete."""
-    with reading(path, "HDF5"), h5py.File(path, "r") as file:
-        return _parse(file)
+    with reading(source.path, "HDF5"), h5py.File(source.path, "r") as file:
+        return _parse(source, file)
 
 
-def _parse(file: Any) -> Sequence:
-    events = {name: _dataset(file, f"events/{name}")[:] for name in EVENT_TYPES}
+def _parse(source: Source, file: Any) -> Sequence:
+    t, x, y, p = (_dataset(file, f"events/{name}")[:] for name in EVENT_TYPES)
     label = file["events/labels"][:] if "events/labels" in file else None
-    images, flows = _members(file, "images"), _members(file, "flow")
+    images, flows = members(file, "images"), members(file, "flow")
     frames = _stack(images, np.uint8, 2) if images else None
     flow = _flow(images, flows)
-    thresholds = file["dase/thresholds"][:].astype(np.float32) if "dase/thresholds" in file else None
     exposure = np.array([float(image.attrs.get("exposure", 0.0)) for image in images.values()])
     size = file.attrs.get("sensor_resolution")
-    configuration = file["dase"].attrs.get("configuration") if "dase" in file else None
-    return Sequence(
-        sensor_events(
-            events["ts"].astype(np.float64, copy=False),
-            coordinates(events["xs"], "events/xs"),
-            coordinates(events["ys"], "events/ys"),
-            events["ps"],
-            size=None if size is None else (int(size[0]), int(size[1])),
-            maps=(frames, flow, thresholds),
-            label=label,
-        ),
-        frames,
-        np.array([_attribute(image, "timestamp") for image in images.values()]) if images else None,
-        flow,
-        thresholds,
-        None if configuration is None else str(configuration),
-        exposure if exposure.any() else None,
+    x, y = coordinates(x, "events/xs"), coordinates(y, "events/ys")
+    found = sensor_events(
+        source,
+        Piece(t.astype(np.float64, copy=False), x, y, p, label),
+        size=None if size is None else (int(size[1]), int(size[0])),
+        maps=(frames, flow, file.get("dase/thresholds")),
     )
+    times = np.array([attribute(image, "timestamp") for image in images.values()]) if images else None
+    return Sequence(found, frames, times, flow, *beside(file), exposure if exposure.any() else None)
+
+
+def beside(file: Any) -> Beside:
+    """Return the thresholds and the configuration."""
+    thresholds = file["dase/thresholds"][:].astype(np.float32) if "dase/thresholds" in file else None
+    configuration = file["dase"].attrs.get("configuration") if "dase" in file else None
+    return thresholds, None if configuration is None else str(configuration)
 
 
 def _dataset(file: Any, name: str) -> Any:
@@ -279,14 +278,15 @@ def _dataset(file: Any, name: str) -> Any:
     return file[name]
 
 
-def _attribute(item: Any, name: str) -> float:
+def attribute(item: Any, name: str) -> float:
+    """Return a number that an attribute holds; raises InputError where there is none."""
     if name not in item.attrs:
         raise InputError(f"'{item.name}' has no attribute '{name}'")
     return float(item.attrs[name])
 
 
-def _members(file: Any, group: str) -> dict[str, Any]:
-    """Datasets of a group by the nine digits that end their names, in their order."""
+def members(file: Any, group: str) -> dict[str, Any]:
+    """Return datasets of a group by the nine digits that end their names, in their order."""
     return {name[-9:]: file[group][name] for name in sorted(file[group])} if group in file else {}
 
 
@@ -294,10 +294,17 @@ def _stack(members: dict[str, Any], kind: type[Any], ndim: int) -> NDArray[Any]:
     first = next(iter(members.values()))
     out = np.empty((len(members), *first.shape), kind)
     for index, member in enumerate(members.values()):
-        if member.shape != first.shape or member.ndim != ndim or member.dtype != kind:
-            raise InputError(f"'{member.name}' must be {np.dtype(kind)} like the first, with {ndim} axes")
-        out[index] = member[:]
+        if member.shape != first.shape:
+            raise InputError(f"'{member.name}' must have shape {first.shape} like the first")
+        out[index] = checked(member, kind, ndim)
     return out
+
+
+def checked(member: Any, kind: type[Any], ndim: int) -> NDArray[Any]:
+    """Return what a dataset holds; raises InputError where it is of another type or number of axes."""
+    if member.ndim != ndim or member.dtype != kind:
+        raise InputError(f"'{member.name}' must be {np.dtype(kind)} with {ndim} axes")
+    return np.asarray(member[:])
 
 
 def _flow(images: dict[str, Any], flows: dict[str, Any]) -> NDArray[np.float32] | None:

@@ -23,8 +23,9 @@ from dase.errors import InputError
 from dase.events import Events
 from dase.io import frames, text
 from dase.io.binary import EventWriter
+from dase.io.format import LIMIT, camera_format
 from dase.io.sequence import Writer, writing
-from dase.io.source import Frames, Piece, Size, Source, camera_format, refuse_bomb
+from dase.io.source import Picture, Piece, Size, Source, refuse_bomb
 
 EVENTS, IMAGES = "events.txt", "images.txt"
 OTHERS = (IMAGES, "calib.txt", "groundtruth.txt", "imu.txt", "readme.txt", "timestamps.txt")
@@ -57,13 +58,19 @@ class _Place:
 
     def open(self, name: str) -> BinaryIO:
         """Open a file of the place; raises InputError where it leads out of it."""
-        if PurePosixPath(name).is_absolute() or ".." in PurePosixPath(name).parts:
-            raise InputError(f"'{name}' leads out of the folder")
+        _check_name(name)
         if self.zip is None:
             return cast(BinaryIO, (Path(self.folder) / name).open("rb"))
         info = self.zip.getinfo(str(self.folder / name))
         refuse_bomb(info.compress_size, info.file_size)
         return cast(BinaryIO, self.zip.open(info))
+
+    def has(self, name: str) -> bool:
+        """Whether there is such a file; raises InputError where it leads out of the place."""
+        _check_name(name)
+        if self.zip is None:
+            return (Path(self.folder) / name).is_file()
+        return str(self.folder / name) in self.zip.NameToInfo
 
     def read(self, name: str, most: int) -> bytes | None:
         """Return the content of a file, None where there is no such file."""
@@ -75,6 +82,11 @@ class _Place:
         if len(content) > most:
             raise InputError(f"{name} is larger than {most >> 20} MiB")
         return content
+
+
+def _check_name(name: str) -> None:
+    if PurePosixPath(name).is_absolute() or ".." in PurePosixPath(name).parts:
+        raise InputError(f"'{name}' leads out of the folder")
 
 
 def _member(archive: zipfile.ZipFile) -> str:
@@ -102,7 +114,7 @@ def size(source: Source) -> Size | None:
         with place.open(place.events) as file:
             known = text.Layout(file.read(text.HEAD)).size
         if known is None and (listed := _listed(place)):
-            first = place.read(listed[0][1], frames.LIMIT)
+            first = place.read(listed[0][1], LIMIT)
             if first is not None:
                 height, width = frames.grey(first, listed[0][1]).shape
                 return width, height
@@ -124,28 +136,19 @@ def _listed(place: _Place) -> list[tuple[float, str]]:
     return out
 
 
-def read_frames(source: Source) -> Frames | None:
-    """Read the frames that images.txt lists, or None."""
+def pictures(source: Source) -> Iterator[Picture]:
+    """Yield the frames that images.txt lists [s]; none where one of them is missing."""
     with _Place(source.path) as place:
         listed = _listed(place)
         times = np.array([time for time, _ in listed])
-        if not listed:
-            return None
         if not np.all(np.isfinite(times)) or np.any(np.diff(times) < 0):
             raise InputError(f"{IMAGES}: times of frames must be finite and must not go back")
-        try:
-            return Frames(frames.stack(_pictures(place, listed)), times)
-        except FileNotFoundError as error:
-            source.note(f"{IMAGES} lists '{error}', which is missing: frames left out")
-            return None
-
-
-def _pictures(place: _Place, listed: list[tuple[float, str]]) -> Iterator[NDArray[np.uint8]]:
-    for _, name in listed:
-        data = place.read(name, frames.LIMIT)
-        if data is None:
-            raise FileNotFoundError(name)
-        yield frames.grey(data, name)
+        missing = next((name for _, name in listed if not place.has(name)), None)
+        if missing is not None:
+            sentence = f"{IMAGES} lists '{missing}', which is missing: frames left out"
+            return source.note(sentence, "refused", "frames", len(listed))
+        for time, name in listed:
+            yield Picture(frames.grey(place.read(name, LIMIT) or b"", name), time)
 
 
 def matches_text(path: Path, head: bytes) -> bool:
@@ -230,7 +233,7 @@ TEXT = camera_format(
     matches=matches_text,
     pieces=pieces,
     size=size,
-    frames=read_frames,
+    pictures=pictures,
     ticks=1.0,
 )
 ZIPPED = camera_format(
@@ -240,6 +243,6 @@ ZIPPED = camera_format(
     matches=matches_zip,
     pieces=pieces,
     size=size,
-    frames=read_frames,
+    pictures=pictures,
     ticks=1.0,
 )

@@ -15,6 +15,7 @@ too large for memory is left out, and said. Source: Zhu et al., The multivehicle
 from __future__ import annotations
 
 from collections.abc import Iterator
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
@@ -23,9 +24,9 @@ from numpy.typing import NDArray
 
 from dase.errors import InputError
 from dase.io.columns import PART, dataset, has, opened, reader
-from dase.io.frames import LIMIT
+from dase.io.format import camera_format
 from dase.io.sequence import coordinates
-from dase.io.source import Frames, Piece, Size, Source, camera_format
+from dase.io.source import Picture, Piece, Size, Source
 
 SIZE = (346, 260)
 CAMERAS = ("davis/left", "davis/right")
@@ -46,48 +47,47 @@ def _parts(file: Any, source: Source) -> Iterator[Piece]:
     for i in range(0, len(events), PART):
         part = events[i : i + PART]
         x, y = (coordinates(part[:, k].astype(np.int64), f"{events.name}[:, {k}]") for k in (0, 1))
-        yield Piece(part[:, 2].astype(np.float64), x, y, part[:, 3] > 0)
+        yield Piece(part[:, 2].astype(np.float64), x, y, part[:, 3])
 
 
-def read_frames(source: Source) -> Frames | None:
-    """Read the frames and, from the ground truth beside the file, the flow at them; None without frames."""
-    with opened(source.path) as file:
+def pictures(source: Source) -> Iterator[Picture]:
+    """Yield the frames [s] and, from the ground truth beside the file, the flow at them."""
+    with opened(source.path) as file, ExitStack() as stack:
         camera = _camera(file)
         if f"{camera}/image_raw" not in file:
-            return None
+            return
         images, times = dataset(file, f"{camera}/image_raw", 3), dataset(file, f"{camera}/image_raw_ts", 1)
         if images.dtype != np.uint8 or len(images) != len(times):
             raise InputError(f"'{images.name}' must be uint8, one for each of the {len(times)} times")
-        if images.size > LIMIT:
-            raise InputError(f"its frames need more than {LIMIT >> 30} GiB of memory: cut it into parts")
         t = times[:].astype(np.float64)
-        return Frames(images[:], t, flow=_flow(source, camera, t, images.shape[1:]))
+        flow = _flow(source, camera, t, images.shape[1:], stack)
+        for k, time in enumerate(t):
+            yield Picture(images[k], time, flow=next(flow, None))
 
 
 def _flow(
-    source: Source, camera: str, t: NDArray[np.float64], shape: tuple[int, int]
-) -> NDArray[np.float32] | None:
-    """Return flow [px/s] at the times of frames, (F, 2, H, W), from the ground truth beside the file."""
+    source: Source, camera: str, t: NDArray[np.float64], shape: tuple[int, int], stack: ExitStack
+) -> Iterator[NDArray[np.float32]]:
+    """Yield the flow [px/s] at the times of frames, (2, H, W), from the ground truth beside the file."""
     path = source.path.with_name(source.path.name.replace("_data.", "_gt."))
     if path == source.path or not path.is_file():
-        return None
+        return
     if 8 * len(t) * shape[0] * shape[1] > FLOW_LIMIT:
-        source.note(f"the flow of {path.name} needs more than {FLOW_LIMIT >> 30} GiB of memory: left out")
-        return None
-    with opened(path) as file:
-        if f"{camera}/flow_dist" not in file:
-            return None
-        flow = dataset(file, f"{camera}/flow_dist", 4)
-        begin = dataset(file, f"{camera}/flow_dist_ts", 1)[:].astype(np.float64)
-        if flow.shape != (len(begin), 2, *shape):
-            raise InputError(f"{path.name}: '{flow.name}' must have shape (K, 2, H, W), got {flow.shape}")
-        out = np.full((len(t), 2, *shape), np.nan, np.float32)
-        interval = np.diff(begin)
-        index = np.searchsorted(begin, t, side="right") - 1
-        for frame, k in enumerate(index):
-            if 0 <= k < len(interval) and interval[k] > 0:
-                out[frame] = flow[k] / interval[k]
-        return out
+        sentence = f"the flow of {path.name} needs more than {FLOW_LIMIT >> 30} GiB of memory: left out"
+        return source.note(sentence, "refused", "flow")
+    file = stack.enter_context(opened(path))
+    if f"{camera}/flow_dist" not in file:
+        return
+    flow = dataset(file, f"{camera}/flow_dist", 4)
+    begin = dataset(file, f"{camera}/flow_dist_ts", 1)[:].astype(np.float64)
+    if flow.shape != (len(begin), 2, *shape):
+        raise InputError(f"{path.name}: '{flow.name}' must have shape (K, 2, H, W), got {flow.shape}")
+    interval = np.diff(begin)
+    for k in np.searchsorted(begin, t, side="right") - 1:
+        known = 0 <= k < len(interval) and interval[k] > 0
+        yield (
+            (flow[k] / interval[k]).astype(np.float32) if known else np.full((2, *shape), np.nan, np.float32)
+        )
 
 
 def size(source: Source) -> Size | None:
@@ -108,6 +108,6 @@ FORMAT = camera_format(
     matches=matches,
     pieces=reader(_parts),
     size=size,
-    frames=read_frames,
+    pictures=pictures,
     ticks=1.0,
 )

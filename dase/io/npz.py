@@ -25,7 +25,9 @@ from numpy.typing import ArrayLike, NDArray
 
 from dase.errors import InputError
 from dase.events import Events
-from dase.io.sequence import Sequence, Writer, coordinates, reading, sensor_events, writing
+from dase.io.rules import sensor_events
+from dase.io.sequence import Sequence, Writer, coordinates, reading, writing
+from dase.io.source import Beside, Piece, Source
 
 # Deflate level 1 takes 7.2 M events of a DAVIS240C from 9.0 to 2.8 bytes each, writing 10 M and reading
 # 41 M events/s on one core; level 6 takes 2.5 bytes but writes 2 M events/s.
@@ -129,40 +131,53 @@ def create(path: Path) -> AbstractContextManager[Writer]:
     return writing(path, _Writer)
 
 
-def read(path: Path) -> Sequence:
+def read(source: Source) -> Sequence:
     """Read an archive; raises InputError where it is damaged or incomplete. Pickled members are refused."""
-    with reading(path, "a NumPy archive"), zipfile.ZipFile(path) as archive:
-        return _parse({name: _load(archive, name) for name in KEYS if f"{name}.npy" in archive.namelist()})
+    with reading(source.path, "a NumPy archive"), zipfile.ZipFile(source.path) as archive:
+        known = (name for name in KEYS if f"{name}.npy" in archive.namelist())
+        return _parse(source, {name: load(archive, name) for name in known})
 
 
-def _load(archive: zipfile.ZipFile, name: str) -> NDArray[Any]:
+def load(archive: zipfile.ZipFile, name: str) -> NDArray[Any]:
+    """Return a member of the archive; never unpickles."""
     with archive.open(f"{name}.npy") as stream:
         return np.asarray(np.lib.format.read_array(stream, allow_pickle=False))
 
 
-def _parse(content: dict[str, NDArray[Any]]) -> Sequence:
+def _parse(source: Source, content: dict[str, NDArray[Any]]) -> Sequence:
     frames, flow, thresholds = (content.get(name) for name in ("frames", "flow", "thresholds"))
     if frames is not None and (frames.dtype != np.uint8 or frames.ndim != 3):
         raise InputError(f"'frames' must be uint8 (F, H, W), got {frames.dtype} {frames.shape}")
     if frames is None and not set(EVENT_KEYS) & set(content):
         raise InputError("has neither events (t_us, x, y, p) nor frames")
-    events = _events(content, (frames, flow, thresholds))
+    events = _events(source, content, (frames, flow, thresholds))
     if flow is not None and frames is None:
         flow = flow / max(float(events.t[-1] - events.t[0]), 1e-6) if len(events) else None
-    times, exposure = (None, None) if frames is None else _frame_times(content)
-    configuration = content.get("configuration")
+    times, exposure = (None, None) if frames is None else frame_times(content)
+    thresholds, configuration = beside(content)
     return Sequence(
         events,
         frames,
         times,
         None if flow is None else flow.astype(np.float32, copy=False),
-        None if thresholds is None else thresholds.astype(np.float32, copy=False),
-        None if configuration is None else str(configuration),
+        thresholds,
+        configuration,
         exposure,
     )
 
 
-def _events(content: dict[str, NDArray[Any]], maps: tuple[NDArray[Any] | None, ...]) -> Events:
+def beside(content: dict[str, NDArray[Any]]) -> Beside:
+    """Return the thresholds and the configuration."""
+    thresholds, configuration = content.get("thresholds"), content.get("configuration")
+    return (
+        None if thresholds is None else thresholds.astype(np.float32, copy=False),
+        None if configuration is None else str(configuration),
+    )
+
+
+def _events(
+    source: Source, content: dict[str, NDArray[Any]], maps: tuple[NDArray[Any] | None, ...]
+) -> Events:
     if not set(EVENT_KEYS) & set(content):
         frames = maps[0]
         assert frames is not None
@@ -173,21 +188,15 @@ def _events(content: dict[str, NDArray[Any]], maps: tuple[NDArray[Any] | None, .
     wh = content.get("wh")
     if wh is not None and (wh.shape != (2,) or wh.dtype.kind not in "iu"):
         raise InputError(f"'wh' must be two integers, got {wh.dtype} of shape {wh.shape}")
-    return sensor_events(
-        content["t_us"] / 1e6,
-        coordinates(content["x"], "x"),
-        coordinates(content["y"], "y"),
-        content["p"],
-        size=None if wh is None else (int(wh[1]), int(wh[0])),
-        maps=maps,
-        label=content.get("label"),
-    )
+    x, y = (coordinates(content[name], name) for name in "xy")
+    piece = Piece(content["t_us"] / 1e6, x, y, content["p"], content.get("label"))
+    return sensor_events(source, piece, size=None if wh is None else (int(wh[0]), int(wh[1])), maps=maps)
 
 
-def _frame_times(
+def frame_times(
     content: dict[str, NDArray[Any]],
 ) -> tuple[NDArray[np.float64] | None, NDArray[np.float64] | None]:
-    """Middle and duration of the exposures [s], each (F,) or None."""
+    """Return middle and duration of the exposures [s], each (F,) or None."""
     if "frame_us" in content:
         return content["frame_us"] / 1e6, None
     if "frame_begin_us" not in content or "frame_end_us" not in content:

@@ -9,23 +9,19 @@ parsed in `dase.io.ros_messages`.
 
 from __future__ import annotations
 
-import bz2
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-from numpy.typing import NDArray
-
 from dase.errors import InputError
-from dase.io import frames, ros_messages
-from dase.io.source import Frames, Piece, Size, Source, camera_format, missing_extra
+from dase.io import packed, ros_messages
+from dase.io.format import camera_format
+from dase.io.source import Picture, Piece, Size, Source, missing_extra
 
 ARRAYS = ("dvs_msgs/msg/EventArray", "prophesee_event_msgs/msg/EventArray")
 PACKETS = ("event_camera_msgs/msg/EventPacket", "event_array_msgs/msg/EventArray")
 IMAGES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
-LARGEST = 1 << 27  # [bytes] of an unpacked chunk
 ROS1 = b"#ROSBAG V"
 MAGICS = (ROS1, b"\x89MCAP0\r\n", b"SQLite format 3\0")
 
@@ -39,38 +35,13 @@ def _opened(source: Source) -> Iterator[tuple[Any, bool]]:
         raise missing_extra("a ROS bag", "ros") from None
     cdr = source.path.is_dir() or not _starts(source.path, ROS1)
     reader: Any = rosbag2.Reader(source.path) if cdr else rosbag1.Reader(source.path)
-    with reader:
-        if not cdr:
-            _bound(reader)
+    with packed.bounded_bags(), reader:
         yield reader, cdr
 
 
 def _starts(path: Path, magic: bytes) -> bool:
     with path.open("rb") as file:
         return file.read(len(magic)) == magic
-
-
-def _bound(reader: Any) -> None:
-    """Replace the unpackers of a ROS 1 bag by ones that stop at `LARGEST`."""
-    from lz4.frame import LZ4FrameDecompressor  # type: ignore[import-untyped]
-    from rosbags.rosbag1.reader import decompressors
-
-    makers = {"bz2": bz2.BZ2Decompressor, "lz4": LZ4FrameDecompressor}
-    bounded = {decompressors[kind]: _unpacker(make) for kind, make in makers.items()}
-    for place, chunk in reader.chunks.items():
-        unpack = bounded.get(chunk.decompressor, chunk.decompressor)
-        reader.chunks[place] = chunk._replace(decompressor=unpack)
-
-
-def _unpacker(make: Callable[[], Any]) -> Callable[[bytes], bytes]:
-    def unpack(data: bytes) -> bytes:
-        unpacker = make()
-        out = bytes(unpacker.decompress(data, max_length=LARGEST))
-        if not unpacker.eof:
-            raise InputError("a chunk is cut short, or larger than it may be")
-        return out
-
-    return unpack
 
 
 def _connections(source: Source, reader: Any, kinds: tuple[str, ...], beside: str = "") -> list[Any]:
@@ -88,7 +59,9 @@ def _connections(source: Source, reader: Any, kinds: tuple[str, ...], beside: st
 
     topic = min(found, key=apart)
     if len(found) > 1:
-        source.note(f"holds topics {', '.join(sorted(found))}: {topic} was read")
+        source.note(
+            f"holds topics {', '.join(sorted(found))}: {topic} was read", "assumed", "streams", len(found)
+        )
     return found[topic]
 
 
@@ -123,7 +96,7 @@ def _messages(source: Source, reader: Any, connections: list[Any]) -> Iterator[t
             return
         except Exception as error:  # rosbags lets pass what its decompressors and its parsers raise
             why = " ".join(str(error).split()) or type(error).__name__
-            source.note(f"damaged or cut short, read up to there ({why})")
+            source.note(f"damaged or cut short, read up to there ({why})", "refused", "damage", 1)
             return
         yield message
 
@@ -137,22 +110,15 @@ def size(source: Source) -> Size | None:
     return None
 
 
-def read_frames(source: Source) -> Frames | None:
-    """Read the images, or None."""
-    times: list[int] = []
+def pictures(source: Source) -> Iterator[Picture]:
+    """Yield the images [ns]."""
     with _opened(source) as (reader, cdr):
         connections = _connections(source, reader, IMAGES, _events(source, reader)[0].topic)
         if not connections:
-            return None
-
-        def loaded() -> Iterator[NDArray[np.uint8]]:
-            for connection, _, data in _messages(source, reader, connections):
-                time, grey = ros_messages.image(data, cdr, connection.msgtype == IMAGES[1])
-                times.append(time)
-                yield grey
-
-        grey = frames.stack(loaded())
-    return Frames(grey, np.array(times, np.int64)) if times else None
+            return  # rosbags takes none for all
+        for connection, _, data in _messages(source, reader, connections):
+            time, grey = ros_messages.image(data, cdr, connection.msgtype == IMAGES[1])
+            yield Picture(grey, time)
 
 
 def matches(path: Path, head: bytes) -> bool:
@@ -167,6 +133,6 @@ FORMAT = camera_format(
     matches=matches,
     pieces=pieces,
     size=size,
-    frames=read_frames,
+    pictures=pictures,
     ticks=1e9,
 )

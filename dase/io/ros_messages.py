@@ -100,7 +100,7 @@ class Message:
 
 def _dvs_piece(events: NDArray[Any]) -> Piece:
     t = events["s"].astype(np.int64) * 10**9 + events["ns"]
-    return Piece(t, events["x"].copy(), events["y"].copy(), events["p"] > 0)
+    return Piece(t, events["x"].copy(), events["y"].copy(), events["p"])
 
 
 def dvs_size(data: bytes, cdr: bool) -> Size:
@@ -158,7 +158,7 @@ class Packets:
         elif encoding == "evt21":
             halves = _words(data, "<u8").view("<u4").reshape(-1, 2)
             at, piece = self.evt2.part(halves[:, 1])
-            yield expand(piece._replace(t=piece.t * 1000), halves[at, 0])
+            yield from expand(piece._replace(t=piece.t * 1000), halves[at, 0])
         elif encoding == "mono":
             yield _mono(_words(data, "<u8"), base)
         elif encoding == "libcaer":

@@ -11,16 +11,32 @@ import numpy as np
 from dase.errors import InputError
 from dase.io import h5
 from dase.io.columns import HDF5, columns, dataset, largest, opened, reader, size_attribute
+from dase.io.format import Format, camera_format
+from dase.io.rules import turned
 from dase.io.sequence import Sequence, reading
-from dase.io.source import Format, Piece, Size, Source, camera_format
+from dase.io.source import Beside, Picture, Piece, Size, Source
 
 COLUMNS = ("events/ts", "events/xs", "events/ys", "events/ps")
 LAYOUTS = "S2R, DSEC, MVSEC, v2e, Prophesee"
 
 
 def _parts(file: Any, source: Source) -> Iterator[Piece]:
-    for t, x, y, p in columns(file, COLUMNS):
-        yield Piece(t.astype(np.float64), x, y, p)
+    labelled = "events/labels" in file
+    for t, x, y, p, *label in columns(file, COLUMNS, beside=("events/labels",) if labelled else ()):
+        yield Piece(t.astype(np.float64), x, y, p, *label)
+
+
+def _pictures(source: Source) -> Iterator[Picture]:
+    """Yield the frames [s] with the flow at them, not a number where there is none."""
+    with opened(source.path) as file:
+        flows, images = h5.members(file, "flow"), h5.members(file, "images")
+        for name, image in images.items():
+            grey = h5.checked(image, np.uint8, 2)
+            flow = h5.checked(flows[name], np.float32, 3) if name in flows else None
+            if flow is None and flows:
+                flow = np.full((2, *grey.shape), np.nan, np.float32)
+            exposure = float(image.attrs.get("exposure", 0.0))
+            yield Picture(grey, h5.attribute(image, "timestamp"), exposure, flow)
 
 
 def _size(source: Source) -> Size | None:
@@ -35,8 +51,7 @@ def _size(source: Source) -> Size | None:
         size = size_attribute(file, "sensor_resolution")
         if size is None:
             raise InputError("does not say how large the sensor is")
-        width, height = largest(file, COLUMNS[1], COLUMNS[2])
-        return size if width <= size[0] and height <= size[1] else size[::-1]
+        return turned(source, size, largest(file, COLUMNS[1], COLUMNS[2]))
 
 
 def _check(file: Any) -> None:
@@ -53,11 +68,17 @@ def _check(file: Any) -> None:
     file.visititems(check)
 
 
+def _beside(source: Source) -> Beside:
+    with reading(source.path, "HDF5"), opened(source.path) as file:
+        _check(file)
+        return h5.beside(file)
+
+
 def read(source: Source) -> Sequence:
     """Read a file; raises InputError where it is damaged, incomplete or of no known layout."""
     with reading(source.path, "HDF5"), opened(source.path) as file:
         _check(file)
-    return h5.read(source.path)
+    return h5.read(source)
 
 
 _streamed = camera_format(
@@ -66,6 +87,7 @@ _streamed = camera_format(
     matches=lambda path, head: False,
     pieces=reader(_parts),
     size=_size,
+    pictures=_pictures,
     ticks=1.0,
 )
 
@@ -75,6 +97,8 @@ FORMAT = Format(
     matches=lambda path, head: head.startswith(HDF5),
     read=read,
     stream=_streamed.stream,
+    pictures=_streamed.pictures,
+    beside=_beside,
     create=h5.create,
     keeps=frozenset({"events", "frames", "flow", "thresholds", "configuration"}),
 )

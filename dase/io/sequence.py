@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dase.errors import InputError
-from dase.events import LABELS, Events
+from dase.events import Events
 
 
 @dataclass(frozen=True)
@@ -241,7 +241,7 @@ def reading(path: Path, kind: str) -> Iterator[None]:
     try:
         yield
     except InputError as error:
-        raise InputError(f"{path}: {error}") from error
+        raise type(error)(f"{path}: {error}") from error
     except FileNotFoundError:
         raise InputError(f"{path}: no such file") from None
     except Exception as error:  # h5py, zipfile, zlib and numpy have no common error for damaged files
@@ -256,52 +256,3 @@ def coordinates(values: NDArray[Any], name: str) -> NDArray[np.uint16]:
     if values.size and (int(values.min()) < 0 or int(values.max()) > 65535):
         raise InputError(f"{name} must lie in 0..65535, got {values.min()}..{values.max()}")
     return values.astype(np.uint16, copy=False)
-
-
-def sensor_events(
-    t: NDArray[np.float64],
-    x: NDArray[np.uint16],
-    y: NDArray[np.uint16],
-    p: NDArray[Any],
-    *,
-    size: tuple[int, int] | None,
-    maps: tuple[NDArray[Any] | None, ...] = (),
-    label: NDArray[Any] | None = None,
-) -> Events:
-    """Build events from what a file holds, sorting them by time where they are not.
-
-    Args:
-        t: Times [s], shape (N,).
-        x: Columns, shape (N,).
-        y: Rows, shape (N,).
-        p: Polarities, shape (N,); above zero is ON.
-        size: Height and width as the file says; writers of such files are known to swap the two.
-        maps: Arrays (..., H, W); the first that is there decides the size over `size`.
-        label: Places in `LABELS`, shape (N,), or None.
-
-    Raises:
-        InputError: The size is unknown, events lie outside the sensor, or labels are not of `LABELS`.
-    """
-    for array in maps:
-        if array is not None and array.ndim >= 2:
-            size = (array.shape[-2], array.shape[-1])
-            break
-    else:
-        if size is not None and len(x) and not _inside(x, y, size) and _inside(x, y, size[::-1]):
-            size = size[::-1]
-    if size is None:
-        raise InputError("does not say how large the sensor is")
-    if len({len(t), len(x), len(y), len(p)}) == 1 and len(x) and not _inside(x, y, size):
-        raise InputError(f"events reach to column {x.max()}, row {y.max()}: outside {size[1]}x{size[0]}")
-    if label is not None:
-        if label.dtype.kind not in "iu" or np.any((label < 0) | (label >= len(LABELS))):
-            raise InputError(f"labels must be whole numbers in 0..{len(LABELS) - 1}: {', '.join(LABELS)}")
-        label = label.astype(np.int8, copy=False)
-    events = Events(t, x, y, p > 0, size[1], size[0], label)
-    if len(t) and not np.all(t[1:] >= t[:-1]):
-        return events.select(np.argsort(t, kind="stable"))
-    return events
-
-
-def _inside(x: NDArray[np.uint16], y: NDArray[np.uint16], size: tuple[int, int]) -> bool:
-    return int(x.max()) < size[1] and int(y.max()) < size[0]

@@ -119,7 +119,7 @@ def _decoded(text: bytes, layout: Layout, line: int) -> Piece:
     if not good.all():
         first = int(begin[np.argmin(good), 0])
         raise _bad(text, first, line)
-    return Piece(time, x.astype(np.uint16), y.astype(np.uint16), p > 0)
+    return Piece(time, x.astype(np.uint16), y.astype(np.uint16), p)
 
 
 def _bad(text: bytes, place: int, line: int) -> InputError:

@@ -17,9 +17,9 @@ import numpy as np
 
 from dase.errors import InputError
 from dase.io.columns import PART, dataset, has, opened, reader
-from dase.io.frames import LIMIT
+from dase.io.format import camera_format
 from dase.io.sequence import coordinates
-from dase.io.source import Frames, Piece, Size, Source, camera_format
+from dase.io.source import Picture, Piece, Size, Source
 
 
 def _parts(file: Any, source: Source) -> Iterator[Piece]:
@@ -28,20 +28,19 @@ def _parts(file: Any, source: Source) -> Iterator[Piece]:
         raise InputError(f"'events' must be whole numbers of shape (N, 4), got {events.dtype} {events.shape}")
     for i in range(0, len(events), PART):
         t, x, y, p = events[i : i + PART].T
-        yield Piece(t.astype(np.int64), coordinates(x, "events[:, 1]"), coordinates(y, "events[:, 2]"), p > 0)
+        yield Piece(t.astype(np.int64), coordinates(x, "events[:, 1]"), coordinates(y, "events[:, 2]"), p)
 
 
-def read_frames(source: Source) -> Frames | None:
-    """Read the frames, or None."""
+def pictures(source: Source) -> Iterator[Picture]:
+    """Yield the frames [us]."""
     with opened(source.path) as file:
         if "frame" not in file or "frame_ts" not in file:
-            return None
+            return
         images, times = dataset(file, "frame", 3), dataset(file, "frame_ts", 1)
         if images.dtype != np.uint8 or len(images) != len(times):
             raise InputError(f"'frame' must be uint8, one for each of the {len(times)} times of 'frame_ts'")
-        if images.size > LIMIT:
-            raise InputError(f"its frames need more than {LIMIT >> 30} GiB of memory: cut it into parts")
-        return Frames(images[:], times[:].astype(np.int64))
+        for k, time in enumerate(times[:].astype(np.int64)):
+            yield Picture(images[k], time)
 
 
 def size(source: Source) -> Size | None:
@@ -62,5 +61,5 @@ FORMAT = camera_format(
     matches=matches,
     pieces=reader(_parts),
     size=size,
-    frames=read_frames,
+    pictures=pictures,
 )

@@ -1,0 +1,68 @@
+"""How far a model is from a recording."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import click
+
+
+@click.command()
+@click.argument("sensor")
+@click.argument("recording", type=click.Path(path_type=Path))
+@click.argument("file", required=False, type=click.Path(path_type=Path))
+@click.option(
+    "-o", "--output", type=click.Path(path_type=Path), help="Report; its numbers go beside it as .json."
+)
+@click.option(
+    "--scene", default="frames", show_default=True,
+    help="What the camera saw: its own frames, video FILE (a clip, a folder, an npz with frames), or static.",
+)  # fmt: skip
+@click.option("--pixels", default=1500, show_default=True, help="In each half of the measurement.")
+@click.option("--device", default="cpu", show_default=True, help="cpu or cuda.")
+@click.option("--seed", default=0, show_default=True, help="The same seed gives the same numbers.")
+@click.option("--quiet", is_flag=True, help="No progress.")
+def command(
+    sensor: str,
+    recording: Path,
+    file: Path | None,
+    output: Path | None,
+    scene: str,
+    pixels: int,
+    device: str,
+    seed: int,
+    quiet: bool,
+) -> None:
+    """Compare the model SENSOR with RECORDING: how large the error is, and where it sits.
+
+    1 is the error that two repeats of the recording would have. Nothing is fitted: `dase fit` does that.
+    """
+    from dase.cli.diagnose import bar
+    from dase.comparison import compare
+    from dase.config import load_sensor
+    from dase.io import replacing
+    from dase.measurement import open_measurement
+
+    model = load_sensor(sensor)
+    measured = open_measurement(recording, scene, file)
+    with bar(quiet) as tell:
+        found = compare(
+            measured.events, measured.scene, model, trust=measured.trust, pixels=pixels, seed=seed,
+            device=device, progress=tell,
+        )  # fmt: skip
+    click.echo(
+        f"error {found.error:.2f}; 1 is what two repeats of the recording give, most stay below {found.gate:.2f}"
+    )
+    width = max(map(len, found.families))
+    for name, error in sorted(found.families.items(), key=lambda item: -item[1]):
+        click.echo(f"  {name:{width}s} {error:7.2f}")
+    for cell in found.cells[:8]:
+        click.echo(f"  {cell.sentence}")
+    for name, (real, made) in found.plain.items():
+        click.echo(f"  {name:34s} measured {real:9.4g}   simulated {made:9.4g}")
+    for note in found.notes:
+        click.echo(f"note: {note}")
+    if output is not None:
+        with replacing(output.with_suffix(".json")) as part:
+            part.write_text(json.dumps(found.to_json(), indent=2) + "\n")

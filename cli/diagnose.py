@@ -1,0 +1,126 @@
+"""Which effect a model lacks."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+
+if TYPE_CHECKING:
+    from dase.results import Diagnosis
+
+
+def explain(ctx: click.Context, parameter: click.Parameter, value: str | None) -> None:
+    """Say what an effect is and what it does to the probes, and exit."""
+    if value is None or ctx.resilient_parsing:
+        return
+    from dase.explain import explanation
+
+    click.echo(explanation(value))
+    ctx.exit()
+
+
+@click.command()
+@click.argument("sensor")
+@click.argument("recording", type=click.Path(path_type=Path))
+@click.argument("file", required=False, type=click.Path(path_type=Path))
+@click.option(
+    "--scene", default="frames", show_default=True,
+    help="What the camera saw: its own frames, video FILE (a clip, a folder, an npz with frames), or static.",
+)  # fmt: skip
+@click.option("--auto", is_flag=True, help="Add what is found and go on until nothing is missing.")
+@click.option("--free", help="Parameters that may be refitted, with commas between.  [default: all]")
+@click.option("--json", "json_", type=click.Path(path_type=Path), help="Write the findings to this file.")
+@click.option("-o", "--output", type=click.Path(path_type=Path), help="Write the sensor with what was found.")
+@click.option("--pixels", default=1500, show_default=True, help="In each half of the measurement.")
+@click.option("--device", default="cpu", show_default=True, help="cpu or cuda.")
+@click.option("--seed", default=0, show_default=True, help="The same seed gives the same findings.")
+@click.option("--quiet", is_flag=True, help="Only the finding, no progress.")
+@click.option("--explain", metavar="EFFECT", callback=explain, is_eager=True, expose_value=False,
+              help="Say what EFFECT is and what it does to the probes, and exit.")  # fmt: skip
+def command(
+    sensor: str,
+    recording: Path,
+    file: Path | None,
+    scene: str,
+    auto: bool,
+    free: str | None,
+    json_: Path | None,
+    output: Path | None,
+    pixels: int,
+    device: str,
+    seed: int,
+    quiet: bool,
+) -> None:
+    """Find the effect that the model SENSOR lacks to explain RECORDING.
+
+    Every effect that the sensor does not have is fitted, and judged on pixels and time held out. Nothing is
+    announced unless it brings the error to what two repeats of the recording would give.
+    """
+    from dase.config import dump_sensor, load_sensor
+    from dase.diagnosis import MOST, diagnose
+    from dase.io import replacing
+    from dase.measurement import open_measurement
+
+    model = load_sensor(sensor)
+    measured = open_measurement(recording, scene, file)
+    with bar(quiet) as tell:
+        found = diagnose(
+            measured.events, measured.scene, model, trust=measured.trust, free=free.split(",") if free else None,
+            most=MOST if auto else 1, pixels=pixels, seed=seed, device=device, progress=tell,
+        )  # fmt: skip
+    if json_ is not None:
+        with replacing(json_) as part:
+            part.write_text(json.dumps(found.to_json(), indent=2) + "\n")
+    if output is not None:
+        with replacing(output) as part:
+            part.write_text(dump_sensor(found.sensor))
+    _print(found, quiet)
+
+
+@contextmanager
+def bar(quiet: bool) -> Iterator[Callable[[str, float, float], None]]:
+    """Show on a terminal what is being done, how far it is, and the present error."""
+    from tqdm import tqdm
+
+    layout = "{desc:32.32} |{bar}| {postfix}"
+    with tqdm(total=1.0, disable=True if quiet else None, bar_format=layout, leave=False) as shown:
+
+        def tell(text: str, share: float, error: float) -> None:
+            shown.n = share
+            shown.set_description_str(text, refresh=False)
+            shown.set_postfix_str("" if error != error else f"error {error:.2f}", refresh=False)
+            shown.refresh()
+
+        yield tell
+
+
+def _print(found: Diagnosis, quiet: bool) -> None:
+    from dase.diagnosis import summary
+
+    click.echo(summary(found))
+    if quiet:
+        return
+    click.echo(f"error as given {found.before:.2f}; 1 is what two repeats of the recording give")
+    for step in found.history:
+        click.echo(f"\n{' + '.join(step.model)}: error {step.error:.2f}, repeats stay below {step.gate:.2f}")
+        for rank in step.ranking[:5]:
+            mark = "+" if rank.effect == step.chosen else " "
+            click.echo(
+                f"  {mark} {rank.effect:14s} error {rank.error:6.2f}  {100 * rank.share:3.0f} % of the way to "
+                f"the floor  p {rank.p_value:.3f}"
+            )
+        if step.ties:
+            click.echo(f"    cannot be told apart from {step.chosen}: {', '.join(step.ties)}")
+        for cell in step.cells[:3]:
+            click.echo(f"    {cell.sentence}")
+    click.echo("\nparameters, with 90 % intervals")
+    for name, estimate in found.parameters.items():
+        click.echo(f"  {name:24s} {estimate.value:10.4g}   {estimate.low:.4g} to {estimate.high:.4g}")
+    for note in found.notes:
+        click.echo(f"note: {note}")
+    click.echo(f"{found.evaluations} simulations, {found.seconds:.1f} s")

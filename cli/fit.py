@@ -1,0 +1,57 @@
+"""Parameters of a sensor from a recording."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import click
+
+
+@click.command()
+@click.argument("sensor")
+@click.argument("recording", type=click.Path(path_type=Path))
+@click.argument("file", required=False, type=click.Path(path_type=Path))
+@click.option("-o", "--output", required=True, type=click.Path(path_type=Path), help="The fitted sensor.")
+@click.option("--free", help="Effects or effect.parameter to fit, with commas between.  [default: all]")
+@click.option(
+    "--scene", default="frames", show_default=True,
+    help="What the camera saw: its own frames, video FILE (a clip, a folder, an npz with frames), or static.",
+)  # fmt: skip
+@click.option("--pixels", default=1500, show_default=True, help="In each half of the measurement.")
+@click.option("--device", default="cpu", show_default=True, help="cpu or cuda.")
+@click.option("--seed", default=0, show_default=True, help="The same seed gives the same fit.")
+@click.option("--quiet", is_flag=True, help="No progress.")
+def command(
+    sensor: str,
+    recording: Path,
+    file: Path | None,
+    output: Path,
+    free: str | None,
+    scene: str,
+    pixels: int,
+    device: str,
+    seed: int,
+    quiet: bool,
+) -> None:
+    """Fit the parameters of the model SENSOR to RECORDING."""
+    from dase.cli.diagnose import bar
+    from dase.config import dump_sensor, load_sensor
+    from dase.fitting import fit
+    from dase.io import replacing
+    from dase.measurement import open_measurement
+
+    model = load_sensor(sensor)
+    measured = open_measurement(recording, scene, file)
+    with bar(quiet) as tell:
+        found = fit(
+            measured.events, measured.scene, model, free=free.split(",") if free else None,
+            trust=measured.trust, pixels=pixels, seed=seed, device=device, progress=tell,
+        )  # fmt: skip
+    with replacing(output) as part:
+        part.write_text(dump_sensor(found.sensor))
+    click.echo(f"error {found.before:.2f} → {found.error:.2f}; repeats stay below {found.gate:.2f}")
+    for name, estimate in found.parameters.items():
+        click.echo(f"  {name:24s} {estimate.value:10.4g}   {estimate.low:.4g} to {estimate.high:.4g}")
+    for note in found.notes:
+        click.echo(f"note: {note}")
+    click.echo(f"{output}: {found.evaluations} simulations, {found.seconds:.1f} s")

@@ -1,0 +1,142 @@
+"""Parameters from statistics: populations of models, a straight-line model of what they give, robust steps."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dase.error import Scale
+from dase.evidence import Half
+from dase.space import Space
+
+Array = NDArray[np.float64]
+
+RADIUS = 0.25
+"""Of the first population, in the units of `Axis.to_place`."""
+
+SMALLEST = 0.03
+"""Of the last: below it the noise of single events hides the slope."""
+
+PRIOR = 2e-3
+"""Weight by which parameters that the data say nothing about are held at their start."""
+
+
+@dataclass(frozen=True)
+class Found:
+    """Where a search ended.
+
+    Args:
+        place: Best place, shape (P,).
+        loss: Of the best place.
+        values: Its statistics, shape (J,).
+        slope: Statistics per unit of place, shape (J, P).
+        places: All places tried, shape (M, P).
+        tried: Their statistics, shape (M, J).
+    """
+
+    place: Array
+    loss: float
+    values: Array
+    slope: Array
+    places: Array
+    tried: Array
+
+
+def search(
+    half: Half, space: Space, start: Array, *, seed: int, iterations: int = 5, radius: float = RADIUS
+) -> Found:
+    """Descend from one start.
+
+    Each iteration simulates a population about the present place, with the random numbers in common, fits a
+    straight line to each statistic, and goes where the robust loss of those lines is least. The slopes come
+    from differences as wide as the population, so the noise of single events does not matter.
+
+    Args:
+        half: What is fitted.
+        space: Free parameters.
+        start: Where to begin, shape (P,).
+        seed: Of the models' random numbers, and of the populations.
+        iterations: Populations.
+        radius: Of the first.
+    """
+    rng = np.random.default_rng([seed, 7])
+    low, high = space.bounds()
+    centre = np.clip(start, low, high)
+    places, tried = np.empty((0, len(centre))), np.empty((0, len(half.scale.target)))
+    best, best_loss = centre, np.inf
+    slope = np.zeros((len(half.scale.target), len(centre)))
+    for _ in range(iterations):
+        population = np.clip(
+            np.concatenate([centre[None], centre + radius * _cross(rng, len(centre))]), low, high
+        )
+        values = half.run(space.sensor, space.vectors(population), seed=seed)
+        places, tried = np.concatenate([places, population]), np.concatenate([tried, values])
+        losses = half.scale.loss(tried) + penalty(places, start)
+        leader = int(np.argmin(losses))
+        improved = losses[leader] < best_loss - 1e-3 * abs(best_loss) if np.isfinite(best_loss) else True
+        best, best_loss = places[leader], float(losses[leader])
+        near = np.abs(places - best).max(1) <= 2.5 * radius
+        slope = slopes(places[near] - best, tried[near] - tried[leader])
+        step = robust_step(half.scale, tried[leader], slope, best - start)
+        length = np.abs(step).max()
+        step *= min(1.0, 2.0 * radius / max(length, 1e-12))
+        centre = np.clip(best + step, low, high)
+        radius = max(radius * (1.0 if improved and length > radius else 0.5), SMALLEST)
+    final = half.run(space.sensor, space.vectors(centre), seed=seed)
+    places, tried = np.concatenate([places, centre[None]]), np.concatenate([tried, final])
+    losses = half.scale.loss(tried) + penalty(places, start)
+    leader = int(np.argmin(losses))
+    return Found(places[leader], float(half.scale.loss(tried[leader])), tried[leader], slope, places, tried)
+
+
+def penalty(places: Array, start: Array) -> Array:
+    """Return what it costs to leave the start, shape (...)."""
+    out: Array = PRIOR * ((places - start) ** 2).sum(-1)
+    return out
+
+
+def _cross(rng: np.random.Generator, size: int) -> Array:
+    """Return both ways along the axes of a random frame, and some directions more, shape (2 P + 2, P)."""
+    frame, _ = np.linalg.qr(rng.standard_normal((size, size)))
+    frame *= np.sqrt(size) / np.maximum(np.abs(frame).max(1, keepdims=True) * np.sqrt(size), 1e-9)
+    more = rng.standard_normal((1, size))
+    more /= np.abs(more).max()
+    return np.concatenate([frame, -frame, more, -more])
+
+
+def slopes(places: Array, values: Array) -> Array:
+    """Return the slopes of straight lines through the origin, shape (J, P)."""
+    size = places.shape[1]
+    ridge = 1e-3 * np.trace(places.T @ places) / size + 1e-12
+    fit = np.linalg.solve(places.T @ places + ridge * np.eye(size), places.T @ values)
+    out: Array = fit.T
+    return out
+
+
+def robust_step(scale: Scale, values: Array, slope: Array, offset: Array) -> Array:
+    """Return the step to the least robust loss of statistics that run along straight lines, shape (P,)."""
+    weights = scale.weights()
+    z0 = scale.z(values)
+    lines = np.where(scale.used[:, None], slope / scale.sigma[:, None], 0.0)
+    step = np.zeros(slope.shape[1])
+    for _ in range(20):
+        z = z0 + lines @ step
+        w = weights / np.sqrt(1.0 + z * z)
+        normal = lines.T @ (w[:, None] * lines) + PRIOR * np.eye(len(step))
+        right = lines.T @ (w * z0) + PRIOR * offset
+        new = -np.linalg.solve(normal + 1e-9 * np.trace(normal) * np.eye(len(step)), right)
+        if np.abs(new - step).max() < 1e-4:
+            return new
+        step = new
+    return step
+
+
+def screen(half: Half, space: Space, starts: Sequence[Array] | Array, *, seed: int) -> tuple[Array, Array]:
+    """Return places in order of their loss, and the losses."""
+    places = np.atleast_2d(np.asarray(starts))
+    losses = half.scale.loss(half.run(space.sensor, space.vectors(places), seed=seed))
+    order = np.argsort(losses)
+    return places[order], losses[order]

@@ -1,0 +1,282 @@
+"""Which physical effect a model lacks."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+
+from dase.candidates import Tried, apart, chance_of, open_to, try_all
+from dase.confidence import estimates
+from dase.effects import EFFECTS, Effect
+from dase.error import Judgement
+from dase.events import Events
+from dase.evidence import PIXELS, Evidence, gather
+from dase.model import Model, fit_present, model_of, settle
+from dase.results import Cell, Diagnosis, Estimate, Rank, Step, Unexplained
+from dase.scene import Scene
+from dase.sensor import Sensor
+from dase.space import value_of
+from dase.stimulus import Trust
+from dase.words import worst_cells
+
+REPEATS = 60
+"""Simulations with other seeds that tell what chance does."""
+
+SIGNIFICANT = 0.02
+"""Largest p-value of an effect that is added; 1 / (REPEATS + 1) is the smallest there is."""
+
+MATERIAL = 0.3
+"""Least fall of the held-out error, in units of the floor."""
+
+SHARE = 0.1
+"""Least share of the way to the floor."""
+
+CLOSE = 1.5
+"""A model up to this error is said to be at the floor: what is left may be significant but is not material."""
+
+TIE = 2.0
+"""Candidates within so many standard errors of the best are not told apart from it."""
+
+MOST = 4
+"""Effects that are added at most."""
+
+Progress = Callable[[str, float, float], None]
+"""Told what is being done, the share of the step done, and the present error."""
+
+
+@dataclass
+class _Search:
+    """What a diagnosis works on."""
+
+    evidence: Evidence
+    effects: Mapping[str, type[Effect]]
+    seed: int
+    progress: Progress
+    given: frozenset[str]
+    history: list[Step] = field(default_factory=list)
+    alternatives: dict[str, list[Tried]] = field(default_factory=dict)
+    error: float = float("nan")
+
+    def judge(self, model: Model) -> Judgement:
+        """Return the held-out error of a model; makes it the present one of all halves."""
+        judgement = model.judge(self.evidence.held, repeats=REPEATS, seed=self.seed + 500)
+        self.error = judgement.error
+        self.progress("judging", 0.0, self.error)
+        return judgement
+
+    def added(self, model: Model) -> tuple[str, ...]:
+        """Return the effects that were added to the given sensor."""
+        return tuple(e.name for e in model.space.sensor.effects if e.name not in self.given)
+
+
+def diagnose(
+    events: Events,
+    scene: Scene,
+    sensor: Sensor | None = None,
+    *,
+    effects: Mapping[str, type[Effect]] = EFFECTS,
+    free: Sequence[str] | None = None,
+    trust: Trust | None = None,
+    most: int = MOST,
+    pixels: int = PIXELS,
+    seed: int = 0,
+    device: str = "cpu",
+    progress: Progress | None = None,
+) -> Diagnosis:
+    """Find the effects that a model of a camera lacks.
+
+    Args:
+        events: What was measured.
+        scene: What the camera saw, on the clock of the events.
+        sensor: The model; None for thresholds alone.
+        effects: Candidates, name to class; those of the sensor are left out.
+        free: Parameters of the sensor that may be refitted; None for all.
+        trust: Where and when the scene is to be trusted; None for everywhere.
+        most: Effects that are added at most.
+        pixels: In each half of the measurement.
+        seed: Of every random number.
+        device: Where kernels run.
+        progress: Told how far it is.
+
+    Raises:
+        InputError: Measurement and scene do not fit, or there is too little to say anything.
+    """
+    begin = time.perf_counter()
+    sensor = sensor or Sensor()
+    evidence = gather(
+        events, scene, log_eps=sensor.log_eps, trust=trust, pixels=pixels, seed=seed, device=device
+    )
+    tell = progress or (lambda text, share, error: None)
+    tell("fitting the present model", 0.0, float("nan"))
+    search = _Search(evidence, effects, seed, tell, frozenset(e.name for e in sensor.effects))
+    before = model_of(sensor, free).judge(evidence.held, repeats=REPEATS // 2, seed=seed + 500).error
+    start = fit_present(evidence, sensor, free, seed=seed)
+    model, judgement, errors = _greedy(search, start, most)
+    if not explained(judgement) and most > 0:
+        model, judgement = _pairs(search, start, model, judgement)
+    if len(search.added(model)) > 1:
+        model, judgement = _review(search, model, judgement)
+    return _verdict(search, start, model, judgement, errors, before, begin)
+
+
+def explained(judgement: Judgement) -> bool:
+    """Whether a model is at the floor."""
+    return judgement.error <= max(judgement.gate, CLOSE)
+
+
+def _greedy(search: _Search, model: Model, most: int) -> tuple[Model, Judgement, list[float]]:
+    """Add the best effect as long as one is missing."""
+    errors = []
+    for _ in range(most + 1):
+        judgement = search.judge(model)
+        errors.append(judgement.error)
+        step, better = _step(search, model, judgement, len(errors) <= most)
+        search.history.append(step)
+        if better is None:
+            break
+        model = better
+    return model, judgement, errors
+
+
+def _step(search: _Search, model: Model, judgement: Judgement, more: bool) -> tuple[Step, Model | None]:
+    """Try all effects; return what was found and the model with the best of them, None if there is none."""
+    evidence, seed = search.evidence, search.seed
+    names = tuple(e.name for e in model.space.sensor.effects)
+    cells = worst_cells(evidence, judgement)
+    step = Step(names, judgement.error, judgement.gate, judgement.families, (), None, (), cells)
+    if explained(judgement) or not more:
+        return step, None
+    repeats = model.rebase(evidence.train, repeats=REPEATS, seed=seed + 300)
+    model.rebase(evidence.scout, repeats=16, seed=seed + 200)
+    open_names = open_to(search.effects, model)
+    if not open_names:
+        return step, None
+    tried = try_all(
+        evidence, model, search.effects, open_names, seed=seed,
+        report=lambda text, share: search.progress(text, share, search.error),
+    )  # fmt: skip
+    present = evidence.train.run(model.space.sensor, model.vector, seed=seed)[0]
+    p_value = chance_of(evidence, tried, repeats, present)
+    base = float(evidence.train.scale.loss(present))
+    finalists = [t for t in tried if np.isfinite(t.held)]
+    best, ties = _choose(search, finalists)
+    ranking = tuple(_rank(t, judgement, p_value(base - t.fit) if np.isfinite(t.held) else 1.0) for t in tried)
+    mine = next(rank for rank in ranking if rank.effect == best.name)
+    enough = mine.fall >= MATERIAL and mine.share >= SHARE and mine.p_value <= SIGNIFICANT
+    search.alternatives[best.name] = [t for t in finalists if t.name != best.name]
+    step = replace(step, ranking=ranking, chosen=best.name if enough else None, ties=ties if enough else ())
+    return step, settle(evidence, best.model, seed=seed) if enough else None
+
+
+def _choose(search: _Search, finalists: Sequence[Tried]) -> tuple[Tried, tuple[str, ...]]:
+    """Return the best candidate, the simplest of those that are not told apart, and the others of those."""
+    first = finalists[0]
+    like = [first]
+    for other in finalists[1:]:
+        gap, error = apart(search.evidence, first.model, other.model, seed=search.seed)
+        if gap < TIE * error and other.held < 1.1 * first.held + 0.05:
+            like.append(other)
+    best = min(like, key=lambda t: (len(t.model.place), t.held))
+    return best, tuple(t.name for t in like if t.name != best.name)
+
+
+def _rank(tried: Tried, judgement: Judgement, p_value: float) -> Rank:
+    """Return a candidate as the user sees it; losses become errors by the unit of the present model."""
+    full = bool(np.isfinite(tried.held))
+    error = tried.held / judgement.unit
+    fall = judgement.error - error
+    share = fall / max(judgement.error - 1.0, 1e-9)
+    mine = {
+        axis.name: Estimate(*(3 * (float(axis.to_value(place)),)))
+        for axis, place in zip(tried.model.space.axes, tried.model.place, strict=True)
+        if axis.name.split(".")[0] in tried.name.split(" + ")
+    }
+    return Rank(tried.name, error, fall, min(share, 1.0), p_value, mine, full)
+
+
+def _pairs(search: _Search, start: Model, model: Model, judgement: Judgement) -> tuple[Model, Judgement]:
+    """Where adding one after the other does not reach the floor, try two at once."""
+    return model, judgement
+
+
+def _review(search: _Search, model: Model, judgement: Judgement) -> tuple[Model, Judgement]:
+    """Drop effects that are not needed any more."""
+    for name in search.added(model):
+        sensor = model.sensor.without(name)
+        free = [a.name for a in model.space.axes if a.name.split(".")[0] != name]
+        less = settle(search.evidence, model_of(sensor, free), seed=search.seed)
+        without = search.judge(less)
+        if explained(without) or without.error <= judgement.error:
+            model, judgement = less, without
+    return model, judgement
+
+
+def _verdict(
+    search: _Search,
+    start: Model,
+    model: Model,
+    judgement: Judgement,
+    errors: list[float],
+    before: float,
+    begin: float,
+) -> Diagnosis:
+    found = search.added(model)
+    order = [s.chosen for s in search.history if s.chosen in found]
+    unexplained: Unexplained | None = None
+    last = search.judge(model)
+    cells = worst_cells(search.evidence, last)
+    notes = list(search.evidence.notes)
+    if not explained(last):
+        unexplained = _unexplained(search, tuple(str(n) for n in order), errors[0], last, cells)
+    values = estimates(search.evidence, model, seed=search.seed)
+    ties = {s.chosen: s.ties for s in search.history if s.chosen in found and s.ties and unexplained is None}
+    kept = unexplained is None
+    path = [errors[0]] + [e for s, e in zip(search.history, errors[1:], strict=False) if s.chosen in found]
+    if kept and len(path) > 1:
+        path[-1] = last.error
+    return Diagnosis(
+        sensor=model.sensor if kept else start.sensor,
+        selected=tuple(str(n) for n in order) if kept else (),
+        errors=tuple(path) if kept else (errors[0],),
+        before=before,
+        floor=1.0,
+        gate=last.gate,
+        parameters=values,
+        ties={str(k): v for k, v in ties.items()},
+        unexplained=unexplained,
+        history=tuple(search.history),
+        notes=tuple(notes),
+        evaluations=search.evidence.evaluations,
+        seconds=time.perf_counter() - begin,
+    )
+
+
+def _unexplained(
+    search: _Search, nearest: tuple[str, ...], first: float, last: Judgement, cells: tuple[Cell, ...]
+) -> Unexplained:
+    share = (last.error - 1.0) / max(first - 1.0, 1e-9)
+    stand_in = " and ".join(nearest) if nearest else "no effect"
+    where = cells[0].sentence if cells else "no single cell stands out"
+    sentence = (
+        f"unexplained: with {stand_in} an error of {last.error:.2g} is left ({100 * share:.0f} % of the error "
+        f"above the floor), which none of the effects known takes to the floor; worst: {where}"
+    )
+    return Unexplained(last.error, share, nearest, cells, sentence)
+
+
+def summary(found: Diagnosis) -> str:
+    """Return the finding in one line."""
+    if found.unexplained is not None:
+        return found.unexplained.sentence
+    if not found.selected:
+        return f"nothing is missing: error {found.errors[0]:.2f}, repeats stay below {found.gate:.2f}"
+    return f"missing: {', '.join(found.selected)}"
+
+
+def value(sensor: Sensor, name: str) -> Any:
+    """Return a parameter of a sensor."""
+    return value_of(sensor, name)

@@ -1,0 +1,102 @@
+"""How far statistics of a model are from those of a measurement."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dase.probes import LAYOUT
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Scale:
+    """What differences are measured by.
+
+    Args:
+        target: Statistics of the measurement, shape (J,).
+        sigma: Standard error of a difference, tolerance included, shape (J,).
+        used: Which statistics are compared, shape (J,).
+    """
+
+    target: Array
+    sigma: Array
+    used: NDArray[np.bool_]
+
+    def z(self, values: Array) -> Array:
+        """Return differences in standard errors, 0 where nothing is compared, shape (..., J)."""
+        return np.where(self.used, (values - self.target) / self.sigma, 0.0)
+
+    def weights(self) -> Array:
+        """Return the weight of each statistic: families weigh alike, shape (J,)."""
+        out = np.zeros(len(self.used))
+        for part in LAYOUT.values():
+            count = np.count_nonzero(self.used[part])
+            if count:
+                out[part] = self.used[part] / count
+        return out / max(out.sum(), 1e-300)
+
+    def loss(self, values: Array) -> Array:
+        """Return the robust distance, about 1 where the differences are chance, shape (...)."""
+        out: Array = robust(self.z(values)) @ self.weights()
+        return out
+
+    def families(self, values: Array) -> dict[str, float]:
+        """Return the robust distance of each family that is compared."""
+        rho = robust(self.z(values))
+        used = {name: part for name, part in LAYOUT.items() if self.used[part].any()}
+        return {name: float(rho[part][self.used[part]].mean()) for name, part in used.items()}
+
+
+@dataclass(frozen=True)
+class Judgement:
+    """The error of a model, and what chance makes of a true one.
+
+    Args:
+        error: 1 is what two repeats of one measurement give, each of them off by what is of no concern.
+        gate: Error that 99 of 100 repeats stay below.
+        families: Error per family.
+        z: Difference of each statistic in standard errors, shape (J,).
+        unit: Robust distance that is called 1.
+    """
+
+    error: float
+    gate: float
+    families: dict[str, float]
+    z: Array
+    unit: float
+
+
+def judge(repeats: Array, seen: Scale, chance: Scale, off: Array, *, seed: int) -> Judgement:
+    """Compare a measurement with repeats of a model.
+
+    The model is the mean of its repeats. Each repeat in turn stands in for the measurement and is compared
+    with the others, off by the tolerance at random: what that gives is called 1. So a difference within the
+    tolerance does not count as an error, and a model without any chance in it still has a floor.
+
+    Args:
+        repeats: Statistics of simulations with different seeds, shape (R, J).
+        seen: Sampling errors of the difference between measurement and model.
+        chance: Sampling errors of the model.
+        off: The tolerance, shape (J,).
+        seed: Of the random part of the tolerance.
+    """
+    count = len(repeats)
+    mean = repeats.mean(0)
+    rng = np.random.default_rng([seed, 3])
+    apart = (repeats - mean) * (count / (count - 1)) + off * rng.standard_normal(repeats.shape)
+    weights = chance.weights()
+    null = robust(np.where(chance.used, apart / chance.sigma, 0.0)) @ weights
+    unit = float(null.mean())
+    gate = max(float(np.quantile(null, 0.99)), unit + 2.6 * float(null.std()))
+    families = {name: value / unit for name, value in seen.families(mean).items()}
+    return Judgement(float(seen.loss(mean)) / unit, gate / unit, families, seen.z(mean), unit)
+
+
+def robust(z: Array) -> Array:
+    """Return the pseudo-Huber loss: z² for small z, 2 |z| for large; its slope never vanishes."""
+    out: Array = 2.0 * (np.sqrt(1.0 + z * z) - 1.0)
+    return out

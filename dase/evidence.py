@@ -1,0 +1,277 @@
+"""A measurement, split for fitting and for judging: other pixels and another time."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from dase.error import Judgement, Scale, judge, robust
+from dase.errors import InputError
+from dase.events import Events
+from dase.kernels import launch
+from dase.kernels import probes as kernels
+from dase.probes import Frame, Sums, compared, statistics, tolerance, zones
+from dase.scene import Scene
+from dase.sensor import Sensor
+from dase.stimulus import MASKED, Grid, Stimulus, Trust, band_edges, light_of, sort_into_cells
+from dase.trials import GROUP, Trials
+
+PIXELS = 1500
+"""Pixels in each half of the measurement."""
+
+SCOUTS = 500
+"""Pixels of the scout."""
+
+SPLIT = 0.6
+"""Share of the time that is fitted; the rest is held out."""
+
+LEAST = 300
+"""Events that a half must have for anything to be said."""
+
+FINEST, COARSEST = 2.5e-4, 2e-3
+"""A scene's own steps are taken when they are equal and lie between these [s]; else `COMMON`."""
+
+COMMON = 1e-3
+
+Array = NDArray[np.float64]
+
+
+@dataclass(eq=False)
+class Half:
+    """Some pixels over some time: models are run, and compared with what was measured there.
+
+    Args:
+        trials: Runs models.
+        found: What was measured.
+        frame: What statistics refer to.
+        scale: What differences are measured by in a fit: sampling errors as they are seen between groups of
+            pixels, also where the model is wrong.
+        chance: What differences are measured by in a test: sampling errors of the present model.
+        seen: As `scale`, for the mean of many repeats of the present model.
+        off: What each statistic may be off by.
+        simulated: Statistics of the present model, the mean over its repeats.
+    """
+
+    trials: Trials
+    found: Sums
+    frame: Frame
+    scale: Scale = field(init=False)
+    chance: Scale = field(init=False)
+    seen: Scale = field(init=False)
+    off: Array = field(init=False)
+    simulated: Array = field(init=False)
+
+    def run(self, sensor: Sensor, vectors: ArrayLike, **options: Any) -> Array:
+        """Return the statistics of models, shape (B, J)."""
+        return statistics(self.trials.run(sensor, np.atleast_2d(np.asarray(vectors)), **options), self.frame)[
+            0
+        ]
+
+    def rebase(self, sensor: Sensor, vector: ArrayLike, *, repeats: int, seed: int) -> Array:
+        """Make a model the present one: expectations and sampling errors are its own.
+
+        Returns:
+            Statistics of `repeats` simulations of it with other seeds, shape (repeats, J).
+        """
+        vectors = np.repeat(np.atleast_2d(np.asarray(vector)), repeats, 0)
+        sums = self.trials.run(sensor, vectors, seed=seed, reseed=True)
+        return self.take(sums)
+
+    def take(self, sums: Sums) -> Array:
+        """Make the model with these repeats the present one; return their statistics."""
+        bare = replace(self.frame, expected=sums.halves.mean(0, dtype=np.float64), measured=None)
+        target, events = statistics(self.found, bare)
+        self.frame = replace(bare, measured=target[0])
+        values, _ = statistics(sums, self.frame)
+        off = tolerance(target[0], events[0]) ** 2
+        repeats = 2.0 * values.var(0, ddof=1)
+        used = compared(events[0])
+        self.off = np.sqrt(off)
+        self.chance = Scale(target[0], np.sqrt((0.5 + 0.5 / len(values)) * repeats + off), used)
+        self.simulated = values.mean(0)
+        self._present = Sums(sums.sums[:1], sums.halves[:1], sums.groups[:1])
+        scatter = self._scatter(sums)
+        self.scale = Scale(target[0], np.sqrt(np.maximum(repeats, scatter) + off), used)
+        # of the difference from the mean of the repeats, which has nearly no sampling error of its own
+        seen = np.maximum((0.5 + 0.5 / len(values)) * repeats, scatter - (0.5 - 0.5 / len(values)) * repeats)
+        self.seen = Scale(target[0], np.sqrt(seen + off), used)
+        return values
+
+    def _scatter(self, sums: Sums) -> Array:
+        """Return the variance of the differences between measurement and model, by groups of pixels, (J,)."""
+        measured, simulated = (self._left(one) for one in (self.found, sums))
+        out: Array = (len(measured) - 1) * (measured - simulated).var(0)
+        return out
+
+    @property
+    def groups(self) -> int:
+        """Number of groups of pixels."""
+        return self.found.groups.shape[1]
+
+    def left(self) -> Array:
+        """Return statistics of the measurement less the model, groups left out one after the other, (G, J)."""
+        return self._left(self.found) - self._left(self._present)
+
+    def leave_out(self, models: list[Sums]) -> Array:
+        """Return the loss of each model with one group of pixels left out after the other, shape (M, G)."""
+        measured = self._left(self.found)
+        weights = self.scale.weights()
+        rows = [
+            robust(np.where(self.scale.used, (self._left(m) - measured) / self.scale.sigma, 0.0))
+            for m in models
+        ]
+        return np.stack([row @ weights for row in rows])
+
+    def _left(self, one: Sums) -> Array:
+        """Return statistics without one group of pixels after the other, shape (G, J)."""
+        count = self.found.groups.shape[1]
+        pixels = np.minimum(np.arange(len(self.frame.zone)) // GROUP, count - 1)
+        expected = self.frame.expected * (np.arange(count)[:, None] != pixels)[..., None]
+        return statistics(one.without(pixels), replace(self.frame, expected=expected))[0]
+
+    def judge(self, repeats: Array, *, seed: int) -> Judgement:
+        """Return the error of the present model, whose repeats are given."""
+        return judge(repeats, self.seen, self.chance, self.off, seed=seed)
+
+
+@dataclass(eq=False)
+class Evidence:
+    """A measurement and the scene it is of.
+
+    Args:
+        train: Pixels and time that are fitted.
+        held: Other pixels, at a later time, which judge.
+        scout: Some of the pixels that are fitted, for what need not be exact.
+        bands: Intensities between the bands, shape (BANDS - 1,).
+        notes: What the data cannot show.
+    """
+
+    train: Half
+    held: Half
+    scout: Half
+    bands: Array
+    notes: tuple[str, ...] = ()
+
+    @property
+    def evaluations(self) -> int:
+        """Models run so far."""
+        return sum(half.trials.evaluations for half in (self.train, self.held, self.scout))
+
+
+def gather(
+    events: Events,
+    scene: Scene,
+    *,
+    log_eps: float = 1e-3,
+    trust: Trust | None = None,
+    pixels: int = PIXELS,
+    seed: int = 0,
+    device: str = "cpu",
+) -> Evidence:
+    """Split a measurement into a half that is fitted and a half that judges.
+
+    Args:
+        events: What was measured.
+        scene: What the camera saw, on the clock of the events.
+        log_eps: Added to intensities before the logarithm.
+        trust: Where and when the scene is to be trusted; None for everywhere.
+        pixels: In each half.
+        seed: Of the choice of pixels.
+        device: Where kernels run.
+
+    Raises:
+        InputError: Different sizes, no common time, or too few events.
+    """
+    grid = common_grid(events, scene)
+    try:
+        to = launch.device(device)
+    except ValueError as error:
+        raise InputError(str(error)) from error
+    size = scene.width * scene.height
+    each = min(pixels, size // 2)
+    if each < 16:
+        raise InputError(f"a diagnosis needs at least 32 pixels, the scene has {scene.width}x{scene.height}")
+    chosen = np.random.default_rng([seed, 1]).permutation(size)[: 2 * each].astype(np.int32)
+    light = light_of(scene, _times(scene, grid), chosen)
+    if not np.all(np.isfinite(light)) or light.min() < 0:
+        raise InputError("scene: intensities must be finite and >= 0")
+    good = np.ones(light.shape, np.bool_) if trust is None else trust(grid.times, chosen).T
+    bands = band_edges(light, good)
+    cell = sort_into_cells(light, grid.step, bands, log_eps)
+    cell[~good] = MASKED
+    cell[:, 0] = MASKED
+    cut = max(2, round(SPLIT * grid.steps))
+    first, last = slice(0, each), slice(each, 2 * each)
+    train_grid = replace(grid, steps=cut)
+    late = cell[last].copy()
+    late[:, :cut] = MASKED
+    halves = []
+    for part, span, cells in ((first, train_grid, cell[first, :cut]), (last, grid, late)):
+        stimulus = Stimulus(
+            chosen[part], scene.width, scene.height, span, light[part, : span.steps], cells, log_eps, to
+        )
+        halves.append(_half(stimulus, events, cut if span is grid else 0))
+    _enough(halves, events, grid)
+    scout = _half(halves[0].trials.stimulus.part(SCOUTS), events, 0)
+    return Evidence(*halves, scout, bands)
+
+
+def common_grid(events: Events, scene: Scene) -> Grid:
+    """Return the time that scene and events have in common, in equal steps."""
+    if (events.width, events.height) != (scene.width, scene.height):
+        raise InputError(
+            f"recording and scene must have one size, got {events.width}x{events.height} "
+            f"and {scene.width}x{scene.height}"
+        )
+    times = scene.sample_times()
+    if len(events) == 0:
+        raise InputError("the recording has no events, so there is nothing to compare")
+    begin, end = float(times[0]), float(times[-1])
+    if events.t[-1] < begin or events.t[0] > end:
+        raise InputError(
+            f"recording and scene must overlap in time, got events from {events.t[0]:.6g} s to "
+            f"{events.t[-1]:.6g} s and a scene from {begin:.6g} s to {end:.6g} s"
+        )
+    step = np.diff(times)
+    even = len(step) > 0 and np.ptp(step) < 1e-3 * step.mean() and FINEST <= step.mean() <= COARSEST
+    h = float(step.mean()) if even else COMMON
+    last = min(end, float(events.t[-1]) + 2 * h)
+    steps = int(np.floor((last - begin) / h + 1e-6)) + 1
+    return Grid(begin, h, max(steps, 2))
+
+
+def _times(scene: Scene, grid: Grid) -> NDArray[np.float64]:
+    """Return the times of the grid, those of the scene itself where they are the same but for rounding."""
+    own = scene.sample_times()[: grid.steps]
+    same = len(own) == grid.steps and np.allclose(own, grid.times, rtol=0, atol=1e-3 * grid.step)
+    return own if same else grid.times
+
+
+def _half(stimulus: Stimulus, events: Events, first: int) -> Half:
+    trials = Trials(stimulus)
+    trials.middle = typical_changes(trials.look(events))
+    found = trials.look(events)
+    seconds = stimulus.grid.step * (stimulus.grid.steps - first)
+    expected = np.zeros((len(stimulus.pixels), kernels.HALVES))
+    zone = zones(stimulus.pixels, stimulus.width, stimulus.height)
+    return Half(trials, found, Frame(expected, zone, seconds))
+
+
+def typical_changes(sums: Sums) -> NDArray[np.float32]:
+    """Return the mean change of the light between two events by polarities and interval, (4 CLASSES,)."""
+    pairs = sums.sums[0, kernels.CHANGE : kernels.CHANGE + 12 * kernels.CLASSES].reshape(-1, 3)
+    return (pairs[:, 1] / np.maximum(pairs[:, 0], 1)).astype(np.float32)
+
+
+def _enough(halves: list[Half], events: Events, grid: Grid) -> None:
+    for half, name in zip(halves, ("fitting", "judging"), strict=True):
+        count = int(half.found.halves.sum())
+        if count < LEAST:
+            raise InputError(
+                f"too few events to say anything: {count} of the {len(events)} lie in the part for {name}, "
+                f"at least {LEAST} are needed; record about {max(2.0, np.ceil(LEAST / max(count, 1))):.0f} times "
+                f"as long as these {grid.step * (grid.steps - 1):.3g} s, or more motion"
+            )

@@ -1,0 +1,131 @@
+"""The parameters of a sensor from a recording."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from dase.confidence import estimates
+from dase.diagnosis import Progress
+from dase.events import Events
+from dase.evidence import PIXELS, gather
+from dase.model import Model, fit_present, model_of, settle
+from dase.results import Estimate, Fit
+from dase.scene import Scene
+from dase.sensor import Sensor
+from dase.space import Axis
+from dase.stimulus import Trust
+
+REPEATS = 60
+"""Simulations with other seeds that tell what chance does."""
+
+OTHERS = 2
+"""Starts beside the wide look at thresholds."""
+
+AGREE = 1.5
+"""Starts agree where their ends lie within so many half-widths of the confidence interval, or `NEAR`."""
+
+NEAR = 0.03
+"""Of each other, in the units of `Axis.to_place`."""
+
+
+def fit(
+    events: Events,
+    scene: Scene,
+    sensor: Sensor,
+    *,
+    free: Sequence[str] | None = None,
+    trust: Trust | None = None,
+    pixels: int = PIXELS,
+    seed: int = 0,
+    device: str = "cpu",
+    progress: Progress | None = None,
+) -> Fit:
+    """Fit the parameters of a sensor to a measurement.
+
+    Args:
+        events: What was measured.
+        scene: What the camera saw, on the clock of the events.
+        sensor: Its effects are fitted; nothing is added.
+        free: Effects or `effect.parameter` that are fitted; None for all.
+        trust: Where and when the scene is to be trusted; None for everywhere.
+        pixels: In each half of the measurement.
+        seed: Of every random number.
+        device: Where kernels run.
+        progress: Told how far it is.
+
+    Raises:
+        InputError: Measurement and scene do not fit, or there is too little to say anything.
+    """
+    begin = time.perf_counter()
+    tell = progress or (lambda text, share, error: None)
+    model_of(sensor, free)  # refuses names that are not there before anything takes time
+    evidence = gather(
+        events, scene, log_eps=sensor.log_eps, trust=trust, pixels=pixels, seed=seed, device=device
+    )
+    given = model_of(sensor, free)
+    before = given.judge(evidence.held, repeats=REPEATS // 2, seed=seed + 500).error
+    tell("a wide look", 0.1, before)
+    best = settle(evidence, fit_present(evidence, sensor, free, seed=seed), seed=seed)
+    ends = [best]
+    for n in range(OTHERS):
+        tell(f"start {n + 2} of {OTHERS + 1}", 0.3 + 0.25 * n, before)
+        ends.append(settle(evidence, _elsewhere(best, seed + n), seed=seed + n))
+    judged = [(m.judge(evidence.held, repeats=REPEATS, seed=seed + 500), m) for m in ends]
+    judgement, model = min(judged, key=lambda pair: pair[0].error)
+    tell("confidence intervals", 0.9, judgement.error)
+    values = estimates(evidence, model, seed=seed)
+    good = [m for j, m in judged if j.error < judgement.error + 0.1]
+    apart = disagreements(model, good, values)
+    notes = [*evidence.notes, *apart, *outside(model)]
+    if len(good) < 2:
+        notes.append("only one of the starts came to this error: the others ended in worse minima")
+    return Fit(
+        sensor=model.sensor,
+        parameters=values,
+        error=judgement.error,
+        before=before,
+        floor=1.0,
+        gate=judgement.gate,
+        agree=not apart and len(good) > 1,
+        notes=tuple(notes),
+        evaluations=evidence.evaluations,
+        seconds=time.perf_counter() - begin,
+    )
+
+
+def _elsewhere(model: Model, seed: int) -> Model:
+    """Return the model well away from where it is."""
+    rng = np.random.default_rng([seed, 11])
+    low, high = model.space.bounds()
+    place = np.clip(model.place + rng.choice([-0.5, 0.5], len(model.place)), low, high)
+    return replace(model, place=place)
+
+
+def disagreements(best: Model, ends: Sequence[Model], values: dict[str, Estimate]) -> list[str]:
+    """Return a sentence for each parameter in which equally good ends differ."""
+    out = []
+    for n, axis in enumerate(best.space.axes):
+        places = np.array([m.place[n] for m in ends])
+        low, high = (float(axis.to_place(v)) for v in (values[axis.name].low, values[axis.name].high))
+        if np.ptp(places) > max(AGREE * 0.5 * (high - low), NEAR):
+            found = ", ".join(f"{float(axis.to_value(p)):.3g}" for p in sorted(places))
+            out.append(f"{axis.name}: starts end at {found}; the data do not say which")
+    return out
+
+
+def outside(model: Model) -> list[str]:
+    """Return a sentence for each parameter beyond its plausible range."""
+    return [
+        f"{axis.name} = {value:.3g} {axis.fact.unit} lies outside its plausible range, "
+        f"{axis.fact.plausible[0]:g} to {axis.fact.plausible[1]:g}"
+        for axis, value in _values(model)
+        if not axis.fact.plausible[0] * 0.999 <= value <= axis.fact.plausible[1] * 1.001
+    ]
+
+
+def _values(model: Model) -> list[tuple[Axis, float]]:
+    return [(a, float(a.to_value(p))) for a, p in zip(model.space.axes, model.place, strict=True)]

@@ -1,0 +1,198 @@
+"""What a file format is, and how its reader becomes one.
+
+A reader yields pieces in the order of the file, in the file's own ticks. From them `camera_format` makes the
+two ways to read: `read` takes all of it and sorts, `stream` hands on chunks of exactly the length asked for,
+sorted within `LATENESS`, in memory that does not grow with the file. Frames come one by one beside that.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import AbstractContextManager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from dase.errors import InputError
+from dase.events import Events
+from dase.io import rules
+from dase.io.sequence import Sequence, Writer, reading
+from dase.io.source import Beside, Picture, Piece, Size, Source, checked_size, guess_size, join
+
+LIMIT = 4 << 30  # [bytes] of frames, or of flow, taken into memory
+
+
+def no_pictures(source: Source) -> Iterator[Picture]:
+    """Yield nothing: a format without frames."""
+    return iter(())
+
+
+@dataclass(frozen=True, kw_only=True)
+class Format:
+    """A file format: how to know it, read it and write it."""
+
+    name: str
+    suffixes: tuple[str, ...]
+    matches: Callable[[Path, bytes], bool]
+    """Whether a path with these first bytes holds this format; never raises."""
+    read: Callable[[Source], Sequence]
+    """Read all of it."""
+    stream: Callable[[Source, int], Iterator[Events]]
+    """Yield its events in chunks; at least one, if empty, for the size of the sensor."""
+    pictures: Callable[[Source], Iterator[Picture]] = no_pictures
+    """Yield its frames with their times [s], as `read` gives them; not a number where nothing tells them."""
+    beside: Callable[[Source], Beside] = lambda source: (None, None)
+    """Read thresholds and configuration."""
+    create: Callable[[Path], AbstractContextManager[Writer]] | None = None
+    """Open for writing; None where the format is read only."""
+    keeps: frozenset[str] = frozenset({"events"})
+    """What of a sequence a file can hold."""
+    extra: str | None = None
+    """Optional dependency of the package that reading needs."""
+
+
+def camera_format(
+    *,
+    pieces: Callable[[Source], Iterator[Piece]],
+    size: Callable[[Source], Size | None],
+    pictures: Callable[[Source], Iterator[Picture]] = no_pictures,
+    extent: Callable[[Source], Size] | None = None,
+    ticks: float = 1e6,
+    **fields: Any,
+) -> Format:
+    """Make a format of its reader.
+
+    Args:
+        pieces: Yields the events in the order of the file; called again where the size has to be found.
+        size: Tells columns and rows, or None where the file does not say.
+        pictures: Yields the frames.
+        extent: Tells one more than the largest column and row, where that is cheaper than decoding all.
+        ticks: Ticks per second of pieces and frames.
+        fields: The other fields of Format.
+    """
+    name = fields["name"]
+
+    def sensor(source: Source) -> Size:
+        known = source.size or size(source)
+        if known is None:
+            found = extent(source) if extent else largest(pieces(source))
+            known = guess_size(source, found)
+        return checked_size(known)
+
+    def read(source: Source) -> Sequence:
+        with reading(source.path, name):
+            frames = taken(_fitting(source, pictures(source), known := sensor(source)))
+            return _read(source, pieces(source), frames, known, ticks)
+
+    def stream(source: Source, chunk: int) -> Iterator[Events]:
+        with reading(source.path, name):
+            yield from _stream(source, pieces(source), sensor(source), ticks, chunk)
+
+    def shown(source: Source) -> Iterator[Picture]:
+        with reading(source.path, name):
+            zero: Any = None
+            for picture in _fitting(source, pictures(source), known := sensor(source)):
+                if zero is None:
+                    settled = rules.settled(source, pieces(source), known, ticks)
+                    first = next((p.t for p in rules.ordered(source, settled, ticks)), np.array([picture.t]))
+                    zero = rules.origin(source, first, ticks)
+                yield picture._replace(t=(picture.t - zero) / ticks)
+
+    return Format(read=read, stream=stream, pictures=shown, **fields)
+
+
+def _fitting(source: Source, pictures: Iterable[Picture], size: Size) -> Iterator[Picture]:
+    """Pass on the pictures that are as large as the sensor; note the others."""
+    for picture in pictures:
+        if picture.grey.shape != size[::-1]:
+            height, width = picture.grey.shape
+            source.note(
+                f"frames of {width}x{height} do not fit the {size[0]}x{size[1]} sensor: left out",
+                "refused",
+                "frames",
+            )
+            return
+        yield picture
+
+
+def _read(
+    source: Source, pieces: Iterable[Piece], pictures: list[Picture], size: Size, ticks: float
+) -> Sequence:
+    piece = rules.by_time(source, join(list(rules.settled(source, pieces, size, ticks))), ticks)
+    times = np.array([picture.t for picture in pictures])
+    zero = rules.origin(source, piece.t if len(piece.t) else times, ticks)
+    events = Events((piece.t - zero) / ticks, piece.x, piece.y, piece.p, *size, piece.label)
+    return sequence_of(events, [picture._replace(t=(picture.t - zero) / ticks) for picture in pictures])
+
+
+def taken(pictures: Iterable[Picture]) -> list[Picture]:
+    """Return pictures of one size; raises InputError where they differ or fill the memory."""
+    out: list[Picture] = []
+    total = 0
+    for picture in pictures:
+        total += picture.grey.nbytes + (0 if picture.flow is None else picture.flow.nbytes)
+        if total > LIMIT:
+            raise InputError(f"its frames need more than {LIMIT >> 30} GiB of memory: cut it into parts")
+        if out and picture.grey.shape != out[0].grey.shape:
+            a, b = out[0].grey.shape, picture.grey.shape
+            raise InputError(f"frame {len(out)} is {b[1]}x{b[0]}, those before are {a[1]}x{a[0]}")
+        out.append(picture)
+    return out
+
+
+def sequence_of(events: Events, pictures: list[Picture]) -> Sequence:
+    """Return a sequence of events and frames with times [s], not a number where nothing tells them."""
+    if not pictures:
+        return Sequence(events)
+    times = np.array([picture.t for picture in pictures], np.float64)
+    exposure = np.array([picture.exposure for picture in pictures], np.float64)
+    flow = [picture.flow for picture in pictures if picture.flow is not None]
+    return Sequence(
+        events,
+        np.stack([picture.grey for picture in pictures]),
+        None if np.isnan(times).any() else times,
+        np.stack(flow) if len(flow) == len(pictures) else None,
+        frame_exposure=exposure if exposure.any() else None,
+    )
+
+
+def _stream(
+    source: Source, pieces: Iterable[Piece], size: Size, ticks: float, chunk: int
+) -> Iterator[Events]:
+    if chunk < 1:
+        raise InputError(f"chunk must be at least 1 event, got {chunk}")
+    zero = None
+    settled = rules.settled(source, pieces, size, ticks)
+    for piece in _cut(rules.ordered(source, settled, ticks), chunk):
+        zero = rules.origin(source, piece.t, ticks) if zero is None else zero
+        yield Events((piece.t - zero) / ticks, piece.x, piece.y, piece.p, *size, piece.label)
+    if zero is None:
+        yield Events.empty(*size)
+
+
+def _cut(pieces: Iterable[Piece], chunk: int) -> Iterator[Piece]:
+    """Cut and join pieces to exactly `chunk` events; the last may be shorter."""
+    waiting: list[Piece] = []
+    missing = chunk
+    for piece in pieces:
+        while len(piece.t) >= missing:
+            waiting.append(piece.take(slice(missing)))
+            piece = piece.take(slice(missing, None))
+            yield join(waiting)
+            waiting, missing = [], chunk
+        if len(piece.t):
+            waiting.append(piece)
+            missing -= len(piece.t)
+    if waiting:
+        yield join(waiting)
+
+
+def largest(pieces: Iterable[Piece]) -> Size:
+    """Return one more than the largest column and row."""
+    width = height = 1
+    for piece in pieces:
+        if len(piece.t):
+            width, height = max(width, int(piece.x.max()) + 1), max(height, int(piece.y.max()) + 1)
+    return width, height

@@ -1,0 +1,165 @@
+"""A model under fit: a sensor, its free parameters, and where they are."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from itertools import product
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dase.descent import Found, screen, search
+from dase.effects.base import Effect
+from dase.error import Judgement
+from dase.evidence import Evidence, Half
+from dase.sensor import Sensor
+from dase.space import Axis, Space, axes_of, with_values
+
+Array = NDArray[np.float64]
+
+THRESHOLDS = (0.04, 0.06, 0.09, 0.12, 0.15, 0.18, 0.22, 0.27, 0.34, 0.45, 0.65)
+"""Tried for both polarities when a model is fitted from nothing."""
+
+RATIO = 2.2
+"""Most that the thresholds of a pixel differ by at the start."""
+
+SHIFTS = (-0.7, -0.4, -0.15, 0.1)
+"""Of the logarithm of the thresholds, when an effect is tried."""
+
+FEW_STARTS = 0.1
+"""Share of the plausible range that is left out at both ends when an effect is tried."""
+
+
+@dataclass(frozen=True)
+class Model:
+    """A sensor with free parameters at a place.
+
+    Args:
+        space: Free parameters.
+        place: Where they are, shape (P,).
+        loss: In the fit that found it.
+    """
+
+    space: Space
+    place: Array
+    loss: float = np.inf
+
+    @property
+    def sensor(self) -> Sensor:
+        """The sensor at the place."""
+        return self.space.at(self.place)
+
+    @property
+    def vector(self) -> NDArray[np.float32]:
+        """The parameter vector, shape (1, all parameters)."""
+        return self.space.vectors(self.place)
+
+    def rebase(self, half: Half, *, repeats: int, seed: int) -> Array:
+        """Make this the present model of a half; return statistics of its repeats, shape (repeats, J)."""
+        return half.rebase(self.space.sensor, self.vector, repeats=repeats, seed=seed)
+
+    def judge(self, half: Half, *, repeats: int, seed: int) -> Judgement:
+        """Make this the present model of a half and return its error there."""
+        return half.judge(self.rebase(half, repeats=repeats, seed=seed), seed=seed)
+
+    def loss_on(self, half: Half, *, seed: int) -> float:
+        """Return the robust distance by the sampling errors of the present model of the half."""
+        return float(half.scale.loss(half.run(self.space.sensor, self.vector, seed=seed))[0])
+
+    def search(self, half: Half, *, seed: int, iterations: int = 4, radius: float = 0.2) -> Model:
+        """Return the model with its parameters improved."""
+        found = self.explore(half, seed=seed, iterations=iterations, radius=radius)
+        return replace(self, place=found.place, loss=found.loss)
+
+    def explore(self, half: Half, *, seed: int, iterations: int = 4, radius: float = 0.2) -> Found:
+        """Improve the parameters and keep all that was tried."""
+        return search(half, self.space, self.place, seed=seed, iterations=iterations, radius=radius)
+
+
+def model_of(sensor: Sensor, free: Sequence[str] | None = None) -> Model:
+    """Return the model of a sensor at its own parameters."""
+    space = Space(sensor, axes_of(sensor, free))
+    return Model(space, space.places())
+
+
+def with_phase(model: Model, phase: float) -> Model:
+    """Return the model with another spread of the pixels' memories at the start."""
+    sensor = with_values(model.space.sensor, {"threshold.phase": phase})
+    return replace(model, space=replace(model.space, sensor=sensor))
+
+
+def fit_present(evidence: Evidence, sensor: Sensor, free: Sequence[str] | None, *, seed: int) -> Model:
+    """Fit the free parameters of a sensor: a wide look at thresholds and phase, then descents."""
+    model = model_of(sensor, free)
+    best = []
+    for phase in (0.0, 1.0):
+        start = with_phase(model, phase)
+        start.rebase(evidence.scout, repeats=12, seed=seed + 100)
+        places = np.concatenate([start.place[None], _threshold_starts(start)])
+        places, losses = screen(evidence.scout, start.space, places, seed=seed)
+        best.append(replace(start, place=places[0], loss=losses[0]))
+    # each was judged by its own sampling errors; judge both by those of the better one
+    best.sort(key=lambda m: m.loss)
+    best[0].rebase(evidence.train, repeats=12, seed=seed + 100)
+    ends = [m.search(evidence.train, seed=seed) for m in best]
+    return settle(evidence, min(ends, key=lambda m: m.loss), seed=seed, rounds=1)
+
+
+def settle(evidence: Evidence, model: Model, *, seed: int, rounds: int = 2) -> Model:
+    """Refit a model by its own sampling errors, which change with it."""
+    for turn in range(rounds):
+        model.rebase(evidence.train, repeats=16, seed=seed + 100)
+        other = with_phase(model, 1.0 - model.space.sensor["threshold"].phase)  # type: ignore[attr-defined]
+        losses = [m.loss_on(evidence.train, seed=seed) for m in (model, other)]
+        model = other if losses[1] < losses[0] else model
+        model = model.search(evidence.train, seed=seed + turn, radius=0.12 / (1 + turn))
+    return model
+
+
+def _threshold_starts(model: Model) -> Array:
+    names = [axis.name for axis in model.space.axes]
+    at = [names.index(n) if n in names else -1 for n in ("threshold.on", "threshold.off")]
+    if min(at) < 0:
+        return model.place[None]
+    pairs = [(a, b) for a, b in product(THRESHOLDS, THRESHOLDS) if 1 / RATIO < a / b < RATIO]
+    out = np.repeat(model.place[None], len(pairs), 0)
+    for column, values in zip(at, np.array(pairs).T, strict=True):
+        out[:, column] = model.space.axes[column].to_place(values)
+    return out
+
+
+def added(present: Model, effect: Effect) -> Model:
+    """Return the present model with an effect added, all of whose parameters are free."""
+    sensor = present.sensor.with_effect(effect)
+    old = [axis.name for axis in present.space.axes]
+    mine = [axis.name for axis in axes_of(sensor, [effect.name])]
+    return model_of(sensor, [*old, *mine])
+
+
+def starts(model: Model, effect: Effect, *, few: bool = False) -> Array:
+    """Return places from which an effect is tried: its strength and its character, at several thresholds."""
+    axes = model.space.axes
+    columns, choices = [], []
+    for n, axis in enumerate(axes):
+        if axis.name.split(".")[0] == effect.name:
+            columns.append(n)
+            choices.append(_tried(axis, float(model.place[n]))[:: 2 if few and axis.main else 1])
+    thresholds = [n for n, axis in enumerate(axes) if axis.name in ("threshold.on", "threshold.off")]
+    out = []
+    for combination in product(*choices):
+        for shift in SHIFTS[1::2] if few else SHIFTS:
+            place = model.place.copy()
+            place[columns] = combination
+            place[thresholds] += shift
+            out.append(place)
+    return np.array(out)
+
+
+def _tried(axis: Axis, present: float) -> list[float]:
+    low, high = (float(axis.to_place(v)) for v in axis.fact.plausible)
+    if axis.main:
+        return list(low + (high - low) * np.linspace(FEW_STARTS, 1 - FEW_STARTS, 6))
+    if axis.name.split(".")[1] in ("dark", "slope", "damping", "knee", "rate", "cutoff"):
+        return [present, low + 0.9 * (high - low)]
+    return [present]

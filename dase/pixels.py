@@ -1,0 +1,314 @@
+"""Pixels of a sensor while time passes: runs the kernels chunk by chunk."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import warp as wp
+from numpy.typing import ArrayLike, NDArray
+
+from dase.errors import InputError
+from dase.events import Events
+from dase.kernels import counts as counting
+from dase.kernels import events as ordering
+from dase.kernels import launch, pixel
+from dase.kernels.random import stream
+from dase.scene import Scene
+
+if TYPE_CHECKING:
+    from dase.sensor import Sensor
+
+
+class Pixels:
+    """Some pixels of a sensor while time passes: runs the composed kernel chunk by chunk.
+
+    Args:
+        sensor: What the pixels do.
+        width: Columns of the sensor.
+        height: Rows of the sensor.
+        pixels: Row-major indices of the pixels to simulate, shape (N,); None for all.
+        parameters: Parameter vectors, shape (B, P), to simulate at once with common random numbers; None for
+            the sensor's own.
+        seed: Of every random number.
+        device: `cpu`, `cuda` or a Warp name.
+        labels: Whether events are marked with what they came from.
+    """
+
+    def __init__(
+        self,
+        sensor: Sensor,
+        width: int,
+        height: int,
+        *,
+        pixels: ArrayLike | None = None,
+        parameters: ArrayLike | None = None,
+        seed: int = 0,
+        device: str = "cpu",
+        labels: bool = False,
+    ):
+        try:
+            self.device = launch.device(device)
+        except ValueError as error:
+            raise InputError(str(error)) from error
+        self.sensor, self.width, self.height = sensor, width, height
+        self.seed = seed & 0x7FFFFFFF  # a key of random numbers has 31 bits
+        self.stages = sensor.stages()
+        self.pixels = (
+            np.arange(width * height, dtype=np.int32) if pixels is None else np.asarray(pixels, np.int32)
+        )
+        vectors = sensor.parameters()[None] if parameters is None else np.asarray(parameters, np.float32)
+        if vectors.ndim != 2 or vectors.shape[1] != len(sensor.parameter_names()):
+            raise InputError(
+                f"parameters must have shape (B, {len(sensor.parameter_names())}), got {vectors.shape}"
+            )
+        if (
+            self.pixels.ndim != 1
+            or len(self.pixels) == 0
+            or self.pixels.min() < 0
+            or self.pixels.max() >= width * height
+        ):
+            raise InputError(f"pixels must be indices of the {width}x{height} sensor, shape (N,), N >= 1")
+        self.batch, self.count = len(vectors), len(self.pixels)
+        self._pixels = wp.array(self.pixels, dtype=int, device=self.device)
+        self._places = tuple(
+            wp.array(a.astype(np.uint16), dtype=wp.uint16, device=self.device)
+            for a in (self.pixels % width, self.pixels // width)
+        )
+        self._parameters = wp.array(vectors, dtype=float, device=self.device)
+        self.sink = "labels" if labels else "keys"
+        shape = (len(pixel.states(self.stages, self.sink)), self.batch, self.count)
+        # two copies, so that a chunk whose events overran their buffer can be run again
+        self._state = wp.zeros(shape, dtype=float, device=self.device)
+        self._next = wp.zeros(shape, dtype=float, device=self.device)
+        self.samples = 0
+        self.begin = 0.0
+        self.slab = 256 if self.device.is_cuda else 2048
+        self._capacity = 4 * self.slab
+        self._buffer: Any = None  # of keys, kept from chunk to chunk
+        # nothing but a change detector: counted by a kernel of its own, several pixels per thread
+        self._plain = all(stage == "threshold" for effect in self.stages for stage, _ in effect.functions)
+        self._vectors = vectors
+        # a CPU takes logarithms of many pixels at once, unless the light is not the scene's
+        lit = any(stage == "light" for effect in self.stages for stage, _ in effect.functions)
+        self._logs_at_once = self.device.is_cpu and not lit and bool(np.all(vectors[:, 3] == vectors[0, 3]))
+        self._levels: Any = None
+        self._bits = max((self.batch * self.count - 1).bit_length(), 1)
+        self._low = 3 if labels else 1
+        delays = any(stage == "delay" for effect in self.stages for stage, _ in effect.functions)
+        # keys of events that leave after the chunk, counted from its end
+        self._late = np.empty(0, np.int64) if delays else None
+
+    def count_events(
+        self, scene: Scene, times: NDArray[np.float64], windows: NDArray[np.int32], size: int
+    ) -> Any:
+        """Advance over `times` and count events.
+
+        Args:
+            scene: What the pixels see.
+            times: Samples [s], shape (K,), following the last ones.
+            windows: Window that the step ending at each sample counts for, shape (K,), not decreasing; -1 for
+                none.
+            size: Number of windows W.
+
+        Returns:
+            Warp array of int32, shape (B, W, 2, N): OFF counts in channel 0, ON counts in channel 1.
+        """
+        sink = pixel.Counts()
+        if np.any(np.diff(windows[windows >= 0]) < 0):
+            raise InputError("windows must not decrease from sample to sample")
+        shape = (self.batch, size, 2, self.count)
+        # the kernel writes each window it meets, whole
+        new = wp.empty if len(np.unique(windows[windows >= 0])) == size else wp.zeros
+        sink.counts = new(shape, dtype=int, device=self.device)
+        if self._plain:
+            self._count(sink.counts, scene, times, windows)
+        else:
+            self._launch("counts", sink, scene, times, windows, align=16)
+        self._advance(times)
+        return sink.counts
+
+    def _count(self, out: Any, scene: Scene, times: NDArray[np.float64], windows: NDArray[np.int32]) -> None:
+        """Count with nothing but thresholds."""
+        self._edges(times)
+        name, source = self.sensor.seen(scene).source(times, self.pixels, self.device)
+        on, off, phase, eps = self._vectors[:, :4].T
+        level = self._thresholds_of_pixels()
+        epses = wp.array(eps, dtype=float, device=self.device)
+        memory, signal = self._state[1], self._state[0]
+        first = max(2 - self.samples, 0)
+        if first:
+            memory, signal = self._next[1], self._next[0]
+            inputs = [
+                source, self._pixels, self.width, self.samples, len(times), self.seed,
+                stream("initial_phase"), level, epses, wp.array(phase, dtype=float, device=self.device),
+                self._state[0], memory, signal,
+            ]  # fmt: skip
+            launch.run(counting.start(name), self.count, inputs, self.device, batch=self.batch)
+            first, memory = first - 1, wp.clone(memory)
+        if first >= len(times):
+            out.zero_()
+            return
+        lanes = counting.widest(self.count, self.device, name)
+        mapped = level.shape[2] > 1
+        shared = not mapped and bool(np.all(on == off))
+        kernel = counting.count(lanes, name, shared=shared, mapped=mapped, states=True)
+        run, window = self._runs(windows)
+        inputs = [
+            source, 0, self._pixels, self.count, self.width, first, level, epses, run, window, memory,
+            self._next[1], self._next[0], out,
+        ]  # fmt: skip
+        launch.run(kernel, counting.blocks(self.count, lanes), inputs, self.device, batch=self.batch)
+
+    def emit(self, scene: Scene, times: NDArray[np.float64]) -> tuple[Events, NDArray[np.int32] | None]:
+        """Advance over `times` and return the events that leave the pixels, and for a batch the row of each.
+
+        Readout effects come behind this, see `dase.outlet.Outlet`.
+
+        Args:
+            scene: What the pixels see.
+            times: Samples [s], shape (K,), following the last ones.
+        """
+        begin = self.begin if self.samples else float(times[0])
+        span = round(float(times[-1]) * 1e9) - round(begin * 1e9)
+        longest = span if self._late is None else span + round(pixel.LATEST * 1e9)
+        if self._bits + self._low + longest.bit_length() > 63:
+            raise InputError(
+                f"a chunk of {span * 1e-9:g} s with {self.batch * self.count} pixels is too long"
+            )
+        keys, used = self._keys(scene, times)
+        top = self._bits + self._low + longest.bit_length()
+        self._advance(times)
+        found = ordering.ordered(keys, used, self._bits, self._low, top, self.device, self._late)
+        events, row = self._decode(found, begin)
+        if self._late is None:
+            return events, row
+        now = int(np.searchsorted(events.t, 1e-9 * float(round(self.begin * 1e9)), side="right"))
+        self._late = found.numpy()[now:] - (span << (self._bits + self._low))
+        return events.select(slice(now)), None if row is None else row[:now]
+
+    def flush(self) -> tuple[Events, NDArray[np.int32] | None]:
+        """Return the events that have not left the pixels yet, as `emit` does; time is over."""
+        late = np.empty(0, np.int64) if self._late is None else self._late
+        self._late = None if self._late is None else late[:0]
+        return self._decode(wp.array(late, dtype=wp.int64, device=self.device), self.begin)
+
+    def _keys(self, scene: Scene, times: NDArray[np.float64]) -> tuple[Any, NDArray[np.int32]]:
+        """Run the pixels until all their events fit; return the keys and how many there are per slab."""
+        slabs = -(-self.count // self.slab)
+        while True:
+            sink = pixel.Keys()
+            shape = (self.batch, slabs, self._capacity)
+            if self._buffer is None or self._buffer.shape != shape:
+                self._buffer = wp.empty(shape, dtype=wp.int64, device=self.device)
+            sink.keys = self._buffer
+            sink.used = wp.zeros((self.batch, slabs), dtype=int, device=self.device)
+            sink.slab, sink.bits, sink.low = self.slab.bit_length() - 1, self._bits, self._low
+            self._launch(self.sink, sink, scene, times, np.zeros(len(times), np.int32), align=self.slab)
+            used = sink.used.numpy()
+            if used.max() <= self._capacity:
+                return sink.keys, used
+            self._capacity = int(1.25 * used.max()) + 1
+
+    def thresholds(self) -> NDArray[np.float32]:
+        """Return the thresholds of each pixel [log intensity], shape (B, 2, N): OFF, ON."""
+        level = self._thresholds_of_pixels().numpy()
+        return np.array(np.broadcast_to(level, (self.batch, 2, self.count)))
+
+    def _thresholds_of_pixels(self) -> Any:
+        """Return thresholds, Warp array of shape (B, 2, N), or (B, 2, 1) where all pixels have the same."""
+        if self._levels is None and not any(effect.functions for effect in self.stages):
+            self._levels = wp.array(self._vectors[:, 1::-1, None].copy(), dtype=float, device=self.device)
+        elif self._levels is None:
+            kernel = pixel.compose_thresholds(self.stages)
+            self._levels = wp.empty((self.batch, 2, self.count), dtype=float, device=self.device)
+            inputs = [self._pixels, self.width, self.height, self.seed, self._parameters, self._levels]
+            launch.run(kernel, self.count, inputs, self.device, batch=self.batch)
+        return self._levels
+
+    def _launch(
+        self,
+        sink_name: str,
+        sink: Any,
+        scene: Scene,
+        times: NDArray[np.float64],
+        windows: NDArray[np.int32],
+        align: int,
+    ) -> None:
+        source_name, source = self.sensor.seen(scene).source(times, self.pixels, self.device)
+        if source_name == "frames" and self._logs_at_once:
+            source_name, source.logs = "both", self._logs(source.values)
+        kernel = pixel.compose(self.stages, source_name, sink_name, cuda=self.device.is_cuda)
+        clock = self._clock(times, windows)
+        inputs = [
+            source, clock, self._pixels, self.width, self.height, self.samples, self.seed,
+            self._parameters, self._state, self._next, sink,
+        ]  # fmt: skip
+        launch.run(kernel, self.count, inputs, self.device, batch=self.batch, align=align)
+
+    def _logs(self, values: Any) -> Any:
+        """Return the log intensity of stored intensities."""
+        out = wp.empty(values.shape, dtype=float, device=self.device)
+        lanes = counting.widest(self.count, self.device, "frames")
+        inputs = [values, float(self._vectors[0, 3]), out]
+        size = counting.blocks(self.count, lanes)
+        launch.run(counting.take_logs(lanes), size, inputs, self.device, batch=len(values))
+        return out
+
+    def _edges(self, times: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the end of the last step and the samples that follow [s], shape (K + 1,)."""
+        first = self.samples == 0
+        edges = np.concatenate([[float(times[0]) if first else self.begin], times])
+        if not np.all(np.diff(edges)[first:] > 0) or not np.all(np.isfinite(edges)):
+            raise InputError("sample times must increase")
+        return edges
+
+    def _runs(self, windows: NDArray[np.int32]) -> tuple[Any, Any]:
+        """Return where runs of one window begin, so that a pixel writes its counts once, and the windows."""
+        run = np.flatnonzero(np.diff(windows, prepend=windows[0] - 1))
+        ends = np.append(run, len(windows)).astype(np.int32)
+        return tuple(
+            wp.array(a, dtype=int, device=self.device) for a in (ends, windows[run].astype(np.int32))
+        )
+
+    def _clock(self, times: NDArray[np.float64], windows: NDArray[np.int32]) -> Any:
+        edges = self._edges(times)
+        dt = np.diff(edges)
+        clock = pixel.Clock()
+        if self.samples == 0:
+            dt[0] = pixel.REST
+        stamps = np.round(edges * 1e9)
+        begin, length = stamps[:-1] - stamps[0], np.diff(stamps)
+        # rounded down, so that no event comes after the end of its step
+        short = length.astype(np.float32)
+        short = np.where(short > length, np.nextafter(short, np.float32(0)), short)
+        to = self.device
+        clock.t = wp.array(times.astype(np.float32), dtype=float, device=to)
+        clock.t64 = wp.array(times, dtype=wp.float64, device=to)
+        clock.dt = wp.array(dt.astype(np.float32), dtype=float, device=to)
+        clock.begin = wp.array(begin.astype(np.int64), dtype=wp.int64, device=to)
+        clock.span = wp.int64(int(stamps[-1] - stamps[0]))
+        clock.length = wp.array(short, dtype=float, device=to)
+        clock.run, clock.window = self._runs(windows)
+        return clock
+
+    def _advance(self, times: NDArray[np.float64]) -> None:
+        self._state, self._next = self._next, self._state
+        self.samples += len(times)
+        self.begin = float(times[-1])
+
+    def _decode(self, keys: Any, begin: float) -> tuple[Events, NDArray[np.int32] | None]:
+        n, to = len(keys), self.device
+        each = ordering.EACH["cuda" if to.is_cuda else "cpu"]
+        out = [wp.empty(n, dtype=d, device=to) for d in (wp.float64, wp.uint16, wp.uint16, wp.uint8)]
+        row = wp.empty(n if self.batch > 1 else 0, dtype=int, device=to)
+        label = wp.empty(n if self.sink == "labels" else 0, dtype=wp.int8, device=to)
+        inputs = [
+            keys, self._bits, self._low, self.count, *self._places,
+            wp.int64(round(begin * 1e9)), each, *out, row, label,
+        ]  # fmt: skip
+        launch.run(ordering.decode, -(-n // each), inputs, to)
+        t, x, y, p = (a.numpy() for a in out)
+        known = label.numpy() if self.sink == "labels" else None
+        events = Events(t, x, y, p.view(np.bool_), self.width, self.height, known)
+        return events, row.numpy() if self.batch > 1 else None

@@ -1,0 +1,274 @@
+"""What comparing, fitting and diagnosing return: frozen, with plain fields."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dase.sensor import Sensor
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """A fitted number and its 90 % confidence interval, in the unit of its parameter."""
+
+    value: float
+    low: float
+    high: float
+
+
+@dataclass(frozen=True)
+class Cell:
+    """One place at which model and measurement are compared.
+
+    Args:
+        probe: Family of summary statistics, a key of `dase.probes.FAMILIES`.
+        where: The cell in words, such as `dark pixels (below 20 DN), at rest for 200 ms`.
+        what: What is compared, such as `OFF events`.
+        measured: The statistic of the measurement.
+        simulated: That of the model.
+        unit: Of both.
+        z: Difference in units of its sampling error, a tolerance included; positive where the model has more.
+        sentence: The finding as one sentence.
+    """
+
+    probe: str
+    where: str
+    what: str
+    measured: float
+    simulated: float
+    unit: str
+    z: float
+    sentence: str
+
+
+@dataclass(frozen=True)
+class Curve:
+    """A statistic over an axis, measured and simulated, for a figure.
+
+    Args:
+        title: What is drawn.
+        x: Middles of the bins, shape (N,).
+        x_label: With unit.
+        y_label: With unit.
+        measured: Shape (N,).
+        simulated: Shape (N,).
+        error: Standard error of the difference, shape (N,).
+        log_x: Whether the axis is logarithmic.
+        log_y: Whether the values are.
+    """
+
+    title: str
+    x: NDArray[np.float64]
+    x_label: str
+    y_label: str
+    measured: NDArray[np.float64]
+    simulated: NDArray[np.float64]
+    error: NDArray[np.float64]
+    log_x: bool = False
+    log_y: bool = False
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """How far a model is from a measurement, and where.
+
+    Args:
+        sensor: The model, as it was compared.
+        error: Mean error over the families on held-out pixels and time; 1 is what two repeats of one
+            measurement give.
+        floor: The error of repeats, 1 by construction.
+        gate: Error that 99 of 100 repeats stay below; above it the model is wrong beyond chance.
+        families: Error per family of probes, in the same unit.
+        cells: Where the model fails, worst first.
+        plain: Name with unit to (measured, simulated), such as `ON events [1/(px s)]`.
+        curves: Figures by family: one or more curves each.
+        notes: What the user should know, such as what the data cannot show.
+        seconds: Time it took.
+    """
+
+    sensor: Sensor
+    error: float
+    floor: float
+    gate: float
+    families: Mapping[str, float]
+    cells: tuple[Cell, ...]
+    plain: Mapping[str, tuple[float, float]]
+    curves: Mapping[str, tuple[Curve, ...]] = field(default_factory=dict)
+    notes: tuple[str, ...] = ()
+    seconds: float = 0.0
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the numbers as JSON objects; figures are left out."""
+        return {
+            "sensor": self.sensor.table(),
+            "error": self.error,
+            "floor": self.floor,
+            "gate": self.gate,
+            "families": dict(self.families),
+            "cells": [asdict(cell) for cell in self.cells],
+            "plain": {k: {"measured": m, "simulated": s} for k, (m, s) in self.plain.items()},
+            "notes": list(self.notes),
+            "seconds": self.seconds,
+        }
+
+
+@dataclass(frozen=True)
+class Fit:
+    """A sensor fitted to a measurement.
+
+    Args:
+        sensor: With the fitted parameters.
+        parameters: `effect.parameter` to its estimate.
+        error: On held-out pixels and time; 1 is what two repeats of one measurement give.
+        before: The error of the sensor before the fit.
+        floor: The error of repeats, 1 by construction.
+        gate: Error that 99 of 100 repeats stay below.
+        agree: Whether the starts of the optimiser came to the same parameters.
+        notes: Parameters that left their plausible range, starts that disagree, what the data cannot show.
+        evaluations: Simulations that were run.
+        seconds: Time it took.
+    """
+
+    sensor: Sensor
+    parameters: Mapping[str, Estimate]
+    error: float
+    before: float
+    floor: float
+    gate: float
+    agree: bool = True
+    notes: tuple[str, ...] = ()
+    evaluations: int = 0
+    seconds: float = 0.0
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the numbers as JSON objects."""
+        out = {name: getattr(self, name) for name in ("error", "before", "floor", "gate", "agree")}
+        out |= {"sensor": self.sensor.table(), "notes": list(self.notes)}
+        out |= {"parameters": {name: asdict(e) for name, e in self.parameters.items()}}
+        return out | {"evaluations": self.evaluations, "seconds": self.seconds}
+
+
+@dataclass(frozen=True)
+class Rank:
+    """One candidate of one step of a diagnosis.
+
+    Args:
+        effect: Name, or names joined by ` + ` for a pair.
+        error: Held-out error with the effect added and everything refitted.
+        fall: By how much the held-out error falls.
+        share: The fall as a share of the way from the present error to the floor.
+        p_value: Chance of such a fall when the present model is true, for the best of all candidates.
+        parameters: `effect.parameter` of what was added to its estimate.
+        refined: Whether it was fitted in full; weak candidates are only screened.
+    """
+
+    effect: str
+    error: float
+    fall: float
+    share: float
+    p_value: float
+    parameters: Mapping[str, Estimate]
+    refined: bool = True
+
+
+@dataclass(frozen=True)
+class Step:
+    """One step of a diagnosis: what was missing in the model so far.
+
+    Args:
+        model: Effects of the present model.
+        error: Its held-out error after it was refitted.
+        gate: Error that 99 of 100 repeats of the present model stay below.
+        families: Its error per family of probes.
+        ranking: Candidates, best first; empty when the model is at the floor.
+        chosen: Effect that was added, names joined by ` + ` for a pair; None when nothing was.
+        ties: Candidates that the data cannot tell apart from the chosen one.
+        cells: Where the present model fails, worst first.
+    """
+
+    model: tuple[str, ...]
+    error: float
+    gate: float
+    families: Mapping[str, float]
+    ranking: tuple[Rank, ...]
+    chosen: str | None
+    ties: tuple[str, ...]
+    cells: tuple[Cell, ...]
+
+
+@dataclass(frozen=True)
+class Unexplained:
+    """An error that no effect of the library takes to the floor.
+
+    Args:
+        error: What is left with the best that was found.
+        share: What is left as a share of the error of the model before the search, both above the floor.
+        nearest: Effects that come nearest to an explanation; stand-ins, not findings.
+        cells: Where what is left sits, worst first.
+        sentence: The finding as one sentence.
+    """
+
+    error: float
+    share: float
+    nearest: tuple[str, ...]
+    cells: tuple[Cell, ...]
+    sentence: str
+
+
+@dataclass(frozen=True)
+class Diagnosis:
+    """Which effects a model lacks.
+
+    Args:
+        sensor: The model with all that was found, fitted; the refitted model where nothing was found.
+        selected: Names of the effects found, in the order added. Empty when nothing is missing, and when the
+            error stays unexplained: a stand-in is never announced as found.
+        errors: Held-out error of the refitted model at the start and after each addition to `selected`.
+        before: Held-out error of the model as it was given, before any fit.
+        floor: The error of repeats, 1 by construction.
+        gate: Error that 99 of 100 repeats of the last model stay below.
+        parameters: `effect.parameter` to its estimate, of all fitted parameters of `sensor`.
+        ties: Effect found to those that explain the data as well.
+        unexplained: What is left, or None.
+        history: One entry per step of the search, provisional additions included.
+        notes: What the user should know.
+        evaluations: Simulations that were run.
+        seconds: Time it took.
+    """
+
+    sensor: Sensor
+    selected: tuple[str, ...]
+    errors: tuple[float, ...]
+    before: float
+    floor: float
+    gate: float
+    parameters: Mapping[str, Estimate]
+    ties: Mapping[str, tuple[str, ...]]
+    unexplained: Unexplained | None
+    history: tuple[Step, ...]
+    notes: tuple[str, ...] = ()
+    evaluations: int = 0
+    seconds: float = 0.0
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the findings as JSON objects."""
+        return {
+            "selected": list(self.selected),
+            "errors": list(self.errors),
+            "before": self.before,
+            "floor": self.floor,
+            "gate": self.gate,
+            "parameters": {name: asdict(e) for name, e in self.parameters.items()},
+            "ties": {name: list(others) for name, others in self.ties.items()},
+            "unexplained": None if self.unexplained is None else asdict(self.unexplained),
+            "history": [asdict(step) for step in self.history],
+            "sensor": self.sensor.table(),
+            "notes": list(self.notes),
+            "evaluations": self.evaluations,
+            "seconds": self.seconds,
+        }

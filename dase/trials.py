@@ -1,0 +1,170 @@
+"""Many models over one stimulus: from parameter vectors to sums of statistics, and the same of a measurement."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+import warp as wp
+from numpy.typing import NDArray
+
+from dase.events import Events
+from dase.kernels import launch, trials
+from dase.kernels import probes as kernels
+from dase.probes import Sums
+from dase.sensor import Sensor
+from dase.stimulus import Stimulus
+
+LAG_TIMES = (-0.003, -0.001, 0.0, 0.001, 0.002, 0.004, 0.008, 0.016, 0.028, 0.044, 0.063)
+"""Before an event [s] at which its light is looked at; the differences of neighbours are averaged."""
+
+CLASS_TIMES = (0.012, 0.05)
+"""Intervals between two events are short, middle or long, divided by these [s]."""
+
+HALF = 0.064
+"""The halves of the time take turns after this [s]."""
+
+SLACK = 2e-6
+"""Files give whole microseconds: an event up to this after a point of the grid belongs to it [s]."""
+
+GROUP = 64
+"""Pixels whose events are summed up together on a CPU; on a GPU every pixel has a thread."""
+
+FINEST = 2
+"""Samples per step of the grid at most: models that ask for more are simulated a little too coarsely."""
+
+ROOM = 1 << 28
+"""Memory for the sums of one launch [bytes]."""
+
+
+def finer_steps(sensor: Sensor, step: float) -> int:
+    """Return how many samples per step the model needs, 0 where those at changes of the light do."""
+    longest = sensor.longest_step()
+    return 0 if longest == np.inf else int(np.clip(np.ceil(step / longest - 1e-6), 1, FINEST))
+
+
+@dataclass(eq=False)
+class Trials:
+    """Runs models over a stimulus.
+
+    Args:
+        stimulus: What the pixels see.
+        middle: Typical change of the light between two events, shape (4 CLASSES,).
+        evaluations: Models run so far.
+        work: Pixels times seconds run so far.
+    """
+
+    stimulus: Stimulus
+    middle: NDArray[np.float32] = field(default_factory=lambda: np.zeros(4 * kernels.CLASSES, np.float32))
+    evaluations: int = 0
+    work: float = 0.0
+
+    def __post_init__(self) -> None:
+        self.device = self.stimulus.device
+        self._pixels = wp.array(self.stimulus.pixels, dtype=int, device=self.device)
+
+    def run(
+        self,
+        sensor: Sensor,
+        vectors: NDArray[Any],
+        *,
+        seed: int = 0,
+        reseed: bool = False,
+        finer: int | None = None,
+    ) -> Sums:
+        """Simulate parameter vectors of a sensor.
+
+        Args:
+            sensor: Names the effects; its own parameters do not matter but for the sampling.
+            vectors: Shape (B, P).
+            seed: Of the random numbers.
+            reseed: Whether each vector gets random numbers of its own.
+            finer: Samples per step; None chooses by the sensor.
+        """
+        finer = finer_steps(sensor, self.stimulus.grid.step) if finer is None else finer
+        history = self.stimulus.history(finer)
+        kernel = trials.compose(sensor.stages())
+        at_once = max(1, ROOM // (4 * len(self.stimulus.pixels) * (kernels.SIZE // self._group() + 16)))
+        parts = []
+        for first in range(0, len(vectors), at_once):
+            rows = np.ascontiguousarray(vectors[first : first + at_once], np.float32)
+            sink = self.sink(len(rows), reseed=reseed)
+            inputs = [
+                history, self._pixels, self.stimulus.width, self.stimulus.height, (seed + first) & 0x3FFFFFFF,
+                wp.array(rows, dtype=float, device=self.device), sink,
+            ]  # fmt: skip
+            count = len(self.stimulus.pixels)
+            launch.run(kernel, count, inputs, self.device, batch=len(rows), align=GROUP)
+            parts.append(self._totals(sink, len(rows)))
+        self.evaluations += len(vectors)
+        grid = self.stimulus.grid
+        self.work += len(vectors) * len(self.stimulus.pixels) * grid.step * (grid.steps - 1)
+        columns = ([getattr(p, name) for p in parts] for name in ("sums", "halves", "groups"))
+        return Sums(*(np.concatenate(column) for column in columns))
+
+    def look(self, events: Events) -> Sums:
+        """Sum up stored events; those of other pixels are left out."""
+        time, polarity, start = self._by_pixel(events)
+        sink = self.sink(1)
+        arrays = [
+            wp.array(start[None].astype(np.int32), device=self.device),
+            wp.array(time, dtype=wp.int64, device=self.device),
+            wp.array(polarity, dtype=wp.uint8, device=self.device),
+        ]
+        launch.run(
+            kernels.walk, len(self.stimulus.pixels), [*arrays, sink], self.device, batch=1, align=GROUP
+        )
+        return self._totals(sink, 1)
+
+    def _by_pixel(self, events: Events) -> tuple[NDArray[np.int64], NDArray[np.uint8], NDArray[np.int64]]:
+        stimulus = self.stimulus
+        place = np.full(stimulus.width * stimulus.height, -1, np.int64)
+        place[stimulus.pixels] = np.arange(len(stimulus.pixels))
+        at = place[events.y.astype(np.int64) * stimulus.width + events.x]
+        inside = at >= 0
+        at = at[inside]
+        order = np.argsort(at, kind="stable")
+        time = np.rint((events.t[inside][order] - stimulus.grid.begin) * 1e9).astype(np.int64)
+        start = np.concatenate([[0], np.cumsum(np.bincount(at, minlength=len(stimulus.pixels)))])
+        return time, events.p[inside][order].astype(np.uint8), start
+
+    def _group(self) -> int:
+        return 1 if self.device.is_cuda else GROUP
+
+    def sink(self, rows: int, *, reseed: bool = False) -> Any:
+        """Return an empty sink."""
+        stimulus, step = self.stimulus, self.stimulus.grid.step
+        out = kernels.Probes()
+        out.cell = stimulus.array("cell", lambda: stimulus.cell)
+        out.level = stimulus.array("level", lambda: stimulus.level)
+        lags = np.rint(np.array(LAG_TIMES) / step).astype(np.int32)
+        out.lags = wp.array(lags, device=self.device)
+        out.middle = wp.array(self.middle, dtype=float, device=self.device)
+        out.classes = wp.array(np.rint(np.array(CLASS_TIMES) / step).astype(np.int32), device=self.device)
+        out.half = max(1, round(HALF / step))
+        out.step, out.slack = wp.float64(step * 1e9), wp.float64(SLACK * 1e9)
+        out.reseed = int(reseed)
+        out.group = self._group()
+        count = len(stimulus.pixels)
+        groups = -(-count // out.group)
+        zeros = (
+            ("memory", count, kernels.MEMORY),
+            ("sums", groups, kernels.SIZE),
+            ("halves", count, kernels.HALVES),
+        )
+        for name, size, numbers in zeros:
+            setattr(out, name, wp.zeros((rows, size, numbers), dtype=float, device=self.device))
+        out.clock = wp.zeros((rows, 1, 0), dtype=int, device=self.device)
+        return out
+
+    def _totals(self, sink: Any, rows: int) -> Sums:
+        sums = sink.sums
+        if self.device.is_cuda:
+            parts = -(-sums.shape[1] // GROUP)
+            less = wp.empty((rows, parts, kernels.SIZE), dtype=float, device=self.device)
+            inputs = [sums, GROUP, less]
+            launch.run(trials.total, parts * kernels.SIZE, inputs, self.device, batch=rows)
+            sums = less
+        groups = sums.numpy()
+        return Sums(groups.sum(1, dtype=np.float64), sink.halves.numpy(), groups)

@@ -1,0 +1,36 @@
+"""Numbers as people read them."""
+
+from __future__ import annotations
+
+import math
+
+SCALES = ((1e9, "G"), (1e6, "M"), (1e3, "k"), (1.0, ""), (1e-3, "m"), (1e-6, "µ"))
+
+
+def grouped(count: int) -> str:
+    """Return a count with its thousands set apart."""
+    return f"{count:,}".replace(",", "\N{NO-BREAK SPACE}")
+
+
+def seconds(value: float) -> str:
+    """Return a time with three digits in a unit that fits: 12.1 s, 3.25 ms, 75 µs."""
+    return metric(value, "s")
+
+
+def metric(value: float, unit: str) -> str:
+    """Return a quantity with three digits and a prefix that fits; "unknown" where it is not a number."""
+    if not math.isfinite(value):
+        return "unknown"
+    scale, prefix = next((pair for pair in SCALES if abs(value) >= 0.9995 * pair[0]), SCALES[-1])
+    digits = max(0, 2 - math.floor(math.log10(abs(value) / scale * 1.0005))) if value else 0
+    text = f"{value / scale:.{digits}f}"
+    return f"{text.rstrip('0').rstrip('.') if '.' in text else text} {prefix}{unit}"
+
+
+def percent(share: float) -> str:
+    """Return a share with two or three digits: 0.013 %, 4.2 %, 97 %."""
+    if not math.isfinite(share):
+        return "unknown"
+    value = 100 * share
+    digits = 0 if value >= 99.95 or not value else max(0, 1 - math.floor(math.log10(value)))
+    return f"{value:.{min(digits, 4)}f} %"

@@ -1,0 +1,190 @@
+"""Summary statistics of events, accumulated per pixel, event by event.
+
+The stimulus of a pixel is known on a grid of equal steps: a cell (what the light does there: at rest, or by how
+much it has changed, in which band of intensity) and the log intensity. `observe` looks at one event; a pixel
+kernel calls it as its events happen, `walk` for events that are stored. Both write the same numbers, so that
+model and measurement are compared like with like. Sums over pixels, and their sampling errors, are
+`dase.probes`'.
+"""
+
+from __future__ import annotations
+
+import warp as wp
+
+KINDS = 7
+"""At rest for long, at rest for a short time, and five bins of the change."""
+
+RESTING = 2
+"""Kinds that are at rest."""
+
+BANDS = 4
+"""Of intensity."""
+
+CELLS = KINDS * BANDS
+
+MASKED = 255
+"""Cell of a step that is not compared."""
+
+INTERVALS = 11
+"""Bins of the interval between two events of a pixel: 0 steps, 1, 2, 3-4, 5-8 and so on by octaves."""
+
+LAGS = 10
+"""Differences of log intensity about an event."""
+
+CLASSES = 3
+"""Of intervals, for the change between two events."""
+
+RATE = 0
+ISI = RATE + 2 * CELLS
+LAG = ISI + 6 * INTERVALS
+LAG_COUNT = LAG + LAGS * BANDS
+CHANGE = LAG_COUNT + BANDS
+REPEAT = CHANGE + 3 * 4 * CLASSES
+SERIAL = REPEAT + 3 * BANDS
+SIZE = SERIAL + 2 * CLASSES
+"""Places of the families in the sums, and how many there are."""
+
+HALVES = 8
+"""Counts kept for every pixel: moving and at rest, even and odd halves of the time, OFF and ON."""
+
+MEMORY = 4
+"""Numbers a pixel remembers from event to event."""
+
+_BANDS, _RESTING, _MASKED = wp.constant(BANDS), wp.constant(RESTING), wp.constant(MASKED)
+_INTERVALS, _LAGS, _CLASSES = wp.constant(INTERVALS), wp.constant(LAGS), wp.constant(CLASSES)
+_CELLS = wp.constant(CELLS)
+_ISI, _LAG, _LAG_COUNT, _CHANGE = (wp.constant(n) for n in (ISI, LAG, LAG_COUNT, CHANGE))
+_REPEAT, _SERIAL = wp.constant(REPEAT), wp.constant(SERIAL)
+
+
+@wp.struct
+class Probes:
+    """Sink that keeps sums over events instead of events."""
+
+    cell: wp.array2d[wp.uint8]  # (N, T) of each step; step k ends at grid point k
+    level: wp.array2d[float]  # (N, T) log intensity at the grid points
+    lags: wp.array[int]  # (LAGS + 1,) steps before an event at which its light is looked at
+    middle: wp.array[float]  # (4 CLASSES,) typical change between two events
+    classes: wp.array[int]  # (CLASSES - 1,) steps that end a class of intervals
+    half: int  # steps after which the halves take turns
+    step: wp.float64  # of the grid [ns]
+    slack: wp.float64  # times up to this past a grid point belong to it [ns]
+    reseed: int  # 0 for common random numbers in all rows, 1 for other ones in each
+    group: int  # pixels that share a row of `sums` and `clock`; one thread works on all of them
+    memory: wp.array3d[float]  # (B, N, MEMORY)
+    sums: wp.array3d[float]  # (B, G, SIZE)
+    halves: wp.array3d[float]  # (B, N, HALVES)
+    clock: wp.array3d[int]  # (B, G, 2 T) OFF, ON events of each step; of length 0 when nobody asks
+
+
+@wp.func
+def octave(steps: int) -> int:
+    """Bin of an interval."""
+    at = int(0)
+    top = int(0)
+    while steps > top and at < _INTERVALS - 1:
+        at += 1
+        top = wp.max(2 * top, 1)
+    return at
+
+
+@wp.func
+def add(sink: Probes, row: int, i: int, place: int, value: float):
+    """Add to one sum of the pixel's group, which one thread owns."""
+    g = i / sink.group
+    sink.sums[row, g, place] = sink.sums[row, g, place] + value
+
+
+@wp.func
+def observe_light(sink: Probes, row: int, i: int, k: int, band: int, sign: float):
+    """How the light went before the event: bandwidth and latency."""
+    end = sink.level.shape[1] - 1
+    newer = sink.level[i, wp.clamp(k - sink.lags[0], 0, end)]
+    for n in range(_LAGS):
+        older = sink.level[i, wp.clamp(k - sink.lags[n + 1], 0, end)]
+        add(sink, row, i, _LAG + n * _BANDS + band, sign * (newer - older))
+        newer = older
+    add(sink, row, i, _LAG_COUNT + band, 1.0)
+
+
+@wp.func
+def observe_pair(sink: Probes, row: int, i: int, k: int, before: int, now: int, last: int, deviation: float):
+    """How the light changed since the pixel's last event; returns the deviation from what is typical."""
+    steps = k - before
+    group = int(0)
+    if steps > sink.classes[0]:
+        group = 1
+    if steps > sink.classes[1]:
+        group = 2
+    pair = (2 * now + last) * _CLASSES + group
+    change = float(2 * now - 1) * (sink.level[i, k] - sink.level[i, before])
+    apart = change - sink.middle[pair]
+    add(sink, row, i, _CHANGE + 3 * pair, 1.0)
+    add(sink, row, i, _CHANGE + 3 * pair + 1, change)
+    add(sink, row, i, _CHANGE + 3 * pair + 2, wp.abs(apart))
+    if deviation > -1.0e5:
+        add(sink, row, i, _SERIAL + 2 * group, 1.0)
+        add(sink, row, i, _SERIAL + 2 * group + 1, wp.clamp(apart, -1.0, 1.0) * deviation)
+    return wp.clamp(apart, -1.0, 1.0)
+
+
+@wp.func
+def observe(sink: Probes, row: int, i: int, time: wp.int64, now: int):
+    """Look at one event of pixel `i`, `time` [ns] after the begin of the grid, `now` 1 for ON."""
+    at = (wp.float64(time) - sink.slack) / sink.step
+    k = int(wp.ceil(at))
+    if k < 0 or k >= sink.cell.shape[1]:
+        return
+    cell = int(sink.cell[i, k])
+    before = int(sink.memory[row, i, 0]) - 1
+    last = int(sink.memory[row, i, 1])
+    deviation = sink.memory[row, i, 2]
+    run = sink.memory[row, i, 3] + 1.0
+    if before != k:
+        run = 1.0
+    apart = float(-1.0e6)
+    if cell != _MASKED:
+        band = cell % _BANDS
+        kind = cell / _BANDS
+        add(sink, row, i, now * _CELLS + cell, 1.0)
+        rest = int(0)
+        if kind < _RESTING:
+            rest = 1
+        else:
+            observe_light(sink, row, i, k, band, float(2 * now - 1))
+        if before >= 0:
+            kinship = int(2)
+            if now == last:
+                kinship = now
+            add(sink, row, i, _ISI + (3 * rest + kinship) * _INTERVALS + octave(k - before), 1.0)
+            apart = observe_pair(sink, row, i, k, before, now, last, deviation)
+        add(sink, row, i, _REPEAT + 3 * band, 1.0)
+        if run >= 2.0:
+            add(sink, row, i, _REPEAT + 3 * band + 1, 1.0)
+        if run >= 3.0:
+            add(sink, row, i, _REPEAT + 3 * band + 2, 1.0)
+        half = 4 * rest + 2 * ((k / sink.half) % 2) + now
+        sink.halves[row, i, half] = sink.halves[row, i, half] + 1.0
+        if sink.clock.shape[2] > 0:
+            wp.atomic_add(sink.clock, row, i / sink.group, now * sink.cell.shape[1] + k, 1)
+    sink.memory[row, i, 0] = float(k + 1)
+    sink.memory[row, i, 1] = float(now)
+    sink.memory[row, i, 2] = apart
+    sink.memory[row, i, 3] = run
+
+
+@wp.kernel(enable_backward=False)
+def walk(
+    # in
+    first: int,
+    start: wp.array2d[int],  # (B, N + 1) first event of each pixel, and the end
+    time: wp.array[wp.int64],  # [ns], in order of row, pixel, time
+    polarity: wp.array[wp.uint8],
+    # out
+    sink: Probes,
+):
+    """Look at stored events, one pixel per thread."""
+    row, i = wp.tid()
+    i += first
+    for n in range(start[row, i], start[row, i + 1]):
+        observe(sink, row, i, time[n], int(polarity[n]))
