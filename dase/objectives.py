@@ -12,8 +12,9 @@ from typing import Any, Literal, Protocol
 
 import torch
 
+from dase.critics import BankShape, CriticBank
 from dase.kernels import bridge
-from dase.networks import BankShape, CriticBank, gradient_magnitude, sort_into_slots
+from dase.networks import gradient_magnitude
 from dase.targets import Pairs
 
 def critic_maps(counts: torch.Tensor) -> torch.Tensor:
@@ -138,7 +139,6 @@ class Adversarial:
         penalty: Weight of the gradient penalty.
         uniform: α of Eq. 13: share of the weights that all classes have alike.
         image: Whether critics see the image too.
-        room: Most patches of a class in a step; None: from calibration.
     """
 
     def __init__(
@@ -152,34 +152,22 @@ class Adversarial:
         penalty: float = 1.0,
         uniform: float = 0.5,
         image: bool = False,
-        room: int | None = None,
     ):
-        self.hasher, self.device, self.room = Hasher(how), torch.device(device), room
+        self.hasher, self.device = Hasher(how), torch.device(device)
         self.rate, self.steps, self.penalty, self.uniform, self.image = rate, steps, penalty, uniform, image
         self.generator = torch.Generator(self.device).manual_seed(seed)
         self.seen = torch.zeros(how.classes, device=self.device)
-
-    def calibrate(self, sets: list[tuple[Pairs, Pairs]]) -> None:
-        """Place the boundaries of the hash and make the bank."""
-        self.hasher.calibrate(*(pairs for both in sets for pairs in both))
-        how = self.hasher.how
-        if self.room is None:
-            most = max(
-                int(torch.bincount(self.hasher.classes(pairs)).max()) for both in sets for pairs in both
-            )
-            self.room = 4 * math.ceil(1.5 * most / 4)
-        self._build(how)
-
-    def _build(self, how: Hash) -> None:
-        assert self.room is not None
-        inputs = (4 + self.image) * how.size**2
-        shape = BankShape(classes=how.classes, inputs=inputs, room=self.room)
+        shape = BankShape(classes=how.classes, inputs=(4 + image) * how.size**2)
         self.bank = CriticBank(shape, device=self.device, generator=self.generator)
 
+    def calibrate(self, sets: list[tuple[Pairs, Pairs]]) -> None:
+        """Place the boundaries of the hash."""
+        self.hasher.calibrate(*(pairs for both in sets for pairs in both))
+
     def weights(self) -> torch.Tensor:
-        """Return ω of Eq. 13 times the number of classes, from the real patches seen so far."""
+        """Return ω of Eq. 13, from the real patches seen so far."""
         share = self.seen / self.seen.sum().clamp_min(1)
-        return (self.uniform / len(share) + (1 - self.uniform) * share) * len(share)
+        return self.uniform / len(share) + (1 - self.uniform) * share
 
     def _patches(self, pairs: Pairs) -> torch.Tensor:
         maps = critic_maps(pairs.counts)
@@ -189,40 +177,38 @@ class Adversarial:
 
     def loss(self, fake: Pairs, real: Pairs, *, move: bool) -> tuple[torch.Tensor, dict[str, torch.Tensor]]:
         """Move the critics, then return minus the weighted mean score of the fake patches."""
-        shape = self.bank.shape
         patches, others = self._patches(fake), self._patches(real)
-        fake_classes, real_classes = self.hasher.classes(fake), self.hasher.classes(real)
-        slots, real_slots = sort_into_slots(fake_classes, shape), sort_into_slots(real_classes, shape)
-        self.seen += real_slots.number
+        ours, theirs = self.hasher.classes(fake), self.hasher.classes(real)
+        number, real_number = (self._number(classes) for classes in (ours, theirs))
+        self.seen += real_number
         weights = self.weights()
-        weights = weights / weights.sum()
         for _ in range(self.steps):
             found = self.bank.step(
-                patches, slots, others, real_slots, weights,
+                patches.detach(), ours, others, theirs, weights,
                 rate=self.rate, penalty=self.penalty, generator=self.generator,
             )  # fmt: skip
-        both = (slots.number > 0) & (real_slots.number > 0)
-        values = {"distance": found.distance, "penalty": found.penalty, "dropped": found.dropped}
-        values["classes"] = both.sum()
+        both = (number > 0) & (real_number > 0)
+        values = {"distance": found.distance, "penalty": found.penalty, "classes": both.sum()}
         if not move:
             return fake.counts.new_zeros(()), values
-        gain = torch.where(both, -weights / slots.number.clamp_min(1), 0.0)
-        return (patches * self.bank.input_gradient(patches.detach(), slots, gain)).sum(), values
+        gain = torch.where(both, -weights / number.clamp_min(1), 0.0)
+        return (patches * self.bank.input_gradient(patches.detach(), ours, gain)).sum(), values
+
+    def _number(self, classes: torch.Tensor) -> torch.Tensor:
+        """Return how many patches each class has."""
+        return torch.zeros_like(self.seen).index_add_(0, classes, torch.ones_like(classes, dtype=torch.float32))
 
     def state(self) -> dict[str, Any]:
         """Return the bank, the hash and the random numbers."""
         return {
             "bank": self.bank.state(),
             "boundaries": self.hasher.boundaries,
-            "room": self.room,
             "seen": self.seen,
             "generator": self.generator.get_state(),
         }
 
     def load(self, state: dict[str, Any]) -> None:
         """Take over what `state` returned."""
-        self.room = state["room"]
-        self._build(self.hasher.how)
         self.bank.load(state["bank"])
         self.hasher.boundaries = {name: value.to(self.device) for name, value in state["boundaries"].items()}
         self.seen.copy_(state["seen"])

@@ -99,7 +99,7 @@ def move_critics(
     copy: torch.Tensor,
     left: torch.Tensor,
     right: torch.Tensor,
-    rows: torch.Tensor,
+    end: torch.Tensor,
     rate: torch.Tensor,
     correction: torch.Tensor,
     *,
@@ -112,14 +112,15 @@ def move_critics(
         weight: Changed in place, float32 (C, J, K); J and K are multiples of 4.
         square: Running mean of squared gradients, changed in place, shaped alike.
         copy: Set to the weights in bfloat16, (C, J, K).
-        left: float32 (C, R, J).
-        right: bfloat16 (C, R, K).
-        rows: How many rows of each of G equal groups count, int32 (C, G).
+        left: float32 (R, J), the rows of critic 0 first.
+        right: bfloat16 or float32 (R, K), in the same order.
+        end: Where the rows of each critic end, int32 (C,).
         rate: Learning rate of each critic, float32 (C,); those at 0 are not touched.
         correction: 1 / (1 - decay^steps) of each critic, float32 (C,).
         decay: Of the running mean.
         tiny: Added to the root of the mean square.
     """
-    inputs = [left, right.view(torch.int32), rows, rate, correction, decay, tiny]
+    half = right.dtype == torch.bfloat16
+    inputs = [left, right.view(torch.int32), end, rate, correction, decay, tiny]
     tiles = weight.view(weight.shape[0], -1, _bank.TILE**2)[..., 0]
-    _launch(_bank.adam, inputs, [weight, square, copy.view(torch.int32)], over=tiles)
+    _launch(_bank.adam[half], inputs, [weight, square, copy.view(torch.int32)], over=tiles)
