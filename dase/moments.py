@@ -148,8 +148,11 @@ class Cells:
         fake = kept["fake_sum"] / kept["fake_number"].clamp_min(1)[:, None]
         return torch.where(known[:, None], fake - real, 0.0)
 
-    def weigh(self) -> None:
-        """Set the weights to the inverse covariance of what one scene adds to the means."""
+    def weigh(self, doubt: float = 0.0) -> None:
+        """Set the weights to the inverse covariance of what one scene adds to the means.
+
+        With `doubt`, means also differ by that share of themselves for reasons that thresholds cannot cure.
+        """
         kept = self.kept
         cells, width = kept["plain_sum"].shape
         total = kept["plain_number"].clamp_min(1)[:, None].expand(cells, width)
@@ -159,7 +162,9 @@ class Cells:
         # a feature that never varies says nothing
         floor = 1e-6 + 1e-3 * diagonal.mean(-1, keepdim=True)
         ridge = RIDGE + diagonal.shape[-1] / kept["scenes"]
-        weight = torch.linalg.inv(covariance + torch.diag_embed(ridge * diagonal + floor))
+        mean = kept["real_sum"] / kept["real_number"].clamp_min(1)[:, None]
+        wrong = (doubt * mean).square().reshape(diagonal.shape) * kept["real_scenes"]
+        weight = torch.linalg.inv(covariance + torch.diag_embed(ridge * diagonal + floor + wrong))
         kept["weight"].copy_(weight / (cells * width))
 
     def slope(self, off: torch.Tensor) -> torch.Tensor:
@@ -181,6 +186,7 @@ class Moments:
         pattern: Whether to compare columns and rows of the sensor as well.
         memory: Share of the fake means that stays from step to step.
         scenes: How many different real scenes there are.
+        doubt: Share by which a mean may differ for reasons that thresholds cannot cure.
     """
 
     def __init__(
@@ -191,8 +197,9 @@ class Moments:
         pattern: bool = False,
         memory: float = 0.95,
         scenes: float = math.inf,
+        doubt: float = 0.0,
     ):
-        self.scenes = scenes
+        self.scenes, self.doubt = scenes, doubt
         self.device, self.levels, self.pattern, self.memory = torch.device(device), levels, pattern, memory
         self.boundaries: list[torch.Tensor] = []
         self.sets: dict[str, Cells] = {}
@@ -259,7 +266,7 @@ class Moments:
     def weigh(self) -> None:
         """Work out the weights."""
         for cells in self.sets.values():
-            cells.weigh()
+            cells.weigh(self.doubt)
 
     def loss(self, fake: Pairs, real: Pairs, *, move: bool) -> tuple[torch.Tensor, dict[str, torch.Tensor]]:
         """Take both batches in; return the fake means of this batch along what they are off."""

@@ -51,6 +51,7 @@ class Recipe:
         hash: Of the patches.
         cells: Levels of brightness and contrast of the moments.
         memory: Of the fake moments from step to step.
+        doubt: Share by which means of features may differ for reasons that thresholds cannot cure.
         newton: Share of a Gauss-Newton step that is taken with the moments.
         network: Of the generator.
         seed: Of everything random.
@@ -80,6 +81,7 @@ class Recipe:
     hash: Hash = Hash()
     cells: tuple[int, int] = (6, 5)
     memory: float = 0.95
+    doubt: float = 0.0
     newton: float = 0.2
     network: NetworkShape = NetworkShape()
     seed: int = 0
@@ -152,6 +154,7 @@ class Training:
                 pattern=pattern,
                 memory=recipe.memory,
                 scenes=self.target.scenes,
+                doubt=recipe.doubt,
             )
         return Adversarial(
             recipe.hash,
