@@ -155,15 +155,29 @@ def leaving_time(clock: Clock, k: int, at: float, late: float) -> wp.int64:
     return time + wp.int64(wp.round(late * 1.0e9))
 
 
+@wp.func_native(
+    """
+    const int slab = i >> shift;
+    int* met = used.data + row * used.shape[1] + slab;
+#ifdef __CUDA_ARCH__
+    const int slot = atomicAdd(met, 1);
+#else
+    const int slot = (*met)++;  // a slab has one thread
+#endif
+    if (slot < keys.shape[2]) keys.data[((size_t)row * keys.shape[1] + slab) * keys.shape[2] + slot] = key;
+"""
+)
+def append(keys: wp.array3d[wp.int64], used: wp.array2d[int], row: int, i: int, shift: int, key: wp.int64):
+    """Append a key to those of the pixel's slab, or only count it where there is no room."""
+    ...
+
+
 @wp.func
 def deposit(sink: Keys, row: int, i: int, size: int, time: wp.int64, code: int):
     """Keep one event that leaves its pixel at `time` [ns since the chunk's begin]."""
-    slab = i >> sink.slab
-    slot = wp.atomic_add(sink.used, row, slab, 1)
-    if slot < sink.keys.shape[2]:
-        place = wp.int64(row) * wp.int64(size) + wp.int64(i)
-        place |= time << wp.int64(sink.bits)
-        sink.keys[row, slab, slot] = (place << wp.int64(sink.low)) | wp.int64(code)
+    place = wp.int64(row) * wp.int64(size) + wp.int64(i)
+    place |= time << wp.int64(sink.bits)
+    append(sink.keys, sink.used, row, i, sink.slab, (place << wp.int64(sink.low)) | wp.int64(code))
 
 
 SINKS = {"counts": Counts, "keys": Keys, "labels": Keys}
