@@ -152,8 +152,8 @@ class Pixels:
             return 0, self._state[1], self._state[0]
         level, eps = self._thresholds_of_pixels()
         inputs = [
-            source, self._pixels, self.width, self.samples, samples, self.seed, stream("initial_phase"), level,
-            eps, wp.array(self._vectors[:, 2], dtype=float, device=self.device), self._state[0],
+            source, self._pixels, self.width, self.samples, samples, self.seed, stream("initial_phase"),
+            level, eps, wp.array(self._vectors[:, 2], dtype=float, device=self.device), self._state[0],
             self._next[1], self._next[0],
         ]  # fmt: skip
         launch.run(counting.start(name), self.count, inputs, self.device, batch=self.batch)
@@ -232,7 +232,7 @@ class Pixels:
         return np.array(np.broadcast_to(level, (self.batch, 2, self.count)))
 
     def _thresholds_of_pixels(self) -> tuple[Any, Any]:
-        """Return thresholds, Warp array of shape (B, 2, N), or (B, 2, 1) where all are the same, and log_eps."""
+        """Return thresholds, of shape (B, 2, N), or (B, 2, 1) where all are the same, and log_eps, (B,)."""
         if self._levels is not None:
             return self._levels
         if not any(effect.functions for effect in self.stages):

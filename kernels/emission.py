@@ -1,7 +1,7 @@
 """Events of pixels that are nothing but a change detector, several pixels per thread, for the CPU.
 
-The same events as the composed kernel's, to the last bit: counted by lanes as in `dase.kernels.counts`, and only
-where a lane has any, one by one.
+The same events as the composed kernel's, to the last bit: counted by lanes as in `dase.kernels.counts`, and
+only where a lane has any, one by one.
 """
 
 # no postponed annotations: those of the kernels made here name types of the functions around them
@@ -63,7 +63,7 @@ def _append(lanes: int) -> Any:
 
 @lru_cache(maxsize=32)
 def emit(lanes: int, source: str) -> wp.Kernel:
-    """Return the emitting kernel, over (B, blocks of `lanes` pixels) threads; see `dase.kernels.counts.count`."""
+    """Return the emitting kernel, over (B, blocks of `lanes` pixels) threads; see `counts.count`."""
     f, start_of = functions(lanes), block(lanes)
     Source, Lanes, Bits = SOURCES[source], f.Lanes, vector(lanes, wp.int32)
     look, append = _look(lanes, source), _append(lanes)

@@ -102,7 +102,7 @@ RADIX = 9
 def radix_sort(
     keys: wp.array[wp.int64], other: wp.array[wp.int64], count: int, begin: int, end: int, low: int
 ):
-    """Sort stably by time, then by place; the result is in `keys` after an even number of passes, else in `other`."""
+    """Sort stably by time, then by place; after an odd number of passes the result is in `other`."""
     ...
 
 

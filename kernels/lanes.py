@@ -168,6 +168,7 @@ def from_text(text: str, name: str, scope: Mapping[str, Any]) -> Any:
 
 
 def native(name: str, snippet: str, scope: dict[str, Any], arguments: str, returns: str) -> Any:
+    """Return the Warp function of a C++ text."""
     # Warp looks for the decorator in the text
     text = f"@wp.func_native(snippet)\ndef {name}({arguments}) -> {returns}: ...\n"
     return from_text(text, name, {**scope, "wp": wp, "snippet": snippet})

@@ -184,7 +184,7 @@ SINKS = {"counts": Counts, "keys": Keys, "labels": Keys}
 
 
 @lru_cache(maxsize=256)
-def compose(stages: tuple[Stages, ...], source: str, sink: str, *, cuda: bool) -> wp.Kernel:
+def compose(stages: tuple[Stages, ...], source: str, sink: str, *, cuda: bool = False) -> wp.Kernel:
     """Return the kernel of a sensor.
 
     Args:
@@ -216,7 +216,7 @@ def compiled(text: str, name: str, scope: dict[str, Any]) -> wp.Kernel:
     return kernel
 
 
-def source_text(stages: tuple[Stages, ...], source: str, sink: str, *, cuda: bool) -> str:
+def source_text(stages: tuple[Stages, ...], source: str, sink: str, *, cuda: bool = False) -> str:
     """Return the text of the kernel that `compose` compiles."""
     return Writer(stages, source, sink, cuda=cuda).kernel()
 
