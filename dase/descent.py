@@ -17,6 +17,15 @@ Array = NDArray[np.float64]
 RADIUS = 0.25
 """Of the first population, in the units of `Axis.to_place`."""
 
+LEFT = 0.25
+"""Least share of the product of slopes that is taken to be no noise."""
+
+WIDEST = 0.6
+"""Of any."""
+
+LONGEST = 12
+"""Populations at most."""
+
 SMALLEST = 0.03
 """Of the last: below it the noise of single events hides the slope."""
 
@@ -59,7 +68,7 @@ def search(
         space: Free parameters.
         start: Where to begin, shape (P,).
         seed: Of the models' random numbers, and of the populations.
-        iterations: Populations.
+        iterations: Populations, not counting those that are still on the way.
         radius: Of the first.
     """
     rng = np.random.default_rng([seed, 7])
@@ -68,10 +77,10 @@ def search(
     places, tried = np.empty((0, len(centre))), np.empty((0, len(half.scale.target)))
     best, best_loss = centre, np.inf
     slope = np.zeros((len(half.scale.target), len(centre)))
-    for _ in range(iterations):
-        population = np.clip(
-            np.concatenate([centre[None], centre + radius * _cross(rng, len(centre))]), low, high
-        )
+    left = iterations
+    for _ in range(LONGEST):
+        cross = _cross(rng, len(centre))
+        population = np.clip(np.concatenate([centre[None], centre + radius * cross]), low, high)
         values = half.run(space, population, seed=seed)
         places, tried = np.concatenate([places, population]), np.concatenate([tried, values])
         losses = half.scale.loss(tried) + penalty(places, start)
@@ -84,7 +93,13 @@ def search(
         length = np.abs(step).max()
         step *= min(1.0, 2.0 * radius / max(length, 1e-12))
         centre = np.clip(best + step, low, high)
+        if improved and length > 2.0 * radius:
+            radius = min(1.5 * radius, WIDEST)  # still on the way: does not count
+            continue
         radius = max(radius * (1.0 if improved and length > radius else 0.5), SMALLEST)
+        left -= 1
+        if left == 0:
+            break
     final = half.run(space, centre, seed=seed)
     places, tried = np.concatenate([places, centre[None]]), np.concatenate([tried, final])
     losses = half.scale.loss(tried) + penalty(places, start)
@@ -113,6 +128,30 @@ def slopes(places: Array, values: Array) -> Array:
     ridge = 1e-3 * np.trace(places.T @ places) / size + 1e-12
     fit = np.linalg.solve(places.T @ places + ridge * np.eye(size), places.T @ values)
     out: Array = fit.T
+    return out
+
+
+def clean_normal(places: Array, values: Array, lines: Array, weights: Array, noise: Array) -> Array:
+    """Return the weighted product of slopes with themselves, less what noise in them adds to it, (P, P).
+
+    Slopes come from simulations whose chance differs. Left in, it would make parameters that the data hardly
+    know look well known.
+
+    Args:
+        places: Relative to the middle, shape (M, P).
+        values: Statistics in standard errors, relative to the middle, shape (M, J).
+        lines: Slopes of them, shape (J, P).
+        weights: Of the statistics, shape (J,).
+        noise: Variance of a statistic of one simulation, which bounds what chance does to `values`, shape (J,).
+    """
+    rest = ((values - places @ lines.T) ** 2).sum(0) / max(len(places) - places.shape[1], 1)
+    normal = lines.T @ (weights[:, None] * lines)
+    excess = (weights * np.minimum(rest, noise)).sum() * np.linalg.pinv(places.T @ places)
+    # along each direction at least LEFT of what was seen stays
+    root = np.linalg.cholesky(normal + 1e-9 * np.trace(normal) * np.eye(len(normal)))
+    inverse = np.linalg.inv(root)
+    value, axes = np.linalg.eigh(np.eye(len(normal)) - inverse @ excess @ inverse.T)
+    out: Array = root @ (axes * np.maximum(value, LEFT)) @ axes.T @ root.T
     return out
 
 

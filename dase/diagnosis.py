@@ -15,11 +15,10 @@ from dase.effects import EFFECTS, Effect
 from dase.error import Judgement
 from dase.events import Events
 from dase.evidence import PIXELS, Evidence, gather
-from dase.model import Model, fit_present, model_of, settle
+from dase.model import Model, fit_present, free_of, model_of, settle
 from dase.results import Cell, Diagnosis, Estimate, Rank, Step, Unexplained
 from dase.scene import Scene
 from dase.sensor import Sensor
-from dase.space import axes_of
 from dase.stimulus import Trust
 from dase.words import worst_cells
 
@@ -245,7 +244,7 @@ def _pair_step(first: Step, name: str) -> Step:
 def _like(sensor: Sensor, model: Model, more: Sequence[str]) -> Model:
     """Return the model of a sensor with what is free in another model, and in some effects more."""
     names = [a.name for a in model.space.axes if a.name.split(".")[0] in sensor]
-    mine = [a.name for a in axes_of(sensor, more)] if more else []
+    mine = [name for effect in more for name in free_of(sensor, effect)]
     return model_of(sensor, list(dict.fromkeys([*names, *mine])))
 
 
@@ -283,21 +282,19 @@ def _verdict(
     found = search.added(model)
     chosen = [n for s in search.history if s.chosen for n in s.chosen.split(" + ")]
     order = tuple(dict.fromkeys([*(n for n in chosen if n in found), *found]))
+    model, values = estimates(search.evidence, model, seed=search.seed)
     last = search.judge(model)
     unexplained: Unexplained | None = None
     if not explained(last):
         cells = worst_cells(search.evidence, last)
         unexplained = _unexplained(search, order, errors[0], last, cells)
-    values = estimates(search.evidence, model, seed=search.seed)
     kept = unexplained is None
-    path = [errors[0], *(e for s, e in zip(search.history, errors[1:], strict=False) if s.chosen in found)]
-    if kept and len(path) > 1:
-        path[-1] = last.error
+    path = _staircase(search, order, errors, last.error) if kept else [errors[0]]
     ties = {n: tuple(sorted(search.ties.get(n, set()) - set(found))) for n in order if kept}
     return Diagnosis(
         sensor=model.sensor if kept else start.sensor,
         selected=order if kept else (),
-        errors=tuple(path) if kept else (errors[0],),
+        errors=tuple(path),
         before=before,
         floor=1.0,
         gate=last.gate,
@@ -309,6 +306,18 @@ def _verdict(
         evaluations=search.evidence.evaluations,
         seconds=time.perf_counter() - begin,
     )
+
+
+def _staircase(search: _Search, order: tuple[str, ...], errors: list[float], last: float) -> list[float]:
+    """Return the error at the start and after each effect that was kept.
+
+    Effects that came in at once, or in place of another, have no error of their own on the way: it is taken to
+    fall to the last error with the first of them.
+    """
+    after = {step.chosen: e for step, e in zip(search.history, errors[1:], strict=False)}
+    path = [errors[0], *(after.get(name, last) for name in order)]
+    path[-1] = last
+    return path
 
 
 def _unexplained(

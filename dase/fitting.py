@@ -77,8 +77,9 @@ def fit(
     judged = [(m.judge(evidence.held, repeats=REPEATS, seed=seed + 500), m) for m in ends]
     judgement, model = min(judged, key=lambda pair: pair[0].error)
     tell("confidence intervals", 0.9, judgement.error)
-    values = estimates(evidence, model, seed=seed)
     good = [m for j, m in judged if j.error < judgement.error + 0.1]
+    model, values = estimates(evidence, model, seed=seed)
+    judgement = model.judge(evidence.held, repeats=REPEATS, seed=seed + 500)
     apart = disagreements(model, good, values)
     notes = [*evidence.notes, *apart, *outside(model)]
     if len(good) < 2:
