@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from dase.descent import PRIOR, clean_normal, slopes
+from dase.descent import PRIOR, TIGHT, clean_normal, slopes
 from dase.evidence import Evidence, Half
 from dase.model import Model
 from dase.results import Estimate
@@ -23,14 +23,17 @@ REACH = (0.03, 0.3)
 FARTHEST = 0.3
 """Longest last step."""
 
-SIDE = 1.645
-"""Standard deviations on either side of a 90 % interval."""
+SIDE = 1.645 * 1.25
+"""Standard deviations on either side of a 90 % interval; a quarter more for the uncertainty of the slopes."""
+
+STEPS = 2
+"""Last steps: the first leaves a part of the chance of a single simulation."""
 
 
 def estimates(evidence: Evidence, model: Model, *, seed: int) -> tuple[Model, dict[str, Estimate]]:
     """Return the model, its parameters improved by a last step, and their 90 % intervals.
 
-    The fit is linearised: statistics run along straight lines in the parameters. The last step goes from the
+    The fit is linearised: statistics run along straight lines in the parameters. The last steps go from the
     mean of many repeats of the model, so that the chance of a single simulation does not stay in the
     parameters. What sampling errors of the statistics make of the parameters is seen in the repeats,
     correlations between statistics included, and in the measurement with one group of pixels left out after
@@ -39,17 +42,18 @@ def estimates(evidence: Evidence, model: Model, *, seed: int) -> tuple[Model, di
     if not model.space.axes:
         return model, {}
     half = evidence.train
-    repeats = model.rebase(half, repeats=REPEATS, seed=seed + 900)
-    mean = repeats.mean(0)
-    gain = _gain(half, model, repeats, seed=seed)
-    step = np.clip(-gain @ np.where(half.scale.used, mean - half.scale.target, 0.0), -FARTHEST, FARTHEST)
-    apart = (repeats - mean) @ gain.T
-    chance = apart.var(0, ddof=1) * (1 + 1 / len(repeats))
-    # what the pixels of the measurement make of it, also where the model is not quite right
-    seen = (half.left() @ gain.T).var(0) * (half.groups - 1)
-    deviation = np.sqrt(np.maximum(chance, seen))
     low, high = model.space.bounds()
-    place = np.clip(model.place + step, low, high)
+    for turn in range(STEPS):
+        repeats = model.rebase(half, repeats=REPEATS, seed=seed + 900 + 100 * turn)
+        mean = repeats.mean(0)
+        gain = _gain(half, model, repeats, seed=seed + turn)
+        # what the pixels of the measurement make of it, also where the model is not quite right
+        seen = (half.left() @ gain.T).var(0) * (half.groups - 1)
+        step = -gain @ np.where(half.scale.used, mean - half.scale.target, 0.0)
+        place = np.clip(model.place + np.clip(step, -FARTHEST, FARTHEST), low, high)
+        model = replace(model, place=place)
+    chance = ((repeats - mean) @ gain.T).var(0, ddof=1) * (1 + 1 / len(repeats))
+    deviation = np.sqrt(np.maximum(chance, seen))
     out = {}
     for n, axis in enumerate(model.space.axes):
         ends = (np.clip(place[n] + side * SIDE * deviation[n], low[n], high[n]) for side in (-1, 1))
@@ -59,11 +63,13 @@ def estimates(evidence: Evidence, model: Model, *, seed: int) -> tuple[Model, di
 
 def _gain(half: Half, model: Model, repeats: Array, *, seed: int) -> Array:
     """Return what a change of the statistics does to the fitted places, shape (P, J)."""
-    mean, reach = repeats.mean(0), np.full(len(model.place), REACH[0])
+    mean = repeats.mean(0)
+    tight = [axis.name.startswith("threshold.") for axis in model.space.axes]
+    reach = np.where(tight, TIGHT, 1.0) * REACH[1]
     for turn in range(2):
         gain = _gain_within(half, model, repeats, reach, seed=seed + 10 * turn)
         # as wide as the parameters are uncertain: wide enough to see a slope, narrow enough to be straight
-        reach = np.clip(3.0 * ((repeats - mean) @ gain.T).std(0), *REACH)
+        reach = np.clip(4.0 * ((repeats - mean) @ gain.T).std(0), *REACH)
     return gain
 
 
