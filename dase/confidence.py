@@ -57,7 +57,9 @@ def estimates(evidence: Evidence, model: Model, *, seed: int) -> tuple[Model, di
     out = {}
     for n, axis in enumerate(model.space.axes):
         ends = (np.clip(place[n] + side * SIDE * deviation[n], low[n], high[n]) for side in (-1, 1))
-        out[axis.name] = Estimate(float(axis.to_value(place[n])), *(float(axis.to_value(end)) for end in ends))
+        out[axis.name] = Estimate(
+            float(axis.to_value(place[n])), *(float(axis.to_value(end)) for end in ends)
+        )
     return replace(model, place=place), out
 
 
@@ -77,7 +79,9 @@ def _gain_within(half: Half, model: Model, repeats: Array, reach: Array, *, seed
     scale, size = half.scale, len(model.place)
     rng = np.random.default_rng([seed, 13])
     low, high = model.space.bounds()
-    steps = rng.choice([-1.0, 1.0], (2 * size + 4, size)) * rng.uniform(0.3, 1.0, (2 * size + 4, size)) * reach
+    steps = (
+        rng.choice([-1.0, 1.0], (2 * size + 4, size)) * rng.uniform(0.3, 1.0, (2 * size + 4, size)) * reach
+    )
     places = np.clip(model.place + np.concatenate([steps, -steps]), low, high)
     values = half.run(model.space, places, seed=seed + 1) / scale.sigma
     places, values = places - places.mean(0), values - values.mean(0)

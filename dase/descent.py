@@ -1,4 +1,4 @@
-"""Parameters from statistics: populations of models, a straight-line model of what they give, robust steps."""
+"""Parameters from statistics: populations of models, straight lines through what they give, robust steps."""
 
 from __future__ import annotations
 
@@ -152,7 +152,7 @@ def clean_normal(places: Array, values: Array, lines: Array, weights: Array, noi
         values: Statistics in standard errors, relative to the middle, shape (M, J).
         lines: Slopes of them, shape (J, P).
         weights: Of the statistics, shape (J,).
-        noise: Variance of a statistic of one simulation, which bounds what chance does to `values`, shape (J,).
+        noise: Variance of a statistic of one simulation, a bound of what chance does to `values`, (J,).
     """
     rest = ((values - places @ lines.T) ** 2).sum(0) / max(len(places) - places.shape[1], 1)
     normal = lines.T @ (weights[:, None] * lines)
