@@ -289,7 +289,7 @@ class Writer:
         return f"{name}({', '.join(arguments)})"
 
     def unless_off(self, effect: Stages, *lines: str) -> list[str]:
-        """Return the lines of an effect; off, it changes nothing, and a kernel for many models skips them."""
+        """Return the lines of an effect; a kernel for many models skips them where it is off."""
         return list(lines)
 
     def argument(self, stage: str, effect: Stages, name: str) -> str:

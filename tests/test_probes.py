@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
+
 import numpy as np
 import pytest
 
@@ -140,7 +142,7 @@ def test_families_fill_the_vector():
     assert list(LAYOUT) == list(FAMILIES)
     ends = [(part.start, part.stop) for part in LAYOUT.values()]
     assert ends[0][0] == 0
-    assert all(a[1] == b[0] for a, b in zip(ends[:-1], ends[1:], strict=True))
+    assert all(a[1] == b[0] for a, b in pairwise(ends))
 
 
 @pytest.mark.parametrize(
