@@ -12,7 +12,7 @@ import click
 if __name__ != "dase.cli":
     raise ImportError("import dase.cli, not cli")
 
-COMMANDS = ("compare", "convert", "demo", "diagnose", "effects", "fit", "info", "show", "synth")
+COMMANDS = ("compare", "convert", "demo", "diagnose", "effects", "fit", "info", "show", "synth", "train")
 
 
 class LazyGroup(click.Group):

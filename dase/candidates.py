@@ -56,7 +56,8 @@ Report = Callable[[str, float], None]
 def open_to(effects: Mapping[str, type[Effect]], present: Model) -> list[str]:
     """Return the names of the effects that can be tried."""
     apart = SceneEffect | StreamEffect
-    names = [n for n, e in effects.items() if n != "threshold" and not issubclass(e, apart)]
+    # what a network has to learn first cannot be tried
+    names = [n for n, e in effects.items() if n != "threshold" and not issubclass(e, apart) and not e.maps]
     return [n for n in names if n not in present.space.sensor or present.space.sensor[n].is_off()]
 
 

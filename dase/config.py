@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 from importlib import resources
 from pathlib import Path
 from typing import Any
@@ -44,7 +45,8 @@ def load_sensor(spec: str | Path, effects: Mapping[str, type[Effect]] = EFFECTS)
         text = path.read_text("utf-8")
     except UnicodeDecodeError as error:
         raise InputError(f"sensor file {path} is not UTF-8 text") from error
-    return parse_sensor(text, str(path), effects)
+    sensor = parse_sensor(text, str(path), effects)
+    return replace(sensor, effects=tuple(effect.located(path.parent) for effect in sensor.effects))
 
 
 def parse_sensor(text: str, where: str, effects: Mapping[str, type[Effect]] = EFFECTS) -> Sensor:
@@ -105,6 +107,7 @@ def dump_sensor(sensor: Sensor) -> str:
         table = tomlkit.table()
         about = {p.name: f"{p.about} [{p.unit}]" for p in effect.parameters()}
         about |= {name: " or ".join(among) for name, among in effect.choices().items()}
+        about |= effect.assets()
         for name, value in sensor.table()[effect.name].items():
             table.add(name, tomlkit.item(value).comment(about[name]))
         document.add(tomlkit.nl())

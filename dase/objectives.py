@@ -13,7 +13,7 @@ from typing import Any, Literal, Protocol
 import torch
 
 from dase.critics import BankShape, CriticBank
-from dase.kernels import bridge
+from dase.kernels import autograd_training as bridge
 from dase.networks import gradient_magnitude
 from dase.targets import Pairs
 

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from dase import images
 from dase.errors import InputError, nearest
-from dase.kernels import bridge
+from dase.kernels import autograd_training as bridge
 from dase.regimes import CLIP, MIXED, NAMES, REGIMES, Regime
 
 BACKGROUND = (320, 480)
