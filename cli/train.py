@@ -77,7 +77,9 @@ def command(
         last = run(training, output, pace=pace, resume=resume, look=look)
     width, height = training.scenery.looks.width, training.scenery.looks.height
     recorded = None if job.of_sensor else (width, height)
-    path = adaptation.write_sensor(output, training.mean, name=output.name or "learned", size=recorded)
+    path = adaptation.write_sensor(
+        output, training.mean, mu=last["mu"], name=output.name or "learned", size=recorded
+    )
     for line in summary(last):
         click.echo(line)
     click.echo(f"{path}: try dase synth --sensor {path}, or look at it: dase show {output}")

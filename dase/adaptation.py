@@ -267,8 +267,20 @@ def job_in(out: Path) -> Job:
     return Job(**table)
 
 
-def write_sensor(out: Path, net: ThresholdNet, *, name: str, size: tuple[int, int] | None = None) -> Path:
-    """Write what was learned as a sensor file with its weights beside it; return its path."""
+@torch.no_grad()
+def write_sensor(
+    out: Path, net: ThresholdNet, *, mu: float, name: str, size: tuple[int, int] | None = None
+) -> Path:
+    """Write what was learned as a sensor file with its weights beside it; return its path.
+
+    Args:
+        out: Folder.
+        net: What was learned.
+        mu: Typical mean threshold [log intensity], which becomes the level that the maps are relative to.
+        name: Of the sensor.
+        size: Columns and rows of the camera [px], if it is one.
+    """
+    net = net.levelled(mu)
     level, ratio = float(net.level[0].exp()), float(net.asymmetry.exp())
     on, off = (float(np.clip(level * ratio**share, 0.01, 10.0)) for share in (0.5, -0.5))
     save_net(out / WEIGHTS, net)

@@ -6,6 +6,7 @@ docs/adaptation.md measures.
 
 from __future__ import annotations
 
+import copy
 import math
 from dataclasses import dataclass
 
@@ -182,6 +183,16 @@ class ThresholdNet(nn.Module):
         return sum(
             (torch.diff(self.table, dim=axis).square().mean() for axis in (1, 2)), self.level.new_zeros(())
         )
+
+    @torch.no_grad()
+    def levelled(self, mu: float) -> ThresholdNet:
+        """Return the same network with `mu` as its level, where a table can take up the difference."""
+        other = copy.deepcopy(self)
+        if self.shape.table is not None:
+            off = math.log(mu) - other.level[0]
+            other.level[0] += off
+            other.table[0] -= off
+        return other
 
     def body(self) -> list[nn.Parameter]:
         """Return the parameters of the UNet."""

@@ -103,7 +103,7 @@ class Sensor:
 
     def maps(self, pixels: NDArray[np.int32], device: Any) -> list[Any]:
         """Return what kernels get beside parameters: an array (M, N) of maps where effects have any."""
-        values = [effect.map_values()[:, pixels] for effect in self.effects if effect.maps]
+        values = [effect.map_values(pixels) for effect in self.effects if effect.maps]
         return [wp.array(np.concatenate(values), dtype=float, device=device)] if values else []
 
     def retimes(self) -> bool:

@@ -72,5 +72,5 @@ def predict(
         raise InputError(f"{path} was learned for a {made} sensor, the scene is {size[0]}x{size[1]}")
     with torch.no_grad():
         maps = net(torch.from_numpy(np.clip(grey, 0, 1))[None])
-    level = float(net.level[0].exp())
+        level = float(net.level[0].exp())
     return maps.mu[0].numpy(), maps.sigma[0].numpy(), level

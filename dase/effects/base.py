@@ -142,8 +142,8 @@ class Effect:
         """Return this effect with its maps for a scene."""
         return self
 
-    def map_values(self) -> NDArray[np.float32]:
-        """Return the maps of `bound_to`, in the order of `maps`, shape (M, H · W)."""
+    def map_values(self, pixels: NDArray[np.int32]) -> NDArray[np.float32]:
+        """Return the maps of `bound_to` at row-major indices of pixels (N,), in the order of `maps`, (M, N)."""
         raise NotImplementedError
 
     @classmethod

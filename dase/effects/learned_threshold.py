@@ -57,9 +57,8 @@ class LearnedThreshold(Effect):
 
     def bound_to(self, scene: Scene) -> LearnedThreshold:
         """Return the effect with the maps of this scene."""
-        if not self.weights:
-            shape = (scene.height, scene.width)
-            return replace(self, bound=np.stack([np.ones(shape), np.zeros(shape)]).astype(np.float32))
+        if not self.weights or self.bound is not None:
+            return self
         try:
             from dase.weights import predict
         except ImportError:
@@ -71,9 +70,10 @@ class LearnedThreshold(Effect):
         mu, sigma, level = predict(Path(self.weights), grey)
         return replace(self, bound=np.stack([mu / level, sigma / mu]).astype(np.float32))
 
-    def map_values(self) -> NDArray[np.float32]:
-        """Return factor and spread of every pixel, shape (2, H · W)."""
+    def map_values(self, pixels: NDArray[np.int32]) -> NDArray[np.float32]:
+        """Return factor and spread of pixels, shape (2, N)."""
+        if not self.weights:
+            return np.stack([np.ones(len(pixels)), np.zeros(len(pixels))]).astype(np.float32)
         if self.bound is None:
             raise InputError(f"effect '{self.name}' depends on the scene, and none has been seen yet")
-        values: NDArray[np.float32] = self.bound
-        return values.reshape(2, -1)
+        return np.asarray(self.bound.reshape(2, -1)[:, pixels])
