@@ -25,6 +25,7 @@ COMMANDS = (
     "remove",
     "show",
     "synth",
+    "train",
 )
 
 

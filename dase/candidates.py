@@ -60,8 +60,9 @@ Report = Callable[[str, float], None]
 def open_to(effects: Mapping[str, type[Effect]], present: Model) -> list[str]:
     """Return the names of the effects that can be tried."""
     sensor = present.space.sensor
-    # what acts on whole pictures has no place in a parameter vector
-    known = [n for n, e in effects.items() if not issubclass(e, SceneEffect)]
+    # what acts on whole pictures has no place in a parameter vector; what a network has to learn first
+    # cannot be tried
+    known = [n for n, e in effects.items() if not issubclass(e, SceneEffect) and not e.maps]
     return [n for n in known if n not in sensor or (sensor[n].is_off() and n != "threshold")]
 
 

@@ -56,6 +56,7 @@ def compare(
     begin = time.perf_counter()
     tell = progress or (lambda text, share, error: None)
     tell("reading the measurement", 0.0, float("nan"))
+    sensor = sensor.bound_to(scene)
     evidence = gather(
         events, scene, log_eps=sensor.log_eps, trust=trust, pixels=pixels, seed=seed, device=device
     )

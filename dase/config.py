@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import fields
+from dataclasses import replace
 from importlib import resources
 from pathlib import Path
 from typing import Any
@@ -35,7 +35,9 @@ def load_sensor(spec: str | Path, effects: Mapping[str, type[Effect]] = EFFECTS)
     Raises:
         InputError: No such preset or file, not TOML, or a name or value that does not exist.
     """
-    return parse_sensor(*read_sensor(spec), effects)
+    sensor = parse_sensor(*read_sensor(spec), effects)
+    folder = Path(spec).parent
+    return replace(sensor, effects=tuple(effect.located(folder) for effect in sensor.effects))
 
 
 def read_sensor(spec: str | Path) -> tuple[str, str]:
@@ -124,6 +126,7 @@ def effect_table(effect: Effect) -> Table:
     table = tomlkit.table()
     about = {p.name: f"{p.about} [{p.unit}]" for p in effect.parameters()}
     about |= {name: " or ".join(among) for name, among in effect.choices().items()}
-    for f in fields(effect):
-        table.add(f.name, tomlkit.item(getattr(effect, f.name)).comment(about[f.name]))
+    about |= effect.assets()
+    for name in effect.settings():
+        table.add(name, tomlkit.item(getattr(effect, name)).comment(about[name]))
     return table

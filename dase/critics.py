@@ -9,7 +9,7 @@ from typing import Any
 import torch
 from torch.nn import functional as F
 
-from dase.kernels import bridge
+from dase.kernels import autograd_training as bridge
 from dase.networks import SLOPE
 
 

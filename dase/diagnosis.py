@@ -122,6 +122,7 @@ def diagnose(
     """
     begin = time.perf_counter()
     sensor = sensor or Sensor()
+    sensor = sensor.bound_to(scene)
     evidence = gather(
         events, scene, log_eps=sensor.log_eps, trust=trust, pixels=pixels, seed=seed, device=device
     )

@@ -63,6 +63,7 @@ def fit(
     begin = time.perf_counter()
     tell = progress or (lambda text, share, error: None)
     model_of(sensor, free)  # refuses names that are not there before anything takes time
+    sensor = sensor.bound_to(scene)
     evidence = gather(
         events, scene, log_eps=sensor.log_eps, trust=trust, pixels=pixels, seed=seed, device=device
     )

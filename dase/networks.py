@@ -6,6 +6,7 @@ docs/adaptation.md measures.
 
 from __future__ import annotations
 
+import copy
 import math
 from dataclasses import dataclass
 
@@ -92,9 +93,7 @@ class UNet(nn.Module):
         wide = [channels * min(2**level, 4) for level in range(depth + 1)]
         self.stem = nn.Conv2d(inputs, wide[0], 3, padding=1)
         self.encode = nn.ModuleList(Residual(n) for n in wide)
-        self.down = nn.ModuleList(
-            nn.Conv2d(a, b, 3, 2, 1) for a, b in zip(wide[:-1], wide[1:], strict=True)
-        )
+        self.down = nn.ModuleList(nn.Conv2d(a, b, 3, 2, 1) for a, b in zip(wide[:-1], wide[1:], strict=True))
         self.up = nn.ModuleList(nn.Conv2d(b, a, 1) for a, b in zip(wide[:-1], wide[1:], strict=True))
         self.decode = nn.ModuleList(nn.Conv2d(n, n, 3, padding=1) for n in wide[:-1])
         self.last = nn.Conv2d(wide[0], 2, 1)
@@ -182,6 +181,16 @@ class ThresholdNet(nn.Module):
         return sum(
             (torch.diff(self.table, dim=axis).square().mean() for axis in (1, 2)), self.level.new_zeros(())
         )
+
+    @torch.no_grad()
+    def levelled(self, mu: float) -> ThresholdNet:
+        """Return the same network with `mu` as its level, where a table can take up the difference."""
+        other = copy.deepcopy(self)
+        if self.shape.table is not None:
+            off = math.log(mu) - other.level[0]
+            other.level[0] += off
+            other.table[0] -= off
+        return other
 
     def body(self) -> list[nn.Parameter]:
         """Return the parameters of the UNet."""

@@ -92,6 +92,7 @@ class Pixels:
         lit = any(stage == "light" for effect in self.stages for stage, _ in effect.functions)
         self._logs_at_once = self.device.is_cpu and not lit and bool(np.all(vectors[:, 3] == vectors[0, 3]))
         self._levels: Any = None
+        self._mapped: list[Any] | None = None
         self._bits = max((self.batch * self.count - 1).bit_length(), 1)
         self._low = 3 if labels else 1
         delays = any(stage == "delay" for effect in self.stages for stage, _ in effect.functions)
@@ -129,6 +130,7 @@ class Pixels:
 
     def _count(self, out: Any, scene: Scene, times: NDArray[np.float64], windows: NDArray[np.int32]) -> None:
         """Count with nothing but thresholds."""
+        self.look_at(scene)
         self._edges(times)
         name, source = self.sensor.seen(scene).source(times, self.pixels, self.device)
         first, memory, _ = self._begin(name, source, len(times))
@@ -162,6 +164,7 @@ class Pixels:
 
     def _emit(self, sink: Any, scene: Scene, times: NDArray[np.float64]) -> None:
         """Emit with nothing but thresholds."""
+        self.look_at(scene)
         clock = self._clock(times, np.zeros(len(times), np.int32))
         name, source = self.sensor.seen(scene).source(times, self.pixels, self.device)
         first, memory, signal = self._begin(name, source, len(times))
@@ -226,8 +229,19 @@ class Pixels:
                 return sink.keys, used
             self._capacity = int(1.25 * used.max()) + 1
 
+    def look_at(self, scene: Scene) -> None:
+        """Work out what pixels owe to the scene, once; it is done before the first sample in any case."""
+        if self._mapped is None:
+            self._mapped = self.sensor.bound_to(scene).maps(self.pixels, self.device)
+
+    def _maps(self) -> list[Any]:
+        return self.sensor.maps(self.pixels, self.device) if self._mapped is None else self._mapped
+
     def thresholds(self) -> NDArray[np.float32]:
-        """Return the thresholds of each pixel [log intensity], shape (B, 2, N): OFF, ON."""
+        """Return the thresholds of each pixel [log intensity], shape (B, 2, N): OFF, ON.
+
+        Where they depend on the scene, `look_at` it first.
+        """
         level = self._thresholds_of_pixels()[0].numpy()
         return np.array(np.broadcast_to(level, (self.batch, 2, self.count)))
 
@@ -240,7 +254,8 @@ class Pixels:
         else:
             kernel = pixel.compose_thresholds(self.stages)
             level = wp.empty((self.batch, 2, self.count), dtype=float, device=self.device)
-            inputs = [self._pixels, self.width, self.height, self.seed, self._parameters, level]
+            inputs = [self._pixels, self.width, self.height, self.seed, self._parameters]
+            inputs += [*self._maps(), level]
             launch.run(kernel, self.count, inputs, self.device, batch=self.batch)
         self._levels = level, wp.array(self._vectors[:, 3], dtype=float, device=self.device)
         return self._levels
@@ -254,6 +269,7 @@ class Pixels:
         windows: NDArray[np.int32],
         align: int,
     ) -> None:
+        self.look_at(scene)
         source_name, source = self.sensor.seen(scene).source(times, self.pixels, self.device)
         if source_name == "frames" and self._logs_at_once:
             source_name, source.logs = "both", self._logs(source.values)
@@ -261,7 +277,7 @@ class Pixels:
         clock = self._clock(times, windows)
         inputs = [
             source, clock, self._pixels, self.width, self.height, self.samples, self.seed,
-            self._parameters, self._state, self._next, sink,
+            self._parameters, *self._maps(), self._state, self._next, sink,
         ]  # fmt: skip
         launch.run(kernel, self.count, inputs, self.device, batch=self.batch, align=align)
 

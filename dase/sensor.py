@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
+import warp as wp
 from numpy.typing import ArrayLike, NDArray
 
 from dase.effects import EFFECTS
@@ -101,6 +102,17 @@ class Sensor:
         """Return the effects behind the pixels that are not off."""
         return tuple(e for e in self.effects if isinstance(e, StreamEffect) and not e.is_off())
 
+    def bound_to(self, scene: Scene) -> Sensor:
+        """Return the sensor with whatever its pixels owe to the scene worked out."""
+        if not any(effect.maps for effect in self.effects):
+            return self
+        return replace(self, effects=tuple(effect.bound_to(scene) for effect in self.effects))
+
+    def maps(self, pixels: NDArray[np.int32], device: Any) -> list[Any]:
+        """Return what kernels get beside parameters: an array (M, N) of maps where effects have any."""
+        values = [effect.map_values(pixels) for effect in self.effects if effect.maps]
+        return [wp.array(np.concatenate(values), dtype=float, device=device)] if values else []
+
     def retimes(self) -> bool:
         """Whether events leave at other times than their crossings', or not all of them leave."""
         late = (e for e in self.effects if isinstance(e, StreamEffect) or "delay" in e.stages)
@@ -126,7 +138,7 @@ class Sensor:
             out["size"] = list(self.size)
         out["log_eps"] = self.log_eps
         for effect in self.effects:
-            out[effect.name] = {f.name: getattr(effect, f.name) for f in fields(effect)}
+            out[effect.name] = {name: getattr(effect, name) for name in effect.settings()}
         return out
 
 

@@ -276,6 +276,7 @@ def _record(
 ) -> Report:
     """Write thresholds, frames, flow and events of a scene, in order of time."""
     outlet = Outlet(array.sensor, scene.width, scene.height, seed=array.seed)
+    array.look_at(scene)
     writer.thresholds(array.thresholds()[0].reshape(2, scene.height, scene.width))
     times = sample_times(scene, array.sensor)
     total, shown = Report(sequences=1), 0

@@ -100,7 +100,8 @@ class Trials:
             sink = self.sink(len(rows), reseed=reseed)
             inputs = [
                 history, self._pixels, self.stimulus.width, self.stimulus.height, (seed + first) & 0x3FFFFFFF,
-                wp.array(rows, dtype=float, device=self.device), sink,
+                wp.array(rows, dtype=float, device=self.device),
+                *sensor.maps(self.stimulus.pixels, self.device), sink,
             ]  # fmt: skip
             count = len(self.stimulus.pixels)
             launch.run(kernel, count, inputs, self.device, batch=len(rows), align=GROUP)

@@ -32,7 +32,8 @@ class History:
 def compose(stages: tuple[pixel.Stages, ...]) -> wp.Kernel:
     """Return the kernel of all models with these effects, over (B, N) threads.
 
-    Its arguments are `first`, a `History`, pixels (N,), width, height, seed, parameters (B, P), `Probes`.
+    Its arguments are `first`, a `History`, pixels (N,), width, height, seed, parameters (B, P), maps
+    (M, N) where an effect has any, `Probes`.
     """
     writer = _Writer(stages)
     return pixel.compiled(writer.kernel(), "pixel_trials", writer.scope)
@@ -95,7 +96,9 @@ class _Writer(pixel.Writer):
         self.depth = 0
         self.add(
             "def pixel_trials(first: int, source: Source, pixels: wp.array[int], width: int, height: int,",
-            "                 seed_in: int, parameters: wp.array2d[float], sink: Sink):",
+            "                 seed_in: int, parameters: wp.array2d[float],",
+            *(["                 maps: wp.array2d[float],"] if self.maps else []),
+            "                 sink: Sink):",
         )
         self.depth = 1
         self.prologue()

@@ -127,9 +127,7 @@ def _finite_variants() -> dict[str, Row]:
         "finite600-wgan-slow-critic": base.but(disjoint=True, recipe=dict(critic_rate=5e-5)),
         "finite600-wgan-cosine-critic": base.but(disjoint=True, recipe=dict(critic_cosine=True)),
         "finite600-wgan-penalty10": base.but(disjoint=True, recipe=dict(penalty=10.0)),
-        "finite600-wgan-global": base.but(
-            disjoint=True, hash=dict(orientations=1, coherence=1, contrast=1)
-        ),
+        "finite600-wgan-global": base.but(disjoint=True, hash=dict(orientations=1, coherence=1, contrast=1)),
         "finite600-moments-same-textures": MOMENTS.but(finite=600),
     }
 
@@ -194,9 +192,7 @@ def measure(name: str, args: argparse.Namespace) -> dict[str, Any]:
     row = rows()[name]
     torch.manual_seed(0)
     begin = time.perf_counter()
-    training = prepare(
-        row, device=args.device, pictures=args.images, small=args.small, seconds=args.seconds
-    )
+    training = prepare(row, device=args.device, pictures=args.images, small=args.small, seconds=args.seconds)
     history: list[dict[str, float]] = []
 
     def look(line: dict[str, float]) -> None:

@@ -19,6 +19,7 @@ from dase.effects.hot import Hot
 from dase.effects.jitter import Jitter
 from dase.effects.latency import Latency
 from dase.effects.leak import Leak
+from dase.effects.learned_threshold import LearnedThreshold
 from dase.effects.linlog import Linlog
 from dase.effects.mismatch import Mismatch
 from dase.effects.optics import SceneEffect as SceneEffect
@@ -49,6 +50,7 @@ _ORDER = (
     VoltageNoise,
     # change detector
     Threshold,
+    LearnedThreshold,
     Mismatch,
     Jitter,
     Leak,
