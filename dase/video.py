@@ -196,10 +196,10 @@ def _is_recording(path: Path) -> bool:
     if not path.is_file():
         return False
     try:
-        io.find(path)
+        # of a video, frames are decoded one by one as they are asked for
+        return io.find(path).name != "frames"
     except InputError:
         return False
-    return True
 
 
 def _scene_of(path: Path, fps: float | None, size: tuple[int, int] | None) -> VideoScene:
