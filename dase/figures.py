@@ -72,7 +72,9 @@ def staircase(
     axes.stairs(errors, np.arange(n + 1) - 0.5, baseline=None, color=INK, lw=2.2)
     axes.stairs(errors, np.arange(n + 1) - 0.5, baseline=bottom, color=INK, fill=True, alpha=0.07, lw=0)
     for i, error in enumerate(errors):
-        _say(axes, number(error), (i, error), (0, 5), fontsize=10, ha="center", va="bottom", weight="bold")
+        # beside the line of the floor, not on it
+        shift, side = ((0, -6), "top") if 0.6 * floor < error < floor else ((0, 5), "bottom")
+        _say(axes, number(error), (i, error), shift, fontsize=10, ha="center", va=side, weight="bold")
         above = errors[i - 1] - floor if i else 0.0
         closed = (errors[i - 1] - error) / above if above > 0 else 0.0
         if closed > 0.2 and n < 7 and errors[i - 1] > 1.8 * error:  # else there is no room for words

@@ -7,19 +7,49 @@ from collections.abc import Mapping, Sequence
 from html import escape
 from pathlib import Path
 
+import numpy as np
+
 from dase import figures, page
 from dase.config import dump_sensor
 from dase.distinguish import WORDS
+from dase.events import Events
 from dase.io import replacing
+from dase.maps import event_plates
+from dase.measurement import Measurement
 from dase.plates import Plate, number
 from dase.results import Comparison, Diagnosis, Estimate, Step
-from dase.sensor import Sensor
+from dase.sensor import Sensor, stream
+
+LONGEST = 2.0
+"""Of what is pictured [s]."""
 
 
 def write(path: Path, html: str) -> None:
     """Write a page, whole or not at all."""
     with replacing(path) as temporary:
         temporary.write_text(html, "utf-8")
+
+
+def pictures(measured: Measurement, sensor: Sensor, *, seed: int = 0, device: str = "cpu") -> list[Plate]:
+    """Return pictures of a measurement beside what a model makes of its scene, its first seconds.
+
+    Args:
+        measured: The measurement.
+        sensor: The model.
+        seed: Of every random number of the simulation.
+        device: `cpu`, `cuda` or a Warp name.
+    """
+    times = measured.scene.sample_times()
+    begin, end = float(times[0]), min(float(times[-1]), float(times[0]) + LONGEST)
+    parts = []
+    for part in stream(measured.scene, sensor, seed=seed, device=device):
+        parts.append(part)
+        if len(part) and part.t[-1] > end:
+            break
+    shown = times[np.unique(np.searchsorted(times, np.linspace(begin, end, 13)[:-1]))]
+    frames = np.clip(255 * measured.scene.frames(shown), 0, 255).astype(np.uint8)
+    simulated = Events.concatenate(parts)
+    return event_plates(measured.events, simulated, (begin, end), frames=frames, frame_times=shown)
 
 
 def comparison_page(found: Comparison, *, recording: str, plates: Sequence[Plate] = ()) -> str:
@@ -112,9 +142,10 @@ def diagnosis_verdict(found: Diagnosis) -> str:
             f"chance reaches {number(found.gate)}.{tried}"
         )
     if not found.selected:
-        return (
-            f"Nothing is missing: the error is {first} noise floors, and chance reaches {number(found.gate)}."
-        )
+        error = f"the error is {first} noise floors, and chance reaches {number(found.gate)}."
+        if found.errors[0] > found.gate:
+            return f"Nothing of weight is missing: {error} What is left is beyond chance, but small."
+        return f"Nothing is missing: {error}"
     names = " and ".join(found.selected)
     ties = "".join(
         f" The data cannot tell {name} from {' or '.join(others)}."

@@ -154,6 +154,8 @@ def test_nothing_missing():
     page = checked(report.diagnosis_page(found, recording="office.h5"))
     assert "Nothing is missing: the error is 1.1 noise floors" in page.words
     assert "unexplained" not in page.words
+    small = diagnosis(selected=(), errors=(1.6,), ties={}, history=(first,))
+    assert "Nothing of weight is missing" in checked(report.diagnosis_page(small, recording="a")).words
 
 
 def test_unexplained_names_nothing_as_found():
