@@ -65,18 +65,17 @@ def open_to(effects: Mapping[str, type[Effect]], present: Model) -> list[str]:
 def prepared(evidence: Evidence, effect: type[Effect]) -> list[Effect]:
     """Return the variants of an effect that are tried, with what can be read off the measurement set.
 
-    No descent finds the frequency of a lamp or the ticks of a clock, but they can be seen. Where no regularity
-    is seen in the time stamps, the effects that make one are not tried.
+    No descent finds the frequency of a lamp or the ticks of a clock, but they can be seen. Where no
+    regularity is seen in the time stamps, the effects that make one are not tried.
     """
     structure = evidence.structure
-    out = variants(effect)
     if effect is Flicker:
-        return [replace(e, frequency=evidence.peak) for e in out]
+        return [Flicker(frequency=evidence.peak)]
     if effect is Timestamp:
-        return [replace(e, step=structure.step, jitter=0.0) for e in out] if structure.step else []
+        return [Timestamp(step=structure.step, jitter=0.0)] if structure.step else []
     if effect is RowScan:
-        return [replace(e, line=structure.line) for e in out if e.direction == structure.direction and structure.line]
-    return out
+        return [RowScan(line=structure.line, direction=structure.direction)] if structure.line else []
+    return variants(effect)
 
 
 def scout(evidence: Evidence, present: Model, effect: Effect, *, seed: int) -> Tried:

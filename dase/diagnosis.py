@@ -15,11 +15,10 @@ from dase.effects import EFFECTS, Effect
 from dase.error import Judgement
 from dase.events import Events
 from dase.evidence import PIXELS, Evidence, gather
-from dase.model import Model, fit_present, model_of, settle
+from dase.model import Model, fit_present, free_of, model_of, settle
 from dase.results import Cell, Diagnosis, Estimate, Rank, Step, Unexplained
 from dase.scene import Scene
 from dase.sensor import Sensor
-from dase.space import axes_of
 from dase.stimulus import Trust
 from dase.words import worst_cells
 
@@ -36,7 +35,10 @@ SHARE = 0.1
 """Least share of the way to the floor."""
 
 CLOSE = 2.0
-"""A model up to this error is said to be at the floor: what is left may be significant but is not material."""
+"""A model up to this error is called at the floor: what is left may be significant but is not material."""
+
+CLOSE_FAMILY = 3.5
+"""The same for the error of one family: what few statistics show, such as dead pixels, the mean hides."""
 
 TIE = 2.0
 """Candidates within so many standard errors of the best are not told apart from it."""
@@ -137,8 +139,10 @@ def diagnose(
 
 
 def explained(judgement: Judgement) -> bool:
-    """Whether a model is at the floor."""
-    return judgement.error <= max(judgement.gate, CLOSE)
+    """Whether a model is at the floor, altogether and in every family of probes."""
+    families = judgement.families
+    inside = (families[name] <= max(judgement.limits[name], CLOSE_FAMILY) for name in families)
+    return judgement.error <= max(judgement.gate, CLOSE) and all(inside)
 
 
 def _greedy(search: _Search, model: Model, most: int) -> tuple[Model, Judgement, list[float]]:
@@ -179,7 +183,11 @@ def _step(search: _Search, model: Model, judgement: Judgement, more: bool) -> tu
     best, ties = _choose(search, finalists)
     ranking = tuple(_rank(t, judgement, p_value(base - t.fit) if np.isfinite(t.held) else 1.0) for t in tried)
     mine = next(rank for rank in ranking if rank.effect == best.name)
-    enough = mine.fall >= MATERIAL and mine.share >= SHARE and mine.p_value <= max(SIGNIFICANT, 1.01 / (1 + len(repeats)))
+    enough = (
+        mine.fall >= MATERIAL
+        and mine.share >= SHARE
+        and mine.p_value <= max(SIGNIFICANT, 1.01 / (1 + len(repeats)))
+    )
     if not search.history:
         search.first = sorted(tried, key=lambda t: t.scouted)
         search.first_fit = model.loss_on(evidence.scout, seed=seed)
@@ -226,7 +234,9 @@ def _pairs(search: _Search, start: Model, model: Model, judgement: Judgement) ->
     tried = []
     for n, (one, two) in enumerate(pairs):
         both = one.model.sensor.with_effect(two.model.sensor[two.name])
-        pair = _like(both, start, (one.name, two.name)).search(evidence.scout, seed=seed, iterations=4, radius=0.3)
+        pair = _like(both, start, (one.name, two.name)).search(
+            evidence.scout, seed=seed, iterations=4, radius=0.3
+        )
         tried.append((pair.loss, f"{one.name} + {two.name}", pair))
         search.progress(f"trying {one.name} + {two.name}", (n + 1) / len(pairs), search.error)
     for _, name, pair in sorted(tried, key=lambda t: t[0])[:2]:
@@ -245,7 +255,7 @@ def _pair_step(first: Step, name: str) -> Step:
 def _like(sensor: Sensor, model: Model, more: Sequence[str]) -> Model:
     """Return the model of a sensor with what is free in another model, and in some effects more."""
     names = [a.name for a in model.space.axes if a.name.split(".")[0] in sensor]
-    mine = [a.name for a in axes_of(sensor, more)] if more else []
+    mine = [name for effect in more for name in free_of(sensor, effect)]
     return model_of(sensor, list(dict.fromkeys([*names, *mine])))
 
 
@@ -283,21 +293,19 @@ def _verdict(
     found = search.added(model)
     chosen = [n for s in search.history if s.chosen for n in s.chosen.split(" + ")]
     order = tuple(dict.fromkeys([*(n for n in chosen if n in found), *found]))
+    model, values = estimates(search.evidence, model, seed=search.seed)
     last = search.judge(model)
     unexplained: Unexplained | None = None
     if not explained(last):
         cells = worst_cells(search.evidence, last)
         unexplained = _unexplained(search, order, errors[0], last, cells)
-    values = estimates(search.evidence, model, seed=search.seed)
     kept = unexplained is None
-    path = [errors[0], *(e for s, e in zip(search.history, errors[1:], strict=False) if s.chosen in found)]
-    if kept and len(path) > 1:
-        path[-1] = last.error
+    path = _staircase(search, order, errors, last.error) if kept else [errors[0]]
     ties = {n: tuple(sorted(search.ties.get(n, set()) - set(found))) for n in order if kept}
     return Diagnosis(
         sensor=model.sensor if kept else start.sensor,
         selected=order if kept else (),
-        errors=tuple(path) if kept else (errors[0],),
+        errors=tuple(path),
         before=before,
         floor=1.0,
         gate=last.gate,
@@ -311,6 +319,18 @@ def _verdict(
     )
 
 
+def _staircase(search: _Search, order: tuple[str, ...], errors: list[float], last: float) -> list[float]:
+    """Return the error at the start and after each effect that was kept.
+
+    Effects that came in at once, or in place of another, have no error of their own on the way: it is taken
+    to fall to the last error with the first of them.
+    """
+    after = {step.chosen: e for step, e in zip(search.history, errors[1:], strict=False)}
+    path = [errors[0], *(after.get(name, last) for name in order)]
+    path[-1] = last
+    return path
+
+
 def _unexplained(
     search: _Search, nearest: tuple[str, ...], first: float, last: Judgement, cells: tuple[Cell, ...]
 ) -> Unexplained:
@@ -318,8 +338,8 @@ def _unexplained(
     stand_in = " and ".join(nearest) if nearest else "no effect"
     where = cells[0].sentence if cells else "no single cell stands out"
     sentence = (
-        f"unexplained: with {stand_in} an error of {last.error:.2g} is left ({100 * share:.0f} % of the error "
-        f"above the floor), which none of the effects known takes to the floor; worst: {where}"
+        f"unexplained: with {stand_in} an error of {last.error:.2g} is left ({100 * share:.0f} % of the "
+        f"error above the floor), which none of the effects known takes to the floor; worst: {where}"
     )
     return Unexplained(last.error, share, nearest, cells, sentence)
 

@@ -123,10 +123,10 @@ class Half:
     @property
     def groups(self) -> int:
         """Number of groups of pixels."""
-        return self.found.groups.shape[1]
+        return int(self.found.groups.shape[1])
 
     def left(self) -> Array:
-        """Return statistics of the measurement less the model, groups left out one after the other, (G, J)."""
+        """Return statistics of the measurement less the model, without one group after the other, (G, J)."""
         return self._left(self.found) - self._left(self._present)
 
     def leave_out(self, models: list[Sums]) -> Array:
@@ -238,7 +238,8 @@ def gather(
     peak = peak_of(halves[0].found.clock[0], grid.step)
     for half in halves:
         half.frame = replace(half.frame, peak=peak)
-    return Evidence(*halves, bands, structure, peak)
+    train, held, scout = halves
+    return Evidence(train, held, scout, bands, structure, peak)
 
 
 def common_grid(events: Events, scene: Scene) -> Grid:
@@ -294,8 +295,9 @@ def _enough(halves: list[Half], events: Events, grid: Grid) -> None:
     for half, name in zip(halves, ("fitting", "judging"), strict=True):
         count = int(half.found.halves.sum())
         if count < LEAST:
+            times = max(2.0, np.ceil(LEAST / max(count, 1)))
             raise InputError(
                 f"too few events to say anything: {count} of the {len(events)} lie in the part for {name}, "
-                f"at least {LEAST} are needed; record about {max(2.0, np.ceil(LEAST / max(count, 1))):.0f} times "
+                f"at least {LEAST} are needed; record about {times:.0f} times "
                 f"as long as these {grid.step * (grid.steps - 1):.3g} s, or more motion"
             )

@@ -58,7 +58,7 @@ def noticeable(effect: type[Effect]) -> Effect:
 
 
 def seen(effect: Effect) -> tuple[dict[str, float], tuple[Cell, ...]]:
-    """Return by how much each family changes, and the cells that change most; `measured` is with the effect."""
+    """Return by how much each family changes, and the cells that change most; measured is with it."""
     scene = bars()
     plain = Sensor(name="without")
     events = simulate(scene, plain.with_effect(effect), seed=1)

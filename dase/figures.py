@@ -65,7 +65,7 @@ def staircase(
     )
     axes = place(figure, 0.85, 0.85, WIDE - 1.2, 2.4)
     n = len(errors)
-    bottom, top = min(0.7 * floor, 0.8 * min(errors)), 1.45 * max(*errors, below)
+    bottom, top = 0.66 * min(floor, *errors), 1.45 * max(*errors, below)
     axes.set(xlim=(-0.5, n - 0.5), ylim=(bottom, top))
     axes.axhspan(bottom, below, color=BOTH, alpha=0.10, lw=0)
     axes.axhline(floor, color=BOTH, lw=1.2, ls=(0, (4, 2)))

@@ -124,12 +124,16 @@ def _threshold_starts(model: Model) -> Array:
     return out
 
 
+def free_of(sensor: Sensor, name: str) -> list[str]:
+    """Return the names of the parameters of an effect that a fit may change; there may be none."""
+    return [axis.name for axis in axes_of(sensor) if axis.name.split(".")[0] == name]
+
+
 def added(present: Model, effect: Effect) -> Model:
     """Return the present model with an effect added, all of whose parameters are free."""
     sensor = present.sensor.with_effect(effect)
     old = [axis.name for axis in present.space.axes]
-    mine = [axis.name for axis in axes_of(sensor, [effect.name])]
-    return model_of(sensor, [*old, *mine])
+    return model_of(sensor, [*old, *free_of(sensor, effect.name)])
 
 
 def starts(model: Model, effect: Effect, *, few: bool = False) -> Array:

@@ -1,7 +1,7 @@
 """Summary statistics of events with a physical reading, and what they are called.
 
-`dase.kernels.probes` adds up numbers event by event; here the sums become statistics that model and measurement
-are compared by. Each belongs to a family, a row of `FAMILIES`.
+`dase.kernels.probes` adds up numbers event by event; here the sums become statistics by which model and
+measurement are compared. Each belongs to a family, a row of `FAMILIES`.
 """
 
 from __future__ import annotations
@@ -163,7 +163,8 @@ def zones(pixels: NDArray[np.int32], width: int, height: int) -> NDArray[np.int6
     """Return the ring that each pixel lies in, shape (N,)."""
     x, y = pixels % width - 0.5 * (width - 1), pixels // width - 0.5 * (height - 1)
     radius = np.hypot(x, y)
-    return np.searchsorted(np.quantile(radius, np.arange(1, ZONES) / ZONES), radius)
+    out: NDArray[np.int64] = np.searchsorted(np.quantile(radius, np.arange(1, ZONES) / ZONES), radius)
+    return out
 
 
 def statistics(found: Sums, frame: Frame) -> tuple[Array, Array]:
@@ -250,7 +251,8 @@ def _odd_pixels(halves: NDArray[np.float32], frame: Frame) -> Array:
 def _by_zone(halves: NDArray[np.float32], zone: NDArray[np.int64]) -> Array:
     ring = (zone[:, None] == np.arange(ZONES)).astype(np.float32)
     state = np.matmul(halves.transpose(0, 2, 1), ring).reshape(len(halves), 2, 2, 2, ZONES)
-    return state.sum(2).reshape(len(halves), -1).astype(np.float64)
+    out: Array = state.sum(2).reshape(len(halves), -1).astype(np.float64)
+    return out
 
 
 def _spectrum(clock: NDArray[np.int64], frame: Frame) -> tuple[Array, Array]:
@@ -298,7 +300,7 @@ MEANS = _is_mean()
 
 
 def tolerance(measured: Array, events: Array) -> Array:
-    """Return what each statistic may be off by, because it is of no concern or a matter of one event, (J,)."""
+    """Return what each statistic may be off by: it is of no concern, or a matter of one event, (J,)."""
     out = TOLERANCE + 1.0 / (events + 3.0)
     lag = np.abs(measured[LAYOUT["lag"]]).reshape(LAGS, BANDS)
     scale = np.repeat(lag.max(0)[None], LAGS, 0).reshape(-1)

@@ -34,7 +34,10 @@ class Structure:
         direction: Where the readout goes.
     """
 
-    NAMES: ClassVar = ("share of times at ticks of one clock", "share of times at which the pixel's line is read")
+    NAMES: ClassVar = (
+        "share of times at ticks of one clock",
+        "share of times at which the pixel's line is read",
+    )
 
     step: float = 0.0
     line: float = 0.0

@@ -1,4 +1,4 @@
-"""Many models over one stimulus: from parameter vectors to sums of statistics, and the same of a measurement."""
+"""Many models over one stimulus: from parameter vectors to sums of statistics; the same of a measurement."""
 
 from __future__ import annotations
 
@@ -125,7 +125,9 @@ class Trials:
         found = self._totals(sink, 1)
         return replace(found, stamps=self.structure.shares(self._mine(events))[None])
 
-    def stream(self, sensor: Sensor, vector: NDArray[Any], effects: Iterable[StreamEffect], *, seed: int) -> Sums:
+    def stream(
+        self, sensor: Sensor, vector: NDArray[Any], effects: Iterable[StreamEffect], *, seed: int
+    ) -> Sums:
         """Simulate one parameter vector with effects behind the pixels, and sum up what leaves.
 
         The pixels are some of a sensor's. A bus that all pixels share is given as much of its bandwidth and
@@ -220,7 +222,7 @@ class _Light(Scene):
     def __init__(self, stimulus: Stimulus):
         self._stimulus = stimulus
         self.width, self.height = stimulus.width, stimulus.height
-        self.times = stimulus.grid.step * np.arange(stimulus.grid.steps)
+        self.times: NDArray[np.float64] = np.float64(stimulus.grid.step) * np.arange(stimulus.grid.steps)
         self.duration = float(self.times[-1])
 
     def sample_times(self) -> NDArray[np.float64]:

@@ -226,6 +226,7 @@ def compose_thresholds(stages: tuple[Stages, ...]) -> wp.Kernel:
 
 
 def compiled(text: str, name: str, scope: dict[str, Any]) -> wp.Kernel:
+    """Return the kernel `name` of a text."""
     filename = f"<dase {name} {zlib.crc32(text.encode()):08x}>"
     # Warp reads the source of a kernel through linecache, and so do tracebacks
     linecache.cache[filename] = (len(text), None, text.splitlines(keepends=True), filename)
@@ -303,7 +304,7 @@ class Writer:
         return f"{name}({', '.join(arguments)})"
 
     def unless_off(self, effect: Stages, *lines: str) -> list[str]:
-        """Return the lines of an effect; off, they change nothing, and a kernel for many models skips them."""
+        """Return the lines of an effect; a kernel for many models skips them where it is off."""
         return list(lines)
 
     def argument(self, stage: str, effect: Stages, name: str) -> str:

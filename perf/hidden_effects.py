@@ -46,7 +46,7 @@ HIDDEN: dict[str, tuple[dict[str, Any], ...]] = {
     "readout": tuple(dict(rate=r) for r in (1.5, 0.8, 0.5)),
     "timestamp": tuple(dict(step=s, jitter=0.0) for s in (1e-4, 3e-4, 1e-3)),
 }
-"""Effect to its parameters at weak, medium and strong. The rate of `readout` is relative to that of the scene."""
+"""Effect to its parameters at weak, medium and strong; the rate of `readout` is in 600,000 events/s."""
 
 PAIRS = (
     ("bandwidth", "leak"), ("bandwidth", "shot"), ("linlog", "mismatch"), ("mismatch", "leak"),
@@ -124,7 +124,9 @@ def _frame(still: np.ndarray, things: list[Any], t: float) -> np.ndarray:
         # back and forth along a line, so that pixels see both edges and pauses
         reach = 0.5 * span * WIDTH
         along = reach * np.sin(speed * t / max(reach, 1))
-        corner = where * (WIDTH, HEIGHT) + along * np.array([np.cos(angle), np.sin(angle)]) - patch.shape[0] / 2
+        corner = (
+            where * (WIDTH, HEIGHT) + along * np.array([np.cos(angle), np.sin(angle)]) - patch.shape[0] / 2
+        )
         first = np.floor(corner).astype(int)
         move = np.array([[1, 0, corner[0] - first[0]], [0, 1, corner[1] - first[1]]], np.float32)
         size = (patch.shape[0] + 1,) * 2
@@ -332,7 +334,9 @@ def _run(options: argparse.Namespace) -> None:
             if "failed" in line:
                 print(f"{line['name']}: {line['failed']}", flush=True)
                 continue
-            print(f"{n + 1}/{len(jobs)} {'ok   ' if right(line) else 'WRONG'} {line['name']:40s} {line['seconds']:5.1f} s {_short(line)}", flush=True)  # fmt: skip
+            mark = "ok   " if right(line) else "WRONG"
+            head = f"{n + 1}/{len(jobs)} {mark} {line['name']:40s} {line['seconds']:5.1f} s"
+            print(head, _short(line), flush=True)
 
 
 def _safely(job: tuple[Case, str, int]) -> dict[str, Any]:

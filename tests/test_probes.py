@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
+
 import numpy as np
 import pytest
 
@@ -55,7 +57,9 @@ def reference(events, stimulus, middle) -> np.ndarray:
                 out[kernels.RATE + p * kernels.CELLS + cell] += 1
                 if kind >= kernels.RESTING:
                     seen = level[i, np.clip(k - lags, 0, last)]
-                    out[kernels.LAG + np.arange(kernels.LAGS) * kernels.BANDS + band] += (2 * p - 1) * -np.diff(seen)
+                    out[kernels.LAG + np.arange(kernels.LAGS) * kernels.BANDS + band] += (
+                        2 * p - 1
+                    ) * -np.diff(seen)
                     out[kernels.LAG_COUNT + band] += 1
                 if before >= 0:
                     gap = k - before
@@ -138,7 +142,7 @@ def test_families_fill_the_vector():
     assert list(LAYOUT) == list(FAMILIES)
     ends = [(part.start, part.stop) for part in LAYOUT.values()]
     assert ends[0][0] == 0
-    assert all(a[1] == b[0] for a, b in zip(ends[:-1], ends[1:], strict=True))
+    assert all(a[1] == b[0] for a, b in pairwise(ends))
 
 
 @pytest.mark.parametrize(
@@ -168,5 +172,3 @@ def test_a_bus_is_shared_out(evidence):
     free = trials.stream(sensor, sensor.parameters(), (), seed=1).halves.sum()
     held = trials.stream(sensor, sensor.parameters(), sensor.streams(), seed=1).halves.sum()
     assert held < 0.95 * free
-
-
