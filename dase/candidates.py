@@ -13,21 +13,22 @@ from dase.effects.base import Effect
 from dase.effects.flicker import Flicker
 from dase.effects.row_scan import RowScan
 from dase.effects.timestamp import Timestamp
+from dase.error import Judgement, Scale
 from dase.evidence import Evidence
-from dase.model import Model, added, starts
+from dase.model import Model, added, settle, starts
 from dase.space import variants
 from dase.trials import finer_steps
 
 Array = NDArray[np.float64]
 
-FINALISTS = 5
+FINALISTS = 4
 """Candidates that are fitted to all pixels of the training half."""
 
 SECOND = 1.25
 """A second start is followed where its loss is below this, relative to the first."""
 
-SEEDS = 6
-"""Simulations whose mean loss is taken where candidates are compared."""
+REPEATS = 30
+"""Simulations with other seeds by which a finalist is judged."""
 
 
 @dataclass(frozen=True)
@@ -39,8 +40,7 @@ class Tried:
         model: With the effect, fitted.
         fit: Its loss where it was fitted.
         scouted: Its loss on the scout.
-        held: Its loss on the held-out half, by what is seen of the model without it; NaN where it was only
-            screened.
+        judged: Its error on the held-out half; None where it was only screened.
         bank: Statistics of all that was tried on the training half, shape (M, J).
     """
 
@@ -48,8 +48,13 @@ class Tried:
     model: Model
     fit: float
     scouted: float = float("nan")
-    held: float = float("nan")
+    judged: Judgement | None = None
     bank: Array | None = None
+
+    @property
+    def error(self) -> float:
+        """The held-out error, NaN where it was only screened."""
+        return self.judged.error if self.judged else float("nan")
 
 
 Report = Callable[[str, float], None]
@@ -97,19 +102,21 @@ def scout(evidence: Evidence, present: Model, effect: Effect, *, seed: int) -> T
 
 
 def refine(evidence: Evidence, tried: Tried, *, seed: int) -> Tried:
-    """Fit a candidate to all pixels of the training half and look at the held-out one."""
-    found: Found = tried.model.explore(evidence.train, seed=seed, iterations=4, radius=0.2)
+    """Fit a candidate to all pixels of the training half, by the sampling errors of the present model."""
+    found: Found = tried.model.explore(evidence.train, seed=seed, iterations=3, radius=0.2)
     model = replace(tried.model, place=found.place, loss=found.loss)
-    held = held_loss(evidence, model, seed=seed)
-    return replace(tried, model=model, fit=found.loss, held=held, bank=found.tried)
+    return replace(tried, model=model, fit=found.loss, bank=found.tried)
 
 
-def held_loss(evidence: Evidence, model: Model, *, seed: int) -> float:
-    """Return the held-out loss of a model as that of the present one is judged: the mean of a few repeats."""
-    half = evidence.held
-    places = np.repeat(model.place[None], SEEDS, 0)
-    values = half.run(model.space, places, seed=seed + 700, reseed=True)
-    return float(half.seen.loss(values.mean(0)))
+def judge_alone(evidence: Evidence, tried: Tried, *, seed: int) -> Tried:
+    """Fit a candidate by its own sampling errors and judge it on the held-out half.
+
+    Effects that make pixels differ have sampling errors far above those of the model without them, by which
+    they would look worse than they are.
+    """
+    model = settle(evidence, tried.model, seed=seed, rounds=1)
+    judged = model.judge(evidence.held, repeats=REPEATS, seed=seed + 500)
+    return replace(tried, model=model, judged=judged)
 
 
 def try_all(
@@ -121,9 +128,9 @@ def try_all(
     seed: int,
     report: Report,
 ) -> list[Tried]:
-    """Try each effect; return the finalists in order of their held-out loss, then the others.
+    """Try each effect; return the finalists in order of their held-out error, then the others.
 
-    All halves must have been rebased to the present model.
+    The training half and the scout must have been rebased to the present model; finalists take their place.
     """
     all_variants = [v for name in names for v in prepared(evidence, effects[name])]
     found: dict[str, Tried] = {}
@@ -133,16 +140,17 @@ def try_all(
             found[effect.name] = tried
         report(f"trying {effect.name}", 0.7 * (n + 1) / len(all_variants))
     order = sorted(found.values(), key=lambda t: t.fit)
-    finalists = []
-    for n, tried in enumerate(order[:FINALISTS]):
-        finalists.append(refine(evidence, tried, seed=seed))
-        report(f"fitting {tried.name}", 0.7 + 0.3 * (n + 1) / min(FINALISTS, len(order)))
-    finalists.sort(key=lambda t: t.held)
-    return [*finalists, *order[FINALISTS:]]
+    finalists = [refine(evidence, tried, seed=seed) for tried in order[:FINALISTS]]
+    done = []
+    for n, tried in enumerate(finalists):
+        report(f"fitting {tried.name}", 0.7 + 0.3 * n / len(finalists))
+        done.append(judge_alone(evidence, tried, seed=seed))
+    done.sort(key=lambda t: t.error)
+    return [*done, *order[FINALISTS:]]
 
 
 def chance_of(
-    evidence: Evidence, tried: Sequence[Tried], repeats: Array, present: Array
+    scale: Scale, tried: Sequence[Tried], repeats: Array, present: Array
 ) -> Callable[[float], float]:
     """Return the function from a fall of the training loss to its p-value, corrected over all candidates.
 
@@ -150,7 +158,7 @@ def chance_of(
     tried for any candidate.
 
     Args:
-        evidence: Rebased to the present model.
+        scale: Of the training half, by which candidates were fitted.
         tried: Candidates with their banks.
         repeats: Statistics of repeats of the present model on the training half, shape (R, J).
         present: Statistics of the present model as it was compared with the candidates, shape (J,).
@@ -159,7 +167,6 @@ def chance_of(
     if not banks:
         return lambda fall: 1.0
     bank = np.concatenate(banks)
-    scale = evidence.train.scale
     gains = []
     for repeat in repeats:
         stand_in = replace(scale, target=repeat)
@@ -170,15 +177,3 @@ def chance_of(
         return float((1 + np.count_nonzero(ordered >= fall)) / (1 + len(ordered)))
 
     return p_value
-
-
-def apart(evidence: Evidence, one: Model, other: Model, *, seed: int) -> tuple[float, float]:
-    """Return by how much the held-out loss of `other` is above that of `one`, and its standard error.
-
-    The error comes from leaving out one group of pixels after the other.
-    """
-    half = evidence.held
-    differences = half.leave_out([half.simulate(m.space, m.place, seed=seed) for m in (one, other)])
-    count = differences.shape[1]
-    gap = differences[1] - differences[0]
-    return float(gap.mean()), float(np.sqrt((count - 1) * gap.var()))

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from dase.error import Judgement, Scale, judge, robust
+from dase.error import Judgement, Scale, judge
 from dase.errors import InputError
 from dase.events import Events
 from dase.kernels import launch
@@ -128,16 +128,6 @@ class Half:
     def left(self) -> Array:
         """Return statistics of the measurement less the model, without one group after the other, (G, J)."""
         return self._left(self.found) - self._left(self._present)
-
-    def leave_out(self, models: list[Sums]) -> Array:
-        """Return the loss of each model with one group of pixels left out after the other, shape (M, G)."""
-        measured = self._left(self.found)
-        weights = self.scale.weights()
-        rows = [
-            robust(np.where(self.scale.used, (self._left(m) - measured) / self.scale.sigma, 0.0))
-            for m in models
-        ]
-        return np.stack([row @ weights for row in rows])
 
     def _left(self, one: Sums) -> Array:
         """Return statistics without one group of pixels after the other, shape (G, J)."""

@@ -3,7 +3,7 @@
     python perf/hidden_effects.py --quick                            a few minutes on a CPU
     python perf/hidden_effects.py --jobs 8 --device cuda:0           everything; goes on where it stopped
     python perf/hidden_effects.py --hidden ../shared/hidden          data of another simulator
-    python perf/hidden_effects.py --report                           docs/hidden-effects.md and .png from the log
+    python perf/hidden_effects.py --report                           the page and its picture from the log
 
 The scenes are made for this and used nowhere else. The diagnosis sees events, scene and a sensor that lacks
 what was hidden; the truth is compared with its answer afterwards. Each run is a line of the log.
@@ -269,7 +269,7 @@ def score_hidden(folder: Path, options: argparse.Namespace) -> None:
 
 
 def hidden_scores(truth: dict[str, Any], answers: dict[str, Any]) -> dict[str, bool]:
-    """Return which answers are right; the other simulator's lin-log mapping and time stamps may be named too."""
+    """Return which answers are right; its lin-log mapping and time stamps may be named too."""
     out = {}
     for name, found in answers.items():
         want = true_effects(truth, name)
