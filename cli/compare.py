@@ -77,7 +77,8 @@ def command(
         from dase import report
 
         plates = report.pictures(measured, model, seed=seed, device=device)
-        report.write(output, report.comparison_page(found, recording=recording.name, plates=plates))
+        page = report.comparison_page(found, recording=recording.name, model=Path(sensor).stem, plates=plates)
+        report.write(output, page)
         with replacing(output.with_suffix(".json")) as part:
             part.write_text(json.dumps(found.to_json(), indent=2) + "\n")
         click.echo(f"{output}: open it in a browser")

@@ -109,7 +109,10 @@ def command(
         from dase import report as pages
 
         plates = pages.pictures(measured, found.sensor, seed=seed, device=device)
-        pages.write(report, pages.diagnosis_page(found, recording=recording.name, plates=plates))
+        page = pages.diagnosis_page(
+            found, recording=recording.name, model=Path(sensor).stem, plates=plates
+        )
+        pages.write(report, page)
     _print(found, quiet)
 
 

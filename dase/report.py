@@ -52,12 +52,15 @@ def pictures(measured: Measurement, sensor: Sensor, *, seed: int = 0, device: st
     return event_plates(measured.events, simulated, (begin, end), frames=frames, frame_times=shown)
 
 
-def comparison_page(found: Comparison, *, recording: str, plates: Sequence[Plate] = ()) -> str:
+def comparison_page(
+    found: Comparison, *, recording: str, model: str | None = None, plates: Sequence[Plate] = ()
+) -> str:
     """Return the report of a comparison.
 
     Args:
         found: What the comparison found.
         recording: What to call the measurement.
+        model: What to call the model; the name of the sensor if None.
         plates: Pictures of it, see `dase.maps`.
     """
     wrong = found.error > found.gate
@@ -70,7 +73,7 @@ def comparison_page(found: Comparison, *, recording: str, plates: Sequence[Plate
         _sensor(found.sensor),
         page.notes(found.notes),
     ]
-    return page.page(f"{found.sensor.name} against {recording}", "comparison", body, found.seconds)
+    return page.page(f"{model or found.sensor.name} against {recording}", "comparison", body, found.seconds)
 
 
 def comparison_verdict(found: Comparison) -> str:
@@ -103,12 +106,15 @@ def comparison_plates(found: Comparison) -> list[Plate]:
     return plates
 
 
-def diagnosis_page(found: Diagnosis, *, recording: str, plates: Sequence[Plate] = ()) -> str:
+def diagnosis_page(
+    found: Diagnosis, *, recording: str, model: str | None = None, plates: Sequence[Plate] = ()
+) -> str:
     """Return the report of a diagnosis.
 
     Args:
         found: What the diagnosis found.
         recording: What to call the measurement.
+        model: What to call the model; the name of the sensor if None.
         plates: Pictures of the model that was found, see `dase.maps`.
     """
     body = [page.verdict(diagnosis_verdict(found), wrong=found.unexplained is not None)]
@@ -127,7 +133,9 @@ def diagnosis_page(found: Diagnosis, *, recording: str, plates: Sequence[Plate] 
         page.notes(found.notes),
     ]
     foot = f"{found.evaluations:,} simulations. " if found.evaluations else ""
-    return page.page(f"{found.sensor.name} against {recording}", "diagnosis", body, found.seconds, foot)
+    return page.page(
+        f"{model or found.sensor.name} against {recording}", "diagnosis", body, found.seconds, foot
+    )
 
 
 def diagnosis_verdict(found: Diagnosis) -> str:
