@@ -109,9 +109,7 @@ def command(
         from dase import report as pages
 
         plates = pages.pictures(measured, found.sensor, seed=seed, device=device)
-        page = pages.diagnosis_page(
-            found, recording=recording.name, model=Path(sensor).stem, plates=plates
-        )
+        page = pages.diagnosis_page(found, recording=recording.name, model=Path(sensor).stem, plates=plates)
         pages.write(report, page)
     _print(found, quiet)
 
