@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,7 +17,6 @@ from dase.error import Judgement, Scale
 from dase.evidence import Evidence
 from dase.model import Model, added, settle, starts
 from dase.space import variants
-from dase.trials import finer_steps
 
 Array = NDArray[np.float64]
 
@@ -31,7 +30,7 @@ REPEATS = 30
 """Simulations with other seeds by which a finalist is judged."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Tried:
     """One candidate.
 
@@ -40,6 +39,7 @@ class Tried:
         model: With the effect, fitted.
         fit: Its loss where it was fitted.
         scouted: Its loss on the scout.
+        families: The same by family.
         judged: Its error on the held-out half; None where it was only screened.
         bank: Statistics of all that was tried on the training half, shape (M, J).
     """
@@ -48,6 +48,7 @@ class Tried:
     model: Model
     fit: float
     scouted: float = float("nan")
+    families: Mapping[str, float] = field(default_factory=dict)
     judged: Judgement | None = None
     bank: Array | None = None
 
@@ -86,8 +87,7 @@ def prepared(evidence: Evidence, effect: type[Effect]) -> list[Effect]:
 def scout(evidence: Evidence, present: Model, effect: Effect, *, seed: int) -> Tried:
     """Try one effect on the scout: a look at many places, then a short descent from the best two."""
     model = added(present, effect)
-    sensor = model.space.sensor
-    slow = model.space.streams or finer_steps(sensor, evidence.scout.trials.stimulus.grid.step) > 0
+    slow = evidence.scout.slow(model.space)
     places, losses = screen(evidence.scout, model.space, starts(model, effect, few=slow), seed=seed)
     apart = np.flatnonzero((np.abs(places - places[0]).max(1) > 0.8) & (losses < SECOND * losses[0]))
     picks = [0, *apart[: 0 if slow else 1]]
@@ -98,7 +98,8 @@ def scout(evidence: Evidence, present: Model, effect: Effect, *, seed: int) -> T
         for n in picks
     ]
     best = min(ends, key=lambda m: m.loss)
-    return Tried(effect.name, best, best.loss, best.loss)
+    values = evidence.scout.run(best.space, best.place, seed=seed)[0]
+    return Tried(effect.name, best, best.loss, best.loss, evidence.scout.scale.families(values))
 
 
 def refine(evidence: Evidence, tried: Tried, *, seed: int) -> Tried:
@@ -125,12 +126,14 @@ def try_all(
     effects: Mapping[str, type[Effect]],
     names: Sequence[str],
     *,
+    worst: Sequence[str],
     seed: int,
     report: Report,
 ) -> list[Tried]:
     """Try each effect; return the finalists in order of their held-out error, then the others.
 
-    The training half and the scout must have been rebased to the present model; finalists take their place.
+    `worst` are the families in which the present model fails; who helps there is looked at more closely. The
+    training half and the scout must have been rebased to the present model; finalists take their place.
     """
     all_variants = [v for name in names for v in prepared(evidence, effects[name])]
     found: dict[str, Tried] = {}
@@ -140,13 +143,24 @@ def try_all(
             found[effect.name] = tried
         report(f"trying {effect.name}", 0.7 * (n + 1) / len(all_variants))
     order = sorted(found.values(), key=lambda t: t.fit)
-    finalists = [refine(evidence, tried, seed=seed) for tried in order[:FINALISTS]]
+    chosen = [*order[:FINALISTS], *specialists(order, worst)]
+    finalists = [refine(evidence, tried, seed=seed) for tried in chosen]
     done = []
     for n, tried in enumerate(finalists):
         report(f"fitting {tried.name}", 0.7 + 0.3 * n / len(finalists))
         done.append(judge_alone(evidence, tried, seed=seed))
     done.sort(key=lambda t: t.error)
-    return [*done, *order[FINALISTS:]]
+    return [*done, *(t for t in order if t not in chosen)]
+
+
+def specialists(order: Sequence[Tried], worst: Sequence[str]) -> list[Tried]:
+    """Return those beside the first ones that help most in the families where the present model is worst."""
+    out: list[Tried] = []
+    for family in worst:
+        best = min(order, key=lambda t: t.families.get(family, float("inf")))
+        if best not in order[:FINALISTS] and best not in out:
+            out.append(best)
+    return out
 
 
 def chance_of(

@@ -143,6 +143,13 @@ def explained(judgement: Judgement) -> bool:
     return judgement.error <= max(judgement.gate, CLOSE) and all(inside)
 
 
+def worst_families(judgement: Judgement) -> list[str]:
+    """Return the two families that are most above their limits, if any are."""
+    families, limits = judgement.families, judgement.limits
+    above = [name for name in families if families[name] > limits[name]]
+    return sorted(above, key=lambda name: -families[name] / limits[name])[:2]
+
+
 def _greedy(search: _Search, model: Model, most: int) -> tuple[Model, Judgement, list[float]]:
     """Add the best effect as long as one is missing."""
     errors = []
@@ -175,7 +182,7 @@ def _step(search: _Search, model: Model, judgement: Judgement, more: bool) -> tu
     if not search.history:
         search.first_fit = model.loss_on(evidence.scout, seed=seed)
     tried = try_all(
-        evidence, model, search.effects, open_names, seed=seed,
+        evidence, model, search.effects, open_names, worst=worst_families(judgement), seed=seed,
         report=lambda text, share: search.progress(text, share, search.error),
     )  # fmt: skip
     p_value = chance_of(scale, tried, repeats, present)
