@@ -171,7 +171,7 @@ def open_video(path: Path, *, fps: float | None = None, size: tuple[int, int] | 
     """Return the scene of a video file, of a folder of frames, or of the frames of a recording.
 
     Args:
-        path: File or folder; of a recording, such as a sequence of `dase synth`, the events are not looked at.
+        path: File or folder; the events of a recording, such as a sequence of `dase synth`, do not matter.
         fps: Frames per second; None takes what the file says.
         size: Columns and rows to resize to; None keeps the video's.
 
