@@ -93,9 +93,7 @@ class Job:
         if not np.isfinite(self.window) or self.window <= 0:
             raise InputError(f"window must be a number > 0 s, got {self.window:g}")
         if self.steps < 0 or self.sequences < 5:
-            raise InputError(
-                f"steps must be >= 0 and sequences >= 5, got {self.steps} and {self.sequences}"
-            )
+            raise InputError(f"steps must be >= 0 and sequences >= 5, got {self.steps} and {self.sequences}")
         if not self.targets:
             raise InputError("name at least one recording, or a sensor file")
         if self.backend.startswith("cuda") and not torch.cuda.is_available():
@@ -292,7 +290,9 @@ def write_sensor(
     return out / SENSOR
 
 
-def baseline(kind: Literal["esim", "rate", "random"], target: Target, scenery: Scenery, *, seed: int = 0) -> Any:
+def baseline(
+    kind: Literal["esim", "rate", "random"], target: Target, scenery: Scenery, *, seed: int = 0
+) -> Any:
     """Return thresholds without learning, see `dase.baselines`."""
     if kind == "esim":
         return esim().to(scenery.device)

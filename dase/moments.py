@@ -209,7 +209,9 @@ class Moments:
         """Place the boundaries of brightness and edge strength at quantiles of both domains."""
         found = [looks(pairs.grey) for both in sets for pairs in both]
         for level, values in zip(self.levels, zip(*found, strict=True), strict=True):
-            pooled = torch.sort(torch.cat([v.flatten()[:: max(v.numel() // 50_000, 1)] for v in values])).values
+            pooled = torch.sort(
+                torch.cat([v.flatten()[:: max(v.numel() // 50_000, 1)] for v in values])
+            ).values
             places = [round(n / level * (len(pooled) - 1)) for n in range(1, level)]
             self.boundaries.append(pooled[places].contiguous())
         height, across = sets[0][0].grey.shape[1:]

@@ -93,9 +93,7 @@ class UNet(nn.Module):
         wide = [channels * min(2**level, 4) for level in range(depth + 1)]
         self.stem = nn.Conv2d(inputs, wide[0], 3, padding=1)
         self.encode = nn.ModuleList(Residual(n) for n in wide)
-        self.down = nn.ModuleList(
-            nn.Conv2d(a, b, 3, 2, 1) for a, b in zip(wide[:-1], wide[1:], strict=True)
-        )
+        self.down = nn.ModuleList(nn.Conv2d(a, b, 3, 2, 1) for a, b in zip(wide[:-1], wide[1:], strict=True))
         self.up = nn.ModuleList(nn.Conv2d(b, a, 1) for a, b in zip(wide[:-1], wide[1:], strict=True))
         self.decode = nn.ModuleList(nn.Conv2d(n, n, 3, padding=1) for n in wide[:-1])
         self.last = nn.Conv2d(wide[0], 2, 1)

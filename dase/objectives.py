@@ -17,6 +17,7 @@ from dase.kernels import autograd_training as bridge
 from dase.networks import gradient_magnitude
 from dase.targets import Pairs
 
+
 def critic_maps(counts: torch.Tensor) -> torch.Tensor:
     """Return what critics see, log(1 + x)/2 of counts and of their gradient magnitudes, (B, 4, H, W)."""
     return 0.5 * torch.log1p(torch.cat([counts, gradient_magnitude(counts)], 1))
@@ -196,7 +197,9 @@ class Adversarial:
 
     def _number(self, classes: torch.Tensor) -> torch.Tensor:
         """Return how many patches each class has."""
-        return torch.zeros_like(self.seen).index_add_(0, classes, torch.ones_like(classes, dtype=torch.float32))
+        return torch.zeros_like(self.seen).index_add_(
+            0, classes, torch.ones_like(classes, dtype=torch.float32)
+        )
 
     def state(self) -> dict[str, Any]:
         """Return the bank, the hash and the random numbers."""

@@ -105,7 +105,9 @@ def _scene_of(recording: Recording) -> CameraScene:
         )
     begin = recording.frame_times if recording.frame_begin is None else recording.frame_begin
     if begin is None:
-        raise InputError("the frames of the recording have no times, so they cannot be laid beside the events")
+        raise InputError(
+            "the frames of the recording have no times, so they cannot be laid beside the events"
+        )
     return CameraScene(recording.frames, begin, recording.frame_end)
 
 

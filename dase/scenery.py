@@ -275,7 +275,10 @@ def _motions(
 
 
 def _half_normal(
-    rng: np.random.Generator, deviation: NDArray[np.float64], most: NDArray[np.float64], shape: tuple[int, ...]
+    rng: np.random.Generator,
+    deviation: NDArray[np.float64],
+    most: NDArray[np.float64],
+    shape: tuple[int, ...],
 ) -> NDArray[np.float64]:
     """Return half-normal numbers up to `most`, drawn again where they are above it."""
     out = np.abs(rng.normal(size=shape)) * deviation

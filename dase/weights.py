@@ -57,9 +57,7 @@ def _loaded(path: Path, changed: int) -> ThresholdNet:
     return load_net(path)
 
 
-def predict(
-    path: Path, grey: NDArray[np.float32]
-) -> tuple[NDArray[np.float32], NDArray[np.float32], float]:
+def predict(path: Path, grey: NDArray[np.float32]) -> tuple[NDArray[np.float32], NDArray[np.float32], float]:
     """Return mean and spread of the thresholds for an image (H, W) in [0, 1], and the level of the mean.
 
     Raises:

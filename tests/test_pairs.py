@@ -33,7 +33,9 @@ def all_on(mode: str) -> dase.Sensor:
     more = (
         OpticsBlur(sigma=0.4),
         Bandwidth(cutoff=400.0),
-        LearnedThreshold(weights="stands for a file", bound=np.full((2, 8, 10), [[[1.1]], [[0.2]]], np.float32)),
+        LearnedThreshold(
+            weights="stands for a file", bound=np.full((2, 8, 10), [[[1.1]], [[0.2]]], np.float32)
+        ),
         Mismatch(spread=0.1),
         Leak(rate=30.0, light=3.0),
         Shot(rate=60.0),

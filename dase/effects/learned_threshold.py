@@ -63,7 +63,7 @@ class LearnedThreshold(Effect):
             from dase.weights import predict
         except ImportError:
             raise InputError(
-                f'effect \'{self.name}\' needs PyTorch and safetensors: pip install "dase[learn]"'
+                f"effect '{self.name}' needs PyTorch and safetensors: pip install \"dase[learn]\""
             ) from None
         times = scene.sample_times()
         grey = scene.frames(times[len(times) // 2 :][:1])[0]
