@@ -44,6 +44,7 @@ from dase.targets import TRUTHS, Endless, Finite, Pairs, Target, record
 from dase.training import Recipe, Training
 
 ROOT = Path(__file__).resolve().parents[1]
+SHARED = ROOT.parent / "shared"
 
 LEARNED = 8.0
 """Seconds of the recording that are learned from."""
@@ -237,7 +238,7 @@ def _probes(later: Recording, name: str, net: Any, folder: Path) -> float | str:
     try:
         place = folder / name
         place.mkdir(exist_ok=True)
-        mu = float(net(torch.full((1, 8, 8), 0.4, device=net.level.device)).mu.mean())
+        mu = float(net(torch.full((1, 8, 8), 0.4, device=net.level.device)).mu.mean().detach())
         sensor = load_sensor(write_sensor(place, net.to("cpu"), mu=mu, name=name))
         assert later.frames is not None
         assert later.frame_begin is not None
@@ -353,7 +354,7 @@ def _brief(line: dict[str, Any]) -> str:
 
 
 def _default_images() -> str:
-    beside = ROOT.parent / "shared" / "photos"
+    beside = SHARED / "photos"
     return str(beside) if beside.is_dir() else "builtin"
 
 
