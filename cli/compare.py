@@ -52,7 +52,8 @@ def command(
             device=device, progress=tell,
         )  # fmt: skip
     click.echo(
-        f"error {found.error:.2f}; 1 is what two repeats of the recording give, most stay below {found.gate:.2f}"
+        f"error {found.error:.2f}; 1 is what two repeats of the recording give, "
+        f"which stay below {found.gate:.2f}"
     )
     width = max(map(len, found.families))
     for name, error in sorted(found.families.items(), key=lambda item: -item[1]):

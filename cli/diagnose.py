@@ -68,9 +68,10 @@ def command(
 
     model = load_sensor(sensor)
     measured = open_measurement(recording, scene, file)
+    names = free.split(",") if free else None
     with bar(quiet) as tell:
         found = diagnose(
-            measured.events, measured.scene, model, trust=measured.trust, free=free.split(",") if free else None,
+            measured.events, measured.scene, model, trust=measured.trust, free=names,
             most=MOST if auto else 1, pixels=pixels, seed=seed, device=device, progress=tell,
         )  # fmt: skip
     if json_ is not None:
@@ -111,8 +112,8 @@ def _print(found: Diagnosis, quiet: bool) -> None:
         for rank in step.ranking[:5]:
             mark = "+" if rank.effect == step.chosen else " "
             click.echo(
-                f"  {mark} {rank.effect:14s} error {rank.error:6.2f}  {100 * rank.share:3.0f} % of the way to "
-                f"the floor  p {rank.p_value:.3f}"
+                f"  {mark} {rank.effect:14s} error {rank.error:6.2f}  {100 * rank.share:3.0f} % of the way "
+                f"to the floor  p {rank.p_value:.3f}"
             )
         if step.ties:
             click.echo(f"    cannot be told apart from {step.chosen}: {', '.join(step.ties)}")

@@ -10,8 +10,10 @@ from numpy.typing import NDArray
 
 from dase.descent import Found, screen
 from dase.effects.base import Effect
+from dase.effects.flicker import Flicker
 from dase.effects.optics import SceneEffect
-from dase.effects.stream import StreamEffect
+from dase.effects.row_scan import RowScan
+from dase.effects.timestamp import Timestamp
 from dase.evidence import Evidence
 from dase.model import Model, added, starts
 from dase.space import variants
@@ -37,6 +39,7 @@ class Tried:
         name: Of the effect, names joined by ` + ` for a pair.
         model: With the effect, fitted.
         fit: Its loss where it was fitted.
+        scouted: Its loss on the scout.
         held: Its loss on the held-out half, by what is seen of the model without it; NaN where it was only
             screened.
         bank: Statistics of all that was tried on the training half, shape (M, J).
@@ -45,6 +48,7 @@ class Tried:
     name: str
     model: Model
     fit: float
+    scouted: float = float("nan")
     held: float = float("nan")
     bank: Array | None = None
 
@@ -55,16 +59,34 @@ Report = Callable[[str, float], None]
 
 def open_to(effects: Mapping[str, type[Effect]], present: Model) -> list[str]:
     """Return the names of the effects that can be tried."""
-    apart = SceneEffect | StreamEffect
-    # what a network has to learn first cannot be tried
-    names = [n for n, e in effects.items() if n != "threshold" and not issubclass(e, apart) and not e.maps]
-    return [n for n in names if n not in present.space.sensor or present.space.sensor[n].is_off()]
+    sensor = present.space.sensor
+    # what acts on whole pictures has no place in a parameter vector; what a network has to learn first
+    # cannot be tried
+    known = [n for n, e in effects.items() if not issubclass(e, SceneEffect) and not e.maps]
+    return [n for n in known if n not in sensor or (sensor[n].is_off() and n != "threshold")]
+
+
+def prepared(evidence: Evidence, effect: type[Effect]) -> list[Effect]:
+    """Return the variants of an effect that are tried, with what can be read off the measurement set.
+
+    No descent finds the frequency of a lamp or the ticks of a clock, but they can be seen. Where no
+    regularity is seen in the time stamps, the effects that make one are not tried.
+    """
+    structure = evidence.structure
+    if effect is Flicker:
+        return [Flicker(frequency=evidence.peak)]
+    if effect is Timestamp:
+        return [Timestamp(step=structure.step, jitter=0.0)] if structure.step else []
+    if effect is RowScan:
+        return [RowScan(line=structure.line, direction=structure.direction)] if structure.line else []
+    return variants(effect)
 
 
 def scout(evidence: Evidence, present: Model, effect: Effect, *, seed: int) -> Tried:
     """Try one effect on the scout: a look at many places, then a short descent from the best two."""
     model = added(present, effect)
-    slow = finer_steps(model.space.sensor, evidence.scout.trials.stimulus.grid.step) > 0
+    sensor = model.space.sensor
+    slow = model.space.streams or finer_steps(sensor, evidence.scout.trials.stimulus.grid.step) > 0
     places, losses = screen(evidence.scout, model.space, starts(model, effect, few=slow), seed=seed)
     apart = np.flatnonzero((np.abs(places - places[0]).max(1) > 0.8) & (losses < SECOND * losses[0]))
     picks = [0, *apart[: 0 if slow else 1]]
@@ -75,7 +97,7 @@ def scout(evidence: Evidence, present: Model, effect: Effect, *, seed: int) -> T
         for n in picks
     ]
     best = min(ends, key=lambda m: m.loss)
-    return Tried(effect.name, best, best.loss)
+    return Tried(effect.name, best, best.loss, best.loss)
 
 
 def refine(evidence: Evidence, tried: Tried, *, seed: int) -> Tried:
@@ -89,8 +111,8 @@ def refine(evidence: Evidence, tried: Tried, *, seed: int) -> Tried:
 def held_loss(evidence: Evidence, model: Model, *, seed: int) -> float:
     """Return the held-out loss of a model as that of the present one is judged: the mean of a few repeats."""
     half = evidence.held
-    vectors = np.repeat(model.vector, SEEDS, 0)
-    values = half.run(model.space.sensor, vectors, seed=seed + 700, reseed=True)
+    places = np.repeat(model.place[None], SEEDS, 0)
+    values = half.run(model.space, places, seed=seed + 700, reseed=True)
     return float(half.seen.loss(values.mean(0)))
 
 
@@ -107,7 +129,7 @@ def try_all(
 
     All halves must have been rebased to the present model.
     """
-    all_variants = [v for name in names for v in variants(effects[name])]
+    all_variants = [v for name in names for v in prepared(evidence, effects[name])]
     found: dict[str, Tried] = {}
     for n, effect in enumerate(all_variants):
         tried = scout(evidence, present, effect, seed=seed)
@@ -160,7 +182,7 @@ def apart(evidence: Evidence, one: Model, other: Model, *, seed: int) -> tuple[f
     The error comes from leaving out one group of pixels after the other.
     """
     half = evidence.held
-    differences = half.leave_out([half.trials.run(m.space.sensor, m.vector, seed=seed) for m in (one, other)])
+    differences = half.leave_out([half.simulate(m.space, m.place, seed=seed) for m in (one, other)])
     count = differences.shape[1]
     gap = differences[1] - differences[0]
     return float(gap.mean()), float(np.sqrt((count - 1) * gap.var()))

@@ -26,7 +26,7 @@ from dase.doubts import doubts
 from dase.errors import InputError
 from dase.events import Events
 from dase.io.sequence import Sequence
-from dase.io.source import Kind, Note, Size
+from dase.io.source import Kind, Motion, Note, Size
 from dase.survey import Statistics, survey
 
 
@@ -76,6 +76,7 @@ class Recording:
         frame_times: Middle of each exposure [s], float64, shape (F,); None where unknown.
         frame_begin: Begin of each exposure [s], float64, shape (F,); None where unknown.
         frame_end: End of each exposure [s], float64, shape (F,); None where unknown.
+        motion: Samples of the motion sensor, see `dase.io.Motion`; None without any.
 
     Raises:
         InputError: Shapes disagree, events lie outside the sensor or the time, or exposures run backwards.
@@ -91,6 +92,7 @@ class Recording:
     frame_times: NDArray[np.float64] | None = None
     frame_begin: NDArray[np.float64] | None = None
     frame_end: NDArray[np.float64] | None = None
+    motion: Motion | None = None
 
     def __post_init__(self) -> None:
         shape = (self.height, self.width)
@@ -142,10 +144,10 @@ class Recording:
         if len(sequence.events):
             end = max(end, np.nextafter(sequence.events.t[-1], np.inf))
         times, exposure = sequence.frame_times, sequence.frame_exposure
-        spans: tuple[NDArray[np.float64] | None, ...] = (None, None)
+        first = last = None
         if times is not None and exposure is not None:
-            spans = (times - exposure / 2, times + exposure / 2)
-            begin, end = min(begin, float(spans[0][0])), max(end, float(spans[1][-1]))
+            first, last = times - exposure / 2, times + exposure / 2
+            begin, end = min(begin, float(first[0])), max(end, float(last[-1]))
         return cls(
             sequence.events,
             float(begin),
@@ -155,7 +157,8 @@ class Recording:
             Report((*said, *doubts(found)), found),
             sequence.frames,
             times,
-            *spans,
+            first,
+            last,
         )
 
     @property
@@ -214,16 +217,24 @@ class Recording:
         begin, end = max(begin, self.begin), min(end, self.end)
         if not begin < end:
             raise InputError(f"slice: must overlap {self.begin:g}..{self.end:g} s")
+        motion = self.motion
+        if motion is not None:
+            within = (motion.t >= begin) & (motion.t < end)
+            motion = Motion(*(column[within] for column in motion))
         events = self.events.slice(begin, end)
+        frames = self._frames_in(begin, end)
+        return replace(self, events=events, begin=begin, end=end, motion=motion, **frames)
+
+    def _frames_in(self, begin: float, end: float) -> dict[str, Any]:
+        """Return the frames whose exposure lies in a span [s], and what goes with them."""
+        names = ("frames", "frame_times", "frame_begin", "frame_end")
         if self.frames is None or self.frame_times is None:
-            return replace(self, events=events, begin=begin, end=end, frames=None)
+            return dict.fromkeys(names)
         first = self.frame_times if self.frame_begin is None else self.frame_begin
         last = self.frame_times if self.frame_end is None else self.frame_end
         kept = (first >= begin) & (last <= end)
-        names = ("frames", "frame_times", "frame_begin", "frame_end")
-        spans: dict[str, Any] = {name: getattr(self, name) for name in names}
-        spans = {name: None if array is None else array[kept] for name, array in spans.items()}
-        return replace(self, events=events, begin=begin, end=end, **spans)
+        found = {name: getattr(self, name) for name in names}
+        return {name: None if array is None else array[kept] for name, array in found.items()}
 
     def masked(self, mask: ArrayLike) -> Recording:
         """Return the recording of those trusted pixels for which `mask`, bool of shape (H, W), is true."""
@@ -317,4 +328,5 @@ def open_recording(path: str | PathLike[str], *, size: Size | None = None) -> Re
         InputError: It is missing, of unknown format, damaged beyond use, or needs an optional library.
     """
     notes: list[str] = []
-    return Recording.of(io.read(path, size=size, notes=notes), notes)
+    recording = Recording.of(io.read(path, size=size, notes=notes), notes)
+    return replace(recording, motion=io.motion(path, size=size, notes=notes))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -17,6 +17,7 @@ from dase.effects.stream import StreamEffect
 from dase.effects.threshold import Threshold
 from dase.errors import InputError
 from dase.events import Events
+from dase.history import Entry
 from dase.kernels import pixel
 from dase.outlet import Outlet, Tally, rows_of
 from dase.pixels import Pixels
@@ -36,12 +37,14 @@ class Sensor:
         size: Columns and rows of the camera [px], for work that has no size of its own; a scene brings its
             own size. None leaves it open.
         log_eps: Added to intensities before the logarithm, so that black is finite (ESIM: 0.001).
+        history: How the sensor came to be; changes nothing.
     """
 
     effects: tuple[Effect, ...] = (Threshold(),)
     name: str = "ideal"
     size: tuple[int, int] | None = None
     log_eps: float = 1e-3
+    history: tuple[Entry, ...] = field(default=(), compare=False)
 
     def __post_init__(self) -> None:
         names = [effect.name for effect in self.effects]
@@ -94,6 +97,10 @@ class Sensor:
         for effect in self.effects:
             scene = effect.seen(scene) if isinstance(effect, SceneEffect) else scene
         return scene
+
+    def streams(self) -> tuple[StreamEffect, ...]:
+        """Return the effects behind the pixels that are not off."""
+        return tuple(e for e in self.effects if isinstance(e, StreamEffect) and not e.is_off())
 
     def bound_to(self, scene: Scene) -> Sensor:
         """Return the sensor with whatever its pixels owe to the scene worked out."""

@@ -91,7 +91,7 @@ def _layout(count: int, aspect: float) -> tuple[Figure, list[Axes], list[Axes]]:
 def _header(figure: Figure, s: Statistics, title: str, window: float, note: str) -> None:
     tall = figure.get_figheight()
     rows = dict(table(s))
-    facts = [f"{s.width} × {s.height} pixels", rows["duration"], f"{rows['events']} events"]
+    facts = [f"{s.width} × {s.height} pixels", seconds(s.duration), f"{rows['events']} events"]
     facts += [f"{rows['ON share']} ON"] if s.events else []
     facts += [note] if note else []
     left, right, first, second = 0.4 / 11, 1 - 0.4 / 11, 1 - 0.3 / tall, 1 - 0.57 / tall

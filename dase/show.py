@@ -44,7 +44,7 @@ def table(statistics: Statistics) -> list[tuple[str, str]]:
     said = ", ".join(f"{name} {100 * share:.1f} %" for name, share in shares)
     return [
         ("sensor", f"{s.width} x {s.height}"),
-        ("duration", seconds(s.duration) + (f", from {s.begin:.3f} s on" if s.begin else "")),
+        ("duration", seconds(s.duration) + (f", from {s.begin:.3f} s on" if abs(s.begin) >= 1e-3 else "")),
         ("events", grouped(s.events)),
         ("ON rate", f"{s.on_rate:.3g} events/pixel/s"),
         ("OFF rate", f"{s.off_rate:.3g} events/pixel/s"),
@@ -140,23 +140,30 @@ def default_window(sequence: Sequence) -> float:
     return power * max(step for step in (1, 2, 5) if step * power <= wanted * (1 + 1e-9))
 
 
-def overlay(grey: NDArray[np.uint8] | None, counts: NDArray[np.int32]) -> NDArray[np.uint8]:
+def overlay(grey: NDArray[Any] | None, counts: NDArray[np.int32]) -> NDArray[np.uint8]:
     """Lay events over a frame: red ON, blue OFF, the more of them the less of the frame shows through.
 
     Args:
-        grey: Frame, shape (H, W); None is white.
+        grey: Frame of 8 to 16 bits, shape (H, W); None is white.
         counts: OFF and ON events, shape (2, H, W).
 
     Returns:
         Red, green and blue, shape (H, W, 3).
     """
-    base = np.full(counts.shape[1:], 1.0) if grey is None else 0.22 + 0.7 * (grey / 255.0) ** 0.8
+    base = np.full(counts.shape[1:], 1.0) if grey is None else 0.22 + 0.7 * (grey / _white(grey)) ** 0.8
     total = counts.sum(0)
     colours = np.array([[int(code[i : i + 2], 16) / 255 for i in (1, 3, 5)] for code in (OFF, ON)])
     mixed = np.tensordot(counts / np.maximum(total, 1), colours, axes=(0, 0))  # (H, W, 3)
     alpha = np.where(total > 0, 1 - 0.35 * 0.5 ** (total - 1.0), 0.0)[..., None]
     blend: NDArray[np.float64] = (1 - alpha) * base[..., None] + alpha * mixed
     return np.rint(255 * blend).astype(np.uint8)
+
+
+def _white(grey: NDArray[Any]) -> float:
+    """Return the largest number of the 8, 10, 12, 14 or 16 bits that a frame makes use of."""
+    return float(
+        (1 << next(bits for bits in (8, 10, 12, 14, 16) if int(grey.max(initial=0)) < 1 << bits)) - 1
+    )
 
 
 def draw(

@@ -24,7 +24,7 @@ from dase.io.source import Picture, Size
 
 BITS = 20  # of the place of an event in a part
 PART = 1 << BITS  # events looked at together
-SAMPLE = 1 << 13  # of them that are asked whether they are alone
+SAMPLE = 1 << 14  # of the first that are asked whether they are alone; of later ones an eighth
 ALONE = 0.01  # [s] around an event in which its 3x3 pixels see no other
 HOT_EVENTS, HOT_RATIO = 10, 10.0  # a hot pixel has that many events, and that many times those around it
 
@@ -207,7 +207,8 @@ class Survey:
         first, last = np.searchsorted(t, (t[0] + ALONE, t[-1] - ALONE))
         if last <= first:
             return
-        asked = np.unique(np.linspace(first, last - 1, min(SAMPLE, last - first)).astype(np.int64))
+        count = min(SAMPLE if not self._asked else SAMPLE // 8, last - first)
+        asked = np.unique(np.linspace(first, last - 1, count).astype(np.int64))
         after = np.searchsorted(t, t[asked] + ALONE, side="right")
         before = np.searchsorted(t, t[asked] - ALONE)
         found = np.zeros(len(asked), np.int64)

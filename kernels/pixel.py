@@ -187,7 +187,7 @@ SINKS = {"counts": Counts, "keys": Keys, "labels": Keys}
 
 
 @lru_cache(maxsize=256)
-def compose(stages: tuple[Stages, ...], source: str, sink: str, *, cuda: bool) -> wp.Kernel:
+def compose(stages: tuple[Stages, ...], source: str, sink: str, *, cuda: bool = False) -> wp.Kernel:
     """Return the kernel of a sensor.
 
     Args:
@@ -219,7 +219,7 @@ def compiled(text: str, name: str, scope: dict[str, Any]) -> wp.Kernel:
     return kernel
 
 
-def source_text(stages: tuple[Stages, ...], source: str, sink: str, *, cuda: bool) -> str:
+def source_text(stages: tuple[Stages, ...], source: str, sink: str, *, cuda: bool = False) -> str:
     """Return the text of the kernel that `compose` compiles."""
     return Writer(stages, source, sink, cuda=cuda).kernel()
 
@@ -293,7 +293,7 @@ class Writer:
         return f"{name}({', '.join(arguments)})"
 
     def unless_off(self, effect: Stages, *lines: str) -> list[str]:
-        """Return the lines of an effect; off, it changes nothing, and a kernel for many models skips them."""
+        """Return the lines of an effect; a kernel for many models skips them where it is off."""
         return list(lines)
 
     def argument(self, stage: str, effect: Stages, name: str) -> str:

@@ -3,15 +3,15 @@
     python perf/fuzz_io.py                        100 000 files of every format
     python perf/fuzz_io.py --format EVT3 --files 1000 --seed 7
 
-Every format runs in a process of its own, so that a crash of a library is seen and named. A file that fails
-is kept as `fuzz_FORMAT_N` in the folder named by --keep.
+Files are read whole and as a stream by turns. Every format runs in a process of its own, so that a crash of
+a library is seen and named. A file that fails is kept as `fuzz_FORMAT_N` in the folder named by --keep.
 """
 
 from __future__ import annotations
 
 import argparse
 import multiprocessing
-import resource
+import os
 import shutil
 import sys
 import tempfile
@@ -31,8 +31,9 @@ from dase import io
 from dase.errors import InputError
 from dase.io.sequence import Sequence
 
-SLOW = 5.0  # [s] for one file
-HUNG = 60.0  # [s] without a sign of life
+SLOW = 5.0  # [s] of processor for one file
+HUNG = 60.0  # [s] of processor without a sign of life
+STUCK = 3600.0  # [s] without one, waiting
 STEP = 100  # files between two signs of life
 MEMORY = 200.0  # [MB] over what the process needed before
 
@@ -58,7 +59,8 @@ def full(path: Path, e, frames) -> None:
 def aedat4(path: Path, e, frames) -> None:
     spans = np.rint(frames[0] * 1e6).astype(int).tolist()
     frames = [(t, t + 900, grey) for t, grey in zip(spans, frames[1], strict=True)]
-    reference_io.aedat4(path, e, frames=frames, compression=1, compress=lz4.frame.compress)
+    motion = [(1000 * k, (0.0, 0.0, 1.0), (1.0, 2.0, 3.0)) for k in range(5)]
+    reference_io.aedat4(path, e, frames=frames, motion=motion, compression=1, compress=lz4.frame.compress)
 
 
 def avi(path: Path, e, frames) -> None:
@@ -86,21 +88,26 @@ W, H = 48, 36
 
 
 def peak() -> float:
-    """Return the largest memory this process has had [MB]."""
-    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+    """Return the largest memory this process has had [MB]; ru_maxrss would begin with what its parent had."""
+    lines = Path("/proc/self/status").read_text().splitlines()
+    return next(int(line.split()[1]) for line in lines if line.startswith("VmHWM")) / 1024
 
 
-def read(path: Path) -> bool:
-    """Read a file whole and as a stream; return whether that gave events."""
-    good = False
-    for act in (io.read, lambda path: [len(part) for part in io.stream(path, chunk=1000)]):
-        try:
-            act(path)
-            good = True
-        except InputError as error:
-            if "\n" in str(error) or not str(error).startswith(str(path)):
-                raise AssertionError(f"not one sentence that names the file: {error}") from error
-    return good
+def read(path: Path, turn: int) -> bool:
+    """Read a file, whole or as a stream by turns; return whether that gave events."""
+    try:
+        if turn % 2:
+            for _ in io.stream(path, chunk=1000):
+                pass
+        else:
+            io.read(path)
+        if path.suffix == ".aedat4":
+            io.motion(path)
+    except InputError as error:
+        if "\n" in str(error) or not str(error).startswith(str(path)):
+            raise AssertionError(f"not one sentence that names the file: {error}") from error
+        return False
+    return True
 
 
 def run(name: str, files: int, seed: int, keep: Path, results) -> None:
@@ -113,7 +120,8 @@ def run(name: str, files: int, seed: int, keep: Path, results) -> None:
         sample = folder / f"sample{suffix}"
         wide = name in reference_io.SAMPLES and not name.startswith("MVSEC")
         make(sample, reference_io.events(rng, 300, *((reference_io.W, reference_io.H) if wide else (W, H))))
-        read(sample)
+        read(sample, 0)
+        read(sample, 1)
         before, good, slowest = peak(), 0, 0.0
         inner = [sample] if sample.is_file() else sorted(p for p in sample.iterdir() if p.is_file())
         contents = [path.read_bytes() for path in inner]
@@ -121,15 +129,15 @@ def run(name: str, files: int, seed: int, keep: Path, results) -> None:
         for k in range(files):
             which = int(rng.integers(0, len(inner)))
             inner[which].write_bytes(reference_io.mutated(contents[which], rng))
-            begin = time.perf_counter()
+            begin = time.process_time()
             try:
-                good += read(sample)
+                good += read(sample, k)
             except BaseException as error:
                 shutil.copy(inner[which], keep / f"fuzz_{name.replace(' ', '_')}_{k}{inner[which].suffix}")
                 results.put((name, "error", f"file {k}: {type(error).__name__}: {error}"))
             finally:
                 inner[which].write_bytes(contents[which])
-            spent = time.perf_counter() - begin
+            spent = time.process_time() - begin
             if spent > max(slowest, SLOW):
                 results.put((name, "error", f"file {k} took {spent:.1f} s"))
             slowest = max(slowest, spent)
@@ -158,14 +166,23 @@ def main() -> int:
     return failed
 
 
+def processor(pid: int) -> float:
+    """Return the time of the processor that a process has used [s]; 0 once it is gone."""
+    try:
+        fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
+    except OSError:
+        return 0.0
+    return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
+
+
 def watch(process, name: str, files: int, keep: Path, results) -> int:
     """Start a process, print its outcome, return 1 where it failed."""
     process.start()
-    errors, last, inner, alive = [], (0, 0, 0.0, 0.0), [], time.monotonic()
+    errors, last, inner, alive, used = [], (0, 0, 0.0, 0.0), [], time.monotonic(), 0.0
     while process.is_alive() or not results.empty():
         if results.empty():
             time.sleep(0.05)
-            if time.monotonic() - alive > HUNG:
+            if processor(process.pid) - used > HUNG or time.monotonic() - alive > STUCK:
                 for path in inner:
                     shutil.copy(path, keep / f"fuzz_{name.replace(' ', '_')}_hung_{path.name}")
                 process.kill()
@@ -173,7 +190,7 @@ def watch(process, name: str, files: int, keep: Path, results) -> int:
                 shutil.rmtree(inner[0].parent, ignore_errors=True)
             continue
         _, kind, value = results.get()
-        alive = time.monotonic()
+        alive, used = time.monotonic(), processor(process.pid)
         if kind == "error":
             errors.append(value)
         elif kind == "files":

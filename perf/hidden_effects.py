@@ -27,7 +27,7 @@ import numpy as np
 STRENGTHS = ("weak", "medium", "strong")
 
 HIDDEN: dict[str, tuple[dict[str, Any], ...]] = {
-    "flicker": tuple(dict(frequency=100.0, depth=d) for d in (0.12, 0.25, 0.5)),
+    "flicker": tuple(dict(frequency=100.0, depth=d) for d in (0.08, 0.15, 0.3)),
     "vignetting": tuple(dict(loss=x) for x in (0.3, 0.6, 0.8)),
     "dark": tuple(dict(current=c, spread=0.3) for c in (0.003, 0.01, 0.04)),
     "linlog": tuple(dict(knee=k, slope=2.5) for k in (0.03, 0.08, 0.16)),
@@ -46,7 +46,7 @@ HIDDEN: dict[str, tuple[dict[str, Any], ...]] = {
     "readout": tuple(dict(rate=r) for r in (1.5, 0.8, 0.5)),
     "timestamp": tuple(dict(step=s, jitter=0.0) for s in (1e-4, 3e-4, 1e-3)),
 }
-"""Effect to its parameters at weak, medium and strong. The rate of `readout` is relative to that of the scene."""
+"""Effect to its parameters at weak, medium and strong; the rate of `readout` is in 600,000 events/s."""
 
 PAIRS = (
     ("bandwidth", "leak"), ("bandwidth", "shot"), ("linlog", "mismatch"), ("mismatch", "leak"),
@@ -124,11 +124,20 @@ def _frame(still: np.ndarray, things: list[Any], t: float) -> np.ndarray:
         # back and forth along a line, so that pixels see both edges and pauses
         reach = 0.5 * span * WIDTH
         along = reach * np.sin(speed * t / max(reach, 1))
-        at = where * (WIDTH, HEIGHT) + along * np.array([np.cos(angle), np.sin(angle)])
-        move = np.array([[1, 0, at[0] - patch.shape[1] / 2], [0, 1, at[1] - patch.shape[0] / 2]], np.float32)
-        cover = cv2.warpAffine(alpha, move, (WIDTH, HEIGHT), flags=cv2.INTER_LINEAR)
-        value = cv2.warpAffine(patch.astype(np.float32), move, (WIDTH, HEIGHT), flags=cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)  # fmt: skip
-        out = out * (1 - cover) + value * cover
+        corner = (
+            where * (WIDTH, HEIGHT) + along * np.array([np.cos(angle), np.sin(angle)]) - patch.shape[0] / 2
+        )
+        first = np.floor(corner).astype(int)
+        move = np.array([[1, 0, corner[0] - first[0]], [0, 1, corner[1] - first[1]]], np.float32)
+        size = (patch.shape[0] + 1,) * 2
+        cover = cv2.warpAffine(alpha, move, size)
+        value = cv2.warpAffine(patch.astype(np.float32), move, size, borderMode=cv2.BORDER_REPLICATE)
+        low = np.maximum(first, 0)
+        high = np.minimum(first + size[0], (WIDTH, HEIGHT))
+        if np.all(high > low):
+            window = np.s_[low[1] : high[1], low[0] : high[0]]
+            part = np.s_[low[1] - first[1] : high[1] - first[1], low[0] - first[0] : high[0] - first[0]]
+            out[window] = out[window] * (1 - cover[part]) + value[part] * cover[part]
     return out
 
 
@@ -325,7 +334,9 @@ def _run(options: argparse.Namespace) -> None:
             if "failed" in line:
                 print(f"{line['name']}: {line['failed']}", flush=True)
                 continue
-            print(f"{n + 1}/{len(jobs)} {'ok   ' if right(line) else 'WRONG'} {line['name']:40s} {line['seconds']:5.1f} s {_short(line)}", flush=True)  # fmt: skip
+            mark = "ok   " if right(line) else "WRONG"
+            head = f"{n + 1}/{len(jobs)} {mark} {line['name']:40s} {line['seconds']:5.1f} s"
+            print(head, _short(line), flush=True)
 
 
 def _safely(job: tuple[Case, str, int]) -> dict[str, Any]:

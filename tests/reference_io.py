@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import struct
+import subprocess
+import sys
 from collections.abc import Callable
 from itertools import pairwise
 from pathlib import Path
 
 import h5py
 import numpy as np
+import pytest
 
 from dase import io
 from dase.events import Events
@@ -16,6 +19,23 @@ from dase.io.sequence import Sequence
 
 W, H = 240, 180
 FRAMES = 3
+
+
+PEAK = """
+def peak():
+    # not ru_maxrss, which begins with what the parent had
+    with open("/proc/self/status") as file:
+        return next(int(line.split()[1]) for line in file if line.startswith("VmHWM")) / 1024
+"""
+"""Script that defines `peak`: the largest memory that the process has had [MiB]."""
+
+
+def measured(script: str, *arguments: object) -> list[str]:
+    """Run a script that may call `peak` in a process of its own; return the lines it prints."""
+    if not Path("/proc/self/status").exists():
+        pytest.skip("the memory of a process is told by /proc")
+    command = [sys.executable, "-c", PEAK + script, *map(str, arguments)]
+    return subprocess.run(command, capture_output=True, text=True, check=True).stdout.splitlines()
 
 
 def events(rng, count=3000, width=W, height=H, begin_us=0, step_us=40):
@@ -93,16 +113,27 @@ AEDAT4_STREAM = """<node name="{}" path="/"><attr key="typeIdentifier" type="str
 UNIX_US = 1_643_243_628_737_093
 
 
-def aedat4(path, e, *, frames=None, compression=0, compress=lambda data: data, packet=500, origin=UNIX_US):
-    """Events and frames as (begin_us, end_us, grey) in packets."""
+def aedat4(
+    path,
+    e,
+    *,
+    frames=None,
+    motion=None,
+    compression=0,
+    compress=lambda data: data,
+    packet=500,
+    origin=UNIX_US,
+):
+    """Events, frames as (begin_us, end_us, grey), and samples (t_us, acceleration, rotation) in packets."""
     streams = [AEDAT4_STREAM.format(0, "EVTS", e.width, e.height)]
     streams += [AEDAT4_STREAM.format(1, "FRME", e.width, e.height)] if frames else []
+    streams += [AEDAT4_STREAM.format(2, "IMUS", 0, 0)] if motion else []
     xml = AEDAT4_XML.format("".join(streams)).encode()
     head = flatbuffer({0: ("i", compression), 1: ("q", -1), 2: (xml, len(xml))}, b"IOHE")
     out = [b"#!AER-DAT4.0\r\n", struct.pack("<I", len(head)), head]
 
     def put(stream, fields):
-        data = flatbuffer(fields, (b"EVTS", b"FRME")[stream])
+        data = fields if isinstance(fields, bytes) else flatbuffer(fields, (b"EVTS", b"FRME")[stream])
         data = compress(struct.pack("<I", len(data)) + data)
         out.append(struct.pack("<ii", stream, len(data)) + data)
 
@@ -116,7 +147,23 @@ def aedat4(path, e, *, frames=None, compression=0, compress=lambda data: data, p
         numbers = {k: ("q", v + origin) for k, v in ((0, begin), (1, begin), (2, end), (3, begin), (4, end))}
         height, width = grey.shape
         put(1, numbers | {5: ("b", 0), 6: ("h", width), 7: ("h", height), 10: (grey.tobytes(), grey.size)})
+    for t, acceleration, rotation in motion or ():
+        put(2, motion_packet(t + origin, (*acceleration, *rotation)))
     path.write_bytes(b"".join(out))
+
+
+def motion_packet(t, values):
+    """A packet of two equal samples: a root table with a vector of tables, built by hand."""
+    fields = struct.pack("<9H", 22, 40, 8, 0, *range(16, 40, 4)[:5]) + struct.pack("<2H", 36, 0)
+    sample = struct.pack("<iiq6f", 0, 0, t, *values)
+    head = struct.pack("<I", 16) + b"IMUS" + struct.pack("<3H", 6, 8, 4) + b"\0\0"  # root at 16, fields at 8
+    root = struct.pack("<ii", 8, 4)  # its vector begins 4 bytes behind the field
+    vector_at = 16 + 8
+    table_at = vector_at + 12
+    fields_at = table_at + 2 * len(sample)
+    vector = struct.pack("<III", 2, *(table_at + k * len(sample) - vector_at - 4 - 4 * k for k in (0, 1)))
+    tables = b"".join(struct.pack("<i", table_at + k * len(sample) - fields_at) + sample[4:] for k in (0, 1))
+    return head + root + vector + tables + fields
 
 
 def dsec(path, e, *, offset=49_599_300_523, **packing):

@@ -14,8 +14,10 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from click.testing import CliRunner
 
-from dase import Events, io
+from dase import Events, InputError, io
+from dase.cli import group
 
 SMALL = ("--size", "32x24", "--duration", "0.1", "--sequences", "1", "--jobs", "1", "--regime", "slow")
 
@@ -213,3 +215,34 @@ def test_convert_and_info(suffix, tmp_path, rng):
     assert told.returncode == 0, told.stderr
     assert "64 x 48" in told.stdout
     assert "unknown format '.xyz'" in one_sentence(dase("convert", tmp_path / "a.h5", tmp_path / "b.xyz"))
+
+
+BROKEN = [
+    ("a.raw", b"", "does not name its encoding"),
+    ("a.raw", b"% evt 3.0\n% geometry 99999x7\n" + bytes(64), "1x1 to 8192x8192, got 99999x7"),
+    ("a.h5", b"\x89HDF\r\n\x1a\n" + bytes(200), "cannot be read as HDF5, damaged or cut short"),
+    ("a.npz", b"PK\x03\x04" + bytes(200), "cannot be read as NumPy archive, damaged or cut short"),
+    ("a.aedat4", b"#!AER-DAT4.0\r\n\xff\xff\xff\x7f", "claims 2147483647 bytes"),
+    ("a.txt", b"0.1 1 1 1\n0.2 1 1 rubbish\n", "line 2 is not 't x y p'"),
+    ("a.xyz", b"something else", "unknown format '.xyz'"),
+    ("missing.raw", None, "No such file"),
+]
+
+
+@pytest.mark.parametrize(("name", "content", "message"), BROKEN)
+def test_broken_files(tmp_path, name, content, message):
+    if content is not None:
+        (tmp_path / name).write_bytes(content)
+    path = str(tmp_path / name)
+    for command in (["info", path], ["show", path], ["convert", path, str(tmp_path / "b.evt2")]):
+        done = CliRunner().invoke(group, command)
+        assert isinstance(done.exception, InputError)
+        assert message in str(done.exception)
+        assert path in str(done.exception)
+        assert "\n" not in str(done.exception)
+    assert sorted(p.name for p in tmp_path.iterdir()) == [name] * (content is not None)
+
+
+def test_a_broken_file_is_one_sentence_and_exit_code_2(tmp_path):
+    (tmp_path / "a.txt").write_bytes(BROKEN[5][1])
+    assert BROKEN[5][2] in one_sentence(dase("info", tmp_path / "a.txt"))

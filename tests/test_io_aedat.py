@@ -14,6 +14,7 @@ from dase.events import Events
 from dase.io import packed
 from dase.io.flatbuffer import Table
 from dase.io.sequence import Sequence
+from dase.recording import open_recording
 
 
 def aedat2(path, rows, chip="", version="2.0", kind=">u4"):
@@ -117,7 +118,7 @@ def test_aedat4_frames_alone_and_of_other_kinds(tmp_path, rng):
     np.testing.assert_allclose(got.frame_exposure, 0.02)
     colour = rng.integers(0, 256, (4, 6, 3), np.uint8)
     wide = rng.integers(0, 65536, (4, 6), np.uint16)
-    for kind, pixels, want in ((16, colour, None), (2, wide, wide >> 8)):
+    for kind, pixels, want in ((16, colour, None), (2, wide, wide)):
         numbers = {0: ("q", UNIX_US), 5: ("b", kind), 6: ("h", 6), 7: ("h", 4), 11: ("q", 5000)}
         from dase.io import aedat4 as module
 
@@ -127,6 +128,7 @@ def test_aedat4_frames_alone_and_of_other_kinds(tmp_path, rng):
         if want is None:
             want = np.rint(pixels @ [0.07, 0.72, 0.21])
         np.testing.assert_array_equal(got, want)
+        assert got.dtype == pixels.dtype
 
 
 def test_aedat4_damage_is_skipped_and_noted(tmp_path, rng):
@@ -190,6 +192,23 @@ def test_without_the_library_the_extra_is_named(tmp_path, rng, monkeypatch):
         io.read(tmp_path / "a.aedat4")
 
 
+def test_aedat4_motion(tmp_path, rng):
+    e = events(rng, 1000)
+    samples = [(k * 1000, rng.normal(size=3), rng.normal(size=3)) for k in range(20)]
+    aedat4(tmp_path / "a.aedat4", e, motion=samples, frames=frames(rng, 1))
+    got = io.motion(tmp_path / "a.aedat4")
+    first = round(e.t[0] * 1e6)
+    np.testing.assert_allclose(got.t * 1e6, np.repeat([t - first for t, *_ in samples], 2), atol=1e-6)
+    want = np.repeat([np.concatenate(values) for _, *values in samples], 2, axis=0)
+    np.testing.assert_allclose(got.acceleration, 9.80665 * want[:, :3], rtol=1e-6)
+    np.testing.assert_allclose(got.rotation, want[:, 3:] * np.pi / 180, rtol=1e-6)
+    part = open_recording(tmp_path / "a.aedat4").slice(0.005, 0.01).motion
+    assert len(part.t) == np.count_nonzero((got.t >= 0.005) & (got.t < 0.01))
+    aedat4(tmp_path / "b.aedat4", e)
+    assert io.motion(tmp_path / "b.aedat4") is None
+    assert open_recording(tmp_path / "b.aedat4").motion is None
+
+
 def same_as_library(path):
     """Compare with what the package aedat reads."""
     aedat = pytest.importorskip("aedat")
@@ -203,10 +222,20 @@ def same_as_library(path):
     np.testing.assert_array_equal(got.frames, [picture["pixels"] for picture in pictures])
     exposures = [picture["exposure_end_t"] - picture["exposure_begin_t"] for picture in pictures]
     np.testing.assert_allclose(got.frame_exposure * 1e6, exposures)
+    samples = [packet["imus"] for packet in packets if "imus" in packet]
+    if samples:
+        samples = np.concatenate(samples)
+        moved = io.motion(path)
+        np.testing.assert_allclose(moved.t * 1e6, samples["t"].astype(float) - float(want["t"][0]), atol=1)
+        for k, axis in enumerate("xyz"):
+            rotation, acceleration = samples[f"gyroscope_{axis}"], samples[f"accelerometer_{axis}"]
+            np.testing.assert_allclose(np.rad2deg(moved.rotation[:, k]), rotation, rtol=1e-5)
+            np.testing.assert_allclose(moved.acceleration[:, k], 9.80665 * acceleration, rtol=1e-5)
 
 
 def test_a_second_library_reads_the_same(tmp_path, rng):
-    aedat4(tmp_path / "a.aedat4", events(rng), frames=frames(rng))
+    samples = [(k * 1000, rng.normal(size=3), rng.normal(size=3)) for k in range(20)]
+    aedat4(tmp_path / "a.aedat4", events(rng), frames=frames(rng), motion=samples)
     same_as_library(tmp_path / "a.aedat4")
 
 

@@ -224,3 +224,16 @@ def test_decoders_carry_nothing_but_what_the_format_says():
     assert [len(piece.t) for piece in decoder(words)] == [1]
     (piece,) = decoder(words[1:])
     assert piece.t.tolist() == [64]
+
+
+@pytest.mark.parametrize("name", ["psee_gen3_evt2.raw", "psee_hd_evt3.raw"])
+def test_a_second_library_reads_the_same_of_a_camera(shared, name):
+    evlib = pytest.importorskip("evlib")
+    path = shared / "recordings/native" / name
+    e = io.read(path).events
+    rows = evlib.load_events(str(path)).collect()
+    t = rows["t"].dt.total_microseconds().to_numpy()
+    got = np.stack([t - t[0], rows["x"], rows["y"], rows["polarity"].to_numpy() > 0])
+    want = np.stack([microseconds(e) - microseconds(e)[0], e.x, e.y, e.p])
+    order, wanted = (np.lexsort(columns[::-1]) for columns in (got, want))
+    np.testing.assert_array_equal(got[:, order], want[:, wanted])

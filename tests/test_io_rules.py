@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 import json
-import subprocess
-import sys
 
 import numpy as np
 import pytest
-from reference_io import FRAMES, H, W, aedat4, bag, events, mvsec, table, v2e
+from reference_io import FRAMES, H, W, aedat4, bag, events, measured, mvsec, table, v2e
 
-from dase import io
+from dase import io, show
 from dase.errors import InputError
 from dase.events import Events
 from dase.io import arrays, rules
@@ -203,11 +201,10 @@ def test_frames_without_times_are_left_out_with_a_note(tmp_path, rng):
 
 def test_converting_frames_needs_no_memory_for_all_of_them(tmp_path):
     """120 MB of frames go from file to file in a process that may use little more than at its start."""
-    pytest.importorskip("resource")
     script = """
-import resource, sys
+import sys
 import numpy as np
-from dase import io
+from dase import io, show
 from dase.events import Events
 n = np.arange(1000)
 def make(path, count):
@@ -218,12 +215,44 @@ def make(path, count):
             writer.frame(k / 1e3, np.full((480, 640), k % 256, np.uint8))
 make(sys.argv[1], 400)
 io.convert(sys.argv[1], sys.argv[2])
-before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+before = peak()
 assert len(io.read(sys.argv[2]).frames) == 400
-print(before, resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024 - before)
+print(before, peak() - before)
 """
-    names = [str(tmp_path / name) for name in ("a.h5", "b.h5")]
-    done = subprocess.run([sys.executable, "-c", script, *names], capture_output=True, text=True, check=True)
-    peak, grown = map(float, done.stdout.split())
+    (line,) = measured(script, tmp_path / "a.h5", tmp_path / "b.h5")
+    peak, grown = map(float, line.split())
     assert grown > 50  # what it would have been
     assert peak < 180
+
+
+@pytest.mark.parametrize("suffix", ["h5", "npz"])
+def test_frames_of_16_bits_stay_so(tmp_path, rng, suffix):
+    e, times = events(rng, 100), np.array([0.0, 0.001])
+    grey = rng.integers(0, 4096, (2, H, W), np.uint16)
+    io.write(tmp_path / f"a.{suffix}", Sequence(e, grey, times))
+    for got in (
+        io.read(tmp_path / f"a.{suffix}").frames,
+        [one.grey for one in io.pictures(tmp_path / f"a.{suffix}")],
+    ):
+        np.testing.assert_array_equal(got, grey)
+        assert got[0].dtype == np.uint16
+    grey[0], grey[0, 0, 0] = 2048, 4095  # 12 bits are in use
+    picture = show.panel(Sequence(Events.empty(W, H), grey[:1], times[:1]), 0.0, 1e-3)
+    assert picture[0, 0].min() > 230
+    assert 100 < np.median(picture) < 180
+    with io.create(tmp_path / f"b.{suffix}") as writer:
+        writer.frame(0.0, grey[0])
+        with pytest.raises(InputError, match="must be uint16 of shape"):
+            writer.frame(0.1, (grey[1] >> 4).astype(np.uint8))
+
+
+def test_pictures_of_16_bits_beside_a_text(tmp_path, rng):
+    cv2 = pytest.importorskip("cv2")
+    folder = tmp_path / "shapes"
+    (folder / "images").mkdir(parents=True)
+    grey = rng.integers(0, 65536, (2, H, W), np.uint16)
+    io.write(folder / "events.txt", Sequence(events(rng, 100)))
+    for k, one in enumerate(grey):
+        cv2.imwrite(str(folder / f"images/{k}.png"), one)
+    (folder / "images.txt").write_text("".join(f"0.00{k} images/{k}.png\n" for k in range(2)))
+    np.testing.assert_array_equal(io.read(folder).frames, grey)

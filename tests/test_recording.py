@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -226,6 +227,26 @@ def test_frames_alone_and_nothing_at_all(tmp_path, rng):
     io.write(tmp_path / "b.h5", Sequence(Events.empty(W, H)))
     got = open_recording(tmp_path / "b.h5")
     assert (len(got.events), len(got.split_pixels(0.5, 1)[0])) == (0, W * H // 2)
+
+
+def test_a_recording_never_unpickles(tmp_path):
+    class Trap:
+        def __reduce__(self):
+            return (Path.touch, (tmp_path / "unpickled",))
+
+    trap = np.array([Trap()] * 4, object)
+    columns = {name: np.ones(4, int) for name in ("t_us", "x", "y", "p")}
+    for name in columns:
+        np.savez(tmp_path / "a.npz", **(columns | {name: trap}), wh=[4, 4])
+        with pytest.raises(InputError, match="never unpickled"):
+            open_recording(tmp_path / "a.npz")
+    np.save(tmp_path / "a.npy", trap, allow_pickle=True)
+    with pytest.raises(InputError, match="never unpickled"):
+        open_recording(tmp_path / "a.npy")
+    (tmp_path / "a.pkl").write_bytes(trap.dumps())
+    with pytest.raises(InputError, match="unknown format"):
+        open_recording(tmp_path / "a.pkl")
+    assert not (tmp_path / "unpickled").exists()
 
 
 def test_every_shared_recording_opens(shared):

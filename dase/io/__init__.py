@@ -46,6 +46,7 @@ from dase.io.sequence import Sequence as Sequence
 from dase.io.sequence import Writer as Writer
 from dase.io.sequence import replacing as replacing
 from dase.io.source import CHUNK, Size, Source
+from dase.io.source import Motion as Motion
 from dase.io.source import Note as Note
 from dase.io.source import Picture as Picture
 
@@ -154,6 +155,22 @@ def pictures(
         InputError: As for `read`.
     """
     return find(path).pictures(_source(path, size, notes))
+
+
+def motion(
+    path: str | PathLike[str], *, size: Size | None = None, notes: list[str] | None = None
+) -> Motion | None:
+    """Read the samples of a camera's motion sensor, times [s] on the clock of the events; None without any.
+
+    Args:
+        path: What to read; of the formats AEDAT 4 has them.
+        size: Columns and rows of the sensor, where the file does not say or says it wrongly.
+        notes: Gets sentences about what was skipped, repaired or guessed.
+
+    Raises:
+        InputError: As for `read`.
+    """
+    return find(path).motion(_source(path, size, notes))
 
 
 def create(path: str | PathLike[str], *, format: str | None = None) -> AbstractContextManager[Writer]:

@@ -7,11 +7,12 @@
     u32 size, FlatBuffer EVTS     structs of 16 bytes: i64 t [Unix us], i16 column, i16 row, bool ON
     u32 size, FlatBuffer FRME     i64 t; begin, end of frame; begin, end of exposure [Unix us]; i8 format;
                                   i16 columns, rows, left, top; pixels; in newer files i64 exposure [us]
+    u32 size, FlatBuffer IMUS     tables: i64 t [Unix us]; f32 temperature, 3 accelerations [g], 3 rotations
+                                  [degrees/s], 3 magnetic fields
 
-Of several streams the first of a kind is read; 16-bit and colour frames become 8-bit grey; motion and
-triggers are skipped. Damaged packets are skipped and counted. Times count from the first event. LZ4 and ZSTD
-come with the extra "aedat". Sources: docs.inivation.com, "AEDAT 4.0"; the schemas of dv-processing
-(Apache-2.0).
+Of several streams the first of a kind is read; colour frames become grey; triggers are skipped. Damaged
+packets are skipped and counted. Times count from the first event. LZ4 and ZSTD come with the extra "aedat".
+Sources: docs.inivation.com, "AEDAT 4.0"; the schemas of dv-processing (Apache-2.0).
 """
 
 from __future__ import annotations
@@ -29,7 +30,7 @@ from dase.errors import InputError
 from dase.io import packed
 from dase.io.flatbuffer import Table
 from dase.io.format import camera_format
-from dase.io.source import Picture, Piece, Size, Source, join
+from dase.io.source import Motion, Picture, Piece, Size, Source, join
 
 T = TypeVar("T")
 
@@ -38,6 +39,7 @@ LONGEST = 1 << 24  # [bytes] of the header
 PART = 1 << 17  # events joined before they are handed on: packets hold a few hundred
 EVENT = np.dtype([("t", "<i8"), ("x", "<i2"), ("y", "<i2"), ("p", "u1"), ("", "V3")])
 ROW = np.dtype("V16")  # NumPy joins these faster than fields
+GRAVITY = 9.80665  # [m/s^2]
 PIXELS = {0: ("u1", 1), 16: ("u1", 3), 24: ("u1", 4), 2: ("<u2", 1), 18: ("<u2", 3), 26: ("<u2", 4)}
 """Format of a frame, a type of OpenCV, to NumPy type and channels."""
 
@@ -165,8 +167,27 @@ def pictures(source: Source) -> Iterator[Picture]:
         yield Picture(grey, begin + (end - begin) / 2, (end - begin) / 1e6)
 
 
-def _frame(packet: Table) -> tuple[NDArray[np.uint8], tuple[int, int]]:
-    """Return the pixels as 8-bit grey, (H, W), and begin and end of the exposure [us]."""
+def motion(source: Source) -> Motion | None:
+    """Read the samples of the motion sensor, times [us]."""
+    rows = [row for rows in _packets(source, "IMUS", _samples) for row in rows]
+    if not rows:
+        return None
+    values = np.array([row[1] for row in rows], np.float64)
+    return Motion(
+        np.array([row[0] for row in rows], np.int64), GRAVITY * values[:, :3], np.deg2rad(values[:, 3:])
+    )
+
+
+def _samples(packet: Table) -> list[tuple[int, list[float]]]:
+    """Return time [us], acceleration [g] and rotation [degrees/s] of each sample."""
+    return [
+        (sample.number(0, "<q", 0), [sample.real(k, "<f", 0.0) for k in range(2, 8)])
+        for sample in packet.tables(0)
+    ]
+
+
+def _frame(packet: Table) -> tuple[NDArray[Any], tuple[int, int]]:
+    """Return the pixels as grey of 8 or 16 bits, (H, W), and begin and end of the exposure [us]."""
     width, height = packet.number(6, "<h", 0), packet.number(7, "<h", 0)
     name, channels = PIXELS[packet.number(5, "<b", 0)]
     pixels = packet.structs(10, np.dtype("u1"))
@@ -174,12 +195,10 @@ def _frame(packet: Table) -> tuple[NDArray[np.uint8], tuple[int, int]]:
     t, begin, end = (packet.number(k, "<q", 0) for k in (0, 3, 4))
     if not 0 < begin <= end:
         begin, end = t, t + max(packet.number(11, "<q", 0), 0)
-    if values.dtype != np.uint8:
-        values = (values >> 8).astype(np.uint8)
     if channels == 1:
         return values[..., 0], (begin, end)
     weights = np.array([0.07, 0.72, 0.21])  # of blue, green and red
-    return np.rint(values[..., :3] @ weights).astype(np.uint8), (begin, end)
+    return np.rint(values[..., :3] @ weights).astype(values.dtype), (begin, end)
 
 
 FORMAT = camera_format(
@@ -190,4 +209,5 @@ FORMAT = camera_format(
     pieces=pieces,
     size=size,
     pictures=pictures,
+    motion=motion,
 )

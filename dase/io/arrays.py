@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from dase.errors import InputError
 from dase.io import npz, rules
 from dase.io.format import Format, camera_format, largest
-from dase.io.sequence import Sequence, coordinates, reading
+from dase.io.sequence import GREYS, Sequence, coordinates, reading
 from dase.io.source import Beside, Picture, Piece, Source, refuse_bomb
 
 NPY = b"\x93NUMPY"
@@ -99,8 +99,10 @@ def _maps(archive: zipfile.ZipFile, name: str, stack: ExitStack) -> Iterator[NDA
     info = archive.getinfo(f"{name}.npy")
     stream = stack.enter_context(archive.open(info))
     shape, kind = _header(stream, info.compress_size, info.file_size)
-    if len(shape) != (3 if name == "frames" else 4) or (name == "frames" and kind != np.uint8):
-        raise InputError(f"'{name}' must be {'uint8 (F, H, W)' if name == 'frames' else '(F, 2, H, W)'}")
+    if name == "frames" and (len(shape) != 3 or kind not in GREYS):
+        raise InputError(f"'frames' must be uint8 or uint16 (F, H, W), got {kind} {shape}")
+    if name == "flow" and len(shape) != 4:
+        raise InputError(f"'flow' must have shape (F, 2, H, W), got {shape}")
     count = int(np.prod(shape[1:]))
     for row in _slices(stream, shape[0] * count, kind, count):
         yield row.reshape(shape[1:])
@@ -125,13 +127,13 @@ def _own_pictures(source: Source) -> Iterator[Picture]:
 
 
 def _read_own(source: Source) -> Sequence:
-    with reading(source.path, "a NumPy archive"), zipfile.ZipFile(source.path) as archive:
+    with reading(source.path, "NumPy archive"), zipfile.ZipFile(source.path) as archive:
         _check(archive)
     return npz.read(source)
 
 
 def _beside(source: Source) -> Beside:
-    with reading(source.path, "a NumPy archive"), zipfile.ZipFile(source.path) as archive:
+    with reading(source.path, "NumPy archive"), zipfile.ZipFile(source.path) as archive:
         _check(archive)
         names = (n for n in ("thresholds", "configuration") if f"{n}.npy" in archive.NameToInfo)
         return npz.beside({name: npz.load(archive, name) for name in names})

@@ -21,6 +21,16 @@ PART = 1 << 20  # events read at once
 BLOCK = 1 << 24  # [bytes] searched at once
 BLOSC, BLOSC2, ZSTD, LZ4 = 32001, 32026, 32015, 32004  # numbers of filters that hdf5plugin brings
 
+TELLING = (
+    "CD/events",
+    *("events/t", "events/x", "events/y", "events/p"),
+    *("prophesee/left/t", "prophesee/left/x", "prophesee/left/y", "prophesee/left/p"),
+    *("davis/left/events", "davis/right/events"),
+    "events",
+)
+"""Datasets that tell layouts apart; what `has` can be asked for."""
+
+_asked: tuple[bytes, frozenset[str]] = b"", frozenset()  # first bytes of a file, and which of these it holds
 _plugin_tried = False
 _sound: set[tuple[str, int, int]] = set()  # large files whose heaps were checked
 
@@ -83,13 +93,21 @@ def _check_heap(file: BinaryIO, begin: int, length: int) -> None:
 
 def has(path: Path, head: bytes, *names: str) -> bool:
     """Whether a file is HDF5 and holds datasets of all these names."""
+    global _asked
     if not head.startswith(HDF5):
         return False
+    asked = _asked
+    if asked[0] is not head:  # all formats are asked about one file in a row, which need not be opened again
+        asked = _asked = head, _found(path)
+    return set(names) <= asked[1]
+
+
+def _found(path: Path) -> frozenset[str]:
     try:
         with h5py.File(path, "r") as file:
-            return all(isinstance(file.get(name), h5py.Dataset) for name in names)
+            return frozenset(name for name in TELLING if isinstance(file.get(name), h5py.Dataset))
     except Exception:  # damaged: left to the reader that is tried at last
-        return False
+        return frozenset()
 
 
 def dataset(file: Any, name: str, ndim: int | None = None) -> Any:

@@ -41,9 +41,13 @@ class Table:
         return self.place + offset if offset else None
 
     def number(self, index: int, kind: str, default: int) -> int:
+        """Return a whole number field."""
+        return int(self.real(index, kind, default))
+
+    def real(self, index: int, kind: str, default: float) -> float:
         """Return a number field."""
         place = self._field(index)
-        return default if place is None else int(_unpack(kind, self.data, place))
+        return default if place is None else _unpack(kind, self.data, place)
 
     def structs(self, index: int, kind: np.dtype[Any]) -> NDArray[Any]:
         """Return a vector of structs, (N,); empty where it is absent."""
@@ -56,6 +60,15 @@ class Table:
             raise InputError(f"a vector claims {count} elements, more than the packet holds")
         return np.frombuffer(self.data, kind, count, place + 4)
 
+    def tables(self, index: int) -> list[Table]:
+        """Return a vector of tables; empty where it is absent."""
+        offsets = self.structs(index, np.dtype("<u4"))
+        if not len(offsets):
+            return []
+        place = self._field(index) or 0
+        first = place + _u32(self.data, place) + 4
+        return [Table(self.data, first + 4 * k + int(offset)) for k, offset in enumerate(offsets)]
+
     def text(self, index: int) -> bytes:
         """Return a text field."""
         return self.structs(index, np.dtype("u1")).tobytes()
@@ -65,7 +78,7 @@ def _u32(data: bytes, place: int) -> int:
     return int(_unpack("<I", data, place))
 
 
-def _unpack(kind: str, data: bytes, place: int) -> int:
+def _unpack(kind: str, data: bytes, place: int) -> Any:
     if place < 0:
         raise InputError("a place lies before the buffer")
-    return int(struct.unpack_from(kind, data, place)[0])
+    return struct.unpack_from(kind, data, place)[0]

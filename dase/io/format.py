@@ -14,12 +14,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from dase.errors import InputError
 from dase.events import Events
 from dase.io import rules
 from dase.io.sequence import Sequence, Writer, reading
-from dase.io.source import Beside, Picture, Piece, Size, Source, checked_size, guess_size, join
+from dase.io.source import Beside, Motion, Picture, Piece, Size, Source, checked_size, guess_size, join
 
 LIMIT = 4 << 30  # [bytes] of frames, or of flow, taken into memory
 
@@ -43,6 +44,8 @@ class Format:
     """Yield its events in chunks; at least one, if empty, for the size of the sensor."""
     pictures: Callable[[Source], Iterator[Picture]] = no_pictures
     """Yield its frames with their times [s], as `read` gives them; not a number where nothing tells them."""
+    motion: Callable[[Source], Motion | None] = lambda source: None
+    """Read the samples of its motion sensor, times [s]; None where there are none."""
     beside: Callable[[Source], Beside] = lambda source: (None, None)
     """Read thresholds and configuration."""
     create: Callable[[Path], AbstractContextManager[Writer]] | None = None
@@ -58,6 +61,7 @@ def camera_format(
     pieces: Callable[[Source], Iterator[Piece]],
     size: Callable[[Source], Size | None],
     pictures: Callable[[Source], Iterator[Picture]] = no_pictures,
+    motion: Callable[[Source], Motion | None] = lambda source: None,
     extent: Callable[[Source], Size] | None = None,
     ticks: float = 1e6,
     **fields: Any,
@@ -68,39 +72,68 @@ def camera_format(
         pieces: Yields the events in the order of the file; called again where the size has to be found.
         size: Tells columns and rows, or None where the file does not say.
         pictures: Yields the frames.
+        motion: Reads the samples of the motion sensor.
         extent: Tells one more than the largest column and row, where that is cheaper than decoding all.
-        ticks: Ticks per second of pieces and frames.
+        ticks: Ticks per second of pieces, frames and motion.
         fields: The other fields of Format.
     """
-    name = fields["name"]
+    r = _Reader(fields["name"], pieces, size, pictures, motion, extent, ticks)
+    return Format(read=r.read, stream=r.stream, pictures=r.shown, motion=r.moved, **fields)
 
-    def sensor(source: Source) -> Size:
-        known = source.size or size(source)
+
+@dataclass(frozen=True)
+class _Reader:
+    """The ways to read a file, see `camera_format`."""
+
+    name: str
+    pieces: Callable[[Source], Iterator[Piece]]
+    size: Callable[[Source], Size | None]
+    pictures: Callable[[Source], Iterator[Picture]]
+    motion: Callable[[Source], Motion | None]
+    extent: Callable[[Source], Size] | None
+    ticks: float
+
+    def read(self, source: Source) -> Sequence:
+        with reading(source.path, self.name):
+            size = self._sensor(source)
+            frames = taken(_fitting(source, self.pictures(source), size))
+            return _read(source, self.pieces(source), frames, size, self.ticks)
+
+    def stream(self, source: Source, chunk: int) -> Iterator[Events]:
+        with reading(source.path, self.name):
+            yield from _stream(source, self.pieces(source), self._sensor(source), self.ticks, chunk)
+
+    def shown(self, source: Source) -> Iterator[Picture]:
+        with reading(source.path, self.name):
+            size, zero = self._sensor(source), None
+            for picture in _fitting(source, self.pictures(source), size):
+                zero = self._begin(source, size, np.array([picture.t])) if zero is None else zero
+                yield picture._replace(t=(picture.t - zero) / self.ticks)
+
+    def moved(self, source: Source) -> Motion | None:
+        with reading(source.path, self.name):
+            found = self.motion(source)
+            if found is None:
+                return None
+            first = next(iter(self.pictures(source)), None)
+            times = found.t if first is None else np.array([first.t])
+            zero = self._begin(source, self._sensor(source), times)
+            return found._replace(t=(found.t - zero) / self.ticks)
+
+    def _sensor(self, source: Source) -> Size:
+        known = source.size or self.size(source)
         if known is None:
-            found = extent(source) if extent else largest(pieces(source))
-            known = guess_size(source, found)
+            known = guess_size(source, (self.extent or self._extent)(source))
         return checked_size(known)
 
-    def read(source: Source) -> Sequence:
-        with reading(source.path, name):
-            frames = taken(_fitting(source, pictures(source), known := sensor(source)))
-            return _read(source, pieces(source), frames, known, ticks)
+    def _extent(self, source: Source) -> Size:
+        return largest(self.pieces(source))
 
-    def stream(source: Source, chunk: int) -> Iterator[Events]:
-        with reading(source.path, name):
-            yield from _stream(source, pieces(source), sensor(source), ticks, chunk)
-
-    def shown(source: Source) -> Iterator[Picture]:
-        with reading(source.path, name):
-            zero: Any = None
-            for picture in _fitting(source, pictures(source), known := sensor(source)):
-                if zero is None:
-                    settled = rules.settled(source, pieces(source), known, ticks)
-                    first = next((p.t for p in rules.ordered(source, settled, ticks)), np.array([picture.t]))
-                    zero = rules.origin(source, first, ticks)
-                yield picture._replace(t=(picture.t - zero) / ticks)
-
-    return Format(read=read, stream=stream, pictures=shown, **fields)
+    def _begin(self, source: Source, size: Size, without_events: NDArray[Any]) -> Any:
+        """Return the tick of time zero: of the first event, else of these times."""
+        settled = rules.settled(source, self.pieces(source), size, self.ticks)
+        first = next((piece.t for piece in rules.ordered(source, settled, self.ticks)), without_events)
+        return rules.origin(source, first, self.ticks)
 
 
 def _fitting(source: Source, pictures: Iterable[Picture], size: Size) -> Iterator[Picture]:
@@ -138,6 +171,9 @@ def taken(pictures: Iterable[Picture]) -> list[Picture]:
         if out and picture.grey.shape != out[0].grey.shape:
             a, b = out[0].grey.shape, picture.grey.shape
             raise InputError(f"frame {len(out)} is {b[1]}x{b[0]}, those before are {a[1]}x{a[0]}")
+        if out and picture.grey.dtype != out[0].grey.dtype:
+            kinds = picture.grey.dtype, out[0].grey.dtype
+            raise InputError(f"frame {len(out)} is {kinds[0]}, those before are {kinds[1]}")
         out.append(picture)
     return out
 

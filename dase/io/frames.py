@@ -11,7 +11,7 @@ from __future__ import annotations
 import io
 from collections.abc import Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from dase.errors import InputError
 from dase.events import Events
 from dase.io.format import Format, sequence_of, taken
-from dase.io.sequence import Sequence, reading
+from dase.io.sequence import GREYS, Sequence, reading
 from dase.io.source import Picture, Source, checked_size
 from dase.pictures import SUFFIXES
 
@@ -27,8 +27,8 @@ if TYPE_CHECKING:
     from dase.video import FrameReader
 
 
-def grey(data: bytes, name: str) -> NDArray[np.uint8]:
-    """Decode a picture to 8-bit grey, (H, W); raises InputError where it is damaged or absurdly large."""
+def grey(data: bytes, name: str) -> NDArray[Any]:
+    """Decode a picture to grey of 8 or 16 bits, (H, W); raises InputError where it is damaged or huge."""
     import cv2
     from PIL import Image
 
@@ -42,12 +42,12 @@ def grey(data: bytes, name: str) -> NDArray[np.uint8]:
     level = cv2.utils.logging.getLogLevel()
     cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)  # our sentence is enough
     try:
-        out = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_GRAYSCALE)
+        out = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH)
     finally:
         cv2.utils.logging.setLogLevel(level)
-    if out is None:
-        raise InputError(f"{name}: cannot be decoded as a picture, damaged or cut short")
-    return np.asarray(out, np.uint8)
+    if out is None or out.dtype not in GREYS:
+        raise InputError(f"{name}: cannot be decoded as a picture of 8 or 16 bits, damaged or cut short")
+    return np.asarray(out)
 
 
 def matches(path: Path, head: bytes) -> bool:

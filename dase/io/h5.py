@@ -2,7 +2,7 @@
 
     events/xs, ys (int16), ts (float64 [s]), ps (bool)       shape (N,)
     events/labels (int8, where known)                        shape (N,), places in `dase.events.LABELS`
-    images/image%09d (uint8, H x W)                          attributes size, timestamp, type, event_idx
+    images/image%09d (uint8 or 16, H x W)                    attributes size, timestamp, type, event_idx
     flow/flow%09d (float32 [px/s], 2 x H x W, x then y)      attributes size, timestamp, event_idx
     dase/thresholds (float32, 2 x H x W), attribute configuration
     root attributes num_events, num_pos, num_neg, duration, t0, tk, num_imgs, num_flow,
@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 from dase.errors import InputError
 from dase.events import Events
 from dase.io.rules import sensor_events
-from dase.io.sequence import Sequence, Writer, coordinates, reading, writing
+from dase.io.sequence import GREYS, Grey, Sequence, Writer, coordinates, reading, writing
 from dase.io.source import Beside, Piece, Source
 
 CHUNK = 1 << 16  # events; 512 KiB of times fit HDF5's default chunk cache of 1 MiB
@@ -171,7 +171,7 @@ class _Writer(Writer):
         self,
         index: int,
         time: float,
-        grey: NDArray[np.uint8],
+        grey: NDArray[Grey],
         flow: NDArray[np.float32] | None,
         exposure: float,
     ) -> None:
@@ -250,7 +250,7 @@ def _parse(source: Source, file: Any) -> Sequence:
     t, x, y, p = (_dataset(file, f"events/{name}")[:] for name in EVENT_TYPES)
     label = file["events/labels"][:] if "events/labels" in file else None
     images, flows = members(file, "images"), members(file, "flow")
-    frames = _stack(images, np.uint8, 2) if images else None
+    frames = _stack(images, GREYS, 2) if images else None
     flow = _flow(images, flows)
     exposure = np.array([float(image.attrs.get("exposure", 0.0)) for image in images.values()])
     size = file.attrs.get("sensor_resolution")
@@ -290,20 +290,21 @@ def members(file: Any, group: str) -> dict[str, Any]:
     return {name[-9:]: file[group][name] for name in sorted(file[group])} if group in file else {}
 
 
-def _stack(members: dict[str, Any], kind: type[Any], ndim: int) -> NDArray[Any]:
+def _stack(members: dict[str, Any], kinds: tuple[type[Any], ...], ndim: int) -> NDArray[Any]:
     first = next(iter(members.values()))
-    out = np.empty((len(members), *first.shape), kind)
+    out = np.empty((len(members), *first.shape), first.dtype)
     for index, member in enumerate(members.values()):
-        if member.shape != first.shape:
-            raise InputError(f"'{member.name}' must have shape {first.shape} like the first")
-        out[index] = checked(member, kind, ndim)
+        if member.shape != first.shape or member.dtype != first.dtype:
+            raise InputError(f"'{member.name}' must be {first.dtype} of shape {first.shape} like the first")
+        out[index] = checked(member, kinds, ndim)
     return out
 
 
-def checked(member: Any, kind: type[Any], ndim: int) -> NDArray[Any]:
+def checked(member: Any, kinds: tuple[type[Any], ...], ndim: int) -> NDArray[Any]:
     """Return what a dataset holds; raises InputError where it is of another type or number of axes."""
-    if member.ndim != ndim or member.dtype != kind:
-        raise InputError(f"'{member.name}' must be {np.dtype(kind)} with {ndim} axes")
+    if member.ndim != ndim or member.dtype not in kinds:
+        names = " or ".join(np.dtype(kind).name for kind in kinds)
+        raise InputError(f"'{member.name}' must be {names} with {ndim} axes")
     return np.asarray(member[:])
 
 
@@ -311,7 +312,7 @@ def _flow(images: dict[str, Any], flows: dict[str, Any]) -> NDArray[np.float32] 
     """Flow of every image, shape (F, 2, H, W); not a number where an image has none."""
     if not flows:
         return None
-    stacked = _stack(flows, np.float32, 3)
+    stacked = _stack(flows, (np.float32,), 3)
     if not images or list(images) == list(flows):
         return stacked
     out = np.full((len(images), *stacked.shape[1:]), np.nan, np.float32)

@@ -3,7 +3,7 @@
     t_us (int32 [us]), x, y (uint16), p (uint8, 1 = ON)      shape (N,), sorted by time
     label (int8, where known)                                shape (N,), places in `dase.events.LABELS`
     wh                                                       [width, height]
-    frames (uint8)                                           shape (F, H, W)
+    frames (uint8 or uint16)                                 shape (F, H, W)
     frame_begin_us, frame_end_us (int32 [us])                shape (F,), begin and end of the exposure
     flow (float32 [px/s], x then y)                          shape (F, 2, H, W)
     thresholds (float32, OFF then ON)                        shape (2, H, W)
@@ -26,7 +26,7 @@ from numpy.typing import ArrayLike, NDArray
 from dase.errors import InputError
 from dase.events import Events
 from dase.io.rules import sensor_events
-from dase.io.sequence import Sequence, Writer, coordinates, reading, writing
+from dase.io.sequence import GREYS, Grey, Sequence, Writer, coordinates, reading, writing
 from dase.io.source import Beside, Piece, Source
 
 # Deflate level 1 takes 7.2 M events of a DAVIS240C from 9.0 to 2.8 bytes each, writing 10 M and reading
@@ -46,7 +46,7 @@ class _Writer(Writer):
         self._path = path
         self._parts: list[tuple[NDArray[Any], ...]] = []
         self._labels: list[NDArray[np.int8]] = []
-        self._grey: list[NDArray[np.uint8]] = []
+        self._images: list[NDArray[Grey]] = []
         self._flow: list[NDArray[np.float32]] = []
         self._begin_us: list[NDArray[np.int32]] = []
         self._end_us: list[NDArray[np.int32]] = []
@@ -62,11 +62,11 @@ class _Writer(Writer):
         self,
         index: int,
         time: float,
-        grey: NDArray[np.uint8],
+        grey: NDArray[Grey],
         flow: NDArray[np.float32] | None,
         exposure: float,
     ) -> None:
-        self._grey.append(grey.copy())
+        self._images.append(grey.copy())
         self._begin_us.append(_microseconds(time - exposure / 2))
         self._end_us.append(_microseconds(time + exposure / 2))
         if flow is not None:
@@ -88,8 +88,8 @@ class _Writer(Writer):
             if self._with_labels:
                 _store(archive, "label", np.concatenate([np.empty(0, np.int8), *self._labels]))
             _store(archive, "wh", np.array(self.size[::-1], np.int64))
-            if self._grey:
-                _store(archive, "frames", np.stack(self._grey))
+            if self._images:
+                _store(archive, "frames", np.stack(self._images))
                 _store(archive, "frame_begin_us", np.stack(self._begin_us))
                 _store(archive, "frame_end_us", np.stack(self._end_us))
             if self._flow:
@@ -133,7 +133,7 @@ def create(path: Path) -> AbstractContextManager[Writer]:
 
 def read(source: Source) -> Sequence:
     """Read an archive; raises InputError where it is damaged or incomplete. Pickled members are refused."""
-    with reading(source.path, "a NumPy archive"), zipfile.ZipFile(source.path) as archive:
+    with reading(source.path, "NumPy archive"), zipfile.ZipFile(source.path) as archive:
         known = (name for name in KEYS if f"{name}.npy" in archive.namelist())
         return _parse(source, {name: load(archive, name) for name in known})
 
@@ -146,8 +146,8 @@ def load(archive: zipfile.ZipFile, name: str) -> NDArray[Any]:
 
 def _parse(source: Source, content: dict[str, NDArray[Any]]) -> Sequence:
     frames, flow, thresholds = (content.get(name) for name in ("frames", "flow", "thresholds"))
-    if frames is not None and (frames.dtype != np.uint8 or frames.ndim != 3):
-        raise InputError(f"'frames' must be uint8 (F, H, W), got {frames.dtype} {frames.shape}")
+    if frames is not None and (frames.dtype not in GREYS or frames.ndim != 3):
+        raise InputError(f"'frames' must be uint8 or uint16 (F, H, W), got {frames.dtype} {frames.shape}")
     if frames is None and not set(EVENT_KEYS) & set(content):
         raise InputError("has neither events (t_us, x, y, p) nor frames")
     events = _events(source, content, (frames, flow, thresholds))

@@ -192,8 +192,8 @@ def _libcaer(words: NDArray[np.uint64], base: int) -> Piece:
     return Piece(t, x, y, valid & 2 > 0)
 
 
-def image(data: bytes, cdr: bool, compressed: bool) -> tuple[int, NDArray[np.uint8]]:
-    """Return the time [ns] and the grey values (H, W) of an Image or a CompressedImage."""
+def image(data: bytes, cdr: bool, compressed: bool) -> tuple[int, NDArray[Any]]:
+    """Return the time [ns] and the grey values of 8 or 16 bits (H, W) of an Image or a CompressedImage."""
     message = Message(data, cdr)
     time = message.stamp()
     if compressed:
@@ -210,7 +210,8 @@ def image(data: bytes, cdr: bool, compressed: bool) -> tuple[int, NDArray[np.uin
         raise InputError(f"an image of {width}x{height} has {len(pixels)} bytes in rows of {step}")
     values = np.frombuffer(pixels, np.uint8).reshape(height, step)[:, :row]
     if wide == 2:
-        return time, values[:, 0 if swapped else 1 :: 2]
+        wide_values = np.ascontiguousarray(values).view(">u2" if swapped else "<u2")
+        return time, wide_values.astype(np.uint16, copy=False)
     if CHANNELS[encoding] == 1:
         return time, values
     weights = (0.21, 0.72, 0.07) if encoding == "rgb8" else (0.07, 0.72, 0.21)

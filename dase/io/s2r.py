@@ -13,7 +13,7 @@ from dase.io import h5
 from dase.io.columns import HDF5, columns, dataset, largest, opened, reader, size_attribute
 from dase.io.format import Format, camera_format
 from dase.io.rules import turned
-from dase.io.sequence import Sequence, reading
+from dase.io.sequence import GREYS, Sequence, reading
 from dase.io.source import Beside, Picture, Piece, Size, Source
 
 COLUMNS = ("events/ts", "events/xs", "events/ys", "events/ps")
@@ -31,8 +31,8 @@ def _pictures(source: Source) -> Iterator[Picture]:
     with opened(source.path) as file:
         flows, images = h5.members(file, "flow"), h5.members(file, "images")
         for name, image in images.items():
-            grey = h5.checked(image, np.uint8, 2)
-            flow = h5.checked(flows[name], np.float32, 3) if name in flows else None
+            grey = h5.checked(image, GREYS, 2)
+            flow = h5.checked(flows[name], (np.float32,), 3) if name in flows else None
             if flow is None and flows:
                 flow = np.full((2, *grey.shape), np.nan, np.float32)
             exposure = float(image.attrs.get("exposure", 0.0))

@@ -17,6 +17,10 @@ from numpy.typing import NDArray
 from dase.errors import InputError
 from dase.events import Events
 
+Grey = np.uint8 | np.uint16
+GREYS = (np.uint8, np.uint16)
+"""Types of grey images; white is their largest number."""
+
 
 @dataclass(frozen=True)
 class Sequence:
@@ -24,7 +28,7 @@ class Sequence:
 
     Args:
         events: The events; their width and height are those of all maps below.
-        frames: Grey images, uint8, shape (F, H, W).
+        frames: Grey images, uint8 or uint16, shape (F, H, W).
         frame_times: Middle of each frame's exposure [s], float64, shape (F,). None where it is unknown.
         flow: Optical flow [px/s], x then y, float32, shape (F, 2, H, W); without frames any number of maps.
         thresholds: Contrast thresholds used, OFF then ON [log intensity], float32, shape (2, H, W).
@@ -36,7 +40,7 @@ class Sequence:
     """
 
     events: Events
-    frames: NDArray[np.uint8] | None = None
+    frames: NDArray[Grey] | None = None
     frame_times: NDArray[np.float64] | None = None
     flow: NDArray[np.float32] | None = None
     thresholds: NDArray[np.float32] | None = None
@@ -83,6 +87,7 @@ class Writer(ABC):
         self._with_flow: bool | None = None
         self._with_labels: bool | None = None
         self._frames = 0
+        self._grey: np.dtype[Any] | None = None
         self._once: set[str] = set()
 
     def events(self, part: Events) -> None:
@@ -115,7 +120,7 @@ class Writer(ABC):
     def frame(
         self,
         time: float,
-        grey: NDArray[np.uint8],
+        grey: NDArray[Grey],
         flow: NDArray[np.float32] | None = None,
         *,
         exposure: float = 0.0,
@@ -124,15 +129,19 @@ class Writer(ABC):
 
         Args:
             time: Middle of the exposure [s], not before the frame before.
-            grey: Image, uint8, shape (H, W).
+            grey: Image, uint8 or uint16 like the first, shape (H, W).
             flow: Optical flow at `time` [px/s], x then y, shape (2, H, W): for all frames or for none.
             exposure: Duration of the exposure [s].
 
         Raises:
             InputError: A time, shape or type is wrong.
         """
-        if grey.dtype != np.uint8 or grey.ndim != 2:
-            raise InputError(f"frame: must be uint8 of shape (H, W), got {grey.dtype} of shape {grey.shape}")
+        wanted = GREYS if self._grey is None else (self._grey,)
+        if grey.dtype not in wanted or grey.ndim != 2:
+            names = " or ".join(np.dtype(kind).name for kind in wanted)
+            raise InputError(
+                f"frame: must be {names} of shape (H, W), got {grey.dtype} of shape {grey.shape}"
+            )
         self._same_size(grey.shape, "frame")
         if not (math.isfinite(time) and time >= self._last_frame):
             raise InputError(f"frame: time must not be before {self._last_frame:g} s, got {time:g} s")
@@ -144,6 +153,7 @@ class Writer(ABC):
             raise InputError("frame: flow must come with all frames or with none")
         self._with_flow = flow is not None
         self._last_frame = time
+        self._grey = grey.dtype
         self._put_frame(self._frames, time, grey, flow, exposure)
         self._frames += 1
 
@@ -188,7 +198,7 @@ class Writer(ABC):
         self,
         index: int,
         time: float,
-        grey: NDArray[np.uint8],
+        grey: NDArray[Grey],
         flow: NDArray[np.float32] | None,
         exposure: float,
     ) -> None: ...

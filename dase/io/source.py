@@ -98,12 +98,26 @@ class Piece(NamedTuple):
 
 
 class Picture(NamedTuple):
-    """A frame of a camera: grey (H, W), middle of the exposure [ticks], its duration [s], flow (2, H, W)."""
+    """A frame of a camera.
 
-    grey: NDArray[np.uint8]
+    Grey (H, W), uint8 or uint16; middle of the exposure [ticks], its duration [s]; flow (2, H, W).
+    """
+
+    grey: NDArray[Any]
     t: Any
     exposure: float = 0.0
     flow: NDArray[np.float32] | None = None
+
+
+class Motion(NamedTuple):
+    """Samples of a camera's motion sensor, in the axes of its maker.
+
+    Times [ticks or s] (N,), acceleration with that of gravity [m/s^2] (N, 3), rotation [rad/s] (N, 3).
+    """
+
+    t: NDArray[Any]
+    acceleration: NDArray[np.float64]
+    rotation: NDArray[np.float64]
 
 
 Beside = tuple[NDArray[np.float32] | None, str | None]
