@@ -18,22 +18,18 @@ if TYPE_CHECKING:
 @click.option("-o", "--output", required=True, type=click.Path(path_type=Path), help="Folder of the run.")
 @click.option(
     "--images",
-    help="Textures of the simulator's scenes: frames (of the recordings), a folder, coco:ANNOTATIONS,FOLDER or "
-    "builtin.  [default: frames; builtin for a sensor file]",
+    help="What the simulator's scenes are made of: frames (of the recordings), a folder, "
+    "coco:ANNOTATIONS,FOLDER or builtin.  [default: frames; builtin for a sensor file]",
 )
 @click.option("--preset", default="default", show_default=True, help="default, tiny (for a CPU) or paper.")
 @click.option("--objective", default="", help="moments or wgan.  [default: the preset's]")
 @click.option("--steps", default=0, help="Generator steps.  [default: the preset's]")
 @click.option("--minutes", type=float, help="Time to take instead of a number of steps.")
 @click.option("--window", default=0.05, show_default=True, help="Time in which events are counted [s].")
-@click.option(
-    "--size", callback=parse_size, metavar="WxH", help="Of scenes, where the target is a sensor file."
-)
+@click.option("--size", callback=parse_size, metavar="WxH", help="Of scenes, if the target is a sensor file.")
 @click.option("--sequences", default=300, show_default=True, help="Simulated by a sensor file as the target.")
 @click.option("--pattern", is_flag=True, help="Learn an offset for every column and row of the sensor.")
-@click.option(
-    "--seed", default=0, show_default=True, help="The same seed learns the same, on the same device."
-)
+@click.option("--seed", default=0, show_default=True, help="The same seed learns the same on one device.")
 @click.option("--backend", default="cpu", show_default=True, help="cpu or cuda.")
 @click.option("--resume", is_flag=True, help="Go on where an interrupted run stopped.")
 @click.option("--tensorboard", is_flag=True, help="Write the log for TensorBoard, too.")

@@ -74,7 +74,7 @@ class Job:
     targets: tuple[str, ...]
     images: str = ""
     preset: str = "default"
-    objective: str = ""
+    objective: Literal["", "moments", "wgan"] = ""
     window: float = 0.05
     size: tuple[int, int] | None = None
     sequences: int = 300

@@ -24,7 +24,8 @@ def constant(mu: float, sigma: float, ratio: float = 1.0) -> ThresholdNet:
     net = ThresholdNet(NetworkShape(channels=4, depth=1, split=True), mu=mu, sigma=sigma)
     with torch.no_grad():
         net.asymmetry.fill_(float(np.log(ratio)))
-    return net.eval()
+    net.eval()
+    return net
 
 
 def esim() -> ThresholdNet:

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 import torch
+from torch.nn import functional as F
 
 from dase.moments import Moments, discrepancy
 from dase.networks import Maps, ThresholdNet
 from dase.scenery import Scenery, middle
-from dase.targets import Noise, Pairs, Target, draw_noise, simulate
+from dase.targets import Pairs, Target, draw_noise, simulate
 
 
 class Exam:
@@ -82,35 +85,69 @@ class HeldOut:
         pairs: Held out.
         scenes: How many to compare them with.
         seed: Of scenes and noise.
+        doubt: Share by which means may differ for reasons that thresholds cannot cure.
     """
 
-    def __init__(self, scenery: Scenery, pairs: Pairs, *, scenes: int = 96, seed: int = 54321):
+    def __init__(
+        self, scenery: Scenery, pairs: Pairs, *, scenes: int = 96, seed: int = 54321, doubt: float = 0.05
+    ):
         self.scenery, self.scenes, self.seed = scenery, scenes, seed
         self.real = [pairs.select(slice(n, n + 12)) for n in range(0, len(pairs), 12)]
-        self.like = Moments(device=scenery.device)
-        first = self._fakes(None)
+        self.like = Moments(device=scenery.device, doubt=doubt)
+        first = self.fakes(None)
         self.like.calibrate(list(zip(first, self.real, strict=False)))
+        for some in self.real:
+            self.like.see_real(some)
         for fake in first:
             self.like.see_plain(Pairs(fake.grey, fake.counts, fake.counts))
         self.like.weigh()
 
     @torch.no_grad()
-    def _fakes(self, net: ThresholdNet | None) -> list[Pairs]:
+    def fakes(self, net: Callable[[torch.Tensor], Maps] | None) -> list[Pairs]:
+        """Return the fixed scenes seen through a network, or at usual thresholds."""
         rng = np.random.default_rng(self.seed)
         generator = torch.Generator(self.scenery.device).manual_seed(self.seed)
         out = []
         for _ in range(0, self.scenes, 12):
             log = self.scenery.draw(rng, 12)
             grey = middle(log)
-            noise: Noise = draw_noise(log, generator)
+            noise = draw_noise(log, generator)
             if net is None:
                 out.append(Pairs(grey, simulate(log, torch.full_like(grey, 0.25), 0.06, noise)))
-                continue
-            maps = net(grey)
-            mu, sigma = maps.by_polarity() if net.shape.split else (maps.mu, maps.sigma)
-            out.append(Pairs(grey, simulate(log, mu, sigma, noise)))
+            else:
+                out.append(Pairs(grey, simulate(log, *net(grey).by_polarity(), noise)))
         return out
 
-    def score(self, net: ThresholdNet) -> float:
+    def score(self, net: Callable[[torch.Tensor], Maps]) -> float:
         """Return the weighted square difference of the moments; smaller is better."""
-        return discrepancy(self._fakes(net), self.real, self.like)
+        return discrepancy(self.fakes(net), self.real, self.like)
+
+    def statistics(self, net: Callable[[torch.Tensor], Maps]) -> dict[str, float]:
+        """Return how counts and 8x8 patches of them differ from the held-out ones, in plain numbers."""
+        fake, real = (torch.cat([pairs.counts for pairs in side]) for side in (self.fakes(net), self.real))
+        out = {"score": self.score(net), "rate": float(fake.mean() / real.mean().clamp_min(1e-9))}
+        out["counts"] = 0.5 * float((histogram(fake) - histogram(real)).abs().sum())
+        sums = [F.avg_pool2d(side, 8) * 64 for side in (fake, real)]
+        spreads = [
+            (F.avg_pool2d(side.square(), 8) - F.avg_pool2d(side, 8).square()).clamp_min(0).sqrt()
+            for side in (fake, real)
+        ]
+        out["patch_sums"] = distance(sums[0], sums[1])
+        out["patch_spreads"] = distance(spreads[0], spreads[1])
+        return out
+
+
+def histogram(counts: torch.Tensor, most: int = 12) -> torch.Tensor:
+    """Return the shares of pixels with 0, 1, ... events, `most` and more in the last."""
+    whole = counts.round().long().clamp(0, most).flatten()
+    return torch.bincount(whole, minlength=most + 1).double() / len(whole)
+
+
+def distance(one: torch.Tensor, other: torch.Tensor) -> float:
+    """Return the mean distance of sorted values of log(1 + x), Wasserstein's of the first order."""
+    shares = torch.linspace(0, 1, 2001, device=one.device, dtype=torch.float64)
+    values = []
+    for side in (one, other):
+        ordered = torch.sort(torch.log1p(side.double()).flatten()).values
+        values.append(ordered[(shares * (len(ordered) - 1)).round().long()])
+    return float((values[0] - values[1]).abs().mean())

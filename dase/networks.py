@@ -9,6 +9,7 @@ from __future__ import annotations
 import copy
 import math
 from dataclasses import dataclass
+from itertools import pairwise
 
 import torch
 from torch import nn
@@ -93,8 +94,8 @@ class UNet(nn.Module):
         wide = [channels * min(2**level, 4) for level in range(depth + 1)]
         self.stem = nn.Conv2d(inputs, wide[0], 3, padding=1)
         self.encode = nn.ModuleList(Residual(n) for n in wide)
-        self.down = nn.ModuleList(nn.Conv2d(a, b, 3, 2, 1) for a, b in zip(wide[:-1], wide[1:], strict=True))
-        self.up = nn.ModuleList(nn.Conv2d(b, a, 1) for a, b in zip(wide[:-1], wide[1:], strict=True))
+        self.down = nn.ModuleList(nn.Conv2d(a, b, 3, 2, 1) for a, b in pairwise(wide))
+        self.up = nn.ModuleList(nn.Conv2d(b, a, 1) for a, b in pairwise(wide))
         self.decode = nn.ModuleList(nn.Conv2d(n, n, 3, padding=1) for n in wide[:-1])
         self.last = nn.Conv2d(wide[0], 2, 1)
         nn.init.zeros_(self.last.weight)
@@ -205,8 +206,8 @@ def look_up(table: torch.Tensor, grey: torch.Tensor) -> torch.Tensor:
     """Interpolate a table by the brightness and the edge strength of every pixel.
 
     Args:
-        table: Shape (2, nodes of brightness, nodes of edge strength). Brightness goes from 0 to 1, edge strength e
-            from 0 to infinity, evenly in e / (e + EDGE).
+        table: Shape (2, nodes of brightness, nodes of edge strength). Brightness goes from 0 to 1, edge
+            strength e from 0 to infinity, evenly in e / (e + EDGE).
         grey: Images in [0, 1], shape (B, H, W).
 
     Returns:
@@ -218,7 +219,7 @@ def look_up(table: torch.Tensor, grey: torch.Tensor) -> torch.Tensor:
 
 
 def table_weights(grey: torch.Tensor, nodes: tuple[int, int]) -> tuple[torch.Tensor, torch.Tensor]:
-    """Return the weights of the nodes of brightness and of edge strength, (B, nodes, H, W) each; see `look_up`."""
+    """Return the weights of the nodes of brightness and of edge strength, each (B, nodes, H, W)."""
     brightness, edge = looks(grey)
     return _hats(brightness.clamp(0, 1), nodes[0]), _hats(edge / (edge + EDGE), nodes[1])
 

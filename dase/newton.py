@@ -141,7 +141,7 @@ class Newton:
             self._patterns(share)
 
     def _choose(self, solve: Any, jacobian: torch.Tensor, weight: torch.Tensor) -> None:
-        """Choose the prior spread whose solution fits held-out scenes best, the moments being linear in it."""
+        """Choose the prior spread whose solution fits held-out scenes best, moments taken as linear."""
         cells = self.moments.sets["look"]
         off = cells.off(held_out=True).flatten()
         scores = []

@@ -24,7 +24,7 @@ def critic_maps(counts: torch.Tensor) -> torch.Tensor:
 
 
 def cut_patches(maps: torch.Tensor, size: int) -> torch.Tensor:
-    """Cut maps (B, C, H, W) into patches without overlap, shape (patches, C · size²); the rest is left out."""
+    """Cut maps (B, C, H, W) into patches side by side, shape (patches, C · size²); the rest is left out."""
     batch, channels, height, width = maps.shape
     rows, columns = height // size, width // size
     cut = maps[..., : rows * size, : columns * size].reshape(batch, channels, rows, size, columns, size)

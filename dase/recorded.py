@@ -91,8 +91,8 @@ def windows_of(
     rate = float(counts.sum((1, 2, 3)).mean()) / (recording.height * recording.width)
     if rate < FEWEST:
         raise InputError(
-            f"the recording has {rate:.2g} events per pixel in windows of {window:g} s where its frames can be "
-            f"trusted; learning needs at least {FEWEST:g}"
+            f"the recording has {rate:.2g} events per pixel in windows of {window:g} s where its frames can "
+            f"be trusted; learning needs at least {FEWEST:g}"
         )
     return Windows(begin, log, counts, kept)
 
@@ -172,7 +172,7 @@ def open_target(
         shape = shape or size
         if size != shape:
             raise InputError(
-                f"{path} is of a {size[0]}x{size[1]} sensor, the recordings before it of {shape[0]}x{shape[1]}"
+                f"{path} is of a {size[0]}x{size[1]} sensor, those before it of {shape[0]}x{shape[1]}"
             )
         try:
             found.append(windows_of(recording, window=window, samples=samples, progress=progress))
@@ -185,7 +185,9 @@ def _joined(
     found: list[Windows], held_out: float, window: float, device: str | torch.device
 ) -> tuple[Finite, Replayed]:
     """Return target and scenes, the held-out windows of all recordings last."""
-    order, rest, start = [], [], 0
+    order: list[int] = []
+    rest: list[int] = []
+    start = 0
     for part in found:
         cut = len(part.begin) - max(int(round(held_out * len(part.begin))), 1)
         order += range(start, start + cut)
@@ -197,7 +199,7 @@ def _joined(
     trusted = float(np.mean([part.trusted for part in found]))
     every = Windows(begin, log, counts, trusted)
     scenes = Replayed(every, window=window, device=device)
-    middle = np.exp(log[order + rest, log.shape[1] // 2].astype(np.float32)) - np.float32(LOG_EPS)
+    middle = np.exp(log[np.array(order + rest), log.shape[1] // 2].astype(np.float32)) - np.float32(LOG_EPS)
     pairs = Pairs(
         torch.from_numpy(middle).half().to(device), torch.from_numpy(counts).clamp_max(2000).half().to(device)
     )

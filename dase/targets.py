@@ -34,7 +34,7 @@ class Varied:
     below: list[torch.Tensor]
 
     def follow(self, value: Callable[[torch.Tensor], torch.Tensor], counts: torch.Tensor) -> torch.Tensor:
-        """Return `value` of the counts, with its gradient by the thresholds: it may be any function of a pixel.
+        """Return `value` of the counts, with its gradient by the thresholds; it looks at single pixels.
 
         A surrogate for the count itself, put through a curved function, is off by what the curve does inside
         the step; the difference of the function's values is not.
@@ -96,7 +96,7 @@ class Target(ABC):
         """Return what further draws depend on, beside the random numbers they are given."""
         return {}
 
-    def load(self, state: dict[str, Any]) -> None:
+    def load(self, state: dict[str, Any]) -> None:  # noqa: B027
         """Take over what `state` returned."""
 
 
@@ -117,6 +117,7 @@ class Endless(Target):
         """Return pairs of scenes drawn by `rng`."""
         log = self.scenery.draw(rng, count)
         grey = middle(log)
+        assert self.truth is not None
         mu, sigma = self.truth(grey)
         return Pairs(grey, simulate(log, mu, sigma, draw_noise(log, self.generator)))
 
@@ -229,7 +230,8 @@ def simulate(
 def vary(log: torch.Tensor, mu: torch.Tensor, sigma: torch.Tensor, noise: Noise) -> Varied:
     """Return how the counts of `simulate`, with the same arguments, answer to the thresholds."""
     theta = thresholds(mu, sigma, noise.z, like=log)
-    above, below = [], []
+    above: list[torch.Tensor] = []
+    below: list[torch.Tensor] = []
     with torch.no_grad():
         for n in range(theta.shape[1]):
             for factor, kept in ((math.exp(STEP), above), (math.exp(-STEP), below)):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import math
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass, field, fields
 from typing import Any, Literal
 
 import numpy as np
@@ -78,12 +78,12 @@ class Recipe:
     penalty: float = 1.0
     uniform: float = 0.5
     critic_image: bool = False
-    hash: Hash = Hash()
+    hash: Hash = field(default_factory=Hash)
     cells: tuple[int, int] = (6, 5)
     memory: float = 0.95
     doubt: float = 0.0
     newton: float = 0.2
-    network: NetworkShape = NetworkShape()
+    network: NetworkShape = field(default_factory=NetworkShape)
     seed: int = 0
 
     def text(self) -> str:

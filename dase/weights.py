@@ -6,6 +6,7 @@ import json
 from dataclasses import asdict
 from functools import lru_cache
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -41,15 +42,15 @@ def load_net(path: Path) -> ThresholdNet:
         net.load_state_dict(tensors)
     except (SafetensorError, RuntimeError, KeyError, ValueError, TypeError) as error:
         raise InputError(f"{path} does not hold learned thresholds: {error}") from error
-    return net.eval()
+    net.eval()
+    return net
 
 
 def shape_of(text: str) -> NetworkShape:
     """Return the shape of a network from JSON."""
     table = json.loads(text)
-    return NetworkShape(
-        **{name: tuple(value) if isinstance(value, list) else value for name, value in table.items()}
-    )
+    fixed: dict[str, Any] = {n: tuple(v) if isinstance(v, list) else v for n, v in table.items()}
+    return NetworkShape(**fixed)
 
 
 @lru_cache(maxsize=4)

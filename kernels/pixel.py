@@ -17,7 +17,8 @@ A stage function asks for what it needs by the names of its arguments: the quant
 `y`, `t64` (t in double precision, for phases of long recordings), `radius` (distance from the middle of the
 sensor to its corner is 1), `nominal_on`, `nominal_off` (thresholds before any effect), parameters and states
 of its effect, random numbers (`uniform`, `normal`: new ones at every sample; `pixel_uniform`, `pixel_normal`:
-one for each pixel; `_2` and so on for more), maps of its effect (one value for each pixel). It returns its quantity, then the new values of its states.
+one for each pixel; `_2` and so on for more), maps of its effect (one value for each pixel). It returns its
+quantity, then the new values of its states.
 `compose` writes the kernel that calls all of them, one line each, so that a sensor costs one pass over its
 samples whatever effects it has. Random numbers are counter-based, keyed by seed, effect, pixel and sample:
 they do not depend on the other effects, on chunks, threads or the batch.

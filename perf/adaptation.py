@@ -29,14 +29,25 @@ import numpy as np
 import torch
 
 from dase import images
+from dase.adaptation import baseline, write_sensor
+from dase.camera import TOLERANCE, CameraScene
+from dase.comparison import compare
+from dase.config import load_sensor
+from dase.evaluation import HeldOut
 from dase.networks import NetworkShape
 from dase.objectives import Hash
+from dase.recorded import Replayed, open_target, windows_of
+from dase.recording import Recording, open_recording
 from dase.run import Pace, run
 from dase.scenery import Looks, Scenery
-from dase.targets import TRUTHS, Endless, Finite, Target, record
+from dase.targets import TRUTHS, Endless, Finite, Pairs, Target, record
 from dase.training import Recipe, Training
 
 ROOT = Path(__file__).resolve().parents[1]
+SHARED = ROOT.parent / "shared"
+
+LEARNED = 8.0
+"""Seconds of the recording that are learned from."""
 
 
 @dataclass(frozen=True)
@@ -51,6 +62,7 @@ class Row:
         recipe: What differs from the default recipe.
         hash: What differs from the default hash.
         network: What differs from the default network.
+        real: Whether the target is the recording: 8 s to learn from, what follows to judge by.
     """
 
     truth: str = "uniform"
@@ -60,6 +72,7 @@ class Row:
     recipe: dict[str, Any] = field(default_factory=dict)
     hash: dict[str, Any] = field(default_factory=dict)
     network: dict[str, Any] = field(default_factory=dict)
+    real: bool = False
 
     def but(self, **changes: Any) -> Row:
         """Return the row with some options changed, dictionaries merged."""
@@ -114,6 +127,13 @@ def rows() -> dict[str, Row]:
         out[f"surrogate-{surrogate}"] = FULL.but(recipe=dict(surrogate=surrogate))
     for anchor in (0.0, 1.0, 30.0):
         out[f"anchor-{anchor:g}"] = FULL.but(recipe=dict(anchor=anchor))
+    recorded = dict(doubt=0.2, batch=8)
+    out["real-moments"] = MOMENTS.but(real=True, recipe=recorded, network=dict(split=True))
+    out["real-moments-doubt.1"] = out["real-moments"].but(recipe=dict(doubt=0.1))
+    out["real-moments-flat"] = out["real-moments"].but(network=dict(table=None), recipe=dict(rate=0.0))
+    out["real-wgan"] = FULL.but(
+        real=True, recipe=dict(batch=8, anchor=0.5), hash=dict(orientations=8), network=dict(split=True)
+    )
     out.update(_finite_variants())
     out.update(_maps())
     return out
@@ -165,8 +185,9 @@ def _maps() -> dict[str, Row]:
     return out
 
 
-def prepare(row: Row, *, device: str, pictures: str, small: bool, seconds: float) -> Training:
+def prepare(row: Row, args: argparse.Namespace) -> Training:
     """Return the run of a row."""
+    device, pictures, small = args.device, args.images, args.small
     looks = Looks(regime="mixed") if not small else Looks(regime="mixed", width=96, height=96, samples=12)
     recipe: dict[str, Any] = dict(steps=10**6, **row.recipe)
     how, network = dict(row.hash), dict(row.network)
@@ -176,6 +197,10 @@ def prepare(row: Row, *, device: str, pictures: str, small: bool, seconds: float
         network |= {"channels": 8, "depth": 2}
         if "pattern" in network:
             network["pattern"] = (96, 96)
+    made = Recipe(hash=Hash(**how), network=NetworkShape(**network), **recipe)
+    if row.real:
+        target, scenes = open_target([Path(args.recording)], until=LEARNED, device=device)
+        return Training(made, target, scenes)
     scenery = Scenery(images.open_images(pictures), looks, device=device, backgrounds=48, objects=96)
     ours, theirs = scenery.split(0.5) if row.disjoint else (scenery, scenery)
     seed = recipe.get("seed", 0)
@@ -183,8 +208,49 @@ def prepare(row: Row, *, device: str, pictures: str, small: bool, seconds: float
     if row.finite:
         pairs = record(target, np.random.default_rng([seed, 77]), row.finite)
         target = Finite(pairs, augment=row.augment, truth=target.truth)
-    made = Recipe(hash=Hash(**how), network=NetworkShape(**network), **recipe)
     return Training(made, target, ours)
+
+
+def judge(training: Training, args: argparse.Namespace, folder: Path) -> dict[str, Any]:
+    """Return how the adapted sensor and the baselines do on the part of the recording that came later."""
+    recording = open_recording(args.recording)
+    recording = recording.masked(~recording.hot)
+    later = recording.slice(recording.begin + LEARNED, recording.end)
+    windows = windows_of(later)
+    scenes = Replayed(windows, window=0.05, device=args.device)
+    grey = np.exp(windows.log[:, windows.log.shape[1] // 2].astype(np.float32)) - np.float32(1e-3)
+    pairs = Pairs(torch.from_numpy(grey).to(args.device), torch.from_numpy(windows.counts).to(args.device))
+    held = HeldOut(scenes, pairs, doubt=0.2)
+    nets: dict[str, Any] = {"adapted": training.mean}
+    for kind in ("esim", "rate", "random"):
+        nets[kind] = baseline(kind, training.target, training.scenery)
+    out: dict[str, Any] = {"trusted": windows.trusted}
+    for name, net in nets.items():
+        out[name] = held.statistics(net)
+        if name != "random":
+            out[name]["probes"] = _probes(later, name, net, folder)
+            print(f"{folder.name} {name}: {out[name]}", flush=True)
+    return out
+
+
+def _probes(later: Recording, name: str, net: Any, folder: Path) -> float | str:
+    """Return the headline error of `dase compare` on the later part."""
+    try:
+        place = folder / name
+        place.mkdir(exist_ok=True)
+        mu = float(net(torch.full((1, 8, 8), 0.4, device=net.level.device)).mu.mean().detach())
+        sensor = load_sensor(write_sensor(place, net.to("cpu"), mu=mu, name=name))
+        assert later.frames is not None
+        assert later.frame_begin is not None
+        scene = CameraScene(later.frames, later.frame_begin, later.frame_end)
+
+        def trust(times: Any, pixels: Any) -> Any:
+            at = np.clip(times, scene.times[0], scene.times[-1])
+            return scene.doubt(at, pixels=pixels) <= TOLERANCE
+
+        return compare(later.events, scene, sensor, trust=trust, pixels=800).error
+    except Exception as error:
+        return f"{type(error).__name__}: {error}"
 
 
 def measure(name: str, args: argparse.Namespace) -> dict[str, Any]:
@@ -192,7 +258,7 @@ def measure(name: str, args: argparse.Namespace) -> dict[str, Any]:
     row = rows()[name]
     torch.manual_seed(0)
     begin = time.perf_counter()
-    training = prepare(row, device=args.device, pictures=args.images, small=args.small, seconds=args.seconds)
+    training = prepare(row, args)
     history: list[dict[str, float]] = []
 
     def look(line: dict[str, float]) -> None:
@@ -205,8 +271,10 @@ def measure(name: str, args: argparse.Namespace) -> dict[str, Any]:
     last = run(training, Path(args.out) / name, pace=pace, look=look)
     scored = [line for line in history if "held_out" in line]
     best = min(scored, key=lambda line: line["held_out"]) if scored else last
+    real = judge(training, args, Path(args.out) / name) if row.real else None
     return {
         "row": name,
+        "real": real,
         "seed": training.recipe.seed,
         "device": _device(args.device),
         "commit": _commit(args.commit),
@@ -258,7 +326,9 @@ def work(names: list[str], args: argparse.Namespace) -> None:
         if left < args.seconds:
             print(f"no time left for {name}")
             return
-        options = [f"--{k}={getattr(args, k)}" for k in ("seconds", "out", "device", "images", "look")]
+        options = [
+            f"--{k}={getattr(args, k)}" for k in ("seconds", "out", "device", "images", "recording", "look")
+        ]
         options += [f"--commit={_commit(args.commit)}", *(["--small"] if args.small else [])]
         command = [sys.executable, __file__, f"--row={name}", "--jobs=1", *options]
         try:
@@ -284,7 +354,7 @@ def _brief(line: dict[str, Any]) -> str:
 
 
 def _default_images() -> str:
-    beside = ROOT.parent / "shared" / "photos"
+    beside = SHARED / "photos"
     return str(beside) if beside.is_dir() else "builtin"
 
 
@@ -298,6 +368,9 @@ def parse(argv: list[str] | None = None) -> argparse.Namespace:
     parser.add_argument("--jobs", type=int, default=1, help="processes at a time on the one device")
     parser.add_argument("--device", default="cuda" if torch.cuda.is_available() else "cpu")
     parser.add_argument("--images", default=_default_images())
+    parser.add_argument(
+        "--recording", default=str(ROOT.parent / "shared/recordings/davis240c_camerashake.npz")
+    )
     parser.add_argument("--look", type=int, default=50, help="steps between lines of the log")
     parser.add_argument("--small", action="store_true", help="tiny scenes, to try things on a CPU")
     parser.add_argument("--verbose", action="store_true", help="print every line of the log")

@@ -143,7 +143,7 @@ class Effect:
         return self
 
     def map_values(self, pixels: NDArray[np.int32]) -> NDArray[np.float32]:
-        """Return the maps of `bound_to` at row-major indices of pixels (N,), in the order of `maps`, (M, N)."""
+        """Return the maps of `bound_to` at row-major indices of pixels (N,), shape (M, N)."""
         raise NotImplementedError
 
     @classmethod
