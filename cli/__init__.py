@@ -12,7 +12,21 @@ import click
 if __name__ != "dase.cli":
     raise ImportError("import dase.cli, not cli")
 
-COMMANDS = ("compare", "convert", "demo", "diagnose", "effects", "fit", "info", "show", "synth")
+COMMANDS = (
+    "add",
+    "compare",
+    "convert",
+    "demo",
+    "diagnose",
+    "distinguish",
+    "effects",
+    "fit",
+    "info",
+    "remove",
+    "show",
+    "synth",
+    "train",
+)
 
 
 class LazyGroup(click.Group):

@@ -1,32 +1,40 @@
-"""What the sensor's effects are."""
+"""What the sensor's effects are, and how to begin one of your own."""
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import click
+
+from dase.cli.options import effects_option
 
 
 @click.group()
 def command() -> None:
-    """List the physical effects, or describe one."""
+    """List the physical effects, describe one, or begin one of your own."""
 
 
 @command.command("list")
-def list_effects() -> None:
+@effects_option
+def list_effects(effects: tuple[Path, ...]) -> None:
     """List all effects, in the order in which they act."""
-    from dase.effects import EFFECTS
+    from dase.effect_files import known_effects
 
-    width = max(map(len, EFFECTS))
-    for name, effect in EFFECTS.items():
+    known = known_effects(effects)
+    width = max(map(len, known))
+    for name, effect in known.items():
         click.echo(f"{name:{width}}  {effect.about().splitlines()[0]}")
 
 
 @command.command("show")
 @click.argument("name")
-def show_effect(name: str) -> None:
+@effects_option
+def show_effect(name: str, effects: tuple[Path, ...]) -> None:
     """Describe the effect NAME: physics, parameters, source."""
+    from dase.effect_files import known_effects
     from dase.effects import SceneEffect, StreamEffect, find
 
-    effect = find(name)
+    effect = find(name, known_effects(effects))
     click.echo(f"{effect.name}: {effect.about()}\n")
     for p in effect.parameters():
         low, high = p.plausible
@@ -41,3 +49,17 @@ def show_effect(name: str) -> None:
     stages = effect.stages or elsewhere or ["core of the change detector"]
     click.echo(f"\nStages: {', '.join(stages)}")
     click.echo(f"Source: {effect.source}")
+
+
+@command.command("new")
+@click.argument("name")
+@click.option("-o", "--output", type=click.Path(path_type=Path), help="Python file.  [default: NAME.py]")
+def new_effect(name: str, output: Path | None) -> None:
+    """Write a Python file with a new effect NAME to fill in. It works as it is."""
+    from dase import effect_template
+
+    output = output or Path(f"{name}.py")
+    effect_template.new_effect(name, output)
+    click.echo(f"{output} written: put your physics into it. Try it:")
+    for line in effect_template.commands(name, str(output)):
+        click.echo(f"    {line}")

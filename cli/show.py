@@ -3,10 +3,14 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import click
 
 from dase.cli.options import parse_size
+
+if TYPE_CHECKING:
+    from dase.io.sequence import Sequence
 
 
 @click.command()
@@ -20,25 +24,36 @@ from dase.cli.options import parse_size
     help="Events per picture.  [default: fits the rate]",
 )
 @click.option("--size", callback=parse_size, metavar="WxH", help="Columns x rows.  [default: as FILE says]")
+@click.option("--trust", is_flag=True, help="Show how far the scene between the frames can be trusted.")
 def command(
-    file: Path, output: Path | None, at: float | None, window: float | None, size: tuple[int, int] | None
+    file: Path,
+    output: Path | None,
+    at: float | None,
+    window: float | None,
+    size: tuple[int, int] | None,
+    trust: bool,
 ) -> None:
     """Draw the events of FILE over its frames and print its statistics.
 
     A PNG is a contact sheet: moments with events in red (ON) and blue (OFF), the event rate, and the
-    intervals between events of one pixel. An MP4 shows all of it, a picture per frame.
+    intervals between events of one pixel. An MP4 shows all of it, a picture per frame. With --trust the PNG
+    shows moments between frames, veiled where what the frames tell of them is in doubt.
     """
     from dase import io, show
     from dase.errors import InputError
 
-    output = output or file.with_suffix(".png")
+    output = output or file.with_suffix(".trust.png" if trust else ".png")
     suffix = output.suffix.lower()
     if suffix not in (".png", ".mp4"):
         raise InputError(f"output: must end with .png or .mp4, got '{output}'")
     if suffix == ".mp4" and at is not None:
         raise InputError("at: shows one moment, which a video cannot; leave it out or write a .png")
+    if trust and (suffix == ".mp4" or at is not None):
+        raise InputError("trust: is a picture of several moments, which takes neither --at nor .mp4")
     sequence = io.read(file, size=size)
-    if suffix == ".mp4":
+    if trust:
+        _draw_trust(sequence, output, file.stem, window)
+    elif suffix == ".mp4":
         show.video(sequence, output, window=window)
     else:
         figure = show.draw(sequence, title=file.stem, at=at, window=window)
@@ -47,3 +62,14 @@ def command(
     for name, value in show.table(show.statistics(sequence)):
         click.echo(f"{name:<18}{value}")
     click.echo(f"{'written':<18}{output}")
+
+
+def _draw_trust(sequence: Sequence, output: Path, title: str, window: float | None) -> None:
+    """Draw it, and say how much is trusted."""
+    from dase import io, trust
+
+    scene = trust.scene_of(sequence)
+    figure = trust.draw(scene, sequence.events, title=title, window=window)
+    with io.replacing(output) as temporary:
+        figure.savefig(temporary)
+    click.echo(f"{100 * scene.trusted().mean():.0f} % of pixels and times trusted")

@@ -6,12 +6,13 @@ import os
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import click
 
-from dase.cli.options import parse_size
+from dase.cli.options import effects_option, parse_size
 
 if TYPE_CHECKING:
     from dase.synth import Report
@@ -23,6 +24,7 @@ if TYPE_CHECKING:
     "--images", default="builtin", show_default=True, help="Folder, coco:ANNOTATIONS,FOLDER or builtin."
 )
 @click.option("--sensor", default="davis346", show_default=True, help="Preset or TOML file.")
+@effects_option
 @click.option("--sequences", default=10, show_default=True, help="How many sequences.")
 @click.option(
     "--size", callback=parse_size, metavar="WxH", help="Columns x rows.  [default: the sensor's, or 346x260]"
@@ -52,7 +54,9 @@ if TYPE_CHECKING:
 @click.option("--labels", is_flag=True, help="Mark events as signal, leak, shot noise or hot pixel.")
 @click.option("--backend", default="cpu", show_default=True, help="cpu or cuda.")
 @click.option(
-    "--video", type=click.Path(path_type=Path), help="Simulate this video file or folder of frames instead."
+    "--video",
+    type=click.Path(path_type=Path),
+    help="Simulate this instead: a video, a folder of frames, or a recording with frames.",
 )
 @click.option("--fps", type=float, help="Frames per second of --video.  [default: what the file says]")
 @click.option("--resume", is_flag=True, help="Finish what an interrupted run left in OUT.")
@@ -60,6 +64,7 @@ def command(
     out: Path,
     images: str,
     sensor: str,
+    effects: tuple[Path, ...],
     sequences: int,
     size: tuple[int, int] | None,
     duration: float,
@@ -82,14 +87,15 @@ def command(
     With --video, the events of your own high-speed video are written to the file OUT instead.
     """
     if video is not None:
-        _video(out, video, fps, sensor, size, seed, backend, frame_rate, labels)
+        _video(out, video, fps, sensor, effects, size, seed, backend, frame_rate, labels)
         return
     if fps is not None:
         raise click.UsageError("--fps goes with --video")
     from dase import synth
     from dase.config import dump_sensor, load_sensor
+    from dase.effect_files import known_effects
 
-    chosen = load_sensor(sensor)
+    chosen = replace(load_sensor(sensor, known_effects(effects)), history=())
     width, height = size or chosen.size or (346, 260)
     job = synth.Job(
         images=images,
@@ -104,6 +110,7 @@ def command(
         backend=backend,
         frame_rate=frame_rate,
         labels=labels,
+        effects=tuple(map(str, effects)),
     )
     count = jobs if jobs is not None else (1 if backend.startswith("cuda") else os.cpu_count() or 1)
     with _bar(sequences, "sequences") as advance:
@@ -117,6 +124,7 @@ def _video(
     video: Path,
     fps: float | None,
     sensor: str,
+    effects: tuple[Path, ...],
     size: tuple[int, int] | None,
     seed: int,
     backend: str,
@@ -126,10 +134,12 @@ def _video(
     """Simulate one video into the file `out`."""
     from dase import synth
     from dase.config import load_sensor
+    from dase.effect_files import known_effects
     from dase.sensor import sample_times
     from dase.video import open_video
 
-    scene, model = open_video(video, fps=fps, size=size), load_sensor(sensor)
+    model = load_sensor(sensor, known_effects(effects))
+    scene = open_video(video, fps=fps, size=size)
     with _bar(len(sample_times(scene, model)), "frames") as advance:
         report = synth.record_scene(
             scene,

@@ -12,6 +12,7 @@ if TYPE_CHECKING:
     from dase.config import dump_sensor as dump_sensor
     from dase.config import load_sensor as load_sensor
     from dase.diagnosis import diagnose as diagnose
+    from dase.effect_files import load_effects as load_effects
     from dase.effects import EFFECTS as EFFECTS
     from dase.effects import Effect as Effect
     from dase.errors import InputError as InputError
@@ -44,6 +45,7 @@ _HOMES = {
     "dase.comparison": ("compare",),
     "dase.config": ("dump_sensor", "load_sensor"),
     "dase.diagnosis": ("diagnose",),
+    "dase.effect_files": ("load_effects",),
     "dase.effects": ("EFFECTS", "Effect"),
     "dase.errors": ("InputError",),
     "dase.events": ("Events",),

@@ -21,6 +21,9 @@ KEPT = 16
 TOLERANCE = 0.2
 """Expected error up to which intensities are trusted [log intensity]: a usual contrast threshold."""
 
+RELATIVE = 0.5
+"""Expected error, as a share of the change between two frames, up to which intensities are trusted."""
+
 MOMENTS = np.linspace(0, 1, 9)
 """Shares of the time between two frames at which a pixel must be trusted to be trusted throughout."""
 
@@ -75,8 +78,7 @@ class CameraScene(Scene):
         self.times = 0.5 * (self.begin + self.end)
         if not np.all(np.diff(self.times) > 0):
             raise InputError("camera: the middles of exposures must increase")
-        kind = self._raw.dtype
-        white = white or (float(np.iinfo(kind).max) if kind.kind in "iu" else 1.0)
+        white = full_scale(self._raw) if white is None else float(white)
         if not (np.isfinite(gamma) and gamma > 0 and np.isfinite(white) and 0 <= black < white):
             raise InputError(
                 f"camera: needs gamma > 0 and 0 <= black < white, got {gamma:g}, {black:g} and {white:g}"
@@ -98,6 +100,7 @@ class CameraScene(Scene):
         self._matches: OrderedDict[int, Match] = OrderedDict()
         self._speed: dict[int, float] = {}
         self._loaded: tuple[Any, Any] = (None, None)
+        self._trusted: NDArray[np.bool_] | None = None
 
     def __len__(self) -> int:
         return len(self._raw)
@@ -198,29 +201,70 @@ class CameraScene(Scene):
         out = between.render_doubt(matches, doubts, chosen, place, share, where)
         return out.reshape(len(at), self.height, self.width) if pixels is None else out
 
-    def confidence(
-        self, times: ArrayLike, *, pixels: NDArray[np.int32] | None = None, tolerance: float = TOLERANCE
+    def limit(
+        self,
+        interval: int,
+        *,
+        tolerance: float = TOLERANCE,
+        relative: float = RELATIVE,
+        device: str = "cpu",
     ) -> NDArray[np.float32]:
-        """Return confidence in [0, 1]: 1 without any doubt, 1/2 where the doubt equals `tolerance`.
-
-        Shapes are those of `doubt`.
-        """
-        share = self.doubt(times, pixels=pixels) / np.float32(tolerance)
-        return np.asarray(1 / (1 + share * share))
-
-    def trusted(self, *, tolerance: float = TOLERANCE, device: str = "cpu") -> NDArray[np.bool_]:
-        """Return which pixels can be trusted all the time between two frames, shape (F - 1, height, width).
+        """Return the doubt accepted of each pixel between two frames [log intensity], (height, width).
 
         Args:
-            tolerance: Doubt that is accepted [log intensity].
+            interval: The frame before.
+            tolerance: Doubt that is accepted of every pixel [log intensity].
+            relative: Doubt that is accepted as a share of what the pixel changes by between the frames: where
+                much happens, an error that would be an event of its own may still be a small one.
             device: Warp device to compute on.
+        """
+        logs = np.log(self.frames(self._moments(interval), device) + np.float32(EPS))
+        return np.asarray(np.maximum(np.float32(tolerance), np.float32(relative) * np.ptp(logs, axis=0)))
+
+    def confidence(
+        self, times: ArrayLike, *, tolerance: float = TOLERANCE, relative: float = RELATIVE
+    ) -> NDArray[np.float32]:
+        """Return confidence, 1 without any doubt, 1/2 where it equals `limit`, (K, height, width)."""
+        place = self.interval(times)
+        limits = {
+            int(k): self.limit(int(k), tolerance=tolerance, relative=relative) for k in np.unique(place)
+        }
+        share = self.doubt(times) / np.stack([limits[int(k)] for k in place])
+        return np.asarray(1 / (1 + share * share))
+
+    def trusted(
+        self, *, tolerance: float = TOLERANCE, relative: float = RELATIVE, device: str = "cpu"
+    ) -> NDArray[np.bool_]:
+        """Return which pixels can be trusted all the time between two frames, shape (F - 1, height, width).
+
+        Options are those of `limit`.
         """
         out = np.empty((len(self.times) - 1, self.height, self.width), np.bool_)
         for k in range(len(out)):
-            gap = self.times[k + 1] - self.times[k]
-            at = np.minimum(self.times[k] + gap * MOMENTS, np.nextafter(self.times[k + 1], 0))
-            out[k] = self.doubt(at, device=device).max(0) <= tolerance
+            limit = self.limit(k, tolerance=tolerance, relative=relative, device=device)
+            out[k] = self.doubt(self._moments(k), device=device).max(0) <= limit
         return out
+
+    def trusts(self, times: NDArray[np.float64], pixels: NDArray[np.int32]) -> NDArray[np.bool_]:
+        """Return where the scene is to be trusted, as a comparison asks: never outside the scene.
+
+        Args:
+            times: Any [s], shape (K,).
+            pixels: Row-major indices, shape (N,).
+
+        Returns:
+            Whether a pixel is `trusted` in the interval a time lies in, shape (K, N).
+        """
+        if self._trusted is None:
+            self._trusted = self.trusted().reshape(len(self.times) - 1, -1)
+        at = np.clip(np.searchsorted(self.times, times, "right") - 1, 0, len(self.times) - 2)
+        inside = (times >= self.times[0]) & (times <= self.times[-1])
+        return np.asarray(self._trusted[at][:, pixels] & inside[:, None])
+
+    def _moments(self, interval: int) -> NDArray[np.float64]:
+        """Return times from a frame to just before the next [s]."""
+        begin, end = self.times[interval : interval + 2]
+        return np.asarray(np.minimum(begin + (end - begin) * MOMENTS, np.nextafter(end, begin)))
 
     def _all(self) -> NDArray[np.int32]:
         return np.arange(self.height * self.width, dtype=np.int32)
@@ -239,6 +283,11 @@ class CameraScene(Scene):
             ahead, back = (np.stack([getattr(m, name) for m in found]) for name in ("ahead", "back"))
             self._loaded = key, between.upload(frames, ahead, back, EPS, device)
         return self._loaded[1], first, (at - first).astype(np.int32), share.astype(np.float32)
+
+
+def full_scale(frames: NDArray[Any]) -> float:
+    """Return the value of intensity 1: the largest of an integer type, 1 for real numbers."""
+    return float(np.iinfo(frames.dtype).max) if frames.dtype.kind in "iu" else 1.0
 
 
 def _check(frames: NDArray[Any], begin: NDArray[np.float64], end: NDArray[np.float64]) -> None:

@@ -56,6 +56,7 @@ def compare(
     begin = time.perf_counter()
     tell = progress or (lambda text, share, error: None)
     tell("reading the measurement", 0.0, float("nan"))
+    sensor = sensor.bound_to(scene)
     evidence = gather(
         events, scene, log_eps=sensor.log_eps, trust=trust, pixels=pixels, seed=seed, device=device
     )
@@ -148,7 +149,7 @@ def _rate_curves(evidence: Evidence, half: Half) -> tuple[Curve, ...]:
             measured, simulated = (c[p, RESTING:, n] / exposure[RESTING:, n] for c in both)
             error = sigma[p, RESTING:, n] * (both[0][p, RESTING:, n] + 3) / exposure[RESTING:, n]
             out.append(
-                Curve(f"{polarity} events, {band(evidence, n)}", middle, "change of light in 16 ms [log intensity]",
+                Curve(f"{polarity} events, {band(evidence, n)}", middle, "change of light in 16 ms",
                       "events per pixel and second", measured, simulated, error)
             )  # fmt: skip
     return tuple(out)
@@ -176,6 +177,7 @@ def _lag_curves(evidence: Evidence, half: Half) -> tuple[Curve, ...]:
     sigma = half.seen.sigma[LAYOUT["lag"]].reshape(LAGS, BANDS)
     return tuple(
         Curve(f"Light before an event, {band(evidence, n)}", middle, "time before the event [ms]",
-              "change of log intensity per ms", both[0][:, n] / width, both[1][:, n] / width, sigma[:, n] / width)
+              "change of log intensity per ms", both[0][:, n] / width, both[1][:, n] / width,
+              sigma[:, n] / width)
         for n in range(BANDS)
     )  # fmt: skip

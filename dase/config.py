@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 from importlib import resources
 from pathlib import Path
 from typing import Any
 
 import tomlkit
 from tomlkit.exceptions import TOMLKitError
+from tomlkit.items import Table
 
-from dase.effects import EFFECTS, Effect
+from dase.effects import EFFECTS, Effect, find
 from dase.errors import InputError, nearest
+from dase.history import read_history
 from dase.sensor import Sensor
 
 
@@ -32,26 +35,36 @@ def load_sensor(spec: str | Path, effects: Mapping[str, type[Effect]] = EFFECTS)
     Raises:
         InputError: No such preset or file, not TOML, or a name or value that does not exist.
     """
+    sensor = parse_sensor(*read_sensor(spec), effects)
+    folder = Path(spec).parent
+    return replace(sensor, effects=tuple(effect.located(folder) for effect in sensor.effects))
+
+
+def read_sensor(spec: str | Path) -> tuple[str, str]:
+    """Return the TOML text of a preset or of a file, and what to call it in messages.
+
+    Raises:
+        InputError: No such preset or file, or it is not text.
+    """
     path = Path(spec)
     known = presets()
     if str(spec) in known:
-        return parse_sensor(known[str(spec)], f"preset '{spec}'", effects)
+        return known[str(spec)], f"preset '{spec}'"
     if not path.is_file():
         if path.suffix == ".toml":
             raise InputError(f"sensor file {path} does not exist")
         raise InputError(f"sensor '{spec}' is neither a preset nor a file: {nearest(str(spec), known)}")
     try:
-        text = path.read_text("utf-8")
+        return path.read_bytes().decode("utf-8"), str(path)  # ends of lines stay as they are
     except UnicodeDecodeError as error:
         raise InputError(f"sensor file {path} is not UTF-8 text") from error
-    return parse_sensor(text, str(path), effects)
 
 
 def parse_sensor(text: str, where: str, effects: Mapping[str, type[Effect]] = EFFECTS) -> Sensor:
     """Return the sensor that a TOML text describes.
 
     Args:
-        text: `name`, `size`, `log_eps`, and a table for each effect.
+        text: `name`, `size`, `log_eps`, a table for each effect, and the history.
         where: What the user calls the text, for messages.
         effects: Effects the text may name.
     """
@@ -73,14 +86,15 @@ def _sensor(table: dict[str, Any], effects: Mapping[str, type[Effect]]) -> Senso
             if not isinstance(value, dict):
                 raise InputError(f"'{name}' must be a table [{name}], got {value!r}")
             found.append(effects[name].from_table(value))
+        elif name == "history":
+            plain[name] = read_history(value)
         elif isinstance(value, dict):
-            raise InputError(f"there is no effect '{name}': {nearest(name, effects)}")
+            find(name, effects)  # says what there is instead
         elif name in ("name", "size", "log_eps"):
             plain[name] = value
         else:
-            raise InputError(
-                f"there is no entry '{name}': {nearest(name, ('name', 'size', 'log_eps', *effects))}"
-            )
+            known = ("name", "size", "log_eps", "history", *effects)
+            raise InputError(f"there is no entry '{name}': {nearest(name, known)}")
     if "size" in plain:
         size = plain["size"]
         if not isinstance(size, list) or len(size) != 2 or not all(type(n) is int for n in size):
@@ -102,11 +116,17 @@ def dump_sensor(sensor: Sensor) -> str:
             break
         document.add(name, value)
     for effect in sensor.effects:
-        table = tomlkit.table()
-        about = {p.name: f"{p.about} [{p.unit}]" for p in effect.parameters()}
-        about |= {name: " or ".join(among) for name, among in effect.choices().items()}
-        for name, value in sensor.table()[effect.name].items():
-            table.add(name, tomlkit.item(value).comment(about[name]))
         document.add(tomlkit.nl())
-        document.add(effect.name, table)
-    return tomlkit.dumps(document)
+        document.add(effect.name, effect_table(effect))
+    return tomlkit.dumps(document) + "".join(f"\n{entry.text()}" for entry in sensor.history)
+
+
+def effect_table(effect: Effect) -> Table:
+    """Return the table of an effect as it stands in a sensor file, with comments."""
+    table = tomlkit.table()
+    about = {p.name: f"{p.about} [{p.unit}]" for p in effect.parameters()}
+    about |= {name: " or ".join(among) for name, among in effect.choices().items()}
+    about |= effect.assets()
+    for name in effect.settings():
+        table.add(name, tomlkit.item(getattr(effect, name)).comment(about[name]))
+    return table

@@ -1,4 +1,4 @@
-"""Parameters from statistics: populations of models, a straight-line model of what they give, robust steps."""
+"""Parameters from statistics: populations of models, straight lines through what they give, robust steps."""
 
 from __future__ import annotations
 
@@ -17,8 +17,26 @@ Array = NDArray[np.float64]
 RADIUS = 0.25
 """Of the first population, in the units of `Axis.to_place`."""
 
-SMALLEST = 0.03
-"""Of the last: below it the noise of single events hides the slope."""
+LEFT = 0.25
+"""Least share of the product of slopes that is taken to be no noise."""
+
+WIDEST = 0.8
+"""Reach of any."""
+
+LONGEST = 12
+"""Populations at most."""
+
+SMALLEST = 0.01
+"""Reach of a population along an axis: below it the noise of single events hides the slope."""
+
+TIGHT = 0.3
+"""Reach along the thresholds relative to other parameters, at first: every event depends on them."""
+
+PART = 0.25
+"""Of the loss, by which a population should see it change."""
+
+LITTLE = 0.3
+"""Loss that chance alone gives."""
 
 PRIOR = 2e-3
 """Weight by which parameters that the data say nothing about are held at their start."""
@@ -59,33 +77,40 @@ def search(
         space: Free parameters.
         start: Where to begin, shape (P,).
         seed: Of the models' random numbers, and of the populations.
-        iterations: Populations.
+        iterations: Populations, not counting those that are still on the way.
         radius: Of the first.
     """
     rng = np.random.default_rng([seed, 7])
     low, high = space.bounds()
     centre = np.clip(start, low, high)
     places, tried = np.empty((0, len(centre))), np.empty((0, len(half.scale.target)))
-    best, best_loss = centre, np.inf
     slope = np.zeros((len(half.scale.target), len(centre)))
-    for _ in range(iterations):
-        population = np.clip(
-            np.concatenate([centre[None], centre + radius * _cross(rng, len(centre))]), low, high
-        )
-        values = half.run(space.sensor, space.vectors(population), seed=seed)
+    tight = np.array([axis.name.startswith("threshold.") for axis in space.axes])
+    reach = np.where(tight, TIGHT * radius, radius)
+    best_loss, left = np.inf, iterations
+    for _ in range(LONGEST if len(centre) else 0):
+        population = np.concatenate([centre[None], centre + reach * _cross(rng, len(centre))])
+        population = np.clip(population, low, high)
+        values = half.run(space, population, seed=seed)
         places, tried = np.concatenate([places, population]), np.concatenate([tried, values])
         losses = half.scale.loss(tried) + penalty(places, start)
         leader = int(np.argmin(losses))
-        improved = losses[leader] < best_loss - 1e-3 * abs(best_loss) if np.isfinite(best_loss) else True
+        improved = losses[leader] < best_loss - 1e-3 * abs(losses[leader])
         best, best_loss = places[leader], float(losses[leader])
-        near = np.abs(places - best).max(1) <= 2.5 * radius
-        slope = slopes(places[near] - best, tried[near] - tried[leader])
-        step = robust_step(half.scale, tried[leader], slope, best - start)
-        length = np.abs(step).max()
-        step *= min(1.0, 2.0 * radius / max(length, 1e-12))
-        centre = np.clip(best + step, low, high)
-        radius = max(radius * (1.0 if improved and length > radius else 0.5), SMALLEST)
-    final = half.run(space.sensor, space.vectors(centre), seed=seed)
+        near = np.all(np.abs(places - best) <= 2.5 * reach, axis=1)
+        slope = slopes((places[near] - best) / reach, tried[near] - tried[leader]) / reach
+        step, steepness = robust_step(half.scale, tried[leader], slope, best - start)
+        beyond = float(np.max(np.abs(step) / reach))
+        centre = np.clip(best + step * min(1.0, 2.0 / max(beyond, 1e-12)), low, high)
+        # as far as the loss changes by a good part of itself, along each axis
+        ideal = np.sqrt(PART * max(best_loss, LITTLE) / np.maximum(steepness, 1e-12))
+        reach = np.clip(np.clip(ideal, 0.35 * reach, 1.6 * reach), SMALLEST, WIDEST)
+        if improved and beyond > 2.0:
+            continue  # still on the way: does not count
+        left -= 1
+        if left <= 0:
+            break
+    final = half.run(space, centre, seed=seed)
     places, tried = np.concatenate([places, centre[None]]), np.concatenate([tried, final])
     losses = half.scale.loss(tried) + penalty(places, start)
     leader = int(np.argmin(losses))
@@ -116,27 +141,55 @@ def slopes(places: Array, values: Array) -> Array:
     return out
 
 
-def robust_step(scale: Scale, values: Array, slope: Array, offset: Array) -> Array:
-    """Return the step to the least robust loss of statistics that run along straight lines, shape (P,)."""
+def clean_normal(places: Array, values: Array, lines: Array, weights: Array, noise: Array) -> Array:
+    """Return the weighted product of slopes with themselves, less what noise in them adds to it, (P, P).
+
+    Slopes come from simulations whose chance differs. Left in, it would make parameters that the data hardly
+    know look well known.
+
+    Args:
+        places: Relative to the middle, shape (M, P).
+        values: Statistics in standard errors, relative to the middle, shape (M, J).
+        lines: Slopes of them, shape (J, P).
+        weights: Of the statistics, shape (J,).
+        noise: Variance of a statistic of one simulation, a bound of what chance does to `values`, (J,).
+    """
+    rest = ((values - places @ lines.T) ** 2).sum(0) / max(len(places) - places.shape[1], 1)
+    normal = lines.T @ (weights[:, None] * lines)
+    excess = (weights * np.minimum(rest, noise)).sum() * np.linalg.pinv(places.T @ places)
+    # along each direction at least LEFT of what was seen stays
+    root = np.linalg.cholesky(normal + 1e-9 * np.trace(normal) * np.eye(len(normal)))
+    inverse = np.linalg.inv(root)
+    value, axes = np.linalg.eigh(np.eye(len(normal)) - inverse @ excess @ inverse.T)
+    out: Array = root @ (axes * np.maximum(value, LEFT)) @ axes.T @ root.T
+    return out
+
+
+def robust_step(scale: Scale, values: Array, slope: Array, offset: Array) -> tuple[Array, Array]:
+    """Return the step to the least robust loss of statistics that run along straight lines, (P,).
+
+    Also what a unit along each axis, squared, adds to the loss, (P,).
+    """
     weights = scale.weights()
     z0 = scale.z(values)
     lines = np.where(scale.used[:, None], slope / scale.sigma[:, None], 0.0)
-    step = np.zeros(slope.shape[1])
+    step, normal = np.zeros(slope.shape[1]), np.zeros((slope.shape[1],) * 2)
     for _ in range(20):
         z = z0 + lines @ step
         w = weights / np.sqrt(1.0 + z * z)
         normal = lines.T @ (w[:, None] * lines) + PRIOR * np.eye(len(step))
         right = lines.T @ (w * z0) + PRIOR * offset
         new = -np.linalg.solve(normal + 1e-9 * np.trace(normal) * np.eye(len(step)), right)
-        if np.abs(new - step).max() < 1e-4:
-            return new
+        done = np.abs(new - step).max() < 1e-4
         step = new
-    return step
+        if done:
+            break
+    return step, np.diag(normal).copy()
 
 
 def screen(half: Half, space: Space, starts: Sequence[Array] | Array, *, seed: int) -> tuple[Array, Array]:
     """Return places in order of their loss, and the losses."""
     places = np.atleast_2d(np.asarray(starts))
-    losses = half.scale.loss(half.run(space.sensor, space.vectors(places), seed=seed))
+    losses = half.scale.loss(half.run(space, places, seed=seed))
     order = np.argsort(losses)
     return places[order], losses[order]

@@ -5,21 +5,18 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any
+from itertools import combinations
 
-import numpy as np
-
-from dase.candidates import Tried, apart, chance_of, open_to, try_all
+from dase.candidates import Tried, chance_of, open_to, try_all
 from dase.confidence import estimates
 from dase.effects import EFFECTS, Effect
 from dase.error import Judgement
 from dase.events import Events
 from dase.evidence import PIXELS, Evidence, gather
-from dase.model import Model, fit_present, model_of, settle
+from dase.model import Model, fit_present, free_of, model_of, settle
 from dase.results import Cell, Diagnosis, Estimate, Rank, Step, Unexplained
 from dase.scene import Scene
 from dase.sensor import Sensor
-from dase.space import value_of
 from dase.stimulus import Trust
 from dase.words import worst_cells
 
@@ -35,14 +32,26 @@ MATERIAL = 0.3
 SHARE = 0.1
 """Least share of the way to the floor."""
 
-CLOSE = 1.5
-"""A model up to this error is said to be at the floor: what is left may be significant but is not material."""
+CLOSE = 2.0
+"""A model up to this error is called at the floor: what is left may be significant but is not material."""
 
-TIE = 2.0
-"""Candidates within so many standard errors of the best are not told apart from it."""
+CLOSE_FAMILY = 3.5
+"""The same for the error of one family: what few statistics show, such as dead pixels, the mean hides."""
+
+TIE = 0.35
+"""Candidates at the floor whose held-out error is within this of the best's are not told apart from it."""
 
 MOST = 4
 """Effects that are added at most."""
+
+PAIRED = 6
+"""Candidates that are tried two at a time where one after the other is not enough."""
+
+SWAPPED = 2
+"""Alternatives to an effect that are tried in its place once all others are found."""
+
+NEARBY = 1.6
+"""Only alternatives whose held-out error was about below this, relative to the chosen one's."""
 
 Progress = Callable[[str, float, float], None]
 """Told what is being done, the share of the step done, and the present error."""
@@ -59,6 +68,10 @@ class _Search:
     given: frozenset[str]
     history: list[Step] = field(default_factory=list)
     alternatives: dict[str, list[Tried]] = field(default_factory=dict)
+    error_of: dict[str, float] = field(default_factory=dict)
+    ties: dict[str, set[str]] = field(default_factory=dict)
+    first: list[Tried] = field(default_factory=list)
+    first_fit: float = float("nan")
     error: float = float("nan")
 
     def judge(self, model: Model) -> Judgement:
@@ -107,6 +120,7 @@ def diagnose(
     """
     begin = time.perf_counter()
     sensor = sensor or Sensor()
+    sensor = sensor.bound_to(scene)
     evidence = gather(
         events, scene, log_eps=sensor.log_eps, trust=trust, pixels=pixels, seed=seed, device=device
     )
@@ -120,12 +134,21 @@ def diagnose(
         model, judgement = _pairs(search, start, model, judgement)
     if len(search.added(model)) > 1:
         model, judgement = _review(search, model, judgement)
-    return _verdict(search, start, model, judgement, errors, before, begin)
+    return _verdict(search, start, model, errors, before, begin)
 
 
 def explained(judgement: Judgement) -> bool:
-    """Whether a model is at the floor."""
-    return judgement.error <= max(judgement.gate, CLOSE)
+    """Whether a model is at the floor, altogether and in every family of probes."""
+    families = judgement.families
+    inside = (families[name] <= max(judgement.limits[name], CLOSE_FAMILY) for name in families)
+    return judgement.error <= max(judgement.gate, CLOSE) and all(inside)
+
+
+def worst_families(judgement: Judgement) -> list[str]:
+    """Return the two families that are most above their limits, if any are."""
+    families, limits = judgement.families, judgement.limits
+    above = [name for name in families if families[name] > limits[name]]
+    return sorted(above, key=lambda name: -families[name] / limits[name])[:2]
 
 
 def _greedy(search: _Search, model: Model, most: int) -> tuple[Model, Judgement, list[float]]:
@@ -155,104 +178,162 @@ def _step(search: _Search, model: Model, judgement: Judgement, more: bool) -> tu
     open_names = open_to(search.effects, model)
     if not open_names:
         return step, None
+    present = evidence.train.run(model.space, model.place, seed=seed)[0]
+    scale, base = evidence.train.scale, float(evidence.train.scale.loss(present))
+    if not search.history:
+        search.first_fit = model.loss_on(evidence.scout, seed=seed)
     tried = try_all(
-        evidence, model, search.effects, open_names, seed=seed,
+        evidence, model, search.effects, open_names, worst=worst_families(judgement), seed=seed,
         report=lambda text, share: search.progress(text, share, search.error),
     )  # fmt: skip
-    present = evidence.train.run(model.space.sensor, model.vector, seed=seed)[0]
-    p_value = chance_of(evidence, tried, repeats, present)
-    base = float(evidence.train.scale.loss(present))
-    finalists = [t for t in tried if np.isfinite(t.held)]
-    best, ties = _choose(search, finalists)
-    ranking = tuple(_rank(t, judgement, p_value(base - t.fit) if np.isfinite(t.held) else 1.0) for t in tried)
+    p_value = chance_of(scale, tried, repeats, present)
+    best, ties = _choose([t for t in tried if t.judged])
+    ranking = tuple(_rank(t, judgement, p_value(base - t.fit) if t.judged else 1.0) for t in tried)
     mine = next(rank for rank in ranking if rank.effect == best.name)
-    enough = mine.fall >= MATERIAL and mine.share >= SHARE and mine.p_value <= SIGNIFICANT
-    search.alternatives[best.name] = [t for t in finalists if t.name != best.name]
+    certain = mine.p_value <= max(SIGNIFICANT, 1.01 / (1 + len(repeats)))
+    enough = mine.fall >= MATERIAL and mine.share >= SHARE and certain
+    if not search.history:
+        search.first = sorted(tried, key=lambda t: t.scouted)
+    if enough:
+        search.alternatives[best.name] = [t for t in tried if t.judged and t.name != best.name]
+        search.error_of[best.name] = best.error
+        search.ties[best.name] = set(ties)
     step = replace(step, ranking=ranking, chosen=best.name if enough else None, ties=ties if enough else ())
-    return step, settle(evidence, best.model, seed=seed) if enough else None
+    return step, settle(evidence, best.model, seed=seed, rounds=1) if enough else None
 
 
-def _choose(search: _Search, finalists: Sequence[Tried]) -> tuple[Tried, tuple[str, ...]]:
+def _choose(finalists: Sequence[Tried]) -> tuple[Tried, tuple[str, ...]]:
     """Return the best candidate, the simplest of those that are not told apart, and the others of those."""
     first = finalists[0]
-    like = [first]
-    for other in finalists[1:]:
-        gap, error = apart(search.evidence, first.model, other.model, seed=search.seed)
-        if gap < TIE * error and other.held < 1.1 * first.held + 0.05:
-            like.append(other)
-    best = min(like, key=lambda t: (len(t.model.place), t.held))
+    reach = max(TIE, 0.1 * first.error)
+    good = first.judged is not None and explained(first.judged)
+    like = [
+        t for t in finalists
+        if t.error <= first.error + reach and t.judged and (explained(t.judged) or not good)
+    ]  # fmt: skip
+    best = min(like, key=lambda t: (len(t.model.place), t.error))
     return best, tuple(t.name for t in like if t.name != best.name)
 
 
 def _rank(tried: Tried, judgement: Judgement, p_value: float) -> Rank:
-    """Return a candidate as the user sees it; losses become errors by the unit of the present model."""
-    full = bool(np.isfinite(tried.held))
-    error = tried.held / judgement.unit
-    fall = judgement.error - error
+    """Return a candidate as the user sees it."""
+    fall = judgement.error - tried.error
     share = fall / max(judgement.error - 1.0, 1e-9)
     mine = {
         axis.name: Estimate(*(3 * (float(axis.to_value(place)),)))
         for axis, place in zip(tried.model.space.axes, tried.model.place, strict=True)
         if axis.name.split(".")[0] in tried.name.split(" + ")
     }
-    return Rank(tried.name, error, fall, min(share, 1.0), p_value, mine, full)
+    return Rank(tried.name, tried.error, fall, min(share, 1.0), p_value, mine, tried.judged is not None)
 
 
 def _pairs(search: _Search, start: Model, model: Model, judgement: Judgement) -> tuple[Model, Judgement]:
     """Where adding one after the other does not reach the floor, try two at once."""
+    evidence, seed = search.evidence, search.seed
+    singles = [t for t in search.first if t.scouted < 0.98 * search.first_fit][:PAIRED]
+    start.rebase(evidence.scout, repeats=16, seed=seed + 200)
+    pairs = list(combinations(singles, 2))
+    tried = []
+    for n, (one, two) in enumerate(pairs):
+        both = one.model.sensor.with_effect(two.model.sensor[two.name])
+        pair = _like(both, start, (one.name, two.name)).search(
+            evidence.scout, seed=seed, iterations=4, radius=0.3
+        )
+        tried.append((pair.loss, f"{one.name} + {two.name}", pair))
+        search.progress(f"trying {one.name} + {two.name}", (n + 1) / len(pairs), search.error)
+    for _, name, pair in sorted(tried, key=lambda t: t[0])[:2]:
+        pair = settle(evidence, pair, seed=seed)
+        judged = search.judge(pair)
+        if judged.error < judgement.error * (1.0 if explained(judged) else 0.8):
+            model, judgement = pair, judged
+            search.history.append(_pair_step(search.history[0], name))
     return model, judgement
 
 
+def _pair_step(first: Step, name: str) -> Step:
+    return replace(first, chosen=name, ties=(), ranking=(), cells=())
+
+
+def _like(sensor: Sensor, model: Model, more: Sequence[str]) -> Model:
+    """Return the model of a sensor with what is free in another model, and in some effects more."""
+    names = [a.name for a in model.space.axes if a.name.split(".")[0] in sensor]
+    mine = [name for effect in more for name in free_of(sensor, effect)]
+    return model_of(sensor, list(dict.fromkeys([*names, *mine])))
+
+
 def _review(search: _Search, model: Model, judgement: Judgement) -> tuple[Model, Judgement]:
-    """Drop effects that are not needed any more."""
+    """Drop effects that are not needed any more, and put simpler ones in place of others."""
     for name in search.added(model):
-        sensor = model.sensor.without(name)
-        free = [a.name for a in model.space.axes if a.name.split(".")[0] != name]
-        less = settle(search.evidence, model_of(sensor, free), seed=search.seed)
+        if len(search.added(model)) == 1:
+            break
+        less = settle(search.evidence, _like(model.sensor.without(name), model, ()), seed=search.seed)
         without = search.judge(less)
         if explained(without) or without.error <= judgement.error:
             model, judgement = less, without
+    for name in search.added(model):
+        for other in search.alternatives.get(name, [])[:SWAPPED]:
+            if (
+                other.name in model.space.sensor
+                or other.error > NEARBY * search.error_of.get(name, 0.0) + TIE
+            ):
+                continue
+            sensor = model.sensor.without(name).with_effect(other.model.sensor[other.name])
+            swapped = settle(search.evidence, _like(sensor, model, [other.name]), seed=search.seed)
+            judged = search.judge(swapped)
+            if not explained(judged):
+                continue
+            simpler = len(swapped.place) < len(model.place)
+            if simpler or not explained(judgement):
+                model, judgement = swapped, judged
+                search.ties[other.name] = {*search.ties.pop(name, set()), name} - {other.name}
+                break
+            search.ties.setdefault(name, set()).add(other.name)
     return model, judgement
 
 
 def _verdict(
-    search: _Search,
-    start: Model,
-    model: Model,
-    judgement: Judgement,
-    errors: list[float],
-    before: float,
-    begin: float,
+    search: _Search, start: Model, model: Model, errors: list[float], before: float, begin: float
 ) -> Diagnosis:
+    """Return what was found; names are announced only where they bring the error to the floor."""
     found = search.added(model)
-    order = [s.chosen for s in search.history if s.chosen in found]
-    unexplained: Unexplained | None = None
+    chosen = [n for s in search.history if s.chosen for n in s.chosen.split(" + ")]
+    order = tuple(dict.fromkeys([*(n for n in chosen if n in found), *found]))
+    model, values = estimates(search.evidence, model, seed=search.seed)
     last = search.judge(model)
-    cells = worst_cells(search.evidence, last)
-    notes = list(search.evidence.notes)
+    unexplained: Unexplained | None = None
     if not explained(last):
-        unexplained = _unexplained(search, tuple(str(n) for n in order), errors[0], last, cells)
-    values = estimates(search.evidence, model, seed=search.seed)
-    ties = {s.chosen: s.ties for s in search.history if s.chosen in found and s.ties and unexplained is None}
+        cells = worst_cells(search.evidence, last)
+        unexplained = _unexplained(search, order, errors[0], last, cells)
     kept = unexplained is None
-    path = [errors[0]] + [e for s, e in zip(search.history, errors[1:], strict=False) if s.chosen in found]
-    if kept and len(path) > 1:
-        path[-1] = last.error
+    path = _staircase(search, order, errors, last.error) if kept else [errors[0]]
+    ties = {n: tuple(sorted(search.ties.get(n, set()) - set(found))) for n in order if kept}
     return Diagnosis(
         sensor=model.sensor if kept else start.sensor,
-        selected=tuple(str(n) for n in order) if kept else (),
-        errors=tuple(path) if kept else (errors[0],),
+        selected=order if kept else (),
+        errors=tuple(path),
         before=before,
         floor=1.0,
         gate=last.gate,
         parameters=values,
-        ties={str(k): v for k, v in ties.items()},
+        ties={name: others for name, others in ties.items() if others},
         unexplained=unexplained,
         history=tuple(search.history),
-        notes=tuple(notes),
+        notes=search.evidence.notes,
         evaluations=search.evidence.evaluations,
         seconds=time.perf_counter() - begin,
     )
+
+
+def _staircase(search: _Search, order: tuple[str, ...], errors: list[float], last: float) -> list[float]:
+    """Return the error at the start and after each effect that was kept.
+
+    Effects that came in at once, or in place of another, have no error of their own on the way: it is taken
+    to fall to the last error with the first of them.
+    """
+    after = {step.chosen: e for step, e in zip(search.history, errors[1:], strict=False)}
+    path = [errors[0], *(after.get(name, last) for name in order)]
+    path[-1] = last
+    return path
 
 
 def _unexplained(
@@ -262,8 +343,8 @@ def _unexplained(
     stand_in = " and ".join(nearest) if nearest else "no effect"
     where = cells[0].sentence if cells else "no single cell stands out"
     sentence = (
-        f"unexplained: with {stand_in} an error of {last.error:.2g} is left ({100 * share:.0f} % of the error "
-        f"above the floor), which none of the effects known takes to the floor; worst: {where}"
+        f"unexplained: with {stand_in} an error of {last.error:.2g} is left ({100 * share:.0f} % of the "
+        f"error above the floor), which none of the effects known takes to the floor; worst: {where}"
     )
     return Unexplained(last.error, share, nearest, cells, sentence)
 
@@ -275,8 +356,3 @@ def summary(found: Diagnosis) -> str:
     if not found.selected:
         return f"nothing is missing: error {found.errors[0]:.2f}, repeats stay below {found.gate:.2f}"
     return f"missing: {', '.join(found.selected)}"
-
-
-def value(sensor: Sensor, name: str) -> Any:
-    """Return a parameter of a sensor."""
-    return value_of(sensor, name)

@@ -11,6 +11,9 @@ from dase.probes import LAYOUT
 
 Array = NDArray[np.float64]
 
+FAR = 4.0
+"""Standard deviations above the mean that the error of a family of a true model hardly ever reaches."""
+
 
 @dataclass(frozen=True)
 class Scale:
@@ -28,7 +31,8 @@ class Scale:
 
     def z(self, values: Array) -> Array:
         """Return differences in standard errors, 0 where nothing is compared, shape (..., J)."""
-        return np.where(self.used, (values - self.target) / self.sigma, 0.0)
+        out: Array = np.where(self.used, (values - self.target) / self.sigma, 0.0)
+        return out
 
     def weights(self) -> Array:
         """Return the weight of each statistic: families weigh alike, shape (J,)."""
@@ -37,7 +41,8 @@ class Scale:
             count = np.count_nonzero(self.used[part])
             if count:
                 out[part] = self.used[part] / count
-        return out / max(out.sum(), 1e-300)
+        out /= max(float(out.sum()), 1e-300)
+        return out
 
     def loss(self, values: Array) -> Array:
         """Return the robust distance, about 1 where the differences are chance, shape (...)."""
@@ -59,6 +64,7 @@ class Judgement:
         error: 1 is what two repeats of one measurement give, each of them off by what is of no concern.
         gate: Error that 99 of 100 repeats stay below.
         families: Error per family.
+        limits: Error per family that hardly any repeat exceeds in any family.
         z: Difference of each statistic in standard errors, shape (J,).
         unit: Robust distance that is called 1.
     """
@@ -66,6 +72,7 @@ class Judgement:
     error: float
     gate: float
     families: dict[str, float]
+    limits: dict[str, float]
     z: Array
     unit: float
 
@@ -89,11 +96,17 @@ def judge(repeats: Array, seen: Scale, chance: Scale, off: Array, *, seed: int) 
     rng = np.random.default_rng([seed, 3])
     apart = (repeats - mean) * (count / (count - 1)) + off * rng.standard_normal(repeats.shape)
     weights = chance.weights()
-    null = robust(np.where(chance.used, apart / chance.sigma, 0.0)) @ weights
+    rho = robust(np.where(chance.used, apart / chance.sigma, 0.0))
+    null = rho @ weights
     unit = float(null.mean())
     gate = max(float(np.quantile(null, 0.99)), unit + 2.6 * float(null.std()))
     families = {name: value / unit for name, value in seen.families(mean).items()}
-    return Judgement(float(seen.loss(mean)) / unit, gate / unit, families, seen.z(mean), unit)
+    limits = {}
+    for name in families:
+        part = LAYOUT[name]
+        own = rho[:, part][:, chance.used[part]].mean(1) / unit
+        limits[name] = max(float(own.max()), float(own.mean() + FAR * own.std()))
+    return Judgement(float(seen.loss(mean)) / unit, gate / unit, families, limits, seen.z(mean), unit)
 
 
 def robust(z: Array) -> Array:

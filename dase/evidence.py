@@ -3,21 +3,21 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
-from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
-from dase.error import Judgement, Scale, judge, robust
+from dase.error import Judgement, Scale, judge
 from dase.errors import InputError
 from dase.events import Events
 from dase.kernels import launch
 from dase.kernels import probes as kernels
-from dase.probes import Frame, Sums, compared, statistics, tolerance, zones
+from dase.probes import Frame, Sums, compared, peak_of, statistics, tolerance, zones
 from dase.scene import Scene
-from dase.sensor import Sensor
+from dase.space import Space
 from dase.stimulus import MASKED, Grid, Stimulus, Trust, band_edges, light_of, sort_into_cells
-from dase.trials import GROUP, Trials
+from dase.structure import Structure, find
+from dase.trials import GROUP, Trials, finer_steps
 
 PIXELS = 1500
 """Pixels in each half of the measurement."""
@@ -27,6 +27,9 @@ SCOUTS = 500
 
 SPLIT = 0.6
 """Share of the time that is fitted; the rest is held out."""
+
+FEW_REPEATS = 24
+"""Repeats of a model that needs many samples, or whose events go through a readout: both take longer."""
 
 LEAST = 300
 """Events that a half must have for anything to be said."""
@@ -64,21 +67,37 @@ class Half:
     off: Array = field(init=False)
     simulated: Array = field(init=False)
 
-    def run(self, sensor: Sensor, vectors: ArrayLike, **options: Any) -> Array:
-        """Return the statistics of models, shape (B, J)."""
-        return statistics(self.trials.run(sensor, np.atleast_2d(np.asarray(vectors)), **options), self.frame)[
-            0
+    def simulate(self, space: Space, places: Array, *, seed: int, reseed: bool = False) -> Sums:
+        """Run the models at some places, shape (B, P)."""
+        places = np.atleast_2d(places)
+        vectors = space.vectors(places)
+        if not self.trials.felt(space.sensor):
+            return self.trials.run(space.sensor, vectors, seed=seed, reseed=reseed)
+        rows = [
+            self.trials.stream(
+                space.sensor, vector, self.trials.felt(space.at(place)), seed=seed + n * reseed
+            )
+            for n, (vector, place) in enumerate(zip(vectors, places, strict=True))
         ]
+        return Sums.join(rows)
 
-    def rebase(self, sensor: Sensor, vector: ArrayLike, *, repeats: int, seed: int) -> Array:
+    def run(self, space: Space, places: Array, *, seed: int, reseed: bool = False) -> Array:
+        """Return the statistics of the models at some places, shape (B, J)."""
+        return statistics(self.simulate(space, places, seed=seed, reseed=reseed), self.frame)[0]
+
+    def slow(self, space: Space) -> bool:
+        """Whether models take many samples, or their events go through a readout."""
+        return bool(self.trials.felt(space.sensor)) or finer_steps(space.sensor, self.frame.step) > 0
+
+    def rebase(self, space: Space, place: Array, *, repeats: int, seed: int) -> Array:
         """Make a model the present one: expectations and sampling errors are its own.
 
         Returns:
             Statistics of `repeats` simulations of it with other seeds, shape (repeats, J).
         """
-        vectors = np.repeat(np.atleast_2d(np.asarray(vector)), repeats, 0)
-        sums = self.trials.run(sensor, vectors, seed=seed, reseed=True)
-        return self.take(sums)
+        repeats = min(repeats, FEW_REPEATS) if self.slow(space) else repeats
+        places = np.repeat(np.atleast_2d(place), repeats, 0)
+        return self.take(self.simulate(space, places, seed=seed, reseed=True))
 
     def take(self, sums: Sums) -> Array:
         """Make the model with these repeats the present one; return their statistics."""
@@ -88,11 +107,11 @@ class Half:
         values, _ = statistics(sums, self.frame)
         off = tolerance(target[0], events[0]) ** 2
         repeats = 2.0 * values.var(0, ddof=1)
-        used = compared(events[0])
+        used = compared(target[0], events[0])
         self.off = np.sqrt(off)
         self.chance = Scale(target[0], np.sqrt((0.5 + 0.5 / len(values)) * repeats + off), used)
         self.simulated = values.mean(0)
-        self._present = Sums(sums.sums[:1], sums.halves[:1], sums.groups[:1])
+        self._present = sums.row(0)
         scatter = self._scatter(sums)
         self.scale = Scale(target[0], np.sqrt(np.maximum(repeats, scatter) + off), used)
         # of the difference from the mean of the repeats, which has nearly no sampling error of its own
@@ -109,21 +128,11 @@ class Half:
     @property
     def groups(self) -> int:
         """Number of groups of pixels."""
-        return self.found.groups.shape[1]
+        return int(self.found.groups.shape[1])
 
     def left(self) -> Array:
-        """Return statistics of the measurement less the model, groups left out one after the other, (G, J)."""
+        """Return statistics of the measurement less the model, without one group after the other, (G, J)."""
         return self._left(self.found) - self._left(self._present)
-
-    def leave_out(self, models: list[Sums]) -> Array:
-        """Return the loss of each model with one group of pixels left out after the other, shape (M, G)."""
-        measured = self._left(self.found)
-        weights = self.scale.weights()
-        rows = [
-            robust(np.where(self.scale.used, (self._left(m) - measured) / self.scale.sigma, 0.0))
-            for m in models
-        ]
-        return np.stack([row @ weights for row in rows])
 
     def _left(self, one: Sums) -> Array:
         """Return statistics without one group of pixels after the other, shape (G, J)."""
@@ -146,6 +155,8 @@ class Evidence:
         held: Other pixels, at a later time, which judge.
         scout: Some of the pixels that are fitted, for what need not be exact.
         bands: Intensities between the bands, shape (BANDS - 1,).
+        structure: Regularities of the time stamps.
+        peak: Frequency at which the rate swings most [Hz].
         notes: What the data cannot show.
     """
 
@@ -153,6 +164,8 @@ class Evidence:
     held: Half
     scout: Half
     bands: Array
+    structure: Structure
+    peak: float
     notes: tuple[str, ...] = ()
 
     @property
@@ -208,15 +221,20 @@ def gather(
     train_grid = replace(grid, steps=cut)
     late = cell[last].copy()
     late[:, :cut] = MASKED
-    halves = []
+    structure = find(events)
+    halves: list[Half] = []
     for part, span, cells in ((first, train_grid, cell[first, :cut]), (last, grid, late)):
         stimulus = Stimulus(
             chosen[part], scene.width, scene.height, span, light[part, : span.steps], cells, log_eps, to
         )
-        halves.append(_half(stimulus, events, cut if span is grid else 0))
+        halves.append(_half(stimulus, events, cut if span is grid else 0, structure))
     _enough(halves, events, grid)
-    scout = _half(halves[0].trials.stimulus.part(SCOUTS), events, 0)
-    return Evidence(*halves, scout, bands)
+    halves.append(_half(halves[0].trials.stimulus.part(SCOUTS), events, 0, structure))
+    peak = peak_of(halves[0].found.clock[0], grid.step)
+    for half in halves:
+        half.frame = replace(half.frame, peak=peak)
+    train, held, scout = halves
+    return Evidence(train, held, scout, bands, structure, peak)
 
 
 def common_grid(events: Events, scene: Scene) -> Grid:
@@ -250,14 +268,16 @@ def _times(scene: Scene, grid: Grid) -> NDArray[np.float64]:
     return own if same else grid.times
 
 
-def _half(stimulus: Stimulus, events: Events, first: int) -> Half:
-    trials = Trials(stimulus)
+def _half(stimulus: Stimulus, events: Events, first: int, structure: Structure) -> Half:
+    trials = Trials(stimulus, structure=structure)
     trials.middle = typical_changes(trials.look(events))
     found = trials.look(events)
     seconds = stimulus.grid.step * (stimulus.grid.steps - first)
     expected = np.zeros((len(stimulus.pixels), kernels.HALVES))
     zone = zones(stimulus.pixels, stimulus.width, stimulus.height)
-    return Half(trials, found, Frame(expected, zone, seconds))
+    regular = structure.step > 0 or structure.line > 0
+    frame = Frame(expected, zone, seconds, first, stimulus.grid.step, regular=regular)
+    return Half(trials, found, frame)
 
 
 def typical_changes(sums: Sums) -> NDArray[np.float32]:
@@ -270,8 +290,9 @@ def _enough(halves: list[Half], events: Events, grid: Grid) -> None:
     for half, name in zip(halves, ("fitting", "judging"), strict=True):
         count = int(half.found.halves.sum())
         if count < LEAST:
+            times = max(2.0, np.ceil(LEAST / max(count, 1)))
             raise InputError(
                 f"too few events to say anything: {count} of the {len(events)} lie in the part for {name}, "
-                f"at least {LEAST} are needed; record about {max(2.0, np.ceil(LEAST / max(count, 1))):.0f} times "
+                f"at least {LEAST} are needed; record about {times:.0f} times "
                 f"as long as these {grid.step * (grid.steps - 1):.3g} s, or more motion"
             )

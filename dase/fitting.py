@@ -25,10 +25,10 @@ REPEATS = 60
 OTHERS = 2
 """Starts beside the wide look at thresholds."""
 
-AGREE = 1.5
+AGREE = 3.0
 """Starts agree where their ends lie within so many half-widths of the confidence interval, or `NEAR`."""
 
-NEAR = 0.03
+NEAR = 0.08
 """Of each other, in the units of `Axis.to_place`."""
 
 
@@ -63,6 +63,7 @@ def fit(
     begin = time.perf_counter()
     tell = progress or (lambda text, share, error: None)
     model_of(sensor, free)  # refuses names that are not there before anything takes time
+    sensor = sensor.bound_to(scene)
     evidence = gather(
         events, scene, log_eps=sensor.log_eps, trust=trust, pixels=pixels, seed=seed, device=device
     )
@@ -77,8 +78,9 @@ def fit(
     judged = [(m.judge(evidence.held, repeats=REPEATS, seed=seed + 500), m) for m in ends]
     judgement, model = min(judged, key=lambda pair: pair[0].error)
     tell("confidence intervals", 0.9, judgement.error)
-    values = estimates(evidence, model, seed=seed)
-    good = [m for j, m in judged if j.error < judgement.error + 0.1]
+    good = [m for j, m in judged if j.error < max(1.25 * judgement.error, judgement.error + 0.25)]
+    model, values = estimates(evidence, model, seed=seed)
+    judgement = model.judge(evidence.held, repeats=REPEATS, seed=seed + 500)
     apart = disagreements(model, good, values)
     notes = [*evidence.notes, *apart, *outside(model)]
     if len(good) < 2:

@@ -85,13 +85,12 @@ def _tones(*frames: Map) -> list[NDArray[np.uint8]]:
 
 def _ways(first: NDArray[np.uint8], second: NDArray[np.uint8]) -> Map:
     """Return the way of each pixel from one frame to another [px], shape (H, W, 2)."""
+    quick = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM).calc(first, second, None)
     flow = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
-    # the preset stops at half the resolution; going on, on a finer grid of patches, costs little
-    flow.setFinestScale(0)
+    flow.setFinestScale(0)  # the presets stop at half the resolution
     flow.setPatchStride(2)
-    way = flow.calc(first, second, None)
-    # begun anew from what most of the picture does: repeated textures then match the right repetition
-    way = flow.calc(first, second, _dominant(way))
+    # begun from what most of the picture does: repeated textures then match the right repetition
+    way = flow.calc(first, second, _dominant(quick))
     # blending over the shortest ways is as exact as following them, and rest is cheap to render
     way[np.hypot(way[..., 0], way[..., 1]) < REST] = 0
     return np.asarray(way)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -42,8 +43,8 @@ def open_measurement(recording: Path, scene: str = "frames", video: Path | None 
 
     Args:
         recording: File of events.
-        scene: `frames` for the recording's own, `static` for light that does not change, `video` for the frames
-            of a file, or the path of that file.
+        scene: `frames` for the recording's own, `static` for light that does not change, `video` for the
+            frames of a file, or the path of that file.
         video: The file of `video`.
 
     Raises:
@@ -107,16 +108,17 @@ def open_clip(path: Path) -> VideoScene:
     return VideoScene(linear(frames, path), times)
 
 
-def linear(frames: NDArray[np.generic], path: Path) -> NDArray[np.float32]:
+def linear(frames: NDArray[Any], path: Path) -> NDArray[np.float32]:
     """Return frames as intensities in [0, 1]; whole numbers are shares of the largest their type holds."""
     if frames.dtype.kind == "u":
-        return frames.astype(np.float32) / np.float32(np.iinfo(frames.dtype).max)
+        shares: NDArray[np.float32] = frames.astype(np.float32) / np.float32(np.iinfo(frames.dtype).max)
+        return shares
     out = frames.astype(np.float32)
     bad = ~np.isfinite(out) | (out < 0)
     if bad.any():
         first = int(np.argwhere(bad)[0][0])
         raise InputError(
-            f"scene {path}: frame {first} has {int(bad[first].sum())} values that are negative or no numbers; "
+            f"scene {path}: frame {first} has {int(bad[first].sum())} values below 0 or not numbers; "
             "intensities must be finite and >= 0"
         )
     return out

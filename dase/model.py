@@ -50,14 +50,9 @@ class Model:
         """The sensor at the place."""
         return self.space.at(self.place)
 
-    @property
-    def vector(self) -> NDArray[np.float32]:
-        """The parameter vector, shape (1, all parameters)."""
-        return self.space.vectors(self.place)
-
     def rebase(self, half: Half, *, repeats: int, seed: int) -> Array:
         """Make this the present model of a half; return statistics of its repeats, shape (repeats, J)."""
-        return half.rebase(self.space.sensor, self.vector, repeats=repeats, seed=seed)
+        return half.rebase(self.space, self.place, repeats=repeats, seed=seed)
 
     def judge(self, half: Half, *, repeats: int, seed: int) -> Judgement:
         """Make this the present model of a half and return its error there."""
@@ -65,7 +60,7 @@ class Model:
 
     def loss_on(self, half: Half, *, seed: int) -> float:
         """Return the robust distance by the sampling errors of the present model of the half."""
-        return float(half.scale.loss(half.run(self.space.sensor, self.vector, seed=seed))[0])
+        return float(half.scale.loss(half.run(self.space, self.place, seed=seed))[0])
 
     def search(self, half: Half, *, seed: int, iterations: int = 4, radius: float = 0.2) -> Model:
         """Return the model with its parameters improved."""
@@ -129,12 +124,16 @@ def _threshold_starts(model: Model) -> Array:
     return out
 
 
+def free_of(sensor: Sensor, name: str) -> list[str]:
+    """Return the names of the parameters of an effect that a fit may change; there may be none."""
+    return [axis.name for axis in axes_of(sensor) if axis.name.split(".")[0] == name]
+
+
 def added(present: Model, effect: Effect) -> Model:
     """Return the present model with an effect added, all of whose parameters are free."""
     sensor = present.sensor.with_effect(effect)
     old = [axis.name for axis in present.space.axes]
-    mine = [axis.name for axis in axes_of(sensor, [effect.name])]
-    return model_of(sensor, [*old, *mine])
+    return model_of(sensor, [*old, *free_of(sensor, effect.name)])
 
 
 def starts(model: Model, effect: Effect, *, few: bool = False) -> Array:
@@ -160,6 +159,8 @@ def _tried(axis: Axis, present: float) -> list[float]:
     low, high = (float(axis.to_place(v)) for v in axis.fact.plausible)
     if axis.main:
         return list(low + (high - low) * np.linspace(FEW_STARTS, 1 - FEW_STARTS, 6))
+    if axis.fact.unit == "turns":
+        return list(np.linspace(-1, 0, 8, endpoint=False) + 1.0)
     if axis.name.split(".")[1] in ("dark", "slope", "damping", "knee", "rate", "cutoff"):
         return [present, low + 0.9 * (high - low)]
     return [present]

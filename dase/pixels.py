@@ -11,8 +11,8 @@ from numpy.typing import ArrayLike, NDArray
 from dase.errors import InputError
 from dase.events import Events
 from dase.kernels import counts as counting
+from dase.kernels import emission, launch, pixel
 from dase.kernels import events as ordering
-from dase.kernels import launch, pixel
 from dase.kernels.random import stream
 from dase.scene import Scene
 
@@ -71,10 +71,8 @@ class Pixels:
             raise InputError(f"pixels must be indices of the {width}x{height} sensor, shape (N,), N >= 1")
         self.batch, self.count = len(vectors), len(self.pixels)
         self._pixels = wp.array(self.pixels, dtype=int, device=self.device)
-        self._places = tuple(
-            wp.array(a.astype(np.uint16), dtype=wp.uint16, device=self.device)
-            for a in (self.pixels % width, self.pixels // width)
-        )
+        xy = self.pixels % width + (self.pixels // width << 16)
+        self._xy = wp.array(xy.astype(np.uint32), dtype=wp.uint32, device=self.device)
         self._parameters = wp.array(vectors, dtype=float, device=self.device)
         self.sink = "labels" if labels else "keys"
         shape = (len(pixel.states(self.stages, self.sink)), self.batch, self.count)
@@ -86,6 +84,7 @@ class Pixels:
         self.slab = 256 if self.device.is_cuda else 2048
         self._capacity = 4 * self.slab
         self._buffer: Any = None  # of keys, kept from chunk to chunk
+        self._room = ordering.Room()
         # nothing but a change detector: counted by a kernel of its own, several pixels per thread
         self._plain = all(stage == "threshold" for effect in self.stages for stage, _ in effect.functions)
         self._vectors = vectors
@@ -93,6 +92,7 @@ class Pixels:
         lit = any(stage == "light" for effect in self.stages for stage, _ in effect.functions)
         self._logs_at_once = self.device.is_cpu and not lit and bool(np.all(vectors[:, 3] == vectors[0, 3]))
         self._levels: Any = None
+        self._mapped: list[Any] | None = None
         self._bits = max((self.batch * self.count - 1).bit_length(), 1)
         self._low = 3 if labels else 1
         delays = any(stage == "delay" for effect in self.stages for stage, _ in effect.functions)
@@ -130,35 +130,51 @@ class Pixels:
 
     def _count(self, out: Any, scene: Scene, times: NDArray[np.float64], windows: NDArray[np.int32]) -> None:
         """Count with nothing but thresholds."""
+        self.look_at(scene)
         self._edges(times)
         name, source = self.sensor.seen(scene).source(times, self.pixels, self.device)
-        on, off, phase, eps = self._vectors[:, :4].T
-        level = self._thresholds_of_pixels()
-        epses = wp.array(eps, dtype=float, device=self.device)
-        memory, signal = self._state[1], self._state[0]
-        first = max(2 - self.samples, 0)
-        if first:
-            memory, signal = self._next[1], self._next[0]
-            inputs = [
-                source, self._pixels, self.width, self.samples, len(times), self.seed,
-                stream("initial_phase"), level, epses, wp.array(phase, dtype=float, device=self.device),
-                self._state[0], memory, signal,
-            ]  # fmt: skip
-            launch.run(counting.start(name), self.count, inputs, self.device, batch=self.batch)
-            first, memory = first - 1, wp.clone(memory)
+        first, memory, _ = self._begin(name, source, len(times))
         if first >= len(times):
             out.zero_()
             return
         lanes = counting.widest(self.count, self.device, name)
-        mapped = level.shape[2] > 1
-        shared = not mapped and bool(np.all(on == off))
-        kernel = counting.count(lanes, name, shared=shared, mapped=mapped, states=True)
-        run, window = self._runs(windows)
+        level, eps = self._thresholds_of_pixels()
+        shared = level.shape[2] == 1 and bool(np.all(self._vectors[:, 0] == self._vectors[:, 1]))
+        kernel = counting.count(lanes, name, shared=shared, states=True)
         inputs = [
-            source, 0, self._pixels, self.count, self.width, first, level, epses, run, window, memory,
+            source, 0, self._pixels, self.count, self.width, first, level, eps, *self._runs(windows), memory,
             self._next[1], self._next[0], out,
         ]  # fmt: skip
         launch.run(kernel, counting.blocks(self.count, lanes), inputs, self.device, batch=self.batch)
+
+    def _begin(self, name: str, source: Any, samples: int) -> tuple[int, Any, Any]:
+        """Return the first sample to compare, and memories and signals before it."""
+        first = max(2 - self.samples, 0)
+        if not first:
+            return 0, self._state[1], self._state[0]
+        level, eps = self._thresholds_of_pixels()
+        inputs = [
+            source, self._pixels, self.width, self.samples, samples, self.seed, stream("initial_phase"),
+            level, eps, wp.array(self._vectors[:, 2], dtype=float, device=self.device), self._state[0],
+            self._next[1], self._next[0],
+        ]  # fmt: skip
+        launch.run(counting.start(name), self.count, inputs, self.device, batch=self.batch)
+        # blocks may overlap, so what they read must not be what they write
+        return first - 1, wp.clone(self._next[1]), wp.clone(self._next[0])
+
+    def _emit(self, sink: Any, scene: Scene, times: NDArray[np.float64]) -> None:
+        """Emit with nothing but thresholds."""
+        self.look_at(scene)
+        clock = self._clock(times, np.zeros(len(times), np.int32))
+        name, source = self.sensor.seen(scene).source(times, self.pixels, self.device)
+        first, memory, signal = self._begin(name, source, len(times))
+        lanes = counting.widest(self.count, self.device, name)
+        inputs = [
+            source, clock, self._pixels, self.count, self.width, first, *self._thresholds_of_pixels(),
+            memory, signal, self._next[1], self._next[0], sink,
+        ]  # fmt: skip
+        size, align = counting.blocks(self.count, lanes), self.slab // lanes
+        launch.run(emission.emit(lanes, name), size, inputs, self.device, batch=self.batch, align=align)
 
     def emit(self, scene: Scene, times: NDArray[np.float64]) -> tuple[Events, NDArray[np.int32] | None]:
         """Advance over `times` and return the events that leave the pixels, and for a batch the row of each.
@@ -179,7 +195,7 @@ class Pixels:
         keys, used = self._keys(scene, times)
         top = self._bits + self._low + longest.bit_length()
         self._advance(times)
-        found = ordering.ordered(keys, used, self._bits, self._low, top, self.device, self._late)
+        found = ordering.ordered(keys, used, self._bits, self._low, top, self.device, self._late, self._room)
         events, row = self._decode(found, begin)
         if self._late is None:
             return events, row
@@ -204,26 +220,44 @@ class Pixels:
             sink.keys = self._buffer
             sink.used = wp.zeros((self.batch, slabs), dtype=int, device=self.device)
             sink.slab, sink.bits, sink.low = self.slab.bit_length() - 1, self._bits, self._low
-            self._launch(self.sink, sink, scene, times, np.zeros(len(times), np.int32), align=self.slab)
+            if self._plain and self.device.is_cpu:
+                self._emit(sink, scene, times)
+            else:
+                self._launch(self.sink, sink, scene, times, np.zeros(len(times), np.int32), align=self.slab)
             used = sink.used.numpy()
             if used.max() <= self._capacity:
                 return sink.keys, used
             self._capacity = int(1.25 * used.max()) + 1
 
+    def look_at(self, scene: Scene) -> None:
+        """Work out what pixels owe to the scene, once; it is done before the first sample in any case."""
+        if self._mapped is None:
+            self._mapped = self.sensor.bound_to(scene).maps(self.pixels, self.device)
+
+    def _maps(self) -> list[Any]:
+        return self.sensor.maps(self.pixels, self.device) if self._mapped is None else self._mapped
+
     def thresholds(self) -> NDArray[np.float32]:
-        """Return the thresholds of each pixel [log intensity], shape (B, 2, N): OFF, ON."""
-        level = self._thresholds_of_pixels().numpy()
+        """Return the thresholds of each pixel [log intensity], shape (B, 2, N): OFF, ON.
+
+        Where they depend on the scene, `look_at` it first.
+        """
+        level = self._thresholds_of_pixels()[0].numpy()
         return np.array(np.broadcast_to(level, (self.batch, 2, self.count)))
 
-    def _thresholds_of_pixels(self) -> Any:
-        """Return thresholds, Warp array of shape (B, 2, N), or (B, 2, 1) where all pixels have the same."""
-        if self._levels is None and not any(effect.functions for effect in self.stages):
-            self._levels = wp.array(self._vectors[:, 1::-1, None].copy(), dtype=float, device=self.device)
-        elif self._levels is None:
+    def _thresholds_of_pixels(self) -> tuple[Any, Any]:
+        """Return thresholds, of shape (B, 2, N), or (B, 2, 1) where all are the same, and log_eps, (B,)."""
+        if self._levels is not None:
+            return self._levels
+        if not any(effect.functions for effect in self.stages):
+            level = wp.array(self._vectors[:, 1::-1, None].copy(), dtype=float, device=self.device)
+        else:
             kernel = pixel.compose_thresholds(self.stages)
-            self._levels = wp.empty((self.batch, 2, self.count), dtype=float, device=self.device)
-            inputs = [self._pixels, self.width, self.height, self.seed, self._parameters, self._levels]
+            level = wp.empty((self.batch, 2, self.count), dtype=float, device=self.device)
+            inputs = [self._pixels, self.width, self.height, self.seed, self._parameters]
+            inputs += [*self._maps(), level]
             launch.run(kernel, self.count, inputs, self.device, batch=self.batch)
+        self._levels = level, wp.array(self._vectors[:, 3], dtype=float, device=self.device)
         return self._levels
 
     def _launch(
@@ -235,6 +269,7 @@ class Pixels:
         windows: NDArray[np.int32],
         align: int,
     ) -> None:
+        self.look_at(scene)
         source_name, source = self.sensor.seen(scene).source(times, self.pixels, self.device)
         if source_name == "frames" and self._logs_at_once:
             source_name, source.logs = "both", self._logs(source.values)
@@ -242,7 +277,7 @@ class Pixels:
         clock = self._clock(times, windows)
         inputs = [
             source, clock, self._pixels, self.width, self.height, self.samples, self.seed,
-            self._parameters, self._state, self._next, sink,
+            self._parameters, *self._maps(), self._state, self._next, sink,
         ]  # fmt: skip
         launch.run(kernel, self.count, inputs, self.device, batch=self.batch, align=align)
 
@@ -304,7 +339,7 @@ class Pixels:
         row = wp.empty(n if self.batch > 1 else 0, dtype=int, device=to)
         label = wp.empty(n if self.sink == "labels" else 0, dtype=wp.int8, device=to)
         inputs = [
-            keys, self._bits, self._low, self.count, *self._places,
+            keys, self._bits, self._low, self.count, self._xy,
             wp.int64(round(begin * 1e9)), each, *out, row, label,
         ]  # fmt: skip
         launch.run(ordering.decode, -(-n // each), inputs, to)

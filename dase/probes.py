@@ -1,16 +1,18 @@
 """Summary statistics of events with a physical reading, and what they are called.
 
-`dase.kernels.probes` adds up numbers event by event; here the sums become statistics that model and measurement
-are compared by. Each belongs to a family, a row of `FAMILIES`.
+`dase.kernels.probes` adds up numbers event by event; here the sums become statistics by which model and
+measurement are compared. Each belongs to a family, a row of `FAMILIES`.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.fft import rfft
+from scipy.ndimage import median_filter
 
 from dase.kernels.probes import (
     BANDS,
@@ -36,6 +38,8 @@ FAMILIES = {
     "spread": "how differently pixels count that see the same",
     "pixels": "pixels far off the others: silent ones, busy ones",
     "space": "events by the distance from the middle of the sensor",
+    "spectrum": "how fast the rate of all pixels swings",
+    "stamps": "regularities of the time stamps; compared only where the measurement has one",
 }
 """Families of statistics, each with the weight of all others."""
 
@@ -51,6 +55,12 @@ SHRINK = 3.0
 ZONES = 4
 """Rings about the middle of the sensor, of equal numbers of pixels."""
 
+TONES = 12
+"""Bands of frequency, from `LOWEST` to half the sampling rate."""
+
+LOWEST = 8.0
+"""[Hz]"""
+
 Array = NDArray[np.float64]
 
 
@@ -62,11 +72,26 @@ class Sums:
         sums: Over all pixels, shape (B, SIZE).
         halves: Counts of each pixel, shape (B, N, HALVES).
         groups: Over groups of neighbours in the list of pixels, shape (B, G, SIZE).
+        clock: OFF and ON events of each step of time, shape (B, 2 T).
+        teams: The same of groups of pixels, shape (B, G, 2 T).
+        stamps: Shares of events that follow regularities of the time stamps, shape (B, 2).
     """
 
     sums: Array
     halves: NDArray[np.float32]
     groups: NDArray[np.float32]
+    clock: NDArray[np.int64]
+    teams: NDArray[np.int32]
+    stamps: Array
+
+    @classmethod
+    def join(cls, parts: Sequence[Sums]) -> Sums:
+        """Return the rows of all parts."""
+        return cls(*(np.concatenate([getattr(p, f.name) for p in parts]) for f in fields(cls)))
+
+    def row(self, n: int) -> Sums:
+        """Return one row."""
+        return Sums(*(getattr(self, f.name)[n : n + 1] for f in fields(Sums)))
 
     def without(self, pixels: NDArray[np.int64]) -> Sums:
         """Return the first row without one group after the other, shape (G, ...).
@@ -76,7 +101,10 @@ class Sums:
         """
         count = self.groups.shape[1]
         kept = np.arange(count)[:, None] != pixels
-        return Sums(self.sums[0] - self.groups[0], self.halves[0] * kept[..., None], self.groups[:0])
+        return Sums(
+            self.sums[0] - self.groups[0], self.halves[0] * kept[..., None], self.groups[:0],
+            self.clock[0] - self.teams[0], self.teams[:0], np.repeat(self.stamps[:1], count, 0),
+        )  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -89,11 +117,19 @@ class Frame:
         measured: Statistics of the measurement, which means of a model with few events are drawn to,
             shape (J,); None to work them out.
         seconds: Time that is compared [s].
+        first: Step of the grid at which it begins.
+        step: Of the grid [s].
+        peak: Frequency at which the measured rate swings most [Hz].
+        regular: Whether the time stamps of the measurement follow a regularity.
     """
 
     expected: Array
     zone: NDArray[np.int64]
     seconds: float
+    first: int = 0
+    step: float = 1e-3
+    peak: float = 0.0
+    regular: bool = False
     measured: Array | None = None
 
 
@@ -107,6 +143,8 @@ def _layout() -> dict[str, slice]:
         "spread": 10,
         "pixels": 4,
         "space": 4 * ZONES,
+        "spectrum": TONES + 2,
+        "stamps": 2,
     }
     ends = np.cumsum(list(sizes.values()))
     return {
@@ -125,7 +163,8 @@ def zones(pixels: NDArray[np.int32], width: int, height: int) -> NDArray[np.int6
     """Return the ring that each pixel lies in, shape (N,)."""
     x, y = pixels % width - 0.5 * (width - 1), pixels // width - 0.5 * (height - 1)
     radius = np.hypot(x, y)
-    return np.searchsorted(np.quantile(radius, np.arange(1, ZONES) / ZONES), radius)
+    out: NDArray[np.int64] = np.searchsorted(np.quantile(radius, np.arange(1, ZONES) / ZONES), radius)
+    return out
 
 
 def statistics(found: Sums, frame: Frame) -> tuple[Array, Array]:
@@ -145,6 +184,8 @@ def statistics(found: Sums, frame: Frame) -> tuple[Array, Array]:
         _spread(found.halves, frame.expected),
         _counts(_odd_pixels(found.halves, frame)),
         _counts(_by_zone(found.halves, frame.zone)),
+        _spectrum(found.clock, frame),
+        (found.stamps, np.full(found.stamps.shape, 1e9 if frame.regular else 0.0)),
     ]
     values = np.concatenate([value for value, _ in parts], axis=1)
     weight = np.concatenate([events for _, events in parts], axis=1)
@@ -179,35 +220,72 @@ def _changes(pairs: Array, serial: Array) -> tuple[Array, Array]:
 def _spread(halves: NDArray[np.float32], expected: Array) -> tuple[Array, Array]:
     """Split-half covariances over pixels of what is not expected, and Fano factors."""
     # state (moving, rest), half, polarity
-    n = halves.reshape(*halves.shape[:2], 2, 2, 2).astype(np.float64)
+    d = (halves - expected.astype(np.float32)).reshape(*halves.shape[:2], 2, 2, 2)
     e = expected.reshape(-1, halves.shape[1], 2, 2, 2)
-    d = n - e
-    off, on = d[..., 0], d[..., 1]
     total = np.maximum(e.sum((1, 3)), 1.0)  # (B or 1, state, polarity)
     both = np.sqrt(total[..., 0] * total[..., 1])
-    same = (d[:, :, :, 0] * d[:, :, :, 1]).sum(1) * 2 / total
-    cross = (off[..., 0] * on[..., 1] + off[..., 1] * on[..., 0]).sum(1) / both
-    fano = (d.sum(3) ** 2).sum(1) / total
-    values = np.concatenate([same, cross[..., None], fano], -1).reshape(len(n), -1)
+    a, b = d[:, :, :, 0], d[:, :, :, 1]  # the halves
+    products = np.einsum("bnsp,bnsq->bspq", a, b, optimize=True).astype(np.float64)
+    own = sum(np.einsum("bnsp,bnsp->bsp", x, x, optimize=True) for x in (a, b)).astype(np.float64)
+    diagonal = np.stack([products[..., 0, 0], products[..., 1, 1]], -1)
+    same = diagonal * 2 / total
+    cross = (products[..., 0, 1] + products[..., 1, 0]) / both
+    fano = (own + 2 * diagonal) / total
+    values = np.concatenate([same, cross[..., None], fano], -1).reshape(len(halves), -1)
     events = np.concatenate([total, both[..., None], total], -1).reshape(len(e), -1)
     return values, np.broadcast_to(events, values.shape)
 
 
 def _odd_pixels(halves: NDArray[np.float32], frame: Frame) -> Array:
     """Numbers of pixels that are silent, and of those that are busy at rest or altogether."""
-    rest, rest_e = halves[:, :, 4:].sum(2), frame.expected[..., 4:].sum(-1)
-    all_, all_e = halves.sum(2), frame.expected.sum(-1)
-    silent = (all_ == 0) & (all_e >= 6)
-    busy = rest > rest_e + 4 * np.sqrt(rest_e + 1) + 2
-    busier = rest > rest_e + 4 * np.sqrt(rest_e + 1) + 15 * frame.seconds
-    much = all_ > 3 * all_e + 20
-    return np.stack([silent.sum(1), busy.sum(1), busier.sum(1), much.sum(1)], 1).astype(np.float64)
+    rest, rest_e = halves[..., 4:].sum(-1), frame.expected[..., 4:].sum(-1).astype(np.float32)
+    all_, all_e = halves.sum(-1), frame.expected.sum(-1).astype(np.float32)
+    bound = rest_e + 4 * np.sqrt(rest_e + 1)
+    odd = (
+        (all_ == 0) & (all_e >= 6), rest > bound + 2, rest > bound + np.float32(15 * frame.seconds),
+        all_ > 3 * all_e + 20,
+    )  # fmt: skip
+    return np.stack([np.count_nonzero(o, axis=1) for o in odd], 1).astype(np.float64)
 
 
 def _by_zone(halves: NDArray[np.float32], zone: NDArray[np.int64]) -> Array:
-    state = halves.reshape(*halves.shape[:2], 2, 2, 2).sum(3).reshape(*halves.shape[:2], 4)
-    rings = [state[:, zone == ring].sum(1) for ring in range(ZONES)]
-    return np.stack(rings, 2).reshape(len(halves), -1).astype(np.float64)
+    ring = (zone[:, None] == np.arange(ZONES)).astype(np.float32)
+    state = np.matmul(halves.transpose(0, 2, 1), ring).reshape(len(halves), 2, 2, 2, ZONES)
+    out: Array = state.sum(2).reshape(len(halves), -1).astype(np.float64)
+    return out
+
+
+def _spectrum(clock: NDArray[np.int64], frame: Frame) -> tuple[Array, Array]:
+    """Logarithms of the power of the net rate in bands of frequency, and its swing at the measured peak."""
+    steps = clock.shape[1] // 2
+    off, on = clock[:, frame.first : steps], clock[:, steps + frame.first :]
+    net = (on - off).astype(np.float32)
+    total = np.maximum((on + off).sum(1), 1)
+    net -= net.mean(1, keepdims=True)
+    count = net.shape[1]
+    power = np.abs(rfft(net * np.hanning(count).astype(np.float32), axis=1)) ** 2 / count
+    frequency = np.fft.rfftfreq(count, frame.step)
+    edges = np.geomspace(LOWEST, 0.5 / frame.step, TONES + 1)
+    inside = np.searchsorted(edges, frequency)[:, None] == np.arange(1, TONES + 1)
+    bands = power @ (inside / np.maximum(inside.sum(0), 1)).astype(np.float32)
+    turn = 2 * np.pi * frame.peak * frame.step * (frame.first + np.arange(count))
+    swing = net @ np.stack([np.cos(turn), -np.sin(turn)], 1).astype(np.float32) / total[:, None]
+    values = np.concatenate([np.log(bands + 0.5), swing], 1).astype(np.float64)
+    return values, np.repeat(total[:, None], values.shape[1], 1).astype(np.float64)
+
+
+def peak_of(clock: NDArray[np.int64], step: float) -> float:
+    """Return the frequency at which the net rate swings most above what is usual about it [Hz]."""
+    steps = clock.shape[-1] // 2
+    net = (clock[..., steps:] - clock[..., :steps]).reshape(-1).astype(np.float64)
+    net -= net.mean()
+    size = 8 * steps
+    power = np.abs(np.fft.rfft(net * np.hanning(steps), size)) ** 2
+    frequency = np.fft.rfftfreq(size, step)
+    usual = median_filter(power, 8 * 25, mode="nearest")
+    above = power / (usual + 1e-3 * power.max() + 1e-9)
+    above[(frequency < 20.0) | (frequency > 0.48 / step)] = 0.0
+    return float(frequency[int(above.argmax())])
 
 
 def _is_mean() -> NDArray[np.bool_]:
@@ -222,7 +300,7 @@ MEANS = _is_mean()
 
 
 def tolerance(measured: Array, events: Array) -> Array:
-    """Return what each statistic may be off by, because it is of no concern or a matter of one event, (J,)."""
+    """Return what each statistic may be off by: it is of no concern, or a matter of one event, (J,)."""
     out = TOLERANCE + 1.0 / (events + 3.0)
     lag = np.abs(measured[LAYOUT["lag"]]).reshape(LAGS, BANDS)
     scale = np.repeat(lag.max(0)[None], LAGS, 0).reshape(-1)
@@ -232,16 +310,18 @@ def tolerance(measured: Array, events: Array) -> Array:
     out[LAYOUT["change"]] *= np.maximum(change, typical)
     out[LAYOUT["change"]][-CLASSES:] *= typical
     out[LAYOUT["repeats"]] *= np.maximum(measured[LAYOUT["repeats"]], 0.1)
+    out[LAYOUT["spectrum"]] = 0.1
+    out[LAYOUT["spectrum"]][TONES:] = 0.005
+    out[LAYOUT["stamps"]] = 0.02
     out[LAYOUT["spread"]] = 0.01 * np.maximum(1.0, np.abs(measured[LAYOUT["spread"]]))
     return out
 
 
-def compared(events: Array) -> NDArray[np.bool_]:
+def compared(measured: Array, events: Array) -> NDArray[np.bool_]:
     """Return which statistics rest on enough events of the measurement to be compared, (J,)."""
     out = np.ones(SIZE, np.bool_)
     out[MEANS] = events[MEANS] >= FEW
     out[LAYOUT["spread"]] = events[LAYOUT["spread"]] >= FEW
+    out[LAYOUT["spectrum"]] = events[LAYOUT["spectrum"]] >= 10 * FEW
+    out[LAYOUT["stamps"]] = (events[LAYOUT["stamps"]] > 0) & (measured[LAYOUT["stamps"]] > 0)
     return out
-
-
-Describe = Callable[[int], str]

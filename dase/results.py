@@ -4,12 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from dase.sensor import Sensor
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 
 @dataclass(frozen=True)
@@ -102,6 +105,12 @@ class Comparison:
     notes: tuple[str, ...] = ()
     seconds: float = 0.0
 
+    def plot(self) -> Figure:
+        """Return the figure of the error per family of probes, with its caption."""
+        from dase import report
+
+        return report.comparison_plates(self)[0].alone()
+
     def to_json(self) -> dict[str, Any]:
         """Return the numbers as JSON objects; figures are left out."""
         return {
@@ -144,6 +153,12 @@ class Fit:
     notes: tuple[str, ...] = ()
     evaluations: int = 0
     seconds: float = 0.0
+
+    def plot(self) -> Figure:
+        """Return the figure of the parameters and their intervals, with its caption."""
+        from dase import report
+
+        return report.parameters_of(self.sensor, self.parameters).alone()
 
     def to_json(self) -> dict[str, Any]:
         """Return the numbers as JSON objects."""
@@ -254,6 +269,12 @@ class Diagnosis:
     notes: tuple[str, ...] = ()
     evaluations: int = 0
     seconds: float = 0.0
+
+    def plot(self) -> Figure:
+        """Return the figure of the falling error, with its caption."""
+        from dase import report
+
+        return report.staircase_of(self).alone()
 
     def to_json(self) -> dict[str, Any]:
         """Return the findings as JSON objects."""

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
+import warp as wp
 from numpy.typing import ArrayLike, NDArray
 
 from dase.effects import EFFECTS
@@ -16,6 +17,7 @@ from dase.effects.stream import StreamEffect
 from dase.effects.threshold import Threshold
 from dase.errors import InputError
 from dase.events import Events
+from dase.history import Entry
 from dase.kernels import pixel
 from dase.outlet import Outlet, Tally, rows_of
 from dase.pixels import Pixels
@@ -35,12 +37,14 @@ class Sensor:
         size: Columns and rows of the camera [px], for work that has no size of its own; a scene brings its
             own size. None leaves it open.
         log_eps: Added to intensities before the logarithm, so that black is finite (ESIM: 0.001).
+        history: How the sensor came to be; changes nothing.
     """
 
     effects: tuple[Effect, ...] = (Threshold(),)
     name: str = "ideal"
     size: tuple[int, int] | None = None
     log_eps: float = 1e-3
+    history: tuple[Entry, ...] = field(default=(), compare=False)
 
     def __post_init__(self) -> None:
         names = [effect.name for effect in self.effects]
@@ -94,6 +98,21 @@ class Sensor:
             scene = effect.seen(scene) if isinstance(effect, SceneEffect) else scene
         return scene
 
+    def streams(self) -> tuple[StreamEffect, ...]:
+        """Return the effects behind the pixels that are not off."""
+        return tuple(e for e in self.effects if isinstance(e, StreamEffect) and not e.is_off())
+
+    def bound_to(self, scene: Scene) -> Sensor:
+        """Return the sensor with whatever its pixels owe to the scene worked out."""
+        if not any(effect.maps for effect in self.effects):
+            return self
+        return replace(self, effects=tuple(effect.bound_to(scene) for effect in self.effects))
+
+    def maps(self, pixels: NDArray[np.int32], device: Any) -> list[Any]:
+        """Return what kernels get beside parameters: an array (M, N) of maps where effects have any."""
+        values = [effect.map_values(pixels) for effect in self.effects if effect.maps]
+        return [wp.array(np.concatenate(values), dtype=float, device=device)] if values else []
+
     def retimes(self) -> bool:
         """Whether events leave at other times than their crossings', or not all of them leave."""
         late = (e for e in self.effects if isinstance(e, StreamEffect) or "delay" in e.stages)
@@ -119,7 +138,7 @@ class Sensor:
             out["size"] = list(self.size)
         out["log_eps"] = self.log_eps
         for effect in self.effects:
-            out[effect.name] = {f.name: getattr(effect, f.name) for f in fields(effect)}
+            out[effect.name] = {name: getattr(effect, name) for name in effect.settings()}
         return out
 
 

@@ -64,6 +64,8 @@ class Axis:
 def axis(effect: str, fact: Parameter) -> Axis:
     """Return the axis of one parameter, somewhat wider than its plausible range."""
     low, high = fact.plausible
+    if fact.unit == "turns":
+        low, high = fact.bounds
     log = low > 0
     if log:
         low, high = low / WIDER, high * WIDER
@@ -96,7 +98,8 @@ class Space:
         names = self.sensor.parameter_names()
         out = np.repeat(self.sensor.parameters()[None], len(places), 0)
         for n, axis in enumerate(self.axes):
-            out[:, names.index(axis.name)] = axis.to_value(places[:, n])
+            if axis.name in names:  # effects behind the pixels have no place there
+                out[:, names.index(axis.name)] = axis.to_value(places[:, n])
         return out
 
     def at(self, place: Array) -> Sensor:
@@ -121,7 +124,13 @@ def with_values(sensor: Sensor, values: Mapping[str, float]) -> Sensor:
     return sensor
 
 
-FIXED = ("threshold.phase", "flicker.frequency", "flicker.phase", "voltage_noise.dark")
+NEARBY = 0.01
+"""Relative range about its start in which the frequency of a lamp is fitted."""
+
+FIXED = (
+    "threshold.phase", "voltage_noise.dark", "row_scan.line", "timestamp.step",
+    "timestamp.jitter", "readout.depth",
+)  # fmt: skip
 """Parameters that a search by small steps cannot find; they are set by other means."""
 
 
@@ -139,8 +148,13 @@ def axes_of(sensor: Sensor, names: Iterable[str] | None = None) -> tuple[Axis, .
         f"{effect.name}.{p.name}": axis(effect.name, p)
         for effect in sensor.effects
         for p in effect.parameters()
-        if f"{effect.name}.{p.name}" in sensor.parameter_names()
     }
+    if "flicker.frequency" in every:
+        # a fit finds it only nearby: elsewhere the phase has turned
+        value = value_of(sensor, "flicker.frequency")
+        every["flicker.frequency"] = replace(
+            every["flicker.frequency"], low=value * (1 - NEARBY), high=value * (1 + NEARBY), log=False
+        )
     if names is None:
         off = {effect.name for effect in sensor.effects if effect.is_off() and effect.name != "threshold"}
         return tuple(a for n, a in every.items() if n not in FIXED and n.split(".")[0] not in off)

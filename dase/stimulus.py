@@ -1,4 +1,4 @@
-"""What some pixels of a scene see: the light that a model is driven with, and the cells events are sorted into."""
+"""What some pixels of a scene see: the light that drives a model, and the cells events are sorted into."""
 
 from __future__ import annotations
 
@@ -28,8 +28,8 @@ EDGES = (-0.25, -0.04, 0.04, 0.25)
 """Between the five bins of the change [log intensity]."""
 
 GROWTH = 0.3
-"""Steps since the light of a pixel last changed grow by this share of the time since then: coarse where nothing
-happens, yet fine enough for filters that still settle."""
+"""Steps grow by this share of the time since the light of a pixel last changed: coarse where nothing happens,
+yet fine enough for filters that still settle."""
 
 BLOCK = 256
 """Frames rendered at once."""
@@ -55,7 +55,8 @@ class Grid:
     @property
     def times(self) -> NDArray[np.float64]:
         """Times of the points [s]."""
-        return self.begin + self.step * np.arange(self.steps)
+        out: NDArray[np.float64] = self.begin + np.float64(self.step) * np.arange(self.steps)
+        return out
 
 
 @dataclass(eq=False)
@@ -86,12 +87,14 @@ class Stimulus:
     @property
     def level(self) -> NDArray[np.float32]:
         """Log intensity, shape (N, T)."""
-        return np.log(self.intensity + np.float32(self.log_eps))
+        out: NDArray[np.float32] = np.log(self.intensity + np.float32(self.log_eps))
+        return out
 
     def exposure(self) -> NDArray[np.float64]:
         """Return the time spent in each cell, summed over pixels [px s], shape (CELLS,)."""
         steps = np.bincount(self.cell.reshape(-1), minlength=256)[:CELLS]
-        return self.grid.step * steps
+        out: NDArray[np.float64] = np.float64(self.grid.step) * steps
+        return out
 
     def part(self, count: int) -> Stimulus:
         """Return the stimulus of the first `count` pixels."""
@@ -201,7 +204,8 @@ def sort_into_cells(
 def _change(level: NDArray[np.float32], step: float) -> NDArray[np.float32]:
     back = max(1, round(SPAN / step))
     before = np.concatenate([np.repeat(level[:, :1], back, 1), level[:, :-back]], axis=1)
-    return level - before[:, : level.shape[1]]
+    out: NDArray[np.float32] = level - before[:, : level.shape[1]]
+    return out
 
 
 def band_edges(intensity: NDArray[np.float32], cell_free: NDArray[np.bool_]) -> NDArray[np.float64]:

@@ -8,6 +8,7 @@ from concurrent.futures import FIRST_COMPLETED, ProcessPoolExecutor, wait
 from contextlib import closing
 from dataclasses import asdict, dataclass, replace
 from functools import lru_cache
+from hashlib import sha256
 from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
@@ -18,6 +19,7 @@ import tomlkit
 import dase
 from dase import images, io, regimes
 from dase.config import dump_sensor, parse_sensor
+from dase.effect_files import known_effects
 from dase.errors import InputError, nearest
 from dase.interrupt import Deferred, deferred, ignored
 from dase.kernels import launch
@@ -48,6 +50,7 @@ class Job:
         backend: `cpu` or `cuda`; they agree to float32 rounding, not to the byte.
         frame_rate: Of frames and flow [Hz].
         labels: Whether events are marked with what they came from.
+        effects: Files with effects of the user's own that the sensor names.
     """
 
     images: str
@@ -62,6 +65,7 @@ class Job:
     backend: str = "cpu"
     frame_rate: float = 60.0
     labels: bool = False
+    effects: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         if self.sequences < 1:
@@ -82,8 +86,11 @@ class Job:
         document = tomlkit.document()
         document.add("dase", dase.__version__)
         for name, value in asdict(self).items():
-            if name != "sensor":
+            if name not in ("sensor", "effects"):
                 document.add(name, value)
+        if self.effects:  # what is in the files determines the bytes, not where they lie
+            files = (Path(path) for path in self.effects)
+            document.add("effects", [f"{f.name} sha256:{sha256(f.read_bytes()).hexdigest()}" for f in files])
         sensor = tomlkit.table(is_super_table=False)
         for key, item in tomlkit.parse(self.sensor).items():
             sensor.add(key, item)
@@ -142,7 +149,7 @@ def run(
         raise InputError(f"jobs must be >= 1, got {jobs}")
     begin = time.perf_counter()
     images.open_images(job.images)
-    Pixels(parse_sensor(job.sensor, "sensor"), 1, 1, device=job.backend)
+    Pixels(_sensor_of(job), 1, 1, device=job.backend)
     todo = _prepare(job, out, resume)
     total = Report()
     jobs = min(jobs, max(len(todo), 1))
@@ -205,7 +212,7 @@ def _warm_up(job: Job) -> None:
     scene = regimes.draw_scene(
         np.random.default_rng(0), source, "background", width=8, height=8, duration=0.02
     )
-    array = Pixels(parse_sensor(job.sensor, "sensor"), 8, 8, device=job.backend, labels=job.labels)
+    array = Pixels(_sensor_of(job), 8, 8, device=job.backend, labels=job.labels)
     Outlet(array.sensor, 8, 8).push(array.emit(scene, scene.sample_times())[0], array.begin)
     scene.frames(np.zeros(1), job.backend)
     scene.flow(np.zeros(1), job.backend)
@@ -232,6 +239,11 @@ def _opened(spec: str) -> images.ImageSource:
     return images.open_images(spec)
 
 
+@lru_cache(maxsize=1)  # a file of effects is read once, whatever becomes of it meanwhile
+def _sensor_of(job: Job) -> Sensor:
+    return parse_sensor(job.sensor, "sensor", known_effects(job.effects))
+
+
 def make_scene(job: Job, index: int) -> LayerScene:
     """Return the scene of one sequence."""
     rng = np.random.default_rng([job.seed, index])
@@ -243,7 +255,7 @@ def make_scene(job: Job, index: int) -> LayerScene:
 def make_sequence(job: Job, out: Path, index: int, interrupt: Deferred) -> Report:
     """Simulate one sequence and write its file; an interrupt leaves nothing and raises KeyboardInterrupt."""
     begin = time.perf_counter()
-    sensor = parse_sensor(job.sensor, "sensor")
+    sensor = _sensor_of(job)
     scene = make_scene(job, index)
     # sequences share neither scene nor pixels' random numbers
     seed = int(np.random.default_rng([job.seed, index, 1]).integers(2**31))
@@ -264,6 +276,7 @@ def _record(
 ) -> Report:
     """Write thresholds, frames, flow and events of a scene, in order of time."""
     outlet = Outlet(array.sensor, scene.width, scene.height, seed=array.seed)
+    array.look_at(scene)
     writer.thresholds(array.thresholds()[0].reshape(2, scene.height, scene.width))
     times = sample_times(scene, array.sensor)
     total, shown = Report(sequences=1), 0
@@ -327,6 +340,7 @@ def record_scene(
             interrupt.check()
             progress(done)
 
-        writer.configuration(dump_sensor(sensor) + f'\n[run]\ndase = "{dase.__version__}"\nseed = {seed}\n')
+        model = dump_sensor(replace(sensor, history=()))
+        writer.configuration(model + f'\n[run]\ndase = "{dase.__version__}"\nseed = {seed}\n')
         report = _record(scene, array, writer, frame_times, advance)
     return replace(report, seconds=time.perf_counter() - begin)

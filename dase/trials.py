@@ -1,20 +1,28 @@
-"""Many models over one stimulus: from parameter vectors to sums of statistics, and the same of a measurement."""
+"""Many models over one stimulus: from parameter vectors to sums of statistics; the same of a measurement."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+import math
+from collections.abc import Iterable
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
 import warp as wp
 from numpy.typing import NDArray
 
+from dase.effects.readout import Readout
+from dase.effects.row_scan import RowScan
+from dase.effects.stream import StreamEffect
+from dase.effects.timestamp import Timestamp
 from dase.events import Events
-from dase.kernels import launch, trials
+from dase.kernels import launch, pixel, trials
 from dase.kernels import probes as kernels
 from dase.probes import Sums
-from dase.sensor import Sensor
+from dase.scene import Scene
+from dase.sensor import Pixels, Sensor
 from dase.stimulus import Stimulus
+from dase.structure import Structure
 
 LAG_TIMES = (-0.003, -0.001, 0.0, 0.001, 0.002, 0.004, 0.008, 0.016, 0.028, 0.044, 0.063)
 """Before an event [s] at which its light is looked at; the differences of neighbours are averaged."""
@@ -30,6 +38,9 @@ SLACK = 2e-6
 
 GROUP = 64
 """Pixels whose events are summed up together on a CPU; on a GPU every pixel has a thread."""
+
+FELT = 0.25
+"""Delays below this share of a step of the grid are not felt."""
 
 FINEST = 2
 """Samples per step of the grid at most: models that ask for more are simulated a little too coarsely."""
@@ -51,12 +62,14 @@ class Trials:
     Args:
         stimulus: What the pixels see.
         middle: Typical change of the light between two events, shape (4 CLASSES,).
+        structure: Regularities of the measured time stamps.
         evaluations: Models run so far.
         work: Pixels times seconds run so far.
     """
 
     stimulus: Stimulus
     middle: NDArray[np.float32] = field(default_factory=lambda: np.zeros(4 * kernels.CLASSES, np.float32))
+    structure: Structure = field(default_factory=Structure)
     evaluations: int = 0
     work: float = 0.0
 
@@ -85,14 +98,15 @@ class Trials:
         finer = finer_steps(sensor, self.stimulus.grid.step) if finer is None else finer
         history = self.stimulus.history(finer)
         kernel = trials.compose(sensor.stages())
-        at_once = max(1, ROOM // (4 * len(self.stimulus.pixels) * (kernels.SIZE // self._group() + 16)))
+        at_once = max(1, ROOM // (4 * len(self.stimulus.pixels) * (kernels.SIZE // self._group() + 80)))
         parts = []
         for first in range(0, len(vectors), at_once):
             rows = np.ascontiguousarray(vectors[first : first + at_once], np.float32)
             sink = self.sink(len(rows), reseed=reseed)
             inputs = [
                 history, self._pixels, self.stimulus.width, self.stimulus.height, (seed + first) & 0x3FFFFFFF,
-                wp.array(rows, dtype=float, device=self.device), sink,
+                wp.array(rows, dtype=float, device=self.device),
+                *sensor.maps(self.stimulus.pixels, self.device), sink,
             ]  # fmt: skip
             count = len(self.stimulus.pixels)
             launch.run(kernel, count, inputs, self.device, batch=len(rows), align=GROUP)
@@ -100,8 +114,7 @@ class Trials:
         self.evaluations += len(vectors)
         grid = self.stimulus.grid
         self.work += len(vectors) * len(self.stimulus.pixels) * grid.step * (grid.steps - 1)
-        columns = ([getattr(p, name) for p in parts] for name in ("sums", "halves", "groups"))
-        return Sums(*(np.concatenate(column) for column in columns))
+        return Sums.join(parts)
 
     def look(self, events: Events) -> Sums:
         """Sum up stored events; those of other pixels are left out."""
@@ -115,7 +128,52 @@ class Trials:
         launch.run(
             kernels.walk, len(self.stimulus.pixels), [*arrays, sink], self.device, batch=1, align=GROUP
         )
-        return self._totals(sink, 1)
+        found = self._totals(sink, 1)
+        return replace(found, stamps=self.structure.shares(self._mine(events))[None])
+
+    def felt(self, sensor: Sensor) -> tuple[StreamEffect, ...]:
+        """Return the effects behind the pixels that the probes can feel.
+
+        Small errors of the time stamps are far below the steps of the grid; they matter only where their
+        regularities are compared.
+        """
+        fine = FELT * self.stimulus.grid.step
+        lines = max(self.stimulus.width, self.stimulus.height)
+        compared = self.structure.step > 0 or self.structure.line > 0
+        return tuple(e for e in sensor.streams() if compared or delay_of(e, lines) > fine)
+
+    def stream(
+        self, sensor: Sensor, vector: NDArray[Any], effects: Iterable[StreamEffect], *, seed: int
+    ) -> Sums:
+        """Simulate one parameter vector with effects behind the pixels, and sum up what leaves.
+
+        The pixels are some of a sensor's. A bus that all pixels share is given as much of its bandwidth and
+        of its queue as they are of all pixels: right for streams, not for single collisions.
+        """
+        stimulus = self.stimulus
+        width, height = stimulus.width, stimulus.height
+        bare = replace(sensor, effects=tuple(e for e in sensor.effects if not isinstance(e, StreamEffect)))
+        array = Pixels(
+            bare, width, height, pixels=stimulus.pixels, parameters=np.atleast_2d(vector), seed=seed,
+            device=str(self.device),
+        )  # fmt: skip
+        scene = _Light(stimulus)
+        parts = [array.emit(scene, scene.times)[0], array.flush()[0]]
+        share = len(stimulus.pixels) / (width * height)
+        readers = [scaled(effect, share).reader(width, height, seed) for effect in effects]
+        events = Events.concatenate(parts)
+        until = math.inf
+        for reader in readers:
+            events, until = reader.push(events, until)
+        self.evaluations += 1
+        return self.look(replace(events, t=events.t + stimulus.grid.begin))
+
+    def _mine(self, events: Events) -> Events:
+        """Return the events of the pixels, within the time that is compared."""
+        stimulus = self.stimulus
+        own = np.zeros(stimulus.width * stimulus.height, np.bool_)
+        own[stimulus.pixels] = True
+        return events.select(own[events.y.astype(np.int64) * stimulus.width + events.x])
 
     def _by_pixel(self, events: Events) -> tuple[NDArray[np.int64], NDArray[np.uint8], NDArray[np.int64]]:
         stimulus = self.stimulus
@@ -155,7 +213,8 @@ class Trials:
         )
         for name, size, numbers in zeros:
             setattr(out, name, wp.zeros((rows, size, numbers), dtype=float, device=self.device))
-        out.clock = wp.zeros((rows, 1, 0), dtype=int, device=self.device)
+        out.team, teams = GROUP, -(-count // GROUP)
+        out.clock = wp.zeros((rows, teams, 2 * stimulus.grid.steps), dtype=int, device=self.device)
         return out
 
     def _totals(self, sink: Any, rows: int) -> Sums:
@@ -167,4 +226,43 @@ class Trials:
             launch.run(trials.total, parts * kernels.SIZE, inputs, self.device, batch=rows)
             sums = less
         groups = sums.numpy()
-        return Sums(groups.sum(1, dtype=np.float64), sink.halves.numpy(), groups)
+        clock = sink.clock.numpy()
+        return Sums(
+            groups.sum(1, dtype=np.float64), sink.halves.numpy(), groups, clock.sum(1), clock,
+            np.zeros((rows, len(Structure.NAMES))),
+        )  # fmt: skip
+
+
+class _Light(Scene):
+    """The light of a stimulus as a scene, from time 0."""
+
+    def __init__(self, stimulus: Stimulus):
+        self._stimulus = stimulus
+        self.width, self.height = stimulus.width, stimulus.height
+        self.times: NDArray[np.float64] = np.float64(stimulus.grid.step) * np.arange(stimulus.grid.steps)
+        self.duration = float(self.times[-1])
+
+    def sample_times(self) -> NDArray[np.float64]:
+        return self.times
+
+    def source(self, times: NDArray[np.float64], pixels: NDArray[np.int32], device: Any) -> tuple[str, Any]:
+        out = pixel.Frames()
+        out.values = self._stimulus.array("light", lambda: self._stimulus.intensity.T)
+        return "frames", out
+
+    def frames(self, times: NDArray[np.float64], device: str = "cpu") -> NDArray[np.float32]:
+        raise NotImplementedError("some pixels are no picture")
+
+
+def delay_of(effect: StreamEffect, lines: int) -> float:
+    """Return about how late an effect behind the pixels makes events [s]; infinite where it may lose some."""
+    if isinstance(effect, Timestamp):
+        return max(effect.step, effect.jitter)
+    return lines * effect.line if isinstance(effect, RowScan) else math.inf
+
+
+def scaled(effect: StreamEffect, share: float) -> StreamEffect:
+    """Return an effect behind the pixels for a share of them."""
+    if isinstance(effect, Readout):
+        return replace(effect, rate=effect.rate * share, depth=max(1.0, effect.depth * share))
+    return effect

@@ -8,9 +8,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from dase.camera import TOLERANCE, CameraScene
+from dase.camera import RELATIVE, TOLERANCE, CameraScene
 from dase.errors import InputError
 from dase.events import Events
+from dase.io.sequence import Sequence
 from dase.matching import HOPELESS
 from dase.show import OFF, ON, overlay
 from dase.units import seconds
@@ -34,9 +35,19 @@ HATCH = 7
 """Dots from one line of the hatching to the next."""
 
 
-def panel(
-    scene: CameraScene, events: Events, time: float, window: float, *, tolerance: float = TOLERANCE
-) -> NDArray[np.uint8]:
+def scene_of(sequence: Sequence) -> CameraScene:
+    """Return the scene between the frames of a sequence.
+
+    Raises:
+        InputError: There are not two frames, or their times are not known.
+    """
+    if sequence.frames is None or len(sequence.frames) < 2 or sequence.frame_times is None:
+        raise InputError("trust: needs at least 2 frames with known times")
+    half = np.zeros(1) if sequence.frame_exposure is None else 0.5 * sequence.frame_exposure
+    return CameraScene(sequence.frames, sequence.frame_times - half, sequence.frame_times + half)
+
+
+def panel(scene: CameraScene, events: Events, time: float, window: float) -> NDArray[np.uint8]:
     """Return the scene with doubts and the events around a time.
 
     Doubt veils the picture, the more the less confidence there is; what no frame can tell, as it is saturated
@@ -47,7 +58,6 @@ def panel(
         events: Of the scene's size, on its clock.
         time: Within the scene [s].
         window: Events of this span around `time` are shown [s].
-        tolerance: Doubt that halves the confidence [log intensity].
 
     Returns:
         Red, green and blue, shape (DOTS · H, DOTS · W, 3).
@@ -56,9 +66,8 @@ def panel(
     top = max(float(np.percentile(light, 99.5)), 1e-6)
     grey = np.rint(255 * np.clip(light / top, 0, 1) ** 0.6).astype(np.uint8)
     counts = events.counts([time - window / 2, time + window / 2])[0]
-    doubt = scene.doubt([time])[0]
-    share = 1 - 1 / (1 + (np.minimum(doubt, HOPELESS) / tolerance) ** 2)
-    hopeless = doubt > 0.01 * HOPELESS  # the frame before and the one after share a doubt
+    share = 1 - scene.confidence([time])[0]
+    hopeless = scene.doubt([time])[0] > 0.01 * HOPELESS  # the frame before and the one after share a doubt
     large, nothing = (a.repeat(DOTS, 0).repeat(DOTS, 1) for a in (overlay(grey, 0 * counts) / 255, hopeless))
     y, x = np.indices(nothing.shape)
     lines = nothing & ((x + y) % HATCH < 2)
@@ -77,7 +86,6 @@ def draw(
     title: str = "",
     moments: int = 6,
     window: float | None = None,
-    tolerance: float = TOLERANCE,
 ) -> Figure:
     """Draw moments between the frames with most events: the scene, its doubts, and the events over both.
 
@@ -87,7 +95,6 @@ def draw(
         title: Name over the sheet.
         moments: How many moments to show; fewer if there are not as many times between frames.
         window: Events of this span around each moment are shown [s]; None: an eighth of the time of a frame.
-        tolerance: Doubt that halves the confidence, and up to which a pixel is trusted [log intensity].
 
     Raises:
         InputError: Sizes differ, or `window` or `moments` is not positive.
@@ -100,12 +107,12 @@ def draw(
         raise InputError(f"trust: moments and window must be > 0, got {moments} and {window:g} s")
     counts = np.diff(np.searchsorted(events.t, scene.times))
     shown = np.sort(np.argsort(-counts, kind="stable")[:moments])
-    trusted = scene.trusted(tolerance=tolerance).mean((1, 2))
+    trusted = scene.trusted().mean((1, 2))
     figure, places = _layout(len(shown), scene.height / scene.width)
-    _header(figure, title, window, tolerance, float(trusted.mean()))
+    _header(figure, title, window, float(trusted.mean()))
     for axes, k in zip(places, shown, strict=True):
         time = float(0.5 * (scene.times[k] + scene.times[k + 1]))
-        axes.imshow(panel(scene, events, time, window, tolerance=tolerance), aspect="auto")
+        axes.imshow(panel(scene, events, time, window), aspect="auto")
         axes.set_title(f"{time:.3f} s, after frame {k}", fontsize=9, color=INK, loc="left", pad=3)
         axes.set_title(f"{100 * trusted[k]:.0f} % trusted", fontsize=9, color=QUIET, loc="right", pad=3)
     return figure
@@ -133,12 +140,13 @@ def _layout(count: int, aspect: float) -> tuple[Figure, list[Axes]]:
     return figure, places
 
 
-def _header(figure: Figure, title: str, window: float, tolerance: float, share: float) -> None:
+def _header(figure: Figure, title: str, window: float, share: float) -> None:
     tall = figure.get_figheight()
     left, right = 0.4 / 11, 1 - 0.4 / 11
     figure.text(left, 1 - 0.3 / tall, title, fontsize=13, color=INK, weight="bold", va="center")
     facts = (
-        f"{100 * share:.0f} % of pixels and times trusted, expected error up to {tolerance:g} log intensity"
+        f"{100 * share:.0f} % of pixels and times trusted: expected error up to {TOLERANCE:g} log intensity "
+        f"or {100 * RELATIVE:.0f} % of the change"
     )
     figure.text(left, 1 - 0.57 / tall, facts, fontsize=9, color=INK, va="center")
     said = f"events of {seconds(window)} around each time"

@@ -168,10 +168,10 @@ class FrameReader:
 
 
 def open_video(path: Path, *, fps: float | None = None, size: tuple[int, int] | None = None) -> VideoScene:
-    """Return the scene of a video file or of a folder of frames.
+    """Return the scene of a video file, of a folder of frames, or of the frames of a recording.
 
     Args:
-        path: File or folder.
+        path: File or folder; the events of a recording, such as a sequence of `dase synth`, do not matter.
         fps: Frames per second; None takes what the file says.
         size: Columns and rows to resize to; None keeps the video's.
 
@@ -180,8 +180,40 @@ def open_video(path: Path, *, fps: float | None = None, size: tuple[int, int] | 
     """
     if fps is not None and not (np.isfinite(fps) and fps > 0):
         raise InputError(f"fps must be a number > 0, got {fps:g}")
-    reader = FrameReader(Path(path), size)
+    path = Path(path)
+    if _is_recording(path):
+        return _scene_of(path, fps, size)
+    reader = FrameReader(path, size)
     rate = fps or reader.rate
     if not rate > 0:
         raise InputError(f"{path} does not say how many frames it has per second: give --fps")
     return VideoScene(reader, np.arange(len(reader)) / rate)
+
+
+def _is_recording(path: Path) -> bool:
+    from dase import io
+
+    if not path.is_file():
+        return False
+    try:
+        # of a video, frames are decoded one by one as they are asked for
+        return io.find(path).name != "frames"
+    except InputError:
+        return False
+
+
+def _scene_of(path: Path, fps: float | None, size: tuple[int, int] | None) -> VideoScene:
+    """Return the scene of a recording's frames."""
+    from dase import io
+
+    sequence = io.read(path)
+    if sequence.frames is None or len(sequence.frames) < 2:
+        raise InputError(f"video {path}: the recording must have at least 2 frames to be taken for a video")
+    frames = sequence.frames
+    if size is not None:
+        frames = np.stack([cv2.resize(frame, size, interpolation=cv2.INTER_AREA) for frame in frames])
+    if fps is None and sequence.frame_times is None:
+        raise InputError(f"{path} does not say when its frames were taken: give --fps")
+    times = sequence.frame_times if fps is None else np.arange(len(frames)) / fps
+    assert times is not None
+    return VideoScene(frames / np.float32(255), times - times[0])

@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from itertools import pairwise
+
 import numpy as np
 
 from dase.error import Judgement
 from dase.evidence import Evidence, Half
-from dase.kernels.probes import BANDS, CLASSES, INTERVALS, KINDS, LAGS
-from dase.probes import LAYOUT, MEANS, ZONES
+from dase.kernels.probes import BANDS, CLASSES, INTERVALS, KINDS
+from dase.probes import LAYOUT, LOWEST, MEANS, TONES, ZONES
 from dase.results import Cell
+from dase.structure import Structure
 from dase.trials import LAG_TIMES
 
 SHOWN = 24
@@ -27,72 +31,94 @@ _ORDER = ("OFF after OFF", "OFF after ON", "ON after OFF", "ON after ON")
 _CLASSES = ("within 12 ms", "within 50 ms", "later than 50 ms")
 _STATES = ("moving", "resting")
 _POLARITY = ("OFF", "ON")
+_SPREADS = (
+    "lasting spread between pixels of OFF events", "lasting spread between pixels of ON events",
+    "shared spread of ON and OFF events", "spread between pixels of OFF events",
+    "spread between pixels of ON events",
+)  # fmt: skip
+_ODD = ("silent pixels", "busy pixels at rest", "very busy pixels at rest", "busy pixels")
+
+Words = tuple[str, str, str]
+"""Where a statistic is taken, what it is, and its unit."""
 
 
 def band(evidence: Evidence, n: int) -> str:
     """Return a band of intensity in words, in grey values of 8 bits."""
     edges = [f"{255 * e:.0f}" for e in evidence.bands]
-    spans = [
-        f"below {edges[0]} DN",
-        *(f"{a} to {b} DN" for a, b in zip(edges, edges[1:], strict=False)),
-        f"above {edges[-1]} DN",
-    ]
-    return f"{_BANDS[n]} pixels ({spans[n]})"
+    between = [f"{a} to {b} DN" for a, b in pairwise(edges)]
+    return f"{_BANDS[n]} pixels ({[f'below {edges[0]} DN', *between, f'above {edges[-1]} DN'][n]})"
 
 
-def place(evidence: Evidence, family: str, n: int) -> tuple[str, str, str]:
+def place(evidence: Evidence, family: str, n: int) -> Words:
     """Return where the `n`-th statistic of a family is taken, what it is, and its unit."""
-    if family == "rate":
-        polarity, cell = divmod(n, KINDS * BANDS)
-        return (
-            f"{band(evidence, cell % BANDS)}, {_KINDS[cell // BANDS]}",
-            f"{_POLARITY[polarity]} events",
-            "events",
-        )
-    if family == "intervals":
-        group, octave = divmod(n, INTERVALS)
-        rest, kin = divmod(group, 3)
-        return f"{_STATES[rest]} pixels", f"intervals {_octave(octave)} of {_PAIRS[kin]}", "events"
-    if family == "lag":
-        lag, where = divmod(n, BANDS)
-        a, b = 1e3 * LAG_TIMES[lag], 1e3 * LAG_TIMES[lag + 1]
-        return (
-            band(evidence, where),
-            f"change of light from {b:g} to {a:g} ms before the event",
-            "log intensity",
-        )
-    if family == "repeats":
-        third, where = divmod(n, BANDS)
-        return (
-            band(evidence, where),
-            f"events that are the {'third' if third else 'second'} in a step",
-            "share",
-        )
-    if family == "change":
-        kind, rest = divmod(n, 4 * CLASSES)
-        if kind == 2:
-            return _CLASSES[rest], "correlation of successive changes between events", "log intensity²"
-        pair, group = divmod(rest, CLASSES)
-        what = ("change between events", "its deviation from the mean")[kind]
-        return _CLASSES[group], f"{what}, {_ORDER[pair]}", "log intensity"
-    if family == "spread":
-        state, what = divmod(n, 5)
-        names = ("lasting spread between pixels of OFF events", "lasting spread between pixels of ON events",
-                 "shared spread of ON and OFF events", "spread between pixels of OFF events", "spread between pixels of ON events")  # fmt: skip
-        return f"{_STATES[state]} pixels", names[what], "events² per event"
-    if family == "pixels":
-        return (
-            "single pixels",
-            ("silent pixels", "busy pixels at rest", "very busy pixels at rest", "busy pixels")[n],
-            "pixels",
-        )
+    return _PLACES[family](evidence, n)
+
+
+def _rate(evidence: Evidence, n: int) -> Words:
+    polarity, cell = divmod(n, KINDS * BANDS)
+    where = f"{band(evidence, cell % BANDS)}, {_KINDS[cell // BANDS]}"
+    return where, f"{_POLARITY[polarity]} events", "events"
+
+
+def _intervals(evidence: Evidence, n: int) -> Words:
+    group, octave = divmod(n, INTERVALS)
+    rest, kin = divmod(group, 3)
+    return f"{_STATES[rest]} pixels", f"intervals {_octave(octave)} of {_PAIRS[kin]}", "events"
+
+
+def _lag(evidence: Evidence, n: int) -> Words:
+    lag, where = divmod(n, BANDS)
+    a, b = 1e3 * LAG_TIMES[lag], 1e3 * LAG_TIMES[lag + 1]
+    what = f"change of light from {b:g} to {a:g} ms before the event"
+    return band(evidence, where), what, "log intensity"
+
+
+def _repeats(evidence: Evidence, n: int) -> Words:
+    third, where = divmod(n, BANDS)
+    what = f"events that are the {'third' if third else 'second'} in a step"
+    return band(evidence, where), what, "share"
+
+
+def _change(evidence: Evidence, n: int) -> Words:
+    kind, rest = divmod(n, 4 * CLASSES)
+    if kind == 2:
+        return _CLASSES[rest], "correlation of successive changes between events", "log intensity²"
+    pair, group = divmod(rest, CLASSES)
+    what = ("change between events", "deviation from the mean change between events")[kind]
+    return _CLASSES[group], f"{what}, {_ORDER[pair]}", "log intensity"
+
+
+def _spread(evidence: Evidence, n: int) -> Words:
+    state, what = divmod(n, len(_SPREADS))
+    return f"{_STATES[state]} pixels", _SPREADS[what], "events² per event"
+
+
+def _pixels(evidence: Evidence, n: int) -> Words:
+    return "single pixels", _ODD[n], "pixels"
+
+
+def _space(evidence: Evidence, n: int) -> Words:
     state, ring = divmod(n, ZONES)
     rest, polarity = divmod(state, 2)
-    return (
-        f"ring {ring + 1} of {ZONES} from the middle, {_STATES[rest]}",
-        f"{_POLARITY[polarity]} events",
-        "events",
-    )
+    where = f"ring {ring + 1} of {ZONES} from the middle, {_STATES[rest]}"
+    return where, f"{_POLARITY[polarity]} events", "events"
+
+
+def _spectrum(evidence: Evidence, n: int) -> Words:
+    if n >= TONES:
+        return "all pixels", f"swing of the net rate at {evidence.peak:.4g} Hz", "share"
+    ends = np.geomspace(LOWEST, 0.5 / evidence.held.frame.step, TONES + 1)
+    return "all pixels", f"power of the net rate from {ends[n]:.3g} to {ends[n + 1]:.3g} Hz", "log power"
+
+
+def _stamps(evidence: Evidence, n: int) -> Words:
+    return "all pixels", Structure.NAMES[n], "share"
+
+
+_PLACES: dict[str, Callable[[Evidence, int], Words]] = {
+    "rate": _rate, "intervals": _intervals, "lag": _lag, "repeats": _repeats, "change": _change,
+    "spread": _spread, "pixels": _pixels, "space": _space, "spectrum": _spectrum, "stamps": _stamps,
+}  # fmt: skip
 
 
 def _octave(n: int) -> str:
@@ -115,7 +141,7 @@ def worst_cells(
             z = judgement.z[j]
             if not half.seen.used[j] or abs(z) < NOTABLE:
                 continue
-            counts = not MEANS[j] and family != "spread"
+            counts = not MEANS[j] and family not in ("spread", "spectrum", "stamps")
             m, s = (np.exp(v[j]) - 3.0 if counts else v[j] for v in (measured, simulated))
             where, what, unit = place(evidence, family, n)
             m, s = (max(0.0, float(v)) if counts else float(v) for v in (m, s))
@@ -133,6 +159,3 @@ def _sentence(where: str, what: str, measured: float, simulated: float, counts: 
     ratio = many / few
     times = f"{ratio:.1f} times too {side}" if ratio >= 1.5 else f"{100 * (ratio - 1):.0f} % too {side}"
     return f"{where}: {times} {what}"
-
-
-__all__ = ["LAGS", "band", "place", "worst_cells"]

@@ -172,7 +172,7 @@ class _Count(torch.autograd.Function):
         seen = _scene.Frames()
         seen.values = wp.from_torch(log.view(batch * samples, pixels))
         lanes = _counts.widest(pixels, wp.device_from_torch(log.device), "log")
-        kernel = _counts.count(lanes, "log", shared=threshold.shape[1] == 1, mapped=True, states=False)
+        kernel = _counts.count(lanes, "log", shared=threshold.shape[1] == 1, states=False)
         unused = torch.empty(batch, 0, device=log.device)
         inputs = [
             seen, samples, wp.empty(0, dtype=int, device=log.device.type), pixels, 1, 1, threshold,

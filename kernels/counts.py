@@ -17,6 +17,7 @@ thread, and returns the same counts.
 
 # no postponed annotations: those of the kernels made here name types of the functions around them
 from functools import lru_cache
+from types import SimpleNamespace
 from typing import Any
 
 import warp as wp
@@ -91,8 +92,54 @@ def _look(lanes: int, source: str) -> Any:
     return look
 
 
+@lru_cache(maxsize=8)
+def block(lanes: int) -> SimpleNamespace:
+    """Return Warp functions for what `lanes` neighbouring pixels know before their first sample."""
+    f = functions(lanes)
+    Lanes, Bits, load = f.Lanes, vector(lanes, wp.int32), f.load
+
+    @wp.func
+    def thresholds(threshold: wp.array3d[float], b: int, p: int, n: int):
+        if threshold.shape[2] == 1:
+            return Lanes(threshold[b, p, 0])
+        return load(threshold[b], p, n)
+
+    @wp.func
+    def columns(pixels: wp.array[int], n: int, width: int):
+        x = Lanes()
+        for lane in range(wp.static(lanes)):
+            x[lane] = float(pixels[n + lane] % width)
+        return x
+
+    @wp.func
+    def rows(pixels: wp.array[int], n: int, width: int):
+        y = Lanes()
+        for lane in range(wp.static(lanes)):
+            y[lane] = float(pixels[n + lane] / width)
+        return y
+
+    @wp.func
+    def layers_of(seen: Layers, x: Lanes, y: Lanes):
+        near = Bits()
+        for lane in range(wp.static(lanes)):
+            near[lane] = layers_near(seen, x[lane], y[lane])
+        return near
+
+    @wp.func
+    def lanes_near(near: Bits):
+        crowd = int(0)
+        for lane in range(wp.static(lanes)):
+            if near[lane] != 0:
+                crowd = wp.static(lanes)
+        return crowd
+
+    return SimpleNamespace(
+        thresholds=thresholds, columns=columns, rows=rows, layers_of=layers_of, lanes_near=lanes_near
+    )
+
+
 @lru_cache(maxsize=64)
-def count(lanes: int, source: str, *, shared: bool, mapped: bool, states: bool) -> wp.Kernel:
+def count(lanes: int, source: str, *, shared: bool, states: bool) -> wp.Kernel:
     """Return the counting kernel, over (B, blocks of `lanes` pixels) threads.
 
     It has no branches, so that several samples are on their way from memory at once. Both polarities are
@@ -103,7 +150,6 @@ def count(lanes: int, source: str, *, shared: bool, mapped: bool, states: bool) 
         lanes: Neighbouring pixels per thread.
         source: One of `SOURCES`.
         shared: Whether ON and OFF have one threshold.
-        mapped: Whether every pixel has its own.
         states: Whether counts are integers and the last sample is kept, as sensors need it, or floats.
     """
     f = functions(lanes)
@@ -113,6 +159,9 @@ def count(lanes: int, source: str, *, shared: bool, mapped: bool, states: bool) 
     minus, plus, plus_abs, advanced = f.minus, f.plus, f.plus_abs, f.advanced
     chosen, inverse, signed_events = f.chosen, f.inverse, f.signed_events
     half_sum, half_difference = f.half_sum, f.half_difference
+    start_of = block(lanes)
+    thresholds, columns, rows_of = start_of.thresholds, start_of.columns, start_of.rows
+    layers_of, lanes_near = start_of.layers_of, start_of.lanes_near
     Number = wp.int32 if states else wp.float32
     stored, layered = source in ("frames", "log"), source == "layers"
 
@@ -139,15 +188,8 @@ def count(lanes: int, source: str, *, shared: bool, mapped: bool, states: bool) 
         """Count the events of every pixel in every window."""
         b, i = wp.tid()
         n = wp.min((first + i) * wp.static(lanes), size - wp.static(lanes))
-        above = threshold.shape[1] - 1
-        off = Lanes()
-        on = Lanes()
-        if wp.static(mapped):
-            off = load(threshold[b], 0, n)
-            on = load(threshold[b], above, n)
-        else:
-            off = Lanes(threshold[b, 0, 0])
-            on = Lanes(threshold[b, above, 0])
+        off = thresholds(threshold, b, 0, n)
+        on = thresholds(threshold, b, threshold.shape[1] - 1, n)
         per_off = inverse(off)
         per_on = inverse(on)
         x = Lanes()
@@ -157,14 +199,11 @@ def count(lanes: int, source: str, *, shared: bool, mapped: bool, states: bool) 
         ground = Ground()
         if wp.static(not stored):
             ground = ground_of(seen)
-            for lane in range(wp.static(lanes)):
-                pixel = pixels[n + lane]
-                x[lane] = float(pixel % width)
-                y[lane] = float(pixel / width)
-                if wp.static(layered):
-                    near[lane] = layers_near(seen, x[lane], y[lane])
-                    if near[lane] != 0:
-                        crowd = wp.static(lanes)
+            x = columns(pixels, n, width)
+            y = rows_of(pixels, n, width)
+            if wp.static(layered):
+                near = layers_of(seen, x, y)
+                crowd = lanes_near(near)
         reference = load(reference_in, b, n)
         sample = Lanes()
         for r in range(run.shape[0] - 1):

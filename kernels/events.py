@@ -33,8 +33,7 @@ def decode(
     bits: int,  # of the place
     low: int,  # bits below the place
     size: int,  # pixels per row of the batch
-    x: wp.array[wp.uint16],  # (N,) column of each pixel
-    y: wp.array[wp.uint16],  # (N,) row of each pixel
+    xy: wp.array[wp.uint32],  # (N,) column of each pixel, and its row 16 bits higher
     begin: wp.int64,  # of the chunk [ns]
     each: int,  # events per thread
     # out
@@ -56,8 +55,9 @@ def decode(
             place = place % size
         # from whole nanoseconds, so that times never go back from chunk to chunk
         t_out[i] = wp.float64(1.0e-9) * wp.float64(begin + (key >> wp.int64(bits + low)))
-        x_out[i] = x[place]
-        y_out[i] = y[place]
+        at = xy[place]
+        x_out[i] = wp.uint16(at & wp.uint32(65535))
+        y_out[i] = wp.uint16(at >> wp.uint32(16))
         p_out[i] = wp.uint8((key >> wp.int64(low - 1)) & wp.int64(1))
         if label_out.shape[0] > 0:
             label_out[i] = wp.int8(key & wp.int64(3))
@@ -89,17 +89,50 @@ RADIX = 9
         from = to;
         to = swap;
     }
+    // events of one time in the order of their places; few, so they are put right by insertion
+    for (int i = 1; i < count; ++i) {
+        if ((from[i - 1] >> low) <= (from[i] >> low)) continue;
+        const long long key = from[i];
+        int j = i;
+        for (; j > 0 && (from[j - 1] >> low) > (key >> low); --j) from[j] = from[j - 1];
+        from[j] = key;
+    }
 """
 )
-def radix_sort(keys: wp.array[wp.int64], other: wp.array[wp.int64], count: int, begin: int, end: int):
-    """Sort stably by some bits; the result is in `keys` after an even number of passes, else in `other`."""
+def radix_sort(
+    keys: wp.array[wp.int64], other: wp.array[wp.int64], count: int, begin: int, end: int, low: int
+):
+    """Sort stably by time, then by place; after an odd number of passes the result is in `other`."""
     ...
 
 
 @wp.kernel(enable_backward=False)
-def sort(first: int, keys: wp.array[wp.int64], other: wp.array[wp.int64], count: int, begin: int, end: int):
+def sort(
+    first: int,
+    # in
+    count: int,
+    begin: int,  # lowest bit of the time
+    end: int,  # bits of all
+    low: int,  # bits below the place
+    # out
+    keys: wp.array[wp.int64],
+    other: wp.array[wp.int64],
+):
     """Sort on one thread of a CPU, three times as fast as Warp's sort of pairs."""
-    radix_sort(keys, other, count, begin, end)
+    radix_sort(keys, other, count, begin, end, low)
+
+
+class Room:
+    """Memory that is kept from chunk to chunk: new memory costs as much as a sort."""
+
+    def __init__(self) -> None:
+        self._kept: wp.array | None = None
+
+    def take(self, size: int, device: wp.Device) -> wp.array:
+        """Return an array of `size` keys; what was taken before is overwritten."""
+        if self._kept is None or len(self._kept) < size:
+            self._kept = wp.empty(size + size // 4, dtype=wp.int64, device=device)
+        return self._kept[:size] if size else wp.empty(0, dtype=wp.int64, device=device)
 
 
 def ordered(
@@ -110,6 +143,7 @@ def ordered(
     top: int,
     device: wp.Device,
     late: np.ndarray | None = None,
+    room: Room | None = None,
 ) -> wp.array:
     """Return all keys in order of time, then place, then polarity.
 
@@ -123,29 +157,27 @@ def ordered(
         top: Bits of all.
         device: Where `keys` live.
         late: Keys that earlier chunks have left, shape (L,), or None where no event leaves late.
+        room: Where to sort; the result lies in it. None takes new memory.
     """
-    out = _gathered(keys, used, np.empty(0, np.int64) if late is None else late, device)
+    out = _gathered(keys, used, np.empty(0, np.int64) if late is None else late, device, room or Room())
     total = len(out) // 2
     if total == 0:
         return out
-    # a CPU slab emits its pixels one after the other, so a stable sort by time alone gives the full order
-    begin = bits + low if device.is_cpu else 0
-    if late is not None:
-        begin = low
+    begin = low if late is not None else bits + low if device.is_cpu else 0
     if device.is_cpu:
         halves = out[:total], out[total:]
-        launch.run(sort, 1, [*halves, total, begin, top], device)
+        launch.run(sort, 1, [total, begin, top, low, *halves], device)
         return halves[-(-(top - begin) // RADIX) % 2]
     idle = wp.empty(2 * total, dtype=wp.int32, device=device)
     wp.utils.radix_sort_pairs(out, idle, total, begin_bit=begin, end_bit=top)
     return out[:total]
 
 
-def _gathered(keys: wp.array, used: np.ndarray, late: np.ndarray, device: wp.Device) -> wp.array:
+def _gathered(keys: wp.array, used: np.ndarray, late: np.ndarray, device: wp.Device, room: Room) -> wp.array:
     """Return late and new keys side by side, in the first half of an array that leaves room for the sort."""
     rows, slabs, capacity = keys.shape
     counts = used.reshape(-1)
-    out = wp.empty(2 * (len(late) + int(counts.sum())), dtype=wp.int64, device=device)
+    out = room.take(2 * (len(late) + int(counts.sum())), device)
     if len(late):
         out[: len(late)].assign(late)
     if not counts.any():

@@ -167,7 +167,8 @@ def from_text(text: str, name: str, scope: Mapping[str, Any]) -> Any:
     return found[name]
 
 
-def _native(name: str, snippet: str, scope: dict[str, Any], arguments: str, returns: str) -> Any:
+def native(name: str, snippet: str, scope: dict[str, Any], arguments: str, returns: str) -> Any:
+    """Return the Warp function of a C++ text."""
     # Warp looks for the decorator in the text
     text = f"@wp.func_native(snippet)\ndef {name}({arguments}) -> {returns}: ...\n"
     return from_text(text, name, {**scope, "wp": wp, "snippet": snippet})
@@ -193,7 +194,7 @@ def _lanewise(
     arguments = ", ".join([*(f"{n}_in: Lanes" for n in names), *([others] if others else [])])
     snippet = f"#ifdef __CUDA_ARCH__\n{gpu}\n#else\n{cpu}\n#endif\n"
     scope = {"Affine": Affine, "Lanes": vector(length)}
-    return _native(name, snippet, scope, arguments, "Lanes")
+    return native(name, snippet, scope, arguments, "Lanes")
 
 
 def vector(length: int, dtype: Any = wp.float32) -> Any:
@@ -209,15 +210,15 @@ def functions(length: int) -> SimpleNamespace:
     def lanewise(name: str, body: str, lanes: str, others: str = "", cuda: str | None = None) -> Any:
         return _lanewise(f"{name}_{length}", length, body, lanes, others, cuda)
 
-    def native(name: str, snippet: str, arguments: str, returns: str) -> Any:
-        return _native(f"{name}_{length}", snippet.format(length=length), scope, arguments, returns)
+    def plain(name: str, snippet: str, arguments: str, returns: str) -> Any:
+        return native(f"{name}_{length}", snippet.format(length=length), scope, arguments, returns)
 
     ground = "grey: wp.array[float], place: Affine, last: wp.vec2, corner: wp.vec2i, step: wp.vec2i"
     return SimpleNamespace(
         Lanes=scope["Lanes"],
-        load=native("load", LOAD, "values: wp.array2d[float], k: int, n: int", "Lanes"),
-        store=native("store", STORE, "values: wp.array[float], n: int, lanes: Lanes", "None"),
-        store_whole=native("store_whole", STORE, "values: wp.array[int], n: int, lanes: Lanes", "None"),
+        load=plain("load", LOAD, "values: wp.array2d[float], k: int, n: int", "Lanes"),
+        store=plain("store", STORE, "values: wp.array[float], n: int, lanes: Lanes", "None"),
+        store_whole=plain("store_whole", STORE, "values: wp.array[int], n: int, lanes: Lanes", "None"),
         minus=lanewise("minus", "V result = a - b;", "a b"),
         plus=lanewise("plus", "V result = a + b;", "a b"),
         plus_abs=lanewise("plus_abs", "V result = a + ABS(b);", "a b"),

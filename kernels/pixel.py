@@ -17,7 +17,8 @@ A stage function asks for what it needs by the names of its arguments: the quant
 `y`, `t64` (t in double precision, for phases of long recordings), `radius` (distance from the middle of the
 sensor to its corner is 1), `nominal_on`, `nominal_off` (thresholds before any effect), parameters and states
 of its effect, random numbers (`uniform`, `normal`: new ones at every sample; `pixel_uniform`, `pixel_normal`:
-one for each pixel; `_2` and so on for more). It returns its quantity, then the new values of its states.
+one for each pixel; `_2` and so on for more), maps of its effect (one value for each pixel). It returns its
+quantity, then the new values of its states.
 `compose` writes the kernel that calls all of them, one line each, so that a sensor costs one pass over its
 samples whatever effects it has. Random numbers are counter-based, keyed by seed, effect, pixel and sample:
 they do not depend on the other effects, on chunks, threads or the batch.
@@ -91,6 +92,7 @@ class Stages:
         delays: Whether the events that `gate` holds back come later; otherwise they are lost.
         label: Of the events that `noise` makes.
         off: (parameter, value) pairs; an effect with all of them changes nothing.
+        maps: Names of quantities that every pixel has its own value of, handed over as arrays.
     """
 
     name: str
@@ -100,6 +102,7 @@ class Stages:
     delays: bool = False
     label: int = SHOT
     off: tuple[tuple[str, float], ...] = ()
+    maps: tuple[str, ...] = ()
 
 
 @wp.struct
@@ -184,7 +187,7 @@ SINKS = {"counts": Counts, "keys": Keys, "labels": Keys}
 
 
 @lru_cache(maxsize=256)
-def compose(stages: tuple[Stages, ...], source: str, sink: str, *, cuda: bool) -> wp.Kernel:
+def compose(stages: tuple[Stages, ...], source: str, sink: str, *, cuda: bool = False) -> wp.Kernel:
     """Return the kernel of a sensor.
 
     Args:
@@ -216,7 +219,7 @@ def compiled(text: str, name: str, scope: dict[str, Any]) -> wp.Kernel:
     return kernel
 
 
-def source_text(stages: tuple[Stages, ...], source: str, sink: str, *, cuda: bool) -> str:
+def source_text(stages: tuple[Stages, ...], source: str, sink: str, *, cuda: bool = False) -> str:
     """Return the text of the kernel that `compose` compiles."""
     return Writer(stages, source, sink, cuda=cuda).kernel()
 
@@ -250,6 +253,7 @@ class Writer:
         for effect in stages:
             for parameter in effect.parameters:
                 self.places[f"{effect.name}_{parameter}"] = len(self.places)
+        self.maps = [f"{effect.name}_{name}" for effect in stages for name in effect.maps]
         self.draws: dict[str, str] = {}
         self.scope: dict[str, Any] = {
             "wp": wp,
@@ -289,12 +293,12 @@ class Writer:
         return f"{name}({', '.join(arguments)})"
 
     def unless_off(self, effect: Stages, *lines: str) -> list[str]:
-        """Return the lines of an effect; off, it changes nothing, and a kernel for many models skips them."""
+        """Return the lines of an effect; a kernel for many models skips them where it is off."""
         return list(lines)
 
     def argument(self, stage: str, effect: Stages, name: str) -> str:
         """Return what a stage function gets for an argument of this name."""
-        if name in effect.parameters or name in effect.states:
+        if name in (*effect.parameters, *effect.states, *effect.maps):
             return f"{effect.name}_{name}"
         if name in QUANTITIES[stage] or (name in ANYWHERE and name not in ("x", "y")):
             return name
@@ -306,7 +310,7 @@ class Writer:
             self.draws[local] = draw.group(2)
             index = "int(redraws)" if stage == "redraw" else "sample"
             return f"{local}" if draw.group(1) else f"{draw.group(2)}({local}_key, {index})"
-        quantities = *effect.parameters, *effect.states, *QUANTITIES[stage]
+        quantities = *effect.parameters, *effect.states, *effect.maps, *QUANTITIES[stage]
         known = *quantities, *ANYWHERE, "normal", "uniform"
         raise ValueError(
             f"effect '{effect.name}': stage '{stage}' has no quantity '{name}'; there are {', '.join(known)}"
@@ -326,6 +330,7 @@ class Writer:
         self.add(
             "def pixel_events(first: int, source: Source, clock: Clock, pixels: wp.array[int], width: int,",
             "                 height: int, begin: int, seed: int, parameters: wp.array2d[float],",
+            *(["                 maps: wp.array2d[float],"] if self.maps else []),
             "                 state_in: wp.array3d[float], state_out: wp.array3d[float], sink: Sink):",
         )
         self.depth = 1
@@ -336,7 +341,9 @@ class Writer:
         """Return the text of the kernel that writes thresholds."""
         self.add(
             "def pixel_thresholds(first: int, pixels: wp.array[int], width: int, height: int, seed: int,",
-            "                     parameters: wp.array2d[float], out: wp.array3d[float]):",
+            "                     parameters: wp.array2d[float],",
+            *(["                     maps: wp.array2d[float],"] if self.maps else []),
+            "                     out: wp.array3d[float]):",
         )
         self.depth = 1
         # resolves which random numbers the threshold functions ask for
@@ -355,6 +362,7 @@ class Writer:
         self.begin()
         self.add("pixel = pixels[i]", "x = pixel % width", "y = pixel / width")
         self.add(*(f"{name} = parameters[row, {at}]" for name, at in self.places.items()))
+        self.add(*(f"{name} = maps[{at}, i]" for at, name in enumerate(self.maps)))
         for local, kind in self.draws.items():
             self.add(f"{local}_key = key(seed, {stream(local)}, pixel)")
             if re.search("_pixel_(uniform|normal)", local):

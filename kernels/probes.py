@@ -1,9 +1,9 @@
 """Summary statistics of events, accumulated per pixel, event by event.
 
-The stimulus of a pixel is known on a grid of equal steps: a cell (what the light does there: at rest, or by how
-much it has changed, in which band of intensity) and the log intensity. `observe` looks at one event; a pixel
-kernel calls it as its events happen, `walk` for events that are stored. Both write the same numbers, so that
-model and measurement are compared like with like. Sums over pixels, and their sampling errors, are
+The stimulus of a pixel is known on a grid of equal steps: a cell (what the light does there: at rest, or by
+how much it has changed, in which band of intensity) and the log intensity. `observe` looks at one event; a
+pixel kernel calls it as its events happen, `walk` for events that are stored. Both write the same numbers, so
+that model and measurement are compared like with like. Sums over pixels, and their sampling errors, are
 `dase.probes`'.
 """
 
@@ -70,11 +70,12 @@ class Probes:
     step: wp.float64  # of the grid [ns]
     slack: wp.float64  # times up to this past a grid point belong to it [ns]
     reseed: int  # 0 for common random numbers in all rows, 1 for other ones in each
-    group: int  # pixels that share a row of `sums` and `clock`; one thread works on all of them
+    group: int  # pixels that share a row of `sums`; one thread works on all of them
+    team: int  # pixels that share a row of `clock`
     memory: wp.array3d[float]  # (B, N, MEMORY)
     sums: wp.array3d[float]  # (B, G, SIZE)
     halves: wp.array3d[float]  # (B, N, HALVES)
-    clock: wp.array3d[int]  # (B, G, 2 T) OFF, ON events of each step; of length 0 when nobody asks
+    clock: wp.array3d[int]  # (B, G, 2 T) OFF, ON events of each step
 
 
 @wp.func
@@ -165,8 +166,7 @@ def observe(sink: Probes, row: int, i: int, time: wp.int64, now: int):
             add(sink, row, i, _REPEAT + 3 * band + 2, 1.0)
         half = 4 * rest + 2 * ((k / sink.half) % 2) + now
         sink.halves[row, i, half] = sink.halves[row, i, half] + 1.0
-        if sink.clock.shape[2] > 0:
-            wp.atomic_add(sink.clock, row, i / sink.group, now * sink.cell.shape[1] + k, 1)
+        wp.atomic_add(sink.clock, row, i / sink.team, now * sink.cell.shape[1] + k, 1)
     sink.memory[row, i, 0] = float(k + 1)
     sink.memory[row, i, 1] = float(now)
     sink.memory[row, i, 2] = apart

@@ -1,9 +1,9 @@
 """One kernel that simulates many models of a sensor over the same stimulus and sums up their events.
 
 The kernel has every effect that any of the models has. An effect whose parameters are at their off values is
-skipped, which changes nothing, bit for bit; so all models run through one compiled kernel. It differs from the
-kernel of `dase.kernels.pixel` in two more ways. Its time samples are the pixel's own: none where the light of
-the pixel does not change. And an event is not stored but looked at, see `dase.kernels.probes`.
+skipped, which changes nothing, bit for bit; so all models run through one compiled kernel. It differs from
+the kernel of `dase.kernels.pixel` in two more ways. Its time samples are the pixel's own: none where the
+light of the pixel does not change. And an event is not stored but looked at, see `dase.kernels.probes`.
 """
 
 from __future__ import annotations
@@ -32,7 +32,8 @@ class History:
 def compose(stages: tuple[pixel.Stages, ...]) -> wp.Kernel:
     """Return the kernel of all models with these effects, over (B, N) threads.
 
-    Its arguments are `first`, a `History`, pixels (N,), width, height, seed, parameters (B, P), `Probes`.
+    Its arguments are `first`, a `History`, pixels (N,), width, height, seed, parameters (B, P), maps
+    (M, N) where an effect has any, `Probes`.
     """
     writer = _Writer(stages)
     return pixel.compiled(writer.kernel(), "pixel_trials", writer.scope)
@@ -95,7 +96,9 @@ class _Writer(pixel.Writer):
         self.depth = 0
         self.add(
             "def pixel_trials(first: int, source: Source, pixels: wp.array[int], width: int, height: int,",
-            "                 seed_in: int, parameters: wp.array2d[float], sink: Sink):",
+            "                 seed_in: int, parameters: wp.array2d[float],",
+            *(["                 maps: wp.array2d[float],"] if self.maps else []),
+            "                 sink: Sink):",
         )
         self.depth = 1
         self.prologue()

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import math
 import statistics
 from pathlib import Path
 from typing import Any
@@ -87,7 +86,7 @@ def goal_lines(found: Row) -> list[str]:
     speed = training["samples"] / middle(training) / 1e9
     share = 4e9 * speed / copy
     shown = f"{speed:.3g} Gsample/s, {share:.0%} of copy"
-    if not chosen(rows, "threads"):
+    if found["kind"] == "cuda":
         add("counting stored log samples", shown, "90 % of copy", share > 0.9)
         noisy = rate("noisy, stored, counted")
         add("noisy sensor, stored samples, counted", f"{noisy:.3g} Gsample/s", "50 Gsample/s", noisy >= 50)
@@ -235,10 +234,14 @@ def section(found: Row) -> str:
     copy = f"copy {found['copy'] / 1e9:.3g} GB/s read plus written"
     threads = f", {found['threads']} threads" if chosen(found["rows"], "threads") else ""
     head = f"## {found['device']}{threads}, commit {found['commit']}, {copy}"
-    fast = math.inf if not found["rows"] else len(found["rows"][0]["seconds"])
-    parts = [head, f"Medians of {fast} rounds.", "\n".join(goal_lines(found))]
-    parts += ["### What an effect costs", "Stored samples, events made.", "\n".join(effect_lines(found))]
-    parts += ["### How time grows", "\n".join(slope_lines(found)), "\n".join(axis_lines(found))]
+    rows = found["rows"]
+    parts = [head]
+    if chosen(rows, "goal"):
+        parts.append("\n".join(goal_lines(found)))
+    if chosen(rows, "effect"):
+        parts += ["### What an effect costs", "Stored samples, events made.", "\n".join(effect_lines(found))]
+    if chosen(rows, "pixels"):
+        parts += ["### How time grows", "\n".join(slope_lines(found)), "\n".join(axis_lines(found))]
     return "\n\n".join(parts)
 
 
@@ -272,6 +275,9 @@ def write(folder: Path) -> None:
     every = [json.loads((folder / name).read_text()) for name in FILES if (folder / name).exists()]
     text = "\n\n".join([TEXT.rstrip(), *map(section, every), *beside(folder)]) + "\n"
     (folder / "speed.md").write_text(text)
-    draw(every, folder / "scaling.png")
+    drawn = [found for found in every if all(chosen(found["rows"], axis) for axis in ("pixels", "effect"))]
+    if drawn:
+        draw(drawn, folder / "scaling.png")
     for found in every:
-        print("\n".join([found["device"], *goal_lines(found), "", *slope_lines(found), ""]))
+        goals = goal_lines(found) if chosen(found["rows"], "goal") else []
+        print("\n".join([found["device"], *goals, "", *slope_lines(found), ""]))

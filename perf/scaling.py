@@ -5,17 +5,20 @@
 Everything is timed in turns, round after round, beside a copy of memory, so that all see the same state of
 the machine. Times are wall-clock, synchronised, and include what the host does for a chunk. The results of
 one device are in `scaling_cpu.json` or `scaling_cuda.json`; `speed.md` and `scaling.png` show those that are
-in the folder. `--draw` writes these two alone.
+in the folder. `--draw` writes these two alone, `--parts goals` measures a part anew.
 """
 
 from __future__ import annotations
 
 import argparse
 import json
+import multiprocessing
+import os
 import platform
 import statistics
 import time
 from collections.abc import Callable, Iterator
+from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
@@ -45,6 +48,8 @@ SAMPLES = {"cpu": 32, "cuda": 64}
 FIXED = {"cpu": (160, 120), "cuda": (1280, 960)}
 """Size of the sensor while the number of samples grows."""
 CHUNK = {"cpu": 64, "cuda": 128}
+PARTS = {"goals": ("goal",), "axes": ("pixels", "samples", "threads", "batch"), "effects": ("effect",)}
+"""Parts to their axes."""
 FEW = 2000
 """Pixels of a batch, as in a diagnosis."""
 CAMERA = (346, 260)
@@ -169,9 +174,9 @@ def axes(device: wp.Device) -> Iterator[Work]:
         yield case_work("batch", NOISY, batch, (FEW // 40, 40), CHUNK[where], device, batch=batch)
 
 
-def effects(device: wp.Device) -> Iterator[Work]:
+def effects(device: wp.Device, size: tuple[int, int] | None = None) -> Iterator[Work]:
     """Yield every effect alone and added to those before it, on stored samples, events made."""
-    size = CAMERA if device.is_cpu else (1280, 960)
+    size = size or (CAMERA if device.is_cpu else (1280, 960))
     samples = CHUNK[kind(device)]
     scene = stored(*size, samples, device.alias)
     total = size[0] * size[1] * samples
@@ -184,6 +189,21 @@ def effects(device: wp.Device) -> Iterator[Work]:
         several = several.with_effect(effect())
         for case, sensor in (("alone", ideal.with_effect(effect())), ("together", several)):
             yield Work("effect", case, name, total, streamed(scene, sensor, samples, device), float)
+
+
+def compile_some(alias: str, first: int, step: int) -> None:
+    """Run some of `effects` on few pixels, so that their kernels are in Warp's cache on disk."""
+    for work in list(effects(launch.device(alias), (64, 48)))[first::step]:
+        work.run()
+
+
+def compile_effects(device: wp.Device, processes: int) -> None:
+    """Compile the kernels of `effects` in several processes: for CUDA one takes seconds."""
+    spawn = multiprocessing.get_context("spawn")
+    with ProcessPoolExecutor(processes, mp_context=spawn) as pool:
+        jobs = [pool.submit(compile_some, device.alias, n, processes) for n in range(processes)]
+        for job in jobs:
+            job.result()
 
 
 def goals(device: wp.Device) -> Iterator[Work]:
@@ -258,31 +278,41 @@ def processor() -> str:
     return f"{named[0].split(':')[1].strip()}, {len(named)} cores" if named else platform.processor() or "CPU"
 
 
+def measure(device: wp.Device, parts: list[str], rounds: int, out: Path) -> None:
+    """Time some parts and write them into the results of the device, in place of older ones."""
+    begin = time.perf_counter()
+    path = out / f"scaling_{kind(device)}.json"
+    kept = json.loads(path.read_text())["rows"] if path.exists() else []
+    work = {"goals": goals, "axes": axes, "effects": effects}
+    beside = measured([copying(device)], rounds, device)
+    copy = 8 * beside[0]["samples"] / statistics.median(beside[0]["seconds"])
+    for part in parts:
+        if part == "effects" and device.is_cuda:
+            compile_effects(device, min(os.cpu_count() or 1, 8))
+        rows = measured(list(work[part](device)), rounds, device)
+        if part == "goals":
+            size = (640, 480) if device.is_cpu else (3840, 2160)
+            took, events = bench_counts(Stored("log", *size, 64, device), rounds, device)
+            row = dict(axis="goal", case="stored log, training kernel", x=0, samples=64 * size[0] * size[1])
+            rows.append(row | dict(read=True, events=events, seconds=[took]))
+        kept = [row for row in kept if row["axis"] not in PARTS[part]] + rows
+        name = processor() if device.is_cpu else device.name
+        found = dict(device=name, kind=kind(device), threads=launch.threads(), commit=commit(), copy=copy)
+        found["rows"] = kept
+        path.write_text(json.dumps(found, indent=1) + "\n")
+        print(f"{part}: {len(rows)} points after {time.perf_counter() - begin:.0f} s", flush=True)
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--device", default="cpu")
     parser.add_argument("--out", type=Path, default=Path("docs"))
     parser.add_argument("--rounds", type=int, default=5)
+    parser.add_argument("--parts", default=",".join(PARTS), help="of what; the rest stays as it was measured")
     parser.add_argument("--draw", action="store_true", help="draw what was measured before")
     options = parser.parse_args()
     if not options.draw:
-        device = launch.device(options.device)
-        begin = time.perf_counter()
-        rows = []
-        for group in ([copying(device), *goals(device)], [*axes(device)], [*effects(device)]):
-            rows += measured(group, options.rounds, device)
-            print(f"{len(rows)} points after {time.perf_counter() - begin:.0f} s", flush=True)
-        size = (640, 480) if device.is_cpu else (3840, 2160)
-        took, events = bench_counts(Stored("log", *size, 64, device), options.rounds, device)
-        rows.append(
-            dict(axis="goal", case="stored log, training kernel", x=0, samples=64 * size[0] * size[1],
-                 read=True, events=events, seconds=[took])
-        )  # fmt: skip
-        copy = 8 * rows[0]["samples"] / statistics.median(rows[0]["seconds"])
-        name = processor() if device.is_cpu else device.name
-        found = dict(device=name, threads=launch.threads(), commit=commit(), copy=copy, rows=rows[1:])
-        path = options.out / f"scaling_{kind(device)}.json"
-        path.write_text(json.dumps(found, indent=1) + "\n")
+        measure(launch.device(options.device), options.parts.split(","), options.rounds, options.out)
     draw_scaling.write(options.out)
 
 

@@ -180,7 +180,13 @@ def test_saturation_and_what_only_one_frame_shows_are_not_trusted(rng):
     confidence = scene.confidence([0.02])
     assert confidence.min() < 1e-6
     assert confidence.max() > 0.9
-    np.testing.assert_allclose(confidence >= 0.5, scene.doubt([0.02]) <= TOLERANCE)
+    np.testing.assert_array_equal(confidence[0] >= 0.5, scene.doubt([0.02])[0] <= scene.limit(0))
+    strict = scene.trusted(relative=0)
+    assert (strict <= trusted).all()
+    np.testing.assert_array_equal(strict[0], scene.doubt(np.linspace(0, 0.04 - 1e-9, 9)).max(0) <= TOLERANCE)
+    pixels = np.array([5 * 80 + 30, 22 * 80 + 33], np.int32)
+    at_once = scene.trusts(np.array([-0.01, 0.01, 0.05, 0.09]), pixels)
+    np.testing.assert_array_equal(at_once, [[0, 0], [1, 0], [1, 0], [0, 0]])
 
 
 def test_doubt_knows_motion_blur(rng):
@@ -189,7 +195,7 @@ def test_doubt_knows_motion_blur(rng):
     shares = []
     for exposure in (1e-3, 0.02):
         begin, end, frames = film(truth, rng, exposure=exposure)
-        shares.append(dase.CameraScene(frames, begin, end).trusted().mean())
+        shares.append(dase.CameraScene(frames, begin, end).trusted(relative=0).mean())
     assert shares[1] < shares[0] - 0.05
     still = film(moving_picture(rng, speed=0.0), rng, exposure=0.02)
     assert dase.CameraScene(still[2], *still[:2]).trusted().mean() > 0.99

@@ -14,6 +14,7 @@ from dase.effects.dark import Dark
 from dase.effects.flicker import Flicker
 from dase.effects.latency import Latency
 from dase.effects.leak import Leak
+from dase.effects.learned_threshold import LearnedThreshold
 from dase.effects.mismatch import Mismatch
 from dase.effects.optics_blur import OpticsBlur
 from dase.effects.readout import Readout
@@ -32,6 +33,9 @@ def all_on(mode: str) -> dase.Sensor:
     more = (
         OpticsBlur(sigma=0.4),
         Bandwidth(cutoff=400.0),
+        LearnedThreshold(
+            weights="stands for a file", bound=np.full((2, 8, 10), [[[1.1]], [[0.2]]], np.float32)
+        ),
         Mismatch(spread=0.1),
         Leak(rate=30.0, light=3.0),
         Shot(rate=60.0),

@@ -420,7 +420,7 @@ def test_the_composer_names_what_it_does_not_know():
 
     stages = (pixel.Stages("odd", (("respond", odd),)),)
     with pytest.raises(ValueError, match="effect 'odd': stage 'respond' has no quantity 'temperature'"):
-        pixel.source_text(stages, "frames", "keys", cuda=False)
+        pixel.source_text(stages, "frames", "keys")
 
 
 def test_cpu_and_cuda_agree(rng):

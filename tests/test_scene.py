@@ -10,6 +10,7 @@ import pytest
 import reference
 
 import dase
+import dase.io
 from dase import regimes
 from dase.images import ImageSource
 from dase.kernels import launch
@@ -383,3 +384,19 @@ def test_mixed_draws_regimes_by_their_share(rng):
     assert 0.1 < np.mean(objects > 19) < 0.22  # half of 70 of 281, those with 20 to 29
     with pytest.raises(dase.InputError, match="no regime 'fats': did you mean 'fast'"):
         drawn(rng, "fats")
+
+
+def test_frames_of_a_recording_are_a_scene(tmp_path, rng):
+    frames = rng.integers(0, 256, (5, 6, 8), dtype=np.uint8)
+    times = np.array([0.5, 0.6, 0.8, 0.9, 1.0])
+    dase.io.write(
+        tmp_path / "a.h5", dase.io.Sequence(dase.Events.empty(8, 6), frames=frames, frame_times=times)
+    )
+    scene = open_video(tmp_path / "a.h5")
+    np.testing.assert_allclose(scene.sample_times(), times - 0.5)
+    np.testing.assert_array_equal(scene.frames(scene.sample_times()), frames / np.float32(255))
+    small = open_video(tmp_path / "a.h5", size=(4, 3), fps=10)
+    assert (small.width, small.height, small.duration) == (4, 3, 0.4)
+    dase.io.write(tmp_path / "b.h5", dase.io.Sequence(dase.Events.empty(8, 6)))
+    with pytest.raises(dase.InputError, match="must have at least 2 frames"):
+        open_video(tmp_path / "b.h5")

@@ -5,6 +5,8 @@ To add one: its file with its dataclass and its Warp functions, its line in `EFF
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 from dase.effects.bandwidth import Bandwidth
 from dase.effects.base import Effect as Effect
 from dase.effects.base import Parameter as Parameter
@@ -17,6 +19,7 @@ from dase.effects.hot import Hot
 from dase.effects.jitter import Jitter
 from dase.effects.latency import Latency
 from dase.effects.leak import Leak
+from dase.effects.learned_threshold import LearnedThreshold
 from dase.effects.linlog import Linlog
 from dase.effects.mismatch import Mismatch
 from dase.effects.optics import SceneEffect as SceneEffect
@@ -47,6 +50,7 @@ _ORDER = (
     VoltageNoise,
     # change detector
     Threshold,
+    LearnedThreshold,
     Mismatch,
     Jitter,
     Leak,
@@ -65,8 +69,10 @@ EFFECTS: dict[str, type[Effect]] = {effect.name: effect for effect in _ORDER}
 """Name in sensor files to class, in the order in which they act."""
 
 
-def find(name: str) -> type[Effect]:
+def find(name: str, effects: Mapping[str, type[Effect]] = EFFECTS) -> type[Effect]:
     """Return the effect of this name; raises InputError with the nearest known name."""
-    if name not in EFFECTS:
-        raise InputError(f"there is no effect '{name}': {nearest(name, EFFECTS)}")
-    return EFFECTS[name]
+    if name not in effects:
+        raise InputError(
+            f"there is no effect '{name}': {nearest(name, effects)} (your own needs --effects FILE)"
+        )
+    return effects[name]

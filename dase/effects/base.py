@@ -7,13 +7,18 @@ import inspect
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any, ClassVar
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
+from numpy.typing import NDArray
 
 from dase.errors import InputError, nearest
 from dase.events import LABELS
 from dase.kernels import pixel
+
+if TYPE_CHECKING:
+    from dase.scene import Scene
 
 
 @dataclass(frozen=True)
@@ -58,6 +63,16 @@ def choice(default: str, *, among: tuple[str, ...], about: str) -> Any:
     return field(default=default, metadata={"choice": among, "about": about})
 
 
+def asset(*, about: str) -> Any:
+    """Declare a file that an effect needs, by its path from the sensor file; "" is none."""
+    return field(default="", metadata={"asset": True, "about": about})
+
+
+def hidden() -> Any:
+    """Declare what an effect carries along that is not in sensor files."""
+    return field(default=None, repr=False, compare=False, metadata={"hidden": True})
+
+
 @dataclass(frozen=True, kw_only=True)
 class Effect:
     """One physical effect of an event camera, the extension point of dase.
@@ -75,6 +90,8 @@ class Effect:
     """Stage name to Warp function."""
     states: ClassVar[tuple[str, ...]] = ()
     """What a pixel remembers from sample to sample."""
+    maps: ClassVar[tuple[str, ...]] = ()
+    """Quantities of which every pixel has its own value, depending on the scene; see `bound_to`."""
     label: ClassVar[str] = "shot"
     """What the events of its `noise` stage are marked as, one of `dase.events.LABELS`."""
 
@@ -108,6 +125,28 @@ class Effect:
         return {f.name: f.metadata["choice"] for f in dataclasses.fields(cls) if "choice" in f.metadata}
 
     @classmethod
+    def assets(cls) -> dict[str, str]:
+        """Return the files this effect needs, name to what they are."""
+        return {f.name: f.metadata["about"] for f in dataclasses.fields(cls) if "asset" in f.metadata}
+
+    @classmethod
+    def settings(cls) -> list[str]:
+        """Return the names of all that a sensor file says about this effect."""
+        return [f.name for f in dataclasses.fields(cls) if "hidden" not in f.metadata]
+
+    def located(self, folder: Path) -> Effect:
+        """Return this effect with its files found from `folder`, in which the sensor file lies."""
+        return self
+
+    def bound_to(self, scene: Scene) -> Effect:
+        """Return this effect with its maps for a scene."""
+        return self
+
+    def map_values(self, pixels: NDArray[np.int32]) -> NDArray[np.float32]:
+        """Return the maps of `bound_to` at row-major indices of pixels (N,), shape (M, N)."""
+        raise NotImplementedError
+
+    @classmethod
     def identity(cls) -> Effect:
         """Return this effect switched off: it changes nothing, bit for bit."""
         return cls(**{p.name: p.off for p in cls.parameters() if p.off is not None})
@@ -119,10 +158,12 @@ class Effect:
     @classmethod
     def from_table(cls, table: Mapping[str, Any]) -> Effect:
         """Make the effect from a table of a sensor file; raises InputError for an unknown name."""
-        known = [f.name for f in dataclasses.fields(cls)]
-        for name in table:
+        known = cls.settings()
+        for name, value in table.items():
             if name not in known:
                 raise InputError(f"effect '{cls.name}' has no parameter '{name}': {nearest(name, known)}")
+            if name in cls.assets() and not isinstance(value, str):
+                raise InputError(f"{cls.name}.{name} must be the path of a file, got {value!r}")
         return cls(**table)
 
     def delays(self) -> bool:
@@ -147,6 +188,7 @@ class Effect:
             states=self.states,
             delays=self.delays(),
             label=LABELS.index(self.label),
+            maps=self.maps,
             off=tuple((p.name, p.off) for p in self.parameters() if p.off is not None),
         )
 

@@ -1,0 +1,115 @@
+"""Another effect for a sensor."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+
+from dase.cli.options import effects_option, sensor_output
+
+if TYPE_CHECKING:
+    from dase.effects import Effect
+    from dase.history import Entry
+    from dase.sensor import Sensor
+
+
+@click.command()
+@click.argument("sensor")
+@click.argument("effect")
+@click.option("--set", "settings", multiple=True, metavar="PARAMETER=VALUE", help="Other than the default.")
+@click.option(
+    "--fit",
+    "recording",
+    type=click.Path(path_type=Path),
+    metavar="RECORDING",
+    help="Fit all parameters to this recording, and note the error before and after.",
+)
+@click.option(
+    "--scene",
+    default="frames",
+    show_default=True,
+    help="What the camera saw in RECORDING: its own frames, a video FILE, or static.",
+)
+@click.option("--device", default="cpu", show_default=True, help="cpu or cuda.")
+@click.option("--seed", default=0, show_default=True, help="The same seed gives the same fit.")
+@sensor_output
+@effects_option
+def command(
+    sensor: str,
+    effect: str,
+    settings: tuple[str, ...],
+    recording: Path | None,
+    scene: str,
+    device: str,
+    seed: int,
+    output: Path | None,
+    effects: tuple[Path, ...],
+) -> None:
+    """Add EFFECT to SENSOR, a preset or a TOML file, whose comments stay.
+
+    The effect gets its default values and goes where it acts. The change is noted at the end of the file.
+    """
+    from dase import edit
+    from dase.config import read_sensor
+    from dase.effect_files import known_effects
+    from dase.effects import find
+
+    values = dict(split(setting) for setting in settings)
+    known = known_effects(effects)
+    chosen = edit.parse_values(find(effect, known), values)
+    text = edit.SensorText(*read_sensor(sensor), known)
+    more = text.added(chosen)
+    entry = edit.today(f"add {effect}")
+    if recording is not None:
+        fitted, entry = _fitted(text.sensor(), chosen, recording, scene, device, seed)
+        more = more.became(fitted)
+    edit.write(more.noted(entry), output)
+    if output is None:
+        return
+    click.echo(f"{output}: {effect} added ({said(more.sensor()[effect])})")
+    if entry.error_before is not None and entry.error_after is not None:
+        errors = f"error {entry.error_before:.2f} before, {entry.error_after:.2f} after"
+        click.echo(f"{errors}; 1 is what two repeats of the recording give")
+
+
+def _fitted(
+    sensor: Sensor, effect: Effect, recording: Path, scene: str, device: str, seed: int
+) -> tuple[Sensor, Entry]:
+    """Return the sensor with the effect, fitted to a recording, and what is to be noted."""
+    from dase import edit
+    from dase.adding import fit_added
+    from dase.cli.diagnose import bar
+    from dase.measurement import open_measurement
+
+    data = open_measurement(recording, scene)
+    with bar(False) as tell:
+        before, found = fit_added(
+            data.events, data.scene, sensor, effect, trust=data.trust, seed=seed, device=device, progress=tell
+        )
+    for note in found.notes:
+        click.echo(f"note: {note}", err=True)
+    entry = edit.today(
+        f"add {effect.name}",
+        recording=recording.name,
+        error_before=round(before, 3),
+        error_after=round(found.error, 3),
+        floor=found.floor,
+    )
+    return edit.rounded(found.sensor), entry
+
+
+def said(effect: Effect) -> str:
+    """Return the values of an effect in a line."""
+    return ", ".join(
+        f"{p.name} {getattr(effect, p.name):g} {p.unit}".removesuffix(" 1") for p in effect.parameters()
+    )
+
+
+def split(setting: str) -> tuple[str, str]:
+    """Return name and value of a text such as rate=0.2."""
+    name, equals, value = setting.partition("=")
+    if not equals or not name.strip():
+        raise click.BadParameter(f"{setting!r} is not of the form PARAMETER=VALUE", param_hint="--set")
+    return name.strip(), value.strip()

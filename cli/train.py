@@ -1,0 +1,152 @@
+"""Learn a camera from its recordings."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from dase.cli.options import parse_size
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+
+@click.command()
+@click.argument("targets", nargs=-1, required=True)
+@click.option("-o", "--output", required=True, type=click.Path(path_type=Path), help="Folder of the run.")
+@click.option(
+    "--images",
+    help="What the simulator's scenes are made of: frames (of the recordings), a folder, "
+    "coco:ANNOTATIONS,FOLDER or builtin.  [default: frames; builtin for a sensor file]",
+)
+@click.option("--preset", default="default", show_default=True, help="default, tiny (for a CPU) or paper.")
+@click.option("--objective", default="", help="moments or wgan.  [default: the preset's]")
+@click.option("--steps", default=0, help="Generator steps.  [default: the preset's]")
+@click.option("--minutes", type=float, help="Time to take instead of a number of steps.")
+@click.option("--window", default=0.05, show_default=True, help="Time in which events are counted [s].")
+@click.option("--size", callback=parse_size, metavar="WxH", help="Of scenes, if the target is a sensor file.")
+@click.option("--sequences", default=300, show_default=True, help="Simulated by a sensor file as the target.")
+@click.option("--pattern", is_flag=True, help="Learn an offset for every column and row of the sensor.")
+@click.option("--seed", default=0, show_default=True, help="The same seed learns the same on one device.")
+@click.option("--backend", default="cpu", show_default=True, help="cpu or cuda.")
+@click.option("--resume", is_flag=True, help="Go on where an interrupted run stopped.")
+@click.option("--tensorboard", is_flag=True, help="Write the log for TensorBoard, too.")
+def command(
+    targets: tuple[str, ...],
+    output: Path,
+    images: str | None,
+    preset: str,
+    objective: str,
+    steps: int,
+    minutes: float | None,
+    window: float,
+    size: tuple[int, int] | None,
+    sequences: int,
+    pattern: bool,
+    seed: int,
+    backend: str,
+    resume: bool,
+    tensorboard: bool,
+) -> None:
+    """Learn the thresholds of a camera from TARGETS, its recordings with frames.
+
+    Nothing has to be paired or calibrated. The folder gets sensor.toml, which `dase synth --sensor`,
+    `dase compare` and `dase diagnose` take, its weights, a log and checkpoints; `dase show FOLDER` draws the
+    learned maps. A sensor file as TARGETS is simulated first: a test with known thresholds.
+    """
+    from dase.errors import InputError
+
+    try:
+        from dase import adaptation
+        from dase.run import Pace, run
+    except ModuleNotFoundError as error:
+        if error.name not in ("torch", "safetensors"):
+            raise
+        raise InputError(f'learning needs {error.name}: pip install "dase[learn]"') from None
+    job = adaptation.Job(
+        targets=targets, images=images or "", preset=preset, objective=objective, steps=steps, window=window,
+        size=size, sequences=sequences, pattern=pattern, seed=seed, backend=backend,
+    )  # fmt: skip
+    adaptation.begin(job, output, resume=resume)
+    with _bar() as opened:
+        training = adaptation.prepare(job, progress=opened)
+    pace = Pace(look=10 if preset == "tiny" else 25, seconds=None if minutes is None else 60 * minutes)
+    with _live(training, output if tensorboard else None) as look:
+        last = run(training, output, pace=pace, resume=resume, look=look)
+    width, height = training.scenery.looks.width, training.scenery.looks.height
+    recorded = None if job.of_sensor else (width, height)
+    path = adaptation.write_sensor(
+        output, training.mean, mu=last["mu"], name=output.name or "learned", size=recorded
+    )
+    for line in summary(last):
+        click.echo(line)
+    click.echo(f"{path}: try dase synth --sensor {path}, or look at it: dase show {output}")
+
+
+def summary(row: dict[str, float]) -> list[str]:
+    """Return what was learned, in a few lines."""
+    lines = [
+        f"thresholds {row['mu']:.3f} ± {row['sigma']:.3f} (mean over pixels; the mean varies by "
+        f"{row['mu_spread']:.3f} from pixel to pixel), ON/OFF {row['ratio']:.2f}"
+    ]
+    if "kl" in row:
+        lines.append(
+            f"from the truth: KL {row['kl']:.4f}, |Δμ| {row['mu_diff']:.4f}, |Δσ| {row['sigma_diff']:.4f}"
+        )
+    return lines
+
+
+class _bar:
+    """A progress bar for what is opened."""
+
+    def __enter__(self) -> Callable[[str, int, int], None]:
+        from tqdm import tqdm
+
+        self.bar: Any = tqdm(delay=0.5, leave=False, disable=None)
+        return self._tell
+
+    def _tell(self, what: str, done: int, total: int) -> None:
+        self.bar.set_description(what, refresh=False)
+        self.bar.total = total
+        self.bar.n = done
+        self.bar.refresh()
+
+    def __exit__(self, *error: object) -> None:
+        self.bar.close()
+
+
+class _live:
+    """The live line of a run, and TensorBoard's log."""
+
+    def __init__(self, training: Any, folder: Path | None):
+        self.training, self.folder, self.writer = training, folder, None
+
+    def __enter__(self) -> Callable[[dict[str, float]], None]:
+        from tqdm import tqdm
+
+        if self.folder is not None:
+            from dase.errors import InputError
+
+            try:
+                from torch.utils.tensorboard import SummaryWriter
+            except ImportError:
+                raise InputError("--tensorboard needs tensorboard: pip install tensorboard") from None
+            self.writer = SummaryWriter(str(self.folder))
+        self.bar: Any = tqdm(total=self.training.recipe.steps, unit=" steps", disable=None)
+        return self._look
+
+    def _look(self, row: dict[str, float]) -> None:
+        self.bar.total = self.training.recipe.steps
+        self.bar.n = max(int(row["step"]), 0)
+        shown = {"distance": "distance", "kl": "KL", "mu_diff": "|Δμ|", "sigma_diff": "|Δσ|", "mu": "μ"}
+        self.bar.set_postfix_str(", ".join(f"{t} {row[n]:.3g}" for n, t in shown.items() if n in row))
+        if self.writer is not None:
+            for name, value in row.items():
+                self.writer.add_scalar(name, value, int(row["step"]))
+
+    def __exit__(self, *error: object) -> None:
+        self.bar.close()
+        if self.writer is not None:
+            self.writer.close()

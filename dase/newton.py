@@ -1,0 +1,193 @@
+"""Gauss-Newton steps of the few numbers that all pixels share, from the moments.
+
+How the moments answer to the level, the table, the ratio and the patterns of a `ThresholdNet` is measured by
+counting the same scenes with all thresholds a little higher and lower. With that, the differences of the
+moments say at once how far to go, however unlike the numbers' scales are; what is left to gradient descent is
+the UNet.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import partial
+from typing import Any
+
+import torch
+
+from dase.kernels.autograd import STEP
+from dase.moments import LONG, Cells, Moments, of_pixels, with_neighbours, with_next
+from dase.networks import ThresholdNet
+from dase.targets import Pairs
+
+LONGEST = 0.1
+"""Most that a number moves in a step [in its logarithm]."""
+
+WIDEST = 1.0
+"""Most that a column or row is off [in its logarithm]."""
+
+LOOSE = (0.01, 0.03, 0.1, 0.3, 1.0)
+"""Candidates of the prior spread between neighbouring nodes of the table, chosen from by held-out data."""
+
+
+class Newton:
+    """Running derivatives of the moments, and the steps.
+
+    Args:
+        moments: What is to vanish.
+        net: Whose shared numbers are moved.
+        memory: Share of the derivatives that stays from step to step.
+    """
+
+    def __init__(self, moments: Moments, net: ThresholdNet, *, memory: float = 0.95):
+        self.moments, self.net, self.memory = moments, net, memory
+        self.loose = LOOSE[2]
+        self.kept: dict[str, torch.Tensor] = {}
+
+    @torch.no_grad()
+    def see(self, fake: Pairs) -> None:
+        """Take in how the counts of a batch answer."""
+        assert fake.answers is not None
+        ends = {name: [of_pixels(counts) for counts in both] for name, both in fake.answers.items()}
+
+        def slope(name: str, add: Callable[[torch.Tensor], torch.Tensor]) -> torch.Tensor:
+            above, below = ends[name]
+            return (add(above) - add(below)) / (2 * STEP)
+
+        member = self.moments.members(fake.grey)
+        self._keep("number", member.sum((0, 1)).double())
+        weights = self.net.basis(fake.grey).flatten(2).transpose(1, 2)  # (B, N, nodes)
+        for name in ends:
+            flat = slope(name, with_neighbours).flatten(2).transpose(1, 2)  # (B, N, F)
+            total: torch.Tensor | int = 0
+            for b in range(len(flat)):
+                if name == "ratio":
+                    total = total + member[b].T @ flat[b]
+                    continue
+                each = (flat[b][:, :, None] * weights[b][:, None]).flatten(1)
+                total = total + (member[b].T @ each).view(member.shape[2], flat.shape[2], -1)
+            assert isinstance(total, torch.Tensor)
+            self._keep(name, total.double().reshape(*total.shape[:2], -1))
+            if self.moments.pattern and name != "ratio":
+                down, across = (slope(name, partial(with_next, axis=axis)) for axis in (-2, -1))
+                self._keep(f"column_{name}", down.sum((0, 2)).T.double(), LONG)
+                self._keep(f"row_{name}", across.sum((0, 3)).T.double(), LONG)
+        if self.moments.pattern:
+            batch, _, height, width = fake.counts.shape
+            self._keep("column_number", fake.counts.new_full((width,), batch * height).double(), LONG)
+            self._keep("row_number", fake.counts.new_full((height,), batch * width).double(), LONG)
+
+    def _keep(self, name: str, value: torch.Tensor, memory: float | None = None) -> None:
+        kept = self.kept.get(name)
+        self.kept[name] = value if kept is None else kept.mul_(memory or self.memory).add_(value)
+
+    def _jacobian(self) -> torch.Tensor:
+        """Return derivatives of the means by the shared numbers, (cells · F, p): nodes of μ, of σ, ratio."""
+        parts = [self.kept[name] for name in ("mu", "sigma", "ratio") if name in self.kept]
+        whole = torch.cat(parts, 2) / self.kept["number"].clamp_min(1)[:, None, None]
+        return whole.flatten(0, 1)
+
+    def _prior(self) -> torch.Tensor:
+        """Return the precision (p, p) of the table for unit prior spread between neighbouring nodes."""
+        shape = self.net.shape.table
+        nodes = 1 if shape is None else shape[0] * shape[1]
+        laplacian = torch.zeros(nodes, nodes, dtype=torch.float64)
+        if shape is not None:
+            index = torch.arange(nodes).view(shape)
+            pairs = [(index[1:], index[:-1]), (index[:, 1:], index[:, :-1])]
+            for a, b in ((a.flatten(), b.flatten()) for a, b in pairs):
+                edge = torch.zeros(len(a), nodes, dtype=torch.float64)
+                edge[torch.arange(len(a)), a], edge[torch.arange(len(a)), b] = 1, -1
+                laplacian += edge.T @ edge
+        size = 2 * nodes + int("ratio" in self.kept)
+        out = torch.zeros(size, size, dtype=torch.float64)
+        out[:nodes, :nodes] = out[nodes : 2 * nodes, nodes : 2 * nodes] = laplacian
+        return out.to(self.moments.device)
+
+    def numbers(self) -> torch.Tensor:
+        """Return the shared numbers, in the order of the derivatives."""
+        net = self.net
+        maps = net.level[:, None] if net.shape.table is None else net.table.flatten(1)
+        parts = [maps[0], maps[1], *([net.asymmetry.view(1)] if net.shape.split else [])]
+        return torch.cat(parts).detach().double()
+
+    def _scenes(self, cells: Cells) -> torch.Tensor:
+        """Return how many different real scenes the means are of."""
+        return cells.kept["real_scenes"].clamp(1, min(self.moments.scenes, 1e9))
+
+    @torch.no_grad()
+    def step(self, share: float) -> None:
+        """Move the shared numbers by `share` of what makes the moments vanish, as far as the prior lets."""
+        cells = self.moments.sets["look"]
+        jacobian, prior = self._jacobian(), self._prior()
+        weight = cells.kept["weight"][0].double()
+        off = cells.off().flatten()
+        curve = jacobian.T @ weight @ jacobian
+        pull = jacobian.T @ weight @ off
+        here = self.numbers()
+        # the weights are per scene and over cells x features; the data says n times as much
+        unit = 1 / (self._scenes(cells) * len(off))
+        tiny = 1e-6 * torch.eye(len(curve), device=curve.device, dtype=curve.dtype) * curve.diagonal().mean()
+
+        def solve(loose: float) -> torch.Tensor:
+            hold = prior * (unit / loose**2)
+            return torch.linalg.solve(curve + hold + tiny, -(pull + hold @ here))
+
+        if self.moments.calls % 25 == 0 and self.net.shape.table is not None:
+            self._choose(solve, jacobian, weight)
+        move = (share * solve(self.loose)).clamp(-LONGEST, LONGEST)
+        self._apply(move)
+        cells.shift((jacobian @ move).view(cells.kept["fake_sum"].shape))
+        if self.moments.pattern:
+            self._patterns(share)
+
+    def _choose(self, solve: Any, jacobian: torch.Tensor, weight: torch.Tensor) -> None:
+        """Choose the prior spread whose solution fits held-out scenes best, moments taken as linear."""
+        cells = self.moments.sets["look"]
+        off = cells.off(held_out=True).flatten()
+        scores = []
+        for loose in LOOSE:
+            rest = off + jacobian @ solve(loose)
+            scores.append(rest @ weight @ rest)
+        self.loose = LOOSE[int(torch.stack(scores).argmin())]
+
+    def _apply(self, move: torch.Tensor) -> None:
+        net = self.net
+        nodes = self.kept["mu"].shape[2]
+        maps = move[: 2 * nodes].float().view(2, nodes)
+        if net.shape.table is None:
+            net.level += maps[:, 0]
+        else:
+            net.table += maps.view(net.table.shape)
+        if net.shape.split:
+            net.asymmetry += move[-1].float()
+
+    def _patterns(self, share: float, loose: float = 0.3) -> None:
+        """Move the offsets of columns and rows, each by its own moments.
+
+        One column sees little, so simulated scenes are remembered longer and noise in them counts as well.
+        """
+        for axis, offsets in (("column", self.net.columns), ("row", self.net.rows)):
+            cells = self.moments.sets[axis]
+            number = self.kept[f"{axis}_number"][:, None]
+            jacobian = torch.stack([self.kept[f"{axis}_{n}"] / number for n in ("mu", "sigma")], 2)
+            weight = cells.kept["weight"].double()
+            curve = torch.einsum("cfp,cfg,cgq->cpq", jacobian, weight, jacobian)
+            pull = torch.einsum("cfp,cfg,cg->cp", jacobian, weight, cells.off())
+            scenes = 1 / (1 / self._scenes(cells) + 1 / cells.kept["fake_scenes"])
+            unit = 1 / (scenes * weight.shape[0] * weight.shape[1] * loose**2)
+            eye = torch.eye(2, device=curve.device, dtype=curve.dtype)
+            here = offsets.T.double()
+            move = -torch.linalg.solve(curve + unit * eye, pull + unit * here)
+            move = (0.5 * share * (move - move.mean(0))).clamp(-LONGEST, LONGEST)
+            move = (here + move).clamp(-WIDEST, WIDEST) - here
+            offsets += move.T.float()
+            cells.shift(torch.einsum("cfp,cp->cf", jacobian, move))
+
+    def state(self) -> dict[str, Any]:
+        """Return what the next step depends on."""
+        return {"kept": self.kept, "loose": self.loose}
+
+    def load(self, state: dict[str, Any]) -> None:
+        """Take over what `state` returned."""
+        self.kept = {name: value.to(self.moments.device) for name, value in state["kept"].items()}
+        self.loose = state["loose"]

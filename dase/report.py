@@ -1,0 +1,229 @@
+"""Reports: one HTML file each, which opens anywhere and needs nothing else."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from html import escape
+from pathlib import Path
+
+import numpy as np
+
+from dase import figures, page
+from dase.config import dump_sensor
+from dase.distinguish import WORDS
+from dase.events import Events
+from dase.io import replacing
+from dase.maps import event_plates
+from dase.measurement import Measurement
+from dase.plates import Plate, number
+from dase.results import Comparison, Diagnosis, Estimate, Step
+from dase.sensor import Sensor, stream
+
+LONGEST = 2.0
+"""Of what is pictured [s]."""
+
+
+def write(path: Path, html: str) -> None:
+    """Write a page, whole or not at all."""
+    with replacing(path) as temporary:
+        temporary.write_text(html, "utf-8")
+
+
+def pictures(measured: Measurement, sensor: Sensor, *, seed: int = 0, device: str = "cpu") -> list[Plate]:
+    """Return pictures of a measurement beside what a model makes of its scene, its first seconds.
+
+    Args:
+        measured: The measurement.
+        sensor: The model.
+        seed: Of every random number of the simulation.
+        device: `cpu`, `cuda` or a Warp name.
+    """
+    times = measured.scene.sample_times()
+    begin, end = float(times[0]), min(float(times[-1]), float(times[0]) + LONGEST)
+    parts = []
+    for part in stream(measured.scene, sensor, seed=seed, device=device):
+        parts.append(part)
+        if len(part) and part.t[-1] > end:
+            break
+    shown = times[np.unique(np.searchsorted(times, np.linspace(begin, end, 13)[:-1]))]
+    frames = np.clip(255 * measured.scene.frames(shown), 0, 255).astype(np.uint8)
+    simulated = Events.concatenate(parts)
+    return event_plates(measured.events, simulated, (begin, end), frames=frames, frame_times=shown)
+
+
+def comparison_page(
+    found: Comparison, *, recording: str, model: str | None = None, plates: Sequence[Plate] = ()
+) -> str:
+    """Return the report of a comparison.
+
+    Args:
+        found: What the comparison found.
+        recording: What to call the measurement.
+        model: What to call the model; the name of the sensor if None.
+        plates: Pictures of it, see `dase.maps`.
+    """
+    wrong = found.error > found.gate
+    body = [
+        page.verdict(comparison_verdict(found), wrong=wrong),
+        page.table(("", "measured", "simulated", "model / measured"), _plain(found.plain)),
+        "<h2>Where the model fails</h2>",
+        page.cells(found.cells, "No single cell differs by more than chance."),
+        *map(page.figure, [*plates, *comparison_plates(found)]),
+        _sensor(found.sensor),
+        page.notes(found.notes),
+    ]
+    return page.page(f"{model or found.sensor.name} against {recording}", "comparison", body, found.seconds)
+
+
+def comparison_verdict(found: Comparison) -> str:
+    """Return what a comparison found, in a sentence or two."""
+    if found.error <= found.gate:
+        return (
+            f"The model cannot be told from the measurement: its error is {number(found.error)} noise "
+            f"floors, and chance alone reaches {number(found.gate)}."
+        )
+    worst = max(found.families, key=lambda name: found.families[name], default="")
+    about = f" It is worst in {family_words(worst)}." if worst else ""
+    return (
+        f"The model is wrong: its error on held-out pixels and time is {number(found.error)} times the noise "
+        f"floor, where chance alone reaches {number(found.gate)}.{about}"
+    )
+
+
+def comparison_plates(found: Comparison) -> list[Plate]:
+    """Return the figures of a comparison: errors by family, then the curves of each family, worst first."""
+    named = {family_words(name): error for name, error in found.families.items()}
+    plates = [figures.families(named, floor=found.floor, gate=found.gate)] if named else []
+    for name in sorted(found.curves, key=lambda name: -found.families.get(name, 0.0)):
+        title = family_words(name)
+        about = f"error {number(found.families[name])}" if name in found.families else ""
+        caption = (
+            "Points are measured, lines are the model's; the grey band is twice the sampling error of their "
+            "difference, so a line outside of it is wrong beyond chance."
+        )
+        plates.append(figures.curves(title[:1].upper() + title[1:], about, found.curves[name], caption))
+    return plates
+
+
+def diagnosis_page(
+    found: Diagnosis, *, recording: str, model: str | None = None, plates: Sequence[Plate] = ()
+) -> str:
+    """Return the report of a diagnosis.
+
+    Args:
+        found: What the diagnosis found.
+        recording: What to call the measurement.
+        model: What to call the model; the name of the sensor if None.
+        plates: Pictures of the model that was found, see `dase.maps`.
+    """
+    body = [page.verdict(diagnosis_verdict(found), wrong=found.unexplained is not None)]
+    body += map(page.figure, diagnosis_plates(found))
+    if found.history and found.history[0].cells:
+        body += ["<h2>Where the model failed</h2>", page.cells(found.history[0].cells)]
+    if found.unexplained is not None:
+        body += ["<h2>What stays unexplained</h2>", f"<p>{escape(found.unexplained.sentence)}.</p>"]
+        body += [
+            page.cells(found.unexplained.cells, "It is spread over many cells; no single one stands out.")
+        ]
+    body += [
+        *map(page.figure, plates),
+        _parameters(found.parameters),
+        _sensor(found.sensor),
+        page.notes(found.notes),
+    ]
+    foot = f"{found.evaluations:,} simulations. " if found.evaluations else ""
+    return page.page(
+        f"{model or found.sensor.name} against {recording}", "diagnosis", body, found.seconds, foot
+    )
+
+
+def diagnosis_verdict(found: Diagnosis) -> str:
+    """Return what a diagnosis found, in a sentence or two."""
+    first, last = number(found.errors[0]), number(found.errors[-1])
+    if found.unexplained is not None:
+        left = number(found.unexplained.error)
+        near = " and ".join(found.unexplained.nearest)
+        tried = f" {near} comes nearest, but leaves {left}: a stand-in, not a finding." if near else ""
+        return (
+            f"Something is missing that no known effect explains: the error is {first} noise floors, and "
+            f"chance reaches {number(found.gate)}.{tried}"
+        )
+    if not found.selected:
+        error = f"the error is {first} noise floors, and chance reaches {number(found.gate)}."
+        if found.errors[0] > found.gate:
+            return f"Nothing of weight is missing: {error} What is left is beyond chance, but small."
+        return f"Nothing is missing: {error}"
+    names = " and ".join(found.selected)
+    ties = "".join(
+        f" The data cannot tell {name} from {' or '.join(others)}."
+        for name, others in found.ties.items()
+        if others
+    )
+    return (
+        f"Missing: {names}. With {'it' if len(found.selected) == 1 else 'them'} the held-out error falls "
+        f"from {first} to {last} noise floors; chance alone reaches {number(found.gate)}.{ties}"
+    )
+
+
+def diagnosis_plates(found: Diagnosis) -> list[Plate]:
+    """Return the figures of a diagnosis: the staircase, the candidates of each step, the parameters."""
+    plates = [staircase_of(found)]
+    plates += [ranking_of(step, found.floor) for step in found.history if step.ranking]
+    return plates + ([parameters_of(found.sensor, found.parameters)] if found.parameters else [])
+
+
+def parameters_of(sensor: Sensor, estimates: Mapping[str, Estimate]) -> Plate:
+    """Return fitted parameters of a sensor within the ranges of real cameras."""
+    facts = {f"{e.name}.{p.name}": p for e in sensor.effects for p in e.parameters()}
+    known = {name: value for name, value in estimates.items() if name in facts}
+    ranges = {name: facts[name].plausible for name in known}
+    return figures.parameters(known, ranges, {name: facts[name].unit for name in known})
+
+
+def staircase_of(found: Diagnosis) -> Plate:
+    """Return the staircase of the falling error."""
+    steps, errors = ["fitted"], list(found.errors)
+    if math.isfinite(found.before) and found.before > 1.05 * errors[0]:
+        steps, errors = ["as given", "fitted"], [found.before, *errors]
+    steps += [f"+ {name}" for name in found.selected]
+    return figures.staircase(steps, errors, floor=found.floor, gate=found.gate)
+
+
+def ranking_of(step: Step, floor: float) -> Plate:
+    """Return how far each candidate of one step brings the error down."""
+    full = [rank for rank in step.ranking if rank.refined and math.isfinite(rank.error)]
+    return figures.ranking(
+        [rank.effect for rank in full],
+        [rank.error for rank in full],
+        present=step.error,
+        p_values=[rank.p_value for rank in full],
+        chosen=[] if step.chosen is None else [step.chosen],
+        ties=step.ties,
+        floor=floor,
+        screened=len(step.ranking) - len(full),
+    )
+
+
+def family_words(name: str) -> str:
+    """Return a family of statistics in a few words."""
+    return WORDS.get(name, name)
+
+
+def _plain(plain: Mapping[str, tuple[float, float]]) -> list[tuple[str, ...]]:
+    # what is left of a count after rounding is none
+    whole = {name: [v if abs(v) > 1e-9 else 0.0 for v in pair] for name, pair in plain.items()}
+    return [(name, number(m), number(s), _ratio(m, s)) for name, (m, s) in whole.items()]
+
+
+def _ratio(measured: float, simulated: float) -> str:
+    return number(simulated / measured) if measured > 0 and math.isfinite(simulated) else "–"
+
+
+def _parameters(found: Mapping[str, Estimate]) -> str:
+    rows = [(name, number(e.value), f"{number(e.low)} to {number(e.high)}") for name, e in found.items()]
+    return page.fold("Parameters as a table", page.table(("parameter", "value", "90 % interval"), rows))
+
+
+def _sensor(sensor: Sensor) -> str:
+    return page.fold("The model as a sensor file", f"<pre>{escape(dump_sensor(sensor))}</pre>")

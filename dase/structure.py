@@ -1,0 +1,125 @@
+"""Regularities of time stamps: clocks that tick slowly, readouts that go from row to row."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dase.events import Events
+
+FILE = 1e-6
+"""Files give whole microseconds: stamps are off by half of it [s]."""
+
+SHORTEST = 3e-6
+"""Shorter regularities cannot be told from the file's own [s]."""
+
+CERTAIN = 0.97
+"""Share of events that must follow a regularity."""
+
+ENOUGH = 100_000
+
+DIRECTIONS = ("down", "up", "right", "left")
+
+
+@dataclass(frozen=True)
+class Structure:
+    """Regularities found in the time stamps of a measurement.
+
+    Args:
+        step: Time between the ticks of the clock [s]; 0 for none that is seen.
+        line: Time from row to row of the readout [s]; 0 for none that is seen.
+        direction: Where the readout goes.
+    """
+
+    NAMES: ClassVar = (
+        "share of times at ticks of one clock",
+        "share of times at which the pixel's line is read",
+    )
+
+    step: float = 0.0
+    line: float = 0.0
+    direction: str = "down"
+
+    def shares(self, events: Events) -> NDArray[np.float64]:
+        """Return the shares of events that follow each regularity, shape (2,); 0 where there is none."""
+        out = np.zeros(2)
+        if len(events) == 0:
+            return out
+        if self.step:
+            out[0] = share_at(events.t, self.step)
+        if self.line:
+            lines, place = places(events, self.direction)
+            out[1] = share_at(events.t - place * self.line, lines * self.line)
+        return out
+
+
+def share_at(t: NDArray[np.float64], step: float) -> float:
+    """Return the share of times that are multiples of a step, but for the rounding of the file."""
+    off = t - np.round(t / step) * step
+    return float(np.mean(np.abs(off) <= min(1.1 * FILE, 0.2 * step)))
+
+
+def places(events: Events, direction: str) -> tuple[int, NDArray[np.float64]]:
+    """Return the number of lines, and the line of each event."""
+    upright = direction in ("down", "up")
+    lines = events.height if upright else events.width
+    place = (events.y if upright else events.x).astype(np.float64)
+    return lines, lines - 1 - place if direction in ("up", "left") else place
+
+
+def find(events: Events) -> Structure:
+    """Return the regularities of a measurement's time stamps, from its first `ENOUGH` events."""
+    events = events.select(slice(ENOUGH))
+    best = Structure()
+    for direction in DIRECTIONS:
+        line = line_time(events, direction)
+        if line > best.line:
+            best = Structure(line=line, direction=direction)
+    # the lines of a scan are read at ticks too
+    return best if best.line else Structure(step=ticks(events.t))
+
+
+def ticks(t: NDArray[np.float64]) -> float:
+    """Return the time between the ticks that all stamps are multiples of [s], 0 where there is none."""
+    gaps = np.diff(t)
+    gaps = gaps[gaps > SHORTEST]
+    if len(gaps) < 50:
+        return 0.0
+    step = float(np.quantile(gaps, 0.02))
+    step = refined(t, step)
+    return step if share_at(t, step) >= CERTAIN and spread_over(t, step) else 0.0
+
+
+def refined(t: NDArray[np.float64], step: float) -> float:
+    """Return the step near `step` that stamps are multiples of, from ever longer stretches of time."""
+    for span in np.geomspace(30 * step, max(float(t[-1]), 60 * step), 12):
+        part = t[t <= t[0] + span]
+        ticks_ = np.round((part - part[0]) / step)
+        if ticks_[-1] > 0:
+            step = float((ticks_ * (part - part[0])).sum() / (ticks_ * ticks_).sum())
+    return step
+
+
+def spread_over(t: NDArray[np.float64], step: float) -> bool:
+    """Whether stamps at multiples are no accident of few distinct times."""
+    return len(np.unique(np.round(t / step))) >= 20
+
+
+def line_time(events: Events, direction: str) -> float:
+    """Return the time from line to line of a readout [s], 0 where there is none in this direction."""
+    lines, place = places(events, direction)
+    order = np.lexsort((events.t, place))
+    t, where = events.t[order], place[order]
+    gaps = np.diff(t)[where[1:] == where[:-1]]
+    gaps = gaps[gaps > SHORTEST]
+    if len(gaps) < 50:
+        return 0.0
+    scan = float(np.quantile(gaps, 0.02))
+    # all stamps of a line are at one phase of the scan; phases of lines follow each other
+    busy = np.bincount(where.astype(np.int64), minlength=lines).argmax()
+    scan = refined(t[where == busy], scan)
+    line = scan / lines
+    return line if share_at(events.t - place * line, scan) >= CERTAIN else 0.0

@@ -1,0 +1,284 @@
+"""The training loop: scenes, thresholds, counts, what tells them from real ones, and the way back."""
+
+from __future__ import annotations
+
+import json
+import math
+from dataclasses import asdict, dataclass, field, fields
+from typing import Any, Literal
+
+import numpy as np
+import torch
+
+from dase.moments import Moments
+from dase.networks import NetworkShape, ThresholdNet
+from dase.newton import Newton
+from dase.objectives import Adversarial, Hash, Objective
+from dase.optimizers import AdaBelief
+from dase.scenery import Scenery, middle
+from dase.targets import Pairs, Target, answers, draw_noise, simulate, vary
+
+REFERENCE = 0.25, 0.06
+"""Threshold and spread at which scenes are counted once more, to tell busy scenes from low thresholds."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Recipe:
+    """Everything about a training run but its data.
+
+    Args:
+        objective: `wgan`, the paper's bank of critics, or `moments`.
+        steps: Generator steps.
+        warmup: Steps before them in which the objective alone learns.
+        batch: Scenes of either domain in a step.
+        mu: Mean threshold to begin with [log intensity].
+        sigma: Standard deviation to begin with [log intensity].
+        optimizer: Of the generator: `adam` (0.5, 0.99) or `adabelief` (0.9, 0.999).
+        rate: Learning rate of the UNet.
+        rate_scalars: Learning rate of the global numbers.
+        ramp: Steps over which the rates rise from 0; a cosine takes them back to 0 at the end.
+        average: Decay of the running mean of the weights that is the result; 0 takes the last weights.
+        anchor: Weight of the mean square residual.
+        smooth: Weight of the roughness of the table.
+        kl: λ of Eq. 9, which is added to the loss.
+        surrogate: Of the gradient of counts.
+        critic_rate: Learning rate of the critics.
+        critic_cosine: Whether it falls as the generator's does.
+        critic_steps: Steps of the critics in a step.
+        penalty: Weight of the gradient penalty.
+        uniform: α of Eq. 13; 1 turns re-weighting off.
+        critic_image: Whether critics see the image.
+        hash: Of the patches.
+        cells: Levels of brightness and contrast of the moments.
+        memory: Of the fake moments from step to step.
+        doubt: Share by which means of features may differ for reasons that thresholds cannot cure.
+        newton: Share of a Gauss-Newton step that is taken with the moments.
+        network: Of the generator.
+        seed: Of everything random.
+    """
+
+    objective: Literal["wgan", "moments"] = "wgan"
+    steps: int = 3000
+    warmup: int = 50
+    batch: int = 12
+    mu: float = 0.5
+    sigma: float = 0.15
+    optimizer: Literal["adam", "adabelief"] = "adam"
+    rate: float = 1e-4
+    rate_scalars: float = 1e-2
+    ramp: int = 100
+    average: float = 0.995
+    anchor: float = 5.0
+    smooth: float = 0.1
+    kl: float = 1e-5
+    surrogate: str = "expected"
+    critic_rate: float = 2e-4
+    critic_cosine: bool = False
+    critic_steps: int = 1
+    penalty: float = 1.0
+    uniform: float = 0.5
+    critic_image: bool = False
+    hash: Hash = field(default_factory=Hash)
+    cells: tuple[int, int] = (6, 5)
+    memory: float = 0.95
+    doubt: float = 0.0
+    newton: float = 0.2
+    network: NetworkShape = field(default_factory=NetworkShape)
+    seed: int = 0
+
+    def text(self) -> str:
+        """Return the recipe as JSON."""
+        return json.dumps(asdict(self), indent=1)
+
+    @classmethod
+    def parse(cls, text: str) -> Recipe:
+        """Return the recipe of a JSON text."""
+        table = json.loads(text)
+        table["hash"] = Hash(**table["hash"])
+        network = table["network"]
+        for name in ("pattern", "table"):
+            network[name] = None if network[name] is None else tuple(network[name])
+        table["network"] = NetworkShape(**network)
+        table["cells"] = tuple(table["cells"])
+        return cls(**{f.name: table[f.name] for f in fields(cls) if f.name in table})
+
+
+class Training:
+    """One run: the state between two steps, and the step.
+
+    Args:
+        recipe: How to learn.
+        target: What to become like.
+        scenery: Draws the simulator's scenes.
+    """
+
+    def __init__(self, recipe: Recipe, target: Target, scenery: Scenery):
+        self.recipe, self.target, self.scenery, self.device = recipe, target, scenery, scenery.device
+        torch.manual_seed(recipe.seed)
+        self.net = ThresholdNet(recipe.network, mu=recipe.mu, sigma=recipe.sigma).to(self.device)
+        self.net = self.net.to(memory_format=torch.channels_last)
+        self.mean = ThresholdNet(recipe.network).to(self.device)
+        self.mean.load_state_dict(self.net.state_dict())
+        self.optimizer = self._optimizer()
+        self.objective = self._objective()
+        moments = self.objective
+        self.newton = Newton(moments, self.net) if isinstance(moments, Moments) else None
+        self.generator = torch.Generator(self.device).manual_seed(recipe.seed + 1)
+        self.scenes = np.random.default_rng([recipe.seed, 1])
+        self.reals = np.random.default_rng([recipe.seed, 2])
+        self.step = -recipe.warmup
+        self.seconds = 0.0
+        self.best = math.inf
+        self.calibrated = False
+
+    def _optimizer(self) -> torch.optim.Optimizer:
+        recipe = self.recipe
+        groups = [
+            {"params": self.net.body(), "lr": recipe.rate, "full": recipe.rate},
+        ]
+        if recipe.objective == "wgan":
+            groups.append(
+                {"params": self.net.scalars(), "lr": recipe.rate_scalars, "full": recipe.rate_scalars}
+            )
+        if recipe.optimizer == "adabelief":
+            return AdaBelief(groups, betas=(0.9, 0.999))
+        return torch.optim.Adam(groups, betas=(0.5, 0.99), fused=self.device.type == "cuda")
+
+    def _objective(self) -> Objective:
+        recipe = self.recipe
+        if recipe.objective == "moments":
+            pattern = recipe.network.pattern is not None
+            return Moments(
+                device=self.device,
+                levels=recipe.cells,
+                pattern=pattern,
+                memory=recipe.memory,
+                scenes=self.target.scenes,
+                doubt=recipe.doubt,
+            )
+        return Adversarial(
+            recipe.hash,
+            device=self.device,
+            seed=recipe.seed + 2,
+            rate=recipe.critic_rate,
+            steps=recipe.critic_steps,
+            penalty=recipe.penalty,
+            uniform=recipe.uniform,
+            image=recipe.critic_image,
+        )
+
+    def calibrate(self, batches: int = 4) -> None:
+        """Show the objective what patches of both domains look like."""
+        sets = []
+        for _ in range(batches):
+            with torch.no_grad():
+                sets.append((self._fake()[0], self.target.draw(self.reals, self.recipe.batch)))
+        self.objective.calibrate(sets)
+        held_out = self.target.held_out()
+        if held_out is not None and isinstance(self.objective, Moments):
+            for n in range(0, len(held_out), self.recipe.batch):
+                some = held_out.select(slice(n, n + self.recipe.batch))
+                self.objective.see_real(some, held_out=True)
+        self.calibrated = True
+
+    def _fake(self) -> tuple[Pairs, torch.Tensor]:
+        """Return simulated pairs and the residual of the network."""
+        log = self.scenery.draw(self.scenes, self.recipe.batch)
+        grey = middle(log)
+        maps = self.net(grey)
+        mu, sigma = maps.by_polarity() if self.recipe.network.split else (maps.mu, maps.sigma)
+        noise = draw_noise(log, self.generator)
+        counts = simulate(log, mu, sigma, noise, surrogate=self.recipe.surrogate)
+        self.maps = maps
+        if self.recipe.objective != "moments":
+            return Pairs(grey, counts), maps.residual
+        with torch.no_grad():
+            level = torch.full_like(grey, REFERENCE[0])
+            reference = simulate(log, level, REFERENCE[1], noise)
+        varied = vary(log, mu, sigma, noise) if self.recipe.rate > 0 else None
+        near = answers(log, mu.detach(), sigma.detach(), noise)
+        return Pairs(grey, counts, reference, varied, near), maps.residual
+
+    def rate(self) -> float:
+        """Return the share of the full learning rates at this step."""
+        step, recipe = self.step, self.recipe
+        fall = max(recipe.steps - recipe.ramp, 1)
+        cosine = 0.5 * (1 + math.cos(math.pi * min(max(step - recipe.ramp, 0) / fall, 1)))
+        return min((step + 1) / max(recipe.ramp, 1), 1) * cosine
+
+    def advance(self) -> dict[str, torch.Tensor]:
+        """Do one step; return what is worth logging, still on the device."""
+        if not self.calibrated:
+            self.calibrate()
+        recipe, move = self.recipe, self.step >= 0
+        share = self.rate() if move else 0.0
+        if recipe.critic_cosine and isinstance(self.objective, Adversarial):
+            self.objective.rate = recipe.critic_rate * (share if move else 1.0)
+        fake, residual = self._fake()
+        real = self.target.draw(self.reals, recipe.batch)
+        loss, values = self.objective.loss(fake, real, move=move)
+        if self.newton is not None:
+            self.newton.see(fake)
+        if move:
+            loss = loss + recipe.anchor * residual.square().mean() + recipe.kl * prior(self.maps)
+            if recipe.smooth:
+                loss = loss + recipe.smooth * self.net.roughness()
+            for group in self.optimizer.param_groups:
+                group["lr"] = share * group["full"]
+            self.optimizer.zero_grad(set_to_none=True)
+            loss.backward()
+            self.optimizer.step()
+            if self.newton is not None:
+                self.newton.step(recipe.newton * share)
+            self._average()
+        self.step += 1
+        values["loss"] = loss.detach()
+        return values
+
+    @torch.no_grad()
+    def _average(self) -> None:
+        # the first steps are forgotten soon, as if the mean had begun later
+        keep = min(self.recipe.average, (self.step + 1) / (self.step + 10)) if self.recipe.average else 0.0
+        mine, theirs = list(self.mean.parameters()), list(self.net.parameters())
+        torch._foreach_lerp_(mine, theirs, 1 - keep)
+
+    def state(self) -> dict[str, Any]:
+        """Return everything the rest of the run depends on."""
+        return {
+            "recipe": self.recipe.text(),
+            "net": self.net.state_dict(),
+            "mean": self.mean.state_dict(),
+            "optimizer": self.optimizer.state_dict(),
+            "newton": None if self.newton is None else self.newton.state(),
+            "objective": self.objective.state(),
+            "generator": self.generator.get_state(),
+            "target": self.target.state(),
+            "scenes": self.scenes.bit_generator.state,
+            "reals": self.reals.bit_generator.state,
+            "step": self.step,
+            "seconds": self.seconds,
+            "best": self.best,
+            "calibrated": self.calibrated,
+        }
+
+    def load(self, state: dict[str, Any]) -> None:
+        """Take over what `state` returned."""
+        self.net.load_state_dict(state["net"])
+        self.mean.load_state_dict(state["mean"])
+        self.optimizer.load_state_dict(state["optimizer"])
+        self.objective.load(state["objective"])
+        if self.newton is not None:
+            self.newton.load(state["newton"])
+        self.generator.set_state(state["generator"].cpu())
+        self.target.load(state["target"])
+        self.scenes.bit_generator.state = state["scenes"]
+        self.reals.bit_generator.state = state["reals"]
+        self.step, self.seconds, self.best = state["step"], state["seconds"], state["best"]
+        self.recipe = Recipe.parse(state["recipe"])
+        self.calibrated = state["calibrated"]
+
+
+def prior(maps: Any) -> torch.Tensor:
+    """Return the mean over pixels of KL(N(μ, σ²) ‖ N(0, 1)): Eq. 9, with the sign that keeps it small."""
+    mu, sigma = maps.mu, maps.sigma
+    return (0.5 * (sigma.square() + mu.square() - 1) - sigma.log()).mean()

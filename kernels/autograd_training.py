@@ -1,0 +1,126 @@
+"""What training hands to kernels without a gradient: rendering batches, hashing patches, moving critics."""
+
+from __future__ import annotations
+
+from functools import lru_cache
+
+import numpy as np
+import torch
+import warp as wp
+
+from dase.kernels import bank as _bank
+from dase.kernels import patches as _patches
+from dase.kernels import scenery as _scenery
+from dase.kernels.autograd import _launch
+from dase.kernels.scene import Affine
+
+
+def render_log(
+    grey: torch.Tensor,
+    texels: torch.Tensor,
+    background: torch.Tensor,
+    start: torch.Tensor,
+    size: torch.Tensor,
+    place: torch.Tensor,
+    box: torch.Tensor,
+    *,
+    width: int,
+    height: int,
+    eps: float,
+) -> torch.Tensor:
+    """Render B scenes of L layers at K samples.
+
+    Args:
+        grey: Backgrounds, shape (G, h · w).
+        texels: All other textures, (intensity · alpha, alpha), shape (T, 2).
+        background: Which background, int32 (B,).
+        start: First texel of each layer, int32 (B, L).
+        size: Width and height of each texture, int32 (B, L, 2).
+        place: Sensor to texture coordinates, shape (B, K, L, 2, 3).
+        box: Corners that a layer stays inside of [px], shape (B, L, 4).
+        width: Columns [px].
+        height: Rows [px].
+        eps: Added to intensities before the logarithm.
+
+    Returns:
+        Log intensity, shape (B, K, height, width) float32.
+    """
+    out = torch.empty(*place.shape[:2], height * width, device=place.device)
+    inputs = [
+        grey, wp.from_torch(texels, dtype=wp.vec2), background, start, wp.from_torch(size, dtype=wp.vec2i),
+        wp.from_torch(place, dtype=Affine), wp.from_torch(box, dtype=wp.vec4), width, eps,
+    ]  # fmt: skip
+    _launch(_scenery.render_log, inputs, [out])
+    return out.view(*place.shape[:2], height, width)
+
+
+def patch_structure(image: torch.Tensor, *, size: int, stride: int) -> dict[str, torch.Tensor]:
+    """Return angle, coherence, strength and energy of every patch, as `dase.patches.attributes` does.
+
+    Args:
+        image: Intensity, shape (B, H, W).
+        size: Side of a patch [px].
+        stride: Step from patch to patch [px].
+
+    Returns:
+        Name to float32 of shape (B, patches), row by row of the grid.
+    """
+    batch, columns, number = _grid(image, size, stride)
+    out = [image.new_empty(batch, number, dtype=torch.float32) for _ in range(4)]
+    inputs = [image.float().contiguous(), _window(size, image.device), stride, columns]
+    _launch(_patches.structure, inputs, out)
+    return dict(zip(("angle", "coherence", "strength", "energy"), out, strict=True))
+
+
+@lru_cache(maxsize=16)
+def _window(size: int, device: torch.device) -> torch.Tensor:
+    """Return Gaussian weights along one axis of a patch, sigma = size/4, sum 1."""
+    weight = np.exp(-0.5 * ((np.arange(size) - (size - 1) / 2) / (size / 4)) ** 2)
+    return torch.tensor(weight / weight.sum(), dtype=torch.float32, device=device)
+
+
+def patch_contrast(counts: torch.Tensor, *, size: int, stride: int) -> torch.Tensor:
+    """Return the contrast of Eq. 12 of every patch of counts (B, C, H, W), shape (B, patches) [events]."""
+    batch, columns, number = _grid(counts, size, stride)
+    out = counts.new_empty(batch, number, dtype=torch.float32)
+    kernel = _patches.contrast_of[wp.float32]
+    _launch(kernel, [counts.detach().float().contiguous(), size, stride, columns], [out])
+    return out
+
+
+def _grid(maps: torch.Tensor, size: int, stride: int) -> tuple[int, int, int]:
+    rows, columns = ((side - size) // stride + 1 for side in maps.shape[-2:])
+    return maps.shape[0], columns, rows * columns
+
+
+def move_critics(
+    weight: torch.Tensor,
+    square: torch.Tensor,
+    copy: torch.Tensor,
+    left: torch.Tensor,
+    right: torch.Tensor,
+    end: torch.Tensor,
+    rate: torch.Tensor,
+    correction: torch.Tensor,
+    *,
+    decay: float,
+    tiny: float = 1e-8,
+) -> None:
+    """Move weights by Adam without momentum along the sum of outer products of `left` and `right` rows.
+
+    Args:
+        weight: Changed in place, float32 (C, J, K); J and K are multiples of 4.
+        square: Running mean of squared gradients, changed in place, shaped alike.
+        copy: Set to the weights in bfloat16, (C, J, K).
+        left: float32 (R, J), the rows of critic 0 first.
+        right: bfloat16 or float32 (R, K), in the same order.
+        end: Where the rows of each critic end, int32 (C,).
+        rate: Learning rate of each critic, float32 (C,); those at 0 are not touched.
+        correction: 1 / (1 - decay^steps) of each critic, float32 (C,).
+        decay: Of the running mean.
+        tiny: Added to the root of the mean square.
+    """
+    half = right.dtype == torch.bfloat16
+    inputs = [left, right.view(torch.int32), end, rate, correction, decay, tiny]
+    tiles = weight.view(weight.shape[0], -1, _bank.TILE**2)[..., 0]
+    _launch(_bank.adam[half], inputs, [weight, square, copy.view(torch.int32)], over=tiles)
