@@ -192,14 +192,14 @@ def open_video(path: Path, *, fps: float | None = None, size: tuple[int, int] | 
 
 def _is_recording(path: Path) -> bool:
     from dase import io
+    from dase.io import frames
 
     if not path.is_file():
         return False
     try:
-        io.find(path)
+        return io.find(path) is not frames.FORMAT  # which are videos and pictures
     except InputError:
         return False
-    return True
 
 
 def _scene_of(path: Path, fps: float | None, size: tuple[int, int] | None) -> VideoScene:
