@@ -11,12 +11,13 @@ from typing import Any, Literal
 import numpy as np
 import torch
 
-from dase import images, io
+from dase import images
 from dase.baselines import Randomised, esim, event_rate
 from dase.config import dump_sensor, load_sensor, presets
 from dase.effects.learned_threshold import LearnedThreshold
 from dase.effects.threshold import Threshold
 from dase.errors import InputError, nearest
+from dase.files import replacing
 from dase.networks import NetworkShape, ThresholdNet
 from dase.objectives import Hash
 from dase.recorded import open_target
@@ -250,7 +251,7 @@ def begin(job: Job, out: Path, *, resume: bool) -> None:
     if not resume and record.exists():
         raise InputError(f"{out} already holds a run; give --resume to go on with it, or another folder")
     out.mkdir(parents=True, exist_ok=True)
-    with io.replacing(record) as temporary:
+    with replacing(record) as temporary:
         temporary.write_text(job.text(), "utf-8")
 
 
@@ -285,7 +286,7 @@ def write_sensor(
     sensor = Sensor(
         effects=(Threshold(on=on, off=off), LearnedThreshold(weights=WEIGHTS)), name=name, size=size
     )
-    with io.replacing(out / SENSOR) as temporary:
+    with replacing(out / SENSOR) as temporary:
         temporary.write_text(dump_sensor(sensor), "utf-8")
     return out / SENSOR
 
