@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
+
 import numpy as np
 import pytest
 import torch
@@ -37,7 +39,7 @@ def networks(bank: CriticBank) -> list[nn.Sequential]:
     out = []
     for critic in range(SHAPE.classes):
         sizes = (SHAPE.inputs, SHAPE.wide, SHAPE.narrow, 1)
-        layers = [nn.Linear(a, b) for a, b in zip(sizes[:-1], sizes[1:], strict=True)]
+        layers = [nn.Linear(a, b) for a, b in pairwise(sizes)]
         for n, layer in enumerate(layers, start=1):
             layer.weight.data = getattr(bank, f"w{n}")[critic].clone().view_as(layer.weight)
             layer.bias.data = getattr(bank, f"b{n}")[critic].clone()
