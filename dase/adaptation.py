@@ -20,15 +20,15 @@ from dase.errors import InputError, nearest
 from dase.files import replacing
 from dase.networks import NetworkShape, ThresholdNet
 from dase.objectives import Hash
-from dase.recorded import open_target
+from dase.recorded import Replayed, open_target
 from dase.scenery import Looks, Scenery, middle
 from dase.sensor import Sensor, count
-from dase.targets import Finite, Pairs, Target, Truth
+from dase.targets import Finite, Pairs, Target, Truth, draw_noise, simulate
 from dase.training import Recipe, Training
 from dase.video import VideoScene
 from dase.weights import save_net
 
-JOB, SENSOR, WEIGHTS = "job.json", "sensor.toml", "learned.safetensors"
+JOB, SENSOR, WEIGHTS, EXAMPLES = "job.json", "sensor.toml", "learned.safetensors", "examples.npz"
 
 TABLE = 6, 5
 """Nodes of brightness and edge strength in the default recipe."""
@@ -289,6 +289,32 @@ def write_sensor(
     with replacing(out / SENSOR) as temporary:
         temporary.write_text(dump_sensor(sensor), "utf-8")
     return out / SENSOR
+
+
+@torch.no_grad()
+def write_examples(out: Path, training: Training, *, scenes: int = 3, seed: int = 0) -> None:
+    """Write what `dase show` draws: some scenes, their events of both sides, and the learned maps.
+
+    The events of the target are those of the same scenes where it saw them, else of others.
+    """
+    scenery, net = training.scenery, training.mean
+    rng, generator = np.random.default_rng(seed), torch.Generator(scenery.device).manual_seed(seed)
+    if isinstance(scenery, Replayed) and isinstance(training.target, Finite):
+        busy = training.target.pairs.counts.float().sum((1, 2, 3))
+        index = torch.sort(torch.topk(busy, min(4 * scenes, len(busy))).indices).values
+        index = index[:: max(len(index) // scenes, 1)][:scenes]
+        log, real = scenery.log[index].float(), training.target.pairs.select(index)
+    else:
+        log, real = scenery.draw(rng, scenes), training.target.draw(rng, scenes)
+    grey = middle(log)
+    maps = net(grey)
+    mu, sigma = maps.by_polarity()
+    counts = simulate(log, mu, sigma, draw_noise(log, generator))
+    arrays = dict(
+        grey=grey, real_grey=real.grey, real=real.counts, simulated=counts, mu=maps.mu, sigma=maps.sigma
+    )
+    with replacing(out / EXAMPLES) as temporary:
+        np.savez_compressed(temporary, **{name: value.cpu().numpy() for name, value in arrays.items()})
 
 
 def baseline(

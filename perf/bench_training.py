@@ -167,9 +167,8 @@ def bank(args: argparse.Namespace, clock: Clock, rate: float, patches: int) -> d
         )
     )
     moved = shape.classes * shape.wide * shape.inputs * 18
-    print(
-        f"grouped products in one launch: {_has_grouped_products(clock.device) if args.device != 'cpu' else '-'}"
-    )
+    if clock.device.type == "cuda":
+        print(f"grouped products in one launch: {_has_grouped_products(clock.device)}")
     return {
         "patches": patches,
         "active": active,

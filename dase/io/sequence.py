@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from dase.errors import InputError
 from dase.events import Events
+from dase.files import replacing as replacing
 
 Grey = np.uint8 | np.uint16
 GREYS = (np.uint8, np.uint16)
