@@ -7,18 +7,25 @@ from pathlib import Path
 
 import click
 
+from dase.cli.options import check_suffix, effects_option
+
 
 @click.command()
 @click.argument("sensor")
 @click.argument("recording", type=click.Path(path_type=Path))
 @click.argument("file", required=False, type=click.Path(path_type=Path))
 @click.option(
-    "-o", "--output", type=click.Path(path_type=Path), help="Report; its numbers go beside it as .json."
+    "-o",
+    "--output",
+    type=click.Path(path_type=Path),
+    callback=check_suffix(".html"),
+    help="Report, one HTML file; its numbers go beside it as .json.",
 )
 @click.option(
     "--scene", default="frames", show_default=True,
     help="What the camera saw: its own frames, video FILE (a clip, a folder, an npz with frames), or static.",
 )  # fmt: skip
+@effects_option
 @click.option("--pixels", default=1500, show_default=True, help="In each half of the measurement.")
 @click.option("--device", default="cpu", show_default=True, help="cpu or cuda.")
 @click.option("--seed", default=0, show_default=True, help="The same seed gives the same numbers.")
@@ -29,6 +36,7 @@ def command(
     file: Path | None,
     output: Path | None,
     scene: str,
+    effects: tuple[Path, ...],
     pixels: int,
     device: str,
     seed: int,
@@ -41,10 +49,11 @@ def command(
     from dase.cli.diagnose import bar
     from dase.comparison import compare
     from dase.config import load_sensor
+    from dase.effect_files import known_effects
     from dase.io import replacing
     from dase.measurement import open_measurement
 
-    model = load_sensor(sensor)
+    model = load_sensor(sensor, known_effects(effects))
     measured = open_measurement(recording, scene, file)
     with bar(quiet) as tell:
         found = compare(
@@ -65,5 +74,11 @@ def command(
     for note in found.notes:
         click.echo(f"note: {note}")
     if output is not None:
+        from dase import report
+
+        plates = report.pictures(measured, model, seed=seed, device=device)
+        page = report.comparison_page(found, recording=recording.name, model=Path(sensor).stem, plates=plates)
+        report.write(output, page)
         with replacing(output.with_suffix(".json")) as part:
             part.write_text(json.dumps(found.to_json(), indent=2) + "\n")
+        click.echo(f"{output}: open it in a browser")

@@ -10,6 +10,8 @@ from typing import TYPE_CHECKING
 
 import click
 
+from dase.cli.options import check_suffix, effects_option
+
 if TYPE_CHECKING:
     from dase.results import Diagnosis
 
@@ -18,9 +20,10 @@ def explain(ctx: click.Context, parameter: click.Parameter, value: str | None) -
     """Say what an effect is and what it does to the probes, and exit."""
     if value is None or ctx.resilient_parsing:
         return
+    from dase.effect_files import known_effects
     from dase.explain import explanation
 
-    click.echo(explanation(value))
+    click.echo(explanation(value, known_effects(ctx.params.get("effects", ()))))
     ctx.exit()
 
 
@@ -36,6 +39,19 @@ def explain(ctx: click.Context, parameter: click.Parameter, value: str | None) -
 @click.option("--free", help="Parameters that may be refitted, with commas between.  [default: all]")
 @click.option("--json", "json_", type=click.Path(path_type=Path), help="Write the findings to this file.")
 @click.option("-o", "--output", type=click.Path(path_type=Path), help="Write the sensor with what was found.")
+@click.option(
+    "--report",
+    type=click.Path(path_type=Path),
+    callback=check_suffix(".html"),
+    help="Write everything into this HTML file, with pictures.",
+)
+@click.option(
+    "--draw",
+    type=click.Path(path_type=Path),
+    callback=check_suffix(".png", ".svg", ".pdf"),
+    help="Draw the falling error into this PNG, SVG or PDF.",
+)
+@effects_option
 @click.option("--pixels", default=1500, show_default=True, help="In each half of the measurement.")
 @click.option("--device", default="cpu", show_default=True, help="cpu or cuda.")
 @click.option("--seed", default=0, show_default=True, help="The same seed gives the same findings.")
@@ -51,6 +67,9 @@ def command(
     free: str | None,
     json_: Path | None,
     output: Path | None,
+    report: Path | None,
+    draw: Path | None,
+    effects: tuple[Path, ...],
     pixels: int,
     device: str,
     seed: int,
@@ -61,25 +80,37 @@ def command(
     Every effect that the sensor does not have is fitted, and judged on pixels and time held out. Nothing is
     announced unless it brings the error to what two repeats of the recording would give.
     """
-    from dase.config import dump_sensor, load_sensor
+    from dase import edit
+    from dase.config import read_sensor
     from dase.diagnosis import MOST, diagnose
+    from dase.effect_files import known_effects
     from dase.io import replacing
     from dase.measurement import open_measurement
 
-    model = load_sensor(sensor)
+    known = known_effects(effects)
+    text = edit.SensorText(*read_sensor(sensor), known)
+    model = text.sensor()
     measured = open_measurement(recording, scene, file)
     names = free.split(",") if free else None
     with bar(quiet) as tell:
         found = diagnose(
-            measured.events, measured.scene, model, trust=measured.trust, free=names,
+            measured.events, measured.scene, model, trust=measured.trust, effects=known, free=names,
             most=MOST if auto else 1, pixels=pixels, seed=seed, device=device, progress=tell,
         )  # fmt: skip
     if json_ is not None:
         with replacing(json_) as part:
             part.write_text(json.dumps(found.to_json(), indent=2) + "\n")
     if output is not None:
-        with replacing(output) as part:
-            part.write_text(dump_sensor(found.sensor))
+        edit.write(edit.diagnosed(text, found, recording.name), output)
+    if draw is not None:
+        with replacing(draw) as part:
+            found.plot().savefig(part)
+    if report is not None:
+        from dase import report as pages
+
+        plates = pages.pictures(measured, found.sensor, seed=seed, device=device)
+        page = pages.diagnosis_page(found, recording=recording.name, model=Path(sensor).stem, plates=plates)
+        pages.write(report, page)
     _print(found, quiet)
 
 

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import click
 
-from dase.cli.options import effects_option
+from dase.cli.options import check_suffix, effects_option
 
 
 @click.command()
@@ -18,7 +18,13 @@ from dase.cli.options import effects_option
 )
 @click.option("--seed", default=0, show_default=True, help="Of the simulated recordings.")
 @click.option("--device", default="cpu", show_default=True, help="cpu or cuda.")
-@click.option("-o", "--output", type=click.Path(path_type=Path), help="Draw it into this PNG, PDF or SVG.")
+@click.option(
+    "-o",
+    "--output",
+    type=click.Path(path_type=Path),
+    callback=check_suffix(".png", ".svg", ".pdf"),
+    help="Draw it into this PNG, SVG or PDF.",
+)
 @effects_option
 def command(
     a: str,
@@ -45,7 +51,6 @@ def command(
     known = known_effects(effects)
     names = (Path(a).stem, Path(b).stem) if Path(a).stem != Path(b).stem else ("A", "B")
     models = (load_sensor(a, known), load_sensor(b, known))
-    check_output(output)
     with tqdm(total=len(distinguish.STANDARDS), unit=" recordings", disable=None) as bar:
 
         def progress(stimulus: str, seconds: float, power: float, last: bool) -> None:
@@ -65,11 +70,3 @@ def command(
 
         with replacing(output) as temporary:
             found.plot(names).savefig(temporary)
-
-
-def check_output(output: Path | None) -> None:
-    """Refuse a picture that could not be written, before the work is done."""
-    from dase.errors import InputError
-
-    if output is not None and output.suffix.lower() not in (".png", ".pdf", ".svg"):
-        raise InputError(f"output must end with .png, .pdf or .svg, got '{output}'")

@@ -6,6 +6,8 @@ from pathlib import Path
 
 import click
 
+from dase.cli.options import effects_option
+
 
 @click.command()
 @click.argument("sensor")
@@ -17,6 +19,7 @@ import click
     "--scene", default="frames", show_default=True,
     help="What the camera saw: its own frames, video FILE (a clip, a folder, an npz with frames), or static.",
 )  # fmt: skip
+@effects_option
 @click.option("--pixels", default=1500, show_default=True, help="In each half of the measurement.")
 @click.option("--device", default="cpu", show_default=True, help="cpu or cuda.")
 @click.option("--seed", default=0, show_default=True, help="The same seed gives the same fit.")
@@ -28,27 +31,29 @@ def command(
     output: Path,
     free: str | None,
     scene: str,
+    effects: tuple[Path, ...],
     pixels: int,
     device: str,
     seed: int,
     quiet: bool,
 ) -> None:
-    """Fit the parameters of the model SENSOR to RECORDING."""
+    """Fit the parameters of the model SENSOR to RECORDING; the comments of its file stay."""
+    from dase import edit
     from dase.cli.diagnose import bar
-    from dase.config import dump_sensor, load_sensor
+    from dase.config import read_sensor
+    from dase.effect_files import known_effects
     from dase.fitting import fit
-    from dase.io import replacing
     from dase.measurement import open_measurement
 
-    model = load_sensor(sensor)
+    text = edit.SensorText(*read_sensor(sensor), known_effects(effects))
+    model = text.sensor()
     measured = open_measurement(recording, scene, file)
     with bar(quiet) as tell:
         found = fit(
             measured.events, measured.scene, model, free=free.split(",") if free else None,
             trust=measured.trust, pixels=pixels, seed=seed, device=device, progress=tell,
         )  # fmt: skip
-    with replacing(output) as part:
-        part.write_text(dump_sensor(found.sensor))
+    edit.write(edit.fitted(text, found, recording.name), output)
     click.echo(f"error {found.before:.2f} → {found.error:.2f}; repeats stay below {found.gate:.2f}")
     for name, estimate in found.parameters.items():
         click.echo(f"  {name:24s} {estimate.value:10.4g}   {estimate.low:.4g} to {estimate.high:.4g}")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 
 import click
@@ -24,6 +25,7 @@ effects_option = click.option(
     "--effects",
     type=click.Path(path_type=Path),
     multiple=True,
+    is_eager=True,  # options that answer at once may need them
     metavar="FILE",
     help="Python file with effects of your own (`dase effects new`); may be given again.",
 )
@@ -36,3 +38,16 @@ sensor_output = click.option(
     help="Sensor file to write; may be SENSOR itself.  [default: print it]",
 )
 """`-o FILE` of commands that write a sensor file; a command gets a path or None."""
+
+
+def check_suffix(*suffixes: str) -> Callable[[click.Context, click.Parameter, Path | None], Path | None]:
+    """Return a callback that refuses another suffix, and a folder that is not there, before any work."""
+
+    def check(ctx: click.Context, parameter: click.Parameter, value: Path | None) -> Path | None:
+        if value is not None and value.suffix.lower() not in suffixes:
+            raise click.BadParameter(f"'{value}' must end with {' or '.join(suffixes)}")
+        if value is not None and not value.parent.is_dir():
+            raise click.BadParameter(f"the folder '{value.parent}' does not exist")
+        return value
+
+    return check

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,24 +14,24 @@ from dase.effects.flicker import Flicker
 from dase.effects.optics import SceneEffect
 from dase.effects.row_scan import RowScan
 from dase.effects.timestamp import Timestamp
+from dase.error import Judgement, Scale
 from dase.evidence import Evidence
-from dase.model import Model, added, starts
+from dase.model import Model, added, settle, starts
 from dase.space import variants
-from dase.trials import finer_steps
 
 Array = NDArray[np.float64]
 
-FINALISTS = 5
+FINALISTS = 4
 """Candidates that are fitted to all pixels of the training half."""
 
 SECOND = 1.25
 """A second start is followed where its loss is below this, relative to the first."""
 
-SEEDS = 6
-"""Simulations whose mean loss is taken where candidates are compared."""
+REPEATS = 30
+"""Simulations with other seeds by which a finalist is judged."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Tried:
     """One candidate.
 
@@ -40,8 +40,8 @@ class Tried:
         model: With the effect, fitted.
         fit: Its loss where it was fitted.
         scouted: Its loss on the scout.
-        held: Its loss on the held-out half, by what is seen of the model without it; NaN where it was only
-            screened.
+        families: The same by family.
+        judged: Its error on the held-out half; None where it was only screened.
         bank: Statistics of all that was tried on the training half, shape (M, J).
     """
 
@@ -49,8 +49,14 @@ class Tried:
     model: Model
     fit: float
     scouted: float = float("nan")
-    held: float = float("nan")
+    families: Mapping[str, float] = field(default_factory=dict)
+    judged: Judgement | None = None
     bank: Array | None = None
+
+    @property
+    def error(self) -> float:
+        """The held-out error, NaN where it was only screened."""
+        return self.judged.error if self.judged else float("nan")
 
 
 Report = Callable[[str, float], None]
@@ -85,8 +91,7 @@ def prepared(evidence: Evidence, effect: type[Effect]) -> list[Effect]:
 def scout(evidence: Evidence, present: Model, effect: Effect, *, seed: int) -> Tried:
     """Try one effect on the scout: a look at many places, then a short descent from the best two."""
     model = added(present, effect)
-    sensor = model.space.sensor
-    slow = model.space.streams or finer_steps(sensor, evidence.scout.trials.stimulus.grid.step) > 0
+    slow = evidence.scout.slow(model.space)
     places, losses = screen(evidence.scout, model.space, starts(model, effect, few=slow), seed=seed)
     apart = np.flatnonzero((np.abs(places - places[0]).max(1) > 0.8) & (losses < SECOND * losses[0]))
     picks = [0, *apart[: 0 if slow else 1]]
@@ -97,23 +102,26 @@ def scout(evidence: Evidence, present: Model, effect: Effect, *, seed: int) -> T
         for n in picks
     ]
     best = min(ends, key=lambda m: m.loss)
-    return Tried(effect.name, best, best.loss, best.loss)
+    values = evidence.scout.run(best.space, best.place, seed=seed)[0]
+    return Tried(effect.name, best, best.loss, best.loss, evidence.scout.scale.families(values))
 
 
 def refine(evidence: Evidence, tried: Tried, *, seed: int) -> Tried:
-    """Fit a candidate to all pixels of the training half and look at the held-out one."""
-    found: Found = tried.model.explore(evidence.train, seed=seed, iterations=4, radius=0.2)
+    """Fit a candidate to all pixels of the training half, by the sampling errors of the present model."""
+    found: Found = tried.model.explore(evidence.train, seed=seed, iterations=3, radius=0.2)
     model = replace(tried.model, place=found.place, loss=found.loss)
-    held = held_loss(evidence, model, seed=seed)
-    return replace(tried, model=model, fit=found.loss, held=held, bank=found.tried)
+    return replace(tried, model=model, fit=found.loss, bank=found.tried)
 
 
-def held_loss(evidence: Evidence, model: Model, *, seed: int) -> float:
-    """Return the held-out loss of a model as that of the present one is judged: the mean of a few repeats."""
-    half = evidence.held
-    places = np.repeat(model.place[None], SEEDS, 0)
-    values = half.run(model.space, places, seed=seed + 700, reseed=True)
-    return float(half.seen.loss(values.mean(0)))
+def judge_alone(evidence: Evidence, tried: Tried, *, seed: int) -> Tried:
+    """Fit a candidate by its own sampling errors and judge it on the held-out half.
+
+    Effects that make pixels differ have sampling errors far above those of the model without them, by which
+    they would look worse than they are.
+    """
+    model = settle(evidence, tried.model, seed=seed, rounds=1)
+    judged = model.judge(evidence.held, repeats=REPEATS, seed=seed + 500)
+    return replace(tried, model=model, judged=judged)
 
 
 def try_all(
@@ -122,12 +130,14 @@ def try_all(
     effects: Mapping[str, type[Effect]],
     names: Sequence[str],
     *,
+    worst: Sequence[str],
     seed: int,
     report: Report,
 ) -> list[Tried]:
-    """Try each effect; return the finalists in order of their held-out loss, then the others.
+    """Try each effect; return the finalists in order of their held-out error, then the others.
 
-    All halves must have been rebased to the present model.
+    `worst` are the families in which the present model fails; who helps there is looked at more closely. The
+    training half and the scout must have been rebased to the present model; finalists take their place.
     """
     all_variants = [v for name in names for v in prepared(evidence, effects[name])]
     found: dict[str, Tried] = {}
@@ -137,16 +147,28 @@ def try_all(
             found[effect.name] = tried
         report(f"trying {effect.name}", 0.7 * (n + 1) / len(all_variants))
     order = sorted(found.values(), key=lambda t: t.fit)
-    finalists = []
-    for n, tried in enumerate(order[:FINALISTS]):
-        finalists.append(refine(evidence, tried, seed=seed))
-        report(f"fitting {tried.name}", 0.7 + 0.3 * (n + 1) / min(FINALISTS, len(order)))
-    finalists.sort(key=lambda t: t.held)
-    return [*finalists, *order[FINALISTS:]]
+    chosen = [*order[:FINALISTS], *specialists(order, worst)]
+    finalists = [refine(evidence, tried, seed=seed) for tried in chosen]
+    done = []
+    for n, tried in enumerate(finalists):
+        report(f"fitting {tried.name}", 0.7 + 0.3 * n / len(finalists))
+        done.append(judge_alone(evidence, tried, seed=seed))
+    done.sort(key=lambda t: t.error)
+    return [*done, *(t for t in order if t not in chosen)]
+
+
+def specialists(order: Sequence[Tried], worst: Sequence[str]) -> list[Tried]:
+    """Return those beside the first ones that help most in the families where the present model is worst."""
+    out: list[Tried] = []
+    for family in worst:
+        best = min(order, key=lambda t: t.families.get(family, float("inf")))
+        if best not in order[:FINALISTS] and best not in out:
+            out.append(best)
+    return out
 
 
 def chance_of(
-    evidence: Evidence, tried: Sequence[Tried], repeats: Array, present: Array
+    scale: Scale, tried: Sequence[Tried], repeats: Array, present: Array
 ) -> Callable[[float], float]:
     """Return the function from a fall of the training loss to its p-value, corrected over all candidates.
 
@@ -154,7 +176,7 @@ def chance_of(
     tried for any candidate.
 
     Args:
-        evidence: Rebased to the present model.
+        scale: Of the training half, by which candidates were fitted.
         tried: Candidates with their banks.
         repeats: Statistics of repeats of the present model on the training half, shape (R, J).
         present: Statistics of the present model as it was compared with the candidates, shape (J,).
@@ -163,7 +185,6 @@ def chance_of(
     if not banks:
         return lambda fall: 1.0
     bank = np.concatenate(banks)
-    scale = evidence.train.scale
     gains = []
     for repeat in repeats:
         stand_in = replace(scale, target=repeat)
@@ -174,15 +195,3 @@ def chance_of(
         return float((1 + np.count_nonzero(ordered >= fall)) / (1 + len(ordered)))
 
     return p_value
-
-
-def apart(evidence: Evidence, one: Model, other: Model, *, seed: int) -> tuple[float, float]:
-    """Return by how much the held-out loss of `other` is above that of `one`, and its standard error.
-
-    The error comes from leaving out one group of pixels after the other.
-    """
-    half = evidence.held
-    differences = half.leave_out([half.simulate(m.space, m.place, seed=seed) for m in (one, other)])
-    count = differences.shape[1]
-    gap = differences[1] - differences[0]
-    return float(gap.mean()), float(np.sqrt((count - 1) * gap.var()))

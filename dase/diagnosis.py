@@ -7,9 +7,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import combinations
 
-import numpy as np
-
-from dase.candidates import Tried, apart, chance_of, open_to, try_all
+from dase.candidates import Tried, chance_of, open_to, try_all
 from dase.confidence import estimates
 from dase.effects import EFFECTS, Effect
 from dase.error import Judgement
@@ -40,8 +38,8 @@ CLOSE = 2.0
 CLOSE_FAMILY = 3.5
 """The same for the error of one family: what few statistics show, such as dead pixels, the mean hides."""
 
-TIE = 2.0
-"""Candidates within so many standard errors of the best are not told apart from it."""
+TIE = 0.35
+"""Candidates at the floor whose held-out error is within this of the best's are not told apart from it."""
 
 MOST = 4
 """Effects that are added at most."""
@@ -53,7 +51,7 @@ SWAPPED = 2
 """Alternatives to an effect that are tried in its place once all others are found."""
 
 NEARBY = 1.6
-"""Only alternatives whose held-out loss was below this, relative to the chosen one's."""
+"""Only alternatives whose held-out error was about below this, relative to the chosen one's."""
 
 Progress = Callable[[str, float, float], None]
 """Told what is being done, the share of the step done, and the present error."""
@@ -70,7 +68,7 @@ class _Search:
     given: frozenset[str]
     history: list[Step] = field(default_factory=list)
     alternatives: dict[str, list[Tried]] = field(default_factory=dict)
-    held_of: dict[str, float] = field(default_factory=dict)
+    error_of: dict[str, float] = field(default_factory=dict)
     ties: dict[str, set[str]] = field(default_factory=dict)
     first: list[Tried] = field(default_factory=list)
     first_fit: float = float("nan")
@@ -146,6 +144,13 @@ def explained(judgement: Judgement) -> bool:
     return judgement.error <= max(judgement.gate, CLOSE) and all(inside)
 
 
+def worst_families(judgement: Judgement) -> list[str]:
+    """Return the two families that are most above their limits, if any are."""
+    families, limits = judgement.families, judgement.limits
+    above = [name for name in families if families[name] > limits[name]]
+    return sorted(above, key=lambda name: -families[name] / limits[name])[:2]
+
+
 def _greedy(search: _Search, model: Model, most: int) -> tuple[Model, Judgement, list[float]]:
     """Add the best effect as long as one is missing."""
     errors = []
@@ -173,57 +178,53 @@ def _step(search: _Search, model: Model, judgement: Judgement, more: bool) -> tu
     open_names = open_to(search.effects, model)
     if not open_names:
         return step, None
+    present = evidence.train.run(model.space, model.place, seed=seed)[0]
+    scale, base = evidence.train.scale, float(evidence.train.scale.loss(present))
+    if not search.history:
+        search.first_fit = model.loss_on(evidence.scout, seed=seed)
     tried = try_all(
-        evidence, model, search.effects, open_names, seed=seed,
+        evidence, model, search.effects, open_names, worst=worst_families(judgement), seed=seed,
         report=lambda text, share: search.progress(text, share, search.error),
     )  # fmt: skip
-    present = evidence.train.run(model.space, model.place, seed=seed)[0]
-    p_value = chance_of(evidence, tried, repeats, present)
-    base = float(evidence.train.scale.loss(present))
-    finalists = [t for t in tried if np.isfinite(t.held)]
-    best, ties = _choose(search, finalists)
-    ranking = tuple(_rank(t, judgement, p_value(base - t.fit) if np.isfinite(t.held) else 1.0) for t in tried)
+    p_value = chance_of(scale, tried, repeats, present)
+    best, ties = _choose([t for t in tried if t.judged])
+    ranking = tuple(_rank(t, judgement, p_value(base - t.fit) if t.judged else 1.0) for t in tried)
     mine = next(rank for rank in ranking if rank.effect == best.name)
-    enough = (
-        mine.fall >= MATERIAL
-        and mine.share >= SHARE
-        and mine.p_value <= max(SIGNIFICANT, 1.01 / (1 + len(repeats)))
-    )
+    certain = mine.p_value <= max(SIGNIFICANT, 1.01 / (1 + len(repeats)))
+    enough = mine.fall >= MATERIAL and mine.share >= SHARE and certain
     if not search.history:
         search.first = sorted(tried, key=lambda t: t.scouted)
-        search.first_fit = model.loss_on(evidence.scout, seed=seed)
     if enough:
-        search.alternatives[best.name] = [t for t in finalists if t.name != best.name]
-        search.held_of[best.name] = best.held
+        search.alternatives[best.name] = [t for t in tried if t.judged and t.name != best.name]
+        search.error_of[best.name] = best.error
         search.ties[best.name] = set(ties)
     step = replace(step, ranking=ranking, chosen=best.name if enough else None, ties=ties if enough else ())
-    return step, settle(evidence, best.model, seed=seed) if enough else None
+    return step, settle(evidence, best.model, seed=seed, rounds=1) if enough else None
 
 
-def _choose(search: _Search, finalists: Sequence[Tried]) -> tuple[Tried, tuple[str, ...]]:
+def _choose(finalists: Sequence[Tried]) -> tuple[Tried, tuple[str, ...]]:
     """Return the best candidate, the simplest of those that are not told apart, and the others of those."""
     first = finalists[0]
-    like = [first]
-    for other in finalists[1:]:
-        gap, error = apart(search.evidence, first.model, other.model, seed=search.seed)
-        if gap < TIE * error and other.held < 1.1 * first.held + 0.05:
-            like.append(other)
-    best = min(like, key=lambda t: (len(t.model.place), t.held))
+    reach = max(TIE, 0.1 * first.error)
+    good = first.judged is not None and explained(first.judged)
+    like = [
+        t for t in finalists
+        if t.error <= first.error + reach and t.judged and (explained(t.judged) or not good)
+    ]  # fmt: skip
+    best = min(like, key=lambda t: (len(t.model.place), t.error))
     return best, tuple(t.name for t in like if t.name != best.name)
 
 
 def _rank(tried: Tried, judgement: Judgement, p_value: float) -> Rank:
-    """Return a candidate as the user sees it; losses become errors by the unit of the present model."""
-    full = bool(np.isfinite(tried.held))
-    error = tried.held / judgement.unit
-    fall = judgement.error - error
+    """Return a candidate as the user sees it."""
+    fall = judgement.error - tried.error
     share = fall / max(judgement.error - 1.0, 1e-9)
     mine = {
         axis.name: Estimate(*(3 * (float(axis.to_value(place)),)))
         for axis, place in zip(tried.model.space.axes, tried.model.place, strict=True)
         if axis.name.split(".")[0] in tried.name.split(" + ")
     }
-    return Rank(tried.name, error, fall, min(share, 1.0), p_value, mine, full)
+    return Rank(tried.name, tried.error, fall, min(share, 1.0), p_value, mine, tried.judged is not None)
 
 
 def _pairs(search: _Search, start: Model, model: Model, judgement: Judgement) -> tuple[Model, Judgement]:
@@ -271,7 +272,10 @@ def _review(search: _Search, model: Model, judgement: Judgement) -> tuple[Model,
             model, judgement = less, without
     for name in search.added(model):
         for other in search.alternatives.get(name, [])[:SWAPPED]:
-            if other.name in model.space.sensor or other.held > NEARBY * search.held_of.get(name, 0.0):
+            if (
+                other.name in model.space.sensor
+                or other.error > NEARBY * search.error_of.get(name, 0.0) + TIE
+            ):
                 continue
             sensor = model.sensor.without(name).with_effect(other.model.sensor[other.name])
             swapped = settle(search.evidence, _like(sensor, model, [other.name]), seed=search.seed)

@@ -17,6 +17,7 @@ from dase.effects import EFFECTS, Effect
 from dase.errors import InputError, nearest
 from dase.history import Entry
 from dase.io import replacing
+from dase.results import Diagnosis, Fit
 from dase.sensor import Sensor
 
 
@@ -164,6 +165,27 @@ def rounded(sensor: Sensor, digits: int = 4) -> Sensor:
         values = {p.name: float(f"{getattr(effect, p.name):.{digits}g}") for p in effect.parameters()}
         sensor = sensor.with_effect(replace(effect, **values))
     return sensor
+
+
+def fitted(text: SensorText, found: Fit, recording: str) -> SensorText:
+    """Return a sensor file with fitted values, and the fall of the error in its history."""
+    facts = {
+        "error_before": round(found.before, 3),
+        "error_after": round(found.error, 3),
+        "floor": found.floor,
+    }
+    return text.became(rounded(found.sensor)).noted(today("fit", recording=recording, **facts))
+
+
+def diagnosed(text: SensorText, found: Diagnosis, recording: str) -> SensorText:
+    """Return a sensor file with the effects that a diagnosis found, and the error after each as history."""
+    text = text.became(rounded(found.sensor))
+    steps = ["fit", *(f"add {name}" for name in found.selected)]
+    errors = [round(error, 3) for error in (found.before, *found.errors)]
+    for did, before, after in zip(steps, errors, errors[1:], strict=False):
+        facts = {"error_before": before, "error_after": after, "floor": found.floor}
+        text = text.noted(today(did, recording=recording, **facts))
+    return text
 
 
 def today(did: str, **facts: Any) -> Entry:

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from dase.error import Judgement, Scale, judge, robust
+from dase.error import Judgement, Scale, judge
 from dase.errors import InputError
 from dase.events import Events
 from dase.kernels import launch
@@ -71,10 +71,12 @@ class Half:
         """Run the models at some places, shape (B, P)."""
         places = np.atleast_2d(places)
         vectors = space.vectors(places)
-        if not space.streams:
+        if not self.trials.felt(space.sensor):
             return self.trials.run(space.sensor, vectors, seed=seed, reseed=reseed)
         rows = [
-            self.trials.stream(space.sensor, vector, space.at(place).streams(), seed=seed + n * reseed)
+            self.trials.stream(
+                space.sensor, vector, self.trials.felt(space.at(place)), seed=seed + n * reseed
+            )
             for n, (vector, place) in enumerate(zip(vectors, places, strict=True))
         ]
         return Sums.join(rows)
@@ -83,14 +85,17 @@ class Half:
         """Return the statistics of the models at some places, shape (B, J)."""
         return statistics(self.simulate(space, places, seed=seed, reseed=reseed), self.frame)[0]
 
+    def slow(self, space: Space) -> bool:
+        """Whether models take many samples, or their events go through a readout."""
+        return bool(self.trials.felt(space.sensor)) or finer_steps(space.sensor, self.frame.step) > 0
+
     def rebase(self, space: Space, place: Array, *, repeats: int, seed: int) -> Array:
         """Make a model the present one: expectations and sampling errors are its own.
 
         Returns:
             Statistics of `repeats` simulations of it with other seeds, shape (repeats, J).
         """
-        slow = space.streams or finer_steps(space.sensor, self.trials.stimulus.grid.step) > 0
-        repeats = min(repeats, FEW_REPEATS) if slow else repeats
+        repeats = min(repeats, FEW_REPEATS) if self.slow(space) else repeats
         places = np.repeat(np.atleast_2d(place), repeats, 0)
         return self.take(self.simulate(space, places, seed=seed, reseed=True))
 
@@ -128,16 +133,6 @@ class Half:
     def left(self) -> Array:
         """Return statistics of the measurement less the model, without one group after the other, (G, J)."""
         return self._left(self.found) - self._left(self._present)
-
-    def leave_out(self, models: list[Sums]) -> Array:
-        """Return the loss of each model with one group of pixels left out after the other, shape (M, G)."""
-        measured = self._left(self.found)
-        weights = self.scale.weights()
-        rows = [
-            robust(np.where(self.scale.used, (self._left(m) - measured) / self.scale.sigma, 0.0))
-            for m in models
-        ]
-        return np.stack([row @ weights for row in rows])
 
     def _left(self, one: Sums) -> Array:
         """Return statistics without one group of pixels after the other, shape (G, J)."""

@@ -1,4 +1,4 @@
-"""What an effect is, and what it does to the probes: seen in a simulation, so that it holds for any effect."""
+"""What an effect is, and what it does to the probes: seen in a simulation, so true of any effect."""
 
 from __future__ import annotations
 

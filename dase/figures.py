@@ -65,14 +65,16 @@ def staircase(
     )
     axes = place(figure, 0.85, 0.85, WIDE - 1.2, 2.4)
     n = len(errors)
-    bottom, top = min(0.7 * floor, 0.8 * min(errors)), 1.45 * max(*errors, below)
+    bottom, top = 0.66 * min(floor, *errors), 1.45 * max(*errors, below)
     axes.set(xlim=(-0.5, n - 0.5), ylim=(bottom, top))
     axes.axhspan(bottom, below, color=BOTH, alpha=0.10, lw=0)
     axes.axhline(floor, color=BOTH, lw=1.2, ls=(0, (4, 2)))
     axes.stairs(errors, np.arange(n + 1) - 0.5, baseline=None, color=INK, lw=2.2)
     axes.stairs(errors, np.arange(n + 1) - 0.5, baseline=bottom, color=INK, fill=True, alpha=0.07, lw=0)
     for i, error in enumerate(errors):
-        _say(axes, number(error), (i, error), (0, 5), fontsize=10, ha="center", va="bottom", weight="bold")
+        # beside the line of the floor, not on it
+        shift, side = ((0, -6), "top") if 0.6 * floor < error < floor else ((0, 5), "bottom")
+        _say(axes, number(error), (i, error), shift, fontsize=10, ha="center", va=side, weight="bold")
         above = errors[i - 1] - floor if i else 0.0
         closed = (errors[i - 1] - error) / above if above > 0 else 0.0
         if closed > 0.2 and n < 7 and errors[i - 1] > 1.8 * error:  # else there is no room for words

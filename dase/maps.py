@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -17,16 +18,21 @@ from scipy.signal import welch
 from dase.errors import InputError
 from dase.events import Events
 from dase.figures import curves
-from dase.io.sequence import Sequence as Recording
 from dase.plates import INK, LINE, OFF, ON, WIDE, Plate, label, legend, number, place, sheet
 from dase.results import Curve
-from dase.show import default_window, overlay, seconds
+from dase.show import overlay, seconds
 
 DIVERGING = LinearSegmentedColormap.from_list("dase", ["#1b4f8f", "#86add3", "#f5f5f3", "#dfa67f", "#a23b16"])
 """Too few to too many."""
 
 SLOWEST, FASTEST = 4.0, 1000.0
 """Resolution and end of spectra [Hz]."""
+
+SHOWN = 0.05
+"""Events per pixel in a picture."""
+
+DOTS = 400
+"""Most columns of a picture."""
 
 MOST = 3.0
 """Octaves at which the colours of a map end."""
@@ -59,7 +65,7 @@ def event_plates(
         raise InputError(f"measured and simulated events must have one size, got {sizes}")
     begin, end = span
     parts = [events.slice(begin, end) for events in (measured, simulated)]
-    window = default_window(Recording(parts[0]))
+    window = _window(parts[0], end - begin, count)
     times = [begin + (end - begin) * (i + 0.5) / count for i in range(count)]
     counts = [np.concatenate([p.counts([t - window / 2, t + window / 2]) for t in times]) for p in parts]
     seen: list[NDArray[np.uint8] | None] = [None] * count
@@ -69,8 +75,16 @@ def event_plates(
     return [
         moments(seen, counts[0], counts[1], times, window),
         residual_maps(whole[0], whole[1], end - begin),
-        *([spectra(parts[0], parts[1], span)] if end - begin >= 4 / SLOWEST else []),
+        *([spectra(parts[0], parts[1], span)] if end - begin >= 1.5 / SLOWEST else []),
     ]
+
+
+def _window(events: Events, span: float, count: int) -> float:
+    """Return a time of 1, 2 or 5 times a power of ten in which about `SHOWN` events come per pixel [s]."""
+    rate = max(len(events), 1) / span / (events.width * events.height)
+    wanted = min(SHOWN / rate, span / count)
+    power = 10.0 ** math.floor(math.log10(wanted))
+    return power * max(step for step in (1, 2, 5) if step * power <= wanted * (1 + 1e-9))
 
 
 def moments(
@@ -99,7 +113,8 @@ def moments(
     for row, (name, counts) in enumerate((("measured", measured), ("simulated", simulated))):
         for i, time in enumerate(times):
             axes = place(figure, 0.65 + i * (across + 0.12), 1.0 + row * (down + 0.1), across, down)
-            _picture(axes, overlay(_calm(frames[i]), counts[i]))
+            size = math.ceil(counts.shape[3] / DOTS)  # no event is lost where a dot stands for several pixels
+            _picture(axes, overlay(_calm(frames[i], size), _blocks(counts[i], size)))
             label(axes, title=f"{time:.3f} s" if row == 0 else "")
             if i == 0:
                 axes.set_ylabel(name, fontsize=10, color=INK, labelpad=6)
@@ -139,9 +154,11 @@ def spectra(measured: Events, simulated: Events, span: tuple[float, float]) -> P
     return curves("Rhythms of the event rate", f"resolution {SLOWEST:g} Hz", panels, caption)
 
 
-def _calm(frame: NDArray[np.uint8] | None) -> NDArray[np.uint8] | None:
-    """Return a frame with less contrast, so that events stand out."""
-    return None if frame is None else (96 + 0.6 * frame.astype(np.float32)).clip(0, 255).astype(np.uint8)
+def _calm(frame: NDArray[np.uint8] | None, size: int) -> NDArray[np.uint8] | None:
+    """Return every `size`th pixel of a frame, with less contrast, so that events stand out."""
+    if frame is None:
+        return None
+    return (96 + 0.6 * frame[::size, ::size].astype(np.float32)).clip(0, 255).astype(np.uint8)
 
 
 def _picture(axes: Axes, picture: NDArray[np.uint8]) -> None:
@@ -151,7 +168,7 @@ def _picture(axes: Axes, picture: NDArray[np.uint8]) -> None:
 
 
 def residual_maps(
-    measured: NDArray[np.float64], simulated: NDArray[np.float64], seconds_long: float, *, least: float = 25.0
+    measured: NDArray[np.float64], simulated: NDArray[np.float64], seconds_long: float, *, least: float = 50.0
 ) -> Plate:
     """Draw where the model sends too many or too few events.
 
@@ -164,6 +181,7 @@ def residual_maps(
     size = _block(measured, least)
     m, s = _blocks(measured, size), _blocks(simulated, size)
     octaves = np.log2((s + 3) / (m + 3))
+    octaves *= np.clip(np.abs(s - m) / np.sqrt(s + m + 1) - 1, 0, 1)  # chance stays white
     aspect = measured.shape[1] / measured.shape[2]
     across = (WIDE - 1.75) / 2
     down = across * aspect
@@ -186,8 +204,8 @@ def residual_maps(
     bar = place(figure, 0.3 + 2 * across + 0.3, 1.0, 0.16, down)
     _colour_bar(figure, bar, image)
     caption = (
-        "Blue: the model sends too few events; brown: too many; white: as many as measured. Places with "
-        "hardly any event on either side stay white."
+        "Blue: the model sends too few events; brown: too many; white: as many as measured, or no "
+        "further off than chance takes them."
     )
     return Plate(figure, caption)
 
@@ -210,7 +228,7 @@ def _block(counts: NDArray[np.float64], least: float) -> int:
     return int(min(max(size, 1), max(min(counts.shape[1:]) // 8, 1)))
 
 
-def _blocks(counts: NDArray[np.float64], size: int) -> NDArray[np.float64]:
+def _blocks(counts: NDArray[Any], size: int) -> NDArray[Any]:
     for axis in (1, 2):
         counts = np.add.reduceat(counts, np.arange(0, counts.shape[axis], size), axis)
     return counts

@@ -7,13 +7,21 @@ from collections.abc import Mapping, Sequence
 from html import escape
 from pathlib import Path
 
+import numpy as np
+
 from dase import figures, page
 from dase.config import dump_sensor
 from dase.distinguish import WORDS
+from dase.events import Events
 from dase.io import replacing
+from dase.maps import event_plates
+from dase.measurement import Measurement
 from dase.plates import Plate, number
 from dase.results import Comparison, Diagnosis, Estimate, Step
-from dase.sensor import Sensor
+from dase.sensor import Sensor, stream
+
+LONGEST = 2.0
+"""Of what is pictured [s]."""
 
 
 def write(path: Path, html: str) -> None:
@@ -22,12 +30,37 @@ def write(path: Path, html: str) -> None:
         temporary.write_text(html, "utf-8")
 
 
-def comparison_page(found: Comparison, *, recording: str, plates: Sequence[Plate] = ()) -> str:
+def pictures(measured: Measurement, sensor: Sensor, *, seed: int = 0, device: str = "cpu") -> list[Plate]:
+    """Return pictures of a measurement beside what a model makes of its scene, its first seconds.
+
+    Args:
+        measured: The measurement.
+        sensor: The model.
+        seed: Of every random number of the simulation.
+        device: `cpu`, `cuda` or a Warp name.
+    """
+    times = measured.scene.sample_times()
+    begin, end = float(times[0]), min(float(times[-1]), float(times[0]) + LONGEST)
+    parts = []
+    for part in stream(measured.scene, sensor, seed=seed, device=device):
+        parts.append(part)
+        if len(part) and part.t[-1] > end:
+            break
+    shown = times[np.unique(np.searchsorted(times, np.linspace(begin, end, 13)[:-1]))]
+    frames = np.clip(255 * measured.scene.frames(shown), 0, 255).astype(np.uint8)
+    simulated = Events.concatenate(parts)
+    return event_plates(measured.events, simulated, (begin, end), frames=frames, frame_times=shown)
+
+
+def comparison_page(
+    found: Comparison, *, recording: str, model: str | None = None, plates: Sequence[Plate] = ()
+) -> str:
     """Return the report of a comparison.
 
     Args:
         found: What the comparison found.
         recording: What to call the measurement.
+        model: What to call the model; the name of the sensor if None.
         plates: Pictures of it, see `dase.maps`.
     """
     wrong = found.error > found.gate
@@ -40,7 +73,7 @@ def comparison_page(found: Comparison, *, recording: str, plates: Sequence[Plate
         _sensor(found.sensor),
         page.notes(found.notes),
     ]
-    return page.page(f"{found.sensor.name} against {recording}", "comparison", body, found.seconds)
+    return page.page(f"{model or found.sensor.name} against {recording}", "comparison", body, found.seconds)
 
 
 def comparison_verdict(found: Comparison) -> str:
@@ -73,12 +106,15 @@ def comparison_plates(found: Comparison) -> list[Plate]:
     return plates
 
 
-def diagnosis_page(found: Diagnosis, *, recording: str, plates: Sequence[Plate] = ()) -> str:
+def diagnosis_page(
+    found: Diagnosis, *, recording: str, model: str | None = None, plates: Sequence[Plate] = ()
+) -> str:
     """Return the report of a diagnosis.
 
     Args:
         found: What the diagnosis found.
         recording: What to call the measurement.
+        model: What to call the model; the name of the sensor if None.
         plates: Pictures of the model that was found, see `dase.maps`.
     """
     body = [page.verdict(diagnosis_verdict(found), wrong=found.unexplained is not None)]
@@ -97,7 +133,9 @@ def diagnosis_page(found: Diagnosis, *, recording: str, plates: Sequence[Plate] 
         page.notes(found.notes),
     ]
     foot = f"{found.evaluations:,} simulations. " if found.evaluations else ""
-    return page.page(f"{found.sensor.name} against {recording}", "diagnosis", body, found.seconds, foot)
+    return page.page(
+        f"{model or found.sensor.name} against {recording}", "diagnosis", body, found.seconds, foot
+    )
 
 
 def diagnosis_verdict(found: Diagnosis) -> str:
@@ -112,9 +150,10 @@ def diagnosis_verdict(found: Diagnosis) -> str:
             f"chance reaches {number(found.gate)}.{tried}"
         )
     if not found.selected:
-        return (
-            f"Nothing is missing: the error is {first} noise floors, and chance reaches {number(found.gate)}."
-        )
+        error = f"the error is {first} noise floors, and chance reaches {number(found.gate)}."
+        if found.errors[0] > found.gate:
+            return f"Nothing of weight is missing: {error} What is left is beyond chance, but small."
+        return f"Nothing is missing: {error}"
     names = " and ".join(found.selected)
     ties = "".join(
         f" The data cannot tell {name} from {' or '.join(others)}."

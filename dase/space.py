@@ -102,11 +102,6 @@ class Space:
                 out[:, names.index(axis.name)] = axis.to_value(places[:, n])
         return out
 
-    @property
-    def streams(self) -> bool:
-        """Whether there are effects behind the pixels."""
-        return bool(self.sensor.streams())
-
     def at(self, place: Array) -> Sensor:
         """Return the sensor at a place."""
         return with_values(

@@ -12,7 +12,9 @@ import warp as wp
 from numpy.typing import NDArray
 
 from dase.effects.readout import Readout
+from dase.effects.row_scan import RowScan
 from dase.effects.stream import StreamEffect
+from dase.effects.timestamp import Timestamp
 from dase.events import Events
 from dase.kernels import launch, pixel, trials
 from dase.kernels import probes as kernels
@@ -36,6 +38,9 @@ SLACK = 2e-6
 
 GROUP = 64
 """Pixels whose events are summed up together on a CPU; on a GPU every pixel has a thread."""
+
+FELT = 0.25
+"""Delays below this share of a step of the grid are not felt."""
 
 FINEST = 2
 """Samples per step of the grid at most: models that ask for more are simulated a little too coarsely."""
@@ -125,6 +130,17 @@ class Trials:
         )
         found = self._totals(sink, 1)
         return replace(found, stamps=self.structure.shares(self._mine(events))[None])
+
+    def felt(self, sensor: Sensor) -> tuple[StreamEffect, ...]:
+        """Return the effects behind the pixels that the probes can feel.
+
+        Small errors of the time stamps are far below the steps of the grid; they matter only where their
+        regularities are compared.
+        """
+        fine = FELT * self.stimulus.grid.step
+        lines = max(self.stimulus.width, self.stimulus.height)
+        compared = self.structure.step > 0 or self.structure.line > 0
+        return tuple(e for e in sensor.streams() if compared or delay_of(e, lines) > fine)
 
     def stream(
         self, sensor: Sensor, vector: NDArray[Any], effects: Iterable[StreamEffect], *, seed: int
@@ -236,6 +252,13 @@ class _Light(Scene):
 
     def frames(self, times: NDArray[np.float64], device: str = "cpu") -> NDArray[np.float32]:
         raise NotImplementedError("some pixels are no picture")
+
+
+def delay_of(effect: StreamEffect, lines: int) -> float:
+    """Return about how late an effect behind the pixels makes events [s]; infinite where it may lose some."""
+    if isinstance(effect, Timestamp):
+        return max(effect.step, effect.jitter)
+    return lines * effect.line if isinstance(effect, RowScan) else math.inf
 
 
 def scaled(effect: StreamEffect, share: float) -> StreamEffect:

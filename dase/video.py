@@ -171,7 +171,7 @@ def open_video(path: Path, *, fps: float | None = None, size: tuple[int, int] | 
     """Return the scene of a video file, of a folder of frames, or of the frames of a recording.
 
     Args:
-        path: File or folder; of a recording, such as a sequence of `dase synth`, the events are not looked at.
+        path: File or folder; the events of a recording, such as a sequence of `dase synth`, do not matter.
         fps: Frames per second; None takes what the file says.
         size: Columns and rows to resize to; None keeps the video's.
 
@@ -196,10 +196,10 @@ def _is_recording(path: Path) -> bool:
     if not path.is_file():
         return False
     try:
-        io.find(path)
+        # of a video, frames are decoded one by one as they are asked for
+        return io.find(path).name != "frames"
     except InputError:
         return False
-    return True
 
 
 def _scene_of(path: Path, fps: float | None, size: tuple[int, int] | None) -> VideoScene:

@@ -2,8 +2,8 @@
 
 The kernel has every effect that any of the models has. An effect whose parameters are at their off values is
 skipped, which changes nothing, bit for bit; so all models run through one compiled kernel. It differs from
-the kernel of `dase.kernels.pixel` in two more ways. Its time samples are the pixel's own: none where the light
-of the pixel does not change. And an event is not stored but looked at, see `dase.kernels.probes`.
+the kernel of `dase.kernels.pixel` in two more ways. Its time samples are the pixel's own: none where the
+light of the pixel does not change. And an event is not stored but looked at, see `dase.kernels.probes`.
 """
 
 from __future__ import annotations

@@ -3,7 +3,7 @@
     python perf/hidden_effects.py --quick                            a few minutes on a CPU
     python perf/hidden_effects.py --jobs 8 --device cuda:0           everything; goes on where it stopped
     python perf/hidden_effects.py --hidden ../shared/hidden          data of another simulator
-    python perf/hidden_effects.py --report                           docs/hidden-effects.md and .png from the log
+    python perf/hidden_effects.py --report                           the page and its picture from the log
 
 The scenes are made for this and used nowhere else. The diagnosis sees events, scene and a sensor that lacks
 what was hidden; the truth is compared with its answer afterwards. Each run is a line of the log.
@@ -23,30 +23,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-
-STRENGTHS = ("weak", "medium", "strong")
-
-HIDDEN: dict[str, tuple[dict[str, Any], ...]] = {
-    "flicker": tuple(dict(frequency=100.0, depth=d) for d in (0.08, 0.15, 0.3)),
-    "vignetting": tuple(dict(loss=x) for x in (0.3, 0.6, 0.8)),
-    "dark": tuple(dict(current=c, spread=0.3) for c in (0.003, 0.01, 0.04)),
-    "linlog": tuple(dict(knee=k, slope=2.5) for k in (0.03, 0.08, 0.16)),
-    "bandwidth": tuple(dict(cutoff=f) for f in (600.0, 150.0, 40.0)),
-    "second_order": tuple(dict(cutoff=f, damping=0.5) for f in (500.0, 150.0, 50.0)),
-    "voltage_noise": tuple(dict(sigma=s, cutoff=50.0) for s in (0.05, 0.07, 0.1)),
-    "mismatch": tuple(dict(spread=s) for s in (0.08, 0.15, 0.3)),
-    "jitter": tuple(dict(spread=s) for s in (0.08, 0.15, 0.3)),
-    "leak": tuple(dict(rate=r) for r in (0.3, 1.0, 4.0)),
-    "shot": tuple(dict(rate=r) for r in (0.5, 2.0, 10.0)),
-    "hot": tuple(dict(share=s, rate=r) for s, r in ((0.003, 50.0), (0.01, 100.0), (0.02, 200.0))),
-    "refractory": tuple(dict(period=p) for p in (2e-3, 5e-3, 15e-3)),
-    "dead": tuple(dict(share=s) for s in (0.003, 0.015, 0.03)),
-    "latency": tuple(dict(delay=d) for d in (1e-3, 3e-3, 8e-3)),
-    "row_scan": tuple(dict(line=x) for x in (3e-6, 1e-5, 3e-5)),
-    "readout": tuple(dict(rate=r) for r in (1.5, 0.8, 0.5)),
-    "timestamp": tuple(dict(step=s, jitter=0.0) for s in (1e-4, 3e-4, 1e-3)),
-}
-"""Effect to its parameters at weak, medium and strong; the rate of `readout` is in 600,000 events/s."""
+from hidden_report import HIDDEN, STRENGTHS, right, short, write_report
 
 PAIRS = (
     ("bandwidth", "leak"), ("bandwidth", "shot"), ("linlog", "mismatch"), ("mismatch", "leak"),
@@ -221,25 +198,6 @@ def cases(options: argparse.Namespace) -> Iterator[Case]:
                 yield Case("unknown", (name,), "strong", seed % options.scenes, seed, removed=name)
 
 
-def right(line: dict[str, Any]) -> bool:
-    """Whether an answer is right: what was hidden and nothing else; a tie that holds it counts."""
-    case, answer = line["case"], line["answer"]
-    selected, want = list(answer["selected"]), list(case["effects"])
-    if case["kind"] == "unknown":
-        return answer["unexplained"] is not None and not selected
-    if case["kind"] == "single":
-        return bool(selected) and named_first(line)
-    return sorted(selected) == sorted(want) if case["kind"] != "pair" else set(want) <= set(selected)
-
-
-def named_first(line: dict[str, Any]) -> bool:
-    """Whether the first effect named, or one announced as its equal, is the hidden one."""
-    selected, want = line["answer"]["selected"], line["case"]["effects"]
-    return bool(selected) and (
-        selected[0] in want or any(w in line["answer"]["ties"].get(selected[0], ()) for w in want)
-    )
-
-
 def score_hidden(folder: Path, options: argparse.Namespace) -> None:
     """Diagnose the cases of another simulator; the truth is opened after all answers are in."""
     import dase
@@ -269,7 +227,7 @@ def score_hidden(folder: Path, options: argparse.Namespace) -> None:
 
 
 def hidden_scores(truth: dict[str, Any], answers: dict[str, Any]) -> dict[str, bool]:
-    """Return which answers are right; the other simulator's lin-log mapping and time stamps may be named too."""
+    """Return which answers are right; its lin-log mapping and time stamps may be named too."""
     out = {}
     for name, found in answers.items():
         want = true_effects(truth, name)
@@ -315,13 +273,16 @@ def main() -> None:
         options.nothing, options.strengths = 5, "medium"
     if not options.report:
         _run(options)
+    if options.log.exists():
+        write_report(options.log, options.out)
 
 
 def _run(options: argparse.Namespace) -> None:
     options.log.parent.mkdir(parents=True, exist_ok=True)
     done = set()
     if options.log.exists():
-        done = {json.loads(line)["name"] for line in options.log.read_text().splitlines() if line.strip()}
+        lines = [json.loads(text) for text in options.log.read_text().splitlines() if text.strip()]
+        done = {line["name"] for line in lines if "failed" not in line}
     todo = [case for case in cases(options) if case.name not in done]
     threads = max(1, (os.cpu_count() or 1) // options.jobs)
     jobs = [(case, options.device, threads) for case in todo]
@@ -336,7 +297,7 @@ def _run(options: argparse.Namespace) -> None:
                 continue
             mark = "ok   " if right(line) else "WRONG"
             head = f"{n + 1}/{len(jobs)} {mark} {line['name']:40s} {line['seconds']:5.1f} s"
-            print(head, _short(line), flush=True)
+            print(head, short(line), flush=True)
 
 
 def _safely(job: tuple[Case, str, int]) -> dict[str, Any]:
@@ -350,21 +311,6 @@ def _safely(job: tuple[Case, str, int]) -> dict[str, Any]:
             "case": asdict(job[0]),
             "failed": f"{error!r} {traceback.format_exc()[-600:]}",
         }
-
-
-def _short(line: dict[str, Any]) -> str:
-    answer = line["answer"]
-    errors = " ".join(f"{e:.2f}" for e in answer["errors"])
-    left = (
-        ""
-        if answer["unexplained"] is None
-        else f" UNEXPLAINED {answer['unexplained']['error']:.2f} near {answer['unexplained']['nearest']}"
-    )
-    ranks = "; ".join(
-        f"{s['error']:.2f}/{s['gate']:.2f}: " + ", ".join(f"{r[0]} {r[1]:.2f}" for r in s["ranking"][:3])
-        for s in line["steps"]
-    )
-    return f"{answer['selected']} {errors}{left} ties {answer['ties']} | {ranks}"
 
 
 if __name__ == "__main__":

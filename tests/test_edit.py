@@ -220,10 +220,10 @@ def test_commands(tmp_path):
 
 def test_add_and_fit(tmp_path, rng):
     """What is added to the model is found in a recording of it, and the fall of the error is written down."""
-    t = np.arange(700) * 1e-3
-    texture = cv2.GaussianBlur(rng.random((40, 400)).astype(np.float32), (0, 0), 2)
+    t = np.arange(600) * 1e-3
+    texture = cv2.GaussianBlur(rng.random((32, 400)).astype(np.float32), (0, 0), 2)
     texture = np.clip((texture - texture.min()) / np.ptp(texture), 0.03, 1)
-    frames = np.stack([texture[:, round(200 * time) :][:, :48] for time in t])
+    frames = np.stack([texture[:, round(200 * time) :][:, :32] for time in t])
     frames = np.round(255 * frames).astype(np.uint8)
     np.savez(tmp_path / "clip.npz", frames=frames, frame_us=np.round(t * 1e6).astype(np.int64))
     truth = Sensor().with_effect(EFFECTS["leak"](rate=8.0))

@@ -165,5 +165,6 @@ def test_logarithm_is_accurate(lanes, device):
     if where.is_cpu:
         assert (error / unit).max() < 1
     else:
-        assert error[:50_000].max() < 5e-7
-        assert (error / unit)[50_000:].max() < 4
+        away = np.abs(want[0]) > np.log(2)
+        assert error[~away].max() < 5e-7
+        assert (error / unit)[away].max() < 4

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import base64
+import json
 import re
 from functools import lru_cache
 from html.parser import HTMLParser
@@ -10,8 +11,9 @@ from html.parser import HTMLParser
 import cv2
 import numpy as np
 import pytest
+from test_cli import dase, one_sentence
 
-from dase import Events, InputError, Sensor, figures, maps, report
+from dase import Events, InputError, Sensor, VideoScene, figures, io, maps, report, simulate
 from dase.effects import EFFECTS
 from dase.plates import OFF, ON, colour_of, number
 from dase.results import Cell, Comparison, Curve, Diagnosis, Estimate, Fit, Rank, Step, Unexplained
@@ -154,6 +156,8 @@ def test_nothing_missing():
     page = checked(report.diagnosis_page(found, recording="office.h5"))
     assert "Nothing is missing: the error is 1.1 noise floors" in page.words
     assert "unexplained" not in page.words
+    small = diagnosis(selected=(), errors=(1.6,), ties={}, history=(first,))
+    assert "Nothing of weight is missing" in checked(report.diagnosis_page(small, recording="a")).words
 
 
 def test_unexplained_names_nothing_as_found():
@@ -279,3 +283,28 @@ def test_results_plot_themselves(tmp_path):
     for found in (comparison(), diagnosis(), fit):
         found.plot().savefig(tmp_path / "plot.png")
         assert (tmp_path / "plot.png").stat().st_size > 10_000
+
+
+def test_compare_writes_a_report(tmp_path, rng):
+    texture = cv2.GaussianBlur(rng.random((24, 300)).astype(np.float32), (0, 0), 2)
+    texture = np.clip((texture - texture.min()) / np.ptp(texture), 0.05, 1)
+    frames = np.stack([np.round(255 * texture[:, n // 4 :][:, :32]) for n in range(500)]).astype(np.uint8)
+    times = np.arange(500) * 1e-3
+    noisy = Sensor().with_effect(EFFECTS["shot"](rate=5.0))
+    events = simulate(VideoScene(frames / np.float32(255), times), noisy, seed=2)
+    io.write(tmp_path / "a.h5", io.Sequence(events, frames=frames, frame_times=times))
+    (tmp_path / "mine.toml").write_text("[threshold]\n")
+    done = dase("compare", "mine.toml", "a.h5", "-o", "report.html", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    page = checked((tmp_path / "report.html").read_text())
+    assert "mine against a.h5" in page.words
+    assert "The model is wrong" in page.words
+    titles = [str(picture["alt"]).split(".")[0] for picture in page.pictures]
+    assert "Measured and simulated events" in titles
+    assert "Rhythms of the event rate" in titles
+    assert "Where the model sends too many or too few events" in titles
+    numbers = json.loads((tmp_path / "report.json").read_text())
+    assert f"{number(numbers['error'])} times the noise floor" in page.words
+    for name in ("report.txt", "nowhere/report.html"):
+        said = one_sentence(dase("compare", "mine.toml", "a.h5", "-o", name, cwd=tmp_path))
+        assert "must end with .html" in said or "folder 'nowhere' does not exist" in said

@@ -184,7 +184,7 @@ def test_32_layers_are_seen_and_33_refused(device, rng):
     full = scene(rng, layers=32)
     want = reference.frame(full, 0.2)
     np.testing.assert_allclose(full.frames(np.array([0.2]), device)[0], want, atol=1e-5)
-    with pytest.raises(dase.dase.InputError, match="1 to 32 layers, got 33"):
+    with pytest.raises(dase.InputError, match="1 to 32 layers, got 33"):
         dase.LayerScene([*full.layers, full.layers[0]], width=4, height=4, duration=1.0)
 
 
@@ -206,9 +206,9 @@ def test_impossible_scenes_are_refused(rng, options, message):
 
 
 def test_impossible_motions_are_refused():
-    with pytest.raises(dase.dase.InputError, match="scales must be > 0"):
+    with pytest.raises(dase.InputError, match="scales must be > 0"):
         dase.Motion(scale_x=(1.0, -1.0))
-    with pytest.raises(dase.dase.InputError, match="angle must be finite"):
+    with pytest.raises(dase.InputError, match="angle must be finite"):
         dase.Motion(angle=(0.0, float("inf")))
 
 
@@ -219,7 +219,7 @@ def test_a_video_is_its_frames(rng):
     np.testing.assert_array_equal(video.frames(times[[1, 3]]), frames[[1, 3]])
     assert (video.width, video.height, video.duration) == (4, 3, 2.0)
     assert video.flow(times) is None
-    with pytest.raises(dase.dase.InputError, match="between its frames"):
+    with pytest.raises(dase.InputError, match="between its frames"):
         video.frames(np.array([1.2]))
 
 
@@ -233,14 +233,14 @@ def test_a_video_is_its_frames(rng):
     ],
 )
 def test_impossible_videos_are_refused(frames, times, message):
-    with pytest.raises(dase.dase.InputError, match=message):
+    with pytest.raises(dase.InputError, match=message):
         dase.VideoScene(frames, times)
 
 
 def test_a_folder_of_pictures_is_read_by_name(tmp_path, device):
     for n in (2, 0, 1):
         cv2.imwrite(str(tmp_path / f"{n:03d}.png"), np.full((6, 8), 40 * (n + 1), np.uint8))
-    with pytest.raises(dase.dase.InputError, match="does not say how many frames"):
+    with pytest.raises(dase.InputError, match="does not say how many frames"):
         open_video(tmp_path)
     video = open_video(tmp_path, fps=100)
     want = np.arange(1, 4)[:, None, None] * 40 / 255 * np.ones((1, 6, 8))
@@ -256,7 +256,7 @@ def test_a_folder_of_pictures_is_read_by_name(tmp_path, device):
 def test_pictures_of_different_sizes_are_refused(tmp_path):
     for n in (0, 1):
         cv2.imwrite(str(tmp_path / f"{n}.png"), np.full((6, 8 + n), 40, np.uint8))
-    with pytest.raises(dase.dase.InputError, match="size"):
+    with pytest.raises(dase.InputError, match="size"):
         dase.simulate(open_video(tmp_path, fps=100), dase.Sensor())
 
 
@@ -281,11 +281,11 @@ def test_a_video_file_is_read_frame_by_frame(tmp_path, suffix, code):
 
 
 def test_what_is_no_video_is_refused(tmp_path):
-    with pytest.raises(dase.dase.InputError, match="does not exist"):
+    with pytest.raises(dase.InputError, match="does not exist"):
         open_video(tmp_path / "none.mp4")
-    with pytest.raises(dase.dase.InputError, match="at least 2 frames, got 0"):
+    with pytest.raises(dase.InputError, match="at least 2 frames, got 0"):
         open_video(tmp_path, fps=10)
-    with pytest.raises(dase.dase.InputError, match="fps must be a number > 0"):
+    with pytest.raises(dase.InputError, match="fps must be a number > 0"):
         open_video(tmp_path, fps=-1)
 
 
@@ -382,7 +382,7 @@ def test_mixed_draws_regimes_by_their_share(rng):
     objects = np.array([len(drawn(rng, "mixed").layers) - 1 for _ in range(400)])
     assert 0.02 < np.mean(objects == 0) < 0.1  # 15 of 281
     assert 0.1 < np.mean(objects > 19) < 0.22  # half of 70 of 281, those with 20 to 29
-    with pytest.raises(dase.dase.InputError, match="no regime 'fats': did you mean 'fast'"):
+    with pytest.raises(dase.InputError, match="no regime 'fats': did you mean 'fast'"):
         drawn(rng, "fats")
 
 

@@ -39,9 +39,16 @@ def test_commands(folder):
         assert line.startswith("dase "), line
         done = dase(*shlex.split(line)[1:], cwd=folder)
         assert done.returncode == 0, f"{line}: {done.stderr}"
-    assert load_sensor(folder / "adapting.toml", load_all(folder))["adaptation"].depth == 0.4
+    assert load_sensor(folder / "camera.toml", load_all(folder))["adaptation"].depth == 0.6
     assert cv2.imread(str(folder / "out" / "sequence_00000.png")) is not None
     assert cv2.imread(str(folder / "powers.png")) is not None
+    # what was hidden in the recording is found, and written down
+    fitted = load_sensor(folder / "fitted.toml", load_all(folder))
+    assert fitted["adaptation"].depth == pytest.approx(0.6, rel=0.2)
+    assert [entry.did for entry in fitted.history][-1] == "add adaptation"
+    assert fitted.history[-1].error_after < 0.6 * fitted.history[-1].error_before
+    assert "Missing: adaptation" in (folder / "report.html").read_text()
+    assert cv2.imread(str(folder / "staircase.png")) is not None
 
 
 def load_all(folder: Path) -> dict:
@@ -59,7 +66,7 @@ def test_python(folder, monkeypatch):
 
 def test_the_effect_is_what_the_page_says(folder):
     """After a step up, OFF events come back: as many as the depth takes back; sooner in bright light."""
-    effect = load_effects(folder / "adaptation.py")["adaptation"](depth=0.6, speed=5.0, dark=0.0)
+    effect = load_effects(folder / "adaptation.py")["adaptation"](depth=0.6, speed=5.0)
     times = np.arange(0, 4, 1e-3)
     back, late = [], []
     for bright in (0.4, 0.8):
