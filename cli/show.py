@@ -38,10 +38,15 @@ def command(
     A PNG is a contact sheet: moments with events in red (ON) and blue (OFF), the event rate, and the
     intervals between events of one pixel. An MP4 shows all of it, a picture per frame. With --trust the PNG
     shows moments between frames, veiled where what the frames tell of them is in doubt.
+
+    The folder of a training run is drawn as the thresholds it has learned, over some of its scenes.
     """
     from dase import io, show
     from dase.errors import InputError
 
+    if file.is_dir() and (file / "job.json").is_file():
+        _draw_run(file, output or file / "learned.png")
+        return
     output = output or file.with_suffix(".trust.png" if trust else ".png")
     suffix = output.suffix.lower()
     if suffix not in (".png", ".mp4"):
@@ -60,6 +65,21 @@ def command(
         with io.replacing(output) as temporary:
             figure.savefig(temporary)
     for name, value in show.table(show.statistics(sequence)):
+        click.echo(f"{name:<18}{value}")
+    click.echo(f"{'written':<18}{output}")
+
+
+def _draw_run(folder: Path, output: Path) -> None:
+    """Draw what a training run has learned."""
+    from dase import io, learned
+    from dase.errors import InputError
+
+    if output.suffix.lower() != ".png":
+        raise InputError(f"output: a training run is drawn as a .png, got '{output}'")
+    figure, lines = learned.draw(folder)
+    with io.replacing(output) as temporary:
+        figure.savefig(temporary)
+    for name, value in lines:
         click.echo(f"{name:<18}{value}")
     click.echo(f"{'written':<18}{output}")
 

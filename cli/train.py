@@ -80,6 +80,7 @@ def command(
     path = adaptation.write_sensor(
         output, training.mean, mu=last["mu"], name=output.name or "learned", size=recorded
     )
+    adaptation.write_examples(output, training)
     for line in summary(last):
         click.echo(line)
     click.echo(f"{path}: try dase synth --sensor {path}, or look at it: dase show {output}")

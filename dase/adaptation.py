@@ -11,23 +11,24 @@ from typing import Any, Literal
 import numpy as np
 import torch
 
-from dase import images, io
+from dase import images
 from dase.baselines import Randomised, esim, event_rate
 from dase.config import dump_sensor, load_sensor, presets
 from dase.effects.learned_threshold import LearnedThreshold
 from dase.effects.threshold import Threshold
 from dase.errors import InputError, nearest
+from dase.files import replacing
 from dase.networks import NetworkShape, ThresholdNet
 from dase.objectives import Hash
-from dase.recorded import open_target
+from dase.recorded import Replayed, open_target
 from dase.scenery import Looks, Scenery, middle
 from dase.sensor import Sensor, count
-from dase.targets import Finite, Pairs, Target, Truth
+from dase.targets import Finite, Pairs, Target, Truth, draw_noise, simulate
 from dase.training import Recipe, Training
 from dase.video import VideoScene
 from dase.weights import save_net
 
-JOB, SENSOR, WEIGHTS = "job.json", "sensor.toml", "learned.safetensors"
+JOB, SENSOR, WEIGHTS, EXAMPLES = "job.json", "sensor.toml", "learned.safetensors", "examples.npz"
 
 TABLE = 6, 5
 """Nodes of brightness and edge strength in the default recipe."""
@@ -250,7 +251,7 @@ def begin(job: Job, out: Path, *, resume: bool) -> None:
     if not resume and record.exists():
         raise InputError(f"{out} already holds a run; give --resume to go on with it, or another folder")
     out.mkdir(parents=True, exist_ok=True)
-    with io.replacing(record) as temporary:
+    with replacing(record) as temporary:
         temporary.write_text(job.text(), "utf-8")
 
 
@@ -285,9 +286,35 @@ def write_sensor(
     sensor = Sensor(
         effects=(Threshold(on=on, off=off), LearnedThreshold(weights=WEIGHTS)), name=name, size=size
     )
-    with io.replacing(out / SENSOR) as temporary:
+    with replacing(out / SENSOR) as temporary:
         temporary.write_text(dump_sensor(sensor), "utf-8")
     return out / SENSOR
+
+
+@torch.no_grad()
+def write_examples(out: Path, training: Training, *, scenes: int = 3, seed: int = 0) -> None:
+    """Write what `dase show` draws: some scenes, their events of both sides, and the learned maps.
+
+    The events of the target are those of the same scenes where it saw them, else of others.
+    """
+    scenery, net = training.scenery, training.mean
+    rng, generator = np.random.default_rng(seed), torch.Generator(scenery.device).manual_seed(seed)
+    if isinstance(scenery, Replayed) and isinstance(training.target, Finite):
+        busy = training.target.pairs.counts.float().sum((1, 2, 3))
+        index = torch.sort(torch.topk(busy, min(4 * scenes, len(busy))).indices).values
+        index = index[:: max(len(index) // scenes, 1)][:scenes]
+        log, real = scenery.log[index].float(), training.target.pairs.select(index)
+    else:
+        log, real = scenery.draw(rng, scenes), training.target.draw(rng, scenes)
+    grey = middle(log)
+    maps = net(grey)
+    mu, sigma = maps.by_polarity()
+    counts = simulate(log, mu, sigma, draw_noise(log, generator))
+    arrays = dict(
+        grey=grey, real_grey=real.grey, real=real.counts, simulated=counts, mu=maps.mu, sigma=maps.sigma
+    )
+    with replacing(out / EXAMPLES) as temporary:
+        np.savez_compressed(temporary, **{name: value.cpu().numpy() for name, value in arrays.items()})
 
 
 def baseline(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Any
 
 import torch
@@ -357,7 +358,7 @@ def grouped(rows: torch.Tensor, weights: torch.Tensor, end: torch.Tensor) -> tor
     Returns:
         Shape (R, N) float32; anything in rows behind the last group.
     """
-    if rows.is_cuda:
+    if rows.is_cuda and _has_grouped_products(rows.device):
         return torch._grouped_mm(rows, weights, offs=end).float()
     out = rows.new_zeros(len(rows), weights.shape[2])
     begin = 0
@@ -365,4 +366,19 @@ def grouped(rows: torch.Tensor, weights: torch.Tensor, end: torch.Tensor) -> tor
         if stop > begin:
             torch.mm(rows[begin:stop], weights[critic], out=out[begin:stop])
         begin = stop
-    return out
+    return out.float()
+
+
+@lru_cache
+def _has_grouped_products(device: torch.device) -> bool:
+    """Return whether PyTorch multiplies groups in one launch on this GPU; without, it is slow but right."""
+    try:
+        end = torch.tensor([8, 8, 16], dtype=torch.int32, device=device)
+        rows = torch.ones(24, 16, dtype=torch.bfloat16, device=device)
+        for weights in (rows.new_ones(3, 16, 8), rows.new_ones(3, 8, 16).transpose(1, 2)):
+            out = torch._grouped_mm(rows, weights, offs=end)
+            if not bool((out[:16] == 16).all()):
+                return False
+    except (AttributeError, RuntimeError):
+        return False
+    return True

@@ -193,13 +193,15 @@ def _joined(
         order += range(start, start + cut)
         rest += range(start + cut, start + len(part.begin))
         start += len(part.begin)
-    log = np.concatenate([part.log for part in found])
-    counts = np.concatenate([part.counts for part in found])[order + rest]
-    begin = np.concatenate([part.begin for part in found])
+    # scenes and pairs in one order, so that a window can be looked at from both sides
+    chosen = np.array(order + rest)
+    log = np.concatenate([part.log for part in found])[chosen]
+    counts = np.concatenate([part.counts for part in found])[chosen]
+    begin = np.concatenate([part.begin for part in found])[chosen]
     trusted = float(np.mean([part.trusted for part in found]))
     every = Windows(begin, log, counts, trusted)
     scenes = Replayed(every, window=window, device=device)
-    middle = np.exp(log[np.array(order + rest), log.shape[1] // 2].astype(np.float32)) - np.float32(LOG_EPS)
+    middle = np.exp(log[:, log.shape[1] // 2].astype(np.float32)) - np.float32(LOG_EPS)
     pairs = Pairs(
         torch.from_numpy(middle).half().to(device), torch.from_numpy(counts).clamp_max(2000).half().to(device)
     )

@@ -12,9 +12,9 @@ from typing import Any
 
 import torch
 
-from dase import io
 from dase.errors import InputError
 from dase.evaluation import Exam, HeldOut
+from dase.files import replacing
 from dase.training import Recipe, Training
 
 CHECKPOINT, RESULT, BEST = "checkpoint.pt", "result.pt", "best.pt"
@@ -75,7 +75,7 @@ def run(
         training.load(load(path, training.device))
     elif path.exists():
         raise InputError(f"{out} already holds a run; give --resume to go on with it, or another folder")
-    with io.replacing(out / RECIPE) as temporary:
+    with replacing(out / RECIPE) as temporary:
         temporary.write_text(training.recipe.text(), "utf-8")
     exam = Exam(training.scenery, training.target)
     pairs = training.target.held_out() if pace.held_out else None
@@ -134,7 +134,7 @@ class _Run:
         left = self.pace.seconds - (time.perf_counter() - begin)
         steps = TIMED[1] + max(int(0.97 * left / each), 1)
         training.recipe = replace(training.recipe, steps=steps)
-        with io.replacing(self.out / RECIPE) as temporary:
+        with replacing(self.out / RECIPE) as temporary:
             temporary.write_text(training.recipe.text(), "utf-8")
 
     def _row(self, values: dict[str, torch.Tensor], last: bool) -> dict[str, float]:
@@ -212,7 +212,7 @@ class _Table:
 
 def save(path: Path, state: dict[str, Any]) -> None:
     """Write a checkpoint; it appears whole or not at all."""
-    with io.replacing(path) as temporary:
+    with replacing(path) as temporary:
         torch.save(state, temporary)
 
 

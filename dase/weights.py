@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
 
-from dase import io
 from dase.errors import InputError
+from dase.files import replacing
 from dase.networks import NetworkShape, ThresholdNet
 
 KIND = "dase.learned_threshold"
@@ -24,7 +24,7 @@ KIND = "dase.learned_threshold"
 def save_net(path: Path, net: ThresholdNet) -> None:
     """Write a network; the file appears whole or not at all."""
     tensors = {name: value.detach().cpu().contiguous() for name, value in net.state_dict().items()}
-    with io.replacing(path) as temporary:
+    with replacing(path) as temporary:
         save_file(tensors, temporary, {"kind": KIND, "shape": json.dumps(asdict(net.shape))})
 
 

@@ -29,15 +29,8 @@ import numpy as np
 import torch
 
 from dase import images
-from dase.adaptation import baseline, write_sensor
-from dase.camera import TOLERANCE, CameraScene
-from dase.comparison import compare
-from dase.config import load_sensor
-from dase.evaluation import HeldOut
 from dase.networks import NetworkShape
 from dase.objectives import Hash
-from dase.recorded import Replayed, open_target, windows_of
-from dase.recording import Recording, open_recording
 from dase.run import Pace, run
 from dase.scenery import Looks, Scenery
 from dase.targets import TRUTHS, Endless, Finite, Pairs, Target, record
@@ -199,6 +192,8 @@ def prepare(row: Row, args: argparse.Namespace) -> Training:
             network["pattern"] = (96, 96)
     made = Recipe(hash=Hash(**how), network=NetworkShape(**network), **recipe)
     if row.real:
+        from dase.recorded import open_target
+
         target, scenes = open_target([Path(args.recording)], until=LEARNED, device=device)
         return Training(made, target, scenes)
     scenery = Scenery(images.open_images(pictures), looks, device=device, backgrounds=48, objects=96)
@@ -213,6 +208,11 @@ def prepare(row: Row, args: argparse.Namespace) -> Training:
 
 def judge(training: Training, args: argparse.Namespace, folder: Path) -> dict[str, Any]:
     """Return how the adapted sensor and the baselines do on the part of the recording that came later."""
+    from dase.adaptation import baseline
+    from dase.evaluation import HeldOut
+    from dase.recorded import Replayed, windows_of
+    from dase.recording import open_recording
+
     recording = open_recording(args.recording)
     recording = recording.masked(~recording.hot)
     later = recording.slice(recording.begin + LEARNED, recording.end)
@@ -233,9 +233,14 @@ def judge(training: Training, args: argparse.Namespace, folder: Path) -> dict[st
     return out
 
 
-def _probes(later: Recording, name: str, net: Any, folder: Path) -> float | str:
+def _probes(later: Any, name: str, net: Any, folder: Path) -> float | str:
     """Return the headline error of `dase compare` on the later part."""
     try:
+        from dase.adaptation import write_sensor
+        from dase.camera import TOLERANCE, CameraScene
+        from dase.comparison import compare
+        from dase.config import load_sensor
+
         place = folder / name
         place.mkdir(exist_ok=True)
         mu = float(net(torch.full((1, 8, 8), 0.4, device=net.level.device)).mu.mean().detach())

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import os
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -16,6 +15,7 @@ from numpy.typing import NDArray
 
 from dase.errors import InputError
 from dase.events import Events
+from dase.files import replacing as replacing
 
 Grey = np.uint8 | np.uint16
 GREYS = (np.uint8, np.uint16)
@@ -208,26 +208,6 @@ class Writer(ABC):
 
     @abstractmethod
     def _put_configuration(self, text: str) -> None: ...
-
-
-@contextmanager
-def replacing(path: Path) -> Iterator[Path]:
-    """Yield a temporary name beside `path` that becomes `path` when the block ends well, else is removed.
-
-    Raises:
-        InputError: The folder does not exist, or `path` is a folder.
-    """
-    if not path.parent.is_dir():
-        raise InputError(f"{path}: the folder '{path.parent}' does not exist")
-    if path.is_dir():
-        raise InputError(f"{path}: is a folder, not a file")
-    temporary = path.with_name(f".{path.stem}.{os.getpid()}.tmp{path.suffix}")
-    try:
-        yield temporary
-        os.replace(temporary, path)
-    except BaseException:
-        temporary.unlink(missing_ok=True)
-        raise
 
 
 @contextmanager

@@ -1,0 +1,227 @@
+"""How fast learning is, part by part, and how near a critic step is to what memory allows.
+
+    python perf/bench_training.py                    the study's size: 12 scenes of 240x240, 24 samples
+    python perf/bench_training.py --small            for a CPU
+    python perf/bench_training.py --out out/training.json
+
+The bound of a critic step is the memory traffic that it cannot do without, `CriticBank.traffic`, at the rate
+of a copy on the same device, measured in the same run.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import platform
+import statistics
+import subprocess
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from dase import images
+from dase.critics import BankShape, CriticBank, _has_grouped_products
+from dase.kernels import autograd_training as bridge
+from dase.networks import NetworkShape
+from dase.objectives import Adversarial, Hash, critic_maps, cut_patches
+from dase.scenery import Looks, Scenery, middle
+from dase.targets import TRUTHS, Endless, Pairs, answers, draw_noise, simulate, vary
+from dase.training import Recipe, Training
+
+ROOT = Path(__file__).resolve().parents[1]
+
+
+class Clock:
+    """Times calls on a device, waiting for it before and after."""
+
+    def __init__(self, device: torch.device, repeats: int):
+        self.device, self.repeats = device, repeats
+
+    def wait(self) -> None:
+        if self.device.type == "cuda":
+            torch.cuda.synchronize(self.device)
+
+    def __call__(self, work: Callable[[], Any], *, inner: int = 1) -> float:
+        """Return the median time of `work` [s], called `inner` times between two looks at the clock."""
+        for _ in range(3):
+            work()
+        times = []
+        for _ in range(self.repeats):
+            self.wait()
+            begin = time.perf_counter()
+            for _ in range(inner):
+                work()
+            self.wait()
+            times.append((time.perf_counter() - begin) / inner)
+        return statistics.median(times)
+
+
+def copy_rate(clock: Clock, size: int) -> float:
+    """Return the bytes per second, read and written, of a copy of `size` bytes."""
+    a = torch.zeros(size // 4, device=clock.device)
+    b = torch.empty_like(a)
+    return 2 * size / clock(lambda: b.copy_(a), inner=5)
+
+
+def make(args: argparse.Namespace, objective: str) -> Training:
+    """Return a run at the size to be measured, some steps old."""
+    looks = Looks(width=96, height=96, samples=12) if args.small else Looks()
+    scenery = Scenery(images.open_images(args.images), looks, device=args.device)
+    how = Hash(size=16, orientations=8, coherence=1) if args.small else Hash()
+    network = NetworkShape(channels=8, depth=2) if args.small else NetworkShape()
+    if objective == "moments":
+        network = NetworkShape(**{**network.__dict__, "table": (6, 5)})
+    batch = 4 if args.small else 12
+    recipe = Recipe(objective=objective, batch=batch, hash=how, network=network, warmup=2, steps=10**6)  # type: ignore[arg-type]
+    training = Training(recipe, Endless(scenery, TRUTHS["uniform"]()), scenery)
+    for _ in range(8):
+        training.advance()
+    return training
+
+
+def iterations(training: Training, clock: Clock) -> dict[str, float]:
+    """Return the time of a whole step and what the parts of it take, each measured alone [s]."""
+    recipe, scenery = training.recipe, training.scenery
+    out = {"iteration": clock(training.advance, inner=5)}
+    log = scenery.draw(training.scenes, recipe.batch)
+    grey, noise = middle(log), draw_noise(log, training.generator)
+    out["render fake"] = clock(lambda: scenery.draw(training.scenes, recipe.batch))
+    out["draw real"] = clock(lambda: training.target.draw(training.reals, recipe.batch))
+    out["network forward"] = clock(lambda: training.net(grey))
+    maps = training.net(grey)
+    weight = torch.randn_like(maps.mu)
+    both = clock(lambda: (training.net(grey).mu * weight).sum().backward())
+    out["network backward"] = both - out["network forward"]
+    mu, sigma = maps.mu.detach().requires_grad_(), maps.sigma.detach().requires_grad_()
+    out["count"] = clock(lambda: simulate(log, mu.detach(), sigma.detach(), noise))
+    both = clock(lambda: simulate(log, mu, sigma, noise).sum().backward())
+    out["count gradient"] = both - out["count"]
+    if recipe.objective == "moments":
+        out["count anew for derivatives"] = clock(
+            lambda: (vary(log, mu, sigma, noise), answers(log, mu.detach(), sigma.detach(), noise))
+        )
+        out |= _moments(training, clock)
+    else:
+        out |= _critics(training, clock)
+    out["optimiser"] = clock(lambda: (training.optimizer.step(), training._average()))
+    return out
+
+
+def _moments(training: Training, clock: Clock) -> dict[str, float]:
+    fake, _ = training._fake()
+    real = training.target.draw(training.reals, training.recipe.batch)
+    assert training.newton is not None
+    newton = training.newton
+    return {
+        "moments": clock(lambda: training.objective.loss(fake, real, move=True)),
+        "newton": clock(lambda: (newton.see(fake), newton.step(0.0))),
+    }
+
+
+def _critics(training: Training, clock: Clock) -> dict[str, float]:
+    objective = training.objective
+    assert isinstance(objective, Adversarial)
+    fake, _ = training._fake()
+    fake = Pairs(fake.grey, fake.counts.detach())
+    real = training.target.draw(training.reals, training.recipe.batch)
+    size = objective.hasher.how.size
+    patches, others = (cut_patches(critic_maps(p.counts), size) for p in (fake, real))
+    ours, theirs = objective.hasher.classes(fake), objective.hasher.classes(real)
+    weights = objective.weights()
+    return {
+        "hash": clock(lambda: objective.hasher.classes(fake)),
+        "maps and patches": clock(lambda: cut_patches(critic_maps(fake.counts), size)),
+        "bank step": clock(lambda: objective.bank.step(patches, ours, others, theirs, weights, rate=1e-9)),
+        "bank input gradient": clock(lambda: objective.bank.input_gradient(patches, ours, weights)),
+        "structure kernel": clock(lambda: bridge.patch_structure(fake.grey, size=size, stride=size)),
+    }
+
+
+def bank(args: argparse.Namespace, clock: Clock, rate: float, patches: int) -> dict[str, float]:
+    """Return how a critic step on evenly spread classes compares with its bound."""
+    shape = BankShape(classes=24, inputs=1024) if args.small else BankShape(classes=216)
+    generator = torch.Generator(args.device).manual_seed(0)
+    made = CriticBank(shape, device=args.device, generator=generator)
+    rng = np.random.default_rng(0)
+    classes = [torch.from_numpy(rng.integers(0, shape.classes, patches)).to(args.device) for _ in range(2)]
+    rows = [torch.rand(patches, shape.inputs, device=args.device) for _ in range(2)]
+    weights = torch.full((shape.classes,), 1 / shape.classes, device=args.device)
+    active = len(set(classes[0].tolist()) & set(classes[1].tolist()))
+    seconds = clock(
+        lambda: made.step(rows[0], classes[0], rows[1], classes[1], weights, rate=1e-9, generator=generator)
+    )
+    bound = made.traffic(active) / rate
+    end = torch.arange(1, shape.classes + 1, dtype=torch.int32, device=args.device) * (
+        3 * patches // shape.classes
+    )
+    left = torch.rand(3 * patches, shape.wide, device=args.device)
+    right = torch.rand(3 * patches, shape.inputs, device=args.device).to(made.working)
+    rates, correction = (torch.full((shape.classes,), v, device=args.device) for v in (1e-9, 1.0))
+    update = clock(
+        lambda: bridge.move_critics(
+            made.w1, made.square["w1"], made.copies["w1"], left, right, end, rates, correction, decay=0.9
+        )
+    )
+    moved = shape.classes * shape.wide * shape.inputs * 18
+    if clock.device.type == "cuda":
+        print(f"grouped products in one launch: {_has_grouped_products(clock.device)}")
+    return {
+        "patches": patches,
+        "active": active,
+        "seconds": seconds,
+        "bound": bound,
+        "share_of_bound": bound / seconds,
+        "update_seconds": update,
+        "update_share": moved / rate / update,
+    }
+
+
+def provenance(device: str, commit: str | None) -> dict[str, str]:
+    name = torch.cuda.get_device_name() if device.startswith("cuda") else f"{platform.machine()} CPU"
+    command = ["git", "rev-parse", "--short", "HEAD"]
+    found = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False).stdout.strip()
+    return {"device": name, "commit": commit or found or "unknown", "torch": torch.__version__}
+
+
+def main() -> None:
+    """Measure and print."""
+    beside = ROOT.parent / "shared" / "photos"
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
+    parser.add_argument("--device", default="cuda" if torch.cuda.is_available() else "cpu")
+    parser.add_argument("--images", default=str(beside) if beside.is_dir() else "builtin")
+    parser.add_argument("--small", action="store_true")
+    parser.add_argument("--repeats", type=int, default=15)
+    parser.add_argument("--out", type=Path)
+    parser.add_argument("--commit")
+    args = parser.parse_args()
+    clock = Clock(torch.device(args.device), args.repeats)
+    rate = copy_rate(clock, 1 << (26 if args.small else 31))
+    found: dict[str, Any] = provenance(args.device, args.commit) | {"copy_rate": rate}
+    print(f"{found['device']}, PyTorch {found['torch']}: a copy moves {rate / 1e12:.3f} TB/s")
+    for patches in (64,) if args.small else (432, 1728):
+        line = bank(args, clock, rate, patches)
+        found[f"bank_{patches}"] = line
+        print(
+            f"critic step on {patches} + {patches} patches: {1e3 * line['seconds']:.2f} ms, bound "
+            f"{1e3 * line['bound']:.2f} ms: {100 * line['share_of_bound']:.0f} %; its update alone "
+            f"{1e3 * line['update_seconds']:.2f} ms: {100 * line['update_share']:.0f} %"
+        )
+    for objective in ("wgan", "moments"):
+        parts = iterations(make(args, objective), clock)
+        found[objective] = parts
+        whole = parts["iteration"]
+        print(f"{objective}: {1e3 * whole:.2f} ms per iteration, {1 / whole:.1f} steps/s")
+        for name, seconds in parts.items():
+            if name != "iteration":
+                print(f"  {name:28s} {1e3 * seconds:8.2f} ms  {100 * seconds / whole:4.0f} %")
+    if args.out is not None:
+        args.out.parent.mkdir(parents=True, exist_ok=True)
+        args.out.write_text(json.dumps(found, indent=1), encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main()
