@@ -35,7 +35,7 @@ def cell(value: Any, digits: int = 4) -> str:
 def table(lines: list[dict[str, Any]], jobs: str) -> list[str]:
     """Return the rows of one group."""
     out = [
-        "| row | device, commit | steps | s | KL | raw | active | Δμ | Δσ | KL ≤ 0.01 after s | slope | corr. |",
+        "| row | device, commit | steps | s | KL | raw | active | Δμ | Δσ | s to KL 0.01 | slope | corr. |",
         "|" + "---|" * 12,
     ]
     for line in sorted(lines, key=lambda line: line["row"]):
