@@ -23,6 +23,12 @@ LEFT = 0.25
 WIDEST = 0.8
 """Reach of any."""
 
+FARTHEST = 2.0
+"""Longest step, in units of the reach of the population it was seen from."""
+
+WIDEN = 1.6
+"""Most by which the reach grows from one population to the next."""
+
 LONGEST = 12
 """Populations at most."""
 
@@ -101,11 +107,11 @@ def search(
         slope = slopes((places[near] - best) / reach, tried[near] - tried[leader]) / reach
         step, steepness = robust_step(half.scale, tried[leader], slope, best - start)
         beyond = float(np.max(np.abs(step) / reach))
-        centre = np.clip(best + step * min(1.0, 2.0 / max(beyond, 1e-12)), low, high)
+        centre = np.clip(best + step * min(1.0, FARTHEST / max(beyond, 1e-12)), low, high)
         # as far as the loss changes by a good part of itself, along each axis
         ideal = np.sqrt(PART * max(best_loss, LITTLE) / np.maximum(steepness, 1e-12))
-        reach = np.clip(np.clip(ideal, 0.35 * reach, 1.6 * reach), SMALLEST, WIDEST)
-        if improved and beyond > 2.0:
+        reach = np.clip(np.clip(ideal, 0.35 * reach, WIDEN * reach), SMALLEST, WIDEST)
+        if improved and beyond > FARTHEST:
             continue  # still on the way: does not count
         left -= 1
         if left <= 0:

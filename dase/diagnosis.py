@@ -35,7 +35,7 @@ SHARE = 0.1
 CLOSE = 2.0
 """A model up to this error is called at the floor: what is left may be significant but is not material."""
 
-CLOSE_FAMILY = 3.5
+CLOSE_FAMILY = 4.0
 """The same for the error of one family: what few statistics show, such as dead pixels, the mean hides."""
 
 TIE = 0.35

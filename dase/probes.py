@@ -313,7 +313,7 @@ def tolerance(measured: Array, events: Array) -> Array:
     out[LAYOUT["spectrum"]] = 0.1
     out[LAYOUT["spectrum"]][TONES:] = 0.005
     out[LAYOUT["stamps"]] = 0.02
-    out[LAYOUT["spread"]] = 0.01 * np.maximum(1.0, np.abs(measured[LAYOUT["spread"]]))
+    out[LAYOUT["spread"]] = 0.015 * np.maximum(1.0, np.abs(measured[LAYOUT["spread"]]))
     return out
 
 

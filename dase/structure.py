@@ -19,7 +19,7 @@ SHORTEST = 3e-6
 CERTAIN = 0.97
 """Share of events that must follow a regularity."""
 
-ENOUGH = 100_000
+ENOUGH = 50_000
 
 DIRECTIONS = ("down", "up", "right", "left")
 
@@ -71,15 +71,16 @@ def places(events: Events, direction: str) -> tuple[int, NDArray[np.float64]]:
 
 
 def find(events: Events) -> Structure:
-    """Return the regularities of a measurement's time stamps, from its first `ENOUGH` events."""
-    events = events.select(slice(ENOUGH))
+    """Return the regularities of a measurement's time stamps: seen in the first events, true of all."""
+    first = events.select(slice(ENOUGH))
     best = Structure()
     for direction in DIRECTIONS:
-        line = line_time(events, direction)
+        line = line_time(first, direction)
         if line > best.line:
             best = Structure(line=line, direction=direction)
-    # the lines of a scan are read at ticks too
-    return best if best.line else Structure(step=ticks(events.t))
+    if not best.line:  # the lines of a scan are read at ticks too
+        best = Structure(step=ticks(first.t))
+    return best if best.shares(events).max() >= CERTAIN else Structure()
 
 
 def ticks(t: NDArray[np.float64]) -> float:

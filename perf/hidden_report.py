@@ -19,7 +19,7 @@ HIDDEN: dict[str, tuple[dict[str, Any], ...]] = {
     "second_order": tuple(dict(cutoff=f, damping=0.5) for f in (500.0, 150.0, 50.0)),
     "voltage_noise": tuple(dict(sigma=s, cutoff=50.0) for s in (0.05, 0.07, 0.1)),
     "mismatch": tuple(dict(spread=s) for s in (0.08, 0.15, 0.3)),
-    "jitter": tuple(dict(spread=s) for s in (0.08, 0.15, 0.3)),
+    "jitter": tuple(dict(spread=s) for s in (0.1, 0.2, 0.35)),
     "leak": tuple(dict(rate=r) for r in (0.3, 1.0, 4.0)),
     "shot": tuple(dict(rate=r) for r in (0.5, 2.0, 10.0)),
     "hot": tuple(dict(share=s, rate=r) for s, r in ((0.003, 50.0), (0.01, 100.0), (0.02, 200.0))),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
@@ -158,6 +159,13 @@ def test_regular_time_stamps_are_found(scene, effect):
         assert found.line == pytest.approx(1.2e-5, rel=1e-3)
         assert found.direction == "up"
     assert found.shares(events).max() > 0.97
+
+
+def test_a_regularity_must_last(scene):
+    events = dase.simulate(scene, Sensor().with_effect(EFFECTS["timestamp"](step=3e-4, jitter=0.0)), seed=1)
+    t = events.t.copy()
+    t[len(t) * 3 // 4 :] += 1e-5
+    assert find(replace(events, t=t)).step == 0
 
 
 def test_ordinary_time_stamps_have_no_regularity(scene):
