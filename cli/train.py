@@ -38,7 +38,7 @@ def command(
     output: Path,
     images: str | None,
     preset: str,
-    objective: str,
+    objective: Any,
     steps: int,
     minutes: float | None,
     window: float,

@@ -39,7 +39,7 @@ class Tried:
         name: Of the effect, names joined by ` + ` for a pair.
         model: With the effect, fitted.
         fit: Its loss where it was fitted.
-        scouted: Its loss on the scout.
+        scouted: Its loss on some of the pixels, relative to that of the present model.
         families: The same by family.
         judged: Its error on the held-out half; None where it was only screened.
         bank: Statistics of all that was tried on the training half, shape (M, J).
@@ -88,22 +88,29 @@ def prepared(evidence: Evidence, effect: type[Effect]) -> list[Effect]:
     return variants(effect)
 
 
+def rare(effect: Effect) -> bool:
+    """Whether an effect acts on a share of the pixels: a few hundred of them do not show it."""
+    return any(p.name == "share" for p in effect.parameters())
+
+
 def scout(evidence: Evidence, present: Model, effect: Effect, *, seed: int) -> Tried:
-    """Try one effect on the scout: a look at many places, then a short descent from the best two."""
+    """Try one effect on some pixels: a look at many places, then a short descent from the best two."""
+    half = evidence.train if rare(effect) else evidence.scout
     model = added(present, effect)
-    slow = evidence.scout.slow(model.space)
-    places, losses = screen(evidence.scout, model.space, starts(model, effect, few=slow), seed=seed)
+    slow = half.slow(model.space)
+    places, losses = screen(half, model.space, starts(model, effect, few=slow), seed=seed)
     apart = np.flatnonzero((np.abs(places - places[0]).max(1) > 0.8) & (losses < SECOND * losses[0]))
-    picks = [0, *apart[: 0 if slow else 1]]
+    picks = [0, *apart[: 0 if slow or rare(effect) else 1]]
     ends = [
-        replace(model, place=places[n], loss=losses[n]).search(
-            evidence.scout, seed=seed, iterations=3, radius=0.25
-        )
+        replace(model, place=places[n], loss=losses[n]).search(half, seed=seed, iterations=3, radius=0.25)
         for n in picks
     ]
     best = min(ends, key=lambda m: m.loss)
-    values = evidence.scout.run(best.space, best.place, seed=seed)[0]
-    return Tried(effect.name, best, best.loss, best.loss, evidence.scout.scale.families(values))
+    values, before = (half.run(m.space, m.place, seed=seed)[0] for m in (best, present))
+    share = best.loss / float(half.scale.loss(before))
+    was = half.scale.families(before)
+    families = {name: value / max(was[name], 1e-9) for name, value in half.scale.families(values).items()}
+    return Tried(effect.name, best, best.loss, share, families)
 
 
 def refine(evidence: Evidence, tried: Tried, *, seed: int) -> Tried:
@@ -143,10 +150,10 @@ def try_all(
     found: dict[str, Tried] = {}
     for n, effect in enumerate(all_variants):
         tried = scout(evidence, present, effect, seed=seed)
-        if effect.name not in found or tried.fit < found[effect.name].fit:
+        if effect.name not in found or tried.scouted < found[effect.name].scouted:
             found[effect.name] = tried
         report(f"trying {effect.name}", 0.7 * (n + 1) / len(all_variants))
-    order = sorted(found.values(), key=lambda t: t.fit)
+    order = sorted(found.values(), key=lambda t: t.scouted)
     chosen = [*order[:FINALISTS], *specialists(order, worst)]
     finalists = [refine(evidence, tried, seed=seed) for tried in chosen]
     done = []

@@ -71,7 +71,6 @@ class _Search:
     error_of: dict[str, float] = field(default_factory=dict)
     ties: dict[str, set[str]] = field(default_factory=dict)
     first: list[Tried] = field(default_factory=list)
-    first_fit: float = float("nan")
     error: float = float("nan")
 
     def judge(self, model: Model) -> Judgement:
@@ -180,8 +179,6 @@ def _step(search: _Search, model: Model, judgement: Judgement, more: bool) -> tu
         return step, None
     present = evidence.train.run(model.space, model.place, seed=seed)[0]
     scale, base = evidence.train.scale, float(evidence.train.scale.loss(present))
-    if not search.history:
-        search.first_fit = model.loss_on(evidence.scout, seed=seed)
     tried = try_all(
         evidence, model, search.effects, open_names, worst=worst_families(judgement), seed=seed,
         report=lambda text, share: search.progress(text, share, search.error),
@@ -230,7 +227,7 @@ def _rank(tried: Tried, judgement: Judgement, p_value: float) -> Rank:
 def _pairs(search: _Search, start: Model, model: Model, judgement: Judgement) -> tuple[Model, Judgement]:
     """Where adding one after the other does not reach the floor, try two at once."""
     evidence, seed = search.evidence, search.seed
-    singles = [t for t in search.first if t.scouted < 0.98 * search.first_fit][:PAIRED]
+    singles = [t for t in search.first if t.scouted < 0.98][:PAIRED]
     start.rebase(evidence.scout, repeats=16, seed=seed + 200)
     pairs = list(combinations(singles, 2))
     tried = []

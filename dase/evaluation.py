@@ -120,7 +120,7 @@ class HeldOut:
 
     def score(self, net: Callable[[torch.Tensor], Maps]) -> float:
         """Return the weighted square difference of the moments; smaller is better."""
-        return discrepancy(self.fakes(net), self.real, self.like)
+        return float(discrepancy(self.fakes(net), self.real, self.like))
 
     def statistics(self, net: Callable[[torch.Tensor], Maps]) -> dict[str, float]:
         """Return how counts and 8x8 patches of them differ from the held-out ones, in plain numbers."""

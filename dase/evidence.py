@@ -105,7 +105,7 @@ class Half:
         target, events = statistics(self.found, bare)
         self.frame = replace(bare, measured=target[0])
         values, _ = statistics(sums, self.frame)
-        off = tolerance(target[0], events[0]) ** 2
+        off = np.maximum(tolerance(target[0], events[0]), 1e-9) ** 2
         repeats = 2.0 * values.var(0, ddof=1)
         used = compared(target[0], events[0])
         self.off = np.sqrt(off)

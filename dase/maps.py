@@ -20,7 +20,8 @@ from dase.events import Events
 from dase.figures import curves
 from dase.plates import INK, LINE, OFF, ON, WIDE, Plate, label, legend, number, place, sheet
 from dase.results import Curve
-from dase.show import overlay, seconds
+from dase.show import overlay
+from dase.units import seconds
 
 DIVERGING = LinearSegmentedColormap.from_list("dase", ["#1b4f8f", "#86add3", "#f5f5f3", "#dfa67f", "#a23b16"])
 """Too few to too many."""

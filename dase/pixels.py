@@ -91,7 +91,7 @@ class Pixels:
         # a CPU takes logarithms of many pixels at once, unless the light is not the scene's
         lit = any(stage == "light" for effect in self.stages for stage, _ in effect.functions)
         self._logs_at_once = self.device.is_cpu and not lit and bool(np.all(vectors[:, 3] == vectors[0, 3]))
-        self._levels: Any = None
+        self._levels: tuple[Any, Any] | None = None
         self._mapped: list[Any] | None = None
         self._bits = max((self.batch * self.count - 1).bit_length(), 1)
         self._low = 3 if labels else 1
@@ -257,8 +257,9 @@ class Pixels:
             inputs = [self._pixels, self.width, self.height, self.seed, self._parameters]
             inputs += [*self._maps(), level]
             launch.run(kernel, self.count, inputs, self.device, batch=self.batch)
-        self._levels = level, wp.array(self._vectors[:, 3], dtype=float, device=self.device)
-        return self._levels
+        levels = level, wp.array(self._vectors[:, 3], dtype=float, device=self.device)
+        self._levels = levels
+        return levels
 
     def _launch(
         self,

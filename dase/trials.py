@@ -18,9 +18,10 @@ from dase.effects.timestamp import Timestamp
 from dase.events import Events
 from dase.kernels import launch, pixel, trials
 from dase.kernels import probes as kernels
+from dase.pixels import Pixels
 from dase.probes import Sums
 from dase.scene import Scene
-from dase.sensor import Pixels, Sensor
+from dase.sensor import Sensor
 from dase.stimulus import Stimulus
 from dase.structure import Structure
 

@@ -192,12 +192,12 @@ def open_video(path: Path, *, fps: float | None = None, size: tuple[int, int] | 
 
 def _is_recording(path: Path) -> bool:
     from dase import io
+    from dase.io import frames
 
     if not path.is_file():
         return False
     try:
-        # of a video, frames are decoded one by one as they are asked for
-        return io.find(path).name != "frames"
+        return io.find(path) is not frames.FORMAT  # which are videos and pictures
     except InputError:
         return False
 

@@ -6,7 +6,7 @@
     python perf/adaptation.py --table --out out/adaptation
 
 Every row appends its line to OUT/rows.jsonl as it ends, and logs to OUT/NAME/log.csv meanwhile, so a run that
-is cut short loses nothing that is done. `--table` writes docs/adaptation.md from the lines.
+is cut short loses nothing that is done. `--table` writes the tables of docs/adaptation.md.
 """
 
 from __future__ import annotations
@@ -25,6 +25,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
+import adaptation_page
 import numpy as np
 import torch
 
@@ -379,6 +380,9 @@ def parse(argv: list[str] | None = None) -> argparse.Namespace:
     parser.add_argument("--look", type=int, default=50, help="steps between lines of the log")
     parser.add_argument("--small", action="store_true", help="tiny scenes, to try things on a CPU")
     parser.add_argument("--verbose", action="store_true", help="print every line of the log")
+    parser.add_argument(
+        "--table", action="store_true", help="only write docs/adaptation.md from OUT/rows.jsonl"
+    )
     parser.add_argument("--commit", help="what to record where there is no git")
     return parser.parse_args(argv)
 
@@ -386,6 +390,9 @@ def parse(argv: list[str] | None = None) -> argparse.Namespace:
 def main() -> None:
     """Run or list rows."""
     args = parse()
+    if args.table:
+        adaptation_page.write(Path(args.out), ROOT / "docs" / "adaptation.md", args.jobs)
+        return
     every = rows()
     names = [n for pattern in args.row for n in every if fnmatch.fnmatch(n, pattern)]
     names = list(dict.fromkeys(names))

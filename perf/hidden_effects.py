@@ -264,6 +264,7 @@ def main() -> None:
     parser.add_argument("--truth", action="store_true")
     parser.add_argument("--report", action="store_true", help="only write the page from the log")
     parser.add_argument("--out", type=Path, default=Path("docs"))
+    parser.add_argument("--where", default="", help="device and commit of the log, for the page")
     options = parser.parse_args()
     if options.hidden:
         score_hidden(options.hidden, options)
@@ -274,7 +275,7 @@ def main() -> None:
     if not options.report:
         _run(options)
     if options.log.exists():
-        write_report(options.log, options.out)
+        write_report(options.log, options.out, options.where)
 
 
 def _run(options: argparse.Namespace) -> None:

@@ -120,7 +120,7 @@ def confusion(lines: list[dict[str, Any]], strength: str) -> tuple[list[str], np
     return names, table
 
 
-def write_report(log: Path, out: Path) -> None:
+def write_report(log: Path, out: Path, where: str) -> None:
     """Write the page and its picture from the log."""
     lines = [json.loads(text) for text in log.read_text().splitlines() if text.strip()]
     table = ["| what | right | of | share |", "|---|---|---|---|"]
@@ -135,6 +135,7 @@ def write_report(log: Path, out: Path) -> None:
     listed = [f"- `{line['name']}`: {short(line).split(' | ')[0]}" for line in wrong[:60]]
     seconds = np.array([line["seconds"] for line in lines if "failed" not in line] or [0.0])
     text = PAGE.format(
+            where=f", on {where}" if where else "",
         table="\n".join(table), wrong="\n".join(listed) or "None.", runs=len(lines),
         median=np.median(seconds), slowest=seconds.max(),
     )  # fmt: skip
@@ -148,7 +149,7 @@ PAGE = """# Hidden effects: the blind benchmark
 `perf/hidden_effects.py` writes this page; edit the text there. It simulates scenes that are used nowhere else
 with a sensor that has an effect the diagnosis is not told of, hands over events and scene, and compares the
 answer with the truth afterwards. {runs} runs; a diagnosis took {median:.1f} s in the median, {slowest:.0f} s
-at most, several at a time.
+at most, several at a time{where}.
 
 {table}
 

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import struct
+
 import h5py
 import numpy as np
 import pytest
-from reference_io import H, W, dsec, ecf, ecf_buffer, events, mvsec, v2e, written
+from reference_io import H, W, dsec, ecf, ecf_buffer, events, measured, mvsec, v2e, written
 
 from dase import io
 from dase.errors import InputError
@@ -208,3 +210,86 @@ def test_s2r_streams_with_the_size_either_way_round(tmp_path, rng):
         del file.attrs["sensor_resolution"]
     with pytest.raises(InputError, match="how large"):
         list(io.stream(tmp_path / "a.h5"))
+
+
+def test_a_text_that_claims_to_be_large_takes_no_memory(tmp_path, rng):
+    """HDF5 takes what the length of a text says before it looks for the text."""
+    path = tmp_path / "a.hdf5"
+    ecf(path, events(rng, 50))
+    content = path.read_bytes()
+    where = content.index(struct.pack("<IQ", len(f"{W}x{H}"), content.index(columns.HEAP)))
+    path.write_bytes(content[:where] + struct.pack("<I", 0xF0000000) + content[where + 4 :])
+    script = """
+import sys
+from dase import io
+from dase.errors import InputError
+before = peak()
+for act in (io.read, lambda path: list(io.stream(path))):
+    try:
+        act(sys.argv[1])
+    except InputError as error:
+        print(error)
+print(peak() - before)
+"""
+    *said, grown = measured(script, path)
+    assert len(said) == 2
+    assert all("cannot be read as Prophesee HDF5" in sentence for sentence in said)
+    assert float(grown) < 100
+
+
+def test_blosc_without_its_parameters_is_no_crash(tmp_path, rng):
+    plugin = pytest.importorskip("hdf5plugin")
+    path = tmp_path / "a.h5"
+    dsec(path, events(rng, 300), **plugin.Blosc(cname="zstd"))
+    content = bytearray(path.read_bytes())
+    where = content.index(b"blosc\0")
+    assert struct.unpack_from("<HHHH", content, where - 8)[::3] == (32001, 7)
+    content[where - 2 : where] = b"\0\0"  # how many there are
+    path.write_bytes(content)
+    for act in (io.read, lambda path: list(io.stream(path))):
+        with pytest.raises(InputError, match="is damaged: its filter has 0 parameters"):
+            act(path)
+
+
+@pytest.mark.parametrize("number", [6, 305])
+def test_filters_nobody_uses_for_events_are_refused(tmp_path, rng, number):
+    dsec(tmp_path / "a.h5", events(rng, 50))
+    with h5py.File(tmp_path / "a.h5", "r+") as file:
+        del file["events/t"]
+        properties = h5py.h5p.create(h5py.h5p.DATASET_CREATE)
+        properties.set_chunk((50,))
+        properties.set_filter(number, h5py.h5z.FLAG_OPTIONAL, (1,) * 20)
+        space = h5py.h5s.create_simple((50,))
+        made = h5py.h5d.create(file["events"].id, b"t", h5py.h5t.NATIVE_UINT32, space, properties)
+        made.write_direct_chunk((0,), bytes(200))
+    for act in (io.read, lambda path: list(io.stream(path))):
+        with pytest.raises(InputError, match=f"with HDF5 filter {number}, which is not known"):
+            act(tmp_path / "a.h5")
+
+
+def test_what_is_not_there_or_lies_elsewhere_is_refused(tmp_path, rng):
+    secret = tmp_path / "secret"
+    secret.write_bytes(bytes(range(200)))
+    layout = h5py.VirtualLayout((50,), np.uint32)
+    layout[:] = h5py.VirtualSource(secret, "t", (50,))
+    makers = {
+        r"has 1 of its 20 chunks": lambda group: group.create_dataset(
+            "t", (50,), np.uint32, chunks=(50,), maxshape=(None,), compression="gzip"
+        ),
+        r"lies in another file": lambda group: group.create_dataset(
+            "t", (50,), np.uint32, external=[(secret, 0, 200)]
+        ),
+        r"lies in another file, which": lambda group: group.create_virtual_dataset("t", layout),
+        r"has 0 of its 200 bytes": lambda group: group.create_dataset("t", (50,), np.uint32),
+    }
+    for match, make in makers.items():
+        dsec(tmp_path / "a.h5", events(rng, 50))
+        with h5py.File(tmp_path / "a.h5", "r+") as file:
+            del file["events/t"]
+            made = make(file["events"])
+            if "chunks" in match:
+                made[:] = 1
+                made.resize((1000,))
+        for act in (io.read, lambda path: list(io.stream(path))):
+            with pytest.raises(InputError, match=match):
+                act(tmp_path / "a.h5")

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager, nullcontext, suppress
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -19,7 +20,10 @@ HDF5 = b"\x89HDF\r\n\x1a\n"
 HEAP = b"GCOL\x01\0\0\0"
 PART = 1 << 20  # events read at once
 BLOCK = 1 << 24  # [bytes] searched at once
-BLOSC, BLOSC2, ZSTD, LZ4 = 32001, 32026, 32015, 32004  # numbers of filters that hdf5plugin brings
+MOST_TEXT = 1 << 26  # [bytes] of an attribute
+FILTERS = {1: 1, 2: 0, 3: 0, 32000: 0, 32001: 4, 32004: 0, 32015: 0, 32026: 4}
+"""Number of a filter to how many parameters it needs: gzip, shuffle, Fletcher's sum, LZF; of hdf5plugin
+Blosc, LZ4, Zstandard, Blosc 2. Blosc crashes without its parameters."""
 
 TELLING = (
     "CD/events",
@@ -119,18 +123,72 @@ def dataset(file: Any, name: str, ndim: int | None = None) -> Any:
         raise InputError(f"'{name}' must have {ndim} axes, got shape {found.shape}")
     if found.dtype.kind not in "biuf" and found.dtype.names is None:
         raise InputError(f"'{name}' must hold numbers, got {found.dtype}")
-    refuse_bomb(found.id.get_storage_size(), found.size * found.dtype.itemsize)
-    for number in _filters(found):
-        if not h5py.h5z.filter_avail(number):
-            if number in (BLOSC, BLOSC2, ZSTD, LZ4):
-                raise missing_extra(f"'{name}' is packed in a way that", "hdf5")
-            raise InputError(f"'{name}' is packed with HDF5 filter {number}, which is not known here")
+    check_whole(found, name)
+    _check_filters(found, name)
     return found
 
 
-def _filters(found: Any) -> list[int]:
+def check_whole(found: Any, name: str) -> None:
+    """Raise InputError where a dataset unpacks to something absurd, is not all there, or lies elsewhere."""
+    stored, kind = found.id.get_storage_size(), found.dtype
+    chunk = math.prod(found.chunks or (0,))
+    refuse_bomb(stored, max(found.size, chunk) * kind.itemsize)
     properties = found.id.get_create_plist()
-    return [properties.get_filter(k)[0] for k in range(properties.get_nfilters())]
+    if properties.get_layout() == h5py.h5d.VIRTUAL or properties.get_external_count():
+        raise InputError(f"'{name}' lies in another file, which is not read")
+    if found.chunks:
+        wanted = math.prod(-(-n // m) for n, m in zip(found.shape, found.chunks, strict=True))
+        if found.id.get_num_chunks() < wanted:
+            raise InputError(f"'{name}' has {found.id.get_num_chunks()} of its {wanted} chunks")
+    elif stored < found.size * kind.itemsize:
+        raise InputError(f"'{name}' has {stored} of its {found.size * kind.itemsize} bytes")
+
+
+def _check_filters(found: Any, name: str) -> None:
+    properties = found.id.get_create_plist()
+    for k in range(properties.get_nfilters()):
+        number, _, parameters, _ = properties.get_filter(k)
+        if number not in FILTERS:
+            raise InputError(f"'{name}' is packed with HDF5 filter {number}, which is not known here")
+        if not h5py.h5z.filter_avail(number):
+            raise missing_extra(f"'{name}' is packed in a way that", "hdf5")
+        if len(parameters) < FILTERS[number]:
+            raise InputError(f"'{name}' is damaged: its filter has {len(parameters)} parameters")
+
+
+def attribute(node: Any, name: str) -> Any:
+    """Return the value of an attribute of a file, group or dataset, None where it is absent."""
+    if name not in node.attrs:
+        return None
+    found = node.attrs.get_id(name)
+    if found.get_storage_size() > MOST_TEXT:
+        raise InputError(f"its attribute '{name}' has {found.get_storage_size()} bytes")
+    with _little_memory() if found.dtype.hasobject else nullcontext():
+        return node.attrs[name]
+
+
+@contextmanager
+def _little_memory() -> Iterator[None]:
+    """While this is open the process gets no more than a little memory, on Linux.
+
+    HDF5 takes as much as the length of a text says, up to 4 GB, before it looks whether there is a text.
+    """
+    try:
+        import resource
+
+        taken = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
+    except (ImportError, OSError):
+        yield
+        return
+    limits = resource.getrlimit(resource.RLIMIT_AS)
+    most = taken + MOST_TEXT
+    if limits[0] != resource.RLIM_INFINITY:
+        most = min(most, limits[0])
+    resource.setrlimit(resource.RLIMIT_AS, (most, limits[1]))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_AS, limits)
 
 
 def columns(
@@ -159,8 +217,8 @@ def largest(file: Any, x: str, y: str) -> Size:
 
 def size_attribute(file: Any, name: str) -> Size | None:
     """Return columns and rows from an attribute of the file that holds rows and columns, or None."""
-    value = np.asarray(file.attrs.get(name, []))
-    if value.shape != (2,) or value.dtype.kind not in "iu":
+    value = np.asarray(attribute(file, name))
+    if value.ndim != 1 or len(value) < 2 or value.dtype.kind not in "iu":
         return None
     return int(value[1]), int(value[0])
 

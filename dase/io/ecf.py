@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 
 from dase.errors import InputError
 from dase.io import raw
-from dase.io.columns import PART, has, opened, reader
+from dase.io.columns import PART, attribute, check_whole, has, opened, reader
 from dase.io.format import camera_format
 from dase.io.sequence import coordinates
 from dase.io.source import Piece, Size, Source, refuse_bomb
@@ -166,7 +166,7 @@ def _parts(file: Any, source: Source) -> Iterator[Piece]:
     properties = events.id.get_create_plist()
     filters = [properties.get_filter(k)[0] for k in range(properties.get_nfilters())]
     if FILTER not in filters:
-        refuse_bomb(events.id.get_storage_size(), events.size * events.dtype.itemsize)
+        check_whole(events, "CD/events")
         for i in range(0, len(events), PART):
             part = events[i : i + PART]
             t, x, y = part["t"].astype(np.int64), coordinates(part["x"], "x"), coordinates(part["y"], "y")
@@ -191,7 +191,7 @@ def size(source: Source) -> Size | None:
         keys = {}
         for node in (file, file["CD"]):
             for name in ("geometry", "format", "system_ID"):
-                value = node.attrs.get(name)
+                value = attribute(node, name)
                 if isinstance(value, bytes):
                     value = value.decode("latin-1")
                 if isinstance(value, str):

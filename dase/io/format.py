@@ -157,7 +157,7 @@ def _read(
     times = np.array([picture.t for picture in pictures])
     zero = rules.origin(source, piece.t if len(piece.t) else times, ticks)
     events = Events((piece.t - zero) / ticks, piece.x, piece.y, piece.p, *size, piece.label)
-    return sequence_of(events, [picture._replace(t=(picture.t - zero) / ticks) for picture in pictures])
+    return sequence_of(events, pictures, zero, ticks)
 
 
 def taken(pictures: Iterable[Picture]) -> list[Picture]:
@@ -178,18 +178,32 @@ def taken(pictures: Iterable[Picture]) -> list[Picture]:
     return out
 
 
-def sequence_of(events: Events, pictures: list[Picture]) -> Sequence:
-    """Return a sequence of events and frames with times [s], not a number where nothing tells them."""
+def sequence_of(events: Events, pictures: list[Picture], begin: Any = 0, ticks: float = 1.0) -> Sequence:
+    """Return a sequence of events and frames.
+
+    Args:
+        events: The events.
+        pictures: The frames; times are not a number where nothing tells them. Their pixels are let go.
+        begin: Tick of time zero.
+        ticks: Ticks per second.
+    """
     if not pictures:
         return Sequence(events)
-    times = np.array([picture.t for picture in pictures], np.float64)
+    times = (np.array([picture.t for picture in pictures]) - begin) / ticks
     exposure = np.array([picture.exposure for picture in pictures], np.float64)
-    flow = [picture.flow for picture in pictures if picture.flow is not None]
+    with_flow = all(picture.flow is not None for picture in pictures)
+    frames = np.empty((len(pictures), *pictures[0].grey.shape), pictures[0].grey.dtype)
+    flow = np.empty((len(pictures), 2, *pictures[0].grey.shape), np.float32) if with_flow else None
+    for k in range(len(pictures)):  # each is let go when it has its place: all are never there twice
+        frames[k] = pictures[k].grey
+        if flow is not None:
+            flow[k] = pictures[k].flow
+        pictures[k] = pictures[k]._replace(grey=frames[k], flow=None)
     return Sequence(
         events,
-        np.stack([picture.grey for picture in pictures]),
+        frames,
         None if np.isnan(times).any() else times,
-        np.stack(flow) if len(flow) == len(pictures) else None,
+        flow,
         frame_exposure=exposure if exposure.any() else None,
     )
 

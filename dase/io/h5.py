@@ -25,6 +25,7 @@ from numpy.typing import NDArray
 
 from dase.errors import InputError
 from dase.events import Events
+from dase.io import columns
 from dase.io.rules import sensor_events
 from dase.io.sequence import GREYS, Grey, Sequence, Writer, coordinates, reading, writing
 from dase.io.source import Beside, Piece, Source
@@ -252,23 +253,23 @@ def _parse(source: Source, file: Any) -> Sequence:
     images, flows = members(file, "images"), members(file, "flow")
     frames = _stack(images, GREYS, 2) if images else None
     flow = _flow(images, flows)
-    exposure = np.array([float(image.attrs.get("exposure", 0.0)) for image in images.values()])
-    size = file.attrs.get("sensor_resolution")
+    exposure = np.array([exposure_of(image) for image in images.values()])
+    size = columns.size_attribute(file, "sensor_resolution")
     x, y = coordinates(x, "events/xs"), coordinates(y, "events/ys")
     found = sensor_events(
         source,
         Piece(t.astype(np.float64, copy=False), x, y, p, label),
-        size=None if size is None else (int(size[1]), int(size[0])),
+        size=size,
         maps=(frames, flow, file.get("dase/thresholds")),
     )
-    times = np.array([attribute(image, "timestamp") for image in images.values()]) if images else None
+    times = np.array([time_of(image) for image in images.values()]) if images else None
     return Sequence(found, frames, times, flow, *beside(file), exposure if exposure.any() else None)
 
 
 def beside(file: Any) -> Beside:
     """Return the thresholds and the configuration."""
     thresholds = file["dase/thresholds"][:].astype(np.float32) if "dase/thresholds" in file else None
-    configuration = file["dase"].attrs.get("configuration") if "dase" in file else None
+    configuration = columns.attribute(file["dase"], "configuration") if "dase" in file else None
     return thresholds, None if configuration is None else str(configuration)
 
 
@@ -278,11 +279,18 @@ def _dataset(file: Any, name: str) -> Any:
     return file[name]
 
 
-def attribute(item: Any, name: str) -> float:
-    """Return a number that an attribute holds; raises InputError where there is none."""
-    if name not in item.attrs:
-        raise InputError(f"'{item.name}' has no attribute '{name}'")
-    return float(item.attrs[name])
+def time_of(image: Any) -> float:
+    """Return the time of an image or flow [s]; raises InputError where there is none."""
+    value = columns.attribute(image, "timestamp")
+    if value is None:
+        raise InputError(f"'{image.name}' has no attribute 'timestamp'")
+    return float(value)
+
+
+def exposure_of(image: Any) -> float:
+    """Return the duration of the exposure of an image [s], 0 where it was taken in an instant."""
+    value = columns.attribute(image, "exposure")
+    return 0.0 if value is None else float(value)
 
 
 def members(file: Any, group: str) -> dict[str, Any]:

@@ -35,8 +35,7 @@ def _pictures(source: Source) -> Iterator[Picture]:
             flow = h5.checked(flows[name], (np.float32,), 3) if name in flows else None
             if flow is None and flows:
                 flow = np.full((2, *grey.shape), np.nan, np.float32)
-            exposure = float(image.attrs.get("exposure", 0.0))
-            yield Picture(grey, h5.attribute(image, "timestamp"), exposure, flow)
+            yield Picture(grey, h5.time_of(image), h5.exposure_of(image), flow)
 
 
 def _size(source: Source) -> Size | None:
