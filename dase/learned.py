@@ -11,6 +11,7 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 
 from dase.errors import InputError
@@ -86,8 +87,8 @@ def _lines(row: dict[str, float], found: dict[str, NDArray[Any]]) -> list[tuple[
 
 
 def _layout(rows: int, aspect: float) -> tuple[Figure, list[list[Axes]], list[Axes]]:
-    wide, side, gap, head, foot = 11.0, 0.35, 0.12, 1.0, 2.9  # all in inches
-    across = (wide - 2 * side - 4 * gap - 0.5) / 5
+    wide, side, gap, head, foot = 11.0, 0.35, 0.12, 1.0, 2.75  # all in inches
+    across = (wide - 2 * side - 4 * gap - 0.75) / 5
     down = across / aspect
     tall = head + rows * (down + gap) + foot
     figure = Figure(figsize=(wide, tall), dpi=150, facecolor="white")
@@ -102,12 +103,12 @@ def _layout(rows: int, aspect: float) -> tuple[Figure, list[list[Axes]], list[Ax
     pictures = [
         # the maps stand apart, to leave room for their scales
         [
-            axes(side + k * (across + gap) + (0.25 if k > 3 else 0), head + n * (down + gap), across, down)
+            axes(side + k * (across + gap) + (0.36 if k > 3 else 0), head + n * (down + gap), across, down)
             for k in range(5)
         ]
         for n in range(rows)
     ]
-    top = head + rows * (down + gap) + 0.75
+    top = head + rows * (down + gap) + 0.6
     plots = [axes(side + 0.5, top, 4.4, 1.6), axes(wide - side - 4.4, top, 4.4, 1.6)]
     for plot in plots:
         plot.spines[["top", "right"]].set_visible(False)
@@ -129,7 +130,7 @@ def _bar(figure: Figure, axes: Axes, shown: Any) -> None:
     box = axes.get_position()
     thin = 0.07 / figure.get_figwidth()
     place = figure.add_axes((box.x1 + 0.6 * thin, box.y0, thin, box.height))
-    bar = figure.colorbar(shown, cax=place)
+    bar = figure.colorbar(shown, cax=place, ticks=MaxNLocator(4, prune="both"))
     bar.outline.set_visible(False)  # type: ignore[operator]
     place.tick_params(labelsize=6.5, colors=INK, length=2, width=0.5, pad=1.5)
 

@@ -187,6 +187,7 @@ class Moments:
         memory: Share of the fake means that stays from step to step.
         scenes: How many different real scenes there are.
         doubt: Share by which a mean may differ for reasons that thresholds cannot cure.
+        variety: How many scenes the simulator's textures are worth, see `Scenery.variety`.
     """
 
     def __init__(
@@ -198,8 +199,9 @@ class Moments:
         memory: float = 0.95,
         scenes: float = math.inf,
         doubt: float = 0.0,
+        variety: float = math.inf,
     ):
-        self.scenes, self.doubt = scenes, doubt
+        self.scenes, self.doubt, self.variety = scenes, doubt, variety
         self.device, self.levels, self.pattern, self.memory = torch.device(device), levels, pattern, memory
         self.boundaries: list[torch.Tensor] = []
         self.sets: dict[str, Cells] = {}

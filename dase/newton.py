@@ -8,6 +8,7 @@ the UNet.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from functools import partial
 from typing import Any
@@ -25,8 +26,8 @@ LONGEST = 0.1
 WIDEST = 1.0
 """Most that a column or row is off [in its logarithm]."""
 
-LOOSE = (0.01, 0.03, 0.1, 0.3, 1.0)
-"""Candidates of the prior spread between neighbouring nodes of the table, chosen from by held-out data."""
+LOOSE = tuple(10 ** (n / 4) for n in range(-10, 1))
+"""Candidates of the prior spread between neighbouring nodes of the table [in its logarithm]."""
 
 
 class Newton:
@@ -40,7 +41,7 @@ class Newton:
 
     def __init__(self, moments: Moments, net: ThresholdNet, *, memory: float = 0.95):
         self.moments, self.net, self.memory = moments, net, memory
-        self.loose = LOOSE[2]
+        self.loose = LOOSE[len(LOOSE) // 2]
         self.kept: dict[str, torch.Tensor] = {}
 
     @torch.no_grad()
@@ -119,36 +120,43 @@ class Newton:
         """Move the shared numbers by `share` of what makes the moments vanish, as far as the prior lets."""
         cells = self.moments.sets["look"]
         jacobian, prior = self._jacobian(), self._prior()
-        weight = cells.kept["weight"][0].double()
+        # weights are of one scene and per cell and feature; other textures are as many scenes as there are
+        scenes = self._scenes(cells).clamp_max(min(self.moments.variety, 1e9))
+        weight = cells.kept["weight"][0].double() * scenes * len(jacobian)
         off = cells.off().flatten()
         curve = jacobian.T @ weight @ jacobian
         pull = jacobian.T @ weight @ off
         here = self.numbers()
-        # the weights are per scene and over cells x features; the data says n times as much
-        unit = 1 / (self._scenes(cells) * len(off))
         tiny = 1e-6 * torch.eye(len(curve), device=curve.device, dtype=curve.dtype) * curve.diagonal().mean()
-
-        def solve(loose: float) -> torch.Tensor:
-            hold = prior * (unit / loose**2)
-            return torch.linalg.solve(curve + hold + tiny, -(pull + hold @ here))
-
         if self.moments.calls % 25 == 0 and self.net.shape.table is not None:
-            self._choose(solve, jacobian, weight)
-        move = (share * solve(self.loose)).clamp(-LONGEST, LONGEST)
+            self._choose(curve + tiny, curve @ here - pull, prior)
+        hold = prior / self.loose**2
+        move = -torch.linalg.solve(curve + hold + tiny, pull + hold @ here)
+        move = (share * move).clamp(-LONGEST, LONGEST)
         self._apply(move)
         cells.shift((jacobian @ move).view(cells.kept["fake_sum"].shape))
         if self.moments.pattern:
             self._patterns(share)
 
-    def _choose(self, solve: Any, jacobian: torch.Tensor, weight: torch.Tensor) -> None:
-        """Choose the prior spread whose solution fits held-out scenes best, moments taken as linear."""
-        cells = self.moments.sets["look"]
-        off = cells.off(held_out=True).flatten()
+    def _choose(self, curve: torch.Tensor, data: torch.Tensor, prior: torch.Tensor) -> None:
+        """Choose the prior spread that makes the moments most likely, the table being averaged over.
+
+        Real scenes held out could not choose: they have the real textures, and a table bent to those fits
+        them too. The evidence (MacKay, Bayesian interpolation, 1992) asks whether chance, the choice of
+        textures included, explains the differences between cells without a table.
+
+        Args:
+            curve: Information of the data on the shared numbers, (p, p).
+            data: The same times what the data alone makes of them, (p,).
+            prior: Precision at unit spread, (p, p).
+        """
+        rank = float(torch.linalg.matrix_rank(prior))
         scores = []
         for loose in LOOSE:
-            rest = off + jacobian @ solve(loose)
-            scores.append(rest @ weight @ rest)
-        self.loose = LOOSE[int(torch.stack(scores).argmin())]
+            whole = curve + prior / loose**2
+            fit = 0.5 * data @ torch.linalg.solve(whole, data)
+            scores.append(fit - 0.5 * torch.linalg.slogdet(whole).logabsdet - rank * math.log(loose))
+        self.loose = LOOSE[int(torch.stack(scores).argmax())]
 
     def _apply(self, move: torch.Tensor) -> None:
         net = self.net

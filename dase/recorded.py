@@ -7,9 +7,11 @@ scenes and speeds without being paired. Pixels whose scene cannot be trusted hav
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -17,6 +19,7 @@ from numpy.typing import NDArray
 
 from dase.camera import TOLERANCE, CameraScene
 from dase.errors import InputError
+from dase.matching import stretches
 from dase.recording import Recording, open_recording
 from dase.scenery import LOG_EPS, Looks, Scenery
 from dase.targets import Finite, Pairs
@@ -108,7 +111,19 @@ def _scene_of(recording: Recording) -> CameraScene:
         raise InputError(
             "the frames of the recording have no times, so they cannot be laid beside the events"
         )
-    return CameraScene(recording.frames, begin, recording.frame_end)
+    scene = CameraScene(recording.frames, begin, recording.frame_end)
+    if not _stretched(recording.frames):
+        return scene
+    gains = stretches([scene.intensity(k) for k in range(len(scene))])
+    return CameraScene(recording.frames, begin, recording.frame_end, gains=gains)
+
+
+def _stretched(frames: NDArray[Any]) -> bool:
+    """Return whether nearly every frame fills the range of its type, which only stretching does."""
+    if frames.dtype.kind != "u":
+        return False
+    full = (frames.min((1, 2)) == 0) & (frames.max((1, 2)) == np.iinfo(frames.dtype).max)
+    return bool(full.mean() > 0.9)
 
 
 def _count(recording: Recording, begin: float, end: float) -> NDArray[np.float32]:
@@ -130,6 +145,11 @@ class Replayed(Scenery):
         self.looks = Looks(width=width, height=height, window=window, samples=samples)
         self.device = torch.device(device)
         self.log = torch.from_numpy(windows.log).to(self.device)
+
+    @property
+    def variety(self) -> float:
+        """No limit: the target has seen the very same scenes."""
+        return math.inf
 
     def draw(self, rng: np.random.Generator, count: int) -> torch.Tensor:
         """Return log intensities of `count` windows, shape (count, samples, height, width)."""

@@ -104,7 +104,7 @@ class _Run:
         training = self.training
         begin = time.perf_counter() - training.seconds
         saved = mark = time.perf_counter()
-        row: dict[str, float] = {}
+        row = {"step": training.step, "seconds": training.seconds} | self.exam.marks(training.mean)
         while training.step < training.recipe.steps:
             values = training.advance()
             wrong = ~torch.isfinite(values["loss"]) & (self.broken < 0)

@@ -155,6 +155,7 @@ class Training:
                 memory=recipe.memory,
                 scenes=self.target.scenes,
                 doubt=recipe.doubt,
+                variety=self.scenery.variety,
             )
         return Adversarial(
             recipe.hash,
