@@ -104,7 +104,9 @@ class _Run:
         training = self.training
         begin = time.perf_counter() - training.seconds
         saved = mark = time.perf_counter()
-        row = {"step": training.step, "seconds": training.seconds} | self.exam.marks(training.mean)
+        row: dict[str, float] = {"step": training.step, "seconds": training.seconds} | self.exam.marks(
+            training.mean
+        )
         while training.step < training.recipe.steps:
             values = training.advance()
             wrong = ~torch.isfinite(values["loss"]) & (self.broken < 0)
