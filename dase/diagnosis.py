@@ -38,6 +38,9 @@ CLOSE = 2.0
 CLOSE_FAMILY = 4.0
 """The same for the error of one family: what few statistics show, such as dead pixels, the mean hides."""
 
+MUCH_FAMILY = 8.0
+"""Error of one family above which a finding is not announced, although the mean is at the floor."""
+
 TIE = 0.35
 """Candidates at the floor whose held-out error is within this of the best's are not told apart from it."""
 
@@ -140,6 +143,17 @@ def explained(judgement: Judgement) -> bool:
     """Whether a model is at the floor, altogether and in every family of probes."""
     families = judgement.families
     inside = (families[name] <= max(judgement.limits[name], CLOSE_FAMILY) for name in families)
+    return judgement.error <= max(judgement.gate, CLOSE) and all(inside)
+
+
+def announced(judgement: Judgement) -> bool:
+    """Whether what was found may be announced: the mean is at the floor, and no family is far off.
+
+    A search goes on while a family is above `CLOSE_FAMILY`; that nothing more is found there does not make
+    what was found a stand-in.
+    """
+    families = judgement.families
+    inside = (families[name] <= max(judgement.limits[name], MUCH_FAMILY) for name in families)
     return judgement.error <= max(judgement.gate, CLOSE) and all(inside)
 
 
@@ -298,7 +312,7 @@ def _verdict(
     model, values = estimates(search.evidence, model, seed=search.seed)
     last = search.judge(model)
     unexplained: Unexplained | None = None
-    if not explained(last):
+    if not announced(last):
         cells = worst_cells(search.evidence, last)
         unexplained = _unexplained(search, order, errors[0], last, cells)
     kept = unexplained is None
