@@ -100,7 +100,7 @@ class Cells:
         numbers = ("real_number", "held_number", "fake_number", "plain_number")
         self.kept |= {name: zeros(cells) for name in numbers}
         self.kept |= {"products": zeros(blocks, size, size), "scenes": zeros()}
-        self.kept |= {"real_scenes": zeros(), "fake_scenes": zeros()}
+        self.kept |= {"real_scenes": zeros(), "fake_scenes": zeros(), "usual": zeros()}
         self.kept["weight"] = torch.zeros(blocks, size, size, device=device)
 
     def see_real(self, sums: torch.Tensor, number: torch.Tensor, *, held_out: bool = False) -> None:
@@ -165,6 +165,7 @@ class Cells:
         mean = kept["real_sum"] / kept["real_number"].clamp_min(1)[:, None]
         wrong = (doubt * mean).square().reshape(diagonal.shape) * kept["real_scenes"]
         weight = torch.linalg.inv(covariance + torch.diag_embed(ridge * diagonal + floor + wrong))
+        kept["usual"].copy_((weight * covariance).sum())
         kept["weight"].copy_(weight / (cells * width))
 
     def slope(self, off: torch.Tensor) -> torch.Tensor:
@@ -187,7 +188,6 @@ class Moments:
         memory: Share of the fake means that stays from step to step.
         scenes: How many different real scenes there are.
         doubt: Share by which a mean may differ for reasons that thresholds cannot cure.
-        variety: How many scenes the simulator's textures are worth, see `Scenery.variety`.
     """
 
     def __init__(
@@ -199,9 +199,8 @@ class Moments:
         memory: float = 0.95,
         scenes: float = math.inf,
         doubt: float = 0.0,
-        variety: float = math.inf,
     ):
-        self.scenes, self.doubt, self.variety = scenes, doubt, variety
+        self.scenes, self.doubt = scenes, doubt
         self.device, self.levels, self.pattern, self.memory = torch.device(device), levels, pattern, memory
         self.boundaries: list[torch.Tensor] = []
         self.sets: dict[str, Cells] = {}

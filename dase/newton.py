@@ -33,6 +33,9 @@ LOOSE = tuple(10 ** (n / 4) for n in range(-10, 1))
 class Newton:
     """Running derivatives of the moments, and the steps.
 
+    What is left of the differences, above what chance between scenes explains, says how far the simulator's
+    scenes are from the target's: the data is trusted that much less (`excess`), and the table held firmer.
+
     Args:
         moments: What is to vanish.
         net: Whose shared numbers are moved.
@@ -42,6 +45,7 @@ class Newton:
     def __init__(self, moments: Moments, net: ThresholdNet, *, memory: float = 0.95):
         self.moments, self.net, self.memory = moments, net, memory
         self.loose = LOOSE[len(LOOSE) // 2]
+        self.excess = 100.0
         self.kept: dict[str, torch.Tensor] = {}
 
     @torch.no_grad()
@@ -120,9 +124,10 @@ class Newton:
         """Move the shared numbers by `share` of what makes the moments vanish, as far as the prior lets."""
         cells = self.moments.sets["look"]
         jacobian, prior = self._jacobian(), self._prior()
-        # weights are of one scene and per cell and feature; other textures are as many scenes as there are
-        scenes = self._scenes(cells).clamp_max(min(self.moments.variety, 1e9))
-        weight = cells.kept["weight"][0].double() * scenes * len(jacobian)
+        # weights are of one scene, and per cell and feature
+        whole = cells.kept["weight"][0].double() * len(jacobian)
+        scenes = 1 / (1 / self._scenes(cells) + 1 / cells.kept["scenes"])
+        weight = whole * scenes / self.excess
         off = cells.off().flatten()
         curve = jacobian.T @ weight @ jacobian
         pull = jacobian.T @ weight @ off
@@ -132,6 +137,11 @@ class Newton:
             self._choose(curve + tiny, curve @ here - pull, prior)
         hold = prior / self.loose**2
         move = -torch.linalg.solve(curve + hold + tiny, pull + hold @ here)
+        # as a table that nothing holds leaves it, or a firm one would look like a bad model
+        free = self.excess * curve + prior / LOOSE[-1] ** 2 + tiny
+        rest = off - jacobian @ torch.linalg.solve(free, self.excess * pull)
+        excess = float(rest @ whole @ rest * scenes / cells.kept["usual"])
+        self.excess = max(1.0, self.memory * self.excess + (1 - self.memory) * excess)
         move = (share * move).clamp(-LONGEST, LONGEST)
         self._apply(move)
         cells.shift((jacobian @ move).view(cells.kept["fake_sum"].shape))
@@ -193,9 +203,9 @@ class Newton:
 
     def state(self) -> dict[str, Any]:
         """Return what the next step depends on."""
-        return {"kept": self.kept, "loose": self.loose}
+        return {"kept": self.kept, "loose": self.loose, "excess": self.excess}
 
     def load(self, state: dict[str, Any]) -> None:
         """Take over what `state` returned."""
         self.kept = {name: value.to(self.moments.device) for name, value in state["kept"].items()}
-        self.loose = state["loose"]
+        self.loose, self.excess = state["loose"], state["excess"]

@@ -7,7 +7,6 @@ scenes and speeds without being paired. Pixels whose scene cannot be trusted hav
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -145,11 +144,6 @@ class Replayed(Scenery):
         self.looks = Looks(width=width, height=height, window=window, samples=samples)
         self.device = torch.device(device)
         self.log = torch.from_numpy(windows.log).to(self.device)
-
-    @property
-    def variety(self) -> float:
-        """No limit: the target has seen the very same scenes."""
-        return math.inf
 
     def draw(self, rng: np.random.Generator, count: int) -> torch.Tensor:
         """Return log intensities of `count` windows, shape (count, samples, height, width)."""

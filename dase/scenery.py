@@ -102,11 +102,6 @@ class Scenery:
         self.start = np.array([*start, total], np.int32)
         self.size = np.array([*size, (1, 1)], np.int32)
 
-    @property
-    def variety(self) -> float:
-        """How many scenes tell something new: a scene of known textures tells little about other ones."""
-        return float(len(self.grey))
-
     def with_looks(self, looks: Looks) -> Scenery:
         """Return scenery of the same textures."""
         other = object.__new__(Scenery)

@@ -155,7 +155,6 @@ class Training:
                 memory=recipe.memory,
                 scenes=self.target.scenes,
                 doubt=recipe.doubt,
-                variety=self.scenery.variety,
             )
         return Adversarial(
             recipe.hash,

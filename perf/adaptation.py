@@ -52,6 +52,7 @@ class Row:
         truth: Name of the sensor to be learned.
         finite: Sequences of real data, recorded once; 0 for new ones in every step.
         disjoint: Whether real scenes have textures that simulated ones have not.
+        textures: Backgrounds in the pool, of which disjoint sides get a half each; twice as many objects.
         augment: Whether finite data is mirrored and turned.
         recipe: What differs from the default recipe.
         hash: What differs from the default hash.
@@ -62,6 +63,7 @@ class Row:
     truth: str = "uniform"
     finite: int = 0
     disjoint: bool = False
+    textures: int = 48
     augment: bool = True
     recipe: dict[str, Any] = field(default_factory=dict)
     hash: dict[str, Any] = field(default_factory=dict)
@@ -93,7 +95,7 @@ def rows() -> dict[str, Row]:
         out[f"moments-low-s{seed}"] = MOMENTS.but(recipe=dict(seed=seed, **LOW))
         for count in (600, 100):
             for name, base in (("wgan", FULL), ("moments", MOMENTS)):
-                row = base.but(finite=count, disjoint=True, recipe=dict(seed=seed))
+                row = base.but(finite=count, disjoint=True, textures=200, recipe=dict(seed=seed))
                 out[f"finite{count}-{name}-s{seed}"] = row
     one = dict(orientations=1, coherence=1, contrast=1)
     out["table4-global"] = FULL.but(hash=one)
@@ -134,7 +136,7 @@ def rows() -> dict[str, Row]:
 
 
 def _finite_variants() -> dict[str, Row]:
-    base = FULL.but(finite=600)
+    base = FULL.but(finite=600, textures=200)
     return {
         "finite600-wgan-same-textures": base,
         "finite600-wgan-plain": base.but(augment=False, disjoint=True),
@@ -143,6 +145,11 @@ def _finite_variants() -> dict[str, Row]:
         "finite600-wgan-penalty10": base.but(disjoint=True, recipe=dict(penalty=10.0)),
         "finite600-wgan-global": base.but(disjoint=True, hash=dict(orientations=1, coherence=1, contrast=1)),
         "finite600-moments-same-textures": MOMENTS.but(finite=600),
+        "finite600-moments-24-textures": MOMENTS.but(finite=600, disjoint=True, textures=48),
+        "finite600-wgan-24-textures": base.but(disjoint=True, textures=48),
+        "finite600-moments-flat": MOMENTS.but(
+            finite=600, disjoint=True, textures=200, recipe=dict(rate=0.0), network=dict(table=None)
+        ),
     }
 
 
@@ -173,7 +180,9 @@ def _maps() -> dict[str, Row]:
     out["maps-column-wgan"] = FULL.but(truth="column", network=pattern)
     out["maps-column-moments-finite600"] = out["maps-column-moments"].but(finite=600, augment=False)
     for truth in ("intensity", "edges"):
-        out[f"maps-{truth}-moments-finite600"] = MOMENTS.but(truth=truth, finite=600, disjoint=True)
+        out[f"maps-{truth}-moments-finite600"] = MOMENTS.but(
+            truth=truth, finite=600, disjoint=True, textures=200
+        )
     for name in ("moments", "wgan"):
         out[f"maps-asymmetric-{name}"] = ways[name].but(truth="asymmetric", network=dict(split=True))
     return out
@@ -197,7 +206,8 @@ def prepare(row: Row, args: argparse.Namespace) -> Training:
 
         target, scenes = open_target([Path(args.recording)], until=LEARNED, device=device)
         return Training(made, target, scenes)
-    scenery = Scenery(images.open_images(pictures), looks, device=device, backgrounds=48, objects=96)
+    source = images.open_images(pictures)
+    scenery = Scenery(source, looks, device=device, backgrounds=row.textures, objects=2 * row.textures)
     ours, theirs = scenery.split(0.5) if row.disjoint else (scenery, scenery)
     seed = recipe.get("seed", 0)
     target: Target = Endless(theirs, TRUTHS[row.truth](), seed=1000 + seed)
