@@ -33,50 +33,27 @@ from dase.kernels.scene import (
     layers_near,
 )
 
-SOURCES = {"frames": Frames, "log": Frames, "both": Frames, "layers": Layers, "background": Layers}
-"""What pixels see, by name: stored intensities, stored log intensities, both, moving layers, one layer."""
+SOURCES = {"frames": Frames, "log": Frames, "layers": Layers, "background": Layers}
+"""What pixels see, by name: stored intensities, stored log intensities, moving layers, one layer."""
 
 
 @lru_cache(maxsize=32)
-def _look(lanes: int, source: str) -> Any:
-    """Return the Warp function from a source to the log intensity of `lanes` neighbouring pixels."""
+def light_of(lanes: int, source: str) -> Any:
+    """Return the Warp function from a source to the intensity of `lanes` neighbouring pixels."""
     f = functions(lanes)
     Source, Lanes, Bits = SOURCES[source], f.Lanes, vector(lanes, wp.int32)
-    load, logarithm, background = f.load, f.logarithm, f.background
+    load, background = f.load, f.background
 
     if source in ("frames", "log"):
 
         @wp.func
-        def look(
-            seen: Source,
-            ground: Ground,
-            k: int,
-            n: int,
-            x: Lanes,
-            y: Lanes,
-            near: Bits,
-            crowd: int,
-            eps: float,
-        ):
-            if wp.static(source == "log"):
-                return load(seen.values, k, n)
-            else:
-                return logarithm(load(seen.values, k, n), eps)
+        def light(seen: Source, ground: Ground, k: int, n: int, x: Lanes, y: Lanes, near: Bits, crowd: int):
+            return load(seen.values, k, n)
 
     else:
 
         @wp.func
-        def look(
-            seen: Source,
-            ground: Ground,
-            k: int,
-            n: int,
-            x: Lanes,
-            y: Lanes,
-            near: Bits,
-            crowd: int,
-            eps: float,
-        ):
+        def light(seen: Source, ground: Ground, k: int, n: int, x: Lanes, y: Lanes, near: Bits, crowd: int):
             light = background(
                 x, y, seen.grey, seen.place[k, 0], ground.last, ground.corner, ground.step, ground.inverse,
                 ground.width,
@@ -87,7 +64,27 @@ def _look(lanes: int, source: str) -> Any:
                     if near[lane] != 0:
                         front = in_front(seen, near[lane], k, x[lane], y[lane])
                         light[lane] = front[0] + front[1] * light[lane]
-            return logarithm(light, eps)
+            return light
+
+    return light
+
+
+@lru_cache(maxsize=32)
+def _look(lanes: int, source: str) -> Any:
+    """Return the Warp function from a source to the log intensity of `lanes` neighbouring pixels."""
+    f = functions(lanes)
+    Source, Lanes, Bits = SOURCES[source], f.Lanes, vector(lanes, wp.int32)
+    light, logarithm = light_of(lanes, source), f.logarithm
+
+    @wp.func
+    def look(
+        seen: Source, ground: Ground, k: int, n: int, x: Lanes, y: Lanes, near: Bits, crowd: int, eps: float
+    ):
+        value = light(seen, ground, k, n, x, y, near, crowd)
+        if wp.static(source == "log"):
+            return value
+        else:
+            return logarithm(value, eps)
 
     return look
 
@@ -296,29 +293,6 @@ def start(source: str) -> wp.Kernel:
         reference_out[b, i] = reference
 
     return start_counting
-
-
-@lru_cache(maxsize=2)
-def take_logs(lanes: int) -> wp.Kernel:
-    """Return the kernel that takes logarithms of stored intensities, over (K, blocks of pixels) threads."""
-    f = functions(lanes)
-    load, store, logarithm = f.load, f.store, f.logarithm
-
-    @wp.kernel(enable_backward=False, module="unique", module_options={"fuse_fp": False})
-    def take_logs(
-        first: int,
-        # in
-        values: wp.array2d[float],  # (K, N) linear intensity
-        eps: float,
-        # out
-        logs_out: wp.array2d[float],  # (K, N) log intensity
-    ):
-        """Take log(value + eps)."""
-        k, i = wp.tid()
-        n = wp.min((first + i) * wp.static(lanes), values.shape[1] - wp.static(lanes))
-        store(logs_out[k], n, logarithm(load(values, k, n), eps))
-
-    return take_logs
 
 
 def widest(size: int, device: wp.Device, source: str) -> int:

@@ -44,9 +44,9 @@ return result_out;
 ON_CUDA = """
 typedef float V;
 typedef int I;
-auto FLOOR = [](V a) {{ return floorf(a); }};
-auto ABS = [](V a) {{ return fabsf(a); }};
-auto FMA = [](V a, V b, V c) {{ return fmaf(a, b, c); }};
+auto FLOOR = [](V a) {{ return __builtin_floorf(a); }};
+auto ABS = [](V a) {{ return __builtin_fabsf(a); }};
+auto FMA = [](V a, V b, V c) {{ return __builtin_fmaf(a, b, c); }};
 auto LESSER = [](auto a, auto b) {{ return a < b ? a : b; }};
 auto WHOLE = [](V a) {{ return (I)a; }};
 auto FLOAT = [](I a) {{ return (V)a; }};
@@ -188,9 +188,14 @@ def _lanewise(
         cuda: What runs on CUDA instead.
     """
     names = lanes.split()
-    cpu = ON_CPU.format(length=length, body=body, inputs="\n".join(f"V {n} = IN({n}_in);" for n in names))
     inputs = "\n".join(f"V {n} = {n}_in[lane];" for n in names)
     gpu = ON_CUDA.format(length=length, body=cuda or body, inputs=inputs)
+    if length > 1:
+        inputs = "\n".join(f"V {n} = IN({n}_in);" for n in names)
+        cpu = ON_CPU.format(length=length, body=body, inputs=inputs)
+    else:
+        # plain numbers, so that loops which call the function can become vectors
+        cpu = ON_CUDA.format(length=1, body=body, inputs=inputs)
     arguments = ", ".join([*(f"{n}_in: Lanes" for n in names), *([others] if others else [])])
     snippet = f"#ifdef __CUDA_ARCH__\n{gpu}\n#else\n{cpu}\n#endif\n"
     scope = {"Affine": Affine, "Lanes": vector(length)}

@@ -25,7 +25,6 @@ class Frames:
     """Stored samples."""
 
     values: wp.array2d[float]  # (K, N) linear intensity, or log intensity for the `log` source
-    logs: wp.array2d[float]  # (K, N) log intensity, for the `both` source
 
 
 @wp.struct
