@@ -68,7 +68,6 @@ class Blocks(Writer):
             "columns": start.columns,
             "rows": start.rows,
             "layers_of": start.layers_of,
-            "lanes_near": start.lanes_near,
             "light_of": light_of(lanes, source),
             "busy_bits": _bits(lanes),
             "lowest_bit": lowest_bit,
@@ -135,11 +134,11 @@ class Blocks(Writer):
         # what nobody uses costs nothing
         self.add(*(f"{name}_lanes = {kind}()" for name, kind in types.items()))
         self.add("x_lanes = columns(pixels, start, width)", "y_lanes = rows(pixels, start, width)")
-        self.add("near_lanes = Ints()", "crowd = int(0)", "ground = Ground()")
+        self.add("near = int(0)", "ground = Ground()")
         if self.source in ("layers", "background"):
             self.add("ground = ground_of(source)")
         if self.source == "layers":
-            self.add("near_lanes = layers_of(source, x_lanes, y_lanes)", "crowd = lanes_near(near_lanes)")
+            self.add("near = layers_of(source, x_lanes, y_lanes)")
 
         def own() -> None:
             self.add("pixel = pixels[i]", "on = nominal_on", "off = nominal_off")
@@ -154,9 +153,7 @@ class Blocks(Writer):
         if self.source in ("frames", "log"):
             self.add(f"{quantity}_lanes = load(source.values, k, start)")
         else:
-            self.add(
-                f"{quantity}_lanes = light_of(source, ground, k, start, x_lanes, y_lanes, near_lanes, crowd)"
-            )
+            self.add(f"{quantity}_lanes = light_of(source, ground, k, start, x_lanes, y_lanes, near)")
 
     def logarithm(self) -> None:
         """Logarithms of the light."""

@@ -85,9 +85,7 @@ def decode(
     begin: wp.int64,  # of the chunk [ns]
     each: int,  # events per thread
     # out
-    t_out: wp.array[
-        wp.float64
-    ],  # [s], from whole nanoseconds, so that it never goes back from chunk to chunk
+    t_out: wp.array[wp.float64],  # [s], from whole nanoseconds, so that it never goes back
     x_out: wp.array[wp.uint16],
     y_out: wp.array[wp.uint16],
     p_out: wp.array[wp.uint8],

@@ -32,6 +32,8 @@ auto LESSER = [](auto a, auto b) {{ return a < b ? a : b; }};
 auto WHOLE = [](V a) {{ return __builtin_convertvector(a, I); }};
 auto FLOAT = [](I a) {{ return __builtin_convertvector(a, V); }};
 auto AT = [](const float* a, I i) {{ V v; for (int l = 0; l < {length}; ++l) v[l] = a[i[l]]; return v; }};
+auto ANY = [](I a) {{ return __builtin_reduce_or(a) != 0; }};
+auto HIGHEST = [](unsigned a) {{ return 31 - __builtin_clz(a); }};
 auto IN = [](const wp::vec_t<{length}, float>& a) {{ V v; __builtin_memcpy(&v, &a, sizeof(V)); return v; }};
 {inputs}
 {body}
@@ -51,6 +53,12 @@ auto LESSER = [](auto a, auto b) {{ return a < b ? a : b; }};
 auto WHOLE = [](V a) {{ return (I)a; }};
 auto FLOAT = [](I a) {{ return (V)a; }};
 auto AT = [](const float* a, I i) {{ return a[i]; }};
+auto ANY = [](I a) {{ return a != 0; }};
+#ifdef __CUDA_ARCH__
+auto HIGHEST = [](unsigned a) {{ return 31 - __clz(a); }};
+#else
+auto HIGHEST = [](unsigned a) {{ return 31 - __builtin_clz(a); }};
+#endif
 wp::vec_t<{length}, float> result_out;
 #pragma unroll
 for (int lane = 0; lane < {length}; ++lane) {{
@@ -121,6 +129,53 @@ i = i + step[1];
 V bottom = AT(grey.data, i);
 bottom = bottom + fu * (AT(grey.data, i + step[0]) - bottom);
 V result = top + fv * (bottom - top);
+"""
+
+FOREGROUND = """
+// as dase.kernels.scene.in_front does, all pixels of the block layer by layer; no texel is no light
+V sum = x * 0.0f;
+V through = sum + 1.0f;
+unsigned left = (unsigned)near;
+while (left != 0) {
+    const int layer = HIGHEST(left);
+    left ^= 1u << layer;
+    const auto& m = wp::index(place, k, layer);
+    const int width = size.data[layer][0];
+    const int height = size.data[layer][1];
+    V u = (x * m.data[0][0] + y * m.data[0][1]) + m.data[0][2];
+    V v = (x * m.data[1][0] + y * m.data[1][1]) + m.data[1][2];
+    I inside = (u > -1.0f) & (v > -1.0f) & (u < (float)width) & (v < (float)height);
+    if (!ANY(inside)) continue;
+    u = inside ? u : V(0.0f);
+    v = inside ? v : V(0.0f);
+    V whole_u = FLOOR(u);
+    V whole_v = FLOOR(v);
+    V fu = u - whole_u;
+    V fv = v - whole_v;
+    I iu = WHOLE(whole_u);
+    I iv = WHOLE(whole_v);
+    const float* from = (const float*)(texels.data + start.data[layer]);
+    I at = 2 * (iv * width + iu);
+    I west = inside & (iu >= 0);
+    I east = inside & (iu + 1 < width);
+    I north = iv >= 0;
+    I south = iv + 1 < height;
+    auto LOOK = [=](I ok, I i) { return ok ? AT(from, ok ? i : I(0)) : V(0.0f); };
+    V color = LOOK(west & north, at);
+    color = color + fu * (LOOK(east & north, at + 2) - color);
+    V below = LOOK(west & south, at + 2 * width);
+    below = below + fu * (LOOK(east & south, at + 2 * width + 2) - below);
+    color = color + fv * (below - color);
+    V alpha = LOOK(west & north, at + 1);
+    alpha = alpha + fu * (LOOK(east & north, at + 3) - alpha);
+    below = LOOK(west & south, at + 2 * width + 1);
+    below = below + fu * (LOOK(east & south, at + 2 * width + 3) - below);
+    alpha = alpha + fv * (below - alpha);
+    sum = sum + through * color;
+    through = through * (1.0f - alpha);
+    if (!ANY(through != 0.0f)) break;
+}
+V result = sum + through * light;
 """
 
 LOAD = """
@@ -218,6 +273,8 @@ def functions(length: int) -> SimpleNamespace:
     def plain(name: str, snippet: str, arguments: str, returns: str) -> Any:
         return native(f"{name}_{length}", snippet.format(length=length), scope, arguments, returns)
 
+    layers = "texels: wp.array[wp.vec2], start: wp.array[int], size: wp.array[wp.vec2i], "
+    layers += "place: wp.array2d[Affine], k: int, near: int"
     ground = "grey: wp.array[float], place: Affine, last: wp.vec2, corner: wp.vec2i, step: wp.vec2i"
     return SimpleNamespace(
         Lanes=scope["Lanes"],
@@ -241,6 +298,7 @@ def functions(length: int) -> SimpleNamespace:
             cuda="V result = __logf(a + eps);",
         ),
         exponential=lanewise("exponential", EXPONENTIAL, "x", cuda="V result = expf(x);"),
+        foreground=lanewise("foreground", FOREGROUND, "light x y", layers),
         background=lanewise("background", BACKGROUND, "x y", f"{ground}, inverse: wp.vec2, width: int"),
     )
 
