@@ -264,8 +264,8 @@ def answers(
     if mu.ndim == 4:
         both = []
         for half in (math.sqrt(up), math.sqrt(down)):
-            maps = (torch.stack([m[:, 0] / half, m[:, 1] * half], 1) for m in (mu, sigma))
-            both.append(simulate(log, *maps, noise))
+            means, spreads = (torch.stack([m[:, 0] / half, m[:, 1] * half], 1) for m in (mu, sigma))
+            both.append(simulate(log, means, spreads, noise))
         out["ratio"] = both[0], both[1]
     return out
 
