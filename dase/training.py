@@ -21,8 +21,8 @@ from dase.targets import Noise, Pairs, Target, answers, draw_noise, simulate, va
 REFERENCE = 0.25, 0.06
 """Threshold and spread at which scenes are counted once more, to tell busy scenes from low thresholds."""
 
-EVERY = 4
-"""One scene of so many is counted at other thresholds as well, to see how the moments answer."""
+DERIVED = 4
+"""Scenes of a step, at least, that are counted at other thresholds as well, to see how the moments answer."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -210,7 +210,7 @@ class Training:
 
     def _some(self, batch: int) -> slice:
         """Return which scenes of a batch the derivatives are taken of, others in every step."""
-        every = min(batch, EVERY)
+        every = max(batch // DERIVED, 1)
         return slice(self.step % every, None, every)
 
     def rate(self) -> float:
