@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import cv2
 import numpy as np
@@ -154,6 +155,14 @@ def _blurred(log: Map, way: Map) -> Map:
     for share in (np.arange(LOOKS) + 0.5) / LOOKS - 0.5:
         total += np.exp(look(log, x + np.float32(share) * way[..., 0], y + np.float32(share) * way[..., 1]))
     return np.asarray(np.log(total / LOOKS))
+
+
+def stretched(frames: NDArray[Any]) -> bool:
+    """Return whether nearly all frames, (F, H, W), fill the range of their type, as stretched ones do."""
+    if frames.dtype.kind != "u":
+        return False
+    full = (frames.min((1, 2)) == 0) & (frames.max((1, 2)) == np.iinfo(frames.dtype).max)
+    return bool(full.mean() > 0.9)
 
 
 def stretches(frames: list[Map] | NDArray[np.float32], *, pull: float = 0.1) -> NDArray[np.float64]:
