@@ -254,16 +254,18 @@ def watch(name: str, folder: Path, files: int, seed: int, keep: Path) -> bool:
     told = context.Array("d", 8, lock=False)
     errors, said = context.SimpleQueue(), []
     while told[NEXT] < files:
-        process = context.Process(target=run, args=(name, folder, files, seed, keep, told, errors))
+        place = Path(tempfile.mkdtemp(dir=folder))
+        process = context.Process(target=run, args=(name, place, files, seed, keep, told, errors))
         process.start()
         why = waited(process, told, errors, said)
         if told[NEXT] < files:
             number = int(told[NEXT])
             said.append(f"file {number}: {why}")
-            for path in (path for path in folder.rglob("*") if path.is_file()):
+            for path in (path for path in place.rglob("*") if path.is_file()):
                 shutil.copy(path, keep / kept(name, number, path))
             told[FAILED] += 1
             told[NEXT] += 1
+        shutil.rmtree(place)
     counts = " | ".join(f"{int(told[kind]):,}" for kind in (NEXT, WHOLE, NOTED, REFUSED, FAILED))
     speed = told[NEXT] / max(told[SPENT], 1e-9)
     print(f"| {name} | {counts} | {told[SLOWEST]:.2f} s | {told[PEAK]:.0f} MB | {speed:.0f} |", flush=True)
