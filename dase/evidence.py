@@ -224,7 +224,8 @@ def gather(
     light = light_of(scene, _times(scene, grid), chosen)
     if not np.all(np.isfinite(light)) or light.min() < 0:
         raise InputError("scene: intensities must be finite and >= 0")
-    good = np.ones(light.shape, np.bool_) if trust is None else trust(grid.times, chosen).T
+    good = np.ones(light.shape, np.bool_) if trust is None else trust(grid.times, chosen).T.copy()
+    good[:, 1:] &= good[:, :-1]  # a step is what lies between two points of the grid
     bands = band_edges(light, good)
     cell = sort_into_cells(light, grid.step, bands, log_eps)
     cell[~good] = MASKED

@@ -27,6 +27,10 @@ LOOKS = 5
 """Places along a blur at which it is sampled."""
 
 
+FEW = 5e-4
+"""Share of a frame's pixels that stretching may leave at either end of the range."""
+
+
 @dataclass(frozen=True)
 class Match:
     """Motion between two frames.
@@ -158,11 +162,16 @@ def _blurred(log: Map, way: Map) -> Map:
 
 
 def stretched(frames: NDArray[Any]) -> bool:
-    """Return whether nearly all frames, (F, H, W), fill the range of their type, as stretched ones do."""
+    """Return whether each frame, (F, H, W), seems to be stretched to the whole range of its type.
+
+    Stretching leaves few pixels at either end, most often one, not always the same; light and shadow beyond
+    the range of a camera leave many.
+    """
     if frames.dtype.kind != "u":
         return False
-    full = (frames.min((1, 2)) == 0) & (frames.max((1, 2)) == np.iinfo(frames.dtype).max)
-    return bool(full.mean() > 0.9)
+    least, most = (np.median((frames == end).mean((1, 2))) for end in (0, np.iinfo(frames.dtype).max))
+    brightest = frames.reshape(len(frames), -1).argmax(1)
+    return bool(0 < least < FEW and 0 < most < FEW and np.ptp(brightest) > 0)
 
 
 def stretches(frames: list[Map] | NDArray[np.float32], *, pull: float = 0.1) -> NDArray[np.float64]:

@@ -26,6 +26,12 @@ from dase.video import VideoScene, open_video
 GREY = 0.5
 """Intensity taken for a static scene of unknown light."""
 
+INTERVALS = 8
+"""Times between frames that tell whether a camera rests."""
+
+REST = 0.1
+"""It does where half of all pixels move by less from one frame to the next [px]."""
+
 Found = TypeVar("Found", Comparison, Diagnosis, Fit)
 
 
@@ -137,13 +143,25 @@ def aligned(
 def camera_scene(
     frames: NDArray[Any], begin: NDArray[np.float64], end: NDArray[np.float64], notes: list[str]
 ) -> CameraScene:
-    """Return the scene between a camera's frames, at rest where they differ by no more than noise."""
+    """Return the scene between a camera's frames.
+
+    Where the camera itself rests, what differs from frame to frame by no more than noise rests as well; where
+    all moves slowly that would make steps of it.
+    """
     gains = None
+    scene = CameraScene(frames, begin, end)
     if stretched(frames):
-        plain = CameraScene(frames, begin, end)
-        gains = stretches([plain.intensity(k) for k in range(len(plain))])
+        gains = stretches([scene.intensity(k) for k in range(len(scene))])
         notes.append("each frame was stretched to the full range of grey: undone as far as they tell")
-    return CameraScene(steady(frames), begin, end, gains=gains)
+        scene = CameraScene(frames, begin, end, gains=gains)
+    return CameraScene(steady(frames), begin, end, gains=gains) if rests(scene) else scene
+
+
+def rests(scene: CameraScene) -> bool:
+    """Return whether most of the picture does not move in most of the times between frames looked at."""
+    chosen = np.unique(np.linspace(0, len(scene) - 2, INTERVALS).astype(int))
+    ways = [np.linalg.norm(scene.matched(int(k)).ahead, axis=-1) for k in chosen]
+    return bool(np.median([np.median(way) for way in ways]) < REST)
 
 
 def open_clip(path: Path) -> VideoScene:

@@ -21,15 +21,20 @@ SENSOR = dase.load_sensor("ideal")
 PIXELS = 600
 
 
-def recorded(path, *, mirrored=False, stretched=False, duration=0.5, speed=1.0):
+PICTURE = dict(width=128, height=96, duration=0.5)
+
+
+def recorded(path, *, mirrored=False, stretched=False, speed=1.0):
     """Write events of a moving picture and frames of 25 Hz and 10 ms; return the events."""
     rng = np.random.default_rng(5)
-    truth = moving_picture(rng, width=128, height=96, duration=duration, speed=speed)
-    events = dase.simulate(truth, SENSOR, seed=1)
+    truth = moving_picture(rng, speed=speed, **PICTURE)
+    noise = dase.EFFECTS["shot"](rate=1.0)
+    events = dase.simulate(truth, SENSOR if speed else SENSOR.with_effect(noise), seed=1)
     begin, end, frames = film(truth, rng, noise=0.004)
     if stretched:
-        low, high = (f(frames, axis=(1, 2), keepdims=True).astype(float) for f in (np.min, np.max))
-        frames = np.rint(255 * (frames - low) / (high - low)).astype(np.uint8)
+        light = frames + 4 * rng.standard_normal(frames.shape)
+        low, high = (f(light, axis=(1, 2), keepdims=True) for f in (np.min, np.max))
+        frames = np.rint(255 * (light - low) / (high - low)).astype(np.uint8)
     frames = frames[:, :, ::-1] if mirrored else frames
     io.write(path, Sequence(events, frames, 0.5 * (begin + end), frame_exposure=end - begin))
     return events
@@ -71,10 +76,12 @@ def test_the_true_model_is_wrong_only_where_frames_are(recording, measured):
     sequence = io.read(path)
     straight = VideoScene(sequence.frames / np.float32(255), sequence.frame_times)
     before = compare(events, straight, SENSOR, pixels=PIXELS)
-    print(f"masked {masked.error:.2f}, bare {bare.error:.2f}, straight lines {before.error:.2f}")
-    assert masked.error < 0.6 * bare.error
-    assert masked.error < 0.4 * before.error
-    wrong = compare(events, measured.scene, dase.load_sensor("ideal").with_effect(slow()), pixels=PIXELS)
+    told = compare(events, moving_picture(np.random.default_rng(5), **PICTURE), SENSOR, pixels=PIXELS)
+    print(*(f"{found.error:.2f}" for found in (masked, bare, before, told)))
+    assert masked.error < 0.65 * bare.error
+    assert masked.error < 0.55 * before.error
+    assert masked.error < 1.4 * told.error  # whose light is taken at each millisecond only
+    wrong = compare(events, measured.scene, SENSOR.with_effect(slow()), pixels=PIXELS)
     assert wrong.error > 2 * masked.error  # and yet it sees what is wrong
 
 
@@ -90,7 +97,7 @@ def test_events_where_nothing_is_known_change_nothing(measured):
     """Neither the error, nor the choice of pixels."""
     scene, events, rng = measured.scene, measured.events, np.random.default_rng(2)
     known = scene.trusted()
-    k, y, x = (axis[::7] for axis in np.nonzero(~known))
+    k, y, x = (axis for axis in np.nonzero(~known))
     t = scene.times[k] + rng.uniform(0.01, 0.99, len(k)) * np.diff(scene.times)[k]
     late = rng.uniform(scene.times[-1] + 1e-3, scene.times[-1] + 2e-3, 500)
     t, x, y = np.append(t, late), np.append(x, np.arange(500) % 128), np.append(y, np.arange(500) % 96)
@@ -103,7 +110,7 @@ def test_events_where_nothing_is_known_change_nothing(measured):
         events.width,
         events.height,
     )
-    assert len(flooded) > 1.1 * len(events)
+    assert len(t) > 10_000
     plain, other = (compare(e, scene, SENSOR, pixels=PIXELS) for e in (events, flooded))
     assert other.error == plain.error
     assert other.families == plain.families
@@ -119,6 +126,15 @@ def test_what_clearly_lies_elsewhere_is_corrected(tmp_path, measured):
     np.testing.assert_allclose(found.scene.frames(times), measured.scene.frames(times), atol=1e-6)
     recorded(tmp_path / "stretched.h5", stretched=True)
     assert any("stretched" in note for note in open_measurement(tmp_path / "stretched.h5").notes)
+
+
+def test_a_camera_that_rests_sees_no_noise(tmp_path, measured):
+    recorded(tmp_path / "still.h5", speed=0.0)
+    scene = open_measurement(tmp_path / "still.h5").scene
+    light = scene.frames(scene.times)
+    assert np.mean(np.diff(light, axis=0) == 0) > 0.95
+    moving = measured.scene.frames(measured.scene.times)
+    assert np.mean(np.diff(moving, axis=0) == 0) < 0.3
 
 
 def test_dense_frames_are_joined_by_lines(tmp_path):

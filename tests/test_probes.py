@@ -102,7 +102,7 @@ def test_no_pair_of_events_reaches_across_what_is_not_compared(scene, device):
     np.testing.assert_allclose(half.found.sums[0], want, rtol=2e-4, atol=2e-3)
     across = reference(events, replace(stimulus, holes=False), half.trials.middle)
     isi = slice(kernels.ISI, kernels.LAG)
-    assert want[isi].sum() < 0.9 * across[isi].sum()
+    assert want[isi].sum() < across[isi].sum() - 500
 
 
 @pytest.mark.parametrize("name", [n for n, e in EFFECTS.items() if n in ON or n == "threshold"])
