@@ -44,7 +44,8 @@ def compare(
         events: What was measured.
         scene: What the camera saw, on the clock of the events.
         sensor: The model.
-        trust: Where and when the scene is to be trusted; None for everywhere.
+        trust: Where and when the scene is to be trusted; None for everywhere, and for what a
+            `CameraScene` trusts of itself.
         pixels: In each half of the measurement.
         seed: Of every random number.
         device: Where kernels run.
