@@ -133,6 +133,13 @@ def test_a_heap_of_texts_with_an_empty_hole_is_no_endless_loop(tmp_path, rng, ma
             act(path)
 
 
+def test_names_in_a_file_cannot_break_the_sentence(tmp_path):
+    with h5py.File(tmp_path / "a.h5", "w") as file:
+        file["two\nlines and \x1b[31mred"] = np.zeros(3)
+    with pytest.raises(InputError, match=r"holds two lines and \?\[31mred$"):
+        io.read(tmp_path / "a.h5")
+
+
 def test_layouts_nobody_knows(tmp_path):
     with h5py.File(tmp_path / "a.h5", "w") as file:
         file["something/else"] = np.zeros(3)
