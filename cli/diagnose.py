@@ -17,7 +17,11 @@ if TYPE_CHECKING:
 
 
 def explain(ctx: click.Context, parameter: click.Parameter, value: str | None) -> None:
-    """Say what an effect is and what it does to the probes, and exit."""
+    """Say what an effect is and what it does to the probes, and exit.
+
+    Not eager: `--effects`, which is, must be known by then wherever it stands; options that are given come
+    before arguments that are not, which nobody misses here.
+    """
     if value is None or ctx.resilient_parsing:
         return
     from dase.effect_files import known_effects
@@ -56,7 +60,7 @@ def explain(ctx: click.Context, parameter: click.Parameter, value: str | None) -
 @click.option("--device", default="cpu", show_default=True, help="cpu or cuda.")
 @click.option("--seed", default=0, show_default=True, help="The same seed gives the same findings.")
 @click.option("--quiet", is_flag=True, help="Only the finding, no progress.")
-@click.option("--explain", metavar="EFFECT", callback=explain, is_eager=True, expose_value=False,
+@click.option("--explain", metavar="EFFECT", callback=explain, expose_value=False,
               help="Say what EFFECT is and what it does to the probes, and exit.")  # fmt: skip
 def command(
     sensor: str,

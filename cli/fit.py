@@ -37,7 +37,11 @@ def command(
     seed: int,
     quiet: bool,
 ) -> None:
-    """Fit the parameters of the model SENSOR to RECORDING; the comments of its file stay."""
+    """Fit the parameters of the model SENSOR to RECORDING; the comments of its file stay.
+
+    Where only one of the starts came to the error of the best, the minimum may be a poor one: the file is
+    written, this is said, and the exit code is 1.
+    """
     from dase import edit
     from dase.cli.diagnose import bar
     from dase.config import read_sensor
@@ -60,3 +64,6 @@ def command(
     for note in found.notes:
         click.echo(f"note: {note}")
     click.echo(f"{output}: {found.evaluations} simulations, {found.seconds:.1f} s")
+    if found.poor:
+        click.echo("dase: the fit may have ended in a poor minimum, see the note above", err=True)
+        click.get_current_context().exit(1)

@@ -33,8 +33,12 @@ def scene() -> dase.VideoScene:
 
 
 @pytest.fixture(scope="module")
-def evidence(scene, device):
-    events = dase.simulate(scene, Sensor().with_effect(EFFECTS["shot"](rate=3.0)), seed=4, device=device)
+def events(scene) -> dase.Events:
+    return dase.simulate(scene, Sensor().with_effect(EFFECTS["shot"](rate=3.0)), seed=4)
+
+
+@pytest.fixture(scope="module")
+def evidence(events, scene, device):
     return gather(events, scene, pixels=300, seed=1, device=device)
 
 
@@ -79,9 +83,8 @@ def reference(events, stimulus, middle) -> np.ndarray:
     return out
 
 
-def test_sums_equal_a_loop_over_events(evidence, scene):
+def test_sums_equal_a_loop_over_events(evidence, events):
     half = evidence.train
-    events = dase.simulate(scene, Sensor().with_effect(EFFECTS["shot"](rate=3.0)), seed=4)
     want = reference(events, half.trials.stimulus, half.trials.middle)
     np.testing.assert_allclose(half.found.sums[0], want, rtol=2e-4, atol=2e-3)
     assert half.found.sums[0, : 2 * kernels.CELLS].sum() == half.found.halves.sum() > 1000
