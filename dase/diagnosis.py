@@ -56,6 +56,9 @@ SWAPPED = 2
 NEARBY = 1.6
 """Only alternatives whose held-out error was about below this, relative to the chosen one's."""
 
+QUICK = 2.0
+"""Only alternatives whose error on the scout, quickly fitted, is below this, relative to the model's own."""
+
 Progress = Callable[[str, float, float], None]
 """Told what is being done, the share of the step done, and the present error."""
 
@@ -282,12 +285,7 @@ def _review(search: _Search, model: Model, judgement: Judgement) -> tuple[Model,
         if explained(without) or without.error <= judgement.error:
             model, judgement = less, without
     for name in search.added(model):
-        for other in search.alternatives.get(name, [])[:SWAPPED]:
-            if (
-                other.name in model.space.sensor
-                or other.error > NEARBY * search.error_of.get(name, 0.0) + TIE
-            ):
-                continue
+        for other in _rivals(search, model, name):
             sensor = model.sensor.without(name).with_effect(other.model.sensor[other.name])
             swapped = settle(search.evidence, _like(sensor, model, [other.name]), seed=search.seed)
             judged = search.judge(swapped)
@@ -300,6 +298,24 @@ def _review(search: _Search, model: Model, judgement: Judgement) -> tuple[Model,
                 break
             search.ties.setdefault(name, set()).add(other.name)
     return model, judgement
+
+
+def _rivals(search: _Search, model: Model, name: str) -> list[Tried]:
+    """Return the alternatives to an effect that may do as well: in its place, not far off on the scout.
+
+    Fitting one in full takes as long as trying a dozen; most are far off.
+    """
+    scout, out = search.evidence.scout, []
+    for other in search.alternatives.get(name, [])[:SWAPPED]:
+        limit = NEARBY * search.error_of.get(name, 0.0) + TIE
+        if other.name in model.space.sensor or other.error > limit:
+            continue
+        repeats = model.rebase(scout, repeats=16, seed=search.seed + 200)
+        sensor = model.sensor.without(name).with_effect(other.model.sensor[other.name])
+        quick = _like(sensor, model, [other.name]).search(scout, seed=search.seed, iterations=2)
+        if quick.loss < QUICK * float(scout.scale.loss(repeats).mean()):
+            out.append(other)
+    return out
 
 
 def _verdict(

@@ -31,8 +31,7 @@ class Scale:
 
     def z(self, values: Array) -> Array:
         """Return differences in standard errors, 0 where nothing is compared, shape (..., J)."""
-        out: Array = np.where(self.used, (values - self.target) / self.sigma, 0.0)
-        return out
+        return in_errors(values - self.target, self)
 
     def weights(self) -> Array:
         """Return the weight of each statistic: families weigh alike, shape (J,)."""
@@ -96,7 +95,7 @@ def judge(repeats: Array, seen: Scale, chance: Scale, off: Array, *, seed: int) 
     rng = np.random.default_rng([seed, 3])
     apart = (repeats - mean) * (count / (count - 1)) + off * rng.standard_normal(repeats.shape)
     weights = chance.weights()
-    rho = robust(np.where(chance.used, apart / chance.sigma, 0.0))
+    rho = robust(in_errors(apart, chance))
     null = rho @ weights
     unit = float(null.mean())
     gate = max(float(np.quantile(null, 0.99)), unit + 2.6 * float(null.std()))
@@ -107,6 +106,12 @@ def judge(repeats: Array, seen: Scale, chance: Scale, off: Array, *, seed: int) 
         own = rho[:, part][:, chance.used[part]].mean(1) / unit
         limits[name] = max(float(own.max()), float(own.mean() + FAR * own.std()))
     return Judgement(float(seen.loss(mean)) / unit, gate / unit, families, limits, seen.z(mean), unit)
+
+
+def in_errors(apart: Array, scale: Scale) -> Array:
+    """Return differences in standard errors, 0 where nothing is compared, shape (..., J)."""
+    out: Array = np.divide(apart, scale.sigma, out=np.zeros(np.shape(apart)), where=scale.used)
+    return out
 
 
 def robust(z: Array) -> Array:
