@@ -88,7 +88,7 @@ def _fitted(
         before, found = fit_added(
             data.events, data.scene, sensor, effect, trust=data.trust, seed=seed, device=device, progress=tell
         )
-    for note in found.notes:
+    for note in data.noted(found).notes:
         click.echo(f"note: {note}", err=True)
     entry = edit.today(
         f"add {effect.name}",

@@ -60,6 +60,7 @@ def command(
             measured.events, measured.scene, model, trust=measured.trust, pixels=pixels, seed=seed,
             device=device, progress=tell,
         )  # fmt: skip
+    found = measured.noted(found)
     click.echo(
         f"error {found.error:.2f}; 1 is what two repeats of the recording give, "
         f"which stay below {found.gate:.2f}"

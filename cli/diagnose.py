@@ -101,6 +101,7 @@ def command(
             measured.events, measured.scene, model, trust=measured.trust, effects=known, free=names,
             most=MOST if auto else 1, pixels=pixels, seed=seed, device=device, progress=tell,
         )  # fmt: skip
+    found = measured.noted(found)
     if json_ is not None:
         with replacing(json_) as part:
             part.write_text(json.dumps(found.to_json(), indent=2) + "\n")

@@ -61,7 +61,7 @@ def command(
     click.echo(f"error {found.before:.2f} → {found.error:.2f}; repeats stay below {found.gate:.2f}")
     for name, estimate in found.parameters.items():
         click.echo(f"  {name:24s} {estimate.value:10.4g}   {estimate.low:.4g} to {estimate.high:.4g}")
-    for note in found.notes:
+    for note in measured.noted(found).notes:
         click.echo(f"note: {note}")
     click.echo(f"{output}: {found.evaluations} simulations, {found.seconds:.1f} s")
     if found.poor:

@@ -35,7 +35,8 @@ def fit_added(
         scene: What the camera saw, on the clock of the events.
         sensor: Without the effect.
         effect: Its values are where the search begins, among others.
-        trust: Where and when the scene is to be trusted; None for everywhere.
+        trust: Where and when the scene is to be trusted; None for everywhere, and for what a
+            `CameraScene` trusts of itself.
         pixels: In each half of the measurement.
         seed: Of every random number.
         device: Where kernels run.

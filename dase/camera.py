@@ -15,8 +15,11 @@ from dase.matching import Match, match
 from dase.scene import Scene
 from dase.video import EPS
 
-KEPT = 16
-"""Matches of frames kept in memory; others are computed anew when they are asked for."""
+KEPT = 1 << 28
+"""Matches of frames kept in memory [bytes]; others are computed anew when they are asked for."""
+
+FEWEST_KEPT = 4
+"""Matches that are kept whatever their size."""
 
 TOLERANCE = 0.2
 """Expected error up to which intensities are trusted [log intensity]: a usual contrast threshold."""
@@ -130,7 +133,9 @@ class CameraScene(Scene):
                 exposure=(float(exposure[0]), float(exposure[1])),
                 usable=(self.usable(pair[0]), self.usable(pair[1])),
             )
-            while len(self._matches) > KEPT:
+            found = self._matches[interval]
+            size = found.ahead.nbytes + found.back.nbytes + found.doubt.nbytes
+            while len(self._matches) > max(KEPT // size, FEWEST_KEPT):
                 self._matches.popitem(last=False)
         self._matches.move_to_end(interval)
         return self._matches[interval]

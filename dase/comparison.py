@@ -44,7 +44,8 @@ def compare(
         events: What was measured.
         scene: What the camera saw, on the clock of the events.
         sensor: The model.
-        trust: Where and when the scene is to be trusted; None for everywhere.
+        trust: Where and when the scene is to be trusted; None for everywhere, and for what a
+            `CameraScene` trusts of itself.
         pixels: In each half of the measurement.
         seed: Of every random number.
         device: Where kernels run.
@@ -84,10 +85,10 @@ def comparison_of(evidence: Evidence, judgement: Judgement, sensor: Sensor, *, s
 
 def plain(half: Half) -> dict[str, tuple[float, float]]:
     """Return measured and simulated values in units that need no explanation."""
-    time_ = half.frame.seconds * len(half.trials.stimulus.pixels)
     out: dict[str, tuple[float, float]] = {}
     counts = [_counts(v, "rate").reshape(2, KINDS, BANDS) for v in (half.seen.target, half.simulated)]
     exposure = half.trials.stimulus.exposure().reshape(KINDS, BANDS)
+    time_ = max(float(exposure.sum()), 1e-9)
     for n, polarity in enumerate(("OFF", "ON")):
         out[f"{polarity} events [1/(px s)]"] = tuple(float(c[n].sum() / time_) for c in counts)  # type: ignore[assignment]
     rest = max(float(exposure[:RESTING].sum()), 1e-9)

@@ -113,7 +113,8 @@ def diagnose(
         sensor: The model; None for thresholds alone.
         effects: Candidates, name to class; those of the sensor are left out.
         free: Parameters of the sensor that may be refitted; None for all.
-        trust: Where and when the scene is to be trusted; None for everywhere.
+        trust: Where and when the scene is to be trusted; None for everywhere, and for what a
+            `CameraScene` trusts of itself.
         most: Effects that are added at most.
         pixels: In each half of the measurement.
         seed: Of every random number.

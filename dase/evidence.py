@@ -7,6 +7,8 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from dase.camera import CameraScene
+from dase.choice import look, where_trusted
 from dase.error import Judgement, Scale, judge
 from dase.errors import InputError
 from dase.events import Events
@@ -190,7 +192,8 @@ def gather(
         events: What was measured.
         scene: What the camera saw, on the clock of the events.
         log_eps: Added to intensities before the logarithm.
-        trust: Where and when the scene is to be trusted; None for everywhere.
+        trust: Where and when the scene is to be trusted, all else is left out; None for everywhere, and for
+            what a `CameraScene` trusts of itself.
         pixels: In each half.
         seed: Of the choice of pixels.
         device: Where kernels run.
@@ -198,6 +201,8 @@ def gather(
     Raises:
         InputError: Different sizes, no common time, or too few events.
     """
+    if trust is None and isinstance(scene, CameraScene):
+        trust = scene.trusts
     grid = common_grid(events, scene)
     try:
         to = launch.device(device)
@@ -207,16 +212,24 @@ def gather(
     each = min(pixels, size // 2)
     if each < 16:
         raise InputError(f"a diagnosis needs at least 32 pixels, the scene has {scene.width}x{scene.height}")
-    chosen = np.random.default_rng([seed, 1]).permutation(size)[: 2 * each].astype(np.int32)
+    rng, notes = np.random.default_rng([seed, 1]), []
+    cut = max(2, round(SPLIT * grid.steps))
+    if trust is None:
+        chosen = rng.permutation(size)[: 2 * each].astype(np.int32)
+    else:
+        looks = look(events, scene, _times(scene, grid), cut, trust)
+        chosen = where_trusted(looks, each, rng)
+        each = len(chosen) // 2
+        notes.append(looks.sentence())
     light = light_of(scene, _times(scene, grid), chosen)
     if not np.all(np.isfinite(light)) or light.min() < 0:
         raise InputError("scene: intensities must be finite and >= 0")
-    good = np.ones(light.shape, np.bool_) if trust is None else trust(grid.times, chosen).T
+    good = np.ones(light.shape, np.bool_) if trust is None else trust(grid.times, chosen).T.copy()
+    good[:, 1:] &= good[:, :-1]  # a step is what lies between two points of the grid
     bands = band_edges(light, good)
     cell = sort_into_cells(light, grid.step, bands, log_eps)
     cell[~good] = MASKED
     cell[:, 0] = MASKED
-    cut = max(2, round(SPLIT * grid.steps))
     first, last = slice(0, each), slice(each, 2 * each)
     train_grid = replace(grid, steps=cut)
     late = cell[last].copy()
@@ -225,16 +238,17 @@ def gather(
     halves: list[Half] = []
     for part, span, cells in ((first, train_grid, cell[first, :cut]), (last, grid, late)):
         stimulus = Stimulus(
-            chosen[part], scene.width, scene.height, span, light[part, : span.steps], cells, log_eps, to
-        )
+            chosen[part], scene.width, scene.height, span, light[part, : span.steps], cells, log_eps, to,
+            trust is not None,
+        )  # fmt: skip
         halves.append(_half(stimulus, events, cut if span is grid else 0, structure))
-    _enough(halves, events, grid)
+    _enough(halves, events, grid, notes)
     halves.append(_half(halves[0].trials.stimulus.part(SCOUTS), events, 0, structure))
     peak = peak_of(halves[0].found.clock[0], grid.step)
     for half in halves:
         half.frame = replace(half.frame, peak=peak)
     train, held, scout = halves
-    return Evidence(train, held, scout, bands, structure, peak)
+    return Evidence(train, held, scout, bands, structure, peak, tuple(notes))
 
 
 def common_grid(events: Events, scene: Scene) -> Grid:
@@ -286,7 +300,7 @@ def typical_changes(sums: Sums) -> NDArray[np.float32]:
     return (pairs[:, 1] / np.maximum(pairs[:, 0], 1)).astype(np.float32)
 
 
-def _enough(halves: list[Half], events: Events, grid: Grid) -> None:
+def _enough(halves: list[Half], events: Events, grid: Grid, notes: list[str]) -> None:
     for half, name in zip(halves, ("fitting", "judging"), strict=True):
         count = int(half.found.halves.sum())
         if count < LEAST:
@@ -295,4 +309,5 @@ def _enough(halves: list[Half], events: Events, grid: Grid) -> None:
                 f"too few events to say anything: {count} of the {len(events)} lie in the part for {name}, "
                 f"at least {LEAST} are needed; record about {times:.0f} times "
                 f"as long as these {grid.step * (grid.steps - 1):.3g} s, or more motion"
+                + "".join(f"; {note}" for note in notes)
             )

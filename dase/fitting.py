@@ -55,7 +55,8 @@ def fit(
         scene: What the camera saw, on the clock of the events.
         sensor: Its effects are fitted; nothing is added.
         free: Effects or `effect.parameter` that are fitted; None for all.
-        trust: Where and when the scene is to be trusted; None for everywhere.
+        trust: Where and when the scene is to be trusted; None for everywhere, and for what a
+            `CameraScene` trusts of itself.
         pixels: In each half of the measurement.
         seed: Of every random number.
         device: Where kernels run.

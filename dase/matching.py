@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import cv2
 import numpy as np
@@ -24,6 +25,10 @@ REST = 0.25
 
 LOOKS = 5
 """Places along a blur at which it is sampled."""
+
+
+FEW = 5e-4
+"""Share of a frame's pixels that stretching may leave at either end of the range."""
 
 
 @dataclass(frozen=True)
@@ -154,6 +159,19 @@ def _blurred(log: Map, way: Map) -> Map:
     for share in (np.arange(LOOKS) + 0.5) / LOOKS - 0.5:
         total += np.exp(look(log, x + np.float32(share) * way[..., 0], y + np.float32(share) * way[..., 1]))
     return np.asarray(np.log(total / LOOKS))
+
+
+def stretched(frames: NDArray[Any]) -> bool:
+    """Return whether each frame, (F, H, W), seems to be stretched to the whole range of its type.
+
+    Stretching leaves few pixels at either end, most often one, not always the same; light and shadow beyond
+    the range of a camera leave many.
+    """
+    if frames.dtype.kind != "u":
+        return False
+    least, most = (np.median((frames == end).mean((1, 2))) for end in (0, np.iinfo(frames.dtype).max))
+    brightest = frames.reshape(len(frames), -1).argmax(1)
+    return bool(0 < least < FEW and 0 < most < FEW and np.ptp(brightest) > 0)
 
 
 def stretches(frames: list[Map] | NDArray[np.float32], *, pull: float = 0.1) -> NDArray[np.float64]:

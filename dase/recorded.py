@@ -10,7 +10,6 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
@@ -18,7 +17,7 @@ from numpy.typing import NDArray
 
 from dase.camera import TOLERANCE, CameraScene
 from dase.errors import InputError
-from dase.matching import stretches
+from dase.matching import stretched, stretches
 from dase.recording import Recording, open_recording
 from dase.scenery import LOG_EPS, Looks, Scenery
 from dase.targets import Finite, Pairs
@@ -111,18 +110,10 @@ def _scene_of(recording: Recording) -> CameraScene:
             "the frames of the recording have no times, so they cannot be laid beside the events"
         )
     scene = CameraScene(recording.frames, begin, recording.frame_end)
-    if not _stretched(recording.frames):
+    if not stretched(recording.frames):
         return scene
     gains = stretches([scene.intensity(k) for k in range(len(scene))])
     return CameraScene(recording.frames, begin, recording.frame_end, gains=gains)
-
-
-def _stretched(frames: NDArray[Any]) -> bool:
-    """Return whether nearly every frame fills the range of its type, which only stretching does."""
-    if frames.dtype.kind != "u":
-        return False
-    full = (frames.min((1, 2)) == 0) & (frames.max((1, 2)) == np.iinfo(frames.dtype).max)
-    return bool(full.mean() > 0.9)
 
 
 def _count(recording: Recording, begin: float, end: float) -> NDArray[np.float32]:

@@ -72,6 +72,7 @@ class Stimulus:
         cell: Cell of each pixel and step, uint8, shape (N, T); `MASKED` where nothing is compared.
         log_eps: Added to intensities before the logarithm.
         device: Where kernels run.
+        holes: Whether parts of the time of some pixels are not compared, and others after them are.
     """
 
     pixels: NDArray[np.int32]
@@ -82,6 +83,7 @@ class Stimulus:
     cell: NDArray[np.uint8]
     log_eps: float
     device: Any
+    holes: bool = False
     _kept: dict[str, Any] = field(default_factory=dict, repr=False)
 
     @property
@@ -101,7 +103,7 @@ class Stimulus:
         cut = slice(0, count)
         return Stimulus(
             self.pixels[cut], self.width, self.height, self.grid, self.intensity[cut], self.cell[cut],
-            self.log_eps, self.device,
+            self.log_eps, self.device, self.holes,
         )  # fmt: skip
 
     def history(self, finer: int = 0) -> Any:

@@ -203,7 +203,7 @@ class Trials:
         out.classes = wp.array(np.rint(np.array(CLASS_TIMES) / step).astype(np.int32), device=self.device)
         out.half = max(1, round(HALF / step))
         out.step, out.slack = wp.float64(step * 1e9), wp.float64(SLACK * 1e9)
-        out.reseed = int(reseed)
+        out.reseed, out.holes = int(reseed), int(stimulus.holes)
         out.group = self._group()
         count = len(stimulus.pixels)
         groups = -(-count // out.group)

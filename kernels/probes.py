@@ -69,6 +69,7 @@ class Probes:
     half: int  # steps after which the halves take turns
     step: wp.float64  # of the grid [ns]
     slack: wp.float64  # times up to this past a grid point belong to it [ns]
+    holes: int  # 1 where parts of the time are not compared: then no pair of events reaches across them
     reseed: int  # 0 for common random numbers in all rows, 1 for other ones in each
     group: int  # pixels that share a row of `sums`; one thread works on all of them
     team: int  # pixels that share a row of `clock`
@@ -130,6 +131,15 @@ def observe_pair(sink: Probes, row: int, i: int, k: int, before: int, now: int, 
 
 
 @wp.func
+def joined(sink: Probes, i: int, before: int, k: int):
+    """Whether all that lies between two events of a pixel is compared."""
+    at = before
+    while at < k and int(sink.cell[i, at]) != _MASKED:
+        at += 1
+    return at == k
+
+
+@wp.func
 def observe(sink: Probes, row: int, i: int, time: wp.int64, now: int):
     """Look at one event of pixel `i`, `time` [ns] after the begin of the grid, `now` 1 for ON."""
     at = (wp.float64(time) - sink.slack) / sink.step
@@ -153,7 +163,7 @@ def observe(sink: Probes, row: int, i: int, time: wp.int64, now: int):
             rest = 1
         else:
             observe_light(sink, row, i, k, band, float(2 * now - 1))
-        if before >= 0:
+        if before >= 0 and (sink.holes == 0 or joined(sink, i, before, k)):
             kinship = int(2)
             if now == last:
                 kinship = now

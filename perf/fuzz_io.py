@@ -2,9 +2,12 @@
 
     python perf/fuzz_io.py                        100 000 files of every format
     python perf/fuzz_io.py --format EVT3 --files 1000 --seed 7
+    python perf/fuzz_io.py --format EVT3 --only 4711 --keep .      one file again, and keep it
 
-Files are read whole and as a stream by turns. Every format runs in a process of its own, so that a crash of
-a library is seen and named. A file that fails is kept as `fuzz_FORMAT_N` in the folder named by --keep.
+Files are damaged in memory, lie on a disk in memory, and are read whole and as a stream by turns. Every
+format runs in a process of its own that a second one watches: a crash, or a file that takes too long or too
+much memory, is counted and kept as `fuzz_FORMAT_N` in the folder named by --keep, and the run goes on with
+the next file. Each file has random numbers of its own, so any one can be made again. Prints Markdown.
 """
 
 from __future__ import annotations
@@ -18,33 +21,42 @@ import tempfile
 import time
 import warnings
 from pathlib import Path
+from typing import Any
 
 import cv2
 import hdf5plugin
 import lz4.frame
 import numpy as np
+from bench_kernels import commit
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 import reference_io
 
 from dase import io
 from dase.errors import InputError
+from dase.events import Events
 from dase.io.sequence import Sequence
 
 SLOW = 5.0  # [s] of processor for one file
 HUNG = 60.0  # [s] of processor without a sign of life
 STUCK = 3600.0  # [s] without one, waiting
-STEP = 100  # files between two signs of life
 MEMORY = 200.0  # [MB] over what the process needed before
+TOO_MUCH = 4000.0  # [MB] at which a process is ended for the sake of the machine
+EVENTS = 200  # in a file
+
+NEXT, WHOLE, NOTED, REFUSED, FAILED, SLOWEST, PEAK, SPENT = range(8)
+"""What a process tells about its files: numbers of the next one, of files read without a word, with a report
+of what was put right or left out, refused with a sentence, and failed; seconds of the slowest, largest memory
+[MB], seconds of processor in all."""
 
 
 def with_frames(make):
-    """Return a maker of a file of events and of three frames."""
+    """Return a maker of a file of events and of three frames, of a small sensor."""
 
-    def made(path: Path, e) -> None:
+    def made(path: Path, e: Events) -> None:
         rng = np.random.default_rng(1)
         times, grey = np.array([0.001, 0.003, 0.005]), rng.integers(0, 256, (3, H, W), np.uint8)
-        make(path, e, (times, grey))
+        make(path, Events(e.t, e.x % np.uint16(W), e.y % np.uint16(H), e.p, W, H), (times, grey))
 
     return made
 
@@ -63,88 +75,133 @@ def aedat4(path: Path, e, frames) -> None:
     reference_io.aedat4(path, e, frames=frames, motion=motion, compression=1, compress=lz4.frame.compress)
 
 
-def avi(path: Path, e, frames) -> None:
-    out = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"MJPG"), 25.0, (W, H))
-    for grey in frames[1]:
-        out.write(np.repeat(grey[..., None] // 16, 3, 2))
-    out.release()
+def video(codec: str):
+    """Return a maker of a video of the frames."""
+
+    def make(path: Path, e, frames) -> None:
+        out = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*codec), 25.0, (W, H))
+        for grey in frames[1]:
+            out.write(np.repeat(grey[..., None] // 16, 3, 2))
+        out.release()
+
+    return make
 
 
-SAMPLES = reference_io.SAMPLES | {
-    "HDF5 with frames": (".h5", with_frames(full)),
-    "NumPy archive with frames": (".npz", with_frames(full)),
+SAMPLES = {
+    **{name: reference_io.SAMPLES[name] for name in ("EVT2", "EVT3", "EVT2.1", "EVT2.1 legacy", "DAT")},
+    "AEDAT2": reference_io.SAMPLES["AEDAT2"],
     "AEDAT4 packed": (".aedat4", with_frames(aedat4)),
+    "ECF": (".hdf5", reference_io.ecf),
+    "ECF, columns packed": (".hdf5", lambda path, e: reference_io.ecf(path, e, mode=1)),
+    "ECF, not packed": (".hdf5", lambda path, e: reference_io.ecf(path, e, mode=0)),
+    "DSEC packed": (".h5", lambda path, e: reference_io.dsec(path, e, **hdf5plugin.Blosc(cname="zstd"))),
     "MVSEC with frames": (".hdf5", with_frames(lambda path, e, f: reference_io.mvsec(path, e, frames=f))),
     "v2e with frames": (".h5", with_frames(lambda path, e, f: reference_io.v2e(path, e, frames=f))),
-    "DSEC packed": (".h5", lambda path, e: reference_io.dsec(path, e, **hdf5plugin.Blosc(cname="zstd"))),
+    "HDF5 with frames": (".h5", with_frames(full)),
+    "NumPy archive with frames": (".npz", with_frames(full)),
+    "array": reference_io.SAMPLES["array"],
+    "array in an archive": reference_io.SAMPLES["array in an archive"],
     "ROS 1 packed": (
         ".bag",
         with_frames(lambda path, e, f: reference_io.bag(path, e, frames=f, compression="LZ4")),
     ),
-    "AVI": (".avi", with_frames(avi)),
-}
-"""Those of the tests, and files that hold more; small sensors keep them small."""
+    "ROS 1": reference_io.SAMPLES["ROS 1"],
+    "ROS 2": reference_io.SAMPLES["ROS 2"],
+    "MCAP": reference_io.SAMPLES["MCAP"],
+    "AVI": (".avi", with_frames(video("MJPG"))),
+    "MP4": (".mp4", with_frames(video("mp4v"))),
+} | reference_io.SAMPLES
+"""Those that hold most first, then what is left of those of the tests; small sensors keep them small."""
 W, H = 48, 36
 
 
-def peak() -> float:
-    """Return the largest memory this process has had [MB]; ru_maxrss would begin with what its parent had."""
-    lines = Path("/proc/self/status").read_text().splitlines()
-    return next(int(line.split()[1]) for line in lines if line.startswith("VmHWM")) / 1024
+class Memory:
+    """The memory of this process [MB]; ru_maxrss would begin with what its parent had."""
+
+    def __init__(self) -> None:
+        self._status = os.open("/proc/self/status", os.O_RDONLY)
+
+    def peak(self) -> float:
+        """Return the largest so far."""
+        text = os.pread(self._status, 4096, 0)
+        return int(text[text.index(b"VmHWM:") + 6 :].split(None, 1)[0]) / 1024
+
+    def forget(self) -> None:
+        """Begin anew with what there is now."""
+        Path("/proc/self/clear_refs").write_text("5")
 
 
-def read(path: Path, turn: int) -> bool:
-    """Read a file, whole or as a stream by turns; return whether that gave events."""
+def read(path: Path, turn: int) -> int:
+    """Read a file, whole or as a stream by turns; return how that ended: WHOLE, NOTED or REFUSED."""
+    notes: list[Any] = []
     try:
         if turn % 2:
-            for _ in io.stream(path, chunk=1000):
+            for _ in io.stream(path, chunk=1000, notes=notes):
                 pass
         else:
-            io.read(path)
+            io.read(path, notes=notes)
         if path.suffix == ".aedat4":
             io.motion(path)
     except InputError as error:
         if "\n" in str(error) or not str(error).startswith(str(path)):
             raise AssertionError(f"not one sentence that names the file: {error}") from error
-        return False
-    return True
+        return REFUSED
+    return NOTED if any(note.kind in ("repaired", "refused") for note in notes) else WHOLE
 
 
-def run(name: str, files: int, seed: int, keep: Path, results) -> None:
-    """Damage and read files of one format; put what happened into `results` after every file in a while."""
-    warnings.simplefilter("error")
+def prepared(name: str, folder: Path, seed: int) -> tuple[Path, list[tuple[Path, bytes]]]:
+    """Write the sample of a format; return its path, and what lies there: paths and contents."""
     rng = np.random.default_rng([seed, *name.encode()])
     suffix, make = SAMPLES[name]
-    folder = Path(tempfile.mkdtemp(dir="/dev/shm" if Path("/dev/shm").is_dir() else None))
-    try:
-        sample = folder / f"sample{suffix}"
-        wide = name in reference_io.SAMPLES and not name.startswith("MVSEC")
-        make(sample, reference_io.events(rng, 300, *((reference_io.W, reference_io.H) if wide else (W, H))))
-        read(sample, 0)
-        read(sample, 1)
-        before, good, slowest = peak(), 0, 0.0
-        inner = [sample] if sample.is_file() else sorted(p for p in sample.iterdir() if p.is_file())
-        contents = [path.read_bytes() for path in inner]
-        results.put((name, "files", inner))
-        for k in range(files):
-            which = int(rng.integers(0, len(inner)))
-            inner[which].write_bytes(reference_io.mutated(contents[which], rng))
-            begin = time.process_time()
-            try:
-                good += read(sample, k)
-            except BaseException as error:
-                shutil.copy(inner[which], keep / f"fuzz_{name.replace(' ', '_')}_{k}{inner[which].suffix}")
-                results.put((name, "error", f"file {k}: {type(error).__name__}: {error}"))
-            finally:
-                inner[which].write_bytes(contents[which])
-            spent = time.process_time() - begin
-            if spent > max(slowest, SLOW):
-                results.put((name, "error", f"file {k} took {spent:.1f} s"))
-            slowest = max(slowest, spent)
-            if k % STEP == STEP - 1 or k == files - 1:
-                results.put((name, "done", (k + 1, good, slowest, peak() - before)))
-    finally:
-        shutil.rmtree(folder)
+    sample = folder / f"sample{suffix}"
+    make(sample, reference_io.events(rng, EVENTS))
+    inner = [sample] if sample.is_file() else sorted(p for p in sample.iterdir() if p.is_file())
+    return sample, [(path, path.read_bytes()) for path in inner]
+
+
+def damage(name: str, inner: list[tuple[Path, bytes]], number: int, seed: int) -> Path:
+    """Write the damaged file of a number; return its path."""
+    rng = np.random.default_rng([seed, number, *name.encode()])
+    path, content = inner[int(rng.integers(0, len(inner))) if len(inner) > 1 else 0]
+    path.write_bytes(reference_io.mutated(content, rng))
+    return path
+
+
+def run(name: str, folder: Path, files: int, seed: int, keep: Path, told, errors) -> None:
+    """Damage and read files of one format from number told[NEXT] on, and tell what happens."""
+    warnings.simplefilter("error")
+    sample, inner = prepared(name, folder, seed)
+    for turn in (0, 1):
+        if read(sample, turn) == REFUSED:
+            errors.put("the sample itself is refused")
+    memory, begun = Memory(), time.process_time()
+    memory.forget()
+    before, used = memory.peak(), told[SPENT]
+    for number in range(int(told[NEXT]), files):
+        path = damage(name, inner, number, seed)
+        begin, outcome = time.process_time(), FAILED
+        try:
+            outcome = read(sample, number)
+        except BaseException as error:
+            errors.put(f"file {number}: {type(error).__name__}: {error}")
+        end, grown = time.process_time(), memory.peak() - before
+        if end - begin > SLOW or grown > MEMORY:
+            errors.put(f"file {number} took {end - begin:.1f} s and {grown:.0f} MB")
+            outcome = FAILED
+            memory.forget()
+        if outcome == FAILED:
+            shutil.copy(path, keep / kept(name, number, path))
+        if len(inner) > 1:
+            path.write_bytes(dict(inner)[path])
+        told[SLOWEST], told[PEAK] = max(told[SLOWEST], end - begin), max(told[PEAK], grown)
+        told[outcome] += 1
+        told[SPENT] = used + end - begun
+        told[NEXT] = number + 1
+
+
+def kept(name: str, number: int, path: Path) -> str:
+    """Return the name of a file that is kept."""
+    return f"fuzz_{name.replace(' ', '_').replace(',', '')}_{number}{path.suffix}"
 
 
 def main() -> int:
@@ -154,58 +211,87 @@ def main() -> int:
     parser.add_argument("--files", type=int, default=100_000)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--keep", type=Path, default=Path(tempfile.gettempdir()))
+    parser.add_argument("--only", type=int, help="the number of a file that is made, kept and read again")
     options = parser.parse_args()
+    os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
     failed = 0
-    print(f"{'format':<27}{'files':>8}{'readable':>10}{'slowest':>10}{'memory':>10}")
+    print(f"commit {commit()}, {EVENTS} events in a file, seed {options.seed}\n")
+    print("| decoder | files | read | read, with a report | refused | failed | slowest | memory | files/s |")
+    print(f"|{'---|' * 9}")
     for name in options.format or SAMPLES:
-        context = multiprocessing.get_context("spawn")
-        results = context.SimpleQueue()
-        arguments = (name, options.files, options.seed, options.keep, results)
-        process = context.Process(target=run, args=arguments)
-        failed += watch(process, name, options.files, options.keep, results)
+        folder = Path(tempfile.mkdtemp(dir="/dev/shm" if Path("/dev/shm").is_dir() else None))
+        try:
+            if options.only is None:
+                failed += watch(name, folder, options.files, options.seed, options.keep)
+            else:
+                again(name, folder, options.only, options.seed, options.keep)
+        finally:
+            shutil.rmtree(folder)
     return failed
 
 
-def processor(pid: int) -> float:
-    """Return the time of the processor that a process has used [s]; 0 once it is gone."""
+def again(name: str, folder: Path, number: int, seed: int, keep: Path) -> None:
+    """Make and keep one file of a format, and read it."""
+    sample, inner = prepared(name, folder, seed)
+    path = damage(name, inner, number, seed)
+    print(shutil.copy(path, keep / kept(name, number, path)), flush=True)
+    read(sample, number)
+
+
+def status(pid: int) -> tuple[float, float]:
+    """Return the time of the processor that a process has used [s] and its memory [MB]; 0 once it is gone."""
     try:
         fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
     except OSError:
-        return 0.0
-    return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
+        return 0.0, 0.0
+    pages = int(fields[21]) * os.sysconf("SC_PAGE_SIZE")
+    return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK"), pages / 2**20
 
 
-def watch(process, name: str, files: int, keep: Path, results) -> int:
-    """Start a process, print its outcome, return 1 where it failed."""
-    process.start()
-    errors, last, inner, alive, used = [], (0, 0, 0.0, 0.0), [], time.monotonic(), 0.0
-    while process.is_alive() or not results.empty():
-        if results.empty():
-            time.sleep(0.05)
-            if processor(process.pid) - used > HUNG or time.monotonic() - alive > STUCK:
-                for path in inner:
-                    shutil.copy(path, keep / f"fuzz_{name.replace(' ', '_')}_hung_{path.name}")
-                process.kill()
-                process.join()
-                shutil.rmtree(inner[0].parent, ignore_errors=True)
-            continue
-        _, kind, value = results.get()
-        alive, used = time.monotonic(), processor(process.pid)
-        if kind == "error":
-            errors.append(value)
-        elif kind == "files":
-            inner = value
-        else:
-            last = value
+def watch(name: str, folder: Path, files: int, seed: int, keep: Path) -> bool:
+    """Read all files of a format in as many processes as it takes; print a row, return whether any failed."""
+    context = multiprocessing.get_context("spawn")
+    told = context.Array("d", 8, lock=False)
+    errors, said = context.SimpleQueue(), []
+    while told[NEXT] < files:
+        place = Path(tempfile.mkdtemp(dir=folder))
+        process = context.Process(target=run, args=(name, place, files, seed, keep, told, errors))
+        process.start()
+        why = waited(process, told, errors, said)
+        if told[NEXT] < files:
+            number = int(told[NEXT])
+            said.append(f"file {number}: {why}")
+            for path in (path for path in place.rglob("*") if path.is_file()):
+                shutil.copy(path, keep / kept(name, number, path))
+            told[FAILED] += 1
+            told[NEXT] += 1
+        shutil.rmtree(place)
+    counts = " | ".join(f"{int(told[kind]):,}" for kind in (NEXT, WHOLE, NOTED, REFUSED, FAILED))
+    speed = told[NEXT] / max(told[SPENT], 1e-9)
+    print(f"| {name} | {counts} | {told[SLOWEST]:.2f} s | {told[PEAK]:.0f} MB | {speed:.0f} |", flush=True)
+    for sentence in said[:20]:
+        print(f"    {sentence}", flush=True)
+    return bool(said)
+
+
+def waited(process, told, errors, said: list[str]) -> str:
+    """Wait until a process ends, and end it where it hangs or takes too much; return how it ended."""
+    number, since, (used, _) = told[NEXT], time.monotonic(), status(process.pid)
+    why = ""
+    while process.is_alive():
+        process.join(0.05)
+        while not errors.empty():
+            said.append(errors.get())
+        spent, memory = status(process.pid)
+        if told[NEXT] != number:
+            number, since, used = told[NEXT], time.monotonic(), spent
+        elif spent - used > HUNG or time.monotonic() - since > STUCK or memory > TOO_MUCH:
+            why = f"was ended after {spent - used:.0f} s with {memory:.0f} MB"
+            process.kill()
     process.join()
-    if process.exitcode:
-        errors.append(f"the process ended with {process.exitcode} after about {last[0]} files")
-    if last[3] > MEMORY:
-        errors.append(f"took {last[3]:.0f} MB")
-    print(f"{name:<27}{last[0]:>8}{last[1]:>10}{last[2]:>9.2f}s{last[3]:>8.0f} MB", flush=True)
-    for error in errors[:5]:
-        print(f"    {error}", flush=True)
-    return int(bool(errors) or last[0] != files)
+    while not errors.empty():
+        said.append(errors.get())
+    return why or f"the process ended with {process.exitcode}"
 
 
 if __name__ == "__main__":

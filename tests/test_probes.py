@@ -66,7 +66,8 @@ def reference(events, stimulus, middle) -> np.ndarray:
                         2 * p - 1
                     ) * -np.diff(seen)
                     out[kernels.LAG_COUNT + band] += 1
-                if before >= 0:
+                broken = stimulus.holes and (stimulus.cell[i, before:k] == kernels.MASKED).any()
+                if before >= 0 and not broken:
                     gap = k - before
                     octave = 0 if gap == 0 else min(int(np.ceil(np.log2(gap))) + 1, kernels.INTERVALS - 1)
                     kin = p if p == polarity else 2
@@ -89,6 +90,22 @@ def test_sums_equal_a_loop_over_events(evidence, events):
     np.testing.assert_allclose(half.found.sums[0], want, rtol=2e-4, atol=2e-3)
     assert half.found.sums[0, : 2 * kernels.CELLS].sum() == half.found.halves.sum() > 1000
     assert half.found.clock.sum() == half.found.halves.sum()
+
+
+def test_no_pair_of_events_reaches_across_what_is_not_compared(scene, device):
+    events = dase.simulate(scene, Sensor().with_effect(EFFECTS["shot"](rate=3.0)), seed=4, device=device)
+    spans = np.random.default_rng(0).random((100, scene.width * scene.height)) < 0.7
+
+    def trust(times, pixels):
+        return spans[np.floor(times / 0.02).astype(int)][:, pixels]
+
+    half = gather(events, scene, trust=trust, pixels=300, seed=1, device=device).train
+    stimulus = half.trials.stimulus
+    want = reference(events, stimulus, half.trials.middle)
+    np.testing.assert_allclose(half.found.sums[0], want, rtol=2e-4, atol=2e-3)
+    across = reference(events, replace(stimulus, holes=False), half.trials.middle)
+    isi = slice(kernels.ISI, kernels.LAG)
+    assert want[isi].sum() < across[isi].sum() - 500
 
 
 @pytest.mark.parametrize("name", [n for n, e in EFFECTS.items() if n in ON or n == "threshold"])
