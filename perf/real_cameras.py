@@ -18,6 +18,7 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 from real_report import write_page
 
@@ -131,46 +132,60 @@ def from_histograms(path: Path, seconds: float = 4.0, side: int = 50) -> Measure
 def of_a_dot(path: Path) -> Measurement:
     """Open a recording of a bright dot that goes in circles; its way is taken from the events.
 
-    The way is a circle fitted to the middle of the events; dot and ground are even, of a size and contrast
-    taken from the events about the way. Only the way is right for certain, and only near the dot anything is
-    compared.
+    A wave of two harmonics goes through the events of the leading edge, which is sharp; the middle of the dot
+    follows it by the time at which these lie on a circle best. Dot and ground are even, their contrast is a
+    guess. The events of the leading edge are called OFF in the file, and the slow tail behind the dot, where
+    it gets dark and a pixel is slow, ON: polarities are taken the other way round.
     """
-    events = dase.io.read(path).events
-    step = 2.5e-4
-    edges = np.arange(events.t[0], events.t[-1], step)
-    at = np.searchsorted(events.t, edges)
-    middle = np.array([[np.median(events.x[a:b]), np.median(events.y[a:b])] for a, b in pairwise(at)])
+    stored = dase.io.read(path).events
+    events = replace(stored, p=~stored.p)
+    lead = events.select(events.p)
+    frequency = _frequency(lead)
+    basis = _wave(lead.t, frequency)
+    places = np.stack([lead.x, lead.y], 1).astype(np.float64)
+    fit = np.linalg.lstsq(basis, places, rcond=None)[0]
+    near = np.hypot(*(places - basis @ fit).T) < 40  # the others are noise, not of the dot
+    fit = np.linalg.lstsq(basis[near], places[near], rcond=None)[0]
+    best = (np.inf, 0.0, 0.0)
+    for late in np.arange(0, 3e-3, 5e-5):
+        apart = np.hypot(*(places[near] - _wave(lead.t[near] - late, frequency) @ fit).T)
+        spread = float(np.percentile(apart, 75) - np.percentile(apart, 25))
+        best = min(best, (spread, late, float(np.median(apart))))
+    _, late, radius = best
+    times = np.arange(events.t[0] + 2.5e-4, events.t[-1], 2.5e-4)
+    x, y = np.meshgrid(np.arange(events.width, dtype=np.float32), np.arange(events.height, dtype=np.float32))
+    frames = np.empty((len(times), events.height, events.width), np.float32)
+    for frame, (a, b) in zip(frames, _wave(times - late, frequency) @ fit, strict=True):
+        frame[:] = 0.02 + 0.5 * np.clip((radius - np.hypot(x - a, y - b)) / 2 + 0.5, 0, 1)
+    notes = (
+        f"no frames: the scene is an even dot of radius {radius:.0f} px whose way is taken from the events, "
+        f"{frequency:.1f} turns per second",
+        "polarities are taken the other way round: what the file calls OFF is the leading edge of a bright dot",
+    )
+    swept = cv2.dilate((frames.max(0) > 0.1).astype(np.uint8), np.ones((41, 41), np.uint8)).reshape(-1) > 0
+    trust = lambda t, pixels: np.broadcast_to(swept[pixels], (len(t), len(pixels)))  # noqa: E731
+    return Measurement(events, dase.VideoScene(frames, times), trust, notes)
+
+
+def _wave(times: np.ndarray, frequency: float) -> np.ndarray:
+    """Return a constant and two harmonics, shape (K, 5)."""
+    turn = 2 * np.pi * frequency * times
+    return np.stack([np.ones_like(turn), *(f(k * turn) for k in (1, 2) for f in (np.cos, np.sin))], 1)
+
+
+def _frequency(events: dase.Events) -> float:
+    """Return how often the middle of the events goes round in a second."""
+    edges = np.linspace(events.t[0], events.t[-1], 100)
+    cuts = pairwise(np.searchsorted(events.t, edges))
+    middle = np.array([(np.median(events.x[a:b]), np.median(events.y[a:b])) for a, b in cuts])
     times = 0.5 * (edges[1:] + edges[:-1])
-    width, height = events.width, events.height
-    wave = _turn(times, middle)
-    way = np.stack([wave @ np.linalg.lstsq(wave, middle[:, k], rcond=None)[0] for k in (0, 1)], 1)
-    k = np.clip(np.searchsorted(edges, events.t, side="right") - 1, 0, len(way) - 1)
-    apart = np.hypot(events.x - way[k, 0], events.y - way[k, 1])
-    radius = float(np.percentile(apart, 90))
-    x, y = np.meshgrid(np.arange(width, dtype=np.float32), np.arange(height, dtype=np.float32))
-    frames = np.empty((len(times), height, width), np.float32)
-    for frame, (a, b) in zip(frames, way, strict=True):
-        edge = np.clip((radius - np.hypot(x - a, y - b)) / 2 + 0.5, 0, 1)
-        frame[:] = 0.02 + 0.5 * edge
-    scene = dase.VideoScene(frames, times)
-    note = f"no frames: the scene is an even dot of {radius:.0f} px, its way taken from the events themselves"
-    return Measurement(events, scene, None, (note,))
-
-
-def _turn(times: np.ndarray, middle: np.ndarray) -> np.ndarray:
-    """Return the harmonics of the frequency at which the middle of the events goes round, shape (K, 5)."""
-    best = None
-    for frequency in np.geomspace(5, 1500, 4000):
-        turn = 2 * np.pi * frequency * times
-        wave = np.stack(
-            [np.ones_like(turn), np.cos(turn), np.sin(turn), np.cos(2 * turn), np.sin(2 * turn)], 1
-        )
-        left = middle - wave @ np.linalg.lstsq(wave, middle, rcond=None)[0]
-        loss = float((left**2).sum())
-        if best is None or loss < best[0]:
-            best = loss, wave
-    assert best is not None
-    return best[1]
+    tried = np.geomspace(5, 500, 2000)
+    left = []
+    for frequency in tried:
+        basis = _wave(times, frequency)
+        fit = np.linalg.lstsq(basis, middle, rcond=None)[0]
+        left.append(float(((middle - basis @ fit) ** 2).sum()))
+    return float(tried[int(np.argmin(left))])
 
 
 CAMERAS = {

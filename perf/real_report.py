@@ -103,8 +103,8 @@ def plain(facts: dict[str, Any]) -> str:
     f = {k: float(facts[k]) for k in ("events", "seconds", "rate", "on", "shortest", "busiest")}
     return (
         f"{f['events']:,.0f} events in {f['seconds']:.3g} s, {100 * f['on']:.0f} % of them ON; one in a "
-        f"thousand intervals of a pixel is shorter than {number(1e3 * f['shortest'])} ms; the busiest pixel sends "
-        f"{number(f['busiest'])} events per second."
+        f"thousand intervals of a pixel is shorter than {number(1e3 * f['shortest'])} ms; the busiest pixel "
+        f"sends {number(f['busiest'])} events per second."
     )
 
 
