@@ -160,7 +160,7 @@ def of_a_dot(path: Path) -> Measurement:
     notes = (
         f"no frames: the scene is an even dot of radius {radius:.0f} px whose way is taken from the events, "
         f"{frequency:.1f} turns per second",
-        "polarities are taken the other way round: what the file calls OFF is the leading edge of a bright dot",
+        "polarities are taken the other way round: the file calls the leading edge of the bright dot OFF",
     )
     swept = cv2.dilate((frames.max(0) > 0.1).astype(np.uint8), np.ones((41, 41), np.uint8)).reshape(-1) > 0
     trust = lambda t, pixels: np.broadcast_to(swept[pixels], (len(t), len(pixels)))  # noqa: E731
