@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from dase.cli.options import check_suffix, effects_option
+from dase.cli.options import check_suffix, effects_option, fps_option, open_recorded
 
 if TYPE_CHECKING:
     from dase.results import Diagnosis
@@ -55,6 +55,7 @@ def explain(ctx: click.Context, parameter: click.Parameter, value: str | None) -
     callback=check_suffix(".png", ".svg", ".pdf"),
     help="Draw the falling error into this PNG, SVG or PDF.",
 )
+@fps_option
 @effects_option
 @click.option("--pixels", default=1500, show_default=True, help="In each half of the measurement.")
 @click.option("--device", default="cpu", show_default=True, help="cpu or cuda.")
@@ -67,6 +68,7 @@ def command(
     recording: Path,
     file: Path | None,
     scene: str,
+    fps: float | None,
     auto: bool,
     free: str | None,
     json_: Path | None,
@@ -89,12 +91,11 @@ def command(
     from dase.diagnosis import MOST, diagnose
     from dase.effect_files import known_effects
     from dase.io import replacing
-    from dase.measurement import open_measurement
 
     known = known_effects(effects)
     text = edit.SensorText(*read_sensor(sensor), known)
     model = text.sensor()
-    measured = open_measurement(recording, scene, file)
+    measured = open_recorded(recording, scene, file, fps)
     names = free.split(",") if free else None
     with bar(quiet) as tell:
         found = diagnose(

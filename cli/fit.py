@@ -6,7 +6,7 @@ from pathlib import Path
 
 import click
 
-from dase.cli.options import effects_option
+from dase.cli.options import effects_option, fps_option, open_recorded
 
 
 @click.command()
@@ -19,6 +19,7 @@ from dase.cli.options import effects_option
     "--scene", default="frames", show_default=True,
     help="What the camera saw: its own frames, video FILE (a clip, a folder, an npz with frames), or static.",
 )  # fmt: skip
+@fps_option
 @effects_option
 @click.option("--pixels", default=1500, show_default=True, help="In each half of the measurement.")
 @click.option("--device", default="cpu", show_default=True, help="cpu or cuda.")
@@ -31,6 +32,7 @@ def command(
     output: Path,
     free: str | None,
     scene: str,
+    fps: float | None,
     effects: tuple[Path, ...],
     pixels: int,
     device: str,
@@ -47,11 +49,10 @@ def command(
     from dase.config import read_sensor
     from dase.effect_files import known_effects
     from dase.fitting import fit
-    from dase.measurement import open_measurement
 
     text = edit.SensorText(*read_sensor(sensor), known_effects(effects))
     model = text.sensor()
-    measured = open_measurement(recording, scene, file)
+    measured = open_recorded(recording, scene, file, fps)
     with bar(quiet) as tell:
         found = fit(
             measured.events, measured.scene, model, free=free.split(",") if free else None,
