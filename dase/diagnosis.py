@@ -32,11 +32,8 @@ MATERIAL = 0.3
 SHARE = 0.1
 """Least share of the way to the floor."""
 
-CLOSE = 2.0
-"""A model up to this error is called at the floor: what is left may be significant but is not material."""
-
 CLOSE_FAMILY = 4.0
-"""The same for the error of one family: what few statistics show, such as dead pixels, the mean hides."""
+"""Error of one family up to which nothing is looked for: what few statistics show the mean hides."""
 
 MUCH_FAMILY = 8.0
 """Error of one family above which a finding is not announced, although the mean is at the floor."""
@@ -147,7 +144,7 @@ def explained(judgement: Judgement) -> bool:
     """Whether a model is at the floor, altogether and in every family of probes."""
     families = judgement.families
     inside = (families[name] <= max(judgement.limits[name], CLOSE_FAMILY) for name in families)
-    return judgement.error <= max(judgement.gate, CLOSE) and all(inside)
+    return judgement.error <= judgement.gate and all(inside)
 
 
 def announced(judgement: Judgement) -> bool:
@@ -158,7 +155,7 @@ def announced(judgement: Judgement) -> bool:
     """
     families = judgement.families
     inside = (families[name] <= max(judgement.limits[name], MUCH_FAMILY) for name in families)
-    return judgement.error <= max(judgement.gate, CLOSE) and all(inside)
+    return judgement.error <= judgement.gate and all(inside)
 
 
 def worst_families(judgement: Judgement) -> list[str]:

@@ -9,7 +9,7 @@ from dataclasses import replace
 import numpy as np
 
 from dase.confidence import estimates
-from dase.diagnosis import CLOSE, Progress
+from dase.diagnosis import Progress
 from dase.error import Judgement
 from dase.events import Events
 from dase.evidence import PIXELS, Evidence, gather
@@ -138,10 +138,9 @@ def _remarks(judgement: Judgement, starts: int, good: int) -> list[str]:
             f"a poor minimum is possible: of {starts} starts only one came to this error; "
             "record more motion, or free fewer parameters"
         )
-    floor = max(judgement.gate, CLOSE)
-    if judgement.error > floor:
+    if judgement.error > judgement.gate:
         out.append(
-            f"the error stays at {judgement.error:.2g}, above {floor:.2g}: "
+            f"the error stays at {judgement.error:.2g}, above {judgement.gate:.2g}: "
             "the model lacks something, which dase diagnose looks for"
         )
     return out
