@@ -22,7 +22,7 @@ import warp as wp
 
 from dase.kernels.scene import Affine
 
-ON_CPU = """
+AT_ONCE = """
 typedef float V __attribute__((ext_vector_type({length})));
 typedef int I __attribute__((ext_vector_type({length})));
 auto FLOOR = [](V a) {{ return __builtin_elementwise_floor(a); }};
@@ -43,22 +43,25 @@ return result_out;
 """
 """What a C++ expression finds around it on the CPU; `auto` spares a second version for integers."""
 
-ON_CUDA = """
+ONE_BY_ONE = """
 typedef float V;
 typedef int I;
+#ifdef __CUDA_ARCH__
+auto FLOOR = [](V a) {{ return floorf(a); }};
+auto ABS = [](V a) {{ return fabsf(a); }};
+auto FMA = [](V a, V b, V c) {{ return fmaf(a, b, c); }};
+auto HIGHEST = [](unsigned a) {{ return 31 - __clz(a); }};
+#else
 auto FLOOR = [](V a) {{ return __builtin_floorf(a); }};
 auto ABS = [](V a) {{ return __builtin_fabsf(a); }};
 auto FMA = [](V a, V b, V c) {{ return __builtin_fmaf(a, b, c); }};
+auto HIGHEST = [](unsigned a) {{ return 31 - __builtin_clz(a); }};
+#endif
 auto LESSER = [](auto a, auto b) {{ return a < b ? a : b; }};
 auto WHOLE = [](V a) {{ return (I)a; }};
 auto FLOAT = [](I a) {{ return (V)a; }};
 auto AT = [](const float* a, I i) {{ return a[i]; }};
 auto ANY = [](I a) {{ return a != 0; }};
-#ifdef __CUDA_ARCH__
-auto HIGHEST = [](unsigned a) {{ return 31 - __clz(a); }};
-#else
-auto HIGHEST = [](unsigned a) {{ return 31 - __builtin_clz(a); }};
-#endif
 wp::vec_t<{length}, float> result_out;
 #pragma unroll
 for (int lane = 0; lane < {length}; ++lane) {{
@@ -244,13 +247,13 @@ def _lanewise(
     """
     names = lanes.split()
     inputs = "\n".join(f"V {n} = {n}_in[lane];" for n in names)
-    gpu = ON_CUDA.format(length=length, body=cuda or body, inputs=inputs)
+    gpu = ONE_BY_ONE.format(length=length, body=cuda or body, inputs=inputs)
     if length > 1:
         inputs = "\n".join(f"V {n} = IN({n}_in);" for n in names)
-        cpu = ON_CPU.format(length=length, body=body, inputs=inputs)
+        cpu = AT_ONCE.format(length=length, body=body, inputs=inputs)
     else:
         # plain numbers, so that loops which call the function can become vectors
-        cpu = ON_CUDA.format(length=1, body=body, inputs=inputs)
+        cpu = ONE_BY_ONE.format(length=1, body=body, inputs=inputs)
     arguments = ", ".join([*(f"{n}_in: Lanes" for n in names), *([others] if others else [])])
     snippet = f"#ifdef __CUDA_ARCH__\n{gpu}\n#else\n{cpu}\n#endif\n"
     scope = {"Affine": Affine, "Lanes": vector(length)}
