@@ -211,9 +211,12 @@ def flow(
     y = float(i / width)
     near = layers_near(layers, x, y)
     top = int(0)
-    for layer in range(1, layers.count):
-        if ((near >> layer) & 1) != 0 and foreground_at(layers, layer, k, x, y)[1] > 0.0:
+    while near != 0:
+        layer = highest_bit(near)
+        near ^= 1 << layer
+        if foreground_at(layers, layer, k, x, y)[1] > 0.0:
             top = layer
+            near = 0
     flow_out[k, i] = velocity[k, top] * wp.vec3(x, y, 1.0)
 
 

@@ -41,8 +41,8 @@ BLOCK = 4 * CHUNK  # events gathered before they are written
 #   lzf + shuffle     5.0 /  6.7          185                       310-420
 #   gzip-1 + shuffle  4.1 /  6.1          90-115                    355-500
 # lzf would be twice as fast, but reads its hash table uninitialised: the same events give files that differ
-# by some bytes. Smooth flow shrinks by 4.3. Frames do not shrink. Whole chunks go past HDF5's own filter, to a
-# library that makes the same kind of stream, of about the same size, six to nine times as fast.
+# by some bytes. Smooth flow shrinks by 4.3. Frames do not shrink. Whole chunks go past HDF5's own filter, to
+# ISA-L, which makes the same kind of stream, of about the same size, six to nine times as fast.
 COMPRESSION: dict[str, Any] = {"compression": "gzip", "compression_opts": 1, "shuffle": True}
 
 LATE = -1  # marks a frame that came after later events had been written
