@@ -24,8 +24,11 @@ from torch.nn import functional as F
 from dase.networks import TINY, gradient_magnitude, looks
 from dase.targets import Pairs
 
-RIDGE = 0.2
-"""Added to the variances before they are inverted, as a share; more while few scenes have been seen."""
+RIDGE = 0.1
+"""Added to the variances before they are inverted, as a share."""
+
+UNSURE = 0.1
+"""The same for each feature per scene that has been seen: few scenes tell little of their covariance."""
 
 LONG = 0.99
 """The same of the moments of columns and rows."""
@@ -161,7 +164,7 @@ class Cells:
         diagonal = covariance.diagonal(dim1=-2, dim2=-1)
         # a feature that never varies says nothing
         floor = 1e-6 + 1e-3 * diagonal.mean(-1, keepdim=True)
-        ridge = RIDGE + diagonal.shape[-1] / kept["scenes"]
+        ridge = RIDGE + UNSURE * diagonal.shape[-1] / kept["scenes"]
         mean = kept["real_sum"] / kept["real_number"].clamp_min(1)[:, None]
         wrong = (doubt * mean).square().reshape(diagonal.shape) * kept["real_scenes"]
         weight, _ = torch.linalg.inv_ex(covariance + torch.diag_embed(ridge * diagonal + floor + wrong))

@@ -72,7 +72,7 @@ def copy_rate(clock: Clock, size: int) -> float:
 
 def make(args: argparse.Namespace, objective: str) -> Training:
     """Return a run at the size to be measured, some steps old."""
-    looks = Looks(width=96, height=96, samples=12) if args.small else Looks()
+    looks = Looks(regime="mixed", **(dict(width=96, height=96, samples=12) if args.small else {}))
     scenery = Scenery(images.open_images(args.images), looks, device=args.device)
     how = Hash(size=16, orientations=8, coherence=1) if args.small else Hash()
     network = NetworkShape(channels=8, depth=2) if args.small else NetworkShape()

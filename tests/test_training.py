@@ -210,7 +210,7 @@ def test_newton_knows_how_moments_move(scenes):
 
 
 def test_weights_of_moments_invert_their_covariance(rng):
-    from dase.moments import RIDGE, Cells
+    from dase.moments import RIDGE, UNSURE, Cells
 
     cells = Cells(2, 3, device=torch.device("cpu"), memory=0.9, joint=True)
     scenes_, pixels = 4000, torch.tensor([10.0, 20.0])
@@ -219,7 +219,7 @@ def test_weights_of_moments_invert_their_covariance(rng):
     cells.see_plain(values.view(-1, 2, 3) * pixels.view(1, 2, 1), pixels.expand(scenes_, 2))
     cells.weigh()
     covariance = root.T @ root
-    loaded = covariance + torch.diag((RIDGE + 6 / scenes_) * covariance.diagonal())
+    loaded = covariance + torch.diag((RIDGE + UNSURE * 6 / scenes_) * covariance.diagonal())
     want = torch.linalg.inv(loaded) / 6
     torch.testing.assert_close(
         cells.kept["weight"][0].double(), want, rtol=0.2, atol=0.02 * float(want.max())
