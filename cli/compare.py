@@ -7,7 +7,7 @@ from pathlib import Path
 
 import click
 
-from dase.cli.options import check_suffix, effects_option
+from dase.cli.options import check_suffix, effects_option, fps_option, open_recorded
 
 
 @click.command()
@@ -25,6 +25,7 @@ from dase.cli.options import check_suffix, effects_option
     "--scene", default="frames", show_default=True,
     help="What the camera saw: its own frames, video FILE (a clip, a folder, an npz with frames), or static.",
 )  # fmt: skip
+@fps_option
 @effects_option
 @click.option("--pixels", default=1500, show_default=True, help="In each half of the measurement.")
 @click.option("--device", default="cpu", show_default=True, help="cpu or cuda.")
@@ -36,6 +37,7 @@ def command(
     file: Path | None,
     output: Path | None,
     scene: str,
+    fps: float | None,
     effects: tuple[Path, ...],
     pixels: int,
     device: str,
@@ -51,10 +53,9 @@ def command(
     from dase.config import load_sensor
     from dase.effect_files import known_effects
     from dase.io import replacing
-    from dase.measurement import open_measurement
 
     model = load_sensor(sensor, known_effects(effects))
-    measured = open_measurement(recording, scene, file)
+    measured = open_recorded(recording, scene, file, fps)
     with bar(quiet) as tell:
         found = compare(
             measured.events, measured.scene, model, trust=measured.trust, pixels=pixels, seed=seed,

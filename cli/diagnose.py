@@ -10,14 +10,18 @@ from typing import TYPE_CHECKING
 
 import click
 
-from dase.cli.options import check_suffix, effects_option
+from dase.cli.options import check_suffix, effects_option, fps_option, open_recorded
 
 if TYPE_CHECKING:
     from dase.results import Diagnosis
 
 
 def explain(ctx: click.Context, parameter: click.Parameter, value: str | None) -> None:
-    """Say what an effect is and what it does to the probes, and exit."""
+    """Say what an effect is and what it does to the probes, and exit.
+
+    Not eager: `--effects`, which is, must be known by then wherever it stands; options that are given come
+    before arguments that are not, which nobody misses here.
+    """
     if value is None or ctx.resilient_parsing:
         return
     from dase.effect_files import known_effects
@@ -51,18 +55,20 @@ def explain(ctx: click.Context, parameter: click.Parameter, value: str | None) -
     callback=check_suffix(".png", ".svg", ".pdf"),
     help="Draw the falling error into this PNG, SVG or PDF.",
 )
+@fps_option
 @effects_option
 @click.option("--pixels", default=1500, show_default=True, help="In each half of the measurement.")
 @click.option("--device", default="cpu", show_default=True, help="cpu or cuda.")
 @click.option("--seed", default=0, show_default=True, help="The same seed gives the same findings.")
 @click.option("--quiet", is_flag=True, help="Only the finding, no progress.")
-@click.option("--explain", metavar="EFFECT", callback=explain, is_eager=True, expose_value=False,
+@click.option("--explain", metavar="EFFECT", callback=explain, expose_value=False,
               help="Say what EFFECT is and what it does to the probes, and exit.")  # fmt: skip
 def command(
     sensor: str,
     recording: Path,
     file: Path | None,
     scene: str,
+    fps: float | None,
     auto: bool,
     free: str | None,
     json_: Path | None,
@@ -85,12 +91,11 @@ def command(
     from dase.diagnosis import MOST, diagnose
     from dase.effect_files import known_effects
     from dase.io import replacing
-    from dase.measurement import open_measurement
 
     known = known_effects(effects)
     text = edit.SensorText(*read_sensor(sensor), known)
     model = text.sensor()
-    measured = open_measurement(recording, scene, file)
+    measured = open_recorded(recording, scene, file, fps)
     names = free.split(",") if free else None
     with bar(quiet) as tell:
         found = diagnose(

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import click
 
-from dase.cli.options import effects_option
+from dase.cli.options import effects_option, fps_option, open_recorded
 
 
 @click.command()
@@ -19,6 +19,7 @@ from dase.cli.options import effects_option
     "--scene", default="frames", show_default=True,
     help="What the camera saw: its own frames, video FILE (a clip, a folder, an npz with frames), or static.",
 )  # fmt: skip
+@fps_option
 @effects_option
 @click.option("--pixels", default=1500, show_default=True, help="In each half of the measurement.")
 @click.option("--device", default="cpu", show_default=True, help="cpu or cuda.")
@@ -31,23 +32,27 @@ def command(
     output: Path,
     free: str | None,
     scene: str,
+    fps: float | None,
     effects: tuple[Path, ...],
     pixels: int,
     device: str,
     seed: int,
     quiet: bool,
 ) -> None:
-    """Fit the parameters of the model SENSOR to RECORDING; the comments of its file stay."""
+    """Fit the parameters of the model SENSOR to RECORDING; the comments of its file stay.
+
+    Where only one of the starts came to the error of the best, the minimum may be a poor one: the file is
+    written, this is said, and the exit code is 1.
+    """
     from dase import edit
     from dase.cli.diagnose import bar
     from dase.config import read_sensor
     from dase.effect_files import known_effects
     from dase.fitting import fit
-    from dase.measurement import open_measurement
 
     text = edit.SensorText(*read_sensor(sensor), known_effects(effects))
     model = text.sensor()
-    measured = open_measurement(recording, scene, file)
+    measured = open_recorded(recording, scene, file, fps)
     with bar(quiet) as tell:
         found = fit(
             measured.events, measured.scene, model, free=free.split(",") if free else None,
@@ -60,3 +65,6 @@ def command(
     for note in measured.noted(found).notes:
         click.echo(f"note: {note}")
     click.echo(f"{output}: {found.evaluations} simulations, {found.seconds:.1f} s")
+    if found.poor:
+        click.echo("dase: the fit may have ended in a poor minimum, see the note above", err=True)
+        click.get_current_context().exit(1)

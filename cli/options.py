@@ -3,9 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import click
+
+if TYPE_CHECKING:
+    from dase.measurement import Measurement
 
 
 def parse_size(ctx: click.Context, param: click.Parameter, value: str | None) -> tuple[int, int] | None:
@@ -31,6 +36,11 @@ effects_option = click.option(
 )
 """`--effects FILE`: a command gets a tuple of paths, for `dase.effect_files.known_effects`."""
 
+fps_option = click.option(
+    "--fps", type=float, help="Frames per second of the clip of --scene.  [default: what the file says]"
+)
+"""`--fps N` of commands that compare with a recording, for `open_recorded`."""
+
 sensor_output = click.option(
     "-o",
     "--output",
@@ -51,3 +61,18 @@ def check_suffix(*suffixes: str) -> Callable[[click.Context, click.Parameter, Pa
         return value
 
     return check
+
+
+def open_recorded(
+    recording: Path, scene: str, file: Path | None = None, fps: float | None = None
+) -> Measurement:
+    """Open a recording and its scene, with the frame rate of its clip where the user gives it."""
+    from dase.measurement import open_measurement
+    from dase.video import open_video
+
+    clip = file if scene == "video" else Path(scene)
+    if fps is None or clip is None:
+        return open_measurement(recording, scene, file)
+    if scene in ("frames", "static"):
+        raise click.UsageError("--fps goes with --scene video FILE")
+    return replace(open_measurement(recording, "static"), scene=open_video(clip, fps=fps))

@@ -32,11 +32,8 @@ MATERIAL = 0.3
 SHARE = 0.1
 """Least share of the way to the floor."""
 
-CLOSE = 2.0
-"""A model up to this error is called at the floor: what is left may be significant but is not material."""
-
 CLOSE_FAMILY = 4.0
-"""The same for the error of one family: what few statistics show, such as dead pixels, the mean hides."""
+"""Error of one family up to which nothing is looked for: what few statistics show the mean hides."""
 
 MUCH_FAMILY = 8.0
 """Error of one family above which a finding is not announced, although the mean is at the floor."""
@@ -55,6 +52,9 @@ SWAPPED = 2
 
 NEARBY = 1.6
 """Only alternatives whose held-out error was about below this, relative to the chosen one's."""
+
+QUICK = 2.0
+"""Only alternatives whose error on the scout, quickly fitted, is below this, relative to the model's own."""
 
 Progress = Callable[[str, float, float], None]
 """Told what is being done, the share of the step done, and the present error."""
@@ -144,7 +144,7 @@ def explained(judgement: Judgement) -> bool:
     """Whether a model is at the floor, altogether and in every family of probes."""
     families = judgement.families
     inside = (families[name] <= max(judgement.limits[name], CLOSE_FAMILY) for name in families)
-    return judgement.error <= max(judgement.gate, CLOSE) and all(inside)
+    return judgement.error <= judgement.gate and all(inside)
 
 
 def announced(judgement: Judgement) -> bool:
@@ -155,7 +155,7 @@ def announced(judgement: Judgement) -> bool:
     """
     families = judgement.families
     inside = (families[name] <= max(judgement.limits[name], MUCH_FAMILY) for name in families)
-    return judgement.error <= max(judgement.gate, CLOSE) and all(inside)
+    return judgement.error <= judgement.gate and all(inside)
 
 
 def worst_families(judgement: Judgement) -> list[str]:
@@ -283,12 +283,7 @@ def _review(search: _Search, model: Model, judgement: Judgement) -> tuple[Model,
         if explained(without) or without.error <= judgement.error:
             model, judgement = less, without
     for name in search.added(model):
-        for other in search.alternatives.get(name, [])[:SWAPPED]:
-            if (
-                other.name in model.space.sensor
-                or other.error > NEARBY * search.error_of.get(name, 0.0) + TIE
-            ):
-                continue
+        for other in _rivals(search, model, name):
             sensor = model.sensor.without(name).with_effect(other.model.sensor[other.name])
             swapped = settle(search.evidence, _like(sensor, model, [other.name]), seed=search.seed)
             judged = search.judge(swapped)
@@ -301,6 +296,24 @@ def _review(search: _Search, model: Model, judgement: Judgement) -> tuple[Model,
                 break
             search.ties.setdefault(name, set()).add(other.name)
     return model, judgement
+
+
+def _rivals(search: _Search, model: Model, name: str) -> list[Tried]:
+    """Return the alternatives to an effect that may do as well: in its place, not far off on the scout.
+
+    Fitting one in full takes as long as trying a dozen; most are far off.
+    """
+    scout, out = search.evidence.scout, []
+    for other in search.alternatives.get(name, [])[:SWAPPED]:
+        limit = NEARBY * search.error_of.get(name, 0.0) + TIE
+        if other.name in model.space.sensor or other.error > limit:
+            continue
+        repeats = model.rebase(scout, repeats=16, seed=search.seed + 200)
+        sensor = model.sensor.without(name).with_effect(other.model.sensor[other.name])
+        quick = _like(sensor, model, [other.name]).search(scout, seed=search.seed, iterations=2)
+        if quick.loss < QUICK * float(scout.scale.loss(repeats).mean()):
+            out.append(other)
+    return out
 
 
 def _verdict(

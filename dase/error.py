@@ -15,6 +15,10 @@ FAR = 4.0
 """Standard deviations above the mean that the error of a family of a true model hardly ever reaches."""
 
 
+CLOSE = 1.2
+"""A model up to this error counts as right also where its repeats differ by less: the rest is no matter."""
+
+
 @dataclass(frozen=True)
 class Scale:
     """What differences are measured by.
@@ -31,8 +35,7 @@ class Scale:
 
     def z(self, values: Array) -> Array:
         """Return differences in standard errors, 0 where nothing is compared, shape (..., J)."""
-        out: Array = np.where(self.used, (values - self.target) / self.sigma, 0.0)
-        return out
+        return in_errors(values - self.target, self)
 
     def weights(self) -> Array:
         """Return the weight of each statistic: families weigh alike, shape (J,)."""
@@ -62,7 +65,7 @@ class Judgement:
 
     Args:
         error: 1 is what two repeats of one measurement give, each of them off by what is of no concern.
-        gate: Error that 99 of 100 repeats stay below.
+        gate: Error up to which the model counts as right: 99 of 100 repeats stay below, and at least `CLOSE`.
         families: Error per family.
         limits: Error per family that hardly any repeat exceeds in any family.
         z: Difference of each statistic in standard errors, shape (J,).
@@ -82,7 +85,8 @@ def judge(repeats: Array, seen: Scale, chance: Scale, off: Array, *, seed: int) 
 
     The model is the mean of its repeats. Each repeat in turn stands in for the measurement and is compared
     with the others, off by the tolerance at random: what that gives is called 1. So a difference within the
-    tolerance does not count as an error, and a model without any chance in it still has a floor.
+    tolerance does not count as an error, and a model without any chance in it still has a floor. The gate is
+    of chance alone: a measurement that the model is true of is not off by the tolerance.
 
     Args:
         repeats: Statistics of simulations with different seeds, shape (R, J).
@@ -94,19 +98,25 @@ def judge(repeats: Array, seen: Scale, chance: Scale, off: Array, *, seed: int) 
     count = len(repeats)
     mean = repeats.mean(0)
     rng = np.random.default_rng([seed, 3])
-    apart = (repeats - mean) * (count / (count - 1)) + off * rng.standard_normal(repeats.shape)
+    apart = (repeats - mean) * (count / (count - 1))
+    rho = robust(in_errors(apart + off * rng.standard_normal(repeats.shape), chance))
     weights = chance.weights()
-    rho = robust(np.where(chance.used, apart / chance.sigma, 0.0))
-    null = rho @ weights
-    unit = float(null.mean())
-    gate = max(float(np.quantile(null, 0.99)), unit + 2.6 * float(null.std()))
+    unit = float((rho @ weights).mean())
+    null = robust(in_errors(apart, chance)) @ weights / unit
+    gate = max(CLOSE, float(np.quantile(null, 0.99)), float(null.mean() + 2.6 * null.std()))
     families = {name: value / unit for name, value in seen.families(mean).items()}
     limits = {}
     for name in families:
         part = LAYOUT[name]
         own = rho[:, part][:, chance.used[part]].mean(1) / unit
         limits[name] = max(float(own.max()), float(own.mean() + FAR * own.std()))
-    return Judgement(float(seen.loss(mean)) / unit, gate / unit, families, limits, seen.z(mean), unit)
+    return Judgement(float(seen.loss(mean)) / unit, gate, families, limits, seen.z(mean), unit)
+
+
+def in_errors(apart: Array, scale: Scale) -> Array:
+    """Return differences in standard errors, 0 where nothing is compared, shape (..., J)."""
+    out: Array = np.divide(apart, scale.sigma, out=np.zeros(np.shape(apart)), where=scale.used)
+    return out
 
 
 def robust(z: Array) -> Array:

@@ -45,7 +45,12 @@ def _say(axes: Axes, text: str, at: tuple[float, float], shift: tuple[float, flo
 
 
 def staircase(
-    steps: Sequence[str], errors: Sequence[float], *, floor: float = 1.0, gate: float | None = None
+    steps: Sequence[str],
+    errors: Sequence[float],
+    *,
+    floor: float = 1.0,
+    gate: float | None = None,
+    stand_ins: int = 0,
 ) -> Plate:
     """Draw how the error falls with every effect that is added.
 
@@ -54,9 +59,10 @@ def staircase(
         errors: Held-out error after each, shape (N,).
         floor: Error of two repeats of one measurement.
         gate: Error that 99 of 100 repeats stay below.
+        stand_ins: How many of the last steps are not announced, as they do not reach the floor.
     """
     below = gate if gate is not None and math.isfinite(gate) else floor
-    done = errors[-1] <= below
+    done = errors[-1] <= below and not stand_ins
     title = "The error falls to the noise floor" if done else "The error falls, but not to the noise floor"
     if len(errors) < 2:
         title = "The error is at the noise floor" if done else "The error is above the noise floor"
@@ -69,8 +75,7 @@ def staircase(
     axes.set(xlim=(-0.5, n - 0.5), ylim=(bottom, top))
     axes.axhspan(bottom, below, color=BOTH, alpha=0.10, lw=0)
     axes.axhline(floor, color=BOTH, lw=1.2, ls=(0, (4, 2)))
-    axes.stairs(errors, np.arange(n + 1) - 0.5, baseline=None, color=INK, lw=2.2)
-    axes.stairs(errors, np.arange(n + 1) - 0.5, baseline=bottom, color=INK, fill=True, alpha=0.07, lw=0)
+    _stairs(axes, errors, n - stand_ins, bottom)
     for i, error in enumerate(errors):
         # beside the line of the floor, not on it
         shift, side = ((0, -6), "top") if 0.6 * floor < error < floor else ((0, 5), "bottom")
@@ -85,13 +90,27 @@ def staircase(
     axes.set_xticklabels([textwrap.fill(step, max(10, 110 // n)) for step in steps], fontsize=9.5)
     axes.tick_params(axis="x", length=0)
     label(axes, y="held-out error [noise floors]")
-    legend(figure, [("line", INK, "error"), ("dash", BOTH, "noise floor"), ("box", "#dcefe8", "chance")])
+    shown = [("line", INK, "error"), ("dash", BOTH, "noise floor"), ("box", "#dcefe8", "chance")]
+    legend(figure, [*shown[:1], *([("dash", QUIET, "with a stand-in")] if stand_ins else []), *shown[1:]])
     caption = (
         "Each step adds one physical effect and fits all parameters again. "
         f"The dashed line is the noise floor ({number(floor)}); inside the green band the model differs from "
         "the measurement by no more than another recording would."
     )
+    if stand_ins:
+        caption += " Stand-ins are what comes nearest of all effects known; they are not announced as found."
     return Plate(figure, caption)
+
+
+def _stairs(axes: Axes, errors: Sequence[float], sure: int, bottom: float) -> None:
+    """Draw the steps; from the `sure`-th on they are dashed."""
+    edges = np.arange(len(errors) + 1) - 0.5
+    axes.stairs(errors, edges, baseline=bottom, color=INK, fill=True, alpha=0.07, lw=0)
+    axes.stairs(errors[:sure], edges[: sure + 1], baseline=None, color=INK, lw=2.2)
+    if sure < len(errors):
+        x = np.repeat(edges[sure:], 2)[:-1]
+        y = np.concatenate([[errors[sure - 1]], np.repeat(errors[sure:], 2)])
+        axes.plot(x, y, color=QUIET, lw=1.8, ls=(0, (3, 1.5)))
 
 
 def families(errors: dict[str, float], *, floor: float = 1.0, gate: float | None = None) -> Plate:

@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import numpy as np
 
 from dase.confidence import estimates
 from dase.diagnosis import Progress
+from dase.error import Judgement
 from dase.events import Events
-from dase.evidence import PIXELS, gather
+from dase.evidence import PIXELS, Evidence, gather
 from dase.model import Model, fit_present, model_of, settle
 from dase.results import Estimate, Fit
 from dase.scene import Scene
@@ -24,6 +25,9 @@ REPEATS = 60
 
 OTHERS = 2
 """Starts beside the wide look at thresholds."""
+
+MOST = 5
+"""The same where no two starts come to the same error."""
 
 AGREE = 3.0
 """Starts agree where their ends lie within so many half-widths of the confidence interval, or `NEAR`."""
@@ -70,22 +74,14 @@ def fit(
     )
     given = model_of(sensor, free)
     before = given.judge(evidence.held, repeats=REPEATS // 2, seed=seed + 500).error
-    tell("a wide look", 0.1, before)
-    best = settle(evidence, fit_present(evidence, sensor, free, seed=seed), seed=seed)
-    ends = [best]
-    for n in range(OTHERS):
-        tell(f"start {n + 2} of {OTHERS + 1}", 0.3 + 0.25 * n, before)
-        ends.append(settle(evidence, _elsewhere(best, seed + n), seed=seed + n))
-    judged = [(m.judge(evidence.held, repeats=REPEATS, seed=seed + 500), m) for m in ends]
-    judgement, model = min(judged, key=lambda pair: pair[0].error)
+    ends = _descend(evidence, sensor, free, seed, lambda text, share: tell(text, share, before))
+    judgement, model = _best(ends)
     tell("confidence intervals", 0.9, judgement.error)
-    good = [m for j, m in judged if j.error < max(1.25 * judgement.error, judgement.error + 0.25)]
+    good = _equal(ends)
     model, values = estimates(evidence, model, seed=seed)
     judgement = model.judge(evidence.held, repeats=REPEATS, seed=seed + 500)
     apart = disagreements(model, good, values)
-    notes = [*evidence.notes, *apart, *outside(model)]
-    if len(good) < 2:
-        notes.append("only one of the starts came to this error: the others ended in worse minima")
+    notes = [*evidence.notes, *apart, *outside(model), *_remarks(judgement, len(ends), len(good))]
     return Fit(
         sensor=model.sensor,
         parameters=values,
@@ -94,10 +90,60 @@ def fit(
         floor=1.0,
         gate=judgement.gate,
         agree=not apart and len(good) > 1,
+        poor=len(good) < 2,
         notes=tuple(notes),
         evaluations=evidence.evaluations,
         seconds=time.perf_counter() - begin,
     )
+
+
+Ends = list[tuple[Judgement, Model]]
+
+
+def _descend(
+    evidence: Evidence,
+    sensor: Sensor,
+    free: Sequence[str] | None,
+    seed: int,
+    tell: Callable[[str, float], None],
+) -> Ends:
+    """Return where several starts end, each with its held-out error."""
+    tell("a wide look", 0.1)
+    model = settle(evidence, fit_present(evidence, sensor, free, seed=seed), seed=seed)
+    ends = [(model.judge(evidence.held, repeats=REPEATS, seed=seed + 500), model)]
+    for n in range(MOST):
+        if n >= OTHERS and len(_equal(ends)) > 1:
+            break
+        tell(f"start {n + 2}", 0.3 + 0.6 * n / MOST)
+        model = settle(evidence, _elsewhere(_best(ends)[1], seed + n), seed=seed + n)
+        ends.append((model.judge(evidence.held, repeats=REPEATS, seed=seed + 500), model))
+    return ends
+
+
+def _best(ends: Ends) -> tuple[Judgement, Model]:
+    return min(ends, key=lambda pair: pair[0].error)
+
+
+def _equal(ends: Ends) -> list[Model]:
+    """Return the ends whose error is about that of the best."""
+    least = _best(ends)[0].error
+    return [model for judged, model in ends if judged.error < max(1.25 * least, least + 0.25)]
+
+
+def _remarks(judgement: Judgement, starts: int, good: int) -> list[str]:
+    """Return what is to be said of a minimum that may be a poor one, and of an error that stays."""
+    out = []
+    if good < 2:
+        out.append(
+            f"a poor minimum is possible: of {starts} starts only one came to this error; "
+            "record more motion, or free fewer parameters"
+        )
+    if judgement.error > judgement.gate:
+        out.append(
+            f"the error stays at {judgement.error:.2g}, above {judgement.gate:.2g}: "
+            "the model lacks something, which dase diagnose looks for"
+        )
+    return out
 
 
 def _elsewhere(model: Model, seed: int) -> Model:

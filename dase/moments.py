@@ -164,7 +164,7 @@ class Cells:
         ridge = RIDGE + diagonal.shape[-1] / kept["scenes"]
         mean = kept["real_sum"] / kept["real_number"].clamp_min(1)[:, None]
         wrong = (doubt * mean).square().reshape(diagonal.shape) * kept["real_scenes"]
-        weight = torch.linalg.inv(covariance + torch.diag_embed(ridge * diagonal + floor + wrong))
+        weight, _ = torch.linalg.inv_ex(covariance + torch.diag_embed(ridge * diagonal + floor + wrong))
         kept["usual"].copy_((weight * covariance).sum())
         kept["weight"].copy_(weight / (cells * width))
 

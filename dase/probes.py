@@ -36,7 +36,8 @@ FAMILIES = {
     "repeats": "further events of a pixel in the same step of time",
     "change": "change of the light between two events of a pixel",
     "spread": "how differently pixels count that see the same",
-    "pixels": "pixels far off the others: silent ones, busy ones",
+    "pixels": "pixels that are far busier than others",
+    "silent": "pixels that send nothing although they see something",
     "space": "events by the distance from the middle of the sensor",
     "spectrum": "how fast the rate of all pixels swings",
     "stamps": "regularities of the time stamps; compared only where the measurement has one",
@@ -51,6 +52,9 @@ FEW = 25.0
 
 SHRINK = 3.0
 """Events of the measurement that are added to a mean of the model, which may have none."""
+
+SEEN = 6.0
+"""Events that are expected of a pixel which is called silent if it sends none."""
 
 ZONES = 4
 """Rings about the middle of the sensor, of equal numbers of pixels."""
@@ -141,7 +145,8 @@ def _layout() -> dict[str, slice]:
         "repeats": 2 * BANDS,
         "change": 2 * 4 * CLASSES + CLASSES,
         "spread": 10,
-        "pixels": 4,
+        "pixels": 3,
+        "silent": 1,
         "space": 4 * ZONES,
         "spectrum": TONES + 2,
         "stamps": 2,
@@ -182,7 +187,7 @@ def statistics(found: Sums, frame: Frame) -> tuple[Array, Array]:
         _repeats(a[:, REPEAT : REPEAT + 3 * BANDS].reshape(-1, BANDS, 3)),
         _changes(a[:, CHANGE : CHANGE + 12 * CLASSES].reshape(-1, 4 * CLASSES, 3), a[:, SERIAL:]),
         _spread(found.halves, frame.expected),
-        _counts(_odd_pixels(found.halves, frame)),
+        *map(_counts, _odd_pixels(found.halves, frame)),
         _counts(_by_zone(found.halves, frame.zone)),
         _spectrum(found.clock, frame),
         (found.stamps, np.full(found.stamps.shape, 1e9 if frame.regular else 0.0)),
@@ -236,16 +241,17 @@ def _spread(halves: NDArray[np.float32], expected: Array) -> tuple[Array, Array]
     return values, np.broadcast_to(events, values.shape)
 
 
-def _odd_pixels(halves: NDArray[np.float32], frame: Frame) -> Array:
-    """Numbers of pixels that are silent, and of those that are busy at rest or altogether."""
+def _odd_pixels(halves: NDArray[np.float32], frame: Frame) -> tuple[Array, Array]:
+    """Numbers of pixels that are busy at rest or altogether, and of those that are silent."""
     rest, rest_e = halves[..., 4:].sum(-1), frame.expected[..., 4:].sum(-1).astype(np.float32)
     all_, all_e = halves.sum(-1), frame.expected.sum(-1).astype(np.float32)
     bound = rest_e + 4 * np.sqrt(rest_e + 1)
-    odd = (
-        (all_ == 0) & (all_e >= 6), rest > bound + 2, rest > bound + np.float32(15 * frame.seconds),
-        all_ > 3 * all_e + 20,
-    )  # fmt: skip
-    return np.stack([np.count_nonzero(o, axis=1) for o in odd], 1).astype(np.float64)
+    busy = rest > bound + 2, rest > bound + np.float32(15 * frame.seconds), all_ > 3 * all_e + 20
+    silent = ((all_ == 0) & (all_e >= SEEN),)
+    many, few = (
+        np.stack([np.count_nonzero(o, axis=1) for o in odd], 1).astype(np.float64) for odd in (busy, silent)
+    )
+    return many, few
 
 
 def _by_zone(halves: NDArray[np.float32], zone: NDArray[np.int64]) -> Array:

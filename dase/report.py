@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from html import escape
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -187,7 +188,21 @@ def staircase_of(found: Diagnosis) -> Plate:
     if math.isfinite(found.before) and found.before > 1.05 * errors[0]:
         steps, errors = ["as given", "fitted"], [found.before, *errors]
     steps += [f"+ {name}" for name in found.selected]
-    return figures.staircase(steps, errors, floor=found.floor, gate=found.gate)
+    names, more = stand_ins(found)
+    return figures.staircase(
+        [*steps, *names], [*errors, *more], floor=found.floor, gate=found.gate, stand_ins=len(names)
+    )
+
+
+def stand_ins(found: Diagnosis) -> tuple[list[str], list[float]]:
+    """Return the effects that came nearest where nothing explains the error, and the errors with them."""
+    if found.unexplained is None or not found.unexplained.nearest:
+        return [], []
+    last, nearest = found.unexplained.error, found.unexplained.nearest
+    after = {a.chosen: b.error for a, b in pairwise(found.history) if a.chosen and a.chosen in b.model}
+    if not all(name in after for name in nearest[:-1]):
+        return [f"+ {' + '.join(nearest)}"], [last]
+    return [f"+ {name}" for name in nearest], [*(after[name] for name in nearest[:-1]), last]
 
 
 def ranking_of(step: Step, floor: float) -> Plate:

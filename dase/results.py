@@ -138,6 +138,7 @@ class Fit:
         floor: The error of repeats, 1 by construction.
         gate: Error that 99 of 100 repeats stay below.
         agree: Whether the starts of the optimiser came to the same parameters.
+        poor: Whether only one start came to this error, so that it may be a poor minimum.
         notes: Parameters that left their plausible range, starts that disagree, what the data cannot show.
         evaluations: Simulations that were run.
         seconds: Time it took.
@@ -150,6 +151,7 @@ class Fit:
     floor: float
     gate: float
     agree: bool = True
+    poor: bool = False
     notes: tuple[str, ...] = ()
     evaluations: int = 0
     seconds: float = 0.0
@@ -162,7 +164,7 @@ class Fit:
 
     def to_json(self) -> dict[str, Any]:
         """Return the numbers as JSON objects."""
-        out = {name: getattr(self, name) for name in ("error", "before", "floor", "gate", "agree")}
+        out = {name: getattr(self, name) for name in ("error", "before", "floor", "gate", "agree", "poor")}
         out |= {"sensor": self.sensor.table(), "notes": list(self.notes)}
         out |= {"parameters": {name: asdict(e) for name, e in self.parameters.items()}}
         return out | {"evaluations": self.evaluations, "seconds": self.seconds}

@@ -36,7 +36,7 @@ _SPREADS = (
     "shared spread of ON and OFF events", "spread between pixels of OFF events",
     "spread between pixels of ON events",
 )  # fmt: skip
-_ODD = ("silent pixels", "busy pixels at rest", "very busy pixels at rest", "busy pixels")
+_ODD = ("busy pixels at rest", "very busy pixels at rest", "busy pixels")
 
 Words = tuple[str, str, str]
 """Where a statistic is taken, what it is, and its unit."""
@@ -97,6 +97,10 @@ def _pixels(evidence: Evidence, n: int) -> Words:
     return "single pixels", _ODD[n], "pixels"
 
 
+def _silent(evidence: Evidence, n: int) -> Words:
+    return "single pixels", "silent pixels", "pixels"
+
+
 def _space(evidence: Evidence, n: int) -> Words:
     state, ring = divmod(n, ZONES)
     rest, polarity = divmod(state, 2)
@@ -117,7 +121,8 @@ def _stamps(evidence: Evidence, n: int) -> Words:
 
 _PLACES: dict[str, Callable[[Evidence, int], Words]] = {
     "rate": _rate, "intervals": _intervals, "lag": _lag, "repeats": _repeats, "change": _change,
-    "spread": _spread, "pixels": _pixels, "space": _space, "spectrum": _spectrum, "stamps": _stamps,
+    "spread": _spread, "pixels": _pixels, "silent": _silent,
+    "space": _space, "spectrum": _spectrum, "stamps": _stamps,
 }  # fmt: skip
 
 

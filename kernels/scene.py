@@ -25,7 +25,6 @@ class Frames:
     """Stored samples."""
 
     values: wp.array2d[float]  # (K, N) linear intensity, or log intensity for the `log` source
-    logs: wp.array2d[float]  # (K, N) log intensity, for the `both` source
 
 
 @wp.struct
@@ -120,8 +119,10 @@ def foreground_at(layers: Layers, layer: int, k: int, x: float, y: float) -> wp.
         i += size[0]
         bottom = layers.texels[i] + fu * (layers.texels[i + 1] - layers.texels[i])
     else:
-        top = (1.0 - fu) * texel(layers, layer, iu, iv) + fu * texel(layers, layer, iu + 1, iv)
-        bottom = (1.0 - fu) * texel(layers, layer, iu, iv + 1) + fu * texel(layers, layer, iu + 1, iv + 1)
+        top = texel(layers, layer, iu, iv)
+        top += fu * (texel(layers, layer, iu + 1, iv) - top)
+        bottom = texel(layers, layer, iu, iv + 1)
+        bottom += fu * (texel(layers, layer, iu + 1, iv + 1) - bottom)
     return top + fv * (bottom - top)
 
 

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import ClassVar
 
+import click
+import cv2
 import numpy as np
 import pytest
 import warp as wp
@@ -13,15 +15,17 @@ from click.testing import CliRunner
 
 import dase
 from dase.cli import group
+from dase.cli.options import open_recorded
 from dase.confidence import estimates
 from dase.diagnosis import diagnose, summary
 from dase.effects import EFFECTS, Effect, parameter
-from dase.error import Scale, judge, robust
+from dase.error import Judgement, Scale, judge, robust
 from dase.evidence import gather
 from dase.explain import bars
-from dase.fitting import fit
+from dase.fitting import _equal, _remarks, fit
 from dase.model import model_of, settle
 from dase.probes import LAYOUT, SIZE
+from dase.results import Fit
 from dase.sensor import Sensor
 from dase.video import VideoScene
 
@@ -164,7 +168,7 @@ def test_the_error_of_repeats_is_one(rng):
     repeats = rng.normal(0, sigma, (200, SIZE))
     chance = Scale(np.zeros(SIZE), np.sqrt(sigma**2 * 1.005 + off**2), used)
     errors = []
-    for _ in range(40):
+    for _ in range(400):
         target = rng.normal(0, sigma) + off * rng.standard_normal(SIZE)
         seen = Scale(target, chance.sigma, used)
         errors.append(judge(repeats, seen, chance, off, seed=0).error)
@@ -265,6 +269,49 @@ def test_the_commands_agree_with_python(tmp_path, scene):
                  str(tmp_path / "f.toml"))  # fmt: skip
     assert result.exception is None, result.exception
     assert dase.load_sensor(tmp_path / "f.toml")["threshold"].on == pytest.approx(0.2, rel=0.05)
+
+
+def test_a_poor_minimum_is_said(tmp_path, scene, monkeypatch):
+    """The file is written, the last line says so, and a script that goes on only after success stops."""
+    save(tmp_path / "r.npz", dase.simulate(scene, Sensor(), seed=1))
+    ends = Fit(Sensor(), {}, error=3.0, before=4.0, floor=1.0, gate=1.2, agree=False, poor=True)
+    monkeypatch.setattr("dase.fitting.fit", lambda *args, **more: ends)
+    words = ["fit", "ideal", str(tmp_path / "r.npz"), "--scene", "static", "-o", str(tmp_path / "f.toml")]
+    result = CliRunner().invoke(group, words)
+    assert result.exit_code == 1
+    assert "poor minimum" in result.output
+    assert (tmp_path / "f.toml").exists()
+    monkeypatch.setattr("dase.fitting.fit", lambda *args, **more: replace(ends, poor=False))
+    assert CliRunner().invoke(group, words).exit_code == 0
+
+
+def test_starts_that_end_higher_are_not_counted():
+    judgements = [Judgement(error, 1.2, {}, {}, np.zeros(1), 1.0) for error in (1.1, 5.0, 9.0)]
+    ends = [(judgement, model_of(Sensor())) for judgement in judgements]
+    assert len(_equal(ends)) == 1
+    assert "only one came" in _remarks(judgements[0], 3, 1)[0]
+    assert "model lacks something" in _remarks(judgements[1], 3, 2)[0]
+    assert _remarks(judgements[0], 3, 2) == []
+
+
+def test_a_clip_is_played_at_the_rate_that_is_given(tmp_path, scene):
+    save(tmp_path / "r.npz", dase.simulate(scene, Sensor(), seed=1))
+    (tmp_path / "clip").mkdir()
+    for k, frame in enumerate(scene.frames(scene.sample_times()[:5])):
+        cv2.imwrite(str(tmp_path / "clip" / f"{k}.png"), np.rint(255 * frame.clip(0, 1)).astype(np.uint8))
+    seen = open_recorded(tmp_path / "r.npz", str(tmp_path / "clip"), None, 200.0).scene
+    np.testing.assert_allclose(seen.sample_times(), np.arange(5) / 200)
+    with pytest.raises(click.UsageError, match="--fps goes with"):
+        open_recorded(tmp_path / "r.npz", "static", None, 200.0)
+
+
+def test_an_effect_of_the_user_is_explained_wherever_its_file_is_named(tmp_path, monkeypatch):
+    monkeypatch.setattr("dase.effect_files.known_effects", lambda paths: [path.name for path in paths])
+    monkeypatch.setattr("dase.explain.explanation", lambda name, known: f"{name} of {known}")
+    for words in (("--effects", "a.py", "--explain", "x"), ("--explain", "x", "--effects", "a.py")):
+        result = CliRunner().invoke(group, ["diagnose", *words])
+        assert result.exit_code == 0, result.output
+        assert result.output == "x of ['a.py']\n"
 
 
 def test_too_small_a_scene_is_refused(scene):

@@ -13,7 +13,7 @@ from dase.effects import EFFECTS, StreamEffect
 from dase.evidence import gather
 from dase.explain import bars
 from dase.kernels import probes as kernels
-from dase.probes import FAMILIES, LAYOUT
+from dase.probes import FAMILIES, LAYOUT, SEEN, statistics
 from dase.sensor import Sensor
 from dase.structure import find
 from dase.trials import CLASS_TIMES, LAG_TIMES
@@ -33,8 +33,12 @@ def scene() -> dase.VideoScene:
 
 
 @pytest.fixture(scope="module")
-def evidence(scene, device):
-    events = dase.simulate(scene, Sensor().with_effect(EFFECTS["shot"](rate=3.0)), seed=4, device=device)
+def events(scene) -> dase.Events:
+    return dase.simulate(scene, Sensor().with_effect(EFFECTS["shot"](rate=3.0)), seed=4)
+
+
+@pytest.fixture(scope="module")
+def evidence(events, scene, device):
     return gather(events, scene, pixels=300, seed=1, device=device)
 
 
@@ -80,9 +84,8 @@ def reference(events, stimulus, middle) -> np.ndarray:
     return out
 
 
-def test_sums_equal_a_loop_over_events(evidence, scene):
+def test_sums_equal_a_loop_over_events(evidence, events):
     half = evidence.train
-    events = dase.simulate(scene, Sensor().with_effect(EFFECTS["shot"](rate=3.0)), seed=4)
     want = reference(events, half.trials.stimulus, half.trials.middle)
     np.testing.assert_allclose(half.found.sums[0], want, rtol=2e-4, atol=2e-3)
     assert half.found.sums[0, : 2 * kernels.CELLS].sum() == half.found.halves.sum() > 1000
@@ -154,6 +157,20 @@ def test_rows_of_a_batch_are_independent(evidence):
         np.testing.assert_array_equal(together.halves[n], alone.halves[0])
     apart = trials.run(Sensor(), np.repeat(vectors[:1], 2, 0), seed=2, reseed=True)
     assert np.any(apart.halves[0] != apart.halves[1])
+
+
+def test_silent_pixels_are_counted(evidence, events):
+    """A pixel is silent if it sends nothing where at least six events are expected."""
+    half = evidence.train
+    expected = half.found.halves[0].astype(float)  # as if the model were exact
+    busy = np.flatnonzero(expected.sum(1) >= SEEN)[:7]
+    few = np.flatnonzero((expected.sum(1) < SEEN) & (expected.sum(1) > 0))[:3]
+    muted = half.trials.stimulus.pixels[np.concatenate([busy, few])]
+    place = events.y.astype(int) * events.width + events.x
+    found = half.trials.look(events.select(~np.isin(place, muted)))
+    frame = replace(half.frame, expected=expected)
+    values = [statistics(sums, frame)[0][0, LAYOUT["silent"]] for sums in (half.found, found)]
+    np.testing.assert_allclose(np.exp(np.concatenate(values)) - 3, [0, 7], atol=1e-9)
 
 
 def test_families_fill_the_vector():

@@ -5,6 +5,7 @@ from __future__ import annotations
 import base64
 import json
 import re
+from dataclasses import replace
 from functools import lru_cache
 from html.parser import HTMLParser
 
@@ -168,6 +169,22 @@ def test_unexplained_names_nothing_as_found():
     assert "shot comes nearest, but leaves 3: a stand-in, not a finding" in page.words
     assert "Missing:" not in page.words
     assert "What stays unexplained" in page.words
+
+
+def test_the_staircase_goes_on_with_stand_ins():
+    left = Unexplained(3.0, 0.4, ("shot", "hot"), CELLS[:2], "unexplained")
+    steps = (
+        Step(("threshold",), 6.0, 1.3, {}, (), "shot", (), ()),
+        Step(("threshold", "shot"), 4.0, 1.3, {}, (), "hot", (), ()),
+        Step(("threshold", "shot", "hot"), 3.1, 1.3, {}, (), None, (), ()),
+    )
+    found = diagnosis(selected=(), errors=(6.0,), ties={}, unexplained=left, history=steps)
+    assert report.stand_ins(found) == (["+ shot", "+ hot"], [4.0, 3.0])
+    assert "not announced" in report.staircase_of(found).caption
+    # found as a pair: there is no error with the first of them alone
+    assert report.stand_ins(replace(found, history=steps[:1])) == (["+ shot + hot"], [3.0])
+    assert report.stand_ins(diagnosis()) == ([], [])
+    assert "not announced" not in report.staircase_of(diagnosis()).caption
 
 
 def test_pages_are_the_same_every_time(tmp_path):
