@@ -53,11 +53,11 @@ def pictures(measured: Measurement, sensor: Sensor, *, seed: int = 0, device: st
             break
     shown = times[np.unique(np.searchsorted(times, np.linspace(begin, end, 13)[:-1]))]
     frames = np.clip(255 * measured.scene.frames(shown), 0, 255).astype(np.uint8)
-    both = [measured.events, Events.concatenate(parts)]
+    real, made = measured.events, Events.concatenate(parts)
     if not isinstance(measured.scene, CameraScene):
-        return event_plates(*both, (begin, end), frames=frames, frame_times=shown)
-    both = [measured.scene.believed(events) for events in both]
-    plates = event_plates(*both, (begin, end), frames=frames, frame_times=shown)
+        return event_plates(real, made, (begin, end), frames=frames, frame_times=shown)
+    real, made = measured.scene.believed(real), measured.scene.believed(made)
+    plates = event_plates(real, made, (begin, end), frames=frames, frame_times=shown)
     return [replace(plate, caption=f"{plate.caption} {BELIEVED}") for plate in plates]
 
 
