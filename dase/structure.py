@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import ClassVar
 
 import numpy as np
@@ -15,6 +15,9 @@ FILE = 1e-6
 
 SHORTEST = 3e-6
 """Shorter regularities cannot be told from the file's own [s]."""
+
+BLANK = 0.02
+"""Share of a scan by which lines may be off: readouts pause between scans, which the lines here share out."""
 
 CERTAIN = 0.97
 """Share of events that must follow a regularity."""
@@ -52,14 +55,21 @@ class Structure:
             out[0] = share_at(events.t, self.step)
         if self.line:
             lines, place = places(events, self.direction)
-            out[1] = share_at(events.t - place * self.line, lines * self.line)
+            out[1] = share_in_scan(events.t, place, self.line, lines)
         return out
 
 
-def share_at(t: NDArray[np.float64], step: float) -> float:
-    """Return the share of times that are multiples of a step, but for the rounding of the file."""
-    off = t - np.round(t / step) * step
-    return float(np.mean(np.abs(off) <= min(1.1 * FILE, 0.2 * step)))
+def share_at(t: NDArray[np.float64], step: float, slack: float = 0.0) -> float:
+    """Return the share of times whole steps apart, but for `slack` and the rounding of the file [s]."""
+    turn = t / step
+    phase = np.angle(np.exp(2j * np.pi * (turn - np.floor(turn))).mean()) / (2 * np.pi)
+    off = np.abs(turn - phase - np.round(turn - phase)) * step
+    return float(np.mean(off <= max(min(1.1 * FILE, 0.2 * step), slack)))
+
+
+def share_in_scan(t: NDArray[np.float64], place: NDArray[np.float64], line: float, lines: int) -> float:
+    """Return the share of times at which a readout that goes from line to line is at the pixel's."""
+    return share_at(t - place * line, lines * line, BLANK * lines * line)
 
 
 def places(events: Events, direction: str) -> tuple[int, NDArray[np.float64]]:
@@ -78,8 +88,11 @@ def find(events: Events) -> Structure:
         line = line_time(first, direction)
         if line > best.line:
             best = Structure(line=line, direction=direction)
-    if not best.line:  # the lines of a scan are read at ticks too
-        best = Structure(step=ticks(first.t))
+    # all of them tell its length better
+    if best.line:
+        best = replace(best, line=line_time(events, best.direction))
+    elif ticks(first.t):  # the lines of a scan are read at ticks too
+        best = Structure(step=ticks(events.t))
     return best if best.shares(events).max() >= CERTAIN else Structure()
 
 
@@ -123,4 +136,4 @@ def line_time(events: Events, direction: str) -> float:
     busy = np.bincount(where.astype(np.int64), minlength=lines).argmax()
     scan = refined(t[where == busy], scan)
     line = scan / lines
-    return line if share_at(events.t - place * line, scan) >= CERTAIN else 0.0
+    return line if share_in_scan(events.t, place, line, lines) >= CERTAIN else 0.0

@@ -70,6 +70,14 @@ def given_back(line: dict[str, Any], lines: list[dict[str, Any]]) -> list[bool]:
     return [named_first(other) for other in lines if other["name"] == name and "failed" not in other]
 
 
+def by_its_equal(line: dict[str, Any], lines: list[dict[str, Any]]) -> bool:
+    """Whether what was named for a removed effect is announced as its equal where both are in the library."""
+    name, selected = line["name"].replace("unknown/", "single/", 1), line["answer"]["selected"]
+    same = [other["answer"] for other in lines if other["name"] == name and "failed" not in other]
+    pairs = [{n, t} for a in same for n in a["ties"] for t in a["ties"][n]]
+    return len(selected) == 1 and {selected[0], line["case"]["effects"][0]} in pairs
+
+
 def named_first(line: dict[str, Any]) -> bool:
     """Whether the first effect named, or one announced as its equal, is the hidden one."""
     selected, want = line["answer"]["selected"], line["case"]["effects"]
@@ -80,6 +88,10 @@ def named_first(line: dict[str, Any]) -> bool:
 
 def rows(lines: list[dict[str, Any]]) -> list[tuple[str, int, int]]:
     """Return (what is asked, right answers, runs) for each row of the table of results."""
+    return [*_single(lines), *_others(lines)]
+
+
+def _single(lines: list[dict[str, Any]]) -> list[tuple[str, int, int]]:
     good = [line for line in lines if "failed" not in line]
     of = lambda kind: [line for line in good if line["case"]["kind"] == kind]  # noqa: E731
     out = []
@@ -91,10 +103,20 @@ def rows(lines: list[dict[str, Any]]) -> list[tuple[str, int, int]]:
     out.append(("hidden parameter within 15 % or its interval", sum(map(recovered, strong)), len(strong)))
     inside = [ok for line in strong for ok in covered(line)]
     out.append(("true parameters inside their 90 % intervals", sum(inside), len(inside)))
+    return out
+
+
+def _others(lines: list[dict[str, Any]]) -> list[tuple[str, int, int]]:
+    good = [line for line in lines if "failed" not in line]
+    of = lambda kind: [line for line in good if line["case"]["kind"] == kind]  # noqa: E731
+    out = []
     out.append(("nothing hidden: nothing announced", sum(map(right, of("nothing"))), len(of("nothing"))))
     out.append(("two hidden effects: both found", sum(map(right, of("pair"))), len(of("pair"))))
     strange = of("unknown")
     out.append(("effect not in the library: unexplained", sum(map(right, strange)), len(strange)))
+    rest = [line for line in strange if not right(line)]
+    even = sum(by_its_equal(line, good) for line in rest)
+    out.append(("... of the rest: one that data do not tell from it was named", even, len(rest)))
     told = [line for line in strange if right(line)]
     out.append(("... in cells where it is to be seen", sum(map(right_cells, told)), len(told)))
     again = [ok for line in strange for ok in given_back(line, good)]

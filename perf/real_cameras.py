@@ -208,7 +208,7 @@ CAMERAS = {
     "dvx_noise_static": Camera(
         static, "iniVation, 640x480", "nothing moves, 2 s: noise alone, about 0.5 Hz per pixel",
         (("noise of both polarities", ("shot", "voltage_noise")), ("a pixel that is stuck", ("hot",)),
-         ("time stamps at multiples of 195 µs", ("timestamp",))),
+         ("columns that are read every 195 µs", ("row_scan", "timestamp"))),
         0.2,
     ),
     "noise_iebcs": Camera(

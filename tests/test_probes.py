@@ -195,6 +195,19 @@ def test_regular_time_stamps_are_found(scene, effect):
     assert found.shares(events).max() > 0.97
 
 
+def test_a_scan_that_begins_anywhere_and_pauses_is_found(scene):
+    """As real ones do: the clock of the file begins within a scan, and between scans nothing is read."""
+    events = dase.simulate(scene, Sensor().with_effect(EFFECTS["shot"](rate=20.0)), seed=1)
+    line, lines = 4e-6, events.width
+    scan = line * lines * 1.015
+    place = lines - 1 - events.x.astype(float)
+    t = np.ceil((events.t - place * line) / scan) * scan + place * line + 0.37 * scan
+    order = np.argsort(t)
+    found = find(replace(events.select(order), t=np.rint(1e6 * t[order]) * 1e-6))
+    assert found.direction == "left"
+    assert found.line == pytest.approx(scan / lines, rel=1e-3)
+
+
 def test_a_regularity_must_last(scene):
     events = dase.simulate(scene, Sensor().with_effect(EFFECTS["timestamp"](step=3e-4, jitter=0.0)), seed=1)
     t = events.t.copy()
