@@ -32,6 +32,19 @@ auto LESSER = [](auto a, auto b) {{ return a < b ? a : b; }};
 auto WHOLE = [](V a) {{ return __builtin_convertvector(a, I); }};
 auto FLOAT = [](I a) {{ return __builtin_convertvector(a, V); }};
 auto AT = [](const float* a, I i) {{ V v; for (int l = 0; l < {length}; ++l) v[l] = a[i[l]]; return v; }};
+auto PAIR = [](const float* a, I i, V& right) {{
+    typedef double D __attribute__((ext_vector_type({length})));
+    D both;
+    for (int l = 0; l < {length}; ++l) {{
+        double two;
+        __builtin_memcpy(&two, a + i[l], 8);
+        both[l] = two;
+    }}
+    typedef float W __attribute__((ext_vector_type(2 * {length})));
+    const W flat = __builtin_bit_cast(W, both);
+    right = flat.odd;
+    return (V)flat.even;
+}};
 auto ANY = [](I a) {{ return __builtin_reduce_or(a) != 0; }};
 auto HIGHEST = [](unsigned a) {{ return 31 - __builtin_clz(a); }};
 auto IN = [](const wp::vec_t<{length}, float>& a) {{ V v; __builtin_memcpy(&v, &a, sizeof(V)); return v; }};
@@ -61,6 +74,7 @@ auto LESSER = [](auto a, auto b) {{ return a < b ? a : b; }};
 auto WHOLE = [](V a) {{ return (I)a; }};
 auto FLOAT = [](I a) {{ return (V)a; }};
 auto AT = [](const float* a, I i) {{ return a[i]; }};
+auto PAIR = [](const float* a, I i, V& right) {{ right = a[i + 1]; return a[i]; }};
 auto ANY = [](I a) {{ return a != 0; }};
 wp::vec_t<{length}, float> result_out;
 #pragma unroll
@@ -126,11 +140,11 @@ I iv = LESSER(WHOLE(v), I(corner[1]));
 V fu = u - FLOAT(iu);
 V fv = v - FLOAT(iv);
 I i = iv * width + iu;
-V top = AT(grey.data, i);
-top = top + fu * (AT(grey.data, i + step[0]) - top);
-i = i + step[1];
-V bottom = AT(grey.data, i);
-bottom = bottom + fu * (AT(grey.data, i + step[0]) - bottom);
+V right;
+V top = PAIR(grey.data, i, right);
+top = top + fu * (right - top);
+V bottom = PAIR(grey.data, i + step[1], right);
+bottom = bottom + fu * (right - bottom);
 V result = top + fv * (bottom - top);
 """
 
@@ -163,17 +177,20 @@ while (left != 0) {
     I east = inside & (iu + 1 < width);
     I north = iv >= 0;
     I south = iv + 1 < height;
-    auto LOOK = [=](I ok, I i) { return ok ? AT(from, ok ? i : I(0)) : V(0.0f); };
-    V color = LOOK(west & north, at);
-    color = color + fu * (LOOK(east & north, at + 2) - color);
-    V below = LOOK(west & south, at + 2 * width);
-    below = below + fu * (LOOK(east & south, at + 2 * width + 2) - below);
+    auto LOOK = [=](I ok, I i, V& opacity) {
+        const V value = PAIR(from, ok ? i : I(0), opacity);
+        opacity = ok ? opacity : V(0.0f);
+        return ok ? value : V(0.0f);
+    };
+    V alpha, next, low, low_next;
+    V color = LOOK(west & north, at, alpha);
+    color = color + fu * (LOOK(east & north, at + 2, next) - color);
+    alpha = alpha + fu * (next - alpha);
+    V below = LOOK(west & south, at + 2 * width, low);
+    below = below + fu * (LOOK(east & south, at + 2 * width + 2, low_next) - below);
+    low = low + fu * (low_next - low);
     color = color + fv * (below - color);
-    V alpha = LOOK(west & north, at + 1);
-    alpha = alpha + fu * (LOOK(east & north, at + 3) - alpha);
-    below = LOOK(west & south, at + 2 * width + 1);
-    below = below + fu * (LOOK(east & south, at + 2 * width + 3) - below);
-    alpha = alpha + fv * (below - alpha);
+    alpha = alpha + fv * (low - alpha);
     sum = sum + through * color;
     through = through * (1.0f - alpha);
     if (!ANY(through != 0.0f)) break;

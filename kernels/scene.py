@@ -31,7 +31,7 @@ class Frames:
 class Layers:
     """Textures and motion of all layers, L layers at K time samples."""
 
-    grey: wp.array[float]  # intensities of layer 0, which most looks go to, once more on their own
+    grey: wp.array[float]  # intensities of layer 0, which most looks go to, once more on their own; and a 0
     texels: wp.array[wp.vec2]  # all textures, row by row: (intensity · alpha, alpha)
     start: wp.array[int]  # (L,) first texel of each layer
     size: wp.array[wp.vec2i]  # (L,) width, height [texel]
@@ -351,7 +351,8 @@ def upload(
         size.append(grey.shape[::-1])
         total += grey.size
     return (
-        wp.array(np.ascontiguousarray(flat[0][:, 0]), dtype=float, device=device),
+        # one more, as the neighbour of the last texel is looked at even where it does not count
+        wp.array(np.append(flat[0][:, 0], np.float32(0.0)), dtype=float, device=device),
         wp.array(np.concatenate(flat), dtype=wp.vec2, device=device),
         wp.array(start, dtype=int, device=device),
         wp.array(np.array(size), dtype=wp.vec2i, device=device),
