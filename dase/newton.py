@@ -47,6 +47,7 @@ class Newton:
         self._choices = torch.tensor(LOOSE, dtype=torch.float64, device=moments.device)
         self.loose = self._choices[len(LOOSE) // 2]
         self.excess = torch.full((), 100.0, dtype=torch.float64, device=moments.device)
+        moments.excess = self.excess
         self.kept: dict[str, torch.Tensor] = {}
         self.prior = self._prior()
 
@@ -145,6 +146,7 @@ class Newton:
         rest = off - jacobian @ _solved(free, self.excess * pull)
         excess = rest @ whole @ rest * scenes / cells.kept["usual"]
         self.excess = torch.lerp(excess, self.excess, self.memory).clamp_min(1.0)
+        self.moments.excess = self.excess
         move = (share * move).clamp(-LONGEST, LONGEST)
         self._apply(move)
         cells.shift((jacobian @ move).view(cells.kept["fake_sum"].shape))
@@ -213,6 +215,7 @@ class Newton:
         """Take over what `state` returned."""
         self.kept = {name: value.to(self.moments.device) for name, value in state["kept"].items()}
         self.loose, self.excess = (state[name].to(self.moments.device) for name in ("loose", "excess"))
+        self.moments.excess = self.excess
 
 
 def _solved(matrix: torch.Tensor, right: torch.Tensor) -> torch.Tensor:

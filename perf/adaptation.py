@@ -46,6 +46,9 @@ SHARED = ROOT.parent / "shared"
 LEARNED = 8.0
 """Seconds of the recording that are learned from."""
 
+OBJECTS = 8
+"""Objects for every background in a pool of which either side has half: a scene shows about ten."""
+
 
 def prepare(row: Row, args: argparse.Namespace) -> Training:
     """Return the run of a row."""
@@ -71,7 +74,7 @@ def prepare(row: Row, args: argparse.Namespace) -> Training:
         looks,
         device=device,
         backgrounds=row.textures,
-        objects=2 * row.textures,
+        objects=(OBJECTS if row.disjoint else 2) * row.textures,
         seed=recipe.get("seed", 0),
     )
     ours, theirs = scenery.split(0.5) if row.disjoint else (scenery, scenery)

@@ -14,7 +14,7 @@ class Row:
         truth: Name of the sensor to be learned.
         finite: Sequences of real data, recorded once; 0 for new ones in every step.
         disjoint: Whether real scenes have textures that simulated ones have not.
-        textures: Backgrounds in the pool, of which disjoint sides get a half each; twice as many objects.
+        textures: Backgrounds in the pool, of which disjoint sides get a half each.
         augment: Whether finite data is mirrored and turned.
         recipe: What differs from the default recipe.
         hash: What differs from the default hash.
