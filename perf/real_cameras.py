@@ -209,7 +209,8 @@ CAMERAS = {
     ),
     "dvx_noise_static": Camera(
         static, "iniVation, 640x480", "nothing moves, 2 s: noise alone, about 0.5 Hz per pixel",
-        (("noise of both polarities", ("shot", "voltage_noise")), ("a pixel that is stuck (one of 307,200, not among those compared)", ("hot",)),
+        (("noise of both polarities", ("shot", "voltage_noise")),
+         ("a pixel that is stuck, one of 307,200: it is not among those compared", ("hot",)),
          ("columns that are read every 195 µs", ("row_scan", "timestamp"))),
         0.2,
     ),
