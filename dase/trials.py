@@ -49,8 +49,8 @@ FINEST = 2
 """Samples per step of the grid at most: models that ask for more are simulated a little too coarsely."""
 
 ALONE = 1
-"""Effects up to which a sensor has a kernel of its own, up to twice as fast. Those with more share one that has
-all effects: it is compiled once, and not for each of hundreds of combinations."""
+"""Effects up to which a sensor has a kernel of its own, up to twice as fast. Those with more share one that
+has all effects: it is compiled once, and not for each of hundreds of combinations."""
 
 ROOM = 1 << 28
 """Memory for the sums of one launch [bytes]."""
@@ -79,7 +79,9 @@ class Trials:
     structure: Structure = field(default_factory=Structure)
     evaluations: int = 0
     work: float = 0.0
-    _kernels: dict[Any, Any] = field(default_factory=dict, repr=False)
+    _kernels: dict[Any, tuple[wp.Kernel, NDArray[np.float32], list[int]]] = field(
+        default_factory=dict, repr=False
+    )
 
     def __post_init__(self) -> None:
         self.device = self.stimulus.device
