@@ -11,11 +11,12 @@ import numpy as np
 import warp as wp
 from numpy.typing import NDArray
 
-from dase.effects import EFFECTS, Threshold
+from dase.effects import EFFECTS
 from dase.effects.optics import SceneEffect
 from dase.effects.readout import Readout
 from dase.effects.row_scan import RowScan
 from dase.effects.stream import StreamEffect
+from dase.effects.threshold import Threshold
 from dase.effects.timestamp import Timestamp
 from dase.events import Events
 from dase.kernels import launch, pixel, trials
