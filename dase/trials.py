@@ -11,9 +11,12 @@ import numpy as np
 import warp as wp
 from numpy.typing import NDArray
 
+from dase.effects import EFFECTS
+from dase.effects.optics import SceneEffect
 from dase.effects.readout import Readout
 from dase.effects.row_scan import RowScan
 from dase.effects.stream import StreamEffect
+from dase.effects.threshold import Threshold
 from dase.effects.timestamp import Timestamp
 from dase.events import Events
 from dase.kernels import launch, pixel, trials
@@ -46,6 +49,10 @@ FELT = 0.25
 FINEST = 2
 """Samples per step of the grid at most: models that ask for more are simulated a little too coarsely."""
 
+ALONE = 1
+"""Effects up to which a sensor has a kernel of its own, up to twice as fast. Those with more share one that
+has all effects: it is compiled once, and not for each of hundreds of combinations."""
+
 ROOM = 1 << 28
 """Memory for the sums of one launch [bytes]."""
 
@@ -73,6 +80,9 @@ class Trials:
     structure: Structure = field(default_factory=Structure)
     evaluations: int = 0
     work: float = 0.0
+    _kernels: dict[Any, tuple[wp.Kernel, NDArray[np.float32], list[int]]] = field(
+        default_factory=dict, repr=False
+    )
 
     def __post_init__(self) -> None:
         self.device = self.stimulus.device
@@ -98,11 +108,13 @@ class Trials:
         """
         finer = finer_steps(sensor, self.stimulus.grid.step) if finer is None else finer
         history = self.stimulus.history(finer)
-        kernel = trials.compose(sensor.stages())
+        kernel, base, at = self._kernel(sensor)
         at_once = max(1, ROOM // (4 * len(self.stimulus.pixels) * (kernels.SIZE // self._group() + 80)))
         parts = []
         for first in range(0, len(vectors), at_once):
-            rows = np.ascontiguousarray(vectors[first : first + at_once], np.float32)
+            part = vectors[first : first + at_once]
+            rows = np.repeat(base[None], len(part), 0)
+            rows[:, at] = part
             sink = self.sink(len(rows), reseed=reseed)
             inputs = [
                 history, self._pixels, self.stimulus.width, self.stimulus.height, (seed + first) & 0x3FFFFFFF,
@@ -116,6 +128,17 @@ class Trials:
         grid = self.stimulus.grid
         self.work += len(vectors) * len(self.stimulus.pixels) * grid.step * (grid.steps - 1)
         return Sums.join(parts)
+
+    def _kernel(self, sensor: Sensor) -> tuple[wp.Kernel, NDArray[np.float32], list[int]]:
+        """Return the kernel of a sensor, a parameter vector for it, and the places of the sensor's own."""
+        key = tuple((e.name, *(getattr(e, name) for name in e.choices())) for e in sensor.effects)
+        if key not in self._kernels:
+            stages = sensor.stages()
+            wide = whole(sensor) if len(stages) > ALONE else sensor
+            names = wide.parameter_names()
+            at = [names.index(name) for name in sensor.parameter_names()]
+            self._kernels[key] = trials.compose(wide.stages()), wide.parameters(), at
+        return self._kernels[key]
 
     def look(self, events: Events) -> Sums:
         """Sum up stored events; those of other pixels are left out."""
@@ -253,6 +276,15 @@ class _Light(Scene):
 
     def frames(self, times: NDArray[np.float64], device: str = "cpu") -> NDArray[np.float32]:
         raise NotImplementedError("some pixels are no picture")
+
+
+def whole(sensor: Sensor) -> Sensor:
+    """Return a sensor with every effect of a pixel that dase has, switched off where the sensor lacks it."""
+    for name, effect in EFFECTS.items():
+        inside = not issubclass(effect, StreamEffect | SceneEffect | Threshold) and not effect.maps
+        if inside and name not in sensor:
+            sensor = sensor.with_effect(effect.identity())
+    return sensor
 
 
 def delay_of(effect: StreamEffect, lines: int) -> float:
