@@ -70,7 +70,10 @@ def check_head(path: Path) -> None:
     if head[8] > 1:
         return
     if head[13:15] != b"\x08\x08":
-        raise InputError(f"has addresses of {head[13]} bytes and lengths of {head[14]}, which are not read")
+        raise InputError(
+            "cannot be read as HDF5, damaged or cut short: "
+            f"it claims addresses of {head[13]} bytes and lengths of {head[14]}"
+        )
     place = 48 + 4 * head[8]
     if head[place : place + 8] != b"\xff" * 8:
         raise InputError("is HDF5 in several files, which is not read, or damaged")
