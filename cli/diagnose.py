@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -147,6 +148,8 @@ def _print(found: Diagnosis, quiet: bool) -> None:
     for step in found.history:
         click.echo(f"\n{' + '.join(step.model)}: error {step.error:.2f}, repeats stay below {step.gate:.2f}")
         for rank in step.ranking[:5]:
+            if math.isnan(rank.error):  # given up before it was judged
+                continue
             mark = "+" if rank.effect == step.chosen else " "
             click.echo(
                 f"  {mark} {rank.effect:14s} error {rank.error:6.2f}  {100 * rank.share:3.0f} % of the way "
