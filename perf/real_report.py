@@ -198,7 +198,7 @@ error is that of pixels and times that no fit has seen; 1 is what two repeats of
 ![measured events, simulated events, and the falling error of each recording](real-cameras.png)
 
 Left: measured. Middle: what the announced model makes of the same scene at the same time; thresholds alone
-where the error stays unexplained. Right: the error with each effect added; the green band is what chance alone
+where the error stays unexplained. Right: the error with each effect added; the green band is what chance
 reaches, dashed steps are stand-ins that do not reach it and are not announced. Red is ON, blue is OFF.
 
 The scene between two frames of a camera is a guess. Only where it can be trusted anything is compared (see
