@@ -87,9 +87,13 @@ def _draw_run(folder: Path, output: Path) -> None:
 def _draw_trust(sequence: Sequence, output: Path, title: str, window: float | None) -> None:
     """Draw it, and say how much is trusted."""
     from dase import io, trust
+    from dase.measurement import between_frames
 
-    scene = trust.scene_of(sequence)
+    notes: list[str] = []
+    scene = between_frames(sequence, notes)
     figure = trust.draw(scene, sequence.events, title=title, window=window)
     with io.replacing(output) as temporary:
         figure.savefig(temporary)
     click.echo(f"{100 * scene.trusted().mean():.0f} % of pixels and times trusted")
+    for note in notes:
+        click.echo(note)

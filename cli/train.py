@@ -60,7 +60,7 @@ def command(
 
     try:
         from dase import adaptation
-        from dase.run import Pace, run
+        from dase.run import CHECKPOINT, Pace, run
     except ModuleNotFoundError as error:
         if error.name not in ("torch", "safetensors"):
             raise
@@ -74,6 +74,8 @@ def command(
         training = adaptation.prepare(job, progress=opened)
     pace = Pace(look=10 if preset == "tiny" else 25, seconds=None if minutes is None else 60 * minutes)
     with _live(training, output if tensorboard else None) as look:
+        # killed before its first checkpoint, a run begins anew
+        resume = resume and (output / CHECKPOINT).is_file()
         last = run(training, output, pace=pace, resume=resume, look=look)
     width, height = training.scenery.looks.width, training.scenery.looks.height
     recorded = None if job.of_sensor else (width, height)

@@ -172,10 +172,11 @@ def _textures(job: Job, looks: Looks) -> Scenery:
         raise InputError("--images frames needs recordings; a sensor file has no frames")
     source = images.open_images(job.images)
     small = job.preset == "tiny"
+    # a scene shows ten objects, so few of them make few different scenes, unlike the target's
+    backgrounds = 24 if small else 96
     return Scenery(
-        source, looks, device=job.backend, seed=job.seed, backgrounds=24 if small else 48,
-        objects=48 if small else 96,
-    )  # fmt: skip
+        source, looks, device=job.backend, seed=job.seed, backgrounds=backgrounds, objects=8 * backgrounds
+    )
 
 
 def _recorded(job: Job, progress: Callable[[str, int, int], None]) -> tuple[Target, Scenery]:

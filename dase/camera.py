@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from dase.errors import InputError
+from dase.events import Events
 from dase.kernels import between, launch
 from dase.kernels.pixel import Frames
 from dase.matching import Match, match
@@ -260,11 +261,25 @@ class CameraScene(Scene):
         Returns:
             Whether a pixel is `trusted` in the interval a time lies in, shape (K, N).
         """
+        at, inside = self._within(times)
+        return np.asarray(self._kept_trust()[at][:, pixels] & inside[:, None])
+
+    def believed(self, events: Events) -> Events:
+        """Return the events of pixels and times at which the scene is to be trusted, see `trusts`."""
+        at, inside = self._within(events.t)
+        pixels = events.y.astype(np.int64) * self.width + events.x
+        return events.select(self._kept_trust()[at, pixels] & inside)
+
+    def _kept_trust(self) -> NDArray[np.bool_]:
+        """Return `trusted` with pixels row by row, shape (F - 1, N)."""
         if self._trusted is None:
             self._trusted = self.trusted().reshape(len(self.times) - 1, -1)
+        return self._trusted
+
+    def _within(self, times: NDArray[np.float64]) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
+        """Return the interval of each time, the nearest where it lies outside, and whether it lies inside."""
         at = np.clip(np.searchsorted(self.times, times, "right") - 1, 0, len(self.times) - 2)
-        inside = (times >= self.times[0]) & (times <= self.times[-1])
-        return np.asarray(self._trusted[at][:, pixels] & inside[:, None])
+        return at, (times >= self.times[0]) & (times <= self.times[-1])
 
     def _moments(self, interval: int) -> NDArray[np.float64]:
         """Return times from a frame to just before the next [s]."""

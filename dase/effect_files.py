@@ -21,7 +21,7 @@ import warp as wp
 from dase.effects import EFFECTS, Effect, StreamEffect
 from dase.errors import InputError, nearest
 from dase.events import LABELS
-from dase.kernels import pixel
+from dase.kernels import compose, pixel, text
 from dase.sensor import Sensor, simulate
 from dase.video import VideoScene
 
@@ -195,7 +195,7 @@ class _Definition:
         taken = {q for qs in pixel.QUANTITIES.values() for q in qs} | set(pixel.ANYWHERE)
         taken |= set(NOISE) if "noise" in effect.stages else set()
         for name in (*known, *effect.states):
-            if name in taken or pixel.DRAW.fullmatch(name):
+            if name in taken or text.DRAW.fullmatch(name):
                 raise self.wrong(f"{effect.name}.{name}: the name is one of dase's own; choose another")
         if len({*known, *effect.states}) != len(known) + len(effect.states):
             raise self.wrong(f"effect '{effect.name}': parameters and states must have names of their own")
@@ -233,7 +233,7 @@ class _Definition:
                 raise self.wrong("stage 'threshold' comes once per pixel and has no time", line)
             alone = dataclasses.replace(effect().compiled(), functions=((stage, function),))
             try:
-                pixel.source_text((alone,), "frames", "keys")
+                compose.source_text((alone,), "frames", "keys")
             except ValueError as error:
                 raise self.wrong(str(error), line) from error
 

@@ -114,6 +114,18 @@ def scene_of_frames(sequence: Sequence, path: Path, notes: list[str]) -> Scene:
         raise InputError(f"{path}: its frames have no times, so they cannot be laid beside the events")
     if float(np.median(np.diff(times))) <= COARSEST * (1 + 1e-6):
         return VideoScene(linear(sequence.frames, path), times)
+    return between_frames(sequence, notes)
+
+
+def between_frames(sequence: Sequence, notes: list[str]) -> CameraScene:
+    """Return the scene between the frames of a sequence, laid on its events; `notes` gets what was found out.
+
+    Raises:
+        InputError: There are not two frames, or their times are not known.
+    """
+    times = sequence.frame_times
+    if sequence.frames is None or len(sequence.frames) < 2 or times is None:
+        raise InputError("the scene between frames needs at least 2 frames with known times")
     half = 0.5 * (np.zeros(len(times)) if sequence.frame_exposure is None else sequence.frame_exposure)
     frames, begin, end = aligned(sequence.events, sequence.frames, times - half, times + half, notes)
     return camera_scene(frames, begin, end, notes)

@@ -24,8 +24,11 @@ from torch.nn import functional as F
 from dase.networks import TINY, gradient_magnitude, looks
 from dase.targets import Pairs
 
-RIDGE = 0.2
-"""Added to the variances before they are inverted, as a share; more while few scenes have been seen."""
+RIDGE = 0.1
+"""Added to the variances before they are inverted, as a share."""
+
+UNSURE = 0.1
+"""The same for each feature per scene that has been seen: few scenes tell little of their covariance."""
 
 LONG = 0.99
 """The same of the moments of columns and rows."""
@@ -148,10 +151,13 @@ class Cells:
         fake = kept["fake_sum"] / kept["fake_number"].clamp_min(1)[:, None]
         return torch.where(known[:, None], fake - real, 0.0)
 
-    def weigh(self, doubt: float = 0.0) -> None:
+    def weigh(self, doubt: float = 0.0, excess: torch.Tensor | float = 1.0) -> None:
         """Set the weights to the inverse covariance of what one scene adds to the means.
 
-        With `doubt`, means also differ by that share of themselves for reasons that thresholds cannot cure.
+        Args:
+            doubt: Share of themselves by which means differ for reasons that thresholds cannot cure.
+            excess: By how much more than chance they differ after a linear step. Where it is large, what
+                varies little is not what tells most, and the weights become those of single features.
         """
         kept = self.kept
         cells, width = kept["plain_sum"].shape
@@ -161,10 +167,10 @@ class Cells:
         diagonal = covariance.diagonal(dim1=-2, dim2=-1)
         # a feature that never varies says nothing
         floor = 1e-6 + 1e-3 * diagonal.mean(-1, keepdim=True)
-        ridge = RIDGE + diagonal.shape[-1] / kept["scenes"]
+        ridge = excess * (RIDGE + UNSURE * diagonal.shape[-1] / kept["scenes"])
         mean = kept["real_sum"] / kept["real_number"].clamp_min(1)[:, None]
         wrong = (doubt * mean).square().reshape(diagonal.shape) * kept["real_scenes"]
-        weight = torch.linalg.inv(covariance + torch.diag_embed(ridge * diagonal + floor + wrong))
+        weight, _ = torch.linalg.inv_ex(covariance + torch.diag_embed(ridge * diagonal + floor + wrong))
         kept["usual"].copy_((weight * covariance).sum())
         kept["weight"].copy_(weight / (cells * width))
 
@@ -188,6 +194,9 @@ class Moments:
         memory: Share of the fake means that stays from step to step.
         scenes: How many different real scenes there are.
         doubt: Share by which a mean may differ for reasons that thresholds cannot cure.
+
+    Attributes:
+        excess: See `Cells.weigh`; set by what moves the thresholds.
     """
 
     def __init__(
@@ -201,6 +210,7 @@ class Moments:
         doubt: float = 0.0,
     ):
         self.scenes, self.doubt = scenes, doubt
+        self.excess: torch.Tensor | float = 1.0
         self.device, self.levels, self.pattern, self.memory = torch.device(device), levels, pattern, memory
         self.boundaries: list[torch.Tensor] = []
         self.sets: dict[str, Cells] = {}
@@ -269,7 +279,7 @@ class Moments:
     def weigh(self) -> None:
         """Work out the weights."""
         for cells in self.sets.values():
-            cells.weigh(self.doubt)
+            cells.weigh(self.doubt, self.excess)
 
     def loss(self, fake: Pairs, real: Pairs, *, move: bool) -> tuple[torch.Tensor, dict[str, torch.Tensor]]:
         """Take both batches in; return the fake means of this batch along what they are off."""

@@ -44,9 +44,12 @@ class Newton:
 
     def __init__(self, moments: Moments, net: ThresholdNet, *, memory: float = 0.95):
         self.moments, self.net, self.memory = moments, net, memory
-        self.loose = LOOSE[len(LOOSE) // 2]
-        self.excess = 100.0
+        self._choices = torch.tensor(LOOSE, dtype=torch.float64, device=moments.device)
+        self.loose = self._choices[len(LOOSE) // 2]
+        self.excess = torch.full((), 100.0, dtype=torch.float64, device=moments.device)
+        moments.excess = self.excess
         self.kept: dict[str, torch.Tensor] = {}
+        self.prior = self._prior()
 
     @torch.no_grad()
     def see(self, fake: Pairs) -> None:
@@ -58,9 +61,10 @@ class Newton:
             above, below = ends[name]
             return (add(above) - add(below)) / (2 * STEP)
 
-        member = self.moments.members(fake.grey)
+        grey = fake.grey[fake.some]
+        member = self.moments.members(grey)
         self._keep("number", member.sum((0, 1)).double())
-        weights = self.net.basis(fake.grey).flatten(2).transpose(1, 2)  # (B, N, nodes)
+        weights = self.net.basis(grey).flatten(2).transpose(1, 2)  # (B, N, nodes)
         for name in ends:
             flat = slope(name, with_neighbours).flatten(2).transpose(1, 2)  # (B, N, F)
             total: torch.Tensor | int = 0
@@ -77,7 +81,7 @@ class Newton:
                 self._keep(f"column_{name}", down.sum((0, 2)).T.double(), LONG)
                 self._keep(f"row_{name}", across.sum((0, 3)).T.double(), LONG)
         if self.moments.pattern:
-            batch, _, height, width = fake.counts.shape
+            batch, height, width = grey.shape
             self._keep("column_number", fake.counts.new_full((width,), batch * height).double(), LONG)
             self._keep("row_number", fake.counts.new_full((height,), batch * width).double(), LONG)
 
@@ -103,7 +107,7 @@ class Newton:
                 edge = torch.zeros(len(a), nodes, dtype=torch.float64)
                 edge[torch.arange(len(a)), a], edge[torch.arange(len(a)), b] = 1, -1
                 laplacian += edge.T @ edge
-        size = 2 * nodes + int("ratio" in self.kept)
+        size = 2 * nodes + int(self.net.shape.split)
         out = torch.zeros(size, size, dtype=torch.float64)
         out[:nodes, :nodes] = out[nodes : 2 * nodes, nodes : 2 * nodes] = laplacian
         return out.to(self.moments.device)
@@ -123,7 +127,7 @@ class Newton:
     def step(self, share: float) -> None:
         """Move the shared numbers by `share` of what makes the moments vanish, as far as the prior lets."""
         cells = self.moments.sets["look"]
-        jacobian, prior = self._jacobian(), self._prior()
+        jacobian, prior = self._jacobian(), self.prior
         # weights are of one scene, and per cell and feature
         whole = cells.kept["weight"][0].double() * len(jacobian)
         scenes = 1 / (1 / self._scenes(cells) + 1 / cells.kept["scenes"])
@@ -136,12 +140,13 @@ class Newton:
         if self.moments.calls % 25 == 0 and self.net.shape.table is not None:
             self._choose(curve + tiny, curve @ here - pull, prior)
         hold = prior / self.loose**2
-        move = -torch.linalg.solve(curve + hold + tiny, pull + hold @ here)
+        move = -_solved(curve + hold + tiny, pull + hold @ here)
         # as a table that nothing holds leaves it, or a firm one would look like a bad model
         free = self.excess * curve + prior / LOOSE[-1] ** 2 + tiny
-        rest = off - jacobian @ torch.linalg.solve(free, self.excess * pull)
-        excess = float(rest @ whole @ rest * scenes / cells.kept["usual"])
-        self.excess = max(1.0, self.memory * self.excess + (1 - self.memory) * excess)
+        rest = off - jacobian @ _solved(free, self.excess * pull)
+        excess = rest @ whole @ rest * scenes / cells.kept["usual"]
+        self.excess = torch.lerp(excess, self.excess, self.memory).clamp_min(1.0)
+        self.moments.excess = self.excess
         move = (share * move).clamp(-LONGEST, LONGEST)
         self._apply(move)
         cells.shift((jacobian @ move).view(cells.kept["fake_sum"].shape))
@@ -160,13 +165,14 @@ class Newton:
             data: The same times what the data alone makes of them, (p,).
             prior: Precision at unit spread, (p, p).
         """
-        rank = float(torch.linalg.matrix_rank(prior))
+        # the differences of the nodes of μ and of σ; nothing holds their levels and the ratio
+        rank = 2 * (self.kept["mu"].shape[2] - 1)
         scores = []
         for loose in LOOSE:
             whole = curve + prior / loose**2
-            fit = 0.5 * data @ torch.linalg.solve(whole, data)
+            fit = 0.5 * data @ _solved(whole, data)
             scores.append(fit - 0.5 * torch.linalg.slogdet(whole).logabsdet - rank * math.log(loose))
-        self.loose = LOOSE[int(torch.stack(scores).argmax())]
+        self.loose = self._choices.take(torch.stack(scores).argmax())
 
     def _apply(self, move: torch.Tensor) -> None:
         net = self.net
@@ -195,7 +201,7 @@ class Newton:
             unit = 1 / (scenes * weight.shape[0] * weight.shape[1] * loose**2)
             eye = torch.eye(2, device=curve.device, dtype=curve.dtype)
             here = offsets.T.double()
-            move = -torch.linalg.solve(curve + unit * eye, pull + unit * here)
+            move = -_solved(curve + unit * eye, pull + unit * here)
             move = (0.5 * share * (move - move.mean(0))).clamp(-LONGEST, LONGEST)
             move = (here + move).clamp(-WIDEST, WIDEST) - here
             offsets += move.T.float()
@@ -208,4 +214,11 @@ class Newton:
     def load(self, state: dict[str, Any]) -> None:
         """Take over what `state` returned."""
         self.kept = {name: value.to(self.moments.device) for name, value in state["kept"].items()}
-        self.loose, self.excess = state["loose"], state["excess"]
+        self.loose, self.excess = (state[name].to(self.moments.device) for name in ("loose", "excess"))
+        self.moments.excess = self.excess
+
+
+def _solved(matrix: torch.Tensor, right: torch.Tensor) -> torch.Tensor:
+    """Return the solution of a linear system, without waiting for the GPU to say whether there is one."""
+    out: torch.Tensor = torch.linalg.solve_ex(matrix, right[..., None])[0][..., 0]
+    return out

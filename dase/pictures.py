@@ -14,6 +14,8 @@ from dase.errors import InputError
 SUFFIXES = ("jpg", "jpeg", "png", "bmp", "tif", "tiff", "webp", "ppm", "pgm")
 """Picture files, whatever their case."""
 
+PNG = b"\x89PNG\r\n\x1a\n"
+
 
 def list_pictures(folder: Path) -> list[Path]:
     """Return the picture files below a folder by name, without hidden ones."""
@@ -45,18 +47,44 @@ def to_grey(pixels: NDArray[Any]) -> tuple[NDArray[np.float32], NDArray[np.float
 
 def decode(path: Path) -> NDArray[Any]:
     """Return pixels as they are in the file: (H, W) or (H, W, channels), uint8 or uint16, BGR or BGRA."""
-    level = cv2.utils.logging.getLogLevel()
-    cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)  # our sentence is enough
     try:
-        pixels = cv2.imdecode(np.frombuffer(path.read_bytes(), np.uint8), cv2.IMREAD_UNCHANGED)
+        data = path.read_bytes()
     except OSError as error:
         raise InputError(f"images: cannot read '{path}': {error.strerror}") from error
-    except cv2.error:  # an empty file, or more pixels than OpenCV takes
-        pixels = None
-    finally:
-        cv2.utils.logging.setLogLevel(level)
+    pixels = unpack(data, cv2.IMREAD_UNCHANGED)
     if pixels is None:
         raise InputError(f"images: cannot decode '{path}': damaged, cut off or too large")
     if pixels.dtype not in (np.uint8, np.uint16):
         raise InputError(f"images: '{path}' must hold 8- or 16-bit values, holds {pixels.dtype}")
     return np.asarray(pixels)
+
+
+def unpack(data: bytes, how: int) -> NDArray[Any] | None:
+    """Return what OpenCV makes of the bytes of a picture, None where it is damaged.
+
+    Args:
+        data: The content of a file.
+        how: Flags of `cv2.imdecode`.
+    """
+    if data.startswith(PNG) and not _whole(data):
+        return None  # OpenCV 5 takes as much memory as a part says it is long
+    level = cv2.utils.logging.getLogLevel()
+    cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)  # our sentence is enough
+    try:
+        pixels: NDArray[Any] | None = cv2.imdecode(np.frombuffer(data, np.uint8), how)
+    except cv2.error:  # an empty file, or more pixels than OpenCV takes
+        return None
+    finally:
+        cv2.utils.logging.setLogLevel(level)
+    return pixels
+
+
+def _whole(data: bytes) -> bool:
+    """Whether all parts of a PNG are there: u32 length, 4 letters, content, u32 sum; the last is IEND."""
+    place = len(PNG)
+    while place + 12 <= len(data):
+        length, name = int.from_bytes(data[place : place + 4], "big"), data[place + 4 : place + 8]
+        place += 12 + length
+        if name == b"IEND":
+            break
+    return place <= len(data)

@@ -10,8 +10,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from dase.errors import InputError
 from dase.events import Events
+from dase.kernels import compose, emission, launch, pixel
 from dase.kernels import counts as counting
-from dase.kernels import emission, launch, pixel
 from dase.kernels import events as ordering
 from dase.kernels.random import stream
 from dase.scene import Scene
@@ -88,9 +88,6 @@ class Pixels:
         # nothing but a change detector: counted by a kernel of its own, several pixels per thread
         self._plain = all(stage == "threshold" for effect in self.stages for stage, _ in effect.functions)
         self._vectors = vectors
-        # a CPU takes logarithms of many pixels at once, unless the light is not the scene's
-        lit = any(stage == "light" for effect in self.stages for stage, _ in effect.functions)
-        self._logs_at_once = self.device.is_cpu and not lit and bool(np.all(vectors[:, 3] == vectors[0, 3]))
         self._levels: tuple[Any, Any] | None = None
         self._mapped: list[Any] | None = None
         self._bits = max((self.batch * self.count - 1).bit_length(), 1)
@@ -252,7 +249,7 @@ class Pixels:
         if not any(effect.functions for effect in self.stages):
             level = wp.array(self._vectors[:, 1::-1, None].copy(), dtype=float, device=self.device)
         else:
-            kernel = pixel.compose_thresholds(self.stages)
+            kernel = compose.compose_thresholds(self.stages)
             level = wp.empty((self.batch, 2, self.count), dtype=float, device=self.device)
             inputs = [self._pixels, self.width, self.height, self.seed, self._parameters]
             inputs += [*self._maps(), level]
@@ -272,24 +269,19 @@ class Pixels:
     ) -> None:
         self.look_at(scene)
         source_name, source = self.sensor.seen(scene).source(times, self.pixels, self.device)
-        if source_name == "frames" and self._logs_at_once:
-            source_name, source.logs = "both", self._logs(source.values)
-        kernel = pixel.compose(self.stages, source_name, sink_name, cuda=self.device.is_cuda)
+        lanes = self._lanes(source_name)
+        kernel = compose.compose(self.stages, source_name, sink_name, lanes=lanes)
         clock = self._clock(times, windows)
         inputs = [
             source, clock, self._pixels, self.width, self.height, self.samples, self.seed,
             self._parameters, *self._maps(), self._state, self._next, sink,
         ]  # fmt: skip
-        launch.run(kernel, self.count, inputs, self.device, batch=self.batch, align=align)
+        size, align = (counting.blocks(self.count, lanes), align // lanes) if lanes else (self.count, align)
+        launch.run(kernel, size, inputs, self.device, batch=self.batch, align=align)
 
-    def _logs(self, values: Any) -> Any:
-        """Return the log intensity of stored intensities."""
-        out = wp.empty(values.shape, dtype=float, device=self.device)
-        lanes = counting.widest(self.count, self.device, "frames")
-        inputs = [values, float(self._vectors[0, 3]), out]
-        size = counting.blocks(self.count, lanes)
-        launch.run(counting.take_logs(lanes), size, inputs, self.device, batch=len(values))
-        return out
+    def _lanes(self, source_name: str) -> int:
+        """Return how many pixels a thread of the composed kernel works on; 0 for CUDA's kernel."""
+        return 0 if self.device.is_cuda else counting.widest(self.count, self.device, source_name)
 
     def _edges(self, times: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the end of the last step and the samples that follow [s], shape (K + 1,)."""

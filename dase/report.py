@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from html import escape
 from itertools import pairwise
 from pathlib import Path
@@ -11,6 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from dase import figures, page
+from dase.camera import CameraScene
 from dase.config import dump_sensor
 from dase.distinguish import WORDS
 from dase.events import Events
@@ -23,6 +25,8 @@ from dase.sensor import Sensor, stream
 
 LONGEST = 2.0
 """Of what is pictured [s]."""
+
+BELIEVED = "Events are shown only where and when the scene between the frames can be trusted."
 
 
 def write(path: Path, html: str) -> None:
@@ -49,8 +53,12 @@ def pictures(measured: Measurement, sensor: Sensor, *, seed: int = 0, device: st
             break
     shown = times[np.unique(np.searchsorted(times, np.linspace(begin, end, 13)[:-1]))]
     frames = np.clip(255 * measured.scene.frames(shown), 0, 255).astype(np.uint8)
-    simulated = Events.concatenate(parts)
-    return event_plates(measured.events, simulated, (begin, end), frames=frames, frame_times=shown)
+    real, made = measured.events, Events.concatenate(parts)
+    if not isinstance(measured.scene, CameraScene):
+        return event_plates(real, made, (begin, end), frames=frames, frame_times=shown)
+    real, made = measured.scene.believed(real), measured.scene.believed(made)
+    plates = event_plates(real, made, (begin, end), frames=frames, frame_times=shown)
+    return [replace(plate, caption=f"{plate.caption} {BELIEVED}") for plate in plates]
 
 
 def comparison_page(

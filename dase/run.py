@@ -20,8 +20,8 @@ from dase.training import Recipe, Training
 CHECKPOINT, RESULT, BEST = "checkpoint.pt", "result.pt", "best.pt"
 LOG, RECIPE = "log.csv", "recipe.json"
 
-TIMED = 30, 60
-"""Steps between which the speed is measured where a run is to take a given time."""
+TIMED = 30
+"""Steps from which, and over which, the speed is measured first where a run is to take a given time."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -103,7 +103,8 @@ class _Run:
     def go(self) -> dict[str, float]:
         training = self.training
         begin = time.perf_counter() - training.seconds
-        saved = mark = time.perf_counter()
+        saved = time.perf_counter()
+        mark = max(training.step, TIMED), saved
         row: dict[str, float] = {"step": training.step, "seconds": training.seconds} | self.exam.marks(
             training.mean
         )
@@ -111,12 +112,11 @@ class _Run:
             values = training.advance()
             wrong = ~torch.isfinite(values["loss"]) & (self.broken < 0)
             self.broken = torch.where(wrong, training.step - 1, self.broken)
-            if training.step == TIMED[0]:
+            if self.pace.seconds is not None and training.step in (TIMED, 2 * mark[0]):
                 _wait(training.device)
-                mark = time.perf_counter()
-            if training.step == TIMED[1] and self.pace.seconds is not None:
-                _wait(training.device)
-                self._fit_time(mark, begin)
+                if training.step > TIMED:
+                    self._fit_time(*mark, begin)
+                mark = training.step, time.perf_counter()
             last = training.step == training.recipe.steps
             if training.step % self.pace.look == 0 or last:
                 _wait(training.device)
@@ -128,14 +128,13 @@ class _Run:
         save(self.out / RESULT, {"net": training.mean.state_dict(), "row": row})
         return row
 
-    def _fit_time(self, mark: float, begin: float) -> None:
-        """Set the number of steps so that the run takes the time it may."""
+    def _fit_time(self, step: int, mark: float, begin: float) -> None:
+        """Set the number of steps so that the run takes the time it may, by its speed since `mark`."""
         training = self.training
         assert self.pace.seconds is not None
-        each = (time.perf_counter() - mark) / (TIMED[1] - TIMED[0])
+        each = (time.perf_counter() - mark) / (training.step - step)
         left = self.pace.seconds - (time.perf_counter() - begin)
-        steps = TIMED[1] + max(int(0.97 * left / each), 1)
-        training.recipe = replace(training.recipe, steps=steps)
+        training.recipe = replace(training.recipe, steps=training.step + max(int(0.97 * left / each), 1))
         with replacing(self.out / RECIPE) as temporary:
             temporary.write_text(training.recipe.text(), "utf-8")
 
@@ -174,7 +173,7 @@ class _Run:
 
 
 class _Table:
-    """A CSV file that is complete after every line.
+    """A CSV file of which every line but the last is whole, however a run ends.
 
     Args:
         path: File; lines after `step` of an interrupted run are dropped.
@@ -184,32 +183,38 @@ class _Table:
     def __init__(self, path: Path, step: int):
         self.path = path
         self.names: list[str] = []
+        self.rows: list[dict[str, str]] = []
         if not path.exists():
             return
         with path.open(newline="", encoding="utf-8") as file:
-            rows = list(csv.DictReader(file))
-        path.unlink()
-        for row in rows:
-            if step > 0 and int(float(row["step"])) <= step:
-                self.add({name: float(value) for name, value in row.items() if value})
+            reader = csv.DictReader(file)
+            # a line that was cut lacks columns
+            rows = [row for row in reader if None not in row.values()]
+            self.names = list(reader.fieldnames or [])
+        self.rows = [row for row in rows if step > 0 and int(float(row["step"])) <= step]
+        if self.rows:
+            self._rewrite()
+        else:
+            self.names = []
+            path.unlink()
 
     def add(self, row: dict[str, float]) -> None:
         """Append a line; columns that come later are added to the file."""
+        line = {name: f"{value:.6g}" for name, value in row.items()}
         new = [name for name in row if name not in self.names]
-        if new and self.names:
-            with self.path.open(newline="", encoding="utf-8") as file:
-                before = list(csv.DictReader(file))
-            self.path.unlink()
-        else:
-            before = []
         self.names += new
-        fresh = not self.path.exists()
+        self.rows.append(line)
+        if new:
+            self._rewrite()
+            return
         with self.path.open("a", newline="", encoding="utf-8") as file:
+            csv.DictWriter(file, self.names).writerow(line)
+
+    def _rewrite(self) -> None:
+        with replacing(self.path) as temporary, temporary.open("w", newline="", encoding="utf-8") as file:
             writer = csv.DictWriter(file, self.names)
-            if fresh:
-                writer.writeheader()
-            writer.writerows(before)
-            writer.writerow({name: f"{value:.6g}" for name, value in row.items()})
+            writer.writeheader()
+            writer.writerows(self.rows)
 
 
 def save(path: Path, state: dict[str, Any]) -> None:

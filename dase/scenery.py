@@ -129,25 +129,26 @@ class Scenery:
         size = self.size[which]
         size[:, 0] = BACKGROUND[::-1]
         place, box = motion.places(looks, size)
-        to = self._to
+        ground = rng.integers(len(self.grey), size=count).astype(np.int32)
+        ground, start, size, place, box = self._sent(ground, self.start[which], size, place, box)
         return bridge.render_log(
-            self.grey,
-            self.texels,
-            to(rng.integers(len(self.grey), size=count).astype(np.int32)),
-            to(self.start[which]),
-            to(size),
-            to(place),
-            to(box),
-            width=looks.width,
-            height=looks.height,
-            eps=LOG_EPS,
-        )
+            self.grey, self.texels, ground, start, size, place, box,
+            width=looks.width, height=looks.height, eps=LOG_EPS,
+        )  # fmt: skip
 
-    def _to(self, array: NDArray[Any]) -> torch.Tensor:
-        tensor = torch.from_numpy(np.ascontiguousarray(array))
-        if self.device.type != "cuda":
-            return tensor
-        return tensor.pin_memory().to(self.device, non_blocking=True)
+    def _sent(self, *arrays: NDArray[Any]) -> list[torch.Tensor]:
+        """Return arrays of 4-byte numbers as tensors on the device, sent in one piece."""
+        flat = np.concatenate([np.ascontiguousarray(a).view(np.int32).ravel() for a in arrays])
+        words = torch.from_numpy(flat)
+        if self.device.type == "cuda":
+            words = words.pin_memory().to(self.device, non_blocking=True)
+        out, begin = [], 0
+        for array in arrays:
+            part = words[begin : begin + array.size]
+            begin += array.size
+            kind = torch.float32 if array.dtype == np.float32 else torch.int32
+            out.append(part.view(kind).view(array.shape))
+        return out
 
 
 def middle(log: torch.Tensor) -> torch.Tensor:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -57,6 +57,7 @@ class Pairs:
         reference: Counts of the same scenes and noise at thresholds that never change, where simulated.
         varied: How the counts answer to the thresholds, where simulated.
         answers: Counts with all μ, σ and ratios at e^STEP and at e^-STEP of themselves, where simulated.
+        some: The pairs of which `answers` are.
     """
 
     grey: torch.Tensor
@@ -64,6 +65,7 @@ class Pairs:
     reference: torch.Tensor | None = None
     varied: Varied | None = None
     answers: dict[str, tuple[torch.Tensor, torch.Tensor]] | None = None
+    some: slice = field(default_factory=lambda: slice(None))
 
     def __len__(self) -> int:
         return len(self.grey)
@@ -262,8 +264,8 @@ def answers(
     if mu.ndim == 4:
         both = []
         for half in (math.sqrt(up), math.sqrt(down)):
-            factor = torch.tensor([1 / half, half], device=log.device).view(1, 2, 1, 1)
-            both.append(simulate(log, mu * factor, sigma * factor, noise))
+            means, spreads = (torch.stack([m[:, 0] / half, m[:, 1] * half], 1) for m in (mu, sigma))
+            both.append(simulate(log, means, spreads, noise))
         out["ratio"] = both[0], both[1]
     return out
 

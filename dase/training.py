@@ -16,10 +16,13 @@ from dase.newton import Newton
 from dase.objectives import Adversarial, Hash, Objective
 from dase.optimizers import AdaBelief
 from dase.scenery import Scenery, middle
-from dase.targets import Pairs, Target, answers, draw_noise, simulate, vary
+from dase.targets import Noise, Pairs, Target, answers, draw_noise, simulate, vary
 
 REFERENCE = 0.25, 0.06
 """Threshold and spread at which scenes are counted once more, to tell busy scenes from low thresholds."""
+
+DERIVED = 4
+"""Scenes of a step, at least, that are counted at other thresholds as well, to see how the moments answer."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -36,7 +39,8 @@ class Recipe:
         optimizer: Of the generator: `adam` (0.5, 0.99) or `adabelief` (0.9, 0.999).
         rate: Learning rate of the UNet.
         rate_scalars: Learning rate of the global numbers.
-        ramp: Steps over which the rates rise from 0; a cosine takes them back to 0 at the end.
+        ramp: Steps over which the rates rise from 0, at most a quarter of all; a cosine takes them back to 0
+            at the end.
         average: Decay of the running mean of the weights that is the result; 0 takes the last weights.
         anchor: Weight of the mean square residual.
         smooth: Weight of the roughness of the table.
@@ -117,8 +121,11 @@ class Training:
         torch.manual_seed(recipe.seed)
         self.net = ThresholdNet(recipe.network, mu=recipe.mu, sigma=recipe.sigma).to(self.device)
         self.net = self.net.to(memory_format=torch.channels_last)
-        self.mean = ThresholdNet(recipe.network).to(self.device)
+        self.mean = ThresholdNet(recipe.network).to(self.device).to(memory_format=torch.channels_last)
         self.mean.load_state_dict(self.net.state_dict())
+        if self.device.type == "cuda":
+            # every step has the same shapes, so trying convolutions out once pays
+            torch.backends.cudnn.benchmark = True
         self.optimizer = self._optimizer()
         self.objective = self._objective()
         moments = self.objective
@@ -196,15 +203,23 @@ class Training:
             level = torch.full_like(grey, REFERENCE[0])
             reference = simulate(log, level, REFERENCE[1], noise)
         varied = vary(log, mu, sigma, noise) if self.recipe.rate > 0 else None
-        near = answers(log, mu.detach(), sigma.detach(), noise)
-        return Pairs(grey, counts, reference, varied, near), maps.residual
+        some = self._some(len(log))
+        few = Noise(noise.z[some], noise.phase[some])
+        near = answers(log[some], mu.detach()[some], sigma.detach()[some], few)
+        return Pairs(grey, counts, reference, varied, near, some), maps.residual
+
+    def _some(self, batch: int) -> slice:
+        """Return which scenes of a batch the derivatives are taken of, others in every step."""
+        every = max(batch // DERIVED, 1)
+        return slice(self.step % every, None, every)
 
     def rate(self) -> float:
         """Return the share of the full learning rates at this step."""
-        step, recipe = self.step, self.recipe
-        fall = max(recipe.steps - recipe.ramp, 1)
-        cosine = 0.5 * (1 + math.cos(math.pi * min(max(step - recipe.ramp, 0) / fall, 1)))
-        return min((step + 1) / max(recipe.ramp, 1), 1) * cosine
+        step, steps = self.step, self.recipe.steps
+        ramp = min(self.recipe.ramp, max(steps // 4, 1))
+        fall = max(steps - ramp, 1)
+        cosine = 0.5 * (1 + math.cos(math.pi * min(max(step - ramp, 0) / fall, 1)))
+        return min((step + 1) / max(ramp, 1), 1) * cosine
 
     def advance(self) -> dict[str, torch.Tensor]:
         """Do one step; return what is worth logging, still on the device."""

@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 from dase.camera import RELATIVE, TOLERANCE, CameraScene
 from dase.errors import InputError
 from dase.events import Events
-from dase.io.sequence import Sequence
 from dase.matching import HOPELESS
 from dase.show import OFF, ON, overlay
 from dase.units import seconds
@@ -33,18 +32,6 @@ DOTS = 3
 
 HATCH = 7
 """Dots from one line of the hatching to the next."""
-
-
-def scene_of(sequence: Sequence) -> CameraScene:
-    """Return the scene between the frames of a sequence.
-
-    Raises:
-        InputError: There are not two frames, or their times are not known.
-    """
-    if sequence.frames is None or len(sequence.frames) < 2 or sequence.frame_times is None:
-        raise InputError("trust: needs at least 2 frames with known times")
-    half = np.zeros(1) if sequence.frame_exposure is None else 0.5 * sequence.frame_exposure
-    return CameraScene(sequence.frames, sequence.frame_times - half, sequence.frame_times + half)
 
 
 def panel(scene: CameraScene, events: Events, time: float, window: float) -> NDArray[np.uint8]:

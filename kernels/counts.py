@@ -22,72 +22,62 @@ from typing import Any
 
 import warp as wp
 
-from dase.kernels.lanes import functions, vector
+from dase.kernels.lanes import functions
 from dase.kernels.random import key, uniform
 from dase.kernels.scene import (
     Frames,
     Ground,
     Layers,
     ground_of,
-    in_front,
     layers_near,
 )
 
-SOURCES = {"frames": Frames, "log": Frames, "both": Frames, "layers": Layers, "background": Layers}
-"""What pixels see, by name: stored intensities, stored log intensities, both, moving layers, one layer."""
+SOURCES = {"frames": Frames, "log": Frames, "layers": Layers, "background": Layers}
+"""What pixels see, by name: stored intensities, stored log intensities, moving layers, one layer."""
+
+
+@lru_cache(maxsize=32)
+def light_of(lanes: int, source: str) -> Any:
+    """Return the Warp function from a source to the intensity of `lanes` neighbouring pixels."""
+    f = functions(lanes)
+    Source, Lanes = SOURCES[source], f.Lanes
+    load, background, foreground = f.load, f.background, f.foreground
+
+    if source in ("frames", "log"):
+
+        @wp.func
+        def light(seen: Source, ground: Ground, k: int, n: int, x: Lanes, y: Lanes, near: int):
+            return load(seen.values, k, n)
+
+    else:
+
+        @wp.func
+        def light(seen: Source, ground: Ground, k: int, n: int, x: Lanes, y: Lanes, near: int):
+            light = background(
+                x, y, seen.grey, seen.place[k, 0], ground.last, ground.corner, ground.step, ground.inverse,
+                ground.width,
+            )  # fmt: skip
+            if wp.static(source == "layers"):
+                light = foreground(light, x, y, seen.texels, seen.start, seen.size, seen.place, k, near)
+            return light
+
+    return light
 
 
 @lru_cache(maxsize=32)
 def _look(lanes: int, source: str) -> Any:
     """Return the Warp function from a source to the log intensity of `lanes` neighbouring pixels."""
     f = functions(lanes)
-    Source, Lanes, Bits = SOURCES[source], f.Lanes, vector(lanes, wp.int32)
-    load, logarithm, background = f.load, f.logarithm, f.background
+    Source, Lanes = SOURCES[source], f.Lanes
+    light, logarithm = light_of(lanes, source), f.logarithm
 
-    if source in ("frames", "log"):
-
-        @wp.func
-        def look(
-            seen: Source,
-            ground: Ground,
-            k: int,
-            n: int,
-            x: Lanes,
-            y: Lanes,
-            near: Bits,
-            crowd: int,
-            eps: float,
-        ):
-            if wp.static(source == "log"):
-                return load(seen.values, k, n)
-            else:
-                return logarithm(load(seen.values, k, n), eps)
-
-    else:
-
-        @wp.func
-        def look(
-            seen: Source,
-            ground: Ground,
-            k: int,
-            n: int,
-            x: Lanes,
-            y: Lanes,
-            near: Bits,
-            crowd: int,
-            eps: float,
-        ):
-            light = background(
-                x, y, seen.grey, seen.place[k, 0], ground.last, ground.corner, ground.step, ground.inverse,
-                ground.width,
-            )  # fmt: skip
-            if wp.static(source == "layers"):
-                # a loop that is not unrolled: most lanes are far from all objects
-                for lane in range(crowd):
-                    if near[lane] != 0:
-                        front = in_front(seen, near[lane], k, x[lane], y[lane])
-                        light[lane] = front[0] + front[1] * light[lane]
-            return logarithm(light, eps)
+    @wp.func
+    def look(seen: Source, ground: Ground, k: int, n: int, x: Lanes, y: Lanes, near: int, eps: float):
+        value = light(seen, ground, k, n, x, y, near)
+        if wp.static(source == "log"):
+            return value
+        else:
+            return logarithm(value, eps)
 
     return look
 
@@ -96,7 +86,7 @@ def _look(lanes: int, source: str) -> Any:
 def block(lanes: int) -> SimpleNamespace:
     """Return Warp functions for what `lanes` neighbouring pixels know before their first sample."""
     f = functions(lanes)
-    Lanes, Bits, load = f.Lanes, vector(lanes, wp.int32), f.load
+    Lanes, load = f.Lanes, f.load
 
     @wp.func
     def thresholds(threshold: wp.array3d[float], b: int, p: int, n: int):
@@ -120,22 +110,12 @@ def block(lanes: int) -> SimpleNamespace:
 
     @wp.func
     def layers_of(seen: Layers, x: Lanes, y: Lanes):
-        near = Bits()
+        near = int(0)
         for lane in range(wp.static(lanes)):
-            near[lane] = layers_near(seen, x[lane], y[lane])
+            near |= layers_near(seen, x[lane], y[lane])
         return near
 
-    @wp.func
-    def lanes_near(near: Bits):
-        crowd = int(0)
-        for lane in range(wp.static(lanes)):
-            if near[lane] != 0:
-                crowd = wp.static(lanes)
-        return crowd
-
-    return SimpleNamespace(
-        thresholds=thresholds, columns=columns, rows=rows, layers_of=layers_of, lanes_near=lanes_near
-    )
+    return SimpleNamespace(thresholds=thresholds, columns=columns, rows=rows, layers_of=layers_of)
 
 
 @lru_cache(maxsize=64)
@@ -153,7 +133,7 @@ def count(lanes: int, source: str, *, shared: bool, states: bool) -> wp.Kernel:
         states: Whether counts are integers and the last sample is kept, as sensors need it, or floats.
     """
     f = functions(lanes)
-    Source, Lanes, Bits = SOURCES[source], f.Lanes, vector(lanes, wp.int32)
+    Source, Lanes = SOURCES[source], f.Lanes
     look = _look(lanes, source)
     load, store, store_whole = f.load, f.store, f.store_whole
     minus, plus, plus_abs, advanced = f.minus, f.plus, f.plus_abs, f.advanced
@@ -161,7 +141,7 @@ def count(lanes: int, source: str, *, shared: bool, states: bool) -> wp.Kernel:
     half_sum, half_difference = f.half_sum, f.half_difference
     start_of = block(lanes)
     thresholds, columns, rows_of = start_of.thresholds, start_of.columns, start_of.rows
-    layers_of, lanes_near = start_of.layers_of, start_of.lanes_near
+    layers_of = start_of.layers_of
     Number = wp.int32 if states else wp.float32
     stored, layered = source in ("frames", "log"), source == "layers"
 
@@ -194,8 +174,7 @@ def count(lanes: int, source: str, *, shared: bool, states: bool) -> wp.Kernel:
         per_on = inverse(on)
         x = Lanes()
         y = Lanes()
-        near = Bits()
-        crowd = int(0)
+        near = int(0)
         ground = Ground()
         if wp.static(not stored):
             ground = ground_of(seen)
@@ -203,14 +182,13 @@ def count(lanes: int, source: str, *, shared: bool, states: bool) -> wp.Kernel:
             y = rows_of(pixels, n, width)
             if wp.static(layered):
                 near = layers_of(seen, x, y)
-                crowd = lanes_near(near)
         reference = load(reference_in, b, n)
         sample = Lanes()
         for r in range(run.shape[0] - 1):
             both = Lanes()
             net = Lanes()
             for k in range(wp.max(run[r], begin), run[r + 1]):
-                sample = look(seen, ground, k + b * rows, n, x, y, near, crowd, eps[b])
+                sample = look(seen, ground, k + b * rows, n, x, y, near, eps[b])
                 change = minus(sample, reference)
                 theta = on
                 per = per_on
@@ -243,7 +221,7 @@ def start(source: str) -> wp.Kernel:
     The memories are spread as if the first change had been going on before.
     """
     f = functions(1)
-    Source, Bits = SOURCES[source], vector(1, wp.int32)
+    Source = SOURCES[source]
     look, Lane = _look(1, source), f.Lanes
     stored, layered = source in ("frames", "log"), source == "layers"
 
@@ -272,18 +250,18 @@ def start(source: str) -> wp.Kernel:
         pixel = pixels[i]
         x = Lane(float(pixel % width))
         y = Lane(float(pixel / width))
-        near = Bits()
+        near = int(0)
         ground = Ground()
         if wp.static(not stored):
             ground = ground_of(seen)
             if wp.static(layered):
-                near[0] = layers_near(seen, x[0], y[0])
+                near = layers_near(seen, x[0], y[0])
         signal = signal_in[b, i]
         if begin == 0:
-            signal = look(seen, ground, 0, i, x, y, near, 1, eps[b])[0]
+            signal = look(seen, ground, 0, i, x, y, near, eps[b])[0]
         reference = signal
         if begin + samples > 1:
-            change = look(seen, ground, 1 - begin, i, x, y, near, 1, eps[b])[0] - signal
+            change = look(seen, ground, 1 - begin, i, x, y, near, eps[b])[0] - signal
             column = wp.where(threshold.shape[2] == 1, 0, i)
             stream = key(seed, initial_phase, pixel)
             lead = phase[b] * uniform(stream, 0)
@@ -296,29 +274,6 @@ def start(source: str) -> wp.Kernel:
         reference_out[b, i] = reference
 
     return start_counting
-
-
-@lru_cache(maxsize=2)
-def take_logs(lanes: int) -> wp.Kernel:
-    """Return the kernel that takes logarithms of stored intensities, over (K, blocks of pixels) threads."""
-    f = functions(lanes)
-    load, store, logarithm = f.load, f.store, f.logarithm
-
-    @wp.kernel(enable_backward=False, module="unique", module_options={"fuse_fp": False})
-    def take_logs(
-        first: int,
-        # in
-        values: wp.array2d[float],  # (K, N) linear intensity
-        eps: float,
-        # out
-        logs_out: wp.array2d[float],  # (K, N) log intensity
-    ):
-        """Take log(value + eps)."""
-        k, i = wp.tid()
-        n = wp.min((first + i) * wp.static(lanes), values.shape[1] - wp.static(lanes))
-        store(logs_out[k], n, logarithm(load(values, k, n), eps))
-
-    return take_logs
 
 
 def widest(size: int, device: wp.Device, source: str) -> int:

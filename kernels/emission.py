@@ -65,12 +65,12 @@ def _append(lanes: int) -> Any:
 def emit(lanes: int, source: str) -> wp.Kernel:
     """Return the emitting kernel, over (B, blocks of `lanes` pixels) threads; see `counts.count`."""
     f, start_of = functions(lanes), block(lanes)
-    Source, Lanes, Bits = SOURCES[source], f.Lanes, vector(lanes, wp.int32)
+    Source, Lanes = SOURCES[source], f.Lanes
     look, append = _look(lanes, source), _append(lanes)
     load, store, minus, advanced = f.load, f.store, f.minus, f.advanced
     chosen, inverse, signed_events = f.chosen, f.inverse, f.signed_events
     thresholds, columns, rows_of = start_of.thresholds, start_of.columns, start_of.rows
-    layers_of, lanes_near = start_of.layers_of, start_of.lanes_near
+    layers_of = start_of.layers_of
     stored, layered = source in ("frames", "log"), source == "layers"
 
     @wp.kernel(enable_backward=False, module="unique", module_options={"fuse_fp": False})
@@ -102,8 +102,7 @@ def emit(lanes: int, source: str) -> wp.Kernel:
         per_on = inverse(on)
         x = Lanes()
         y = Lanes()
-        near = Bits()
-        crowd = int(0)
+        near = int(0)
         ground = Ground()
         if wp.static(not stored):
             ground = ground_of(seen)
@@ -111,11 +110,10 @@ def emit(lanes: int, source: str) -> wp.Kernel:
             y = rows_of(pixels, n, width)
             if wp.static(layered):
                 near = layers_of(seen, x, y)
-                crowd = lanes_near(near)
         reference = load(reference_in, b, n)
         signal = load(signal_in, b, n)
         for k in range(begin, clock.length.shape[0]):
-            sample = look(seen, ground, k, n, x, y, near, crowd, eps[b])
+            sample = look(seen, ground, k, n, x, y, near, eps[b])
             change = minus(sample, reference)
             theta = chosen(change, on, off)
             events = signed_events(change, theta, chosen(change, per_on, per_off))

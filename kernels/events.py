@@ -25,6 +25,54 @@ def gather(
         keys_out[start[slab] + n] = keys[slab, n]
 
 
+@wp.func_native(
+    """
+    // one output after the other, so that the compiler makes vectors of the loops
+    const long long* __restrict__ from = keys.data;
+    const int last = last_in < keys.shape[0] ? last_in : keys.shape[0];
+    const long long mask = (1ll << bits) - 1;
+    double* __restrict__ t = t_out.data;
+    for (int i = first; i < last; ++i) t[i] = 1.0e-9 * (double)(begin + (from[i] >> (bits + low)));
+    unsigned char* __restrict__ p = p_out.data;
+    for (int i = first; i < last; ++i) p[i] = (unsigned char)((from[i] >> (low - 1)) & 1);
+    const unsigned* __restrict__ pixels = xy.data;
+    unsigned short* __restrict__ x = x_out.data;
+    unsigned short* __restrict__ y = y_out.data;
+    const bool rows = row_out.shape[0] > 0;
+    for (int i = first; i < last; ++i) {
+        int place = (int)((from[i] >> low) & mask);
+        if (rows) {
+            row_out.data[i] = place / size;
+            place %= size;
+        }
+        const unsigned at = pixels[place];
+        x[i] = (unsigned short)at;
+        y[i] = (unsigned short)(at >> 16);
+    }
+    if (label_out.shape[0] > 0)
+        for (int i = first; i < last; ++i) label_out.data[i] = (signed char)(from[i] & 3);
+"""
+)
+def unpack(
+    keys: wp.array[wp.int64],
+    first: int,
+    last_in: int,
+    bits: int,
+    low: int,
+    size: int,
+    xy: wp.array[wp.uint32],
+    begin: wp.int64,
+    t_out: wp.array[wp.float64],
+    x_out: wp.array[wp.uint16],
+    y_out: wp.array[wp.uint16],
+    p_out: wp.array[wp.uint8],
+    row_out: wp.array[int],
+    label_out: wp.array[wp.int8],
+):
+    """Decode keys `first` to `last_in`."""
+    ...
+
+
 @wp.kernel(enable_backward=False)
 def decode(
     # in
@@ -37,7 +85,7 @@ def decode(
     begin: wp.int64,  # of the chunk [ns]
     each: int,  # events per thread
     # out
-    t_out: wp.array[wp.float64],  # [s]
+    t_out: wp.array[wp.float64],  # [s], from whole nanoseconds, so that it never goes back
     x_out: wp.array[wp.uint16],
     y_out: wp.array[wp.uint16],
     p_out: wp.array[wp.uint8],
@@ -46,24 +94,13 @@ def decode(
 ):
     """Unpack keys: time, pixel, polarity and label of each event."""
     _, n = wp.tid()
-    n += first
-    for i in range(n * each, wp.min((n + 1) * each, keys.shape[0])):
-        key = keys[i]
-        place = int((key >> wp.int64(low)) & ((wp.int64(1) << wp.int64(bits)) - wp.int64(1)))
-        if row_out.shape[0] > 0:
-            row_out[i] = place / size
-            place = place % size
-        # from whole nanoseconds, so that times never go back from chunk to chunk
-        t_out[i] = wp.float64(1.0e-9) * wp.float64(begin + (key >> wp.int64(bits + low)))
-        at = xy[place]
-        x_out[i] = wp.uint16(at & wp.uint32(65535))
-        y_out[i] = wp.uint16(at >> wp.uint32(16))
-        p_out[i] = wp.uint8((key >> wp.int64(low - 1)) & wp.int64(1))
-        if label_out.shape[0] > 0:
-            label_out[i] = wp.int8(key & wp.int64(3))
+    n = (n + first) * each
+    unpack(
+        keys, n, n + each, bits, low, size, xy, begin, t_out, x_out, y_out, p_out, row_out, label_out
+    )  # fmt: skip
 
 
-EACH = {"cpu": 256, "cuda": 1}
+EACH = {"cpu": 1024, "cuda": 1}
 """Events that a thread decodes: on the CPU it costs as much to begin a thread as to decode ten."""
 
 RADIX = 9

@@ -22,7 +22,7 @@ import warp as wp
 
 from dase.kernels.scene import Affine
 
-ON_CPU = """
+AT_ONCE = """
 typedef float V __attribute__((ext_vector_type({length})));
 typedef int I __attribute__((ext_vector_type({length})));
 auto FLOOR = [](V a) {{ return __builtin_elementwise_floor(a); }};
@@ -32,6 +32,21 @@ auto LESSER = [](auto a, auto b) {{ return a < b ? a : b; }};
 auto WHOLE = [](V a) {{ return __builtin_convertvector(a, I); }};
 auto FLOAT = [](I a) {{ return __builtin_convertvector(a, V); }};
 auto AT = [](const float* a, I i) {{ V v; for (int l = 0; l < {length}; ++l) v[l] = a[i[l]]; return v; }};
+auto PAIR = [](const float* a, I i, V& right) {{
+    typedef double D __attribute__((ext_vector_type({length})));
+    D both;
+    for (int l = 0; l < {length}; ++l) {{
+        double two;
+        __builtin_memcpy(&two, a + i[l], 8);
+        both[l] = two;
+    }}
+    typedef float W __attribute__((ext_vector_type(2 * {length})));
+    const W flat = __builtin_bit_cast(W, both);
+    right = flat.odd;
+    return (V)flat.even;
+}};
+auto ANY = [](I a) {{ return __builtin_reduce_or(a) != 0; }};
+auto HIGHEST = [](unsigned a) {{ return 31 - __builtin_clz(a); }};
 auto IN = [](const wp::vec_t<{length}, float>& a) {{ V v; __builtin_memcpy(&v, &a, sizeof(V)); return v; }};
 {inputs}
 {body}
@@ -41,16 +56,26 @@ return result_out;
 """
 """What a C++ expression finds around it on the CPU; `auto` spares a second version for integers."""
 
-ON_CUDA = """
+ONE_BY_ONE = """
 typedef float V;
 typedef int I;
+#ifdef __CUDA_ARCH__
 auto FLOOR = [](V a) {{ return floorf(a); }};
 auto ABS = [](V a) {{ return fabsf(a); }};
 auto FMA = [](V a, V b, V c) {{ return fmaf(a, b, c); }};
+auto HIGHEST = [](unsigned a) {{ return 31 - __clz(a); }};
+#else
+auto FLOOR = [](V a) {{ return __builtin_floorf(a); }};
+auto ABS = [](V a) {{ return __builtin_fabsf(a); }};
+auto FMA = [](V a, V b, V c) {{ return __builtin_fmaf(a, b, c); }};
+auto HIGHEST = [](unsigned a) {{ return 31 - __builtin_clz(a); }};
+#endif
 auto LESSER = [](auto a, auto b) {{ return a < b ? a : b; }};
 auto WHOLE = [](V a) {{ return (I)a; }};
 auto FLOAT = [](I a) {{ return (V)a; }};
 auto AT = [](const float* a, I i) {{ return a[i]; }};
+auto PAIR = [](const float* a, I i, V& right) {{ right = a[i + 1]; return a[i]; }};
+auto ANY = [](I a) {{ return a != 0; }};
 wp::vec_t<{length}, float> result_out;
 #pragma unroll
 for (int lane = 0; lane < {length}; ++lane) {{
@@ -115,12 +140,62 @@ I iv = LESSER(WHOLE(v), I(corner[1]));
 V fu = u - FLOAT(iu);
 V fv = v - FLOAT(iv);
 I i = iv * width + iu;
-V top = AT(grey.data, i);
-top = top + fu * (AT(grey.data, i + step[0]) - top);
-i = i + step[1];
-V bottom = AT(grey.data, i);
-bottom = bottom + fu * (AT(grey.data, i + step[0]) - bottom);
+V right;
+V top = PAIR(grey.data, i, right);
+top = top + fu * (right - top);
+V bottom = PAIR(grey.data, i + step[1], right);
+bottom = bottom + fu * (right - bottom);
 V result = top + fv * (bottom - top);
+"""
+
+FOREGROUND = """
+// as dase.kernels.scene.in_front does, all pixels of the block layer by layer; no texel is no light
+V sum = x * 0.0f;
+V through = sum + 1.0f;
+unsigned left = (unsigned)near;
+while (left != 0) {
+    const int layer = HIGHEST(left);
+    left ^= 1u << layer;
+    const auto& m = wp::index(place, k, layer);
+    const int width = size.data[layer][0];
+    const int height = size.data[layer][1];
+    V u = (x * m.data[0][0] + y * m.data[0][1]) + m.data[0][2];
+    V v = (x * m.data[1][0] + y * m.data[1][1]) + m.data[1][2];
+    I inside = (u > -1.0f) & (v > -1.0f) & (u < (float)width) & (v < (float)height);
+    if (!ANY(inside)) continue;
+    u = inside ? u : V(0.0f);
+    v = inside ? v : V(0.0f);
+    V whole_u = FLOOR(u);
+    V whole_v = FLOOR(v);
+    V fu = u - whole_u;
+    V fv = v - whole_v;
+    I iu = WHOLE(whole_u);
+    I iv = WHOLE(whole_v);
+    const float* from = (const float*)(texels.data + start.data[layer]);
+    I at = 2 * (iv * width + iu);
+    I west = inside & (iu >= 0);
+    I east = inside & (iu + 1 < width);
+    I north = iv >= 0;
+    I south = iv + 1 < height;
+    auto LOOK = [=](I ok, I i, V& opacity) {
+        const V value = PAIR(from, ok ? i : I(0), opacity);
+        opacity = ok ? opacity : V(0.0f);
+        return ok ? value : V(0.0f);
+    };
+    V alpha, next, low, low_next;
+    V color = LOOK(west & north, at, alpha);
+    color = color + fu * (LOOK(east & north, at + 2, next) - color);
+    alpha = alpha + fu * (next - alpha);
+    V below = LOOK(west & south, at + 2 * width, low);
+    below = below + fu * (LOOK(east & south, at + 2 * width + 2, low_next) - below);
+    low = low + fu * (low_next - low);
+    color = color + fv * (below - color);
+    alpha = alpha + fv * (low - alpha);
+    sum = sum + through * color;
+    through = through * (1.0f - alpha);
+    if (!ANY(through != 0.0f)) break;
+}
+V result = sum + through * light;
 """
 
 LOAD = """
@@ -188,9 +263,14 @@ def _lanewise(
         cuda: What runs on CUDA instead.
     """
     names = lanes.split()
-    cpu = ON_CPU.format(length=length, body=body, inputs="\n".join(f"V {n} = IN({n}_in);" for n in names))
     inputs = "\n".join(f"V {n} = {n}_in[lane];" for n in names)
-    gpu = ON_CUDA.format(length=length, body=cuda or body, inputs=inputs)
+    gpu = ONE_BY_ONE.format(length=length, body=cuda or body, inputs=inputs)
+    if length > 1:
+        inputs = "\n".join(f"V {n} = IN({n}_in);" for n in names)
+        cpu = AT_ONCE.format(length=length, body=body, inputs=inputs)
+    else:
+        # plain numbers, so that loops which call the function can become vectors
+        cpu = ONE_BY_ONE.format(length=1, body=body, inputs=inputs)
     arguments = ", ".join([*(f"{n}_in: Lanes" for n in names), *([others] if others else [])])
     snippet = f"#ifdef __CUDA_ARCH__\n{gpu}\n#else\n{cpu}\n#endif\n"
     scope = {"Affine": Affine, "Lanes": vector(length)}
@@ -213,6 +293,8 @@ def functions(length: int) -> SimpleNamespace:
     def plain(name: str, snippet: str, arguments: str, returns: str) -> Any:
         return native(f"{name}_{length}", snippet.format(length=length), scope, arguments, returns)
 
+    layers = "texels: wp.array[wp.vec2], start: wp.array[int], size: wp.array[wp.vec2i], "
+    layers += "place: wp.array2d[Affine], k: int, near: int"
     ground = "grey: wp.array[float], place: Affine, last: wp.vec2, corner: wp.vec2i, step: wp.vec2i"
     return SimpleNamespace(
         Lanes=scope["Lanes"],
@@ -235,16 +317,39 @@ def functions(length: int) -> SimpleNamespace:
             "eps: float",
             cuda="V result = __logf(a + eps);",
         ),
+        natural=lanewise("natural", "V x = a;" + LOGARITHM, "a", cuda="V result = logf(a);"),
         exponential=lanewise("exponential", EXPONENTIAL, "x", cuda="V result = expf(x);"),
+        foreground=lanewise("foreground", FOREGROUND, "light x y", layers),
         background=lanewise("background", BACKGROUND, "x y", f"{ground}, inverse: wp.vec2, width: int"),
     )
 
 
 Lane = vector(1)
-_exponential = functions(1).exponential
+_exponential, _natural = functions(1).exponential, functions(1).natural
 
 
 @wp.func
 def exponential(x: float) -> float:
     """e to the x within 2 ulp, 0 below e^-87; on the CPU a call of the C library would cost twice as much."""
     return _exponential(Lane(x))[0]
+
+
+@wp.func
+def logarithm(x: float) -> float:
+    """Natural logarithm of a normal number x > 0 within 1 ulp; that of the C library takes one at a time."""
+    return _natural(Lane(x))[0]
+
+
+@wp.func
+def circle(turn: float):
+    """Cosine and sine of `turn` in [0, 1] turns, within 4e-7: a fifth of the time of the library's."""
+    quarter = int(4.0 * turn + 0.5)
+    f = 4.0 * turn - float(quarter)
+    g = f * f
+    # Taylor series in quarter turns, |f| <= 1/2
+    x = 1.0 + g * (-1.23370055 + g * (0.253669508 + g * (-0.0208634807 + g * 0.000919260274)))
+    y = f * (1.57079633 + g * (-0.645964098 + g * (0.0796926262 + g * (-0.00468175414 + g * 0.000160441185))))
+    odd = (quarter & 1) != 0
+    cosine = wp.where(odd, y, x)
+    sine = wp.where(odd, x, y)
+    return wp.where(((quarter + 1) & 2) != 0, -cosine, cosine), wp.where((quarter & 2) != 0, -sine, sine)

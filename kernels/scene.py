@@ -25,14 +25,13 @@ class Frames:
     """Stored samples."""
 
     values: wp.array2d[float]  # (K, N) linear intensity, or log intensity for the `log` source
-    logs: wp.array2d[float]  # (K, N) log intensity, for the `both` source
 
 
 @wp.struct
 class Layers:
     """Textures and motion of all layers, L layers at K time samples."""
 
-    grey: wp.array[float]  # intensities of layer 0, which most looks go to, once more on their own
+    grey: wp.array[float]  # intensities of layer 0, which most looks go to, once more on their own; and a 0
     texels: wp.array[wp.vec2]  # all textures, row by row: (intensity · alpha, alpha)
     start: wp.array[int]  # (L,) first texel of each layer
     size: wp.array[wp.vec2i]  # (L,) width, height [texel]
@@ -120,8 +119,10 @@ def foreground_at(layers: Layers, layer: int, k: int, x: float, y: float) -> wp.
         i += size[0]
         bottom = layers.texels[i] + fu * (layers.texels[i + 1] - layers.texels[i])
     else:
-        top = (1.0 - fu) * texel(layers, layer, iu, iv) + fu * texel(layers, layer, iu + 1, iv)
-        bottom = (1.0 - fu) * texel(layers, layer, iu, iv + 1) + fu * texel(layers, layer, iu + 1, iv + 1)
+        top = texel(layers, layer, iu, iv)
+        top += fu * (texel(layers, layer, iu + 1, iv) - top)
+        bottom = texel(layers, layer, iu, iv + 1)
+        bottom += fu * (texel(layers, layer, iu + 1, iv + 1) - bottom)
     return top + fv * (bottom - top)
 
 
@@ -210,9 +211,12 @@ def flow(
     y = float(i / width)
     near = layers_near(layers, x, y)
     top = int(0)
-    for layer in range(1, layers.count):
-        if ((near >> layer) & 1) != 0 and foreground_at(layers, layer, k, x, y)[1] > 0.0:
+    while near != 0:
+        layer = highest_bit(near)
+        near ^= 1 << layer
+        if foreground_at(layers, layer, k, x, y)[1] > 0.0:
             top = layer
+            near = 0
     flow_out[k, i] = velocity[k, top] * wp.vec3(x, y, 1.0)
 
 
@@ -347,7 +351,8 @@ def upload(
         size.append(grey.shape[::-1])
         total += grey.size
     return (
-        wp.array(np.ascontiguousarray(flat[0][:, 0]), dtype=float, device=device),
+        # one more, as the neighbour of the last texel is looked at even where it does not count
+        wp.array(np.append(flat[0][:, 0], np.float32(0.0)), dtype=float, device=device),
         wp.array(np.concatenate(flat), dtype=wp.vec2, device=device),
         wp.array(start, dtype=int, device=device),
         wp.array(np.array(size), dtype=wp.vec2i, device=device),

@@ -14,7 +14,9 @@ from functools import lru_cache
 import warp as wp
 
 from dase.kernels import pixel
+from dase.kernels.compose import compiled
 from dase.kernels.probes import Probes, observe
+from dase.kernels.writer import VOLTAGE, Writer
 
 
 @wp.struct
@@ -36,7 +38,7 @@ def compose(stages: tuple[pixel.Stages, ...]) -> wp.Kernel:
     (M, N) where an effect has any, `Probes`.
     """
     writer = _Writer(stages)
-    return pixel.compiled(writer.kernel(), "pixel_trials", writer.scope)
+    return compiled(writer.kernel(), "pixel_trials", writer.scope)
 
 
 def source_text(stages: tuple[pixel.Stages, ...]) -> str:
@@ -76,7 +78,7 @@ def total(
     out[row, part, place] = value
 
 
-class _Writer(pixel.Writer):
+class _Writer(Writer):
     """Writes the text of the kernel."""
 
     def __init__(self, stages: tuple[pixel.Stages, ...]):
@@ -137,7 +139,7 @@ class _Writer(pixel.Writer):
         lights = [effect for effect, _ in self.of("light")]
         if lights:
             acts = [f"{effect.name}_acts" if effect.off else "True" for effect in lights]
-            self.add(f"if {' or '.join(acts)}:", f"    {pixel.VOLTAGE}")
+            self.add(f"if {' or '.join(acts)}:", f"    {VOLTAGE}")
         self.respond()
         self.sample()
         self.add("stamp = source.stamp[k]")

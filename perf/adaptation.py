@@ -1,12 +1,14 @@
 """How well thresholds are learned: the experiments of docs/adaptation.md, each by its name.
 
     python perf/adaptation.py --list
-    python perf/adaptation.py --row full-s0 --seconds 60 --out out/adaptation
-    python perf/adaptation.py --row 'table4-*' --row 'maps-*' --seconds 60 --jobs 2 --out out/adaptation
+    python perf/adaptation.py --plan all --budget 900 --out out/adaptation      a GPU's quarter of an hour
+    python perf/adaptation.py --row full-s0 --row 'maps-*' --seconds 60 --jobs 2 --out out/adaptation
     python perf/adaptation.py --table --out out/adaptation
 
-Every row appends its line to OUT/rows.jsonl as it ends, and logs to OUT/NAME/log.csv meanwhile, so a run that
-is cut short loses nothing that is done. `--table` writes the tables of docs/adaptation.md.
+Every row appends its line to OUT/rows.jsonl as it ends, and logs to OUT/NAME/log.csv meanwhile, so a run
+that is cut short loses nothing that is done, and the same command goes on with the rows that are missing.
+Neither network nor matplotlib is needed; `--table` writes the tables and pictures of docs/adaptation.md from
+the lines, anywhere. The rows `real-*` need `--recording FILE`, with frames and their times.
 """
 
 from __future__ import annotations
@@ -15,21 +17,22 @@ import argparse
 import fnmatch
 import json
 import math
-import os
 import platform
+import shutil
 import subprocess
 import sys
 import time
-from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
-import adaptation_page
+import adaptation_jobs
 import numpy as np
 import torch
+from adaptation_rows import Planned, Row, plan, rows
 
 from dase import images
+from dase.adaptation import write_examples
 from dase.networks import NetworkShape
 from dase.objectives import Hash
 from dase.run import Pace, run
@@ -43,149 +46,8 @@ SHARED = ROOT.parent / "shared"
 LEARNED = 8.0
 """Seconds of the recording that are learned from."""
 
-
-@dataclass(frozen=True)
-class Row:
-    """One experiment.
-
-    Args:
-        truth: Name of the sensor to be learned.
-        finite: Sequences of real data, recorded once; 0 for new ones in every step.
-        disjoint: Whether real scenes have textures that simulated ones have not.
-        textures: Backgrounds in the pool, of which disjoint sides get a half each; twice as many objects.
-        augment: Whether finite data is mirrored and turned.
-        recipe: What differs from the default recipe.
-        hash: What differs from the default hash.
-        network: What differs from the default network.
-        real: Whether the target is the recording: 8 s to learn from, what follows to judge by.
-    """
-
-    truth: str = "uniform"
-    finite: int = 0
-    disjoint: bool = False
-    textures: int = 48
-    augment: bool = True
-    recipe: dict[str, Any] = field(default_factory=dict)
-    hash: dict[str, Any] = field(default_factory=dict)
-    network: dict[str, Any] = field(default_factory=dict)
-    real: bool = False
-
-    def but(self, **changes: Any) -> Row:
-        """Return the row with some options changed, dictionaries merged."""
-        merged = {
-            name: {**getattr(self, name), **value} if isinstance(value, dict) else value
-            for name, value in changes.items()
-        }
-        return replace(self, **merged)
-
-
-FULL = Row()
-LOW = dict(mu=0.1, sigma=0.02)
-MOMENTS = Row(recipe=dict(objective="moments", rate=1e-4, anchor=1.0), network=dict(table=(6, 5)))
-ATTRIBUTES = {"angle": ("orientations", 24), "contrast": ("contrast", 3), "coherence": ("coherence", 3)}
-
-
-def rows() -> dict[str, Row]:
-    """Return all experiments by name."""
-    out: dict[str, Row] = {}
-    for seed in range(3):
-        out[f"full-s{seed}"] = FULL.but(recipe=dict(seed=seed))
-        out[f"full-low-s{seed}"] = FULL.but(recipe=dict(seed=seed, **LOW))
-        out[f"moments-s{seed}"] = MOMENTS.but(recipe=dict(seed=seed))
-        out[f"moments-low-s{seed}"] = MOMENTS.but(recipe=dict(seed=seed, **LOW))
-        for count in (600, 100):
-            for name, base in (("wgan", FULL), ("moments", MOMENTS)):
-                row = base.but(finite=count, disjoint=True, textures=200, recipe=dict(seed=seed))
-                out[f"finite{count}-{name}-s{seed}"] = row
-    one = dict(orientations=1, coherence=1, contrast=1)
-    out["table4-global"] = FULL.but(hash=one)
-    out["table4-uniform"] = FULL.but(recipe=dict(uniform=1.0))
-    for kind in ("energy", "events"):
-        for n in range(8):
-            used = [name for bit, name in enumerate(ATTRIBUTES) if n >> bit & 1]
-            how = {**one, **dict(ATTRIBUTES[name] for name in used), "contrast_from": kind}
-            out[f"table5-{kind}-{'+'.join(used) or 'none'}"] = FULL.but(hash=how)
-    out["table5-ranked"] = FULL.but(hash=dict(contrast_from="events-ranked"))
-    out["fig3-no-kl"] = FULL.but(recipe=dict(kl=0.0))
-    out["fig3-literal"] = FULL.but(recipe=dict(anchor=0.0), network=dict(literal=True))
-    out["fig3-literal-no-kl"] = out["fig3-literal"].but(recipe=dict(kl=0.0))
-    out["paper"] = FULL.but(
-        recipe=dict(
-            optimizer="adabelief", rate=4e-4, rate_scalars=4e-4, critic_rate=4e-4, critic_cosine=True,
-            anchor=0.0, average=0.0, surrogate="interval", warmup=0,
-        ),
-        hash=dict(contrast_from="events"),
-        network=dict(literal=True),
-    )  # fmt: skip
-    for size in (8, 16, 24, 40, 60, 80):
-        out[f"fig5-{size}"] = FULL.but(hash=dict(size=size))
-    for surrogate in ("interval", "events"):
-        out[f"surrogate-{surrogate}"] = FULL.but(recipe=dict(surrogate=surrogate))
-    for anchor in (0.0, 1.0, 30.0):
-        out[f"anchor-{anchor:g}"] = FULL.but(recipe=dict(anchor=anchor))
-    recorded = dict(doubt=0.2, batch=8)
-    out["real-moments"] = MOMENTS.but(real=True, recipe=recorded, network=dict(split=True))
-    out["real-moments-doubt.1"] = out["real-moments"].but(recipe=dict(doubt=0.1))
-    out["real-moments-flat"] = out["real-moments"].but(network=dict(table=None), recipe=dict(rate=0.0))
-    out["real-wgan"] = FULL.but(
-        real=True, recipe=dict(batch=8, anchor=0.5), hash=dict(orientations=8), network=dict(split=True)
-    )
-    out.update(_finite_variants())
-    out.update(_maps())
-    return out
-
-
-def _finite_variants() -> dict[str, Row]:
-    base = FULL.but(finite=600, textures=200)
-    return {
-        "finite600-wgan-same-textures": base,
-        "finite600-wgan-plain": base.but(augment=False, disjoint=True),
-        "finite600-wgan-slow-critic": base.but(disjoint=True, recipe=dict(critic_rate=5e-5)),
-        "finite600-wgan-cosine-critic": base.but(disjoint=True, recipe=dict(critic_cosine=True)),
-        "finite600-wgan-penalty10": base.but(disjoint=True, recipe=dict(penalty=10.0)),
-        "finite600-wgan-global": base.but(disjoint=True, hash=dict(orientations=1, coherence=1, contrast=1)),
-        "finite600-moments-same-textures": MOMENTS.but(finite=600),
-        "finite600-moments-24-textures": MOMENTS.but(finite=600, disjoint=True, textures=48),
-        "finite600-wgan-24-textures": base.but(disjoint=True, textures=48),
-        "finite600-moments-flat": MOMENTS.but(
-            finite=600, disjoint=True, textures=200, recipe=dict(rate=0.0), network=dict(table=None)
-        ),
-    }
-
-
-def _maps() -> dict[str, Row]:
-    """Targets whose thresholds differ from pixel to pixel, and ways to learn them."""
-    ways = {
-        "moments": MOMENTS,
-        "moments-table-only": MOMENTS.but(recipe=dict(rate=0.0)),
-        "moments-unet-only": MOMENTS.but(recipe=dict(rate=1e-3, anchor=0.01), network=dict(table=None)),
-        "moments-unet": MOMENTS.but(recipe=dict(rate=1e-3, anchor=0.01)),
-        "wgan": FULL.but(recipe=dict(anchor=0.5)),
-        "wgan-table": FULL.but(recipe=dict(anchor=5.0), network=dict(table=(6, 5))),
-        "wgan-image-table": FULL.but(recipe=dict(critic_image=True), network=dict(table=(6, 5))),
-        "wgan-image": FULL.but(recipe=dict(anchor=0.5, critic_image=True)),
-        "wgan-intensity": FULL.but(
-            recipe=dict(anchor=0.5), hash=dict(orientations=8, coherence=1, contrast=3, intensity=6)
-        ),
-        "wgan-small": FULL.but(
-            recipe=dict(anchor=0.5, rate=3e-4), hash=dict(size=16, orientations=8, coherence=1, intensity=6)
-        ),
-    }
-    out = {}
-    for truth in ("intensity", "edges"):
-        for name, way in ways.items():
-            out[f"maps-{truth}-{name}"] = way.but(truth=truth)
-    pattern = dict(pattern=(240, 240))
-    out["maps-column-moments"] = ways["moments"].but(truth="column", network=pattern)
-    out["maps-column-wgan"] = FULL.but(truth="column", network=pattern)
-    out["maps-column-moments-finite600"] = out["maps-column-moments"].but(finite=600, augment=False)
-    for truth in ("intensity", "edges"):
-        out[f"maps-{truth}-moments-finite600"] = MOMENTS.but(
-            truth=truth, finite=600, disjoint=True, textures=200
-        )
-    for name in ("moments", "wgan"):
-        out[f"maps-asymmetric-{name}"] = ways[name].but(truth="asymmetric", network=dict(split=True))
-    return out
+OBJECTS = 8
+"""Objects for every background in a pool of which either side has half: a scene shows about ten."""
 
 
 def prepare(row: Row, args: argparse.Namespace) -> Training:
@@ -207,7 +69,14 @@ def prepare(row: Row, args: argparse.Namespace) -> Training:
         target, scenes = open_target([Path(args.recording)], until=LEARNED, device=device)
         return Training(made, target, scenes)
     source = images.open_images(pictures)
-    scenery = Scenery(source, looks, device=device, backgrounds=row.textures, objects=2 * row.textures)
+    scenery = Scenery(
+        source,
+        looks,
+        device=device,
+        backgrounds=row.textures,
+        objects=(OBJECTS if row.disjoint else 2) * row.textures,
+        seed=recipe.get("seed", 0),
+    )
     ours, theirs = scenery.split(0.5) if row.disjoint else (scenery, scenery)
     seed = recipe.get("seed", 0)
     target: Target = Endless(theirs, TRUTHS[row.truth](), seed=1000 + seed)
@@ -269,7 +138,7 @@ def _probes(later: Any, name: str, net: Any, folder: Path) -> float | str:
         return f"{type(error).__name__}: {error}"
 
 
-def measure(name: str, args: argparse.Namespace) -> dict[str, Any]:
+def measure(name: str, seconds: float, args: argparse.Namespace) -> dict[str, Any]:
     """Run one row and return its line."""
     row = rows()[name]
     torch.manual_seed(0)
@@ -283,11 +152,15 @@ def measure(name: str, args: argparse.Namespace) -> dict[str, Any]:
             shown = ("step", "seconds", "distance", "raw_kl", "kl", "kl_active", "mu", "slope", "held_out")
             print(name, " ".join(f"{k}={line[k]:.4g}" for k in shown if k in line), flush=True)
 
-    pace = Pace(seconds=args.seconds, save=math.inf, look=args.look)
-    last = run(training, Path(args.out) / name, pace=pace, look=look)
+    pace = Pace(seconds=seconds, save=math.inf, look=args.look)
+    folder = Path(args.out) / name
+    shutil.rmtree(folder, ignore_errors=True)
+    last = run(training, folder, pace=pace, look=look)
     scored = [line for line in history if "held_out" in line]
     best = min(scored, key=lambda line: line["held_out"]) if scored else last
-    real = judge(training, args, Path(args.out) / name) if row.real else None
+    if row.real or row.truth != "uniform":
+        write_examples(folder, training)
+    real = judge(training, args, folder) if row.real else None
     return {
         "row": name,
         "real": real,
@@ -296,6 +169,7 @@ def measure(name: str, args: argparse.Namespace) -> dict[str, Any]:
         "commit": _commit(args.commit),
         "images": Path(args.images).name,
         "small": args.small,
+        "jobs": args.alone if training.recipe.objective == "wgan" else args.jobs,
         "wall": time.perf_counter() - begin,
         "steps_per_second": training.recipe.steps / last["seconds"],
         "at_001": next((h["seconds"] for h in history if h.get("kl", 1) <= 0.01), None),
@@ -317,43 +191,38 @@ def _commit(given: str | None) -> str:
     return found.stdout.strip() or "unknown"
 
 
-def work(names: list[str], args: argparse.Namespace) -> None:
-    """Run rows one after the other, or several processes at a time."""
+def work(planned: list[Planned], args: argparse.Namespace) -> None:
+    """Run the rows that OUT/rows.jsonl does not hold yet."""
     out = Path(args.out)
     out.mkdir(parents=True, exist_ok=True)
-    end = time.perf_counter() + args.budget
-    if args.jobs == 1:
-        for name in names:
-            if time.perf_counter() + args.seconds > end:
-                print(f"no time left for {name}")
-                continue
-            try:
-                line = measure(name, args)
-            except Exception as error:
-                line = {"row": name, "error": f"{type(error).__name__}: {error}"}
-            with (out / "rows.jsonl").open("a", encoding="utf-8") as file:
-                file.write(json.dumps(line) + "\n")
-            print(_brief(line), flush=True)
-        return
-    environment = {**os.environ, "OMP_NUM_THREADS": str(max((os.cpu_count() or 2) // args.jobs // 2, 1))}
+    lines = out / "rows.jsonl"
+    done = set()
+    if lines.exists():
+        done = {line["row"] for line in map(json.loads, lines.read_text().splitlines()) if "last" in line}
 
-    def one(name: str) -> None:
-        left = end - time.perf_counter()
-        if left < args.seconds:
-            print(f"no time left for {name}")
-            return
-        options = [
-            f"--{k}={getattr(args, k)}" for k in ("seconds", "out", "device", "images", "recording", "look")
-        ]
-        options += [f"--commit={_commit(args.commit)}", *(["--small"] if args.small else [])]
-        command = [sys.executable, __file__, f"--row={name}", "--jobs=1", *options]
-        try:
-            subprocess.run(command, env=environment, timeout=left, check=False)
-        except subprocess.TimeoutExpired:
-            print(f"{name}: cut off")
+    def tell(line: dict[str, Any]) -> None:
+        with lines.open("a", encoding="utf-8") as file:
+            file.write(json.dumps(line) + "\n")
+        print(_brief(line), flush=True)
 
-    with ThreadPoolExecutor(args.jobs) as pool:
-        list(pool.map(one, names))
+    tasks = [
+        adaptation_jobs.Task(p.name, args.scale * p.seconds, 1 / (args.alone if p.adversarial else args.jobs))
+        for p in planned
+        if p.name not in done
+    ]
+    args.commit = _commit(args.commit)
+    adaptation_jobs.run_all(tasks, partial(_runner, args), tell, budget=args.budget)
+
+
+def _runner(args: argparse.Namespace) -> adaptation_jobs.Run:
+    return partial(_measured, args)
+
+
+def _measured(args: argparse.Namespace, name: str, seconds: float) -> dict[str, Any]:
+    line = measure(name, seconds, args)
+    if torch.cuda.is_available():
+        torch.cuda.empty_cache()
+    return line
 
 
 def _brief(line: dict[str, Any]) -> str:
@@ -378,10 +247,13 @@ def parse(argv: list[str] | None = None) -> argparse.Namespace:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument("--row", action="append", default=[], help="name or pattern; may be repeated")
     parser.add_argument("--list", action="store_true", help="print all names")
-    parser.add_argument("--seconds", type=float, default=60.0, help="training time of a row")
-    parser.add_argument("--budget", type=float, default=math.inf, help="seconds after which no row is begun")
+    parser.add_argument("--plan", help="main, tables or all: rows in the order of their importance")
+    parser.add_argument("--seconds", type=float, default=60.0, help="training time of each --row")
+    parser.add_argument("--scale", type=float, default=1.0, help="all training times are multiplied by this")
+    parser.add_argument("--budget", type=float, default=math.inf, help="seconds after which all ends")
     parser.add_argument("--out", default="out/adaptation")
-    parser.add_argument("--jobs", type=int, default=1, help="processes at a time on the one device")
+    parser.add_argument("--jobs", type=int, default=1, help="rows at a time that have no critics")
+    parser.add_argument("--alone", type=int, default=1, help="rows at a time that have critics")
     parser.add_argument("--device", default="cuda" if torch.cuda.is_available() else "cpu")
     parser.add_argument("--images", default=_default_images())
     parser.add_argument(
@@ -401,15 +273,22 @@ def main() -> None:
     """Run or list rows."""
     args = parse()
     if args.table:
-        adaptation_page.write(Path(args.out), ROOT / "docs" / "adaptation.md", args.jobs)
+        import adaptation_page
+
+        adaptation_page.write(Path(args.out), ROOT / "docs" / "adaptation.md")
         return
     every = rows()
-    names = [n for pattern in args.row for n in every if fnmatch.fnmatch(n, pattern)]
-    names = list(dict.fromkeys(names))
-    if args.list or not names:
-        print("\n".join(every if args.list else ["no row of that name; --list shows them"]))
+    if args.list:
+        print("\n".join(every))
         return
-    work(names, args)
+    planned = plan(args.plan) if args.plan else []
+    names = [n for pattern in args.row for n in every if fnmatch.fnmatch(n, pattern)]
+    planned += [
+        Planned(n, args.seconds, every[n].recipe.get("objective") != "moments") for n in dict.fromkeys(names)
+    ]
+    if not planned:
+        raise SystemExit("no row of that name; --list shows them")
+    work(planned, args)
 
 
 if __name__ == "__main__":

@@ -1,5 +1,7 @@
 """How fast learning is, part by part, and how near a critic step is to what memory allows.
 
+Each part is timed alone, waiting for the device, so the parts of a step add up to more than the step.
+
     python perf/bench_training.py                    the study's size: 12 scenes of 240x240, 24 samples
     python perf/bench_training.py --small            for a CPU
     python perf/bench_training.py --out out/training.json
@@ -16,6 +18,7 @@ import platform
 import statistics
 import subprocess
 import time
+import warnings
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -24,7 +27,7 @@ import numpy as np
 import torch
 
 from dase import images
-from dase.critics import BankShape, CriticBank, _has_grouped_products
+from dase.critics import BankShape, CriticBank, _Batch, _has_grouped_products
 from dase.kernels import autograd_training as bridge
 from dase.networks import NetworkShape
 from dase.objectives import Adversarial, Hash, critic_maps, cut_patches
@@ -69,7 +72,7 @@ def copy_rate(clock: Clock, size: int) -> float:
 
 def make(args: argparse.Namespace, objective: str) -> Training:
     """Return a run at the size to be measured, some steps old."""
-    looks = Looks(width=96, height=96, samples=12) if args.small else Looks()
+    looks = Looks(regime="mixed", **(dict(width=96, height=96, samples=12) if args.small else {}))
     scenery = Scenery(images.open_images(args.images), looks, device=args.device)
     how = Hash(size=16, orientations=8, coherence=1) if args.small else Hash()
     network = NetworkShape(channels=8, depth=2) if args.small else NetworkShape()
@@ -132,13 +135,90 @@ def _critics(training: Training, clock: Clock) -> dict[str, float]:
     patches, others = (cut_patches(critic_maps(p.counts), size) for p in (fake, real))
     ours, theirs = objective.hasher.classes(fake), objective.hasher.classes(real)
     weights = objective.weights()
-    return {
-        "hash": clock(lambda: objective.hasher.classes(fake)),
-        "maps and patches": clock(lambda: cut_patches(critic_maps(fake.counts), size)),
-        "bank step": clock(lambda: objective.bank.step(patches, ours, others, theirs, weights, rate=1e-9)),
-        "bank input gradient": clock(lambda: objective.bank.input_gradient(patches, ours, weights)),
-        "structure kernel": clock(lambda: bridge.patch_structure(fake.grey, size=size, stride=size)),
+    bank = objective.bank
+    share = torch.rand(len(patches), 1, device=clock.device)
+
+    def sort() -> _Batch:
+        return _Batch(bank, patches, ours, others, theirs, weights, share)
+
+    batch = sort()
+    rows = batch.rows.clone()
+
+    def differentiate() -> None:
+        batch.rows.copy_(rows)
+        batch.differentiate(1.0)
+
+    parts = {
+        "bank: sort and gather": clock(sort),
+        "bank: forward": clock(lambda: bank._forward(rows, batch.by)),
+        "bank: forward, gradients": clock(differentiate),
+        "bank step": clock(lambda: bank.step(patches, ours, others, theirs, weights, rate=1e-9)),
     }
+    penalty = parts.pop("bank: forward, gradients") - parts["bank: forward"]
+    step = parts.pop("bank step")
+    return parts | {
+        "bank: gradients, penalty": penalty,
+        "bank: optimiser": step - penalty - sum(parts.values()),
+        "bank: input gradient": clock(lambda: bank.input_gradient(patches, ours, weights)),
+        "hash, both sides": 2 * clock(lambda: objective.hasher.classes(fake)),
+        "maps and patches": clock(lambda: cut_patches(critic_maps(fake.counts), size)),
+    }
+
+
+GROUPS = {
+    "render": ("render fake", "draw real"),
+    "UNet": ("network forward", "network backward"),
+    "counts": ("count", "count gradient", "count anew for derivatives"),
+    "bank": ("bank: sort and gather", "bank: forward", "bank: input gradient"),
+    "penalty": ("bank: gradients, penalty",),
+    "moments": ("moments", "newton"),
+    "optimisers": ("optimiser", "bank: optimiser"),
+    "hash": ("hash, both sides", "maps and patches"),
+}
+"""Parts of a step under the names that are reported."""
+
+
+def shares(parts: dict[str, float]) -> dict[str, float]:
+    """Return the time of each group [s]."""
+    sums = {name: sum(parts.get(part, 0.0) for part in group) for name, group in GROUPS.items()}
+    return {name: value for name, value in sums.items() if value}
+
+
+def host(training: Training, clock: Clock, steps: int = 20) -> dict[str, float]:
+    """Return the processor time of a step in Python's thread [s], and how often a step waits for the GPU."""
+    begin = time.thread_time()
+    for _ in range(steps):
+        training.advance()
+    out = {"host_seconds": (time.thread_time() - begin) / steps}
+    clock.wait()
+    if clock.device.type == "cuda":
+        torch.cuda.set_sync_debug_mode("warn")
+        with warnings.catch_warnings(record=True) as seen:
+            warnings.simplefilter("always")
+            training.advance()
+        torch.cuda.set_sync_debug_mode("default")
+        out["waits"] = len(seen)
+        for text in sorted({f"{w.filename}:{w.lineno}" for w in seen}):
+            print(f"  waits for the GPU at {text}")
+    return out
+
+
+def kernels(training: Training, steps: int = 5) -> None:
+    """Print what runs on the GPU in a step, the longest first."""
+    from torch.profiler import ProfilerActivity, profile
+
+    with profile(activities=[ProfilerActivity.CUDA]) as seen:
+        for _ in range(steps):
+            training.advance()
+        torch.cuda.synchronize()
+    spent: dict[str, list[float]] = {}
+    for event in seen.events():
+        spent.setdefault(event.name, []).append(event.time_range.elapsed_us())
+    total = sum(map(sum, spent.values())) / steps / 1e3
+    number = sum(map(len, spent.values())) / steps
+    print(f"  the GPU is busy for {total:.2f} ms per step, {number:.0f} kernels and copies; the longest:")
+    for name, each in sorted(spent.items(), key=lambda item: -sum(item[1]))[:14]:
+        print(f"    {sum(each) / steps / 1e3:7.3f} ms {len(each) / steps:6.1f} x {name[:90]}")
 
 
 def bank(args: argparse.Namespace, clock: Clock, rate: float, patches: int) -> dict[str, float]:
@@ -211,13 +291,22 @@ def main() -> None:
             f"{1e3 * line['update_seconds']:.2f} ms: {100 * line['update_share']:.0f} %"
         )
     for objective in ("wgan", "moments"):
-        parts = iterations(make(args, objective), clock)
-        found[objective] = parts
+        training = make(args, objective)
+        parts = iterations(training, clock)
         whole = parts["iteration"]
+        parts |= host(training, clock)
+        found[objective] = parts | {"shares": shares(parts)}
         print(f"{objective}: {1e3 * whole:.2f} ms per iteration, {1 / whole:.1f} steps/s")
-        for name, seconds in parts.items():
-            if name != "iteration":
-                print(f"  {name:28s} {1e3 * seconds:8.2f} ms  {100 * seconds / whole:4.0f} %")
+        print(f"  Python's thread works {1e3 * parts['host_seconds']:.2f} ms per step")
+        if "waits" in parts:
+            print(f"  a step waits for the GPU {parts['waits']} times")
+        for name, seconds in found[objective]["shares"].items():
+            print(f"  {name:28s} {1e3 * seconds:8.2f} ms  {100 * seconds / whole:4.0f} %")
+            for part in GROUPS[name]:
+                if part in parts and len(GROUPS[name]) > 1:
+                    print(f"      {part:24s} {1e3 * parts[part]:8.2f} ms")
+        if clock.device.type == "cuda":
+            kernels(training)
     if args.out is not None:
         args.out.parent.mkdir(parents=True, exist_ok=True)
         args.out.write_text(json.dumps(found, indent=1), encoding="utf-8")

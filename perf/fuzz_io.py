@@ -87,6 +87,18 @@ def video(codec: str):
     return make
 
 
+def pictures(path: Path, e, frames) -> None:
+    """A folder of text with pictures; each file of it is damaged on its own."""
+    path.mkdir()
+    rows = zip(e.t.tolist(), e.x.tolist(), e.y.tolist(), e.p.astype(int).tolist(), strict=True)
+    (path / "events.txt").write_text("".join(f"{t:.6f} {x} {y} {p}\n" for t, x, y, p in rows))
+    names = [f"frame_{k}.png" for k in range(len(frames[0]))]
+    lines = (f"{t} {name}\n" for t, name in zip(frames[0], names, strict=True))
+    (path / "images.txt").write_text("".join(lines))
+    for name, grey in zip(names, frames[1], strict=True):
+        cv2.imwrite(str(path / name), grey)
+
+
 SAMPLES = {
     **{name: reference_io.SAMPLES[name] for name in ("EVT2", "EVT3", "EVT2.1", "EVT2.1 legacy", "DAT")},
     "AEDAT2": reference_io.SAMPLES["AEDAT2"],
@@ -110,6 +122,7 @@ SAMPLES = {
     "MCAP": reference_io.SAMPLES["MCAP"],
     "AVI": (".avi", with_frames(video("MJPG"))),
     "MP4": (".mp4", with_frames(video("mp4v"))),
+    "text with PNG": (".folder", with_frames(pictures)),
 } | reference_io.SAMPLES
 """Those that hold most first, then what is left of those of the tests; small sensors keep them small."""
 W, H = 48, 36

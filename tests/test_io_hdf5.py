@@ -15,6 +15,17 @@ from dase.io import columns
 from dase.io import ecf as ecf_module
 from dase.io.sequence import Sequence
 
+READ = """
+import sys
+from dase import io
+from dase.errors import InputError
+try:
+    io.read(sys.argv[1])
+except InputError as error:
+    print(error)
+"""
+"""Script that reads a file and prints why it cannot be read."""
+
 
 def test_dsec_with_blosc(tmp_path, rng):
     plugin = pytest.importorskip("hdf5plugin")
@@ -133,6 +144,13 @@ def test_a_heap_of_texts_with_an_empty_hole_is_no_endless_loop(tmp_path, rng, ma
             act(path)
 
 
+def test_names_in_a_file_cannot_break_the_sentence(tmp_path):
+    with h5py.File(tmp_path / "a.h5", "w") as file:
+        file["two\nlines and \x1b[31mred"] = np.zeros(3)
+    with pytest.raises(InputError, match=r"holds two lines and \?\[31mred$"):
+        io.read(tmp_path / "a.h5")
+
+
 def test_layouts_nobody_knows(tmp_path):
     with h5py.File(tmp_path / "a.h5", "w") as file:
         file["something/else"] = np.zeros(3)
@@ -249,6 +267,32 @@ def test_blosc_without_its_parameters_is_no_crash(tmp_path, rng):
     for act in (io.read, lambda path: list(io.stream(path))):
         with pytest.raises(InputError, match="is damaged: its filter has 0 parameters"):
             act(path)
+
+
+def test_a_list_of_unknown_kind_is_no_crash(tmp_path, rng):
+    """In a process of its own, which HDF5 2.0 would end."""
+    ecf(tmp_path / "a.hdf5", events(rng))
+    data = bytearray((tmp_path / "a.hdf5").read_bytes())
+    place = data.index(b"\x19\x01\x01\x00\x10\x00\x00\x00")  # a text of any length; nearly
+    data[place + 1] = 9
+    (tmp_path / "a.hdf5").write_bytes(data)
+    (line,) = measured(READ, tmp_path / "a.hdf5")
+    assert line.endswith("its attribute 'geometry' holds neither numbers nor a text")
+
+
+def test_a_file_that_says_it_is_several_takes_no_memory(tmp_path, rng):
+    ecf(tmp_path / "a.hdf5", events(rng))
+    data = bytearray((tmp_path / "a.hdf5").read_bytes())
+    assert data[48:56] == b"\xff" * 8
+    data[48:56] = struct.pack("<Q", 4096)
+    data[4096:4112] = struct.pack("<IQ4x", 0, 1 << 30)
+    (tmp_path / "a.hdf5").write_bytes(data)
+    (line,) = measured(READ, tmp_path / "a.hdf5")
+    assert line.endswith("is HDF5 in several files, which is not read, or damaged")
+    for size in (0, 8, 40):
+        (tmp_path / "a.hdf5").write_bytes(data[:size])
+        with pytest.raises(InputError, match=r"a\.hdf5: "):
+            io.read(tmp_path / "a.hdf5")
 
 
 @pytest.mark.parametrize("number", [6, 305])

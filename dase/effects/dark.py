@@ -8,12 +8,13 @@ from typing import ClassVar
 import warp as wp
 
 from dase.effects.base import Effect, parameter
+from dase.kernels.lanes import exponential
 
 
 @wp.func
 def joined(intensity: float, current: float, spread: float, pixel_normal: float):
     """Intensity that would make photocurrent and dark current together."""
-    return intensity + current * wp.exp(spread * pixel_normal)
+    return intensity + current * exponential(spread * pixel_normal)
 
 
 @dataclass(frozen=True, kw_only=True)

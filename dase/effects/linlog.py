@@ -8,6 +8,7 @@ from typing import ClassVar
 import warp as wp
 
 from dase.effects.base import Effect, parameter
+from dase.kernels.lanes import exponential, logarithm
 
 
 @wp.func
@@ -15,9 +16,9 @@ def respond(voltage: float, log_eps: float, knee: float, slope: float):
     """Voltage that falls linearly with the intensity below the knee."""
     out = voltage
     if knee > 0.0:
-        top = wp.log(knee + log_eps)
+        top = logarithm(knee + log_eps)
         if voltage < top:
-            out = top + slope * (wp.exp(voltage - top) - 1.0)
+            out = top + slope * (exponential(voltage - top) - 1.0)
     return out
 
 

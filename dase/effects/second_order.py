@@ -9,7 +9,7 @@ from typing import ClassVar
 import warp as wp
 
 from dase.effects.base import Effect, parameter
-from dase.kernels.lanes import exponential
+from dase.kernels.lanes import circle, exponential
 
 
 @wp.func
@@ -20,8 +20,10 @@ def impulse(x: float, damping: float):
     if damping < 1.0:
         w = wp.sqrt((1.0 - damping) * (1.0 + damping))
         decay = exponential(-damping * x)
-        h = decay * wp.sin(w * x) / w
-        dh = decay * wp.cos(w * x) - damping * h
+        turn = w * x / (2.0 * wp.pi)
+        cosine, sine = circle(turn - wp.floor(turn))
+        h = decay * sine / w
+        dh = decay * cosine - damping * h
     else:
         w = wp.sqrt((damping - 1.0) * (damping + 1.0))
         fast = exponential(-(damping + w) * x)

@@ -9,6 +9,7 @@ from typing import ClassVar
 import warp as wp
 
 from dase.effects.base import Effect, parameter
+from dase.kernels.lanes import circle, exponential, logarithm
 
 POLE = wp.constant(2.0 * math.pi / math.sqrt(math.sqrt(2.0) - 1.0))
 """Frequency of either of two equal poles [rad/s] at which together they lose 3 dB at 1 Hz."""
@@ -30,21 +31,6 @@ def fresh(x: float, kept: float):
 
 
 @wp.func
-def circle(turn: float):
-    """Cosine and sine of `turn` in [0, 1] turns, within 4e-7: a fifth of the time of the library's."""
-    quarter = int(4.0 * turn + 0.5)
-    f = 4.0 * turn - float(quarter)
-    g = f * f
-    # Taylor series in quarter turns, |f| <= 1/2
-    x = 1.0 + g * (-1.23370055 + g * (0.253669508 + g * (-0.0208634807 + g * 0.000919260274)))
-    y = f * (1.57079633 + g * (-0.645964098 + g * (0.0796926262 + g * (-0.00468175414 + g * 0.000160441185))))
-    odd = (quarter & 1) != 0
-    cosine = wp.where(odd, y, x)
-    sine = wp.where(odd, x, y)
-    return wp.where(((quarter + 1) & 2) != 0, -cosine, cosine), wp.where((quarter & 2) != 0, -sine, sine)
-
-
-@wp.func
 def noisy(
     voltage: float,
     intensity: float,
@@ -63,14 +49,14 @@ def noisy(
     share = light / (light + knee)
     # beyond 100 time constants nothing is remembered
     x = wp.min(POLE * cutoff * share * dt, 100.0)
-    kept = wp.exp(-x)
+    kept = exponential(-x)
     var, mixed, speed_var = fresh(x, kept * kept)
     first = wp.sqrt(var)
     cross = mixed / first
     then = wp.sqrt(wp.max(speed_var - cross * cross, 0.0))
     # both normals of one Box-Muller pair
     normal, normal_2 = circle(uniform_2)
-    scale = sigma * wp.sqrt(-2.0 * wp.log(1.0 - uniform) * (1.0 - share))
+    scale = sigma * wp.sqrt(-2.0 * logarithm(1.0 - uniform) * (1.0 - share))
     now = kept * (noise + x * (noise + speed)) + scale * first * normal
     speed_now = kept * (speed - x * (noise + speed)) + scale * (cross * normal + then * normal_2)
     return voltage + now, now, speed_now

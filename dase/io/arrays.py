@@ -151,6 +151,8 @@ def _own_size(source: Source) -> tuple[int, int] | None:
                     shape, _ = _header(stream, info.compress_size, info.file_size)
                 if len(shape) >= 2:
                     return shape[-1], shape[-2]
+        if not known:
+            raise InputError(npz.NOTHING)
         if len(known) < len(npz.EVENT_KEYS):
             raise InputError(f"has no '{next(n for n in npz.EVENT_KEYS if n not in known)}'")
         if "wh.npy" not in archive.NameToInfo:

@@ -25,6 +25,9 @@ FILTERS = {1: 1, 2: 0, 3: 0, 32000: 0, 32001: 4, 32004: 0, 32015: 0, 32026: 4}
 """Number of a filter to how many parameters it needs: gzip, shuffle, Fletcher's sum, LZF; of hdf5plugin
 Blosc, LZ4, Zstandard, Blosc 2. Blosc crashes without its parameters."""
 
+PLAIN = (h5py.h5t.INTEGER, h5py.h5t.FLOAT, h5py.h5t.STRING, h5py.h5t.ENUM)
+"""Kinds of attributes that are read. HDF5 2.0 crashes on a list whose kind of length is unknown."""
+
 TELLING = (
     "CD/events",
     *("events/t", "events/x", "events/y", "events/p"),
@@ -47,9 +50,33 @@ def opened(path: Path) -> Iterator[Any]:
         _plugin_tried = True
         with suppress(ImportError):
             import hdf5plugin  # noqa: F401  # registers its filters
+    check_head(path)
     check_heaps(path)
     with h5py.File(path, "r") as file:
         yield file
+
+
+def check_head(path: Path) -> None:
+    """Raise InputError where the first block of a file asks for what no single file needs.
+
+    8 bytes that mark the file, then u8 version of the block. In versions 0 and 1: at byte 13 u8 bytes of an
+    address and of a length; at 24, in version 1 at 28, u64 begin, free space, end, driver. HDF5 2.0 takes as
+    much memory for the driver as it finds there; only files in several parts have one, others all ones.
+    """
+    with path.open("rb") as file:
+        head = file.read(64)
+    if len(head) < 64:
+        raise InputError(f"ends after {len(head)} bytes")
+    if head[8] > 1:
+        return
+    if head[13:15] != b"\x08\x08":
+        raise InputError(
+            "cannot be read as HDF5, damaged or cut short: "
+            f"it claims addresses of {head[13]} bytes and lengths of {head[14]}"
+        )
+    place = 48 + 4 * head[8]
+    if head[place : place + 8] != b"\xff" * 8:
+        raise InputError("is HDF5 in several files, which is not read, or damaged")
 
 
 def check_heaps(path: Path) -> None:
@@ -108,6 +135,7 @@ def has(path: Path, head: bytes, *names: str) -> bool:
 
 def _found(path: Path) -> frozenset[str]:
     try:
+        check_head(path)
         with h5py.File(path, "r") as file:
             return frozenset(name for name in TELLING if isinstance(file.get(name), h5py.Dataset))
     except Exception:  # damaged: left to the reader that is tried at last
@@ -121,7 +149,7 @@ def dataset(file: Any, name: str, ndim: int | None = None) -> Any:
         raise InputError(f"has no '{name}'")
     if ndim is not None and found.ndim != ndim:
         raise InputError(f"'{name}' must have {ndim} axes, got shape {found.shape}")
-    if found.dtype.kind not in "biuf" and found.dtype.names is None:
+    if (found.dtype.kind not in "biuf" and found.dtype.names is None) or found.dtype.hasobject:
         raise InputError(f"'{name}' must hold numbers, got {found.dtype}")
     check_whole(found, name)
     _check_filters(found, name)
@@ -163,6 +191,8 @@ def attribute(node: Any, name: str) -> Any:
     found = node.attrs.get_id(name)
     if found.get_storage_size() > MOST_TEXT:
         raise InputError(f"its attribute '{name}' has {found.get_storage_size()} bytes")
+    if found.get_type().get_class() not in PLAIN:
+        raise InputError(f"its attribute '{name}' holds neither numbers nor a text")
     with _little_memory() if found.dtype.hasobject else nullcontext():
         return node.attrs[name]
 

@@ -161,7 +161,8 @@ def _times(buffer: NDArray[np.uint8], count: int) -> tuple[Counts, int]:
 
 def _parts(file: Any, source: Source) -> Iterator[Piece]:
     events = file["CD/events"]
-    if events.ndim != 1 or not {"x", "y", "p", "t"} <= set(events.dtype.names or ()):
+    kinds = {name: events.dtype[name].kind for name in events.dtype.names or ()}
+    if events.ndim != 1 or not {"x", "y", "p", "t"} <= set(kinds) or not set(kinds.values()) <= set("biu"):
         raise InputError(f"'CD/events' must have the fields x, y, p and t, got {events.dtype}")
     properties = events.id.get_create_plist()
     filters = [properties.get_filter(k)[0] for k in range(properties.get_nfilters())]

@@ -20,11 +20,15 @@ from dase.errors import InputError
 from dase.events import Events
 from dase.io.format import Format, sequence_of, taken
 from dase.io.sequence import GREYS, Sequence, reading
-from dase.io.source import Picture, Source, checked_size
-from dase.pictures import SUFFIXES
+from dase.io.source import Picture, Source, checked_size, refuse_bomb
+from dase.pictures import SUFFIXES, unpack
 
 if TYPE_CHECKING:
     from dase.video import FrameReader
+
+
+WIDEST = 8
+"""Bytes of a pixel, at most: red, green, blue and alpha of 16 bits."""
 
 
 def grey(data: bytes, name: str) -> NDArray[Any]:
@@ -34,17 +38,13 @@ def grey(data: bytes, name: str) -> NDArray[Any]:
 
     try:
         with Image.open(io.BytesIO(data)) as picture:
-            checked_size(picture.size)
+            width, height = checked_size(picture.size)
+            refuse_bomb(len(data), WIDEST * width * height)
     except InputError as error:
         raise InputError(f"{name}: {error}") from None
     except Exception as error:  # whatever Pillow makes of a damaged head
         raise InputError(f"{name}: cannot be decoded as a picture ({error})") from None
-    level = cv2.utils.logging.getLogLevel()
-    cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)  # our sentence is enough
-    try:
-        out = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH)
-    finally:
-        cv2.utils.logging.setLogLevel(level)
+    out = unpack(data, cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH)
     if out is None or out.dtype not in GREYS:
         raise InputError(f"{name}: cannot be decoded as a picture of 8 or 16 bits, damaged or cut short")
     return np.asarray(out)

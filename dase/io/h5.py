@@ -21,6 +21,7 @@ from typing import Any
 
 import h5py
 import numpy as np
+from isal import isal_zlib
 from numpy.typing import NDArray
 
 from dase.errors import InputError
@@ -40,7 +41,8 @@ BLOCK = 4 * CHUNK  # events gathered before they are written
 #   lzf + shuffle     5.0 /  6.7          185                       310-420
 #   gzip-1 + shuffle  4.1 /  6.1          90-115                    355-500
 # lzf would be twice as fast, but reads its hash table uninitialised: the same events give files that differ
-# by some bytes. Smooth flow shrinks by 4.3. Frames do not shrink.
+# by some bytes. Smooth flow shrinks by 4.3. Frames do not shrink. Whole chunks go past HDF5's own filter, to
+# ISA-L, which makes the same kind of stream, of about the same size, six to nine times as fast.
 COMPRESSION: dict[str, Any] = {"compression": "gzip", "compression_opts": 1, "shuffle": True}
 
 LATE = -1  # marks a frame that came after later events had been written
@@ -109,6 +111,14 @@ class _Disk:
         self._file.close()
 
 
+def put_chunk(dataset: h5py.Dataset, place: int | tuple[int, ...], values: NDArray[Any]) -> None:
+    """Write one whole chunk of a dataset, filtered as `COMPRESSION` says: shuffled, then deflated."""
+    # the first bytes of all numbers, then the second ones, and so on
+    planes = values.reshape(-1).view(np.uint8).reshape(-1, values.itemsize).T
+    packed = isal_zlib.compress(np.ascontiguousarray(planes), 1)
+    dataset.id.write_direct_chunk(place if isinstance(place, tuple) else (place,), packed)
+
+
 class _Writer(Writer):
     """Appends whole blocks of events, and frames as they come."""
 
@@ -162,7 +172,11 @@ class _Writer(Writer):
                 self._create(name)
             dataset = self._file[f"events/{name}"]
             dataset.resize((end,))
-            dataset[self._written : end] = column[:count]
+            whole = count // CHUNK * CHUNK
+            for begin in range(0, whole, CHUNK):
+                put_chunk(dataset, self._written + begin, column[begin : begin + CHUNK])
+            if whole < count:
+                dataset[self._written + whole : end] = column[whole:count]
         self._written, self._last_written = end, float(columns[0][count - 1])
         self._waiting -= count
         self._parts = [tuple(column[count:].copy() for column in columns)] if self._waiting else []
@@ -186,11 +200,9 @@ class _Writer(Writer):
         self._before.append(self._written if time > self._last_written else LATE)
         if flow is not None:
             field = self._file.create_dataset(
-                f"flow/flow{index:09d}",
-                data=flow.astype(np.float32, copy=False),
-                chunks=flow.shape,
-                **COMPRESSION,
+                f"flow/flow{index:09d}", flow.shape, np.float32, chunks=flow.shape, **COMPRESSION
             )
+            put_chunk(field, (0, 0, 0), flow.astype(np.float32, copy=False))
             field.attrs["size"] = flow.shape
             field.attrs["timestamp"] = float(time)
         self._disk.check()

@@ -37,6 +37,8 @@ EVENT_KEYS = ("t_us", "x", "y", "p")
 FRAME_KEYS = ("frames", "frame_begin_us", "frame_end_us", "frame_us")
 KEYS = (*EVENT_KEYS, "label", "wh", *FRAME_KEYS, "flow", "thresholds", "configuration")
 
+NOTHING = "has neither events (t_us, x, y, p) nor frames"
+
 
 class _Writer(Writer):
     """Keeps all parts in memory and writes them at the end, for an array needs its length first."""
@@ -149,7 +151,7 @@ def _parse(source: Source, content: dict[str, NDArray[Any]]) -> Sequence:
     if frames is not None and (frames.dtype not in GREYS or frames.ndim != 3):
         raise InputError(f"'frames' must be uint8 or uint16 (F, H, W), got {frames.dtype} {frames.shape}")
     if frames is None and not set(EVENT_KEYS) & set(content):
-        raise InputError("has neither events (t_us, x, y, p) nor frames")
+        raise InputError(NOTHING)
     events = _events(source, content, (frames, flow, thresholds))
     if flow is not None and frames is None:
         flow = flow / max(float(events.t[-1] - events.t[0]), 1e-6) if len(events) else None

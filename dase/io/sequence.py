@@ -231,12 +231,17 @@ def reading(path: Path, kind: str) -> Iterator[None]:
     try:
         yield
     except InputError as error:
-        raise type(error)(f"{path}: {error}") from error
+        raise type(error)(f"{path}: {_sentence(error)}") from error
     except FileNotFoundError:
         raise InputError(f"{path}: no such file") from None
     except Exception as error:  # h5py, zipfile, zlib and numpy have no common error for damaged files
-        why = " ".join(str(error).split()) or type(error).__name__
+        why = _sentence(error) or type(error).__name__
         raise InputError(f"{path}: cannot be read as {kind}, damaged or cut short ({why})") from error
+
+
+def _sentence(error: Exception) -> str:
+    """Return what an error says in one line; names out of a damaged file may hold anything."""
+    return "".join(c if c.isprintable() else "?" for c in " ".join(str(error).split()))
 
 
 def coordinates(values: NDArray[Any], name: str) -> NDArray[np.uint16]:
