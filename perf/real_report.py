@@ -14,6 +14,7 @@ matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.ticker import NullFormatter
 
 from dase.plates import BOTH, INK, QUIET, number
 from dase.show import overlay
@@ -119,7 +120,8 @@ def _threshold(found: dict[str, Any]) -> str:
 def _estimates(found: dict[str, Any]) -> str:
     chosen = [(n, e) for n, e in found["parameters"].items()]
     said = [f"`{n}` {e['value']:.3g} ({e['low']:.3g} to {e['high']:.3g})" for n, e in chosen]
-    return "Fitted, with 90 % intervals: " + ", ".join(said) + "." if said else ""
+    what = "Fitted with the stand-ins" if found["unexplained"] else "Fitted"
+    return f"{what}, with 90 % intervals: {', '.join(said)}." if said else ""
 
 
 def draw(cameras: Mapping[str, Any], found: Mapping[str, Any], path: Path) -> None:
@@ -166,15 +168,18 @@ def staircase(axis: Axes, found: dict[str, Any]) -> None:
         x = np.repeat(edges[sure:], 2)[:-1]
         axis.plot(x, [errors[sure - 1], *np.repeat(errors[sure:], 2)], color=QUIET, lw=1.7, ls=(0, (3, 1.5)))
     for k, error in enumerate(errors):
+        below = 0.6 < error < 1  # beside the line of the floor, not on it
         axis.annotate(
-            number(error), (k, error), (0, 4), textcoords="offset points", ha="center", weight="bold",
-            fontsize=9, color=INK if k < sure else QUIET,
+            number(error), (k, error), (0, -12 if below else 4), textcoords="offset points", ha="center",
+            weight="bold", fontsize=9, color=INK if k < sure else QUIET,
         )  # fmt: skip
     axis.set_ylim(0.5 * min(1.0, *errors), 2.2 * max(*errors, gate))
     axis.set_xlim(-0.5, max(n, 3) - 0.5)
     axis.set_xticks(range(n), [s.replace(" + ", "\n+ ").strip() for s in steps], fontsize=8.5)
     axis.tick_params(axis="x", length=0)
     axis.tick_params(axis="y", labelsize=8)
+    axis.yaxis.set_major_formatter(lambda value, _: f"{value:g}")
+    axis.yaxis.set_minor_formatter(NullFormatter())
     axis.spines[["top", "right"]].set_visible(False)
     axis.set_title(
         "error on held-out pixels and time" + (" (dashed: stand-ins)" if stand_ins else ""),
@@ -192,9 +197,9 @@ error is that of pixels and times that no fit has seen; 1 is what two repeats of
 
 ![measured events, simulated events, and the falling error of each recording](real-cameras.png)
 
-Left: measured. Middle: what the model makes of the same scene at the same time. Right: the error with each
-effect added; the green band is what chance alone reaches, dashed steps are stand-ins that do not reach it and
-are not announced. Red is ON, blue is OFF.
+Left: measured. Middle: what the announced model makes of the same scene at the same time; thresholds alone
+where the error stays unexplained. Right: the error with each effect added; the green band is what chance
+reaches, dashed steps are stand-ins that do not reach it and are not announced. Red is ON, blue is OFF.
 
 The scene between two frames of a camera is a guess. Only where it can be trusted anything is compared (see
 [scenes](scenes.md)), and where that is not enough, an error stays that is the scene's and not the sensor's:
