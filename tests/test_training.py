@@ -224,6 +224,10 @@ def test_weights_of_moments_invert_their_covariance(rng):
     torch.testing.assert_close(
         cells.kept["weight"][0].double(), want, rtol=0.2, atol=0.02 * float(want.max())
     )
+    # where moments do not fit, each weighs by its own variance
+    cells.weigh(excess=1e4)
+    weight = cells.kept["weight"][0]
+    assert float((weight - torch.diag(weight.diagonal())).abs().max()) < 1e-2 * float(weight.diagonal().min())
 
 
 def test_features_of_neighbours_tell_the_spread(scenes, rng):
