@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -55,11 +56,13 @@ def command(
     Nothing has to be paired or calibrated. The folder gets sensor.toml, which `dase synth --sensor`,
     `dase compare` and `dase diagnose` take, its weights, a log and checkpoints; `dase show FOLDER` draws the
     learned maps. A sensor file as TARGETS is simulated first: a test with known thresholds.
+
+    On several GPUs: torchrun --nproc-per-node 4 --no-python dase train ... --backend cuda
     """
     from dase.errors import InputError
 
     try:
-        from dase import adaptation
+        from dase import adaptation, parallel
         from dase.run import CHECKPOINT, Pace, run
     except ModuleNotFoundError as error:
         if error.name not in ("torch", "safetensors"):
@@ -69,14 +72,26 @@ def command(
         targets=targets, images=images or "", preset=preset, objective=objective, steps=steps, window=window,
         size=size, sequences=sequences, pattern=pattern, seed=seed, backend=backend,
     )  # fmt: skip
-    adaptation.begin(job, output, resume=resume)
-    with _bar() as opened:
-        training = adaptation.prepare(job, progress=opened)
+    backend = parallel.join(backend)
+    first = parallel.rank() == 0
+    if first:
+        adaptation.begin(job, output, resume=resume)
+    with _bar(silent=not first) as opened:
+        training = adaptation.prepare(replace(job, backend=backend), progress=opened)
     pace = Pace(look=10 if preset == "tiny" else 25, seconds=None if minutes is None else 60 * minutes)
-    with _live(training, output if tensorboard else None) as look:
+    with _live(training, output if tensorboard and first else None, silent=not first) as look:
         # killed before its first checkpoint, a run begins anew
         resume = resume and (output / CHECKPOINT).is_file()
         last = run(training, output, pace=pace, resume=resume, look=look)
+    if first:
+        _finish(job, output, training, last)
+    parallel.leave()
+
+
+def _finish(job: Any, output: Path, training: Any, last: dict[str, float]) -> None:
+    """Write the sensor and say what was learned."""
+    from dase import adaptation
+
     width, height = training.scenery.looks.width, training.scenery.looks.height
     recorded = None if job.of_sensor else (width, height)
     path = adaptation.write_sensor(
@@ -104,10 +119,13 @@ def summary(row: dict[str, float]) -> list[str]:
 class _bar:
     """A progress bar for what is opened."""
 
+    def __init__(self, *, silent: bool):
+        self.silent = silent
+
     def __enter__(self) -> Callable[[str, int, int], None]:
         from tqdm import tqdm
 
-        self.bar: Any = tqdm(delay=0.5, leave=False, disable=None)
+        self.bar: Any = tqdm(delay=0.5, leave=False, disable=self.silent or None)
         return self._tell
 
     def _tell(self, what: str, done: int, total: int) -> None:
@@ -123,8 +141,8 @@ class _bar:
 class _live:
     """The live line of a run, and TensorBoard's log."""
 
-    def __init__(self, training: Any, folder: Path | None):
-        self.training, self.folder, self.writer = training, folder, None
+    def __init__(self, training: Any, folder: Path | None, *, silent: bool):
+        self.training, self.folder, self.writer, self.silent = training, folder, None, silent
 
     def __enter__(self) -> Callable[[dict[str, float]], None]:
         from tqdm import tqdm
@@ -137,7 +155,7 @@ class _live:
             except ImportError:
                 raise InputError("--tensorboard needs tensorboard: pip install tensorboard") from None
             self.writer = SummaryWriter(str(self.folder))
-        self.bar: Any = tqdm(total=self.training.recipe.steps, unit=" steps", disable=None)
+        self.bar: Any = tqdm(total=self.training.recipe.steps, unit=" steps", disable=self.silent or None)
         return self._look
 
     def _look(self, row: dict[str, float]) -> None:

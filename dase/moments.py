@@ -21,6 +21,7 @@ from typing import Any
 import torch
 from torch.nn import functional as F
 
+from dase import parallel
 from dase.networks import TINY, gradient_magnitude, looks
 from dase.targets import Pairs
 
@@ -225,6 +226,7 @@ class Moments:
             ).values
             places = [round(n / level * (len(pooled) - 1)) for n in range(1, level)]
             self.boundaries.append(pooled[places].contiguous())
+        parallel.alike(self.boundaries)
         height, across = sets[0][0].grey.shape[1:]
         self._make(across, height)
 
@@ -266,15 +268,17 @@ class Moments:
     @torch.no_grad()
     def see_real(self, real: Pairs, *, held_out: bool = False) -> None:
         """Take real pairs in, some of them for choosing between priors only."""
-        for name, (sums, number) in self.sums(real).items():
-            self.sets[name].see_real(sums, number, held_out=held_out)
+        for name, both in self.sums(real).items():
+            self.sets[name].see_real(*map(parallel.together, both), held_out=held_out)
 
     @torch.no_grad()
     def see_plain(self, fake: Pairs) -> dict[str, torch.Tensor]:
         """Take the reference counts of simulated pairs in; return how far each scene is off."""
         assert fake.reference is not None
         found = self.sums(Pairs(fake.grey, fake.reference))
-        return {name: self.sets[name].see_plain(*both) for name, both in found.items()}
+        return {
+            name: self.sets[name].see_plain(*map(parallel.together, both)) for name, both in found.items()
+        }
 
     def weigh(self) -> None:
         """Work out the weights."""
@@ -290,7 +294,8 @@ class Moments:
             self.weigh()
         self.calls += 1
         total, distance = fake.counts.new_zeros(()), fake.counts.new_zeros(())
-        for name, (sums, number) in self.sums(fake).items():
+        for name, both in self.sums(fake).items():
+            sums, number = map(parallel.together, both)
             cells = self.sets[name]
             # earlier batches say how far off the means are, this one which way they go: no bias by its noise
             off = cells.off()

@@ -15,6 +15,7 @@ from typing import Any
 
 import torch
 
+from dase import parallel
 from dase.kernels.autograd import STEP
 from dase.moments import LONG, Cells, Moments, of_pixels, with_neighbours, with_next
 from dase.networks import ThresholdNet
@@ -86,7 +87,7 @@ class Newton:
             self._keep("row_number", fake.counts.new_full((height,), batch * width).double(), LONG)
 
     def _keep(self, name: str, value: torch.Tensor, memory: float | None = None) -> None:
-        kept = self.kept.get(name)
+        kept, value = self.kept.get(name), parallel.total(value)
         self.kept[name] = value if kept is None else kept.mul_(memory or self.memory).add_(value)
 
     def _jacobian(self) -> torch.Tensor:

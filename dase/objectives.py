@@ -12,6 +12,7 @@ from typing import Any, Literal, Protocol
 
 import torch
 
+from dase import parallel
 from dase.critics import BankShape, CriticBank
 from dase.kernels import autograd_training as bridge
 from dase.networks import gradient_magnitude
@@ -164,6 +165,7 @@ class Adversarial:
     def calibrate(self, sets: list[tuple[Pairs, Pairs]]) -> None:
         """Place the boundaries of the hash."""
         self.hasher.calibrate(*(pairs for both in sets for pairs in both))
+        parallel.alike(self.hasher.boundaries.values())
 
     def weights(self) -> torch.Tensor:
         """Return ω of Eq. 13, from the real patches seen so far."""
@@ -178,9 +180,10 @@ class Adversarial:
 
     def loss(self, fake: Pairs, real: Pairs, *, move: bool) -> tuple[torch.Tensor, dict[str, torch.Tensor]]:
         """Move the critics, then return minus the weighted mean score of the fake patches."""
-        patches, others = self._patches(fake), self._patches(real)
-        ours, theirs = self.hasher.classes(fake), self.hasher.classes(real)
+        patches, others = (parallel.together(self._patches(pairs)) for pairs in (fake, real))
+        ours, theirs = (parallel.together(self.hasher.classes(pairs)) for pairs in (fake, real))
         number, real_number = (self._number(classes) for classes in (ours, theirs))
+        ours, theirs = (parallel.own(classes, len(self.seen)) for classes in (ours, theirs))
         self.seen += real_number
         weights = self.weights()
         for _ in range(self.steps):
@@ -189,11 +192,13 @@ class Adversarial:
                 rate=self.rate, penalty=self.penalty, generator=self.generator,
             )  # fmt: skip
         both = (number > 0) & (real_number > 0)
-        values = {"distance": found.distance, "penalty": found.penalty, "classes": both.sum()}
+        distance, lies = parallel.total(found.distance), parallel.total(found.penalty)
+        values = {"distance": distance, "penalty": lies, "classes": both.sum()}
         if not move:
             return fake.counts.new_zeros(()), values
         gain = torch.where(both, -weights / number.clamp_min(1), 0.0)
-        return (patches * self.bank.input_gradient(patches.detach(), ours, gain)).sum(), values
+        slopes = parallel.total(self.bank.input_gradient(patches.detach(), ours, gain))
+        return (patches * slopes).sum(), values
 
     def _number(self, classes: torch.Tensor) -> torch.Tensor:
         """Return how many patches each class has."""
@@ -204,11 +209,19 @@ class Adversarial:
     def state(self) -> dict[str, Any]:
         """Return the bank, the hash and the random numbers."""
         return {
-            "bank": self.bank.state(),
+            "bank": self._bank(),
             "boundaries": self.hasher.boundaries,
             "seen": self.seen,
             "generator": self.generator.get_state(),
         }
+
+    def _bank(self) -> dict[str, Any]:
+        """Return the state of all critics, each from the process that looks after it."""
+        state = self.bank.state()
+        out: dict[str, Any] = {"steps": parallel.from_owners(state["steps"])}
+        for kind in ("weights", "square"):
+            out[kind] = {name: parallel.from_owners(value) for name, value in state[kind].items()}
+        return out
 
     def load(self, state: dict[str, Any]) -> None:
         """Take over what `state` returned."""

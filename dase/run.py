@@ -12,6 +12,7 @@ from typing import Any
 
 import torch
 
+from dase import parallel
 from dase.errors import InputError
 from dase.evaluation import Exam, HeldOut
 from dase.files import replacing
@@ -75,8 +76,7 @@ def run(
         training.load(load(path, training.device))
     elif path.exists():
         raise InputError(f"{out} already holds a run; give --resume to go on with it, or another folder")
-    with replacing(out / RECIPE) as temporary:
-        temporary.write_text(training.recipe.text(), "utf-8")
+    _write_recipe(out, training.recipe)
     exam = Exam(training.scenery, training.target)
     pairs = training.target.held_out() if pace.held_out else None
     held = None if pairs is None else HeldOut(training.scenery, pairs)
@@ -98,7 +98,7 @@ class _Run:
         self.training, self.out, self.pace = training, out, pace
         self.exam, self.held, self.look = exam, held, look
         self.broken = torch.full((), -1, device=training.device)
-        self.table = _Table(out / LOG, training.step)
+        self.table = None if parallel.rank() else _Table(out / LOG, training.step)
 
     def go(self) -> dict[str, float]:
         training = self.training
@@ -122,7 +122,8 @@ class _Run:
                 _wait(training.device)
                 training.seconds = time.perf_counter() - begin
                 row = self._row(values, last)
-                if time.perf_counter() - saved > self.pace.save or (last and self.pace.save < math.inf):
+                due = time.perf_counter() - saved > self.pace.save or (last and self.pace.save < math.inf)
+                if parallel.agreed(due):
                     save(self.out / CHECKPOINT, training.state())
                     saved = time.perf_counter()
         save(self.out / RESULT, {"net": training.mean.state_dict(), "row": row})
@@ -132,15 +133,17 @@ class _Run:
         """Set the number of steps so that the run takes the time it may, by its speed since `mark`."""
         training = self.training
         assert self.pace.seconds is not None
-        each = (time.perf_counter() - mark) / (training.step - step)
-        left = self.pace.seconds - (time.perf_counter() - begin)
+        now = time.perf_counter()
+        each = parallel.agreed((now - mark) / (training.step - step))
+        left = parallel.agreed(self.pace.seconds - (now - begin))
         training.recipe = replace(training.recipe, steps=training.step + max(int(0.97 * left / each), 1))
-        with replacing(self.out / RECIPE) as temporary:
-            temporary.write_text(training.recipe.text(), "utf-8")
+        _write_recipe(self.out, training.recipe)
 
     def _row(self, values: dict[str, torch.Tensor], last: bool) -> dict[str, float]:
         training = self.training
         self._check()
+        if self.table is None:
+            return {}
         row = {"step": training.step, "seconds": training.seconds}
         row |= {name: float(value) for name, value in values.items()}
         row |= {f"raw_{name}": value for name, value in self.exam.marks(training.net).items()}
@@ -217,8 +220,16 @@ class _Table:
             writer.writerows(self.rows)
 
 
+def _write_recipe(out: Path, recipe: Recipe) -> None:
+    if parallel.rank() == 0:
+        with replacing(out / RECIPE) as temporary:
+            temporary.write_text(recipe.text(), "utf-8")
+
+
 def save(path: Path, state: dict[str, Any]) -> None:
-    """Write a checkpoint; it appears whole or not at all."""
+    """Write a checkpoint, if this is the first process; it appears whole or not at all."""
+    if parallel.rank():
+        return
     with replacing(path) as temporary:
         torch.save(state, temporary)
 

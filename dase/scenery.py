@@ -24,6 +24,9 @@ BACKGROUND = (320, 480)
 LOG_EPS = 1e-3
 """Added to intensities before the logarithm, as `Sensor.log_eps` is by default."""
 
+LINE = 32
+"""Numbers of 4 bytes in a line of a GPU's memory."""
+
 SHAKEN = Regime(1, (0, 8), (400.0, 1400.0), (0.0, 60.0), (20.0, 300.0), (0.0, 60.0))
 """A camera in motion before moving things: most pixels see a change in a short window."""
 
@@ -137,17 +140,21 @@ class Scenery:
         )  # fmt: skip
 
     def _sent(self, *arrays: NDArray[Any]) -> list[torch.Tensor]:
-        """Return arrays of 4-byte numbers as tensors on the device, sent in one piece."""
-        flat = np.concatenate([np.ascontiguousarray(a).view(np.int32).ravel() for a in arrays])
+        """Return arrays of 4-byte numbers as tensors on the device, sent in one piece.
+
+        Each begins at a multiple of LINE numbers, as vectors on a GPU may ask for.
+        """
+        begin = np.cumsum([0, *(-(-a.size // LINE) * LINE for a in arrays)])
+        flat = np.zeros(begin[-1], np.int32)
+        for array, start in zip(arrays, begin, strict=False):
+            flat[start : start + array.size] = np.ascontiguousarray(array).view(np.int32).ravel()
         words = torch.from_numpy(flat)
         if self.device.type == "cuda":
             words = words.pin_memory().to(self.device, non_blocking=True)
-        out, begin = [], 0
-        for array in arrays:
-            part = words[begin : begin + array.size]
-            begin += array.size
+        out = []
+        for array, start in zip(arrays, begin, strict=False):
             kind = torch.float32 if array.dtype == np.float32 else torch.int32
-            out.append(part.view(kind).view(array.shape))
+            out.append(words[start : start + array.size].view(kind).view(array.shape))
         return out
 
 

@@ -94,6 +94,9 @@ class Target(ABC):
         """Return pairs that `draw` never gives, or None where every draw is new."""
         return None
 
+    def part(self, process: int) -> None:  # noqa: B027
+        """Become different from the same target in other processes, but for what is recorded."""
+
     def state(self) -> dict[str, Any]:
         """Return what further draws depend on, beside the random numbers they are given."""
         return {}
@@ -122,6 +125,11 @@ class Endless(Target):
         assert self.truth is not None
         mu, sigma = self.truth(grey)
         return Pairs(grey, simulate(log, mu, sigma, draw_noise(log, self.generator)))
+
+    def part(self, process: int) -> None:
+        """Draw other thresholds and phases than other processes."""
+        if process:
+            self.generator.manual_seed(self.generator.initial_seed() + process)
 
     def state(self) -> dict[str, Any]:
         """Return the state of the random numbers."""

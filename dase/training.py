@@ -10,6 +10,8 @@ from typing import Any, Literal
 import numpy as np
 import torch
 
+from dase import parallel
+from dase.errors import InputError
 from dase.moments import Moments
 from dase.networks import NetworkShape, ThresholdNet
 from dase.newton import Newton
@@ -20,6 +22,9 @@ from dase.targets import Noise, Pairs, Target, answers, draw_noise, simulate, va
 
 REFERENCE = 0.25, 0.06
 """Threshold and spread at which scenes are counted once more, to tell busy scenes from low thresholds."""
+
+APART = 1_000_003
+"""Between the seeds of one process and the next."""
 
 DERIVED = 4
 """Scenes of a step, at least, that are counted at other thresholds as well, to see how the moments answer."""
@@ -130,9 +135,13 @@ class Training:
         self.objective = self._objective()
         moments = self.objective
         self.newton = Newton(moments, self.net) if isinstance(moments, Moments) else None
-        self.generator = torch.Generator(self.device).manual_seed(recipe.seed + 1)
-        self.scenes = np.random.default_rng([recipe.seed, 1])
-        self.reals = np.random.default_rng([recipe.seed, 2])
+        parallel.alike(self.net.state_dict().values())
+        self.generator = torch.Generator(self.device).manual_seed(recipe.seed + 1 + APART * parallel.rank())
+        # other processes have scenes and phases of their own
+        apart = [parallel.rank()] if parallel.rank() else []
+        self.scenes = np.random.default_rng([recipe.seed, 1, *apart])
+        self.reals = np.random.default_rng([recipe.seed, 2, *apart])
+        target.part(parallel.rank())
         self.step = -recipe.warmup
         self.seconds = 0.0
         self.best = math.inf
@@ -235,16 +244,21 @@ class Training:
         if self.newton is not None:
             self.newton.see(fake)
         if move:
-            loss = loss + recipe.anchor * residual.square().mean() + recipe.kl * prior(self.maps)
+            held = recipe.anchor * residual.square().mean() + recipe.kl * prior(self.maps)
             if recipe.smooth:
-                loss = loss + recipe.smooth * self.net.roughness()
+                held = held + recipe.smooth * self.net.roughness()
+            # the objective's part is that of the process's own scenes, to be summed over all
+            loss = loss + held / parallel.size()
             for group in self.optimizer.param_groups:
                 group["lr"] = share * group["full"]
             self.optimizer.zero_grad(set_to_none=True)
             loss.backward()
+            parallel.total_gradients(self.net.parameters())
             self.optimizer.step()
             if self.newton is not None:
                 self.newton.step(recipe.newton * share)
+                shared = [v for n, v in self.net.state_dict().items() if not n.startswith("unet.")]
+                parallel.alike(shared)
             self._average()
         self.step += 1
         values["loss"] = loss.detach()
@@ -266,28 +280,37 @@ class Training:
             "optimizer": self.optimizer.state_dict(),
             "newton": None if self.newton is None else self.newton.state(),
             "objective": self.objective.state(),
-            "generator": self.generator.get_state(),
-            "target": self.target.state(),
-            "scenes": self.scenes.bit_generator.state,
-            "reals": self.reals.bit_generator.state,
+            "random": parallel.everybodys(self._random()),
             "step": self.step,
             "seconds": self.seconds,
             "best": self.best,
             "calibrated": self.calibrated,
         }
 
+    def _random(self) -> dict[str, Any]:
+        """Return what makes this process's scenes its own."""
+        return {
+            "generator": self.generator.get_state(),
+            "target": self.target.state(),
+            "scenes": self.scenes.bit_generator.state,
+            "reals": self.reals.bit_generator.state,
+        }
+
     def load(self, state: dict[str, Any]) -> None:
-        """Take over what `state` returned."""
+        """Take over what `state` returned; raises InputError for the state of another number of processes."""
+        if len(state["random"]) != parallel.size():
+            raise InputError(f"the run has {len(state['random'])} processes, not {parallel.size()}")
         self.net.load_state_dict(state["net"])
         self.mean.load_state_dict(state["mean"])
         self.optimizer.load_state_dict(state["optimizer"])
         self.objective.load(state["objective"])
         if self.newton is not None:
             self.newton.load(state["newton"])
-        self.generator.set_state(state["generator"].cpu())
-        self.target.load(state["target"])
-        self.scenes.bit_generator.state = state["scenes"]
-        self.reals.bit_generator.state = state["reals"]
+        mine = state["random"][parallel.rank()]
+        self.generator.set_state(mine["generator"].cpu())
+        self.target.load(mine["target"])
+        self.scenes.bit_generator.state = mine["scenes"]
+        self.reals.bit_generator.state = mine["reals"]
         self.step, self.seconds, self.best = state["step"], state["seconds"], state["best"]
         self.recipe = Recipe.parse(state["recipe"])
         self.calibrated = state["calibrated"]

@@ -15,6 +15,7 @@ from __future__ import annotations
 
 import argparse
 import fnmatch
+import gc
 import json
 import math
 import platform
@@ -219,10 +220,12 @@ def _runner(args: argparse.Namespace) -> adaptation_jobs.Run:
 
 
 def _measured(args: argparse.Namespace, name: str, seconds: float) -> dict[str, Any]:
-    line = measure(name, seconds, args)
-    if torch.cuda.is_available():
+    try:
+        return measure(name, seconds, args)
+    finally:
+        # the next rows are other processes' as well
+        gc.collect()
         torch.cuda.empty_cache()
-    return line
 
 
 def _brief(line: dict[str, Any]) -> str:
