@@ -250,7 +250,7 @@ def _run(options: argparse.Namespace) -> None:
     print(f"{len(done)} runs in the log, {len(jobs)} to do", flush=True)
     context = multiprocessing.get_context("spawn")
     with options.log.open("a") as log:
-        if options.hidden and "other" in options.kinds and "time/a_01" not in done:
+        if options.hidden and "other" in options.kinds and "time/a_01" not in done and options.minutes > 0:
             _note(log, _timed(options), options, "alone")
         with context.Pool(options.jobs) as pool:
             for n, line in enumerate(pool.imap_unordered(_safely, jobs)):

@@ -30,8 +30,12 @@ def write_page(cameras: Mapping[str, Any], log: Path, out: Path) -> None:
     if not found:
         return
     draw(cameras, found, out / "real-cameras.png")
+    names = ", ".join(name for name in cameras if name not in found)
+    left = f"\nNot diagnosed yet: {names}.\n" if names else ""
     parts = [section(name, cameras[name], *found[name]) for name in found]
-    (out / "real-cameras.md").write_text(PAGE.format(table=table(cameras, found), parts="\n\n".join(parts)))
+    (out / "real-cameras.md").write_text(
+        PAGE.format(table=table(cameras, found), parts="\n\n".join(parts), left=left)
+    )
 
 
 def answer(found: dict[str, Any]) -> str:
@@ -194,7 +198,7 @@ compared with a sensor that has thresholds alone, and `dase diagnose --auto` loo
 error is that of pixels and times that no fit has seen; 1 is what two repeats of the recording would have.
 
 {table}
-
+{left}
 ![measured events, simulated events, and the falling error of each recording](real-cameras.png)
 
 Left: measured. Middle: what the announced model makes of the same scene at the same time; thresholds alone
