@@ -101,18 +101,8 @@ def test_two_processes_do_what_one_does_with_all_scenes(tmp_path):
 @pytest.mark.parametrize("objective", ["moments", "wgan"])
 def test_the_command_on_two_processes(objective, tmp_path):
     out = tmp_path / "run"
-    words = (
-        "--no-python",
-        str(Path(sys.executable).parent / "dase"),
-        "train",
-        "esim",
-        "-o",
-        str(out),
-        "--preset",
-        "tiny",
-        "--steps",
-        "6",
-    )
+    command = str(Path(sys.executable).parent / "dase")
+    words = ("--no-python", command, "train", "esim", "-o", str(out), "--preset", "tiny", "--steps", "6")
     words = (*words, "--objective", objective, "--sequences", "8", "--size", "48x48")
     launched(*words)
     assert (out / "sensor.toml").is_file()
