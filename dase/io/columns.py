@@ -66,7 +66,7 @@ def check_head(path: Path) -> None:
     with path.open("rb") as file:
         head = file.read(64)
     if len(head) < 64:
-        raise InputError(f"ends after {len(head)} bytes")
+        raise InputError(f"cannot be read as HDF5, damaged or cut short: it ends after {len(head)} bytes")
     if head[8] > 1:
         return
     if head[13:15] != b"\x08\x08":
