@@ -109,37 +109,59 @@ RADIX = 9
 
 @wp.func_native(
     """
-    long long* from = keys.data;
-    long long* to = other.data;
-    int place[1 << 9];
-    for (int shift = begin; shift < end; shift += 9) {
-        for (int d = 0; d < 512; ++d) place[d] = 0;
-        for (int i = 0; i < count; ++i) ++place[(from[i] >> shift) & 511];
-        int sum = 0;
+    // the first pass reads the keys where the pixels left them
+    auto each = [&](auto look) {
+        for (int i = 0; i < late.shape[0]; ++i) look(late.data[i]);
+        for (int slab = 0; slab < used.shape[0]; ++slab) {
+            const long long* from = keys.data + (size_t)slab * keys.shape[1];
+            for (int i = 0; i < used.data[slab]; ++i) look(from[i]);
+        }
+    };
+    auto sum = [](int* place) {
+        int before = 0;
         for (int d = 0; d < 512; ++d) {
             const int here = place[d];
-            place[d] = sum;
-            sum += here;
+            place[d] = before;
+            before += here;
         }
-        for (int i = 0; i < count; ++i) to[place[(from[i] >> shift) & 511]++] = from[i];
+    };
+    int place[512] = {};
+    long long* to = one.data;
+    long long* from = other.data;
+    each([&](long long key) { ++place[(key >> begin) & 511]; });
+    sum(place);
+    each([&](long long key) { to[place[(key >> begin) & 511]++] = key; });
+    for (int shift = begin + 9; shift < end; shift += 9) {
         long long* swap = from;
         from = to;
         to = swap;
+        for (int d = 0; d < 512; ++d) place[d] = 0;
+        for (int i = 0; i < count; ++i) ++place[(from[i] >> shift) & 511];
+        sum(place);
+        for (int i = 0; i < count; ++i) to[place[(from[i] >> shift) & 511]++] = from[i];
     }
     // events of one time in the order of their places; few, so they are put right by insertion
     for (int i = 1; i < count; ++i) {
-        if ((from[i - 1] >> low) <= (from[i] >> low)) continue;
-        const long long key = from[i];
+        if ((to[i - 1] >> low) <= (to[i] >> low)) continue;
+        const long long key = to[i];
         int j = i;
-        for (; j > 0 && (from[j - 1] >> low) > (key >> low); --j) from[j] = from[j - 1];
-        from[j] = key;
+        for (; j > 0 && (to[j - 1] >> low) > (key >> low); --j) to[j] = to[j - 1];
+        to[j] = key;
     }
 """
 )
 def radix_sort(
-    keys: wp.array[wp.int64], other: wp.array[wp.int64], count: int, begin: int, end: int, low: int
+    late: wp.array[wp.int64],
+    keys: wp.array2d[wp.int64],
+    used: wp.array[int],
+    count: int,
+    begin: int,
+    end: int,
+    low: int,
+    one: wp.array[wp.int64],
+    other: wp.array[wp.int64],
 ):
-    """Sort stably by time, then by place; after an odd number of passes the result is in `other`."""
+    """Sort stably by time, then by place; after an even number of passes the result is in `other`."""
     ...
 
 
@@ -147,16 +169,19 @@ def radix_sort(
 def sort(
     first: int,
     # in
-    count: int,
+    late: wp.array[wp.int64],
+    keys: wp.array2d[wp.int64],  # (S, capacity)
+    used: wp.array[int],  # (S,)
+    count: int,  # of all keys
     begin: int,  # lowest bit of the time
     end: int,  # bits of all
     low: int,  # bits below the place
     # out
-    keys: wp.array[wp.int64],
+    one: wp.array[wp.int64],
     other: wp.array[wp.int64],
 ):
     """Sort on one thread of a CPU, three times as fast as Warp's sort of pairs."""
-    radix_sort(keys, other, count, begin, end, low)
+    radix_sort(late, keys, used, count, begin, end, low, one, other)
 
 
 class Room:
@@ -196,36 +221,25 @@ def ordered(
         late: Keys that earlier chunks have left, shape (L,), or None where no event leaves late.
         room: Where to sort; the result lies in it. None takes new memory.
     """
-    out = _gathered(keys, used, np.empty(0, np.int64) if late is None else late, device, room or Room())
-    total = len(out) // 2
+    begin = low if late is not None else bits + low if device.is_cpu else 0
+    late = np.empty(0, np.int64) if late is None else late
+    total = len(late) + int(used.sum())
+    out = (room or Room()).take(2 * total, device)
     if total == 0:
         return out
-    begin = low if late is not None else bits + low if device.is_cpu else 0
+    counts = wp.array(used.reshape(-1), dtype=int, device=device)
+    flat = keys.reshape((keys.shape[0] * keys.shape[1], keys.shape[2]))
     if device.is_cpu:
         halves = out[:total], out[total:]
-        launch.run(sort, 1, [total, begin, top, low, *halves], device)
-        return halves[-(-(top - begin) // RADIX) % 2]
+        before = wp.array(late, dtype=wp.int64, device=device)
+        launch.run(sort, 1, [before, flat, counts, total, begin, top, low, *halves], device)
+        return halves[(-(-(top - begin) // RADIX) + 1) % 2]
+    if len(late):
+        out[: len(late)].assign(late)
+    start = len(late) + np.concatenate([[0], np.cumsum(used.reshape(-1))[:-1]])
+    if used.any():
+        arguments = [flat, counts, wp.array(start, dtype=int, device=device), out]
+        launch.run(gather, len(start), arguments, device, batch=int(used.max()))
     idle = wp.empty(2 * total, dtype=wp.int32, device=device)
     wp.utils.radix_sort_pairs(out, idle, total, begin_bit=begin, end_bit=top)
     return out[:total]
-
-
-def _gathered(keys: wp.array, used: np.ndarray, late: np.ndarray, device: wp.Device, room: Room) -> wp.array:
-    """Return late and new keys side by side, in the first half of an array that leaves room for the sort."""
-    rows, slabs, capacity = keys.shape
-    counts = used.reshape(-1)
-    out = room.take(2 * (len(late) + int(counts.sum())), device)
-    if len(late):
-        out[: len(late)].assign(late)
-    if not counts.any():
-        return out
-    start = len(late) + np.concatenate([[0], np.cumsum(counts)[:-1]])
-    flat = keys.reshape((rows * slabs, capacity))
-    if device.is_cpu:
-        source, target = flat.numpy(), out.numpy()
-        for slab, (at, n) in enumerate(zip(start, counts, strict=True)):
-            target[at : at + n] = source[slab, :n]
-    else:
-        arguments = [flat, *(wp.array(a, dtype=int, device=device) for a in (counts, start)), out]
-        launch.run(gather, rows * slabs, arguments, device, batch=int(counts.max()))
-    return out

@@ -12,6 +12,7 @@ import tempfile
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
+import numpy as np
 import warp as wp
 
 wp.config.log_level = wp.LOG_WARNING
@@ -110,3 +111,10 @@ def run(
         _pool = ThreadPoolExecutor(_threads, thread_name_prefix="dase")
     for done in _pool.map(work, starts):
         assert done is None
+
+
+def room(size: int, dtype: Any, device: wp.Device) -> wp.array:
+    """Return new memory; on a CPU NumPy's, which asks for large pages: small ones cost as much as the work."""
+    if device.is_cuda:
+        return wp.empty(size, dtype=dtype, device=device)
+    return wp.array(np.empty(size, wp.dtype_to_numpy(dtype)), dtype=dtype, device=device, copy=False)
