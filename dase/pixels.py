@@ -213,7 +213,7 @@ class Pixels:
             sink = pixel.Keys()
             shape = (self.batch, slabs, self._capacity)
             if self._buffer is None or self._buffer.shape != shape:
-                self._buffer = wp.empty(shape, dtype=wp.int64, device=self.device)
+                self._buffer = launch.room(shape, wp.int64, self.device)
             sink.keys = self._buffer
             sink.used = wp.zeros((self.batch, slabs), dtype=int, device=self.device)
             sink.slab, sink.bits, sink.low = self.slab.bit_length() - 1, self._bits, self._low

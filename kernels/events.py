@@ -193,7 +193,7 @@ class Room:
     def take(self, size: int, device: wp.Device) -> wp.array:
         """Return an array of `size` keys; what was taken before is overwritten."""
         if self._kept is None or len(self._kept) < size:
-            self._kept = wp.empty(size + size // 4, dtype=wp.int64, device=device)
+            self._kept = launch.room(size + size // 4, wp.int64, device)
         return self._kept[:size] if size else wp.empty(0, dtype=wp.int64, device=device)
 
 

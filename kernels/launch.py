@@ -113,8 +113,8 @@ def run(
         assert done is None
 
 
-def room(size: int, dtype: Any, device: wp.Device) -> wp.array:
-    """Return new memory; on a CPU NumPy's, which asks for large pages: small ones cost as much as the work."""
+def room(shape: int | tuple[int, ...], dtype: Any, device: wp.Device) -> wp.array:
+    """Return new memory; on a CPU NumPy's, which asks for large pages: small ones cost as much as work."""
     if device.is_cuda:
-        return wp.empty(size, dtype=dtype, device=device)
-    return wp.array(np.empty(size, wp.dtype_to_numpy(dtype)), dtype=dtype, device=device, copy=False)
+        return wp.empty(shape, dtype=dtype, device=device)
+    return wp.array(np.empty(shape, wp.dtype_to_numpy(dtype)), dtype=dtype, device=device, copy=False)
