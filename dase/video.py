@@ -55,7 +55,8 @@ class VideoScene(Scene):
         source = pixel.Frames()
         above = np.minimum(np.searchsorted(self._times, times), len(self._times) - 1)
         if np.array_equal(self._times[above], times):
-            source.values = wp.array(self._rows(above, pixels), dtype=float, device=device)
+            # on a CPU the frames themselves: a copy would take longer than the events
+            source.values = wp.array(self._rows(above, pixels), dtype=float, device=device, copy=False)
         else:
             source.values = self._between(times, above, pixels, device)
         return "frames", source
@@ -65,7 +66,11 @@ class VideoScene(Scene):
         return np.asarray(self._at(times), np.float32)
 
     def _rows(self, index: NDArray[np.int64], pixels: NDArray[np.int32]) -> NDArray[np.float32]:
-        flat = self._frames[index].reshape(len(index), -1)
+        if isinstance(self._frames, np.ndarray) and np.all(np.diff(index) == 1):
+            frames = self._frames[index[0] : index[0] + len(index)]  # no copy
+        else:
+            frames = self._frames[index]
+        flat = frames.reshape(len(index), -1)
         every = np.array_equal(pixels, np.arange(flat.shape[1]))
         return np.ascontiguousarray(flat if every else flat[:, pixels], np.float32)
 
