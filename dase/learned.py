@@ -40,7 +40,7 @@ def draw(folder: Path) -> tuple[Figure, list[tuple[str, str]]]:
     figure, pictures, plots = _layout(len(found["grey"]), found["grey"].shape[2] / found["grey"].shape[1])
     same = np.allclose(found["grey"], found["real_grey"], atol=2e-3)
     titles = [*COLUMNS]
-    titles[1] += "" if same else " (other scenes)"
+    titles[1] = titles[1] if same else "target, other scenes"
     scales = {name: tuple(np.percentile(found[name], (1, 99))) for name in ("mu", "sigma")}
     most = float(np.percentile(np.concatenate([found["real"], found["simulated"]]).sum(1), 99.5))
     for n, line in enumerate(pictures):
@@ -60,7 +60,7 @@ def draw(folder: Path) -> tuple[Figure, list[tuple[str, str]]]:
     _curves(plots, rows)
     tall = figure.get_figheight()
     figure.text(0.35 / 11, 1 - 0.3 / tall, folder.name, fontsize=13, color=INK, weight="bold", va="center")
-    lines = _lines(rows[-1], found)
+    lines = _lines(rows[-1], found, same=same)
     said = "   ".join(f"{name} {value}" for name, value in lines[:4])
     figure.text(0.35 / 11, 1 - 0.57 / tall, said, fontsize=9, color=INK, va="center")
     return figure, lines
@@ -73,14 +73,16 @@ def _log(path: Path) -> list[dict[str, float]]:
         return [{k: float(v) for k, v in row.items() if v} for row in csv.DictReader(file)]
 
 
-def _lines(row: dict[str, float], found: dict[str, NDArray[Any]]) -> list[tuple[str, str]]:
+def _lines(row: dict[str, float], found: dict[str, NDArray[Any]], *, same: bool) -> list[tuple[str, str]]:
     out = [
         ("thresholds", f"{row['mu']:.3f} ± {row['sigma']:.3f}"),
         ("between pixels", f"± {row['mu_spread']:.3f}"),
         ("ON / OFF", f"{row['ratio']:.3f}"),
         ("steps", f"{row['step']:.0f} in {row['seconds']:.0f} s"),
-        ("events", f"{found['simulated'].mean() / max(found['real'].mean(), 1e-9):.2f} of the target's here"),
     ]
+    if same:
+        ratio = found["simulated"].mean() / max(found["real"].mean(), 1e-9)
+        out.append(("events", f"{ratio:.2f} of the target's here"))
     if "kl" in row:
         out.append(("KL from truth", f"{row['kl']:.4f}"))
     return out
