@@ -51,10 +51,12 @@ class Axis:
         return 2.0 * (value - self.low) / (self.high - self.low)
 
     def to_value(self, place: Any) -> Any:
-        """Return the value at a place."""
+        """Return the value at a place, the nearest one in range."""
         if self.log:
-            return np.exp(np.clip(place, math.log(self.low), math.log(self.high)))
-        return self.low + np.clip(place, 0.0, 2.0) * (self.high - self.low) / 2.0
+            value = np.exp(np.clip(place, math.log(self.low), math.log(self.high)))
+        else:
+            value = self.low + np.clip(place, 0.0, 2.0) * (self.high - self.low) / 2.0
+        return np.clip(value, self.low, self.high)  # the exponential of a logarithm may be a bit off
 
     def bounds(self) -> tuple[float, float]:
         """Return the places of the ends."""
