@@ -90,21 +90,13 @@ class _Writer(Writer):
             return list(lines)
         return [f"if {effect.name}_acts:", *(f"    {line}" for line in lines)]
 
-    def kernel(self) -> str:
-        """Return the whole text."""
-        self.depth = 1
-        self.loop()
-        body, self.lines = self.lines, []
-        self.depth = 0
-        self.add(
+    def head(self) -> list[str]:
+        return [
             "def pixel_trials(first: int, source: Source, pixels: wp.array[int], width: int, height: int,",
             "                 seed_in: int, parameters: wp.array2d[float],",
             *(["                 maps: wp.array2d[float],"] if self.maps else []),
             "                 sink: Sink):",
-        )
-        self.depth = 1
-        self.prologue()
-        return "\n".join([*self.lines, *body]) + "\n"
+        ]
 
     def begin(self) -> None:
         super().begin()

@@ -25,15 +25,19 @@ class Writer(Crossings):
         self.loop()
         body, self.lines = self.lines, []
         self.depth = 0
-        self.add(
+        self.add(*self.head())
+        self.depth = 1
+        self.prologue()
+        return "\n".join([*self.lines, *body]) + "\n"
+
+    def head(self) -> list[str]:
+        """Return the line that names the kernel and its arguments."""
+        return [
             "def pixel_events(first: int, source: Source, clock: Clock, pixels: wp.array[int], width: int,",
             "                 height: int, begin: int, seed: int, parameters: wp.array2d[float],",
             *(["                 maps: wp.array2d[float],"] if self.maps else []),
             "                 state_in: wp.array3d[float], state_out: wp.array3d[float], sink: Sink):",
-        )
-        self.depth = 1
-        self.prologue()
-        return "\n".join([*self.lines, *body]) + "\n"
+        ]
 
     def thresholds(self) -> str:
         """Return the text of the kernel that writes thresholds."""
