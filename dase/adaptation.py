@@ -301,10 +301,10 @@ def write_examples(out: Path, training: Training, *, scenes: int = 3, seed: int 
     scenery, net = training.scenery, training.mean
     rng, generator = np.random.default_rng(seed), torch.Generator(scenery.device).manual_seed(seed)
     if isinstance(scenery, Replayed) and isinstance(training.target, Finite):
-        busy = training.target.pairs.counts.float().sum((1, 2, 3))
+        busy = training.target.recorded.counts.float().sum((1, 2, 3))
         index = torch.sort(torch.topk(busy, min(4 * scenes, len(busy))).indices).values
         index = index[:: max(len(index) // scenes, 1)][:scenes]
-        log, real = scenery.log[index].float(), training.target.pairs.select(index)
+        log, real = scenery.log[index].float(), training.target.recorded.select(index)
     else:
         log, real = scenery.draw(rng, scenes), training.target.draw(rng, scenes)
     grey = middle(log)
@@ -326,5 +326,5 @@ def baseline(
         return esim().to(scenery.device)
     if kind == "random":
         return Randomised(seed)
-    pairs = target.pairs if isinstance(target, Finite) else target.draw(np.random.default_rng(seed), 96)
+    pairs = target.recorded if isinstance(target, Finite) else target.draw(np.random.default_rng(seed), 96)
     return event_rate(pairs, scenery, seed=seed).to(scenery.device)

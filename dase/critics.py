@@ -198,7 +198,7 @@ class CriticBank:
         real_classes: torch.Tensor,
         weights: torch.Tensor,
         *,
-        rate: float,
+        rate: float | torch.Tensor,
         penalty: float = 1.0,
         generator: torch.Generator | None = None,
     ) -> Critique:
@@ -235,6 +235,10 @@ class CriticBank:
             root = (square * correction[:, None]).sqrt_().add_(1e-8)
             weight.addcdiv_(gradient * -rates[:, None], root)
         return critique
+
+    def one_launch(self) -> bool:
+        """Return whether a layer of all critics is one launch on a GPU, and nothing waits for it."""
+        return self.device.type == "cuda" and _has_grouped_products(self.device)
 
     def traffic(self, active: int) -> int:
         """Return the bytes that one step has to move at least, `active` critics being in use.

@@ -16,6 +16,7 @@ drawn, so its part in how a batch differs from all others is taken out: a contro
 from __future__ import annotations
 
 import math
+from collections.abc import Hashable
 from typing import Any
 
 import torch
@@ -216,6 +217,7 @@ class Moments:
         self.boundaries: list[torch.Tensor] = []
         self.sets: dict[str, Cells] = {}
         self.calls = 0
+        self.held = self.anew = False
 
     def calibrate(self, sets: list[tuple[Pairs, Pairs]]) -> None:
         """Place the boundaries of brightness and edge strength at quantiles of both domains."""
@@ -248,7 +250,7 @@ class Moments:
     def members(self, grey: torch.Tensor) -> torch.Tensor:
         """Return 1 where a pixel is in a cell of looks, else 0, shape (B, pixels, cells)."""
         brightness, edge = looks(grey)
-        cell = torch.bucketize(brightness, self.boundaries[0]) * self.levels[1]
+        cell = torch.bucketize(brightness.contiguous(), self.boundaries[0]) * self.levels[1]
         cell = cell + torch.bucketize(edge, self.boundaries[1])
         every = torch.arange(self.levels[0] * self.levels[1], device=self.device)
         return (cell.flatten(1)[..., None] == every).float()
@@ -285,14 +287,20 @@ class Moments:
         for cells in self.sets.values():
             cells.weigh(self.doubt, self.excess)
 
+    def begin(self) -> Hashable:
+        """Count a step that is about to come; return its kind, see `dase.replay`."""
+        # where real scenes never come again, some batches are held out
+        self.held = self.scenes == math.inf and self.calls % 8 == 7
+        self.anew = self.calls % ANEW == 0
+        self.calls += 1
+        return None if self.anew else self.held
+
     def loss(self, fake: Pairs, real: Pairs, *, move: bool) -> tuple[torch.Tensor, dict[str, torch.Tensor]]:
         """Take both batches in; return the fake means of this batch along what they are off."""
-        # where real scenes never come again, some batches are held out
-        self.see_real(real, held_out=self.scenes == math.inf and self.calls % 8 == 7)
+        self.see_real(real, held_out=self.held)
         plain = self.see_plain(fake)
-        if self.calls % ANEW == 0:
+        if self.anew:
             self.weigh()
-        self.calls += 1
         total, distance = fake.counts.new_zeros(()), fake.counts.new_zeros(())
         for name, both in self.sums(fake).items():
             sums, number = map(parallel.together, both)

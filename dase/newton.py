@@ -46,7 +46,7 @@ class Newton:
     def __init__(self, moments: Moments, net: ThresholdNet, *, memory: float = 0.95):
         self.moments, self.net, self.memory = moments, net, memory
         self._choices = torch.tensor(LOOSE, dtype=torch.float64, device=moments.device)
-        self.loose = self._choices[len(LOOSE) // 2]
+        self.loose = self._choices[len(LOOSE) // 2].clone()
         self.excess = torch.full((), 100.0, dtype=torch.float64, device=moments.device)
         moments.excess = self.excess
         self.kept: dict[str, torch.Tensor] = {}
@@ -62,21 +62,19 @@ class Newton:
             above, below = ends[name]
             return (add(above) - add(below)) / (2 * STEP)
 
-        grey = fake.grey[fake.some]
+        grey = fake.grey if fake.some is None else fake.grey[fake.some]
         member = self.moments.members(grey)
         self._keep("number", member.sum((0, 1)).double())
         weights = self.net.basis(grey).flatten(2).transpose(1, 2)  # (B, N, nodes)
         for name in ends:
             flat = slope(name, with_neighbours).flatten(2).transpose(1, 2)  # (B, N, F)
-            total: torch.Tensor | int = 0
+            total = torch.zeros((), device=grey.device)
             for b in range(len(flat)):
-                if name == "ratio":
-                    total = total + member[b].T @ flat[b]
-                    continue
-                each = (flat[b][:, :, None] * weights[b][:, None]).flatten(1)
-                total = total + (member[b].T @ each).view(member.shape[2], flat.shape[2], -1)
-            assert isinstance(total, torch.Tensor)
-            self._keep(name, total.double().reshape(*total.shape[:2], -1))
+                each = flat[b]
+                if name != "ratio":
+                    each = (each[:, :, None] * weights[b][:, None]).flatten(1)
+                total = total + summed(member[b], each)
+            self._keep(name, total.double().view(len(total), flat.shape[2], -1))
             if self.moments.pattern and name != "ratio":
                 down, across = (slope(name, partial(with_next, axis=axis)) for axis in (-2, -1))
                 self._keep(f"column_{name}", down.sum((0, 2)).T.double(), LONG)
@@ -125,7 +123,7 @@ class Newton:
         return cells.kept["real_scenes"].clamp(1, min(self.moments.scenes, 1e9))
 
     @torch.no_grad()
-    def step(self, share: float) -> None:
+    def step(self, share: float | torch.Tensor) -> None:
         """Move the shared numbers by `share` of what makes the moments vanish, as far as the prior lets."""
         cells = self.moments.sets["look"]
         jacobian, prior = self._jacobian(), self.prior
@@ -138,7 +136,7 @@ class Newton:
         pull = jacobian.T @ weight @ off
         here = self.numbers()
         tiny = 1e-6 * torch.eye(len(curve), device=curve.device, dtype=curve.dtype) * curve.diagonal().mean()
-        if self.moments.calls % 25 == 0 and self.net.shape.table is not None:
+        if self.moments.anew and self.net.shape.table is not None:
             self._choose(curve + tiny, curve @ here - pull, prior)
         hold = prior / self.loose**2
         move = -_solved(curve + hold + tiny, pull + hold @ here)
@@ -146,8 +144,7 @@ class Newton:
         free = self.excess * curve + prior / LOOSE[-1] ** 2 + tiny
         rest = off - jacobian @ _solved(free, self.excess * pull)
         excess = rest @ whole @ rest * scenes / cells.kept["usual"]
-        self.excess = torch.lerp(excess, self.excess, self.memory).clamp_min(1.0)
-        self.moments.excess = self.excess
+        self.excess.copy_(torch.lerp(excess, self.excess, self.memory).clamp_min(1.0))
         move = (share * move).clamp(-LONGEST, LONGEST)
         self._apply(move)
         cells.shift((jacobian @ move).view(cells.kept["fake_sum"].shape))
@@ -173,7 +170,7 @@ class Newton:
             whole = curve + prior / loose**2
             fit = 0.5 * data @ _solved(whole, data)
             scores.append(fit - 0.5 * torch.linalg.slogdet(whole).logabsdet - rank * math.log(loose))
-        self.loose = self._choices.take(torch.stack(scores).argmax())
+        self.loose.copy_(self._choices.take(torch.stack(scores).argmax()))
 
     def _apply(self, move: torch.Tensor) -> None:
         net = self.net
@@ -186,7 +183,7 @@ class Newton:
         if net.shape.split:
             net.asymmetry += move[-1].float()
 
-    def _patterns(self, share: float, loose: float = 0.3) -> None:
+    def _patterns(self, share: float | torch.Tensor, loose: float = 0.3) -> None:
         """Move the offsets of columns and rows, each by its own moments.
 
         One column sees little, so simulated scenes are remembered longer and noise in them counts as well.
@@ -217,6 +214,17 @@ class Newton:
         self.kept = {name: value.to(self.moments.device) for name, value in state["kept"].items()}
         self.loose, self.excess = (state[name].to(self.moments.device) for name in ("loose", "excess"))
         self.moments.excess = self.excess
+
+
+def summed(member: torch.Tensor, values: torch.Tensor) -> torch.Tensor:
+    """Return the sums of values (N, F) over the pixels of each cell (N, cells), shape (cells, F).
+
+    In many pieces, which a GPU works at side by side; in one it took 16 times as long.
+    """
+    pixels = len(member)
+    pieces = next(n for n in range(min(64, pixels), 0, -1) if pixels % n == 0)
+    a, b = (maps.reshape(pieces, pixels // pieces, -1) for maps in (member, values))
+    return torch.bmm(a.transpose(1, 2), b).sum(0)
 
 
 def _solved(matrix: torch.Tensor, right: torch.Tensor) -> torch.Tensor:

@@ -7,6 +7,7 @@ Two objectives share the images: `Adversarial`, the paper's bank of critics over
 from __future__ import annotations
 
 import math
+from collections.abc import Hashable
 from dataclasses import dataclass
 from typing import Any, Literal, Protocol
 
@@ -106,8 +107,7 @@ class Hasher:
 def _quantiles(values: torch.Tensor, levels: int) -> torch.Tensor:
     """Return the boundaries between `levels` equal shares."""
     ordered = torch.sort(values.flatten()).values
-    places = [round(n / levels * (len(ordered) - 1)) for n in range(1, levels)]
-    return ordered[places].contiguous()
+    return torch.stack([ordered[round(n / levels * (len(ordered) - 1))] for n in range(1, levels)])
 
 
 class Objective(Protocol):
@@ -115,6 +115,9 @@ class Objective(Protocol):
 
     def calibrate(self, sets: list[tuple[Pairs, Pairs]]) -> None:
         """Look at pairs of a fake and a real batch before training."""
+
+    def begin(self) -> Hashable:
+        """Count a step that is about to come; return its kind, see `dase.replay`."""
 
     def loss(self, fake: Pairs, real: Pairs, *, move: bool) -> tuple[torch.Tensor, dict[str, torch.Tensor]]:
         """Learn from both batches; return a loss whose gradient by the fake counts leads towards the real.
@@ -136,7 +139,7 @@ class Adversarial:
         how: The hash of patches.
         device: PyTorch device.
         seed: Of weights and shares.
-        rate: Learning rate of the critics.
+        rate: Learning rate of the critics; a tensor may be changed between steps that are replayed.
         steps: Steps of the critics for each call.
         penalty: Weight of the gradient penalty.
         uniform: α of Eq. 13: share of the weights that all classes have alike.
@@ -149,7 +152,7 @@ class Adversarial:
         *,
         device: str | torch.device,
         seed: int = 0,
-        rate: float = 2e-4,
+        rate: float | torch.Tensor = 2e-4,
         steps: int = 1,
         penalty: float = 1.0,
         uniform: float = 0.5,
@@ -166,6 +169,10 @@ class Adversarial:
         """Place the boundaries of the hash."""
         self.hasher.calibrate(*(pairs for both in sets for pairs in both))
         parallel.alike(self.hasher.boundaries.values())
+
+    def begin(self) -> Hashable:
+        """All steps are of one kind, where products of groups are one launch."""
+        return "all" if self.bank.one_launch() else None
 
     def weights(self) -> torch.Tensor:
         """Return ω of Eq. 13, from the real patches seen so far."""

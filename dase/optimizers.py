@@ -15,7 +15,7 @@ class AdaBelief(torch.optim.Optimizer):
 
     Args:
         params: Parameters or groups of them.
-        lr: Learning rate.
+        lr: Learning rate; a tensor may be changed between steps that are replayed.
         betas: Decay of the mean, and of the mean square deviation from it.
         eps: Added to the mean square deviation, and to its root.
     """
@@ -23,7 +23,7 @@ class AdaBelief(torch.optim.Optimizer):
     def __init__(
         self,
         params: Iterable[Any],
-        lr: float = 4e-4,
+        lr: float | torch.Tensor = 4e-4,
         betas: tuple[float, float] = (0.9, 0.999),
         eps: float = 1e-16,
     ):
@@ -39,11 +39,11 @@ class AdaBelief(torch.optim.Optimizer):
                     continue
                 state = self.state[p]
                 if not state:
-                    state.update(step=0, mean=torch.zeros_like(p), spread=torch.zeros_like(p))
+                    state.update(step=p.new_zeros(()), mean=torch.zeros_like(p), spread=torch.zeros_like(p))
                 state["step"] += 1
                 mean, spread = state["mean"], state["spread"]
                 mean.lerp_(p.grad, 1 - first)
                 stray = p.grad - mean
                 spread.mul_(second).addcmul_(stray, stray, value=1 - second).add_(group["eps"])
                 root = (spread / (1 - second ** state["step"])).sqrt_().add_(group["eps"])
-                p.addcdiv_(mean, root, value=-group["lr"] / (1 - first ** state["step"]))
+                p.sub_(mean / root * (group["lr"] / (1 - first ** state["step"])))

@@ -136,10 +136,14 @@ class Replayed(Scenery):
         self.device = torch.device(device)
         self.log = torch.from_numpy(windows.log).to(self.device)
 
-    def draw(self, rng: np.random.Generator, count: int) -> torch.Tensor:
-        """Return log intensities of `count` windows, shape (count, samples, height, width)."""
+    def numbers(self, rng: np.random.Generator, count: int) -> NDArray[np.int32]:
+        """Choose `count` windows."""
         index = rng.choice(len(self.log), size=count, replace=count > len(self.log))
-        return self.log[torch.from_numpy(index).to(self.device)].float()
+        return np.asarray(index, np.int32)
+
+    def render(self, numbers: torch.Tensor, count: int) -> torch.Tensor:
+        """Return the log intensities of windows, shape (count, samples, height, width)."""
+        return self.log[numbers[:count].long()].float()
 
 
 def open_target(

@@ -6,6 +6,7 @@ textures are drawn once, into a pool that stays on the device; each step then co
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -124,6 +125,10 @@ class Scenery:
 
     def draw(self, rng: np.random.Generator, count: int) -> torch.Tensor:
         """Return log intensities of `count` random scenes, shape (count, samples, height, width)."""
+        return self.render(sent(self.numbers(rng, count), self.device), count)
+
+    def numbers(self, rng: np.random.Generator, count: int) -> NDArray[np.int32]:
+        """Draw `count` scenes; return all that is random in them, for `render`, as words of 4 bytes."""
         looks = self.looks
         motion = draw_motion(rng, looks, count)
         layers = motion.x.shape[1]
@@ -133,29 +138,48 @@ class Scenery:
         size[:, 0] = BACKGROUND[::-1]
         place, box = motion.places(looks, size)
         ground = rng.integers(len(self.grey), size=count).astype(np.int32)
-        ground, start, size, place, box = self._sent(ground, self.start[which], size, place, box)
+        return packed(ground, self.start[which], size, place, box)
+
+    def render(self, numbers: torch.Tensor, count: int) -> torch.Tensor:
+        """Return log intensities (count, samples, height, width) of what `numbers` drew, on the device."""
+        looks, layers = self.looks, most_layers(self.looks)
+        pair = (count, layers)
+        shapes = (count,), pair, (*pair, 2), (count, looks.samples, layers, 2, 3), (*pair, 4)
+        ground, start, size, place, box = unpacked(numbers, *shapes)
         return bridge.render_log(
-            self.grey, self.texels, ground, start, size, place, box,
+            self.grey, self.texels, ground, start, size, place.view(torch.float32), box.view(torch.float32),
             width=looks.width, height=looks.height, eps=LOG_EPS,
         )  # fmt: skip
 
-    def _sent(self, *arrays: NDArray[Any]) -> list[torch.Tensor]:
-        """Return arrays of 4-byte numbers as tensors on the device, sent in one piece.
 
-        Each begins at a multiple of LINE numbers, as vectors on a GPU may ask for.
-        """
-        begin = np.cumsum([0, *(-(-a.size // LINE) * LINE for a in arrays)])
-        flat = np.zeros(begin[-1], np.int32)
-        for array, start in zip(arrays, begin, strict=False):
-            flat[start : start + array.size] = np.ascontiguousarray(array).view(np.int32).ravel()
-        words = torch.from_numpy(flat)
-        if self.device.type == "cuda":
-            words = words.pin_memory().to(self.device, non_blocking=True)
-        out = []
-        for array, start in zip(arrays, begin, strict=False):
-            kind = torch.float32 if array.dtype == np.float32 else torch.int32
-            out.append(words[start : start + array.size].view(kind).view(array.shape))
-        return out
+def packed(*arrays: NDArray[Any]) -> NDArray[np.int32]:
+    """Return arrays of 4-byte numbers one behind the other, each from a multiple of LINE on.
+
+    Vectors on a GPU may ask for that.
+    """
+    begin = np.cumsum([0, *(-(-a.size // LINE) * LINE for a in arrays)])
+    flat = np.zeros(begin[-1], np.int32)
+    for array, start in zip(arrays, begin, strict=False):
+        flat[start : start + array.size] = np.ascontiguousarray(array).view(np.int32).ravel()
+    return flat
+
+
+def unpacked(words: torch.Tensor, *shapes: tuple[int, ...]) -> list[torch.Tensor]:
+    """Return the arrays of these shapes that `packed` put into int32 words."""
+    out, begin = [], 0
+    for shape in shapes:
+        size = math.prod(shape)
+        out.append(words[begin : begin + size].view(shape))
+        begin += -(-size // LINE) * LINE
+    return out
+
+
+def sent(words: NDArray[np.int32], device: torch.device, to: torch.Tensor | None = None) -> torch.Tensor:
+    """Return words on a device, in the memory of `to` if given; nobody waits for the copy."""
+    here = torch.from_numpy(words)
+    if device.type == "cuda":
+        here = here.pin_memory()
+    return here.to(device, non_blocking=True) if to is None else to.copy_(here, non_blocking=True)
 
 
 def middle(log: torch.Tensor) -> torch.Tensor:
@@ -225,18 +249,27 @@ class Motions:
         return place.astype(np.float32), box.astype(np.float32)
 
 
+def kinds(looks: Looks) -> list[Regime]:
+    """Return the regimes that scenes are drawn from."""
+    names = list(REGIMES) if looks.regime == MIXED else [looks.regime]
+    return [MOTIONS[name] for name in names]
+
+
+def most_layers(looks: Looks) -> int:
+    """Return how many layers a scene has room for: the background and the most objects of any regime."""
+    return 1 + max(int(how.objects[1]) for how in kinds(looks))
+
+
 def draw_motion(rng: np.random.Generator, looks: Looks, count: int) -> Motions:
     """Draw the motion of `count` scenes, all at once; see `dase.regimes` for the numbers."""
-    names = list(REGIMES) if looks.regime == MIXED else [looks.regime]
-    hows = [MOTIONS[name] for name in names]
+    hows = kinds(looks)
     odds = np.array([how.scenes for how in hows], float)
     kind = rng.choice(len(hows), size=count, p=odds / odds.sum())
     table = np.array(
         [(*h.objects, *h.speed, *h.spin, *h.background_speed, *h.background_spin) for h in hows], float
     )[kind]
-    most = max(int(how.objects[1]) for how in hows)
     objects = rng.integers(table[:, 0].astype(int), table[:, 1].astype(int) + 1)
-    there = np.arange(most + 1)[None] <= objects[:, None]
+    there = np.arange(most_layers(looks))[None] <= objects[:, None]
     shape = there.shape
     speed = _half_normal(rng, table[:, 2:3], table[:, 3:4], shape)
     speed[:, 0] = rng.uniform(table[:, 6], table[:, 7])

@@ -5,15 +5,17 @@ from __future__ import annotations
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 
 from dase.kernels.autograd import FLOOR, STEP, count_events, thresholds
 from dase.networks import edge_strength
-from dase.scenery import Scenery, middle
+from dase.scenery import Scenery, middle, sent
 
 Truth = Callable[[torch.Tensor], tuple[torch.Tensor, torch.Tensor]]
 """Images (B, H, W) to μ and σ of their thresholds, each (B, 2, H, W), OFF before ON [log intensity]."""
@@ -57,7 +59,7 @@ class Pairs:
         reference: Counts of the same scenes and noise at thresholds that never change, where simulated.
         varied: How the counts answer to the thresholds, where simulated.
         answers: Counts with all μ, σ and ratios at e^STEP and at e^-STEP of themselves, where simulated.
-        some: The pairs of which `answers` are.
+        some: Indices of the pairs of which `answers` are.
     """
 
     grey: torch.Tensor
@@ -65,7 +67,7 @@ class Pairs:
     reference: torch.Tensor | None = None
     varied: Varied | None = None
     answers: dict[str, tuple[torch.Tensor, torch.Tensor]] | None = None
-    some: slice = field(default_factory=lambda: slice(None))
+    some: torch.Tensor | None = None
 
     def __len__(self) -> int:
         return len(self.grey)
@@ -86,9 +88,22 @@ class Target(ABC):
     truth: Truth | None = None
     scenes: float = math.inf
 
+    @property
     @abstractmethod
+    def device(self) -> torch.device:
+        """Where pairs are."""
+
+    @abstractmethod
+    def numbers(self, rng: np.random.Generator, count: int) -> NDArray[np.int32]:
+        """Draw `count` pairs; return what `pairs` needs to know of them, as words of 4 bytes."""
+
+    @abstractmethod
+    def pairs(self, numbers: torch.Tensor, count: int) -> Pairs:
+        """Return the pairs that `numbers` drew; the processor decides nothing here."""
+
     def draw(self, rng: np.random.Generator, count: int) -> Pairs:
         """Return random pairs."""
+        return self.pairs(sent(self.numbers(rng, count), self.device), count)
 
     def held_out(self) -> Pairs | None:
         """Return pairs that `draw` never gives, or None where every draw is new."""
@@ -118,9 +133,18 @@ class Endless(Target):
         self.scenery, self.truth = scenery, truth
         self.generator = torch.Generator(scenery.device).manual_seed(seed)
 
-    def draw(self, rng: np.random.Generator, count: int) -> Pairs:
-        """Return pairs of scenes drawn by `rng`."""
-        log = self.scenery.draw(rng, count)
+    @property
+    def device(self) -> torch.device:
+        """Where scenes are rendered."""
+        return self.scenery.device
+
+    def numbers(self, rng: np.random.Generator, count: int) -> NDArray[np.int32]:
+        """Draw scenes."""
+        return self.scenery.numbers(rng, count)
+
+    def pairs(self, numbers: torch.Tensor, count: int) -> Pairs:
+        """Render scenes and let the sensor see them."""
+        log = self.scenery.render(numbers, count)
         grey = middle(log)
         assert self.truth is not None
         mu, sigma = self.truth(grey)
@@ -154,31 +178,42 @@ class Finite(Target):
         self, pairs: Pairs, *, held_out: float = 0.2, augment: bool = True, truth: Truth | None = None
     ):
         cut = len(pairs) - int(round(held_out * len(pairs)))
-        self.pairs = Pairs(pairs.grey[:cut], pairs.counts[:cut])
+        self.recorded = Pairs(pairs.grey[:cut], pairs.counts[:cut])
         self.rest = Pairs(pairs.grey[cut:], pairs.counts[cut:]) if cut < len(pairs) else None
         self.augment, self.truth, self.scenes = augment, truth, float(cut)
 
-    def draw(self, rng: np.random.Generator, count: int) -> Pairs:
-        """Return some of the pairs, each turned and mirrored at random where `augment` says so."""
-        index = rng.choice(len(self.pairs), size=count, replace=count > len(self.pairs))
-        some = self.pairs.select(torch.from_numpy(index).to(self.pairs.grey.device))
-        return flipped(some, rng) if self.augment else some
+    @property
+    def device(self) -> torch.device:
+        """Where the pairs were recorded to."""
+        return self.recorded.grey.device
+
+    def numbers(self, rng: np.random.Generator, count: int) -> NDArray[np.int32]:
+        """Choose pairs, and how each is turned and mirrored."""
+        index = rng.choice(len(self.recorded), size=count, replace=count > len(self.recorded))
+        mirrored = rng.random((2, count)) < 0.5
+        turned = np.full(count, rng.random() < 0.5)
+        return np.stack([index, *mirrored, turned]).astype(np.int32).ravel()
+
+    def pairs(self, numbers: torch.Tensor, count: int) -> Pairs:
+        """Return chosen pairs, turned and mirrored where `augment` says so."""
+        index, across, along, turned = numbers.view(4, count)
+        some = self.recorded.select(index.long())
+        return flipped(some, across > 0, along > 0, turned > 0) if self.augment else some
 
     def held_out(self) -> Pairs | None:
         """Return the pairs kept away from training."""
         return self.rest
 
 
-def flipped(pairs: Pairs, rng: np.random.Generator) -> Pairs:
-    """Mirror each pair at random, and transpose all of them at random where they are square."""
-    across, along = (torch.from_numpy(rng.random(len(pairs)) < 0.5).to(pairs.grey.device) for _ in range(2))
+def flipped(pairs: Pairs, across: torch.Tensor, along: torch.Tensor, turned: torch.Tensor) -> Pairs:
+    """Mirror pairs across and along, and transpose them if they are square, where these (B,) say so."""
     out = []
     for maps in (pairs.grey[:, None], pairs.counts):
-        for axis, which in ((-1, across), (-2, along)):
+        for which, axis in ((across, -1), (along, -2)):
             maps = torch.where(which.view(-1, 1, 1, 1), maps.flip(axis), maps)
+        if maps.shape[-1] == maps.shape[-2]:
+            maps = torch.where(turned.view(-1, 1, 1, 1), maps.transpose(-1, -2), maps)
         out.append(maps)
-    if pairs.grey.shape[1] == pairs.grey.shape[2] and rng.random() < 0.5:
-        out = [maps.transpose(-1, -2).contiguous() for maps in out]
     return Pairs(out[0][:, 0], out[1])
 
 
@@ -315,10 +350,14 @@ def by_edges(low: float = 0.14, gain: float = 0.16, half: float = 0.04, spread: 
 def by_column(mu: float = 0.2, spread: float = 0.25, depth: float = 0.25, seed: int = 3) -> Truth:
     """A fixed pattern: every column has a factor exp(depth · N(0, 1)) of its own."""
 
+    @lru_cache(maxsize=4)
+    def factors(width: int, device: torch.device) -> torch.Tensor:
+        drawn = np.exp(depth * np.random.default_rng(seed).normal(size=width)).astype(np.float32)
+        return torch.from_numpy(drawn).to(device)
+
     def truth(grey: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        factor = np.exp(depth * np.random.default_rng(seed).normal(size=grey.shape[-1])).astype(np.float32)
-        row = torch.from_numpy(factor).to(grey.device)
-        maps = (mu * row).clamp_min(2 * FLOOR).expand(len(grey), 2, *grey.shape[1:])
+        row = (mu * factors(grey.shape[-1], grey.device)).clamp_min(2 * FLOOR)
+        maps = row.expand(len(grey), 2, *grey.shape[1:])
         return maps, spread * maps
 
     return truth
@@ -328,8 +367,7 @@ def asymmetric(mu: float = 0.2, sigma: float = 0.05, ratio: float = 1.4) -> Trut
     """ON thresholds `ratio` times the OFF thresholds, evenly about `mu` in the logarithm."""
 
     def truth(grey: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        factor = torch.tensor([ratio**-0.5, ratio**0.5], device=grey.device).view(1, 2, 1, 1)
-        like = torch.ones_like(grey)[:, None] * factor
+        like = torch.stack([torch.full_like(grey, ratio**power) for power in (-0.5, 0.5)], 1)
         return mu * like, sigma * like
 
     return truth

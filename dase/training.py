@@ -13,11 +13,12 @@ import torch
 from dase import parallel
 from dase.errors import InputError
 from dase.moments import Moments
-from dase.networks import NetworkShape, ThresholdNet
+from dase.networks import Maps, NetworkShape, ThresholdNet
 from dase.newton import Newton
 from dase.objectives import Adversarial, Hash, Objective
 from dase.optimizers import AdaBelief
-from dase.scenery import Scenery, middle
+from dase.replay import Replay
+from dase.scenery import Scenery, middle, packed, sent, unpacked
 from dase.targets import Noise, Pairs, Target, answers, draw_noise, simulate, vary
 
 REFERENCE = 0.25, 0.06
@@ -142,23 +143,31 @@ class Training:
         self.scenes = np.random.default_rng([recipe.seed, 1, *apart])
         self.reals = np.random.default_rng([recipe.seed, 2, *apart])
         target.part(parallel.rank())
+        self.replay = Replay(self.device, self._generators())
+        self.inputs: torch.Tensor | None = None
         self.step = -recipe.warmup
         self.seconds = 0.0
         self.best = math.inf
         self.calibrated = False
 
+    def _generators(self) -> list[torch.Generator]:
+        """Return all random numbers that a step draws on the device."""
+        parts = self, self.target, self.objective
+        return [part.generator for part in parts if hasattr(part, "generator")]
+
     def _optimizer(self) -> torch.optim.Optimizer:
-        recipe = self.recipe
-        groups = [
-            {"params": self.net.body(), "lr": recipe.rate, "full": recipe.rate},
-        ]
+        recipe, cuda = self.recipe, self.device.type == "cuda"
+        parts = [(self.net.body(), recipe.rate)]
         if recipe.objective == "wgan":
-            groups.append(
-                {"params": self.net.scalars(), "lr": recipe.rate_scalars, "full": recipe.rate_scalars}
-            )
+            parts.append((self.net.scalars(), recipe.rate_scalars))
+        # rates are tensors, which a step that is replayed can read
+        groups = [
+            {"params": params, "lr": torch.tensor(rate, device=self.device), "full": rate}
+            for params, rate in parts
+        ]
         if recipe.optimizer == "adabelief":
             return AdaBelief(groups, betas=(0.9, 0.999))
-        return torch.optim.Adam(groups, betas=(0.5, 0.99), fused=self.device.type == "cuda")
+        return torch.optim.Adam(groups, betas=(0.5, 0.99), fused=cuda, capturable=cuda)
 
     def _objective(self) -> Objective:
         recipe = self.recipe
@@ -188,7 +197,8 @@ class Training:
         sets = []
         for _ in range(batches):
             with torch.no_grad():
-                sets.append((self._fake()[0], self.target.draw(self.reals, self.recipe.batch)))
+                log = self.scenery.draw(self.scenes, self.recipe.batch)
+                sets.append((self._fake(log)[0], self.target.draw(self.reals, self.recipe.batch)))
         self.objective.calibrate(sets)
         held_out = self.target.held_out()
         if held_out is not None and isinstance(self.objective, Moments):
@@ -197,30 +207,23 @@ class Training:
                 self.objective.see_real(some, held_out=True)
         self.calibrated = True
 
-    def _fake(self) -> tuple[Pairs, torch.Tensor]:
-        """Return simulated pairs and the residual of the network."""
-        log = self.scenery.draw(self.scenes, self.recipe.batch)
+    def _fake(self, log: torch.Tensor, step: torch.Tensor | int = 0) -> tuple[Pairs, Maps]:
+        """Return pairs simulated from log intensities, and the maps of their thresholds."""
         grey = middle(log)
         maps = self.net(grey)
         mu, sigma = maps.by_polarity() if self.recipe.network.split else (maps.mu, maps.sigma)
         noise = draw_noise(log, self.generator)
         counts = simulate(log, mu, sigma, noise, surrogate=self.recipe.surrogate)
-        self.maps = maps
         if self.recipe.objective != "moments":
-            return Pairs(grey, counts), maps.residual
+            return Pairs(grey, counts), maps
         with torch.no_grad():
             level = torch.full_like(grey, REFERENCE[0])
             reference = simulate(log, level, REFERENCE[1], noise)
         varied = vary(log, mu, sigma, noise) if self.recipe.rate > 0 else None
-        some = self._some(len(log))
+        some = some_of(len(log), step, log.device)
         few = Noise(noise.z[some], noise.phase[some])
         near = answers(log[some], mu.detach()[some], sigma.detach()[some], few)
-        return Pairs(grey, counts, reference, varied, near, some), maps.residual
-
-    def _some(self, batch: int) -> slice:
-        """Return which scenes of a batch the derivatives are taken of, others in every step."""
-        every = max(batch // DERIVED, 1)
-        return slice(self.step % every, None, every)
+        return Pairs(grey, counts, reference, varied, near, some), maps
 
     def rate(self) -> float:
         """Return the share of the full learning rates at this step."""
@@ -231,26 +234,54 @@ class Training:
         return min((step + 1) / max(ramp, 1), 1) * cosine
 
     def advance(self) -> dict[str, torch.Tensor]:
-        """Do one step; return what is worth logging, still on the device."""
+        """Do one step; return what is worth logging, still on the device and until the next step."""
         if not self.calibrated:
             self.calibrate()
-        recipe, move = self.recipe, self.step >= 0
-        share = self.rate() if move else 0.0
-        if recipe.critic_cosine and isinstance(self.objective, Adversarial):
-            self.objective.rate = recipe.critic_rate * (share if move else 1.0)
-        fake, residual = self._fake()
-        real = self.target.draw(self.reals, recipe.batch)
+        move = self.step >= 0
+        self.inputs = self._drawn(self.rate() if move else 0.0)
+        kind = self.objective.begin()
+        # in the middle of a run there is only one kind, or two
+        values = self.replay(kind if kind is None else (move, kind), lambda: self._work(move))
+        self.step += 1
+        return values
+
+    def _drawn(self, share: float) -> torch.Tensor:
+        """Draw scenes; return all that a step reads from the processor, where the last one read it."""
+        recipe = self.recipe
+        critic_rate = recipe.critic_rate * (share if recipe.critic_cosine and self.step >= 0 else 1.0)
+        # the first steps are forgotten soon, as if the mean had begun later
+        step = max(self.step, 0)
+        keep = min(recipe.average, (step + 1) / (step + 10)) if recipe.average else 0.0
+        parts = (
+            np.array([share, critic_rate, 1 - keep], np.float32),
+            np.array([self.step + recipe.warmup], np.int32),
+            self.scenery.numbers(self.scenes, recipe.batch),
+            self.target.numbers(self.reals, recipe.batch),
+        )
+        self.shapes = [part.shape for part in parts]
+        return sent(packed(*parts), self.device, to=self.inputs)
+
+    def _work(self, move: bool) -> dict[str, torch.Tensor]:
+        """Do what a step does on the device."""
+        recipe, inputs = self.recipe, self.inputs
+        assert inputs is not None
+        numbers, step, scenes, reals = unpacked(inputs, *self.shapes)
+        share, critic_rate, learn = numbers.view(torch.float32).unbind()
+        if isinstance(self.objective, Adversarial):
+            self.objective.rate = critic_rate
+        fake, maps = self._fake(self.scenery.render(scenes, recipe.batch), step)
+        real = self.target.pairs(reals, recipe.batch)
         loss, values = self.objective.loss(fake, real, move=move)
         if self.newton is not None:
             self.newton.see(fake)
         if move:
-            held = recipe.anchor * residual.square().mean() + recipe.kl * prior(self.maps)
+            held = recipe.anchor * maps.residual.square().mean() + recipe.kl * prior(maps)
             if recipe.smooth:
                 held = held + recipe.smooth * self.net.roughness()
             # the objective's part is that of the process's own scenes, to be summed over all
             loss = loss + held / parallel.size()
             for group in self.optimizer.param_groups:
-                group["lr"] = share * group["full"]
+                group["lr"].copy_(share * group["full"])
             self.optimizer.zero_grad(set_to_none=True)
             loss.backward()
             parallel.total_gradients(self.net.parameters())
@@ -259,17 +290,15 @@ class Training:
                 self.newton.step(recipe.newton * share)
                 shared = [v for n, v in self.net.state_dict().items() if not n.startswith("unet.")]
                 parallel.alike(shared)
-            self._average()
-        self.step += 1
-        values["loss"] = loss.detach()
-        return values
+            self._average(learn)
+        return values | {"loss": loss.detach()}
 
     @torch.no_grad()
-    def _average(self) -> None:
-        # the first steps are forgotten soon, as if the mean had begun later
-        keep = min(self.recipe.average, (self.step + 1) / (self.step + 10)) if self.recipe.average else 0.0
+    def _average(self, learn: torch.Tensor) -> None:
         mine, theirs = list(self.mean.parameters()), list(self.net.parameters())
-        torch._foreach_lerp_(mine, theirs, 1 - keep)
+        apart = torch._foreach_sub(theirs, mine)
+        torch._foreach_mul_(apart, learn)
+        torch._foreach_add_(mine, apart)
 
     def state(self) -> dict[str, Any]:
         """Return everything the rest of the run depends on."""
@@ -303,6 +332,8 @@ class Training:
         self.net.load_state_dict(state["net"])
         self.mean.load_state_dict(state["mean"])
         self.optimizer.load_state_dict(state["optimizer"])
+        for group in self.optimizer.param_groups:
+            group["lr"] = torch.as_tensor(group["lr"], device=self.device)
         self.objective.load(state["objective"])
         if self.newton is not None:
             self.newton.load(state["newton"])
@@ -316,7 +347,13 @@ class Training:
         self.calibrated = state["calibrated"]
 
 
-def prior(maps: Any) -> torch.Tensor:
+def some_of(batch: int, step: torch.Tensor | int, device: torch.device) -> torch.Tensor:
+    """Return which scenes of a batch the derivatives are taken of, others in every step; indices."""
+    every = max(batch // DERIVED, 1)
+    return (torch.arange(-(-batch // every), device=device) * every + step) % batch
+
+
+def prior(maps: Maps) -> torch.Tensor:
     """Return the mean over pixels of KL(N(μ, σ²) ‖ N(0, 1)): Eq. 9, with the sign that keeps it small."""
     mu, sigma = maps.mu, maps.sigma
     return (0.5 * (sigma.square() + mu.square() - 1) - sigma.log()).mean()

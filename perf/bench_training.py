@@ -1,6 +1,6 @@
 """How fast learning is, part by part, and how near a critic step is to what memory allows.
 
-Each part is timed alone, waiting for the device, so the parts of a step add up to more than the step.
+Each part is timed alone; on a GPU as it runs in a step, from a recording, so that its launches cost nothing.
 
     python perf/bench_training.py                    the study's size: 12 scenes of 240x240, 24 samples
     python perf/bench_training.py --small            for a CPU
@@ -19,7 +19,7 @@ import statistics
 import subprocess
 import time
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -31,7 +31,8 @@ from dase.critics import BankShape, CriticBank, _Batch, _has_grouped_products
 from dase.kernels import autograd_training as bridge
 from dase.networks import NetworkShape
 from dase.objectives import Adversarial, Hash, critic_maps, cut_patches
-from dase.scenery import Looks, Scenery, middle
+from dase.replay import Replay
+from dase.scenery import Looks, Scenery, middle, sent
 from dase.targets import TRUTHS, Endless, Pairs, answers, draw_noise, simulate, vary
 from dase.training import Recipe, Training
 
@@ -39,18 +40,29 @@ ROOT = Path(__file__).resolve().parents[1]
 
 
 class Clock:
-    """Times calls on a device, waiting for it before and after."""
+    """Times calls on a device, waiting for it before and after.
 
-    def __init__(self, device: torch.device, repeats: int):
-        self.device, self.repeats = device, repeats
+    Args:
+        device: What to wait for.
+        repeats: Of a measurement.
+        generators: Random numbers that calls draw on the device.
+    """
+
+    def __init__(self, device: torch.device, repeats: int, generators: Sequence[torch.Generator] = ()):
+        self.device, self.repeats, self.generators = device, repeats, generators
 
     def wait(self) -> None:
         if self.device.type == "cuda":
             torch.cuda.synchronize(self.device)
 
+    def recorded(self, work: Callable[[], Any]) -> float:
+        """Return the median time [s] of what `work` does on the device."""
+        replay = Replay(self.device, self.generators)
+        return self(lambda: replay("all", work), inner=5)
+
     def __call__(self, work: Callable[[], Any], *, inner: int = 1) -> float:
         """Return the median time of `work` [s], called `inner` times between two looks at the clock."""
-        for _ in range(3):
+        for _ in range(5):
             work()
         times = []
         for _ in range(self.repeats):
@@ -81,54 +93,69 @@ def make(args: argparse.Namespace, objective: str) -> Training:
     batch = 4 if args.small else 12
     recipe = Recipe(objective=objective, batch=batch, hash=how, network=network, warmup=2, steps=10**6)  # type: ignore[arg-type]
     training = Training(recipe, Endless(scenery, TRUTHS["uniform"]()), scenery)
-    for _ in range(8):
+    for _ in range(30):
         training.advance()
     return training
 
 
 def iterations(training: Training, clock: Clock) -> dict[str, float]:
     """Return the time of a whole step and what the parts of it take, each measured alone [s]."""
-    recipe, scenery = training.recipe, training.scenery
-    out = {"iteration": clock(training.advance, inner=5)}
-    log = scenery.draw(training.scenes, recipe.batch)
+    recipe, scenery, target = training.recipe, training.scenery, training.target
+    # moments are weighed anew every 25 steps
+    out = {"iteration": clock(training.advance, inner=25)}
+    numbers = scenery.numbers(training.scenes, recipe.batch)
+    words, reals = (sent(n, clock.device) for n in (numbers, target.numbers(training.reals, recipe.batch)))
+    out["host: draw scenes"] = clock(lambda: training._drawn(0.0))
+    log = scenery.render(words, recipe.batch)
     grey, noise = middle(log), draw_noise(log, training.generator)
-    out["render fake"] = clock(lambda: scenery.draw(training.scenes, recipe.batch))
-    out["draw real"] = clock(lambda: training.target.draw(training.reals, recipe.batch))
-    out["network forward"] = clock(lambda: training.net(grey))
+    out["render fake"] = clock.recorded(lambda: scenery.render(words, recipe.batch))
+    out["draw real"] = clock.recorded(lambda: target.pairs(reals, recipe.batch))
+    out["network forward"] = clock.recorded(lambda: training.net(grey))
+    weight = torch.randn_like(grey)
+
+    def both() -> None:
+        training.net.zero_grad(set_to_none=True)
+        (training.net(grey).mu * weight).sum().backward()
+
+    out["network backward"] = clock.recorded(both) - out["network forward"]
     maps = training.net(grey)
-    weight = torch.randn_like(maps.mu)
-    both = clock(lambda: (training.net(grey).mu * weight).sum().backward())
-    out["network backward"] = both - out["network forward"]
     mu, sigma = maps.mu.detach().requires_grad_(), maps.sigma.detach().requires_grad_()
-    out["count"] = clock(lambda: simulate(log, mu.detach(), sigma.detach(), noise))
-    both = clock(lambda: simulate(log, mu, sigma, noise).sum().backward())
-    out["count gradient"] = both - out["count"]
+    out["count"] = clock.recorded(lambda: simulate(log, mu.detach(), sigma.detach(), noise))
+
+    def gradient() -> None:
+        mu.grad = sigma.grad = None
+        simulate(log, mu, sigma, noise).sum().backward()
+
+    out["count gradient"] = clock.recorded(gradient) - out["count"]
     if recipe.objective == "moments":
-        out["count anew for derivatives"] = clock(
+        out["count anew for derivatives"] = clock.recorded(
             lambda: (vary(log, mu, sigma, noise), answers(log, mu.detach(), sigma.detach(), noise))
         )
         out |= _moments(training, clock)
     else:
         out |= _critics(training, clock)
-    out["optimiser"] = clock(lambda: (training.optimizer.step(), training._average()))
+    learn = torch.zeros((), device=clock.device)
+    out["optimiser"] = clock.recorded(lambda: (training.optimizer.step(), training._average(learn)))
     return out
 
 
 def _moments(training: Training, clock: Clock) -> dict[str, float]:
-    fake, _ = training._fake()
+    fake, _ = training._fake(training.scenery.draw(training.scenes, training.recipe.batch))
     real = training.target.draw(training.reals, training.recipe.batch)
     assert training.newton is not None
     newton = training.newton
+    while training.objective.begin() is None:
+        pass
     return {
-        "moments": clock(lambda: training.objective.loss(fake, real, move=True)),
-        "newton": clock(lambda: (newton.see(fake), newton.step(0.0))),
+        "moments": clock.recorded(lambda: training.objective.loss(fake, real, move=True)),
+        "newton": clock.recorded(lambda: (newton.see(fake), newton.step(0.0))),
     }
 
 
 def _critics(training: Training, clock: Clock) -> dict[str, float]:
     objective = training.objective
     assert isinstance(objective, Adversarial)
-    fake, _ = training._fake()
+    fake, _ = training._fake(training.scenery.draw(training.scenes, training.recipe.batch))
     fake = Pairs(fake.grey, fake.counts.detach())
     real = training.target.draw(training.reals, training.recipe.batch)
     size = objective.hasher.how.size
@@ -137,6 +164,7 @@ def _critics(training: Training, clock: Clock) -> dict[str, float]:
     weights = objective.weights()
     bank = objective.bank
     share = torch.rand(len(patches), 1, device=clock.device)
+    rate = torch.tensor(1e-9, device=clock.device)
 
     def sort() -> _Batch:
         return _Batch(bank, patches, ours, others, theirs, weights, share)
@@ -149,19 +177,19 @@ def _critics(training: Training, clock: Clock) -> dict[str, float]:
         batch.differentiate(1.0)
 
     parts = {
-        "bank: sort and gather": clock(sort),
-        "bank: forward": clock(lambda: bank._forward(rows, batch.by)),
-        "bank: forward, gradients": clock(differentiate),
-        "bank step": clock(lambda: bank.step(patches, ours, others, theirs, weights, rate=1e-9)),
+        "bank: sort and gather": clock.recorded(sort),
+        "bank: forward": clock.recorded(lambda: bank._forward(rows, batch.by)),
+        "bank: forward, gradients": clock.recorded(differentiate),
+        "bank step": clock.recorded(lambda: bank.step(patches, ours, others, theirs, weights, rate=rate)),
     }
     penalty = parts.pop("bank: forward, gradients") - parts["bank: forward"]
     step = parts.pop("bank step")
     return parts | {
         "bank: gradients, penalty": penalty,
         "bank: optimiser": step - penalty - sum(parts.values()),
-        "bank: input gradient": clock(lambda: bank.input_gradient(patches, ours, weights)),
-        "hash, both sides": 2 * clock(lambda: objective.hasher.classes(fake)),
-        "maps and patches": clock(lambda: cut_patches(critic_maps(fake.counts), size)),
+        "bank: input gradient": clock.recorded(lambda: bank.input_gradient(patches, ours, weights)),
+        "hash, both sides": 2 * clock.recorded(lambda: objective.hasher.classes(fake)),
+        "maps and patches": clock.recorded(lambda: cut_patches(critic_maps(fake.counts), size)),
     }
 
 
@@ -205,6 +233,7 @@ def host(training: Training, clock: Clock, steps: int = 20) -> dict[str, float]:
 
 def kernels(training: Training, steps: int = 5) -> None:
     """Print what runs on the GPU in a step, the longest first."""
+    from torch.autograd import DeviceType
     from torch.profiler import ProfilerActivity, profile
 
     with profile(activities=[ProfilerActivity.CUDA]) as seen:
@@ -213,6 +242,8 @@ def kernels(training: Training, steps: int = 5) -> None:
         torch.cuda.synchronize()
     spent: dict[str, list[float]] = {}
     for event in seen.events():
+        if event.device_type != DeviceType.CUDA:
+            continue
         spent.setdefault(event.name, []).append(event.time_range.elapsed_us())
     total = sum(map(sum, spent.values())) / steps / 1e3
     number = sum(map(len, spent.values())) / steps
@@ -231,7 +262,7 @@ def bank(args: argparse.Namespace, clock: Clock, rate: float, patches: int) -> d
     rows = [torch.rand(patches, shape.inputs, device=args.device) for _ in range(2)]
     weights = torch.full((shape.classes,), 1 / shape.classes, device=args.device)
     active = len(set(classes[0].tolist()) & set(classes[1].tolist()))
-    seconds = clock(
+    seconds = Clock(clock.device, clock.repeats, [generator]).recorded(
         lambda: made.step(rows[0], classes[0], rows[1], classes[1], weights, rate=1e-9, generator=generator)
     )
     bound = made.traffic(active) / rate
@@ -241,7 +272,7 @@ def bank(args: argparse.Namespace, clock: Clock, rate: float, patches: int) -> d
     left = torch.rand(3 * patches, shape.wide, device=args.device)
     right = torch.rand(3 * patches, shape.inputs, device=args.device).to(made.working)
     rates, correction = (torch.full((shape.classes,), v, device=args.device) for v in (1e-9, 1.0))
-    update = clock(
+    update = clock.recorded(
         lambda: bridge.move_critics(
             made.w1, made.square["w1"], made.copies["w1"], left, right, end, rates, correction, decay=0.9
         )
@@ -292,12 +323,16 @@ def main() -> None:
         )
     for objective in ("wgan", "moments"):
         training = make(args, objective)
+        clock.generators = training._generators()
         parts = iterations(training, clock)
         whole = parts["iteration"]
         parts |= host(training, clock)
         found[objective] = parts | {"shares": shares(parts)}
         print(f"{objective}: {1e3 * whole:.2f} ms per iteration, {1 / whole:.1f} steps/s")
-        print(f"  Python's thread works {1e3 * parts['host_seconds']:.2f} ms per step")
+        print(
+            f"  Python's thread works {1e3 * parts['host_seconds']:.2f} ms per step, meanwhile; "
+            f"{1e3 * parts['host: draw scenes']:.2f} ms of it draw scenes"
+        )
         if "waits" in parts:
             print(f"  a step waits for the GPU {parts['waits']} times")
         for name, seconds in found[objective]["shares"].items():

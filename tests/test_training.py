@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import json
 import math
+import re
 from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
 
-from dase import images, patches, scenery
+from dase import images, patches, replay, scenery
 from dase.baselines import Randomised, constant, event_rate
 from dase.errors import InputError
 from dase.evaluation import Exam, HeldOut
@@ -181,13 +182,17 @@ def test_counts_answer_as_central_differences_say(scenes, rng):
     torch.testing.assert_close(slope, want, rtol=2e-2, atol=1e-3)
 
 
+def a_fake(training):
+    log = training.scenery.draw(training.scenes, training.recipe.batch)
+    return training._fake(log, training.step)[0]
+
+
 def test_newton_knows_how_moments_move(scenes):
     training = a_run(scenes, network=NetworkShape(channels=4, depth=1, split=True), mu=0.2, sigma=0.05)
     training.calibrate()
     assert isinstance(training.objective, Moments)
     assert training.newton is not None
-    fake, _ = training._fake()
-    training.newton.see(fake)
+    training.newton.see(a_fake(training))
     jacobian = training.newton._jacobian()
     log, noise = scenes.draw(np.random.default_rng(1), 4), None
     noise = draw_noise(log, torch.Generator().manual_seed(1))
@@ -259,13 +264,13 @@ def test_critics_push_towards_the_target(scenes):
     for _ in range(30):
         training.advance()
     assert training.step == 0
-    loss, _ = training.objective.loss(training._fake()[0], training.target.draw(training.reals, 6), move=True)
+    loss, _ = training.objective.loss(a_fake(training), training.target.draw(training.reals, 6), move=True)
     loss.backward()
     assert float(training.net.level.grad[0]) > 0  # descent lowers thresholds that are too high
     low = a_run(scenes, **WGAN, warmup=30, batch=6, mu=0.1, sigma=0.025)
     for _ in range(30):
         low.advance()
-    loss, _ = low.objective.loss(low._fake()[0], low.target.draw(low.reals, 6), move=True)
+    loss, _ = low.objective.loss(a_fake(low), low.target.draw(low.reals, 6), move=True)
     loss.backward()
     assert float(low.net.level.grad[0]) < 0
 
@@ -288,11 +293,70 @@ def test_derivatives_are_of_other_scenes_in_every_step(scenes):
     training = a_run(scenes, batch=8)
     seen = []
     for training.step in range(2):
-        fake, _ = training._fake()
-        seen += list(range(8))[fake.some]
+        fake = a_fake(training)
+        seen += fake.some.tolist()
         for above, below in fake.answers.values():
             assert above.shape == below.shape == (4, 2, SIDE, SIDE)
     assert sorted(seen) == list(range(8))
+
+
+def tensors(value, name=""):
+    """Yield all tensors inside of dictionaries and lists, by their names."""
+    if isinstance(value, torch.Tensor):
+        yield name, value
+    elif isinstance(value, dict | list | tuple):
+        items = value.items() if isinstance(value, dict) else enumerate(value)
+        for key, inner in items:
+            yield from tensors(inner, f"{name}.{key}")
+
+
+KINDS = {
+    "moments": dict(network=NetworkShape(channels=4, depth=1, split=True, table=(3, 3))),
+    "patterns": dict(network=NetworkShape(channels=4, depth=1, pattern=(SIDE, SIDE))),
+    "adabelief": dict(optimizer="adabelief"),
+    "critics": dict(WGAN, critic_cosine=True, batch=6),
+}
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_steps_leave_everything_where_it_was(scenes, kind):
+    # what is replayed reads and writes the memory of the step that was recorded
+    training = a_run(scenes, **KINDS[kind], steps=80, warmup=4)
+    for _ in range(8):
+        training.advance()
+
+    def places():
+        state = training.state() | {"inputs": training.inputs}
+        return {name: value.data_ptr() for name, value in tensors(state) if not re.search("random|generator", name)}
+
+    before = places()
+    assert len(before) > 20
+    for _ in range(30):
+        training.advance()
+    assert places() == before
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_replayed_steps_are_the_same_steps(scenes, device, kind, monkeypatch):
+    if device == "cpu":
+        pytest.skip("steps are replayed on a GPU only; --device cuda:0 asks for one")
+    source = images.open_images("builtin")
+    there = scenery.Scenery(source, scenes.looks, device=device, backgrounds=6, objects=8)
+    ends = []
+    for seen in (10**9, 3):
+        monkeypatch.setattr(replay, "SEEN", seen)
+        training = a_run(there, **KINDS[kind], steps=60, warmup=8)
+        for _ in range(40):
+            values = training.advance()
+        assert bool(training.replay.recorded) == (seen == 3)
+        assert np.isfinite(float(values["loss"]))
+        ends.append(training)
+    first, second = (dict(tensors([t.net.state_dict(), t.mean.state_dict()])) for t in ends)
+    for name, value in first.items():
+        # sums on a GPU are taken in any order
+        torch.testing.assert_close(second[name], value, rtol=2e-3, atol=2e-4, msg=name)
+    numbers = [t.generator.get_state() for t in ends]
+    assert torch.equal(*numbers)
 
 
 def same(one, other) -> bool:
@@ -368,20 +432,18 @@ def test_finite_targets_hold_out_the_last_and_mirror_the_rest(scenes):
     endless = Endless(scenes, TRUTHS["uniform"]())
     pairs = record(endless, np.random.default_rng(0), 10, batch=4)
     target = Finite(pairs, held_out=0.2)
-    assert (len(target.pairs), len(target.held_out()), target.scenes) == (8, 2, 8.0)
+    assert (len(target.recorded), len(target.held_out()), target.scenes) == (8, 2, 8.0)
     assert torch.equal(target.held_out().grey, pairs.grey[8:])
     some = pairs.select(slice(3))
-    mirrored = flipped(some, np.random.default_rng(3))
+    across, along, turn = torch.tensor([[1, 0, 1], [0, 1, 1], [0, 1, 1]], dtype=torch.bool)
+    mirrored = flipped(some, across, along, turn)
     for n in range(3):
-        options = [(t, f) for t in (False, True) for f in ((), (-1,), (-2,), (-1, -2))]
-
-        def turned(maps, how):
-            out = maps.flip(how[1]) if how[1] else maps
-            return out.transpose(-1, -2) if how[0] else out
-
-        fits = [how for how in options if torch.equal(mirrored.grey[n], turned(some.grey[n], how))]
-        assert fits
-        assert any(torch.equal(mirrored.counts[n], turned(some.counts[n], how)) for how in fits)
+        for maps, got in ((some.grey[n], mirrored.grey[n]), (some.counts[n], mirrored.counts[n])):
+            want = maps.flip([axis for axis, on in ((-1, across), (-2, along)) if on[n]])
+            assert torch.equal(got, want.transpose(-1, -2) if turn[n] else want)
+    drawn = target.draw(np.random.default_rng(0), 6)
+    levels = pairs.grey[:8].float().sum((1, 2))
+    assert all(float((levels - g.sum()).abs().min()) < 1e-2 for g in drawn.grey)
 
 
 def test_a_held_out_score_finds_the_nearest(scenes):
