@@ -17,7 +17,7 @@ import torch
 
 from dase import parallel
 from dase.kernels.autograd import STEP
-from dase.moments import LONG, Cells, Moments, of_pixels, with_neighbours, with_next
+from dase.moments import LONG, Cells, Moments, of_pixels, summed, with_neighbours, with_next
 from dase.networks import ThresholdNet
 from dase.targets import Pairs
 
@@ -73,7 +73,7 @@ class Newton:
                 each = flat[b]
                 if name != "ratio":
                     each = (each[:, :, None] * weights[b][:, None]).flatten(1)
-                total = total + summed(member[b], each)
+                total = total + summed(member[b : b + 1], each[None])[0]
             self._keep(name, total.double().view(len(total), flat.shape[2], -1))
             if self.moments.pattern and name != "ratio":
                 down, across = (slope(name, partial(with_next, axis=axis)) for axis in (-2, -1))
@@ -214,17 +214,6 @@ class Newton:
         self.kept = {name: value.to(self.moments.device) for name, value in state["kept"].items()}
         self.loose, self.excess = (state[name].to(self.moments.device) for name in ("loose", "excess"))
         self.moments.excess = self.excess
-
-
-def summed(member: torch.Tensor, values: torch.Tensor) -> torch.Tensor:
-    """Return the sums of values (N, F) over the pixels of each cell (N, cells), shape (cells, F).
-
-    In many pieces, which a GPU works at side by side; in one it took 16 times as long.
-    """
-    pixels = len(member)
-    pieces = next(n for n in range(min(64, pixels), 0, -1) if pixels % n == 0)
-    a, b = (maps.reshape(pieces, pixels // pieces, -1) for maps in (member, values))
-    return torch.bmm(a.transpose(1, 2), b).sum(0)
 
 
 def _solved(matrix: torch.Tensor, right: torch.Tensor) -> torch.Tensor:

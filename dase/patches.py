@@ -80,7 +80,11 @@ def attributes(
     weight = wp.array(_window(size), dtype=wp.float32, device=where)
     structure = [out[name] for name in ("angle", "coherence", "strength", "energy")]
     over = {"size": rows * columns, "device": where, "batch": batch}
-    launch.run(kernels.structure, inputs=[image, weight, stride, columns, *structure], **over)
+    sums = wp.empty((batch, rows * columns * size), dtype=wp.vec3, device=where)
+    launch.run(
+        kernels.structure_rows, sums.shape[1], [image, weight, stride, columns, sums], where, batch=batch
+    )
+    launch.run(kernels.structure, inputs=[sums, weight, *structure], **over)
     contrast = kernels.contrast_of[counts.dtype]
     launch.run(contrast, inputs=[counts, size, stride, columns, out["contrast"]], **over)
     found = PatchAttributes(**{name: out[name].numpy().reshape(batch, rows, columns) for name in names})

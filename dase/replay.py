@@ -34,6 +34,8 @@ class Replay:
         self.device, self.generators = device, generators
         self.seen: dict[Hashable, int] = {}
         self.recorded: dict[Hashable, tuple[torch.cuda.CUDAGraph, object]] = {}
+        # steps follow one another, so they may use the same memory
+        self.pool = torch.cuda.graph_pool_handle() if device.type == "cuda" else None
 
     def __call__(self, kind: Hashable, step: Callable[[], T]) -> T:
         """Run `step`; return what it returns, in memory that the next one of its kind writes again.
@@ -58,6 +60,7 @@ class Replay:
         for generator in self.generators:
             graph.register_generator_state(generator)
         # gradients are made by another thread, so calls of others cannot be forbidden
-        with torch.cuda.device(self.device), torch.cuda.graph(graph, capture_error_mode="relaxed"):
+        recording = torch.cuda.graph(graph, pool=self.pool, capture_error_mode="relaxed")
+        with torch.cuda.device(self.device), recording:
             values = step()
         return graph, values

@@ -66,9 +66,13 @@ def patch_structure(image: torch.Tensor, *, size: int, stride: int) -> dict[str,
         Name to float32 of shape (B, patches), row by row of the grid.
     """
     batch, columns, number = _grid(image, size, stride)
+    weight = _window(size, image.device)
+    rows = image.new_empty(batch, number * size, 3, dtype=torch.float32)
+    lent = wp.from_torch(rows, dtype=wp.vec3)
     out = [image.new_empty(batch, number, dtype=torch.float32) for _ in range(4)]
-    inputs = [image.float().contiguous(), _window(size, image.device), stride, columns]
-    _launch(_patches.structure, inputs, out)
+    inputs = [image.float().contiguous(), weight, stride, columns]
+    _launch(_patches.structure_rows, inputs, [lent], over=rows[..., 0])
+    _launch(_patches.structure, [lent, weight], out)
     return dict(zip(("angle", "coherence", "strength", "energy"), out, strict=True))
 
 

@@ -1,6 +1,7 @@
 """The structure of patches: orientation, coherence, strength and energy of the image, contrast of the events.
 
-One thread per patch: patches are many and small, and no thread waits for another. Patch i of a map lies at
+No thread waits for another. The image is summed by a thread for every row of a patch first, since patches
+alone are too few to keep a GPU busy. Patch i of a map lies at
 row i // columns and column i % columns of the grid. Nothing here is differentiated: a hash has no gradient.
 """
 
@@ -24,23 +25,32 @@ def gradient(image: wp.array3d[float], b: int, y: int, x: int) -> wp.vec2:
     return 0.5 * wp.vec2(gx, gy)
 
 
-@wp.func
-def structure_tensor(
-    image: wp.array3d[float], weight: wp.array[float], b: int, top: int, left: int
-) -> wp.vec3:
-    """Weighted mean of gx², gx·gy and gy² over a patch [intensity²/pixel²].
+@wp.kernel
+def structure_rows(
+    first: int,
+    # in
+    image: wp.array3d[float],  # (B, H, W) [intensity]
+    weight: wp.array[float],  # (S,) window along one axis, its sum 1
+    stride: int,  # [pixel]
+    columns: int,  # of the grid of patches
+    # out
+    row_out: wp.array2d[wp.vec3],  # (B, N·S) weighted means of gx², gx·gy, gy² [intensity²/pixel²]
+):
+    """Sum the structure tensor over a row of a patch, one row per thread.
 
     Summing row by row keeps float32 rounding at that of a few terms, which the small eigenvalue feels.
     """
+    b, i = wp.tid()
+    i += first
     size = weight.shape[0]
-    tensor = wp.vec3(0.0)
-    for i in range(size):
-        row = wp.vec3(0.0)
-        for j in range(size):
-            g = gradient(image, b, top + i, left + j)
-            row += weight[j] * wp.vec3(g[0] * g[0], g[0] * g[1], g[1] * g[1])
-        tensor += weight[i] * row
-    return tensor
+    patch = i // size
+    y = (patch // columns) * stride + i % size
+    left = (patch % columns) * stride
+    row = wp.vec3(0.0)
+    for j in range(size):
+        g = gradient(image, b, y, left + j)
+        row += weight[j] * wp.vec3(g[0] * g[0], g[0] * g[1], g[1] * g[1])
+    row_out[b, i] = row
 
 
 @wp.func
@@ -74,10 +84,8 @@ def coherence(roots: wp.vec2) -> float:
 def structure(
     first: int,
     # in
-    image: wp.array3d[float],  # (B, H, W) [intensity]
+    row: wp.array2d[wp.vec3],  # (B, N·S) from `structure_rows`
     weight: wp.array[float],  # (S,) window along one axis, its sum 1
-    stride: int,  # [pixel]
-    columns: int,  # of the grid of patches
     # out
     angle_out: wp.array2d[float],  # (B, N) [rad]
     coherence_out: wp.array2d[float],  # (B, N)
@@ -87,7 +95,10 @@ def structure(
     """Eigen analysis of image gradients, one patch per thread."""
     b, i = wp.tid()
     i += first
-    tensor = structure_tensor(image, weight, b, (i // columns) * stride, (i % columns) * stride)
+    size = weight.shape[0]
+    tensor = wp.vec3(0.0)
+    for j in range(size):
+        tensor += weight[j] * row[b, i * size + j]
     roots = singular_values(tensor)
     angle_out[b, i] = orientation(tensor)
     coherence_out[b, i] = coherence(roots)
