@@ -212,11 +212,14 @@ def work(planned: list[Planned], args: argparse.Namespace) -> None:
         if p.name not in done
     ]
     args.commit = _commit(args.commit)
-    adaptation_jobs.run_all(tasks, partial(_runner, args), tell, budget=args.budget)
+    devices = args.device.split(",")
+    adaptation_jobs.run_all(tasks, partial(_runner, args), tell, budget=args.budget, devices=devices)
 
 
-def _runner(args: argparse.Namespace) -> adaptation_jobs.Run:
-    return partial(_measured, args)
+def _runner(args: argparse.Namespace, device: str) -> adaptation_jobs.Run:
+    if device.startswith("cuda:"):
+        torch.cuda.set_device(device)
+    return partial(_measured, argparse.Namespace(**{**vars(args), "device": device}))
 
 
 def _measured(args: argparse.Namespace, name: str, seconds: float) -> dict[str, Any]:
@@ -255,14 +258,16 @@ def parse(argv: list[str] | None = None) -> argparse.Namespace:
     parser.add_argument("--scale", type=float, default=1.0, help="all training times are multiplied by this")
     parser.add_argument("--budget", type=float, default=math.inf, help="seconds after which all ends")
     parser.add_argument("--out", default="out/adaptation")
-    parser.add_argument("--jobs", type=int, default=1, help="rows at a time that have no critics")
-    parser.add_argument("--alone", type=int, default=1, help="rows at a time that have critics")
-    parser.add_argument("--device", default="cuda" if torch.cuda.is_available() else "cpu")
+    parser.add_argument("--jobs", type=int, default=1, help="rows at a time on a device, without critics")
+    parser.add_argument("--alone", type=int, default=1, help="the same for rows that have critics")
+    parser.add_argument(
+        "--device", default="cuda" if torch.cuda.is_available() else "cpu", help="or some: cuda:0,cuda:1"
+    )
     parser.add_argument("--images", default=_default_images())
     parser.add_argument(
         "--recording", default=str(ROOT.parent / "shared/recordings/davis240c_camerashake.npz")
     )
-    parser.add_argument("--look", type=int, default=50, help="steps between lines of the log")
+    parser.add_argument("--look", type=int, default=100, help="steps between lines of the log")
     parser.add_argument("--small", action="store_true", help="tiny scenes, to try things on a CPU")
     parser.add_argument("--verbose", action="store_true", help="print every line of the log")
     parser.add_argument(

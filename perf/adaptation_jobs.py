@@ -1,11 +1,11 @@
-"""Many experiments on one device: processes that take rows in their order, as far as the device has room."""
+"""Many experiments on some devices: processes that take rows in their order, as far as a device has room."""
 
 from __future__ import annotations
 
 import multiprocessing
 import os
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from multiprocessing.connection import Connection, wait
 from typing import Any
@@ -21,7 +21,7 @@ class Task:
     Args:
         name: Of the row.
         seconds: Training time.
-        share: Of the device that it takes, in (0, 1].
+        share: Of a device that it takes, in (0, 1].
     """
 
     name: str
@@ -31,8 +31,9 @@ class Task:
 
 @dataclass
 class Worker:
-    """A process that runs one row after the other, and what it runs now."""
+    """A process that runs one row after the other on a device, and what it runs now."""
 
+    device: str
     process: multiprocessing.process.BaseProcess
     pipe: Connection
     task: Task | None = None
@@ -42,7 +43,12 @@ Run = Callable[[str, float], dict[str, Any]]
 
 
 def run_all(
-    tasks: list[Task], make: Callable[[], Run], tell: Callable[[dict[str, Any]], None], *, budget: float
+    tasks: list[Task],
+    make: Callable[[str], Run],
+    tell: Callable[[dict[str, Any]], None],
+    *,
+    budget: float,
+    devices: Sequence[str],
 ) -> None:
     """Run tasks until the budget is spent, in their order.
 
@@ -50,13 +56,14 @@ def run_all(
 
     Args:
         tasks: The most important first.
-        make: Called in each worker (so it must be a module's function); returns what runs a row by name and
-            seconds and returns its line.
+        make: Called in each worker with its device (so it must be a module's function); returns what runs a
+            row by name and seconds and returns its line.
         tell: Called with every line, here.
         budget: Seconds in all.
+        devices: Names of PyTorch devices.
     """
     end = time.perf_counter() + budget
-    most = max((round(1 / task.share) for task in tasks), default=1)
+    most = len(devices) * max((round(1 / task.share) for task in tasks), default=1)
     # set before the workers import what reads it
     os.environ["OMP_NUM_THREADS"] = str(max((os.cpu_count() or 2) // most, 1))
     os.environ.setdefault("DASE_THREADS", os.environ["OMP_NUM_THREADS"])
@@ -67,13 +74,15 @@ def run_all(
             for task in late:
                 waiting.remove(task)
                 print(f"{task.name}: no time left", flush=True)
-            room = 1 - sum(worker.task.share for worker in busy if worker.task is not None)
-            # strictly in order: a row that needs the whole device is not passed by small ones for ever
-            while waiting and waiting[0].share <= room + 1e-6:
-                worker = idle.pop() if idle else _start(make)
+            # strictly in order: a row that needs a whole device is not passed by small ones for ever
+            while waiting:
+                device, room = _emptiest(devices, busy)
+                if waiting[0].share > room + 1e-6:
+                    break
+                worker = next((w for w in idle if w.device == device), None) or _start(make, device)
+                idle = [w for w in idle if w is not worker]
                 worker.task = waiting.pop(0)
                 worker.pipe.send((worker.task.name, worker.task.seconds))
-                room -= worker.task.share
                 busy.append(worker)
             left = end - time.perf_counter()
             if left <= 0:
@@ -97,17 +106,26 @@ def run_all(
             worker.process.join()
 
 
-def _start(make: Callable[[], Run]) -> Worker:
+def _emptiest(devices: Sequence[str], busy: list[Worker]) -> tuple[str, float]:
+    """Return the device with the most room, and how much that is."""
+    room = dict.fromkeys(devices, 1.0)
+    for worker in busy:
+        if worker.task is not None:
+            room[worker.device] -= worker.task.share
+    return max(room.items(), key=lambda item: item[1])
+
+
+def _start(make: Callable[[str], Run], device: str) -> Worker:
     context = multiprocessing.get_context("spawn")
     ours, theirs = context.Pipe()
-    process = context.Process(target=_work, args=(make, theirs), daemon=True)
+    process = context.Process(target=_work, args=(make, device, theirs), daemon=True)
     process.start()
     theirs.close()
-    return Worker(process, ours)
+    return Worker(device, process, ours)
 
 
-def _work(make: Callable[[], Run], pipe: Connection) -> None:
-    run = make()
+def _work(make: Callable[[str], Run], device: str, pipe: Connection) -> None:
+    run = make(device)
     while True:
         name, seconds = pipe.recv()
         try:
