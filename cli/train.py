@@ -78,7 +78,7 @@ def command(
         adaptation.begin(job, output, resume=resume)
     with _bar(silent=not first) as opened:
         training = adaptation.prepare(replace(job, backend=backend), progress=opened)
-    looks = 100 if backend == "cuda" else 25
+    looks = 100 if backend.startswith("cuda") else 25
     pace = Pace(look=10 if preset == "tiny" else looks, seconds=None if minutes is None else 60 * minutes)
     with _live(training, output if tensorboard and first else None, silent=not first) as look:
         # killed before its first checkpoint, a run begins anew
