@@ -110,7 +110,9 @@ class Job:
         """Return how to learn."""
         recipe = PRESETS[self.preset]
         if self.objective == "wgan" and recipe.objective != "wgan":
-            recipe = replace(recipe, objective="wgan", anchor=5.0, steps=3000, ramp=100, warmup=50)
+            recipe = replace(
+                recipe, objective="wgan", anchor=5.0, steps=3000, ramp=100, warmup=50, hash=Hash(size=8)
+            )
         elif self.objective:
             recipe = replace(recipe, objective=self.objective)
         if self.objective == "wgan" and self.preset == "tiny":

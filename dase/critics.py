@@ -54,9 +54,11 @@ class Sorted:
     @classmethod
     def by(cls, classes: torch.Tensor, critics: int) -> Sorted:
         """Sort rows of these classes, int64 (R,); nothing waits for the GPU."""
-        ordered, order = torch.sort(classes, stable=True)
+        # a GPU's sort goes over all bits of a key
+        keys = classes.short() if critics < 2**15 else classes
+        ordered, order = torch.sort(keys, stable=True)
         number = classes.new_zeros(critics + 1).index_add_(0, classes, torch.ones_like(classes))
-        return cls(order, ordered, number[:-1].cumsum(0).int(), number[:-1])
+        return cls(order, ordered.long(), number[:-1].cumsum(0).int(), number[:-1])
 
 
 @dataclass

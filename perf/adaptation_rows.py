@@ -42,6 +42,11 @@ class Row:
 
 
 FULL = Row()
+"""The paper's hash and its patches of 40 px."""
+
+SMALL = FULL.but(hash=dict(size=8))
+"""The same with patches of the size that learns best."""
+
 SIZES = (8, 16, 24, 40, 60, 80)
 LOW = dict(mu=0.1, sigma=0.02)
 MOMENTS = Row(recipe=dict(objective="moments", rate=1e-4, anchor=1.0), network=dict(table=(6, 5)))
@@ -52,12 +57,14 @@ def rows() -> dict[str, Row]:
     """Return all experiments by name."""
     out: dict[str, Row] = {}
     for seed in range(3):
-        out[f"full-s{seed}"] = FULL.but(recipe=dict(seed=seed))
-        out[f"full-low-s{seed}"] = FULL.but(recipe=dict(seed=seed, **LOW))
+        out[f"full-s{seed}"] = SMALL.but(recipe=dict(seed=seed))
+        out[f"full-low-s{seed}"] = SMALL.but(recipe=dict(seed=seed, **LOW))
+        out[f"full16-s{seed}"] = FULL.but(recipe=dict(seed=seed), hash=dict(size=16))
+        out[f"full40-s{seed}"] = FULL.but(recipe=dict(seed=seed))
         out[f"moments-s{seed}"] = MOMENTS.but(recipe=dict(seed=seed))
         out[f"moments-low-s{seed}"] = MOMENTS.but(recipe=dict(seed=seed, **LOW))
         for count in (600, 100):
-            for name, base in (("wgan", FULL), ("moments", MOMENTS)):
+            for name, base in (("wgan", SMALL), ("moments", MOMENTS)):
                 row = base.but(finite=count, disjoint=True, textures=200, recipe=dict(seed=seed))
                 out[f"finite{count}-{name}-s{seed}"] = row
     one = dict(orientations=1, coherence=1, contrast=1)
@@ -90,9 +97,10 @@ def rows() -> dict[str, Row]:
         out[f"anchor-{anchor:g}"] = FULL.but(recipe=dict(anchor=anchor))
     recorded = dict(doubt=0.2, batch=8)
     out["real-moments"] = MOMENTS.but(real=True, recipe=recorded, network=dict(split=True))
-    out["real-moments-doubt.1"] = out["real-moments"].but(recipe=dict(doubt=0.1))
+    for doubt in (0.05, 0.1):
+        out[f"real-moments-doubt{doubt:g}"] = out["real-moments"].but(recipe=dict(doubt=doubt))
     out["real-moments-flat"] = out["real-moments"].but(network=dict(table=None), recipe=dict(rate=0.0))
-    out["real-wgan"] = FULL.but(
+    out["real-wgan"] = SMALL.but(
         real=True, recipe=dict(batch=8, anchor=0.5), hash=dict(orientations=8), network=dict(split=True)
     )
     out.update(_finite_variants())
@@ -126,7 +134,10 @@ def _maps() -> dict[str, Row]:
         "moments-unet-only": MOMENTS.but(recipe=dict(rate=1e-3, anchor=0.01), network=dict(table=None)),
         "moments-unet": MOMENTS.but(recipe=dict(rate=1e-3, anchor=0.01)),
         "wgan": FULL.but(recipe=dict(anchor=0.5)),
-        "wgan-table": FULL.but(recipe=dict(anchor=5.0), network=dict(table=(6, 5))),
+        "wgan-table": SMALL.but(recipe=dict(anchor=5.0), network=dict(table=(6, 5))),
+        "wgan-table-intensity": SMALL.but(
+            recipe=dict(anchor=5.0), network=dict(table=(6, 5)), hash=dict(orientations=8, intensity=6)
+        ),
         "wgan-image-table": FULL.but(recipe=dict(critic_image=True), network=dict(table=(6, 5))),
         "wgan-image": FULL.but(recipe=dict(anchor=0.5, critic_image=True)),
         "wgan-intensity": FULL.but(
@@ -142,13 +153,13 @@ def _maps() -> dict[str, Row]:
             out[f"maps-{truth}-{name}"] = way.but(truth=truth)
     pattern = dict(pattern=(240, 240))
     out["maps-column-moments"] = ways["moments"].but(truth="column", network=pattern)
-    out["maps-column-wgan"] = FULL.but(truth="column", network=pattern)
+    out["maps-column-wgan"] = SMALL.but(truth="column", network=pattern)
     out["maps-column-moments-finite600"] = out["maps-column-moments"].but(finite=600, augment=False)
     for truth in ("intensity", "edges"):
         out[f"maps-{truth}-moments-finite600"] = MOMENTS.but(
             truth=truth, finite=600, disjoint=True, textures=200
         )
-    for name in ("moments", "wgan"):
+    for name in ("moments", "wgan-table"):
         out[f"maps-asymmetric-{name}"] = ways[name].but(truth="asymmetric", network=dict(split=True))
     return out
 
@@ -172,8 +183,10 @@ SEEDS = (0, 1, 2)
 
 SAME = {
     "table5-energy-none": "table4-global",
-    "table5-energy-angle+contrast+coherence": "full-s0",
-    "fig5-40": "full-s0",
+    "table5-energy-angle+contrast+coherence": "full40-s0",
+    "fig5-40": "full40-s0",
+    "fig5-16": "full16-s0",
+    "fig5-8": "full-s0",
 }
 """Rows that are other rows by another name."""
 
@@ -185,22 +198,23 @@ def plan(which: str) -> list[Planned]:
     main += [f"finite{count}-moments-s{n}" for count in (600, 100) for n in SEEDS]
     main += [f"maps-{truth}-moments" for truth in ("intensity", "edges", "column", "asymmetric")]
     main += ["real-moments", "real-moments-flat"]
-    main += [f"{kind}-s{n}" for kind in ("full", "full-low") for n in SEEDS]
+    main += [f"{kind}-s{n}" for kind in ("full", "full-low", "full16", "full40") for n in SEEDS]
     tables = ["table4-global", "table4-uniform", "table5-events-angle+contrast+coherence"]
     tables += [f"table4-moments-{name}" for name in ("global", "brightness", "edges")]
     tables += [n for n in every if n.startswith("table5-energy") and n not in SAME]
     tables += ["fig3-literal", "fig3-literal-no-kl", "fig3-no-kl"]
     tables += [f"fig5-{size}" for size in SIZES if f"fig5-{size}" not in SAME]
-    rest = ["real-wgan", "finite600-wgan-s0", "finite100-wgan-s0", "paper", "table5-ranked"]
+    rest = ["real-wgan", "real-moments-doubt0.05", "real-moments-doubt0.1", "paper", "table5-ranked"]
+    rest += [f"finite{count}-wgan-s{n}" for count in (600, 100) for n in SEEDS]
     rest += [f"table5-events-{used}" for used in ("contrast", "angle+contrast", "contrast+coherence")]
-    rest += [f"maps-{truth}-wgan-table" for truth in ("intensity", "edges")]
-    rest += ["maps-column-wgan", "maps-asymmetric-wgan"]
+    rest += [f"maps-{truth}-wgan-table" for truth in ("intensity", "edges", "asymmetric")]
+    rest += ["maps-column-wgan", "maps-intensity-wgan-table-intensity"]
     chosen = {"main": main, "tables": tables, "all": main + tables + rest}
     if which not in chosen:
         raise SystemExit(f"--plan must be one of {', '.join(chosen)}, got '{which}'")
     out = []
     for name in chosen[which]:
         adversarial = every[name].recipe.get("objective") != "moments"
-        long = name.startswith(("full", "real", "paper")) or not adversarial
+        long = name.startswith(("full", "real", "paper"))
         out.append(Planned(name, 40.0 if long else 28.0, adversarial))
     return out
