@@ -13,11 +13,12 @@ from dase.effects import EFFECTS, Effect
 from dase.error import Judgement
 from dase.events import Events
 from dase.evidence import PIXELS, Evidence, gather
-from dase.model import Model, fit_present, free_of, model_of, settle
+from dase.model import Model, fit_present, free_of, model_of, settle, settling
 from dase.results import Cell, Diagnosis, Estimate, Rank, Step, Unexplained
 from dase.scene import Scene
 from dase.sensor import Sensor
 from dase.stimulus import Trust
+from dase.together import together
 from dase.words import worst_cells
 
 REPEATS = 60
@@ -192,7 +193,7 @@ def _step(search: _Search, model: Model, judgement: Judgement, more: bool) -> tu
     open_names = open_to(search.effects, model)
     if not open_names:
         return step, None
-    present = evidence.train.run(model.space, model.place, seed=seed)[0]
+    present = evidence.train.run(model.space, model.place[None], seed=seed)[0]
     scale, base = evidence.train.scale, float(evidence.train.scale.loss(present))
     tried = try_all(
         evidence, model, search.effects, open_names, worst=worst_families(judgement), seed=seed,
@@ -245,16 +246,18 @@ def _pairs(search: _Search, start: Model, model: Model, judgement: Judgement) ->
     singles = [t for t in search.first if t.scouted < 0.98][:PAIRED]
     start.rebase(evidence.scout, repeats=16, seed=seed + 200)
     pairs = list(combinations(singles, 2))
-    tried = []
-    for n, (one, two) in enumerate(pairs):
+    works = []
+    for one, two in pairs:
         both = one.model.sensor.with_effect(two.model.sensor[two.name])
-        pair = _like(both, start, (one.name, two.name)).search(
-            evidence.scout, seed=seed, iterations=4, radius=0.3
-        )
-        tried.append((pair.loss, f"{one.name} + {two.name}", pair))
-        search.progress(f"trying {one.name} + {two.name}", (n + 1) / len(pairs), search.error)
-    for _, name, pair in sorted(tried, key=lambda t: t[0])[:2]:
-        pair = settle(evidence, pair, seed=seed)
+        pair = _like(both, start, (one.name, two.name))
+        works.append(pair.searching(evidence.scout, seed=seed, iterations=4, radius=0.3))
+    ends = together(works, lambda share: search.progress("trying pairs", share, search.error))
+    tried = [
+        (pair.loss, f"{one.name} + {two.name}", pair) for (one, two), pair in zip(pairs, ends, strict=True)
+    ]
+    first = sorted(tried, key=lambda t: t[0])[:2]
+    settled = together([settling(evidence, pair, seed=seed) for _, _, pair in first])
+    for (_, name, _), pair in zip(first, settled, strict=True):
         judged = search.judge(pair)
         if judged.error < judgement.error * (1.0 if explained(judged) else 0.8):
             model, judgement = pair, judged
@@ -303,17 +306,21 @@ def _rivals(search: _Search, model: Model, name: str) -> list[Tried]:
 
     Fitting one in full takes as long as trying a dozen; most are far off.
     """
-    scout, out = search.evidence.scout, []
-    for other in search.alternatives.get(name, [])[:SWAPPED]:
-        limit = NEARBY * search.error_of.get(name, 0.0) + TIE
-        if other.name in model.space.sensor or other.error > limit:
-            continue
-        repeats = model.rebase(scout, repeats=16, seed=search.seed + 200)
+    scout, limit = search.evidence.scout.view(), NEARBY * search.error_of.get(name, 0.0) + TIE
+    near = [
+        other
+        for other in search.alternatives.get(name, [])[:SWAPPED]
+        if other.name not in model.space.sensor and other.error <= limit
+    ]
+    if not near:
+        return []
+    repeats = model.rebase(scout, repeats=16, seed=search.seed + 200)
+    works = []
+    for other in near:
         sensor = model.sensor.without(name).with_effect(other.model.sensor[other.name])
-        quick = _like(sensor, model, [other.name]).search(scout, seed=search.seed, iterations=2)
-        if quick.loss < QUICK * float(scout.scale.loss(repeats).mean()):
-            out.append(other)
-    return out
+        works.append(_like(sensor, model, [other.name]).searching(scout, seed=search.seed, iterations=2))
+    enough = QUICK * float(scout.scale.loss(repeats).mean())
+    return [other for other, quick in zip(near, together(works), strict=True) if quick.loss < enough]
 
 
 def _verdict(

@@ -50,11 +50,20 @@ HALVES = 8
 MEMORY = 4
 """Numbers a pixel remembers from event to event."""
 
+ZONES = 4
+"""Rings about the middle of the sensor, of equal numbers of pixels."""
+
+PRODUCTS, ODD, RINGS = 0, 12, 16
+FOLD = RINGS + 4 * ZONES
+"""Places in what the counts of pixels are folded into, and how many numbers there are: products of what is
+not expected in the two halves, pixels that count oddly, events by zone."""
+
 _BANDS, _RESTING, _MASKED = wp.constant(BANDS), wp.constant(RESTING), wp.constant(MASKED)
 _INTERVALS, _LAGS, _CLASSES = wp.constant(INTERVALS), wp.constant(LAGS), wp.constant(CLASSES)
 _CELLS = wp.constant(CELLS)
 _ISI, _LAG, _LAG_COUNT, _CHANGE = (wp.constant(n) for n in (ISI, LAG, LAG_COUNT, CHANGE))
 _REPEAT, _SERIAL = wp.constant(REPEAT), wp.constant(SERIAL)
+_ODD, _RINGS, _FOLD, _ZONES = (wp.constant(n) for n in (ODD, RINGS, FOLD, ZONES))
 
 
 @wp.struct
@@ -70,7 +79,7 @@ class Probes:
     step: wp.float64  # of the grid [ns]
     slack: wp.float64  # times up to this past a grid point belong to it [ns]
     holes: int  # 1 where parts of the time are not compared: then no pair of events reaches across them
-    reseed: int  # 0 for common random numbers in all rows, 1 for other ones in each
+    ticks: wp.array[wp.int64]  # (B,) from tick to tick of the clock that stamps the events [ps]; 0 for none
     group: int  # pixels that share a row of `sums`; one thread works on all of them
     team: int  # pixels that share a row of `clock`
     memory: wp.array3d[float]  # (B, N, MEMORY)
@@ -142,7 +151,10 @@ def joined(sink: Probes, i: int, before: int, k: int):
 @wp.func
 def observe(sink: Probes, row: int, i: int, time: wp.int64, now: int):
     """Look at one event of pixel `i`, `time` [ns] after the begin of the grid, `now` 1 for ON."""
-    at = (wp.float64(time) - sink.slack) / sink.step
+    stamp = time
+    if sink.ticks[row] > wp.int64(0):
+        stamp = wp.int64(1000) * time / sink.ticks[row] * sink.ticks[row] / wp.int64(1000)
+    at = (wp.float64(stamp) - sink.slack) / sink.step
     k = int(wp.ceil(at))
     if k < 0 or k >= sink.cell.shape[1]:
         return
@@ -198,3 +210,96 @@ def walk(
     i += first
     for n in range(start[row, i], start[row, i + 1]):
         observe(sink, row, i, time[n], int(polarity[n]))
+
+
+@wp.kernel(enable_backward=False)
+def fold(
+    # in
+    first: int,
+    halves: wp.array3d[float],  # (B, N, HALVES)
+    expected: wp.array3d[float],  # (K, N, HALVES) what the present model expects
+    frame: wp.array[int],  # (B,) which of those a row is compared with
+    zone: wp.array[int],  # (N,)
+    often: float,  # events at rest of a pixel that is called hot
+    seen: float,  # events that are expected of a pixel which is called silent if it sends none
+    team: int,  # pixels that one thread adds up
+    # out
+    out: wp.array3d[float],  # (B, G, FOLD)
+):
+    """Fold the counts of the pixels of each group into a few sums."""
+    row, g = wp.tid()
+    g += first
+    of = frame[row]
+    sums = wp.vector(length=wp.static(FOLD), dtype=float)
+    for i in range(g * team, wp.min((g + 1) * team, halves.shape[1])):
+        rest = float(0.0)
+        usual = float(0.0)
+        every = float(0.0)
+        all_usual = float(0.0)
+        for state in range(2):
+            for n in range(4):
+                count = halves[row, i, 4 * state + n]
+                mean = expected[of, i, 4 * state + n]
+                every += count
+                all_usual += mean
+                if state == 1:
+                    rest += count
+                    usual += mean
+            a_off = halves[row, i, 4 * state] - expected[of, i, 4 * state]
+            a_on = halves[row, i, 4 * state + 1] - expected[of, i, 4 * state + 1]
+            b_off = halves[row, i, 4 * state + 2] - expected[of, i, 4 * state + 2]
+            b_on = halves[row, i, 4 * state + 3] - expected[of, i, 4 * state + 3]
+            sums[6 * state] += a_off * b_off
+            sums[6 * state + 1] += a_off * b_on
+            sums[6 * state + 2] += a_on * b_off
+            sums[6 * state + 3] += a_on * b_on
+            sums[6 * state + 4] += a_off * a_off + b_off * b_off
+            sums[6 * state + 5] += a_on * a_on + b_on * b_on
+            for p in range(2):
+                ring = _RINGS + (2 * state + p) * _ZONES + zone[i]
+                sums[ring] += halves[row, i, 4 * state + p] + halves[row, i, 4 * state + 2 + p]
+        bound = usual + 4.0 * wp.sqrt(usual + 1.0)
+        if rest > bound + 2.0:
+            sums[_ODD] += 1.0
+        if rest > bound + often:
+            sums[_ODD + 1] += 1.0
+        if every > 3.0 * all_usual + 20.0:
+            sums[_ODD + 2] += 1.0
+        if every == 0.0 and all_usual >= seen:
+            sums[_ODD + 3] += 1.0
+    for n in range(_FOLD):
+        out[row, g, n] = sums[n]
+
+
+@wp.kernel(enable_backward=False)
+def together(
+    # in
+    first: int,
+    parts: wp.array3d[float],  # (B, G, K)
+    # out
+    out: wp.array2d[wp.float64],  # (B, K)
+):
+    """Add up what groups of pixels have."""
+    row, k = wp.tid()
+    k += first
+    value = wp.float64(0.0)
+    for g in range(parts.shape[1]):
+        value += wp.float64(parts[row, g, k])
+    out[row, k] = value
+
+
+@wp.kernel(enable_backward=False)
+def counted(
+    # in
+    first: int,
+    parts: wp.array3d[int],  # (B, G, K)
+    # out
+    out: wp.array2d[int],  # (B, K)
+):
+    """Add up what groups of pixels have counted."""
+    row, k = wp.tid()
+    k += first
+    value = int(0)
+    for g in range(parts.shape[1]):
+        value += parts[row, g, k]
+    out[row, k] = value

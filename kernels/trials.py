@@ -34,7 +34,7 @@ class History:
 def compose(stages: tuple[pixel.Stages, ...]) -> wp.Kernel:
     """Return the kernel of all models with these effects, over (B, N) threads.
 
-    Its arguments are `first`, a `History`, pixels (N,), width, height, seed, parameters (B, P), maps
+    Its arguments are `first`, a `History`, pixels (N,), width, height, seeds (B,), parameters (B, P), maps
     (M, N) where an effect has any, `Probes`.
     """
     writer = _Writer(stages)
@@ -93,14 +93,14 @@ class _Writer(Writer):
     def head(self) -> list[str]:
         return [
             "def pixel_trials(first: int, source: Source, pixels: wp.array[int], width: int, height: int,",
-            "                 seed_in: int, parameters: wp.array2d[float],",
+            "                 seeds: wp.array[int], parameters: wp.array2d[float],",
             *(["                 maps: wp.array2d[float],"] if self.maps else []),
             "                 sink: Sink):",
         ]
 
     def begin(self) -> None:
         super().begin()
-        self.add("seed = seed_in + row * sink.reseed")
+        self.add("seed = seeds[row]")
 
     def pixel(self) -> None:
         super().pixel()
