@@ -117,6 +117,7 @@ class Trials:
         self.device = self.stimulus.device
         self._middle: tuple[Any, Any] | None = None
         self._kind = "cuda" if self.device.is_cuda else "cpu"
+        self._lanes = 1 if self.device.is_cuda else trials.LANES
         self._pixels = wp.array(self.stimulus.pixels, dtype=int, device=self.device)
 
     def run(
@@ -175,7 +176,8 @@ class Trials:
                 wp.array(seeds[part], dtype=int, device=self.device),
                 wp.array(rows[part], dtype=float, device=self.device), *maps, sink,
             ]  # fmt: skip
-            launch.run(kernel, count, inputs, self.device, batch=len(rows[part]), align=GROUP)
+            blocks = -(-len(rows[part]) // self._lanes)
+            launch.run(kernel, count, inputs, self.device, batch=blocks, align=GROUP)
             grouped = self._grouped(sink.sums)
             sums.append(over_groups(grouped))
             clock.append(self._clock(sink.clock))
@@ -212,7 +214,7 @@ class Trials:
             wide = whole(sensor) if len(stages) > ALONE[self._kind] else sensor
             names = wide.parameter_names()
             at = [names.index(name) for name in sensor.parameter_names()]
-            self._kernels[key] = trials.compose(wide.stages()), wide.parameters(), at
+            self._kernels[key] = trials.compose(wide.stages(), lanes=self._lanes), wide.parameters(), at
         return self._kernels[key]
 
     def look(self, events: Events) -> Sums:
