@@ -15,8 +15,8 @@ from dase.effects.optics import SceneEffect
 from dase.effects.row_scan import RowScan
 from dase.effects.timestamp import Timestamp
 from dase.error import Judgement, Scale
-from dase.evidence import Evidence
-from dase.model import Model, added, settling, starts
+from dase.evidence import Evidence, Half
+from dase.model import SETTLED, Model, added, settling, starts
 from dase.space import variants
 from dase.together import Ask, Work, alone, beside, together
 
@@ -27,6 +27,12 @@ FINALISTS = 4
 
 SECOND = 1.25
 """A second start is followed where its loss is below this, relative to the first."""
+
+BEHIND = 2.0
+"""A finalist goes on where its error before the last fit is at most this times the best's, and `CLOSE`."""
+
+CLOSE = 1.0
+"""Such an error that is added to the limit, for errors near the floor say little."""
 
 REPEATS = 30
 """Simulations with other seeds by which a finalist is judged."""
@@ -130,13 +136,33 @@ def refining(evidence: Evidence, tried: Tried, *, seed: int) -> Work[Tried]:
     return replace(tried, model=model, fit=found.loss, bank=found.tried)
 
 
-def judging_alone(evidence: Evidence, tried: Tried, *, seed: int) -> Work[Tried]:
-    """Fit a candidate by its own sampling errors and judge it on the held-out half.
+def judge_alone(evidence: Evidence, tried: Sequence[Tried], *, seed: int) -> list[Tried]:
+    """Fit candidates by their own sampling errors and judge them on the held-out half.
 
     Effects that make pixels differ have sampling errors far above those of the model without them, by which
-    they would look worse than they are.
+    they would look worse than they are. The repeats that give those of a candidate also tell its error where
+    it was fitted so far; candidates far behind the best by that measure go no further.
     """
-    model = yield from settling(evidence, tried.model, seed=seed, rounds=1)
+    looks = [_looking(evidence, t, seed=seed) for t in tried]
+    found = together(looks)
+    limit = BEHIND * min(error for error, _ in found) + CLOSE
+    works = [
+        _judging(evidence, t, half, seed=seed)
+        for t, (error, half) in zip(tried, found, strict=True) if error <= limit
+    ]  # fmt: skip
+    done = {t.name: t for t in together(works)}
+    return [done.get(t.name, t) for t in tried]
+
+
+def _looking(evidence: Evidence, tried: Tried, *, seed: int) -> Work[tuple[float, Half]]:
+    """Return the error on the training half, and that half with the candidate as its present model."""
+    half = evidence.train.view()
+    values = yield from half.rebasing(tried.model.space, tried.model.place, repeats=SETTLED, seed=seed + 100)
+    return half.judge(values, seed=seed).error, half
+
+
+def _judging(evidence: Evidence, tried: Tried, half: Half, *, seed: int) -> Work[Tried]:
+    model = yield from settling(evidence, tried.model, seed=seed, rounds=1, half=half)
     judged = yield from model.judging(evidence.held.view(), repeats=REPEATS, seed=seed + 500)
     return replace(tried, model=model, judged=judged)
 
@@ -167,8 +193,8 @@ def try_all(
     report(f"fitting {', '.join(t.name for t in chosen)}", 0.5)
     finalists = together([refining(evidence, tried, seed=seed) for tried in chosen])
     report(f"judging {', '.join(t.name for t in chosen)}", 0.75)
-    done = together([judging_alone(evidence, tried, seed=seed) for tried in finalists])
-    done.sort(key=lambda t: t.error)
+    done = judge_alone(evidence, finalists, seed=seed)
+    done.sort(key=lambda t: t.error if t.judged else np.inf)
     return [*done, *(t for t in order if t not in chosen)]
 
 

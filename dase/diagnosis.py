@@ -278,49 +278,55 @@ def _like(sensor: Sensor, model: Model, more: Sequence[str]) -> Model:
 
 def _review(search: _Search, model: Model, judgement: Judgement) -> tuple[Model, Judgement]:
     """Drop effects that are not needed any more, and put simpler ones in place of others."""
-    for name in search.added(model):
-        if len(search.added(model)) == 1:
+    settled: set[str] = set()
+    while len(search.added(model)) > 1:
+        names = [name for name in search.added(model) if name not in settled]
+        ways = {name: _like(model.sensor.without(name), model, ()) for name in names}
+        less = next(iter(_promising(search, model, ways).items()), None)
+        if less is None:
             break
-        less = settle(search.evidence, _like(model.sensor.without(name), model, ()), seed=search.seed)
-        without = search.judge(less)
+        settled.add(less[0])
+        fitted = settle(search.evidence, less[1], seed=search.seed)
+        without = search.judge(fitted)
         if explained(without) or without.error <= judgement.error:
-            model, judgement = less, without
+            model, judgement = fitted, without
     for name in search.added(model):
-        for other in _rivals(search, model, name):
-            sensor = model.sensor.without(name).with_effect(other.model.sensor[other.name])
-            swapped = settle(search.evidence, _like(sensor, model, [other.name]), seed=search.seed)
+        for other, swap in _rivals(search, model, name).items():
+            swapped = settle(search.evidence, swap, seed=search.seed)
             judged = search.judge(swapped)
             if not explained(judged):
                 continue
             simpler = len(swapped.place) < len(model.place)
             if simpler or not explained(judgement):
                 model, judgement = swapped, judged
-                search.ties[other.name] = {*search.ties.pop(name, set()), name} - {other.name}
+                search.ties[other] = {*search.ties.pop(name, set()), name} - {other}
                 break
-            search.ties.setdefault(name, set()).add(other.name)
+            search.ties.setdefault(name, set()).add(other)
     return model, judgement
 
 
-def _rivals(search: _Search, model: Model, name: str) -> list[Tried]:
-    """Return the alternatives to an effect that may do as well: in its place, not far off on the scout.
+def _promising(search: _Search, model: Model, ways: Mapping[str, Model]) -> dict[str, Model]:
+    """Return those models that may do as well as the present one: not far off on the scout, quickly fitted.
 
     Fitting one in full takes as long as trying a dozen; most are far off.
     """
-    scout, limit = search.evidence.scout.view(), NEARBY * search.error_of.get(name, 0.0) + TIE
-    near = [
-        other
-        for other in search.alternatives.get(name, [])[:SWAPPED]
-        if other.name not in model.space.sensor and other.error <= limit
-    ]
-    if not near:
-        return []
+    if not ways:
+        return {}
+    scout = search.evidence.scout.view()
     repeats = model.rebase(scout, repeats=16, seed=search.seed + 200)
-    works = []
-    for other in near:
-        sensor = model.sensor.without(name).with_effect(other.model.sensor[other.name])
-        works.append(_like(sensor, model, [other.name]).searching(scout, seed=search.seed, iterations=2))
     enough = QUICK * float(scout.scale.loss(repeats).mean())
-    return [other for other, quick in zip(near, together(works), strict=True) if quick.loss < enough]
+    quick = together([way.searching(scout, seed=search.seed, iterations=2) for way in ways.values()])
+    return {name: way for (name, way), q in zip(ways.items(), quick, strict=True) if q.loss < enough}
+
+
+def _rivals(search: _Search, model: Model, name: str) -> dict[str, Model]:
+    """Return the models with an alternative in the place of an effect that may do as well."""
+    limit, ways = NEARBY * search.error_of.get(name, 0.0) + TIE, {}
+    for other in search.alternatives.get(name, [])[:SWAPPED]:
+        if other.name not in model.space.sensor and other.error <= limit:
+            sensor = model.sensor.without(name).with_effect(other.model.sensor[other.name])
+            ways[other.name] = _like(sensor, model, [other.name])
+    return _promising(search, model, ways)
 
 
 def _verdict(

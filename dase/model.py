@@ -28,6 +28,9 @@ RATIO = 2.2
 SHIFTS = (-0.7, -0.4, -0.15, 0.1)
 """Of the logarithm of the thresholds, when an effect is tried."""
 
+SETTLED = 16
+"""Repeats that give a model's sampling errors while it is fitted."""
+
 FEW_STARTS = 0.1
 """Share of the plausible range that is left out at both ends when an effect is tried."""
 
@@ -111,11 +114,14 @@ def settle(evidence: Evidence, model: Model, *, seed: int, rounds: int = 2) -> M
     return alone(settling(evidence, model, seed=seed, rounds=rounds))
 
 
-def settling(evidence: Evidence, model: Model, *, seed: int, rounds: int = 2) -> Work[Model]:
-    """Do what `settle` does, see `together`."""
-    half = evidence.train.view()
+def settling(
+    evidence: Evidence, model: Model, *, seed: int, rounds: int = 2, half: Half | None = None
+) -> Work[Model]:
+    """Do what `settle` does, see `together`; `half` is the training half if the model is its present one."""
     for turn in range(rounds):
-        yield from half.rebasing(model.space, model.place, repeats=16, seed=seed + 100)
+        if half is None or turn > 0:
+            half = evidence.train.view()
+            yield from half.rebasing(model.space, model.place, repeats=SETTLED, seed=seed + 100)
         other = with_phase(model, 1.0 - model.space.sensor["threshold"].phase)  # type: ignore[attr-defined]
         values = yield [Ask(half, m.space, m.place[None], seed) for m in (model, other)]
         losses = [float(half.scale.loss(value)[0]) for value in values]

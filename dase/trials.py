@@ -241,7 +241,9 @@ class Trials:
         folded = None
         if frame is not None:
             folded = over_groups(fold(pixels, [frame], np.zeros(len(streams), np.int64)))
-        stamps = np.stack([self.structure.shares(self._mine(events)) for events in streams])
+        stamps = np.zeros((len(streams), len(Structure.NAMES)))
+        if self.structure != Structure():
+            stamps = np.stack([self.structure.shares(self._mine(events)) for events in streams])
         return Sums(
             over_groups(grouped), pixels, self._clock(sink.clock), stamps,
             *_first(grouped, sink.clock, 0), frame, folded,
@@ -331,7 +333,9 @@ class Trials:
         at = place[events.y.astype(np.int64) * stimulus.width + events.x]
         inside = at >= 0
         at = at[inside]
-        order = np.argsort(at, kind="stable")
+        # as small integers, which are sorted by their digits
+        small = at.astype(np.uint16) if len(stimulus.pixels) <= 1 << 16 else at
+        order = np.argsort(small, kind="stable")
         time = np.rint((events.t[inside][order] - stimulus.grid.begin) * 1e9).astype(np.int64)
         start = np.concatenate([[0], np.cumsum(np.bincount(at, minlength=len(stimulus.pixels)))])
         return time, events.p[inside][order].astype(np.uint8), start
