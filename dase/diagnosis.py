@@ -54,6 +54,10 @@ SWAPPED = 2
 NEARBY = 1.6
 """Only alternatives whose held-out error was about below this, relative to the chosen one's."""
 
+DROPPED = 4.0
+"""An effect is tried to be dropped where the error on the scout without it, quickly fitted, is below this, in
+units of the gate."""
+
 QUICK = 2.0
 """Only alternatives whose error on the scout, quickly fitted, is below this, relative to the model's own."""
 
@@ -278,15 +282,12 @@ def _like(sensor: Sensor, model: Model, more: Sequence[str]) -> Model:
 
 def _review(search: _Search, model: Model, judgement: Judgement) -> tuple[Model, Judgement]:
     """Drop effects that are not needed any more, and put simpler ones in place of others."""
-    settled: set[str] = set()
-    while len(search.added(model)) > 1:
-        names = [name for name in search.added(model) if name not in settled]
-        ways = {name: _like(model.sensor.without(name), model, ()) for name in names}
-        less = next(iter(_promising(search, model, ways).items()), None)
-        if less is None:
-            break
-        settled.add(less[0])
-        fitted = settle(search.evidence, less[1], seed=search.seed)
+    whole = model
+    for name, less in _droppable(search, model).items():
+        if name not in model.sensor or len(search.added(model)) == 1:
+            continue
+        less = less if model is whole else _like(model.sensor.without(name), model, ())
+        fitted = settle(search.evidence, less, seed=search.seed)
         without = search.judge(fitted)
         if explained(without) or without.error <= judgement.error:
             model, judgement = fitted, without
@@ -305,11 +306,24 @@ def _review(search: _Search, model: Model, judgement: Judgement) -> tuple[Model,
     return model, judgement
 
 
-def _promising(search: _Search, model: Model, ways: Mapping[str, Model]) -> dict[str, Model]:
-    """Return those models that may do as well as the present one: not far off on the scout, quickly fitted.
+def _droppable(search: _Search, model: Model) -> dict[str, Model]:
+    """Return the models without one effect that may do: not far off on the scout, quickly fitted.
 
     Fitting one in full takes as long as trying a dozen; most are far off.
     """
+    scout, seed = search.evidence.scout.view(), search.seed
+    model.rebase(scout, repeats=16, seed=seed + 200)
+    ways = {name: _like(model.sensor.without(name), model, ()) for name in search.added(model)}
+    quick = together([way.searching(scout, seed=seed, iterations=2) for way in ways.values()])
+    judged = together([way.judging(scout.view(), repeats=16, seed=seed + 500) for way in quick])
+    return {
+        name: way for name, way, judgement in zip(ways, quick, judged, strict=True)
+        if judgement.error < DROPPED * judgement.gate
+    }  # fmt: skip
+
+
+def _promising(search: _Search, model: Model, ways: Mapping[str, Model]) -> dict[str, Model]:
+    """Return those models that may do as well as the present one: quickly fitted, not far off on the scout."""
     if not ways:
         return {}
     scout = search.evidence.scout.view()

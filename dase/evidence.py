@@ -114,9 +114,11 @@ class Half:
         self.off = np.sqrt(off)
         self.chance = Scale(target[0], np.sqrt((0.5 + 0.5 / len(values)) * repeats + off), used)
         self.simulated = values.mean(0)
-        measured, present = (statistics(without(one, self.frame), self.frame)[0] for one in (self.found, sums))
+        measured, present = (
+            statistics(without(one, self.frame), self.frame)[0] for one in (self.found, sums)
+        )
         self.left = measured - present
-        scatter = (len(measured) - 1) * self.left.var(0)
+        scatter = (len(self.left) - 1) * self.left.var(0)
         self.scale = Scale(target[0], np.sqrt(np.maximum(repeats, scatter) + off), used)
         # of the difference from the mean of the repeats, which has nearly no sampling error of its own
         seen = np.maximum((0.5 + 0.5 / len(values)) * repeats, scatter - (0.5 - 0.5 / len(values)) * repeats)

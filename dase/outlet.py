@@ -119,5 +119,5 @@ def rows_of(events: Events, row: NDArray[np.int32] | None, batch: int) -> Sequen
         return [events]
     # rows as small integers, which are sorted by their digits
     order = np.argsort(row.astype(np.uint16) if batch <= 1 << 16 else row, kind="stable")
-    ends = np.cumsum(np.bincount(row, minlength=batch))
-    return [events.select(order[end - count : end]) for end, count in zip(ends, np.diff(ends, prepend=0), strict=True)]
+    parts = np.split(order, np.cumsum(np.bincount(row, minlength=batch))[:-1])
+    return [events.select(part) for part in parts]

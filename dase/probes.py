@@ -142,10 +142,13 @@ class Sums:
         pixels = wp.empty((int(begins[-1]), *first.pixels.shape[1:]), dtype=float, device=first.pixels.device)
         for part, begin, end in zip(parts, begins, begins[1:], strict=False):
             wp.copy(pixels[int(begin) : int(end)], part.pixels)
-        sums, clock, stamps = (np.concatenate([getattr(p, n) for p in parts]) for n in ("sums", "clock", "stamps"))
-        one = all(part.frame is first.frame and part.folded is not None for part in parts)
-        folded = np.concatenate([part.folded for part in parts]) if one else None  # type: ignore[misc]
-        return cls(sums, pixels, clock, stamps, first.groups, first.teams, first.frame if one else None, folded)
+        rest = [np.concatenate([getattr(p, name) for p in parts]) for name in ("sums", "clock", "stamps")]
+        folded = [part.folded for part in parts if part.folded is not None and part.frame is first.frame]
+        whole = len(folded) == len(parts)
+        return cls(
+            rest[0], pixels, rest[1], rest[2], first.groups, first.teams, first.frame if whole else None,
+            np.concatenate(folded) if whole else None,
+        )  # fmt: skip
 
     @property
     def halves(self) -> NDArray[np.float32]:
@@ -215,7 +218,8 @@ def totals(found: Sums, frame: Frame) -> Totals:
 
 def without(found: Sums, frame: Frame) -> Totals:
     """Return the totals of the first row without one group of pixels after the other, shapes (G, ...)."""
-    assert found.groups is not None and found.teams is not None
+    assert found.groups is not None
+    assert found.teams is not None
     parts = fold(found.pixels[:1], [frame], np.zeros(1, np.int64)).numpy()[0].astype(np.float64)
     expected = frame.by_group
     return Totals(

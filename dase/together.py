@@ -121,9 +121,8 @@ def _statistics(found: Sequence[tuple[int, Half, Sums]]) -> dict[int, Array]:
     for members in groups.values():
         frame = members[0][1].frame
         parts = [totals(sums, frame) for _, _, sums in members]
-        names = ("sums", "folded", "clock", "stamps")
-        both = Totals(*(np.concatenate([getattr(p, n) for p in parts]) for n in names), parts[0].expected)
+        both = [np.concatenate([getattr(p, n) for p in parts]) for n in ("sums", "folded", "clock", "stamps")]
         ends = np.cumsum([len(p.sums) for p in parts])[:-1]
-        values = np.split(statistics(both, frame)[0], ends)
+        values = np.split(statistics(Totals(*both, expected=parts[0].expected), frame)[0], ends)
         out.update(zip([n for n, _, _ in members], values, strict=True))
     return out

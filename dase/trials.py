@@ -2,29 +2,23 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 import warp as wp
 from numpy.typing import NDArray
 
+from dase.behind import clock_of, emitted, felt, sent
 from dase.effects import EFFECTS
 from dase.effects.optics import SceneEffect
-from dase.effects.readout import Readout
-from dase.effects.row_scan import RowScan
 from dase.effects.stream import StreamEffect
 from dase.effects.threshold import Threshold
-from dase.effects.timestamp import Timestamp
 from dase.events import Events
-from dase.kernels import launch, pixel, trials
+from dase.kernels import launch, trials
 from dase.kernels import probes as kernels
-from dase.outlet import rows_of
-from dase.pixels import Pixels
 from dase.probes import GROUP, Frame, Sums, fold, over_groups
-from dase.scene import Scene
 from dase.sensor import Sensor
 from dase.stimulus import Stimulus
 from dase.structure import Structure
@@ -40,9 +34,6 @@ HALF = 0.064
 
 SLACK = 2e-6
 """Files give whole microseconds: an event up to this after a point of the grid belongs to it [s]."""
-
-FELT = 0.25
-"""Delays below this share of a step of the grid are not felt."""
 
 FINEST = 2
 """Samples per step of the grid at most: models that ask for more are simulated a little too coarsely."""
@@ -149,31 +140,26 @@ class Trials:
 
     def _run(self, orders: Sequence[Order], history: Any) -> list[Sums]:
         """Simulate models that have a kernel in common."""
-        kernel = self._kernel(orders[0].sensor)[0]
-        parameters = []
-        for order in orders:
-            _, base, at = self._kernel(order.sensor)
-            vectors = np.repeat(base[None], len(order.vectors), 0)
-            vectors[:, at] = order.vectors
-            parameters.append(vectors)
-        rows, count = np.concatenate(parameters), len(self.stimulus.pixels)
-        seeds = np.concatenate([order.seeds() for order in orders]).astype(np.int32)
-        ticks = np.repeat([round(order.ticks * 1e12) for order in orders], [len(o.vectors) for o in orders])
+        kernel, maps = (
+            self._kernel(orders[0].sensor)[0],
+            orders[0].sensor.maps(self.stimulus.pixels, self.device),
+        )
+        count, seeds = len(self.stimulus.pixels), np.concatenate([order.seeds() for order in orders])
+        rows = np.concatenate([self._wide(order) for order in orders])
+        ends = np.cumsum([len(order.vectors) for order in orders])
+        begins = np.concatenate([[0], ends[:-1]])
+        ticks = np.repeat([round(order.ticks * 1e12) for order in orders], ends - begins)
+        # the first of repeats shows how groups of pixels differ
+        apart = [int(begin) for begin, order in zip(begins, orders, strict=True) if order.reseed]
         pixels = wp.zeros((len(rows), count, kernels.HALVES), dtype=float, device=self.device)
-        maps = orders[0].sensor.maps(self.stimulus.pixels, self.device)
-        # the first row of models with random numbers of their own shows how groups of pixels differ
-        begins = np.cumsum([0, *(len(order.vectors) for order in orders)])
-        apart = {int(b) for b, order in zip(begins, orders, strict=False) if order.reseed}
-        steps = 2 * self.stimulus.grid.steps
-        each = 4 * (count * (kernels.SIZE // self._group() + 8) + -(-count // GROUP) * steps)
-        at_once = max(1, ROOM[self._kind] // each)
-        sums, clock, groups = [], [], {}
-        for first in range(0, len(rows), at_once):
-            part = slice(first, min(first + at_once, len(rows)))
+        sums, clock = [], []
+        groups: dict[int, tuple[NDArray[np.float32], NDArray[np.int32]]] = {}
+        for first in range(0, len(rows), self._at_once()):
+            part = slice(first, min(first + self._at_once(), len(rows)))
             sink = self.sink(pixels[part], ticks[part])
             inputs = [
                 history, self._pixels, self.stimulus.width, self.stimulus.height,
-                wp.array(seeds[part], dtype=int, device=self.device),
+                wp.array(seeds[part].astype(np.int32), dtype=int, device=self.device),
                 wp.array(rows[part], dtype=float, device=self.device), *maps, sink,
             ]  # fmt: skip
             blocks = -(-len(rows[part]) // self._lanes)
@@ -181,30 +167,35 @@ class Trials:
             grouped = self._grouped(sink.sums)
             sums.append(over_groups(grouped))
             clock.append(self._clock(sink.clock))
-            groups |= {n: _first(grouped, sink.clock, n - first) for n in apart if part.start <= n < part.stop}
+            mine = [n for n in apart if part.start <= n < part.stop]
+            groups |= {n: _first(grouped, sink.clock, n - first) for n in mine}
         self.evaluations += len(rows)
         self.work += len(rows) * count * self.stimulus.grid.step * (self.stimulus.grid.steps - 1)
-        known = [order.frame for order in orders if order.frame is not None]
-        frames = list({id(frame): frame for frame in known}.values())
-        folded = None
-        if frames:
-            places = [id(frame) for frame in frames]
-            which = [places.index(id(o.frame)) if o.frame is not None else 0 for o in orders]
-            folded = over_groups(fold(pixels, frames, np.repeat(which, np.diff(begins))))
-        all_sums, all_clock = np.concatenate(sums), np.concatenate(clock)
+        folded, both, clocks = _folded(orders, pixels), np.concatenate(sums), np.concatenate(clock)
         out = []
-        for order, begin, end in zip(orders, begins, begins[1:], strict=False):
-            cut = slice(int(begin), int(end))
-            stamps = np.zeros((len(order.vectors), len(Structure.NAMES)))
-            stamps[:, 0] = (order.ticks > 0) & (self.structure.step > 0)
-            mine = folded[cut] if folded is not None and order.frame is not None else None
+        for order, begin, end in zip(orders, begins.tolist(), ends.tolist(), strict=True):
+            cut = slice(begin, end)
+            stamps = np.zeros((end - begin, len(Structure.NAMES)))
+            stamps[:, 0] = order.ticks > 0 and self.structure.step > 0
+            known = None if folded is None or order.frame is None else folded[cut]
+            of_groups, teams = groups.get(begin, (None, None))
             out.append(
-                Sums(
-                    all_sums[cut], pixels[cut], all_clock[cut], stamps, *groups.get(int(begin), (None, None)),
-                    order.frame, mine,
-                )
-            )  # fmt: skip
+                Sums(both[cut], pixels[cut], clocks[cut], stamps, of_groups, teams, order.frame, known)
+            )
         return out
+
+    def _wide(self, order: Order) -> NDArray[np.float32]:
+        """Return parameter vectors as the kernel takes them."""
+        _, base, at = self._kernel(order.sensor)
+        out = np.repeat(base[None], len(order.vectors), 0)
+        out[:, at] = order.vectors
+        return out
+
+    def _at_once(self) -> int:
+        """Return how many models there is room for."""
+        count, group = len(self.stimulus.pixels), self._group()
+        numbers = -(-count // group) * kernels.SIZE + -(-count // GROUP) * 2 * self.stimulus.grid.steps
+        return max(1, ROOM[self._kind] // (4 * (numbers + count * (kernels.MEMORY + kernels.HALVES))))
 
     def _kernel(self, sensor: Sensor) -> tuple[wp.Kernel, NDArray[np.float32], list[int]]:
         """Return the kernel of a sensor, a parameter vector for it, and the places of the sensor's own."""
@@ -234,9 +225,7 @@ class Trials:
             wp.array(np.concatenate([p[0] for p in parts]), dtype=wp.int64, device=self.device),
             wp.array(np.concatenate([p[1] for p in parts]), dtype=wp.uint8, device=self.device),
         ]
-        launch.run(
-            kernels.walk, count, [*arrays, sink], self.device, batch=len(streams), align=GROUP
-        )
+        launch.run(kernels.walk, count, [*arrays, sink], self.device, batch=len(streams), align=GROUP)
         grouped = self._grouped(sink.sums)
         folded = None
         if frame is not None:
@@ -250,30 +239,12 @@ class Trials:
         )  # fmt: skip
 
     def felt(self, sensor: Sensor) -> tuple[StreamEffect, ...]:
-        """Return the effects behind the pixels that the probes can feel.
-
-        Small errors of the time stamps are far below the steps of the grid; they matter only where their
-        regularities are compared.
-        """
-        fine = FELT * self.stimulus.grid.step
-        lines = max(self.stimulus.width, self.stimulus.height)
-        compared = self.structure.step > 0 or self.structure.line > 0
-        return tuple(e for e in sensor.streams() if compared or delay_of(e, lines) > fine)
+        """Return the effects behind the pixels that the probes can feel."""
+        return felt(self.stimulus, self.structure, sensor)
 
     def ticks(self, sensor: Sensor) -> float | None:
-        """Return the ticks of a clock that is all the probes feel behind the pixels [s], 0 for nothing.
-
-        The kernel stamps events by such a clock itself. None where events have to be stored and go through
-        what is behind the pixels.
-        """
-        felt = self.felt(sensor)
-        if not felt:
-            return 0.0
-        clock = felt[0]
-        alone = len(felt) == 1 and isinstance(clock, Timestamp) and clock.jitter == 0 and clock.step > 0
-        structure = self.structure
-        seen = structure.line == 0 and (structure.step == 0 or structure.step == getattr(clock, "step", 0.0))
-        return float(clock.step) if alone and seen else None  # type: ignore[attr-defined]
+        """Return what the kernel needs to know of a sensor's clock, see `clock_of`; None for a readout."""
+        return clock_of(self.felt(sensor), self.structure)
 
     def stream(
         self, sensor: Sensor, vector: NDArray[Any], effects: Iterable[StreamEffect], *, seed: int
@@ -282,42 +253,17 @@ class Trials:
         return self.stream_all(Order(sensor, np.atleast_2d(vector), seed), [tuple(effects)])
 
     def stream_all(self, order: Order, effects: Sequence[Sequence[StreamEffect]]) -> Sums:
-        """Simulate models with effects behind the pixels, given for each, and sum up what leaves.
-
-        The pixels are some of a sensor's. A bus that all pixels share is given as much of its bandwidth and
-        of its queue as they are of all pixels: right for streams, not for single collisions.
-        """
-        sensor, seeds = order.sensor, order.seeds()
-        bare = replace(sensor, effects=tuple(e for e in sensor.effects if not isinstance(e, StreamEffect)))
-        parts = []
+        """Simulate models with effects behind the pixels, given for each, and sum up what leaves."""
+        seeds, parts, rows = order.seeds(), [], len(order.vectors)
         at_once = 1 if order.reseed else STREAMED
-        for first in range(0, len(order.vectors), at_once):
-            part = slice(first, first + at_once)
-            left = self._emitted(bare, order.vectors[part], int(seeds[first]))
-            read = zip(left, effects[part], seeds[part], strict=True)
-            parts += [self._read(events, behind, int(seed)) for events, behind, seed in read]
-        self.evaluations += len(parts)
-        return Sums.join([self._look(parts[n : n + STREAMED], order.frame) for n in range(0, len(parts), STREAMED)])
-
-    def _emitted(self, sensor: Sensor, vectors: NDArray[Any], seed: int) -> list[Events]:
-        """Return the events that leave the pixels, of each model."""
-        stimulus = self.stimulus
-        array = Pixels(
-            sensor, stimulus.width, stimulus.height, pixels=stimulus.pixels, parameters=vectors, seed=seed,
-            device=str(self.device),
-        )  # fmt: skip
-        scene = _Light(stimulus)
-        parts = [rows_of(*found, array.batch) for found in (array.emit(scene, scene.times), array.flush())]
-        return [Events.concatenate(list(row)) for row in zip(*parts, strict=True)]
-
-    def _read(self, events: Events, effects: Iterable[StreamEffect], seed: int) -> Events:
-        """Return what leaves the sensor."""
-        stimulus, until = self.stimulus, math.inf
-        share = len(stimulus.pixels) / (stimulus.width * stimulus.height)
-        for effect in effects:
-            reader = scaled(effect, share).reader(stimulus.width, stimulus.height, seed)
-            events, until = reader.push(events, until)
-        return replace(events, t=events.t + stimulus.grid.begin)
+        for first in range(0, rows, at_once):
+            cut = slice(first, first + at_once)
+            left = emitted(self.stimulus, order.sensor, order.vectors[cut], int(seeds[first]))
+            read = zip(left, effects[cut], seeds[cut], strict=True)
+            parts += [sent(self.stimulus, events, behind, int(seed)) for events, behind, seed in read]
+        self.evaluations += rows
+        begins = range(0, rows, STREAMED)
+        return Sums.join([self._look(parts[n : n + STREAMED], order.frame) for n in begins])
 
     def _mine(self, events: Events) -> Events:
         """Return the events of the pixels, within the time that is compared."""
@@ -394,30 +340,19 @@ class Trials:
         return found
 
 
+def _folded(orders: Sequence[Order], pixels: Any) -> NDArray[np.float64] | None:
+    """Return the counts of pixels folded, as far as it is known for what."""
+    frames = list({id(o.frame): o.frame for o in orders if o.frame is not None}.values())
+    if not frames:
+        return None
+    places = {id(frame): n for n, frame in enumerate(frames)}
+    which = [places.get(id(order.frame), 0) for order in orders]
+    return over_groups(fold(pixels, frames, np.repeat(which, [len(order.vectors) for order in orders])))
+
+
 def _first(grouped: Any, clock: Any, row: int) -> tuple[NDArray[np.float32], NDArray[np.int32]]:
     """Return sums and events of each step of the groups of one row."""
     return grouped[row].numpy().copy(), clock[row].numpy().copy()
-
-
-class _Light(Scene):
-    """The light of a stimulus as a scene, from time 0."""
-
-    def __init__(self, stimulus: Stimulus):
-        self._stimulus = stimulus
-        self.width, self.height = stimulus.width, stimulus.height
-        self.times: NDArray[np.float64] = np.float64(stimulus.grid.step) * np.arange(stimulus.grid.steps)
-        self.duration = float(self.times[-1])
-
-    def sample_times(self) -> NDArray[np.float64]:
-        return self.times
-
-    def source(self, times: NDArray[np.float64], pixels: NDArray[np.int32], device: Any) -> tuple[str, Any]:
-        out = pixel.Frames()
-        out.values = self._stimulus.array("light", lambda: self._stimulus.intensity.T)
-        return "frames", out
-
-    def frames(self, times: NDArray[np.float64], device: str = "cpu") -> NDArray[np.float32]:
-        raise NotImplementedError("some pixels are no picture")
 
 
 def whole(sensor: Sensor) -> Sensor:
@@ -427,17 +362,3 @@ def whole(sensor: Sensor) -> Sensor:
         if inside and name not in sensor:
             sensor = sensor.with_effect(effect.identity())
     return sensor
-
-
-def delay_of(effect: StreamEffect, lines: int) -> float:
-    """Return about how late an effect behind the pixels makes events [s]; infinite where it may lose some."""
-    if isinstance(effect, Timestamp):
-        return max(effect.step, effect.jitter)
-    return lines * effect.line if isinstance(effect, RowScan) else math.inf
-
-
-def scaled(effect: StreamEffect, share: float) -> StreamEffect:
-    """Return an effect behind the pixels for a share of them."""
-    if isinstance(effect, Readout):
-        return replace(effect, rate=effect.rate * share, depth=max(1.0, effect.depth * share))
-    return effect

@@ -21,7 +21,6 @@ from dase.kernels.compose import compiled
 from dase.kernels.probes import Probes, observe
 from dase.kernels.writer import VOLTAGE, Writer
 
-
 LANES = 16
 """Models of a pixel that a CPU thread works on side by side."""
 
@@ -230,8 +229,11 @@ class _Lanes(_Trials, Blocks):
             for effect in self.stages:
                 acts = self.acts(effect)
                 self.add(*acts)
-                self.add(f"{effect.name}_some = {effect.name}_some | {effect.name}_acts" if acts else
-                         f"{effect.name}_some = int(1)")
+                self.add(
+                    f"{effect.name}_some = {effect.name}_some | {effect.name}_acts"
+                    if acts
+                    else f"{effect.name}_some = int(1)"
+                )
             self.own_draws()
             self.add(*start)
 
