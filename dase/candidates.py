@@ -8,16 +8,17 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from dase.descent import Found, screen
+from dase.descent import screening
 from dase.effects.base import Effect
 from dase.effects.flicker import Flicker
 from dase.effects.optics import SceneEffect
 from dase.effects.row_scan import RowScan
 from dase.effects.timestamp import Timestamp
 from dase.error import Judgement, Scale
-from dase.evidence import Evidence
-from dase.model import Model, added, settle, starts
+from dase.evidence import Evidence, Half
+from dase.model import SETTLED, Model, added, settling, starts
 from dase.space import variants
+from dase.together import Ask, Work, alone, beside, together
 
 Array = NDArray[np.float64]
 
@@ -26,6 +27,12 @@ FINALISTS = 4
 
 SECOND = 1.25
 """A second start is followed where its loss is below this, relative to the first."""
+
+BEHIND = 2.0
+"""A finalist goes on where its error before the last fit is at most this times the best's, and `CLOSE`."""
+
+CLOSE = 1.0
+"""Such an error that is added to the limit, for errors near the floor say little."""
 
 REPEATS = 30
 """Simulations with other seeds by which a finalist is judged."""
@@ -95,39 +102,68 @@ def rare(effect: Effect) -> bool:
 
 def scout(evidence: Evidence, present: Model, effect: Effect, *, seed: int) -> Tried:
     """Try one effect on some pixels: a look at many places, then a short descent from the best two."""
+    return alone(scouting(evidence, present, effect, seed=seed))
+
+
+def scouting(evidence: Evidence, present: Model, effect: Effect, *, seed: int) -> Work[Tried]:
+    """Do what `scout` does, see `together`."""
     half = evidence.train if rare(effect) else evidence.scout
     model = added(present, effect)
     slow = half.slow(model.space)
-    places, losses = screen(half, model.space, starts(model, effect, few=slow), seed=seed)
+    (before,) = yield [Ask(half, present.space, present.place[None], seed)]
+    places, losses = yield from screening(half, model.space, starts(model, effect, few=slow), seed=seed)
     apart = np.flatnonzero((np.abs(places - places[0]).max(1) > 0.8) & (losses < SECOND * losses[0]))
     picks = [0, *apart[: 0 if slow or rare(effect) else 1]]
-    ends = [
-        replace(model, place=places[n], loss=losses[n]).search(half, seed=seed, iterations=3, radius=0.25)
-        for n in picks
-    ]
-    best = min(ends, key=lambda m: m.loss)
-    values, before = (half.run(m.space, m.place, seed=seed)[0] for m in (best, present))
-    share = best.loss / float(half.scale.loss(before))
-    was = half.scale.families(before)
-    families = {name: value / max(was[name], 1e-9) for name, value in half.scale.families(values).items()}
-    return Tried(effect.name, best, best.loss, share, families)
+    ends = yield from beside(
+        [
+            replace(model, place=places[n], loss=losses[n]).exploring(
+                half, seed=seed, iterations=3, radius=0.25
+            )
+            for n in picks
+        ]
+    )
+    best = min(ends, key=lambda found: found.loss)
+    share = best.loss / float(half.scale.loss(before[0]))
+    was, now = half.scale.families(before[0]), half.scale.families(best.values)
+    families = {name: value / max(was[name], 1e-9) for name, value in now.items()}
+    return Tried(effect.name, replace(model, place=best.place, loss=best.loss), best.loss, share, families)
 
 
-def refine(evidence: Evidence, tried: Tried, *, seed: int) -> Tried:
+def refining(evidence: Evidence, tried: Tried, *, seed: int) -> Work[Tried]:
     """Fit a candidate to all pixels of the training half, by the sampling errors of the present model."""
-    found: Found = tried.model.explore(evidence.train, seed=seed, iterations=3, radius=0.2)
+    found = yield from tried.model.exploring(evidence.train, seed=seed, iterations=3, radius=0.2)
     model = replace(tried.model, place=found.place, loss=found.loss)
     return replace(tried, model=model, fit=found.loss, bank=found.tried)
 
 
-def judge_alone(evidence: Evidence, tried: Tried, *, seed: int) -> Tried:
-    """Fit a candidate by its own sampling errors and judge it on the held-out half.
+def judge_alone(evidence: Evidence, tried: Sequence[Tried], *, seed: int) -> list[Tried]:
+    """Fit candidates by their own sampling errors and judge them on the held-out half.
 
     Effects that make pixels differ have sampling errors far above those of the model without them, by which
-    they would look worse than they are.
+    they would look worse than they are. The repeats that give those of a candidate also tell its error where
+    it was fitted so far; candidates far behind the best by that measure go no further.
     """
-    model = settle(evidence, tried.model, seed=seed, rounds=1)
-    judged = model.judge(evidence.held, repeats=REPEATS, seed=seed + 500)
+    looks = [_looking(evidence, t, seed=seed) for t in tried]
+    found = together(looks)
+    limit = BEHIND * min(error for error, _ in found) + CLOSE
+    works = [
+        _judging(evidence, t, half, seed=seed)
+        for t, (error, half) in zip(tried, found, strict=True) if error <= limit
+    ]  # fmt: skip
+    done = {t.name: t for t in together(works)}
+    return [done.get(t.name, t) for t in tried]
+
+
+def _looking(evidence: Evidence, tried: Tried, *, seed: int) -> Work[tuple[float, Half]]:
+    """Return the error on the training half, and that half with the candidate as its present model."""
+    half = evidence.train.view()
+    values = yield from half.rebasing(tried.model.space, tried.model.place, repeats=SETTLED, seed=seed + 100)
+    return half.judge(values, seed=seed).error, half
+
+
+def _judging(evidence: Evidence, tried: Tried, half: Half, *, seed: int) -> Work[Tried]:
+    model = yield from settling(evidence, tried.model, seed=seed, rounds=1, half=half)
+    judged = yield from model.judging(evidence.held.view(), repeats=REPEATS, seed=seed + 500)
     return replace(tried, model=model, judged=judged)
 
 
@@ -148,19 +184,17 @@ def try_all(
     """
     all_variants = [v for name in names for v in prepared(evidence, effects[name])]
     found: dict[str, Tried] = {}
-    for n, effect in enumerate(all_variants):
-        tried = scout(evidence, present, effect, seed=seed)
-        if effect.name not in found or tried.scouted < found[effect.name].scouted:
-            found[effect.name] = tried
-        report(f"trying {effect.name}", 0.7 * (n + 1) / len(all_variants))
+    looks = [scouting(evidence, present, effect, seed=seed) for effect in all_variants]
+    for tried in together(looks, lambda share: report("trying all effects", 0.5 * share)):
+        if tried.name not in found or tried.scouted < found[tried.name].scouted:
+            found[tried.name] = tried
     order = sorted(found.values(), key=lambda t: t.scouted)
     chosen = [*order[:FINALISTS], *specialists(order, worst)]
-    finalists = [refine(evidence, tried, seed=seed) for tried in chosen]
-    done = []
-    for n, tried in enumerate(finalists):
-        report(f"fitting {tried.name}", 0.7 + 0.3 * n / len(finalists))
-        done.append(judge_alone(evidence, tried, seed=seed))
-    done.sort(key=lambda t: t.error)
+    report(f"fitting {', '.join(t.name for t in chosen)}", 0.5)
+    finalists = together([refining(evidence, tried, seed=seed) for tried in chosen])
+    report(f"judging {', '.join(t.name for t in chosen)}", 0.75)
+    done = judge_alone(evidence, finalists, seed=seed)
+    done.sort(key=lambda t: t.error if t.judged else np.inf)
     return [*done, *(t for t in order if t not in chosen)]
 
 

@@ -48,7 +48,7 @@ def estimates(evidence: Evidence, model: Model, *, seed: int) -> tuple[Model, di
         mean = repeats.mean(0)
         gain = _gain(half, model, repeats, seed=seed + turn)
         # what the pixels of the measurement make of it, also where the model is not quite right
-        seen = (half.left() @ gain.T).var(0) * (half.groups - 1)
+        seen = (half.left @ gain.T).var(0) * (half.groups - 1)
         step = -gain @ np.where(half.scale.used, mean - half.scale.target, 0.0)
         place = np.clip(model.place + np.clip(step, -FARTHEST, FARTHEST), low, high)
         model = replace(model, place=place)

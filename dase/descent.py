@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from dase.error import Scale
 from dase.evidence import Half
 from dase.space import Space
+from dase.together import Ask, Work
 
 Array = NDArray[np.float64]
 
@@ -69,10 +70,10 @@ class Found:
     tried: Array
 
 
-def search(
+def searching(
     half: Half, space: Space, start: Array, *, seed: int, iterations: int = 5, radius: float = RADIUS
-) -> Found:
-    """Descend from one start.
+) -> Work[Found]:
+    """Descend from one start, see `together`.
 
     Each iteration simulates a population about the present place, with the random numbers in common, fits a
     straight line to each statistic, and goes where the robust loss of those lines is least. The slopes come
@@ -97,7 +98,7 @@ def search(
     for _ in range(LONGEST if len(centre) else 0):
         population = np.concatenate([centre[None], centre + reach * _cross(rng, len(centre))])
         population = np.clip(population, low, high)
-        values = half.run(space, population, seed=seed)
+        (values,) = yield [Ask(half, space, population, seed)]
         places, tried = np.concatenate([places, population]), np.concatenate([tried, values])
         losses = half.scale.loss(tried) + penalty(places, start)
         leader = int(np.argmin(losses))
@@ -116,7 +117,7 @@ def search(
         left -= 1
         if left <= 0:
             break
-    final = half.run(space, centre, seed=seed)
+    (final,) = yield [Ask(half, space, centre[None], seed)]
     places, tried = np.concatenate([places, centre[None]]), np.concatenate([tried, final])
     losses = half.scale.loss(tried) + penalty(places, start)
     leader = int(np.argmin(losses))
@@ -193,9 +194,12 @@ def robust_step(scale: Scale, values: Array, slope: Array, offset: Array) -> tup
     return step, np.diag(normal).copy()
 
 
-def screen(half: Half, space: Space, starts: Sequence[Array] | Array, *, seed: int) -> tuple[Array, Array]:
-    """Return places in order of their loss, and the losses."""
+def screening(
+    half: Half, space: Space, starts: Sequence[Array] | Array, *, seed: int
+) -> Work[tuple[Array, Array]]:
+    """Return places in order of their loss, and the losses, see `together`."""
     places = np.atleast_2d(np.asarray(starts))
-    losses = half.scale.loss(half.run(space, places, seed=seed))
+    (values,) = yield [Ask(half, space, places, seed)]
+    losses = half.scale.loss(values)
     order = np.argsort(losses)
     return places[order], losses[order]

@@ -13,11 +13,12 @@ from dase.effects import EFFECTS, Effect
 from dase.error import Judgement
 from dase.events import Events
 from dase.evidence import PIXELS, Evidence, gather
-from dase.model import Model, fit_present, free_of, model_of, settle
+from dase.model import Model, fit_present, free_of, model_of, settle, settling
 from dase.results import Cell, Diagnosis, Estimate, Rank, Step, Unexplained
 from dase.scene import Scene
 from dase.sensor import Sensor
 from dase.stimulus import Trust
+from dase.together import together
 from dase.words import worst_cells
 
 REPEATS = 60
@@ -52,6 +53,10 @@ SWAPPED = 2
 
 NEARBY = 1.6
 """Only alternatives whose held-out error was about below this, relative to the chosen one's."""
+
+DROPPED = 4.0
+"""An effect is tried to be dropped where the error on the scout without it, quickly fitted, is below this, in
+units of the gate."""
 
 QUICK = 2.0
 """Only alternatives whose error on the scout, quickly fitted, is below this, relative to the model's own."""
@@ -192,7 +197,7 @@ def _step(search: _Search, model: Model, judgement: Judgement, more: bool) -> tu
     open_names = open_to(search.effects, model)
     if not open_names:
         return step, None
-    present = evidence.train.run(model.space, model.place, seed=seed)[0]
+    present = evidence.train.run(model.space, model.place[None], seed=seed)[0]
     scale, base = evidence.train.scale, float(evidence.train.scale.loss(present))
     tried = try_all(
         evidence, model, search.effects, open_names, worst=worst_families(judgement), seed=seed,
@@ -245,16 +250,18 @@ def _pairs(search: _Search, start: Model, model: Model, judgement: Judgement) ->
     singles = [t for t in search.first if t.scouted < 0.98][:PAIRED]
     start.rebase(evidence.scout, repeats=16, seed=seed + 200)
     pairs = list(combinations(singles, 2))
-    tried = []
-    for n, (one, two) in enumerate(pairs):
+    works = []
+    for one, two in pairs:
         both = one.model.sensor.with_effect(two.model.sensor[two.name])
-        pair = _like(both, start, (one.name, two.name)).search(
-            evidence.scout, seed=seed, iterations=4, radius=0.3
-        )
-        tried.append((pair.loss, f"{one.name} + {two.name}", pair))
-        search.progress(f"trying {one.name} + {two.name}", (n + 1) / len(pairs), search.error)
-    for _, name, pair in sorted(tried, key=lambda t: t[0])[:2]:
-        pair = settle(evidence, pair, seed=seed)
+        pair = _like(both, start, (one.name, two.name))
+        works.append(pair.searching(evidence.scout, seed=seed, iterations=4, radius=0.3))
+    ends = together(works, lambda share: search.progress("trying pairs", share, search.error))
+    tried = [
+        (pair.loss, f"{one.name} + {two.name}", pair) for (one, two), pair in zip(pairs, ends, strict=True)
+    ]
+    first = sorted(tried, key=lambda t: t[0])[:2]
+    settled = together([settling(evidence, pair, seed=seed) for _, _, pair in first])
+    for (_, name, _), pair in zip(first, settled, strict=True):
         judged = search.judge(pair)
         if judged.error < judgement.error * (1.0 if explained(judged) else 0.8):
             model, judgement = pair, judged
@@ -275,45 +282,65 @@ def _like(sensor: Sensor, model: Model, more: Sequence[str]) -> Model:
 
 def _review(search: _Search, model: Model, judgement: Judgement) -> tuple[Model, Judgement]:
     """Drop effects that are not needed any more, and put simpler ones in place of others."""
-    for name in search.added(model):
-        if len(search.added(model)) == 1:
-            break
-        less = settle(search.evidence, _like(model.sensor.without(name), model, ()), seed=search.seed)
-        without = search.judge(less)
+    whole = model
+    for name, less in _droppable(search, model).items():
+        if name not in model.sensor or len(search.added(model)) == 1:
+            continue
+        less = less if model is whole else _like(model.sensor.without(name), model, ())
+        fitted = settle(search.evidence, less, seed=search.seed)
+        without = search.judge(fitted)
         if explained(without) or without.error <= judgement.error:
-            model, judgement = less, without
+            model, judgement = fitted, without
     for name in search.added(model):
-        for other in _rivals(search, model, name):
-            sensor = model.sensor.without(name).with_effect(other.model.sensor[other.name])
-            swapped = settle(search.evidence, _like(sensor, model, [other.name]), seed=search.seed)
+        for other, swap in _rivals(search, model, name).items():
+            swapped = settle(search.evidence, swap, seed=search.seed)
             judged = search.judge(swapped)
             if not explained(judged):
                 continue
             simpler = len(swapped.place) < len(model.place)
             if simpler or not explained(judgement):
                 model, judgement = swapped, judged
-                search.ties[other.name] = {*search.ties.pop(name, set()), name} - {other.name}
+                search.ties[other] = {*search.ties.pop(name, set()), name} - {other}
                 break
-            search.ties.setdefault(name, set()).add(other.name)
+            search.ties.setdefault(name, set()).add(other)
     return model, judgement
 
 
-def _rivals(search: _Search, model: Model, name: str) -> list[Tried]:
-    """Return the alternatives to an effect that may do as well: in its place, not far off on the scout.
+def _droppable(search: _Search, model: Model) -> dict[str, Model]:
+    """Return the models without one effect that may do: not far off on the scout, quickly fitted.
 
     Fitting one in full takes as long as trying a dozen; most are far off.
     """
-    scout, out = search.evidence.scout, []
+    scout, seed = search.evidence.scout.view(), search.seed
+    model.rebase(scout, repeats=16, seed=seed + 200)
+    ways = {name: _like(model.sensor.without(name), model, ()) for name in search.added(model)}
+    quick = together([way.searching(scout, seed=seed, iterations=2) for way in ways.values()])
+    judged = together([way.judging(scout.view(), repeats=16, seed=seed + 500) for way in quick])
+    return {
+        name: way for name, way, judgement in zip(ways, quick, judged, strict=True)
+        if judgement.error < DROPPED * judgement.gate
+    }  # fmt: skip
+
+
+def _promising(search: _Search, model: Model, ways: Mapping[str, Model]) -> dict[str, Model]:
+    """Return those models that may do as well as the present one: quickly fitted, not far off on the scout."""
+    if not ways:
+        return {}
+    scout = search.evidence.scout.view()
+    repeats = model.rebase(scout, repeats=16, seed=search.seed + 200)
+    enough = QUICK * float(scout.scale.loss(repeats).mean())
+    quick = together([way.searching(scout, seed=search.seed, iterations=2) for way in ways.values()])
+    return {name: way for (name, way), q in zip(ways.items(), quick, strict=True) if q.loss < enough}
+
+
+def _rivals(search: _Search, model: Model, name: str) -> dict[str, Model]:
+    """Return the models with an alternative in the place of an effect that may do as well."""
+    limit, ways = NEARBY * search.error_of.get(name, 0.0) + TIE, {}
     for other in search.alternatives.get(name, [])[:SWAPPED]:
-        limit = NEARBY * search.error_of.get(name, 0.0) + TIE
-        if other.name in model.space.sensor or other.error > limit:
-            continue
-        repeats = model.rebase(scout, repeats=16, seed=search.seed + 200)
-        sensor = model.sensor.without(name).with_effect(other.model.sensor[other.name])
-        quick = _like(sensor, model, [other.name]).search(scout, seed=search.seed, iterations=2)
-        if quick.loss < QUICK * float(scout.scale.loss(repeats).mean()):
-            out.append(other)
-    return out
+        if other.name not in model.space.sensor and other.error <= limit:
+            sensor = model.sensor.without(name).with_effect(other.model.sensor[other.name])
+            ways[other.name] = _like(sensor, model, [other.name])
+    return _promising(search, model, ways)
 
 
 def _verdict(

@@ -19,7 +19,7 @@ from dase.probes import LAYOUT, Frame, Sums, compared, peak_of, statistics, tole
 from dase.sensor import Sensor
 from dase.stimulus import MASKED, Grid, Stimulus, band_edges, sort_into_cells
 from dase.structure import SHORTEST, Structure
-from dase.trials import Trials, finer_steps
+from dase.trials import Order, Trials, finer_steps
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -336,9 +336,8 @@ class _Bench:
         if not self.readout:
             vectors = np.repeat(vector[None], rows, 0)
             return self.trials.run(model, vectors, seed=seed, reseed=True, finer=self.finer)
-        return Sums.join(
-            [self.trials.stream(model, vector, model.streams(), seed=seed + n) for n in range(rows)]
-        )
+        order = Order(model, np.repeat(vector[None], rows, 0), seed, reseed=True)
+        return self.trials.stream_all(order, [model.streams()] * rows)
 
     def _joined(self, sums: Sums) -> Sums:
         """Return recordings put together of their parts, whose pixels do not know of each other."""
@@ -346,14 +345,11 @@ class _Bench:
         def by(a: NDArray[Any]) -> NDArray[Any]:
             return a.reshape(-1, self.parts, *a.shape[1:])
 
-        halves = by(sums.halves)
         return Sums(
-            sums=by(sums.sums).sum(1),
-            halves=halves.reshape(len(halves), -1, halves.shape[-1]),
-            groups=by(sums.groups)[:, 0, :0],
-            clock=by(sums.clock).sum(1),
-            teams=by(sums.teams)[:, 0, :0],
-            stamps=by(sums.stamps).mean(1),
+            by(sums.sums).sum(1),
+            sums.pixels.reshape((len(sums.sums) // self.parts, -1, sums.pixels.shape[2])),
+            by(sums.clock).sum(1),
+            by(sums.stamps).mean(1),
         )
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from copy import copy
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -14,12 +15,13 @@ from dase.errors import InputError
 from dase.events import Events
 from dase.kernels import launch
 from dase.kernels import probes as kernels
-from dase.probes import Frame, Sums, compared, peak_of, statistics, tolerance, zones
+from dase.probes import Frame, Sums, compared, peak_of, statistics, tolerance, without, zones
 from dase.scene import Scene
 from dase.space import Space
 from dase.stimulus import MASKED, Grid, Stimulus, Trust, band_edges, light_of, sort_into_cells
 from dase.structure import Structure, find
-from dase.trials import GROUP, Trials, finer_steps
+from dase.together import Ask, Work, alone, simulated
+from dase.trials import Trials, finer_steps
 
 PIXELS = 1500
 """Pixels in each half of the measurement."""
@@ -58,6 +60,8 @@ class Half:
         seen: As `scale`, for the mean of many repeats of the present model.
         off: What each statistic may be off by.
         simulated: Statistics of the present model, the mean over its repeats.
+        left: Statistics of the measurement less a repeat of the present model, without one group of pixels
+            after the other, shape (G, J).
     """
 
     trials: Trials
@@ -68,28 +72,21 @@ class Half:
     seen: Scale = field(init=False)
     off: Array = field(init=False)
     simulated: Array = field(init=False)
+    left: Array = field(init=False)
 
-    def simulate(self, space: Space, places: Array, *, seed: int, reseed: bool = False) -> Sums:
-        """Run the models at some places, shape (B, P)."""
-        places = np.atleast_2d(places)
-        vectors = space.vectors(places)
-        if not self.trials.felt(space.sensor):
-            return self.trials.run(space.sensor, vectors, seed=seed, reseed=reseed)
-        rows = [
-            self.trials.stream(
-                space.sensor, vector, self.trials.felt(space.at(place)), seed=seed + n * reseed
-            )
-            for n, (vector, place) in enumerate(zip(vectors, places, strict=True))
-        ]
-        return Sums.join(rows)
+    def view(self) -> Half:
+        """Return the same half, which may have another present model."""
+        return copy(self)
 
-    def run(self, space: Space, places: Array, *, seed: int, reseed: bool = False) -> Array:
+    def run(self, space: Space, places: Array, *, seed: int) -> Array:
         """Return the statistics of the models at some places, shape (B, J)."""
-        return statistics(self.simulate(space, places, seed=seed, reseed=reseed), self.frame)[0]
+        found: Array = simulated([Ask(self, space, np.atleast_2d(places), seed)])[0]
+        return found
 
     def slow(self, space: Space) -> bool:
         """Whether models take many samples, or their events go through a readout."""
-        return bool(self.trials.felt(space.sensor)) or finer_steps(space.sensor, self.frame.step) > 0
+        readout = self.trials.ticks(space.sensor) is None
+        return readout or finer_steps(space.sensor, self.frame.step) > 0
 
     def rebase(self, space: Space, place: Array, *, repeats: int, seed: int) -> Array:
         """Make a model the present one: expectations and sampling errors are its own.
@@ -97,9 +94,13 @@ class Half:
         Returns:
             Statistics of `repeats` simulations of it with other seeds, shape (repeats, J).
         """
+        return alone(self.rebasing(space, place, repeats=repeats, seed=seed))
+
+    def rebasing(self, space: Space, place: Array, *, repeats: int, seed: int) -> Work[Array]:
+        """Do what `rebase` does, see `together`."""
         repeats = min(repeats, FEW_REPEATS) if self.slow(space) else repeats
-        places = np.repeat(np.atleast_2d(place), repeats, 0)
-        return self.take(self.simulate(space, places, seed=seed, reseed=True))
+        sums = yield [Ask(self, space, np.repeat(np.atleast_2d(place), repeats, 0), seed, repeats=True)]
+        return self.take(sums[0])
 
     def take(self, sums: Sums) -> Array:
         """Make the model with these repeats the present one; return their statistics."""
@@ -113,35 +114,21 @@ class Half:
         self.off = np.sqrt(off)
         self.chance = Scale(target[0], np.sqrt((0.5 + 0.5 / len(values)) * repeats + off), used)
         self.simulated = values.mean(0)
-        self._present = sums.row(0)
-        scatter = self._scatter(sums)
+        measured, present = (
+            statistics(without(one, self.frame), self.frame)[0] for one in (self.found, sums)
+        )
+        self.left = measured - present
+        scatter = (len(self.left) - 1) * self.left.var(0)
         self.scale = Scale(target[0], np.sqrt(np.maximum(repeats, scatter) + off), used)
         # of the difference from the mean of the repeats, which has nearly no sampling error of its own
         seen = np.maximum((0.5 + 0.5 / len(values)) * repeats, scatter - (0.5 - 0.5 / len(values)) * repeats)
         self.seen = Scale(target[0], np.sqrt(seen + off), used)
         return values
 
-    def _scatter(self, sums: Sums) -> Array:
-        """Return the variance of the differences between measurement and model, by groups of pixels, (J,)."""
-        measured, simulated = (self._left(one) for one in (self.found, sums))
-        out: Array = (len(measured) - 1) * (measured - simulated).var(0)
-        return out
-
     @property
     def groups(self) -> int:
         """Number of groups of pixels."""
-        return int(self.found.groups.shape[1])
-
-    def left(self) -> Array:
-        """Return statistics of the measurement less the model, without one group after the other, (G, J)."""
-        return self._left(self.found) - self._left(self._present)
-
-    def _left(self, one: Sums) -> Array:
-        """Return statistics without one group of pixels after the other, shape (G, J)."""
-        count = self.found.groups.shape[1]
-        pixels = np.minimum(np.arange(len(self.frame.zone)) // GROUP, count - 1)
-        expected = self.frame.expected * (np.arange(count)[:, None] != pixels)[..., None]
-        return statistics(one.without(pixels), replace(self.frame, expected=expected))[0]
+        return len(self.left)
 
     def judge(self, repeats: Array, *, seed: int) -> Judgement:
         """Return the error of the present model, whose repeats are given."""

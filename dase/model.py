@@ -9,12 +9,13 @@ from itertools import product
 import numpy as np
 from numpy.typing import NDArray
 
-from dase.descent import Found, screen, search
+from dase.descent import Found, screening, searching
 from dase.effects.base import Effect
 from dase.error import Judgement
 from dase.evidence import Evidence, Half
 from dase.sensor import Sensor
 from dase.space import Axis, Space, axes_of, with_values
+from dase.together import Ask, Work, alone, together
 
 Array = NDArray[np.float64]
 
@@ -26,6 +27,9 @@ RATIO = 2.2
 
 SHIFTS = (-0.7, -0.4, -0.15, 0.1)
 """Of the logarithm of the thresholds, when an effect is tried."""
+
+SETTLED = 16
+"""Repeats that give a model's sampling errors while it is fitted."""
 
 FEW_STARTS = 0.1
 """Share of the plausible range that is left out at both ends when an effect is tried."""
@@ -56,20 +60,21 @@ class Model:
 
     def judge(self, half: Half, *, repeats: int, seed: int) -> Judgement:
         """Make this the present model of a half and return its error there."""
-        return half.judge(self.rebase(half, repeats=repeats, seed=seed), seed=seed)
+        return alone(self.judging(half, repeats=repeats, seed=seed))
 
-    def loss_on(self, half: Half, *, seed: int) -> float:
-        """Return the robust distance by the sampling errors of the present model of the half."""
-        return float(half.scale.loss(half.run(self.space, self.place, seed=seed))[0])
+    def judging(self, half: Half, *, repeats: int, seed: int) -> Work[Judgement]:
+        """Do what `judge` does, see `together`."""
+        values = yield from half.rebasing(self.space, self.place, repeats=repeats, seed=seed)
+        return half.judge(values, seed=seed)
 
-    def search(self, half: Half, *, seed: int, iterations: int = 4, radius: float = 0.2) -> Model:
-        """Return the model with its parameters improved."""
-        found = self.explore(half, seed=seed, iterations=iterations, radius=radius)
+    def searching(self, half: Half, *, seed: int, iterations: int = 4, radius: float = 0.2) -> Work[Model]:
+        """Return the model with its parameters improved, see `together`."""
+        found = yield from self.exploring(half, seed=seed, iterations=iterations, radius=radius)
         return replace(self, place=found.place, loss=found.loss)
 
-    def explore(self, half: Half, *, seed: int, iterations: int = 4, radius: float = 0.2) -> Found:
-        """Improve the parameters and keep all that was tried."""
-        return search(half, self.space, self.place, seed=seed, iterations=iterations, radius=radius)
+    def exploring(self, half: Half, *, seed: int, iterations: int = 4, radius: float = 0.2) -> Work[Found]:
+        """Improve the parameters and keep all that was tried, see `together`."""
+        return searching(half, self.space, self.place, seed=seed, iterations=iterations, radius=radius)
 
 
 def model_of(sensor: Sensor, free: Sequence[str] | None = None) -> Model:
@@ -87,28 +92,41 @@ def with_phase(model: Model, phase: float) -> Model:
 def fit_present(evidence: Evidence, sensor: Sensor, free: Sequence[str] | None, *, seed: int) -> Model:
     """Fit the free parameters of a sensor: a wide look at thresholds and phase, then descents."""
     model = model_of(sensor, free)
-    best = []
-    for phase in (0.0, 1.0):
-        start = with_phase(model, phase)
-        start.rebase(evidence.scout, repeats=12, seed=seed + 100)
-        places = np.concatenate([start.place[None], _threshold_starts(start)])
-        places, losses = screen(evidence.scout, start.space, places, seed=seed)
-        best.append(replace(start, place=places[0], loss=losses[0]))
+    looks = [_looking(evidence.scout.view(), with_phase(model, phase), seed=seed) for phase in (0.0, 1.0)]
     # each was judged by its own sampling errors; judge both by those of the better one
-    best.sort(key=lambda m: m.loss)
-    best[0].rebase(evidence.train, repeats=12, seed=seed + 100)
-    ends = [m.search(evidence.train, seed=seed) for m in best]
+    best = sorted(together(looks), key=lambda m: m.loss)
+    half = evidence.train.view()
+    best[0].rebase(half, repeats=12, seed=seed + 100)
+    ends = together([m.searching(half, seed=seed) for m in best])
     return settle(evidence, min(ends, key=lambda m: m.loss), seed=seed, rounds=1)
+
+
+def _looking(half: Half, start: Model, *, seed: int) -> Work[Model]:
+    """Return the best of many thresholds."""
+    yield from half.rebasing(start.space, start.place, repeats=12, seed=seed + 100)
+    places = np.concatenate([start.place[None], _threshold_starts(start)])
+    places, losses = yield from screening(half, start.space, places, seed=seed)
+    return replace(start, place=places[0], loss=losses[0])
 
 
 def settle(evidence: Evidence, model: Model, *, seed: int, rounds: int = 2) -> Model:
     """Refit a model by its own sampling errors, which change with it."""
+    return alone(settling(evidence, model, seed=seed, rounds=rounds))
+
+
+def settling(
+    evidence: Evidence, model: Model, *, seed: int, rounds: int = 2, half: Half | None = None
+) -> Work[Model]:
+    """Do what `settle` does, see `together`; `half` is the training half if the model is its present one."""
     for turn in range(rounds):
-        model.rebase(evidence.train, repeats=16, seed=seed + 100)
+        if half is None or turn > 0:
+            half = evidence.train.view()
+            yield from half.rebasing(model.space, model.place, repeats=SETTLED, seed=seed + 100)
         other = with_phase(model, 1.0 - model.space.sensor["threshold"].phase)  # type: ignore[attr-defined]
-        losses = [m.loss_on(evidence.train, seed=seed) for m in (model, other)]
+        values = yield [Ask(half, m.space, m.place[None], seed) for m in (model, other)]
+        losses = [float(half.scale.loss(value)[0]) for value in values]
         model = other if losses[1] < losses[0] else model
-        model = model.search(evidence.train, seed=seed + turn, radius=0.12 / (1 + turn))
+        model = yield from model.searching(half, seed=seed + turn, radius=0.12 / (1 + turn))
     return model
 
 

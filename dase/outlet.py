@@ -115,4 +115,9 @@ class Tally:
 
 def rows_of(events: Events, row: NDArray[np.int32] | None, batch: int) -> Sequence[Events]:
     """Return the stream of each row of a batch."""
-    return [events] if row is None else [events.select(row == b) for b in range(batch)]
+    if row is None:
+        return [events]
+    # rows as small integers, which are sorted by their digits
+    order = np.argsort(row.astype(np.uint16) if batch <= 1 << 16 else row, kind="stable")
+    parts = np.split(order, np.cumsum(np.bincount(row, minlength=batch))[:-1])
+    return [events.select(part) for part in parts]

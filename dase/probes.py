@@ -7,13 +7,18 @@ measurement are compared. Each belongs to a family, a row of `FAMILIES`.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
 
 import numpy as np
+import warp as wp
 from numpy.typing import NDArray
 from scipy.fft import rfft
 from scipy.ndimage import median_filter
 
+from dase.kernels import launch
+from dase.kernels import probes as kernels
 from dase.kernels.probes import (
     BANDS,
     CELLS,
@@ -24,9 +29,13 @@ from dase.kernels.probes import (
     LAG,
     LAG_COUNT,
     LAGS,
+    ODD,
+    PRODUCTS,
     RATE,
     REPEAT,
+    RINGS,
     SERIAL,
+    ZONES,
 )
 
 FAMILIES = {
@@ -56,8 +65,8 @@ SHRINK = 3.0
 SEEN = 6.0
 """Events that are expected of a pixel which is called silent if it sends none."""
 
-ZONES = 4
-"""Rings about the middle of the sensor, of equal numbers of pixels."""
+GROUP = 64
+"""Neighbours in the list of pixels that form a group; on a CPU one thread works on all of them."""
 
 TONES = 12
 """Bands of frequency, from `LOWEST` to half the sampling rate."""
@@ -69,54 +78,11 @@ Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
-class Sums:
-    """What the kernels have added up, a row for each model.
-
-    Args:
-        sums: Over all pixels, shape (B, SIZE).
-        halves: Counts of each pixel, shape (B, N, HALVES).
-        groups: Over groups of neighbours in the list of pixels, shape (B, G, SIZE).
-        clock: OFF and ON events of each step of time, shape (B, 2 T).
-        teams: The same of groups of pixels, shape (B, G, 2 T).
-        stamps: Shares of events that follow regularities of the time stamps, shape (B, 2).
-    """
-
-    sums: Array
-    halves: NDArray[np.float32]
-    groups: NDArray[np.float32]
-    clock: NDArray[np.int64]
-    teams: NDArray[np.int32]
-    stamps: Array
-
-    @classmethod
-    def join(cls, parts: Sequence[Sums]) -> Sums:
-        """Return the rows of all parts."""
-        return cls(*(np.concatenate([getattr(p, f.name) for p in parts]) for f in fields(cls)))
-
-    def row(self, n: int) -> Sums:
-        """Return one row."""
-        return Sums(*(getattr(self, f.name)[n : n + 1] for f in fields(Sums)))
-
-    def without(self, pixels: NDArray[np.int64]) -> Sums:
-        """Return the first row without one group after the other, shape (G, ...).
-
-        Args:
-            pixels: Group of each pixel, shape (N,).
-        """
-        count = self.groups.shape[1]
-        kept = np.arange(count)[:, None] != pixels
-        return Sums(
-            self.sums[0] - self.groups[0], self.halves[0] * kept[..., None], self.groups[:0],
-            self.clock[0] - self.teams[0], self.teams[:0], np.repeat(self.stamps[:1], count, 0),
-        )  # fmt: skip
-
-
-@dataclass(frozen=True)
 class Frame:
     """What statistics refer to; the same for measurement and models.
 
     Args:
-        expected: Counts that the present model expects, shape (N, HALVES), or one for each row.
+        expected: Counts that the present model expects, shape (N, HALVES).
         zone: Ring of each pixel, shape (N,).
         measured: Statistics of the measurement, which means of a model with few events are drawn to,
             shape (J,); None to work them out.
@@ -135,6 +101,131 @@ class Frame:
     peak: float = 0.0
     regular: bool = False
     measured: Array | None = None
+
+    @cached_property
+    def by_group(self) -> Array:
+        """What is expected of each group of pixels, shape (G, HALVES)."""
+        return np.add.reduceat(self.expected, np.arange(0, len(self.expected), GROUP))
+
+
+@dataclass(frozen=True)
+class Sums:
+    """What the kernels have added up, a row for each model.
+
+    Args:
+        sums: Over all pixels, shape (B, SIZE).
+        pixels: Counts of each pixel, a Warp array of shape (B, N, HALVES).
+        clock: OFF and ON events of each step of time, shape (B, 2 T).
+        stamps: Shares of events that follow regularities of the time stamps, shape (B, 2).
+        groups: Sums over groups of neighbours in the list of pixels, of the first row, shape (G, SIZE).
+        teams: OFF and ON events of each step of these groups, of the first row, shape (G, 2 T).
+        frame: What the counts of pixels have been folded for.
+        folded: The counts of pixels folded, shape (B, FOLD).
+    """
+
+    sums: Array
+    pixels: Any
+    clock: NDArray[np.int32]
+    stamps: Array
+    groups: NDArray[np.float32] | None = None
+    teams: NDArray[np.int32] | None = None
+    frame: Frame | None = None
+    folded: Array | None = None
+
+    @classmethod
+    def join(cls, parts: Sequence[Sums]) -> Sums:
+        """Return the rows of all parts; of groups those of the first part's first row."""
+        first = parts[0]
+        if len(parts) == 1:
+            return first
+        begins = np.cumsum([0, *(len(p.sums) for p in parts)])
+        pixels = wp.empty((int(begins[-1]), *first.pixels.shape[1:]), dtype=float, device=first.pixels.device)
+        for part, begin, end in zip(parts, begins, begins[1:], strict=False):
+            wp.copy(pixels[int(begin) : int(end)], part.pixels)
+        rest = [np.concatenate([getattr(p, name) for p in parts]) for name in ("sums", "clock", "stamps")]
+        folded = [part.folded for part in parts if part.folded is not None and part.frame is first.frame]
+        whole = len(folded) == len(parts)
+        return cls(
+            rest[0], pixels, rest[1], rest[2], first.groups, first.teams, first.frame if whole else None,
+            np.concatenate(folded) if whole else None,
+        )  # fmt: skip
+
+    @property
+    def halves(self) -> NDArray[np.float32]:
+        """Counts of each pixel, shape (B, N, HALVES)."""
+        out: NDArray[np.float32] = self.pixels.numpy()
+        return out
+
+
+@dataclass(frozen=True)
+class Totals:
+    """What statistics are worked out from, a row for each model.
+
+    Args:
+        sums: Over all pixels, shape (B, SIZE).
+        folded: The counts of pixels folded, shape (B, FOLD).
+        clock: OFF and ON events of each step of time, shape (B, 2 T).
+        stamps: Shares of events that follow regularities of the time stamps, shape (B, 2).
+        expected: Sums of what is expected, shape (B or 1, HALVES).
+    """
+
+    sums: Array
+    folded: Array
+    clock: NDArray[np.int32]
+    stamps: Array
+    expected: Array
+
+
+def fold(pixels: Any, frames: Sequence[Frame], which: NDArray[np.int64]) -> Any:
+    """Fold the counts of pixels where they are.
+
+    Args:
+        pixels: Counts, a Warp array of shape (B, N, HALVES).
+        frames: What they are compared with; the same pixels and time.
+        which: Frame of each row, shape (B,).
+
+    Returns:
+        A Warp array of shape (B, G, FOLD).
+    """
+    rows, count, _ = pixels.shape
+    groups, to, frame = -(-count // GROUP), pixels.device, frames[0]
+    expected = np.stack([f.expected for f in frames]).astype(np.float32)
+    out = wp.empty((rows, groups, kernels.FOLD), dtype=float, device=to)
+    inputs = [
+        pixels, wp.array(expected, device=to), wp.array(which.astype(np.int32), device=to),
+        wp.array(frame.zone.astype(np.int32), device=to), 15.0 * frame.seconds, SEEN, GROUP, out,
+    ]  # fmt: skip
+    launch.run(kernels.fold, groups, inputs, to, batch=rows)
+    return out
+
+
+def over_groups(parts: Any) -> Array:
+    """Return the sums over groups of a Warp array (B, G, K), shape (B, K)."""
+    rows, _, size = parts.shape
+    out = wp.empty((rows, size), dtype=wp.float64, device=parts.device)
+    launch.run(kernels.together, size, [parts, out], parts.device, batch=rows)
+    found: Array = out.numpy()
+    return found
+
+
+def totals(found: Sums, frame: Frame) -> Totals:
+    """Return what the statistics of some models are worked out from."""
+    folded = found.folded
+    if folded is None or found.frame is not frame:
+        folded = over_groups(fold(found.pixels, [frame], np.zeros(len(found.sums), np.int64)))
+    return Totals(found.sums, folded, found.clock, found.stamps, frame.by_group.sum(0)[None])
+
+
+def without(found: Sums, frame: Frame) -> Totals:
+    """Return the totals of the first row without one group of pixels after the other, shapes (G, ...)."""
+    assert found.groups is not None
+    assert found.teams is not None
+    parts = fold(found.pixels[:1], [frame], np.zeros(1, np.int64)).numpy()[0].astype(np.float64)
+    expected = frame.by_group
+    return Totals(
+        found.sums[0] - found.groups, parts.sum(0) - parts, found.clock[0] - found.teams,
+        np.repeat(found.stamps[:1], len(parts), 0), expected.sum(0) - expected,
+    )  # fmt: skip
 
 
 def _layout() -> dict[str, slice]:
@@ -172,25 +263,28 @@ def zones(pixels: NDArray[np.int32], width: int, height: int) -> NDArray[np.int6
     return out
 
 
-def statistics(found: Sums, frame: Frame) -> tuple[Array, Array]:
+def statistics(found: Sums | Totals, frame: Frame) -> tuple[Array, Array]:
     """Return statistics and how many events each rests on.
 
     Returns:
         Statistics, shape (B, J), and events, shape (B, J); of counts, which are given as log(count + 3), the
         count itself.
     """
-    a = found.sums.astype(np.float64)
+    of = totals(found, frame) if isinstance(found, Sums) else found
+    a = of.sums
+    odd = of.folded[:, ODD : ODD + 4]
     parts = [
         _counts(a[:, RATE : RATE + 2 * CELLS]),
         _counts(a[:, ISI : ISI + 6 * INTERVALS]),
         _means(a[:, LAG : LAG + LAGS * BANDS], np.tile(a[:, LAG_COUNT : LAG_COUNT + BANDS], LAGS)),
         _repeats(a[:, REPEAT : REPEAT + 3 * BANDS].reshape(-1, BANDS, 3)),
         _changes(a[:, CHANGE : CHANGE + 12 * CLASSES].reshape(-1, 4 * CLASSES, 3), a[:, SERIAL:]),
-        _spread(found.halves, frame.expected),
-        *map(_counts, _odd_pixels(found.halves, frame)),
-        _counts(_by_zone(found.halves, frame.zone)),
-        _spectrum(found.clock, frame),
-        (found.stamps, np.full(found.stamps.shape, 1e9 if frame.regular else 0.0)),
+        _spread(of.folded[:, PRODUCTS : PRODUCTS + 12], of.expected),
+        _counts(odd[:, :3]),
+        _counts(odd[:, 3:]),
+        _counts(of.folded[:, RINGS:]),
+        _spectrum(of.clock, frame),
+        (of.stamps, np.full(of.stamps.shape, 1e9 if frame.regular else 0.0)),
     ]
     values = np.concatenate([value for value, _ in parts], axis=1)
     weight = np.concatenate([events for _, events in parts], axis=1)
@@ -222,46 +316,23 @@ def _changes(pairs: Array, serial: Array) -> tuple[Array, Array]:
     return np.concatenate([mean, deviation, product], 1), np.concatenate([events, events, count], 1)
 
 
-def _spread(halves: NDArray[np.float32], expected: Array) -> tuple[Array, Array]:
+def _spread(products: Array, expected: Array) -> tuple[Array, Array]:
     """Split-half covariances over pixels of what is not expected, and Fano factors."""
-    # state (moving, rest), half, polarity
-    d = (halves - expected.astype(np.float32)).reshape(*halves.shape[:2], 2, 2, 2)
-    e = expected.reshape(-1, halves.shape[1], 2, 2, 2)
-    total = np.maximum(e.sum((1, 3)), 1.0)  # (B or 1, state, polarity)
+    # state (moving, rest), then: products over the halves by their polarities, those of a half with itself
+    of = products.reshape(-1, 2, 6)
+    e = expected.reshape(-1, 2, 2, 2)  # state, half, polarity
+    total = np.maximum(e.sum(2), 1.0)  # (B or 1, state, polarity)
     both = np.sqrt(total[..., 0] * total[..., 1])
-    a, b = d[:, :, :, 0], d[:, :, :, 1]  # the halves
-    products = np.einsum("bnsp,bnsq->bspq", a, b, optimize=True).astype(np.float64)
-    own = sum(np.einsum("bnsp,bnsp->bsp", x, x, optimize=True) for x in (a, b)).astype(np.float64)
-    diagonal = np.stack([products[..., 0, 0], products[..., 1, 1]], -1)
+    diagonal, own = of[..., [0, 3]], of[..., 4:]
     same = diagonal * 2 / total
-    cross = (products[..., 0, 1] + products[..., 1, 0]) / both
+    cross = (of[..., 1] + of[..., 2]) / both
     fano = (own + 2 * diagonal) / total
-    values = np.concatenate([same, cross[..., None], fano], -1).reshape(len(halves), -1)
+    values = np.concatenate([same, cross[..., None], fano], -1).reshape(len(of), -1)
     events = np.concatenate([total, both[..., None], total], -1).reshape(len(e), -1)
     return values, np.broadcast_to(events, values.shape)
 
 
-def _odd_pixels(halves: NDArray[np.float32], frame: Frame) -> tuple[Array, Array]:
-    """Numbers of pixels that are busy at rest or altogether, and of those that are silent."""
-    rest, rest_e = halves[..., 4:].sum(-1), frame.expected[..., 4:].sum(-1).astype(np.float32)
-    all_, all_e = halves.sum(-1), frame.expected.sum(-1).astype(np.float32)
-    bound = rest_e + 4 * np.sqrt(rest_e + 1)
-    busy = rest > bound + 2, rest > bound + np.float32(15 * frame.seconds), all_ > 3 * all_e + 20
-    silent = ((all_ == 0) & (all_e >= SEEN),)
-    many, few = (
-        np.stack([np.count_nonzero(o, axis=1) for o in odd], 1).astype(np.float64) for odd in (busy, silent)
-    )
-    return many, few
-
-
-def _by_zone(halves: NDArray[np.float32], zone: NDArray[np.int64]) -> Array:
-    ring = (zone[:, None] == np.arange(ZONES)).astype(np.float32)
-    state = np.matmul(halves.transpose(0, 2, 1), ring).reshape(len(halves), 2, 2, 2, ZONES)
-    out: Array = state.sum(2).reshape(len(halves), -1).astype(np.float64)
-    return out
-
-
-def _spectrum(clock: NDArray[np.int64], frame: Frame) -> tuple[Array, Array]:
+def _spectrum(clock: NDArray[np.int32], frame: Frame) -> tuple[Array, Array]:
     """Logarithms of the power of the net rate in bands of frequency, and its swing at the measured peak."""
     steps = clock.shape[1] // 2
     off, on = clock[:, frame.first : steps], clock[:, steps + frame.first :]

@@ -2,28 +2,23 @@
 
 from __future__ import annotations
 
-import math
-from collections.abc import Iterable
-from dataclasses import dataclass, field, replace
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 import warp as wp
 from numpy.typing import NDArray
 
+from dase.behind import clock_of, emitted, felt, sent
 from dase.effects import EFFECTS
 from dase.effects.optics import SceneEffect
-from dase.effects.readout import Readout
-from dase.effects.row_scan import RowScan
 from dase.effects.stream import StreamEffect
 from dase.effects.threshold import Threshold
-from dase.effects.timestamp import Timestamp
 from dase.events import Events
-from dase.kernels import launch, pixel, trials
+from dase.kernels import launch, trials
 from dase.kernels import probes as kernels
-from dase.pixels import Pixels
-from dase.probes import Sums
-from dase.scene import Scene
+from dase.probes import GROUP, Frame, Sums, fold, over_groups
 from dase.sensor import Sensor
 from dase.stimulus import Stimulus
 from dase.structure import Structure
@@ -40,27 +35,52 @@ HALF = 0.064
 SLACK = 2e-6
 """Files give whole microseconds: an event up to this after a point of the grid belongs to it [s]."""
 
-GROUP = 64
-"""Pixels whose events are summed up together on a CPU; on a GPU every pixel has a thread."""
-
-FELT = 0.25
-"""Delays below this share of a step of the grid are not felt."""
-
 FINEST = 2
 """Samples per step of the grid at most: models that ask for more are simulated a little too coarsely."""
 
-ALONE = 1
+ALONE = {"cpu": 1, "cuda": 0}
 """Effects up to which a sensor has a kernel of its own, up to twice as fast. Those with more share one that
-has all effects: it is compiled once, and not for each of hundreds of combinations."""
+has all effects: it is compiled once, and not for each of hundreds of combinations. On a GPU all do, so that
+all candidates run in one launch."""
 
-ROOM = 1 << 28
-"""Memory for the sums of one launch [bytes]."""
+ROOM = {"cpu": 1 << 26, "cuda": 1 << 31}
+"""Memory for the sums of one launch [bytes]; on a CPU they should stay in the caches."""
+
+STREAMED = 32
+"""Models whose events are stored at a time."""
 
 
 def finer_steps(sensor: Sensor, step: float) -> int:
     """Return how many samples per step the model needs, 0 where those at changes of the light do."""
     longest = sensor.longest_step()
     return 0 if longest == np.inf else int(np.clip(np.ceil(step / longest - 1e-6), 1, FINEST))
+
+
+@dataclass(frozen=True, eq=False)
+class Order:
+    """Models to run: one sensor at several parameter vectors.
+
+    Args:
+        sensor: Names the effects; its own parameters do not matter but for the sampling.
+        vectors: Shape (B, P).
+        seed: Of the random numbers.
+        reseed: Whether each vector gets random numbers of its own.
+        finer: Samples per step; None chooses by the sensor.
+        frame: What the counts of pixels are folded for; None where that is not known yet.
+        ticks: From tick to tick of the clock that stamps the events [s], 0 for none.
+    """
+
+    sensor: Sensor
+    vectors: NDArray[Any]
+    seed: int = 0
+    reseed: bool = False
+    finer: int | None = None
+    frame: Frame | None = None
+    ticks: float = 0.0
+
+    def seeds(self) -> NDArray[np.int64]:
+        """Return the seed of each vector, shape (B,)."""
+        return (self.seed + int(self.reseed) * np.arange(len(self.vectors))) & 0x3FFFFFFF
 
 
 @dataclass(eq=False)
@@ -86,6 +106,9 @@ class Trials:
 
     def __post_init__(self) -> None:
         self.device = self.stimulus.device
+        self._middle: tuple[Any, Any] | None = None
+        self._kind = "cuda" if self.device.is_cuda else "cpu"
+        self._lanes = 1 if self.device.is_cuda else trials.LANES
         self._pixels = wp.array(self.stimulus.pixels, dtype=int, device=self.device)
 
     def run(
@@ -97,100 +120,150 @@ class Trials:
         reseed: bool = False,
         finer: int | None = None,
     ) -> Sums:
-        """Simulate parameter vectors of a sensor.
+        """Simulate parameter vectors of one sensor; see `Order`."""
+        return self.run_all([Order(sensor, vectors, seed, reseed, finer)])[0]
 
-        Args:
-            sensor: Names the effects; its own parameters do not matter but for the sampling.
-            vectors: Shape (B, P).
-            seed: Of the random numbers.
-            reseed: Whether each vector gets random numbers of its own.
-            finer: Samples per step; None chooses by the sensor.
-        """
-        finer = finer_steps(sensor, self.stimulus.grid.step) if finer is None else finer
-        history = self.stimulus.history(finer)
-        kernel, base, at = self._kernel(sensor)
-        at_once = max(1, ROOM // (4 * len(self.stimulus.pixels) * (kernels.SIZE // self._group() + 80)))
-        parts = []
-        for first in range(0, len(vectors), at_once):
-            part = vectors[first : first + at_once]
-            rows = np.repeat(base[None], len(part), 0)
-            rows[:, at] = part
-            sink = self.sink(len(rows), reseed=reseed)
+    def run_all(self, orders: Sequence[Order]) -> list[Sums]:
+        """Simulate many models; those that have a kernel in common run together, whatever their effects."""
+        together: dict[Any, list[int]] = {}
+        step = self.stimulus.grid.step
+        for n, order in enumerate(orders):
+            finer = finer_steps(order.sensor, step) if order.finer is None else order.finer
+            kernel = self._kernel(order.sensor)[0]
+            maps = n if any(effect.maps for effect in order.sensor.effects) else -1
+            together.setdefault((finer, id(kernel), maps), []).append(n)
+        out: dict[int, Sums] = {}
+        for (finer, _, _), members in together.items():
+            found = self._run([orders[n] for n in members], self.stimulus.history(finer))
+            out.update(zip(members, found, strict=True))
+        return [out[n] for n in range(len(orders))]
+
+    def _run(self, orders: Sequence[Order], history: Any) -> list[Sums]:
+        """Simulate models that have a kernel in common."""
+        kernel, maps = (
+            self._kernel(orders[0].sensor)[0],
+            orders[0].sensor.maps(self.stimulus.pixels, self.device),
+        )
+        count, seeds = len(self.stimulus.pixels), np.concatenate([order.seeds() for order in orders])
+        rows = np.concatenate([self._wide(order) for order in orders])
+        ends = np.cumsum([len(order.vectors) for order in orders])
+        begins = np.concatenate([[0], ends[:-1]])
+        ticks = np.repeat([round(order.ticks * 1e12) for order in orders], ends - begins)
+        # the first of repeats shows how groups of pixels differ
+        apart = [int(begin) for begin, order in zip(begins, orders, strict=True) if order.reseed]
+        pixels = wp.zeros((len(rows), count, kernels.HALVES), dtype=float, device=self.device)
+        sums, clock = [], []
+        groups: dict[int, tuple[NDArray[np.float32], NDArray[np.int32]]] = {}
+        for first in range(0, len(rows), self._at_once()):
+            part = slice(first, min(first + self._at_once(), len(rows)))
+            sink = self.sink(pixels[part], ticks[part])
             inputs = [
-                history, self._pixels, self.stimulus.width, self.stimulus.height, (seed + first) & 0x3FFFFFFF,
-                wp.array(rows, dtype=float, device=self.device),
-                *sensor.maps(self.stimulus.pixels, self.device), sink,
+                history, self._pixels, self.stimulus.width, self.stimulus.height,
+                wp.array(seeds[part].astype(np.int32), dtype=int, device=self.device),
+                wp.array(rows[part], dtype=float, device=self.device), *maps, sink,
             ]  # fmt: skip
-            count = len(self.stimulus.pixels)
-            launch.run(kernel, count, inputs, self.device, batch=len(rows), align=GROUP)
-            parts.append(self._totals(sink, len(rows)))
-        self.evaluations += len(vectors)
-        grid = self.stimulus.grid
-        self.work += len(vectors) * len(self.stimulus.pixels) * grid.step * (grid.steps - 1)
-        return Sums.join(parts)
+            blocks = -(-len(rows[part]) // self._lanes)
+            launch.run(kernel, count, inputs, self.device, batch=blocks, align=GROUP)
+            grouped = self._grouped(sink.sums)
+            sums.append(over_groups(grouped))
+            clock.append(self._clock(sink.clock))
+            mine = [n for n in apart if part.start <= n < part.stop]
+            groups |= {n: _first(grouped, sink.clock, n - first) for n in mine}
+        self.evaluations += len(rows)
+        self.work += len(rows) * count * self.stimulus.grid.step * (self.stimulus.grid.steps - 1)
+        folded, both, clocks = _folded(orders, pixels), np.concatenate(sums), np.concatenate(clock)
+        out = []
+        for order, begin, end in zip(orders, begins.tolist(), ends.tolist(), strict=True):
+            cut = slice(begin, end)
+            stamps = np.zeros((end - begin, len(Structure.NAMES)))
+            stamps[:, 0] = order.ticks > 0 and self.structure.step > 0
+            known = None if folded is None or order.frame is None else folded[cut]
+            of_groups, teams = groups.get(begin, (None, None))
+            out.append(
+                Sums(both[cut], pixels[cut], clocks[cut], stamps, of_groups, teams, order.frame, known)
+            )
+        return out
+
+    def _wide(self, order: Order) -> NDArray[np.float32]:
+        """Return parameter vectors as the kernel takes them."""
+        _, base, at = self._kernel(order.sensor)
+        out = np.repeat(base[None], len(order.vectors), 0)
+        out[:, at] = order.vectors
+        return out
+
+    def _at_once(self) -> int:
+        """Return how many models there is room for."""
+        count, group = len(self.stimulus.pixels), self._group()
+        numbers = -(-count // group) * kernels.SIZE + -(-count // GROUP) * 2 * self.stimulus.grid.steps
+        return max(1, ROOM[self._kind] // (4 * (numbers + count * (kernels.MEMORY + kernels.HALVES))))
 
     def _kernel(self, sensor: Sensor) -> tuple[wp.Kernel, NDArray[np.float32], list[int]]:
         """Return the kernel of a sensor, a parameter vector for it, and the places of the sensor's own."""
         key = tuple((e.name, *(getattr(e, name) for name in e.choices())) for e in sensor.effects)
         if key not in self._kernels:
             stages = sensor.stages()
-            wide = whole(sensor) if len(stages) > ALONE else sensor
+            wide = whole(sensor) if len(stages) > ALONE[self._kind] else sensor
             names = wide.parameter_names()
             at = [names.index(name) for name in sensor.parameter_names()]
-            self._kernels[key] = trials.compose(wide.stages()), wide.parameters(), at
+            self._kernels[key] = trials.compose(wide.stages(), lanes=self._lanes), wide.parameters(), at
         return self._kernels[key]
 
     def look(self, events: Events) -> Sums:
         """Sum up stored events; those of other pixels are left out."""
-        time, polarity, start = self._by_pixel(events)
-        sink = self.sink(1)
+        return self._look([events])
+
+    def _look(self, streams: Sequence[Events], frame: Frame | None = None) -> Sums:
+        """Sum up streams of stored events, one per row."""
+        parts = [self._by_pixel(events) for events in streams]
+        lengths = np.cumsum([0, *(len(time) for time, _, _ in parts)])
+        start = np.stack([begin + first for (_, _, begin), first in zip(parts, lengths, strict=False)])
+        count = len(self.stimulus.pixels)
+        pixels = wp.zeros((len(streams), count, kernels.HALVES), dtype=float, device=self.device)
+        sink = self.sink(pixels, np.zeros(len(streams), np.int64))
         arrays = [
-            wp.array(start[None].astype(np.int32), device=self.device),
-            wp.array(time, dtype=wp.int64, device=self.device),
-            wp.array(polarity, dtype=wp.uint8, device=self.device),
+            wp.array(start.astype(np.int32), device=self.device),
+            wp.array(np.concatenate([p[0] for p in parts]), dtype=wp.int64, device=self.device),
+            wp.array(np.concatenate([p[1] for p in parts]), dtype=wp.uint8, device=self.device),
         ]
-        launch.run(
-            kernels.walk, len(self.stimulus.pixels), [*arrays, sink], self.device, batch=1, align=GROUP
-        )
-        found = self._totals(sink, 1)
-        return replace(found, stamps=self.structure.shares(self._mine(events))[None])
+        launch.run(kernels.walk, count, [*arrays, sink], self.device, batch=len(streams), align=GROUP)
+        grouped = self._grouped(sink.sums)
+        folded = None
+        if frame is not None:
+            folded = over_groups(fold(pixels, [frame], np.zeros(len(streams), np.int64)))
+        stamps = np.zeros((len(streams), len(Structure.NAMES)))
+        if self.structure != Structure():
+            stamps = np.stack([self.structure.shares(self._mine(events)) for events in streams])
+        return Sums(
+            over_groups(grouped), pixels, self._clock(sink.clock), stamps,
+            *_first(grouped, sink.clock, 0), frame, folded,
+        )  # fmt: skip
 
     def felt(self, sensor: Sensor) -> tuple[StreamEffect, ...]:
-        """Return the effects behind the pixels that the probes can feel.
+        """Return the effects behind the pixels that the probes can feel."""
+        return felt(self.stimulus, self.structure, sensor)
 
-        Small errors of the time stamps are far below the steps of the grid; they matter only where their
-        regularities are compared.
-        """
-        fine = FELT * self.stimulus.grid.step
-        lines = max(self.stimulus.width, self.stimulus.height)
-        compared = self.structure.step > 0 or self.structure.line > 0
-        return tuple(e for e in sensor.streams() if compared or delay_of(e, lines) > fine)
+    def ticks(self, sensor: Sensor) -> float | None:
+        """Return what the kernel needs to know of a sensor's clock, see `clock_of`; None for a readout."""
+        return clock_of(self.felt(sensor), self.structure)
 
     def stream(
         self, sensor: Sensor, vector: NDArray[Any], effects: Iterable[StreamEffect], *, seed: int
     ) -> Sums:
-        """Simulate one parameter vector with effects behind the pixels, and sum up what leaves.
+        """Simulate one parameter vector with effects behind the pixels, and sum up what leaves."""
+        return self.stream_all(Order(sensor, np.atleast_2d(vector), seed), [tuple(effects)])
 
-        The pixels are some of a sensor's. A bus that all pixels share is given as much of its bandwidth and
-        of its queue as they are of all pixels: right for streams, not for single collisions.
-        """
-        stimulus = self.stimulus
-        width, height = stimulus.width, stimulus.height
-        bare = replace(sensor, effects=tuple(e for e in sensor.effects if not isinstance(e, StreamEffect)))
-        array = Pixels(
-            bare, width, height, pixels=stimulus.pixels, parameters=np.atleast_2d(vector), seed=seed,
-            device=str(self.device),
-        )  # fmt: skip
-        scene = _Light(stimulus)
-        parts = [array.emit(scene, scene.times)[0], array.flush()[0]]
-        share = len(stimulus.pixels) / (width * height)
-        readers = [scaled(effect, share).reader(width, height, seed) for effect in effects]
-        events = Events.concatenate(parts)
-        until = math.inf
-        for reader in readers:
-            events, until = reader.push(events, until)
-        self.evaluations += 1
-        return self.look(replace(events, t=events.t + stimulus.grid.begin))
+    def stream_all(self, order: Order, effects: Sequence[Sequence[StreamEffect]]) -> Sums:
+        """Simulate models with effects behind the pixels, given for each, and sum up what leaves."""
+        seeds, parts, rows = order.seeds(), [], len(order.vectors)
+        at_once = 1 if order.reseed else STREAMED
+        for first in range(0, rows, at_once):
+            cut = slice(first, first + at_once)
+            left = emitted(self.stimulus, order.sensor, order.vectors[cut], int(seeds[first]))
+            read = zip(left, effects[cut], seeds[cut], strict=True)
+            parts += [sent(self.stimulus, events, behind, int(seed)) for events, behind, seed in read]
+        self.evaluations += rows
+        begins = range(0, rows, STREAMED)
+        return Sums.join([self._look(parts[n : n + STREAMED], order.frame) for n in begins])
 
     def _mine(self, events: Events) -> Events:
         """Return the events of the pixels, within the time that is compared."""
@@ -206,7 +279,9 @@ class Trials:
         at = place[events.y.astype(np.int64) * stimulus.width + events.x]
         inside = at >= 0
         at = at[inside]
-        order = np.argsort(at, kind="stable")
+        # as small integers, which are sorted by their digits
+        small = at.astype(np.uint16) if len(stimulus.pixels) <= 1 << 16 else at
+        order = np.argsort(small, kind="stable")
         time = np.rint((events.t[inside][order] - stimulus.grid.begin) * 1e9).astype(np.int64)
         start = np.concatenate([[0], np.cumsum(np.bincount(at, minlength=len(stimulus.pixels)))])
         return time, events.p[inside][order].astype(np.uint8), start
@@ -214,68 +289,70 @@ class Trials:
     def _group(self) -> int:
         return 1 if self.device.is_cuda else GROUP
 
-    def sink(self, rows: int, *, reseed: bool = False) -> Any:
-        """Return an empty sink."""
+    def sink(self, pixels: Any, ticks: NDArray[np.int64]) -> Any:
+        """Return an empty sink.
+
+        Args:
+            pixels: Counts of each pixel, a Warp array of zeros, shape (B, N, HALVES).
+            ticks: From tick to tick of the clock that stamps events [ps], 0 for none, shape (B,).
+        """
         stimulus, step = self.stimulus, self.stimulus.grid.step
         out = kernels.Probes()
         out.cell = stimulus.array("cell", lambda: stimulus.cell)
         out.level = stimulus.array("level", lambda: stimulus.level)
-        lags = np.rint(np.array(LAG_TIMES) / step).astype(np.int32)
-        out.lags = wp.array(lags, device=self.device)
-        out.middle = wp.array(self.middle, dtype=float, device=self.device)
-        out.classes = wp.array(np.rint(np.array(CLASS_TIMES) / step).astype(np.int32), device=self.device)
+        out.lags = stimulus.array("lags", lambda: np.rint(np.array(LAG_TIMES) / step).astype(np.int32))
+        out.classes = stimulus.array(
+            "classes", lambda: np.rint(np.array(CLASS_TIMES) / step).astype(np.int32)
+        )
+        if self._middle is None or self._middle[0] is not self.middle:
+            self._middle = self.middle, wp.array(self.middle, dtype=float, device=self.device)
+        out.middle = self._middle[1]
         out.half = max(1, round(HALF / step))
         out.step, out.slack = wp.float64(step * 1e9), wp.float64(SLACK * 1e9)
-        out.reseed, out.holes = int(reseed), int(stimulus.holes)
+        out.ticks = wp.array(ticks.astype(np.int64), dtype=wp.int64, device=self.device)
+        out.holes = int(stimulus.holes)
         out.group = self._group()
-        count = len(stimulus.pixels)
+        out.halves = pixels
+        rows, count, _ = pixels.shape
+        out.memory = wp.zeros((rows, count, kernels.MEMORY), dtype=float, device=self.device)
         groups = -(-count // out.group)
-        zeros = (
-            ("memory", count, kernels.MEMORY),
-            ("sums", groups, kernels.SIZE),
-            ("halves", count, kernels.HALVES),
-        )
-        for name, size, numbers in zeros:
-            setattr(out, name, wp.zeros((rows, size, numbers), dtype=float, device=self.device))
+        out.sums = wp.zeros((rows, groups, kernels.SIZE), dtype=float, device=self.device)
         out.team, teams = GROUP, -(-count // GROUP)
         out.clock = wp.zeros((rows, teams, 2 * stimulus.grid.steps), dtype=int, device=self.device)
         return out
 
-    def _totals(self, sink: Any, rows: int) -> Sums:
-        sums = sink.sums
-        if self.device.is_cuda:
-            parts = -(-sums.shape[1] // GROUP)
-            less = wp.empty((rows, parts, kernels.SIZE), dtype=float, device=self.device)
-            inputs = [sums, GROUP, less]
-            launch.run(trials.total, parts * kernels.SIZE, inputs, self.device, batch=rows)
-            sums = less
-        groups = sums.numpy()
-        clock = sink.clock.numpy()
-        return Sums(
-            groups.sum(1, dtype=np.float64), sink.halves.numpy(), groups, clock.sum(1), clock,
-            np.zeros((rows, len(Structure.NAMES))),
-        )  # fmt: skip
+    def _grouped(self, sums: Any) -> Any:
+        """Return the sums over groups of pixels, a Warp array of shape (B, G, SIZE)."""
+        if not self.device.is_cuda:
+            return sums
+        rows, count, size = sums.shape
+        parts = -(-count // GROUP)
+        less = wp.empty((rows, parts, size), dtype=float, device=self.device)
+        launch.run(trials.total, parts * size, [sums, GROUP, less], self.device, batch=rows)
+        return less
+
+    def _clock(self, teams: Any) -> NDArray[np.int32]:
+        """Return the events of each step over all groups, shape (B, 2 T)."""
+        rows, _, steps = teams.shape
+        out = wp.empty((rows, steps), dtype=int, device=self.device)
+        launch.run(kernels.counted, steps, [teams, out], self.device, batch=rows)
+        found: NDArray[np.int32] = out.numpy()
+        return found
 
 
-class _Light(Scene):
-    """The light of a stimulus as a scene, from time 0."""
+def _folded(orders: Sequence[Order], pixels: Any) -> NDArray[np.float64] | None:
+    """Return the counts of pixels folded, as far as it is known for what."""
+    frames = list({id(o.frame): o.frame for o in orders if o.frame is not None}.values())
+    if not frames:
+        return None
+    places = {id(frame): n for n, frame in enumerate(frames)}
+    which = [places.get(id(order.frame), 0) for order in orders]
+    return over_groups(fold(pixels, frames, np.repeat(which, [len(order.vectors) for order in orders])))
 
-    def __init__(self, stimulus: Stimulus):
-        self._stimulus = stimulus
-        self.width, self.height = stimulus.width, stimulus.height
-        self.times: NDArray[np.float64] = np.float64(stimulus.grid.step) * np.arange(stimulus.grid.steps)
-        self.duration = float(self.times[-1])
 
-    def sample_times(self) -> NDArray[np.float64]:
-        return self.times
-
-    def source(self, times: NDArray[np.float64], pixels: NDArray[np.int32], device: Any) -> tuple[str, Any]:
-        out = pixel.Frames()
-        out.values = self._stimulus.array("light", lambda: self._stimulus.intensity.T)
-        return "frames", out
-
-    def frames(self, times: NDArray[np.float64], device: str = "cpu") -> NDArray[np.float32]:
-        raise NotImplementedError("some pixels are no picture")
+def _first(grouped: Any, clock: Any, row: int) -> tuple[NDArray[np.float32], NDArray[np.int32]]:
+    """Return sums and events of each step of the groups of one row."""
+    return grouped[row].numpy().copy(), clock[row].numpy().copy()
 
 
 def whole(sensor: Sensor) -> Sensor:
@@ -285,17 +362,3 @@ def whole(sensor: Sensor) -> Sensor:
         if inside and name not in sensor:
             sensor = sensor.with_effect(effect.identity())
     return sensor
-
-
-def delay_of(effect: StreamEffect, lines: int) -> float:
-    """Return about how late an effect behind the pixels makes events [s]; infinite where it may lose some."""
-    if isinstance(effect, Timestamp):
-        return max(effect.step, effect.jitter)
-    return lines * effect.line if isinstance(effect, RowScan) else math.inf
-
-
-def scaled(effect: StreamEffect, share: float) -> StreamEffect:
-    """Return an effect behind the pixels for a share of them."""
-    if isinstance(effect, Readout):
-        return replace(effect, rate=effect.rate * share, depth=max(1.0, effect.depth * share))
-    return effect

@@ -9,8 +9,8 @@ import numpy as np
 
 from dase.error import Judgement
 from dase.evidence import Evidence, Half
-from dase.kernels.probes import BANDS, CLASSES, INTERVALS, KINDS
-from dase.probes import LAYOUT, LOWEST, MEANS, TONES, ZONES
+from dase.kernels.probes import BANDS, CLASSES, INTERVALS, KINDS, ZONES
+from dase.probes import LAYOUT, LOWEST, MEANS, TONES
 from dase.results import Cell
 from dase.structure import Structure
 from dase.trials import LAG_TIMES

@@ -103,11 +103,15 @@ class Blocks(Writer):
         self.add(head or f"for each in range({self.size}):")
         self.depth += 1
         self.add(lane or f"lane = within(each, {self.size})")
-        self.add("i = start + lane")
+        self.add(self.whose())
         self.add(*(f"{name} = {name}_lanes[lane]" for name in laned if self.is_read(name, lines)))
         self.add(*lines)
         self.add(*(f"{name}_lanes[lane] = {name}" for name in laned if self.is_set(name, lines)))
         self.depth -= 1
+
+    def whose(self) -> str:
+        """Return the line that says what a lane is."""
+        return "i = start + lane"
 
     @staticmethod
     def is_set(name: str, lines: list[str]) -> bool:
@@ -162,11 +166,15 @@ class Blocks(Writer):
     def events(self) -> None:
         """Events of the pixels that have any."""
         self.lanes([f"busy = wp.where({self.busy_when()}, 1.0, 0.0)"])
-        self.add("bits = busy_bits(busy_lanes, new)")
+        self.add(self.which())
         found = f"lane = within(lowest_bit(bits), {self.size})"
         self.lanes(
             ["bits = bits & (bits - 1)", *self.written(self.busy)], head="while bits != 0:", lane=found
         )
+
+    def which(self) -> str:
+        """Return the line that says which lanes have events."""
+        return "bits = busy_bits(busy_lanes, new)"
 
     def put_counts(self) -> None:
         """Hand the counts of a window over."""

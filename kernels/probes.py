@@ -50,11 +50,20 @@ HALVES = 8
 MEMORY = 4
 """Numbers a pixel remembers from event to event."""
 
+ZONES = 4
+"""Rings about the middle of the sensor, of equal numbers of pixels."""
+
+PRODUCTS, ODD, RINGS = 0, 12, 16
+FOLD = RINGS + 4 * ZONES
+"""Places in what the counts of pixels are folded into, and how many numbers there are: products of what is
+not expected in the two halves, pixels that count oddly, events by zone."""
+
 _BANDS, _RESTING, _MASKED = wp.constant(BANDS), wp.constant(RESTING), wp.constant(MASKED)
 _INTERVALS, _LAGS, _CLASSES = wp.constant(INTERVALS), wp.constant(LAGS), wp.constant(CLASSES)
-_CELLS = wp.constant(CELLS)
+_CELLS, _SIZE = wp.constant(CELLS), wp.constant(SIZE)
 _ISI, _LAG, _LAG_COUNT, _CHANGE = (wp.constant(n) for n in (ISI, LAG, LAG_COUNT, CHANGE))
 _REPEAT, _SERIAL = wp.constant(REPEAT), wp.constant(SERIAL)
+_ODD, _RINGS, _FOLD, _ZONES = (wp.constant(n) for n in (ODD, RINGS, FOLD, ZONES))
 
 
 @wp.struct
@@ -70,7 +79,7 @@ class Probes:
     step: wp.float64  # of the grid [ns]
     slack: wp.float64  # times up to this past a grid point belong to it [ns]
     holes: int  # 1 where parts of the time are not compared: then no pair of events reaches across them
-    reseed: int  # 0 for common random numbers in all rows, 1 for other ones in each
+    ticks: wp.array[wp.int64]  # (B,) from tick to tick of the clock that stamps the events [ps]; 0 for none
     group: int  # pixels that share a row of `sums`; one thread works on all of them
     team: int  # pixels that share a row of `clock`
     memory: wp.array3d[float]  # (B, N, MEMORY)
@@ -79,38 +88,49 @@ class Probes:
     clock: wp.array3d[int]  # (B, G, 2 T) OFF, ON events of each step
 
 
-@wp.func
-def octave(steps: int) -> int:
-    """Bin of an interval."""
-    at = int(0)
-    top = int(0)
-    while steps > top and at < _INTERVALS - 1:
-        at += 1
-        top = wp.max(2 * top, 1)
-    return at
+@wp.func_native("a.data[place] += value;")
+def plus(a: wp.array3d[float], place: int, value: float):
+    """Add to what one thread owns; Warp's own look-up takes most of the time of an event."""
+    ...
+
+
+@wp.func_native("return a.data[place];")
+def at_place(a: wp.array2d[float], place: int) -> float:
+    """Return what lies at a place of a contiguous array."""
+    ...
+
+
+@wp.func_native(
+    """
+#ifdef __CUDA_ARCH__
+    const int zeros = __clz(steps - 1);
+#else
+    const int zeros = steps > 1 ? __builtin_clz((unsigned)(steps - 1)) : 32;
+#endif
+    const int at = steps > 0 ? 33 - zeros : 0;
+    return at < last ? at : last;
+"""
+)
+def octave(steps: int, last: int) -> int:
+    """Bin of an interval, at most `last`."""
+    ...
 
 
 @wp.func
-def add(sink: Probes, row: int, i: int, place: int, value: float):
-    """Add to one sum of the pixel's group, which one thread owns."""
-    g = i / sink.group
-    sink.sums[row, g, place] = sink.sums[row, g, place] + value
-
-
-@wp.func
-def observe_light(sink: Probes, row: int, i: int, k: int, band: int, sign: float):
+def observe_light(sink: Probes, base: int, i: int, k: int, band: int, sign: float):
     """How the light went before the event: bandwidth and latency."""
     end = sink.level.shape[1] - 1
-    newer = sink.level[i, wp.clamp(k - sink.lags[0], 0, end)]
+    first = i * sink.level.shape[1]
+    newer = at_place(sink.level, first + wp.clamp(k - sink.lags[0], 0, end))
     for n in range(_LAGS):
-        older = sink.level[i, wp.clamp(k - sink.lags[n + 1], 0, end)]
-        add(sink, row, i, _LAG + n * _BANDS + band, sign * (newer - older))
+        older = at_place(sink.level, first + wp.clamp(k - sink.lags[n + 1], 0, end))
+        plus(sink.sums, base + _LAG + n * _BANDS + band, sign * (newer - older))
         newer = older
-    add(sink, row, i, _LAG_COUNT + band, 1.0)
+    plus(sink.sums, base + _LAG_COUNT + band, 1.0)
 
 
 @wp.func
-def observe_pair(sink: Probes, row: int, i: int, k: int, before: int, now: int, last: int, deviation: float):
+def observe_pair(sink: Probes, base: int, i: int, k: int, before: int, now: int, last: int, deviation: float):
     """How the light changed since the pixel's last event; returns the deviation from what is typical."""
     steps = k - before
     group = int(0)
@@ -119,14 +139,15 @@ def observe_pair(sink: Probes, row: int, i: int, k: int, before: int, now: int, 
     if steps > sink.classes[1]:
         group = 2
     pair = (2 * now + last) * _CLASSES + group
-    change = float(2 * now - 1) * (sink.level[i, k] - sink.level[i, before])
+    first = i * sink.level.shape[1]
+    change = float(2 * now - 1) * (at_place(sink.level, first + k) - at_place(sink.level, first + before))
     apart = change - sink.middle[pair]
-    add(sink, row, i, _CHANGE + 3 * pair, 1.0)
-    add(sink, row, i, _CHANGE + 3 * pair + 1, change)
-    add(sink, row, i, _CHANGE + 3 * pair + 2, wp.abs(apart))
+    plus(sink.sums, base + _CHANGE + 3 * pair, 1.0)
+    plus(sink.sums, base + _CHANGE + 3 * pair + 1, change)
+    plus(sink.sums, base + _CHANGE + 3 * pair + 2, wp.abs(apart))
     if deviation > -1.0e5:
-        add(sink, row, i, _SERIAL + 2 * group, 1.0)
-        add(sink, row, i, _SERIAL + 2 * group + 1, wp.clamp(apart, -1.0, 1.0) * deviation)
+        plus(sink.sums, base + _SERIAL + 2 * group, 1.0)
+        plus(sink.sums, base + _SERIAL + 2 * group + 1, wp.clamp(apart, -1.0, 1.0) * deviation)
     return wp.clamp(apart, -1.0, 1.0)
 
 
@@ -142,7 +163,10 @@ def joined(sink: Probes, i: int, before: int, k: int):
 @wp.func
 def observe(sink: Probes, row: int, i: int, time: wp.int64, now: int):
     """Look at one event of pixel `i`, `time` [ns] after the begin of the grid, `now` 1 for ON."""
-    at = (wp.float64(time) - sink.slack) / sink.step
+    stamp = time
+    if sink.ticks[row] > wp.int64(0):
+        stamp = wp.int64(1000) * time / sink.ticks[row] * sink.ticks[row] / wp.int64(1000)
+    at = (wp.float64(stamp) - sink.slack) / sink.step
     k = int(wp.ceil(at))
     if k < 0 or k >= sink.cell.shape[1]:
         return
@@ -154,26 +178,29 @@ def observe(sink: Probes, row: int, i: int, time: wp.int64, now: int):
     if before != k:
         run = 1.0
     apart = float(-1.0e6)
+    # the group's sums, which one thread owns
+    base = (row * sink.sums.shape[1] + i / sink.group) * _SIZE
     if cell != _MASKED:
         band = cell % _BANDS
         kind = cell / _BANDS
-        add(sink, row, i, now * _CELLS + cell, 1.0)
+        plus(sink.sums, base + now * _CELLS + cell, 1.0)
         rest = int(0)
         if kind < _RESTING:
             rest = 1
         else:
-            observe_light(sink, row, i, k, band, float(2 * now - 1))
+            observe_light(sink, base, i, k, band, float(2 * now - 1))
         if before >= 0 and (sink.holes == 0 or joined(sink, i, before, k)):
             kinship = int(2)
             if now == last:
                 kinship = now
-            add(sink, row, i, _ISI + (3 * rest + kinship) * _INTERVALS + octave(k - before), 1.0)
-            apart = observe_pair(sink, row, i, k, before, now, last, deviation)
-        add(sink, row, i, _REPEAT + 3 * band, 1.0)
+            interval = octave(k - before, _INTERVALS - 1)
+            plus(sink.sums, base + _ISI + (3 * rest + kinship) * _INTERVALS + interval, 1.0)
+            apart = observe_pair(sink, base, i, k, before, now, last, deviation)
+        plus(sink.sums, base + _REPEAT + 3 * band, 1.0)
         if run >= 2.0:
-            add(sink, row, i, _REPEAT + 3 * band + 1, 1.0)
+            plus(sink.sums, base + _REPEAT + 3 * band + 1, 1.0)
         if run >= 3.0:
-            add(sink, row, i, _REPEAT + 3 * band + 2, 1.0)
+            plus(sink.sums, base + _REPEAT + 3 * band + 2, 1.0)
         half = 4 * rest + 2 * ((k / sink.half) % 2) + now
         sink.halves[row, i, half] = sink.halves[row, i, half] + 1.0
         wp.atomic_add(sink.clock, row, i / sink.team, now * sink.cell.shape[1] + k, 1)
@@ -198,3 +225,96 @@ def walk(
     i += first
     for n in range(start[row, i], start[row, i + 1]):
         observe(sink, row, i, time[n], int(polarity[n]))
+
+
+@wp.kernel(enable_backward=False)
+def fold(
+    # in
+    first: int,
+    halves: wp.array3d[float],  # (B, N, HALVES)
+    expected: wp.array3d[float],  # (K, N, HALVES) what the present model expects
+    frame: wp.array[int],  # (B,) which of those a row is compared with
+    zone: wp.array[int],  # (N,)
+    often: float,  # events at rest of a pixel that is called hot
+    seen: float,  # events that are expected of a pixel which is called silent if it sends none
+    team: int,  # pixels that one thread adds up
+    # out
+    out: wp.array3d[float],  # (B, G, FOLD)
+):
+    """Fold the counts of the pixels of each group into a few sums."""
+    row, g = wp.tid()
+    g += first
+    of = frame[row]
+    sums = wp.vector(length=wp.static(FOLD), dtype=float)
+    for i in range(g * team, wp.min((g + 1) * team, halves.shape[1])):
+        rest = float(0.0)
+        usual = float(0.0)
+        every = float(0.0)
+        all_usual = float(0.0)
+        for state in range(2):
+            for n in range(4):
+                count = halves[row, i, 4 * state + n]
+                mean = expected[of, i, 4 * state + n]
+                every += count
+                all_usual += mean
+                if state == 1:
+                    rest += count
+                    usual += mean
+            a_off = halves[row, i, 4 * state] - expected[of, i, 4 * state]
+            a_on = halves[row, i, 4 * state + 1] - expected[of, i, 4 * state + 1]
+            b_off = halves[row, i, 4 * state + 2] - expected[of, i, 4 * state + 2]
+            b_on = halves[row, i, 4 * state + 3] - expected[of, i, 4 * state + 3]
+            sums[6 * state] += a_off * b_off
+            sums[6 * state + 1] += a_off * b_on
+            sums[6 * state + 2] += a_on * b_off
+            sums[6 * state + 3] += a_on * b_on
+            sums[6 * state + 4] += a_off * a_off + b_off * b_off
+            sums[6 * state + 5] += a_on * a_on + b_on * b_on
+            for p in range(2):
+                ring = _RINGS + (2 * state + p) * _ZONES + zone[i]
+                sums[ring] += halves[row, i, 4 * state + p] + halves[row, i, 4 * state + 2 + p]
+        bound = usual + 4.0 * wp.sqrt(usual + 1.0)
+        if rest > bound + 2.0:
+            sums[_ODD] += 1.0
+        if rest > bound + often:
+            sums[_ODD + 1] += 1.0
+        if every > 3.0 * all_usual + 20.0:
+            sums[_ODD + 2] += 1.0
+        if every == 0.0 and all_usual >= seen:
+            sums[_ODD + 3] += 1.0
+    for n in range(_FOLD):
+        out[row, g, n] = sums[n]
+
+
+@wp.kernel(enable_backward=False)
+def together(
+    # in
+    first: int,
+    parts: wp.array3d[float],  # (B, G, K)
+    # out
+    out: wp.array2d[wp.float64],  # (B, K)
+):
+    """Add up what groups of pixels have."""
+    row, k = wp.tid()
+    k += first
+    value = wp.float64(0.0)
+    for g in range(parts.shape[1]):
+        value += wp.float64(parts[row, g, k])
+    out[row, k] = value
+
+
+@wp.kernel(enable_backward=False)
+def counted(
+    # in
+    first: int,
+    parts: wp.array3d[int],  # (B, G, K)
+    # out
+    out: wp.array2d[int],  # (B, K)
+):
+    """Add up what groups of pixels have counted."""
+    row, k = wp.tid()
+    k += first
+    value = int(0)
+    for g in range(parts.shape[1]):
+        value += parts[row, g, k]
+    out[row, k] = value

@@ -9,14 +9,20 @@ light of the pixel does not change. And an event is not stored but looked at, se
 from __future__ import annotations
 
 import math
+import re
+from collections.abc import Callable
 from functools import lru_cache
 
 import warp as wp
 
 from dase.kernels import pixel
+from dase.kernels.blocks import Blocks
 from dase.kernels.compose import compiled
 from dase.kernels.probes import Probes, observe
 from dase.kernels.writer import VOLTAGE, Writer
+
+LANES = 16
+"""Models of a pixel that a CPU thread works on side by side."""
 
 
 @wp.struct
@@ -31,19 +37,19 @@ class History:
 
 
 @lru_cache(maxsize=64)
-def compose(stages: tuple[pixel.Stages, ...]) -> wp.Kernel:
-    """Return the kernel of all models with these effects, over (B, N) threads.
+def compose(stages: tuple[pixel.Stages, ...], *, lanes: int = 1) -> wp.Kernel:
+    """Return the kernel of all models with these effects, over (blocks of `lanes` models, N) threads.
 
-    Its arguments are `first`, a `History`, pixels (N,), width, height, seed, parameters (B, P), maps
+    Its arguments are `first`, a `History`, pixels (N,), width, height, seeds (B,), parameters (B, P), maps
     (M, N) where an effect has any, `Probes`.
     """
-    writer = _Writer(stages)
+    writer = _Lanes(stages) if lanes > 1 else _Threads(stages)
     return compiled(writer.kernel(), "pixel_trials", writer.scope)
 
 
-def source_text(stages: tuple[pixel.Stages, ...]) -> str:
+def source_text(stages: tuple[pixel.Stages, ...], *, lanes: int = 1) -> str:
     """Return the text of the kernel that `compose` compiles."""
-    return _Writer(stages).kernel()
+    return (_Lanes(stages) if lanes > 1 else _Threads(stages)).kernel()
 
 
 def _number(value: float) -> str:
@@ -78,47 +84,34 @@ def total(
     out[row, part, place] = value
 
 
-class _Writer(Writer):
-    """Writes the text of the kernel."""
-
-    def __init__(self, stages: tuple[pixel.Stages, ...]):
-        super().__init__(stages, "frames", "keys", cuda=False)
-        self.scope |= {"Source": History, "Sink": Probes, "observe": observe, "instant": instant}
-
-    def unless_off(self, effect: pixel.Stages, *lines: str) -> list[str]:
-        if not effect.off:
-            return list(lines)
-        return [f"if {effect.name}_acts:", *(f"    {line}" for line in lines)]
+class _Trials(Writer):
+    """What the kernels of many models have in common, whatever runs side by side."""
 
     def head(self) -> list[str]:
         return [
             "def pixel_trials(first: int, source: Source, pixels: wp.array[int], width: int, height: int,",
-            "                 seed_in: int, parameters: wp.array2d[float],",
+            "                 seeds: wp.array[int], parameters: wp.array2d[float],",
             *(["                 maps: wp.array2d[float],"] if self.maps else []),
             "                 sink: Sink):",
         ]
 
-    def begin(self) -> None:
-        super().begin()
-        self.add("seed = seed_in + row * sink.reseed")
+    def unless_off(self, effect: pixel.Stages, *lines: str) -> list[str]:
+        if not effect.off:
+            return list(lines)
+        return [f"if {effect.name}_acts != 0:", *(f"    {line}" for line in lines)]
 
-    def pixel(self) -> None:
-        super().pixel()
-        for effect in self.stages:
-            differs = [f"{effect.name}_{p} != {_number(value)}" for p, value in effect.off]
-            self.add(*([f"{effect.name}_acts = {' or '.join(differs)}"] if differs else []))
-        self.add("begin_at = source.start[i]", "end_at = source.start[i + 1]")
-
-    def ahead(self) -> None:
-        """Samples of one pixel lie side by side in memory."""
+    def acts(self, effect: pixel.Stages) -> list[str]:
+        """Return the line that says whether an effect is on."""
+        differs = " or ".join(f"{effect.name}_{p} != {_number(value)}" for p, value in effect.off)
+        return [f"{effect.name}_acts = wp.where({differs}, 1, 0)"] if differs else []
 
     def restore(self) -> None:
         self.add(*(f"{name} = float(0.0)" for name in self.states))
-        self.add("stamp = int(0)", *(["leaving = 0.0"] if "leaving" in self.states else []))
+        self.add(*(["leaving = 0.0"] if "leaving" in self.states else []))
 
     def loop(self) -> None:
         """One sample after the other."""
-        self.add("for k in range(begin_at, end_at):")
+        self.add("stamp = int(0)", "for k in range(begin_at, end_at):")
         self.depth += 1
         self.add(
             "steps = source.stamp[k] - stamp", "dt = float(steps) * source.step", "sample = k - begin_at"
@@ -126,12 +119,13 @@ class _Writer(Writer):
         self.add("if sample == 0:", f"    dt = {pixel.REST}")
         if self.asks("t") or self.asks("t64"):
             self.add("t64 = wp.float64(source.stamp[k]) * wp.float64(source.step)", "t = float(t64)")
-        self.add("intensity = source.intensity[k]", "voltage = source.voltage[k]")
+        self.add("seen = source.intensity[k]", "level = source.voltage[k]")
+        self.part(lambda: self.add("intensity = seen + 0.0", "voltage = level + 0.0"))
         self.light()
         lights = [effect for effect, _ in self.of("light")]
         if lights:
-            acts = [f"{effect.name}_acts" if effect.off else "True" for effect in lights]
-            self.add(f"if {' or '.join(acts)}:", f"    {VOLTAGE}")
+            acts = " or ".join(f"{effect.name}_acts != 0" if effect.off else "True" for effect in lights)
+            self.part(lambda: self.add(f"if {acts}:", f"    {VOLTAGE}"))
         self.respond()
         self.sample()
         self.add("stamp = source.stamp[k]")
@@ -145,3 +139,118 @@ class _Writer(Writer):
 
     def keep(self, time: str, polarity: str, label: str) -> str:
         return f"observe(sink, row, i, {time}, {polarity})"
+
+
+SCOPE = {"Source": History, "Sink": Probes, "observe": observe, "instant": instant}
+
+
+class _Threads(_Trials):
+    """Writes the text of the kernel for CUDA: one model of one pixel per thread."""
+
+    def __init__(self, stages: tuple[pixel.Stages, ...]):
+        super().__init__(stages, "frames", "keys", cuda=False)
+        self.scope |= SCOPE
+
+    def begin(self) -> None:
+        super().begin()
+        self.add("seed = seeds[row]")
+
+    def pixel(self) -> None:
+        super().pixel()
+        for effect in self.stages:
+            self.add(*self.acts(effect))
+        self.add("begin_at = source.start[i]", "end_at = source.start[i + 1]")
+
+    def ahead(self) -> None:
+        """Samples of one pixel lie side by side in memory."""
+
+
+class _Lanes(_Trials, Blocks):
+    """Writes the text of the kernel for a CPU: a thread works on one pixel of several models.
+
+    They see the same light, so its samples are read once, and what becomes of it is worked out in the CPU's
+    own vectors. What none of the models of a thread has is skipped.
+    """
+
+    def __init__(self, stages: tuple[pixel.Stages, ...]):
+        Blocks.__init__(self, stages, "frames", "keys", lanes=LANES)
+        self.scope |= SCOPE
+
+    def types(self) -> dict[str, str]:
+        floats = ["on", "off", "mean_on", "mean_off", "nominal_on", "nominal_off", "intensity", "voltage"]
+        floats += ["before", "after", "leaked_before", "busy", *self.states, *self.places]
+        floats += [f"{effect.name}_{q}" for effect, _ in self.of("noise") for q in ("on", "off", "spend")]
+        floats += [local for local in self.draws if self.once(local)]
+        ints = [*(f"{effect.name}_acts" for effect in self.stages), *(f"{local}_key" for local in self.draws)]
+        kinds = {"Floats": floats, "Ints": ints, "Longs": ["leaves"]}
+        return {name: kind for kind, names in kinds.items() for name in names}
+
+    def part(self, write: Callable[[], None], *, when: str = "", then: tuple[str, ...] = ()) -> None:
+        # models differ in their phase; one of 0 changes nothing
+        super().part(write, when=when.removesuffix(" and phase != 0.0"), then=then)
+
+    def start_noise(self, effect: pixel.Stages) -> None:
+        """Lanes are 0 where nothing has been written."""
+
+    def whose(self) -> str:
+        return "row = start + lane"
+
+    def which(self) -> str:
+        return "bits = busy_bits(busy_lanes, 0) & mine"
+
+    def lanes(self, lines: list[str], *, head: str = "", lane: str = "") -> None:
+        """Write lines for one lane after the other; those of effects that no lane has are skipped."""
+        if head:
+            super().lanes(lines, head=head, lane=lane)
+            return
+        for guards, part in _guarded(lines):
+            if guards:
+                self.add(f"if {' or '.join(f'{name}_some != 0' for name in guards)}:")
+                self.depth += 1
+            super().lanes(part)
+            self.depth -= bool(guards)
+
+    def prologue(self) -> None:
+        """What the models know of the pixel before its first sample."""
+        start = self.starts()
+        self.add("block, i = wp.tid()", "i += first", f"start = block * {self.size}")
+        self.add("last = parameters.shape[0] - 1")
+        self.add(f"mine = (1 << wp.min({self.size}, last + 1 - start)) - 1")
+        self.add("pixel = pixels[i]", "x = pixel % width", "y = pixel / width")
+        self.add("begin_at = source.start[i]", "end_at = source.start[i + 1]")
+        self.add(*(f"{name}_lanes = {kind}()" for name, kind in self.types().items()))
+        self.add(*(f"{effect.name}_some = int(0)" for effect in self.stages))
+        self.where()
+
+        def own() -> None:
+            self.add("of = wp.min(start + lane, last)", "seed = seeds[of]")
+            self.add(*(f"{name} = parameters[of, {at}]" for name, at in self.places.items()))
+            self.add("nominal_on = on", "nominal_off = off")
+            for effect in self.stages:
+                acts = self.acts(effect)
+                self.add(*acts)
+                self.add(
+                    f"{effect.name}_some = {effect.name}_some | {effect.name}_acts"
+                    if acts
+                    else f"{effect.name}_some = int(1)"
+                )
+            self.own_draws()
+            self.add(*start)
+
+        Blocks.lanes(self, self.written(own))
+
+
+def _guarded(lines: list[str]) -> list[tuple[list[str], list[str]]]:
+    """Split lines into runs, each with the effects of which one must act for it to do anything."""
+    runs: list[tuple[list[str], list[str]]] = []
+    for line in lines:
+        if line.startswith((" ", "elif", "else")):
+            runs[-1][1].append(line)
+            continue
+        asked = re.fullmatch(r"if (\w+_acts != 0(?: or \w+_acts != 0)*):", line)
+        guards = re.findall(r"(\w+)_acts", asked.group(1)) if asked else []
+        if runs and not guards and not runs[-1][0]:
+            runs[-1][1].append(line)
+        else:
+            runs.append((guards, [line]))
+    return runs

@@ -70,11 +70,19 @@ class Writer(Crossings):
 
     def own(self) -> None:
         """What differs from pixel to pixel before any light comes."""
-        self.add(*(f"{name} = maps[{at}, i]" for at, name in enumerate(self.maps)))
+        self.where()
+        self.own_draws()
+
+    def own_draws(self) -> None:
+        """The pixel's own random numbers."""
         for local, kind in self.draws.items():
             self.add(f"{local}_key = key(seed, {stream(local)}, pixel)")
             if self.once(local):
                 self.add(f"{local} = {kind}({local}_key, 0)")
+
+    def where(self) -> None:
+        """What depends on where the pixel is."""
+        self.add(*(f"{name} = maps[{at}, i]" for at, name in enumerate(self.maps)))
         if self.asks("radius"):
             self.add(
                 "middle = wp.vec2(float(x) - 0.5 * float(width - 1), float(y) - 0.5 * float(height - 1))"
@@ -271,8 +279,8 @@ class Writer(Crossings):
         """What is left when the step is over."""
         for effect, _ in self.of("noise"):
             n = effect.name
-            self.add(f"{n}_left = {n}_hazard - {n}_spend", f"{n}_rest = {n}_spend - ({n}_hazard - {n}_left)")
-            self.add(f"{n}_hazard = {n}_left")
+            left = f"{n}_left = {n}_hazard - {n}_spend", f"{n}_rest = {n}_spend - ({n}_hazard - {n}_left)"
+            self.add(*self.unless_off(effect, *left, f"{n}_hazard = {n}_left"))
         self.add("signal = voltage")
         if "age" in self.states:
             self.add("age += dt")

@@ -9,6 +9,7 @@ from typing import ClassVar
 import warp as wp
 
 from dase.effects.base import Effect, parameter
+from dase.kernels.lanes import circle
 
 
 @wp.func
@@ -17,7 +18,8 @@ def lamp(intensity: float, t64: wp.float64, frequency: float, depth: float, phas
     # float32 resolves no more than a quarter of a millisecond after an hour
     turns = wp.float64(frequency) * t64
     turn = float(turns - wp.floor(turns)) + phase
-    return intensity * (1.0 + depth * wp.sin(2.0 * wp.pi * turn))
+    _cosine, sine = circle(turn - wp.floor(turn))
+    return intensity * (1.0 + depth * sine)
 
 
 @dataclass(frozen=True, kw_only=True)

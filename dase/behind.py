@@ -1,0 +1,115 @@
+"""What is behind the pixels of a model under trial: what the probes feel of it, events that go through."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dase.effects.readout import Readout
+from dase.effects.row_scan import RowScan
+from dase.effects.stream import StreamEffect
+from dase.effects.timestamp import Timestamp
+from dase.events import Events
+from dase.kernels import pixel
+from dase.outlet import rows_of
+from dase.pixels import Pixels
+from dase.scene import Scene
+from dase.sensor import Sensor
+from dase.stimulus import Stimulus
+from dase.structure import Structure
+
+FELT = 0.25
+"""Delays below this share of a step of the grid are not felt."""
+
+
+def felt(stimulus: Stimulus, structure: Structure, sensor: Sensor) -> tuple[StreamEffect, ...]:
+    """Return the effects behind the pixels that the probes can feel.
+
+    Small errors of the time stamps are far below the steps of the grid; they matter only where their
+    regularities are compared.
+    """
+    fine = FELT * stimulus.grid.step
+    lines = max(stimulus.width, stimulus.height)
+    compared = structure.step > 0 or structure.line > 0
+    return tuple(e for e in sensor.streams() if compared or delay_of(e, lines) > fine)
+
+
+def clock_of(effects: tuple[StreamEffect, ...], structure: Structure) -> float | None:
+    """Return the ticks of a clock that is all the probes feel behind the pixels [s], 0 for nothing.
+
+    The kernel stamps events by such a clock itself. None where events have to be stored and go through what
+    is behind the pixels.
+    """
+    if not effects:
+        return 0.0
+    clock = effects[0]
+    if len(effects) > 1 or not isinstance(clock, Timestamp) or clock.jitter or not clock.step:
+        return None
+    same = structure.line == 0 and structure.step in (0.0, clock.step)
+    return clock.step if same else None
+
+
+def emitted(stimulus: Stimulus, sensor: Sensor, vectors: NDArray[Any], seed: int) -> list[Events]:
+    """Return the events that leave the pixels, of each model."""
+    bare = replace(sensor, effects=tuple(e for e in sensor.effects if not isinstance(e, StreamEffect)))
+    array = Pixels(
+        bare, stimulus.width, stimulus.height, pixels=stimulus.pixels, parameters=vectors, seed=seed,
+        device=str(stimulus.device),
+    )  # fmt: skip
+    scene = _Light(stimulus)
+    parts = [rows_of(*found, array.batch) for found in (array.emit(scene, scene.times), array.flush())]
+    return [Events.concatenate(list(row)) for row in zip(*parts, strict=True)]
+
+
+def sent(stimulus: Stimulus, events: Events, effects: Iterable[StreamEffect], seed: int) -> Events:
+    """Return what leaves the sensor.
+
+    The pixels are some of a sensor's. A bus that all pixels share is given as much of its bandwidth and of
+    its queue as they are of all pixels: right for streams, not for single collisions.
+    """
+    until = math.inf
+    share = len(stimulus.pixels) / (stimulus.width * stimulus.height)
+    for effect in effects:
+        reader = scaled(effect, share).reader(stimulus.width, stimulus.height, seed)
+        events, until = reader.push(events, until)
+    return replace(events, t=events.t + stimulus.grid.begin)
+
+
+class _Light(Scene):
+    """The light of a stimulus as a scene, from time 0."""
+
+    def __init__(self, stimulus: Stimulus):
+        self._stimulus = stimulus
+        self.width, self.height = stimulus.width, stimulus.height
+        self.times: NDArray[np.float64] = np.float64(stimulus.grid.step) * np.arange(stimulus.grid.steps)
+        self.duration = float(self.times[-1])
+
+    def sample_times(self) -> NDArray[np.float64]:
+        return self.times
+
+    def source(self, times: NDArray[np.float64], pixels: NDArray[np.int32], device: Any) -> tuple[str, Any]:
+        out = pixel.Frames()
+        out.values = self._stimulus.array("light", lambda: self._stimulus.intensity.T)
+        return "frames", out
+
+    def frames(self, times: NDArray[np.float64], device: str = "cpu") -> NDArray[np.float32]:
+        raise NotImplementedError("some pixels are no picture")
+
+
+def delay_of(effect: StreamEffect, lines: int) -> float:
+    """Return about how late an effect behind the pixels makes events [s]; infinite where it may lose some."""
+    if isinstance(effect, Timestamp):
+        return max(effect.step, effect.jitter)
+    return lines * effect.line if isinstance(effect, RowScan) else math.inf
+
+
+def scaled(effect: StreamEffect, share: float) -> StreamEffect:
+    """Return an effect behind the pixels for a share of them."""
+    if isinstance(effect, Readout):
+        return replace(effect, rate=effect.rate * share, depth=max(1.0, effect.depth * share))
+    return effect
