@@ -11,7 +11,7 @@ torch = pytest.importorskip("torch", reason="the bridge needs torch")
 
 from dase.images import Picture  # noqa: E402
 from dase.kernels import launch  # noqa: E402
-from dase.kernels.autograd import affine_places, render  # noqa: E402
+from dase.kernels.autograd_scene import affine_places, render  # noqa: E402
 from dase.layers import Layer, LayerScene, Motion  # noqa: E402
 
 WIDTH, HEIGHT = 40, 30
