@@ -22,6 +22,8 @@ EPS = 1e-3
 """Added to intensities before the logarithm between frames; that of sensors unless they say otherwise."""
 TITLES = re.compile(rb"LIST(.{4})INFO", re.DOTALL)
 """A list of titles in an AVI, with its length [bytes]."""
+LONGEST = 1 << 24
+"""Bytes of titles that do no harm, whatever a damaged file claims."""
 PLAIN = 0, int.from_bytes(b"BGR\x18", "little")
 """Code and pixels of an uncompressed AVI: OpenCV 5.0 writes beyond its memory where it turns one over."""
 PIECE = 1 << 22
@@ -201,7 +203,7 @@ class FrameReader:
 
 
 def _refuse_titles(path: Path) -> None:
-    """Raise InputError where a list of titles in an AVI says that it is longer than the file.
+    """Raise InputError where a list of titles in an AVI says that it is far longer than the file.
 
     FFmpeg takes as much memory as such a list says, and fills it with zeros, before it reads what is there.
     It follows damaged sizes to wherever they lead, so the list may lie anywhere.
@@ -215,7 +217,7 @@ def _refuse_titles(path: Path) -> None:
             kept += more
             for found in TITLES.finditer(kept):
                 claimed = int.from_bytes(found[1], "little")
-                if claimed > length:
+                if claimed > max(length, LONGEST):
                     sizes = f"{claimed:,} bytes of titles in a file of {length:,}"
                     raise InputError(f"video {path} is damaged: it claims {sizes}")
             kept = kept[-11:]  # all but one byte of what is looked for

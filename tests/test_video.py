@@ -133,9 +133,9 @@ def test_an_avi_from_parts_is_its_frames(tmp_path, rng, width, options):
     np.testing.assert_allclose(got.frame_times, np.arange(4) / 25)
 
 
-@pytest.mark.parametrize("claimed", [10_000, 1 << 29, 0x7FFFFFFF, 0xB300001A, 0xFFFFFFF0, 0xFFFFFFFF])
+@pytest.mark.parametrize("claimed", [(1 << 24) + 1, 1 << 29, 0x7FFFFFFF, 0xB300001A, 0xFFFFFFF0, 0xFFFFFFFF])
 @pytest.mark.parametrize("where", ["first", "last"])
-def test_titles_longer_than_their_file_are_refused(tmp_path, rng, claimed, where):
+def test_titles_far_longer_than_their_file_are_refused(tmp_path, rng, claimed, where):
     path = tmp_path / "a.avi"
     path.write_bytes(avi(rng.integers(0, 256, (4, 6, 8), np.uint8), **{where: titles(claimed)}))
     sentence = f"it claims {claimed:,} bytes of titles in a file of {path.stat().st_size:,}$"
@@ -163,6 +163,13 @@ def test_dropped_frames_are_skipped(tmp_path, rng):
     content = avi(grey)
     second = content.index(b"00db", content.index(b"00db") + 1)
     path.write_bytes(content[:second] + chunk(b"00db", b"") + chunk(b"00db", bytes(10)) + content[second:])
+    np.testing.assert_array_equal(dase.io.read(path).frames, grey)
+
+
+@pytest.mark.parametrize("claimed", [40, 10_000, 1 << 24])
+def test_titles_little_longer_than_their_file_are_no_harm(tmp_path, rng, claimed):
+    grey, path = rng.integers(0, 256, (4, 6, 8), np.uint8), tmp_path / "a.avi"
+    path.write_bytes(avi(grey, last=titles(claimed)))
     np.testing.assert_array_equal(dase.io.read(path).frames, grey)
 
 
