@@ -56,5 +56,7 @@ def fit_added(
     # far from where it is, a descent could end in the wrong place
     present.rebase(evidence.scout, repeats=16, seed=seed + 200)
     start = scout(evidence, present, effect, seed=seed).model.sensor
-    how = {"trust": trust, "pixels": pixels, "seed": seed, "device": device, "progress": progress}
-    return before, fit(events, scene, start, **how)  # type: ignore[arg-type]
+    fitted = fit(
+        events, scene, start, trust=trust, pixels=pixels, seed=seed, device=device, progress=progress
+    )
+    return before, fitted
