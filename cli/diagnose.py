@@ -88,13 +88,12 @@ def command(
     announced unless it brings the error to what two repeats of the recording would give.
     """
     from dase import edit
-    from dase.config import read_sensor
     from dase.diagnosis import MOST, diagnose
     from dase.effect_files import known_effects
     from dase.io import replacing
 
     known = known_effects(effects)
-    text = edit.SensorText(*read_sensor(sensor), known)
+    text = edit.read(sensor, known)
     model = text.sensor()
     measured = open_recorded(recording, scene, file, fps)
     names = free.split(",") if free else None

@@ -46,11 +46,10 @@ def command(
     """
     from dase import edit
     from dase.cli.diagnose import bar
-    from dase.config import read_sensor
     from dase.effect_files import known_effects
     from dase.fitting import fit
 
-    text = edit.SensorText(*read_sensor(sensor), known_effects(effects))
+    text = edit.read(sensor, known_effects(effects))
     model = text.sensor()
     measured = open_recorded(recording, scene, file, fps)
     with bar(quiet) as tell:

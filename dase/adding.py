@@ -46,6 +46,7 @@ def fit_added(
         Held-out error of the sensor without the effect, fitted as well as it can be, and the fit with it.
     """
     tell = progress or (lambda text, share, error: None)
+    sensor, effect = sensor.bound_to(scene), effect.bound_to(scene)
     evidence = gather(
         events, scene, log_eps=sensor.log_eps, trust=trust, pixels=pixels, seed=seed, device=device
     )
