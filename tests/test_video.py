@@ -10,6 +10,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from reference_io import PEAK
 from reference_video import avi, chunk, titles
 
 import dase
@@ -182,10 +183,8 @@ def test_titles_that_a_cut_left_half_are_no_harm(tmp_path, rng):
 def test_a_damaged_video_takes_little_memory_and_says_nothing_else(tmp_path, rng):
     """FFmpeg fills what titles claim with zeros: half a gigabyte here, were it let to."""
     script = """
-import pathlib, re, sys
+import sys
 import dase.io, dase.video
-def peak():
-    return int(re.search(r"VmHWM:\\s+(\\d+)", pathlib.Path("/proc/self/status").read_text())[1]) / 1024
 before, sentence = peak(), "read"
 try:
     dase.io.read(sys.argv[1])
@@ -203,7 +202,7 @@ print(peak() - before, sentence)
         (avi(grey).replace(b"hdrl", b"hdxl"), "cannot be decoded|at least 2 frames|^read$"),
     ):
         path.write_bytes(damaged)
-        command = [sys.executable, "-c", script, str(path)]
+        command = [sys.executable, "-c", PEAK + script, str(path)]
         done = subprocess.run(command, capture_output=True, text=True, check=True)
         assert done.stderr == ""
         grown, said = done.stdout.split(" ", 1)
