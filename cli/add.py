@@ -52,14 +52,13 @@ def command(
     The effect gets its default values and goes where it acts. The change is noted at the end of the file.
     """
     from dase import edit
-    from dase.config import read_sensor
     from dase.effect_files import known_effects
     from dase.effects import find
 
     values = dict(split(setting) for setting in settings)
     known = known_effects(effects)
     chosen = edit.parse_values(find(effect, known), values)
-    text = edit.SensorText(*read_sensor(sensor), known)
+    text = edit.read(sensor, known)
     more = text.added(chosen)
     entry = edit.today(f"add {effect}")
     if recording is not None:

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import click
 
-from dase.cli.options import check_suffix, effects_option, fps_option, open_recorded
+from dase.cli.options import check_suffix, effects_option, fps_option, open_recorded, scene_option
 
 
 @click.command()
@@ -21,10 +21,7 @@ from dase.cli.options import check_suffix, effects_option, fps_option, open_reco
     callback=check_suffix(".html"),
     help="Report, one HTML file; its numbers go beside it as .json.",
 )
-@click.option(
-    "--scene", default="frames", show_default=True,
-    help="What the camera saw: its own frames, video FILE (a clip, a folder, an npz with frames), or static.",
-)  # fmt: skip
+@scene_option
 @fps_option
 @effects_option
 @click.option("--pixels", default=1500, show_default=True, help="In each half of the measurement.")

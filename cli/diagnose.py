@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from dase.cli.options import check_suffix, effects_option, fps_option, open_recorded
+from dase.cli.options import check_suffix, effects_option, fps_option, open_recorded, scene_option
 
 if TYPE_CHECKING:
     from dase.results import Diagnosis
@@ -36,10 +36,7 @@ def explain(ctx: click.Context, parameter: click.Parameter, value: str | None) -
 @click.argument("sensor")
 @click.argument("recording", type=click.Path(path_type=Path))
 @click.argument("file", required=False, type=click.Path(path_type=Path))
-@click.option(
-    "--scene", default="frames", show_default=True,
-    help="What the camera saw: its own frames, video FILE (a clip, a folder, an npz with frames), or static.",
-)  # fmt: skip
+@scene_option
 @click.option("--auto", is_flag=True, help="Add what is found and go on until nothing is missing.")
 @click.option("--free", help="Parameters that may be refitted, with commas between.  [default: all]")
 @click.option("--json", "json_", type=click.Path(path_type=Path), help="Write the findings to this file.")
@@ -88,13 +85,12 @@ def command(
     announced unless it brings the error to what two repeats of the recording would give.
     """
     from dase import edit
-    from dase.config import read_sensor
     from dase.diagnosis import MOST, diagnose
     from dase.effect_files import known_effects
     from dase.io import replacing
 
     known = known_effects(effects)
-    text = edit.SensorText(*read_sensor(sensor), known)
+    text = edit.read(sensor, known)
     model = text.sensor()
     measured = open_recorded(recording, scene, file, fps)
     names = free.split(",") if free else None

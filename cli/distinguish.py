@@ -44,14 +44,14 @@ def command(
     """
     from tqdm import tqdm
 
-    from dase import distinguish
+    from dase import distinguish, standards
     from dase.config import load_sensor
     from dase.effect_files import known_effects
 
     known = known_effects(effects)
     names = (Path(a).stem, Path(b).stem) if Path(a).stem != Path(b).stem else ("A", "B")
     models = (load_sensor(a, known), load_sensor(b, known))
-    with tqdm(total=len(distinguish.STANDARDS), unit=" recordings", disable=None) as bar:
+    with tqdm(total=len(standards.STANDARDS), unit=" recordings", disable=None) as bar:
 
         def progress(stimulus: str, seconds: float, power: float, last: bool) -> None:
             bar.set_postfix_str(f"{stimulus}, {seconds:g} s: {100 * power:.0f} %", refresh=True)

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import click
 
-from dase.cli.options import effects_option, fps_option, open_recorded
+from dase.cli.options import effects_option, fps_option, open_recorded, scene_option
 
 
 @click.command()
@@ -15,10 +15,7 @@ from dase.cli.options import effects_option, fps_option, open_recorded
 @click.argument("file", required=False, type=click.Path(path_type=Path))
 @click.option("-o", "--output", required=True, type=click.Path(path_type=Path), help="The fitted sensor.")
 @click.option("--free", help="Effects or effect.parameter to fit, with commas between.  [default: all]")
-@click.option(
-    "--scene", default="frames", show_default=True,
-    help="What the camera saw: its own frames, video FILE (a clip, a folder, an npz with frames), or static.",
-)  # fmt: skip
+@scene_option
 @fps_option
 @effects_option
 @click.option("--pixels", default=1500, show_default=True, help="In each half of the measurement.")
@@ -46,11 +43,10 @@ def command(
     """
     from dase import edit
     from dase.cli.diagnose import bar
-    from dase.config import read_sensor
     from dase.effect_files import known_effects
     from dase.fitting import fit
 
-    text = edit.SensorText(*read_sensor(sensor), known_effects(effects))
+    text = edit.read(sensor, known_effects(effects))
     model = text.sensor()
     measured = open_recorded(recording, scene, file, fps)
     with bar(quiet) as tell:

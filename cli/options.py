@@ -36,6 +36,14 @@ effects_option = click.option(
 )
 """`--effects FILE`: a command gets a tuple of paths, for `dase.effect_files.known_effects`."""
 
+scene_option = click.option(
+    "--scene",
+    default="frames",
+    show_default=True,
+    help="What the camera saw: its own frames, video FILE (a clip, a folder, an npz with frames), or static.",
+)
+"""`--scene NAME` of commands that compare with a recording, for `open_recorded`."""
+
 fps_option = click.option(
     "--fps", type=float, help="Frames per second of the clip of --scene.  [default: what the file says]"
 )

@@ -20,10 +20,9 @@ def command(sensor: str, effect: str, output: Path | None, effects: tuple[Path, 
     The comment right above the effect goes with it. The change is noted at the end of the file.
     """
     from dase import edit
-    from dase.config import read_sensor
     from dase.effect_files import known_effects
 
-    text = edit.SensorText(*read_sensor(sensor), known_effects(effects)).removed(effect)
+    text = edit.read(sensor, known_effects(effects)).removed(effect)
     edit.write(text.noted(edit.today(f"remove {effect}")), output)
     if output is not None:
         click.echo(f"{output}: {effect} removed")

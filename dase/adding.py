@@ -46,6 +46,7 @@ def fit_added(
         Held-out error of the sensor without the effect, fitted as well as it can be, and the fit with it.
     """
     tell = progress or (lambda text, share, error: None)
+    sensor, effect = sensor.bound_to(scene), effect.bound_to(scene)
     evidence = gather(
         events, scene, log_eps=sensor.log_eps, trust=trust, pixels=pixels, seed=seed, device=device
     )
@@ -56,5 +57,7 @@ def fit_added(
     # far from where it is, a descent could end in the wrong place
     present.rebase(evidence.scout, repeats=16, seed=seed + 200)
     start = scout(evidence, present, effect, seed=seed).model.sensor
-    how = {"trust": trust, "pixels": pixels, "seed": seed, "device": device, "progress": progress}
-    return before, fit(events, scene, start, **how)  # type: ignore[arg-type]
+    fitted = fit(
+        events, scene, start, trust=trust, pixels=pixels, seed=seed, device=device, progress=progress
+    )
+    return before, fitted

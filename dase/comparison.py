@@ -85,26 +85,33 @@ def comparison_of(evidence: Evidence, judgement: Judgement, sensor: Sensor, *, s
 
 def plain(half: Half) -> dict[str, tuple[float, float]]:
     """Return measured and simulated values in units that need no explanation."""
-    out: dict[str, tuple[float, float]] = {}
-    counts = [_counts(v, "rate").reshape(2, KINDS, BANDS) for v in (half.seen.target, half.simulated)]
+    values = half.seen.target, half.simulated
+    real, made = (_rates(v) for v in values)
     exposure = half.trials.stimulus.exposure().reshape(KINDS, BANDS)
     time_ = max(float(exposure.sum()), 1e-9)
-    for n, polarity in enumerate(("OFF", "ON")):
-        out[f"{polarity} events [1/(px s)]"] = tuple(float(c[n].sum() / time_) for c in counts)  # type: ignore[assignment]
     rest = max(float(exposure[:RESTING].sum()), 1e-9)
-    for n, polarity in enumerate(("OFF", "ON")):
-        rates = tuple(float(c[n, :RESTING].sum() / rest) for c in counts)
-        out[f"{polarity} events at rest [1/(px s)]"] = rates  # type: ignore[assignment]
+    names = ("OFF", "ON")
+    out = {
+        f"{names[n]} events [1/(px s)]": (float(real[n].sum() / time_), float(made[n].sum() / time_))
+        for n in range(2)
+    }
+    for n in range(2):
+        slow = real[n, :RESTING].sum() / rest, made[n, :RESTING].sum() / rest
+        out[f"{names[n]} events at rest [1/(px s)]"] = float(slow[0]), float(slow[1])
     step = 1e3 * half.trials.stimulus.grid.step
-    medians = tuple(_median(_counts(v, "intervals"), step) for v in (half.seen.target, half.simulated))
-    out["median interval of a pixel [ms]"] = medians  # type: ignore[assignment]
-    lags = tuple(_mean_lag(v) for v in (half.seen.target, half.simulated))
-    out["mean lag behind the light [ms]"] = lags  # type: ignore[assignment]
+    a, b = (_median(_counts(v, "intervals"), step) for v in values)
+    out["median interval of a pixel [ms]"] = a, b
+    a, b = (_mean_lag(v) for v in values)
+    out["mean lag behind the light [ms]"] = a, b
     return out
 
 
 def _counts(values: Array, family: str) -> Array:
     return np.maximum(np.exp(values[LAYOUT[family]]) - 3.0, 0.0)
+
+
+def _rates(values: Array) -> Array:
+    return _counts(values, "rate").reshape(2, KINDS, BANDS)
 
 
 def _octaves(step: float) -> Array:
@@ -143,7 +150,7 @@ def _rate_curves(evidence: Evidence, half: Half) -> tuple[Curve, ...]:
     exposure = np.maximum(half.trials.stimulus.exposure().reshape(KINDS, BANDS), 1e-9)
     middle = np.array([-0.4, -0.12, 0.0, 0.12, 0.4])
     out = []
-    both = [_counts(v, "rate").reshape(2, KINDS, BANDS) for v in (half.seen.target, half.simulated)]
+    both = [_rates(v) for v in (half.seen.target, half.simulated)]
     sigma = half.seen.sigma[LAYOUT["rate"]].reshape(2, KINDS, BANDS)
     for n in range(BANDS):
         for p, polarity in enumerate(("OFF", "ON")):

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import replace
 from importlib import resources
 from pathlib import Path
 from typing import Any
@@ -35,9 +34,7 @@ def load_sensor(spec: str | Path, effects: Mapping[str, type[Effect]] = EFFECTS)
     Raises:
         InputError: No such preset or file, not TOML, or a name or value that does not exist.
     """
-    sensor = parse_sensor(*read_sensor(spec), effects)
-    folder = Path(spec).parent
-    return replace(sensor, effects=tuple(effect.located(folder) for effect in sensor.effects))
+    return parse_sensor(*read_sensor(spec), effects).located(Path(spec).parent)
 
 
 def read_sensor(spec: str | Path) -> tuple[str, str]:

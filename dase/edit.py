@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import datetime
+import os
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
@@ -12,7 +13,7 @@ from typing import Any
 import tomlkit
 
 import dase
-from dase.config import effect_table, parse_sensor
+from dase.config import effect_table, parse_sensor, read_sensor
 from dase.effects import EFFECTS, Effect
 from dase.errors import InputError, nearest
 from dase.history import Entry
@@ -29,15 +30,17 @@ class SensorText:
         text: TOML.
         where: What the user calls it, for messages.
         effects: Effects it may name.
+        folder: In which the text lies; the files of effects are found from there.
     """
 
     text: str
     where: str
     effects: Mapping[str, type[Effect]] = field(default_factory=lambda: EFFECTS)
+    folder: Path = Path()
 
     def sensor(self) -> Sensor:
         """Return the sensor that the text describes."""
-        return parse_sensor(self.text, self.where, self.effects)
+        return parse_sensor(self.text, self.where, self.effects).located(self.folder)
 
     def added(self, effect: Effect) -> SensorText:
         """Return the text with the table of an effect, placed where it acts.
@@ -81,11 +84,24 @@ class SensorText:
         """Return the text with the values of an effect that it has; their comments stay."""
         document = tomlkit.parse(self.text)
         table: Any = document[effect.name]
-        after = self.sensor().with_effect(effect)
-        for name, value in after.table()[effect.name].items():
-            if name in table or value != getattr(type(effect)(), name):
+        before = self.sensor()
+        for name in effect.settings():
+            value = getattr(effect, name)
+            if value != getattr(before[effect.name], name):
                 table[name] = value
-        return self._checked(tomlkit.dumps(document), after)
+        return self._checked(tomlkit.dumps(document), before.with_effect(effect))
+
+    def moved(self, folder: Path) -> SensorText:
+        """Return the text as it stands in another folder: paths of files lead to where they are."""
+        document = tomlkit.parse(self.text)
+        sensor = self.sensor()
+        files = [(e, name) for e in sensor.effects for name in e.assets() if getattr(e, name)]
+        if not files or folder.resolve() == self.folder.resolve():
+            return self
+        for effect, name in files:
+            table: Any = document[effect.name]
+            table[name] = Path(os.path.relpath(getattr(effect, name), folder.resolve())).as_posix()
+        return replace(self, folder=folder)._checked(tomlkit.dumps(document), sensor)
 
     def became(self, sensor: Sensor) -> SensorText:
         """Return the text that describes another sensor: effects added, removed, or with other values."""
@@ -109,7 +125,7 @@ class SensorText:
 
     def _checked(self, text: str, want: Sensor) -> SensorText:
         text = text.replace("\n", "\r\n") if "\r\n" in self.text and "\r\n" not in text else text
-        new = SensorText(text, self.where, self.effects)
+        new = replace(self, text=text)
         try:
             right = new.sensor() == want
         except InputError:
@@ -150,13 +166,26 @@ def _comment_above(lines: list[str], at: int) -> int:
     return at
 
 
+def read(spec: str | Path, effects: Mapping[str, type[Effect]] = EFFECTS) -> SensorText:
+    """Return the text of a preset or of a sensor file.
+
+    Args:
+        spec: Name of a preset, or path of a file.
+        effects: Effects it may name.
+
+    Raises:
+        InputError: No such preset or file, or it is not text.
+    """
+    return SensorText(*read_sensor(spec), effects, Path(spec).parent)
+
+
 def write(sensor: SensorText, path: Path | None) -> None:
     """Write a sensor file, whole or not at all; None prints it."""
     if path is None:
         print(sensor.text, end="")
         return
     with replacing(path) as temporary:
-        temporary.write_bytes(sensor.text.encode())
+        temporary.write_bytes(sensor.moved(path.parent).text.encode())
 
 
 def rounded(sensor: Sensor, digits: int = 4) -> Sensor:

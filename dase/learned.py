@@ -8,14 +8,13 @@ from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 
 from dase.errors import InputError
-from dase.sheet import INK, QUIET
+from dase.sheet import INK, QUIET, paper
 from dase.show import OFF, ON
 
 EXAMPLES, LOG = "examples.npz", "log.csv"
@@ -93,15 +92,7 @@ def _layout(rows: int, aspect: float) -> tuple[Figure, list[list[Axes]], list[Ax
     across = (wide - 2 * side - 4 * gap - 0.75) / 5
     down = across / aspect
     tall = head + rows * (down + gap) + foot
-    figure = Figure(figsize=(wide, tall), dpi=150, facecolor="white")
-    FigureCanvasAgg(figure)
-
-    def axes(x: float, y: float, width: float, height: float) -> Axes:
-        made = figure.add_axes((x / wide, 1 - (y + height) / tall, width / wide, height / tall))
-        made.spines[:].set(color="#bbbbbb", linewidth=0.6)
-        made.tick_params(colors=INK, labelsize=8, color="#bbbbbb", which="both")
-        return made
-
+    figure, axes = paper(wide, tall)
     pictures = [
         # the maps stand apart, to leave room for their scales
         [
@@ -133,7 +124,7 @@ def _bar(figure: Figure, axes: Axes, shown: Any) -> None:
     thin = 0.07 / figure.get_figwidth()
     place = figure.add_axes((box.x1 + 0.6 * thin, box.y0, thin, box.height))
     bar = figure.colorbar(shown, cax=place, ticks=MaxNLocator(4, prune="both"))
-    bar.outline.set_visible(False)  # type: ignore[operator]
+    bar.outline.set_visible(False)
     place.tick_params(labelsize=6.5, colors=INK, length=2, width=0.5, pad=1.5)
 
 

@@ -30,7 +30,7 @@ class AdaBelief(torch.optim.Optimizer):
         super().__init__(params, {"lr": lr, "betas": betas, "eps": eps})
 
     @torch.no_grad()
-    def step(self, closure: Callable[[], Any] | None = None) -> None:  # type: ignore[override]
+    def step(self, closure: Callable[[], Any] | None = None) -> None:
         """Move all parameters that have a gradient; `closure` is not used."""
         for group in self.param_groups:
             first, second = group["betas"]

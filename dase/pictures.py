@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -68,15 +70,23 @@ def unpack(data: bytes, how: int) -> NDArray[Any] | None:
     """
     if data.startswith(PNG) and not _whole(data):
         return None  # OpenCV 5 takes as much memory as a part says it is long
-    level = cv2.utils.logging.getLogLevel()
-    cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)  # our sentence is enough
     try:
-        pixels: NDArray[Any] | None = cv2.imdecode(np.frombuffer(data, np.uint8), how)
+        with quiet():
+            pixels: NDArray[Any] | None = cv2.imdecode(np.frombuffer(data, np.uint8), how)
     except cv2.error:  # an empty file, or more pixels than OpenCV takes
         return None
+    return pixels
+
+
+@contextmanager
+def quiet() -> Iterator[None]:
+    """Keep OpenCV from writing about damaged files to the terminal: our sentence is enough."""
+    level = cv2.utils.logging.getLogLevel()
+    cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
+    try:
+        yield
     finally:
         cv2.utils.logging.setLogLevel(level)
-    return pixels
 
 
 def _whole(data: bytes) -> bool:

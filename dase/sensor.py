@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -101,6 +102,10 @@ class Sensor:
     def streams(self) -> tuple[StreamEffect, ...]:
         """Return the effects behind the pixels that are not off."""
         return tuple(e for e in self.effects if isinstance(e, StreamEffect) and not e.is_off())
+
+    def located(self, folder: Path) -> Sensor:
+        """Return the sensor with the files of its effects found from `folder`, in which its own file lies."""
+        return replace(self, effects=tuple(effect.located(folder) for effect in self.effects))
 
     def bound_to(self, scene: Scene) -> Sensor:
         """Return the sensor with whatever its pixels owe to the scene worked out."""

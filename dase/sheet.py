@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from collections.abc import Sequence as Items
 
 import numpy as np
@@ -64,15 +65,7 @@ def _layout(count: int, aspect: float) -> tuple[Figure, list[Axes], list[Axes]]:
     down = across * aspect
     tall = head + rows * (down + label) + foot
     left = (wide - columns * across - gap * (columns - 1)) / 2
-    figure = Figure(figsize=(wide, tall), dpi=150, facecolor="white")
-    FigureCanvasAgg(figure)
-
-    def axes(x: float, y: float, width: float, height: float) -> Axes:
-        made = figure.add_axes((x / wide, 1 - (y + height) / tall, width / wide, height / tall))
-        made.spines[:].set(color="#bbbbbb", linewidth=0.6)
-        made.tick_params(colors=INK, labelsize=8, color="#bbbbbb", which="both")
-        return made
-
+    figure, axes = paper(wide, tall)
     pictures = [
         axes(
             left + (k % columns) * (across + gap),
@@ -86,6 +79,25 @@ def _layout(count: int, aspect: float) -> tuple[Figure, list[Axes], list[Axes]]:
     for plot in plots:
         plot.spines[["top", "right"]].set_visible(False)
     return figure, pictures, plots
+
+
+def paper(wide: float, tall: float) -> tuple[Figure, Callable[[float, float, float, float], Axes]]:
+    """Return an empty figure, and what puts pale axes onto it; all in inches from the upper left corner.
+
+    Args:
+        wide: Width of the figure.
+        tall: Its height.
+    """
+    figure = Figure(figsize=(wide, tall), dpi=150, facecolor="white")
+    FigureCanvasAgg(figure)
+
+    def axes(x: float, y: float, width: float, height: float) -> Axes:
+        made = figure.add_axes((x / wide, 1 - (y + height) / tall, width / wide, height / tall))
+        made.spines[:].set(color="#bbbbbb", linewidth=0.6)
+        made.tick_params(colors=INK, labelsize=8, color="#bbbbbb", which="both")
+        return made
+
+    return figure, axes
 
 
 def _header(figure: Figure, s: Statistics, title: str, window: float, note: str) -> None:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+import re
 from pathlib import Path
 from typing import Any
 
@@ -13,11 +15,19 @@ from numpy.typing import ArrayLike, NDArray
 from dase.errors import InputError
 from dase.kernels import pixel
 from dase.kernels.scene import interpolate
-from dase.pictures import list_pictures, read_grey, to_grey
+from dase.pictures import list_pictures, quiet, read_grey, to_grey
 from dase.scene import Scene
 
 EPS = 1e-3
 """Added to intensities before the logarithm between frames; that of sensors unless they say otherwise."""
+TITLES = re.compile(rb"LIST(.{4})INFO", re.DOTALL)
+"""A list of titles in an AVI, with its length [bytes]."""
+LONGEST = 1 << 24
+"""Bytes of titles that do no harm, whatever a damaged file claims."""
+PLAIN = 0, int.from_bytes(b"BGR\x18", "little")
+"""Code and pixels of an uncompressed AVI: OpenCV 5.0 writes beyond its memory where it turns one over."""
+PIECE = 1 << 22
+"""Bytes of a file that are looked at together."""
 
 
 class VideoScene(Scene):
@@ -107,6 +117,7 @@ class FrameReader:
             raise InputError(f"video {path} does not exist")
         self._files = list_pictures(path) if path.is_dir() else None
         self._capture: Any = None
+        self._plain: tuple[int, int] | None = None
         self.rate = 0.0
         self._count = len(self._files) if self._files is not None else self._count_frames()
         if self._count < 2:
@@ -138,25 +149,44 @@ class FrameReader:
         return np.stack([out[i] for i in wanted])
 
     def _open(self) -> Any:
-        capture = cv2.VideoCapture(str(self._path))
+        os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")  # says nothing of its own about damaged files
+        with quiet():  # FFmpeg alone: the others after it take as much memory as a damaged file asks for
+            capture = cv2.VideoCapture(str(self._path), cv2.CAP_FFMPEG)
         if not capture.isOpened():
             raise InputError(f"video {self._path} cannot be decoded")
+        if self._plain is not None:
+            capture.set(cv2.CAP_PROP_FORMAT, -1)  # packets as they are
         return capture
 
     def _count_frames(self) -> int:
-        # the count in the header is often wrong
+        _refuse_titles(self._path)
         capture = self._open()
+        size = int(capture.get(cv2.CAP_PROP_FRAME_WIDTH)), int(capture.get(cv2.CAP_PROP_FRAME_HEIGHT))
+        _refuse_huge(self._path, size)
+        kind = int(capture.get(cv2.CAP_PROP_FOURCC)), int(capture.get(cv2.CAP_PROP_CODEC_PIXEL_FORMAT))
+        self._plain = size if kind == PLAIN else None
         self.rate = float(capture.get(cv2.CAP_PROP_FPS))
-        count = 0
-        while capture.grab():
+        if self._plain is not None:
+            capture = self._open()
+        count = 0  # that in the header is often wrong
+        while capture.grab() if self._plain is None else self._read(capture) is not None:
             count += 1
         return count
+
+    def _read(self, capture: Any) -> NDArray[np.uint8] | None:
+        while True:
+            good, frame = capture.read()
+            if good and self._plain is not None:
+                frame = _unpacked(capture, frame.ravel(), self._plain)
+                if frame is None:
+                    continue  # a packet of a dropped frame is empty
+            return frame if good else None
 
     def _decode(self, index: int) -> NDArray[np.float32]:
         if self._capture is None:
             self._capture = self._open()
-        good, frame = self._capture.read()
-        if not good:
+        frame = self._read(self._capture)
+        if frame is None:
             raise InputError(f"video {self._path}: frame {index} cannot be decoded")
         self._next = index + 1
         return self._grey(to_grey(frame)[0], self._path)
@@ -170,6 +200,50 @@ class FrameReader:
             sizes = f"{got[1]}x{got[0]}, the frames before {want[1]}x{want[0]}"
             raise InputError(f"video: all frames must have one size, {path} has {sizes}")
         return grey
+
+
+def _refuse_titles(path: Path) -> None:
+    """Raise InputError where a list of titles in an AVI says that it is far longer than the file.
+
+    FFmpeg takes as much memory as such a list says, and fills it with zeros, before it reads what is there.
+    It follows damaged sizes to wherever they lead, so the list may lie anywhere.
+    """
+    length = path.stat().st_size
+    with path.open("rb") as file:
+        kept = file.read(12)
+        if kept[:4] not in (b"RIFF", b"ON2 "):
+            return
+        while more := file.read(PIECE):
+            kept += more
+            for found in TITLES.finditer(kept):
+                claimed = int.from_bytes(found[1], "little")
+                if claimed > max(length, LONGEST):
+                    sizes = f"{claimed:,} bytes of titles in a file of {length:,}"
+                    raise InputError(f"video {path} is damaged: it claims {sizes}")
+            kept = kept[-11:]  # all but one byte of what is looked for
+
+
+def _refuse_huge(path: Path, size: tuple[int, int]) -> None:
+    """Raise InputError where a small file says that it holds frames of an absurd size."""
+    from dase.io.source import refuse_bomb
+
+    try:
+        refuse_bomb(path.stat().st_size, 3 * size[0] * size[1])  # blue, green and red of one frame
+    except InputError as error:
+        raise InputError(f"video {path}: a frame of {size[0]}x{size[1]} {error}") from None
+
+
+def _unpacked(capture: Any, packet: NDArray[np.uint8], size: tuple[int, int]) -> NDArray[np.uint8] | None:
+    """Return the frame (H, W, 3) of the bytes of an uncompressed AVI, or None where some are missing."""
+    width, height = size
+    step = -(-3 * width // 4) * 4  # rows end at multiples of four bytes, in most files
+    step = step if len(packet) >= step * height else 3 * width
+    if len(packet) < step * height:
+        return None
+    frame = packet[: step * height].reshape(height, step)[:, : 3 * width].reshape(height, width, 3)
+    _, more = capture.retrieve(flag=int(capture.get(cv2.CAP_PROP_CODEC_EXTRADATA_INDEX)))
+    upward = more is not None and more.tobytes().endswith(b"BottomUp\0")  # what FFmpeg calls it
+    return frame[::-1] if upward else frame
 
 
 def open_video(path: Path, *, fps: float | None = None, size: tuple[int, int] | None = None) -> VideoScene:

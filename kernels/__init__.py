@@ -8,7 +8,7 @@ In the order of the pipeline:
 - `pixel`: the effects of a sensor composed into one kernel, intensity to counts or events;
 - `events`: sort and decode what `pixel` emitted;
 - `patches`: the structure of image and count-map patches;
-- `autograd`: the bridge to PyTorch, the only file that imports it.
+- `autograd`, `autograd_scene`, `autograd_training`: the bridge to PyTorch, the only files that import it.
 
 Nothing here imports from `dase`.
 """

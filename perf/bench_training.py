@@ -91,7 +91,7 @@ def make(args: argparse.Namespace, objective: str) -> Training:
     if objective == "moments":
         network = NetworkShape(**{**network.__dict__, "table": (6, 5)})
     batch = 4 if args.small else 12
-    recipe = Recipe(objective=objective, batch=batch, hash=how, network=network, warmup=2, steps=10**6)  # type: ignore[arg-type]
+    recipe = Recipe(objective=objective, batch=batch, hash=how, network=network, warmup=2, steps=10**6)
     training = Training(recipe, Endless(scenery, TRUTHS["uniform"]()), scenery)
     for _ in range(30):
         training.advance()

@@ -31,6 +31,7 @@ from bench_kernels import commit
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 import reference_io
+import reference_video
 
 from dase import io
 from dase.errors import InputError
@@ -87,6 +88,12 @@ def video(codec: str):
     return make
 
 
+def uncompressed(path: Path, e, frames) -> None:
+    """A video of the frames as they are, with titles before and after them."""
+    titles = reference_video.titles()
+    path.write_bytes(reference_video.avi(frames[1], first=titles, last=titles))
+
+
 def pictures(path: Path, e, frames) -> None:
     """A folder of text with pictures; each file of it is damaged on its own."""
     path.mkdir()
@@ -121,6 +128,7 @@ SAMPLES = {
     "ROS 2": reference_io.SAMPLES["ROS 2"],
     "MCAP": reference_io.SAMPLES["MCAP"],
     "AVI": (".avi", with_frames(video("MJPG"))),
+    "AVI, not compressed": (".avi", with_frames(uncompressed)),
     "MP4": (".mp4", with_frames(video("mp4v"))),
     "text with PNG": (".folder", with_frames(pictures)),
 } | reference_io.SAMPLES

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -91,9 +92,13 @@ def rows(lines: list[dict[str, Any]]) -> list[tuple[str, int, int]]:
     return [*_single(lines), *_others(lines)]
 
 
+def _of(lines: list[dict[str, Any]], kind: str) -> list[dict[str, Any]]:
+    return [line for line in lines if line["case"]["kind"] == kind]
+
+
 def _single(lines: list[dict[str, Any]]) -> list[tuple[str, int, int]]:
     good = [line for line in lines if "failed" not in line]
-    of = lambda kind: [line for line in good if line["case"]["kind"] == kind]  # noqa: E731
+    of = partial(_of, good)
     out = []
     for strength in STRENGTHS:
         mine = [line for line in of("single") if line["case"]["strength"] == strength]
@@ -108,7 +113,7 @@ def _single(lines: list[dict[str, Any]]) -> list[tuple[str, int, int]]:
 
 def _others(lines: list[dict[str, Any]]) -> list[tuple[str, int, int]]:
     good = [line for line in lines if "failed" not in line]
-    of = lambda kind: [line for line in good if line["case"]["kind"] == kind]  # noqa: E731
+    of = partial(_of, good)
     out = []
     out.append(("nothing hidden: nothing announced", sum(map(right, of("nothing"))), len(of("nothing"))))
     out.append(("two hidden effects: both found", sum(map(right, of("pair"))), len(of("pair"))))

@@ -144,12 +144,12 @@ def openeb_runs(clip: Clip, options: argparse.Namespace) -> dict[str, dict[str, 
         package.__path__ = [str(path or folder / "video_to_event")]
         sys.modules[name] = package
     try:
-        import metavision_sdk_base  # noqa: F401
+        import metavision_sdk_base  # noqa: F401  # only whether it is there
     except ImportError:
         # a checkout lacks this compiled part, of which the simulator needs the layout of an event
         names, formats = ["x", "y", "p", "t"], ["<u2", "<u2", "<i2", "<i8"]
         event = np.dtype({"names": names, "formats": formats, "offsets": [0, 2, 4, 8], "itemsize": 16})
-        sys.modules["metavision_sdk_base"] = types.SimpleNamespace(EventCD=event)  # type: ignore[assignment]
+        sys.modules["metavision_sdk_base"] = types.SimpleNamespace(EventCD=event)
     from metavision_core_ml.video_to_event.simulator import EventSimulator
 
     def run(setting: dict[str, float]) -> int:

@@ -46,7 +46,7 @@ class Worker:
         command += ["--path", str(path)] if path else []
         limits = ("OMP", "MKL", "OPENBLAS", "NUMBA")
         several = {f"{name}_NUM_THREADS": str(threads) for name in limits}
-        self._log = tempfile.TemporaryFile("w+")  # noqa: SIM115, it lives as long as the process
+        self._log = tempfile.TemporaryFile("w+")  # noqa: SIM115  # it lives as long as the process
         self._process = subprocess.Popen(
             command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=self._log, text=True,
             env={**os.environ, **several, "DASE_THREADS": str(threads)},

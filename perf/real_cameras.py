@@ -165,7 +165,10 @@ def of_a_dot(path: Path) -> Measurement:
         "polarities are taken the other way round: the file calls the leading edge of the bright dot OFF",
     )
     swept = cv2.dilate((frames.max(0) > 0.1).astype(np.uint8), np.ones((41, 41), np.uint8)).reshape(-1) > 0
-    trust = lambda t, pixels: np.broadcast_to(swept[pixels], (len(t), len(pixels)))  # noqa: E731
+
+    def trust(t: np.ndarray, pixels: np.ndarray) -> np.ndarray:
+        return np.broadcast_to(swept[pixels], (len(t), len(pixels)))
+
     return Measurement(events, dase.VideoScene(frames, times), trust, notes)
 
 

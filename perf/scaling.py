@@ -20,7 +20,7 @@ import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import lru_cache, partial
 from pathlib import Path
 from typing import Any
 
@@ -230,7 +230,7 @@ def goals(device: wp.Device) -> Iterator[Work]:
 
         yield case_work("goal", WARPED, threads, CAMERA, samples, device, threads=threads)
         yield Work("goal", "NumPy tuned", threads, total, tuned, summed, threads=threads)
-    plain: Callable[[], Any] = lambda: pipeline.count_plain(pictures, samples, 0.2)  # noqa: E731
+    plain = partial(pipeline.count_plain, pictures, samples, 0.2)
     yield Work("goal", "NumPy plain", 1, total, plain, summed, threads=1)
     # a stream goes on: memory is new and too small in the first of its chunks alone
     long = CHUNKS * CHUNK[kind(device)]

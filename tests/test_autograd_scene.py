@@ -9,10 +9,10 @@ import pytest
 
 torch = pytest.importorskip("torch", reason="the bridge needs torch")
 
-from dase.images import Picture  # noqa: E402
-from dase.kernels import launch  # noqa: E402
-from dase.kernels.autograd import affine_places, render  # noqa: E402
-from dase.layers import Layer, LayerScene, Motion  # noqa: E402
+from dase.images import Picture
+from dase.kernels import launch
+from dase.kernels.autograd_scene import affine_places, render
+from dase.layers import Layer, LayerScene, Motion
 
 WIDTH, HEIGHT = 40, 30
 FIELDS = ("x", "y", "angle", "scale_x", "scale_y")

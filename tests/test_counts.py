@@ -7,9 +7,9 @@ import pytest
 
 torch = pytest.importorskip("torch", reason="the bridge needs torch")
 
-import reference_counts as reference  # noqa: E402
+import reference_counts as reference
 
-from dase.kernels.autograd import FLOOR, count_events, thresholds  # noqa: E402
+from dase.kernels.autograd import FLOOR, count_events, thresholds
 
 GRID = 2.0**-12
 """Step of the dyadic grid [log intensity], on which float32 rounds nothing here."""

@@ -15,7 +15,8 @@ ARCH = 90
 """Compute capability that is compiled for: H100 and H200."""
 
 MODULES = (
-    "between", "blur", "events", "patches", "probes", "readout", "scene", "scenery", "surrogates", "trials",
+    "between", "blur", "events", "patches", "probes", "readout", "scene", "scene_gradient", "scenery",
+    "surrogates", "trials",
 )  # fmt: skip
 """Those whose kernels are not made by functions."""
 

@@ -10,9 +10,10 @@ from scipy.stats import norm
 from test_cli import dase, one_sentence
 
 from dase import InputError, Sensor
-from dase.distinguish import STANDARDS, WORDS, distinguish, rows, separation
+from dase.distinguish import WORDS, distinguish, rows, separation
 from dase.effects import EFFECTS
 from dase.probes import FAMILIES
+from dase.standards import STANDARDS
 
 QUICK = {"pixels": 200, "repeats": 12, "longest": 1.0}
 

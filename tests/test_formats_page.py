@@ -7,6 +7,7 @@ import re
 import shlex
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 import reference_io
@@ -64,7 +65,6 @@ def make(path, rng):
     elif path.suffix == ".mcap":
         reference_io.mcap(path, e)
     elif name == "frames":
-        cv2 = pytest.importorskip("cv2")
         out = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"MJPG"), 25.0, (96, 64))
         for _ in range(3):
             out.write(rng.integers(0, 256, (64, 96, 3), np.uint8))

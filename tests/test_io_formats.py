@@ -6,6 +6,7 @@ import contextlib
 import io as streams
 import zipfile
 
+import cv2
 import h5py
 import numpy as np
 import pytest
@@ -265,7 +266,6 @@ def test_zip_bombs(tmp_path, name):
 
 
 def test_frames_of_a_video_and_of_a_folder(tmp_path, rng):
-    cv2 = pytest.importorskip("cv2")
     grey = rng.integers(0, 256, (4, 64, 96), np.uint8)
     folder = tmp_path / "pictures"
     folder.mkdir()

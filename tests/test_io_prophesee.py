@@ -208,7 +208,7 @@ def test_headers_that_do_not_help(tmp_path):
 
 @pytest.mark.parametrize("name", ["EVT2", "EVT3"])
 def test_a_second_library_reads_the_same(tmp_path, rng, name):
-    evlib = pytest.importorskip("evlib")
+    evlib = pytest.importorskip("evlib", reason="needs evlib, a second reader of EVT")
     e = events(rng, 2000)
     io.write(tmp_path / "a.raw", Sequence(e), format=name)
     rows = evlib.load_events(str(tmp_path / "a.raw")).collect()
@@ -228,7 +228,7 @@ def test_decoders_carry_nothing_but_what_the_format_says():
 
 @pytest.mark.parametrize("name", ["psee_gen3_evt2.raw", "psee_hd_evt3.raw"])
 def test_a_second_library_reads_the_same_of_a_camera(shared, name):
-    evlib = pytest.importorskip("evlib")
+    evlib = pytest.importorskip("evlib", reason="needs evlib, a second reader of EVT")
     path = shared / "recordings/native" / name
     e = io.read(path).events
     rows = evlib.load_events(str(path)).collect()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 
+import cv2
 import numpy as np
 import pytest
 from reference_io import FRAMES, H, W, aedat4, bag, events, measured, mvsec, table, v2e
@@ -247,7 +248,6 @@ def test_frames_of_16_bits_stay_so(tmp_path, rng, suffix):
 
 
 def test_pictures_of_16_bits_beside_a_text(tmp_path, rng):
-    cv2 = pytest.importorskip("cv2")
     folder = tmp_path / "shapes"
     (folder / "images").mkdir(parents=True)
     grey = rng.integers(0, 65536, (2, H, W), np.uint16)

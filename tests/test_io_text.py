@@ -5,6 +5,7 @@ from __future__ import annotations
 import io as streams
 import zipfile
 
+import cv2
 import numpy as np
 import pytest
 from reference_io import H, W, events, measured
@@ -117,7 +118,6 @@ def test_texts_that_are_no_events(tmp_path):
 
 @pytest.mark.parametrize("packed", [False, True])
 def test_ijrr_folder_and_zip_with_frames(tmp_path, rng, packed):
-    cv2 = pytest.importorskip("cv2")
     e, grey = events(rng, 500), rng.integers(0, 256, (3, H, W), np.uint8)
     folder = tmp_path / "shapes"
     (folder / "images").mkdir(parents=True)
@@ -178,7 +178,6 @@ print(peak() - before)
 
 def test_a_picture_that_claims_to_be_large_takes_no_memory(tmp_path, rng):
     """OpenCV 5 takes 1.4 GB for a PNG of 2 kB whose part says that it is as long."""
-    cv2 = pytest.importorskip("cv2")
     cv2.imwrite(str(tmp_path / "a.png"), rng.integers(0, 256, (36, 48), np.uint8))
     *said, grown = measured(CLAIMS, tmp_path / "a.png")
     assert len(said) == 2

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 import torch
@@ -13,6 +14,7 @@ from click.testing import CliRunner
 import dase
 from dase import io
 from dase.config import dump_sensor, load_sensor
+from dase.effects.leak import Leak
 from dase.effects.learned_threshold import LearnedThreshold
 from dase.effects.mismatch import Mismatch
 from dase.effects.threshold import Threshold
@@ -111,6 +113,43 @@ def test_a_sensor_file_finds_its_weights_wherever_it_lies(folder, scene, monkeyp
     assert Path(sensor["learned_threshold"].weights) == (folder / adaptation.WEIGHTS).resolve()
     assert len(dase.simulate(scene, sensor)) > 0
     assert "bound" not in dump_sensor(sensor.bound_to(scene))
+
+
+def test_an_effect_is_fitted_beside_learned_thresholds(folder, rng, monkeypatch):
+    """From anywhere, and into another folder, from which the weights are still found."""
+    t = np.arange(500) * 1e-3
+    texture = cv2.GaussianBlur(rng.random((20, 300)).astype(np.float32), (0, 0), 2)
+    texture = np.clip((texture - texture.min()) / np.ptp(texture), 0.03, 1)
+    grey = np.stack([texture[:, round(200 * time) :][:, :24] for time in t])
+    frames = np.round(255 * grey).astype(np.uint8)
+    np.savez(folder / "clip.npz", frames=frames, frame_us=np.round(t * 1e6).astype(np.int64))
+    sensor = load_sensor(folder / adaptation.SENSOR)
+    truth, scene = sensor.with_effect(Leak(rate=8.0)), VideoScene(frames / np.float32(255), t)
+    io.write(folder / "recording.h5", Sequence(dase.simulate(scene, truth, seed=3)))
+    (folder / "other").mkdir()
+    monkeypatch.chdir(folder / "other")
+    options = ("--fit", "../recording.h5", "--scene", "../clip.npz", "-o", "more.toml")
+    done = call("add", f"../{adaptation.SENSOR}", "leak", *options)
+    assert done.exit_code == 0, done.output
+    assert f'weights = "../{adaptation.WEIGHTS}"' in Path("more.toml").read_text()
+    monkeypatch.chdir("/")
+    more = load_sensor(folder / "other/more.toml")
+    # a share that grows with the light and one that does not are alike where the light is much the same
+    assert more["leak"].rate * (1 + more["leak"].light * grey.mean()) == pytest.approx(8.0, rel=0.2)
+    assert more["learned_threshold"].weights == sensor["learned_threshold"].weights
+    entry = more.history[-1]
+    assert entry.error_before > 2 * entry.error_after
+
+
+def test_a_sensor_file_edited_in_place_keeps_the_name_of_its_weights(folder, monkeypatch):
+    path = folder / adaptation.SENSOR
+    said = next(line for line in path.read_text().splitlines() if line.startswith("weights"))
+    monkeypatch.chdir("/")
+    for command in ("add", "remove"):
+        done = call(command, str(path), "leak", "-o", str(path))
+        assert done.exit_code == 0, done.output
+        assert said in path.read_text().splitlines()
+        assert ("leak" in load_sensor(path)) == (command == "add")
 
 
 def test_bad_weights_are_named(folder, scene):

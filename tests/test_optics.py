@@ -131,6 +131,6 @@ def test_fine_texture_fades(device):
 
 def test_stored_logarithms_are_refused(rng):
     scene = flicker(rng)
-    scene.source = lambda times, pixels, device: ("log", pixel.Frames())  # type: ignore[method-assign]
+    scene.source = lambda times, pixels, device: ("log", pixel.Frames())
     with pytest.raises(dase.InputError, match="optics_blur needs intensities"):
         dase.simulate(scene, dase.Sensor((OpticsBlur(), Threshold())))

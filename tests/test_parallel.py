@@ -14,12 +14,12 @@ import pytest
 torch = pytest.importorskip("torch")
 pytest.importorskip("safetensors")
 
-from dase import parallel  # noqa: E402
-from dase.images import open_images  # noqa: E402
-from dase.moments import Moments  # noqa: E402
-from dase.objectives import Adversarial, Hash  # noqa: E402
-from dase.scenery import Looks, Scenery, middle  # noqa: E402
-from dase.targets import Pairs, draw_noise, simulate  # noqa: E402
+from dase import parallel
+from dase.images import open_images
+from dase.moments import Moments
+from dase.objectives import Adversarial, Hash
+from dase.scenery import Looks, Scenery, middle
+from dase.targets import Pairs, draw_noise, simulate
 
 LAUNCH = [sys.executable, "-m", "torch.distributed.run", "--nproc-per-node", "2"]
 

@@ -4,18 +4,15 @@ from __future__ import annotations
 
 from itertools import pairwise
 
-import cv2
 import numpy as np
 import pytest
 import reference
 
 import dase
-import dase.io
 from dase import regimes
 from dase.images import ImageSource
 from dase.kernels import launch
 from dase.kernels import scene as kernels
-from dase.video import FrameReader, open_video
 
 SIZES = [(12, 9), (7, 13), (10, 10), (1, 6), (15, 4)]
 
@@ -212,83 +209,6 @@ def test_impossible_motions_are_refused():
         dase.Motion(angle=(0.0, float("inf")))
 
 
-def test_a_video_is_its_frames(rng):
-    frames, times = rng.random((5, 3, 4), np.float32), np.array([1.0, 1.5, 1.6, 2.0, 3.0])
-    video = dase.VideoScene(frames, times)
-    np.testing.assert_array_equal(video.sample_times(), times)
-    np.testing.assert_array_equal(video.frames(times[[1, 3]]), frames[[1, 3]])
-    assert (video.width, video.height, video.duration) == (4, 3, 2.0)
-    assert video.flow(times) is None
-    with pytest.raises(dase.InputError, match="between its frames"):
-        video.frames(np.array([1.2]))
-
-
-@pytest.mark.parametrize(
-    ("frames", "times", "message"),
-    [
-        (np.zeros((3, 4)), [0, 1, 2], r"shape \(F, height, width\), got \(3, 4\)"),
-        (np.zeros((3, 4, 4)), [0, 1], r"3 frames need as many times, got \(2,\)"),
-        (np.full((2, 4, 4), np.nan), [0, 1], "finite and >= 0"),
-        (np.full((2, 4, 4), -0.1), [0, 1], "finite and >= 0"),
-    ],
-)
-def test_impossible_videos_are_refused(frames, times, message):
-    with pytest.raises(dase.InputError, match=message):
-        dase.VideoScene(frames, times)
-
-
-def test_a_folder_of_pictures_is_read_by_name(tmp_path, device):
-    for n in (2, 0, 1):
-        cv2.imwrite(str(tmp_path / f"{n:03d}.png"), np.full((6, 8), 40 * (n + 1), np.uint8))
-    with pytest.raises(dase.InputError, match="does not say how many frames"):
-        open_video(tmp_path)
-    video = open_video(tmp_path, fps=100)
-    want = np.arange(1, 4)[:, None, None] * 40 / 255 * np.ones((1, 6, 8))
-    np.testing.assert_allclose(video.frames(video.sample_times()), want, rtol=1e-6)
-    np.testing.assert_allclose(video.sample_times(), [0, 0.01, 0.02])
-    small = open_video(tmp_path, fps=100, size=(4, 3))
-    assert small.frames(small.sample_times()).shape == (3, 3, 4)
-    sensor = dase.Sensor((dase.EFFECTS["threshold"](phase=0.0),))
-    events = dase.simulate(video, sensor, device=device)
-    assert len(events) == 48 * int(np.log(0.4716 / 0.1578) / 0.2)
-
-
-def test_pictures_of_different_sizes_are_refused(tmp_path):
-    for n in (0, 1):
-        cv2.imwrite(str(tmp_path / f"{n}.png"), np.full((6, 8 + n), 40, np.uint8))
-    with pytest.raises(dase.InputError, match="size"):
-        dase.simulate(open_video(tmp_path, fps=100), dase.Sensor())
-
-
-@pytest.mark.parametrize(("suffix", "code"), [("avi", "MJPG"), ("mp4", "mp4v")])
-def test_a_video_file_is_read_frame_by_frame(tmp_path, suffix, code):
-    path = tmp_path / f"film.{suffix}"
-    writer = cv2.VideoWriter(str(path), cv2.VideoWriter_fourcc(*code), 50.0, (32, 24))
-    if not writer.isOpened():
-        pytest.skip(f"OpenCV writes no {suffix} here")
-    for n in range(9):
-        writer.write(np.full((24, 32, 3), 25 * n, np.uint8))
-    writer.release()
-    video = open_video(path)
-    np.testing.assert_allclose(video.sample_times(), np.arange(9) / 50)
-    want = np.arange(9) * 25 / 255
-    whole = video.frames(video.sample_times())
-    np.testing.assert_allclose(whole.mean((1, 2)), want, atol=0.02)
-    # any increasing run of frames, forwards, overlapping and back again
-    reader = FrameReader(path)
-    for index in ([0, 1, 2], [2, 3], [5, 8], [0], [8], [3, 4, 7]):
-        np.testing.assert_array_equal(reader[np.array(index)], whole[index])
-
-
-def test_what_is_no_video_is_refused(tmp_path):
-    with pytest.raises(dase.InputError, match="does not exist"):
-        open_video(tmp_path / "none.mp4")
-    with pytest.raises(dase.InputError, match="at least 2 frames, got 0"):
-        open_video(tmp_path, fps=10)
-    with pytest.raises(dase.InputError, match="fps must be a number > 0"):
-        open_video(tmp_path, fps=-1)
-
-
 class Plain(ImageSource):
     """Textures of no interest."""
 
@@ -384,19 +304,3 @@ def test_mixed_draws_regimes_by_their_share(rng):
     assert 0.1 < np.mean(objects > 19) < 0.22  # half of 70 of 281, those with 20 to 29
     with pytest.raises(dase.InputError, match="no regime 'fats': did you mean 'fast'"):
         drawn(rng, "fats")
-
-
-def test_frames_of_a_recording_are_a_scene(tmp_path, rng):
-    frames = rng.integers(0, 256, (5, 6, 8), dtype=np.uint8)
-    times = np.array([0.5, 0.6, 0.8, 0.9, 1.0])
-    dase.io.write(
-        tmp_path / "a.h5", dase.io.Sequence(dase.Events.empty(8, 6), frames=frames, frame_times=times)
-    )
-    scene = open_video(tmp_path / "a.h5")
-    np.testing.assert_allclose(scene.sample_times(), times - 0.5)
-    np.testing.assert_array_equal(scene.frames(scene.sample_times()), frames / np.float32(255))
-    small = open_video(tmp_path / "a.h5", size=(4, 3), fps=10)
-    assert (small.width, small.height, small.duration) == (4, 3, 0.4)
-    dase.io.write(tmp_path / "b.h5", dase.io.Sequence(dase.Events.empty(8, 6)))
-    with pytest.raises(dase.InputError, match="must have at least 2 frames"):
-        open_video(tmp_path / "b.h5")

@@ -49,7 +49,7 @@ class LearnedThreshold(Effect):
         about="share of the way from equal pixels to the learned ones",
     )
     weights: str = asset(about="file of the network, beside the sensor file")
-    bound: Any = hidden()  # noqa: RUF009
+    bound: Any = hidden()  # noqa: RUF009  # a field, as those above
 
     def located(self, folder: Path) -> LearnedThreshold:
         """Return the effect with its file found from the folder of the sensor file."""

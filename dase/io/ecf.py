@@ -102,6 +102,15 @@ def _long(words: NDArray[Any], escapes: NDArray[np.intp]) -> Counts:
     return padded[escapes + 1] | padded[escapes + 2] << 8
 
 
+def _holder(lengths: NDArray[Any], count: int) -> int:
+    """Return which of the words, each for so many events, holds the last of `count`."""
+    total = np.cumsum(lengths)
+    last = int(np.searchsorted(total, count))
+    if count and last >= len(total):
+        raise _short()
+    return last
+
+
 def _runs(words: NDArray[Any], count: int, bits: int) -> tuple[Counts, int]:
     """Return the values of `count` events coded as runs, and the number of words they took."""
     most = (1 << bits) - 1
@@ -110,10 +119,7 @@ def _runs(words: NDArray[Any], count: int, bits: int) -> tuple[Counts, int]:
     escapes, data = _escaped(lengths == most, 2 if words.dtype.itemsize == 1 else 1)
     lengths[escapes] = _long(words, escapes)
     lengths[data] = 0
-    total = np.cumsum(lengths)
-    last = int(np.searchsorted(total, count))
-    if count and last >= len(total):
-        raise _short()
+    last = _holder(lengths, count)
     values = np.repeat(words[: last + 1].astype(np.int64) >> bits, lengths[: last + 1])[:count]
     follow = int(np.argmin(np.append(data[last + 1 :], False))) if last + 1 < len(data) else 0
     return values, (last + 1 + follow) if count else 0
@@ -123,11 +129,7 @@ def _masked(words: NDArray[Any], count: int) -> tuple[Counts, int]:
     words = words[:count].astype(np.int64)
     bits = np.ones((len(words), 6), np.bool_)
     bits[:, 1:] = (words[:, None] >> np.arange(4, -1, -1)) & 1 > 0
-    total = np.cumsum(bits.sum(axis=1))
-    last = int(np.searchsorted(total, count))
-    if count and last >= len(total):
-        raise _short()
-    used = last + 1 if count else 0
+    used = _holder(bits.sum(axis=1), count) + 1 if count else 0
     values = ((words[:used] >> 5)[:, None] + np.arange(6))[bits[:used]]
     return values[:count], used
 
@@ -142,11 +144,7 @@ def _times(buffer: NDArray[np.uint8], count: int) -> tuple[Counts, int]:
     lengths = np.where(steps, 0, low)
     lengths[escapes] = _long(bytes_, escapes)
     lengths[data] = 0
-    total = np.cumsum(lengths)
-    last = int(np.searchsorted(total, count))
-    if count and last >= len(total):
-        raise _short()
-    end = last + 1 if count else 0
+    end = _holder(lengths, count) + 1 if count else 0
     place = np.arange(end)
     steps = steps[:end]
     before = np.maximum.accumulate(np.where(steps, -1, place))  # last byte that is no step

@@ -49,7 +49,8 @@ class Note(str):
     rule: str
     number: int
 
-    def __new__(cls, text: str, kind: Kind = "said", rule: str = "", number: int = 0) -> Note:  # noqa: D102
+    def __new__(cls, text: str, kind: Kind = "said", rule: str = "", number: int = 0) -> Note:
+        """Return the sentence with its fields."""
         note = super().__new__(cls, text)
         note.kind, note.rule, note.number = kind, rule, number
         return note
