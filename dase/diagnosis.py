@@ -323,7 +323,7 @@ def _droppable(search: _Search, model: Model) -> dict[str, Model]:
 
 
 def _promising(search: _Search, model: Model, ways: Mapping[str, Model]) -> dict[str, Model]:
-    """Return those models that may do as well as the present one: quickly fitted, not far off on the scout."""
+    """Return models that may do as well as the present one: quickly fitted, not far off on the scout."""
     if not ways:
         return {}
     scout = search.evidence.scout.view()

@@ -19,7 +19,7 @@ import multiprocessing
 import os
 import time
 from collections.abc import Iterator
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from itertools import product
 from pathlib import Path
 from typing import Any
@@ -220,7 +220,7 @@ def main() -> None:
     parser.add_argument("--scenes", type=int, default=3)
     parser.add_argument("--nothing", type=int, default=100)
     parser.add_argument("--quick", action="store_true", help="one seed, one scene, medium only")
-    parser.add_argument("--device", default="cpu")
+    parser.add_argument("--device", default="cpu", help="or some, which share the runs: cuda:0,cuda:1")
     parser.add_argument("--jobs", type=int, default=1)
     parser.add_argument("--minutes", type=float, default=float("inf"), help="no run begins after these")
     parser.add_argument("--report", action="store_true", help="only write the page from the log")
@@ -246,20 +246,25 @@ def _run(options: argparse.Namespace) -> None:
     todo = [case for case in cases(options) if case.name not in done]
     threads = max(1, (os.cpu_count() or 1) // options.jobs)
     until = begin + 60 * options.minutes
-    jobs = [Job(case, options.device, threads, options.hidden, until) for case in todo]
+    devices = options.device.split(",")
+    jobs = [Job(case, devices[0], threads, options.hidden, until) for case in todo]
     print(f"{len(done)} runs in the log, {len(jobs)} to do", flush=True)
     context = multiprocessing.get_context("spawn")
     with options.log.open("a") as log:
         if options.hidden and "other" in options.kinds and "time/a_01" not in done and options.minutes > 0:
             _note(log, _timed(options), options, "alone")
-        with context.Pool(options.jobs) as pool:
+        places = context.SimpleQueue()
+        for n in range(options.jobs):
+            places.put(devices[n % len(devices)])
+        with context.Pool(options.jobs, _settle, (places,)) as pool:
             for n, line in enumerate(pool.imap_unordered(_safely, jobs)):
                 _note(log, line, options, f"{n + 1}/{len(jobs)}")
 
 
 def _timed(options: argparse.Namespace) -> dict[str, Any]:
     """Run one case of the other simulator twice, alone: the first time compiles."""
-    job = Job(Case("time", (), "a_01", 0, 0), options.device, os.cpu_count() or 1, options.hidden)
+    device = options.device.split(",")[0]
+    job = Job(Case("time", (), "a_01", 0, 0), device, os.cpu_count() or 1, options.hidden)
     first = _safely(job)
     return _safely(job) | {"first": first.get("seconds")}
 
@@ -279,9 +284,18 @@ def _note(log: Any, line: dict[str, Any], options: argparse.Namespace, count: st
     print(f"{count} {mark} {line['name']:40s} {line['seconds']:5.1f} s", short(line), flush=True)
 
 
+_place: list[str] = []
+"""The device of this process, if it has one to itself or shares it with others."""
+
+
+def _settle(places: Any) -> None:
+    _place[:] = [places.get()]
+
+
 def _safely(job: Job) -> dict[str, Any]:
     if time.time() > job.until:
         return {"late": job.case.name}
+    job = replace(job, device=_place[0]) if _place else job
     try:
         return run_case(job)
     except Exception as error:  # one bad run must not end the others
