@@ -13,9 +13,10 @@ from dase.effects import EFFECTS, StreamEffect
 from dase.evidence import gather
 from dase.explain import bars
 from dase.kernels import probes as kernels
-from dase.probes import FAMILIES, LAYOUT, SEEN, statistics
+from dase.probes import FAMILIES, LAYOUT, statistics
 from dase.sensor import Sensor
 from dase.structure import find
+from dase.sums import SEEN
 from dase.trials import CLASS_TIMES, LAG_TIMES
 
 ON = {
