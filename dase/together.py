@@ -2,7 +2,7 @@
 
 A search, a fit, a judgement is a generator: it yields what it wants simulated, gets the answers, and goes on.
 `together` runs as many of them as there are, step by step. Rows of a launch do not know of each other, so the
-answers are those that each would get alone, to the bit.
+sums are those that each would get alone, to the bit, and the statistics but for rounding.
 """
 
 from __future__ import annotations
