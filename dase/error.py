@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -45,6 +46,10 @@ class Scale:
 
     def weights(self) -> Array:
         """Return the weight of each statistic: families weigh alike, shape (J,)."""
+        return self._weights
+
+    @cached_property
+    def _weights(self) -> Array:
         out = np.zeros(len(self.used))
         for part in LAYOUT.values():
             count = np.count_nonzero(self.used[part])

@@ -6,6 +6,8 @@ measurement are compared. Each belongs to a family, a row of `FAMILIES`.
 
 from __future__ import annotations
 
+from functools import lru_cache
+
 import numpy as np
 from numpy.typing import NDArray
 from scipy.fft import rfft
@@ -176,15 +178,22 @@ def _spectrum(clock: NDArray[np.int32], frame: Frame) -> tuple[Array, Array]:
     total = np.maximum((on + off).sum(1), 1)
     net -= net.mean(1, keepdims=True)
     count = net.shape[1]
-    power = np.abs(rfft(net * np.hanning(count).astype(np.float32), axis=1)) ** 2 / count
-    frequency = np.fft.rfftfreq(count, frame.step)
-    edges = np.geomspace(LOWEST, 0.5 / frame.step, TONES + 1)
-    inside = np.searchsorted(edges, frequency)[:, None] == np.arange(1, TONES + 1)
-    bands = power @ (inside / np.maximum(inside.sum(0), 1)).astype(np.float32)
+    window, mean = _tones(count, frame.step)
+    power = np.abs(rfft(net * window, axis=1)) ** 2 / count
+    bands = power @ mean
     turn = 2 * np.pi * frame.peak * frame.step * (frame.first + np.arange(count))
     swing = net @ np.stack([np.cos(turn), -np.sin(turn)], 1).astype(np.float32) / total[:, None]
     values = np.concatenate([np.log(bands + 0.5), swing], 1).astype(np.float64)
     return values, np.repeat(total[:, None], values.shape[1], 1).astype(np.float64)
+
+
+@lru_cache(maxsize=8)
+def _tones(count: int, step: float) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Return the window, shape (T,), and what makes means over bands of the power, shape (F, TONES)."""
+    edges = np.geomspace(LOWEST, 0.5 / step, TONES + 1)
+    inside = np.searchsorted(edges, np.fft.rfftfreq(count, step))[:, None] == np.arange(1, TONES + 1)
+    mean = (inside / np.maximum(inside.sum(0), 1)).astype(np.float32)
+    return np.hanning(count).astype(np.float32), mean
 
 
 def peak_of(clock: NDArray[np.int64], step: float) -> float:
