@@ -34,6 +34,12 @@ BEHIND = 2.0
 CLOSE = 1.0
 """Such an error that is added to the limit, for errors near the floor say little."""
 
+AGAIN = 2
+"""Times at most that a finalist is fitted further whose training loss is least but not its held-out error."""
+
+SURELY = 0.8
+"""Its training loss, relative to that of the finalist with the least held-out error."""
+
 REPEATS = 30
 """Simulations with other seeds by which a finalist is judged."""
 
@@ -151,7 +157,18 @@ def judge_alone(evidence: Evidence, tried: Sequence[Tried], *, seed: int) -> lis
         for t, (error, half) in zip(tried, found, strict=True) if error <= limit
     ]  # fmt: skip
     done = {t.name: t for t in together(works)}
+    for _ in range(AGAIN):
+        first, least = (min(done.values(), key=key) for key in (_error, lambda t: t.model.loss))
+        if least is first or least.model.loss > SURELY * first.model.loss:
+            break
+        # better where it was fitted, worse where it is judged: it is still on its way
+        half = alone(_looking(evidence, least, seed=seed))[1]
+        done[least.name] = alone(_judging(evidence, least, half, seed=seed))
     return [done.get(t.name, t) for t in tried]
+
+
+def _error(tried: Tried) -> float:
+    return tried.error
 
 
 def _looking(evidence: Evidence, tried: Tried, *, seed: int) -> Work[tuple[float, Half]]:

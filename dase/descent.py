@@ -45,6 +45,9 @@ PART = 0.25
 LITTLE = 0.3
 """Loss that chance alone gives."""
 
+MUCH = 0.9
+"""A loss below this, relative to that before, tells that a descent is still on its way."""
+
 PRIOR = 2e-3
 """Weight by which parameters that the data say nothing about are held at their start."""
 
@@ -71,7 +74,14 @@ class Found:
 
 
 def searching(
-    half: Half, space: Space, start: Array, *, seed: int, iterations: int = 5, radius: float = RADIUS
+    half: Half,
+    space: Space,
+    start: Array,
+    *,
+    seed: int,
+    iterations: int = 5,
+    radius: float = RADIUS,
+    patient: bool = False,
 ) -> Work[Found]:
     """Descend from one start, see `together`.
 
@@ -86,6 +96,7 @@ def searching(
         seed: Of the models' random numbers, and of the populations.
         iterations: Populations, not counting those that are still on the way.
         radius: Of the first.
+        patient: Whether populations that still bring the loss down much do not count either.
     """
     rng = np.random.default_rng([seed, 7])
     low, high = space.bounds()
@@ -103,6 +114,7 @@ def searching(
         losses = half.scale.loss(tried) + penalty(places, start)
         leader = int(np.argmin(losses))
         improved = losses[leader] < best_loss - 1e-3 * abs(losses[leader])
+        much = patient and losses[leader] < MUCH * best_loss < np.inf
         best, best_loss = places[leader], float(losses[leader])
         near = np.all(np.abs(places - best) <= 2.5 * reach, axis=1)
         slope = slopes((places[near] - best) / reach, tried[near] - tried[leader]) / reach
@@ -112,7 +124,7 @@ def searching(
         # as far as the loss changes by a good part of itself, along each axis
         ideal = np.sqrt(PART * max(best_loss, LITTLE) / np.maximum(steepness, 1e-12))
         reach = np.clip(np.clip(ideal, 0.35 * reach, WIDEN * reach), SMALLEST, WIDEST)
-        if improved and beyond > FARTHEST:
+        if (improved and beyond > FARTHEST) or much:
             continue  # still on the way: does not count
         left -= 1
         if left <= 0:

@@ -10,7 +10,7 @@ from itertools import combinations
 from dase.candidates import Tried, chance_of, open_to, try_all
 from dase.confidence import estimates
 from dase.effects import EFFECTS, Effect
-from dase.error import Judgement
+from dase.error import Judgement, announced, explained, worst_families
 from dase.events import Events
 from dase.evidence import PIXELS, Evidence, gather
 from dase.model import Model, fit_present, free_of, model_of, settle, settling
@@ -32,12 +32,6 @@ MATERIAL = 0.3
 
 SHARE = 0.1
 """Least share of the way to the floor."""
-
-CLOSE_FAMILY = 4.0
-"""Error of one family up to which nothing is looked for: what few statistics show the mean hides."""
-
-MUCH_FAMILY = 8.0
-"""Error of one family above which a finding is not announced, although the mean is at the floor."""
 
 TIE = 0.35
 """Candidates at the floor whose held-out error is within this of the best's are not told apart from it."""
@@ -143,31 +137,6 @@ def diagnose(
     if len(search.added(model)) > 1:
         model, judgement = _review(search, model, judgement)
     return _verdict(search, start, model, errors, before, begin)
-
-
-def explained(judgement: Judgement) -> bool:
-    """Whether a model is at the floor, altogether and in every family of probes."""
-    families = judgement.families
-    inside = (families[name] <= max(judgement.limits[name], CLOSE_FAMILY) for name in families)
-    return judgement.error <= judgement.gate and all(inside)
-
-
-def announced(judgement: Judgement) -> bool:
-    """Whether what was found may be announced: the mean is at the floor, and no family is far off.
-
-    A search goes on while a family is above `CLOSE_FAMILY`; that nothing more is found there does not make
-    what was found a stand-in.
-    """
-    families = judgement.families
-    inside = (families[name] <= max(judgement.limits[name], MUCH_FAMILY) for name in families)
-    return judgement.error <= judgement.gate and all(inside)
-
-
-def worst_families(judgement: Judgement) -> list[str]:
-    """Return the two families that are most above their limits, if any are."""
-    families, limits = judgement.families, judgement.limits
-    above = [name for name in families if families[name] > limits[name]]
-    return sorted(above, key=lambda name: -families[name] / limits[name])[:2]
 
 
 def _greedy(search: _Search, model: Model, most: int) -> tuple[Model, Judgement, list[float]]:
@@ -281,16 +250,9 @@ def _like(sensor: Sensor, model: Model, more: Sequence[str]) -> Model:
 
 
 def _review(search: _Search, model: Model, judgement: Judgement) -> tuple[Model, Judgement]:
-    """Drop effects that are not needed any more, and put simpler ones in place of others."""
-    whole = model
-    for name, less in _droppable(search, model).items():
-        if name not in model.sensor or len(search.added(model)) == 1:
-            continue
-        less = less if model is whole else _like(model.sensor.without(name), model, ())
-        fitted = settle(search.evidence, less, seed=search.seed)
-        without = search.judge(fitted)
-        if explained(without) or without.error <= judgement.error:
-            model, judgement = fitted, without
+    """Drop effects that are not needed any more, put simpler ones in place of others, and drop again."""
+    model, judgement = _drop(search, model, judgement)
+    before = model
     for name in search.added(model):
         for other, swap in _rivals(search, model, name).items():
             swapped = settle(search.evidence, swap, seed=search.seed)
@@ -303,6 +265,22 @@ def _review(search: _Search, model: Model, judgement: Judgement) -> tuple[Model,
                 search.ties[other] = {*search.ties.pop(name, set()), name} - {other}
                 break
             search.ties.setdefault(name, set()).add(other)
+    return _drop(search, model, judgement) if model is not before else (model, judgement)
+
+
+def _drop(search: _Search, model: Model, judgement: Judgement) -> tuple[Model, Judgement]:
+    """Drop effects that are not needed any more."""
+    whole = model
+    for name, less in _droppable(search, model).items():
+        if name not in model.sensor or len(search.added(model)) == 1:
+            continue
+        less = less if model is whole else _like(model.sensor.without(name), model, ())
+        fitted = settle(search.evidence, less, seed=search.seed)
+        without = search.judge(fitted)
+        # what would not be added now is not kept
+        needless = announced(without) and without.error < judgement.error + MATERIAL
+        if explained(without) or needless or without.error <= judgement.error:
+            model, judgement = fitted, without
     return model, judgement
 
 
@@ -323,7 +301,7 @@ def _droppable(search: _Search, model: Model) -> dict[str, Model]:
 
 
 def _promising(search: _Search, model: Model, ways: Mapping[str, Model]) -> dict[str, Model]:
-    """Return models that may do as well as the present one: quickly fitted, not far off on the scout."""
+    """Return those models that may do as well as the present one: not far off on the scout."""
     if not ways:
         return {}
     scout = search.evidence.scout.view()

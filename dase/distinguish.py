@@ -15,11 +15,12 @@ from dase.effects.timestamp import Timestamp
 from dase.errors import InputError
 from dase.evidence import typical_changes
 from dase.kernels import launch
-from dase.probes import LAYOUT, Frame, Sums, compared, peak_of, statistics, tolerance, zones
+from dase.probes import LAYOUT, compared, peak_of, statistics, tolerance, zones
 from dase.sensor import Sensor
 from dase.standards import STANDARDS, Standard
 from dase.stimulus import MASKED, Grid, Stimulus, band_edges, sort_into_cells
 from dase.structure import SHORTEST, Structure
+from dase.sums import Frame, Sums
 from dase.trials import Order, Trials, finer_steps
 
 if TYPE_CHECKING:

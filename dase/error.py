@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,6 +18,12 @@ FAR = 4.0
 
 CLOSE = 1.2
 """A model up to this error counts as right also where its repeats differ by less: the rest is no matter."""
+
+CLOSE_FAMILY = 4.0
+"""Error of one family up to which nothing is looked for: what few statistics show the mean hides."""
+
+MUCH_FAMILY = 8.0
+"""Error of one family above which a finding is not announced, although the mean is at the floor."""
 
 
 @dataclass(frozen=True)
@@ -39,6 +46,10 @@ class Scale:
 
     def weights(self) -> Array:
         """Return the weight of each statistic: families weigh alike, shape (J,)."""
+        return self._weights
+
+    @cached_property
+    def _weights(self) -> Array:
         out = np.zeros(len(self.used))
         for part in LAYOUT.values():
             count = np.count_nonzero(self.used[part])
@@ -123,3 +134,28 @@ def robust(z: Array) -> Array:
     """Return the pseudo-Huber loss: z² for small z, 2 |z| for large; its slope never vanishes."""
     out: Array = 2.0 * (np.sqrt(1.0 + z * z) - 1.0)
     return out
+
+
+def explained(judgement: Judgement) -> bool:
+    """Whether a model is at the floor, altogether and in every family of probes."""
+    families = judgement.families
+    inside = (families[name] <= max(judgement.limits[name], CLOSE_FAMILY) for name in families)
+    return judgement.error <= judgement.gate and all(inside)
+
+
+def announced(judgement: Judgement) -> bool:
+    """Whether what was found may be announced: the mean is at the floor, and no family is far off.
+
+    A search goes on while a family is above `CLOSE_FAMILY`; that nothing more is found there does not make
+    what was found a stand-in.
+    """
+    families = judgement.families
+    inside = (families[name] <= max(judgement.limits[name], MUCH_FAMILY) for name in families)
+    return judgement.error <= judgement.gate and all(inside)
+
+
+def worst_families(judgement: Judgement) -> list[str]:
+    """Return the two families that are most above their limits, if any are."""
+    families, limits = judgement.families, judgement.limits
+    above = [name for name in families if families[name] > limits[name]]
+    return sorted(above, key=lambda name: -families[name] / limits[name])[:2]

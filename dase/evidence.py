@@ -15,11 +15,12 @@ from dase.errors import InputError
 from dase.events import Events
 from dase.kernels import launch
 from dase.kernels import probes as kernels
-from dase.probes import Frame, Sums, compared, peak_of, statistics, tolerance, without, zones
+from dase.probes import compared, peak_of, statistics, tolerance, zones
 from dase.scene import Scene
 from dase.space import Space
 from dase.stimulus import MASKED, Grid, Stimulus, Trust, band_edges, light_of, sort_into_cells
 from dase.structure import Structure, find
+from dase.sums import Frame, Sums, without
 from dase.together import Ask, Work, alone, simulated
 from dase.trials import Trials, finer_steps
 

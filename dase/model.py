@@ -67,9 +67,13 @@ class Model:
         values = yield from half.rebasing(self.space, self.place, repeats=repeats, seed=seed)
         return half.judge(values, seed=seed)
 
-    def searching(self, half: Half, *, seed: int, iterations: int = 4, radius: float = 0.2) -> Work[Model]:
+    def searching(
+        self, half: Half, *, seed: int, iterations: int = 4, radius: float = 0.2, patient: bool = False
+    ) -> Work[Model]:
         """Return the model with its parameters improved, see `together`."""
-        found = yield from self.exploring(half, seed=seed, iterations=iterations, radius=radius)
+        found = yield from searching(
+            half, self.space, self.place, seed=seed, iterations=iterations, radius=radius, patient=patient
+        )
         return replace(self, place=found.place, loss=found.loss)
 
     def exploring(self, half: Half, *, seed: int, iterations: int = 4, radius: float = 0.2) -> Work[Found]:
@@ -126,7 +130,7 @@ def settling(
         values = yield [Ask(half, m.space, m.place[None], seed) for m in (model, other)]
         losses = [float(half.scale.loss(value)[0]) for value in values]
         model = other if losses[1] < losses[0] else model
-        model = yield from model.searching(half, seed=seed + turn, radius=0.12 / (1 + turn))
+        model = yield from model.searching(half, seed=seed + turn, radius=0.12 / (1 + turn), patient=True)
     return model
 
 

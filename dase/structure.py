@@ -23,6 +23,10 @@ CERTAIN = 0.97
 """Share of events that must follow a regularity."""
 
 ENOUGH = 50_000
+"""Events in which a readout's lines are looked for."""
+
+SLOW = 20
+"""Times as many in which ticks are looked for: of a slow clock, thousands of events share one."""
 
 DIRECTIONS = ("down", "up", "right", "left")
 
@@ -91,7 +95,7 @@ def find(events: Events) -> Structure:
     # all of them tell its length better
     if best.line:
         best = replace(best, line=line_time(events, best.direction))
-    elif ticks(first.t):  # the lines of a scan are read at ticks too
+    elif ticks(events.t[: SLOW * ENOUGH]):  # the lines of a scan are read at ticks too
         best = Structure(step=ticks(events.t))
     return best if best.shares(events).max() >= CERTAIN else Structure()
 

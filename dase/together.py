@@ -2,7 +2,7 @@
 
 A search, a fit, a judgement is a generator: it yields what it wants simulated, gets the answers, and goes on.
 `together` runs as many of them as there are, step by step. Rows of a launch do not know of each other, so the
-answers are those that each would get alone, to the bit.
+sums are those that each would get alone, to the bit, and the statistics but for rounding.
 """
 
 from __future__ import annotations
@@ -14,8 +14,9 @@ from typing import TYPE_CHECKING, Any, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from dase.probes import Sums, Totals, statistics, totals
+from dase.probes import statistics
 from dase.space import Space
+from dase.sums import Sums, Totals, totals
 from dase.trials import Order, Trials
 
 if TYPE_CHECKING:
@@ -121,8 +122,10 @@ def _statistics(found: Sequence[tuple[int, Half, Sums]]) -> dict[int, Array]:
     for members in groups.values():
         frame = members[0][1].frame
         parts = [totals(sums, frame) for _, _, sums in members]
-        both = [np.concatenate([getattr(p, n) for p in parts]) for n in ("sums", "folded", "clock", "stamps")]
+        names = ("sums", "folded", "clock", "stamps")
+        joined = [np.concatenate([getattr(p, n) for p in parts]) for n in names]
+        both = Totals(joined[0], joined[1], joined[2], joined[3], parts[0].expected)
         ends = np.cumsum([len(p.sums) for p in parts])[:-1]
-        values = np.split(statistics(Totals(*both, expected=parts[0].expected), frame)[0], ends)
+        values = np.split(statistics(both, frame)[0], ends)
         out.update(zip([n for n, _, _ in members], values, strict=True))
     return out

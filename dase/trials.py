@@ -18,10 +18,10 @@ from dase.effects.threshold import Threshold
 from dase.events import Events
 from dase.kernels import launch, trials
 from dase.kernels import probes as kernels
-from dase.probes import GROUP, Frame, Sums, fold, over_groups
 from dase.sensor import Sensor
 from dase.stimulus import Stimulus
 from dase.structure import Structure
+from dase.sums import GROUP, Frame, Sums, fold, over_groups
 
 LAG_TIMES = (-0.003, -0.001, 0.0, 0.001, 0.002, 0.004, 0.008, 0.016, 0.028, 0.044, 0.063)
 """Before an event [s] at which its light is looked at; the differences of neighbours are averaged."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from copy import copy
 from dataclasses import replace
 from itertools import pairwise
 
@@ -13,10 +14,13 @@ from dase.effects import EFFECTS, StreamEffect
 from dase.evidence import gather
 from dase.explain import bars
 from dase.kernels import probes as kernels
-from dase.probes import FAMILIES, LAYOUT, SEEN, statistics
+from dase.model import model_of
+from dase.probes import FAMILIES, LAYOUT, statistics
 from dase.sensor import Sensor
-from dase.structure import find
-from dase.trials import CLASS_TIMES, LAG_TIMES
+from dase.structure import Structure, find
+from dase.sums import GROUP, SEEN, totals, without
+from dase.together import alone, together
+from dase.trials import CLASS_TIMES, LAG_TIMES, Order
 
 ON = {
     "flicker": dict(depth=0.3), "vignetting": dict(loss=0.5), "dark": dict(current=0.02, spread=0.3),
@@ -157,6 +161,83 @@ def test_rows_of_a_batch_are_independent(evidence):
         np.testing.assert_array_equal(together.halves[n], alone.halves[0])
     apart = trials.run(Sensor(), np.repeat(vectors[:1], 2, 0), seed=2, reseed=True)
     assert np.any(apart.halves[0] != apart.halves[1])
+
+
+def test_models_side_by_side_are_those_alone(evidence, device, rng):
+    """A CPU works on several models of a pixel in its vectors: the same to the last bit."""
+    if str(device).startswith("cuda"):
+        pytest.skip("on a GPU every model of a pixel has a thread of its own")
+    lanes = evidence.scout.trials
+    threads = copy(lanes)
+    threads._kernels, threads._lanes = {}, 1
+    names = ("leak", "shot", "dark", "linlog", "bandwidth", "latency", "jitter", "voltage_noise")
+    sensors = [Sensor().with_effect(EFFECTS[n](**ON[n])) for n in names]
+    # enough effects for the kernel that has all of them
+    sensors = [s.with_effect(EFFECTS["refractory"](period=2e-3)) for s in sensors]
+    orders = []
+    for n, sensor in enumerate(sensors):
+        vectors = np.repeat(sensor.parameters()[None], 5, 0)
+        vectors[:, :2] *= np.exp(rng.uniform(-0.3, 0.3, (5, 2)))
+        vectors[:, 2] = rng.choice([0.0, 1.0], 5)
+        orders.append(Order(sensor, vectors, seed=n, reseed=n % 2 > 0, finer=1))
+    for one, other in zip(lanes.run_all(orders), threads.run_all(orders), strict=True):
+        assert one.halves.sum() > 500
+        np.testing.assert_array_equal(one.halves, other.halves)
+        np.testing.assert_array_equal(one.sums, other.sums)
+        np.testing.assert_array_equal(one.clock, other.clock)
+
+
+def test_a_clock_is_the_same_inside_the_kernel(evidence):
+    """Events that the kernel stamps by a clock that ticks fall where those that go through one fall."""
+    clock = EFFECTS["timestamp"](step=3e-3, jitter=0.0)
+    sensor, trials = Sensor().with_effect(clock), copy(evidence.train.trials)
+    vector = sensor.parameters()[None]
+    trials.structure = Structure(step=clock.step)
+    ticks = trials.ticks(sensor)
+    assert ticks == clock.step
+    got, free = trials.run_all([Order(sensor, vector, 9, finer=1, ticks=t) for t in (ticks, 0.0)])
+    want = trials.stream(sensor, vector, sensor.streams(), seed=9)
+    many = want.clock.sum()
+    assert np.abs(got.clock - want.clock).sum() < 1e-2 * many < 0.5 * np.abs(free.clock - want.clock).sum()
+    np.testing.assert_allclose(got.stamps, want.stamps, atol=1e-2)
+    # where more than that is to be felt, events have to go through it
+    assert trials.ticks(sensor.with_effect(EFFECTS["readout"](rate=1e5))) is None
+    trials.structure = Structure(step=2e-3)
+    assert trials.ticks(sensor) is None
+
+
+def test_counts_fold_as_plain_loops_would(evidence, rng):
+    """Products over the halves, pixels that count oddly, and rings, summed up where the counts are."""
+    half = evidence.train
+    expected = half.found.halves[0] * rng.uniform(0.5, 1.5, half.found.halves[0].shape)
+    frame = replace(half.frame, expected=expected)
+    counts, got = half.found.halves[0].astype(float), totals(half.found, frame).folded[0]
+    d = (counts - expected).reshape(-1, 2, 2, 2)  # state, half, polarity
+    products = np.einsum("nsp,nsq->spq", d[:, :, 0], d[:, :, 1]).reshape(2, 4)
+    own = (d**2).sum((0, 2))
+    np.testing.assert_allclose(got[:12], np.concatenate([products, own], 1).ravel(), rtol=1e-4, atol=1e-2)
+    rings = [counts[frame.zone == z].reshape(-1, 2, 2, 2).sum((0, 2)) for z in range(kernels.ZONES)]
+    np.testing.assert_array_equal(got[kernels.RINGS :], np.stack(rings, -1).ravel())
+    left = without(half.found, frame)
+    keep = np.arange(len(expected)) >= GROUP
+    d = d[keep]
+    np.testing.assert_allclose(
+        left.folded[0][:4], np.einsum("np,nq->pq", d[:, 0, 0], d[:, 0, 1]).ravel(), rtol=1e-4, atol=1e-2
+    )
+    np.testing.assert_allclose(left.expected[0], expected[keep].sum(0))
+
+
+def test_searches_side_by_side_end_where_each_ends_alone(evidence):
+    half = evidence.scout.view()
+    models = [
+        model_of(Sensor().with_effect(EFFECTS[name](**ON[name]))) for name in ("leak", "shot", "linlog")
+    ]
+    models[0].rebase(half, repeats=6, seed=1)
+    works = [m.searching(half, seed=3, iterations=1) for m in models]
+    for found, model in zip(together(works), models, strict=True):
+        want = alone(model.searching(half, seed=3, iterations=1))
+        np.testing.assert_allclose(found.place, want.place, atol=1e-5)
+        assert found.loss == pytest.approx(want.loss, rel=1e-4)
 
 
 def test_silent_pixels_are_counted(evidence, events):

@@ -7,6 +7,7 @@ import inspect
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
 
@@ -113,11 +114,7 @@ class Effect:
     @classmethod
     def parameters(cls) -> tuple[Parameter, ...]:
         """Return the numbers of this effect, in the order of its fields."""
-        return tuple(
-            Parameter(f.name, **f.metadata["parameter"])
-            for f in dataclasses.fields(cls)
-            if "parameter" in f.metadata
-        )
+        return _parameters_of(cls)  # type: ignore[arg-type]
 
     @classmethod
     def choices(cls) -> dict[str, tuple[str, ...]]:
@@ -196,3 +193,12 @@ class Effect:
     def about(cls) -> str:
         """Return the plain-language description."""
         return inspect.cleandoc(cls.__doc__ or "")
+
+
+@cache
+def _parameters_of(effect: type[Effect]) -> tuple[Parameter, ...]:
+    return tuple(
+        Parameter(f.name, **f.metadata["parameter"])
+        for f in dataclasses.fields(effect)
+        if "parameter" in f.metadata
+    )
