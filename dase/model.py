@@ -76,9 +76,13 @@ class Model:
         )
         return replace(self, place=found.place, loss=found.loss)
 
-    def exploring(self, half: Half, *, seed: int, iterations: int = 4, radius: float = 0.2) -> Work[Found]:
+    def exploring(
+        self, half: Half, *, seed: int, iterations: int = 4, radius: float = 0.2, patient: bool = False
+    ) -> Work[Found]:
         """Improve the parameters and keep all that was tried, see `together`."""
-        return searching(half, self.space, self.place, seed=seed, iterations=iterations, radius=radius)
+        return searching(
+            half, self.space, self.place, seed=seed, iterations=iterations, radius=radius, patient=patient
+        )
 
 
 def model_of(sensor: Sensor, free: Sequence[str] | None = None) -> Model:
