@@ -174,14 +174,18 @@ class Trials:
         folded, both, clocks = _folded(orders, pixels), np.concatenate(sums), np.concatenate(clock)
         out = []
         for order, begin, end in zip(orders, begins.tolist(), ends.tolist(), strict=True):
-            cut = slice(begin, end)
-            stamps = np.zeros((end - begin, len(Structure.NAMES)))
-            stamps[:, 0] = order.ticks > 0 and self.structure.step > 0
+            cut, (of_groups, teams) = slice(begin, end), groups.get(begin, (None, None))
             known = None if folded is None or order.frame is None else folded[cut]
-            of_groups, teams = groups.get(begin, (None, None))
+            stamps = self._stamps(order)
             out.append(
                 Sums(both[cut], pixels[cut], clocks[cut], stamps, of_groups, teams, order.frame, known)
             )
+        return out
+
+    def _stamps(self, order: Order) -> NDArray[np.float64]:
+        """Return the shares of events that follow regularities: those that a clock has stamped do."""
+        out = np.zeros((len(order.vectors), len(Structure.NAMES)))
+        out[:, 0] = order.ticks > 0 and self.structure.step > 0
         return out
 
     def _wide(self, order: Order) -> NDArray[np.float32]:

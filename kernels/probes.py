@@ -94,9 +94,9 @@ def plus(a: wp.array3d[float], place: int, value: float):
     ...
 
 
-@wp.func_native("return a.data[place];")
-def at_place(a: wp.array2d[float], place: int) -> float:
-    """Return what lies at a place of a contiguous array."""
+@wp.func_native("return a.data[(size_t)i * a.shape[1] + k];")
+def entry(a: wp.array2d[float], i: int, k: int) -> float:
+    """Return a[i, k] of a contiguous array."""
     ...
 
 
@@ -120,10 +120,9 @@ def octave(steps: int, last: int) -> int:
 def observe_light(sink: Probes, base: int, i: int, k: int, band: int, sign: float):
     """How the light went before the event: bandwidth and latency."""
     end = sink.level.shape[1] - 1
-    first = i * sink.level.shape[1]
-    newer = at_place(sink.level, first + wp.clamp(k - sink.lags[0], 0, end))
+    newer = entry(sink.level, i, wp.clamp(k - sink.lags[0], 0, end))
     for n in range(_LAGS):
-        older = at_place(sink.level, first + wp.clamp(k - sink.lags[n + 1], 0, end))
+        older = entry(sink.level, i, wp.clamp(k - sink.lags[n + 1], 0, end))
         plus(sink.sums, base + _LAG + n * _BANDS + band, sign * (newer - older))
         newer = older
     plus(sink.sums, base + _LAG_COUNT + band, 1.0)
@@ -139,8 +138,7 @@ def observe_pair(sink: Probes, base: int, i: int, k: int, before: int, now: int,
     if steps > sink.classes[1]:
         group = 2
     pair = (2 * now + last) * _CLASSES + group
-    first = i * sink.level.shape[1]
-    change = float(2 * now - 1) * (at_place(sink.level, first + k) - at_place(sink.level, first + before))
+    change = float(2 * now - 1) * (entry(sink.level, i, k) - entry(sink.level, i, before))
     apart = change - sink.middle[pair]
     plus(sink.sums, base + _CHANGE + 3 * pair, 1.0)
     plus(sink.sums, base + _CHANGE + 3 * pair + 1, change)
