@@ -138,7 +138,9 @@ def scouting(evidence: Evidence, present: Model, effect: Effect, *, seed: int) -
 def refining(evidence: Evidence, tried: Tried, *, seed: int) -> Work[Tried]:
     """Fit a candidate to all pixels of the training half, by the sampling errors of the present model."""
     # a finalist that is still on its way would be judged by where it happens to be
-    found = yield from tried.model.exploring(evidence.train, seed=seed, iterations=3, radius=0.2, patient=True)
+    found = yield from tried.model.exploring(
+        evidence.train, seed=seed, iterations=3, radius=0.2, patient=True
+    )
     model = replace(tried.model, place=found.place, loss=found.loss)
     return replace(tried, model=model, fit=found.loss, bank=found.tried)
 

@@ -10,7 +10,7 @@ from itertools import combinations
 from dase.candidates import Tried, chance_of, open_to, try_all
 from dase.confidence import estimates
 from dase.effects import EFFECTS, Effect
-from dase.error import Judgement, announced, explained, worst_families
+from dase.error import Judgement, announced, explained, silent, worst_families
 from dase.events import Events
 from dase.evidence import PIXELS, Evidence, gather
 from dase.model import Model, fit_present, free_of, model_of, settle, settling
@@ -29,6 +29,9 @@ SIGNIFICANT = 0.02
 
 MATERIAL = 0.3
 """Least fall of the held-out error, in units of the floor."""
+
+LITTLE = 0.2
+"""The same where the model counts as right without: then only what leaves no more than chance is added."""
 
 SHARE = 0.1
 """Least share of the way to the floor."""
@@ -159,7 +162,7 @@ def _step(search: _Search, model: Model, judgement: Judgement, more: bool) -> tu
     names = tuple(e.name for e in model.space.sensor.effects)
     cells = worst_cells(evidence, judgement)
     step = Step(names, judgement.error, judgement.gate, judgement.families, (), None, (), cells)
-    if explained(judgement) or not more:
+    if silent(judgement) or not more:
         return step, None
     repeats = model.rebase(evidence.train, repeats=REPEATS, seed=seed + 300)
     model.rebase(evidence.scout, repeats=16, seed=seed + 200)
@@ -178,6 +181,9 @@ def _step(search: _Search, model: Model, judgement: Judgement, more: bool) -> tu
     mine = next(rank for rank in ranking if rank.effect == best.name)
     certain = mine.p_value <= max(SIGNIFICANT, 1.01 / (1 + len(repeats)))
     enough = mine.fall >= MATERIAL and mine.share >= SHARE and certain
+    if explained(judgement):
+        # what is left may be the scene's or the other simulator's: only what accounts for all of it is added
+        enough = mine.fall >= LITTLE and best.judged is not None and silent(best.judged) and certain
     if not search.history:
         search.first = sorted(tried, key=lambda t: t.scouted)
     if enough:
@@ -278,8 +284,10 @@ def _drop(search: _Search, model: Model, judgement: Judgement) -> tuple[Model, J
         fitted = settle(search.evidence, less, seed=search.seed)
         without = search.judge(fitted)
         # what would not be added now is not kept
-        needless = announced(without) and without.error < judgement.error + MATERIAL
-        if explained(without) or needless or without.error <= judgement.error:
+        fall = without.error - judgement.error
+        enough = LITTLE if explained(without) and silent(judgement) else MATERIAL
+        left = explained(without) and not silent(judgement)
+        if silent(without) or left or fall <= 0 or (announced(without) and fall < enough):
             model, judgement = fitted, without
     return model, judgement
 
