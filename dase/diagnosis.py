@@ -30,8 +30,9 @@ SIGNIFICANT = 0.02
 MATERIAL = 0.3
 """Least fall of the held-out error, in units of the floor."""
 
-LITTLE = 0.2
-"""The same where the model counts as right without: then only what leaves no more than chance is added."""
+HALF = 0.5
+"""Where the model counts as right without it, an effect is added only if it leaves no more than chance, and
+at most this share of the error."""
 
 SHARE = 0.1
 """Least share of the way to the floor."""
@@ -182,8 +183,7 @@ def _step(search: _Search, model: Model, judgement: Judgement, more: bool) -> tu
     certain = mine.p_value <= max(SIGNIFICANT, 1.01 / (1 + len(repeats)))
     enough = mine.fall >= MATERIAL and mine.share >= SHARE and certain
     if explained(judgement):
-        # what is left may be the scene's or the other simulator's: only what accounts for all of it is added
-        enough = mine.fall >= LITTLE and best.judged is not None and silent(best.judged) and certain
+        enough = certain and best.judged is not None and _accounts(best.judged, judgement)
     if not search.history:
         search.first = sorted(tried, key=lambda t: t.scouted)
     if enough:
@@ -205,6 +205,14 @@ def _choose(finalists: Sequence[Tried]) -> tuple[Tried, tuple[str, ...]]:
     ]  # fmt: skip
     best = min(like, key=lambda t: (len(t.model.place), t.error))
     return best, tuple(t.name for t in like if t.name != best.name)
+
+
+def _accounts(judgement: Judgement, without: Judgement) -> bool:
+    """Whether an effect explains what a model that counts as right leaves without it.
+
+    That may be the scene's fault, or another simulator's habit, so it must explain most of it.
+    """
+    return silent(judgement) and judgement.error <= HALF * without.error
 
 
 def _rank(tried: Tried, judgement: Judgement, p_value: float) -> Rank:
@@ -284,10 +292,10 @@ def _drop(search: _Search, model: Model, judgement: Judgement) -> tuple[Model, J
         fitted = settle(search.evidence, less, seed=search.seed)
         without = search.judge(fitted)
         # what would not be added now is not kept
-        fall = without.error - judgement.error
-        enough = LITTLE if explained(without) and silent(judgement) else MATERIAL
-        left = explained(without) and not silent(judgement)
-        if silent(without) or left or fall <= 0 or (announced(without) and fall < enough):
+        needless = announced(without) and without.error < judgement.error + MATERIAL
+        if explained(without):
+            needless = silent(without) or not _accounts(judgement, without)
+        if needless or without.error <= judgement.error:
             model, judgement = fitted, without
     return model, judgement
 

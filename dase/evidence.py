@@ -15,7 +15,7 @@ from dase.errors import InputError
 from dase.events import Events
 from dase.kernels import launch
 from dase.kernels import probes as kernels
-from dase.probes import compared, peak_of, statistics, tolerance, zones
+from dase.probes import compared, peak_of, precise, statistics, tolerance, zones
 from dase.scene import Scene
 from dase.space import Space
 from dase.stimulus import MASKED, Grid, Stimulus, Trust, band_edges, light_of, sort_into_cells
@@ -233,6 +233,7 @@ def gather(
     _enough(halves, events, grid, notes)
     halves.append(_half(halves[0].trials.stimulus.part(SCOUTS), events, 0, structure))
     peak = peak_of(halves[0].found.clock[0], grid.step)
+    peak = precise(events, grid.begin, grid.begin + cut * grid.step, peak)
     for half in halves:
         half.frame = replace(half.frame, peak=peak)
     train, held, scout = halves

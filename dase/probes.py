@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from scipy.fft import rfft
 from scipy.ndimage import median_filter
 
+from dase.events import Events
 from dase.kernels.probes import (
     BANDS,
     CELLS,
@@ -208,6 +209,23 @@ def peak_of(clock: NDArray[np.int64], step: float) -> float:
     above = power / (usual + 1e-3 * power.max() + 1e-9)
     above[(frequency < 20.0) | (frequency > 0.48 / step)] = 0.0
     return float(frequency[int(above.argmax())])
+
+
+def precise(events: Events, begin: float, end: float, near: float) -> float:
+    """Return the frequency about `near` at which the net rate of all events swings most in a time [Hz]."""
+    step = 1 / (32 * near)
+    bins = int((end - begin) / step)
+    inside = (events.t >= begin) & (events.t < begin + bins * step)
+    place = np.minimum((events.t[inside] - begin) / step, bins - 1).astype(np.int64)
+    net = np.bincount(place, np.where(events.p[inside], 1.0, -1.0), bins)
+    net = (net - net.mean()) * np.hanning(bins)
+    # finer than a Fourier transform of this time has them
+    frequency = near + np.linspace(-1.5, 1.5, 121) / (end - begin)
+    power = np.abs(np.exp(-2j * np.pi * frequency[:, None] * step * np.arange(bins)) @ net) ** 2
+    top = int(power[1:-1].argmax()) + 1
+    left, middle, right = np.log(power[top - 1 : top + 2] + 1e-300)
+    shift = 0.5 * (left - right) / min(left - 2 * middle + right, -1e-12)
+    return float(frequency[top] + np.clip(shift, -1, 1) * (frequency[1] - frequency[0]))
 
 
 def _is_mean() -> NDArray[np.bool_]:
