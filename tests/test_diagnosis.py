@@ -17,9 +17,9 @@ import dase
 from dase.cli import group
 from dase.cli.options import open_recorded
 from dase.confidence import estimates
-from dase.diagnosis import diagnose, summary
+from dase.diagnosis import _accounts, diagnose, summary
 from dase.effects import EFFECTS, Effect, parameter
-from dase.error import Judgement, Scale, judge, robust
+from dase.error import Judgement, Scale, explained, judge, robust, silent
 from dase.evidence import gather
 from dase.explain import bars
 from dase.fitting import _equal, _remarks, fit
@@ -319,3 +319,22 @@ def test_too_small_a_scene_is_refused(scene):
     tiny = VideoScene(scene.frames(scene.sample_times())[:, :4, :4], scene.sample_times())
     with pytest.raises(dase.InputError, match="32 pixels"):
         gather(dase.simulate(tiny, Sensor()), tiny)
+
+
+def judged(error: float, quiet: float = 0.5, **families: float) -> Judgement:
+    return Judgement(error, 1.2, quiet, families, dict.fromkeys(families, 2.0), np.zeros(1), 1.0)
+
+
+def test_a_search_ends_at_what_chance_gives():
+    assert silent(judged(0.4))
+    assert not silent(judged(0.8))
+    assert explained(judged(0.8))
+    assert silent(judged(0.8, quiet=0.9))
+    # a family far off is looked at, however small the mean
+    assert not silent(judged(0.3, rate=5.0))
+
+
+def test_little_is_added_only_where_it_accounts_for_most():
+    assert _accounts(judged(0.3), judged(0.8))
+    assert not _accounts(judged(0.45), judged(0.8))  # more than half is left
+    assert not _accounts(judged(0.6), judged(1.3))  # more than chance is left

@@ -15,7 +15,7 @@ from dase.evidence import gather
 from dase.explain import bars
 from dase.kernels import probes as kernels
 from dase.model import model_of
-from dase.probes import FAMILIES, LAYOUT, statistics
+from dase.probes import FAMILIES, LAYOUT, precise, statistics
 from dase.sensor import Sensor
 from dase.structure import Structure, find
 from dase.sums import GROUP, SEEN, totals, without
@@ -308,3 +308,29 @@ def test_a_bus_is_shared_out(evidence):
     free = trials.stream(sensor, sensor.parameters(), (), seed=1).halves.sum()
     held = trials.stream(sensor, sensor.parameters(), sensor.streams(), seed=1).halves.sum()
     assert held < 0.95 * free
+
+
+def a_lamp(rng, frequency: float, seconds: float = 1.0) -> dase.Events:
+    """Events whose polarity follows a lamp, among others that do not."""
+    t = np.sort(rng.uniform(0, seconds, 60_000))
+    on = rng.random(len(t)) < 0.5 + 0.15 * np.cos(2 * np.pi * frequency * t + 1.0)
+    x, y = (rng.integers(0, 32, len(t)) for _ in range(2))
+    return dase.Events(t, x, y, on, 32, 32)
+
+
+@pytest.mark.parametrize("frequency", [49.83, 100.0, 213.7])
+def test_a_lamp_is_known_better_than_a_turn_of_the_window(rng, frequency):
+    events = a_lamp(rng, frequency)
+    for off in (-0.6, 0.0, 0.8):
+        # a window of 0.6 s has frequencies 1.7 Hz apart
+        assert precise(events, 0.0, 0.6, frequency + off) == pytest.approx(frequency, abs=0.08)
+
+
+def test_slow_clocks_are_seen_in_busy_recordings(rng):
+    t = np.sort(np.round(rng.uniform(0, 0.3, 400_000) / 1e-3) * 1e-3)
+    x, y = (rng.integers(0, 64, len(t)) for _ in range(2))
+    events = dase.Events(t, x, y, rng.random(len(t)) < 0.5, 64, 64)
+    # 50,000 events have 38 ticks, too few
+    assert find(events).step == pytest.approx(1e-3, rel=1e-4)
+    free = dase.Events(np.sort(rng.uniform(0, 0.3, len(t))), x, y, events.p, 64, 64)
+    assert find(free) == Structure()
