@@ -7,7 +7,6 @@ import time
 import numpy as np
 from numpy.typing import NDArray
 
-from dase.diagnosis import Progress
 from dase.error import Judgement
 from dase.events import Events
 from dase.evidence import PIXELS, Evidence, Half, gather
@@ -16,6 +15,7 @@ from dase.model import model_of
 from dase.probes import LAYOUT
 from dase.results import Comparison, Curve
 from dase.scene import Scene
+from dase.search import Progress
 from dase.sensor import Sensor
 from dase.stimulus import Trust
 from dase.trials import LAG_TIMES

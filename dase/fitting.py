@@ -9,13 +9,13 @@ from dataclasses import replace
 import numpy as np
 
 from dase.confidence import estimates
-from dase.diagnosis import Progress
 from dase.error import Judgement
 from dase.events import Events
 from dase.evidence import PIXELS, Evidence, gather
 from dase.model import Model, fit_present, model_of, settle
 from dase.results import Estimate, Fit
 from dase.scene import Scene
+from dase.search import Progress
 from dase.sensor import Sensor
 from dase.space import Axis
 from dase.stimulus import Trust

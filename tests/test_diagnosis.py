@@ -17,7 +17,7 @@ import dase
 from dase.cli import group
 from dase.cli.options import open_recorded
 from dase.confidence import estimates
-from dase.diagnosis import _accounts, diagnose, summary
+from dase.diagnosis import diagnose, summary
 from dase.effects import EFFECTS, Effect, parameter
 from dase.error import Judgement, Scale, explained, judge, robust, silent
 from dase.evidence import gather
@@ -26,6 +26,7 @@ from dase.fitting import _equal, _remarks, fit
 from dase.model import model_of, settle
 from dase.probes import LAYOUT, SIZE
 from dase.results import Fit
+from dase.search import accounts
 from dase.sensor import Sensor
 from dase.video import VideoScene
 
@@ -335,6 +336,6 @@ def test_a_search_ends_at_what_chance_gives():
 
 
 def test_little_is_added_only_where_it_accounts_for_most():
-    assert _accounts(judged(0.3), judged(0.8))
-    assert not _accounts(judged(0.45), judged(0.8))  # more than half is left
-    assert not _accounts(judged(0.6), judged(1.3))  # more than chance is left
+    assert accounts(judged(0.3), judged(0.8))
+    assert not accounts(judged(0.45), judged(0.8))  # more than half is left
+    assert not accounts(judged(0.6), judged(1.3))  # more than chance is left

@@ -1,0 +1,97 @@
+"""Whether a diagnosis needs all that it added, and whether something simpler does."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+from dase.error import Judgement, announced, explained, silent
+from dase.model import Model, settle
+from dase.search import MATERIAL, TIE, Search, accounts, like_of
+from dase.together import together
+
+SWAPPED = 2
+"""Alternatives to an effect that are tried in its place once all others are found."""
+
+NEARBY = 1.6
+"""Only alternatives whose held-out error was about below this, relative to the chosen one's."""
+
+DROPPED = 4.0
+"""An effect is tried to be dropped where the error on the scout without it, quickly fitted, is below this, in
+units of the gate."""
+
+QUICK = 2.0
+"""Only alternatives whose error on the scout, quickly fitted, is below this, relative to the model's own."""
+
+
+def review(search: Search, model: Model, judgement: Judgement) -> tuple[Model, Judgement]:
+    """Drop effects that are not needed any more, put simpler ones in place of others, and drop again."""
+    model, judgement = _drop(search, model, judgement)
+    before = model
+    for name in search.added(model):
+        for other, swap in _rivals(search, model, name).items():
+            swapped = settle(search.evidence, swap, seed=search.seed)
+            judged = search.judge(swapped)
+            if not explained(judged):
+                continue
+            simpler = len(swapped.place) < len(model.place)
+            if simpler or not explained(judgement):
+                model, judgement = swapped, judged
+                search.ties[other] = {*search.ties.pop(name, set()), name} - {other}
+                break
+            search.ties.setdefault(name, set()).add(other)
+    return _drop(search, model, judgement) if model is not before else (model, judgement)
+
+
+def _drop(search: Search, model: Model, judgement: Judgement) -> tuple[Model, Judgement]:
+    """Drop effects that are not needed any more."""
+    whole = model
+    for name, less in _droppable(search, model).items():
+        if name not in model.sensor or len(search.added(model)) == 1:
+            continue
+        less = less if model is whole else like_of(model.sensor.without(name), model, ())
+        fitted = settle(search.evidence, less, seed=search.seed)
+        without = search.judge(fitted)
+        # what would not be added now is not kept
+        needless = announced(without) and without.error < judgement.error + MATERIAL
+        if explained(without):
+            needless = silent(without) or not accounts(judgement, without)
+        if needless or without.error <= judgement.error:
+            model, judgement = fitted, without
+    return model, judgement
+
+
+def _droppable(search: Search, model: Model) -> dict[str, Model]:
+    """Return the models without one effect that may do: not far off on the scout, quickly fitted.
+
+    Fitting one in full takes as long as trying a dozen; most are far off.
+    """
+    scout, seed = search.evidence.scout.view(), search.seed
+    model.rebase(scout, repeats=16, seed=seed + 200)
+    ways = {name: like_of(model.sensor.without(name), model, ()) for name in search.added(model)}
+    quick = together([way.searching(scout, seed=seed, iterations=2) for way in ways.values()])
+    judged = together([way.judging(scout.view(), repeats=16, seed=seed + 500) for way in quick])
+    return {
+        name: way for name, way, judgement in zip(ways, quick, judged, strict=True)
+        if judgement.error < DROPPED * judgement.gate
+    }  # fmt: skip
+
+
+def _promising(search: Search, model: Model, ways: Mapping[str, Model]) -> dict[str, Model]:
+    """Return those models that may do as well as the present one: not far off on the scout."""
+    if not ways:
+        return {}
+    scout = search.evidence.scout.view()
+    repeats = model.rebase(scout, repeats=16, seed=search.seed + 200)
+    enough = QUICK * float(scout.scale.loss(repeats).mean())
+    quick = together([way.searching(scout, seed=search.seed, iterations=2) for way in ways.values()])
+    return {name: way for (name, way), q in zip(ways.items(), quick, strict=True) if q.loss < enough}
+
+
+def _rivals(search: Search, model: Model, name: str) -> dict[str, Model]:
+    """Return the models with an alternative in the place of an effect that may do as well."""
+    limit, ways = NEARBY * search.error_of.get(name, 0.0) + TIE, {}
+    for other in search.alternatives.get(name, [])[:SWAPPED]:
+        if other.name not in model.space.sensor and other.error <= limit:
+            sensor = model.sensor.without(name).with_effect(other.model.sensor[other.name])
+            ways[other.name] = like_of(sensor, model, [other.name])
+    return _promising(search, model, ways)
