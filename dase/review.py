@@ -15,7 +15,7 @@ SWAPPED = 2
 NEARBY = 1.6
 """Only alternatives whose held-out error was about below this, relative to the chosen one's."""
 
-DROPPED = 4.0
+DROPPED = 8.0
 """An effect is tried to be dropped where the error on the scout without it, quickly fitted, is below this, in
 units of the gate."""
 
