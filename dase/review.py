@@ -77,14 +77,20 @@ def _droppable(search: Search, model: Model) -> dict[str, Model]:
 
 
 def _promising(search: Search, model: Model, ways: Mapping[str, Model]) -> dict[str, Model]:
-    """Return those models that may do as well as the present one: not far off on the scout."""
+    """Return those models that may do as well as the present one: simpler, or not far off on the scout.
+
+    A simpler model may be long on its way: bandwidth after an overdamped second order had been fitted.
+    """
     if not ways:
         return {}
     scout = search.evidence.scout.view()
     repeats = model.rebase(scout, repeats=16, seed=search.seed + 200)
     enough = QUICK * float(scout.scale.loss(repeats).mean())
     quick = together([way.searching(scout, seed=search.seed, iterations=2) for way in ways.values()])
-    return {name: way for (name, way), q in zip(ways.items(), quick, strict=True) if q.loss < enough}
+    return {
+        name: way for (name, way), q in zip(ways.items(), quick, strict=True)
+        if q.loss < enough or len(way.place) < len(model.place)
+    }  # fmt: skip
 
 
 def _rivals(search: Search, model: Model, name: str) -> dict[str, Model]:
