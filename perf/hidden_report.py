@@ -248,6 +248,11 @@ Named first: the first effect selected is the hidden one, or is announced as tie
 
 Rows: what was hidden. Columns: what was named first.
 
+Most misses are of `readout`: it is simulated on the pixels that are looked at, with their share of the bus,
+which is right where the bus is free or full and not between; so the error stays just above the floor and
+nothing is announced. Leak beside shot noise and jitter beside mismatch leave no more than chance once the
+other of the two is fitted.
+
 A removed effect is right if the answer is "unexplained" and nothing is named. The cells are right if one of
 the first five is a cell in which the true sensor without the effect differs from the data.
 
@@ -261,12 +266,12 @@ logarithmically above, and its times are even parts of its frames: `linlog` and 
 ## Again
 
 ```sh
-python perf/hidden_effects.py --device cuda:0 --jobs 14 --minutes 9 --hidden ../shared/hidden \\
-    --log perf/hidden_effects.jsonl --where "one NVIDIA H100, 14 processes at a time, commit ..."
+python perf/hidden_effects.py --device cuda:0,cuda:1,cuda:2,cuda:3 --jobs 56 --hidden ../shared/hidden \\
+    --log perf/hidden_effects.jsonl --where "four NVIDIA H200, commit ..."
 ```
 
-goes on where the log stops; kinds and effects take turns, so that whatever was reached is balanced. Without
-a log it begins anew. `--report` only writes this page.
+takes six minutes, and goes on where the log stops; kinds and effects take turns, so that whatever was reached
+is balanced. Without a log it begins anew. `--report` only writes this page.
 
 ## Wrong answers, weak effects left out
 

@@ -128,6 +128,10 @@ def _estimates(found: dict[str, Any]) -> str:
     return f"{what}, with 90 % intervals: {', '.join(said)}." if said else ""
 
 
+OPEN = {"davis346_cuke_cradle", "dvx_noise_static"}
+"""Recordings of which a picture may be published here: MIT, Apache-2.0."""
+
+
 def draw(cameras: Mapping[str, Any], found: Mapping[str, Any], path: Path) -> None:
     """Draw for each recording: measured events, the model's, and the staircase of the error."""
     rows = len(found)
@@ -140,13 +144,17 @@ def draw(cameras: Mapping[str, Any], found: Mapping[str, Any], path: Path) -> No
         top = max(float(np.percentile(grey, 99.5)), 1e-6)
         calm = np.rint(255 * np.clip(grey / top, 0, 1)).astype(np.uint8) if np.ptp(grey) > 0 else None
         for axis, kind in zip(line[:2], ("measured", "simulated"), strict=True):
-            axis.imshow(_large(overlay(calm, facts[kind])), interpolation="nearest")
             axis.set_xticks([])
             axis.set_yticks([])
             axis.spines[:].set_visible(False)
-            axis.set_title(f"{kind}, {1e3 * cameras[name].window:g} ms", fontsize=8.5, color=QUIET, pad=4)
+            if name in OPEN:
+                axis.imshow(_large(overlay(calm, facts[kind])), interpolation="nearest")
+                title = f"{kind}, {1e3 * cameras[name].window:g} ms"
+                axis.set_title(title, fontsize=8.5, color=QUIET, pad=4)
+            elif kind == "measured":
+                text = "not shown: the recording has no licence for it"
+                axis.text(0, 0.9, text, fontsize=8.5, color=QUIET, transform=axis.transAxes)
         line[0].set_title(f"{name}\n", fontsize=10.5, color=INK, weight="bold", loc="left", pad=2)
-        line[0].set_title(f"measured, {1e3 * cameras[name].window:g} ms", fontsize=8.5, color=QUIET, pad=4)
         staircase(line[2], what)
     figure.savefig(path, dpi=110, facecolor="white")
     plt.close(figure)
