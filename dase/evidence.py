@@ -233,7 +233,8 @@ def gather(
     _enough(halves, events, grid, notes)
     halves.append(_half(halves[0].trials.stimulus.part(SCOUTS), events, 0, structure))
     peak = peak_of(halves[0].found.clock[0], grid.step)
-    peak = precise(events, grid.begin, grid.begin + cut * grid.step, peak)
+    if trust is None:  # else most events are where the scene is not known
+        peak = precise(events, grid.begin, grid.begin + cut * grid.step, peak)
     for half in halves:
         half.frame = replace(half.frame, peak=peak)
     train, held, scout = halves

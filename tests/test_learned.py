@@ -292,7 +292,7 @@ def test_the_command_learns_from_a_sensor_and_goes_on(tmp_path, monkeypatch):
         (("ideal", "--window", "-1"), "window must be a number > 0 s, got -1"),
         (("ideal", "ideal"), "one sensor file is one target, got 2"),
         (("ideal", "--objective", "magic"), "objective must be moments or wgan"),
-        (("ideal", "--objective", "wgan", "--size", "24x24", "--sequences", "5"), "patches are 40 px wide"),
+        (("ideal", "--preset", "paper", "--size", "24x24", "--sequences", "5"), "patches are 40 px wide"),
     ],
 )
 def test_bad_options_are_named(tmp_path, arguments, said):
