@@ -15,7 +15,7 @@ from dase.error import Judgement
 from dase.evidence import Evidence, Half
 from dase.sensor import Sensor
 from dase.space import Axis, Space, axes_of, with_values
-from dase.together import Ask, Work, alone, together
+from dase.together import Ask, Work, alone, simulated, together
 
 Array = NDArray[np.float64]
 
@@ -133,11 +133,9 @@ def settle(evidence: Evidence, model: Model, *, seed: int, rounds: int = 2) -> M
     ends = together([settling(evidence, model, seed=each, rounds=rounds) for each in seeds])
     half = evidence.train.view()
     ends[0].rebase(half, repeats=SETTLED, seed=seed + 100)
-    losses = [
-        sum(float(half.scale.loss(half.run(m.space, m.place[None], seed=each)[0])) for each in seeds)
-        for m in ends
-    ]
-    return ends[int(np.argmin(losses))]
+    values = simulated([Ask(half, m.space, m.place[None], each) for m in ends for each in seeds])
+    losses = np.reshape([float(half.scale.loss(value)[0]) for value in values], (len(ends), len(seeds)))
+    return ends[int(losses.mean(1).argmin())]
 
 
 def settling(
@@ -177,7 +175,7 @@ def added(present: Model, effect: Effect) -> Model:
     """Return the present model with an effect added, all of whose parameters are free."""
     sensor = present.sensor.with_effect(effect)
     old = [axis.name for axis in present.space.axes]
-    # the pixels of all events tell a lamp's frequency better than the few that are fitted
+    # read off the events of all pixels, a lamp's frequency is better than a fit to a few makes it
     new = [name for name in free_of(sensor, effect.name) if name != "flicker.frequency"]
     return model_of(sensor, [*old, *new])
 
