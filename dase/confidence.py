@@ -43,8 +43,10 @@ def estimates(evidence: Evidence, model: Model, *, seed: int) -> tuple[Model, di
         return model, {}
     half = evidence.train
     low, high = model.space.bounds()
+    places, errors = [model.place], []
     for turn in range(STEPS):
         repeats = model.rebase(half, repeats=REPEATS, seed=seed + 900 + 100 * turn)
+        errors.append(half.judge(repeats, seed=seed).error)
         mean = repeats.mean(0)
         gain = _gain(half, model, repeats, seed=seed + turn)
         # what the pixels of the measurement make of it, also where the model is not quite right
@@ -52,6 +54,9 @@ def estimates(evidence: Evidence, model: Model, *, seed: int) -> tuple[Model, di
         step = -gain @ np.where(half.scale.used, mean - half.scale.target, 0.0)
         place = np.clip(model.place + np.clip(step, -FARTHEST, FARTHEST), low, high)
         model = replace(model, place=place)
+        places.append(place)
+    errors.append(model.judge(half.view(), repeats=REPEATS, seed=seed + 900 + 100 * STEPS).error)
+    place = places[int(np.argmin(errors))]  # where lines are not straight, a step may lead astray
     chance = ((repeats - mean) @ gain.T).var(0, ddof=1) * (1 + 1 / len(repeats))
     deviation = np.sqrt(np.maximum(chance, seen))
     out = {}

@@ -23,7 +23,7 @@ from dase.stimulus import Trust
 from dase.together import together
 from dase.words import worst_cells
 
-SIGNIFICANT = 0.02
+SIGNIFICANT = 0.05
 """Largest p-value of an effect that is added; 1 / (REPEATS + 1) is the smallest there is."""
 
 SHARE = 0.1
@@ -122,19 +122,19 @@ def _step(search: Search, model: Model, judgement: Judgement, more: bool) -> tup
         report=lambda text, share: search.progress(text, share, search.error),
     )  # fmt: skip
     p_value = chance_of(scale, tried, repeats, present)
-    best, ties = _choose([t for t in tried if t.judged])
+    finalists = [t for t in tried if t.judged]
+    worthy = [t for t in finalists if t.judged and accounts(t.judged, judgement)]
+    best, ties = _choose((explained(judgement) and worthy) or finalists)
     ranking = tuple(_rank(t, judgement, p_value(base - t.fit) if t.judged else 1.0) for t in tried)
     mine = next(rank for rank in ranking if rank.effect == best.name)
     certain = mine.p_value <= max(SIGNIFICANT, 1.01 / (1 + len(repeats)))
     enough = mine.fall >= MATERIAL and mine.share >= SHARE and certain
     if explained(judgement):
-        enough = certain and best.judged is not None and accounts(best.judged, judgement)
+        enough = certain and bool(worthy)
     if not search.history:
         search.first = sorted(tried, key=lambda t: t.scouted)
     if enough:
-        search.alternatives[best.name] = [t for t in tried if t.judged and t.name != best.name]
-        search.error_of[best.name] = best.error
-        search.ties[best.name] = set(ties)
+        search.note(best, finalists, ties, judgement)
     step = replace(step, ranking=ranking, chosen=best.name if enough else None, ties=ties if enough else ())
     return step, settle(evidence, best.model, seed=seed, rounds=1) if enough else None
 

@@ -16,11 +16,11 @@ FAR = 4.0
 """Standard deviations above the mean that the error of a family of a true model hardly ever reaches."""
 
 
-CLOSE = 1.2
+CLOSE = 1.15
 """A model up to this error counts as right also where its repeats differ by less: the rest is no matter."""
 
 QUIET = 0.5
-"""Error up to which nothing more is looked for, at least: 100 models that lacked nothing had 0.13 to 0.38."""
+"""Error up to which nothing more is looked for: 100 models that lacked nothing had 0.13 to 0.38."""
 
 CLOSE_FAMILY = 4.0
 """Error of one family up to which nothing is looked for: what few statistics show the mean hides."""
@@ -80,7 +80,8 @@ class Judgement:
     Args:
         error: 1 is what two repeats of one measurement give, each of them off by what is of no concern.
         gate: Error up to which the model counts as right: 99 of 100 repeats stay below, and at least `CLOSE`.
-        quiet: Error up to which chance alone explains it: as the gate, and at least `QUIET`.
+        reach: Error that 99 of 100 repeats stay below.
+        level: Error of a repeat, in the mean.
         families: Error per family.
         limits: Error per family that hardly any repeat exceeds in any family.
         z: Difference of each statistic in standard errors, shape (J,).
@@ -89,7 +90,8 @@ class Judgement:
 
     error: float
     gate: float
-    quiet: float
+    reach: float
+    level: float
     families: dict[str, float]
     limits: dict[str, float]
     z: Array
@@ -127,7 +129,8 @@ def judge(repeats: Array, seen: Scale, chance: Scale, off: Array, *, seed: int) 
         own = rho[:, part][:, chance.used[part]].mean(1) / unit
         limits[name] = max(float(own.max()), float(own.mean() + FAR * own.std()))
     error = float(seen.loss(mean)) / unit
-    return Judgement(error, max(CLOSE, reach), max(QUIET, reach), families, limits, seen.z(mean), unit)
+    level = float(null.mean())
+    return Judgement(error, max(CLOSE, reach), reach, level, families, limits, seen.z(mean), unit)
 
 
 def in_errors(apart: Array, scale: Scale) -> Array:
@@ -143,8 +146,8 @@ def robust(z: Array) -> Array:
 
 
 def silent(judgement: Judgement) -> bool:
-    """Whether chance alone explains what a model leaves, so that nothing more is looked for."""
-    return judgement.error <= judgement.quiet and explained(judgement)
+    """Whether a model leaves so little that nothing more is looked for."""
+    return judgement.error <= QUIET and explained(judgement)
 
 
 def explained(judgement: Judgement) -> bool:

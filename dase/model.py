@@ -25,7 +25,7 @@ THRESHOLDS = (0.04, 0.06, 0.09, 0.12, 0.15, 0.18, 0.22, 0.27, 0.34, 0.45, 0.65)
 RATIO = 2.2
 """Most that the thresholds of a pixel differ by at the start."""
 
-SHIFTS = (-0.7, -0.4, -0.15, 0.1)
+SHIFTS = (-0.7, -0.4, -0.15, 0.1, 0.35)
 """Of the logarithm of the thresholds, when an effect is tried."""
 
 SETTLED = 16
@@ -204,7 +204,7 @@ def _tried(axis: Axis, present: float) -> list[float]:
     if axis.main:
         return list(low + (high - low) * np.linspace(FEW_STARTS, 1 - FEW_STARTS, 6))
     if axis.fact.unit == "turns":
-        return list(np.linspace(-1, 0, 8, endpoint=False) + 1.0)
+        return [float(axis.to_place(turn)) for turn in np.linspace(0, 1, 8, endpoint=False)]
     if axis.name.split(".")[1] in ("dark", "slope", "damping", "knee", "rate", "cutoff"):
         return [present, low + 0.9 * (high - low)]
     return [present]

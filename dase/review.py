@@ -31,7 +31,8 @@ def review(search: Search, model: Model, judgement: Judgement) -> tuple[Model, J
         for other, swap in _rivals(search, model, name).items():
             swapped = settle(search.evidence, swap, seed=search.seed)
             judged = search.judge(swapped)
-            if not explained(judged):
+            without = search.without.get(name)
+            if not explained(judged) or (without is not None and not accounts(judged, without)):
                 continue
             simpler = len(swapped.place) < len(model.place)
             if simpler or not explained(judgement):

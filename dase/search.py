@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 
 from dase.candidates import Tried
 from dase.effects import Effect
-from dase.error import Judgement, silent
+from dase.error import QUIET, Judgement, explained
 from dase.evidence import Evidence
 from dase.model import Model, free_of, model_of
 from dase.results import Step
@@ -23,8 +23,8 @@ TIE = 0.35
 """Candidates at the floor whose held-out error is within this of the best's are not told apart from it."""
 
 HALF = 0.5
-"""Where the model counts as right without it, an effect is added only if it leaves no more than chance, and
-at most this share of the error."""
+"""Where the model counts as right without it, an effect is added only if it leaves no more than chance
+may, and at most this share of what was left above the level of chance."""
 
 Progress = Callable[[str, float, float], None]
 """Told what is being done, the share of the step done, and the present error."""
@@ -32,7 +32,11 @@ Progress = Callable[[str, float, float], None]
 
 @dataclass
 class Search:
-    """What a diagnosis works on."""
+    """What a diagnosis works on.
+
+    Args:
+        without: What the model left before an effect was added to it, where it counted as right already.
+    """
 
     evidence: Evidence
     effects: Mapping[str, type[Effect]]
@@ -43,6 +47,7 @@ class Search:
     alternatives: dict[str, list[Tried]] = field(default_factory=dict)
     error_of: dict[str, float] = field(default_factory=dict)
     ties: dict[str, set[str]] = field(default_factory=dict)
+    without: dict[str, Judgement] = field(default_factory=dict)
     first: list[Tried] = field(default_factory=list)
     error: float = float("nan")
 
@@ -52,6 +57,14 @@ class Search:
         self.error = judgement.error
         self.progress("judging", 0.0, self.error)
         return judgement
+
+    def note(self, best: Tried, finalists: Sequence[Tried], ties: Sequence[str], without: Judgement) -> None:
+        """Note what a review needs to know of an effect that is added."""
+        self.alternatives[best.name] = [t for t in finalists if t.name != best.name]
+        self.error_of[best.name] = best.error
+        self.ties[best.name] = set(ties)
+        if explained(without):
+            self.without[best.name] = without
 
     def added(self, model: Model) -> tuple[str, ...]:
         """Return the effects that were added to the given sensor."""
@@ -63,7 +76,9 @@ def accounts(judgement: Judgement, without: Judgement) -> bool:
 
     That may be the scene's fault, or another simulator's habit, so it must explain most of it.
     """
-    return silent(judgement) and judgement.error <= HALF * without.error
+    level = judgement.level
+    chance = judgement.error <= max(QUIET, judgement.reach) and explained(judgement)
+    return chance and judgement.error - level <= HALF * (without.error - level)
 
 
 def like_of(sensor: Sensor, model: Model, more: Sequence[str]) -> Model:

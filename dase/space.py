@@ -16,6 +16,9 @@ from dase.sensor import Sensor
 
 Array = NDArray[np.float64]
 
+PHASE = 0.125
+"""Unit along a phase [turns]: beyond it, statistics do not run along straight lines."""
+
 WIDER = 3.0
 """A fit may leave the plausible range by this factor, and then says so."""
 
@@ -30,6 +33,7 @@ class Axis:
         low: Least value of the search.
         high: Largest value of the search.
         log: Whether the search goes by factors.
+        span: How long the range is in units of the search, where it does not go by factors.
     """
 
     name: str
@@ -37,6 +41,7 @@ class Axis:
     low: float
     high: float
     log: bool
+    span: float = 2.0
 
     @property
     def main(self) -> bool:
@@ -44,18 +49,18 @@ class Axis:
         return self.fact.off is not None
 
     def to_place(self, value: Any) -> Any:
-        """Return where a value lies: a unit is a factor e, or half the range."""
+        """Return where a value lies: a unit is a factor e, or a part of the range."""
         value = np.clip(value, self.low, self.high)
         if self.log:
             return np.log(value)
-        return 2.0 * (value - self.low) / (self.high - self.low)
+        return self.span * (value - self.low) / (self.high - self.low)
 
     def to_value(self, place: Any) -> Any:
         """Return the value at a place, the nearest one in range."""
         if self.log:
             value = np.exp(np.clip(place, math.log(self.low), math.log(self.high)))
         else:
-            value = self.low + np.clip(place, 0.0, 2.0) * (self.high - self.low) / 2.0
+            value = self.low + np.clip(place, 0.0, self.span) * (self.high - self.low) / self.span
         return np.clip(value, self.low, self.high)  # the exponential of a logarithm may be a bit off
 
     def bounds(self) -> tuple[float, float]:
@@ -71,7 +76,9 @@ def axis(effect: str, fact: Parameter) -> Axis:
     log = low > 0
     if log:
         low, high = low / WIDER, high * WIDER
-    return Axis(f"{effect}.{fact.name}", fact, max(low, fact.bounds[0]), min(high, fact.bounds[1]), log)
+    low, high = max(low, fact.bounds[0]), min(high, fact.bounds[1])
+    span = (high - low) / PHASE if fact.unit == "turns" else 2.0
+    return Axis(f"{effect}.{fact.name}", fact, low, high, log, span)
 
 
 @dataclass(frozen=True)
@@ -155,8 +162,9 @@ def axes_of(sensor: Sensor, names: Iterable[str] | None = None) -> tuple[Axis, .
         # a fit finds it only nearby: elsewhere the phase has turned
         value = value_of(sensor, "flicker.frequency")
         every["flicker.frequency"] = replace(
-            every["flicker.frequency"], low=value * (1 - NEARBY), high=value * (1 + NEARBY), log=False
-        )
+            every["flicker.frequency"], low=value * (1 - NEARBY), high=value * (1 + NEARBY), log=False,
+            span=2.0 / PHASE,
+        )  # fmt: skip
     if names is None:
         off = {effect.name for effect in sensor.effects if effect.is_off() and effect.name != "threshold"}
         return tuple(a for n, a in every.items() if n not in FIXED and n.split(".")[0] not in off)

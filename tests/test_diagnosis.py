@@ -322,20 +322,21 @@ def test_too_small_a_scene_is_refused(scene):
         gather(dase.simulate(tiny, Sensor()), tiny)
 
 
-def judged(error: float, quiet: float = 0.5, **families: float) -> Judgement:
-    return Judgement(error, 1.2, quiet, families, dict.fromkeys(families, 2.0), np.zeros(1), 1.0)
+def judged(error: float, reach: float = 0.4, level: float = 0.2, **families: float) -> Judgement:
+    return Judgement(error, 1.2, reach, level, families, dict.fromkeys(families, 2.0), np.zeros(1), 1.0)
 
 
 def test_a_search_ends_at_what_chance_gives():
     assert silent(judged(0.4))
     assert not silent(judged(0.8))
     assert explained(judged(0.8))
-    assert silent(judged(0.8, quiet=0.9))
     # a family far off is looked at, however small the mean
     assert not silent(judged(0.3, rate=5.0))
 
 
 def test_little_is_added_only_where_it_accounts_for_most():
     assert accounts(judged(0.3), judged(0.8))
-    assert not accounts(judged(0.45), judged(0.8))  # more than half is left
+    assert accounts(judged(0.45), judged(0.8))  # 0.25 of 0.6 above the level of chance
+    assert not accounts(judged(0.45), judged(0.6))  # 0.25 of 0.4
     assert not accounts(judged(0.6), judged(1.3))  # more than chance is left
+    assert accounts(judged(0.6, reach=0.7), judged(1.3))
