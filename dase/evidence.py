@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from dase.camera import CameraScene
 from dase.choice import look, where_trusted
+from dase.crowd import Load, Surroundings
 from dase.error import Judgement, Scale, judge
 from dase.errors import InputError
 from dase.events import Events
@@ -55,6 +56,8 @@ class Half:
         trials: Runs models.
         found: What was measured.
         frame: What statistics refer to.
+        around: What all pixels see; None where that is not known.
+        load: What the pixels that are not looked at send in the present model.
         scale: What differences are measured by in a fit: sampling errors as they are seen between groups of
             pixels, also where the model is wrong.
         chance: What differences are measured by in a test: sampling errors of the present model.
@@ -68,6 +71,8 @@ class Half:
     trials: Trials
     found: Sums
     frame: Frame
+    around: Surroundings | None = None
+    load: Load | None = None
     scale: Scale = field(init=False)
     chance: Scale = field(init=False)
     seen: Scale = field(init=False)
@@ -100,6 +105,8 @@ class Half:
     def rebasing(self, space: Space, place: Array, *, repeats: int, seed: int) -> Work[Array]:
         """Do what `rebase` does, see `together`."""
         repeats = min(repeats, FEW_REPEATS) if self.slow(space) else repeats
+        if self.around is not None:
+            self.load = Load(self.around, space.at(place), self.trials.stimulus)
         sums = yield [Ask(self, space, np.repeat(np.atleast_2d(place), repeats, 0), seed, repeats=True)]
         return self.take(sums[0])
 
@@ -237,6 +244,8 @@ def gather(
         peak = precise(events, grid.begin, grid.begin + cut * grid.step, peak)
     for half in halves:
         half.frame = replace(half.frame, peak=peak)
+        # where the scene is trusted here and there only, nobody knows what all pixels send
+        half.around = Surroundings(scene, _times(scene, grid), seed, device) if trust is None else None
     train, held, scout = halves
     return Evidence(train, held, scout, bands, structure, peak, tuple(notes))
 

@@ -10,10 +10,23 @@ NEVER = -(2**62)
 LOST = wp.constant(wp.int64(NEVER))
 
 
+SPREAD = wp.constant(wp.float64(0.6180339887498949))
+
+
+@wp.func
+def copies(number: int, weight: float) -> int:
+    """Return how often an event that stands for `weight` events is sent: whole, and right in the mean."""
+    place = wp.float64(number) * SPREAD
+    return int(wp.floor(wp.float64(weight) + place - wp.floor(place)))
+
+
 @wp.kernel(enable_backward=False)
 def queue(
     # in
     arrival: wp.array[wp.int64],  # (N,) [ps], not decreasing
+    other: wp.array[wp.int64],  # (M,) [ps], not decreasing: events of which only what they delay matters
+    polarity: wp.array[wp.uint8],  # (M,) of those
+    weight: wp.array[float],  # (2,) how many events one of those stands for, by polarity
     service: wp.int64,  # time to send one event [ps]
     patience: wp.int64,  # an event that would have to wait longer is lost [ps]
     # in and out
@@ -27,8 +40,30 @@ def queue(
     faster than the copies around it, and the events are on the host anyway, on their way to a file.
     """
     free = busy[0]
+    turn = int(0)
+    sent = int(0)  # copies of the one of the others whose turn it is
+    before = wp.int64(0)  # the one before it
+    count = other.shape[0]
+    if count > 0:
+        before = other[0]
     for i in range(arrival.shape[0]):
         at = arrival[i]
+        early = bool(True)
+        while early and turn < count:
+            many = copies(turn, weight[int(polarity[turn])])
+            # copies keep apart: events at one time would collide more often than the events they stand for
+            due = other[turn]
+            if many > 1:
+                due = before + (due - before) * wp.int64(sent + 1) / wp.int64(many)
+            early = due <= at
+            if early:
+                if many > 0 and free - due <= patience:
+                    free = wp.max(free, due) + service
+                sent += 1
+                if sent >= many:
+                    before = other[turn]
+                    turn += 1
+                    sent = 0
         if free - at > patience:
             through[i] = LOST
         else:
