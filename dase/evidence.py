@@ -45,6 +45,9 @@ FINEST, COARSEST = 2.5e-4, 2e-3
 
 COMMON = 1e-3
 
+BUSY = 2e-3
+"""Events are counted for so long to see how fast they come at most [s]."""
+
 Array = NDArray[np.float64]
 
 
@@ -84,6 +87,13 @@ class Half:
         """Return the same half, which may have another present model."""
         return copy(self)
 
+    def loaded(self, space: Space, place: Array) -> Half:
+        """Return the same half, where the pixels that are not looked at send what they do in some model."""
+        out = self.view()
+        if self.around is not None:
+            out.load = Load(self.around, space.at(place), self.trials.stimulus)
+        return out
+
     def run(self, space: Space, places: Array, *, seed: int) -> Array:
         """Return the statistics of the models at some places, shape (B, J)."""
         found: Array = simulated([Ask(self, space, np.atleast_2d(places), seed)])[0]
@@ -105,8 +115,7 @@ class Half:
     def rebasing(self, space: Space, place: Array, *, repeats: int, seed: int) -> Work[Array]:
         """Do what `rebase` does, see `together`."""
         repeats = min(repeats, FEW_REPEATS) if self.slow(space) else repeats
-        if self.around is not None:
-            self.load = Load(self.around, space.at(place), self.trials.stimulus)
+        self.load = self.loaded(space, place).load
         sums = yield [Ask(self, space, np.repeat(np.atleast_2d(place), repeats, 0), seed, repeats=True)]
         return self.take(sums[0])
 
@@ -154,6 +163,7 @@ class Evidence:
         bands: Intensities between the bands, shape (BANDS - 1,).
         structure: Regularities of the time stamps.
         peak: Frequency at which the rate swings most [Hz].
+        busiest: Most events per second of all pixels [Hz].
         notes: What the data cannot show.
     """
 
@@ -163,6 +173,7 @@ class Evidence:
     bands: Array
     structure: Structure
     peak: float
+    busiest: float
     notes: tuple[str, ...] = ()
 
     @property
@@ -247,7 +258,7 @@ def gather(
         # where the scene is trusted here and there only, nobody knows what all pixels send
         half.around = Surroundings(scene, _times(scene, grid), seed, device) if trust is None else None
     train, held, scout = halves
-    return Evidence(train, held, scout, bands, structure, peak, tuple(notes))
+    return Evidence(train, held, scout, bands, structure, peak, busiest(events), tuple(notes))
 
 
 def common_grid(events: Events, scene: Scene) -> Grid:
@@ -272,6 +283,12 @@ def common_grid(events: Events, scene: Scene) -> Grid:
     last = min(end, float(events.t[-1]) + 2 * h)
     steps = int(np.floor((last - begin) / h + 1e-6)) + 1
     return Grid(begin, h, max(steps, 2))
+
+
+def busiest(events: Events) -> float:
+    """Return the most events per second [Hz]: the rate of a bus, if it ever was full for long enough."""
+    counts = np.bincount(((events.t - events.t[0]) / BUSY).astype(np.int64))
+    return float(counts.max()) / BUSY
 
 
 def _times(scene: Scene, grid: Grid) -> NDArray[np.float64]:
