@@ -89,8 +89,9 @@ def open_to(effects: Mapping[str, type[Effect]], present: Model) -> list[str]:
 def prepared(evidence: Evidence, effect: type[Effect]) -> list[Effect]:
     """Return the variants of an effect that are tried, with what can be read off the measurement set.
 
-    No descent finds the frequency of a lamp or the ticks of a clock, but they can be seen. Where no
-    regularity is seen in the time stamps, the effects that make one are not tried.
+    No descent finds the frequency of a lamp or the ticks of a clock, but they can be seen, as can the rate of
+    a bus where it is full. Where no regularity is seen in the time stamps, the effects that make one are not
+    tried.
     """
     structure = evidence.structure
     if effect is Flicker:
@@ -99,8 +100,9 @@ def prepared(evidence: Evidence, effect: type[Effect]) -> list[Effect]:
         return [Timestamp(step=structure.step, jitter=0.0)] if structure.step else []
     if effect is RowScan:
         return [RowScan(line=structure.line, direction=structure.direction)] if structure.line else []
-    if effect is Readout:  # no faster than they come, or they would not
-        return [replace(e, rate=evidence.busiest) for e in variants(effect)]
+    if effect is Readout:
+        # events come as fast as the bus can send them, if it ever was full
+        return [replace(e, rate=evidence.busiest) for e in variants(effect) if isinstance(e, Readout)]
     return variants(effect)
 
 

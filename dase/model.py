@@ -211,7 +211,7 @@ def starts(model: Model, effect: Effect, *, few: bool = False) -> Array:
     thresholds = [n for n, axis in enumerate(axes) if axis.name in ("threshold.on", "threshold.off")]
     out = []
     for combination in product(*choices):
-        for shift in SHIFTS[1::2] if few and "readout" != effect.name else SHIFTS:
+        for shift in SHIFTS[1::2] if few and effect.name != "readout" else SHIFTS:
             place = model.place.copy()
             place[columns] = combination
             place[thresholds] += shift

@@ -29,8 +29,8 @@ SLOW = 20
 """Times as many in which ticks are looked for: of a slow clock, thousands of events share one."""
 
 TURNS = 0.8
-"""Least share of events one step behind the one before that tells a bus from a clock, which has at most 0.41 of
-them by chance."""
+"""Least share of events one step behind the one before that tells a bus from a clock, which has at most 0.41
+of them by chance."""
 
 DIRECTIONS = ("down", "up", "right", "left")
 

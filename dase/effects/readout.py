@@ -52,8 +52,10 @@ class Bus(Reader):
             weight: How many OFF and ON events each of the others stands for, shape (2,).
         """
         arrival, through = 1000 * nanoseconds(events.t), np.empty(len(events), np.int64)
-        columns = ((arrival, wp.int64), (others.time, wp.int64), (others.polarity, wp.uint8),
-                   (weight.astype(np.float32), float), (self._busy, wp.int64), (through, wp.int64))  # fmt: skip
+        columns = (
+            (arrival, wp.int64), (others.time, wp.int64), (others.polarity, wp.uint8),
+            (weight.astype(np.float32), float), (self._busy, wp.int64), (through, wp.int64),
+        )  # fmt: skip
         arrays = [wp.array(a, dtype=d, device=self._cpu, copy=False) for a, d in columns]
         inputs = [*arrays[:4], wp.int64(self._service), wp.int64(self._patience), *arrays[4:]]
         wp.launch(queue, dim=1, inputs=inputs, device=self._cpu)
