@@ -10,14 +10,17 @@ NEVER = -(2**62)
 LOST = wp.constant(wp.int64(NEVER))
 
 
-SPREAD = wp.constant(wp.float64(0.6180339887498949))
+ONE = 1 << 32
+"""A weight of 1."""
+
+SPREAD = wp.constant(wp.int64(2654435769))  # the golden ratio, so that any run of numbers is spread evenly
+PARTS = wp.constant(wp.int64(ONE - 1))
 
 
 @wp.func
-def copies(number: int, weight: float) -> int:
-    """Return how often an event that stands for `weight` events is sent: whole, and right in the mean."""
-    place = wp.float64(number) * SPREAD
-    return int(wp.floor(wp.float64(weight) + place - wp.floor(place)))
+def copies(number: int, weight: wp.int64) -> int:
+    """Return how often an event that stands for `weight` / ONE events is sent: whole, right in the mean."""
+    return int((weight + ((wp.int64(number) * SPREAD) & PARTS)) >> wp.int64(32))
 
 
 @wp.kernel(enable_backward=False)
@@ -26,7 +29,7 @@ def queue(
     arrival: wp.array[wp.int64],  # (N,) [ps], not decreasing
     other: wp.array[wp.int64],  # (M,) [ps], not decreasing: events of which only what they delay matters
     polarity: wp.array[wp.uint8],  # (M,) of those
-    weight: wp.array[float],  # (2,) how many events one of those stands for, by polarity
+    weight: wp.array[wp.int64],  # (2,) how many events one of those stands for, times ONE, by polarity
     service: wp.int64,  # time to send one event [ps]
     patience: wp.int64,  # an event that would have to wait longer is lost [ps]
     # in and out

@@ -14,7 +14,7 @@ from dase.effects.base import choice, parameter
 from dase.effects.stream import Reader, StreamEffect, nanoseconds, seconds
 from dase.events import Events
 from dase.kernels import launch
-from dase.kernels.readout import NEVER, queue
+from dase.kernels.readout import NEVER, ONE, queue
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,7 +54,7 @@ class Bus(Reader):
         arrival, through = 1000 * nanoseconds(events.t), np.empty(len(events), np.int64)
         columns = (
             (arrival, wp.int64), (others.time, wp.int64), (others.polarity, wp.uint8),
-            (weight.astype(np.float32), float), (self._busy, wp.int64), (through, wp.int64),
+            (np.rint(weight * ONE).astype(np.int64), wp.int64), (self._busy, wp.int64), (through, wp.int64),
         )  # fmt: skip
         arrays = [wp.array(a, dtype=d, device=self._cpu, copy=False) for a, d in columns]
         inputs = [*arrays[:4], wp.int64(self._service), wp.int64(self._patience), *arrays[4:]]
