@@ -10,7 +10,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from dase.effects.readout import Readout
+from dase.crowd import Load
+from dase.effects.readout import Bus, Readout
 from dase.effects.row_scan import RowScan
 from dase.effects.stream import StreamEffect
 from dase.effects.timestamp import Timestamp
@@ -66,17 +67,26 @@ def emitted(stimulus: Stimulus, sensor: Sensor, vectors: NDArray[Any], seed: int
     return [Events.concatenate(list(row)) for row in zip(*parts, strict=True)]
 
 
-def sent(stimulus: Stimulus, events: Events, effects: Iterable[StreamEffect], seed: int) -> Events:
+def sent(
+    stimulus: Stimulus, events: Events, effects: Iterable[StreamEffect], seed: int, load: Load | None = None
+) -> Events:
     """Return what leaves the sensor.
 
-    The pixels are some of a sensor's. A bus that all pixels share is given as much of its bandwidth and of
-    its queue as they are of all pixels: right for streams, not for single collisions.
+    The pixels are some of a sensor's. What the others send over a bus that all share is `load`. Where that is
+    not known, for lack of a scene that all pixels see, the bus is given as much of its bandwidth and of its
+    queue as these pixels are of all: right while it is full or free, not between.
     """
-    until = math.inf
+    until, weight = math.inf, None if load is None else load.weight(events)
     share = len(stimulus.pixels) / (stimulus.width * stimulus.height)
+    before: list[StreamEffect] = []
     for effect in effects:
-        reader = scaled(effect, share).reader(stimulus.width, stimulus.height, seed)
-        events, until = reader.push(events, until)
+        reader = effect.reader(stimulus.width, stimulus.height, seed)
+        if load is not None and weight is not None and isinstance(reader, Bus):
+            events = reader.beside(events, load.others(before, seed), weight)
+        else:
+            reader = scaled(effect, share).reader(stimulus.width, stimulus.height, seed)
+            events, until = reader.push(events, until)
+        before.append(effect)
     return replace(events, t=events.t + stimulus.grid.begin)
 
 

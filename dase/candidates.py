@@ -12,6 +12,7 @@ from dase.descent import screening
 from dase.effects.base import Effect
 from dase.effects.flicker import Flicker
 from dase.effects.optics import SceneEffect
+from dase.effects.readout import Readout
 from dase.effects.row_scan import RowScan
 from dase.effects.timestamp import Timestamp
 from dase.error import Judgement, Scale
@@ -88,8 +89,9 @@ def open_to(effects: Mapping[str, type[Effect]], present: Model) -> list[str]:
 def prepared(evidence: Evidence, effect: type[Effect]) -> list[Effect]:
     """Return the variants of an effect that are tried, with what can be read off the measurement set.
 
-    No descent finds the frequency of a lamp or the ticks of a clock, but they can be seen. Where no
-    regularity is seen in the time stamps, the effects that make one are not tried.
+    No descent finds the frequency of a lamp or the ticks of a clock, but they can be seen, as can the rate of
+    a bus where it is full. Where no regularity is seen in the time stamps, the effects that make one are not
+    tried.
     """
     structure = evidence.structure
     if effect is Flicker:
@@ -98,6 +100,9 @@ def prepared(evidence: Evidence, effect: type[Effect]) -> list[Effect]:
         return [Timestamp(step=structure.step, jitter=0.0)] if structure.step else []
     if effect is RowScan:
         return [RowScan(line=structure.line, direction=structure.direction)] if structure.line else []
+    if effect is Readout:
+        # events come as fast as the bus can send them, if it ever was full
+        return [replace(e, rate=evidence.busiest) for e in variants(effect) if isinstance(e, Readout)]
     return variants(effect)
 
 
@@ -138,9 +143,8 @@ def scouting(evidence: Evidence, present: Model, effect: Effect, *, seed: int) -
 def refining(evidence: Evidence, tried: Tried, *, seed: int) -> Work[Tried]:
     """Fit a candidate to all pixels of the training half, by the sampling errors of the present model."""
     # a finalist that is still on its way would be judged by where it happens to be
-    found = yield from tried.model.exploring(
-        evidence.train, seed=seed, iterations=3, radius=0.2, patient=True
-    )
+    half = evidence.train.loaded(tried.model.space, tried.model.place)
+    found = yield from tried.model.exploring(half, seed=seed, iterations=3, radius=0.2, patient=True)
     model = replace(tried.model, place=found.place, loss=found.loss)
     return replace(tried, model=model, fit=found.loss, bank=found.tried)
 

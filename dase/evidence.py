@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from dase.camera import CameraScene
 from dase.choice import look, where_trusted
+from dase.crowd import Load, Surroundings
 from dase.error import Judgement, Scale, judge
 from dase.errors import InputError
 from dase.events import Events
@@ -44,6 +45,9 @@ FINEST, COARSEST = 2.5e-4, 2e-3
 
 COMMON = 1e-3
 
+BUSY = 2e-3
+"""Events are counted for so long to see how fast they come at most [s]."""
+
 Array = NDArray[np.float64]
 
 
@@ -55,6 +59,8 @@ class Half:
         trials: Runs models.
         found: What was measured.
         frame: What statistics refer to.
+        around: What all pixels see; None where that is not known.
+        load: What the pixels that are not looked at send in the present model.
         scale: What differences are measured by in a fit: sampling errors as they are seen between groups of
             pixels, also where the model is wrong.
         chance: What differences are measured by in a test: sampling errors of the present model.
@@ -68,6 +74,8 @@ class Half:
     trials: Trials
     found: Sums
     frame: Frame
+    around: Surroundings | None = None
+    load: Load | None = None
     scale: Scale = field(init=False)
     chance: Scale = field(init=False)
     seen: Scale = field(init=False)
@@ -78,6 +86,13 @@ class Half:
     def view(self) -> Half:
         """Return the same half, which may have another present model."""
         return copy(self)
+
+    def loaded(self, space: Space, place: Array) -> Half:
+        """Return the same half, where the pixels that are not looked at send what they do in some model."""
+        out = self.view()
+        if self.around is not None:
+            out.load = Load(self.around, space.at(place), self.trials.stimulus)
+        return out
 
     def run(self, space: Space, places: Array, *, seed: int) -> Array:
         """Return the statistics of the models at some places, shape (B, J)."""
@@ -100,6 +115,7 @@ class Half:
     def rebasing(self, space: Space, place: Array, *, repeats: int, seed: int) -> Work[Array]:
         """Do what `rebase` does, see `together`."""
         repeats = min(repeats, FEW_REPEATS) if self.slow(space) else repeats
+        self.load = self.loaded(space, place).load
         sums = yield [Ask(self, space, np.repeat(np.atleast_2d(place), repeats, 0), seed, repeats=True)]
         return self.take(sums[0])
 
@@ -147,6 +163,7 @@ class Evidence:
         bands: Intensities between the bands, shape (BANDS - 1,).
         structure: Regularities of the time stamps.
         peak: Frequency at which the rate swings most [Hz].
+        busiest: Most events per second of all pixels [Hz].
         notes: What the data cannot show.
     """
 
@@ -156,6 +173,7 @@ class Evidence:
     bands: Array
     structure: Structure
     peak: float
+    busiest: float
     notes: tuple[str, ...] = ()
 
     @property
@@ -237,8 +255,10 @@ def gather(
         peak = precise(events, grid.begin, grid.begin + cut * grid.step, peak)
     for half in halves:
         half.frame = replace(half.frame, peak=peak)
+        # where the scene is trusted here and there only, nobody knows what all pixels send
+        half.around = Surroundings(scene, _times(scene, grid), seed, device) if trust is None else None
     train, held, scout = halves
-    return Evidence(train, held, scout, bands, structure, peak, tuple(notes))
+    return Evidence(train, held, scout, bands, structure, peak, busiest(events), tuple(notes))
 
 
 def common_grid(events: Events, scene: Scene) -> Grid:
@@ -263,6 +283,12 @@ def common_grid(events: Events, scene: Scene) -> Grid:
     last = min(end, float(events.t[-1]) + 2 * h)
     steps = int(np.floor((last - begin) / h + 1e-6)) + 1
     return Grid(begin, h, max(steps, 2))
+
+
+def busiest(events: Events) -> float:
+    """Return the most events per second [Hz]: the rate of a bus, if it ever was full for long enough."""
+    counts = np.bincount(((events.t - events.t[0]) / BUSY).astype(np.int64))
+    return float(counts.max()) / BUSY
 
 
 def _times(scene: Scene, grid: Grid) -> NDArray[np.float64]:

@@ -37,6 +37,12 @@ DESCENTS = 3
 APART = 10_007
 """Between their seeds."""
 
+ALIKE = 2.0
+"""Most by which the loss of another phase may grow where it becomes the present one."""
+
+ROOM = 0.3
+"""Of the logarithm of a bus's rate above the most events per second."""
+
 FEW_STARTS = 0.1
 """Share of the plausible range that is left out at both ends when an effect is tried."""
 
@@ -149,9 +155,22 @@ def settling(
         other = with_phase(model, 1.0 - model.space.sensor["threshold"].phase)  # type: ignore[attr-defined]
         values = yield [Ask(half, m.space, m.place[None], seed) for m in (model, other)]
         losses = [float(half.scale.loss(value)[0]) for value in values]
-        model = other if losses[1] < losses[0] else model
+        if losses[1] < losses[0] and (yield from _as_good(evidence, other, losses[0], seed=seed)):
+            model = other
         model = yield from model.searching(half, seed=seed + turn, radius=0.12 / (1 + turn), patient=True)
     return model
+
+
+def _as_good(evidence: Evidence, model: Model, loss: float, *, seed: int) -> Work[bool]:
+    """Whether a model's loss is about as small by its own sampling errors.
+
+    By those of a model with chance in it, one without looks no worse, until it is the present one and its
+    repeats are all alike.
+    """
+    half = evidence.train.view()
+    yield from half.rebasing(model.space, model.place, repeats=SETTLED, seed=seed + 100)
+    (values,) = yield [Ask(half, model.space, model.place[None], seed)]
+    return float(half.scale.loss(values)[0]) < ALIKE * loss
 
 
 def _threshold_starts(model: Model) -> Array:
@@ -187,11 +206,12 @@ def starts(model: Model, effect: Effect, *, few: bool = False) -> Array:
     for n, axis in enumerate(axes):
         if axis.name.split(".")[0] == effect.name:
             columns.append(n)
-            choices.append(_tried(axis, float(model.place[n]))[:: 2 if few and axis.main else 1])
+            tried = _tried(axis, float(model.place[n]))
+            choices.append(tried[::2] if few and axis.main and len(tried) > 2 else tried)
     thresholds = [n for n, axis in enumerate(axes) if axis.name in ("threshold.on", "threshold.off")]
     out = []
     for combination in product(*choices):
-        for shift in SHIFTS[1::2] if few else SHIFTS:
+        for shift in SHIFTS[1::2] if few and effect.name != "readout" else SHIFTS:
             place = model.place.copy()
             place[columns] = combination
             place[thresholds] += shift
@@ -201,6 +221,8 @@ def starts(model: Model, effect: Effect, *, few: bool = False) -> Array:
 
 def _tried(axis: Axis, present: float) -> list[float]:
     low, high = (float(axis.to_place(v)) for v in axis.fact.plausible)
+    if axis.name == "readout.rate":  # is seen where the bus is full
+        return [present, present + ROOM]
     if axis.main:
         return list(low + (high - low) * np.linspace(FEW_STARTS, 1 - FEW_STARTS, 6))
     if axis.fact.unit == "turns":

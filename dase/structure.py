@@ -28,6 +28,10 @@ ENOUGH = 50_000
 SLOW = 20
 """Times as many in which ticks are looked for: of a slow clock, thousands of events share one."""
 
+TURNS = 0.8
+"""Least share of events one step behind the one before that tells a bus from a clock, which has at most 0.41
+of them by chance."""
+
 DIRECTIONS = ("down", "up", "right", "left")
 
 
@@ -108,7 +112,17 @@ def ticks(t: NDArray[np.float64]) -> float:
         return 0.0
     step = float(np.quantile(gaps, 0.02))
     step = refined(t, step)
-    return step if share_at(t, step) >= CERTAIN and spread_over(t, step) else 0.0
+    regular = share_at(t, step) >= CERTAIN and spread_over(t, step)
+    return step if regular and not in_turns(t, step) else 0.0
+
+
+def in_turns(t: NDArray[np.float64], step: float) -> bool:
+    """Whether stamps take one multiple after the other, each once: a bus that is never free sends so.
+
+    To a clock, events come by chance: where there is one per tick in the mean, many ticks have several.
+    """
+    ticks_ = np.round((t - t[0]) / step)
+    return float(np.mean(np.diff(ticks_) == 1)) >= TURNS
 
 
 def refined(t: NDArray[np.float64], step: float) -> float:

@@ -102,7 +102,7 @@ def simulated(asks: Sequence[Ask]) -> list[Any]:
         order = Order(ask.space.sensor, vectors, ask.seed, ask.repeats, None, frame, ticks or 0.0)
         if ticks is None:
             effects = [trials.felt(ask.space.at(place)) for place in np.atleast_2d(ask.places)]
-            sums[n] = trials.stream_all(order, effects)
+            sums[n] = trials.stream_all(order, effects, ask.half.load)
         else:
             _, members, mine = orders.setdefault(id(trials), (trials, [], []))
             members.append(n)

@@ -11,6 +11,7 @@ import warp as wp
 from numpy.typing import NDArray
 
 from dase.behind import clock_of, emitted, felt, sent
+from dase.crowd import Load
 from dase.effects import EFFECTS
 from dase.effects.optics import SceneEffect
 from dase.effects.stream import StreamEffect
@@ -256,15 +257,20 @@ class Trials:
         """Simulate one parameter vector with effects behind the pixels, and sum up what leaves."""
         return self.stream_all(Order(sensor, np.atleast_2d(vector), seed), [tuple(effects)])
 
-    def stream_all(self, order: Order, effects: Sequence[Sequence[StreamEffect]]) -> Sums:
-        """Simulate models with effects behind the pixels, given for each, and sum up what leaves."""
+    def stream_all(
+        self, order: Order, effects: Sequence[Sequence[StreamEffect]], load: Load | None = None
+    ) -> Sums:
+        """Simulate models with effects behind the pixels, given for each, and sum up what leaves.
+
+        `load` is what the sensor's other pixels send over a bus that all share, None where it is not known.
+        """
         seeds, parts, rows = order.seeds(), [], len(order.vectors)
         at_once = 1 if order.reseed else STREAMED
         for first in range(0, rows, at_once):
             cut = slice(first, first + at_once)
             left = emitted(self.stimulus, order.sensor, order.vectors[cut], int(seeds[first]))
             read = zip(left, effects[cut], seeds[cut], strict=True)
-            parts += [sent(self.stimulus, events, behind, int(seed)) for events, behind, seed in read]
+            parts += [sent(self.stimulus, events, behind, int(seed), load) for events, behind, seed in read]
         self.evaluations += rows
         begins = range(0, rows, STREAMED)
         return Sums.join([self._look(parts[n : n + STREAMED], order.frame) for n in begins])

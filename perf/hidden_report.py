@@ -248,9 +248,7 @@ Named first: the first effect selected is the hidden one, or is announced as tie
 
 Rows: what was hidden. Columns: what was named first.
 
-Most misses are of `readout`: it is simulated on the pixels that are looked at, with their share of the bus,
-which is right where the bus is free or full and not between; so the error stays just above the floor and
-nothing is announced. Leak beside shot noise and jitter beside mismatch leave no more than chance once the
+Leak beside shot noise and jitter beside mismatch leave no more than chance once the
 other of the two is fitted.
 
 A removed effect is right if the answer is "unexplained" and nothing is named. The cells are right if one of

@@ -8,12 +8,26 @@ from typing import ClassVar
 
 import numpy as np
 import warp as wp
+from numpy.typing import NDArray
 
 from dase.effects.base import choice, parameter
 from dase.effects.stream import Reader, StreamEffect, nanoseconds, seconds
 from dase.events import Events
 from dase.kernels import launch
-from dase.kernels.readout import NEVER, queue
+from dase.kernels.readout import NEVER, ONE, queue
+
+
+@dataclass(frozen=True, eq=False)
+class Others:
+    """Events that take their turns on a bus and are not looked at.
+
+    Args:
+        time: When they get there, not decreasing [ps], shape (M,).
+        polarity: 1 for ON, shape (M,).
+    """
+
+    time: NDArray[np.int64]
+    polarity: NDArray[np.uint8]
 
 
 class Bus(Reader):
@@ -26,15 +40,29 @@ class Bus(Reader):
 
     def push(self, events: Events, until: float) -> tuple[Events, float]:
         """Give all events that find room, at the times at which they are through, be it after `until`."""
+        empty = Others(np.empty(0, np.int64), np.empty(0, np.uint8))
+        return self.beside(events, empty, np.ones(2)), until
+
+    def beside(self, events: Events, others: Others, weight: NDArray[np.float64]) -> Events:
+        """Return those of some events that find room beside others that go the same way.
+
+        Args:
+            events: Sorted by time.
+            others: They take room and time, and are not returned.
+            weight: How many OFF and ON events each of the others stands for, shape (2,).
+        """
         arrival, through = 1000 * nanoseconds(events.t), np.empty(len(events), np.int64)
-        arrays = [wp.array(a, dtype=wp.int64, device=self._cpu, copy=False) for a in (arrival, through)]
-        busy = wp.array(self._busy, dtype=wp.int64, device=self._cpu, copy=False)
-        inputs = [arrays[0], wp.int64(self._service), wp.int64(self._patience), busy, arrays[1]]
+        columns = (
+            (arrival, wp.int64), (others.time, wp.int64), (others.polarity, wp.uint8),
+            (np.rint(weight * ONE).astype(np.int64), wp.int64), (self._busy, wp.int64), (through, wp.int64),
+        )  # fmt: skip
+        arrays = [wp.array(a, dtype=d, device=self._cpu, copy=False) for a, d in columns]
+        inputs = [*arrays[:4], wp.int64(self._service), wp.int64(self._patience), *arrays[4:]]
         wp.launch(queue, dim=1, inputs=inputs, device=self._cpu)
         lost = through == NEVER
         if lost.any():
             events, through = events.select(~lost), through[~lost]
-        return replace(events, t=seconds(through // 1000)), until
+        return replace(events, t=seconds(through // 1000))
 
 
 @dataclass(frozen=True, kw_only=True)

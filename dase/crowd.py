@@ -1,0 +1,114 @@
+"""The pixels of a sensor that are not looked at: what they send over the bus that all pixels share."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dase.effects.readout import Others
+from dase.effects.stream import StreamEffect, nanoseconds
+from dase.events import Events
+from dase.pixels import Pixels
+from dase.scene import Scene
+from dase.sensor import CHUNK, Sensor, chunks
+from dase.stimulus import Stimulus
+
+MOST = 2.5e7
+"""Pixels times points of time that are simulated: of a larger sensor or a longer time, some pixels stand for
+all."""
+
+
+@dataclass(frozen=True, eq=False)
+class Surroundings:
+    """A scene as all pixels see it.
+
+    Args:
+        scene: What they see.
+        times: Points of the grid of time [s], shape (T,).
+        seed: Of the random numbers, and of which pixels stand for all.
+        device: Where kernels run.
+    """
+
+    scene: Scene
+    times: NDArray[np.float64]
+    seed: int
+    device: str
+
+    def pixels(self, chosen: NDArray[np.int32], steps: int) -> NDArray[np.int32]:
+        """Return those that are simulated to know what all send: those looked at and others, sorted."""
+        size = self.scene.width * self.scene.height
+        rng = np.random.default_rng([self.seed, 2])
+        rest = np.setdiff1d(rng.permutation(size), chosen, assume_unique=True).astype(np.int32)
+        room = max(len(chosen), int(MOST / steps) - len(chosen))
+        return np.sort(np.concatenate([chosen, rest[:room]]))
+
+    def emitted(self, sensor: Sensor, pixels: NDArray[np.int32], steps: int) -> Events:
+        """Return what leaves some pixels up to a point of time, from time 0."""
+        bare = replace(sensor, effects=tuple(e for e in sensor.effects if not isinstance(e, StreamEffect)))
+        array = Pixels(
+            bare, self.scene.width, self.scene.height, pixels=pixels, seed=self.seed, device=self.device
+        )
+        size = CHUNK["cuda" if array.device.is_cuda else "cpu"]
+        parts = [array.emit(self.scene, times)[0] for times in chunks(self.times[:steps], size)]
+        events = Events.concatenate([*parts, array.flush()[0]])
+        return replace(events, t=events.t - float(self.times[0]))
+
+
+@dataclass(eq=False)
+class Load:
+    """What the pixels that are not looked at send, as the present model has it.
+
+    Worked out when it is first asked for: most models have no bus.
+
+    Args:
+        around: What all pixels see.
+        sensor: The present model.
+        stimulus: The pixels that are looked at, and their time.
+    """
+
+    around: Surroundings
+    sensor: Sensor
+    stimulus: Stimulus
+    _before: dict[tuple[StreamEffect, ...], Others] = field(default_factory=dict, repr=False)
+
+    def weight(self, events: Events) -> NDArray[np.float64]:
+        """Return how many events one of the others stands for, shape (2,).
+
+        Args:
+            events: What leaves the pixels that are looked at in the model under trial. It sends more or less
+                than the present one, and so it is taken to do everywhere.
+        """
+        _, counts, each = self._events
+        return each * (_polarities(events) + 1) / (counts + 1)
+
+    def others(self, effects: Iterable[StreamEffect], seed: int) -> Others:
+        """Return the others' events behind some effects."""
+        key = tuple(effects)
+        if key not in self._before:
+            events, until = self._events[0], np.inf
+            for effect in key:
+                reader = effect.reader(self.stimulus.width, self.stimulus.height, seed)
+                events, until = reader.push(events, until)
+            self._before[key] = Others(1000 * nanoseconds(events.t), events.p.astype(np.uint8))
+        return self._before[key]
+
+    @cached_property
+    def _events(self) -> tuple[Events, NDArray[np.float64], float]:
+        """The others' events, how many those looked at have, and how many of the others one stands for."""
+        chosen, steps = self.stimulus.pixels, self.stimulus.grid.steps
+        pixels = self.around.pixels(chosen, steps)
+        events = self.around.emitted(self.sensor, pixels, steps)
+        own = np.zeros(self.stimulus.width * self.stimulus.height, np.bool_)
+        own[chosen] = True
+        mine = own[events.y.astype(np.int64) * self.stimulus.width + events.x]
+        each = (len(own) - len(chosen)) / max(len(pixels) - len(chosen), 1)
+        return events.select(~mine), _polarities(events.select(mine)), each
+
+
+def _polarities(events: Events) -> NDArray[Any]:
+    return np.bincount(events.p.astype(np.int64), minlength=2)
