@@ -144,9 +144,33 @@ def refining(evidence: Evidence, tried: Tried, *, seed: int) -> Work[Tried]:
     """Fit a candidate to all pixels of the training half, by the sampling errors of the present model."""
     # a finalist that is still on its way would be judged by where it happens to be
     half = evidence.train.loaded(tried.model.space, tried.model.place)
-    found = yield from tried.model.exploring(half, seed=seed, iterations=3, radius=0.2, patient=True)
+    ways = turned(tried.model, half.frame.step)
+    ends = yield from beside(
+        [way.exploring(half, seed=seed, iterations=3, radius=0.2, patient=True) for way in ways]
+    )
+    found = min(ends, key=lambda end: end.loss)
     model = replace(tried.model, place=found.place, loss=found.loss)
-    return replace(tried, model=model, fit=found.loss, bank=found.tried)
+    bank = np.concatenate([end.tried for end in ends])
+    return replace(tried, model=model, fit=found.loss, bank=bank)
+
+
+def turned(model: Model, step: float) -> list[Model]:
+    """Return a model, and where it has a lamp, also those with the lamp a step of the grid earlier and later.
+
+    What probes tell by steps hardly changes when all events are a step off, so a fit may end there.
+    """
+    names = [axis.name for axis in model.space.axes]
+    if "flicker.phase" not in names:
+        return [model]
+    at = names.index("flicker.phase")
+    turn = step * model.sensor["flicker"].frequency  # type: ignore[attr-defined]
+    out = [model]
+    for phase in (-turn, turn):
+        place = model.place.copy()
+        value = float(model.space.axes[at].to_value(place[at])) + phase
+        place[at] = model.space.axes[at].to_place((value + 1.0) % 2.0 - 1.0)
+        out.append(replace(model, place=place))
+    return out
 
 
 def judge_alone(evidence: Evidence, tried: Sequence[Tried], *, seed: int) -> list[Tried]:
