@@ -288,7 +288,7 @@ def test_a_poor_minimum_is_said(tmp_path, scene, monkeypatch):
 
 
 def test_starts_that_end_higher_are_not_counted():
-    judgements = [Judgement(error, 1.2, 0.5, {}, {}, np.zeros(1), 1.0) for error in (1.1, 5.0, 9.0)]
+    judgements = [Judgement(error, 1.2, 0.5, 0.3, {}, {}, np.zeros(1), 1.0) for error in (1.1, 5.0, 9.0)]
     ends = [(judgement, model_of(Sensor())) for judgement in judgements]
     assert len(_equal(ends)) == 1
     assert "only one came" in _remarks(judgements[0], 3, 1)[0]
