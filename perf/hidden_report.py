@@ -248,9 +248,9 @@ Named first: the first effect selected is the hidden one, or is announced as tie
 
 Rows: what was hidden. Columns: what was named first.
 
-Of the pairs, jitter beside mismatch is missed: once a spread of thresholds is fitted, jitter leaves no more than
-chance in these scenes. Second order includes bandwidth, so where bandwidth is taken out of the library it explains
-the data as well as the truth does, and is named.
+Of the pairs, jitter beside mismatch is missed: once a spread of thresholds is fitted, jitter leaves no more
+than chance in these scenes. Second order includes bandwidth, so where bandwidth is taken out of the library
+it explains the data as well as the truth does, and is named.
 
 A removed effect is right if the answer is "unexplained" and nothing is named. The cells are right if one of
 the first five is a cell in which the true sensor without the effect differs from the data.
