@@ -1,0 +1,88 @@
+"""Where searches begin, and when their last steps are taken back."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import dase
+from dase import confidence
+from dase.candidates import turned
+from dase.confidence import estimates
+from dase.effects import EFFECTS
+from dase.evidence import gather
+from dase.explain import bars
+from dase.model import added, model_of, starts
+from dase.sensor import Sensor
+
+LAMP = EFFECTS["flicker"](frequency=100.0, depth=0.2, phase=0.05)
+
+
+@pytest.fixture(scope="module")
+def lit() -> Sensor:
+    return Sensor().with_effect(LAMP)
+
+
+def phases(models) -> np.ndarray:
+    return np.array([model.sensor["flicker"].phase for model in models])
+
+
+def test_a_lamp_is_also_looked_for_one_step_earlier_and_later(lit):
+    got = phases(turned(model_of(lit), 1e-3)) % 1.0
+    np.testing.assert_allclose(got, [0.05, 0.95, 0.15], atol=1e-6)
+    bare = model_of(Sensor())
+    assert turned(bare, 1e-3) == [bare]
+
+
+def test_a_lamp_at_the_end_of_the_range_of_phases_stays_within(lit):
+    end = lit.with_effect(replace(LAMP, phase=0.95))
+    got = phases(turned(model_of(end), 1e-3))
+    assert np.all(np.abs(got) <= 1.0)
+    np.testing.assert_allclose(got % 1.0, [0.95, 0.85, 0.05], atol=1e-6)
+
+
+def test_starts_go_once_round_the_lamp():
+    model = added(model_of(Sensor()), LAMP)
+    n = [axis.name for axis in model.space.axes].index("flicker.phase")
+    tried = np.unique(model.space.axes[n].to_value(starts(model, LAMP)[:, n]).round(6))
+    np.testing.assert_allclose(tried, np.arange(8) / 8)
+
+
+def test_thresholds_are_tried_on_both_sides_of_the_present_ones():
+    present = model_of(Sensor())
+    model = added(present, EFFECTS["linlog"]())
+    n = [axis.name for axis in model.space.axes].index("threshold.on")
+    tried = starts(model, EFFECTS["linlog"]())[:, n] - model.place[n]
+    assert tried.min() < -0.5
+    assert tried.max() > 0.3
+
+
+@pytest.fixture(scope="module")
+def evidence(lit, device):
+    scene = bars()
+    return gather(dase.simulate(scene, lit, seed=4, device=device), scene, pixels=200, seed=1, device=device)
+
+
+def test_a_last_step_that_leads_astray_is_taken_back(evidence, lit, monkeypatch):
+    model = model_of(lit, ["threshold", "flicker.depth", "flicker.phase"])
+    gain = confidence._gain
+
+    def wrong(half, model, repeats, *, seed):
+        out = gain(half, model, repeats, seed=seed)
+        return -40.0 * out
+
+    monkeypatch.setattr(confidence, "_gain", wrong)
+    stays, values = estimates(evidence, model, seed=0)
+    np.testing.assert_array_equal(stays.place, model.place)
+    assert values["flicker.phase"].value == pytest.approx(0.05, abs=1e-6)
+
+
+def test_a_last_step_that_helps_is_taken(evidence, lit):
+    off = lit.with_effect(replace(lit["threshold"], on=0.215, off=0.19))
+    model = model_of(off, ["threshold"])
+    moved, values = estimates(evidence, model, seed=0)
+    assert values["threshold.on"].value == pytest.approx(lit["threshold"].on, rel=0.03)
+    assert values["threshold.off"].value == pytest.approx(lit["threshold"].off, rel=0.03)
+    assert not np.array_equal(moved.place, model.place)
