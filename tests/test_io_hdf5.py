@@ -144,6 +144,24 @@ def test_a_heap_of_texts_with_an_empty_hole_is_no_endless_loop(tmp_path, rng, ma
             act(path)
 
 
+@pytest.mark.parametrize("ring", [1, 2], ids=["to itself", "to and fro"])
+def test_a_heap_of_names_whose_holes_go_round_is_no_endless_loop(tmp_path, rng, ring):
+    """HDF5 2.0 takes memory until there is none."""
+    path = tmp_path / "a.h5"
+    written("HDF5")(path, events(rng, 50))
+    content = bytearray(path.read_bytes())
+    heap = content.index(columns.NAMES)
+    size, hole, data = (int.from_bytes(content[heap + n : heap + n + 8], "little") for n in (8, 16, 24))
+    assert hole + 16 * ring <= size
+    for n in range(ring):
+        place = data + hole + 16 * n
+        content[place : place + 8] = (hole + 16 * ((n + 1) % ring)).to_bytes(8, "little")
+    path.write_bytes(content)
+    for act in (io.read, lambda path: list(io.stream(path))):
+        with pytest.raises(InputError, match="heap of names is damaged"):
+            act(path)
+
+
 def test_names_in_a_file_cannot_break_the_sentence(tmp_path):
     with h5py.File(tmp_path / "a.h5", "w") as file:
         file["two\nlines and \x1b[31mred"] = np.zeros(3)

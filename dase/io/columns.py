@@ -18,6 +18,7 @@ from dase.io.source import Piece, Size, Source, missing_extra, refuse_bomb
 
 HDF5 = b"\x89HDF\r\n\x1a\n"
 HEAP = b"GCOL\x01\0\0\0"
+NAMES = b"HEAP\0\0\0\0"
 PART = 1 << 20  # events read at once
 BLOCK = 1 << 24  # [bytes] searched at once
 MOST_TEXT = 1 << 26  # [bytes] of an attribute
@@ -80,30 +81,33 @@ def check_head(path: Path) -> None:
 
 
 def check_heaps(path: Path) -> None:
-    """Raise InputError where a heap of texts is damaged: HDF5 2.0 reads one with an empty hole for ever.
+    """Raise InputError where a heap of texts or of names is damaged: HDF5 2.0 reads some for ever.
 
-    A heap is "GCOL", version 1, three zeros, u64 size with this head; then objects: u16 number, 6 bytes, u64
-    length, data padded to 8 bytes; number 0 is the hole at the end, whose length counts its head.
+    A heap of texts is "GCOL", version 1, three zeros, u64 size with this head; then objects: u16 number, 6
+    bytes, u64 length, data padded to 8 bytes; number 0 is the hole at the end, whose length counts its head.
+    That of the names in a group is "HEAP", four zeros, u64 size of its data, place in them of the first hole,
+    address of the data; a hole is u64 place of the next one, 1 for none, and u64 length.
     """
     state = path.stat()
     key = (str(path.resolve()), state.st_mtime_ns, state.st_size)
     if key in _sound:
         return
     with path.open("rb") as file:
-        for begin in _heaps(file):
-            _check_heap(file, begin, state.st_size)
+        for kind, begin in _heaps(file):
+            (_check_heap if kind == HEAP else _check_names)(file, begin, state.st_size)
     if state.st_size > BLOCK:  # a small one is looked at again sooner than its time tells that it changed
         _sound.add(key)
 
 
-def _heaps(file: BinaryIO) -> Iterator[int]:
-    """Yield where heaps begin; in blocks, for a file may be larger than the memory."""
+def _heaps(file: BinaryIO) -> Iterator[tuple[bytes, int]]:
+    """Yield kinds of heaps and where they begin; in blocks, for a file may be larger than the memory."""
     place, tail = 0, b""
     while block := file.read(BLOCK):
         text = tail + block
-        found = -1
-        while (found := text.find(HEAP, found + 1)) >= 0:
-            yield place - len(tail) + found
+        for kind in (HEAP, NAMES):
+            found = -1
+            while (found := text.find(kind, found + 1)) >= 0:
+                yield kind, place - len(tail) + found
         file.seek(place := place + len(block))
         tail = text[1 - len(HEAP) :]
 
@@ -122,6 +126,19 @@ def _check_heap(file: BinaryIO, begin: int, length: int) -> None:
         place += step
 
 
+def _check_names(file: BinaryIO, begin: int, length: int) -> None:
+    file.seek(begin + 8)
+    size, hole, data = (int.from_bytes(file.read(8), "little") for _ in range(3))
+    seen = set()
+    # what looks like a heap but lies elsewhere, among numbers, has no data in the file
+    while hole + 16 <= size and data + size <= length:
+        if hole in seen:
+            raise InputError("a heap of names is damaged")
+        seen.add(hole)
+        file.seek(data + hole)
+        hole = int.from_bytes(file.read(8), "little")
+
+
 def has(path: Path, head: bytes, *names: str) -> bool:
     """Whether a file is HDF5 and holds datasets of all these names."""
     global _asked
@@ -136,6 +153,7 @@ def has(path: Path, head: bytes, *names: str) -> bool:
 def _found(path: Path) -> frozenset[str]:
     try:
         check_head(path)
+        check_heaps(path)
         with h5py.File(path, "r") as file:
             return frozenset(name for name in TELLING if isinstance(file.get(name), h5py.Dataset))
     except Exception:  # damaged: left to the reader that is tried at last
