@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -264,13 +265,13 @@ class Trials:
 
         `load` is what the sensor's other pixels send over a bus that all share, None where it is not known.
         """
-        seeds, parts, rows = order.seeds(), [], len(order.vectors)
+        seeds, left, rows = order.seeds(), [], len(order.vectors)
         at_once = 1 if order.reseed else STREAMED
         for first in range(0, rows, at_once):
             cut = slice(first, first + at_once)
-            left = emitted(self.stimulus, order.sensor, order.vectors[cut], int(seeds[first]))
-            read = zip(left, effects[cut], seeds[cut], strict=True)
-            parts += [sent(self.stimulus, events, behind, int(seed), load) for events, behind, seed in read]
+            left += emitted(self.stimulus, order.sensor, order.vectors[cut], int(seeds[first]))
+        each = zip(left, effects, seeds, strict=True)
+        parts = launch.each([partial(sent, self.stimulus, e, behind, int(s), load) for e, behind, s in each])
         self.evaluations += rows
         begins = range(0, rows, STREAMED)
         return Sums.join([self._look(parts[n : n + STREAMED], order.frame) for n in begins])

@@ -9,13 +9,16 @@ from __future__ import annotations
 import os
 import sys
 import tempfile
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 import warp as wp
 
 wp.config.log_level = wp.LOG_WARNING
+
+Result = TypeVar("Result")
 
 _pool: ThreadPoolExecutor | None = None
 _threads = int(os.environ.get("DASE_THREADS", "0")) or os.cpu_count() or 1
@@ -111,6 +114,19 @@ def run(
         _pool = ThreadPoolExecutor(_threads, thread_name_prefix="dase")
     for done in _pool.map(work, starts):
         assert done is None
+
+
+def each(works: Sequence[Callable[[], Result]]) -> list[Result]:
+    """Return what works give that pass their time in kernels of the CPU or in NumPy, done on its threads.
+
+    The first is done before the others: what it loads or works out is there for all. Works may use `run`,
+    whose threads are others.
+    """
+    if len(works) < 2 or _threads == 1:
+        return [work() for work in works]
+    first = works[0]()
+    with ThreadPoolExecutor(_threads, thread_name_prefix="dase works") as pool:
+        return [first, *pool.map(lambda work: work(), works[1:])]
 
 
 def room(shape: int | tuple[int, ...], dtype: Any, device: wp.Device) -> wp.array:
