@@ -231,11 +231,9 @@ class CriticBank:
                 rates, correction, decay=self.decay,
             )  # fmt: skip
         for name, gradient in batch.sums.items():
-            weight, square = getattr(self, name), self.square[name]
-            moved = torch.lerp(gradient.square(), square, self.decay)
-            square.copy_(torch.where(batch.active[:, None], moved, square))
-            root = (square * correction[:, None]).sqrt_().add_(1e-8)
-            weight.addcdiv_(gradient * -rates[:, None], root)
+            bridge.move_sums(
+                getattr(self, name), self.square[name], gradient, rates, correction, decay=self.decay
+            )
         return critique
 
     def one_launch(self) -> bool:

@@ -137,7 +137,8 @@ class Pixels:
         lanes = counting.widest(self.count, self.device, name)
         level, eps = self._thresholds_of_pixels()
         shared = level.shape[2] == 1 and bool(np.all(self._vectors[:, 0] == self._vectors[:, 1]))
-        kernel = counting.count(lanes, name, shared=shared, states=True)
+        aligned = counting.aligned(name, source, self.count)
+        kernel = counting.count(lanes, name, shared=shared, states=True, aligned=aligned)
         inputs = [
             source, 0, self._pixels, self.count, self.width, first, level, eps, *self._runs(windows), memory,
             self._next[1], self._next[0], out,

@@ -165,7 +165,8 @@ class _Count(torch.autograd.Function):
         seen = _scene.Frames()
         seen.values = wp.from_torch(log.view(batch * samples, pixels))
         lanes = _counts.widest(pixels, wp.device_from_torch(log.device), "log")
-        kernel = _counts.count(lanes, "log", shared=threshold.shape[1] == 1, states=False)
+        shared, aligned = threshold.shape[1] == 1, _counts.aligned("log", seen, pixels)
+        kernel = _counts.count(lanes, "log", shared=shared, states=False, aligned=aligned)
         unused = torch.empty(batch, 0, device=log.device)
         inputs = [
             seen, samples, wp.empty(0, dtype=int, device=log.device.type), pixels, 1, 1, threshold,

@@ -128,3 +128,17 @@ def move_critics(
     inputs = [left, right.view(torch.int32), end, rate, correction, decay, tiny]
     tiles = weight.view(weight.shape[0], -1, _bank.TILE**2)[..., 0]
     _launch(_bank.adam[half], inputs, [weight, square, copy.view(torch.int32)], over=tiles)
+
+
+def move_sums(
+    weight: torch.Tensor,
+    square: torch.Tensor,
+    gradient: torch.Tensor,
+    rate: torch.Tensor,
+    correction: torch.Tensor,
+    *,
+    decay: float,
+    tiny: float = 1e-8,
+) -> None:
+    """Move weights by Adam without momentum along a gradient, all float32 (C, J); see `move_critics`."""
+    _launch(_bank.adam_of, [gradient, rate, correction, decay, tiny], [weight, square], over=gradient)

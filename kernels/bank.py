@@ -48,54 +48,76 @@ def store(a: wp.array3d[float], c: int, j: int, k: int, q: wp.vec4):
 @wp.func_native(
     """
 #ifdef __CUDA_ARCH__
-    const float4 q = __ldg(reinterpret_cast<const float4*>(&wp::index(a, r, k)));
-    return wp::vec_t<4, wp::float32>(q.x, q.y, q.z, q.w);
+    *reinterpret_cast<int2*>(&wp::index(a, c, j, k)) = make_int2(low, high);
 #else
-    const float* q = &wp::index(a, r, k);
-    return wp::vec_t<4, wp::float32>(q[0], q[1], q[2], q[3]);
+    (&wp::index(a, c, j, k))[0] = low;
+    (&wp::index(a, c, j, k))[1] = high;
 #endif
 """
 )
-def row(a: wp.array2d[float], r: int, k: int) -> wp.vec4:
-    """Return a[r, k : k + 4] by one load of 16 bytes."""
+def store_pairs(a: wp.array3d[int], c: int, j: int, k: int, low: int, high: int):
+    """Set a[c, j, k : k + 2] by one store of 8 bytes."""
     ...
 
 
-@wp.func_native(
-    """
-#ifdef __CUDA_ARCH__
-    const float4 q = __ldg(reinterpret_cast<const float4*>(&wp::index(a, r, k)));
-    return wp::vec_t<4, wp::float32>(q.x, q.y, q.z, q.w);
-#else
-    wp::vec_t<4, wp::float32> q;
-    __builtin_memcpy(&q, &wp::index(a, r, k), sizeof(q));
-    return q;
-#endif
-"""
-)
-def full_row(a: wp.array2d[int], r: int, k: int) -> wp.vec4:
-    """Return the four float32 at [r, k : k + 4] of rows that are handed over as words."""
-    ...
-
-
-@wp.func_native(
-    """
+OUTER = """
+    // plain pointers and no stores in between, so that several rows are on their way from memory at once
     typedef unsigned int word;
+    wp::mat_t<4, 4, wp::float32> sum(0.0f);
+    const float* a = &wp::index(left, begin, j);
+    const int* b = &wp::index(right, begin, WORDS);
+    const size_t step_a = left.strides[0] / 4, step_b = right.strides[0] / 4;
 #ifdef __CUDA_ARCH__
-    const uint2 q = __ldg(reinterpret_cast<const uint2*>(&wp::index(a, r, k / 2)));
-    const word low = q.x, high = q.y;
-    #define DASE_AS_FLOAT __uint_as_float
-#else
-    const word low = (&wp::index(a, r, k / 2))[0], high = (&wp::index(a, r, k / 2))[1];
-    #define DASE_AS_FLOAT(bits) __builtin_bit_cast(float, (word)(bits))
+#pragma unroll 4
 #endif
-    return wp::vec_t<4, wp::float32>(
-        DASE_AS_FLOAT(low << 16), DASE_AS_FLOAT(low & 0xffff0000u), DASE_AS_FLOAT(high << 16),
-        DASE_AS_FLOAT(high & 0xffff0000u));
+    for (int r = begin; r < end; ++r, a += step_a, b += step_b) {
+#ifdef __CUDA_ARCH__
+        const float4 four = __ldg(reinterpret_cast<const float4*>(a));
+        const float p[4] = {four.x, four.y, four.z, four.w};
+#else
+        const float* p = a;
+#endif
+        float q[4];
+        READ
+        for (int m = 0; m < 4; ++m)
+            for (int n = 0; n < 4; ++n) sum.data[m][n] += p[m] * q[n];
+    }
+    return sum;
 """
-)
-def half_row(a: wp.array2d[int], r: int, k: int) -> wp.vec4:
-    """Return the four bfloat16 at [r, k : k + 4] of rows that are handed over as words of two."""
+"""Sum of outer products of 4 numbers of the left rows with 4 of the right ones."""
+
+HALF = """
+#ifdef __CUDA_ARCH__
+        const uint2 two = __ldg(reinterpret_cast<const uint2*>(b));
+#else
+        const struct { word x, y; } two = {(word)b[0], (word)b[1]};
+#endif
+        const word bits[4] = {two.x << 16, two.x & 0xffff0000u, two.y << 16, two.y & 0xffff0000u};
+        __builtin_memcpy(q, bits, sizeof(q));
+"""
+
+FULL = """
+#ifdef __CUDA_ARCH__
+        *reinterpret_cast<float4*>(q) = __ldg(reinterpret_cast<const float4*>(b));
+#else
+        __builtin_memcpy(q, b, sizeof(q));
+#endif
+"""
+
+
+@wp.func_native(OUTER.replace("WORDS", "k / 2").replace("READ", HALF))
+def half_outer(
+    left: wp.array2d[float], right: wp.array2d[int], begin: int, end: int, j: int, k: int
+) -> wp.mat44:
+    """Sum left[r, j : j + 4] right[r, k : k + 4] over rows; the right ones are bfloat16, two in a word."""
+    ...
+
+
+@wp.func_native(OUTER.replace("WORDS", "k").replace("READ", FULL))
+def full_outer(
+    left: wp.array2d[float], right: wp.array2d[int], begin: int, end: int, j: int, k: int
+) -> wp.mat44:
+    """Sum left[r, j : j + 4] right[r, k : k + 4] over rows; the right ones are float32, as words."""
     ...
 
 
@@ -115,7 +137,7 @@ def pair(low: float, high: float) -> int:
 
 def _adam(half: bool) -> wp.Kernel:
     """Return the kernel for right rows in bfloat16, or in float32."""
-    right_row = half_row if half else full_row
+    outer = half_outer if half else full_outer
 
     @wp.kernel(enable_backward=False, module="unique")
     def adam(
@@ -142,24 +164,51 @@ def _adam(half: bool) -> wp.Kernel:
         across = weight.shape[2] / TILE
         k = TILE * (i % across)
         j = TILE * (i / across)
-        gradient = wp.mat44()
+        # everything is asked for before anything is worked out: no load may pass a store
+        means = wp.mat44()
+        weights = wp.mat44()
+        for n in range(TILE):
+            means[n] = load(square, c, j + n, k)
+            weights[n] = load(weight, c, j + n, k)
         begin = int(0)
         if c > 0:
             begin = end[c - 1]
-        for r in range(begin, end[c]):
-            gradient += wp.outer(row(left, r, j), right_row(right, r, k))
+        gradient = outer(left, right, begin, end[c], j, k)
         for n in range(TILE):
             slope = gradient[n]
-            mean = decay * load(square, c, j + n, k) + (1.0 - decay) * wp.cw_mul(slope, slope)
+            mean = decay * means[n] + (1.0 - decay) * wp.cw_mul(slope, slope)
             store(square, c, j + n, k, mean)
-            w = load(weight, c, j + n, k)
+            w = weights[n]
             for m in range(TILE):
                 w[m] = w[m] - rate[c] * slope[m] / (wp.sqrt(mean[m] * correction[c]) + tiny)
             store(weight, c, j + n, k, w)
-            copy[c, j + n, k / 2] = pair(w[0], w[1])
-            copy[c, j + n, k / 2 + 1] = pair(w[2], w[3])
+            store_pairs(copy, c, j + n, k / 2, pair(w[0], w[1]), pair(w[2], w[3]))
 
     return adam
+
+
+@wp.kernel(enable_backward=False)
+def adam_of(
+    first: int,
+    # in
+    gradient: wp.array2d[float],  # (C, J)
+    rate: wp.array[float],  # (C,) learning rate, 0 leaves a critic alone
+    correction: wp.array[float],  # (C,) 1 / (1 - decay^steps)
+    decay: float,  # of the mean square
+    tiny: float,  # added to the root
+    # inout
+    weight: wp.array2d[float],  # (C, J)
+    square: wp.array2d[float],  # (C, J) running mean of the gradient's square
+):
+    """The step of `adam` where the gradient is known."""
+    c, i = wp.tid()
+    if rate[c] == 0.0:
+        return
+    i += first
+    slope = gradient[c, i]
+    mean = decay * square[c, i] + (1.0 - decay) * slope * slope
+    square[c, i] = mean
+    weight[c, i] = weight[c, i] - rate[c] * slope / (wp.sqrt(mean * correction[c]) + tiny)
 
 
 adam = {half: _adam(half) for half in (True, False)}

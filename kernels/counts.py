@@ -37,11 +37,11 @@ SOURCES = {"frames": Frames, "log": Frames, "layers": Layers, "background": Laye
 
 
 @lru_cache(maxsize=32)
-def light_of(lanes: int, source: str) -> Any:
+def light_of(lanes: int, source: str, *, aligned: bool = False) -> Any:
     """Return the Warp function from a source to the intensity of `lanes` neighbouring pixels."""
     f = functions(lanes)
     Source, Lanes = SOURCES[source], f.Lanes
-    load, background, foreground = f.load, f.background, f.foreground
+    load, background, foreground = f.load_aligned if aligned else f.load, f.background, f.foreground
 
     if source in ("frames", "log"):
 
@@ -65,11 +65,11 @@ def light_of(lanes: int, source: str) -> Any:
 
 
 @lru_cache(maxsize=32)
-def _look(lanes: int, source: str) -> Any:
+def _look(lanes: int, source: str, *, aligned: bool = False) -> Any:
     """Return the Warp function from a source to the log intensity of `lanes` neighbouring pixels."""
     f = functions(lanes)
     Source, Lanes = SOURCES[source], f.Lanes
-    light, logarithm = light_of(lanes, source), f.logarithm
+    light, logarithm = light_of(lanes, source, aligned=aligned), f.logarithm
 
     @wp.func
     def look(seen: Source, ground: Ground, k: int, n: int, x: Lanes, y: Lanes, near: int, eps: float):
@@ -119,7 +119,7 @@ def block(lanes: int) -> SimpleNamespace:
 
 
 @lru_cache(maxsize=64)
-def count(lanes: int, source: str, *, shared: bool, states: bool) -> wp.Kernel:
+def count(lanes: int, source: str, *, shared: bool, states: bool, aligned: bool = False) -> wp.Kernel:
     """Return the counting kernel, over (B, blocks of `lanes` pixels) threads.
 
     It has no branches, so that several samples are on their way from memory at once. Both polarities are
@@ -131,10 +131,11 @@ def count(lanes: int, source: str, *, shared: bool, states: bool) -> wp.Kernel:
         source: One of `SOURCES`.
         shared: Whether ON and OFF have one threshold.
         states: Whether counts are integers and the last sample is kept, as sensors need it, or floats.
+        aligned: Whether stored samples are, see `aligned`.
     """
     f = functions(lanes)
     Source, Lanes = SOURCES[source], f.Lanes
-    look = _look(lanes, source)
+    look = _look(lanes, source, aligned=aligned)
     load, store, store_whole = f.load, f.store, f.store_whole
     minus, plus, plus_abs, advanced = f.minus, f.plus, f.plus_abs, f.advanced
     chosen, inverse, signed_events = f.chosen, f.inverse, f.signed_events
@@ -282,6 +283,12 @@ def widest(size: int, device: wp.Device, source: str) -> int:
     if device.is_cuda and source == "layers":
         lanes = 1
     return lanes if size >= lanes else 1
+
+
+def aligned(source: str, seen: Any, size: int) -> bool:
+    """Return whether stored samples of any block of 4 of `size` pixels begin at a multiple of 16 bytes."""
+    stored = source in ("frames", "log")
+    return stored and not (size % 4 or seen.values.ptr % 16 or seen.values.strides[0] % 16)
 
 
 def blocks(size: int, lanes: int) -> int:

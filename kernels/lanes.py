@@ -119,13 +119,13 @@ V result = x < -87.0f ? V(0.0f) : (FMA(p, square, f) + 1.0f) * power;
 """e to the x, 0 below e^-87, e^88 above it (Moshier: Cephes Mathematical Library, expf, 1992)."""
 
 SIGNED_EVENTS = """
-// a product with the inverse is wrong by one at most, which comparisons mend; a division is slow everywhere
-V size = ABS(change);
-V n = FLOOR(size * inverse);
-n = (n + 1.0f) * threshold <= size ? n + 1.0f : n;
-n = n * threshold > size ? n - 1.0f : n;
-V result = change >= 0.0f ? n : -n;
+// the sum with 1.5 2^23 has no digits behind the point, so that near is the whole number nearest to the
+// quotient, however the inverse rounds; where its product goes beyond the change, the one before is meant
+V near = FMA(change, inverse, V(12582912.0f)) - 12582912.0f;
+V step = change < 0.0f ? V(-1.0f) : V(1.0f);
+V result = ABS(near * threshold) > ABS(change) ? near - step : near;
 """
+"""Events of a change, below 2^21 of them: a division, and a floor on a GPU, are slow."""
 
 BACKGROUND = """
 // place times (x, y, 1), then reflected, as in dase.kernels.scene.background_at
@@ -211,6 +211,16 @@ for (int lane = 0; lane < {length}; ++lane) result[lane] = from[lane];
 return result;
 """
 
+LOAD_FOUR = """
+#ifdef __CUDA_ARCH__
+if ({length} == 4) {{
+    const float4 q = __ldg(reinterpret_cast<const float4*>(&wp::index(values, k, n)));
+    return *reinterpret_cast<const wp::vec_t<{length}, float>*>(&q);
+}}
+#endif
+"""
+"""Before `LOAD` where all addresses are multiples of 16: to ask keeps samples from overlapping."""
+
 STORE = """
 auto* to = values.data + n;
 #ifdef __CUDA_ARCH__
@@ -227,8 +237,7 @@ for (int lane = 0; lane < {length}; ++lane) to[lane] = lanes[lane];
 @wp.func
 def whole(size: float, threshold: float, inverse: float) -> float:
     """Return the greatest whole n with n threshold <= size, as `signed_events` does for all lanes."""
-    n = wp.floor(size * inverse)
-    n = wp.where((n + 1.0) * threshold <= size, n + 1.0, n)
+    n = (size * inverse + 12582912.0) - 12582912.0
     return wp.where(n * threshold > size, n - 1.0, n)
 
 
@@ -295,10 +304,12 @@ def functions(length: int) -> SimpleNamespace:
 
     layers = "texels: wp.array[wp.vec2], start: wp.array[int], size: wp.array[wp.vec2i], "
     layers += "place: wp.array2d[Affine], k: int, near: int"
+    rows = "values: wp.array2d[float], k: int, n: int"
     ground = "grey: wp.array[float], place: Affine, last: wp.vec2, corner: wp.vec2i, step: wp.vec2i"
     return SimpleNamespace(
         Lanes=scope["Lanes"],
-        load=plain("load", LOAD, "values: wp.array2d[float], k: int, n: int", "Lanes"),
+        load=plain("load", LOAD, rows, "Lanes"),
+        load_aligned=plain("load_aligned", LOAD_FOUR + LOAD, rows, "Lanes"),
         store=plain("store", STORE, "values: wp.array[float], n: int, lanes: Lanes", "None"),
         store_whole=plain("store_whole", STORE, "values: wp.array[int], n: int, lanes: Lanes", "None"),
         minus=lanewise("minus", "V result = a - b;", "a b"),

@@ -157,7 +157,8 @@ def bench_counts(scene: Stored, repeats: int, device: wp.Device) -> tuple[float,
     """Return seconds and events of the counting kernel that training uses, several pixels per thread."""
     samples, pixels = scene.data.values.shape
     lanes = counts.widest(pixels, device, "log")
-    kernel = counts.count(lanes, "log", shared=True, states=False)
+    aligned = counts.aligned("log", scene.data, pixels)
+    kernel = counts.count(lanes, "log", shared=True, states=False, aligned=aligned)
     out = wp.zeros((1, 1, 2, pixels), dtype=float, device=device)
     nothing = wp.empty((1, 0), dtype=float, device=device)
     arguments = [

@@ -66,6 +66,16 @@ def test_counts_equal_the_recursion_bit_for_bit(kind, equal, device, rng):
         np.testing.assert_array_equal(interval_counts(log, on, off, device, phase), want)
 
 
+@pytest.mark.parametrize("pixels", [300, 301, 302, 3])
+def test_rows_of_any_length_and_up_to_a_million_events_at_once(pixels, device, rng):
+    """A GPU asks for four pixels at once where the lengths of the rows allow."""
+    log = rng.uniform(-5000, 5000, (12, pixels)).astype(np.float32)
+    on, off = np.geomspace(0.011, 1, 2 * pixels).reshape(2, pixels).astype(np.float32)
+    want = reference.recursion(log, on, off, np.zeros(pixels, np.float32))
+    assert want.max() > 1e5
+    np.testing.assert_array_equal(interval_counts(log, on, off, device), want)
+
+
 def test_jump_gives_many_events_at_once(device):
     log = np.array([[0.0], [5.0], [-1.0]], np.float32)
     got = interval_counts(log, np.array([0.25]), np.array([0.5]), device)

@@ -54,3 +54,5 @@ def test_pixels_of_many_models(tmp_path):
 @pytest.mark.parametrize(("source", "lanes"), [("log", 4), ("frames", 4), ("background", 4), ("layers", 1)])
 def test_counting(source, lanes, tmp_path):
     compiles(counts.count(lanes, source, shared=False, states=True).module, tmp_path)
+    if source in ("log", "frames"):
+        compiles(counts.count(lanes, source, shared=False, states=True, aligned=True).module, tmp_path)
