@@ -171,6 +171,7 @@ def main() -> None:
     parser.add_argument("measured", type=Path)
     parser.add_argument("--out", type=Path, default=Path("docs"))
     options = parser.parse_args()
+    options.out.mkdir(parents=True, exist_ok=True)
     sensor = parse_sensor(SENSOR, "sensor")
     shot = Shot(rate=10.5, bright=0.0, balance=0.57)
     poisson = sensor.without("voltage_noise").with_effect(shot)
