@@ -7,7 +7,8 @@ import struct
 import h5py
 import numpy as np
 import pytest
-from reference_io import H, W, dsec, ecf, ecf_buffer, events, measured, mvsec, v2e, written
+from reference_ecf import ecf_buffer
+from reference_io import H, W, dsec, ecf, events, measured, mvsec, v2e, written
 
 from dase import io
 from dase.errors import InputError
