@@ -139,6 +139,7 @@ def recordings(folder: Path, picture: Path | None, out: Path | None) -> None:
     quiet = steady(frames)
     print(f"  steady: {np.mean(np.diff(quiet, axis=0) == 0):.2f} of all pixels rest from a frame to the next")
     if picture is not None:
+        picture.parent.mkdir(parents=True, exist_ok=True)
         trust.draw(scene, events, title="Newton's cradle before a DAVIS346", moments=3).savefig(picture)
     events, frames, begin, end = load(folder, "davis240c_camerashake")
     light = list(frames / np.float32(255))

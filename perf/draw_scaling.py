@@ -147,22 +147,32 @@ def slope_lines(found: Row) -> list[str]:
 
 
 def draw_curves(axis: Any, found: Row, name: str) -> None:
-    """Draw the curves of one axis, median and spread."""
-    rows = chosen(found["rows"], name)
+    """Draw the curves of one axis, median and spread, with their slopes at their ends."""
+    rows, ends = chosen(found["rows"], name), []
     for case, colour in palette(rows).items():
         curve = chosen(rows, name, case)
         x = [row["x"] for row in curve]
         y = np.array([[f(row["seconds"]) for f in (min, statistics.median, max)] for row in curve]) * 1e3
-        label = f"{case}: {slope(curve):.2f}" if len(curve) > 1 else case
-        axis.plot(x, y[:, 1], "o-", color=colour, markersize=4, linewidth=1.4, label=label)
-        axis.fill_between(x, y[:, 0], y[:, 2], color=colour, alpha=0.18, linewidth=0)
+        axis.plot(x, y[:, 1], "o-", color=colour, markersize=4, linewidth=1.6, label=case)
+        axis.fill_between(x, y[:, 0], y[:, 2], color=colour, alpha=0.16, linewidth=0)
+        ends.append((y[-1, 1], f"{slope(curve):.2f}", colour))
     guide(axis, rows, -1 if name == "threads" else 1)
     axis.set(xscale="log", yscale="log", xlabel=AXES[name], ylabel="time [ms]")
     if name == "threads":
         ticks = [row["x"] for row in rows if row["case"] == rows[0]["case"]]
         axis.set_xticks(ticks, [str(t) for t in ticks])
         axis.minorticks_off()
-    axis.legend(fontsize=6.5, frameon=False, title="slope of the upper half", title_fontsize=6.5)
+    write_slopes(axis, ends)
+
+
+def write_slopes(axis: Any, ends: list[tuple[float, str, str]]) -> None:
+    """Write a number right of the end of each curve, none over another."""
+    axis.set_ylim(axis.get_ylim())
+    least = -1.0
+    for y, text, colour in sorted(ends):
+        level = axis.transAxes.inverted().transform(axis.transData.transform((axis.get_xlim()[1], y)))[1]
+        least = max(level, least + 0.065)
+        axis.text(1.01, least, text, transform=axis.transAxes, color=colour, fontsize=9, va="center")
 
 
 def palette(rows: list[Row]) -> dict[str, str]:
@@ -200,18 +210,18 @@ def draw_effects(axis: Any, found: Row) -> None:
     )  # fmt: skip
     sums = per * (base + np.cumsum([max(middle(r) - base, 0) for r in alone]))
     axis.plot(sums, place, ":", color="0.4", linewidth=1, label="their sum")
-    axis.set_yticks(place, names, fontsize=7)
-    axis.invert_yaxis()
+    axis.set_yticks(place, names, fontsize=9)
+    axis.set_ylim(len(names) - 0.4, -2.6)  # the first is at the top, below what the legend takes
     axis.set(xlabel="ns per sample")
-    axis.legend(fontsize=6.5, frameon=False)
+    axis.legend(fontsize=9, frameon=False, loc="upper right", borderaxespad=0.1)
 
 
 def draw(every: list[Row], path: Path) -> None:
     """Draw the panels of each device."""
-    figure = plt.figure(figsize=(12, 6.8 * len(every)), layout="constrained")
+    figure = plt.figure(figsize=(13, 7.2 * len(every)), layout="constrained")
     parts = figure.subfigures(len(every), 1, squeeze=False, hspace=0.04)[:, 0]
     for part, found in zip(parts, every, strict=True):
-        part.suptitle(f"{found['device']}, commit {found['commit']}", fontsize=11)
+        part.suptitle(f"{found['device']}, commit {found['commit']}", fontsize=13, weight="bold")
         names = [name for name in AXES if chosen(found["rows"], name)]
         grid = part.add_gridspec(2, 3)
         # without threads the curve over samples takes the place of two
@@ -225,7 +235,13 @@ def draw(every: list[Row], path: Path) -> None:
         for axis in panels:
             axis.spines[["top", "right"]].set_visible(False)
             axis.grid(alpha=0.25, linewidth=0.5)
-    figure.savefig(path, dpi=110)
+        # colours mean the same in every panel; at the ends of the curves stand their slopes
+        lines, cases = panels[0].get_legend_handles_labels()
+        part.legend(
+            lines, cases, ncols=len(cases), loc="outside lower center", fontsize=9.5, frameon=False,
+            title="At the right of a curve: slope of its upper half", title_fontsize=9.5,
+        )  # fmt: skip
+    figure.savefig(path, dpi=130)
     plt.close(figure)
 
 

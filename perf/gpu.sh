@@ -23,7 +23,7 @@ run() { # NAME COMMAND...
 
 for step in "${steps[@]}"; do
     case $step in
-    tests) run tests "$python" -m pytest -q -p no:cacheprovider --device cuda:0 tests/test_{pixel,lanes,effects,effects_more,pairs,readout,labels,counts,scene,autograd_scene,patches,probes,optics,camera,static}.py ;;
+    tests) run tests "$python" -m pytest -q -p no:cacheprovider --device cuda:0 tests/test_{pixel,pixel_invariants,lanes,effects,effects_more,effects_voltage,effects_noise,pairs,readout,readout_stages,labels,counts,scene,autograd_scene,autograd_scene_differences,patches,probes,optics,camera,static}.py ;;
     kernels)
         run kernels_4k "$python" perf/bench_kernels.py --device cuda --size 3840x2160
         run kernels_vga "$python" perf/bench_kernels.py --device cuda --size 640x480 ;;

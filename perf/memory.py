@@ -122,6 +122,7 @@ def main() -> None:
     print(f"{speed:.1f} Mpx-samples/s, {last['events']:,} events in {last['took']:.0f} s")
     print(f"peak {peak / 2**20:.0f} MiB, slope {slope / 2**20:+.3f} MiB per simulated second")
     if options.json:
+        options.json.parent.mkdir(parents=True, exist_ok=True)
         found = dict(size=options.size, samples=samples, effects=len(sensor.effects), commit=commit())
         found |= dict(peak=peak, slope=slope, rows=rows)
         options.json.write_text(json.dumps(found, indent=1) + "\n")

@@ -17,6 +17,7 @@ import matplotlib
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 import numpy as np
+from matplotlib.ticker import NullFormatter
 
 import dase
 from dase.config import parse_sensor
@@ -105,7 +106,7 @@ def summary(intervals: np.ndarray) -> dict[str, float]:
 
 def draw(columns: dict[str, dict[str, np.ndarray]], path: Path) -> None:
     """Draw the deciles over pixels of the rates."""
-    figure, axes = plt.subplots(1, 3, figsize=(10, 3.2), sharey=True, layout="constrained")
+    figure, axes = plt.subplots(1, 3, figsize=(10, 3.5), sharey=True, layout="constrained")
     share = np.linspace(0.05, 0.95, 19)
     for axis, level in zip(axes, LEVELS, strict=True):
         for (name, data), style in zip(columns.items(), ("o", "-", ":"), strict=False):
@@ -113,10 +114,18 @@ def draw(columns: dict[str, dict[str, np.ndarray]], path: Path) -> None:
                 rate = np.maximum(np.quantile(rates(data[level])[polarity], share), 0.01)
                 label = f"{'ON' if polarity else 'OFF'}, {name}"
                 axis.plot(rate, share, style, color=colour, label=label, markersize=3)
-        axis.set(title=f"{LEVELS[level][0]:g} lux", xscale="log", xlabel="rate of a pixel [Hz]; 0.01: none")
+        axis.set(title=f"{LEVELS[level][0]:g} lux", xscale="log", xlabel="rate of a pixel [Hz]")
+        decades = [n * 10.0**k for k in range(-2, 2) for n in ((1, 2, 5) if level == "0.1lux" else (1,))]
+        low, high = axis.get_xlim()
+        ticks = [tick for tick in decades if low <= tick <= high]
+        axis.set_xticks(ticks, ["none" if tick == 0.01 else f"{tick:g}" for tick in ticks])
+        axis.xaxis.set_minor_formatter(NullFormatter())
+        axis.spines[["top", "right"]].set_visible(False)
+        axis.grid(alpha=0.25, linewidth=0.5)
     axes[0].set_ylabel("share of pixels below")
-    axes[0].legend(fontsize=7)
-    figure.savefig(path, dpi=110)
+    lines, labels = axes[0].get_legend_handles_labels()
+    figure.legend(lines, labels, ncols=6, loc="outside lower center", fontsize=9, frameon=False)
+    figure.savefig(path, dpi=130)
     plt.close(figure)
 
 
@@ -171,6 +180,7 @@ def main() -> None:
     parser.add_argument("measured", type=Path)
     parser.add_argument("--out", type=Path, default=Path("docs"))
     options = parser.parse_args()
+    options.out.mkdir(parents=True, exist_ok=True)
     sensor = parse_sensor(SENSOR, "sensor")
     shot = Shot(rate=10.5, bright=0.0, balance=0.57)
     poisson = sensor.without("voltage_noise").with_effect(shot)

@@ -191,6 +191,7 @@ def main() -> None:
                 lines.append(row(task, setting, threads, runs, samples * height * width))
                 print(shown(lines[-1]), flush=True)
     if options.json:
+        options.json.parent.mkdir(parents=True, exist_ok=True)
         options.json.write_text(json.dumps({"about": about, "rows": lines}, indent=1) + "\n")
 
 

@@ -287,7 +287,8 @@ def main() -> None:
     parser.add_argument("--again", action="store_true", help="diagnose what was diagnosed before, too")
     parser.add_argument("--report", action="store_true", help="only write the page")
     options = parser.parse_args()
-    options.log.mkdir(parents=True, exist_ok=True)
+    for folder in (options.log, options.out):
+        folder.mkdir(parents=True, exist_ok=True)
     for name in options.only.split(","):
         path = options.folder / f"{name}.npz"
         done = (options.log / f"{name}.json").exists() and not options.again

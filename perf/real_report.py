@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -131,33 +131,50 @@ def _estimates(found: dict[str, Any]) -> str:
 OPEN = {"davis346_cuke_cradle", "dvx_noise_static"}
 """Recordings of which a picture may be published here: MIT, Apache-2.0."""
 
+CLOSED_IN_A_ROW = 2
+"""Staircases of the others, side by side."""
+
 
 def draw(cameras: Mapping[str, Any], found: Mapping[str, Any], path: Path) -> None:
-    """Draw for each recording: measured events, the model's, and the staircase of the error."""
-    rows = len(found)
-    figure, axes = plt.subplots(
-        rows, 3, figsize=(11.5, 2.55 * rows), width_ratios=[1, 1, 1.35], layout="constrained", squeeze=False
-    )
-    figure.get_layout_engine().set(hspace=0.09, wspace=0.03)
-    for line, (name, (what, facts)) in zip(axes, found.items(), strict=True):
-        grey = facts["grey"]
-        top = max(float(np.percentile(grey, 99.5)), 1e-6)
-        calm = np.rint(255 * np.clip(grey / top, 0, 1)).astype(np.uint8) if np.ptp(grey) > 0 else None
-        for axis, kind in zip(line[:2], ("measured", "simulated"), strict=True):
-            axis.set_xticks([])
-            axis.set_yticks([])
-            axis.spines[:].set_visible(False)
-            if name in OPEN:
-                axis.imshow(_large(overlay(calm, facts[kind])), interpolation="nearest")
-                title = f"{kind}, {1e3 * cameras[name].window:g} ms"
-                axis.set_title(title, fontsize=8.5, color=QUIET, pad=4)
-            elif kind == "measured":
-                text = "not shown: the recording has no licence for it"
-                axis.text(0, 0.9, text, fontsize=8.5, color=QUIET, transform=axis.transAxes)
-        line[0].set_title(f"{name}\n", fontsize=10.5, color=INK, weight="bold", loc="left", pad=2)
-        staircase(line[2], what)
+    """Draw measured events, the model's and the staircase of the error; of closed recordings that alone."""
+    shown = {name: both for name, both in found.items() if name in OPEN}
+    others = {name: both for name, both in found.items() if name not in OPEN}
+    heights = [n for n in (len(shown), -(-len(others) // CLOSED_IN_A_ROW)) if n]
+    figure = plt.figure(figsize=(11.5, 2.75 * sum(heights)), layout="constrained")
+    figure.get_layout_engine().set(hspace=0.08, wspace=0.03)
+    parts = list(figure.subfigures(len(heights), 1, squeeze=False, height_ratios=heights)[:, 0])
+    if shown:
+        lines = parts.pop(0).subplots(len(shown), 3, width_ratios=[1, 1, 1.35], squeeze=False)
+        for line, (name, (what, facts)) in zip(lines, shown.items(), strict=True):
+            draw_pictures(line[:2], facts, cameras[name].window)
+            _name(line[0], name)
+            staircase(line[2], what)
+    if others:
+        axes = parts.pop(0).subplots(heights[-1], CLOSED_IN_A_ROW, squeeze=False).ravel()
+        for axis, (name, (what, _)) in zip(axes, others.items(), strict=False):
+            staircase(axis, what)
+            _name(axis, name)
+        for axis in axes[len(others) :]:
+            axis.set_axis_off()
     figure.savefig(path, dpi=110, facecolor="white")
     plt.close(figure)
+
+
+def draw_pictures(axes: Sequence[Axes], facts: Mapping[str, Any], window: float) -> None:
+    """Draw events of a window [s], measured and simulated, over the scene's light where it is known."""
+    grey = facts["grey"]
+    top = max(float(np.percentile(grey, 99.5)), 1e-6)
+    calm = np.rint(255 * np.clip(grey / top, 0, 1)).astype(np.uint8) if np.ptp(grey) > 0 else None
+    for axis, kind in zip(axes, ("measured", "simulated"), strict=True):
+        axis.set_xticks([])
+        axis.set_yticks([])
+        axis.spines[:].set(color=QUIET, linewidth=0.5)
+        axis.imshow(_large(overlay(calm, facts[kind])), interpolation="nearest")
+        axis.set_title(f"{kind}, {1e3 * window:g} ms", fontsize=8.5, color=QUIET, pad=4)
+
+
+def _name(axis: Axes, name: str) -> None:
+    axis.set_title(f"{name}\n", fontsize=10.5, color=INK, weight="bold", loc="left", pad=2)
 
 
 def _large(picture: np.ndarray) -> np.ndarray:
@@ -211,7 +228,8 @@ error is that of pixels and times that no fit has seen; 1 is what two repeats of
 
 Left: measured. Middle: what the announced model makes of the same scene at the same time; thresholds alone
 where the error stays unexplained. Right: the error with each effect added; the green band is what chance
-reaches, dashed steps are stand-ins that do not reach it and are not announced. Red is ON, blue is OFF.
+reaches, dashed steps are stand-ins that do not reach it and are not announced. Red is ON, blue is OFF. Of
+recordings that have no licence for it no events are shown, only the error.
 
 The scene between two frames of a camera is a guess. Only where it can be trusted anything is compared (see
 [scenes](scenes.md)), and where that is not enough, an error stays that is the scene's and not the sensor's:

@@ -315,6 +315,7 @@ def main() -> None:
     parser.add_argument("--parts", default=",".join(PARTS), help="of what; the rest stays as it was measured")
     parser.add_argument("--draw", action="store_true", help="draw what was measured before")
     options = parser.parse_args()
+    options.out.mkdir(parents=True, exist_ok=True)
     if not options.draw:
         measure(launch.device(options.device), options.parts.split(","), options.rounds, options.out)
     draw_scaling.write(options.out)

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import os
 import struct
+import time
 
 import h5py
 import numpy as np
 import pytest
-from reference_io import H, W, dsec, ecf, ecf_buffer, events, measured, mvsec, v2e, written
+from reference_ecf import ecf_buffer
+from reference_io import H, W, dsec, ecf, events, measured, mvsec, v2e, written
 
 from dase import io
 from dase.errors import InputError
@@ -160,6 +163,32 @@ def test_a_heap_of_names_whose_holes_go_round_is_no_endless_loop(tmp_path, rng, 
     for act in (io.read, lambda path: list(io.stream(path))):
         with pytest.raises(InputError, match="heap of names is damaged"):
             act(path)
+
+
+def test_heaps_are_checked_once_until_the_file_changes(tmp_path, rng, monkeypatch):
+    path, searched = tmp_path / "a.h5", []
+    written("HDF5")(path, events(rng, 50))
+    heaps = columns._heaps
+    monkeypatch.setattr(columns, "_heaps", lambda file: searched.append(file.name) or heaps(file))
+    io.read(path)
+    assert len(searched) > 1  # just written: its time may stay when it changes
+    searched.clear()
+    with monkeypatch.context() as later:
+        now = time.time_ns
+        later.setattr(time, "time_ns", lambda: now() + 2 * columns.SETTLED)
+        for _ in range(3):
+            io.read(path)
+    assert len(searched) == 1
+    io.read(path)
+    assert len(searched) == 1
+    content, state = bytearray(path.read_bytes()), path.stat()
+    heap = content.index(columns.NAMES)
+    hole, data = (int.from_bytes(content[heap + n : heap + n + 8], "little") for n in (16, 24))
+    content[data + hole : data + hole + 8] = hole.to_bytes(8, "little")
+    path.write_bytes(content)
+    os.utime(path, ns=(state.st_atime_ns, state.st_mtime_ns))  # the same length at the same time
+    with pytest.raises(InputError, match="heap of names is damaged"):
+        io.read(path)
 
 
 def test_names_in_a_file_cannot_break_the_sentence(tmp_path):

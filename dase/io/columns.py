@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, nullcontext, suppress
 from pathlib import Path
@@ -38,9 +39,15 @@ TELLING = (
 )
 """Datasets that tell layouts apart; what `has` can be asked for."""
 
+SETTLED = 2_000_000_000
+"""Age [ns] of a change from which on the next one has another time, however coarse the clock of the disk."""
+
+MOST_SOUND = 1000
+"""Files that are remembered."""
+
 _asked: tuple[bytes, frozenset[str]] = b"", frozenset()  # first bytes of a file, and which of these it holds
 _plugin_tried = False
-_sound: set[tuple[str, int, int]] = set()  # large files whose heaps were checked
+_sound: dict[Path, tuple[int, ...]] = {}  # files whose heaps were checked, and their state then
 
 
 @contextmanager
@@ -88,15 +95,20 @@ def check_heaps(path: Path) -> None:
     That of the names in a group is "HEAP", four zeros, u64 size of its data, place in them of the first hole,
     address of the data; a hole is u64 place of the next one, 1 for none, and u64 length.
     """
-    state = path.stat()
-    key = (str(path.resolve()), state.st_mtime_ns, state.st_size)
-    if key in _sound:
+    place, found = path.resolve(), path.stat()
+    # the second time is that of any change on Unix, so that setting the first one back hides none
+    state = found.st_ino, found.st_size, found.st_mtime_ns, found.st_ctime_ns
+    if _sound.get(place) == state:
         return
+    now = time.time_ns()
     with path.open("rb") as file:
         for kind, begin in _heaps(file):
-            (_check_heap if kind == HEAP else _check_names)(file, begin, state.st_size)
-    if state.st_size > BLOCK:  # a small one is looked at again sooner than its time tells that it changed
-        _sound.add(key)
+            (_check_heap if kind == HEAP else _check_names)(file, begin, found.st_size)
+    # a small one may change once more before the clock of its times goes on
+    if found.st_size > BLOCK or max(state[2:]) < now - SETTLED:
+        if len(_sound) >= MOST_SOUND:
+            _sound.clear()
+        _sound[place] = state
 
 
 def _heaps(file: BinaryIO) -> Iterator[tuple[bytes, int]]:
