@@ -8,9 +8,8 @@ from functools import lru_cache
 from typing import Any
 
 import torch
-from torch.nn import functional as F
 
-from dase.kernels import autograd_training as bridge
+from dase.kernels import autograd_critics as bridge
 from dase.networks import SLOPE
 
 
@@ -41,15 +40,13 @@ class Sorted:
 
     Args:
         order: Which row comes where, int64 (R,).
-        classes: Critic of each row in that order, int64 (R,); the number of critics for rows of none.
+        of: Critic of each row in that order, int32 (R,); the number of critics for rows of none.
         end: Where the rows of each critic end, int32 (C,).
-        number: How many each has, int64 (C,).
     """
 
     order: torch.Tensor
-    classes: torch.Tensor
+    of: torch.Tensor
     end: torch.Tensor
-    number: torch.Tensor
 
     @classmethod
     def by(cls, classes: torch.Tensor, critics: int) -> Sorted:
@@ -58,7 +55,7 @@ class Sorted:
         keys = classes.short() if critics < 2**15 else classes
         ordered, order = torch.sort(keys, stable=True)
         number = classes.new_zeros(critics + 1).index_add_(0, classes, torch.ones_like(classes))
-        return cls(order, ordered.long(), number[:-1].cumsum(0).int(), number[:-1])
+        return cls(order, ordered.int(), number[:-1].cumsum(0).int())
 
 
 @dataclass
@@ -76,11 +73,19 @@ class Critique:
 
 @dataclass
 class Activations:
-    """What the critics make of rows: sums of both layers, scores, and slopes of the scores by the sums."""
+    """What the critics make of rows.
+
+    Args:
+        first: Sums of the first layer, float32 (R, wide).
+        hidden: What goes on from it, in the type of the products.
+        second: Sums of the second layer, float32 (R, narrow).
+        by_first: Derivative of the scores by the sums of the first layer.
+        by_second: That by those of the second.
+    """
 
     first: torch.Tensor
+    hidden: torch.Tensor
     second: torch.Tensor
-    score: torch.Tensor
     by_first: torch.Tensor
     by_second: torch.Tensor
 
@@ -154,23 +159,30 @@ class CriticBank:
         out: torch.Tensor = self.copies[name] if self.working == torch.bfloat16 else getattr(self, name)
         return out
 
-    def _forward(self, rows: torch.Tensor, by: Sorted) -> Activations:
-        """Return what critics make of sorted rows (R, inputs); rows of no critic get anything finite."""
-        # rows of no critic borrow the last one's biases
-        classes = by.classes.clamp_max(self.shape.classes - 1)
-        first = grouped(rows, self._layer("w1").transpose(1, 2), by.end) + self.b1[classes]
-        hidden = F.leaky_relu(first, SLOPE).to(self.working)
-        second = grouped(hidden, self._layer("w2").transpose(1, 2), by.end) + self.b2[classes]
-        last = self.w3[classes]
-        score = (F.leaky_relu(second, SLOPE) * last).sum(1) + self.b3[classes, 0]
-        by_second = last * _slope(second)
-        by_first = grouped(by_second.to(self.working), self._layer("w2"), by.end) * _slope(first)
-        return Activations(first, second, score, by_first, by_second)
+    def _forward(self, rows: torch.Tensor, of: torch.Tensor, end: torch.Tensor) -> Activations:
+        """Return what critics make of rows (R, inputs).
+
+        Args:
+            rows: Critic by critic.
+            of: The critic of each, int32 (R,), the number of critics for none.
+            end: Where the rows of each critic end, int32 (C,).
+        """
+        w2 = self._layer("w2")
+        product = grouped(rows, self._layer("w1").transpose(1, 2), end)
+        first, hidden = bridge.first_layer(product, of, self.b1, slope=SLOPE)
+        product = grouped(hidden, w2.transpose(1, 2), end)
+        second, by_second, back = bridge.second_layer(product, of, self.b2, self.w3, slope=SLOPE)
+        product = grouped(back, w2, end)
+        by_first = bridge.way_back(product, of, first, critics=self.shape.classes, slope=SLOPE)
+        return Activations(first, hidden, second, by_first, by_second)
+
+    def _scores(self, at: Activations, of: torch.Tensor) -> torch.Tensor:
+        return bridge.score(at.second, of, self.w3, self.b3, slope=SLOPE)
 
     def scores(self, patches: torch.Tensor, classes: torch.Tensor) -> torch.Tensor:
         """Return the score of each patch (N, inputs) by the critic of its class (N,)."""
         by = Sorted.by(classes, self.shape.classes)
-        score = self._forward(patches.to(self.working)[by.order], by).score
+        score = self._scores(self._forward(patches.to(self.working)[by.order], by.of, by.end), by.of)
         return torch.empty_like(score).index_copy_(0, by.order, score)
 
     @torch.no_grad()
@@ -184,11 +196,14 @@ class CriticBank:
             classes: Theirs, int64 (N,); the number of critics for patches of none, whose gradient is 0.
             gain: Of every class, shape (C,).
         """
+        gains = torch.cat([gain, gain.new_zeros(1)])
+        # a class without gain is none: its critic's weights need not be read
+        classes = torch.where(gains[classes] != 0, classes, self.shape.classes)
         by = Sorted.by(classes, self.shape.classes)
-        at = self._forward(patches.to(self.working)[by.order], by)
-        gains = torch.cat([gain, gain.new_zeros(1)])[by.classes]
+        at = self._forward(patches.to(self.working)[by.order], by.of, by.end)
+        gains = gains[by.of.long()]
         slopes = grouped((at.by_first * gains[:, None]).to(self.working), self._layer("w1"), by.end)
-        slopes = torch.where((by.classes < self.shape.classes)[:, None], slopes, 0.0)
+        slopes = torch.where((by.of < self.shape.classes)[:, None], slopes.float(), 0.0)
         return torch.empty_like(slopes).index_copy_(0, by.order, slopes)
 
     @torch.no_grad()
@@ -222,18 +237,15 @@ class CriticBank:
         share = torch.rand(len(fake), 1, device=self.device, generator=generator)
         batch = _Batch(self, fake, fake_classes, real, real_classes, weights, share)
         critique = batch.differentiate(penalty)
-        self.steps += batch.active
-        correction = 1 / (1 - self.decay ** self.steps.clamp_min(1))
-        rates = torch.where(batch.active, rate, 0.0)
+        speed = rate if isinstance(rate, torch.Tensor) else torch.full((1,), rate, device=self.device)
+        paces = bridge.pace(batch.layout, speed, self.steps, decay=self.decay)
         for name, (left, right) in batch.outer.items():
             bridge.move_critics(
-                getattr(self, name), self.square[name], self.copies[name], left, right, batch.by.end,
-                rates, correction, decay=self.decay,
+                getattr(self, name), self.square[name], self.copies[name], left, right, batch.layout.end[0],
+                *paces, decay=self.decay,
             )  # fmt: skip
         for name, gradient in batch.sums.items():
-            bridge.move_sums(
-                getattr(self, name), self.square[name], gradient, rates, correction, decay=self.decay
-            )
+            bridge.move_sums(getattr(self, name), self.square[name], gradient, *paces, decay=self.decay)
         return critique
 
     def one_launch(self) -> bool:
@@ -254,8 +266,8 @@ class _Batch:
     """The rows of one step, and the gradients of the loss.
 
     Attributes:
-        active: Which critics have patches of both domains, bool (C,).
-        by: Order of all rows: fake, real, and half way between.
+        layout: Where the rows of each critic lie: fake, real, and half way between.
+        rows: They, (R, inputs).
         outer: Layer to the left and right rows of its gradient.
         sums: Gradients of all other weights.
     """
@@ -270,85 +282,36 @@ class _Batch:
         weights: torch.Tensor,
         share: torch.Tensor,
     ):
-        self.bank, critics = bank, bank.shape.classes
-        fakes, reals = Sorted.by(fake_classes, critics), Sorted.by(real_classes, critics)
-        # the i-th fake patch of a class is paired with its i-th real one
-        rank = torch.arange(len(fake), device=bank.device)
-        first_fake, first_real = (_padded(s.end - s.number) for s in (fakes, reals))
-        rank = torch.empty_like(rank).index_copy_(0, fakes.order, rank - first_fake[fakes.classes])
-        paired = rank < _padded(reals.number)[fake_classes]
-        partner = reals.order[(first_real[fake_classes] + rank).clamp_max(len(real) - 1)]
-        fake, real = fake.to(bank.working), real.to(bank.working)
-        between = torch.lerp(real[partner], fake, share.to(bank.working))
-        between_classes = torch.where(paired, fake_classes, critics)
-        classes = torch.cat([fake_classes, real_classes, between_classes])
-        self.by = Sorted.by(classes, critics)
-        self.rows = torch.cat([fake, real, between])[self.by.order]
-        # the rows half way, in the order of their critics, and where they lie among all
-        self.between = Sorted.by(between_classes, critics)
-        inverse = torch.empty_like(self.by.order).index_copy_(
-            0, self.by.order, torch.arange(len(classes), device=bank.device)
-        )
-        self.place = inverse[len(fake) + len(real) + self.between.order]
-        self.active = (fakes.number > 0) & (reals.number > 0)
-        sides = ((fakes.number, 1), (reals.number, -1), (self.between.number, 0))
-        gains = [
-            sign * _padded(torch.where(self.active, weights / number.clamp_min(1), 0.0))
-            for number, sign in sides
-        ]
-        every = torch.cat([gains[0][fake_classes], gains[1][real_classes], gains[2][between_classes]])
-        self.gain = every[self.by.order]
-        held = torch.where(self.active, weights / self.between.number.clamp_min(1), 0.0)
-        self.held = _padded(held)[self.between.classes]
+        self.bank, self.layout = bank, bridge.lay_out(fake_classes, real_classes, weights)
+        self.rows = bridge.gather(fake, real, share, self.layout, bank.working)
 
     def differentiate(self, penalty: float) -> Critique:
         """Set `outer` and `sums`."""
-        bank, by, place = self.bank, self.by, self.place
-        at = bank._forward(self.rows, by)
-        known = (by.classes < bank.shape.classes)[:, None]
-        score = torch.where(known[:, 0], at.score, 0.0)
-        distance = -(self.gain * score).sum()
-        plain = torch.where(known, self.gain[:, None], 0.0)
-        left_first = torch.where(known, at.by_first, 0.0) * plain
-        left_second = torch.where(known, at.by_second, 0.0) * plain
-        by_bias, by_bias2 = left_first.clone(), left_second.clone()
+        bank, layout, working = self.bank, self.layout, self.bank.working
+        w1, w2 = bank._layer("w1"), bank._layer("w2")
+        at = bank._forward(self.rows, layout.of, layout.end[0])
+        distance = -(layout.gain * bank._scores(at, layout.of)).sum()
+        left_first, left_second, last = bridge.weigh(
+            at.second, at.by_first, at.by_second, layout, slope=SLOPE
+        )
         # the penalty: g = slope of the first layer times its weights, loss = held |g|²
-        inside = (self.between.classes < bank.shape.classes)[:, None]
-        first = torch.where(inside, at.by_first[place], 0.0)
-        second = torch.where(inside, at.by_second[place], 0.0)
-        g = grouped(first.to(bank.working), bank._layer("w1"), self.between.end)
-        g = torch.where(inside, g, 0.0)
-        by_g = ((2 * penalty) * self.held[:, None] * g).to(bank.working)
-        slope_first, slope_second = (_slope(sums[place]) for sums in (at.first, at.second))
-        ends = self.between.end
-        by_first = grouped(by_g, bank._layer("w1").transpose(1, 2), ends) * slope_first
-        by_first = torch.where(inside, by_first, 0.0)
-        by_second = grouped(by_first.to(bank.working), bank._layer("w2").transpose(1, 2), ends) * slope_second
-        by_second = torch.where(inside, by_second, 0.0)
-        hidden = torch.where(known, F.leaky_relu(at.first, SLOPE), 0.0).to(bank.working)
-        last = torch.where(known, F.leaky_relu(at.second, SLOPE), 0.0) * plain
-        self.rows[place], left_first[place] = by_g, first
-        hidden[place], left_second[place] = by_first.to(bank.working), second
-        last[place] = by_second
-        self.outer = {"w1": (left_first, self.rows), "w2": (left_second, hidden)}
-        parts = {"b1": by_bias, "b2": by_bias2, "w3": last, "b3": plain}
-        self.sums = {name: self._per_critic(value) for name, value in parts.items()}
-        return Critique(distance, (self.held * g.square().sum(1)).sum())
-
-    def _per_critic(self, rows: torch.Tensor) -> torch.Tensor:
-        """Return the sums of rows over each critic's, (C, ...)."""
-        out = rows.new_zeros(self.bank.shape.classes + 1, rows.shape[1])
-        return out.index_add_(0, self.by.classes, rows)[:-1]
-
-
-def _padded(values: torch.Tensor) -> torch.Tensor:
-    """Add a zero for rows of no critic."""
-    return torch.cat([values, values.new_zeros(1)])
-
-
-def _slope(sums: torch.Tensor) -> torch.Tensor:
-    """Return the slope of the leaky rectifier."""
-    return torch.where(sums > 0, 1.0, SLOPE)
+        ends = layout.end[1]
+        g = grouped(bridge.half_way(at.by_first, layout, working), w1, ends)
+        by_g = bridge.penalise(g, layout, self.rows, penalty=penalty)
+        length = torch.linalg.vector_norm(g, dim=1, dtype=torch.float32)
+        lies = torch.where(layout.place >= 0, layout.held * length.square(), 0.0).sum()
+        product = grouped(by_g, w1.transpose(1, 2), ends)
+        by_first = bridge.again_first(product, at.first, layout, at.hidden, slope=SLOPE)
+        product = grouped(by_first, w2.transpose(1, 2), ends)
+        bridge.again_second(product, at.second, layout, last, slope=SLOPE)
+        self.outer = {"w1": (left_first, self.rows), "w2": (left_second, at.hidden)}
+        self.sums = {
+            "b1": bridge.sum_rows(left_first, layout, between=False),
+            "b2": bridge.sum_rows(left_second, layout, between=False),
+            "w3": bridge.sum_rows(last, layout, between=True),
+            "b3": bridge.sum_rows(layout.gain[:, None], layout, between=False),
+        }
+        return Critique(distance, lies)
 
 
 def grouped(rows: torch.Tensor, weights: torch.Tensor, end: torch.Tensor) -> torch.Tensor:
@@ -360,17 +323,17 @@ def grouped(rows: torch.Tensor, weights: torch.Tensor, end: torch.Tensor) -> tor
         end: Where groups end, int32 (C,).
 
     Returns:
-        Shape (R, N) float32; anything in rows behind the last group.
+        Shape (R, N) in the type of the rows; anything in rows behind the last group.
     """
     if rows.is_cuda and _has_grouped_products(rows.device):
-        return torch._grouped_mm(rows, weights, offs=end).float()
+        return torch._grouped_mm(rows, weights, offs=end)
     out = rows.new_zeros(len(rows), weights.shape[2])
     begin = 0
     for critic, stop in enumerate(end.tolist()):
         if stop > begin:
             torch.mm(rows[begin:stop], weights[critic], out=out[begin:stop])
         begin = stop
-    return out.float()
+    return out
 
 
 @lru_cache

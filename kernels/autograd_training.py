@@ -8,7 +8,6 @@ import numpy as np
 import torch
 import warp as wp
 
-from dase.kernels import bank as _bank
 from dase.kernels import patches as _patches
 from dase.kernels import scenery as _scenery
 from dase.kernels.autograd import _launch
@@ -95,50 +94,3 @@ def patch_contrast(counts: torch.Tensor, *, size: int, stride: int) -> torch.Ten
 def _grid(maps: torch.Tensor, size: int, stride: int) -> tuple[int, int, int]:
     rows, columns = ((side - size) // stride + 1 for side in maps.shape[-2:])
     return maps.shape[0], columns, rows * columns
-
-
-def move_critics(
-    weight: torch.Tensor,
-    square: torch.Tensor,
-    copy: torch.Tensor,
-    left: torch.Tensor,
-    right: torch.Tensor,
-    end: torch.Tensor,
-    rate: torch.Tensor,
-    correction: torch.Tensor,
-    *,
-    decay: float,
-    tiny: float = 1e-8,
-) -> None:
-    """Move weights by Adam without momentum along the sum of outer products of `left` and `right` rows.
-
-    Args:
-        weight: Changed in place, float32 (C, J, K); J and K are multiples of 4.
-        square: Running mean of squared gradients, changed in place, shaped alike.
-        copy: Set to the weights in bfloat16, (C, J, K).
-        left: float32 (R, J), the rows of critic 0 first.
-        right: bfloat16 or float32 (R, K), in the same order.
-        end: Where the rows of each critic end, int32 (C,).
-        rate: Learning rate of each critic, float32 (C,); those at 0 are not touched.
-        correction: 1 / (1 - decay^steps) of each critic, float32 (C,).
-        decay: Of the running mean.
-        tiny: Added to the root of the mean square.
-    """
-    half = right.dtype == torch.bfloat16
-    inputs = [left, right.view(torch.int32), end, rate, correction, decay, tiny]
-    tiles = weight.view(weight.shape[0], -1, _bank.TILE**2)[..., 0]
-    _launch(_bank.adam[half], inputs, [weight, square, copy.view(torch.int32)], over=tiles)
-
-
-def move_sums(
-    weight: torch.Tensor,
-    square: torch.Tensor,
-    gradient: torch.Tensor,
-    rate: torch.Tensor,
-    correction: torch.Tensor,
-    *,
-    decay: float,
-    tiny: float = 1e-8,
-) -> None:
-    """Move weights by Adam without momentum along a gradient, all float32 (C, J); see `move_critics`."""
-    _launch(_bank.adam_of, [gradient, rate, correction, decay, tiny], [weight, square], over=gradient)

@@ -28,7 +28,7 @@ import torch
 
 from dase import images
 from dase.critics import BankShape, CriticBank, _Batch, _has_grouped_products
-from dase.kernels import autograd_training as bridge
+from dase.kernels import autograd_critics as bridge
 from dase.networks import NetworkShape
 from dase.objectives import Adversarial, Hash, critic_maps, cut_patches
 from dase.replay import Replay
@@ -170,7 +170,7 @@ def _critics(training: Training, clock: Clock) -> dict[str, float]:
         return _Batch(bank, patches, ours, others, theirs, weights, share)
 
     batch = sort()
-    rows = batch.rows.clone()
+    rows, layout = batch.rows.clone(), batch.layout
 
     def differentiate() -> None:
         batch.rows.copy_(rows)
@@ -178,7 +178,7 @@ def _critics(training: Training, clock: Clock) -> dict[str, float]:
 
     parts = {
         "bank: sort and gather": clock.recorded(sort),
-        "bank: forward": clock.recorded(lambda: bank._forward(rows, batch.by)),
+        "bank: forward": clock.recorded(lambda: bank._forward(rows, layout.of, layout.end[0])),
         "bank: forward, gradients": clock.recorded(differentiate),
         "bank step": clock.recorded(lambda: bank.step(patches, ours, others, theirs, weights, rate=rate)),
     }

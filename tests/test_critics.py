@@ -10,7 +10,7 @@ import torch
 from torch import nn
 
 from dase.critics import BankShape, CriticBank, Sorted, _Batch, grouped
-from dase.kernels import autograd_training as bridge
+from dase.kernels import autograd_critics as bridge
 
 SHAPE = BankShape(classes=5, inputs=64, wide=16, narrow=8)
 FAKE = torch.tensor([0, 0, 1, 1, 1, 3, 3, 0, 4])  # class 2 has no fake patches, 4 no real ones
@@ -70,10 +70,14 @@ def test_gradients_are_those_of_double_backward(bank, batch):
     gradients = dict(work.sums)
     for name, (left, right) in work.outer.items():
         gradients[name], begin = torch.zeros_like(getattr(bank, name)), 0
-        for critic, end in enumerate(work.by.end.tolist()):
+        for critic, end in enumerate(work.layout.end[0].tolist()):
             gradients[name][critic] = left[begin:end].T @ right[begin:end]
             begin = end
-    assert work.active.tolist() == [critic in BOTH for critic in range(5)]
+    number, ends = work.layout.number.tolist(), work.layout.end.tolist()
+    assert number == [np.bincount(classes, minlength=5).tolist() for classes in (FAKE, REAL)]
+    pairs = [min(both) for both in zip(*number, strict=True)]
+    rows = [p and p + sum(both) for p, both in zip(pairs, zip(*number, strict=True), strict=True)]
+    assert ends == [np.cumsum(rows).tolist(), np.cumsum(pairs).tolist()]
     for critic in BOTH:
         for n in (1, 2, 3):
             layer = critics[critic][2 * (n - 1)]
@@ -163,10 +167,10 @@ def test_moving_by_outer_products(device, dtype):
 def test_grouped_products_and_order(rng):
     classes = torch.from_numpy(rng.integers(0, 4, 20))
     by = Sorted.by(classes, 3)  # class 3 is none
-    assert torch.equal(by.number, torch.bincount(classes, minlength=4)[:3])
+    assert torch.equal(by.end, torch.bincount(classes, minlength=4)[:3].cumsum(0).int())
     rows, weights = torch.randn(20, 8), torch.randn(3, 8, 4)
     got = grouped(rows[by.order], weights, by.end)
-    for n, (row, critic) in enumerate(zip(by.order.tolist(), by.classes.tolist(), strict=True)):
+    for n, (row, critic) in enumerate(zip(by.order.tolist(), by.of.tolist(), strict=True)):
         if critic < 3:
             close(got[n], rows[row] @ weights[critic])
 

@@ -1,0 +1,221 @@
+"""What a bank of critics needs of the kernels, on PyTorch's tensors; gradients are written out by hand."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from types import SimpleNamespace
+
+import torch
+
+from dase.kernels import bank as _bank
+from dase.kernels import critics as _critics
+from dase.kernels.autograd import _launch
+
+
+@dataclass
+class Layout:
+    """Rows of a step, critic by critic, each critic's in the order fake, real, half way between.
+
+    Args:
+        number: Rows of each class, fake and real, int32 (2, C).
+        end: Where a critic's rows end among all, and among those half way, int32 (2, C).
+        order: Which row lies where, numbered fake, real, half way; -1 behind the last; int32 (R,).
+        of: Its critic, C behind the last, int32 (R,).
+        gain: Derivative of the loss by its score, float32 (R,).
+        place: Where the rows half way lie, -1 for pairs that there are not, int32 (N,).
+        held: What they weigh in the penalty, float32 (N,).
+        sides: Fake and real rows, N + M; greater numbers in `order` are half way.
+    """
+
+    number: torch.Tensor
+    end: torch.Tensor
+    order: torch.Tensor
+    of: torch.Tensor
+    gain: torch.Tensor
+    place: torch.Tensor
+    held: torch.Tensor
+    sides: int
+
+
+def lay_out(fake: torch.Tensor, real: torch.Tensor, weights: torch.Tensor) -> Layout:
+    """Lay out the rows of critics that have some of both sides.
+
+    Args:
+        fake: Class of each fake row, int64 (N,); the number of critics for none.
+        real: The same of the real ones, int64 (M,).
+        weights: Of each class, float32 (C,).
+    """
+    critics, sides, device = len(weights), len(fake) + len(real), weights.device
+    number, end = (torch.empty(2, critics, dtype=torch.int32, device=device) for _ in range(2))
+    _launch(_critics.count_rows, [fake, real], [number])
+    _launch(_critics.lay_out, [number], [end])
+
+    def preset(size: int, value: int) -> torch.Tensor:
+        return torch.full((size,), value, dtype=torch.int32, device=device)
+
+    size = sides + len(fake)
+    order, of, place = preset(size, -1), preset(size, critics), preset(len(fake), -1)
+    gain, held = (torch.zeros(n, device=device) for n in (size, len(fake)))
+    outputs = [order, of, gain, place, held]
+    _launch(_critics.place_rows, [fake, real, number, end, weights], outputs, over=order[None], size=sides)
+    return Layout(number, end, order, of, gain, place, held, sides)
+
+
+def gather(
+    fake: torch.Tensor, real: torch.Tensor, share: torch.Tensor, layout: Layout, dtype: torch.dtype
+) -> torch.Tensor:
+    """Return all rows in order, (R, K) of `dtype`; `share` (N, 1) is that of the fake one half way."""
+    rows = torch.empty(len(layout.order), fake.shape[1], dtype=dtype, device=fake.device)
+    inputs = [fake, real, share, layout.order, layout.of, layout.number]
+    _launch(_layers(rows).gather, inputs, [rows])
+    return rows
+
+
+def pace(
+    layout: Layout, rate: torch.Tensor, steps: torch.Tensor, *, decay: float
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """Count a step of the critics that have rows in `steps` (C,); return their rates and corrections."""
+    rates, correction = torch.empty_like(steps), torch.empty_like(steps)
+    _launch(_critics.pace, [layout.number, rate.view(1), decay], [steps, rates, correction], over=steps[None])
+    return rates, correction
+
+
+def first_layer(
+    product: torch.Tensor, of: torch.Tensor, bias: torch.Tensor, *, slope: float
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """Return the sums of the first layer, float32 (R, J), and what goes on, in the type of the product."""
+    total, hidden = torch.empty_like(product, dtype=torch.float32), torch.empty_like(product)
+    _launch(_layers(product).first_layer, [product, of, bias, slope], [total, hidden])
+    return total, hidden
+
+
+def second_layer(
+    product: torch.Tensor, of: torch.Tensor, bias: torch.Tensor, last: torch.Tensor, *, slope: float
+) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    """Return the sums of the second layer, the scores' derivative by them, both float32, and it again.
+
+    `last` are the weights of the third layer, (C, J).
+    """
+    total, by_total = (torch.empty_like(product, dtype=torch.float32) for _ in range(2))
+    back = torch.empty_like(product)
+    _launch(_layers(product).second_layer, [product, of, bias, last, slope], [total, by_total, back])
+    return total, by_total, back
+
+
+def way_back(
+    product: torch.Tensor, of: torch.Tensor, total: torch.Tensor, *, critics: int, slope: float
+) -> torch.Tensor:
+    """Return the scores' derivative by the sums `total` of the first layer, float32 (R, J)."""
+    out = torch.empty_like(total)
+    _launch(_layers(product).way_back, [product, of, total, slope, critics], [out])
+    return out
+
+
+def score(
+    second: torch.Tensor, of: torch.Tensor, last: torch.Tensor, bias: torch.Tensor, *, slope: float
+) -> torch.Tensor:
+    """Return the score of each row (R,) from the sums of the second layer; 0 for rows of no critic."""
+    out = torch.empty(len(of), device=second.device)
+    _launch(_critics.score, [second, of, last, bias, slope], [out], over=out[None])
+    return out
+
+
+def half_way(values: torch.Tensor, layout: Layout, dtype: torch.dtype) -> torch.Tensor:
+    """Return the rows half way of values of all rows, (N, J) of `dtype`."""
+    out = torch.empty(len(layout.place), values.shape[1], dtype=dtype, device=values.device)
+    _launch(_layers(out).half_way, [values, layout.place], [out])
+    return out
+
+
+def penalise(gradient: torch.Tensor, layout: Layout, rows: torch.Tensor, *, penalty: float) -> torch.Tensor:
+    """Return the derivative of the penalty by the gradient (N, K), and set `rows` half way to it."""
+    out = torch.empty_like(gradient)
+    inputs = [gradient, layout.place, layout.held, penalty]
+    _launch(_layers(gradient).penalise, inputs, [out, rows])
+    return out
+
+
+def again_first(
+    product: torch.Tensor, total: torch.Tensor, layout: Layout, hidden: torch.Tensor, *, slope: float
+) -> torch.Tensor:
+    """Return a product (N, J) times the slopes of the first layer, and set `hidden` half way to it."""
+    out = torch.empty_like(product)
+    _launch(_layers(product).again_first, [product, total, layout.place, slope], [out, hidden])
+    return out
+
+
+def again_second(
+    product: torch.Tensor, total: torch.Tensor, layout: Layout, last: torch.Tensor, *, slope: float
+) -> None:
+    """Set `last` half way to a product (N, J) times the slopes of the second layer."""
+    _launch(_layers(product).again_second, [total, layout.place, slope, product], [last], over=product)
+
+
+def weigh(
+    second: torch.Tensor, by_first: torch.Tensor, by_second: torch.Tensor, layout: Layout, *, slope: float
+) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    """Return the left rows of both layers' gradients, and the terms of the third's but for rows half way."""
+    order, gain, between = layout.order, layout.gain, layout.sides
+    left_first, left_second, last = (torch.empty_like(v) for v in (by_first, by_second, second))
+    _launch(_critics.weigh_first, [by_first, order, gain, between], [left_first])
+    _launch(_critics.weigh_second, [second, by_second, order, gain, between, slope], [left_second, last])
+    return left_first, left_second, last
+
+
+def sum_rows(values: torch.Tensor, layout: Layout, *, between: bool) -> torch.Tensor:
+    """Return the sum over each critic's rows, (C, J), with or without those half way."""
+    out = torch.empty(layout.end.shape[1], values.shape[1], device=values.device)
+    before = len(layout.order) if between else layout.sides
+    _launch(_critics.sum_rows, [values, layout.order, layout.end, before], [out])
+    return out
+
+
+def _layers(rows: torch.Tensor) -> SimpleNamespace:
+    return _critics.layers[rows.dtype == torch.bfloat16]
+
+
+def move_critics(
+    weight: torch.Tensor,
+    square: torch.Tensor,
+    copy: torch.Tensor,
+    left: torch.Tensor,
+    right: torch.Tensor,
+    end: torch.Tensor,
+    rate: torch.Tensor,
+    correction: torch.Tensor,
+    *,
+    decay: float,
+    tiny: float = 1e-8,
+) -> None:
+    """Move weights by Adam without momentum along the sum of outer products of `left` and `right` rows.
+
+    Args:
+        weight: Changed in place, float32 (C, J, K); J and K are multiples of 4.
+        square: Running mean of squared gradients, changed in place, shaped alike.
+        copy: Set to the weights in bfloat16, (C, J, K).
+        left: float32 (R, J), the rows of critic 0 first.
+        right: bfloat16 or float32 (R, K), in the same order.
+        end: Where the rows of each critic end, int32 (C,).
+        rate: Learning rate of each critic, float32 (C,); those at 0 are not touched.
+        correction: 1 / (1 - decay^steps) of each critic, float32 (C,).
+        decay: Of the running mean.
+        tiny: Added to the root of the mean square.
+    """
+    half = right.dtype == torch.bfloat16
+    inputs = [left, right.view(torch.int32), end, rate, correction, decay, tiny]
+    tiles = weight.view(weight.shape[0], -1, _bank.TILE**2)[..., 0]
+    _launch(_bank.adam[half], inputs, [weight, square, copy.view(torch.int32)], over=tiles)
+
+
+def move_sums(
+    weight: torch.Tensor,
+    square: torch.Tensor,
+    gradient: torch.Tensor,
+    rate: torch.Tensor,
+    correction: torch.Tensor,
+    *,
+    decay: float,
+    tiny: float = 1e-8,
+) -> None:
+    """Move weights by Adam without momentum along a gradient, all float32 (C, J); see `move_critics`."""
+    _launch(_bank.adam_of, [gradient, rate, correction, decay, tiny], [weight, square], over=gradient)
