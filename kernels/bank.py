@@ -89,11 +89,15 @@ OUTER = """
 HALF = """
 #ifdef __CUDA_ARCH__
         const uint2 two = __ldg(reinterpret_cast<const uint2*>(b));
+        #define DASE_AS_FLOAT __uint_as_float
 #else
         const struct { word x, y; } two = {(word)b[0], (word)b[1]};
+        #define DASE_AS_FLOAT(bits) __builtin_bit_cast(float, (word)(bits))
 #endif
-        const word bits[4] = {two.x << 16, two.x & 0xffff0000u, two.y << 16, two.y & 0xffff0000u};
-        __builtin_memcpy(q, bits, sizeof(q));
+        q[0] = DASE_AS_FLOAT(two.x << 16);
+        q[1] = DASE_AS_FLOAT(two.x & 0xffff0000u);
+        q[2] = DASE_AS_FLOAT(two.y << 16);
+        q[3] = DASE_AS_FLOAT(two.y & 0xffff0000u);
 """
 
 FULL = """

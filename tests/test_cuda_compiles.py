@@ -8,15 +8,15 @@ import pytest
 import warp as wp
 
 from dase.effects import EFFECTS
-from dase.kernels import compose, counts, launch, trials
+from dase.kernels import bank, compose, counts, critics, launch, trials
 from dase.sensor import Sensor
 
 ARCH = 90
 """Compute capability that is compiled for: H100 and H200."""
 
 MODULES = (
-    "between", "blur", "events", "patches", "probes", "readout", "scene", "scene_gradient", "scenery",
-    "surrogates", "trials",
+    "bank", "between", "blur", "critics", "events", "patches", "probes", "readout", "scene", "scene_gradient",
+    "scenery", "surrogates", "trials",
 )  # fmt: skip
 """Those whose kernels are not made by functions."""
 
@@ -56,3 +56,9 @@ def test_counting(source, lanes, tmp_path):
     compiles(counts.count(lanes, source, shared=False, states=True).module, tmp_path)
     if source in ("log", "frames"):
         compiles(counts.count(lanes, source, shared=False, states=True, aligned=True).module, tmp_path)
+
+
+@pytest.mark.parametrize("half", [True, False])
+def test_critics(half, tmp_path):
+    for kernel in (bank.adam[half], *vars(critics.layers[half]).values()):
+        compiles(kernel.module, tmp_path)
