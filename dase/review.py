@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
+from dase.closer import shown
 from dase.error import Judgement, announced, explained, silent
 from dase.model import Model, settle
 from dase.search import MATERIAL, TIE, Search, accounts, like_of
@@ -56,7 +57,8 @@ def _drop(search: Search, model: Model, judgement: Judgement) -> tuple[Model, Ju
         needless = announced(without) and without.error < judgement.error + MATERIAL
         if explained(without):
             needless = silent(without) or not accounts(judgement, without)
-        if needless or without.error <= judgement.error:
+        needless = needless or without.error <= judgement.error
+        if needless and not shown(search, fitted, without, model):
             model, judgement = fitted, without
     return model, judgement
 
