@@ -35,6 +35,8 @@ def review(search: Search, model: Model, judgement: Judgement) -> tuple[Model, J
             without = search.without.get(name)
             if not explained(judged) or (without is not None and not accounts(judged, without)):
                 continue
+            if shown(search, swapped, judged, model):
+                continue
             simpler = len(swapped.place) < len(model.place)
             if simpler or not explained(judgement):
                 model, judgement = swapped, judged

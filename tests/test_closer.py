@@ -154,3 +154,11 @@ def test_a_simpler_rival_takes_the_place_and_the_tie_is_told(monkeypatch):
     search, model, judgement = fake("ac", errors, monkeypatch, rivals={"c": "b"})
     assert reviewing.review(search, model, judgement)[0].names == "ac"
     assert search.ties == {"c": {"b"}}
+
+
+def test_no_rival_takes_the_place_of_what_a_closer_look_shows(monkeypatch):
+    errors = {"aZ": 0.3, "Z": 9.0, "a": 9.0, "ab": 0.4, "b": 9.0}
+    search, model, judgement = fake("aZ", errors, monkeypatch, rivals={"Z": "b"})
+    monkeypatch.setattr(reviewing, "shown", lambda search, less, without, m: less.names == "ab")
+    assert reviewing.review(search, model, judgement)[0].names == "aZ"
+    assert search.ties == {}
