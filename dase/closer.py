@@ -72,20 +72,20 @@ class Way:
         return out
 
 
-def closer(search: Search, model: Model, judgement: Judgement) -> Tried | None:
-    """Return the effect that chance hid, fitted and judged; None if there is none, or nothing hides."""
+def closer(search: Search, model: Model, judgement: Judgement) -> tuple[Tried, float] | None:
+    """Return the effect that chance hid, fitted and judged, and its p-value; None if there is none."""
     if not hides(judgement):
         return None
     search.progress("looking closer", 0.0, search.error)
     start = _nearest(search, model)
     if start is None:
         return None
-    name, begin = start
+    name, begin, p_value = start
     fitted = settle(search.evidence, begin, seed=search.seed, rounds=1)
     judged = alone(fitted.judging(search.evidence.held.view(), repeats=REPEATS, seed=search.seed + 500))
     if not explained(judged) or away(search.evidence.held, model, fitted, seed=search.seed) < AGAIN:
         return None
-    return Tried(name, fitted, fitted.loss, judged=judged)
+    return Tried(name, fitted, fitted.loss, judged=judged), p_value
 
 
 def hides(judgement: Judgement) -> bool:
@@ -108,8 +108,11 @@ def away(half: Half, model: Model, other: Model, *, seed: int) -> float:
     return float(way.away(_in_errors(half, two - one))[0])
 
 
-def _nearest(search: Search, model: Model) -> tuple[str, Model] | None:
-    """Return the effect on whose way the measurement is farthest from the model, and where to begin."""
+def _nearest(search: Search, model: Model) -> tuple[str, Model, float] | None:
+    """Return the effect on whose way the measurement is farthest from the model, where to begin, a p-value.
+
+    For that, repeats stand in for the measurement, each on the way on which it is farthest.
+    """
     half, way = _based(search.evidence.train, model, seed=search.seed)
     reach = np.where([a.name.startswith("threshold.") for a in model.space.axes], 0.05, 0.2)
     sides = np.concatenate([model.place[None], model.place + np.diag(reach), model.place - np.diag(reach)])
@@ -124,12 +127,14 @@ def _nearest(search: Search, model: Model) -> tuple[str, Model] | None:
     # what the free parameters can do as well tells nothing
     bare = ways - (ways @ frame) @ frame.T
     far = way.away(bare)
+    chance = np.array([Way(way.repeats, one).away(bare).max() for one in way.repeats])
     first = int(far.argmax())
     if far[first] < AWAY:
         return None
     name, other, place = [(n, m, place) for n, m, places in tried for place in places][first]
     step = (way.seen - ways[first]) @ np.linalg.pinv(slopes).T * reach
-    return name, _begin(model, other, place, step)
+    p_value = (1 + np.count_nonzero(chance >= far[first])) / (1 + len(chance))
+    return name, _begin(model, other, place, step), float(p_value)
 
 
 def _begin(model: Model, other: Model, place: Array, step: Array) -> Model:

@@ -98,7 +98,7 @@ def _greedy(search: Search, model: Model, most: int) -> tuple[Model, Judgement, 
         more = len(errors) <= most
         step, better = _step(search, model, judgement, more)
         if better is None and more and (hidden := closer(search, model, judgement)) is not None:
-            step, better = _found(search, hidden, step, judgement), hidden.model
+            step, better = _found(search, *hidden, step, judgement), hidden[0].model
         search.history.append(step)
         if better is None:
             break
@@ -143,10 +143,10 @@ def _step(search: Search, model: Model, judgement: Judgement, more: bool) -> tup
     return step, settle(evidence, best.model, seed=seed, rounds=1) if enough else None
 
 
-def _found(search: Search, hidden: Tried, step: Step, judgement: Judgement) -> Step:
+def _found(search: Search, hidden: Tried, p_value: float, step: Step, judgement: Judgement) -> Step:
     """Note an effect that only a closer look shows."""
     search.note(hidden, [hidden], (), judgement)
-    rank = _rank(hidden, judgement, 1 / (1 + REPEATS))
+    rank = _rank(hidden, judgement, p_value)
     others = tuple(r for r in step.ranking if r.effect != hidden.name)
     return replace(step, ranking=(rank, *others), chosen=hidden.name)
 

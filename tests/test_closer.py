@@ -62,8 +62,9 @@ def searches(device) -> dict[str, Search]:
 def test_jitter_is_seen_beside_mismatch_and_not_where_there_is_none(searches):
     model = model_of(TRUE)
     assert _nearest(searches["plain"], model) is None
-    name, start = _nearest(searches["uneven"], model)
+    name, start, p_value = _nearest(searches["uneven"], model)
     assert name == "jitter"
+    assert p_value == pytest.approx(1 / 61)  # none of the repeats is as far on any way
     assert 0.1 < start.sensor["jitter"].spread < 0.5
     true = model_of(TRUE.with_effect(JITTER))
     assert away(searches["uneven"].evidence.train, model, true, seed=1) > AWAY
