@@ -8,6 +8,7 @@ from dataclasses import replace
 from itertools import combinations
 
 from dase.candidates import Tried, chance_of, open_to, try_all
+from dase.closer import closer
 from dase.confidence import estimates
 from dase.effects import EFFECTS, Effect
 from dase.error import Judgement, announced, explained, silent, worst_families
@@ -94,7 +95,10 @@ def _greedy(search: Search, model: Model, most: int) -> tuple[Model, Judgement, 
     for _ in range(most + 1):
         judgement = search.judge(model)
         errors.append(judgement.error)
-        step, better = _step(search, model, judgement, len(errors) <= most)
+        more = len(errors) <= most
+        step, better = _step(search, model, judgement, more)
+        if better is None and more and (hidden := closer(search, model, judgement)) is not None:
+            step, better = _found(search, *hidden, step, judgement), hidden[0].model
         search.history.append(step)
         if better is None:
             break
@@ -137,6 +141,14 @@ def _step(search: Search, model: Model, judgement: Judgement, more: bool) -> tup
         search.note(best, finalists, ties, judgement)
     step = replace(step, ranking=ranking, chosen=best.name if enough else None, ties=ties if enough else ())
     return step, settle(evidence, best.model, seed=seed, rounds=1) if enough else None
+
+
+def _found(search: Search, hidden: Tried, p_value: float, step: Step, judgement: Judgement) -> Step:
+    """Note an effect that only a closer look shows."""
+    search.note(hidden, [hidden], (), judgement)
+    rank = _rank(hidden, judgement, p_value)
+    others = tuple(r for r in step.ranking if r.effect != hidden.name)
+    return replace(step, ranking=(rank, *others), chosen=hidden.name)
 
 
 def _choose(finalists: Sequence[Tried]) -> tuple[Tried, tuple[str, ...]]:

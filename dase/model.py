@@ -41,7 +41,8 @@ ALIKE = 2.0
 """Most by which the loss of another phase may grow where it becomes the present one."""
 
 ROOM = 0.3
-"""Of the logarithm of a bus's rate above the most events per second."""
+"""Beside a value that is seen in a measurement, one higher by this is tried: of a bus, the most events per
+second are the least it can send."""
 
 FEW_STARTS = 0.1
 """Share of the plausible range that is left out at both ends when an effect is tried."""
@@ -202,16 +203,17 @@ def added(present: Model, effect: Effect) -> Model:
 def starts(model: Model, effect: Effect, *, few: bool = False) -> Array:
     """Return places from which an effect is tried: its strength and its character, at several thresholds."""
     axes = model.space.axes
-    columns, choices = [], []
+    columns, choices, seen = [], [], False
     for n, axis in enumerate(axes):
         if axis.name.split(".")[0] == effect.name:
             columns.append(n)
+            seen |= axis.fact.seen
             tried = _tried(axis, float(model.place[n]))
             choices.append(tried[::2] if few and axis.main and len(tried) > 2 else tried)
     thresholds = [n for n, axis in enumerate(axes) if axis.name in ("threshold.on", "threshold.off")]
     out = []
     for combination in product(*choices):
-        for shift in SHIFTS[1::2] if few and effect.name != "readout" else SHIFTS:
+        for shift in SHIFTS[1::2] if few and not seen else SHIFTS:
             place = model.place.copy()
             place[columns] = combination
             place[thresholds] += shift
@@ -221,7 +223,7 @@ def starts(model: Model, effect: Effect, *, few: bool = False) -> Array:
 
 def _tried(axis: Axis, present: float) -> list[float]:
     low, high = (float(axis.to_place(v)) for v in axis.fact.plausible)
-    if axis.name == "readout.rate":  # is seen where the bus is full
+    if axis.fact.seen:
         return [present, present + ROOM]
     if axis.main:
         return list(low + (high - low) * np.linspace(FEW_STARTS, 1 - FEW_STARTS, 6))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
+from dase.closer import shown
 from dase.error import Judgement, announced, explained, silent
 from dase.model import Model, settle
 from dase.search import MATERIAL, TIE, Search, accounts, like_of
@@ -34,6 +35,8 @@ def review(search: Search, model: Model, judgement: Judgement) -> tuple[Model, J
             without = search.without.get(name)
             if not explained(judged) or (without is not None and not accounts(judged, without)):
                 continue
+            if shown(search, swapped, judged, model):
+                continue
             simpler = len(swapped.place) < len(model.place)
             if simpler or not explained(judgement):
                 model, judgement = swapped, judged
@@ -56,7 +59,8 @@ def _drop(search: Search, model: Model, judgement: Judgement) -> tuple[Model, Ju
         needless = announced(without) and without.error < judgement.error + MATERIAL
         if explained(without):
             needless = silent(without) or not accounts(judgement, without)
-        if needless or without.error <= judgement.error:
+        needless = needless or without.error <= judgement.error
+        if needless and not shown(search, fitted, without, model):
             model, judgement = fitted, without
     return model, judgement
 

@@ -60,68 +60,57 @@ def store_pairs(a: wp.array3d[int], c: int, j: int, k: int, low: int, high: int)
     ...
 
 
-OUTER = """
-    // plain pointers and no stores in between, so that several rows are on their way from memory at once
-    typedef unsigned int word;
-    wp::mat_t<4, 4, wp::float32> sum(0.0f);
-    const float* a = &wp::index(left, begin, j);
-    const int* b = &wp::index(right, begin, WORDS);
-    const size_t step_a = left.strides[0] / 4, step_b = right.strides[0] / 4;
+@wp.func_native(
+    """
 #ifdef __CUDA_ARCH__
-#pragma unroll 4
-#endif
-    for (int r = begin; r < end; ++r, a += step_a, b += step_b) {
-#ifdef __CUDA_ARCH__
-        const float4 four = __ldg(reinterpret_cast<const float4*>(a));
-        const float p[4] = {four.x, four.y, four.z, four.w};
+    const float4 q = __ldg(reinterpret_cast<const float4*>(&wp::index(a, r, k)));
+    return wp::vec_t<4, wp::float32>(q.x, q.y, q.z, q.w);
 #else
-        const float* p = a;
-#endif
-        float q[4];
-        READ
-        for (int m = 0; m < 4; ++m)
-            for (int n = 0; n < 4; ++n) sum.data[m][n] += p[m] * q[n];
-    }
-    return sum;
-"""
-"""Sum of outer products of 4 numbers of the left rows with 4 of the right ones."""
-
-HALF = """
-#ifdef __CUDA_ARCH__
-        const uint2 two = __ldg(reinterpret_cast<const uint2*>(b));
-        #define DASE_AS_FLOAT __uint_as_float
-#else
-        const struct { word x, y; } two = {(word)b[0], (word)b[1]};
-        #define DASE_AS_FLOAT(bits) __builtin_bit_cast(float, (word)(bits))
-#endif
-        q[0] = DASE_AS_FLOAT(two.x << 16);
-        q[1] = DASE_AS_FLOAT(two.x & 0xffff0000u);
-        q[2] = DASE_AS_FLOAT(two.y << 16);
-        q[3] = DASE_AS_FLOAT(two.y & 0xffff0000u);
-"""
-
-FULL = """
-#ifdef __CUDA_ARCH__
-        *reinterpret_cast<float4*>(q) = __ldg(reinterpret_cast<const float4*>(b));
-#else
-        __builtin_memcpy(q, b, sizeof(q));
+    const float* q = &wp::index(a, r, k);
+    return wp::vec_t<4, wp::float32>(q[0], q[1], q[2], q[3]);
 #endif
 """
-
-
-@wp.func_native(OUTER.replace("WORDS", "k / 2").replace("READ", HALF))
-def half_outer(
-    left: wp.array2d[float], right: wp.array2d[int], begin: int, end: int, j: int, k: int
-) -> wp.mat44:
-    """Sum left[r, j : j + 4] right[r, k : k + 4] over rows; the right ones are bfloat16, two in a word."""
+)
+def row(a: wp.array2d[float], r: int, k: int) -> wp.vec4:
+    """Return a[r, k : k + 4] by one load of 16 bytes."""
     ...
 
 
-@wp.func_native(OUTER.replace("WORDS", "k").replace("READ", FULL))
-def full_outer(
-    left: wp.array2d[float], right: wp.array2d[int], begin: int, end: int, j: int, k: int
-) -> wp.mat44:
-    """Sum left[r, j : j + 4] right[r, k : k + 4] over rows; the right ones are float32, as words."""
+@wp.func_native(
+    """
+#ifdef __CUDA_ARCH__
+    const float4 q = __ldg(reinterpret_cast<const float4*>(&wp::index(a, r, k)));
+    return wp::vec_t<4, wp::float32>(q.x, q.y, q.z, q.w);
+#else
+    wp::vec_t<4, wp::float32> q;
+    __builtin_memcpy(&q, &wp::index(a, r, k), sizeof(q));
+    return q;
+#endif
+"""
+)
+def full_row(a: wp.array2d[int], r: int, k: int) -> wp.vec4:
+    """Return the four float32 at [r, k : k + 4] of rows that are handed over as words."""
+    ...
+
+
+@wp.func_native(
+    """
+    typedef unsigned int word;
+#ifdef __CUDA_ARCH__
+    const uint2 q = __ldg(reinterpret_cast<const uint2*>(&wp::index(a, r, k / 2)));
+    const word low = q.x, high = q.y;
+    #define DASE_AS_FLOAT __uint_as_float
+#else
+    const word low = (&wp::index(a, r, k / 2))[0], high = (&wp::index(a, r, k / 2))[1];
+    #define DASE_AS_FLOAT(bits) __builtin_bit_cast(float, (word)(bits))
+#endif
+    return wp::vec_t<4, wp::float32>(
+        DASE_AS_FLOAT(low << 16), DASE_AS_FLOAT(low & 0xffff0000u), DASE_AS_FLOAT(high << 16),
+        DASE_AS_FLOAT(high & 0xffff0000u));
+"""
+)
+def half_row(a: wp.array2d[int], r: int, k: int) -> wp.vec4:
+    """Return the four bfloat16 at [r, k : k + 4] of rows that are handed over as words of two."""
     ...
 
 
@@ -141,7 +130,7 @@ def pair(low: float, high: float) -> int:
 
 def _adam(half: bool) -> wp.Kernel:
     """Return the kernel for right rows in bfloat16, or in float32."""
-    outer = half_outer if half else full_outer
+    right_row = half_row if half else full_row
 
     @wp.kernel(enable_backward=False, module="unique")
     def adam(
@@ -174,10 +163,12 @@ def _adam(half: bool) -> wp.Kernel:
         for n in range(TILE):
             means[n] = load(square, c, j + n, k)
             weights[n] = load(weight, c, j + n, k)
+        gradient = wp.mat44()
         begin = int(0)
         if c > 0:
             begin = end[c - 1]
-        gradient = outer(left, right, begin, end[c], j, k)
+        for r in range(begin, end[c]):
+            gradient += wp.outer(row(left, r, j), right_row(right, r, k))
         for n in range(TILE):
             slope = gradient[n]
             mean = decay * means[n] + (1.0 - decay) * wp.cw_mul(slope, slope)

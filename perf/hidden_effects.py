@@ -45,6 +45,7 @@ V2E = {
 class Case:
     """One run: what is hidden in which scene; `removed` is taken out of the library.
 
+    With it go the effects that include it, which explain all that it does; of kind `included` they stay.
     Of another simulator `strength` is the name of the case; its effects are looked up when the answer is in.
     """
 
@@ -126,7 +127,8 @@ def run_case(job: Job) -> dict[str, Any]:
 
     case = job.case
     events, scene, given, true = measured(job)
-    library = {name: effect for name, effect in EFFECTS.items() if name != case.removed}
+    removed = {case.removed, *(including(case.removed) if case.kind == "unknown" else ())}
+    library = {name: effect for name, effect in EFFECTS.items() if name not in removed}
     begin = time.perf_counter()
     found = diagnose(events, scene, given, effects=library, seed=case.seed, device=job.device)
     seconds = time.perf_counter() - begin
@@ -150,6 +152,13 @@ def run_case(job: Job) -> dict[str, Any]:
     if case.removed:
         line["missing"] = missing_cells(job, events, scene, true.without(case.removed))
     return line
+
+
+def including(name: str) -> list[str]:
+    """Return the effects that have another as a special case."""
+    from dase.effects import EFFECTS
+
+    return [other for other, effect in EFFECTS.items() if name in effect.includes]
 
 
 def missing_cells(job: Job, events: Any, scene: Any, sensor: Any) -> list[list[str]]:
@@ -177,6 +186,10 @@ def cases(options: argparse.Namespace) -> Iterator[Case]:
         "unknown": [
             Case("unknown", (name,), "strong", seed % options.scenes, seed, removed=name)
             for seed in range(min(options.seeds, 3)) for name in names_of(options)
+        ],
+        "included": [
+            Case("included", (name,), "strong", seed % options.scenes, seed, removed=name)
+            for seed in range(min(options.seeds, 3)) for name in names_of(options) if including(name)
         ],
         "other": [
             Case("other", (), path.stem, 0, 0)
@@ -213,7 +226,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--log", type=Path, default=Path("out/hidden_effects.jsonl"))
     parser.add_argument("--hidden", type=Path, help="folder of another simulator's cases")
-    parser.add_argument("--kinds", default="single,nothing,pairs,unknown,other")
+    parser.add_argument("--kinds", default="single,nothing,pairs,unknown,included,other")
     parser.add_argument("--only", default="", help="effects, with commas between")
     parser.add_argument("--strengths", default="weak,medium,strong")
     parser.add_argument("--seeds", type=int, default=5)
@@ -233,6 +246,7 @@ def main() -> None:
     if not options.report:
         _run(options)
     if options.log.exists():
+        options.out.mkdir(parents=True, exist_ok=True)
         write_report(options.log, options.out, options.where)
 
 

@@ -101,6 +101,21 @@ def test_a_second_order_pixel_starts_settled(device, damping):
     assert counts(still([0.0, 0.1, 1.0], 5.0, 50), sensor, 5.0, device).sum() == 0
 
 
+@pytest.mark.parametrize("dark", [0.1, 1.0])
+def test_a_strongly_damped_second_order_is_a_bandwidth(device, dark):
+    assert SecondOrder.includes == ("bandwidth",)
+    quiet = Threshold(on=0.01, off=0.01, phase=0.0)
+    larger = SecondOrder(cutoff=2 * 20.0 * 1.5, damping=20.0, dark=dark)
+    scene = ramp(5.0, 0.3, 3, 65)
+    got, want = (
+        counts(scene, every(quiet, effect), 0.3, device)[1]
+        for effect in (larger, Bandwidth(cutoff=1.5, dark=dark))
+    )
+    np.testing.assert_allclose(got, want, atol=1.5)
+    assert want.min() > 10
+    assert counts(scene, every(quiet), 0.3, device)[1].min() > 1.4 * want.max()
+
+
 def noise_rates(
     device: str, light: list[float], effect: VoltageNoise, *others: dase.Effect, samples: int = 2
 ) -> np.ndarray:

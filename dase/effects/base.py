@@ -34,6 +34,7 @@ class Parameter:
         bounds: Values outside are refused.
         plausible: Where real cameras lie; a diagnosis looks for the effect in this range.
         about: One line.
+        seen: Whether a diagnosis sees about where it is in the measurement, and begins there.
     """
 
     name: str
@@ -43,6 +44,7 @@ class Parameter:
     bounds: tuple[float, float]
     plausible: tuple[float, float]
     about: str
+    seen: bool = False
 
 
 def parameter(
@@ -53,9 +55,12 @@ def parameter(
     off: float | None = None,
     bounds: tuple[float, float] = (0.0, math.inf),
     plausible: tuple[float, float],
+    seen: bool = False,
 ) -> Any:
     """Declare a parameter of an effect; see `Parameter`."""
-    facts = dict(unit=unit, default=default, off=off, bounds=bounds, plausible=plausible, about=about)
+    facts = dict(
+        unit=unit, default=default, off=off, bounds=bounds, plausible=plausible, about=about, seen=seen
+    )
     return field(default=default, metadata={"parameter": facts})
 
 
@@ -91,6 +96,8 @@ class Effect:
     """Stage name to Warp function."""
     states: ClassVar[tuple[str, ...]] = ()
     """What a pixel remembers from sample to sample."""
+    includes: ClassVar[tuple[str, ...]] = ()
+    """Names of effects that this one becomes at the end of its range: it explains all that they do."""
     maps: ClassVar[tuple[str, ...]] = ()
     """Quantities of which every pixel has its own value, depending on the scene; see `bound_to`."""
     label: ClassVar[str] = "shot"

@@ -94,6 +94,7 @@ class Readout(StreamEffect):
         bounds=(1.0, math.inf),
         plausible=(5e5, 1e9),
         about="most events per second, of the whole sensor",
+        seen=True,
     )
     depth: float = parameter(
         4096.0,

@@ -95,7 +95,8 @@ class SecondOrder(Effect):
     H(s) = ω² / (s² + 2 damping ω s + ω²). The natural frequency ω/2π is `cutoff` at intensity 1 (white) and
     falls linearly to `dark * cutoff` at intensity 0; the damping is held constant, although in the circuit
     it changes with the light. The quality factor is Q = 1 / (2 damping); at damping 0.71 the natural
-    frequency is the -3 dB frequency. Exact at any sampling, for under-, over- and critical damping.
+    frequency is the -3 dB frequency. Exact at any sampling, for under-, over- and critical damping. Strongly
+    damped it is one low-pass with the cutoff `cutoff / (2 damping)`: `bandwidth`.
     """
 
     name: ClassVar[str] = "second_order"
@@ -106,6 +107,7 @@ class SecondOrder(Effect):
     )
     stages: ClassVar = {"respond": filtered}
     states: ClassVar = ("input", "output", "slope")
+    includes: ClassVar = ("bandwidth",)
 
     cutoff: float = parameter(
         300.0,
