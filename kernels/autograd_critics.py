@@ -9,6 +9,7 @@ import torch
 
 from dase.kernels import bank as _bank
 from dase.kernels import critics as _critics
+from dase.kernels import rows as _rows
 from dase.kernels.autograd import _launch
 
 
@@ -37,6 +38,13 @@ class Layout:
     sides: int
 
 
+def in_order(keys: torch.Tensor, *, below: int) -> tuple[torch.Tensor, torch.Tensor]:
+    """Return keys (N,) from 0 on in order, int32, and where each was; equal ones keep their order."""
+    # a GPU's sort goes over all bits of a key
+    ordered, order = torch.sort(keys.short() if below <= 2**15 else keys, stable=True)
+    return ordered.int(), order
+
+
 def lay_out(fake: torch.Tensor, real: torch.Tensor, weights: torch.Tensor) -> Layout:
     """Lay out the rows of critics that have some of both sides.
 
@@ -46,18 +54,19 @@ def lay_out(fake: torch.Tensor, real: torch.Tensor, weights: torch.Tensor) -> La
         weights: Of each class, float32 (C,).
     """
     critics, sides, device = len(weights), len(fake) + len(real), weights.device
-    number, end = (torch.empty(2, critics, dtype=torch.int32, device=device) for _ in range(2))
-    _launch(_critics.count_rows, [fake, real], [number])
-    _launch(_critics.lay_out, [number], [end])
+    number, size = (torch.empty(2, critics, dtype=torch.int32, device=device) for _ in range(2))
+    keys, row = in_order(torch.cat([2 * fake, 2 * real + 1]), below=2 * critics + 2)
+    _launch(_rows.count_rows, [keys], [number, size], over=weights[None])
+    end = size.cumsum(1, dtype=torch.int32)
 
     def preset(size: int, value: int) -> torch.Tensor:
         return torch.full((size,), value, dtype=torch.int32, device=device)
 
-    size = sides + len(fake)
-    order, of, place = preset(size, -1), preset(size, critics), preset(len(fake), -1)
-    gain, held = (torch.zeros(n, device=device) for n in (size, len(fake)))
+    whole = sides + len(fake)
+    order, of, place = preset(whole, -1), preset(whole, critics), preset(len(fake), -1)
+    gain, held = (torch.zeros(n, device=device) for n in (whole, len(fake)))
     outputs = [order, of, gain, place, held]
-    _launch(_critics.place_rows, [fake, real, number, end, weights], outputs, over=order[None], size=sides)
+    _launch(_rows.place_rows, [keys, row, number, end, weights], outputs, over=keys[None])
     return Layout(number, end, order, of, gain, place, held, sides)
 
 
@@ -67,7 +76,7 @@ def gather(
     """Return all rows in order, (R, K) of `dtype`; `share` (N, 1) is that of the fake one half way."""
     rows = torch.empty(len(layout.order), fake.shape[1], dtype=dtype, device=fake.device)
     inputs = [fake, real, share, layout.order, layout.of, layout.number]
-    _launch(_layers(rows).gather, inputs, [rows])
+    _launch(_layers(rows).gather, inputs, [_words(rows)], size=rows.shape[1] // 4)
     return rows
 
 
@@ -76,7 +85,7 @@ def pace(
 ) -> tuple[torch.Tensor, torch.Tensor]:
     """Count a step of the critics that have rows in `steps` (C,); return their rates and corrections."""
     rates, correction = torch.empty_like(steps), torch.empty_like(steps)
-    _launch(_critics.pace, [layout.number, rate.view(1), decay], [steps, rates, correction], over=steps[None])
+    _launch(_rows.pace, [layout.number, rate.view(1), decay], [steps, rates, correction], over=steps[None])
     return rates, correction
 
 
@@ -127,21 +136,32 @@ def half_way(values: torch.Tensor, layout: Layout, dtype: torch.dtype) -> torch.
     return out
 
 
-def penalise(gradient: torch.Tensor, layout: Layout, rows: torch.Tensor, *, penalty: float) -> torch.Tensor:
-    """Return the derivative of the penalty by the gradient (N, K), and set `rows` half way to it."""
+def penalise(gradient: torch.Tensor, layout: Layout, rows: torch.Tensor) -> torch.Tensor:
+    """Return half the derivative of the mean square by the gradient (N, K), and set `rows` half way to it."""
     out = torch.empty_like(gradient)
-    inputs = [gradient, layout.place, layout.held, penalty]
-    _launch(_layers(gradient).penalise, inputs, [out, rows])
+    inputs = [_words(gradient), layout.place, layout.held]
+    _launch(_layers(gradient).penalise, inputs, [_words(out), _words(rows)], size=gradient.shape[1] // 4)
     return out
 
 
 def again_first(
-    product: torch.Tensor, total: torch.Tensor, layout: Layout, hidden: torch.Tensor, *, slope: float
-) -> torch.Tensor:
-    """Return a product (N, J) times the slopes of the first layer, and set `hidden` half way to it."""
-    out = torch.empty_like(product)
-    _launch(_layers(product).again_first, [product, total, layout.place, slope], [out, hidden])
-    return out
+    product: torch.Tensor,
+    total: torch.Tensor,
+    by_total: torch.Tensor,
+    layout: Layout,
+    hidden: torch.Tensor,
+    *,
+    slope: float,
+    penalty: float,
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """Return a product (N, J) times the slopes of the first layer, and set `hidden` half way to it.
+
+    Also the terms of the mean squared gradient, float32 (N, J).
+    """
+    out, square = torch.empty_like(product), torch.empty_like(product, dtype=torch.float32)
+    inputs = [product, total, by_total, layout.place, slope, penalty]
+    _launch(_layers(product).again_first, inputs, [out, hidden, square])
+    return out, square
 
 
 def again_second(
@@ -152,12 +172,18 @@ def again_second(
 
 
 def weigh(
-    second: torch.Tensor, by_first: torch.Tensor, by_second: torch.Tensor, layout: Layout, *, slope: float
+    second: torch.Tensor,
+    by_first: torch.Tensor,
+    by_second: torch.Tensor,
+    layout: Layout,
+    *,
+    slope: float,
+    penalty: float,
 ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
     """Return the left rows of both layers' gradients, and the terms of the third's but for rows half way."""
     order, gain, between = layout.order, layout.gain, layout.sides
     left_first, left_second, last = (torch.empty_like(v) for v in (by_first, by_second, second))
-    _launch(_critics.weigh_first, [by_first, order, gain, between], [left_first])
+    _launch(_critics.weigh_first, [by_first, order, gain, between, penalty], [left_first])
     _launch(_critics.weigh_second, [second, by_second, order, gain, between, slope], [left_second, last])
     return left_first, left_second, last
 
@@ -166,8 +192,12 @@ def sum_rows(values: torch.Tensor, layout: Layout, *, between: bool) -> torch.Te
     """Return the sum over each critic's rows, (C, J), with or without those half way."""
     out = torch.empty(layout.end.shape[1], values.shape[1], device=values.device)
     before = len(layout.order) if between else layout.sides
-    _launch(_critics.sum_rows, [values, layout.order, layout.end, before], [out])
+    _launch(_rows.sum_rows, [values, layout.order, layout.end, before], [out])
     return out
+
+
+def _words(rows: torch.Tensor) -> torch.Tensor:
+    return rows.view(torch.int32)
 
 
 def _layers(rows: torch.Tensor) -> SimpleNamespace:
@@ -202,9 +232,10 @@ def move_critics(
         tiny: Added to the root of the mean square.
     """
     half = right.dtype == torch.bfloat16
-    inputs = [left, right.view(torch.int32), end, rate, correction, decay, tiny]
-    tiles = weight.view(weight.shape[0], -1, _bank.TILE**2)[..., 0]
-    _launch(_bank.adam[half], inputs, [weight, square, copy.view(torch.int32)], over=tiles)
+    inputs = [left, _words(right), end, rate, correction, decay, tiny]
+    outputs = [weight.flatten(0, 1), square.flatten(0, 1), _words(copy).flatten(0, 1)]
+    strips = -(-weight.shape[1] // (_bank.TILE * _bank.STRIP)) * weight.shape[2] // _bank.TILE
+    _launch(_bank.adam[half], inputs, outputs, over=rate[:, None], size=strips)
 
 
 def move_sums(
@@ -219,3 +250,24 @@ def move_sums(
 ) -> None:
     """Move weights by Adam without momentum along a gradient, all float32 (C, J); see `move_critics`."""
     _launch(_bank.adam_of, [gradient, rate, correction, decay, tiny], [weight, square], over=gradient)
+
+
+def spread(rows: torch.Tensor, weights: torch.Tensor, end: torch.Tensor) -> torch.Tensor:
+    """Multiply the few rows of each critic with its weights.
+
+    Args:
+        rows: bfloat16 (R, K), the rows of critic 0 first; K is a multiple of 4.
+        weights: bfloat16 (C, K, N), contiguous; N is a multiple of 4.
+        end: Where the rows of each critic end, int32 (C,).
+
+    Returns:
+        bfloat16 (R, N), anything in rows behind the last critic's.
+    """
+    out = torch.empty(len(rows), weights.shape[2], dtype=rows.dtype, device=rows.device)
+    parts = torch.empty_like(end)
+    _launch(_bank.count_parts, [end], [parts], over=parts[None])
+    most = len(rows) // _bank.ROWS + len(end)
+    inputs = [_words(rows), _words(weights).flatten(0, 1), end, parts.cumsum(0, dtype=torch.int32)]
+    each = end.new_empty(1).expand(most, weights.shape[2] // _bank.TILE)
+    _launch(_bank.spread, inputs, [_words(out)], over=each)
+    return out

@@ -1,14 +1,15 @@
-"""What a bank of critics does between its products: rows in order, layers, and what follows from them.
+"""What a bank of critics does between its products: layers, and what follows from them.
 
 Every kernel stands for a dozen small ones of a tensor library, which a critic step would spend a quarter of
-its time on. Rows lie critic by critic, each critic's in the order fake, real, half way between; behind them
-lie rows of no critic, whose class is the number of critics, and whose values are 0.
+its time on. Rows lie as `dase.kernels.rows` lays them out; values of rows of no critic are 0.
 """
 
 # no postponed annotations: those of the kernels made here name types of the functions around them
 from types import SimpleNamespace
 
 import warp as wp
+
+from dase.kernels.quads import read, words
 
 wp.set_module_options({"enable_backward": False})
 
@@ -23,141 +24,6 @@ def leaky(x: float, slope: float) -> float:
 def incline(x: float, slope: float) -> float:
     """Slope of the leaky rectifier."""
     return wp.where(x > 0.0, 1.0, slope)
-
-
-@wp.func
-def class_of(fake: wp.array[wp.int64], real: wp.array[wp.int64], i: int) -> int:
-    """Return the class of the i-th row, fake ones first."""
-    if i < fake.shape[0]:
-        return int(fake[i])
-    return int(real[i - fake.shape[0]])
-
-
-@wp.kernel
-def count_rows(
-    first: int,
-    # in
-    fake: wp.array[wp.int64],  # (N,) class of each row, C for none
-    real: wp.array[wp.int64],  # (M,)
-    # out
-    number: wp.array2d[int],  # (2, C) rows of each class, fake and real
-):
-    """Count the rows of both sides."""
-    side, i = wp.tid()
-    c = wp.int64(i + first)
-    found = int(0)
-    if side == 0:
-        for n in range(fake.shape[0]):
-            found += wp.where(fake[n] == c, 1, 0)
-    else:
-        for n in range(real.shape[0]):
-            found += wp.where(real[n] == c, 1, 0)
-    number[side, i + first] = found
-
-
-@wp.func
-def pairs_of(number: wp.array2d[int], c: int) -> int:
-    """Rows half way: one for each pair of a fake and a real one."""
-    return wp.min(number[0, c], number[1, c])
-
-
-@wp.func
-def rows_of(number: wp.array2d[int], c: int) -> int:
-    """Rows of a critic; without rows of both sides it has none."""
-    pairs = pairs_of(number, c)
-    return wp.where(pairs > 0, number[0, c] + number[1, c] + pairs, 0)
-
-
-@wp.kernel
-def lay_out(
-    first: int,
-    # in
-    number: wp.array2d[int],  # (2, C)
-    # out
-    end: wp.array2d[int],  # (2, C) where a critic's rows end, among all and among those half way
-):
-    """Find where the rows of each critic end."""
-    side, i = wp.tid()
-    i += first
-    total = int(0)
-    for c in range(i + 1):
-        total += wp.where(side == 0, rows_of(number, c), pairs_of(number, c))
-    end[side, i] = total
-
-
-@wp.kernel
-def place_rows(
-    first: int,
-    # in
-    fake: wp.array[wp.int64],  # (N,) class of each row, C for none
-    real: wp.array[wp.int64],  # (M,)
-    number: wp.array2d[int],  # (2, C)
-    end: wp.array2d[int],  # (2, C)
-    weights: wp.array[float],  # (C,)
-    # out, preset for rows of no critic
-    order: wp.array[int],  # (R,) which row lies here: fake, then real, then half way; -1
-    of: wp.array[int],  # (R,) its critic; C
-    gain: wp.array[float],  # (R,) derivative of the loss by its score; 0
-    place: wp.array[int],  # (N,) where the rows half way lie, critic by critic; -1
-    held: wp.array[float],  # (N,) what they weigh in the penalty; 0
-):
-    """Give every row its place; the i-th fake row of a class is paired with its i-th real one."""
-    _, i = wp.tid()
-    i += first
-    fakes = fake.shape[0]
-    is_fake = i < fakes
-    c = class_of(fake, real, i)
-    if c >= number.shape[1]:
-        return
-    pairs = pairs_of(number, c)
-    if pairs == 0:
-        return
-    begin = end[0, c] - rows_of(number, c)
-    rank = int(0)
-    if is_fake:
-        for n in range(i):
-            rank += wp.where(fake[n] == fake[i], 1, 0)
-        order[begin + rank] = i
-        of[begin + rank] = c
-        gain[begin + rank] = weights[c] / float(number[0, c])
-        if rank < pairs:
-            here = begin + number[0, c] + number[1, c] + rank
-            order[here] = fakes + real.shape[0] + i
-            of[here] = c
-            slot = end[1, c] - pairs + rank
-            place[slot] = here
-            held[slot] = weights[c] / float(pairs)
-    else:
-        mine = i - fakes
-        for n in range(mine):
-            rank += wp.where(real[n] == real[mine], 1, 0)
-        here = begin + number[0, c] + rank
-        order[here] = i
-        of[here] = c
-        gain[here] = -weights[c] / float(number[1, c])
-
-
-@wp.kernel
-def pace(
-    first: int,
-    # in
-    number: wp.array2d[int],  # (2, C)
-    rate: wp.array[float],  # (1,) learning rate
-    decay: float,  # of the mean square
-    # inout
-    steps: wp.array[float],  # (C,) that each critic has made
-    # out
-    rates: wp.array[float],  # (C,) 0 for critics without rows
-    correction: wp.array[float],  # (C,) 1 / (1 - decay^steps)
-):
-    """Count the step of the critics that make one."""
-    _, c = wp.tid()
-    c += first
-    moves = pairs_of(number, c) > 0
-    made = steps[c] + wp.where(moves, 1.0, 0.0)
-    steps[c] = made
-    rates[c] = wp.where(moves, rate[0], 0.0)
-    correction[c] = 1.0 / (1.0 - wp.pow(decay, wp.max(made, 1.0)))
 
 
 @wp.kernel
@@ -179,8 +45,11 @@ def score(
     c = of[r]
     if c < last.shape[0]:
         total = bias[c, 0]
-        for j in range(second.shape[1]):
-            total += last[c, j] * leaky(second[r, j], slope)
+        for j in range(0, second.shape[1], 4):
+            value = read(second, r, j)
+            for n in range(4):
+                value[n] = leaky(value[n], slope)
+            total += wp.dot(read(last, c, j), value)
     out[r] = total
 
 
@@ -192,13 +61,14 @@ def weigh_first(
     order: wp.array[int],  # (R,)
     gain: wp.array[float],  # (R,)
     between: int,  # rows from this one on are half way
+    penalty: float,
     # out
     left: wp.array2d[float],  # (R, J)
 ):
     """Make the left rows of the first layer's gradient."""
     r, j = wp.tid()
     j += first
-    left[r, j] = by_first[r, j] * wp.where(order[r] >= between, 1.0, gain[r])
+    left[r, j] = by_first[r, j] * wp.where(order[r] >= between, 2.0 * penalty, gain[r])
 
 
 @wp.kernel
@@ -222,33 +92,10 @@ def weigh_second(
     last[r, j] = leaky(second[r, j], slope) * gain[r]
 
 
-@wp.kernel
-def sum_rows(
-    first: int,
-    # in
-    values: wp.array2d[float],  # (R, J)
-    order: wp.array[int],  # (R,)
-    end: wp.array2d[int],  # (2, C)
-    before: int,  # rows from this one on are left out
-    # out
-    out: wp.array2d[float],  # (C, J)
-):
-    """Sum up the rows of each critic, one after the other."""
-    c, j = wp.tid()
-    j += first
-    begin = int(0)
-    if c > 0:
-        begin = end[0, c - 1]
-    total = float(0.0)
-    for r in range(begin, end[0, c]):
-        if order[r] < before:
-            total += values[r, j]
-    out[c, j] = total
-
-
 def _layers(half: bool) -> SimpleNamespace:
     """Return the kernels that read or write rows in the type of the products, bfloat16 or float32."""
     Number = wp.bfloat16 if half else wp.float32
+    get, put = words[half]
 
     @wp.kernel(enable_backward=False, module="unique")
     def gather(
@@ -261,25 +108,25 @@ def _layers(half: bool) -> SimpleNamespace:
         of: wp.array[int],  # (R,)
         number: wp.array2d[int],  # (2, C)
         # out
-        rows: wp.array2d[Number],  # (R, K)
+        rows: wp.array2d[int],  # (R, K) as words
     ):
         """Put all rows in order."""
         r, k = wp.tid()
-        k += first
+        k = 4 * (k + first)
         i = order[r]
         fakes = fake.shape[0]
         sides = fakes + real.shape[0]
-        value = float(0.0)
+        value = wp.vec4()
         if i >= sides:
             # real rows of a critic lie as far before those half way as there are
             partner = order[r - number[1, of[r]]] - fakes
-            value = real[partner, k]
-            value += share[i - sides, 0] * (fake[i - sides, k] - value)
+            value = read(real, partner, k)
+            value += share[i - sides, 0] * (read(fake, i - sides, k) - value)
         elif i >= fakes:
-            value = real[i - fakes, k]
+            value = read(real, i - fakes, k)
         elif i >= 0:
-            value = fake[i, k]
-        rows[r, k] = Number(value)
+            value = read(fake, i, k)
+        put(rows, r, k, value)
 
     @wp.kernel(enable_backward=False, module="unique")
     def first_layer(
@@ -370,23 +217,22 @@ def _layers(half: bool) -> SimpleNamespace:
     def penalise(
         first: int,
         # in
-        gradient: wp.array2d[Number],  # (N, K) of the scores by the rows half way
+        gradient: wp.array2d[int],  # (N, K) of the scores by the rows half way, as words
         place: wp.array[int],  # (N,)
         held: wp.array[float],  # (N,)
-        penalty: float,
         # out
-        by_gradient: wp.array2d[Number],  # (N, K) derivative of the loss by it
-        rows: wp.array2d[Number],  # (R, K) set to it where these rows lie
+        by_gradient: wp.array2d[int],  # (N, K) half the derivative of the mean square by it, as words
+        rows: wp.array2d[int],  # (R, K) set to it where these rows lie, as words
     ):
-        """Differentiate the penalty; its rows are the right ones of the first layer's gradient."""
+        """Differentiate the mean square; its rows are the right ones of the first layer's gradient."""
         n, k = wp.tid()
-        k += first
-        value = float(0.0)
+        k = 4 * (k + first)
+        value = wp.vec4()
         p = place[n]
         if p >= 0:
-            value = 2.0 * penalty * held[n] * float(gradient[n, k])
-            rows[p, k] = Number(value)
-        by_gradient[n, k] = Number(value)
+            value = held[n] * get(gradient, n, k)
+            put(rows, p, k, value)
+        put(by_gradient, n, k, value)
 
     @wp.kernel(enable_backward=False, module="unique")
     def again_first(
@@ -394,21 +240,28 @@ def _layers(half: bool) -> SimpleNamespace:
         # in
         product: wp.array2d[Number],  # (N, J)
         total: wp.array2d[float],  # (R, J) sums of the first layer
+        by_total: wp.array2d[float],  # (R, J) derivative of the scores by them
         place: wp.array[int],  # (N,)
         slope: float,
+        penalty: float,
         # out
         out: wp.array2d[Number],  # (N, J)
         hidden: wp.array2d[Number],  # (R, J) set to it where these rows lie
+        square: wp.array2d[float],  # (N, J) terms of the mean squared gradient
     ):
         """Go through the first layer once more with the penalty's derivative."""
         n, j = wp.tid()
         j += first
         value = float(0.0)
+        term = float(0.0)
         p = place[n]
         if p >= 0:
-            value = float(product[n, j]) * incline(total[p, j], slope)
+            # the gradient is the weights' transpose times by_total, so this sums up to its square
+            term = float(product[n, j]) * by_total[p, j]
+            value = 2.0 * penalty * float(product[n, j]) * incline(total[p, j], slope)
             hidden[p, j] = Number(value)
         out[n, j] = Number(value)
+        square[n, j] = term
 
     @wp.kernel(enable_backward=False, module="unique")
     def again_second(

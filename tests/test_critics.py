@@ -175,6 +175,21 @@ def test_grouped_products_and_order(rng):
             close(got[n], rows[row] @ weights[critic])
 
 
+@pytest.mark.parametrize("rows", [(3, 0, 1, 9, 4, 0), (0, 0, 5, 0), (1,), (17,)])
+def test_few_rows_are_spread_over_columns(rng, device, rows):
+    end = torch.tensor(np.cumsum(rows), dtype=torch.int32)
+    many = int(end[-1]) + 5  # some of no critic
+    left = torch.from_numpy(rng.normal(size=(many, 24))).bfloat16()
+    weights = torch.from_numpy(rng.normal(size=(len(rows), 24, 40))).bfloat16()
+    name = "cuda" if "cuda" in device else "cpu"
+    got = bridge.spread(left.to(name), weights.to(name), end.to(name)).cpu().float()
+    begin = 0
+    for critic, stop in enumerate(end.tolist()):
+        want = left[begin:stop].float() @ weights[critic].float()
+        torch.testing.assert_close(got[begin:stop], want, rtol=0.01, atol=1e-4)
+        begin = stop
+
+
 def test_traffic_counts_what_has_to_move():
     bank = CriticBank(BankShape(classes=2, inputs=16, wide=8, narrow=8))
     assert bank.traffic(1) == 8 * (16 + 8) * (3 * 2 + 4 * 4 + 2)

@@ -15,8 +15,8 @@ ARCH = 90
 """Compute capability that is compiled for: H100 and H200."""
 
 MODULES = (
-    "bank", "between", "blur", "critics", "events", "patches", "probes", "readout", "scene", "scene_gradient",
-    "scenery", "surrogates", "trials",
+    "bank", "between", "blur", "critics", "events", "patches", "probes", "readout", "rows", "scene",
+    "scene_gradient", "scenery", "surrogates", "trials",
 )  # fmt: skip
 """Those whose kernels are not made by functions."""
 
