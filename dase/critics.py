@@ -12,7 +12,7 @@ import torch
 from dase.kernels import autograd_critics as bridge
 from dase.networks import SLOPE
 
-FEW = 8
+FEW = 4
 """Rows of a critic, in the mean, up to which a kernel of our own is faster than PyTorch's grouped product:
 with 2 of them that reads the weights at 45 % of a copy on an H200, since its tiles are for many."""
 

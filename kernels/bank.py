@@ -15,7 +15,7 @@ wp.set_module_options({"enable_backward": False})
 TILE = 4
 """A thread works on TILE x TILE weights at a time."""
 
-STRIP = 4
+STRIP = 8
 """So many times, one tile below the other."""
 
 ROWS = 4
