@@ -41,6 +41,9 @@ AGAIN = 2
 SURELY = 0.8
 """Its training loss, relative to that of the finalist with the least held-out error."""
 
+IDLE = 0.01
+"""Share of what a bus can send below which it is no candidate: it would lose less than that."""
+
 REPEATS = 30
 """Simulations with other seeds by which a finalist is judged."""
 
@@ -91,7 +94,7 @@ def prepared(evidence: Evidence, effect: type[Effect]) -> list[Effect]:
 
     No descent finds the frequency of a lamp or the ticks of a clock, but they can be seen, as can the rate of
     a bus where it is full. Where no regularity is seen in the time stamps, the effects that make one are not
-    tried.
+    tried; nor is a bus that is known to be free nearly always.
     """
     structure = evidence.structure
     if effect is Flicker:
@@ -101,6 +104,8 @@ def prepared(evidence: Evidence, effect: type[Effect]) -> list[Effect]:
     if effect is RowScan:
         return [RowScan(line=structure.line, direction=structure.direction)] if structure.line else []
     if effect is Readout:
+        if evidence.busiest < IDLE * evidence.fastest:
+            return []
         # events come as fast as the bus can send them, if it ever was full
         return [replace(e, rate=evidence.busiest) for e in variants(effect) if isinstance(e, Readout)]
     return variants(effect)

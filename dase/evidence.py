@@ -20,7 +20,7 @@ from dase.probes import compared, peak_of, precise, statistics, tolerance, zones
 from dase.scene import Scene
 from dase.space import Space
 from dase.stimulus import MASKED, Grid, Stimulus, Trust, band_edges, light_of, sort_into_cells
-from dase.structure import Structure, find
+from dase.structure import FILE, Structure, find
 from dase.sums import Frame, Sums, without
 from dase.together import Ask, Work, alone, simulated
 from dase.trials import Trials, finer_steps
@@ -164,6 +164,7 @@ class Evidence:
         structure: Regularities of the time stamps.
         peak: Frequency at which the rate swings most [Hz].
         busiest: Most events per second of all pixels [Hz].
+        fastest: Events per second that a bus, if there is one, can send at least [Hz].
         notes: What the data cannot show.
     """
 
@@ -174,6 +175,7 @@ class Evidence:
     structure: Structure
     peak: float
     busiest: float
+    fastest: float
     notes: tuple[str, ...] = ()
 
     @property
@@ -258,7 +260,8 @@ def gather(
         # where the scene is trusted here and there only, nobody knows what all pixels send
         half.around = Surroundings(scene, _times(scene, grid), seed, device) if trust is None else None
     train, held, scout = halves
-    return Evidence(train, held, scout, bands, structure, peak, busiest(events), tuple(notes))
+    rates = busiest(events), fastest(events, structure)
+    return Evidence(train, held, scout, bands, structure, peak, *rates, tuple(notes))
 
 
 def common_grid(events: Events, scene: Scene) -> Grid:
@@ -289,6 +292,15 @@ def busiest(events: Events) -> float:
     """Return the most events per second [Hz]: the rate of a bus, if it ever was full for long enough."""
     counts = np.bincount(((events.t - events.t[0]) / BUSY).astype(np.int64))
     return float(counts.max()) / BUSY
+
+
+def fastest(events: Events, structure: Structure) -> float:
+    """Return the events per second that a bus can send at least [Hz], as it has sent some as fast as that."""
+    if structure.line:
+        return 0.0  # stamps tell when a line was read
+    slack = max(FILE, structure.step)
+    runs = (2**n for n in range(13) if 2**n < len(events))
+    return max((n / (float((events.t[n:] - events.t[:-n]).min()) + slack) for n in runs), default=0.0)
 
 
 def _times(scene: Scene, grid: Grid) -> NDArray[np.float64]:

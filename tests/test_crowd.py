@@ -15,10 +15,10 @@ from dase.effects import EFFECTS
 from dase.effects.readout import Others, Readout
 from dase.effects.row_scan import RowScan
 from dase.effects.stream import nanoseconds
-from dase.evidence import BUSY, gather
+from dase.evidence import BUSY, fastest, gather
 from dase.model import model_of
 from dase.sensor import Sensor
-from dase.structure import find, share_at
+from dase.structure import Structure, find, share_at
 from dase.together import Ask, simulated
 from dase.trials import Order
 
@@ -153,6 +153,20 @@ def test_the_rate_of_a_bus_that_was_full_is_seen(evidence):
     first = prepared(evidence, Readout)
     assert [e.mode for e in first] == ["delay", "drop"]
     assert all(abs(e.rate - BUS.rate) <= 1.01 / BUSY for e in first)
+
+
+def test_a_bus_is_no_candidate_where_it_is_known_to_be_free(evidence, rng):
+    count = 20_000
+    x, y = rng.integers(0, 50, (2, count), dtype=np.uint16)
+    apart = dase.Events(1e-5 * np.arange(count), x, y, x > 20, 50, 50)
+    assert fastest(apart, Structure()) == pytest.approx(1e5, rel=1e-3)  # the runs of 4096
+    bursts = replace(apart, t=np.repeat(0.02 * np.arange(20), 1000))
+    assert fastest(bursts, Structure()) == pytest.approx(512 / 1e-6)
+    # what shares a tick may have been sent at any time of it
+    assert fastest(bursts, Structure(step=1e-3)) == pytest.approx(512 / 1e-3)
+    assert fastest(bursts, Structure(line=1e-5)) == 0
+    assert evidence.fastest <= 1.2 * BUS.rate  # it was full
+    assert prepared(replace(evidence, fastest=200 * evidence.busiest), Readout) == []
 
 
 def test_a_bus_that_is_never_free_is_no_clock(rng):
