@@ -15,7 +15,7 @@ from reference_video import avi, chunk, titles
 
 import dase
 import dase.io
-from dase import video as module
+from dase import capture as module
 from dase.video import FrameReader, open_video
 
 
