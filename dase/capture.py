@@ -24,8 +24,8 @@ TITLES = re.compile(rb"LIST(.{4})INFO", re.DOTALL)
 """A list of titles in an AVI, with its length [bytes]."""
 LONGEST = 1 << 24
 """Bytes of titles that do no harm, whatever a damaged file claims."""
-KEPT = {b"vp90": 10} | dict.fromkeys(
-    (b"vp80", b"fmp4", b"mjpg", b"ffv1", b"hfyu", b"ffvh", b"mpng", b"rle ", b"dib ", b"avdn", b"apch"), 5
+KEPT = {b"vp90": 10, b"fmp4": 6} | dict.fromkeys(
+    (b"vp80", b"mjpg", b"ffv1", b"hfyu", b"ffvh", b"mpng", b"rle ", b"dib ", b"avdn", b"apch"), 5
 )
 """Frames that decoders keep at most, by the names that OpenCV has for them, in small letters."""
 KEPT_ELSE = 26
@@ -35,11 +35,16 @@ DEPTH = {b"I420": 1.5, b"Y800": 1, b"Y42B": 2, b"444P": 3, b"BGR\x18": 3, b"RGB\
 DEPTH_ELSE = 8
 UNKNOWN = b"\xff\xff\xff\xff"
 """The format before anything was decoded."""
-BESIDE = 17
-"""Bytes of a pixel beside the decoder: blue, green and red twice, as OpenCV has them, and grey of eleven
-frames."""
+TAKEN = 10
+"""Frames that are kept as grey at once, at least: of a byte per pixel each."""
+BESIDE = 7 + TAKEN
+"""Bytes of a pixel beside the decoder: blue, green and red twice, as OpenCV has them, and grey."""
 OPTIONS = "OPENCV_FFMPEG_CAPTURE_OPTIONS"
 """Environment variable with options of FFmpeg."""
+LOG_LEVEL = "OPENCV_FFMPEG_LOGLEVEL"
+"""Environment variable with the level of FFmpeg's messages."""
+QUIET = -8
+"""The level of none at all."""
 PIECE = 1 << 22
 """Bytes of a file that are looked at together."""
 FLOOR = 4 << 20
@@ -65,7 +70,7 @@ def opened(path: Path) -> Any:
 
 
 def _capture(path: Path, with_options: str | None = None) -> Any:
-    os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")  # says nothing of its own about damaged files
+    os.environ.setdefault(LOG_LEVEL, str(QUIET))  # says nothing of its own about damaged files
     # each thread of a decoder keeps frames of its own, and there would be as many as processors
     parameters = [cv2.CAP_PROP_N_THREADS, 1]
     before = os.environ.get(OPTIONS)
@@ -95,7 +100,7 @@ def _name(capture: Any, which: int) -> bytes:
 
 
 def needed(capture: Any) -> int:
-    """Return the bytes of memory that decoding takes at most, with some frames."""
+    """Return the bytes of memory that decoding takes at most, with `TAKEN` frames of it."""
     width, height = size_of(capture)
     kept = KEPT.get(_name(capture, cv2.CAP_PROP_FOURCC).lower(), KEPT_ELSE)
     format = _name(capture, cv2.CAP_PROP_CODEC_PIXEL_FORMAT)
@@ -160,14 +165,14 @@ def _at_once(most: int) -> Iterator[None]:
 def _silent() -> Iterator[None]:
     """Keep FFmpeg quiet, also where it was used before it could be told so by its environment."""
     library = _library()
-    level = 0 if library is None else library.av_log_get_level()
     if library is not None:
-        library.av_log_set_level(-8)
+        library.av_log_set_level(QUIET)
     try:
         yield
     finally:
-        if library is not None:
-            library.av_log_set_level(level)
+        wanted = os.environ.get(LOG_LEVEL, "")
+        if library is not None and wanted.lstrip("-").isdigit():
+            library.av_log_set_level(int(wanted))
 
 
 @lru_cache(maxsize=1)

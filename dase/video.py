@@ -116,7 +116,7 @@ class FrameReader:
         self.packed = sum(file.stat().st_size for file in self._files or [path])
         """Bytes of all files."""
         self.decoding = 0
-        """Bytes of memory that decoding takes at most."""
+        """Bytes of memory that decoding takes at most, beside the frames after the first `capture.TAKEN`."""
         self._first: tuple[int, ...] = ()
         self._count = len(self._files) if self._files is not None else self._count_frames()
         if self._count < 2:

@@ -80,21 +80,29 @@ def read(source: Source) -> Sequence:
     """Read all frames; times are None where nothing tells them."""
     with reading(source.path, "frames"):
         reader = _reader(source)
-        total = math.prod(reader.shape)
-        if total > LIMIT:
-            raise InputError(f"its frames need more than {LIMIT >> 30} GiB of memory: cut it into parts")
-        try:
-            refuse_bomb(reader.packed, total + reader.decoding, FRAMES_RATIO)
-        except InputError as error:
-            raise InputError(
-                f"{len(reader)} frames at once {error}; dase.io.pictures gives one by one"
-            ) from None
+        _refuse_many(reader)
         times = _times(source, reader)
-        frames = np.empty(reader.shape, np.uint8)  # filled as they come: they are never there twice
-        for k, levels in enumerate(reader.levels()):
-            frames[k] = levels
+        frames = np.empty(reader.shape, np.uint8)  # filled as they come: none is there twice
+        coming = reader.levels()
+        for k in range(len(frames)):
+            frames[k] = next(coming)
         height, width = reader.shape[1:]
         return Sequence(Events.empty(width, height), frames, None if np.isnan(times).any() else times)
+
+
+def _refuse_many(reader: FrameReader) -> None:
+    """Raise InputError where the frames would fill the memory, or are absurdly many for their file."""
+    from dase.capture import TAKEN
+
+    total = math.prod(reader.shape)
+    if total > LIMIT:
+        raise InputError(f"its frames need more than {LIMIT >> 30} GiB of memory: cut it into parts")
+    further = total // len(reader) * max(len(reader) - TAKEN, 0)
+    try:
+        refuse_bomb(reader.packed, max(total, reader.decoding + further), FRAMES_RATIO)
+    except InputError as error:
+        why = f"all {len(reader)} frames at once: {error}; dase.io.pictures gives one by one"
+        raise InputError(why) from None
 
 
 def _times(source: Source, reader: FrameReader) -> NDArray[np.float64]:
