@@ -23,8 +23,8 @@ BAND = 1 << 18
 """Pixels turned to grey at once: the numbers in between take little memory, and stay in the cache."""
 SHALLOW = frozenset(("1", "L", "LA", "P", "PA", "RGB", "RGBA", "RGBX", "CMYK", "YCbCr"))
 """Pillow's names of pixels whose values have 8 bits."""
-TAKEN = 12, 20
-"""Bytes that a pixel takes at most, of 8 and of 16 bits per value: on its way, as it is, as grey and alpha."""
+TAKEN = 13, 20
+"""Bytes that a pixel takes at most, of 8 and of 16 bits per value: decoded, as it is, as grey and alpha."""
 
 
 def list_pictures(folder: Path) -> list[Path]:
