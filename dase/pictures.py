@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -17,6 +18,13 @@ SUFFIXES = ("jpg", "jpeg", "png", "bmp", "tif", "tiff", "webp", "ppm", "pgm")
 """Picture files, whatever their case."""
 
 PNG = b"\x89PNG\r\n\x1a\n"
+TIFF = b"II*\0", b"MM\0*", b"II+\0", b"MM\0+"
+BAND = 1 << 18
+"""Pixels turned to grey at once: the numbers in between take little memory, and stay in the cache."""
+SHALLOW = frozenset(("1", "L", "LA", "P", "PA", "RGB", "RGBA", "RGBX", "CMYK", "YCbCr"))
+"""Pillow's names of pixels whose values have 8 bits."""
+TAKEN = 13, 20
+"""Bytes that a pixel takes at most, of 8 and of 16 bits per value: decoded, as it is, as grey and alpha."""
 
 
 def list_pictures(folder: Path) -> list[Path]:
@@ -24,11 +32,6 @@ def list_pictures(folder: Path) -> list[Path]:
     suffixed = (path for path in folder.rglob("*") if path.suffix.lower()[1:] in SUFFIXES and path.is_file())
     names = sorted(path.relative_to(folder).as_posix() for path in suffixed)
     return [folder / name for name in names if "/." not in f"/{name}"]
-
-
-def read_grey(path: Path) -> NDArray[np.float32]:
-    """Return the grey values of a file in [0, 1], shape (H, W)."""
-    return to_grey(decode(path))[0]
 
 
 def to_grey(pixels: NDArray[Any]) -> tuple[NDArray[np.float32], NDArray[np.float32] | None]:
@@ -42,9 +45,27 @@ def to_grey(pixels: NDArray[Any]) -> tuple[NDArray[np.float32], NDArray[np.float
     alpha = planes.pop() / full if len(planes) in (2, 4) else None
     weights = (0.07, 0.72, 0.21) if len(planes) == 3 else (1.0,)  # of BGR; S2R takes luma for intensity
     grey = np.zeros(planes[0].shape, np.float32)
-    for weight, plane in zip(weights, planes, strict=True):
-        grey += np.float32(weight) / full * plane
+    for band in _bands(grey.shape):
+        for weight, plane in zip(weights, planes, strict=True):
+            grey[band] += np.float32(weight) / full * plane[band]
     return grey, alpha
+
+
+def to_levels(pixels: NDArray[Any]) -> NDArray[np.uint8]:
+    """Return grey values in 0..255, shape (H, W), of pixels as `to_grey` takes them; needs no memory beside.
+
+    Args:
+        pixels: (H, W) or (H, W, channels), uint8 or uint16, BGR or BGRA.
+    """
+    out = np.empty(pixels.shape[:2], np.uint8)
+    for band in _bands(pixels.shape):
+        out[band] = np.rint(255 * to_grey(pixels[band])[0])
+    return out
+
+
+def _bands(shape: tuple[int, ...]) -> Iterator[slice]:
+    rows = max(1, BAND // max(1, shape[1]))
+    return (slice(top, top + rows) for top in range(0, shape[0], rows))
 
 
 def decode(path: Path) -> NDArray[Any]:
@@ -53,12 +74,64 @@ def decode(path: Path) -> NDArray[Any]:
         data = path.read_bytes()
     except OSError as error:
         raise InputError(f"images: cannot read '{path}': {error.strerror}") from error
-    pixels = unpack(data, cv2.IMREAD_UNCHANGED)
+    try:
+        pixels = None if head(data) is None else unpack(data, cv2.IMREAD_UNCHANGED)
+    except InputError as error:
+        raise InputError(f"images: cannot decode '{path}': {error}") from None
     if pixels is None:
         raise InputError(f"images: cannot decode '{path}': damaged, cut off or too large")
     if pixels.dtype not in (np.uint8, np.uint16):
         raise InputError(f"images: '{path}' must hold 8- or 16-bit values, holds {pixels.dtype}")
     return np.asarray(pixels)
+
+
+def head(data: bytes) -> tuple[int, int] | None:
+    """Return columns and rows of a picture as its head tells them, None where it is damaged.
+
+    Nothing is decoded. Raises InputError where a small file claims a picture of absurd size.
+
+    Args:
+        data: The content of a file.
+    """
+    from PIL import Image
+
+    from dase.io.source import refuse_bomb
+
+    size: tuple[int, int] | None
+    limit, Image.MAX_IMAGE_PIXELS = Image.MAX_IMAGE_PIXELS, None  # ours goes with the size of the file
+    try:
+        with Image.open(io.BytesIO(data)) as picture:
+            size = int(picture.size[0]), int(picture.size[1])
+            shallow = picture.mode in SHALLOW
+    except Exception:  # whatever Pillow makes of a damaged head
+        size, shallow = _tiff_size(data), False
+    finally:
+        Image.MAX_IMAGE_PIXELS = limit
+    if size is None:
+        return None
+    if data.startswith(PNG) and data[24:25] == b"\x10":
+        shallow = False
+    try:
+        refuse_bomb(len(data), TAKEN[not shallow] * size[0] * size[1])
+    except InputError as error:
+        raise InputError(f"a picture of {size[0]}x{size[1]} {error}") from None
+    return size
+
+
+def _tiff_size(data: bytes) -> tuple[int, int] | None:
+    """Return columns and rows of a TIFF that Pillow cannot decode, as of three colours of 16 bits."""
+    from PIL.TiffImagePlugin import IMAGELENGTH, IMAGEWIDTH, ImageFileDirectory_v2
+
+    if not data.startswith(TIFF):
+        return None
+    try:
+        tags = ImageFileDirectory_v2(data[: 16 if b"+" in data[2:4] else 8])
+        stream = io.BytesIO(data)
+        stream.seek(tags.next)
+        tags.load(stream)
+        return int(tags[IMAGEWIDTH]), int(tags[IMAGELENGTH])
+    except Exception:  # whatever Pillow makes of a damaged head
+        return None
 
 
 def unpack(data: bytes, how: int) -> NDArray[Any] | None:

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import os
-import re
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -12,22 +11,17 @@ import numpy as np
 import warp as wp
 from numpy.typing import ArrayLike, NDArray
 
+from dase.capture import bounded, needed, opened, pixel_format, refuse_titles, size_of
 from dase.errors import InputError
 from dase.kernels import pixel
 from dase.kernels.scene import interpolate
-from dase.pictures import list_pictures, quiet, read_grey, to_grey
+from dase.pictures import decode, list_pictures, to_grey, to_levels
 from dase.scene import Scene
 
 EPS = 1e-3
 """Added to intensities before the logarithm between frames; that of sensors unless they say otherwise."""
-TITLES = re.compile(rb"LIST(.{4})INFO", re.DOTALL)
-"""A list of titles in an AVI, with its length [bytes]."""
-LONGEST = 1 << 24
-"""Bytes of titles that do no harm, whatever a damaged file claims."""
-PLAIN = 0, int.from_bytes(b"BGR\x18", "little")
+PLAIN = bytes(4), b"BGR\x18"
 """Code and pixels of an uncompressed AVI: OpenCV 5.0 writes beyond its memory where it turns one over."""
-PIECE = 1 << 22
-"""Bytes of a file that are looked at together."""
 
 
 class VideoScene(Scene):
@@ -119,14 +113,20 @@ class FrameReader:
         self._capture: Any = None
         self._plain: tuple[int, int] | None = None
         self.rate = 0.0
+        self.packed = sum(file.stat().st_size for file in self._files or [path])
+        """Bytes of all files."""
+        self.decoding = 0
+        """Bytes of memory that decoding takes at most, beside the frames after the first `capture.TAKEN`."""
+        self._first: tuple[int, ...] = ()
         self._count = len(self._files) if self._files is not None else self._count_frames()
         if self._count < 2:
             raise InputError(f"video {path} must have at least 2 frames, got {self._count}")
         # the chunk before and the one asked for may overlap by the frames that are stored
         self._kept: dict[int, NDArray[np.float32]] = {}
         self._next = 0
-        self.shape: tuple[int, ...] = (self._count,)
-        self.shape = (self._count, *self[np.array([0])].shape[1:])
+        if self._files is not None:
+            self._first = decode(self._files[0]).shape[:2]
+        self.shape: tuple[int, ...] = (self._count, *(self._first if size is None else size[::-1]))
         self.ndim = 3
 
     def __len__(self) -> int:
@@ -136,7 +136,7 @@ class FrameReader:
         """Return the frames of increasing indices, intensity in [0, 1], shape (K, height, width)."""
         wanted = [int(i) for i in index]
         if self._files is not None:
-            return np.stack([self._grey(read_grey(self._files[i]), self._files[i]) for i in wanted])
+            return np.stack([self._grey(decode(self._files[i]), self._files[i]) for i in wanted])
         out = {i: self._kept[i] for i in wanted if i in self._kept}
         missing = [i for i in wanted if i not in out]
         if missing and missing[0] < self._next:
@@ -148,89 +148,82 @@ class FrameReader:
         self._kept = {i: out[i] for i in wanted}
         return np.stack([out[i] for i in wanted])
 
+    def levels(self) -> Iterator[NDArray[np.uint8]]:
+        """Yield all frames, 0 to 255, shape (height, width), not resized; little but a frame is kept."""
+        if self._files is not None:
+            for file in self._files:
+                yield to_levels(self._checked(decode(file), file))
+            return
+        capture = self._open()
+        for index in range(self._count):
+            yield to_levels(self._checked(self._next_of(capture, index), self._path))
+
     def _open(self) -> Any:
-        os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")  # says nothing of its own about damaged files
-        with quiet():  # FFmpeg alone: the others after it take as much memory as a damaged file asks for
-            capture = cv2.VideoCapture(str(self._path), cv2.CAP_FFMPEG)
-        if not capture.isOpened():
-            raise InputError(f"video {self._path} cannot be decoded")
+        capture = opened(self._path)
         if self._plain is not None:
             capture.set(cv2.CAP_PROP_FORMAT, -1)  # packets as they are
         return capture
 
     def _count_frames(self) -> int:
-        _refuse_titles(self._path)
+        refuse_titles(self._path)
         capture = self._open()
-        size = int(capture.get(cv2.CAP_PROP_FRAME_WIDTH)), int(capture.get(cv2.CAP_PROP_FRAME_HEIGHT))
-        _refuse_huge(self._path, size)
-        kind = int(capture.get(cv2.CAP_PROP_FOURCC)), int(capture.get(cv2.CAP_PROP_CODEC_PIXEL_FORMAT))
+        size = size_of(capture)
+        kind = pixel_format(capture)
         self._plain = size if kind == PLAIN else None
         self.rate = float(capture.get(cv2.CAP_PROP_FPS))
         if self._plain is not None:
             capture = self._open()
-        count = 0  # that in the header is often wrong
-        while capture.grab() if self._plain is None else self._read(capture) is not None:
+        frame = self._read(capture)
+        if frame is None:
+            return 0
+        self.decoding = needed(capture)
+        self._first, count = frame.shape[:2], 1  # the number in the header is often wrong
+        del frame
+        while self._grab(capture) if self._plain is None else self._read(capture) is not None:
             count += 1
         return count
 
+    def _grab(self, capture: Any) -> bool:
+        """Decode the next frame; what is far larger than the head of the file says cannot be decoded."""
+        with bounded(capture, self.packed):
+            return bool(capture.grab())
+
     def _read(self, capture: Any) -> NDArray[np.uint8] | None:
-        while True:
-            good, frame = capture.read()
+        while self._grab(capture):
+            good, frame = capture.retrieve()
             if good and self._plain is not None:
                 frame = _unpacked(capture, frame.ravel(), self._plain)
                 if frame is None:
                     continue  # a packet of a dropped frame is empty
             return frame if good else None
+        return None
+
+    def _next_of(self, capture: Any, index: int) -> NDArray[np.uint8]:
+        frame = self._read(capture)
+        if frame is None:
+            raise InputError(f"video {self._path}: frame {index} cannot be decoded")
+        return frame
 
     def _decode(self, index: int) -> NDArray[np.float32]:
         if self._capture is None:
             self._capture = self._open()
-        frame = self._read(self._capture)
-        if frame is None:
-            raise InputError(f"video {self._path}: frame {index} cannot be decoded")
+        frame = self._next_of(self._capture, index)
         self._next = index + 1
-        return self._grey(to_grey(frame)[0], self._path)
+        return self._grey(frame, self._path)
 
-    def _grey(self, grey: NDArray[np.float32], path: Path) -> NDArray[np.float32]:
-        if self._size is not None:
-            grey = cv2.resize(grey, self._size, interpolation=cv2.INTER_AREA)
-        want = self.shape[1:] or grey.shape
-        if grey.shape != want:
-            got = grey.shape
+    def _checked(self, pixels: NDArray[Any], path: Path) -> NDArray[Any]:
+        """Return pixels; raises InputError where their size is not that of the first frame."""
+        got, want = pixels.shape[:2], self._first
+        if got != want:
             sizes = f"{got[1]}x{got[0]}, the frames before {want[1]}x{want[0]}"
             raise InputError(f"video: all frames must have one size, {path} has {sizes}")
+        return pixels
+
+    def _grey(self, pixels: NDArray[Any], path: Path) -> NDArray[np.float32]:
+        if self._size is None:
+            return to_grey(self._checked(pixels, path))[0]
+        grey: NDArray[np.float32] = cv2.resize(to_grey(pixels)[0], self._size, interpolation=cv2.INTER_AREA)
         return grey
-
-
-def _refuse_titles(path: Path) -> None:
-    """Raise InputError where a list of titles in an AVI says that it is far longer than the file.
-
-    FFmpeg takes as much memory as such a list says, and fills it with zeros, before it reads what is there.
-    It follows damaged sizes to wherever they lead, so the list may lie anywhere.
-    """
-    length = path.stat().st_size
-    with path.open("rb") as file:
-        kept = file.read(12)
-        if kept[:4] not in (b"RIFF", b"ON2 "):
-            return
-        while more := file.read(PIECE):
-            kept += more
-            for found in TITLES.finditer(kept):
-                claimed = int.from_bytes(found[1], "little")
-                if claimed > max(length, LONGEST):
-                    sizes = f"{claimed:,} bytes of titles in a file of {length:,}"
-                    raise InputError(f"video {path} is damaged: it claims {sizes}")
-            kept = kept[-11:]  # all but one byte of what is looked for
-
-
-def _refuse_huge(path: Path, size: tuple[int, int]) -> None:
-    """Raise InputError where a small file says that it holds frames of an absurd size."""
-    from dase.io.source import refuse_bomb
-
-    try:
-        refuse_bomb(path.stat().st_size, 3 * size[0] * size[1])  # blue, green and red of one frame
-    except InputError as error:
-        raise InputError(f"video {path}: a frame of {size[0]}x{size[1]} {error}") from None
 
 
 def _unpacked(capture: Any, packet: NDArray[np.uint8], size: tuple[int, int]) -> NDArray[np.uint8] | None:

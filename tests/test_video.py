@@ -10,12 +10,12 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from reference_io import PEAK
+from reference_io import PEAK, measured
 from reference_video import avi, chunk, titles
 
 import dase
 import dase.io
-from dase import video as module
+from dase import capture
 from dase.video import FrameReader, open_video
 
 
@@ -147,7 +147,7 @@ def test_titles_far_longer_than_their_file_are_refused(tmp_path, rng, claimed, w
 
 @pytest.mark.parametrize("shift", range(12))
 def test_titles_are_found_wherever_a_piece_ends(tmp_path, rng, monkeypatch, shift):
-    monkeypatch.setattr(module, "PIECE", 64)
+    monkeypatch.setattr(capture, "PIECE", 64)
     grey, path = rng.integers(0, 256, (2, 6, 8), np.uint8), tmp_path / "a.avi"
     for more in range(64 // 12 + 1):
         padding = chunk(b"JUNK", bytes(2 * (shift + 12 * more)))
@@ -242,9 +242,103 @@ def test_good_videos_of_every_codec_open(tmp_path, suffix, code):
     np.testing.assert_allclose(got.frame_times, np.arange(3) / 25)
 
 
-@pytest.mark.parametrize(("suffix", "code"), [("avi", "MJPG"), ("mp4", "vp09")])
-def test_plain_frames_of_8k_open(tmp_path, suffix, code):
-    """One frame unpacks to 200 times the file and more: much, but no bomb."""
-    path = written(tmp_path / f"a.{suffix}", code, (7680, 4320), (90, 90))
-    assert path.stat().st_size * 150 < 3 * 7680 * 4320
+@pytest.mark.parametrize(
+    ("suffix", "code", "size"),
+    [
+        ("webm", "VP80", (3840, 2160)),
+        ("avi", "MJPG", (3840, 2160)),
+        ("webm", "VP90", (2560, 2556)),
+    ],
+)
+def test_the_largest_plain_frames_take_little_memory(tmp_path, suffix, code, size):
+    """Ten frames of 4K are a few kB of VP8: nothing but their size tells them from a good video."""
+    path = written(tmp_path / f"a.{suffix}", code, size, [0] * 10)
+    script = """
+import sys
+import dase.io, dase.video
+before = peak()
+shape = dase.io.read(sys.argv[1]).frames.shape
+print(*shape, peak() - before)
+"""
+    (line,) = measured(script, path)
+    *shape, grown = line.split()
+    assert shape == ["10", str(size[1]), str(size[0])]
+    assert float(grown) < 200
+
+
+@pytest.mark.parametrize(("suffix", "code"), [("webm", "VP80"), ("webm", "VP90")])
+def test_small_files_of_huge_frames_are_refused_before_decoding(tmp_path, suffix, code):
+    path = written(tmp_path / f"a.{suffix}", code, (8192, 4096), (0,))
+    script = """
+import sys
+import dase, dase.io, dase.video
+before = peak()
+for read in (dase.io.read, dase.video.open_video, lambda path: next(dase.io.pictures(path))):
+    try:
+        read(sys.argv[1])
+    except dase.InputError as error:
+        print(error)
+print(peak() - before)
+"""
+    *said, grown = measured(script, path)
+    assert len(said) == 3
+    sentence = r"a\.\w+: a frame of 8192x4096 unpacks from .* more than 100 times .*; such .* megapixels"
+    assert all(re.search(sentence, line) for line in said)
+    assert float(grown) < 48  # a frame alone is 48 MiB
+
+
+def test_large_files_of_huge_frames_open(tmp_path, rng):
+    """Frames of 8K with something on them are a hundredth of what decoding them takes, and more."""
+    path = tmp_path / "a.avi"
+    out = cv2.VideoWriter(str(path), cv2.CAP_FFMPEG, cv2.VideoWriter.fourcc(*"MJPG"), 25.0, (7680, 4320))
+    if not out.isOpened():
+        pytest.skip("this OpenCV writes no MJPG")
+    noise = cv2.resize(rng.integers(0, 256, (2160, 3840, 3), np.uint8), (7680, 4320))
+    for frame in (noise, noise):
+        out.write(frame)
+    out.release()
     assert FrameReader(path, (48, 27)).shape == (2, 27, 48)
+
+
+def test_more_frames_than_a_small_file_may_give_at_once_come_one_by_one(tmp_path, monkeypatch):
+    path = written(tmp_path / "a.webm", "VP80", (64, 48), [0] * 16)
+    assert dase.io.read(path).frames.shape == (16, 48, 64)
+    monkeypatch.setattr(dase.io.source, "BOMB_BYTES", 64 * 48 * 30)  # less than 24.5 and 6 further frames
+    monkeypatch.setattr(dase.io.frames, "FRAMES_RATIO", 10)
+    with pytest.raises(dase.InputError, match=r"all 16 frames at once: .* more than 10 times is refused"):
+        dase.io.read(path)
+    assert sum(1 for _ in dase.io.pictures(path)) == 16
+    assert len(FrameReader(path)) == 16
+    assert len(dase.io.read(written(tmp_path / "b.webm", "VP80", (64, 48), [0] * 15)).frames) == 15
+
+
+def grown_webm(small: bytes, large: bytes) -> bytes:
+    """Return a file of VP8 whose last frames are those of a larger video: its head tells the small size."""
+    cluster = b"\x1f\x43\xb6\x75"
+    last = large[large.index(cluster) :]
+    last = last[: last.index(b"\x1c\x53\xbb\x6b")] if b"\x1c\x53\xbb\x6b" in last else last
+    return small[: small.index(cluster)] + small[small.index(cluster) :].split(b"\x1c\x53\xbb\x6b")[0] + last
+
+
+def test_frames_far_larger_than_the_head_says_are_not_decoded(tmp_path):
+    """A frame of VP8 may change the size; OpenCV shrinks it, when FFmpeg has decoded it, without a word."""
+    if capture._library() is None:
+        pytest.skip("FFmpeg of this OpenCV cannot be told how much memory it may take")
+    small = written(tmp_path / "small.webm", "VP80", (320, 240), (40, 90)).read_bytes()
+    large = written(tmp_path / "large.webm", "VP80", (6000, 5000), (0,)).read_bytes()
+    path = tmp_path / "a.webm"
+    path.write_bytes(grown_webm(small, large))
+    script = """
+import sys
+import dase.io, dase.video
+from dase import capture
+before = peak()
+print(*dase.io.read(sys.argv[1]).frames.shape, peak() - before)
+capture.FLOOR = 1 << 30
+before = peak()
+print(*dase.io.read(sys.argv[1]).frames.shape, peak() - before)
+"""
+    bounded, free = (line.split() for line in measured(script, path))
+    assert bounded[:3] == ["2", "240", "320"]
+    assert float(bounded[3]) < 25
+    assert float(free[3]) > 30  # as without the bound

@@ -8,7 +8,7 @@ Nothing says how long such frames were exposed.
 
 from __future__ import annotations
 
-import io
+import math
 from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -18,57 +18,49 @@ from numpy.typing import NDArray
 
 from dase.errors import InputError
 from dase.events import Events
-from dase.io.format import Format, sequence_of, taken
+from dase.io.format import LIMIT, Format
 from dase.io.sequence import GREYS, Sequence, reading
 from dase.io.source import Picture, Source, checked_size, refuse_bomb
-from dase.pictures import SUFFIXES, unpack
+from dase.pictures import SUFFIXES, head, unpack
 
 if TYPE_CHECKING:
     from dase.video import FrameReader
 
 
-WIDEST = 8
-"""Bytes of a pixel, at most: red, green, blue and alpha of 16 bits."""
+FRAMES_RATIO = 1000
+"""How many times its size the frames of a file may take together: ten times what one alone may, as frames of
+a video repeat each other. Moving scenes stay far below."""
 
 
 def grey(data: bytes, name: str) -> NDArray[Any]:
     """Decode a picture to grey of 8 or 16 bits, (H, W); raises InputError where it is damaged or huge."""
     import cv2
-    from PIL import Image
 
     try:
-        with Image.open(io.BytesIO(data)) as picture:
-            width, height = checked_size(picture.size)
-            refuse_bomb(len(data), WIDEST * width * height)
+        size = head(data)
+        if size is not None:
+            checked_size(size)
     except InputError as error:
         raise InputError(f"{name}: {error}") from None
-    except Exception as error:  # whatever Pillow makes of a damaged head
-        raise InputError(f"{name}: cannot be decoded as a picture ({error})") from None
-    out = unpack(data, cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH)
+    out = None if size is None else unpack(data, cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH)
     if out is None or out.dtype not in GREYS:
         raise InputError(f"{name}: cannot be decoded as a picture of 8 or 16 bits, damaged or cut short")
     return np.asarray(out)
 
 
-def matches(path: Path, head: bytes) -> bool:
+def matches(path: Path, begin: bytes) -> bool:
     """Whether a file is a video, or a folder holds pictures."""
     if path.is_dir():
         return any(entry.suffix.lower()[1:] in SUFFIXES for entry in path.iterdir())
-    avi = head[:4] == b"RIFF" and head[8:12] == b"AVI "
-    return avi or head[4:8] == b"ftyp" or head.startswith(b"\x1aE\xdf\xa3")
+    avi = begin[:4] == b"RIFF" and begin[8:12] == b"AVI "
+    return avi or begin[4:8] == b"ftyp" or begin.startswith(b"\x1aE\xdf\xa3")
 
 
 def pictures(source: Source) -> Iterator[Picture]:
     """Yield the frames; times [s] are not a number where nothing tells them."""
     reader = _reader(source)
-    times = _times(source.path / "timestamps.txt", len(reader)) if source.path.is_dir() else None
-    if times is None and 0 < reader.rate < 1e7:
-        times = np.arange(len(reader)) / reader.rate
-    if times is None:
-        source.note("nothing tells the times of the frames", "assumed", "frames")
-        times = np.full(len(reader), np.nan)
-    for index, time in enumerate(times):
-        yield Picture(np.rint(255 * reader[np.array([index])][0]).astype(np.uint8), time)
+    for levels, time in zip(reader.levels(), _times(source, reader), strict=True):
+        yield Picture(levels, time)
 
 
 def _reader(source: Source) -> FrameReader:
@@ -87,14 +79,44 @@ def _shown(source: Source) -> Iterator[Picture]:
 def read(source: Source) -> Sequence:
     """Read all frames; times are None where nothing tells them."""
     with reading(source.path, "frames"):
-        found = taken(pictures(source))
-        height, width = found[0].grey.shape
-        return sequence_of(Events.empty(width, height), found)
+        reader = _reader(source)
+        _refuse_many(reader)
+        times = _times(source, reader)
+        frames = np.empty(reader.shape, np.uint8)  # filled as they come: none is there twice
+        coming = reader.levels()
+        for k in range(len(frames)):
+            frames[k] = next(coming)
+        height, width = reader.shape[1:]
+        return Sequence(Events.empty(width, height), frames, None if np.isnan(times).any() else times)
 
 
-def _times(path: Path, count: int) -> NDArray[np.float64] | None:
-    if not path.is_file():
-        return None
+def _refuse_many(reader: FrameReader) -> None:
+    """Raise InputError where the frames would fill the memory, or are absurdly many for their file."""
+    from dase.capture import TAKEN
+
+    total = math.prod(reader.shape)
+    if total > LIMIT:
+        raise InputError(f"its frames need more than {LIMIT >> 30} GiB of memory: cut it into parts")
+    further = total // len(reader) * max(len(reader) - TAKEN, 0)
+    try:
+        refuse_bomb(reader.packed, max(total, reader.decoding + further), FRAMES_RATIO)
+    except InputError as error:
+        why = f"all {len(reader)} frames at once: {error}; dase.io.pictures gives one by one"
+        raise InputError(why) from None
+
+
+def _times(source: Source, reader: FrameReader) -> NDArray[np.float64]:
+    """Return the times of the frames [s], not a number where nothing tells them, which is noted."""
+    listed = source.path / "timestamps.txt"
+    if source.path.is_dir() and listed.is_file():
+        return _listed(listed, len(reader))
+    if 0 < reader.rate < 1e7:
+        return np.arange(len(reader)) / reader.rate
+    source.note("nothing tells the times of the frames", "assumed", "frames")
+    return np.full(len(reader), np.nan)
+
+
+def _listed(path: Path, count: int) -> NDArray[np.float64]:
     rows = [line.split() for line in path.read_text("latin-1").splitlines() if line.split("#")[0].strip()]
     for k in (0, -1):
         try:

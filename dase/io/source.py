@@ -160,12 +160,11 @@ def checked_size(size: Size) -> Size:
     return size
 
 
-def refuse_bomb(packed: int, unpacked: int) -> None:
+def refuse_bomb(packed: int, unpacked: int, ratio: int = BOMB_RATIO) -> None:
     """Raise InputError where a small file claims to unpack to something absurd [bytes]."""
-    if unpacked > BOMB_BYTES and unpacked > BOMB_RATIO * packed:
+    if unpacked > BOMB_BYTES and unpacked > ratio * packed:
         raise InputError(
-            f"unpacks from {packed / 1e6:.3g} to {unpacked / 1e6:.0f} MB: "
-            f"more than {BOMB_RATIO} times is refused"
+            f"unpacks from {packed / 1e6:.3g} to {unpacked / 1e6:.0f} MB: more than {ratio} times is refused"
         )
 
 
