@@ -18,6 +18,7 @@ from dase.effects.timestamp import Timestamp
 from dase.error import Judgement, Scale
 from dase.evidence import Evidence, Half
 from dase.model import SETTLED, Model, added, settling, starts
+from dase.race import Race
 from dase.space import variants
 from dase.together import Ask, Work, alone, beside, together
 
@@ -27,31 +28,35 @@ FINALISTS = 4
 """Candidates that are fitted to all pixels of the training half."""
 
 FOLLOWED = 8
-"""Candidates whose events go through a readout are followed only where a look puts them among so many: they
-take ten times as long, and where something else is missing as well, their turn comes."""
+"""Candidates that are followed where a look shows one clearly ahead: the turn of the others comes. Of those
+whose events go through a readout, which takes ten times as long, no more are ever followed."""
 
-LAGS = 1.1
-"""A search that hardly gets better is stopped where its loss is above this, relative to that of the last
-candidate that goes on, or of another search of its own."""
-
-STALLS = 0.95
-"""A search hardly gets better where a population leaves more than this of its loss."""
+CLEAR = 0.6
+"""Loss of such a one, relative to that of the present model."""
 
 SECOND = 1.25
 """A second start is followed where its loss is below this, relative to the first."""
 
-BEHIND = 2.0
+BEHIND = 1.5
 """A finalist goes on where its error before the last fit is at most this times the best's, and `CLOSE`."""
 
 CLOSE = 1.0
 """Such an error that is added to the limit, for errors near the floor say little."""
 
 LOSES = 1.6
-"""A finalist that hardly gets better is fitted no further where its loss is above this, relative to that of
-the best."""
+"""A finalist is fitted no further where its loss will not come below this, relative to that of the best."""
+
+GIVES_UP = 2.0
+"""The same before each finalist has sampling errors of its own, by which it may look better."""
 
 AGAIN = 2
 """Times at most that a finalist is fitted further whose training loss is least but not its held-out error."""
+
+FAR = 3.0
+"""A finalist whose error before the last fit is above this is judged by `FEW` simulations."""
+
+FEW = 12
+"""Simulations by which models are judged that are far from the floor."""
 
 SURELY = 0.8
 """Its training loss, relative to that of the finalist with the least held-out error."""
@@ -91,33 +96,6 @@ class Tried:
     def error(self) -> float:
         """The held-out error, NaN where it was only screened."""
         return self.judged.error if self.judged else float("nan")
-
-
-@dataclass(frozen=True, eq=False)
-class Race:
-    """Searches side by side of which a few go on: those that are behind and hardly get better may stop.
-
-    Args:
-        places: Candidates that go on.
-        lags: Loss of one that is behind, relative to that of the last of those.
-        best: The least loss of each candidate so far.
-    """
-
-    places: int
-    lags: float
-    best: dict[str, float] = field(default_factory=dict)
-
-    def over(self, name: str, unit: float = 1.0) -> Over:
-        """Return what one search of a candidate asks, whose loss is divided by `unit`."""
-
-        def over(loss: float, before: float) -> bool:
-            mine = loss / unit
-            self.best[name] = min(mine, self.best.get(name, np.inf))
-            first = sorted(self.best.values())[: self.places]
-            last = first[-1] if len(first) == self.places else np.inf
-            return loss > STALLS * before and (mine > self.lags * last or mine > LAGS * self.best[name])
-
-        return over
 
 
 Report = Callable[[str, float], None]
@@ -199,13 +177,23 @@ def looking(evidence: Evidence, present: Model, effect: Effect, *, seed: int) ->
     return Look(effect, model, half, before[0], places, losses)
 
 
+def scout(evidence: Evidence, present: Model, effect: Effect, *, seed: int) -> Tried:
+    """Try one effect on some pixels: a look at many places, then a short descent from the best two."""
+    look = alone(looking(evidence, present, effect, seed=seed))
+    return alone(following(look, Race(1), seed=seed))
+
+
 def followed(looks: Sequence[Look]) -> list[Look]:
     """Return those looks from which a descent is worth its time."""
-    names: dict[str, float] = {}
+    best: dict[str, float] = {}
     for look in looks:
-        names[look.effect.name] = min(look.share, names.get(look.effect.name, np.inf))
-    last = sorted(names.values())[:FOLLOWED][-1]
-    return [look for look in looks if look.share <= last or not look.half.streams(look.model.space)]
+        best[look.effect.name] = min(look.share, best.get(look.effect.name, np.inf))
+    first = sorted(best.values())[:FOLLOWED]
+    clear = first[0] < CLEAR
+    return [
+        look for look in looks
+        if look.share <= first[-1] or not (clear or look.half.streams(look.model.space))
+    ]  # fmt: skip
 
 
 def following(look: Look, race: Race, *, seed: int) -> Work[Tried]:
@@ -240,9 +228,7 @@ def refining(evidence: Evidence, tried: Tried, race: Race, *, seed: int) -> Work
     ways = turned(tried.model, half.frame.step)
     ends = yield from beside(
         [
-            way.exploring(
-                half, seed=seed, iterations=3, radius=0.2, patient=True, over=race.over(tried.name)
-            )
+            way.exploring(half, seed=seed, iterations=3, radius=0.2, patient=True, over=race.over(tried.name))
             for way in ways
         ]
     )
@@ -283,7 +269,7 @@ def judge_alone(evidence: Evidence, tried: Sequence[Tried], *, seed: int) -> lis
     limit = BEHIND * min(error for error, _ in found) + CLOSE
     race = Race(1, LOSES)
     works = [
-        _judging(evidence, t, half, race.over(t.name), seed=seed)
+        _judging(evidence, t, half, FEW if error > FAR else REPEATS, race.over(t.name), seed=seed)
         for t, (error, half) in zip(tried, found, strict=True) if error <= limit
     ]  # fmt: skip
     done = {t.name: t for t in together(works)}
@@ -293,7 +279,7 @@ def judge_alone(evidence: Evidence, tried: Sequence[Tried], *, seed: int) -> lis
             break
         # better where it was fitted, worse where it is judged: it is still on its way
         half = alone(_looking(evidence, least, seed=seed))[1]
-        done[least.name] = alone(_judging(evidence, least, half, None, seed=seed))
+        done[least.name] = alone(_judging(evidence, least, half, REPEATS, None, seed=seed))
     return [done.get(t.name, t) for t in tried]
 
 
@@ -309,10 +295,10 @@ def _looking(evidence: Evidence, tried: Tried, *, seed: int) -> Work[tuple[float
 
 
 def _judging(
-    evidence: Evidence, tried: Tried, half: Half, over: Over | None, *, seed: int
+    evidence: Evidence, tried: Tried, half: Half, repeats: int, over: Over | None, *, seed: int
 ) -> Work[Tried]:
     model = yield from settling(evidence, tried.model, seed=seed, rounds=1, half=half, over=over)
-    judged = yield from model.judging(evidence.held.view(), repeats=REPEATS, seed=seed + 500)
+    judged = yield from model.judging(evidence.held.view(), repeats=repeats, seed=seed + 500)
     return replace(tried, model=model, judged=judged)
 
 
@@ -338,7 +324,7 @@ def try_all(
         [looking(evidence, present, effect, seed=seed) for effect in all_variants],
         lambda share: report("looking at all effects", 0.2 * share),
     )
-    race = Race(FINALISTS, LAGS)
+    race = Race(FINALISTS)
     works = [following(look, race, seed=seed) for look in followed(looks)]
     for tried in together(works, lambda share: report("trying all effects", 0.2 + 0.3 * share)):
         if tried.name not in found or tried.scouted < found[tried.name].scouted:
@@ -346,10 +332,14 @@ def try_all(
     order = sorted(found.values(), key=lambda t: t.scouted)
     chosen = [*order[:FINALISTS], *specialists(order, worst)]
     report(f"fitting {', '.join(t.name for t in chosen)}", 0.5)
-    last = Race(1, BEHIND)
-    finalists = with_chance(evidence, present, together(
-        [refining(evidence, tried, last, seed=seed) for tried in chosen]
-    ), repeats, seed=seed)
+    last = Race(1, GIVES_UP)
+    finalists = with_chance(
+        evidence,
+        present,
+        together([refining(evidence, tried, last, seed=seed) for tried in chosen]),
+        repeats,
+        seed=seed,
+    )
     # what chance does as well is not added, whatever its error
     certain = [t for t in finalists if t.p_value <= max(SIGNIFICANT, 1.01 / (1 + len(repeats)))]
     report(f"judging {', '.join(t.name for t in certain)}", 0.75)

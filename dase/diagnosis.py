@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from itertools import combinations
 
-from dase.candidates import Tried, open_to, try_all
+from dase.candidates import FEW, Tried, open_to, try_all
 from dase.closer import closer
 from dase.confidence import estimates
 from dase.effects import EFFECTS, Effect
@@ -92,12 +92,12 @@ def diagnose(
 
 def _greedy(search: Search, model: Model, most: int) -> tuple[Model, Judgement, list[float]]:
     """Add the best effect as long as one is missing."""
-    errors = []
+    errors, far = list[float](), False
     for _ in range(most + 1):
-        judgement = search.judge(model)
+        judgement = search.judge(model, repeats=FEW if far else REPEATS)
         errors.append(judgement.error)
         more = len(errors) <= most
-        step, better = _step(search, model, judgement, more)
+        step, better, far = _step(search, model, judgement, more)
         if better is None and more and (hidden := closer(search, model, judgement)) is not None:
             step, better = _found(search, *hidden, step, judgement), hidden[0].model
         search.history.append(step)
@@ -107,19 +107,24 @@ def _greedy(search: Search, model: Model, most: int) -> tuple[Model, Judgement, 
     return model, judgement, errors
 
 
-def _step(search: Search, model: Model, judgement: Judgement, more: bool) -> tuple[Step, Model | None]:
-    """Try all effects; return what was found and the model with the best of them, None if there is none."""
+def _step(search: Search, model: Model, judgement: Judgement, more: bool) -> tuple[Step, Model | None, bool]:
+    """Try all effects.
+
+    Returns:
+        What was found, the model with the best of them, None if there is none, and whether that is still far
+        from the floor.
+    """
     evidence, seed = search.evidence, search.seed
     names = tuple(e.name for e in model.space.sensor.effects)
     cells = worst_cells(evidence, judgement)
     step = Step(names, judgement.error, judgement.gate, judgement.families, (), None, (), cells)
     if silent(judgement) or not more:
-        return step, None
+        return step, None, False
     repeats = model.rebase(evidence.train, repeats=REPEATS, seed=seed + 300)
     model.rebase(evidence.scout, repeats=16, seed=seed + 200)
     open_names = open_to(search.effects, model)
     if not open_names:
-        return step, None
+        return step, None, False
     tried = try_all(
         evidence, model, search.effects, open_names, repeats=repeats, worst=worst_families(judgement),
         seed=seed, report=lambda text, share: search.progress(text, share, search.error),
@@ -131,16 +136,16 @@ def _step(search: Search, model: Model, judgement: Judgement, more: bool) -> tup
     worthy = [t for t in finalists if t.judged and accounts(t.judged, judgement)]
     able = worthy if explained(judgement) else finalists
     if not able:
-        return step, None
+        return step, None, False
     best, ties = _choose(able)
     mine = _rank(best, judgement)
     if not explained(judgement) and (mine.fall < MATERIAL or mine.share < SHARE):
-        return step, None
+        return step, None, False
     search.note(best, finalists, ties, judgement)
     step = replace(step, chosen=best.name, ties=ties)
     # far from the floor, the next effect moves everything again
     far = best.error > SETTLES * judgement.gate
-    return step, best.model if far else settle(evidence, best.model, seed=seed, rounds=1)
+    return step, best.model if far else settle(evidence, best.model, seed=seed, rounds=1), far
 
 
 def _found(search: Search, hidden: Tried, p_value: float, step: Step, judgement: Judgement) -> Step:

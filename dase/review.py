@@ -7,6 +7,7 @@ from collections.abc import Mapping
 from dase.closer import shown
 from dase.error import Judgement, announced, explained, silent
 from dase.model import Model, settle, settling
+from dase.race import short_of
 from dase.search import MATERIAL, TIE, Search, accounts, like_of
 from dase.together import together
 
@@ -21,8 +22,8 @@ DROPPED = 8.0
 units of the gate."""
 
 NEAR = 2.0
-"""A model is fitted in full where one descent takes its held-out error below this, in units of the gate, or of
-the present model's error if that is larger."""
+"""A model is fitted in full where one descent takes its held-out error below this, in units of the gate or of
+the present model's error."""
 
 REPEATS = 16
 """Simulations by which that is judged."""
@@ -107,11 +108,13 @@ def _promising(search: Search, model: Model, ways: Mapping[str, Model]) -> dict[
     scout = search.evidence.scout.view()
     repeats = model.rebase(scout, repeats=16, seed=search.seed + 200)
     enough = QUICK * float(scout.scale.loss(repeats).mean())
-    quick = together([way.searching(scout, seed=search.seed, iterations=2) for way in ways.values()])
-    return {
-        name: way for (name, way), q in zip(ways.items(), quick, strict=True)
-        if q.loss < enough or len(way.place) < len(model.place)
-    }  # fmt: skip
+    simpler = {name: len(way.place) < len(model.place) for name, way in ways.items()}
+    works = [
+        way.searching(scout, seed=search.seed, iterations=2, over=None if simpler[name] else short_of(enough))
+        for name, way in ways.items()
+    ]
+    quick = zip(ways, together(works), strict=True)
+    return {name: ways[name] for name, found in quick if found.loss < enough or simpler[name]}
 
 
 def _rivals(search: Search, model: Model, name: str) -> dict[str, Model]:
