@@ -8,7 +8,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from dase.descent import screening
+from dase.descent import Over, screening
 from dase.effects.base import Effect
 from dase.effects.flicker import Flicker
 from dase.effects.optics import SceneEffect
@@ -18,6 +18,7 @@ from dase.effects.timestamp import Timestamp
 from dase.error import Judgement, Scale
 from dase.evidence import Evidence, Half
 from dase.model import SETTLED, Model, added, settling, starts
+from dase.race import Race
 from dase.space import variants
 from dase.together import Ask, Work, alone, beside, together
 
@@ -26,17 +27,36 @@ Array = NDArray[np.float64]
 FINALISTS = 4
 """Candidates that are fitted to all pixels of the training half."""
 
+FOLLOWED = 8
+"""Candidates that are followed where a look shows one clearly ahead: the turn of the others comes. Of those
+whose events go through a readout, which takes ten times as long, no more are ever followed."""
+
+CLEAR = 0.6
+"""Loss of such a one, relative to that of the present model."""
+
 SECOND = 1.25
 """A second start is followed where its loss is below this, relative to the first."""
 
-BEHIND = 2.0
+BEHIND = 1.5
 """A finalist goes on where its error before the last fit is at most this times the best's, and `CLOSE`."""
 
 CLOSE = 1.0
 """Such an error that is added to the limit, for errors near the floor say little."""
 
+LOSES = 1.6
+"""A finalist is fitted no further where its loss will not come below this, relative to that of the best."""
+
+GIVES_UP = 2.0
+"""The same before each finalist has sampling errors of its own, by which it may look better."""
+
 AGAIN = 2
 """Times at most that a finalist is fitted further whose training loss is least but not its held-out error."""
+
+FAR = 3.0
+"""A finalist whose error before the last fit is above this is judged by `FEW` simulations."""
+
+FEW = 12
+"""Simulations by which models are judged that are far from the floor."""
 
 SURELY = 0.8
 """Its training loss, relative to that of the finalist with the least held-out error."""
@@ -46,6 +66,9 @@ IDLE = 0.01
 
 REPEATS = 30
 """Simulations with other seeds by which a finalist is judged."""
+
+SIGNIFICANT = 0.05
+"""Largest p-value of an effect that is added; 1 / (repeats + 1) is the smallest there is."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,8 +81,9 @@ class Tried:
         fit: Its loss where it was fitted.
         scouted: Its loss on some of the pixels, relative to that of the present model.
         families: The same by family.
-        judged: Its error on the held-out half; None where it was only screened.
+        judged: Its error on the held-out half; None where it was not looked at.
         bank: Statistics of all that was tried on the training half, shape (M, J).
+        p_value: Of the fall of the loss where it was fitted; 1 where it was only screened.
     """
 
     name: str
@@ -69,6 +93,7 @@ class Tried:
     families: Mapping[str, float] = field(default_factory=dict)
     judged: Judgement | None = None
     bank: Array | None = None
+    p_value: float = 1.0
 
     @property
     def error(self) -> float:
@@ -116,42 +141,101 @@ def rare(effect: Effect) -> bool:
     return any(p.name == "share" for p in effect.parameters())
 
 
-def scout(evidence: Evidence, present: Model, effect: Effect, *, seed: int) -> Tried:
-    """Try one effect on some pixels: a look at many places, then a short descent from the best two."""
-    return alone(scouting(evidence, present, effect, seed=seed))
+@dataclass(frozen=True, eq=False)
+class Look:
+    """Many places at which an effect was tried.
+
+    Args:
+        effect: What was tried.
+        model: The present one with it.
+        half: Where.
+        before: Statistics of the present model there, shape (J,).
+        places: In order of their loss, shape (M, P).
+        losses: Shape (M,).
+    """
+
+    effect: Effect
+    model: Model
+    half: Half
+    before: Array
+    places: Array
+    losses: Array
+
+    @property
+    def share(self) -> float:
+        """The least loss relative to that of the present model."""
+        return float(self.losses[0]) / self.present
+
+    @property
+    def present(self) -> float:
+        """Loss of the present model."""
+        return float(self.half.scale.loss(self.before))
 
 
-def scouting(evidence: Evidence, present: Model, effect: Effect, *, seed: int) -> Work[Tried]:
-    """Do what `scout` does, see `together`."""
+def looking(evidence: Evidence, present: Model, effect: Effect, *, seed: int) -> Work[Look]:
+    """Look at an effect at many places, on some pixels, see `together`."""
     half = evidence.train if rare(effect) else evidence.scout
     model = added(present, effect)
-    slow = half.slow(model.space)
     (before,) = yield [Ask(half, present.space, present.place[None], seed)]
-    places, losses = yield from screening(half, model.space, starts(model, effect, few=slow), seed=seed)
+    few = half.slow(model.space)
+    places, losses = yield from screening(half, model.space, starts(model, effect, few=few), seed=seed)
+    return Look(effect, model, half, before[0], places, losses)
+
+
+def scout(evidence: Evidence, present: Model, effect: Effect, *, seed: int) -> Tried:
+    """Try one effect on some pixels: a look at many places, then a short descent from the best two."""
+    look = alone(looking(evidence, present, effect, seed=seed))
+    return alone(following(look, Race(1), seed=seed))
+
+
+def followed(looks: Sequence[Look]) -> list[Look]:
+    """Return those looks from which a descent is worth its time."""
+    best: dict[str, float] = {}
+    for look in looks:
+        best[look.effect.name] = min(look.share, best.get(look.effect.name, np.inf))
+    first = sorted(best.values())[:FOLLOWED]
+    clear = first[0] < CLEAR
+    return [
+        look for look in looks
+        if look.share <= first[-1] or not (clear or look.half.streams(look.model.space))
+    ]  # fmt: skip
+
+
+def following(look: Look, race: Race, *, seed: int) -> Work[Tried]:
+    """Descend from the best two places of a look, see `together`."""
+    half, places, losses = look.half, look.places, look.losses
+    slow = half.slow(look.model.space) or rare(look.effect)
     apart = np.flatnonzero((np.abs(places - places[0]).max(1) > 0.8) & (losses < SECOND * losses[0]))
-    picks = [0, *apart[: 0 if slow or rare(effect) else 1]]
     ends = yield from beside(
         [
-            replace(model, place=places[n], loss=losses[n]).exploring(
-                half, seed=seed, iterations=3, radius=0.25
+            replace(look.model, place=places[n], loss=losses[n]).exploring(
+                half, seed=seed, iterations=3, radius=0.25, over=race.over(look.effect.name, look.present)
             )
-            for n in picks
+            for n in [0, *apart[: 0 if slow else 1]]
         ]
     )
     best = min(ends, key=lambda found: found.loss)
-    share = best.loss / float(half.scale.loss(before[0]))
-    was, now = half.scale.families(before[0]), half.scale.families(best.values)
+    model = replace(look.model, place=best.place, loss=best.loss)
+    return tried_at(look, model, best.values)
+
+
+def tried_at(look: Look, model: Model, values: Array) -> Tried:
+    """Return the candidate of a look at some place, with its statistics."""
+    was, now = look.half.scale.families(look.before), look.half.scale.families(values)
     families = {name: value / max(was[name], 1e-9) for name, value in now.items()}
-    return Tried(effect.name, replace(model, place=best.place, loss=best.loss), best.loss, share, families)
+    return Tried(look.effect.name, model, model.loss, model.loss / look.present, families)
 
 
-def refining(evidence: Evidence, tried: Tried, *, seed: int) -> Work[Tried]:
+def refining(evidence: Evidence, tried: Tried, race: Race, *, seed: int) -> Work[Tried]:
     """Fit a candidate to all pixels of the training half, by the sampling errors of the present model."""
     # a finalist that is still on its way would be judged by where it happens to be
     half = evidence.train.loaded(tried.model.space, tried.model.place)
     ways = turned(tried.model, half.frame.step)
     ends = yield from beside(
-        [way.exploring(half, seed=seed, iterations=3, radius=0.2, patient=True) for way in ways]
+        [
+            way.exploring(half, seed=seed, iterations=3, radius=0.2, patient=True, over=race.over(tried.name))
+            for way in ways
+        ]
     )
     found = min(ends, key=lambda end: end.loss)
     model = replace(tried.model, place=found.place, loss=found.loss)
@@ -188,8 +272,9 @@ def judge_alone(evidence: Evidence, tried: Sequence[Tried], *, seed: int) -> lis
     looks = [_looking(evidence, t, seed=seed) for t in tried]
     found = together(looks)
     limit = BEHIND * min(error for error, _ in found) + CLOSE
+    race = Race(1, LOSES)
     works = [
-        _judging(evidence, t, half, seed=seed)
+        _judging(evidence, t, half, FEW if error > FAR else REPEATS, race.over(t.name), seed=seed)
         for t, (error, half) in zip(tried, found, strict=True) if error <= limit
     ]  # fmt: skip
     done = {t.name: t for t in together(works)}
@@ -199,7 +284,7 @@ def judge_alone(evidence: Evidence, tried: Sequence[Tried], *, seed: int) -> lis
             break
         # better where it was fitted, worse where it is judged: it is still on its way
         half = alone(_looking(evidence, least, seed=seed))[1]
-        done[least.name] = alone(_judging(evidence, least, half, seed=seed))
+        done[least.name] = alone(_judging(evidence, least, half, REPEATS, None, seed=seed))
     return [done.get(t.name, t) for t in tried]
 
 
@@ -214,9 +299,11 @@ def _looking(evidence: Evidence, tried: Tried, *, seed: int) -> Work[tuple[float
     return half.judge(values, seed=seed).error, half
 
 
-def _judging(evidence: Evidence, tried: Tried, half: Half, *, seed: int) -> Work[Tried]:
-    model = yield from settling(evidence, tried.model, seed=seed, rounds=1, half=half)
-    judged = yield from model.judging(evidence.held.view(), repeats=REPEATS, seed=seed + 500)
+def _judging(
+    evidence: Evidence, tried: Tried, half: Half, repeats: int, over: Over | None, *, seed: int
+) -> Work[Tried]:
+    model = yield from settling(evidence, tried.model, seed=seed, rounds=1, half=half, over=over)
+    judged = yield from model.judging(evidence.held.view(), repeats=repeats, seed=seed + 500)
     return replace(tried, model=model, judged=judged)
 
 
@@ -226,29 +313,55 @@ def try_all(
     effects: Mapping[str, type[Effect]],
     names: Sequence[str],
     *,
+    repeats: Array,
     worst: Sequence[str],
     seed: int,
     report: Report,
 ) -> list[Tried]:
-    """Try each effect; return the finalists in order of their held-out error, then the others.
+    """Try each effect; return those that were judged in order of their held-out error, then the others.
 
-    `worst` are the families in which the present model fails; who helps there is looked at more closely. The
-    training half and the scout must have been rebased to the present model; finalists take their place.
+    `repeats` are those of the present model on the training half, to which that and the scout must have been
+    rebased; `worst` are the families in which it fails: who helps there is looked at more closely.
     """
     all_variants = [v for name in names for v in prepared(evidence, effects[name])]
     found: dict[str, Tried] = {}
-    looks = [scouting(evidence, present, effect, seed=seed) for effect in all_variants]
-    for tried in together(looks, lambda share: report("trying all effects", 0.5 * share)):
+    looks = together(
+        [looking(evidence, present, effect, seed=seed) for effect in all_variants],
+        lambda share: report("looking at all effects", 0.2 * share),
+    )
+    race = Race(FINALISTS)
+    works = [following(look, race, seed=seed) for look in followed(looks)]
+    for tried in together(works, lambda share: report("trying all effects", 0.2 + 0.3 * share)):
         if tried.name not in found or tried.scouted < found[tried.name].scouted:
             found[tried.name] = tried
     order = sorted(found.values(), key=lambda t: t.scouted)
     chosen = [*order[:FINALISTS], *specialists(order, worst)]
     report(f"fitting {', '.join(t.name for t in chosen)}", 0.5)
-    finalists = together([refining(evidence, tried, seed=seed) for tried in chosen])
-    report(f"judging {', '.join(t.name for t in chosen)}", 0.75)
-    done = judge_alone(evidence, finalists, seed=seed)
-    done.sort(key=lambda t: t.error if t.judged else np.inf)
+    last = Race(1, GIVES_UP)
+    finalists = with_chance(
+        evidence,
+        present,
+        together([refining(evidence, tried, last, seed=seed) for tried in chosen]),
+        repeats,
+        seed=seed,
+    )
+    # what chance does as well is not added, whatever its error
+    certain = [t for t in finalists if t.p_value <= max(SIGNIFICANT, 1.01 / (1 + len(repeats)))]
+    report(f"judging {', '.join(t.name for t in certain)}", 0.75)
+    done = judge_alone(evidence, certain, seed=seed) if certain else []
+    done += [t for t in finalists if t not in certain]
+    done.sort(key=lambda t: (t.error if t.judged else np.inf, t.p_value))
     return [*done, *(t for t in order if t not in chosen)]
+
+
+def with_chance(
+    evidence: Evidence, present: Model, tried: Sequence[Tried], repeats: Array, *, seed: int
+) -> list[Tried]:
+    """Return candidates with the p-values of what they make of the training loss."""
+    scale = evidence.train.scale
+    standing = evidence.train.run(present.space, present.place[None], seed=seed)[0]
+    p_value = chance_of(scale, tried, repeats, standing)
+    return [replace(t, p_value=p_value(float(scale.loss(standing)) - t.fit)) for t in tried]
 
 
 def specialists(order: Sequence[Tried], worst: Sequence[str]) -> list[Tried]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -52,6 +52,10 @@ PRIOR = 2e-3
 """Weight by which parameters that the data say nothing about are held at their start."""
 
 
+Over = Callable[[float, float], bool]
+"""Whether a search may stop, from its loss and that before the last population."""
+
+
 @dataclass(frozen=True)
 class Found:
     """Where a search ended.
@@ -82,6 +86,7 @@ def searching(
     iterations: int = 5,
     radius: float = RADIUS,
     patient: bool = False,
+    over: Over | None = None,
 ) -> Work[Found]:
     """Descend from one start, see `together`.
 
@@ -97,6 +102,7 @@ def searching(
         iterations: Populations, not counting those that are still on the way.
         radius: Of the first.
         patient: Whether populations that still bring the loss down much do not count either.
+        over: Asked after each population, with the loss and that before, whether to stop.
     """
     rng = np.random.default_rng([seed, 7])
     low, high = space.bounds()
@@ -115,6 +121,7 @@ def searching(
         leader = int(np.argmin(losses))
         improved = losses[leader] < best_loss - 1e-3 * abs(losses[leader])
         much = patient and losses[leader] < MUCH * best_loss < np.inf
+        behind = over is not None and over(float(losses[leader]), best_loss)
         best, best_loss = places[leader], float(losses[leader])
         near = np.all(np.abs(places - best) <= 2.5 * reach, axis=1)
         slope = slopes((places[near] - best) / reach, tried[near] - tried[leader]) / reach
@@ -124,6 +131,8 @@ def searching(
         # as far as the loss changes by a good part of itself, along each axis
         ideal = np.sqrt(PART * max(best_loss, LITTLE) / np.maximum(steepness, 1e-12))
         reach = np.clip(np.clip(ideal, 0.35 * reach, WIDEN * reach), SMALLEST, WIDEST)
+        if behind:
+            break
         if (improved and beyond > FARTHEST) or much:
             continue  # still on the way: does not count
         left -= 1

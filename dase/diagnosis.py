@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from itertools import combinations
 
-from dase.candidates import Tried, chance_of, open_to, try_all
+from dase.candidates import FEW, Tried, open_to, try_all
 from dase.closer import closer
 from dase.confidence import estimates
 from dase.effects import EFFECTS, Effect
@@ -24,11 +24,12 @@ from dase.stimulus import Trust
 from dase.together import together
 from dase.words import worst_cells
 
-SIGNIFICANT = 0.05
-"""Largest p-value of an effect that is added; 1 / (REPEATS + 1) is the smallest there is."""
-
 SHARE = 0.1
 """Least share of the way to the floor."""
+
+SETTLES = 2.0
+"""A model with one effect more is fitted by several descents where its error is at most this, in units of the
+gate: before that it is only on its way."""
 
 MOST = 4
 """Effects that are added at most."""
@@ -91,12 +92,12 @@ def diagnose(
 
 def _greedy(search: Search, model: Model, most: int) -> tuple[Model, Judgement, list[float]]:
     """Add the best effect as long as one is missing."""
-    errors = []
+    errors, far = list[float](), False
     for _ in range(most + 1):
-        judgement = search.judge(model)
+        judgement = search.judge(model, repeats=FEW if far else REPEATS)
         errors.append(judgement.error)
         more = len(errors) <= most
-        step, better = _step(search, model, judgement, more)
+        step, better, far = _step(search, model, judgement, more)
         if better is None and more and (hidden := closer(search, model, judgement)) is not None:
             step, better = _found(search, *hidden, step, judgement), hidden[0].model
         search.history.append(step)
@@ -106,47 +107,51 @@ def _greedy(search: Search, model: Model, most: int) -> tuple[Model, Judgement, 
     return model, judgement, errors
 
 
-def _step(search: Search, model: Model, judgement: Judgement, more: bool) -> tuple[Step, Model | None]:
-    """Try all effects; return what was found and the model with the best of them, None if there is none."""
+def _step(search: Search, model: Model, judgement: Judgement, more: bool) -> tuple[Step, Model | None, bool]:
+    """Try all effects.
+
+    Returns:
+        What was found, the model with the best of them, None if there is none, and whether that is still far
+        from the floor.
+    """
     evidence, seed = search.evidence, search.seed
     names = tuple(e.name for e in model.space.sensor.effects)
     cells = worst_cells(evidence, judgement)
     step = Step(names, judgement.error, judgement.gate, judgement.families, (), None, (), cells)
     if silent(judgement) or not more:
-        return step, None
+        return step, None, False
     repeats = model.rebase(evidence.train, repeats=REPEATS, seed=seed + 300)
     model.rebase(evidence.scout, repeats=16, seed=seed + 200)
     open_names = open_to(search.effects, model)
     if not open_names:
-        return step, None
-    present = evidence.train.run(model.space, model.place[None], seed=seed)[0]
-    scale, base = evidence.train.scale, float(evidence.train.scale.loss(present))
+        return step, None, False
     tried = try_all(
-        evidence, model, search.effects, open_names, worst=worst_families(judgement), seed=seed,
-        report=lambda text, share: search.progress(text, share, search.error),
+        evidence, model, search.effects, open_names, repeats=repeats, worst=worst_families(judgement),
+        seed=seed, report=lambda text, share: search.progress(text, share, search.error),
     )  # fmt: skip
-    p_value = chance_of(scale, tried, repeats, present)
     finalists = [t for t in tried if t.judged]
-    worthy = [t for t in finalists if t.judged and accounts(t.judged, judgement)]
-    best, ties = _choose((explained(judgement) and worthy) or finalists)
-    ranking = tuple(_rank(t, judgement, p_value(base - t.fit) if t.judged else 1.0) for t in tried)
-    mine = next(rank for rank in ranking if rank.effect == best.name)
-    certain = mine.p_value <= max(SIGNIFICANT, 1.01 / (1 + len(repeats)))
-    enough = mine.fall >= MATERIAL and mine.share >= SHARE and certain
-    if explained(judgement):
-        enough = certain and bool(worthy)
+    step = replace(step, ranking=tuple(_rank(t, judgement) for t in tried))
     if not search.history:
         search.first = sorted(tried, key=lambda t: t.scouted)
-    if enough:
-        search.note(best, finalists, ties, judgement)
-    step = replace(step, ranking=ranking, chosen=best.name if enough else None, ties=ties if enough else ())
-    return step, settle(evidence, best.model, seed=seed, rounds=1) if enough else None
+    worthy = [t for t in finalists if t.judged and accounts(t.judged, judgement)]
+    able = worthy if explained(judgement) else finalists
+    if not able:
+        return step, None, False
+    best, ties = _choose(able)
+    mine = _rank(best, judgement)
+    if not explained(judgement) and (mine.fall < MATERIAL or mine.share < SHARE):
+        return step, None, False
+    search.note(best, finalists, ties, judgement)
+    step = replace(step, chosen=best.name, ties=ties)
+    # far from the floor, the next effect moves everything again
+    far = best.error > SETTLES * judgement.gate
+    return step, best.model if far else settle(evidence, best.model, seed=seed, rounds=1), far
 
 
 def _found(search: Search, hidden: Tried, p_value: float, step: Step, judgement: Judgement) -> Step:
     """Note an effect that only a closer look shows."""
     search.note(hidden, [hidden], (), judgement)
-    rank = _rank(hidden, judgement, p_value)
+    rank = _rank(replace(hidden, p_value=p_value), judgement)
     others = tuple(r for r in step.ranking if r.effect != hidden.name)
     return replace(step, ranking=(rank, *others), chosen=hidden.name)
 
@@ -164,7 +169,7 @@ def _choose(finalists: Sequence[Tried]) -> tuple[Tried, tuple[str, ...]]:
     return best, tuple(t.name for t in like if t.name != best.name)
 
 
-def _rank(tried: Tried, judgement: Judgement, p_value: float) -> Rank:
+def _rank(tried: Tried, judgement: Judgement) -> Rank:
     """Return a candidate as the user sees it."""
     fall = judgement.error - tried.error
     share = fall / max(judgement.error - 1.0, 1e-9)
@@ -173,7 +178,7 @@ def _rank(tried: Tried, judgement: Judgement, p_value: float) -> Rank:
         for axis, place in zip(tried.model.space.axes, tried.model.place, strict=True)
         if axis.name.split(".")[0] in tried.name.split(" + ")
     }
-    return Rank(tried.name, tried.error, fall, min(share, 1.0), p_value, mine, tried.judged is not None)
+    return Rank(tried.name, tried.error, fall, min(share, 1.0), tried.p_value, mine, tried.judged is not None)
 
 
 def _pairs(search: Search, start: Model, model: Model, judgement: Judgement) -> tuple[Model, Judgement]:

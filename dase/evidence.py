@@ -99,10 +99,13 @@ class Half:
         found: Array = simulated([Ask(self, space, np.atleast_2d(places), seed)])[0]
         return found
 
+    def streams(self, space: Space) -> bool:
+        """Whether the events of models go through a readout."""
+        return self.trials.ticks(space.sensor) is None
+
     def slow(self, space: Space) -> bool:
         """Whether models take many samples, or their events go through a readout."""
-        readout = self.trials.ticks(space.sensor) is None
-        return readout or finer_steps(space.sensor, self.frame.step) > 0
+        return self.streams(space) or finer_steps(space.sensor, self.frame.step) > 0
 
     def rebase(self, space: Space, place: Array, *, repeats: int, seed: int) -> Array:
         """Make a model the present one: expectations and sampling errors are its own.

@@ -9,7 +9,7 @@ from itertools import product
 import numpy as np
 from numpy.typing import NDArray
 
-from dase.descent import Found, screening, searching
+from dase.descent import Found, Over, screening, searching
 from dase.effects.base import Effect
 from dase.error import Judgement
 from dase.evidence import Evidence, Half
@@ -25,7 +25,7 @@ THRESHOLDS = (0.04, 0.06, 0.09, 0.12, 0.15, 0.18, 0.22, 0.27, 0.34, 0.45, 0.65)
 RATIO = 2.2
 """Most that the thresholds of a pixel differ by at the start."""
 
-SHIFTS = (-0.7, -0.4, -0.15, 0.1, 0.35)
+SHIFTS = (-0.7, -0.4, -0.15, 0.0, 0.35)
 """Of the logarithm of the thresholds, when an effect is tried."""
 
 SETTLED = 16
@@ -81,21 +81,36 @@ class Model:
         return half.judge(values, seed=seed)
 
     def searching(
-        self, half: Half, *, seed: int, iterations: int = 4, radius: float = 0.2, patient: bool = False
+        self,
+        half: Half,
+        *,
+        seed: int,
+        iterations: int = 4,
+        radius: float = 0.2,
+        patient: bool = False,
+        over: Over | None = None,
     ) -> Work[Model]:
         """Return the model with its parameters improved, see `together`."""
-        found = yield from searching(
-            half, self.space, self.place, seed=seed, iterations=iterations, radius=radius, patient=patient
+        found = yield from self.exploring(
+            half, seed=seed, iterations=iterations, radius=radius, patient=patient, over=over
         )
         return replace(self, place=found.place, loss=found.loss)
 
     def exploring(
-        self, half: Half, *, seed: int, iterations: int = 4, radius: float = 0.2, patient: bool = False
+        self,
+        half: Half,
+        *,
+        seed: int,
+        iterations: int = 4,
+        radius: float = 0.2,
+        patient: bool = False,
+        over: Over | None = None,
     ) -> Work[Found]:
         """Improve the parameters and keep all that was tried, see `together`."""
         return searching(
-            half, self.space, self.place, seed=seed, iterations=iterations, radius=radius, patient=patient
-        )
+            half, self.space, self.place, seed=seed, iterations=iterations, radius=radius, patient=patient,
+            over=over,
+        )  # fmt: skip
 
 
 def model_of(sensor: Sensor, free: Sequence[str] | None = None) -> Model:
@@ -146,7 +161,13 @@ def settle(evidence: Evidence, model: Model, *, seed: int, rounds: int = 2) -> M
 
 
 def settling(
-    evidence: Evidence, model: Model, *, seed: int, rounds: int = 2, half: Half | None = None
+    evidence: Evidence,
+    model: Model,
+    *,
+    seed: int,
+    rounds: int = 2,
+    half: Half | None = None,
+    over: Over | None = None,
 ) -> Work[Model]:
     """Do what `settle` does, see `together`; `half` is the training half if the model is its present one."""
     for turn in range(rounds):
@@ -158,7 +179,9 @@ def settling(
         losses = [float(half.scale.loss(value)[0]) for value in values]
         if losses[1] < losses[0] and (yield from _as_good(evidence, other, losses[0], seed=seed)):
             model = other
-        model = yield from model.searching(half, seed=seed + turn, radius=0.12 / (1 + turn), patient=True)
+        model = yield from model.searching(
+            half, seed=seed + turn, radius=0.12 / (1 + turn), patient=True, over=over
+        )
     return model
 
 

@@ -6,7 +6,8 @@ from collections.abc import Mapping
 
 from dase.closer import shown
 from dase.error import Judgement, announced, explained, silent
-from dase.model import Model, settle
+from dase.model import Model, settle, settling
+from dase.race import short_of
 from dase.search import MATERIAL, TIE, Search, accounts, like_of
 from dase.together import together
 
@@ -20,6 +21,13 @@ DROPPED = 8.0
 """An effect is tried to be dropped where the error on the scout without it, quickly fitted, is below this, in
 units of the gate."""
 
+NEAR = 2.0
+"""A model is fitted in full where one descent takes its held-out error below this, in units of the gate or of
+the present model's error."""
+
+REPEATS = 16
+"""Simulations by which that is judged."""
+
 QUICK = 2.0
 """Only alternatives whose error on the scout, quickly fitted, is below this, relative to the model's own."""
 
@@ -29,7 +37,7 @@ def review(search: Search, model: Model, judgement: Judgement) -> tuple[Model, J
     model, judgement = _drop(search, model, judgement)
     before = model
     for name in search.added(model):
-        for other, swap in _rivals(search, model, name).items():
+        for other, swap in _near(search, _rivals(search, model, name), judgement).items():
             swapped = settle(search.evidence, swap, seed=search.seed)
             judged = search.judge(swapped)
             without = search.without.get(name)
@@ -49,7 +57,7 @@ def review(search: Search, model: Model, judgement: Judgement) -> tuple[Model, J
 def _drop(search: Search, model: Model, judgement: Judgement) -> tuple[Model, Judgement]:
     """Drop effects that are not needed any more."""
     whole = model
-    for name, less in _droppable(search, model).items():
+    for name, less in _near(search, _droppable(search, model), judgement).items():
         if name not in model.sensor or len(search.added(model)) == 1:
             continue
         less = less if model is whole else like_of(model.sensor.without(name), model, ())
@@ -63,6 +71,15 @@ def _drop(search: Search, model: Model, judgement: Judgement) -> tuple[Model, Ju
         if needless and not shown(search, fitted, without, model):
             model, judgement = fitted, without
     return model, judgement
+
+
+def _near(search: Search, ways: Mapping[str, Model], judgement: Judgement) -> dict[str, Model]:
+    """Return those models that one descent takes near enough to be fitted in full, fitted by it."""
+    evidence, seed = search.evidence, search.seed
+    ends = together([settling(evidence, way, seed=seed, rounds=1) for way in ways.values()])
+    judged = together([m.judging(evidence.held.view(), repeats=REPEATS, seed=seed + 500) for m in ends])
+    limit = NEAR * max(judgement.gate, judgement.error)
+    return {name: m for name, m, j in zip(ways, ends, judged, strict=True) if j.error < limit}
 
 
 def _droppable(search: Search, model: Model) -> dict[str, Model]:
@@ -91,11 +108,13 @@ def _promising(search: Search, model: Model, ways: Mapping[str, Model]) -> dict[
     scout = search.evidence.scout.view()
     repeats = model.rebase(scout, repeats=16, seed=search.seed + 200)
     enough = QUICK * float(scout.scale.loss(repeats).mean())
-    quick = together([way.searching(scout, seed=search.seed, iterations=2) for way in ways.values()])
-    return {
-        name: way for (name, way), q in zip(ways.items(), quick, strict=True)
-        if q.loss < enough or len(way.place) < len(model.place)
-    }  # fmt: skip
+    simpler = {name: len(way.place) < len(model.place) for name, way in ways.items()}
+    works = [
+        way.searching(scout, seed=search.seed, iterations=2, over=None if simpler[name] else short_of(enough))
+        for name, way in ways.items()
+    ]
+    quick = zip(ways, together(works), strict=True)
+    return {name: ways[name] for name, found in quick if found.loss < enough or simpler[name]}
 
 
 def _rivals(search: Search, model: Model, name: str) -> dict[str, Model]:

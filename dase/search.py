@@ -51,9 +51,9 @@ class Search:
     first: list[Tried] = field(default_factory=list)
     error: float = float("nan")
 
-    def judge(self, model: Model) -> Judgement:
-        """Return the held-out error of a model; makes it the present one of all halves."""
-        judgement = model.judge(self.evidence.held, repeats=REPEATS, seed=self.seed + 500)
+    def judge(self, model: Model, *, repeats: int = REPEATS) -> Judgement:
+        """Return the held-out error of a model; makes it the present one of that half."""
+        judgement = model.judge(self.evidence.held, repeats=repeats, seed=self.seed + 500)
         self.error = judgement.error
         self.progress("judging", 0.0, self.error)
         return judgement

@@ -116,6 +116,7 @@ def fake(names: str, errors: dict[str, float], monkeypatch, **more) -> tuple:
         judge=lambda m: judged(errors[m.names]), added=lambda m: tuple(m.names), **(defaults | more)
     )
     monkeypatch.setattr(reviewing, "settle", lambda evidence, m, seed: m)
+    monkeypatch.setattr(reviewing, "_near", lambda search, ways, judgement: ways)
     monkeypatch.setattr(reviewing, "like_of", lambda sensor, m, more: model(str(sensor)))
     monkeypatch.setattr(
         reviewing, "_droppable",
