@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from copy import copy
 from dataclasses import dataclass, field, replace
+from functools import partial
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -238,14 +241,16 @@ def gather(
     good = np.ones(light.shape, np.bool_) if trust is None else trust(grid.times, chosen).T.copy()
     good[:, 1:] &= good[:, :-1]  # a step is what lies between two points of the grid
     bands = band_edges(light, good)
-    cell = sort_into_cells(light, grid.step, bands, log_eps)
+    sorting = partial(sort_into_cells, step=grid.step, bands=bands, log_eps=log_eps)
+    works: list[Callable[[], Any]] = [partial(sorting, part) for part in np.array_split(light, 8)]
+    *parts, structure = launch.each([*works, partial(find, events)])
+    cell = np.concatenate(parts)
     cell[~good] = MASKED
     cell[:, 0] = MASKED
     first, last = slice(0, each), slice(each, 2 * each)
     train_grid = replace(grid, steps=cut)
     late = cell[last].copy()
     late[:, :cut] = MASKED
-    structure = find(events)
     halves: list[Half] = []
     for part, span, cells in ((first, train_grid, cell[first, :cut]), (last, grid, late)):
         stimulus = Stimulus(
