@@ -243,7 +243,8 @@ def gather(
     bands = band_edges(light, good)
     sorting = partial(sort_into_cells, step=grid.step, bands=bands, log_eps=log_eps)
     works: list[Callable[[], Any]] = [partial(sorting, part) for part in np.array_split(light, 8)]
-    *parts, structure = launch.each([*works, partial(find, events)])
+    works.append(partial(find, events))
+    *parts, structure = launch.each(works)
     cell = np.concatenate(parts)
     cell[~good] = MASKED
     cell[:, 0] = MASKED
