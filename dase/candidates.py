@@ -17,7 +17,7 @@ from dase.effects.row_scan import RowScan
 from dase.effects.timestamp import Timestamp
 from dase.error import Judgement, Scale
 from dase.evidence import Evidence, Half
-from dase.model import SETTLED, Model, added, settling, starts
+from dase.model import SETTLED, Model, added, settling, starts, turned
 from dase.race import Race
 from dase.space import variants
 from dase.together import Ask, Work, alone, beside, together
@@ -171,6 +171,11 @@ class Look:
         """Loss of the present model."""
         return float(self.half.scale.loss(self.before))
 
+    def found(self, place: Array, loss: float) -> Tried:
+        """Return the candidate at a place."""
+        model = replace(self.model, place=place, loss=loss)
+        return Tried(self.effect.name, model, loss, loss / self.present)
+
 
 def looking(evidence: Evidence, present: Model, effect: Effect, *, seed: int) -> Work[Look]:
     """Look at an effect at many places, on some pixels, see `together`."""
@@ -215,15 +220,11 @@ def following(look: Look, race: Race, *, seed: int) -> Work[Tried]:
         ]
     )
     best = min(ends, key=lambda found: found.loss)
-    model = replace(look.model, place=best.place, loss=best.loss)
-    return tried_at(look, model, best.values)
-
-
-def tried_at(look: Look, model: Model, values: Array) -> Tried:
-    """Return the candidate of a look at some place, with its statistics."""
-    was, now = look.half.scale.families(look.before), look.half.scale.families(values)
-    families = {name: value / max(was[name], 1e-9) for name, value in now.items()}
-    return Tried(look.effect.name, model, model.loss, model.loss / look.present, families)
+    was, now = half.scale.families(look.before), half.scale.families(best.values)
+    return replace(
+        look.found(best.place, best.loss),
+        families={name: value / max(was[name], 1e-9) for name, value in now.items()},
+    )
 
 
 def refining(evidence: Evidence, tried: Tried, race: Race, *, seed: int) -> Work[Tried]:
@@ -241,25 +242,6 @@ def refining(evidence: Evidence, tried: Tried, race: Race, *, seed: int) -> Work
     model = replace(tried.model, place=found.place, loss=found.loss)
     bank = np.concatenate([end.tried for end in ends])
     return replace(tried, model=model, fit=found.loss, bank=bank)
-
-
-def turned(model: Model, step: float) -> list[Model]:
-    """Return a model, and where it has a lamp, also those with the lamp a step of the grid earlier and later.
-
-    What probes tell by steps hardly changes when all events are a step off, so a fit may end there.
-    """
-    names = [axis.name for axis in model.space.axes]
-    if "flicker.phase" not in names:
-        return [model]
-    at = names.index("flicker.phase")
-    turn = step * model.sensor["flicker"].frequency  # type: ignore[attr-defined]
-    out = [model]
-    for phase in (-turn, turn):
-        place = model.place.copy()
-        value = float(model.space.axes[at].to_value(place[at])) + phase
-        place[at] = model.space.axes[at].to_place((value + 1.0) % 2.0 - 1.0)
-        out.append(replace(model, place=place))
-    return out
 
 
 def judge_alone(evidence: Evidence, tried: Sequence[Tried], *, seed: int) -> list[Tried]:
@@ -324,34 +306,37 @@ def try_all(
     rebased; `worst` are the families in which it fails: who helps there is looked at more closely.
     """
     all_variants = [v for name in names for v in prepared(evidence, effects[name])]
-    found: dict[str, Tried] = {}
-    looks = together(
-        [looking(evidence, present, effect, seed=seed) for effect in all_variants],
-        lambda share: report("looking at all effects", 0.2 * share),
-    )
-    race = Race(FINALISTS)
-    works = [following(look, race, seed=seed) for look in followed(looks)]
-    for tried in together(works, lambda share: report("trying all effects", 0.2 + 0.3 * share)):
-        if tried.name not in found or tried.scouted < found[tried.name].scouted:
-            found[tried.name] = tried
-    order = sorted(found.values(), key=lambda t: t.scouted)
+    order, left = _scouted(evidence, present, all_variants, seed=seed, report=report)
     chosen = [*order[:FINALISTS], *specialists(order, worst)]
     report(f"fitting {', '.join(t.name for t in chosen)}", 0.5)
     last = Race(1, GIVES_UP)
-    finalists = with_chance(
-        evidence,
-        present,
-        together([refining(evidence, tried, last, seed=seed) for tried in chosen]),
-        repeats,
-        seed=seed,
-    )
+    refined = together([refining(evidence, tried, last, seed=seed) for tried in chosen])
+    finalists = with_chance(evidence, present, refined, repeats, seed=seed)
     # what chance does as well is not added, whatever its error
     certain = [t for t in finalists if t.p_value <= max(SIGNIFICANT, 1.01 / (1 + len(repeats)))]
     report(f"judging {', '.join(t.name for t in certain)}", 0.75)
     done = judge_alone(evidence, certain, seed=seed) if certain else []
     done += [t for t in finalists if t not in certain]
     done.sort(key=lambda t: (t.error if t.judged else np.inf, t.p_value))
-    return [*done, *(t for t in order if t not in chosen)]
+    return [*done, *(t for t in order if t not in chosen), *left]
+
+
+def _scouted(
+    evidence: Evidence, present: Model, variants: Sequence[Effect], *, seed: int, report: Report
+) -> tuple[list[Tried], list[Tried]]:
+    """Return candidates in order of their loss on some pixels, and those that were only looked at."""
+    looks = together(
+        [looking(evidence, present, effect, seed=seed) for effect in variants],
+        lambda share: report("looking at all effects", 0.2 * share),
+    )
+    race, found = Race(FINALISTS), dict[str, Tried]()
+    works = [following(look, race, seed=seed) for look in followed(looks)]
+    for tried in together(works, lambda share: report("trying all effects", 0.2 + 0.3 * share)):
+        if tried.name not in found or tried.scouted < found[tried.name].scouted:
+            found[tried.name] = tried
+    left = {look.effect.name: look.found(look.places[0], float(look.losses[0])) for look in looks}
+    first = sorted(found.values(), key=lambda t: t.scouted)
+    return first, [tried for name, tried in left.items() if name not in found]
 
 
 def with_chance(

@@ -75,7 +75,8 @@ class Way:
 
 def closer(search: Search, model: Model, judgement: Judgement) -> tuple[Tried, float] | None:
     """Return the effect that chance hid, fitted and judged, and its p-value; None if there is none."""
-    if not hides(judgement):
+    # also above what chance does: there no candidate may be certain by the fall of its loss
+    if judgement.level < HIDES or not explained(judgement):
         return None
     search.progress("looking closer", 0.0, search.error)
     start = _nearest(search, model)

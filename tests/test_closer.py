@@ -75,7 +75,7 @@ def test_jitter_is_seen_beside_mismatch_and_not_where_there_is_none(searches):
 def test_nothing_is_looked_at_where_chance_hides_nothing(searches):
     search = searches["uneven"]
     before = search.evidence.evaluations
-    for judgement in (judged(0.3, level=0.1), judged(0.9, level=0.4, reach=0.7), judged(2.0, reach=3.0)):
+    for judgement in (judged(0.3, level=0.1), judged(1.2, level=0.4, reach=0.7), judged(2.0, reach=3.0)):
         assert closer(search, model_of(TRUE), judgement) is None
     assert search.evidence.evaluations == before
 

@@ -9,12 +9,11 @@ import pytest
 
 import dase
 from dase import confidence
-from dase.candidates import turned
 from dase.confidence import estimates
 from dase.effects import EFFECTS
 from dase.evidence import gather
 from dase.explain import bars
-from dase.model import added, model_of, starts
+from dase.model import added, model_of, starts, turned
 from dase.sensor import Sensor
 
 LAMP = EFFECTS["flicker"](frequency=100.0, depth=0.2, phase=0.05)
