@@ -167,16 +167,35 @@ def _looking(half: Half, start: Model, *, seed: int) -> Work[Model]:
 def settle(evidence: Evidence, model: Model, *, seed: int, rounds: int = 2) -> Model:
     """Refit a model by its own sampling errors, which change with it.
 
-    Each of some descents has random numbers of its own, because they end where those happen to lead; the best
-    of them by the random numbers of all is taken.
+    Each of some descents has random numbers of its own, because they end where those happen to lead, and the
+    last one begins with the other phase; the best of them by the random numbers of all is taken.
     """
     seeds = [seed + APART * n for n in range(DESCENTS)]
-    ends = together([settling(evidence, model, seed=each, rounds=rounds) for each in seeds])
+    works = [settling(evidence, model, seed=each, rounds=rounds) for each in seeds[:-1]]
+    works.append(_from_other_phase(evidence, model, seed=seeds[-1], rounds=rounds))
+    ends = together(works)
     half = evidence.train.view()
     ends[0].rebase(half, repeats=SETTLED, seed=seed + 100)
     values = simulated([Ask(half, m.space, m.place[None], each) for m in ends for each in seeds])
     losses = np.reshape([float(half.scale.loss(value)[0]) for value in values], (len(ends), len(seeds)))
     return ends[int(losses.mean(1).argmin())]
+
+
+def _from_other_phase(evidence: Evidence, model: Model, *, seed: int, rounds: int) -> Work[Model]:
+    """Refit a model from what pixels may have seen otherwise before the start.
+
+    Where that is wrong, all else is bent to make up for it, and the right one looks no better before all is
+    fitted again.
+    """
+    half = evidence.train.view()
+    yield from half.rebasing(model.space, model.place, repeats=SETTLED, seed=seed + 100)
+    other = yield from _turned(model).searching(half, seed=seed, iterations=3, patient=True)
+    return (yield from settling(evidence, other, seed=seed, rounds=rounds))
+
+
+def _turned(model: Model) -> Model:
+    phase = model.space.sensor["threshold"].phase  # type: ignore[attr-defined]
+    return with_phase(model, 1.0 - phase)
 
 
 def settling(
@@ -193,7 +212,7 @@ def settling(
         if half is None or turn > 0:
             half = evidence.train.view()
             yield from half.rebasing(model.space, model.place, repeats=SETTLED, seed=seed + 100)
-        other = with_phase(model, 1.0 - model.space.sensor["threshold"].phase)  # type: ignore[attr-defined]
+        other = _turned(model)
         values = yield [Ask(half, m.space, m.place[None], seed) for m in (model, other)]
         losses = [float(half.scale.loss(value)[0]) for value in values]
         if losses[1] < losses[0] and (yield from _as_good(evidence, other, losses[0], seed=seed)):

@@ -9,12 +9,14 @@ import pytest
 
 import dase
 from dase import confidence
+from dase import model as model_module
 from dase.confidence import estimates
 from dase.effects import EFFECTS
 from dase.evidence import gather
 from dase.explain import bars
-from dase.model import added, model_of, starts, turned
+from dase.model import added, model_of, settle, settling, starts, turned, with_phase
 from dase.sensor import Sensor
+from dase.together import alone
 
 LAMP = EFFECTS["flicker"](frequency=100.0, depth=0.2, phase=0.05)
 
@@ -56,6 +58,22 @@ def test_thresholds_are_tried_on_both_sides_of_the_present_ones():
     tried = starts(model, EFFECTS["linlog"]())[:, n] - model.place[n]
     assert tried.min() < -0.5
     assert tried.max() > 0.3
+
+
+def test_a_phase_that_looks_no_better_at_the_same_place_is_found(device, monkeypatch):
+    """One descent goes from it although nothing speaks for it there."""
+
+    def never(*args, **options):
+        yield from ()
+        return False
+
+    monkeypatch.setattr(model_module, "_as_good", never)
+    scene, true = bars(), Sensor().with_effect(EFFECTS["threshold"](on=0.2, off=0.2, phase=0.0))
+    events = dase.simulate(scene, true, seed=4, device=device)
+    found = gather(events, scene, pixels=200, seed=1, device=device)
+    start = with_phase(model_of(true), 1.0)
+    assert alone(settling(found, start, seed=0, rounds=1)).sensor["threshold"].phase == 1
+    assert settle(found, start, seed=0, rounds=1).sensor["threshold"].phase == 0
 
 
 @pytest.fixture(scope="module")
