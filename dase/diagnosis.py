@@ -28,8 +28,8 @@ SHARE = 0.1
 """Least share of the way to the floor."""
 
 SETTLES = 2.0
-"""A model with one effect more is fitted by several descents where its error is at most this, in units of the
-gate: before that it is only on its way."""
+"""A model with one effect more is judged by fewer simulations where its error is above this, in units of the
+gate: it is only on its way."""
 
 MOST = 4
 """Effects that are added at most."""
@@ -143,9 +143,7 @@ def _step(search: Search, model: Model, judgement: Judgement, more: bool) -> tup
         return step, None, False
     search.note(best, finalists, ties, judgement)
     step = replace(step, chosen=best.name, ties=ties)
-    # far from the floor, the next effect moves everything again
-    far = best.error > SETTLES * judgement.gate
-    return step, best.model if far else settle(evidence, best.model, seed=seed, rounds=1), far
+    return step, settle(evidence, best.model, seed=seed, rounds=1), best.error > SETTLES * judgement.gate
 
 
 def _found(search: Search, hidden: Tried, p_value: float, step: Step, judgement: Judgement) -> Step:
