@@ -42,6 +42,10 @@ ANEW = 25
 """Steps after which the weights are worked out again."""
 
 
+Members = tuple[torch.Tensor, torch.Tensor]
+"""See `Moments.members`."""
+
+
 def of_pixels(counts: torch.Tensor) -> torch.Tensor:
     """Return features (B, 7, H, W) that depend on the counts (B, 2, H, W) of the pixel alone.
 
@@ -247,19 +251,29 @@ class Moments:
             for name, size in sizes.items()
         }
 
-    def members(self, grey: torch.Tensor) -> torch.Tensor:
-        """Return 1 where a pixel is in a cell of looks, else 0, shape (B, pixels, cells)."""
+    def members(self, grey: torch.Tensor) -> Members:
+        """Return which cells of looks pixels are in, 1 or 0 (B, pixels, cells), and how many (B, cells)."""
         brightness, edge = looks(grey)
         cell = torch.bucketize(brightness.contiguous(), self.boundaries[0]) * self.levels[1]
-        cell = cell + torch.bucketize(edge, self.boundaries[1])
+        cell = (cell + torch.bucketize(edge, self.boundaries[1])).flatten(1)[..., None]
         every = torch.arange(self.levels[0] * self.levels[1], device=self.device)
-        return (cell.flatten(1)[..., None] == every).float()
+        # numbers at once: truth values first would be another pass
+        member = torch.eq(cell, every, out=grey.new_empty((*cell.shape[:2], len(every))))
+        return member, member.sum(1)
 
-    def sums(self, pairs: Pairs) -> dict[str, tuple[torch.Tensor, torch.Tensor]]:
-        """Return sums (B, cells, F) and numbers of pixels (B, cells) for each set of cells."""
-        pixels, member = pixel_features(pairs), self.members(pairs.grey)
+    def sums(
+        self, pairs: Pairs, members: Members | None = None
+    ) -> dict[str, tuple[torch.Tensor, torch.Tensor]]:
+        """Return sums (B, cells, F) and numbers of pixels (B, cells) for each set of cells.
+
+        Args:
+            pairs: Of which counts are summed.
+            members: What `members` returned for their images, where it is known.
+        """
+        pixels = pixel_features(pairs)
+        member, number = self.members(pairs.grey) if members is None else members
         found = with_neighbours(pixels)
-        out = {"look": (summed(member, found.flatten(2).transpose(1, 2)), member.sum(1))}
+        out = {"look": (summed(member, found.flatten(2).transpose(1, 2)), number)}
         if self.pattern:
             batch, _, height, width = found.shape
             down, across = with_next(pixels, -2).sum(2), with_next(pixels, -1).sum(3)
@@ -274,10 +288,10 @@ class Moments:
             self.sets[name].see_real(*map(parallel.together, both), held_out=held_out)
 
     @torch.no_grad()
-    def see_plain(self, fake: Pairs) -> dict[str, torch.Tensor]:
+    def see_plain(self, fake: Pairs, members: Members | None = None) -> dict[str, torch.Tensor]:
         """Take the reference counts of simulated pairs in; return how far each scene is off."""
         assert fake.reference is not None
-        found = self.sums(Pairs(fake.grey, fake.reference))
+        found = self.sums(Pairs(fake.grey, fake.reference), members)
         return {
             name: self.sets[name].see_plain(*map(parallel.together, both)) for name, both in found.items()
         }
@@ -298,11 +312,12 @@ class Moments:
     def loss(self, fake: Pairs, real: Pairs, *, move: bool) -> tuple[torch.Tensor, dict[str, torch.Tensor]]:
         """Take both batches in; return the fake means of this batch along what they are off."""
         self.see_real(real, held_out=self.held)
-        plain = self.see_plain(fake)
+        members = self.members(fake.grey)
+        plain = self.see_plain(fake, members)
         if self.anew:
             self.weigh()
         total, distance = fake.counts.new_zeros(()), fake.counts.new_zeros(())
-        for name, both in self.sums(fake).items():
+        for name, both in self.sums(fake, members).items():
             sums, number = map(parallel.together, both)
             cells = self.sets[name]
             # earlier batches say how far off the means are, this one which way they go: no bias by its noise
@@ -337,7 +352,8 @@ def summed(member: torch.Tensor, values: torch.Tensor) -> torch.Tensor:
     batch, pixels = member.shape[:2]
     pieces = next(n for n in range(min(64, pixels), 0, -1) if pixels % n == 0)
     a, b = (maps.reshape(batch * pieces, pixels // pieces, -1) for maps in (member, values))
-    return torch.bmm(a.transpose(1, 2), b).view(batch, pieces, a.shape[2], -1).sum(1)
+    pieced = torch.bmm(a.transpose(1, 2), b).view(batch, pieces, a.shape[2], -1)
+    return pieced.sum(1, dtype=torch.float32)
 
 
 @torch.no_grad()

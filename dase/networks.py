@@ -111,7 +111,10 @@ class UNet(nn.Module):
         x = self.encode[-1](x)
         for level in reversed(range(len(skips))):
             skip = skips[level]
-            x = F.interpolate(self.up[level](x), scale_factor=2, mode="nearest")
+            x = self.up[level](x)
+            # autocast would copy every number in float32
+            with torch.autocast(x.device.type, enabled=False):
+                x = F.interpolate(x, scale_factor=2, mode="nearest")
             # odd sides come back one pixel too long
             x = F.leaky_relu(self.decode[level](x[..., : skip.shape[-2], : skip.shape[-1]] + skip), SLOPE)
         out: torch.Tensor = self.last(x)
@@ -168,12 +171,14 @@ class ThresholdNet(nn.Module):
         mu, sigma = total.exp().unbind(1)
         return Maps(mu, sigma, ratio, u)
 
-    def basis(self, grey: torch.Tensor) -> torch.Tensor:
-        """Return how much each node of the table counts in each pixel, (B, nodes, H, W); ones without it."""
+    def hats(self, grey: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        """Return how much rows (B, R, H, W) and columns (B, C, H, W) of the table count in each pixel.
+
+        A node counts as much as its row times its column; without a table there is one.
+        """
         if self.shape.table is None:
-            return torch.ones_like(grey)[:, None]
-        rows, columns = table_weights(grey, self.shape.table)
-        return (rows[:, :, None] * columns[:, None]).flatten(1, 2)
+            return torch.ones_like(grey)[:, None], torch.ones_like(grey)[:, None]
+        return table_weights(grey, self.shape.table)
 
     def roughness(self) -> torch.Tensor:
         """Return the mean square difference between neighbouring nodes of the table, 0 without one."""

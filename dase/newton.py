@@ -63,18 +63,24 @@ class Newton:
             return (add(above) - add(below)) / (2 * STEP)
 
         grey = fake.grey if fake.some is None else fake.grey[fake.some]
-        member = self.moments.members(grey)
-        self._keep("number", member.sum((0, 1)).double())
-        weights = self.net.basis(grey).flatten(2).transpose(1, 2)  # (B, N, nodes)
+        member, number = self.moments.members(grey)
+        self._keep("number", number.sum(0).double())
+        # half the memory traffic; what a derivative is off by only makes a step a little longer or shorter
+        working = torch.bfloat16 if grey.is_cuda else torch.float32
+        rows, columns = (hats.flatten(2).transpose(1, 2).to(working) for hats in self.net.hats(grey))
+        cells, size = number.shape[1], (rows.shape[2], columns.shape[2])
+        # a node is a row times a column: half goes to the cells, half to the features
+        places = (member.to(working)[..., None] * columns[:, :, None]).flatten(2)
         for name in ends:
-            flat = slope(name, with_neighbours).flatten(2).transpose(1, 2)  # (B, N, F)
-            total = torch.zeros((), device=grey.device)
-            for b in range(len(flat)):
-                each = flat[b]
-                if name != "ratio":
-                    each = (each[:, :, None] * weights[b][:, None]).flatten(1)
-                total = total + summed(member[b : b + 1], each[None])[0]
-            self._keep(name, total.double().view(len(total), flat.shape[2], -1))
+            flat = slope(name, with_neighbours).flatten(2).transpose(1, 2).to(working)  # (B, N, F)
+            width = flat.shape[2]
+            if name == "ratio":
+                total = summed(member.to(working), flat).sum(0).view(cells, width, 1)
+            else:
+                each = (flat[..., None] * rows[:, :, None]).flatten(2)
+                total = summed(places, each).sum(0).view(cells, size[1], width, size[0])
+                total = total.permute(0, 2, 3, 1).reshape(cells, width, -1)
+            self._keep(name, total.double())
             if self.moments.pattern and name != "ratio":
                 down, across = (slope(name, partial(with_next, axis=axis)) for axis in (-2, -1))
                 self._keep(f"column_{name}", down.sum((0, 2)).T.double(), LONG)
@@ -139,10 +145,11 @@ class Newton:
         if self.moments.anew and self.net.shape.table is not None:
             self._choose(curve + tiny, curve @ here - pull, prior)
         hold = prior / self.loose**2
-        move = -_solved(curve + hold + tiny, pull + hold @ here)
         # as a table that nothing holds leaves it, or a firm one would look like a bad model
         free = self.excess * curve + prior / LOOSE[-1] ** 2 + tiny
-        rest = off - jacobian @ _solved(free, self.excess * pull)
+        both = torch.stack([curve + hold + tiny, free])
+        move, fit = _solved(both, torch.stack([-pull - hold @ here, self.excess * pull]))
+        rest = off - jacobian @ fit
         excess = rest @ whole @ rest * scenes / cells.kept["usual"]
         self.excess.copy_(torch.lerp(excess, self.excess, self.memory).clamp_min(1.0))
         move = (share * move).clamp(-LONGEST, LONGEST)
@@ -217,6 +224,8 @@ class Newton:
 
 
 def _solved(matrix: torch.Tensor, right: torch.Tensor) -> torch.Tensor:
-    """Return the solution of a linear system, without waiting for the GPU to say whether there is one."""
-    out: torch.Tensor = torch.linalg.solve_ex(matrix, right[..., None])[0][..., 0]
+    """Return the solutions of symmetric positive definite systems, without waiting for the GPU to say so."""
+    factor, _ = torch.linalg.cholesky_ex(matrix)
+    half = torch.linalg.solve_triangular(factor, right[..., None], upper=False)
+    out: torch.Tensor = torch.linalg.solve_triangular(factor.mT, half, upper=True)[..., 0]
     return out

@@ -160,6 +160,10 @@ class Training:
         parts = [(self.net.body(), recipe.rate)]
         if recipe.objective == "wgan":
             parts.append((self.net.scalars(), recipe.rate_scalars))
+        else:
+            for shared in self.net.scalars():
+                # moved by Newton's steps
+                shared.requires_grad_(False)
         # rates are tensors, which a step that is replayed can read
         groups = [
             {"params": params, "lr": torch.tensor(rate, device=self.device), "full": rate}

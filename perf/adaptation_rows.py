@@ -47,6 +47,9 @@ FULL = Row()
 SMALL = FULL.but(hash=dict(size=8))
 """The same with patches of the size that learns best."""
 
+STEADY = dict(critic_steps=2)
+"""Critics that keep up with the generator, which wanders less, for longer runs."""
+
 SIZES = (8, 16, 24, 40, 60, 80)
 LOW = dict(mu=0.1, sigma=0.02)
 MOMENTS = Row(recipe=dict(objective="moments", rate=1e-4, anchor=1.0), network=dict(table=(6, 5)))
@@ -57,8 +60,8 @@ def rows() -> dict[str, Row]:
     """Return all experiments by name."""
     out: dict[str, Row] = {}
     for seed in range(3):
-        out[f"full-s{seed}"] = SMALL.but(recipe=dict(seed=seed))
-        out[f"full-low-s{seed}"] = SMALL.but(recipe=dict(seed=seed, **LOW))
+        out[f"full-s{seed}"] = SMALL.but(recipe=dict(seed=seed, **STEADY))
+        out[f"full-low-s{seed}"] = SMALL.but(recipe=dict(seed=seed, **STEADY, **LOW))
         out[f"full16-s{seed}"] = FULL.but(recipe=dict(seed=seed), hash=dict(size=16))
         out[f"full40-s{seed}"] = FULL.but(recipe=dict(seed=seed))
         out[f"moments-s{seed}"] = MOMENTS.but(recipe=dict(seed=seed))
@@ -215,6 +218,8 @@ def plan(which: str) -> list[Planned]:
     out = []
     for name in chosen[which]:
         adversarial = every[name].recipe.get("objective") != "moments"
-        long = name.startswith(("full", "real", "paper"))
-        out.append(Planned(name, 40.0 if long else 28.0, adversarial))
+        seconds = 40.0 if name.startswith(("full", "real", "paper")) else 28.0
+        if "critic_steps" in every[name].recipe:
+            seconds = 75.0
+        out.append(Planned(name, seconds, adversarial))
     return out
