@@ -28,6 +28,7 @@ from dase.alignment import align
 from dase.diagnosis import diagnose
 from dase.measurement import Measurement, camera_scene, open_measurement
 from dase.sensor import stream
+from dase.survey import Survey
 
 LONGEST = 1.0
 """Of a recording with frames that is looked at [s]: all of its pixels change all the time."""
@@ -268,11 +269,14 @@ def pictures(camera: Camera, measured: Measurement, sensor: dase.Sensor) -> dict
     order = np.lexsort((events.t, pixel))
     gaps = np.diff(events.t[order])[np.diff(pixel[order]) == 0]
     counts = np.bincount(pixel, minlength=events.width * events.height)
+    looked = Survey(events.width, events.height)
+    looked.events(events)
     return {
         "measured": events.counts(edges)[0], "simulated": simulated.counts(edges)[0], "grey": grey,
         "rate": np.array(len(events) / (events.t[-1] - events.t[0])),
         "on": np.array(events.p.mean()), "shortest": np.array(np.quantile(gaps, 1e-3)),
         "busiest": np.array(counts.max() / (events.t[-1] - events.t[0])),
+        "hot": np.array(np.count_nonzero(looked.hot())),
         "seconds": np.array(events.t[-1] - events.t[0]), "events": np.array(len(events)),
     }  # fmt: skip
 

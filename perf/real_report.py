@@ -105,11 +105,12 @@ def section(name: str, camera: Any, found: dict[str, Any], facts: dict[str, Any]
 
 def plain(facts: dict[str, Any]) -> str:
     """Return what can be counted without a model."""
-    f = {k: float(facts[k]) for k in ("events", "seconds", "rate", "on", "shortest", "busiest")}
+    f = {k: float(facts[k]) for k in ("events", "seconds", "rate", "on", "shortest", "busiest", "hot")}
     return (
         f"{f['events']:,.0f} events in {f['seconds']:.3g} s, {100 * f['on']:.0f} % of them ON; one in a "
         f"thousand intervals of a pixel is shorter than {number(1e3 * f['shortest'])} ms; the busiest pixel "
-        f"sends {number(f['busiest'])} events per second."
+        f"sends {number(f['busiest'])} events per second; {f['hot']:,.0f} pixels send ten times as "
+        "many as those around them."
     )
 
 
