@@ -278,12 +278,13 @@ class Writer(Crossings):
         return " or ".join([crossed, *(f"{n}_spend > {n}_hazard" for n in noisy)])
 
     def asleep(self) -> list[str]:
-        """Return the lines that set `asleep` to the rest of the dead time, for pixels that wait for its end."""
+        """Return the lines that set `asleep` to the rest of the dead time, where events wait for its end."""
         if not self.delays():
             return []
         lines = ["asleep = float(0.0)"]
         for effect, function in self.of("gate"):
-            lines += self.unless_off(effect, f"asleep = wp.max(asleep, {self.call('gate', effect, function)})")
+            rest = self.call("gate", effect, function)
+            lines += self.unless_off(effect, f"asleep = wp.max(asleep, {rest})")
         return lines
 
     def events(self) -> None:
