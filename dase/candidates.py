@@ -8,7 +8,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from dase.descent import Over, screening
+from dase.descent import Over, screening, searching
 from dase.effects.base import Effect
 from dase.effects.flicker import Flicker
 from dase.effects.optics import SceneEffect
@@ -211,12 +211,12 @@ def following(look: Look, race: Race, *, seed: int) -> Work[Tried]:
     half, places, losses = look.half, look.places, look.losses
     slow = half.slow(look.model.space) or rare(look.effect)
     apart = np.flatnonzero((np.abs(places - places[0]).max(1) > 0.8) & (losses < SECOND * losses[0]))
+    name, unit, space = look.effect.name, look.present, look.model.space
+    begins = places[[0, *apart[: 0 if slow else 1]]]
     ends = yield from beside(
         [
-            replace(look.model, place=places[n], loss=losses[n]).exploring(
-                half, seed=seed, iterations=3, radius=0.25, over=race.over(look.effect.name, look.present)
-            )
-            for n in [0, *apart[: 0 if slow else 1]]
+            searching(half, space, begin, seed=seed, iterations=3, over=race.over(name, unit))
+            for begin in begins
         ]
     )
     best = min(ends, key=lambda found: found.loss)
@@ -232,12 +232,15 @@ def refining(evidence: Evidence, tried: Tried, race: Race, *, seed: int) -> Work
     # a finalist that is still on its way would be judged by where it happens to be
     half = evidence.train.loaded(tried.model.space, tried.model.place)
     ways = turned(tried.model, half.frame.step)
-    ends = yield from beside(
-        [
-            way.exploring(half, seed=seed, iterations=3, radius=0.2, patient=True, over=race.over(tried.name))
-            for way in ways
-        ]
-    )
+    works = []
+    for way in ways:
+        over = race.over(tried.name)
+        works.append(
+            searching(
+                half, way.space, way.place, seed=seed, iterations=3, radius=0.2, patient=True, over=over
+            )
+        )
+    ends = yield from beside(works)
     found = min(ends, key=lambda end: end.loss)
     model = replace(tried.model, place=found.place, loss=found.loss)
     bank = np.concatenate([end.tried for end in ends])

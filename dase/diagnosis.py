@@ -27,9 +27,9 @@ from dase.words import worst_cells
 SHARE = 0.1
 """Least share of the way to the floor."""
 
-SETTLES = 2.0
+ON_ITS_WAY = 2.0
 """A model with one effect more is judged by fewer simulations where its error is above this, in units of the
-gate: it is only on its way."""
+gate."""
 
 MOST = 4
 """Effects that are added at most."""
@@ -143,7 +143,7 @@ def _step(search: Search, model: Model, judgement: Judgement, more: bool) -> tup
         return step, None, False
     search.note(best, finalists, ties, judgement)
     step = replace(step, chosen=best.name, ties=ties)
-    return step, settle(evidence, best.model, seed=seed, rounds=1), best.error > SETTLES * judgement.gate
+    return step, settle(evidence, best.model, seed=seed, rounds=1), best.error > ON_ITS_WAY * judgement.gate
 
 
 def _found(search: Search, hidden: Tried, p_value: float, step: Step, judgement: Judgement) -> Step:

@@ -9,7 +9,7 @@ from itertools import product
 import numpy as np
 from numpy.typing import NDArray
 
-from dase.descent import Found, Over, screening, searching
+from dase.descent import Over, screening, searching
 from dase.effects.base import Effect
 from dase.error import Judgement
 from dase.evidence import Evidence, Half
@@ -91,26 +91,11 @@ class Model:
         over: Over | None = None,
     ) -> Work[Model]:
         """Return the model with its parameters improved, see `together`."""
-        found = yield from self.exploring(
-            half, seed=seed, iterations=iterations, radius=radius, patient=patient, over=over
-        )
-        return replace(self, place=found.place, loss=found.loss)
-
-    def exploring(
-        self,
-        half: Half,
-        *,
-        seed: int,
-        iterations: int = 4,
-        radius: float = 0.2,
-        patient: bool = False,
-        over: Over | None = None,
-    ) -> Work[Found]:
-        """Improve the parameters and keep all that was tried, see `together`."""
-        return searching(
+        found = yield from searching(
             half, self.space, self.place, seed=seed, iterations=iterations, radius=radius, patient=patient,
             over=over,
         )  # fmt: skip
+        return replace(self, place=found.place, loss=found.loss)
 
 
 def model_of(sensor: Sensor, free: Sequence[str] | None = None) -> Model:

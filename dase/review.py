@@ -21,7 +21,7 @@ DROPPED = 8.0
 """An effect is tried to be dropped where the error on the scout without it, quickly fitted, is below this, in
 units of the gate."""
 
-NEAR = 2.0
+NEAR = 1.5
 """A model is fitted in full where one descent takes its held-out error below this, in units of the gate or of
 the present model's error."""
 

@@ -77,7 +77,7 @@ class Blocks(Writer):
     def types(self) -> dict[str, str]:
         """Return the Warp type of the lanes of every quantity that differs from pixel to pixel."""
         floats = ["x", "y", "on", "off", "mean_on", "mean_off", "radius", "intensity", "voltage"]
-        floats += ["before", "after", "leaked_before", "busy", *self.states, *self.maps]
+        floats += ["before", "after", "leaked_before", "asleep", "busy", *self.states, *self.maps]
         floats += [f"{effect.name}_{q}" for effect, _ in self.of("noise") for q in ("on", "off", "spend")]
         floats += [local for local in self.draws if self.once(local)]
         ints = ["pixel", "on_count", "off_count", *(f"{local}_key" for local in self.draws)]
@@ -165,7 +165,7 @@ class Blocks(Writer):
 
     def events(self) -> None:
         """Events of the pixels that have any."""
-        self.lanes([f"busy = wp.where({self.busy_when()}, 1.0, 0.0)"])
+        self.lanes([*self.asleep(), f"busy = wp.where({self.busy_when()}, 1.0, 0.0)"])
         self.add(self.which())
         found = f"lane = within(lowest_bit(bits), {self.size})"
         self.lanes(

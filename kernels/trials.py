@@ -178,7 +178,7 @@ class _Lanes(_Trials, Blocks):
 
     def types(self) -> dict[str, str]:
         floats = ["on", "off", "mean_on", "mean_off", "nominal_on", "nominal_off", "intensity", "voltage"]
-        floats += ["before", "after", "leaked_before", "busy", *self.states, *self.places]
+        floats += ["before", "after", "leaked_before", "asleep", "busy", *self.states, *self.places]
         floats += [f"{effect.name}_{q}" for effect, _ in self.of("noise") for q in ("on", "off", "spend")]
         floats += [local for local in self.draws if self.once(local)]
         ints = [*(f"{effect.name}_acts" for effect in self.stages), *(f"{local}_key" for local in self.draws)]

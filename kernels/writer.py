@@ -13,6 +13,9 @@ from dase.kernels.random import stream
 AHEAD = 4
 """Stored samples of a pixel that are under way from memory at a time."""
 
+LONGER = 1.0001
+"""A pixel whose dead time lasts so many times what is left of a step, or longer, sleeps through it."""
+
 VOLTAGE = "voltage = logarithm(Lane(intensity), log_eps)[0]"
 
 
@@ -266,13 +269,27 @@ class Writer(Crossings):
     def busy_when(self) -> str:
         """Return the condition on which the step can have events."""
         noisy = (effect.name for effect, _ in self.of("noise"))
-        busy = ["after >= on", "after <= -off", *(f"{n}_spend > {n}_hazard" for n in noisy)]
-        # a crossing that waits for the end of the dead time may come although the signal returns
-        busy += ["before >= on", "before <= -off"] if self.delays() else []
-        return " or ".join(busy)
+        crossed = "after >= on or after <= -off"
+        if self.delays():
+            # a crossing that waits for the end of the dead time may come although the signal returns
+            crossed += " or before >= on or before <= -off"
+            awake = f"asleep <= {LONGER} * dt" + (" or leaked != 0.0" if "leaked" in self.states else "")
+            crossed = f"({crossed}) and ({awake})"
+        return " or ".join([crossed, *(f"{n}_spend > {n}_hazard" for n in noisy)])
+
+    def asleep(self) -> list[str]:
+        """Return the lines that set `asleep` to the rest of the dead time, where events wait for its end."""
+        if not self.delays():
+            return []
+        lines = ["asleep = float(0.0)"]
+        for effect, function in self.of("gate"):
+            rest = self.call("gate", effect, function)
+            lines += self.unless_off(effect, f"asleep = wp.max(asleep, {rest})")
+        return lines
 
     def events(self) -> None:
         """Events of the step, if there are any."""
+        self.part(lambda: self.add(*self.asleep()))
         self.part(self.busy, when=self.busy_when())
 
     def settle(self) -> None:
