@@ -7,7 +7,8 @@ Each part is timed alone; on a GPU as it runs in a step, from a recording, so th
     python perf/bench_training.py --out out/training.json
 
 The bound of a critic step is the memory traffic that it cannot do without, `CriticBank.traffic`, at the rate
-of a copy on the same device, measured in the same run.
+of a copy on the same device, measured in the same run. In turns with it two naive banks are timed, see
+`perf/naive_bank.py`.
 """
 
 from __future__ import annotations
@@ -23,6 +24,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
+import naive_bank
 import numpy as np
 import torch
 
@@ -62,17 +64,23 @@ class Clock:
 
     def __call__(self, work: Callable[[], Any], *, inner: int = 1) -> float:
         """Return the median time of `work` [s], called `inner` times between two looks at the clock."""
-        for _ in range(5):
-            work()
-        times = []
-        for _ in range(self.repeats):
-            self.wait()
-            begin = time.perf_counter()
-            for _ in range(inner):
+        return self.in_turns({"": work}, inner=inner)[""]
+
+    def in_turns(self, works: dict[str, Callable[[], Any]], *, inner: int = 1) -> dict[str, float]:
+        """Return the median times of some works [s], each measured once before any is again."""
+        for work in works.values():
+            for _ in range(5):
                 work()
-            self.wait()
-            times.append((time.perf_counter() - begin) / inner)
-        return statistics.median(times)
+        times: dict[str, list[float]] = {name: [] for name in works}
+        for _ in range(self.repeats):
+            for name, work in works.items():
+                self.wait()
+                begin = time.perf_counter()
+                for _ in range(inner):
+                    work()
+                self.wait()
+                times[name].append((time.perf_counter() - begin) / inner)
+        return {name: statistics.median(each) for name, each in times.items()}
 
 
 def copy_rate(clock: Clock, size: int) -> float:
@@ -252,8 +260,8 @@ def kernels(training: Training, steps: int = 5) -> None:
         print(f"    {sum(each) / steps / 1e3:7.3f} ms {len(each) / steps:6.1f} x {name[:90]}")
 
 
-def bank(args: argparse.Namespace, clock: Clock, rate: float, patches: int) -> dict[str, float]:
-    """Return how a critic step on evenly spread classes compares with its bound."""
+def bank(args: argparse.Namespace, clock: Clock, rate: float, patches: int) -> dict[str, Any]:
+    """Return how a critic step on evenly spread classes compares with its bound, and with naive banks."""
     shape = BankShape(classes=24, inputs=1024) if args.small else BankShape(classes=216)
     generator = torch.Generator(args.device).manual_seed(0)
     made = CriticBank(shape, device=args.device, generator=generator)
@@ -262,9 +270,14 @@ def bank(args: argparse.Namespace, clock: Clock, rate: float, patches: int) -> d
     rows = [torch.rand(patches, shape.inputs, device=args.device) for _ in range(2)]
     weights = torch.full((shape.classes,), 1 / shape.classes, device=args.device)
     active = len(set(classes[0].tolist()) & set(classes[1].tolist()))
-    seconds = Clock(clock.device, clock.repeats, [generator]).recorded(
-        lambda: made.step(rows[0], classes[0], rows[1], classes[1], weights, rate=1e-9, generator=generator)
-    )
+
+    def step() -> Any:
+        return made.step(rows[0], classes[0], rows[1], classes[1], weights, rate=1e-9, generator=generator)
+
+    seconds = Clock(clock.device, clock.repeats, [generator]).recorded(step)
+    replay = Replay(clock.device, [generator])
+    given = naive_bank.Patches(rows[0], classes[0], rows[1], classes[1], weights)
+    naive = naive_bank.compare(made, given, lambda: replay("all", step), step, clock)
     bound = made.traffic(active) / rate
     end = torch.arange(1, shape.classes + 1, dtype=torch.int32, device=args.device) * (
         3 * patches // shape.classes
@@ -288,6 +301,7 @@ def bank(args: argparse.Namespace, clock: Clock, rate: float, patches: int) -> d
         "share_of_bound": bound / seconds,
         "update_seconds": update,
         "update_share": moved / rate / update,
+        "naive": naive,
     }
 
 
@@ -313,6 +327,7 @@ def main() -> None:
     rate = copy_rate(clock, 1 << (26 if args.small else 31))
     found: dict[str, Any] = provenance(args.device, args.commit) | {"copy_rate": rate}
     print(f"{found['device']}, PyTorch {found['torch']}: a copy moves {rate / 1e12:.3f} TB/s")
+    faults: list[str] = []
     for patches in (64,) if args.small else (432, 1728):
         line = bank(args, clock, rate, patches)
         found[f"bank_{patches}"] = line
@@ -321,6 +336,8 @@ def main() -> None:
             f"{1e3 * line['bound']:.2f} ms: {100 * line['share_of_bound']:.0f} %; its update alone "
             f"{1e3 * line['update_seconds']:.2f} ms: {100 * line['update_share']:.0f} %"
         )
+        print(naive_bank.told(line["naive"], line["bound"]))
+        faults += naive_bank.faults(line["naive"])
     for objective in ("wgan", "moments"):
         training = make(args, objective)
         clock.generators = training._generators()
@@ -345,6 +362,8 @@ def main() -> None:
     if args.out is not None:
         args.out.parent.mkdir(parents=True, exist_ok=True)
         args.out.write_text(json.dumps(found, indent=1), encoding="utf-8")
+    if faults:
+        raise SystemExit("\n".join(faults))
 
 
 if __name__ == "__main__":
