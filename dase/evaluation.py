@@ -99,7 +99,7 @@ class HeldOut:
         for some in self.real:
             self.like.see_real(some)
         for fake in first:
-            self.like.see_plain(Pairs(fake.grey, fake.counts, fake.counts))
+            self.like.see_plain(Pairs(fake.grey, fake.counts, fake.counts), self.like.members(fake.grey))
         self.like.weigh()
 
     @torch.no_grad()

@@ -288,8 +288,13 @@ class Moments:
             self.sets[name].see_real(*map(parallel.together, both), held_out=held_out)
 
     @torch.no_grad()
-    def see_plain(self, fake: Pairs, members: Members | None = None) -> dict[str, torch.Tensor]:
-        """Take the reference counts of simulated pairs in; return how far each scene is off."""
+    def see_plain(self, fake: Pairs, members: Members) -> dict[str, torch.Tensor]:
+        """Take the reference counts of simulated pairs in; return how far each scene is off.
+
+        Args:
+            fake: With their reference counts.
+            members: What `members` returned for their images.
+        """
         assert fake.reference is not None
         found = self.sums(Pairs(fake.grey, fake.reference), members)
         return {

@@ -70,12 +70,13 @@ class Newton:
         rows, columns = (hats.flatten(2).transpose(1, 2).to(working) for hats in self.net.hats(grey))
         cells, size = number.shape[1], (rows.shape[2], columns.shape[2])
         # a node is a row times a column: half goes to the cells, half to the features
-        places = (member.to(working)[..., None] * columns[:, :, None]).flatten(2)
+        member = member.to(working)
+        places = (member[..., None] * columns[:, :, None]).flatten(2)
         for name in ends:
             flat = slope(name, with_neighbours).flatten(2).transpose(1, 2).to(working)  # (B, N, F)
             width = flat.shape[2]
             if name == "ratio":
-                total = summed(member.to(working), flat).sum(0).view(cells, width, 1)
+                total = summed(member, flat).sum(0).view(cells, width, 1)
             else:
                 each = (flat[..., None] * rows[:, :, None]).flatten(2)
                 total = summed(places, each).sum(0).view(cells, size[1], width, size[0])

@@ -20,6 +20,7 @@ from typing import Any
 
 import cv2
 import numpy as np
+from bench_kernels import commit
 from real_report import write_page
 
 import dase
@@ -240,7 +241,7 @@ def look(name: str, path: Path, options: argparse.Namespace) -> None:
         measured.events, measured.scene, trust=measured.trust, pixels=camera.pixels, device=options.device
     )
     found = measured.noted(found)
-    (options.log / f"{name}.json").write_text(json.dumps(found.to_json()))
+    (options.log / f"{name}.json").write_text(json.dumps(found.to_json() | {"commit": options.commit}))
     np.savez_compressed(options.log / f"{name}.npz", **pictures(camera, measured, found.sensor))
     from dase.diagnosis import summary
 
@@ -290,7 +291,9 @@ def main() -> None:
     parser.add_argument("--device", default="cpu")
     parser.add_argument("--again", action="store_true", help="diagnose what was diagnosed before, too")
     parser.add_argument("--report", action="store_true", help="only write the page")
+    parser.add_argument("--commit", help="what to record where there is no git")
     options = parser.parse_args()
+    options.commit = options.commit or commit()
     for folder in (options.log, options.out):
         folder.mkdir(parents=True, exist_ok=True)
     for name in options.only.split(","):

@@ -34,8 +34,19 @@ def write_page(cameras: Mapping[str, Any], log: Path, out: Path) -> None:
     left = f"\nNot diagnosed yet: {names}.\n" if names else ""
     parts = [section(name, cameras[name], *found[name]) for name in found]
     (out / "real-cameras.md").write_text(
-        PAGE.format(table=table(cameras, found), parts="\n\n".join(parts), left=left)
+        PAGE.format(table=table(cameras, found), parts="\n\n".join(parts), left=left, made=made_at(found))
     )
+
+
+def made_at(found: Mapping[str, Any]) -> str:
+    """Return a sentence with the commits at which recordings were diagnosed."""
+    at: dict[str, list[str]] = {}
+    for name, (what, _) in found.items():
+        at.setdefault(what.get("commit", ""), []).append(name)
+    if len(at) == 1:
+        return f" All are of commit {next(iter(at))}." if all(at) else ""
+    known = (f"{commit or 'unknown'} ({', '.join(names)})" for commit, names in at.items())
+    return f" Commits: {', '.join(known)}."
 
 
 def answer(found: dict[str, Any]) -> str:
@@ -221,7 +232,8 @@ PAGE = """# Real cameras
 
 `perf/real_cameras.py` writes this page; edit the text there and in `perf/real_report.py`. Each recording is
 compared with a sensor that has thresholds alone, and `dase diagnose --auto` looks for what is missing. The
-error is that of pixels and times that no fit has seen; 1 is what two repeats of the recording would have.
+error is that of pixels and times that no fit has seen; 1 is what two repeats of the recording would
+have.{made}
 
 {table}
 {left}
