@@ -15,6 +15,7 @@ from dase import images
 from dase.baselines import Randomised, esim, event_rate
 from dase.config import dump_sensor, load_sensor, presets
 from dase.effects.learned_threshold import LearnedThreshold
+from dase.effects.mismatch import Mismatch
 from dase.effects.threshold import Threshold
 from dase.errors import InputError, nearest
 from dase.files import replacing
@@ -231,9 +232,10 @@ def _truth(sensor: Sensor) -> Truth | None:
     known = {"threshold", "mismatch"}
     if any(effect.name not in known and not effect.is_off() for effect in sensor.effects):
         return None
-    spread = sensor["mismatch"].spread if "mismatch" in sensor else 0.0  # type: ignore[attr-defined]
     threshold = sensor["threshold"]
-    both = [threshold.off, threshold.on]  # type: ignore[attr-defined]
+    assert isinstance(threshold, Threshold)
+    both = [threshold.off, threshold.on]
+    spread = max((effect.spread for effect in sensor.effects if isinstance(effect, Mismatch)), default=0.0)
 
     def truth(grey: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         mu = torch.tensor(both, device=grey.device).view(1, 2, 1, 1).expand(len(grey), 2, *grey.shape[1:])

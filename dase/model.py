@@ -11,6 +11,8 @@ from numpy.typing import NDArray
 
 from dase.descent import Over, screening, searching
 from dase.effects.base import Effect
+from dase.effects.flicker import Flicker
+from dase.effects.threshold import Threshold
 from dase.error import Judgement
 from dase.evidence import Evidence, Half
 from dase.sensor import Sensor
@@ -119,7 +121,9 @@ def turned(model: Model, step: float) -> list[Model]:
     if "flicker.phase" not in names:
         return [model]
     at = names.index("flicker.phase")
-    turn = step * model.sensor["flicker"].frequency  # type: ignore[attr-defined]
+    lamp = model.sensor["flicker"]
+    assert isinstance(lamp, Flicker)
+    turn = step * lamp.frequency
     out = [model]
     for phase in (-turn, turn):
         place = model.place.copy()
@@ -179,8 +183,9 @@ def _from_other_phase(evidence: Evidence, model: Model, *, seed: int, rounds: in
 
 
 def _turned(model: Model) -> Model:
-    phase = model.space.sensor["threshold"].phase  # type: ignore[attr-defined]
-    return with_phase(model, 1.0 - phase)
+    threshold = model.space.sensor["threshold"]
+    assert isinstance(threshold, Threshold)
+    return with_phase(model, 1.0 - threshold.phase)
 
 
 def settling(

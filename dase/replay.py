@@ -7,7 +7,7 @@ them. Recorded, they are one launch.
 from __future__ import annotations
 
 from collections.abc import Callable, Hashable, Sequence
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import torch
 
@@ -33,7 +33,7 @@ class Replay:
     def __init__(self, device: torch.device, generators: Sequence[torch.Generator]):
         self.device, self.generators = device, generators
         self.seen: dict[Hashable, int] = {}
-        self.recorded: dict[Hashable, tuple[torch.cuda.CUDAGraph, object]] = {}
+        self.recorded: dict[Hashable, tuple[torch.cuda.CUDAGraph, Any]] = {}
         # steps follow one another, so they may use the same memory
         self.pool = torch.cuda.graph_pool_handle() if device.type == "cuda" else None
 
@@ -51,9 +51,10 @@ class Replay:
             if self.seen[kind] <= SEEN:
                 return step()
             self.recorded[kind] = self._record(step)
+        values: T
         graph, values = self.recorded[kind]
         graph.replay()
-        return values  # type: ignore[return-value]
+        return values
 
     def _record(self, step: Callable[[], T]) -> tuple[torch.cuda.CUDAGraph, T]:
         graph = torch.cuda.CUDAGraph()

@@ -13,7 +13,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from dase.kernels.autograd import FLOOR, STEP, count_events, thresholds
+from dase.kernels.autograd import FLOOR, STEP, Surrogate, count_events, thresholds
 from dase.networks import edge_strength
 from dase.scenery import Scenery, middle, sent
 
@@ -109,14 +109,14 @@ class Target(ABC):
         """Return pairs that `draw` never gives, or None where every draw is new."""
         return None
 
-    def part(self, process: int) -> None:  # noqa: B027
+    def part(self, process: int) -> None:  # noqa: B027  # most have nothing to do here
         """Become different from the same target in other processes, but for what is recorded."""
 
     def state(self) -> dict[str, Any]:
         """Return what further draws depend on, beside the random numbers they are given."""
         return {}
 
-    def load(self, state: dict[str, Any]) -> None:  # noqa: B027
+    def load(self, state: dict[str, Any]) -> None:  # noqa: B027  # most have nothing to do here
         """Take over what `state` returned."""
 
 
@@ -254,7 +254,7 @@ def simulate(
     sigma: torch.Tensor | float,
     noise: Noise,
     *,
-    surrogate: str = "expected",
+    surrogate: Surrogate = "expected",
 ) -> torch.Tensor:
     """Count the events of scenes.
 
@@ -268,7 +268,7 @@ def simulate(
     Returns:
         Counts of the whole window, shape (B, 2, H, W), OFF before ON.
     """
-    counts = count_events(log, mu, sigma, noise.z, phase=noise.phase, surrogate=surrogate)  # type: ignore[arg-type]
+    counts = count_events(log, mu, sigma, noise.z, phase=noise.phase, surrogate=surrogate)
     return counts[:, 0]
 
 

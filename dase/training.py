@@ -12,6 +12,7 @@ import torch
 
 from dase import parallel
 from dase.errors import InputError
+from dase.kernels.autograd import Surrogate
 from dase.moments import Moments
 from dase.networks import Maps, NetworkShape, ThresholdNet
 from dase.newton import Newton
@@ -81,7 +82,7 @@ class Recipe:
     anchor: float = 5.0
     smooth: float = 0.1
     kl: float = 1e-5
-    surrogate: str = "expected"
+    surrogate: Surrogate = "expected"
     critic_rate: float = 2e-4
     critic_cosine: bool = False
     critic_steps: int = 1

@@ -53,7 +53,7 @@ def device(name: str) -> wp.Device:
         raise ValueError(f"backend '{name}' needs an NVIDIA GPU with a driver, none was found; use 'cpu'")
     try:
         return wp.get_device("cuda:0" if name == "cuda" else name)
-    except Exception as error:
+    except ValueError as error:
         names = ", ".join(d.alias for d in wp.get_devices())
         raise ValueError(f"backend '{name}' does not exist, here there are: {names}") from error
 

@@ -10,6 +10,7 @@ import sys
 import time
 import types
 from collections.abc import Callable
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -144,7 +145,7 @@ def openeb_runs(clip: Clip, options: argparse.Namespace) -> dict[str, dict[str, 
         package.__path__ = [str(path or folder / "video_to_event")]
         sys.modules[name] = package
     try:
-        import metavision_sdk_base  # noqa: F401  # only whether it is there
+        import_module("metavision_sdk_base")
     except ImportError:
         # a checkout lacks this compiled part, of which the simulator needs the layout of an event
         names, formats = ["x", "y", "p", "t"], ["<u2", "<u2", "<i2", "<i8"]

@@ -186,8 +186,6 @@ def test_the_commands_say_what_is_compared(tmp_path, recording):
 def test_a_davis_and_its_frames(shared):
     """20 ms exposures every 40 ms leave little to trust, yet enough to compare."""
     path = shared / "recordings" / "native" / "davis346_cuke_cradle.aedat4"
-    if not path.exists():
-        pytest.skip("needs ../shared/recordings")
     found = open_measurement(path)
     assert isinstance(found.scene, dase.CameraScene)
     evidence = gather(found.events, found.scene, trust=found.trust)

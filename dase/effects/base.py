@@ -121,7 +121,7 @@ class Effect:
     @classmethod
     def parameters(cls) -> tuple[Parameter, ...]:
         """Return the numbers of this effect, in the order of its fields."""
-        return _parameters_of(cls)  # type: ignore[arg-type]
+        return _parameters_of(cls)  # type: ignore[arg-type]  # mypy takes a class for unhashable
 
     @classmethod
     def choices(cls) -> dict[str, tuple[str, ...]]:

@@ -142,7 +142,7 @@ class EventWriter(Writer):
 
     def abandon(self) -> None:
         """Close the file."""
-        with suppress(Exception):
+        with suppress(OSError):
             self._file.close()
 
     def _start(self) -> None:

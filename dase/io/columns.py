@@ -6,6 +6,7 @@ import math
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, nullcontext, suppress
+from importlib import import_module
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -57,7 +58,7 @@ def opened(path: Path) -> Iterator[Any]:
     if not _plugin_tried:
         _plugin_tried = True
         with suppress(ImportError):
-            import hdf5plugin  # noqa: F401  # registers its filters
+            import_module("hdf5plugin")  # registers its filters
     check_head(path)
     check_heaps(path)
     with h5py.File(path, "r") as file:

@@ -16,6 +16,7 @@ from __future__ import annotations
 
 import math
 from contextlib import AbstractContextManager, suppress
+from io import FileIO
 from pathlib import Path
 from typing import Any
 
@@ -66,7 +67,7 @@ class _Disk:
     """
 
     def __init__(self, path: Path) -> None:
-        self._file = open(path, "w+b", buffering=0)  # noqa: SIM115  # closed by `close`
+        self._file = FileIO(path, "w+")
         self.failure: BaseException | None = None
 
     def check(self) -> None:

@@ -165,7 +165,7 @@ def matches_zip(path: Path, head: bytes) -> bool:
     try:
         with zipfile.ZipFile(path) as archive:
             names = archive.namelist()
-    except Exception:
+    except Exception:  # damaged: left to the reader that is tried at last
         return False
     return any(name.lower().endswith(SUFFIXES) for name in names) and not any(
         n.endswith(".npy") for n in names
