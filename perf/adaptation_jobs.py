@@ -65,7 +65,8 @@ def run_all(
     end = time.perf_counter() + budget
     most = len(devices) * max((round(1 / task.share) for task in tasks), default=1)
     # set before the workers import what reads it
-    os.environ["OMP_NUM_THREADS"] = str(max((os.cpu_count() or 2) // most, 1))
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 2
+    os.environ["OMP_NUM_THREADS"] = str(max(cores // most, 1))
     os.environ.setdefault("DASE_THREADS", os.environ["OMP_NUM_THREADS"])
     waiting, idle, busy = list(tasks), [], []
     try:

@@ -1,19 +1,31 @@
 #!/usr/bin/env bash
-# Measures everything that wants a GPU, in order of importance; what is there already is gone on with.
+# Measures everything that wants a GPU, and what wants many cores; what is there already is gone on with.
 #
 #   PHOTOS=folder RECORDING=davis240c_camerashake.npz HIDDEN=folder perf/gpu.sh OUT [STEP...]
 #
-# Steps: tests, kernels, synth, scaling, training, diagnosis, learning. PYTHON names the interpreter, COMMIT
-# the commit where there is no git. Each step writes its log and its tables into OUT; none stops the others.
+# Steps: tests, kernels, synth, scaling, both, learning, matrix, training, v2e, pack. Where a call may not take
+# long, and there are several GPUs, this is two calls:
+#
+#   LIMIT=560 perf/gpu.sh OUT both pack                        learning on the GPUs, the matrix on the CPU
+#   REST=240 perf/gpu.sh OUT matrix training v2e tests pack    the rest of the matrix, then the GPU alone
+#
+# LIMIT and REST are seconds; what has not ended by then is stopped, loses its last runs, and goes on when
+# called again. PYTHON names the interpreter, COMMIT the commit where there is no git, DEVICES the GPUs if not
+# all. Each step writes its log and its tables into OUT; none stops the others; `pack` leaves OUT.tar.gz.
 set -uo pipefail
 cd "$(dirname "$0")/.."
 out=$1 && shift
 steps=("${@:-}")
-[ -n "${steps[0]}" ] || steps=(tests kernels synth scaling training diagnosis learning)
+[ -n "${steps[0]}" ] || steps=(tests kernels synth scaling both matrix training v2e pack)
 python=${PYTHON:-python3}
 commit=${COMMIT:-$(git describe --always --dirty)}
 export PYTHONPATH=$PWD:${PYTHONPATH:-} PYTHONUNBUFFERED=1
-mkdir -p "$out"
+cores=$(env -u OMP_NUM_THREADS nproc)
+all='import torch; print(*(f"cuda:{n}" for n in range(torch.cuda.device_count())), sep=",")'
+devices=${DEVICES:-$("$python" -c "$all")}
+first=${devices%%,*}
+room=${ROOM:-10} # cores for learning beside the matrix
+mkdir -p "$out/docs"
 
 run() { # NAME COMMAND...
     local name=$1 begin=$SECONDS && shift
@@ -21,21 +33,59 @@ run() { # NAME COMMAND...
     echo "$name: status $?, $((SECONDS - begin)) s: $(tail -n 1 "$out/$name.log")"
 }
 
+on() { # CORES COMMAND...: on these alone, so that neither takes those of the other
+    local cores=$1 && shift
+    if command -v taskset >/dev/null; then taskset -c "$cores" "$@"; else "$@"; fi
+}
+
+learning() { # SECONDS [CORES]
+    # it ends by itself, and is only kept from hanging
+    run learning on "${2:-0-$((cores - 1))}" timeout -k 5 $(($1 + 20)) "$python" perf/adaptation.py \
+        --plan all --jobs 2 --alone 2 --device "$devices" --budget "$1" --images "${PHOTOS:-builtin}" \
+        ${RECORDING:+--recording "$RECORDING"} --commit "$commit" --out "$out/adaptation"
+}
+
+matrix() { # SECONDS JOBS [CORES]
+    local end=$((SECONDS + $1)) where=${3:-0-$((cores - 1))}
+    local blind=("$python" perf/hidden_effects.py --log "$out/hidden_effects.jsonl" --out "$out/docs")
+    export OMP_NUM_THREADS=1
+    # one run alone compiles what the others would all compile at the same time
+    run warm on "$where" timeout -k 5 "$1" "${blind[@]}" --kinds nothing --nothing 1
+    # `timeout` ends its whole group; every line of the log is one whole run
+    run matrix on "$where" timeout -k 5 $((end - SECONDS > 0 ? end - SECONDS : 1)) "${blind[@]}" \
+        --kinds single,nothing,pairs,unknown,included --jobs "$2"
+    echo "matrix: $(wc -l <"$out/hidden_effects.jsonl") runs in the log"
+    unset OMP_NUM_THREADS
+}
+
 for step in "${steps[@]}"; do
     case $step in
-    tests) run tests "$python" -m pytest -q -p no:cacheprovider --device cuda:0 tests/test_{pixel,pixel_invariants,lanes,effects,effects_more,effects_voltage,effects_noise,pairs,readout,readout_stages,labels,counts,scene,autograd_scene,autograd_scene_differences,patches,probes,optics,camera,static}.py ;;
+    tests) run tests "$python" -m pytest -q -p no:cacheprovider --device "$first" \
+        tests/test_{pixel,pixel_invariants,lanes,effects,effects_more,effects_voltage,effects_noise,pairs}.py \
+        tests/test_{readout,readout_stages,labels,counts,scene,autograd_scene,autograd_scene_differences}.py \
+        tests/test_{patches,probes,optics,camera,static,starts,video,critics,learned,training_run}.py ;;
     kernels)
         run kernels_4k "$python" perf/bench_kernels.py --device cuda --size 3840x2160
         run kernels_vga "$python" perf/bench_kernels.py --device cuda --size 640x480 ;;
     synth) for jobs in 1 8; do
-        run "synth_$jobs" "$python" perf/bench_synth.py --images "${PHOTOS:-builtin}" --backend cuda --jobs "$jobs"
+        run "synth_$jobs" "$python" perf/bench_synth.py --images "${PHOTOS:-builtin}" --backend cuda \
+            --jobs "$jobs"
     done ;;
-    scaling)
-        mkdir -p "$out/docs"
-        run scaling "$python" perf/scaling.py --device cuda --out "$out/docs" ;;
-    training) run training "$python" perf/bench_training.py --images "${PHOTOS:-builtin}" --commit "$commit" --out "$out/training.json" ;;
-    diagnosis) run diagnosis "$python" perf/hidden_effects.py --jobs "${JOBS:-14}" --device cuda:0 --minutes "${MINUTES:-12}" --log "$out/hidden_effects.jsonl" ${HIDDEN:+--hidden "$HIDDEN"} ;;
-    learning) run learning "$python" perf/adaptation.py --plan all --jobs 6 --alone 2 --budget "${BUDGET:-560}" --images "${PHOTOS:-builtin}" ${RECORDING:+--recording "$RECORDING"} --commit "$commit" --out "$out/adaptation" ;;
+    scaling) run scaling "$python" perf/scaling.py --device cuda --out "$out/docs" ;;
+    both)
+        learning "${LIMIT:-560}" "0-$((room - 1))" &
+        matrix "${LIMIT:-560}" $((cores - room)) "$room-$((cores - 1))"
+        wait ;;
+    learning) learning "${LIMIT:-560}" ;;
+    matrix) matrix "${REST:-240}" $((cores > 4 ? cores - 2 : cores)) ;;
+    training) run training "$python" perf/bench_training.py --device "$first" \
+        --images "${PHOTOS:-builtin}" --commit "$commit" --out "$out/training.json" ;;
+    v2e) [ -z "${HIDDEN:-}" ] || run v2e "$python" perf/hidden_effects.py --kinds other --hidden "$HIDDEN" \
+        --device "$devices" --jobs 4 --log "$out/hidden_effects.jsonl" --out "$out/docs" ;;
+    pack) # without networks, and without examples that no page shows
+        tar czf "$out.tar.gz" --exclude='*.pt' --exclude='*.safetensors' --exclude='real-*/examples.npz' \
+            --exclude='*-wgan*/examples.npz' -C "$out" .
+        ls -l "$out.tar.gz" ;;
     *) echo "there is no step '$step'" && exit 2 ;;
     esac
 done

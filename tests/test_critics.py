@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import importlib
 from itertools import pairwise
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -94,6 +96,20 @@ def test_gradients_are_those_of_double_backward(bank, batch):
 
 def close(got: torch.Tensor, want: torch.Tensor) -> None:
     torch.testing.assert_close(got, want, rtol=1e-4, atol=1e-7)
+
+
+@pytest.mark.parametrize("kind", ["Loop", "Padded"])
+def test_naive_banks_differentiate_the_same_loss(bank, batch, kind, monkeypatch):
+    monkeypatch.syspath_prepend(Path(__file__).parents[1] / "perf")
+    naive_bank = importlib.import_module("naive_bank")
+    naive = getattr(naive_bank, kind)(bank)
+    patches = naive_bank.Patches(batch["fake"], FAKE, batch["real"], REAL, batch["weights"])
+    found = naive_bank.differences(bank, naive, patches)
+    assert max(found["bank"].values()) < 1e-5
+    assert not naive_bank.faults({"differences": {kind: found}})
+    bank.w2 *= 1.05
+    found = naive_bank.differences(bank, naive, patches)
+    assert naive_bank.faults({"differences": {kind: found}})
 
 
 def test_a_step_is_adams_and_leaves_other_critics_alone(bank, batch):
