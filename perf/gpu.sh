@@ -81,7 +81,7 @@ for step in "${steps[@]}"; do
     training) run training "$python" perf/bench_training.py --device "$first" \
         --images "${PHOTOS:-builtin}" --commit "$commit" --out "$out/training.json" ;;
     v2e) [ -z "${HIDDEN:-}" ] || run v2e "$python" perf/hidden_effects.py --kinds other --hidden "$HIDDEN" \
-        --device "$devices" --jobs 4 --log "$out/hidden_effects.jsonl" --out "$out/docs" ;;
+        --device "$first" --jobs 1 --log "$out/hidden_effects.jsonl" --out "$out/docs" ;;
     pack) # without networks, and without examples that no page shows
         tar czf "$out.tar.gz" --exclude='*.pt' --exclude='*.safetensors' --exclude='real-*/examples.npz' \
             --exclude='*-wgan*/examples.npz' -C "$out" .
