@@ -13,14 +13,71 @@ LOST = wp.constant(wp.int64(NEVER))
 ONE = 1 << 32
 """A weight of 1."""
 
-SPREAD = wp.constant(wp.int64(2654435769))  # the golden ratio, so that any run of numbers is spread evenly
-PARTS = wp.constant(wp.int64(ONE - 1))
-
-
-@wp.func
-def copies(number: int, weight: wp.int64) -> int:
-    """Return how often an event that stands for `weight` / ONE events is sent: whole, right in the mean."""
-    return int((weight + ((wp.int64(number) * SPREAD) & PARTS)) >> wp.int64(32))
+@wp.func_native(
+    """
+    const long long* __restrict__ due = other.data;
+    const unsigned char* __restrict__ sign = polarity.data;
+    const int count = other.shape[0];
+    long long free = busy.data[0];
+    int turn = 0;  // of the others
+    long long sent = 0;  // copies of the one whose turn it is
+    long long at = count > 0 ? due[0] : 0;  // when the last copy got there
+    long long step = 0, rest = 0, part = 0;  // from copy to copy, and what is left over by whole numbers
+    for (int i = 0; i < arrival.shape[0]; ++i) {
+        const long long mine = arrival.data[i];
+        while (turn < count) {
+            // the golden ratio, so that any run of numbers is spread evenly: whole, right in the mean
+            const long long many = (weight.data[sign[turn]] + ((turn * 2654435769ll) & 0xffffffffll)) >> 32;
+            if (many <= 1) {
+                if (due[turn] > mine) break;
+                at = due[turn++];
+                const long long through = (free > at ? free : at) + service;
+                free = (many == 1) & (free - at <= patience) ? through : free;
+                continue;
+            }
+            // copies keep apart: events at one time would collide more often than the events they stand for
+            if (sent == 0) {
+                step = (due[turn] - at) / many;
+                rest = (due[turn] - at) % many;
+                part = 0;
+            }
+            while (sent < many) {
+                const bool over = part + rest >= many;
+                const long long next = at + step + over;
+                if (next > mine) break;
+                at = next;
+                part += rest - (over ? many : 0);
+                const long long through = (free > at ? free : at) + service;
+                free = free - at <= patience ? through : free;
+                ++sent;
+            }
+            if (sent < many) break;
+            sent = 0;
+            ++turn;
+        }
+        if (free - mine > patience) {
+            through.data[i] = lost;
+        } else {
+            free = (free > mine ? free : mine) + service;
+            through.data[i] = free;
+        }
+    }
+    busy.data[0] = free;
+"""
+)
+def in_turn(
+    arrival: wp.array[wp.int64],
+    other: wp.array[wp.int64],
+    polarity: wp.array[wp.uint8],
+    weight: wp.array[wp.int64],
+    service: wp.int64,
+    patience: wp.int64,
+    lost: wp.int64,
+    busy: wp.array[wp.int64],
+    through: wp.array[wp.int64],
+):
+    """Do what `queue` does."""
+    ...
 
 
 @wp.kernel(enable_backward=False)
@@ -42,34 +99,4 @@ def queue(
     Which events are lost depends on all that were sent before, so this is no scan. On one CPU thread it is
     faster than the copies around it, and the events are on the host anyway, on their way to a file.
     """
-    free = busy[0]
-    turn = int(0)
-    sent = int(0)  # copies of the one of the others whose turn it is
-    before = wp.int64(0)  # the one before it
-    count = other.shape[0]
-    if count > 0:
-        before = other[0]
-    for i in range(arrival.shape[0]):
-        at = arrival[i]
-        early = bool(True)
-        while early and turn < count:
-            many = copies(turn, weight[int(polarity[turn])])
-            # copies keep apart: events at one time would collide more often than the events they stand for
-            due = other[turn]
-            if many > 1:
-                due = before + (due - before) * wp.int64(sent + 1) / wp.int64(many)
-            early = due <= at
-            if early:
-                if many > 0 and free - due <= patience:
-                    free = wp.max(free, due) + service
-                sent += 1
-                if sent >= many:
-                    before = other[turn]
-                    turn += 1
-                    sent = 0
-        if free - at > patience:
-            through[i] = LOST
-        else:
-            free = wp.max(free, at) + service
-            through[i] = free
-    busy[0] = free
+    in_turn(arrival, other, polarity, weight, service, patience, LOST, busy, through)
