@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -16,13 +17,17 @@ from dase.effects.row_scan import RowScan
 from dase.effects.stream import StreamEffect
 from dase.effects.timestamp import Timestamp
 from dase.events import Events
-from dase.kernels import pixel
+from dase.kernels import launch, pixel
 from dase.outlet import rows_of
 from dase.pixels import Pixels
 from dase.scene import Scene
 from dase.sensor import Sensor
 from dase.stimulus import Stimulus
 from dase.structure import Structure
+
+ROOM = 512
+"""Events per pixel that there is room for: a model that sends more is run again. What is not used costs
+nothing."""
 
 FELT = 0.25
 """Delays below this share of a step of the grid are not felt."""
@@ -55,16 +60,27 @@ def clock_of(effects: tuple[StreamEffect, ...], structure: Structure) -> float |
     return clock.step if same else None
 
 
-def emitted(stimulus: Stimulus, sensor: Sensor, vectors: NDArray[Any], seed: int) -> list[Events]:
+def emitted(
+    stimulus: Stimulus, sensor: Sensor, vectors: NDArray[Any], seeds: NDArray[np.int64]
+) -> list[Events]:
     """Return the events that leave the pixels, of each model."""
     bare = replace(sensor, effects=tuple(e for e in sensor.effects if not isinstance(e, StreamEffect)))
-    array = Pixels(
-        bare, stimulus.width, stimulus.height, pixels=stimulus.pixels, parameters=vectors, seed=seed,
-        device=str(stimulus.device),
-    )  # fmt: skip
-    scene = _Light(stimulus)
-    parts = [rows_of(*found, array.batch) for found in (array.emit(scene, scene.times), array.flush())]
-    return [Events.concatenate(list(row)) for row in zip(*parts, strict=True)]
+
+    def out(rows: slice) -> list[Events]:
+        array = Pixels(
+            bare, stimulus.width, stimulus.height, pixels=stimulus.pixels, parameters=vectors[rows],
+            seed=int(seeds[rows.start]), device=str(stimulus.device), room=ROOM,
+        )  # fmt: skip
+        scene = _Light(stimulus)
+        parts = [rows_of(*found, array.batch) for found in (array.emit(scene, scene.times), array.flush())]
+        return [Events.concatenate(list(row)) for row in zip(*parts, strict=True)]
+
+    if stimulus.device.is_cuda and np.all(seeds == seeds[0]):
+        return out(slice(0, len(seeds)))
+    alone = [slice(n, n + 1) for n in range(len(seeds))]
+    # on a CPU one after the other: the events of a model are sorted in its caches, those of all are not
+    works = [partial(out, rows) for rows in alone]
+    return [events for (events,) in ([w() for w in works] if stimulus.device.is_cuda else launch.each(works))]
 
 
 def sent(

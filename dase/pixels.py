@@ -33,6 +33,7 @@ class Pixels:
         seed: Of every random number.
         device: `cpu`, `cuda` or a Warp name.
         labels: Whether events are marked with what they came from.
+        room: Events per pixel of a chunk that there is room for at first; with more, it runs again.
     """
 
     def __init__(
@@ -46,6 +47,7 @@ class Pixels:
         seed: int = 0,
         device: str = "cpu",
         labels: bool = False,
+        room: int = 4,
     ):
         try:
             self.device = launch.device(device)
@@ -82,7 +84,7 @@ class Pixels:
         self.samples = 0
         self.begin = 0.0
         self.slab = 256 if self.device.is_cuda else 2048
-        self._capacity = 4 * self.slab
+        self._capacity = room * self.slab
         self._buffer: Any = None  # of keys, kept from chunk to chunk
         self._room = ordering.Room()
         # nothing but a change detector: counted by a kernel of its own, several pixels per thread

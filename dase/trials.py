@@ -22,6 +22,7 @@ from dase.kernels import launch, trials
 from dase.kernels import probes as kernels
 from dase.sensor import Sensor
 from dase.stimulus import Stimulus
+from dase.stored import by_pixel
 from dase.structure import Structure
 from dase.sums import GROUP, Frame, Sums, fold, over_groups
 
@@ -220,18 +221,11 @@ class Trials:
 
     def _look(self, streams: Sequence[Events], frame: Frame | None = None) -> Sums:
         """Sum up streams of stored events, one per row."""
-        parts = [self._by_pixel(events) for events in streams]
-        lengths = np.cumsum([0, *(len(time) for time, _, _ in parts)])
-        start = np.stack([begin + first for (_, _, begin), first in zip(parts, lengths, strict=False)])
         count = len(self.stimulus.pixels)
         pixels = wp.zeros((len(streams), count, kernels.HALVES), dtype=float, device=self.device)
         sink = self.sink(pixels, np.zeros(len(streams), np.int64))
-        arrays = [
-            wp.array(start.astype(np.int32), device=self.device),
-            wp.array(np.concatenate([p[0] for p in parts]), dtype=wp.int64, device=self.device),
-            wp.array(np.concatenate([p[1] for p in parts]), dtype=wp.uint8, device=self.device),
-        ]
-        launch.run(kernels.walk, count, [*arrays, sink], self.device, batch=len(streams), align=GROUP)
+        inputs = [*by_pixel(self.stimulus, streams), sink]
+        launch.run(kernels.walk, count, inputs, self.device, batch=len(streams), align=GROUP)
         grouped = self._grouped(sink.sums)
         folded = None
         if frame is not None:
@@ -265,16 +259,15 @@ class Trials:
 
         `load` is what the sensor's other pixels send over a bus that all share, None where it is not known.
         """
-        seeds, left, rows = order.seeds(), [], len(order.vectors)
-        at_once = 1 if order.reseed else STREAMED
-        for first in range(0, rows, at_once):
-            cut = slice(first, first + at_once)
-            left += emitted(self.stimulus, order.sensor, order.vectors[cut], int(seeds[first]))
-        each = zip(left, effects, seeds, strict=True)
-        parts = launch.each([partial(sent, self.stimulus, e, behind, int(s), load) for e, behind, s in each])
+        seeds, rows, found = order.seeds(), len(order.vectors), []
         self.evaluations += rows
-        begins = range(0, rows, STREAMED)
-        return Sums.join([self._look(parts[n : n + STREAMED], order.frame) for n in begins])
+        for first in range(0, rows, STREAMED):
+            cut = slice(first, first + STREAMED)
+            left = emitted(self.stimulus, order.sensor, order.vectors[cut], seeds[cut])
+            each = zip(left, effects[cut], seeds[cut], strict=True)
+            works = [partial(sent, self.stimulus, e, behind, int(s), load) for e, behind, s in each]
+            found.append(self._look(launch.each(works), order.frame))
+        return Sums.join(found)
 
     def _mine(self, events: Events) -> Events:
         """Return the events of the pixels, within the time that is compared."""
@@ -282,20 +275,6 @@ class Trials:
         own = np.zeros(stimulus.width * stimulus.height, np.bool_)
         own[stimulus.pixels] = True
         return events.select(own[events.y.astype(np.int64) * stimulus.width + events.x])
-
-    def _by_pixel(self, events: Events) -> tuple[NDArray[np.int64], NDArray[np.uint8], NDArray[np.int64]]:
-        stimulus = self.stimulus
-        place = np.full(stimulus.width * stimulus.height, -1, np.int64)
-        place[stimulus.pixels] = np.arange(len(stimulus.pixels))
-        at = place[events.y.astype(np.int64) * stimulus.width + events.x]
-        inside = at >= 0
-        at = at[inside]
-        # as small integers, which are sorted by their digits
-        small = at.astype(np.uint16) if len(stimulus.pixels) <= 1 << 16 else at
-        order = np.argsort(small, kind="stable")
-        time = np.rint((events.t[inside][order] - stimulus.grid.begin) * 1e9).astype(np.int64)
-        start = np.concatenate([[0], np.cumsum(np.bincount(at, minlength=len(stimulus.pixels)))])
-        return time, events.p[inside][order].astype(np.uint8), start
 
     def _group(self) -> int:
         return 1 if self.device.is_cuda else GROUP

@@ -5,13 +5,11 @@ from __future__ import annotations
 import warp as wp
 
 NEVER = -(2**62)
-"""Time at which a lost event is through [ps]."""
-
-LOST = wp.constant(wp.int64(NEVER))
-
+"""Time until when a bus is busy that has not sent anything yet [ps]."""
 
 ONE = 1 << 32
 """A weight of 1."""
+
 
 @wp.func_native(
     """
@@ -24,7 +22,7 @@ ONE = 1 << 32
     long long at = count > 0 ? due[0] : 0;  // when the last copy got there
     long long step = 0, rest = 0, part = 0;  // from copy to copy, and what is left over by whole numbers
     for (int i = 0; i < arrival.shape[0]; ++i) {
-        const long long mine = arrival.data[i];
+        const long long mine = 1000 * (long long)__builtin_rint(1e9 * arrival.data[i]);
         while (turn < count) {
             // the golden ratio, so that any run of numbers is spread evenly: whole, right in the mean
             const long long many = (weight.data[sign[turn]] + ((turn * 2654435769ll) & 0xffffffffll)) >> 32;
@@ -32,7 +30,7 @@ ONE = 1 << 32
                 if (due[turn] > mine) break;
                 at = due[turn++];
                 const long long through = (free > at ? free : at) + service;
-                free = (many == 1) & (free - at <= patience) ? through : free;
+                free = ((many == 1) & (free - at <= patience)) ? through : free;
                 continue;
             }
             // copies keep apart: events at one time would collide more often than the events they stand for
@@ -56,25 +54,25 @@ ONE = 1 << 32
             ++turn;
         }
         if (free - mine > patience) {
-            through.data[i] = lost;
+            through.data[i] = __builtin_nan("");
         } else {
             free = (free > mine ? free : mine) + service;
-            through.data[i] = free;
+            const long long whole = free / 1000 - (free % 1000 < 0);
+            through.data[i] = 1e-9 * (double)whole;
         }
     }
     busy.data[0] = free;
 """
 )
 def in_turn(
-    arrival: wp.array[wp.int64],
+    arrival: wp.array[wp.float64],
     other: wp.array[wp.int64],
     polarity: wp.array[wp.uint8],
     weight: wp.array[wp.int64],
     service: wp.int64,
     patience: wp.int64,
-    lost: wp.int64,
     busy: wp.array[wp.int64],
-    through: wp.array[wp.int64],
+    through: wp.array[wp.float64],
 ):
     """Do what `queue` does."""
     ...
@@ -83,7 +81,7 @@ def in_turn(
 @wp.kernel(enable_backward=False)
 def queue(
     # in
-    arrival: wp.array[wp.int64],  # (N,) [ps], not decreasing
+    arrival: wp.array[wp.float64],  # (N,) [s], taken as whole nanoseconds, not decreasing
     other: wp.array[wp.int64],  # (M,) [ps], not decreasing: events of which only what they delay matters
     polarity: wp.array[wp.uint8],  # (M,) of those
     weight: wp.array[wp.int64],  # (2,) how many events one of those stands for, times ONE, by polarity
@@ -92,11 +90,11 @@ def queue(
     # in and out
     busy: wp.array[wp.int64],  # (1,) until when the bus is busy [ps]
     # out
-    through: wp.array[wp.int64],  # (N,) when the event is through [ps], NEVER where it is lost
+    through: wp.array[wp.float64],  # (N,) when the event is through [s], in whole nanoseconds, NaN where lost
 ):
     """Send events one after the other, on one thread.
 
     Which events are lost depends on all that were sent before, so this is no scan. On one CPU thread it is
     faster than the copies around it, and the events are on the host anyway, on their way to a file.
     """
-    in_turn(arrival, other, polarity, weight, service, patience, LOST, busy, through)
+    in_turn(arrival, other, polarity, weight, service, patience, busy, through)

@@ -109,7 +109,7 @@ def test_a_model_that_sends_more_is_taken_to_do_so_everywhere(evidence, true, sc
     other = true.with_effect(replace(true["threshold"], on=0.4, off=0.3))
     near, far = (half.loaded(*place(s)).load for s in (true, other))
     stimulus = half.trials.stimulus
-    events = emitted(stimulus, true, true.parameters()[None], 5)[0]
+    events = emitted(stimulus, true, true.parameters()[None], np.array([5]))[0]
     bare = [np.bincount(load._events[0].p.astype(int), minlength=2) for load in (near, far)]
     ours, theirs = (load.weight(events) * own for load, own in zip((near, far), bare, strict=True))
     np.testing.assert_allclose(theirs, ours, rtol=0.15)
@@ -122,7 +122,7 @@ def test_some_of_many_pixels_stand_for_all(evidence, true, monkeypatch):
     assert len(everyone._events[0]) > 0  # before there is less room
     monkeypatch.setattr(crowd, "MOST", 500 * half.trials.stimulus.grid.steps)
     some = half.loaded(*place(true)).load
-    events = emitted(half.trials.stimulus, true, true.parameters()[None], 5)[0]
+    events = emitted(half.trials.stimulus, true, true.parameters()[None], np.array([5]))[0]
     assert len(some._events[0]) < 0.5 * len(everyone._events[0])
     total = [load.weight(events).sum() / 2 * len(load._events[0]) for load in (some, everyone)]
     assert total[0] == pytest.approx(total[1], rel=0.2)

@@ -11,7 +11,7 @@ import warp as wp
 from numpy.typing import NDArray
 
 from dase.effects.base import choice, parameter
-from dase.effects.stream import Reader, StreamEffect, nanoseconds, seconds
+from dase.effects.stream import Reader, StreamEffect
 from dase.events import Events
 from dase.kernels import launch
 from dase.kernels.readout import NEVER, ONE, queue
@@ -51,18 +51,18 @@ class Bus(Reader):
             others: They take room and time, and are not returned.
             weight: How many OFF and ON events each of the others stands for, shape (2,).
         """
-        arrival, through = 1000 * nanoseconds(events.t), np.empty(len(events), np.int64)
+        through = np.empty(len(events))
         columns = (
-            (arrival, wp.int64), (others.time, wp.int64), (others.polarity, wp.uint8),
-            (np.rint(weight * ONE).astype(np.int64), wp.int64), (self._busy, wp.int64), (through, wp.int64),
+            (events.t, wp.float64), (others.time, wp.int64), (others.polarity, wp.uint8),
+            (np.rint(weight * ONE).astype(np.int64), wp.int64), (self._busy, wp.int64), (through, wp.float64),
         )  # fmt: skip
         arrays = [wp.array(a, dtype=d, device=self._cpu, copy=False) for a, d in columns]
         inputs = [*arrays[:4], wp.int64(self._service), wp.int64(self._patience), *arrays[4:]]
         wp.launch(queue, dim=1, inputs=inputs, device=self._cpu)
-        lost = through == NEVER
-        if lost.any():
-            events, through = events.select(~lost), through[~lost]
-        return replace(events, t=seconds(through // 1000))
+        sent = ~np.isnan(through)
+        if not sent.all():
+            events, through = events.select(sent), through[sent]
+        return replace(events, t=through)
 
 
 @dataclass(frozen=True, kw_only=True)
