@@ -73,7 +73,8 @@ def emitted(
         )  # fmt: skip
         scene = _Light(stimulus)
         parts = [rows_of(*found, array.batch) for found in (array.emit(scene, scene.times), array.flush())]
-        return [Events.concatenate(list(row)) for row in zip(*parts, strict=True)]
+        # hardly any effect holds events back
+        return [Events.concatenate(row) if len(row[1]) else row[0] for row in zip(*parts, strict=True)]
 
     if stimulus.device.is_cuda and np.all(seeds == seeds[0]):
         return out(slice(0, len(seeds)))

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,6 +22,10 @@ MOST = 2.5e7
 all."""
 
 
+KEPT = 3
+"""Present models whose load is kept."""
+
+
 @dataclass(frozen=True, eq=False)
 class Surroundings:
     """A scene as all pixels see it.
@@ -38,6 +41,20 @@ class Surroundings:
     times: NDArray[np.float64]
     seed: int
     device: str
+    _loads: list[Load] = field(default_factory=list, repr=False)
+
+    def load(self, sensor: Sensor, stimulus: Stimulus) -> Load:
+        """Return what the pixels that are not looked at send in a model; the last few are kept.
+
+        A model becomes the present one several times over: descents begin at one place, and what its bus is
+        like does not matter here.
+        """
+        bare = replace(sensor, effects=tuple(e for e in sensor.effects if not isinstance(e, StreamEffect)))
+        found = next((load for load in self._loads if load.sensor == bare), None)
+        if found is None:
+            found = Load(self, bare, stimulus)
+        self._loads[:] = [found, *(load for load in self._loads if load is not found)][:KEPT]
+        return found
 
     def pixels(self, chosen: NDArray[np.int32], steps: int) -> NDArray[np.int32]:
         """Return those that are simulated to know what all send: those looked at and others, sorted."""
@@ -49,9 +66,8 @@ class Surroundings:
 
     def emitted(self, sensor: Sensor, pixels: NDArray[np.int32], steps: int) -> Events:
         """Return what leaves some pixels up to a point of time, from time 0."""
-        bare = replace(sensor, effects=tuple(e for e in sensor.effects if not isinstance(e, StreamEffect)))
         array = Pixels(
-            bare, self.scene.width, self.scene.height, pixels=pixels, seed=self.seed, device=self.device
+            sensor, self.scene.width, self.scene.height, pixels=pixels, seed=self.seed, device=self.device
         )
         size = CHUNK["cuda" if array.device.is_cuda else "cpu"]
         parts = [array.emit(self.scene, times)[0] for times in chunks(self.times[:steps], size)]
@@ -67,7 +83,7 @@ class Load:
 
     Args:
         around: What all pixels see.
-        sensor: The present model.
+        sensor: The present model without what is behind the pixels.
         stimulus: The pixels that are looked at, and their time.
     """
 
@@ -98,7 +114,7 @@ class Load:
         return self._before[key]
 
     @cached_property
-    def _events(self) -> tuple[Events, NDArray[np.float64], float]:
+    def _events(self) -> tuple[Events, NDArray[np.int64], float]:
         """The others' events, how many those looked at have, and how many of the others one stands for."""
         chosen, steps = self.stimulus.pixels, self.stimulus.grid.steps
         pixels = self.around.pixels(chosen, steps)
@@ -110,5 +126,7 @@ class Load:
         return events.select(~mine), _polarities(events.select(mine)), each
 
 
-def _polarities(events: Events) -> NDArray[Any]:
-    return np.bincount(events.p.astype(np.int64), minlength=2)
+def _polarities(events: Events) -> NDArray[np.int64]:
+    """Return the numbers of OFF and ON events."""
+    on = np.count_nonzero(events.p)
+    return np.array([len(events) - on, on])

@@ -94,7 +94,7 @@ class Half:
         """Return the same half, where the pixels that are not looked at send what they do in some model."""
         out = self.view()
         if self.around is not None:
-            out.load = Load(self.around, space.at(place), self.trials.stimulus)
+            out.load = self.around.load(space.at(place), self.trials.stimulus)
         return out
 
     def run(self, space: Space, places: Array, *, seed: int) -> Array:

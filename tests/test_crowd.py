@@ -18,6 +18,7 @@ from dase.effects.stream import nanoseconds
 from dase.evidence import BUSY, fastest, gather
 from dase.model import model_of
 from dase.sensor import Sensor
+from dase.stored import by_pixel
 from dase.structure import Structure, find, share_at
 from dase.together import Ask, simulated
 from dase.trials import Order
@@ -121,11 +122,39 @@ def test_some_of_many_pixels_stand_for_all(evidence, true, monkeypatch):
     everyone = half.loaded(*place(true)).load
     assert len(everyone._events[0]) > 0  # before there is less room
     monkeypatch.setattr(crowd, "MOST", 500 * half.trials.stimulus.grid.steps)
+    half.around._loads.clear()
     some = half.loaded(*place(true)).load
     events = emitted(half.trials.stimulus, true, true.parameters()[None], np.array([5]))[0]
     assert len(some._events[0]) < 0.5 * len(everyone._events[0])
     total = [load.weight(events).sum() / 2 * len(load._events[0]) for load in (some, everyone)]
     assert total[0] == pytest.approx(total[1], rel=0.2)
+
+
+def test_what_others_send_is_worked_out_once_for_each_model_of_their_pixels(evidence, true):
+    half = evidence.train
+    first = half.loaded(*place(true)).load
+    assert half.loaded(*place(true.with_effect(replace(BUS, rate=2e5)))).load is first
+    assert half.loaded(*place(true.with_effect(EFFECTS["shot"](rate=6.0)))).load is not first
+    assert evidence.held.loaded(*place(true)).load is not first
+
+
+def test_events_are_sorted_to_their_pixels(evidence, rng):
+    stimulus, size = evidence.train.trials.stimulus, WIDTH * HEIGHT
+    counts = (5000, 0, 3000)
+    streams = []
+    for count in counts:
+        at = rng.integers(0, size, count)
+        t = stimulus.grid.begin + 1e-9 * np.sort(rng.integers(0, 10**8, count))
+        x, y = (at % WIDTH).astype(np.uint16), (at // WIDTH).astype(np.uint16)
+        streams.append(dase.Events(t, x, y, rng.random(count) < 0.4, WIDTH, HEIGHT))
+    start, time, polarity = (a.numpy() for a in by_pixel(stimulus, streams))
+    for n, events in enumerate(streams):
+        index = events.y.astype(int) * WIDTH + events.x
+        for i, pixel in enumerate(stimulus.pixels):
+            mine, got = events.select(index == pixel), slice(start[n, i], start[n, i + 1])
+            want = np.rint((mine.t - stimulus.grid.begin) * 1e9).astype(np.int64)
+            np.testing.assert_array_equal(time[got], want)
+            np.testing.assert_array_equal(polarity[got], mine.p)
 
 
 def test_others_go_through_what_is_before_the_bus(evidence, true):
