@@ -25,6 +25,10 @@ NEAR = 1.5
 """A model is fitted in full where one descent takes its held-out error below this, in units of the gate or of
 the present model's error."""
 
+LOST = 4.0
+"""The present model's error counts up to this for that, in units of the gate: nothing comes to the floor from
+farther off, and what stands in for an effect that nobody knows need not be the best that does."""
+
 REPEATS = 16
 """Simulations by which that is judged."""
 
@@ -78,7 +82,7 @@ def _near(search: Search, ways: Mapping[str, Model], judgement: Judgement) -> di
     evidence, seed = search.evidence, search.seed
     ends = together([settling(evidence, way, seed=seed, rounds=1) for way in ways.values()])
     judged = together([m.judging(evidence.held.view(), repeats=REPEATS, seed=seed + 500) for m in ends])
-    limit = NEAR * max(judgement.gate, judgement.error)
+    limit = NEAR * min(max(judgement.gate, judgement.error), LOST * judgement.gate)
     return {name: m for name, m, j in zip(ways, ends, judged, strict=True) if j.error < limit}
 
 
