@@ -26,8 +26,8 @@ from dase.stimulus import Stimulus
 from dase.structure import Structure
 
 ROOM = 512
-"""Events per pixel that there is room for: a model that sends more is run again. What is not used costs
-nothing."""
+"""Events per pixel that there is room for: a model that sends more is run again. On a CPU room costs
+nothing before it is used."""
 
 FELT = 0.25
 """Delays below this share of a step of the grid are not felt."""

@@ -29,8 +29,13 @@ ONE = 1 << 32
             if (many <= 1) {
                 if (due[turn] > mine) break;
                 at = due[turn++];
-                const long long through = (free > at ? free : at) + service;
-                free = ((many == 1) & (free - at <= patience)) ? through : free;
+                const long long after = (free > at ? free : at) + service;
+                free = ((many == 1) & (free - at <= patience)) ? after : free;
+                continue;
+            }
+            // the queue is full until after its last copy: all are lost
+            if (sent == 0 && free - due[turn] > patience && due[turn] <= mine) {
+                at = due[turn++];
                 continue;
             }
             // copies keep apart: events at one time would collide more often than the events they stand for
@@ -45,8 +50,8 @@ ONE = 1 << 32
                 if (next > mine) break;
                 at = next;
                 part += rest - (over ? many : 0);
-                const long long through = (free > at ? free : at) + service;
-                free = free - at <= patience ? through : free;
+                const long long after = (free > at ? free : at) + service;
+                free = free - at <= patience ? after : free;
                 ++sent;
             }
             if (sent < many) break;
