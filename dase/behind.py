@@ -25,9 +25,9 @@ from dase.sensor import Sensor
 from dase.stimulus import Stimulus
 from dase.structure import Structure
 
-ROOM = 512
-"""Events per pixel that there is room for: a model that sends more is run again. On a CPU room costs
-nothing before it is used."""
+ROOM = {"cpu": 2048, "cuda": 64}
+"""Events per pixel that there is room for: a model that sends more is run again. On a CPU room costs nothing
+before it is used."""
 
 FELT = 0.25
 """Delays below this share of a step of the grid are not felt."""
@@ -65,23 +65,23 @@ def emitted(
 ) -> list[Events]:
     """Return the events that leave the pixels, of each model."""
     bare = replace(sensor, effects=tuple(e for e in sensor.effects if not isinstance(e, StreamEffect)))
+    kind = "cuda" if stimulus.device.is_cuda else "cpu"
 
     def out(rows: slice) -> list[Events]:
         array = Pixels(
             bare, stimulus.width, stimulus.height, pixels=stimulus.pixels, parameters=vectors[rows],
-            seed=int(seeds[rows.start]), device=str(stimulus.device), room=ROOM,
+            seed=int(seeds[rows.start]), device=str(stimulus.device), room=ROOM[kind],
         )  # fmt: skip
         scene = _Light(stimulus)
         parts = [rows_of(*found, array.batch) for found in (array.emit(scene, scene.times), array.flush())]
         # hardly any effect holds events back
         return [Events.concatenate(row) if len(row[1]) else row[0] for row in zip(*parts, strict=True)]
 
-    if stimulus.device.is_cuda and np.all(seeds == seeds[0]):
+    if kind == "cuda" and np.all(seeds == seeds[0]):
         return out(slice(0, len(seeds)))
-    alone = [slice(n, n + 1) for n in range(len(seeds))]
     # on a CPU one after the other: the events of a model are sorted in its caches, those of all are not
-    works = [partial(out, rows) for rows in alone]
-    return [events for (events,) in ([w() for w in works] if stimulus.device.is_cuda else launch.each(works))]
+    works = [partial(out, slice(n, n + 1)) for n in range(len(seeds))]
+    return [events for (events,) in ([work() for work in works] if kind == "cuda" else launch.each(works))]
 
 
 def sent(
