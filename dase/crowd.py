@@ -21,6 +21,8 @@ MOST = 2.5e7
 """Pixels times points of time that are simulated: of a larger sensor or a longer time, some pixels stand for
 all."""
 
+SENT = 6e6
+"""Events that all of them send: of a model that sends more, some stand for all, too."""
 
 KEPT = 3
 """Present models whose load is kept."""
@@ -56,13 +58,19 @@ class Surroundings:
         self._loads[:] = [found, *(load for load in self._loads if load is not found)][:KEPT]
         return found
 
-    def pixels(self, chosen: NDArray[np.int32], steps: int) -> NDArray[np.int32]:
-        """Return those that are simulated to know what all send: those looked at and others, sorted."""
+    def others(self, chosen: NDArray[np.int32], steps: int, sent: int) -> NDArray[np.int32]:
+        """Return those that are simulated to know what all send that are not looked at, sorted.
+
+        Args:
+            chosen: Those that are looked at, shape (N,).
+            steps: Of the grid.
+            sent: Events that those send.
+        """
         size = self.scene.width * self.scene.height
         rng = np.random.default_rng([self.seed, 2])
         rest = np.setdiff1d(rng.permutation(size), chosen, assume_unique=True).astype(np.int32)
-        room = max(len(chosen), int(MOST / steps) - len(chosen))
-        return np.sort(np.concatenate([chosen, rest[:room]]))
+        room = min(int(MOST / steps), int(SENT / max(sent, 1) * len(chosen))) - len(chosen)
+        return np.sort(rest[: max(len(chosen), room)])
 
     def emitted(self, sensor: Sensor, pixels: NDArray[np.int32], steps: int) -> Events:
         """Return what leaves some pixels up to a point of time, from time 0."""
@@ -117,13 +125,11 @@ class Load:
     def _events(self) -> tuple[Events, NDArray[np.int64], float]:
         """The others' events, how many those looked at have, and how many of the others one stands for."""
         chosen, steps = self.stimulus.pixels, self.stimulus.grid.steps
-        pixels = self.around.pixels(chosen, steps)
-        events = self.around.emitted(self.sensor, pixels, steps)
-        own = np.zeros(self.stimulus.width * self.stimulus.height, np.bool_)
-        own[chosen] = True
-        mine = own[events.y.astype(np.int64) * self.stimulus.width + events.x]
-        each = (len(own) - len(chosen)) / max(len(pixels) - len(chosen), 1)
-        return events.select(~mine), _polarities(events.select(mine)), each
+        mine = self.around.emitted(self.sensor, chosen, steps)
+        others = self.around.others(chosen, steps, len(mine))
+        events = self.around.emitted(self.sensor, others, steps)
+        each = (self.stimulus.width * self.stimulus.height - len(chosen)) / len(others)
+        return events, _polarities(mine), each
 
 
 def _polarities(events: Events) -> NDArray[np.int64]:

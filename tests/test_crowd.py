@@ -117,11 +117,13 @@ def test_a_model_that_sends_more_is_taken_to_do_so_everywhere(evidence, true, sc
     assert np.all(bare[1] < 0.8 * bare[0])
 
 
-def test_some_of_many_pixels_stand_for_all(evidence, true, monkeypatch):
+@pytest.mark.parametrize("limit", ["MOST", "SENT"])
+def test_some_of_many_pixels_stand_for_all(evidence, true, monkeypatch, limit):
     half = evidence.train
     everyone = half.loaded(*place(true)).load
     assert len(everyone._events[0]) > 0  # before there is less room
-    monkeypatch.setattr(crowd, "MOST", 500 * half.trials.stimulus.grid.steps)
+    few = {"MOST": 500 * half.trials.stimulus.grid.steps, "SENT": 0.4 * len(everyone._events[0])}
+    monkeypatch.setattr(crowd, limit, few[limit])
     half.around._loads.clear()
     some = half.loaded(*place(true)).load
     events = emitted(half.trials.stimulus, true, true.parameters()[None], np.array([5]))[0]
