@@ -137,6 +137,12 @@ def test_what_is_not_needed_is_dropped(monkeypatch):
     assert (left.names, after.error) == ("a", 0.35)
 
 
+def test_what_is_far_from_the_floor_is_not_reviewed(monkeypatch):
+    errors = {"ab": 4.5, "a": 0.3, "b": 6.0}  # the gate is at 1.15
+    assert reviewing.review(*fake("ab", errors, monkeypatch))[0].names == "a"
+    assert reviewing.review(*fake("ab", {**errors, "ab": 4.7}, monkeypatch))[0].names == "ab"
+
+
 def test_what_accounts_for_most_stays_and_so_does_what_only_a_closer_look_shows(monkeypatch):
     search, model, judgement = fake("ab", {"ab": 0.3, "a": 0.8, "b": 6.0}, monkeypatch)
     assert reviewing.review(search, model, judgement)[0].names == "ab"
