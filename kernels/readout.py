@@ -22,7 +22,7 @@ ONE = 1 << 32
     long long at = count > 0 ? due[0] : 0;  // when the last copy got there
     long long step = 0, rest = 0, part = 0;  // from copy to copy, and what is left over by whole numbers
     for (int i = 0; i < arrival.shape[0]; ++i) {
-        const long long mine = 1000 * (long long)__builtin_rint(1e9 * arrival.data[i]);
+        const long long mine = 1000 * (long long)rint(1e9 * arrival.data[i]);
         while (turn < count) {
             // the golden ratio, so that any run of numbers is spread evenly: whole, right in the mean
             const long long many = (weight.data[sign[turn]] + ((turn * 2654435769ll) & 0xffffffffll)) >> 32;
@@ -59,7 +59,7 @@ ONE = 1 << 32
             ++turn;
         }
         if (free - mine > patience) {
-            through.data[i] = __builtin_nan("");
+            through.data[i] = NAN;
         } else {
             free = (free > mine ? free : mine) + service;
             const long long whole = free / 1000 - (free % 1000 < 0);

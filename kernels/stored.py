@@ -21,7 +21,7 @@ import warp as wp
         const int i = place.data[(size_t)y.data[n] * width + x.data[n]];
         if (i < 0) continue;
         const int to = at[i + 1]++;
-        time.data[to] = (long long)__builtin_rint((t.data[n] - begin) * 1e9);
+        time.data[to] = (long long)rint((t.data[n] - begin) * 1e9);
         polarity.data[to] = p.data[n];
     }
 """

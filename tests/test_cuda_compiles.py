@@ -16,7 +16,7 @@ ARCH = 90
 
 MODULES = (
     "bank", "between", "blur", "critics", "events", "patches", "probes", "readout", "rows", "scene",
-    "scene_gradient", "scenery", "surrogates", "trials",
+    "scene_gradient", "scenery", "stored", "surrogates", "trials",
 )  # fmt: skip
 """Those whose kernels are not made by functions."""
 
