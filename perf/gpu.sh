@@ -3,20 +3,21 @@
 #
 #   PHOTOS=folder RECORDING=davis240c_camerashake.npz HIDDEN=folder perf/gpu.sh OUT [STEP...]
 #
-# Steps: tests, kernels, synth, scaling, both, learning, matrix, training, v2e, pack. Where a call may not take
+# Steps: tests, kernels, synth, scaling, both, learning, matrix, training, v2e. Where a call may not take
 # long, and there are several GPUs, this is two calls:
 #
-#   LIMIT=560 perf/gpu.sh OUT both pack                        learning on the GPUs, the matrix on the CPU
-#   REST=240 perf/gpu.sh OUT matrix training v2e tests pack    the rest of the matrix, then the GPU alone
+#   LIMIT=560 perf/gpu.sh OUT both                        learning on the GPUs, the matrix on the CPU
+#   REST=240 perf/gpu.sh OUT matrix training v2e tests    the rest of the matrix, then the GPU alone
 #
 # LIMIT and REST are seconds; what has not ended by then is stopped, loses its last runs, and goes on when
 # called again. PYTHON names the interpreter, COMMIT the commit where there is no git, DEVICES the GPUs if not
-# all. Each step writes its log and its tables into OUT; none stops the others; `pack` leaves OUT.tar.gz.
+# all. Each step writes its log and its tables into OUT; none stops the others. After each of them all
+# of OUT that pages need is packed into OUT.tar.gz, or PACK.
 set -uo pipefail
 cd "$(dirname "$0")/.."
 out=$1 && shift
 steps=("${@:-}")
-[ -n "${steps[0]}" ] || steps=(tests kernels synth scaling both matrix training v2e pack)
+[ -n "${steps[0]}" ] || steps=(tests kernels synth scaling both matrix training v2e)
 python=${PYTHON:-python3}
 commit=${COMMIT:-$(git describe --always --dirty)}
 export PYTHONPATH=$PWD:${PYTHONPATH:-} PYTHONUNBUFFERED=1
@@ -58,6 +59,12 @@ matrix() { # SECONDS JOBS [CORES]
     unset OMP_NUM_THREADS
 }
 
+pack() { # without networks, and without examples that no page shows; whole at any moment
+    local to=${PACK:-$out.tar.gz}
+    tar czf "$to.part" --exclude='*.pt' --exclude='*.safetensors' --exclude='real-*/examples.npz' \
+        --exclude='*-wgan*/examples.npz' -C "$out" . && mv "$to.part" "$to"
+}
+
 for step in "${steps[@]}"; do
     case $step in
     tests) run tests "$python" -m pytest -q -p no:cacheprovider --device "$first" \
@@ -82,10 +89,7 @@ for step in "${steps[@]}"; do
         --images "${PHOTOS:-builtin}" --commit "$commit" --out "$out/training.json" ;;
     v2e) [ -z "${HIDDEN:-}" ] || run v2e "$python" perf/hidden_effects.py --kinds other --hidden "$HIDDEN" \
         --device "$first" --jobs 1 --log "$out/hidden_effects.jsonl" --out "$out/docs" ;;
-    pack) # without networks, and without examples that no page shows
-        tar czf "$out.tar.gz" --exclude='*.pt' --exclude='*.safetensors' --exclude='real-*/examples.npz' \
-            --exclude='*-wgan*/examples.npz' -C "$out" .
-        ls -l "$out.tar.gz" ;;
     *) echo "there is no step '$step'" && exit 2 ;;
     esac
+    pack
 done
