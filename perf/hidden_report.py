@@ -296,11 +296,10 @@ logarithmically above, and its times are even parts of its frames: `linlog` and 
 ## Again
 
 ```sh
-python perf/hidden_effects.py --device cuda:0,cuda:1,cuda:2,cuda:3 --jobs 56 --hidden ../shared/hidden \\
-    --log perf/hidden_effects.jsonl --where "four NVIDIA H200, commit ..."
+python perf/hidden_effects.py --jobs 54 --hidden ../shared/hidden --log perf/hidden_effects.jsonl --where "commit ..."
 ```
 
-takes six minutes, and goes on where the log stops; kinds and effects take turns, so that whatever was reached
+takes about ten minutes on so many cores, and goes on where the log stops; kinds and effects take turns, so that whatever was reached
 is balanced. Without a log it begins anew. `--report` only writes this page.
 
 ## Wrong answers, weak effects left out
