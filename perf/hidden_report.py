@@ -296,11 +296,12 @@ logarithmically above, and its times are even parts of its frames: `linlog` and 
 ## Again
 
 ```sh
-python perf/hidden_effects.py --jobs 54 --hidden ../shared/hidden --log perf/hidden_effects.jsonl --where "commit ..."
+python perf/hidden_effects.py --jobs 54 --hidden ../shared/hidden --log perf/hidden_effects.jsonl \\
+    --where "commit ..."
 ```
 
-takes about ten minutes on so many cores, and goes on where the log stops; kinds and effects take turns, so that whatever was reached
-is balanced. Without a log it begins anew. `--report` only writes this page.
+takes about ten minutes on so many cores, and goes on where the log stops; kinds and effects take turns, so
+that whatever was reached is balanced. Without a log it begins anew. `--report` only writes this page.
 
 ## Wrong answers, weak effects left out
 
