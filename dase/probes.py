@@ -182,8 +182,7 @@ def _spectrum(clock: NDArray[np.int32], frame: Frame) -> tuple[Array, Array]:
     window, mean = _tones(count, frame.step)
     power = np.abs(rfft(net * window, axis=1)) ** 2 / count
     bands = power @ mean
-    turn = 2 * np.pi * frame.peak * frame.step * (frame.first + np.arange(count))
-    swing = net @ np.stack([np.cos(turn), -np.sin(turn)], 1).astype(np.float32) / total[:, None]
+    swing = net @ _swing(frame.peak, frame.first, count, frame.step) / total[:, None]
     values = np.concatenate([np.log(bands + 0.5), swing], 1).astype(np.float64)
     return values, np.repeat(total[:, None], values.shape[1], 1).astype(np.float64)
 
@@ -195,6 +194,13 @@ def _tones(count: int, step: float) -> tuple[NDArray[np.float32], NDArray[np.flo
     inside = np.searchsorted(edges, np.fft.rfftfreq(count, step))[:, None] == np.arange(1, TONES + 1)
     mean = (inside / np.maximum(inside.sum(0), 1)).astype(np.float32)
     return np.hanning(count).astype(np.float32), mean
+
+
+@lru_cache(maxsize=8)
+def _swing(peak: float, first: int, count: int, step: float) -> NDArray[np.float32]:
+    """Return the two phases of a frequency, shape (T, 2)."""
+    turn = 2 * np.pi * peak * step * (first + np.arange(count))
+    return np.stack([np.cos(turn), -np.sin(turn)], 1).astype(np.float32)
 
 
 def peak_of(clock: NDArray[np.int64], step: float) -> float:

@@ -111,7 +111,7 @@ class Trials:
         self.device = self.stimulus.device
         self._middle: tuple[Any, Any] | None = None
         self._kind = "cuda" if self.device.is_cuda else "cpu"
-        self._lanes = 1 if self.device.is_cuda else trials.LANES
+        self._lanes = 1 if self.device.is_cuda else kernels.LANES
         self._pixels = wp.array(self.stimulus.pixels, dtype=int, device=self.device)
 
     def run(
@@ -306,6 +306,8 @@ class Trials:
         rows, count, _ = pixels.shape
         out.memory = wp.zeros((rows, count, kernels.MEMORY), dtype=float, device=self.device)
         groups = -(-count // out.group)
+        if not self.device.is_cuda:
+            out.queue = wp.empty((groups, kernels.QUEUE), dtype=wp.int64, device=self.device)
         out.sums = wp.zeros((rows, groups, kernels.SIZE), dtype=float, device=self.device)
         out.team, teams = GROUP, -(-count // GROUP)
         out.clock = wp.zeros((rows, teams, 2 * stimulus.grid.steps), dtype=int, device=self.device)
@@ -325,7 +327,7 @@ class Trials:
         """Return the events of each step over all groups, shape (B, 2 T)."""
         rows, _, steps = teams.shape
         out = wp.empty((rows, steps), dtype=int, device=self.device)
-        launch.run(kernels.counted, steps, [teams, out], self.device, batch=rows)
+        launch.run(kernels.counted, steps, [teams, out], self.device, batch=rows, slabs=1)
         found: NDArray[np.int32] = out.numpy()
         return found
 

@@ -42,10 +42,10 @@ def compose_thresholds(stages: tuple[Stages, ...]) -> wp.Kernel:
     return compiled(writer.thresholds(), "pixel_thresholds", writer.scope)
 
 
-def compiled(text: str, name: str, scope: dict[str, Any]) -> wp.Kernel:
-    """Return the kernel of a text."""
+def compiled(text: str, name: str, scope: dict[str, Any], **more: Any) -> wp.Kernel:
+    """Return the kernel of a text; `more` are options of its module."""
     # contraction: see dase.kernels.lanes; loops over lanes stay loops, which the compiler turns into vectors
-    options = {"fuse_fp": False, "max_unroll": 0}
+    options = {"fuse_fp": False, "max_unroll": 0, **more}
     kernel: wp.Kernel = wp.kernel(
         from_text(text, name, scope), enable_backward=False, module="unique", module_options=options
     )

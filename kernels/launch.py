@@ -79,7 +79,14 @@ def _init() -> None:
 
 
 def run(
-    kernel: wp.Kernel, size: int, inputs: list[Any], device: wp.Device, *, batch: int = 1, align: int = 1
+    kernel: wp.Kernel,
+    size: int,
+    inputs: list[Any],
+    device: wp.Device,
+    *,
+    batch: int = 1,
+    align: int = 1,
+    slabs: int = 4,
 ) -> None:
     """Launch `kernel` over (batch, size) threads and wait for it on the CPU.
 
@@ -90,6 +97,7 @@ def run(
         device: Where the arrays live.
         batch: Length of the leading axis, which is never cut.
         align: Slabs begin at multiples of this, so that no two threads share what belongs together.
+        slabs: Of each thread; several even out rows of different cost, each takes a tenth of a millisecond.
     """
     if size == 0 or batch == 0:
         return
@@ -98,8 +106,7 @@ def run(
         return
     # load before the threads race for it
     kernel.module.load(device, block_dim=1)  # the variant that CPU launches use
-    # several slabs per thread even out rows of different cost
-    pieces = 1 if _threads == 1 else min(4 * _threads, -(-size // align))
+    pieces = 1 if _threads == 1 else min(slabs * _threads, -(-size // align))
     step = align * -(-size // (align * pieces))
     starts = range(0, size, step)
 

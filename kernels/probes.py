@@ -50,6 +50,12 @@ HALVES = 8
 MEMORY = 4
 """Numbers a pixel remembers from event to event."""
 
+LANES = 16
+"""Models of a pixel that a CPU thread works on side by side."""
+
+QUEUE = 512
+"""Their events that wait until they are looked at, a multiple of 8."""
+
 ZONES = 4
 """Rings about the middle of the sensor, of equal numbers of pixels."""
 
@@ -58,11 +64,6 @@ FOLD = RINGS + 4 * ZONES
 """Places in what the counts of pixels are folded into, and how many numbers there are: products of what is
 not expected in the two halves, pixels that count oddly, events by zone."""
 
-_BANDS, _RESTING, _MASKED = wp.constant(BANDS), wp.constant(RESTING), wp.constant(MASKED)
-_INTERVALS, _LAGS, _CLASSES = wp.constant(INTERVALS), wp.constant(LAGS), wp.constant(CLASSES)
-_CELLS, _SIZE = wp.constant(CELLS), wp.constant(SIZE)
-_ISI, _LAG, _LAG_COUNT, _CHANGE = (wp.constant(n) for n in (ISI, LAG, LAG_COUNT, CHANGE))
-_REPEAT, _SERIAL = wp.constant(REPEAT), wp.constant(SERIAL)
 _ODD, _RINGS, _FOLD, _ZONES = (wp.constant(n) for n in (ODD, RINGS, FOLD, ZONES))
 
 
@@ -83,129 +84,174 @@ class Probes:
     group: int  # pixels that share a row of `sums`; one thread works on all of them
     team: int  # pixels that share a row of `clock`
     memory: wp.array3d[float]  # (B, N, MEMORY)
+    queue: wp.array2d[wp.int64]  # (G, QUEUE) events of a pixel that wait, on a CPU: time [ns], ON, lane
     sums: wp.array3d[float]  # (B, G, SIZE)
     halves: wp.array3d[float]  # (B, N, HALVES)
     clock: wp.array3d[int]  # (B, G, 2 T) OFF, ON events of each step
 
 
-@wp.func_native("a.data[place] += value;")
-def plus(a: wp.array3d[float], place: int, value: float):
-    """Add to what one thread owns; Warp's own look-up takes most of the time of an event."""
-    ...
+_PLACES = {
+    "BANDS": BANDS, "RESTING": RESTING, "MASKED": MASKED, "INTERVALS": INTERVALS, "LAGS": LAGS,
+    "CLASSES": CLASSES, "CELLS": CELLS, "SIZE": SIZE, "ISI": ISI, "LAG": LAG, "LAG_COUNT": LAG_COUNT,
+    "CHANGE": CHANGE, "REPEAT": REPEAT, "SERIAL": SERIAL, "HALVES": HALVES, "MEMORY": MEMORY, "LANES": LANES,
+    "QUEUE": QUEUE,
+}  # fmt: skip
+
+LOOK = (
+    f"enum {{ {', '.join(f'{name} = {at}' for name, at in _PLACES.items())} }};"
+    """
+const int steps = sink.cell.shape[1];
+const unsigned char* cell = sink.cell.data + (size_t)i * steps;
+const int end = sink.level.shape[1] - 1;
+const float* level = sink.level.data + (size_t)i * sink.level.shape[1];
+const int* lags = sink.lags.data;
+const int group = i / sink.group;
+const int team = i / sink.team;
+auto INSIDE = [=](int k) { return k < 0 ? 0 : k > end ? end : k; };
+auto OCTAVE = [](int size, int last) {
+    // bin of an interval
+#ifdef __CUDA_ARCH__
+    const int zeros = __clz(size - 1);
+#else
+    const int zeros = size > 1 ? __builtin_clz((unsigned)(size - 1)) : 32;
+#endif
+    const int at = size > 0 ? 33 - zeros : 0;
+    return at < last ? at : last;
+};
+auto JOINED = [&](int before, int k) {
+    // whether all that lies between two events is compared
+    while (before < k && cell[before] != MASKED) ++before;
+    return before == k;
+};
+auto LOOK_AT = [&](int row, int k, int now, float* memory) {
+    if (k < 0 || k >= steps) return;
+    const int before = (int)memory[0] - 1;
+    const int last = (int)memory[1];
+    const float run = before == k ? memory[3] + 1.0f : 1.0f;
+    float apart = -1.0e6f;
+    if (cell[k] != MASKED) {
+        const int band = cell[k] % BANDS;
+        const int rest = cell[k] / BANDS < RESTING;
+        // the group's sums, which one thread owns
+        float* sums = sink.sums.data + ((size_t)row * sink.sums.shape[1] + group) * SIZE;
+        sums[now * CELLS + cell[k]] += 1.0f;
+        if (!rest) {
+            // how the light went before the event: bandwidth and latency
+            const float sign = now ? 1.0f : -1.0f;
+            float* to = sums + LAG + band;
+            float newer = level[INSIDE(k - lags[0])];
+            for (int n = 0; n < LAGS; ++n) {
+                const float older = level[INSIDE(k - lags[n + 1])];
+                to[n * BANDS] += sign * (newer - older);
+                newer = older;
+            }
+            sums[LAG_COUNT + band] += 1.0f;
+        }
+        if (before >= 0 && (sink.holes == 0 || JOINED(before, k))) {
+            const int kinship = now == last ? now : 2;
+            const int size = k - before;
+            sums[ISI + (3 * rest + kinship) * INTERVALS + OCTAVE(size, INTERVALS - 1)] += 1.0f;
+            // how the light changed since the last event, and how far from what is typical
+            const int of = (size > sink.classes.data[0]) + (size > sink.classes.data[1]);
+            const int pair = (2 * now + last) * CLASSES + of;
+            const float change = (now ? 1.0f : -1.0f) * (level[k] - level[before]);
+            const float off = change - sink.middle.data[pair];
+            apart = off < -1.0f ? -1.0f : off > 1.0f ? 1.0f : off;
+            float* changes = sums + CHANGE + 3 * pair;
+            changes[0] += 1.0f;
+            changes[1] += change;
+            changes[2] += off < 0.0f ? -off : off;
+            if (memory[2] > -1.0e5f) {
+                sums[SERIAL + 2 * of] += 1.0f;
+                sums[SERIAL + 2 * of + 1] += apart * memory[2];
+            }
+        }
+        float* repeats = sums + REPEAT + 3 * band;
+        repeats[0] += 1.0f;
+        if (run >= 2.0f) repeats[1] += 1.0f;
+        if (run >= 3.0f) repeats[2] += 1.0f;
+        const int half = 4 * rest + 2 * (k / sink.half % 2) + now;
+        sink.halves.data[((size_t)row * sink.halves.shape[1] + i) * HALVES + half] += 1.0f;
+        int* clock = sink.clock.data + ((size_t)row * sink.clock.shape[1] + team) * sink.clock.shape[2];
+#ifdef __CUDA_ARCH__
+        atomicAdd(clock + now * steps + k, 1);
+#else
+        clock[now * steps + k] += 1;
+#endif
+    }
+    memory[0] = (float)(k + 1);
+    memory[1] = (float)now;
+    memory[2] = apart;
+    memory[3] = run;
+};
+auto STAMPED = [&](int row, long long time) {
+    const long long tick = sink.ticks.data[row];
+    return tick > 0 ? 1000 * time / tick * tick / 1000 : time;
+};
+auto MEMORY_OF = [&](int row) {
+    return sink.memory.data + ((size_t)row * sink.memory.shape[1] + i) * MEMORY;
+};
+"""
+)
+"""What one event of pixel `i` adds to the sums, as C++ that `observe` and `look_back` have in common."""
 
 
-@wp.func_native("return a.data[(size_t)i * a.shape[1] + k];")
-def entry(a: wp.array2d[float], i: int, k: int) -> float:
-    """Return a[i, k] of a contiguous array."""
+@wp.func_native(
+    LOOK
+    + """
+const double at = ((double)STAMPED(row, time) - sink.slack) / sink.step;
+LOOK_AT(row, (int)ceil(at), now, MEMORY_OF(row));
+"""
+)
+def observe(sink: Probes, row: int, i: int, time: wp.int64, now: int):
+    """Look at one event of pixel `i`, `time` [ns] after the begin of the grid, `now` 1 for ON."""
     ...
 
 
 @wp.func_native(
     """
-#ifdef __CUDA_ARCH__
-    const int zeros = __clz(steps - 1);
-#else
-    const int zeros = steps > 1 ? __builtin_clz((unsigned)(steps - 1)) : 32;
-#endif
-    const int at = steps > 0 ? 33 - zeros : 0;
-    return at < last ? at : last;
+sink.queue.data[(size_t)slot * sink.queue.shape[1] + waiting] = (time << 1 | now) << 4 | lane;
+return waiting + 1;
 """
 )
-def octave(steps: int, last: int) -> int:
-    """Bin of an interval, at most `last`."""
+def put_off(sink: Probes, slot: int, waiting: int, lane: int, time: wp.int64, now: int) -> int:
+    """Keep an event of a lane until `look_back`; returns how many wait."""
     ...
 
 
-@wp.func
-def observe_light(sink: Probes, base: int, i: int, k: int, band: int, sign: float):
-    """How the light went before the event: bandwidth and latency."""
-    end = sink.level.shape[1] - 1
-    newer = entry(sink.level, i, wp.clamp(k - sink.lags[0], 0, end))
-    for n in range(_LAGS):
-        older = entry(sink.level, i, wp.clamp(k - sink.lags[n + 1], 0, end))
-        plus(sink.sums, base + _LAG + n * _BANDS + band, sign * (newer - older))
-        newer = older
-    plus(sink.sums, base + _LAG_COUNT + band, 1.0)
-
-
-@wp.func
-def observe_pair(sink: Probes, base: int, i: int, k: int, before: int, now: int, last: int, deviation: float):
-    """How the light changed since the pixel's last event; returns the deviation from what is typical."""
-    steps = k - before
-    group = int(0)
-    if steps > sink.classes[0]:
-        group = 1
-    if steps > sink.classes[1]:
-        group = 2
-    pair = (2 * now + last) * _CLASSES + group
-    change = float(2 * now - 1) * (entry(sink.level, i, k) - entry(sink.level, i, before))
-    apart = change - sink.middle[pair]
-    plus(sink.sums, base + _CHANGE + 3 * pair, 1.0)
-    plus(sink.sums, base + _CHANGE + 3 * pair + 1, change)
-    plus(sink.sums, base + _CHANGE + 3 * pair + 2, wp.abs(apart))
-    if deviation > -1.0e5:
-        plus(sink.sums, base + _SERIAL + 2 * group, 1.0)
-        plus(sink.sums, base + _SERIAL + 2 * group + 1, wp.clamp(apart, -1.0, 1.0) * deviation)
-    return wp.clamp(apart, -1.0, 1.0)
-
-
-@wp.func
-def joined(sink: Probes, i: int, before: int, k: int):
-    """Whether all that lies between two events of a pixel is compared."""
-    at = before
-    while at < k and int(sink.cell[i, at]) != _MASKED:
-        at += 1
-    return at == k
-
-
-@wp.func
-def observe(sink: Probes, row: int, i: int, time: wp.int64, now: int):
-    """Look at one event of pixel `i`, `time` [ns] after the begin of the grid, `now` 1 for ON."""
-    stamp = time
-    if sink.ticks[row] > wp.int64(0):
-        stamp = wp.int64(1000) * time / sink.ticks[row] * sink.ticks[row] / wp.int64(1000)
-    at = (wp.float64(stamp) - sink.slack) / sink.step
-    k = int(wp.ceil(at))
-    if k < 0 or k >= sink.cell.shape[1]:
-        return
-    cell = int(sink.cell[i, k])
-    before = int(sink.memory[row, i, 0]) - 1
-    last = int(sink.memory[row, i, 1])
-    deviation = sink.memory[row, i, 2]
-    run = sink.memory[row, i, 3] + 1.0
-    if before != k:
-        run = 1.0
-    apart = float(-1.0e6)
-    # the group's sums, which one thread owns
-    base = (row * sink.sums.shape[1] + i / sink.group) * _SIZE
-    if cell != _MASKED:
-        band = cell % _BANDS
-        kind = cell / _BANDS
-        plus(sink.sums, base + now * _CELLS + cell, 1.0)
-        rest = int(0)
-        if kind < _RESTING:
-            rest = 1
-        else:
-            observe_light(sink, base, i, k, band, float(2 * now - 1))
-        if before >= 0 and (sink.holes == 0 or joined(sink, i, before, k)):
-            kinship = int(2)
-            if now == last:
-                kinship = now
-            interval = octave(k - before, _INTERVALS - 1)
-            plus(sink.sums, base + _ISI + (3 * rest + kinship) * _INTERVALS + interval, 1.0)
-            apart = observe_pair(sink, base, i, k, before, now, last, deviation)
-        plus(sink.sums, base + _REPEAT + 3 * band, 1.0)
-        if run >= 2.0:
-            plus(sink.sums, base + _REPEAT + 3 * band + 1, 1.0)
-        if run >= 3.0:
-            plus(sink.sums, base + _REPEAT + 3 * band + 2, 1.0)
-        half = 4 * rest + 2 * ((k / sink.half) % 2) + now
-        sink.halves[row, i, half] = sink.halves[row, i, half] + 1.0
-        wp.atomic_add(sink.clock, row, i / sink.team, now * sink.cell.shape[1] + k, 1)
-    sink.memory[row, i, 0] = float(k + 1)
-    sink.memory[row, i, 1] = float(now)
-    sink.memory[row, i, 2] = apart
-    sink.memory[row, i, 3] = run
+@wp.func_native(
+    LOOK
+    + """
+// all times first, in the CPU's vectors, and then one event after the other
+typedef double Times __attribute__((ext_vector_type(8)));
+typedef long long Longs __attribute__((ext_vector_type(8)));
+typedef int Ints __attribute__((ext_vector_type(8)));
+long long* queue = sink.queue.data + (size_t)group * sink.queue.shape[1];
+long long ticking = 0;
+const int rows = sink.ticks.shape[0] - start;
+for (int lane = 0; lane < LANES && lane < rows; ++lane) ticking |= sink.ticks.data[start + lane];
+if (ticking > 0) {
+    for (int n = 0; n < waiting; ++n)
+        queue[n] = STAMPED(start + (int)(queue[n] & (LANES - 1)), queue[n] >> 5) << 5 | (queue[n] & 31);
+}
+int grid[QUEUE];
+for (int n = 0; n < waiting; n += 8) {
+    Longs time;
+    __builtin_memcpy(&time, queue + n, sizeof(time));
+    const Times at = (__builtin_convertvector(time >> 5, Times) - sink.slack) / sink.step;
+    const Ints k = __builtin_convertvector(__builtin_elementwise_ceil(at), Ints);
+    __builtin_memcpy(grid + n, &k, sizeof(k));
+}
+for (int n = 0; n < waiting; ++n) {
+    const int row = start + (int)(queue[n] & (LANES - 1));
+    LOOK_AT(row, grid[n], (int)(queue[n] >> 4 & 1), MEMORY_OF(row));
+}
+return 0;
+"""
+)
+def look_back(sink: Probes, start: int, i: int, waiting: int) -> int:
+    """Look at the events of pixel `i` that wait, of models `start` and after, on a CPU; none wait then."""
+    ...
 
 
 @wp.kernel(enable_backward=False)

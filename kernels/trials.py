@@ -18,11 +18,12 @@ import warp as wp
 from dase.kernels import pixel
 from dase.kernels.blocks import Blocks
 from dase.kernels.compose import compiled
-from dase.kernels.probes import Probes, observe
+from dase.kernels.probes import LANES, QUEUE, Probes, look_back, observe, put_off
 from dase.kernels.writer import VOLTAGE, Writer
 
-LANES = 16
-"""Models of a pixel that a CPU thread works on side by side."""
+FLAGS = "-march=native -mprefer-vector-width=512 -mllvm=-inline-threshold=400"
+"""On a CPU: 16 lanes fill its longest vectors, which compilers shun by themselves, and what looks at events
+is not copied to all places where there are some. The bits are the same."""
 
 
 @wp.struct
@@ -43,8 +44,11 @@ def compose(stages: tuple[pixel.Stages, ...], *, lanes: int = 1) -> wp.Kernel:
     Its arguments are `first`, a `History`, pixels (N,), width, height, seeds (B,), parameters (B, P), maps
     (M, N) where an effect has any, `Probes`.
     """
-    writer = _Lanes(stages) if lanes > 1 else _Threads(stages)
-    return compiled(writer.kernel(), "pixel_trials", writer.scope)
+    if lanes == 1:
+        writer: _Trials = _Threads(stages)
+        return compiled(writer.kernel(), "pixel_trials", writer.scope)
+    writer = _Lanes(stages)
+    return compiled(writer.kernel(), "pixel_trials", writer.scope, cpu_compiler_flags=FLAGS)
 
 
 def source_text(stages: tuple[pixel.Stages, ...], *, lanes: int = 1) -> str:
@@ -61,7 +65,10 @@ def instant(begin: int, steps: int, step: float, share: float, late: float) -> w
     """When an event leaves [ns]: `share` of `steps` after `begin`, and `late` [s]."""
     nanoseconds = wp.float64(step) * wp.float64(1.0e9)
     at = wp.float64(begin) + wp.float64(wp.min(share, 1.0)) * wp.float64(steps)
-    return wp.int64(at * nanoseconds) + wp.int64(wp.round(late * 1.0e9))
+    time = wp.int64(at * nanoseconds)
+    if late > 0.0:
+        time += wp.int64(wp.round(late * 1.0e9))
+    return time
 
 
 @wp.kernel(enable_backward=False)
@@ -141,7 +148,10 @@ class _Trials(Writer):
         return f"observe(sink, row, i, {time}, {polarity})"
 
 
-SCOPE = {"Source": History, "Sink": Probes, "observe": observe, "instant": instant}
+SCOPE = {
+    "Source": History, "Sink": Probes, "observe": observe, "put_off": put_off, "look_back": look_back,
+    "instant": instant,
+}  # fmt: skip
 
 
 class _Threads(_Trials):
@@ -176,6 +186,19 @@ class _Lanes(_Trials, Blocks):
         Blocks.__init__(self, stages, "frames", "keys", lanes=LANES)
         self.scope |= SCOPE
 
+    def keep(self, time: str, polarity: str, label: str) -> str:
+        # what becomes of one event depends on few others; looked at together, they overlap
+        return f"met = put_off(sink, slot, met, lane, {time}, {polarity})"
+
+    def event(self, share: str, polarity: str, label: str) -> None:
+        super().event(share, polarity, label)
+        self.add(f"if met == {QUEUE}:", "    met = look_back(sink, start, i, met)")
+
+    def loop(self) -> None:
+        self.add("met = int(0)", "slot = i / sink.group")
+        super().loop()
+        self.add("look_back(sink, start, i, met)")
+
     def types(self) -> dict[str, str]:
         floats = ["on", "off", "mean_on", "mean_off", "nominal_on", "nominal_off", "intensity", "voltage"]
         floats += ["before", "after", "leaked_before", "asleep", "busy", *self.states, *self.places]
@@ -197,6 +220,11 @@ class _Lanes(_Trials, Blocks):
 
     def which(self) -> str:
         return "bits = busy_bits(busy_lanes, 0) & mine"
+
+    def drawn(self, local: str, line: str) -> list[str]:
+        # most effects are off, and a normal number takes as long as an event
+        effect = next((e for e in self.stages if e.off and local.startswith(f"{e.name}_")), None)
+        return [line] if effect is None else [f"{local} = float(0.0)", *self.unless_off(effect, line)]
 
     def lanes(self, lines: list[str], *, head: str = "", lane: str = "") -> None:
         """Write lines for one lane after the other; those of effects that no lane has are skipped."""

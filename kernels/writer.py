@@ -81,7 +81,11 @@ class Writer(Crossings):
         for local, kind in self.draws.items():
             self.add(f"{local}_key = key(seed, {stream(local)}, pixel)")
             if self.once(local):
-                self.add(f"{local} = {kind}({local}_key, 0)")
+                self.add(*self.drawn(local, f"{local} = {kind}({local}_key, 0)"))
+
+    def drawn(self, local: str, line: str) -> list[str]:
+        """Return the lines that draw a number of the pixel."""
+        return [line]
 
     def where(self) -> None:
         """What depends on where the pixel is."""

@@ -188,6 +188,23 @@ def test_models_side_by_side_are_those_alone(evidence, device, rng):
         np.testing.assert_array_equal(one.clock, other.clock)
 
 
+def test_more_events_than_may_wait(evidence, device, rng):
+    """Where the models of a thread have more events in a pixel than wait until they are looked at."""
+    if str(device).startswith("cuda"):
+        pytest.skip("on a GPU no event waits")
+    lanes = evidence.scout.trials
+    threads = copy(lanes)
+    threads._kernels, threads._lanes = {}, 1
+    vectors = np.repeat(Sensor().parameters()[None], kernels.LANES, 0)
+    vectors[:, :2] = rng.uniform(0.01, 0.02, (kernels.LANES, 2))
+    orders = [Order(Sensor(), vectors, seed=3, ticks=ticks) for ticks in (0.0, 3e-3)]
+    for one, other in zip(lanes.run_all(orders), threads.run_all(orders), strict=True):
+        assert one.halves.sum((0, 2)).max() > 2 * kernels.QUEUE
+        np.testing.assert_array_equal(one.halves, other.halves)
+        np.testing.assert_array_equal(one.sums, other.sums)
+        np.testing.assert_array_equal(one.clock, other.clock)
+
+
 def test_a_clock_is_the_same_inside_the_kernel(evidence):
     """Events that the kernel stamps by a clock that ticks fall where those that go through one fall."""
     clock = EFFECTS["timestamp"](step=3e-3, jitter=0.0)

@@ -17,9 +17,9 @@ def impulse(x: float, damping: float):
     """Impulse response h of 1 / (s² + 2 damping s + 1) after x, and its derivative."""
     h = float(0.0)
     dh = float(0.0)
+    decay = exponential(-damping * x)
     if damping < 1.0:
         w = wp.sqrt((1.0 - damping) * (1.0 + damping))
-        decay = exponential(-damping * x)
         turn = w * x / (2.0 * wp.pi)
         cosine, sine = circle(turn - wp.floor(turn))
         h = decay * sine / w
@@ -30,7 +30,7 @@ def impulse(x: float, damping: float):
         slow = exponential(-x / (damping + w))
         z = w * x
         # the difference of nearly equal numbers loses digits
-        h = exponential(-damping * x) * x * (1.0 + z * z / 6.0 * (1.0 + z * z / 20.0))
+        h = decay * x * (1.0 + z * z / 6.0 * (1.0 + z * z / 20.0))
         if z > 0.3:
             h = 0.5 * (slow - fast) / w
         dh = 0.5 * (slow + fast) - damping * h
