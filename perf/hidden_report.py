@@ -244,7 +244,7 @@ def others(lines: list[dict[str, Any]]) -> str:
     )
     if not mine:
         return "Not run."
-    out += ["| case | hidden | named | error | |", "|---|---|---|---|---|"]
+    out += ["| case | hidden | named | error | s | |", "|---|---|---|---|---|---|"]
     for line in mine:
         answer = line["answer"]
         named = ", ".join(
@@ -257,7 +257,7 @@ def others(lines: list[dict[str, Any]]) -> str:
         hidden = ", ".join(line["case"]["effects"]) or "nothing"
         out.append(
             f"| {line['case']['strength']} | {hidden} | {named or 'nothing'} | {errors} | "
-            f"{'right' if right(line) else '**wrong**'} |"
+            f"{line['seconds']:.1f} | {'right' if right(line) else '**wrong**'} |"
         )
     return "\n".join(out)
 
