@@ -198,7 +198,7 @@ def _tones(count: int, step: float) -> tuple[NDArray[np.float32], NDArray[np.flo
 
 @lru_cache(maxsize=8)
 def _swing(peak: float, first: int, count: int, step: float) -> NDArray[np.float32]:
-    """Return the two phases of a frequency, shape (T, 2)."""
+    """Return cosine and minus sine of a frequency `peak` [Hz] at steps [s] from `first` on, shape (T, 2)."""
     turn = 2 * np.pi * peak * step * (first + np.arange(count))
     return np.stack([np.cos(turn), -np.sin(turn)], 1).astype(np.float32)
 

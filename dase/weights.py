@@ -35,7 +35,8 @@ def load_net(path: Path) -> ThresholdNet:
     try:
         with safe_open(path, "pt") as file:
             about = file.metadata() or {}
-            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118  # it is no dict
+            names = file.keys()
+            tensors = {name: file.get_tensor(name) for name in names}
         if about.get("kind") != KIND:
             raise InputError(f"{path} does not hold learned thresholds")
         net = ThresholdNet(shape_of(about["shape"]))

@@ -164,13 +164,22 @@ def test_rows_of_a_batch_are_independent(evidence):
     assert np.any(apart.halves[0] != apart.halves[1])
 
 
+def side_by_side(lanes, orders):
+    """Run models on a CPU in its vectors, compare them with one after the other, and return their sums."""
+    threads = copy(lanes)
+    threads._kernels, threads._lanes = {}, 1
+    found = lanes.run_all(orders)
+    for one, other in zip(found, threads.run_all(orders), strict=True):
+        np.testing.assert_array_equal(one.halves, other.halves)
+        np.testing.assert_array_equal(one.sums, other.sums)
+        np.testing.assert_array_equal(one.clock, other.clock)
+    return found
+
+
 def test_models_side_by_side_are_those_alone(evidence, device, rng):
     """A CPU works on several models of a pixel in its vectors: the same to the last bit."""
     if str(device).startswith("cuda"):
         pytest.skip("on a GPU every model of a pixel has a thread of its own")
-    lanes = evidence.scout.trials
-    threads = copy(lanes)
-    threads._kernels, threads._lanes = {}, 1
     names = ("leak", "shot", "dark", "linlog", "bandwidth", "latency", "jitter", "voltage_noise")
     sensors = [Sensor().with_effect(EFFECTS[n](**ON[n])) for n in names]
     # enough effects for the kernel that has all of them
@@ -181,28 +190,19 @@ def test_models_side_by_side_are_those_alone(evidence, device, rng):
         vectors[:, :2] *= np.exp(rng.uniform(-0.3, 0.3, (5, 2)))
         vectors[:, 2] = rng.choice([0.0, 1.0], 5)
         orders.append(Order(sensor, vectors, seed=n, reseed=n % 2 > 0, finer=1))
-    for one, other in zip(lanes.run_all(orders), threads.run_all(orders), strict=True):
-        assert one.halves.sum() > 500
-        np.testing.assert_array_equal(one.halves, other.halves)
-        np.testing.assert_array_equal(one.sums, other.sums)
-        np.testing.assert_array_equal(one.clock, other.clock)
+    for sums in side_by_side(evidence.scout.trials, orders):
+        assert sums.halves.sum() > 500
 
 
 def test_more_events_than_may_wait(evidence, device, rng):
     """Where the models of a thread have more events in a pixel than wait until they are looked at."""
     if str(device).startswith("cuda"):
         pytest.skip("on a GPU no event waits")
-    lanes = evidence.scout.trials
-    threads = copy(lanes)
-    threads._kernels, threads._lanes = {}, 1
     vectors = np.repeat(Sensor().parameters()[None], kernels.LANES, 0)
     vectors[:, :2] = rng.uniform(0.01, 0.02, (kernels.LANES, 2))
     orders = [Order(Sensor(), vectors, seed=3, ticks=ticks) for ticks in (0.0, 3e-3)]
-    for one, other in zip(lanes.run_all(orders), threads.run_all(orders), strict=True):
-        assert one.halves.sum((0, 2)).max() > 2 * kernels.QUEUE
-        np.testing.assert_array_equal(one.halves, other.halves)
-        np.testing.assert_array_equal(one.sums, other.sums)
-        np.testing.assert_array_equal(one.clock, other.clock)
+    for sums in side_by_side(evidence.scout.trials, orders):
+        assert sums.halves.sum((0, 2)).max() > 2 * kernels.QUEUE
 
 
 def test_a_clock_is_the_same_inside_the_kernel(evidence):
