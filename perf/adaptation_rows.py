@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -50,6 +51,9 @@ SMALL = FULL.but(hash=dict(size=8))
 STEADY = dict(critic_steps=2)
 """Critics that keep up with the generator, which wanders less, for longer runs."""
 
+DRAWS = range(6)
+"""Seeds of rows with finite data, each with textures of its own: chance is in the draw of those."""
+
 SIZES = (8, 16, 24, 40, 60, 80)
 LOW = dict(mu=0.1, sigma=0.02)
 MOMENTS = Row(recipe=dict(objective="moments", rate=1e-4, anchor=1.0), network=dict(table=(6, 5)))
@@ -66,10 +70,10 @@ def rows() -> dict[str, Row]:
         out[f"full40-s{seed}"] = FULL.but(recipe=dict(seed=seed))
         out[f"moments-s{seed}"] = MOMENTS.but(recipe=dict(seed=seed))
         out[f"moments-low-s{seed}"] = MOMENTS.but(recipe=dict(seed=seed, **LOW))
-        for count in (600, 100):
-            for name, base in (("wgan", SMALL), ("moments", MOMENTS)):
-                row = base.but(finite=count, disjoint=True, textures=200, recipe=dict(seed=seed))
-                out[f"finite{count}-{name}-s{seed}"] = row
+    for seed, count in itertools.product(DRAWS, (600, 100)):
+        for name, base in (("wgan", SMALL), ("moments", MOMENTS)):
+            row = base.but(finite=count, disjoint=True, textures=200, recipe=dict(seed=seed))
+            out[f"finite{count}-{name}-s{seed}"] = row
     one = dict(orientations=1, coherence=1, contrast=1)
     out["table4-global"] = FULL.but(hash=one)
     out["table4-uniform"] = FULL.but(recipe=dict(uniform=1.0))
@@ -113,7 +117,12 @@ def rows() -> dict[str, Row]:
 
 def _finite_variants() -> dict[str, Row]:
     base = FULL.but(finite=600, textures=200)
-    return {
+    energy = dict(size=8, orientations=6, contrast=12)
+    fine = {
+        f"finite600-wgan-energy12-s{seed}": base.but(disjoint=True, hash=energy, recipe=dict(seed=seed))
+        for seed in DRAWS
+    }
+    return fine | {
         "finite600-wgan-same-textures": base,
         "finite600-wgan-plain": base.but(augment=False, disjoint=True),
         "finite600-wgan-slow-critic": base.but(disjoint=True, recipe=dict(critic_rate=5e-5)),
@@ -198,7 +207,7 @@ def plan(which: str) -> list[Planned]:
     """Return the rows of a plan, the most important first: `main`, `tables` or `all`."""
     every = rows()
     main = [f"{kind}-s{n}" for kind in ("moments", "moments-low") for n in SEEDS]
-    main += [f"finite{count}-moments-s{n}" for count in (600, 100) for n in SEEDS]
+    main += [f"finite{count}-moments-s{n}" for count in (600, 100) for n in DRAWS]
     main += [f"maps-{truth}-moments" for truth in ("intensity", "edges", "column", "asymmetric")]
     main += ["real-moments", "real-moments-flat"]
     main += [f"{kind}-s{n}" for kind in ("full", "full-low", "full16", "full40") for n in SEEDS]
@@ -208,7 +217,7 @@ def plan(which: str) -> list[Planned]:
     tables += ["fig3-literal", "fig3-literal-no-kl", "fig3-no-kl"]
     tables += [f"fig5-{size}" for size in SIZES if f"fig5-{size}" not in SAME]
     rest = ["real-wgan", "real-moments-doubt0.05", "real-moments-doubt0.1", "paper", "table5-ranked"]
-    rest += [f"finite{count}-wgan-s{n}" for count in (600, 100) for n in SEEDS]
+    rest += [f"finite{count}-wgan-s{n}" for count in (600, 100) for n in DRAWS]
     rest += [f"table5-events-{used}" for used in ("contrast", "angle+contrast", "contrast+coherence")]
     rest += [f"maps-{truth}-wgan-table" for truth in ("intensity", "edges", "asymmetric")]
     rest += ["maps-column-wgan", "maps-intensity-wgan-table-intensity"]
