@@ -11,6 +11,7 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
+from dase import learned
 from dase.sheet import INK, QUIET
 from dase.show import OFF, ON
 from dase.targets import TRUTHS
@@ -22,8 +23,14 @@ MAPS = {"intensity": "rise with brightness", "edges": "higher at edges", "column
 
 
 def draw(out: Path, found: Lines, folder: Path) -> list[tuple[Path, str]]:
-    """Write the pictures for which there are rows; return their paths and titles."""
+    """Write the pictures for which there are rows; return the paths and titles of those for the page.
+
+    What was learned from the recording (the paper's Fig. 6) stays beside its row, as OUT/real-*/learned.png:
+    a recording may have no licence.
+    """
     shown = []
+    for run in sorted(out.glob("real-*/examples.npz")):
+        _save(learned.draw(run.parent)[0], run.with_name("learned.png"))
     if any(name.startswith(tuple(COLOURS)) for name in found):
         shown.append((folder / "adaptation-runs.png", "How runs went, what was learned, sizes of patches"))
         _save(_runs(found), shown[-1][0])

@@ -61,7 +61,7 @@ matrix() { # SECONDS JOBS [CORES]
 
 pack() { # without networks, and without examples that no page shows; whole at any moment
     local to=${PACK:-$out.tar.gz}
-    tar czf "$to.part" --exclude='*.pt' --exclude='*.safetensors' --exclude='real-*/examples.npz' \
+    tar czf "$to.part" --exclude='*.pt' --exclude='*.safetensors' --exclude='real-moments-*/examples.npz' \
         --exclude='*-wgan*/examples.npz' -C "$out" . && mv "$to.part" "$to"
 }
 
