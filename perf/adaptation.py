@@ -20,6 +20,7 @@ import json
 import math
 import platform
 import shutil
+import statistics
 import subprocess
 import sys
 import time
@@ -33,9 +34,16 @@ import torch
 from adaptation_rows import Planned, Row, plan, rows
 
 from dase import images
-from dase.adaptation import write_examples
+from dase.adaptation import baseline, write_examples, write_sensor
+from dase.baselines import Randomised, constant
+from dase.camera import TOLERANCE, CameraScene
+from dase.comparison import compare
+from dase.config import load_sensor
+from dase.evaluation import HeldOut
 from dase.networks import NetworkShape
 from dase.objectives import Hash
+from dase.recorded import Replayed, open_target, windows_of
+from dase.recording import open_recording
 from dase.run import Pace, run
 from dase.scenery import Looks, Scenery
 from dase.targets import TRUTHS, Endless, Finite, Pairs, Target, record
@@ -47,6 +55,9 @@ SHARED = ROOT.parent / "shared"
 LEARNED = 8.0
 """Seconds of the recording that are learned from."""
 
+DRAWN = 8
+"""Sensors of broad randomisation whose errors in the probes are averaged."""
+
 OBJECTS = 8
 """Objects for every background in a pool of which either side has half: a scene shows about ten."""
 
@@ -55,7 +66,7 @@ def prepare(row: Row, args: argparse.Namespace) -> Training:
     """Return the run of a row."""
     device, pictures, small = args.device, args.images, args.small
     looks = Looks(regime="mixed") if not small else Looks(regime="mixed", width=96, height=96, samples=12)
-    recipe: dict[str, Any] = dict(steps=10**6, **row.recipe)
+    recipe: dict[str, Any] = {"steps": 10**6, **row.recipe}
     how, network = dict(row.hash), dict(row.network)
     if small:
         recipe["batch"], recipe["warmup"] = 4, 30
@@ -65,8 +76,6 @@ def prepare(row: Row, args: argparse.Namespace) -> Training:
             network["pattern"] = (96, 96)
     made = Recipe(hash=Hash(**how), network=NetworkShape(**network), **recipe)
     if row.real:
-        from dase.recorded import open_target
-
         target, scenes = open_target([Path(args.recording)], until=LEARNED, device=device)
         return Training(made, target, scenes)
     source = images.open_images(pictures)
@@ -87,13 +96,8 @@ def prepare(row: Row, args: argparse.Namespace) -> Training:
     return Training(made, target, ours)
 
 
-def judge(training: Training, args: argparse.Namespace, folder: Path) -> dict[str, Any]:
-    """Return how the adapted sensor and the baselines do on the part of the recording that came later."""
-    from dase.adaptation import baseline
-    from dase.evaluation import HeldOut
-    from dase.recorded import Replayed, windows_of
-    from dase.recording import open_recording
-
+def judge(row: Row, training: Training, args: argparse.Namespace, folder: Path) -> dict[str, Any]:
+    """Return how the adapted sensor or the baselines do on the part of the recording that came later."""
     recording = open_recording(args.recording)
     recording = recording.masked(~recording.hot)
     later = recording.slice(recording.begin + LEARNED, recording.end)
@@ -102,41 +106,39 @@ def judge(training: Training, args: argparse.Namespace, folder: Path) -> dict[st
     grey = np.exp(windows.log[:, windows.log.shape[1] // 2].astype(np.float32)) - np.float32(1e-3)
     pairs = Pairs(torch.from_numpy(grey).to(args.device), torch.from_numpy(windows.counts).to(args.device))
     held = HeldOut(scenes, pairs, doubt=0.2)
-    nets: dict[str, Any] = {"adapted": training.mean}
-    for kind in ("esim", "rate", "random"):
-        nets[kind] = baseline(kind, training.target, training.scenery)
     out: dict[str, Any] = {"trusted": windows.trusted}
-    for name, net in nets.items():
+    for name in row.judged:
+        net = training.mean if name == "adapted" else baseline(name, training.target, training.scenery)
         out[name] = held.statistics(net)
-        if name != "random":
-            out[name]["probes"] = _probes(later, name, net, folder)
-            print(f"{folder.name} {name}: {out[name]}", flush=True)
+        sensors = [_drawn(n) for n in range(DRAWN)] if name == "random" else [net]
+        errors = [_probes(later, name, one, folder) for one in sensors]
+        out[name] |= {"probes": statistics.mean(errors), "probes_each": errors}
+        print(f"{folder.name} {name}: {out[name]}", flush=True)
     return out
 
 
-def _probes(later: Any, name: str, net: Any, folder: Path) -> float | str:
+def _drawn(seed: int) -> Any:
+    """Return a sensor that broad randomisation may draw: a recording is of one."""
+    maps = Randomised(seed)(torch.zeros(1, 16, 16))
+    mu = float(maps.mu.mean())
+    return constant(mu, float(maps.sigma.mean()), float(maps.ratio))
+
+
+def _probes(later: Any, name: str, net: Any, folder: Path) -> float:
     """Return the headline error of `dase compare` on the later part."""
-    try:
-        from dase.adaptation import write_sensor
-        from dase.camera import TOLERANCE, CameraScene
-        from dase.comparison import compare
-        from dase.config import load_sensor
+    place = folder / name
+    place.mkdir(exist_ok=True)
+    mu = float(net(torch.full((1, 8, 8), 0.4, device=net.level.device)).mu.mean().detach())
+    sensor = load_sensor(write_sensor(place, net.to("cpu"), mu=mu, name=name))
+    assert later.frames is not None
+    assert later.frame_begin is not None
+    scene = CameraScene(later.frames, later.frame_begin, later.frame_end)
 
-        place = folder / name
-        place.mkdir(exist_ok=True)
-        mu = float(net(torch.full((1, 8, 8), 0.4, device=net.level.device)).mu.mean().detach())
-        sensor = load_sensor(write_sensor(place, net.to("cpu"), mu=mu, name=name))
-        assert later.frames is not None
-        assert later.frame_begin is not None
-        scene = CameraScene(later.frames, later.frame_begin, later.frame_end)
+    def trust(times: Any, pixels: Any) -> Any:
+        at = np.clip(times, scene.times[0], scene.times[-1])
+        return scene.doubt(at, pixels=pixels) <= TOLERANCE
 
-        def trust(times: Any, pixels: Any) -> Any:
-            at = np.clip(times, scene.times[0], scene.times[-1])
-            return scene.doubt(at, pixels=pixels) <= TOLERANCE
-
-        return compare(later.events, scene, sensor, trust=trust, pixels=800).error
-    except Exception as error:
-        return f"{type(error).__name__}: {error}"
+    return compare(later.events, scene, sensor, trust=trust, pixels=800).error
 
 
 def measure(name: str, seconds: float, args: argparse.Namespace) -> dict[str, Any]:
@@ -159,9 +161,9 @@ def measure(name: str, seconds: float, args: argparse.Namespace) -> dict[str, An
     last = run(training, folder, pace=pace, look=look)
     scored = [line for line in history if "held_out" in line]
     best = min(scored, key=lambda line: line["held_out"]) if scored else last
-    if row.real or row.truth != "uniform":
+    if training.step and (row.real or row.truth != "uniform"):
         write_examples(folder, training)
-    real = judge(training, args, folder) if row.real else None
+    real = judge(row, training, args, folder) if row.real else None
     return {
         "row": name,
         "real": real,
@@ -172,7 +174,7 @@ def measure(name: str, seconds: float, args: argparse.Namespace) -> dict[str, An
         "small": args.small,
         "jobs": args.alone if training.recipe.objective == "wgan" else args.jobs,
         "wall": time.perf_counter() - begin,
-        "steps_per_second": training.recipe.steps / last["seconds"],
+        "steps_per_second": training.recipe.steps / max(last["seconds"], 1e-9),
         "at_001": next((h["seconds"] for h in history if h.get("kl", 1) <= 0.01), None),
         "last": last,
         "best": best,

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import adaptation_pictures
-from adaptation_rows import SAME
+from adaptation_rows import SAME, rows
 
 GROUPS = {
     "Target N(0.2, 0.05), endless real data": ("moments", "full", "paper", "surrogate", "anchor"),
@@ -32,9 +32,7 @@ JUDGED = {
 
 
 def cell(value: Any, digits: int = 2) -> str:
-    """Return a number for a table, or the reason why there is none."""
-    if isinstance(value, str):
-        return value.partition(":")[0]
+    """Return a number for a table."""
     return "-" if value is None else f"{value:.{digits}g}"
 
 
@@ -56,17 +54,18 @@ def table(lines: list[dict[str, Any]]) -> list[str]:
 
 
 def judged(lines: list[dict[str, Any]]) -> list[str]:
-    """Return how sensors do on the part of a recording that came later."""
+    """Return how sensors do on the part of a recording that came later, each row's and the baselines."""
     out = [
         "| row | sensor | probes: error | moments | rate | counts | sums of 8x8 | spreads in 8x8 |",
         "|" + "---|" * 8,
     ]
+    every = rows()
     for line in lines:
-        for key, shown in JUDGED.items():
+        for key in every[line["row"]].judged:
             found = line["real"][key]
             names = ("probes", "score", "rate", "counts", "patch_sums", "patch_spreads")
             figures = " | ".join(cell(found.get(name), 3) for name in names)
-            out.append(f"| {line['row']} | {shown} | {figures} |")
+            out.append(f"| {line['row']} | {JUDGED[key]} | {figures} |")
     return out
 
 

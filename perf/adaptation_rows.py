@@ -21,6 +21,7 @@ class Row:
         hash: What differs from the default hash.
         network: What differs from the default network.
         real: Whether the target is the recording: 8 s to learn from, what follows to judge by.
+        judged: What is judged on what follows: `adapted`, or baselines, for which nothing is learned.
     """
 
     truth: str = "uniform"
@@ -32,6 +33,7 @@ class Row:
     hash: dict[str, Any] = field(default_factory=dict)
     network: dict[str, Any] = field(default_factory=dict)
     real: bool = False
+    judged: tuple[str, ...] = ("adapted",)
 
     def but(self, **changes: Any) -> Row:
         """Return the row with some options changed, dictionaries merged."""
@@ -53,6 +55,9 @@ STEADY = dict(critic_steps=2)
 
 DRAWS = range(6)
 """Seeds of rows with finite data, each with textures of its own: chance is in the draw of those."""
+
+BASELINES = ("esim", "rate", "random")
+"""What a learned sensor is compared with, see `dase.adaptation.baseline`."""
 
 SIZES = (8, 16, 24, 40, 60, 80)
 LOW = dict(mu=0.1, sigma=0.02)
@@ -104,6 +109,7 @@ def rows() -> dict[str, Row]:
         out[f"anchor-{anchor:g}"] = FULL.but(recipe=dict(anchor=anchor))
     recorded = dict(doubt=0.2, batch=8)
     out["real-moments"] = MOMENTS.but(real=True, recipe=recorded, network=dict(split=True))
+    out["real-baselines"] = out["real-moments"].but(judged=BASELINES, recipe=dict(steps=0, warmup=0))
     for doubt in (0.05, 0.1):
         out[f"real-moments-doubt{doubt:g}"] = out["real-moments"].but(recipe=dict(doubt=doubt))
     out["real-moments-flat"] = out["real-moments"].but(network=dict(table=None), recipe=dict(rate=0.0))
@@ -209,7 +215,7 @@ def plan(which: str) -> list[Planned]:
     main = [f"{kind}-s{n}" for kind in ("moments", "moments-low") for n in SEEDS]
     main += [f"finite{count}-moments-s{n}" for count in (600, 100) for n in DRAWS]
     main += [f"maps-{truth}-moments" for truth in ("intensity", "edges", "column", "asymmetric")]
-    main += ["real-moments", "real-moments-flat"]
+    main += ["real-moments", "real-moments-flat", "real-baselines"]
     main += [f"{kind}-s{n}" for kind in ("full", "full-low", "full16", "full40") for n in SEEDS]
     tables = ["table4-global", "table4-uniform", "table5-events-angle+contrast+coherence"]
     tables += [f"table4-moments-{name}" for name in ("global", "brightness", "edges")]
@@ -230,5 +236,7 @@ def plan(which: str) -> list[Planned]:
         seconds = 40.0 if name.startswith(("full", "real", "paper")) else 28.0
         if "critic_steps" in every[name].recipe:
             seconds = 75.0
+        if every[name].recipe.get("steps") == 0:
+            seconds = 0.0
         out.append(Planned(name, seconds, adversarial))
     return out
