@@ -22,6 +22,7 @@ from dase.files import replacing
 from dase.networks import NetworkShape, ThresholdNet
 from dase.objectives import Hash
 from dase.recorded import Replayed, open_target
+from dase.run import CHECKPOINT
 from dase.scenery import Looks, Scenery, middle
 from dase.sensor import Sensor, count
 from dase.targets import Finite, Pairs, Target, Truth, draw_noise, simulate
@@ -245,7 +246,7 @@ def _truth(sensor: Sensor) -> Truth | None:
 
 
 def begin(job: Job, out: Path, *, resume: bool) -> None:
-    """Leave the record of a job in its folder; raises InputError where another one began there."""
+    """Leave the record of a job in its folder; raises InputError where another one has a checkpoint there."""
     record = out / JOB
     if out.exists() and not out.is_dir():
         raise InputError(f"{out} must be a folder, but it is a file")
@@ -253,7 +254,7 @@ def begin(job: Job, out: Path, *, resume: bool) -> None:
         raise InputError(f"{out} holds no run to resume")
     if resume and record.read_text("utf-8") != job.text():
         raise InputError(f"{out} was begun with other options (see {record}); --resume needs the same ones")
-    if not resume and record.exists():
+    if not resume and (out / CHECKPOINT).exists():
         raise InputError(f"{out} already holds a run; give --resume to go on with it, or another folder")
     out.mkdir(parents=True, exist_ok=True)
     with replacing(record) as temporary:

@@ -12,20 +12,22 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from safetensors import SafetensorError, safe_open
-from safetensors.torch import save_file
+from safetensors.torch import save
 
 from dase.errors import InputError
 from dase.files import replacing
 from dase.networks import NetworkShape, ThresholdNet
 
 KIND = "dase.learned_threshold"
+"""Name of the file's only entry of metadata, the shape as JSON; of several the order is up to chance."""
 
 
 def save_net(path: Path, net: ThresholdNet) -> None:
     """Write a network; the file appears whole or not at all."""
     tensors = {name: value.detach().cpu().contiguous() for name, value in net.state_dict().items()}
     with replacing(path) as temporary:
-        save_file(tensors, temporary, {"kind": KIND, "shape": json.dumps(asdict(net.shape))})
+        # `save_file` would let nobody else read it
+        temporary.write_bytes(save(tensors, {KIND: json.dumps(asdict(net.shape))}))
 
 
 def load_net(path: Path) -> ThresholdNet:
@@ -34,12 +36,12 @@ def load_net(path: Path) -> ThresholdNet:
         raise InputError(f"the weights {path} do not exist; they belong beside the sensor file")
     try:
         with safe_open(path, "pt") as file:
-            about = file.metadata() or {}
+            shape = (file.metadata() or {}).get(KIND)
             names = file.keys()
             tensors = {name: file.get_tensor(name) for name in names}
-        if about.get("kind") != KIND:
+        if shape is None:
             raise InputError(f"{path} does not hold learned thresholds")
-        net = ThresholdNet(shape_of(about["shape"]))
+        net = ThresholdNet(shape_of(shape))
         net.load_state_dict(tensors)
     except (SafetensorError, RuntimeError, KeyError, ValueError, TypeError) as error:
         raise InputError(f"{path} does not hold learned thresholds: {error}") from error
