@@ -51,7 +51,7 @@ MEMORY = 4
 """Numbers a pixel remembers from event to event."""
 
 LANES = 16
-"""Models of a pixel that a CPU thread works on side by side."""
+"""Models of a pixel that a CPU thread works on side by side; an event that waits has 4 bits for which."""
 
 QUEUE = 512
 """Their events that wait until they are looked at, a multiple of 8."""
