@@ -22,7 +22,7 @@ lint: .venv/ready
 	$(BIN)/mypy
 
 perf: .venv/ready
-	$(BIN)/python perf/bench_kernels.py
+	$(BIN)/python -m perf.benchmarks.kernels
 
 clean:
 	rm -rf .venv build dist *.egg-info out

@@ -11,8 +11,8 @@ from dase.cli.options import effects_option, sensor_output
 
 if TYPE_CHECKING:
     from dase.effects import Effect
-    from dase.history import Entry
-    from dase.sensor import Sensor
+    from dase.simulation.sensor import Sensor
+    from dase.simulation.sensor_history import Entry
 
 
 @click.command()
@@ -51,20 +51,20 @@ def command(
 
     The effect gets its default values and goes where it acts. The change is noted at the end of the file.
     """
-    from dase import edit
-    from dase.effect_files import known_effects
     from dase.effects import find
+    from dase.simulation import sensor_edit
+    from dase.simulation.user_effects import known_effects
 
     values = dict(split(setting) for setting in settings)
     known = known_effects(effects)
-    chosen = edit.parse_values(find(effect, known), values)
-    text = edit.read(sensor, known)
+    chosen = sensor_edit.parse_values(find(effect, known), values)
+    text = sensor_edit.read(sensor, known)
     more = text.added(chosen)
-    entry = edit.today(f"add {effect}")
+    entry = sensor_edit.today(f"add {effect}")
     if recording is not None:
         fitted, entry = _fitted(text.sensor(), chosen, recording, scene, device, seed)
         more = more.became(fitted)
-    edit.write(more.noted(entry), output)
+    sensor_edit.write(more.noted(entry), output)
     if output is None:
         return
     click.echo(f"{output}: {effect} added ({said(more.sensor()[effect])})")
@@ -77,10 +77,11 @@ def _fitted(
     sensor: Sensor, effect: Effect, recording: Path, scene: str, device: str, seed: int
 ) -> tuple[Sensor, Entry]:
     """Return the sensor with the effect, fitted to a recording, and what is to be noted."""
-    from dase import edit
-    from dase.adding import fit_added
     from dase.cli.diagnose import bar
-    from dase.measurement import open_measurement
+    from dase.diagnosis import sensor_update
+    from dase.diagnosis.add_effect import fit_added
+    from dase.diagnosis.measurement import open_measurement
+    from dase.simulation import sensor_edit
 
     data = open_measurement(recording, scene)
     with bar(False) as tell:
@@ -89,14 +90,14 @@ def _fitted(
         )
     for note in data.noted(found).notes:
         click.echo(f"note: {note}", err=True)
-    entry = edit.today(
+    entry = sensor_edit.today(
         f"add {effect.name}",
         recording=recording.name,
         error_before=round(before, 3),
         error_after=round(found.error, 3),
         floor=found.floor,
     )
-    return edit.rounded(found.sensor), entry
+    return sensor_update.rounded(found.sensor), entry
 
 
 def said(effect: Effect) -> str:

@@ -46,10 +46,10 @@ def command(
     1 is the error that two repeats of the recording would have. Nothing is fitted: `dase fit` does that.
     """
     from dase.cli.diagnose import bar
-    from dase.comparison import compare
-    from dase.config import load_sensor
-    from dase.effect_files import known_effects
+    from dase.diagnosis.compare import compare
     from dase.io import replacing
+    from dase.simulation.sensor_file import load_sensor
+    from dase.simulation.user_effects import known_effects
 
     model = load_sensor(sensor, known_effects(effects))
     measured = open_recorded(recording, scene, file, fps)
@@ -73,7 +73,7 @@ def command(
     for note in found.notes:
         click.echo(f"note: {note}")
     if output is not None:
-        from dase import report
+        from dase.figures import report
 
         plates = report.pictures(measured, model, seed=seed, device=device)
         page = report.comparison_page(found, recording=recording.name, model=Path(sensor).stem, plates=plates)

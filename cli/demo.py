@@ -14,7 +14,7 @@ import click
 @click.option("--backend", default="cpu", show_default=True, help="cpu or cuda.")
 def command(out: Path, backend: str) -> None:
     """Simulate a DAVIS346 before moving photographs, and draw what it sees."""
-    from dase import demo
+    from dase.datasets import demo
 
     picture, events = demo.run(out, backend=backend, say=click.echo)
     click.echo(f"Look at the picture  {picture}")

@@ -25,8 +25,8 @@ def explain(ctx: click.Context, parameter: click.Parameter, value: str | None) -
     """
     if value is None or ctx.resilient_parsing:
         return
-    from dase.effect_files import known_effects
-    from dase.explain import explanation
+    from dase.diagnosis.explain_effect import explanation
+    from dase.simulation.user_effects import known_effects
 
     click.echo(explanation(value, known_effects(ctx.params.get("effects", ()))))
     ctx.exit()
@@ -84,13 +84,14 @@ def command(
     Every effect that the sensor does not have is fitted, and judged on pixels and time held out. Nothing is
     announced unless it brings the error to what two repeats of the recording would give.
     """
-    from dase import edit
-    from dase.diagnosis import MOST, diagnose
-    from dase.effect_files import known_effects
+    from dase.diagnosis import sensor_update
+    from dase.diagnosis.diagnose import MOST, diagnose
     from dase.io import replacing
+    from dase.simulation import sensor_edit
+    from dase.simulation.user_effects import known_effects
 
     known = known_effects(effects)
-    text = edit.read(sensor, known)
+    text = sensor_edit.read(sensor, known)
     model = text.sensor()
     measured = open_recorded(recording, scene, file, fps)
     names = free.split(",") if free else None
@@ -104,12 +105,14 @@ def command(
         with replacing(json_) as part:
             part.write_text(json.dumps(found.to_json(), indent=2) + "\n")
     if output is not None:
-        edit.write(edit.diagnosed(text, found, recording.name), output)
+        sensor_edit.write(sensor_update.diagnosed(text, found, recording.name), output)
     if draw is not None:
+        from dase.figures.plot import plot
+
         with replacing(draw) as part:
-            found.plot().savefig(part)
+            plot(found).savefig(part)
     if report is not None:
-        from dase import report as pages
+        from dase.figures import report as pages
 
         plates = pages.pictures(measured, found.sensor, seed=seed, device=device)
         page = pages.diagnosis_page(found, recording=recording.name, model=Path(sensor).stem, plates=plates)
@@ -135,7 +138,7 @@ def bar(quiet: bool) -> Iterator[Callable[[str, float, float], None]]:
 
 
 def _print(found: Diagnosis, quiet: bool) -> None:
-    from dase.diagnosis import summary
+    from dase.diagnosis.diagnose import summary
 
     click.echo(summary(found))
     if quiet:

@@ -44,14 +44,14 @@ def command(
     """
     from tqdm import tqdm
 
-    from dase import distinguish, standards
-    from dase.config import load_sensor
-    from dase.effect_files import known_effects
+    from dase.diagnosis import distinguish, standard_stimuli
+    from dase.simulation.sensor_file import load_sensor
+    from dase.simulation.user_effects import known_effects
 
     known = known_effects(effects)
     names = (Path(a).stem, Path(b).stem) if Path(a).stem != Path(b).stem else ("A", "B")
     models = (load_sensor(a, known), load_sensor(b, known))
-    with tqdm(total=len(standards.STANDARDS), unit=" recordings", disable=None) as bar:
+    with tqdm(total=len(standard_stimuli.STANDARDS), unit=" recordings", disable=None) as bar:
 
         def progress(stimulus: str, seconds: float, power: float, last: bool) -> None:
             bar.set_postfix_str(f"{stimulus}, {seconds:g} s: {100 * power:.0f} %", refresh=True)
@@ -66,7 +66,8 @@ def command(
         click.echo("  ".join(f"{cell:{width}}" for cell, width in zip(row, widths, strict=True)).rstrip())
     click.echo(f"\n{found.sentence}")
     if output is not None:
+        from dase.figures.plot import plot
         from dase.io import replacing
 
         with replacing(output) as temporary:
-            found.plot(names).savefig(temporary)
+            plot(found, names=names).savefig(temporary)

@@ -18,7 +18,7 @@ def command() -> None:
 @effects_option
 def list_effects(effects: tuple[Path, ...]) -> None:
     """List all effects, in the order in which they act."""
-    from dase.effect_files import known_effects
+    from dase.simulation.user_effects import known_effects
 
     known = known_effects(effects)
     width = max(map(len, known))
@@ -31,8 +31,8 @@ def list_effects(effects: tuple[Path, ...]) -> None:
 @effects_option
 def show_effect(name: str, effects: tuple[Path, ...]) -> None:
     """Describe the effect NAME: physics, parameters, source."""
-    from dase.effect_files import known_effects
     from dase.effects import SceneEffect, StreamEffect, find
+    from dase.simulation.user_effects import known_effects
 
     effect = find(name, known_effects(effects))
     click.echo(f"{effect.name}: {effect.about()}\n")
@@ -56,7 +56,7 @@ def show_effect(name: str, effects: tuple[Path, ...]) -> None:
 @click.option("-o", "--output", type=click.Path(path_type=Path), help="Python file.  [default: NAME.py]")
 def new_effect(name: str, output: Path | None) -> None:
     """Write a Python file with a new effect NAME to fill in. It works as it is."""
-    from dase import effect_template
+    from dase.simulation import effect_template
 
     output = output or Path(f"{name}.py")
     effect_template.new_effect(name, output)

@@ -41,12 +41,13 @@ def command(
     Where only one of the starts came to the error of the best, the minimum may be a poor one: the file is
     written, this is said, and the exit code is 1.
     """
-    from dase import edit
     from dase.cli.diagnose import bar
-    from dase.effect_files import known_effects
-    from dase.fitting import fit
+    from dase.diagnosis import sensor_update
+    from dase.fitting.fit import fit
+    from dase.simulation import sensor_edit
+    from dase.simulation.user_effects import known_effects
 
-    text = edit.read(sensor, known_effects(effects))
+    text = sensor_edit.read(sensor, known_effects(effects))
     model = text.sensor()
     measured = open_recorded(recording, scene, file, fps)
     with bar(quiet) as tell:
@@ -54,7 +55,7 @@ def command(
             measured.events, measured.scene, model, free=free.split(",") if free else None,
             trust=measured.trust, pixels=pixels, seed=seed, device=device, progress=tell,
         )  # fmt: skip
-    edit.write(edit.fitted(text, found, recording.name), output)
+    sensor_edit.write(sensor_update.fitted(text, found, recording.name), output)
     click.echo(f"error {found.before:.2f} → {found.error:.2f}; repeats stay below {found.gate:.2f}")
     for name, estimate in found.parameters.items():
         click.echo(f"  {name:24s} {estimate.value:10.4g}   {estimate.low:.4g} to {estimate.high:.4g}")

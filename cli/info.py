@@ -27,9 +27,10 @@ def command(file: Path, size: tuple[int, int] | None, as_json: bool) -> None:
 
     from tqdm import tqdm
 
-    from dase import io, show
-    from dase.doubts import doubts
-    from dase.survey import survey_file
+    from dase import io
+    from dase.recordings import summary
+    from dase.recordings.anomalies import doubts
+    from dase.recordings.statistics import survey_file
 
     notes: list[str] = []
     name = io.find(file).name
@@ -37,12 +38,12 @@ def command(file: Path, size: tuple[int, int] | None, as_json: bool) -> None:
         found = survey_file(file, size=size, notes=notes, progress=bar.update).statistics()
     said = [note for note in (*notes, *doubts(found)) if isinstance(note, io.Note)]
     if as_json:
-        return click.echo(json.dumps(show.as_json(name, found, said), indent=1))
+        return click.echo(json.dumps(summary.as_json(name, found, said), indent=1))
     click.echo(f"{'format':<18}{name}")
-    for key, value in show.table(found):
+    for key, value in summary.table(found):
         click.echo(f"{key:<18}{value}")
     click.echo("\ntime between successive events of one pixel")
-    for line in show.histogram(found):
+    for line in summary.histogram(found):
         click.echo(line)
     if said:
         click.echo()

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import click
 
 if TYPE_CHECKING:
-    from dase.measurement import Measurement
+    from dase.diagnosis.measurement import Measurement
 
 
 def parse_size(ctx: click.Context, param: click.Parameter, value: str | None) -> tuple[int, int] | None:
@@ -34,7 +34,7 @@ effects_option = click.option(
     metavar="FILE",
     help="Python file with effects of your own (`dase effects new`); may be given again.",
 )
-"""`--effects FILE`: a command gets a tuple of paths, for `dase.effect_files.known_effects`."""
+"""`--effects FILE`: a command gets a tuple of paths, for `dase.simulation.user_effects.known_effects`."""
 
 scene_option = click.option(
     "--scene",
@@ -75,8 +75,8 @@ def open_recorded(
     recording: Path, scene: str, file: Path | None = None, fps: float | None = None
 ) -> Measurement:
     """Open a recording and its scene, with the frame rate of its clip where the user gives it."""
-    from dase.measurement import open_measurement
-    from dase.video import open_video
+    from dase.diagnosis.measurement import open_measurement
+    from dase.scenes.video import open_video
 
     clip = file if scene == "video" else Path(scene)
     if fps is None or clip is None:

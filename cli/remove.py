@@ -19,10 +19,10 @@ def command(sensor: str, effect: str, output: Path | None, effects: tuple[Path, 
 
     The comment right above the effect goes with it. The change is noted at the end of the file.
     """
-    from dase import edit
-    from dase.effect_files import known_effects
+    from dase.simulation import sensor_edit
+    from dase.simulation.user_effects import known_effects
 
-    text = edit.read(sensor, known_effects(effects)).removed(effect)
-    edit.write(text.noted(edit.today(f"remove {effect}")), output)
+    text = sensor_edit.read(sensor, known_effects(effects)).removed(effect)
+    sensor_edit.write(text.noted(sensor_edit.today(f"remove {effect}")), output)
     if output is not None:
         click.echo(f"{output}: {effect} removed")

@@ -41,8 +41,10 @@ def command(
 
     The folder of a training run is drawn as the thresholds it has learned, over some of its scenes.
     """
-    from dase import io, show
+    from dase import io
     from dase.errors import InputError
+    from dase.figures import event_images
+    from dase.recordings import summary
 
     if file.is_dir() and (file / "job.json").is_file():
         _draw_run(file, output or file / "learned.png")
@@ -59,24 +61,25 @@ def command(
     if trust:
         _draw_trust(sequence, output, file.stem, window)
     elif suffix == ".mp4":
-        show.video(sequence, output, window=window)
+        event_images.video(sequence, output, window=window)
     else:
-        figure = show.draw(sequence, title=file.stem, at=at, window=window)
+        figure = event_images.draw(sequence, title=file.stem, at=at, window=window)
         with io.replacing(output) as temporary:
             figure.savefig(temporary)
-    for name, value in show.table(show.statistics(sequence)):
+    for name, value in summary.table(event_images.statistics(sequence)):
         click.echo(f"{name:<18}{value}")
     click.echo(f"{'written':<18}{output}")
 
 
 def _draw_run(folder: Path, output: Path) -> None:
     """Draw what a training run has learned."""
-    from dase import io, learned
+    from dase import io
     from dase.errors import InputError
+    from dase.figures import training_figure
 
     if output.suffix.lower() != ".png":
         raise InputError(f"output: a training run is drawn as a .png, got '{output}'")
-    figure, lines = learned.draw(folder)
+    figure, lines = training_figure.draw(folder)
     with io.replacing(output) as temporary:
         figure.savefig(temporary)
     for name, value in lines:
@@ -86,12 +89,13 @@ def _draw_run(folder: Path, output: Path) -> None:
 
 def _draw_trust(sequence: Sequence, output: Path, title: str, window: float | None) -> None:
     """Draw it, and say how much is trusted."""
-    from dase import io, trust
-    from dase.measurement import between_frames
+    from dase import io
+    from dase.diagnosis.measurement import between_frames
+    from dase.figures import trust_figure
 
     notes: list[str] = []
     scene = between_frames(sequence, notes)
-    figure = trust.draw(scene, sequence.events, title=title, window=window)
+    figure = trust_figure.draw(scene, sequence.events, title=title, window=window)
     with io.replacing(output) as temporary:
         figure.savefig(temporary)
     click.echo(f"{100 * scene.trusted().mean():.0f} % of pixels and times trusted")

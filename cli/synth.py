@@ -15,7 +15,7 @@ import click
 from dase.cli.options import effects_option, parse_size
 
 if TYPE_CHECKING:
-    from dase.synth import Report
+    from dase.datasets.generate import Report
 
 
 @click.command()
@@ -91,13 +91,13 @@ def command(
         return
     if fps is not None:
         raise click.UsageError("--fps goes with --video")
-    from dase import synth
-    from dase.config import dump_sensor, load_sensor
-    from dase.effect_files import known_effects
+    from dase.datasets import generate
+    from dase.simulation.sensor_file import dump_sensor, load_sensor
+    from dase.simulation.user_effects import known_effects
 
     chosen = replace(load_sensor(sensor, known_effects(effects)), history=())
     width, height = size or chosen.size or (346, 260)
-    job = synth.Job(
+    job = generate.Job(
         images=images,
         sensor=dump_sensor(chosen),
         sequences=sequences,
@@ -114,7 +114,7 @@ def command(
     )
     count = jobs if jobs is not None else (1 if backend.startswith("cuda") else os.cpu_count() or 1)
     with _bar(sequences, "sequences") as advance:
-        report = synth.run(job, out, jobs=count, resume=resume, progress=advance)
+        report = generate.run(job, out, jobs=count, resume=resume, progress=advance)
     _summary(report)
     click.echo(f"Look at one: dase show {job.path(out, 0)}")
 
@@ -132,16 +132,16 @@ def _video(
     labels: bool,
 ) -> None:
     """Simulate one video into the file `out`."""
-    from dase import synth
-    from dase.config import load_sensor
-    from dase.effect_files import known_effects
-    from dase.sensor import sample_times
-    from dase.video import open_video
+    from dase.datasets import generate
+    from dase.scenes.video import open_video
+    from dase.simulation.sensor_file import load_sensor
+    from dase.simulation.simulate import sample_times
+    from dase.simulation.user_effects import known_effects
 
     model = load_sensor(sensor, known_effects(effects))
     scene = open_video(video, fps=fps, size=size)
     with _bar(len(sample_times(scene, model)), "frames") as advance:
-        report = synth.record_scene(
+        report = generate.record_scene(
             scene,
             model,
             out,

@@ -62,22 +62,23 @@ def command(
     from dase.errors import InputError
 
     try:
-        from dase import adaptation, parallel
-        from dase.run import CHECKPOINT, Pace, run
+        from dase.learning import distributed
+        from dase.learning import job as learning_job
+        from dase.learning.run import CHECKPOINT, Pace, run
     except ModuleNotFoundError as error:
         if error.name not in ("torch", "safetensors"):
             raise
         raise InputError(f'learning needs {error.name}: pip install "dase[learn]"') from None
-    job = adaptation.Job(
+    job = learning_job.Job(
         targets=targets, images=images or "", preset=preset, objective=objective, steps=steps, window=window,
         size=size, sequences=sequences, pattern=pattern, seed=seed, backend=backend,
     )  # fmt: skip
-    backend = parallel.join(backend)
-    first = parallel.rank() == 0
+    backend = distributed.join(backend)
+    first = distributed.rank() == 0
     if first:
-        adaptation.begin(job, output, resume=resume)
+        learning_job.begin(job, output, resume=resume)
     with _bar(silent=not first) as opened:
-        training = adaptation.prepare(replace(job, backend=backend), progress=opened)
+        training = learning_job.prepare(replace(job, backend=backend), progress=opened)
     looks = 100 if backend.startswith("cuda") else 25
     pace = Pace(look=10 if preset == "tiny" else looks, seconds=None if minutes is None else 60 * minutes)
     with _live(training, output if tensorboard and first else None, silent=not first) as look:
@@ -86,19 +87,19 @@ def command(
         last = run(training, output, pace=pace, resume=resume, look=look)
     if first:
         _finish(job, output, training, last)
-    parallel.leave()
+    distributed.leave()
 
 
 def _finish(job: Any, output: Path, training: Any, last: dict[str, float]) -> None:
     """Write the sensor and say what was learned."""
-    from dase import adaptation
+    from dase.learning import job as learning_job
 
     width, height = training.scenery.looks.width, training.scenery.looks.height
     recorded = None if job.of_sensor else (width, height)
-    path = adaptation.write_sensor(
+    path = learning_job.write_sensor(
         output, training.mean, mu=last["mu"], name=output.name or "learned", size=recorded
     )
-    adaptation.write_examples(output, training)
+    learning_job.write_examples(output, training)
     for line in summary(last):
         click.echo(line)
     click.echo(f"{path}: try dase synth --sensor {path}, or look at it: dase show {output}")

@@ -1,62 +1,61 @@
 """A learned, physical event-camera simulator."""
 
 from importlib import import_module
-from importlib.metadata import PackageNotFoundError
-from importlib.metadata import version as _version
 from typing import TYPE_CHECKING, Any
 
+from dase.version import __version__ as __version__
+
 if TYPE_CHECKING:
-    from dase.alignment import align as align
-    from dase.camera import CameraScene as CameraScene
-    from dase.comparison import compare as compare
-    from dase.config import dump_sensor as dump_sensor
-    from dase.config import load_sensor as load_sensor
-    from dase.diagnosis import diagnose as diagnose
-    from dase.effect_files import load_effects as load_effects
+    from dase.diagnosis.compare import compare as compare
+    from dase.diagnosis.diagnose import diagnose as diagnose
     from dase.effects import EFFECTS as EFFECTS
     from dase.effects import Effect as Effect
     from dase.errors import InputError as InputError
     from dase.events import Events as Events
-    from dase.fitting import fit as fit
-    from dase.images import Picture as Picture
-    from dase.images import open_images as open_images
-    from dase.layers import Layer as Layer
-    from dase.layers import LayerScene as LayerScene
-    from dase.layers import Motion as Motion
-    from dase.recording import Recording as Recording
-    from dase.recording import open_recording as open_recording
-    from dase.scene import Scene as Scene
-    from dase.sensor import Sensor as Sensor
-    from dase.sensor import count as count
-    from dase.sensor import simulate as simulate
-    from dase.sensor import stream as stream
-    from dase.static import StaticScene as StaticScene
-    from dase.video import VideoScene as VideoScene
-    from dase.video import open_video as open_video
+    from dase.figures.plot import plot as plot
+    from dase.fitting.fit import fit as fit
+    from dase.recordings.recording import Recording as Recording
+    from dase.recordings.recording import open_recording as open_recording
+    from dase.scenes.between_frames import CameraScene as CameraScene
+    from dase.scenes.frame_alignment import align as align
+    from dase.scenes.image_sources import Picture as Picture
+    from dase.scenes.image_sources import open_images as open_images
+    from dase.scenes.layers import Layer as Layer
+    from dase.scenes.layers import LayerScene as LayerScene
+    from dase.scenes.layers import Motion as Motion
+    from dase.scenes.scene import Scene as Scene
+    from dase.scenes.static import StaticScene as StaticScene
+    from dase.scenes.video import VideoScene as VideoScene
+    from dase.scenes.video import open_video as open_video
+    from dase.simulation.sensor import Sensor as Sensor
+    from dase.simulation.sensor_file import dump_sensor as dump_sensor
+    from dase.simulation.sensor_file import load_sensor as load_sensor
+    from dase.simulation.simulate import count as count
+    from dase.simulation.simulate import simulate as simulate
+    from dase.simulation.simulate import stream as stream
+    from dase.simulation.user_effects import load_effects as load_effects
 
-try:
-    __version__ = _version("dase")
-except PackageNotFoundError:  # a checkout on the path, not installed
-    __version__ = "0+unknown"
 
 _HOMES = {
-    "dase.alignment": ("align",),
-    "dase.camera": ("CameraScene",),
-    "dase.comparison": ("compare",),
-    "dase.config": ("dump_sensor", "load_sensor"),
-    "dase.diagnosis": ("diagnose",),
-    "dase.effect_files": ("load_effects",),
+    "dase.scenes.frame_alignment": ("align",),
+    "dase.scenes.between_frames": ("CameraScene",),
+    "dase.diagnosis.compare": ("compare",),
+    "dase.simulation.sensor_file": ("dump_sensor", "load_sensor"),
+    "dase.diagnosis.diagnose": ("diagnose",),
+    "dase.simulation.user_effects": ("load_effects",),
     "dase.effects": ("EFFECTS", "Effect"),
     "dase.errors": ("InputError",),
     "dase.events": ("Events",),
-    "dase.fitting": ("fit",),
-    "dase.images": ("Picture", "open_images"),
-    "dase.layers": ("Layer", "LayerScene", "Motion"),
-    "dase.recording": ("Recording", "open_recording"),
-    "dase.scene": ("Scene",),
-    "dase.sensor": ("Sensor", "count", "simulate", "stream"),
-    "dase.static": ("StaticScene",),
-    "dase.video": ("VideoScene", "open_video"),
+    "dase.figures.plot": ("plot",),
+    "dase.fitting.fit": ("fit",),
+    "dase.scenes.image_sources": ("Picture", "open_images"),
+    "dase.scenes.layers": ("Layer", "LayerScene", "Motion"),
+    "dase.recordings.recording": ("Recording", "open_recording"),
+    "dase.scenes.scene": ("Scene",),
+    "dase.simulation.sensor": ("Sensor",),
+    "dase.simulation.simulate": ("count", "simulate", "stream"),
+    "dase.scenes.static": ("StaticScene",),
+    "dase.scenes.video": ("VideoScene", "open_video"),
 }
 """Module to the public names it is the home of; loaded when first used, so that `dase --help` is instant."""
 

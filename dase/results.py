@@ -2,17 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, field
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from dase.sensor import Sensor
+from dase.simulation.sensor import Sensor
 
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
+Progress = Callable[[str, float, float], None]
+"""Told what is being done, the share of the step done, and the present error."""
 
 
 @dataclass(frozen=True)
@@ -29,7 +29,7 @@ class Cell:
     """One place at which model and measurement are compared.
 
     Args:
-        probe: Family of summary statistics, a key of `dase.probes.FAMILIES`.
+        probe: Family of summary statistics, a key of `dase.probes.statistics.FAMILIES`.
         where: The cell in words, such as `dark pixels (below 20 DN), at rest for 200 ms`.
         what: What is compared, such as `OFF events`.
         measured: The statistic of the measurement.
@@ -105,12 +105,6 @@ class Comparison:
     notes: tuple[str, ...] = ()
     seconds: float = 0.0
 
-    def plot(self) -> Figure:
-        """Return the figure of the error per family of probes, with its caption."""
-        from dase import report
-
-        return report.comparison_plates(self)[0].alone()
-
     def to_json(self) -> dict[str, Any]:
         """Return the numbers as JSON objects; figures are left out."""
         return {
@@ -155,12 +149,6 @@ class Fit:
     notes: tuple[str, ...] = ()
     evaluations: int = 0
     seconds: float = 0.0
-
-    def plot(self) -> Figure:
-        """Return the figure of the parameters and their intervals, with its caption."""
-        from dase import report
-
-        return report.parameters_of(self.sensor, self.parameters).alone()
 
     def to_json(self) -> dict[str, Any]:
         """Return the numbers as JSON objects."""
@@ -272,12 +260,6 @@ class Diagnosis:
     evaluations: int = 0
     seconds: float = 0.0
 
-    def plot(self) -> Figure:
-        """Return the figure of the falling error, with its caption."""
-        from dase import report
-
-        return report.staircase_of(self).alone()
-
     def to_json(self) -> dict[str, Any]:
         """Return the findings as JSON objects."""
         return {
@@ -295,3 +277,45 @@ class Diagnosis:
             "evaluations": self.evaluations,
             "seconds": self.seconds,
         }
+
+
+@dataclass(frozen=True)
+class Answer:
+    """What one standard recording does for telling two models apart.
+
+    Args:
+        stimulus: Name of the recording.
+        how: To make it.
+        seconds: Shortest duration that tells them apart; None if none up to `longest` does.
+        power: Share of recordings of B that are known, at that or the longest duration.
+        differs: Family of statistics that differs most, in words; empty where nothing clearly differs.
+        rates: OFF and ON events of A, then of B [1/(px s)].
+        tried: Durations [s] and the power of each.
+    """
+
+    stimulus: str
+    how: str
+    seconds: float | None
+    power: float
+    differs: str
+    rates: tuple[float, float, float, float]
+    tried: tuple[tuple[float, float], ...] = ()
+
+
+@dataclass(frozen=True)
+class Distinction:
+    """Which recording tells two models apart.
+
+    Args:
+        answers: One per standard recording, in the order of `STANDARDS`.
+        best: The answer of the shortest recording, None where none tells them apart.
+        sentence: Advice.
+        pixels: Of a recording that were looked at.
+        longest: Longest duration that was tried [s].
+    """
+
+    answers: tuple[Answer, ...]
+    best: Answer | None
+    sentence: str
+    pixels: int
+    longest: float

@@ -7,10 +7,10 @@ from types import SimpleNamespace
 
 import torch
 
-from dase.kernels import bank as _bank
-from dase.kernels import critics as _critics
-from dase.kernels import rows as _rows
-from dase.kernels.autograd import _launch
+from dase.kernels import critic_layers as _critics
+from dase.kernels import critic_products as _bank
+from dase.kernels import critic_rows as _rows
+from dase.kernels.autograd_counts import _launch
 
 
 @dataclass

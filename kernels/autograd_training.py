@@ -8,10 +8,10 @@ import numpy as np
 import torch
 import warp as wp
 
-from dase.kernels import patches as _patches
-from dase.kernels import scenery as _scenery
-from dase.kernels.autograd import _launch
-from dase.kernels.scene import Affine
+from dase.kernels import patch_structure as _patches
+from dase.kernels import scene_batch as _scenery
+from dase.kernels.autograd_counts import _launch
+from dase.kernels.scene_layers import Affine
 
 
 def render_log(
@@ -54,7 +54,8 @@ def render_log(
 
 
 def patch_structure(image: torch.Tensor, *, size: int, stride: int) -> dict[str, torch.Tensor]:
-    """Return angle, coherence, strength and energy of every patch, as `dase.patches.attributes` does.
+    """Return angle, coherence, strength and energy of every patch, as `dase.learning.patch_hash.attributes`
+    does.
 
     Args:
         image: Intensity, shape (B, H, W).

@@ -1,8 +1,8 @@
 """Damage files of every format and read them: no crash, no hang, no error but InputError, little memory.
 
-    python perf/fuzz_io.py                        100 000 files of every format
-    python perf/fuzz_io.py --format EVT3 --files 1000 --seed 7
-    python perf/fuzz_io.py --format EVT3 --only 4711 --keep .      one file again, and keep it
+    python -m perf.fuzz_io                        100 000 files of every format
+    python -m perf.fuzz_io --format EVT3 --files 1000 --seed 7
+    python -m perf.fuzz_io --format EVT3 --only 4711 --keep .      one file again, and keep it
 
 Files are damaged in memory, lie on a disk in memory, and are read whole and as a stream by turns. Every
 format runs in a process of its own that a second one watches: a crash, or a file that takes too long or too
@@ -27,11 +27,12 @@ import cv2
 import hdf5plugin
 import lz4.frame
 import numpy as np
-from bench_kernels import commit
+
+from perf.benchmarks.kernels import commit
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
-import reference_io
-import reference_video
+from helpers import avi_files as reference_video
+from helpers import sample_files as reference_io
 
 from dase import io
 from dase.errors import InputError

@@ -41,14 +41,14 @@ on() { # CORES COMMAND...: on these alone, so that neither takes those of the ot
 
 learning() { # SECONDS [CORES]
     # it ends by itself, and is only kept from hanging
-    run learning on "${2:-0-$((cores - 1))}" timeout -k 5 $(($1 + 20)) "$python" perf/adaptation.py \
+    run learning on "${2:-0-$((cores - 1))}" timeout -k 5 $(($1 + 20)) "$python" -m perf.experiments.adaptation.run \
         --plan all --jobs 2 --alone 2 --device "$devices" --budget "$1" --images "${PHOTOS:-builtin}" \
         ${RECORDING:+--recording "$RECORDING"} --commit "$commit" --out "$out/adaptation"
 }
 
 matrix() { # SECONDS JOBS [CORES]
     local end=$((SECONDS + $1)) where=${3:-0-$((cores - 1))}
-    local blind=("$python" perf/hidden_effects.py --log "$out/hidden_effects.jsonl" --out "$out/docs")
+    local blind=("$python" -m perf.experiments.blind_diagnosis.run --log "$out/hidden_effects.jsonl" --out "$out/docs")
     export OMP_NUM_THREADS=1
     # one run alone compiles what the others would all compile at the same time
     run warm on "$where" timeout -k 5 "$1" "${blind[@]}" --kinds nothing --nothing 1
@@ -72,23 +72,23 @@ for step in "${steps[@]}"; do
         tests/test_{readout,readout_stages,labels,counts,scene,autograd_scene,autograd_scene_differences}.py \
         tests/test_{patches,probes,optics,camera,static,starts,video,critics,learned,training_run}.py ;;
     kernels)
-        run kernels_4k "$python" perf/bench_kernels.py --device cuda --size 3840x2160
-        run kernels_vga "$python" perf/bench_kernels.py --device cuda --size 640x480 ;;
+        run kernels_4k "$python" -m perf.benchmarks.kernels --device cuda --size 3840x2160
+        run kernels_vga "$python" -m perf.benchmarks.kernels --device cuda --size 640x480 ;;
     synth) for jobs in 1 8; do
-        run "synth_$jobs" "$python" perf/bench_synth.py --images "${PHOTOS:-builtin}" --backend cuda \
+        run "synth_$jobs" "$python" -m perf.benchmarks.synth --images "${PHOTOS:-builtin}" --backend cuda \
             --jobs "$jobs"
     done ;;
-    scaling) run scaling "$python" perf/scaling.py --device cuda --out "$out/docs" ;;
+    scaling) run scaling "$python" -m perf.benchmarks.scaling --device cuda --out "$out/docs" ;;
     both)
         learning "${LIMIT:-560}" "0-$((room - 1))" &
         matrix "${LIMIT:-560}" $((cores - room)) "$room-$((cores - 1))"
         wait ;;
     learning) learning "${LIMIT:-560}" ;;
     matrix) matrix "${REST:-240}" $((cores > 4 ? cores - 2 : cores)) ;;
-    training) run training "$python" perf/bench_training.py --device "$first" \
+    training) run training "$python" -m perf.benchmarks.training --device "$first" \
         --images "${PHOTOS:-builtin}" --commit "$commit" --out "$out/training.json" ;;
     v2e) for name in v2e_cold v2e; do # the first compiles
-        [ -z "${HIDDEN:-}" ] || run $name "$python" perf/hidden_effects.py --kinds other --hidden "$HIDDEN" \
+        [ -z "${HIDDEN:-}" ] || run $name "$python" -m perf.experiments.blind_diagnosis.run --kinds other --hidden "$HIDDEN" \
             --device "$first" --jobs 1 --log "$out/$name.jsonl" --out "$out/docs"
     done ;;
     *) echo "there is no step '$step'" && exit 2 ;;

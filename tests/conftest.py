@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 
 import numpy as np
@@ -20,14 +21,18 @@ def device(request: pytest.FixtureRequest) -> str:
 
 @pytest.fixture
 def rng(request: pytest.FixtureRequest) -> np.random.Generator:
-    """Random numbers of their own for every test, the same in every run."""
-    return np.random.default_rng(list(request.node.nodeid.encode()))
+    """Random numbers of their own for every test, the same in every run and wherever its file lies."""
+    return np.random.default_rng(list(request.node.name.encode()))
 
 
 @pytest.fixture(scope="session")
 def shared() -> Path:
-    """Folder of recordings and photographs beside the checkout; skips where it is absent."""
-    path = Path(__file__).parents[2] / "shared"
+    """Folder of recordings and photographs that are no part of the project; skips where it is absent.
+
+    `DASE_DATA` names it; without it, it is the folder `shared` beside the checkout.
+    """
+    beside = Path(__file__).parents[2] / "shared"
+    path = Path(os.environ.get("DASE_DATA", beside))
     if not (path / "photos").is_dir():
-        pytest.skip("needs the recordings and photographs of ../shared, which are not part of the project")
+        pytest.skip("needs recordings and photographs that are no part of the project: set DASE_DATA")
     return path

@@ -16,10 +16,10 @@ from numpy.typing import NDArray
 
 from dase.errors import InputError, nearest
 from dase.events import LABELS
-from dase.kernels import pixel
+from dase.kernels import pixel_stages
 
 if TYPE_CHECKING:
-    from dase.scene import Scene
+    from dase.scenes.scene import Scene
 
 
 @dataclass(frozen=True)
@@ -84,8 +84,8 @@ class Effect:
     """One physical effect of an event camera, the extension point of dase.
 
     A subclass is a frozen dataclass whose fields are made by `parameter` (numbers, which may be fitted) and
-    `choice`. Its docstring is the plain-language description. `stages` maps a stage of `dase.kernels.pixel`
-    to a Warp function; the arguments of such a function are resolved by name.
+    `choice`. Its docstring is the plain-language description. `stages` maps a stage of
+    `dase.kernels.pixel_stages` to a Warp function; the arguments of such a function are resolved by name.
     """
 
     name: ClassVar[str]
@@ -178,14 +178,13 @@ class Effect:
         """Return the longest time between samples that still shows the effect [s]."""
         return math.inf
 
-    def compiled(self) -> pixel.Stages:
+    def compiled(self) -> pixel_stages.Stages:
         """Return what the kernel composer needs to know."""
         for stage in self.stages:
-            if stage not in pixel.STAGES:
-                raise InputError(
-                    f"effect '{self.name}' has a function for stage '{stage}': {nearest(stage, pixel.STAGES)}"
-                )
-        return pixel.Stages(
+            if stage not in pixel_stages.STAGES:
+                has = nearest(stage, pixel_stages.STAGES)
+                raise InputError(f"effect '{self.name}' has a function for stage '{stage}': {has}")
+        return pixel_stages.Stages(
             name=self.name,
             functions=tuple(self.stages.items()),
             parameters=tuple(p.name for p in self.parameters()),

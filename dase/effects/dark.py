@@ -8,7 +8,7 @@ from typing import ClassVar
 import warp as wp
 
 from dase.effects.base import Effect, parameter
-from dase.kernels.lanes import exponential
+from dase.kernels.vector_math import exponential
 
 
 @wp.func

@@ -9,7 +9,7 @@ from typing import ClassVar
 import warp as wp
 
 from dase.effects.base import Effect, parameter
-from dase.kernels.lanes import circle
+from dase.kernels.vector_math import circle
 
 
 @wp.func

@@ -15,7 +15,7 @@ from dase.errors import InputError
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from dase.scene import Scene
+    from dase.scenes.scene import Scene
 
 
 @wp.func
@@ -60,7 +60,7 @@ class LearnedThreshold(Effect):
         if not self.weights or self.bound is not None:
             return self
         try:
-            from dase.weights import predict
+            from dase.networks.weights_file import predict
         except ImportError:
             raise InputError(
                 f"effect '{self.name}' needs PyTorch and safetensors: pip install \"dase[learn]\""

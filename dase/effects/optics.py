@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import ClassVar
 
 from dase.effects.base import Effect
-from dase.scene import Scene
+from dase.scenes.scene import Scene
 
 
 @dataclass(frozen=True, kw_only=True)

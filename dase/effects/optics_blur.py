@@ -13,10 +13,10 @@ from numpy.typing import NDArray
 from dase.effects.base import parameter
 from dase.effects.optics import SceneEffect
 from dase.errors import InputError
-from dase.kernels import launch, pixel
-from dase.kernels.blur import blur
-from dase.kernels.scene import render_frames
-from dase.scene import Scene
+from dase.kernels import launch, pixel_stages
+from dase.kernels.scene_blur import blur
+from dase.kernels.scene_layers import render_frames
+from dase.scenes.scene import Scene
 
 WIDEST = 20.0
 """Greatest sigma [px]."""
@@ -65,7 +65,7 @@ class Unsharp(Scene):
             pictures = source.values
         else:
             raise InputError("optics_blur needs intensities, and this scene gives log intensities")
-        frames = pixel.Frames()
+        frames = pixel_stages.Frames()
         frames.values = blur(pictures, self._weights, self.width, pixels, device)
         return "frames", frames
 

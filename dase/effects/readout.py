@@ -14,7 +14,7 @@ from dase.effects.base import choice, parameter
 from dase.effects.stream import Reader, StreamEffect
 from dase.events import Events
 from dase.kernels import launch
-from dase.kernels.readout import NEVER, ONE, queue
+from dase.kernels.event_queue import NEVER, ONE, queue
 
 
 @dataclass(frozen=True, eq=False)

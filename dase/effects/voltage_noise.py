@@ -9,7 +9,7 @@ from typing import ClassVar
 import warp as wp
 
 from dase.effects.base import Effect, parameter
-from dase.kernels.lanes import circle, exponential, logarithm
+from dase.kernels.vector_math import circle, exponential, logarithm
 
 POLE = wp.constant(2.0 * math.pi / math.sqrt(math.sqrt(2.0) - 1.0))
 """Frequency of either of two equal poles [rad/s] at which together they lose 3 dB at 1 Hz."""

@@ -19,12 +19,12 @@ from numpy.typing import NDArray
 from dase.errors import InputError
 from dase.events import Events
 from dase.io.format import LIMIT, Format
+from dase.io.image_files import SUFFIXES, head, unpack
 from dase.io.sequence import GREYS, Sequence, reading
 from dase.io.source import Picture, Source, checked_size, refuse_bomb
-from dase.pictures import SUFFIXES, head, unpack
 
 if TYPE_CHECKING:
-    from dase.video import FrameReader
+    from dase.io.video_file import FrameReader
 
 
 FRAMES_RATIO = 1000
@@ -64,7 +64,7 @@ def pictures(source: Source) -> Iterator[Picture]:
 
 
 def _reader(source: Source) -> FrameReader:
-    from dase.video import FrameReader
+    from dase.io.video_file import FrameReader
 
     reader = FrameReader(source.path)
     checked_size((reader.shape[2], reader.shape[1]))
@@ -92,7 +92,7 @@ def read(source: Source) -> Sequence:
 
 def _refuse_many(reader: FrameReader) -> None:
     """Raise InputError where the frames would fill the memory, or are absurdly many for their file."""
-    from dase.capture import TAKEN
+    from dase.io.ffmpeg import TAKEN
 
     total = math.prod(reader.shape)
     if total > LIMIT:

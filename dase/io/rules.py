@@ -7,7 +7,8 @@
     origin      times that are dates count from the first event instead
     size        a size stored the wrong way round is turned
 
-What merely looks wrong (hot pixels, events twice, gaps) is found in `dase.survey` and left alone.
+What merely looks wrong (hot pixels, events twice, gaps) is found in `dase.recordings.statistics` and left
+alone.
 """
 
 from __future__ import annotations

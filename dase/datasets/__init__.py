@@ -1,0 +1,1 @@
+"""Many labelled sequences: the jobs of `dase synth` and `dase demo`."""

@@ -1,0 +1,350 @@
+"""Many labelled event sequences from pictures: the work behind `dase synth`."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Generator
+from concurrent.futures import FIRST_COMPLETED, ProcessPoolExecutor, wait
+from contextlib import closing
+from dataclasses import asdict, dataclass, replace
+from functools import lru_cache
+from hashlib import sha256
+from multiprocessing import get_context
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import tomlkit
+
+from dase import io
+from dase.datasets.interrupt import Deferred, deferred, ignored
+from dase.errors import InputError, nearest
+from dase.kernels import launch
+from dase.scenes import image_sources, random_scenes
+from dase.scenes.layers import LayerScene
+from dase.scenes.scene import Scene
+from dase.simulation.pixel_array import Pixels
+from dase.simulation.readout_chain import Outlet
+from dase.simulation.sensor import Sensor
+from dase.simulation.sensor_file import dump_sensor, parse_sensor
+from dase.simulation.simulate import CHUNK, chunks, sample_times
+from dase.simulation.user_effects import known_effects
+from dase.version import __version__
+
+RECORD = "synth.toml"
+"""File beside the sequences that holds everything that made them."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Job:
+    """Everything that determines the bytes of a data set.
+
+    Args:
+        images: As `dase.scenes.image_sources.open_images` takes it.
+        sensor: TOML text of the sensor.
+        sequences: How many.
+        width: Columns [px].
+        height: Rows [px].
+        duration: Of each sequence [s].
+        regime: One of `dase.scenes.random_scenes.NAMES`.
+        seed: Of scenes and sensors.
+        format: Suffix of the files, without the dot.
+        backend: `cpu` or `cuda`; they agree to float32 rounding, not to the byte.
+        frame_rate: Of frames and flow [Hz].
+        labels: Whether events are marked with what they came from.
+        effects: Files with effects of the user's own that the sensor names.
+    """
+
+    images: str
+    sensor: str
+    sequences: int
+    width: int
+    height: int
+    duration: float
+    regime: str
+    seed: int = 0
+    format: str = "h5"
+    backend: str = "cpu"
+    frame_rate: float = 60.0
+    labels: bool = False
+    effects: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        if self.sequences < 1:
+            raise InputError(f"sequences must be >= 1, got {self.sequences}")
+        if self.width < 1 or self.height < 1:
+            raise InputError(f"size must be at least 1x1, got {self.width}x{self.height}")
+        for name in ("duration", "frame_rate"):
+            value = getattr(self, name)
+            if not np.isfinite(value) or value <= 0:
+                raise InputError(f"{name.replace('_', ' ')} must be a number > 0, got {value:g}")
+        if self.regime not in random_scenes.NAMES:
+            raise InputError(
+                f"there is no regime '{self.regime}': {nearest(self.regime, random_scenes.NAMES)}"
+            )
+        if self.seed < 0:
+            raise InputError(f"seed must be >= 0, got {self.seed}")
+
+    def text(self) -> str:
+        """Return the job as TOML text."""
+        document = tomlkit.document()
+        document.add("dase", __version__)
+        for name, value in asdict(self).items():
+            if name not in ("sensor", "effects"):
+                document.add(name, value)
+        if self.effects:  # what is in the files determines the bytes, not where they lie
+            files = (Path(path) for path in self.effects)
+            document.add("effects", [f"{f.name} sha256:{sha256(f.read_bytes()).hexdigest()}" for f in files])
+        sensor = tomlkit.table(is_super_table=False)
+        for key, item in tomlkit.parse(self.sensor).items():
+            sensor.add(key, item)
+        document.add("sensor", sensor)
+        return tomlkit.dumps(document)
+
+    def path(self, out: Path, index: int) -> Path:
+        """Return the file of one sequence."""
+        return out / f"sequence_{index:05d}.{self.format}"
+
+
+@dataclass(frozen=True)
+class Report:
+    """What one or more sequences cost and gave.
+
+    Args:
+        sequences: How many were made.
+        events: In all.
+        samples: Time samples rendered, the number a user pays for.
+        pixels: Pixel samples: samples times pixels.
+        seconds: Wall time [s].
+    """
+
+    sequences: int = 0
+    events: int = 0
+    samples: int = 0
+    pixels: int = 0
+    seconds: float = 0.0
+
+    def plus(self, other: Report) -> Report:
+        """Return the sum of two reports."""
+        return Report(*(a + b for a, b in zip(asdict(self).values(), asdict(other).values(), strict=True)))
+
+
+def run(
+    job: Job,
+    out: Path,
+    *,
+    jobs: int = 1,
+    resume: bool = False,
+    progress: Callable[[Report], None] = lambda report: None,
+) -> Report:
+    """Make all sequences of a job, each an atomic file, and return what they cost.
+
+    Args:
+        job: What to make; the same job gives the same bytes whatever `jobs` is.
+        out: Folder, made if missing.
+        jobs: Processes that share the work.
+        resume: Keep the sequences that an interrupted run of the same job has left.
+        progress: Called with the report of each finished sequence.
+
+    Raises:
+        InputError: `out` holds other work, or something in the job does not exist.
+    """
+    if jobs < 1:
+        raise InputError(f"jobs must be >= 1, got {jobs}")
+    begin = time.perf_counter()
+    image_sources.open_images(job.images)
+    Pixels(_sensor_of(job), 1, 1, device=job.backend)
+    todo = _prepare(job, out, resume)
+    total = Report()
+    jobs = min(jobs, max(len(todo), 1))
+    # closing ends the processes when `progress` raises
+    with deferred() as interrupt, closing(_work(job, out, todo, jobs, interrupt)) as reports:
+        for report in reports:
+            total = total.plus(report)
+            progress(report)
+    return replace(total, seconds=time.perf_counter() - begin)
+
+
+def _prepare(job: Job, out: Path, resume: bool) -> list[int]:
+    """Check the folder, leave the record in it, and return the sequences still to be made."""
+    record = out / RECORD
+    if out.exists() and not out.is_dir():
+        raise InputError(f"{out} must be a folder, but it is a file")
+    if record.exists():
+        if not resume:
+            raise InputError(f"{out} already holds a data set; give --resume to finish it, or another folder")
+        if record.read_text("utf-8") != job.text():
+            raise InputError(
+                f"{out} was begun with other options (see {record}); --resume needs the same ones"
+            )
+    out.mkdir(parents=True, exist_ok=True)
+    for stale in out.glob(".sequence_*.tmp.*"):  # of a run that was killed
+        stale.unlink()
+    with io.replacing(record) as temporary:
+        temporary.write_text(job.text(), "utf-8")
+    return [i for i in range(job.sequences) if not job.path(out, i).exists()]
+
+
+def _work(
+    job: Job, out: Path, todo: list[int], jobs: int, interrupt: Deferred
+) -> Generator[Report, None, None]:
+    if jobs == 1:
+        for index in todo:
+            yield make_sequence(job, out, index, interrupt)
+        return
+    # compiles the kernels once, before the processes race for it
+    _warm_up(job)
+    context = get_context("spawn")
+    stop = context.Event()
+    pool = ProcessPoolExecutor(jobs, mp_context=context, initializer=_begin_worker, initargs=(stop,))
+    try:
+        with ignored():
+            left = {pool.submit(_in_worker, job, out, index) for index in todo}
+        while left:
+            done, left = wait(left, timeout=0.1, return_when=FIRST_COMPLETED)
+            for future in done:
+                yield future.result()
+            interrupt.check()
+    finally:
+        if left:
+            stop.set()
+        pool.shutdown(cancel_futures=True)
+
+
+def _warm_up(job: Job) -> None:
+    source = image_sources.open_images(job.images)
+    scene = random_scenes.draw_scene(
+        np.random.default_rng(0), source, "background", width=8, height=8, duration=0.02
+    )
+    array = Pixels(_sensor_of(job), 8, 8, device=job.backend, labels=job.labels)
+    Outlet(array.sensor, 8, 8).push(array.emit(scene, scene.sample_times())[0], array.begin)
+    scene.frames(np.zeros(1), job.backend)
+    scene.flow(np.zeros(1), job.backend)
+    array.thresholds()
+
+
+def _begin_worker(stop: Any) -> None:
+    global _stop
+    launch.set_threads(1)
+    _stop = Deferred(stop)
+
+
+_stop: Deferred | None = None
+"""In a worker process: whether the others want it to end."""
+
+
+def _in_worker(job: Job, out: Path, index: int) -> Report:
+    assert _stop is not None
+    return make_sequence(job, out, index, _stop)
+
+
+@lru_cache(maxsize=1)
+def _opened(spec: str) -> image_sources.ImageSource:
+    return image_sources.open_images(spec)
+
+
+@lru_cache(maxsize=1)  # a file of effects is read once, whatever becomes of it meanwhile
+def _sensor_of(job: Job) -> Sensor:
+    return parse_sensor(job.sensor, "sensor", known_effects(job.effects))
+
+
+def make_scene(job: Job, index: int) -> LayerScene:
+    """Return the scene of one sequence."""
+    rng = np.random.default_rng([job.seed, index])
+    return random_scenes.draw_scene(
+        rng, _opened(job.images), job.regime, width=job.width, height=job.height, duration=job.duration
+    )
+
+
+def make_sequence(job: Job, out: Path, index: int, interrupt: Deferred) -> Report:
+    """Simulate one sequence and write its file; an interrupt leaves nothing and raises KeyboardInterrupt."""
+    begin = time.perf_counter()
+    sensor = _sensor_of(job)
+    scene = make_scene(job, index)
+    # sequences share neither scene nor pixels' random numbers
+    seed = int(np.random.default_rng([job.seed, index, 1]).integers(2**31))
+    array = Pixels(sensor, job.width, job.height, seed=seed, device=job.backend, labels=job.labels)
+    with io.create(job.path(out, index)) as writer:
+        writer.configuration(job.text() + f"\n[sequence]\nindex = {index}\nsensor_seed = {seed}\n")
+        frame_times = np.arange(0, scene.duration, 1 / job.frame_rate)
+        report = _record(scene, array, writer, frame_times, lambda done: interrupt.check())
+    return replace(report, seconds=time.perf_counter() - begin)
+
+
+def _record(
+    scene: Scene,
+    array: Pixels,
+    writer: io.Writer,
+    frame_times: np.ndarray,
+    progress: Callable[[Report], None],
+) -> Report:
+    """Write thresholds, frames, flow and events of a scene, in order of time."""
+    outlet = Outlet(array.sensor, scene.width, scene.height, seed=array.seed)
+    array.look_at(scene)
+    writer.thresholds(array.thresholds()[0].reshape(2, scene.height, scene.width))
+    times = sample_times(scene, array.sensor)
+    total, shown = Report(sequences=1), 0
+    for part in chunks(times, CHUNK["cuda" if array.device.is_cuda else "cpu"]):
+        due = int(np.searchsorted(frame_times, part[-1], side="right"))
+        if due > shown:
+            _write_frames(scene, writer, frame_times[shown:due], array.device.alias)
+            shown = due
+        events = outlet.push(array.emit(scene, part)[0], array.begin)
+        writer.events(events)
+        done = Report(0, len(events), len(part), len(part) * array.count)
+        total = total.plus(done)
+        progress(done)
+    for events in (outlet.push(array.flush()[0], array.begin), outlet.flush()):
+        writer.events(events)
+        total = total.plus(Report(0, len(events)))
+    return total
+
+
+def _write_frames(scene: Scene, writer: io.Writer, times: np.ndarray, device: str) -> None:
+    frames = np.clip(np.round(scene.frames(times, device) * 255), 0, 255).astype(np.uint8)
+    flow = scene.flow(times, device)
+    for i, at in enumerate(times):
+        writer.frame(float(at), frames[i], None if flow is None else flow[i])
+
+
+def record_scene(
+    scene: Scene,
+    sensor: Sensor,
+    path: Path,
+    *,
+    frame_rate: float = 60.0,
+    seed: int = 0,
+    device: str = "cpu",
+    labels: bool = False,
+    progress: Callable[[Report], None] = lambda report: None,
+) -> Report:
+    """Simulate any scene into one file.
+
+    Args:
+        scene: What the sensor sees.
+        sensor: What it does.
+        path: File to write, in the format of its suffix.
+        frame_rate: Highest rate of the samples that are also stored as frames [Hz].
+        seed: Of every random number.
+        device: `cpu`, `cuda` or a Warp name.
+        labels: Whether events are marked with what they came from.
+        progress: Called with the report of each finished chunk.
+    """
+    begin = time.perf_counter()
+    if not np.isfinite(frame_rate) or frame_rate <= 0:
+        raise InputError(f"frame rate must be a number > 0, got {frame_rate:g}")
+    times = scene.sample_times()
+    # the first sample of each frame period; a slack of 1e-6 of it keeps equal rates equal
+    period = np.floor((times - times[0]) * frame_rate + 1e-6)
+    frame_times = times[np.concatenate([[True], np.diff(period) > 0])]
+    array = Pixels(sensor, scene.width, scene.height, seed=seed, device=device, labels=labels)
+    with deferred() as interrupt, io.create(path) as writer:
+
+        def advance(done: Report) -> None:
+            interrupt.check()
+            progress(done)
+
+        model = dump_sensor(replace(sensor, history=()))
+        writer.configuration(model + f'\n[run]\ndase = "{__version__}"\nseed = {seed}\n')
+        report = _record(scene, array, writer, frame_times, advance)
+    return replace(report, seconds=time.perf_counter() - begin)

@@ -1,0 +1,1 @@
+"""What a model lacks: comparing it with a measurement, trying effects, saying what was found."""

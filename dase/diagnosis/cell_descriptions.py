@@ -1,0 +1,167 @@
+"""Cells and statistics in words."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from itertools import pairwise
+
+import numpy as np
+
+from dase.fitting.batch_simulator import LAG_TIMES
+from dase.fitting.data_split import Evidence
+from dase.fitting.subset import Half
+from dase.kernels.event_probes import BANDS, CLASSES, INTERVALS, KINDS, ZONES
+from dase.probes.distance import Judgement
+from dase.probes.statistics import LAYOUT, LOWEST, MEANS, TONES
+from dase.probes.timestamp_patterns import Structure
+from dase.results import Cell
+
+SHOWN = 24
+"""Cells that are listed."""
+
+NOTABLE = 2.5
+"""Standard errors below which a cell is not worth a sentence."""
+
+_KINDS = (
+    "at rest for 200 ms", "at rest for 60 ms", "where the light falls fast", "where the light falls",
+    "where the light changes little", "where the light rises", "where the light rises fast",
+)  # fmt: skip
+_BANDS = ("dark", "dim", "middle", "bright")
+_PAIRS = ("OFF after OFF", "ON after ON", "opposite after each other")
+_ORDER = ("OFF after OFF", "OFF after ON", "ON after OFF", "ON after ON")
+_CLASSES = ("within 12 ms", "within 50 ms", "later than 50 ms")
+_STATES = ("moving", "resting")
+_POLARITY = ("OFF", "ON")
+_SPREADS = (
+    "lasting spread between pixels of OFF events", "lasting spread between pixels of ON events",
+    "shared spread of ON and OFF events", "spread between pixels of OFF events",
+    "spread between pixels of ON events",
+)  # fmt: skip
+_ODD = ("busy pixels at rest", "very busy pixels at rest", "busy pixels")
+
+Words = tuple[str, str, str]
+"""Where a statistic is taken, what it is, and its unit."""
+
+
+def band(evidence: Evidence, n: int) -> str:
+    """Return a band of intensity in words, in grey values of 8 bits."""
+    edges = [f"{255 * e:.0f}" for e in evidence.bands]
+    between = [f"{a} to {b} DN" for a, b in pairwise(edges)]
+    return f"{_BANDS[n]} pixels ({[f'below {edges[0]} DN', *between, f'above {edges[-1]} DN'][n]})"
+
+
+def place(evidence: Evidence, family: str, n: int) -> Words:
+    """Return where the `n`-th statistic of a family is taken, what it is, and its unit."""
+    return _PLACES[family](evidence, n)
+
+
+def _rate(evidence: Evidence, n: int) -> Words:
+    polarity, cell = divmod(n, KINDS * BANDS)
+    where = f"{band(evidence, cell % BANDS)}, {_KINDS[cell // BANDS]}"
+    return where, f"{_POLARITY[polarity]} events", "events"
+
+
+def _intervals(evidence: Evidence, n: int) -> Words:
+    group, octave = divmod(n, INTERVALS)
+    rest, kin = divmod(group, 3)
+    return f"{_STATES[rest]} pixels", f"intervals {_octave(octave)} of {_PAIRS[kin]}", "events"
+
+
+def _lag(evidence: Evidence, n: int) -> Words:
+    lag, where = divmod(n, BANDS)
+    a, b = 1e3 * LAG_TIMES[lag], 1e3 * LAG_TIMES[lag + 1]
+    what = f"change of light from {b:g} to {a:g} ms before the event"
+    return band(evidence, where), what, "log intensity"
+
+
+def _repeats(evidence: Evidence, n: int) -> Words:
+    third, where = divmod(n, BANDS)
+    what = f"events that are the {'third' if third else 'second'} in a step"
+    return band(evidence, where), what, "share"
+
+
+def _change(evidence: Evidence, n: int) -> Words:
+    kind, rest = divmod(n, 4 * CLASSES)
+    if kind == 2:
+        return _CLASSES[rest], "correlation of successive changes between events", "log intensity²"
+    pair, group = divmod(rest, CLASSES)
+    what = ("change between events", "deviation from the mean change between events")[kind]
+    return _CLASSES[group], f"{what}, {_ORDER[pair]}", "log intensity"
+
+
+def _spread(evidence: Evidence, n: int) -> Words:
+    state, what = divmod(n, len(_SPREADS))
+    return f"{_STATES[state]} pixels", _SPREADS[what], "events² per event"
+
+
+def _pixels(evidence: Evidence, n: int) -> Words:
+    return "single pixels", _ODD[n], "pixels"
+
+
+def _silent(evidence: Evidence, n: int) -> Words:
+    return "single pixels", "silent pixels", "pixels"
+
+
+def _space(evidence: Evidence, n: int) -> Words:
+    state, ring = divmod(n, ZONES)
+    rest, polarity = divmod(state, 2)
+    where = f"ring {ring + 1} of {ZONES} from the middle, {_STATES[rest]}"
+    return where, f"{_POLARITY[polarity]} events", "events"
+
+
+def _spectrum(evidence: Evidence, n: int) -> Words:
+    if n >= TONES:
+        return "all pixels", f"swing of the net rate at {evidence.peak:.4g} Hz", "share"
+    ends = np.geomspace(LOWEST, 0.5 / evidence.held.frame.step, TONES + 1)
+    return "all pixels", f"power of the net rate from {ends[n]:.3g} to {ends[n + 1]:.3g} Hz", "log power"
+
+
+def _stamps(evidence: Evidence, n: int) -> Words:
+    return "all pixels", Structure.NAMES[n], "share"
+
+
+_PLACES: dict[str, Callable[[Evidence, int], Words]] = {
+    "rate": _rate, "intervals": _intervals, "lag": _lag, "repeats": _repeats, "change": _change,
+    "spread": _spread, "pixels": _pixels, "silent": _silent,
+    "space": _space, "spectrum": _spectrum, "stamps": _stamps,
+}  # fmt: skip
+
+
+def _octave(n: int) -> str:
+    if n < 2:
+        return ("within one step of time", "of one step")[n]
+    if n == INTERVALS - 1:
+        return f"longer than {2 ** (n - 2)} steps"
+    return f"up to {2 ** (n - 1)} steps"
+
+
+def worst_cells(
+    evidence: Evidence, judgement: Judgement, half: Half | None = None, *, shown: int = SHOWN
+) -> tuple[Cell, ...]:
+    """Return where model and measurement differ most, worst first."""
+    half = half or evidence.held
+    simulated, measured = half.simulated, half.seen.target
+    out = []
+    for family, part in LAYOUT.items():
+        for n, j in enumerate(range(part.start, part.stop)):
+            z = judgement.z[j]
+            if not half.seen.used[j] or abs(z) < NOTABLE:
+                continue
+            counts = not MEANS[j] and family not in ("spread", "spectrum", "stamps")
+            m, s = (np.exp(v[j]) - 3.0 if counts else v[j] for v in (measured, simulated))
+            where, what, unit = place(evidence, family, n)
+            m, s = (max(0.0, float(v)) if counts else float(v) for v in (m, s))
+            out.append(Cell(family, where, what, m, s, unit, float(z), _sentence(where, what, m, s, counts)))
+    return tuple(sorted(out, key=lambda cell: -abs(cell.z))[:shown])
+
+
+def _sentence(where: str, what: str, measured: float, simulated: float, counts: bool) -> str:
+    if not counts:
+        return f"{where}: {what} is {simulated:.3g} in the model, {measured:.3g} in the measurement"
+    few, many = sorted((measured, simulated))
+    side = "few" if simulated < measured else "many"
+    if few < 0.5:
+        return f"{where}: {what}, {simulated:.0f} in the model, {measured:.0f} in the measurement"
+    ratio = many / few
+    times = f"{ratio:.1f} times too {side}" if ratio >= 1.5 else f"{100 * (ratio - 1):.0f} % too {side}"
+    return f"{where}: {times} {what}"

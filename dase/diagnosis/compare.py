@@ -1,0 +1,191 @@
+"""How far a model of a camera is from a recording, and where."""
+
+from __future__ import annotations
+
+import time
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dase.diagnosis.cell_descriptions import band, worst_cells
+from dase.events import Events
+from dase.fitting.batch_simulator import LAG_TIMES
+from dase.fitting.data_split import PIXELS, Evidence, gather
+from dase.fitting.model import model_of
+from dase.fitting.subset import Half
+from dase.kernels.event_probes import BANDS, INTERVALS, KINDS, LAGS, RESTING
+from dase.probes.distance import Judgement
+from dase.probes.statistics import LAYOUT
+from dase.probes.stimulus import Trust
+from dase.results import Comparison, Curve, Progress
+from dase.scenes.scene import Scene
+from dase.simulation.sensor import Sensor
+
+Array = NDArray[np.float64]
+
+REPEATS = 60
+"""Simulations with other seeds that tell what chance does."""
+
+
+def compare(
+    events: Events,
+    scene: Scene,
+    sensor: Sensor,
+    *,
+    trust: Trust | None = None,
+    pixels: int = PIXELS,
+    seed: int = 0,
+    device: str = "cpu",
+    progress: Progress | None = None,
+) -> Comparison:
+    """Compare a model with a measurement, as it is: nothing is fitted.
+
+    Args:
+        events: What was measured.
+        scene: What the camera saw, on the clock of the events.
+        sensor: The model.
+        trust: Where and when the scene is to be trusted; None for everywhere, and for what a
+            `CameraScene` trusts of itself.
+        pixels: In each half of the measurement.
+        seed: Of every random number.
+        device: Where kernels run.
+        progress: Told how far it is.
+
+    Raises:
+        InputError: Measurement and scene do not fit, or there is too little to say anything.
+    """
+    begin = time.perf_counter()
+    tell = progress or (lambda text, share, error: None)
+    tell("reading the measurement", 0.0, float("nan"))
+    sensor = sensor.bound_to(scene)
+    evidence = gather(
+        events, scene, log_eps=sensor.log_eps, trust=trust, pixels=pixels, seed=seed, device=device
+    )
+    tell("simulating", 0.3, float("nan"))
+    judgement = model_of(sensor).judge(evidence.held, repeats=REPEATS, seed=seed + 500)
+    tell("comparing", 1.0, judgement.error)
+    return comparison_of(evidence, judgement, sensor, seconds=time.perf_counter() - begin)
+
+
+def comparison_of(evidence: Evidence, judgement: Judgement, sensor: Sensor, *, seconds: float) -> Comparison:
+    """Return the comparison with the model that the held-out half was rebased to."""
+    return Comparison(
+        sensor=sensor,
+        error=judgement.error,
+        floor=1.0,
+        gate=judgement.gate,
+        families=judgement.families,
+        cells=worst_cells(evidence, judgement),
+        plain=plain(evidence.held),
+        curves=curves(evidence),
+        notes=evidence.notes,
+        seconds=seconds,
+    )
+
+
+def plain(half: Half) -> dict[str, tuple[float, float]]:
+    """Return measured and simulated values in units that need no explanation."""
+    values = half.seen.target, half.simulated
+    real, made = (_rates(v) for v in values)
+    exposure = half.trials.stimulus.exposure().reshape(KINDS, BANDS)
+    time_ = max(float(exposure.sum()), 1e-9)
+    rest = max(float(exposure[:RESTING].sum()), 1e-9)
+    names = ("OFF", "ON")
+    out = {
+        f"{names[n]} events [1/(px s)]": (float(real[n].sum() / time_), float(made[n].sum() / time_))
+        for n in range(2)
+    }
+    for n in range(2):
+        slow = real[n, :RESTING].sum() / rest, made[n, :RESTING].sum() / rest
+        out[f"{names[n]} events at rest [1/(px s)]"] = float(slow[0]), float(slow[1])
+    step = 1e3 * half.trials.stimulus.grid.step
+    a, b = (_median(_counts(v, "intervals"), step) for v in values)
+    out["median interval of a pixel [ms]"] = a, b
+    a, b = (_mean_lag(v) for v in values)
+    out["mean lag behind the light [ms]"] = a, b
+    return out
+
+
+def _counts(values: Array, family: str) -> Array:
+    return np.maximum(np.exp(values[LAYOUT[family]]) - 3.0, 0.0)
+
+
+def _rates(values: Array) -> Array:
+    return _counts(values, "rate").reshape(2, KINDS, BANDS)
+
+
+def _octaves(step: float) -> Array:
+    """Return the upper ends of the bins of intervals, in units of `step`."""
+    return step * np.concatenate([[0.5], 2.0 ** np.arange(INTERVALS - 1)])
+
+
+def _median(counts: Array, step: float) -> float:
+    """Return the median interval, on a logarithmic scale within its bin."""
+    total = counts.reshape(-1, INTERVALS).sum(0)
+    if total.sum() == 0:
+        return float("nan")
+    share = np.concatenate([[0.0], np.cumsum(total) / total.sum()])
+    ends = np.log(np.concatenate([[0.25 * step], _octaves(step)]))
+    return float(np.exp(np.interp(0.5, share, ends)))
+
+
+def _mean_lag(values: Array) -> float:
+    change = values[LAYOUT["lag"]].reshape(LAGS, BANDS).mean(1)
+    middle = 0.5 * (np.array(LAG_TIMES[1:]) + np.array(LAG_TIMES[:-1]))
+    weight = np.maximum(change, 0.0)
+    return float(1e3 * (weight * middle).sum() / max(weight.sum(), 1e-12))
+
+
+def curves(evidence: Evidence) -> dict[str, tuple[Curve, ...]]:
+    """Return what figures are drawn from, by family."""
+    half = evidence.held
+    return {
+        "rate": _rate_curves(evidence, half),
+        "intervals": _interval_curves(half),
+        "lag": _lag_curves(evidence, half),
+    }
+
+
+def _rate_curves(evidence: Evidence, half: Half) -> tuple[Curve, ...]:
+    exposure = np.maximum(half.trials.stimulus.exposure().reshape(KINDS, BANDS), 1e-9)
+    middle = np.array([-0.4, -0.12, 0.0, 0.12, 0.4])
+    out = []
+    both = [_rates(v) for v in (half.seen.target, half.simulated)]
+    sigma = half.seen.sigma[LAYOUT["rate"]].reshape(2, KINDS, BANDS)
+    for n in range(BANDS):
+        for p, polarity in enumerate(("OFF", "ON")):
+            measured, simulated = (c[p, RESTING:, n] / exposure[RESTING:, n] for c in both)
+            error = sigma[p, RESTING:, n] * (both[0][p, RESTING:, n] + 3) / exposure[RESTING:, n]
+            out.append(
+                Curve(f"{polarity} events, {band(evidence, n)}", middle, "change of light in 16 ms",
+                      "events per pixel and second", measured, simulated, error)
+            )  # fmt: skip
+    return tuple(out)
+
+
+def _interval_curves(half: Half) -> tuple[Curve, ...]:
+    step = half.trials.stimulus.grid.step * 1e3
+    ends = _octaves(step)
+    middle = np.concatenate([[0.35 * step], np.sqrt(ends[:-1] * ends[1:])])
+    names = [f"{kin}, {state}" for state in ("moving", "at rest") for kin in ("OFF-OFF", "ON-ON", "opposite")]
+    both = [_counts(v, "intervals").reshape(6, INTERVALS) for v in (half.seen.target, half.simulated)]
+    sigma = half.seen.sigma[LAYOUT["intervals"]].reshape(6, INTERVALS)
+    return tuple(
+        Curve(f"Intervals {name}", middle, "interval [ms]", "events", both[0][n], both[1][n],
+              sigma[n] * (both[0][n] + 3), log_x=True, log_y=True)
+        for n, name in enumerate(names)
+    )  # fmt: skip
+
+
+def _lag_curves(evidence: Evidence, half: Half) -> tuple[Curve, ...]:
+    times = np.array(LAG_TIMES)
+    width = 1e3 * np.diff(times)
+    middle = 1e3 * 0.5 * (times[1:] + times[:-1])
+    both = [v[LAYOUT["lag"]].reshape(LAGS, BANDS) for v in (half.seen.target, half.simulated)]
+    sigma = half.seen.sigma[LAYOUT["lag"]].reshape(LAGS, BANDS)
+    return tuple(
+        Curve(f"Light before an event, {band(evidence, n)}", middle, "time before the event [ms]",
+              "change of log intensity per ms", both[0][:, n] / width, both[1][:, n] / width,
+              sigma[:, n] / width)
+        for n in range(BANDS)
+    )  # fmt: skip

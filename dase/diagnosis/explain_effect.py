@@ -1,0 +1,90 @@
+"""What an effect is, and what it does to the probes: seen in a simulation, so true of any effect."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+
+import numpy as np
+
+from dase.diagnosis.cell_descriptions import worst_cells
+from dase.effects import EFFECTS, Effect
+from dase.errors import InputError, nearest
+from dase.fitting.data_split import gather
+from dase.fitting.model import model_of
+from dase.probes.statistics import FAMILIES
+from dase.results import Cell
+from dase.scenes.video import VideoScene
+from dase.simulation.sensor import Sensor
+from dase.simulation.simulate import simulate
+
+WIDTH, HEIGHT, DURATION, RATE = 72, 48, 0.8, 1000
+
+SHOWN = 6
+"""Cells that are listed."""
+
+
+def explanation(name: str, effects: Mapping[str, type[Effect]] = EFFECTS) -> str:
+    """Return what the effect `name` is, what it does to the probes, and where it was described.
+
+    Raises:
+        InputError: There is no such effect.
+    """
+    if name not in effects:
+        raise InputError(f"there is no effect '{name}': {nearest(name, effects)}")
+    effect = effects[name]
+    lines = [f"{name}: {effect.about()}", ""]
+    clear = noticeable(effect)
+    families, cells = seen(clear)
+    units = {p.name: "" if p.unit == "1" else f" {p.unit}" for p in effect.parameters()}
+    values = ", ".join(f"{n} {getattr(clear, n):.3g}{unit}" for n, unit in units.items())
+    lines.append(f"What it does to the probes, at {values}, over bars that move and stand still:")
+    for family, error in sorted(families.items(), key=lambda item: -item[1]):
+        if error > 1.5:
+            lines.append(f"  {family:10s} {error:7.1f}  {FAMILIES[family]}")
+    if len(lines) == 3:
+        lines.append("  nothing that such a recording would show")
+    lines += [f"  - {with_and_without(cell)}" for cell in cells[:SHOWN]]
+    return "\n".join([*lines, "", f"Source: {effect.source}"])
+
+
+def noticeable(effect: type[Effect]) -> Effect:
+    """Return an effect as strong as half way from its default to the end of its plausible range."""
+    values = {}
+    for p in effect.parameters():
+        if p.off is not None and p.default > 0:
+            end = p.plausible[0] if p.off > p.default else p.plausible[1]
+            values[p.name] = math.sqrt(p.default * end)
+    return effect(**values)
+
+
+def seen(effect: Effect) -> tuple[dict[str, float], tuple[Cell, ...]]:
+    """Return by how much each family changes, and the cells that change most; measured is with it."""
+    scene = bars()
+    plain = Sensor(name="without")
+    events = simulate(scene, plain.with_effect(effect), seed=1)
+    evidence = gather(events, scene, pixels=WIDTH * HEIGHT // 2)
+    judgement = model_of(plain).judge(evidence.held, repeats=24, seed=2)
+    return judgement.families, worst_cells(evidence, judgement)
+
+
+def with_and_without(cell: Cell) -> str:
+    """Return what an effect does to a cell, in words."""
+    if cell.unit == "events":
+        return f"{cell.where}: {cell.what} {cell.simulated:.0f} without, {cell.measured:.0f} with"
+    return f"{cell.where}: {cell.what} {cell.simulated:.3g} without, {cell.measured:.3g} with"
+
+
+def bars() -> VideoScene:
+    """Return bars that move at several speeds over a still background from dark to bright."""
+    x, y = np.meshgrid(np.arange(WIDTH), np.arange(HEIGHT))
+    still = np.exp(np.linspace(np.log(0.01), np.log(0.9), WIDTH))[None] * np.ones((HEIGHT, 1))
+    times = np.arange(round(DURATION * RATE) + 1) / RATE
+    frames = np.empty((len(times), HEIGHT, WIDTH), np.float32)
+    speeds = np.repeat([12.0, 60.0, 250.0, 900.0], HEIGHT // 4)[:, None]
+    for k, t in enumerate(times):
+        # each strip of rows has its own speed; bars pass for a while, then the light rests
+        moving = np.where(np.sin(2 * np.pi * (t / 0.4 + y / HEIGHT)) > -0.2, 1.0, 0.0)
+        wave = 0.5 + 0.5 * np.tanh(4 * np.sin(2 * np.pi * (x - speeds * t) / 24.0))
+        frames[k] = still * (1 + moving * (1.5 * wave - 0.5))
+    return VideoScene(np.clip(frames, 0, 4), times)

@@ -1,0 +1,1 @@
+"""Pictures of events, findings and trainings, and the pages they stand on."""

@@ -1,0 +1,262 @@
+"""Reports: one HTML file each, which opens anywhere and needs nothing else."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from html import escape
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+
+from dase.diagnosis.measurement import Measurement
+from dase.events import Events
+from dase.figures import diagnosis_figures
+from dase.figures import html as html_page
+from dase.figures.event_maps import event_plates
+from dase.figures.style import Plate, number
+from dase.io import replacing
+from dase.probes.statistics import WORDS
+from dase.results import Comparison, Diagnosis, Estimate, Step
+from dase.scenes.between_frames import CameraScene
+from dase.simulation.sensor import Sensor
+from dase.simulation.sensor_file import dump_sensor
+from dase.simulation.simulate import stream
+
+LONGEST = 2.0
+"""Of what is pictured [s]."""
+
+BELIEVED = "Events are shown only where and when the scene between the frames can be trusted."
+
+
+def write(path: Path, html: str) -> None:
+    """Write a page, whole or not at all."""
+    with replacing(path) as temporary:
+        temporary.write_text(html, "utf-8")
+
+
+def pictures(measured: Measurement, sensor: Sensor, *, seed: int = 0, device: str = "cpu") -> list[Plate]:
+    """Return pictures of a measurement beside what a model makes of its scene, its first seconds.
+
+    Args:
+        measured: The measurement.
+        sensor: The model.
+        seed: Of every random number of the simulation.
+        device: `cpu`, `cuda` or a Warp name.
+    """
+    times = measured.scene.sample_times()
+    begin, end = float(times[0]), min(float(times[-1]), float(times[0]) + LONGEST)
+    parts = []
+    for part in stream(measured.scene, sensor, seed=seed, device=device):
+        parts.append(part)
+        if len(part) and part.t[-1] > end:
+            break
+    shown = times[np.unique(np.searchsorted(times, np.linspace(begin, end, 13)[:-1]))]
+    frames = np.clip(255 * measured.scene.frames(shown), 0, 255).astype(np.uint8)
+    real, made = measured.events, Events.concatenate(parts)
+    if not isinstance(measured.scene, CameraScene):
+        return event_plates(real, made, (begin, end), frames=frames, frame_times=shown)
+    real, made = measured.scene.believed(real), measured.scene.believed(made)
+    plates = event_plates(real, made, (begin, end), frames=frames, frame_times=shown)
+    return [replace(plate, caption=f"{plate.caption} {BELIEVED}") for plate in plates]
+
+
+def comparison_page(
+    found: Comparison, *, recording: str, model: str | None = None, plates: Sequence[Plate] = ()
+) -> str:
+    """Return the report of a comparison.
+
+    Args:
+        found: What the comparison found.
+        recording: What to call the measurement.
+        model: What to call the model; the name of the sensor if None.
+        plates: Pictures of it, see `dase.figures.event_maps`.
+    """
+    wrong = found.error > found.gate
+    body = [
+        html_page.verdict(comparison_verdict(found), wrong=wrong),
+        html_page.table(("", "measured", "simulated", "model / measured"), _plain(found.plain)),
+        "<h2>Where the model fails</h2>",
+        html_page.cells(found.cells, "No single cell differs by more than chance."),
+        *map(html_page.figure, [*plates, *comparison_plates(found)]),
+        _sensor(found.sensor),
+        html_page.notes(found.notes),
+    ]
+    return html_page.page(
+        f"{model or found.sensor.name} against {recording}", "comparison", body, found.seconds
+    )
+
+
+def comparison_verdict(found: Comparison) -> str:
+    """Return what a comparison found, in a sentence or two."""
+    if found.error <= found.gate:
+        return (
+            f"The model cannot be told from the measurement: its error is {number(found.error)} noise "
+            f"floors, and chance alone reaches {number(found.gate)}."
+        )
+    worst = max(found.families, key=lambda name: found.families[name], default="")
+    about = f" It is worst in {family_words(worst)}." if worst else ""
+    return (
+        f"The model is wrong: its error on held-out pixels and time is {number(found.error)} times the noise "
+        f"floor, where chance alone reaches {number(found.gate)}.{about}"
+    )
+
+
+def comparison_plates(found: Comparison) -> list[Plate]:
+    """Return the figures of a comparison: errors by family, then the curves of each family, worst first."""
+    named = {family_words(name): error for name, error in found.families.items()}
+    plates = [diagnosis_figures.families(named, floor=found.floor, gate=found.gate)] if named else []
+    for name in sorted(found.curves, key=lambda name: -found.families.get(name, 0.0)):
+        title = family_words(name)
+        about = f"error {number(found.families[name])}" if name in found.families else ""
+        caption = (
+            "Points are measured, lines are the model's; the grey band is twice the sampling error of their "
+            "difference, so a line outside of it is wrong beyond chance."
+        )
+        plates.append(
+            diagnosis_figures.curves(title[:1].upper() + title[1:], about, found.curves[name], caption)
+        )
+    return plates
+
+
+def diagnosis_page(
+    found: Diagnosis, *, recording: str, model: str | None = None, plates: Sequence[Plate] = ()
+) -> str:
+    """Return the report of a diagnosis.
+
+    Args:
+        found: What the diagnosis found.
+        recording: What to call the measurement.
+        model: What to call the model; the name of the sensor if None.
+        plates: Pictures of the model that was found, see `dase.figures.event_maps`.
+    """
+    body = [html_page.verdict(diagnosis_verdict(found), wrong=found.unexplained is not None)]
+    body += map(html_page.figure, diagnosis_plates(found))
+    if found.history and found.history[0].cells:
+        body += ["<h2>Where the model failed</h2>", html_page.cells(found.history[0].cells)]
+    if found.unexplained is not None:
+        body += ["<h2>What stays unexplained</h2>", f"<p>{escape(found.unexplained.sentence)}.</p>"]
+        body += [
+            html_page.cells(
+                found.unexplained.cells, "It is spread over many cells; no single one stands out."
+            )
+        ]
+    body += [
+        *map(html_page.figure, plates),
+        _parameters(found.parameters),
+        _sensor(found.sensor),
+        html_page.notes(found.notes),
+    ]
+    foot = f"{found.evaluations:,} simulations. " if found.evaluations else ""
+    return html_page.page(
+        f"{model or found.sensor.name} against {recording}", "diagnosis", body, found.seconds, foot
+    )
+
+
+def diagnosis_verdict(found: Diagnosis) -> str:
+    """Return what a diagnosis found, in a sentence or two."""
+    first, last = number(found.errors[0]), number(found.errors[-1])
+    if found.unexplained is not None:
+        left = number(found.unexplained.error)
+        near = " and ".join(found.unexplained.nearest)
+        tried = f" {near} comes nearest, but leaves {left}: a stand-in, not a finding." if near else ""
+        return (
+            f"Something is missing that no known effect explains: the error is {first} noise floors, and "
+            f"chance reaches {number(found.gate)}.{tried}"
+        )
+    if not found.selected:
+        error = f"the error is {first} noise floors, and chance reaches {number(found.gate)}."
+        if found.errors[0] > found.gate:
+            return f"Nothing of weight is missing: {error} What is left is beyond chance, but small."
+        return f"Nothing is missing: {error}"
+    names = " and ".join(found.selected)
+    ties = "".join(
+        f" The data cannot tell {name} from {' or '.join(others)}."
+        for name, others in found.ties.items()
+        if others
+    )
+    return (
+        f"Missing: {names}. With {'it' if len(found.selected) == 1 else 'them'} the held-out error falls "
+        f"from {first} to {last} noise floors; chance alone reaches {number(found.gate)}.{ties}"
+    )
+
+
+def diagnosis_plates(found: Diagnosis) -> list[Plate]:
+    """Return the figures of a diagnosis: the staircase, the candidates of each step, the parameters."""
+    plates = [staircase_of(found)]
+    plates += [ranking_of(step, found.floor) for step in found.history if step.ranking]
+    return plates + ([parameters_of(found.sensor, found.parameters)] if found.parameters else [])
+
+
+def parameters_of(sensor: Sensor, estimates: Mapping[str, Estimate]) -> Plate:
+    """Return fitted parameters of a sensor within the ranges of real cameras."""
+    facts = {f"{e.name}.{p.name}": p for e in sensor.effects for p in e.parameters()}
+    known = {name: value for name, value in estimates.items() if name in facts}
+    ranges = {name: facts[name].plausible for name in known}
+    return diagnosis_figures.parameters(known, ranges, {name: facts[name].unit for name in known})
+
+
+def staircase_of(found: Diagnosis) -> Plate:
+    """Return the staircase of the falling error."""
+    steps, errors = ["fitted"], list(found.errors)
+    if math.isfinite(found.before) and found.before > 1.05 * errors[0]:
+        steps, errors = ["as given", "fitted"], [found.before, *errors]
+    steps += [f"+ {name}" for name in found.selected]
+    names, more = stand_ins(found)
+    return diagnosis_figures.staircase(
+        [*steps, *names], [*errors, *more], floor=found.floor, gate=found.gate, stand_ins=len(names)
+    )
+
+
+def stand_ins(found: Diagnosis) -> tuple[list[str], list[float]]:
+    """Return the effects that came nearest where nothing explains the error, and the errors with them."""
+    if found.unexplained is None or not found.unexplained.nearest:
+        return [], []
+    last, nearest = found.unexplained.error, found.unexplained.nearest
+    after = {a.chosen: b.error for a, b in pairwise(found.history) if a.chosen and a.chosen in b.model}
+    if not all(name in after for name in nearest[:-1]):
+        return [f"+ {' + '.join(nearest)}"], [last]
+    return [f"+ {name}" for name in nearest], [*(after[name] for name in nearest[:-1]), last]
+
+
+def ranking_of(step: Step, floor: float) -> Plate:
+    """Return how far each candidate of one step brings the error down."""
+    full = [rank for rank in step.ranking if rank.refined and math.isfinite(rank.error)]
+    return diagnosis_figures.ranking(
+        [rank.effect for rank in full],
+        [rank.error for rank in full],
+        present=step.error,
+        p_values=[rank.p_value for rank in full],
+        chosen=[] if step.chosen is None else [step.chosen],
+        ties=step.ties,
+        floor=floor,
+        screened=len(step.ranking) - len(full),
+    )
+
+
+def family_words(name: str) -> str:
+    """Return a family of statistics in a few words."""
+    return WORDS.get(name, name)
+
+
+def _plain(plain: Mapping[str, tuple[float, float]]) -> list[tuple[str, ...]]:
+    # what is left of a count after rounding is none
+    whole = {name: [v if abs(v) > 1e-9 else 0.0 for v in pair] for name, pair in plain.items()}
+    return [(name, number(m), number(s), _ratio(m, s)) for name, (m, s) in whole.items()]
+
+
+def _ratio(measured: float, simulated: float) -> str:
+    return number(simulated / measured) if measured > 0 and math.isfinite(simulated) else "–"
+
+
+def _parameters(found: Mapping[str, Estimate]) -> str:
+    rows = [(name, number(e.value), f"{number(e.low)} to {number(e.high)}") for name, e in found.items()]
+    return html_page.fold(
+        "Parameters as a table", html_page.table(("parameter", "value", "90 % interval"), rows)
+    )
+
+
+def _sensor(sensor: Sensor) -> str:
+    return html_page.fold("The model as a sensor file", f"<pre>{escape(dump_sensor(sensor))}</pre>")

@@ -1,0 +1,360 @@
+"""Many models over one stimulus: from parameter vectors to sums of statistics; the same of a measurement."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field
+from functools import partial
+from typing import Any
+
+import numpy as np
+import warp as wp
+from numpy.typing import NDArray
+
+from dase.effects import EFFECTS
+from dase.effects.optics import SceneEffect
+from dase.effects.stream import StreamEffect
+from dase.effects.threshold import Threshold
+from dase.events import Events
+from dase.fitting.bus_load import Load
+from dase.fitting.readout_simulator import clock_of, emitted, felt, sent
+from dase.kernels import event_probes as kernels
+from dase.kernels import launch, pixel_codegen_trials
+from dase.probes.accumulators import GROUP, Frame, Sums, fold, over_groups
+from dase.probes.events_by_pixel import by_pixel
+from dase.probes.stimulus import Stimulus
+from dase.probes.timestamp_patterns import Structure
+from dase.simulation.sensor import Sensor
+
+LAG_TIMES = (-0.003, -0.001, 0.0, 0.001, 0.002, 0.004, 0.008, 0.016, 0.028, 0.044, 0.063)
+"""Before an event [s] at which its light is looked at; the differences of neighbours are averaged."""
+
+CLASS_TIMES = (0.012, 0.05)
+"""Intervals between two events are short, middle or long, divided by these [s]."""
+
+HALF = 0.064
+"""The halves of the time take turns after this [s]."""
+
+SLACK = 2e-6
+"""Files give whole microseconds: an event up to this after a point of the grid belongs to it [s]."""
+
+FINEST = 2
+"""Samples per step of the grid at most: models that ask for more are simulated a little too coarsely."""
+
+ALONE = {"cpu": 1, "cuda": 0}
+"""Effects up to which a sensor has a kernel of its own, up to twice as fast. Those with more share one that
+has all effects: it is compiled once, and not for each of hundreds of combinations. On a GPU all do, so that
+all candidates run in one launch."""
+
+ROOM = {"cpu": 1 << 26, "cuda": 1 << 31}
+"""Memory for the sums of one launch [bytes]; on a CPU they should stay in the caches."""
+
+STREAMED = 32
+"""Models whose events are stored at a time."""
+
+
+def finer_steps(sensor: Sensor, step: float) -> int:
+    """Return how many samples per step the model needs, 0 where those at changes of the light do."""
+    longest = sensor.longest_step()
+    return 0 if longest == np.inf else int(np.clip(np.ceil(step / longest - 1e-6), 1, FINEST))
+
+
+@dataclass(frozen=True, eq=False)
+class Order:
+    """Models to run: one sensor at several parameter vectors.
+
+    Args:
+        sensor: Names the effects; its own parameters do not matter but for the sampling.
+        vectors: Shape (B, P).
+        seed: Of the random numbers.
+        reseed: Whether each vector gets random numbers of its own.
+        finer: Samples per step; None chooses by the sensor.
+        frame: What the counts of pixels are folded for; None where that is not known yet.
+        ticks: From tick to tick of the clock that stamps the events [s], 0 for none.
+    """
+
+    sensor: Sensor
+    vectors: NDArray[Any]
+    seed: int = 0
+    reseed: bool = False
+    finer: int | None = None
+    frame: Frame | None = None
+    ticks: float = 0.0
+
+    def seeds(self) -> NDArray[np.int64]:
+        """Return the seed of each vector, shape (B,)."""
+        return (self.seed + int(self.reseed) * np.arange(len(self.vectors))) & 0x3FFFFFFF
+
+
+@dataclass(eq=False)
+class Trials:
+    """Runs models over a stimulus.
+
+    Args:
+        stimulus: What the pixels see.
+        middle: Typical change of the light between two events, shape (4 CLASSES,).
+        structure: Regularities of the measured time stamps.
+        evaluations: Models run so far.
+        work: Pixels times seconds run so far.
+    """
+
+    stimulus: Stimulus
+    middle: NDArray[np.float32] = field(default_factory=lambda: np.zeros(4 * kernels.CLASSES, np.float32))
+    structure: Structure = field(default_factory=Structure)
+    evaluations: int = 0
+    work: float = 0.0
+    _kernels: dict[Any, tuple[wp.Kernel, NDArray[np.float32], list[int]]] = field(
+        default_factory=dict, repr=False
+    )
+
+    def __post_init__(self) -> None:
+        self.device = self.stimulus.device
+        self._middle: tuple[Any, Any] | None = None
+        self._kind = "cuda" if self.device.is_cuda else "cpu"
+        self._lanes = 1 if self.device.is_cuda else kernels.LANES
+        self._pixels = wp.array(self.stimulus.pixels, dtype=int, device=self.device)
+
+    def run(
+        self,
+        sensor: Sensor,
+        vectors: NDArray[Any],
+        *,
+        seed: int = 0,
+        reseed: bool = False,
+        finer: int | None = None,
+    ) -> Sums:
+        """Simulate parameter vectors of one sensor; see `Order`."""
+        return self.run_all([Order(sensor, vectors, seed, reseed, finer)])[0]
+
+    def run_all(self, orders: Sequence[Order]) -> list[Sums]:
+        """Simulate many models; those that have a kernel in common run together, whatever their effects."""
+        together: dict[Any, list[int]] = {}
+        step = self.stimulus.grid.step
+        for n, order in enumerate(orders):
+            finer = finer_steps(order.sensor, step) if order.finer is None else order.finer
+            kernel = self._kernel(order.sensor)[0]
+            maps = n if any(effect.maps for effect in order.sensor.effects) else -1
+            together.setdefault((finer, id(kernel), maps), []).append(n)
+        out: dict[int, Sums] = {}
+        for (finer, _, _), members in together.items():
+            found = self._run([orders[n] for n in members], self.stimulus.history(finer))
+            out.update(zip(members, found, strict=True))
+        return [out[n] for n in range(len(orders))]
+
+    def _run(self, orders: Sequence[Order], history: Any) -> list[Sums]:
+        """Simulate models that have a kernel in common."""
+        kernel, maps = (
+            self._kernel(orders[0].sensor)[0],
+            orders[0].sensor.maps(self.stimulus.pixels, self.device),
+        )
+        count, seeds = len(self.stimulus.pixels), np.concatenate([order.seeds() for order in orders])
+        rows = np.concatenate([self._wide(order) for order in orders])
+        ends = np.cumsum([len(order.vectors) for order in orders])
+        begins = np.concatenate([[0], ends[:-1]])
+        ticks = np.repeat([round(order.ticks * 1e12) for order in orders], ends - begins)
+        # the first of repeats shows how groups of pixels differ
+        apart = [int(begin) for begin, order in zip(begins, orders, strict=True) if order.reseed]
+        pixels = wp.zeros((len(rows), count, kernels.HALVES), dtype=float, device=self.device)
+        sums, clock = [], []
+        groups: dict[int, tuple[NDArray[np.float32], NDArray[np.int32]]] = {}
+        for first in range(0, len(rows), self._at_once()):
+            part = slice(first, min(first + self._at_once(), len(rows)))
+            sink = self.sink(pixels[part], ticks[part])
+            inputs = [
+                history, self._pixels, self.stimulus.width, self.stimulus.height,
+                wp.array(seeds[part].astype(np.int32), dtype=int, device=self.device),
+                wp.array(rows[part], dtype=float, device=self.device), *maps, sink,
+            ]  # fmt: skip
+            blocks = -(-len(rows[part]) // self._lanes)
+            launch.run(kernel, count, inputs, self.device, batch=blocks, align=GROUP)
+            grouped = self._grouped(sink.sums)
+            sums.append(over_groups(grouped))
+            clock.append(self._clock(sink.clock))
+            mine = [n for n in apart if part.start <= n < part.stop]
+            groups |= {n: _first(grouped, sink.clock, n - first) for n in mine}
+        self.evaluations += len(rows)
+        self.work += len(rows) * count * self.stimulus.grid.step * (self.stimulus.grid.steps - 1)
+        folded, both, clocks = _folded(orders, pixels), np.concatenate(sums), np.concatenate(clock)
+        out = []
+        for order, begin, end in zip(orders, begins.tolist(), ends.tolist(), strict=True):
+            cut, (of_groups, teams) = slice(begin, end), groups.get(begin, (None, None))
+            known = None if folded is None or order.frame is None else folded[cut]
+            stamps = self._stamps(order)
+            out.append(
+                Sums(both[cut], pixels[cut], clocks[cut], stamps, of_groups, teams, order.frame, known)
+            )
+        return out
+
+    def _stamps(self, order: Order) -> NDArray[np.float64]:
+        """Return the shares of events that follow regularities: those that a clock has stamped do."""
+        out = np.zeros((len(order.vectors), len(Structure.NAMES)))
+        out[:, 0] = order.ticks > 0 and self.structure.step > 0
+        return out
+
+    def _wide(self, order: Order) -> NDArray[np.float32]:
+        """Return parameter vectors as the kernel takes them."""
+        _, base, at = self._kernel(order.sensor)
+        out = np.repeat(base[None], len(order.vectors), 0)
+        out[:, at] = order.vectors
+        return out
+
+    def _at_once(self) -> int:
+        """Return how many models there is room for."""
+        count, group = len(self.stimulus.pixels), self._group()
+        numbers = -(-count // group) * kernels.SIZE + -(-count // GROUP) * 2 * self.stimulus.grid.steps
+        return max(1, ROOM[self._kind] // (4 * (numbers + count * (kernels.MEMORY + kernels.HALVES))))
+
+    def _kernel(self, sensor: Sensor) -> tuple[wp.Kernel, NDArray[np.float32], list[int]]:
+        """Return the kernel of a sensor, a parameter vector for it, and the places of the sensor's own."""
+        key = tuple((e.name, *(getattr(e, name) for name in e.choices())) for e in sensor.effects)
+        if key not in self._kernels:
+            stages = sensor.stages()
+            wide = whole(sensor) if len(stages) > ALONE[self._kind] else sensor
+            names = wide.parameter_names()
+            at = [names.index(name) for name in sensor.parameter_names()]
+            self._kernels[key] = (
+                pixel_codegen_trials.compose(wide.stages(), lanes=self._lanes),
+                wide.parameters(),
+                at,
+            )
+        return self._kernels[key]
+
+    def look(self, events: Events) -> Sums:
+        """Sum up stored events; those of other pixels are left out."""
+        return self._look([events])
+
+    def _look(self, streams: Sequence[Events], frame: Frame | None = None) -> Sums:
+        """Sum up streams of stored events, one per row."""
+        count = len(self.stimulus.pixels)
+        pixels = wp.zeros((len(streams), count, kernels.HALVES), dtype=float, device=self.device)
+        sink = self.sink(pixels, np.zeros(len(streams), np.int64))
+        inputs = [*by_pixel(self.stimulus, streams), sink]
+        launch.run(kernels.walk, count, inputs, self.device, batch=len(streams), align=GROUP)
+        grouped = self._grouped(sink.sums)
+        folded = None
+        if frame is not None:
+            folded = over_groups(fold(pixels, [frame], np.zeros(len(streams), np.int64)))
+        stamps = np.zeros((len(streams), len(Structure.NAMES)))
+        if self.structure != Structure():
+            stamps = np.stack([self.structure.shares(self._mine(events)) for events in streams])
+        return Sums(
+            over_groups(grouped), pixels, self._clock(sink.clock), stamps,
+            *_first(grouped, sink.clock, 0), frame, folded,
+        )  # fmt: skip
+
+    def felt(self, sensor: Sensor) -> tuple[StreamEffect, ...]:
+        """Return the effects behind the pixels that the probes can feel."""
+        return felt(self.stimulus, self.structure, sensor)
+
+    def ticks(self, sensor: Sensor) -> float | None:
+        """Return what the kernel needs to know of a sensor's clock, see `clock_of`; None for a readout."""
+        return clock_of(self.felt(sensor), self.structure)
+
+    def stream(
+        self, sensor: Sensor, vector: NDArray[Any], effects: Iterable[StreamEffect], *, seed: int
+    ) -> Sums:
+        """Simulate one parameter vector with effects behind the pixels, and sum up what leaves."""
+        return self.stream_all(Order(sensor, np.atleast_2d(vector), seed), [tuple(effects)])
+
+    def stream_all(
+        self, order: Order, effects: Sequence[Sequence[StreamEffect]], load: Load | None = None
+    ) -> Sums:
+        """Simulate models with effects behind the pixels, given for each, and sum up what leaves.
+
+        `load` is what the sensor's other pixels send over a bus that all share, None where it is not known.
+        """
+        seeds, rows, found = order.seeds(), len(order.vectors), []
+        self.evaluations += rows
+        for first in range(0, rows, STREAMED):
+            cut = slice(first, first + STREAMED)
+            left = emitted(self.stimulus, order.sensor, order.vectors[cut], seeds[cut])
+            each = zip(left, effects[cut], seeds[cut], strict=True)
+            works = [partial(sent, self.stimulus, e, behind, int(s), load) for e, behind, s in each]
+            found.append(self._look(launch.each(works), order.frame))
+        return Sums.join(found)
+
+    def _mine(self, events: Events) -> Events:
+        """Return the events of the pixels, within the time that is compared."""
+        stimulus = self.stimulus
+        own = np.zeros(stimulus.width * stimulus.height, np.bool_)
+        own[stimulus.pixels] = True
+        return events.select(own[events.y.astype(np.int64) * stimulus.width + events.x])
+
+    def _group(self) -> int:
+        return 1 if self.device.is_cuda else GROUP
+
+    def sink(self, pixels: Any, ticks: NDArray[np.int64]) -> Any:
+        """Return an empty sink.
+
+        Args:
+            pixels: Counts of each pixel, a Warp array of zeros, shape (B, N, HALVES).
+            ticks: From tick to tick of the clock that stamps events [ps], 0 for none, shape (B,).
+        """
+        stimulus, step = self.stimulus, self.stimulus.grid.step
+        out = kernels.Probes()
+        out.cell = stimulus.array("cell", lambda: stimulus.cell)
+        out.level = stimulus.array("level", lambda: stimulus.level)
+        out.lags = stimulus.array("lags", lambda: np.rint(np.array(LAG_TIMES) / step).astype(np.int32))
+        out.classes = stimulus.array(
+            "classes", lambda: np.rint(np.array(CLASS_TIMES) / step).astype(np.int32)
+        )
+        if self._middle is None or self._middle[0] is not self.middle:
+            self._middle = self.middle, wp.array(self.middle, dtype=float, device=self.device)
+        out.middle = self._middle[1]
+        out.half = max(1, round(HALF / step))
+        out.step, out.slack = wp.float64(step * 1e9), wp.float64(SLACK * 1e9)
+        out.ticks = wp.array(ticks.astype(np.int64), dtype=wp.int64, device=self.device)
+        out.holes = int(stimulus.holes)
+        out.group = self._group()
+        out.halves = pixels
+        rows, count, _ = pixels.shape
+        out.memory = wp.zeros((rows, count, kernels.MEMORY), dtype=float, device=self.device)
+        groups = -(-count // out.group)
+        if not self.device.is_cuda:
+            out.queue = wp.empty((groups, kernels.QUEUE), dtype=wp.int64, device=self.device)
+        out.sums = wp.zeros((rows, groups, kernels.SIZE), dtype=float, device=self.device)
+        out.team, teams = GROUP, -(-count // GROUP)
+        out.clock = wp.zeros((rows, teams, 2 * stimulus.grid.steps), dtype=int, device=self.device)
+        return out
+
+    def _grouped(self, sums: Any) -> Any:
+        """Return the sums over groups of pixels, a Warp array of shape (B, G, SIZE)."""
+        if not self.device.is_cuda:
+            return sums
+        rows, count, size = sums.shape
+        parts = -(-count // GROUP)
+        less = wp.empty((rows, parts, size), dtype=float, device=self.device)
+        launch.run(pixel_codegen_trials.total, parts * size, [sums, GROUP, less], self.device, batch=rows)
+        return less
+
+    def _clock(self, teams: Any) -> NDArray[np.int32]:
+        """Return the events of each step over all groups, shape (B, 2 T)."""
+        rows, _, steps = teams.shape
+        out = wp.empty((rows, steps), dtype=int, device=self.device)
+        launch.run(kernels.counted, steps, [teams, out], self.device, batch=rows, slabs=1)
+        found: NDArray[np.int32] = out.numpy()
+        return found
+
+
+def _folded(orders: Sequence[Order], pixels: Any) -> NDArray[np.float64] | None:
+    """Return the counts of pixels folded, as far as it is known for what."""
+    frames = list({id(o.frame): o.frame for o in orders if o.frame is not None}.values())
+    if not frames:
+        return None
+    places = {id(frame): n for n, frame in enumerate(frames)}
+    which = [places.get(id(order.frame), 0) for order in orders]
+    return over_groups(fold(pixels, frames, np.repeat(which, [len(order.vectors) for order in orders])))
+
+
+def _first(grouped: Any, clock: Any, row: int) -> tuple[NDArray[np.float32], NDArray[np.int32]]:
+    """Return sums and events of each step of the groups of one row."""
+    return grouped[row].numpy().copy(), clock[row].numpy().copy()
+
+
+def whole(sensor: Sensor) -> Sensor:
+    """Return a sensor with every effect of a pixel that dase has, switched off where the sensor lacks it."""
+    for name, effect in EFFECTS.items():
+        inside = not issubclass(effect, StreamEffect | SceneEffect | Threshold) and not effect.maps
+        if inside and name not in sensor:
+            sensor = sensor.with_effect(effect.identity())
+    return sensor

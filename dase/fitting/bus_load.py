@@ -1,0 +1,139 @@
+"""The pixels of a sensor that are not looked at: what they send over the bus that all pixels share."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dase.effects.readout import Others
+from dase.effects.stream import StreamEffect, nanoseconds
+from dase.events import Events
+from dase.probes.stimulus import Stimulus
+from dase.scenes.scene import Scene
+from dase.simulation.pixel_array import Pixels
+from dase.simulation.sensor import Sensor
+from dase.simulation.simulate import CHUNK, chunks
+
+MOST = 2.5e7
+"""Pixels times points of time that are simulated: of a larger sensor or a longer time, some pixels stand for
+all."""
+
+SENT = 6e6
+"""Events that all of them send: of a model that sends more, some stand for all, too."""
+
+KEPT = 3
+"""Present models whose load is kept."""
+
+
+@dataclass(frozen=True, eq=False)
+class Surroundings:
+    """A scene as all pixels see it.
+
+    Args:
+        scene: What they see.
+        times: Points of the grid of time [s], shape (T,).
+        seed: Of the random numbers, and of which pixels stand for all.
+        device: Where kernels run.
+    """
+
+    scene: Scene
+    times: NDArray[np.float64]
+    seed: int
+    device: str
+    _loads: list[Load] = field(default_factory=list, repr=False)
+
+    def load(self, sensor: Sensor, stimulus: Stimulus) -> Load:
+        """Return what the pixels that are not looked at send in a model; the last few are kept.
+
+        A model becomes the present one several times over: descents begin at one place, and what its bus is
+        like does not matter here.
+        """
+        bare = replace(sensor, effects=tuple(e for e in sensor.effects if not isinstance(e, StreamEffect)))
+        found = next((load for load in self._loads if load.sensor == bare), None)
+        if found is None:
+            found = Load(self, bare, stimulus)
+        self._loads[:] = [found, *(load for load in self._loads if load is not found)][:KEPT]
+        return found
+
+    def others(self, chosen: NDArray[np.int32], steps: int, sent: int) -> NDArray[np.int32]:
+        """Return those that are simulated to know what all send that are not looked at, sorted.
+
+        Args:
+            chosen: Those that are looked at, shape (N,).
+            steps: Of the grid.
+            sent: Events that those send.
+        """
+        size = self.scene.width * self.scene.height
+        rng = np.random.default_rng([self.seed, 2])
+        rest = np.setdiff1d(rng.permutation(size), chosen, assume_unique=True).astype(np.int32)
+        room = min(int(MOST / steps), int(SENT / max(sent, 1) * len(chosen))) - len(chosen)
+        return np.sort(rest[: max(len(chosen), room)])
+
+    def emitted(self, sensor: Sensor, pixels: NDArray[np.int32], steps: int) -> Events:
+        """Return what leaves some pixels up to a point of time, from time 0."""
+        array = Pixels(
+            sensor, self.scene.width, self.scene.height, pixels=pixels, seed=self.seed, device=self.device
+        )
+        size = CHUNK["cuda" if array.device.is_cuda else "cpu"]
+        parts = [array.emit(self.scene, times)[0] for times in chunks(self.times[:steps], size)]
+        events = Events.concatenate([*parts, array.flush()[0]])
+        return replace(events, t=events.t - float(self.times[0]))
+
+
+@dataclass(eq=False)
+class Load:
+    """What the pixels that are not looked at send, as the present model has it.
+
+    Worked out when it is first asked for: most models have no bus.
+
+    Args:
+        around: What all pixels see.
+        sensor: The present model without what is behind the pixels.
+        stimulus: The pixels that are looked at, and their time.
+    """
+
+    around: Surroundings
+    sensor: Sensor
+    stimulus: Stimulus
+    _before: dict[tuple[StreamEffect, ...], Others] = field(default_factory=dict, repr=False)
+
+    def weight(self, events: Events) -> NDArray[np.float64]:
+        """Return how many events one of the others stands for, shape (2,).
+
+        Args:
+            events: What leaves the pixels that are looked at in the model under trial. It sends more or less
+                than the present one, and so it is taken to do everywhere.
+        """
+        _, counts, each = self._events
+        return each * (_polarities(events) + 1) / (counts + 1)
+
+    def others(self, effects: Iterable[StreamEffect], seed: int) -> Others:
+        """Return the others' events behind some effects."""
+        key = tuple(effects)
+        if key not in self._before:
+            events, until = self._events[0], np.inf
+            for effect in key:
+                reader = effect.reader(self.stimulus.width, self.stimulus.height, seed)
+                events, until = reader.push(events, until)
+            self._before[key] = Others(1000 * nanoseconds(events.t), events.p.astype(np.uint8))
+        return self._before[key]
+
+    @cached_property
+    def _events(self) -> tuple[Events, NDArray[np.int64], float]:
+        """The others' events, how many those looked at have, and how many of the others one stands for."""
+        chosen, steps = self.stimulus.pixels, self.stimulus.grid.steps
+        mine = self.around.emitted(self.sensor, chosen, steps)
+        others = self.around.others(chosen, steps, len(mine))
+        events = self.around.emitted(self.sensor, others, steps)
+        each = (self.stimulus.width * self.stimulus.height - len(chosen)) / len(others)
+        return events, _polarities(mine), each
+
+
+def _polarities(events: Events) -> NDArray[np.int64]:
+    """Return the numbers of OFF and ON events."""
+    on = np.count_nonzero(events.p)
+    return np.array([len(events) - on, on])

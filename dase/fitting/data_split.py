@@ -1,0 +1,245 @@
+"""A measurement, split for fitting and for judging: other pixels and another time."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dase.errors import InputError
+from dase.events import Events
+from dase.fitting.batch_simulator import Trials
+from dase.fitting.bus_load import Surroundings
+from dase.fitting.pixel_selection import look, where_trusted
+from dase.fitting.subset import Array, Half
+from dase.kernels import event_probes as kernels
+from dase.kernels import launch
+from dase.probes.accumulators import Frame, Sums
+from dase.probes.statistics import peak_of, precise, zones
+from dase.probes.stimulus import (
+    COARSEST,
+    FINEST,
+    MASKED,
+    Grid,
+    Stimulus,
+    Trust,
+    band_edges,
+    light_of,
+    sort_into_cells,
+)
+from dase.probes.timestamp_patterns import FILE, Structure, find
+from dase.scenes.between_frames import CameraScene
+from dase.scenes.scene import Scene
+
+PIXELS = 1500
+"""Pixels in each half of the measurement."""
+
+SCOUTS = 500
+"""Pixels of the scout."""
+
+SPLIT = 0.6
+"""Share of the time that is fitted; the rest is held out."""
+
+LEAST = 300
+"""Events that a half must have for anything to be said."""
+
+COMMON = 1e-3
+
+BUSY = 2e-3
+"""Events are counted for so long to see how fast they come at most [s]."""
+
+
+@dataclass(eq=False)
+class Evidence:
+    """A measurement and the scene it is of.
+
+    Args:
+        train: Pixels and time that are fitted.
+        held: Other pixels, at a later time, which judge.
+        scout: Some of the pixels that are fitted, for what need not be exact.
+        bands: Intensities between the bands, shape (BANDS - 1,).
+        structure: Regularities of the time stamps.
+        peak: Frequency at which the rate swings most [Hz].
+        busiest: Most events per second of all pixels [Hz].
+        fastest: Events per second that a bus, if there is one, can send at least [Hz].
+        notes: What the data cannot show.
+    """
+
+    train: Half
+    held: Half
+    scout: Half
+    bands: Array
+    structure: Structure
+    peak: float
+    busiest: float
+    fastest: float
+    notes: tuple[str, ...] = ()
+
+    @property
+    def evaluations(self) -> int:
+        """Models run so far."""
+        return sum(half.trials.evaluations for half in (self.train, self.held, self.scout))
+
+
+def gather(
+    events: Events,
+    scene: Scene,
+    *,
+    log_eps: float = 1e-3,
+    trust: Trust | None = None,
+    pixels: int = PIXELS,
+    seed: int = 0,
+    device: str = "cpu",
+) -> Evidence:
+    """Split a measurement into a half that is fitted and a half that judges.
+
+    Args:
+        events: What was measured.
+        scene: What the camera saw, on the clock of the events.
+        log_eps: Added to intensities before the logarithm.
+        trust: Where and when the scene is to be trusted, all else is left out; None for everywhere, and for
+            what a `CameraScene` trusts of itself.
+        pixels: In each half.
+        seed: Of the choice of pixels.
+        device: Where kernels run.
+
+    Raises:
+        InputError: Different sizes, no common time, or too few events.
+    """
+    if trust is None and isinstance(scene, CameraScene):
+        trust = scene.trusts
+    grid = common_grid(events, scene)
+    try:
+        to = launch.device(device)
+    except ValueError as error:
+        raise InputError(str(error)) from error
+    size = scene.width * scene.height
+    each = min(pixels, size // 2)
+    if each < 16:
+        raise InputError(f"a diagnosis needs at least 32 pixels, the scene has {scene.width}x{scene.height}")
+    rng, notes = np.random.default_rng([seed, 1]), []
+    cut = max(2, round(SPLIT * grid.steps))
+    if trust is None:
+        chosen = rng.permutation(size)[: 2 * each].astype(np.int32)
+    else:
+        looks = look(events, scene, _times(scene, grid), cut, trust)
+        chosen = where_trusted(looks, each, rng)
+        each = len(chosen) // 2
+        notes.append(looks.sentence())
+    light = light_of(scene, _times(scene, grid), chosen)
+    if not np.all(np.isfinite(light)) or light.min() < 0:
+        raise InputError("scene: intensities must be finite and >= 0")
+    good = np.ones(light.shape, np.bool_) if trust is None else trust(grid.times, chosen).T.copy()
+    good[:, 1:] &= good[:, :-1]  # a step is what lies between two points of the grid
+    bands = band_edges(light, good)
+    sorting = partial(sort_into_cells, step=grid.step, bands=bands, log_eps=log_eps)
+    works: list[Callable[[], Any]] = [partial(sorting, part) for part in np.array_split(light, 8)]
+    works.append(partial(find, events))
+    *parts, structure = launch.each(works)
+    cell = np.concatenate(parts)
+    cell[~good] = MASKED
+    cell[:, 0] = MASKED
+    first, last = slice(0, each), slice(each, 2 * each)
+    train_grid = replace(grid, steps=cut)
+    late = cell[last].copy()
+    late[:, :cut] = MASKED
+    halves: list[Half] = []
+    for part, span, cells in ((first, train_grid, cell[first, :cut]), (last, grid, late)):
+        stimulus = Stimulus(
+            chosen[part], scene.width, scene.height, span, light[part, : span.steps], cells, log_eps, to,
+            trust is not None,
+        )  # fmt: skip
+        halves.append(_half(stimulus, events, cut if span is grid else 0, structure))
+    _enough(halves, events, grid, notes)
+    halves.append(_half(halves[0].trials.stimulus.part(SCOUTS), events, 0, structure))
+    peak = peak_of(halves[0].found.clock[0], grid.step)
+    if trust is None:  # else most events are where the scene is not known
+        peak = precise(events, grid.begin, grid.begin + cut * grid.step, peak)
+    for half in halves:
+        half.frame = replace(half.frame, peak=peak)
+        # where the scene is trusted here and there only, nobody knows what all pixels send
+        half.around = Surroundings(scene, _times(scene, grid), seed, device) if trust is None else None
+    train, held, scout = halves
+    rates = busiest(events), fastest(events, structure)
+    return Evidence(train, held, scout, bands, structure, peak, *rates, tuple(notes))
+
+
+def common_grid(events: Events, scene: Scene) -> Grid:
+    """Return the time that scene and events have in common, in equal steps."""
+    if (events.width, events.height) != (scene.width, scene.height):
+        raise InputError(
+            f"recording and scene must have one size, got {events.width}x{events.height} "
+            f"and {scene.width}x{scene.height}"
+        )
+    times = scene.sample_times()
+    if len(events) == 0:
+        raise InputError("the recording has no events, so there is nothing to compare")
+    begin, end = float(times[0]), float(times[-1])
+    if events.t[-1] < begin or events.t[0] > end:
+        raise InputError(
+            f"recording and scene must overlap in time, got events from {events.t[0]:.6g} s to "
+            f"{events.t[-1]:.6g} s and a scene from {begin:.6g} s to {end:.6g} s"
+        )
+    step = np.diff(times)
+    even = len(step) > 0 and np.ptp(step) < 1e-3 * step.mean() and FINEST <= step.mean() <= COARSEST
+    h = float(step.mean()) if even else COMMON
+    last = min(end, float(events.t[-1]) + 2 * h)
+    steps = int(np.floor((last - begin) / h + 1e-6)) + 1
+    return Grid(begin, h, max(steps, 2))
+
+
+def busiest(events: Events) -> float:
+    """Return the most events per second [Hz]: the rate of a bus, if it ever was full for long enough."""
+    counts = np.bincount(((events.t - events.t[0]) / BUSY).astype(np.int64))
+    return float(counts.max()) / BUSY
+
+
+def fastest(events: Events, structure: Structure) -> float:
+    """Return the events per second that a bus can send at least [Hz], as it has sent some as fast as that."""
+    if structure.line:
+        return 0.0  # stamps tell when a line was read
+    slack = max(FILE, structure.step)
+    runs = (2**n for n in range(13) if 2**n < len(events))
+    return max((n / (float((events.t[n:] - events.t[:-n]).min()) + slack) for n in runs), default=0.0)
+
+
+def _times(scene: Scene, grid: Grid) -> NDArray[np.float64]:
+    """Return the times of the grid, those of the scene itself where they are the same but for rounding."""
+    own = scene.sample_times()[: grid.steps]
+    same = len(own) == grid.steps and np.allclose(own, grid.times, rtol=0, atol=1e-3 * grid.step)
+    return own if same else grid.times
+
+
+def _half(stimulus: Stimulus, events: Events, first: int, structure: Structure) -> Half:
+    trials = Trials(stimulus, structure=structure)
+    trials.middle = typical_changes(trials.look(events))
+    found = trials.look(events)
+    seconds = stimulus.grid.step * (stimulus.grid.steps - first)
+    expected = np.zeros((len(stimulus.pixels), kernels.HALVES))
+    zone = zones(stimulus.pixels, stimulus.width, stimulus.height)
+    regular = structure.step > 0 or structure.line > 0
+    frame = Frame(expected, zone, seconds, first, stimulus.grid.step, regular=regular)
+    return Half(trials, found, frame)
+
+
+def typical_changes(sums: Sums) -> NDArray[np.float32]:
+    """Return the mean change of the light between two events by polarities and interval, (4 CLASSES,)."""
+    pairs = sums.sums[0, kernels.CHANGE : kernels.CHANGE + 12 * kernels.CLASSES].reshape(-1, 3)
+    return (pairs[:, 1] / np.maximum(pairs[:, 0], 1)).astype(np.float32)
+
+
+def _enough(halves: list[Half], events: Events, grid: Grid, notes: list[str]) -> None:
+    for half, name in zip(halves, ("fitting", "judging"), strict=True):
+        count = int(half.found.halves.sum())
+        if count < LEAST:
+            times = max(2.0, np.ceil(LEAST / max(count, 1)))
+            raise InputError(
+                f"too few events to say anything: {count} of the {len(events)} lie in the part for {name}, "
+                f"at least {LEAST} are needed; record about {times:.0f} times "
+                f"as long as these {grid.step * (grid.steps - 1):.3g} s, or more motion"
+                + "".join(f"; {note}" for note in notes)
+            )

@@ -1,0 +1,51 @@
+"""Searches side by side of which a few go on: those that will not come to the front stop."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+from dase.fitting.descent import Over
+
+LAGS = 1.1
+"""A search stops where its loss will stay above this, relative to that of the last candidate that goes on, or
+of another search of its own."""
+
+AHEAD = 2
+"""Populations ahead for which the loss is taken to fall as by the last one."""
+
+
+@dataclass(frozen=True, eq=False)
+class Race:
+    """What candidates have reached so far.
+
+    Args:
+        places: Candidates that go on.
+        lags: Loss of one that is behind, relative to that of the last of those.
+        best: The least loss of each candidate.
+    """
+
+    places: int
+    lags: float = LAGS
+    best: dict[str, float] = field(default_factory=dict)
+
+    def over(self, name: str, unit: float = 1.0) -> Over:
+        """Return what one search of a candidate asks, whose loss is divided by `unit`."""
+
+        def over(loss: float, before: float) -> bool:
+            self.best[name] = min(loss / unit, self.best.get(name, float("inf")))
+            first = sorted(self.best.values())[: self.places]
+            last = first[-1] if len(first) == self.places else float("inf")
+            soon = expected(loss, before) / unit
+            return soon > min(self.lags * last, LAGS * self.best[name])
+
+        return over
+
+
+def short_of(goal: float) -> Over:
+    """Return whether a search will not come below a loss."""
+    return lambda loss, before: expected(loss, before) > goal
+
+
+def expected(loss: float, before: float) -> float:
+    """Return the loss some populations ahead; nothing is known of it after the first."""
+    return float(loss * min(loss / before, 1.0) ** AHEAD)

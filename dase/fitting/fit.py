@@ -1,0 +1,179 @@
+"""The parameters of a sensor from a recording."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from dase.events import Events
+from dase.fitting.confidence_intervals import estimates
+from dase.fitting.data_split import PIXELS, Evidence, gather
+from dase.fitting.model import Model, fit_present, model_of, settle
+from dase.fitting.parameter_space import Axis
+from dase.probes.distance import Judgement
+from dase.probes.stimulus import Trust
+from dase.results import Estimate, Fit, Progress
+from dase.scenes.scene import Scene
+from dase.simulation.sensor import Sensor
+
+REPEATS = 60
+"""Simulations with other seeds that tell what chance does."""
+
+OTHERS = 2
+"""Starts beside the wide look at thresholds."""
+
+MOST = 5
+"""The same where no two starts come to the same error."""
+
+AGREE = 3.0
+"""Starts agree where their ends lie within so many half-widths of the confidence interval, or `NEAR`."""
+
+NEAR = 0.08
+"""Of each other, in the units of `Axis.to_place`."""
+
+
+def fit(
+    events: Events,
+    scene: Scene,
+    sensor: Sensor,
+    *,
+    free: Sequence[str] | None = None,
+    trust: Trust | None = None,
+    pixels: int = PIXELS,
+    seed: int = 0,
+    device: str = "cpu",
+    progress: Progress | None = None,
+) -> Fit:
+    """Fit the parameters of a sensor to a measurement.
+
+    Args:
+        events: What was measured.
+        scene: What the camera saw, on the clock of the events.
+        sensor: Its effects are fitted; nothing is added.
+        free: Effects or `effect.parameter` that are fitted; None for all.
+        trust: Where and when the scene is to be trusted; None for everywhere, and for what a
+            `CameraScene` trusts of itself.
+        pixels: In each half of the measurement.
+        seed: Of every random number.
+        device: Where kernels run.
+        progress: Told how far it is.
+
+    Raises:
+        InputError: Measurement and scene do not fit, or there is too little to say anything.
+    """
+    begin = time.perf_counter()
+    tell = progress or (lambda text, share, error: None)
+    model_of(sensor, free)  # refuses names that are not there before anything takes time
+    sensor = sensor.bound_to(scene)
+    evidence = gather(
+        events, scene, log_eps=sensor.log_eps, trust=trust, pixels=pixels, seed=seed, device=device
+    )
+    given = model_of(sensor, free)
+    before = given.judge(evidence.held, repeats=REPEATS // 2, seed=seed + 500).error
+    ends = _descend(evidence, sensor, free, seed, lambda text, share: tell(text, share, before))
+    judgement, model = _best(ends)
+    tell("confidence intervals", 0.9, judgement.error)
+    good = _equal(ends)
+    model, values = estimates(evidence, model, seed=seed)
+    judgement = model.judge(evidence.held, repeats=REPEATS, seed=seed + 500)
+    apart = disagreements(model, good, values)
+    notes = [*evidence.notes, *apart, *outside(model), *_remarks(judgement, len(ends), len(good))]
+    return Fit(
+        sensor=model.sensor,
+        parameters=values,
+        error=judgement.error,
+        before=before,
+        floor=1.0,
+        gate=judgement.gate,
+        agree=not apart and len(good) > 1,
+        poor=len(good) < 2,
+        notes=tuple(notes),
+        evaluations=evidence.evaluations,
+        seconds=time.perf_counter() - begin,
+    )
+
+
+Ends = list[tuple[Judgement, Model]]
+
+
+def _descend(
+    evidence: Evidence,
+    sensor: Sensor,
+    free: Sequence[str] | None,
+    seed: int,
+    tell: Callable[[str, float], None],
+) -> Ends:
+    """Return where several starts end, each with its held-out error."""
+    tell("a wide look", 0.1)
+    model = settle(evidence, fit_present(evidence, sensor, free, seed=seed), seed=seed)
+    ends = [(model.judge(evidence.held, repeats=REPEATS, seed=seed + 500), model)]
+    for n in range(MOST):
+        if n >= OTHERS and len(_equal(ends)) > 1:
+            break
+        tell(f"start {n + 2}", 0.3 + 0.6 * n / MOST)
+        model = settle(evidence, _elsewhere(_best(ends)[1], seed + n), seed=seed + n)
+        ends.append((model.judge(evidence.held, repeats=REPEATS, seed=seed + 500), model))
+    return ends
+
+
+def _best(ends: Ends) -> tuple[Judgement, Model]:
+    return min(ends, key=lambda pair: pair[0].error)
+
+
+def _equal(ends: Ends) -> list[Model]:
+    """Return the ends whose error is about that of the best."""
+    least = _best(ends)[0].error
+    return [model for judged, model in ends if judged.error < max(1.25 * least, least + 0.25)]
+
+
+def _remarks(judgement: Judgement, starts: int, good: int) -> list[str]:
+    """Return what is to be said of a minimum that may be a poor one, and of an error that stays."""
+    out = []
+    if good < 2:
+        out.append(
+            f"a poor minimum is possible: of {starts} starts only one came to this error; "
+            "record more motion, or free fewer parameters"
+        )
+    if judgement.error > judgement.gate:
+        out.append(
+            f"the error stays at {judgement.error:.2g}, above {judgement.gate:.2g}: "
+            "the model lacks something, which dase diagnose looks for"
+        )
+    return out
+
+
+def _elsewhere(model: Model, seed: int) -> Model:
+    """Return the model well away from where it is."""
+    rng = np.random.default_rng([seed, 11])
+    low, high = model.space.bounds()
+    place = np.clip(model.place + rng.choice([-0.5, 0.5], len(model.place)), low, high)
+    return replace(model, place=place)
+
+
+def disagreements(best: Model, ends: Sequence[Model], values: dict[str, Estimate]) -> list[str]:
+    """Return a sentence for each parameter in which equally good ends differ."""
+    out = []
+    for n, axis in enumerate(best.space.axes):
+        places = np.array([m.place[n] for m in ends])
+        low, high = (float(axis.to_place(v)) for v in (values[axis.name].low, values[axis.name].high))
+        if np.ptp(places) > max(AGREE * 0.5 * (high - low), NEAR):
+            found = ", ".join(f"{float(axis.to_value(p)):.3g}" for p in sorted(places))
+            out.append(f"{axis.name}: starts end at {found}; the data do not say which")
+    return out
+
+
+def outside(model: Model) -> list[str]:
+    """Return a sentence for each parameter beyond its plausible range."""
+    return [
+        f"{axis.name} = {value:.3g} {axis.fact.unit} lies outside its plausible range, "
+        f"{axis.fact.plausible[0]:g} to {axis.fact.plausible[1]:g}"
+        for axis, value in _values(model)
+        if not axis.fact.plausible[0] * 0.999 <= value <= axis.fact.plausible[1] * 1.001
+    ]
+
+
+def _values(model: Model) -> list[tuple[Axis, float]]:
+    return [(a, float(a.to_value(p))) for a, p in zip(model.space.axes, model.place, strict=True)]

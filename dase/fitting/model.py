@@ -1,0 +1,286 @@
+"""A model under fit: a sensor, its free parameters, and where they are."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from itertools import product
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dase.effects.base import Effect
+from dase.effects.flicker import Flicker
+from dase.effects.threshold import Threshold
+from dase.fitting.data_split import Evidence
+from dase.fitting.descent import Over, screening, searching
+from dase.fitting.parameter_space import Axis, Space, axes_of, with_values
+from dase.fitting.scheduler import Ask, Work, alone, simulated, together
+from dase.fitting.subset import Half
+from dase.probes.distance import Judgement
+from dase.simulation.sensor import Sensor
+
+Array = NDArray[np.float64]
+
+THRESHOLDS = (0.04, 0.06, 0.09, 0.12, 0.15, 0.18, 0.22, 0.27, 0.34, 0.45, 0.65)
+"""Tried for both polarities when a model is fitted from nothing."""
+
+RATIO = 2.2
+"""Most that the thresholds of a pixel differ by at the start."""
+
+SHIFTS = (-0.7, -0.4, -0.15, 0.0, 0.35)
+"""Of the logarithm of the thresholds, when an effect is tried."""
+
+SETTLED = 16
+"""Repeats that give a model's sampling errors while it is fitted."""
+
+DESCENTS = 3
+"""Descents of which the best is taken."""
+
+APART = 10_007
+"""Between their seeds."""
+
+ALIKE = 2.0
+"""Most by which the loss of another phase may grow where it becomes the present one."""
+
+ROOM = 0.3
+"""Beside a value that is seen in a measurement, one higher by this is tried: of a bus, the most events per
+second are the least it can send."""
+
+FEW_STARTS = 0.1
+"""Share of the plausible range that is left out at both ends when an effect is tried."""
+
+
+@dataclass(frozen=True)
+class Model:
+    """A sensor with free parameters at a place.
+
+    Args:
+        space: Free parameters.
+        place: Where they are, shape (P,).
+        loss: In the fit that found it.
+    """
+
+    space: Space
+    place: Array
+    loss: float = np.inf
+
+    @property
+    def sensor(self) -> Sensor:
+        """The sensor at the place."""
+        return self.space.at(self.place)
+
+    def rebase(self, half: Half, *, repeats: int, seed: int) -> Array:
+        """Make this the present model of a half; return statistics of its repeats, shape (repeats, J)."""
+        return half.rebase(self.space, self.place, repeats=repeats, seed=seed)
+
+    def judge(self, half: Half, *, repeats: int, seed: int) -> Judgement:
+        """Make this the present model of a half and return its error there."""
+        return alone(self.judging(half, repeats=repeats, seed=seed))
+
+    def judging(self, half: Half, *, repeats: int, seed: int) -> Work[Judgement]:
+        """Do what `judge` does, see `together`."""
+        values = yield from half.rebasing(self.space, self.place, repeats=repeats, seed=seed)
+        return half.judge(values, seed=seed)
+
+    def searching(
+        self,
+        half: Half,
+        *,
+        seed: int,
+        iterations: int = 4,
+        radius: float = 0.2,
+        patient: bool = False,
+        over: Over | None = None,
+    ) -> Work[Model]:
+        """Return the model with its parameters improved, see `together`."""
+        found = yield from searching(
+            half, self.space, self.place, seed=seed, iterations=iterations, radius=radius, patient=patient,
+            over=over,
+        )  # fmt: skip
+        return replace(self, place=found.place, loss=found.loss)
+
+
+def model_of(sensor: Sensor, free: Sequence[str] | None = None) -> Model:
+    """Return the model of a sensor at its own parameters."""
+    space = Space(sensor, axes_of(sensor, free))
+    return Model(space, space.places())
+
+
+def with_phase(model: Model, phase: float) -> Model:
+    """Return the model with another spread of the pixels' memories at the start."""
+    sensor = with_values(model.space.sensor, {"threshold.phase": phase})
+    return replace(model, space=replace(model.space, sensor=sensor))
+
+
+def turned(model: Model, step: float) -> list[Model]:
+    """Return a model, and where it has a lamp, also those with the lamp a step of the grid earlier and later.
+
+    What probes tell by steps hardly changes when all events are a step off, so a fit may end there.
+    """
+    names = [axis.name for axis in model.space.axes]
+    if "flicker.phase" not in names:
+        return [model]
+    at = names.index("flicker.phase")
+    lamp = model.sensor["flicker"]
+    assert isinstance(lamp, Flicker)
+    turn = step * lamp.frequency
+    out = [model]
+    for phase in (-turn, turn):
+        place = model.place.copy()
+        value = float(model.space.axes[at].to_value(place[at])) + phase
+        place[at] = model.space.axes[at].to_place((value + 1.0) % 2.0 - 1.0)
+        out.append(replace(model, place=place))
+    return out
+
+
+def fit_present(evidence: Evidence, sensor: Sensor, free: Sequence[str] | None, *, seed: int) -> Model:
+    """Fit the free parameters of a sensor: a wide look at thresholds and phase, then descents."""
+    model = model_of(sensor, free)
+    looks = [_looking(evidence.scout.view(), with_phase(model, phase), seed=seed) for phase in (0.0, 1.0)]
+    # each was judged by its own sampling errors; judge both by those of the better one
+    best = sorted(together(looks), key=lambda m: m.loss)
+    half = evidence.train.view()
+    best[0].rebase(half, repeats=12, seed=seed + 100)
+    ends = together([m.searching(half, seed=seed) for m in best])
+    return settle(evidence, min(ends, key=lambda m: m.loss), seed=seed, rounds=1)
+
+
+def _looking(half: Half, start: Model, *, seed: int) -> Work[Model]:
+    """Return the best of many thresholds."""
+    yield from half.rebasing(start.space, start.place, repeats=12, seed=seed + 100)
+    places = np.concatenate([start.place[None], _threshold_starts(start)])
+    places, losses = yield from screening(half, start.space, places, seed=seed)
+    return replace(start, place=places[0], loss=losses[0])
+
+
+def settle(evidence: Evidence, model: Model, *, seed: int, rounds: int = 2) -> Model:
+    """Refit a model by its own sampling errors, which change with it.
+
+    Each of some descents has random numbers of its own, because they end where those happen to lead, and the
+    last one begins with the other phase; the best of them by the random numbers of all is taken.
+    """
+    seeds = [seed + APART * n for n in range(DESCENTS)]
+    works = [settling(evidence, model, seed=each, rounds=rounds) for each in seeds[:-1]]
+    works.append(_from_other_phase(evidence, model, seed=seeds[-1], rounds=rounds))
+    ends = together(works)
+    half = evidence.train.view()
+    ends[0].rebase(half, repeats=SETTLED, seed=seed + 100)
+    values = simulated([Ask(half, m.space, m.place[None], each) for m in ends for each in seeds])
+    losses = np.reshape([float(half.scale.loss(value)[0]) for value in values], (len(ends), len(seeds)))
+    return ends[int(losses.mean(1).argmin())]
+
+
+def _from_other_phase(evidence: Evidence, model: Model, *, seed: int, rounds: int) -> Work[Model]:
+    """Refit a model from what pixels may have seen otherwise before the start.
+
+    Where that is wrong, all else is bent to make up for it, and the right one looks no better before all is
+    fitted again.
+    """
+    half = evidence.train.view()
+    yield from half.rebasing(model.space, model.place, repeats=SETTLED, seed=seed + 100)
+    other = yield from _turned(model).searching(half, seed=seed, iterations=3, patient=True)
+    return (yield from settling(evidence, other, seed=seed, rounds=rounds))
+
+
+def _turned(model: Model) -> Model:
+    threshold = model.space.sensor["threshold"]
+    assert isinstance(threshold, Threshold)
+    return with_phase(model, 1.0 - threshold.phase)
+
+
+def settling(
+    evidence: Evidence,
+    model: Model,
+    *,
+    seed: int,
+    rounds: int = 2,
+    half: Half | None = None,
+    over: Over | None = None,
+) -> Work[Model]:
+    """Do what `settle` does, see `together`; `half` is the training half if the model is its present one."""
+    for turn in range(rounds):
+        if half is None or turn > 0:
+            half = evidence.train.view()
+            yield from half.rebasing(model.space, model.place, repeats=SETTLED, seed=seed + 100)
+        other = _turned(model)
+        values = yield [Ask(half, m.space, m.place[None], seed) for m in (model, other)]
+        losses = [float(half.scale.loss(value)[0]) for value in values]
+        if losses[1] < losses[0] and (yield from _as_good(evidence, other, losses[0], seed=seed)):
+            model = other
+        model = yield from model.searching(
+            half, seed=seed + turn, radius=0.12 / (1 + turn), patient=True, over=over
+        )
+    return model
+
+
+def _as_good(evidence: Evidence, model: Model, loss: float, *, seed: int) -> Work[bool]:
+    """Whether a model's loss is about as small by its own sampling errors.
+
+    By those of a model with chance in it, one without looks no worse, until it is the present one and its
+    repeats are all alike.
+    """
+    half = evidence.train.view()
+    yield from half.rebasing(model.space, model.place, repeats=SETTLED, seed=seed + 100)
+    (values,) = yield [Ask(half, model.space, model.place[None], seed)]
+    return float(half.scale.loss(values)[0]) < ALIKE * loss
+
+
+def _threshold_starts(model: Model) -> Array:
+    names = [axis.name for axis in model.space.axes]
+    at = [names.index(n) if n in names else -1 for n in ("threshold.on", "threshold.off")]
+    if min(at) < 0:
+        return model.place[None]
+    pairs = [(a, b) for a, b in product(THRESHOLDS, THRESHOLDS) if 1 / RATIO < a / b < RATIO]
+    out = np.repeat(model.place[None], len(pairs), 0)
+    for column, values in zip(at, np.array(pairs).T, strict=True):
+        out[:, column] = model.space.axes[column].to_place(values)
+    return out
+
+
+def free_of(sensor: Sensor, name: str) -> list[str]:
+    """Return the names of the parameters of an effect that a fit may change; there may be none."""
+    return [axis.name for axis in axes_of(sensor) if axis.name.split(".")[0] == name]
+
+
+def added(present: Model, effect: Effect) -> Model:
+    """Return the present model with an effect added, all of whose parameters are free."""
+    sensor = present.sensor.with_effect(effect)
+    old = [axis.name for axis in present.space.axes]
+    # read off the events of all pixels, a lamp's frequency is better than a fit to a few makes it
+    new = [name for name in free_of(sensor, effect.name) if name != "flicker.frequency"]
+    return model_of(sensor, [*old, *new])
+
+
+def starts(model: Model, effect: Effect, *, few: bool = False) -> Array:
+    """Return places from which an effect is tried: its strength and its character, at several thresholds."""
+    axes = model.space.axes
+    columns, choices, seen = [], [], False
+    for n, axis in enumerate(axes):
+        if axis.name.split(".")[0] == effect.name:
+            columns.append(n)
+            seen |= axis.fact.seen
+            tried = _tried(axis, float(model.place[n]))
+            choices.append(tried[::2] if few and axis.main and len(tried) > 2 else tried)
+    thresholds = [n for n, axis in enumerate(axes) if axis.name in ("threshold.on", "threshold.off")]
+    out = []
+    for combination in product(*choices):
+        for shift in SHIFTS[1::2] if few and not seen else SHIFTS:
+            place = model.place.copy()
+            place[columns] = combination
+            place[thresholds] += shift
+            out.append(place)
+    return np.array(out)
+
+
+def _tried(axis: Axis, present: float) -> list[float]:
+    low, high = (float(axis.to_place(v)) for v in axis.fact.plausible)
+    if axis.fact.seen:
+        return [present, present + ROOM]
+    if axis.main:
+        return list(low + (high - low) * np.linspace(FEW_STARTS, 1 - FEW_STARTS, 6))
+    if axis.fact.unit == "turns":
+        return [float(axis.to_place(turn)) for turn in np.linspace(0, 1, 8, endpoint=False)]
+    if axis.name.split(".")[1] in ("dark", "slope", "damping", "knee", "rate", "cutoff"):
+        return [present, low + 0.9 * (high - low)]
+    return [present]

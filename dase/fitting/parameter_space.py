@@ -1,0 +1,191 @@
+"""Free parameters of a sensor, and the space in which they are searched."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, fields, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dase.effects.base import Effect, Parameter
+from dase.errors import InputError, nearest
+from dase.simulation.sensor import Sensor
+
+Array = NDArray[np.float64]
+
+PHASE = 0.125
+"""Unit along a phase [turns]: beyond it, statistics do not run along straight lines."""
+
+WIDER = 3.0
+"""A fit may leave the plausible range by this factor, and then says so."""
+
+
+@dataclass(frozen=True)
+class Axis:
+    """One free parameter.
+
+    Args:
+        name: `effect.parameter`.
+        fact: What the effect says about it.
+        low: Least value of the search.
+        high: Largest value of the search.
+        log: Whether the search goes by factors.
+        span: How long the range is in units of the search, where it does not go by factors.
+    """
+
+    name: str
+    fact: Parameter
+    low: float
+    high: float
+    log: bool
+    span: float = 2.0
+
+    @property
+    def main(self) -> bool:
+        """Whether it switches its effect off."""
+        return self.fact.off is not None
+
+    def to_place(self, value: Any) -> Any:
+        """Return where a value lies: a unit is a factor e, or a part of the range."""
+        value = np.clip(value, self.low, self.high)
+        if self.log:
+            return np.log(value)
+        return self.span * (value - self.low) / (self.high - self.low)
+
+    def to_value(self, place: Any) -> Any:
+        """Return the value at a place, the nearest one in range."""
+        if self.log:
+            value = np.exp(np.clip(place, math.log(self.low), math.log(self.high)))
+        else:
+            value = self.low + np.clip(place, 0.0, self.span) * (self.high - self.low) / self.span
+        return np.clip(value, self.low, self.high)  # the exponential of a logarithm may be a bit off
+
+    def bounds(self) -> tuple[float, float]:
+        """Return the places of the ends."""
+        return float(self.to_place(self.low)), float(self.to_place(self.high))
+
+
+def axis(effect: str, fact: Parameter) -> Axis:
+    """Return the axis of one parameter, somewhat wider than its plausible range."""
+    low, high = fact.plausible
+    if fact.unit == "turns":
+        low, high = fact.bounds
+    log = low > 0
+    if log:
+        low, high = low / WIDER, high * WIDER
+    low, high = max(low, fact.bounds[0]), min(high, fact.bounds[1])
+    span = (high - low) / PHASE if fact.unit == "turns" else 2.0
+    return Axis(f"{effect}.{fact.name}", fact, low, high, log, span)
+
+
+@dataclass(frozen=True)
+class Space:
+    """Free parameters of a sensor.
+
+    Args:
+        sensor: Fixed parameters are its own.
+        axes: The free ones.
+    """
+
+    sensor: Sensor
+    axes: tuple[Axis, ...]
+
+    def places(self) -> Array:
+        """Return where the sensor lies, shape (P,)."""
+        return np.array([axis.to_place(value_of(self.sensor, axis.name)) for axis in self.axes])
+
+    def bounds(self) -> Array:
+        """Return the least and the largest places, shape (2, P)."""
+        return np.array([axis.bounds() for axis in self.axes]).T.reshape(2, -1)
+
+    def vectors(self, places: Array) -> NDArray[np.float32]:
+        """Return the parameter vectors at some places, shape (B, all parameters)."""
+        places = np.atleast_2d(places)
+        names = self.sensor.parameter_names()
+        out = np.repeat(self.sensor.parameters()[None], len(places), 0)
+        for n, axis in enumerate(self.axes):
+            if axis.name in names:  # effects behind the pixels have no place there
+                out[:, names.index(axis.name)] = axis.to_value(places[:, n])
+        return out
+
+    def at(self, place: Array) -> Sensor:
+        """Return the sensor at a place."""
+        return with_values(
+            self.sensor,
+            {axis.name: float(axis.to_value(p)) for axis, p in zip(self.axes, place, strict=True)},
+        )
+
+
+def value_of(sensor: Sensor, name: str) -> float:
+    """Return the parameter `effect.parameter` of a sensor."""
+    effect, parameter = name.split(".")
+    return float(getattr(sensor[effect], parameter))
+
+
+def with_values(sensor: Sensor, values: Mapping[str, float]) -> Sensor:
+    """Return the sensor with some parameters set."""
+    for name in dict.fromkeys(key.split(".")[0] for key in values):
+        mine = {key.split(".")[1]: value for key, value in values.items() if key.split(".")[0] == name}
+        sensor = sensor.with_effect(replace(sensor[name], **mine))
+    return sensor
+
+
+NEARBY = 0.01
+"""Relative range about its start in which the frequency of a lamp is fitted."""
+
+FIXED = (
+    "threshold.phase", "voltage_noise.dark", "row_scan.line", "timestamp.step",
+    "timestamp.jitter", "readout.depth",
+)  # fmt: skip
+"""Parameters that a search by small steps cannot find; they are set by other means."""
+
+
+def axes_of(sensor: Sensor, names: Iterable[str] | None = None) -> tuple[Axis, ...]:
+    """Return the axes of a sensor's free parameters.
+
+    Args:
+        sensor: Whose parameters.
+        names: Effects or `effect.parameter`; None for all parameters of all effects that are not off.
+
+    Raises:
+        InputError: A name that the sensor does not have.
+    """
+    every = {
+        f"{effect.name}.{p.name}": axis(effect.name, p)
+        for effect in sensor.effects
+        for p in effect.parameters()
+    }
+    if "flicker.frequency" in every:
+        # a fit finds it only nearby: elsewhere the phase has turned
+        value = value_of(sensor, "flicker.frequency")
+        every["flicker.frequency"] = replace(
+            every["flicker.frequency"], low=value * (1 - NEARBY), high=value * (1 + NEARBY), log=False,
+            span=2.0 / PHASE,
+        )  # fmt: skip
+    if names is None:
+        off = {effect.name for effect in sensor.effects if effect.is_off() and effect.name != "threshold"}
+        return tuple(a for n, a in every.items() if n not in FIXED and n.split(".")[0] not in off)
+    chosen = []
+    for name in names:
+        found = [n for n in every if n == name or (n.split(".")[0] == name and n not in FIXED)]
+        if not found:
+            known = [*every, *(e.name for e in sensor.effects)]
+            raise InputError(f"--free: the sensor has no parameter '{name}': {nearest(name, known)}")
+        chosen += found
+    return tuple(every[n] for n in every if n in chosen)
+
+
+def variants(effect: type[Effect]) -> list[Effect]:
+    """Return an effect with each combination of its words, otherwise at its defaults."""
+    out: list[Effect] = [effect()]
+    for name, words in effect.choices().items():
+        out = [replace(e, **{name: word}) for e in out for word in words]
+    return out
+
+
+def default_values(effect: Effect) -> dict[str, Any]:
+    """Return the fields of an effect."""
+    return {f.name: getattr(effect, f.name) for f in fields(effect)}

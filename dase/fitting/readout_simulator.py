@@ -1,0 +1,142 @@
+"""What is behind the pixels of a model under trial: what the probes feel of it, events that go through."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+from dataclasses import replace
+from functools import partial
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dase.effects.readout import Bus, Readout
+from dase.effects.row_scan import RowScan
+from dase.effects.stream import StreamEffect
+from dase.effects.timestamp import Timestamp
+from dase.events import Events
+from dase.fitting.bus_load import Load
+from dase.kernels import launch, pixel_stages
+from dase.probes.stimulus import Stimulus
+from dase.probes.timestamp_patterns import Structure
+from dase.scenes.scene import Scene
+from dase.simulation.pixel_array import Pixels
+from dase.simulation.readout_chain import rows_of
+from dase.simulation.sensor import Sensor
+
+ROOM = {"cpu": 2048, "cuda": 64}
+"""Events per pixel that there is room for: a model that sends more is run again. On a CPU room costs nothing
+before it is used."""
+
+FELT = 0.25
+"""Delays below this share of a step of the grid are not felt."""
+
+
+def felt(stimulus: Stimulus, structure: Structure, sensor: Sensor) -> tuple[StreamEffect, ...]:
+    """Return the effects behind the pixels that the probes can feel.
+
+    Small errors of the time stamps are far below the steps of the grid; they matter only where their
+    regularities are compared.
+    """
+    fine = FELT * stimulus.grid.step
+    lines = max(stimulus.width, stimulus.height)
+    compared = structure.step > 0 or structure.line > 0
+    return tuple(e for e in sensor.streams() if compared or delay_of(e, lines) > fine)
+
+
+def clock_of(effects: tuple[StreamEffect, ...], structure: Structure) -> float | None:
+    """Return the ticks of a clock that is all the probes feel behind the pixels [s], 0 for nothing.
+
+    The kernel stamps events by such a clock itself. None where events have to be stored and go through what
+    is behind the pixels.
+    """
+    if not effects:
+        return 0.0
+    clock = effects[0]
+    if len(effects) > 1 or not isinstance(clock, Timestamp) or clock.jitter or not clock.step:
+        return None
+    same = structure.line == 0 and structure.step in (0.0, clock.step)
+    return clock.step if same else None
+
+
+def emitted(
+    stimulus: Stimulus, sensor: Sensor, vectors: NDArray[Any], seeds: NDArray[np.int64]
+) -> list[Events]:
+    """Return the events that leave the pixels, of each model."""
+    bare = replace(sensor, effects=tuple(e for e in sensor.effects if not isinstance(e, StreamEffect)))
+    kind = "cuda" if stimulus.device.is_cuda else "cpu"
+
+    def out(rows: slice) -> list[Events]:
+        array = Pixels(
+            bare, stimulus.width, stimulus.height, pixels=stimulus.pixels, parameters=vectors[rows],
+            seed=int(seeds[rows.start]), device=str(stimulus.device), room=ROOM[kind],
+        )  # fmt: skip
+        scene = _Light(stimulus)
+        parts = [rows_of(*found, array.batch) for found in (array.emit(scene, scene.times), array.flush())]
+        # hardly any effect holds events back
+        return [Events.concatenate(row) if len(row[1]) else row[0] for row in zip(*parts, strict=True)]
+
+    if kind == "cuda" and np.all(seeds == seeds[0]):
+        return out(slice(0, len(seeds)))
+    # on a CPU one after the other: the events of a model are sorted in its caches, those of all are not
+    works = [partial(out, slice(n, n + 1)) for n in range(len(seeds))]
+    return [events for (events,) in ([work() for work in works] if kind == "cuda" else launch.each(works))]
+
+
+def sent(
+    stimulus: Stimulus, events: Events, effects: Iterable[StreamEffect], seed: int, load: Load | None = None
+) -> Events:
+    """Return what leaves the sensor.
+
+    The pixels are some of a sensor's. What the others send over a bus that all share is `load`. Where that is
+    not known, for lack of a scene that all pixels see, the bus is given as much of its bandwidth and of its
+    queue as these pixels are of all: right while it is full or free, not between.
+    """
+    until, weight = math.inf, None if load is None else load.weight(events)
+    share = len(stimulus.pixels) / (stimulus.width * stimulus.height)
+    before: list[StreamEffect] = []
+    for effect in effects:
+        reader = effect.reader(stimulus.width, stimulus.height, seed)
+        if load is not None and weight is not None and isinstance(reader, Bus):
+            events = reader.beside(events, load.others(before, seed), weight)
+        else:
+            reader = scaled(effect, share).reader(stimulus.width, stimulus.height, seed)
+            events, until = reader.push(events, until)
+        before.append(effect)
+    return replace(events, t=events.t + stimulus.grid.begin)
+
+
+class _Light(Scene):
+    """The light of a stimulus as a scene, from time 0."""
+
+    def __init__(self, stimulus: Stimulus):
+        self._stimulus = stimulus
+        self.width, self.height = stimulus.width, stimulus.height
+        self.times: NDArray[np.float64] = np.float64(stimulus.grid.step) * np.arange(stimulus.grid.steps)
+        self.duration = float(self.times[-1])
+
+    def sample_times(self) -> NDArray[np.float64]:
+        return self.times
+
+    def source(self, times: NDArray[np.float64], pixels: NDArray[np.int32], device: Any) -> tuple[str, Any]:
+        out = pixel_stages.Frames()
+        out.values = self._stimulus.array("light", lambda: self._stimulus.intensity.T)
+        return "frames", out
+
+    def frames(self, times: NDArray[np.float64], device: str = "cpu") -> NDArray[np.float32]:
+        raise NotImplementedError("some pixels are no picture")
+
+
+def delay_of(effect: StreamEffect, lines: int) -> float:
+    """Return about how late an effect behind the pixels makes events [s]; infinite where it may lose some."""
+    if isinstance(effect, Timestamp):
+        return max(effect.step, effect.jitter)
+    return lines * effect.line if isinstance(effect, RowScan) else math.inf
+
+
+def scaled(effect: StreamEffect, share: float) -> StreamEffect:
+    """Return an effect behind the pixels for a share of them."""
+    if isinstance(effect, Readout):
+        return replace(effect, rate=effect.rate * share, depth=max(1.0, effect.depth * share))
+    return effect

@@ -1,0 +1,131 @@
+"""Work that asks for simulations, done side by side: what is asked for at the same time runs in one launch.
+
+A search, a fit, a judgement is a generator: it yields what it wants simulated, gets the answers, and goes on.
+`together` runs as many of them as there are, step by step. Rows of a launch do not know of each other, so the
+sums are those that each would get alone, to the bit, and the statistics but for rounding.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Generator, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dase.fitting.batch_simulator import Order, Trials
+from dase.fitting.parameter_space import Space
+from dase.probes.accumulators import Sums, Totals, totals
+from dase.probes.statistics import statistics
+
+if TYPE_CHECKING:
+    from dase.fitting.subset import Half
+
+Array = NDArray[np.float64]
+
+Result = TypeVar("Result")
+
+
+@dataclass(frozen=True, eq=False)
+class Ask:
+    """Models that are to be simulated.
+
+    Args:
+        half: The pixels and the time.
+        space: The models' free parameters.
+        places: Where they are, shape (B, P).
+        seed: Of the random numbers.
+        repeats: Whether each model gets random numbers of its own. Then the answer is sums, else statistics,
+            shape (B, J).
+    """
+
+    half: Half
+    space: Space
+    places: Array
+    seed: int
+    repeats: bool = False
+
+
+Work = Generator[list[Ask], list[Any], Result]
+"""Yields lists of what it asks for, and gets a list of the answers."""
+
+
+def together(works: Sequence[Work[Result]], report: Callable[[float], None] | None = None) -> list[Result]:
+    """Do all works side by side and return their results; `report` is told the share that is done."""
+    work = beside(works, report)
+    try:
+        asks = next(work)
+        while True:
+            asks = work.send(simulated(asks))
+    except StopIteration as stop:
+        return list(stop.value)
+
+
+def beside(
+    works: Sequence[Work[Result]], report: Callable[[float], None] | None = None
+) -> Work[list[Result]]:
+    """Do all works side by side within another work, and return their results."""
+    results: dict[int, Result] = {}
+    answers: dict[int, list[Any] | None] = dict.fromkeys(range(len(works)))
+    while answers:
+        asked: dict[int, list[Ask]] = {}
+        for n, answer in answers.items():
+            try:
+                asked[n] = next(works[n]) if answer is None else works[n].send(answer)
+            except StopIteration as stop:
+                results[n] = stop.value
+        if asked:
+            found = iter((yield [ask for asks in asked.values() for ask in asks]))
+            answers = {n: [next(found) for _ in asks] for n, asks in asked.items()}
+        answers = answers if asked else {}
+        if report is not None:
+            report(len(results) / max(len(works), 1))
+    return [results[n] for n in range(len(works))]
+
+
+def alone(work: Work[Result]) -> Result:
+    """Do one work."""
+    return together([work])[0]
+
+
+def simulated(asks: Sequence[Ask]) -> list[Any]:
+    """Return the answer to each."""
+    orders: dict[int, tuple[Trials, list[int], list[Order]]] = {}
+    sums: dict[int, Sums] = {}
+    for n, ask in enumerate(asks):
+        trials, frame = ask.half.trials, None if ask.repeats else ask.half.frame
+        ticks = trials.ticks(ask.space.sensor)
+        if ticks and any(axis.name.startswith("timestamp.") for axis in ask.space.axes):
+            ticks = None
+        vectors = ask.space.vectors(ask.places)
+        order = Order(ask.space.sensor, vectors, ask.seed, ask.repeats, None, frame, ticks or 0.0)
+        if ticks is None:
+            effects = [trials.felt(ask.space.at(place)) for place in np.atleast_2d(ask.places)]
+            sums[n] = trials.stream_all(order, effects, ask.half.load)
+        else:
+            _, members, mine = orders.setdefault(id(trials), (trials, [], []))
+            members.append(n)
+            mine.append(order)
+    for trials, members, mine in orders.values():
+        sums.update(zip(members, trials.run_all(mine), strict=True))
+    values = _statistics([(n, ask.half, sums[n]) for n, ask in enumerate(asks) if not ask.repeats])
+    return [sums[n] if ask.repeats else values[n] for n, ask in enumerate(asks)]
+
+
+def _statistics(found: Sequence[tuple[int, Half, Sums]]) -> dict[int, Array]:
+    """Return the statistics of models, those that refer to the same worked out at once."""
+    groups: dict[int, list[tuple[int, Half, Sums]]] = {}
+    for one in found:
+        groups.setdefault(id(one[1].frame), []).append(one)
+    out: dict[int, Array] = {}
+    for members in groups.values():
+        frame = members[0][1].frame
+        parts = [totals(sums, frame) for _, _, sums in members]
+        names = ("sums", "folded", "clock", "stamps")
+        joined = [np.concatenate([getattr(p, n) for p in parts]) for n in names]
+        both = Totals(joined[0], joined[1], joined[2], joined[3], parts[0].expected)
+        ends = np.cumsum([len(p.sums) for p in parts])[:-1]
+        values = np.split(statistics(both, frame)[0], ends)
+        out.update(zip([n for n, _, _ in members], values, strict=True))
+    return out

@@ -1,0 +1,208 @@
+"""Videos opened with FFmpeg as OpenCV has it: in memory that small files cannot drive up.
+
+A file of a few kB may hold frames that take gigabytes, as black ones pack well. So the head is read before
+anything is decoded, and tells what decoding would take at most; FFmpeg is told how much it may take at once.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import os
+import re
+from collections.abc import Iterator
+from contextlib import contextmanager
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import cv2
+
+from dase.errors import InputError
+from dase.io.image_files import quiet
+
+TITLES = re.compile(rb"LIST(.{4})INFO", re.DOTALL)
+"""A list of titles in an AVI, with its length [bytes]."""
+LONGEST = 1 << 24
+"""Bytes of titles that do no harm, whatever a damaged file claims."""
+KEPT = {b"vp90": 10, b"fmp4": 6} | dict.fromkeys(
+    (b"vp80", b"mjpg", b"ffv1", b"hfyu", b"ffvh", b"mpng", b"rle ", b"dib ", b"avdn", b"apch"), 5
+)
+"""Frames that decoders keep at most, by the names that OpenCV has for them, in small letters."""
+KEPT_ELSE = 26
+"""Those of H.264 and HEVC: sixteen to refer to, the others on their way."""
+DEPTH = {b"I420": 1.5, b"Y800": 1, b"Y42B": 2, b"444P": 3, b"BGR\x18": 3, b"RGB\x18": 3, b"BGR\0": 4}
+"""Bytes of a pixel in a frame that a decoder keeps, by its format."""
+DEPTH_ELSE = 8
+UNKNOWN = b"\xff\xff\xff\xff"
+"""The format before anything was decoded."""
+TAKEN = 10
+"""Frames that are kept as grey at once, at least: of a byte per pixel each."""
+BESIDE = 7 + TAKEN
+"""Bytes of a pixel beside the decoder: blue, green and red twice, as OpenCV has them, and grey."""
+OPTIONS = "OPENCV_FFMPEG_CAPTURE_OPTIONS"
+"""Environment variable with options of FFmpeg."""
+LOG_LEVEL = "OPENCV_FFMPEG_LOGLEVEL"
+"""Environment variable with the level of FFmpeg's messages."""
+QUIET = -8
+"""The level of none at all."""
+PIECE = 1 << 22
+"""Bytes of a file that are looked at together."""
+FLOOR = 4 << 20
+"""Bytes that FFmpeg may always take at once: a frame of 4 megapixels, of which even 26 stay below 200 MiB."""
+UNTOLD = 2048, 2048
+"""Columns and rows that FFmpeg may decode, in any format, where the head of a file does not tell them."""
+RESIZING = frozenset((b"vp80", b"vp90", b"h264", b"hevc"))
+"""Codecs whose frames may change their size on the way, which take nothing larger than a plane at once."""
+NO_LIMIT = (1 << 31) - 1
+"""Bytes that FFmpeg takes at once, unless told otherwise."""
+
+
+def opened(path: Path) -> Any:
+    """Open a video with FFmpeg; raises InputError where it cannot be, or its frames are absurdly large."""
+    packed = path.stat().st_size
+    # without decoders, which would decode a frame to be asked its size; FFmpeg calls that an error
+    with _at_once(FLOOR + 2 * packed), _silent():
+        size = size_of(_capture(path, "codec_whitelist;none"))
+    if min(size) < 1:  # of MPEG-4 only the decoder knows it
+        size = UNTOLD
+    with _at_once(max(FLOOR, _plane(size, DEPTH_ELSE)) + 2 * packed):
+        return _capture(path)
+
+
+def _capture(path: Path, with_options: str | None = None) -> Any:
+    os.environ.setdefault(LOG_LEVEL, str(QUIET))  # says nothing of its own about damaged files
+    # each thread of a decoder keeps frames of its own, and there would be as many as processors
+    parameters = [cv2.CAP_PROP_N_THREADS, 1]
+    before = os.environ.get(OPTIONS)
+    if with_options is not None:
+        os.environ[OPTIONS] = with_options
+    try:
+        with quiet():  # FFmpeg alone: the others after it take as much memory as a damaged file asks for
+            capture = cv2.VideoCapture(str(path), cv2.CAP_FFMPEG, parameters)
+    finally:
+        if with_options is not None:
+            del os.environ[OPTIONS]
+            os.environ.update({} if before is None else {OPTIONS: before})
+    if not capture.isOpened():
+        raise InputError(f"video {path} cannot be decoded")
+    _refuse_huge(path, capture)
+    return capture
+
+
+def size_of(capture: Any) -> tuple[int, int]:
+    """Return columns and rows: those of the last frame, before any those that the head of the file tells."""
+    return int(capture.get(cv2.CAP_PROP_FRAME_WIDTH)), int(capture.get(cv2.CAP_PROP_FRAME_HEIGHT))
+
+
+def _name(capture: Any, which: int) -> bytes:
+    """Return the four letters of a codec or of a format of pixels."""
+    return (int(capture.get(which)) & 0xFFFFFFFF).to_bytes(4, "little")
+
+
+def needed(capture: Any) -> int:
+    """Return the bytes of memory that decoding takes at most, with `TAKEN` frames of it."""
+    width, height = size_of(capture)
+    kept = KEPT.get(_name(capture, cv2.CAP_PROP_FOURCC).lower(), KEPT_ELSE)
+    format = _name(capture, cv2.CAP_PROP_CODEC_PIXEL_FORMAT)
+    depth = DEPTH[b"I420"] if format == UNKNOWN else DEPTH.get(format, DEPTH_ELSE)
+    return int((BESIDE + kept * depth) * max(width, 0) * max(height, 0))
+
+
+def pixel_format(capture: Any) -> tuple[bytes, bytes]:
+    """Return the names of the codec and of its format of pixels, four bytes each."""
+    return _name(capture, cv2.CAP_PROP_FOURCC), _name(capture, cv2.CAP_PROP_CODEC_PIXEL_FORMAT)
+
+
+def _refuse_huge(path: Path, capture: Any) -> None:
+    """Raise InputError where a small file holds frames of an absurd size, or says so."""
+    from dase.io.source import BOMB_BYTES, refuse_bomb
+
+    (width, height), memory = size_of(capture), needed(capture)
+    try:
+        refuse_bomb(path.stat().st_size, memory)
+    except InputError as error:
+        most = BOMB_BYTES * width * height / memory / 1e6
+        always = f"such frames of up to {most:.1f} megapixels are always read"
+        raise InputError(f"video {path}: a frame of {width}x{height} {error}; {always}") from None
+
+
+@contextmanager
+def bounded(capture: Any, packed: int) -> Iterator[None]:
+    """Decode frames of no more than about the size that the head of the file says.
+
+    A frame may say another size, and OpenCV then shrinks it to that of the head without a word: all that can
+    be known beforehand is how much FFmpeg takes at once.
+
+    Args:
+        capture: The video.
+        packed: Bytes of the file; its tables and packets may take as much.
+    """
+    codec, pixels = pixel_format(capture)
+    depth = 1 if codec.lower() in RESIZING and DEPTH.get(pixels, DEPTH_ELSE) <= 3 else DEPTH_ELSE
+    with _at_once(max(FLOOR, _plane(size_of(capture), depth)) + 2 * packed):
+        yield
+
+
+def _plane(size: tuple[int, int], depth: int) -> int:
+    return depth * (max(size[0], 0) + 256) * (max(size[1], 0) + 256)  # FFmpeg adds borders
+
+
+@contextmanager
+def _at_once(most: int) -> Iterator[None]:
+    """Let FFmpeg take no more bytes at once, where its library can be told so."""
+    library = _library()
+    if library is None:
+        yield
+        return
+    library.av_max_alloc(min(most, NO_LIMIT))
+    try:
+        yield
+    finally:
+        library.av_max_alloc(NO_LIMIT)
+
+
+@contextmanager
+def _silent() -> Iterator[None]:
+    """Keep FFmpeg quiet, also where it was used before it could be told so by its environment."""
+    library = _library()
+    if library is not None:
+        library.av_log_set_level(QUIET)
+    try:
+        yield
+    finally:
+        wanted = os.environ.get(LOG_LEVEL, "")
+        if library is not None and wanted.lstrip("-").isdigit():
+            library.av_log_set_level(int(wanted))
+
+
+@lru_cache(maxsize=1)
+def _library() -> Any:
+    """Return the library of FFmpeg that comes with OpenCV; None where it is not a file of its own."""
+    home = Path(cv2.__file__).parent
+    for folder in (*home.parent.glob("opencv_*.libs"), home / ".dylibs"):  # of wheels for Linux and macOS
+        for file in folder.glob("libavutil*"):
+            library = ctypes.CDLL(str(file))
+            library.av_max_alloc.argtypes, library.av_max_alloc.restype = [ctypes.c_size_t], None
+            return library
+    return None
+
+
+def refuse_titles(path: Path) -> None:
+    """Raise InputError where a list of titles in an AVI says that it is far longer than the file.
+
+    FFmpeg takes as much memory as such a list says, and fills it with zeros, before it reads what is there.
+    It follows damaged sizes to wherever they lead, so the list may lie anywhere.
+    """
+    length = path.stat().st_size
+    with path.open("rb") as file:
+        kept = file.read(12)
+        if kept[:4] not in (b"RIFF", b"ON2 "):
+            return
+        while more := file.read(PIECE):
+            kept += more
+            for found in TITLES.finditer(kept):
+                claimed = int.from_bytes(found[1], "little")
+                if claimed > max(length, LONGEST):
+                    sizes = f"{claimed:,} bytes of titles in a file of {length:,}"
+                    raise InputError(f"video {path} is damaged: it claims {sizes}")
+            kept = kept[-11:]  # all but one byte of what is looked for

@@ -1,0 +1,160 @@
+"""Frames of a video file, decoded one after the other."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from dase.errors import InputError
+from dase.io.ffmpeg import bounded, needed, opened, pixel_format, refuse_titles, size_of
+from dase.io.image_files import decode, list_pictures, to_grey, to_levels
+
+PLAIN = bytes(4), b"BGR\x18"
+"""Code and pixels of an uncompressed AVI: OpenCV 5.0 writes beyond its memory where it turns one over."""
+
+
+class FrameReader:
+    """Frames of a file or folder, decoded when they are asked for, so that long videos need no memory.
+
+    Args:
+        path: Video file, or folder of pictures in the order of their names.
+        size: Columns and rows to resize to, or None.
+    """
+
+    def __init__(self, path: Path, size: tuple[int, int] | None = None):
+        self._path, self._size = path, size
+        if not path.exists():
+            raise InputError(f"video {path} does not exist")
+        self._files = list_pictures(path) if path.is_dir() else None
+        self._capture: Any = None
+        self._plain: tuple[int, int] | None = None
+        self.rate = 0.0
+        self.packed = sum(file.stat().st_size for file in self._files or [path])
+        """Bytes of all files."""
+        self.decoding = 0
+        """Bytes of memory that decoding takes at most, beside the frames after the first `capture.TAKEN`."""
+        self._first: tuple[int, ...] = ()
+        self._count = len(self._files) if self._files is not None else self._count_frames()
+        if self._count < 2:
+            raise InputError(f"video {path} must have at least 2 frames, got {self._count}")
+        # the chunk before and the one asked for may overlap by the frames that are stored
+        self._kept: dict[int, NDArray[np.float32]] = {}
+        self._next = 0
+        if self._files is not None:
+            self._first = decode(self._files[0]).shape[:2]
+        self.shape: tuple[int, ...] = (self._count, *(self._first if size is None else size[::-1]))
+        self.ndim = 3
+
+    def __len__(self) -> int:
+        return self._count
+
+    def __getitem__(self, index: NDArray[np.int64]) -> NDArray[np.float32]:
+        """Return the frames of increasing indices, intensity in [0, 1], shape (K, height, width)."""
+        wanted = [int(i) for i in index]
+        if self._files is not None:
+            return np.stack([self._grey(decode(self._files[i]), self._files[i]) for i in wanted])
+        out = {i: self._kept[i] for i in wanted if i in self._kept}
+        missing = [i for i in wanted if i not in out]
+        if missing and missing[0] < self._next:
+            self._capture, self._next = None, 0
+        for i in range(self._next, missing[-1] + 1 if missing else 0):
+            frame = self._decode(i)
+            if i in missing:
+                out[i] = frame
+        self._kept = {i: out[i] for i in wanted}
+        return np.stack([out[i] for i in wanted])
+
+    def levels(self) -> Iterator[NDArray[np.uint8]]:
+        """Yield all frames, 0 to 255, shape (height, width), not resized; little but a frame is kept."""
+        if self._files is not None:
+            for file in self._files:
+                yield to_levels(self._checked(decode(file), file))
+            return
+        capture = self._open()
+        for index in range(self._count):
+            yield to_levels(self._checked(self._next_of(capture, index), self._path))
+
+    def _open(self) -> Any:
+        capture = opened(self._path)
+        if self._plain is not None:
+            capture.set(cv2.CAP_PROP_FORMAT, -1)  # packets as they are
+        return capture
+
+    def _count_frames(self) -> int:
+        refuse_titles(self._path)
+        capture = self._open()
+        size = size_of(capture)
+        kind = pixel_format(capture)
+        self._plain = size if kind == PLAIN else None
+        self.rate = float(capture.get(cv2.CAP_PROP_FPS))
+        if self._plain is not None:
+            capture = self._open()
+        frame = self._read(capture)
+        if frame is None:
+            return 0
+        self.decoding = needed(capture)
+        self._first, count = frame.shape[:2], 1  # the number in the header is often wrong
+        del frame
+        while self._grab(capture) if self._plain is None else self._read(capture) is not None:
+            count += 1
+        return count
+
+    def _grab(self, capture: Any) -> bool:
+        """Decode the next frame; what is far larger than the head of the file says cannot be decoded."""
+        with bounded(capture, self.packed):
+            return bool(capture.grab())
+
+    def _read(self, capture: Any) -> NDArray[np.uint8] | None:
+        while self._grab(capture):
+            good, frame = capture.retrieve()
+            if good and self._plain is not None:
+                frame = _unpacked(capture, frame.ravel(), self._plain)
+                if frame is None:
+                    continue  # a packet of a dropped frame is empty
+            return frame if good else None
+        return None
+
+    def _next_of(self, capture: Any, index: int) -> NDArray[np.uint8]:
+        frame = self._read(capture)
+        if frame is None:
+            raise InputError(f"video {self._path}: frame {index} cannot be decoded")
+        return frame
+
+    def _decode(self, index: int) -> NDArray[np.float32]:
+        if self._capture is None:
+            self._capture = self._open()
+        frame = self._next_of(self._capture, index)
+        self._next = index + 1
+        return self._grey(frame, self._path)
+
+    def _checked(self, pixels: NDArray[Any], path: Path) -> NDArray[Any]:
+        """Return pixels; raises InputError where their size is not that of the first frame."""
+        got, want = pixels.shape[:2], self._first
+        if got != want:
+            sizes = f"{got[1]}x{got[0]}, the frames before {want[1]}x{want[0]}"
+            raise InputError(f"video: all frames must have one size, {path} has {sizes}")
+        return pixels
+
+    def _grey(self, pixels: NDArray[Any], path: Path) -> NDArray[np.float32]:
+        if self._size is None:
+            return to_grey(self._checked(pixels, path))[0]
+        grey: NDArray[np.float32] = cv2.resize(to_grey(pixels)[0], self._size, interpolation=cv2.INTER_AREA)
+        return grey
+
+
+def _unpacked(capture: Any, packet: NDArray[np.uint8], size: tuple[int, int]) -> NDArray[np.uint8] | None:
+    """Return the frame (H, W, 3) of the bytes of an uncompressed AVI, or None where some are missing."""
+    width, height = size
+    step = -(-3 * width // 4) * 4  # rows end at multiples of four bytes, in most files
+    step = step if len(packet) >= step * height else 3 * width
+    if len(packet) < step * height:
+        return None
+    frame = packet[: step * height].reshape(height, step)[:, : 3 * width].reshape(height, width, 3)
+    _, more = capture.retrieve(flag=int(capture.get(cv2.CAP_PROP_CODEC_EXTRADATA_INDEX)))
+    upward = more is not None and more.tobytes().endswith(b"BottomUp\0")  # what FFmpeg calls it
+    return frame[::-1] if upward else frame

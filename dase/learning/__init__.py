@@ -1,0 +1,1 @@
+"""Learning thresholds from recordings that are paired with nothing."""

@@ -1,0 +1,153 @@
+"""How far learned thresholds are from known ones, and how far simulated counts are from unseen real ones."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import torch
+from torch.nn import functional as F
+
+from dase.learning.moment_matching import Moments, discrepancy
+from dase.learning.scene_batches import Scenery, middle
+from dase.learning.targets import Pairs, Target, draw_noise, simulate
+from dase.networks.threshold_network import Maps, ThresholdNet
+
+
+class Exam:
+    """Fixed scenes and noise on which networks are compared.
+
+    Args:
+        scenery: Draws the scenes.
+        target: Its `truth`, where known, and its held-out pairs.
+        scenes: How many.
+        seed: Of scenes and noise.
+    """
+
+    def __init__(self, scenery: Scenery, target: Target, *, scenes: int = 16, seed: int = 12345):
+        rng, generator = np.random.default_rng(seed), torch.Generator(scenery.device).manual_seed(seed)
+        self.log = scenery.draw(rng, scenes)
+        self.grey = middle(self.log)
+        self.noise = draw_noise(self.log, generator)
+        self.truth = None if target.truth is None else target.truth(self.grey)
+        mu, sigma = self.truth or (torch.full_like(self.grey, 0.2), 0.05)
+        self.active = simulate(self.log, mu, sigma, self.noise).sum(1) > 0
+
+    @torch.no_grad()
+    def marks(self, net: ThresholdNet) -> dict[str, float]:
+        """Return numbers that describe the maps of `net`, and compare them with the truth where known.
+
+        KL is that of the learned from the true normal distribution of each pixel's threshold, averaged over
+        pixels and both polarities; differences are those of the maps [log intensity]. Slope and correlation
+        are of the learned on the true mean over active pixels.
+        """
+        maps = net(self.grey)
+        out = {
+            "mu": float(maps.mu.mean()),
+            "sigma": float(maps.sigma.mean()),
+            "mu_spread": float(maps.mu.std()),
+            "sigma_spread": float(maps.sigma.std()),
+            "ratio": float(maps.ratio),
+        }
+        return out if self.truth is None else out | self._compare(maps)
+
+    def _compare(self, maps: Maps) -> dict[str, float]:
+        assert self.truth is not None
+        (mu, sigma), (true_mu, true_sigma) = maps.by_polarity(), self.truth
+        kl = torch.log(true_sigma / sigma) - 0.5
+        kl = (kl + (sigma.square() + (mu - true_mu).square()) / (2 * true_sigma.square())).mean(1)
+        got, want = mu.mean(1)[self.active].double(), true_mu.mean(1)[self.active].double()
+        got, want = got - got.mean(), want - want.mean()
+        flat = float(want.square().mean()) < 1e-10
+        out = {
+            "kl": float(kl.mean()),
+            "kl_active": float(kl[self.active].mean()),
+            "kl_idle": float(kl[~self.active].mean()),
+            "mu_diff": float((mu - true_mu).abs().mean()),
+            "mu_diff_spread": float((mu - true_mu).abs().std()),
+            "sigma_diff": float((sigma - true_sigma).abs().mean()),
+            "sigma_diff_spread": float((sigma - true_sigma).abs().std()),
+        }
+        if not flat:
+            out["slope"] = float((got * want).mean() / want.square().mean())
+            out["correlation"] = float((got * want).mean() / (got.std() * want.std()).clamp_min(1e-12))
+        return out
+
+
+class HeldOut:
+    """Pairs that training never sees, against fixed scenes seen through a network.
+
+    The score needs no truth. It compares moments, whatever the objective, because they cannot be learned by
+    heart; boundaries and weights come from the held-out pairs and a first set of scenes.
+
+    Args:
+        scenery: Draws the scenes.
+        pairs: Held out.
+        scenes: How many to compare them with.
+        seed: Of scenes and noise.
+        doubt: Share by which means may differ for reasons that thresholds cannot cure.
+    """
+
+    def __init__(
+        self, scenery: Scenery, pairs: Pairs, *, scenes: int = 96, seed: int = 54321, doubt: float = 0.05
+    ):
+        self.scenery, self.scenes, self.seed = scenery, scenes, seed
+        self.real = [pairs.select(slice(n, n + 12)) for n in range(0, len(pairs), 12)]
+        self.like = Moments(device=scenery.device, doubt=doubt)
+        first = self.fakes(None)
+        self.like.calibrate(list(zip(first, self.real, strict=False)))
+        for some in self.real:
+            self.like.see_real(some)
+        for fake in first:
+            self.like.see_plain(Pairs(fake.grey, fake.counts, fake.counts), self.like.members(fake.grey))
+        self.like.weigh()
+
+    @torch.no_grad()
+    def fakes(self, net: Callable[[torch.Tensor], Maps] | None) -> list[Pairs]:
+        """Return the fixed scenes seen through a network, or at usual thresholds."""
+        rng = np.random.default_rng(self.seed)
+        generator = torch.Generator(self.scenery.device).manual_seed(self.seed)
+        out = []
+        for _ in range(0, self.scenes, 12):
+            log = self.scenery.draw(rng, 12)
+            grey = middle(log)
+            noise = draw_noise(log, generator)
+            if net is None:
+                out.append(Pairs(grey, simulate(log, torch.full_like(grey, 0.25), 0.06, noise)))
+            else:
+                out.append(Pairs(grey, simulate(log, *net(grey).by_polarity(), noise)))
+        return out
+
+    def score(self, net: Callable[[torch.Tensor], Maps]) -> float:
+        """Return the weighted square difference of the moments; smaller is better."""
+        return float(discrepancy(self.fakes(net), self.real, self.like))
+
+    def statistics(self, net: Callable[[torch.Tensor], Maps]) -> dict[str, float]:
+        """Return how counts and 8x8 patches of them differ from the held-out ones, in plain numbers."""
+        fake, real = (torch.cat([pairs.counts for pairs in side]) for side in (self.fakes(net), self.real))
+        out = {"score": self.score(net), "rate": float(fake.mean() / real.mean().clamp_min(1e-9))}
+        out["counts"] = 0.5 * float((histogram(fake) - histogram(real)).abs().sum())
+        sums = [F.avg_pool2d(side, 8) * 64 for side in (fake, real)]
+        spreads = [
+            (F.avg_pool2d(side.square(), 8) - F.avg_pool2d(side, 8).square()).clamp_min(0).sqrt()
+            for side in (fake, real)
+        ]
+        out["patch_sums"] = distance(sums[0], sums[1])
+        out["patch_spreads"] = distance(spreads[0], spreads[1])
+        return out
+
+
+def histogram(counts: torch.Tensor, most: int = 12) -> torch.Tensor:
+    """Return the shares of pixels with 0, 1, ... events, `most` and more in the last."""
+    whole = counts.round().long().clamp(0, most).flatten()
+    return torch.bincount(whole, minlength=most + 1).double() / len(whole)
+
+
+def distance(one: torch.Tensor, other: torch.Tensor) -> float:
+    """Return the mean distance of sorted values of log(1 + x), Wasserstein's of the first order."""
+    shares = torch.linspace(0, 1, 2001, device=one.device, dtype=torch.float64)
+    values = []
+    for side in (one, other):
+        ordered = torch.sort(torch.log1p(side.double()).flatten()).values
+        values.append(ordered[(shares * (len(ordered) - 1)).round().long()])
+    return float((values[0] - values[1]).abs().mean())

@@ -1,0 +1,337 @@
+"""From recordings to a sensor file: the work behind `dase train`."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+import torch
+
+from dase.atomic_file import replacing
+from dase.effects.learned_threshold import LearnedThreshold
+from dase.effects.mismatch import Mismatch
+from dase.effects.threshold import Threshold
+from dase.errors import InputError, nearest
+from dase.learning.adversarial import Hash
+from dase.learning.baselines import Randomised, esim, event_rate
+from dase.learning.recorded_target import Replayed, open_target
+from dase.learning.run import CHECKPOINT
+from dase.learning.scene_batches import Looks, Scenery, middle
+from dase.learning.targets import Finite, Pairs, Target, Truth, draw_noise, simulate
+from dase.learning.training import Recipe, Training
+from dase.networks.threshold_network import NetworkShape, ThresholdNet
+from dase.networks.weights_file import save_net
+from dase.scenes import image_sources
+from dase.scenes.video import VideoScene
+from dase.simulation.sensor import Sensor
+from dase.simulation.sensor_file import dump_sensor, load_sensor, presets
+from dase.simulation.simulate import count
+
+JOB, SENSOR, WEIGHTS, EXAMPLES = "job.json", "sensor.toml", "learned.safetensors", "examples.npz"
+
+TABLE = 6, 5
+"""Nodes of brightness and edge strength in the default recipe."""
+
+RECORDED_DOUBT = 0.2
+"""Share by which the moments of a recording may differ because of what its frames do not show."""
+
+PRESETS: dict[str, Recipe] = {
+    "default": Recipe(
+        objective="moments", steps=600, rate=1e-4, anchor=1.0, network=NetworkShape(table=TABLE, split=True)
+    ),
+    "tiny": Recipe(
+        objective="moments", steps=120, warmup=20, batch=4, rate=1e-4, anchor=1.0, ramp=20,
+        network=NetworkShape(channels=8, depth=2, table=TABLE, split=True),
+    ),
+    "paper": Recipe(
+        objective="wgan", steps=20_000, warmup=0, optimizer="adabelief", rate=4e-4, rate_scalars=4e-4,
+        critic_rate=4e-4, critic_cosine=True, anchor=0.0, average=0.0, surrogate="interval",
+        hash=Hash(contrast_from="events"), network=NetworkShape(literal=True),
+    ),
+}  # fmt: skip
+"""Recipes by name. `default` is the best found, `paper` the paper's literal setting, `tiny` for a CPU."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Job:
+    """What a run learns from, and what that was learned with.
+
+    Args:
+        targets: Recordings, or one sensor file or preset.
+        images: Textures of the simulator's scenes, as `dase.scenes.image_sources.open_images` takes them;
+        `frames` for the
+            windows of the recordings themselves; "" for `frames`, or `builtin` if there are none.
+        preset: One of `PRESETS`.
+        objective: `moments`, `wgan`, or "" for that of the preset.
+        window: Duration of a window [s].
+        size: Columns and rows of scenes of textures [px].
+        sequences: Simulated by a sensor file as the target.
+        pattern: Whether to learn an offset for every column and row.
+        steps: Generator steps; 0 for those of the preset.
+        seed: Of everything random.
+        backend: `cpu` or `cuda`.
+    """
+
+    targets: tuple[str, ...]
+    images: str = ""
+    preset: str = "default"
+    objective: Literal["", "moments", "wgan"] = ""
+    window: float = 0.05
+    size: tuple[int, int] | None = None
+    sequences: int = 300
+    pattern: bool = False
+    steps: int = 0
+    seed: int = 0
+    backend: str = "cpu"
+
+    def __post_init__(self) -> None:
+        if not self.images:
+            object.__setattr__(self, "images", "builtin" if self.targets and self.of_sensor else "frames")
+        if self.preset not in PRESETS:
+            raise InputError(f"there is no preset '{self.preset}': {nearest(self.preset, PRESETS)}")
+        if self.objective not in ("", "moments", "wgan"):
+            raise InputError(f"objective must be moments or wgan, got '{self.objective}'")
+        if not np.isfinite(self.window) or self.window <= 0:
+            raise InputError(f"window must be a number > 0 s, got {self.window:g}")
+        if self.steps < 0 or self.sequences < 5:
+            raise InputError(f"steps must be >= 0 and sequences >= 5, got {self.steps} and {self.sequences}")
+        if not self.targets:
+            raise InputError("name at least one recording, or a sensor file")
+        if self.backend.startswith("cuda") and not torch.cuda.is_available():
+            raise InputError(f"backend '{self.backend}' needs an NVIDIA GPU that PyTorch can use; use 'cpu'")
+
+    @property
+    def of_sensor(self) -> bool:
+        """Whether the target is a sensor file."""
+        first = self.targets[0]
+        return first in presets() or first.endswith(".toml")
+
+    def recipe(self) -> Recipe:
+        """Return how to learn."""
+        recipe = PRESETS[self.preset]
+        if self.objective == "wgan" and recipe.objective != "wgan":
+            recipe = replace(
+                recipe, objective="wgan", anchor=5.0, steps=3000, ramp=100, warmup=50, hash=Hash(size=8)
+            )
+        elif self.objective:
+            recipe = replace(recipe, objective=self.objective)
+        if self.objective == "wgan" and self.preset == "tiny":
+            recipe = replace(recipe, hash=Hash(size=16, orientations=8, coherence=1), steps=600)
+        if not self.of_sensor:
+            recipe = replace(recipe, doubt=RECORDED_DOUBT)
+        return replace(recipe, seed=self.seed, steps=self.steps or recipe.steps)
+
+    def looks(self) -> Looks:
+        """Return what scenes of textures look like."""
+        small = self.preset == "tiny"
+        width, height = self.size or ((96, 96) if small else (240, 240))
+        return Looks(
+            width=width, height=height, window=self.window, samples=12 if small else 24, regime="mixed"
+        )
+
+    def text(self) -> str:
+        """Return the job as JSON."""
+        return json.dumps(asdict(self), indent=1)
+
+
+def prepare(
+    job: Job, *, progress: Callable[[str, int, int], None] = lambda what, done, total: None
+) -> Training:
+    """Open what a job names and return the run, at its beginning.
+
+    Args:
+        job: What to learn from.
+        progress: Told what is being opened, how much of it is done, and of how much.
+
+    Raises:
+        InputError: Something is missing, damaged, or does not fit.
+    """
+    target: Target
+    if job.of_sensor:
+        if len(job.targets) > 1:
+            raise InputError(f"one sensor file is one target, got {len(job.targets)}")
+        scenery = _textures(job, job.looks())
+        target = of_sensor(
+            load_sensor(job.targets[0]), scenery, job.sequences, seed=job.seed, backend=job.backend,
+            progress=lambda done, total: progress("simulating the target", done, total),
+        )  # fmt: skip
+    else:
+        target, scenery = _recorded(job, progress)
+    recipe = job.recipe()
+    if job.pattern:
+        size = scenery.looks.width, scenery.looks.height
+        recipe = replace(recipe, network=replace(recipe.network, pattern=size))
+    smallest = min(scenery.looks.width, scenery.looks.height)
+    if recipe.objective == "wgan" and smallest < recipe.hash.size:
+        raise InputError(
+            f"patches are {recipe.hash.size} px wide, the sensor {scenery.looks.width}x{scenery.looks.height}"
+        )
+    return Training(recipe, target, scenery)
+
+
+def _textures(job: Job, looks: Looks) -> Scenery:
+    if job.images == "frames":
+        raise InputError("--images frames needs recordings; a sensor file has no frames")
+    source = image_sources.open_images(job.images)
+    small = job.preset == "tiny"
+    # a scene shows ten objects, so few of them make few different scenes, unlike the target's
+    backgrounds = 24 if small else 96
+    return Scenery(
+        source, looks, device=job.backend, seed=job.seed, backgrounds=backgrounds, objects=8 * backgrounds
+    )
+
+
+def _recorded(job: Job, progress: Callable[[str, int, int], None]) -> tuple[Target, Scenery]:
+    target, scenery = open_target(
+        [Path(name) for name in job.targets],
+        window=job.window,
+        samples=12 if job.preset == "tiny" else 16,
+        device=job.backend,
+        progress=lambda done, total: progress("reading the recordings", done, total),
+    )
+    if job.images == "frames":
+        return target, scenery
+    looks = replace(job.looks(), width=scenery.looks.width, height=scenery.looks.height)
+    return target, _textures(job, looks)
+
+
+def of_sensor(
+    sensor: Sensor,
+    scenery: Scenery,
+    sequences: int,
+    *,
+    seed: int = 0,
+    backend: str = "cpu",
+    progress: Callable[[int, int], None] = lambda done, total: None,
+) -> Finite:
+    """Simulate sequences with a sensor, as the target of the synthetic experiment.
+
+    Its thresholds are known where it has no effect but `threshold` and `mismatch`.
+    """
+    rng = np.random.default_rng([seed, 4])
+    looks = scenery.looks
+    times = np.linspace(0, looks.window, looks.samples)
+    grey, counts = [], []
+    for n in range(sequences):
+        log = scenery.draw(rng, 1)
+        frames = torch.exp(log[0]).cpu().numpy() - np.float32(1e-3)
+        scene = VideoScene(np.clip(frames, 0, 1), times)
+        found = count(scene, sensor, (-1.0, looks.window), seed=int(rng.integers(2**31)), device=backend)
+        counts.append(torch.from_numpy(found[0, 0].reshape(2, looks.height, looks.width)))
+        grey.append(middle(log)[0].cpu())
+        progress(n + 1, sequences)
+    pairs = Pairs(
+        torch.stack(grey).half().to(backend), torch.stack(counts).clamp_max(2000).half().to(backend)
+    )
+    return Finite(pairs, truth=_truth(sensor))
+
+
+def _truth(sensor: Sensor) -> Truth | None:
+    """Return the thresholds of a sensor, None where other effects change what they mean."""
+    known = {"threshold", "mismatch"}
+    if any(effect.name not in known and not effect.is_off() for effect in sensor.effects):
+        return None
+    threshold = sensor["threshold"]
+    assert isinstance(threshold, Threshold)
+    both = [threshold.off, threshold.on]
+    spread = max((effect.spread for effect in sensor.effects if isinstance(effect, Mismatch)), default=0.0)
+
+    def truth(grey: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        mu = torch.tensor(both, device=grey.device).view(1, 2, 1, 1).expand(len(grey), 2, *grey.shape[1:])
+        return mu, max(spread, 1e-3) * mu
+
+    return truth
+
+
+def begin(job: Job, out: Path, *, resume: bool) -> None:
+    """Leave the record of a job in its folder; raises InputError where another one has a checkpoint there."""
+    record = out / JOB
+    if out.exists() and not out.is_dir():
+        raise InputError(f"{out} must be a folder, but it is a file")
+    if resume and not record.is_file():
+        raise InputError(f"{out} holds no run to resume")
+    if resume and record.read_text("utf-8") != job.text():
+        raise InputError(f"{out} was begun with other options (see {record}); --resume needs the same ones")
+    if not resume and (out / CHECKPOINT).exists():
+        raise InputError(f"{out} already holds a run; give --resume to go on with it, or another folder")
+    out.mkdir(parents=True, exist_ok=True)
+    with replacing(record) as temporary:
+        temporary.write_text(job.text(), "utf-8")
+
+
+def job_in(out: Path) -> Job:
+    """Return the job of a run; raises InputError where there is none."""
+    record = out / JOB
+    if not record.is_file():
+        raise InputError(f"{out} holds no training run: {JOB} is missing")
+    table: dict[str, Any] = json.loads(record.read_text("utf-8"))
+    table["targets"] = tuple(table["targets"])
+    table["size"] = None if table["size"] is None else tuple(table["size"])
+    return Job(**table)
+
+
+@torch.no_grad()
+def write_sensor(
+    out: Path, net: ThresholdNet, *, mu: float, name: str, size: tuple[int, int] | None = None
+) -> Path:
+    """Write what was learned as a sensor file with its weights beside it; return its path.
+
+    Args:
+        out: Folder.
+        net: What was learned.
+        mu: Typical mean threshold [log intensity], which becomes the level that the maps are relative to.
+        name: Of the sensor.
+        size: Columns and rows of the camera [px], if it is one.
+    """
+    net = net.levelled(mu)
+    level, ratio = float(net.level[0].exp()), float(net.asymmetry.exp())
+    on, off = (float(np.clip(level * ratio**share, 0.01, 10.0)) for share in (0.5, -0.5))
+    save_net(out / WEIGHTS, net)
+    sensor = Sensor(
+        effects=(Threshold(on=on, off=off), LearnedThreshold(weights=WEIGHTS)), name=name, size=size
+    )
+    with replacing(out / SENSOR) as temporary:
+        temporary.write_text(dump_sensor(sensor), "utf-8")
+    return out / SENSOR
+
+
+@torch.no_grad()
+def write_examples(out: Path, training: Training, *, scenes: int = 3, seed: int = 0) -> None:
+    """Write what `dase show` draws: some scenes, their events of both sides, and the learned maps.
+
+    The events of the target are those of the same scenes where it saw them, else of others.
+    """
+    scenery, net = training.scenery, training.mean
+    rng, generator = np.random.default_rng(seed), torch.Generator(scenery.device).manual_seed(seed)
+    if isinstance(scenery, Replayed) and isinstance(training.target, Finite):
+        busy = training.target.recorded.counts.float().sum((1, 2, 3))
+        index = torch.sort(torch.topk(busy, min(4 * scenes, len(busy))).indices).values
+        index = index[:: max(len(index) // scenes, 1)][:scenes]
+        log, real = scenery.log[index].float(), training.target.recorded.select(index)
+    else:
+        log, real = scenery.draw(rng, scenes), training.target.draw(rng, scenes)
+    grey = middle(log)
+    maps = net(grey)
+    mu, sigma = maps.by_polarity()
+    counts = simulate(log, mu, sigma, draw_noise(log, generator))
+    arrays = dict(
+        grey=grey, real_grey=real.grey, real=real.counts, simulated=counts, mu=maps.mu, sigma=maps.sigma
+    )
+    with replacing(out / EXAMPLES) as temporary:
+        np.savez_compressed(temporary, **{name: value.cpu().numpy() for name, value in arrays.items()})
+
+
+def baseline(
+    kind: Literal["esim", "rate", "random"], target: Target, scenery: Scenery, *, seed: int = 0
+) -> Any:
+    """Return thresholds without learning, see `dase.learning.baselines`."""
+    if kind == "esim":
+        return esim().to(scenery.device)
+    if kind == "random":
+        return Randomised(seed)
+    pairs = target.recorded if isinstance(target, Finite) else target.draw(np.random.default_rng(seed), 96)
+    return event_rate(pairs, scenery, seed=seed).to(scenery.device)

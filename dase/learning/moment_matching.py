@@ -1,0 +1,376 @@
+"""The objective without an adversary: means of fixed features between pixels whose surroundings look alike.
+
+Pixels are put into cells by brightness and edge strength; in every cell the means
+of a dozen features of the counts are compared. What changes with the image is compared where the image is
+alike, so thresholds that depend on brightness or on edges are told from scenes that do. Nothing can be
+learned by heart: there are a few hundred numbers whatever the data.
+
+Scenes differ in speed, and that changes counts far more than thresholds do. Two things keep it out. The
+differences of all cells and features are weighted together by the inverse of their covariance between
+scenes (Hansen, Large sample properties of generalized method of moments estimators, 1982), so what speed
+does to all of them counts little, and what it leaves alone, such as the counts at an edge that has passed,
+counts much. And what a simulated scene does at thresholds that never change is known for all scenes ever
+drawn, so its part in how a batch differs from all others is taken out: a control variate.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Hashable
+from typing import Any
+
+import torch
+from torch.nn import functional as F
+
+from dase.learning import distributed
+from dase.learning.targets import Pairs
+from dase.networks.threshold_network import TINY, gradient_magnitude, looks
+
+RIDGE = 0.1
+"""Added to the variances before they are inverted, as a share."""
+
+UNSURE = 0.1
+"""The same for each feature per scene that has been seen: few scenes tell little of their covariance."""
+
+LONG = 0.99
+"""The same of the moments of columns and rows."""
+
+FORGET = 0.99
+"""Share of the regression on the reference that stays from step to step."""
+
+ANEW = 25
+"""Steps after which the weights are worked out again."""
+
+
+Members = tuple[torch.Tensor, torch.Tensor]
+"""See `Moments.members`."""
+
+
+def of_pixels(counts: torch.Tensor) -> torch.Tensor:
+    """Return features (B, 7, H, W) that depend on the counts (B, 2, H, W) of the pixel alone.
+
+    Level, its square, how busy, and how much of both.
+    """
+    level = torch.log1p(counts)
+    both = level[:, :1] * level[:, 1:]
+    return torch.cat([level, level.square(), counts / (1 + counts), both], 1)
+
+
+def with_neighbours(pixels: torch.Tensor) -> torch.Tensor:
+    """Add features of the level (the first two) between neighbours, which see the same change: (B, 13, H, W).
+
+    Their differences tell the spread of the thresholds.
+    """
+    level = pixels[:, :2]
+    rough = gradient_magnitude(level)
+    near = F.avg_pool2d(level, 3, stride=1, padding=1, count_include_pad=False)
+    return torch.cat([pixels, rough, rough.square(), near.square()], 1)
+
+
+def with_next(pixels: torch.Tensor, axis: int) -> torch.Tensor:
+    """Add differences of the level to the next pixel along `axis` only, shape (B, 11, H, W).
+
+    Those of other columns must not come into what a column is judged by.
+    """
+    last = (0, 0, 0, 1) if axis == -2 else (0, 1)
+    step = F.pad(torch.diff(pixels[:, :2], dim=axis), last)
+    return torch.cat([pixels, torch.sqrt(step.square() + TINY), step.square()], 1)
+
+
+def pixel_features(pairs: Pairs) -> torch.Tensor:
+    """Return features (B, 7, H, W) of pixels, with gradients where the pairs say how counts answer."""
+    if pairs.varied is None:
+        return of_pixels(pairs.counts)
+    return pairs.varied.follow(of_pixels, pairs.counts)
+
+
+class Cells:
+    """Running means, covariances and weights of the features in a set of cells.
+
+    Args:
+        cells: How many.
+        width: Number of features.
+        device: PyTorch device.
+        memory: Share of the fake means that stays from step to step.
+        joint: Whether the covariance is that of all cells together; else each cell has its own.
+    """
+
+    def __init__(self, cells: int, width: int, *, device: torch.device, memory: float, joint: bool):
+        self.memory, self.joint = memory, joint
+        blocks, size = (1, cells * width) if joint else (cells, width)
+
+        def zeros(*shape: int) -> torch.Tensor:
+            return torch.zeros(shape, dtype=torch.float64, device=device)
+
+        self.kept: dict[str, torch.Tensor] = {
+            name: zeros(cells, width)
+            for name in ("real_sum", "held_sum", "fake_sum", "plain_sum", "both", "square")
+        }
+        numbers = ("real_number", "held_number", "fake_number", "plain_number")
+        self.kept |= {name: zeros(cells) for name in numbers}
+        self.kept |= {"products": zeros(blocks, size, size), "scenes": zeros()}
+        self.kept |= {"real_scenes": zeros(), "fake_scenes": zeros(), "usual": zeros()}
+        self.kept["weight"] = torch.zeros(blocks, size, size, device=device)
+
+    def see_real(self, sums: torch.Tensor, number: torch.Tensor, *, held_out: bool = False) -> None:
+        """Add scenes: sums of the features (B, cells, F) over `number` (B, cells) pixels."""
+        side = "held" if held_out else "real"
+        self.kept[f"{side}_sum"] += sums.double().sum(0)
+        self.kept[f"{side}_number"] += number.double().sum(0)
+        if not held_out:
+            self.kept["real_scenes"] += len(sums)
+
+    def see_plain(self, sums: torch.Tensor, number: torch.Tensor) -> torch.Tensor:
+        """Add scenes at the reference thresholds; return by how much each is off the mean of all."""
+        kept = self.kept
+        sums, number = sums.double(), number.double()
+        kept["plain_sum"] += sums.sum(0)
+        kept["plain_number"] += number.sum(0)
+        usual = kept["plain_sum"] / kept["plain_number"].clamp_min(1)[:, None]
+        off = sums - number[..., None] * usual
+        flat = off.reshape(len(off), *kept["products"].shape[:2])
+        kept["products"] += torch.einsum("bnf,bng->nfg", flat, flat)
+        kept["scenes"] += len(sums)
+        return off
+
+    def see_fake(self, sums: torch.Tensor, number: torch.Tensor, off: torch.Tensor) -> None:
+        """Add scenes that were `off` at the reference thresholds, and forget a part of earlier ones."""
+        kept = self.kept
+        sums, number = sums.detach().double(), number.double()
+        mean = sums.sum(0) / number.sum(0).clamp_min(1)[:, None]
+        kept["both"].mul_(FORGET).add_((off * (sums - number[..., None] * mean)).sum(0))
+        kept["square"].mul_(FORGET).add_(off.square().sum(0))
+        slope = kept["both"] / kept["square"].clamp_min(1e-12)
+        kept["fake_sum"].mul_(self.memory).add_((sums - slope * off).sum(0))
+        kept["fake_number"].mul_(self.memory).add_(number.sum(0))
+        kept["fake_scenes"].mul_(self.memory).add_(len(sums))
+
+    def shift(self, means: torch.Tensor) -> None:
+        """Add to the fake means (cells, F) what a move of the thresholds does to them."""
+        self.kept["fake_sum"] += self.kept["fake_number"][:, None] * means
+
+    def off(self, *, held_out: bool = False) -> torch.Tensor:
+        """Return fake minus real means, shape (cells, F); 0 where one has no pixel."""
+        kept, side = self.kept, "held" if held_out else "real"
+        known = (kept[f"{side}_number"] > 0) & (kept["fake_number"] > 0)
+        real = kept[f"{side}_sum"] / kept[f"{side}_number"].clamp_min(1)[:, None]
+        fake = kept["fake_sum"] / kept["fake_number"].clamp_min(1)[:, None]
+        return torch.where(known[:, None], fake - real, 0.0)
+
+    def weigh(self, doubt: float = 0.0, excess: torch.Tensor | float = 1.0) -> None:
+        """Set the weights to the inverse covariance of what one scene adds to the means.
+
+        Args:
+            doubt: Share of themselves by which means differ for reasons that thresholds cannot cure.
+            excess: By how much more than chance they differ after a linear step. Where it is large, what
+                varies little is not what tells most, and the weights become those of single features.
+        """
+        kept = self.kept
+        cells, width = kept["plain_sum"].shape
+        total = kept["plain_number"].clamp_min(1)[:, None].expand(cells, width)
+        total = total.reshape(kept["products"].shape[:2]) / kept["scenes"]
+        covariance = kept["products"] / (total[:, :, None] * total[:, None, :] * kept["scenes"])
+        diagonal = covariance.diagonal(dim1=-2, dim2=-1)
+        # a feature that never varies says nothing
+        floor = 1e-6 + 1e-3 * diagonal.mean(-1, keepdim=True)
+        ridge = excess * (RIDGE + UNSURE * diagonal.shape[-1] / kept["scenes"])
+        mean = kept["real_sum"] / kept["real_number"].clamp_min(1)[:, None]
+        wrong = (doubt * mean).square().reshape(diagonal.shape) * kept["real_scenes"]
+        weight, _ = torch.linalg.inv_ex(covariance + torch.diag_embed(ridge * diagonal + floor + wrong))
+        kept["usual"].copy_((weight * covariance).sum())
+        kept["weight"].copy_(weight / (cells * width))
+
+    def slope(self, off: torch.Tensor) -> torch.Tensor:
+        """Return the derivative of half the weighted square difference by the fake means, (cells, F)."""
+        flat = off.float().reshape(self.kept["weight"].shape[:2])
+        return torch.einsum("nfg,ng->nf", self.kept["weight"], flat).reshape(off.shape)
+
+    def distance(self, off: torch.Tensor) -> torch.Tensor:
+        """Return the weighted square difference, in variances of a scene, mean over cells and features."""
+        return (self.slope(off) * off).sum()
+
+
+class Moments:
+    """Compare means of features in cells; see the module.
+
+    Args:
+        device: PyTorch device.
+        levels: Levels of brightness, and of edge strength.
+        pattern: Whether to compare columns and rows of the sensor as well.
+        memory: Share of the fake means that stays from step to step.
+        scenes: How many different real scenes there are.
+        doubt: Share by which a mean may differ for reasons that thresholds cannot cure.
+
+    Attributes:
+        excess: See `Cells.weigh`; set by what moves the thresholds.
+    """
+
+    def __init__(
+        self,
+        *,
+        device: str | torch.device,
+        levels: tuple[int, int] = (6, 5),
+        pattern: bool = False,
+        memory: float = 0.95,
+        scenes: float = math.inf,
+        doubt: float = 0.0,
+    ):
+        self.scenes, self.doubt = scenes, doubt
+        self.excess: torch.Tensor | float = 1.0
+        self.device, self.levels, self.pattern, self.memory = torch.device(device), levels, pattern, memory
+        self.boundaries: list[torch.Tensor] = []
+        self.sets: dict[str, Cells] = {}
+        self.calls = 0
+        self.held = self.anew = False
+
+    def calibrate(self, sets: list[tuple[Pairs, Pairs]]) -> None:
+        """Place the boundaries of brightness and edge strength at quantiles of both domains."""
+        found = [looks(pairs.grey) for both in sets for pairs in both]
+        for level, values in zip(self.levels, zip(*found, strict=True), strict=True):
+            pooled = torch.sort(
+                torch.cat([v.flatten()[:: max(v.numel() // 50_000, 1)] for v in values])
+            ).values
+            places = [round(n / level * (len(pooled) - 1)) for n in range(1, level)]
+            self.boundaries.append(pooled[places].contiguous())
+        distributed.alike(self.boundaries)
+        height, across = sets[0][0].grey.shape[1:]
+        self._make(across, height)
+
+    def _make(self, across: int, height: int) -> None:
+        sizes = {"look": self.levels[0] * self.levels[1]}
+        if self.pattern:
+            sizes |= {"column": across, "row": height}
+        self.sets = {
+            name: Cells(
+                size,
+                13 if name == "look" else 11,
+                device=self.device,
+                memory=self.memory if name == "look" else LONG,
+                joint=name == "look",
+            )
+            for name, size in sizes.items()
+        }
+
+    def members(self, grey: torch.Tensor) -> Members:
+        """Return which cells of looks pixels are in, 1 or 0 (B, pixels, cells), and how many (B, cells)."""
+        brightness, edge = looks(grey)
+        cell = torch.bucketize(brightness.contiguous(), self.boundaries[0]) * self.levels[1]
+        cell = (cell + torch.bucketize(edge, self.boundaries[1])).flatten(1)[..., None]
+        every = torch.arange(self.levels[0] * self.levels[1], device=self.device)
+        # numbers at once: truth values first would be another pass
+        member = torch.eq(cell, every, out=grey.new_empty((*cell.shape[:2], len(every))))
+        return member, member.sum(1)
+
+    def sums(
+        self, pairs: Pairs, members: Members | None = None
+    ) -> dict[str, tuple[torch.Tensor, torch.Tensor]]:
+        """Return sums (B, cells, F) and numbers of pixels (B, cells) for each set of cells.
+
+        Args:
+            pairs: Of which counts are summed.
+            members: What `members` returned for their images, where it is known.
+        """
+        pixels = pixel_features(pairs)
+        member, number = self.members(pairs.grey) if members is None else members
+        found = with_neighbours(pixels)
+        out = {"look": (summed(member, found.flatten(2).transpose(1, 2)), number)}
+        if self.pattern:
+            batch, _, height, width = found.shape
+            down, across = with_next(pixels, -2).sum(2), with_next(pixels, -1).sum(3)
+            out["column"] = down.transpose(1, 2), found.new_full((batch, width), height)
+            out["row"] = across.transpose(1, 2), found.new_full((batch, height), width)
+        return out
+
+    @torch.no_grad()
+    def see_real(self, real: Pairs, *, held_out: bool = False) -> None:
+        """Take real pairs in, some of them for choosing between priors only."""
+        for name, both in self.sums(real).items():
+            self.sets[name].see_real(*map(distributed.together, both), held_out=held_out)
+
+    @torch.no_grad()
+    def see_plain(self, fake: Pairs, members: Members) -> dict[str, torch.Tensor]:
+        """Take the reference counts of simulated pairs in; return how far each scene is off.
+
+        Args:
+            fake: With their reference counts.
+            members: What `members` returned for their images.
+        """
+        assert fake.reference is not None
+        found = self.sums(Pairs(fake.grey, fake.reference), members)
+        return {
+            name: self.sets[name].see_plain(*map(distributed.together, both)) for name, both in found.items()
+        }
+
+    def weigh(self) -> None:
+        """Work out the weights."""
+        for cells in self.sets.values():
+            cells.weigh(self.doubt, self.excess)
+
+    def begin(self) -> Hashable:
+        """Count a step that is about to come; return its kind, see `dase.learning.cuda_graph`."""
+        # where real scenes never come again, some batches are held out
+        self.held = self.scenes == math.inf and self.calls % 8 == 7
+        self.anew = self.calls % ANEW == 0
+        self.calls += 1
+        return None if self.anew else self.held
+
+    def loss(self, fake: Pairs, real: Pairs, *, move: bool) -> tuple[torch.Tensor, dict[str, torch.Tensor]]:
+        """Take both batches in; return the fake means of this batch along what they are off."""
+        self.see_real(real, held_out=self.held)
+        members = self.members(fake.grey)
+        plain = self.see_plain(fake, members)
+        if self.anew:
+            self.weigh()
+        total, distance = fake.counts.new_zeros(()), fake.counts.new_zeros(())
+        for name, both in self.sums(fake, members).items():
+            sums, number = map(distributed.together, both)
+            cells = self.sets[name]
+            # earlier batches say how far off the means are, this one which way they go: no bias by its noise
+            off = cells.off()
+            if move:
+                means = sums.sum(0) / number.sum(0).clamp_min(1)[:, None]
+                total = total + (cells.slope(off) * means).sum()
+            distance = distance + cells.distance(off)
+            cells.see_fake(sums, number, plain[name])
+        return total, {"distance": distance}
+
+    def state(self) -> dict[str, Any]:
+        """Return the boundaries and all running means."""
+        sets = {name: cells.kept for name, cells in self.sets.items()}
+        return {"boundaries": self.boundaries, "sets": sets, "calls": self.calls}
+
+    def load(self, state: dict[str, Any]) -> None:
+        """Take over what `state` returned."""
+        self.boundaries = [b.to(self.device) for b in state["boundaries"]]
+        self.calls = state["calls"]
+        sizes = [len(state["sets"][name]["real_sum"]) if self.pattern else 0 for name in ("column", "row")]
+        self._make(*sizes)
+        for name, kept in state["sets"].items():
+            self.sets[name].kept = {key: value.to(self.device) for key, value in kept.items()}
+
+
+def summed(member: torch.Tensor, values: torch.Tensor) -> torch.Tensor:
+    """Return the sums of values (B, N, F) over the pixels of each cell (B, N, cells), shape (B, cells, F).
+
+    In many pieces, which a GPU works at side by side; in one it took 16 times as long.
+    """
+    batch, pixels = member.shape[:2]
+    pieces = next(n for n in range(min(64, pixels), 0, -1) if pixels % n == 0)
+    a, b = (maps.reshape(batch * pieces, pixels // pieces, -1) for maps in (member, values))
+    pieced = torch.bmm(a.transpose(1, 2), b).view(batch, pieces, a.shape[2], -1)
+    return pieced.sum(1, dtype=torch.float32)
+
+
+@torch.no_grad()
+def discrepancy(fake: list[Pairs], real: list[Pairs], like: Moments) -> float:
+    """Return how far pairs are apart, with the cells and weights of an objective."""
+    total = 0.0
+    parts = [[like.sums(pairs) for pairs in side] for side in (fake, real)]
+    for name, cells in like.sets.items():
+        means = []
+        for side in parts:
+            sums = torch.stack([part[name][0].sum(0) for part in side]).sum(0)
+            number = torch.stack([part[name][1].sum(0) for part in side]).sum(0)
+            means.append(sums / number.clamp_min(1)[:, None])
+        total += float(cells.distance(means[0] - means[1]))
+    return total

@@ -1,0 +1,217 @@
+"""A camera's recordings as the target of training, and their own frames as the scenes.
+
+The recording is cut into windows. What the camera saw in each, `CameraScene` tells from its frames; the
+simulator is shown the same windows, in other order and with other noise, so that the two sides have the same
+scenes and speeds without being paired. Pixels whose scene cannot be trusted have no events on either side.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from dase.errors import InputError
+from dase.learning.scene_batches import LOG_EPS, Looks, Scenery
+from dase.learning.targets import Finite, Pairs
+from dase.recordings.recording import Recording, open_recording
+from dase.scenes.between_frames import TOLERANCE, CameraScene
+from dase.scenes.frame_motion import stretched, stretches
+
+FEWEST = 0.005
+"""Fewest events per pixel and window from which anything can be learned."""
+
+ROOM = 1 << 31
+"""Most memory of the windows' log intensities [bytes]; of a longer recording only some windows are used."""
+
+
+@dataclass(frozen=True)
+class Windows:
+    """What a camera saw and sent, window by window.
+
+    Args:
+        begin: Begin of each window [s], shape (M,).
+        log: Log intensities, float16, shape (M, K, H, W); constant where the scene is not trusted.
+        counts: Events, float32, shape (M, 2, H, W), OFF before ON; none where the scene is not trusted.
+        trusted: Share of the pixels whose scene is trusted.
+    """
+
+    begin: NDArray[np.float64]
+    log: NDArray[np.float16]
+    counts: NDArray[np.float32]
+    trusted: float
+
+
+def windows_of(
+    recording: Recording,
+    *,
+    window: float = 0.05,
+    samples: int = 16,
+    tolerance: float = TOLERANCE,
+    most: int | None = None,
+    progress: Callable[[int, int], None] = lambda done, total: None,
+) -> Windows:
+    """Cut a recording into windows.
+
+    Args:
+        recording: With frames whose times are known.
+        window: Duration [s].
+        samples: Of the log intensity, in a window.
+        tolerance: Doubt up to which a scene is trusted [log intensity].
+        most: Windows, evenly chosen; None for as many as fit into memory.
+        progress: Called with how many windows are done, and of how many.
+
+    Raises:
+        InputError: There are no frames or times, or too few events.
+    """
+    scene = _scene_of(recording)
+    begin = np.arange(scene.times[0], scene.times[-1] - window, window)
+    if len(begin) < 4:
+        raise InputError(
+            f"the frames of the recording span {scene.duration:g} s; 4 windows of {window:g} s need "
+            f"{4 * window:g} s"
+        )
+    size = 2 * samples * recording.height * recording.width
+    most = min(most or len(begin), max(ROOM // size, 4))
+    begin = begin[np.unique(np.round(np.linspace(0, len(begin) - 1, min(most, len(begin)))).astype(int))]
+    log = np.empty((len(begin), samples, recording.height, recording.width), np.float16)
+    counts = np.empty((len(begin), 2, recording.height, recording.width), np.float32)
+    kept = 0.0
+    for n, start in enumerate(begin):
+        times = start + window * np.linspace(0, 1, samples)
+        trusted = recording.mask & (scene.doubt(times[:: max(samples // 4, 1)]).max(0) <= tolerance)
+        levels = np.log(scene.frames(times) + np.float32(LOG_EPS))
+        log[n] = np.where(trusted, levels, levels[samples // 2])
+        counts[n] = np.where(trusted, _count(recording, start, start + window), 0)
+        kept += float(trusted.mean()) / len(begin)
+        progress(n + 1, len(begin))
+    rate = float(counts.sum((1, 2, 3)).mean()) / (recording.height * recording.width)
+    if rate < FEWEST:
+        raise InputError(
+            f"the recording has {rate:.2g} events per pixel in windows of {window:g} s where its frames can "
+            f"be trusted; learning needs at least {FEWEST:g}"
+        )
+    return Windows(begin, log, counts, kept)
+
+
+def _scene_of(recording: Recording) -> CameraScene:
+    if recording.frames is None or len(recording.frames) < 2:
+        raise InputError(
+            "the recording has no frames, by which events are compared where scenes are alike; record with "
+            "frames, or reconstruct them and store them with the events"
+        )
+    begin = recording.frame_times if recording.frame_begin is None else recording.frame_begin
+    if begin is None:
+        raise InputError(
+            "the frames of the recording have no times, so they cannot be laid beside the events"
+        )
+    scene = CameraScene(recording.frames, begin, recording.frame_end)
+    if not stretched(recording.frames):
+        return scene
+    gains = stretches([scene.intensity(k) for k in range(len(scene))])
+    return CameraScene(recording.frames, begin, recording.frame_end, gains=gains)
+
+
+def _count(recording: Recording, begin: float, end: float) -> NDArray[np.float32]:
+    events = recording.events
+    first, last = np.searchsorted(events.t, (begin, end))
+    some = slice(int(first), int(last))
+    place = (
+        events.p[some].astype(np.int64) * recording.height + events.y[some]
+    ) * recording.width + events.x[some]
+    found = np.bincount(place, minlength=2 * recording.height * recording.width)
+    return found.reshape(2, recording.height, recording.width).astype(np.float32)
+
+
+class Replayed(Scenery):
+    """Scenes that are the windows of a recording, on a device."""
+
+    def __init__(self, windows: Windows, *, window: float, device: str | torch.device = "cpu"):
+        samples, height, width = windows.log.shape[1:]
+        self.looks = Looks(width=width, height=height, window=window, samples=samples)
+        self.device = torch.device(device)
+        self.log = torch.from_numpy(windows.log).to(self.device)
+
+    def numbers(self, rng: np.random.Generator, count: int) -> NDArray[np.int32]:
+        """Choose `count` windows."""
+        index = rng.choice(len(self.log), size=count, replace=count > len(self.log))
+        return np.asarray(index, np.int32)
+
+    def render(self, numbers: torch.Tensor, count: int) -> torch.Tensor:
+        """Return the log intensities of windows, shape (count, samples, height, width)."""
+        return self.log[numbers[:count].long()].float()
+
+
+def open_target(
+    paths: Sequence[Path],
+    *,
+    window: float = 0.05,
+    samples: int = 16,
+    held_out: float = 0.2,
+    until: float | None = None,
+    device: str | torch.device = "cpu",
+    progress: Callable[[int, int], None] = lambda done, total: None,
+) -> tuple[Finite, Replayed]:
+    """Open recordings of one camera as a target, and their windows as scenes.
+
+    Args:
+        paths: Files.
+        window: Duration of a window [s].
+        samples: Of the log intensity, in a window.
+        held_out: Share of the windows kept for choosing between models: the last ones of each recording.
+        until: Time at which learning stops in each recording [s from its begin]; None for its end.
+        device: PyTorch device.
+        progress: Called with how many windows are done, and of how many.
+
+    Raises:
+        InputError: A file cannot be read, is of another size, or holds too little.
+    """
+    found: list[Windows] = []
+    shape = None
+    for path in paths:
+        recording = open_recording(path)
+        recording = recording.masked(~recording.hot)
+        if until is not None:
+            recording = recording.slice(recording.begin, recording.begin + until)
+        size = (recording.width, recording.height)
+        shape = shape or size
+        if size != shape:
+            raise InputError(
+                f"{path} is of a {size[0]}x{size[1]} sensor, those before it of {shape[0]}x{shape[1]}"
+            )
+        try:
+            found.append(windows_of(recording, window=window, samples=samples, progress=progress))
+        except InputError as error:
+            raise InputError(f"{path}: {error}") from error
+    return _joined(found, held_out, window, device)
+
+
+def _joined(
+    found: list[Windows], held_out: float, window: float, device: str | torch.device
+) -> tuple[Finite, Replayed]:
+    """Return target and scenes, the held-out windows of all recordings last."""
+    order: list[int] = []
+    rest: list[int] = []
+    start = 0
+    for part in found:
+        cut = len(part.begin) - max(int(round(held_out * len(part.begin))), 1)
+        order += range(start, start + cut)
+        rest += range(start + cut, start + len(part.begin))
+        start += len(part.begin)
+    # scenes and pairs in one order, so that a window can be looked at from both sides
+    chosen = np.array(order + rest)
+    log = np.concatenate([part.log for part in found])[chosen]
+    counts = np.concatenate([part.counts for part in found])[chosen]
+    begin = np.concatenate([part.begin for part in found])[chosen]
+    trusted = float(np.mean([part.trusted for part in found]))
+    every = Windows(begin, log, counts, trusted)
+    scenes = Replayed(every, window=window, device=device)
+    middle = np.exp(log[:, log.shape[1] // 2].astype(np.float32)) - np.float32(LOG_EPS)
+    pairs = Pairs(
+        torch.from_numpy(middle).half().to(device), torch.from_numpy(counts).clamp_max(2000).half().to(device)
+    )
+    return Finite(pairs, held_out=len(rest) / start, augment=False), scenes

@@ -1,0 +1,257 @@
+"""A training run in a folder: log, checkpoints, resuming, stopping."""
+
+from __future__ import annotations
+
+import csv
+import math
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from dase.atomic_file import replacing
+from dase.errors import InputError
+from dase.learning import distributed
+from dase.learning.evaluation import Exam, HeldOut
+from dase.learning.training import Recipe, Training
+
+CHECKPOINT, RESULT, BEST = "checkpoint.pt", "result.pt", "best.pt"
+LOG, RECIPE = "log.csv", "recipe.json"
+
+TIMED = 30
+"""Steps from which, and over which, the speed is measured first where a run is to take a given time."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Pace:
+    """How often what is done.
+
+    Args:
+        look: Steps between lines of the log.
+        save: Seconds between checkpoints; infinite for none, not even at the end.
+        seconds: Time the run may take, which sets its number of steps; None keeps the recipe's.
+        held_out: Looks between scores on held-out pairs; 0 for none.
+    """
+
+    look: int = 50
+    save: float = 30.0
+    seconds: float | None = None
+    held_out: int = 2
+
+
+class Broken(InputError):
+    """Training met a number that is not finite."""
+
+
+def run(
+    training: Training,
+    out: Path,
+    *,
+    pace: Pace | None = None,
+    resume: bool = False,
+    look: Callable[[dict[str, float]], None] = lambda row: None,
+) -> dict[str, float]:
+    """Train to the end, in the folder `out`; return the last line of the log.
+
+    Args:
+        training: The run.
+        out: Folder, made if missing.
+        pace: How often to log, look and save.
+        resume: Go on from the checkpoint in `out`.
+        look: Called with each line of the log.
+
+    Raises:
+        InputError: `out` holds another run, or nothing to resume.
+        Broken: A loss or weight is not finite; the last checkpoint is good.
+    """
+    pace = pace or Pace()
+    out.mkdir(parents=True, exist_ok=True)
+    path = out / CHECKPOINT
+    if resume:
+        if not path.is_file():
+            raise InputError(f"{out} holds no checkpoint to resume")
+        training.load(load(path, training.device))
+    elif path.exists():
+        raise InputError(f"{out} already holds a run; give --resume to go on with it, or another folder")
+    _write_recipe(out, training.recipe)
+    exam = Exam(training.scenery, training.target)
+    pairs = training.target.held_out() if pace.held_out else None
+    held = None if pairs is None else HeldOut(training.scenery, pairs)
+    return _Run(training, out, pace, exam, held, look).go()
+
+
+class _Run:
+    """The loop around the steps."""
+
+    def __init__(
+        self,
+        training: Training,
+        out: Path,
+        pace: Pace,
+        exam: Exam,
+        held: HeldOut | None,
+        look: Callable[[dict[str, float]], None],
+    ):
+        self.training, self.out, self.pace = training, out, pace
+        self.exam, self.held, self.look = exam, held, look
+        self.broken = torch.full((), -1, device=training.device)
+        self.table = None if distributed.rank() else _Table(out / LOG, training.step)
+
+    def go(self) -> dict[str, float]:
+        training = self.training
+        begin = time.perf_counter() - training.seconds
+        saved = time.perf_counter()
+        mark = max(training.step, TIMED), saved
+        row: dict[str, float] = {"step": training.step, "seconds": training.seconds} | self.exam.marks(
+            training.mean
+        )
+        while training.step < training.recipe.steps:
+            values = training.advance()
+            wrong = ~torch.isfinite(values["loss"]) & (self.broken < 0)
+            self.broken = torch.where(wrong, training.step - 1, self.broken)
+            if self.pace.seconds is not None and training.step in (TIMED, 2 * mark[0]):
+                _wait(training.device)
+                if training.step > TIMED:
+                    self._fit_time(*mark, begin)
+                mark = training.step, time.perf_counter()
+            last = training.step == training.recipe.steps
+            if training.step % self.pace.look == 0 or last:
+                _wait(training.device)
+                training.seconds = time.perf_counter() - begin
+                row = self._row(values, last)
+                due = time.perf_counter() - saved > self.pace.save or (last and self.pace.save < math.inf)
+                if distributed.agreed(due):
+                    save(self.out / CHECKPOINT, training.state())
+                    saved = time.perf_counter()
+        save(self.out / RESULT, {"net": training.mean.state_dict(), "row": row})
+        return row
+
+    def _fit_time(self, step: int, mark: float, begin: float) -> None:
+        """Set the number of steps so that the run takes the time it may, by its speed since `mark`."""
+        training = self.training
+        assert self.pace.seconds is not None
+        now = time.perf_counter()
+        each = distributed.agreed((now - mark) / (training.step - step))
+        left = distributed.agreed(self.pace.seconds - (now - begin))
+        training.recipe = replace(training.recipe, steps=training.step + max(int(0.97 * left / each), 1))
+        _write_recipe(self.out, training.recipe)
+
+    def _row(self, values: dict[str, torch.Tensor], last: bool) -> dict[str, float]:
+        training = self.training
+        self._check()
+        if self.table is None:
+            return {}
+        row = {"step": training.step, "seconds": training.seconds}
+        row |= {name: float(value) for name, value in values.items()}
+        row |= {f"raw_{name}": value for name, value in self.exam.marks(training.net).items()}
+        row |= self.exam.marks(training.mean)
+        if self.held is not None and training.step > 0:
+            looks = training.step // self.pace.look
+            if last or looks % self.pace.held_out == 0:
+                row["held_out"] = self.held.score(training.mean)
+                if row["held_out"] < training.best:
+                    training.best = row["held_out"]
+                    save(self.out / BEST, {"net": training.mean.state_dict(), "row": row})
+        self.table.add(row)
+        self.look(row)
+        return row
+
+    def _check(self) -> None:
+        """Raise Broken where a number is not finite."""
+        training, step = self.training, int(self.broken)
+        culprit = "the loss" if step >= 0 else None
+        for name, value in training.net.named_parameters():
+            if not bool(torch.isfinite(value).all()):
+                culprit = f"the weight '{name}'"
+                break
+        if culprit is None:
+            return
+        when = f"at step {step}" if step >= 0 else f"by step {training.step}"
+        path = self.out / CHECKPOINT
+        good = f"the last good checkpoint is {path}" if path.exists() else "there is no checkpoint yet"
+        raise Broken(f"training broke {when}: {culprit} is not finite; {good}")
+
+
+class _Table:
+    """A CSV file of which every line but the last is whole, however a run ends.
+
+    Args:
+        path: File; lines after `step` of an interrupted run are dropped.
+        step: Where training begins.
+    """
+
+    def __init__(self, path: Path, step: int):
+        self.path = path
+        self.names: list[str] = []
+        self.rows: list[dict[str, str]] = []
+        if not path.exists():
+            return
+        with path.open(newline="", encoding="utf-8") as file:
+            reader = csv.DictReader(file)
+            # a line that was cut lacks columns
+            rows = [row for row in reader if None not in row.values()]
+            self.names = list(reader.fieldnames or [])
+        self.rows = [row for row in rows if step > 0 and int(float(row["step"])) <= step]
+        if self.rows:
+            self._rewrite()
+        else:
+            self.names = []
+            path.unlink()
+
+    def add(self, row: dict[str, float]) -> None:
+        """Append a line; columns that come later are added to the file."""
+        line = {name: f"{value:.6g}" for name, value in row.items()}
+        new = [name for name in row if name not in self.names]
+        self.names += new
+        self.rows.append(line)
+        if new:
+            self._rewrite()
+            return
+        with self.path.open("a", newline="", encoding="utf-8") as file:
+            csv.DictWriter(file, self.names).writerow(line)
+
+    def _rewrite(self) -> None:
+        with replacing(self.path) as temporary, temporary.open("w", newline="", encoding="utf-8") as file:
+            writer = csv.DictWriter(file, self.names)
+            writer.writeheader()
+            writer.writerows(self.rows)
+
+
+def _write_recipe(out: Path, recipe: Recipe) -> None:
+    if distributed.rank() == 0:
+        with replacing(out / RECIPE) as temporary:
+            temporary.write_text(recipe.text(), "utf-8")
+
+
+def save(path: Path, state: dict[str, Any]) -> None:
+    """Write a checkpoint, if this is the first process; it appears whole or not at all."""
+    if distributed.rank():
+        return
+    with replacing(path) as temporary:
+        torch.save(state, temporary)
+
+
+def load(path: Path, device: torch.device | str) -> dict[str, Any]:
+    """Return a checkpoint; raises InputError where it is none."""
+    try:
+        # random states are kept as Python objects of NumPy's
+        state: dict[str, Any] = torch.load(path, map_location=device, weights_only=True)
+    except Exception as error:
+        raise InputError(f"{path} is not a checkpoint of a training run: {error}") from error
+    return state
+
+
+def recipe_in(out: Path) -> Recipe:
+    """Return the recipe of the run in a folder; raises InputError where there is none."""
+    path = out / RECIPE
+    if not path.is_file():
+        raise InputError(f"{out} holds no training run: {RECIPE} is missing")
+    return Recipe.parse(path.read_text("utf-8"))
+
+
+def _wait(device: torch.device) -> None:
+    if device.type == "cuda":
+        torch.cuda.synchronize(device)

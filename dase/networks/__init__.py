@@ -1,0 +1,1 @@
+"""The network of learned thresholds, and the file of its weights."""

@@ -1,0 +1,78 @@
+"""Files of learned thresholds: the network's weights, and how it is built, as safetensors."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import asdict
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import save
+
+from dase.atomic_file import replacing
+from dase.errors import InputError
+from dase.networks.threshold_network import NetworkShape, ThresholdNet
+
+KIND = "dase.learned_threshold"
+"""Name of the file's only entry of metadata, the shape as JSON; of several the order is up to chance."""
+
+
+def save_net(path: Path, net: ThresholdNet) -> None:
+    """Write a network; the file appears whole or not at all."""
+    tensors = {name: value.detach().cpu().contiguous() for name, value in net.state_dict().items()}
+    with replacing(path) as temporary:
+        # `save_file` would let nobody else read it
+        temporary.write_bytes(save(tensors, {KIND: json.dumps(asdict(net.shape))}))
+
+
+def load_net(path: Path) -> ThresholdNet:
+    """Read a network; raises InputError where the file holds none."""
+    if not path.is_file():
+        raise InputError(f"the weights {path} do not exist; they belong beside the sensor file")
+    try:
+        with safe_open(path, "pt") as file:
+            shape = (file.metadata() or {}).get(KIND)
+            names = file.keys()
+            tensors = {name: file.get_tensor(name) for name in names}
+        if shape is None:
+            raise InputError(f"{path} does not hold learned thresholds")
+        net = ThresholdNet(shape_of(shape))
+        net.load_state_dict(tensors)
+    except (SafetensorError, RuntimeError, KeyError, ValueError, TypeError) as error:
+        raise InputError(f"{path} does not hold learned thresholds: {error}") from error
+    net.eval()
+    return net
+
+
+def shape_of(text: str) -> NetworkShape:
+    """Return the shape of a network from JSON."""
+    table = json.loads(text)
+    fixed: dict[str, Any] = {n: tuple(v) if isinstance(v, list) else v for n, v in table.items()}
+    return NetworkShape(**fixed)
+
+
+@lru_cache(maxsize=4)
+def _loaded(path: Path, changed: int) -> ThresholdNet:
+    return load_net(path)
+
+
+def predict(path: Path, grey: NDArray[np.float32]) -> tuple[NDArray[np.float32], NDArray[np.float32], float]:
+    """Return mean and spread of the thresholds for an image (H, W) in [0, 1], and the level of the mean.
+
+    Raises:
+        InputError: The file holds no network, or one for a sensor of another size.
+    """
+    net = _loaded(path, path.stat().st_mtime_ns) if path.is_file() else load_net(path)
+    size = grey.shape[1], grey.shape[0]
+    if net.shape.pattern not in (None, size):
+        made = "x".join(map(str, net.shape.pattern or ()))
+        raise InputError(f"{path} was learned for a {made} sensor, the scene is {size[0]}x{size[1]}")
+    with torch.no_grad():
+        maps = net(torch.from_numpy(np.clip(grey, 0, 1))[None])
+        level = float(net.level[0].exp())
+    return maps.mu[0].numpy(), maps.sigma[0].numpy(), level

@@ -1,0 +1,294 @@
+"""Summary statistics of events with a physical reading, and what they are called.
+
+`dase.kernels.event_probes` adds up numbers event by event; here the sums become statistics by which model and
+measurement are compared. Each belongs to a family, a row of `FAMILIES`.
+"""
+
+from __future__ import annotations
+
+from functools import lru_cache
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.fft import rfft
+from scipy.ndimage import median_filter
+
+from dase.events import Events
+from dase.kernels.event_probes import (
+    BANDS,
+    CELLS,
+    CHANGE,
+    CLASSES,
+    INTERVALS,
+    ISI,
+    LAG,
+    LAG_COUNT,
+    LAGS,
+    ODD,
+    PRODUCTS,
+    RATE,
+    REPEAT,
+    RINGS,
+    SERIAL,
+    ZONES,
+)
+from dase.probes.accumulators import Frame, Sums, Totals, totals
+
+if TYPE_CHECKING:
+    pass
+
+
+FAMILIES = {
+    "rate": "events per polarity, by what the light does and how bright it is",
+    "intervals": "time between two events of a pixel, by their polarities, at rest and moving",
+    "lag": "how the light went before and after an event, by how bright it is",
+    "repeats": "further events of a pixel in the same step of time",
+    "change": "change of the light between two events of a pixel",
+    "spread": "how differently pixels count that see the same",
+    "pixels": "pixels that are far busier than others",
+    "silent": "pixels that send nothing although they see something",
+    "space": "events by the distance from the middle of the sensor",
+    "spectrum": "how fast the rate of all pixels swings",
+    "stamps": "regularities of the time stamps; compared only where the measurement has one",
+}
+"""Families of statistics, each with the weight of all others."""
+
+TOLERANCE = 0.015
+"""Relative difference that is of no concern."""
+
+FEW = 25.0
+"""Events below which a mean over events is not compared."""
+
+SHRINK = 3.0
+"""Events of the measurement that are added to a mean of the model, which may have none."""
+
+TONES = 12
+"""Bands of frequency, from `LOWEST` to half the sampling rate."""
+
+LOWEST = 8.0
+"""[Hz]"""
+
+Array = NDArray[np.float64]
+
+
+def _layout() -> dict[str, slice]:
+    sizes = {
+        "rate": 2 * CELLS,
+        "intervals": 6 * INTERVALS,
+        "lag": LAGS * BANDS,
+        "repeats": 2 * BANDS,
+        "change": 2 * 4 * CLASSES + CLASSES,
+        "spread": 10,
+        "pixels": 3,
+        "silent": 1,
+        "space": 4 * ZONES,
+        "spectrum": TONES + 2,
+        "stamps": 2,
+    }
+    ends = np.cumsum(list(sizes.values()))
+    return {
+        name: slice(int(end - size), int(end)) for (name, size), end in zip(sizes.items(), ends, strict=True)
+    }
+
+
+LAYOUT = _layout()
+"""Place of each family in a vector of statistics."""
+
+SIZE = max(part.stop for part in LAYOUT.values())
+"""Statistics in all."""
+
+
+def zones(pixels: NDArray[np.int32], width: int, height: int) -> NDArray[np.int64]:
+    """Return the ring that each pixel lies in, shape (N,)."""
+    x, y = pixels % width - 0.5 * (width - 1), pixels // width - 0.5 * (height - 1)
+    radius = np.hypot(x, y)
+    out: NDArray[np.int64] = np.searchsorted(np.quantile(radius, np.arange(1, ZONES) / ZONES), radius)
+    return out
+
+
+def statistics(found: Sums | Totals, frame: Frame) -> tuple[Array, Array]:
+    """Return statistics and how many events each rests on.
+
+    Returns:
+        Statistics, shape (B, J), and events, shape (B, J); of counts, which are given as log(count + 3), the
+        count itself.
+    """
+    of = totals(found, frame) if isinstance(found, Sums) else found
+    a = of.sums
+    odd = of.folded[:, ODD : ODD + 4]
+    parts = [
+        _counts(a[:, RATE : RATE + 2 * CELLS]),
+        _counts(a[:, ISI : ISI + 6 * INTERVALS]),
+        _means(a[:, LAG : LAG + LAGS * BANDS], np.tile(a[:, LAG_COUNT : LAG_COUNT + BANDS], LAGS)),
+        _repeats(a[:, REPEAT : REPEAT + 3 * BANDS].reshape(-1, BANDS, 3)),
+        _changes(a[:, CHANGE : CHANGE + 12 * CLASSES].reshape(-1, 4 * CLASSES, 3), a[:, SERIAL:]),
+        _spread(of.folded[:, PRODUCTS : PRODUCTS + 12], of.expected),
+        _counts(odd[:, :3]),
+        _counts(odd[:, 3:]),
+        _counts(of.folded[:, RINGS:]),
+        _spectrum(of.clock, frame),
+        (of.stamps, np.full(of.stamps.shape, 1e9 if frame.regular else 0.0)),
+    ]
+    values = np.concatenate([value for value, _ in parts], axis=1)
+    weight = np.concatenate([events for _, events in parts], axis=1)
+    if frame.measured is not None:
+        means = MEANS
+        drawn = (values * weight + SHRINK * frame.measured) / (weight + SHRINK)
+        values[:, means] = drawn[:, means]
+    return values, weight
+
+
+def _counts(counts: Array) -> tuple[Array, Array]:
+    return np.log(counts + 3.0), counts
+
+
+def _means(total: Array, events: Array) -> tuple[Array, Array]:
+    return total / np.maximum(events, 1.0), events
+
+
+def _repeats(counts: Array) -> tuple[Array, Array]:
+    second, third = (_means(counts[:, :, n], counts[:, :, 0]) for n in (1, 2))
+    return np.concatenate([second[0], third[0]], 1), np.concatenate([second[1], third[1]], 1)
+
+
+def _changes(pairs: Array, serial: Array) -> tuple[Array, Array]:
+    events = pairs[:, :, 0]
+    mean, _ = _means(pairs[:, :, 1], events)
+    deviation, _ = _means(pairs[:, :, 2], events)
+    product, count = _means(serial[:, 1::2], serial[:, 0::2])
+    return np.concatenate([mean, deviation, product], 1), np.concatenate([events, events, count], 1)
+
+
+def _spread(products: Array, expected: Array) -> tuple[Array, Array]:
+    """Split-half covariances over pixels of what is not expected, and Fano factors."""
+    # state (moving, rest), then: products over the halves by their polarities, those of a half with itself
+    of = products.reshape(-1, 2, 6)
+    e = expected.reshape(-1, 2, 2, 2)  # state, half, polarity
+    total = np.maximum(e.sum(2), 1.0)  # (B or 1, state, polarity)
+    both = np.sqrt(total[..., 0] * total[..., 1])
+    diagonal, own = of[..., [0, 3]], of[..., 4:]
+    same = diagonal * 2 / total
+    cross = (of[..., 1] + of[..., 2]) / both
+    fano = (own + 2 * diagonal) / total
+    values = np.concatenate([same, cross[..., None], fano], -1).reshape(len(of), -1)
+    events = np.concatenate([total, both[..., None], total], -1).reshape(len(e), -1)
+    return values, np.broadcast_to(events, values.shape)
+
+
+def _spectrum(clock: NDArray[np.int32], frame: Frame) -> tuple[Array, Array]:
+    """Logarithms of the power of the net rate in bands of frequency, and its swing at the measured peak."""
+    steps = clock.shape[1] // 2
+    off, on = clock[:, frame.first : steps], clock[:, steps + frame.first :]
+    net = (on - off).astype(np.float32)
+    total = np.maximum((on + off).sum(1), 1)
+    net -= net.mean(1, keepdims=True)
+    count = net.shape[1]
+    window, mean = _tones(count, frame.step)
+    power = np.abs(rfft(net * window, axis=1)) ** 2 / count
+    bands = power @ mean
+    swing = net @ _swing(frame.peak, frame.first, count, frame.step) / total[:, None]
+    values = np.concatenate([np.log(bands + 0.5), swing], 1).astype(np.float64)
+    return values, np.repeat(total[:, None], values.shape[1], 1).astype(np.float64)
+
+
+@lru_cache(maxsize=8)
+def _tones(count: int, step: float) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Return the window, shape (T,), and what makes means over bands of the power, shape (F, TONES)."""
+    edges = np.geomspace(LOWEST, 0.5 / step, TONES + 1)
+    inside = np.searchsorted(edges, np.fft.rfftfreq(count, step))[:, None] == np.arange(1, TONES + 1)
+    mean = (inside / np.maximum(inside.sum(0), 1)).astype(np.float32)
+    return np.hanning(count).astype(np.float32), mean
+
+
+@lru_cache(maxsize=8)
+def _swing(peak: float, first: int, count: int, step: float) -> NDArray[np.float32]:
+    """Return cosine and minus sine of a frequency `peak` [Hz] at steps [s] from `first` on, shape (T, 2)."""
+    turn = 2 * np.pi * peak * step * (first + np.arange(count))
+    return np.stack([np.cos(turn), -np.sin(turn)], 1).astype(np.float32)
+
+
+def peak_of(clock: NDArray[np.int64], step: float) -> float:
+    """Return the frequency at which the net rate swings most above what is usual about it [Hz]."""
+    steps = clock.shape[-1] // 2
+    net = (clock[..., steps:] - clock[..., :steps]).reshape(-1).astype(np.float64)
+    net -= net.mean()
+    size = 8 * steps
+    power = np.abs(np.fft.rfft(net * np.hanning(steps), size)) ** 2
+    frequency = np.fft.rfftfreq(size, step)
+    usual = median_filter(power, 8 * 25, mode="nearest")
+    above = power / (usual + 1e-3 * power.max() + 1e-9)
+    above[(frequency < 20.0) | (frequency > 0.48 / step)] = 0.0
+    return float(frequency[int(above.argmax())])
+
+
+def precise(events: Events, begin: float, end: float, near: float) -> float:
+    """Return the frequency about `near` at which the net rate of all events swings most in a time [Hz]."""
+    step = 1 / (32 * near)
+    bins = int((end - begin) / step)
+    inside = (events.t >= begin) & (events.t < begin + bins * step)
+    place = np.minimum((events.t[inside] - begin) / step, bins - 1).astype(np.int64)
+    net = np.bincount(place, np.where(events.p[inside], 1.0, -1.0), bins)
+    net = (net - net.mean()) * np.hanning(bins)
+    # finer than a Fourier transform of this time has them
+    frequency = near + np.linspace(-1.5, 1.5, 121) / (end - begin)
+    power = np.abs(np.exp(-2j * np.pi * frequency[:, None] * step * np.arange(bins)) @ net) ** 2
+    top = int(power[1:-1].argmax()) + 1
+    left, middle, right = np.log(power[top - 1 : top + 2] + 1e-300)
+    shift = 0.5 * (left - right) / min(left - 2 * middle + right, -1e-12)
+    return float(frequency[top] + np.clip(shift, -1, 1) * (frequency[1] - frequency[0]))
+
+
+def _is_mean() -> NDArray[np.bool_]:
+    out = np.zeros(SIZE, np.bool_)
+    for name in ("lag", "repeats", "change"):
+        out[LAYOUT[name]] = True
+    return out
+
+
+MEANS = _is_mean()
+"""Which statistics are means over events."""
+
+
+def tolerance(measured: Array, events: Array) -> Array:
+    """Return what each statistic may be off by: it is of no concern, or a matter of one event, (J,)."""
+    out = TOLERANCE + 1.0 / (events + 3.0)
+    lag = np.abs(measured[LAYOUT["lag"]]).reshape(LAGS, BANDS)
+    scale = np.repeat(lag.max(0)[None], LAGS, 0).reshape(-1)
+    out[LAYOUT["lag"]] *= scale
+    change = np.abs(measured[LAYOUT["change"]])
+    typical = 0.5 * np.median(change[: 4 * CLASSES]) if change.any() else 1.0
+    out[LAYOUT["change"]] *= np.maximum(change, typical)
+    out[LAYOUT["change"]][-CLASSES:] *= typical
+    out[LAYOUT["repeats"]] *= np.maximum(measured[LAYOUT["repeats"]], 0.1)
+    out[LAYOUT["spectrum"]] = 0.1
+    out[LAYOUT["spectrum"]][TONES:] = 0.005
+    out[LAYOUT["stamps"]] = 0.02
+    out[LAYOUT["spread"]] = 0.015 * np.maximum(1.0, np.abs(measured[LAYOUT["spread"]]))
+    return out
+
+
+def compared(measured: Array, events: Array) -> NDArray[np.bool_]:
+    """Return which statistics rest on enough events of the measurement to be compared, (J,)."""
+    out = np.ones(SIZE, np.bool_)
+    out[MEANS] = events[MEANS] >= FEW
+    out[LAYOUT["spread"]] = events[LAYOUT["spread"]] >= FEW
+    out[LAYOUT["spectrum"]] = events[LAYOUT["spectrum"]] >= 10 * FEW
+    out[LAYOUT["stamps"]] = (events[LAYOUT["stamps"]] > 0) & (measured[LAYOUT["stamps"]] > 0)
+    return out
+
+
+WORDS = {
+    "rate": "how many events come",
+    "intervals": "the time between events of a pixel",
+    "lag": "how late events come",
+    "repeats": "bursts of events",
+    "change": "the contrast from event to event",
+    "spread": "how unlike pixels are",
+    "pixels": "busy pixels",
+    "silent": "silent pixels",
+    "space": "events in the middle and in the corners",
+    "spectrum": "rhythms of the event rate",
+    "stamps": "the clock of the time stamps",
+}
+"""Family of statistics to what differs."""

@@ -1,0 +1,225 @@
+"""What some pixels of a scene see: the light that drives a model, and the cells events are sorted into."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+import warp as wp
+from numpy.typing import NDArray
+from scipy.ndimage import maximum_filter1d, minimum_filter1d
+
+from dase.kernels import launch, pixel_codegen_trials
+from dase.kernels.event_probes import BANDS, CELLS, KINDS, MASKED, RESTING
+from dase.scenes.scene import Scene
+
+STILL = 0.02
+"""Light that changes by less is at rest [log intensity]."""
+
+REST = (0.2, 0.06)
+"""How long the light has been at rest for the first two kinds of cells [s]."""
+
+SPAN = 0.016
+"""The light's change is taken over this time [s]."""
+
+EDGES = (-0.25, -0.04, 0.04, 0.25)
+"""Between the five bins of the change [log intensity]."""
+
+GROWTH = 0.3
+"""Steps grow by this share of the time since the light of a pixel last changed: coarse where nothing happens,
+yet fine enough for filters that still settle."""
+
+BLOCK = 256
+"""Frames rendered at once."""
+
+Trust = Callable[[NDArray[np.float64], NDArray[np.int32]], NDArray[np.bool_]]
+"""Times (K,) and pixels (N,) to whether the scene is to be trusted there, shape (K, N)."""
+
+
+@dataclass(frozen=True)
+class Grid:
+    """Equal steps of time.
+
+    Args:
+        begin: Time of point 0 [s].
+        step: From point to point [s].
+        steps: Number of points.
+    """
+
+    begin: float
+    step: float
+    steps: int
+
+    @property
+    def times(self) -> NDArray[np.float64]:
+        """Times of the points [s]."""
+        out: NDArray[np.float64] = self.begin + np.float64(self.step) * np.arange(self.steps)
+        return out
+
+
+@dataclass(eq=False)
+class Stimulus:
+    """Light of some pixels on a grid of time.
+
+    Args:
+        pixels: Row-major indices, shape (N,).
+        width: Columns of the sensor.
+        height: Rows of the sensor.
+        grid: The time.
+        intensity: Linear, float32, shape (N, T).
+        cell: Cell of each pixel and step, uint8, shape (N, T); `MASKED` where nothing is compared.
+        log_eps: Added to intensities before the logarithm.
+        device: Where kernels run.
+        holes: Whether parts of the time of some pixels are not compared, and others after them are.
+    """
+
+    pixels: NDArray[np.int32]
+    width: int
+    height: int
+    grid: Grid
+    intensity: NDArray[np.float32]
+    cell: NDArray[np.uint8]
+    log_eps: float
+    device: Any
+    holes: bool = False
+    _kept: dict[str, Any] = field(default_factory=dict, repr=False)
+
+    @property
+    def level(self) -> NDArray[np.float32]:
+        """Log intensity, shape (N, T)."""
+        out: NDArray[np.float32] = np.log(self.intensity + np.float32(self.log_eps))
+        return out
+
+    def exposure(self) -> NDArray[np.float64]:
+        """Return the time spent in each cell, summed over pixels [px s], shape (CELLS,)."""
+        steps = np.bincount(self.cell.reshape(-1), minlength=256)[:CELLS]
+        out: NDArray[np.float64] = np.float64(self.grid.step) * steps
+        return out
+
+    def part(self, count: int) -> Stimulus:
+        """Return the stimulus of the first `count` pixels."""
+        cut = slice(0, count)
+        return Stimulus(
+            self.pixels[cut], self.width, self.height, self.grid, self.intensity[cut], self.cell[cut],
+            self.log_eps, self.device, self.holes,
+        )  # fmt: skip
+
+    def history(self, finer: int = 0) -> Any:
+        """Return the light as a kernel of many models takes it.
+
+        Args:
+            finer: 0 leaves out samples where nothing changes; n > 0 takes n samples per step everywhere.
+        """
+        name = f"history {finer}"
+        if name not in self._kept:
+            self._kept[name] = self._dense(finer) if finer else self._sparse()
+        return self._kept[name]
+
+    def array(self, name: str, make: Callable[[], NDArray[Any]]) -> Any:
+        """Return an array on the device, moved there once."""
+        if name not in self._kept:
+            self._kept[name] = wp.array(np.ascontiguousarray(make()), device=self.device)
+        return self._kept[name]
+
+    def _sparse(self) -> Any:
+        count, steps = self.intensity.shape
+        changed = np.zeros((count, steps), np.bool_)
+        changed[:, 1:] = self.intensity[:, 1:] != self.intensity[:, :-1]
+        index = np.arange(steps)
+        since = index - np.maximum.accumulate(np.where(changed, index, 0), axis=1)
+        gaps = [0]
+        while gaps[-1] < steps:
+            gaps.append(gaps[-1] + max(1, int(GROWTH * gaps[-1])))
+        due = np.zeros(steps + 1, np.bool_)
+        due[[gap for gap in gaps if gap <= steps]] = True
+        keep = due[since]
+        keep[:, :-1] |= changed[:, 1:]  # the end of each rest
+        keep[:, [0, 1, -1]] = True  # a pixel's phase is set by where the light goes in the first step
+        start = np.concatenate([[0], np.cumsum(keep.sum(1))])
+        row, at = np.nonzero(keep)
+        return self._arrays(start, at, self.intensity[row, at], self.grid.step)
+
+    def _dense(self, finer: int) -> Any:
+        count, steps = self.intensity.shape
+        points = (steps - 1) * finer + 1
+        level = self.level
+        at = np.arange(points) / finer
+        below = np.minimum(at.astype(np.int64), steps - 2)
+        share = (at - below).astype(np.float32)
+        between = level[:, below] * (1 - share) + level[:, below + 1] * share
+        light = np.maximum(np.exp(between) - np.float32(self.log_eps), 0)
+        start = points * np.arange(count + 1)
+        return self._arrays(
+            start, np.tile(np.arange(points), count), light.reshape(-1), self.grid.step / finer
+        )
+
+    def _arrays(
+        self, start: NDArray[Any], stamp: NDArray[Any], light: NDArray[np.float32], step: float
+    ) -> Any:
+        out = pixel_codegen_trials.History()
+        out.start = wp.array(start.astype(np.int32), device=self.device)
+        out.stamp = wp.array(stamp.astype(np.int32), device=self.device)
+        out.intensity = wp.array(light.astype(np.float32), device=self.device)
+        out.voltage = wp.array(np.log(light + np.float32(self.log_eps)), device=self.device)
+        out.step = step
+        return out
+
+
+def light_of(scene: Scene, times: NDArray[np.float64], pixels: NDArray[np.int32]) -> NDArray[np.float32]:
+    """Return the linear intensity of some pixels at some times, shape (N, T)."""
+    out = np.empty((len(pixels), len(times)), np.float32)
+    for first in range(0, len(times), BLOCK):
+        part = times[first : first + BLOCK]
+        name, source = scene.source(part, pixels, launch.device("cpu"))
+        if name == "frames":
+            values = source.values.numpy()
+        else:
+            values = scene.frames(part).reshape(len(part), -1)[:, pixels]
+        out[:, first : first + BLOCK] = values.T
+    return out
+
+
+def sort_into_cells(
+    intensity: NDArray[np.float32], step: float, bands: NDArray[np.float64], log_eps: float
+) -> NDArray[np.uint8]:
+    """Return the cell of each pixel and step, uint8, shape (N, T).
+
+    Args:
+        intensity: Linear, shape (N, T).
+        step: Of the grid [s].
+        bands: Intensities between the bands, shape (BANDS - 1,).
+        log_eps: Added to intensities before the logarithm.
+    """
+    level = np.log(intensity + np.float32(log_eps))
+    kind = np.searchsorted(EDGES, _change(level, step)).astype(np.uint8) + RESTING
+    for number, time in reversed(list(enumerate(REST))):
+        width = max(2, round(time / step))
+        # a window that ends at the step; before the first one the light was at rest
+        shift = dict(size=width, axis=1, mode="nearest", origin=(width - 1) // 2)
+        spread = maximum_filter1d(level, **shift) - minimum_filter1d(level, **shift)
+        kind[spread < STILL] = number
+    return kind * BANDS + np.searchsorted(bands, intensity).astype(np.uint8)
+
+
+def _change(level: NDArray[np.float32], step: float) -> NDArray[np.float32]:
+    back = max(1, round(SPAN / step))
+    before = np.concatenate([np.repeat(level[:, :1], back, 1), level[:, :-back]], axis=1)
+    out: NDArray[np.float32] = level - before[:, : level.shape[1]]
+    return out
+
+
+def band_edges(intensity: NDArray[np.float32], cell_free: NDArray[np.bool_]) -> NDArray[np.float64]:
+    """Return the intensities between the bands: quantiles over the pixels and times that are compared."""
+    values = intensity[cell_free]
+    return np.quantile(values, (0.15, 0.4, 0.7)) if len(values) else np.array([0.1, 0.3, 0.6])
+
+
+__all__ = [
+    "CELLS", "KINDS", "MASKED", "Grid", "Stimulus", "Trust", "band_edges", "light_of", "sort_into_cells",
+]  # fmt: skip
+
+
+FINEST, COARSEST = 2.5e-4, 2e-3
+"""A scene's own steps are taken when they are equal and lie between these [s]; else `COMMON`."""

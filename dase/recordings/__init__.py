@@ -1,0 +1,1 @@
+"""Recordings of cameras: opening them, their statistics, and what looks odd in them."""

@@ -1,0 +1,343 @@
+"""What is in a recording: rates, intervals, hot pixels, the structure of its time stamps, what looks odd.
+
+Events are looked at piece by piece, in memory that does not grow with the recording.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from os import PathLike
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from dase import io
+from dase.events import LABELS, Events
+from dase.io.rules import TooLateError
+from dase.io.sequence import Sequence
+from dase.io.source import Picture, Size
+from dase.recordings.interval_statistics import Intervals
+
+BITS = 20  # of the place of an event in a part
+PART = 1 << BITS  # events looked at together
+SAMPLE = 1 << 14  # of the first that are asked whether they are alone; of later ones an eighth
+ALONE = 0.01  # [s] around an event in which its 3x3 pixels see no other
+HOT_EVENTS, HOT_RATIO = 10, 10.0  # a hot pixel has that many events, and that many times those around it
+
+
+@dataclass(frozen=True, kw_only=True)
+class Statistics:
+    """What people ask about a recording first. Not a number where nothing can be said."""
+
+    width: int
+    """Columns of the sensor."""
+    height: int
+    """Rows of the sensor."""
+    frames: int
+    """Grey frames."""
+    frame_interval: float
+    """Median time from one frame to the next [s]."""
+    exposure: tuple[float, float]
+    """Shortest and longest exposure of a frame [s]."""
+    clipped: float
+    """Share of the pixels of all frames that are black or white."""
+    begin: float
+    """First time of an event or frame [s]."""
+    duration: float
+    """From the first event or frame to the last [s]."""
+    events: int
+    """Events of both polarities."""
+    on_rate: float
+    """ON events per pixel [Hz]."""
+    off_rate: float
+    """OFF events per pixel [Hz]."""
+    on_share: float
+    """ON events / events."""
+    flip_share: float
+    """Share of successive events of one pixel that differ in polarity."""
+    alone_rate: float
+    """Events with no other in their 3x3 pixels within 10 ms, per pixel [Hz]; from a sample of the events."""
+    interval_shortest: float
+    """0.1st percentile of the time between successive events of one pixel [s]."""
+    interval_low: float
+    """1st percentile of it [s]."""
+    interval_median: float
+    """Median of it [s]."""
+    interval_high: float
+    """99th percentile of it [s]."""
+    interval_mode: float
+    """Most frequent of it [s]."""
+    intervals: tuple[tuple[float, float, int], ...]
+    """Histogram of it: begin [s], end [s], number."""
+    simultaneous: int
+    """Pairs of events of one pixel at the same time."""
+    period: float
+    """Time of which short intervals are multiples, that of a readout [s]."""
+    period_share: float
+    """Share of the intervals that are."""
+    quantum: float
+    """Largest time of which all time stamps are multiples, but for a common offset [s]."""
+    stamps: int
+    """Different time stamps in a row."""
+    longest_gap: tuple[float, float]
+    """Begin [s] and length [s] of the longest time without an event."""
+    active: tuple[int, int, int, int]
+    """First column, first row, columns and rows of the part that has events."""
+    silent_pixels: int
+    """Pixels without an event."""
+    busiest_rate: float
+    """Events of the pixel that has most [Hz]."""
+    busiest_pixel: tuple[int, int]
+    """Its column and row."""
+    hot_pixels: int
+    """Pixels with ten times the events of those around them."""
+    hot_share: float
+    """Share of the events that come from them."""
+    label_shares: tuple[float, ...] | None
+    """Share of the events with each of `dase.events.LABELS`; None where events have no labels."""
+
+
+class Survey:
+    """Takes the events and frames of a recording, each in order of time.
+
+    Args:
+        width: Columns of the sensor.
+        height: Rows of the sensor.
+    """
+
+    def __init__(self, width: int, height: int) -> None:
+        self.width, self.height = width, height
+        pixels = width * height
+        self._on = np.zeros(pixels, np.int64)  # zeros take no memory before they are written to
+        self._off = np.zeros(pixels, np.int64)
+        self._last = np.zeros(pixels)
+        self._polarity = np.zeros(pixels, np.bool_)
+        self._pairs = self._flips = 0
+        self._asked = self._alone = 0
+        self._labels: NDArray[np.int64] | None = np.zeros(len(LABELS), np.int64)
+        self._span = (math.inf, -math.inf)
+        self._newest = math.nan
+        self._gap = (math.nan, 0.0)
+        self._quantum, self._stamps = 0, 0
+        self._times: list[float] = []
+        self._exposures: list[float] = []
+        self._clipped: list[float] = []
+        self.intervals = Intervals()
+
+    def events(self, part: Events) -> None:
+        """Take events."""
+        for i in range(0, len(part), PART):
+            self._part(part.select(slice(i, i + PART)))
+
+    def picture(self, picture: Picture) -> None:
+        """Take a frame."""
+        if math.isfinite(picture.t):
+            self._reach(float(picture.t), float(picture.t))
+        self._times.append(float(picture.t))
+        self._exposures.append(float(picture.exposure))
+        white = np.iinfo(picture.grey.dtype).max if picture.grey.dtype.kind in "iu" else 1.0
+        self._clipped.append(float(np.mean((picture.grey == 0) | (picture.grey == white))))
+
+    def hot(self) -> NDArray[np.bool_]:
+        """Return which pixels have ten times the events of those around them, shape (H, W)."""
+        counts = (self._on + self._off).reshape(self.height, self.width)
+        around = cv2.medianBlur(counts.astype(np.float32), 3)
+        found: NDArray[np.bool_] = (counts >= HOT_EVENTS) & (counts > HOT_RATIO * (around + 1))
+        return found
+
+    def _reach(self, begin: float, end: float) -> None:
+        self._span = min(self._span[0], begin), max(self._span[1], end)
+
+    def _part(self, part: Events) -> None:
+        t = part.t
+        pixel = part.y.astype(np.int64) * self.width + part.x
+        key = (pixel << BITS) | np.arange(len(t))  # one sort of 64 bits is faster than a stable one of pixels
+        key.sort()
+        self._stamp(t)
+        self._ask(part, key)
+        self._pixels(part, key)
+        if part.label is None:
+            self._labels = None
+        elif self._labels is not None:
+            self._labels += np.bincount(part.label, minlength=len(LABELS))
+        self._reach(float(t[0]), float(t[-1]))
+        self._newest = float(t[-1])
+
+    def _pixels(self, part: Events, key: NDArray[np.int64]) -> None:
+        """Count the events, intervals and changes of polarity of every pixel."""
+        pixel, index = key >> BITS, key & ((1 << BITS) - 1)
+        t, p = part.t[index], part.p[index]
+        first = np.ones(len(t), np.bool_)
+        first[1:] = pixel[1:] != pixel[:-1]
+        begin = np.flatnonzero(first)
+        place = pixel[begin]
+        known = self._on[place] + self._off[place] > 0
+        between = np.diff(t)[~first[1:]]
+        self.intervals.add(np.concatenate((between, t[begin[known]] - self._last[place[known]])))
+        self._pairs += len(between) + int(np.count_nonzero(known))
+        self._flips += int(np.count_nonzero((p[1:] != p[:-1]) & ~first[1:]))
+        self._flips += int(np.count_nonzero(p[begin[known]] != self._polarity[place[known]]))
+        end = np.append(begin[1:], len(t)) - 1
+        self._last[place], self._polarity[place] = t[end], p[end]
+        total = np.diff(np.append(begin, len(t)))
+        on = np.add.reduceat(p.astype(np.int64), begin)
+        self._on[place] += on
+        self._off[place] += total - on
+
+    def _stamp(self, t: NDArray[np.float64]) -> None:
+        """Look at steps from one time to the next."""
+        before = np.append(t[0] if math.isnan(self._newest) else self._newest, t[:-1])
+        steps = t - before
+        self._stamps += int(np.count_nonzero(steps)) + int(math.isnan(self._newest))
+        longest = int(np.argmax(steps))
+        if steps[longest] > self._gap[1]:
+            self._gap = float(before[longest]), float(steps[longest])
+        if self._quantum == 0 or self._quantum > 1000:  # finer than a microsecond is of no interest
+            steps_ns = np.rint(steps * 1e9).astype(np.int64)
+            if self._quantum == 0 or np.any(steps_ns % self._quantum):
+                self._quantum = int(np.gcd.reduce(np.append(np.unique(steps_ns), self._quantum)))
+
+    def _ask(self, part: Events, key: NDArray[np.int64]) -> None:
+        """Ask some events whether they are alone; those near the ends of the part would not know."""
+        t = part.t
+        first, last = np.searchsorted(t, (t[0] + ALONE, t[-1] - ALONE))
+        if last <= first:
+            return
+        count = min(SAMPLE if not self._asked else SAMPLE // 8, last - first)
+        asked = np.unique(np.linspace(first, last - 1, count).astype(np.int64))
+        after = np.searchsorted(t, t[asked] + ALONE, side="right")
+        before = np.searchsorted(t, t[asked] - ALONE)
+        found = np.zeros(len(asked), np.int64)
+        x, y = part.x[asked].astype(np.int64), part.y[asked].astype(np.int64)
+        for dy in (-1, 0, 1):
+            for dx in (-1, 0, 1):
+                near = ((y + dy) * self.width + x + dx) << BITS
+                good = (x + dx >= 0) & (x + dx < self.width) & (y + dy >= 0) & (y + dy < self.height)
+                count = np.searchsorted(key, near | after) - np.searchsorted(key, near | before)
+                found += np.where(good, count, 0)
+        self._asked += len(asked)
+        self._alone += int(np.count_nonzero(found == 1))
+
+    def statistics(self) -> Statistics:
+        """Return what was found."""
+        counts = self._on + self._off
+        events, on, pixels = int(counts.sum()), int(self._on.sum()), len(counts)
+        begin, end = self._span if self._span[0] <= self._span[1] else (0.0, 0.0)
+        duration = end - begin
+        hot = self.hot()
+        busiest = int(counts.argmax())
+        period, period_share = self.intervals.period()
+        return Statistics(
+            width=self.width,
+            height=self.height,
+            **self._frames(),
+            begin=begin,
+            duration=duration,
+            events=events,
+            on_rate=_ratio(on, pixels * duration),
+            off_rate=_ratio(events - on, pixels * duration),
+            on_share=_ratio(on, events),
+            flip_share=_ratio(self._flips, self._pairs),
+            alone_rate=_ratio(self._alone, self._asked) * _ratio(events, pixels * duration),
+            interval_shortest=self.intervals.quantile(0.001),
+            interval_low=self.intervals.quantile(0.01),
+            interval_median=self.intervals.quantile(0.5),
+            interval_high=self.intervals.quantile(0.99),
+            interval_mode=self.intervals.mode(),
+            intervals=tuple(self.intervals.histogram()),
+            simultaneous=self.intervals.zeros,
+            period=period,
+            period_share=period_share,
+            quantum=self._quantum * 1e-9 if self._quantum else math.nan,
+            stamps=self._stamps,
+            longest_gap=self._gap,
+            active=_active(counts.reshape(self.height, self.width)),
+            silent_pixels=int(np.count_nonzero(counts == 0)),
+            busiest_rate=_ratio(int(counts[busiest]), duration),
+            busiest_pixel=(busiest % self.width, busiest // self.width),
+            hot_pixels=int(np.count_nonzero(hot)),
+            hot_share=_ratio(int(counts[hot.reshape(-1)].sum()), events),
+            label_shares=self._shares(events),
+        )
+
+    def _frames(self) -> dict[str, Any]:
+        times, exposures = np.array(self._times), np.array(self._exposures)
+        return {
+            "frames": len(times),
+            "frame_interval": float(np.median(np.diff(times))) if len(times) > 1 else math.nan,
+            "exposure": (float(exposures.min()), float(exposures.max()))
+            if exposures.any()
+            else (math.nan, math.nan),
+            "clipped": float(np.mean(self._clipped)) if self._clipped else math.nan,
+        }
+
+    def _shares(self, events: int) -> tuple[float, ...] | None:
+        if self._labels is None or not events:
+            return None
+        return tuple(float(count) / events for count in self._labels)
+
+
+def _ratio(a: float, b: float) -> float:
+    return a / b if b > 0 else math.nan
+
+
+def _active(counts: NDArray[np.int64]) -> tuple[int, int, int, int]:
+    columns, rows = np.flatnonzero(counts.any(0)), np.flatnonzero(counts.any(1))
+    if not len(columns):
+        return 0, 0, 0, 0
+    x, y = int(columns[0]), int(rows[0])
+    return x, y, int(columns[-1]) - x + 1, int(rows[-1]) - y + 1
+
+
+def survey_file(
+    path: str | PathLike[str],
+    *,
+    size: Size | None = None,
+    notes: list[str] | None = None,
+    progress: Callable[[int], object] = lambda count: None,
+) -> Survey:
+    """Look at a file piece by piece; only one whose times go back far is held in memory.
+
+    Args:
+        path: Any file that `dase.io.read` takes.
+        size: Columns and rows of the sensor, where the file does not say or says it wrongly.
+        notes: Gets sentences about what was skipped, repaired or guessed.
+        progress: Is told how many events were looked at since it was told last.
+
+    Raises:
+        InputError: As for `dase.io.read`.
+    """
+    out: Survey | None = None
+    try:
+        for part in io.stream(path, size=size, notes=notes):
+            out = out or Survey(part.width, part.height)
+            out.events(part)
+            progress(len(part))
+    except TooLateError:
+        return survey(io.read(path, size=size, notes=notes))
+    assert out is not None  # a stream has at least one part
+    for picture in io.pictures(path, size=size, notes=notes):
+        out.picture(picture)
+    return out
+
+
+def survey(sequence: Sequence) -> Survey:
+    """Look at a whole sequence."""
+    out = Survey(sequence.events.width, sequence.events.height)
+    out.events(sequence.events)
+    if sequence.frames is not None:
+        unknown = np.full(len(sequence.frames), math.nan)
+        times = unknown if sequence.frame_times is None else sequence.frame_times
+        exposures = np.zeros(len(unknown)) if sequence.frame_exposure is None else sequence.frame_exposure
+        for grey, time, exposure in zip(sequence.frames, times, exposures, strict=True):
+            out.picture(Picture(grey, time, float(exposure)))
+    return out
+
+
+def statistics(sequence: Sequence) -> Statistics:
+    """Return the statistics of a whole sequence."""
+    return survey(sequence).statistics()

@@ -1,0 +1,371 @@
+"""Pictures to make scenes of: photographs that come along, a folder, or the instances of COCO."""
+
+from __future__ import annotations
+
+import json
+import warnings
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from dase.errors import InputError
+from dase.io.image_files import SUFFIXES, decode, list_pictures, to_grey
+
+LONGEST_SIDE = 1024  # [px] larger pictures are shrunk
+CACHED_PICTURES = 64  # decoded pictures kept per process: at most 4 MiB each, 8 MiB with alpha
+# fmt: off
+PHOTOGRAPHS = (  # inside the wheel of scikit-image; its other files are silhouettes, charts and duplicates
+    "astronaut.png", "brick.png", "camera.png", "chelsea.png", "coffee.png", "coins.png", "grass.png",
+    "gravel.png", "hubble_deep_field.jpg", "ihc.png", "moon.png", "motorcycle_left.png", "retina.jpg",
+    "rocket.jpg", "text.png",
+)
+# fmt: on
+DRAWN_SHARE = 0.25  # share of procedural textures among the built-in pictures
+DRAWN_SIZE = (384, 512)  # (H, W) of a procedural texture [px]
+SMALLEST_CUT = 16  # [px] no side of a crop is shorter, unless the picture is
+COCO_SHARE, COCO_AREA = 0.005, 400  # an instance must cover this share of its picture and these pixels
+
+Grey = NDArray[np.float32]
+
+
+@dataclass(frozen=True)
+class Picture:
+    """A texture.
+
+    Args:
+        grey: Intensity in [0, 1], float32, shape (H, W).
+        alpha: Opacity in [0, 1], float32, shape (H, W); None is opaque.
+    """
+
+    grey: Grey
+    alpha: Grey | None = None
+
+
+class ImageSource(ABC):
+    """Pictures to make scenes of; what is drawn depends on the random numbers alone.
+
+    Args:
+        name: What `open_images` was given; goes into the configuration.
+    """
+
+    name: str
+
+    @abstractmethod
+    def __len__(self) -> int:
+        """Number of picture files to draw from."""
+
+    @abstractmethod
+    def background(self, rng: np.random.Generator) -> Picture:
+        """Draw a whole picture, opaque; raises InputError for a file that cannot be read."""
+
+    @abstractmethod
+    def foreground(self, rng: np.random.Generator) -> Picture:
+        """Draw an object with alpha, cropped tightly; raises InputError for a file that cannot be read.
+
+        The outermost pixels of an outlined object have alpha 0, so that interpolation fades out.
+        A rectangle has alpha 1 up to its sharp border.
+        """
+
+
+def open_images(spec: str) -> ImageSource:
+    """Open a source of pictures.
+
+    Args:
+        spec: "builtin"; a folder, searched recursively; or "coco:ANNOTATIONS.json,DIR", split at the last
+            comma, which needs the extra `coco`.
+
+    Raises:
+        InputError: The folder or the annotations are missing or hold nothing to draw.
+    """
+    if spec == "builtin":
+        package = find_spec("skimage")
+        folder = Path(package.origin if package and package.origin else "skimage").parent / "data"
+        return FolderImages(spec, [folder / name for name in PHOTOGRAPHS], drawn_share=DRAWN_SHARE)
+    if spec.startswith("coco:"):
+        annotations, _, directory = spec.removeprefix("coco:").rpartition(",")
+        if not annotations or not directory:
+            raise InputError(f"images: write coco:ANNOTATIONS.json,DIR with one comma between, got '{spec}'")
+        return CocoImages(spec, Path(annotations), _existing_folder(directory))
+    found = list_pictures(_existing_folder(spec))
+    if not found:
+        raise InputError(f"images: folder '{spec}' must hold a {', '.join(SUFFIXES)} file, found none")
+    return FolderImages(spec, found)
+
+
+class FolderImages(ImageSource):
+    """Picture files, drawn uniformly, and optionally procedural textures.
+
+    A file with a cut-out in its alpha channel gives that as foreground; from any other a rectangle, a blob,
+    an ellipse or a polygon is cut.
+
+    Args:
+        name: What `open_images` was given.
+        paths: The files; they are decoded when they are drawn.
+        drawn_share: Share of procedural textures in [0, 1].
+    """
+
+    def __init__(self, name: str, paths: Sequence[Path], *, drawn_share: float = 0.0):
+        self.name = name
+        self._paths = paths
+        self._drawn_share = drawn_share
+
+    def __len__(self) -> int:
+        return len(self._paths)
+
+    def background(self, rng: np.random.Generator) -> Picture:
+        """Draw a whole picture; what its alpha channel hides has the mean grey of what it shows."""
+        return Picture(self._draw(rng).grey.copy())
+
+    def foreground(self, rng: np.random.Generator) -> Picture:
+        """Draw the cut-out of a file, or cut a shape from it."""
+        picture = self._draw(rng)
+        return cut(picture.grey, rng) if picture.alpha is None else _trim(picture.grey, picture.alpha)
+
+    def _draw(self, rng: np.random.Generator) -> Picture:
+        if rng.random() < self._drawn_share:
+            return Picture(draw_texture(rng))
+        return _read(self._paths[int(rng.integers(len(self._paths)))])
+
+
+class CocoImages(ImageSource):
+    """Photographs with outlined objects, annotated as COCO instances (Lin et al., Microsoft COCO, 2014).
+
+    Foregrounds are instances, drawn uniformly, without crowds and tiny ones; backgrounds are whole images.
+
+    Args:
+        name: What `open_images` was given.
+        annotations: JSON file with `images` and `annotations`.
+        directory: Folder of the images.
+
+    Raises:
+        InputError: A file is missing or the annotations hold no usable instance.
+    """
+
+    def __init__(self, name: str, annotations: Path, directory: Path):
+        try:
+            from pycocotools.coco import COCO
+        except ImportError:
+            raise InputError('images: coco: needs pycocotools; pip install "dase[coco]"') from None
+        self.name = name
+        self._file, self._folder = annotations, directory
+        images, instances = _read_annotations(annotations)
+        self._images, self._instances = list(images.values()), instances
+        missing = [i["file_name"] for i in self._images if not (directory / i["file_name"]).is_file()]
+        if missing:
+            raise InputError(
+                f"images: '{directory}' must hold every image that '{annotations}' lists, "
+                f"lacks {len(missing)} of {len(images)}, first '{missing[0]}'"
+            )
+        self._coco = COCO()  # given a file, it would print; an outline needs nothing but the image sizes
+        self._coco.imgs = images
+
+    def __len__(self) -> int:
+        return len(self._images)
+
+    def background(self, rng: np.random.Generator) -> Picture:
+        """Draw a whole image."""
+        image = self._images[rng.integers(len(self._images))]
+        return Picture(_read(self._folder / image["file_name"]).grey.copy())
+
+    def foreground(self, rng: np.random.Generator) -> Picture:
+        """Draw an instance; raises InputError if its outline does not fit its image."""
+        instance = self._instances[rng.integers(len(self._instances))]
+        image = self._coco.imgs[instance["image_id"]]
+        grey = _read(self._folder / image["file_name"]).grey
+        what = f"images: '{self._file}': annotation {instance.get('id')} of '{image['file_name']}'"
+        size = image["width"], image["height"]
+        if _shrunk(*size) != grey.shape[::-1]:
+            raise InputError(f"{what} must have the size of the image file, got {size[0]}x{size[1]}")
+        try:
+            with warnings.catch_warnings(action="ignore"):  # pycocotools 2.0.11 warns with NumPy 2
+                mask = np.asarray(self._coco.annToMask(instance), np.float32)
+        except Exception as error:  # pycocotools raises what it likes, bare Exceptions too
+            raise InputError(f"{what} must be a polygon or a run-length code: {error}") from error
+        if not mask.any():
+            raise InputError(f"{what} must enclose a pixel, encloses none")
+        mask = cv2.resize(mask, grey.shape[::-1], interpolation=cv2.INTER_AREA)
+        return _trim(grey, cv2.GaussianBlur(mask, (3, 3), 0))
+
+
+def _read_annotations(path: Path) -> tuple[dict[int, dict[str, Any]], list[dict[str, Any]]]:
+    """Return the images by their id and the instances worth cutting out."""
+    try:
+        content = json.loads(path.read_bytes())
+    except OSError as error:
+        raise InputError(f"images: cannot read annotations '{path}': {error.strerror}") from error
+    except ValueError as error:
+        raise InputError(f"images: annotations '{path}' must be JSON: {error}") from error
+    try:
+        images = {image["id"]: image for image in content["images"]}
+        instances = [a for a in content["annotations"] if _usable(a, images[a["image_id"]])]
+        for image in images.values():
+            Path(image["file_name"])  # a TypeError unless it is a string
+    except (KeyError, TypeError) as error:
+        raise InputError(
+            f"images: annotations '{path}' must list images (id, file_name, width, height) and annotations "
+            f"(image_id, area, segmentation), as COCO instances do; {type(error).__name__}: {error}"
+        ) from error
+    if not instances:
+        raise InputError(
+            f"images: annotations '{path}' must hold an instance, not a crowd, of at least {COCO_AREA} px "
+            f"and {COCO_SHARE:.1%} of its image, found none among {len(content['annotations'])}"
+        )
+    return images, instances
+
+
+def _usable(instance: dict[str, Any], image: dict[str, Any]) -> bool:
+    least = max(COCO_AREA, COCO_SHARE * image["width"] * image["height"])
+    return bool(instance.get("segmentation")) and not instance.get("iscrowd") and instance["area"] >= least
+
+
+def _existing_folder(name: str) -> Path:
+    if not name or not Path(name).exists():
+        raise InputError(f"images: folder '{name}' is missing (or write builtin, or coco:FILE.json,DIR)")
+    if not Path(name).is_dir():
+        raise InputError(f"images: must be a folder, '{name}' is a file")
+    return Path(name)
+
+
+@lru_cache(maxsize=CACHED_PICTURES)
+def _read(path: Path) -> Picture:
+    """Decode, grey, shrink and median-filter a file; the arrays are shared, hence read-only."""
+    grey, alpha = to_grey(decode(path))
+    if alpha is not None and (alpha > 0).any():
+        grey[alpha == 0] = grey[alpha > 0].mean()  # what is hidden must not leak into edges and backgrounds
+    size = _shrunk(*grey.shape[::-1])
+    grey = cv2.resize(grey, size, interpolation=cv2.INTER_AREA)
+    alpha = None if alpha is None else cv2.resize(alpha, size, interpolation=cv2.INTER_AREA)
+    grey = cv2.medianBlur(np.clip(grey, 0, 1), 3)
+    grey.flags.writeable = False
+    if alpha is None or not 0.005 < float((alpha > 0.5).mean()) < 0.995:
+        return Picture(grey)  # an alpha channel that shows or hides everything is no cut-out
+    alpha.flags.writeable = False
+    return Picture(grey, alpha)
+
+
+def _shrunk(width: int, height: int) -> tuple[int, int]:
+    """Return width and height of a picture after shrinking."""
+    scale = min(1.0, LONGEST_SIDE / max(width, height))
+    return max(1, round(width * scale)), max(1, round(height * scale))
+
+
+def _trim(grey: Grey, alpha: Grey) -> Picture:
+    """Crop to alpha > 0 and put a border of alpha 0 around."""
+    rows, columns = (np.flatnonzero((alpha > 0).any(axis)) for axis in (1, 0))
+    box = slice(rows[0], rows[-1] + 1), slice(columns[0], columns[-1] + 1)
+    return Picture(np.pad(grey[box], 1, mode="edge"), np.clip(np.pad(alpha[box], 1), 0, 1))
+
+
+def cut(grey: Grey, rng: np.random.Generator) -> Picture:
+    """Cut a random shape from a random place of a picture.
+
+    Three in ten are rectangles, as many blobs; the rest are ellipses and polygons, with an edge 2 px soft.
+
+    Args:
+        grey: Intensity in [0, 1], shape (H, W).
+        rng: Random numbers.
+    """
+    sides = [max(min(n, SMALLEST_CUT), round(n * rng.uniform(0.3, 1))) for n in grey.shape]
+    top, left = (int(rng.integers(n - side + 1)) for n, side in zip(grey.shape, sides, strict=True))
+    part = grey[top : top + sides[0], left : left + sides[1]].copy()
+    kind = rng.choice(4, p=(0.3, 0.3, 0.2, 0.2))
+    if kind == 0 or min(sides) < SMALLEST_CUT:
+        return Picture(part, np.ones_like(part))
+    outline = (_blob, _ellipse, _polygon)[kind - 1](rng)
+    mask = np.zeros(part.shape, np.uint8)
+    _fill(mask, 2.0 + outline * np.subtract(mask.shape[::-1], 5), 255)  # 2 px for the soft edge
+    return _trim(part, cv2.GaussianBlur(mask, (3, 3), 0) / np.float32(255))
+
+
+def _blob(rng: np.random.Generator) -> NDArray[np.float64]:
+    """Star-convex, the logarithm of the radius a random Fourier series."""
+    angle = np.linspace(0, 2 * np.pi, 180, endpoint=False)
+    order = np.arange(1, 9)
+    waves = np.cos(np.outer(angle, order) + rng.uniform(0, 2 * np.pi, 8))
+    return _unit_square(angle, np.exp(waves @ (rng.normal(0, 0.5, 8) / order)))
+
+
+def _ellipse(rng: np.random.Generator) -> NDArray[np.float64]:
+    angle = np.linspace(0, 2 * np.pi, 180, endpoint=False)
+    radius = 1 / np.hypot(np.cos(angle), np.sin(angle) / rng.uniform(0.35, 1))
+    return _unit_square(angle + rng.uniform(0, np.pi), radius)
+
+
+def _polygon(rng: np.random.Generator) -> NDArray[np.float64]:
+    """Three to nine corners around a point; often not convex."""
+    corners = int(rng.integers(3, 10))
+    angle = 2 * np.pi / corners * (np.arange(corners) + rng.uniform(-0.35, 0.35, corners)) + rng.uniform(0, 7)
+    return _unit_square(angle, rng.uniform(0.4, 1, corners))
+
+
+def _unit_square(angle: NDArray[np.float64], radius: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return an outline from a point inside: (x, y), shape (N, 2), scaled to fill the unit square."""
+    points = radius[:, None] * np.stack([np.cos(angle), np.sin(angle)], -1)
+    low = points.min(0)
+    return np.asarray((points - low) / (points.max(0) - low))
+
+
+def _fixed(points: NDArray[np.float64]) -> NDArray[np.int32]:
+    return np.round(points * 16).astype(np.int32)  # OpenCV's coordinates, here with 4 fractional bits
+
+
+def _fill(canvas: NDArray[np.uint8], points: NDArray[np.float64], level: int) -> None:
+    cv2.fillPoly(canvas, [_fixed(points)], level, cv2.LINE_AA, 4)
+
+
+def draw_texture(rng: np.random.Generator) -> Grey:
+    """Draw fractal noise, a grating or checkerboard, polygons, or strokes like writing.
+
+    Returns:
+        Intensity in [0, 1], shape DRAWN_SIZE; its darkest and brightest level are random, too.
+    """
+    unit = (_fractal, _grating, _polygons, _strokes)[rng.integers(4)](rng)
+    levels = rng.permutation([rng.uniform(0, 0.4), rng.uniform(0.6, 1)])
+    return np.asarray(cv2.medianBlur(np.float32(levels[0] + (levels[1] - levels[0]) * unit), 3))
+
+
+def _fractal(rng: np.random.Generator) -> NDArray[np.float64]:
+    """Noise whose amplitude falls as 1/f^slope, from 0.8 (sand) to 2 (clouds)."""
+    frequency = np.hypot(np.fft.fftfreq(DRAWN_SIZE[0])[:, None], np.fft.rfftfreq(DRAWN_SIZE[1]))
+    frequency[0, 0] = np.inf  # no mean
+    spectrum = np.fft.rfft2(rng.standard_normal(DRAWN_SIZE)) * frequency ** -rng.uniform(0.8, 2)
+    noise = np.fft.irfft2(spectrum, DRAWN_SIZE)
+    return np.asarray(np.clip(0.5 + 0.2 * noise / noise.std(), 0, 1))
+
+
+def _grating(rng: np.random.Generator) -> NDArray[np.float64]:
+    """Soft-edged stripes, or a checkerboard of two of them."""
+    y, x = np.mgrid[: DRAWN_SIZE[0], : DRAWN_SIZE[1]]
+    angle, period = rng.uniform(0, np.pi), rng.uniform(12, 96)
+    along = 2 * np.pi / period * (x * np.cos(angle) + y * np.sin(angle)) + rng.uniform(0, 7)
+    across = 2 * np.pi / period * (y * np.cos(angle) - x * np.sin(angle)) + rng.uniform(0, 7)
+    wave = np.sin(along) * (np.sin(across) if rng.random() < 0.5 else 1)
+    return np.asarray(0.5 + 0.5 * np.tanh(wave * rng.uniform(1, period / 4)))
+
+
+def _polygons(rng: np.random.Generator) -> NDArray[np.float64]:
+    canvas = np.full(DRAWN_SIZE, rng.integers(256), np.uint8)
+    for size in np.geomspace(300, 30, int(rng.integers(15, 60))):  # the small ones last, on top
+        corner = rng.uniform(-0.5 * size, DRAWN_SIZE[::-1])
+        _fill(canvas, corner + size * _polygon(rng), int(rng.integers(256)))
+    return canvas / 255
+
+
+def _strokes(rng: np.random.Generator) -> NDArray[np.float64]:
+    """Lines of letters of two to four strokes, with spaces between words."""
+    canvas = np.zeros(DRAWN_SIZE, np.uint8)
+    pitch = int(rng.integers(14, 48))  # from line to line [px]
+    for top in range(pitch // 4, DRAWN_SIZE[0] - pitch, pitch):
+        for left in np.arange(pitch / 2, DRAWN_SIZE[1] - pitch, 0.55 * pitch):
+            if rng.random() < 0.85:
+                letter = (left, top) + pitch * rng.uniform(0, (0.45, 0.7), (int(rng.integers(3, 6)), 2))
+                cv2.polylines(canvas, [_fixed(letter)], False, 255, 1 + pitch // 16, cv2.LINE_AA, 4)
+    return canvas / 255

@@ -1,0 +1,252 @@
+"""Scenes of moving textures."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import warp as wp
+from numpy.typing import NDArray
+
+from dase.errors import InputError
+from dase.kernels import launch
+from dase.kernels import scene_layers as kernels
+from dase.scenes.image_sources import Picture
+from dase.scenes.scene import Scene
+
+Pair = tuple[float, float]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Motion:
+    """Affine motion, linear in time: each pair holds the value at the beginning and at the end of a scene.
+
+    Lengths are in widths of the sensor, so that a scene keeps its looks when the sensor size changes.
+
+    Args:
+        x: Horizontal place of the centre, 0 is the middle of the picture.
+        y: Vertical place of the centre.
+        angle: Rotation [rad].
+        scale_x: Horizontal scale; at 1 the texture is as wide as the sensor.
+        scale_y: Vertical scale.
+    """
+
+    x: Pair = (0.0, 0.0)
+    y: Pair = (0.0, 0.0)
+    angle: Pair = (0.0, 0.0)
+    scale_x: Pair = (1.0, 1.0)
+    scale_y: Pair = (1.0, 1.0)
+
+    def __post_init__(self) -> None:
+        for name in ("x", "y", "angle", "scale_x", "scale_y"):
+            if not np.all(np.isfinite(getattr(self, name))):
+                raise InputError(f"motion: {name} must be finite, got {getattr(self, name)}")
+        if min(*self.scale_x, *self.scale_y) <= 0:
+            raise InputError(f"motion: scales must be > 0, got {self.scale_x} and {self.scale_y}")
+
+
+@dataclass(frozen=True)
+class Layer:
+    """A texture and its motion."""
+
+    picture: Picture
+    motion: Motion
+
+
+class LayerScene(Scene):
+    """Textured layers that move over each other.
+
+    The renderer of S2R (Stoffregen et al., Reducing the sim-to-real gap for event cameras, 2020): rotation,
+    translation and x and y scale are linear in time, layers are composited back to front, the background is
+    continued by reflection. Unlike there, textures keep their aspect ratio.
+
+    Args:
+        layers: Background first, at most 32.
+        width: Columns [px].
+        height: Rows [px].
+        duration: Length [s].
+        travel: Share of a pixel that anything may move between two samples (λ of Eq. 5 of the paper).
+        shortest: Lower bound of the time between samples [s] (δ of Eq. 5).
+        longest: Upper bound of it [s]; S2R samples at 72 Hz at least.
+    """
+
+    anytime = True
+
+    def __init__(
+        self,
+        layers: Sequence[Layer],
+        *,
+        width: int,
+        height: int,
+        duration: float,
+        travel: float = 0.5,
+        shortest: float = 1e-3,
+        longest: float = 1 / 72,
+    ):
+        if not 1 <= len(layers) <= kernels.MAX_LAYERS:
+            raise InputError(f"a scene needs 1 to {kernels.MAX_LAYERS} layers, got {len(layers)}")
+        if width < 1 or height < 1:
+            raise InputError(f"scene size must be at least 1x1, got {width}x{height}")
+        if not duration > 0 or not np.isfinite(duration):
+            raise InputError(f"scene duration must be > 0 s, got {duration:g}")
+        if not 0 < shortest <= longest or not travel > 0:
+            raise InputError(
+                "sampling needs 0 < shortest <= longest and travel > 0, "
+                f"got {shortest:g}, {longest:g} and {travel:g}"
+            )
+        self.layers = tuple(layers)
+        self.width, self.height, self.duration = width, height, duration
+        self.travel, self.shortest, self.longest = travel, shortest, longest
+        self._uploaded: dict[str, Any] = {}
+
+    def forward(self, times: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Return texture-to-sensor maps M(t) and their time derivatives, each of shape (T, L, 3, 3)."""
+        share = np.asarray(times, np.float64)[:, None] / self.duration
+        rows = [
+            [getattr(layer.motion, n) for layer in self.layers]
+            for n in ("x", "y", "angle", "scale_x", "scale_y")
+        ]
+        ends = np.array(rows, np.float64)  # (5, L, 2)
+        rate = (ends[..., 1] - ends[..., 0]) / self.duration
+        x, y, angle, sx, sy = (ends[i, :, 0] + share * (ends[i, :, 1] - ends[i, :, 0]) for i in range(5))
+        vx, vy, spin, gx, gy = (rate[i] for i in range(5))
+        c, s = np.cos(angle), np.sin(angle)
+        m = np.zeros((*x.shape, 3, 3))
+        m[..., 0, :] = np.stack([sx * c, -sy * s, x], -1)
+        m[..., 1, :] = np.stack([sx * s, sy * c, y], -1)
+        m[..., 2, 2] = 1
+        d = np.zeros_like(m)
+        d[..., 0, :] = np.stack([gx * c - sx * s * spin, -gy * s - sy * c * spin, vx + 0 * x], -1)
+        d[..., 1, :] = np.stack([gx * s + sx * c * spin, gy * c - sy * s * spin, vy + 0 * y], -1)
+        to_sensor = _plane(self.width, self.height, self.width)
+        from_texture = np.stack(
+            [np.linalg.inv(self._texture_plane(layer)) for layer in range(len(self.layers))]
+        )
+        return to_sensor @ m @ from_texture, to_sensor @ d @ from_texture
+
+    def _texture_plane(self, layer: int) -> NDArray[np.float64]:
+        """Return the map from the unit plane to texels of a layer."""
+        h, w = self.layers[layer].picture.grey.shape
+        if layer == 0:
+            # at scale 1 the background covers the sensor
+            return _plane(w, h, min(w, h * self.width / self.height))
+        return _plane(w, h, max(w, h))
+
+    def velocity(self, times: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return maps from sensor coordinates to velocity [px/s], shape (T, L, 2, 3)."""
+        m, d = self.forward(times)
+        return np.asarray((d @ np.linalg.inv(m))[..., :2, :])
+
+    def speed(self, times: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the highest speed of any layer inside the picture [px/s], shape (T,).
+
+        Speed is convex over the polygon in which a layer overlaps the picture, so the highest one is found
+        at a corner of it. Layers hidden behind others count as well: an upper bound of max|v| of Eq. 5.
+        """
+        m, d = self.forward(times)
+        points, inside = self._corners(m)
+        v = np.einsum("tlij,tlpj->tlpi", (d @ np.linalg.inv(m))[..., :2, :], points)
+        return np.asarray(np.where(inside, np.linalg.norm(v, axis=-1), 0.0).max(axis=(1, 2)))
+
+    def _outlines(self, m: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the corners of all layers on the sensor [px], shape (T, L, 4, 2)."""
+        out = []
+        for i, layer in enumerate(self.layers):
+            h, w = layer.picture.grey.shape
+            corners = np.array([[-1, -1, 1], [w, -1, 1], [w, h, 1], [-1, h, 1]], np.float64)
+            out.append(np.einsum("tij,pj->tpi", m[:, i, :2], corners))
+        return np.stack(out, 1)
+
+    def _corners(self, m: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+        """Return candidates for corners of layer ∩ picture, homogeneous (T, L, P, 3), and which are."""
+        w, h = self.width - 1, self.height - 1
+        quad = self._outlines(m)
+        frame = np.array([[0, 0], [w, 0], [w, h], [0, h]], np.float64)
+        inverse = np.linalg.inv(m)
+        back = np.einsum("tlij,pj->tlpi", inverse[..., :2, :], np.c_[frame, np.ones(4)])
+        sizes = np.array([layer.picture.grey.shape[::-1] for layer in self.layers])[None, :, None]
+        frame_in = np.all((back >= -1) & (back <= sizes), -1)
+        frame_in[:, 0] = True  # the background is everywhere
+        quad_in = np.all((quad >= 0) & (quad <= [w, h]), -1)
+        quad_in[:, 0] = False
+        a, b = quad, np.roll(quad, -1, axis=2)
+        crossings, crosses = [], []
+        for axis, level in ((0, 0), (0, w), (1, 0), (1, h)):
+            with np.errstate(divide="ignore", invalid="ignore"):
+                share = (level - a[..., axis]) / (b[..., axis] - a[..., axis])
+            hit = (share >= 0) & (share <= 1)  # False for the NaN of parallel edges
+            at = a + np.where(hit, share, 0.0)[..., None] * (b - a)
+            other = at[..., 1 - axis]
+            hit &= (other >= 0) & (other <= (w, h)[1 - axis])
+            hit[:, 0] = False
+            crossings.append(at)
+            crosses.append(hit)
+        everywhere = np.broadcast_to(frame, (*quad.shape[:2], 4, 2))
+        points = np.concatenate([everywhere, quad, *crossings], axis=2)
+        inside = np.concatenate([frame_in, quad_in, *crosses], axis=2)
+        return np.concatenate([points, np.ones((*points.shape[:3], 1))], -1), inside
+
+    def sample_times(self) -> NDArray[np.float64]:
+        """Return adaptive sample times [s] by Eq. 5: the step is travel / max|v|, between the two bounds.
+
+        The speed is looked up on a grid of `shortest`; between two grid points the larger value holds.
+        """
+        cells = max(int(np.ceil(self.duration / self.shortest)), 1)
+        grid = np.linspace(0, self.duration, min(cells, 100_000) + 1)
+        speed = np.concatenate([self.speed(part) for part in np.array_split(grid, max(len(grid) // 512, 1))])
+        held = np.maximum(speed[:-1], speed[1:])
+        way = np.concatenate([[0.0], np.cumsum(np.maximum(held, 1e-9) * np.diff(grid))])
+        times = [0.0]
+        while times[-1] < self.duration:
+            now = times[-1]
+            # a step may span many cells, and something fast may enter the picture in a later one
+            due = np.interp(np.interp(now, grid, way) + self.travel, way, grid, right=np.inf)
+            times.append(now + float(np.clip(due - now, self.shortest, self.longest)))
+        # the last step ends with the scene; a stub shorter than half the bound is not worth a sample
+        if len(times) > 2 and self.duration - times[-2] < 0.5 * self.shortest:
+            times.pop()
+        times[-1] = self.duration
+        return np.array(times)
+
+    def arrays(self, times: NDArray[np.float64], device: wp.Device) -> kernels.Layers:
+        """Return textures and motion at `times` on a Warp device."""
+        if device.alias not in self._uploaded:
+            textures = [(layer.picture.grey, layer.picture.alpha) for layer in self.layers]
+            self._uploaded[device.alias] = kernels.upload(textures, device)
+        m, _ = self.forward(times)
+        quad = self._outlines(m)
+        # only these samples are looked at, so their outlines bound the layer; the pixel is for float32
+        box = np.concatenate([quad.min((0, 2)) - 1, quad.max((0, 2)) + 1], -1)
+        layers = kernels.Layers()
+        layers.grey, layers.texels, layers.start, layers.size = self._uploaded[device.alias]
+        layers.place = wp.array(
+            np.linalg.inv(m)[..., :2, :].astype(np.float32), dtype=kernels.Affine, device=device
+        )
+        layers.box = wp.array(box.astype(np.float32), dtype=wp.vec4, device=device)
+        layers.count = len(self.layers)
+        return layers
+
+    def source(self, times: NDArray[np.float64], pixels: NDArray[np.int32], device: Any) -> tuple[str, Any]:
+        """Return the layers themselves: the pixel kernel warps, so no frame is ever stored."""
+        return "background" if len(self.layers) == 1 else "layers", self.arrays(times, device)
+
+    def frames(self, times: NDArray[np.float64], device: str = "cpu") -> NDArray[np.float32]:
+        """Return intensities in [0, 1] at `times` [s], shape (K, height, width)."""
+        where = launch.device(device)
+        out = kernels.render_frames(self.arrays(times, where), self.width, self.height, where)
+        return np.asarray(out.numpy().reshape(len(times), self.height, self.width))
+
+    def flow(self, times: NDArray[np.float64], device: str = "cpu") -> NDArray[np.float32]:
+        """Return the flow of the foremost layer at `times` [px/s], shape (K, 2, height, width)."""
+        where = launch.device(device)
+        maps = wp.array(self.velocity(times).astype(np.float32), dtype=kernels.Affine, device=where)
+        out = kernels.render_flow(self.arrays(times, where), maps, self.width, self.height, where)
+        stacked = out.numpy().reshape(len(times), self.height, self.width, 2)
+        return np.ascontiguousarray(np.moveaxis(stacked, -1, 1))
+
+
+def _plane(width: int, height: int, unit: float) -> NDArray[np.float64]:
+    """Return the map from the plane, whose unit is `unit` pixels, to pixels; centres lie at integers."""
+    return np.array([[unit, 0, (width - 1) / 2], [0, unit, (height - 1) / 2], [0, 0, 1]], np.float64)

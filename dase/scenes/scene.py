@@ -1,0 +1,50 @@
+"""What a sensor looks at."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+
+class Scene(ABC):
+    """Linear intensity, and where known flow, at pixels and times.
+
+    Attributes:
+        width: Columns of the picture [px].
+        height: Rows of the picture [px].
+        duration: Length [s].
+        anytime: Whether `source` takes any time between the first sample and the last.
+    """
+
+    width: int
+    height: int
+    duration: float
+    anytime: bool = False
+
+    @abstractmethod
+    def sample_times(self) -> NDArray[np.float64]:
+        """Return the times at which the scene is to be sampled [s], from 0 to `duration`, increasing."""
+
+    @abstractmethod
+    def source(self, times: NDArray[np.float64], pixels: NDArray[np.int32], device: Any) -> tuple[str, Any]:
+        """Return what a pixel kernel reads intensities from.
+
+        Args:
+            times: Samples [s], shape (K,), a run of `sample_times`.
+            pixels: Row-major indices of the pixels asked for, shape (N,).
+            device: Warp device of the result.
+
+        Returns:
+            Name of a source of `dase.kernels.pixel_stages`, and its arguments.
+        """
+
+    @abstractmethod
+    def frames(self, times: NDArray[np.float64], device: str = "cpu") -> NDArray[np.float32]:
+        """Return intensities in [0, 1] at `times` [s], shape (K, height, width)."""
+
+    def flow(self, times: NDArray[np.float64], device: str = "cpu") -> NDArray[np.float32] | None:
+        """Return the flow at `times` [px/s], shape (K, 2, height, width), x then y; None where unknown."""
+        return None

@@ -1,0 +1,347 @@
+"""Pixels of a sensor while time passes: runs the kernels chunk by chunk."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import warp as wp
+from numpy.typing import ArrayLike, NDArray
+
+from dase.errors import InputError
+from dase.events import Events
+from dase.kernels import event_keys as ordering
+from dase.kernels import launch, pixel_compile, pixel_stages, threshold_events
+from dase.kernels import threshold_counts as counting
+from dase.kernels.random import stream
+from dase.scenes.scene import Scene
+
+if TYPE_CHECKING:
+    from dase.simulation.sensor import Sensor
+
+
+class Pixels:
+    """Some pixels of a sensor while time passes: runs the composed kernel chunk by chunk.
+
+    Args:
+        sensor: What the pixels do.
+        width: Columns of the sensor.
+        height: Rows of the sensor.
+        pixels: Row-major indices of the pixels to simulate, shape (N,); None for all.
+        parameters: Parameter vectors, shape (B, P), to simulate at once with common random numbers; None for
+            the sensor's own.
+        seed: Of every random number.
+        device: `cpu`, `cuda` or a Warp name.
+        labels: Whether events are marked with what they came from.
+        room: Events per pixel of a chunk that there is room for at first; with more, it runs again.
+    """
+
+    def __init__(
+        self,
+        sensor: Sensor,
+        width: int,
+        height: int,
+        *,
+        pixels: ArrayLike | None = None,
+        parameters: ArrayLike | None = None,
+        seed: int = 0,
+        device: str = "cpu",
+        labels: bool = False,
+        room: int = 4,
+    ):
+        try:
+            self.device = launch.device(device)
+        except ValueError as error:
+            raise InputError(str(error)) from error
+        self.sensor, self.width, self.height = sensor, width, height
+        self.seed = seed & 0x7FFFFFFF  # a key of random numbers has 31 bits
+        self.stages = sensor.stages()
+        self.pixels = (
+            np.arange(width * height, dtype=np.int32) if pixels is None else np.asarray(pixels, np.int32)
+        )
+        vectors = sensor.parameters()[None] if parameters is None else np.asarray(parameters, np.float32)
+        if vectors.ndim != 2 or vectors.shape[1] != len(sensor.parameter_names()):
+            raise InputError(
+                f"parameters must have shape (B, {len(sensor.parameter_names())}), got {vectors.shape}"
+            )
+        if (
+            self.pixels.ndim != 1
+            or len(self.pixels) == 0
+            or self.pixels.min() < 0
+            or self.pixels.max() >= width * height
+        ):
+            raise InputError(f"pixels must be indices of the {width}x{height} sensor, shape (N,), N >= 1")
+        self.batch, self.count = len(vectors), len(self.pixels)
+        self._pixels = wp.array(self.pixels, dtype=int, device=self.device)
+        xy = self.pixels % width + (self.pixels // width << 16)
+        self._xy = wp.array(xy.astype(np.uint32), dtype=wp.uint32, device=self.device)
+        self._parameters = wp.array(vectors, dtype=float, device=self.device)
+        self.sink = "labels" if labels else "keys"
+        shape = (len(pixel_stages.states(self.stages, self.sink)), self.batch, self.count)
+        # two copies, so that a chunk whose events overran their buffer can be run again
+        self._state = wp.zeros(shape, dtype=float, device=self.device)
+        self._next = wp.zeros(shape, dtype=float, device=self.device)
+        self.samples = 0
+        self.begin = 0.0
+        self.slab = 256 if self.device.is_cuda else 2048
+        self._capacity = room * self.slab
+        self._buffer: Any = None  # of keys, kept from chunk to chunk
+        self._room = ordering.Room()
+        # nothing but a change detector: counted by a kernel of its own, several pixels per thread
+        self._plain = all(stage == "threshold" for effect in self.stages for stage, _ in effect.functions)
+        self._vectors = vectors
+        self._levels: tuple[Any, Any] | None = None
+        self._mapped: list[Any] | None = None
+        self._bits = max((self.batch * self.count - 1).bit_length(), 1)
+        self._low = 3 if labels else 1
+        delays = any(stage == "delay" for effect in self.stages for stage, _ in effect.functions)
+        # keys of events that leave after the chunk, counted from its end
+        self._late = np.empty(0, np.int64) if delays else None
+
+    def count_events(
+        self, scene: Scene, times: NDArray[np.float64], windows: NDArray[np.int32], size: int
+    ) -> Any:
+        """Advance over `times` and count events.
+
+        Args:
+            scene: What the pixels see.
+            times: Samples [s], shape (K,), following the last ones.
+            windows: Window that the step ending at each sample counts for, shape (K,), not decreasing; -1 for
+                none.
+            size: Number of windows W.
+
+        Returns:
+            Warp array of int32, shape (B, W, 2, N): OFF counts in channel 0, ON counts in channel 1.
+        """
+        sink = pixel_stages.Counts()
+        if np.any(np.diff(windows[windows >= 0]) < 0):
+            raise InputError("windows must not decrease from sample to sample")
+        shape = (self.batch, size, 2, self.count)
+        # the kernel writes each window it meets, whole
+        new = wp.empty if len(np.unique(windows[windows >= 0])) == size else wp.zeros
+        sink.counts = new(shape, dtype=int, device=self.device)
+        if self._plain:
+            self._count(sink.counts, scene, times, windows)
+        else:
+            self._launch("counts", sink, scene, times, windows, align=16)
+        self._advance(times)
+        return sink.counts
+
+    def _count(self, out: Any, scene: Scene, times: NDArray[np.float64], windows: NDArray[np.int32]) -> None:
+        """Count with nothing but thresholds."""
+        self.look_at(scene)
+        self._edges(times)
+        name, source = self.sensor.seen(scene).source(times, self.pixels, self.device)
+        first, memory, _ = self._begin(name, source, len(times))
+        if first >= len(times):
+            out.zero_()
+            return
+        lanes = counting.widest(self.count, self.device, name)
+        level, eps = self._thresholds_of_pixels()
+        shared = level.shape[2] == 1 and bool(np.all(self._vectors[:, 0] == self._vectors[:, 1]))
+        aligned = counting.aligned(name, source, self.count)
+        kernel = counting.count(lanes, name, shared=shared, states=True, aligned=aligned)
+        inputs = [
+            source, 0, self._pixels, self.count, self.width, first, level, eps, *self._runs(windows), memory,
+            self._next[1], self._next[0], out,
+        ]  # fmt: skip
+        launch.run(kernel, counting.blocks(self.count, lanes), inputs, self.device, batch=self.batch)
+
+    def _begin(self, name: str, source: Any, samples: int) -> tuple[int, Any, Any]:
+        """Return the first sample to compare, and memories and signals before it."""
+        first = max(2 - self.samples, 0)
+        if not first:
+            return 0, self._state[1], self._state[0]
+        level, eps = self._thresholds_of_pixels()
+        inputs = [
+            source, self._pixels, self.width, self.samples, samples, self.seed, stream("initial_phase"),
+            level, eps, wp.array(self._vectors[:, 2], dtype=float, device=self.device), self._state[0],
+            self._next[1], self._next[0],
+        ]  # fmt: skip
+        launch.run(counting.start(name), self.count, inputs, self.device, batch=self.batch)
+        # blocks may overlap, so what they read must not be what they write
+        return first - 1, wp.clone(self._next[1]), wp.clone(self._next[0])
+
+    def _emit(self, sink: Any, scene: Scene, times: NDArray[np.float64]) -> None:
+        """Emit with nothing but thresholds."""
+        self.look_at(scene)
+        clock = self._clock(times, np.zeros(len(times), np.int32))
+        name, source = self.sensor.seen(scene).source(times, self.pixels, self.device)
+        first, memory, signal = self._begin(name, source, len(times))
+        lanes = counting.widest(self.count, self.device, name)
+        inputs = [
+            source, clock, self._pixels, self.count, self.width, first, *self._thresholds_of_pixels(),
+            memory, signal, self._next[1], self._next[0], sink,
+        ]  # fmt: skip
+        size, align = counting.blocks(self.count, lanes), self.slab // lanes
+        launch.run(
+            threshold_events.emit(lanes, name), size, inputs, self.device, batch=self.batch, align=align
+        )
+
+    def emit(self, scene: Scene, times: NDArray[np.float64]) -> tuple[Events, NDArray[np.int32] | None]:
+        """Advance over `times` and return the events that leave the pixels, and for a batch the row of each.
+
+        Readout effects come behind this, see `dase.simulation.readout_chain.Outlet`.
+
+        Args:
+            scene: What the pixels see.
+            times: Samples [s], shape (K,), following the last ones.
+        """
+        begin = self.begin if self.samples else float(times[0])
+        span = round(float(times[-1]) * 1e9) - round(begin * 1e9)
+        longest = span if self._late is None else span + round(pixel_stages.LATEST * 1e9)
+        if self._bits + self._low + longest.bit_length() > 63:
+            raise InputError(
+                f"a chunk of {span * 1e-9:g} s with {self.batch * self.count} pixels is too long"
+            )
+        keys, used = self._keys(scene, times)
+        top = self._bits + self._low + longest.bit_length()
+        self._advance(times)
+        found = ordering.ordered(keys, used, self._bits, self._low, top, self.device, self._late, self._room)
+        events, row = self._decode(found, begin)
+        if self._late is None:
+            return events, row
+        now = int(np.searchsorted(events.t, 1e-9 * float(round(self.begin * 1e9)), side="right"))
+        self._late = found.numpy()[now:] - (span << (self._bits + self._low))
+        return events.select(slice(now)), None if row is None else row[:now]
+
+    def flush(self) -> tuple[Events, NDArray[np.int32] | None]:
+        """Return the events that have not left the pixels yet, as `emit` does; time is over."""
+        late = np.empty(0, np.int64) if self._late is None else self._late
+        self._late = None if self._late is None else late[:0]
+        return self._decode(wp.array(late, dtype=wp.int64, device=self.device), self.begin)
+
+    def _keys(self, scene: Scene, times: NDArray[np.float64]) -> tuple[Any, NDArray[np.int32]]:
+        """Run the pixels until all their events fit; return the keys and how many there are per slab."""
+        slabs = -(-self.count // self.slab)
+        while True:
+            sink = pixel_stages.Keys()
+            shape = (self.batch, slabs, self._capacity)
+            if self._buffer is None or self._buffer.shape != shape:
+                self._buffer = launch.room(shape, wp.int64, self.device)
+            sink.keys = self._buffer
+            sink.used = wp.zeros((self.batch, slabs), dtype=int, device=self.device)
+            sink.slab, sink.bits, sink.low = self.slab.bit_length() - 1, self._bits, self._low
+            if self._plain and self.device.is_cpu:
+                self._emit(sink, scene, times)
+            else:
+                self._launch(self.sink, sink, scene, times, np.zeros(len(times), np.int32), align=self.slab)
+            used = sink.used.numpy()
+            if used.max() <= self._capacity:
+                return sink.keys, used
+            self._capacity = int(1.25 * used.max()) + 1
+
+    def look_at(self, scene: Scene) -> None:
+        """Work out what pixels owe to the scene, once; it is done before the first sample in any case."""
+        if self._mapped is None:
+            self._mapped = self.sensor.bound_to(scene).maps(self.pixels, self.device)
+
+    def _maps(self) -> list[Any]:
+        return self.sensor.maps(self.pixels, self.device) if self._mapped is None else self._mapped
+
+    def thresholds(self) -> NDArray[np.float32]:
+        """Return the thresholds of each pixel [log intensity], shape (B, 2, N): OFF, ON.
+
+        Where they depend on the scene, `look_at` it first.
+        """
+        level = self._thresholds_of_pixels()[0].numpy()
+        return np.array(np.broadcast_to(level, (self.batch, 2, self.count)))
+
+    def _thresholds_of_pixels(self) -> tuple[Any, Any]:
+        """Return thresholds, of shape (B, 2, N), or (B, 2, 1) where all are the same, and log_eps, (B,)."""
+        if self._levels is not None:
+            return self._levels
+        if not any(effect.functions for effect in self.stages):
+            level = wp.array(self._vectors[:, 1::-1, None].copy(), dtype=float, device=self.device)
+        else:
+            kernel = pixel_compile.compose_thresholds(self.stages)
+            level = wp.empty((self.batch, 2, self.count), dtype=float, device=self.device)
+            inputs = [self._pixels, self.width, self.height, self.seed, self._parameters]
+            inputs += [*self._maps(), level]
+            launch.run(kernel, self.count, inputs, self.device, batch=self.batch)
+        levels = level, wp.array(self._vectors[:, 3], dtype=float, device=self.device)
+        self._levels = levels
+        return levels
+
+    def _launch(
+        self,
+        sink_name: str,
+        sink: Any,
+        scene: Scene,
+        times: NDArray[np.float64],
+        windows: NDArray[np.int32],
+        align: int,
+    ) -> None:
+        self.look_at(scene)
+        source_name, source = self.sensor.seen(scene).source(times, self.pixels, self.device)
+        lanes = self._lanes(source_name)
+        kernel = pixel_compile.compose(self.stages, source_name, sink_name, lanes=lanes)
+        clock = self._clock(times, windows)
+        inputs = [
+            source, clock, self._pixels, self.width, self.height, self.samples, self.seed,
+            self._parameters, *self._maps(), self._state, self._next, sink,
+        ]  # fmt: skip
+        size, align = (counting.blocks(self.count, lanes), align // lanes) if lanes else (self.count, align)
+        launch.run(kernel, size, inputs, self.device, batch=self.batch, align=align)
+
+    def _lanes(self, source_name: str) -> int:
+        """Return how many pixels a thread of the composed kernel works on; 0 for CUDA's kernel."""
+        return 0 if self.device.is_cuda else counting.widest(self.count, self.device, source_name)
+
+    def _edges(self, times: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the end of the last step and the samples that follow [s], shape (K + 1,)."""
+        first = self.samples == 0
+        edges = np.concatenate([[float(times[0]) if first else self.begin], times])
+        if not np.all(np.diff(edges)[first:] > 0) or not np.all(np.isfinite(edges)):
+            raise InputError("sample times must increase")
+        return edges
+
+    def _runs(self, windows: NDArray[np.int32]) -> tuple[Any, Any]:
+        """Return where runs of one window begin, so that a pixel writes its counts once, and the windows."""
+        run = np.flatnonzero(np.diff(windows, prepend=windows[0] - 1))
+        ends = np.append(run, len(windows)).astype(np.int32)
+        return tuple(
+            wp.array(a, dtype=int, device=self.device) for a in (ends, windows[run].astype(np.int32))
+        )
+
+    def _clock(self, times: NDArray[np.float64], windows: NDArray[np.int32]) -> Any:
+        edges = self._edges(times)
+        dt = np.diff(edges)
+        clock = pixel_stages.Clock()
+        if self.samples == 0:
+            dt[0] = pixel_stages.REST
+        stamps = np.round(edges * 1e9)
+        begin, length = stamps[:-1] - stamps[0], np.diff(stamps)
+        # rounded down, so that no event comes after the end of its step
+        short = length.astype(np.float32)
+        short = np.where(short > length, np.nextafter(short, np.float32(0)), short)
+        to = self.device
+        clock.t = wp.array(times.astype(np.float32), dtype=float, device=to)
+        clock.t64 = wp.array(times, dtype=wp.float64, device=to)
+        clock.dt = wp.array(dt.astype(np.float32), dtype=float, device=to)
+        clock.begin = wp.array(begin.astype(np.int64), dtype=wp.int64, device=to)
+        clock.span = wp.int64(int(stamps[-1] - stamps[0]))
+        clock.length = wp.array(short, dtype=float, device=to)
+        clock.run, clock.window = self._runs(windows)
+        return clock
+
+    def _advance(self, times: NDArray[np.float64]) -> None:
+        self._state, self._next = self._next, self._state
+        self.samples += len(times)
+        self.begin = float(times[-1])
+
+    def _decode(self, keys: Any, begin: float) -> tuple[Events, NDArray[np.int32] | None]:
+        n, to = len(keys), self.device
+        each = ordering.EACH["cuda" if to.is_cuda else "cpu"]
+        out = [launch.room(n, d, to) for d in (wp.float64, wp.uint16, wp.uint16, wp.uint8)]
+        row = wp.empty(n if self.batch > 1 else 0, dtype=int, device=to)
+        label = wp.empty(n if self.sink == "labels" else 0, dtype=wp.int8, device=to)
+        inputs = [
+            keys, self._bits, self._low, self.count, self._xy,
+            wp.int64(round(begin * 1e9)), each, *out, row, label,
+        ]  # fmt: skip
+        launch.run(ordering.decode, -(-n // each), inputs, to)
+        t, x, y, p = (a.numpy() for a in out)
+        known = label.numpy() if self.sink == "labels" else None
+        events = Events(t, x, y, p.view(np.bool_), self.width, self.height, known)
+        return events, row.numpy() if self.batch > 1 else None

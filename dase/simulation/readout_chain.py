@@ -1,0 +1,123 @@
+"""What leaves a camera: the stream of its pixels' events behind its readout effects."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dase.effects.stream import StreamEffect, nanoseconds
+from dase.errors import InputError
+from dase.events import Events
+
+if TYPE_CHECKING:
+    from dase.simulation.sensor import Sensor
+
+LONGEST = 4e6
+"""Readers reckon in whole picoseconds of 64 bits, which hold times up to this [s]."""
+
+
+PART = 1 << 17
+"""Events that go through the readers at once: few enough to be sorted within the caches."""
+
+
+class Outlet:
+    """The way out of a camera: its readout effects in the order in which the sensor has them.
+
+    Effects that are switched off are left out, so that the stream passes as it is, bit for bit.
+
+    Args:
+        sensor: Whose effects.
+        width: Columns of the sensor.
+        height: Rows of the sensor.
+        pixels: How many pixels are simulated; None for all.
+        seed: Of every random number.
+    """
+
+    def __init__(self, sensor: Sensor, width: int, height: int, *, pixels: int | None = None, seed: int = 0):
+        effects = [e for e in sensor.effects if isinstance(e, StreamEffect) and not e.is_off()]
+        for effect in effects:
+            if not effect.per_pixel and pixels not in (None, width * height):
+                raise InputError(
+                    f"effect '{effect.name}' needs all {width * height} pixels of the sensor, got {pixels}; "
+                    "leave it out or simulate them all"
+                )
+        self._empty = Events.empty(width, height)
+        self._readers = [effect.reader(width, height, seed) for effect in effects]
+
+    def push(self, events: Events, until: float) -> Events:
+        """Return what leaves after a part of the stream; a later part brings what comes late.
+
+        Args:
+            events: Sorted by time; they follow those of the parts before.
+            until: No later part begins earlier [s].
+
+        Returns:
+            Events sorted by time; they follow those returned before.
+        """
+        if self._readers and len(events) and max(-events.t[0], events.t[-1]) > LONGEST:
+            raise InputError(
+                f"readout effects need times within {LONGEST:g} s of 0, "
+                f"got {events.t[0]:g}..{events.t[-1]:g} s"
+            )
+        if not self._readers:
+            return events
+        out = []
+        for i in range(0, max(len(events), 1), PART):
+            end = float(events.t[i + PART]) if i + PART < len(events) else until
+            out.append(self._through(events.select(slice(i, i + PART)), end))
+        return Events.concatenate(out)
+
+    def _through(self, events: Events, until: float) -> Events:
+        for reader in self._readers:
+            events, until = reader.push(events, until)
+        return events
+
+    def flush(self) -> Events:
+        """Return what is still inside; the stream is over."""
+        return self.push(self._empty, math.inf)
+
+
+class Tally:
+    """Counts the events that leave a camera, per window and pixel.
+
+    Args:
+        edges: Window edges [s], increasing, shape (W + 1,); a window holds edge < t <= next edge, as counting
+            at the pixels has it.
+        pixels: Row-major indices of the pixels, no two alike, shape (N,).
+        size: Pixels of the sensor.
+    """
+
+    def __init__(self, edges: NDArray[np.float64], pixels: NDArray[np.int32], size: int):
+        self._edges = nanoseconds(edges)
+        self._place = np.full(size, -1)
+        self._place[pixels] = np.arange(len(pixels))
+        if np.count_nonzero(self._place >= 0) != len(pixels):
+            raise InputError("pixels must differ where events are counted behind a readout effect")
+        self.counts = np.zeros((len(edges) - 1, 2, len(pixels)), np.int32)
+
+    def add(self, events: Events) -> None:
+        """Count a part of the stream."""
+        windows = np.searchsorted(self._edges, nanoseconds(events.t), side="left") - 1
+        inside = (windows >= 0) & (windows < len(self.counts))
+        if not inside.any():
+            return
+        events, windows = events.select(inside), windows[inside]
+        place = self._place[events.y.astype(np.int64) * events.width + events.x]
+        low, high = int(windows[0]), int(windows[-1]) + 1
+        shape = (high - low, *self.counts.shape[1:])
+        flat = np.ravel_multi_index((windows - low, events.p.astype(np.int64), place), shape)
+        self.counts[low:high] += np.bincount(flat, minlength=math.prod(shape)).reshape(shape).astype(np.int32)
+
+
+def rows_of(events: Events, row: NDArray[np.int32] | None, batch: int) -> Sequence[Events]:
+    """Return the stream of each row of a batch."""
+    if row is None:
+        return [events]
+    # rows as small integers, which are sorted by their digits
+    order = np.argsort(row.astype(np.uint16) if batch <= 1 << 16 else row, kind="stable")
+    parts = np.split(order, np.cumsum(np.bincount(row, minlength=batch))[:-1])
+    return [events.select(part) for part in parts]

@@ -1,0 +1,140 @@
+"""The sensor: an ordered list of effects, and the main path from a scene to events."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import warp as wp
+from numpy.typing import NDArray
+
+from dase.effects import EFFECTS
+from dase.effects.base import Effect
+from dase.effects.optics import SceneEffect
+from dase.effects.stream import StreamEffect
+from dase.effects.threshold import Threshold
+from dase.errors import InputError
+from dase.kernels import pixel_stages
+from dase.scenes.scene import Scene
+from dase.simulation.sensor_history import Entry
+
+
+@dataclass(frozen=True)
+class Sensor:
+    """An event camera: a threshold and any further effects, in the order in which they act.
+
+    Args:
+        effects: At most one of each kind; a `Threshold` among them.
+        name: For the user.
+        size: Columns and rows of the camera [px], for work that has no size of its own; a scene brings its
+            own size. None leaves it open.
+        log_eps: Added to intensities before the logarithm, so that black is finite (ESIM: 0.001).
+        history: How the sensor came to be; changes nothing.
+    """
+
+    effects: tuple[Effect, ...] = (Threshold(),)
+    name: str = "ideal"
+    size: tuple[int, int] | None = None
+    log_eps: float = 1e-3
+    history: tuple[Entry, ...] = field(default=(), compare=False)
+
+    def __post_init__(self) -> None:
+        names = [effect.name for effect in self.effects]
+        if len(set(names)) != len(names):
+            raise InputError(f"sensor '{self.name}': each effect may appear once, got {', '.join(names)}")
+        if "threshold" not in names:
+            raise InputError(
+                f"sensor '{self.name}' needs the effect 'threshold', got {', '.join(names) or 'none'}"
+            )
+        if not 0 < self.log_eps < 1:
+            raise InputError(f"sensor '{self.name}': log_eps must lie in (0, 1), got {self.log_eps:g}")
+        if self.size is not None and min(self.size) < 1:
+            raise InputError(
+                f"sensor '{self.name}': size must be at least 1x1, got {self.size[0]}x{self.size[1]}"
+            )
+
+    def __getitem__(self, name: str) -> Effect:
+        for effect in self.effects:
+            if effect.name == name:
+                return effect
+        raise KeyError(f"sensor '{self.name}' has no effect '{name}'")
+
+    def __contains__(self, name: str) -> bool:
+        return any(effect.name == name for effect in self.effects)
+
+    def with_effect(self, effect: Effect) -> Sensor:
+        """Return the sensor with `effect` added where it acts, or in place of the one of the same name."""
+        if effect.name in self:
+            return replace(self, effects=tuple(effect if e.name == effect.name else e for e in self.effects))
+        place = {name: i for i, name in enumerate(EFFECTS)}
+        later = [place.get(e.name, 0) > place.get(effect.name, len(place)) for e in self.effects]
+        at = later.index(True) if True in later else len(later)
+        return replace(self, effects=(*self.effects[:at], effect, *self.effects[at:]))
+
+    def without(self, name: str) -> Sensor:
+        """Return the sensor without the effect `name`."""
+        return replace(self, effects=tuple(e for e in self.effects if e.name != name))
+
+    def longest_step(self) -> float:
+        """Return the longest time between samples that still shows all effects [s]."""
+        return min(effect.longest_step() for effect in self.effects)
+
+    def stages(self) -> tuple[pixel_stages.Stages, ...]:
+        """Return the pixels' effects as the kernel composer sees them; the threshold is part of its core."""
+        apart = (Threshold, SceneEffect, StreamEffect)
+        return tuple(effect.compiled() for effect in self.effects if not isinstance(effect, apart))
+
+    def seen(self, scene: Scene) -> Scene:
+        """Return what the pixels see of `scene`."""
+        for effect in self.effects:
+            scene = effect.seen(scene) if isinstance(effect, SceneEffect) else scene
+        return scene
+
+    def streams(self) -> tuple[StreamEffect, ...]:
+        """Return the effects behind the pixels that are not off."""
+        return tuple(e for e in self.effects if isinstance(e, StreamEffect) and not e.is_off())
+
+    def located(self, folder: Path) -> Sensor:
+        """Return the sensor with the files of its effects found from `folder`, in which its own file lies."""
+        return replace(self, effects=tuple(effect.located(folder) for effect in self.effects))
+
+    def bound_to(self, scene: Scene) -> Sensor:
+        """Return the sensor with whatever its pixels owe to the scene worked out."""
+        if not any(effect.maps for effect in self.effects):
+            return self
+        return replace(self, effects=tuple(effect.bound_to(scene) for effect in self.effects))
+
+    def maps(self, pixels: NDArray[np.int32], device: Any) -> list[Any]:
+        """Return what kernels get beside parameters: an array (M, N) of maps where effects have any."""
+        values = [effect.map_values(pixels) for effect in self.effects if effect.maps]
+        return [wp.array(np.concatenate(values), dtype=float, device=device)] if values else []
+
+    def retimes(self) -> bool:
+        """Whether events leave at other times than their crossings', or not all of them leave."""
+        late = (e for e in self.effects if isinstance(e, StreamEffect) or "delay" in e.stages)
+        return not all(effect.is_off() for effect in late)
+
+    def parameter_names(self) -> list[str]:
+        """Return `effect.parameter` for every place of a parameter vector."""
+        core = ["threshold.on", "threshold.off", "threshold.phase", "sensor.log_eps"]
+        return core + [f"{s.name}.{p}" for s in self.stages() for p in s.parameters]
+
+    def parameters(self) -> NDArray[np.float32]:
+        """Return the parameter vector of this sensor, shape (P,)."""
+        values = [
+            self.log_eps if n == "sensor.log_eps" else getattr(self[n.split(".")[0]], n.split(".")[1])
+            for n in self.parameter_names()
+        ]
+        return np.array(values, np.float32)
+
+    def table(self) -> dict[str, Any]:
+        """Return the sensor as it stands in a sensor file."""
+        out: dict[str, Any] = {"name": self.name}
+        if self.size is not None:
+            out["size"] = list(self.size)
+        out["log_eps"] = self.log_eps
+        for effect in self.effects:
+            out[effect.name] = {name: getattr(effect, name) for name in effect.settings()}
+        return out

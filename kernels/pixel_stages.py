@@ -1,0 +1,185 @@
+"""The effects of a sensor, composed into one kernel per pixel.
+
+A pixel turns light into events in this order; each effect adds Warp functions at some of these stages:
+
+    light      (intensity, ...)           -> intensity            what reaches the photodiode
+    log        voltage = log(intensity + log_eps)
+    respond    (voltage, intensity, log_eps, ...) -> voltage      photoreceptor
+    threshold  (on, off, ...)             -> on, off              once per pixel [log intensity]
+    redraw     (on, off, ...)             -> on, off              anew after each event; random numbers too
+    drift      (intensity, on, off, ...)  -> drift                of the change towards ON [log intensity/s]
+    noise      (intensity, on, off, ...)  -> rate_on, rate_off    of events without a change [Hz]
+    count      exact threshold crossings of the change since the last event
+    gate       (age, ...)                 -> wait                 time the pixel stays dead [s]
+    delay      (intensity, polarity, ...) -> delay                until the event leaves the pixel [s]
+
+A stage function asks for what it needs by the names of its arguments: the quantities above, `t`, `dt`, `x`,
+`y`, `t64` (t in double precision, for phases of long recordings), `radius` (distance from the middle of the
+sensor to its corner is 1), `nominal_on`, `nominal_off` (thresholds before any effect), parameters and states
+of its effect, random numbers (`uniform`, `normal`: new ones at every sample; `pixel_uniform`, `pixel_normal`:
+one for each pixel; `_2` and so on for more), maps of its effect (one value for each pixel). It returns its
+quantity, then the new values of its states.
+`dase.kernels.pixel_compile` makes the kernel that calls all of them, one line each, so that a sensor costs
+one pass over its samples whatever effects it has. Random numbers are counter-based, keyed by seed, effect,
+pixel and sample: they do not depend on the other effects, on chunks, threads or the batch.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import warp as wp
+
+from dase.kernels.scene_layers import Frames as Frames
+
+REST = 1e30
+"""Duration of the rest before the first sample [s]: filters start settled."""
+
+LATEST = 1.0
+"""Longest time from a crossing to its event's leaving the pixel [s]."""
+
+SIGNAL, LEAK, SHOT = 0, 1, 2
+"""Labels of events: places in `dase.events.LABELS`."""
+
+STAGES = ("light", "respond", "threshold", "redraw", "drift", "noise", "gate", "delay")
+CORE = ("on", "off", "phase", "log_eps")
+"""Parameters of the change detector itself; they lead the parameter vector."""
+
+QUANTITIES = {
+    "light": ("intensity",),
+    "respond": ("voltage", "intensity", "log_eps"),
+    "threshold": ("on", "off"),
+    "redraw": ("on", "off"),
+    "drift": ("intensity", "on", "off"),
+    "noise": ("intensity", "on", "off"),
+    "gate": ("age",),
+    "delay": ("intensity", "polarity"),
+}
+"""What the functions of a stage may ask for beside parameters, states, random numbers and `ANYWHERE`."""
+
+ANYWHERE = ("x", "y", "t", "dt", "t64", "radius", "nominal_on", "nominal_off")
+"""What the functions of every stage may ask for; `t`, `dt` and `t64` only where there are samples."""
+
+
+@dataclass(frozen=True)
+class Stages:
+    """The part of an effect that the composer sees.
+
+    Args:
+        name: Of the effect, a Python identifier.
+        functions: (stage, Warp function) pairs.
+        parameters: Names, in the order of their places in the parameter vector.
+        states: Names of what a pixel remembers from sample to sample; all zero at the start.
+        delays: Whether the events that `gate` holds back come later; otherwise they are lost.
+        label: Of the events that `noise` makes.
+        off: (parameter, value) pairs; an effect with all of them changes nothing.
+        maps: Names of quantities that every pixel has its own value of, handed over as arrays.
+    """
+
+    name: str
+    functions: tuple[tuple[str, Any], ...]
+    parameters: tuple[str, ...] = ()
+    states: tuple[str, ...] = ()
+    delays: bool = False
+    label: int = SHOT
+    off: tuple[tuple[str, float], ...] = ()
+    maps: tuple[str, ...] = ()
+
+
+@wp.struct
+class Clock:
+    """Time samples of one chunk; sample k ends the step that begins at sample k - 1."""
+
+    t: wp.array[float]  # (K,) [s]
+    t64: wp.array[wp.float64]  # (K,) [s]
+    dt: wp.array[float]  # (K,) [s], REST at the first sample of all
+    begin: wp.array[wp.int64]  # (K,) begin of the step [ns since the chunk's begin]
+    length: wp.array[float]  # (K,) duration of the step [ns]
+    span: wp.int64  # of the chunk [ns]
+    run: wp.array[int]  # (R + 1,) samples at which runs of one window begin, and K
+    window: wp.array[int]  # (R,) window that a run is counted in; -1 for none
+
+
+@wp.struct
+class Counts:
+    """Sink that counts events."""
+
+    counts: wp.array4d[int]  # (B, W, 2, N) OFF, ON
+
+
+@wp.struct
+class Keys:
+    """Sink that keeps every event as one sortable 64-bit key: time, place, polarity, label if asked for."""
+
+    keys: wp.array3d[wp.int64]  # (B, slabs, capacity)
+    used: wp.array2d[int]  # (B, slabs) events met; more than the capacity asks for another run
+    slab: int  # pixels per slab, as a power of 2
+    bits: int  # of row · N + i
+    low: int  # bits below: 1 of the polarity, 2 more of the label
+
+
+@wp.func_native("return a.data[k];")
+def element(a: wp.array[float], k: int) -> float:
+    """Return a[k]; Warp's own look-up asks whether k is negative, in the innermost loop."""
+    ...
+
+
+@wp.func_native(
+    "return *(const float*)((const char*)a.data + (size_t)k * (size_t)a.strides[0] + 4 * (size_t)i);"
+)
+def stored(a: wp.array2d[float], k: int, i: int) -> float:
+    """Return a[k, i], as `element` does."""
+    ...
+
+
+@wp.func
+def leaving_time(clock: Clock, k: int, at: float, late: float) -> wp.int64:
+    """When an event of the share `at` of step k leaves, `late` [s] after it [ns since the chunk's begin]."""
+    time = clock.begin[k] + wp.int64(wp.min(at * clock.length[k], clock.length[k]))
+    return time + wp.int64(wp.round(late * 1.0e9))
+
+
+@wp.func_native(
+    """
+    const int slab = i >> shift;
+    int* met = used.data + row * used.shape[1] + slab;
+#ifdef __CUDA_ARCH__
+    const int slot = atomicAdd(met, 1);
+#else
+    const int slot = (*met)++;  // a slab has one thread
+#endif
+    if (slot < keys.shape[2]) keys.data[((size_t)row * keys.shape[1] + slab) * keys.shape[2] + slot] = key;
+"""
+)
+def append(keys: wp.array3d[wp.int64], used: wp.array2d[int], row: int, i: int, shift: int, key: wp.int64):
+    """Append a key to those of the pixel's slab, or only count it where there is no room."""
+    ...
+
+
+@wp.func
+def deposit(sink: Keys, row: int, i: int, size: int, time: wp.int64, code: int):
+    """Keep one event that leaves its pixel at `time` [ns since the chunk's begin]."""
+    place = wp.int64(row) * wp.int64(size) + wp.int64(i)
+    place |= time << wp.int64(sink.bits)
+    append(sink.keys, sink.used, row, i, sink.slab, (place << wp.int64(sink.low)) | wp.int64(code))
+
+
+SINKS = {"counts": Counts, "keys": Keys, "labels": Keys}
+
+
+def states(stages: Sequence[Stages], sink: str = "keys") -> list[str]:
+    """Return the names of what a pixel with these effects remembers, in the order of the state array."""
+    kinds = {stage for effect in stages for stage, _ in effect.functions}
+    names = ["signal", "reference"]
+    names += ["leaked", "leaked_rest"] if "drift" in kinds else []
+    names += ["age"] if "gate" in kinds else []
+    names += ["redraws"] if "redraw" in kinds else []
+    names += ["leaving"] if "delay" in kinds else []
+    names += ["drained"] if "drift" in kinds and sink == "labels" else []
+    for effect in stages:
+        if any(stage == "noise" for stage, _ in effect.functions):
+            names += [f"{effect.name}_hazard", f"{effect.name}_rest", f"{effect.name}_events"]
+        names += [f"{effect.name}_{state}" for state in effect.states]
+    return names

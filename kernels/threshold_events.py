@@ -1,0 +1,129 @@
+"""Events of pixels that are nothing but a change detector, several pixels per thread, for the CPU.
+
+The same events as the composed kernel's, to the last bit: counted by lanes as in
+`dase.kernels.threshold_counts`, and only where a lane has any, one by one.
+"""
+
+# no postponed annotations: those of the kernels made here name types of the functions around them
+from functools import lru_cache
+from typing import Any
+
+import warp as wp
+
+from dase.kernels.pixel_stages import Clock, Keys
+from dase.kernels.scene_layers import Ground, ground_of
+from dase.kernels.threshold_counts import SOURCES, _look, block
+from dase.kernels.vector_math import functions, native, vector
+
+APPEND = """
+typedef float V __attribute__((ext_vector_type({length})));
+V all;
+__builtin_memcpy(&all, &events, sizeof(V));
+typedef bool B __attribute__((ext_vector_type({length})));
+unsigned busy = __builtin_bit_cast({mask}, __builtin_convertvector(all != 0.0f, B)) & ((1u << {length}) - 1);
+// lanes before `from` belong to the block before
+busy &= ~0u << from;
+while (busy) {{
+    const int lane = __builtin_ctz(busy);
+    busy &= busy - 1;
+    const int crossed = (int)__builtin_fabsf(events[lane]);
+    const bool rises = events[lane] > 0.0f;
+    const float theta = rises ? on[lane] : -off[lane];
+    const float before = signal[lane] - reference[lane];
+    const float way = change[lane] - before;
+    const long long code = (long long)(rises ? 1 : 0) << (low - 1);
+    const long long place = (((long long)row * size + n + lane) << low) | code;
+    const int slab = (n + lane) >> shift;
+    int* met = used.data + row * used.shape[1] + slab;
+    long long* slots = keys.data + ((size_t)row * keys.shape[1] + slab) * keys.shape[2];
+    for (int m = 1; m <= crossed; ++m) {{
+        float share = way != 0.0f ? ((float)m * theta - before) / way : 0.0f;
+        share = share < 0.0f ? 0.0f : (share > 1.0f ? 1.0f : share);
+        const float at = share * length;
+        const long long time = begin + (long long)(at < length ? at : length);
+        const int slot = (*met)++;
+        if (slot < keys.shape[2]) slots[slot] = (time << (bits + low)) | place;
+    }}
+}}
+"""
+
+
+@lru_cache(maxsize=8)
+def _append(lanes: int) -> Any:
+    """Return the function that appends the events of one step of `lanes` pixels."""
+    arguments = (
+        "events: Lanes, change: Lanes, signal: Lanes, reference: Lanes, on: Lanes, off: Lanes, "
+        "begin: wp.int64, length: float, keys: wp.array3d[wp.int64], used: wp.array2d[int], "
+        "row: int, n: int, size: int, shift: int, bits: int, low: int, from_lane: int"
+    )
+    mask = "unsigned short" if lanes == 16 else "unsigned char"
+    snippet = APPEND.format(length=lanes, mask=mask).replace("from;", "from_lane;")
+    return native(f"append_{lanes}", snippet, {"Lanes": vector(lanes)}, arguments, "None")
+
+
+@lru_cache(maxsize=32)
+def emit(lanes: int, source: str) -> wp.Kernel:
+    """Return the emitting kernel, over (B, blocks of `lanes` pixels) threads; see `counts.count`."""
+    f, start_of = functions(lanes), block(lanes)
+    Source, Lanes = SOURCES[source], f.Lanes
+    look, append = _look(lanes, source), _append(lanes)
+    load, store, minus, advanced = f.load, f.store, f.minus, f.advanced
+    chosen, inverse, signed_events = f.chosen, f.inverse, f.signed_events
+    thresholds, columns, rows_of = start_of.thresholds, start_of.columns, start_of.rows
+    layers_of = start_of.layers_of
+    stored, layered = source in ("frames", "log"), source == "layers"
+
+    @wp.kernel(enable_backward=False, module="unique", module_options={"fuse_fp": False})
+    def emit_events(
+        first: int,
+        # in
+        seen: Source,
+        clock: Clock,
+        pixels: wp.array[int],  # (N,) row-major indices
+        size: int,  # N
+        width: int,  # of the sensor
+        begin: int,  # first sample to compare
+        threshold: wp.array3d[float],  # (B, 2, N or 1) [log intensity], OFF then ON
+        eps: wp.array[float],  # (B,) added to intensities
+        reference_in: wp.array2d[float],  # (B, N) [log intensity]
+        signal_in: wp.array2d[float],  # (B, N) last sample [log intensity]
+        # out
+        reference_out: wp.array2d[float],  # (B, N) [log intensity]
+        signal_out: wp.array2d[float],  # (B, N) last sample [log intensity]
+        sink: Keys,
+    ):
+        """Emit the events of every pixel."""
+        b, i = wp.tid()
+        n = wp.min((first + i) * wp.static(lanes), size - wp.static(lanes))
+        new = (first + i) * wp.static(lanes) - n
+        off = thresholds(threshold, b, 0, n)
+        on = thresholds(threshold, b, 1, n)
+        per_off = inverse(off)
+        per_on = inverse(on)
+        x = Lanes()
+        y = Lanes()
+        near = int(0)
+        ground = Ground()
+        if wp.static(not stored):
+            ground = ground_of(seen)
+            x = columns(pixels, n, width)
+            y = rows_of(pixels, n, width)
+            if wp.static(layered):
+                near = layers_of(seen, x, y)
+        reference = load(reference_in, b, n)
+        signal = load(signal_in, b, n)
+        for k in range(begin, clock.length.shape[0]):
+            sample = look(seen, ground, k, n, x, y, near, eps[b])
+            change = minus(sample, reference)
+            theta = chosen(change, on, off)
+            events = signed_events(change, theta, chosen(change, per_on, per_off))
+            append(
+                events, change, signal, reference, on, off, clock.begin[k], clock.length[k], sink.keys,
+                sink.used, b, n, size, sink.slab, sink.bits, sink.low, new,
+            )  # fmt: skip
+            reference = advanced(reference, events, theta)
+            signal = sample
+        store(reference_out[b], n, reference)
+        store(signal_out[b], n, signal)
+
+    return emit_events

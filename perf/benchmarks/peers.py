@@ -1,0 +1,200 @@
+r"""Compares dase with other simulators that the user has, side by side in one run, on the same clip.
+
+    python -m perf.benchmarks.peers --v2e PATH --openeb PATH --esim \
+        [--clip FILE] [--size 346x260] [--json OUT]
+
+PATH is a checkout; `--esim` needs the module esim_py. Each runs in a process of its own with what it needs
+installed; one that is not given is said to be so. Runs take turns, so that all see the same state of the
+machine. Every simulator gets 8-bit pictures in memory (esim_py: in files) and returns events in memory.
+`photograph moved` makes the pictures itself, by warping a photograph; its time includes that.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import platform
+import statistics
+import subprocess
+import sys
+import tempfile
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+
+import dase
+from perf.benchmarks import kernels
+
+HERE = Path(__file__).parent
+
+
+class Worker:
+    """A simulator in its process.
+
+    Args:
+        peer: A name of `peer_worker.PEERS`.
+        clip: Folder of the clip.
+        threads: How many the simulator may use.
+        path: Of its checkout.
+    """
+
+    def __init__(self, peer: str, clip: Path, threads: int, path: Path | None):
+        command = [sys.executable, str(HERE / "peer_worker.py"), peer, str(clip), "--threads", str(threads)]
+        command += ["--path", str(path)] if path else []
+        limits = ("OMP", "MKL", "OPENBLAS", "NUMBA")
+        several = {f"{name}_NUM_THREADS": str(threads) for name in limits}
+        self._log = tempfile.TemporaryFile("w+")  # noqa: SIM115  # it lives as long as the process
+        self._process = subprocess.Popen(
+            command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=self._log, text=True,
+            env={**os.environ, **several, "DASE_THREADS": str(threads)},
+        )  # fmt: skip
+        self.runs: dict[str, list[str]] = self._answer()
+
+    def _answer(self) -> Any:
+        assert self._process.stdout is not None
+        line = self._process.stdout.readline()
+        if not line:
+            self._process.wait()
+            self._log.seek(0)
+            raise RuntimeError((self._log.read().strip() or "it ended without a word").splitlines()[-1])
+        return json.loads(line)
+
+    def run(self, task: str, setting: str) -> dict[str, float]:
+        """Return seconds, events, memory before and greatest memory of one run [bytes]."""
+        assert self._process.stdin is not None
+        print(json.dumps([task, setting]), file=self._process.stdin, flush=True)
+        found: dict[str, float] = self._answer()
+        return found
+
+    def close(self) -> None:
+        assert self._process.stdin is not None
+        self._process.stdin.close()
+        self._process.wait()
+
+
+def make_clip(folder: Path, options: argparse.Namespace) -> tuple[int, int, int]:
+    """Write the clip; return its samples, height and width."""
+    width, height = map(int, options.size.split("x"))
+    if options.clip is None:
+        scene: dase.Scene = kernels.moving_layers(0, width, height, options.samples)
+        times = np.arange(options.samples) * 1e-3
+        (folder / "moved").touch()
+    else:
+        scene = dase.open_video(options.clip, size=(width, height))
+        times = scene.sample_times()[: options.samples]
+    frames = np.rint(255 * scene.frames(times).clip(0, 1)).astype(np.uint8)
+    np.save(folder / "frames.npy", frames)
+    np.save(folder / "times.npy", times - times[0])
+    (folder / "pictures").mkdir()
+    for k, frame in enumerate(frames):
+        cv2.imwrite(str(folder / "pictures" / f"{k:06d}.bmp"), frame)
+    return len(frames), height, width
+
+
+def measure(
+    clip: Path, threads: int, peers: dict[str, Path | None], rounds: int
+) -> Iterator[tuple[str, str, list[dict[str, float]]]]:
+    """Yield task, setting and runs of every simulator, without the first run of each, which compiles."""
+    workers: dict[str, Worker] = {}
+    for peer, path in peers.items():
+        try:
+            workers[peer] = Worker(peer, clip, threads, path)
+        except RuntimeError as error:
+            print(f"{peer}: does not start: {error}")
+    for setting in ("clean", "as v2e", "noisy"):
+        todo = [(peer, task) for peer, w in workers.items() for task, has in w.runs.items() if setting in has]
+        found: dict[str, list[dict[str, float]]] = {task: [] for _, task in todo}
+        for turn in range(rounds + 1):
+            for peer, task in todo:
+                if peer not in workers:
+                    continue
+                try:
+                    result = workers[peer].run(task, setting)
+                except RuntimeError as error:
+                    print(f"{peer}: {task}, {setting}: {error}")
+                    del workers[peer]
+                    continue
+                found[task] += [result] if turn else []
+        for task, runs in found.items():
+            if runs:
+                yield task, setting, runs
+    for worker in workers.values():
+        worker.close()
+
+
+def row(task: str, setting: str, threads: int, runs: list[dict[str, float]], work: int) -> dict[str, Any]:
+    """Return one line of the table."""
+    seconds = sorted(run["s"] for run in runs)
+    middle = statistics.median(seconds)
+    events = statistics.median(run["events"] for run in runs)
+    return {
+        "simulator": task,
+        "setting": setting,
+        "threads": threads,
+        "Mpx-samples/s": work / middle / 1e6,
+        "slowest": work / seconds[-1] / 1e6,
+        "fastest": work / seconds[0] / 1e6,
+        "Mevents/s": events / middle / 1e6,
+        "events": int(events),
+        "peak MiB": max(run["peak"] for run in runs) / 2**20,
+        "MiB of the run": max(run["peak"] - run["before"] for run in runs) / 2**20,
+    }
+
+
+def shown(line: dict[str, Any]) -> str:
+    """Return a line of the table in Markdown."""
+    speed = f"{line['Mpx-samples/s']:.1f} ({line['slowest']:.1f} to {line['fastest']:.1f})"
+    silent = line["simulator"].startswith("reading")
+    rate = "-" if silent else f"{line['Mevents/s']:.2f} | {line['events']:,}"
+    rate += " | -" if silent else ""
+    return (
+        f"| {line['simulator']} | {line['setting']} | {line['threads']} | {speed} | {rate} "
+        f"| {line['peak MiB']:.0f} | {line['MiB of the run']:.0f} |"
+    )
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--v2e", type=Path, help="checkout of SensorsINI/v2e")
+    parser.add_argument(
+        "--openeb", type=Path, help="checkout of prophesee-ai/openeb, or folder of its Python"
+    )
+    parser.add_argument("--esim", action="store_true", help="esim_py can be imported")
+    parser.add_argument("--clip", type=Path, help="video instead of a moving photograph")
+    parser.add_argument("--size", default="346x260")
+    parser.add_argument("--samples", type=int, default=200, help="pictures")
+    parser.add_argument("--rounds", type=int, default=3)
+    parser.add_argument("--json", type=Path)
+    options = parser.parse_args()
+    peers: dict[str, Path | None] = {"dase": None, "numpy": None}
+    for name in ("v2e", "openeb", "esim"):
+        given = getattr(options, name)
+        if given:
+            peers[name] = given if isinstance(given, Path) else None
+        else:
+            print(f"{name}: not given")
+    lines = []
+    with tempfile.TemporaryDirectory() as folder:
+        samples, height, width = make_clip(Path(folder), options)
+        about = f"{width}x{height}, {samples} pictures, {platform.processor() or platform.machine()}, "
+        about += f"{os.cpu_count()} cores, commit {kernels.commit()}"
+        print(f"\n{about}; median of {options.rounds} rounds (slowest to fastest)\n")
+        print(
+            "| simulator | setting | threads | Mpx-samples/s | Mevents/s | events | peak MiB | of the run |"
+        )
+        print("|---|---|---|---|---|---|---|---|")
+        for threads in sorted({1, os.cpu_count() or 1}):
+            for task, setting, runs in measure(Path(folder), threads, peers, options.rounds):
+                lines.append(row(task, setting, threads, runs, samples * height * width))
+                print(shown(lines[-1]), flush=True)
+    if options.json:
+        options.json.parent.mkdir(parents=True, exist_ok=True)
+        options.json.write_text(json.dumps({"about": about, "rows": lines}, indent=1) + "\n")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,258 @@
+"""Writes docs/real-cameras.md and its picture from what `real_cameras.py` found."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import matplotlib
+
+matplotlib.use("Agg")
+import matplotlib.pyplot as plt
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.ticker import NullFormatter
+
+from dase.figures.event_images import overlay
+from dase.figures.style import BOTH, INK, QUIET, number
+
+
+def write_page(cameras: Mapping[str, Any], log: Path, out: Path) -> None:
+    """Write the page from what was found; recordings that were not diagnosed are left out."""
+    found = {}
+    for name in cameras:
+        if (log / f"{name}.json").exists():
+            with np.load(log / f"{name}.npz") as data:
+                found[name] = json.loads((log / f"{name}.json").read_text()), dict(data)
+    if not found:
+        return
+    draw(cameras, found, out / "real-cameras.png")
+    names = ", ".join(name for name in cameras if name not in found)
+    left = f"\nNot diagnosed yet: {names}.\n" if names else ""
+    parts = [section(name, cameras[name], *found[name]) for name in found]
+    (out / "real-cameras.md").write_text(
+        PAGE.format(table=table(cameras, found), parts="\n\n".join(parts), left=left, made=made_at(found))
+    )
+
+
+def made_at(found: Mapping[str, Any]) -> str:
+    """Return a sentence with the commits at which recordings were diagnosed."""
+    at: dict[str, list[str]] = {}
+    for name, (what, _) in found.items():
+        at.setdefault(what.get("commit", ""), []).append(name)
+    if len(at) == 1:
+        return f" All are of commit {next(iter(at))}." if all(at) else ""
+    known = (f"{commit or 'unknown'} ({', '.join(names)})" for commit, names in at.items())
+    return f" Commits: {', '.join(known)}."
+
+
+def answer(found: dict[str, Any]) -> str:
+    """Return what a diagnosis found, in a few words."""
+    left = found["unexplained"]
+    if left is not None:
+        near = " + ".join(left["nearest"])
+        return f"unexplained; nearest {near}" if near else "unexplained"
+    return ", ".join(found["selected"]) or "nothing is missing"
+
+
+def path_of(found: dict[str, Any]) -> tuple[list[str], list[float], int]:
+    """Return steps, their errors, and how many of the last are stand-ins."""
+    steps, errors = ["thresholds"], list(found["errors"])
+    steps += [f"+ {name}" for name in found["selected"]]
+    left = found["unexplained"]
+    if left is None or not left["nearest"]:
+        return steps, errors, 0
+    history = found["history"]
+    after = {a["chosen"]: b["error"] for a, b in pairwise(history) if a["chosen"]}
+    names = left["nearest"]
+    if all(name in after for name in names[:-1]):
+        return (
+            [*steps, *(f"+ {n}" for n in names)],
+            [*errors, *(after[n] for n in names[:-1]), left["error"]],
+            len(names),
+        )
+    return [*steps, "+ " + " + ".join(names)], [*errors, left["error"]], 1
+
+
+def table(cameras: Mapping[str, Any], found: Mapping[str, Any]) -> str:
+    """Return the table of all recordings."""
+    lines = ["| recording | error at first | at last | answer | time |", "|---|---|---|---|---|"]
+    for name, (what, _) in found.items():
+        _, errors, _ = path_of(what)
+        lines.append(
+            f"| {name} ({cameras[name].sensor}) | {number(errors[0])} | {number(errors[-1])} | "
+            f"{answer(what)} | {what['seconds']:.0f} s |"
+        )
+    return "\n".join(lines)
+
+
+def section(name: str, camera: Any, found: dict[str, Any], facts: dict[str, Any]) -> str:
+    """Return what is said of one recording."""
+    lines = [f"## {name}", "", f"{camera.sensor}; {camera.shows}. {plain(facts)}", ""]
+    lines += [
+        f"**{answer(found)}.** " + _estimates(found),
+        "",
+        "| visible in the events | the diagnosis |",
+        "|---|---|",
+    ]
+    near = found["unexplained"]["nearest"] if found["unexplained"] else []
+    for words, effects in camera.visible:
+        said = [e for e in effects if e in found["selected"]]
+        stand = [e for e in effects if e in near]
+        verdict = (
+            f"found: {', '.join(said)}" if said else f"stand-in: {', '.join(stand)}" if stand else "not found"
+        )
+        lines.append(f"| {words} | {_threshold(found) if effects == ('threshold',) else verdict} |")
+    cells = found["unexplained"]["cells"] if found["unexplained"] else []
+    if cells:
+        lines += ["", "What stays unexplained, worst first:", "", *(f"- {c['sentence']}" for c in cells[:4])]
+    if found["notes"]:
+        lines += ["", *(f"- note: {note}" for note in found["notes"])]
+    return "\n".join(lines)
+
+
+def plain(facts: dict[str, Any]) -> str:
+    """Return what can be counted without a model."""
+    f = {k: float(facts[k]) for k in ("events", "seconds", "rate", "on", "shortest", "busiest", "hot")}
+    return (
+        f"{f['events']:,.0f} events in {f['seconds']:.3g} s, {100 * f['on']:.0f} % of them ON; one in a "
+        f"thousand intervals of a pixel is shorter than {number(1e3 * f['shortest'])} ms; the busiest pixel "
+        f"sends {number(f['busiest'])} events per second; {f['hot']:,.0f} pixels send ten times as "
+        "many as those around them."
+    )
+
+
+def _threshold(found: dict[str, Any]) -> str:
+    both = [found["parameters"].get(f"threshold.{p}") for p in ("on", "off")]
+    if None in both:
+        return "not fitted"
+    on, off = (f"{e['value']:.3g} ({e['low']:.3g} to {e['high']:.3g})" for e in both)
+    return f"thresholds ON {on}, OFF {off}"
+
+
+def _estimates(found: dict[str, Any]) -> str:
+    chosen = [(n, e) for n, e in found["parameters"].items()]
+    said = [f"`{n}` {e['value']:.3g} ({e['low']:.3g} to {e['high']:.3g})" for n, e in chosen]
+    what = "Fitted with the stand-ins" if found["unexplained"] else "Fitted"
+    return f"{what}, with 90 % intervals: {', '.join(said)}." if said else ""
+
+
+OPEN = {"davis346_cuke_cradle", "dvx_noise_static"}
+"""Recordings of which a picture may be published here: MIT, Apache-2.0."""
+
+CLOSED_IN_A_ROW = 2
+"""Staircases of the others, side by side."""
+
+
+def draw(cameras: Mapping[str, Any], found: Mapping[str, Any], path: Path) -> None:
+    """Draw measured events, the model's and the staircase of the error; of closed recordings that alone."""
+    shown = {name: both for name, both in found.items() if name in OPEN}
+    others = {name: both for name, both in found.items() if name not in OPEN}
+    heights = [n for n in (len(shown), -(-len(others) // CLOSED_IN_A_ROW)) if n]
+    figure = plt.figure(figsize=(11.5, 2.75 * sum(heights)), layout="constrained")
+    figure.get_layout_engine().set(hspace=0.08, wspace=0.03)
+    parts = list(figure.subfigures(len(heights), 1, squeeze=False, height_ratios=heights)[:, 0])
+    if shown:
+        lines = parts.pop(0).subplots(len(shown), 3, width_ratios=[1, 1, 1.35], squeeze=False)
+        for line, (name, (what, facts)) in zip(lines, shown.items(), strict=True):
+            draw_pictures(line[:2], facts, cameras[name].window)
+            _name(line[0], name)
+            staircase(line[2], what)
+    if others:
+        axes = parts.pop(0).subplots(heights[-1], CLOSED_IN_A_ROW, squeeze=False).ravel()
+        for axis, (name, (what, _)) in zip(axes, others.items(), strict=False):
+            staircase(axis, what)
+            _name(axis, name)
+        for axis in axes[len(others) :]:
+            axis.set_axis_off()
+    figure.savefig(path, dpi=110, facecolor="white")
+    plt.close(figure)
+
+
+def draw_pictures(axes: Sequence[Axes], facts: Mapping[str, Any], window: float) -> None:
+    """Draw events of a window [s], measured and simulated, over the scene's light where it is known."""
+    grey = facts["grey"]
+    top = max(float(np.percentile(grey, 99.5)), 1e-6)
+    calm = np.rint(255 * np.clip(grey / top, 0, 1)).astype(np.uint8) if np.ptp(grey) > 0 else None
+    for axis, kind in zip(axes, ("measured", "simulated"), strict=True):
+        axis.set_xticks([])
+        axis.set_yticks([])
+        axis.spines[:].set(color=QUIET, linewidth=0.5)
+        axis.imshow(_large(overlay(calm, facts[kind])), interpolation="nearest")
+        axis.set_title(f"{kind}, {1e3 * window:g} ms", fontsize=8.5, color=QUIET, pad=4)
+
+
+def _name(axis: Axes, name: str) -> None:
+    axis.set_title(f"{name}\n", fontsize=10.5, color=INK, weight="bold", loc="left", pad=2)
+
+
+def _large(picture: np.ndarray) -> np.ndarray:
+    """Return a picture of sensible size: single events stay visible when it is shrunk."""
+    size = max(1, round(900 / picture.shape[1]))
+    return picture.repeat(size, 0).repeat(size, 1)
+
+
+def staircase(axis: Axes, found: dict[str, Any]) -> None:
+    """Draw the falling error into an axis; what is not announced is dashed."""
+    steps, errors, stand_ins = path_of(found)
+    n, gate = len(errors), max(found["gate"], 1.0)
+    sure, edges = n - stand_ins, np.arange(n + 1) - 0.5
+    axis.set_yscale("log")
+    axis.axhspan(1e-3, gate, color=BOTH, alpha=0.10, lw=0)
+    axis.axhline(1, color=BOTH, lw=1.2, ls=(0, (4, 2)))
+    axis.stairs(errors, edges, baseline=1e-3, fill=True, color=INK, alpha=0.07, lw=0)
+    axis.stairs(errors[:sure], edges[: sure + 1], baseline=None, color=INK, lw=2)
+    if stand_ins:
+        x = np.repeat(edges[sure:], 2)[:-1]
+        axis.plot(x, [errors[sure - 1], *np.repeat(errors[sure:], 2)], color=QUIET, lw=1.7, ls=(0, (3, 1.5)))
+    for k, error in enumerate(errors):
+        below = 0.6 < error < 1  # beside the line of the floor, not on it
+        axis.annotate(
+            number(error), (k, error), (0, -12 if below else 4), textcoords="offset points", ha="center",
+            weight="bold", fontsize=9, color=INK if k < sure else QUIET,
+        )  # fmt: skip
+    axis.set_ylim(0.5 * min(1.0, *errors), 2.2 * max(*errors, gate))
+    axis.set_xlim(-0.5, max(n, 3) - 0.5)
+    axis.set_xticks(range(n), [s.replace(" + ", "\n+ ").strip() for s in steps], fontsize=8.5)
+    axis.tick_params(axis="x", length=0)
+    axis.tick_params(axis="y", labelsize=8)
+    axis.yaxis.set_major_formatter(lambda value, _: f"{value:g}")
+    axis.yaxis.set_minor_formatter(NullFormatter())
+    axis.spines[["top", "right"]].set_visible(False)
+    axis.set_title(
+        "error on held-out pixels and time" + (" (dashed: stand-ins)" if stand_ins else ""),
+        fontsize=8.5, color=QUIET, pad=4,
+    )  # fmt: skip
+
+
+PAGE = """# Real cameras
+
+`perf/experiments/real_cameras/run.py` writes this page; edit the text there and in
+`perf/experiments/real_cameras/report.py`. Each recording is compared with a sensor that has thresholds alone,
+and `dase diagnose --auto` looks for what is missing. The error is that of pixels and times that no fit has
+seen; 1 is what two repeats of the recording would have.{made}
+
+{table}
+{left}
+![measured events, simulated events, and the falling error of each recording](real-cameras.png)
+
+Left: measured. Middle: what the announced model makes of the same scene at the same time; thresholds alone
+where the error stays unexplained. Right: the error with each effect added; the green band is what chance
+reaches, dashed steps are stand-ins that do not reach it and are not announced. Red is ON, blue is OFF. Of
+recordings that have no licence for it no events are shown, only the error.
+
+The scene between two frames of a camera is a guess. Only where it can be trusted anything is compared (see
+[scenes](scenes.md)), and where that is not enough, an error stays that is the scene's and not the sensor's:
+it is called unexplained.
+
+{parts}
+
+## Again
+
+```sh
+python -m perf.experiments.real_cameras.run $DASE_DATA/recordings --again
+```
+"""

@@ -1,0 +1,200 @@
+"""The voltage of a pixel: a photoreceptor of second order, and noise of the voltage."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import warp as wp
+from reference import effects as reference_effects
+from scipy.linalg import expm
+from scipy.stats import norm
+from test_effects import KS, distance, ramp
+from test_effects_more import counts, every, still
+from test_pixel_kernel import by_pixel
+
+import dase
+from dase.effects import second_order, voltage_noise
+from dase.effects.bandwidth import Bandwidth
+from dase.effects.second_order import SecondOrder
+from dase.effects.threshold import Threshold
+from dase.effects.voltage_noise import VoltageNoise
+
+
+@pytest.mark.parametrize("damping", [0.2, 0.5, 1.0, 3.0])
+def test_a_step_overshoots_by_the_damping(device, damping):
+    step, theta, cutoff = 1.0, 0.01, 20.0
+    times = np.concatenate([[-1e-7], np.linspace(0, 1.0, 4001)])
+    frames = np.exp(np.r_[-1.5 - step, np.full(4001, -1.5)])[:, None, None] - 1e-3
+    quiet = Threshold(on=theta, off=theta, phase=0.0)
+    sensor = every(quiet, SecondOrder(cutoff=cutoff, damping=damping, dark=1.0))
+    events = dase.simulate(dase.VideoScene(frames, times), sensor, device=device)
+    first_off = np.append(np.flatnonzero(~events.p), len(events))[0]
+    peak = first_off * theta
+    if damping < 1:
+        ring = np.sqrt(1 - damping**2)
+        assert peak == pytest.approx(step * (1 + np.exp(-np.pi * damping / ring)), abs=1.5 * theta)
+        # the highest voltage comes half a ringing period after the step
+        assert events.t[first_off - 1] < 0.5 / (cutoff * ring) < events.t[first_off]
+    else:
+        assert len(events) == first_off
+        assert peak == pytest.approx(step, abs=1.5 * theta)
+
+
+@pytest.mark.parametrize(("damping", "light"), [(0.2, 0.9), (1.0, 0.9), (2.0, 0.9), (0.7, 0.1)])
+def test_a_sine_at_the_natural_frequency_gains_by_the_quality(device, damping, light):
+    dark, swings, cutoff = 0.25, 40, 50.0
+    frequency = cutoff * (dark + (1 - dark) * light)
+    times = np.linspace(0, swings / frequency, 100 * swings + 1)
+    # a swing so small that the light is the same throughout
+    frames = ((light + 1e-3) * np.exp(0.1 * np.sin(2 * np.pi * frequency * times)) - 1e-3)[:, None, None]
+    sensor = every(
+        Threshold(on=0.01, off=0.01, phase=0.0), SecondOrder(cutoff=cutoff, damping=damping, dark=dark)
+    )
+    edges = np.array([swings / 2, swings]) / frequency
+    got = dase.count(dase.VideoScene(frames, times), sensor, edges, device=device).sum()
+    # 4 amplitudes per period, of which hysteresis takes a threshold at each turn
+    amplitude = (got / (swings / 2) / 2 + 0.5) * 0.01 / 2
+    assert amplitude == pytest.approx(0.1 / (2 * damping), abs=0.006)
+
+
+@pytest.mark.parametrize("damping", [0.1, 1.0, 15.0])
+def test_the_second_order_does_not_depend_on_sampling(device, damping):
+    quiet = Threshold(on=0.01, off=0.01, phase=0.0)
+    sensor = every(quiet, SecondOrder(cutoff=1.5, damping=damping, dark=1.0))
+    totals = [counts(ramp(5.0, 0.3, 1, n), sensor, 0.3, device)[1].sum() for n in (2, 9, 1025)]
+    want = reference_effects.second_order(
+        np.array([0.0, 0.3]), np.array([[0.0], [5.0]]), np.full((2, 1), 3 * np.pi), damping
+    )[1, 0]
+    np.testing.assert_allclose(totals, want / 0.01, atol=1.5)
+    assert want > 0.1
+
+
+@wp.kernel(enable_backward=False)
+def answers(x: wp.array[float], damping: wp.array[float], out: wp.array2d[float]):
+    i = wp.tid()
+    h, dh = second_order.impulse(x[i], damping[i])
+    behind, speed = second_order.lag(x[i], damping[i], h, dh + 2.0 * damping[i] * h)
+    out[i, 0] = h
+    out[i, 1] = dh
+    out[i, 2] = behind
+    out[i, 3] = speed
+
+
+def test_closed_forms_keep_their_digits(device):
+    x, damping = np.meshgrid(np.geomspace(1e-4, 50, 60), [0.05, 0.4, 0.999, 1.0, 1.0001, 1.05, 3.0, 20.0])
+    x, damping = x.ravel().astype(np.float32), damping.ravel().astype(np.float32)
+    out = wp.empty((len(x), 4), dtype=float, device=device)
+    inputs = [wp.array(a, dtype=float, device=device) for a in (x, damping)]
+    wp.launch(answers, len(x), inputs=[*inputs, out], device=device)
+    for got, at, zeta in zip(out.numpy().astype(float), x.astype(float), damping.astype(float), strict=True):
+        # displacement, its speed, the time integral of the displacement
+        flow = expm(at * np.array([[0, 1, 0], [-1, -2 * zeta, 0], [1, 0, 0]]))
+        want = [flow[0, 1], flow[1, 1], flow[2, 0] / at, (1 - flow[0, 0]) / at]
+        # float32 rounds shares of a step of 1 after a division by x
+        slack = 3e-6 + 3e-7 * (2 * zeta / at if 2 * zeta * at > 0.09 else 1)
+        np.testing.assert_allclose(got, want, atol=slack)
+
+
+@pytest.mark.parametrize("damping", [0.05, 1.0, 20.0])
+def test_a_second_order_pixel_starts_settled(device, damping):
+    sensor = every(Threshold(on=0.01, off=0.01), SecondOrder(cutoff=0.01, damping=damping, dark=1e-4))
+    assert counts(still([0.0, 0.1, 1.0], 5.0, 50), sensor, 5.0, device).sum() == 0
+
+
+@pytest.mark.parametrize("dark", [0.1, 1.0])
+def test_a_strongly_damped_second_order_is_a_bandwidth(device, dark):
+    assert SecondOrder.includes == ("bandwidth",)
+    quiet = Threshold(on=0.01, off=0.01, phase=0.0)
+    larger = SecondOrder(cutoff=2 * 20.0 * 1.5, damping=20.0, dark=dark)
+    scene = ramp(5.0, 0.3, 3, 65)
+    got, want = (
+        counts(scene, every(quiet, effect), 0.3, device)[1]
+        for effect in (larger, Bandwidth(cutoff=1.5, dark=dark))
+    )
+    np.testing.assert_allclose(got, want, atol=1.5)
+    assert want.min() > 10
+    assert counts(scene, every(quiet), 0.3, device)[1].min() > 1.4 * want.max()
+
+
+def noise_rates(
+    device: str, light: list[float], effect: VoltageNoise, *others: dase.Effect, samples: int = 2
+) -> np.ndarray:
+    """Return OFF and ON rates [Hz] of static pixels, 400 of each light, shape (2, lights)."""
+    scene = still(np.repeat(light, 400), 2.0, samples)
+    sensor = every(effect, *others)
+    return counts(scene, sensor, 2.0, device).reshape(2, len(light), 400).mean(-1) / 2.0
+
+
+@wp.kernel(enable_backward=False)
+def points(turn: wp.array[float], out: wp.array2d[float]):
+    i = wp.tid()
+    cosine, sine = voltage_noise.circle(turn[i])
+    out[i, 0] = cosine
+    out[i, 1] = sine
+
+
+def test_points_of_the_circle(device):
+    near = np.arange(9) / 8
+    turn = np.r_[np.linspace(0, 1, 4097), near[:-1] + 1e-7, near[1:] - 1e-7].astype(np.float32)
+    out = wp.empty((len(turn), 2), dtype=float, device=device)
+    wp.launch(points, len(turn), inputs=[wp.array(turn, dtype=float, device=device), out], device=device)
+    angle = 2 * np.pi * turn.astype(float)
+    np.testing.assert_allclose(out.numpy(), np.stack([np.cos(angle), np.sin(angle)], -1), atol=4e-7)
+
+
+def test_voltage_noise_is_normal(device):
+    # thresholds so small that the events tell where the voltage is; it begins settled, and half a second is
+    # 24 time constants, so its change is that of two independent values of variance 2
+    pixels, fine = 4000, 0.01
+    effect = VoltageNoise(sigma=2.0, cutoff=10.0, knee=1.0, dark=1e-6)
+    sensor = every(Threshold(on=fine, off=fine, phase=0.0), effect)
+    off, on = counts(still(np.ones(pixels), 0.5, 2), sensor, 0.5, device).astype(float)
+    moved = np.sort(fine * (on - off)) / 2
+    assert distance(moved, norm.cdf(moved)) < KS
+    assert moved.std() == pytest.approx(1, rel=4 / np.sqrt(2 * pixels))
+
+
+def test_voltage_noise_has_the_speed_of_its_spectrum(device):
+    # far below the amplitude a threshold is passed |dn/dt| / θ times a second, and E|dn/dt| = σ λ √(2/π)
+    sigma, cutoff, knee, light = 2.0, 40.0, 0.5, 0.5
+    effect = VoltageNoise(sigma=sigma, cutoff=cutoff, knee=knee, dark=1e-6)
+    fine = Threshold(on=0.01, off=0.01)
+    off, on = noise_rates(device, [light], effect, fine, samples=8001)[:, 0]
+    pole = 2 * np.pi * cutoff / 2 / np.sqrt(np.sqrt(2) - 1)
+    want = sigma * np.sqrt(0.5) * pole * np.sqrt(2 / np.pi) / 0.01
+    assert on + off == pytest.approx(want, rel=0.05)
+    assert on == pytest.approx(off, rel=0.01)
+
+
+def test_voltage_noise_events_rise_as_light_falls(device):
+    # and with the photoreceptor's own low-pass, which shares the light
+    noisy = VoltageNoise(sigma=0.2, cutoff=100.0, knee=0.03, dark=1e-3)
+    light = [0.6, 0.3, 0.15, 0.06]
+    for others in ((), (Bandwidth(cutoff=100.0),)):
+        total = noise_rates(device, light, noisy, *others).sum(0)
+        assert np.all(np.diff(total) > 0.5)
+        assert total[-1] > 20 * total[0]
+    # where the photocurrent limits the bandwidth, less light means slower noise of the same amplitude
+    dim = noise_rates(device, [0.01, 0.003, 0.001, 0.0], noisy).sum(0)
+    assert np.all(np.diff(dim) < -0.5)
+
+
+def test_voltage_noise_is_stationary_and_returns(device):
+    effect = VoltageNoise(sigma=0.12, cutoff=50.0, knee=0.1)
+    sensor = every(effect)
+    scene = still(np.full(3000, 0.05), 1.2, 2)
+    windows = dase.count(scene, sensor, np.arange(7) * 0.2, device=device)[0].sum((1, 2)).astype(float)
+    assert abs(windows[0] / windows[1:].mean() - 1) < 4 / np.sqrt(windows[0])
+    events = by_pixel(dase.simulate(still(np.full(200, 0.05), 5.0, 2), sensor, device=device))
+    flips = np.concatenate([np.diff(e[:, 1]) != 0 for e in events])
+    assert flips.mean() > 0.6  # of shot noise it would be a half
+    assert len(flips) > 2000
+
+
+def test_the_rate_of_voltage_noise_does_not_depend_on_sampling(device):
+    effect = VoltageNoise(sigma=0.12, cutoff=60.0, knee=0.1, dark=1e-3)
+    asked, finer = (
+        counts(still(np.full(2000, 0.1), 2.0, samples), every(effect), 2.0, device).sum()
+        for samples in (2, 8001)
+    )
+    assert asked == pytest.approx(finer, rel=0.06)

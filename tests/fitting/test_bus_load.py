@@ -1,0 +1,211 @@
+"""A bus that all pixels share, where only some of them are looked at."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import dase
+from dase.diagnosis.candidates import prepared
+from dase.effects import EFFECTS
+from dase.effects.readout import Others, Readout
+from dase.effects.row_scan import RowScan
+from dase.effects.stream import nanoseconds
+from dase.fitting import bus_load
+from dase.fitting.batch_simulator import Order
+from dase.fitting.data_split import BUSY, fastest, gather
+from dase.fitting.model import model_of
+from dase.fitting.readout_simulator import emitted
+from dase.fitting.scheduler import Ask, simulated
+from dase.probes.events_by_pixel import by_pixel
+from dase.probes.timestamp_patterns import Structure, find, share_at
+from dase.simulation.sensor import Sensor
+
+WIDTH, HEIGHT, SECONDS = 40, 30, 0.3
+BUS = Readout(rate=1.2e5, depth=300.0)
+
+
+@pytest.fixture(scope="module")
+def scene() -> dase.VideoScene:
+    """Return a small disc that runs to and fro: few pixels have events at a time."""
+    times = np.arange(round(SECONDS * 1000) + 1) / 1000
+    y, x = np.mgrid[:HEIGHT, :WIDTH]
+    along = 0.5 * WIDTH + 0.4 * WIDTH * np.sin(2 * np.pi * 7 * times)
+    up = 0.5 * HEIGHT + 0.3 * HEIGHT * np.sin(2 * np.pi * 3 * times)
+    away = np.hypot(x - along[:, None, None], y - up[:, None, None])
+    return dase.VideoScene((0.05 + 0.9 / (1 + np.exp(2 * (away - 6)))).astype(np.float32), times)
+
+
+@pytest.fixture(scope="module")
+def true() -> Sensor:
+    return Sensor().with_effect(EFFECTS["shot"](rate=5.0)).with_effect(BUS)
+
+
+@pytest.fixture(scope="module")
+def evidence(scene, true, device):
+    return gather(dase.simulate(scene, true, seed=4), scene, pixels=150, seed=1, device=device)
+
+
+def stream(rng, count: int) -> dase.Events:
+    """Return events in bunches, columns numbered."""
+    t = np.sort(np.abs(rng.choice(rng.uniform(0, 2e-2, 20), count) + rng.normal(0, 2e-4, count)))
+    x, p = np.arange(count) % 50, rng.random(count) < 0.5
+    return dase.Events(1e-9 * np.rint(1e9 * t), x.astype(np.uint16), np.zeros(count, np.uint16), p, 50, 1)
+
+
+@pytest.mark.parametrize("bus", [Readout(rate=1e5, depth=50.0), Readout(rate=1e5, mode="drop")])
+def test_some_events_beside_others_leave_as_from_one_queue(rng, bus):
+    events = stream(rng, 3000)
+    mine = events.x < 5
+    rest = events.select(~mine)
+    others = Others(1000 * nanoseconds(rest.t), rest.p.astype(np.uint8))
+    got = bus.reader(50, 1, 0).beside(events.select(mine), others, np.ones(2))
+    whole, _ = bus.reader(50, 1, 0).push(events, np.inf)
+    want = whole.select(whole.x < 5)
+    assert 0 < len(want) < mine.sum()
+    # events at one time may change places
+    assert abs(len(got) - len(want)) <= 0.01 * len(want)
+    late = [np.bincount((e.t / 1e-3).astype(int), minlength=40) for e in (got, want)]
+    assert np.abs(late[0] - late[1]).sum() <= 0.02 * len(want)
+
+
+@pytest.mark.parametrize("weight", [(0.0, 0.0), (0.3, 0.3), (1.7, 0.0), (2.5, 2.5)])
+def test_others_take_as_much_time_as_what_they_stand_for(rng, weight):
+    bus, rest = Readout(rate=5e3, depth=1e6), stream(rng, 2000)
+    others = Others(1000 * nanoseconds(rest.t), rest.p.astype(np.uint8))
+    last = replace(rest.select(slice(1)), t=rest.t[-1:] + 1e-9)
+    (end,) = bus.reader(50, 1, 0).beside(last, others, np.array(weight)).t
+    before = sum(w * np.count_nonzero(rest.p == p) for p, w in enumerate(weight))
+    begin = rest.t[0] if before else last.t[0]  # the bus does not rest from the first to the last
+    assert end - begin == pytest.approx((before + 1) / bus.rate, rel=0.03)
+
+
+def busy(half, true, load) -> np.ndarray:
+    """Return the events of each 3 ms in the mean over 16 repeats, and those that were measured, (2, K)."""
+    order = Order(true, np.repeat(true.parameters()[None], 16, 0), 9, reseed=True)
+    model = half.trials.stream_all(order, [true.streams()] * 16, load).clock.mean(0)
+    both = np.stack([model, half.found.clock[0]]).reshape(2, 2, -1).sum(1)
+    return np.add.reduceat(both, np.arange(0, both.shape[1], 3), axis=1)
+
+
+def test_some_pixels_of_the_true_model_send_what_they_send_among_all(evidence, true):
+    """What was measured went through the bus beside the events of all pixels of another seed."""
+    half = evidence.train.loaded(*place(true))
+    one, of_share = busy(half, true, half.load), busy(half, true, None)
+    chance = [((m - f) ** 2 / (m + 1)).mean() for m, f in (one, of_share)]
+    assert chance[0] < 1 < 1.5 < chance[1]  # a share of the bus at all times does not tell
+    assert len(half.load._events[0]) > 0
+
+
+def place(sensor: Sensor):
+    model = model_of(sensor)
+    return model.space, model.place
+
+
+def test_a_model_that_sends_more_is_taken_to_do_so_everywhere(evidence, true, scene):
+    """Thresholds that are not those of the load."""
+    half = evidence.train
+    other = true.with_effect(replace(true["threshold"], on=0.4, off=0.3))
+    near, far = (half.loaded(*place(s)).load for s in (true, other))
+    stimulus = half.trials.stimulus
+    events = emitted(stimulus, true, true.parameters()[None], np.array([5]))[0]
+    bare = [np.bincount(load._events[0].p.astype(int), minlength=2) for load in (near, far)]
+    ours, theirs = (load.weight(events) * own for load, own in zip((near, far), bare, strict=True))
+    np.testing.assert_allclose(theirs, ours, rtol=0.15)
+    assert np.all(bare[1] < 0.8 * bare[0])
+
+
+@pytest.mark.parametrize("limit", ["MOST", "SENT"])
+def test_some_of_many_pixels_stand_for_all(evidence, true, monkeypatch, limit):
+    half = evidence.train
+    everyone = half.loaded(*place(true)).load
+    assert len(everyone._events[0]) > 0  # before there is less room
+    few = {"MOST": 500 * half.trials.stimulus.grid.steps, "SENT": 0.4 * len(everyone._events[0])}
+    monkeypatch.setattr(bus_load, limit, few[limit])
+    half.around._loads.clear()
+    some = half.loaded(*place(true)).load
+    events = emitted(half.trials.stimulus, true, true.parameters()[None], np.array([5]))[0]
+    assert len(some._events[0]) < 0.5 * len(everyone._events[0])
+    total = [load.weight(events).sum() / 2 * len(load._events[0]) for load in (some, everyone)]
+    assert total[0] == pytest.approx(total[1], rel=0.2)
+
+
+def test_what_others_send_is_worked_out_once_for_each_model_of_their_pixels(evidence, true):
+    half = evidence.train
+    first = half.loaded(*place(true)).load
+    assert half.loaded(*place(true.with_effect(replace(BUS, rate=2e5)))).load is first
+    assert half.loaded(*place(true.with_effect(EFFECTS["shot"](rate=6.0)))).load is not first
+    assert evidence.held.loaded(*place(true)).load is not first
+
+
+def test_events_are_sorted_to_their_pixels(evidence, rng):
+    stimulus, size = evidence.train.trials.stimulus, WIDTH * HEIGHT
+    counts = (5000, 0, 3000)
+    streams = []
+    for count in counts:
+        at = rng.integers(0, size, count)
+        t = stimulus.grid.begin + 1e-9 * np.sort(rng.integers(0, 10**8, count))
+        x, y = (at % WIDTH).astype(np.uint16), (at // WIDTH).astype(np.uint16)
+        streams.append(dase.Events(t, x, y, rng.random(count) < 0.4, WIDTH, HEIGHT))
+    start, time, polarity = (a.numpy() for a in by_pixel(stimulus, streams))
+    for n, events in enumerate(streams):
+        index = events.y.astype(int) * WIDTH + events.x
+        for i, pixel in enumerate(stimulus.pixels):
+            mine, got = events.select(index == pixel), slice(start[n, i], start[n, i + 1])
+            want = np.rint((mine.t - stimulus.grid.begin) * 1e9).astype(np.int64)
+            np.testing.assert_array_equal(time[got], want)
+            np.testing.assert_array_equal(polarity[got], mine.p)
+
+
+def test_others_go_through_what_is_before_the_bus(evidence, true):
+    load, scan = evidence.train.loaded(*place(true)).load, RowScan(line=1e-6)
+    plain, scanned = load.others((), 0), load.others((scan,), 0)
+    assert 0.9 * len(plain.time) < len(scanned.time) <= len(plain.time)
+    assert np.all(np.diff(scanned.time) >= 0)
+    at_lines = [np.mean(np.abs(o.time / 1e6 - np.round(o.time / 1e6)) < 0.01) for o in (plain, scanned)]
+    assert at_lines[0] < 0.1
+    assert at_lines[1] > 0.99
+
+
+def test_answers_do_not_depend_on_what_is_asked_beside(evidence, true):
+    half = evidence.scout.view()
+    model = model_of(true)
+    model.rebase(half, repeats=6, seed=1)
+    asks = [Ask(half, model.space, model.place[None] + d, 3) for d in (0.0, 0.1)]
+    alone_ = [simulated([ask])[0] for ask in asks]
+    for got, want in zip(simulated(asks), alone_, strict=True):
+        np.testing.assert_allclose(got, want, rtol=1e-6, atol=1e-7)
+    assert np.abs(alone_[0] - alone_[1]).max() > 1e-2
+
+
+def test_the_rate_of_a_bus_that_was_full_is_seen(evidence):
+    first = prepared(evidence, Readout)
+    assert [e.mode for e in first] == ["delay", "drop"]
+    assert all(abs(e.rate - BUS.rate) <= 1.01 / BUSY for e in first)
+
+
+def test_a_bus_is_no_candidate_where_it_is_known_to_be_free(evidence, rng):
+    count = 20_000
+    x, y = rng.integers(0, 50, (2, count), dtype=np.uint16)
+    apart = dase.Events(1e-5 * np.arange(count), x, y, x > 20, 50, 50)
+    assert fastest(apart, Structure()) == pytest.approx(1e5, rel=1e-3)  # the runs of 4096
+    bursts = replace(apart, t=np.repeat(0.02 * np.arange(20), 1000))
+    assert fastest(bursts, Structure()) == pytest.approx(512 / 1e-6)
+    # what shares a tick may have been sent at any time of it
+    assert fastest(bursts, Structure(step=1e-3)) == pytest.approx(512 / 1e-3)
+    assert fastest(bursts, Structure(line=1e-5)) == 0
+    assert evidence.fastest <= 1.2 * BUS.rate  # it was full
+    assert prepared(replace(evidence, fastest=200 * evidence.busiest), Readout) == []
+
+
+def test_a_bus_that_is_never_free_is_no_clock(rng):
+    """It sends at ticks, one event each; to a clock as fast, events come by chance."""
+    step, count = 1e-5, 20_000
+    x, y = rng.integers(0, 50, (2, count), dtype=np.uint16)
+    full = dase.Events(0.01 + step * np.arange(count), x, y, x > 20, 50, 50)
+    assert share_at(full.t, step) == 1
+    assert find(full).step == 0
+    by_chance = np.sort(rng.integers(0, count, count))
+    assert find(replace(full, t=0.01 + step * by_chance)).step == pytest.approx(step, rel=1e-4)

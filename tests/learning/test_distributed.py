@@ -1,0 +1,122 @@
+"""Training by several processes is training by one with as many times the scenes."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+torch = pytest.importorskip("torch")
+pytest.importorskip("safetensors")
+
+from dase.learning import distributed
+from dase.learning.adversarial import Adversarial, Hash
+from dase.learning.moment_matching import Moments
+from dase.learning.scene_batches import Looks, Scenery, middle
+from dase.learning.targets import Pairs, draw_noise, simulate
+from dase.scenes.image_sources import open_images
+
+LAUNCH = [sys.executable, "-m", "torch.distributed.run", "--nproc-per-node", "2"]
+
+
+def launched(*words: str) -> None:
+    alone = {"OMP_NUM_THREADS": "1", "DASE_THREADS": "1"}
+    done = subprocess.run(
+        [*LAUNCH, *words], env=os.environ | alone, capture_output=True, text=True, timeout=600
+    )
+    assert done.returncode == 0, done.stderr[-3000:]
+
+
+def batches() -> tuple[Pairs, Pairs]:
+    """Return four simulated scenes, of a threshold that wants a gradient, and four real ones."""
+    looks = Looks(width=48, height=48, window=0.05, samples=8, regime="mixed")
+    scenery = Scenery(open_images("builtin"), looks, device="cpu", seed=1, backgrounds=4, objects=8)
+    rng, generator = np.random.default_rng(0), torch.Generator().manual_seed(0)
+    out = []
+    for level in (0.3, 0.2):
+        log = scenery.draw(rng, 4)
+        grey, noise = middle(log), draw_noise(log, generator)
+        counts = simulate(log, torch.full_like(grey, level), 0.05, noise)
+        out.append(Pairs(grey, counts, simulate(log, torch.full_like(grey, 0.25), 0.05, noise)))
+    return out[0], out[1]
+
+
+def objectives() -> dict:
+    how = Hash(size=16, orientations=4, coherence=1)
+    return {"moments": Moments(device="cpu"), "critics": Adversarial(how, device="cpu", seed=3)}
+
+
+def part(pairs: Pairs, some: slice) -> Pairs:
+    return Pairs(pairs.grey[some], pairs.counts[some], pairs.reference[some])
+
+
+def steps(some: slice) -> dict:
+    """Return what two steps on some of the scenes make of both objectives, and the gradients."""
+    fake, real = batches()
+    out = {}
+    for name, objective in objectives().items():
+        objective.calibrate([(fake, real)])
+        gradients = []
+        for _ in range(2):
+            mine = part(fake, some)
+            counts = mine.counts.clone().requires_grad_()
+            loss, values = objective.loss(
+                Pairs(mine.grey, counts, mine.reference), part(real, some), move=True
+            )
+            (gradient,) = torch.autograd.grad(loss, counts)
+            gradients.append(distributed.together(gradient))
+        out[name] = {"gradients": gradients, "values": values, "state": objective.state()}
+    return out
+
+
+def flat(value, at=""):
+    if isinstance(value, torch.Tensor):
+        yield at, value.double()
+    elif isinstance(value, dict):
+        for key, inner in value.items():
+            yield from flat(inner, f"{at}/{key}")
+    elif isinstance(value, list | tuple):
+        for key, inner in enumerate(value):
+            yield from flat(inner, f"{at}/{key}")
+
+
+def test_two_processes_do_what_one_does_with_all_scenes(tmp_path):
+    launched(str(Path(__file__)), str(tmp_path / "two.pt"))
+    two = torch.load(tmp_path / "two.pt", weights_only=True)
+    one = steps(slice(None))
+    found, wanted = dict(flat(two)), dict(flat(one))
+    assert found.keys() == wanted.keys()
+    assert sum("gradients" in name for name in wanted) == 4
+    for name, value in wanted.items():
+        if "generator" not in name:
+            size = float(value.abs().max())
+            assert float((found[name] - value).abs().max()) <= 2e-4 * size + 1e-9, name
+
+
+@pytest.mark.parametrize("objective", ["moments", "wgan"])
+def test_the_command_on_two_processes(objective, tmp_path):
+    out = tmp_path / "run"
+    command = str(Path(sys.executable).parent / "dase")
+    words = ("--no-python", command, "train", "esim", "-o", str(out), "--preset", "tiny", "--steps", "6")
+    words = (*words, "--objective", objective, "--sequences", "8", "--size", "48x48")
+    launched(*words)
+    assert (out / "sensor.toml").is_file()
+    assert json.loads((out / "recipe.json").read_text())["steps"] == 6
+    log = (out / "log.csv").read_text().splitlines()
+    assert log[-1].startswith("6,")
+    launched(*words, "--resume")
+    assert torch.load(out / "checkpoint.pt", weights_only=True)["step"] == 6
+
+
+if __name__ == "__main__":
+    distributed.join("cpu")
+    half = slice(2 * distributed.rank(), 2 * distributed.rank() + 2)
+    result = steps(half)
+    if distributed.rank() == 0:
+        torch.save(result, sys.argv[1])
+    distributed.leave()

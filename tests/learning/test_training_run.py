@@ -1,0 +1,207 @@
+"""Training as a whole: steps, their replay, and the folder of a run that goes on where it stopped."""
+
+from __future__ import annotations
+
+import re
+
+import numpy as np
+import pytest
+import torch
+from test_training import SIDE, WGAN, a_fake, a_run, small_scenes
+
+from dase.errors import InputError
+from dase.learning import cuda_graph, scene_batches
+from dase.learning.evaluation import Exam
+from dase.learning.run import CHECKPOINT, LOG, Broken, Pace, load, run
+from dase.learning.targets import Pairs
+from dase.networks.threshold_network import NetworkShape
+from dase.scenes import image_sources
+
+
+@pytest.fixture(scope="module")
+def scenes() -> scene_batches.Scenery:
+    return small_scenes()
+
+
+@pytest.mark.parametrize("start", [(0.45, 0.12), (0.09, 0.02)])
+def test_a_wrong_start_is_left_behind(scenes, start):
+    training = a_run(scenes, mu=start[0], sigma=start[1], steps=60, warmup=10)
+    exam = Exam(scenes, training.target, scenes=4)
+    before = exam.marks(training.net)
+    while training.step < training.recipe.steps:
+        training.advance()
+    after = exam.marks(training.mean)
+    assert after["mu_diff"] < 0.1 * before["mu_diff"]
+    assert after["kl"] < 0.05
+    assert before["kl"] > 1
+    assert set(after) >= {"kl_active", "kl_idle", "mu_spread", "sigma_spread"}
+
+
+def test_critics_push_towards_the_target(scenes):
+    training = a_run(scenes, **WGAN, warmup=30, batch=6, mu=0.4, sigma=0.1)
+    for _ in range(30):
+        training.advance()
+    assert training.step == 0
+    loss, _ = training.objective.loss(a_fake(training), training.target.draw(training.reals, 6), move=True)
+    loss.backward()
+    assert float(training.net.level.grad[0]) > 0  # descent lowers thresholds that are too high
+    low = a_run(scenes, **WGAN, warmup=30, batch=6, mu=0.1, sigma=0.025)
+    for _ in range(30):
+        low.advance()
+    loss, _ = low.objective.loss(a_fake(low), low.target.draw(low.reals, 6), move=True)
+    loss.backward()
+    assert float(low.net.level.grad[0]) < 0
+
+
+def test_rates_rise_and_fall_within_the_steps_there_are(scenes):
+    for steps, ramp in ((400, 50), (24, 50), (2, 50)):
+        training = a_run(scenes, steps=steps, ramp=ramp)
+        shares = []
+        for training.step in range(steps):
+            shares.append(training.rate())
+        top = int(np.argmax(shares))
+        assert top == min(ramp, max(steps // 4, 1)) - 1
+        assert shares[top] == 1
+        assert (np.diff(shares[: top + 1]) > 0).all()
+        assert (np.diff(shares[top + 1 :]) < 0).all()
+        assert np.sum(shares) > 0.4 * steps
+
+
+def test_derivatives_are_of_other_scenes_in_every_step(scenes):
+    training = a_run(scenes, batch=8)
+    seen = []
+    for training.step in range(2):
+        fake = a_fake(training)
+        seen += fake.some.tolist()
+        for above, below in fake.answers.values():
+            assert above.shape == below.shape == (4, 2, SIDE, SIDE)
+    assert sorted(seen) == list(range(8))
+
+
+def tensors(value, name=""):
+    """Yield all tensors inside of dictionaries and lists, by their names."""
+    if isinstance(value, torch.Tensor):
+        yield name, value
+    elif isinstance(value, dict | list | tuple):
+        items = value.items() if isinstance(value, dict) else enumerate(value)
+        for key, inner in items:
+            yield from tensors(inner, f"{name}.{key}")
+
+
+KINDS = {
+    "moments": dict(network=NetworkShape(channels=4, depth=1, split=True, table=(3, 3))),
+    "patterns": dict(network=NetworkShape(channels=4, depth=1, pattern=(SIDE, SIDE))),
+    "adabelief": dict(optimizer="adabelief"),
+    "critics": dict(WGAN, critic_cosine=True, batch=6),
+}
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_steps_leave_everything_where_it_was(scenes, kind):
+    # what is replayed reads and writes the memory of the step that was recorded
+    training = a_run(scenes, **KINDS[kind], steps=80, warmup=4)
+    for _ in range(8):
+        training.advance()
+
+    def places():
+        state = training.state() | {"inputs": training.inputs}
+        kept = ((n, v) for n, v in tensors(state) if not re.search("random|generator", n))
+        return {name: value.data_ptr() for name, value in kept}
+
+    before = places()
+    assert len(before) > 20
+    for _ in range(30):
+        training.advance()
+    assert places() == before
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_replayed_steps_are_the_same_steps(scenes, device, kind, monkeypatch):
+    if device == "cpu":
+        pytest.skip("steps are replayed on a GPU only; --device cuda:0 asks for one")
+    source = image_sources.open_images("builtin")
+    there = scene_batches.Scenery(source, scenes.looks, device=device, backgrounds=6, objects=8)
+    ends = []
+    for seen in (10**9, 3):
+        monkeypatch.setattr(cuda_graph, "SEEN", seen)
+        training = a_run(there, **KINDS[kind], steps=60, warmup=8)
+        for _ in range(40):
+            values = training.advance()
+        assert bool(training.replay.recorded) == (seen == 3)
+        assert np.isfinite(float(values["loss"]))
+        ends.append(training)
+    first, second = (dict(tensors([t.net.state_dict(), t.mean.state_dict()])) for t in ends)
+    for name, value in first.items():
+        # sums on a GPU are taken in any order
+        torch.testing.assert_close(second[name], value, rtol=2e-3, atol=2e-4, msg=name)
+    numbers = [t.generator.get_state() for t in ends]
+    assert torch.equal(*numbers)
+
+
+def same(one, other) -> bool:
+    if isinstance(one, torch.Tensor):
+        return torch.equal(one, other)
+    if isinstance(one, dict):
+        return one.keys() == other.keys() and all(same(one[k], other[k]) for k in one)
+    if isinstance(one, (list, tuple)):
+        return len(one) == len(other) and all(same(a, b) for a, b in zip(one, other, strict=True))
+    return one == other
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"network": NetworkShape(channels=4, depth=1, table=(3, 2), split=True, pattern=(SIDE, SIDE))},
+        WGAN,
+        {**WGAN, "optimizer": "adabelief", "critic_image": True},
+    ],
+    ids=["moments", "wgan", "adabelief"],
+)
+def test_a_resumed_run_ends_bit_equal(scenes, tmp_path, changes):
+    recipe = {**changes, "steps": 8, "warmup": 2}
+    whole, first, second = (a_run(scenes, **recipe) for _ in range(3))
+    pace = Pace(look=2, save=0.0, held_out=0)
+    run(whole, tmp_path / "whole", pace=pace)
+
+    def stop(row: dict[str, float]) -> None:
+        if row["step"] == 4:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        run(first, tmp_path / "cut", pace=pace, look=stop)
+    with (tmp_path / "cut" / LOG).open("a") as file:
+        file.write("1")  # of a line that was being written when the run was killed
+    run(second, tmp_path / "cut", pace=pace, resume=True)
+    states = [load(tmp_path / name / CHECKPOINT, "cpu") for name in ("whole", "cut")]
+    for state in states:
+        del state["seconds"]
+    assert same(*states)
+    steps = [
+        [line.split(",")[0] for line in (tmp_path / name / LOG).read_text().splitlines()]
+        for name in ("whole", "cut")
+    ]
+    assert steps[0] == steps[1]
+
+
+def test_nan_stops_with_its_step_and_the_last_good_checkpoint(scenes, tmp_path):
+    training = a_run(scenes, steps=30, warmup=1)
+    plain = training.objective.loss
+
+    def poisoned(fake: Pairs, real: Pairs, *, move: bool):
+        loss, values = plain(fake, real, move=move)
+        return (loss * float("nan") if training.step == 7 else loss), values
+
+    training.objective.loss = poisoned
+    with pytest.raises(Broken, match=r"broke at step 7: .* is not finite; the last good checkpoint is .*pt"):
+        run(training, tmp_path / "run", pace=Pace(look=5, save=0.0, held_out=0))
+    assert load(tmp_path / "run" / CHECKPOINT, "cpu")["step"] == 5
+
+
+def test_a_folder_is_not_begun_twice(scenes, tmp_path):
+    with pytest.raises(InputError, match="no checkpoint to resume"):
+        run(a_run(scenes), tmp_path / "none", resume=True)
+    (tmp_path / CHECKPOINT).write_bytes(b"not one")
+    with pytest.raises(InputError, match="already holds a run"):
+        run(a_run(scenes), tmp_path)
+    with pytest.raises(InputError, match="is not a checkpoint"):
+        run(a_run(scenes), tmp_path, resume=True)

@@ -1,0 +1,77 @@
+"""What is installed is what is in the tree, and imports go one way."""
+
+from __future__ import annotations
+
+import ast
+import subprocess
+import sys
+import tomllib
+from pathlib import Path
+
+import pytest
+
+import dase
+
+ROOT = Path(__file__).parents[2]
+
+
+def declared() -> dict:
+    return tomllib.loads((ROOT / "pyproject.toml").read_text())
+
+
+def test_declared_packages_equal_those_on_disk():
+    on_disk = {"dase", "dase.kernels", "dase.cli"}
+    on_disk |= {f"dase.{p.parent.name}" for p in (ROOT / "dase").glob("*/__init__.py")}
+    assert set(declared()["tool"]["setuptools"]["packages"]) == on_disk
+
+
+def test_public_names_are_exported_once_and_documented():
+    tree = ast.parse((ROOT / "dase" / "__init__.py").read_text())
+    typed = next(node for node in tree.body if isinstance(node, ast.If))
+    names = {(node.module, alias.asname) for node in typed.body for alias in node.names}
+    assert names == {(module, name) for name, module in dase._MODULE_OF.items()}
+    for name in dase.__all__:
+        assert name == "EFFECTS" or getattr(dase, name).__doc__, name
+    with pytest.raises(AttributeError, match="no attribute 'nonsense'"):
+        _ = dase.nonsense
+
+
+def imported(path: Path) -> set[str]:
+    tree = ast.parse(path.read_text())
+    names = {a.name for node in ast.walk(tree) if isinstance(node, ast.Import) for a in node.names}
+    return names | {
+        node.module for node in ast.walk(tree) if isinstance(node, ast.ImportFrom) and node.module
+    }
+
+
+def test_imports_go_one_way():
+    for path in (ROOT / "kernels").glob("*.py"):
+        assert all(
+            n == "dase.kernels" or n.startswith("dase.kernels.") or not n.startswith("dase")
+            for n in imported(path)
+        ), path
+    for path in (ROOT / "dase").glob("*.py"):
+        assert not any(n.startswith("dase.cli") for n in imported(path)), path
+    torch = [
+        p.name for p in (ROOT / "kernels").glob("*.py") if any(n.startswith("torch") for n in imported(p))
+    ]
+    assert all(name.startswith("autograd") for name in torch)
+
+
+def test_help_loads_nothing_heavy():
+    script = (
+        "import sys; sys.argv = ['dase', '--help']\n"
+        "from dase.cli import main\n"
+        "try: main()\n"
+        "except SystemExit: pass\n"
+        "heavy = {'warp', 'torch', 'cv2', 'matplotlib', 'h5py', 'numpy'} & set(sys.modules)\n"
+        "assert not heavy, heavy"
+    )
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    assert "synth" in done.stdout
+
+
+def test_kernels_refuse_a_second_name():
+    done = subprocess.run([sys.executable, "-c", "import kernels"], cwd=ROOT, capture_output=True, text=True)
+    assert "import dase.kernels, not kernels" in done.stderr

@@ -1,0 +1,49 @@
+"""The examples of the README, word for word."""
+
+from __future__ import annotations
+
+import re
+import shlex
+from pathlib import Path
+
+from dase.effects import EFFECTS
+from dase.simulation.sensor_file import parse_sensor
+
+README = (Path(__file__).parents[2] / "README.md").read_text("utf-8")
+
+
+def blocks(language: str) -> list[str]:
+    return re.findall(rf"```{language}\n(.*?)```", README, flags=re.DOTALL)
+
+
+def test_python():
+    (code,) = blocks("python")
+    scope: dict = {}
+    exec(compile(code, "README.md", "exec"), scope)
+    assert len(scope["events"]) > 1000
+    assert scope["counts"].shape == (1, 2, 2, 346 * 260)
+    # an event in the first nanosecond of a window may count for the one before
+    assert abs(int(scope["counts"].sum()) - len(scope["events"])) <= 2
+    assert scope["grid"].shape == (5, 260, 346)
+
+
+def test_sensor():
+    (text,) = blocks("toml")
+    assert parse_sensor(text, "README").size == (346, 260)
+
+
+def test_commands_and_their_options_exist():
+    import click
+
+    from dase.cli import group
+
+    context = click.Context(group)
+    for line in "\n".join(blocks("sh")).splitlines():
+        words = shlex.split(line, comments=True)
+        if not words or words[0] != "dase":
+            continue
+        command = group.get_command(context, words[1])
+        assert command is not None, line
+        known = {name for p in command.params for name in (*p.opts, *p.secondary_opts)}
+        assert {w for w in words[2:] if w.startswith("-")} <= known, line
+    assert set(re.findall(r"dase effects show (\w+)", README)) <= set(EFFECTS)

@@ -1,0 +1,128 @@
+"""Plain twins of the effects between light and change detector: float64, written from the physics."""
+
+from __future__ import annotations
+
+import numpy as np
+from reference import pixel as reference
+from reference.pixel import Stream, setting
+from scipy.linalg import cholesky, expm
+
+import dase
+
+
+def light(sensor: dase.Sensor, times: np.ndarray, frames: np.ndarray, seed: int) -> np.ndarray:
+    """Return what reaches the photodiodes, dark current included, shape (K, N).
+
+    Args:
+        sensor: Its built-in effects.
+        times: Samples [s], shape (K,).
+        frames: Linear intensity, shape (K, H, W).
+        seed: Of every random number.
+    """
+    _, height, width = frames.shape
+    out = frames.astype(np.float64)
+    if "flicker" in sensor:
+        lamp = sensor["flicker"]
+        turns = 2 * np.pi * (lamp.frequency * times + lamp.phase)
+        out = out * (1 + lamp.depth * np.sin(turns))[:, None, None]
+    y, x = np.mgrid[:height, :width]
+    square = ((2 * x - width + 1) ** 2 + (2 * y - height + 1) ** 2) / (width**2 + height**2)
+    corner = np.arccos((1 - setting(sensor, "vignetting", "loss", 0.0)) ** 0.25)
+    out = out * np.cos(np.arctan(np.tan(corner) * np.sqrt(square))) ** 4
+    out = out.reshape(len(times), -1)
+    current, spread = (setting(sensor, "dark", name, 0.0) for name in ("current", "spread"))
+    normal = [Stream("dark_light_pixel_normal", seed, i).normal() for i in range(width * height)]
+    return out + current * np.exp(spread * np.array(normal))
+
+
+def linlog(voltage: np.ndarray, knee: float, slope: float, eps: float) -> np.ndarray:
+    """Return log(I + eps) above the knee, below it the line of this slope [1 / (knee + eps)]."""
+    line = np.log(knee + eps) + slope * (np.exp(voltage) - eps - knee) / (knee + eps)
+    return np.where(np.exp(voltage) - eps < knee, line, voltage)
+
+
+def second_order(times: np.ndarray, level: np.ndarray, omega: np.ndarray, damping: float) -> np.ndarray:
+    """Return level behind ω² / (s² + 2 damping ω s + ω²), settled at the first sample.
+
+    Args:
+        times: Samples [s], shape (K,).
+        level: Straight between samples, shape (K, N).
+        omega: Natural frequency during the step that ends at each sample [rad/s], shape (K, N).
+        damping: Of the filter.
+    """
+    out = np.array(level, np.float64)
+    for i in range(level.shape[1]):
+        state = np.array([level[0, i], 0.0, level[0, i], 0.0])  # output, its slope, input, its slope
+        for k in range(1, len(times)):
+            dt, w = times[k] - times[k - 1], omega[k, i]
+            state[2:] = level[k - 1, i], (level[k, i] - level[k - 1, i]) / dt
+            flow = np.zeros((4, 4))
+            flow[0, 1] = flow[2, 3] = 1
+            flow[1] = [-w * w, -2 * damping * w, w * w, 0]
+            state = expm(flow * dt) @ state
+            out[k, i] = state[0]
+    return out
+
+
+def voltage_noise(
+    times: np.ndarray, intensity: np.ndarray, sensor: dase.Sensor, normals: np.ndarray
+) -> np.ndarray:
+    """Return the noise of two equal poles from its covariance, shape (K, N).
+
+    Args:
+        times: Samples [s], shape (K,).
+        intensity: Linear, shape (K, N).
+        sensor: Has the effect.
+        normals: Standard normal, shape (2, K, N).
+    """
+    effect = sensor["voltage_noise"]
+    total = intensity + effect.dark
+    corner = effect.cutoff * total / (total + effect.knee)
+    sigma = effect.sigma * np.sqrt(effect.knee / (total + effect.knee))
+    pole = 2 * np.pi * corner / np.sqrt(np.sqrt(2) - 1)
+    out = np.zeros_like(intensity)
+    for i in range(intensity.shape[1]):
+        state = sigma[0, i] * normals[:, 0, i]
+        out[0, i] = state[0]
+        for k in range(1, len(times)):
+            # noise and its slope over the pole; d²n = -2 λ dn - λ² n + white noise
+            step = expm(np.array([[0, 1], [-1, -2]]) * pole[k, i] * (times[k] - times[k - 1]))
+            fresh = np.eye(2) - step @ step.T
+            state = step @ state + sigma[k, i] * cholesky(fresh, lower=True) @ normals[:, k, i]
+            out[k, i] = state[0]
+    return out
+
+
+def voltage(sensor: dase.Sensor, times: np.ndarray, intensity: np.ndarray, seed: int) -> np.ndarray:
+    """Return the voltage at the change detector, shape (K, N), of the intensity at the photodiode."""
+    level = np.log(intensity + sensor.log_eps)
+    bright = np.clip(intensity, 0, 1)
+    if "linlog" in sensor:
+        level = linlog(level, sensor["linlog"].knee, sensor["linlog"].slope, sensor.log_eps)
+    if np.isfinite(setting(sensor, "bandwidth", "cutoff", np.inf)):
+        slow = sensor["bandwidth"]
+        level = reference.lowpass(times, level, slow.cutoff * (slow.dark + (1 - slow.dark) * bright))
+    if np.isfinite(setting(sensor, "second_order", "cutoff", np.inf)):
+        slow = sensor["second_order"]
+        omega = 2 * np.pi * slow.cutoff * (slow.dark + (1 - slow.dark) * bright)
+        level = second_order(times, level, omega, slow.damping)
+    if setting(sensor, "voltage_noise", "sigma", 0.0) > 0:
+        streams = ("voltage_noise_respond_uniform", "voltage_noise_respond_uniform_2")
+        pixels = range(intensity.shape[1])
+        first, second = np.array(
+            [[[Stream(s, seed, i).uniform(k) for i in pixels] for k in range(len(times))] for s in streams]
+        )
+        radius, angle = np.sqrt(-2 * np.log(1 - first)), 2 * np.pi * second
+        normals = radius * np.cos(angle), radius * np.sin(angle)
+        level = level + voltage_noise(times, intensity, sensor, np.array(normals))
+    return level
+
+
+def events(sensor: dase.Sensor, times: np.ndarray, frames: np.ndarray, seed: int) -> list[np.ndarray]:
+    """Return the events of every pixel as `Detector.run` does, of a sensor without noise events."""
+    intensity = light(sensor, times, frames, seed)
+    level = voltage(sensor, times, intensity, seed)
+    none = np.zeros((len(times), 2))
+    return [
+        reference.detector(sensor, i, seed).run(times, level[:, i], none) for i in range(intensity.shape[1])
+    ]
