@@ -15,7 +15,7 @@ from matplotlib.ticker import EngFormatter, NullFormatter
 from numpy.typing import NDArray
 
 from dase.figures.style import OFF, ON
-from dase.formatting import seconds
+from dase.formatting import format_seconds
 from dase.io.sequence import Sequence
 from dase.recordings.statistics import Statistics
 from dase.recordings.summary import table
@@ -105,13 +105,13 @@ def paper(wide: float, tall: float) -> tuple[Figure, Callable[[float, float, flo
 def _header(figure: Figure, s: Statistics, title: str, window: float, note: str) -> None:
     tall = figure.get_figheight()
     rows = dict(table(s))
-    facts = [f"{s.width} × {s.height} pixels", seconds(s.duration), f"{rows['events']} events"]
+    facts = [f"{s.width} × {s.height} pixels", format_seconds(s.duration), f"{rows['events']} events"]
     facts += [f"{rows['ON share']} ON"] if s.events else []
     facts += [note] if note else []
     left, right, first, second = 0.4 / 11, 1 - 0.4 / 11, 1 - 0.3 / tall, 1 - 0.57 / tall
     figure.text(left, first, title, fontsize=13, color=INK, weight="bold", va="center")
     figure.text(left, second, "   ".join(facts), fontsize=9, color=INK, va="center")
-    said = f"events of {seconds(window)} around each time"
+    said = f"events of {format_seconds(window)} around each time"
     figure.text(right, first, said, fontsize=9, color=INK, va="center", ha="right")
     for x, colour, name in ((right - 0.055, ON, "ON"), (right, OFF, "OFF")):
         figure.text(x, second, f"\N{BLACK SQUARE} {name}", fontsize=9, color=colour, va="center", ha="right")
@@ -162,7 +162,7 @@ def _draw_intervals(axes: Axes, between: NDArray[np.float64]) -> None:
     axes.set_ylim(bottom=0)
     axes.xaxis.set_major_formatter(EngFormatter("s", sep="\N{THIN SPACE}"))
     axes.xaxis.set_minor_formatter(NullFormatter())
-    said = f"median {seconds(median)},  1 to 99 %: {seconds(low)} to {seconds(high)}"
+    said = f"median {format_seconds(median)},  1 to 99 %: {format_seconds(low)} to {format_seconds(high)}"
     axes.set_title(said, fontsize=8, color=INK, loc="right", pad=5)
 
 

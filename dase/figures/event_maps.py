@@ -20,7 +20,7 @@ from dase.events import Events
 from dase.figures.diagnosis_figures import curves
 from dase.figures.event_images import overlay
 from dase.figures.style import INK, LINE, OFF, ON, WIDE, Plate, label, legend, number, place, sheet
-from dase.formatting import seconds
+from dase.formatting import format_seconds
 from dase.results import Curve
 
 DIVERGING = LinearSegmentedColormap.from_list("dase", ["#1b4f8f", "#86add3", "#f5f5f3", "#dfa67f", "#a23b16"])
@@ -109,7 +109,9 @@ def moments(
     across = (WIDE - 0.95 - 0.12 * (n - 1)) / n
     down = across * aspect
     figure = sheet(
-        1.2 + 2 * down, "Measured and simulated events", f"events of {seconds(window)} around each time"
+        1.2 + 2 * down,
+        "Measured and simulated events",
+        f"events of {format_seconds(window)} around each time",
     )
     for row, (name, counts) in enumerate((("measured", measured), ("simulated", simulated))):
         for i, time in enumerate(times):
@@ -187,7 +189,7 @@ def residual_maps(
     across = (WIDE - 1.75) / 2
     down = across * aspect
     block = f"blocks of {size} × {size} pixels" if size > 1 else "pixel by pixel"
-    about = f"events of the model against those measured in {seconds(seconds_long)}, {block}"
+    about = f"events of the model against those measured in {format_seconds(seconds_long)}, {block}"
     figure = sheet(1.2 + down, "Where the model sends too many or too few events", about)
     for i, (channel, name) in enumerate(((1, "ON"), (0, "OFF"))):
         axes = place(figure, 0.3 + i * (across + 0.15), 1.0, across, down)

@@ -123,7 +123,7 @@ def _is_recording(path: Path) -> bool:
     if not path.is_file():
         return False
     try:
-        return io.find(path) is not frames.FORMAT  # which are videos and pictures
+        return io.find_format(path) is not frames.FORMAT  # which are videos and pictures
     except InputError:
         return False
 

@@ -100,7 +100,7 @@ def test_nothing_to_count():
     ],
 )
 def test_seconds(value, text):
-    assert formatting.seconds(value) == text
+    assert formatting.format_seconds(value) == text
 
 
 def test_default_window_is_a_round_number(rng):

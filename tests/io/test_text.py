@@ -49,7 +49,7 @@ def test_times_are_read_as_python_reads_them(tmp_path, rng):
     words = [repr(t) if k % 3 else f"{t:.{k % 17}f}" for k, t in enumerate(times.tolist())]
     words += ["1504645177.420018196", "1e2", ".5", "7.", "00012.50", "0.1234567890123456789"]
     content = "".join(f"{word} 1 1 1\n" for word in words)
-    (piece,) = text.decode(lambda: streams.BytesIO(content.encode()))
+    (piece,) = text.decode_text(lambda: streams.BytesIO(content.encode()))
     assert piece.t.tolist() == [float(word) for word in words]
 
 
@@ -161,13 +161,13 @@ import sys
 from pathlib import Path
 from dase.errors import InputError
 from dase.io import frames
-from dase.io.image_files import decode
+from dase.io.image_files import decode_file
 data = Path(sys.argv[1]).read_bytes()
-frames.grey(data, "whole"), decode(Path(sys.argv[1]))
+frames.decode_grey(data, "whole"), decode_file(Path(sys.argv[1]))
 before = peak()
 place = data.index(b"IDAT") - 4
 Path(sys.argv[1]).write_bytes(data[:place] + bytes.fromhex("54000000") + data[place + 4 :])
-for act in (lambda: frames.grey(Path(sys.argv[1]).read_bytes(), "a.png"), lambda: decode(Path(sys.argv[1]))):
+for act in (lambda: frames.decode_grey(Path(sys.argv[1]).read_bytes(), "a.png"), lambda: decode_file(Path(sys.argv[1]))):
     try:
         act()
     except InputError as error:

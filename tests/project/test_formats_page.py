@@ -92,7 +92,7 @@ def test_command(tmp_path, rng, monkeypatch, line):
     monkeypatch.chdir(tmp_path)
     done = CliRunner().invoke(group, words[1:])
     assert done.exit_code == 0, done.output
-    assert io.find(path).name == NAMES[path.name]
+    assert io.find_format(path).name == NAMES[path.name]
     if words[1] == "info":
         assert f"format            {NAMES[path.name]}" in done.output
         if "--size" in words:
@@ -119,7 +119,7 @@ def test_what_can_be_written_is_what_is_written_there():
     for name, suffixes in rows:
         known = written[name.replace("HDF5 (S2R)", "HDF5")]
         for suffix in re.findall(r"`(\.\w+)`", suffixes):
-            assert io.writable(f"a{suffix}").name == known.name, suffix
+            assert io.find_writable_format(f"a{suffix}").name == known.name, suffix
 
 
 def test_python(tmp_path, rng, monkeypatch):
