@@ -49,7 +49,7 @@ from typing import Any
 
 import numpy as np
 
-ROOT = Path(__file__).resolve().parents[1]
+ROOT = next(folder for folder in Path(__file__).resolve().parents if (folder / "pyproject.toml").exists())
 
 RENAMED: dict[str, str] = {}
 """Fields and columns that have a new name: new name, or dotted path from the top of the file, to the old
@@ -569,6 +569,15 @@ def simulated(device: str) -> dict[str, Any]:
     return out
 
 
+def processor() -> str:
+    """Return the name of the processor."""
+    try:
+        lines = Path("/proc/cpuinfo").read_text().splitlines()
+        return next(line.split(":")[1].strip() for line in lines if line.startswith("model name"))
+    except (OSError, StopIteration):
+        return platform.machine()
+
+
 def about(device: str) -> dict[str, Any]:
     """Return what was run on what."""
     import warp
@@ -581,10 +590,10 @@ def about(device: str) -> dict[str, Any]:
         command = ["git", "-C", str(where), *arguments]
         return subprocess.run(command, capture_output=True, text=True, check=False).stdout
 
-    commit, state = git("rev-parse", "HEAD"), git("status", "--porcelain")
+    commit, state = git("rev-parse", "--verify", "-q", "HEAD") or "unknown", git("status", "--porcelain")
     changed = any(line[3:].startswith(("dase", "kernels", "cli")) for line in state.splitlines())
     out = {"commit": commit.strip() + " with changes" * changed, "device": device}
-    out |= {"machine": platform.machine(), "python": platform.python_version(), "numpy": np.__version__}
+    out |= {"machine": processor(), "python": platform.python_version(), "numpy": np.__version__}
     out |= {"warp": warp.config.version}
     try:
         import torch
