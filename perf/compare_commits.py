@@ -13,8 +13,8 @@ faster. Printed are the median of all pairs and its 90 % interval, the times the
 compute the same. The interval is a bootstrap over rounds and the pairs in them, for two processes of the same
 code differ by some per cent as long as they live. A figure that a checkout cannot run is named and left out.
 
-`--hidden FOLDER --case NAME` diagnoses a case of another simulator, `NAME.npz` with `clip_a.npz` beside it,
-as `perf/hidden_effects.py` reads them, instead of a made one.
+`--hidden FOLDER --case a_01` diagnoses a case of another simulator, `a_01.npz` with `clip_a.npz` beside it,
+as hidden_effects.py reads them, instead of a made one.
 """
 
 from __future__ import annotations
@@ -108,7 +108,7 @@ def make_diagnose(options: argparse.Namespace) -> Work:
     import dase
 
     if options.hidden:
-        with np.load(options.hidden / "clip_a.npz") as data:
+        with np.load(options.hidden / f"clip_{options.case[0]}.npz") as data:
             scene = dase.VideoScene(data["frames"].astype(np.float32) / 255, data["frame_us"] * 1e-6)
         with np.load(options.hidden / f"{options.case}.npz") as data:
             t, x, y, p = (data[k] for k in ("t_us", "x", "y", "p"))
