@@ -167,7 +167,8 @@ frames.decode_grey(data, "whole"), decode_file(Path(sys.argv[1]))
 before = peak()
 place = data.index(b"IDAT") - 4
 Path(sys.argv[1]).write_bytes(data[:place] + bytes.fromhex("54000000") + data[place + 4 :])
-for act in (lambda: frames.decode_grey(Path(sys.argv[1]).read_bytes(), "a.png"), lambda: decode_file(Path(sys.argv[1]))):
+path = Path(sys.argv[1])
+for act in (lambda: frames.decode_grey(path.read_bytes(), "a.png"), lambda: decode_file(path)):
     try:
         act()
     except InputError as error:
