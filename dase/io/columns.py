@@ -28,6 +28,9 @@ FILTERS = {1: 1, 2: 0, 3: 0, 32000: 0, 32001: 4, 32004: 0, 32015: 0, 32026: 4}
 """Number of a filter to how many parameters it needs: gzip, shuffle, Fletcher's sum, LZF; of hdf5plugin
 Blosc, LZ4, Zstandard, Blosc 2. Blosc crashes without its parameters."""
 
+MOST_LINKS = 16
+"""Links within a file that are followed on the way to one name; HDF5 itself takes as many."""
+
 PLAIN = (h5py.h5t.INTEGER, h5py.h5t.FLOAT, h5py.h5t.STRING, h5py.h5t.ENUM)
 """Kinds of attributes that are read. HDF5 2.0 crashes on a list whose kind of length is unknown."""
 
@@ -51,8 +54,84 @@ _plugin_tried = False
 _sound: dict[Path, tuple[int, ...]] = {}  # files whose heaps were checked, and their state then
 
 
+class Hdf5Group:
+    """A group, or the root, of an HDF5 file, from which nothing outside of that file can be reached.
+
+    h5py follows whatever link lies on the way to a name, also one into another file, and a dataset may keep
+    its values in other files. No reader gets an object of h5py but by this class, so none can forget to look.
+
+    Args:
+        group: The group as h5py has it.
+    """
+
+    def __init__(self, group: Any) -> None:
+        self._group = group
+        self.attrs = group.attrs
+        self.name = group.name
+
+    def get(self, name: str, default: Any = None) -> Any:
+        """Return a dataset of h5py or an `Hdf5Group`, else `default` where there is nothing of this name.
+
+        Raises:
+            InputError: It lies in another file, or links lead nowhere for too long.
+        """
+        found = self._reach(self._group, name, [MOST_LINKS], name)
+        return default if found is None else found
+
+    def __getitem__(self, name: str) -> Any:
+        found = self.get(name)
+        if found is None:
+            raise InputError(f"has no '{name}'")
+        return found
+
+    def __contains__(self, name: str) -> bool:
+        return self.get(name) is not None
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._group)
+
+    def _reach(self, node: Any, name: str, left: list[int], asked: str) -> Any:
+        """Walk from a group along a name; `left[0]` counts down the links that may still be followed.
+
+        One count for the whole walk: were it one per link, two links to the next two would double the work
+        with every further pair.
+        """
+        if name.startswith("/"):
+            node = node.file
+        for part in name.split("/"):
+            if part in ("", "."):
+                continue
+            if not isinstance(node, h5py.Group) or not node.id.links.exists(part.encode()):
+                return None
+            kind = node.id.links.get_info(part.encode()).type
+            if kind == h5py.h5l.TYPE_SOFT:
+                left[0] -= 1
+                if left[0] < 0:
+                    raise InputError(f"'{asked}' is a link to a link, again and again")
+                target = node.id.links.get_val(part.encode()).decode("utf-8", "replace")
+                node = self._reach(node, target, left, asked)
+                node = node._group if isinstance(node, Hdf5Group) else node
+            elif kind == h5py.h5l.TYPE_HARD:
+                node = node[part]
+            else:
+                raise InputError(f"'{asked}' is a link to another file, which is not read")
+        if isinstance(node, h5py.Dataset):
+            _check_place(node, asked)
+        return Hdf5Group(node) if isinstance(node, h5py.Group) else node
+
+
+def _check_place(found: Any, name: str) -> None:
+    """Raise InputError where the values of a dataset lie in another file; that is asked before its shape.
+
+    HDF5 opens the sources of a virtual dataset to tell how large it is.
+    """
+    properties = found.id.get_create_plist()
+    if properties.get_layout() == h5py.h5d.VIRTUAL or properties.get_external_count():
+        raise InputError(f"'{name}' lies in another file, which is not read")
+
+
 @contextmanager
-def open_hdf5(path: Path) -> Iterator[Any]:
+def open_hdf5(path: Path) -> Iterator[Hdf5Group]:
     """Open a file for reading, with the filters of hdf5plugin where that is installed."""
     global _plugin_tried
     if not _plugin_tried:
@@ -62,7 +141,7 @@ def open_hdf5(path: Path) -> Iterator[Any]:
     check_head(path)
     check_heaps(path)
     with h5py.File(path, "r") as file:
-        yield file
+        yield Hdf5Group(file)
 
 
 def check_head(path: Path) -> None:
@@ -168,9 +247,17 @@ def _telling_datasets(path: Path) -> frozenset[str]:
         check_head(path)
         check_heaps(path)
         with h5py.File(path, "r") as file:
-            return frozenset(name for name in TELLING if isinstance(file.get(name), h5py.Dataset))
+            root = Hdf5Group(file)
+            return frozenset(name for name in TELLING if _is_there(root, name))
     except Exception:  # damaged: left to the reader that is tried at last
         return frozenset()
+
+
+def _is_there(root: Hdf5Group, name: str) -> bool:
+    try:
+        return isinstance(root.get(name), h5py.Dataset)
+    except InputError:  # elsewhere: its reader, which is to be found, says so
+        return True
 
 
 def checked_dataset(file: Any, name: str, ndim: int | None = None) -> Any:
@@ -188,13 +275,12 @@ def checked_dataset(file: Any, name: str, ndim: int | None = None) -> Any:
 
 
 def check_whole(found: Any, name: str) -> None:
-    """Raise InputError where a dataset unpacks to something absurd, is not all there, or lies elsewhere."""
-    stored, kind = found.id.get_storage_size(), found.dtype
+    """Raise InputError where a dataset unpacks to something absurd or is not all there."""
+    stored, kind, length = found.id.get_storage_size(), found.dtype, found.file.id.get_filesize()
+    if stored > length:
+        raise InputError(f"'{name}' claims {stored} bytes of a file of {length}")
     chunk = math.prod(found.chunks or (0,))
     refuse_bomb(stored, max(found.size, chunk) * kind.itemsize)
-    properties = found.id.get_create_plist()
-    if properties.get_layout() == h5py.h5d.VIRTUAL or properties.get_external_count():
-        raise InputError(f"'{name}' lies in another file, which is not read")
     if found.chunks:
         wanted = math.prod(-(-n // m) for n, m in zip(found.shape, found.chunks, strict=True))
         if found.id.get_num_chunks() < wanted:

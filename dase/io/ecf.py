@@ -178,7 +178,10 @@ def _read_parts(file: Any, source: Source) -> Iterator[Piece]:
     if filters != [FILTER]:
         raise InputError("'CD/events' is packed with ECF and more, which is not known here")
     length, chunk = len(events), events.chunks[0]
-    refuse_bomb(events.id.get_storage_size() + 1, 16 * length)
+    stored, whole = events.id.get_storage_size(), events.file.id.get_filesize()
+    if stored > whole:
+        raise InputError(f"'CD/events' claims {stored} bytes of a file of {whole}")
+    refuse_bomb(stored + 1, 16 * length)
     for i in range(0, length, chunk):
         mask, data = events.id.read_direct_chunk((i,))
         if mask:

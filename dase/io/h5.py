@@ -30,7 +30,7 @@ from dase.events import Events
 from dase.io import columns
 from dase.io.rules import sensor_events
 from dase.io.sequence import GREYS, Grey, Sequence, Writer, checked_coordinates, reading_file, writing_file
-from dase.io.source import Beside, Piece, Source
+from dase.io.source import Beside, Piece, Source, refuse_bomb
 
 CHUNK = 1 << 16  # events; 512 KiB of times fit HDF5's default chunk cache of 1 MiB
 BLOCK = 4 * CHUNK  # events gathered before they are written
@@ -273,13 +273,13 @@ def create(path: Path) -> AbstractContextManager[Writer]:
 
 def read(source: Source) -> Sequence:
     """Read an HDF5 file of the S2R layout; raises InputError where it is damaged or incomplete."""
-    with reading_file(source.path, "HDF5"), h5py.File(source.path, "r") as file:
+    with reading_file(source.path, "HDF5"), columns.open_hdf5(source.path) as file:
         return _parse_file(source, file)
 
 
 def _parse_file(source: Source, file: Any) -> Sequence:
-    t, x, y, p = (_require_dataset(file, f"events/{name}")[:] for name in EVENT_TYPES)
-    label = file["events/labels"][:] if "events/labels" in file else None
+    t, x, y, p = (columns.checked_dataset(file, f"events/{name}")[:] for name in EVENT_TYPES)
+    label = columns.checked_dataset(file, "events/labels")[:] if "events/labels" in file else None
     images, flows = numbered_members(file, "images"), numbered_members(file, "flow")
     frames = _stack_members(images, GREYS, 2) if images else None
     flow = _stack_flow(images, flows)
@@ -298,15 +298,11 @@ def _parse_file(source: Source, file: Any) -> Sequence:
 
 def read_beside(file: Any) -> Beside:
     """Return the thresholds and the configuration."""
-    thresholds = file["dase/thresholds"][:].astype(np.float32) if "dase/thresholds" in file else None
+    thresholds = None
+    if "dase/thresholds" in file:
+        thresholds = columns.checked_dataset(file, "dase/thresholds")[:].astype(np.float32)
     configuration = columns.read_attribute(file["dase"], "configuration") if "dase" in file else None
     return thresholds, None if configuration is None else str(configuration)
-
-
-def _require_dataset(file: Any, name: str) -> Any:
-    if name not in file:
-        raise InputError(f"has no '{name}'")
-    return file[name]
 
 
 def time_of(image: Any) -> float:
@@ -324,8 +320,21 @@ def exposure_of(image: Any) -> float:
 
 
 def numbered_members(file: Any, group: str) -> dict[str, Any]:
-    """Return datasets of a group by the nine digits that end their names, in their order."""
-    return {name[-9:]: file[group][name] for name in sorted(file[group])} if group in file else {}
+    """Return datasets of a group by the nine digits that end their names, in their order.
+
+    Raises:
+        InputError: Together they unpack to something absurd: many names may be links to one dataset.
+    """
+    if group not in file:
+        return {}
+    found = {name[-9:]: columns.checked_dataset(file[group], name) for name in sorted(file[group])}
+    unpacked = sum(member.size * member.dtype.itemsize for member in found.values())
+    length = next((member.file.id.get_filesize() for member in found.values()), 0)
+    try:
+        refuse_bomb(length, unpacked)
+    except InputError as error:
+        raise InputError(f"all of '{group}' {error}") from None
+    return found
 
 
 def _stack_members(members: dict[str, Any], kinds: tuple[type[Any], ...], ndim: int) -> NDArray[Any]:

@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from contextlib import suppress
+from itertools import islice
 from typing import Any
 
-import h5py
 import numpy as np
 
 from dase.errors import InputError
 from dase.io import h5
 from dase.io.columns import (
     HDF5,
+    Hdf5Group,
     checked_dataset,
     find_largest,
     open_hdf5,
@@ -64,15 +66,23 @@ def _read_size(source: Source) -> Size | None:
 def _check_layout(file: Any) -> None:
     """Raise InputError where nothing of the layout is there, or something is absurdly large."""
     if not any(name in file for name in (*COLUMNS, "images")):
-        held: list[str] = []
-        file.visit(lambda name: held.append(name) if len(held) < 6 else None)
-        raise InputError(f"is HDF5 of no known layout ({LAYOUTS}): holds {', '.join(held) or 'nothing'}")
-
-    def check(name: str, found: Any) -> None:
-        if isinstance(found, h5py.Dataset) and name.split("/")[0] in ("events", "images", "flow", "dase"):
+        held = ", ".join(islice(_list_names(file), 6))
+        raise InputError(f"is HDF5 of no known layout ({LAYOUTS}): holds {held or 'nothing'}")
+    # of each group only what a reader takes from it; what lies deeper is never asked for
+    for name in (*COLUMNS, "events/labels", "dase/thresholds"):
+        if name in file:
             checked_dataset(file, name)
+    for group in ("images", "flow"):
+        h5.numbered_members(file, group)
 
-    file.visititems(check)
+
+def _list_names(file: Hdf5Group) -> Iterator[str]:
+    """Yield the names at the root of a file and one level below; links that lead out are names, too."""
+    for name in file:
+        yield name
+        with suppress(Exception):  # whatever a damaged file makes of it
+            inner = file.get(name)
+            yield from (f"{name}/{one}" for one in (inner if isinstance(inner, Hdf5Group) else ()))
 
 
 def _read_beside(source: Source) -> Beside:
