@@ -7,7 +7,12 @@ ValueError
 from __future__ import annotations
 
 import difflib
+import operator
 from collections.abc import Iterable
+from typing import Any
+
+SEEDS = 1 << 31
+"""Seeds of simulations lie below: a key of random numbers has 31 bits."""
 
 
 class InputError(ValueError):
@@ -24,3 +29,26 @@ def nearest(name: str, known: Iterable[str]) -> str:
     if close:
         return f"did you mean '{close[0]}'?"
     return f"known: {', '.join(known)}"
+
+
+def checked_integer(name: str, value: Any, least: int, end: int | None = None) -> int:
+    """Return a whole number; raises InputError where `value` is none, below `least`, or `end` or more.
+
+    Numbers with a fraction are refused, never cut; so are those that stand for a whole one, as 2.0.
+    """
+    try:
+        number = operator.index(value)
+    except TypeError:
+        number = least - 1
+    if number < least or (end is not None and number >= end) or isinstance(value, bool):
+        span = f">= {least}" if end is None else f"in {least}..{end - 1}"
+        raise InputError(f"{name} must be a whole number {span}, got {value!r}")
+    return number
+
+
+def checked_seed(seed: Any, end: int = SEEDS) -> int:
+    """Return a seed; raises InputError where it is no whole number in 0..end - 1.
+
+    It is never taken modulo anything: two seeds are two sets of random numbers.
+    """
+    return checked_integer("seed", seed, 0, end)

@@ -12,10 +12,29 @@ from numpy.typing import ArrayLike, NDArray
 
 from dase.errors import InputError
 
+LARGEST_SIDE = 16384
+"""Columns or rows of a sensor that is simulated, at most; coordinates of events have 16 bits."""
+
 LABELS = ("signal", "leak", "shot", "hot")
 """What an event came from: a change of light, the leak of the pixel's memory, the noise of few photons, a
 hot pixel. An ON event is the leak's when, since the pixel's memory was last set, the leak brought it nearer
 to the threshold than the light did."""
+
+
+def _whole_coordinates(values: NDArray[Any], name: str) -> NDArray[np.uint16]:
+    """Return coordinates (N,) as uint16; raises InputError where they would wrap or lose a fraction."""
+    if values.dtype.kind not in "iu":
+        raise InputError(f"events: {name} must be whole numbers, got {values.dtype}")
+    if len(values) and not 0 <= int(values.min()) <= int(values.max()) < 1 << 16:
+        raise InputError(f"events: {name} must lie in 0..65535, got {values.min()}..{values.max()}")
+    return values.astype(np.uint16)
+
+
+def _polarities(values: NDArray[Any]) -> NDArray[np.bool_]:
+    """Return polarities (N,) as bool; raises InputError where they are not 0 and 1: -1 would become ON."""
+    if values.dtype.kind not in "iuf" or np.any((values != 0) & (values != 1)):
+        raise InputError(f"events: p must be bool, True for ON, got {values.dtype} with other numbers")
+    return values.astype(np.bool_)
 
 
 @dataclass(frozen=True)
@@ -27,9 +46,15 @@ class Events:
         x: Columns, uint16, shape (N,).
         y: Rows, uint16, shape (N,).
         p: Polarities, bool, shape (N,): True is ON.
-        width: Columns of the sensor.
-        height: Rows of the sensor.
+        width: Columns of the sensor, at most 65536.
+        height: Rows of the sensor, at most 65536.
         label: Places in `LABELS`, int8, shape (N,); None where unknown.
+
+    Columns of other types are converted where that loses nothing: whole numbers in 0..65535, polarities 0 and
+    1, any real times.
+
+    Raises:
+        InputError: Shapes differ, the sensor has no size, or a column cannot be converted.
     """
 
     t: NDArray[np.float64]
@@ -48,8 +73,19 @@ class Events:
             )
         if len(set(sizes.values())) != 1 or self.t.ndim != 1:
             raise InputError(f"events: t, x, y and p must have one common shape (N,), got {sizes}")
-        if self.width < 1 or self.height < 1:
-            raise InputError(f"events: sensor size must be at least 1x1, got {self.width}x{self.height}")
+        if not 1 <= min(self.width, self.height) <= max(self.width, self.height) <= 1 << 16:
+            size = f"{self.width}x{self.height}"
+            raise InputError(f"events: sensor size must lie between 1x1 and 65536x65536, got {size}")
+        # one comparison of types each where nothing is to be done, as almost always
+        if self.t.dtype != np.float64:
+            if self.t.dtype.kind not in "iuf":
+                raise InputError(f"events: t must be numbers [s], got {self.t.dtype}")
+            object.__setattr__(self, "t", self.t.astype(np.float64))
+        for name in "xy":
+            if getattr(self, name).dtype != np.uint16:
+                object.__setattr__(self, name, _whole_coordinates(getattr(self, name), name))
+        if self.p.dtype != np.bool_:
+            object.__setattr__(self, "p", _polarities(self.p))
 
     def __len__(self) -> int:
         return len(self.t)

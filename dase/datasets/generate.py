@@ -18,7 +18,7 @@ import tomlkit
 
 from dase import io
 from dase.datasets.interrupt import Deferred, deferred, ignored
-from dase.errors import InputError, nearest
+from dase.errors import InputError, checked_integer, nearest
 from dase.kernels import launch
 from dase.scenes import image_sources, random_scenes
 from dase.scenes.layers import LayerScene
@@ -82,8 +82,7 @@ class Job:
             raise InputError(
                 f"there is no regime '{self.regime}': {nearest(self.regime, random_scenes.NAMES)}"
             )
-        if self.seed < 0:
-            raise InputError(f"seed must be >= 0, got {self.seed}")
+        checked_integer("seed", self.seed, 0)
 
     def text(self) -> str:
         """Return the job as TOML text."""

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from dase.diagnosis.standard_stimuli import STANDARDS, Standard
 from dase.effects.row_scan import RowScan
 from dase.effects.timestamp import Timestamp
-from dase.errors import InputError
+from dase.errors import InputError, checked_seed
 from dase.fitting.batch_simulator import Order, Trials, finer_steps
 from dase.fitting.data_split import typical_changes
 from dase.kernels import launch
@@ -80,6 +80,7 @@ def distinguish(
         InputError: The models are of cameras that differ in size, or a number is out of range.
     """
     size = _check(a, b, longest, pixels, repeats)
+    checked_seed(seed, 1 << 30)
     durations = [t for t in LADDER if t < longest] + [longest]
     answers = []
     for number, standard in enumerate(STANDARDS):

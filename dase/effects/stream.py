@@ -13,6 +13,7 @@ import warp as wp
 from numpy.typing import ArrayLike, NDArray
 
 from dase.effects.base import Effect
+from dase.errors import checked_seed
 from dase.events import Events
 from dase.kernels import launch
 
@@ -58,7 +59,7 @@ class StreamEffect(Effect):
 
 def random_numbers(seed: int, name: str) -> np.random.Generator:
     """Return the random numbers of the readout effect `name`; they come in the order of the events."""
-    return np.random.default_rng([seed & 0x7FFFFFFF, zlib.crc32(name.encode())])
+    return np.random.default_rng([checked_seed(seed), zlib.crc32(name.encode())])
 
 
 def nanoseconds(seconds: ArrayLike) -> NDArray[np.int64]:

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from dase.errors import InputError
+from dase.errors import InputError, checked_seed
 from dase.events import Events
 from dase.fitting.batch_simulator import Trials
 from dase.fitting.bus_load import Surroundings
@@ -110,6 +110,8 @@ def gather(
     Raises:
         InputError: Different sizes, no common time, or too few events.
     """
+    # offsets are added for further random numbers, and batches count in 30 bits
+    checked_seed(seed, 1 << 30)
     if trust is None and isinstance(scene, CameraScene):
         trust = scene.trusts
     grid = common_grid(events, scene)

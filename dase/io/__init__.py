@@ -19,7 +19,7 @@ from math import isfinite
 from os import PathLike
 from pathlib import Path
 
-from dase.errors import InputError, nearest
+from dase.errors import InputError, checked_integer, nearest
 from dase.events import Events
 from dase.io import (
     aedat2,
@@ -133,8 +133,7 @@ def stream(
     Raises:
         InputError: As for `read`; also where times go back too far to be sorted on the way.
     """
-    if chunk < 1:
-        raise InputError(f"chunk must be at least 1 event, got {chunk}")
+    chunk = checked_integer("chunk", chunk, 1)
     source = _make_source(path, size, notes)
     return find_format(path).stream(source, chunk)
 

@@ -211,8 +211,6 @@ def sequence_of(events: Events, pictures: list[Picture], begin: Any = 0, ticks: 
 def _stream_events(
     source: Source, pieces: Iterable[Piece], size: Size, ticks: float, chunk: int
 ) -> Iterator[Events]:
-    if chunk < 1:
-        raise InputError(f"chunk must be at least 1 event, got {chunk}")
     zero = None
     settled = rules.settle_pieces(source, pieces, size, ticks)
     for piece in _cut_chunks(rules.order_pieces(source, settled, ticks), chunk):

@@ -15,7 +15,7 @@ from dase.atomic_file import replacing
 from dase.effects.learned_threshold import LearnedThreshold
 from dase.effects.mismatch import Mismatch
 from dase.effects.threshold import Threshold
-from dase.errors import InputError, nearest
+from dase.errors import InputError, checked_seed, nearest
 from dase.learning.adversarial import Hash
 from dase.learning.baselines import Randomised, esim, event_rate
 from dase.learning.recorded_target import Replayed, open_target
@@ -91,6 +91,7 @@ class Job:
     def __post_init__(self) -> None:
         if not self.images:
             object.__setattr__(self, "images", "builtin" if self.targets and self.of_sensor else "frames")
+        checked_seed(self.seed)
         if self.preset not in PRESETS:
             raise InputError(f"there is no preset '{self.preset}': {nearest(self.preset, PRESETS)}")
         if self.objective not in ("", "moments", "wgan"):

@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from dase import io
-from dase.errors import InputError
+from dase.errors import InputError, checked_seed
 from dase.events import Events
 from dase.io.sequence import Sequence
 from dase.io.source import Kind, Motion, Note, Size
@@ -271,7 +271,7 @@ class Recording:
         pixels = self.pixels
         if not 1 <= count <= len(pixels):
             raise InputError(f"subsample: must take 1 to {len(pixels)} of the trusted pixels, got {count}")
-        return np.sort(np.random.default_rng(seed).choice(pixels, count, replace=False))
+        return np.sort(np.random.default_rng(checked_seed(seed)).choice(pixels, count, replace=False))
 
     def split_pixels(self, share: float, seed: int) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
         """Return the trusted pixels in two parts at random, for training and held out.
@@ -284,7 +284,7 @@ class Recording:
             Row-major indices, each increasing.
         """
         _check_share(share)
-        pixels = np.random.default_rng(seed).permutation(self.pixels)
+        pixels = np.random.default_rng(checked_seed(seed)).permutation(self.pixels)
         held = min(max(round(share * len(pixels)), 1), len(pixels) - 1)
         if held < 1:
             raise InputError("split: needs at least 2 trusted pixels")

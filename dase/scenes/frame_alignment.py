@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from dase.errors import InputError
+from dase.errors import InputError, checked_seed
 from dase.events import Events
 from dase.scenes.between_frames import CameraScene
 
@@ -186,7 +186,7 @@ def align(
         raise InputError(f"align: latest must be >= 0 s, got {latest:g}")
     search = _Search(events, scene, reach)
     counts = np.full(len(search.changes), 1 / len(search.changes))
-    draws = np.random.default_rng(seed).multinomial(len(counts), counts, RESAMPLES)
+    draws = np.random.default_rng(checked_seed(seed)).multinomial(len(counts), counts, RESAMPLES)
     return _decide(search, *_nearest(search, gap, latest), draws)
 
 

@@ -8,8 +8,8 @@ import numpy as np
 import warp as wp
 from numpy.typing import ArrayLike, NDArray
 
-from dase.errors import InputError
-from dase.events import Events
+from dase.errors import InputError, checked_seed
+from dase.events import LARGEST_SIDE, Events
 from dase.kernels import event_keys as ordering
 from dase.kernels import launch, pixel_compile, pixel_stages, threshold_events
 from dase.kernels import threshold_counts as counting
@@ -18,6 +18,19 @@ from dase.scenes.scene import Scene
 
 if TYPE_CHECKING:
     from dase.simulation.sensor import Sensor
+
+
+def _pixel_indices(pixels: ArrayLike | None, width: int, height: int) -> NDArray[np.int32]:
+    """Return row-major indices, shape (N,); raises InputError where they are none: a fraction is not cut."""
+    if pixels is None:
+        return np.arange(width * height, dtype=np.int32)
+    given = np.asarray(pixels)
+    whole = given.dtype.kind in "iu" and given.ndim == 1 and len(given)
+    if not whole or int(given.min()) < 0 or int(given.max()) >= width * height:
+        raise InputError(
+            f"pixels must be whole numbers, indices of the {width}x{height} sensor, shape (N,), N >= 1"
+        )
+    return given.astype(np.int32)
 
 
 class Pixels:
@@ -54,23 +67,17 @@ class Pixels:
         except ValueError as error:
             raise InputError(str(error)) from error
         self.sensor, self.width, self.height = sensor, width, height
-        self.seed = seed & 0x7FFFFFFF  # a key of random numbers has 31 bits
+        self.seed = checked_seed(seed)
+        if max(width, height) > LARGEST_SIDE or width * height >= 1 << 31:
+            # columns and rows of an event have 16 bits each, the index of a pixel 31
+            raise InputError(f"a sensor must be at most {LARGEST_SIDE} wide and high, got {width}x{height}")
         self.stages = sensor.stages()
-        self.pixels = (
-            np.arange(width * height, dtype=np.int32) if pixels is None else np.asarray(pixels, np.int32)
-        )
+        self.pixels = _pixel_indices(pixels, width, height)
         vectors = sensor.parameters()[None] if parameters is None else np.asarray(parameters, np.float32)
         if vectors.ndim != 2 or vectors.shape[1] != len(sensor.parameter_names()):
             raise InputError(
                 f"parameters must have shape (B, {len(sensor.parameter_names())}), got {vectors.shape}"
             )
-        if (
-            self.pixels.ndim != 1
-            or len(self.pixels) == 0
-            or self.pixels.min() < 0
-            or self.pixels.max() >= width * height
-        ):
-            raise InputError(f"pixels must be indices of the {width}x{height} sensor, shape (N,), N >= 1")
         self.batch, self.count = len(vectors), len(self.pixels)
         self._pixels = wp.array(self.pixels, dtype=int, device=self.device)
         xy = self.pixels % width + (self.pixels // width << 16)

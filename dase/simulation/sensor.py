@@ -16,6 +16,7 @@ from dase.effects.optics import SceneEffect
 from dase.effects.stream import StreamEffect
 from dase.effects.threshold import Threshold
 from dase.errors import InputError
+from dase.events import LARGEST_SIDE
 from dase.kernels import pixel_stages
 from dase.scenes.scene import Scene
 from dase.simulation.sensor_history import Entry
@@ -50,10 +51,9 @@ class Sensor:
             )
         if not 0 < self.log_eps < 1:
             raise InputError(f"sensor '{self.name}': log_eps must lie in (0, 1), got {self.log_eps:g}")
-        if self.size is not None and min(self.size) < 1:
-            raise InputError(
-                f"sensor '{self.name}': size must be at least 1x1, got {self.size[0]}x{self.size[1]}"
-            )
+        if self.size is not None and not 1 <= min(self.size) <= max(self.size) <= LARGEST_SIDE:
+            size, most = f"{self.size[0]}x{self.size[1]}", f"{LARGEST_SIDE}x{LARGEST_SIDE}"
+            raise InputError(f"sensor '{self.name}': size must lie between 1x1 and {most}, got {size}")
 
     def __getitem__(self, name: str) -> Effect:
         for effect in self.effects:

@@ -7,7 +7,7 @@ from collections.abc import Iterator
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from dase.errors import InputError
+from dase.errors import InputError, checked_integer
 from dase.events import Events
 from dase.scenes.scene import Scene
 from dase.simulation.pixel_array import Pixels
@@ -54,16 +54,17 @@ def stream(
         seed: Of every random number; the same seed gives the same events, whatever `chunk` is.
         device: `cpu`, `cuda` or a Warp name.
         pixels: Row-major indices of the pixels to simulate; None for all.
-        chunk: Samples per chunk.
+        chunk: Samples per chunk, at least 1; None for what suits the device.
         labels: Whether events are marked with what they came from.
 
     Yields:
         Events in order of time. Those that leave the sensor late come with a later chunk, or in one more part
         at the end.
     """
+    if chunk is not None:
+        chunk = checked_integer("chunk", chunk, 1)
     array = Pixels(sensor, scene.width, scene.height, pixels=pixels, seed=seed, device=device, labels=labels)
-    for parts in _leaving(scene, array, chunk):
-        yield parts[0]
+    return (parts[0] for parts in _leaving(scene, array, chunk))
 
 
 def _leaving(scene: Scene, array: Pixels, chunk: int | None = None) -> Iterator[list[Events]]:
