@@ -48,9 +48,14 @@ BITS = np.array([bin(mask).count("1") for mask in range(4096)], np.int64)
 
 
 class Decoder:
-    """Decodes words; carries time, row and vector base over from one call to the next."""
+    """Decodes words; carries time, row and vector base over from one call to the next.
 
-    def __init__(self) -> None:
+    Args:
+        clears: Whether a new TIME_HIGH sets the low bits of the time to zero, as it does in EVT 3.0.
+    """
+
+    def __init__(self, *, clears: bool = True) -> None:
+        self._clears = clears
         self._turns = Rollover(12, back=True)
         self._high = UNDATED  # continued high part of the time
         self._low = 0
@@ -115,7 +120,12 @@ class Decoder:
         out = np.empty(len(at) + 1, np.int64)
         out[0] = self._low
         out[1:] = words.take(at) & 4095
-        out[places + 1] = 0
+        if self._clears:
+            out[places + 1] = 0
+        else:  # the low bits stay those of the last word that told them
+            told = np.arange(len(out))
+            told[places + 1] = 0
+            out = out.take(np.maximum.accumulate(told))
         self._low = int(out[-1])
         counts = np.diff(places + 1, prepend=0, append=len(out))
         high = np.repeat(np.concatenate(([self._high], highs)), counts)

@@ -10,7 +10,7 @@ parsed in `dase.io.ros_messages`.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -34,9 +34,36 @@ def _open_bag(source: Source) -> Iterator[tuple[Any, bool]]:
     except ImportError:
         raise missing_extra("a ROS bag", "ros") from None
     cdr = source.path.is_dir() or not _starts_with(source.path, ROS1)
-    reader: Any = rosbag2.Reader(source.path) if cdr else rosbag1.Reader(source.path)
-    with packed.bounded_bags(), reader:
+    with packed.bounded_bags(), ExitStack() as stack:
+        try:
+            reader = stack.enter_context(rosbag2.Reader(source.path) if cdr else rosbag1.Reader(source.path))
+        except rosbag2.ReaderError as error:
+            # metadata written by hand, by converters or by recorders that were killed lack entries; those of
+            # the files themselves are all that is needed
+            files = sorted(file for file in source.path.glob("*") if file.suffix in (".mcap", ".db3"))
+            if not files or "missing: [" in str(error):
+                raise
+            source.note(
+                f"metadata.yaml is of no use ({error}): its {len(files)} files were read one after the other",
+                "repaired",
+                "metadata",
+            )
+            reader = _Chain([stack.enter_context(rosbag2.Reader(file)) for file in files])
         yield reader, cdr
+
+
+class _Chain:
+    """Several files of one bag, read one after the other."""
+
+    def __init__(self, readers: list[Any]) -> None:
+        self._readers = readers
+        self.connections = [connection for reader in readers for connection in reader.connections]
+
+    def messages(self, connections: list[Any]) -> Iterator[tuple[Any, int, bytes]]:
+        for reader in self._readers:
+            own = [one for one in reader.connections if any(one is asked for asked in connections)]
+            if own:  # rosbags takes none for all
+                yield from reader.messages(own)
 
 
 def _starts_with(path: Path, magic: bytes) -> bool:

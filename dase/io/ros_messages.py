@@ -11,8 +11,8 @@
     sensor_msgs/Image                 header, u32 rows, columns, text encoding, u8 big-endian, u32 step, data
     sensor_msgs/CompressedImage       header, text format, data
 
-Sources: the .msg files of rpg_dvs_ros, event_camera_msgs and common_msgs; event_camera_codecs (Apache-2.0)
-for the encodings mono, libcaer and libcaer_cmp.
+Sources: the .msg files of rpg_dvs_ros, event_camera_msgs and common_msgs; event_camera_codecs and
+libcaer_driver (Apache-2.0) for the encodings mono, libcaer and libcaer_cmp.
 """
 
 from __future__ import annotations
@@ -169,10 +169,15 @@ class Packets:
             raise InputError(f"events are encoded as '{encoding}', known: {', '.join(ENCODINGS)}")
 
     def _libcaer_cmp(self, words: NDArray[np.uint16], base: int) -> Iterator[Piece]:
+        """Yield the events [ns]: counted in microseconds from a time base in nanoseconds.
+
+        TIME_HIGH leaves the low bits of the time as they were: libcaer_driver writes TIME_LOW only where
+        these change.
+        """
         start = np.array([0x8000], "<u2")  # every packet begins at its own time base
         words = np.concatenate((start, (LIBCAER_CMP[words >> 12] << 12) | (words & 4095)))
-        for piece in evt3.Decoder()(words):
-            yield Piece((piece.t + base) * 1000, piece.y, piece.x, piece.p)
+        for piece in evt3.Decoder(clears=False)(words):
+            yield Piece(piece.t * 1000 + base, piece.y, piece.x, piece.p)
 
 
 def _as_words(data: bytes, kind: str) -> NDArray[Any]:
