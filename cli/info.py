@@ -3,22 +3,21 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import click
 
-from dase.cli.options import parse_size
+from dase.cli.options import reading_options
+
+if TYPE_CHECKING:
+    from dase.io.source import ReadOptions
 
 
 @click.command()
 @click.argument("file", type=click.Path(path_type=Path))
-@click.option(
-    "--size",
-    callback=parse_size,
-    metavar="WxH",
-    help="Columns x rows.  [default: as FILE says]",
-)
 @click.option("--json", "as_json", is_flag=True, help="Print one JSON object, for programs.")
-def command(file: Path, size: tuple[int, int] | None, as_json: bool) -> None:
+@reading_options
+def command(file: Path, as_json: bool, reading: ReadOptions) -> None:
     """Say what is in FILE: rates, intervals, hot pixels, frames, what was repaired and what looks odd.
 
     FILE streams through, whatever its size. Isolated events are counted on a sample; all else on all events.
@@ -35,7 +34,7 @@ def command(file: Path, size: tuple[int, int] | None, as_json: bool) -> None:
     notes: list[str] = []
     name = io.find_format(file).name
     with tqdm(unit=" events", unit_scale=True, delay=1.0, leave=False, disable=None) as bar:
-        found = survey_file(file, size=size, notes=notes, progress=bar.update).statistics()
+        found = survey_file(file, notes=notes, progress=bar.update, **reading).statistics()
     said = [note for note in (*notes, *doubts(found)) if isinstance(note, io.Note)]
     if as_json:
         return click.echo(json.dumps(summary.as_json(name, found, said), indent=1))

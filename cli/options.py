@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import replace
+from functools import wraps
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import click
 
@@ -26,13 +28,57 @@ def parse_size(ctx: click.Context, param: click.Parameter, value: str | None) ->
     return width, height
 
 
+def _parse_region(
+    ctx: click.Context, param: click.Parameter, value: str | None
+) -> tuple[int, int, int, int] | None:
+    if value is None:
+        return None
+    try:
+        x, y, width, height = (int(part) for part in value.split(","))
+    except ValueError:
+        raise click.BadParameter(f"{value!r} is not of the form x,y,w,h, such as 0,0,320,240") from None
+    return x, y, width, height
+
+
+def reading_options(command: Callable[..., Any]) -> Callable[..., Any]:
+    """Add what a user may say about a file that is read; a command gets it as the mapping `reading`.
+
+    The mapping is the keywords of `dase.io.read`, see `dase.io.ReadOptions`.
+    """
+
+    @wraps(command)
+    def gathered(*args: Any, **given: Any) -> Any:
+        from dase.io.source import Part
+
+        begin, end, region = (given.pop(name) for name in ("begin", "end", "region"))
+        part = None
+        if (begin, end, region) != (None, None, None):
+            span = -math.inf if begin is None else begin, math.inf if end is None else end
+            part = Part(*span, region)
+        reading = {name: given.pop(name) for name in ("size", "chip", "columns")} | {"part": part}
+        return command(*args, reading=reading, **given)
+
+    options = (
+        click.option("--size", callback=parse_size, metavar="WxH", help="Columns x rows, else the file's."),
+        click.option("--from", "begin", type=float, metavar="SECONDS", help="Read from this time on."),
+        click.option("--to", "end", type=float, metavar="SECONDS", help="Read up to this time."),
+        click.option("--region", callback=_parse_region, metavar="X,Y,W,H", help="Read W x H pixels from X,Y."),
+        click.option("--chip", metavar="NAME", help="Chip of an AEDAT 1 or 2 that names none, as davis240."),
+        click.option("--columns", metavar="ORDER", help="Order of columns without names, as txyp."),
+    )  # fmt: skip
+    for option in reversed(options):
+        gathered = option(gathered)
+    return gathered
+
+
 effects_option = click.option(
     "--effects",
     type=click.Path(path_type=Path),
     multiple=True,
     is_eager=True,  # options that answer at once may need them
     metavar="FILE",
-    help="Python file with effects of your own (`dase effects new`); may be given again.",
+    help="Python file with effects of your own (`dase effects new`): its code is run, so only files that you "
+    "trust. May be given again.",
 )
 """`--effects FILE`: a command gets a tuple of paths, for `dase.simulation.user_effects.known_effects`."""
 

@@ -7,10 +7,11 @@ from typing import TYPE_CHECKING
 
 import click
 
-from dase.cli.options import parse_size
+from dase.cli.options import reading_options
 
 if TYPE_CHECKING:
     from dase.io.sequence import Sequence
+    from dase.io.source import ReadOptions
 
 
 @click.command()
@@ -23,15 +24,15 @@ if TYPE_CHECKING:
     metavar="SECONDS",
     help="Events per picture.  [default: fits the rate]",
 )
-@click.option("--size", callback=parse_size, metavar="WxH", help="Columns x rows.  [default: as FILE says]")
 @click.option("--trust", is_flag=True, help="Show how far the scene between the frames can be trusted.")
+@reading_options
 def command(
     file: Path,
     output: Path | None,
     at: float | None,
     window: float | None,
-    size: tuple[int, int] | None,
     trust: bool,
+    reading: ReadOptions,
 ) -> None:
     """Draw the events of FILE over its frames and print its statistics.
 
@@ -57,7 +58,7 @@ def command(
         raise InputError("at: shows one moment, which a video cannot; leave it out or write a .png")
     if trust and (suffix == ".mp4" or at is not None):
         raise InputError("trust: is a picture of several moments, which takes neither --at nor .mp4")
-    sequence = io.read(file, size=size)
+    sequence = io.read(file, **reading)
     if trust:
         _draw_trust(sequence, output, file.stem, window)
     elif suffix == ".mp4":

@@ -18,6 +18,7 @@ from dataclasses import replace
 from math import isfinite
 from os import PathLike
 from pathlib import Path
+from typing import Unpack
 
 from dase.errors import InputError, checked_integer, nearest
 from dase.events import Events
@@ -41,14 +42,19 @@ from dase.io import (
 from dase.io import h5 as h5
 from dase.io import npz as npz
 from dase.io.format import Format as Format
+from dase.io.format import collect_pictures, sequence_of
+from dase.io.parts import cut_beside, cut_motion, cut_pictures, cut_sequence, cut_stream, note_part
 from dase.io.rules import TooLateError
 from dase.io.sequence import Sequence as Sequence
 from dase.io.sequence import Writer as Writer
+from dase.io.sequence import reading_file
 from dase.io.sequence import replacing as replacing
-from dase.io.source import CHUNK, Size, Source
+from dase.io.source import CHUNK, Source
 from dase.io.source import Motion as Motion
 from dase.io.source import Note as Note
+from dase.io.source import Part as Part
 from dase.io.source import Picture as Picture
+from dase.io.source import ReadOptions as ReadOptions
 
 FORMATS: tuple[Format, ...] = (
     ecf.FORMAT,
@@ -97,27 +103,42 @@ def find_format(path: str | PathLike[str]) -> Format:
     return _of_suffix(path, (s2r.FORMAT, arrays.OWN, *FORMATS))
 
 
-def read(path: str | PathLike[str], *, size: Size | None = None, notes: list[str] | None = None) -> Sequence:
-    """Read a file or folder whole.
+def read(
+    path: str | PathLike[str], *, notes: list[str] | None = None, **options: Unpack[ReadOptions]
+) -> Sequence:
+    """Read a file or folder whole, or a part of it.
 
     Args:
         path: What to read; its content chooses the format, then its suffix.
-        size: Columns and rows of the sensor, where the file does not say or says it wrongly.
         notes: Gets sentences about what was skipped, repaired or guessed.
+        options: What is known about the file, and the part to read, see `ReadOptions`.
 
     Raises:
-        InputError: It is missing, of unknown format, damaged or incomplete, or needs an optional library.
+        InputError: It is missing, of unknown format, damaged or incomplete, or needs an optional library; an
+            option does not fit it.
     """
-    source = _make_source(path, size, notes)
-    return find_format(path).read(source)
+    format, source = _opened(path, notes, options)
+    part = source.part
+    if part is None:
+        return format.read(source)
+    note_part(source, part)
+    with reading_file(source.path, format.name):
+        if "flow" in format.keeps:  # which a stream does not give without frames
+            return cut_sequence(source, format.read(source), part)
+        try:
+            events = Events.concatenate(cut_stream(format.stream(source, CHUNK), part, CHUNK))
+        except TooLateError:
+            return cut_sequence(source, format.read(source), part)
+        frames = collect_pictures(cut_pictures(source, format.pictures(source), part))
+        return sequence_of(events, frames)
 
 
 def stream(
     path: str | PathLike[str],
     *,
     chunk: int = CHUNK,
-    size: Size | None = None,
     notes: list[str] | None = None,
+    **options: Unpack[ReadOptions],
 ) -> Iterator[Events]:
     """Yield the events of a file in chunks, so that the file may be larger than the memory.
 
@@ -127,19 +148,28 @@ def stream(
     Args:
         path: What to read; its content chooses the format, then its suffix.
         chunk: Events in a chunk.
-        size: Columns and rows of the sensor, where the file does not say or says it wrongly.
         notes: Gets sentences about what was skipped, repaired or guessed; complete after the last chunk.
+        options: What is known about the file, and the part to read, see `ReadOptions`.
 
     Raises:
         InputError: As for `read`; also where times go back too far to be sorted on the way.
     """
     chunk = checked_integer("chunk", chunk, 1)
-    source = _make_source(path, size, notes)
-    return find_format(path).stream(source, chunk)
+    format, source = _opened(path, notes, options)
+    return _stream_part(format, source, chunk)
+
+
+def _stream_part(format: Format, source: Source, chunk: int) -> Iterator[Events]:
+    if source.part is None:
+        yield from format.stream(source, chunk)
+        return
+    note_part(source, source.part)
+    with reading_file(source.path, format.name):
+        yield from cut_stream(format.stream(source, chunk), source.part, chunk)
 
 
 def pictures(
-    path: str | PathLike[str], *, size: Size | None = None, notes: list[str] | None = None
+    path: str | PathLike[str], *, notes: list[str] | None = None, **options: Unpack[ReadOptions]
 ) -> Iterator[Picture]:
     """Yield the frames of a file one by one, as `read` gives them.
 
@@ -147,29 +177,39 @@ def pictures(
 
     Args:
         path: What to read; its content chooses the format, then its suffix.
-        size: Columns and rows of the sensor, where the file does not say or says it wrongly.
         notes: Gets sentences about what was skipped, repaired or guessed.
+        options: What is known about the file, and the part to read, see `ReadOptions`.
 
     Raises:
         InputError: As for `read`.
     """
-    return find_format(path).pictures(_make_source(path, size, notes))
+    return _picture_part(*_opened(path, notes, options))
+
+
+def _picture_part(format: Format, source: Source) -> Iterator[Picture]:
+    if source.part is None:
+        yield from format.pictures(source)
+        return
+    with reading_file(source.path, format.name):
+        yield from cut_pictures(source, format.pictures(source), source.part)
 
 
 def motion(
-    path: str | PathLike[str], *, size: Size | None = None, notes: list[str] | None = None
+    path: str | PathLike[str], *, notes: list[str] | None = None, **options: Unpack[ReadOptions]
 ) -> Motion | None:
     """Read the samples of a camera's motion sensor, times [s] on the clock of the events; None without any.
 
     Args:
         path: What to read; of the formats AEDAT 4 has them.
-        size: Columns and rows of the sensor, where the file does not say or says it wrongly.
         notes: Gets sentences about what was skipped, repaired or guessed.
+        options: What is known about the file, and the part to read, see `ReadOptions`.
 
     Raises:
         InputError: As for `read`.
     """
-    return find_format(path).motion(_make_source(path, size, notes))
+    format, source = _opened(path, notes, options)
+    found = format.motion(source)
+    return found if source.part is None else cut_motion(found, source.part)
 
 
 def create(path: str | PathLike[str], *, format: str | None = None) -> AbstractContextManager[Writer]:
@@ -233,10 +273,10 @@ def convert(
     target: str | PathLike[str],
     *,
     format: str | None = None,
-    size: Size | None = None,
     with_frames: bool = True,
     notes: list[str] | None = None,
     progress: Callable[[int], object] = lambda count: None,
+    **options: Unpack[ReadOptions],
 ) -> int:
     """Convert a file piece by piece, whatever its size, and return its number of events.
 
@@ -247,51 +287,61 @@ def convert(
         source: Any file that `read` takes.
         target: File to write.
         format: Name of its format; None goes by its suffix.
-        size: Columns and rows of the sensor, where `source` does not say or says it wrongly.
         with_frames: Take frames along where `target` can hold them.
         notes: Gets sentences about what was skipped, repaired or guessed.
         progress: Is told how many events were written since it was told last.
+        options: What is known about `source`, and the part to convert, see `ReadOptions`.
 
     Raises:
         InputError: As for `read` and `create`.
     """
     notes = [] if notes is None else notes
-    taken, keeps = _make_source(source, size, notes), find_writable_format(target, format).keeps
+    (reader, taken), keeps = _opened(source, notes, options), find_writable_format(target, format).keeps
     total = 0
     try:
         with create(target, format=format) as writer:
-            for part in find_format(source).stream(taken, CHUNK):
+            for part in _stream_part(reader, taken, CHUNK):
                 writer.events(part)
                 total += len(part)
                 progress(len(part))
             if with_frames and "frames" in keeps:
-                _add_frames(taken, writer)
-                _add_beside(taken, writer)
+                _add_frames(reader, taken, writer)
+                _add_beside(reader, taken, writer)
     except TooLateError:
-        sequence = replace(find_format(source).read(taken), flow=None)
+        sequence = replace(read(source, notes=notes, **options), flow=None)
         keeps_frames = with_frames and "frames" in keeps and sequence.frame_times is not None
         write(target, sequence if keeps_frames else Sequence(sequence.events), format=format)
         total = len(sequence.events)
     return total
 
 
-def _add_frames(source: Source, writer: Writer) -> None:
-    for grey, time, exposure, flow in find_format(source.path).pictures(source):
+def _add_frames(reader: Format, source: Source, writer: Writer) -> None:
+    for grey, time, exposure, flow in _picture_part(reader, source):
         if not isfinite(time):
             return source.note("frames without times cannot be converted: left out", "refused", "frames")
         writer.frame(float(time), grey, flow, exposure=exposure)
 
 
-def _add_beside(source: Source, writer: Writer) -> None:
-    thresholds, configuration = find_format(source.path).beside(source)
+def _add_beside(reader: Format, source: Source, writer: Writer) -> None:
+    beside = reader.beside(source)
+    thresholds, configuration = beside if source.part is None else cut_beside(beside, source.part)
     if thresholds is not None:
         writer.thresholds(thresholds)
     if configuration is not None:
         writer.configuration(configuration)
 
 
-def _make_source(path: str | PathLike[str], size: Size | None, notes: list[str] | None) -> Source:
-    return Source(Path(path), size, [] if notes is None else notes)
+def _opened(
+    path: str | PathLike[str], notes: list[str] | None, options: ReadOptions
+) -> tuple[Format, Source]:
+    """Return the format of a file and what is known about it; refuses an option that means nothing to it."""
+    source = Source(Path(path), notes=[] if notes is None else notes, **options)
+    found = find_format(source.path)
+    for name in ("chip", "columns"):
+        if getattr(source, name) is not None and name not in found.asks:
+            takers = ", ".join(one.name for one in FORMATS if name in one.asks)
+            raise InputError(f"{path}: is {found.name}, which takes no {name}; {takers} do")
+    return found, source
 
 
 def _of_suffix(path: Path, formats: Iterable[Format]) -> Format:

@@ -9,8 +9,15 @@
     DVS640      -    20..11   10..1     bit 0: 1 = ON        as v2e writes it
 
 AEDAT 1.0 differs by 16-bit addresses, always of a DVS128. Rows count from below, columns from the right, and
-are turned here. Frame samples, IMU samples and special events are skipped. Without an AEChip line the layout
-is told from the bits in use. Sources: docs.inivation.com, "AEDAT file formats"; jAER's extractors; v2e (MIT).
+are turned here. Special events and IMU samples are skipped. Without an AEChip line the layout is told from
+the bits in use, and said; `chip` decides.
+
+    frames      31 = 1   30..22 row   21..12 column   11..10 which read   9..0 sample of the converter
+
+Every pixel of a frame is read twice: read 0 after its reset, read 1 at the end of the exposure; 3 is an IMU
+sample. Grey is the first minus the second. Here columns count from the left. Frames become 16 bits, all that
+the converter can say being white. Sources: docs.inivation.com, "AEDAT file formats"; jAER's extractors; v2e
+(MIT).
 """
 
 from __future__ import annotations
@@ -20,17 +27,24 @@ from collections.abc import Iterator
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from dase.errors import InputError
+from dase.errors import InputError, nearest
 from dase.events import Events
 from dase.io.binary import EventWriter, Rollover, read_records
 from dase.io.format import camera_format
 from dase.io.sequence import Writer, writing_file
-from dase.io.source import Piece, Size, Source, guess_size
+from dase.io.source import Picture, Piece, Size, Source, guess_size
 
+SAMPLE_BITS = 10
+APS, READ_SHIFT = np.uint32(1 << 31), 10
+MOST_MISFITS = 0.01
+"""Share of addresses, damaged ones, that may not fit a layout that is taken for possible."""
+LEAST_READ = 0.5
+"""Share of the pixels that must have been read twice; frames with less, cut off, are left out."""
 LONGEST = 1 << 21  # [bytes] of a header: jAER stores all its preferences
 END = b"#End Of ASCII Header\r\n"
 
@@ -98,7 +112,7 @@ def parse_header(head: bytes) -> Header:
         text = line.decode("latin-1").strip()
         if match := re.match(r"#!AER-DAT([0-9.]+)", text):
             if match[1] not in ("1.0", "2.0"):
-                raise InputError(f"is AEDAT {match[1]}, which is not read: convert it to AEDAT 4 with DV")
+                raise InputError(f"is AEDAT {match[1]}, which is not read")
             address = 2 if match[1] == "1.0" else 4
         if match := re.match(r"# *AEChip: *(\S+)", text):
             chip = match[1].lower().rpartition(".")[2]
@@ -125,48 +139,177 @@ def _read_records(source: Source, head: Header) -> Iterator[tuple[NDArray[np.uin
 def find_layout(source: Source) -> tuple[Layout, Size]:
     """Return the layout of the addresses, and columns and rows of the sensor."""
     head = read_header(source)
-    known = [entry for entry in CHIPS if entry[0] in head.chip]
+    name = (source.chip or head.chip).lower()
+    known = [entry for entry in CHIPS if entry[0] in name]
     if known:
         return known[0][1], source.size or known[0][2]
-    if head.chip:
-        raise InputError(f"chip '{head.chip}' is not known: {', '.join(name for name, *_ in CHIPS)} are")
-    used = largest_x = largest_y = 0
+    if name:
+        names = [chip for chip, *_ in CHIPS]
+        raise InputError(f"chip '{name}' is not known: {nearest(name, names)}")
+    return _told_from_addresses(source, head)
+
+
+def _told_from_addresses(source: Source, head: Header) -> tuple[Layout, Size]:
+    """Return layout and size where no chip is named; a note says which were possible, and why this one."""
+    total = 0
+    fits = dict.fromkeys((DVS128, DAVIS, DVS640), 0)
+    largest = dict.fromkeys(fits, (0, 0))  # column and row
     for address, _ in _read_records(source, head):
-        events = address[address & DAVIS.special == 0]
-        used |= int(np.bitwise_or.reduce(address[address < 1 << 31], initial=0))
-        if len(events):
-            largest_x = max(largest_x, int(_extract_bits(events, DAVIS.x).max()))
-            largest_y = max(largest_y, int(_extract_bits(events, DAVIS.y).max()))
-    if (used < 1 << 16 and used & 1023) or not used:
-        return DVS128, source.size or (128, 128)
-    if used & 1023:
-        return DVS640, source.size or (640, 480)
-    return DAVIS, source.size or guess_size(source, (largest_x + 1, largest_y + 1))
+        total += len(address)
+        for form in fits:
+            good = _fitting(address, form)
+            fits[form] += int(np.count_nonzero(good))
+            events = address[good & (address & np.uint32(form.special) == 0)]
+            if len(events):
+                x, y = (int(_extract_bits(events, place).max()) for place in (form.x, form.y))
+                largest[form] = max(largest[form][0], x), max(largest[form][1], y)
+    possible = [form for form in fits if fits[form] >= (1 - MOST_MISFITS) * total]
+    form = possible[0] if possible else max(fits, key=lambda one: fits[one])
+    chips = [
+        (name, one, size)
+        for name, one, size in CHIPS
+        if one in (possible or [form]) and largest[one][0] < size[0] and largest[one][1] < size[1]
+    ]
+    # of one layout the smallest that holds all events
+    taken = min((entry for entry in chips if entry[1] is form), key=lambda entry: entry[2], default=None)
+    if taken is None:
+        return form, source.size or guess_size(source, (largest[form][0] + 1, largest[form][1] + 1))
+    if len(chips) > 1:
+        names = ", ".join(name for name, *_ in chips)
+        why = f"{taken[0]} was taken, the smallest that holds all events; chip decides"
+        source.note(f"the file names no chip, its addresses fit {names}: {why}", "assumed", "chip")
+    else:
+        source.note(f"the file names no chip, its addresses fit {taken[0]} alone", "assumed", "chip")
+    return form, source.size or taken[2]
+
+
+def _fitting(address: NDArray[np.uint32], form: Layout) -> NDArray[np.bool_]:
+    """Return which addresses could be of a layout: without bits that it never sets, (N,)."""
+    good: NDArray[np.bool_]
+    if form is DAVIS:  # what is no event of a pixel may have any bits
+        good = (address & np.uint32(form.special) != 0) | (address & np.uint32(1023) == 0)
+    elif form is DVS128:
+        good = address < 1 << 16
+    else:
+        good = (address < 1 << 21) & (_extract_bits(address, form.x) < 640)
+        good &= _extract_bits(address, form.y) < 480
+    return good
 
 
 def read_pieces(source: Source) -> Iterator[Piece]:
     """Yield the events."""
     form, (width, height) = find_layout(source)
     turns = Rollover(32)
-    samples = special = 0
+    motion = special = 0
     for address, time in _read_records(source, read_header(source)):
         t = turns(time)
         if form.special:
             other = (address & form.special) != 0
             if other.any():
-                high = int(np.count_nonzero(address[other] >> 31))
-                samples, special = samples + high, special + int(np.count_nonzero(other)) - high
+                high = address[other] >> READ_SHIFT  # the top bit and the kind of read
+                if form is DAVIS:
+                    motion += int(np.count_nonzero((high >> 21 > 0) & (high & 3 > 1)))
+                special += int(np.count_nonzero(high >> 21 == 0))
                 address, t = address[~other], t[~other]
         # what lies beyond the sensor turns over to a large number, and is left out as that
         x = np.uint16(width - 1) - _extract_bits(address, form.x)
         y = np.uint16(height - 1) - _extract_bits(address, form.y)
         yield Piece(t, x, y, (address >> form.p) & 1 == form.on)
-    if samples:
-        sentence = f"{samples} samples of frames and motion sensors: skipped"
-        source.note(sentence, "refused", "samples", samples)
+    if motion:
+        sentence = f"{motion} samples of the motion sensor: skipped"
+        source.note(sentence, "refused", "samples", motion)
     if special:
         sentence = f"{special} special events (external signals, or noise labelled by v2e): skipped"
         source.note(sentence, "refused", "special", special)
+
+
+def read_pictures(source: Source) -> Iterator[Picture]:
+    """Yield the frames [us]; none where the chip has no frames."""
+    form, size = find_layout(source)
+    if form is not DAVIS:
+        return
+    cut_off = 0
+    for samples in _frame_samples(source, size):
+        picture = _picture_of(samples, size)
+        if picture is None:
+            cut_off += 1
+        else:
+            yield picture
+    if cut_off:
+        source.note(f"{cut_off} frames are cut off: left out", "refused", "frames", cut_off)
+
+
+class _Samples(NamedTuple):
+    """Samples of the converter, each (N,).
+
+    Place in the first reads of a frame, or behind them in the second ones; value; time [us].
+    """
+
+    key: NDArray[np.int64]
+    value: NDArray[np.int64]
+    t: NDArray[np.int64]
+
+    def take(self, part: slice) -> _Samples:
+        """Return the samples of a slice."""
+        return _Samples(self.key[part], self.value[part], self.t[part])
+
+
+def _frame_samples(source: Source, size: Size) -> Iterator[_Samples]:
+    """Yield the samples of one frame after the other.
+
+    A frame ends where a read of a pixel comes that it already has, whatever the order in which chips with a
+    global or a rolling shutter read their pixels.
+    """
+    turns = Rollover(32)
+    pixels = size[0] * size[1]
+    none = np.empty(0, np.int64)
+    held = _Samples(none, none, none)
+    for address, time in _read_records(source, read_header(source)):
+        t = turns(time)
+        read = (address >> READ_SHIFT) & 3
+        x, y = (_extract_bits(address, place).astype(np.int64) for place in (DAVIS.x, DAVIS.y))
+        chosen = np.flatnonzero((address & APS > 0) & (read < 2) & (x < size[0]) & (y < size[1]))
+        key = (read[chosen] * pixels + (size[1] - 1 - y[chosen]) * size[0] + x[chosen]).astype(np.int64)
+        value = (address[chosen] & ((1 << SAMPLE_BITS) - 1)).astype(np.int64)
+        pairs = zip(held, (key, value, t[chosen]), strict=True)
+        held = _Samples(*(np.concatenate(pair) for pair in pairs))
+        begin = 0
+        for end in _frame_ends(held.key):
+            yield held.take(slice(begin, end))
+            begin = end
+        held = held.take(slice(begin, None))
+    if len(held.key):
+        yield held
+
+
+def _frame_ends(key: NDArray[np.int64]) -> Iterator[int]:
+    """Yield where frames begin but the first: at a key that the frame it would belong to already holds."""
+    order = np.argsort(key, kind="stable")
+    same = np.flatnonzero(key[order][1:] == key[order][:-1])
+    again, before = order[same + 1], order[same]  # places of a key, and of the same one the time before
+    by_place = np.argsort(again)
+    begin = 0
+    for place, last in zip(again[by_place].tolist(), before[by_place].tolist(), strict=True):
+        if last >= begin:
+            begin = place
+            yield place
+
+
+def _picture_of(samples: _Samples, size: Size) -> Picture | None:
+    """Return the frame of the samples, None where too few pixels were read twice."""
+    (key, value, t), pixels = samples, size[0] * size[1]
+    if len(key) < 2 * LEAST_READ * pixels:
+        return None  # before anything as large as the sensor is made for a handful of samples
+    reads = np.full(2 * pixels, -1, np.int64)
+    reads[key] = value
+    both = (reads[:pixels] >= 0) & (reads[pixels:] >= 0)
+    if np.count_nonzero(both) < LEAST_READ * pixels:
+        return None
+    # light takes charge away; noise makes some of the darkest negative
+    grey = np.where(both, np.clip(reads[:pixels] - reads[pixels:], 0, None), 0)
+    scaled = np.rint(grey * (65535 / ((1 << SAMPLE_BITS) - 1))).astype(np.uint16)
+    begin, end = float(np.median(t[key < pixels])), float(np.median(t[key >= pixels]))
+    return Picture(scaled.reshape(size[::-1]), (begin + end) / 2, max(end - begin, 0.0) / 1e6)
 
 
 def _extract_bits(address: NDArray[np.uint32], place: tuple[int, int]) -> NDArray[np.uint16]:
@@ -212,5 +355,7 @@ FORMAT = camera_format(
     create=create,
     matches=lambda path, head: head.startswith(b"#!AER-DAT") and not head.startswith(b"#!AER-DAT4"),
     pieces=read_pieces,
+    pictures=read_pictures,
+    asks=frozenset({"chip"}),
     size=lambda source: find_layout(source)[1],
 )

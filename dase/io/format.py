@@ -52,6 +52,8 @@ class Format:
     """Open for writing; None where the format is read only."""
     keeps: frozenset[str] = frozenset({"events"})
     """What of a sequence a file can hold."""
+    asks: frozenset[str] = frozenset()
+    """Options of `ReadOptions` beside the size that say what a file may leave open."""
     extra: str | None = None
     """Optional dependency of the package that reading needs."""
 
@@ -213,14 +215,14 @@ def _stream_events(
 ) -> Iterator[Events]:
     zero = None
     settled = rules.settle_pieces(source, pieces, size, ticks)
-    for piece in _cut_chunks(rules.order_pieces(source, settled, ticks), chunk):
+    for piece in cut_chunks(rules.order_pieces(source, settled, ticks), chunk):
         zero = rules.find_origin(source, piece.t, ticks) if zero is None else zero
         yield Events((piece.t - zero) / ticks, piece.x, piece.y, piece.p, *size, piece.label)
     if zero is None:
         yield Events.empty(*size)
 
 
-def _cut_chunks(pieces: Iterable[Piece], chunk: int) -> Iterator[Piece]:
+def cut_chunks(pieces: Iterable[Piece], chunk: int) -> Iterator[Piece]:
     """Cut and join pieces to exactly `chunk` events; the last may be shorter."""
     waiting: list[Piece] = []
     missing = chunk

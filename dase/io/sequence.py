@@ -231,6 +231,8 @@ def reading_file(path: Path, kind: str) -> Iterator[None]:
     try:
         yield
     except InputError as error:
+        if str(error).startswith(f"{path}: "):
+            raise  # from a reader within a reader
         raise type(error)(f"{path}: {_one_line(error)}") from error
     except FileNotFoundError:
         raise InputError(f"{path}: no such file") from None

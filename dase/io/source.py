@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal, NamedTuple, TypedDict
 
 import numpy as np
 from numpy.typing import NDArray
 
-from dase.errors import InputError
+from dase.errors import InputError, checked_integer
 
 Size = tuple[int, int]
 """Columns and rows."""
@@ -61,6 +62,49 @@ class Note(str):
 
 
 @dataclass(frozen=True)
+class Part:
+    """The part of a recording that is read; its clock stays that of the file.
+
+    Args:
+        begin: First time [s].
+        end: End of the time [s], which is not read.
+        region: First column, first row, columns and rows; None for the whole sensor. What is read begins at
+            column and row 0.
+
+    Raises:
+        InputError: The part has no time, or no pixel.
+    """
+
+    begin: float = -math.inf
+    end: float = math.inf
+    region: tuple[int, int, int, int] | None = None
+
+    def __post_init__(self) -> None:
+        if not self.begin < self.end:
+            raise InputError(f"the part of time must end after it begins, got {self.begin:g}..{self.end:g} s")
+        if self.region is not None:
+            if len(self.region) != 4:
+                raise InputError(f"a region is x, y, columns and rows, got {self.region}")
+            for name, value, least in zip(
+                ("x", "y", "columns", "rows"), self.region, (0, 0, 1, 1), strict=True
+            ):
+                checked_integer(f"region: {name}", value, least)
+
+
+class ReadOptions(TypedDict, total=False):
+    """What a user may say about a file that is read."""
+
+    size: Size | None
+    """Columns and rows of the sensor, where the file does not say or says it wrongly."""
+    chip: str | None
+    """Name of the chip, as davis240, where a file of AEDAT 1 or 2 does not say or says it wrongly."""
+    columns: str | None
+    """Order of the columns, as txyp or xytp, of a table whose columns have no names."""
+    part: Part | None
+    """The part of time and sensor to read; None for all."""
+
+
+@dataclass(frozen=True)
 class Source:
     """A file to read, what the user knows about it, and what the reader saw.
 
@@ -68,11 +112,17 @@ class Source:
         path: File or folder.
         size: Columns and rows where the user says so; it wins over what the file says.
         notes: What was skipped, repaired or guessed, each a `Note`; readers append to it.
+        chip: Name of the chip where the user says so, for AEDAT 1 and 2.
+        columns: Order of columns without names where the user says so, four letters of t, x, y and p.
+        part: The part to read; readers may leave out what lies outside, `dase.io` does.
     """
 
     path: Path
     size: Size | None = None
     notes: list[str] = field(default_factory=list)
+    chip: str | None = None
+    columns: str | None = None
+    part: Part | None = None
 
     def note(self, sentence: str, kind: Kind = "said", rule: str = "", number: int = 0) -> None:
         """Append a note, once."""

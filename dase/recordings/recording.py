@@ -16,7 +16,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from os import PathLike
-from typing import Any
+from typing import Any, Unpack
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -25,7 +25,7 @@ from dase import io
 from dase.errors import InputError, checked_seed
 from dase.events import Events
 from dase.io.sequence import Sequence
-from dase.io.source import Kind, Motion, Note, Size
+from dase.io.source import Kind, Motion, Note, ReadOptions
 from dase.recordings.anomalies import doubts
 from dase.recordings.statistics import Statistics, survey
 
@@ -317,16 +317,16 @@ def _check_share(share: float) -> None:
         raise InputError(f"split: share must lie between 0 and 1, got {share:g}")
 
 
-def open_recording(path: str | PathLike[str], *, size: Size | None = None) -> Recording:
+def open_recording(path: str | PathLike[str], **options: Unpack[ReadOptions]) -> Recording:
     """Open any file of a camera that dase reads, check it and report what was repaired and what looks odd.
 
     Args:
         path: File or folder; its content chooses the format.
-        size: Columns and rows of the sensor, where the file does not say or says it wrongly.
+        options: What is known about the file, and the part to read, see `dase.io.ReadOptions`.
 
     Raises:
         InputError: It is missing, of unknown format, damaged beyond use, or needs an optional library.
     """
     notes: list[str] = []
-    recording = Recording.of(io.read(path, size=size, notes=notes), notes)
-    return replace(recording, motion=io.motion(path, size=size, notes=notes))
+    recording = Recording.of(io.read(path, notes=notes, **options), notes)
+    return replace(recording, motion=io.motion(path, notes=notes, **options))

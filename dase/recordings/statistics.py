@@ -9,7 +9,7 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from os import PathLike
-from typing import Any
+from typing import Any, Unpack
 
 import cv2
 import numpy as np
@@ -19,7 +19,7 @@ from dase import io
 from dase.events import LABELS, Events
 from dase.io.rules import TooLateError
 from dase.io.sequence import Sequence
-from dase.io.source import Picture, Size
+from dase.io.source import Picture, ReadOptions
 from dase.recordings.interval_statistics import Intervals
 
 BITS = 20  # of the place of an event in a part
@@ -296,15 +296,15 @@ def _active(counts: NDArray[np.int64]) -> tuple[int, int, int, int]:
 def survey_file(
     path: str | PathLike[str],
     *,
-    size: Size | None = None,
     notes: list[str] | None = None,
     progress: Callable[[int], object] = lambda count: None,
+    **options: Unpack[ReadOptions],
 ) -> Survey:
     """Look at a file piece by piece; only one whose times go back far is held in memory.
 
     Args:
         path: Any file that `dase.io.read` takes.
-        size: Columns and rows of the sensor, where the file does not say or says it wrongly.
+        options: What is known about the file, and the part to read, see `dase.io.ReadOptions`.
         notes: Gets sentences about what was skipped, repaired or guessed.
         progress: Is told how many events were looked at since it was told last.
 
@@ -313,14 +313,14 @@ def survey_file(
     """
     out: Survey | None = None
     try:
-        for part in io.stream(path, size=size, notes=notes):
+        for part in io.stream(path, notes=notes, **options):
             out = out or Survey(part.width, part.height)
             out.events(part)
             progress(len(part))
     except TooLateError:
-        return survey(io.read(path, size=size, notes=notes))
+        return survey(io.read(path, notes=notes, **options))
     assert out is not None  # a stream has at least one part
-    for picture in io.pictures(path, size=size, notes=notes):
+    for picture in io.pictures(path, notes=notes, **options):
         out.picture(picture)
     return out
 

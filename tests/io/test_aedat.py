@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import struct
+import time
 
 import numpy as np
 import pytest
@@ -11,6 +12,7 @@ from helpers.sample_files import AEDAT4_XML, UNIX_US, H, W, aedat4, events, flat
 from dase import io
 from dase.errors import InputError
 from dase.events import Events
+from dase.io import aedat2 as aedat2_module
 from dase.io import packed
 from dase.io.flatbuffer import Table
 from dase.io.sequence import Sequence
@@ -31,7 +33,7 @@ def davis(x, y, p):
 @pytest.mark.parametrize("chip", ["DAVIS240C", "Davis346blue", ""])
 def test_davis_addresses(tmp_path, chip):
     width, height = (346, 260) if "346" in chip else (240, 180)
-    rows = [(davis(0, 0, 1), 2**32 - 2), (1 << 31 | 77, 5), (davis(5, 7, 1) | 1 << 10, 6)]
+    rows = [(davis(0, 0, 1), 2**32 - 2), (1 << 31 | 0xC00 | 77, 5), (davis(5, 7, 1) | 1 << 10, 6)]
     rows += [(davis(width - 1, height - 1, 0), 3), (davis(400, 7, 0), 4)]
     aedat2(tmp_path / "a.aedat", rows if chip else rows[:-1], chip)
     notes = []
@@ -40,7 +42,7 @@ def test_davis_addresses(tmp_path, chip):
     assert (got.t * 1e6).round().tolist() == [2**32 - 2, 2**32 + 3]
     assert (got.x.tolist(), got.y.tolist()) == ([width - 1, 0], [height - 1, 0])
     assert got.p.tolist() == [True, False]
-    assert "1 samples of frames and motion sensors: skipped" in notes
+    assert "1 samples of the motion sensor: skipped" in notes
     assert any(note.startswith("1 special events") for note in notes)
     assert any("1 events lie outside" in note for note in notes) == bool(chip)
 
@@ -242,3 +244,101 @@ def test_a_second_library_reads_the_same(tmp_path, rng):
 def test_a_second_library_reads_the_same_of_a_camera(shared):
     pytest.importorskip("lz4")
     same_as_library(shared / "recordings/native/davis346_cuke_cradle.aedat4")
+
+
+def aps(x, y, read, value):
+    """A sample of a frame: bit 31, row from below, column from the left, which read, 10 bits."""
+    return 1 << 31 | (179 - y) << 22 | x << 12 | read << 10 | value
+
+
+def frame_rows(grey, begin_us, exposure_us, *, rolling=False):
+    """The samples of a frame of a DAVIS240, reset minus signal is its grey; columns from the right."""
+    out = []
+    first = [(x, y) for x in reversed(range(240)) for y in range(180)]
+    resets = [(aps(x, y, 0, 900), begin_us + x % 7) for x, y in first]
+    signals = [(aps(x, y, 1, 900 - int(grey[y, x])), begin_us + exposure_us + x % 7) for x, y in first]
+    if not rolling:
+        return resets + signals
+    for k in range(0, len(first), 180):  # column by column, reset and then signal
+        out += resets[k : k + 180] + signals[k : k + 180]
+    return out
+
+
+@pytest.mark.parametrize("rolling", [False, True])
+def test_frames_of_aedat_2(tmp_path, rng, rolling):
+    grey = rng.integers(0, 900, (3, 180, 240))
+    rows = [(davis(5, 7, 1), 900), (davis(239, 179, 0), 950)]
+    for k, one in enumerate(grey):
+        rows += frame_rows(one, 1000 + 50_000 * k, 8000, rolling=rolling)
+        rows.insert(len(rows) - 100, (davis(1, 2, 0), 1000 + 50_000 * k))  # between the samples
+        rows.insert(len(rows) - 300, (1 << 31 | 0xC00 | 5, 1000 + 50_000 * k))  # of the motion sensor
+    rows += frame_rows(grey[0], 200_000, 8000)[:30_000]  # cut off
+    aedat2(tmp_path / "a.aedat", rows, "DAVIS240C")
+    notes = []
+    got = io.read(tmp_path / "a.aedat", notes=notes)
+    assert got.frames.dtype == np.uint16
+    np.testing.assert_array_equal(got.frames, np.rint(grey * (65535 / 1023)))
+    np.testing.assert_allclose(got.frame_times, (1003 + 4000 + 50_000 * np.arange(3)) / 1e6, atol=2e-6)
+    np.testing.assert_allclose(got.frame_exposure, 0.008, atol=2e-6)
+    assert "1 frames are cut off: left out" in notes
+    assert "3 samples of the motion sensor: skipped" in notes
+    assert len(got.events) == 5
+    assert len(list(io.pictures(tmp_path / "a.aedat"))) == 3
+
+
+def test_frames_of_aedat_2_lie_on_their_events(tmp_path):
+    """An event and a sample of the same pixel: events count columns from the right, frames from the left."""
+    grey = np.zeros((180, 240), int)
+    grey[20, 30] = 500
+    aedat2(tmp_path / "a.aedat", [(davis(239 - 30, 179 - 20, 1), 5), *frame_rows(grey, 10, 100)], "DAVIS240C")
+    got = io.read(tmp_path / "a.aedat")
+    assert (got.events.x[0], got.events.y[0]) == (30, 20)
+    assert np.argwhere(got.frames[0]).tolist() == [[20, 30]]
+
+
+def test_many_samples_of_one_pixel_are_no_frames(tmp_path):
+    begin = time.process_time()
+    aedat2(tmp_path / "a.aedat", [(aps(5, 5, 0, 1), k) for k in range(400_000)], "DAVIS240C")
+    begin = time.process_time()
+    assert list(io.pictures(tmp_path / "a.aedat")) == []
+    assert time.process_time() - begin < 5
+
+
+@pytest.mark.parametrize(
+    ("largest", "taken", "possible"),
+    [
+        ((127, 127), "davis128", "davis240, davis346, davis640, davis128, davis208"),
+        ((200, 150), "davis208", "davis240, davis346, davis640, davis208"),
+        ((239, 179), "davis240", "davis240, davis346, davis640"),
+        ((340, 250), "davis346", "davis346, davis640"),
+    ],
+)
+def test_a_davis_without_a_chip_line(tmp_path, rng, largest, taken, possible):
+    size = next(size for name, _, size in aedat2_module.CHIPS if name == taken)
+    n = 500
+    x, y, p = rng.integers(0, largest[0], n), rng.integers(0, largest[1], n), rng.integers(0, 2, n)
+    x[0], y[0] = largest
+    pixels = zip(x.tolist(), y.tolist(), p.tolist(), strict=True)
+    rows = [(davis(*pixel), 10 * k) for k, pixel in enumerate(pixels)]
+    # what used to make it a DVS640: an external signal with a number in its low bits
+    rows += [(1 << 10 | 3, 10 * n), (1 << 31 | 0xC00 | 77, 10 * n)]
+    aedat2(tmp_path / "a.aedat", rows, "")
+    notes = []
+    got = io.read(tmp_path / "a.aedat", notes=notes).events
+    assert (got.width, got.height) == size
+    np.testing.assert_array_equal(got.x, size[0] - 1 - x)
+    np.testing.assert_array_equal(got.y, size[1] - 1 - y)
+    np.testing.assert_array_equal(got.p, p > 0)
+    (note,) = (note for note in notes if getattr(note, "rule", "") == "chip")
+    assert note.startswith(f"the file names no chip, its addresses fit {possible}: {taken} was taken")
+    notes = []
+    got = io.read(tmp_path / "a.aedat", chip="davis346", notes=notes).events
+    assert (got.width, got.height) == (346, 260)
+    np.testing.assert_array_equal(got.x, 345 - x)
+    assert not any("names no chip" in note for note in notes)
+
+
+def test_an_unknown_chip_is_refused(tmp_path):
+    aedat2(tmp_path / "a.aedat", [(davis(5, 7, 1), 5)], "")
+    with pytest.raises(InputError, match="chip 'davis34' is not known: did you mean 'davis346'"):
+        io.read(tmp_path / "a.aedat", chip="davis34")
