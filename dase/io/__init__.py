@@ -24,19 +24,24 @@ from dase.errors import InputError, checked_integer, nearest
 from dase.events import Events
 from dase.io import (
     aedat2,
+    aedat3,
     aedat4,
     arrays,
     dat,
     dsec,
     ecf,
+    event_stream,
     evt2,
     evt3,
     evt21,
     frames,
     ijrr,
+    matlab,
     mvsec,
+    nmnist,
     ros,
     s2r,
+    table,
     v2e,
 )
 from dase.io import h5 as h5
@@ -62,6 +67,7 @@ FORMATS: tuple[Format, ...] = (
     mvsec.FORMAT,
     v2e.FORMAT,
     s2r.FORMAT,  # any other HDF5
+    table.FORMAT,
     arrays.TABLE,
     ijrr.ZIPPED,
     arrays.OWN,  # any other zip
@@ -70,7 +76,11 @@ FORMATS: tuple[Format, ...] = (
     evt21.FORMAT,
     dat.FORMAT,
     aedat4.FORMAT,
+    aedat3.FORMAT,
     aedat2.FORMAT,
+    event_stream.FORMAT,
+    matlab.FORMAT,
+    nmnist.FORMAT,
     ros.FORMAT,
     ijrr.TEXT,
     frames.FORMAT,

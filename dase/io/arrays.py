@@ -40,8 +40,24 @@ HEADERS = {
 }
 
 
-def _read_header(stream: IO[bytes], packed: int, unpacked: int) -> tuple[tuple[int, ...], np.dtype[Any]]:
+def read_array_header(stream: IO[bytes], packed: int, unpacked: int) -> tuple[tuple[int, ...], np.dtype[Any]]:
     """Read the header of an array; raises InputError where it holds objects or claims more than there is."""
+    shape, kind, by_column = read_any_header(stream, packed, unpacked)
+    if by_column and len(shape) > 1:
+        raise InputError(f"array of {kind} {shape} is stored column by column, which is not read")
+    return shape, kind
+
+
+def read_any_header(
+    stream: IO[bytes], packed: int, unpacked: int
+) -> tuple[tuple[int, ...], np.dtype[Any], bool]:
+    """Return shape and type of an array, and whether it is stored column by column; see `read_array_header`.
+
+    Args:
+        stream: At the begin of the array; then behind its header.
+        packed: Bytes that it takes in the file.
+        unpacked: Bytes that it may take.
+    """
     version = np.lib.format.read_magic(stream)
     if version not in HEADERS:
         raise InputError(f"array of unknown version {version}")
@@ -49,10 +65,10 @@ def _read_header(stream: IO[bytes], packed: int, unpacked: int) -> tuple[tuple[i
     if kind.hasobject:
         raise InputError("holds Python objects, which are never unpickled (allow_pickle is off)")
     size = kind.itemsize * int(np.prod([float(n) for n in shape]))
-    if size > unpacked or min(shape, default=0) < 0 or (by_column and len(shape) > 1):
+    if size > unpacked or min(shape, default=0) < 0:
         raise InputError(f"array of {kind} {shape} does not fit its {unpacked} bytes")
     refuse_bomb(packed, size)
-    return shape, kind
+    return shape, kind, by_column
 
 
 def _read_slices(stream: IO[bytes], count: int, kind: np.dtype[Any], part: int = 0) -> Iterator[NDArray[Any]]:
@@ -71,7 +87,7 @@ def _check_members(archive: zipfile.ZipFile) -> None:
         if f"{name}.npy" in archive.NameToInfo:
             info = archive.getinfo(f"{name}.npy")
             with archive.open(info) as stream:
-                _read_header(stream, info.compress_size, info.file_size)
+                read_array_header(stream, info.compress_size, info.file_size)
 
 
 def _own_pieces(source: Source) -> Iterator[Piece]:
@@ -84,7 +100,7 @@ def _own_pieces(source: Source) -> Iterator[Piece]:
         for name in (*npz.EVENT_KEYS, "label") if labelled else npz.EVENT_KEYS:
             info = archive.getinfo(f"{name}.npy")
             stream = stack.enter_context(archive.open(info))
-            shape, kind = _read_header(stream, info.compress_size, info.file_size)
+            shape, kind = read_array_header(stream, info.compress_size, info.file_size)
             if len(shape) != 1 or (lengths and shape[0] != lengths[0]):
                 raise InputError(f"'{name}' must be one number per event, got shape {shape}")
             lengths.append(shape[0])
@@ -98,7 +114,7 @@ def _read_maps(archive: zipfile.ZipFile, name: str, stack: ExitStack) -> Iterato
     """Yield the frames, (H, W), or the flow, (2, H, W), of an archive one by one."""
     info = archive.getinfo(f"{name}.npy")
     stream = stack.enter_context(archive.open(info))
-    shape, kind = _read_header(stream, info.compress_size, info.file_size)
+    shape, kind = read_array_header(stream, info.compress_size, info.file_size)
     if name == "frames" and (len(shape) != 3 or kind not in GREYS):
         raise InputError(f"'frames' must be uint8 or uint16 (F, H, W), got {kind} {shape}")
     if name == "flow" and len(shape) != 4:
@@ -148,7 +164,7 @@ def _own_size(source: Source) -> tuple[int, int] | None:
             if f"{name}.npy" in archive.NameToInfo:
                 info = archive.getinfo(f"{name}.npy")
                 with archive.open(info) as stream:
-                    shape, _ = _read_header(stream, info.compress_size, info.file_size)
+                    shape, _ = read_array_header(stream, info.compress_size, info.file_size)
                 if len(shape) >= 2:
                     return shape[-1], shape[-2]
         if not known:
@@ -177,7 +193,7 @@ def _find_table(archive: zipfile.ZipFile) -> tuple[str, int, np.dtype[Any]] | No
     for info in archive.infolist():
         if info.filename.endswith(".npy"):
             with archive.open(info) as stream:
-                shape, kind = _read_header(stream, info.compress_size, info.file_size)
+                shape, kind = read_array_header(stream, info.compress_size, info.file_size)
             if len(shape) == 1 and _event_fields(kind):
                 return info.filename, shape[0], kind
     return None
@@ -188,7 +204,7 @@ def _table_pieces(source: Source) -> Iterator[Piece]:
         if source.path.suffix.lower() == ".npy" or not zipfile.is_zipfile(source.path):
             stream: IO[bytes] = stack.enter_context(source.path.open("rb"))
             length = source.path.stat().st_size
-            shape, kind = _read_header(stream, length, length)
+            shape, kind = read_array_header(stream, length, length)
             if len(shape) != 1 or not _event_fields(kind):
                 raise InputError(f"must be a structured array with fields t, x, y, p, got {kind} {shape}")
             count = shape[0]
@@ -199,7 +215,7 @@ def _table_pieces(source: Source) -> Iterator[Piece]:
                 raise InputError("has no structured array with fields t, x, y, p")
             stream = stack.enter_context(archive.open(found[0]))
             count, kind = found[1:]
-            _read_header(stream, count * kind.itemsize, archive.getinfo(found[0]).file_size)
+            read_array_header(stream, count * kind.itemsize, archive.getinfo(found[0]).file_size)
         names = _event_fields(kind) or []
         for rows in _read_slices(stream, count, kind):
             t, x, y, p = (rows[name] for name in names)

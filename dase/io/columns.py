@@ -21,6 +21,7 @@ from dase.io.source import Piece, Size, Source, missing_extra, refuse_bomb
 HDF5 = b"\x89HDF\r\n\x1a\n"
 HEAP = b"GCOL\x01\0\0\0"
 NAMES = b"HEAP\0\0\0\0"
+USER_BLOCK = 512  # [bytes] that MATLAB puts before the mark of HDF5
 PART = 1 << 20  # events read at once
 BLOCK = 1 << 24  # [bytes] searched at once
 MOST_TEXT = 1 << 26  # [bytes] of an attribute
@@ -152,6 +153,10 @@ def check_head(path: Path) -> None:
     much memory for the driver as it finds there; only files in several parts have one, others all ones.
     """
     with path.open("rb") as file:
+        if file.read(len(HDF5)) != HDF5:
+            file.seek(USER_BLOCK)  # of MATLAB
+        else:
+            file.seek(0)
         head = file.read(64)
     if len(head) < 64:
         raise InputError(f"cannot be read as HDF5, damaged or cut short: it ends after {len(head)} bytes")
@@ -182,8 +187,13 @@ def check_heaps(path: Path) -> None:
         return
     now = time.time_ns()
     with path.open("rb") as file:
+        base = 0 if file.read(len(HDF5)) == HDF5 else USER_BLOCK
+        file.seek(0)
         for kind, begin in _find_heaps(file):
-            (_check_heap if kind == HEAP else _check_names)(file, begin, found.st_size)
+            if kind == HEAP:
+                _check_heap(file, begin, found.st_size)
+            else:
+                _check_names(file, begin, found.st_size, base)
     # a small one may change once more before the clock of its times goes on
     if found.st_size > BLOCK or max(state[2:]) < now - SETTLED:
         if len(_sound) >= MOST_SOUND:
@@ -218,9 +228,10 @@ def _check_heap(file: BinaryIO, begin: int, length: int) -> None:
         place += step
 
 
-def _check_names(file: BinaryIO, begin: int, length: int) -> None:
+def _check_names(file: BinaryIO, begin: int, length: int, base: int) -> None:
     file.seek(begin + 8)
     size, hole, data = (int.from_bytes(file.read(8), "little") for _ in range(3))
+    data += base  # addresses count from the mark of HDF5
     seen = set()
     # what looks like a heap but lies elsewhere, among numbers, has no data in the file
     while hole + 16 <= size and data + size <= length:

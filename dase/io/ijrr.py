@@ -105,7 +105,7 @@ def _events_member(archive: zipfile.ZipFile) -> str:
 def read_pieces(source: Source) -> Iterator[Piece]:
     """Yield the events [s]."""
     with _Place(source.path) as place:
-        yield from text.decode_text(lambda: place.open(place.events))
+        yield from text.decode_text(lambda: place.open(place.events), source)
 
 
 def read_size(source: Source) -> Size | None:
@@ -235,6 +235,7 @@ TEXT = camera_format(
     size=read_size,
     pictures=read_pictures,
     ticks=1.0,
+    asks=frozenset({"columns"}),
 )
 ZIPPED = camera_format(
     name="zip of text",
@@ -245,4 +246,5 @@ ZIPPED = camera_format(
     size=read_size,
     pictures=read_pictures,
     ticks=1.0,
+    asks=frozenset({"columns"}),
 )

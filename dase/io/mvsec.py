@@ -46,7 +46,7 @@ def _read_parts(file: Any, source: Source) -> Iterator[Piece]:
         raise InputError(f"'{events.name}' must have shape (N, 4), got {events.shape}")
     for i in range(0, len(events), PART):
         part = events[i : i + PART]
-        x, y = (checked_coordinates(part[:, k].astype(np.int64), f"{events.name}[:, {k}]") for k in (0, 1))
+        x, y = (checked_coordinates(part[:, k], f"{events.name}[:, {k}]") for k in (0, 1))
         yield Piece(part[:, 2].astype(np.float64), x, y, part[:, 3])
 
 

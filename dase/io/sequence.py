@@ -247,8 +247,15 @@ def _one_line(error: Exception) -> str:
 
 
 def checked_coordinates(values: NDArray[Any], name: str) -> NDArray[np.uint16]:
-    """Return pixel coordinates, shape (N,), as uint16; raises InputError where they do not fit."""
-    if values.dtype.kind not in "iu":
+    """Return pixel coordinates, shape (N,), as uint16; raises InputError where they do not fit.
+
+    Real numbers are taken where they are whole ones: a fraction is never cut.
+    """
+    if values.dtype.kind == "f":
+        wrong = np.flatnonzero(~(values == np.floor(values)) | ~np.isfinite(values))
+        if len(wrong):
+            raise InputError(f"{name} must be whole numbers, got {values[wrong[0]]:g}")
+    elif values.dtype.kind not in "iu":
         raise InputError(f"{name} must be integers, got {values.dtype}")
     if values.size and (int(values.min()) < 0 or int(values.max()) > 65535):
         raise InputError(f"{name} must lie in 0..65535, got {values.min()}..{values.max()}")

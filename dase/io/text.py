@@ -4,7 +4,9 @@
     346 260                                   rpg_e2vid: a first line of two numbers tells the size
     0.003811000 96 133 0                      t x y p: seconds, or microseconds where no time has a point
     96,133,0,3811                             x,y,p,t: as metavision_file_to_csv writes it, microseconds
+    timestamp,x,y,polarity                    names of the columns, in any order
 
+Other orders of the columns are told by the user or from the values, and said, see `dase.io.column_order`.
 Polarity is 0 or 1, or -1 or 1. Times are read exactly as Python's `float` would. Sources: the IJRR data
 (Mueggler et al., The event-camera dataset and simulator, 2017), rpg_e2vid, v2e.
 """
@@ -19,7 +21,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dase.errors import InputError
-from dase.io.source import Piece, Size
+from dase.io.column_order import checked_order, named_order, note_order, recognised_order
+from dase.io.source import Piece, Size, Source
 
 BLOCK = 1 << 20  # [bytes] decoded at once
 LONGEST = 200  # [bytes] of a line
@@ -40,7 +43,8 @@ class Layout:
         InputError: The first lines do not hold events.
     """
 
-    def __init__(self, head: bytes) -> None:
+    def __init__(self, head: bytes, source: Source | None = None) -> None:
+        named: str | None = None
         self.size: Size | None = None
         self.begin = 0
         lines = head.split(b"\n")
@@ -54,17 +58,33 @@ class Layout:
                 rows.append(list(match.groups()))
             elif rows and line.strip():
                 break  # left to the decoder, which knows the number of the line
-            elif not rows and not line.startswith(b"#") and line.strip() and not _names_columns(line):
+            elif not rows and _names_columns(line):
+                named = named_order(re.split(r"[ ,\t]+", line.decode("latin-1").strip())) or named
+            elif not rows and not line.startswith(b"#") and line.strip():
                 raise InputError(f"holds no events: '{line[:40].decode('latin-1')}' is not 't x y p'")
             if not rows:
                 self.begin += len(line) + 1
         if not rows and self.size is None:
             raise InputError("holds no events")
-        columns = [{row[k] for row in rows} for k in range(4)]
-        signs = {b"0", b"1", b"-1"}
-        self.time_first = columns[3] <= signs or not columns[2] <= signs
-        times = columns[0 if self.time_first else 3]
+        self.order = _order_of(rows, named, source)
+        times = {row[self.order.index("t")] for row in rows}
         self.micro = bool(times) and not any(set(time) & set(b".eE") for time in times)
+
+
+def _order_of(rows: list[list[bytes]], named: str | None, source: Source | None) -> str:
+    """Return the order of the columns: as the user says, as a line names them, or as the values tell."""
+    if source is not None and source.columns is not None:
+        return checked_order(source.columns)
+    if named is not None:
+        return named
+    found = recognised_order(np.array(rows, "S40").astype(np.float64)) if rows else "txyp"
+    if found is None:  # a line among these is no event: the decoder names it, if it is told how to read
+        signs = {b"0", b"1", b"-1"}
+        last, third = ({row[k] for row in rows} <= signs for k in (3, 2))
+        return "txyp" if last or not third else "xypt"
+    if found not in ("txyp", "xypt") and source is not None:
+        note_order(source, found)
+    return found
 
 
 def _names_columns(line: bytes) -> bool:
@@ -83,11 +103,16 @@ def matches_head(head: bytes) -> bool:
     return False
 
 
-def decode_text(open_file: Callable[[], BinaryIO]) -> Iterator[Piece]:
-    """Yield events [s] of a text; raises InputError with the number of a line that is none."""
+def decode_text(open_file: Callable[[], BinaryIO], source: Source | None = None) -> Iterator[Piece]:
+    """Yield events [s] of a text; raises InputError with the number of a line that is none.
+
+    Args:
+        open_file: Opens the text.
+        source: What the user says about it; gets a note of what was told from the values.
+    """
     with open_file() as file:
         head = file.read(HEAD)
-        layout = Layout(head)
+        layout = Layout(head, source)
         line = head[: layout.begin].count(b"\n") + 1
         rest = head[layout.begin :]
         while block := file.read(BLOCK):
@@ -111,7 +136,7 @@ def _decode_lines(text: bytes, layout: Layout, line: int) -> Piece:
         edges = np.concatenate(([0], edges))
     begin, end = edges[::2], edges[1::2]  # the text ends with a newline
     begin, end = _split_rows(c, begin, end, text, line)
-    k = (0, 1, 2, 3) if layout.time_first else (3, 0, 1, 2)
+    k = [layout.order.index(letter) for letter in "txyp"]
     time = _parse_times(c, text, begin[:, k[0]], end[:, k[0]], layout.micro)
     x, y = (_parse_integers(c, begin[:, i], end[:, i], 6) for i in k[1:3])
     p = _parse_integers(c, begin[:, k[3]], end[:, k[3]], 2, signed=True)

@@ -214,6 +214,94 @@ def table(path, e):
     np.save(path, rows) if path.suffix == ".npy" else np.savez_compressed(path, events=rows)
 
 
+def plain(path, e, *, order="xytp"):
+    """A table of numbers whose columns have no names."""
+    columns = {"t": microseconds(e), "x": e.x, "y": e.y, "p": e.p}
+    np.save(path, np.stack([columns[letter] for letter in order], axis=1).astype(np.int64))
+
+
+def event_stream(path, e, *, kind=1, exposures=()):
+    """DVS or ATIS events byte by byte; `exposures` are indices of ATIS events that are not of change."""
+    out = b"Event Stream" + bytes((2, 0, 0, kind)) + struct.pack("<HH", e.width, e.height)
+    now, most = 0, 127 if kind == 1 else 63
+    for k, t in enumerate(microseconds(e).tolist()):
+        step, now = t - now, t
+        if kind == 1:
+            out += b"\xff" * (step // most)
+            step %= most
+            first = step << 1 | int(e.p[k])
+        else:
+            while step >= most:
+                times = min(step // most, 3)
+                out += bytes([0xFC | times])
+                step -= most * times
+            first = step << 2 | int(e.p[k]) << 1 | (k in exposures)
+        out += bytes([first]) + struct.pack("<HH", e.x[k], e.y[k])
+    path.write_bytes(out)
+
+
+def nmnist(path, e):
+    """Five bytes per event; the time starts over where it reaches 2^13 us, marked by a row of 240."""
+    out, turns = b"", 0
+    for t, x, y, p in zip(microseconds(e).tolist(), e.x.tolist(), e.y.tolist(), e.p.tolist(), strict=True):
+        while t - turns * 8192 >= 8192:
+            turns += 1
+            out += bytes([0, 240, 0, 0, 0])
+        word = int(p) << 23 | t - turns * 8192
+        out += bytes([x, y]) + word.to_bytes(3, "big")
+    path.write_bytes(out)
+
+
+def matlab(path, e, *, compress=True, structure=True, shift=0):
+    """What `savemat` writes: a structure with the fields ts, x, y and p, columns counted from `shift`."""
+    from scipy.io import savemat
+
+    columns = {"x": e.x.astype(np.float64) + shift, "y": e.y.astype(np.float64) + shift}
+    columns |= {"ts": microseconds(e).astype(np.float64), "p": e.p.astype(np.float64) + shift}
+    savemat(path, {"about": "a text", "TD": columns} if structure else columns, do_compression=compress)
+
+
+def matlab73(path, e):
+    """A MATLAB file of version 7.3: HDF5 behind 512 bytes, a group with rows of float64."""
+    with h5py.File(path, "w", userblock_size=512) as file:
+        for name, column in {"x": e.x, "y": e.y, "ts": microseconds(e), "pol": e.p}.items():
+            file[f"TD/{name}"] = column.astype(np.float64)[None]
+    data = bytearray(path.read_bytes())
+    head = b"MATLAB 7.3 MAT-file, Platform: GLNXA64".ljust(124) + struct.pack("<H2s", 0x0200, b"IM")
+    data[: len(head)] = head
+    path.write_bytes(data)
+
+
+AEDAT3_HEAD = b"#!AER-DAT3.1\r\n#Format: RAW\r\n#Source 1: {}\r\n#Start-Time: 2017\r\n#!END-HEADER\r\n"
+
+
+def aedat3(path, e, *, frames=(), motion=(), packet=500, chip=b"DAVIS240C", overflows=0):
+    """Polarity packets, frames as (begin_us, end_us, grey), samples (t_us, acceleration, rotation)."""
+    out = [AEDAT3_HEAD.replace(b"{}", chip)]
+
+    def put(kind, place, events):
+        size = len(events[0])
+        out.append(
+            struct.pack("<hh6i", kind, 1, size, place, overflows, len(events), len(events), len(events))
+        )
+        out.extend(events)
+
+    t = microseconds(e)
+    for i in range(0, len(e), packet):
+        k = slice(i, i + packet)
+        word = (
+            1 | e.p[k].astype(np.uint32) << 1 | e.y[k].astype(np.uint32) << 2 | e.x[k].astype(np.uint32) << 17
+        )
+        put(1, 4, [struct.pack("<Ii", *row) for row in zip(word.tolist(), t[k].tolist(), strict=True)])
+    for begin, end, grey in frames:
+        height, width = grey.shape
+        numbers = (1 | 1 << 1, begin - 9, end + 9, begin, end, width, height, 0, 0)
+        put(2, 8, [struct.pack("<I8i", *numbers) + grey.astype("<u2").tobytes()])
+    for time, acceleration, rotation in motion:
+        put(3, 4, [struct.pack("<Ii7f", 1, time, *acceleration, *rotation, 20.0)])
+    path.write_bytes(b"".join(out))
+
+
 DVS = {
     "dvs_msgs/msg/Event": "uint16 x\nuint16 y\ntime ts\nbool polarity\n",
     "dvs_msgs/msg/EventArray": "std_msgs/Header header\nuint32 height\nuint32 width\n"
@@ -324,6 +412,13 @@ SAMPLES: dict[str, tuple[str, Callable[[Path, Events], None]]] = {
     "ROS 1": (".bag", bag),
     "ROS 2": (".folder", lambda path, e: bag(path, e, ros=2)),
     "MCAP": (".mcap", mcap),
+    "NumPy table": (".npy", plain),
+    "Event Stream": (".es", event_stream),
+    "Event Stream ATIS": (".es", lambda path, e: event_stream(path, e, kind=2)),
+    "N-MNIST": (".bin", nmnist),
+    "MATLAB": (".mat", matlab),
+    "MATLAB 7.3": (".mat", matlab73),
+    "AEDAT3": (".aedat", aedat3),
 }
 """Name to suffix and a function that writes events to a path."""
 

@@ -39,6 +39,11 @@ NAMES = {
     "sequence_00000.h5": "HDF5",
     "clip.avi": "frames",
     "recording.h5": "HDF5",
+    "gesture.aedat": "AEDAT3",
+    "events.npy": "NumPy table",
+    "events.mat": "MATLAB",
+    "recording.es": "Event Stream",
+    "00001.bin": "N-MNIST",
 }
 """File of the page to the format it must be found to have."""
 
