@@ -6,6 +6,7 @@ import errno
 import importlib
 import os
 import sys
+from typing import Any
 
 import click
 
@@ -29,8 +30,38 @@ COMMANDS = (
 )
 
 
+class PrintableStream:
+    """A text stream that shows characters which would steer a terminal, instead of sending them.
+
+    Args:
+        stream: Where the text goes.
+    """
+
+    def __init__(self, stream: Any) -> None:
+        self._stream = stream
+
+    def write(self, text: str) -> int:
+        """Write a text; return how many of its characters were taken, all."""
+        from dase.errors import printable
+
+        self._stream.write(printable(text))
+        return len(text)
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._stream, name)
+
+
 class LazyGroup(click.Group):
     """A group that imports a command's file when the command is named, so that `--help` answers at once."""
+
+    def invoke(self, ctx: click.Context) -> Any:
+        """Run a command; what it prints cannot steer the terminal, whatever names and texts of files hold."""
+        shown = sys.stdout
+        sys.stdout = PrintableStream(shown)
+        try:
+            return super().invoke(ctx)
+        finally:
+            sys.stdout = shown
 
     def list_commands(self, ctx: click.Context) -> list[str]:
         """Return the names of all commands."""
@@ -72,7 +103,8 @@ def main() -> None:
     except KeyboardInterrupt:
         _leave("interrupted", 130)
     except click.ClickException as error:
-        error.show()
+        shown: Any = PrintableStream(sys.stderr)  # words of the command line may be names of files
+        error.show(file=shown)
         sys.exit(error.exit_code)
     except InputError as error:
         _leave(str(error), 2)
@@ -89,5 +121,7 @@ def main() -> None:
 
 
 def _leave(message: str, code: int) -> None:
-    click.echo(f"dase: {message}", err=True)
+    from dase.errors import printable
+
+    click.echo(f"dase: {printable(message)}", err=True)
     sys.exit(code)

@@ -62,7 +62,7 @@ def reading_options(command: Callable[..., Any]) -> Callable[..., Any]:
         click.option("--size", callback=parse_size, metavar="WxH", help="Columns x rows, else the file's."),
         click.option("--from", "begin", type=float, metavar="SECONDS", help="Read from this time on."),
         click.option("--to", "end", type=float, metavar="SECONDS", help="Read up to this time."),
-        click.option("--region", callback=_parse_region, metavar="X,Y,W,H", help="Read W x H pixels from X,Y."),
+        click.option("--region", callback=_parse_region, metavar="X,Y,W,H", help="Read these pixels."),
         click.option("--chip", metavar="NAME", help="Chip of an AEDAT 1 or 2 that names none, as davis240."),
         click.option("--columns", metavar="ORDER", help="Order of columns without names, as txyp."),
     )  # fmt: skip

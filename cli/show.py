@@ -43,7 +43,7 @@ def command(
     The folder of a training run is drawn as the thresholds it has learned, over some of its scenes.
     """
     from dase import io
-    from dase.errors import InputError
+    from dase.errors import InputError, printable
     from dase.figures import event_images
     from dase.recordings import summary
 
@@ -60,11 +60,11 @@ def command(
         raise InputError("trust: is a picture of several moments, which takes neither --at nor .mp4")
     sequence = io.read(file, **reading)
     if trust:
-        _draw_trust(sequence, output, file.stem, window)
+        _draw_trust(sequence, output, printable(file.stem), window)
     elif suffix == ".mp4":
         event_images.video(sequence, output, window=window)
     else:
-        figure = event_images.draw(sequence, title=file.stem, at=at, window=window)
+        figure = event_images.draw(sequence, title=printable(file.stem), at=at, window=window)
         with io.replacing(output) as temporary:
             figure.savefig(temporary)
     for name, value in summary.table(event_images.statistics(sequence)):

@@ -10,6 +10,7 @@ import difflib
 import operator
 from collections.abc import Iterable
 from typing import Any
+from unicodedata import category
 
 SEEDS = 1 << 31
 """Seeds of simulations lie below: a key of random numbers has 31 bits."""
@@ -18,8 +19,25 @@ SEEDS = 1 << 31
 class InputError(ValueError):
     """A file, option or value that dase cannot work with.
 
-    The message names the thing, the rule and the value. The command line prints it and exits with 2.
+    The message names the thing, the rule and the value. The command line prints it and exits with 2. What it
+    takes from files and their names cannot steer a terminal, see `printable`.
     """
+
+    def __str__(self) -> str:
+        return printable(super().__str__())
+
+
+def printable(text: str) -> str:
+    """Return a text whose every character is shown: others, as those that steer a terminal, become `\\x1b`.
+
+    Ends of lines and tabs stay. What turns the direction of writing, or cannot be encoded, is shown, too.
+    """
+    if text.isascii() and text.isprintable():
+        return text
+    hidden = {c for c in set(text) if c not in "\n\t" and category(c) in ("Cc", "Cf", "Cs", "Zl", "Zp")}
+    for c in hidden:
+        text = text.replace(c, c.encode("unicode_escape", "surrogatepass").decode("ascii"))
+    return text
 
 
 def nearest(name: str, known: Iterable[str]) -> str:

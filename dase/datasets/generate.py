@@ -29,6 +29,7 @@ from dase.simulation.sensor import Sensor
 from dase.simulation.sensor_file import dump_sensor, parse_sensor
 from dase.simulation.simulate import CHUNK, chunks, sample_times
 from dase.simulation.user_effects import known_effects
+from dase.text_files import read_text_file
 from dase.version import __version__
 
 RECORD = "synth.toml"
@@ -172,7 +173,7 @@ def _prepare(job: Job, out: Path, resume: bool) -> list[int]:
     if record.exists():
         if not resume:
             raise InputError(f"{out} already holds a data set; give --resume to finish it, or another folder")
-        if record.read_text("utf-8") != job.text():
+        if read_text_file(record, "the record", 1 << 24) != job.text():
             raise InputError(
                 f"{out} was begun with other options (see {record}); --resume needs the same ones"
             )

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from dase import io
 from dase.errors import InputError
 from dase.events import Events
+from dase.io.arrays import check_archive
 from dase.io.sequence import Sequence
 from dase.probes.stimulus import COARSEST, Trust
 from dase.results import Comparison, Diagnosis, Fit
@@ -182,14 +183,15 @@ def open_clip(path: Path) -> VideoScene:
     if path.suffix.lower() != ".npz":
         return open_video(path)
     try:
+        check_archive(path, ("frames", "frame_us"))
         with np.load(path, allow_pickle=False) as data:
             missing = [name for name in ("frames", "frame_us") if name not in data]
             if missing:
                 raise InputError(f"scene {path} has no '{missing[0]}', got {', '.join(data) or 'nothing'}")
             frames, times = data["frames"], data["frame_us"] * 1e-6
-    except (OSError, ValueError) as error:
-        if isinstance(error, InputError):
-            raise
+    except InputError as error:
+        raise InputError(f"scene {path}: {error}" if str(path) not in str(error) else str(error)) from error
+    except Exception as error:  # numpy, zipfile and zlib have no common error for damaged files
         raise InputError(f"scene {path} cannot be read as an archive of frames: {error}") from error
     return VideoScene(linear(frames, path), times)
 

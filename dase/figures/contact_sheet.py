@@ -109,7 +109,7 @@ def _header(figure: Figure, s: Statistics, title: str, window: float, note: str)
     facts += [f"{rows['ON share']} ON"] if s.events else []
     facts += [note] if note else []
     left, right, first, second = 0.4 / 11, 1 - 0.4 / 11, 1 - 0.3 / tall, 1 - 0.57 / tall
-    figure.text(left, first, title, fontsize=13, color=INK, weight="bold", va="center")
+    figure.text(left, first, title, fontsize=13, color=INK, weight="bold", va="center", parse_math=False)
     figure.text(left, second, "   ".join(facts), fontsize=9, color=INK, va="center")
     said = f"events of {format_seconds(window)} around each time"
     figure.text(right, first, said, fontsize=9, color=INK, va="center", ha="right")

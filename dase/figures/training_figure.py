@@ -58,7 +58,16 @@ def draw(folder: Path) -> tuple[Figure, list[tuple[str, str]]]:
                 axes.set_title(title, fontsize=9, color=INK, loc="left", pad=4)
     _curves(plots, rows)
     tall = figure.get_figheight()
-    figure.text(0.35 / 11, 1 - 0.3 / tall, folder.name, fontsize=13, color=INK, weight="bold", va="center")
+    figure.text(
+        0.35 / 11,
+        1 - 0.3 / tall,
+        folder.name,
+        fontsize=13,
+        color=INK,
+        weight="bold",
+        va="center",
+        parse_math=False,
+    )
     lines = _lines(rows[-1], found, same=same)
     said = "   ".join(f"{name} {value}" for name, value in lines[:4])
     figure.text(0.35 / 11, 1 - 0.57 / tall, said, fontsize=9, color=INK, va="center")

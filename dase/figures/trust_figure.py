@@ -131,7 +131,9 @@ def _layout(count: int, aspect: float) -> tuple[Figure, list[Axes]]:
 def _header(figure: Figure, title: str, window: float, share: float) -> None:
     tall = figure.get_figheight()
     left, right = 0.4 / 11, 1 - 0.4 / 11
-    figure.text(left, 1 - 0.3 / tall, title, fontsize=13, color=INK, weight="bold", va="center")
+    figure.text(
+        left, 1 - 0.3 / tall, title, fontsize=13, color=INK, weight="bold", va="center", parse_math=False
+    )
     facts = (
         f"{100 * share:.0f} % of pixels and times trusted: expected error up to {TOLERANCE:g} log intensity "
         f"or {100 * RELATIVE:.0f} % of the change"

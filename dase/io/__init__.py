@@ -60,6 +60,7 @@ from dase.io.source import Note as Note
 from dase.io.source import Part as Part
 from dase.io.source import Picture as Picture
 from dase.io.source import ReadOptions as ReadOptions
+from dase.text_files import stands_for
 
 FORMATS: tuple[Format, ...] = (
     ecf.FORMAT,
@@ -103,6 +104,9 @@ def find_format(path: str | PathLike[str]) -> Format:
         if not path.is_dir():
             with path.open("rb") as file:
                 head = file.read(HEAD)
+        pointer = stands_for(head)
+        if pointer:
+            raise InputError(f"{path}: {pointer}")
         found = next((format for format in FORMATS if format.matches(path, head)), None)
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror})") from error

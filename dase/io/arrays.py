@@ -81,9 +81,17 @@ def _read_slices(stream: IO[bytes], count: int, kind: np.dtype[Any], part: int =
         yield np.frombuffer(data, kind)
 
 
-def _check_members(archive: zipfile.ZipFile) -> None:
+def check_archive(path: Path, names: tuple[str, ...]) -> None:
+    """Raise InputError where a file is no zip, or arrays of these names in it would unpack to too much."""
+    if not zipfile.is_zipfile(path):
+        raise InputError("is no zip, as archives of NumPy are")
+    with zipfile.ZipFile(path) as archive:
+        _check_members(archive, names)
+
+
+def _check_members(archive: zipfile.ZipFile, names: tuple[str, ...] = npz.KEYS) -> None:
     """Raise InputError where members would unpack to something absurd."""
-    for name in npz.KEYS:
+    for name in names:
         if f"{name}.npy" in archive.NameToInfo:
             info = archive.getinfo(f"{name}.npy")
             with archive.open(info) as stream:
@@ -189,9 +197,11 @@ def _event_fields(kind: np.dtype[Any]) -> list[str] | None:
 
 
 def _find_table(archive: zipfile.ZipFile) -> tuple[str, int, np.dtype[Any]] | None:
-    """Return name, length and type of the first structured array of events."""
+    """Return name, length and type of the first structured array of events, of the first hundred arrays."""
+    looked = 0
     for info in archive.infolist():
-        if info.filename.endswith(".npy"):
+        if info.filename.endswith(".npy") and looked < 100:
+            looked += 1
             with archive.open(info) as stream:
                 shape, kind = read_array_header(stream, info.compress_size, info.file_size)
             if len(shape) == 1 and _event_fields(kind):

@@ -22,6 +22,7 @@ from dase.io.format import LIMIT, Format
 from dase.io.image_files import SUFFIXES, decode_bytes, head_size
 from dase.io.sequence import GREYS, Sequence, reading_file
 from dase.io.source import Picture, Source, checked_size, refuse_bomb
+from dase.text_files import stands_for
 
 if TYPE_CHECKING:
     from dase.io.video_file import FrameReader
@@ -36,6 +37,9 @@ def decode_grey(data: bytes, name: str) -> NDArray[Any]:
     """Decode a picture to grey of 8 or 16 bits, (H, W); raises InputError where it is damaged or huge."""
     import cv2
 
+    pointer = stands_for(data[:1024])
+    if pointer:
+        raise InputError(f"{name} {pointer}")
     try:
         size = head_size(data)
         if size is not None:

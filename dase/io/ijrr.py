@@ -94,8 +94,9 @@ def _events_member(archive: zipfile.ZipFile) -> str:
     texts = [
         name for name in archive.namelist() if name.lower().endswith(SUFFIXES) and "__MACOSX" not in name
     ]
-    named = [name for name in texts if PurePosixPath(name).name == EVENTS]
-    others = [name for name in texts if PurePosixPath(name).name.lower() not in OTHERS]
+    # by hand: an archive may have 60 000 members, and a path of each would take a second
+    named = [name for name in texts if name.rpartition("/")[2] == EVENTS]
+    others = [name for name in texts if name.rpartition("/")[2].lower() not in OTHERS]
     found = named or others
     if len(found) != 1:
         raise InputError(f"a zip of events must hold one text of them, got {len(found)}")

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dase.errors import InputError
+from dase.text_files import stands_for
 
 SUFFIXES = ("jpg", "jpeg", "png", "bmp", "tif", "tiff", "webp", "ppm", "pgm")
 """Picture files, whatever their case."""
@@ -74,6 +75,9 @@ def decode_file(path: Path) -> NDArray[Any]:
         data = path.read_bytes()
     except OSError as error:
         raise InputError(f"images: cannot read '{path}': {error.strerror}") from error
+    pointer = stands_for(data[:1024])
+    if pointer:
+        raise InputError(f"images: '{path}' {pointer}")
     try:
         pixels = None if head_size(data) is None else decode_bytes(data, cv2.IMREAD_UNCHANGED)
     except InputError as error:

@@ -10,7 +10,7 @@ from typing import Any, Literal, NamedTuple, TypedDict
 import numpy as np
 from numpy.typing import NDArray
 
-from dase.errors import InputError, checked_integer
+from dase.errors import InputError, checked_integer, printable
 
 Size = tuple[int, int]
 """Columns and rows."""
@@ -52,7 +52,7 @@ class Note(str):
 
     def __new__(cls, text: str, kind: Kind = "said", rule: str = "", number: int = 0) -> Note:
         """Return the sentence with its fields."""
-        note = super().__new__(cls, text)
+        note = super().__new__(cls, printable(text))
         note.kind, note.rule, note.number = kind, rule, number
         return note
 

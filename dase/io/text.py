@@ -30,7 +30,8 @@ HEAD = 1 << 14  # [bytes] looked at to tell the columns
 DIGITS = 17  # of a time, point included, that fit the fast path
 POWERS = 10.0 ** np.arange(DIGITS + 1)
 
-NUMBER = rb"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?"
+# every text has one way to match: two, as of digits before and after a missing point, take quadratic time
+NUMBER = rb"[-+]?(?:\d+(?:\.\d*)?|\.\d+)(?:[eE][-+]?\d+)?"
 LINE = re.compile(rb"[ \t]*" + rb"[ \t,]+".join([b"(" + NUMBER + b")"] * 4) + rb"(?:[ \t,]+\d+)?[ \t,]*\r?")
 WORD = re.compile(NUMBER)
 SIZE = re.compile(rb"(?:# *)?(\d{1,6})[ \t,]+(\d{1,6})(?: columns and rows.*)?\r?")

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from dase.errors import InputError
 from dase.io.ffmpeg import bounded_decoding, decoding_memory, open_video, pixel_format, refuse_titles, size_of
 from dase.io.image_files import decode_file, list_pictures, to_grey, to_levels
+from dase.text_files import stands_for
 
 PLAIN = bytes(4), b"BGR\x18"
 """Code and pixels of an uncompressed AVI: OpenCV 5.0 writes beyond its memory where it turns one over."""
@@ -31,6 +32,11 @@ class FrameReader:
         if not path.exists():
             raise InputError(f"video {path} does not exist")
         self._files = list_pictures(path) if path.is_dir() else None
+        if self._files is None:
+            with path.open("rb") as file:
+                pointer = stands_for(file.read(1024))
+            if pointer:
+                raise InputError(f"video {path} {pointer}")
         self._capture: Any = None
         self._plain: tuple[int, int] | None = None
         self.rate = 0.0

@@ -30,6 +30,7 @@ from dase.scenes.video import VideoScene
 from dase.simulation.sensor import Sensor
 from dase.simulation.sensor_file import dump_sensor, load_sensor, presets
 from dase.simulation.simulate import count
+from dase.text_files import parse_json, read_text_file
 
 JOB, SENSOR, WEIGHTS, EXAMPLES = "job.json", "sensor.toml", "learned.safetensors", "examples.npz"
 
@@ -255,7 +256,7 @@ def begin(job: Job, out: Path, *, resume: bool) -> None:
         raise InputError(f"{out} must be a folder, but it is a file")
     if resume and not record.is_file():
         raise InputError(f"{out} holds no run to resume")
-    if resume and record.read_text("utf-8") != job.text():
+    if resume and read_text_file(record, "the record", 1 << 24) != job.text():
         raise InputError(f"{out} was begun with other options (see {record}); --resume needs the same ones")
     if not resume and (out / CHECKPOINT).exists():
         raise InputError(f"{out} already holds a run; give --resume to go on with it, or another folder")
@@ -269,10 +270,13 @@ def job_in(out: Path) -> Job:
     record = out / JOB
     if not record.is_file():
         raise InputError(f"{out} holds no training run: {JOB} is missing")
-    table: dict[str, Any] = json.loads(record.read_text("utf-8"))
-    table["targets"] = tuple(table["targets"])
-    table["size"] = None if table["size"] is None else tuple(table["size"])
-    return Job(**table)
+    table = parse_json(read_text_file(record, "the record", 1 << 24), str(record))
+    try:
+        table["targets"] = tuple(table["targets"])
+        table["size"] = None if table["size"] is None else tuple(table["size"])
+        return Job(**table)
+    except (TypeError, KeyError) as error:
+        raise InputError(f"{record} is no record of a training run: {error}") from error
 
 
 @torch.no_grad()

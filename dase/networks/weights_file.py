@@ -15,8 +15,10 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save
 
 from dase.atomic_file import replacing
-from dase.errors import InputError
+from dase.errors import InputError, checked_integer
+from dase.events import LARGEST_SIDE
 from dase.networks.threshold_network import NetworkShape, ThresholdNet
+from dase.text_files import parse_json, stands_for
 
 KIND = "dase.learned_threshold"
 """Name of the file's only entry of metadata, the shape as JSON; of several the order is up to chance."""
@@ -34,6 +36,10 @@ def load_net(path: Path) -> ThresholdNet:
     """Read a network; raises InputError where the file holds none."""
     if not path.is_file():
         raise InputError(f"the weights {path} do not exist; they belong beside the sensor file")
+    with path.open("rb") as head:
+        pointer = stands_for(head.read(1024))
+    if pointer:
+        raise InputError(f"the weights {path}: {pointer}")
     try:
         with safe_open(path, "pt") as file:
             shape = (file.metadata() or {}).get(KIND)
@@ -51,9 +57,24 @@ def load_net(path: Path) -> ThresholdNet:
 
 def shape_of(text: str) -> NetworkShape:
     """Return the shape of a network from JSON."""
-    table = json.loads(text)
+    table = parse_json(text, "the shape of the network")
+    if not isinstance(table, dict):
+        raise InputError(f"the shape of the network must be a table, got {type(table).__name__}")
     fixed: dict[str, Any] = {n: tuple(v) if isinstance(v, list) else v for n, v in table.items()}
-    return NetworkShape(**fixed)
+    shape = NetworkShape(**fixed)
+    # a network is built before its weights are laid beside it, so what it takes is bounded here
+    checked_integer("channels", shape.channels, 1, 1025)
+    checked_integer("depth", shape.depth, 1, 9)
+    pairs = (("pattern", shape.pattern, LARGEST_SIDE), ("table", shape.table, 1024))
+    for name, pair, most in pairs:
+        if pair is not None and (not isinstance(pair, tuple) or len(pair) != 2):
+            raise InputError(f"{name} must be two whole numbers, got {pair!r}")
+        for number in pair or ():
+            checked_integer(name, number, 1, most + 1)
+    for name in ("coordinates", "split", "literal"):
+        if not isinstance(getattr(shape, name), bool):
+            raise InputError(f"{name} must be true or false, got {getattr(shape, name)!r}")
+    return shape
 
 
 @lru_cache(maxsize=4)

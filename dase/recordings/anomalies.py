@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
+from itertools import pairwise
 
 from dase.formatting import format_count, format_percent, format_seconds
 from dase.io.source import Note
@@ -16,6 +17,8 @@ HOT_PIXELS = 0.001  # share of the pixels
 FASTEST = 2e-6  # [s] no pixel sends two events so soon
 GAP = 0.01  # [s] without an event, where it is also
 GAPS = 50.0  # times as long as most
+ALIKE = 0.2  # by how much gaps that repeat differ in length
+REPEATED = 3  # times that make a gap one that repeats
 COARSE = 1e-5  # [s] of time stamps
 FLIPS = 0.9  # share of successive events that differ in polarity
 CLIPPED = 0.3  # share of black and white pixels in frames
@@ -61,13 +64,43 @@ def _times(s: Statistics) -> Iterator[Note]:
     if s.simultaneous > max(0.001 * s.events, 9):
         text = f"{format_count(s.simultaneous)} events are of the same pixel and time as another"
         yield Note(text, "odd", "duplicate", s.simultaneous)
-    begin, length = s.longest_gap
-    if length > max(GAP, GAPS * s.duration / max(s.stamps, 1)):
-        text = f"no event at all for {format_seconds(length)}, from {begin:.3f} s on: data may be missing"
-        yield Note(text, "odd", "gap")
+    yield from _gaps(s)
     if s.quantum > COARSE:
         text = f"all time stamps are whole multiples of {format_seconds(s.quantum)}"
         yield Note(text, "odd", "coarse")
+
+
+def _gaps(s: Statistics) -> Iterator[Note]:
+    """Name the gaps: one, several, or one that comes again and again with the same length."""
+    least = max(GAP, GAPS * s.duration / max(s.stamps, 1))
+    gaps = [gap for gap in s.gaps if gap[1] > least]
+    if not gaps:
+        return
+    longest = max(gaps, key=lambda gap: gap[1])
+    lengths = sorted(length for _, length in gaps)
+    middle = lengths[len(lengths) // 2]
+    alike = [gap for gap in gaps if abs(gap[1] - middle) <= ALIKE * middle]
+    if len(alike) >= REPEATED:
+        begins = [begin for begin, _ in alike]
+        steps = sorted(b - a for a, b in pairwise(begins))
+        every, total = steps[len(steps) // 2], sum(length for _, length in alike)
+        regular = steps[-1] - steps[0] <= ALIKE * every
+        pace = f"every {format_seconds(every)}" if regular else f"some {format_seconds(every)} apart"
+        text = (
+            f"no event at all for {format_seconds(middle)}, {len(alike)} times, {pace}, "
+            f"from {begins[0]:.3f} s on: {format_percent(total / s.duration)} of the time may be missing"
+        )
+        yield Note(text, "odd", "gap", len(alike))
+        gaps = [gap for gap in gaps if gap not in alike]
+        if not gaps:
+            return
+        longest = max(gaps, key=lambda gap: gap[1])
+    text = (
+        f"no event at all for {format_seconds(longest[1])}, from {longest[0]:.3f} s on: data may be missing"
+    )
+    if len(gaps) > 1:
+        text += f"; {len(gaps)} such gaps"
+    yield Note(text, "odd", "gap", len(gaps))
 
 
 def _frames(s: Statistics) -> Iterator[Note]:

@@ -26,6 +26,8 @@ BITS = 20  # of the place of an event in a part
 PART = 1 << BITS  # events looked at together
 SAMPLE = 1 << 14  # of the first that are asked whether they are alone; of later ones an eighth
 ALONE = 0.01  # [s] around an event in which its 3x3 pixels see no other
+LEAST_GAP = 0.01  # [s] without any event; shorter ones are no gaps
+MOST_GAPS = 1000  # that are remembered, the longest
 HOT_EVENTS, HOT_RATIO = 10, 10.0  # a hot pixel has that many events, and that many times those around it
 
 
@@ -85,6 +87,8 @@ class Statistics:
     """Different time stamps in a row."""
     longest_gap: tuple[float, float]
     """Begin [s] and length [s] of the longest time without an event."""
+    gaps: tuple[tuple[float, float], ...]
+    """Begin [s] and length [s] of times of 10 ms and more without any event: the 1000 longest, in order."""
     active: tuple[int, int, int, int]
     """First column, first row, columns and rows of the part that has events."""
     silent_pixels: int
@@ -122,6 +126,7 @@ class Survey:
         self._span = (math.inf, -math.inf)
         self._newest = math.nan
         self._gap = (math.nan, 0.0)
+        self._gaps: list[tuple[float, float]] = []
         self._quantum, self._stamps = 0, 0
         self._times: list[float] = []
         self._exposures: list[float] = []
@@ -196,6 +201,10 @@ class Survey:
         longest = int(np.argmax(steps))
         if steps[longest] > self._gap[1]:
             self._gap = float(before[longest]), float(steps[longest])
+        for place in np.flatnonzero(steps > LEAST_GAP).tolist():
+            self._gaps.append((float(before[place]), float(steps[place])))
+        if len(self._gaps) > 2 * MOST_GAPS:  # only the longest can be worth a word
+            self._gaps = sorted(self._gaps, key=lambda gap: -gap[1])[:MOST_GAPS]
         if self._quantum == 0 or self._quantum > 1000:  # finer than a microsecond is of no interest
             steps_ns = np.rint(steps * 1e9).astype(np.int64)
             if self._quantum == 0 or np.any(steps_ns % self._quantum):
@@ -255,6 +264,7 @@ class Survey:
             quantum=self._quantum * 1e-9 if self._quantum else math.nan,
             stamps=self._stamps,
             longest_gap=self._gap,
+            gaps=tuple(sorted(sorted(self._gaps, key=lambda gap: -gap[1])[:MOST_GAPS])),
             active=_active(counts.reshape(self.height, self.width)),
             silent_pixels=int(np.count_nonzero(counts == 0)),
             busiest_rate=_ratio(int(counts[busiest]), duration),

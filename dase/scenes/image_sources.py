@@ -2,22 +2,22 @@
 
 from __future__ import annotations
 
-import json
 import warnings
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from importlib.util import find_spec
-from pathlib import Path
+from pathlib import Path, PurePosixPath, PureWindowsPath
 from typing import Any
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from dase.errors import InputError
+from dase.errors import InputError, checked_integer
 from dase.io.image_files import SUFFIXES, decode_file, list_pictures, to_grey
+from dase.text_files import parse_json, stands_for
 
 LONGEST_SIDE = 1024  # [px] larger pictures are shrunk
 CACHED_PICTURES = 64  # decoded pictures kept per process: at most 4 MiB each, 8 MiB with alpha
@@ -31,6 +31,8 @@ PHOTOGRAPHS = (  # inside the wheel of scikit-image; its other files are silhoue
 DRAWN_SHARE = 0.25  # share of procedural textures among the built-in pictures
 DRAWN_SIZE = (384, 512)  # (H, W) of a procedural texture [px]
 SMALLEST_CUT = 16  # [px] no side of a crop is shorter, unless the picture is
+MOST_POLYGONS, MOST_NUMBERS = 2000, 400_000  # of one outline; those of COCO have below 50 of 10 000
+MOST_PIXELS = 200_000_000  # of a picture that is annotated
 COCO_SHARE, COCO_AREA = 0.005, 400  # an instance must cover this share of its picture and these pixels
 
 Grey = NDArray[np.float32]
@@ -185,6 +187,10 @@ class CocoImages(ImageSource):
         if _shrunk(*size) != grey.shape[::-1]:
             raise InputError(f"{what} must have the size of the image file, got {size[0]}x{size[1]}")
         try:
+            check_outline(instance["segmentation"], *size)
+        except InputError as error:
+            raise InputError(f"{what} must be a polygon or a run-length code: {error}") from None
+        try:
             with warnings.catch_warnings(action="ignore"):  # pycocotools 2.0.11 warns with NumPy 2
                 mask = np.asarray(self._coco.annToMask(instance), np.float32)
         except Exception as error:  # pycocotools raises what it likes, bare Exceptions too
@@ -198,16 +204,19 @@ class CocoImages(ImageSource):
 def _read_annotations(path: Path) -> tuple[dict[int, dict[str, Any]], list[dict[str, Any]]]:
     """Return the images by their id and the instances worth cutting out."""
     try:
-        content = json.loads(path.read_bytes())
+        data = path.read_bytes()
     except OSError as error:
         raise InputError(f"images: cannot read annotations '{path}': {error.strerror}") from error
-    except ValueError as error:
-        raise InputError(f"images: annotations '{path}' must be JSON: {error}") from error
+    pointer = stands_for(data[:1024])
+    if pointer:
+        raise InputError(f"images: annotations '{path}' {pointer}")
+    content = parse_json(data, f"images: annotations '{path}'")
     try:
         images = {image["id"]: image for image in content["images"]}
         instances = [a for a in content["annotations"] if _usable(a, images[a["image_id"]])]
         for image in images.values():
-            Path(image["file_name"])  # a TypeError unless it is a string
+            _check_file_name(image["file_name"], path)
+            _check_image_size(image, path)
     except (KeyError, TypeError) as error:
         raise InputError(
             f"images: annotations '{path}' must list images (id, file_name, width, height) and annotations "
@@ -219,6 +228,93 @@ def _read_annotations(path: Path) -> tuple[dict[int, dict[str, Any]], list[dict[
             f"and {COCO_SHARE:.1%} of its image, found none among {len(content['annotations'])}"
         )
     return images, instances
+
+
+def _check_file_name(name: Any, annotations: Path) -> None:
+    """Raise InputError where the name of a picture leads out of the folder of pictures."""
+    if not isinstance(name, str) or not name or "\0" in name:
+        raise InputError(f"images: annotations '{annotations}' must name files, got {name!r}")
+    for kind in (PurePosixPath, PureWindowsPath):
+        parts = kind(name)
+        if parts.is_absolute() or parts.drive or ".." in parts.parts:
+            raise InputError(
+                f"images: annotations '{annotations}' name '{name}', which leads out of the folder"
+            )
+
+
+def _check_image_size(image: dict[str, Any], annotations: Path) -> None:
+    """Raise InputError where a picture claims a size that none has: its outlines are drawn so large."""
+    for name in ("width", "height"):
+        checked_integer(f"images: '{annotations}': {name} of '{image['file_name']}'", image[name], 1, 1 << 15)
+    if image["width"] * image["height"] > MOST_PIXELS:
+        raise InputError(
+            f"images: '{annotations}': '{image['file_name']}' claims {image['width']}x{image['height']}, "
+            f"more than {MOST_PIXELS / 1e6:.0f} million pixels"
+        )
+
+
+def check_outline(outline: Any, width: int, height: int) -> None:
+    """Raise InputError where an outline is not one that pycocotools can take: it crashes on others.
+
+    Args:
+        outline: Polygons as lists x, y, x, y, ...; or a run-length code, a table of size [rows, columns] and
+            counts, a list or a compressed text.
+        width: Columns of the picture.
+        height: Rows of the picture.
+    """
+    if isinstance(outline, dict):
+        _check_runs(outline, width, height)
+        return
+    if not isinstance(outline, list) or not all(isinstance(polygon, list) for polygon in outline):
+        raise InputError("it is neither a list of polygons nor a table")
+    numbers = sum(len(polygon) for polygon in outline)
+    if len(outline) > MOST_POLYGONS or numbers > MOST_NUMBERS:
+        raise InputError(
+            f"it has {len(outline)} polygons of {numbers} numbers, "
+            f"at most {MOST_POLYGONS} of {MOST_NUMBERS} are read"
+        )
+    reach = 2 * max(width, height)
+    for polygon in outline:
+        if len(polygon) < 6 or len(polygon) % 2:
+            raise InputError(
+                f"a polygon has {len(polygon)} numbers; at least 6, and two for a corner, are needed"
+            )
+        if not all(type(value) in (int, float) and abs(value) <= reach for value in polygon):
+            raise InputError(f"a corner of a polygon does not lie near the {width}x{height} picture")
+
+
+def _check_runs(outline: dict[str, Any], width: int, height: int) -> None:
+    if outline.get("size") != [height, width]:
+        raise InputError(f"its size must be [{height}, {width}], got {outline.get('size')!r}")
+    counts = outline.get("counts")
+    if isinstance(counts, str):
+        counts = _unpacked_runs(counts)
+    if not isinstance(counts, list) or not all(type(count) is int and count >= 0 for count in counts):
+        raise InputError("its counts must be whole numbers >= 0")
+    if sum(counts) != width * height:
+        raise InputError(f"its counts must add up to {width * height} pixels, not {sum(counts)}")
+
+
+def _unpacked_runs(text: str) -> list[int]:
+    """Return the counts of a compressed run-length code: 5 bits a letter from '0' on, bit 5: more follow."""
+    out: list[int] = []
+    value = shift = 0
+    for letter in text:
+        bits = ord(letter) - 48
+        if not 0 <= bits < 64 or shift > 25:
+            raise InputError("its counts are no compressed run-length code")
+        value |= (bits & 31) << shift
+        shift += 5
+        if bits & 32:
+            continue
+        if bits & 16:
+            value -= 1 << shift
+        # from the fourth on, each is told as the difference to the one before the last
+        out.append(value + (out[-2] if len(out) > 2 else 0))
+        value = shift = 0
+    if shift:
+        raise InputError("its counts are no compressed run-length code")
+    return out
 
 
 def _usable(instance: dict[str, Any], image: dict[str, Any]) -> bool:

@@ -81,9 +81,9 @@ class SensorText:
 
     def changed(self, effect: Effect) -> SensorText:
         """Return the text with the values of an effect that it has; their comments stay."""
+        before = self.sensor()
         document = tomlkit.parse(self.text)
         table: Any = document[effect.name]
-        before = self.sensor()
         for name in effect.settings():
             value = getattr(effect, name)
             if value != getattr(before[effect.name], name):
@@ -92,8 +92,8 @@ class SensorText:
 
     def moved(self, folder: Path) -> SensorText:
         """Return the text as it stands in another folder: paths of files lead to where they are."""
+        sensor = self.sensor()  # which says what is wrong with the text
         document = tomlkit.parse(self.text)
-        sensor = self.sensor()
         files = [(e, name) for e in sensor.effects for name in e.assets() if getattr(e, name)]
         if not files or folder.resolve() == self.folder.resolve():
             return self

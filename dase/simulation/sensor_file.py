@@ -8,13 +8,13 @@ from pathlib import Path
 from typing import Any
 
 import tomlkit
-from tomlkit.exceptions import TOMLKitError
 from tomlkit.items import Table
 
 from dase.effects import EFFECTS, Effect, find
 from dase.errors import InputError, nearest
 from dase.simulation.sensor import Sensor
 from dase.simulation.sensor_history import read_history
+from dase.text_files import parse_toml, read_text_file
 
 
 def presets() -> dict[str, str]:
@@ -51,10 +51,7 @@ def read_sensor(spec: str | Path) -> tuple[str, str]:
         if path.suffix == ".toml":
             raise InputError(f"sensor file {path} does not exist")
         raise InputError(f"sensor '{spec}' is neither a preset nor a file: {nearest(str(spec), known)}")
-    try:
-        return path.read_bytes().decode("utf-8"), str(path)  # ends of lines stay as they are
-    except UnicodeDecodeError as error:
-        raise InputError(f"sensor file {path} is not UTF-8 text") from error
+    return read_text_file(path, "sensor file"), str(path)
 
 
 def parse_sensor(text: str, where: str, effects: Mapping[str, type[Effect]] = EFFECTS) -> Sensor:
@@ -65,10 +62,7 @@ def parse_sensor(text: str, where: str, effects: Mapping[str, type[Effect]] = EF
         where: What the user calls the text, for messages.
         effects: Effects the text may name.
     """
-    try:
-        table = tomlkit.parse(text).unwrap()
-    except TOMLKitError as error:
-        raise InputError(f"{where} is not TOML: {error}") from error
+    table = parse_toml(text, where)
     try:
         return _sensor(table, effects)
     except InputError as error:

@@ -25,6 +25,7 @@ from dase.kernels import pixel_codegen, pixel_compile, pixel_stages
 from dase.scenes.video import VideoScene
 from dase.simulation.sensor import Sensor
 from dase.simulation.simulate import simulate
+from dase.text_files import read_text_file
 
 RESERVED = ("name", "size", "log_eps", "history", "sensor")
 """Other entries of a sensor file; no effect can have such a name."""
@@ -107,10 +108,7 @@ def _home(effect: type[Effect]) -> str:
 def _read(path: Path) -> str:
     if not path.is_file():
         raise InputError(f"effect file {path} does not exist")
-    try:
-        return path.read_text("utf-8")
-    except UnicodeDecodeError as error:
-        raise InputError(f"effect file {path} is not UTF-8 text") from error
+    return read_text_file(path, "effect file", 1 << 24)
 
 
 def _run(path: Path, text: str) -> ModuleType:

@@ -274,3 +274,40 @@ def test_what_is_known_of_the_shared_recordings(shared):
     assert bench.on_share == pytest.approx(0.3, abs=0.01)
     assert bench.active[2] == 190
     assert odd(bench)["bare"] == "no event in columns 190..239"
+
+
+def with_gaps(rng, gaps):
+    """One second of 50 000 events, without any in spans of time [s]."""
+    t = np.sort(rng.random(50_000))
+    for begin, end in gaps:
+        t = t[(t < begin) | (t >= end)]
+    n = len(t)
+    x, y = (rng.integers(0, 64, n, np.uint16) for _ in "xy")
+    return Sequence(Events(t, x, y, rng.random(n) < 0.5, 64, 64))
+
+
+@pytest.mark.parametrize(
+    ("gaps", "said"),
+    [
+        ([(0.1 + 0.03 * k, 0.118 + 0.03 * k) for k in range(29)], ["18 ms, 29 times, every 30 ms, from"]),
+        ([(0.1, 0.118), (0.13, 0.148), (0.5, 0.518), (0.7, 0.9)], ["18 ms, 3 times, some", "200 ms, from"]),
+        ([(0.1, 0.15), (0.5, 0.53)], ["50 ms, from 0.100 s on: data may be missing; 2 such gaps"]),
+        ([(0.5, 0.53)], ["30 ms, from 0.500 s on: data may be missing"]),
+        ([], []),
+    ],
+)  # fmt: skip
+def test_gaps_that_repeat_are_named(rng, gaps, said):
+    found = statistics(with_gaps(rng, gaps))
+    assert len(found.gaps) == len(gaps)
+    np.testing.assert_allclose([begin for begin, _ in found.gaps], [begin for begin, _ in gaps], atol=1e-3)
+    notes = [note for note in doubts(found) if note.rule == "gap"]
+    assert len(notes) == len(said)
+    for note, words in zip(notes, said, strict=True):
+        assert words in note
+
+
+def test_gaps_do_not_fill_the_memory(rng):
+    t = np.repeat(np.arange(5000) * 0.02, 2)
+    x = np.zeros(len(t), np.uint16)
+    found = statistics(Sequence(Events(t, x, x, x > 0, 64, 64)))
+    assert len(found.gaps) == 1000

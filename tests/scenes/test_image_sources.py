@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import sys
+import time
 from pathlib import Path
 from typing import Any
 
@@ -375,3 +376,112 @@ def test_floating_point_files_are_refused(tmp_path, rng):
     write(tmp_path / "a.tif", np.ones((9, 9), np.float32))
     with pytest.raises(InputError, match=r"a.tif' must hold 8- or 16-bit values, holds float32"):
         open_images(str(tmp_path)).foreground(rng)
+
+
+SQUARE = [10.0, 10.0, 50.0, 10.0, 50.0, 50.0, 10.0, 50.0]
+
+
+def annotated(tmp_path, segmentation, **image):
+    """One picture of 90x60 with an outline; fields of the picture may be others."""
+    write(tmp_path / "pictures" / "a.png", noise(np.random.default_rng(0), 60, 90, 3))
+    content = {
+        "images": [{"id": 1, "file_name": "a.png", "width": 90, "height": 60, **image}],
+        "annotations": [{"id": 7, "image_id": 1, "area": 1600, "iscrowd": 0, "segmentation": segmentation}],
+    }
+    (tmp_path / "instances.json").write_text(json.dumps(content))
+    return f"coco:{tmp_path / 'instances.json'},{tmp_path / 'pictures'}"
+
+
+def runs(mask):
+    """Counts of a run-length code, column by column, as pycocotools packs them."""
+    from pycocotools import mask as masks
+
+    packed = masks.encode(np.asfortranarray(mask))
+    return packed["counts"].decode()
+
+
+@pytest.mark.parametrize(
+    ("segmentation", "match"),
+    [
+        ([[1e300, 0, 5, 5, 9, 1e300]], "does not lie near"),
+        ([[float("nan"), 0, 5, 5, 9, 9]], "does not lie near"),
+        ([[float("inf"), 0, 5, 5, 9, 9]], "does not lie near"),
+        ([[-(2**31), 0, 5, 5, 9, 9]], "does not lie near"),
+        ([[10**400, 0, 5, 5, 9, 9]], "does not lie near"),
+        ([["1", 0, 5, 5, 9, 9]], "does not lie near"),
+        ([[1, 2, 3, 4]], "has 4 numbers"),
+        ([[1, 2, 3, 4, 5, 6, 7]], "has 7 numbers"),
+        ([SQUARE] * 200_000, "200000 polygons"),
+        ([[1.0, 2.0] * 300_000], "1 polygons of 600000 numbers"),
+        ([5], "neither a list of polygons"),
+        ({"size": [60, 91], "counts": [0, 5460]}, "its size must be"),
+        ({"size": [60, 90], "counts": [0, 5401]}, "add up to 5400"),
+        ({"size": [60, 90], "counts": [-1, 5401]}, "whole numbers >= 0"),
+        ({"size": [60, 90], "counts": "zzzzzzzzzzzzzzzzz"}, "no compressed"),
+        ({"size": [60, 90], "counts": "\u0001"}, "no compressed"),
+        ({"size": [60, 90], "counts": "PP0"}, "counts must"),
+        ({"size": [60, 90]}, "counts must"),
+    ],
+)  # fmt: skip
+def test_coco_outlines_that_would_crash_are_refused(tmp_path, rng, segmentation, match):
+    pytest.importorskip("pycocotools")
+    begin = time.process_time()
+    source = open_images(annotated(tmp_path, segmentation))
+    with pytest.raises(InputError, match=rf"annotation 7 of 'a.png'.*{match}"):
+        source.foreground(rng)
+    assert time.process_time() - begin < 5
+
+
+def test_coco_outlines_of_every_kind_are_cut_out(tmp_path, rng):
+    pytest.importorskip("pycocotools")
+    mask = np.zeros((60, 90), np.uint8)
+    mask[10:50, 10:50] = 1
+    mask[20:25, 60:80] = mask[59, 89] = 1
+    flat = mask.ravel(order="F")
+    edges = np.flatnonzero(np.diff(np.concatenate(([0], flat)))).tolist()
+    plain = np.diff([0, *edges, flat.size]).tolist()
+    for segmentation in (
+        [SQUARE],
+        {"size": [60, 90], "counts": plain},
+        {"size": [60, 90], "counts": runs(mask)},
+    ):
+        picture = open_images(annotated(tmp_path, segmentation)).foreground(rng)
+        assert picture.grey.shape[0] >= 40
+    assert image_sources._unpacked_runs(runs(mask)) == plain
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        "/etc/passwd",
+        "../a.png",
+        "b/../../a.png",
+        "C:\\a.png",
+        "..\\a.png",
+        "\\\\host\\a.png",
+        "",
+        "a\0.png",
+        5,
+    ],
+)
+def test_coco_names_that_lead_out_are_refused(tmp_path, name):
+    pytest.importorskip("pycocotools")
+    write(tmp_path / "a.png", noise(np.random.default_rng(0), 60, 90, 3))
+    with pytest.raises(InputError, match=r"leads out of the folder|must name files"):
+        open_images(annotated(tmp_path, [SQUARE], file_name=name))
+
+
+@pytest.mark.parametrize(
+    "size", [{"width": 2**31}, {"width": 32768, "height": 32768}, {"width": 1.5}, {"height": 0}]
+)
+def test_coco_sizes_that_are_none(tmp_path, size):
+    pytest.importorskip("pycocotools")
+    with pytest.raises(InputError, match=r"must be a whole number|million pixels"):
+        open_images(annotated(tmp_path, [SQUARE], **size))
+
+
+def test_deeply_nested_annotations(tmp_path):
+    pytest.importorskip("pycocotools")
+    (tmp_path / "deep.json").write_text('{"images": ' + "[" * 200_000 + "]" * 200_000 + "}")
+    with pytest.raises(InputError, match="nested too deeply"):
+        open_images(f"coco:{tmp_path / 'deep.json'},{tmp_path}")

@@ -1,0 +1,209 @@
+"""Small files that took half a minute and more, or ended in a traceback: each is a sentence, soon."""
+
+from __future__ import annotations
+
+import json
+import time
+import zipfile
+from contextlib import suppress
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+from helpers import sample_files as reference_io
+
+import dase
+from dase import io
+from dase.cli import group
+from dase.diagnosis.measurement import open_clip
+from dase.errors import InputError
+from dase.text_files import parse_json, parse_toml, read_text_file
+
+
+@pytest.fixture(autouse=True)
+def soon(request):
+    begin = time.process_time()
+    yield
+    making = "60_000" in request.node.name  # which takes longer than reading, and is timed there
+    assert making or time.process_time() - begin < 5
+
+
+@pytest.mark.parametrize("content", [b"1" * 50_000_000, b"1 " * 25_000_000, b"0.5 1 1 1" + b" " * 50_000_000])
+def test_one_line_of_50_mb(tmp_path, content):
+    (tmp_path / "a.txt").write_bytes(content)
+    with pytest.raises(InputError, match=r"a\.txt: "):
+        io.read(tmp_path / "a.txt")
+
+
+@pytest.mark.parametrize("name", ["a{}.txt", "a{}.npy", "frame_{}.png"])
+def test_a_zip_of_60_000_members(tmp_path, rng, name):
+    e = reference_io.events(rng, 300)
+    with zipfile.ZipFile(tmp_path / "a.zip", "w") as archive:
+        for k in range(60_000):
+            archive.writestr(name.format(k), b"")
+        archive.writestr(
+            "events.txt", "".join(f"{t:.6f} {x} {y} 1\n" for t, x, y in zip(e.t, e.x, e.y, strict=True))
+        )
+    for act in (io.read, lambda path: list(io.stream(path)), lambda path: list(io.pictures(path))):
+        begin = time.process_time()
+        with suppress(InputError):
+            act(tmp_path / "a.zip")
+        assert time.process_time() - begin < 5
+
+
+def test_a_folder_of_text_with_a_long_list_of_pictures(tmp_path):
+    (tmp_path / "events.txt").write_text("0.5 1 1 1\n")
+    (tmp_path / "images.txt").write_text("".join(f"{k} {k}.png\n" for k in range(300_000)))
+    assert len(io.read(tmp_path).events) == 1
+
+
+def toml(tmp_path, text):
+    (tmp_path / "a.toml").write_bytes(text if isinstance(text, bytes) else text.encode())
+    return tmp_path / "a.toml"
+
+
+@pytest.mark.parametrize(
+    ("text", "match"),
+    [
+        ("# " + "a" * 10_000_000, "larger than 256 KiB"),
+        ("a = " + "[" * 100_000, "is not TOML"),
+        ("a = " + "[" * 100_000 + "]" * 100_000, "is not TOML"),
+        ("a" + ".a" * 100_000 + " = 1", "is not TOML"),
+        ('name = "a\0b"', "is not TOML"),
+        ("na\0me = 1", "is not TOML"),
+        (b'name = "\xff\xfe"', "is not UTF-8"),
+        ("size = [99999999999, 1]\n[threshold]\non = 0.2", "size must lie between"),
+        ("size = " + "9" * 5000, "is not TOML"),
+        ('"\x1b[31mred" = 1', "is not TOML"),
+        ('"\\u001b[31mred" = 1', r"\\x1b\[31mred"),
+        ('[[history]]\n"a\\u009bb" = 1', r"\\x9bb"),
+    ],
+)  # fmt: skip
+def test_sensor_files(tmp_path, text, match):
+    path = toml(tmp_path, text)
+    with pytest.raises(InputError, match=match) as found:
+        dase.load_sensor(path)
+    assert str(path) in str(found.value)
+    assert "\x1b" not in str(found.value)
+    for words in (("remove", str(path), "leak"), ("add", str(path), "leak")):
+        done = CliRunner().invoke(group, [*words])
+        assert isinstance(done.exception, InputError | SystemExit), done.exception
+
+
+def test_the_record_of_a_data_set_that_is_no_utf_8(tmp_path):
+    (tmp_path / "d").mkdir()
+    (tmp_path / "d" / "synth.toml").write_bytes(b"\xff\xfe")
+    done = CliRunner().invoke(group, ["synth", str(tmp_path / "d"), "--resume", "--sequences", "1"])
+    assert "is not UTF-8 text" in str(done.exception)
+
+
+@pytest.mark.parametrize("content", [b"", b"no zip", b"PK\x03\x04 cut short", b"\x80\x04."])
+def test_a_scene_that_is_no_zip(tmp_path, content):
+    (tmp_path / "x.npz").write_bytes(content)
+    with pytest.raises(InputError, match=r"x\.npz"):
+        open_clip(tmp_path / "x.npz")
+
+
+def test_a_scene_that_unpacks_to_too_much(tmp_path):
+    np.savez_compressed(
+        tmp_path / "x.npz", frames=np.zeros((300, 1000, 1000), np.uint8), frame_us=np.arange(300)
+    )
+    with pytest.raises(InputError, match="unpacks from"):
+        open_clip(tmp_path / "x.npz")
+
+
+def test_deeply_nested_texts():
+    for act, deep in ((parse_json, "[" * 100_000), (parse_toml, "a = " + "[" * 100_000)):
+        with pytest.raises(InputError, match="x "):
+            act(deep, "x")
+    with pytest.raises(InputError, match="x must be JSON"):
+        parse_json(b"\xff", "x")
+
+
+POINTER = f"version https://git-lfs.github.com/spec/v1\noid sha256:{'4d7a2146' * 8}\nsize 12345678\n"
+
+
+@pytest.mark.parametrize("suffix", [".h5", ".raw", ".aedat4", ".bag", ".npz", ".txt", ".avi", ".bin"])
+def test_a_git_lfs_pointer_is_called_one(tmp_path, suffix):
+    path = tmp_path / f"a{suffix}"
+    path.write_text(POINTER)
+    for act in (io.read, lambda one: list(io.stream(one)), lambda one: io.convert(one, tmp_path / "b.h5")):
+        with pytest.raises(InputError, match="is a Git LFS pointer, not the file of 12,345,678 bytes"):
+            act(path)
+
+
+@pytest.mark.parametrize(
+    ("content", "match"),
+    [
+        (POINTER.encode(), "Git LFS pointer"),
+        (b"/annex/objects/SHA256E-s1234--abc.h5\n", "git-annex pointer"),
+        (b"\n<!DOCTYPE html>\n<html><head>", "is a web page"),
+    ],
+)
+def test_other_files_that_stand_for_one(tmp_path, content, match):
+    from dase.scenes.video import open_video
+
+    (tmp_path / "a.png").write_bytes(content)
+    (tmp_path / "b.png").write_bytes(content)
+    (tmp_path / "a.toml").write_bytes(content)
+    (tmp_path / "a.avi").write_bytes(content)
+    (tmp_path / "s").mkdir()
+    for act in (
+        lambda: io.find_format(tmp_path / "a.png"),
+        lambda: io.read(tmp_path),
+        lambda: dase.load_sensor(tmp_path / "a.toml"),
+        lambda: open_video(tmp_path / "a.avi"),
+        lambda: dase.open_images(str(tmp_path)).background(np.random.default_rng(0)),
+    ):
+        with pytest.raises(InputError, match=match):
+            act()
+
+
+def test_weights(tmp_path):
+    pytest.importorskip("torch")
+    from safetensors.torch import save
+
+    from dase.networks import weights_file
+    from dase.networks.threshold_network import NetworkShape, ThresholdNet
+
+    def put(text):
+        (tmp_path / "w.safetensors").write_bytes(save({}, {weights_file.KIND: text}))
+        return tmp_path / "w.safetensors"
+
+    for shape, match in (
+        ({"depth": 10_000}, "depth must be a whole number"),
+        ({"channels": 10**9}, "channels must be a whole number"),
+        ({"depth": 2.5}, "depth must be a whole number"),
+        ({"table": [10**6, 10**6]}, "table must be a whole number"),
+        ({"pattern": [10**9, 2]}, "pattern must be a whole number"),
+        ({"pattern": 5}, "pattern must be two"),
+        ({"split": 5}, "split must be true or false"),
+        ([1, 2], "must be a table"),
+        ("a", "must be a table"),
+    ):
+        with pytest.raises(InputError, match=match):
+            weights_file.load_net(put(json.dumps(shape)))
+    with pytest.raises(InputError, match="nested too deeply"):
+        weights_file.load_net(put("[" * 100_000))
+    net = ThresholdNet(NetworkShape(channels=4, depth=2))
+    weights_file.save_net(tmp_path / "good.safetensors", net)
+    assert weights_file.load_net(tmp_path / "good.safetensors").shape == net.shape
+    (tmp_path / "p.safetensors").write_text(POINTER)
+    with pytest.raises(InputError, match="Git LFS pointer"):
+        weights_file.load_net(tmp_path / "p.safetensors")
+
+
+def test_metadata_of_weights_that_are_a_list(tmp_path):
+    pytest.importorskip("torch")
+    from dase.networks import weights_file
+
+    for metadata in ([1], {"a": [1]}, 5, {weights_file.KIND: 5}):
+        head = json.dumps({"__metadata__": metadata}).encode()
+        (tmp_path / "w.safetensors").write_bytes(len(head).to_bytes(8, "little") + head)
+        with pytest.raises(InputError, match="does not hold learned thresholds"):
+            weights_file.load_net(tmp_path / "w.safetensors")
+
+
+def test_a_text_file_has_an_end(tmp_path):
+    with pytest.raises(InputError, match="cannot be read"):
+        read_text_file(tmp_path, "a file")
