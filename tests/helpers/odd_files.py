@@ -60,7 +60,7 @@ VALUES = (
 
 def odd_text(text: str, rng: np.random.Generator) -> str:
     """Return a text of JSON or TOML with some values replaced, lines doubled, or brackets added."""
-    for _ in range(rng.integers(1, 5)):
+    for _ in range(rng.integers(1, 3)):
         kind = rng.integers(0, 6)
         places = list(re.finditer(r'"[^"\n]*"|-?\d[\d.e-]*|\[[^\[\]]*\]', text))
         if kind < 3 and places:
