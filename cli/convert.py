@@ -19,7 +19,9 @@ if TYPE_CHECKING:
 @click.option("--format", "format_", help="Format of TARGET.  [default: by its suffix]")
 @click.option("--events-only", is_flag=True, help="Leave frames behind.")
 @reading_options
-def command(source: Path, target: Path, format_: str | None, events_only: bool, reading: ReadOptions) -> None:
+def convert_command(
+    source: Path, target: Path, format_: str | None, events_only: bool, reading: ReadOptions
+) -> None:
     """Convert the events of SOURCE, any file dase reads, to TARGET.
 
     Formats are known by content, then by suffix. Frames go along where both formats have them. Files stream

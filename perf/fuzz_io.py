@@ -206,7 +206,7 @@ def read_sensor(path: Path, turn: int) -> int:
     sensor = load_sensor(path)
     if turn % 2:
         dump_sensor(sensor)
-        sensor_edit.read(path).sensor()
+        sensor_edit.read_sensor_text(path).sensor()
     return WHOLE
 
 

@@ -69,7 +69,7 @@ class _Elements:
             raise InputError("a variable claims more bytes than the file has")
         return kind, self._data[begin : begin + size]
 
-    def numbers(self) -> NDArray[Any]:
+    def draw_numbers(self) -> NDArray[Any]:
         """Return the numbers of the next element, (N,)."""
         kind, data = self.take()
         if kind not in NUMBERS:
@@ -94,17 +94,17 @@ def _read_matrix(data: memoryview, order: str, depth: int = 0) -> tuple[str, Any
     if not len(data):
         return "", None
     parts = _Elements(data, order)
-    flags, sizes = parts.numbers(), parts.numbers()
+    flags, sizes = parts.draw_numbers(), parts.draw_numbers()
     _, name = parts.take()
     text = bytes(name).decode("latin-1")
     kind = int(flags[0]) & 255 if len(flags) else 0
     if kind in NUMERIC:
-        values = parts.numbers()
+        values = parts.draw_numbers()
         if math.prod(sizes.tolist()) != len(values):
             raise InputError(f"'{text}' must have {math.prod(sizes.tolist())} numbers, has {len(values)}")
         return text, values
     if kind == STRUCTURE and depth == 0 and math.prod(sizes.tolist()) == 1:
-        (width,) = parts.numbers().tolist()
+        (width,) = parts.draw_numbers().tolist()
         _, names = parts.take()
         if not 0 < width <= 64:
             raise InputError(f"'{text}' claims names of {width} bytes")

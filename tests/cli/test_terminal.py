@@ -12,7 +12,7 @@ from click.testing import CliRunner
 from helpers import sample_files as reference_io
 
 from dase import io
-from dase.cli import group
+from dase.cli import dase_group
 from dase.errors import InputError, printable
 
 EVIL = "\x1b]0;owned\x07\x1b[31m\x9b2J\u202e"
@@ -72,7 +72,7 @@ def test_names_in_files(tmp_path, suffix, make, words):
     path = tmp_path / f"a{suffix}"
     make(path)
     done = CliRunner().invoke(
-        group, [*words, str(path), *([str(tmp_path / "b.h5")] if words[0] == "convert" else [])]
+        dase_group, [*words, str(path), *([str(tmp_path / "b.h5")] if words[0] == "convert" else [])]
     )
     assert clean(done.output)
     assert clean(str(done.exception))
@@ -86,7 +86,7 @@ def test_names_of_files(tmp_path, rng):
         ["convert", path, tmp_path / "b\x1b[5m.raw"],
         ["show", path, "-o", tmp_path / "\x9b.png"],
     ):
-        done = CliRunner().invoke(group, [str(word) for word in words])
+        done = CliRunner().invoke(dase_group, [str(word) for word in words])
         assert done.exit_code == 0, done.exception
         assert clean(done.output)
 
@@ -107,12 +107,12 @@ def test_what_the_command_prints_in_a_process_of_its_own(tmp_path, words):
 def test_a_dollar_in_the_name_is_no_mathematics(tmp_path, rng):
     path = tmp_path / "a$\\frac{1$b$_^.h5"
     reference_io.SAMPLES["HDF5"][1](path, reference_io.events(rng, 1000))
-    done = CliRunner().invoke(group, ["show", str(path), "-o", str(tmp_path / "a.png")])
+    done = CliRunner().invoke(dase_group, ["show", str(path), "-o", str(tmp_path / "a.png")])
     assert done.exit_code == 0, done.exception
 
 
 def test_the_help_of_effects_says_that_it_runs_code():
-    done = CliRunner().invoke(group, ["info", "--help"])
+    done = CliRunner().invoke(dase_group, ["info", "--help"])
     assert done.exit_code == 0
-    done = CliRunner().invoke(group, ["compare", "--help"])
+    done = CliRunner().invoke(dase_group, ["compare", "--help"])
     assert "its code is run" in " ".join(done.output.split())

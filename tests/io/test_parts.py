@@ -11,7 +11,7 @@ from helpers import sample_files as reference_io
 
 import dase
 from dase import io
-from dase.cli import group
+from dase.cli import dase_group
 from dase.errors import InputError
 from dase.io.sequence import Sequence
 
@@ -142,15 +142,15 @@ def test_commands(tmp_path, rng):
     io.write(path, whole)
     wanted = len(cut(whole.events, PART)[0])
     part = ["--from", "0.004", "--to", "0.012", "--region", "60,40,100,90"]
-    done = CliRunner().invoke(group, ["convert", str(path), str(tmp_path / "b.raw"), *part])
+    done = CliRunner().invoke(dase_group, ["convert", str(path), str(tmp_path / "b.raw"), *part])
     assert f"{wanted:,} events written" in done.output, done.output
     assert "read was a part only: from 0.004 s to 0.012 s, 100x90 pixels at (60, 40)" in done.output
-    done = CliRunner().invoke(group, ["info", str(path), "--json", *part])
+    done = CliRunner().invoke(dase_group, ["info", str(path), "--json", *part])
     said = json.loads(done.output)
     assert (said["events"], said["width"], said["height"]) == (wanted, 100, 90)
-    done = CliRunner().invoke(group, ["show", str(path), "-o", str(tmp_path / "a.png"), *part])
+    done = CliRunner().invoke(dase_group, ["show", str(path), "-o", str(tmp_path / "a.png"), *part])
     assert "100 x 90" in done.output, done.output
-    done = CliRunner().invoke(group, ["info", str(path), "--region", "1,2,3"])
+    done = CliRunner().invoke(dase_group, ["info", str(path), "--region", "1,2,3"])
     assert "not of the form x,y,w,h" in done.output
-    done = CliRunner().invoke(group, ["info", str(path), "--chip", "davis240"])
+    done = CliRunner().invoke(dase_group, ["info", str(path), "--chip", "davis240"])
     assert "takes no chip" in str(done.exception)

@@ -14,7 +14,7 @@ from helpers import sample_files as reference_io
 
 import dase
 from dase import io
-from dase.cli import group
+from dase.cli import dase_group
 from dase.diagnosis.measurement import open_clip
 from dase.errors import InputError
 from dase.text_files import parse_json, parse_toml, read_text_file
@@ -86,14 +86,14 @@ def test_sensor_files(tmp_path, text, match):
     assert str(path) in str(found.value)
     assert "\x1b" not in str(found.value)
     for words in (("remove", str(path), "leak"), ("add", str(path), "leak")):
-        done = CliRunner().invoke(group, [*words])
+        done = CliRunner().invoke(dase_group, [*words])
         assert isinstance(done.exception, InputError | SystemExit), done.exception
 
 
 def test_the_record_of_a_data_set_that_is_no_utf_8(tmp_path):
     (tmp_path / "d").mkdir()
     (tmp_path / "d" / "synth.toml").write_bytes(b"\xff\xfe")
-    done = CliRunner().invoke(group, ["synth", str(tmp_path / "d"), "--resume", "--sequences", "1"])
+    done = CliRunner().invoke(dase_group, ["synth", str(tmp_path / "d"), "--resume", "--sequences", "1"])
     assert "is not UTF-8 text" in str(done.exception)
 
 
