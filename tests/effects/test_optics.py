@@ -5,9 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import warp as wp
+from helpers.event_comparison import by_pixel, same
+from helpers.small_scenes import flicker, layers
 from scipy.special import ive
 from scipy.stats import norm
-from test_pixel_kernel import by_pixel, flicker, layers, same
 
 import dase
 from dase.effects.optics_blur import OpticsBlur, Unsharp, weights

@@ -9,13 +9,14 @@ import pytest
 
 torch = pytest.importorskip("torch", reason="the bridge needs torch")
 
+from helpers.layer_gradients import FIELDS, sizes_of
+
 from dase.kernels import launch
 from dase.kernels.autograd_scene_layers import affine_places, render
 from dase.scenes.image_sources import Picture
 from dase.scenes.layers import Layer, LayerScene, Motion
 
 WIDTH, HEIGHT = 40, 30
-FIELDS = ("x", "y", "angle", "scale_x", "scale_y")
 
 
 def random_layers(rng, count, device):
@@ -37,10 +38,6 @@ def random_motion(rng, layers, device):
     motion[:, 2] *= 4  # angle [rad]
     motion[:, 3:] = rng.uniform(0.5, 0.9, (layers, 2, 2))
     return torch.tensor(motion, dtype=torch.float32, device=device)
-
-
-def sizes_of(textures):
-    return [tuple(grey.shape) for grey, _ in textures]
 
 
 def random_scene(rng, count, device, samples=3):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from test_vector_math import scene_of
+from helpers.stored_scenes import scene_of
 
 import dase
 from dase.effects import EFFECTS

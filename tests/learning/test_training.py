@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import json
 import math
-from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
+from helpers.tiny_training import SIDE, a_fake, a_run, small_scenes
 
 from dase.kernels import autograd_training as bridge
 from dase.learning import patch_hash, scene_batches
@@ -30,33 +30,15 @@ from dase.learning.targets import (
     simulate,
     vary,
 )
-from dase.learning.training import Recipe, Training, prior
+from dase.learning.training import Recipe, prior
 from dase.networks.threshold_network import Maps, NetworkShape, ThresholdNet, edge_strength, look_up
-from dase.scenes import image_sources
 from dase.scenes.image_sources import Picture
 from dase.scenes.layers import Layer, LayerScene, Motion
-
-SIDE = 48
-TINY = NetworkShape(channels=4, depth=1)
-
-
-def small_scenes() -> scene_batches.Scenery:
-    looks = scene_batches.Looks(width=SIDE, height=SIDE, samples=6, regime="variety")
-    return scene_batches.Scenery(image_sources.open_images("builtin"), looks, backgrounds=6, objects=8)
 
 
 @pytest.fixture(scope="module")
 def scenes() -> scene_batches.Scenery:
     return small_scenes()
-
-
-def a_run(scenes: scene_batches.Scenery, **changes) -> Training:
-    recipe = Recipe(objective="moments", steps=40, warmup=6, batch=4, ramp=5, network=TINY, rate=1e-4)
-    target = Endless(scenes, TRUTHS["uniform"](), seed=9)
-    return Training(replace(recipe, **changes), target, scenes)
-
-
-WGAN = dict(objective="wgan", anchor=5.0, hash=Hash(size=16, orientations=2, coherence=1, contrast=2))
 
 
 def test_batches_show_what_layer_scenes_show(scenes):
@@ -193,11 +175,6 @@ def test_counts_answer_as_central_differences_say(scenes, rng):
     want = (ends[0].square() - ends[1].square()).mean() / (2 * math.sinh(0.1))
     # spread and level scale together, but where the floor cuts
     torch.testing.assert_close(slope, want, rtol=2e-2, atol=1e-3)
-
-
-def a_fake(training):
-    log = training.scenery.draw(training.scenes, training.recipe.batch)
-    return training._fake(log, training.step)[0]
 
 
 def test_newton_knows_how_moments_move(scenes):

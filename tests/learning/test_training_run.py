@@ -7,7 +7,7 @@ import re
 import numpy as np
 import pytest
 import torch
-from test_training import SIDE, WGAN, a_fake, a_run, small_scenes
+from helpers.tiny_training import SIDE, WGAN, a_fake, a_run, small_scenes
 
 from dase.errors import InputError
 from dase.learning import cuda_graph, scene_batches
