@@ -55,6 +55,25 @@ SHAPE_OR_UNIT = re.compile(
 ARRAYS = r"ndarray|NDArray|ArrayLike|Tensor|wp\.array\w*|array[1-4]d"
 """Names of types of arrays, besides those that the tree gives them itself."""
 
+FLOORS: tuple[tuple[tuple[str, ...], str], ...] = (
+    (("cli",), "Commands may use everything; nothing uses them."),
+    (("datasets",), "Whole data sets are written with all of the below, pictures included."),
+    (("figures",), "Pictures and pages show what was found; nothing that is computed depends on them."),
+    (("diagnosis",), "What a model lacks is asked with many fits."),
+    (("fitting",), "Parameters are fitted by simulating many models and comparing statistics."),
+    (("results", "learning"), "Results hold sensors; learning makes thresholds for them, without any fit."),
+    (("simulation",), "A sensor puts effects together and runs them over a scene."),
+    (("probes", "effects"), "An effect knows scenes and kernels, not the sensor; a statistic only events."),
+    (("recordings", "scenes"), "What a camera wrote, and what a camera looks at, both from files or made."),
+    (("io", "networks", "presets"), "Files know events, not what they are used for."),
+    (
+        ("events", "formatting", "atomic_file"),
+        "What everybody speaks of: events, readable numbers, whole files.",
+    ),
+    (("errors", "version", "kernels"), "Kernels know nothing of dase, so that each can be read by itself."),
+)
+"""Packages from top to bottom, and why they lie there; imports go down, never up or sideways."""
+
 Function = ast.FunctionDef | ast.AsyncFunctionDef
 
 
@@ -114,6 +133,12 @@ def module_name(path: Path) -> str:
     parts = path.with_suffix("").parts
     parts = parts if parts[0] == "dase" else ("dase", *parts)
     return ".".join(parts[:-1] if parts[-1] == "__init__" else parts)
+
+
+def floor_of(module: str) -> int:
+    """Return the floor of a module, 0 for the highest; `dase` itself, which lends out names, is above."""
+    part = module.split(".")[1] if "." in module else module
+    return next((k for k, (names, _) in enumerate(FLOORS) if part in names), -1)
 
 
 def package_of(path: Path) -> str:

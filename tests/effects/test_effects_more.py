@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import importlib.util
 from pathlib import Path
 
 import numpy as np
 import pytest
 from helpers.event_comparison import by_pixel, rows, same
+from helpers.scripts import load_script
 from helpers.sensors import FURTHER, STRONG, counts, every
 from helpers.small_scenes import flicker, static, still
 from reference import effects as reference_effects
@@ -236,23 +236,14 @@ def test_every_preset_simulates(device, rng, name):
     assert 0.2 < events.p.mean() < 0.8
 
 
-def script(path: str):
-    """Return a script of the checkout as a module."""
-    file = Path(__file__).parents[2] / path
-    spec = importlib.util.spec_from_file_location(file.stem, file)
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
-
-
 def test_the_page_of_effects_is_that_of_the_code():
     page = (Path(__file__).parents[2] / "docs" / "effects.md").read_text("utf-8")
-    assert page == script("docs/effects.py").page(), "run python docs/effects.py"
+    assert page == load_script("docs/effects.py").page(), "run python docs/effects.py"
 
 
 @pytest.mark.parametrize(("level", "pixels"), [("0.1lux", 600), ("161lux", 900), ("3klux", 900)])
 def test_noise_is_like_that_of_a_camera(shared, level, pixels):
-    noise = script("perf/experiments/noise/run.py")
+    noise = load_script("perf/experiments/noise/run.py")
     sensor = parse_sensor(noise.SENSOR, "sensor")
     want = noise.measured(shared / "recordings" / "noise_iebcs.npz")[level]
     got = noise.simulated(sensor, level, pixels=pixels)
