@@ -86,9 +86,11 @@ def test_what_chance_does_as_well_is_not_judged(search, lacks):
         evidence, model, LIBRARY, names, repeats=repeats, worst=(), seed=1, report=lambda text, share: None
     )
     assert {t.name for t in tried} == set(names)
-    assert all((t.judged is not None) <= (t.p_value <= candidates.SIGNIFICANT) for t in tried)
+    for one in tried:
+        assert one.judged is None or one.p_value <= candidates.SIGNIFICANT
     if lacks:
         assert tried[0].name == "mismatch"
+        assert tried[0].judged is not None
         assert tried[0].p_value == pytest.approx(1 / 61)
         assert tried[0].error < 0.8
     else:

@@ -242,11 +242,20 @@ def test_threads_do_not_change_gradients(rng):
             torch.testing.assert_close(g, w, rtol=1e-4, atol=1e-4 * w.abs().max().item())
 
 
-def test_places_that_are_not_numbers_stay_inside_the_textures(device, rng):
+@pytest.mark.parametrize("value", [1e30, -1e30, math.nan, math.inf])
+def test_places_out_of_reach_stay_inside_the_textures(device, rng, value):
     textures, place = random_scene(rng, 2, device)
-    for value in (math.nan, math.inf, 1e30):
-        lost = torch.full_like(place, value).requires_grad_()
-        render(textures, lost, width=WIDTH, height=HEIGHT).sum().backward()
+    *leaves, lost = leaves_of(textures, torch.full_like(place, value))
+    frames = render(textures, lost, width=WIDTH, height=HEIGHT)
+    of_background, *of_foregrounds, _ = torch.autograd.grad(frames.sum(), [*leaves, lost])
+    for gradient in of_foregrounds:  # foregrounds are nowhere in the picture
+        torch.testing.assert_close(gradient, torch.zeros_like(gradient))
+    if math.isfinite(value):  # the folded background is everywhere: each pixel shows texels of weight 1
+        assert of_background.sum().item() == pytest.approx(frames.numel())
+        without = render(textures[:1], lost[:, :1], width=WIDTH, height=HEIGHT)
+        torch.testing.assert_close(frames, without, rtol=0, atol=0)
+    else:  # said, not hidden: 0 · ∞ is no number either
+        assert frames[:, 0, 0].isnan().all()
 
 
 @pytest.mark.parametrize(
