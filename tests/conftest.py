@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import os
 from pathlib import Path
 
 import numpy as np
 import pytest
+from helpers.scripts import load_script
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
@@ -29,10 +29,9 @@ def rng(request: pytest.FixtureRequest) -> np.random.Generator:
 def shared() -> Path:
     """Folder of recordings and photographs that are no part of the project; skips where it is absent.
 
-    `DASE_DATA` names it; without it, it is the folder `shared` beside the checkout.
+    `DASE_DATA` names it, see perf/data_folder.py.
     """
-    beside = Path(__file__).parents[2] / "shared"
-    path = Path(os.environ.get("DASE_DATA", beside))
-    if not (path / "photos").is_dir():
+    path = load_script("perf/data_folder.py").data_folder()
+    if path is None or not (path / "photos").is_dir():
         pytest.skip("needs recordings and photographs that are no part of the project: set DASE_DATA")
     return path

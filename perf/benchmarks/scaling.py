@@ -32,7 +32,8 @@ import dase
 from dase.effects.threshold import Threshold
 from dase.kernels import launch
 from dase.scenes.scene import Scene
-from dase.simulation.sensor import Pixels, Sensor
+from dase.simulation.pixel_array import Pixels
+from dase.simulation.sensor import Sensor
 from dase.simulation.sensor_file import load_sensor
 from perf.benchmarks import numpy_baseline, scaling_page
 from perf.benchmarks.kernels import Stored, bench_counts, commit, moving_layers
