@@ -22,7 +22,7 @@ lint: .venv/ready
 	$(BIN)/mypy
 
 perf: .venv/ready
-	$(BIN)/python -m perf.benchmarks.kernels
+	$(BIN)/python -m perf.benchmarks
 
 clean:
 	rm -rf .venv build dist *.egg-info out

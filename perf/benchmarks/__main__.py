@@ -32,7 +32,7 @@ def main() -> None:
         )
         if done.returncode:
             raise SystemExit(f"perf.benchmarks.{name} ended with status {done.returncode}")
-    print(f"\n{time.perf_counter() - begin:.0f} s in all, what was compiled for the first time among them")
+    print(f"\n{time.perf_counter() - begin:.0f} s in all, with what was compiled for the first time")
 
 
 if __name__ == "__main__":

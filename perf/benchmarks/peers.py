@@ -177,8 +177,11 @@ def main() -> None:
     peers: dict[str, Path | None] = {"dase": None, "numpy": None}
     for name in ("v2e", "openeb", "esim"):
         given = getattr(options, name)
-        if given or find_spec(INSTALLED[name]):
-            peers[name] = given if isinstance(given, Path) else None
+        installed = find_spec(INSTALLED[name])
+        if isinstance(given, Path):
+            peers[name] = given
+        elif installed is not None and installed.origin is not None:
+            peers[name] = Path(installed.origin).parents[1]
         else:
             print(f"{name}: neither given nor installed")
     lines = []
