@@ -33,6 +33,7 @@ def folder(tmp_path_factory) -> Path:
     return path
 
 
+@pytest.mark.slow
 def test_commands(folder):
     lines = [line for block in blocks("sh")[1:] for line in block.splitlines()]
     for line in lines:
