@@ -3,16 +3,16 @@
 from __future__ import annotations
 
 import ast
+import json
 import subprocess
 import sys
 import tomllib
-from pathlib import Path
 
 import pytest
+from helpers.scripts import ROOT, load_script
+from PIL import Image
 
 import dase
-
-ROOT = Path(__file__).parents[2]
 
 
 def declared() -> dict:
@@ -53,3 +53,14 @@ def test_help_loads_nothing_heavy():
 def test_kernels_refuse_a_second_name():
     done = subprocess.run([sys.executable, "-c", "import kernels"], cwd=ROOT, capture_output=True, text=True)
     assert "import dase.kernels, not kernels" in done.stderr
+
+
+def test_the_page_of_the_architecture_is_that_of_the_code():
+    script = load_script("docs/architecture.py")
+    page = (ROOT / "docs" / "architecture.md").read_text("utf-8")
+    assert page == script.page(), "run python docs/architecture.py"
+    with Image.open(ROOT / "docs" / "architecture.png") as picture:
+        drawn = json.loads(picture.text["Description"])["packages"]
+    assert drawn == sorted(script.find_packages()), "run python docs/architecture.py"
+    for steps in script.WAYS.values():
+        assert set(dict(steps)) <= set(drawn)
