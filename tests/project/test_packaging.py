@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ast
 import json
+import re
 import subprocess
 import sys
 import tomllib
@@ -64,3 +65,22 @@ def test_the_page_of_the_architecture_is_that_of_the_code():
     assert drawn == sorted(script.find_packages()), "run python docs/architecture.py"
     for steps in script.WAYS.values():
         assert set(dict(steps)) <= set(drawn)
+
+
+def test_hooks_run_what_make_lint_runs():
+    recipe = (ROOT / "Makefile").read_text().split("\nlint: .venv/ready\n")[1].split("\n\n")[0]
+    commands = [line.strip().replace("$(BIN)", ".venv/bin") for line in recipe.splitlines()]
+    hooks = (ROOT / ".pre-commit-config.yaml").read_text()
+    assert re.findall(r"entry: (.*)", hooks) == commands
+
+
+@pytest.mark.parametrize("page", ["CONTRIBUTING.md", "docs/architecture.md"])
+def test_pages_for_contributors_name_what_is_there(page):
+    text = (ROOT / page).read_text("utf-8")
+    named = set(re.findall(r"`((?:dase|kernels|cli|tests|perf|docs)/[\w/.]*)`", text))
+    assert not [name for name in named if "NAME" not in name and not (ROOT / name).exists()]
+    folder = (ROOT / page).parent
+    assert not [to for to in re.findall(r"\]\(([^)#:]+)\)", text) if not (folder / to).exists()]
+    targets = set(re.findall(r"^([\w-]+):", (ROOT / "Makefile").read_text(), flags=re.MULTILINE))
+    asked = set(re.findall(r"^(?:JOBS=4 )?make ([a-z-]+)", text, flags=re.MULTILINE))
+    assert asked <= targets
