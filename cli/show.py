@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 )
 @click.option("--size", callback=parse_size, metavar="WxH", help="Columns x rows.  [default: as FILE says]")
 @click.option("--trust", is_flag=True, help="Show how far the scene between the frames can be trusted.")
-def command(
+def show_command(
     file: Path,
     output: Path | None,
     at: float | None,
@@ -66,7 +66,7 @@ def command(
         figure = event_images.draw(sequence, title=file.stem, at=at, window=window)
         with io.replacing(output) as temporary:
             figure.savefig(temporary)
-    for name, value in summary.table(event_images.statistics(sequence)):
+    for name, value in summary.statistics_table(event_images.sequence_statistics(sequence)):
         click.echo(f"{name:<18}{value}")
     click.echo(f"{'written':<18}{output}")
 

@@ -17,8 +17,8 @@ from dase.probes.stimulus import COARSEST, Trust
 from dase.results import Comparison, Diagnosis, Fit
 from dase.scenes.between_frames import CameraScene
 from dase.scenes.frame_alignment import PARTS, align
-from dase.scenes.frame_denoising import steady
-from dase.scenes.frame_motion import stretched, stretches
+from dase.scenes.frame_denoising import denoise_resting_pixels
+from dase.scenes.frame_motion import estimate_stretches, is_stretched
 from dase.scenes.scene import Scene
 from dase.scenes.video import VideoScene, open_video
 
@@ -161,11 +161,11 @@ def camera_scene(
     """
     gains = None
     scene = CameraScene(frames, begin, end)
-    if stretched(frames):
-        gains = stretches([scene.intensity(k) for k in range(len(scene))])
+    if is_stretched(frames):
+        gains = estimate_stretches([scene.intensity(k) for k in range(len(scene))])
         notes.append("each frame was stretched to the full range of grey: undone as far as they tell")
         scene = CameraScene(frames, begin, end, gains=gains)
-    return CameraScene(steady(frames), begin, end, gains=gains) if rests(scene) else scene
+    return CameraScene(denoise_resting_pixels(frames), begin, end, gains=gains) if rests(scene) else scene
 
 
 def rests(scene: CameraScene) -> bool:

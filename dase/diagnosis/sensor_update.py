@@ -6,7 +6,7 @@ from dataclasses import replace
 
 from dase.results import Diagnosis, Fit
 from dase.simulation.sensor import Sensor
-from dase.simulation.sensor_edit import SensorText, today
+from dase.simulation.sensor_edit import SensorText, history_entry_today
 
 
 def rounded(sensor: Sensor, digits: int = 4) -> Sensor:
@@ -24,7 +24,7 @@ def fitted(text: SensorText, found: Fit, recording: str) -> SensorText:
         "error_after": round(found.error, 3),
         "floor": found.floor,
     }
-    return text.became(rounded(found.sensor)).noted(today("fit", recording=recording, **facts))
+    return text.became(rounded(found.sensor)).noted(history_entry_today("fit", recording=recording, **facts))
 
 
 def diagnosed(text: SensorText, found: Diagnosis, recording: str) -> SensorText:
@@ -34,5 +34,5 @@ def diagnosed(text: SensorText, found: Diagnosis, recording: str) -> SensorText:
     errors = [round(error, 3) for error in (found.before, *found.errors)]
     for did, before, after in zip(steps, errors, errors[1:], strict=False):
         facts = {"error_before": before, "error_after": after, "floor": found.floor}
-        text = text.noted(today(did, recording=recording, **facts))
+        text = text.noted(history_entry_today(did, recording=recording, **facts))
     return text

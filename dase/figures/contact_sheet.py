@@ -18,7 +18,7 @@ from dase.figures.style import OFF, ON
 from dase.formatting import seconds
 from dase.io.sequence import Sequence
 from dase.recordings.statistics import Statistics
-from dase.recordings.summary import table
+from dase.recordings.summary import statistics_table
 
 INK, QUIET = "#2b2b2b", "#8a8a8a"
 
@@ -104,7 +104,7 @@ def paper(wide: float, tall: float) -> tuple[Figure, Callable[[float, float, flo
 
 def _header(figure: Figure, s: Statistics, title: str, window: float, note: str) -> None:
     tall = figure.get_figheight()
-    rows = dict(table(s))
+    rows = dict(statistics_table(s))
     facts = [f"{s.width} × {s.height} pixels", seconds(s.duration), f"{rows['events']} events"]
     facts += [f"{rows['ON share']} ON"] if s.events else []
     facts += [note] if note else []

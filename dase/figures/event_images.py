@@ -15,7 +15,7 @@ from dase.events import Events
 from dase.figures.style import OFF, ON
 from dase.io.sequence import Sequence, replacing
 from dase.recordings.statistics import Statistics as Statistics
-from dase.recordings.statistics import statistics as statistics
+from dase.recordings.statistics import sequence_statistics as sequence_statistics
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -102,7 +102,7 @@ def draw(
     dots = 360 if len(times) > 1 else 1300  # dots across a picture that stay visible on the sheet
     shrink = math.ceil(sequence.events.width / dots)
     panels = [panel(sequence, time, window, shrink=shrink) for time in times]
-    return contact_sheet.draw(sequence, statistics(sequence), between, panels, times, window, title)
+    return contact_sheet.draw(sequence, sequence_statistics(sequence), between, panels, times, window, title)
 
 
 def panel(sequence: Sequence, time: float, window: float, *, shrink: int = 1) -> NDArray[np.uint8]:

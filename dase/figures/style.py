@@ -25,7 +25,7 @@ from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 from numpy.typing import NDArray
 
 from dase.recordings.statistics import Statistics as Statistics
-from dase.recordings.statistics import statistics as statistics
+from dase.recordings.statistics import sequence_statistics as sequence_statistics
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

@@ -20,7 +20,7 @@ from dase.learning.scene_batches import LOG_EPS, Looks, Scenery
 from dase.learning.targets import Finite, Pairs
 from dase.recordings.recording import Recording, open_recording
 from dase.scenes.between_frames import TOLERANCE, CameraScene
-from dase.scenes.frame_motion import stretched, stretches
+from dase.scenes.frame_motion import estimate_stretches, is_stretched
 
 FEWEST = 0.005
 """Fewest events per pixel and window from which anything can be learned."""
@@ -110,9 +110,9 @@ def _scene_of(recording: Recording) -> CameraScene:
             "the frames of the recording have no times, so they cannot be laid beside the events"
         )
     scene = CameraScene(recording.frames, begin, recording.frame_end)
-    if not stretched(recording.frames):
+    if not is_stretched(recording.frames):
         return scene
-    gains = stretches([scene.intensity(k) for k in range(len(scene))])
+    gains = estimate_stretches([scene.intensity(k) for k in range(len(scene))])
     return CameraScene(recording.frames, begin, recording.frame_end, gains=gains)
 
 

@@ -21,14 +21,14 @@ FLIPS = 0.9  # share of successive events that differ in polarity
 CLIPPED = 0.3  # share of black and white pixels in frames
 
 
-def doubts(s: Statistics) -> list[Note]:
+def find_anomalies(s: Statistics) -> list[Note]:
     """Return what looks odd, as notes of the kind "odd"."""
     if not s.events:
         return [Note("there are no events", "odd", "empty")]
-    return [*_polarity(s), *_places(s), *_times(s), *_frames(s)]
+    return [*_polarity_anomalies(s), *_place_anomalies(s), *_time_anomalies(s), *_frame_anomalies(s)]
 
 
-def _polarity(s: Statistics) -> Iterator[Note]:
+def _polarity_anomalies(s: Statistics) -> Iterator[Note]:
     if s.events >= 100 and not 1 - ONE_SIDED <= s.on_share <= ONE_SIDED:
         name, share = ("ON", s.on_share) if s.on_share > 0.5 else ("OFF", 1 - s.on_share)
         text = f"{percent(share)} of the events are {name}: their polarity may be lost"
@@ -39,7 +39,7 @@ def _polarity(s: Statistics) -> Iterator[Note]:
         yield Note(text, "odd", "flips")
 
 
-def _places(s: Statistics) -> Iterator[Note]:
+def _place_anomalies(s: Statistics) -> Iterator[Note]:
     x, y, width, height = s.active
     inside = s.silent_pixels - (s.width * s.height - width * height)
     if inside < 0.5 * width * height:
@@ -54,7 +54,7 @@ def _places(s: Statistics) -> Iterator[Note]:
         yield Note(text, "odd", "hot", s.hot_pixels)
 
 
-def _times(s: Statistics) -> Iterator[Note]:
+def _time_anomalies(s: Statistics) -> Iterator[Note]:
     if s.interval_low <= FASTEST:
         text = f"more than 1 % of the times between events of one pixel are {seconds(FASTEST)} or less"
         yield Note(text, "odd", "fast")
@@ -70,7 +70,7 @@ def _times(s: Statistics) -> Iterator[Note]:
         yield Note(text, "odd", "coarse")
 
 
-def _frames(s: Statistics) -> Iterator[Note]:
+def _frame_anomalies(s: Statistics) -> Iterator[Note]:
     if not s.frames:
         return
     if math.isnan(s.frame_interval) and s.frames > 1:

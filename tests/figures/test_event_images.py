@@ -44,7 +44,7 @@ BY_HAND = [(0.0, 0, 0, 1), (0.1, 2, 1, 0), (0.4, 0, 0, 1), (0.5, 0, 0, 0), (1.1,
 
 
 def test_statistics_by_hand():
-    got = event_images.statistics(Sequence(stream(BY_HAND, 3, 2)))
+    got = event_images.sequence_statistics(Sequence(stream(BY_HAND, 3, 2)))
     between = sorted(event_images.intervals(stream(BY_HAND, 3, 2)))
     np.testing.assert_allclose(between, [0.1, 0.4, 1.0])
     assert (got.width, got.height, got.frames, got.events) == (3, 2, 0, 6)
@@ -70,7 +70,9 @@ def test_intervals_equal_a_loop_over_pixels(rng):
 def test_frames_lengthen_the_duration():
     frames = np.zeros((2, 2, 3), np.uint8)
     assert (
-        event_images.statistics(Sequence(stream(BY_HAND, 3, 2), frames, np.array([-1.0, 3.0]))).duration
+        event_images.sequence_statistics(
+            Sequence(stream(BY_HAND, 3, 2), frames, np.array([-1.0, 3.0]))
+        ).duration
         == 4.0
     )
 
@@ -78,10 +80,10 @@ def test_frames_lengthen_the_duration():
 def test_nothing_to_count():
     for events in (Events.empty(3, 2), stream(BY_HAND[:1], 3, 2)):
         sequence = Sequence(events)
-        got = event_images.statistics(sequence)
+        got = event_images.sequence_statistics(sequence)
         assert math.isnan(got.interval_median)
         assert got.silent_pixels == 6 - len(events)
-        assert dict(summary.table(got))["interval, median"] == "unknown"
+        assert dict(summary.statistics_table(got))["interval, median"] == "unknown"
         figure = event_images.draw(sequence)
         figure.canvas.draw()
 
@@ -212,11 +214,11 @@ def test_command(tmp_path, rng):
 def test_ten_million_events_take_seconds(rng):
     sequence = random_sequence(rng, 10_000_000, frames=0, width=640, height=480, end=10.0)
     begin = time.perf_counter()
-    event_images.statistics(sequence)
+    event_images.sequence_statistics(sequence)
     assert time.perf_counter() - begin < 10.0
 
 
 def test_shared_recording(shared):
-    got = event_images.statistics(io.read(shared / "recordings" / "dvx_noise_static.npz"))
+    got = event_images.sequence_statistics(io.read(shared / "recordings" / "dvx_noise_static.npz"))
     assert 0.2 < got.on_rate + got.off_rate < 1.0
     assert got.busiest_rate > 1000.0  # its stuck pixel

@@ -14,7 +14,7 @@ from click.testing import CliRunner
 from helpers import sample_files as reference_io
 
 from dase import io
-from dase.cli import group
+from dase.cli import dase_group
 from dase.io.format import Format
 
 ROOT = Path(__file__).parents[2]
@@ -90,7 +90,7 @@ def test_command(tmp_path, rng, monkeypatch, line):
         pytest.importorskip("rosbags")
     make(path, rng)
     monkeypatch.chdir(tmp_path)
-    done = CliRunner().invoke(group, words[1:])
+    done = CliRunner().invoke(dase_group, words[1:])
     assert done.exit_code == 0, done.output
     assert io.find(path).name == NAMES[path.name]
     if words[1] == "info":
