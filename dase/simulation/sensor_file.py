@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from importlib import resources
+from os import PathLike, fspath
 from pathlib import Path
 from typing import Any
 
@@ -35,6 +36,27 @@ def load_sensor(spec: str | Path, effects: Mapping[str, type[Effect]] = EFFECTS)
         InputError: No such preset or file, not TOML, or a name or value that does not exist.
     """
     return parse_sensor(*read_sensor(spec), effects).located(Path(spec).parent)
+
+
+def as_sensor(sensor: Sensor | str | PathLike[str]) -> Sensor:
+    """Return a sensor however it is given: as it is, or loaded.
+
+    Every function that users call takes its sensor through this one.
+
+    Args:
+        sensor: A `Sensor`, the name of a preset, or the path of a sensor file.
+
+    Raises:
+        InputError: It is none of these, or as `load_sensor`.
+    """
+    if isinstance(sensor, Sensor):
+        return sensor
+    if isinstance(sensor, str | PathLike):
+        return load_sensor(fspath(sensor))
+    raise InputError(
+        "sensor: must be a dase.Sensor, the name of a preset or the path of a sensor file, "
+        f"got {type(sensor).__name__}"
+    )
 
 
 def read_sensor(spec: str | Path) -> tuple[str, str]:

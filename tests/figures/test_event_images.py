@@ -195,7 +195,7 @@ def test_every_event_is_in_one_picture_of_the_video(rng):
 
 
 def test_command(tmp_path, rng):
-    command = importlib.import_module("dase.cli.show").command
+    command = importlib.import_module("dase.cli.show").show_command
     io.write(tmp_path / "a.h5", random_sequence(rng))
     done = CliRunner().invoke(command, [str(tmp_path / "a.h5")])
     assert done.exit_code == 0, done.output

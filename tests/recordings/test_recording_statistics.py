@@ -234,7 +234,7 @@ def test_memory_does_not_grow_with_the_recording(rng):
 def test_info_prints_and_writes_json(tmp_path, rng):
     import importlib
 
-    command = importlib.import_module("dase.cli.info").command
+    command = importlib.import_module("dase.cli.info").info_command
     e = some(rng, 5000, 64, 48)
     (tmp_path / "a.txt").write_text(
         "".join(f"{t:.6f} {x} {y} 1\n" for t, x, y in zip(e.t, e.x, e.y, strict=True))
