@@ -135,7 +135,7 @@ def _synth_video(
     from dase.datasets import generate
     from dase.scenes.video import open_video
     from dase.simulation.sensor_file import load_sensor
-    from dase.simulation.simulate import sample_times
+    from dase.simulation.sensor_run import sample_times
     from dase.simulation.user_effects import known_effects
 
     model = load_sensor(sensor, known_effects(effects))

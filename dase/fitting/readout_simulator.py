@@ -21,9 +21,8 @@ from dase.kernels import launch, pixel_stages
 from dase.probes.stimulus import Stimulus
 from dase.probes.timestamp_patterns import Structure
 from dase.scenes.scene import Scene
-from dase.simulation.pixel_array import PixelArray
-from dase.simulation.readout_chain import split_by_row
 from dase.simulation.sensor import Sensor
+from dase.simulation.sensor_run import SensorRun
 
 ROOM = {"cpu": 2048, "cuda": 64}
 """Events per pixel that there is room for: a model that sends more is run again. On a CPU room costs nothing
@@ -68,16 +67,11 @@ def emitted(
     kind = "cuda" if stimulus.device.is_cuda else "cpu"
 
     def out(rows: slice) -> list[Events]:
-        array = PixelArray(
-            bare, stimulus.width, stimulus.height, pixels=stimulus.pixels, parameters=vectors[rows],
-            seed=int(seeds[rows.start]), device=str(stimulus.device), room=ROOM[kind],
-        )  # fmt: skip
-        scene = _Light(stimulus)
-        parts = [
-            split_by_row(*found, array.batch) for found in (array.emit(scene, scene.times), array.flush())
-        ]
-        # hardly any effect holds events back
-        return [Events.concatenate(row) if len(row[1]) else row[0] for row in zip(*parts, strict=True)]
+        return SensorRun(
+            _Light(stimulus), bare, pixels=stimulus.pixels, parameters=vectors[rows],
+            seed=int(seeds[rows.start]), device=str(stimulus.device), events_per_pixel=ROOM[kind],
+            chunk=stimulus.grid.steps,
+        ).events()  # fmt: skip
 
     if kind == "cuda" and np.all(seeds == seeds[0]):
         return out(slice(0, len(seeds)))

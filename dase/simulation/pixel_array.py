@@ -33,7 +33,7 @@ class PixelArray:
         seed: Of every random number.
         device: `cpu`, `cuda` or a Warp name.
         labels: Whether events are marked with what they came from.
-        room: Events per pixel of a chunk that there is room for at first; with more, it runs again.
+        events_per_pixel: Room for events of a chunk at first; a chunk with more runs again with more room.
     """
 
     def __init__(
@@ -47,7 +47,7 @@ class PixelArray:
         seed: int = 0,
         device: str = "cpu",
         labels: bool = False,
-        room: int = 4,
+        events_per_pixel: int = 4,
     ):
         try:
             self.device = launch.device(device)
@@ -84,7 +84,7 @@ class PixelArray:
         self.samples = 0
         self.begin = 0.0
         self.slab = 256 if self.device.is_cuda else 2048
-        self._capacity = room * self.slab
+        self._capacity = events_per_pixel * self.slab
         self._buffer: Any = None  # of keys, kept from chunk to chunk
         self._room = ordering.Room()
         # nothing but a change detector: counted by a kernel of its own, several pixels per thread
