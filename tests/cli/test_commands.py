@@ -123,7 +123,7 @@ def test_synth_then_show(tmp_path):
     assert shown.returncode == 0, shown.stderr
     assert cv2.imread(str(out / "sequence_00000.png")) is not None
     # a second run must not overwrite the first
-    assert "--resume" in one_sentence(dase("synth", out, *SMALL))
+    assert "resume it" in one_sentence(dase("synth", out, *SMALL))
     assert "other options" in one_sentence(dase("synth", out, *SMALL, "--resume", "--seed", "9"))
 
 
