@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from dase.cli.options import effects_option, sensor_output
+from dase.cli.options import device_option, effects_option, sensor_output
 
 if TYPE_CHECKING:
     from dase.effects import Effect
@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     show_default=True,
     help="What the camera saw in RECORDING: its own frames, a video FILE, or static.",
 )
-@click.option("--device", default="cpu", show_default=True, help="cpu or cuda.")
+@device_option
 @click.option("--seed", default=0, show_default=True, help="The same seed gives the same fit.")
 @sensor_output
 @effects_option

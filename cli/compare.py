@@ -7,7 +7,14 @@ from pathlib import Path
 
 import click
 
-from dase.cli.options import check_suffix, effects_option, fps_option, open_recorded, scene_option
+from dase.cli.options import (
+    check_suffix,
+    device_option,
+    effects_option,
+    fps_option,
+    open_recorded,
+    scene_option,
+)
 
 
 @click.command()
@@ -25,7 +32,7 @@ from dase.cli.options import check_suffix, effects_option, fps_option, open_reco
 @fps_option
 @effects_option
 @click.option("--pixels", default=1500, show_default=True, help="In each half of the measurement.")
-@click.option("--device", default="cpu", show_default=True, help="cpu or cuda.")
+@device_option
 @click.option("--seed", default=0, show_default=True, help="The same seed gives the same numbers.")
 @click.option("--quiet", is_flag=True, help="No progress.")
 def compare_command(

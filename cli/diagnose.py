@@ -11,7 +11,14 @@ from typing import TYPE_CHECKING
 
 import click
 
-from dase.cli.options import check_suffix, effects_option, fps_option, open_recorded, scene_option
+from dase.cli.options import (
+    check_suffix,
+    device_option,
+    effects_option,
+    fps_option,
+    open_recorded,
+    scene_option,
+)
 
 if TYPE_CHECKING:
     from dase.results import Diagnosis
@@ -56,7 +63,7 @@ def print_explanation(ctx: click.Context, parameter: click.Parameter, value: str
 @fps_option
 @effects_option
 @click.option("--pixels", default=1500, show_default=True, help="In each half of the measurement.")
-@click.option("--device", default="cpu", show_default=True, help="cpu or cuda.")
+@device_option
 @click.option("--seed", default=0, show_default=True, help="The same seed gives the same findings.")
 @click.option("--quiet", is_flag=True, help="Only the finding, no progress.")
 @click.option("--explain", metavar="EFFECT", callback=print_explanation, expose_value=False,

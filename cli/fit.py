@@ -6,7 +6,7 @@ from pathlib import Path
 
 import click
 
-from dase.cli.options import effects_option, fps_option, open_recorded, scene_option
+from dase.cli.options import device_option, effects_option, fps_option, open_recorded, scene_option
 
 
 @click.command()
@@ -19,7 +19,7 @@ from dase.cli.options import effects_option, fps_option, open_recorded, scene_op
 @fps_option
 @effects_option
 @click.option("--pixels", default=1500, show_default=True, help="In each half of the measurement.")
-@click.option("--device", default="cpu", show_default=True, help="cpu or cuda.")
+@device_option
 @click.option("--seed", default=0, show_default=True, help="The same seed gives the same fit.")
 @click.option("--quiet", is_flag=True, help="No progress.")
 def fit_command(

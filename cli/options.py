@@ -58,6 +58,33 @@ sensor_output = click.option(
 """`-o FILE` of commands that write a sensor file; a command gets a path or None."""
 
 
+class _FirstSpelling(click.Option):
+    """An option whose help shows its first spelling only; the others are for those who know them."""
+
+    def get_help_record(self, ctx: click.Context) -> tuple[str, str] | None:
+        """Return the line of the help, with one name."""
+        spellings, self.opts = self.opts, self.opts[:1]
+        try:
+            return super().get_help_record(ctx)
+        finally:
+            self.opts = spellings
+
+
+device_option = click.option("--device", default="cpu", show_default=True, help="cpu or cuda.")
+"""`--device NAME`, where Warp kernels run; a command gets the name."""
+
+device_or_backend_option = click.option(
+    "--device",
+    "--backend",  # what these commands called it at first
+    "device",
+    cls=_FirstSpelling,
+    default="cpu",
+    show_default=True,
+    help="cpu or cuda.",
+)
+"""`--device NAME` of commands that also take it as `--backend`."""
+
+
 def check_suffix(*suffixes: str) -> Callable[[click.Context, click.Parameter, Path | None], Path | None]:
     """Return a callback that refuses another suffix, and a folder that is not there, before any work."""
 

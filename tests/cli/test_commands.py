@@ -72,7 +72,7 @@ def test_cuda_without_a_gpu(tmp_path):
 
     if wp.is_cuda_available():
         pytest.skip("needs a machine without a GPU")
-    assert "needs an NVIDIA GPU" in one_sentence(dase("synth", tmp_path / "out", *SMALL, "--backend", "cuda"))
+    assert "needs an NVIDIA GPU" in one_sentence(dase("synth", tmp_path / "out", *SMALL, "--device", "cuda"))
 
 
 @pytest.mark.parametrize(
@@ -246,3 +246,10 @@ def test_broken_files(tmp_path, name, content, message):
 def test_a_broken_file_is_one_sentence_and_exit_code_2(tmp_path):
     (tmp_path / "a.txt").write_bytes(BROKEN[5][1])
     assert BROKEN[5][2] in one_sentence(dase("info", tmp_path / "a.txt"))
+
+
+def test_help_shows_one_spelling_of_the_device():
+    for name in ("synth", "train", "demo"):
+        text = CliRunner().invoke(dase_group, [name, "--help"]).output
+        assert "--device" in text
+        assert "--backend" not in text
