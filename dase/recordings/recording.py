@@ -153,7 +153,7 @@ class Recording:
             float(begin),
             float(end),
             np.ones((sequence.events.height, sequence.events.width), np.bool_),
-            looked.hot(),
+            looked.hot_pixels(),
             RecordingReport((*said, *find_anomalies(found)), found),
             sequence.frames,
             times,
