@@ -24,7 +24,7 @@ class IntervalSettings:
     short: int = 1 << 16
     """Up to where whole microseconds are counted, for the period [us]."""
     nudge: float = 0.02
-    """Share of a bin that all are moved by: whole microseconds stay in one bin whatever their last bit says."""
+    """Share of a bin that all move by: whole microseconds stay in one bin whatever their last bit says."""
     mode_bins: int = 24
     """Bins per decade the most frequent interval is looked for in."""
     mode_share: float = 0.002
@@ -108,9 +108,8 @@ class IntervalStatistics:
         if counts.sum() < settings.fewest:
             return math.nan
         edges = settings.least * 10 ** (np.arange(len(counts) + 1) / settings.mode_bins)
-        at = int(
-            np.argmax(np.where(counts > settings.mode_share * counts.sum(), counts / np.diff(edges), 0.0))
-        )
+        filled = counts > settings.mode_share * counts.sum()
+        at = int(np.argmax(np.where(filled, counts / np.diff(edges), 0.0)))
         low, high = (round(edge * 1e6) for edge in (edges[at], edges[at + 1]))
         if low < 1 or high >= settings.short:
             return float(math.sqrt(edges[at] * edges[at + 1]))
@@ -136,11 +135,8 @@ class IntervalStatistics:
             if power[k] < 3 * float(np.median(around)):
                 continue  # a hump, no line
             tone = _refine_frequency(self._short, k)
-            shares = [
-                abs(_phase_coherence(self._short, m * tone))
-                for m in range(1, settings.harmonics + 1)
-                if m * k <= last
-            ]
+            tones = [m * tone for m in range(1, settings.harmonics + 1) if m * k <= last]
+            shares = [abs(_phase_coherence(self._short, one)) for one in tones]
             if min(shares) > settings.peak / 2:
                 return 1e-6 / tone, shares[0]
         return math.nan, math.nan

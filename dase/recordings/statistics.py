@@ -174,9 +174,8 @@ class RecordingSurvey:
     def _add_part(self, part: Events) -> None:
         t = part.t
         pixel = part.y.astype(np.int64) * self.width + part.x
-        key = (pixel << self.settings.place_bits) | np.arange(
-            len(t)
-        )  # one sort of 64 bits is faster than a stable one of pixels
+        # one sort of 64 bits is faster than a stable one of pixels
+        key = (pixel << self.settings.place_bits) | np.arange(len(t))
         key.sort()
         self._look_at_stamps(t)
         self._ask_whether_alone(part, key)

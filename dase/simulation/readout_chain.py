@@ -16,13 +16,6 @@ from dase.events import Events
 if TYPE_CHECKING:
     from dase.simulation.sensor import Sensor
 
-LONGEST_TIME = 4e6
-"""Readers reckon in whole picoseconds of 64 bits, which hold times up to this [s]."""
-
-
-PART = 1 << 17
-"""Events that go through the readers at once: few enough to be sorted within the caches."""
-
 
 class ReadoutChain:
     """The way out of a camera: its readout effects in the order in which the sensor has them.
@@ -35,9 +28,19 @@ class ReadoutChain:
         height: Rows of the sensor.
         pixels: How many pixels are simulated; None for all.
         seed: Of every random number.
+        part: Events that go through the effects at once: few enough to be sorted within the caches.
     """
 
-    def __init__(self, sensor: Sensor, width: int, height: int, *, pixels: int | None = None, seed: int = 0):
+    def __init__(
+        self,
+        sensor: Sensor,
+        width: int,
+        height: int,
+        *,
+        pixels: int | None = None,
+        seed: int = 0,
+        part: int = 1 << 17,
+    ):
         effects = [e for e in sensor.effects if isinstance(e, StreamEffect) and not e.is_off()]
         for effect in effects:
             if not effect.per_pixel and pixels not in (None, width * height):
@@ -45,6 +48,7 @@ class ReadoutChain:
                     f"effect '{effect.name}' needs all {width * height} pixels of the sensor, got {pixels}; "
                     "leave it out or simulate them all"
                 )
+        self._part = part
         self._empty = Events.empty(width, height)
         self._readers = [effect.reader(width, height, seed) for effect in effects]
 
@@ -58,20 +62,24 @@ class ReadoutChain:
         Returns:
             Events sorted by time; they follow those returned before.
         """
-        if self._readers and len(events) and max(-events.t[0], events.t[-1]) > LONGEST_TIME:
-            raise InputError(
-                f"readout effects need times within {LONGEST_TIME:g} s of 0, "
-                f"got {events.t[0]:g}..{events.t[-1]:g} s"
-            )
         if not self._readers:
             return events
+        latest = (
+            4e6  # [s] readers reckon in whole picoseconds of 64 bits, which hold some nine million seconds
+        )
+        if len(events) and max(-events.t[0], events.t[-1]) > latest:
+            raise InputError(
+                f"readout effects need times within {latest:g} s of 0, "
+                f"got {events.t[0]:g}..{events.t[-1]:g} s"
+            )
         out = []
-        for i in range(0, max(len(events), 1), PART):
-            end = float(events.t[i + PART]) if i + PART < len(events) else until
-            out.append(self._through(events.select(slice(i, i + PART)), end))
+        for i in range(0, max(len(events), 1), self._part):
+            # of a part, too, it is known that nothing earlier than the next event follows
+            end = float(events.t[i + self._part]) if i + self._part < len(events) else until
+            out.append(self._through_readers(events.select(slice(i, i + self._part)), end))
         return Events.concatenate(out)
 
-    def _through(self, events: Events, until: float) -> Events:
+    def _through_readers(self, events: Events, until: float) -> Events:
         for reader in self._readers:
             events, until = reader.push(events, until)
         return events

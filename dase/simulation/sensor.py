@@ -18,6 +18,7 @@ from dase.effects.threshold import Threshold
 from dase.errors import InputError
 from dase.kernels import pixel_stages
 from dase.scenes.scene import Scene
+from dase.scenes.video import LOG_EPS
 from dase.simulation.sensor_history import HistoryEntry
 
 
@@ -37,7 +38,7 @@ class Sensor:
     effects: tuple[Effect, ...] = (Threshold(),)
     name: str = "ideal"
     size: tuple[int, int] | None = None
-    log_eps: float = 1e-3
+    log_eps: float = LOG_EPS
     history: tuple[HistoryEntry, ...] = field(default=(), compare=False)
 
     def __post_init__(self) -> None:

@@ -14,6 +14,7 @@ from tomlkit.items import Table
 
 from dase.effects import EFFECTS, Effect, find
 from dase.errors import InputError, nearest
+from dase.scenes.video import LOG_EPS
 from dase.simulation.sensor import Sensor
 from dase.simulation.sensor_history import read_history
 
@@ -121,7 +122,7 @@ def _sensor_of_table(table: dict[str, Any], effects: Mapping[str, type[Effect]])
         plain["size"] = (size[0], size[1])
     if not isinstance(plain.get("name", ""), str):
         raise InputError(f"name must be a text, got {plain['name']!r}")
-    eps = plain.get("log_eps", 0.001)
+    eps = plain.get("log_eps", LOG_EPS)
     if isinstance(eps, bool) or not isinstance(eps, int | float):
         raise InputError(f"log_eps must be a number, got {eps!r}")
     return Sensor(effects=tuple(found), **{"name": "unnamed", **plain})
