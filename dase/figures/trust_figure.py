@@ -13,7 +13,7 @@ from dase.events import Events
 from dase.figures.event_images import overlay
 from dase.figures.style import OFF, ON
 from dase.formatting import seconds
-from dase.scenes.between_frames import RELATIVE, TOLERANCE, CameraScene
+from dase.scenes.between_frames import CameraScene, TrustSettings
 from dase.scenes.frame_motion import HOPELESS
 
 if TYPE_CHECKING:
@@ -133,8 +133,9 @@ def _header(figure: Figure, title: str, window: float, share: float) -> None:
     left, right = 0.4 / 11, 1 - 0.4 / 11
     figure.text(left, 1 - 0.3 / tall, title, fontsize=13, color=INK, weight="bold", va="center")
     facts = (
-        f"{100 * share:.0f} % of pixels and times trusted: expected error up to {TOLERANCE:g} log intensity "
-        f"or {100 * RELATIVE:.0f} % of the change"
+        f"{100 * share:.0f} % of pixels and times trusted: expected error up to "
+        f"{TrustSettings.tolerance:g} log intensity "
+        f"or {100 * TrustSettings.relative:.0f} % of the change"
     )
     figure.text(left, 1 - 0.57 / tall, facts, fontsize=9, color=INK, va="center")
     said = f"events of {seconds(window)} around each time"

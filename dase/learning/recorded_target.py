@@ -19,7 +19,7 @@ from dase.errors import InputError
 from dase.learning.scene_batches import LOG_EPS, Looks, Scenery
 from dase.learning.targets import Finite, Pairs
 from dase.recordings.recording import Recording, open_recording
-from dase.scenes.between_frames import TOLERANCE, CameraScene
+from dase.scenes.between_frames import CameraScene, TrustSettings
 from dase.scenes.frame_motion import estimate_stretches, is_stretched
 
 FEWEST = 0.005
@@ -51,7 +51,7 @@ def windows_of(
     *,
     window: float = 0.05,
     samples: int = 16,
-    tolerance: float = TOLERANCE,
+    tolerance: float = TrustSettings.tolerance,
     most: int | None = None,
     progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> Windows:

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from dase.errors import InputError, nearest
 from dase.kernels import autograd_training as bridge
 from dase.scenes import image_sources
-from dase.scenes.random_scenes import CLIP, MIXED, REGIME_NAMES, REGIMES, Regime
+from dase.scenes.random_scenes import MIXED, REGIME_NAMES, REGIMES, Regime
 
 BACKGROUND = (320, 480)
 """Rows and columns of the backgrounds in the pool [texel]."""
@@ -300,11 +300,11 @@ def _motions(
     angle = rng.uniform(0, 2 * np.pi, shape)
     turn = np.radians(spin) * rng.choice((-1, 1), shape) * window
     # a short window is a piece of S2R's clip, so that it does not zoom faster
-    begin = rng.uniform(0, CLIP - window, shape) if window < CLIP else np.zeros(shape)
+    begin = rng.uniform(0, Regime.clip - window, shape) if window < Regime.clip else np.zeros(shape)
     scales = []
     for _ in range(2):
         first, second = rng.uniform(low, high, shape), rng.uniform(low, high, shape)
-        ends = [first + (second - first) * t / max(CLIP, window) for t in (begin, begin + window)]
+        ends = [first + (second - first) * t / max(Regime.clip, window) for t in (begin, begin + window)]
         scales.append(np.stack(ends, -1))
     return Motions(
         np.stack([x - vx * when, x + vx * (window - when)], -1),

@@ -14,7 +14,7 @@ from dase.errors import InputError
 from dase.kernels import launch
 from dase.kernels import scene_layers as kernels
 from dase.scenes.image_sources import Picture
-from dase.scenes.scene import Scene
+from dase.scenes.scene import SamplingSettings, Scene
 
 Pair = tuple[float, float]
 
@@ -81,9 +81,9 @@ class LayerScene(Scene):
         width: int,
         height: int,
         duration: float,
-        travel: float = 0.5,
-        shortest: float = 1e-3,
-        longest: float = 1 / 72,
+        travel: float = SamplingSettings.travel,
+        shortest: float = SamplingSettings.shortest,
+        longest: float = SamplingSettings.longest,
     ):
         if not 1 <= len(layers) <= kernels.MAX_LAYERS:
             raise InputError(f"a scene needs 1 to {kernels.MAX_LAYERS} layers, got {len(layers)}")

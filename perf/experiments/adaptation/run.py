@@ -44,7 +44,7 @@ from dase.learning.training import Recipe, Training
 from dase.networks.threshold_network import NetworkShape
 from dase.recordings.recording import open_recording
 from dase.scenes import image_sources
-from dase.scenes.between_frames import TOLERANCE, CameraScene
+from dase.scenes.between_frames import CameraScene, TrustSettings
 from dase.simulation.sensor_file import load_sensor
 from perf.experiments.adaptation import jobs
 from perf.experiments.adaptation.rows import Planned, Row, plan, rows
@@ -136,7 +136,7 @@ def _probes(later: Any, name: str, net: Any, folder: Path) -> float:
 
     def trust(times: Any, pixels: Any) -> Any:
         at = np.clip(times, scene.times[0], scene.times[-1])
-        return scene.doubt(at, pixels=pixels) <= TOLERANCE
+        return scene.doubt(at, pixels=pixels) <= TrustSettings.tolerance
 
     return compare(later.events, scene, sensor, trust=trust, pixels=800).error
 
