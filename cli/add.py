@@ -59,12 +59,12 @@ def add_command(
     known = known_effects(effects)
     chosen = sensor_edit.parse_values(find(effect, known), values)
     text = sensor_edit.read_sensor_text(sensor, known)
-    more = text.added(chosen)
+    more = text.with_effect(chosen)
     entry = sensor_edit.history_entry_today(f"add {effect}")
     if recording is not None:
         fitted, entry = _fit_effect(text.sensor(), chosen, recording, scene, device, seed)
-        more = more.became(fitted)
-    sensor_edit.write_sensor_text(more.noted(entry), output)
+        more = more.describing(fitted)
+    sensor_edit.write_sensor_text(more.with_history(entry), output)
     if output is None:
         return
     click.echo(f"{output}: {effect} added ({describe_values(more.sensor()[effect])})")

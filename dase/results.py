@@ -108,7 +108,7 @@ class Comparison:
     def to_json(self) -> dict[str, Any]:
         """Return the numbers as JSON objects; figures are left out."""
         return {
-            "sensor": self.sensor.table(),
+            "sensor": self.sensor.to_table(),
             "error": self.error,
             "floor": self.floor,
             "gate": self.gate,
@@ -153,7 +153,7 @@ class Fit:
     def to_json(self) -> dict[str, Any]:
         """Return the numbers as JSON objects."""
         out = {name: getattr(self, name) for name in ("error", "before", "floor", "gate", "agree", "poor")}
-        out |= {"sensor": self.sensor.table(), "notes": list(self.notes)}
+        out |= {"sensor": self.sensor.to_table(), "notes": list(self.notes)}
         out |= {"parameters": {name: asdict(e) for name, e in self.parameters.items()}}
         return out | {"evaluations": self.evaluations, "seconds": self.seconds}
 
@@ -272,7 +272,7 @@ class Diagnosis:
             "ties": {name: list(others) for name, others in self.ties.items()},
             "unexplained": None if self.unexplained is None else asdict(self.unexplained),
             "history": [asdict(step) for step in self.history],
-            "sensor": self.sensor.table(),
+            "sensor": self.sensor.to_table(),
             "notes": list(self.notes),
             "evaluations": self.evaluations,
             "seconds": self.seconds,

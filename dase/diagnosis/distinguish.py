@@ -117,7 +117,7 @@ def _check(a: Sensor, b: Sensor, longest: float, pixels: int, repeats: int) -> t
 def _structure(models: tuple[Sensor, Sensor]) -> Structure:
     """Return the regularity of time stamps that a readout of the models makes, if a file could show it."""
     for model in models:
-        for effect in model.streams():
+        for effect in model.readout_effects():
             if isinstance(effect, Timestamp) and effect.step >= SHORTEST:
                 return Structure(step=effect.step)
             if isinstance(effect, RowScan):
@@ -160,7 +160,7 @@ class _Bench:
         cell[:, 0] = MASKED
         self.finer = finer
         # a readout that both have tells nothing
-        self.readout = set(models[0].streams()) != set(models[1].streams())
+        self.readout = set(models[0].readout_effects()) != set(models[1].readout_effects())
         structure = _structure(models) if self.readout else Structure()
         stimulus = Stimulus(chosen, width, height, grid, light, cell, log_eps, to)
         self.trials = Trials(stimulus, structure=structure)
@@ -213,7 +213,7 @@ class _Bench:
             vectors = np.repeat(vector[None], rows, 0)
             return self.trials.run(model, vectors, seed=seed, reseed=True, finer=self.finer)
         order = Order(model, np.repeat(vector[None], rows, 0), seed, reseed=True)
-        return self.trials.stream_all(order, [model.streams()] * rows)
+        return self.trials.stream_all(order, [model.readout_effects()] * rows)
 
     def _joined(self, sums: Sums) -> Sums:
         """Return recordings put together of their parts, whose pixels do not know of each other."""

@@ -24,15 +24,16 @@ def fitted(text: SensorText, found: Fit, recording: str) -> SensorText:
         "error_after": round(found.error, 3),
         "floor": found.floor,
     }
-    return text.became(rounded(found.sensor)).noted(history_entry_today("fit", recording=recording, **facts))
+    entry = history_entry_today("fit", recording=recording, **facts)
+    return text.describing(rounded(found.sensor)).with_history(entry)
 
 
 def diagnosed(text: SensorText, found: Diagnosis, recording: str) -> SensorText:
     """Return a sensor file with the effects that a diagnosis found, and the error after each as history."""
-    text = text.became(rounded(found.sensor))
+    text = text.describing(rounded(found.sensor))
     steps = ["fit", *(f"add {name}" for name in found.selected)]
     errors = [round(error, 3) for error in (found.before, *found.errors)]
     for did, before, after in zip(steps, errors, errors[1:], strict=False):
         facts = {"error_before": before, "error_after": after, "floor": found.floor}
-        text = text.noted(history_entry_today(did, recording=recording, **facts))
+        text = text.with_history(history_entry_today(did, recording=recording, **facts))
     return text

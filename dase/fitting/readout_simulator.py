@@ -41,7 +41,7 @@ def felt(stimulus: Stimulus, structure: Structure, sensor: Sensor) -> tuple[Stre
     fine = FELT * stimulus.grid.step
     lines = max(stimulus.width, stimulus.height)
     compared = structure.step > 0 or structure.line > 0
-    return tuple(e for e in sensor.streams() if compared or delay_of(e, lines) > fine)
+    return tuple(e for e in sensor.readout_effects() if compared or delay_of(e, lines) > fine)
 
 
 def clock_of(effects: tuple[StreamEffect, ...], structure: Structure) -> float | None:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,9 +11,7 @@ from numpy.typing import NDArray
 from dase.effects.stream import StreamEffect, nanoseconds
 from dase.errors import InputError
 from dase.events import Events
-
-if TYPE_CHECKING:
-    from dase.simulation.sensor import Sensor
+from dase.simulation.sensor import Sensor
 
 
 class ReadoutChain:

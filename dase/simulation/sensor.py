@@ -87,13 +87,13 @@ class Sensor:
         apart = (Threshold, SceneEffect, StreamEffect)
         return tuple(effect.compiled() for effect in self.effects if not isinstance(effect, apart))
 
-    def seen(self, scene: Scene) -> Scene:
+    def through_optics(self, scene: Scene) -> Scene:
         """Return what the pixels see of `scene`."""
         for effect in self.effects:
             scene = effect.seen(scene) if isinstance(effect, SceneEffect) else scene
         return scene
 
-    def streams(self) -> tuple[StreamEffect, ...]:
+    def readout_effects(self) -> tuple[StreamEffect, ...]:
         """Return the effects behind the pixels that are not off."""
         return tuple(e for e in self.effects if isinstance(e, StreamEffect) and not e.is_off())
 
@@ -112,7 +112,7 @@ class Sensor:
         values = [effect.map_values(pixels) for effect in self.effects if effect.maps]
         return [wp.array(np.concatenate(values), dtype=float, device=device)] if values else []
 
-    def retimes(self) -> bool:
+    def changes_event_stream(self) -> bool:
         """Whether events leave at other times than their crossings', or not all of them leave."""
         late = (e for e in self.effects if isinstance(e, StreamEffect) or "delay" in e.stages)
         return not all(effect.is_off() for effect in late)
@@ -130,7 +130,7 @@ class Sensor:
         ]
         return np.array(values, np.float32)
 
-    def table(self) -> dict[str, Any]:
+    def to_table(self) -> dict[str, Any]:
         """Return the sensor as it stands in a sensor file."""
         out: dict[str, Any] = {"name": self.name}
         if self.size is not None:

@@ -131,7 +131,7 @@ def _sensor_of_table(table: dict[str, Any], effects: Mapping[str, type[Effect]])
 def dump_sensor(sensor: Sensor) -> str:
     """Return a sensor as TOML text, every parameter with its unit and meaning."""
     document = tomlkit.document()
-    for name, value in sensor.table().items():
+    for name, value in sensor.to_table().items():
         if isinstance(value, dict):
             break
         document.add(name, value)

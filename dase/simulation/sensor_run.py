@@ -92,7 +92,7 @@ class SensorRun:
 
     def thresholds(self) -> NDArray[np.float32]:
         """Return the thresholds of each pixel before this scene [log intensity], shape (B, 2, N): OFF, ON."""
-        self.pixel_array.look_at(self.scene)
+        self.pixel_array.bind_scene(self.scene)
         return self.pixel_array.thresholds()
 
     def chunks(self) -> Iterator[RunChunk]:
@@ -141,7 +141,9 @@ class SensorRun:
         edges = np.asarray(edges, np.float64)
         if edges.ndim != 1 or len(edges) < 2 or not np.all(np.diff(edges) > 0):
             raise InputError("window edges must increase, and there must be at least 2")
-        return self._count_leaving(edges) if self.sensor.retimes() else self._count_at_pixels(edges)
+        if self.sensor.changes_event_stream():
+            return self._count_leaving(edges)
+        return self._count_at_pixels(edges)
 
     def _count_leaving(self, edges: NDArray[np.float64]) -> NDArray[np.int32]:
         """Count what leaves the camera, shape (B, W, 2, N)."""

@@ -122,7 +122,8 @@ def _can_run_at_once(scene: Scene, variants: Sequence[Sensor], name: str) -> boo
         return False
     step = sample_times(scene, first)
     return all(
-        variant.retimes() == first.retimes() and np.array_equal(sample_times(scene, variant), step)
+        np.array_equal(sample_times(scene, variant), step)
+        and variant.changes_event_stream() == first.changes_event_stream()
         for variant in variants[1:]
     )
 

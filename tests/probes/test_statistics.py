@@ -214,7 +214,7 @@ def test_a_clock_is_the_same_inside_the_kernel(evidence):
     ticks = trials.ticks(sensor)
     assert ticks == clock.step
     got, free = trials.run_all([Order(sensor, vector, 9, finer=1, ticks=t) for t in (ticks, 0.0)])
-    want = trials.stream(sensor, vector, sensor.streams(), seed=9)
+    want = trials.stream(sensor, vector, sensor.readout_effects(), seed=9)
     many = want.clock.sum()
     assert np.abs(got.clock - want.clock).sum() < 1e-2 * many < 0.5 * np.abs(free.clock - want.clock).sum()
     np.testing.assert_allclose(got.stamps, want.stamps, atol=1e-2)
@@ -346,7 +346,7 @@ def test_a_bus_is_shared_out(evidence):
     trials = evidence.train.trials
     sensor = Sensor().with_effect(EFFECTS["readout"](rate=1e5, mode="drop"))
     free = trials.stream(sensor, sensor.parameters(), (), seed=1).halves.sum()
-    held = trials.stream(sensor, sensor.parameters(), sensor.streams(), seed=1).halves.sum()
+    held = trials.stream(sensor, sensor.parameters(), sensor.readout_effects(), seed=1).halves.sum()
     assert held < 0.95 * free
 
 
