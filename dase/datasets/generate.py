@@ -154,6 +154,7 @@ def generate_dataset(
     if jobs < 1:
         raise InputError(f"jobs must be >= 1, got {jobs}")
     begin = time.perf_counter()
+    # what cannot work is refused before the folder is made or a process started
     image_sources.open_images(job.images)
     PixelArray(_sensor_of(job), 1, 1, device=job.backend)
     todo = _prepare_folder(job, out, resume)
@@ -205,11 +206,13 @@ def _make_sequences(
         with ignore_interrupt():
             left = {pool.submit(_in_worker, job, out, index) for index in todo}
         while left:
+            # not longer, so that Ctrl-C is obeyed at once although nothing finishes
             done, left = wait(left, timeout=0.1, return_when=FIRST_COMPLETED)
             for future in done:
                 yield future.result()
             interrupt.check()
     finally:
+        # workers end at their next chunk and leave no half-written file behind
         if left:
             stop.set()
         pool.shutdown(cancel_futures=True)
@@ -229,6 +232,7 @@ def _warm_up(job: DatasetJob) -> None:
 
 def _begin_worker(stop: Any) -> None:
     global _stop
+    # the processes share the cores already; threads of each would compete for them
     launch.set_threads(1)
     _stop = DeferredInterrupt(stop)
 
@@ -348,6 +352,7 @@ def record_scene(
     times = scene.sample_times()
     # the first sample of each frame period; a slack of 1e-6 of it keeps equal rates equal
     period = np.floor((times - times[0]) * frame_rate + 1e-6)
+    # samples themselves, as a scene of frames is not known between them
     frame_times = times[np.concatenate([[True], np.diff(period) > 0])]
     run = SensorRun(scene, sensor, seed=seed, device=device, labels=labels)
     with defer_interrupt() as interrupt, io.create(path) as writer:
@@ -356,6 +361,7 @@ def record_scene(
             interrupt.check()
             progress(done)
 
+        # its history says how the sensor came to be, which no event depends on
         model = dump_sensor(replace(sensor, history=()))
         writer.configuration(model + f'\n[run]\ndase = "{__version__}"\nseed = {seed}\n')
         report = _record_into(writer, run, frame_times, advance)

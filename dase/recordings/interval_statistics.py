@@ -63,8 +63,10 @@ class IntervalStatistics:
         self.count += len(seconds)
         if self.count <= settings.exact:
             self._exact.append(seconds.copy())
+        # pairs at one time have no logarithm; they count as the shortest intervals in quantiles
         positive = seconds[seconds > 0]
         self.zeros += len(seconds) - len(positive)
+        # in place: parts of a million intervals would need five copies otherwise
         place = np.log10(positive, out=np.empty_like(positive))
         place -= math.log10(settings.least)
         place *= settings.fine
@@ -131,6 +133,7 @@ class IntervalStatistics:
         for k in range(first, last // 2):
             if power[k] < settings.peak or power[k] < power[k - 1 : k + 2].max():
                 continue
+            # a line stands out of its surroundings, its own leakage left out
             around = np.concatenate((power[k - k // 4 - 4 : k - 2], power[k + 3 : k + k // 4 + 5]))
             if power[k] < 3 * float(np.median(around)):
                 continue  # a hump, no line

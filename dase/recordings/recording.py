@@ -140,6 +140,7 @@ class Recording:
         looked = survey_sequence(sequence)
         found = looked.statistics()
         said = [note if isinstance(note, Note) else Note(note) for note in notes]
+        # spans are half-open, so that the last event lies in them only if they end behind it
         begin, end = found.begin, np.nextafter(found.begin + found.duration, np.inf)
         if len(sequence.events):
             end = max(end, np.nextafter(sequence.events.t[-1], np.inf))
@@ -200,7 +201,7 @@ class Recording:
             raise InputError(f"crop: must lie on the {sensor} sensor, got {part}")
         e = self.events
         kept = (e.x >= x) & (e.x < x + width) & (e.y >= y) & (e.y < y + height)
-        e = e.select(kept)
+        e = e.select(kept)  # before the shift, which would wrap around below 0 in uint16
         moved = Events(e.t, e.x - np.uint16(x), e.y - np.uint16(y), e.p, width, height, e.label)
         window = (slice(y, y + height), slice(x, x + width))
         frames = None if self.frames is None else self.frames[:, *window]

@@ -163,6 +163,7 @@ class RecordingSurvey:
     def hot_pixels(self) -> NDArray[np.bool_]:
         """Return which pixels have ten times the events of those around them, shape (H, W)."""
         counts = (self._on + self._off).reshape(self.height, self.width)
+        # the median of 3x3 pixels, so that a hot pixel does not count among those around its neighbour
         around = cv2.medianBlur(counts.astype(np.float32), 3)
         found: NDArray[np.bool_] = counts > self.settings.hot_ratio * (around + 1)
         found &= counts >= self.settings.hot_events
@@ -192,6 +193,7 @@ class RecordingSurvey:
         bits = self.settings.place_bits
         pixel, index = key >> bits, key & ((1 << bits) - 1)
         t, p = part.t[index], part.p[index]
+        # runs of one pixel in the sorted keys; what it sent last in earlier parts joins the parts
         first = np.ones(len(t), np.bool_)
         first[1:] = pixel[1:] != pixel[:-1]
         begin = np.flatnonzero(first)
@@ -218,6 +220,7 @@ class RecordingSurvey:
         if steps[longest] > self._gap[1]:
             self._gap = float(before[longest]), float(steps[longest])
         if self._quantum == 0 or self._quantum > 1000:  # finer than a microsecond is of no interest
+            # the greatest common divisor needs whole numbers; offsets of the clock cancel in steps
             steps_ns = np.rint(steps * 1e9).astype(np.int64)
             if self._quantum == 0 or np.any(steps_ns % self._quantum):
                 self._quantum = int(np.gcd.reduce(np.append(np.unique(steps_ns), self._quantum)))
@@ -228,6 +231,7 @@ class RecordingSurvey:
         first, last = np.searchsorted(t, (t[0] + alone, t[-1] - alone))
         if last <= first:
             return
+        # fewer of later parts, so that long recordings do not pay for what short ones need
         count = min(most if not self._asked else most // 8, last - first)
         asked = np.unique(np.linspace(first, last - 1, count).astype(np.int64))
         after = np.searchsorted(t, t[asked] + alone, side="right")
@@ -236,6 +240,7 @@ class RecordingSurvey:
         x, y = part.x[asked].astype(np.int64), part.y[asked].astype(np.int64)
         for dy in (-1, 0, 1):
             for dx in (-1, 0, 1):
+                # all events of a pixel stand together and in order of time: two searches count those near
                 near = ((y + dy) * self.width + x + dx) << self.settings.place_bits
                 good = (x + dx >= 0) & (x + dx < self.width) & (y + dy >= 0) & (y + dy < self.height)
                 count = np.searchsorted(key, near | after) - np.searchsorted(key, near | before)

@@ -77,6 +77,7 @@ def denoise_resting_pixels(
             total = np.where(goes_on[k], total, 0) + values[k]
             count = np.where(goes_on[k], count, 0) + 1
             limit = np.where(goes_on[k] & (limit != 0), limit, bounds[k])
+        # the mean of the rest so far: a drift is seen against all of it, not against the last frame
         means.append(total / count)
         limits.append(limit)
     for k in range(len(raw) - 2, -1, -1):  # the last frame of a rest knows the mean of all

@@ -83,7 +83,7 @@ class ReadoutChain:
 
     def flush(self) -> Events:
         """Return what is still inside; the stream is over."""
-        return self.push(self._empty, math.inf)
+        return self.push(self._empty, math.inf)  # nothing earlier than the end of time can follow
 
 
 class WindowCounter:
@@ -112,6 +112,7 @@ class WindowCounter:
             return
         events, windows = events.select(inside), windows[inside]
         place = self._place[events.y.astype(np.int64) * events.width + events.x]
+        # times ascend, and with them windows: only those of this part are touched
         low, high = int(windows[0]), int(windows[-1]) + 1
         shape = (high - low, *self.counts.shape[1:])
         flat = np.ravel_multi_index((windows - low, events.p.astype(np.int64), place), shape)
@@ -122,7 +123,7 @@ def split_by_row(events: Events, row: NDArray[np.int32] | None, batch: int) -> S
     """Return the stream of each row of a batch."""
     if row is None:
         return [events]
-    # rows as small integers, which are sorted by their digits
+    # stable, so that each stream stays in order of time; rows as small integers are sorted by their digits
     order = np.argsort(row.astype(np.uint16) if batch <= 1 << 16 else row, kind="stable")
     parts = np.split(order, np.cumsum(np.bincount(row, minlength=batch))[:-1])
     return [events.select(part) for part in parts]
