@@ -51,13 +51,13 @@ def add_command(
 
     The effect gets its default values and goes where it acts. The change is noted at the end of the file.
     """
-    from dase.effects import find
+    from dase.effects import find_effect
     from dase.simulation import sensor_edit
     from dase.simulation.user_effects import known_effects
 
     values = dict(split_setting(setting) for setting in settings)
     known = known_effects(effects)
-    chosen = sensor_edit.parse_values(find(effect, known), values)
+    chosen = sensor_edit.parse_values(find_effect(effect, known), values)
     text = sensor_edit.read_sensor_text(sensor, known)
     more = text.with_effect(chosen)
     entry = sensor_edit.history_entry_today(f"add {effect}")
@@ -97,7 +97,7 @@ def _fit_effect(
         error_after=round(found.error, 3),
         floor=found.floor,
     )
-    return sensor_update.rounded(found.sensor), entry
+    return sensor_update.round_parameters(found.sensor), entry
 
 
 def describe_values(effect: Effect) -> str:

@@ -33,7 +33,7 @@ def info_command(file: Path, size: tuple[int, int] | None, as_json: bool) -> Non
     from dase.recordings.statistics import survey_file
 
     notes: list[str] = []
-    name = io.find(file).name
+    name = io.find_format(file).name
     with tqdm(unit=" events", unit_scale=True, delay=1.0, leave=False, disable=None) as bar:
         found = survey_file(file, size=size, notes=notes, progress=bar.update).statistics()
     said = [note for note in (*notes, *find_anomalies(found)) if isinstance(note, io.Note)]

@@ -6,7 +6,7 @@ import math
 from collections.abc import Iterator
 from dataclasses import dataclass
 
-from dase.formatting import grouped, percent, seconds
+from dase.formatting import format_count, format_percent, format_seconds
 from dase.io.source import Note
 from dase.recordings.statistics import Statistics
 
@@ -65,10 +65,10 @@ def find_anomalies(s: Statistics, settings: AnomalySettings = AnomalySettings())
 def _polarity_anomalies(s: Statistics, limits: AnomalySettings) -> Iterator[Note]:
     if s.events >= limits.least_events and not 1 - limits.one_sided <= s.on_share <= limits.one_sided:
         name, share = ("ON", s.on_share) if s.on_share > 0.5 else ("OFF", 1 - s.on_share)
-        text = f"{percent(share)} of the events are {name}: their polarity may be lost"
+        text = f"{format_percent(share)} of the events are {name}: their polarity may be lost"
         yield Note(text, "odd", "polarity")
     if s.events >= limits.least_events_for_flips and s.flip_share > limits.flips:
-        flips = percent(s.flip_share)
+        flips = format_percent(s.flip_share)
         text = f"{flips} of the successive events of a pixel differ in polarity: flicker, or noise"
         yield Note(text, "odd", "flips")
 
@@ -85,24 +85,24 @@ def _place_anomalies(s: Statistics, limits: AnomalySettings) -> Iterator[Note]:
                 yield Note(f"no event in {name} {' and '.join(bare)}", "odd", "bare", all_ - count)
     most = limits.hot_pixels * s.width * s.height
     if s.hot_pixels and (s.hot_share > limits.hot_share or s.hot_pixels > most):
-        share = percent(s.hot_share)
-        text = f"{grouped(s.hot_pixels)} hot pixels send {share} of the events"
+        share = format_percent(s.hot_share)
+        text = f"{format_count(s.hot_pixels)} hot pixels send {share} of the events"
         yield Note(text, "odd", "hot", s.hot_pixels)
 
 
 def _time_anomalies(s: Statistics, limits: AnomalySettings) -> Iterator[Note]:
     if s.interval_low <= limits.fastest:
-        text = f"more than 1 % of the times between events of one pixel are {seconds(limits.fastest)} or less"
+        text = f"more than 1 % of the times between events of one pixel are {format_seconds(limits.fastest)} or less"
         yield Note(text, "odd", "fast")
     if s.simultaneous > max(limits.simultaneous * s.events, limits.least_simultaneous):
-        text = f"{grouped(s.simultaneous)} events are of the same pixel and time as another"
+        text = f"{format_count(s.simultaneous)} events are of the same pixel and time as another"
         yield Note(text, "odd", "duplicate", s.simultaneous)
     begin, length = s.longest_gap
     if length > max(limits.gap, limits.gaps * s.duration / max(s.stamps, 1)):
-        text = f"no event at all for {seconds(length)}, from {begin:.3f} s on: data may be missing"
+        text = f"no event at all for {format_seconds(length)}, from {begin:.3f} s on: data may be missing"
         yield Note(text, "odd", "gap")
     if s.quantum > limits.coarse:
-        text = f"all time stamps are whole multiples of {seconds(s.quantum)}"
+        text = f"all time stamps are whole multiples of {format_seconds(s.quantum)}"
         yield Note(text, "odd", "coarse")
 
 
@@ -114,7 +114,9 @@ def _frame_anomalies(s: Statistics, limits: AnomalySettings) -> Iterator[Note]:
     elif math.isnan(s.exposure[1]):
         yield Note("the exposure of the frames is not known, or an instant", "odd", "exposure")
     elif s.exposure[1] > limits.exposure * s.frame_interval:
-        text = f"frames are exposed for {seconds(s.exposure[1])} but come every {seconds(s.frame_interval)}"
+        text = f"frames are exposed for {format_seconds(s.exposure[1])} but come every {format_seconds(s.frame_interval)}"
         yield Note(text, "odd", "exposure")
     if s.clipped > limits.clipped:
-        yield Note(f"{percent(s.clipped)} of the pixels of the frames are black or white", "odd", "clipped")
+        yield Note(
+            f"{format_percent(s.clipped)} of the pixels of the frames are black or white", "odd", "clipped"
+        )

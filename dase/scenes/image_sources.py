@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dase.errors import InputError
-from dase.io.image_files import SUFFIXES, decode, list_pictures, to_grey
+from dase.io.image_files import SUFFIXES, decode_file, list_pictures, to_grey
 
 # fmt: off
 PHOTOGRAPHS = (  # inside the wheel of scikit-image; its other files are silhouettes, charts and duplicates
@@ -254,7 +254,7 @@ def _existing_folder(name: str) -> Path:
 @lru_cache(maxsize=64)  # per process: at most 4 MiB each, 8 MiB with alpha
 def _read_picture(path: Path) -> Picture:
     """Decode, grey, shrink and median-filter a file; the arrays are shared, hence read-only."""
-    grey, alpha = to_grey(decode(path))
+    grey, alpha = to_grey(decode_file(path))
     if alpha is not None and (alpha > 0).any():
         grey[alpha == 0] = grey[alpha > 0].mean()  # what is hidden must not leak into edges and backgrounds
     size = _shrunk_size(*grey.shape[::-1])

@@ -12,7 +12,7 @@ import tomlkit
 from tomlkit.exceptions import TOMLKitError
 from tomlkit.items import Table
 
-from dase.effects import EFFECTS, Effect, find
+from dase.effects import EFFECTS, Effect, find_effect
 from dase.errors import InputError, nearest
 from dase.scenes.video import LOG_EPS
 from dase.simulation.sensor import Sensor
@@ -109,7 +109,7 @@ def _sensor_of_table(table: dict[str, Any], effects: Mapping[str, type[Effect]])
         elif name == "history":
             plain[name] = read_history(value)
         elif isinstance(value, dict):
-            find(name, effects)  # says what there is instead
+            find_effect(name, effects)  # says what there is instead
         elif name in ("name", "size", "log_eps"):
             plain[name] = value
         else:
