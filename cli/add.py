@@ -97,7 +97,7 @@ def _fitted(
         error_after=round(found.error, 3),
         floor=found.floor,
     )
-    return sensor_update.rounded(found.sensor), entry
+    return sensor_update.round_parameters(found.sensor), entry
 
 
 def said(effect: Effect) -> str:

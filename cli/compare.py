@@ -75,9 +75,9 @@ def command(
     if output is not None:
         from dase.figures import report
 
-        plates = report.pictures(measured, model, seed=seed, device=device)
+        plates = report.measurement_plates(measured, model, seed=seed, device=device)
         page = report.comparison_page(found, recording=recording.name, model=Path(sensor).stem, plates=plates)
-        report.write(output, page)
+        report.write_page(output, page)
         with replacing(output.with_suffix(".json")) as part:
             part.write_text(json.dumps(found.to_json(), indent=2) + "\n")
         click.echo(f"{output}: open it in a browser")

@@ -25,10 +25,10 @@ def explain(ctx: click.Context, parameter: click.Parameter, value: str | None) -
     """
     if value is None or ctx.resilient_parsing:
         return
-    from dase.diagnosis.explain_effect import explanation
+    from dase.diagnosis.explain_effect import explain_effect
     from dase.simulation.user_effects import known_effects
 
-    click.echo(explanation(value, known_effects(ctx.params.get("effects", ()))))
+    click.echo(explain_effect(value, known_effects(ctx.params.get("effects", ()))))
     ctx.exit()
 
 
@@ -105,7 +105,7 @@ def command(
         with replacing(json_) as part:
             part.write_text(json.dumps(found.to_json(), indent=2) + "\n")
     if output is not None:
-        sensor_edit.write(sensor_update.diagnosed(text, found, recording.name), output)
+        sensor_edit.write(sensor_update.with_diagnosis(text, found, recording.name), output)
     if draw is not None:
         from dase.figures.plot import plot
 
@@ -114,9 +114,9 @@ def command(
     if report is not None:
         from dase.figures import report as pages
 
-        plates = pages.pictures(measured, found.sensor, seed=seed, device=device)
+        plates = pages.measurement_plates(measured, found.sensor, seed=seed, device=device)
         page = pages.diagnosis_page(found, recording=recording.name, model=Path(sensor).stem, plates=plates)
-        pages.write(report, page)
+        pages.write_page(report, page)
     _print(found, quiet)
 
 
@@ -138,9 +138,9 @@ def bar(quiet: bool) -> Iterator[Callable[[str, float, float], None]]:
 
 
 def _print(found: Diagnosis, quiet: bool) -> None:
-    from dase.diagnosis.diagnose import summary
+    from dase.diagnosis.diagnose import summary_line
 
-    click.echo(summary(found))
+    click.echo(summary_line(found))
     if quiet:
         return
     click.echo(f"error as given {found.before:.2f}; 1 is what two repeats of the recording give")

@@ -55,7 +55,7 @@ def command(
             measured.events, measured.scene, model, free=free.split(",") if free else None,
             trust=measured.trust, pixels=pixels, seed=seed, device=device, progress=tell,
         )  # fmt: skip
-    sensor_edit.write(sensor_update.fitted(text, found, recording.name), output)
+    sensor_edit.write(sensor_update.with_fit(text, found, recording.name), output)
     click.echo(f"error {found.before:.2f} → {found.error:.2f}; repeats stay below {found.gate:.2f}")
     for name, estimate in found.parameters.items():
         click.echo(f"  {name:24s} {estimate.value:10.4g}   {estimate.low:.4g} to {estimate.high:.4g}")

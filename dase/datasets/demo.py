@@ -43,7 +43,9 @@ def run(out: Path, *, backend: str = "cpu", say: Callable[[str], object] = print
     say(f"{report.events:,} events from {report.samples} time samples in {report.seconds:.1f} s")
     events = job.path(out, 0)
     picture = events.with_suffix(".png")
-    figure = event_images.draw(io.read(events), title="dase demo: davis346 before moving photographs")
+    figure = event_images.draw_sequence(
+        io.read(events), title="dase demo: davis346 before moving photographs"
+    )
     with io.replacing(picture) as temporary:
         figure.savefig(temporary)
     return picture, events

@@ -140,7 +140,7 @@ def recordings(folder: Path, picture: Path | None, out: Path | None) -> None:
     print(f"  steady: {np.mean(np.diff(quiet, axis=0) == 0):.2f} of all pixels rest from a frame to the next")
     if picture is not None:
         picture.parent.mkdir(parents=True, exist_ok=True)
-        trust_figure.draw(scene, events, title="Newton's cradle before a DAVIS346", moments=3).savefig(
+        trust_figure.draw_trust(scene, events, title="Newton's cradle before a DAVIS346", moments=3).savefig(
             picture
         )
     events, frames, begin, end = load(folder, "davis240c_camerashake")
@@ -158,7 +158,7 @@ def recordings(folder: Path, picture: Path | None, out: Path | None) -> None:
     agreement(events, scene, 5e-3)
     if out is not None:
         out.mkdir(parents=True, exist_ok=True)
-        trust_figure.draw(scene, events, title="davis240c_camerashake").savefig(out / "camerashake.png")
+        trust_figure.draw_trust(scene, events, title="davis240c_camerashake").savefig(out / "camerashake.png")
 
 
 def main() -> None:

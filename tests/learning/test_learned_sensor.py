@@ -289,7 +289,7 @@ def test_the_command_learns_from_a_sensor_and_goes_on(tmp_path, monkeypatch):
     assert "begun with other options" in str(other.exception)
     again = call("train", str(sensor), "-o", str(out), *options, "--resume")
     assert again.exit_code == 0, again.output
-    figure, lines = training_figure.draw(out)
+    figure, lines = training_figure.draw_training(out)
     assert {"thresholds", "ON / OFF", "KL from truth"} <= {name for name, _ in lines}
     assert len(figure.axes) == 3 * 5 + 2 + 2
     shown = call("show", str(out))

@@ -145,5 +145,5 @@ def test_every_format_can_be_drawn(tmp_path, rng, name):
     maker(tmp_path / f"a{suffix}", reference_io.events(rng, 500, *wide))
     sequence = io.read(tmp_path / f"a{suffix}")
     middle = sum(sequence.span) / 2
-    picture = event_images.panel(sequence, middle, sequence.span[1] - sequence.span[0] + 1)
+    picture = event_images.moment_picture(sequence, middle, sequence.span[1] - sequence.span[0] + 1)
     assert np.count_nonzero((picture != 255).any(-1)) > 450  # nearly every event has a pixel of its own

@@ -10,7 +10,7 @@ import pytest
 from test_commands import dase, one_sentence
 
 from dase import InputError, Sensor, VideoScene, dump_sensor, io, load_sensor, simulate
-from dase.diagnosis.sensor_update import rounded
+from dase.diagnosis.sensor_update import round_parameters
 from dase.effects import EFFECTS
 from dase.simulation.sensor_edit import SensorText, parse_values, today
 from dase.simulation.sensor_file import parse_sensor, presets
@@ -113,9 +113,11 @@ def test_becomes_another_sensor():
 
 
 def test_rounded():
-    sensor = rounded(Sensor().with_effect(EFFECTS["bandwidth"](cutoff=123.456789, dark=1 / 3)))
+    sensor = round_parameters(Sensor().with_effect(EFFECTS["bandwidth"](cutoff=123.456789, dark=1 / 3)))
     assert (sensor["bandwidth"].cutoff, sensor["bandwidth"].dark) == (123.5, 0.3333)
-    assert rounded(Sensor().with_effect(EFFECTS["bandwidth"](cutoff=float("inf"))))["bandwidth"].is_off()
+    assert round_parameters(Sensor().with_effect(EFFECTS["bandwidth"](cutoff=float("inf"))))[
+        "bandwidth"
+    ].is_off()
 
 
 @pytest.mark.parametrize("newline", ["\n", "\r\n"])
