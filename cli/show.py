@@ -90,8 +90,8 @@ def _draw_run(folder: Path, output: Path) -> None:
 def _draw_trust(sequence: Sequence, output: Path, title: str, window: float | None) -> None:
     """Draw it, and say how much is trusted."""
     from dase import io
-    from dase.diagnosis.measurement import scene_between_frames
     from dase.figures import trust_figure
+    from dase.fitting.measurement import scene_between_frames
 
     notes: list[str] = []
     scene = scene_between_frames(sequence, notes)

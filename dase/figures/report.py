@@ -11,12 +11,12 @@ from pathlib import Path
 
 import numpy as np
 
-from dase.diagnosis.measurement import Measurement
 from dase.events import Events
 from dase.figures import diagnosis_figures
 from dase.figures import html as html_page
 from dase.figures.event_maps import event_plates
 from dase.figures.style import Plate, format_number
+from dase.fitting.measurement import Measurement
 from dase.io import replacing
 from dase.probes.statistics import WORDS
 from dase.results import Comparison, Diagnosis, Estimate, Step

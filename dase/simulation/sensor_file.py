@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Mapping
 from importlib import resources
+from os import PathLike
 from pathlib import Path
 from typing import Any
 
@@ -35,6 +37,15 @@ def load_sensor(spec: str | Path, effects: Mapping[str, type[Effect]] = EFFECTS)
         InputError: No such preset or file, not TOML, or a name or value that does not exist.
     """
     return parse_sensor(*read_sensor(spec), effects).located(Path(spec).parent)
+
+
+def as_sensor(sensor: Sensor | str | PathLike[str]) -> Sensor:
+    """Return a sensor as it is; a preset's name or a sensor file's path is loaded, see `load_sensor`."""
+    if isinstance(sensor, Sensor):
+        return sensor
+    if isinstance(sensor, str | PathLike):
+        return load_sensor(os.fspath(sensor))
+    raise TypeError(f"sensor: expected a Sensor, a preset's name or a path, got {type(sensor).__name__}")
 
 
 def read_sensor(spec: str | Path) -> tuple[str, str]:

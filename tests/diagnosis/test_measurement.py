@@ -11,8 +11,8 @@ import dase
 from dase import io
 from dase.cli import group
 from dase.diagnosis.compare import compare
-from dase.diagnosis.measurement import open_measurement
 from dase.fitting.data_split import gather
+from dase.fitting.measurement import open_measurement
 from dase.io.sequence import Sequence
 from dase.probes.stimulus import MASKED
 from dase.scenes.video import VideoScene
@@ -71,17 +71,19 @@ def test_frames_far_apart_make_a_scene_with_trust(measured):
 def test_the_true_model_is_wrong_only_where_frames_are(recording, measured):
     """A mask that left in what the frames do not show, or a scene without it, would blame the model."""
     path, events = recording
-    masked = compare(events, measured.scene, SENSOR, pixels=PIXELS)  # a scene's own trust is what is taken
-    bare = compare(events, measured.scene, SENSOR, pixels=PIXELS, trust=everywhere)
+    masked = compare(
+        events, SENSOR, scene=measured.scene, pixels=PIXELS
+    )  # a scene's own trust is what is taken
+    bare = compare(events, SENSOR, scene=measured.scene, pixels=PIXELS, trust=everywhere)
     sequence = io.read(path)
     straight = VideoScene(sequence.frames / np.float32(255), sequence.frame_times)
-    before = compare(events, straight, SENSOR, pixels=PIXELS)
-    told = compare(events, moving_picture(np.random.default_rng(5), **PICTURE), SENSOR, pixels=PIXELS)
+    before = compare(events, SENSOR, scene=straight, pixels=PIXELS)
+    told = compare(events, SENSOR, scene=moving_picture(np.random.default_rng(5), **PICTURE), pixels=PIXELS)
     print(*(f"{found.error:.2f}" for found in (masked, bare, before, told)))
     assert masked.error < 0.65 * bare.error
     assert masked.error < 0.55 * before.error
     assert masked.error < 1.4 * told.error  # whose light is taken at each millisecond only
-    wrong = compare(events, measured.scene, SENSOR.with_effect(slow()), pixels=PIXELS)
+    wrong = compare(events, SENSOR.with_effect(slow()), scene=measured.scene, pixels=PIXELS)
     assert wrong.error > 2 * masked.error  # and yet it sees what is wrong
 
 
@@ -111,7 +113,7 @@ def test_events_where_nothing_is_known_change_nothing(measured):
         events.height,
     )
     assert len(t) > 10_000
-    plain, other = (compare(e, scene, SENSOR, pixels=PIXELS) for e in (events, flooded))
+    plain, other = (compare(e, SENSOR, scene=scene, pixels=PIXELS) for e in (events, flooded))
     assert other.error == plain.error
     assert other.families == plain.families
     assert other.plain == plain.plain

@@ -138,7 +138,7 @@ def _probes(later: Any, name: str, net: Any, folder: Path) -> float:
         at = np.clip(times, scene.times[0], scene.times[-1])
         return scene.doubt(at, pixels=pixels) <= TOLERANCE
 
-    return compare(later.events, scene, sensor, trust=trust, pixels=800).error
+    return compare(later.events, sensor, scene=scene, trust=trust, pixels=800).error
 
 
 def measure(name: str, seconds: float, args: argparse.Namespace) -> dict[str, Any]:

@@ -26,7 +26,7 @@ import numpy as np
 import dase
 import dase.io
 from dase.diagnosis.diagnose import diagnose
-from dase.diagnosis.measurement import Measurement, camera_scene, open_measurement
+from dase.fitting.measurement import Measurement, camera_scene, open_measurement
 from dase.recordings.statistics import Survey
 from dase.scenes.frame_alignment import align
 from dase.simulation.simulate import stream
@@ -239,10 +239,7 @@ def look(name: str, path: Path, options: argparse.Namespace) -> None:
     """Diagnose one recording and keep what was found."""
     camera = CAMERAS[name]
     measured = camera.open(path)
-    found = diagnose(
-        measured.events, measured.scene, trust=measured.trust, pixels=camera.pixels, device=options.device
-    )
-    found = measured.noted(found)
+    found = diagnose(measured, pixels=camera.pixels, device=options.device)
     (options.log / f"{name}.json").write_text(json.dumps(found.to_json() | {"commit": options.commit}))
     np.savez_compressed(options.log / f"{name}.npz", **pictures(camera, measured, found.sensor))
     from dase.diagnosis.diagnose import summary_line
