@@ -172,10 +172,12 @@ def _prepare(job: Job, out: Path, resume: bool) -> list[int]:
         raise InputError(f"{out} must be a folder, but it is a file")
     if record.exists():
         if not resume:
-            raise InputError(f"{out} already holds a data set; give --resume to finish it, or another folder")
+            raise InputError(
+                f"{out} already holds a data set; resume it, or give another folder", argument="resume"
+            )
         if record.read_text("utf-8") != job.text():
             raise InputError(
-                f"{out} was begun with other options (see {record}); --resume needs the same ones"
+                f"{out} was begun with other options (see {record}); to resume takes the same ones"
             )
     out.mkdir(parents=True, exist_ok=True)
     for stale in out.glob(".sequence_*.tmp.*"):  # of a run that was killed

@@ -32,7 +32,7 @@ def draw_training(folder: Path) -> tuple[Figure, list[tuple[str, str]]]:
     """
     path = folder / EXAMPLES
     if not path.is_file():
-        raise InputError(f"{folder} holds a run that has not ended; go on with it by --resume")
+        raise InputError(f"{folder} holds a run that has not ended; resume it first")
     with np.load(path) as data:
         found = {name: data[name] for name in data.files}
     rows = _read_log(folder / LOG)

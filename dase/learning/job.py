@@ -175,7 +175,7 @@ def prepare(
 
 def _textures(job: Job, looks: Looks) -> Scenery:
     if job.images == "frames":
-        raise InputError("--images frames needs recordings; a sensor file has no frames")
+        raise InputError("images: frames are those of recordings; a sensor file has none", argument="images")
     source = image_sources.open_images(job.images)
     small = job.preset == "tiny"
     # a scene shows ten objects, so few of them make few different scenes, unlike the target's
@@ -255,9 +255,9 @@ def begin(job: Job, out: Path, *, resume: bool) -> None:
     if resume and not record.is_file():
         raise InputError(f"{out} holds no run to resume")
     if resume and record.read_text("utf-8") != job.text():
-        raise InputError(f"{out} was begun with other options (see {record}); --resume needs the same ones")
+        raise InputError(f"{out} was begun with other options (see {record}); to resume takes the same ones")
     if not resume and (out / CHECKPOINT).exists():
-        raise InputError(f"{out} already holds a run; give --resume to go on with it, or another folder")
+        raise InputError(f"{out} already holds a run; resume it, or give another folder", argument="resume")
     out.mkdir(parents=True, exist_ok=True)
     with replacing(record) as temporary:
         temporary.write_text(job.text(), "utf-8")

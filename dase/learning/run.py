@@ -75,7 +75,7 @@ def run(
             raise InputError(f"{out} holds no checkpoint to resume")
         training.load(load(path, training.device))
     elif path.exists():
-        raise InputError(f"{out} already holds a run; give --resume to go on with it, or another folder")
+        raise InputError(f"{out} already holds a run; resume it, or give another folder", argument="resume")
     _write_recipe(out, training.recipe)
     exam = Exam(training.scenery, training.target)
     pairs = training.target.held_out() if pace.held_out else None

@@ -83,7 +83,7 @@ def parse_sensor(text: str, where: str, effects: Mapping[str, type[Effect]] = EF
     try:
         return _sensor(table, effects)
     except InputError as error:
-        raise InputError(f"{where}: {error}") from error
+        raise InputError(f"{where}: {error}", argument=error.argument) from error
 
 
 def _sensor(table: dict[str, Any], effects: Mapping[str, type[Effect]]) -> Sensor:
