@@ -139,9 +139,8 @@ def bar(quiet: bool) -> Iterator[Callable[[str, float, float], None]]:
 
 
 def _print(found: Diagnosis, quiet: bool) -> None:
-    from dase.diagnosis.diagnose import summary_line
 
-    click.echo(summary_line(found))
+    click.echo(found.finding())
     if quiet:
         return
     click.echo(f"error as given {found.before:.2f}; 1 is what two repeats of the recording give")

@@ -290,12 +290,3 @@ def _describe_unexplained(
         f"error above the floor), which none of the effects known takes to the floor; worst: {where}"
     )
     return Unexplained(last.error, share, nearest, cells, sentence)
-
-
-def summary_line(found: Diagnosis) -> str:
-    """Return the finding in one line."""
-    if found.unexplained is not None:
-        return found.unexplained.sentence
-    if not found.selected:
-        return f"nothing is missing: error {found.errors[0]:.2f}, repeats stay below {found.gate:.2f}"
-    return f"missing: {', '.join(found.selected)}"

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from dase import io
 from dase.errors import InputError
 from dase.events import Events
+from dase.formatting import fit_to_screen
 from dase.io.sequence import Sequence
 from dase.probes.stimulus import COARSEST, Trust
 from dase.recordings.recording import Recording
@@ -32,7 +33,7 @@ from dase.scenes.video import VideoScene, open_video
 Found = TypeVar("Found", Comparison, Diagnosis, Fit)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Measurement:
     """Events and the scene they are of, on one clock.
 
@@ -47,6 +48,11 @@ class Measurement:
     scene: Scene
     trust: Trust | None = None
     notes: tuple[str, ...] = ()
+
+    def __repr__(self) -> str:
+        trust = "everywhere" if self.trust is None else "in part"
+        lines = [f"Measurement, its scene trusted {trust}", f"  {self.events}", f"  {self.scene}"]
+        return fit_to_screen([*lines, *(f"  note: {note}" for note in self.notes)])
 
     def noted(self, found: Found) -> Found:
         """Return a finding with what was noticed while reading before its own notes."""

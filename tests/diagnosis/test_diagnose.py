@@ -16,7 +16,7 @@ from click.testing import CliRunner
 import dase
 from dase.cli import group
 from dase.cli.options import open_recorded
-from dase.diagnosis.diagnose import diagnose, summary_line
+from dase.diagnosis.diagnose import diagnose
 from dase.diagnosis.explain_effect import moving_bars
 from dase.diagnosis.state import explains_remainder
 from dase.effects import EFFECTS, Effect, parameter
@@ -83,14 +83,14 @@ def test_a_hidden_effect_is_named(scene, device, effect):
     assert abs(got.value / true - 1) < 0.15 or got.low < true < got.high
     assert found.parameters["threshold.on"].value == pytest.approx(0.18, rel=0.05)
     assert json.loads(json.dumps(found.to_json()))["selected"] == [effect.name]
-    assert f"missing: {effect.name}" in summary_line(found)
+    assert f"missing: {effect.name}" in found.finding()
 
 
 def test_nothing_is_invented(scene, device):
     found = diagnose(hidden(scene, device), scene=scene, effects=LIBRARY, pixels=PIXELS, device=device)
     assert found.selected == ()
     assert found.unexplained is None
-    assert "nothing is missing" in summary_line(found)
+    assert "nothing is missing" in found.finding()
 
 
 def test_two_hidden_effects_are_both_found(scene, device):

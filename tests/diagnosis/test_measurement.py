@@ -12,7 +12,7 @@ from dase import io
 from dase.cli import group
 from dase.diagnosis.compare import compare
 from dase.fitting.data_split import gather
-from dase.fitting.measurement import open_measurement
+from dase.fitting.measurement import Measurement, as_measurement, measurement_of, open_measurement
 from dase.io.sequence import Sequence
 from dase.probes.stimulus import MASKED
 from dase.scenes.video import VideoScene
@@ -196,3 +196,51 @@ def test_a_davis_and_its_frames(shared):
     pixels, events = (float(word) for word in told.replace("%", " ").split() if word[0].isdigit())
     assert 40 < pixels < 80
     assert 5 < events < 40
+
+
+def test_a_recording_its_path_and_its_measurement_give_the_same(recording, measured):
+    path, events = recording
+    opened = dase.open_recording(path)
+    made = measurement_of(opened)
+    assert made.notes == measured.notes
+    np.testing.assert_array_equal(made.scene.frames([0.1, 0.2]), measured.scene.frames([0.1, 0.2]))
+    found = [dase.compare(what, "ideal", pixels=300) for what in (path, str(path), opened, made, measured)]
+    assert len({one.error for one in found}) == 1
+    assert len({one.notes for one in found}) == 1
+    assert found[0].notes[: len(measured.notes)] == measured.notes
+    told = dase.compare(events, SENSOR, scene=measured.scene, pixels=300)
+    assert told.error == found[0].error
+    assert told.notes == found[0].notes[len(measured.notes) :]
+
+
+def test_the_scene_is_chosen_beside_the_recording(tmp_path, recording, measured):
+    path, events = recording
+    for what in (path, dase.open_recording(path), events, measured):
+        still = as_measurement(what, "static")
+        assert isinstance(still.scene, VideoScene)
+        assert still.trust is None
+        assert as_measurement(what, measured.scene).scene is measured.scene
+    assert as_measurement(measured) is measured
+    assert as_measurement(measured, trust=everywhere).trust is everywhere
+    with pytest.raises(dase.InputError, match="events do not say what the camera saw") as refused:
+        dase.fit(events, "ideal")
+    assert refused.value.argument == "scene"
+    with pytest.raises(dase.InputError, match="has no frames to take the scene from"):
+        measurement_of(Sequence(events))
+    with pytest.raises(TypeError, match="expected a recording"):
+        dase.diagnose(measured.scene, SENSOR)
+    with pytest.raises(TypeError, match="sensor: expected"):
+        dase.compare(events, measured.scene)
+
+
+def test_masked_pixels_take_part_in_nothing(recording):
+    opened = dase.open_recording(recording[0])
+    mask = np.ones((96, 128), bool)
+    mask[:, :40] = False
+    for scene in ("frames", "static"):
+        found = measurement_of(opened.masked(mask), scene)
+        pixels = np.arange(96 * 128, dtype=np.int32)
+        assert isinstance(found, Measurement)
+        trusted = found.trust(np.array([0.1, 0.3]), pixels)
+        assert not trusted[:, ~mask.reshape(-1)].any()
+        assert trusted[:, mask.reshape(-1)].any()

@@ -242,9 +242,8 @@ def look(name: str, path: Path, options: argparse.Namespace) -> None:
     found = diagnose(measured, pixels=camera.pixels, device=options.device)
     (options.log / f"{name}.json").write_text(json.dumps(found.to_json() | {"commit": options.commit}))
     np.savez_compressed(options.log / f"{name}.npz", **pictures(camera, measured, found.sensor))
-    from dase.diagnosis.diagnose import summary_line
 
-    print(f"{name}: {found.seconds:.0f} s, {summary_line(found)}", flush=True)
+    print(f"{name}: {found.seconds:.0f} s, {found.finding()}", flush=True)
     for step in found.history:
         ranks = ", ".join(f"{r.effect} {r.error:.2f}" for r in step.ranking[:5])
         print(f"    {step.error:6.2f} gate {step.gate:4.2f} {step.chosen} [{ranks}]", flush=True)
