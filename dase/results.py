@@ -1,6 +1,7 @@
 """What comparing, fitting and diagnosing return: frozen, with plain fields.
 
-What Python prints of a result is a table that fits on a screen and says what was found; `to_json` has all of it.
+What Python prints of a result is a table that fits on a screen and says what was found; `to_json` has all of
+it.
 """
 
 from __future__ import annotations

@@ -25,11 +25,6 @@ from dase.simulation.sensor import Sensor
 from dase.simulation.sensor_file import dump_sensor
 from dase.simulation.simulate import stream
 
-LONGEST = 2.0
-"""Of what is pictured [s]."""
-
-BELIEVED = "Events are shown only where and when the scene between the frames can be trusted."
-
 
 def write_page(path: Path, html: str) -> None:
     """Write a page, whole or not at all."""
@@ -38,7 +33,7 @@ def write_page(path: Path, html: str) -> None:
 
 
 def measurement_plates(
-    measured: Measurement, sensor: Sensor, *, seed: int = 0, device: str = "cpu"
+    measured: Measurement, sensor: Sensor, *, seed: int = 0, device: str = "cpu", longest: float = 2.0
 ) -> list[Plate]:
     """Return pictures of a measurement beside what a model makes of its scene, its first seconds.
 
@@ -47,9 +42,10 @@ def measurement_plates(
         sensor: The model.
         seed: Of every random number of the simulation.
         device: `cpu`, `cuda` or a Warp name.
+        longest: Of what is pictured [s].
     """
     times = measured.scene.sample_times()
-    begin, end = float(times[0]), min(float(times[-1]), float(times[0]) + LONGEST)
+    begin, end = float(times[0]), min(float(times[-1]), float(times[0]) + longest)
     parts = []
     for part in stream(measured.scene, sensor, seed=seed, device=device):
         parts.append(part)
@@ -62,7 +58,8 @@ def measurement_plates(
         return event_plates(real, made, (begin, end), frames=frames, frame_times=shown)
     real, made = measured.scene.believed(real), measured.scene.believed(made)
     plates = event_plates(real, made, (begin, end), frames=frames, frame_times=shown)
-    return [replace(plate, caption=f"{plate.caption} {BELIEVED}") for plate in plates]
+    believed = "Events are shown only where and when the scene between the frames can be trusted."
+    return [replace(plate, caption=f"{plate.caption} {believed}") for plate in plates]
 
 
 def comparison_page(
@@ -101,8 +98,8 @@ def comparison_verdict(found: Comparison) -> str:
     worst = max(found.families, key=lambda name: found.families[name], default="")
     about = f" It is worst in {family_words(worst)}." if worst else ""
     return (
-        f"The model is wrong: its error on held-out pixels and time is {format_number(found.error)} times the noise "
-        f"floor, where chance alone reaches {format_number(found.gate)}.{about}"
+        f"The model is wrong: its error on held-out pixels and time is {format_number(found.error)} "
+        f"times the noise floor, where chance alone reaches {format_number(found.gate)}.{about}"
     )
 
 

@@ -43,8 +43,9 @@ def comparison() -> Comparison:
 
 def diagnosis(**more) -> Diagnosis:
     found = dict(
-        sensor=Sensor(), selected=("leak", "bandwidth"), errors=(6.0, 2.5, 1.04), before=9.0, floor=1.0, gate=1.2,
-        parameters=PARAMETERS, ties={"leak": ("shot",)}, unexplained=None, history=(STEP,) * 5, notes=NOTES,
+        sensor=Sensor(), selected=("leak", "bandwidth"), errors=(6.0, 2.5, 1.04), before=9.0, floor=1.0,
+        gate=1.2, parameters=PARAMETERS, ties={"leak": ("shot",)}, unexplained=None, history=(STEP,) * 5,
+        notes=NOTES,
     )  # fmt: skip
     return Diagnosis(**(found | more))
 
