@@ -26,7 +26,7 @@ from dase.cli.options import check_suffix, effects_option
     help="Draw it into this PNG, SVG or PDF.",
 )
 @effects_option
-def command(
+def distinguish_command(
     a: str,
     b: str,
     longest: float,

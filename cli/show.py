@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 )
 @click.option("--size", callback=parse_size, metavar="WxH", help="Columns x rows.  [default: as FILE says]")
 @click.option("--trust", is_flag=True, help="Show how far the scene between the frames can be trusted.")
-def command(
+def show_command(
     file: Path,
     output: Path | None,
     at: float | None,
@@ -45,6 +45,7 @@ def command(
     from dase.errors import InputError
     from dase.figures import event_images
     from dase.recordings import summary
+    from dase.recordings.statistics import sequence_statistics
 
     if file.is_dir() and (file / "job.json").is_file():
         _draw_run(file, output or file / "learned.png")
@@ -66,7 +67,7 @@ def command(
         figure = event_images.draw_sequence(sequence, title=file.stem, at=at, window=window)
         with io.replacing(output) as temporary:
             figure.savefig(temporary)
-    for name, value in summary.table(event_images.statistics(sequence)):
+    for name, value in summary.statistics_table(sequence_statistics(sequence)):
         click.echo(f"{name:<18}{value}")
     click.echo(f"{'written':<18}{output}")
 

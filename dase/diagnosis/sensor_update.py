@@ -6,7 +6,7 @@ from dataclasses import replace
 
 from dase.results import Diagnosis, Fit
 from dase.simulation.sensor import Sensor
-from dase.simulation.sensor_edit import SensorText, today
+from dase.simulation.sensor_edit import SensorText, history_entry_today
 
 
 def round_parameters(sensor: Sensor, digits: int = 4) -> Sensor:
@@ -24,7 +24,9 @@ def with_fit(text: SensorText, found: Fit, recording: str) -> SensorText:
         "error_after": round(found.error, 3),
         "floor": found.floor,
     }
-    return text.became(round_parameters(found.sensor)).noted(today("fit", recording=recording, **facts))
+    return text.became(round_parameters(found.sensor)).noted(
+        history_entry_today("fit", recording=recording, **facts)
+    )
 
 
 def with_diagnosis(text: SensorText, found: Diagnosis, recording: str) -> SensorText:
@@ -34,5 +36,5 @@ def with_diagnosis(text: SensorText, found: Diagnosis, recording: str) -> Sensor
     errors = [round(error, 3) for error in (found.before, *found.errors)]
     for did, before, after in zip(steps, errors, errors[1:], strict=False):
         facts = {"error_before": before, "error_after": after, "floor": found.floor}
-        text = text.noted(today(did, recording=recording, **facts))
+        text = text.noted(history_entry_today(did, recording=recording, **facts))
     return text

@@ -15,10 +15,10 @@ from matplotlib.ticker import EngFormatter, NullFormatter
 from numpy.typing import NDArray
 
 from dase.figures.style import Colour
-from dase.formatting import seconds
+from dase.formatting import format_seconds
 from dase.io.sequence import Sequence
 from dase.recordings.statistics import Statistics
-from dase.recordings.summary import table
+from dase.recordings.summary import statistics_table
 
 
 def draw_contact_sheet(
@@ -104,14 +104,14 @@ def figure_in_inches(wide: float, tall: float) -> tuple[Figure, Callable[[float,
 
 def _draw_header(figure: Figure, s: Statistics, title: str, window: float, note: str) -> None:
     tall = figure.get_figheight()
-    rows = dict(table(s))
-    facts = [f"{s.width} × {s.height} pixels", seconds(s.duration), f"{rows['events']} events"]
+    rows = dict(statistics_table(s))
+    facts = [f"{s.width} × {s.height} pixels", format_seconds(s.duration), f"{rows['events']} events"]
     facts += [f"{rows['ON share']} ON"] if s.events else []
     facts += [note] if note else []
     left, right, first, second = 0.4 / 11, 1 - 0.4 / 11, 1 - 0.3 / tall, 1 - 0.57 / tall
     figure.text(left, first, title, fontsize=13, color=Colour.INK, weight="bold", va="center")
     figure.text(left, second, "   ".join(facts), fontsize=9, color=Colour.INK, va="center")
-    said = f"events of {seconds(window)} around each time"
+    said = f"events of {format_seconds(window)} around each time"
     figure.text(right, first, said, fontsize=9, color=Colour.INK, va="center", ha="right")
     for x, colour, name in ((right - 0.055, Colour.ON, "ON"), (right, Colour.OFF, "OFF")):
         figure.text(x, second, f"\N{BLACK SQUARE} {name}", fontsize=9, color=colour, va="center", ha="right")
@@ -164,7 +164,7 @@ def _draw_intervals(axes: Axes, between: NDArray[np.float64]) -> None:
     axes.set_ylim(bottom=0)
     axes.xaxis.set_major_formatter(EngFormatter("s", sep="\N{THIN SPACE}"))
     axes.xaxis.set_minor_formatter(NullFormatter())
-    said = f"median {seconds(median)},  1 to 99 %: {seconds(low)} to {seconds(high)}"
+    said = f"median {format_seconds(median)},  1 to 99 %: {format_seconds(low)} to {format_seconds(high)}"
     axes.set_title(said, fontsize=8, color=Colour.INK, loc="right", pad=5)
 
 

@@ -14,8 +14,7 @@ from dase.errors import InputError
 from dase.events import Events
 from dase.figures.style import Colour
 from dase.io.sequence import Sequence, replacing
-from dase.recordings.statistics import Statistics as Statistics
-from dase.recordings.statistics import statistics as statistics
+from dase.recordings.statistics import sequence_statistics
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -106,7 +105,7 @@ def draw_sequence(
     shrink = math.ceil(sequence.events.width / dots)
     panels = [moment_picture(sequence, time, window, shrink=shrink) for time in times]
     return contact_sheet.draw_contact_sheet(
-        sequence, statistics(sequence), between, panels, times, window, title
+        sequence, sequence_statistics(sequence), between, panels, times, window, title
     )
 
 

@@ -29,7 +29,7 @@ from dase.figures.style import (
     place_axes,
     titled_figure,
 )
-from dase.formatting import seconds
+from dase.formatting import format_seconds
 from dase.results import Curve
 
 
@@ -103,7 +103,9 @@ def draw_moments(
     across = (WIDE - 0.95 - 0.12 * (n - 1)) / n
     down = across * aspect
     figure = titled_figure(
-        1.2 + 2 * down, "Measured and simulated events", f"events of {seconds(window)} around each time"
+        1.2 + 2 * down,
+        "Measured and simulated events",
+        f"events of {format_seconds(window)} around each time",
     )
     for row, (name, counts) in enumerate((("measured", measured), ("simulated", simulated))):
         for i, time in enumerate(times):
@@ -202,7 +204,7 @@ def draw_residual_maps(
     across = (WIDE - 1.75) / 2
     down = across * aspect
     block = f"blocks of {size} × {size} pixels" if size > 1 else "pixel by pixel"
-    about = f"events of the model against those measured in {seconds(seconds_long)}, {block}"
+    about = f"events of the model against those measured in {format_seconds(seconds_long)}, {block}"
     figure = titled_figure(1.2 + down, "Where the model sends too many or too few events", about)
     for i, (channel, name) in enumerate(((1, "ON"), (0, "OFF"))):
         axes = place_axes(figure, 0.3 + i * (across + 0.15), 1.0, across, down)

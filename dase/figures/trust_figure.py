@@ -15,7 +15,7 @@ from dase.errors import InputError
 from dase.events import Events
 from dase.figures.event_images import overlay_events
 from dase.figures.style import Colour
-from dase.formatting import seconds
+from dase.formatting import format_seconds
 from dase.scenes.between_frames import RELATIVE, TOLERANCE, CameraScene
 from dase.scenes.frame_motion import HOPELESS
 
@@ -126,7 +126,7 @@ def _draw_header(figure: Figure, title: str, window: float, share: float) -> Non
         f"or {100 * RELATIVE:.0f} % of the change"
     )
     figure.text(left, 1 - 0.57 / tall, facts, fontsize=9, color=Colour.INK, va="center")
-    said = f"events of {seconds(window)} around each time"
+    said = f"events of {format_seconds(window)} around each time"
     figure.text(right, 1 - 0.3 / tall, said, fontsize=9, color=Colour.INK, va="center", ha="right")
     legend = (
         (right, "\N{BLACK SQUARE} OFF", Colour.OFF),

@@ -25,8 +25,8 @@ from dase.recordings.recording import Recording
 from dase.results import Comparison, Diagnosis, Fit
 from dase.scenes.between_frames import CameraScene
 from dase.scenes.frame_alignment import PARTS, align
-from dase.scenes.frame_denoising import steady
-from dase.scenes.frame_motion import stretched, stretches
+from dase.scenes.frame_denoising import denoise_resting_pixels
+from dase.scenes.frame_motion import estimate_stretches, is_stretched
 from dase.scenes.scene import Scene
 from dase.scenes.video import VideoScene, open_video
 
@@ -262,11 +262,13 @@ def camera_scene(
     """
     gains = None
     scene = CameraScene(frames, begin, end)
-    if stretched(frames):
-        gains = stretches([scene.intensity(k) for k in range(len(scene))])
+    if is_stretched(frames):
+        gains = estimate_stretches([scene.intensity(k) for k in range(len(scene))])
         notes.append("each frame was stretched to the full range of grey: undone as far as they tell")
         scene = CameraScene(frames, begin, end, gains=gains)
-    return CameraScene(steady(frames), begin, end, gains=gains) if camera_rests(scene) else scene
+    return (
+        CameraScene(denoise_resting_pixels(frames), begin, end, gains=gains) if camera_rests(scene) else scene
+    )
 
 
 def camera_rests(scene: CameraScene, *, looks: int = 8, movement: float = 0.1) -> bool:

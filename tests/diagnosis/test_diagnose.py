@@ -14,7 +14,7 @@ import warp as wp
 from click.testing import CliRunner
 
 import dase
-from dase.cli import group
+from dase.cli import dase_group
 from dase.cli.options import open_recorded
 from dase.diagnosis.diagnose import diagnose
 from dase.diagnosis.explain_effect import moving_bars
@@ -196,7 +196,7 @@ def test_families_weigh_alike():
 
 
 def run(*words: str):
-    return CliRunner().invoke(group, words, standalone_mode=False)
+    return CliRunner().invoke(dase_group, words, standalone_mode=False)
 
 
 def save(path, events, **more):
@@ -279,12 +279,12 @@ def test_a_poor_minimum_is_said(tmp_path, scene, monkeypatch):
     ends = Fit(Sensor(), {}, error=3.0, before=4.0, floor=1.0, gate=1.2, agree=False, poor=True)
     monkeypatch.setattr("dase.fitting.fit.fit", lambda *args, **more: ends)
     words = ["fit", "ideal", str(tmp_path / "r.npz"), "--scene", "static", "-o", str(tmp_path / "f.toml")]
-    result = CliRunner().invoke(group, words)
+    result = CliRunner().invoke(dase_group, words)
     assert result.exit_code == 1
     assert "poor minimum" in result.output
     assert (tmp_path / "f.toml").exists()
     monkeypatch.setattr("dase.fitting.fit.fit", lambda *args, **more: replace(ends, poor=False))
-    assert CliRunner().invoke(group, words).exit_code == 0
+    assert CliRunner().invoke(dase_group, words).exit_code == 0
 
 
 def test_starts_that_end_higher_are_not_counted():
@@ -315,7 +315,7 @@ def test_an_effect_of_the_user_is_explained_wherever_its_file_is_named(tmp_path,
         "dase.diagnosis.explain_effect.explain_effect", lambda name, known: f"{name} of {known}"
     )
     for words in (("--effects", "a.py", "--explain", "x"), ("--explain", "x", "--effects", "a.py")):
-        result = CliRunner().invoke(group, ["diagnose", *words])
+        result = CliRunner().invoke(dase_group, ["diagnose", *words])
         assert result.exit_code == 0, result.output
         assert result.output == "x of ['a.py']\n"
 

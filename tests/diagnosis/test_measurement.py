@@ -9,7 +9,7 @@ from reference.scene_frames import film, moving_picture
 
 import dase
 from dase import io
-from dase.cli import group
+from dase.cli import dase_group
 from dase.diagnosis.compare import compare
 from dase.fitting.data_split import gather
 from dase.fitting.measurement import Measurement, as_measurement, measurement_of, open_measurement
@@ -177,7 +177,7 @@ def test_events_that_are_believed(measured):
 def test_the_commands_say_what_is_compared(tmp_path, recording):
     report = tmp_path / "report.html"
     arguments = ["compare", "ideal", str(recording[0]), "--pixels", "300", "-o", str(report), "--quiet"]
-    done = CliRunner().invoke(group, arguments)
+    done = CliRunner().invoke(dase_group, arguments)
     assert done.exit_code == 0, done.output
     for sentence in ("compared is only where the scene can be trusted: ", "after the frames"):
         assert sentence in done.output

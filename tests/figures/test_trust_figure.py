@@ -59,17 +59,17 @@ def test_a_sheet_is_drawn(seen, tmp_path):
 
 
 def test_the_command_draws_it(seen, tmp_path):
-    from dase.cli import group
+    from dase.cli import dase_group
 
     _, events, frames, begin, end = seen
     known = {"frame_times": 0.5 * (begin + end), "frame_exposure": end - begin}
     io.write(tmp_path / "made.npz", Sequence(events, frames, **known))
-    done = CliRunner().invoke(group, ["show", str(tmp_path / "made.npz"), "--trust"])
+    done = CliRunner().invoke(dase_group, ["show", str(tmp_path / "made.npz"), "--trust"])
     assert done.exit_code == 0, done.output
     assert "% of pixels and times trusted" in done.output
     assert "ms after the frames and correlate with them at 0." in done.output
     assert (tmp_path / "made.trust.png").stat().st_size > 10_000
     io.write(tmp_path / "bare.npz", Sequence(events))
-    done = CliRunner().invoke(group, ["show", str(tmp_path / "bare.npz"), "--trust"])
+    done = CliRunner().invoke(dase_group, ["show", str(tmp_path / "bare.npz"), "--trust"])
     with pytest.raises(dase.InputError, match="needs at least 2 frames with known times"):
         raise done.exception

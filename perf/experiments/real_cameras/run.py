@@ -27,7 +27,7 @@ import dase
 import dase.io
 from dase.diagnosis.diagnose import diagnose
 from dase.fitting.measurement import Measurement, camera_scene, open_measurement
-from dase.recordings.statistics import Survey
+from dase.recordings.statistics import RecordingSurvey
 from dase.scenes.frame_alignment import align
 from dase.simulation.simulate import stream
 from perf.benchmarks.kernels import commit
@@ -268,7 +268,7 @@ def pictures(camera: Camera, measured: Measurement, sensor: dase.Sensor) -> dict
     order = np.lexsort((events.t, pixel))
     gaps = np.diff(events.t[order])[np.diff(pixel[order]) == 0]
     counts = np.bincount(pixel, minlength=events.width * events.height)
-    looked = Survey(events.width, events.height)
+    looked = RecordingSurvey(events.width, events.height)
     looked.events(events)
     return {
         "measured": events.counts(edges)[0], "simulated": simulated.counts(edges)[0], "grey": grey,
