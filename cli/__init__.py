@@ -1,4 +1,4 @@
-"""The `dase` command. Each command is a file with a click command called `command`, loaded when it is run."""
+"""The `dase` command. Each command is a file with a click command `NAME_command`, loaded when it is run."""
 
 from __future__ import annotations
 
@@ -40,7 +40,9 @@ class LazyGroup(click.Group):
         """Return the command of this name."""
         if cmd_name not in COMMANDS:
             return None
-        command: click.Command = importlib.import_module(f"dase.cli.{cmd_name}").command
+        command: click.Command = getattr(
+            importlib.import_module(f"dase.cli.{cmd_name}"), f"{cmd_name}_command"
+        )
         return command
 
 
