@@ -51,19 +51,19 @@ def add_command(
 
     The effect gets its default values and goes where it acts. The change is noted at the end of the file.
     """
-    from dase.effects import find
+    from dase.effects import find_effect
     from dase.simulation import sensor_edit
     from dase.simulation.user_effects import known_effects
 
     values = dict(split_setting(setting) for setting in settings)
     known = known_effects(effects)
-    chosen = sensor_edit.parse_values(find(effect, known), values)
+    chosen = sensor_edit.parse_values(find_effect(effect, known), values)
     text = sensor_edit.read_sensor_text(sensor, known)
     more = text.added(chosen)
     entry = sensor_edit.history_entry_today(f"add {effect}")
     if recording is not None:
         fitted, entry = _fit_effect(text.sensor(), chosen, recording, scene, device, seed)
-        more = more.became(fitted)
+        more = more.describing(fitted)
     sensor_edit.write_sensor_text(more.noted(entry), output)
     if output is None:
         return

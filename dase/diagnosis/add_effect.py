@@ -8,10 +8,10 @@ from os import PathLike
 from dase.diagnosis.candidates import screen_and_descend
 from dase.diagnosis.settings import DEFAULTS
 from dase.effects import Effect
-from dase.fitting.data_split import PIXELS, gather
+from dase.fitting.data_split import PIXELS, split_measurement
 from dase.fitting.fit import fit
 from dase.fitting.measurement import Measured, SceneChoice, as_measurement
-from dase.fitting.model import fit_present
+from dase.fitting.model import fit_present_model
 from dase.probes.stimulus import Trust
 from dase.results import Fit
 from dase.simulation.sensor import Sensor
@@ -52,12 +52,12 @@ def fit_added(
     without = as_sensor(sensor)
     measurement = as_measurement(measured, scene, trust)
     without, effect = without.bound_to(measurement.scene), effect.bound_to(measurement.scene)
-    evidence = gather(
+    evidence = split_measurement(
         measurement.events, measurement.scene, log_eps=without.log_eps, trust=measurement.trust,
         pixels=pixels, seed=seed, device=device,
     )  # fmt: skip
     tell("fitting without the effect", 0.0, float("nan"))
-    present = fit_present(evidence, without, None, seed=seed)
+    present = fit_present_model(evidence, without, None, seed=seed)
     before = present.judge(evidence.held, repeats=DEFAULTS.repeats // 2, seed=seed + 500).error
     tell(f"where to begin with {effect.name}", 0.1, before)
     # far from where it is, a descent could end in the wrong place

@@ -15,14 +15,21 @@ from dase.effects.optics import SceneEffect
 from dase.effects.readout import Readout
 from dase.effects.row_scan import RowScan
 from dase.effects.timestamp import Timestamp
-from dase.fitting.data_split import Evidence
-from dase.fitting.descent import Over, screening, searching
-from dase.fitting.early_stopping import Race
-from dase.fitting.model import SETTLED, Model, added, settling, starts, turned
-from dase.fitting.parameter_space import variants
-from dase.fitting.scheduler import Ask, Work, alone, beside, together
-from dase.fitting.subset import Half
-from dase.probes.distance import Judgement, Scale
+from dase.fitting.data_split import SplitMeasurement
+from dase.fitting.descent import StopRule, descent_work, ranking_work
+from dase.fitting.early_stopping import CandidateRace
+from dase.fitting.model import (
+    SETTLED,
+    FittedModel,
+    refit_work,
+    starting_places,
+    with_effect_added,
+    with_lamp_shifted,
+)
+from dase.fitting.parameter_space import effect_variants
+from dase.fitting.scheduler import SimulationRequest, Work, run_side_by_side, run_work, side_by_side_work
+from dase.fitting.subset import PixelSubset
+from dase.probes.distance import ErrorScale, Judgement
 
 Array = NDArray[np.float64]
 
@@ -43,7 +50,7 @@ class Candidate:
     """
 
     name: str
-    model: Model
+    model: FittedModel
     training_loss: float
     screened_loss: float = float("nan")
     family_losses: Mapping[str, float] = field(default_factory=dict)
@@ -61,7 +68,7 @@ StepProgress = Callable[[str, float], None]
 """Told what is being done, and the share of the step that is done."""
 
 
-def effects_to_try(effects: Mapping[str, type[Effect]], present: Model) -> list[str]:
+def effects_to_try(effects: Mapping[str, type[Effect]], present: FittedModel) -> list[str]:
     """Return the names of the effects that can be tried."""
     sensor = present.space.sensor
     # what acts on whole pictures has no place in a parameter vector; what a network has to learn first
@@ -71,7 +78,7 @@ def effects_to_try(effects: Mapping[str, type[Effect]], present: Model) -> list[
 
 
 def variants_to_try(
-    evidence: Evidence, effect: type[Effect], *, idle_bus: float = DEFAULTS.candidates.idle_bus
+    evidence: SplitMeasurement, effect: type[Effect], *, idle_bus: float = DEFAULTS.candidates.idle_bus
 ) -> list[Effect]:
     """Return the variants of an effect that are tried, with what can be read off the measurement set.
 
@@ -92,11 +99,15 @@ def variants_to_try(
     if effect is RowScan:
         return [RowScan(line=structure.line, direction=structure.direction)] if structure.line else []
     if effect is Readout:
-        if evidence.busiest < idle_bus * evidence.fastest:
+        if evidence.highest_event_rate < idle_bus * evidence.least_bus_rate:
             return []
         # events come as fast as the bus can send them, if it ever was full
-        return [replace(e, rate=evidence.busiest) for e in variants(effect) if isinstance(e, Readout)]
-    return variants(effect)
+        return [
+            replace(e, rate=evidence.highest_event_rate)
+            for e in effect_variants(effect)
+            if isinstance(e, Readout)
+        ]
+    return effect_variants(effect)
 
 
 def acts_on_few_pixels(effect: Effect) -> bool:
@@ -118,8 +129,8 @@ class Screening:
     """
 
     effect: Effect
-    model: Model
-    half: Half
+    model: FittedModel
+    half: PixelSubset
     before: Array
     places: Array
     losses: Array
@@ -140,20 +151,26 @@ class Screening:
         return Candidate(self.effect.name, model, loss, loss / self.present_loss)
 
 
-def screen_effect(evidence: Evidence, present: Model, effect: Effect, *, seed: int) -> Work[Screening]:
-    """Run an effect at many places of its parameters, on some pixels, see `together`."""
+def screen_effect(
+    evidence: SplitMeasurement, present: FittedModel, effect: Effect, *, seed: int
+) -> Work[Screening]:
+    """Run an effect at many places of its parameters, on some pixels, see `run_side_by_side`."""
     half = evidence.train if acts_on_few_pixels(effect) else evidence.scout
-    model = added(present, effect)
-    (before,) = yield [Ask(half, present.space, present.place[None], seed)]
+    model = with_effect_added(present, effect)
+    (before,) = yield [SimulationRequest(half, present.space, present.place[None], seed)]
     few = half.slow(model.space)
-    places, losses = yield from screening(half, model.space, starts(model, effect, few=few), seed=seed)
+    places, losses = yield from ranking_work(
+        half, model.space, starting_places(model, effect, few=few), seed=seed
+    )
     return Screening(effect, model, half, before[0], places, losses)
 
 
-def screen_and_descend(evidence: Evidence, present: Model, effect: Effect, *, seed: int) -> Candidate:
+def screen_and_descend(
+    evidence: SplitMeasurement, present: FittedModel, effect: Effect, *, seed: int
+) -> Candidate:
     """Try one effect on some pixels: many places, then a short descent from the best two."""
-    screening = alone(screen_effect(evidence, present, effect, seed=seed))
-    return alone(descend_from_screening(screening, Race(1), seed=seed))
+    screening = run_work(screen_effect(evidence, present, effect, seed=seed))
+    return run_work(descend_from_screening(screening, CandidateRace(1), seed=seed))
 
 
 def worth_descending(
@@ -173,9 +190,9 @@ def worth_descending(
 
 
 def descend_from_screening(
-    screening: Screening, race: Race, *, seed: int, settings: CandidateSettings = DEFAULTS.candidates
+    screening: Screening, race: CandidateRace, *, seed: int, settings: CandidateSettings = DEFAULTS.candidates
 ) -> Work[Candidate]:
-    """Descend from the best two places of a screening, see `together`."""
+    """Descend from the best two places of a screening, see `run_side_by_side`."""
     half, places, losses = screening.half, screening.places, screening.losses
     name, unit, space = screening.effect.name, screening.present_loss, screening.model.space
     # one start is enough where a second takes too long
@@ -183,9 +200,9 @@ def descend_from_screening(
     elsewhere = np.abs(places - places[0]).max(1) > settings.apart
     others = np.flatnonzero(elsewhere & (losses < settings.second_start * losses[0]))
     begins = places[[0, *others[: 0 if slow else 1]]]
-    ends = yield from beside(
+    ends = yield from side_by_side_work(
         [
-            searching(half, space, begin, seed=seed, iterations=3, over=race.over(name, unit))
+            descent_work(half, space, begin, seed=seed, iterations=3, over=race.over(name, unit))
             for begin in begins
         ]
     )
@@ -197,20 +214,22 @@ def descend_from_screening(
     )
 
 
-def refine_candidate(evidence: Evidence, tried: Candidate, race: Race, *, seed: int) -> Work[Candidate]:
+def refine_candidate(
+    evidence: SplitMeasurement, tried: Candidate, race: CandidateRace, *, seed: int
+) -> Work[Candidate]:
     """Fit a candidate to all pixels of the training half, by the sampling errors of the present model."""
     # a finalist that is still on its way would be judged by where it happens to be
     half = evidence.train.loaded(tried.model.space, tried.model.place)
-    ways = turned(tried.model, half.frame.step)
+    ways = with_lamp_shifted(tried.model, half.frame.step)
     works = []
     for way in ways:
         over = race.over(tried.name)
         works.append(
-            searching(
+            descent_work(
                 half, way.space, way.place, seed=seed, iterations=3, radius=0.2, patient=True, over=over
             )
         )
-    ends = yield from beside(works)
+    ends = yield from side_by_side_work(works)
     found = min(ends, key=lambda end: end.loss)
     model = replace(tried.model, place=found.place, loss=found.loss)
     bank = np.concatenate([end.tried for end in ends])
@@ -218,7 +237,7 @@ def refine_candidate(evidence: Evidence, tried: Candidate, race: Race, *, seed: 
 
 
 def refit_and_judge(
-    evidence: Evidence,
+    evidence: SplitMeasurement,
     candidates: Sequence[Candidate],
     *,
     seed: int,
@@ -230,24 +249,24 @@ def refit_and_judge(
     they would look worse than they are. The repeats that give those of a candidate also tell its error where
     it was fitted so far; candidates far behind the best by that measure go no further.
     """
-    found = together([_error_where_fitted(evidence, one, seed=seed) for one in candidates])
+    found = run_side_by_side([_error_where_fitted(evidence, one, seed=seed) for one in candidates])
     limit = settings.behind * min(error for error, _ in found) + settings.close
-    race = Race(1, settings.loses)
+    race = CandidateRace(1, settings.loses)
     works = []
     for one, (error, half) in zip(candidates, found, strict=True):
         if error <= limit:
             repeats = settings.few_repeats if error > settings.far else settings.repeats
             works.append(_settle_and_judge(evidence, one, half, repeats, race.over(one.name), seed=seed))
-    done = {one.name: one for one in together(works)}
+    done = {one.name: one for one in run_side_by_side(works)}
     for _ in range(settings.refits):
         first = min(done.values(), key=_held_out_error)
         least = min(done.values(), key=lambda one: one.model.loss)
         if least is first or least.model.loss > settings.surely * first.model.loss:
             break
         # better where it was fitted, worse where it is judged: it is still on its way
-        half = alone(_error_where_fitted(evidence, least, seed=seed))[1]
+        half = run_work(_error_where_fitted(evidence, least, seed=seed))[1]
         again = _settle_and_judge(evidence, least, half, settings.repeats, None, seed=seed)
-        done[least.name] = alone(again)
+        done[least.name] = run_work(again)
     return [done.get(one.name, one) for one in candidates]
 
 
@@ -255,7 +274,9 @@ def _held_out_error(tried: Candidate) -> float:
     return tried.error
 
 
-def _error_where_fitted(evidence: Evidence, tried: Candidate, *, seed: int) -> Work[tuple[float, Half]]:
+def _error_where_fitted(
+    evidence: SplitMeasurement, tried: Candidate, *, seed: int
+) -> Work[tuple[float, PixelSubset]]:
     """Return the error on the training half, and that half with the candidate as its present model."""
     half = evidence.train.view()
     values = yield from half.rebasing(tried.model.space, tried.model.place, repeats=SETTLED, seed=seed + 100)
@@ -263,16 +284,22 @@ def _error_where_fitted(evidence: Evidence, tried: Candidate, *, seed: int) -> W
 
 
 def _settle_and_judge(
-    evidence: Evidence, tried: Candidate, half: Half, repeats: int, over: Over | None, *, seed: int
+    evidence: SplitMeasurement,
+    tried: Candidate,
+    half: PixelSubset,
+    repeats: int,
+    over: StopRule | None,
+    *,
+    seed: int,
 ) -> Work[Candidate]:
-    model = yield from settling(evidence, tried.model, seed=seed, rounds=1, half=half, over=over)
+    model = yield from refit_work(evidence, tried.model, seed=seed, rounds=1, half=half, over=over)
     judgement = yield from model.judging(evidence.held.view(), repeats=repeats, seed=seed + 500)
     return replace(tried, model=model, judgement=judgement)
 
 
 def try_effects(
-    evidence: Evidence,
-    present: Model,
+    evidence: SplitMeasurement,
+    present: FittedModel,
     effects: Mapping[str, type[Effect]],
     names: Sequence[str],
     *,
@@ -306,8 +333,8 @@ def try_effects(
     first = order[: settings.finalists]
     chosen = [*first, *family_specialists(order, first, worst)]
     report(f"fitting {', '.join(one.name for one in chosen)}", 0.5)
-    last = Race(1, settings.gives_up)
-    refined = together([refine_candidate(evidence, one, last, seed=seed) for one in chosen])
+    last = CandidateRace(1, settings.gives_up)
+    refined = run_side_by_side([refine_candidate(evidence, one, last, seed=seed) for one in chosen])
     finalists = with_p_values(evidence, present, refined, repeats, seed=seed)
     # what chance does as well is not added, whatever its error; few repeats cannot give a small p-value
     significant = max(settings.significant, 1.01 / (1 + len(repeats)))
@@ -320,8 +347,8 @@ def try_effects(
 
 
 def _screen_variants(
-    evidence: Evidence,
-    present: Model,
+    evidence: SplitMeasurement,
+    present: FittedModel,
     variants: Sequence[Effect],
     *,
     seed: int,
@@ -329,16 +356,16 @@ def _screen_variants(
     settings: CandidateSettings,
 ) -> tuple[list[Candidate], list[Candidate]]:
     """Return candidates in order of their loss on some pixels, and those from which nothing descended."""
-    screenings = together(
+    screenings = run_side_by_side(
         [screen_effect(evidence, present, effect, seed=seed) for effect in variants],
         lambda share: report("looking at all effects", 0.2 * share),
     )
-    race, found = Race(settings.finalists), dict[str, Candidate]()
+    race, found = CandidateRace(settings.finalists), dict[str, Candidate]()
     works = [
         descend_from_screening(one, race, seed=seed, settings=settings)
         for one in worth_descending(screenings, settings)
     ]
-    for tried in together(works, lambda share: report("trying all effects", 0.2 + 0.3 * share)):
+    for tried in run_side_by_side(works, lambda share: report("trying all effects", 0.2 + 0.3 * share)):
         # of the variants of an effect the best stands for it
         if tried.name not in found or tried.screened_loss < found[tried.name].screened_loss:
             found[tried.name] = tried
@@ -360,7 +387,12 @@ def family_specialists(
 
 
 def with_p_values(
-    evidence: Evidence, present: Model, candidates: Sequence[Candidate], repeats: Array, *, seed: int
+    evidence: SplitMeasurement,
+    present: FittedModel,
+    candidates: Sequence[Candidate],
+    repeats: Array,
+    *,
+    seed: int,
 ) -> list[Candidate]:
     """Return candidates with the p-values of what they make of the training loss."""
     scale = evidence.train.scale
@@ -372,7 +404,7 @@ def with_p_values(
 
 
 def p_value_function(
-    scale: Scale, candidates: Sequence[Candidate], repeats: Array, present: Array
+    scale: ErrorScale, candidates: Sequence[Candidate], repeats: Array, present: Array
 ) -> Callable[[float], float]:
     """Return the function from a fall of the training loss to its p-value, corrected over all candidates.
 

@@ -8,12 +8,12 @@ from itertools import pairwise
 import numpy as np
 
 from dase.fitting.batch_simulator import LAG_TIMES
-from dase.fitting.data_split import Evidence
-from dase.fitting.subset import Half
+from dase.fitting.data_split import SplitMeasurement
+from dase.fitting.subset import PixelSubset
 from dase.kernels.event_probes import BANDS, CLASSES, INTERVALS, KINDS, ZONES
 from dase.probes.distance import Judgement
 from dase.probes.statistics import LAYOUT, LOWEST, MEANS, TONES
-from dase.probes.timestamp_patterns import Structure
+from dase.probes.timestamp_patterns import TimestampStructure
 from dase.results import Cell
 
 StatisticWords = tuple[str, str, str]
@@ -24,7 +24,7 @@ _BOTH_POLARITIES = ("OFF", "ON")
 _STATES = ("moving", "resting")
 
 
-def band_in_words(evidence: Evidence, n: int) -> str:
+def band_in_words(evidence: SplitMeasurement, n: int) -> str:
     """Return a band of intensity in words, in grey values of 8 bits."""
     edges = [f"{255 * e:.0f}" for e in evidence.bands]
     between = [f"{a} to {b} DN" for a, b in pairwise(edges)]
@@ -32,9 +32,9 @@ def band_in_words(evidence: Evidence, n: int) -> str:
     return f"{name} pixels ({[f'below {edges[0]} DN', *between, f'above {edges[-1]} DN'][n]})"
 
 
-def describe_statistic(evidence: Evidence, family: str, n: int) -> StatisticWords:
+def describe_statistic(evidence: SplitMeasurement, family: str, n: int) -> StatisticWords:
     """Return where the `n`-th statistic of a family is taken, what it is, and its unit."""
-    words: dict[str, Callable[[Evidence, int], StatisticWords]] = {
+    words: dict[str, Callable[[SplitMeasurement, int], StatisticWords]] = {
         "rate": _rate_words,
         "intervals": _interval_words,
         "lag": _lag_words,
@@ -50,7 +50,7 @@ def describe_statistic(evidence: Evidence, family: str, n: int) -> StatisticWord
     return words[family](evidence, n)
 
 
-def _rate_words(evidence: Evidence, n: int) -> StatisticWords:
+def _rate_words(evidence: SplitMeasurement, n: int) -> StatisticWords:
     polarity, cell = divmod(n, KINDS * BANDS)
     # in the order of the kinds of `dase.kernels.event_probes`
     kind = (
@@ -64,27 +64,27 @@ def _rate_words(evidence: Evidence, n: int) -> StatisticWords:
     )
 
 
-def _interval_words(evidence: Evidence, n: int) -> StatisticWords:
+def _interval_words(evidence: SplitMeasurement, n: int) -> StatisticWords:
     group, octave = divmod(n, INTERVALS)
     rest, kin = divmod(group, 3)
     pair = ("OFF after OFF", "ON after ON", "opposite after each other")[kin]
     return f"{_STATES[rest]} pixels", f"intervals {_octave_words(octave)} of {pair}", "events"
 
 
-def _lag_words(evidence: Evidence, n: int) -> StatisticWords:
+def _lag_words(evidence: SplitMeasurement, n: int) -> StatisticWords:
     lag, where = divmod(n, BANDS)
     a, b = 1e3 * LAG_TIMES[lag], 1e3 * LAG_TIMES[lag + 1]
     what = f"change of light from {b:g} to {a:g} ms before the event"
     return band_in_words(evidence, where), what, "log intensity"
 
 
-def _repeat_words(evidence: Evidence, n: int) -> StatisticWords:
+def _repeat_words(evidence: SplitMeasurement, n: int) -> StatisticWords:
     third, where = divmod(n, BANDS)
     what = f"events that are the {'third' if third else 'second'} in a step"
     return band_in_words(evidence, where), what, "share"
 
 
-def _change_words(evidence: Evidence, n: int) -> StatisticWords:
+def _change_words(evidence: SplitMeasurement, n: int) -> StatisticWords:
     kind, rest = divmod(n, 4 * CLASSES)
     after = ("within 12 ms", "within 50 ms", "later than 50 ms")
     if kind == 2:
@@ -95,7 +95,7 @@ def _change_words(evidence: Evidence, n: int) -> StatisticWords:
     return after[group], f"{what}, {order}", "log intensity"
 
 
-def _spread_words(evidence: Evidence, n: int) -> StatisticWords:
+def _spread_words(evidence: SplitMeasurement, n: int) -> StatisticWords:
     spreads = (
         "lasting spread between pixels of OFF events", "lasting spread between pixels of ON events",
         "shared spread of ON and OFF events", "spread between pixels of OFF events",
@@ -105,31 +105,31 @@ def _spread_words(evidence: Evidence, n: int) -> StatisticWords:
     return f"{_STATES[state]} pixels", spreads[what], "events² per event"
 
 
-def _odd_pixel_words(evidence: Evidence, n: int) -> StatisticWords:
+def _odd_pixel_words(evidence: SplitMeasurement, n: int) -> StatisticWords:
     what = ("busy pixels at rest", "very busy pixels at rest", "busy pixels")[n]
     return "single pixels", what, "pixels"
 
 
-def _silent_pixel_words(evidence: Evidence, n: int) -> StatisticWords:
+def _silent_pixel_words(evidence: SplitMeasurement, n: int) -> StatisticWords:
     return "single pixels", "silent pixels", "pixels"
 
 
-def _ring_words(evidence: Evidence, n: int) -> StatisticWords:
+def _ring_words(evidence: SplitMeasurement, n: int) -> StatisticWords:
     state, ring = divmod(n, ZONES)
     rest, polarity = divmod(state, 2)
     where = f"ring {ring + 1} of {ZONES} from the middle, {_STATES[rest]}"
     return where, f"{_BOTH_POLARITIES[polarity]} events", "events"
 
 
-def _spectrum_words(evidence: Evidence, n: int) -> StatisticWords:
+def _spectrum_words(evidence: SplitMeasurement, n: int) -> StatisticWords:
     if n >= TONES:
         return "all pixels", f"swing of the net rate at {evidence.peak:.4g} Hz", "share"
     ends = np.geomspace(LOWEST, 0.5 / evidence.held.frame.step, TONES + 1)
     return "all pixels", f"power of the net rate from {ends[n]:.3g} to {ends[n + 1]:.3g} Hz", "log power"
 
 
-def _timestamp_words(evidence: Evidence, n: int) -> StatisticWords:
-    return "all pixels", Structure.NAMES[n], "share"
+def _timestamp_words(evidence: SplitMeasurement, n: int) -> StatisticWords:
+    return "all pixels", TimestampStructure.NAMES[n], "share"
 
 
 def _octave_words(n: int) -> str:
@@ -141,9 +141,9 @@ def _octave_words(n: int) -> str:
 
 
 def worst_cells(
-    evidence: Evidence,
+    evidence: SplitMeasurement,
     judgement: Judgement,
-    half: Half | None = None,
+    half: PixelSubset | None = None,
     *,
     shown: int = 24,
     notable: float = 2.5,

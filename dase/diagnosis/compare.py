@@ -11,10 +11,10 @@ from numpy.typing import NDArray
 from dase.diagnosis.cell_descriptions import band_in_words, worst_cells
 from dase.diagnosis.settings import DEFAULTS, DiagnosisSettings
 from dase.fitting.batch_simulator import LAG_TIMES
-from dase.fitting.data_split import PIXELS, Evidence, gather
+from dase.fitting.data_split import PIXELS, SplitMeasurement, split_measurement
 from dase.fitting.measurement import Measured, SceneChoice, as_measurement
 from dase.fitting.model import model_of
-from dase.fitting.subset import Half
+from dase.fitting.subset import PixelSubset
 from dase.kernels.event_probes import BANDS, INTERVALS, KINDS, LAGS, RESTING
 from dase.probes.distance import Judgement
 from dase.probes.statistics import LAYOUT
@@ -62,7 +62,7 @@ def compare(
     model = as_sensor(sensor)
     measurement = as_measurement(measured, scene, trust)
     model = model.bound_to(measurement.scene)
-    evidence = gather(
+    evidence = split_measurement(
         measurement.events, measurement.scene, log_eps=model.log_eps, trust=measurement.trust,
         pixels=pixels, seed=seed, device=device,
     )  # fmt: skip
@@ -73,7 +73,9 @@ def compare(
     return measurement.noted(found)
 
 
-def comparison_of(evidence: Evidence, judgement: Judgement, sensor: Sensor, *, seconds: float) -> Comparison:
+def comparison_of(
+    evidence: SplitMeasurement, judgement: Judgement, sensor: Sensor, *, seconds: float
+) -> Comparison:
     """Return the comparison with the model that the held-out half was rebased to."""
     return Comparison(
         sensor=sensor,
@@ -89,7 +91,7 @@ def comparison_of(evidence: Evidence, judgement: Judgement, sensor: Sensor, *, s
     )
 
 
-def plain_numbers(half: Half) -> dict[str, tuple[float, float]]:
+def plain_numbers(half: PixelSubset) -> dict[str, tuple[float, float]]:
     """Return measured and simulated values in units that need no explanation."""
     values = half.seen.target, half.simulated
     real, made = (_rate_counts(v) for v in values)
@@ -142,7 +144,7 @@ def _mean_lag(values: Array) -> float:
     return float(1e3 * (weight * middle).sum() / max(weight.sum(), 1e-12))
 
 
-def family_curves(evidence: Evidence) -> dict[str, tuple[Curve, ...]]:
+def family_curves(evidence: SplitMeasurement) -> dict[str, tuple[Curve, ...]]:
     """Return what figures are drawn from, by family."""
     half = evidence.held
     return {
@@ -152,7 +154,7 @@ def family_curves(evidence: Evidence) -> dict[str, tuple[Curve, ...]]:
     }
 
 
-def _rate_curves(evidence: Evidence, half: Half) -> tuple[Curve, ...]:
+def _rate_curves(evidence: SplitMeasurement, half: PixelSubset) -> tuple[Curve, ...]:
     exposure = np.maximum(half.trials.stimulus.exposure().reshape(KINDS, BANDS), 1e-9)
     middle = np.array([-0.4, -0.12, 0.0, 0.12, 0.4])
     out = []
@@ -169,7 +171,7 @@ def _rate_curves(evidence: Evidence, half: Half) -> tuple[Curve, ...]:
     return tuple(out)
 
 
-def _interval_curves(half: Half) -> tuple[Curve, ...]:
+def _interval_curves(half: PixelSubset) -> tuple[Curve, ...]:
     step = half.trials.stimulus.grid.step * 1e3
     ends = _octave_ends(step)
     middle = np.concatenate([[0.35 * step], np.sqrt(ends[:-1] * ends[1:])])
@@ -183,7 +185,7 @@ def _interval_curves(half: Half) -> tuple[Curve, ...]:
     )  # fmt: skip
 
 
-def _lag_curves(evidence: Evidence, half: Half) -> tuple[Curve, ...]:
+def _lag_curves(evidence: SplitMeasurement, half: PixelSubset) -> tuple[Curve, ...]:
     times = np.array(LAG_TIMES)
     width = 1e3 * np.diff(times)
     middle = 1e3 * 0.5 * (times[1:] + times[:-1])

@@ -15,12 +15,12 @@ from dase.diagnosis.pruning import prune_model
 from dase.diagnosis.settings import DEFAULTS, DiagnosisSettings
 from dase.diagnosis.state import DiagnosisState, explains_remainder, with_same_freedom
 from dase.effects import EFFECTS, Effect
-from dase.fitting.confidence_intervals import estimates
-from dase.fitting.data_split import PIXELS, gather
+from dase.fitting.confidence_intervals import estimate_parameters
+from dase.fitting.data_split import PIXELS, split_measurement
 from dase.fitting.measurement import Measured, SceneChoice, as_measurement
-from dase.fitting.model import Model, fit_present, model_of, settle, settling
-from dase.fitting.scheduler import together
-from dase.probes.distance import Judgement, announced, explained, silent, worst_families
+from dase.fitting.model import FittedModel, fit_present_model, model_of, refit_model, refit_work
+from dase.fitting.scheduler import run_side_by_side
+from dase.probes.distance import Judgement, leaves_nothing, may_be_announced, reaches_floor, worst_families
 from dase.probes.stimulus import Trust
 from dase.results import Cell, Diagnosis, Estimate, Progress, Rank, Step, Unexplained
 from dase.simulation.sensor import Sensor
@@ -68,7 +68,7 @@ def diagnose(
     given = Sensor() if sensor is None else as_sensor(sensor)
     measurement = as_measurement(measured, scene, trust)
     given = given.bound_to(measurement.scene)
-    evidence = gather(
+    evidence = split_measurement(
         measurement.events, measurement.scene, log_eps=given.log_eps, trust=measurement.trust,
         pixels=pixels, seed=seed, device=device,
     )  # fmt: skip
@@ -76,9 +76,9 @@ def diagnose(
     names = frozenset(effect.name for effect in given.effects)
     state = DiagnosisState(evidence, effects, seed, tell, names, settings)
     before = model_of(given, free).judge(evidence.held, repeats=settings.repeats // 2, seed=seed + 500).error
-    start = fit_present(evidence, given, free, seed=seed)
+    start = fit_present_model(evidence, given, free, seed=seed)
     model, judgement, errors = _add_one_by_one(state, start, most)
-    if not explained(judgement) and most > 0:
+    if not reaches_floor(judgement) and most > 0:
         model, judgement = _add_pair(state, start, model, judgement)
     if len(state.added_to(model)) > 1:
         model, judgement = prune_model(state, model, judgement)
@@ -86,7 +86,9 @@ def diagnose(
     return measurement.noted(replace(found, seconds=time.perf_counter() - begin))
 
 
-def _add_one_by_one(state: DiagnosisState, model: Model, most: int) -> tuple[Model, Judgement, list[float]]:
+def _add_one_by_one(
+    state: DiagnosisState, model: FittedModel, most: int
+) -> tuple[FittedModel, Judgement, list[float]]:
     """Add the best effect as long as one is missing.
 
     Returns:
@@ -109,8 +111,8 @@ def _add_one_by_one(state: DiagnosisState, model: Model, most: int) -> tuple[Mod
 
 
 def _look_for_effect(
-    state: DiagnosisState, model: Model, judgement: Judgement, more: bool
-) -> tuple[Step, Model | None, bool]:
+    state: DiagnosisState, model: FittedModel, judgement: Judgement, more: bool
+) -> tuple[Step, FittedModel | None, bool]:
     """Try all effects.
 
     Returns:
@@ -121,7 +123,7 @@ def _look_for_effect(
     names = tuple(e.name for e in model.space.sensor.effects)
     cells = worst_cells(evidence, judgement)
     step = Step(names, judgement.error, judgement.gate, judgement.families, (), None, (), cells)
-    if silent(judgement) or not more:
+    if leaves_nothing(judgement) or not more:
         return step, None, False
     repeats = model.rebase(evidence.train, repeats=settings.repeats, seed=seed + 300)
     model.rebase(evidence.scout, repeats=settings.scout_repeats, seed=seed + 200)
@@ -142,7 +144,7 @@ def _look_for_effect(
     state.note_addition(best, [one for one in tried if one.judgement], ties, judgement)
     step = replace(step, chosen=best.name, ties=ties)
     far = best.error > settings.on_its_way * judgement.gate
-    return step, settle(evidence, best.model, seed=seed, rounds=1), far
+    return step, refit_model(evidence, best.model, seed=seed, rounds=1), far
 
 
 def _best_candidate(
@@ -151,7 +153,7 @@ def _best_candidate(
     """Return the candidate that is to be added, None if there is none, and those not told apart from it."""
     settings = state.settings
     finalists = [one for one in tried if one.judgement]
-    right = explained(judgement)
+    right = reaches_floor(judgement)
     if right:
         finalists = [
             one for one in finalists
@@ -182,10 +184,10 @@ def _simplest_of_the_best(
     """Return the best candidate, the simplest of those that are not told apart, and the others of those."""
     first = finalists[0]
     reach = max(settings.tie, settings.tie_share * first.error)
-    good = first.judgement is not None and explained(first.judgement)
+    good = first.judgement is not None and reaches_floor(first.judgement)
     like = [
         one for one in finalists
-        if one.error <= first.error + reach and one.judgement and (explained(one.judgement) or not good)
+        if one.error <= first.error + reach and one.judgement and (reaches_floor(one.judgement) or not good)
     ]  # fmt: skip
     best = min(like, key=lambda one: (len(one.model.place), one.error))
     return best, tuple(one.name for one in like if one.name != best.name)
@@ -207,8 +209,8 @@ def _rank_of(candidate: Candidate, judgement: Judgement) -> Rank:
 
 
 def _add_pair(
-    state: DiagnosisState, start: Model, model: Model, judgement: Judgement
-) -> tuple[Model, Judgement]:
+    state: DiagnosisState, start: FittedModel, model: FittedModel, judgement: Judgement
+) -> tuple[FittedModel, Judgement]:
     """Where adding one after the other does not reach the floor, try two at once."""
     evidence, seed, settings = state.evidence, state.seed, state.settings
     singles = [one for one in state.first if one.screened_loss < settings.pair_helps_alone][: settings.paired]
@@ -219,31 +221,31 @@ def _add_pair(
         both = one.model.sensor.with_effect(two.model.sensor[two.name])
         pair = with_same_freedom(both, start, (one.name, two.name))
         works.append(pair.searching(evidence.scout, seed=seed, iterations=4, radius=0.3))
-    ends = together(works, lambda share: state.progress("trying pairs", share, state.error))
+    ends = run_side_by_side(works, lambda share: state.progress("trying pairs", share, state.error))
     tried = [
         (pair.loss, f"{one.name} + {two.name}", pair) for (one, two), pair in zip(pairs, ends, strict=True)
     ]
     first = sorted(tried, key=lambda t: t[0])[:2]
-    settled = together([settling(evidence, pair, seed=seed) for _, _, pair in first])
+    settled = run_side_by_side([refit_work(evidence, pair, seed=seed) for _, _, pair in first])
     for (_, name, _), pair in zip(first, settled, strict=True):
         judged = state.judge(pair)
-        if judged.error < judgement.error * (1.0 if explained(judged) else settings.pair_gain):
+        if judged.error < judgement.error * (1.0 if reaches_floor(judged) else settings.pair_gain):
             model, judgement = pair, judged
             state.history.append(replace(state.history[0], chosen=name, ties=(), ranking=(), cells=()))
     return model, judgement
 
 
 def _conclude_diagnosis(
-    state: DiagnosisState, start: Model, model: Model, errors: list[float], before: float
+    state: DiagnosisState, start: FittedModel, model: FittedModel, errors: list[float], before: float
 ) -> Diagnosis:
     """Return what was found; names are announced only where they bring the error to the floor."""
     found = state.added_to(model)
     chosen = [n for s in state.history if s.chosen for n in s.chosen.split(" + ")]
     order = tuple(dict.fromkeys([*(n for n in chosen if n in found), *found]))
-    model, values = estimates(state.evidence, model, seed=state.seed)
+    model, values = estimate_parameters(state.evidence, model, seed=state.seed)
     last = state.judge(model)
     unexplained: Unexplained | None = None
-    if not announced(last):
+    if not may_be_announced(last):
         cells = worst_cells(state.evidence, last)
         unexplained = _describe_unexplained(state, order, errors[0], last, cells)
     kept = unexplained is None

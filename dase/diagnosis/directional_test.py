@@ -16,11 +16,11 @@ from numpy.typing import NDArray
 from dase.diagnosis.candidates import Candidate, effects_to_try, variants_to_try
 from dase.diagnosis.settings import DEFAULTS
 from dase.diagnosis.state import DiagnosisState
-from dase.fitting.model import Model, added, settle
-from dase.fitting.scheduler import Ask, alone, simulated
-from dase.fitting.subset import Half
-from dase.probes.distance import Judgement, explained
-from dase.probes.statistics import statistics
+from dase.fitting.model import FittedModel, refit_model, with_effect_added
+from dase.fitting.scheduler import SimulationRequest, answer_requests, run_work
+from dase.fitting.subset import PixelSubset
+from dase.probes.distance import Judgement, reaches_floor
+from dase.probes.statistics import compute_statistics
 
 Array = NDArray[np.float64]
 
@@ -57,22 +57,22 @@ class RepeatCloud:
 
 
 def find_hidden_effect(
-    state: DiagnosisState, model: Model, judgement: Judgement
+    state: DiagnosisState, model: FittedModel, judgement: Judgement
 ) -> tuple[Candidate, float] | None:
     """Return the effect that chance hid, fitted and judged, and its p-value; None if there is none."""
     hidden = state.settings.hidden
     # also above what chance does: there no candidate may be certain by the fall of its loss
-    if judgement.level < hidden.hides or not explained(judgement):
+    if judgement.level < hidden.hides or not reaches_floor(judgement):
         return None
     state.progress("looking closer", 0.0, state.error)
     start = _most_deviating_effect(state, model)
     if start is None:
         return None
     name, begin, p_value = start
-    fitted = settle(state.evidence, begin, seed=state.seed, rounds=1)
+    fitted = refit_model(state.evidence, begin, seed=state.seed, rounds=1)
     repeats = state.settings.repeats
-    judged = alone(fitted.judging(state.evidence.held.view(), repeats=repeats, seed=state.seed + 500))
-    if not explained(judged):
+    judged = run_work(fitted.judging(state.evidence.held.view(), repeats=repeats, seed=state.seed + 500))
+    if not reaches_floor(judged):
         return None
     if deviation_towards(state, state.evidence.held, model, fitted) < hidden.away_held_out:
         return None
@@ -81,10 +81,12 @@ def find_hidden_effect(
 
 def may_hide_effect(judgement: Judgement, hides: float = DEFAULTS.hidden.hides) -> bool:
     """Whether the chance of a model may hide an effect: it makes much of the error, and may make all."""
-    return judgement.level >= hides and judgement.error <= judgement.reach and explained(judgement)
+    return judgement.level >= hides and judgement.error <= judgement.reach and reaches_floor(judgement)
 
 
-def lacks_effect_of(state: DiagnosisState, model: Model, judgement: Judgement, other: Model) -> bool:
+def lacks_effect_of(
+    state: DiagnosisState, model: FittedModel, judgement: Judgement, other: FittedModel
+) -> bool:
     """Whether a closer look shows that a model, which leaves what is judged, lacks what another one has."""
     hidden = state.settings.hidden
     if not may_hide_effect(judgement, hidden.hides):
@@ -93,14 +95,18 @@ def lacks_effect_of(state: DiagnosisState, model: Model, judgement: Judgement, o
     return all(deviation_towards(state, half, model, other) >= least for half, least in ways)
 
 
-def deviation_towards(state: DiagnosisState, half: Half, model: Model, other: Model) -> float:
+def deviation_towards(
+    state: DiagnosisState, half: PixelSubset, model: FittedModel, other: FittedModel
+) -> float:
     """Return how far a measurement is from repeats of a model, on the way to another, in their deviations."""
     half, cloud = _repeat_cloud(state, half, model)
     one, two = _mean_statistics(state, half, [(model, model.place[None]), (other, other.place[None])])
     return float(cloud.deviations_along(_in_standard_errors(half, two - one))[0])
 
 
-def _most_deviating_effect(state: DiagnosisState, model: Model) -> tuple[str, Model, float] | None:
+def _most_deviating_effect(
+    state: DiagnosisState, model: FittedModel
+) -> tuple[str, FittedModel, float] | None:
     """Return the effect on whose way the measurement is farthest from the model, where to begin, a p-value.
 
     For that, repeats stand in for the measurement, each on the way on which it is farthest.
@@ -135,7 +141,7 @@ def _most_deviating_effect(state: DiagnosisState, model: Model) -> tuple[str, Mo
     )
 
 
-def _starting_model(model: Model, other: Model, place: Array, step: Array) -> Model:
+def _starting_model(model: FittedModel, other: FittedModel, place: Array, step: Array) -> FittedModel:
     """Return the model with an effect more where the rest has given way to it.
 
     Args:
@@ -148,17 +154,19 @@ def _starting_model(model: Model, other: Model, place: Array, step: Array) -> Mo
     place = place.copy()
     for axis, change in zip(model.space.axes, step, strict=True):
         place[names.index(axis.name)] += change
-    return Model(other.space, place)
+    return FittedModel(other.space, place)
 
 
-def _models_to_probe(state: DiagnosisState, model: Model, half: Half) -> list[tuple[str, Model, Array]]:
+def _models_to_probe(
+    state: DiagnosisState, model: FittedModel, half: PixelSubset
+) -> list[tuple[str, FittedModel, Array]]:
     """Return effects, the models with them, and the places where those are looked at; none that are slow."""
     out = []
     effects, idle_bus = state.effects, state.settings.candidates.idle_bus
     strengths = np.array(state.settings.hidden.strengths)
     names = effects_to_try(effects, model)
     for effect in (e for n in names for e in variants_to_try(state.evidence, effects[n], idle_bus=idle_bus)):
-        other = added(model, effect)
+        other = with_effect_added(model, effect)
         columns = [
             n for n, a in enumerate(other.space.axes) if a.name.split(".")[0] == effect.name and a.main
         ]
@@ -172,7 +180,9 @@ def _models_to_probe(state: DiagnosisState, model: Model, half: Half) -> list[tu
     return out
 
 
-def _repeat_cloud(state: DiagnosisState, half: Half, model: Model) -> tuple[Half, RepeatCloud]:
+def _repeat_cloud(
+    state: DiagnosisState, half: PixelSubset, model: FittedModel
+) -> tuple[PixelSubset, RepeatCloud]:
     """Return a half with a model as its present one, and the repeats of it beside the measurement."""
     half = half.view()
     repeats = model.rebase(half, repeats=state.settings.repeats, seed=state.seed + 700)
@@ -182,17 +192,22 @@ def _repeat_cloud(state: DiagnosisState, half: Half, model: Model) -> tuple[Half
     return half, cloud
 
 
-def _in_standard_errors(half: Half, apart: Array) -> Array:
+def _in_standard_errors(half: PixelSubset, apart: Array) -> Array:
     """Return differences (..., J) in standard errors, only those that are compared."""
     used = half.chance.used
     out: Array = apart[..., used] / half.chance.sigma[used]
     return out
 
 
-def _mean_statistics(state: DiagnosisState, half: Half, models: Sequence[tuple[Model, Array]]) -> list[Array]:
+def _mean_statistics(
+    state: DiagnosisState, half: PixelSubset, models: Sequence[tuple[FittedModel, Array]]
+) -> list[Array]:
     """Return the mean statistics of models at some places, (M, J) each, their random numbers in common."""
     count, seed = state.settings.hidden.repeats_of_mean, state.seed
-    sums = simulated(
-        [Ask(half, m.space, np.repeat(places, count, 0), seed + 900, repeats=True) for m, places in models]
+    sums = answer_requests(
+        [
+            SimulationRequest(half, m.space, np.repeat(places, count, 0), seed + 900, repeats=True)
+            for m, places in models
+        ]
     )
-    return [statistics(one, half.frame)[0].reshape(-1, count, len(half.off)).mean(1) for one in sums]
+    return [compute_statistics(one, half.frame)[0].reshape(-1, count, len(half.off)).mean(1) for one in sums]

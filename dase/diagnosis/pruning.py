@@ -6,13 +6,15 @@ from collections.abc import Mapping
 
 from dase.diagnosis.directional_test import lacks_effect_of
 from dase.diagnosis.state import DiagnosisState, explains_remainder, with_same_freedom
-from dase.fitting.early_stopping import short_of
-from dase.fitting.model import Model, settle, settling
-from dase.fitting.scheduler import together
-from dase.probes.distance import Judgement, announced, explained, silent
+from dase.fitting.early_stopping import stop_unless_below
+from dase.fitting.model import FittedModel, refit_model, refit_work
+from dase.fitting.scheduler import run_side_by_side
+from dase.probes.distance import Judgement, leaves_nothing, may_be_announced, reaches_floor
 
 
-def prune_model(state: DiagnosisState, model: Model, judgement: Judgement) -> tuple[Model, Judgement]:
+def prune_model(
+    state: DiagnosisState, model: FittedModel, judgement: Judgement
+) -> tuple[FittedModel, Judgement]:
     """Drop effects that are not needed any more, put simpler ones in place of others, and drop again.
 
     Args:
@@ -26,17 +28,17 @@ def prune_model(state: DiagnosisState, model: Model, judgement: Judgement) -> tu
     before = model
     for name in state.added_to(model):
         for other, swap in _keep_near_models(state, _rival_models(state, model, name), judgement).items():
-            swapped = settle(state.evidence, swap, seed=state.seed)
+            swapped = refit_model(state.evidence, swap, seed=state.seed)
             judged = state.judge(swapped)
             without = state.without.get(name)
-            if not explained(judged):
+            if not reaches_floor(judged):
                 continue
             if without is not None and not explains_remainder(judged, without, state.settings):
                 continue
             if lacks_effect_of(state, swapped, judged, model):
                 continue
             simpler = len(swapped.place) < len(model.place)
-            if simpler or not explained(judgement):
+            if simpler or not reaches_floor(judgement):
                 model, judgement = swapped, judged
                 state.ties[other] = {*state.ties.pop(name, set()), name} - {other}
                 break
@@ -44,19 +46,21 @@ def prune_model(state: DiagnosisState, model: Model, judgement: Judgement) -> tu
     return _drop_needless(state, model, judgement) if model is not before else (model, judgement)
 
 
-def _drop_needless(state: DiagnosisState, model: Model, judgement: Judgement) -> tuple[Model, Judgement]:
+def _drop_needless(
+    state: DiagnosisState, model: FittedModel, judgement: Judgement
+) -> tuple[FittedModel, Judgement]:
     """Drop effects that are not needed any more."""
     whole = model
     for name, less in _keep_near_models(state, _droppable_models(state, model), judgement).items():
         if name not in model.sensor or len(state.added_to(model)) == 1:
             continue
         less = less if model is whole else with_same_freedom(model.sensor.without(name), model, ())
-        fitted = settle(state.evidence, less, seed=state.seed)
+        fitted = refit_model(state.evidence, less, seed=state.seed)
         without = state.judge(fitted)
         # what would not be added now is not kept
-        needless = announced(without) and without.error < judgement.error + state.settings.material
-        if explained(without):
-            needless = silent(without) or not explains_remainder(judgement, without, state.settings)
+        needless = may_be_announced(without) and without.error < judgement.error + state.settings.material
+        if reaches_floor(without):
+            needless = leaves_nothing(without) or not explains_remainder(judgement, without, state.settings)
         needless = needless or without.error <= judgement.error
         if needless and not lacks_effect_of(state, fitted, without, model):
             model, judgement = fitted, without
@@ -64,19 +68,19 @@ def _drop_needless(state: DiagnosisState, model: Model, judgement: Judgement) ->
 
 
 def _keep_near_models(
-    state: DiagnosisState, ways: Mapping[str, Model], judgement: Judgement
-) -> dict[str, Model]:
+    state: DiagnosisState, ways: Mapping[str, FittedModel], judgement: Judgement
+) -> dict[str, FittedModel]:
     """Return those models that one descent takes near enough to be fitted in full, fitted by it."""
     evidence, seed, pruning = state.evidence, state.seed, state.settings.pruning
-    ends = together([settling(evidence, way, seed=seed, rounds=1) for way in ways.values()])
-    judged = together(
+    ends = run_side_by_side([refit_work(evidence, way, seed=seed, rounds=1) for way in ways.values()])
+    judged = run_side_by_side(
         [m.judging(evidence.held.view(), repeats=pruning.repeats, seed=seed + 500) for m in ends]
     )
     limit = pruning.near * max(judgement.gate, judgement.error)
     return {name: m for name, m, j in zip(ways, ends, judged, strict=True) if j.error < limit}
 
 
-def _droppable_models(state: DiagnosisState, model: Model) -> dict[str, Model]:
+def _droppable_models(state: DiagnosisState, model: FittedModel) -> dict[str, FittedModel]:
     """Return the models without one effect that may do: not far off on the scout, quickly fitted.
 
     Fitting one in full takes as long as trying a dozen; most are far off.
@@ -84,8 +88,8 @@ def _droppable_models(state: DiagnosisState, model: Model) -> dict[str, Model]:
     scout, seed, repeats = state.evidence.scout.view(), state.seed, state.settings.scout_repeats
     model.rebase(scout, repeats=repeats, seed=seed + 200)
     ways = {name: with_same_freedom(model.sensor.without(name), model, ()) for name in state.added_to(model)}
-    quick = together([way.searching(scout, seed=seed, iterations=2) for way in ways.values()])
-    judged = together([way.judging(scout.view(), repeats=repeats, seed=seed + 500) for way in quick])
+    quick = run_side_by_side([way.searching(scout, seed=seed, iterations=2) for way in ways.values()])
+    judged = run_side_by_side([way.judging(scout.view(), repeats=repeats, seed=seed + 500) for way in quick])
     return {
         name: way for name, way, judgement in zip(ways, quick, judged, strict=True)
         if judgement.error < state.settings.pruning.droppable * judgement.gate
@@ -93,8 +97,8 @@ def _droppable_models(state: DiagnosisState, model: Model) -> dict[str, Model]:
 
 
 def _keep_promising_models(
-    state: DiagnosisState, model: Model, ways: Mapping[str, Model]
-) -> dict[str, Model]:
+    state: DiagnosisState, model: FittedModel, ways: Mapping[str, FittedModel]
+) -> dict[str, FittedModel]:
     """Return those models that may do as well as the present one: simpler, or not far off on the scout.
 
     A simpler model may be long on its way: bandwidth after an overdamped second order had been fitted.
@@ -106,14 +110,16 @@ def _keep_promising_models(
     enough = state.settings.pruning.rival_loss * float(scout.scale.loss(repeats).mean())
     simpler = {name: len(way.place) < len(model.place) for name, way in ways.items()}
     works = [
-        way.searching(scout, seed=state.seed, iterations=2, over=None if simpler[name] else short_of(enough))
+        way.searching(
+            scout, seed=state.seed, iterations=2, over=None if simpler[name] else stop_unless_below(enough)
+        )
         for name, way in ways.items()
     ]
-    quick = zip(ways, together(works), strict=True)
+    quick = zip(ways, run_side_by_side(works), strict=True)
     return {name: ways[name] for name, found in quick if found.loss < enough or simpler[name]}
 
 
-def _rival_models(state: DiagnosisState, model: Model, name: str) -> dict[str, Model]:
+def _rival_models(state: DiagnosisState, model: FittedModel, name: str) -> dict[str, FittedModel]:
     """Return the models with an alternative in the place of an effect that may do as well."""
     pruning = state.settings.pruning
     limit, ways = pruning.rival_error * state.error_of.get(name, 0.0) + state.settings.tie, {}

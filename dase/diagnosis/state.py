@@ -8,9 +8,9 @@ from dataclasses import dataclass, field
 from dase.diagnosis.candidates import Candidate
 from dase.diagnosis.settings import DEFAULTS, DiagnosisSettings
 from dase.effects import Effect
-from dase.fitting.data_split import Evidence
-from dase.fitting.model import Model, free_of, model_of
-from dase.probes.distance import QUIET, Judgement, explained
+from dase.fitting.data_split import SplitMeasurement
+from dase.fitting.model import FittedModel, free_of, model_of
+from dase.probes.distance import QUIET, Judgement, reaches_floor
 from dase.results import Progress, Step
 from dase.simulation.sensor import Sensor
 
@@ -35,7 +35,7 @@ class DiagnosisState:
         error: Held-out error of the model that was judged last.
     """
 
-    evidence: Evidence
+    evidence: SplitMeasurement
     effects: Mapping[str, type[Effect]]
     seed: int
     progress: Progress
@@ -49,7 +49,7 @@ class DiagnosisState:
     first: list[Candidate] = field(default_factory=list)
     error: float = float("nan")
 
-    def judge(self, model: Model, *, repeats: int | None = None) -> Judgement:
+    def judge(self, model: FittedModel, *, repeats: int | None = None) -> Judgement:
         """Return the held-out error of a model; makes it the present one of that half."""
         repeats = self.settings.repeats if repeats is None else repeats
         judgement = model.judge(self.evidence.held, repeats=repeats, seed=self.seed + 500)
@@ -71,10 +71,10 @@ class DiagnosisState:
         self.alternatives[best.name] = [one for one in finalists if one.name != best.name]
         self.error_of[best.name] = best.error
         self.ties[best.name] = set(ties)
-        if explained(without):
+        if reaches_floor(without):
             self.without[best.name] = without
 
-    def added_to(self, model: Model) -> tuple[str, ...]:
+    def added_to(self, model: FittedModel) -> tuple[str, ...]:
         """Return the effects of a model that the given sensor did not have."""
         return tuple(e.name for e in model.space.sensor.effects if e.name not in self.given)
 
@@ -87,11 +87,11 @@ def explains_remainder(
     That may be the scene's fault, or another simulator's habit, so it must explain most of it.
     """
     level = judgement.level
-    chance = judgement.error <= max(QUIET, judgement.reach) and explained(judgement)
+    chance = judgement.error <= max(QUIET, judgement.reach) and reaches_floor(judgement)
     return chance and judgement.error - level <= settings.remainder * (without.error - level)
 
 
-def with_same_freedom(sensor: Sensor, model: Model, more: Sequence[str]) -> Model:
+def with_same_freedom(sensor: Sensor, model: FittedModel, more: Sequence[str]) -> FittedModel:
     """Return the model of a sensor in which what is free in another model is free, and all of some effects.
 
     Args:

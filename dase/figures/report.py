@@ -18,7 +18,7 @@ from dase.figures.event_maps import event_plates
 from dase.figures.style import Plate, format_number
 from dase.fitting.measurement import Measurement
 from dase.io import replacing
-from dase.probes.statistics import WORDS
+from dase.probes.statistics import FAMILY_WORDS
 from dase.results import Comparison, Diagnosis, Estimate, Step
 from dase.scenes.between_frames import CameraScene
 from dase.simulation.sensor import Sensor
@@ -56,7 +56,7 @@ def measurement_plates(
     real, made = measured.events, Events.concatenate(parts)
     if not isinstance(measured.scene, CameraScene):
         return event_plates(real, made, (begin, end), frames=frames, frame_times=shown)
-    real, made = measured.scene.believed(real), measured.scene.believed(made)
+    real, made = measured.scene.trusted_events(real), measured.scene.trusted_events(made)
     plates = event_plates(real, made, (begin, end), frames=frames, frame_times=shown)
     believed = "Events are shown only where and when the scene between the frames can be trusted."
     return [replace(plate, caption=f"{plate.caption} {believed}") for plate in plates]
@@ -237,7 +237,7 @@ def ranking_of(step: Step, floor: float) -> Plate:
 
 def family_words(name: str) -> str:
     """Return a family of statistics in a few words."""
-    return WORDS.get(name, name)
+    return FAMILY_WORDS.get(name, name)
 
 
 def _plain_rows(plain: Mapping[str, tuple[float, float]]) -> list[tuple[str, ...]]:

@@ -140,7 +140,7 @@ def measurement_of(
         raise InputError(f"{name} has no events, so there is nothing to compare")
     own = scene == "frames"
     seen = scene_of_frames(recorded, name, said) if own else _chosen_scene(scene, recorded.events)
-    trust: Trust | None = seen.trusts if isinstance(seen, CameraScene) else None
+    trust: Trust | None = seen.is_trusted if isinstance(seen, CameraScene) else None
     if isinstance(recorded, Recording) and not recorded.mask.all():
         trust = _trust_within(recorded.mask, trust)
     return Measurement(recorded.events, seen, trust, tuple(said))

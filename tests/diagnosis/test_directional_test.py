@@ -21,8 +21,8 @@ from dase.diagnosis.explain_effect import moving_bars
 from dase.diagnosis.settings import DEFAULTS
 from dase.diagnosis.state import DiagnosisState
 from dase.effects import EFFECTS
-from dase.fitting.data_split import gather
-from dase.fitting.model import Model, model_of
+from dase.fitting.data_split import split_measurement
+from dase.fitting.model import FittedModel, model_of
 from dase.probes.distance import Judgement
 from dase.simulation.sensor import Sensor
 
@@ -62,7 +62,7 @@ def searches(device) -> dict[str, DiagnosisState]:
     out = {}
     for name, sensor in (("plain", TRUE), ("uneven", TRUE.with_effect(JITTER))):
         events = dase.simulate(scene, sensor, seed=4, device=device)
-        evidence = gather(events, scene, pixels=900, seed=1, device=device)
+        evidence = split_measurement(events, scene, pixels=900, seed=1, device=device)
         out[name] = DiagnosisState(
             evidence, LIBRARY, 1, lambda text, share, error: None, frozenset({"threshold"})
         )
@@ -92,7 +92,7 @@ def test_nothing_is_looked_at_where_chance_hides_nothing(searches):
 
 
 def tried(name: str, error: float, parameters: int = 2) -> Candidate:
-    return Candidate(name, Model(None, np.zeros(parameters)), 0.0, judgement=judged(error))
+    return Candidate(name, FittedModel(None, np.zeros(parameters)), 0.0, judgement=judged(error))
 
 
 def test_the_simplest_of_those_that_are_not_told_apart_is_chosen():
