@@ -19,7 +19,7 @@ from dase.effects.mismatch import Mismatch
 from dase.effects.threshold import Threshold
 from dase.events import Events
 from dase.io.sequence import Sequence
-from dase.learning.recorded_target import open_target, windows_of
+from dase.learning.recorded_target import cut_windows, open_target
 from dase.networks.threshold_network import NetworkShape, ThresholdNet
 from dase.recordings.recording import Recording
 from dase.scenes.video import VideoScene
@@ -214,7 +214,7 @@ def moving(seconds: float = 1.0, rate: float = 0.2) -> Sequence:
 def test_windows_hold_the_scene_and_the_events():
     sequence = moving()
     recording = Recording.of(sequence)
-    windows = windows_of(recording, window=0.1, samples=5)
+    windows = cut_windows(recording, window=0.1, samples=5)
     assert windows.log.shape == (len(windows.begin), 5, 32, 32)
     assert windows.trusted > 0.5
     trusted = np.ptp(windows.log, axis=1) > 0
@@ -271,7 +271,7 @@ def test_the_command_learns_from_a_sensor_and_goes_on(tmp_path, monkeypatch):
         raise KeyboardInterrupt
 
     with monkeypatch.context() as patch:
-        patch.setattr("dase.learning.run.run", killed)
+        patch.setattr("dase.learning.run.train_in_folder", killed)
         call("train", str(sensor), "-o", str(out), *options)
     # there is no checkpoint yet, so it begins anew
     first = call("train", str(sensor), "-o", str(out), *options, "--resume")
