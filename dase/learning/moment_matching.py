@@ -17,6 +17,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Hashable
+from dataclasses import dataclass
 from typing import Any
 
 import torch
@@ -26,24 +27,39 @@ from dase.learning import distributed
 from dase.learning.targets import Pairs
 from dase.networks.threshold_network import MAGNITUDE_FLOOR, brightness_and_edge, gradient_magnitude
 
-RIDGE = 0.1
-"""Added to the variances before they are inverted, as a share."""
+REFERENCE = 0.25, 0.06
+"""Usual mean and spread, at which scenes are counted once more to tell busy scenes from low thresholds
+[log intensity]."""
 
-UNSURE = 0.1
-"""The same for each feature per scene that has been seen: few scenes tell little of their covariance."""
 
-LONG = 0.99
-"""The same of the moments of columns and rows."""
+@dataclass(frozen=True, kw_only=True)
+class MomentWeighting:
+    """How moments are averaged and weighed; the method's own numbers, not a run's.
 
-FORGET = 0.99
-"""Share of the regression on the reference that stays from step to step."""
+    Args:
+        ridge: Added to the variances before they are inverted, as a share: the features are nearly dependent.
+        scarce_ridge: The same for each feature per scene that has been seen: few scenes tell little of their
+            covariance.
+        floor: Added to the variances before they are inverted: a feature that never varies says nothing.
+        floor_share: The same as a share of their mean.
+        regression_memory: Share of the regression on the reference counts that stays from step to step.
+        pattern_memory: Share of the moments of columns and rows that stays; one of them sees few pixels.
+        interval: Steps after which the weights are worked out again, which takes longer than a step.
+        hold_out_every: Real batches of which one is held out, where real scenes never come again.
+    """
 
-ANEW = 25
-"""Steps after which the weights are worked out again."""
+    ridge: float = 0.1
+    scarce_ridge: float = 0.1
+    floor: float = 1e-6
+    floor_share: float = 1e-3
+    regression_memory: float = 0.99
+    pattern_memory: float = 0.99
+    interval: int = 25
+    hold_out_every: int = 8
 
 
 CellMembers = tuple[torch.Tensor, torch.Tensor]
-"""See `Moments.members`."""
+"""See `Moments.cell_members`."""
 
 
 def single_pixel_features(counts: torch.Tensor) -> torch.Tensor:
@@ -93,10 +109,25 @@ class CellMoments:
         device: PyTorch device.
         memory: Share of the fake means that stays from step to step.
         joint: Whether the covariance is that of all cells together; else each cell has its own.
+        weighting: How moments are averaged and weighed.
+
+    Attributes:
+        kept: All running sums, float64, which a checkpoint holds: with C cells and F features, `*_sum`,
+            `both` and `square` (C, F), `*_number` (C,) [pixels], `*_scenes` and `usual` scalars, `products`
+            and `weight` (1, C · F, C · F) where `joint`, else (C, F, F).
     """
 
-    def __init__(self, cells: int, width: int, *, device: torch.device, memory: float, joint: bool):
-        self.memory, self.joint = memory, joint
+    def __init__(
+        self,
+        cells: int,
+        width: int,
+        *,
+        device: torch.device,
+        memory: float,
+        joint: bool,
+        weighting: MomentWeighting = MomentWeighting(),
+    ):
+        self.memory, self.joint, self.weighting = memory, joint, weighting
         blocks, size = (1, cells * width) if joint else (cells, width)
 
         def zeros(*shape: int) -> torch.Tensor:
@@ -138,8 +169,9 @@ class CellMoments:
         kept = self.kept
         sums, number = sums.detach().double(), number.double()
         mean = sums.sum(0) / number.sum(0).clamp_min(1)[:, None]
-        kept["both"].mul_(FORGET).add_((off * (sums - number[..., None] * mean)).sum(0))
-        kept["square"].mul_(FORGET).add_(off.square().sum(0))
+        memory = self.weighting.regression_memory
+        kept["both"].mul_(memory).add_((off * (sums - number[..., None] * mean)).sum(0))
+        kept["square"].mul_(memory).add_(off.square().sum(0))
         slope = kept["both"] / kept["square"].clamp_min(1e-12)
         kept["fake_sum"].mul_(self.memory).add_((sums - slope * off).sum(0))
         kept["fake_number"].mul_(self.memory).add_(number.sum(0))
@@ -171,9 +203,9 @@ class CellMoments:
         total = total.reshape(kept["products"].shape[:2]) / kept["scenes"]
         covariance = kept["products"] / (total[:, :, None] * total[:, None, :] * kept["scenes"])
         diagonal = covariance.diagonal(dim1=-2, dim2=-1)
-        # a feature that never varies says nothing
-        floor = 1e-6 + 1e-3 * diagonal.mean(-1, keepdim=True)
-        ridge = excess * (RIDGE + UNSURE * diagonal.shape[-1] / kept["scenes"])
+        how = self.weighting
+        floor = how.floor + how.floor_share * diagonal.mean(-1, keepdim=True)
+        ridge = excess * (how.ridge + how.scarce_ridge * diagonal.shape[-1] / kept["scenes"])
         mean = kept["real_sum"] / kept["real_number"].clamp_min(1)[:, None]
         wrong = (doubt * mean).square().reshape(diagonal.shape) * kept["real_scenes"]
         weight, _ = torch.linalg.inv_ex(covariance + torch.diag_embed(ridge * diagonal + floor + wrong))
@@ -214,14 +246,16 @@ class Moments:
         memory: float = 0.95,
         scenes: float = math.inf,
         doubt: float = 0.0,
+        weighting: MomentWeighting = MomentWeighting(),
     ):
+        self.weighting = weighting
         self.scenes, self.doubt = scenes, doubt
         self.excess: torch.Tensor | float = 1.0
         self.device, self.levels, self.pattern, self.memory = torch.device(device), levels, pattern, memory
         self.boundaries: list[torch.Tensor] = []
         self.sets: dict[str, CellMoments] = {}
         self.calls = 0
-        self.held = self.anew = False
+        self.holds_out = self.reweighs = False
 
     def calibrate(self, sets: list[tuple[Pairs, Pairs]]) -> None:
         """Place the boundaries of brightness and edge strength at quantiles of both domains."""
@@ -245,8 +279,9 @@ class Moments:
                 size,
                 13 if name == "look" else 11,
                 device=self.device,
-                memory=self.memory if name == "look" else LONG,
+                memory=self.memory if name == "look" else self.weighting.pattern_memory,
                 joint=name == "look",
+                weighting=self.weighting,
             )
             for name, size in sizes.items()
         }
@@ -310,20 +345,21 @@ class Moments:
         for cells in self.sets.values():
             cells.weigh(self.doubt, self.excess)
 
-    def begin(self) -> Hashable:
+    def begin_step(self) -> Hashable:
         """Count a step that is about to come; return its kind, see `dase.learning.cuda_graph`."""
         # where real scenes never come again, some batches are held out
-        self.held = self.scenes == math.inf and self.calls % 8 == 7
-        self.anew = self.calls % ANEW == 0
+        every = self.weighting.hold_out_every
+        self.holds_out = self.scenes == math.inf and self.calls % every == every - 1
+        self.reweighs = self.calls % self.weighting.interval == 0
         self.calls += 1
-        return None if self.anew else self.held
+        return None if self.reweighs else self.holds_out
 
     def loss(self, fake: Pairs, real: Pairs, *, move: bool) -> tuple[torch.Tensor, dict[str, torch.Tensor]]:
         """Take both batches in; return the fake means of this batch along what they are off."""
-        self.add_real(real, held_out=self.held)
+        self.add_real(real, held_out=self.holds_out)
         members = self.cell_members(fake.grey)
         plain = self.add_reference(fake, members)
-        if self.anew:
+        if self.reweighs:
             self.weigh()
         total, distance = fake.counts.new_zeros(()), fake.counts.new_zeros(())
         for name, both in self.cell_sums(fake, members).items():

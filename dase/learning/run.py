@@ -16,7 +16,8 @@ from dase.atomic_file import replacing
 from dase.errors import InputError
 from dase.learning import distributed
 from dase.learning.evaluation import HeldOutScore, MapEvaluation
-from dase.learning.training import Recipe, Training
+from dase.learning.recipe import Recipe
+from dase.learning.training import Training, TrainingSettings
 
 CHECKPOINT, RESULT, BEST = "checkpoint.pt", "result.pt", "best.pt"
 LOG, RECIPE = "log.csv", "recipe.json"
@@ -221,7 +222,7 @@ class _LogTable:
             writer.writerows(self.rows)
 
 
-def _write_recipe(out: Path, recipe: Recipe) -> None:
+def _write_recipe(out: Path, recipe: TrainingSettings) -> None:
     if distributed.process_rank() == 0:
         with replacing(out / RECIPE) as temporary:
             temporary.write_text(recipe.text(), "utf-8")

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import re
+from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
-from test_training import SIDE, WGAN, a_fake, a_run, small_scenes
+from test_training import CRITICS, SIDE, WGAN, a_fake, a_run, small_scenes
 
 from dase.errors import InputError
 from dase.learning import cuda_graph, scene_batches
@@ -58,7 +59,7 @@ def test_rates_rise_and_fall_within_the_steps_there_are(scenes):
         training = a_run(scenes, steps=steps, ramp=ramp)
         shares = []
         for training.step in range(steps):
-            shares.append(training.rate())
+            shares.append(training.learning_share())
         top = int(np.argmax(shares))
         assert top == min(ramp, max(steps // 4, 1)) - 1
         assert shares[top] == 1
@@ -92,7 +93,7 @@ KINDS = {
     "moments": dict(network=NetworkShape(channels=4, depth=1, split=True, table=(3, 3))),
     "patterns": dict(network=NetworkShape(channels=4, depth=1, pattern=(SIDE, SIDE))),
     "adabelief": dict(optimizer="adabelief"),
-    "critics": dict(WGAN, critic_cosine=True, batch=6),
+    "critics": dict(WGAN, adversarial=replace(CRITICS, critic_cosine=True), batch=6),
 }
 
 
@@ -153,7 +154,7 @@ def same(one, other) -> bool:
     [
         {"network": NetworkShape(channels=4, depth=1, table=(3, 2), split=True, pattern=(SIDE, SIDE))},
         WGAN,
-        {**WGAN, "optimizer": "adabelief", "critic_image": True},
+        {**WGAN, "optimizer": "adabelief", "adversarial": replace(CRITICS, critic_image=True)},
     ],
     ids=["moments", "wgan", "adabelief"],
 )
@@ -187,8 +188,8 @@ def test_nan_stops_with_its_step_and_the_last_good_checkpoint(scenes, tmp_path):
     training = a_run(scenes, steps=30, warmup=1)
     plain = training.objective.loss
 
-    def poisoned(fake: Pairs, real: Pairs, *, move: bool):
-        loss, values = plain(fake, real, move=move)
+    def poisoned(fake: Pairs, real: Pairs, *, move: bool, rates: torch.Tensor):
+        loss, values = plain(fake, real, move=move, rates=rates)
         return (loss * float("nan") if training.step == 7 else loss), values
 
     training.objective.loss = poisoned

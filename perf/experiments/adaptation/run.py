@@ -35,12 +35,13 @@ from dase.diagnosis.compare import compare
 from dase.learning.adversarial import PatchHash
 from dase.learning.baselines import RandomThresholds, constant_thresholds
 from dase.learning.evaluation import HeldOutScore
-from dase.learning.job import make_baseline, write_examples, write_sensor
+from dase.learning.job import compose_training, make_baseline, write_examples, write_sensor
+from dase.learning.recipe import Recipe
 from dase.learning.recorded_target import ReplayedScenes, cut_windows, open_target
 from dase.learning.run import RunSchedule, train_in_folder
 from dase.learning.scene_batches import Scenery, SceneSettings
 from dase.learning.targets import TRUTHS, EndlessTarget, FiniteTarget, Pairs, Target, record_pairs
-from dase.learning.training import Recipe, Training
+from dase.learning.training import Training
 from dase.networks.threshold_network import NetworkShape
 from dase.recordings.recording import open_recording
 from dase.scenes import image_sources
@@ -78,10 +79,10 @@ def prepare(row: Row, args: argparse.Namespace) -> Training:
         network |= {"channels": 8, "depth": 2}
         if "pattern" in network:
             network["pattern"] = (96, 96)
-    made = Recipe(hash=PatchHash(**how), network=NetworkShape(**network), **recipe)
+    made = Recipe.from_names(hash=PatchHash(**how), network=NetworkShape(**network), **recipe)
     if row.real:
         target, scenes = open_target([Path(args.recording)], until=LEARNED, device=device)
-        return Training(made, target, scenes)
+        return compose_training(made, target, scenes)
     source = image_sources.open_images(pictures)
     scenery = Scenery(
         source,
@@ -97,7 +98,7 @@ def prepare(row: Row, args: argparse.Namespace) -> Training:
     if row.finite:
         pairs = record_pairs(target, np.random.default_rng([seed, 77]), row.finite)
         target = FiniteTarget(pairs, augment=row.augment, truth=target.truth)
-    return Training(made, target, ours)
+    return compose_training(made, target, ours)
 
 
 def judge(row: Row, training: Training, args: argparse.Namespace, folder: Path) -> dict[str, Any]:
