@@ -12,10 +12,6 @@ import torch
 from dase.kernels import autograd_critics as bridge
 from dase.networks.threshold_network import LEAKY_SLOPE
 
-FEW = 4
-"""Rows of a critic, in the mean, up to which a kernel of our own is faster than PyTorch's grouped product:
-with 2 of them that reads the weights at 45 % of a copy on an H200, since its tiles are for many."""
-
 
 @dataclass(frozen=True, kw_only=True)
 class BankShape:
@@ -318,18 +314,23 @@ class CriticBatch:
         return CriticStep(distance, square.sum())
 
 
-def multiply_groups(rows: torch.Tensor, weights: torch.Tensor, end: torch.Tensor) -> torch.Tensor:
+def multiply_groups(
+    rows: torch.Tensor, weights: torch.Tensor, end: torch.Tensor, *, few: int = 4
+) -> torch.Tensor:
     """Multiply each group of rows with a matrix of its own.
 
     Args:
         rows: Shape (R, K), group by group.
         weights: Shape (C, K, N).
         end: Where groups end, int32 (C,).
+        few: Rows of a group, in the mean, up to which a kernel of our own is faster than PyTorch's grouped
+            product: with 2 of them that reads the weights at 45 % of a copy on an H200, since its tiles are
+            for many.
 
     Returns:
         Shape (R, N) in the type of the rows; anything in rows behind the last group.
     """
-    if rows.is_cuda and weights.stride(2) == 1 and len(rows) <= FEW * len(weights):
+    if rows.is_cuda and weights.stride(2) == 1 and len(rows) <= few * len(weights):
         return bridge.spread(rows, weights, end)
     if rows.is_cuda and _has_grouped_products(rows.device):
         return torch._grouped_mm(rows, weights, offs=end)

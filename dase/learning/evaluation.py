@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from torch.nn import functional as F
 
-from dase.learning.moment_matching import Moments, moment_discrepancy
+from dase.learning.moment_matching import REFERENCE, Moments, MomentSettings, moment_discrepancy
 from dase.learning.scene_batches import Scenery, middle_intensity
 from dase.learning.targets import Pairs, Target, draw_noise, simulate_counts
 from dase.networks.threshold_network import ThresholdMaps, ThresholdNet
@@ -93,7 +93,7 @@ class HeldOutScore:
     ):
         self.scenery, self.scenes, self.seed = scenery, scenes, seed
         self.real = [pairs.select(slice(n, n + 12)) for n in range(0, len(pairs), 12)]
-        self.like = Moments(device=scenery.device, doubt=doubt)
+        self.like = Moments(MomentSettings(doubt=doubt), device=scenery.device)
         first = self.simulate_fakes(None)
         self.like.calibrate(list(zip(first, self.real, strict=False)))
         for some in self.real:
@@ -115,7 +115,8 @@ class HeldOutScore:
             grey = middle_intensity(log)
             noise = draw_noise(log, generator)
             if net is None:
-                out.append(Pairs(grey, simulate_counts(log, torch.full_like(grey, 0.25), 0.06, noise)))
+                level = torch.full_like(grey, REFERENCE[0])
+                out.append(Pairs(grey, simulate_counts(log, level, REFERENCE[1], noise)))
             else:
                 out.append(Pairs(grey, simulate_counts(log, *net(grey).by_polarity(), noise)))
         return out

@@ -22,8 +22,8 @@ from dase.learning.moment_objective import MomentObjective
 from dase.learning.recipe import Recipe
 from dase.learning.recorded_target import ReplayedScenes, open_target
 from dase.learning.run import CHECKPOINT
-from dase.learning.scene_batches import Scenery, SceneSettings, middle_intensity
-from dase.learning.targets import FiniteTarget, Pairs, Target, Truth, draw_noise, simulate_counts
+from dase.learning.scene_batches import LOG_EPS, Scenery, SceneSettings, middle_intensity
+from dase.learning.targets import FiniteTarget, Target, Truth, draw_noise, simulate_counts, store_pairs
 from dase.learning.training import Objective, Training, make_network
 from dase.networks.threshold_network import NetworkShape, ThresholdNet
 from dase.networks.weights_file import save_net
@@ -241,15 +241,13 @@ def simulate_target(
     grey, counts = [], []
     for n in range(sequences):
         log = scenery.draw(rng, 1)
-        frames = torch.exp(log[0]).cpu().numpy() - np.float32(1e-3)
+        frames = torch.exp(log[0]).cpu().numpy() - np.float32(LOG_EPS)
         scene = VideoScene(np.clip(frames, 0, 1), times)
         found = count(scene, sensor, (-1.0, looks.window), seed=int(rng.integers(2**31)), device=backend)
         counts.append(torch.from_numpy(found[0, 0].reshape(2, looks.height, looks.width)))
         grey.append(middle_intensity(log)[0].cpu())
         progress(n + 1, sequences)
-    pairs = Pairs(
-        torch.stack(grey).half().to(backend), torch.stack(counts).clamp_max(2000).half().to(backend)
-    )
+    pairs = store_pairs(torch.stack(grey), torch.stack(counts), backend)
     return FiniteTarget(pairs, truth=_true_thresholds(sensor))
 
 

@@ -33,6 +33,25 @@ REFERENCE = 0.25, 0.06
 
 
 @dataclass(frozen=True, kw_only=True)
+class MomentSettings:
+    """What can be chosen about the moments; the names are those of a run's `recipe.json`.
+
+    Args:
+        cells: Levels of brightness and of edge strength by which pixels are compared.
+        memory: Share of the fake moments that stays from step to step: less follows the thresholds sooner,
+            more averages over more scenes.
+        doubt: Share by which means of features may differ for reasons that thresholds cannot cure, such as
+            what a recording's frames do not show.
+        newton: Share of a Gauss-Newton step that is taken; a whole one would follow the noise of a batch.
+    """
+
+    cells: tuple[int, int] = (6, 5)
+    memory: float = 0.95
+    doubt: float = 0.0
+    newton: float = 0.2
+
+
+@dataclass(frozen=True, kw_only=True)
 class MomentWeighting:
     """How moments are averaged and weighed; the method's own numbers, not a run's.
 
@@ -226,12 +245,10 @@ class Moments:
     """Compare means of features in cells; see the module.
 
     Args:
+        settings: What to compare; its `newton` is not used here.
         device: PyTorch device.
-        levels: Levels of brightness, and of edge strength.
         pattern: Whether to compare columns and rows of the sensor as well.
-        memory: Share of the fake means that stays from step to step.
         scenes: How many different real scenes there are.
-        doubt: Share by which a mean may differ for reasons that thresholds cannot cure.
 
     Attributes:
         excess: See `Cells.weigh`; set by what moves the thresholds.
@@ -239,19 +256,16 @@ class Moments:
 
     def __init__(
         self,
+        settings: MomentSettings = MomentSettings(),
         *,
         device: str | torch.device,
-        levels: tuple[int, int] = (6, 5),
         pattern: bool = False,
-        memory: float = 0.95,
         scenes: float = math.inf,
-        doubt: float = 0.0,
         weighting: MomentWeighting = MomentWeighting(),
     ):
-        self.weighting = weighting
-        self.scenes, self.doubt = scenes, doubt
+        self.settings, self.weighting = settings, weighting
         self.excess: torch.Tensor | float = 1.0
-        self.device, self.levels, self.pattern, self.memory = torch.device(device), levels, pattern, memory
+        self.device, self.pattern, self.scenes = torch.device(device), pattern, scenes
         self.boundaries: list[torch.Tensor] = []
         self.sets: dict[str, CellMoments] = {}
         self.calls = 0
@@ -260,7 +274,7 @@ class Moments:
     def calibrate(self, sets: list[tuple[Pairs, Pairs]]) -> None:
         """Place the boundaries of brightness and edge strength at quantiles of both domains."""
         found = [brightness_and_edge(pairs.grey) for both in sets for pairs in both]
-        for level, values in zip(self.levels, zip(*found, strict=True), strict=True):
+        for level, values in zip(self.settings.cells, zip(*found, strict=True), strict=True):
             pooled = torch.sort(
                 torch.cat([v.flatten()[:: max(v.numel() // 50_000, 1)] for v in values])
             ).values
@@ -268,10 +282,11 @@ class Moments:
             self.boundaries.append(pooled[places].contiguous())
         distributed.broadcast_tensors(self.boundaries)
         height, across = sets[0][0].grey.shape[1:]
-        self._make(across, height)
+        self._make_cells(across, height)
 
-    def _make(self, across: int, height: int) -> None:
-        sizes = {"look": self.levels[0] * self.levels[1]}
+    def _make_cells(self, across: int, height: int) -> None:
+        """Begin anew, for a sensor of `across` columns and `height` rows."""
+        sizes = {"look": self.settings.cells[0] * self.settings.cells[1]}
         if self.pattern:
             sizes |= {"column": across, "row": height}
         self.sets = {
@@ -279,7 +294,7 @@ class Moments:
                 size,
                 13 if name == "look" else 11,
                 device=self.device,
-                memory=self.memory if name == "look" else self.weighting.pattern_memory,
+                memory=self.settings.memory if name == "look" else self.weighting.pattern_memory,
                 joint=name == "look",
                 weighting=self.weighting,
             )
@@ -287,11 +302,11 @@ class Moments:
         }
 
     def cell_members(self, grey: torch.Tensor) -> CellMembers:
-        """Return which cells of looks pixels are in, 1 or 0 (B, pixels, cells), and how many (B, cells)."""
+        """Return which cells of `look` pixels are in, 1 or 0 (B, pixels, cells), and how many (B, cells)."""
         brightness, edge = brightness_and_edge(grey)
-        cell = torch.bucketize(brightness.contiguous(), self.boundaries[0]) * self.levels[1]
+        cell = torch.bucketize(brightness.contiguous(), self.boundaries[0]) * self.settings.cells[1]
         cell = (cell + torch.bucketize(edge, self.boundaries[1])).flatten(1)[..., None]
-        every = torch.arange(self.levels[0] * self.levels[1], device=self.device)
+        every = torch.arange(self.settings.cells[0] * self.settings.cells[1], device=self.device)
         # numbers at once: truth values first would be another pass
         member = torch.eq(cell, every, out=grey.new_empty((*cell.shape[:2], len(every))))
         return member, member.sum(1)
@@ -303,7 +318,7 @@ class Moments:
 
         Args:
             pairs: Of which counts are summed.
-            members: What `members` returned for their images, where it is known.
+            members: What `cell_members` returned for their images, where it is known.
         """
         pixels = pixel_features(pairs)
         member, number = self.cell_members(pairs.grey) if members is None else members
@@ -331,7 +346,7 @@ class Moments:
 
         Args:
             fake: With their reference counts.
-            members: What `members` returned for their images.
+            members: What `cell_members` returned for their images.
         """
         assert fake.reference is not None
         found = self.cell_sums(Pairs(fake.grey, fake.reference), members)
@@ -343,7 +358,7 @@ class Moments:
     def weigh(self) -> None:
         """Work out the weights."""
         for cells in self.sets.values():
-            cells.weigh(self.doubt, self.excess)
+            cells.weigh(self.settings.doubt, self.excess)
 
     def begin_step(self) -> Hashable:
         """Count a step that is about to come; return its kind, see `dase.learning.cuda_graph`."""
@@ -384,7 +399,7 @@ class Moments:
         self.boundaries = [b.to(self.device) for b in state["boundaries"]]
         self.calls = state["calls"]
         sizes = [len(state["sets"][name]["real_sum"]) if self.pattern else 0 for name in ("column", "row")]
-        self._make(*sizes)
+        self._make_cells(*sizes)
         for name, kept in state["sets"].items():
             self.sets[name].kept = {key: value.to(self.device) for key, value in kept.items()}
 

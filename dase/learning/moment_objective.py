@@ -8,35 +8,16 @@ from __future__ import annotations
 
 import math
 from collections.abc import Hashable, Iterable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 import torch
 
 from dase.learning import distributed
 from dase.learning.gauss_newton import GaussNewton
-from dase.learning.moment_matching import REFERENCE, Moments
+from dase.learning.moment_matching import REFERENCE, Moments, MomentSettings
 from dase.learning.targets import Pairs, PixelNoise, simulate_counts, vary_parameters, vary_thresholds
 from dase.networks.threshold_network import ThresholdNet
-
-
-@dataclass(frozen=True, kw_only=True)
-class MomentSettings:
-    """What can be chosen about the moments; the names are those of a run's `recipe.json`.
-
-    Args:
-        cells: Levels of brightness and of edge strength by which pixels are compared.
-        memory: Share of the fake moments that stays from step to step: less follows the thresholds sooner,
-            more averages over more scenes.
-        doubt: Share by which means of features may differ for reasons that thresholds cannot cure, such as
-            what a recording's frames do not show.
-        newton: Share of a Gauss-Newton step that is taken; a whole one would follow the noise of a batch.
-    """
-
-    cells: tuple[int, int] = (6, 5)
-    memory: float = 0.95
-    doubt: float = 0.0
-    newton: float = 0.2
 
 
 class MomentObjective:
@@ -65,14 +46,8 @@ class MomentObjective:
     ):
         self.settings, self.net = settings, net
         self.trains_network, self.derived = trains_network, derived
-        self.moments = Moments(
-            device=net.level.device,
-            levels=settings.cells,
-            pattern=net.shape.pattern is not None,
-            memory=settings.memory,
-            scenes=scenes,
-            doubt=settings.doubt,
-        )
+        pattern = net.shape.pattern is not None
+        self.moments = Moments(settings, device=net.level.device, pattern=pattern, scenes=scenes)
         self.newton = GaussNewton(self.moments, net)
 
     def calibrate(self, sets: list[tuple[Pairs, Pairs]], held_out: Iterable[Pairs] = ()) -> None:

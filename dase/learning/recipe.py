@@ -7,7 +7,7 @@ from dataclasses import asdict, dataclass, field, fields
 from typing import Any, Literal, Self
 
 from dase.learning.adversarial import AdversarialSettings, PatchHash
-from dase.learning.moment_objective import MomentSettings
+from dase.learning.moment_matching import MomentSettings
 from dase.learning.training import TrainingSettings
 from dase.networks.threshold_network import NetworkShape
 

@@ -19,20 +19,20 @@ from dase.errors import InputError, nearest
 from dase.kernels import autograd_training as bridge
 from dase.scenes import image_sources
 from dase.scenes.random_scenes import CLIP, MIXED, NAMES, REGIMES, Regime
+from dase.simulation.sensor import Sensor
 
 BACKGROUND = (320, 480)
 """Rows and columns of the backgrounds in the pool [texel]."""
 
-LOG_EPS = 1e-3
-"""Added to intensities before the logarithm, as `Sensor.log_eps` is by default."""
+LOG_EPS = Sensor.log_eps
+"""Added to intensities before the logarithm, as sensors do by default."""
 
-LINE = 32
-"""Numbers of 4 bytes in a line of a GPU's memory."""
-
-SHAKEN = Regime(1, (0, 8), (400.0, 1400.0), (0.0, 60.0), (20.0, 300.0), (0.0, 60.0))
-"""A camera in motion before moving things: most pixels see a change in a short window."""
-
-MOTIONS = {**REGIMES, "shaken": SHAKEN}
+MOTIONS = {
+    **REGIMES,
+    "shaken": Regime(1, (0, 8), (400.0, 1400.0), (0.0, 60.0), (20.0, 300.0), (0.0, 60.0)),
+}
+"""Regimes by name: those of `dase.scenes.random_scenes`, and a camera in motion before moving things, so that
+most pixels see a change in a short window."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -154,15 +154,21 @@ class Scenery:
 
 
 def pack_words(*arrays: NDArray[Any]) -> NDArray[np.int32]:
-    """Return arrays of 4-byte numbers one behind the other, each from a multiple of LINE on.
+    """Return arrays of 4-byte numbers one behind the other, each from the begin of a line of GPU memory.
 
     Vectors on a GPU may ask for that.
     """
-    begin = np.cumsum([0, *(-(-a.size // LINE) * LINE for a in arrays)])
+    begin = np.cumsum([0, *(_whole_lines(a.size) for a in arrays)])
     flat = np.zeros(begin[-1], np.int32)
     for array, start in zip(arrays, begin, strict=False):
         flat[start : start + array.size] = np.ascontiguousarray(array).view(np.int32).ravel()
     return flat
+
+
+def _whole_lines(words: int) -> int:
+    """Return how many words of 4 bytes the lines of a GPU's memory have that so many words fill."""
+    line = 32
+    return -(-words // line) * line
 
 
 def unpack_words(words: torch.Tensor, *shapes: tuple[int, ...]) -> list[torch.Tensor]:
@@ -171,7 +177,7 @@ def unpack_words(words: torch.Tensor, *shapes: tuple[int, ...]) -> list[torch.Te
     for shape in shapes:
         size = math.prod(shape)
         out.append(words[begin : begin + size].view(shape))
-        begin += -(-size // LINE) * LINE
+        begin += _whole_lines(size)
     return out
 
 
