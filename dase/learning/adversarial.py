@@ -61,7 +61,14 @@ class PatchHash:
 
 
 class PatchHasher:
-    """Sends patches to classes; boundaries of levels are quantiles of what `calibrate` was shown."""
+    """Sends patches to classes; boundaries of levels are quantiles of what `calibrate` was shown.
+
+    Args:
+        how: The attributes and their levels.
+
+    Attributes:
+        boundaries: Between the levels of an attribute by its name, float32 (levels - 1,).
+    """
 
     def __init__(self, how: PatchHash):
         self.how = how
@@ -95,6 +102,7 @@ class PatchHasher:
         size = self.how.size
         found = bridge.patch_structure(pairs.grey, size=size, stride=size)
         found = {name: value.flatten() for name, value in found.items()}
+        # without events the hash cannot depend on the thresholds that are being learned
         found["contrast"] = found["energy"]
         if self.how.contrast_from != "energy":
             found["contrast"] = bridge.patch_contrast(pairs.counts, size=size, stride=size).flatten()
@@ -104,7 +112,7 @@ class PatchHasher:
 
 
 def _quantile_boundaries(values: torch.Tensor, levels: int) -> torch.Tensor:
-    """Return the boundaries between `levels` equal shares."""
+    """Return the boundaries between `levels` equal shares of values of any shape, (levels - 1,)."""
     ordered = torch.sort(values.flatten()).values
     return torch.stack([ordered[round(n / levels * (len(ordered) - 1))] for n in range(1, levels)])
 
@@ -229,8 +237,10 @@ class AdversarialObjective:
         values = {"distance": distance, "penalty": lies, "classes": both.sum()}
         if not move:
             return fake.counts.new_zeros(()), values
+        # every class counts by its weight, however many patches it has in this batch
         gain = torch.where(both, -weights / number.clamp_min(1), 0.0)
         slopes = distributed.sum_over_processes(self.bank.input_gradient(patches.detach(), ours, gain))
+        # a sum whose gradient by the patches is `slopes`: autograd goes on from here to the counts
         return (patches * slopes).sum(), values
 
     def _number(self, classes: torch.Tensor) -> torch.Tensor:

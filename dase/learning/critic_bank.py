@@ -19,7 +19,7 @@ class BankShape:
 
     Args:
         classes: Number of critics.
-        inputs: Numbers in a patch; a multiple of 8.
+        inputs: Numbers in a patch; a multiple of 8, as products of groups on a GPU ask for.
         wide: Outputs of the first layer; a multiple of 8.
         narrow: Outputs of the second layer; a multiple of 8.
     """
@@ -61,8 +61,8 @@ class CriticStep:
     """What one step of the bank found.
 
     Args:
-        distance: Weighted difference of the critics' means, real minus fake: what Eq. 10 maximises.
-        penalty: Weighted mean squared gradient between the domains.
+        distance: Weighted difference of the critics' means, real minus fake, a scalar: what Eq. 10 maximises.
+        penalty: Weighted mean squared gradient between the domains, a scalar.
     """
 
     distance: torch.Tensor
@@ -75,10 +75,10 @@ class Activations:
 
     Args:
         first: Sums of the first layer, float32 (R, wide).
-        hidden: What goes on from it, in the type of the products.
+        hidden: The same behind its rectifiers, (R, wide) in the type of the products.
         second: Sums of the second layer, float32 (R, narrow).
-        by_first: Derivative of the scores by the sums of the first layer.
-        by_second: That by those of the second.
+        by_first: Derivative of the scores by the sums of the first layer, (R, wide).
+        by_second: Derivative of the scores by the sums of the second layer, (R, narrow).
     """
 
     first: torch.Tensor
@@ -101,6 +101,14 @@ class CriticBank:
         device: PyTorch device.
         generator: Draws the weights.
         decay: Of Adam's mean square; there is no momentum.
+
+    Attributes:
+        w1, b1: Weights and biases of the first layer, float32 (C, wide, inputs) and (C, wide).
+        w2, b2: Those of the second layer, (C, narrow, wide) and (C, narrow).
+        w3, b3: Those of the last layer, (C, narrow) and (C, 1).
+        square: Adam's mean square of the gradient of each, by its name and of its shape.
+        steps: Steps that each critic has made, float32 (C,).
+        copies: w1 and w2 as bfloat16, which products on a GPU read; as new as the weights after every step.
     """
 
     def __init__(
@@ -234,6 +242,7 @@ class CriticBank:
             penalty: Weight of the penalty.
             generator: Draws the shares.
         """
+        # as many numbers whatever the classes, so that a step that is replayed draws as one that is not
         share = torch.rand(len(fake), 1, device=self.device, generator=generator)
         batch = CriticBatch(self, fake, fake_classes, real, real_classes, weights, share)
         critique = batch.differentiate(penalty)
@@ -265,11 +274,21 @@ class CriticBank:
 class CriticBatch:
     """The rows of one step, and the gradients of the loss.
 
+    Args:
+        bank: The critics.
+        fake: Patches of the simulator, shape (N, inputs).
+        fake_classes: Their classes, int64 (N,).
+        real: Patches of the target, shape (M, inputs).
+        real_classes: Their classes, int64 (M,).
+        weights: Of each class, shape (C,).
+        share: Where between fake and real the penalty is taken, in [0, 1], shape (N, 1).
+
     Attributes:
         layout: Where the rows of each critic lie: fake, real, and half way between.
-        rows: They, (R, inputs).
-        outer: Layer to the left and right rows of its gradient.
-        sums: Gradients of all other weights.
+        rows: All rows in that order, (R, inputs).
+        outer: By the name of a layer, left (R, outputs) and right rows (R, inputs) whose outer products,
+            summed over the rows of a critic, are the gradient of its weights.
+        sums: Gradients of all other weights, by name and of their shapes.
     """
 
     def __init__(
@@ -286,7 +305,11 @@ class CriticBatch:
         self.rows = bridge.gather(fake, real, share, self.layout, bank.working)
 
     def differentiate(self, penalty: float) -> CriticStep:
-        """Set `outer` and `sums`."""
+        """Set `outer` and `sums`; return the distance and the penalty.
+
+        Args:
+            penalty: Weight of the gradient penalty.
+        """
         bank, layout, working = self.bank, self.layout, self.bank.working
         w1, w2 = bank._working_weights("w1"), bank._working_weights("w2")
         at = bank._forward(self.rows, layout.of, layout.end[0])
@@ -294,7 +317,8 @@ class CriticBatch:
         left_first, left_second, last = bridge.weigh(
             at.second, at.by_first, at.by_second, layout, slope=LEAKY_SLOPE, penalty=penalty
         )
-        # the penalty: g = slope of the first layer times its weights, loss = penalty · held |g|²
+        # the penalty: g = slope of the first layer times its weights, loss = penalty · held |g|²; what comes
+        # back from it passes the same matrices as the scores, and the kinks add nothing
         ends = layout.end[1]
         g = multiply_groups(bridge.half_way(at.by_first, layout, working), w1, ends)
         by_g = bridge.penalise(g, layout, self.rows)
@@ -334,6 +358,7 @@ def multiply_groups(
         return bridge.spread(rows, weights, end)
     if rows.is_cuda and _has_grouped_products(rows.device):
         return torch._grouped_mm(rows, weights, offs=end)
+    # slow but right: on a CPU, and on GPUs whose PyTorch lacks the product
     out = rows.new_zeros(len(rows), weights.shape[2])
     begin = 0
     for critic, stop in enumerate(end.tolist()):

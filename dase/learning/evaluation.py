@@ -86,13 +86,21 @@ class HeldOutScore:
         scenes: How many to compare them with.
         seed: Of scenes and noise.
         doubt: Share by which means may differ for reasons that thresholds cannot cure.
+        batch: Scenes that are simulated and compared at a time, which bounds the memory.
     """
 
     def __init__(
-        self, scenery: Scenery, pairs: Pairs, *, scenes: int = 96, seed: int = 54321, doubt: float = 0.05
+        self,
+        scenery: Scenery,
+        pairs: Pairs,
+        *,
+        scenes: int = 96,
+        seed: int = 54321,
+        doubt: float = 0.05,
+        batch: int = 12,
     ):
-        self.scenery, self.scenes, self.seed = scenery, scenes, seed
-        self.real = [pairs.select(slice(n, n + 12)) for n in range(0, len(pairs), 12)]
+        self.scenery, self.scenes, self.seed, self.batch = scenery, scenes, seed, batch
+        self.real = [pairs.select(slice(n, n + batch)) for n in range(0, len(pairs), batch)]
         self.like = Moments(MomentSettings(doubt=doubt), device=scenery.device)
         first = self.simulate_fakes(None)
         self.like.calibrate(list(zip(first, self.real, strict=False)))
@@ -106,12 +114,12 @@ class HeldOutScore:
 
     @torch.no_grad()
     def simulate_fakes(self, net: Callable[[torch.Tensor], ThresholdMaps] | None) -> list[Pairs]:
-        """Return the fixed scenes seen through a network, or at usual thresholds."""
+        """Return batches of the fixed scenes seen through a network, or at usual thresholds without one."""
         rng = np.random.default_rng(self.seed)
         generator = torch.Generator(self.scenery.device).manual_seed(self.seed)
         out = []
-        for _ in range(0, self.scenes, 12):
-            log = self.scenery.draw(rng, 12)
+        for _ in range(0, self.scenes, self.batch):
+            log = self.scenery.draw(rng, self.batch)
             grey = middle_intensity(log)
             noise = draw_noise(log, generator)
             if net is None:
@@ -143,7 +151,7 @@ class HeldOutScore:
 
 
 def count_histogram(counts: torch.Tensor, most: int = 12) -> torch.Tensor:
-    """Return the shares of pixels with 0, 1, ... events, `most` and more in the last."""
+    """Return the shares of pixels with 0, 1, ... events, (most + 1,); the last has `most` and more."""
     whole = counts.round().long().clamp(0, most).flatten()
     return torch.bincount(whole, minlength=most + 1).double() / len(whole)
 

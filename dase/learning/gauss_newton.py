@@ -89,7 +89,11 @@ class GaussNewton:
 
     @torch.no_grad()
     def add_answers(self, fake: Pairs) -> None:
-        """Take in how the counts of a batch answer."""
+        """Take in how the counts of a batch answer.
+
+        Args:
+            fake: B simulated pairs, with `answers` for all of them or for `some`.
+        """
         assert fake.answers is not None
         ends = {
             name: [single_pixel_features(counts) for counts in both] for name, both in fake.answers.items()
@@ -170,12 +174,17 @@ class GaussNewton:
 
     @torch.no_grad()
     def step(self, share: float | torch.Tensor) -> None:
-        """Move the shared numbers by `share` of what makes the moments vanish, as far as the prior lets."""
+        """Move the shared numbers by `share` of what makes the moments vanish, as far as the prior lets.
+
+        With the Jacobian J of the moments, their weights W, differences d, and numbers x with prior P, the
+        whole step is -(JᵀWJ + P)⁻¹ (JᵀWd + Px).
+        """
         cells = self.moments.sets["look"]
         jacobian, prior = self._jacobian(), self.prior
         # weights are of one scene, and per cell and feature
         whole = cells.kept["weight"][0].double() * len(jacobian)
         scenes = 1 / (1 / self._real_scene_count(cells) + 1 / cells.kept["scenes"])
+        # chance in the real scenes and in the simulated ones adds up, see `scenes`
         weight = whole * scenes / self.excess
         off = cells.mean_difference().flatten()
         curve = jacobian.T @ weight @ jacobian
@@ -190,12 +199,14 @@ class GaussNewton:
         free = self.excess * curve + prior / self.settings.spreads[-1] ** 2 + tiny
         both = torch.stack([curve + hold + tiny, free])
         move, fit = _solve_positive_definite(both, torch.stack([-pull - hold @ here, self.excess * pull]))
+        # what a free table could not explain, in units of what chance leaves
         rest = off - jacobian @ fit
         excess = rest @ whole @ rest * scenes / cells.kept["usual"]
         self.excess.copy_(torch.lerp(excess, self.excess, self.settings.memory).clamp_min(1.0))
         longest = self.settings.longest
         move = (share * move).clamp(-longest, longest)
         self._move_network(move)
+        # the running means are of scenes seen before the move, so the move has to be told to them
         cells.shift_fake_means((jacobian @ move).view(cells.kept["fake_sum"].shape))
         if self.moments.pattern:
             self._move_patterns(share)
@@ -251,6 +262,7 @@ class GaussNewton:
             eye = torch.eye(2, device=curve.device, dtype=curve.dtype)
             here = offsets.T.double()
             move = -_solve_positive_definite(curve + unit * eye, pull + unit * here)
+            # the mean of all columns is the level's, which the step above moves
             move = (how.pattern_share * share * (move - move.mean(0))).clamp(-longest, longest)
             move = (here + move).clamp(-widest, widest) - here
             offsets += move.T.float()

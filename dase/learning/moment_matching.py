@@ -163,7 +163,13 @@ class CellMoments:
         self.kept["weight"] = torch.zeros(blocks, size, size, device=device)
 
     def add_real(self, sums: torch.Tensor, number: torch.Tensor, *, held_out: bool = False) -> None:
-        """Add scenes: sums of the features (B, cells, F) over `number` (B, cells) pixels."""
+        """Add real scenes.
+
+        Args:
+            sums: Of the features over the pixels of a cell, shape (B, cells, F).
+            number: Of these pixels, shape (B, cells).
+            held_out: Whether the scenes are kept apart from those that are learned from.
+        """
         side = "held" if held_out else "real"
         self.kept[f"{side}_sum"] += sums.double().sum(0)
         self.kept[f"{side}_number"] += number.double().sum(0)
@@ -171,7 +177,11 @@ class CellMoments:
             self.kept["real_scenes"] += len(sums)
 
     def add_reference(self, sums: torch.Tensor, number: torch.Tensor) -> torch.Tensor:
-        """Add scenes at the reference thresholds; return by how much each is off the mean of all."""
+        """Add simulated scenes at the reference thresholds; arguments as those of `add_real`.
+
+        Returns:
+            By how much the sums of each scene are off what the mean of all would make them, (B, cells, F).
+        """
         kept = self.kept
         sums, number = sums.double(), number.double()
         kept["plain_sum"] += sums.sum(0)
@@ -184,13 +194,20 @@ class CellMoments:
         return off
 
     def add_fake(self, sums: torch.Tensor, number: torch.Tensor, off: torch.Tensor) -> None:
-        """Add scenes that were `off` at the reference thresholds, and forget a part of earlier ones."""
+        """Add simulated scenes, and forget a part of earlier ones.
+
+        Args:
+            sums: Of the features, shape (B, cells, F).
+            number: Of pixels, shape (B, cells).
+            off: What `add_reference` returned for the same scenes, shape (B, cells, F).
+        """
         kept = self.kept
         sums, number = sums.detach().double(), number.double()
         mean = sums.sum(0) / number.sum(0).clamp_min(1)[:, None]
         memory = self.weighting.regression_memory
         kept["both"].mul_(memory).add_((off * (sums - number[..., None] * mean)).sum(0))
         kept["square"].mul_(memory).add_(off.square().sum(0))
+        # the control variate: a scene busy at the reference is busy now, which says nothing of the thresholds
         slope = kept["both"] / kept["square"].clamp_min(1e-12)
         kept["fake_sum"].mul_(self.memory).add_((sums - slope * off).sum(0))
         kept["fake_number"].mul_(self.memory).add_(number.sum(0))
@@ -228,6 +245,7 @@ class CellMoments:
         mean = kept["real_sum"] / kept["real_number"].clamp_min(1)[:, None]
         wrong = (doubt * mean).square().reshape(diagonal.shape) * kept["real_scenes"]
         weight, _ = torch.linalg.inv_ex(covariance + torch.diag_embed(ridge * diagonal + floor + wrong))
+        # `usual` is what chance makes of the distance of one scene, by which the excess is measured
         kept["usual"].copy_((weight * covariance).sum())
         kept["weight"].copy_(weight / (cells * width))
 
@@ -407,7 +425,7 @@ class Moments:
 def sum_by_cell(member: torch.Tensor, values: torch.Tensor) -> torch.Tensor:
     """Return the sums of values (B, N, F) over the pixels of each cell (B, N, cells), shape (B, cells, F).
 
-    In many pieces, which a GPU works at side by side; in one it took 16 times as long.
+    Pixels are summed in many pieces, which a GPU works at side by side; in one it took 16 times as long.
     """
     batch, pixels = member.shape[:2]
     pieces = next(n for n in range(min(64, pixels), 0, -1) if pixels % n == 0)
@@ -418,7 +436,7 @@ def sum_by_cell(member: torch.Tensor, values: torch.Tensor) -> torch.Tensor:
 
 @torch.no_grad()
 def moment_discrepancy(fake: list[Pairs], real: list[Pairs], like: Moments) -> float:
-    """Return how far pairs are apart, with the cells and weights of an objective."""
+    """Return how far simulated and real batches are apart, by the cells and weights of `like`."""
     total = 0.0
     parts = [[like.cell_sums(pairs) for pairs in side] for side in (fake, real)]
     for name, cells in like.sets.items():

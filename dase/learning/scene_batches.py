@@ -102,6 +102,8 @@ class Scenery:
             start.append(total)
             size.append(front.grey.shape[::-1])
             total += front.grey.size
+        # intensities of layers in front are stored times their alpha, as compositing wants them; the last
+        # texture is one transparent texel, for the layers that a scene lacks
         self.grey = torch.from_numpy(np.stack(grounds).reshape(len(grounds), -1)).to(self.device)
         self.texels = torch.from_numpy(np.concatenate([*flat, np.zeros((1, 2), np.float32)])).to(self.device)
         self.start = np.array([*start, total], np.int32)
@@ -198,6 +200,7 @@ def middle_intensity(log: torch.Tensor) -> torch.Tensor:
 
 def _fit_background(grey: NDArray[np.float32]) -> NDArray[np.float32]:
     """Return a texture as a background of the pool: turned upright, cut and scaled to one size."""
+    # heavy, and wanted only where a pool is made: recordings bring their own scenes
     import cv2
 
     if grey.shape[0] > grey.shape[1]:
@@ -332,6 +335,7 @@ def _half_normal(
 ) -> NDArray[np.float64]:
     """Return half-normal numbers up to `most`, drawn again where they are above it."""
     out = np.abs(rng.normal(size=shape)) * deviation
+    # as good as certain to end before: 64 draws all above `most` would need a bound far below the deviation
     for _ in range(64):
         high = out > most
         if not high.any():

@@ -44,6 +44,7 @@ class VariedCounts:
         the step; the difference of the function's values is not.
         """
         out = value(counts.detach())
+        # a slope by the logarithm; between e^-STEP and e^STEP lie 2 sinh(STEP) of a threshold
         for n, (above, below) in enumerate(zip(self.above, self.below, strict=True)):
             slope = (value(above) - value(below)) / (2 * math.sinh(STEP))
             log = self.log[:, n : n + 1]
@@ -241,7 +242,12 @@ def record_pairs(target: Target, rng: np.random.Generator, count: int, *, batch:
 
 @dataclass
 class PixelNoise:
-    """What is random in pixels: one normal number for both thresholds, which go together, and the phase."""
+    """What is random in pixels.
+
+    Args:
+        z: Normal numbers, one for both thresholds of a pixel, which go together, shape (B, H, W).
+        phase: Where between two events a pixel begins, in (-1, 1), shape (B, H, W).
+    """
 
     z: torch.Tensor
     phase: torch.Tensor

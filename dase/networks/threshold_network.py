@@ -81,7 +81,13 @@ class ResidualBlock(nn.Module):
 
 
 class UNet(nn.Module):
-    """Residual encoder, skips, two outputs that begin at zero (Ronneberger et al., U-Net, 2015)."""
+    """Residual encoder, skips, two outputs that begin at zero (Ronneberger et al., U-Net, 2015).
+
+    Args:
+        inputs: Channels of the image.
+        channels: Channels at full resolution; they double with every level, four times as many at most.
+        depth: How often the resolution is halved.
+    """
 
     def __init__(self, inputs: int, channels: int, depth: int):
         super().__init__()
