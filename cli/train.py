@@ -34,7 +34,7 @@ if TYPE_CHECKING:
 @click.option("--backend", default="cpu", show_default=True, help="cpu or cuda.")
 @click.option("--resume", is_flag=True, help="Go on where an interrupted run stopped.")
 @click.option("--tensorboard", is_flag=True, help="Write the log for TensorBoard, too.")
-def command(
+def train_command(
     targets: tuple[str, ...],
     output: Path,
     images: str | None,
@@ -77,22 +77,22 @@ def command(
     first = distributed.process_rank() == 0
     if first:
         learning_job.record_job(job, output, resume=resume)
-    with _bar(silent=not first) as opened:
+    with _OpeningBar(silent=not first) as opened:
         training = learning_job.open_training(replace(job, backend=backend), progress=opened)
     looks = 100 if backend.startswith("cuda") else 25
     schedule = RunSchedule(
         log_every=10 if preset == "tiny" else looks, seconds=None if minutes is None else 60 * minutes
     )
-    with _live(training, output if tensorboard and first else None, silent=not first) as look:
+    with _LiveLine(training, output if tensorboard and first else None, silent=not first) as look:
         # killed before its first checkpoint, a run begins anew
         resume = resume and (output / CHECKPOINT).is_file()
         last = train_in_folder(training, output, schedule=schedule, resume=resume, on_row=look)
     if first:
-        _finish(job, output, training, last)
+        _write_results(job, output, training, last)
     distributed.leave_processes()
 
 
-def _finish(job: Any, output: Path, training: Any, last: dict[str, float]) -> None:
+def _write_results(job: Any, output: Path, training: Any, last: dict[str, float]) -> None:
     """Write the sensor and say what was learned."""
     from dase.learning import job as learning_job
 
@@ -102,12 +102,12 @@ def _finish(job: Any, output: Path, training: Any, last: dict[str, float]) -> No
         output, training.mean, mu=last["mu"], name=output.name or "learned", size=recorded
     )
     learning_job.write_examples(output, training)
-    for line in summary(last):
+    for line in summary_of_run(last):
         click.echo(line)
     click.echo(f"{path}: try dase synth --sensor {path}, or look at it: dase show {output}")
 
 
-def summary(row: dict[str, float]) -> list[str]:
+def summary_of_run(row: dict[str, float]) -> list[str]:
     """Return what was learned, in a few lines."""
     lines = [
         f"thresholds {row['mu']:.3f} ± {row['sigma']:.3f} (mean over pixels; the mean varies by "
@@ -120,7 +120,7 @@ def summary(row: dict[str, float]) -> list[str]:
     return lines
 
 
-class _bar:
+class _OpeningBar:
     """A progress bar for what is opened."""
 
     def __init__(self, *, silent: bool):
@@ -142,7 +142,7 @@ class _bar:
         self.bar.close()
 
 
-class _live:
+class _LiveLine:
     """The live line of a run, and TensorBoard's log."""
 
     def __init__(self, training: Any, folder: Path | None, *, silent: bool):

@@ -30,7 +30,7 @@ from dase.networks.weights_file import save_net
 from dase.scenes import image_sources
 from dase.scenes.video import VideoScene
 from dase.simulation.sensor import Sensor
-from dase.simulation.sensor_file import dump_sensor, load_sensor, presets
+from dase.simulation.sensor_file import dump_sensor, load_sensor, read_presets
 from dase.simulation.simulate import count
 
 JOB, SENSOR, WEIGHTS, EXAMPLES = "job.json", "sensor.toml", "learned.safetensors", "examples.npz"
@@ -109,7 +109,7 @@ class Job:
     def targets_sensor(self) -> bool:
         """Whether the target is a sensor file."""
         first = self.targets[0]
-        return first in presets() or first.endswith(".toml")
+        return first in read_presets() or first.endswith(".toml")
 
     def recipe(self) -> Recipe:
         """Return how to learn."""

@@ -20,7 +20,7 @@ from dase.learning.scene_batches import LOG_EPS, Scenery, SceneSettings
 from dase.learning.targets import FiniteTarget, store_pairs
 from dase.recordings.recording import Recording, open_recording
 from dase.scenes.between_frames import TOLERANCE, CameraScene
-from dase.scenes.frame_motion import stretched, stretches
+from dase.scenes.frame_motion import estimate_stretches, is_stretched
 
 
 @dataclass(frozen=True)
@@ -108,9 +108,9 @@ def _scene_of(recording: Recording) -> CameraScene:
             "the frames of the recording have no times, so they cannot be laid beside the events"
         )
     scene = CameraScene(recording.frames, begin, recording.frame_end)
-    if not stretched(recording.frames):
+    if not is_stretched(recording.frames):
         return scene
-    gains = stretches([scene.intensity(k) for k in range(len(scene))])
+    gains = estimate_stretches([scene.intensity(k) for k in range(len(scene))])
     return CameraScene(recording.frames, begin, recording.frame_end, gains=gains)
 
 

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from dase.errors import InputError, nearest
 from dase.kernels import autograd_training as bridge
 from dase.scenes import image_sources
-from dase.scenes.random_scenes import CLIP, MIXED, NAMES, REGIMES, Regime
+from dase.scenes.random_scenes import CLIP, MIXED, REGIME_NAMES, REGIMES, Regime
 from dase.simulation.sensor import Sensor
 
 BACKGROUND = (320, 480)
@@ -44,7 +44,7 @@ class SceneSettings:
         height: Rows [px].
         window: Duration [s].
         samples: Time samples, the first at 0 and the last at `window`.
-        regime: One of `dase.scenes.random_scenes.NAMES`, or `shaken`.
+        regime: One of `dase.scenes.random_scenes.REGIME_NAMES`, or `shaken`.
         speed: All speeds are multiplied by this.
     """
 
@@ -62,7 +62,7 @@ class SceneSettings:
             raise InputError(
                 f"a window needs 2 samples and more than 0 s, got {self.samples} in {self.window:g} s"
             )
-        known = (*NAMES, "shaken")
+        known = (*REGIME_NAMES, "shaken")
         if self.regime not in known:
             raise InputError(f"there is no regime '{self.regime}': {nearest(self.regime, known)}")
 

@@ -13,7 +13,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from dase.kernels.autograd_counts import FLOOR, STEP, Surrogate, count_events, thresholds
+from dase.kernels.autograd_counts import FLOOR, STEP, Surrogate, clipped_thresholds, count_events
 from dase.learning.scene_batches import Scenery, middle_intensity, send_words
 from dase.networks.threshold_network import edge_strength
 
@@ -296,7 +296,7 @@ def vary_thresholds(
     log: torch.Tensor, mu: torch.Tensor, sigma: torch.Tensor, noise: PixelNoise
 ) -> VariedCounts:
     """Return how the counts of `simulate_counts`, with the same arguments, answer to the thresholds."""
-    theta = thresholds(mu, sigma, noise.z, like=log)
+    theta = clipped_thresholds(mu, sigma, noise.z, like=log)
     above: list[torch.Tensor] = []
     below: list[torch.Tensor] = []
     with torch.no_grad():
