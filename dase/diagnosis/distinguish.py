@@ -149,7 +149,7 @@ class _Bench:
         chosen = np.sort(rng.choice(width * height, count, replace=count > width * height)).astype(np.int32)
         grid = Grid(0.0, step, steps)
         try:
-            to = launch.device(device)
+            to = launch.find_device(device)
         except ValueError as error:
             raise InputError(str(error)) from error
         light = standard.light(rng, count, grid.times)

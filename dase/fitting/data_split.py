@@ -114,7 +114,7 @@ def gather(
         trust = scene.trusts
     grid = common_grid(events, scene)
     try:
-        to = launch.device(device)
+        to = launch.find_device(device)
     except ValueError as error:
         raise InputError(str(error)) from error
     size = scene.width * scene.height
@@ -139,7 +139,7 @@ def gather(
     sorting = partial(sort_into_cells, step=grid.step, bands=bands, log_eps=log_eps)
     works: list[Callable[[], Any]] = [partial(sorting, part) for part in np.array_split(light, 8)]
     works.append(partial(find, events))
-    *parts, structure = launch.each(works)
+    *parts, structure = launch.run_concurrently(works)
     cell = np.concatenate(parts)
     cell[~good] = MASKED
     cell[:, 0] = MASKED

@@ -81,7 +81,10 @@ def emitted(
         return out(slice(0, len(seeds)))
     # on a CPU one after the other: the events of a model are sorted in its caches, those of all are not
     works = [partial(out, slice(n, n + 1)) for n in range(len(seeds))]
-    return [events for (events,) in ([work() for work in works] if kind == "cuda" else launch.each(works))]
+    return [
+        events
+        for (events,) in ([work() for work in works] if kind == "cuda" else launch.run_concurrently(works))
+    ]
 
 
 def sent(

@@ -55,7 +55,7 @@ class Sorted:
     @classmethod
     def by(cls, classes: torch.Tensor, critics: int) -> Sorted:
         """Sort rows of these classes, int64 (R,); nothing waits for the GPU."""
-        of, order = bridge.in_order(classes, below=critics + 1)
+        of, order = bridge.sort_keys(classes, below=critics + 1)
         number = classes.new_zeros(critics + 1).index_add_(0, classes, torch.ones_like(classes))
         return cls(order, of, number[:-1].cumsum(0).int())
 
@@ -175,11 +175,13 @@ class CriticBank:
         product = grouped(hidden, w2.transpose(1, 2), end)
         second, by_second, back = bridge.second_layer(product, of, self.b2, self.w3, slope=SLOPE)
         product = grouped(back, w2, end)
-        by_first = bridge.way_back(product, of, first, critics=self.shape.classes, slope=SLOPE)
+        by_first = bridge.back_through_first_layer(
+            product, of, first, critics=self.shape.classes, slope=SLOPE
+        )
         return Activations(first, hidden, second, by_first, by_second)
 
     def _scores(self, at: Activations, of: torch.Tensor) -> torch.Tensor:
-        return bridge.score(at.second, of, self.w3, self.b3, slope=SLOPE)
+        return bridge.score_rows(at.second, of, self.w3, self.b3, slope=SLOPE)
 
     def scores(self, patches: torch.Tensor, classes: torch.Tensor) -> torch.Tensor:
         """Return the score of each patch (N, inputs) by the critic of its class (N,)."""
@@ -240,7 +242,7 @@ class CriticBank:
         batch = _Batch(self, fake, fake_classes, real, real_classes, weights, share)
         critique = batch.differentiate(penalty)
         speed = rate if isinstance(rate, torch.Tensor) else torch.full((1,), rate, device=self.device)
-        paces = bridge.pace(batch.layout, speed, self.steps, decay=self.decay)
+        paces = bridge.count_steps(batch.layout, speed, self.steps, decay=self.decay)
         for name, (left, right) in batch.outer.items():
             bridge.move_critics(
                 getattr(self, name), self.square[name], self.copies[name], left, right, batch.layout.end[0],
@@ -284,8 +286,8 @@ class _Batch:
         weights: torch.Tensor,
         share: torch.Tensor,
     ):
-        self.bank, self.layout = bank, bridge.lay_out(fake_classes, real_classes, weights)
-        self.rows = bridge.gather(fake, real, share, self.layout, bank.working)
+        self.bank, self.layout = bank, bridge.lay_out_rows(fake_classes, real_classes, weights)
+        self.rows = bridge.gather_rows(fake, real, share, self.layout, bank.working)
 
     def differentiate(self, penalty: float) -> Critique:
         """Set `outer` and `sums`."""
@@ -293,19 +295,19 @@ class _Batch:
         w1, w2 = bank._layer("w1"), bank._layer("w2")
         at = bank._forward(self.rows, layout.of, layout.end[0])
         distance = -(layout.gain * bank._scores(at, layout.of)).sum()
-        left_first, left_second, last = bridge.weigh(
+        left_first, left_second, last = bridge.weigh_rows(
             at.second, at.by_first, at.by_second, layout, slope=SLOPE, penalty=penalty
         )
         # the penalty: g = slope of the first layer times its weights, loss = penalty · held |g|²
         ends = layout.end[1]
-        g = grouped(bridge.half_way(at.by_first, layout, working), w1, ends)
-        by_g = bridge.penalise(g, layout, self.rows)
+        g = grouped(bridge.rows_half_way(at.by_first, layout, working), w1, ends)
+        by_g = bridge.penalise_gradient(g, layout, self.rows)
         product = grouped(by_g, w1.transpose(1, 2), ends)
-        by_first, square = bridge.again_first(
+        by_first, square = bridge.penalty_through_first_layer(
             product, at.first, at.by_first, layout, at.hidden, slope=SLOPE, penalty=penalty
         )
         product = grouped(by_first, w2.transpose(1, 2), ends)
-        bridge.again_second(product, at.second, layout, last, slope=SLOPE)
+        bridge.penalty_through_second_layer(product, at.second, layout, last, slope=SLOPE)
         self.outer = {"w1": (left_first, self.rows), "w2": (left_second, at.hidden)}
         self.sums = {
             "b1": bridge.sum_rows(left_first, layout, between=False),
@@ -328,7 +330,7 @@ def grouped(rows: torch.Tensor, weights: torch.Tensor, end: torch.Tensor) -> tor
         Shape (R, N) in the type of the rows; anything in rows behind the last group.
     """
     if rows.is_cuda and weights.stride(2) == 1 and len(rows) <= FEW * len(weights):
-        return bridge.spread(rows, weights, end)
+        return bridge.multiply_by_critic(rows, weights, end)
     if rows.is_cuda and _has_grouped_products(rows.device):
         return torch._grouped_mm(rows, weights, offs=end)
     out = rows.new_zeros(len(rows), weights.shape[2])

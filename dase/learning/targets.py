@@ -13,7 +13,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from dase.kernels.autograd_counts import FLOOR, STEP, Surrogate, count_events, thresholds
+from dase.kernels.autograd_counts import FLOOR, STEP, Surrogate, clipped_thresholds, count_events
 from dase.learning.scene_batches import Scenery, middle, sent
 from dase.networks.threshold_network import edge_strength
 
@@ -274,7 +274,7 @@ def simulate(
 
 def vary(log: torch.Tensor, mu: torch.Tensor, sigma: torch.Tensor, noise: Noise) -> Varied:
     """Return how the counts of `simulate`, with the same arguments, answer to the thresholds."""
-    theta = thresholds(mu, sigma, noise.z, like=log)
+    theta = clipped_thresholds(mu, sigma, noise.z, like=log)
     above: list[torch.Tensor] = []
     below: list[torch.Tensor] = []
     with torch.no_grad():

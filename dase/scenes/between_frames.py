@@ -174,12 +174,12 @@ class CameraScene(Scene):
         matches, _, at, share = self._prepared(times, device)
         last = times == self.times[-1]  # a frame as well, as which it must come out
         at, share = np.where(last, at + 1, at).astype(np.int32), np.where(last, np.float32(0), share)
-        source.values = scene_frames.render(matches, pixels, at, share, EPS, device)
+        source.values = scene_frames.render_between(matches, pixels, at, share, EPS, device)
         return "frames", source
 
     def frames(self, times: NDArray[np.float64], device: str = "cpu") -> NDArray[np.float32]:
         """Return intensities at `times` [s], shape (K, height, width)."""
-        _, source = self.source(np.asarray(times, np.float64), self._all(), launch.device(device))
+        _, source = self.source(np.asarray(times, np.float64), self._all(), launch.find_device(device))
         return np.asarray(source.values.numpy().reshape(-1, self.height, self.width))
 
     def doubt(
@@ -200,7 +200,7 @@ class CameraScene(Scene):
             Shape (K, N), or (K, height, width) for all pixels.
         """
         at = np.asarray(times, np.float64)
-        where = launch.device(device)
+        where = launch.find_device(device)
         matches, first, place, share = self._prepared(at, where)
         doubts = np.stack([self.matched(first + j).doubt for j in range(matches.ahead.shape[0])])
         chosen = self._all() if pixels is None else np.asarray(pixels, np.int32)
@@ -291,7 +291,7 @@ class CameraScene(Scene):
 
     def _prepared(
         self, times: NDArray[np.float64], device: Any
-    ) -> tuple[scene_frames.Matches, int, NDArray[np.int32], NDArray[np.float32]]:
+    ) -> tuple[scene_frames.MatchedFrames, int, NDArray[np.int32], NDArray[np.float32]]:
         """Return the matches these times need, the first interval, and interval and share of each time."""
         at = self.interval(times)
         share = (times - self.times[at]) / np.diff(self.times)[at]
@@ -301,7 +301,7 @@ class CameraScene(Scene):
             found = [self.matched(k) for k in range(first, final + 1)]
             frames = np.stack([self.intensity(k) for k in range(first, final + 2)])
             ahead, back = (np.stack([getattr(m, name) for m in found]) for name in ("ahead", "back"))
-            self._loaded = key, scene_frames.upload(frames, ahead, back, EPS, device)
+            self._loaded = key, scene_frames.upload_matches(frames, ahead, back, EPS, device)
         return self._loaded[1], first, (at - first).astype(np.int32), share.astype(np.float32)
 
 

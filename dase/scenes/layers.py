@@ -214,7 +214,7 @@ class LayerScene(Scene):
         """Return textures and motion at `times` on a Warp device."""
         if device.alias not in self._uploaded:
             textures = [(layer.picture.grey, layer.picture.alpha) for layer in self.layers]
-            self._uploaded[device.alias] = kernels.upload(textures, device)
+            self._uploaded[device.alias] = kernels.upload_textures(textures, device)
         m, _ = self.forward(times)
         quad = self._outlines(m)
         # only these samples are looked at, so their outlines bound the layer; the pixel is for float32
@@ -234,13 +234,13 @@ class LayerScene(Scene):
 
     def frames(self, times: NDArray[np.float64], device: str = "cpu") -> NDArray[np.float32]:
         """Return intensities in [0, 1] at `times` [s], shape (K, height, width)."""
-        where = launch.device(device)
+        where = launch.find_device(device)
         out = kernels.render_frames(self.arrays(times, where), self.width, self.height, where)
         return np.asarray(out.numpy().reshape(len(times), self.height, self.width))
 
     def flow(self, times: NDArray[np.float64], device: str = "cpu") -> NDArray[np.float32]:
         """Return the flow of the foremost layer at `times` [px/s], shape (K, 2, height, width)."""
-        where = launch.device(device)
+        where = launch.find_device(device)
         maps = wp.array(self.velocity(times).astype(np.float32), dtype=kernels.Affine, device=where)
         out = kernels.render_flow(self.arrays(times, where), maps, self.width, self.height, where)
         stacked = out.numpy().reshape(len(times), self.height, self.width, 2)

@@ -81,7 +81,7 @@ class Sensor:
         """Return the longest time between samples that still shows all effects [s]."""
         return min(effect.longest_step() for effect in self.effects)
 
-    def stages(self) -> tuple[pixel_stages.Stages, ...]:
+    def stages(self) -> tuple[pixel_stages.EffectStages, ...]:
         """Return the pixels' effects as the kernel composer sees them; the threshold is part of its core."""
         apart = (Threshold, SceneEffect, StreamEffect)
         return tuple(effect.compiled() for effect in self.effects if not isinstance(effect, apart))

@@ -76,7 +76,7 @@ def speed() -> None:
     """Print how long 0.5 s of a DAVIS346 take at 1 kHz, all pixels and a tenth of them."""
     rng = np.random.default_rng(0)
     begin, end, frames = film(moving_picture(rng, width=346, height=260, duration=0.52), rng)
-    device, size = launch.device("cpu"), 346 * 260
+    device, size = launch.find_device("cpu"), 346 * 260
     for name, pixels in (("all", np.arange(size)), ("a tenth", rng.permutation(size)[: size // 10])):
         camera = dase.CameraScene(frames, begin, end)
         camera.frames(camera.times[:1])  # compiles

@@ -108,7 +108,7 @@ def test_all_effects_in_chunks_and_counts(device, rng, mode):
 
 def _between(scene: dase.VideoScene, times: np.ndarray, device: str) -> np.ndarray:
     everywhere = np.arange(scene.width * scene.height, dtype=np.int32)
-    source = scene.source(times, everywhere, launch.device(device))[1]
+    source = scene.source(times, everywhere, launch.find_device(device))[1]
     return source.values.numpy().reshape(len(times), scene.height, scene.width)
 
 
@@ -184,7 +184,7 @@ def test_between_frames_the_log_intensity_runs_straight(device):
     np.testing.assert_allclose(got, want, rtol=1e-5)
     for outside in (-0.1, 4.1):
         with pytest.raises(dase.InputError, match="outside"):
-            scene.source(np.array([outside]), np.array([0], np.int32), launch.device("cpu"))
+            scene.source(np.array([outside]), np.array([0], np.int32), launch.find_device("cpu"))
 
 
 @pytest.mark.parametrize("loss", [0.3, 0.8])

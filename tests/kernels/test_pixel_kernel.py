@@ -209,7 +209,7 @@ def test_time_never_goes_back_from_chunk_to_chunk(device):
 
 def test_threads_do_not_matter(rng):
     scene, sensor = flicker(rng, samples=12, size=(90, 80)), full()
-    before, streams, counts = launch.threads(), [], []
+    before, streams, counts = launch.thread_count(), [], []
     try:
         for threads in (1, 2, 3):
             launch.set_threads(threads)
@@ -327,7 +327,7 @@ def test_the_composer_names_what_it_does_not_know():
     def odd(voltage: float, temperature: float):
         return voltage
 
-    stages = (pixel_stages.Stages("odd", (("respond", odd),)),)
+    stages = (pixel_stages.EffectStages("odd", (("respond", odd),)),)
     with pytest.raises(ValueError, match="effect 'odd': stage 'respond' has no quantity 'temperature'"):
         pixel_compile.source_text(stages, "frames", "keys")
 

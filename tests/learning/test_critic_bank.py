@@ -198,7 +198,7 @@ def test_few_rows_are_spread_over_columns(rng, device, rows):
     left = torch.from_numpy(rng.normal(size=(many, 24))).bfloat16()
     weights = torch.from_numpy(rng.normal(size=(len(rows), 24, 40))).bfloat16()
     name = "cuda" if "cuda" in device else "cpu"
-    got = bridge.spread(left.to(name), weights.to(name), end.to(name)).cpu().float()
+    got = bridge.multiply_by_critic(left.to(name), weights.to(name), end.to(name)).cpu().float()
     begin = 0
     for critic, stop in enumerate(end.tolist()):
         want = left[begin:stop].float() @ weights[critic].float()

@@ -48,7 +48,7 @@ def evidence(events, scene, device):
 
 
 def reference(events, stimulus, middle) -> np.ndarray:
-    """Add up what `observe` adds up, event by event."""
+    """Add up what `observe_event` adds up, event by event."""
     step, out = stimulus.grid.step, np.zeros(kernels.SIZE)
     lags = np.rint(np.array(LAG_TIMES) / step).astype(int)
     ends = np.rint(np.array(CLASS_TIMES) / step).astype(int)

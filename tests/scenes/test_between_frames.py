@@ -27,16 +27,16 @@ def rms(error):
 
 @pytest.mark.parametrize("size", [(23, 31), (9, 14)])
 def test_rendering_matches_the_twin(device, rng, size):
-    to = launch.device(device)
+    to = launch.find_device(device)
     frames = rng.random((3, *size), np.float32)
     ahead, back = (np.stack([smooth(rng, size, 3.0) for _ in "01"]) for _ in "ab")  # some lead far outside
     ahead[0, :4] = 0
-    matches = scene_frames.upload(frames, ahead, back, EPS, to)
+    matches = scene_frames.upload_matches(frames, ahead, back, EPS, to)
     y, x = np.mgrid[: size[0], : size[1]].reshape(2, -1)
     pixels = rng.permutation(size[0] * size[1])[:100].astype(np.int32)
     places = np.stack([x, y], 1)[pixels].astype(float)
     interval, share = np.array([0, 0, 1, 1], np.int32), np.array([0.0, 0.3, 0.55, 0.9], np.float32)
-    got = scene_frames.render(matches, pixels, interval, share, EPS, to).numpy()
+    got = scene_frames.render_between(matches, pixels, interval, share, EPS, to).numpy()
     doubts = rng.random((2, 2, *size), np.float32)
     doubted = scene_frames.render_doubt(matches, doubts, pixels, interval, share, to)
     for k, (j, s) in enumerate(zip(interval, share, strict=True)):
@@ -85,11 +85,11 @@ def test_any_pixels_and_chunks_give_the_same(filmed, device, rng):
     times = np.sort(rng.uniform(*scene.times[[0, -1]], 9))
     pixels = rng.permutation(scene.width * scene.height)[:500].astype(np.int32)
     whole = scene.frames(times, device).reshape(9, -1)[:, pixels]
-    name, source = scene.source(times, pixels, launch.device(device))
+    name, source = scene.source(times, pixels, launch.find_device(device))
     assert name == "frames"
     np.testing.assert_array_equal(source.values.numpy(), whole)
     apart = [
-        scene.source(times[k : k + 1], pixels, launch.device(device))[1].values.numpy() for k in range(9)
+        scene.source(times[k : k + 1], pixels, launch.find_device(device))[1].values.numpy() for k in range(9)
     ]
     np.testing.assert_array_equal(np.concatenate(apart), whole)
     doubt = scene.doubt(times, device=device).reshape(9, -1)[:, pixels]
