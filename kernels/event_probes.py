@@ -2,8 +2,8 @@
 
 The stimulus of a pixel is known on a grid of equal steps: a cell (what the light does there: at rest, or by
 how much it has changed, in which band of intensity) and the log intensity. `observe_event` looks at one
-event; a pixel kernel calls it as its events happen, `observe_stored_events` for events that are stored. Both write
-the same numbers, so that model and measurement are compared like with like. Sums over pixels, and their
+event; a pixel kernel calls it as its events happen, `observe_stored_events` for events that are stored. Both
+write the same numbers, so that model and measurement are compared like with like. Sums over pixels, and their
 sampling errors, are worked out in `dase.probes.statistics`.
 """
 
