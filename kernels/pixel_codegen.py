@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import ast
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import TypeAlias
 
@@ -46,7 +46,7 @@ class Line:
     """One line without a body."""
 
     text: str
-    draws: tuple[Draw, ...] = ()
+    draws: tuple[Draw, ...] = ()  # keys are made before the first sample, so a line must tell
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -119,11 +119,14 @@ class Part:
 @lru_cache(maxsize=8192)
 def _flow(text: str) -> tuple[tuple[str, ...], frozenset[str], frozenset[str]]:
     """Return the names of a line, those that it reads, and those that it writes."""
+    # heads of blocks are no statements by themselves
     tree = ast.parse(f"{text} pass" if text.endswith(":") else text)
     found = [node for node in ast.walk(tree) if isinstance(node, ast.Name)]
+    # `ast.walk` goes level by level, not from left to right
     found.sort(key=lambda node: node.col_offset)
     writes = frozenset(node.id for node in found if isinstance(node.ctx, ast.Store))
     reads = frozenset(node.id for node in found if isinstance(node.ctx, ast.Load))
+    # Python's syntax tree says only that `a += b` stores `a`
     if isinstance(tree.body[0], ast.AugAssign):
         reads |= writes
     return tuple(dict.fromkeys(node.id for node in found)), reads, writes
@@ -154,6 +157,8 @@ def every_line(statements: Iterable[Statement]) -> Iterator[Line]:
 
 def draws_of(statements: Iterable[Statement]) -> tuple[Draw, ...]:
     """Return the random numbers that statements ask for, each once, in the order of the text."""
+    # a set would do for the numbers, which depend on names alone; but a sensor must always get the same text,
+    # or the cache of compiled kernels would not know it
     return tuple(dict.fromkeys(draw for line in every_line(statements) for draw in line.draws))
 
 
@@ -165,6 +170,7 @@ def names_needed(statements: Iterable[Statement]) -> dict[str, bool]:
     """
     needed: dict[str, bool] = {}
     for statement in statements:
+        # a block may be left out: what it sets keeps its old value then, so that this is needed
         given = statement.writes - statement.reads if isinstance(statement, Line) else frozenset()
         for line in every_line((statement,)):
             for name in line.names:
@@ -197,8 +203,9 @@ def resolve_guards(statements: Iterable[Statement], *, ask: bool) -> tuple[State
         body = resolve_guards(statement.body, ask=ask)
         if isinstance(statement, Block):
             otherwise = resolve_guards(statement.otherwise, ask=ask)
-            found.append(Block(statement.head, body, otherwise, statement.draws, statement.acting))
+            found.append(replace(statement, body=body, otherwise=otherwise))
         elif ask and statement.effect.off:
+            # `acting` stays behind: a layout with lanes asks once for all of them
             found.append(Block(f"if {acting(statement.effect)}:", body, acting=(statement.effect,)))
         else:
             found += body
@@ -213,7 +220,7 @@ def print_statements(statements: Iterable[Statement], depth: int = 0) -> list[st
         if isinstance(statement, Line):
             text.append(indent + statement.text)
             continue
-        assert isinstance(statement, Block)
+        assert isinstance(statement, Block)  # there are no guards left
         text += [indent + statement.head, *print_statements(statement.body, depth + 1)]
         if statement.otherwise:
             text += [indent + "else:", *print_statements(statement.otherwise, depth + 1)]

@@ -101,10 +101,12 @@ class Lanes:
         """Return statements for one lane after the other, or for the one that `lane` finds while `head`."""
         body = resolve_guards(body, ask=self.asks if ask is None else ask)
         needed, written = names_needed(body), names_written(body)
+        # all else is the same for all lanes, or is born and dies in the body
         shared = [name for name in needed if name in self.kinds]
         return Block(
             head or f"for each in range({self.size}):",
             (
+                # `within` spares Warp's question whether an index counts from the end, which no vector has
                 *lines(lane or f"lane = within(each, {self.size})", self.index),
                 *lines(*(f"{name} = {name}_lanes[lane]" for name in shared if needed[name])),
                 *body,
@@ -116,6 +118,7 @@ class Lanes:
         """Return the statements of a part."""
         body: tuple[Statement, ...] = part.body
         if part.handover:
+            # the lanes before have worked along, but must not write: the other thread may be ahead
             body = (if_block("lane >= new", *body),)
         loops = (*self._loops(body), *part.then)
         # a condition that lanes do not share cannot stand around the loop
@@ -128,6 +131,7 @@ class Lanes:
 
     def lay_out_events(self, program: Program) -> tuple[Statement, ...]:
         """Return the events of the lanes that have any, one lane after the other."""
+        # a number, not a truth value: so the loop that asks becomes vectors, and few lanes answer yes
         condition = Line(f"busy = wp.where({program.busy}, 1.0, 0.0)")
         found = f"lane = within(lowest_bit(bits), {self.size})"
         events = (Line("bits = bits & (bits - 1)"), *program.events)
@@ -150,6 +154,7 @@ class Lanes:
             if not (isinstance(statement, Block) and statement.acting):
                 together.append(statement)
                 continue
+            # what came before keeps its place in the order
             found += [self.loop(together)] if together else []
             together = []
             some = " or ".join(f"{effect.name}_some != 0" for effect in statement.acting)
@@ -243,6 +248,7 @@ def _prepare_block(program: Program, layout: Lanes) -> tuple[Statement, ...]:
         *program.begin,
     )
     return (
+        # the last block is pushed back rather than cut, so that every loop has `size` turns
         *lines(
             "row, thread = wp.tid()",
             "size = pixels.shape[0]",

@@ -78,6 +78,7 @@ def print_pixel_kernel(model: PixelModel) -> str:
         layout.lay_out_all(put_counts(model)),
     )
     begin = (
+        # a launch may be a slab of the pixels, which begins at `first`
         *lines("row, i = wp.tid()", "i += first"),
         *place_pixel(program),
         Line("size = pixels.shape[0]"),
@@ -120,6 +121,7 @@ def loop_over_windows(
     before: tuple[Statement, ...], samples: tuple[Statement, ...], after: tuple[Statement, ...]
 ) -> Block:
     """Return the loop over the samples of each window, with what a window begins and ends with."""
+    # events that are kept one by one are of no window, and all samples one run
     window = lines("window = clock.window[part]") if after else ()
     body = (*before, Block("for k in range(clock.run[part], clock.run[part + 1]):", samples), *window, *after)
     return Block("for part in range(clock.window.shape[0]):", body)
@@ -127,6 +129,7 @@ def loop_over_windows(
 
 def step_quantities(model: PixelModel) -> tuple[Statement, ...]:
     """Return what all pixels know of a step."""
+    # `sample` counts over all chunks: it is the index of random numbers
     found = ["dt = element(clock.dt, k)", "sample = begin + k"]
     found += ["t = element(clock.t, k)"] if model.asks("t") else []
     found += ["t64 = clock.t64[k]"] if model.asks("t64") else []
@@ -137,6 +140,7 @@ def place_alone(model: PixelModel) -> tuple[Statement, ...]:
     """Return where the pixel is, its parameters, and what depends on these."""
     found = ["pixel = pixels[i]", "x = pixel % width", "y = pixel / width"]
     found += [f"{name} = parameters[row, {at}]" for at, name in enumerate(model.parameters)]
+    # before any effect changes them
     if model.asks("nominal_on", "nominal_off"):
         found += ["nominal_on = on", "nominal_off = off"]
     return *lines(*found), *pixel_places(model)
@@ -153,6 +157,7 @@ def _prepare_look(model: PixelModel) -> tuple[Statement, ...]:
         return lines("near = layers_near(source, float(x), float(y))", "ground = ground_of(source)")
     if model.source == "background":
         return lines("ground = ground_of(source)")
+    # the last sample again where there are fewer: no branch in the loop
     ahead = (f"ahead_{n} = source.values[wp.min({n}, last), i]" for n in range(SAMPLES_AHEAD))
     return lines("last = source.values.shape[0] - 1", *ahead)
 

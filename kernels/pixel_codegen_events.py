@@ -9,12 +9,9 @@ from __future__ import annotations
 
 from dase.kernels.pixel_codegen import Block, Draw, Guarded, Line, Statement, if_block, lines
 from dase.kernels.pixel_codegen_model import PixelModel
-from dase.kernels.pixel_stages import LATEST, LEAK, SIGNAL, EffectStages
+from dase.kernels.pixel_stages import LATEST, EffectStages, Label
 
 Statements = tuple[Statement, ...]
-
-LONGEST_SLEEP = 1.0001
-"""A pixel whose dead time lasts so many times what is left of a step, or longer, sleeps through it."""
 
 
 def count_on(name: str) -> Line:
@@ -61,7 +58,8 @@ def sleep_condition(model: PixelModel) -> tuple[Statements, str]:
         # a crossing that waits for the end of the dead time may come although the signal returns
         crossed += " or before >= on or before <= -off"
         # a leak is taken off the reference where there are events, so that it must not sleep
-        awake = f"asleep <= {LONGEST_SLEEP} * dt" + (" or leaked != 0.0" if "leaked" in model.states else "")
+        # one whose dead time ends with the step must not miss it by rounding: hence a little more than dt
+        awake = "asleep <= 1.0001 * dt" + (" or leaked != 0.0" if "leaked" in model.states else "")
         crossed = f"({crossed}) and ({awake})"
     noisy = [f"{effect.name}_spend > {effect.name}_hazard" for effect, _ in model.of("noise")]
     return tuple(asleep), " or ".join([crossed, *noisy])
@@ -113,6 +111,7 @@ def _crossings(model: PixelModel) -> Statements:
         Line("crossed = int(whole(wp.abs(change), wp.abs(theta), 1.0 / wp.abs(theta)))"),
         *(lines("passed = int(0)") if model.delays else ()),
     ]
+    # the dearer ways only for sensors that need them
     if model.of("redraw"):
         found += _crossings_one_by_one(model)
     elif model.sink == "counts" and not model.of("gate"):
@@ -128,6 +127,7 @@ def _crossings(model: PixelModel) -> Statements:
             event = (*_wait_for_gate(model), Line("passed += 1"), *asked, *_event(model, "share", label))
         else:
             event = (*asked, *_unless_dead(model, "share", label))
+        # all crossings of a step have one threshold, so their number is known before the loop
         body = (*_crossing_time(model, "n"), *event, *_memorise_leak(model))
         found += [Block("for n in range(crossed):", body), Line(f"moved += float({passed}) * theta")]
     return tuple(found)
@@ -172,6 +172,7 @@ def _crossing_time(model: PixelModel, number: str) -> Statements:
             "after != before",
             f"share = (moved + float({number} + 1) * theta - before) / (after - before)",
         ),
+        # rounding must not bring an event before another one, or into the next step
         Line(f"share = wp.clamp(share, {begin}, stop)"),
     )
 
@@ -181,6 +182,7 @@ def _wait_for_gate(model: PixelModel) -> Statements:
     return (
         *_dead_time(model, "share"),
         if_block("wait > 0.0", "share += wait / dt"),
+        # still dead: what crosses is looked at again when time has gone on
         if_block("share > stop", "break"),
     )
 
@@ -192,6 +194,7 @@ def _pending_crossings(model: PixelModel) -> Statements:
         Line("at += wait / dt"),
         if_block("at > stop", "break"),
         *lines("change = before + (after - before) * at - moved", "theta = float(0.0)", "polarity = int(0)"),
+        # one at a time: each begins a dead time of its own
         if_block("change >= on", "theta = on", "polarity = 1"),
         if_block("change <= -off", "theta = -off"),
         if_block("theta == 0.0", "break"),
@@ -221,10 +224,13 @@ def _dead_time(model: PixelModel, share: str) -> Statements:
 def _label_crossing(model: PixelModel, share: str) -> tuple[str, Statements]:
     """Return the label of a crossing, and what it takes: whether the leak did more for it than the light."""
     if not model.labelled:
-        return str(SIGNAL), ()
+        return f"{Label.SIGNAL:d}", ()
     return "label", (
-        *lines(f"slipped = leaked_before + (leaked - leaked_before) * {share}", f"label = int({SIGNAL})"),
-        if_block("polarity == 1 and drained + slipped > 0.5 * on", f"label = {LEAK}"),
+        *lines(
+            f"slipped = leaked_before + (leaked - leaked_before) * {share}", f"label = int({Label.SIGNAL:d})"
+        ),
+        # a leak is towards ON, so OFF events are never its
+        if_block("polarity == 1 and drained + slipped > 0.5 * on", f"label = {Label.LEAK:d}"),
     )
 
 
@@ -246,6 +252,7 @@ def _leave_pixel(model: PixelModel, share: str) -> tuple[str, Statements]:
     return "leaves", (
         Line("late = float(0.0)"),
         *late,
+        # chunks keep what leaves late for so long, and keys have room for it
         Line(f"late = wp.clamp(late, 0.0, {LATEST})"),
         Line(f"leaves = wp.max(leaves, {instant.format(share=share, late='late')})"),
     )
@@ -253,6 +260,7 @@ def _leave_pixel(model: PixelModel, share: str) -> tuple[str, Statements]:
 
 def _event(model: PixelModel, share: str, label: str) -> Statements:
     """Return the emission of an event after `share` of the step."""
+    # negative, as the whole step is added to the age when it is over
     aged = lines(f"age = -{share} * dt") if "age" in model.states else ()
     if model.sink == "counts":
         return (*lines("on_count += polarity", "off_count += 1 - polarity"), *aged, *model.outlet.emitted)
@@ -275,13 +283,14 @@ def _noise_event(model: PixelModel, effect: EffectStages) -> Statements:
     n = effect.name
     polarity, noise = Draw(f"{n}_polarity", "uniform", effect), noise_key(effect)
     is_on = f"uniform({polarity.key}, int({n}_events)) * ({n}_on + {n}_off) < {n}_on"
+    # only what leaves the pixel resets it: a dead pixel's noise changes nothing
     then = (Line("moved = value"), *_memorise_leak(model), *thresholds_after_event(model))
     slipped = "slipped = leaked_before + (leaked - leaked_before) * stop"
     return (
         Line("polarity = int(0)"),
         Block(f"if {is_on}:", lines("polarity = 1"), draws=(polarity,)),
         *(lines(slipped) if model.labelled else ()),
-        *_unless_dead(model, "stop", str(effect.label), *then),
+        *_unless_dead(model, "stop", f"{effect.label:d}", *then),
         Line(f"{n}_hazard += waiting({noise.key}, int({n}_events))", (noise,)),
         count_on(f"{n}_events"),
     )

@@ -74,8 +74,10 @@ def random_number(name: str) -> re.Match[str] | None:
 
 def _argument(stage: str, effect: EffectStages, name: str) -> Call:
     """Return what a stage function gets for an argument of this name."""
+    # an effect's own names first: it may call a parameter like a quantity
     if name in (*effect.parameters, *effect.states, *effect.maps):
         return Call(f"{effect.name}_{name}", ())
+    # whole numbers in the kernel, but stage functions reckon with them
     if name in ("x", "y"):
         return Call(f"float({name})", ())
     if name in (*QUANTITIES[stage], *ANYWHERE):
@@ -83,12 +85,14 @@ def _argument(stage: str, effect: EffectStages, name: str) -> Call:
     number = random_number(name)
     if number:
         per_pixel, kind = number.group(1) is not None, number.group(2)
+        # named after effect, stage and argument: other effects do not change the numbers of this one
         draw = Draw(f"{effect.name}_{stage}_{name}", kind, effect, per_pixel)
         # thresholds are drawn anew after each event, of which a sample may have several
         index = "int(redraws)" if stage == "redraw" else "sample"
         return Call(draw.name if per_pixel else f"{kind}({draw.key}, {index})", (draw,))
     quantities = *effect.parameters, *effect.states, *effect.maps, *QUANTITIES[stage]
     known = *quantities, *ANYWHERE, "normal", "uniform"
+    # a misspelt argument of a user's effect ends here
     raise ValueError(
         f"effect '{effect.name}': stage '{stage}' has no quantity '{name}'; there are {', '.join(known)}"
     )
@@ -130,6 +134,7 @@ class PixelModel:
     sink: str
     outlet: Outlet = Outlet()
 
+    # asked for at every other statement, hence kept
     @cached_property
     def states(self) -> list[str]:
         """Names of what a pixel remembers, in the order of the state array."""
@@ -172,6 +177,7 @@ class PixelModel:
 
 def pixel_scope(model: PixelModel) -> dict[str, Any]:
     """Return what the names of a kernel mean that it does not define itself."""
+    # `Source` and `Sink` stand for one of several structures, so that all kernels have the same head
     functions = {call_name(stage, effect): f for effect in model.stages for stage, f in effect.functions}
     return {
         "wp": wp,

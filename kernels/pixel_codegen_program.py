@@ -24,8 +24,8 @@ from dase.kernels.pixel_codegen_events import noise_key, redraw_thresholds, slee
 from dase.kernels.pixel_codegen_model import PixelModel
 from dase.kernels.random import stream_number
 
-INITIAL_PHASE = Draw("initial_phase", "uniform")
 VOLTAGE = "voltage = logarithm(Lane(intensity), log_eps)[0]"
+"""Line that takes the logarithm of the light of one pixel."""
 
 
 @dataclass(frozen=True)
@@ -62,6 +62,7 @@ def pass_through(model: PixelModel, stage: str, quantity: str) -> tuple[Part, ..
     parts = []
     for effect, call in model.calls(stage):
         results = ", ".join([quantity, *(f"{effect.name}_{state}" for state in effect.states)])
+        # a part of its own: a function without branches becomes vectors, whatever its neighbours do
         parts.append(Part((Guarded(effect, (Line(f"{results} = {call.text}", call.draws),)),)))
     return tuple(parts)
 
@@ -78,6 +79,7 @@ def intensity_of_log(model: PixelModel) -> tuple[Part, ...]:
         raise ValueError("effects on light need intensities, not log intensities")
     if not model.asks("intensity", stages=("respond", "drift", "noise", "delay")):
         return ()
+    # before the photoreceptor changes the voltage
     return (Part(lines("intensity = exponential(voltage) - log_eps")),)
 
 
@@ -114,6 +116,7 @@ def draw_numbers(draws: Iterable[Draw], *, presets: bool = False) -> tuple[State
             continue
         number = Line(f"{draw.name} = {draw.kind}({draw.key}, 0)")
         if presets and draw.effect is not None and draw.effect.off:
+            # a name must have a value on every way through a Warp kernel
             found += [Line(f"{draw.name} = float(0.0)"), Guarded(draw.effect, (number,))]
         else:
             found.append(number)
@@ -136,6 +139,7 @@ def make_program(model: PixelModel) -> Program:
     change = change_since_event(model)
     asleep, busy = sleep_condition(model)
     events, settle, begin = step_events(model), settle_step(model), begin_chunk(model)
+    # in the order in which a kernel works through them
     draws = all_draws(light, respond, change, asleep, events, settle.body, begin)
     return Program(model, light, respond, change, asleep, busy, events, settle, begin, draws)
 
@@ -193,7 +197,7 @@ def _drift(model: PixelModel) -> tuple[Statement, ...]:
 
 def _start_phase(model: PixelModel) -> tuple[Statement, ...]:
     """Spread the memories at the start as if the first change had been going on before."""
-    draw = INITIAL_PHASE
+    draw = Draw("initial_phase", "uniform")
     falls = f"after < 0.0 or (after == 0.0 and uniform({draw.key}, 1) < 0.5)"
     # a pixel that starts half way is done with half of the way, whatever of it the leak will make
     off = ["reference += lead * off", *(["drained -= 0.5 * lead * off"] if model.labelled else [])]
@@ -213,6 +217,7 @@ def _spend_noise(model: PixelModel) -> tuple[Statement, ...]:
         n = effect.name
         if model.outlet.presets_noise:
             found += lines(*(f"{n}_{name} = float(0.0)" for name in ("on", "off", "spend")))
+        # the hazard of a Poisson process: an event comes when what is waited for is spent
         spend = Line(f"{n}_spend = ({n}_on + {n}_off) * dt + {n}_rest")
         found.append(Guarded(effect, (Line(f"{n}_on, {n}_off = {call.text}", call.draws), spend)))
     return tuple(found)
@@ -237,6 +242,7 @@ def settle_step(model: PixelModel) -> Part:
 
 def begin_chunk(model: PixelModel) -> tuple[Statement, ...]:
     """Return the statements that set thresholds and memories at the begin of a chunk."""
+    # thresholds depend on seed and pixel only: to work them out again costs less than to keep them
     found = [*assign_thresholds(model), *lines(*(f"{name} = float(0.0)" for name in model.states))]
     if model.outlet.resumes:
         kept = (f"{name} = state_in[{at}, row, i]" for at, name in enumerate(model.states))
@@ -244,6 +250,7 @@ def begin_chunk(model: PixelModel) -> tuple[Statement, ...]:
     elif "leaving" in model.states:
         found.append(Line("leaving = 0.0"))
     redraws = redraw_thresholds(model)
+    # thresholds scatter about the pixel's own, which are kept for that
     found += [*lines("mean_on = on", "mean_off = off"), *redraws] if redraws else []
     if "leaving" in model.states and model.sink != "counts":
         # the state holds the bits of whole nanoseconds, which float32 would round
@@ -268,5 +275,6 @@ def keep_states(model: PixelModel) -> Part:
     """Return the part that keeps what the next chunk needs."""
     leaving = "leaving = wp.cast(wp.int32(wp.max(leaves - clock.span, wp.int64(0))), float)"
     kept = [f"state_out[{at}, row, i] = {name}" for at, name in enumerate(model.states)]
+    # counts know no times, so nobody asks when an event has left
     counts = "leaving" not in model.states or model.sink == "counts"
     return Part(lines(*kept) if counts else lines(leaving, *kept), handover=True)

@@ -41,8 +41,6 @@ from dase.kernels.pixel_codegen_program import VOLTAGE, Program, draw_numbers, m
 from dase.kernels.pixel_compile import compile_text
 from dase.kernels.pixel_stages import REST, EffectStages
 
-INSTANT = "instant(stamp, steps, source.step, {share}, {late})"
-
 
 @wp.struct
 class LightHistory:
@@ -119,14 +117,15 @@ def sum_pixel_groups(
 
 def _model(stages: tuple[EffectStages, ...], lanes: int) -> PixelModel:
     """Return what the kernel is made from; its events are observed, on a CPU after a while."""
+    instant = "instant(stamp, steps, source.step, {share}, {late})"
     if lanes == 1:
         observed = "observe(sink, row, i, {time}, {code})"
-        outlet = Outlet(INSTANT, observed, resumes=False, presets_noise=True)
+        outlet = Outlet(instant, observed, resumes=False, presets_noise=True)
     else:
         # what becomes of one event depends on few others; looked at together, they overlap
         queued = "met = put_off(sink, slot, met, lane, {time}, {code})"
         full = if_block(f"met == {QUEUE}", "met = look_back(sink, start, i, met)")
-        outlet = Outlet(INSTANT, queued, (full,), resumes=False)
+        outlet = Outlet(instant, queued, (full,), resumes=False)
     return PixelModel(stages, "frames", "keys", outlet)
 
 

@@ -18,20 +18,12 @@ from dase.events import Events
 from dase.kernels.event_probes import (
     BANDS,
     CELLS,
-    CHANGE,
     CLASSES,
     INTERVALS,
-    ISI,
-    LAG,
-    LAG_COUNT,
     LAGS,
-    ODD,
-    PRODUCTS,
-    RATE,
-    REPEAT,
-    RINGS,
-    SERIAL,
     ZONES,
+    FoldPlace,
+    SumPlace,
 )
 from dase.probes.accumulators import Frame, Sums, Totals, totals
 
@@ -116,17 +108,23 @@ def statistics(found: Sums | Totals, frame: Frame) -> tuple[Array, Array]:
     """
     of = totals(found, frame) if isinstance(found, Sums) else found
     a = of.sums
-    odd = of.folded[:, ODD : ODD + 4]
+    odd = of.folded[:, FoldPlace.ODD : FoldPlace.ODD + 4]
     parts = [
-        _counts(a[:, RATE : RATE + 2 * CELLS]),
-        _counts(a[:, ISI : ISI + 6 * INTERVALS]),
-        _means(a[:, LAG : LAG + LAGS * BANDS], np.tile(a[:, LAG_COUNT : LAG_COUNT + BANDS], LAGS)),
-        _repeats(a[:, REPEAT : REPEAT + 3 * BANDS].reshape(-1, BANDS, 3)),
-        _changes(a[:, CHANGE : CHANGE + 12 * CLASSES].reshape(-1, 4 * CLASSES, 3), a[:, SERIAL:]),
-        _spread(of.folded[:, PRODUCTS : PRODUCTS + 12], of.expected),
+        _counts(a[:, SumPlace.RATE : SumPlace.RATE + 2 * CELLS]),
+        _counts(a[:, SumPlace.ISI : SumPlace.ISI + 6 * INTERVALS]),
+        _means(
+            a[:, SumPlace.LAG : SumPlace.LAG + LAGS * BANDS],
+            np.tile(a[:, SumPlace.LAG_COUNT : SumPlace.LAG_COUNT + BANDS], LAGS),
+        ),
+        _repeats(a[:, SumPlace.REPEAT : SumPlace.REPEAT + 3 * BANDS].reshape(-1, BANDS, 3)),
+        _changes(
+            a[:, SumPlace.CHANGE : SumPlace.CHANGE + 12 * CLASSES].reshape(-1, 4 * CLASSES, 3),
+            a[:, SumPlace.SERIAL :],
+        ),
+        _spread(of.folded[:, FoldPlace.PRODUCTS : FoldPlace.PRODUCTS + 12], of.expected),
         _counts(odd[:, :3]),
         _counts(odd[:, 3:]),
-        _counts(of.folded[:, RINGS:]),
+        _counts(of.folded[:, FoldPlace.RINGS :]),
         _spectrum(of.clock, frame),
         (of.stamps, np.full(of.stamps.shape, 1e9 if frame.regular else 0.0)),
     ]

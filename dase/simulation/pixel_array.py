@@ -344,7 +344,7 @@ class Pixels:
 
     def _decode(self, keys: Any, begin: float) -> tuple[Events, NDArray[np.int32] | None]:
         n, to = len(keys), self.device
-        each = ordering.EACH["cuda" if to.is_cuda else "cpu"]
+        each = ordering.events_per_thread(to)
         out = [launch.new_array(n, d, to) for d in (wp.float64, wp.uint16, wp.uint16, wp.uint8)]
         row = wp.empty(n if self.batch > 1 else 0, dtype=int, device=to)
         label = wp.empty(n if self.sink == "labels" else 0, dtype=wp.int8, device=to)
