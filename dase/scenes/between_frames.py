@@ -12,9 +12,9 @@ from dase.errors import InputError
 from dase.events import Events
 from dase.kernels import launch, scene_frames
 from dase.kernels.pixel_stages import Frames
-from dase.scenes.frame_motion import Match, match
+from dase.scenes.frame_motion import FrameMatch, match_frames
 from dase.scenes.scene import Scene
-from dase.scenes.video import EPS
+from dase.scenes.video import LOG_EPS
 
 KEPT = 1 << 28
 """Matches of frames kept in memory [bytes]; others are computed anew when they are asked for."""
@@ -53,7 +53,7 @@ class CameraScene(Scene):
         white: Value of intensity 1; it and higher ones count as saturated. None: the largest of the integer
             type, 1 for real numbers.
         gains: Gain and offset that undo a stretch of each frame's intensities, shape (F, 2), see
-            `dase.scenes.frame_motion.stretches`.
+            `dase.scenes.frame_motion.estimate_stretches`.
         travel: Share of a pixel that things may move between two samples.
         shortest: Lower bound of the time between samples [s].
         longest: Upper bound of it [s].
@@ -78,7 +78,7 @@ class CameraScene(Scene):
         self._raw = np.asarray(frames)
         self.begin = np.asarray(begin, np.float64)
         self.end = self.begin if end is None else np.asarray(end, np.float64)
-        _check(self._raw, self.begin, self.end)
+        _check_frames_and_times(self._raw, self.begin, self.end)
         self.times = 0.5 * (self.begin + self.end)
         if not np.all(np.diff(self.times) > 0):
             raise InputError("camera: the middles of exposures must increase")
@@ -101,7 +101,7 @@ class CameraScene(Scene):
         self.travel, self.shortest, self.longest = travel, shortest, longest
         self.height, self.width = self._raw.shape[1:]
         self.duration = float(self.times[-1] - self.times[0])
-        self._matches: OrderedDict[int, Match] = OrderedDict()
+        self._matches: OrderedDict[int, FrameMatch] = OrderedDict()
         self._speed: dict[int, float] = {}
         self._loaded: tuple[Any, Any] = (None, None)
         self._trusted: NDArray[np.bool_] | None = None
@@ -121,16 +121,16 @@ class CameraScene(Scene):
         raw = self._raw[index]
         return np.asarray((raw > self.black) & (raw < self.white))
 
-    def matched(self, interval: int) -> Match:
+    def matched(self, interval: int) -> FrameMatch:
         """Return the motion between frame `interval` and the next."""
         if interval not in self._matches:
             gap = self.times[interval + 1] - self.times[interval]
             exposure = (self.end - self.begin)[interval : interval + 2] / gap
             pair = interval, interval + 1
-            self._matches[interval] = match(
+            self._matches[interval] = match_frames(
                 self.intensity(pair[0]),
                 self.intensity(pair[1]),
-                eps=EPS,
+                eps=LOG_EPS,
                 exposure=(float(exposure[0]), float(exposure[1])),
                 usable=(self.usable(pair[0]), self.usable(pair[1])),
             )
@@ -174,7 +174,7 @@ class CameraScene(Scene):
         matches, _, at, share = self._prepared(times, device)
         last = times == self.times[-1]  # a frame as well, as which it must come out
         at, share = np.where(last, at + 1, at).astype(np.int32), np.where(last, np.float32(0), share)
-        source.values = scene_frames.render_between(matches, pixels, at, share, EPS, device)
+        source.values = scene_frames.render_between(matches, pixels, at, share, LOG_EPS, device)
         return "frames", source
 
     def frames(self, times: NDArray[np.float64], device: str = "cpu") -> NDArray[np.float32]:
@@ -224,7 +224,7 @@ class CameraScene(Scene):
                 much happens, an error that would be an event of its own may still be a small one.
             device: Warp device to compute on.
         """
-        logs = np.log(self.frames(self._moments(interval), device) + np.float32(EPS))
+        logs = np.log(self.frames(self._moments(interval), device) + np.float32(LOG_EPS))
         return np.asarray(np.maximum(np.float32(tolerance), np.float32(relative) * np.ptp(logs, axis=0)))
 
     def confidence(
@@ -301,7 +301,7 @@ class CameraScene(Scene):
             found = [self.matched(k) for k in range(first, final + 1)]
             frames = np.stack([self.intensity(k) for k in range(first, final + 2)])
             ahead, back = (np.stack([getattr(m, name) for m in found]) for name in ("ahead", "back"))
-            self._loaded = key, scene_frames.upload_matches(frames, ahead, back, EPS, device)
+            self._loaded = key, scene_frames.upload_matches(frames, ahead, back, LOG_EPS, device)
         return self._loaded[1], first, (at - first).astype(np.int32), share.astype(np.float32)
 
 
@@ -310,7 +310,9 @@ def full_scale(frames: NDArray[Any]) -> float:
     return float(np.iinfo(frames.dtype).max) if frames.dtype.kind in "iu" else 1.0
 
 
-def _check(frames: NDArray[Any], begin: NDArray[np.float64], end: NDArray[np.float64]) -> None:
+def _check_frames_and_times(
+    frames: NDArray[Any], begin: NDArray[np.float64], end: NDArray[np.float64]
+) -> None:
     if frames.ndim != 3 or len(frames) < 2 or min(frames.shape) < 1:
         raise InputError(f"camera: needs at least 2 frames of shape (F, height, width), got {frames.shape}")
     if frames.dtype.kind not in "iuf":

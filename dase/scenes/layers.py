@@ -120,7 +120,7 @@ class LayerScene(Scene):
         d = np.zeros_like(m)
         d[..., 0, :] = np.stack([gx * c - sx * s * spin, -gy * s - sy * c * spin, vx + 0 * x], -1)
         d[..., 1, :] = np.stack([gx * s + sx * c * spin, gy * c - sy * s * spin, vy + 0 * y], -1)
-        to_sensor = _plane(self.width, self.height, self.width)
+        to_sensor = _unit_plane_to_pixels(self.width, self.height, self.width)
         from_texture = np.stack(
             [np.linalg.inv(self._texture_plane(layer)) for layer in range(len(self.layers))]
         )
@@ -131,8 +131,8 @@ class LayerScene(Scene):
         h, w = self.layers[layer].picture.grey.shape
         if layer == 0:
             # at scale 1 the background covers the sensor
-            return _plane(w, h, min(w, h * self.width / self.height))
-        return _plane(w, h, max(w, h))
+            return _unit_plane_to_pixels(w, h, min(w, h * self.width / self.height))
+        return _unit_plane_to_pixels(w, h, max(w, h))
 
     def velocity(self, times: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return maps from sensor coordinates to velocity [px/s], shape (T, L, 2, 3)."""
@@ -247,6 +247,6 @@ class LayerScene(Scene):
         return np.ascontiguousarray(np.moveaxis(stacked, -1, 1))
 
 
-def _plane(width: int, height: int, unit: float) -> NDArray[np.float64]:
+def _unit_plane_to_pixels(width: int, height: int, unit: float) -> NDArray[np.float64]:
     """Return the map from the plane, whose unit is `unit` pixels, to pixels; centres lie at integers."""
     return np.array([[unit, 0, (width - 1) / 2], [0, unit, (height - 1) / 2], [0, 0, 1]], np.float64)

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from dase.simulation.sensor import Sensor
 
 
-class Pixels:
+class PixelArray:
     """Some pixels of a sensor while time passes: runs the composed kernel chunk by chunk.
 
     Args:
@@ -189,7 +189,7 @@ class Pixels:
     def emit(self, scene: Scene, times: NDArray[np.float64]) -> tuple[Events, NDArray[np.int32] | None]:
         """Advance over `times` and return the events that leave the pixels, and for a batch the row of each.
 
-        Readout effects come behind this, see `dase.simulation.readout_chain.Outlet`.
+        Readout effects come behind this, see `dase.simulation.readout_chain.ReadoutChain`.
 
         Args:
             scene: What the pixels see.

@@ -18,7 +18,7 @@ from dase.effects.threshold import Threshold
 from dase.errors import InputError
 from dase.kernels import pixel_stages
 from dase.scenes.scene import Scene
-from dase.simulation.sensor_history import Entry
+from dase.simulation.sensor_history import HistoryEntry
 
 
 @dataclass(frozen=True)
@@ -38,7 +38,7 @@ class Sensor:
     name: str = "ideal"
     size: tuple[int, int] | None = None
     log_eps: float = 1e-3
-    history: tuple[Entry, ...] = field(default=(), compare=False)
+    history: tuple[HistoryEntry, ...] = field(default=(), compare=False)
 
     def __post_init__(self) -> None:
         names = [effect.name for effect in self.effects]

@@ -17,7 +17,7 @@ from dase.errors import InputError, nearest
 from dase.io import replacing
 from dase.simulation.sensor import Sensor
 from dase.simulation.sensor_file import effect_table, parse_sensor, read_sensor
-from dase.simulation.sensor_history import Entry
+from dase.simulation.sensor_history import HistoryEntry
 from dase.version import __version__
 
 
@@ -115,7 +115,7 @@ class SensorText:
                 text = text.changed(effect)
         return text
 
-    def noted(self, entry: Entry) -> SensorText:
+    def noted(self, entry: HistoryEntry) -> SensorText:
         """Return the text with one more entry of its history."""
         return self._checked("\n".join([*self._body(), "", entry.text()]), self.sensor())
 
@@ -165,7 +165,7 @@ def _comment_above(lines: list[str], at: int) -> int:
     return at
 
 
-def read(spec: str | Path, effects: Mapping[str, type[Effect]] = EFFECTS) -> SensorText:
+def read_sensor_text(spec: str | Path, effects: Mapping[str, type[Effect]] = EFFECTS) -> SensorText:
     """Return the text of a preset or of a sensor file.
 
     Args:
@@ -178,7 +178,7 @@ def read(spec: str | Path, effects: Mapping[str, type[Effect]] = EFFECTS) -> Sen
     return SensorText(*read_sensor(spec), effects, Path(spec).parent)
 
 
-def write(sensor: SensorText, path: Path | None) -> None:
+def write_sensor_text(sensor: SensorText, path: Path | None) -> None:
     """Write a sensor file, whole or not at all; None prints it."""
     if path is None:
         print(sensor.text, end="")
@@ -187,9 +187,9 @@ def write(sensor: SensorText, path: Path | None) -> None:
         temporary.write_bytes(sensor.moved(path.parent).text.encode())
 
 
-def today(did: str, **facts: Any) -> Entry:
+def history_entry_today(did: str, **facts: Any) -> HistoryEntry:
     """Return a history entry of today."""
-    return Entry(did=did, dase=__version__, date=datetime.date.today(), **facts)
+    return HistoryEntry(did=did, dase=__version__, date=datetime.date.today(), **facts)
 
 
 def parse_values(effect: type[Effect], settings: Mapping[str, str]) -> Effect:

@@ -23,7 +23,7 @@ from dase.kernels import launch, pixel_stages, threshold_counts
 from dase.scenes.image_sources import open_images
 from dase.scenes.layers import Layer, LayerScene, Motion
 from dase.scenes.scene import Scene
-from dase.simulation.pixel_array import Pixels
+from dase.simulation.pixel_array import PixelArray
 from dase.simulation.sensor import Sensor
 from dase.simulation.sensor_file import load_sensor
 
@@ -135,7 +135,7 @@ def bench(
     """Return seconds and events of one chunk of `samples`."""
     times = np.arange(samples) * 1e-3
     windows = np.zeros(samples, np.int32)
-    array = Pixels(sensor, scene.width, scene.height, device=device.alias)
+    array = PixelArray(sensor, scene.width, scene.height, device=device.alias)
     found: list[Any] = []
 
     def work() -> None:

@@ -15,7 +15,7 @@ from dase.kernels.vector_math import exponential, lane_functions
 from dase.scenes.image_sources import open_images
 from dase.scenes.layers import Layer, LayerScene, Motion
 from dase.scenes.scene import Scene
-from dase.simulation.pixel_array import Pixels
+from dase.simulation.pixel_array import PixelArray
 
 
 class Stored(Scene):
@@ -60,7 +60,7 @@ def scene_of(kind, rng, device):
 
 def counted(sensor, scene, device, *, chunk=1000, pixels=None, parameters=None):
     """Return counts in windows of 7 samples, what the pixels remember, and whether lanes counted."""
-    array = Pixels(
+    array = PixelArray(
         sensor, scene.width, scene.height, pixels=pixels, parameters=parameters, seed=5, device=device
     )
     times = scene.sample_times()

@@ -10,7 +10,7 @@ from reference.scene_frames import bilinear, blend, film, moving_picture, origin
 import dase
 from dase.kernels import launch, scene_frames
 from dase.scenes.between_frames import TOLERANCE
-from dase.scenes.frame_motion import HOPELESS, stretches
+from dase.scenes.frame_motion import HOPELESS, estimate_stretches
 
 EPS = 1e-3
 
@@ -234,7 +234,7 @@ def test_stretches_of_frames_are_found():
     gains, offsets = rng.uniform(0.85, 1.1, len(frames)), rng.uniform(-0.04, 0.04, len(frames))
     light = frames / np.float32(255)
     stretched = np.clip(gains[:, None, None] * light + offsets[:, None, None], 0, 1).astype(np.float32)
-    found = stretches(list(stretched))
+    found = estimate_stretches(list(stretched))
     undone = found[:, :1] * np.stack([gains, offsets], 1) + found[:, 1:] * (0, 1)
     # common gain and offset are free; between neighbours they are not
     levels = undone[:, :1] * (0.3, 0.7) + undone[:, 1:]

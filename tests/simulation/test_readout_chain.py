@@ -20,10 +20,10 @@ from dase.effects.readout import Readout
 from dase.effects.refractory import Refractory
 from dase.effects.row_scan import RowScan
 from dase.effects.shot import Shot
-from dase.effects.stream import order
+from dase.effects.stream import order_events
 from dase.effects.threshold import Threshold
 from dase.effects.timestamp import Timestamp
-from dase.simulation.readout_chain import Outlet
+from dase.simulation.readout_chain import ReadoutChain
 from dase.simulation.sensor_file import parse_sensor
 
 WIDTH, HEIGHT = 13, 11
@@ -47,7 +47,7 @@ def bunched(rng: np.random.Generator, count: int = 3000, tick: int = 1) -> dase.
 
 def through(sensor: dase.Sensor, events: dase.Events, cuts: list[int] | None = None, seed: int = 0):
     """Return what leaves a sensor whose pixels send `events`, cut into parts before some indices."""
-    outlet = Outlet(sensor, events.width, events.height, seed=seed)
+    outlet = ReadoutChain(sensor, events.width, events.height, seed=seed)
     edges = [0, *(cuts or []), len(events)]
     parts = []
     for begin, end in pairwise(edges):
@@ -191,7 +191,7 @@ def test_indices_that_sort(rng):
     columns = [rng.integers(-5, 5, 500) for _ in range(3)]
     wide = [rng.integers(-(2**60), 2**60, 500), columns[0]]  # more than 62 bits together
     for some in (columns, wide, columns[:1], [np.zeros(7, int)], [np.empty(0, int)]):
-        np.testing.assert_array_equal(order(*some), np.lexsort(some[::-1]))
+        np.testing.assert_array_equal(order_events(*some), np.lexsort(some[::-1]))
 
 
 # ---- counting
