@@ -75,10 +75,10 @@ def compose_trials(stages: tuple[EffectStages, ...], *, lanes: int = 1) -> wp.Ke
         "look_back": observe_queued_events,
         "instant": event_instant,
     }
-    return compile_text(trials_text(stages, lanes=lanes), "pixel_trials", scope, **options)
+    return compile_text(source_text(stages, lanes=lanes), "pixel_trials", scope, **options)
 
 
-def trials_text(stages: tuple[EffectStages, ...], *, lanes: int = 1) -> str:
+def source_text(stages: tuple[EffectStages, ...], *, lanes: int = 1) -> str:
     """Return the text of the kernel that `compose_trials` compiles."""
     program = make_program(_model(stages, lanes))
     return _print_with_lanes(program) if lanes > 1 else _print_alone(program)

@@ -116,4 +116,4 @@ def test_arguments_are_resolved_by_name():
 def test_texts_are_python(source, sink, lanes):
     stages = tuple(effect().compiled() for effect in EFFECTS.values())
     compile(pixel_compile.source_text(stages, source, sink, lanes=lanes), "kernel", "exec")
-    compile(pixel_codegen_trials.trials_text(stages, lanes=max(lanes, 1)), "kernel", "exec")
+    compile(pixel_codegen_trials.source_text(stages, lanes=max(lanes, 1)), "kernel", "exec")
