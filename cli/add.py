@@ -63,7 +63,7 @@ def add_command(
     entry = sensor_edit.history_entry_today(f"add {effect}")
     if recording is not None:
         fitted, entry = _fit_effect(text.sensor(), chosen, recording, scene, device, seed)
-        more = more.became(fitted)
+        more = more.describing(fitted)
     sensor_edit.write_sensor_text(more.noted(entry), output)
     if output is None:
         return

@@ -90,7 +90,7 @@ def open_measurement(recording: Path, scene: str = "frames", video: Path | None 
     else:
         seen = scene_of_frames(sequence, recording, notes)
     if isinstance(seen, CameraScene):
-        trust = seen.trusts
+        trust = seen.is_trusted
     return Measurement(sequence.events, seen, trust, tuple(notes))
 
 

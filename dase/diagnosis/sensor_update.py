@@ -24,14 +24,14 @@ def with_fit(text: SensorText, found: Fit, recording: str) -> SensorText:
         "error_after": round(found.error, 3),
         "floor": found.floor,
     }
-    return text.became(round_parameters(found.sensor)).noted(
+    return text.describing(round_parameters(found.sensor)).noted(
         history_entry_today("fit", recording=recording, **facts)
     )
 
 
 def with_diagnosis(text: SensorText, found: Diagnosis, recording: str) -> SensorText:
     """Return a sensor file with the effects that a diagnosis found, and the error after each as history."""
-    text = text.became(round_parameters(found.sensor))
+    text = text.describing(round_parameters(found.sensor))
     steps = ["fit", *(f"add {name}" for name in found.selected)]
     errors = [round(error, 3) for error in (found.before, *found.errors)]
     for did, before, after in zip(steps, errors, errors[1:], strict=False):

@@ -60,7 +60,7 @@ def measurement_plates(
     real, made = measured.events, Events.concatenate(parts)
     if not isinstance(measured.scene, CameraScene):
         return event_plates(real, made, (begin, end), frames=frames, frame_times=shown)
-    real, made = measured.scene.believed(real), measured.scene.believed(made)
+    real, made = measured.scene.trusted_events(real), measured.scene.trusted_events(made)
     plates = event_plates(real, made, (begin, end), frames=frames, frame_times=shown)
     return [replace(plate, caption=f"{plate.caption} {BELIEVED}") for plate in plates]
 

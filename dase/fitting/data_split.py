@@ -111,7 +111,7 @@ def split_measurement(
         InputError: Different sizes, no common time, or too few events.
     """
     if trust is None and isinstance(scene, CameraScene):
-        trust = scene.trusts
+        trust = scene.is_trusted
     grid = common_grid(events, scene)
     try:
         to = launch.find_device(device)

@@ -179,7 +179,7 @@ class CameraScene(Scene):
 
     def frames(self, times: NDArray[np.float64], device: str = "cpu") -> NDArray[np.float32]:
         """Return intensities at `times` [s], shape (K, height, width)."""
-        _, source = self.source(np.asarray(times, np.float64), self._all(), launch.find_device(device))
+        _, source = self.source(np.asarray(times, np.float64), self._all_pixels(), launch.find_device(device))
         return np.asarray(source.values.numpy().reshape(-1, self.height, self.width))
 
     def doubt(
@@ -203,7 +203,7 @@ class CameraScene(Scene):
         where = launch.find_device(device)
         matches, first, place, share = self._prepared(at, where)
         doubts = np.stack([self.matched(first + j).doubt for j in range(matches.ahead.shape[0])])
-        chosen = self._all() if pixels is None else np.asarray(pixels, np.int32)
+        chosen = self._all_pixels() if pixels is None else np.asarray(pixels, np.int32)
         out = scene_frames.render_doubt(matches, doubts, chosen, place, share, where)
         return out.reshape(len(at), self.height, self.width) if pixels is None else out
 
@@ -251,7 +251,7 @@ class CameraScene(Scene):
             out[k] = self.doubt(self._moments(k), device=device).max(0) <= limit
         return out
 
-    def trusts(self, times: NDArray[np.float64], pixels: NDArray[np.int32]) -> NDArray[np.bool_]:
+    def is_trusted(self, times: NDArray[np.float64], pixels: NDArray[np.int32]) -> NDArray[np.bool_]:
         """Return where the scene is to be trusted, as a comparison asks: never outside the scene.
 
         Args:
@@ -264,7 +264,7 @@ class CameraScene(Scene):
         at, inside = self._within(times)
         return np.asarray(self._kept_trust()[at][:, pixels] & inside[:, None])
 
-    def believed(self, events: Events) -> Events:
+    def trusted_events(self, events: Events) -> Events:
         """Return the events of pixels and times at which the scene is to be trusted, see `trusts`."""
         at, inside = self._within(events.t)
         pixels = events.y.astype(np.int64) * self.width + events.x
@@ -286,7 +286,7 @@ class CameraScene(Scene):
         begin, end = self.times[interval : interval + 2]
         return np.asarray(np.minimum(begin + (end - begin) * MOMENTS, np.nextafter(end, begin)))
 
-    def _all(self) -> NDArray[np.int32]:
+    def _all_pixels(self) -> NDArray[np.int32]:
         return np.arange(self.height * self.width, dtype=np.int32)
 
     def _prepared(

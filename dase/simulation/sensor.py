@@ -111,7 +111,7 @@ class Sensor:
         values = [effect.map_values(pixels) for effect in self.effects if effect.maps]
         return [wp.array(np.concatenate(values), dtype=float, device=device)] if values else []
 
-    def retimes(self) -> bool:
+    def changes_event_stream(self) -> bool:
         """Whether events leave at other times than their crossings', or not all of them leave."""
         late = (e for e in self.effects if isinstance(e, StreamEffect) or "delay" in e.stages)
         return not all(effect.is_off() for effect in late)

@@ -79,7 +79,7 @@ class SensorText:
         new = "\n\n".join(part for part in (head, tail.rstrip()) if part) + "\n"
         return self._checked(new, after)
 
-    def changed(self, effect: Effect) -> SensorText:
+    def with_values_of(self, effect: Effect) -> SensorText:
         """Return the text with the values of an effect that it has; their comments stay."""
         document = tomlkit.parse(self.text)
         table: Any = document[effect.name]
@@ -102,7 +102,7 @@ class SensorText:
             table[name] = Path(os.path.relpath(getattr(effect, name), folder.resolve())).as_posix()
         return replace(self, folder=folder)._checked(tomlkit.dumps(document), sensor)
 
-    def became(self, sensor: Sensor) -> SensorText:
+    def describing(self, sensor: Sensor) -> SensorText:
         """Return the text that describes another sensor: effects added, removed, or with other values."""
         text = self
         for effect in self.sensor().effects:
@@ -112,7 +112,7 @@ class SensorText:
             if effect.name not in text.sensor():
                 text = text.added(effect)
             elif text.sensor()[effect.name] != effect:
-                text = text.changed(effect)
+                text = text.with_values_of(effect)
         return text
 
     def noted(self, entry: HistoryEntry) -> SensorText:

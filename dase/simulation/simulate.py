@@ -130,7 +130,7 @@ def count(
     array = PixelArray(
         sensor, scene.width, scene.height, pixels=pixels, parameters=parameters, seed=seed, device=device
     )
-    if sensor.retimes():
+    if sensor.changes_event_stream():
         return _count_leaving(scene, array, edges)
     total = np.zeros((array.batch, len(edges) - 1, 2, array.count), np.int32)
     for times in chunks(sample_times(scene, sensor), CHUNK["cuda" if array.device.is_cuda else "cpu"]):

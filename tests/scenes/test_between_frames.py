@@ -184,7 +184,7 @@ def test_saturation_and_what_only_one_frame_shows_are_not_trusted(rng):
     assert (strict <= trusted).all()
     np.testing.assert_array_equal(strict[0], scene.doubt(np.linspace(0, 0.04 - 1e-9, 9)).max(0) <= TOLERANCE)
     pixels = np.array([5 * 80 + 30, 22 * 80 + 33], np.int32)
-    at_once = scene.trusts(np.array([-0.01, 0.01, 0.05, 0.09]), pixels)
+    at_once = scene.is_trusted(np.array([-0.01, 0.01, 0.05, 0.09]), pixels)
     np.testing.assert_array_equal(at_once, [[0, 0], [1, 0], [1, 0], [0, 0]])
 
 

@@ -93,7 +93,7 @@ def test_place_and_comments():
 
 def test_changed_values_keep_their_comments():
     text = SensorText(MINE, "mine")
-    new = text.changed(EFFECTS["threshold"](on=0.3, off=0.22, phase=0.5))
+    new = text.with_values_of(EFFECTS["threshold"](on=0.3, off=0.22, phase=0.5))
     assert new.sensor()["threshold"].on == 0.3
     assert "on   = 0.3       # strange spacing" in new.text
     assert "phase = 0.5" in new.text
@@ -105,11 +105,11 @@ def test_becomes_another_sensor():
     text = SensorText(MINE, "mine")
     want = text.sensor().without("leak").with_effect(EFFECTS["shot"](rate=3.0))
     want = want.with_effect(EFFECTS["refractory"](period=0.002)).with_effect(EFFECTS["threshold"](on=0.3))
-    new = text.became(want)
+    new = text.describing(want)
     assert new.sensor() == want
     assert "period = 0.002    # s" in new.text
     assert "on   = 0.3       # strange spacing" in new.text
-    assert text.became(text.sensor()).text == MINE
+    assert text.describing(text.sensor()).text == MINE
 
 
 def test_rounded():

@@ -93,7 +93,7 @@ def without_times(path: Path) -> Measurement:
     ]
     begin = times + found.offset if "offset" not in found.clear else begin
     scene = camera_scene(frames, begin, begin, notes)
-    return Measurement(events, scene, scene.trusts, tuple(notes))
+    return Measurement(events, scene, scene.is_trusted, tuple(notes))
 
 
 def from_histograms(path: Path, seconds: float = 2.0, side: int = 50) -> Measurement:
