@@ -51,13 +51,13 @@ def command(
 
     The effect gets its default values and goes where it acts. The change is noted at the end of the file.
     """
-    from dase.effects import find
+    from dase.effects import find_effect
     from dase.simulation import sensor_edit
     from dase.simulation.user_effects import known_effects
 
     values = dict(split(setting) for setting in settings)
     known = known_effects(effects)
-    chosen = sensor_edit.parse_values(find(effect, known), values)
+    chosen = sensor_edit.parse_values(find_effect(effect, known), values)
     text = sensor_edit.read(sensor, known)
     more = text.added(chosen)
     entry = sensor_edit.today(f"add {effect}")

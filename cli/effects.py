@@ -31,10 +31,10 @@ def list_effects(effects: tuple[Path, ...]) -> None:
 @effects_option
 def show_effect(name: str, effects: tuple[Path, ...]) -> None:
     """Describe the effect NAME: physics, parameters, source."""
-    from dase.effects import SceneEffect, StreamEffect, find
+    from dase.effects import SceneEffect, StreamEffect, find_effect
     from dase.simulation.user_effects import known_effects
 
-    effect = find(name, known_effects(effects))
+    effect = find_effect(name, known_effects(effects))
     click.echo(f"{effect.name}: {effect.about()}\n")
     for p in effect.parameters():
         low, high = p.plausible

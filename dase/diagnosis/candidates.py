@@ -14,14 +14,21 @@ from dase.effects.optics import SceneEffect
 from dase.effects.readout import Readout
 from dase.effects.row_scan import RowScan
 from dase.effects.timestamp import Timestamp
-from dase.fitting.data_split import Evidence
-from dase.fitting.descent import Over, screening, searching
-from dase.fitting.early_stopping import Race
-from dase.fitting.model import SETTLED, Model, added, settling, starts, turned
-from dase.fitting.parameter_space import variants
-from dase.fitting.scheduler import Ask, Work, alone, beside, together
-from dase.fitting.subset import Half
-from dase.probes.distance import Judgement, Scale
+from dase.fitting.data_split import SplitMeasurement
+from dase.fitting.descent import StopRule, descent_work, ranking_work
+from dase.fitting.early_stopping import CandidateRace
+from dase.fitting.model import (
+    SETTLED,
+    FittedModel,
+    refit_work,
+    starting_places,
+    with_effect_added,
+    with_lamp_shifted,
+)
+from dase.fitting.parameter_space import effect_variants
+from dase.fitting.scheduler import SimulationRequest, Work, run_side_by_side, run_work, side_by_side_work
+from dase.fitting.subset import PixelSubset
+from dase.probes.distance import ErrorScale, Judgement
 
 Array = NDArray[np.float64]
 
@@ -88,7 +95,7 @@ class Tried:
     """
 
     name: str
-    model: Model
+    model: FittedModel
     fit: float
     scouted: float = float("nan")
     families: Mapping[str, float] = field(default_factory=dict)
@@ -106,7 +113,7 @@ Report = Callable[[str, float], None]
 """Told what is being done, and the share of the step that is done."""
 
 
-def open_to(effects: Mapping[str, type[Effect]], present: Model) -> list[str]:
+def open_to(effects: Mapping[str, type[Effect]], present: FittedModel) -> list[str]:
     """Return the names of the effects that can be tried."""
     sensor = present.space.sensor
     # what acts on whole pictures has no place in a parameter vector; what a network has to learn first
@@ -115,7 +122,7 @@ def open_to(effects: Mapping[str, type[Effect]], present: Model) -> list[str]:
     return [n for n in known if n not in sensor or (sensor[n].is_off() and n != "threshold")]
 
 
-def prepared(evidence: Evidence, effect: type[Effect]) -> list[Effect]:
+def prepared(evidence: SplitMeasurement, effect: type[Effect]) -> list[Effect]:
     """Return the variants of an effect that are tried, with what can be read off the measurement set.
 
     No descent finds the frequency of a lamp or the ticks of a clock, but they can be seen, as can the rate of
@@ -130,11 +137,15 @@ def prepared(evidence: Evidence, effect: type[Effect]) -> list[Effect]:
     if effect is RowScan:
         return [RowScan(line=structure.line, direction=structure.direction)] if structure.line else []
     if effect is Readout:
-        if evidence.busiest < IDLE * evidence.fastest:
+        if evidence.highest_event_rate < IDLE * evidence.least_bus_rate:
             return []
         # events come as fast as the bus can send them, if it ever was full
-        return [replace(e, rate=evidence.busiest) for e in variants(effect) if isinstance(e, Readout)]
-    return variants(effect)
+        return [
+            replace(e, rate=evidence.highest_event_rate)
+            for e in effect_variants(effect)
+            if isinstance(e, Readout)
+        ]
+    return effect_variants(effect)
 
 
 def rare(effect: Effect) -> bool:
@@ -156,8 +167,8 @@ class Look:
     """
 
     effect: Effect
-    model: Model
-    half: Half
+    model: FittedModel
+    half: PixelSubset
     before: Array
     places: Array
     losses: Array
@@ -178,20 +189,22 @@ class Look:
         return Tried(self.effect.name, model, loss, loss / self.present)
 
 
-def looking(evidence: Evidence, present: Model, effect: Effect, *, seed: int) -> Work[Look]:
-    """Look at an effect at many places, on some pixels, see `together`."""
+def looking(evidence: SplitMeasurement, present: FittedModel, effect: Effect, *, seed: int) -> Work[Look]:
+    """Look at an effect at many places, on some pixels, see `run_side_by_side`."""
     half = evidence.train if rare(effect) else evidence.scout
-    model = added(present, effect)
-    (before,) = yield [Ask(half, present.space, present.place[None], seed)]
+    model = with_effect_added(present, effect)
+    (before,) = yield [SimulationRequest(half, present.space, present.place[None], seed)]
     few = half.slow(model.space)
-    places, losses = yield from screening(half, model.space, starts(model, effect, few=few), seed=seed)
+    places, losses = yield from ranking_work(
+        half, model.space, starting_places(model, effect, few=few), seed=seed
+    )
     return Look(effect, model, half, before[0], places, losses)
 
 
-def scout(evidence: Evidence, present: Model, effect: Effect, *, seed: int) -> Tried:
+def scout(evidence: SplitMeasurement, present: FittedModel, effect: Effect, *, seed: int) -> Tried:
     """Try one effect on some pixels: a look at many places, then a short descent from the best two."""
-    look = alone(looking(evidence, present, effect, seed=seed))
-    return alone(following(look, Race(1), seed=seed))
+    look = run_work(looking(evidence, present, effect, seed=seed))
+    return run_work(following(look, CandidateRace(1), seed=seed))
 
 
 def followed(looks: Sequence[Look]) -> list[Look]:
@@ -207,16 +220,16 @@ def followed(looks: Sequence[Look]) -> list[Look]:
     ]  # fmt: skip
 
 
-def following(look: Look, race: Race, *, seed: int) -> Work[Tried]:
-    """Descend from the best two places of a look, see `together`."""
+def following(look: Look, race: CandidateRace, *, seed: int) -> Work[Tried]:
+    """Descend from the best two places of a look, see `run_side_by_side`."""
     half, places, losses = look.half, look.places, look.losses
     slow = half.slow(look.model.space) or rare(look.effect)
     apart = np.flatnonzero((np.abs(places - places[0]).max(1) > 0.8) & (losses < SECOND * losses[0]))
     name, unit, space = look.effect.name, look.present, look.model.space
     begins = places[[0, *apart[: 0 if slow else 1]]]
-    ends = yield from beside(
+    ends = yield from side_by_side_work(
         [
-            searching(half, space, begin, seed=seed, iterations=3, over=race.over(name, unit))
+            descent_work(half, space, begin, seed=seed, iterations=3, over=race.over(name, unit))
             for begin in begins
         ]
     )
@@ -228,27 +241,27 @@ def following(look: Look, race: Race, *, seed: int) -> Work[Tried]:
     )
 
 
-def refining(evidence: Evidence, tried: Tried, race: Race, *, seed: int) -> Work[Tried]:
+def refining(evidence: SplitMeasurement, tried: Tried, race: CandidateRace, *, seed: int) -> Work[Tried]:
     """Fit a candidate to all pixels of the training half, by the sampling errors of the present model."""
     # a finalist that is still on its way would be judged by where it happens to be
     half = evidence.train.loaded(tried.model.space, tried.model.place)
-    ways = turned(tried.model, half.frame.step)
+    ways = with_lamp_shifted(tried.model, half.frame.step)
     works = []
     for way in ways:
         over = race.over(tried.name)
         works.append(
-            searching(
+            descent_work(
                 half, way.space, way.place, seed=seed, iterations=3, radius=0.2, patient=True, over=over
             )
         )
-    ends = yield from beside(works)
+    ends = yield from side_by_side_work(works)
     found = min(ends, key=lambda end: end.loss)
     model = replace(tried.model, place=found.place, loss=found.loss)
     bank = np.concatenate([end.tried for end in ends])
     return replace(tried, model=model, fit=found.loss, bank=bank)
 
 
-def judge_alone(evidence: Evidence, tried: Sequence[Tried], *, seed: int) -> list[Tried]:
+def judge_alone(evidence: SplitMeasurement, tried: Sequence[Tried], *, seed: int) -> list[Tried]:
     """Fit candidates by their own sampling errors and judge them on the held-out half.
 
     Effects that make pixels differ have sampling errors far above those of the model without them, by which
@@ -256,21 +269,21 @@ def judge_alone(evidence: Evidence, tried: Sequence[Tried], *, seed: int) -> lis
     it was fitted so far; candidates far behind the best by that measure go no further.
     """
     looks = [_looking(evidence, t, seed=seed) for t in tried]
-    found = together(looks)
+    found = run_side_by_side(looks)
     limit = BEHIND * min(error for error, _ in found) + CLOSE
-    race = Race(1, LOSES)
+    race = CandidateRace(1, LOSES)
     works = [
         _judging(evidence, t, half, FEW if error > FAR else REPEATS, race.over(t.name), seed=seed)
         for t, (error, half) in zip(tried, found, strict=True) if error <= limit
     ]  # fmt: skip
-    done = {t.name: t for t in together(works)}
+    done = {t.name: t for t in run_side_by_side(works)}
     for _ in range(AGAIN):
         first, least = (min(done.values(), key=key) for key in (_error, lambda t: t.model.loss))
         if least is first or least.model.loss > SURELY * first.model.loss:
             break
         # better where it was fitted, worse where it is judged: it is still on its way
-        half = alone(_looking(evidence, least, seed=seed))[1]
-        done[least.name] = alone(_judging(evidence, least, half, REPEATS, None, seed=seed))
+        half = run_work(_looking(evidence, least, seed=seed))[1]
+        done[least.name] = run_work(_judging(evidence, least, half, REPEATS, None, seed=seed))
     return [done.get(t.name, t) for t in tried]
 
 
@@ -278,7 +291,7 @@ def _error(tried: Tried) -> float:
     return tried.error
 
 
-def _looking(evidence: Evidence, tried: Tried, *, seed: int) -> Work[tuple[float, Half]]:
+def _looking(evidence: SplitMeasurement, tried: Tried, *, seed: int) -> Work[tuple[float, PixelSubset]]:
     """Return the error on the training half, and that half with the candidate as its present model."""
     half = evidence.train.view()
     values = yield from half.rebasing(tried.model.space, tried.model.place, repeats=SETTLED, seed=seed + 100)
@@ -286,16 +299,22 @@ def _looking(evidence: Evidence, tried: Tried, *, seed: int) -> Work[tuple[float
 
 
 def _judging(
-    evidence: Evidence, tried: Tried, half: Half, repeats: int, over: Over | None, *, seed: int
+    evidence: SplitMeasurement,
+    tried: Tried,
+    half: PixelSubset,
+    repeats: int,
+    over: StopRule | None,
+    *,
+    seed: int,
 ) -> Work[Tried]:
-    model = yield from settling(evidence, tried.model, seed=seed, rounds=1, half=half, over=over)
+    model = yield from refit_work(evidence, tried.model, seed=seed, rounds=1, half=half, over=over)
     judged = yield from model.judging(evidence.held.view(), repeats=repeats, seed=seed + 500)
     return replace(tried, model=model, judged=judged)
 
 
 def try_all(
-    evidence: Evidence,
-    present: Model,
+    evidence: SplitMeasurement,
+    present: FittedModel,
     effects: Mapping[str, type[Effect]],
     names: Sequence[str],
     *,
@@ -313,8 +332,8 @@ def try_all(
     order, left = _scouted(evidence, present, all_variants, seed=seed, report=report)
     chosen = [*order[:FINALISTS], *specialists(order, worst)]
     report(f"fitting {', '.join(t.name for t in chosen)}", 0.5)
-    last = Race(1, GIVES_UP)
-    refined = together([refining(evidence, tried, last, seed=seed) for tried in chosen])
+    last = CandidateRace(1, GIVES_UP)
+    refined = run_side_by_side([refining(evidence, tried, last, seed=seed) for tried in chosen])
     finalists = with_chance(evidence, present, refined, repeats, seed=seed)
     # what chance does as well is not added, whatever its error
     certain = [t for t in finalists if t.p_value <= max(SIGNIFICANT, 1.01 / (1 + len(repeats)))]
@@ -326,16 +345,16 @@ def try_all(
 
 
 def _scouted(
-    evidence: Evidence, present: Model, variants: Sequence[Effect], *, seed: int, report: Report
+    evidence: SplitMeasurement, present: FittedModel, variants: Sequence[Effect], *, seed: int, report: Report
 ) -> tuple[list[Tried], list[Tried]]:
     """Return candidates in order of their loss on some pixels, and those that were only looked at."""
-    looks = together(
+    looks = run_side_by_side(
         [looking(evidence, present, effect, seed=seed) for effect in variants],
         lambda share: report("looking at all effects", 0.2 * share),
     )
-    race, found = Race(FINALISTS), dict[str, Tried]()
+    race, found = CandidateRace(FINALISTS), dict[str, Tried]()
     works = [following(look, race, seed=seed) for look in followed(looks)]
-    for tried in together(works, lambda share: report("trying all effects", 0.2 + 0.3 * share)):
+    for tried in run_side_by_side(works, lambda share: report("trying all effects", 0.2 + 0.3 * share)):
         if tried.name not in found or tried.scouted < found[tried.name].scouted:
             found[tried.name] = tried
     left = {look.effect.name: look.found(look.places[0], float(look.losses[0])) for look in looks}
@@ -344,7 +363,7 @@ def _scouted(
 
 
 def with_chance(
-    evidence: Evidence, present: Model, tried: Sequence[Tried], repeats: Array, *, seed: int
+    evidence: SplitMeasurement, present: FittedModel, tried: Sequence[Tried], repeats: Array, *, seed: int
 ) -> list[Tried]:
     """Return candidates with the p-values of what they make of the training loss."""
     scale = evidence.train.scale
@@ -364,7 +383,7 @@ def specialists(order: Sequence[Tried], worst: Sequence[str]) -> list[Tried]:
 
 
 def chance_of(
-    scale: Scale, tried: Sequence[Tried], repeats: Array, present: Array
+    scale: ErrorScale, tried: Sequence[Tried], repeats: Array, present: Array
 ) -> Callable[[float], float]:
     """Return the function from a fall of the training loss to its p-value, corrected over all candidates.
 

@@ -10,9 +10,9 @@ from numpy.typing import NDArray
 from dase.diagnosis.cell_descriptions import band, worst_cells
 from dase.events import Events
 from dase.fitting.batch_simulator import LAG_TIMES
-from dase.fitting.data_split import PIXELS, Evidence, gather
+from dase.fitting.data_split import PIXELS, SplitMeasurement, split_measurement
 from dase.fitting.model import model_of
-from dase.fitting.subset import Half
+from dase.fitting.subset import PixelSubset
 from dase.kernels.event_probes import BANDS, INTERVALS, KINDS, LAGS, RESTING
 from dase.probes.distance import Judgement
 from dase.probes.statistics import LAYOUT
@@ -58,7 +58,7 @@ def compare(
     tell = progress or (lambda text, share, error: None)
     tell("reading the measurement", 0.0, float("nan"))
     sensor = sensor.bound_to(scene)
-    evidence = gather(
+    evidence = split_measurement(
         events, scene, log_eps=sensor.log_eps, trust=trust, pixels=pixels, seed=seed, device=device
     )
     tell("simulating", 0.3, float("nan"))
@@ -67,7 +67,9 @@ def compare(
     return comparison_of(evidence, judgement, sensor, seconds=time.perf_counter() - begin)
 
 
-def comparison_of(evidence: Evidence, judgement: Judgement, sensor: Sensor, *, seconds: float) -> Comparison:
+def comparison_of(
+    evidence: SplitMeasurement, judgement: Judgement, sensor: Sensor, *, seconds: float
+) -> Comparison:
     """Return the comparison with the model that the held-out half was rebased to."""
     return Comparison(
         sensor=sensor,
@@ -83,7 +85,7 @@ def comparison_of(evidence: Evidence, judgement: Judgement, sensor: Sensor, *, s
     )
 
 
-def plain(half: Half) -> dict[str, tuple[float, float]]:
+def plain(half: PixelSubset) -> dict[str, tuple[float, float]]:
     """Return measured and simulated values in units that need no explanation."""
     values = half.seen.target, half.simulated
     real, made = (_rates(v) for v in values)
@@ -136,7 +138,7 @@ def _mean_lag(values: Array) -> float:
     return float(1e3 * (weight * middle).sum() / max(weight.sum(), 1e-12))
 
 
-def curves(evidence: Evidence) -> dict[str, tuple[Curve, ...]]:
+def curves(evidence: SplitMeasurement) -> dict[str, tuple[Curve, ...]]:
     """Return what figures are drawn from, by family."""
     half = evidence.held
     return {
@@ -146,7 +148,7 @@ def curves(evidence: Evidence) -> dict[str, tuple[Curve, ...]]:
     }
 
 
-def _rate_curves(evidence: Evidence, half: Half) -> tuple[Curve, ...]:
+def _rate_curves(evidence: SplitMeasurement, half: PixelSubset) -> tuple[Curve, ...]:
     exposure = np.maximum(half.trials.stimulus.exposure().reshape(KINDS, BANDS), 1e-9)
     middle = np.array([-0.4, -0.12, 0.0, 0.12, 0.4])
     out = []
@@ -163,7 +165,7 @@ def _rate_curves(evidence: Evidence, half: Half) -> tuple[Curve, ...]:
     return tuple(out)
 
 
-def _interval_curves(half: Half) -> tuple[Curve, ...]:
+def _interval_curves(half: PixelSubset) -> tuple[Curve, ...]:
     step = half.trials.stimulus.grid.step * 1e3
     ends = _octaves(step)
     middle = np.concatenate([[0.35 * step], np.sqrt(ends[:-1] * ends[1:])])
@@ -177,7 +179,7 @@ def _interval_curves(half: Half) -> tuple[Curve, ...]:
     )  # fmt: skip
 
 
-def _lag_curves(evidence: Evidence, half: Half) -> tuple[Curve, ...]:
+def _lag_curves(evidence: SplitMeasurement, half: PixelSubset) -> tuple[Curve, ...]:
     times = np.array(LAG_TIMES)
     width = 1e3 * np.diff(times)
     middle = 1e3 * 0.5 * (times[1:] + times[:-1])

@@ -14,11 +14,11 @@ from dase.diagnosis.pruning import review
 from dase.diagnosis.state import MATERIAL, REPEATS, TIE, Search, accounts, like_of
 from dase.effects import EFFECTS, Effect
 from dase.events import Events
-from dase.fitting.confidence_intervals import estimates
-from dase.fitting.data_split import PIXELS, gather
-from dase.fitting.model import Model, fit_present, model_of, settle, settling
-from dase.fitting.scheduler import together
-from dase.probes.distance import Judgement, announced, explained, silent, worst_families
+from dase.fitting.confidence_intervals import estimate_parameters
+from dase.fitting.data_split import PIXELS, split_measurement
+from dase.fitting.model import FittedModel, fit_present_model, model_of, refit_model, refit_work
+from dase.fitting.scheduler import run_side_by_side
+from dase.probes.distance import Judgement, leaves_nothing, may_be_announced, reaches_floor, worst_families
 from dase.probes.stimulus import Trust
 from dase.results import Cell, Diagnosis, Estimate, Progress, Rank, Step, Unexplained
 from dase.scenes.scene import Scene
@@ -74,23 +74,23 @@ def diagnose(
     begin = time.perf_counter()
     sensor = sensor or Sensor()
     sensor = sensor.bound_to(scene)
-    evidence = gather(
+    evidence = split_measurement(
         events, scene, log_eps=sensor.log_eps, trust=trust, pixels=pixels, seed=seed, device=device
     )
     tell = progress or (lambda text, share, error: None)
     tell("fitting the present model", 0.0, float("nan"))
     search = Search(evidence, effects, seed, tell, frozenset(e.name for e in sensor.effects))
     before = model_of(sensor, free).judge(evidence.held, repeats=REPEATS // 2, seed=seed + 500).error
-    start = fit_present(evidence, sensor, free, seed=seed)
+    start = fit_present_model(evidence, sensor, free, seed=seed)
     model, judgement, errors = _greedy(search, start, most)
-    if not explained(judgement) and most > 0:
+    if not reaches_floor(judgement) and most > 0:
         model, judgement = _pairs(search, start, model, judgement)
     if len(search.added(model)) > 1:
         model, judgement = review(search, model, judgement)
     return _verdict(search, start, model, errors, before, begin)
 
 
-def _greedy(search: Search, model: Model, most: int) -> tuple[Model, Judgement, list[float]]:
+def _greedy(search: Search, model: FittedModel, most: int) -> tuple[FittedModel, Judgement, list[float]]:
     """Add the best effect as long as one is missing."""
     errors, far = list[float](), False
     for _ in range(most + 1):
@@ -107,7 +107,9 @@ def _greedy(search: Search, model: Model, most: int) -> tuple[Model, Judgement, 
     return model, judgement, errors
 
 
-def _step(search: Search, model: Model, judgement: Judgement, more: bool) -> tuple[Step, Model | None, bool]:
+def _step(
+    search: Search, model: FittedModel, judgement: Judgement, more: bool
+) -> tuple[Step, FittedModel | None, bool]:
     """Try all effects.
 
     Returns:
@@ -118,7 +120,7 @@ def _step(search: Search, model: Model, judgement: Judgement, more: bool) -> tup
     names = tuple(e.name for e in model.space.sensor.effects)
     cells = worst_cells(evidence, judgement)
     step = Step(names, judgement.error, judgement.gate, judgement.families, (), None, (), cells)
-    if silent(judgement) or not more:
+    if leaves_nothing(judgement) or not more:
         return step, None, False
     repeats = model.rebase(evidence.train, repeats=REPEATS, seed=seed + 300)
     model.rebase(evidence.scout, repeats=16, seed=seed + 200)
@@ -134,16 +136,20 @@ def _step(search: Search, model: Model, judgement: Judgement, more: bool) -> tup
     if not search.history:
         search.first = sorted(tried, key=lambda t: t.scouted)
     worthy = [t for t in finalists if t.judged and accounts(t.judged, judgement)]
-    able = worthy if explained(judgement) else finalists
+    able = worthy if reaches_floor(judgement) else finalists
     if not able:
         return step, None, False
     best, ties = _choose(able)
     mine = _rank(best, judgement)
-    if not explained(judgement) and (mine.fall < MATERIAL or mine.share < SHARE):
+    if not reaches_floor(judgement) and (mine.fall < MATERIAL or mine.share < SHARE):
         return step, None, False
     search.note(best, finalists, ties, judgement)
     step = replace(step, chosen=best.name, ties=ties)
-    return step, settle(evidence, best.model, seed=seed, rounds=1), best.error > ON_ITS_WAY * judgement.gate
+    return (
+        step,
+        refit_model(evidence, best.model, seed=seed, rounds=1),
+        best.error > ON_ITS_WAY * judgement.gate,
+    )
 
 
 def _found(search: Search, hidden: Tried, p_value: float, step: Step, judgement: Judgement) -> Step:
@@ -158,10 +164,10 @@ def _choose(finalists: Sequence[Tried]) -> tuple[Tried, tuple[str, ...]]:
     """Return the best candidate, the simplest of those that are not told apart, and the others of those."""
     first = finalists[0]
     reach = max(TIE, 0.1 * first.error)
-    good = first.judged is not None and explained(first.judged)
+    good = first.judged is not None and reaches_floor(first.judged)
     like = [
         t for t in finalists
-        if t.error <= first.error + reach and t.judged and (explained(t.judged) or not good)
+        if t.error <= first.error + reach and t.judged and (reaches_floor(t.judged) or not good)
     ]  # fmt: skip
     best = min(like, key=lambda t: (len(t.model.place), t.error))
     return best, tuple(t.name for t in like if t.name != best.name)
@@ -179,7 +185,9 @@ def _rank(tried: Tried, judgement: Judgement) -> Rank:
     return Rank(tried.name, tried.error, fall, min(share, 1.0), tried.p_value, mine, tried.judged is not None)
 
 
-def _pairs(search: Search, start: Model, model: Model, judgement: Judgement) -> tuple[Model, Judgement]:
+def _pairs(
+    search: Search, start: FittedModel, model: FittedModel, judgement: Judgement
+) -> tuple[FittedModel, Judgement]:
     """Where adding one after the other does not reach the floor, try two at once."""
     evidence, seed = search.evidence, search.seed
     singles = [t for t in search.first if t.scouted < 0.98][:PAIRED]
@@ -190,15 +198,15 @@ def _pairs(search: Search, start: Model, model: Model, judgement: Judgement) -> 
         both = one.model.sensor.with_effect(two.model.sensor[two.name])
         pair = like_of(both, start, (one.name, two.name))
         works.append(pair.searching(evidence.scout, seed=seed, iterations=4, radius=0.3))
-    ends = together(works, lambda share: search.progress("trying pairs", share, search.error))
+    ends = run_side_by_side(works, lambda share: search.progress("trying pairs", share, search.error))
     tried = [
         (pair.loss, f"{one.name} + {two.name}", pair) for (one, two), pair in zip(pairs, ends, strict=True)
     ]
     first = sorted(tried, key=lambda t: t[0])[:2]
-    settled = together([settling(evidence, pair, seed=seed) for _, _, pair in first])
+    settled = run_side_by_side([refit_work(evidence, pair, seed=seed) for _, _, pair in first])
     for (_, name, _), pair in zip(first, settled, strict=True):
         judged = search.judge(pair)
-        if judged.error < judgement.error * (1.0 if explained(judged) else 0.8):
+        if judged.error < judgement.error * (1.0 if reaches_floor(judged) else 0.8):
             model, judgement = pair, judged
             search.history.append(_pair_step(search.history[0], name))
     return model, judgement
@@ -209,16 +217,16 @@ def _pair_step(first: Step, name: str) -> Step:
 
 
 def _verdict(
-    search: Search, start: Model, model: Model, errors: list[float], before: float, begin: float
+    search: Search, start: FittedModel, model: FittedModel, errors: list[float], before: float, begin: float
 ) -> Diagnosis:
     """Return what was found; names are announced only where they bring the error to the floor."""
     found = search.added(model)
     chosen = [n for s in search.history if s.chosen for n in s.chosen.split(" + ")]
     order = tuple(dict.fromkeys([*(n for n in chosen if n in found), *found]))
-    model, values = estimates(search.evidence, model, seed=search.seed)
+    model, values = estimate_parameters(search.evidence, model, seed=search.seed)
     last = search.judge(model)
     unexplained: Unexplained | None = None
-    if not announced(last):
+    if not may_be_announced(last):
         cells = worst_cells(search.evidence, last)
         unexplained = _unexplained(search, order, errors[0], last, cells)
     kept = unexplained is None

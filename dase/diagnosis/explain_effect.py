@@ -10,7 +10,7 @@ import numpy as np
 from dase.diagnosis.cell_descriptions import worst_cells
 from dase.effects import EFFECTS, Effect
 from dase.errors import InputError, nearest
-from dase.fitting.data_split import gather
+from dase.fitting.data_split import split_measurement
 from dase.fitting.model import model_of
 from dase.probes.statistics import FAMILIES
 from dase.results import Cell
@@ -63,7 +63,7 @@ def seen(effect: Effect) -> tuple[dict[str, float], tuple[Cell, ...]]:
     scene = bars()
     plain = Sensor(name="without")
     events = simulate(scene, plain.with_effect(effect), seed=1)
-    evidence = gather(events, scene, pixels=WIDTH * HEIGHT // 2)
+    evidence = split_measurement(events, scene, pixels=WIDTH * HEIGHT // 2)
     judgement = model_of(plain).judge(evidence.held, repeats=24, seed=2)
     return judgement.families, worst_cells(evidence, judgement)
 

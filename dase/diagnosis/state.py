@@ -7,9 +7,9 @@ from dataclasses import dataclass, field
 
 from dase.diagnosis.candidates import Tried
 from dase.effects import Effect
-from dase.fitting.data_split import Evidence
-from dase.fitting.model import Model, free_of, model_of
-from dase.probes.distance import QUIET, Judgement, explained
+from dase.fitting.data_split import SplitMeasurement
+from dase.fitting.model import FittedModel, free_of, model_of
+from dase.probes.distance import QUIET, Judgement, reaches_floor
 from dase.results import Progress, Step
 from dase.simulation.sensor import Sensor
 
@@ -35,7 +35,7 @@ class Search:
         without: What the model left before an effect was added to it, where it counted as right already.
     """
 
-    evidence: Evidence
+    evidence: SplitMeasurement
     effects: Mapping[str, type[Effect]]
     seed: int
     progress: Progress
@@ -48,7 +48,7 @@ class Search:
     first: list[Tried] = field(default_factory=list)
     error: float = float("nan")
 
-    def judge(self, model: Model, *, repeats: int = REPEATS) -> Judgement:
+    def judge(self, model: FittedModel, *, repeats: int = REPEATS) -> Judgement:
         """Return the held-out error of a model; makes it the present one of that half."""
         judgement = model.judge(self.evidence.held, repeats=repeats, seed=self.seed + 500)
         self.error = judgement.error
@@ -60,10 +60,10 @@ class Search:
         self.alternatives[best.name] = [t for t in finalists if t.name != best.name]
         self.error_of[best.name] = best.error
         self.ties[best.name] = set(ties)
-        if explained(without):
+        if reaches_floor(without):
             self.without[best.name] = without
 
-    def added(self, model: Model) -> tuple[str, ...]:
+    def added(self, model: FittedModel) -> tuple[str, ...]:
         """Return the effects that were added to the given sensor."""
         return tuple(e.name for e in model.space.sensor.effects if e.name not in self.given)
 
@@ -74,11 +74,11 @@ def accounts(judgement: Judgement, without: Judgement) -> bool:
     That may be the scene's fault, or another simulator's habit, so it must explain most of it.
     """
     level = judgement.level
-    chance = judgement.error <= max(QUIET, judgement.reach) and explained(judgement)
+    chance = judgement.error <= max(QUIET, judgement.reach) and reaches_floor(judgement)
     return chance and judgement.error - level <= HALF * (without.error - level)
 
 
-def like_of(sensor: Sensor, model: Model, more: Sequence[str]) -> Model:
+def like_of(sensor: Sensor, model: FittedModel, more: Sequence[str]) -> FittedModel:
     """Return the model of a sensor with what is free in another model, and in some effects more."""
     names = [a.name for a in model.space.axes if a.name.split(".")[0] in sensor]
     mine = [name for effect in more for name in free_of(sensor, effect)]

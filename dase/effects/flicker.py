@@ -13,7 +13,7 @@ from dase.kernels.vector_math import circle
 
 
 @wp.func
-def lamp(intensity: float, t64: wp.float64, frequency: float, depth: float, phase: float):
+def flickering_light(intensity: float, t64: wp.float64, frequency: float, depth: float, phase: float):
     """Intensity under a lamp whose flux is 1 + depth · sin."""
     # float32 resolves no more than a quarter of a millisecond after an hour
     turns = wp.float64(frequency) * t64
@@ -40,7 +40,7 @@ class Flicker(Effect):
         "IEEE Std 1789: Recommended practices for modulating current in high-brightness LEDs, 2015 "
         "(depth and frequency of lamps)"
     )
-    stages: ClassVar = {"light": lamp}
+    stages: ClassVar = {"light": flickering_light}
 
     frequency: float = parameter(
         100.0,

@@ -19,7 +19,9 @@ if TYPE_CHECKING:
 
 
 @wp.func
-def learned(on: float, off: float, factor: float, spread: float, strength: float, pixel_normal: float):
+def learned_thresholds(
+    on: float, off: float, factor: float, spread: float, strength: float, pixel_normal: float
+):
     """Thresholds of one pixel, both moved by the same random number, as in the paper."""
     moved = 1.0 + strength * (factor * (1.0 + spread * pixel_normal) - 1.0)
     return wp.max(on * moved, 0.01), wp.max(off * moved, 0.01)
@@ -37,7 +39,7 @@ class LearnedThreshold(Effect):
 
     name: ClassVar[str] = "learned_threshold"
     source: ClassVar[str] = "How to Learn a Domain-Adaptive Event Simulator?, 2021"
-    stages: ClassVar = {"threshold": learned}
+    stages: ClassVar = {"threshold": learned_thresholds}
     maps: ClassVar = ("factor", "spread")
 
     strength: float = parameter(

@@ -22,7 +22,7 @@ WIDEST = 20.0
 """Greatest sigma [px]."""
 
 
-def weights(sigma: float) -> NDArray[np.float32]:
+def blur_weights(sigma: float) -> NDArray[np.float32]:
     """Return the discrete Gaussian of variance sigma² [px²]: middle, first neighbours and so on, (R + 1,).
 
     Its variance is exact however narrow it is, where samples of the normal density would fall short, and
@@ -49,7 +49,7 @@ class Unsharp(Scene):
         self.scene = scene
         self.width, self.height, self.duration = scene.width, scene.height, scene.duration
         self.anytime = scene.anytime
-        self._weights = weights(sigma)
+        self._weights = blur_weights(sigma)
         self._every = np.arange(scene.width * scene.height, dtype=np.int32)
 
     def sample_times(self) -> NDArray[np.float64]:

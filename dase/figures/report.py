@@ -18,7 +18,7 @@ from dase.figures import html as html_page
 from dase.figures.event_maps import event_plates
 from dase.figures.style import Plate, number
 from dase.io import replacing
-from dase.probes.statistics import WORDS
+from dase.probes.statistics import FAMILY_WORDS
 from dase.results import Comparison, Diagnosis, Estimate, Step
 from dase.scenes.between_frames import CameraScene
 from dase.simulation.sensor import Sensor
@@ -238,7 +238,7 @@ def ranking_of(step: Step, floor: float) -> Plate:
 
 def family_words(name: str) -> str:
     """Return a family of statistics in a few words."""
-    return WORDS.get(name, name)
+    return FAMILY_WORDS.get(name, name)
 
 
 def _plain(plain: Mapping[str, tuple[float, float]]) -> list[tuple[str, ...]]:

@@ -16,7 +16,7 @@ from dase.kernels.event_order import to_pixels
 from dase.probes.stimulus import Stimulus
 
 
-def by_pixel(stimulus: Stimulus, streams: Sequence[Events]) -> tuple[Any, Any, Any]:
+def sort_by_pixel(stimulus: Stimulus, streams: Sequence[Events]) -> tuple[Any, Any, Any]:
     """Return the events of a stimulus' pixels as Warp arrays on its device; those of others are left out.
 
     Returns:
@@ -30,7 +30,7 @@ def by_pixel(stimulus: Stimulus, streams: Sequence[Events]) -> tuple[Any, Any, A
     place[stimulus.pixels] = np.arange(len(stimulus.pixels), dtype=np.int32)
     parts = [slice(int(end) - len(events), int(end)) for events, end in zip(streams, ends, strict=True)]
     launch.each([
-        partial(_sort, stimulus, events, place, start[n], time[part], polarity[part])
+        partial(_sort_stream, stimulus, events, place, start[n], time[part], polarity[part])
         for n, (events, part) in enumerate(zip(streams, parts, strict=True))
     ])  # fmt: skip
     start += (ends - [len(events) for events in streams]).astype(np.int32)[:, None]
@@ -39,7 +39,7 @@ def by_pixel(stimulus: Stimulus, streams: Sequence[Events]) -> tuple[Any, Any, A
     return first, times, signs
 
 
-def _sort(
+def _sort_stream(
     stimulus: Stimulus,
     events: Events,
     place: NDArray[np.int32],

@@ -193,7 +193,7 @@ def sort_into_cells(
         log_eps: Added to intensities before the logarithm.
     """
     level = np.log(intensity + np.float32(log_eps))
-    kind = np.searchsorted(EDGES, _change(level, step)).astype(np.uint8) + RESTING
+    kind = np.searchsorted(EDGES, _light_change(level, step)).astype(np.uint8) + RESTING
     for number, time in reversed(list(enumerate(REST))):
         width = max(2, round(time / step))
         # a window that ends at the step; before the first one the light was at rest
@@ -203,7 +203,7 @@ def sort_into_cells(
     return kind * BANDS + np.searchsorted(bands, intensity).astype(np.uint8)
 
 
-def _change(level: NDArray[np.float32], step: float) -> NDArray[np.float32]:
+def _light_change(level: NDArray[np.float32], step: float) -> NDArray[np.float32]:
     back = max(1, round(SPAN / step))
     before = np.concatenate([np.repeat(level[:, :1], back, 1), level[:, :-back]], axis=1)
     out: NDArray[np.float32] = level - before[:, : level.shape[1]]

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from dase.effects.stream import StreamEffect, nanoseconds
+from dase.effects.stream import StreamEffect, to_nanoseconds
 from dase.errors import InputError
 from dase.events import Events
 
@@ -92,7 +92,7 @@ class Tally:
     """
 
     def __init__(self, edges: NDArray[np.float64], pixels: NDArray[np.int32], size: int):
-        self._edges = nanoseconds(edges)
+        self._edges = to_nanoseconds(edges)
         self._place = np.full(size, -1)
         self._place[pixels] = np.arange(len(pixels))
         if np.count_nonzero(self._place >= 0) != len(pixels):
@@ -101,7 +101,7 @@ class Tally:
 
     def add(self, events: Events) -> None:
         """Count a part of the stream."""
-        windows = np.searchsorted(self._edges, nanoseconds(events.t), side="left") - 1
+        windows = np.searchsorted(self._edges, to_nanoseconds(events.t), side="left") - 1
         inside = (windows >= 0) & (windows < len(self.counts))
         if not inside.any():
             return

@@ -11,7 +11,7 @@ import tomlkit
 from tomlkit.exceptions import TOMLKitError
 from tomlkit.items import Table
 
-from dase.effects import EFFECTS, Effect, find
+from dase.effects import EFFECTS, Effect, find_effect
 from dase.errors import InputError, nearest
 from dase.simulation.sensor import Sensor
 from dase.simulation.sensor_history import read_history
@@ -86,7 +86,7 @@ def _sensor(table: dict[str, Any], effects: Mapping[str, type[Effect]]) -> Senso
         elif name == "history":
             plain[name] = read_history(value)
         elif isinstance(value, dict):
-            find(name, effects)  # says what there is instead
+            find_effect(name, effects)  # says what there is instead
         elif name in ("name", "size", "log_eps"):
             plain[name] = value
         else:

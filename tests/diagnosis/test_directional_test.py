@@ -15,8 +15,8 @@ from dase.diagnosis.directional_test import AGAIN, AWAY, PLAIN, Way, _nearest, a
 from dase.diagnosis.explain_effect import bars
 from dase.diagnosis.state import Search
 from dase.effects import EFFECTS
-from dase.fitting.data_split import gather
-from dase.fitting.model import Model, model_of
+from dase.fitting.data_split import split_measurement
+from dase.fitting.model import FittedModel, model_of
 from dase.probes.distance import Judgement
 from dase.simulation.sensor import Sensor
 
@@ -54,7 +54,7 @@ def searches(device) -> dict[str, Search]:
     out = {}
     for name, sensor in (("plain", TRUE), ("uneven", TRUE.with_effect(JITTER))):
         events = dase.simulate(scene, sensor, seed=4, device=device)
-        evidence = gather(events, scene, pixels=900, seed=1, device=device)
+        evidence = split_measurement(events, scene, pixels=900, seed=1, device=device)
         out[name] = Search(evidence, LIBRARY, 1, lambda text, share, error: None, frozenset({"threshold"}))
     return out
 
@@ -81,7 +81,7 @@ def test_nothing_is_looked_at_where_chance_hides_nothing(searches):
 
 
 def tried(name: str, error: float, parameters: int = 2) -> Tried:
-    return Tried(name, Model(None, np.zeros(parameters)), 0.0, judged=judged(error))
+    return Tried(name, FittedModel(None, np.zeros(parameters)), 0.0, judged=judged(error))
 
 
 def test_the_simplest_of_those_that_are_not_told_apart_is_chosen():
@@ -115,7 +115,7 @@ def fake(names: str, errors: dict[str, float], monkeypatch, **more) -> tuple:
     search = SimpleNamespace(
         judge=lambda m: judged(errors[m.names]), added=lambda m: tuple(m.names), **(defaults | more)
     )
-    monkeypatch.setattr(reviewing, "settle", lambda evidence, m, seed: m)
+    monkeypatch.setattr(reviewing, "refit_model", lambda evidence, m, seed: m)
     monkeypatch.setattr(reviewing, "_near", lambda search, ways, judgement: ways)
     monkeypatch.setattr(reviewing, "like_of", lambda sensor, m, more: model(str(sensor)))
     monkeypatch.setattr(

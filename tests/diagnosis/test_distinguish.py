@@ -13,7 +13,7 @@ from dase import InputError, Sensor
 from dase.diagnosis.distinguish import distinguish, rows, separation
 from dase.diagnosis.standard_stimuli import STANDARDS
 from dase.effects import EFFECTS
-from dase.probes.statistics import FAMILIES, WORDS
+from dase.probes.statistics import FAMILIES, FAMILY_WORDS
 
 QUICK = {"pixels": 200, "repeats": 12, "longest": 1.0}
 
@@ -30,7 +30,7 @@ def of(found, stimulus):
 
 
 def test_every_family_has_words():
-    assert set(WORDS) == set(FAMILIES)
+    assert set(FAMILY_WORDS) == set(FAMILIES)
 
 
 def test_power_of_a_known_difference(rng):

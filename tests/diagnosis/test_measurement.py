@@ -12,7 +12,7 @@ from dase import io
 from dase.cli import group
 from dase.diagnosis.compare import compare
 from dase.diagnosis.measurement import open_measurement
-from dase.fitting.data_split import gather
+from dase.fitting.data_split import split_measurement
 from dase.io.sequence import Sequence
 from dase.probes.stimulus import MASKED
 from dase.scenes.video import VideoScene
@@ -55,7 +55,7 @@ def test_frames_far_apart_make_a_scene_with_trust(measured):
     assert isinstance(measured.scene, dase.CameraScene)
     assert measured.trust is not None
     assert any("after the frames" in note and "nothing was corrected" in note for note in measured.notes)
-    evidence = gather(measured.events, measured.scene, trust=measured.trust, pixels=PIXELS)
+    evidence = split_measurement(measured.events, measured.scene, trust=measured.trust, pixels=PIXELS)
     for half in (evidence.train, evidence.held):
         stimulus = half.trials.stimulus
         compared = stimulus.cell != MASKED
@@ -155,10 +155,10 @@ def test_next_to_nothing_to_trust_is_said(measured):
         return np.broadcast_to(few[pixels], (len(times), len(pixels)))
 
     with pytest.raises(dase.InputError, match=r"trusted in 0\.16 % of pixels and times only"):
-        gather(measured.events, measured.scene, trust=nearly_nowhere)
+        split_measurement(measured.events, measured.scene, trust=nearly_nowhere)
     still = measured.events.select(slice(None, None, 200))
     with pytest.raises(dase.InputError, match=r"too few events .* compared is only where the scene can be"):
-        gather(still, measured.scene, pixels=PIXELS)
+        split_measurement(still, measured.scene, pixels=PIXELS)
 
 
 def test_events_that_are_believed(measured):
@@ -188,7 +188,7 @@ def test_a_davis_and_its_frames(shared):
     path = shared / "recordings" / "native" / "davis346_cuke_cradle.aedat4"
     found = open_measurement(path)
     assert isinstance(found.scene, dase.CameraScene)
-    evidence = gather(found.events, found.scene, trust=found.trust)
+    evidence = split_measurement(found.events, found.scene, trust=found.trust)
     assert min(int(h.found.halves.sum()) for h in (evidence.train, evidence.held)) > 1000
     told = next(note for note in evidence.notes if note.startswith("compared is only"))
     pixels, events = (float(word) for word in told.replace("%", " ").split() if word[0].isdigit())
