@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from dase.diagnosis.candidates import scout
+from dase.diagnosis.candidates import screen_and_descend
 from dase.effects import Effect
 from dase.events import Events
 from dase.fitting.data_split import PIXELS, split_measurement
@@ -56,7 +56,7 @@ def fit_added(
     tell(f"where to begin with {effect.name}", 0.1, before)
     # far from where it is, a descent could end in the wrong place
     present.rebase(evidence.scout, repeats=16, seed=seed + 200)
-    start = scout(evidence, present, effect, seed=seed).model.sensor
+    start = screen_and_descend(evidence, present, effect, seed=seed).model.sensor
     fitted = fit(
         events, scene, start, trust=trust, pixels=pixels, seed=seed, device=device, progress=progress
     )

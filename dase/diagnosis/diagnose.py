@@ -7,11 +7,11 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from itertools import combinations
 
-from dase.diagnosis.candidates import FEW, Tried, open_to, try_all
+from dase.diagnosis.candidates import FEW, Candidate, effects_to_try, try_effects
 from dase.diagnosis.cell_descriptions import worst_cells
-from dase.diagnosis.directional_test import closer
-from dase.diagnosis.pruning import review
-from dase.diagnosis.state import MATERIAL, REPEATS, TIE, Search, accounts, like_of
+from dase.diagnosis.directional_test import find_hidden_effect
+from dase.diagnosis.pruning import prune_model
+from dase.diagnosis.state import MATERIAL, REPEATS, TIE, DiagnosisState, explains_remainder, with_same_freedom
 from dase.effects import EFFECTS, Effect
 from dase.events import Events
 from dase.fitting.confidence_intervals import estimate_parameters
@@ -79,27 +79,29 @@ def diagnose(
     )
     tell = progress or (lambda text, share, error: None)
     tell("fitting the present model", 0.0, float("nan"))
-    search = Search(evidence, effects, seed, tell, frozenset(e.name for e in sensor.effects))
+    search = DiagnosisState(evidence, effects, seed, tell, frozenset(e.name for e in sensor.effects))
     before = model_of(sensor, free).judge(evidence.held, repeats=REPEATS // 2, seed=seed + 500).error
     start = fit_present_model(evidence, sensor, free, seed=seed)
-    model, judgement, errors = _greedy(search, start, most)
+    model, judgement, errors = _add_one_by_one(search, start, most)
     if not reaches_floor(judgement) and most > 0:
-        model, judgement = _pairs(search, start, model, judgement)
+        model, judgement = _add_pair(search, start, model, judgement)
     if len(search.added(model)) > 1:
-        model, judgement = review(search, model, judgement)
-    return _verdict(search, start, model, errors, before, begin)
+        model, judgement = prune_model(search, model, judgement)
+    return _conclude_diagnosis(search, start, model, errors, before, begin)
 
 
-def _greedy(search: Search, model: FittedModel, most: int) -> tuple[FittedModel, Judgement, list[float]]:
+def _add_one_by_one(
+    search: DiagnosisState, model: FittedModel, most: int
+) -> tuple[FittedModel, Judgement, list[float]]:
     """Add the best effect as long as one is missing."""
     errors, far = list[float](), False
     for _ in range(most + 1):
         judgement = search.judge(model, repeats=FEW if far else REPEATS)
         errors.append(judgement.error)
         more = len(errors) <= most
-        step, better, far = _step(search, model, judgement, more)
-        if better is None and more and (hidden := closer(search, model, judgement)) is not None:
-            step, better = _found(search, *hidden, step, judgement), hidden[0].model
+        step, better, far = _look_for_effect(search, model, judgement, more)
+        if better is None and more and (hidden := find_hidden_effect(search, model, judgement)) is not None:
+            step, better = _note_hidden_effect(search, *hidden, step, judgement), hidden[0].model
         search.history.append(step)
         if better is None:
             break
@@ -107,8 +109,8 @@ def _greedy(search: Search, model: FittedModel, most: int) -> tuple[FittedModel,
     return model, judgement, errors
 
 
-def _step(
-    search: Search, model: FittedModel, judgement: Judgement, more: bool
+def _look_for_effect(
+    search: DiagnosisState, model: FittedModel, judgement: Judgement, more: bool
 ) -> tuple[Step, FittedModel | None, bool]:
     """Try all effects.
 
@@ -124,23 +126,23 @@ def _step(
         return step, None, False
     repeats = model.rebase(evidence.train, repeats=REPEATS, seed=seed + 300)
     model.rebase(evidence.scout, repeats=16, seed=seed + 200)
-    open_names = open_to(search.effects, model)
+    open_names = effects_to_try(search.effects, model)
     if not open_names:
         return step, None, False
-    tried = try_all(
+    tried = try_effects(
         evidence, model, search.effects, open_names, repeats=repeats, worst=worst_families(judgement),
         seed=seed, report=lambda text, share: search.progress(text, share, search.error),
     )  # fmt: skip
     finalists = [t for t in tried if t.judged]
-    step = replace(step, ranking=tuple(_rank(t, judgement) for t in tried))
+    step = replace(step, ranking=tuple(_rank_of(t, judgement) for t in tried))
     if not search.history:
-        search.first = sorted(tried, key=lambda t: t.scouted)
-    worthy = [t for t in finalists if t.judged and accounts(t.judged, judgement)]
+        search.first = sorted(tried, key=lambda t: t.screened_loss)
+    worthy = [t for t in finalists if t.judged and explains_remainder(t.judged, judgement)]
     able = worthy if reaches_floor(judgement) else finalists
     if not able:
         return step, None, False
-    best, ties = _choose(able)
-    mine = _rank(best, judgement)
+    best, ties = _simplest_of_the_best(able)
+    mine = _rank_of(best, judgement)
     if not reaches_floor(judgement) and (mine.fall < MATERIAL or mine.share < SHARE):
         return step, None, False
     search.note(best, finalists, ties, judgement)
@@ -152,15 +154,17 @@ def _step(
     )
 
 
-def _found(search: Search, hidden: Tried, p_value: float, step: Step, judgement: Judgement) -> Step:
+def _note_hidden_effect(
+    search: DiagnosisState, hidden: Candidate, p_value: float, step: Step, judgement: Judgement
+) -> Step:
     """Note an effect that only a closer look shows."""
     search.note(hidden, [hidden], (), judgement)
-    rank = _rank(replace(hidden, p_value=p_value), judgement)
+    rank = _rank_of(replace(hidden, p_value=p_value), judgement)
     others = tuple(r for r in step.ranking if r.effect != hidden.name)
     return replace(step, ranking=(rank, *others), chosen=hidden.name)
 
 
-def _choose(finalists: Sequence[Tried]) -> tuple[Tried, tuple[str, ...]]:
+def _simplest_of_the_best(finalists: Sequence[Candidate]) -> tuple[Candidate, tuple[str, ...]]:
     """Return the best candidate, the simplest of those that are not told apart, and the others of those."""
     first = finalists[0]
     reach = max(TIE, 0.1 * first.error)
@@ -173,7 +177,7 @@ def _choose(finalists: Sequence[Tried]) -> tuple[Tried, tuple[str, ...]]:
     return best, tuple(t.name for t in like if t.name != best.name)
 
 
-def _rank(tried: Tried, judgement: Judgement) -> Rank:
+def _rank_of(tried: Candidate, judgement: Judgement) -> Rank:
     """Return a candidate as the user sees it."""
     fall = judgement.error - tried.error
     share = fall / max(judgement.error - 1.0, 1e-9)
@@ -185,18 +189,18 @@ def _rank(tried: Tried, judgement: Judgement) -> Rank:
     return Rank(tried.name, tried.error, fall, min(share, 1.0), tried.p_value, mine, tried.judged is not None)
 
 
-def _pairs(
-    search: Search, start: FittedModel, model: FittedModel, judgement: Judgement
+def _add_pair(
+    search: DiagnosisState, start: FittedModel, model: FittedModel, judgement: Judgement
 ) -> tuple[FittedModel, Judgement]:
     """Where adding one after the other does not reach the floor, try two at once."""
     evidence, seed = search.evidence, search.seed
-    singles = [t for t in search.first if t.scouted < 0.98][:PAIRED]
+    singles = [t for t in search.first if t.screened_loss < 0.98][:PAIRED]
     start.rebase(evidence.scout, repeats=16, seed=seed + 200)
     pairs = list(combinations(singles, 2))
     works = []
     for one, two in pairs:
         both = one.model.sensor.with_effect(two.model.sensor[two.name])
-        pair = like_of(both, start, (one.name, two.name))
+        pair = with_same_freedom(both, start, (one.name, two.name))
         works.append(pair.searching(evidence.scout, seed=seed, iterations=4, radius=0.3))
     ends = run_side_by_side(works, lambda share: search.progress("trying pairs", share, search.error))
     tried = [
@@ -216,8 +220,13 @@ def _pair_step(first: Step, name: str) -> Step:
     return replace(first, chosen=name, ties=(), ranking=(), cells=())
 
 
-def _verdict(
-    search: Search, start: FittedModel, model: FittedModel, errors: list[float], before: float, begin: float
+def _conclude_diagnosis(
+    search: DiagnosisState,
+    start: FittedModel,
+    model: FittedModel,
+    errors: list[float],
+    before: float,
+    begin: float,
 ) -> Diagnosis:
     """Return what was found; names are announced only where they bring the error to the floor."""
     found = search.added(model)
@@ -228,9 +237,9 @@ def _verdict(
     unexplained: Unexplained | None = None
     if not may_be_announced(last):
         cells = worst_cells(search.evidence, last)
-        unexplained = _unexplained(search, order, errors[0], last, cells)
+        unexplained = _describe_unexplained(search, order, errors[0], last, cells)
     kept = unexplained is None
-    path = _staircase(search, order, errors, last.error) if kept else [errors[0]]
+    path = _errors_after_additions(search, order, errors, last.error) if kept else [errors[0]]
     ties = {n: tuple(sorted(search.ties.get(n, set()) - set(found))) for n in order if kept}
     return Diagnosis(
         sensor=model.sensor if kept else start.sensor,
@@ -249,7 +258,9 @@ def _verdict(
     )
 
 
-def _staircase(search: Search, order: tuple[str, ...], errors: list[float], last: float) -> list[float]:
+def _errors_after_additions(
+    search: DiagnosisState, order: tuple[str, ...], errors: list[float], last: float
+) -> list[float]:
     """Return the error at the start and after each effect that was kept.
 
     Effects that came in at once, or in place of another, have no error of their own on the way: it is taken
@@ -261,8 +272,8 @@ def _staircase(search: Search, order: tuple[str, ...], errors: list[float], last
     return path
 
 
-def _unexplained(
-    search: Search, nearest: tuple[str, ...], first: float, last: Judgement, cells: tuple[Cell, ...]
+def _describe_unexplained(
+    search: DiagnosisState, nearest: tuple[str, ...], first: float, last: Judgement, cells: tuple[Cell, ...]
 ) -> Unexplained:
     share = (last.error - 1.0) / max(first - 1.0, 1e-9)
     stand_in = " and ".join(nearest) if nearest else "no effect"
@@ -274,7 +285,7 @@ def _unexplained(
     return Unexplained(last.error, share, nearest, cells, sentence)
 
 
-def summary(found: Diagnosis) -> str:
+def summary_line(found: Diagnosis) -> str:
     """Return the finding in one line."""
     if found.unexplained is not None:
         return found.unexplained.sentence

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from dase.diagnosis.standard_stimuli import STANDARDS, Standard
+from dase.diagnosis.standard_stimuli import STANDARD_STIMULI, StandardStimulus
 from dase.effects.row_scan import RowScan
 from dase.effects.timestamp import Timestamp
 from dase.errors import InputError
@@ -87,13 +87,13 @@ def distinguish(
     Raises:
         InputError: The models are of cameras that differ in size, or a number is out of range.
     """
-    size = _check(a, b, longest, pixels, repeats)
+    size = _check_arguments(a, b, longest, pixels, repeats)
     durations = [t for t in LADDER if t < longest] + [longest]
     answers = []
-    for number, standard in enumerate(STANDARDS):
+    for number, standard in enumerate(STANDARD_STIMULI):
         tried: list[tuple[float, float]] = []
         for seconds in durations:
-            bench = _Bench(standard, seconds, size, pixels, (a, b), seed + 1000 * number, device)
+            bench = _StimulusTest(standard, seconds, size, pixels, (a, b), seed + 1000 * number, device)
             answer = bench.judge(repeats)
             tried.append((seconds, answer.power))
             last = answer.seconds is not None or seconds == longest
@@ -103,11 +103,11 @@ def distinguish(
         answers.append(replace(answer, tried=tuple(tried)))
     known = [answer for answer in answers if answer.seconds is not None]
     best = min(known, key=lambda answer: answer.seconds or 0.0, default=None)
-    sentence = _advice(best, longest, pixels, *(names or (a.name, b.name)))
+    sentence = _advice_sentence(best, longest, pixels, *(names or (a.name, b.name)))
     return Distinction(tuple(answers), best, sentence, pixels, longest)
 
 
-def _check(a: Sensor, b: Sensor, longest: float, pixels: int, repeats: int) -> tuple[int, int]:
+def _check_arguments(a: Sensor, b: Sensor, longest: float, pixels: int, repeats: int) -> tuple[int, int]:
     if not (LADDER[0] <= longest <= 600):
         raise InputError(f"longest must lie in [{LADDER[0]:g}, 600] s, got {longest:g}")
     if pixels < 16:
@@ -122,7 +122,7 @@ def _check(a: Sensor, b: Sensor, longest: float, pixels: int, repeats: int) -> t
     return a.size or b.size or (346, 260)
 
 
-def _structure(models: tuple[Sensor, Sensor]) -> TimestampStructure:
+def _timestamp_structure(models: tuple[Sensor, Sensor]) -> TimestampStructure:
     """Return the regularity of time stamps that a readout of the models makes, if a file could show it."""
     for model in models:
         for effect in model.streams():
@@ -133,12 +133,12 @@ def _structure(models: tuple[Sensor, Sensor]) -> TimestampStructure:
     return TimestampStructure()
 
 
-class _Bench:
+class _StimulusTest:
     """Both models on one stimulus of one duration."""
 
     def __init__(
         self,
-        standard: Standard,
+        standard: StandardStimulus,
         seconds: float,
         size: tuple[int, int],
         pixels: int,
@@ -157,7 +157,7 @@ class _Bench:
         chosen = np.sort(rng.choice(width * height, count, replace=count > width * height)).astype(np.int32)
         grid = Grid(0.0, step, steps)
         try:
-            to = launch.device(device)
+            to = launch.find_device(device)
         except ValueError as error:
             raise InputError(str(error)) from error
         light = standard.light(rng, count, grid.times)
@@ -169,7 +169,7 @@ class _Bench:
         self.finer = finer
         # a readout that both have tells nothing
         self.readout = set(models[0].streams()) != set(models[1].streams())
-        structure = _structure(models) if self.readout else TimestampStructure()
+        structure = _timestamp_structure(models) if self.readout else TimestampStructure()
         stimulus = Stimulus(chosen, width, height, grid, light, cell, log_eps, to)
         self.trials = BatchSimulator(stimulus, structure=structure)
         self.regular = structure != TimestampStructure()
@@ -188,7 +188,7 @@ class _Bench:
         (a, events), (b, more) = (compute_statistics(sums, frame) for sums in found)
         used = is_compared(a.mean(0), events.mean(0)) | is_compared(b.mean(0), more.mean(0))
         off = tolerance_of(a.mean(0), np.maximum(events.mean(0), more.mean(0)))
-        power, share = separation(a * used, b * used, off)
+        power, share = separating_power(a * used, b * used, off)
         told = power >= POWER
         says = {name: float(share[part].sum()) for name, part in LAYOUT.items()}
         # the plainest of those that say about as much
@@ -237,7 +237,7 @@ class _Bench:
         )
 
 
-def separation(a: Array, b: Array, tolerance: Array) -> tuple[float, Array]:
+def separating_power(a: Array, b: Array, tolerance: Array) -> tuple[float, Array]:
     """Return how well a linear rule tells two kinds of recordings apart that it has not seen.
 
     Args:
@@ -258,12 +258,12 @@ def separation(a: Array, b: Array, tolerance: Array) -> tuple[float, Array]:
         weight = np.divide(difference, variance, out=np.zeros_like(variance), where=clear)
         say += weight * difference
         powers.append(
-            _power(a[judged] @ weight, b[judged] @ weight, float(np.sum((weight * tolerance) ** 2)))
+            _power_of_scores(a[judged] @ weight, b[judged] @ weight, float(np.sum((weight * tolerance) ** 2)))
         )
     return float(np.mean(powers)), say
 
 
-def _power(a: Array, b: Array, blur: float) -> float:
+def _power_of_scores(a: Array, b: Array, blur: float) -> float:
     """Return the share of scores of B above what 5 % of A's are above, both taken as normal."""
     wide, high = (math.sqrt(s.var(ddof=1) + blur) for s in (a, b))
     if wide == 0 or high == 0:
@@ -276,7 +276,7 @@ _QUANTILE = 1.6448536269514722
 """Standard deviations above which 5 % of a normal distribution lie."""
 
 
-def _advice(best: Answer | None, longest: float, pixels: int, a: str, b: str) -> str:
+def _advice_sentence(best: Answer | None, longest: float, pixels: int, a: str, b: str) -> str:
     if best is None:
         return (
             f"{a} and {b} are indistinguishable in any of these recordings up to {longest:g} s "
@@ -285,7 +285,7 @@ def _advice(best: Answer | None, longest: float, pixels: int, a: str, b: str) ->
     return f"Record {best.stimulus} for {best.seconds:g} s, {best.how}: {a} and {b} differ in {best.differs}."
 
 
-def rows(found: Distinction, a: str, b: str) -> Iterator[tuple[str, ...]]:
+def table_rows(found: Distinction, a: str, b: str) -> Iterator[tuple[str, ...]]:
     """Yield the rows of a table of the answers, its head first."""
     yield "recording", "tells apart in", "power", f"events of {a} [1/(px s)]", f"of {b}", "they differ in"
     for answer in found.answers:

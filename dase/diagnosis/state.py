@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
-from dase.diagnosis.candidates import Tried
+from dase.diagnosis.candidates import Candidate
 from dase.effects import Effect
 from dase.fitting.data_split import SplitMeasurement
 from dase.fitting.model import FittedModel, free_of, model_of
@@ -28,7 +28,7 @@ may, and at most this share of what was left above the level of chance."""
 
 
 @dataclass
-class Search:
+class DiagnosisState:
     """What a diagnosis works on.
 
     Args:
@@ -41,11 +41,11 @@ class Search:
     progress: Progress
     given: frozenset[str]
     history: list[Step] = field(default_factory=list)
-    alternatives: dict[str, list[Tried]] = field(default_factory=dict)
+    alternatives: dict[str, list[Candidate]] = field(default_factory=dict)
     error_of: dict[str, float] = field(default_factory=dict)
     ties: dict[str, set[str]] = field(default_factory=dict)
     without: dict[str, Judgement] = field(default_factory=dict)
-    first: list[Tried] = field(default_factory=list)
+    first: list[Candidate] = field(default_factory=list)
     error: float = float("nan")
 
     def judge(self, model: FittedModel, *, repeats: int = REPEATS) -> Judgement:
@@ -55,7 +55,9 @@ class Search:
         self.progress("judging", 0.0, self.error)
         return judgement
 
-    def note(self, best: Tried, finalists: Sequence[Tried], ties: Sequence[str], without: Judgement) -> None:
+    def note(
+        self, best: Candidate, finalists: Sequence[Candidate], ties: Sequence[str], without: Judgement
+    ) -> None:
         """Note what a review needs to know of an effect that is added."""
         self.alternatives[best.name] = [t for t in finalists if t.name != best.name]
         self.error_of[best.name] = best.error
@@ -68,7 +70,7 @@ class Search:
         return tuple(e.name for e in model.space.sensor.effects if e.name not in self.given)
 
 
-def accounts(judgement: Judgement, without: Judgement) -> bool:
+def explains_remainder(judgement: Judgement, without: Judgement) -> bool:
     """Whether an effect explains what a model that counts as right leaves without it.
 
     That may be the scene's fault, or another simulator's habit, so it must explain most of it.
@@ -78,7 +80,7 @@ def accounts(judgement: Judgement, without: Judgement) -> bool:
     return chance and judgement.error - level <= HALF * (without.error - level)
 
 
-def like_of(sensor: Sensor, model: FittedModel, more: Sequence[str]) -> FittedModel:
+def with_same_freedom(sensor: Sensor, model: FittedModel, more: Sequence[str]) -> FittedModel:
     """Return the model of a sensor with what is free in another model, and in some effects more."""
     names = [a.name for a in model.space.axes if a.name.split(".")[0] in sensor]
     mine = [name for effect in more for name in free_of(sensor, effect)]

@@ -9,7 +9,7 @@ from typing import ClassVar
 import warp as wp
 
 from dase.effects.base import Effect, parameter
-from dase.kernels.vector_math import circle
+from dase.kernels.vector_math import cosine_and_sine
 
 
 @wp.func
@@ -18,7 +18,7 @@ def flickering_light(intensity: float, t64: wp.float64, frequency: float, depth:
     # float32 resolves no more than a quarter of a millisecond after an hour
     turns = wp.float64(frequency) * t64
     turn = float(turns - wp.floor(turns)) + phase
-    _cosine, sine = circle(turn - wp.floor(turn))
+    _cosine, sine = cosine_and_sine(turn - wp.floor(turn))
     return intensity * (1.0 + depth * sine)
 
 

@@ -62,14 +62,14 @@ class LearnedThreshold(Effect):
         if not self.weights or self.bound is not None:
             return self
         try:
-            from dase.networks.weights_file import predict
+            from dase.networks.weights_file import predict_thresholds
         except ImportError:
             raise InputError(
                 f"effect '{self.name}' needs PyTorch and safetensors: pip install \"dase[learn]\""
             ) from None
         times = scene.sample_times()
         grey = scene.frames(times[len(times) // 2 :][:1])[0]
-        mu, sigma, level = predict(Path(self.weights), grey)
+        mu, sigma, level = predict_thresholds(Path(self.weights), grey)
         return replace(self, bound=np.stack([mu / level, sigma / mu]).astype(np.float32))
 
     def map_values(self, pixels: NDArray[np.int32]) -> NDArray[np.float32]:

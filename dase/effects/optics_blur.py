@@ -14,7 +14,7 @@ from dase.effects.base import parameter
 from dase.effects.optics import SceneEffect
 from dase.errors import InputError
 from dase.kernels import launch, pixel_stages
-from dase.kernels.scene_blur import blur
+from dase.kernels.scene_blur import blur_frames
 from dase.kernels.scene_layers import render_frames
 from dase.scenes.scene import Scene
 
@@ -66,14 +66,16 @@ class Unsharp(Scene):
         else:
             raise InputError("optics_blur needs intensities, and this scene gives log intensities")
         frames = pixel_stages.Frames()
-        frames.values = blur(pictures, self._weights, self.width, pixels, device)
+        frames.values = blur_frames(pictures, self._weights, self.width, pixels, device)
         return "frames", frames
 
     def frames(self, times: NDArray[np.float64], device: str = "cpu") -> NDArray[np.float32]:
         """Return the blurred pictures at `times` [s], shape (K, height, width)."""
-        where = launch.device(device)
+        where = launch.find_device(device)
         flat = self.scene.frames(times, device).reshape(len(times), -1)
-        found = blur(wp.array(flat, dtype=float, device=where), self._weights, self.width, self._every, where)
+        found = blur_frames(
+            wp.array(flat, dtype=float, device=where), self._weights, self.width, self._every, where
+        )
         return np.asarray(found.numpy().reshape(len(times), self.height, self.width))
 
     def flow(self, times: NDArray[np.float64], device: str = "cpu") -> NDArray[np.float32] | None:

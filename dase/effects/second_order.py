@@ -9,7 +9,7 @@ from typing import ClassVar
 import warp as wp
 
 from dase.effects.base import Effect, parameter
-from dase.kernels.vector_math import circle, exponential
+from dase.kernels.vector_math import cosine_and_sine, exponential
 
 
 @wp.func
@@ -21,7 +21,7 @@ def impulse_response(x: float, damping: float):
     if damping < 1.0:
         w = wp.sqrt((1.0 - damping) * (1.0 + damping))
         turn = w * x / (2.0 * wp.pi)
-        cosine, sine = circle(turn - wp.floor(turn))
+        cosine, sine = cosine_and_sine(turn - wp.floor(turn))
         h = decay * sine / w
         dh = decay * cosine - damping * h
     else:

@@ -9,7 +9,7 @@ from typing import ClassVar
 import warp as wp
 
 from dase.effects.base import Effect, parameter
-from dase.kernels.vector_math import circle, exponential, logarithm
+from dase.kernels.vector_math import cosine_and_sine, exponential, logarithm
 
 POLE = wp.constant(2.0 * math.pi / math.sqrt(math.sqrt(2.0) - 1.0))
 """Frequency of either of two equal poles [rad/s] at which together they lose 3 dB at 1 Hz."""
@@ -55,7 +55,7 @@ def noisy_voltage(
     cross = mixed / first
     then = wp.sqrt(wp.max(speed_var - cross * cross, 0.0))
     # both normals of one Box-Muller pair
-    normal, normal_2 = circle(uniform_2)
+    normal, normal_2 = cosine_and_sine(uniform_2)
     scale = sigma * wp.sqrt(-2.0 * logarithm(1.0 - uniform) * (1.0 - share))
     now = kept * (noise + x * (noise + speed)) + scale * first * normal
     speed_now = kept * (speed - x * (noise + speed)) + scale * (cross * normal + then * normal_2)

@@ -166,7 +166,7 @@ class BatchSimulator:
                 wp.array(rows[part], dtype=float, device=self.device), *maps, sink,
             ]  # fmt: skip
             blocks = -(-len(rows[part]) // self._lanes)
-            launch.run(kernel, count, inputs, self.device, batch=blocks, align=GROUP)
+            launch.run_kernel(kernel, count, inputs, self.device, batch=blocks, align=GROUP)
             grouped = self._grouped(sink.sums)
             sums.append(sum_over_groups(grouped))
             clock.append(self._clock(sink.clock))
@@ -213,7 +213,7 @@ class BatchSimulator:
             names = wide.parameter_names()
             at = [names.index(name) for name in sensor.parameter_names()]
             self._kernels[key] = (
-                pixel_codegen_trials.compose(wide.stages(), lanes=self._lanes),
+                pixel_codegen_trials.compose_trials(wide.stages(), lanes=self._lanes),
                 wide.parameters(),
                 at,
             )
@@ -229,7 +229,9 @@ class BatchSimulator:
         pixels = wp.zeros((len(streams), count, kernels.HALVES), dtype=float, device=self.device)
         sink = self.sink(pixels, np.zeros(len(streams), np.int64))
         inputs = [*sort_by_pixel(self.stimulus, streams), sink]
-        launch.run(kernels.walk, count, inputs, self.device, batch=len(streams), align=GROUP)
+        launch.run_kernel(
+            kernels.observe_stored_events, count, inputs, self.device, batch=len(streams), align=GROUP
+        )
         grouped = self._grouped(sink.sums)
         folded = None
         if frame is not None:
@@ -270,7 +272,7 @@ class BatchSimulator:
             left = simulate_pixels(self.stimulus, order.sensor, order.vectors[cut], seeds[cut])
             each = zip(left, effects[cut], seeds[cut], strict=True)
             works = [partial(pass_readout, self.stimulus, e, behind, int(s), load) for e, behind, s in each]
-            found.append(self._look(launch.each(works), order.frame))
+            found.append(self._look(launch.run_concurrently(works), order.frame))
         return ProbeSums.join(found)
 
     def _events_of_pixels(self, events: Events) -> Events:
@@ -291,7 +293,7 @@ class BatchSimulator:
             ticks: From tick to tick of the clock that stamps events [ps], 0 for none, shape (B,).
         """
         stimulus, step = self.stimulus, self.stimulus.grid.step
-        out = kernels.Probes()
+        out = kernels.ProbeSums()
         out.cell = stimulus.array("cell", lambda: stimulus.cell)
         out.level = stimulus.array("level", lambda: stimulus.level)
         out.lags = stimulus.array("lags", lambda: np.rint(np.array(LAG_TIMES) / step).astype(np.int32))
@@ -324,14 +326,16 @@ class BatchSimulator:
         rows, count, size = sums.shape
         parts = -(-count // GROUP)
         less = wp.empty((rows, parts, size), dtype=float, device=self.device)
-        launch.run(pixel_codegen_trials.total, parts * size, [sums, GROUP, less], self.device, batch=rows)
+        launch.run_kernel(
+            pixel_codegen_trials.sum_pixel_groups, parts * size, [sums, GROUP, less], self.device, batch=rows
+        )
         return less
 
     def _clock(self, teams: Any) -> NDArray[np.int32]:
         """Return the events of each step over all groups, shape (B, 2 T)."""
         rows, _, steps = teams.shape
         out = wp.empty((rows, steps), dtype=int, device=self.device)
-        launch.run(kernels.counted, steps, [teams, out], self.device, batch=rows, slabs=1)
+        launch.run_kernel(kernels.sum_group_counts, steps, [teams, out], self.device, batch=rows, slabs=1)
         found: NDArray[np.int32] = out.numpy()
         return found
 

@@ -14,7 +14,7 @@ from dase.effects.stream import StreamEffect, to_nanoseconds
 from dase.events import Events
 from dase.probes.stimulus import Stimulus
 from dase.scenes.scene import Scene
-from dase.simulation.pixel_array import Pixels
+from dase.simulation.pixel_array import PixelArray
 from dase.simulation.sensor import Sensor
 from dase.simulation.simulate import CHUNK, chunks
 
@@ -75,7 +75,7 @@ class WholeSensor:
 
     def emitted(self, sensor: Sensor, pixels: NDArray[np.int32], steps: int) -> Events:
         """Return what leaves some pixels up to a point of time, from time 0."""
-        array = Pixels(
+        array = PixelArray(
             sensor, self.scene.width, self.scene.height, pixels=pixels, seed=self.seed, device=self.device
         )
         size = CHUNK["cuda" if array.device.is_cuda else "cpu"]

@@ -111,10 +111,10 @@ def split_measurement(
         InputError: Different sizes, no common time, or too few events.
     """
     if trust is None and isinstance(scene, CameraScene):
-        trust = scene.trusts
+        trust = scene.is_trusted
     grid = common_grid(events, scene)
     try:
-        to = launch.device(device)
+        to = launch.find_device(device)
     except ValueError as error:
         raise InputError(str(error)) from error
     size = scene.width * scene.height
@@ -139,7 +139,7 @@ def split_measurement(
     sorting = partial(sort_into_cells, step=grid.step, bands=bands, log_eps=log_eps)
     works: list[Callable[[], Any]] = [partial(sorting, part) for part in np.array_split(light, 8)]
     works.append(partial(find_structure, events))
-    *parts, structure = launch.each(works)
+    *parts, structure = launch.run_concurrently(works)
     cell = np.concatenate(parts)
     cell[~good] = MASKED
     cell[:, 0] = MASKED

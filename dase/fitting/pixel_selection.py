@@ -11,7 +11,7 @@ from dase.errors import InputError
 from dase.events import Events
 from dase.probes.stimulus import Trust, light_of
 from dase.scenes.scene import Scene
-from dase.scenes.video import EPS
+from dase.scenes.video import LOG_EPS
 
 LOOKS = 200
 """Times at which it is looked where a scene can be trusted."""
@@ -64,7 +64,7 @@ def find_trusted_parts(events: Events, scene: Scene, times: Array, cut: int, tru
     before: NDArray[np.float32] | None = None
     for k, step in enumerate(steps):
         at = times[step : step + 1]
-        level, good = np.log(light_of(scene, at, every)[:, 0] + np.float32(EPS)), trust(at, every)[0]
+        level, good = np.log(light_of(scene, at, every)[:, 0] + np.float32(LOG_EPS)), trust(at, every)[0]
         half = int(step >= cut)
         time[half] += good
         if before is not None:

@@ -21,8 +21,8 @@ from dase.kernels import launch, pixel_stages
 from dase.probes.stimulus import Stimulus
 from dase.probes.timestamp_patterns import TimestampStructure
 from dase.scenes.scene import Scene
-from dase.simulation.pixel_array import Pixels
-from dase.simulation.readout_chain import rows_of
+from dase.simulation.pixel_array import PixelArray
+from dase.simulation.readout_chain import split_by_row
 from dase.simulation.sensor import Sensor
 
 ROOM = {"cpu": 2048, "cuda": 64}
@@ -70,12 +70,14 @@ def simulate_pixels(
     kind = "cuda" if stimulus.device.is_cuda else "cpu"
 
     def out(rows: slice) -> list[Events]:
-        array = Pixels(
+        array = PixelArray(
             bare, stimulus.width, stimulus.height, pixels=stimulus.pixels, parameters=vectors[rows],
             seed=int(seeds[rows.start]), device=str(stimulus.device), room=ROOM[kind],
         )  # fmt: skip
         scene = _StimulusScene(stimulus)
-        parts = [rows_of(*found, array.batch) for found in (array.emit(scene, scene.times), array.flush())]
+        parts = [
+            split_by_row(*found, array.batch) for found in (array.emit(scene, scene.times), array.flush())
+        ]
         # hardly any effect holds events back
         return [Events.concatenate(row) if len(row[1]) else row[0] for row in zip(*parts, strict=True)]
 
@@ -83,7 +85,10 @@ def simulate_pixels(
         return out(slice(0, len(seeds)))
     # on a CPU one after the other: the events of a model are sorted in its caches, those of all are not
     works = [partial(out, slice(n, n + 1)) for n in range(len(seeds))]
-    return [events for (events,) in ([work() for work in works] if kind == "cuda" else launch.each(works))]
+    return [
+        events
+        for (events,) in ([work() for work in works] if kind == "cuda" else launch.run_concurrently(works))
+    ]
 
 
 def pass_readout(

@@ -141,7 +141,7 @@ def fold_counts(pixels: Any, frames: Sequence[StatisticsFrame], which: NDArray[n
         pixels, wp.array(expected, device=to), wp.array(which.astype(np.int32), device=to),
         wp.array(frame.zone.astype(np.int32), device=to), 15.0 * frame.seconds, SEEN, GROUP, out,
     ]  # fmt: skip
-    launch.run(kernels.fold, groups, inputs, to, batch=rows, slabs=1)
+    launch.run_kernel(kernels.fold_pixel_counts, groups, inputs, to, batch=rows, slabs=1)
     return out
 
 
@@ -149,7 +149,7 @@ def sum_over_groups(parts: Any) -> Array:
     """Return the sums over groups of a Warp array (B, G, K), shape (B, K)."""
     rows, _, size = parts.shape
     out = wp.empty((rows, size), dtype=wp.float64, device=parts.device)
-    launch.run(kernels.together, size, [parts, out], parts.device, batch=rows, slabs=1)
+    launch.run_kernel(kernels.sum_groups, size, [parts, out], parts.device, batch=rows, slabs=1)
     found: Array = out.numpy()
     return found
 

@@ -158,7 +158,7 @@ class Stimulus:
     def _arrays(
         self, start: NDArray[Any], stamp: NDArray[Any], light: NDArray[np.float32], step: float
     ) -> Any:
-        out = pixel_codegen_trials.History()
+        out = pixel_codegen_trials.LightHistory()
         out.start = wp.array(start.astype(np.int32), device=self.device)
         out.stamp = wp.array(stamp.astype(np.int32), device=self.device)
         out.intensity = wp.array(light.astype(np.float32), device=self.device)
@@ -172,7 +172,7 @@ def light_of(scene: Scene, times: NDArray[np.float64], pixels: NDArray[np.int32]
     out = np.empty((len(pixels), len(times)), np.float32)
     for first in range(0, len(times), BLOCK):
         part = times[first : first + BLOCK]
-        name, source = scene.source(part, pixels, launch.device("cpu"))
+        name, source = scene.source(part, pixels, launch.find_device("cpu"))
         if name == "frames":
             values = source.values.numpy()
         else:

@@ -17,7 +17,7 @@ import pytest
 from click.testing import CliRunner
 
 from dase import Events, InputError, io
-from dase.cli import group
+from dase.cli import dase_group
 
 SMALL = ("--size", "32x24", "--duration", "0.1", "--sequences", "1", "--jobs", "1", "--regime", "slow")
 
@@ -235,7 +235,7 @@ def test_broken_files(tmp_path, name, content, message):
         (tmp_path / name).write_bytes(content)
     path = str(tmp_path / name)
     for command in (["info", path], ["show", path], ["convert", path, str(tmp_path / "b.evt2")]):
-        done = CliRunner().invoke(group, command)
+        done = CliRunner().invoke(dase_group, command)
         assert isinstance(done.exception, InputError)
         assert message in str(done.exception)
         assert path in str(done.exception)

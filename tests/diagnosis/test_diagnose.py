@@ -14,11 +14,11 @@ import warp as wp
 from click.testing import CliRunner
 
 import dase
-from dase.cli import group
+from dase.cli import dase_group
 from dase.cli.options import open_recorded
-from dase.diagnosis.diagnose import diagnose, summary
-from dase.diagnosis.explain_effect import bars
-from dase.diagnosis.state import accounts
+from dase.diagnosis.diagnose import diagnose, summary_line
+from dase.diagnosis.explain_effect import moving_bars
+from dase.diagnosis.state import explains_remainder
 from dase.effects import EFFECTS, Effect, parameter
 from dase.fitting.confidence_intervals import estimate_parameters
 from dase.fitting.data_split import split_measurement
@@ -64,7 +64,7 @@ class Popping(Effect):
 
 @pytest.fixture(scope="module")
 def scene() -> VideoScene:
-    return bars()
+    return moving_bars()
 
 
 def hidden(scene, device, *effects: Effect, seed: int = 3) -> dase.Events:
@@ -90,14 +90,14 @@ def test_a_hidden_effect_is_named(scene, device, effect):
     assert abs(got.value / true - 1) < 0.15 or got.low < true < got.high
     assert found.parameters["threshold.on"].value == pytest.approx(0.18, rel=0.05)
     assert json.loads(json.dumps(found.to_json()))["selected"] == [effect.name]
-    assert f"missing: {effect.name}" in summary(found)
+    assert f"missing: {effect.name}" in summary_line(found)
 
 
 def test_nothing_is_invented(scene, device):
     found = diagnose(hidden(scene, device), scene, effects=LIBRARY, pixels=PIXELS, device=device)
     assert found.selected == ()
     assert found.unexplained is None
-    assert "nothing is missing" in summary(found)
+    assert "nothing is missing" in summary_line(found)
 
 
 def test_two_hidden_effects_are_both_found(scene, device):
@@ -203,7 +203,7 @@ def test_families_weigh_alike():
 
 
 def run(*words: str):
-    return CliRunner().invoke(group, words, standalone_mode=False)
+    return CliRunner().invoke(dase_group, words, standalone_mode=False)
 
 
 def save(path, events, **more):
@@ -286,12 +286,12 @@ def test_a_poor_minimum_is_said(tmp_path, scene, monkeypatch):
     ends = Fit(Sensor(), {}, error=3.0, before=4.0, floor=1.0, gate=1.2, agree=False, poor=True)
     monkeypatch.setattr("dase.fitting.fit.fit", lambda *args, **more: ends)
     words = ["fit", "ideal", str(tmp_path / "r.npz"), "--scene", "static", "-o", str(tmp_path / "f.toml")]
-    result = CliRunner().invoke(group, words)
+    result = CliRunner().invoke(dase_group, words)
     assert result.exit_code == 1
     assert "poor minimum" in result.output
     assert (tmp_path / "f.toml").exists()
     monkeypatch.setattr("dase.fitting.fit.fit", lambda *args, **more: replace(ends, poor=False))
-    assert CliRunner().invoke(group, words).exit_code == 0
+    assert CliRunner().invoke(dase_group, words).exit_code == 0
 
 
 def test_starts_that_end_higher_are_not_counted():
@@ -318,9 +318,11 @@ def test_an_effect_of_the_user_is_explained_wherever_its_file_is_named(tmp_path,
     monkeypatch.setattr(
         "dase.simulation.user_effects.known_effects", lambda paths: [path.name for path in paths]
     )
-    monkeypatch.setattr("dase.diagnosis.explain_effect.explanation", lambda name, known: f"{name} of {known}")
+    monkeypatch.setattr(
+        "dase.diagnosis.explain_effect.explain_effect", lambda name, known: f"{name} of {known}"
+    )
     for words in (("--effects", "a.py", "--explain", "x"), ("--explain", "x", "--effects", "a.py")):
-        result = CliRunner().invoke(group, ["diagnose", *words])
+        result = CliRunner().invoke(dase_group, ["diagnose", *words])
         assert result.exit_code == 0, result.output
         assert result.output == "x of ['a.py']\n"
 
@@ -344,8 +346,8 @@ def test_a_search_ends_at_what_chance_gives():
 
 
 def test_little_is_added_only_where_it_accounts_for_most():
-    assert accounts(judged(0.3), judged(0.8))
-    assert accounts(judged(0.45), judged(0.8))  # 0.25 of 0.6 above the level of chance
-    assert not accounts(judged(0.45), judged(0.6))  # 0.25 of 0.4
-    assert not accounts(judged(0.6), judged(1.3))  # more than chance is left
-    assert accounts(judged(0.6, reach=0.7), judged(1.3))
+    assert explains_remainder(judged(0.3), judged(0.8))
+    assert explains_remainder(judged(0.45), judged(0.8))  # 0.25 of 0.6 above the level of chance
+    assert not explains_remainder(judged(0.45), judged(0.6))  # 0.25 of 0.4
+    assert not explains_remainder(judged(0.6), judged(1.3))  # more than chance is left
+    assert explains_remainder(judged(0.6, reach=0.7), judged(1.3))

@@ -9,7 +9,7 @@ from reference.scene_frames import film, moving_picture
 
 import dase
 from dase import io
-from dase.cli import group
+from dase.cli import dase_group
 from dase.diagnosis.compare import compare
 from dase.diagnosis.measurement import open_measurement
 from dase.fitting.data_split import split_measurement
@@ -60,7 +60,7 @@ def test_frames_far_apart_make_a_scene_with_trust(measured):
         stimulus = half.trials.stimulus
         compared = stimulus.cell != MASKED
         assert 0.3 < compared.mean() < 1 or half is evidence.held
-        trusted = measured.scene.trusts(stimulus.grid.times, stimulus.pixels).T
+        trusted = measured.scene.is_trusted(stimulus.grid.times, stimulus.pixels).T
         assert not (compared & ~trusted).any()
         assert stimulus.holes
     first, second = (half.trials.stimulus.pixels for half in (evidence.train, evidence.held))
@@ -163,11 +163,11 @@ def test_next_to_nothing_to_trust_is_said(measured):
 
 def test_events_that_are_believed(measured):
     scene, events = measured.scene, measured.events
-    got = scene.believed(events)
+    got = scene.trusted_events(events)
     assert 0.2 < len(got) / len(events) < 0.8
     some = np.random.default_rng(1).integers(0, len(events), 2000)
     pixels = (events.y[some].astype(int) * 128 + events.x[some]).astype(np.int32)
-    want = [scene.trusts(events.t[k : k + 1], pixels[n : n + 1])[0, 0] for n, k in enumerate(some)]
+    want = [scene.is_trusted(events.t[k : k + 1], pixels[n : n + 1])[0, 0] for n, k in enumerate(some)]
     kept = set(zip(got.t, got.x, got.y, strict=True))
     assert [row in kept for row in zip(events.t[some], events.x[some], events.y[some], strict=True)] == want
 
@@ -175,7 +175,7 @@ def test_events_that_are_believed(measured):
 def test_the_commands_say_what_is_compared(tmp_path, recording):
     report = tmp_path / "report.html"
     arguments = ["compare", "ideal", str(recording[0]), "--pixels", "300", "-o", str(report), "--quiet"]
-    done = CliRunner().invoke(group, arguments)
+    done = CliRunner().invoke(dase_group, arguments)
     assert done.exit_code == 0, done.output
     for sentence in ("compared is only where the scene can be trusted: ", "after the frames"):
         assert sentence in done.output

@@ -43,13 +43,15 @@ def test_the_point_spread_has_the_width_asked_for(sigma):
     assert np.all(line >= 0)
 
 
-@pytest.mark.parametrize("way", [scene_blur.blur, scene_blur.by_kernels], ids=["chosen", "kernels"])
+@pytest.mark.parametrize(
+    "way", [scene_blur.blur_frames, scene_blur.blur_by_kernels], ids=["chosen", "kernels"]
+)
 @pytest.mark.parametrize(("size", "sigma"), [((7, 9), 0.5), ((24, 13), 1.7), ((3, 2), 1.0), ((1, 5), 0.8)])
 def test_the_blur_is_a_convolution(device, rng, way, size, sigma):
     pictures = rng.random((3, *size), np.float32)
     every, some = np.arange(size[0] * size[1], dtype=np.int32), np.array([4, 0, 3], np.int32)
     want = blurred(pictures, sigma).reshape(3, -1)
-    where = launch.device(device)
+    where = launch.find_device(device)
     flat = wp.array(pictures.reshape(3, -1), dtype=float, device=where)
     for pixels in (every, some):
         got = way(flat, blur_weights(sigma), size[1], pixels, where).numpy()

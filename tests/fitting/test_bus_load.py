@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import dase
-from dase.diagnosis.candidates import prepared
+from dase.diagnosis.candidates import variants_to_try
 from dase.effects import EFFECTS
 from dase.effects.readout import Others, Readout
 from dase.effects.row_scan import RowScan
@@ -181,7 +181,7 @@ def test_answers_do_not_depend_on_what_is_asked_beside(evidence, true):
 
 
 def test_the_rate_of_a_bus_that_was_full_is_seen(evidence):
-    first = prepared(evidence, Readout)
+    first = variants_to_try(evidence, Readout)
     assert [e.mode for e in first] == ["delay", "drop"]
     assert all(abs(e.rate - BUS.rate) <= 1.01 / BUSY for e in first)
 
@@ -197,7 +197,7 @@ def test_a_bus_is_no_candidate_where_it_is_known_to_be_free(evidence, rng):
     assert least_bus_rate(bursts, TimestampStructure(step=1e-3)) == pytest.approx(512 / 1e-3)
     assert least_bus_rate(bursts, TimestampStructure(line=1e-5)) == 0
     assert evidence.least_bus_rate <= 1.2 * BUS.rate  # it was full
-    assert prepared(replace(evidence, least_bus_rate=200 * evidence.highest_event_rate), Readout) == []
+    assert variants_to_try(replace(evidence, least_bus_rate=200 * evidence.highest_event_rate), Readout) == []
 
 
 def test_a_bus_that_is_never_free_is_no_clock(rng):

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import dase
-from dase.diagnosis.explain_effect import bars
+from dase.diagnosis.explain_effect import moving_bars
 from dase.effects import EFFECTS
 from dase.fitting import confidence_intervals
 from dase.fitting import model as model_module
@@ -76,7 +76,7 @@ def test_a_phase_that_looks_no_better_at_the_same_place_is_found(device, monkeyp
         return False
 
     monkeypatch.setattr(model_module, "_as_good_work", never)
-    scene, true = bars(), Sensor().with_effect(EFFECTS["threshold"](on=0.2, off=0.2, phase=0.0))
+    scene, true = moving_bars(), Sensor().with_effect(EFFECTS["threshold"](on=0.2, off=0.2, phase=0.0))
     events = dase.simulate(scene, true, seed=4, device=device)
     found = split_measurement(events, scene, pixels=200, seed=1, device=device)
     start = with_phase(model_of(true), 1.0)
@@ -86,7 +86,7 @@ def test_a_phase_that_looks_no_better_at_the_same_place_is_found(device, monkeyp
 
 @pytest.fixture(scope="module")
 def evidence(lit, device):
-    scene = bars()
+    scene = moving_bars()
     return split_measurement(
         dase.simulate(scene, lit, seed=4, device=device), scene, pixels=200, seed=1, device=device
     )

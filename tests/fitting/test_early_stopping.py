@@ -9,10 +9,10 @@ import pytest
 
 import dase
 from dase.diagnosis import candidates
-from dase.diagnosis.candidates import FOLLOWED, followed, try_all
-from dase.diagnosis.explain_effect import bars
-from dase.diagnosis.pruning import _near
-from dase.diagnosis.state import Search
+from dase.diagnosis.candidates import FOLLOWED, try_effects, worth_descending
+from dase.diagnosis.explain_effect import moving_bars
+from dase.diagnosis.pruning import _keep_near_models
+from dase.diagnosis.state import DiagnosisState
 from dase.effects import EFFECTS
 from dase.fitting.data_split import split_measurement
 from dase.fitting.descent import descent_work
@@ -61,19 +61,19 @@ def look(name: str, share: float, streams: bool = False) -> SimpleNamespace:
 def test_where_one_is_clearly_ahead_the_turn_of_others_comes():
     others = [look(f"e{n}", 0.9 + 0.01 * n) for n in range(12)]
     buses = [look("bus", 0.95, True), look("late", 1.5, True)]
-    got = [one.effect.name for one in followed([*others, *buses, look("best", 0.3)])]
+    got = [one.effect.name for one in worth_descending([*others, *buses, look("best", 0.3)])]
     assert sorted(got) == sorted(["best", "bus", *(f"e{n}" for n in range(6))])
     assert len(got) == FOLLOWED
-    got = [one.effect.name for one in followed([*others, *buses, look("best", 0.8)])]
+    got = [one.effect.name for one in worth_descending([*others, *buses, look("best", 0.8)])]
     assert set(got) == {"best", "bus", *(f"e{n}" for n in range(12))}  # only the bus far behind is left out
 
 
 @pytest.fixture(scope="module")
-def search(device) -> Search:
-    scene = bars()
+def search(device) -> DiagnosisState:
+    scene = moving_bars()
     events = dase.simulate(scene, TRUE, seed=4, device=device)
     evidence = split_measurement(events, scene, pixels=600, seed=1, device=device)
-    return Search(evidence, LIBRARY, 1, lambda text, share, error: None, frozenset({"threshold"}))
+    return DiagnosisState(evidence, LIBRARY, 1, lambda text, share, error: None, frozenset({"threshold"}))
 
 
 @pytest.mark.parametrize("lacks", [True, False], ids=["lacks mismatch", "lacks nothing"])
@@ -82,7 +82,7 @@ def test_what_chance_does_as_well_is_not_judged(search, lacks):
     repeats = model.rebase(evidence.train, repeats=60, seed=300)
     model.rebase(evidence.scout, repeats=16, seed=200)
     names = ["mismatch", "leak", "hot"] if lacks else ["leak", "hot"]
-    tried = try_all(
+    tried = try_effects(
         evidence, model, LIBRARY, names, repeats=repeats, worst=(), seed=1, report=lambda text, share: None
     )
     assert {t.name for t in tried} == set(names)
@@ -99,8 +99,8 @@ def test_only_what_one_descent_takes_near_is_fitted_in_full(search):
     slow = TRUE.with_effect(EFFECTS["bandwidth"](cutoff=10.0))
     ways = {"far": model_of(slow, ["threshold"]), "near": model_of(TRUE)}
     present = Judgement(0.3, 1.15, 0.5, 0.2, {}, {}, np.zeros(1), 1.0)
-    assert list(_near(search, ways, present)) == ["near"]
-    assert _near(search, {}, present) == {}
+    assert list(_keep_near_models(search, ways, present)) == ["near"]
+    assert _keep_near_models(search, {}, present) == {}
 
 
 def test_a_search_that_is_over_stops(search):

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import dase
-from dase.diagnosis.explain_effect import bars
+from dase.diagnosis.explain_effect import moving_bars
 from dase.effects import EFFECTS, StreamEffect
 from dase.fitting import descent
 from dase.fitting.batch_simulator import CLASS_TIMES, LAG_TIMES, SimulationOrder
@@ -34,7 +34,7 @@ ON = {
 
 @pytest.fixture(scope="module")
 def scene() -> dase.VideoScene:
-    return bars()
+    return moving_bars()
 
 
 @pytest.fixture(scope="module")

@@ -23,7 +23,7 @@ from dase.effects.shot import Shot
 from dase.effects.stream import order_events
 from dase.effects.threshold import Threshold
 from dase.effects.timestamp import Timestamp
-from dase.simulation.readout_chain import Outlet
+from dase.simulation.readout_chain import ReadoutChain
 from dase.simulation.sensor_file import parse_sensor
 
 WIDTH, HEIGHT = 13, 11
@@ -47,7 +47,7 @@ def bunched(rng: np.random.Generator, count: int = 3000, tick: int = 1) -> dase.
 
 def through(sensor: dase.Sensor, events: dase.Events, cuts: list[int] | None = None, seed: int = 0):
     """Return what leaves a sensor whose pixels send `events`, cut into parts before some indices."""
-    outlet = Outlet(sensor, events.width, events.height, seed=seed)
+    outlet = ReadoutChain(sensor, events.width, events.height, seed=seed)
     edges = [0, *(cuts or []), len(events)]
     parts = []
     for begin, end in pairwise(edges):
