@@ -1,7 +1,7 @@
 """How unlike simulated and real counts are, and which way the thresholds should move.
 
-Two objectives share the images: `AdversarialObjective`, the paper's bank of critics over hashed patches (Eqs. 10 to
-13), and `Moments`, which compares means of fixed features between pixels whose surroundings look alike.
+Two objectives share the images: `AdversarialObjective`, the paper's bank of critics over hashed patches (Eqs.
+10 to 13), and `Moments`, which compares means of fixed features between pixels whose surroundings look alike.
 """
 
 from __future__ import annotations

@@ -13,7 +13,8 @@ from dase.learning.targets import Pairs, draw_noise, simulate_counts
 from dase.networks.threshold_network import NetworkShape, ThresholdMaps, ThresholdNet
 
 ESIM = 0.18, 0.03
-"""Mean and spread of ESIM's thresholds as it was used to train E2VID [log intensity]; the preset `esim_thresholds`."""
+"""Mean and spread of ESIM's thresholds as it was used to train E2VID [log intensity]; the preset
+`esim_thresholds`."""
 
 RANDOM = (0.05, 2.0), 1.5
 """Thresholds and greatest ratio of ON and OFF of broad randomisation (V2V, 2025)."""
