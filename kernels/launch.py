@@ -1,7 +1,8 @@
 """Where kernels run, and how CPU work is spread over threads.
 
 Warp runs a CPU launch on one thread and releases the GIL meanwhile, so a launch is cut into slabs that a
-thread pool works off. Every kernel that goes through `run_kernel` takes the start of its slab as first argument.
+thread pool works off. Every kernel that goes through `run_kernel` takes the start of its slab as first
+argument.
 """
 
 from __future__ import annotations
@@ -144,8 +145,8 @@ def run_kernel(
 def run_concurrently(works: Sequence[Callable[[], Result]]) -> list[Result]:
     """Return what works give that pass their time in kernels of the CPU or in NumPy, done on its threads.
 
-    The first is done before the others: what it loads or works out is there for all. Works may use `run_kernel`,
-    whose threads are others.
+    The first is done before the others: what it loads or works out is there for all. Works may use
+    `run_kernel`, whose threads are others.
     """
     if len(works) < 2 or _threads == 1:
         return [work() for work in works]

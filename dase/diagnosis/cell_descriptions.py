@@ -121,8 +121,8 @@ def _timestamp_words(evidence: SplitMeasurement, n: int) -> StatisticWords:
 
 
 _PLACES: dict[str, Callable[[SplitMeasurement, int], StatisticWords]] = {
-    "rate": _rate_words, "intervals": _interval_words, "lag": _lag_words, "repeats": _repeat_words, "change": _change_words,
-    "spread": _spread_words, "pixels": _odd_pixel_words, "silent": _silent_pixel_words,
+    "rate": _rate_words, "intervals": _interval_words, "lag": _lag_words, "repeats": _repeat_words, "change":
+    _change_words, "spread": _spread_words, "pixels": _odd_pixel_words, "silent": _silent_pixel_words,
     "space": _ring_words, "spectrum": _spectrum_words, "stamps": _timestamp_words,
 }  # fmt: skip
 

@@ -210,12 +210,12 @@ class _ShiftSearch:
         """Return weighted correlations (J, flips, 2 R + 1, 2 R + 1) and weights (J,) at an offset [s]."""
         scores, weights = [], []
         for exposures, change in zip(self.exposures, self.changes, strict=True):
-            image = self._image(exposures, offset)
+            image = self._event_image(exposures, offset)
             weights.append(float(image.std()) * float(change.std()) + 1e-12)
             scores.append([weights[-1] * self._shifts(image, change, flip) for flip in flips])
         return np.array(scores), np.array(weights)
 
-    def _image(self, exposures: Scores, offset: float) -> NDArray[np.float32]:
+    def _event_image(self, exposures: Scores, offset: float) -> NDArray[np.float32]:
         """Return what the events of each pixel say of the change between two exposures, (H, W)."""
         b0, e0, b1, e1 = exposures
         part = slice(*np.searchsorted(self.events.t, (b0 + offset, e1 + offset)))

@@ -50,7 +50,7 @@ print(mine, os.read(reader, 100).decode())
 def test_a_first_call_by_many_threads_keeps_standard_error():
     done = output_of("""
 found = []
-threads = [threading.Thread(target=lambda: found.append(launch.device("cpu").alias)) for _ in range(8)]
+threads = [threading.Thread(target=lambda: found.append(launch.find_device("cpu").alias)) for _ in range(8)]
 [t.start() for t in threads]
 [t.join() for t in threads]
 print("still here", file=sys.stderr)

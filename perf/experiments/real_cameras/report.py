@@ -211,8 +211,8 @@ def staircase(axis: Axes, found: dict[str, Any]) -> None:
     for k, error in enumerate(errors):
         below = 0.6 < error < 1  # beside the line of the floor, not on it
         axis.annotate(
-            format_number(error), (k, error), (0, -12 if below else 4), textcoords="offset points", ha="center",
-            weight="bold", fontsize=9, color=INK if k < sure else QUIET,
+            format_number(error), (k, error), (0, -12 if below else 4), textcoords="offset points",
+            ha="center", weight="bold", fontsize=9, color=INK if k < sure else QUIET,
         )  # fmt: skip
     axis.set_ylim(0.5 * min(1.0, *errors), 2.2 * max(*errors, gate))
     axis.set_xlim(-0.5, max(n, 3) - 0.5)
