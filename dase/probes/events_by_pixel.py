@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from dase.events import Events
 from dase.kernels import launch
-from dase.kernels.event_order import sort_by_pixel
+from dase.kernels.event_order import sort_into_pixels
 from dase.probes.stimulus import Stimulus
 
 
@@ -59,4 +59,4 @@ def _sort_stream(
         wp.float64(stimulus.grid.begin), lent(start, wp.int32), lent(time, wp.int64),
         lent(polarity, wp.uint8),
     ]  # fmt: skip
-    wp.launch(sort_by_pixel, dim=1, inputs=inputs, device=cpu)
+    wp.launch(sort_into_pixels, dim=1, inputs=inputs, device=cpu)
