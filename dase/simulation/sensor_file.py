@@ -95,7 +95,7 @@ def parse_sensor(text: str, where: str, effects: Mapping[str, type[Effect]] = EF
     try:
         return _sensor_of_table(table, effects)
     except InputError as error:
-        raise InputError(f"{where}: {error}") from error
+        raise InputError(f"{where}: {error}", argument=error.argument) from error
 
 
 def _sensor_of_table(table: dict[str, Any], effects: Mapping[str, type[Effect]]) -> Sensor:
