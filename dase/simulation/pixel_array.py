@@ -162,7 +162,8 @@ class PixelArray:
         level, eps = self._thresholds_of_pixels()
         inputs = [
             source, self._pixels, self.width, self.samples, samples, self.seed,
-            stream_number("initial_phase"), level, eps, wp.array(self._vectors[:, 2], dtype=float, device=self.device), self._state[0],
+            stream_number("initial_phase"), level, eps,
+            wp.array(self._vectors[:, 2], dtype=float, device=self.device), self._state[0],
             self._next[1], self._next[0],
         ]  # fmt: skip
         launch.run_kernel(counting.starting_kernel(name), self.count, inputs, self.device, batch=self.batch)
