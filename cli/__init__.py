@@ -82,7 +82,7 @@ def main() -> None:
         error.show()
         sys.exit(error.exit_code)
     except InputError as error:
-        _exit_with(str(error), 2)
+        _exit_with(f"{error} (--{error.argument})" if error.argument else str(error), 2)
     except BrokenPipeError:
         # the reader of our output has gone; nothing is left to say to it
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())

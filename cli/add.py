@@ -80,15 +80,13 @@ def _fit_effect(
     from dase.cli.diagnose import progress_bar
     from dase.diagnosis import sensor_update
     from dase.diagnosis.add_effect import fit_added
-    from dase.diagnosis.measurement import open_measurement
+    from dase.fitting.measurement import open_measurement
     from dase.simulation import sensor_edit
 
     data = open_measurement(recording, scene)
     with progress_bar(False) as tell:
-        before, found = fit_added(
-            data.events, data.scene, sensor, effect, trust=data.trust, seed=seed, device=device, progress=tell
-        )
-    for note in data.noted(found).notes:
+        before, found = fit_added(data, sensor, effect, seed=seed, device=device, progress=tell)
+    for note in found.notes:
         click.echo(f"note: {note}", err=True)
     entry = sensor_edit.history_entry_today(
         f"add {effect.name}",

@@ -61,11 +61,7 @@ def compare_command(
     model = load_sensor(sensor, known_effects(effects))
     measured = open_recorded(recording, scene, file, fps)
     with progress_bar(quiet) as tell:
-        found = compare(
-            measured.events, measured.scene, model, trust=measured.trust, pixels=pixels, seed=seed,
-            device=device, progress=tell,
-        )  # fmt: skip
-    found = measured.noted(found)
+        found = compare(measured, model, pixels=pixels, seed=seed, device=device, progress=tell)
     click.echo(
         f"error {found.error:.2f}; 1 is what two repeats of the recording give, "
         f"which stay below {found.gate:.2f}"

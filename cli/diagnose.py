@@ -6,6 +6,7 @@ import json
 import math
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -92,7 +93,7 @@ def diagnose_command(
     announced unless it brings the error to what two repeats of the recording would give.
     """
     from dase.diagnosis import sensor_update
-    from dase.diagnosis.diagnose import MOST, diagnose
+    from dase.diagnosis.diagnose import diagnose
     from dase.io import replacing
     from dase.simulation import sensor_edit
     from dase.simulation.user_effects import known_effects
@@ -103,11 +104,11 @@ def diagnose_command(
     measured = open_recorded(recording, scene, file, fps)
     names = free.split(",") if free else None
     with progress_bar(quiet) as tell:
-        found = diagnose(
-            measured.events, measured.scene, model, trust=measured.trust, effects=known, free=names,
-            most=MOST if auto else 1, pixels=pixels, seed=seed, device=device, progress=tell,
-        )  # fmt: skip
-    found = measured.noted(found)
+        # without --auto, the first effect that is missing
+        look = diagnose if auto else partial(diagnose, most=1)
+        found = look(
+            measured, model, effects=known, free=names, pixels=pixels, seed=seed, device=device, progress=tell
+        )
     if json_ is not None:
         with replacing(json_) as part:
             part.write_text(json.dumps(found.to_json(), indent=2) + "\n")
@@ -145,9 +146,8 @@ def progress_bar(quiet: bool) -> Iterator[Callable[[str, float, float], None]]:
 
 
 def _print_findings(found: Diagnosis, quiet: bool) -> None:
-    from dase.diagnosis.diagnose import summary_line
 
-    click.echo(summary_line(found))
+    click.echo(found.finding())
     if quiet:
         return
     click.echo(f"error as given {found.before:.2f}; 1 is what two repeats of the recording give")

@@ -51,15 +51,13 @@ def fit_command(
     model = text.sensor()
     measured = open_recorded(recording, scene, file, fps)
     with progress_bar(quiet) as tell:
-        found = fit(
-            measured.events, measured.scene, model, free=free.split(",") if free else None,
-            trust=measured.trust, pixels=pixels, seed=seed, device=device, progress=tell,
-        )  # fmt: skip
+        names = free.split(",") if free else None
+        found = fit(measured, model, free=names, pixels=pixels, seed=seed, device=device, progress=tell)
     sensor_edit.write_sensor_text(sensor_update.with_fit(text, found, recording.name), output)
     click.echo(f"error {found.before:.2f} → {found.error:.2f}; repeats stay below {found.gate:.2f}")
     for name, estimate in found.parameters.items():
         click.echo(f"  {name:24s} {estimate.value:10.4g}   {estimate.low:.4g} to {estimate.high:.4g}")
-    for note in measured.noted(found).notes:
+    for note in found.notes:
         click.echo(f"note: {note}")
     click.echo(f"{output}: {found.evaluations} simulations, {found.seconds:.1f} s")
     if found.poor:

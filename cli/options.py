@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import click
 
 if TYPE_CHECKING:
-    from dase.diagnosis.measurement import Measurement
+    from dase.fitting.measurement import Measurement
 
 
 def parse_size(ctx: click.Context, param: click.Parameter, value: str | None) -> tuple[int, int] | None:
@@ -102,12 +101,17 @@ def open_recorded(
     recording: Path, scene: str, file: Path | None = None, fps: float | None = None
 ) -> Measurement:
     """Open a recording and its scene, with the frame rate of its clip where the user gives it."""
-    from dase.diagnosis.measurement import open_measurement
+    from dase.errors import InputError
+    from dase.fitting.measurement import open_measurement
     from dase.scenes.video import open_video
 
     clip = file if scene == "video" else Path(scene)
-    if fps is None or clip is None:
-        return open_measurement(recording, scene, file)
+    if clip is None:
+        raise InputError("--scene video needs the file: --scene video FILE")
     if scene in ("frames", "static"):
-        raise click.UsageError("--fps goes with --scene video FILE")
-    return replace(open_measurement(recording, "static"), scene=open_video(clip, fps=fps))
+        if file is not None:
+            raise InputError(f"--scene {scene} takes no file, got {file}")
+        if fps is not None:
+            raise click.UsageError("--fps goes with --scene video FILE")
+        return open_measurement(recording, scene)
+    return open_measurement(recording, clip if fps is None else open_video(clip, fps=fps))

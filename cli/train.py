@@ -80,13 +80,13 @@ def train_command(
     with _OpeningBar(silent=not first) as opened:
         training = learning_job.open_training(replace(job, backend=device), progress=opened)
     looks = 100 if device.startswith("cuda") else 25
-    pace = RunSchedule(
-        look=10 if preset == "tiny" else looks, seconds=None if minutes is None else 60 * minutes
+    schedule = RunSchedule(
+        log_every=10 if preset == "tiny" else looks, seconds=None if minutes is None else 60 * minutes
     )
     with _LiveLine(training, output if tensorboard and first else None, silent=not first) as look:
         # killed before its first checkpoint, a run begins anew
         resume = resume and (output / CHECKPOINT).is_file()
-        last = train_in_folder(training, output, pace=pace, resume=resume, look=look)
+        last = train_in_folder(training, output, schedule=schedule, resume=resume, on_row=look)
     if first:
         _write_results(job, output, training, last)
     distributed.leave_processes()

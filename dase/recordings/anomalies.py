@@ -31,7 +31,7 @@ class AnomalySettings:
     """Share of the events that hot pixels may send."""
     hot_pixels: float = 0.001
     """Share of the pixels that may be hot."""
-    fastest: float = 2e-6
+    shortest_interval: float = 2e-6
     """Time in which no pixel sends two events [s]."""
     simultaneous: float = 0.001
     """Share of the events that may be of the same pixel and time as another."""
@@ -91,8 +91,9 @@ def _place_anomalies(s: Statistics, limits: AnomalySettings) -> Iterator[Note]:
 
 
 def _time_anomalies(s: Statistics, limits: AnomalySettings) -> Iterator[Note]:
-    if s.interval_low <= limits.fastest:
-        text = f"more than 1 % of the times between events of one pixel are {format_seconds(limits.fastest)} or less"
+    if s.interval_low <= limits.shortest_interval:
+        soon = format_seconds(limits.shortest_interval)
+        text = f"more than 1 % of the times between events of one pixel are {soon} or less"
         yield Note(text, "odd", "fast")
     if s.simultaneous > max(limits.simultaneous * s.events, limits.least_simultaneous):
         text = f"{format_count(s.simultaneous)} events are of the same pixel and time as another"
@@ -114,7 +115,8 @@ def _frame_anomalies(s: Statistics, limits: AnomalySettings) -> Iterator[Note]:
     elif math.isnan(s.exposure[1]):
         yield Note("the exposure of the frames is not known, or an instant", "odd", "exposure")
     elif s.exposure[1] > limits.exposure * s.frame_interval:
-        text = f"frames are exposed for {format_seconds(s.exposure[1])} but come every {format_seconds(s.frame_interval)}"
+        exposure, interval = format_seconds(s.exposure[1]), format_seconds(s.frame_interval)
+        text = f"frames are exposed for {exposure} but come every {interval}"
         yield Note(text, "odd", "exposure")
     if s.clipped > limits.clipped:
         yield Note(

@@ -24,13 +24,14 @@ from numpy.typing import ArrayLike, NDArray
 from dase import io
 from dase.errors import InputError
 from dase.events import Events
+from dase.formatting import fit_to_screen
 from dase.io.sequence import Sequence
 from dase.io.source import Kind, Motion, Note, Size
 from dase.recordings.anomalies import find_anomalies
 from dase.recordings.statistics import Statistics, survey_sequence
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class RecordingReport:
     """What was noticed when a recording was opened.
 
@@ -41,6 +42,11 @@ class RecordingReport:
 
     notes: tuple[Note, ...]
     statistics: Statistics
+
+    def __repr__(self) -> str:
+        count = len(self.notes)
+        notes = [f"  {note.kind}: {note}" for note in self.notes]
+        return fit_to_screen([f"Report of {count} note{'s' if count != 1 else ''}", *notes], rows=20)
 
     def _of(self, kind: Kind) -> tuple[Note, ...]:
         return tuple(note for note in self.notes if note.kind == kind)
@@ -61,7 +67,7 @@ class RecordingReport:
         return self._of("odd")
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Recording:
     """What a camera recorded.
 
@@ -128,6 +134,18 @@ class Recording:
             and np.any(self.frame_end < self.frame_begin)
         ):
             raise InputError("recording: an exposure must not end before it begins")
+
+    def __repr__(self) -> str:
+        frames = "no frames" if self.frames is None else f"{len(self.frames)} frames"
+        masked = self.mask.size - int(self.mask.sum())
+        lines = [
+            f"Recording of {self.width}x{self.height} pixels, {self.begin:.6g} s to {self.end:.6g} s",
+            f"  {self.events}",
+            f"  {frames}, {'no ' if self.motion is None else ''}samples of the motion sensor",
+            f"  {int(self.hot.sum())} hot pixels, {masked} masked",
+            *(f"  {note.kind}: {note}" for note in self.report.notes),
+        ]
+        return fit_to_screen(lines)
 
     @classmethod
     def of(cls, sequence: Sequence, notes: Iterable[str] = ()) -> Recording:

@@ -37,6 +37,9 @@ class Scene(ABC):
     duration: float
     anytime: bool = False
 
+    def __repr__(self) -> str:
+        return f"{type(self).__name__}({self.width}x{self.height} pixels, {self.duration:g} s)"
+
     @abstractmethod
     def sample_times(self) -> NDArray[np.float64]:
         """Return the times at which the scene is to be sampled [s], from 0 to `duration`, increasing."""

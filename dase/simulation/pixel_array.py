@@ -161,8 +161,9 @@ class PixelArray:
             return 0, self._state[1], self._state[0]
         level, eps = self._thresholds_of_pixels()
         inputs = [
-            source, self._pixels, self.width, self.samples, samples, self.seed, stream_number("initial_phase"),
-            level, eps, wp.array(self._vectors[:, 2], dtype=float, device=self.device), self._state[0],
+            source, self._pixels, self.width, self.samples, samples, self.seed,
+            stream_number("initial_phase"), level, eps,
+            wp.array(self._vectors[:, 2], dtype=float, device=self.device), self._state[0],
             self._next[1], self._next[0],
         ]  # fmt: skip
         launch.run_kernel(counting.starting_kernel(name), self.count, inputs, self.device, batch=self.batch)
@@ -355,7 +356,7 @@ class PixelArray:
 
     def _decode_keys(self, keys: Any, begin: float) -> tuple[Events, NDArray[np.int32] | None]:
         n, to = len(keys), self.device
-        each = ordering.EACH["cuda" if to.is_cuda else "cpu"]
+        each = ordering.events_per_thread(to)
         out = [launch.new_array(n, d, to) for d in (wp.float64, wp.uint16, wp.uint16, wp.uint8)]
         row = wp.empty(n if self.batch > 1 else 0, dtype=int, device=to)
         label = wp.empty(n if self.sink == "labels" else 0, dtype=wp.int8, device=to)

@@ -48,16 +48,14 @@ def as_sensor(sensor: Sensor | str | PathLike[str]) -> Sensor:
         sensor: A `Sensor`, the name of a preset, or the path of a sensor file.
 
     Raises:
-        InputError: It is none of these, or as `load_sensor`.
+        InputError: As `load_sensor`.
+        TypeError: It is none of these.
     """
     if isinstance(sensor, Sensor):
         return sensor
     if isinstance(sensor, str | PathLike):
         return load_sensor(fspath(sensor))
-    raise InputError(
-        "sensor: must be a dase.Sensor, the name of a preset or the path of a sensor file, "
-        f"got {type(sensor).__name__}"
-    )
+    raise TypeError(f"sensor: expected a Sensor, a preset's name or a path, got {type(sensor).__name__}")
 
 
 def read_sensor(spec: str | Path) -> tuple[str, str]:
@@ -95,7 +93,7 @@ def parse_sensor(text: str, where: str, effects: Mapping[str, type[Effect]] = EF
     try:
         return _sensor_of_table(table, effects)
     except InputError as error:
-        raise InputError(f"{where}: {error}") from error
+        raise InputError(f"{where}: {error}", argument=error.argument) from error
 
 
 def _sensor_of_table(table: dict[str, Any], effects: Mapping[str, type[Effect]]) -> Sensor:

@@ -21,7 +21,7 @@ import warp as wp
 from dase.effects import EFFECTS, Effect, StreamEffect
 from dase.errors import InputError, nearest
 from dase.events import LABELS
-from dase.kernels import pixel_codegen, pixel_compile, pixel_stages
+from dase.kernels import pixel_codegen_model, pixel_compile, pixel_stages
 from dase.scenes.video import VideoScene
 from dase.simulation.sensor import Sensor
 from dase.simulation.simulate import simulate
@@ -197,7 +197,7 @@ class _EffectDefinition:
             # what the composed kernel itself keeps for an effect with noise events
             taken |= {"hazard", "rest", "events", "spend", "left"}
         for name in (*known, *effect.states):
-            if name in taken or pixel_codegen.DRAW.fullmatch(name):
+            if name in taken or pixel_codegen_model.random_number(name):
                 raise self.wrong(f"{effect.name}.{name}: the name is one of dase's own; choose another")
         if len({*known, *effect.states}) != len(known) + len(effect.states):
             raise self.wrong(f"effect '{effect.name}': parameters and states must have names of their own")

@@ -332,10 +332,10 @@ def test_frames_far_larger_than_the_head_says_are_not_decoded(tmp_path):
     script = """
 import sys
 import dase.io, dase.scenes.video
-from dase import capture
+from dase.io import ffmpeg
 before = peak()
 print(*dase.io.read(sys.argv[1]).frames.shape, peak() - before)
-capture.FLOOR = 1 << 30
+ffmpeg.FLOOR = 1 << 30
 before = peak()
 print(*dase.io.read(sys.argv[1]).frames.shape, peak() - before)
 """
