@@ -10,8 +10,9 @@ from numpy.typing import NDArray
 
 from dase.fitting.parameter_space import ParameterSpace
 from dase.fitting.scheduler import SimulationRequest, Work
-from dase.fitting.subset import PixelSubset
+from dase.fitting.subset import CalibratedSubset
 from dase.probes.distance import ErrorScale
+from dase.probes.random_streams import Draw
 
 Array = NDArray[np.float64]
 
@@ -78,7 +79,7 @@ class DescentEnd:
 
 
 def descent_work(
-    half: PixelSubset,
+    half: CalibratedSubset,
     space: ParameterSpace,
     start: Array,
     *,
@@ -104,7 +105,7 @@ def descent_work(
         patient: Whether populations that still bring the loss down much do not count either.
         over: Asked after each population, with the loss and that before, whether to stop.
     """
-    rng = np.random.default_rng([seed, 7])
+    rng = Draw.POPULATION.generator(seed)
     low, high = space.bounds()
     centre = np.clip(start, low, high)
     places, tried = np.empty((0, len(centre))), np.empty((0, len(half.scale.target)))
@@ -218,7 +219,7 @@ def robust_step(scale: ErrorScale, values: Array, slope: Array, offset: Array) -
 
 
 def ranking_work(
-    half: PixelSubset, space: ParameterSpace, starts: Sequence[Array] | Array, *, seed: int
+    half: CalibratedSubset, space: ParameterSpace, starts: Sequence[Array] | Array, *, seed: int
 ) -> Work[tuple[Array, Array]]:
     """Return places in order of their loss, and the losses, see `scheduler`."""
     places = np.atleast_2d(np.asarray(starts))
