@@ -44,7 +44,7 @@ class LazyGroup(click.Group):
         return command
 
 
-def version(ctx: click.Context, parameter: click.Parameter, value: bool) -> None:
+def print_version(ctx: click.Context, parameter: click.Parameter, value: bool) -> None:
     """Print the version and exit."""
     if value and not ctx.resilient_parsing:
         from importlib.metadata import version as installed
@@ -55,9 +55,14 @@ def version(ctx: click.Context, parameter: click.Parameter, value: bool) -> None
 
 @click.group(cls=LazyGroup, context_settings={"help_option_names": ["-h", "--help"]})
 @click.option(
-    "--version", is_flag=True, expose_value=False, is_eager=True, callback=version, help="Print the version."
+    "--version",
+    is_flag=True,
+    expose_value=False,
+    is_eager=True,
+    callback=print_version,
+    help="Print the version.",
 )
-def group() -> None:
+def dase_group() -> None:
     """Simulate event cameras: exact, fast, and like yours."""
 
 
@@ -66,16 +71,16 @@ def main() -> None:
     from dase.errors import InputError
 
     try:
-        code = group.main(standalone_mode=False)
+        code = dase_group.main(standalone_mode=False)
     except click.exceptions.Abort:
-        _leave("interrupted", 130)
+        _exit_with("interrupted", 130)
     except KeyboardInterrupt:
-        _leave("interrupted", 130)
+        _exit_with("interrupted", 130)
     except click.ClickException as error:
         error.show()
         sys.exit(error.exit_code)
     except InputError as error:
-        _leave(str(error), 2)
+        _exit_with(str(error), 2)
     except BrokenPipeError:
         # the reader of our output has gone; nothing is left to say to it
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
@@ -84,10 +89,10 @@ def main() -> None:
         reason = (
             "no space left on the disk" if error.errno == errno.ENOSPC else (error.strerror or str(error))
         )
-        _leave(f"{error.filename}: {reason}" if error.filename else reason, 2)
+        _exit_with(f"{error.filename}: {reason}" if error.filename else reason, 2)
     sys.exit(code if isinstance(code, int) else 0)
 
 
-def _leave(message: str, code: int) -> None:
+def _exit_with(message: str, code: int) -> None:
     click.echo(f"dase: {message}", err=True)
     sys.exit(code)

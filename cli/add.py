@@ -12,7 +12,7 @@ from dase.cli.options import effects_option, sensor_output
 if TYPE_CHECKING:
     from dase.effects import Effect
     from dase.simulation.sensor import Sensor
-    from dase.simulation.sensor_history import Entry
+    from dase.simulation.sensor_history import HistoryEntry
 
 
 @click.command()
@@ -36,7 +36,7 @@ if TYPE_CHECKING:
 @click.option("--seed", default=0, show_default=True, help="The same seed gives the same fit.")
 @sensor_output
 @effects_option
-def command(
+def add_command(
     sensor: str,
     effect: str,
     settings: tuple[str, ...],
@@ -51,63 +51,63 @@ def command(
 
     The effect gets its default values and goes where it acts. The change is noted at the end of the file.
     """
-    from dase.effects import find
+    from dase.effects import find_effect
     from dase.simulation import sensor_edit
     from dase.simulation.user_effects import known_effects
 
-    values = dict(split(setting) for setting in settings)
+    values = dict(split_setting(setting) for setting in settings)
     known = known_effects(effects)
-    chosen = sensor_edit.parse_values(find(effect, known), values)
-    text = sensor_edit.read(sensor, known)
+    chosen = sensor_edit.parse_values(find_effect(effect, known), values)
+    text = sensor_edit.read_sensor_text(sensor, known)
     more = text.added(chosen)
-    entry = sensor_edit.today(f"add {effect}")
+    entry = sensor_edit.history_entry_today(f"add {effect}")
     if recording is not None:
-        fitted, entry = _fitted(text.sensor(), chosen, recording, scene, device, seed)
-        more = more.became(fitted)
-    sensor_edit.write(more.noted(entry), output)
+        fitted, entry = _fit_effect(text.sensor(), chosen, recording, scene, device, seed)
+        more = more.describing(fitted)
+    sensor_edit.write_sensor_text(more.noted(entry), output)
     if output is None:
         return
-    click.echo(f"{output}: {effect} added ({said(more.sensor()[effect])})")
+    click.echo(f"{output}: {effect} added ({describe_values(more.sensor()[effect])})")
     if entry.error_before is not None and entry.error_after is not None:
         errors = f"error {entry.error_before:.2f} before, {entry.error_after:.2f} after"
         click.echo(f"{errors}; 1 is what two repeats of the recording give")
 
 
-def _fitted(
+def _fit_effect(
     sensor: Sensor, effect: Effect, recording: Path, scene: str, device: str, seed: int
-) -> tuple[Sensor, Entry]:
+) -> tuple[Sensor, HistoryEntry]:
     """Return the sensor with the effect, fitted to a recording, and what is to be noted."""
-    from dase.cli.diagnose import bar
+    from dase.cli.diagnose import progress_bar
     from dase.diagnosis import sensor_update
     from dase.diagnosis.add_effect import fit_added
     from dase.diagnosis.measurement import open_measurement
     from dase.simulation import sensor_edit
 
     data = open_measurement(recording, scene)
-    with bar(False) as tell:
+    with progress_bar(False) as tell:
         before, found = fit_added(
             data.events, data.scene, sensor, effect, trust=data.trust, seed=seed, device=device, progress=tell
         )
     for note in data.noted(found).notes:
         click.echo(f"note: {note}", err=True)
-    entry = sensor_edit.today(
+    entry = sensor_edit.history_entry_today(
         f"add {effect.name}",
         recording=recording.name,
         error_before=round(before, 3),
         error_after=round(found.error, 3),
         floor=found.floor,
     )
-    return sensor_update.rounded(found.sensor), entry
+    return sensor_update.round_parameters(found.sensor), entry
 
 
-def said(effect: Effect) -> str:
+def describe_values(effect: Effect) -> str:
     """Return the values of an effect in a line."""
     return ", ".join(
         f"{p.name} {getattr(effect, p.name):g} {p.unit}".removesuffix(" 1") for p in effect.parameters()
     )
 
 
-def split(setting: str) -> tuple[str, str]:
+def split_setting(setting: str) -> tuple[str, str]:
     """Return name and value of a text such as rate=0.2."""
     name, equals, value = setting.partition("=")
     if not equals or not name.strip():

@@ -28,7 +28,7 @@ from dase.cli.options import check_suffix, effects_option, fps_option, open_reco
 @click.option("--device", default="cpu", show_default=True, help="cpu or cuda.")
 @click.option("--seed", default=0, show_default=True, help="The same seed gives the same numbers.")
 @click.option("--quiet", is_flag=True, help="No progress.")
-def command(
+def compare_command(
     sensor: str,
     recording: Path,
     file: Path | None,
@@ -45,7 +45,7 @@ def command(
 
     1 is the error that two repeats of the recording would have. Nothing is fitted: `dase fit` does that.
     """
-    from dase.cli.diagnose import bar
+    from dase.cli.diagnose import progress_bar
     from dase.diagnosis.compare import compare
     from dase.io import replacing
     from dase.simulation.sensor_file import load_sensor
@@ -53,7 +53,7 @@ def command(
 
     model = load_sensor(sensor, known_effects(effects))
     measured = open_recorded(recording, scene, file, fps)
-    with bar(quiet) as tell:
+    with progress_bar(quiet) as tell:
         found = compare(
             measured.events, measured.scene, model, trust=measured.trust, pixels=pixels, seed=seed,
             device=device, progress=tell,
@@ -75,9 +75,9 @@ def command(
     if output is not None:
         from dase.figures import report
 
-        plates = report.pictures(measured, model, seed=seed, device=device)
+        plates = report.measurement_plates(measured, model, seed=seed, device=device)
         page = report.comparison_page(found, recording=recording.name, model=Path(sensor).stem, plates=plates)
-        report.write(output, page)
+        report.write_page(output, page)
         with replacing(output.with_suffix(".json")) as part:
             part.write_text(json.dumps(found.to_json(), indent=2) + "\n")
         click.echo(f"{output}: open it in a browser")

@@ -15,7 +15,7 @@ from dase.cli.options import parse_size
 @click.option("--format", "format_", help="Format of TARGET.  [default: by its suffix]")
 @click.option("--size", callback=parse_size, metavar="WxH", help="Columns x rows.  [default: as SOURCE says]")
 @click.option("--events-only", is_flag=True, help="Leave frames behind.")
-def command(
+def convert_command(
     source: Path, target: Path, format_: str | None, size: tuple[int, int] | None, events_only: bool
 ) -> None:
     """Convert the events of SOURCE, any file dase reads, to TARGET.

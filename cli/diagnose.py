@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from dase.results import Diagnosis
 
 
-def explain(ctx: click.Context, parameter: click.Parameter, value: str | None) -> None:
+def print_explanation(ctx: click.Context, parameter: click.Parameter, value: str | None) -> None:
     """Say what an effect is and what it does to the probes, and exit.
 
     Not eager: `--effects`, which is, must be known by then wherever it stands; options that are given come
@@ -25,10 +25,10 @@ def explain(ctx: click.Context, parameter: click.Parameter, value: str | None) -
     """
     if value is None or ctx.resilient_parsing:
         return
-    from dase.diagnosis.explain_effect import explanation
+    from dase.diagnosis.explain_effect import explain_effect
     from dase.simulation.user_effects import known_effects
 
-    click.echo(explanation(value, known_effects(ctx.params.get("effects", ()))))
+    click.echo(explain_effect(value, known_effects(ctx.params.get("effects", ()))))
     ctx.exit()
 
 
@@ -59,9 +59,9 @@ def explain(ctx: click.Context, parameter: click.Parameter, value: str | None) -
 @click.option("--device", default="cpu", show_default=True, help="cpu or cuda.")
 @click.option("--seed", default=0, show_default=True, help="The same seed gives the same findings.")
 @click.option("--quiet", is_flag=True, help="Only the finding, no progress.")
-@click.option("--explain", metavar="EFFECT", callback=explain, expose_value=False,
+@click.option("--explain", metavar="EFFECT", callback=print_explanation, expose_value=False,
               help="Say what EFFECT is and what it does to the probes, and exit.")  # fmt: skip
-def command(
+def diagnose_command(
     sensor: str,
     recording: Path,
     file: Path | None,
@@ -91,11 +91,11 @@ def command(
     from dase.simulation.user_effects import known_effects
 
     known = known_effects(effects)
-    text = sensor_edit.read(sensor, known)
+    text = sensor_edit.read_sensor_text(sensor, known)
     model = text.sensor()
     measured = open_recorded(recording, scene, file, fps)
     names = free.split(",") if free else None
-    with bar(quiet) as tell:
+    with progress_bar(quiet) as tell:
         found = diagnose(
             measured.events, measured.scene, model, trust=measured.trust, effects=known, free=names,
             most=MOST if auto else 1, pixels=pixels, seed=seed, device=device, progress=tell,
@@ -105,7 +105,7 @@ def command(
         with replacing(json_) as part:
             part.write_text(json.dumps(found.to_json(), indent=2) + "\n")
     if output is not None:
-        sensor_edit.write(sensor_update.diagnosed(text, found, recording.name), output)
+        sensor_edit.write_sensor_text(sensor_update.with_diagnosis(text, found, recording.name), output)
     if draw is not None:
         from dase.figures.plot import plot
 
@@ -114,14 +114,14 @@ def command(
     if report is not None:
         from dase.figures import report as pages
 
-        plates = pages.pictures(measured, found.sensor, seed=seed, device=device)
+        plates = pages.measurement_plates(measured, found.sensor, seed=seed, device=device)
         page = pages.diagnosis_page(found, recording=recording.name, model=Path(sensor).stem, plates=plates)
-        pages.write(report, page)
-    _print(found, quiet)
+        pages.write_page(report, page)
+    _print_findings(found, quiet)
 
 
 @contextmanager
-def bar(quiet: bool) -> Iterator[Callable[[str, float, float], None]]:
+def progress_bar(quiet: bool) -> Iterator[Callable[[str, float, float], None]]:
     """Show on a terminal what is being done, how far it is, and the present error."""
     from tqdm import tqdm
 
@@ -137,10 +137,10 @@ def bar(quiet: bool) -> Iterator[Callable[[str, float, float], None]]:
         yield tell
 
 
-def _print(found: Diagnosis, quiet: bool) -> None:
-    from dase.diagnosis.diagnose import summary
+def _print_findings(found: Diagnosis, quiet: bool) -> None:
+    from dase.diagnosis.diagnose import summary_line
 
-    click.echo(summary(found))
+    click.echo(summary_line(found))
     if quiet:
         return
     click.echo(f"error as given {found.before:.2f}; 1 is what two repeats of the recording give")

@@ -26,7 +26,7 @@ from dase.cli.options import check_suffix, effects_option
     help="Draw it into this PNG, SVG or PDF.",
 )
 @effects_option
-def command(
+def distinguish_command(
     a: str,
     b: str,
     longest: float,
@@ -51,7 +51,7 @@ def command(
     known = known_effects(effects)
     names = (Path(a).stem, Path(b).stem) if Path(a).stem != Path(b).stem else ("A", "B")
     models = (load_sensor(a, known), load_sensor(b, known))
-    with tqdm(total=len(standard_stimuli.STANDARDS), unit=" recordings", disable=None) as bar:
+    with tqdm(total=len(standard_stimuli.STANDARD_STIMULI), unit=" recordings", disable=None) as bar:
 
         def progress(stimulus: str, seconds: float, power: float, last: bool) -> None:
             bar.set_postfix_str(f"{stimulus}, {seconds:g} s: {100 * power:.0f} %", refresh=True)
@@ -60,7 +60,7 @@ def command(
         found = distinguish.distinguish(
             *models, names=names, longest=longest, pixels=pixels, seed=seed, device=device, progress=progress
         )
-    table = list(distinguish.rows(found, *names))
+    table = list(distinguish.table_rows(found, *names))
     widths = [max(map(len, column)) for column in zip(*table, strict=True)]
     for row in table:
         click.echo("  ".join(f"{cell:{width}}" for cell, width in zip(row, widths, strict=True)).rstrip())

@@ -10,11 +10,11 @@ from dase.cli.options import effects_option
 
 
 @click.group()
-def command() -> None:
+def effects_command() -> None:
     """List the physical effects, describe one, or begin one of your own."""
 
 
-@command.command("list")
+@effects_command.command("list")
 @effects_option
 def list_effects(effects: tuple[Path, ...]) -> None:
     """List all effects, in the order in which they act."""
@@ -26,15 +26,15 @@ def list_effects(effects: tuple[Path, ...]) -> None:
         click.echo(f"{name:{width}}  {effect.about().splitlines()[0]}")
 
 
-@command.command("show")
+@effects_command.command("show")
 @click.argument("name")
 @effects_option
 def show_effect(name: str, effects: tuple[Path, ...]) -> None:
     """Describe the effect NAME: physics, parameters, source."""
-    from dase.effects import SceneEffect, StreamEffect, find
+    from dase.effects import SceneEffect, StreamEffect, find_effect
     from dase.simulation.user_effects import known_effects
 
-    effect = find(name, known_effects(effects))
+    effect = find_effect(name, known_effects(effects))
     click.echo(f"{effect.name}: {effect.about()}\n")
     for p in effect.parameters():
         low, high = p.plausible
@@ -51,7 +51,7 @@ def show_effect(name: str, effects: tuple[Path, ...]) -> None:
     click.echo(f"Source: {effect.source}")
 
 
-@command.command("new")
+@effects_command.command("new")
 @click.argument("name")
 @click.option("-o", "--output", type=click.Path(path_type=Path), help="Python file.  [default: NAME.py]")
 def new_effect(name: str, output: Path | None) -> None:
@@ -61,5 +61,5 @@ def new_effect(name: str, output: Path | None) -> None:
     output = output or Path(f"{name}.py")
     effect_template.new_effect(name, output)
     click.echo(f"{output} written: put your physics into it. Try it:")
-    for line in effect_template.commands(name, str(output)):
+    for line in effect_template.trial_commands(name, str(output)):
         click.echo(f"    {line}")

@@ -22,7 +22,7 @@ from dase.cli.options import effects_option, fps_option, open_recorded, scene_op
 @click.option("--device", default="cpu", show_default=True, help="cpu or cuda.")
 @click.option("--seed", default=0, show_default=True, help="The same seed gives the same fit.")
 @click.option("--quiet", is_flag=True, help="No progress.")
-def command(
+def fit_command(
     sensor: str,
     recording: Path,
     file: Path | None,
@@ -41,21 +41,21 @@ def command(
     Where only one of the starts came to the error of the best, the minimum may be a poor one: the file is
     written, this is said, and the exit code is 1.
     """
-    from dase.cli.diagnose import bar
+    from dase.cli.diagnose import progress_bar
     from dase.diagnosis import sensor_update
     from dase.fitting.fit import fit
     from dase.simulation import sensor_edit
     from dase.simulation.user_effects import known_effects
 
-    text = sensor_edit.read(sensor, known_effects(effects))
+    text = sensor_edit.read_sensor_text(sensor, known_effects(effects))
     model = text.sensor()
     measured = open_recorded(recording, scene, file, fps)
-    with bar(quiet) as tell:
+    with progress_bar(quiet) as tell:
         found = fit(
             measured.events, measured.scene, model, free=free.split(",") if free else None,
             trust=measured.trust, pixels=pixels, seed=seed, device=device, progress=tell,
         )  # fmt: skip
-    sensor_edit.write(sensor_update.fitted(text, found, recording.name), output)
+    sensor_edit.write_sensor_text(sensor_update.with_fit(text, found, recording.name), output)
     click.echo(f"error {found.before:.2f} → {found.error:.2f}; repeats stay below {found.gate:.2f}")
     for name, estimate in found.parameters.items():
         click.echo(f"  {name:24s} {estimate.value:10.4g}   {estimate.low:.4g} to {estimate.high:.4g}")

@@ -18,7 +18,7 @@ from dase.cli.options import parse_size
     help="Columns x rows.  [default: as FILE says]",
 )
 @click.option("--json", "as_json", is_flag=True, help="Print one JSON object, for programs.")
-def command(file: Path, size: tuple[int, int] | None, as_json: bool) -> None:
+def info_command(file: Path, size: tuple[int, int] | None, as_json: bool) -> None:
     """Say what is in FILE: rates, intervals, hot pixels, frames, what was repaired and what looks odd.
 
     FILE streams through, whatever its size. Isolated events are counted on a sample; all else on all events.
@@ -29,21 +29,21 @@ def command(file: Path, size: tuple[int, int] | None, as_json: bool) -> None:
 
     from dase import io
     from dase.recordings import summary
-    from dase.recordings.anomalies import doubts
+    from dase.recordings.anomalies import find_anomalies
     from dase.recordings.statistics import survey_file
 
     notes: list[str] = []
-    name = io.find(file).name
+    name = io.find_format(file).name
     with tqdm(unit=" events", unit_scale=True, delay=1.0, leave=False, disable=None) as bar:
         found = survey_file(file, size=size, notes=notes, progress=bar.update).statistics()
-    said = [note for note in (*notes, *doubts(found)) if isinstance(note, io.Note)]
+    said = [note for note in (*notes, *find_anomalies(found)) if isinstance(note, io.Note)]
     if as_json:
         return click.echo(json.dumps(summary.as_json(name, found, said), indent=1))
     click.echo(f"{'format':<18}{name}")
-    for key, value in summary.table(found):
+    for key, value in summary.statistics_table(found):
         click.echo(f"{key:<18}{value}")
     click.echo("\ntime between successive events of one pixel")
-    for line in summary.histogram(found):
+    for line in summary.interval_histogram(found):
         click.echo(line)
     if said:
         click.echo()

@@ -14,7 +14,7 @@ from dase.cli.options import effects_option, sensor_output
 @click.argument("effect")
 @sensor_output
 @effects_option
-def command(sensor: str, effect: str, output: Path | None, effects: tuple[Path, ...]) -> None:
+def remove_command(sensor: str, effect: str, output: Path | None, effects: tuple[Path, ...]) -> None:
     """Remove EFFECT from SENSOR, a preset or a TOML file, whose comments stay.
 
     The comment right above the effect goes with it. The change is noted at the end of the file.
@@ -22,7 +22,7 @@ def command(sensor: str, effect: str, output: Path | None, effects: tuple[Path, 
     from dase.simulation import sensor_edit
     from dase.simulation.user_effects import known_effects
 
-    text = sensor_edit.read(sensor, known_effects(effects)).removed(effect)
-    sensor_edit.write(text.noted(sensor_edit.today(f"remove {effect}")), output)
+    text = sensor_edit.read_sensor_text(sensor, known_effects(effects)).removed(effect)
+    sensor_edit.write_sensor_text(text.noted(sensor_edit.history_entry_today(f"remove {effect}")), output)
     if output is not None:
         click.echo(f"{output}: {effect} removed")

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 )
 @click.option("--size", callback=parse_size, metavar="WxH", help="Columns x rows.  [default: as FILE says]")
 @click.option("--trust", is_flag=True, help="Show how far the scene between the frames can be trusted.")
-def command(
+def show_command(
     file: Path,
     output: Path | None,
     at: float | None,
@@ -61,12 +61,12 @@ def command(
     if trust:
         _draw_trust(sequence, output, file.stem, window)
     elif suffix == ".mp4":
-        event_images.video(sequence, output, window=window)
+        event_images.write_video(sequence, output, window=window)
     else:
-        figure = event_images.draw(sequence, title=file.stem, at=at, window=window)
+        figure = event_images.draw_sequence(sequence, title=file.stem, at=at, window=window)
         with io.replacing(output) as temporary:
             figure.savefig(temporary)
-    for name, value in summary.table(event_images.statistics(sequence)):
+    for name, value in summary.statistics_table(event_images.statistics(sequence)):
         click.echo(f"{name:<18}{value}")
     click.echo(f"{'written':<18}{output}")
 
@@ -79,7 +79,7 @@ def _draw_run(folder: Path, output: Path) -> None:
 
     if output.suffix.lower() != ".png":
         raise InputError(f"output: a training run is drawn as a .png, got '{output}'")
-    figure, lines = training_figure.draw(folder)
+    figure, lines = training_figure.draw_training(folder)
     with io.replacing(output) as temporary:
         figure.savefig(temporary)
     for name, value in lines:
@@ -90,12 +90,12 @@ def _draw_run(folder: Path, output: Path) -> None:
 def _draw_trust(sequence: Sequence, output: Path, title: str, window: float | None) -> None:
     """Draw it, and say how much is trusted."""
     from dase import io
-    from dase.diagnosis.measurement import between_frames
+    from dase.diagnosis.measurement import scene_between_frames
     from dase.figures import trust_figure
 
     notes: list[str] = []
-    scene = between_frames(sequence, notes)
-    figure = trust_figure.draw(scene, sequence.events, title=title, window=window)
+    scene = scene_between_frames(sequence, notes)
+    figure = trust_figure.draw_trust(scene, sequence.events, title=title, window=window)
     with io.replacing(output) as temporary:
         figure.savefig(temporary)
     click.echo(f"{100 * scene.trusted().mean():.0f} % of pixels and times trusted")

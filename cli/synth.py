@@ -15,7 +15,7 @@ import click
 from dase.cli.options import effects_option, parse_size
 
 if TYPE_CHECKING:
-    from dase.datasets.generate import Report
+    from dase.datasets.generate import WorkReport
 
 
 @click.command()
@@ -60,7 +60,7 @@ if TYPE_CHECKING:
 )
 @click.option("--fps", type=float, help="Frames per second of --video.  [default: what the file says]")
 @click.option("--resume", is_flag=True, help="Finish what an interrupted run left in OUT.")
-def command(
+def synth_command(
     out: Path,
     images: str,
     sensor: str,
@@ -87,7 +87,7 @@ def command(
     With --video, the events of your own high-speed video are written to the file OUT instead.
     """
     if video is not None:
-        _video(out, video, fps, sensor, effects, size, seed, backend, frame_rate, labels)
+        _synth_video(out, video, fps, sensor, effects, size, seed, backend, frame_rate, labels)
         return
     if fps is not None:
         raise click.UsageError("--fps goes with --video")
@@ -97,7 +97,7 @@ def command(
 
     chosen = replace(load_sensor(sensor, known_effects(effects)), history=())
     width, height = size or chosen.size or (346, 260)
-    job = generate.Job(
+    job = generate.DatasetJob(
         images=images,
         sensor=dump_sensor(chosen),
         sequences=sequences,
@@ -113,13 +113,13 @@ def command(
         effects=tuple(map(str, effects)),
     )
     count = jobs if jobs is not None else (1 if backend.startswith("cuda") else os.cpu_count() or 1)
-    with _bar(sequences, "sequences") as advance:
-        report = generate.run(job, out, jobs=count, resume=resume, progress=advance)
-    _summary(report)
+    with _progress_bar(sequences, "sequences") as advance:
+        report = generate.generate_dataset(job, out, jobs=count, resume=resume, progress=advance)
+    _print_summary(report)
     click.echo(f"Look at one: dase show {job.path(out, 0)}")
 
 
-def _video(
+def _synth_video(
     out: Path,
     video: Path,
     fps: float | None,
@@ -140,7 +140,7 @@ def _video(
 
     model = load_sensor(sensor, known_effects(effects))
     scene = open_video(video, fps=fps, size=size)
-    with _bar(len(sample_times(scene, model)), "frames") as advance:
+    with _progress_bar(len(sample_times(scene, model)), "frames") as advance:
         report = generate.record_scene(
             scene,
             model,
@@ -151,12 +151,12 @@ def _video(
             labels=labels,
             progress=advance,
         )
-    _summary(report)
+    _print_summary(report)
     click.echo(f"Look at it: dase show {out}")
 
 
 @contextmanager
-def _bar(total: int, unit: str) -> Iterator[Callable[[Report], None]]:
+def _progress_bar(total: int, unit: str) -> Iterator[Callable[[WorkReport], None]]:
     """Show a progress bar on a terminal; give the function that a finished piece of work is reported to."""
     from tqdm import tqdm
 
@@ -164,7 +164,7 @@ def _bar(total: int, unit: str) -> Iterator[Callable[[Report], None]]:
         events = 0
         begin = time.perf_counter()
 
-        def advance(done: Report) -> None:
+        def advance(done: WorkReport) -> None:
             nonlocal events
             events += done.events
             rate = events / (time.perf_counter() - begin)
@@ -174,7 +174,7 @@ def _bar(total: int, unit: str) -> Iterator[Callable[[Report], None]]:
         yield advance
 
 
-def _summary(report: Report) -> None:
+def _print_summary(report: WorkReport) -> None:
     seconds = max(report.seconds, 1e-9)
     click.echo(
         f"{report.events:,} events in {report.sequences} sequence{'s' * (report.sequences != 1)}, "

@@ -34,7 +34,7 @@ if TYPE_CHECKING:
 @click.option("--backend", default="cpu", show_default=True, help="cpu or cuda.")
 @click.option("--resume", is_flag=True, help="Go on where an interrupted run stopped.")
 @click.option("--tensorboard", is_flag=True, help="Write the log for TensorBoard, too.")
-def command(
+def train_command(
     targets: tuple[str, ...],
     output: Path,
     images: str | None,
@@ -64,7 +64,7 @@ def command(
     try:
         from dase.learning import distributed
         from dase.learning import job as learning_job
-        from dase.learning.run import CHECKPOINT, Pace, run
+        from dase.learning.run import CHECKPOINT, RunSchedule, train_in_folder
     except ModuleNotFoundError as error:
         if error.name not in ("torch", "safetensors"):
             raise
@@ -73,39 +73,41 @@ def command(
         targets=targets, images=images or "", preset=preset, objective=objective, steps=steps, window=window,
         size=size, sequences=sequences, pattern=pattern, seed=seed, backend=backend,
     )  # fmt: skip
-    backend = distributed.join(backend)
-    first = distributed.rank() == 0
+    backend = distributed.join_processes(backend)
+    first = distributed.process_rank() == 0
     if first:
-        learning_job.begin(job, output, resume=resume)
-    with _bar(silent=not first) as opened:
-        training = learning_job.prepare(replace(job, backend=backend), progress=opened)
+        learning_job.record_job(job, output, resume=resume)
+    with _OpeningBar(silent=not first) as opened:
+        training = learning_job.open_training(replace(job, backend=backend), progress=opened)
     looks = 100 if backend.startswith("cuda") else 25
-    pace = Pace(look=10 if preset == "tiny" else looks, seconds=None if minutes is None else 60 * minutes)
-    with _live(training, output if tensorboard and first else None, silent=not first) as look:
+    pace = RunSchedule(
+        look=10 if preset == "tiny" else looks, seconds=None if minutes is None else 60 * minutes
+    )
+    with _LiveLine(training, output if tensorboard and first else None, silent=not first) as look:
         # killed before its first checkpoint, a run begins anew
         resume = resume and (output / CHECKPOINT).is_file()
-        last = run(training, output, pace=pace, resume=resume, look=look)
+        last = train_in_folder(training, output, pace=pace, resume=resume, look=look)
     if first:
-        _finish(job, output, training, last)
-    distributed.leave()
+        _write_results(job, output, training, last)
+    distributed.leave_processes()
 
 
-def _finish(job: Any, output: Path, training: Any, last: dict[str, float]) -> None:
+def _write_results(job: Any, output: Path, training: Any, last: dict[str, float]) -> None:
     """Write the sensor and say what was learned."""
     from dase.learning import job as learning_job
 
-    width, height = training.scenery.looks.width, training.scenery.looks.height
-    recorded = None if job.of_sensor else (width, height)
+    width, height = training.scenery.scene_settings.width, training.scenery.scene_settings.height
+    recorded = None if job.targets_sensor else (width, height)
     path = learning_job.write_sensor(
         output, training.mean, mu=last["mu"], name=output.name or "learned", size=recorded
     )
     learning_job.write_examples(output, training)
-    for line in summary(last):
+    for line in summary_of_run(last):
         click.echo(line)
     click.echo(f"{path}: try dase synth --sensor {path}, or look at it: dase show {output}")
 
 
-def summary(row: dict[str, float]) -> list[str]:
+def summary_of_run(row: dict[str, float]) -> list[str]:
     """Return what was learned, in a few lines."""
     lines = [
         f"thresholds {row['mu']:.3f} ± {row['sigma']:.3f} (mean over pixels; the mean varies by "
@@ -118,7 +120,7 @@ def summary(row: dict[str, float]) -> list[str]:
     return lines
 
 
-class _bar:
+class _OpeningBar:
     """A progress bar for what is opened."""
 
     def __init__(self, *, silent: bool):
@@ -140,7 +142,7 @@ class _bar:
         self.bar.close()
 
 
-class _live:
+class _LiveLine:
     """The live line of a run, and TensorBoard's log."""
 
     def __init__(self, training: Any, folder: Path | None, *, silent: bool):

@@ -7,17 +7,17 @@ import math
 SCALES = ((1e9, "G"), (1e6, "M"), (1e3, "k"), (1.0, ""), (1e-3, "m"), (1e-6, "µ"))
 
 
-def grouped(count: int) -> str:
+def format_count(count: int) -> str:
     """Return a count with its thousands set apart."""
     return f"{count:,}".replace(",", "\N{NO-BREAK SPACE}")
 
 
-def seconds(value: float) -> str:
+def format_seconds(value: float) -> str:
     """Return a time with three digits in a unit that fits: 12.1 s, 3.25 ms, 75 µs."""
-    return metric(value, "s")
+    return format_metric(value, "s")
 
 
-def metric(value: float, unit: str) -> str:
+def format_metric(value: float, unit: str) -> str:
     """Return a quantity with three digits and a prefix that fits; "unknown" where it is not a number."""
     if not math.isfinite(value):
         return "unknown"
@@ -27,7 +27,7 @@ def metric(value: float, unit: str) -> str:
     return f"{text.rstrip('0').rstrip('.') if '.' in text else text} {prefix}{unit}"
 
 
-def percent(share: float) -> str:
+def format_percent(share: float) -> str:
     """Return a share with two or three digits: 0.013 %, 4.2 %, 97 %."""
     if not math.isfinite(share):
         return "unknown"

@@ -19,7 +19,7 @@ from torch.autograd.function import once_differentiable
 from dase.kernels import scene_layers as _scene
 from dase.kernels import threshold_counts as _counts
 from dase.kernels import threshold_surrogates as _surrogates
-from dase.kernels.launch import run
+from dase.kernels.launch import run_kernel
 
 wp.init()  # a bare wp.from_torch fails without it
 
@@ -47,7 +47,7 @@ def count_events(
 ) -> torch.Tensor:
     """Count events exactly, differentiable in the distribution of the thresholds.
 
-    The threshold of a pixel is max(mu + sigma z, 0.01), see `thresholds`. Gradients go to `mu` and `sigma`.
+    The threshold of a pixel is max(mu + sigma z, 0.01), see `clipped_thresholds`. Gradients go to `mu` and `sigma`.
     They treat the phase as a fixed fraction of the threshold, and none goes to `log` or `phase`.
 
     Args:
@@ -74,25 +74,25 @@ def count_events(
         raise ValueError(f"surrogate must be one of {', '.join(get_args(Surrogate))}, got {surrogate!r}")
     if not step > 0:
         raise ValueError(f"step must be > 0, got {step}")
-    _check("log", log, None, None)
+    check_tensor("log", log, None, None)
     if log.ndim < 3 or log.shape[1] < 2:
         raise ValueError(f"log must have shape (B, K, *S) with K >= 2, got {tuple(log.shape)}")
     batch, samples, *space = log.shape
-    threshold = thresholds(mu, sigma, z, like=log).flatten(2)
+    threshold = clipped_thresholds(mu, sigma, z, like=log).flatten(2)
     if phase is None:
         start = torch.zeros(batch, threshold.shape[2], device=log.device)
     else:
-        _check("phase", phase, ((batch, *space),), log.device)
+        check_tensor("phase", phase, ((batch, *space),), log.device)
         fraction = phase.detach().float().flatten(1)
         on, off = threshold.detach()[:, -1], threshold.detach()[:, 0]
         start = fraction * torch.where(fraction >= 0, on, off)
-    window = _window(windows, samples - 1)
+    window = _window_indices(windows, samples - 1)
     flat = log.detach().flatten(2)
     counts = _Count.apply(flat, threshold, start, window, surrogate, step)
     return counts.view(batch, max(window) + 1, 2, *space)
 
 
-def thresholds(
+def clipped_thresholds(
     mu: torch.Tensor, sigma: torch.Tensor | float, z: torch.Tensor | float, *, like: torch.Tensor
 ) -> torch.Tensor:
     """Return the thresholds max(mu + sigma z, 0.01) that `count_events` uses.
@@ -119,7 +119,7 @@ def thresholds(
         if isinstance(value, (int, float)) and name != "mu":
             parts.append(value)
             continue
-        _check(name, value, ((batch, *space), (batch, 2, *space)), like.device)
+        check_tensor(name, value, ((batch, *space), (batch, 2, *space)), like.device)
         value = value.float()
         parts.append(value if value.ndim == like.ndim else value.unsqueeze(1))
     return _Floor.apply(parts[0] + parts[1] * parts[2], parts[0].detach())
@@ -164,20 +164,22 @@ class _Count(torch.autograd.Function):
         counts = torch.zeros(batch, max(target) + 1, 2, pixels, device=log.device)
         seen = _scene.Frames()
         seen.values = wp.from_torch(log.view(batch * samples, pixels))
-        lanes = _counts.widest(pixels, wp.device_from_torch(log.device), "log")
-        shared, aligned = threshold.shape[1] == 1, _counts.aligned("log", seen, pixels)
-        kernel = _counts.count(lanes, "log", shared=shared, states=False, aligned=aligned)
+        lanes = _counts.widest_block(pixels, wp.device_from_torch(log.device), "log")
+        shared, aligned = threshold.shape[1] == 1, _counts.samples_are_aligned("log", seen, pixels)
+        kernel = _counts.counting_kernel(lanes, "log", shared=shared, states=False, aligned=aligned)
         unused = torch.empty(batch, 0, device=log.device)
         inputs = [
             seen, samples, wp.empty(0, dtype=int, device=log.device.type), pixels, 1, 1, threshold,
-            torch.zeros(batch, device=log.device), _on_device(tuple(k + 1 for k in runs), log.device),
-            _on_device(target, log.device), log[:, 0] - phase,
+            torch.zeros(batch, device=log.device), indices_on_device(tuple(k + 1 for k in runs), log.device),
+            indices_on_device(target, log.device), log[:, 0] - phase,
         ]  # fmt: skip
-        _launch(kernel, inputs, [unused, unused, counts], over=log, size=_counts.blocks(pixels, lanes))
+        launch_on_tensors(
+            kernel, inputs, [unused, unused, counts], over=log, size=_counts.block_count(pixels, lanes)
+        )
         if not once:
             sums = counts.new_zeros(batch, max(window) + 1, 2, pixels)
-            counts = sums.index_add_(1, _on_device(window, log.device), counts)
-        ctx.save_for_backward(log, threshold, phase, _on_device(windows, log.device), counts)
+            counts = sums.index_add_(1, indices_on_device(window, log.device), counts)
+        ctx.save_for_backward(log, threshold, phase, indices_on_device(windows, log.device), counts)
         ctx.surrogate, ctx.step = surrogate, step
         return counts
 
@@ -188,15 +190,17 @@ class _Count(torch.autograd.Function):
         gradient = gradient.float().contiguous()
         out = torch.zeros_like(threshold)
         if ctx.surrogate == "events":
-            _launch(_surrogates.events_gradient, [threshold, counts, gradient], [out])
+            launch_on_tensors(_surrogates.events_gradient, [threshold, counts, gradient], [out])
         elif ctx.surrogate == "interval":
-            _launch(_surrogates.interval_gradient, [log, threshold, phase, window, gradient], [out])
+            launch_on_tensors(_surrogates.interval_gradient, [log, threshold, phase, window, gradient], [out])
         else:
-            _launch(_surrogates.expected_gradient, [log, threshold, phase, window, gradient, ctx.step], [out])
+            launch_on_tensors(
+                _surrogates.expected_gradient, [log, threshold, phase, window, gradient, ctx.step], [out]
+            )
         return None, out, None, None, None, None
 
 
-def _launch(
+def launch_on_tensors(
     kernel: wp.Kernel,
     inputs: list[Any],
     outputs: list[Any],
@@ -213,8 +217,8 @@ def _launch(
     # detached: Warp would ask a tensor that requires a gradient for its .grad
     arguments = [wp.from_torch(a.detach()) if isinstance(a, torch.Tensor) else a for a in (*inputs, *outputs)]
     device = wp.device_from_torch(shape.device)
-    with _stream(shape.device):
-        run(
+    with _follow_torch_stream(shape.device):
+        run_kernel(
             kernel,
             shape.shape[-1] if size is None else size,
             arguments,
@@ -224,7 +228,7 @@ def _launch(
         )
 
 
-def _stream(device: torch.device) -> AbstractContextManager[Any]:
+def _follow_torch_stream(device: torch.device) -> AbstractContextManager[Any]:
     """Make Warp follow PyTorch's current stream of a CUDA `device`."""
     if device.type != "cuda":
         return nullcontext()
@@ -232,7 +236,7 @@ def _stream(device: torch.device) -> AbstractContextManager[Any]:
     return wp.ScopedStream(wp.stream_from_torch(torch.cuda.current_stream(device)), sync_enter=False)
 
 
-def _check(
+def check_tensor(
     name: str, value: Any, shapes: tuple[tuple[int, ...], ...] | None, device: torch.device | None
 ) -> None:
     """Raise ValueError unless `value` is a floating-point tensor of one of `shapes` on `device`."""
@@ -247,7 +251,7 @@ def _check(
         raise ValueError(f"{name} must be on {device}, got {value.device}")
 
 
-def _window(windows: Sequence[int] | torch.Tensor | None, intervals: int) -> tuple[int, ...]:
+def _window_indices(windows: Sequence[int] | torch.Tensor | None, intervals: int) -> tuple[int, ...]:
     """Return the window of every interval, shape (K - 1,).
 
     Raises:
@@ -269,7 +273,7 @@ def _window(windows: Sequence[int] | torch.Tensor | None, intervals: int) -> tup
 
 
 @lru_cache(maxsize=64)
-def _on_device(indices: tuple[int, ...], device: torch.device) -> torch.Tensor:
+def indices_on_device(indices: tuple[int, ...], device: torch.device) -> torch.Tensor:
     """Return `indices` as int32 on `device`, kept so that a training loop copies them once."""
     # a tensor born in inference mode could not be saved for a later backward pass
     with torch.inference_mode(False):

@@ -10,11 +10,11 @@ import torch
 from dase.kernels import critic_layers as _critics
 from dase.kernels import critic_products as _bank
 from dase.kernels import critic_rows as _rows
-from dase.kernels.autograd_counts import _launch
+from dase.kernels.autograd_counts import launch_on_tensors
 
 
 @dataclass
-class Layout:
+class RowLayout:
     """Rows of a step, critic by critic, each critic's in the order fake, real, half way between.
 
     Args:
@@ -38,14 +38,14 @@ class Layout:
     sides: int
 
 
-def in_order(keys: torch.Tensor, *, below: int) -> tuple[torch.Tensor, torch.Tensor]:
+def sort_keys(keys: torch.Tensor, *, below: int) -> tuple[torch.Tensor, torch.Tensor]:
     """Return keys (N,) from 0 on in order, int32, and where each was; equal ones keep their order."""
     # a GPU's sort goes over all bits of a key
     ordered, order = torch.sort(keys.short() if below <= 2**15 else keys, stable=True)
     return ordered.int(), order
 
 
-def lay_out(fake: torch.Tensor, real: torch.Tensor, weights: torch.Tensor) -> Layout:
+def lay_out_rows(fake: torch.Tensor, real: torch.Tensor, weights: torch.Tensor) -> RowLayout:
     """Lay out the rows of critics that have some of both sides.
 
     Args:
@@ -55,8 +55,8 @@ def lay_out(fake: torch.Tensor, real: torch.Tensor, weights: torch.Tensor) -> La
     """
     critics, sides, device = len(weights), len(fake) + len(real), weights.device
     number, size = (torch.empty(2, critics, dtype=torch.int32, device=device) for _ in range(2))
-    keys, row = in_order(torch.cat([2 * fake, 2 * real + 1]), below=2 * critics + 2)
-    _launch(_rows.count_rows, [keys], [number, size], over=weights[None])
+    keys, row = sort_keys(torch.cat([2 * fake, 2 * real + 1]), below=2 * critics + 2)
+    launch_on_tensors(_rows.count_rows, [keys], [number, size], over=weights[None])
     end = size.cumsum(1, dtype=torch.int32)
 
     def preset(size: int, value: int) -> torch.Tensor:
@@ -66,26 +66,28 @@ def lay_out(fake: torch.Tensor, real: torch.Tensor, weights: torch.Tensor) -> La
     order, of, place = preset(whole, -1), preset(whole, critics), preset(len(fake), -1)
     gain, held = (torch.zeros(n, device=device) for n in (whole, len(fake)))
     outputs = [order, of, gain, place, held]
-    _launch(_rows.place_rows, [keys, row, number, end, weights], outputs, over=keys[None])
-    return Layout(number, end, order, of, gain, place, held, sides)
+    launch_on_tensors(_rows.place_rows, [keys, row, number, end, weights], outputs, over=keys[None])
+    return RowLayout(number, end, order, of, gain, place, held, sides)
 
 
-def gather(
-    fake: torch.Tensor, real: torch.Tensor, share: torch.Tensor, layout: Layout, dtype: torch.dtype
+def gather_rows(
+    fake: torch.Tensor, real: torch.Tensor, share: torch.Tensor, layout: RowLayout, dtype: torch.dtype
 ) -> torch.Tensor:
     """Return all rows in order, (R, K) of `dtype`; `share` (N, 1) is that of the fake one half way."""
     rows = torch.empty(len(layout.order), fake.shape[1], dtype=dtype, device=fake.device)
     inputs = [fake, real, share, layout.order, layout.of, layout.number]
-    _launch(_layers(rows).gather, inputs, [_words(rows)], size=rows.shape[1] // 4)
+    launch_on_tensors(_layer_kernels(rows).gather, inputs, [_as_words(rows)], size=rows.shape[1] // 4)
     return rows
 
 
-def pace(
-    layout: Layout, rate: torch.Tensor, steps: torch.Tensor, *, decay: float
+def count_steps(
+    layout: RowLayout, rate: torch.Tensor, steps: torch.Tensor, *, decay: float
 ) -> tuple[torch.Tensor, torch.Tensor]:
     """Count a step of the critics that have rows in `steps` (C,); return their rates and corrections."""
     rates, correction = torch.empty_like(steps), torch.empty_like(steps)
-    _launch(_rows.pace, [layout.number, rate.view(1), decay], [steps, rates, correction], over=steps[None])
+    launch_on_tensors(
+        _rows.count_steps, [layout.number, rate.view(1), decay], [steps, rates, correction], over=steps[None]
+    )
     return rates, correction
 
 
@@ -94,7 +96,7 @@ def first_layer(
 ) -> tuple[torch.Tensor, torch.Tensor]:
     """Return the sums of the first layer, float32 (R, J), and what goes on, in the type of the product."""
     total, hidden = torch.empty_like(product, dtype=torch.float32), torch.empty_like(product)
-    _launch(_layers(product).first_layer, [product, of, bias, slope], [total, hidden])
+    launch_on_tensors(_layer_kernels(product).first_layer, [product, of, bias, slope], [total, hidden])
     return total, hidden
 
 
@@ -107,48 +109,55 @@ def second_layer(
     """
     total, by_total = (torch.empty_like(product, dtype=torch.float32) for _ in range(2))
     back = torch.empty_like(product)
-    _launch(_layers(product).second_layer, [product, of, bias, last, slope], [total, by_total, back])
+    launch_on_tensors(
+        _layer_kernels(product).second_layer, [product, of, bias, last, slope], [total, by_total, back]
+    )
     return total, by_total, back
 
 
-def way_back(
+def back_through_first_layer(
     product: torch.Tensor, of: torch.Tensor, total: torch.Tensor, *, critics: int, slope: float
 ) -> torch.Tensor:
     """Return the scores' derivative by the sums `total` of the first layer, float32 (R, J)."""
     out = torch.empty_like(total)
-    _launch(_layers(product).way_back, [product, of, total, slope, critics], [out])
+    launch_on_tensors(_layer_kernels(product).way_back, [product, of, total, slope, critics], [out])
     return out
 
 
-def score(
+def score_rows(
     second: torch.Tensor, of: torch.Tensor, last: torch.Tensor, bias: torch.Tensor, *, slope: float
 ) -> torch.Tensor:
     """Return the score of each row (R,) from the sums of the second layer; 0 for rows of no critic."""
     out = torch.empty(len(of), device=second.device)
-    _launch(_critics.score, [second, of, last, bias, slope], [out], over=out[None])
+    launch_on_tensors(_critics.score_rows, [second, of, last, bias, slope], [out], over=out[None])
     return out
 
 
-def half_way(values: torch.Tensor, layout: Layout, dtype: torch.dtype) -> torch.Tensor:
+def rows_half_way(values: torch.Tensor, layout: RowLayout, dtype: torch.dtype) -> torch.Tensor:
     """Return the rows half way of values of all rows, (N, J) of `dtype`."""
     out = torch.empty(len(layout.place), values.shape[1], dtype=dtype, device=values.device)
-    _launch(_layers(out).half_way, [values, layout.place], [out])
+    launch_on_tensors(_layer_kernels(out).half_way, [values, layout.place], [out])
     return out
 
 
-def penalise(gradient: torch.Tensor, layout: Layout, rows: torch.Tensor) -> torch.Tensor:
+def penalise_gradient(gradient: torch.Tensor, layout: RowLayout, rows: torch.Tensor) -> torch.Tensor:
     """Return half the derivative of the mean square by the gradient (N, K), and set `rows` half way to it."""
     out = torch.empty_like(gradient)
-    inputs = [_words(gradient), layout.place, layout.held]
-    _launch(_layers(gradient).penalise, inputs, [_words(out), _words(rows)], size=gradient.shape[1] // 4)
+    inputs = [_as_words(gradient), layout.place, layout.held]
+    launch_on_tensors(
+        _layer_kernels(gradient).penalise,
+        inputs,
+        [_as_words(out), _as_words(rows)],
+        size=gradient.shape[1] // 4,
+    )
     return out
 
 
-def again_first(
+def penalty_through_first_layer(
     product: torch.Tensor,
     total: torch.Tensor,
     by_total: torch.Tensor,
-    layout: Layout,
+    layout: RowLayout,
     hidden: torch.Tensor,
     *,
     slope: float,
@@ -160,22 +169,24 @@ def again_first(
     """
     out, square = torch.empty_like(product), torch.empty_like(product, dtype=torch.float32)
     inputs = [product, total, by_total, layout.place, slope, penalty]
-    _launch(_layers(product).again_first, inputs, [out, hidden, square])
+    launch_on_tensors(_layer_kernels(product).again_first, inputs, [out, hidden, square])
     return out, square
 
 
-def again_second(
-    product: torch.Tensor, total: torch.Tensor, layout: Layout, last: torch.Tensor, *, slope: float
+def penalty_through_second_layer(
+    product: torch.Tensor, total: torch.Tensor, layout: RowLayout, last: torch.Tensor, *, slope: float
 ) -> None:
     """Set `last` half way to a product (N, J) times the slopes of the second layer."""
-    _launch(_layers(product).again_second, [total, layout.place, slope, product], [last], over=product)
+    launch_on_tensors(
+        _layer_kernels(product).again_second, [total, layout.place, slope, product], [last], over=product
+    )
 
 
-def weigh(
+def weigh_rows(
     second: torch.Tensor,
     by_first: torch.Tensor,
     by_second: torch.Tensor,
-    layout: Layout,
+    layout: RowLayout,
     *,
     slope: float,
     penalty: float,
@@ -183,25 +194,27 @@ def weigh(
     """Return the left rows of both layers' gradients, and the terms of the third's but for rows half way."""
     order, gain, between = layout.order, layout.gain, layout.sides
     left_first, left_second, last = (torch.empty_like(v) for v in (by_first, by_second, second))
-    _launch(_critics.weigh_first, [by_first, order, gain, between, penalty], [left_first])
-    _launch(_critics.weigh_second, [second, by_second, order, gain, between, slope], [left_second, last])
+    launch_on_tensors(_critics.weigh_first, [by_first, order, gain, between, penalty], [left_first])
+    launch_on_tensors(
+        _critics.weigh_second, [second, by_second, order, gain, between, slope], [left_second, last]
+    )
     return left_first, left_second, last
 
 
-def sum_rows(values: torch.Tensor, layout: Layout, *, between: bool) -> torch.Tensor:
+def sum_rows(values: torch.Tensor, layout: RowLayout, *, between: bool) -> torch.Tensor:
     """Return the sum over each critic's rows, (C, J), with or without those half way."""
     out = torch.empty(layout.end.shape[1], values.shape[1], device=values.device)
     before = len(layout.order) if between else layout.sides
-    _launch(_rows.sum_rows, [values, layout.order, layout.end, before], [out])
+    launch_on_tensors(_rows.sum_rows, [values, layout.order, layout.end, before], [out])
     return out
 
 
-def _words(rows: torch.Tensor) -> torch.Tensor:
+def _as_words(rows: torch.Tensor) -> torch.Tensor:
     return rows.view(torch.int32)
 
 
-def _layers(rows: torch.Tensor) -> SimpleNamespace:
-    return _critics.layers[rows.dtype == torch.bfloat16]
+def _layer_kernels(rows: torch.Tensor) -> SimpleNamespace:
+    return _critics.layer_kernels[rows.dtype == torch.bfloat16]
 
 
 def move_critics(
@@ -232,10 +245,10 @@ def move_critics(
         tiny: Added to the root of the mean square.
     """
     half = right.dtype == torch.bfloat16
-    inputs = [left, _words(right), end, rate, correction, decay, tiny]
-    outputs = [weight.flatten(0, 1), square.flatten(0, 1), _words(copy).flatten(0, 1)]
+    inputs = [left, _as_words(right), end, rate, correction, decay, tiny]
+    outputs = [weight.flatten(0, 1), square.flatten(0, 1), _as_words(copy).flatten(0, 1)]
     strips = -(-weight.shape[1] // (_bank.TILE * _bank.STRIP)) * weight.shape[2] // _bank.TILE
-    _launch(_bank.adam[half], inputs, outputs, over=rate[:, None], size=strips)
+    launch_on_tensors(_bank.adam_kernels[half], inputs, outputs, over=rate[:, None], size=strips)
 
 
 def move_sums(
@@ -249,10 +262,12 @@ def move_sums(
     tiny: float = 1e-8,
 ) -> None:
     """Move weights by Adam without momentum along a gradient, all float32 (C, J); see `move_critics`."""
-    _launch(_bank.adam_of, [gradient, rate, correction, decay, tiny], [weight, square], over=gradient)
+    launch_on_tensors(
+        _bank.adam_step, [gradient, rate, correction, decay, tiny], [weight, square], over=gradient
+    )
 
 
-def spread(rows: torch.Tensor, weights: torch.Tensor, end: torch.Tensor) -> torch.Tensor:
+def multiply_by_critic(rows: torch.Tensor, weights: torch.Tensor, end: torch.Tensor) -> torch.Tensor:
     """Multiply the few rows of each critic with its weights.
 
     Args:
@@ -265,9 +280,9 @@ def spread(rows: torch.Tensor, weights: torch.Tensor, end: torch.Tensor) -> torc
     """
     out = torch.empty(len(rows), weights.shape[2], dtype=rows.dtype, device=rows.device)
     parts = torch.empty_like(end)
-    _launch(_bank.count_parts, [end], [parts], over=parts[None])
+    launch_on_tensors(_bank.count_parts, [end], [parts], over=parts[None])
     most = len(rows) // _bank.ROWS + len(end)
-    inputs = [_words(rows), _words(weights).flatten(0, 1), end, parts.cumsum(0, dtype=torch.int32)]
+    inputs = [_as_words(rows), _as_words(weights).flatten(0, 1), end, parts.cumsum(0, dtype=torch.int32)]
     each = end.new_empty(1).expand(most, weights.shape[2] // _bank.TILE)
-    _launch(_bank.spread, inputs, [_words(out)], over=each)
+    launch_on_tensors(_bank.multiply_parts, inputs, [_as_words(out)], over=each)
     return out

@@ -11,8 +11,8 @@ import warp as wp
 from torch.autograd.function import once_differentiable
 
 from dase.kernels import scene_layers as _scene
-from dase.kernels.autograd_counts import _check, _launch, _on_device
-from dase.kernels.launch import threads
+from dase.kernels.autograd_counts import check_tensor, indices_on_device, launch_on_tensors
+from dase.kernels.launch import thread_count
 from dase.kernels.scene_layers_gradient import render_gradient
 
 Texture = tuple[torch.Tensor, torch.Tensor | None]
@@ -22,7 +22,9 @@ COPIES = 256
 """Copies of the gradient of `place` on a GPU, so that neighbouring pixels need not wait for each other."""
 
 
-def render(textures: Sequence[Texture], place: torch.Tensor, *, width: int, height: int) -> torch.Tensor:
+def render_layers(
+    textures: Sequence[Texture], place: torch.Tensor, *, width: int, height: int
+) -> torch.Tensor:
     """Render moving layers, differentiable in their textures and places: `LayerScene.frames` for training.
 
     Gradients are those of bilinear sampling: by `place` they jump where a pixel crosses a texel centre, and
@@ -43,7 +45,7 @@ def render(textures: Sequence[Texture], place: torch.Tensor, *, width: int, heig
     Raises:
         ValueError: A shape, dtype or device does not fit.
     """
-    _check("place", place, None, None)
+    check_tensor("place", place, None, None)
     _check_textures(textures, place.device)
     if place.ndim != 4 or tuple(place.shape[1:]) != (len(textures), 2, 3):
         raise ValueError(f"place must have shape (K, {len(textures)}, 2, 3), got {tuple(place.shape)}")
@@ -83,7 +85,7 @@ def affine_places(
     Raises:
         ValueError: A shape or dtype does not fit.
     """
-    _check("motion", motion, ((len(sizes), 5, 2),), None)
+    check_tensor("motion", motion, ((len(sizes), 5, 2),), None)
     # float32 would leave errors of 1e-5 and more
     begin, end = motion.double().unbind(-1)  # each (L, 5)
     share = torch.as_tensor(times, dtype=torch.float64, device=motion.device)[:, None, None] / duration
@@ -114,7 +116,7 @@ class _Render(torch.autograd.Function):
     ) -> torch.Tensor:
         texels, place = texels.contiguous(), place.contiguous()
         frames = torch.empty(len(place), pixels, device=place.device)
-        _launch(_scene.render, [_layers(texels, place, sizes), width], [frames])
+        launch_on_tensors(_scene.render_intensity, [_lend_layers(texels, place, sizes), width], [frames])
         ctx.save_for_backward(texels, place)
         ctx.sizes, ctx.width = sizes, width
         return frames
@@ -125,28 +127,28 @@ class _Render(torch.autograd.Function):
         texels, place = ctx.saved_tensors
         gradient = gradient.float().contiguous()
         # adding is atomic on a GPU but not on the CPU, where every thread gets a copy and a run of pixels
-        lots = min(threads(), 16)
+        lots = min(thread_count(), 16)
         stretch = 1 if gradient.is_cuda else -(-gradient.shape[1] // lots)
         wanted = [bool(n) for n in ctx.needs_input_grad[:2]]
         copies = (1, COPIES) if gradient.is_cuda else (lots, lots)
         by_texels = texels.new_zeros(copies[0], len(texels) * wanted[0], 2)
         by_place = place.new_zeros(copies[1], len(place) * wanted[1], *place.shape[1:])
         outputs = [wp.from_torch(by_texels, dtype=wp.vec2), wp.from_torch(by_place, dtype=_scene.Affine)]
-        inputs = [_layers(texels, place, ctx.sizes), gradient, ctx.width, stretch]
-        _launch(render_gradient, inputs, outputs, over=gradient, align=stretch)
+        inputs = [_lend_layers(texels, place, ctx.sizes), gradient, ctx.width, stretch]
+        launch_on_tensors(render_gradient, inputs, outputs, over=gradient, align=stretch)
         sums = [by.sum(0) if want else None for by, want in zip((by_texels, by_place), wanted, strict=True)]
         return *sums, None, None, None
 
 
-def _layers(texels: torch.Tensor, place: torch.Tensor, sizes: tuple[tuple[int, int], ...]) -> Any:
+def _lend_layers(texels: torch.Tensor, place: torch.Tensor, sizes: tuple[tuple[int, int], ...]) -> Any:
     """Lend textures of `sizes` (width, height) and places to Warp; no layer is ruled out anywhere."""
     starts = (0, *accumulate(w * h for w, h in sizes))
     corner = place.new_full((len(sizes), 2), torch.inf)
     layers = _scene.Layers()
     layers.grey = wp.from_torch(texels.detach()[: starts[1], 0].contiguous())
     layers.texels = wp.from_torch(texels.detach(), dtype=wp.vec2)
-    layers.start = wp.from_torch(_on_device(starts[:-1], place.device))
-    flat = _on_device(tuple(side for size in sizes for side in size), place.device)
+    layers.start = wp.from_torch(indices_on_device(starts[:-1], place.device))
+    flat = indices_on_device(tuple(side for size in sizes for side in size), place.device)
     layers.size = wp.from_torch(flat.view(-1, 2), dtype=wp.vec2i)
     layers.place = wp.from_torch(place.detach(), dtype=_scene.Affine)
     layers.box = wp.from_torch(torch.cat([-corner, corner], 1), dtype=wp.vec4)
@@ -155,7 +157,7 @@ def _layers(texels: torch.Tensor, place: torch.Tensor, sizes: tuple[tuple[int, i
 
 
 def _check_textures(textures: Sequence[Texture], device: torch.device) -> None:
-    """Raise ValueError unless `textures` are layers that `render` takes, all on `device`."""
+    """Raise ValueError unless `textures` are layers that `render_layers` takes, all on `device`."""
     if not 1 <= len(textures) <= _scene.MAX_LAYERS:
         raise ValueError(f"textures must be 1 to {_scene.MAX_LAYERS} layers, got {len(textures)}")
     for n, layer in enumerate(textures):
@@ -164,8 +166,8 @@ def _check_textures(textures: Sequence[Texture], device: torch.device) -> None:
                 f"textures[{n}] must be a pair of intensity and alpha, got {type(layer).__name__}"
             )
         grey, alpha = layer
-        _check(f"intensity of textures[{n}]", grey, None, device)
+        check_tensor(f"intensity of textures[{n}]", grey, None, device)
         if grey.ndim != 2 or grey.numel() == 0:
             raise ValueError(f"intensity of textures[{n}] must have shape (h, w), got {tuple(grey.shape)}")
         if alpha is not None:
-            _check(f"alpha of textures[{n}]", alpha, (tuple(grey.shape),), device)
+            check_tensor(f"alpha of textures[{n}]", alpha, (tuple(grey.shape),), device)

@@ -10,7 +10,7 @@ import warp as wp
 
 from dase.kernels import patch_structure as _patches
 from dase.kernels import scene_batch as _scenery
-from dase.kernels.autograd_counts import _launch
+from dase.kernels.autograd_counts import launch_on_tensors
 from dase.kernels.scene_layers import Affine
 
 
@@ -49,7 +49,7 @@ def render_log(
         grey, wp.from_torch(texels, dtype=wp.vec2), background, start, wp.from_torch(size, dtype=wp.vec2i),
         wp.from_torch(place, dtype=Affine), wp.from_torch(box, dtype=wp.vec4), width, eps,
     ]  # fmt: skip
-    _launch(_scenery.render_log, inputs, [out])
+    launch_on_tensors(_scenery.render_log, inputs, [out])
     return out.view(*place.shape[:2], height, width)
 
 
@@ -65,19 +65,19 @@ def patch_structure(image: torch.Tensor, *, size: int, stride: int) -> dict[str,
     Returns:
         Name to float32 of shape (B, patches), row by row of the grid.
     """
-    batch, columns, number = _grid(image, size, stride)
-    weight = _window(size, image.device)
+    batch, columns, number = _patch_grid(image, size, stride)
+    weight = _gaussian_window(size, image.device)
     rows = image.new_empty(batch, number * size, 3, dtype=torch.float32)
     lent = wp.from_torch(rows, dtype=wp.vec3)
     out = [image.new_empty(batch, number, dtype=torch.float32) for _ in range(4)]
     inputs = [image.float().contiguous(), weight, stride, columns]
-    _launch(_patches.structure_rows, inputs, [lent], over=rows[..., 0])
-    _launch(_patches.structure, [lent, weight], out)
+    launch_on_tensors(_patches.structure_rows, inputs, [lent], over=rows[..., 0])
+    launch_on_tensors(_patches.structure_of_patches, [lent, weight], out)
     return dict(zip(("angle", "coherence", "strength", "energy"), out, strict=True))
 
 
 @lru_cache(maxsize=16)
-def _window(size: int, device: torch.device) -> torch.Tensor:
+def _gaussian_window(size: int, device: torch.device) -> torch.Tensor:
     """Return Gaussian weights along one axis of a patch, sigma = size/4, sum 1."""
     weight = np.exp(-0.5 * ((np.arange(size) - (size - 1) / 2) / (size / 4)) ** 2)
     return torch.tensor(weight / weight.sum(), dtype=torch.float32, device=device)
@@ -85,13 +85,13 @@ def _window(size: int, device: torch.device) -> torch.Tensor:
 
 def patch_contrast(counts: torch.Tensor, *, size: int, stride: int) -> torch.Tensor:
     """Return the contrast of Eq. 12 of every patch of counts (B, C, H, W), shape (B, patches) [events]."""
-    batch, columns, number = _grid(counts, size, stride)
+    batch, columns, number = _patch_grid(counts, size, stride)
     out = counts.new_empty(batch, number, dtype=torch.float32)
-    kernel = _patches.contrast_of[wp.float32]
-    _launch(kernel, [counts.detach().float().contiguous(), size, stride, columns], [out])
+    kernel = _patches.contrast_kernels[wp.float32]
+    launch_on_tensors(kernel, [counts.detach().float().contiguous(), size, stride, columns], [out])
     return out
 
 
-def _grid(maps: torch.Tensor, size: int, stride: int) -> tuple[int, int, int]:
+def _patch_grid(maps: torch.Tensor, size: int, stride: int) -> tuple[int, int, int]:
     rows, columns = ((side - size) // stride + 1 for side in maps.shape[-2:])
     return maps.shape[0], columns, rows * columns

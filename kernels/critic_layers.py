@@ -9,25 +9,25 @@ from types import SimpleNamespace
 
 import warp as wp
 
-from dase.kernels.vec4 import read, words
+from dase.kernels.vec4 import read_vec4, word_functions
 
 wp.set_module_options({"enable_backward": False})
 
 
 @wp.func
-def leaky(x: float, slope: float) -> float:
+def leaky_relu(x: float, slope: float) -> float:
     """Return the leaky rectifier."""
     return wp.where(x > 0.0, x, slope * x)
 
 
 @wp.func
-def incline(x: float, slope: float) -> float:
+def leaky_relu_slope(x: float, slope: float) -> float:
     """Slope of the leaky rectifier."""
     return wp.where(x > 0.0, 1.0, slope)
 
 
 @wp.kernel
-def score(
+def score_rows(
     first: int,
     # in
     second: wp.array2d[float],  # (R, J) sums of the second layer
@@ -46,10 +46,10 @@ def score(
     if c < last.shape[0]:
         total = bias[c, 0]
         for j in range(0, second.shape[1], 4):
-            value = read(second, r, j)
+            value = read_vec4(second, r, j)
             for n in range(4):
-                value[n] = leaky(value[n], slope)
-            total += wp.dot(read(last, c, j), value)
+                value[n] = leaky_relu(value[n], slope)
+            total += wp.dot(read_vec4(last, c, j), value)
     out[r] = total
 
 
@@ -89,13 +89,13 @@ def weigh_second(
     r, j = wp.tid()
     j += first
     left[r, j] = by_second[r, j] * wp.where(order[r] >= between, 1.0, gain[r])
-    last[r, j] = leaky(second[r, j], slope) * gain[r]
+    last[r, j] = leaky_relu(second[r, j], slope) * gain[r]
 
 
-def _layers(half: bool) -> SimpleNamespace:
+def _make_layer_kernels(half: bool) -> SimpleNamespace:
     """Return the kernels that read or write rows in the type of the products, bfloat16 or float32."""
     Number = wp.bfloat16 if half else wp.float32
-    get, put = words[half]
+    get, put = word_functions[half]
 
     @wp.kernel(enable_backward=False, module="unique")
     def gather(
@@ -120,12 +120,12 @@ def _layers(half: bool) -> SimpleNamespace:
         if i >= sides:
             # real rows of a critic lie as far before those half way as there are
             partner = order[r - number[1, of[r]]] - fakes
-            value = read(real, partner, k)
-            value += share[i - sides, 0] * (read(fake, i - sides, k) - value)
+            value = read_vec4(real, partner, k)
+            value += share[i - sides, 0] * (read_vec4(fake, i - sides, k) - value)
         elif i >= fakes:
-            value = read(real, i - fakes, k)
+            value = read_vec4(real, i - fakes, k)
         elif i >= 0:
-            value = read(fake, i, k)
+            value = read_vec4(fake, i, k)
         put(rows, r, k, value)
 
     @wp.kernel(enable_backward=False, module="unique")
@@ -147,7 +147,7 @@ def _layers(half: bool) -> SimpleNamespace:
         if of[r] < bias.shape[0]:
             value = float(product[r, j]) + bias[of[r], j]
         total[r, j] = value
-        hidden[r, j] = Number(leaky(value, slope))
+        hidden[r, j] = Number(leaky_relu(value, slope))
 
     @wp.kernel(enable_backward=False, module="unique")
     def second_layer(
@@ -171,7 +171,7 @@ def _layers(half: bool) -> SimpleNamespace:
         c = of[r]
         if c < bias.shape[0]:
             value = float(product[r, j]) + bias[c, j]
-            by_value = last[c, j] * incline(value, slope)
+            by_value = last[c, j] * leaky_relu_slope(value, slope)
         total[r, j] = value
         by_total[r, j] = by_value
         back[r, j] = Number(by_value)
@@ -193,7 +193,7 @@ def _layers(half: bool) -> SimpleNamespace:
         j += first
         value = float(0.0)
         if of[r] < critics:
-            value = float(product[r, j]) * incline(total[r, j], slope)
+            value = float(product[r, j]) * leaky_relu_slope(total[r, j], slope)
         by_total[r, j] = value
 
     @wp.kernel(enable_backward=False, module="unique")
@@ -258,7 +258,7 @@ def _layers(half: bool) -> SimpleNamespace:
         if p >= 0:
             # the gradient is the weights' transpose times by_total, so this sums up to its square
             term = float(product[n, j]) * by_total[p, j]
-            value = 2.0 * penalty * float(product[n, j]) * incline(total[p, j], slope)
+            value = 2.0 * penalty * float(product[n, j]) * leaky_relu_slope(total[p, j], slope)
             hidden[p, j] = Number(value)
         out[n, j] = Number(value)
         square[n, j] = term
@@ -279,7 +279,7 @@ def _layers(half: bool) -> SimpleNamespace:
         j += first
         p = place[n]
         if p >= 0:
-            last[p, j] = float(product[n, j]) * incline(second[p, j], slope)
+            last[p, j] = float(product[n, j]) * leaky_relu_slope(second[p, j], slope)
 
     return SimpleNamespace(
         gather=gather,
@@ -293,5 +293,5 @@ def _layers(half: bool) -> SimpleNamespace:
     )
 
 
-layers = {half: _layers(half) for half in (True, False)}
+layer_kernels = {half: _make_layer_kernels(half) for half in (True, False)}
 """Kernels by whether products are of bfloat16."""

@@ -8,7 +8,7 @@ registers only: a weight is read, moved and written once.
 # no postponed annotations: those of the kernels made here name types of the functions around them
 import warp as wp
 
-from dase.kernels.vec4 import load, read_half, store, store_half
+from dase.kernels.vec4 import load_vec4, read_half, store_half, store_vec4
 
 wp.set_module_options({"enable_backward": False})
 
@@ -98,7 +98,7 @@ def outer_full(
     ...
 
 
-def _adam(half: bool) -> wp.Kernel:
+def _make_adam_kernel(half: bool) -> wp.Kernel:
     """Return the kernel for right rows in bfloat16, or in float32."""
     outer = outer_half if half else outer_full
 
@@ -138,24 +138,24 @@ def _adam(half: bool) -> wp.Kernel:
             means = wp.mat44()
             weights = wp.mat44()
             for n in range(TILE):
-                means[n] = load(square, above + j + n, k)
-                weights[n] = load(weight, above + j + n, k)
+                means[n] = load_vec4(square, above + j + n, k)
+                weights[n] = load_vec4(weight, above + j + n, k)
             gradient = outer(left, right, begin, stop, j, k)
             for n in range(TILE):
                 slope = gradient[n]
                 mean = decay * means[n] + (1.0 - decay) * wp.cw_mul(slope, slope)
-                store(square, above + j + n, k, mean)
+                store_vec4(square, above + j + n, k, mean)
                 w = weights[n]
                 for m in range(TILE):
                     w[m] = w[m] - speed * over_root(slope[m], mean[m] * unbias, tiny)
-                store(weight, above + j + n, k, w)
+                store_vec4(weight, above + j + n, k, w)
                 store_half(copy, above + j + n, k, w)
 
     return adam
 
 
 @wp.kernel(enable_backward=False)
-def adam_of(
+def adam_step(
     first: int,
     # in
     gradient: wp.array2d[float],  # (C, J)
@@ -167,7 +167,7 @@ def adam_of(
     weight: wp.array2d[float],  # (C, J)
     square: wp.array2d[float],  # (C, J) running mean of the gradient's square
 ):
-    """The step of `adam` where the gradient is known."""
+    """The step of `adam_kernels` where the gradient is known."""
     c, i = wp.tid()
     if rate[c] == 0.0:
         return
@@ -196,7 +196,7 @@ def count_parts(
 
 
 @wp.kernel(enable_backward=False)
-def spread(
+def multiply_parts(
     first: int,
     # in
     rows: wp.array2d[int],  # (R, K) bfloat16, as words
@@ -232,5 +232,5 @@ def spread(
             store_half(out, row + n, k, total[n])
 
 
-adam = {half: _adam(half) for half in (True, False)}
+adam_kernels = {half: _make_adam_kernel(half) for half in (True, False)}
 """Kernels by whether the right rows are bfloat16."""

@@ -12,7 +12,7 @@ wp.set_module_options({"enable_backward": False})
 
 
 @wp.func
-def below(keys: wp.array[int], key: int) -> int:
+def count_below(keys: wp.array[int], key: int) -> int:
     """Return how many of the keys, which are in order, are less."""
     place = wp.lower_bound(keys, key)
     # where all are less, Warp returns the last place
@@ -44,9 +44,9 @@ def count_rows(
     """Count the rows of both sides."""
     _, c = wp.tid()
     c += first
-    real = below(keys, 2 * c + 1)
-    number[0, c] = real - below(keys, 2 * c)
-    number[1, c] = below(keys, 2 * c + 2) - real
+    real = count_below(keys, 2 * c + 1)
+    number[0, c] = real - count_below(keys, 2 * c)
+    number[1, c] = count_below(keys, 2 * c + 2) - real
     size[0, c] = rows_of(number, c)
     size[1, c] = pairs_of(number, c)
 
@@ -77,7 +77,7 @@ def place_rows(
     pairs = pairs_of(number, c)
     if pairs == 0:
         return
-    rank = i - below(keys, key)
+    rank = i - count_below(keys, key)
     begin = end[0, c] - rows_of(number, c)
     if key % 2 == 0:
         order[begin + rank] = int(row[i])
@@ -122,7 +122,7 @@ def sum_rows(
 
 
 @wp.kernel
-def pace(
+def count_steps(
     first: int,
     # in
     number: wp.array2d[int],  # (2, C)

@@ -9,7 +9,7 @@ from dase.kernels import launch
 
 
 @wp.kernel(enable_backward=False)
-def gather(
+def close_gaps(
     # in
     first: int,
     keys: wp.array2d[wp.int64],  # (S, capacity)
@@ -53,7 +53,7 @@ def gather(
         for (int i = first; i < last; ++i) label_out.data[i] = (signed char)(from[i] & 3);
 """
 )
-def unpack(
+def unpack_keys(
     keys: wp.array[wp.int64],
     first: int,
     last_in: int,
@@ -74,7 +74,7 @@ def unpack(
 
 
 @wp.kernel(enable_backward=False)
-def decode(
+def decode_keys(
     # in
     first: int,
     keys: wp.array[wp.int64],
@@ -95,7 +95,7 @@ def decode(
     """Unpack keys: time, pixel, polarity and label of each event."""
     _, n = wp.tid()
     n = (n + first) * each
-    unpack(
+    unpack_keys(
         keys, n, n + each, bits, low, size, xy, begin, t_out, x_out, y_out, p_out, row_out, label_out
     )  # fmt: skip
 
@@ -166,7 +166,7 @@ def radix_sort(
 
 
 @wp.kernel(enable_backward=False)
-def sort(
+def sort_keys(
     first: int,
     # in
     late: wp.array[wp.int64],
@@ -184,7 +184,7 @@ def sort(
     radix_sort(late, keys, used, count, begin, end, low, one, other)
 
 
-class Room:
+class KeyBuffer:
     """Memory that is kept from chunk to chunk: new memory costs as much as a sort."""
 
     def __init__(self) -> None:
@@ -193,11 +193,11 @@ class Room:
     def take(self, size: int, device: wp.Device) -> wp.array:
         """Return an array of `size` keys; what was taken before is overwritten."""
         if self._kept is None or len(self._kept) < size:
-            self._kept = launch.room(size + size // 4, wp.int64, device)
+            self._kept = launch.new_array(size + size // 4, wp.int64, device)
         return self._kept[:size] if size else wp.empty(0, dtype=wp.int64, device=device)
 
 
-def ordered(
+def keys_in_order(
     keys: wp.array,
     used: np.ndarray,
     bits: int,
@@ -205,7 +205,7 @@ def ordered(
     top: int,
     device: wp.Device,
     late: np.ndarray | None = None,
-    room: Room | None = None,
+    room: KeyBuffer | None = None,
 ) -> wp.array:
     """Return all keys in order of time, then place, then polarity.
 
@@ -224,7 +224,7 @@ def ordered(
     begin = low if late is not None else bits + low if device.is_cpu else 0
     late = np.empty(0, np.int64) if late is None else late
     total = len(late) + int(used.sum())
-    out = (room or Room()).take(2 * total, device)
+    out = (room or KeyBuffer()).take(2 * total, device)
     if total == 0:
         return out
     counts = wp.array(used.reshape(-1), dtype=int, device=device)
@@ -232,14 +232,14 @@ def ordered(
     if device.is_cpu:
         halves = out[:total], out[total:]
         before = wp.array(late, dtype=wp.int64, device=device)
-        launch.run(sort, 1, [before, flat, counts, total, begin, top, low, *halves], device)
+        launch.run_kernel(sort_keys, 1, [before, flat, counts, total, begin, top, low, *halves], device)
         return halves[(-(-(top - begin) // RADIX) + 1) % 2]
     if len(late):
         out[: len(late)].assign(late)
     start = len(late) + np.concatenate([[0], np.cumsum(used.reshape(-1))[:-1]])
     if used.any():
         arguments = [flat, counts, wp.array(start, dtype=int, device=device), out]
-        launch.run(gather, len(start), arguments, device, batch=int(used.max()))
+        launch.run_kernel(close_gaps, len(start), arguments, device, batch=int(used.max()))
     idle = wp.empty(2 * total, dtype=wp.int32, device=device)
     wp.utils.radix_sort_pairs(out, idle, total, begin_bit=begin, end_bit=top)
     return out[:total]

@@ -38,12 +38,12 @@ def counting_sort(
     time: wp.array[wp.int64],
     polarity: wp.array[wp.uint8],
 ):
-    """Do what `to_pixels` does."""
+    """Do what `sort_into_pixels` does."""
     ...
 
 
 @wp.kernel(enable_backward=False)
-def to_pixels(
+def sort_into_pixels(
     # in
     t: wp.array[wp.float64],  # (M,) [s], not decreasing
     x: wp.array[wp.uint16],  # (M,)

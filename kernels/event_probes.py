@@ -1,8 +1,8 @@
 """Summary statistics of events, accumulated per pixel, event by event.
 
 The stimulus of a pixel is known on a grid of equal steps: a cell (what the light does there: at rest, or by
-how much it has changed, in which band of intensity) and the log intensity. `observe` looks at one event; a
-pixel kernel calls it as its events happen, `walk` for events that are stored. Both write the same numbers, so
+how much it has changed, in which band of intensity) and the log intensity. `observe_event` looks at one event; a
+pixel kernel calls it as its events happen, `observe_stored_events` for events that are stored. Both write the same numbers, so
 that model and measurement are compared like with like. Sums over pixels, and their sampling errors, are
 `dase.probes.statistics`'.
 """
@@ -68,7 +68,7 @@ _ODD, _RINGS, _FOLD, _ZONES = (wp.constant(n) for n in (ODD, RINGS, FOLD, ZONES)
 
 
 @wp.struct
-class Probes:
+class ProbeSums:
     """Sink that keeps sums over events instead of events."""
 
     cell: wp.array2d[wp.uint8]  # (N, T) of each step; step k ends at grid point k
@@ -193,7 +193,7 @@ auto MEMORY_OF = [&](int row) {
 };
 """
 )
-"""What one event of pixel `i` adds to the sums, as C++ that `observe` and `look_back` have in common."""
+"""What one event of pixel `i` adds to the sums, as C++ that `observe_event` and `observe_queued_events` have in common."""
 
 
 @wp.func_native(
@@ -203,7 +203,7 @@ const double at = ((double)STAMPED(row, time) - sink.slack) / sink.step;
 LOOK_AT(row, (int)ceil(at), now, MEMORY_OF(row));
 """
 )
-def observe(sink: Probes, row: int, i: int, time: wp.int64, now: int):
+def observe_event(sink: ProbeSums, row: int, i: int, time: wp.int64, now: int):
     """Look at one event of pixel `i`, `time` [ns] after the begin of the grid, `now` 1 for ON."""
     ...
 
@@ -214,8 +214,8 @@ sink.queue.data[(size_t)slot * sink.queue.shape[1] + waiting] = (time << 1 | now
 return waiting + 1;
 """
 )
-def put_off(sink: Probes, slot: int, waiting: int, lane: int, time: wp.int64, now: int) -> int:
-    """Keep an event of a lane until `look_back`; returns how many wait."""
+def queue_event(sink: ProbeSums, slot: int, waiting: int, lane: int, time: wp.int64, now: int) -> int:
+    """Keep an event of a lane until `observe_queued_events`; returns how many wait."""
     ...
 
 
@@ -249,30 +249,30 @@ for (int n = 0; n < waiting; ++n) {
 return 0;
 """
 )
-def look_back(sink: Probes, start: int, i: int, waiting: int) -> int:
+def observe_queued_events(sink: ProbeSums, start: int, i: int, waiting: int) -> int:
     """Look at the events of pixel `i` that wait, of models `start` and after, on a CPU; none wait then."""
     ...
 
 
 @wp.kernel(enable_backward=False)
-def walk(
+def observe_stored_events(
     # in
     first: int,
     start: wp.array2d[int],  # (B, N + 1) first event of each pixel, and the end
     time: wp.array[wp.int64],  # [ns], in order of row, pixel, time
     polarity: wp.array[wp.uint8],
     # out
-    sink: Probes,
+    sink: ProbeSums,
 ):
     """Look at stored events, one pixel per thread."""
     row, i = wp.tid()
     i += first
     for n in range(start[row, i], start[row, i + 1]):
-        observe(sink, row, i, time[n], int(polarity[n]))
+        observe_event(sink, row, i, time[n], int(polarity[n]))
 
 
 @wp.kernel(enable_backward=False)
-def fold(
+def fold_pixel_counts(
     # in
     first: int,
     halves: wp.array3d[float],  # (B, N, HALVES)
@@ -331,7 +331,7 @@ def fold(
 
 
 @wp.kernel(enable_backward=False)
-def together(
+def sum_groups(
     # in
     first: int,
     parts: wp.array3d[float],  # (B, G, K)
@@ -348,7 +348,7 @@ def together(
 
 
 @wp.kernel(enable_backward=False)
-def counted(
+def sum_group_counts(
     # in
     first: int,
     parts: wp.array3d[int],  # (B, G, K)

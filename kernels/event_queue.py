@@ -69,7 +69,7 @@ ONE = 1 << 32
     busy.data[0] = free;
 """
 )
-def in_turn(
+def send_in_turn(
     arrival: wp.array[wp.float64],
     other: wp.array[wp.int64],
     polarity: wp.array[wp.uint8],
@@ -79,12 +79,12 @@ def in_turn(
     busy: wp.array[wp.int64],
     through: wp.array[wp.float64],
 ):
-    """Do what `queue` does."""
+    """Do what `send_over_bus` does."""
     ...
 
 
 @wp.kernel(enable_backward=False)
-def queue(
+def send_over_bus(
     # in
     arrival: wp.array[wp.float64],  # (N,) [s], taken as whole nanoseconds, not decreasing
     other: wp.array[wp.int64],  # (M,) [ps], not decreasing: events of which only what they delay matters
@@ -102,4 +102,4 @@ def queue(
     Which events are lost depends on all that were sent before, so this is no scan. On one CPU thread it is
     faster than the copies around it, and the events are on the host anyway, on their way to a file.
     """
-    in_turn(arrival, other, polarity, weight, service, patience, busy, through)
+    send_in_turn(arrival, other, polarity, weight, service, patience, busy, through)

@@ -1,7 +1,7 @@
 """Where kernels run, and how CPU work is spread over threads.
 
 Warp runs a CPU launch on one thread and releases the GIL meanwhile, so a launch is cut into slabs that a
-thread pool works off. Every kernel that goes through `run` takes the start of its slab as first argument.
+thread pool works off. Every kernel that goes through `run_kernel` takes the start of its slab as first argument.
 """
 
 from __future__ import annotations
@@ -24,8 +24,8 @@ _pool: ThreadPoolExecutor | None = None
 _threads = int(os.environ.get("DASE_THREADS", "0")) or os.cpu_count() or 1
 
 
-def threads() -> int:
-    """Return the number of CPU threads that `run` uses."""
+def thread_count() -> int:
+    """Return the number of CPU threads that `run_kernel` uses."""
     return _threads
 
 
@@ -39,7 +39,7 @@ def set_threads(count: int) -> None:
     _pool, _threads = None, count
 
 
-def device(name: str) -> wp.Device:
+def find_device(name: str) -> wp.Device:
     """Return the Warp device of a backend name.
 
     Args:
@@ -48,7 +48,7 @@ def device(name: str) -> wp.Device:
     Raises:
         ValueError: There is no such device on this machine.
     """
-    _init()
+    _start_warp()
     if name.startswith("cuda") and not wp.is_cuda_available():
         raise ValueError(f"backend '{name}' needs an NVIDIA GPU with a driver, none was found; use 'cpu'")
     try:
@@ -58,7 +58,7 @@ def device(name: str) -> wp.Device:
         raise ValueError(f"backend '{name}' does not exist, here there are: {names}") from error
 
 
-def _init() -> None:
+def _start_warp() -> None:
     """Start Warp without its line on standard error that a machine has no NVIDIA driver."""
     if wp._src.context.runtime is not None:
         return
@@ -78,7 +78,7 @@ def _init() -> None:
                 print(line, file=sys.stderr)
 
 
-def run(
+def run_kernel(
     kernel: wp.Kernel,
     size: int,
     inputs: list[Any],
@@ -123,10 +123,10 @@ def run(
         assert done is None
 
 
-def each(works: Sequence[Callable[[], Result]]) -> list[Result]:
+def run_concurrently(works: Sequence[Callable[[], Result]]) -> list[Result]:
     """Return what works give that pass their time in kernels of the CPU or in NumPy, done on its threads.
 
-    The first is done before the others: what it loads or works out is there for all. Works may use `run`,
+    The first is done before the others: what it loads or works out is there for all. Works may use `run_kernel`,
     whose threads are others.
     """
     if len(works) < 2 or _threads == 1:
@@ -136,7 +136,7 @@ def each(works: Sequence[Callable[[], Result]]) -> list[Result]:
         return [first, *pool.map(lambda work: work(), works[1:])]
 
 
-def room(shape: int | tuple[int, ...], dtype: Any, device: wp.Device) -> wp.array:
+def new_array(shape: int | tuple[int, ...], dtype: Any, device: wp.Device) -> wp.array:
     """Return new memory; on a CPU NumPy's, which asks for large pages: small ones cost as much as work."""
     if device.is_cuda:
         return wp.empty(shape, dtype=dtype, device=device)

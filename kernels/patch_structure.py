@@ -16,7 +16,7 @@ Bins = wp.types.vector(length=16, dtype=float)
 
 
 @wp.func
-def gradient(image: wp.array3d[float], b: int, y: int, x: int) -> wp.vec2:
+def image_gradient(image: wp.array3d[float], b: int, y: int, x: int) -> wp.vec2:
     """Central differences along x and y [intensity/pixel]; outside, the image repeats its border."""
     bottom = image.shape[1] - 1
     right = image.shape[2] - 1
@@ -48,7 +48,7 @@ def structure_rows(
     left = (patch % columns) * stride
     row = wp.vec3(0.0)
     for j in range(size):
-        g = gradient(image, b, y, left + j)
+        g = image_gradient(image, b, y, left + j)
         row += weight[j] * wp.vec3(g[0] * g[0], g[0] * g[1], g[1] * g[1])
     row_out[b, i] = row
 
@@ -81,7 +81,7 @@ def coherence(roots: wp.vec2) -> float:
 
 
 @wp.kernel
-def structure(
+def structure_of_patches(
     first: int,
     # in
     row: wp.array2d[wp.vec3],  # (B, N·S) from `structure_rows`
@@ -107,7 +107,7 @@ def structure(
 
 
 @wp.func
-def total(counts: wp.array4d[Any], b: int, y: int, x: int) -> float:
+def total_count(counts: wp.array4d[Any], b: int, y: int, x: int) -> float:
     """Events of a pixel, all polarities [events]."""
     events = float(0.0)
     for channel in range(counts.shape[1]):
@@ -136,7 +136,7 @@ def density_weighted(squares: Bins, number: Bins) -> float:
 
 
 @wp.kernel
-def contrast(
+def contrast_of_patches(
     first: int,
     # in
     counts: wp.array4d[Any],  # (B, C, H, W) [events], int32 or float32
@@ -154,14 +154,14 @@ def contrast(
     squares = Bins()
     number = Bins()
     for y in range(top, top + size):
-        here = total(counts, b, y, left)
+        here = total_count(counts, b, y, left)
         for x in range(left, left + size):
             if y + 1 < top + size:
-                g = wp.abs(total(counts, b, y + 1, x) - here)
+                g = wp.abs(total_count(counts, b, y + 1, x) - here)
                 squares[bin_of(g)] += g * g
                 number[bin_of(g)] += 1.0
             if x + 1 < left + size:
-                next = total(counts, b, y, x + 1)
+                next = total_count(counts, b, y, x + 1)
                 g = wp.abs(next - here)
                 squares[bin_of(g)] += g * g
                 number[bin_of(g)] += 1.0
@@ -170,7 +170,7 @@ def contrast(
 
 
 # made here, because `run` loads a module before its threads start, and that builds only kernels it knows
-contrast_of = {
-    wp.int32: wp.overload(contrast, {"counts": wp.array4d[wp.int32]}),
-    wp.float32: wp.overload(contrast, {"counts": wp.array4d[wp.float32]}),
+contrast_kernels = {
+    wp.int32: wp.overload(contrast_of_patches, {"counts": wp.array4d[wp.int32]}),
+    wp.float32: wp.overload(contrast_of_patches, {"counts": wp.array4d[wp.float32]}),
 }

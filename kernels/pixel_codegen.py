@@ -13,18 +13,24 @@ from dase.kernels.pixel_stages import (
     CORE,
     QUANTITIES,
     SINKS,
-    Clock,
-    Stages,
-    deposit,
-    element,
+    EffectStages,
+    SampleClock,
+    array_element,
+    deposit_event,
     leaving_time,
     states,
-    stored,
+    stored_sample,
 )
-from dase.kernels.random import key, normal, uniform, waiting
-from dase.kernels.scene_layers import Ground, background_at, ground_of, layer_intensity, layers_near
+from dase.kernels.random import normal, stream_key, uniform, unit_exponential
+from dase.kernels.scene_layers import (
+    BackgroundGeometry,
+    background_at,
+    background_geometry,
+    layer_intensity,
+    layers_near,
+)
 from dase.kernels.threshold_counts import SOURCES
-from dase.kernels.vector_math import exponential, functions, whole
+from dase.kernels.vector_math import exponential, lane_functions, whole_quotient
 
 DRAW = re.compile(r"(pixel_)?(uniform|normal)(_\d)?")
 
@@ -32,7 +38,7 @@ DRAW = re.compile(r"(pixel_)?(uniform|normal)(_\d)?")
 class Text:
     """Lines of a kernel, and what its names mean."""
 
-    def __init__(self, stages: tuple[Stages, ...], source: str, sink: str, *, cuda: bool):
+    def __init__(self, stages: tuple[EffectStages, ...], source: str, sink: str, *, cuda: bool):
         self.stages, self.source, self.sink = stages, source, sink
         self.prefetches = cuda and source in ("frames", "log")
         self.lines: list[str] = []
@@ -48,23 +54,23 @@ class Text:
             "wp": wp,
             "Source": SOURCES[source],
             "Sink": SINKS[sink],
-            "Clock": Clock,
-            "deposit": deposit,
-            "element": element,
-            "stored": stored,
+            "Clock": SampleClock,
+            "deposit": deposit_event,
+            "element": array_element,
+            "stored": stored_sample,
             "leaving_time": leaving_time,
-            "key": key,
+            "key": stream_key,
             "uniform": uniform,
             "normal": normal,
-            "waiting": waiting,
+            "waiting": unit_exponential,
             "layer_intensity": layer_intensity,
             "layers_near": layers_near,
-            "Ground": Ground,
-            "ground_of": ground_of,
+            "Ground": BackgroundGeometry,
+            "ground_of": background_geometry,
             "background_at": background_at,
-            "logarithm": functions(1).logarithm,
-            "Lane": functions(1).Lanes,
-            "whole": whole,
+            "logarithm": lane_functions(1).logarithm,
+            "Lane": lane_functions(1).Lanes,
+            "whole": whole_quotient,
             "exponential": exponential,
         }
 
@@ -72,22 +78,22 @@ class Text:
         """Append lines at the present depth."""
         self.lines += ["    " * self.depth + line for line in lines]
 
-    def of(self, stage: str) -> list[tuple[Stages, Any]]:
+    def of(self, stage: str) -> list[tuple[EffectStages, Any]]:
         """Return the functions of a stage with their effects."""
         return [(effect, f) for effect in self.stages for kind, f in effect.functions if kind == stage]
 
-    def call(self, stage: str, effect: Stages, function: Any) -> str:
+    def call(self, stage: str, effect: EffectStages, function: Any) -> str:
         """Return the call of a stage function, arguments resolved by name."""
         name = f"{stage}_of_{effect.name}"  # no name of a parameter
         self.scope[name] = function
         arguments = [self.argument(stage, effect, a) for a in inspect.signature(function.func).parameters]
         return f"{name}({', '.join(arguments)})"
 
-    def unless_off(self, effect: Stages, *lines: str) -> list[str]:
+    def unless_off(self, effect: EffectStages, *lines: str) -> list[str]:
         """Return the lines of an effect; a kernel for many models skips them where it is off."""
         return list(lines)
 
-    def argument(self, stage: str, effect: Stages, name: str) -> str:
+    def argument(self, stage: str, effect: EffectStages, name: str) -> str:
         """Return what a stage function gets for an argument of this name."""
         if name in (*effect.parameters, *effect.states, *effect.maps):
             return f"{effect.name}_{name}"
@@ -113,11 +119,11 @@ class Text:
         return any(name in inspect.signature(f.func).parameters for f in functions)
 
     @staticmethod
-    def returns(quantity: str, effect: Stages) -> str:
+    def returns(quantity: str, effect: EffectStages) -> str:
         """Return the left side of a stage that may change the effect's states."""
         return ", ".join([quantity, *(f"{effect.name}_{state}" for state in effect.states)])
 
-    def noise_key(self, effect: Stages) -> str:
+    def noise_key(self, effect: EffectStages) -> str:
         """Name of the random stream of an effect's noise events."""
         self.draws[f"{effect.name}_noise"] = "uniform"
         return f"{effect.name}_noise_key"

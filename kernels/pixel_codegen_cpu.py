@@ -14,9 +14,9 @@ from collections.abc import Callable
 import warp as wp
 
 from dase.kernels.pixel_codegen_cuda import Writer
-from dase.kernels.pixel_stages import Stages
-from dase.kernels.threshold_counts import block, light_of
-from dase.kernels.vector_math import functions, native, vector
+from dase.kernels.pixel_stages import EffectStages
+from dase.kernels.threshold_counts import block_functions, light_of
+from dase.kernels.vector_math import lane_functions, lane_type, native_function
 
 NAME = re.compile(r"[A-Za-z_]\w*")
 
@@ -33,7 +33,9 @@ return bits & (~0u << first);
 def _bits(lanes: int) -> object:
     """Return the function from a vector of 1 or 16 lanes to bits: which are not 0, from lane `first` on."""
     snippet = BITS.format(length=lanes) if lanes > 1 else "return busy[0] != 0.0f && first == 0;"
-    return native(f"busy_bits_{lanes}", snippet, {"Lanes": vector(lanes)}, "busy: Lanes, first: int", "int")
+    return native_function(
+        f"busy_bits_{lanes}", snippet, {"Lanes": lane_type(lanes)}, "busy: Lanes, first: int", "int"
+    )
 
 
 @wp.func_native("return __builtin_ctz((unsigned int)bits);")
@@ -55,14 +57,14 @@ class Blocks(Writer):
     the other thread's.
     """
 
-    def __init__(self, stages: tuple[Stages, ...], source: str, sink: str, *, lanes: int):
+    def __init__(self, stages: tuple[EffectStages, ...], source: str, sink: str, *, lanes: int):
         super().__init__(stages, source, sink, cuda=False)
         self.size = lanes
-        f, start = functions(lanes), block(lanes)
+        f, start = lane_functions(lanes), block_functions(lanes)
         self.scope |= {
             "Floats": f.Lanes,
-            "Ints": vector(lanes, wp.int32),
-            "Longs": vector(lanes, wp.int64),
+            "Ints": lane_type(lanes, wp.int32),
+            "Longs": lane_type(lanes, wp.int64),
             "load": f.load,
             "logarithms": f.logarithm,
             "columns": start.columns,

@@ -7,8 +7,8 @@ import re
 from collections.abc import Callable
 
 from dase.kernels.pixel_codegen_events import Crossings
-from dase.kernels.pixel_stages import Stages
-from dase.kernels.random import stream
+from dase.kernels.pixel_stages import EffectStages
+from dase.kernels.random import stream_number
 
 AHEAD = 4
 """Stored samples of a pixel that are under way from memory at a time."""
@@ -79,7 +79,7 @@ class Writer(Crossings):
     def own_draws(self) -> None:
         """The pixel's own random numbers."""
         for local, kind in self.draws.items():
-            self.add(f"{local}_key = key(seed, {stream(local)}, pixel)")
+            self.add(f"{local}_key = key(seed, {stream_number(local)}, pixel)")
             if self.once(local):
                 self.add(*self.drawn(local, f"{local} = {kind}({local}_key, 0)"))
 
@@ -306,7 +306,7 @@ class Writer(Crossings):
         if "age" in self.states:
             self.add("age += dt")
 
-    def start_noise(self, effect: Stages) -> None:
+    def start_noise(self, effect: EffectStages) -> None:
         """What the noise of an effect is before its rates are known: nothing here, they always are."""
 
     def start_phase(self) -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dase.kernels.pixel_codegen import Text
-from dase.kernels.pixel_stages import LATEST, LEAK, SIGNAL, Stages
+from dase.kernels.pixel_stages import LATEST, LEAK, SIGNAL, EffectStages
 
 COUNT_ON = "{0} = wp.where({0} < 8388608.0, {0} + 1.0, 1.0)"
 """Counts events in float32 without coming to a halt where it resolves no more; random numbers then repeat."""
@@ -198,7 +198,7 @@ class Crossings(Text):
         self.add(*then)
         self.depth -= 1
 
-    def noise_event(self, number: int, effect: Stages) -> None:
+    def noise_event(self, number: int, effect: EffectStages) -> None:
         """Emit the noise event at `stop`; like any event it makes the pixel memorise the present signal."""
         n = effect.name
         self.draws[f"{n}_polarity"] = "uniform"

@@ -17,10 +17,17 @@ from functools import lru_cache
 import warp as wp
 
 from dase.kernels import pixel_stages
-from dase.kernels.event_probes import LANES, QUEUE, Probes, look_back, observe, put_off
+from dase.kernels.event_probes import (
+    LANES,
+    QUEUE,
+    ProbeSums,
+    observe_event,
+    observe_queued_events,
+    queue_event,
+)
 from dase.kernels.pixel_codegen_cpu import Blocks
 from dase.kernels.pixel_codegen_cuda import VOLTAGE, Writer
-from dase.kernels.pixel_compile import compiled
+from dase.kernels.pixel_compile import compile_text
 
 FLAGS = "-march=native -mprefer-vector-width=512 -mllvm=-inline-threshold=400"
 """On a CPU: 16 lanes fill its longest vectors, which compilers shun by themselves, and what looks at events
@@ -28,7 +35,7 @@ is not copied to all places where there are some. The bits are the same."""
 
 
 @wp.struct
-class History:
+class LightHistory:
     """Light of some pixels, each at times of its own; between them its logarithm runs straight."""
 
     start: wp.array[int]  # (N + 1,) first sample of each pixel, and the end
@@ -39,21 +46,21 @@ class History:
 
 
 @lru_cache(maxsize=64)
-def compose(stages: tuple[pixel_stages.Stages, ...], *, lanes: int = 1) -> wp.Kernel:
+def compose_trials(stages: tuple[pixel_stages.EffectStages, ...], *, lanes: int = 1) -> wp.Kernel:
     """Return the kernel of all models with these effects, over (blocks of `lanes` models, N) threads.
 
-    Its arguments are `first`, a `History`, pixels (N,), width, height, seeds (B,), parameters (B, P), maps
-    (M, N) where an effect has any, `Probes`.
+    Its arguments are `first`, a `LightHistory`, pixels (N,), width, height, seeds (B,), parameters (B, P), maps
+    (M, N) where an effect has any, `ProbeSums`.
     """
     if lanes == 1:
         writer: _Trials = _Threads(stages)
-        return compiled(writer.kernel(), "pixel_trials", writer.scope)
+        return compile_text(writer.kernel(), "pixel_trials", writer.scope)
     writer = _Lanes(stages)
-    return compiled(writer.kernel(), "pixel_trials", writer.scope, cpu_compiler_flags=FLAGS)
+    return compile_text(writer.kernel(), "pixel_trials", writer.scope, cpu_compiler_flags=FLAGS)
 
 
-def source_text(stages: tuple[pixel_stages.Stages, ...], *, lanes: int = 1) -> str:
-    """Return the text of the kernel that `compose` compiles."""
+def source_text(stages: tuple[pixel_stages.EffectStages, ...], *, lanes: int = 1) -> str:
+    """Return the text of the kernel that `compose_trials` compiles."""
     return (_Lanes(stages) if lanes > 1 else _Threads(stages)).kernel()
 
 
@@ -62,7 +69,7 @@ def _number(value: float) -> str:
 
 
 @wp.func
-def instant(begin: int, steps: int, step: float, share: float, late: float) -> wp.int64:
+def event_instant(begin: int, steps: int, step: float, share: float, late: float) -> wp.int64:
     """When an event leaves [ns]: `share` of `steps` after `begin`, and `late` [s]."""
     nanoseconds = wp.float64(step) * wp.float64(1.0e9)
     at = wp.float64(begin) + wp.float64(wp.min(share, 1.0)) * wp.float64(steps)
@@ -73,7 +80,7 @@ def instant(begin: int, steps: int, step: float, share: float, late: float) -> w
 
 
 @wp.kernel(enable_backward=False)
-def total(
+def sum_pixel_groups(
     # in
     first: int,
     sums: wp.array3d[float],  # (B, G, SIZE)
@@ -103,12 +110,12 @@ class _Trials(Writer):
             "                 sink: Sink):",
         ]
 
-    def unless_off(self, effect: pixel_stages.Stages, *lines: str) -> list[str]:
+    def unless_off(self, effect: pixel_stages.EffectStages, *lines: str) -> list[str]:
         if not effect.off:
             return list(lines)
         return [f"if {effect.name}_acts != 0:", *(f"    {line}" for line in lines)]
 
-    def acts(self, effect: pixel_stages.Stages) -> list[str]:
+    def acts(self, effect: pixel_stages.EffectStages) -> list[str]:
         """Return the line that says whether an effect is on."""
         differs = " or ".join(f"{effect.name}_{p} != {_number(value)}" for p, value in effect.off)
         return [f"{effect.name}_acts = wp.where({differs}, 1, 0)"] if differs else []
@@ -139,7 +146,7 @@ class _Trials(Writer):
         self.add("stamp = source.stamp[k]")
         self.depth -= 1
 
-    def start_noise(self, effect: pixel_stages.Stages) -> None:
+    def start_noise(self, effect: pixel_stages.EffectStages) -> None:
         self.add(*(f"{effect.name}_{name} = float(0.0)" for name in ("on", "off", "spend")))
 
     def instant(self, share: str, late: str) -> str:
@@ -150,15 +157,15 @@ class _Trials(Writer):
 
 
 SCOPE = {
-    "Source": History, "Sink": Probes, "observe": observe, "put_off": put_off, "look_back": look_back,
-    "instant": instant,
+    "Source": LightHistory, "Sink": ProbeSums, "observe": observe_event, "put_off": queue_event, "look_back": observe_queued_events,
+    "instant": event_instant,
 }  # fmt: skip
 
 
 class _Threads(_Trials):
     """Writes the text of the kernel for CUDA: one model of one pixel per thread."""
 
-    def __init__(self, stages: tuple[pixel_stages.Stages, ...]):
+    def __init__(self, stages: tuple[pixel_stages.EffectStages, ...]):
         super().__init__(stages, "frames", "keys", cuda=False)
         self.scope |= SCOPE
 
@@ -183,7 +190,7 @@ class _Lanes(_Trials, Blocks):
     own vectors. What none of the models of a thread has is skipped.
     """
 
-    def __init__(self, stages: tuple[pixel_stages.Stages, ...]):
+    def __init__(self, stages: tuple[pixel_stages.EffectStages, ...]):
         Blocks.__init__(self, stages, "frames", "keys", lanes=LANES)
         self.scope |= SCOPE
 
@@ -213,7 +220,7 @@ class _Lanes(_Trials, Blocks):
         # models differ in their phase; one of 0 changes nothing
         super().part(write, when=when.removesuffix(" and phase != 0.0"), then=then)
 
-    def start_noise(self, effect: pixel_stages.Stages) -> None:
+    def start_noise(self, effect: pixel_stages.EffectStages) -> None:
         """Lanes are 0 where nothing has been written."""
 
     def whose(self) -> str:

@@ -64,7 +64,7 @@ ANYWHERE = ("x", "y", "t", "dt", "t64", "radius", "nominal_on", "nominal_off")
 
 
 @dataclass(frozen=True)
-class Stages:
+class EffectStages:
     """The part of an effect that the composer sees.
 
     Args:
@@ -89,7 +89,7 @@ class Stages:
 
 
 @wp.struct
-class Clock:
+class SampleClock:
     """Time samples of one chunk; sample k ends the step that begins at sample k - 1."""
 
     t: wp.array[float]  # (K,) [s]
@@ -103,14 +103,14 @@ class Clock:
 
 
 @wp.struct
-class Counts:
+class EventCounts:
     """Sink that counts events."""
 
     counts: wp.array4d[int]  # (B, W, 2, N) OFF, ON
 
 
 @wp.struct
-class Keys:
+class EventKeys:
     """Sink that keeps every event as one sortable 64-bit key: time, place, polarity, label if asked for."""
 
     keys: wp.array3d[wp.int64]  # (B, slabs, capacity)
@@ -121,7 +121,7 @@ class Keys:
 
 
 @wp.func_native("return a.data[k];")
-def element(a: wp.array[float], k: int) -> float:
+def array_element(a: wp.array[float], k: int) -> float:
     """Return a[k]; Warp's own look-up asks whether k is negative, in the innermost loop."""
     ...
 
@@ -129,13 +129,13 @@ def element(a: wp.array[float], k: int) -> float:
 @wp.func_native(
     "return *(const float*)((const char*)a.data + (size_t)k * (size_t)a.strides[0] + 4 * (size_t)i);"
 )
-def stored(a: wp.array2d[float], k: int, i: int) -> float:
-    """Return a[k, i], as `element` does."""
+def stored_sample(a: wp.array2d[float], k: int, i: int) -> float:
+    """Return a[k, i], as `array_element` does."""
     ...
 
 
 @wp.func
-def leaving_time(clock: Clock, k: int, at: float, late: float) -> wp.int64:
+def leaving_time(clock: SampleClock, k: int, at: float, late: float) -> wp.int64:
     """When an event of the share `at` of step k leaves, `late` [s] after it [ns since the chunk's begin]."""
     time = clock.begin[k] + wp.int64(wp.min(at * clock.length[k], clock.length[k]))
     return time + wp.int64(wp.round(late * 1.0e9))
@@ -153,23 +153,25 @@ def leaving_time(clock: Clock, k: int, at: float, late: float) -> wp.int64:
     if (slot < keys.shape[2]) keys.data[((size_t)row * keys.shape[1] + slab) * keys.shape[2] + slot] = key;
 """
 )
-def append(keys: wp.array3d[wp.int64], used: wp.array2d[int], row: int, i: int, shift: int, key: wp.int64):
+def append_key(
+    keys: wp.array3d[wp.int64], used: wp.array2d[int], row: int, i: int, shift: int, key: wp.int64
+):
     """Append a key to those of the pixel's slab, or only count it where there is no room."""
     ...
 
 
 @wp.func
-def deposit(sink: Keys, row: int, i: int, size: int, time: wp.int64, code: int):
+def deposit_event(sink: EventKeys, row: int, i: int, size: int, time: wp.int64, code: int):
     """Keep one event that leaves its pixel at `time` [ns since the chunk's begin]."""
     place = wp.int64(row) * wp.int64(size) + wp.int64(i)
     place |= time << wp.int64(sink.bits)
-    append(sink.keys, sink.used, row, i, sink.slab, (place << wp.int64(sink.low)) | wp.int64(code))
+    append_key(sink.keys, sink.used, row, i, sink.slab, (place << wp.int64(sink.low)) | wp.int64(code))
 
 
-SINKS = {"counts": Counts, "keys": Keys, "labels": Keys}
+SINKS = {"counts": EventCounts, "keys": EventKeys, "labels": EventKeys}
 
 
-def states(stages: Sequence[Stages], sink: str = "keys") -> list[str]:
+def states(stages: Sequence[EffectStages], sink: str = "keys") -> list[str]:
     """Return the names of what a pixel with these effects remembers, in the order of the state array."""
     kinds = {stage for effect in stages for stage, _ in effect.functions}
     names = ["signal", "reference"]

@@ -7,13 +7,13 @@ import zlib
 import warp as wp
 
 
-def stream(name: str) -> int:
+def stream_number(name: str) -> int:
     """Return the number of a named stream of random numbers, a 31-bit hash."""
     return zlib.crc32(name.encode()) & 0x7FFFFFFF
 
 
 @wp.func
-def key(seed: int, stream: int, pixel: int) -> int:
+def stream_key(seed: int, stream: int, pixel: int) -> int:
     """Key of one stream of random numbers of one pixel."""
     return int(wp.rand_init(seed ^ stream, pixel))
 
@@ -31,6 +31,6 @@ def normal(key: int, index: int) -> float:
 
 
 @wp.func
-def waiting(key: int, index: int) -> float:
+def unit_exponential(key: int, index: int) -> float:
     """Exponential with mean 1: the hazard a Poisson process spends before its next event."""
     return -wp.log(1.0 - uniform(key, index))

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import warp as wp
 
-from dase.kernels.scene_layers import Affine, Layers, ground_of, layer_intensity, layers_near
+from dase.kernels.scene_layers import Affine, Layers, background_geometry, layer_intensity, layers_near
 
 
 @wp.kernel(enable_backward=False)
@@ -41,6 +41,6 @@ def render_log(
     x = float(i % width)
     y = float(i / width)
     near = layers_near(layers, x, y)
-    ground = ground_of(layers)
+    ground = background_geometry(layers)
     for k in range(place.shape[1]):
         log_out[b, k, i] = wp.log(layer_intensity(layers, ground, near, k, x, y) + eps)

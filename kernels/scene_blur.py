@@ -11,7 +11,7 @@ from dase.kernels import launch
 
 
 @wp.func
-def mirrored(n: int, size: int) -> int:
+def mirrored_index(n: int, size: int) -> int:
     """Fold an index into a line of `size`, as reflect-101 does."""
     if n >= 0 and n < size:
         return n
@@ -37,8 +37,8 @@ def blur_rows(
     row = i - x
     total = weights[0] * pictures[k, i]
     for n in range(1, weights.shape[0]):
-        left = pictures[k, row + mirrored(x - n, width)]
-        total += weights[n] * (left + pictures[k, row + mirrored(x + n, width)])
+        left = pictures[k, row + mirrored_index(x - n, width)]
+        total += weights[n] * (left + pictures[k, row + mirrored_index(x + n, width)])
     out[k, i] = total
 
 
@@ -62,12 +62,12 @@ def blur_columns(
     height = pictures.shape[1] / width
     total = weights[0] * pictures[k, pixel]
     for n in range(1, weights.shape[0]):
-        above = pictures[k, mirrored(y - n, height) * width + x]
-        total += weights[n] * (above + pictures[k, mirrored(y + n, height) * width + x])
+        above = pictures[k, mirrored_index(y - n, height) * width + x]
+        total += weights[n] * (above + pictures[k, mirrored_index(y + n, height) * width + x])
     out[k, i] = total
 
 
-def blur(
+def blur_frames(
     pictures: wp.array, weights: NDArray[np.float32], width: int, pixels: NDArray[np.int32], device: wp.Device
 ) -> wp.array:
     """Return blurred pictures at some pixels, shape (K, N).
@@ -80,23 +80,23 @@ def blur(
         device: Where to work.
     """
     # on the CPU ten times as fast as the kernels, whose loads the compiler does not gather into vectors
-    return (_by_opencv if device.is_cpu else by_kernels)(pictures, weights, width, pixels, device)
+    return (_blur_by_opencv if device.is_cpu else blur_by_kernels)(pictures, weights, width, pixels, device)
 
 
-def by_kernels(
+def blur_by_kernels(
     pictures: wp.array, weights: NDArray[np.float32], width: int, pixels: NDArray[np.int32], device: wp.Device
 ) -> wp.array:
-    """Do `blur` on any device."""
+    """Do `blur_frames` on any device."""
     samples, size = pictures.shape
     on, where = (wp.array(a, dtype=d, device=device) for a, d in ((weights, float), (pixels, int)))
     half = wp.empty((samples, size), dtype=float, device=device)
-    launch.run(blur_rows, size, [pictures, on, width, half], device, batch=samples)
+    launch.run_kernel(blur_rows, size, [pictures, on, width, half], device, batch=samples)
     out = wp.empty((samples, len(pixels)), dtype=float, device=device)
-    launch.run(blur_columns, len(pixels), [half, on, where, width, out], device, batch=samples)
+    launch.run_kernel(blur_columns, len(pixels), [half, on, where, width, out], device, batch=samples)
     return out
 
 
-def _by_opencv(
+def _blur_by_opencv(
     pictures: wp.array, weights: NDArray[np.float32], width: int, pixels: NDArray[np.int32], device: wp.Device
 ) -> wp.array:
     samples, size = pictures.shape

@@ -20,7 +20,7 @@ STEPS = 2
 
 
 @wp.struct
-class Matches:
+class MatchedFrames:
     """J + 1 successive frames and the motion between them."""
 
     frames: wp.array3d[float]  # (J + 1, H, W) linear intensity
@@ -47,7 +47,7 @@ def way_at(ways: wp.array3d[wp.vec2], j: int, at: wp.vec2) -> wp.vec2:
 
 
 @wp.func
-def origin(ways: wp.array3d[wp.vec2], j: int, share: float, x: wp.vec2) -> wp.vec2:
+def origin_of_pixel(ways: wp.array3d[wp.vec2], j: int, share: float, x: wp.vec2) -> wp.vec2:
     """Place from which the content of pixel `x`, at integers, came, having gone this share of its way."""
     way = ways[j, int(x[1]), int(x[0])]
     if way[0] == 0.0 and way[1] == 0.0:
@@ -59,7 +59,7 @@ def origin(ways: wp.array3d[wp.vec2], j: int, share: float, x: wp.vec2) -> wp.ve
 
 
 @wp.func
-def cubic(f: float) -> wp.vec4:
+def cubic_weights(f: float) -> wp.vec4:
     """Weights of four neighbours, Catmull-Rom; `f` from the second to the third."""
     return wp.vec4(
         f * (-0.5 + f * (1.0 - 0.5 * f)),
@@ -80,8 +80,8 @@ def value_at(maps: wp.array3d[float], j: int, at: wp.vec2) -> float:
     y1 = int(y)
     if x == float(x1) and y == float(y1):
         return maps[j, y1, x1]
-    wx = cubic(x - float(x1))
-    wy = cubic(y - float(y1))
+    wx = cubic_weights(x - float(x1))
+    wy = cubic_weights(y - float(y1))
     x0 = wp.max(x1 - 1, 0)
     x2 = wp.min(x1 + 1, right)
     x3 = wp.min(x1 + 2, right)
@@ -95,7 +95,7 @@ def value_at(maps: wp.array3d[float], j: int, at: wp.vec2) -> float:
 
 
 @wp.func
-def seen(maps: wp.array3d[float], at: wp.vec2) -> float:
+def inside_weight(maps: wp.array3d[float], at: wp.vec2) -> float:
     """1 inside the frame, falling to almost 0 over a pixel beyond its border."""
     x = wp.max(-at[0], at[0] - float(maps.shape[2] - 1))
     y = wp.max(-at[1], at[1] - float(maps.shape[1] - 1))
@@ -103,10 +103,10 @@ def seen(maps: wp.array3d[float], at: wp.vec2) -> float:
 
 
 @wp.kernel(enable_backward=False)
-def blend(
+def blend_frames(
     first: int,
     # in
-    matches: Matches,
+    matches: MatchedFrames,
     pixels: wp.array[int],  # (N,) row-major
     interval: wp.array[int],  # (K,) frame before each sample
     share: wp.array[float],  # (K,) of the time to the frame after it, below 1
@@ -125,19 +125,19 @@ def blend(
         out[k, i] = matches.frames[j, row, column]
         return
     x = wp.vec2(float(column), float(row))
-    p = origin(matches.ahead, j, s, x)
-    q = origin(matches.back, j, 1.0 - s, x)
-    before = (1.0 - s) * seen(matches.logs, p)
-    after = s * seen(matches.logs, q)
+    p = origin_of_pixel(matches.ahead, j, s, x)
+    q = origin_of_pixel(matches.back, j, 1.0 - s, x)
+    before = (1.0 - s) * inside_weight(matches.logs, p)
+    after = s * inside_weight(matches.logs, q)
     level = before * value_at(matches.logs, j, p) + after * value_at(matches.logs, j + 1, q)
     out[k, i] = wp.max(wp.exp(level / (before + after)) - eps, 0.0)
 
 
 @wp.kernel(enable_backward=False)
-def carry(
+def carry_doubts(
     first: int,
     # in
-    matches: Matches,
+    matches: MatchedFrames,
     doubts: wp.array4d[float],  # (J, 2, H, W) of the frame before and of the one after
     pixels: wp.array[int],  # (N,) row-major
     interval: wp.array[int],  # (K,)
@@ -153,22 +153,22 @@ def carry(
     bottom = doubts.shape[2] - 1
     right = doubts.shape[3] - 1
     x = wp.vec2(float(pixels[i] % doubts.shape[3]), float(pixels[i] / doubts.shape[3]))
-    p = origin(matches.ahead, j, s, x)
-    q = origin(matches.back, j, 1.0 - s, x)
+    p = origin_of_pixel(matches.ahead, j, s, x)
+    q = origin_of_pixel(matches.back, j, 1.0 - s, x)
     a = doubts[j, 0, wp.clamp(int(p[1] + 0.5), 0, bottom), wp.clamp(int(p[0] + 0.5), 0, right)]
     b = doubts[j, 1, wp.clamp(int(q[1] + 0.5), 0, bottom), wp.clamp(int(q[0] + 0.5), 0, right)]
     out[k, i] = wp.sqrt((1.0 - s) * a * a + s * b * b)
 
 
-def upload(
+def upload_matches(
     frames: NDArray[np.float32],
     ahead: NDArray[np.float32],
     back: NDArray[np.float32],
     eps: float,
     device: wp.Device,
-) -> Matches:
+) -> MatchedFrames:
     """Move frames, shape (J + 1, H, W), and the ways between them [px], (J, H, W, 2), to `device`."""
-    out = Matches()
+    out = MatchedFrames()
     out.frames = wp.array(frames, dtype=float, device=device)
     out.logs = wp.array(np.log(frames + np.float32(eps)), dtype=float, device=device)
     out.ahead = wp.array(ahead, dtype=wp.vec2, device=device)
@@ -176,32 +176,32 @@ def upload(
     return out
 
 
-def render(
-    matches: Matches,
+def render_between(
+    matches: MatchedFrames,
     pixels: NDArray[np.int32],
     interval: NDArray[np.int32],
     share: NDArray[np.float32],
     eps: float,
     device: wp.Device,
 ) -> Any:
-    """Return intensities, Warp array of shape (K, N); see `blend`."""
+    """Return intensities, Warp array of shape (K, N); see `blend_frames`."""
     out = wp.empty((len(share), len(pixels)), dtype=float, device=device)
     given = [wp.array(a, dtype=t, device=device) for a, t in ((pixels, int), (interval, int), (share, float))]
-    launch.run(blend, len(pixels), [matches, *given, eps, out], device, batch=len(share))
+    launch.run_kernel(blend_frames, len(pixels), [matches, *given, eps, out], device, batch=len(share))
     return out
 
 
 def render_doubt(
-    matches: Matches,
+    matches: MatchedFrames,
     doubts: NDArray[np.float32],
     pixels: NDArray[np.int32],
     interval: NDArray[np.int32],
     share: NDArray[np.float32],
     device: wp.Device,
 ) -> NDArray[np.float32]:
-    """Return doubts, shape (K, N); see `carry`."""
+    """Return doubts, shape (K, N); see `carry_doubts`."""
     out = wp.empty((len(share), len(pixels)), dtype=float, device=device)
     given = [wp.array(a, dtype=t, device=device) for a, t in ((pixels, int), (interval, int), (share, float))]
     maps = wp.array(doubts, dtype=float, device=device)
-    launch.run(carry, len(pixels), [matches, maps, *given, out], device, batch=len(share))
+    launch.run_kernel(carry_doubts, len(pixels), [matches, maps, *given, out], device, batch=len(share))
     return np.asarray(out.numpy())

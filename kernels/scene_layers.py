@@ -40,7 +40,7 @@ class Layers:
 
 
 @wp.struct
-class Ground:
+class BackgroundGeometry:
     """What every look at the background needs; a thread works it out once."""
 
     width: int
@@ -51,10 +51,10 @@ class Ground:
 
 
 @wp.func
-def ground_of(layers: Layers) -> Ground:
+def background_geometry(layers: Layers) -> BackgroundGeometry:
     """Geometry of layer 0."""
     size = layers.size[0]
-    ground = Ground()
+    ground = BackgroundGeometry()
     ground.width = size[0]
     ground.last = wp.vec2(float(size[0] - 1), float(size[1] - 1))
     ground.corner = wp.vec2i(wp.max(size[0] - 2, 0), wp.max(size[1] - 2, 0))
@@ -64,17 +64,17 @@ def ground_of(layers: Layers) -> Ground:
 
 
 @wp.func
-def reflected(u: float, last: float, inverse: float) -> float:
+def reflected_coordinate(u: float, last: float, inverse: float) -> float:
     """Fold a coordinate into [0, last] as reflect-101 does; `inverse` is 1 / (2 last)."""
     return wp.min(wp.abs(u - 2.0 * last * wp.floor(u * inverse + 0.5)), last)
 
 
 @wp.func
-def background_at(layers: Layers, ground: Ground, k: int, x: float, y: float) -> float:
+def background_at(layers: Layers, ground: BackgroundGeometry, k: int, x: float, y: float) -> float:
     """Intensity of layer 0."""
     at = layers.place[k, 0] * wp.vec3(x, y, 1.0)
-    u = reflected(at[0], ground.last[0], ground.inverse[0])
-    v = reflected(at[1], ground.last[1], ground.inverse[1])
+    u = reflected_coordinate(at[0], ground.last[0], ground.inverse[0])
+    v = reflected_coordinate(at[1], ground.last[1], ground.inverse[1])
     iu = wp.min(int(u), ground.corner[0])
     iv = wp.min(int(v), ground.corner[1])
     fu = u - float(iu)
@@ -89,7 +89,7 @@ def background_at(layers: Layers, ground: Ground, k: int, x: float, y: float) ->
 
 
 @wp.func
-def texel(layers: Layers, layer: int, u: int, v: int) -> wp.vec2:
+def texel_at(layers: Layers, layer: int, u: int, v: int) -> wp.vec2:
     """(intensity · alpha, alpha) of a texel, transparent outside."""
     size = layers.size[layer]
     if u < 0 or v < 0 or u >= size[0] or v >= size[1]:
@@ -118,10 +118,10 @@ def foreground_at(layers: Layers, layer: int, k: int, x: float, y: float) -> wp.
         i += size[0]
         bottom = layers.texels[i] + fu * (layers.texels[i + 1] - layers.texels[i])
     else:
-        top = texel(layers, layer, iu, iv)
-        top += fu * (texel(layers, layer, iu + 1, iv) - top)
-        bottom = texel(layers, layer, iu, iv + 1)
-        bottom += fu * (texel(layers, layer, iu + 1, iv + 1) - bottom)
+        top = texel_at(layers, layer, iu, iv)
+        top += fu * (texel_at(layers, layer, iu + 1, iv) - top)
+        bottom = texel_at(layers, layer, iu, iv + 1)
+        bottom += fu * (texel_at(layers, layer, iu + 1, iv + 1) - bottom)
     return top + fv * (bottom - top)
 
 
@@ -168,7 +168,9 @@ def in_front(layers: Layers, near: int, k: int, x: float, y: float) -> wp.vec2:
 
 
 @wp.func
-def layer_intensity(layers: Layers, ground: Ground, near: int, k: int, x: float, y: float) -> float:
+def layer_intensity(
+    layers: Layers, ground: BackgroundGeometry, near: int, k: int, x: float, y: float
+) -> float:
     """Intensity of a pixel at sample k, composited front to back."""
     front = in_front(layers, near, k, x, y)
     if front[1] == 0.0:
@@ -177,7 +179,7 @@ def layer_intensity(layers: Layers, ground: Ground, near: int, k: int, x: float,
 
 
 @wp.kernel(enable_backward=False)
-def render(
+def render_intensity(
     # in
     first: int,
     layers: Layers,
@@ -190,11 +192,13 @@ def render(
     i += first
     x = float(i % width)
     y = float(i / width)
-    intensity_out[k, i] = layer_intensity(layers, ground_of(layers), layers_near(layers, x, y), k, x, y)
+    intensity_out[k, i] = layer_intensity(
+        layers, background_geometry(layers), layers_near(layers, x, y), k, x, y
+    )
 
 
 @wp.kernel(enable_backward=False)
-def flow(
+def foremost_velocity(
     # in
     first: int,
     layers: Layers,
@@ -219,7 +223,7 @@ def flow(
     flow_out[k, i] = velocity[k, top] * wp.vec3(x, y, 1.0)
 
 
-def upload(
+def upload_textures(
     textures: list[tuple[np.ndarray, np.ndarray | None]], device: wp.Device
 ) -> tuple[wp.array, wp.array, wp.array, wp.array]:
     """Move textures to `device`.
@@ -248,7 +252,7 @@ def upload(
 
 
 @wp.kernel(enable_backward=False)
-def mix(
+def mix_frames(
     first: int,
     # in
     frames: wp.array2d[float],  # (F, N) linear intensity
@@ -269,21 +273,21 @@ def mix(
         out[k, i] = wp.max((before + eps) * wp.exp(share[k] * step) - eps, 0.0)
 
 
-def interpolate(
+def interpolate_frames(
     frames: NDArray[np.float32],
     at: NDArray[np.int32],
     share: NDArray[np.float64],
     eps: float,
     device: wp.Device,
 ) -> wp.array:
-    """Return intensities between frames, shape (K, N); see `mix`."""
+    """Return intensities between frames, shape (K, N); see `mix_frames`."""
     samples, pixels = len(share), frames.shape[1]
     out = wp.empty((samples, pixels), dtype=float, device=device)
     arrays = [
         wp.array(a, dtype=kind, device=device)
         for a, kind in ((frames, float), (at, int), (share.astype(np.float32), float))
     ]
-    launch.run(mix, pixels, [*arrays, eps, out], device, batch=samples)
+    launch.run_kernel(mix_frames, pixels, [*arrays, eps, out], device, batch=samples)
     return out
 
 
@@ -291,7 +295,7 @@ def render_frames(layers: Layers, width: int, height: int, device: wp.Device) ->
     """Return intensities of all samples, shape (K, H · W)."""
     samples = layers.place.shape[0]
     out = wp.empty((samples, height * width), dtype=float, device=device)
-    launch.run(render, height * width, [layers, width, out], device, batch=samples)
+    launch.run_kernel(render_intensity, height * width, [layers, width, out], device, batch=samples)
     return out
 
 
@@ -299,5 +303,7 @@ def render_flow(layers: Layers, velocity: wp.array, width: int, height: int, dev
     """Return the flow of all samples [px/s], shape (K, H · W) of vec2."""
     samples = layers.place.shape[0]
     out = wp.empty((samples, height * width), dtype=wp.vec2, device=device)
-    launch.run(flow, height * width, [layers, velocity, width, out], device, batch=samples)
+    launch.run_kernel(
+        foremost_velocity, height * width, [layers, velocity, width, out], device, batch=samples
+    )
     return out

@@ -9,9 +9,9 @@ from dase.kernels.scene_layers import (
     Affine,
     Layers,
     background_at,
+    background_geometry,
     foreground_at,
-    ground_of,
-    reflected,
+    reflected_coordinate,
 )
 
 PerLayer = wp.types.vector(length=MAX_LAYERS, dtype=wp.float32)
@@ -19,14 +19,14 @@ PerLayer = wp.types.vector(length=MAX_LAYERS, dtype=wp.float32)
 
 @wp.func
 def fold_slope(u: float, last: float, inverse: float) -> float:
-    """Derivative of `reflected`: where the fold runs backwards, so does the derivative."""
+    """Derivative of `reflected_coordinate`: where the fold runs backwards, so does the derivative."""
     if last == 0.0:
         return 0.0
     return wp.where(u < 2.0 * last * wp.floor(u * inverse + 0.5), -1.0, 1.0)
 
 
 @wp.func
-def spread(
+def spread_gradient(
     layers: Layers,
     layer: int,
     corner: wp.vec2i,  # upper left of the four texels
@@ -67,22 +67,22 @@ def spread_layer(
     slot: int,
     texel_gradient_out: wp.array2d[wp.vec2],
 ) -> wp.vec2:
-    """Do `spread` where `background_at` or `foreground_at` looked; return the gradient by `at` [1/texel]."""
+    """Do `spread_gradient` where `background_at` or `foreground_at` looked; return the gradient by `at` [1/texel]."""
     size = layers.size[layer]
     if layer > 0:
         if at[0] <= -1.0 or at[1] <= -1.0 or at[0] >= float(size[0]) or at[1] >= float(size[1]):
             return wp.vec2(0.0, 0.0)
         corner = wp.vec2i(int(wp.floor(at[0])), int(wp.floor(at[1])))
-        return spread(layers, layer, corner, at[0], at[1], gradient, slot, texel_gradient_out)
-    ground = ground_of(layers)
-    u = reflected(at[0], ground.last[0], ground.inverse[0])
-    v = reflected(at[1], ground.last[1], ground.inverse[1])
+        return spread_gradient(layers, layer, corner, at[0], at[1], gradient, slot, texel_gradient_out)
+    ground = background_geometry(layers)
+    u = reflected_coordinate(at[0], ground.last[0], ground.inverse[0])
+    v = reflected_coordinate(at[1], ground.last[1], ground.inverse[1])
     corner = wp.vec2i(wp.min(int(u), ground.corner[0]), wp.min(int(v), ground.corner[1]))
     slope = wp.vec2(
         fold_slope(at[0], ground.last[0], ground.inverse[0]),
         fold_slope(at[1], ground.last[1], ground.inverse[1]),
     )
-    return wp.cw_mul(slope, spread(layers, layer, corner, u, v, gradient, slot, texel_gradient_out))
+    return wp.cw_mul(slope, spread_gradient(layers, layer, corner, u, v, gradient, slot, texel_gradient_out))
 
 
 @wp.kernel(enable_backward=False)
@@ -109,7 +109,7 @@ def render_gradient(
     y = float(i / width)
     behind = PerLayer()
     passes = PerLayer()
-    light = background_at(layers, ground_of(layers), k, x, y)
+    light = background_at(layers, background_geometry(layers), k, x, y)
     for layer in range(1, layers.count):
         front = foreground_at(layers, layer, k, x, y)
         behind[layer] = light

@@ -22,15 +22,15 @@ from typing import Any
 
 import warp as wp
 
-from dase.kernels.random import key, uniform
+from dase.kernels.random import stream_key, uniform
 from dase.kernels.scene_layers import (
+    BackgroundGeometry,
     Frames,
-    Ground,
     Layers,
-    ground_of,
+    background_geometry,
     layers_near,
 )
-from dase.kernels.vector_math import functions
+from dase.kernels.vector_math import lane_functions
 
 SOURCES = {"frames": Frames, "log": Frames, "layers": Layers, "background": Layers}
 """What pixels see, by name: stored intensities, stored log intensities, moving layers, one layer."""
@@ -39,20 +39,20 @@ SOURCES = {"frames": Frames, "log": Frames, "layers": Layers, "background": Laye
 @lru_cache(maxsize=32)
 def light_of(lanes: int, source: str, *, aligned: bool = False) -> Any:
     """Return the Warp function from a source to the intensity of `lanes` neighbouring pixels."""
-    f = functions(lanes)
+    f = lane_functions(lanes)
     Source, Lanes = SOURCES[source], f.Lanes
     load, background, foreground = f.load_aligned if aligned else f.load, f.background, f.foreground
 
     if source in ("frames", "log"):
 
         @wp.func
-        def light(seen: Source, ground: Ground, k: int, n: int, x: Lanes, y: Lanes, near: int):
+        def light(seen: Source, ground: BackgroundGeometry, k: int, n: int, x: Lanes, y: Lanes, near: int):
             return load(seen.values, k, n)
 
     else:
 
         @wp.func
-        def light(seen: Source, ground: Ground, k: int, n: int, x: Lanes, y: Lanes, near: int):
+        def light(seen: Source, ground: BackgroundGeometry, k: int, n: int, x: Lanes, y: Lanes, near: int):
             light = background(
                 x, y, seen.grey, seen.place[k, 0], ground.last, ground.corner, ground.step, ground.inverse,
                 ground.width,
@@ -65,14 +65,16 @@ def light_of(lanes: int, source: str, *, aligned: bool = False) -> Any:
 
 
 @lru_cache(maxsize=32)
-def _look(lanes: int, source: str, *, aligned: bool = False) -> Any:
+def log_light_of(lanes: int, source: str, *, aligned: bool = False) -> Any:
     """Return the Warp function from a source to the log intensity of `lanes` neighbouring pixels."""
-    f = functions(lanes)
+    f = lane_functions(lanes)
     Source, Lanes = SOURCES[source], f.Lanes
     light, logarithm = light_of(lanes, source, aligned=aligned), f.logarithm
 
     @wp.func
-    def look(seen: Source, ground: Ground, k: int, n: int, x: Lanes, y: Lanes, near: int, eps: float):
+    def look(
+        seen: Source, ground: BackgroundGeometry, k: int, n: int, x: Lanes, y: Lanes, near: int, eps: float
+    ):
         value = light(seen, ground, k, n, x, y, near)
         if wp.static(source == "log"):
             return value
@@ -83,9 +85,9 @@ def _look(lanes: int, source: str, *, aligned: bool = False) -> Any:
 
 
 @lru_cache(maxsize=8)
-def block(lanes: int) -> SimpleNamespace:
+def block_functions(lanes: int) -> SimpleNamespace:
     """Return Warp functions for what `lanes` neighbouring pixels know before their first sample."""
-    f = functions(lanes)
+    f = lane_functions(lanes)
     Lanes, load = f.Lanes, f.load
 
     @wp.func
@@ -119,7 +121,9 @@ def block(lanes: int) -> SimpleNamespace:
 
 
 @lru_cache(maxsize=64)
-def count(lanes: int, source: str, *, shared: bool, states: bool, aligned: bool = False) -> wp.Kernel:
+def counting_kernel(
+    lanes: int, source: str, *, shared: bool, states: bool, aligned: bool = False
+) -> wp.Kernel:
     """Return the counting kernel, over (B, blocks of `lanes` pixels) threads.
 
     It has no branches, so that several samples are on their way from memory at once. Both polarities are
@@ -131,16 +135,16 @@ def count(lanes: int, source: str, *, shared: bool, states: bool, aligned: bool 
         source: One of `SOURCES`.
         shared: Whether ON and OFF have one threshold.
         states: Whether counts are integers and the last sample is kept, as sensors need it, or floats.
-        aligned: Whether stored samples are, see `aligned`.
+        aligned: Whether stored samples are, see `samples_are_aligned`.
     """
-    f = functions(lanes)
+    f = lane_functions(lanes)
     Source, Lanes = SOURCES[source], f.Lanes
-    look = _look(lanes, source, aligned=aligned)
+    look = log_light_of(lanes, source, aligned=aligned)
     load, store, store_whole = f.load, f.store, f.store_whole
     minus, plus, plus_abs, advanced = f.minus, f.plus, f.plus_abs, f.advanced
     chosen, inverse, signed_events = f.chosen, f.inverse, f.signed_events
     half_sum, half_difference = f.half_sum, f.half_difference
-    start_of = block(lanes)
+    start_of = block_functions(lanes)
     thresholds, columns, rows_of = start_of.thresholds, start_of.columns, start_of.rows
     layers_of = start_of.layers_of
     Number = wp.int32 if states else wp.float32
@@ -176,9 +180,9 @@ def count(lanes: int, source: str, *, shared: bool, states: bool, aligned: bool 
         x = Lanes()
         y = Lanes()
         near = int(0)
-        ground = Ground()
+        ground = BackgroundGeometry()
         if wp.static(not stored):
-            ground = ground_of(seen)
+            ground = background_geometry(seen)
             x = columns(pixels, n, width)
             y = rows_of(pixels, n, width)
             if wp.static(layered):
@@ -216,14 +220,14 @@ def count(lanes: int, source: str, *, shared: bool, states: bool, aligned: bool 
 
 
 @lru_cache(maxsize=32)
-def start(source: str) -> wp.Kernel:
+def starting_kernel(source: str) -> wp.Kernel:
     """Return the kernel that sets memories at the first samples, over (B, N) threads.
 
     The memories are spread as if the first change had been going on before.
     """
-    f = functions(1)
+    f = lane_functions(1)
     Source = SOURCES[source]
-    look, Lane = _look(1, source), f.Lanes
+    look, Lane = log_light_of(1, source), f.Lanes
     stored, layered = source in ("frames", "log"), source == "layers"
 
     @wp.kernel(enable_backward=False, module="unique", module_options={"fuse_fp": False})
@@ -252,9 +256,9 @@ def start(source: str) -> wp.Kernel:
         x = Lane(float(pixel % width))
         y = Lane(float(pixel / width))
         near = int(0)
-        ground = Ground()
+        ground = BackgroundGeometry()
         if wp.static(not stored):
-            ground = ground_of(seen)
+            ground = background_geometry(seen)
             if wp.static(layered):
                 near = layers_near(seen, x[0], y[0])
         signal = signal_in[b, i]
@@ -264,7 +268,7 @@ def start(source: str) -> wp.Kernel:
         if begin + samples > 1:
             change = look(seen, ground, 1 - begin, i, x, y, near, eps[b])[0] - signal
             column = wp.where(threshold.shape[2] == 1, 0, i)
-            stream = key(seed, initial_phase, pixel)
+            stream = stream_key(seed, initial_phase, pixel)
             lead = phase[b] * uniform(stream, 0)
             if phase[b] != 0.0:
                 if change < 0.0 or (change == 0.0 and uniform(stream, 1) < 0.5):
@@ -277,7 +281,7 @@ def start(source: str) -> wp.Kernel:
     return start_counting
 
 
-def widest(size: int, device: wp.Device, source: str) -> int:
+def widest_block(size: int, device: wp.Device, source: str) -> int:
     """Return how many neighbouring pixels a thread works on."""
     lanes = 4 if device.is_cuda else 16
     if device.is_cuda and source == "layers":
@@ -285,12 +289,12 @@ def widest(size: int, device: wp.Device, source: str) -> int:
     return lanes if size >= lanes else 1
 
 
-def aligned(source: str, seen: Any, size: int) -> bool:
+def samples_are_aligned(source: str, seen: Any, size: int) -> bool:
     """Return whether stored samples of any block of 4 of `size` pixels begin at a multiple of 16 bytes."""
     stored = source in ("frames", "log")
     return stored and not (size % 4 or seen.values.ptr % 16 or seen.values.strides[0] % 16)
 
 
-def blocks(size: int, lanes: int) -> int:
+def block_count(size: int, lanes: int) -> int:
     """Return how many blocks of `lanes` pixels there are."""
     return -(-size // lanes)

@@ -10,10 +10,10 @@ from typing import Any
 
 import warp as wp
 
-from dase.kernels.pixel_stages import Clock, Keys
-from dase.kernels.scene_layers import Ground, ground_of
-from dase.kernels.threshold_counts import SOURCES, _look, block
-from dase.kernels.vector_math import functions, native, vector
+from dase.kernels.pixel_stages import EventKeys, SampleClock
+from dase.kernels.scene_layers import BackgroundGeometry, background_geometry
+from dase.kernels.threshold_counts import SOURCES, block_functions, log_light_of
+from dase.kernels.vector_math import lane_functions, lane_type, native_function
 
 APPEND = """
 typedef float V __attribute__((ext_vector_type({length})));
@@ -49,7 +49,7 @@ while (busy) {{
 
 
 @lru_cache(maxsize=8)
-def _append(lanes: int) -> Any:
+def _append_function(lanes: int) -> Any:
     """Return the function that appends the events of one step of `lanes` pixels."""
     arguments = (
         "events: Lanes, change: Lanes, signal: Lanes, reference: Lanes, on: Lanes, off: Lanes, "
@@ -58,15 +58,15 @@ def _append(lanes: int) -> Any:
     )
     mask = "unsigned short" if lanes == 16 else "unsigned char"
     snippet = APPEND.format(length=lanes, mask=mask).replace("from;", "from_lane;")
-    return native(f"append_{lanes}", snippet, {"Lanes": vector(lanes)}, arguments, "None")
+    return native_function(f"append_{lanes}", snippet, {"Lanes": lane_type(lanes)}, arguments, "None")
 
 
 @lru_cache(maxsize=32)
-def emit(lanes: int, source: str) -> wp.Kernel:
+def emitting_kernel(lanes: int, source: str) -> wp.Kernel:
     """Return the emitting kernel, over (B, blocks of `lanes` pixels) threads; see `counts.count`."""
-    f, start_of = functions(lanes), block(lanes)
+    f, start_of = lane_functions(lanes), block_functions(lanes)
     Source, Lanes = SOURCES[source], f.Lanes
-    look, append = _look(lanes, source), _append(lanes)
+    look, append = log_light_of(lanes, source), _append_function(lanes)
     load, store, minus, advanced = f.load, f.store, f.minus, f.advanced
     chosen, inverse, signed_events = f.chosen, f.inverse, f.signed_events
     thresholds, columns, rows_of = start_of.thresholds, start_of.columns, start_of.rows
@@ -78,7 +78,7 @@ def emit(lanes: int, source: str) -> wp.Kernel:
         first: int,
         # in
         seen: Source,
-        clock: Clock,
+        clock: SampleClock,
         pixels: wp.array[int],  # (N,) row-major indices
         size: int,  # N
         width: int,  # of the sensor
@@ -90,7 +90,7 @@ def emit(lanes: int, source: str) -> wp.Kernel:
         # out
         reference_out: wp.array2d[float],  # (B, N) [log intensity]
         signal_out: wp.array2d[float],  # (B, N) last sample [log intensity]
-        sink: Keys,
+        sink: EventKeys,
     ):
         """Emit the events of every pixel."""
         b, i = wp.tid()
@@ -103,9 +103,9 @@ def emit(lanes: int, source: str) -> wp.Kernel:
         x = Lanes()
         y = Lanes()
         near = int(0)
-        ground = Ground()
+        ground = BackgroundGeometry()
         if wp.static(not stored):
-            ground = ground_of(seen)
+            ground = background_geometry(seen)
             x = columns(pixels, n, width)
             y = rows_of(pixels, n, width)
             if wp.static(layered):

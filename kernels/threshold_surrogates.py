@@ -15,28 +15,28 @@ from __future__ import annotations
 
 import warp as wp
 
-from dase.kernels.vector_math import whole
+from dase.kernels.vector_math import whole_quotient
 
 # the adjoints are written by hand; fused multiply-adds would move events between intervals
 wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 
 
 @wp.func
-def crossings(change: float, on: float, off: float, per_on: float, per_off: float) -> float:
+def signed_crossings(change: float, on: float, off: float, per_on: float, per_off: float) -> float:
     """Return the events of a change of log intensity, ON positive, OFF negative; `per_` are inverses."""
     up = change >= 0.0
-    events = whole(wp.abs(change), wp.where(up, on, off), wp.where(up, per_on, per_off))
+    events = whole_quotient(wp.abs(change), wp.where(up, on, off), wp.where(up, per_on, per_off))
     return wp.where(up, events, -events)
 
 
 @wp.func
-def height(events: float, on: float, off: float) -> float:
+def height_of_events(events: float, on: float, off: float) -> float:
     """Return what signed `events` stand for [log intensity]."""
     return events * wp.where(events >= 0.0, on, off)
 
 
 @wp.func
-def weighted(events: float, gradient_on: float, gradient_off: float) -> float:
+def weighted_events(events: float, gradient_on: float, gradient_off: float) -> float:
     """Return the objective that signed `events` add: their number times the gradient of their polarity."""
     return wp.where(events >= 0.0, events * gradient_on, -events * gradient_off)
 
@@ -65,9 +65,9 @@ def interval_gradient(
     on = threshold[b, last, n]
     reference = log[b, 0, n] - phase[b, n]
     for k in range(1, log.shape[1]):
-        events = crossings(log[b, k, n] - reference, on, off, 1.0 / on, 1.0 / off)
+        events = signed_crossings(log[b, k, n] - reference, on, off, 1.0 / on, 1.0 / off)
         if events != 0.0:
-            reference += height(events, on, off)
+            reference += height_of_events(events, on, off)
             p = wp.where(events > 0.0, 1, 0)
             c = wp.where(events > 0.0, last, 0)
             slope = -wp.abs(log[b, k, n] - log[b, k - 1, n]) / (threshold[b, c, n] * threshold[b, c, n])
@@ -101,13 +101,13 @@ def events_gradient(
 
 
 @wp.func
-def scaled(on: float, off: float, phase: float, on_scale: float, off_scale: float) -> wp.vec3f:
+def scaled_thresholds(on: float, off: float, phase: float, on_scale: float, off_scale: float) -> wp.vec3f:
     """Return scaled thresholds and the phase at the same fraction of the threshold of its sign."""
     return wp.vec3f(on_scale * on, off_scale * off, phase * wp.where(phase >= 0.0, on_scale, off_scale))
 
 
 @wp.func
-def difference(
+def objective_difference(
     b: int,
     n: int,
     log: wp.array3d[float],
@@ -124,15 +124,17 @@ def difference(
     change = float(0.0)
     for k in range(1, log.shape[1]):
         sample = log[b, k, n]
-        high_events = crossings(sample - high_reference, high[0], high[1], high_inverse[0], high_inverse[1])
-        low_events = crossings(sample - low_reference, low[0], low[1], low_inverse[0], low_inverse[1])
+        high_events = signed_crossings(
+            sample - high_reference, high[0], high[1], high_inverse[0], high_inverse[1]
+        )
+        low_events = signed_crossings(sample - low_reference, low[0], low[1], low_inverse[0], low_inverse[1])
         if high_events != 0.0 or low_events != 0.0:
-            high_reference += height(high_events, high[0], high[1])
-            low_reference += height(low_events, low[0], low[1])
+            high_reference += height_of_events(high_events, high[0], high[1])
+            low_reference += height_of_events(low_events, low[0], low[1])
             w = window[k - 1]
             g_off = gradient[b, w, 0, n]
             g_on = gradient[b, w, 1, n]
-            change += weighted(high_events, g_on, g_off) - weighted(low_events, g_on, g_off)
+            change += weighted_events(high_events, g_on, g_off) - weighted_events(low_events, g_on, g_off)
     return change
 
 
@@ -164,7 +166,11 @@ def expected_gradient(
         # a shared threshold moves both polarities
         moves_on = c == last
         moves_off = c == 0
-        high = scaled(on, off, phase[b, n], wp.where(moves_on, up, 1.0), wp.where(moves_off, up, 1.0))
-        low = scaled(on, off, phase[b, n], wp.where(moves_on, down, 1.0), wp.where(moves_off, down, 1.0))
-        change = difference(b, n, log, window, gradient, high, low)
+        high = scaled_thresholds(
+            on, off, phase[b, n], wp.where(moves_on, up, 1.0), wp.where(moves_off, up, 1.0)
+        )
+        low = scaled_thresholds(
+            on, off, phase[b, n], wp.where(moves_on, down, 1.0), wp.where(moves_off, down, 1.0)
+        )
+        change = objective_difference(b, n, log, window, gradient, high, low)
         threshold_gradient_out[b, c, n] = change / ((up - down) * threshold[b, c, n])

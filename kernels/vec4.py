@@ -21,7 +21,7 @@ wp.set_module_options({"enable_backward": False})
 #endif
 """
 )
-def load(a: wp.array2d[float], r: int, k: int) -> wp.vec4:
+def load_vec4(a: wp.array2d[float], r: int, k: int) -> wp.vec4:
     """Return a[r, k : k + 4], which the kernel may change."""
     ...
 
@@ -37,7 +37,7 @@ def load(a: wp.array2d[float], r: int, k: int) -> wp.vec4:
 #endif
 """
 )
-def read(a: wp.array2d[float], r: int, k: int) -> wp.vec4:
+def read_vec4(a: wp.array2d[float], r: int, k: int) -> wp.vec4:
     """Return a[r, k : k + 4], which the kernel does not change."""
     ...
 
@@ -51,7 +51,7 @@ def read(a: wp.array2d[float], r: int, k: int) -> wp.vec4:
 #endif
 """
 )
-def store(a: wp.array2d[float], r: int, k: int, q: wp.vec4):
+def store_vec4(a: wp.array2d[float], r: int, k: int, q: wp.vec4):
     """Set a[r, k : k + 4]."""
     ...
 
@@ -132,5 +132,5 @@ def store_full(a: wp.array2d[int], r: int, k: int, q: wp.vec4):
     ...
 
 
-words = {True: (read_half, store_half), False: (read_full, store_full)}
+word_functions = {True: (read_half, store_half), False: (read_full, store_full)}
 """How rows of words are read and set, by whether they hold bfloat16."""

@@ -235,13 +235,13 @@ for (int lane = 0; lane < {length}; ++lane) to[lane] = lanes[lane];
 
 
 @wp.func
-def whole(size: float, threshold: float, inverse: float) -> float:
+def whole_quotient(size: float, threshold: float, inverse: float) -> float:
     """Return the greatest whole n with n threshold <= size, as `signed_events` does for all lanes."""
     n = (size * inverse + 12582912.0) - 12582912.0
     return wp.where(n * threshold > size, n - 1.0, n)
 
 
-def from_text(text: str, name: str, scope: Mapping[str, Any]) -> Any:
+def function_from_text(text: str, name: str, scope: Mapping[str, Any]) -> Any:
     """Return the function `name` of a Python text, made so that Warp and tracebacks find its source."""
     filename = f"<dase {name} {zlib.crc32(text.encode()):08x}>"
     # both read the source through linecache
@@ -251,14 +251,14 @@ def from_text(text: str, name: str, scope: Mapping[str, Any]) -> Any:
     return found[name]
 
 
-def native(name: str, snippet: str, scope: dict[str, Any], arguments: str, returns: str) -> Any:
+def native_function(name: str, snippet: str, scope: dict[str, Any], arguments: str, returns: str) -> Any:
     """Return the Warp function of a C++ text."""
     # Warp looks for the decorator in the text
     text = f"@wp.func_native(snippet)\ndef {name}({arguments}) -> {returns}: ...\n"
-    return from_text(text, name, {**scope, "wp": wp, "snippet": snippet})
+    return function_from_text(text, name, {**scope, "wp": wp, "snippet": snippet})
 
 
-def _lanewise(
+def _lanewise_function(
     name: str, length: int, body: str, lanes: str, others: str = "", cuda: str | None = None
 ) -> Any:
     """Return a function from Warp vectors to a Warp vector, from C++ that sets `result`.
@@ -282,25 +282,25 @@ def _lanewise(
         cpu = ONE_BY_ONE.format(length=1, body=body, inputs=inputs)
     arguments = ", ".join([*(f"{n}_in: Lanes" for n in names), *([others] if others else [])])
     snippet = f"#ifdef __CUDA_ARCH__\n{gpu}\n#else\n{cpu}\n#endif\n"
-    scope = {"Affine": Affine, "Lanes": vector(length)}
-    return native(name, snippet, scope, arguments, "Lanes")
+    scope = {"Affine": Affine, "Lanes": lane_type(length)}
+    return native_function(name, snippet, scope, arguments, "Lanes")
 
 
-def vector(length: int, dtype: Any = wp.float32) -> Any:
+def lane_type(length: int, dtype: Any = wp.float32) -> Any:
     """Return the Warp type of `length` lanes."""
     return wp.types.vector(length=length, dtype=dtype)
 
 
 @lru_cache(maxsize=8)
-def functions(length: int) -> SimpleNamespace:
+def lane_functions(length: int) -> SimpleNamespace:
     """Return the Warp functions on `length` lanes, and `Lanes`, their type."""
-    scope = {"Lanes": vector(length)}
+    scope = {"Lanes": lane_type(length)}
 
     def lanewise(name: str, body: str, lanes: str, others: str = "", cuda: str | None = None) -> Any:
-        return _lanewise(f"{name}_{length}", length, body, lanes, others, cuda)
+        return _lanewise_function(f"{name}_{length}", length, body, lanes, others, cuda)
 
     def plain(name: str, snippet: str, arguments: str, returns: str) -> Any:
-        return native(f"{name}_{length}", snippet.format(length=length), scope, arguments, returns)
+        return native_function(f"{name}_{length}", snippet.format(length=length), scope, arguments, returns)
 
     layers = "texels: wp.array[wp.vec2], start: wp.array[int], size: wp.array[wp.vec2i], "
     layers += "place: wp.array2d[Affine], k: int, near: int"
@@ -335,8 +335,8 @@ def functions(length: int) -> SimpleNamespace:
     )
 
 
-Lane = vector(1)
-_exponential, _natural = functions(1).exponential, functions(1).natural
+Lane = lane_type(1)
+_exponential, _natural = lane_functions(1).exponential, lane_functions(1).natural
 
 
 @wp.func
@@ -352,7 +352,7 @@ def logarithm(x: float) -> float:
 
 
 @wp.func
-def circle(turn: float):
+def cosine_and_sine(turn: float):
     """Cosine and sine of `turn` in [0, 1] turns, within 4e-7: a fifth of the time of the library's."""
     quarter = int(4.0 * turn + 0.5)
     f = 4.0 * turn - float(quarter)

@@ -63,21 +63,21 @@ def with_frames(make):
     return made
 
 
-def full(path: Path, e, frames) -> None:
+def write_full(path: Path, e, frames) -> None:
     """Everything our own layouts can hold."""
     flow, thresholds = np.zeros((3, 2, H, W), np.float32), np.full((2, H, W), 0.2, np.float32)
     exposure = np.full(3, 1e-3)
     io.write(path, Sequence(e, frames[1], frames[0], flow, thresholds, "a = 1\n" * 40, exposure))
 
 
-def aedat4(path: Path, e, frames) -> None:
+def write_aedat4(path: Path, e, frames) -> None:
     spans = np.rint(frames[0] * 1e6).astype(int).tolist()
     frames = [(t, t + 900, grey) for t, grey in zip(spans, frames[1], strict=True)]
     motion = [(1000 * k, (0.0, 0.0, 1.0), (1.0, 2.0, 3.0)) for k in range(5)]
     reference_io.aedat4(path, e, frames=frames, motion=motion, compression=1, compress=lz4.frame.compress)
 
 
-def video(codec: str):
+def video_maker(codec: str):
     """Return a maker of a video of the frames."""
 
     def make(path: Path, e, frames) -> None:
@@ -89,13 +89,13 @@ def video(codec: str):
     return make
 
 
-def uncompressed(path: Path, e, frames) -> None:
+def write_plain_avi(path: Path, e, frames) -> None:
     """A video of the frames as they are, with titles before and after them."""
     titles = reference_video.titles()
     path.write_bytes(reference_video.avi(frames[1], first=titles, last=titles))
 
 
-def pictures(path: Path, e, frames) -> None:
+def write_pictures(path: Path, e, frames) -> None:
     """A folder of text with pictures; each file of it is damaged on its own."""
     path.mkdir()
     rows = zip(e.t.tolist(), e.x.tolist(), e.y.tolist(), e.p.astype(int).tolist(), strict=True)
@@ -110,15 +110,15 @@ def pictures(path: Path, e, frames) -> None:
 SAMPLES = {
     **{name: reference_io.SAMPLES[name] for name in ("EVT2", "EVT3", "EVT2.1", "EVT2.1 legacy", "DAT")},
     "AEDAT2": reference_io.SAMPLES["AEDAT2"],
-    "AEDAT4 packed": (".aedat4", with_frames(aedat4)),
+    "AEDAT4 packed": (".aedat4", with_frames(write_aedat4)),
     "ECF": (".hdf5", reference_io.ecf),
     "ECF, columns packed": (".hdf5", lambda path, e: reference_io.ecf(path, e, mode=1)),
     "ECF, not packed": (".hdf5", lambda path, e: reference_io.ecf(path, e, mode=0)),
     "DSEC packed": (".h5", lambda path, e: reference_io.dsec(path, e, **hdf5plugin.Blosc(cname="zstd"))),
     "MVSEC with frames": (".hdf5", with_frames(lambda path, e, f: reference_io.mvsec(path, e, frames=f))),
     "v2e with frames": (".h5", with_frames(lambda path, e, f: reference_io.v2e(path, e, frames=f))),
-    "HDF5 with frames": (".h5", with_frames(full)),
-    "NumPy archive with frames": (".npz", with_frames(full)),
+    "HDF5 with frames": (".h5", with_frames(write_full)),
+    "NumPy archive with frames": (".npz", with_frames(write_full)),
     "array": reference_io.SAMPLES["array"],
     "array in an archive": reference_io.SAMPLES["array in an archive"],
     "ROS 1 packed": (
@@ -128,10 +128,10 @@ SAMPLES = {
     "ROS 1": reference_io.SAMPLES["ROS 1"],
     "ROS 2": reference_io.SAMPLES["ROS 2"],
     "MCAP": reference_io.SAMPLES["MCAP"],
-    "AVI": (".avi", with_frames(video("MJPG"))),
-    "AVI, not compressed": (".avi", with_frames(uncompressed)),
-    "MP4": (".mp4", with_frames(video("mp4v"))),
-    "text with PNG": (".folder", with_frames(pictures)),
+    "AVI": (".avi", with_frames(video_maker("MJPG"))),
+    "AVI, not compressed": (".avi", with_frames(write_plain_avi)),
+    "MP4": (".mp4", with_frames(video_maker("mp4v"))),
+    "text with PNG": (".folder", with_frames(write_pictures)),
 } | reference_io.SAMPLES
 """Those that hold most first, then what is left of those of the tests; small sensors keep them small."""
 W, H = 48, 36
@@ -153,7 +153,7 @@ class Memory:
         Path("/proc/self/clear_refs").write_text("5")
 
 
-def read(path: Path, turn: int) -> int:
+def read_file(path: Path, turn: int) -> int:
     """Read a file, whole or as a stream by turns; return how that ended: WHOLE, NOTED or REFUSED."""
     notes: list[Any] = []
     try:
@@ -171,7 +171,7 @@ def read(path: Path, turn: int) -> int:
     return NOTED if any(note.kind in ("repaired", "refused") for note in notes) else WHOLE
 
 
-def prepared(name: str, folder: Path, seed: int) -> tuple[Path, list[tuple[Path, bytes]]]:
+def prepare_sample(name: str, folder: Path, seed: int) -> tuple[Path, list[tuple[Path, bytes]]]:
     """Write the sample of a format; return its path, and what lies there: paths and contents."""
     rng = np.random.default_rng([seed, *name.encode()])
     suffix, make = SAMPLES[name]
@@ -181,7 +181,7 @@ def prepared(name: str, folder: Path, seed: int) -> tuple[Path, list[tuple[Path,
     return sample, [(path, path.read_bytes()) for path in inner]
 
 
-def damage(name: str, inner: list[tuple[Path, bytes]], number: int, seed: int) -> Path:
+def write_damaged(name: str, inner: list[tuple[Path, bytes]], number: int, seed: int) -> Path:
     """Write the damaged file of a number; return its path."""
     rng = np.random.default_rng([seed, number, *name.encode()])
     path, content = inner[int(rng.integers(0, len(inner))) if len(inner) > 1 else 0]
@@ -189,21 +189,21 @@ def damage(name: str, inner: list[tuple[Path, bytes]], number: int, seed: int) -
     return path
 
 
-def run(name: str, folder: Path, files: int, seed: int, keep: Path, told, errors) -> None:
+def run_files(name: str, folder: Path, files: int, seed: int, keep: Path, told, errors) -> None:
     """Damage and read files of one format from number told[NEXT] on, and tell what happens."""
     warnings.simplefilter("error")
-    sample, inner = prepared(name, folder, seed)
+    sample, inner = prepare_sample(name, folder, seed)
     for turn in (0, 1):
-        if read(sample, turn) == REFUSED:
+        if read_file(sample, turn) == REFUSED:
             errors.put("the sample itself is refused")
     memory, begun = Memory(), time.process_time()
     memory.forget()
     before, used = memory.peak(), told[SPENT]
     for number in range(int(told[NEXT]), files):
-        path = damage(name, inner, number, seed)
+        path = write_damaged(name, inner, number, seed)
         begin, outcome = time.process_time(), FAILED
         try:
-            outcome = read(sample, number)
+            outcome = read_file(sample, number)
         except BaseException as error:
             errors.put(f"file {number}: {type(error).__name__}: {error}")
         end, grown = time.process_time(), memory.peak() - before
@@ -212,7 +212,7 @@ def run(name: str, folder: Path, files: int, seed: int, keep: Path, told, errors
             outcome = FAILED
             memory.forget()
         if outcome == FAILED:
-            shutil.copy(path, keep / kept(name, number, path))
+            shutil.copy(path, keep / kept_name(name, number, path))
         if len(inner) > 1:
             path.write_bytes(dict(inner)[path])
         told[SLOWEST], told[PEAK] = max(told[SLOWEST], end - begin), max(told[PEAK], grown)
@@ -221,7 +221,7 @@ def run(name: str, folder: Path, files: int, seed: int, keep: Path, told, errors
         told[NEXT] = number + 1
 
 
-def kept(name: str, number: int, path: Path) -> str:
+def kept_name(name: str, number: int, path: Path) -> str:
     """Return the name of a file that is kept."""
     return f"fuzz_{name.replace(' ', '_').replace(',', '')}_{number}{path.suffix}"
 
@@ -244,23 +244,23 @@ def main() -> int:
         folder = Path(tempfile.mkdtemp(dir="/dev/shm" if Path("/dev/shm").is_dir() else None))
         try:
             if options.only is None:
-                failed += watch(name, folder, options.files, options.seed, options.keep)
+                failed += watch_format(name, folder, options.files, options.seed, options.keep)
             else:
-                again(name, folder, options.only, options.seed, options.keep)
+                repeat_file(name, folder, options.only, options.seed, options.keep)
         finally:
             shutil.rmtree(folder)
     return failed
 
 
-def again(name: str, folder: Path, number: int, seed: int, keep: Path) -> None:
+def repeat_file(name: str, folder: Path, number: int, seed: int, keep: Path) -> None:
     """Make and keep one file of a format, and read it."""
-    sample, inner = prepared(name, folder, seed)
-    path = damage(name, inner, number, seed)
-    print(shutil.copy(path, keep / kept(name, number, path)), flush=True)
-    read(sample, number)
+    sample, inner = prepare_sample(name, folder, seed)
+    path = write_damaged(name, inner, number, seed)
+    print(shutil.copy(path, keep / kept_name(name, number, path)), flush=True)
+    read_file(sample, number)
 
 
-def status(pid: int) -> tuple[float, float]:
+def process_status(pid: int) -> tuple[float, float]:
     """Return the time of the processor that a process has used [s] and its memory [MB]; 0 once it is gone."""
     try:
         fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
@@ -270,21 +270,21 @@ def status(pid: int) -> tuple[float, float]:
     return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK"), pages / 2**20
 
 
-def watch(name: str, folder: Path, files: int, seed: int, keep: Path) -> bool:
+def watch_format(name: str, folder: Path, files: int, seed: int, keep: Path) -> bool:
     """Read all files of a format in as many processes as it takes; print a row, return whether any failed."""
     context = multiprocessing.get_context("spawn")
     told = context.Array("d", 8, lock=False)
     errors, said = context.SimpleQueue(), []
     while told[NEXT] < files:
         place = Path(tempfile.mkdtemp(dir=folder))
-        process = context.Process(target=run, args=(name, place, files, seed, keep, told, errors))
+        process = context.Process(target=run_files, args=(name, place, files, seed, keep, told, errors))
         process.start()
-        why = waited(process, told, errors, said)
+        why = wait_for(process, told, errors, said)
         if told[NEXT] < files:
             number = int(told[NEXT])
             said.append(f"file {number}: {why}")
             for path in (path for path in place.rglob("*") if path.is_file()):
-                shutil.copy(path, keep / kept(name, number, path))
+                shutil.copy(path, keep / kept_name(name, number, path))
             told[FAILED] += 1
             told[NEXT] += 1
         shutil.rmtree(place)
@@ -296,15 +296,15 @@ def watch(name: str, folder: Path, files: int, seed: int, keep: Path) -> bool:
     return bool(said)
 
 
-def waited(process, told, errors, said: list[str]) -> str:
+def wait_for(process, told, errors, said: list[str]) -> str:
     """Wait until a process ends, and end it where it hangs or takes too much; return how it ended."""
-    number, since, (used, _) = told[NEXT], time.monotonic(), status(process.pid)
+    number, since, (used, _) = told[NEXT], time.monotonic(), process_status(process.pid)
     why = ""
     while process.is_alive():
         process.join(0.05)
         while not errors.empty():
             said.append(errors.get())
-        spent, memory = status(process.pid)
+        spent, memory = process_status(process.pid)
         if told[NEXT] != number:
             number, since, used = told[NEXT], time.monotonic(), spent
         elif spent - used > HUNG or time.monotonic() - since > STUCK or memory > TOO_MUCH:

@@ -12,7 +12,7 @@ from dase.figures import event_images
 from dase.simulation.sensor_file import dump_sensor, load_sensor
 
 
-def run(out: Path, *, backend: str = "cpu", say: Callable[[str], object] = print) -> tuple[Path, Path]:
+def run_demo(out: Path, *, backend: str = "cpu", say: Callable[[str], object] = print) -> tuple[Path, Path]:
     """Simulate one second of photographs before a DAVIS346 and draw it.
 
     Args:
@@ -23,11 +23,11 @@ def run(out: Path, *, backend: str = "cpu", say: Callable[[str], object] = print
     Returns:
         The picture and the event file.
     """
-    if (out / generate.RECORD).exists():
+    if (out / generate.RECORD_FILE).exists():
         shutil.rmtree(out)
     sensor = load_sensor("davis346")
     assert sensor.size is not None
-    job = generate.Job(
+    job = generate.DatasetJob(
         images="builtin",
         sensor=dump_sensor(sensor),
         sequences=1,
@@ -39,11 +39,13 @@ def run(out: Path, *, backend: str = "cpu", say: Callable[[str], object] = print
         backend=backend,
     )
     say("Simulating 1 s of a DAVIS346 before moving photographs (the first run compiles the kernels) ...")
-    report = generate.run(job, out)
+    report = generate.generate_dataset(job, out)
     say(f"{report.events:,} events from {report.samples} time samples in {report.seconds:.1f} s")
     events = job.path(out, 0)
     picture = events.with_suffix(".png")
-    figure = event_images.draw(io.read(events), title="dase demo: davis346 before moving photographs")
+    figure = event_images.draw_sequence(
+        io.read(events), title="dase demo: davis346 before moving photographs"
+    )
     with io.replacing(picture) as temporary:
         figure.savefig(temporary)
     return picture, events

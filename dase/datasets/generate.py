@@ -17,26 +17,26 @@ import numpy as np
 import tomlkit
 
 from dase import io
-from dase.datasets.interrupt import Deferred, deferred, ignored
+from dase.datasets.interrupt import DeferredInterrupt, defer_interrupt, ignore_interrupt
 from dase.errors import InputError, nearest
 from dase.kernels import launch
 from dase.scenes import image_sources, random_scenes
 from dase.scenes.layers import LayerScene
 from dase.scenes.scene import Scene
-from dase.simulation.pixel_array import Pixels
-from dase.simulation.readout_chain import Outlet
+from dase.simulation.pixel_array import PixelArray
+from dase.simulation.readout_chain import ReadoutChain
 from dase.simulation.sensor import Sensor
 from dase.simulation.sensor_file import dump_sensor, parse_sensor
 from dase.simulation.simulate import CHUNK, chunks, sample_times
 from dase.simulation.user_effects import known_effects
 from dase.version import __version__
 
-RECORD = "synth.toml"
+RECORD_FILE = "synth.toml"
 """File beside the sequences that holds everything that made them."""
 
 
 @dataclass(frozen=True, kw_only=True)
-class Job:
+class DatasetJob:
     """Everything that determines the bytes of a data set.
 
     Args:
@@ -46,7 +46,7 @@ class Job:
         width: Columns [px].
         height: Rows [px].
         duration: Of each sequence [s].
-        regime: One of `dase.scenes.random_scenes.NAMES`.
+        regime: One of `dase.scenes.random_scenes.REGIME_NAMES`.
         seed: Of scenes and sensors.
         format: Suffix of the files, without the dot.
         backend: `cpu` or `cuda`; they agree to float32 rounding, not to the byte.
@@ -78,9 +78,9 @@ class Job:
             value = getattr(self, name)
             if not np.isfinite(value) or value <= 0:
                 raise InputError(f"{name.replace('_', ' ')} must be a number > 0, got {value:g}")
-        if self.regime not in random_scenes.NAMES:
+        if self.regime not in random_scenes.REGIME_NAMES:
             raise InputError(
-                f"there is no regime '{self.regime}': {nearest(self.regime, random_scenes.NAMES)}"
+                f"there is no regime '{self.regime}': {nearest(self.regime, random_scenes.REGIME_NAMES)}"
             )
         if self.seed < 0:
             raise InputError(f"seed must be >= 0, got {self.seed}")
@@ -107,7 +107,7 @@ class Job:
 
 
 @dataclass(frozen=True)
-class Report:
+class WorkReport:
     """What one or more sequences cost and gave.
 
     Args:
@@ -124,19 +124,21 @@ class Report:
     pixels: int = 0
     seconds: float = 0.0
 
-    def plus(self, other: Report) -> Report:
+    def plus(self, other: WorkReport) -> WorkReport:
         """Return the sum of two reports."""
-        return Report(*(a + b for a, b in zip(asdict(self).values(), asdict(other).values(), strict=True)))
+        return WorkReport(
+            *(a + b for a, b in zip(asdict(self).values(), asdict(other).values(), strict=True))
+        )
 
 
-def run(
-    job: Job,
+def generate_dataset(
+    job: DatasetJob,
     out: Path,
     *,
     jobs: int = 1,
     resume: bool = False,
-    progress: Callable[[Report], None] = lambda report: None,
-) -> Report:
+    progress: Callable[[WorkReport], None] = lambda report: None,
+) -> WorkReport:
     """Make all sequences of a job, each an atomic file, and return what they cost.
 
     Args:
@@ -153,21 +155,21 @@ def run(
         raise InputError(f"jobs must be >= 1, got {jobs}")
     begin = time.perf_counter()
     image_sources.open_images(job.images)
-    Pixels(_sensor_of(job), 1, 1, device=job.backend)
-    todo = _prepare(job, out, resume)
-    total = Report()
+    PixelArray(_sensor_of(job), 1, 1, device=job.backend)
+    todo = _prepare_folder(job, out, resume)
+    total = WorkReport()
     jobs = min(jobs, max(len(todo), 1))
     # closing ends the processes when `progress` raises
-    with deferred() as interrupt, closing(_work(job, out, todo, jobs, interrupt)) as reports:
+    with defer_interrupt() as interrupt, closing(_make_sequences(job, out, todo, jobs, interrupt)) as reports:
         for report in reports:
             total = total.plus(report)
             progress(report)
     return replace(total, seconds=time.perf_counter() - begin)
 
 
-def _prepare(job: Job, out: Path, resume: bool) -> list[int]:
+def _prepare_folder(job: DatasetJob, out: Path, resume: bool) -> list[int]:
     """Check the folder, leave the record in it, and return the sequences still to be made."""
-    record = out / RECORD
+    record = out / RECORD_FILE
     if out.exists() and not out.is_dir():
         raise InputError(f"{out} must be a folder, but it is a file")
     if record.exists():
@@ -185,9 +187,9 @@ def _prepare(job: Job, out: Path, resume: bool) -> list[int]:
     return [i for i in range(job.sequences) if not job.path(out, i).exists()]
 
 
-def _work(
-    job: Job, out: Path, todo: list[int], jobs: int, interrupt: Deferred
-) -> Generator[Report, None, None]:
+def _make_sequences(
+    job: DatasetJob, out: Path, todo: list[int], jobs: int, interrupt: DeferredInterrupt
+) -> Generator[WorkReport, None, None]:
     if jobs == 1:
         for index in todo:
             yield make_sequence(job, out, index, interrupt)
@@ -198,7 +200,7 @@ def _work(
     stop = context.Event()
     pool = ProcessPoolExecutor(jobs, mp_context=context, initializer=_begin_worker, initargs=(stop,))
     try:
-        with ignored():
+        with ignore_interrupt():
             left = {pool.submit(_in_worker, job, out, index) for index in todo}
         while left:
             done, left = wait(left, timeout=0.1, return_when=FIRST_COMPLETED)
@@ -211,13 +213,13 @@ def _work(
         pool.shutdown(cancel_futures=True)
 
 
-def _warm_up(job: Job) -> None:
+def _warm_up(job: DatasetJob) -> None:
     source = image_sources.open_images(job.images)
     scene = random_scenes.draw_scene(
         np.random.default_rng(0), source, "background", width=8, height=8, duration=0.02
     )
-    array = Pixels(_sensor_of(job), 8, 8, device=job.backend, labels=job.labels)
-    Outlet(array.sensor, 8, 8).push(array.emit(scene, scene.sample_times())[0], array.begin)
+    array = PixelArray(_sensor_of(job), 8, 8, device=job.backend, labels=job.labels)
+    ReadoutChain(array.sensor, 8, 8).push(array.emit(scene, scene.sample_times())[0], array.begin)
     scene.frames(np.zeros(1), job.backend)
     scene.flow(np.zeros(1), job.backend)
     array.thresholds()
@@ -226,64 +228,69 @@ def _warm_up(job: Job) -> None:
 def _begin_worker(stop: Any) -> None:
     global _stop
     launch.set_threads(1)
-    _stop = Deferred(stop)
+    _stop = DeferredInterrupt(stop)
 
 
-_stop: Deferred | None = None
+_stop: DeferredInterrupt | None = None
 """In a worker process: whether the others want it to end."""
 
 
-def _in_worker(job: Job, out: Path, index: int) -> Report:
+def _in_worker(job: DatasetJob, out: Path, index: int) -> WorkReport:
     assert _stop is not None
     return make_sequence(job, out, index, _stop)
 
 
 @lru_cache(maxsize=1)
-def _opened(spec: str) -> image_sources.ImageSource:
+def _open_images_once(spec: str) -> image_sources.ImageSource:
     return image_sources.open_images(spec)
 
 
 @lru_cache(maxsize=1)  # a file of effects is read once, whatever becomes of it meanwhile
-def _sensor_of(job: Job) -> Sensor:
+def _sensor_of(job: DatasetJob) -> Sensor:
     return parse_sensor(job.sensor, "sensor", known_effects(job.effects))
 
 
-def make_scene(job: Job, index: int) -> LayerScene:
+def make_scene(job: DatasetJob, index: int) -> LayerScene:
     """Return the scene of one sequence."""
     rng = np.random.default_rng([job.seed, index])
     return random_scenes.draw_scene(
-        rng, _opened(job.images), job.regime, width=job.width, height=job.height, duration=job.duration
+        rng,
+        _open_images_once(job.images),
+        job.regime,
+        width=job.width,
+        height=job.height,
+        duration=job.duration,
     )
 
 
-def make_sequence(job: Job, out: Path, index: int, interrupt: Deferred) -> Report:
+def make_sequence(job: DatasetJob, out: Path, index: int, interrupt: DeferredInterrupt) -> WorkReport:
     """Simulate one sequence and write its file; an interrupt leaves nothing and raises KeyboardInterrupt."""
     begin = time.perf_counter()
     sensor = _sensor_of(job)
     scene = make_scene(job, index)
     # sequences share neither scene nor pixels' random numbers
     seed = int(np.random.default_rng([job.seed, index, 1]).integers(2**31))
-    array = Pixels(sensor, job.width, job.height, seed=seed, device=job.backend, labels=job.labels)
+    array = PixelArray(sensor, job.width, job.height, seed=seed, device=job.backend, labels=job.labels)
     with io.create(job.path(out, index)) as writer:
         writer.configuration(job.text() + f"\n[sequence]\nindex = {index}\nsensor_seed = {seed}\n")
         frame_times = np.arange(0, scene.duration, 1 / job.frame_rate)
-        report = _record(scene, array, writer, frame_times, lambda done: interrupt.check())
+        report = _record_into(scene, array, writer, frame_times, lambda done: interrupt.check())
     return replace(report, seconds=time.perf_counter() - begin)
 
 
-def _record(
+def _record_into(
     scene: Scene,
-    array: Pixels,
+    array: PixelArray,
     writer: io.Writer,
     frame_times: np.ndarray,
-    progress: Callable[[Report], None],
-) -> Report:
+    progress: Callable[[WorkReport], None],
+) -> WorkReport:
     """Write thresholds, frames, flow and events of a scene, in order of time."""
-    outlet = Outlet(array.sensor, scene.width, scene.height, seed=array.seed)
+    outlet = ReadoutChain(array.sensor, scene.width, scene.height, seed=array.seed)
     array.look_at(scene)
     writer.thresholds(array.thresholds()[0].reshape(2, scene.height, scene.width))
     times = sample_times(scene, array.sensor)
-    total, shown = Report(sequences=1), 0
+    total, shown = WorkReport(sequences=1), 0
     for part in chunks(times, CHUNK["cuda" if array.device.is_cuda else "cpu"]):
         due = int(np.searchsorted(frame_times, part[-1], side="right"))
         if due > shown:
@@ -291,12 +298,12 @@ def _record(
             shown = due
         events = outlet.push(array.emit(scene, part)[0], array.begin)
         writer.events(events)
-        done = Report(0, len(events), len(part), len(part) * array.count)
+        done = WorkReport(0, len(events), len(part), len(part) * array.count)
         total = total.plus(done)
         progress(done)
     for events in (outlet.push(array.flush()[0], array.begin), outlet.flush()):
         writer.events(events)
-        total = total.plus(Report(0, len(events)))
+        total = total.plus(WorkReport(0, len(events)))
     return total
 
 
@@ -316,8 +323,8 @@ def record_scene(
     seed: int = 0,
     device: str = "cpu",
     labels: bool = False,
-    progress: Callable[[Report], None] = lambda report: None,
-) -> Report:
+    progress: Callable[[WorkReport], None] = lambda report: None,
+) -> WorkReport:
     """Simulate any scene into one file.
 
     Args:
@@ -337,14 +344,14 @@ def record_scene(
     # the first sample of each frame period; a slack of 1e-6 of it keeps equal rates equal
     period = np.floor((times - times[0]) * frame_rate + 1e-6)
     frame_times = times[np.concatenate([[True], np.diff(period) > 0])]
-    array = Pixels(sensor, scene.width, scene.height, seed=seed, device=device, labels=labels)
-    with deferred() as interrupt, io.create(path) as writer:
+    array = PixelArray(sensor, scene.width, scene.height, seed=seed, device=device, labels=labels)
+    with defer_interrupt() as interrupt, io.create(path) as writer:
 
-        def advance(done: Report) -> None:
+        def advance(done: WorkReport) -> None:
             interrupt.check()
             progress(done)
 
         model = dump_sensor(replace(sensor, history=()))
         writer.configuration(model + f'\n[run]\ndase = "{__version__}"\nseed = {seed}\n')
-        report = _record(scene, array, writer, frame_times, advance)
+        report = _record_into(scene, array, writer, frame_times, advance)
     return replace(report, seconds=time.perf_counter() - begin)

@@ -9,7 +9,7 @@ from contextlib import contextmanager
 from typing import Any
 
 
-class Deferred:
+class DeferredInterrupt:
     """An interrupt that waits until `check` is called; also across processes, through their event."""
 
     def __init__(self, event: Any):
@@ -22,7 +22,7 @@ class Deferred:
 
 
 @contextmanager
-def deferred(event: Any = None) -> Iterator[Deferred]:
+def defer_interrupt(event: Any = None) -> Iterator[DeferredInterrupt]:
     """Hold Ctrl-C back until `check`; raised anywhere else it could be lost in a destructor.
 
     Args:
@@ -30,18 +30,18 @@ def deferred(event: Any = None) -> Iterator[Deferred]:
     """
     event = event or threading.Event()
     if threading.current_thread() is not threading.main_thread():
-        yield Deferred(event)  # only the main thread may handle signals
+        yield DeferredInterrupt(event)  # only the main thread may handle signals
         return
     before: Callable[..., Any] | int | None = signal.getsignal(signal.SIGINT)
     signal.signal(signal.SIGINT, lambda number, frame: event.set())
     try:
-        yield Deferred(event)
+        yield DeferredInterrupt(event)
     finally:
         signal.signal(signal.SIGINT, before)
 
 
 @contextmanager
-def ignored() -> Iterator[None]:
+def ignore_interrupt() -> Iterator[None]:
     """Ignore Ctrl-C; processes started meanwhile ignore it for good."""
     if threading.current_thread() is not threading.main_thread():
         yield

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from dase.diagnosis.candidates import scout
+from dase.diagnosis.candidates import screen_and_descend
 from dase.effects import Effect
 from dase.events import Events
-from dase.fitting.data_split import PIXELS, gather
+from dase.fitting.data_split import PIXELS, split_measurement
 from dase.fitting.fit import fit
-from dase.fitting.model import fit_present
+from dase.fitting.model import fit_present_model
 from dase.probes.stimulus import Trust
 from dase.results import Fit
 from dase.scenes.scene import Scene
@@ -47,16 +47,16 @@ def fit_added(
     """
     tell = progress or (lambda text, share, error: None)
     sensor, effect = sensor.bound_to(scene), effect.bound_to(scene)
-    evidence = gather(
+    evidence = split_measurement(
         events, scene, log_eps=sensor.log_eps, trust=trust, pixels=pixels, seed=seed, device=device
     )
     tell("fitting without the effect", 0.0, float("nan"))
-    present = fit_present(evidence, sensor, None, seed=seed)
+    present = fit_present_model(evidence, sensor, None, seed=seed)
     before = present.judge(evidence.held, repeats=30, seed=seed + 500).error
     tell(f"where to begin with {effect.name}", 0.1, before)
     # far from where it is, a descent could end in the wrong place
     present.rebase(evidence.scout, repeats=16, seed=seed + 200)
-    start = scout(evidence, present, effect, seed=seed).model.sensor
+    start = screen_and_descend(evidence, present, effect, seed=seed).model.sensor
     fitted = fit(
         events, scene, start, trust=trust, pixels=pixels, seed=seed, device=device, progress=progress
     )

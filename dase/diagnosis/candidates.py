@@ -14,14 +14,21 @@ from dase.effects.optics import SceneEffect
 from dase.effects.readout import Readout
 from dase.effects.row_scan import RowScan
 from dase.effects.timestamp import Timestamp
-from dase.fitting.data_split import Evidence
-from dase.fitting.descent import Over, screening, searching
-from dase.fitting.early_stopping import Race
-from dase.fitting.model import SETTLED, Model, added, settling, starts, turned
-from dase.fitting.parameter_space import variants
-from dase.fitting.scheduler import Ask, Work, alone, beside, together
-from dase.fitting.subset import Half
-from dase.probes.distance import Judgement, Scale
+from dase.fitting.data_split import SplitMeasurement
+from dase.fitting.descent import StopRule, descent_work, ranking_work
+from dase.fitting.early_stopping import CandidateRace
+from dase.fitting.model import (
+    SETTLED,
+    FittedModel,
+    refit_work,
+    starting_places,
+    with_effect_added,
+    with_lamp_shifted,
+)
+from dase.fitting.parameter_space import effect_variants
+from dase.fitting.scheduler import SimulationRequest, Work, run_side_by_side, run_work, side_by_side_work
+from dase.fitting.subset import PixelSubset
+from dase.probes.distance import ErrorScale, Judgement
 
 Array = NDArray[np.float64]
 
@@ -73,7 +80,7 @@ SIGNIFICANT = 0.05
 
 
 @dataclass(frozen=True, eq=False)
-class Tried:
+class Candidate:
     """One candidate.
 
     Args:
@@ -88,9 +95,9 @@ class Tried:
     """
 
     name: str
-    model: Model
+    model: FittedModel
     fit: float
-    scouted: float = float("nan")
+    screened_loss: float = float("nan")
     families: Mapping[str, float] = field(default_factory=dict)
     judged: Judgement | None = None
     bank: Array | None = None
@@ -102,11 +109,11 @@ class Tried:
         return self.judged.error if self.judged else float("nan")
 
 
-Report = Callable[[str, float], None]
+StepProgress = Callable[[str, float], None]
 """Told what is being done, and the share of the step that is done."""
 
 
-def open_to(effects: Mapping[str, type[Effect]], present: Model) -> list[str]:
+def effects_to_try(effects: Mapping[str, type[Effect]], present: FittedModel) -> list[str]:
     """Return the names of the effects that can be tried."""
     sensor = present.space.sensor
     # what acts on whole pictures has no place in a parameter vector; what a network has to learn first
@@ -115,7 +122,7 @@ def open_to(effects: Mapping[str, type[Effect]], present: Model) -> list[str]:
     return [n for n in known if n not in sensor or (sensor[n].is_off() and n != "threshold")]
 
 
-def prepared(evidence: Evidence, effect: type[Effect]) -> list[Effect]:
+def variants_to_try(evidence: SplitMeasurement, effect: type[Effect]) -> list[Effect]:
     """Return the variants of an effect that are tried, with what can be read off the measurement set.
 
     No descent finds the frequency of a lamp or the ticks of a clock, but they can be seen, as can the rate of
@@ -130,20 +137,24 @@ def prepared(evidence: Evidence, effect: type[Effect]) -> list[Effect]:
     if effect is RowScan:
         return [RowScan(line=structure.line, direction=structure.direction)] if structure.line else []
     if effect is Readout:
-        if evidence.busiest < IDLE * evidence.fastest:
+        if evidence.highest_event_rate < IDLE * evidence.least_bus_rate:
             return []
         # events come as fast as the bus can send them, if it ever was full
-        return [replace(e, rate=evidence.busiest) for e in variants(effect) if isinstance(e, Readout)]
-    return variants(effect)
+        return [
+            replace(e, rate=evidence.highest_event_rate)
+            for e in effect_variants(effect)
+            if isinstance(e, Readout)
+        ]
+    return effect_variants(effect)
 
 
-def rare(effect: Effect) -> bool:
+def acts_on_few_pixels(effect: Effect) -> bool:
     """Whether an effect acts on a share of the pixels: a few hundred of them do not show it."""
     return any(p.name == "share" for p in effect.parameters())
 
 
 @dataclass(frozen=True, eq=False)
-class Look:
+class Screening:
     """Many places at which an effect was tried.
 
     Args:
@@ -156,8 +167,8 @@ class Look:
     """
 
     effect: Effect
-    model: Model
-    half: Half
+    model: FittedModel
+    half: PixelSubset
     before: Array
     places: Array
     losses: Array
@@ -172,29 +183,35 @@ class Look:
         """Loss of the present model."""
         return float(self.half.scale.loss(self.before))
 
-    def found(self, place: Array, loss: float) -> Tried:
+    def found(self, place: Array, loss: float) -> Candidate:
         """Return the candidate at a place."""
         model = replace(self.model, place=place, loss=loss)
-        return Tried(self.effect.name, model, loss, loss / self.present)
+        return Candidate(self.effect.name, model, loss, loss / self.present)
 
 
-def looking(evidence: Evidence, present: Model, effect: Effect, *, seed: int) -> Work[Look]:
-    """Look at an effect at many places, on some pixels, see `together`."""
-    half = evidence.train if rare(effect) else evidence.scout
-    model = added(present, effect)
-    (before,) = yield [Ask(half, present.space, present.place[None], seed)]
+def screen_effect(
+    evidence: SplitMeasurement, present: FittedModel, effect: Effect, *, seed: int
+) -> Work[Screening]:
+    """Look at an effect at many places, on some pixels, see `run_side_by_side`."""
+    half = evidence.train if acts_on_few_pixels(effect) else evidence.scout
+    model = with_effect_added(present, effect)
+    (before,) = yield [SimulationRequest(half, present.space, present.place[None], seed)]
     few = half.slow(model.space)
-    places, losses = yield from screening(half, model.space, starts(model, effect, few=few), seed=seed)
-    return Look(effect, model, half, before[0], places, losses)
+    places, losses = yield from ranking_work(
+        half, model.space, starting_places(model, effect, few=few), seed=seed
+    )
+    return Screening(effect, model, half, before[0], places, losses)
 
 
-def scout(evidence: Evidence, present: Model, effect: Effect, *, seed: int) -> Tried:
+def screen_and_descend(
+    evidence: SplitMeasurement, present: FittedModel, effect: Effect, *, seed: int
+) -> Candidate:
     """Try one effect on some pixels: a look at many places, then a short descent from the best two."""
-    look = alone(looking(evidence, present, effect, seed=seed))
-    return alone(following(look, Race(1), seed=seed))
+    look = run_work(screen_effect(evidence, present, effect, seed=seed))
+    return run_work(descend_from_screening(look, CandidateRace(1), seed=seed))
 
 
-def followed(looks: Sequence[Look]) -> list[Look]:
+def worth_descending(looks: Sequence[Screening]) -> list[Screening]:
     """Return those looks from which a descent is worth its time."""
     best: dict[str, float] = {}
     for look in looks:
@@ -207,16 +224,16 @@ def followed(looks: Sequence[Look]) -> list[Look]:
     ]  # fmt: skip
 
 
-def following(look: Look, race: Race, *, seed: int) -> Work[Tried]:
-    """Descend from the best two places of a look, see `together`."""
+def descend_from_screening(look: Screening, race: CandidateRace, *, seed: int) -> Work[Candidate]:
+    """Descend from the best two places of a look, see `run_side_by_side`."""
     half, places, losses = look.half, look.places, look.losses
-    slow = half.slow(look.model.space) or rare(look.effect)
+    slow = half.slow(look.model.space) or acts_on_few_pixels(look.effect)
     apart = np.flatnonzero((np.abs(places - places[0]).max(1) > 0.8) & (losses < SECOND * losses[0]))
     name, unit, space = look.effect.name, look.present, look.model.space
     begins = places[[0, *apart[: 0 if slow else 1]]]
-    ends = yield from beside(
+    ends = yield from side_by_side_work(
         [
-            searching(half, space, begin, seed=seed, iterations=3, over=race.over(name, unit))
+            descent_work(half, space, begin, seed=seed, iterations=3, over=race.over(name, unit))
             for begin in begins
         ]
     )
@@ -228,134 +245,149 @@ def following(look: Look, race: Race, *, seed: int) -> Work[Tried]:
     )
 
 
-def refining(evidence: Evidence, tried: Tried, race: Race, *, seed: int) -> Work[Tried]:
+def refine_candidate(
+    evidence: SplitMeasurement, tried: Candidate, race: CandidateRace, *, seed: int
+) -> Work[Candidate]:
     """Fit a candidate to all pixels of the training half, by the sampling errors of the present model."""
     # a finalist that is still on its way would be judged by where it happens to be
     half = evidence.train.loaded(tried.model.space, tried.model.place)
-    ways = turned(tried.model, half.frame.step)
+    ways = with_lamp_shifted(tried.model, half.frame.step)
     works = []
     for way in ways:
         over = race.over(tried.name)
         works.append(
-            searching(
+            descent_work(
                 half, way.space, way.place, seed=seed, iterations=3, radius=0.2, patient=True, over=over
             )
         )
-    ends = yield from beside(works)
+    ends = yield from side_by_side_work(works)
     found = min(ends, key=lambda end: end.loss)
     model = replace(tried.model, place=found.place, loss=found.loss)
     bank = np.concatenate([end.tried for end in ends])
     return replace(tried, model=model, fit=found.loss, bank=bank)
 
 
-def judge_alone(evidence: Evidence, tried: Sequence[Tried], *, seed: int) -> list[Tried]:
+def refit_and_judge(evidence: SplitMeasurement, tried: Sequence[Candidate], *, seed: int) -> list[Candidate]:
     """Fit candidates by their own sampling errors and judge them on the held-out half.
 
     Effects that make pixels differ have sampling errors far above those of the model without them, by which
     they would look worse than they are. The repeats that give those of a candidate also tell its error where
     it was fitted so far; candidates far behind the best by that measure go no further.
     """
-    looks = [_looking(evidence, t, seed=seed) for t in tried]
-    found = together(looks)
+    looks = [_error_where_fitted(evidence, t, seed=seed) for t in tried]
+    found = run_side_by_side(looks)
     limit = BEHIND * min(error for error, _ in found) + CLOSE
-    race = Race(1, LOSES)
+    race = CandidateRace(1, LOSES)
     works = [
-        _judging(evidence, t, half, FEW if error > FAR else REPEATS, race.over(t.name), seed=seed)
+        _settle_and_judge(evidence, t, half, FEW if error > FAR else REPEATS, race.over(t.name), seed=seed)
         for t, (error, half) in zip(tried, found, strict=True) if error <= limit
     ]  # fmt: skip
-    done = {t.name: t for t in together(works)}
+    done = {t.name: t for t in run_side_by_side(works)}
     for _ in range(AGAIN):
-        first, least = (min(done.values(), key=key) for key in (_error, lambda t: t.model.loss))
+        first, least = (min(done.values(), key=key) for key in (_held_out_error, lambda t: t.model.loss))
         if least is first or least.model.loss > SURELY * first.model.loss:
             break
         # better where it was fitted, worse where it is judged: it is still on its way
-        half = alone(_looking(evidence, least, seed=seed))[1]
-        done[least.name] = alone(_judging(evidence, least, half, REPEATS, None, seed=seed))
+        half = run_work(_error_where_fitted(evidence, least, seed=seed))[1]
+        done[least.name] = run_work(_settle_and_judge(evidence, least, half, REPEATS, None, seed=seed))
     return [done.get(t.name, t) for t in tried]
 
 
-def _error(tried: Tried) -> float:
+def _held_out_error(tried: Candidate) -> float:
     return tried.error
 
 
-def _looking(evidence: Evidence, tried: Tried, *, seed: int) -> Work[tuple[float, Half]]:
+def _error_where_fitted(
+    evidence: SplitMeasurement, tried: Candidate, *, seed: int
+) -> Work[tuple[float, PixelSubset]]:
     """Return the error on the training half, and that half with the candidate as its present model."""
     half = evidence.train.view()
     values = yield from half.rebasing(tried.model.space, tried.model.place, repeats=SETTLED, seed=seed + 100)
     return half.judge(values, seed=seed).error, half
 
 
-def _judging(
-    evidence: Evidence, tried: Tried, half: Half, repeats: int, over: Over | None, *, seed: int
-) -> Work[Tried]:
-    model = yield from settling(evidence, tried.model, seed=seed, rounds=1, half=half, over=over)
+def _settle_and_judge(
+    evidence: SplitMeasurement,
+    tried: Candidate,
+    half: PixelSubset,
+    repeats: int,
+    over: StopRule | None,
+    *,
+    seed: int,
+) -> Work[Candidate]:
+    model = yield from refit_work(evidence, tried.model, seed=seed, rounds=1, half=half, over=over)
     judged = yield from model.judging(evidence.held.view(), repeats=repeats, seed=seed + 500)
     return replace(tried, model=model, judged=judged)
 
 
-def try_all(
-    evidence: Evidence,
-    present: Model,
+def try_effects(
+    evidence: SplitMeasurement,
+    present: FittedModel,
     effects: Mapping[str, type[Effect]],
     names: Sequence[str],
     *,
     repeats: Array,
     worst: Sequence[str],
     seed: int,
-    report: Report,
-) -> list[Tried]:
+    report: StepProgress,
+) -> list[Candidate]:
     """Try each effect; return those that were judged in order of their held-out error, then the others.
 
     `repeats` are those of the present model on the training half, to which that and the scout must have been
     rebased; `worst` are the families in which it fails: who helps there is looked at more closely.
     """
-    all_variants = [v for name in names for v in prepared(evidence, effects[name])]
-    order, left = _scouted(evidence, present, all_variants, seed=seed, report=report)
-    chosen = [*order[:FINALISTS], *specialists(order, worst)]
+    all_variants = [v for name in names for v in variants_to_try(evidence, effects[name])]
+    order, left = _screen_variants(evidence, present, all_variants, seed=seed, report=report)
+    chosen = [*order[:FINALISTS], *family_specialists(order, worst)]
     report(f"fitting {', '.join(t.name for t in chosen)}", 0.5)
-    last = Race(1, GIVES_UP)
-    refined = together([refining(evidence, tried, last, seed=seed) for tried in chosen])
-    finalists = with_chance(evidence, present, refined, repeats, seed=seed)
+    last = CandidateRace(1, GIVES_UP)
+    refined = run_side_by_side([refine_candidate(evidence, tried, last, seed=seed) for tried in chosen])
+    finalists = with_p_values(evidence, present, refined, repeats, seed=seed)
     # what chance does as well is not added, whatever its error
     certain = [t for t in finalists if t.p_value <= max(SIGNIFICANT, 1.01 / (1 + len(repeats)))]
     report(f"judging {', '.join(t.name for t in certain)}", 0.75)
-    done = judge_alone(evidence, certain, seed=seed) if certain else []
+    done = refit_and_judge(evidence, certain, seed=seed) if certain else []
     done += [t for t in finalists if t not in certain]
     done.sort(key=lambda t: (t.error if t.judged else np.inf, t.p_value))
     return [*done, *(t for t in order if t not in chosen), *left]
 
 
-def _scouted(
-    evidence: Evidence, present: Model, variants: Sequence[Effect], *, seed: int, report: Report
-) -> tuple[list[Tried], list[Tried]]:
+def _screen_variants(
+    evidence: SplitMeasurement,
+    present: FittedModel,
+    variants: Sequence[Effect],
+    *,
+    seed: int,
+    report: StepProgress,
+) -> tuple[list[Candidate], list[Candidate]]:
     """Return candidates in order of their loss on some pixels, and those that were only looked at."""
-    looks = together(
-        [looking(evidence, present, effect, seed=seed) for effect in variants],
+    looks = run_side_by_side(
+        [screen_effect(evidence, present, effect, seed=seed) for effect in variants],
         lambda share: report("looking at all effects", 0.2 * share),
     )
-    race, found = Race(FINALISTS), dict[str, Tried]()
-    works = [following(look, race, seed=seed) for look in followed(looks)]
-    for tried in together(works, lambda share: report("trying all effects", 0.2 + 0.3 * share)):
-        if tried.name not in found or tried.scouted < found[tried.name].scouted:
+    race, found = CandidateRace(FINALISTS), dict[str, Candidate]()
+    works = [descend_from_screening(look, race, seed=seed) for look in worth_descending(looks)]
+    for tried in run_side_by_side(works, lambda share: report("trying all effects", 0.2 + 0.3 * share)):
+        if tried.name not in found or tried.screened_loss < found[tried.name].screened_loss:
             found[tried.name] = tried
     left = {look.effect.name: look.found(look.places[0], float(look.losses[0])) for look in looks}
-    first = sorted(found.values(), key=lambda t: t.scouted)
+    first = sorted(found.values(), key=lambda t: t.screened_loss)
     return first, [tried for name, tried in left.items() if name not in found]
 
 
-def with_chance(
-    evidence: Evidence, present: Model, tried: Sequence[Tried], repeats: Array, *, seed: int
-) -> list[Tried]:
+def with_p_values(
+    evidence: SplitMeasurement, present: FittedModel, tried: Sequence[Candidate], repeats: Array, *, seed: int
+) -> list[Candidate]:
     """Return candidates with the p-values of what they make of the training loss."""
     scale = evidence.train.scale
     standing = evidence.train.run(present.space, present.place[None], seed=seed)[0]
-    p_value = chance_of(scale, tried, repeats, standing)
+    p_value = p_value_function(scale, tried, repeats, standing)
     return [replace(t, p_value=p_value(float(scale.loss(standing)) - t.fit)) for t in tried]
 
 
-def specialists(order: Sequence[Tried], worst: Sequence[str]) -> list[Tried]:
+def family_specialists(order: Sequence[Candidate], worst: Sequence[str]) -> list[Candidate]:
     """Return those beside the first ones that help most in the families where the present model is worst."""
-    out: list[Tried] = []
+    out: list[Candidate] = []
     for family in worst:
         best = min(order, key=lambda t: t.families.get(family, float("inf")))
         if best not in order[:FINALISTS] and best not in out:
@@ -363,8 +395,8 @@ def specialists(order: Sequence[Tried], worst: Sequence[str]) -> list[Tried]:
     return out
 
 
-def chance_of(
-    scale: Scale, tried: Sequence[Tried], repeats: Array, present: Array
+def p_value_function(
+    scale: ErrorScale, tried: Sequence[Candidate], repeats: Array, present: Array
 ) -> Callable[[float], float]:
     """Return the function from a fall of the training loss to its p-value, corrected over all candidates.
 

@@ -8,12 +8,12 @@ from itertools import pairwise
 import numpy as np
 
 from dase.fitting.batch_simulator import LAG_TIMES
-from dase.fitting.data_split import Evidence
-from dase.fitting.subset import Half
+from dase.fitting.data_split import SplitMeasurement
+from dase.fitting.subset import PixelSubset
 from dase.kernels.event_probes import BANDS, CLASSES, INTERVALS, KINDS, ZONES
 from dase.probes.distance import Judgement
 from dase.probes.statistics import LAYOUT, LOWEST, MEANS, TONES
-from dase.probes.timestamp_patterns import Structure
+from dase.probes.timestamp_patterns import TimestampStructure
 from dase.results import Cell
 
 SHOWN = 24
@@ -39,48 +39,48 @@ _SPREADS = (
 )  # fmt: skip
 _ODD = ("busy pixels at rest", "very busy pixels at rest", "busy pixels")
 
-Words = tuple[str, str, str]
+StatisticWords = tuple[str, str, str]
 """Where a statistic is taken, what it is, and its unit."""
 
 
-def band(evidence: Evidence, n: int) -> str:
+def band_in_words(evidence: SplitMeasurement, n: int) -> str:
     """Return a band of intensity in words, in grey values of 8 bits."""
     edges = [f"{255 * e:.0f}" for e in evidence.bands]
     between = [f"{a} to {b} DN" for a, b in pairwise(edges)]
     return f"{_BANDS[n]} pixels ({[f'below {edges[0]} DN', *between, f'above {edges[-1]} DN'][n]})"
 
 
-def place(evidence: Evidence, family: str, n: int) -> Words:
+def describe_statistic(evidence: SplitMeasurement, family: str, n: int) -> StatisticWords:
     """Return where the `n`-th statistic of a family is taken, what it is, and its unit."""
     return _PLACES[family](evidence, n)
 
 
-def _rate(evidence: Evidence, n: int) -> Words:
+def _rate_words(evidence: SplitMeasurement, n: int) -> StatisticWords:
     polarity, cell = divmod(n, KINDS * BANDS)
-    where = f"{band(evidence, cell % BANDS)}, {_KINDS[cell // BANDS]}"
+    where = f"{band_in_words(evidence, cell % BANDS)}, {_KINDS[cell // BANDS]}"
     return where, f"{_POLARITY[polarity]} events", "events"
 
 
-def _intervals(evidence: Evidence, n: int) -> Words:
+def _interval_words(evidence: SplitMeasurement, n: int) -> StatisticWords:
     group, octave = divmod(n, INTERVALS)
     rest, kin = divmod(group, 3)
-    return f"{_STATES[rest]} pixels", f"intervals {_octave(octave)} of {_PAIRS[kin]}", "events"
+    return f"{_STATES[rest]} pixels", f"intervals {_octave_words(octave)} of {_PAIRS[kin]}", "events"
 
 
-def _lag(evidence: Evidence, n: int) -> Words:
+def _lag_words(evidence: SplitMeasurement, n: int) -> StatisticWords:
     lag, where = divmod(n, BANDS)
     a, b = 1e3 * LAG_TIMES[lag], 1e3 * LAG_TIMES[lag + 1]
     what = f"change of light from {b:g} to {a:g} ms before the event"
-    return band(evidence, where), what, "log intensity"
+    return band_in_words(evidence, where), what, "log intensity"
 
 
-def _repeats(evidence: Evidence, n: int) -> Words:
+def _repeat_words(evidence: SplitMeasurement, n: int) -> StatisticWords:
     third, where = divmod(n, BANDS)
     what = f"events that are the {'third' if third else 'second'} in a step"
-    return band(evidence, where), what, "share"
+    return band_in_words(evidence, where), what, "share"
 
 
-def _change(evidence: Evidence, n: int) -> Words:
+def _change_words(evidence: SplitMeasurement, n: int) -> StatisticWords:
     kind, rest = divmod(n, 4 * CLASSES)
     if kind == 2:
         return _CLASSES[rest], "correlation of successive changes between events", "log intensity²"
@@ -89,45 +89,45 @@ def _change(evidence: Evidence, n: int) -> Words:
     return _CLASSES[group], f"{what}, {_ORDER[pair]}", "log intensity"
 
 
-def _spread(evidence: Evidence, n: int) -> Words:
+def _spread_words(evidence: SplitMeasurement, n: int) -> StatisticWords:
     state, what = divmod(n, len(_SPREADS))
     return f"{_STATES[state]} pixels", _SPREADS[what], "events² per event"
 
 
-def _pixels(evidence: Evidence, n: int) -> Words:
+def _odd_pixel_words(evidence: SplitMeasurement, n: int) -> StatisticWords:
     return "single pixels", _ODD[n], "pixels"
 
 
-def _silent(evidence: Evidence, n: int) -> Words:
+def _silent_pixel_words(evidence: SplitMeasurement, n: int) -> StatisticWords:
     return "single pixels", "silent pixels", "pixels"
 
 
-def _space(evidence: Evidence, n: int) -> Words:
+def _ring_words(evidence: SplitMeasurement, n: int) -> StatisticWords:
     state, ring = divmod(n, ZONES)
     rest, polarity = divmod(state, 2)
     where = f"ring {ring + 1} of {ZONES} from the middle, {_STATES[rest]}"
     return where, f"{_POLARITY[polarity]} events", "events"
 
 
-def _spectrum(evidence: Evidence, n: int) -> Words:
+def _spectrum_words(evidence: SplitMeasurement, n: int) -> StatisticWords:
     if n >= TONES:
         return "all pixels", f"swing of the net rate at {evidence.peak:.4g} Hz", "share"
     ends = np.geomspace(LOWEST, 0.5 / evidence.held.frame.step, TONES + 1)
     return "all pixels", f"power of the net rate from {ends[n]:.3g} to {ends[n + 1]:.3g} Hz", "log power"
 
 
-def _stamps(evidence: Evidence, n: int) -> Words:
-    return "all pixels", Structure.NAMES[n], "share"
+def _timestamp_words(evidence: SplitMeasurement, n: int) -> StatisticWords:
+    return "all pixels", TimestampStructure.NAMES[n], "share"
 
 
-_PLACES: dict[str, Callable[[Evidence, int], Words]] = {
-    "rate": _rate, "intervals": _intervals, "lag": _lag, "repeats": _repeats, "change": _change,
-    "spread": _spread, "pixels": _pixels, "silent": _silent,
-    "space": _space, "spectrum": _spectrum, "stamps": _stamps,
+_PLACES: dict[str, Callable[[SplitMeasurement, int], StatisticWords]] = {
+    "rate": _rate_words, "intervals": _interval_words, "lag": _lag_words, "repeats": _repeat_words, "change": _change_words,
+    "spread": _spread_words, "pixels": _odd_pixel_words, "silent": _silent_pixel_words,
+    "space": _ring_words, "spectrum": _spectrum_words, "stamps": _timestamp_words,
 }  # fmt: skip
 
 
-def _octave(n: int) -> str:
+def _octave_words(n: int) -> str:
     if n < 2:
         return ("within one step of time", "of one step")[n]
     if n == INTERVALS - 1:
@@ -136,7 +136,7 @@ def _octave(n: int) -> str:
 
 
 def worst_cells(
-    evidence: Evidence, judgement: Judgement, half: Half | None = None, *, shown: int = SHOWN
+    evidence: SplitMeasurement, judgement: Judgement, half: PixelSubset | None = None, *, shown: int = SHOWN
 ) -> tuple[Cell, ...]:
     """Return where model and measurement differ most, worst first."""
     half = half or evidence.held
@@ -149,13 +149,15 @@ def worst_cells(
                 continue
             counts = not MEANS[j] and family not in ("spread", "spectrum", "stamps")
             m, s = (np.exp(v[j]) - 3.0 if counts else v[j] for v in (measured, simulated))
-            where, what, unit = place(evidence, family, n)
+            where, what, unit = describe_statistic(evidence, family, n)
             m, s = (max(0.0, float(v)) if counts else float(v) for v in (m, s))
-            out.append(Cell(family, where, what, m, s, unit, float(z), _sentence(where, what, m, s, counts)))
+            out.append(
+                Cell(family, where, what, m, s, unit, float(z), _cell_sentence(where, what, m, s, counts))
+            )
     return tuple(sorted(out, key=lambda cell: -abs(cell.z))[:shown])
 
 
-def _sentence(where: str, what: str, measured: float, simulated: float, counts: bool) -> str:
+def _cell_sentence(where: str, what: str, measured: float, simulated: float, counts: bool) -> str:
     if not counts:
         return f"{where}: {what} is {simulated:.3g} in the model, {measured:.3g} in the measurement"
     few, many = sorted((measured, simulated))

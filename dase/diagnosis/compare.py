@@ -7,12 +7,12 @@ import time
 import numpy as np
 from numpy.typing import NDArray
 
-from dase.diagnosis.cell_descriptions import band, worst_cells
+from dase.diagnosis.cell_descriptions import band_in_words, worst_cells
 from dase.events import Events
 from dase.fitting.batch_simulator import LAG_TIMES
-from dase.fitting.data_split import PIXELS, Evidence, gather
+from dase.fitting.data_split import PIXELS, SplitMeasurement, split_measurement
 from dase.fitting.model import model_of
-from dase.fitting.subset import Half
+from dase.fitting.subset import PixelSubset
 from dase.kernels.event_probes import BANDS, INTERVALS, KINDS, LAGS, RESTING
 from dase.probes.distance import Judgement
 from dase.probes.statistics import LAYOUT
@@ -58,7 +58,7 @@ def compare(
     tell = progress or (lambda text, share, error: None)
     tell("reading the measurement", 0.0, float("nan"))
     sensor = sensor.bound_to(scene)
-    evidence = gather(
+    evidence = split_measurement(
         events, scene, log_eps=sensor.log_eps, trust=trust, pixels=pixels, seed=seed, device=device
     )
     tell("simulating", 0.3, float("nan"))
@@ -67,7 +67,9 @@ def compare(
     return comparison_of(evidence, judgement, sensor, seconds=time.perf_counter() - begin)
 
 
-def comparison_of(evidence: Evidence, judgement: Judgement, sensor: Sensor, *, seconds: float) -> Comparison:
+def comparison_of(
+    evidence: SplitMeasurement, judgement: Judgement, sensor: Sensor, *, seconds: float
+) -> Comparison:
     """Return the comparison with the model that the held-out half was rebased to."""
     return Comparison(
         sensor=sensor,
@@ -76,17 +78,17 @@ def comparison_of(evidence: Evidence, judgement: Judgement, sensor: Sensor, *, s
         gate=judgement.gate,
         families=judgement.families,
         cells=worst_cells(evidence, judgement),
-        plain=plain(evidence.held),
-        curves=curves(evidence),
+        plain=plain_numbers(evidence.held),
+        curves=family_curves(evidence),
         notes=evidence.notes,
         seconds=seconds,
     )
 
 
-def plain(half: Half) -> dict[str, tuple[float, float]]:
+def plain_numbers(half: PixelSubset) -> dict[str, tuple[float, float]]:
     """Return measured and simulated values in units that need no explanation."""
     values = half.seen.target, half.simulated
-    real, made = (_rates(v) for v in values)
+    real, made = (_rate_counts(v) for v in values)
     exposure = half.trials.stimulus.exposure().reshape(KINDS, BANDS)
     time_ = max(float(exposure.sum()), 1e-9)
     rest = max(float(exposure[:RESTING].sum()), 1e-9)
@@ -99,33 +101,33 @@ def plain(half: Half) -> dict[str, tuple[float, float]]:
         slow = real[n, :RESTING].sum() / rest, made[n, :RESTING].sum() / rest
         out[f"{names[n]} events at rest [1/(px s)]"] = float(slow[0]), float(slow[1])
     step = 1e3 * half.trials.stimulus.grid.step
-    a, b = (_median(_counts(v, "intervals"), step) for v in values)
+    a, b = (_median_interval(_family_counts(v, "intervals"), step) for v in values)
     out["median interval of a pixel [ms]"] = a, b
     a, b = (_mean_lag(v) for v in values)
     out["mean lag behind the light [ms]"] = a, b
     return out
 
 
-def _counts(values: Array, family: str) -> Array:
+def _family_counts(values: Array, family: str) -> Array:
     return np.maximum(np.exp(values[LAYOUT[family]]) - 3.0, 0.0)
 
 
-def _rates(values: Array) -> Array:
-    return _counts(values, "rate").reshape(2, KINDS, BANDS)
+def _rate_counts(values: Array) -> Array:
+    return _family_counts(values, "rate").reshape(2, KINDS, BANDS)
 
 
-def _octaves(step: float) -> Array:
+def _octave_ends(step: float) -> Array:
     """Return the upper ends of the bins of intervals, in units of `step`."""
     return step * np.concatenate([[0.5], 2.0 ** np.arange(INTERVALS - 1)])
 
 
-def _median(counts: Array, step: float) -> float:
+def _median_interval(counts: Array, step: float) -> float:
     """Return the median interval, on a logarithmic scale within its bin."""
     total = counts.reshape(-1, INTERVALS).sum(0)
     if total.sum() == 0:
         return float("nan")
     share = np.concatenate([[0.0], np.cumsum(total) / total.sum()])
-    ends = np.log(np.concatenate([[0.25 * step], _octaves(step)]))
+    ends = np.log(np.concatenate([[0.25 * step], _octave_ends(step)]))
     return float(np.exp(np.interp(0.5, share, ends)))
 
 
@@ -136,7 +138,7 @@ def _mean_lag(values: Array) -> float:
     return float(1e3 * (weight * middle).sum() / max(weight.sum(), 1e-12))
 
 
-def curves(evidence: Evidence) -> dict[str, tuple[Curve, ...]]:
+def family_curves(evidence: SplitMeasurement) -> dict[str, tuple[Curve, ...]]:
     """Return what figures are drawn from, by family."""
     half = evidence.held
     return {
@@ -146,29 +148,29 @@ def curves(evidence: Evidence) -> dict[str, tuple[Curve, ...]]:
     }
 
 
-def _rate_curves(evidence: Evidence, half: Half) -> tuple[Curve, ...]:
+def _rate_curves(evidence: SplitMeasurement, half: PixelSubset) -> tuple[Curve, ...]:
     exposure = np.maximum(half.trials.stimulus.exposure().reshape(KINDS, BANDS), 1e-9)
     middle = np.array([-0.4, -0.12, 0.0, 0.12, 0.4])
     out = []
-    both = [_rates(v) for v in (half.seen.target, half.simulated)]
+    both = [_rate_counts(v) for v in (half.seen.target, half.simulated)]
     sigma = half.seen.sigma[LAYOUT["rate"]].reshape(2, KINDS, BANDS)
     for n in range(BANDS):
         for p, polarity in enumerate(("OFF", "ON")):
             measured, simulated = (c[p, RESTING:, n] / exposure[RESTING:, n] for c in both)
             error = sigma[p, RESTING:, n] * (both[0][p, RESTING:, n] + 3) / exposure[RESTING:, n]
             out.append(
-                Curve(f"{polarity} events, {band(evidence, n)}", middle, "change of light in 16 ms",
+                Curve(f"{polarity} events, {band_in_words(evidence, n)}", middle, "change of light in 16 ms",
                       "events per pixel and second", measured, simulated, error)
             )  # fmt: skip
     return tuple(out)
 
 
-def _interval_curves(half: Half) -> tuple[Curve, ...]:
+def _interval_curves(half: PixelSubset) -> tuple[Curve, ...]:
     step = half.trials.stimulus.grid.step * 1e3
-    ends = _octaves(step)
+    ends = _octave_ends(step)
     middle = np.concatenate([[0.35 * step], np.sqrt(ends[:-1] * ends[1:])])
     names = [f"{kin}, {state}" for state in ("moving", "at rest") for kin in ("OFF-OFF", "ON-ON", "opposite")]
-    both = [_counts(v, "intervals").reshape(6, INTERVALS) for v in (half.seen.target, half.simulated)]
+    both = [_family_counts(v, "intervals").reshape(6, INTERVALS) for v in (half.seen.target, half.simulated)]
     sigma = half.seen.sigma[LAYOUT["intervals"]].reshape(6, INTERVALS)
     return tuple(
         Curve(f"Intervals {name}", middle, "interval [ms]", "events", both[0][n], both[1][n],
@@ -177,14 +179,14 @@ def _interval_curves(half: Half) -> tuple[Curve, ...]:
     )  # fmt: skip
 
 
-def _lag_curves(evidence: Evidence, half: Half) -> tuple[Curve, ...]:
+def _lag_curves(evidence: SplitMeasurement, half: PixelSubset) -> tuple[Curve, ...]:
     times = np.array(LAG_TIMES)
     width = 1e3 * np.diff(times)
     middle = 1e3 * 0.5 * (times[1:] + times[:-1])
     both = [v[LAYOUT["lag"]].reshape(LAGS, BANDS) for v in (half.seen.target, half.simulated)]
     sigma = half.seen.sigma[LAYOUT["lag"]].reshape(LAGS, BANDS)
     return tuple(
-        Curve(f"Light before an event, {band(evidence, n)}", middle, "time before the event [ms]",
+        Curve(f"Light before an event, {band_in_words(evidence, n)}", middle, "time before the event [ms]",
               "change of log intensity per ms", both[0][:, n] / width, both[1][:, n] / width,
               sigma[:, n] / width)
         for n in range(BANDS)

@@ -13,13 +13,13 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from dase.diagnosis.candidates import Tried, open_to, prepared
-from dase.diagnosis.state import REPEATS, Search
-from dase.fitting.model import Model, added, settle
-from dase.fitting.scheduler import Ask, alone, simulated
-from dase.fitting.subset import Half
-from dase.probes.distance import Judgement, explained
-from dase.probes.statistics import statistics
+from dase.diagnosis.candidates import Candidate, effects_to_try, variants_to_try
+from dase.diagnosis.state import REPEATS, DiagnosisState
+from dase.fitting.model import FittedModel, refit_model, with_effect_added
+from dase.fitting.scheduler import SimulationRequest, answer_requests, run_work
+from dase.fitting.subset import PixelSubset
+from dase.probes.distance import Judgement, reaches_floor
+from dase.probes.statistics import compute_statistics
 
 Array = NDArray[np.float64]
 
@@ -49,7 +49,7 @@ FARTHEST = 0.2
 
 
 @dataclass(frozen=True)
-class Way:
+class RepeatCloud:
     """From repeats of a model to where other models are.
 
     Args:
@@ -60,7 +60,7 @@ class Way:
     repeats: Array
     seen: Array
 
-    def away(self, ways: Array) -> Array:
+    def deviations_along(self, ways: Array) -> Array:
         """Return how far the measurement is from the repeats along some ways (M, J), in deviations, (M,).
 
         The repeats and the measurement may be off by the tolerance, which their standard errors know: without
@@ -73,87 +73,102 @@ class Way:
         return out
 
 
-def closer(search: Search, model: Model, judgement: Judgement) -> tuple[Tried, float] | None:
+def find_hidden_effect(
+    search: DiagnosisState, model: FittedModel, judgement: Judgement
+) -> tuple[Candidate, float] | None:
     """Return the effect that chance hid, fitted and judged, and its p-value; None if there is none."""
     # also above what chance does: there no candidate may be certain by the fall of its loss
-    if judgement.level < HIDES or not explained(judgement):
+    if judgement.level < HIDES or not reaches_floor(judgement):
         return None
     search.progress("looking closer", 0.0, search.error)
-    start = _nearest(search, model)
+    start = _most_deviating_effect(search, model)
     if start is None:
         return None
     name, begin, p_value = start
-    fitted = settle(search.evidence, begin, seed=search.seed, rounds=1)
-    judged = alone(fitted.judging(search.evidence.held.view(), repeats=REPEATS, seed=search.seed + 500))
-    if not explained(judged) or away(search.evidence.held, model, fitted, seed=search.seed) < AGAIN:
+    fitted = refit_model(search.evidence, begin, seed=search.seed, rounds=1)
+    judged = run_work(fitted.judging(search.evidence.held.view(), repeats=REPEATS, seed=search.seed + 500))
+    if (
+        not reaches_floor(judged)
+        or deviation_towards(search.evidence.held, model, fitted, seed=search.seed) < AGAIN
+    ):
         return None
-    return Tried(name, fitted, fitted.loss, judged=judged), p_value
+    return Candidate(name, fitted, fitted.loss, judged=judged), p_value
 
 
-def hides(judgement: Judgement) -> bool:
+def may_hide_effect(judgement: Judgement) -> bool:
     """Whether the chance of a model may hide an effect: it makes much of the error, and may make all."""
-    return judgement.level >= HIDES and judgement.error <= judgement.reach and explained(judgement)
+    return judgement.level >= HIDES and judgement.error <= judgement.reach and reaches_floor(judgement)
 
 
-def shown(search: Search, model: Model, judgement: Judgement, other: Model) -> bool:
+def lacks_effect_of(
+    search: DiagnosisState, model: FittedModel, judgement: Judgement, other: FittedModel
+) -> bool:
     """Whether a closer look shows that a model, which leaves what is judged, lacks what another one has."""
-    if not hides(judgement):
+    if not may_hide_effect(judgement):
         return False
     ways = ((search.evidence.train, AWAY), (search.evidence.held, AGAIN))
-    return all(away(half, model, other, seed=search.seed) >= least for half, least in ways)
+    return all(deviation_towards(half, model, other, seed=search.seed) >= least for half, least in ways)
 
 
-def away(half: Half, model: Model, other: Model, *, seed: int) -> float:
+def deviation_towards(half: PixelSubset, model: FittedModel, other: FittedModel, *, seed: int) -> float:
     """Return how far a measurement is from repeats of a model, on the way to another, in their deviations."""
-    half, way = _based(half, model, seed=seed)
-    one, two = _means(half, [(model, model.place[None]), (other, other.place[None])], seed=seed)
-    return float(way.away(_in_errors(half, two - one))[0])
+    half, way = _repeat_cloud(half, model, seed=seed)
+    one, two = _mean_statistics(half, [(model, model.place[None]), (other, other.place[None])], seed=seed)
+    return float(way.deviations_along(_in_standard_errors(half, two - one))[0])
 
 
-def _nearest(search: Search, model: Model) -> tuple[str, Model, float] | None:
+def _most_deviating_effect(
+    search: DiagnosisState, model: FittedModel
+) -> tuple[str, FittedModel, float] | None:
     """Return the effect on whose way the measurement is farthest from the model, where to begin, a p-value.
 
     For that, repeats stand in for the measurement, each on the way on which it is farthest.
     """
-    half, way = _based(search.evidence.train, model, seed=search.seed)
+    half, way = _repeat_cloud(search.evidence.train, model, seed=search.seed)
     reach = np.where([a.name.startswith("threshold.") for a in model.space.axes], 0.05, 0.2)
     sides = np.concatenate([model.place[None], model.place + np.diag(reach), model.place - np.diag(reach)])
-    tried = _tried(search, model, half)
+    tried = _models_to_probe(search, model, half)
     if not tried:
         return None
-    here, *there = _means(half, [(model, sides), *((m, places) for _, m, places in tried)], seed=search.seed)
+    here, *there = _mean_statistics(
+        half, [(model, sides), *((m, places) for _, m, places in tried)], seed=search.seed
+    )
     plus, minus = np.split(here[1:], 2)
-    slopes = _in_errors(half, 0.5 * (plus - minus)).T
-    ways = np.clip(_in_errors(half, np.concatenate(there) - here[0]), -PLAIN, PLAIN)
+    slopes = _in_standard_errors(half, 0.5 * (plus - minus)).T
+    ways = np.clip(_in_standard_errors(half, np.concatenate(there) - here[0]), -PLAIN, PLAIN)
     frame, _ = np.linalg.qr(slopes)
     # what the free parameters can do as well tells nothing
     bare = ways - (ways @ frame) @ frame.T
-    far = way.away(bare)
-    chance = np.array([Way(way.repeats, one).away(bare).max() for one in way.repeats])
+    far = way.deviations_along(bare)
+    chance = np.array([RepeatCloud(way.repeats, one).deviations_along(bare).max() for one in way.repeats])
     first = int(far.argmax())
     if far[first] < AWAY:
         return None
     name, other, place = [(n, m, place) for n, m, places in tried for place in places][first]
     step = (way.seen - ways[first]) @ np.linalg.pinv(slopes).T * reach
     p_value = (1 + np.count_nonzero(chance >= far[first])) / (1 + len(chance))
-    return name, _begin(model, other, place, step), float(p_value)
+    return name, _starting_model(model, other, place, step), float(p_value)
 
 
-def _begin(model: Model, other: Model, place: Array, step: Array) -> Model:
+def _starting_model(model: FittedModel, other: FittedModel, place: Array, step: Array) -> FittedModel:
     """Return the model with an effect more where the rest has given way to it."""
     names = [axis.name for axis in other.space.axes]
     place = place.copy()
     for axis, change in zip(model.space.axes, np.clip(step, -FARTHEST, FARTHEST), strict=True):
         place[names.index(axis.name)] += change
-    return Model(other.space, place)
+    return FittedModel(other.space, place)
 
 
-def _tried(search: Search, model: Model, half: Half) -> list[tuple[str, Model, Array]]:
+def _models_to_probe(
+    search: DiagnosisState, model: FittedModel, half: PixelSubset
+) -> list[tuple[str, FittedModel, Array]]:
     """Return effects, the models with them, and the places where those are looked at; none that are slow."""
     out = []
     effects = search.effects
-    for effect in (e for n in open_to(effects, model) for e in prepared(search.evidence, effects[n])):
-        other = added(model, effect)
+    for effect in (
+        e for n in effects_to_try(effects, model) for e in variants_to_try(search.evidence, effects[n])
+    ):
+        other = with_effect_added(model, effect)
         columns = [
             n for n, a in enumerate(other.space.axes) if a.name.split(".")[0] == effect.name and a.main
         ]
@@ -167,23 +182,30 @@ def _tried(search: Search, model: Model, half: Half) -> list[tuple[str, Model, A
     return out
 
 
-def _based(half: Half, model: Model, *, seed: int) -> tuple[Half, Way]:
+def _repeat_cloud(half: PixelSubset, model: FittedModel, *, seed: int) -> tuple[PixelSubset, RepeatCloud]:
     half = half.view()
     repeats = model.rebase(half, repeats=REPEATS, seed=seed + 700)
     middle = repeats.mean(0)
-    return half, Way(_in_errors(half, repeats - middle), _in_errors(half, half.chance.target - middle))
+    return half, RepeatCloud(
+        _in_standard_errors(half, repeats - middle), _in_standard_errors(half, half.chance.target - middle)
+    )
 
 
-def _in_errors(half: Half, apart: Array) -> Array:
+def _in_standard_errors(half: PixelSubset, apart: Array) -> Array:
     """Return differences in standard errors, those that are compared."""
     used = half.chance.used
     out: Array = apart[..., used] / half.chance.sigma[used]
     return out
 
 
-def _means(half: Half, models: Sequence[tuple[Model, Array]], *, seed: int) -> list[Array]:
+def _mean_statistics(
+    half: PixelSubset, models: Sequence[tuple[FittedModel, Array]], *, seed: int
+) -> list[Array]:
     """Return the mean statistics of models at some places, their random numbers in common."""
-    sums = simulated(
-        [Ask(half, m.space, np.repeat(places, MEANS, 0), seed + 900, repeats=True) for m, places in models]
+    sums = answer_requests(
+        [
+            SimulationRequest(half, m.space, np.repeat(places, MEANS, 0), seed + 900, repeats=True)
+            for m, places in models
+        ]
     )
-    return [statistics(one, half.frame)[0].reshape(-1, MEANS, len(half.off)).mean(1) for one in sums]
+    return [compute_statistics(one, half.frame)[0].reshape(-1, MEANS, len(half.off)).mean(1) for one in sums]

@@ -10,17 +10,25 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from dase.diagnosis.standard_stimuli import STANDARDS, Standard
+from dase.diagnosis.standard_stimuli import STANDARD_STIMULI, StandardStimulus
 from dase.effects.row_scan import RowScan
 from dase.effects.timestamp import Timestamp
 from dase.errors import InputError
-from dase.fitting.batch_simulator import Order, Trials, finer_steps
+from dase.fitting.batch_simulator import BatchSimulator, SimulationOrder, samples_per_step
 from dase.fitting.data_split import typical_changes
 from dase.kernels import launch
-from dase.probes.accumulators import Frame, Sums
-from dase.probes.statistics import LAYOUT, WORDS, compared, peak_of, statistics, tolerance, zones
+from dase.probes.accumulators import ProbeSums, StatisticsFrame
+from dase.probes.statistics import (
+    FAMILY_WORDS,
+    LAYOUT,
+    compute_statistics,
+    is_compared,
+    peak_of,
+    ring_of_pixels,
+    tolerance_of,
+)
 from dase.probes.stimulus import MASKED, Grid, Stimulus, band_edges, sort_into_cells
-from dase.probes.timestamp_patterns import SHORTEST, Structure
+from dase.probes.timestamp_patterns import SHORTEST, TimestampStructure
 from dase.results import Answer, Distinction
 from dase.simulation.sensor import Sensor
 
@@ -79,13 +87,13 @@ def distinguish(
     Raises:
         InputError: The models are of cameras that differ in size, or a number is out of range.
     """
-    size = _check(a, b, longest, pixels, repeats)
+    size = _check_arguments(a, b, longest, pixels, repeats)
     durations = [t for t in LADDER if t < longest] + [longest]
     answers = []
-    for number, standard in enumerate(STANDARDS):
+    for number, standard in enumerate(STANDARD_STIMULI):
         tried: list[tuple[float, float]] = []
         for seconds in durations:
-            bench = _Bench(standard, seconds, size, pixels, (a, b), seed + 1000 * number, device)
+            bench = _StimulusTest(standard, seconds, size, pixels, (a, b), seed + 1000 * number, device)
             answer = bench.judge(repeats)
             tried.append((seconds, answer.power))
             last = answer.seconds is not None or seconds == longest
@@ -95,11 +103,11 @@ def distinguish(
         answers.append(replace(answer, tried=tuple(tried)))
     known = [answer for answer in answers if answer.seconds is not None]
     best = min(known, key=lambda answer: answer.seconds or 0.0, default=None)
-    sentence = _advice(best, longest, pixels, *(names or (a.name, b.name)))
+    sentence = _advice_sentence(best, longest, pixels, *(names or (a.name, b.name)))
     return Distinction(tuple(answers), best, sentence, pixels, longest)
 
 
-def _check(a: Sensor, b: Sensor, longest: float, pixels: int, repeats: int) -> tuple[int, int]:
+def _check_arguments(a: Sensor, b: Sensor, longest: float, pixels: int, repeats: int) -> tuple[int, int]:
     if not (LADDER[0] <= longest <= 600):
         raise InputError(f"longest must lie in [{LADDER[0]:g}, 600] s, got {longest:g}")
     if pixels < 16:
@@ -114,23 +122,23 @@ def _check(a: Sensor, b: Sensor, longest: float, pixels: int, repeats: int) -> t
     return a.size or b.size or (346, 260)
 
 
-def _structure(models: tuple[Sensor, Sensor]) -> Structure:
+def _timestamp_structure(models: tuple[Sensor, Sensor]) -> TimestampStructure:
     """Return the regularity of time stamps that a readout of the models makes, if a file could show it."""
     for model in models:
         for effect in model.streams():
             if isinstance(effect, Timestamp) and effect.step >= SHORTEST:
-                return Structure(step=effect.step)
+                return TimestampStructure(step=effect.step)
             if isinstance(effect, RowScan):
-                return Structure(line=effect.line, direction=effect.direction)
-    return Structure()
+                return TimestampStructure(line=effect.line, direction=effect.direction)
+    return TimestampStructure()
 
 
-class _Bench:
+class _StimulusTest:
     """Both models on one stimulus of one duration."""
 
     def __init__(
         self,
-        standard: Standard,
+        standard: StandardStimulus,
         seconds: float,
         size: tuple[int, int],
         pixels: int,
@@ -141,7 +149,7 @@ class _Bench:
         self.standard, self.models, self.seed = standard, models, seed
         step, (width, height) = standard.step, size
         steps = round(seconds / step) + 1
-        finer = max(finer_steps(model, step) for model in models)
+        finer = max(samples_per_step(model, step) for model in models)
         # a recording is put together of parts, for light takes memory
         self.parts = max(1, math.ceil(pixels * steps * max(finer, 1) / ROOM))
         count = math.ceil(pixels / self.parts)
@@ -149,7 +157,7 @@ class _Bench:
         chosen = np.sort(rng.choice(width * height, count, replace=count > width * height)).astype(np.int32)
         grid = Grid(0.0, step, steps)
         try:
-            to = launch.device(device)
+            to = launch.find_device(device)
         except ValueError as error:
             raise InputError(str(error)) from error
         light = standard.light(rng, count, grid.times)
@@ -161,12 +169,12 @@ class _Bench:
         self.finer = finer
         # a readout that both have tells nothing
         self.readout = set(models[0].streams()) != set(models[1].streams())
-        structure = _structure(models) if self.readout else Structure()
+        structure = _timestamp_structure(models) if self.readout else TimestampStructure()
         stimulus = Stimulus(chosen, width, height, grid, light, cell, log_eps, to)
-        self.trials = Trials(stimulus, structure=structure)
-        self.regular = structure != Structure()
+        self.trials = BatchSimulator(stimulus, structure=structure)
+        self.regular = structure != TimestampStructure()
         self.seconds = step * (steps - 1)
-        self.zone = np.tile(zones(chosen, width, height), self.parts)
+        self.zone = np.tile(ring_of_pixels(chosen, width, height), self.parts)
 
     def judge(self, repeats: int) -> Answer:
         """Say how well recordings of the two models are told apart."""
@@ -176,11 +184,11 @@ class _Bench:
         expected = sum(sums.halves.mean(0, dtype=np.float64) for sums in found) / 2
         step = self.standard.step
         peak = peak_of(sum(sums.clock.sum(0) for sums in found), step)
-        frame = Frame(np.asarray(expected), self.zone, self.seconds, 0, step, peak, self.regular)
-        (a, events), (b, more) = (statistics(sums, frame) for sums in found)
-        used = compared(a.mean(0), events.mean(0)) | compared(b.mean(0), more.mean(0))
-        off = tolerance(a.mean(0), np.maximum(events.mean(0), more.mean(0)))
-        power, share = separation(a * used, b * used, off)
+        frame = StatisticsFrame(np.asarray(expected), self.zone, self.seconds, 0, step, peak, self.regular)
+        (a, events), (b, more) = (compute_statistics(sums, frame) for sums in found)
+        used = is_compared(a.mean(0), events.mean(0)) | is_compared(b.mean(0), more.mean(0))
+        off = tolerance_of(a.mean(0), np.maximum(events.mean(0), more.mean(0)))
+        power, share = separating_power(a * used, b * used, off)
         told = power >= POWER
         says = {name: float(share[part].sum()) for name, part in LAYOUT.items()}
         # the plainest of those that say about as much
@@ -192,11 +200,11 @@ class _Bench:
             self.standard.how,
             self.seconds if told else None,
             power,
-            WORDS[family] if clear else "",
+            FAMILY_WORDS[family] if clear else "",
             (float(rates[0][0]), float(rates[0][1]), float(rates[1][0]), float(rates[1][1])),
         )
 
-    def _recordings(self, number: int, repeats: int) -> Sums:
+    def _recordings(self, number: int, repeats: int) -> ProbeSums:
         """Return what recordings of a model sum up to, one per row."""
         seed = self.seed + 1 + number * 500_000
         # rows that are simulated at once: their clocks take memory
@@ -205,23 +213,23 @@ class _Bench:
         for first in range(0, repeats, at_once):
             rows = min(at_once, repeats - first) * self.parts
             done.append(self._joined(self._simulated(self.models[number], rows, seed + first * self.parts)))
-        return Sums.join(done)
+        return ProbeSums.join(done)
 
-    def _simulated(self, model: Sensor, rows: int, seed: int) -> Sums:
+    def _simulated(self, model: Sensor, rows: int, seed: int) -> ProbeSums:
         vector = model.parameters()
         if not self.readout:
             vectors = np.repeat(vector[None], rows, 0)
             return self.trials.run(model, vectors, seed=seed, reseed=True, finer=self.finer)
-        order = Order(model, np.repeat(vector[None], rows, 0), seed, reseed=True)
-        return self.trials.stream_all(order, [model.streams()] * rows)
+        order = SimulationOrder(model, np.repeat(vector[None], rows, 0), seed, reseed=True)
+        return self.trials.simulate_streams(order, [model.streams()] * rows)
 
-    def _joined(self, sums: Sums) -> Sums:
+    def _joined(self, sums: ProbeSums) -> ProbeSums:
         """Return recordings put together of their parts, whose pixels do not know of each other."""
 
         def by(a: NDArray[Any]) -> NDArray[Any]:
             return a.reshape(-1, self.parts, *a.shape[1:])
 
-        return Sums(
+        return ProbeSums(
             by(sums.sums).sum(1),
             sums.pixels.reshape((len(sums.sums) // self.parts, -1, sums.pixels.shape[2])),
             by(sums.clock).sum(1),
@@ -229,7 +237,7 @@ class _Bench:
         )
 
 
-def separation(a: Array, b: Array, tolerance: Array) -> tuple[float, Array]:
+def separating_power(a: Array, b: Array, tolerance: Array) -> tuple[float, Array]:
     """Return how well a linear rule tells two kinds of recordings apart that it has not seen.
 
     Args:
@@ -250,12 +258,12 @@ def separation(a: Array, b: Array, tolerance: Array) -> tuple[float, Array]:
         weight = np.divide(difference, variance, out=np.zeros_like(variance), where=clear)
         say += weight * difference
         powers.append(
-            _power(a[judged] @ weight, b[judged] @ weight, float(np.sum((weight * tolerance) ** 2)))
+            _power_of_scores(a[judged] @ weight, b[judged] @ weight, float(np.sum((weight * tolerance) ** 2)))
         )
     return float(np.mean(powers)), say
 
 
-def _power(a: Array, b: Array, blur: float) -> float:
+def _power_of_scores(a: Array, b: Array, blur: float) -> float:
     """Return the share of scores of B above what 5 % of A's are above, both taken as normal."""
     wide, high = (math.sqrt(s.var(ddof=1) + blur) for s in (a, b))
     if wide == 0 or high == 0:
@@ -268,7 +276,7 @@ _QUANTILE = 1.6448536269514722
 """Standard deviations above which 5 % of a normal distribution lie."""
 
 
-def _advice(best: Answer | None, longest: float, pixels: int, a: str, b: str) -> str:
+def _advice_sentence(best: Answer | None, longest: float, pixels: int, a: str, b: str) -> str:
     if best is None:
         return (
             f"{a} and {b} are indistinguishable in any of these recordings up to {longest:g} s "
@@ -277,7 +285,7 @@ def _advice(best: Answer | None, longest: float, pixels: int, a: str, b: str) ->
     return f"Record {best.stimulus} for {best.seconds:g} s, {best.how}: {a} and {b} differ in {best.differs}."
 
 
-def rows(found: Distinction, a: str, b: str) -> Iterator[tuple[str, ...]]:
+def table_rows(found: Distinction, a: str, b: str) -> Iterator[tuple[str, ...]]:
     """Yield the rows of a table of the answers, its head first."""
     yield "recording", "tells apart in", "power", f"events of {a} [1/(px s)]", f"of {b}", "they differ in"
     for answer in found.answers:

@@ -10,7 +10,7 @@ import numpy as np
 from dase.diagnosis.cell_descriptions import worst_cells
 from dase.effects import EFFECTS, Effect
 from dase.errors import InputError, nearest
-from dase.fitting.data_split import gather
+from dase.fitting.data_split import split_measurement
 from dase.fitting.model import model_of
 from dase.probes.statistics import FAMILIES
 from dase.results import Cell
@@ -24,7 +24,7 @@ SHOWN = 6
 """Cells that are listed."""
 
 
-def explanation(name: str, effects: Mapping[str, type[Effect]] = EFFECTS) -> str:
+def explain_effect(name: str, effects: Mapping[str, type[Effect]] = EFFECTS) -> str:
     """Return what the effect `name` is, what it does to the probes, and where it was described.
 
     Raises:
@@ -34,8 +34,8 @@ def explanation(name: str, effects: Mapping[str, type[Effect]] = EFFECTS) -> str
         raise InputError(f"there is no effect '{name}': {nearest(name, effects)}")
     effect = effects[name]
     lines = [f"{name}: {effect.about()}", ""]
-    clear = noticeable(effect)
-    families, cells = seen(clear)
+    clear = noticeable_effect(effect)
+    families, cells = changes_by_effect(clear)
     units = {p.name: "" if p.unit == "1" else f" {p.unit}" for p in effect.parameters()}
     values = ", ".join(f"{n} {getattr(clear, n):.3g}{unit}" for n, unit in units.items())
     lines.append(f"What it does to the probes, at {values}, over bars that move and stand still:")
@@ -48,7 +48,7 @@ def explanation(name: str, effects: Mapping[str, type[Effect]] = EFFECTS) -> str
     return "\n".join([*lines, "", f"Source: {effect.source}"])
 
 
-def noticeable(effect: type[Effect]) -> Effect:
+def noticeable_effect(effect: type[Effect]) -> Effect:
     """Return an effect as strong as half way from its default to the end of its plausible range."""
     values = {}
     for p in effect.parameters():
@@ -58,12 +58,12 @@ def noticeable(effect: type[Effect]) -> Effect:
     return effect(**values)
 
 
-def seen(effect: Effect) -> tuple[dict[str, float], tuple[Cell, ...]]:
+def changes_by_effect(effect: Effect) -> tuple[dict[str, float], tuple[Cell, ...]]:
     """Return by how much each family changes, and the cells that change most; measured is with it."""
-    scene = bars()
+    scene = moving_bars()
     plain = Sensor(name="without")
     events = simulate(scene, plain.with_effect(effect), seed=1)
-    evidence = gather(events, scene, pixels=WIDTH * HEIGHT // 2)
+    evidence = split_measurement(events, scene, pixels=WIDTH * HEIGHT // 2)
     judgement = model_of(plain).judge(evidence.held, repeats=24, seed=2)
     return judgement.families, worst_cells(evidence, judgement)
 
@@ -75,7 +75,7 @@ def with_and_without(cell: Cell) -> str:
     return f"{cell.where}: {cell.what} {cell.simulated:.3g} without, {cell.measured:.3g} with"
 
 
-def bars() -> VideoScene:
+def moving_bars() -> VideoScene:
     """Return bars that move at several speeds over a still background from dark to bright."""
     x, y = np.meshgrid(np.arange(WIDTH), np.arange(HEIGHT))
     still = np.exp(np.linspace(np.log(0.01), np.log(0.9), WIDTH))[None] * np.ones((HEIGHT, 1))

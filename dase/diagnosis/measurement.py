@@ -17,8 +17,8 @@ from dase.probes.stimulus import COARSEST, Trust
 from dase.results import Comparison, Diagnosis, Fit
 from dase.scenes.between_frames import CameraScene
 from dase.scenes.frame_alignment import PARTS, align
-from dase.scenes.frame_denoising import steady
-from dase.scenes.frame_motion import stretched, stretches
+from dase.scenes.frame_denoising import denoise_resting_pixels
+from dase.scenes.frame_motion import estimate_stretches, is_stretched
 from dase.scenes.scene import Scene
 from dase.scenes.video import VideoScene, open_video
 
@@ -90,7 +90,7 @@ def open_measurement(recording: Path, scene: str = "frames", video: Path | None 
     else:
         seen = scene_of_frames(sequence, recording, notes)
     if isinstance(seen, CameraScene):
-        trust = seen.trusts
+        trust = seen.is_trusted
     return Measurement(sequence.events, seen, trust, tuple(notes))
 
 
@@ -112,11 +112,11 @@ def scene_of_frames(sequence: Sequence, path: Path, notes: list[str]) -> Scene:
     if times is None:
         raise InputError(f"{path}: its frames have no times, so they cannot be laid beside the events")
     if float(np.median(np.diff(times))) <= COARSEST * (1 + 1e-6):
-        return VideoScene(linear(sequence.frames, path), times)
-    return between_frames(sequence, notes)
+        return VideoScene(linear_intensity(sequence.frames, path), times)
+    return scene_between_frames(sequence, notes)
 
 
-def between_frames(sequence: Sequence, notes: list[str]) -> CameraScene:
+def scene_between_frames(sequence: Sequence, notes: list[str]) -> CameraScene:
     """Return the scene between the frames of a sequence, laid on its events; `notes` gets what was found out.
 
     Raises:
@@ -126,11 +126,13 @@ def between_frames(sequence: Sequence, notes: list[str]) -> CameraScene:
     if sequence.frames is None or len(sequence.frames) < 2 or times is None:
         raise InputError("the scene between frames needs at least 2 frames with known times")
     half = 0.5 * (np.zeros(len(times)) if sequence.frame_exposure is None else sequence.frame_exposure)
-    frames, begin, end = aligned(sequence.events, sequence.frames, times - half, times + half, notes)
+    frames, begin, end = align_with_events(
+        sequence.events, sequence.frames, times - half, times + half, notes
+    )
     return camera_scene(frames, begin, end, notes)
 
 
-def aligned(
+def align_with_events(
     events: Events,
     frames: NDArray[Any],
     begin: NDArray[np.float64],
@@ -161,14 +163,16 @@ def camera_scene(
     """
     gains = None
     scene = CameraScene(frames, begin, end)
-    if stretched(frames):
-        gains = stretches([scene.intensity(k) for k in range(len(scene))])
+    if is_stretched(frames):
+        gains = estimate_stretches([scene.intensity(k) for k in range(len(scene))])
         notes.append("each frame was stretched to the full range of grey: undone as far as they tell")
         scene = CameraScene(frames, begin, end, gains=gains)
-    return CameraScene(steady(frames), begin, end, gains=gains) if rests(scene) else scene
+    return (
+        CameraScene(denoise_resting_pixels(frames), begin, end, gains=gains) if camera_rests(scene) else scene
+    )
 
 
-def rests(scene: CameraScene) -> bool:
+def camera_rests(scene: CameraScene) -> bool:
     """Return whether most of the picture does not move in most of the times between frames looked at."""
     chosen = np.unique(np.linspace(0, len(scene) - 2, INTERVALS).astype(int))
     ways = [np.linalg.norm(scene.matched(int(k)).ahead, axis=-1) for k in chosen]
@@ -191,10 +195,10 @@ def open_clip(path: Path) -> VideoScene:
         if isinstance(error, InputError):
             raise
         raise InputError(f"scene {path} cannot be read as an archive of frames: {error}") from error
-    return VideoScene(linear(frames, path), times)
+    return VideoScene(linear_intensity(frames, path), times)
 
 
-def linear(frames: NDArray[Any], path: Path) -> NDArray[np.float32]:
+def linear_intensity(frames: NDArray[Any], path: Path) -> NDArray[np.float32]:
     """Return frames as intensities in [0, 1]; whole numbers are shares of the largest their type holds."""
     if frames.dtype.kind == "u":
         shares: NDArray[np.float32] = frames.astype(np.float32) / np.float32(np.iinfo(frames.dtype).max)

@@ -6,10 +6,10 @@ from dataclasses import replace
 
 from dase.results import Diagnosis, Fit
 from dase.simulation.sensor import Sensor
-from dase.simulation.sensor_edit import SensorText, today
+from dase.simulation.sensor_edit import SensorText, history_entry_today
 
 
-def rounded(sensor: Sensor, digits: int = 4) -> Sensor:
+def round_parameters(sensor: Sensor, digits: int = 4) -> Sensor:
     """Return a fitted sensor with values that people can read."""
     for effect in sensor.effects:
         values = {p.name: float(f"{getattr(effect, p.name):.{digits}g}") for p in effect.parameters()}
@@ -17,22 +17,24 @@ def rounded(sensor: Sensor, digits: int = 4) -> Sensor:
     return sensor
 
 
-def fitted(text: SensorText, found: Fit, recording: str) -> SensorText:
+def with_fit(text: SensorText, found: Fit, recording: str) -> SensorText:
     """Return a sensor file with fitted values, and the fall of the error in its history."""
     facts = {
         "error_before": round(found.before, 3),
         "error_after": round(found.error, 3),
         "floor": found.floor,
     }
-    return text.became(rounded(found.sensor)).noted(today("fit", recording=recording, **facts))
+    return text.describing(round_parameters(found.sensor)).noted(
+        history_entry_today("fit", recording=recording, **facts)
+    )
 
 
-def diagnosed(text: SensorText, found: Diagnosis, recording: str) -> SensorText:
+def with_diagnosis(text: SensorText, found: Diagnosis, recording: str) -> SensorText:
     """Return a sensor file with the effects that a diagnosis found, and the error after each as history."""
-    text = text.became(rounded(found.sensor))
+    text = text.describing(round_parameters(found.sensor))
     steps = ["fit", *(f"add {name}" for name in found.selected)]
     errors = [round(error, 3) for error in (found.before, *found.errors)]
     for did, before, after in zip(steps, errors, errors[1:], strict=False):
         facts = {"error_before": before, "error_after": after, "floor": found.floor}
-        text = text.noted(today(did, recording=recording, **facts))
+        text = text.noted(history_entry_today(did, recording=recording, **facts))
     return text

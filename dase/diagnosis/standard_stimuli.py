@@ -14,7 +14,7 @@ Light = Callable[[np.random.Generator, int, Array], NDArray[np.float32]]
 
 
 @dataclass(frozen=True)
-class Standard:
+class StandardStimulus:
     """A recording that anybody can make.
 
     Args:
@@ -30,7 +30,7 @@ class Standard:
     light: Light
 
 
-def _static(low: float, high: float) -> Light:
+def _static_light(low: float, high: float) -> Light:
     def light(rng: np.random.Generator, count: int, times: Array) -> NDArray[np.float32]:
         level = np.exp(rng.uniform(math.log(low), math.log(high), (count, 1)))
         return np.repeat(level.astype(np.float32), len(times), 1)
@@ -38,7 +38,7 @@ def _static(low: float, high: float) -> Light:
     return light
 
 
-def _edges(speed: float, width: float, blur: float = 1.5) -> Light:
+def _edge_light(speed: float, width: float, blur: float = 1.5) -> Light:
     """Bars of random brightness, `width` wide, that go by at `speed` [px/s]; their edges are `blur` wide."""
 
     def light(rng: np.random.Generator, count: int, times: Array) -> NDArray[np.float32]:
@@ -53,7 +53,7 @@ def _edges(speed: float, width: float, blur: float = 1.5) -> Light:
     return light
 
 
-def _flicker(frequency: float, depth: float) -> Light:
+def _flicker_light(frequency: float, depth: float) -> Light:
     def light(rng: np.random.Generator, count: int, times: Array) -> NDArray[np.float32]:
         level = np.exp(rng.uniform(math.log(0.02), math.log(0.6), (count, 1)))
         return (level * (1 + depth * np.sin(2 * np.pi * frequency * times))).astype(np.float32)
@@ -61,15 +61,24 @@ def _flicker(frequency: float, depth: float) -> Light:
     return light
 
 
-STANDARDS = (
-    Standard(
-        "static dark", "a scene at rest in little light, 0.2 to 2 % of white", 1e-3, _static(2e-3, 2e-2)
+STANDARD_STIMULI = (
+    StandardStimulus(
+        "static dark", "a scene at rest in little light, 0.2 to 2 % of white", 1e-3, _static_light(2e-3, 2e-2)
     ),
-    Standard("static bright", "a scene at rest in full light, 30 to 100 % of white", 1e-3, _static(0.3, 1.0)),
-    Standard("slow edge", "bars of many greys that go by at 20 px/s, 20 px wide", 1e-3, _edges(20, 20)),
-    Standard("fast edge", "bars of many greys that go by at 1000 px/s, 100 px wide", 5e-4, _edges(1000, 100)),
-    Standard(
-        "flicker", "a scene at rest, its light going up and down by 50 % at 10 Hz", 1e-3, _flicker(10, 0.5)
+    StandardStimulus(
+        "static bright", "a scene at rest in full light, 30 to 100 % of white", 1e-3, _static_light(0.3, 1.0)
+    ),
+    StandardStimulus(
+        "slow edge", "bars of many greys that go by at 20 px/s, 20 px wide", 1e-3, _edge_light(20, 20)
+    ),
+    StandardStimulus(
+        "fast edge", "bars of many greys that go by at 1000 px/s, 100 px wide", 5e-4, _edge_light(1000, 100)
+    ),
+    StandardStimulus(
+        "flicker",
+        "a scene at rest, its light going up and down by 50 % at 10 Hz",
+        1e-3,
+        _flicker_light(10, 0.5),
     ),
 )
 """What is tried, the easiest to record first."""

@@ -69,7 +69,7 @@ EFFECTS: dict[str, type[Effect]] = {effect.name: effect for effect in _ORDER}
 """Name in sensor files to class, in the order in which they act."""
 
 
-def find(name: str, effects: Mapping[str, type[Effect]] = EFFECTS) -> type[Effect]:
+def find_effect(name: str, effects: Mapping[str, type[Effect]] = EFFECTS) -> type[Effect]:
     """Return the effect of this name; raises InputError with the nearest known name."""
     if name not in effects:
         raise InputError(

@@ -13,7 +13,7 @@ from dase.kernels.vector_math import exponential
 
 
 @wp.func
-def lowpass(
+def lowpass_voltage(
     voltage: float, intensity: float, dt: float, cutoff: float, dark: float, input: float, output: float
 ):
     """First-order low-pass, exact for an input that runs straight between samples."""
@@ -42,7 +42,7 @@ class Bandwidth(Effect):
     source: ClassVar[str] = (
         "Hu, Liu, Delbruck: v2e, from video frames to realistic DVS events, 2021 (finite bandwidth)"
     )
-    stages: ClassVar = {"respond": lowpass}
+    stages: ClassVar = {"respond": lowpass_voltage}
     states: ClassVar = ("input", "output")
 
     cutoff: float = parameter(

@@ -178,13 +178,13 @@ class Effect:
         """Return the longest time between samples that still shows the effect [s]."""
         return math.inf
 
-    def compiled(self) -> pixel_stages.Stages:
+    def compiled(self) -> pixel_stages.EffectStages:
         """Return what the kernel composer needs to know."""
         for stage in self.stages:
             if stage not in pixel_stages.STAGES:
                 has = nearest(stage, pixel_stages.STAGES)
                 raise InputError(f"effect '{self.name}' has a function for stage '{stage}': {has}")
-        return pixel_stages.Stages(
+        return pixel_stages.EffectStages(
             name=self.name,
             functions=tuple(self.stages.items()),
             parameters=tuple(p.name for p in self.parameters()),

@@ -12,7 +12,7 @@ from dase.kernels.vector_math import exponential
 
 
 @wp.func
-def joined(intensity: float, current: float, spread: float, pixel_normal: float):
+def add_dark_current(intensity: float, current: float, spread: float, pixel_normal: float):
     """Intensity that would make photocurrent and dark current together."""
     return intensity + current * exponential(spread * pixel_normal)
 
@@ -34,7 +34,7 @@ class Dark(Effect):
         "temporal contrast vision sensor, 2008; "
         "Nozaki, Delbruck: Temperature and parasitic photocurrent effects in dynamic vision sensors, 2017"
     )
-    stages: ClassVar = {"light": joined}
+    stages: ClassVar = {"light": add_dark_current}
 
     current: float = parameter(
         0.003,

@@ -11,7 +11,7 @@ from dase.effects.base import Effect, parameter
 
 
 @wp.func
-def silence(share: float, pixel_uniform: float):
+def silence_pixel(share: float, pixel_uniform: float):
     """Time the pixel stays dead [s]: for ever, or not at all."""
     return wp.where(pixel_uniform < share, 1.0e30, 0.0)
 
@@ -26,7 +26,7 @@ class Dead(Effect):
 
     name: ClassVar[str] = "dead"
     source: ClassVar[str] = "Gallego et al.: Event-based vision, a survey, 2022 (non-idealities)"
-    stages: ClassVar = {"gate": silence}
+    stages: ClassVar = {"gate": silence_pixel}
 
     share: float = parameter(
         0.001,

@@ -9,16 +9,16 @@ from typing import ClassVar
 import warp as wp
 
 from dase.effects.base import Effect, parameter
-from dase.kernels.vector_math import circle
+from dase.kernels.vector_math import cosine_and_sine
 
 
 @wp.func
-def lamp(intensity: float, t64: wp.float64, frequency: float, depth: float, phase: float):
+def flickering_light(intensity: float, t64: wp.float64, frequency: float, depth: float, phase: float):
     """Intensity under a lamp whose flux is 1 + depth · sin."""
     # float32 resolves no more than a quarter of a millisecond after an hour
     turns = wp.float64(frequency) * t64
     turn = float(turns - wp.floor(turns)) + phase
-    _cosine, sine = circle(turn - wp.floor(turn))
+    _cosine, sine = cosine_and_sine(turn - wp.floor(turn))
     return intensity * (1.0 + depth * sine)
 
 
@@ -40,7 +40,7 @@ class Flicker(Effect):
         "IEEE Std 1789: Recommended practices for modulating current in high-brightness LEDs, 2015 "
         "(depth and frequency of lamps)"
     )
-    stages: ClassVar = {"light": lamp}
+    stages: ClassVar = {"light": flickering_light}
 
     frequency: float = parameter(
         100.0,

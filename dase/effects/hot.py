@@ -11,7 +11,7 @@ from dase.effects.base import Effect, parameter
 
 
 @wp.func
-def rates(
+def hot_rates(
     share: float, rate: float, spread: float, balance: float, pixel_uniform: float, pixel_normal: float
 ):
     """ON and OFF rates [Hz], none for a sound pixel."""
@@ -39,7 +39,7 @@ class Hot(Effect):
         "cameras, 2020 (shares of hot pixels)"
     )
     label: ClassVar[str] = "hot"
-    stages: ClassVar = {"noise": rates}
+    stages: ClassVar = {"noise": hot_rates}
 
     share: float = parameter(
         0.001,

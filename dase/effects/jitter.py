@@ -11,7 +11,7 @@ from dase.effects.base import Effect, parameter
 
 
 @wp.func
-def drawn(on: float, off: float, spread: float, normal: float, normal_2: float):
+def redraw_thresholds(on: float, off: float, spread: float, normal: float, normal_2: float):
     """Thresholds until the next event."""
     return wp.max(on * (1.0 + spread * normal), 0.01), wp.max(off * (1.0 + spread * normal_2), 0.01)
 
@@ -30,7 +30,7 @@ class Jitter(Effect):
 
     name: ClassVar[str] = "jitter"
     source: ClassVar[str] = "Rebecq, Gehrig, Scaramuzza: ESIM, an open event camera simulator, 2018"
-    stages: ClassVar = {"redraw": drawn}
+    stages: ClassVar = {"redraw": redraw_thresholds}
 
     spread: float = parameter(
         0.1,

@@ -11,7 +11,7 @@ from dase.effects.base import Effect, parameter
 
 
 @wp.func
-def lateness(intensity: float, delay: float, light: float, dark: float):
+def event_delay(intensity: float, delay: float, light: float, dark: float):
     """Time from a crossing to its event's leaving the pixel [s]."""
     current = dark + (1.0 - dark) * wp.clamp(intensity, 0.0, 1.0)
     return delay * (1.0 - light + light / current)
@@ -36,7 +36,7 @@ class Latency(Effect):
         "Lichtsteiner, Posch, Delbruck: A 128x128 120 dB 15 us latency asynchronous "
         "temporal contrast vision sensor, 2008 (latency over illumination)"
     )
-    stages: ClassVar = {"delay": lateness}
+    stages: ClassVar = {"delay": event_delay}
 
     delay: float = parameter(
         1e-4,

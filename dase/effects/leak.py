@@ -11,7 +11,9 @@ from dase.effects.base import Effect, parameter
 
 
 @wp.func
-def drift(intensity: float, nominal_on: float, rate: float, spread: float, light: float, pixel_normal: float):
+def leak_drift(
+    intensity: float, nominal_on: float, rate: float, spread: float, light: float, pixel_normal: float
+):
     """Speed at which the pixel's memory leaks away, towards ON [log intensity/s]."""
     return wp.max(rate * (1.0 + spread * pixel_normal), 0.0) * nominal_on * (1.0 + light * intensity)
 
@@ -34,7 +36,7 @@ class Leak(Effect):
     source: ClassVar[str] = (
         "Nozaki, Delbruck: Temperature and parasitic photocurrent effects in dynamic vision sensors, 2017"
     )
-    stages: ClassVar = {"drift": drift}
+    stages: ClassVar = {"drift": leak_drift}
 
     rate: float = parameter(
         0.1,

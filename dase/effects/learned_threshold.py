@@ -19,7 +19,9 @@ if TYPE_CHECKING:
 
 
 @wp.func
-def learned(on: float, off: float, factor: float, spread: float, strength: float, pixel_normal: float):
+def learned_thresholds(
+    on: float, off: float, factor: float, spread: float, strength: float, pixel_normal: float
+):
     """Thresholds of one pixel, both moved by the same random number, as in the paper."""
     moved = 1.0 + strength * (factor * (1.0 + spread * pixel_normal) - 1.0)
     return wp.max(on * moved, 0.01), wp.max(off * moved, 0.01)
@@ -37,7 +39,7 @@ class LearnedThreshold(Effect):
 
     name: ClassVar[str] = "learned_threshold"
     source: ClassVar[str] = "How to Learn a Domain-Adaptive Event Simulator?, 2021"
-    stages: ClassVar = {"threshold": learned}
+    stages: ClassVar = {"threshold": learned_thresholds}
     maps: ClassVar = ("factor", "spread")
 
     strength: float = parameter(
@@ -60,14 +62,14 @@ class LearnedThreshold(Effect):
         if not self.weights or self.bound is not None:
             return self
         try:
-            from dase.networks.weights_file import predict
+            from dase.networks.weights_file import predict_thresholds
         except ImportError:
             raise InputError(
                 f"effect '{self.name}' needs PyTorch and safetensors: pip install \"dase[learn]\""
             ) from None
         times = scene.sample_times()
         grey = scene.frames(times[len(times) // 2 :][:1])[0]
-        mu, sigma, level = predict(Path(self.weights), grey)
+        mu, sigma, level = predict_thresholds(Path(self.weights), grey)
         return replace(self, bound=np.stack([mu / level, sigma / mu]).astype(np.float32))
 
     def map_values(self, pixels: NDArray[np.int32]) -> NDArray[np.float32]:

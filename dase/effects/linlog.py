@@ -12,7 +12,7 @@ from dase.kernels.vector_math import exponential, logarithm
 
 
 @wp.func
-def respond(voltage: float, log_eps: float, knee: float, slope: float):
+def linlog_voltage(voltage: float, log_eps: float, knee: float, slope: float):
     """Voltage that falls linearly with the intensity below the knee."""
     out = voltage
     if knee > 0.0:
@@ -39,7 +39,7 @@ class Linlog(Effect):
     source: ClassVar[str] = (
         "Hu, Liu, Delbruck: v2e, from video frames to realistic DVS events, 2021 (lin-log mapping)"
     )
-    stages: ClassVar = {"respond": respond}
+    stages: ClassVar = {"respond": linlog_voltage}
 
     knee: float = parameter(
         20 / 255,

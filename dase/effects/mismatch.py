@@ -11,7 +11,7 @@ from dase.effects.base import Effect, parameter
 
 
 @wp.func
-def scatter(on: float, off: float, spread: float, pixel_normal: float, pixel_normal_2: float):
+def scatter_thresholds(on: float, off: float, spread: float, pixel_normal: float, pixel_normal_2: float):
     """Thresholds of one pixel; transistors differ independently for ON and OFF."""
     # the floor keeps a pixel far out in the tail from firing without end (the paper's epsilon)
     return wp.max(on * (1.0 + spread * pixel_normal), 0.01), wp.max(
@@ -33,7 +33,7 @@ class Mismatch(Effect):
         "Lichtsteiner, Posch, Delbruck: A 128x128 120 dB 15 us latency asynchronous "
         "temporal contrast vision sensor, 2008"
     )
-    stages: ClassVar = {"threshold": scatter}
+    stages: ClassVar = {"threshold": scatter_thresholds}
 
     spread: float = parameter(
         0.15,

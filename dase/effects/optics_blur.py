@@ -14,7 +14,7 @@ from dase.effects.base import parameter
 from dase.effects.optics import SceneEffect
 from dase.errors import InputError
 from dase.kernels import launch, pixel_stages
-from dase.kernels.scene_blur import blur
+from dase.kernels.scene_blur import blur_frames
 from dase.kernels.scene_layers import render_frames
 from dase.scenes.scene import Scene
 
@@ -22,7 +22,7 @@ WIDEST = 20.0
 """Greatest sigma [px]."""
 
 
-def weights(sigma: float) -> NDArray[np.float32]:
+def blur_weights(sigma: float) -> NDArray[np.float32]:
     """Return the discrete Gaussian of variance sigma² [px²]: middle, first neighbours and so on, (R + 1,).
 
     Its variance is exact however narrow it is, where samples of the normal density would fall short, and
@@ -49,7 +49,7 @@ class Unsharp(Scene):
         self.scene = scene
         self.width, self.height, self.duration = scene.width, scene.height, scene.duration
         self.anytime = scene.anytime
-        self._weights = weights(sigma)
+        self._weights = blur_weights(sigma)
         self._every = np.arange(scene.width * scene.height, dtype=np.int32)
 
     def sample_times(self) -> NDArray[np.float64]:
@@ -66,14 +66,16 @@ class Unsharp(Scene):
         else:
             raise InputError("optics_blur needs intensities, and this scene gives log intensities")
         frames = pixel_stages.Frames()
-        frames.values = blur(pictures, self._weights, self.width, pixels, device)
+        frames.values = blur_frames(pictures, self._weights, self.width, pixels, device)
         return "frames", frames
 
     def frames(self, times: NDArray[np.float64], device: str = "cpu") -> NDArray[np.float32]:
         """Return the blurred pictures at `times` [s], shape (K, height, width)."""
-        where = launch.device(device)
+        where = launch.find_device(device)
         flat = self.scene.frames(times, device).reshape(len(times), -1)
-        found = blur(wp.array(flat, dtype=float, device=where), self._weights, self.width, self._every, where)
+        found = blur_frames(
+            wp.array(flat, dtype=float, device=where), self._weights, self.width, self._every, where
+        )
         return np.asarray(found.numpy().reshape(len(times), self.height, self.width))
 
     def flow(self, times: NDArray[np.float64], device: str = "cpu") -> NDArray[np.float32] | None:

@@ -14,7 +14,7 @@ from dase.effects.base import choice, parameter
 from dase.effects.stream import Reader, StreamEffect
 from dase.events import Events
 from dase.kernels import launch
-from dase.kernels.event_queue import NEVER, ONE, queue
+from dase.kernels.event_queue import NEVER, ONE, send_over_bus
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,7 +35,7 @@ class Bus(Reader):
 
     def __init__(self, service: int, patience: int):
         self._service, self._patience = service, patience  # [ps]
-        self._cpu = launch.device("cpu")
+        self._cpu = launch.find_device("cpu")
         self._busy = np.array([NEVER], np.int64)  # until when [ps]
 
     def push(self, events: Events, until: float) -> tuple[Events, float]:
@@ -58,7 +58,7 @@ class Bus(Reader):
         )  # fmt: skip
         arrays = [wp.array(a, dtype=d, device=self._cpu, copy=False) for a, d in columns]
         inputs = [*arrays[:4], wp.int64(self._service), wp.int64(self._patience), *arrays[4:]]
-        wp.launch(queue, dim=1, inputs=inputs, device=self._cpu)
+        wp.launch(send_over_bus, dim=1, inputs=inputs, device=self._cpu)
         sent = ~np.isnan(through)
         if not sent.all():
             events, through = events.select(sent), through[sent]

@@ -11,7 +11,7 @@ from dase.effects.base import Effect, choice, parameter
 
 
 @wp.func
-def dead(age: float, period: float):
+def dead_time_left(age: float, period: float):
     """Time the pixel stays dead [s]; none when not positive."""
     return period - age
 
@@ -33,7 +33,7 @@ class Refractory(Effect):
         "Lichtsteiner, Posch, Delbruck: A 128x128 120 dB 15 us latency asynchronous "
         "temporal contrast vision sensor, 2008"
     )
-    stages: ClassVar = {"gate": dead}
+    stages: ClassVar = {"gate": dead_time_left}
 
     period: float = parameter(
         1e-3,

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dase.effects.base import choice, parameter
-from dase.effects.stream import Reader, StreamEffect, instant, nanoseconds, order, seconds
+from dase.effects.stream import Reader, StreamEffect, order_events, to_nanosecond, to_nanoseconds, to_seconds
 from dase.errors import InputError
 from dase.events import Events
 
@@ -33,23 +33,23 @@ class Scan(Reader):
         """Give the events whose line is read before `until`, one for each pixel and scan."""
         waiting = Events.concatenate([self._waiting, events])
         due = np.concatenate([self._due, self.next_line(events)])
-        leaves = due * self._line // 1000 < instant(until)
+        leaves = due * self._line // 1000 < to_nanosecond(until)
         self._waiting, self._due = waiting.select(~leaves), due[~leaves]
         waiting, due = waiting.select(leaves), due[leaves]
         across = waiting.x if self._direction in ("down", "up") else waiting.y
-        index = order(due, across.astype(np.int64))
+        index = order_events(due, across.astype(np.int64))
         line, across = due[index], across[index]
         # a pixel holds its first request until it is read, and does not look at the light meanwhile
         first = np.ones(len(index), np.bool_)
         first[1:] = (line[1:] != line[:-1]) | (across[1:] != across[:-1])
-        return replace(waiting.select(index[first]), t=seconds(line[first] * self._line // 1000)), until
+        return replace(waiting.select(index[first]), t=to_seconds(line[first] * self._line // 1000)), until
 
     def next_line(self, events: Events) -> NDArray[np.int64]:
         """Return the number of the line at whose reading each event leaves, shape (N,)."""
         place = (events.y if self._direction in ("down", "up") else events.x).astype(np.int64)
         if self._direction in ("up", "left"):
             place = self._lines - 1 - place
-        late = 1000 * nanoseconds(events.t) - place * self._line
+        late = 1000 * to_nanoseconds(events.t) - place * self._line
         scans = -(-late // (self._lines * self._line))
         return scans * self._lines + place
 

@@ -9,11 +9,11 @@ from typing import ClassVar
 import warp as wp
 
 from dase.effects.base import Effect, parameter
-from dase.kernels.vector_math import circle, exponential
+from dase.kernels.vector_math import cosine_and_sine, exponential
 
 
 @wp.func
-def impulse(x: float, damping: float):
+def impulse_response(x: float, damping: float):
     """Impulse response h of 1 / (s² + 2 damping s + 1) after x, and its derivative."""
     h = float(0.0)
     dh = float(0.0)
@@ -21,7 +21,7 @@ def impulse(x: float, damping: float):
     if damping < 1.0:
         w = wp.sqrt((1.0 - damping) * (1.0 + damping))
         turn = w * x / (2.0 * wp.pi)
-        cosine, sine = circle(turn - wp.floor(turn))
+        cosine, sine = cosine_and_sine(turn - wp.floor(turn))
         h = decay * sine / w
         dh = decay * cosine - damping * h
     else:
@@ -38,7 +38,7 @@ def impulse(x: float, damping: float):
 
 
 @wp.func
-def lag(x: float, damping: float, h: float, rest: float):
+def ramp_lag(x: float, damping: float, h: float, rest: float):
     """Shares of a ramp's step by which the output lags, and by which it has got up to speed.
 
     `rest` is what is left after x of a displacement, p; the shares are the mean of p from 0 to x, and
@@ -57,7 +57,7 @@ def lag(x: float, damping: float, h: float, rest: float):
 
 
 @wp.func
-def filtered(
+def second_order_voltage(
     voltage: float,
     intensity: float,
     dt: float,
@@ -76,9 +76,9 @@ def filtered(
     speed = step / dt
     # beyond this it follows at once; infinity would make not-a-numbers below
     if x < 1.0e8:
-        h, dh = impulse(x, damping)
+        h, dh = impulse_response(x, damping)
         rest = dh + 2.0 * damping * h
-        behind, reached = lag(x, damping, h, rest)
+        behind, reached = ramp_lag(x, damping, h, rest)
         settled = voltage - step * behind + (output - input) * rest + slope / omega * h
         speed = omega * (step * reached - (output - input) * h) + slope * dh
     return settled, voltage, settled, speed
@@ -105,7 +105,7 @@ class SecondOrder(Effect):
         "Lichtsteiner, Posch, Delbruck: A 128x128 120 dB 15 us latency asynchronous "
         "temporal contrast vision sensor, 2008"
     )
-    stages: ClassVar = {"respond": filtered}
+    stages: ClassVar = {"respond": second_order_voltage}
     states: ClassVar = ("input", "output", "slope")
     includes: ClassVar = ("bandwidth",)
 

@@ -11,7 +11,7 @@ from dase.effects.base import Effect, parameter
 
 
 @wp.func
-def rates(
+def shot_rates(
     intensity: float,
     on: float,
     off: float,
@@ -45,7 +45,7 @@ class Shot(Effect):
     source: ClassVar[str] = (
         "Hu, Liu, Delbruck: v2e, from video frames to realistic DVS events, 2021 (temporal noise)"
     )
-    stages: ClassVar = {"noise": rates}
+    stages: ClassVar = {"noise": shot_rates}
 
     rate: float = parameter(
         1.0,

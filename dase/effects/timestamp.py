@@ -13,11 +13,11 @@ from dase.effects.stream import (
     FOREVER,
     Reader,
     StreamEffect,
-    instant,
-    nanoseconds,
-    order,
+    order_events,
     random_numbers,
-    seconds,
+    to_nanosecond,
+    to_nanoseconds,
+    to_seconds,
 )
 from dase.errors import InputError
 from dase.events import Events
@@ -38,13 +38,13 @@ class Stamp(Reader):
 
     def push(self, events: Events, until: float) -> tuple[Events, float]:
         """Give the events that no later one can precede any more."""
-        at, bound = nanoseconds(events.t), instant(until)
+        at, bound = to_nanoseconds(events.t), to_nanosecond(until)
         if self._jitter > 0:
             events, at, bound = self._jittered(events, at, bound)
         if self._step:
             at = 1000 * at // self._step * self._step // 1000
             bound = bound if bound == FOREVER else 1000 * bound // self._step * self._step // 1000
-        return replace(events, t=seconds(at)), math.inf if bound == FOREVER else 1e-9 * bound
+        return replace(events, t=to_seconds(at)), math.inf if bound == FOREVER else 1e-9 * bound
 
     def _jittered(self, events: Events, at: np.ndarray, bound: int) -> tuple[Events, np.ndarray, int]:
         error = np.clip(self._random.standard_normal(len(at)), -WIDEST, WIDEST)
@@ -56,7 +56,7 @@ class Stamp(Reader):
         stays = np.flatnonzero(at >= bound)
         self._waiting, self._at = events.select(stays), at[stays]
         leaves = np.flatnonzero(at < bound)
-        index = leaves[order(at[leaves])]
+        index = leaves[order_events(at[leaves])]
         return events.select(index), at[index], bound
 
 

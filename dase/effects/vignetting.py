@@ -11,7 +11,7 @@ from dase.effects.base import Effect, parameter
 
 
 @wp.func
-def falloff(intensity: float, radius: float, loss: float):
+def vignetted_light(intensity: float, radius: float, loss: float):
     """Intensity after the cos⁴ law."""
     # cos²(angle) = 1 / (1 + tan²(angle)), and the tangent grows with the distance from the middle
     tangent = (1.0 / wp.sqrt(1.0 - loss) - 1.0) * radius * radius
@@ -32,7 +32,7 @@ class Vignetting(Effect):
 
     name: ClassVar[str] = "vignetting"
     source: ClassVar[str] = "Goldman, Chen: Vignette and exposure calibration and compensation, 2005"
-    stages: ClassVar = {"light": falloff}
+    stages: ClassVar = {"light": vignetted_light}
 
     loss: float = parameter(
         0.4,

@@ -9,14 +9,14 @@ from typing import ClassVar
 import warp as wp
 
 from dase.effects.base import Effect, parameter
-from dase.kernels.vector_math import circle, exponential, logarithm
+from dase.kernels.vector_math import cosine_and_sine, exponential, logarithm
 
 POLE = wp.constant(2.0 * math.pi / math.sqrt(math.sqrt(2.0) - 1.0))
 """Frequency of either of two equal poles [rad/s] at which together they lose 3 dB at 1 Hz."""
 
 
 @wp.func
-def fresh(x: float, kept: float):
+def fresh_variance(x: float, kept: float):
     """Variance, covariance and variance of noise and its speed that are new after x time constants.
 
     In units of the stationary variance; the speed in units of the pole. `kept` is exp(-2x).
@@ -31,7 +31,7 @@ def fresh(x: float, kept: float):
 
 
 @wp.func
-def noisy(
+def noisy_voltage(
     voltage: float,
     intensity: float,
     dt: float,
@@ -50,12 +50,12 @@ def noisy(
     # beyond 100 time constants nothing is remembered
     x = wp.min(POLE * cutoff * share * dt, 100.0)
     kept = exponential(-x)
-    var, mixed, speed_var = fresh(x, kept * kept)
+    var, mixed, speed_var = fresh_variance(x, kept * kept)
     first = wp.sqrt(var)
     cross = mixed / first
     then = wp.sqrt(wp.max(speed_var - cross * cross, 0.0))
     # both normals of one Box-Muller pair
-    normal, normal_2 = circle(uniform_2)
+    normal, normal_2 = cosine_and_sine(uniform_2)
     scale = sigma * wp.sqrt(-2.0 * logarithm(1.0 - uniform) * (1.0 - share))
     now = kept * (noise + x * (noise + speed)) + scale * first * normal
     speed_now = kept * (speed - x * (noise + speed)) + scale * (cross * normal + then * normal_2)
@@ -83,7 +83,7 @@ class VoltageNoise(Effect):
     source: ClassVar[str] = (
         "Graca, Delbruck: Unraveling the paradox of intensity-dependent DVS pixel noise, 2021"
     )
-    stages: ClassVar = {"respond": noisy}
+    stages: ClassVar = {"respond": noisy_voltage}
     states: ClassVar = ("noise", "speed")
 
     sigma: float = parameter(

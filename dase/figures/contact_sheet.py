@@ -15,15 +15,15 @@ from matplotlib.ticker import EngFormatter, NullFormatter
 from numpy.typing import NDArray
 
 from dase.figures.style import OFF, ON
-from dase.formatting import seconds
+from dase.formatting import format_seconds
 from dase.io.sequence import Sequence
 from dase.recordings.statistics import Statistics
-from dase.recordings.summary import table
+from dase.recordings.summary import statistics_table
 
 INK, QUIET = "#2b2b2b", "#8a8a8a"
 
 
-def draw(
+def draw_contact_sheet(
     sequence: Sequence,
     statistics: Statistics,
     between: NDArray[np.float64],
@@ -45,20 +45,22 @@ def draw(
     """
     begin, end = sequence.span
     aspect = sequence.events.height / sequence.events.width
-    figure, pictures, (rate, histogram) = _layout(len(times), aspect)
+    figure, pictures, (rate, histogram) = _lay_out(len(times), aspect)
     unknown = sequence.frames is not None and sequence.frame_times is None
-    _header(figure, statistics, title, window, "times of frames unknown, spread evenly" if unknown else "")
+    _draw_header(
+        figure, statistics, title, window, "times of frames unknown, spread evenly" if unknown else ""
+    )
     for axes, panel, time in zip(pictures, panels, times, strict=True):
         # three dots per pixel keep single events sharp where matplotlib interpolates
         axes.imshow(panel.repeat(3, 0).repeat(3, 1), extent=(0, 1, 0, aspect))
         axes.set(xticks=[], yticks=[])
-        axes.set_title(_at(time, end - begin), fontsize=9, color=INK, loc="left", pad=3)
+        axes.set_title(_time_label(time, end - begin), fontsize=9, color=INK, loc="left", pad=3)
     _draw_rate(rate, sequence, times)
     _draw_intervals(histogram, between)
     return figure
 
 
-def _layout(count: int, aspect: float) -> tuple[Figure, list[Axes], list[Axes]]:
+def _lay_out(count: int, aspect: float) -> tuple[Figure, list[Axes], list[Axes]]:
     """Return a figure with `count` axes of height / width `aspect`, and two for plots below them."""
     columns = min(count, 3 if aspect < 1.2 else 6)
     rows = math.ceil(count / columns)
@@ -67,7 +69,7 @@ def _layout(count: int, aspect: float) -> tuple[Figure, list[Axes], list[Axes]]:
     down = across * aspect
     tall = head + rows * (down + label) + foot
     left = (wide - columns * across - gap * (columns - 1)) / 2
-    figure, axes = paper(wide, tall)
+    figure, axes = figure_in_inches(wide, tall)
     pictures = [
         axes(
             left + (k % columns) * (across + gap),
@@ -83,7 +85,7 @@ def _layout(count: int, aspect: float) -> tuple[Figure, list[Axes], list[Axes]]:
     return figure, pictures, plots
 
 
-def paper(wide: float, tall: float) -> tuple[Figure, Callable[[float, float, float, float], Axes]]:
+def figure_in_inches(wide: float, tall: float) -> tuple[Figure, Callable[[float, float, float, float], Axes]]:
     """Return an empty figure, and what puts pale axes onto it; all in inches from the upper left corner.
 
     Args:
@@ -102,22 +104,22 @@ def paper(wide: float, tall: float) -> tuple[Figure, Callable[[float, float, flo
     return figure, axes
 
 
-def _header(figure: Figure, s: Statistics, title: str, window: float, note: str) -> None:
+def _draw_header(figure: Figure, s: Statistics, title: str, window: float, note: str) -> None:
     tall = figure.get_figheight()
-    rows = dict(table(s))
-    facts = [f"{s.width} × {s.height} pixels", seconds(s.duration), f"{rows['events']} events"]
+    rows = dict(statistics_table(s))
+    facts = [f"{s.width} × {s.height} pixels", format_seconds(s.duration), f"{rows['events']} events"]
     facts += [f"{rows['ON share']} ON"] if s.events else []
     facts += [note] if note else []
     left, right, first, second = 0.4 / 11, 1 - 0.4 / 11, 1 - 0.3 / tall, 1 - 0.57 / tall
     figure.text(left, first, title, fontsize=13, color=INK, weight="bold", va="center")
     figure.text(left, second, "   ".join(facts), fontsize=9, color=INK, va="center")
-    said = f"events of {seconds(window)} around each time"
+    said = f"events of {format_seconds(window)} around each time"
     figure.text(right, first, said, fontsize=9, color=INK, va="center", ha="right")
     for x, colour, name in ((right - 0.055, ON, "ON"), (right, OFF, "OFF")):
         figure.text(x, second, f"\N{BLACK SQUARE} {name}", fontsize=9, color=colour, va="center", ha="right")
 
 
-def _at(time: float, span: float) -> str:
+def _time_label(time: float, span: float) -> str:
     """Return a time [s] with as many digits as tell moments of a span [s] apart."""
     digits = max(0, 2 - math.floor(math.log10(span))) if span > 0 else 3
     return f"{time:.{digits}f} s"
@@ -162,7 +164,7 @@ def _draw_intervals(axes: Axes, between: NDArray[np.float64]) -> None:
     axes.set_ylim(bottom=0)
     axes.xaxis.set_major_formatter(EngFormatter("s", sep="\N{THIN SPACE}"))
     axes.xaxis.set_minor_formatter(NullFormatter())
-    said = f"median {seconds(median)},  1 to 99 %: {seconds(low)} to {seconds(high)}"
+    said = f"median {format_seconds(median)},  1 to 99 %: {format_seconds(low)} to {format_seconds(high)}"
     axes.set_title(said, fontsize=8, color=INK, loc="right", pad=5)
 
 

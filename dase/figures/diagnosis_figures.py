@@ -21,13 +21,13 @@ from dase.figures.style import (
     WASH,
     WIDE,
     Plate,
+    add_legend,
     colour_of,
-    label,
-    legend,
+    format_number,
+    label_axes,
     log_axis,
-    number,
-    place,
-    sheet,
+    place_axes,
+    titled_figure,
 )
 from dase.results import Curve, Estimate
 
@@ -38,13 +38,15 @@ DENSE = 60
 """Points of a curve that are drawn as a line when there are more."""
 
 
-def _say(axes: Axes, text: str, at: tuple[float, float], shift: tuple[float, float], **how: Any) -> None:
+def _write_beside(
+    axes: Axes, text: str, at: tuple[float, float], shift: tuple[float, float], **how: Any
+) -> None:
     """Write words beside a point of the data, `shift` in points."""
     how = {"fontsize": 8.5, "color": INK, "va": "center", **how}
     axes.annotate(text, at, shift, textcoords="offset points", **how)
 
 
-def staircase(
+def draw_staircase(
     steps: Sequence[str],
     errors: Sequence[float],
     *,
@@ -66,35 +68,37 @@ def staircase(
     title = "The error falls to the noise floor" if done else "The error falls, but not to the noise floor"
     if len(errors) < 2:
         title = "The error is at the noise floor" if done else "The error is above the noise floor"
-    figure = sheet(
+    figure = titled_figure(
         3.62, title, "on pixels and times that no fit has seen; 1 is what repeats of one measurement give"
     )
-    axes = place(figure, 0.85, 0.85, WIDE - 1.2, 2.4)
+    axes = place_axes(figure, 0.85, 0.85, WIDE - 1.2, 2.4)
     n = len(errors)
     bottom, top = 0.66 * min(floor, *errors), 1.45 * max(*errors, below)
     axes.set(xlim=(-0.5, n - 0.5), ylim=(bottom, top))
     axes.axhspan(bottom, below, color=BOTH, alpha=0.10, lw=0)
     axes.axhline(floor, color=BOTH, lw=1.2, ls=(0, (4, 2)))
-    _stairs(axes, errors, n - stand_ins, bottom)
+    _draw_stairs(axes, errors, n - stand_ins, bottom)
     for i, error in enumerate(errors):
         # beside the line of the floor, not on it
         shift, side = ((0, -6), "top") if 0.6 * floor < error < floor else ((0, 5), "bottom")
-        _say(axes, number(error), (i, error), shift, fontsize=10, ha="center", va=side, weight="bold")
+        _write_beside(
+            axes, format_number(error), (i, error), shift, fontsize=10, ha="center", va=side, weight="bold"
+        )
         above = errors[i - 1] - floor if i else 0.0
         closed = (errors[i - 1] - error) / above if above > 0 else 0.0
         if closed > 0.2 and n < 7 and errors[i - 1] > 1.8 * error:  # else there is no room for words
             said = f"{100 * min(closed, 1.0):.0f} % of the way\nto the floor"
-            _say(axes, said, (i - 0.5, errors[i - 1]), (6, -1), fontsize=7.5, color=QUIET, va="top")
+            _write_beside(axes, said, (i - 0.5, errors[i - 1]), (6, -1), fontsize=7.5, color=QUIET, va="top")
     log_axis(axes, "y")
     axes.xaxis.set_major_locator(FixedLocator(list(range(n))))
     axes.set_xticklabels([textwrap.fill(step, max(10, 110 // n)) for step in steps], fontsize=9.5)
     axes.tick_params(axis="x", length=0)
-    label(axes, y="held-out error [noise floors]")
+    label_axes(axes, y="held-out error [noise floors]")
     shown = [("line", INK, "error"), ("dash", BOTH, "noise floor"), ("box", "#dcefe8", "chance")]
-    legend(figure, [*shown[:1], *([("dash", QUIET, "with a stand-in")] if stand_ins else []), *shown[1:]])
+    add_legend(figure, [*shown[:1], *([("dash", QUIET, "with a stand-in")] if stand_ins else []), *shown[1:]])
     caption = (
         "Each step adds one physical effect and fits all parameters again. "
-        f"The dashed line is the noise floor ({number(floor)}); inside the green band the model differs from "
+        f"The dashed line is the noise floor ({format_number(floor)}); inside the green band the model differs from "
         "the measurement by no more than another recording would."
     )
     if stand_ins:
@@ -102,7 +106,7 @@ def staircase(
     return Plate(figure, caption)
 
 
-def _stairs(axes: Axes, errors: Sequence[float], sure: int, bottom: float) -> None:
+def _draw_stairs(axes: Axes, errors: Sequence[float], sure: int, bottom: float) -> None:
     """Draw the steps; from the `sure`-th on they are dashed."""
     edges = np.arange(len(errors) + 1) - 0.5
     axes.stairs(errors, edges, baseline=bottom, color=INK, fill=True, alpha=0.07, lw=0)
@@ -113,7 +117,7 @@ def _stairs(axes: Axes, errors: Sequence[float], sure: int, bottom: float) -> No
         axes.plot(x, y, color=QUIET, lw=1.8, ls=(0, (3, 1.5)))
 
 
-def families(errors: dict[str, float], *, floor: float = 1.0, gate: float | None = None) -> Plate:
+def draw_families(errors: dict[str, float], *, floor: float = 1.0, gate: float | None = None) -> Plate:
     """Draw the error of each family of probes.
 
     Args:
@@ -122,24 +126,24 @@ def families(errors: dict[str, float], *, floor: float = 1.0, gate: float | None
         gate: Error that 99 of 100 repeats stay below, of the mean over families.
     """
     ranked = sorted(errors.items(), key=lambda item: item[1])
-    figure = sheet(
+    figure = titled_figure(
         1.4 + 0.27 * len(ranked), "What the model gets wrong", "error per kind of statistic, worst first"
     )
-    axes = place(figure, 2.9, 0.8, WIDE - 3.5, 0.27 * len(ranked))
+    axes = place_axes(figure, 2.9, 0.8, WIDE - 3.5, 0.27 * len(ranked))
     values = [max(value, 0.0) for _, value in ranked]
     limit = gate if gate is not None and math.isfinite(gate) else 2 * floor
     colours = [INK if value > limit else LINE for value in values]
     axes.barh(range(len(ranked)), values, color=colours, height=0.62)
     axes.axvline(floor, color=BOTH, lw=1.2, ls=(0, (4, 2)))
     for i, value in enumerate(values):
-        _say(axes, number(value), (value, i), (4, 0), bbox={"color": "white", "pad": 0.8})
+        _write_beside(axes, format_number(value), (value, i), (4, 0), bbox={"color": "white", "pad": 0.8})
     axes.set(xlim=(0, 1.12 * max([*values, 2 * floor])), ylim=(-0.6, len(ranked) - 0.4))
     axes.yaxis.set_major_locator(FixedLocator(list(range(len(ranked)))))
     axes.set_yticklabels([name for name, _ in ranked], fontsize=9)
     axes.tick_params(axis="y", length=0)
     axes.spines["left"].set_visible(False)
-    label(axes, x="held-out error [noise floors]")
-    legend(
+    label_axes(axes, x="held-out error [noise floors]")
+    add_legend(
         figure, [("box", INK, "beyond chance"), ("box", LINE, "within chance"), ("dash", BOTH, "noise floor")]
     )
     caption = (
@@ -149,7 +153,7 @@ def families(errors: dict[str, float], *, floor: float = 1.0, gate: float | None
     return Plate(figure, caption)
 
 
-def ranking(
+def draw_ranking(
     effects: Sequence[str],
     errors: Sequence[float],
     *,
@@ -176,16 +180,16 @@ def ranking(
     found = f"Missing: {' and '.join(chosen)}" if chosen else "No candidate explains the error"
     about = "held-out error with one more effect, everything refitted"
     about += f"; a first look ruled out {screened} more" if screened else ""
-    figure = sheet(1.42 + 0.25 * n, found, about)
-    axes = place(figure, 1.6, 0.85, WIDE - 3.6, 0.25 * n)
+    figure = titled_figure(1.42 + 0.25 * n, found, about)
+    axes = place_axes(figure, 1.6, 0.85, WIDE - 3.6, 0.25 * n)
     rows = np.arange(n)[::-1]
     low, high = 0.75 * min(floor, *errors), 1.3 * max(present, *errors)
     for row, effect, error, p in zip(rows, effects, errors, p_values, strict=True):
         colour = INK if effect in chosen else QUIET if effect in ties else LINE
         axes.plot([present, error], [row, row], color=colour, lw=1.6, solid_capstyle="butt")
         axes.plot([error], [row], "o", ms=6, color=colour)
-        note = f"{number(error)}   " + (
-            f"p ≤ {number(p)}" if p < 0.05 else "by chance" if p > 0.5 else f"p = {p:.2f}"
+        note = f"{format_number(error)}   " + (
+            f"p ≤ {format_number(p)}" if p < 0.05 else "by chance" if p > 0.5 else f"p = {p:.2f}"
         )
         note += "   found" if effect in chosen else "   as good" if effect in ties else ""
         axes.annotate(
@@ -201,8 +205,10 @@ def ranking(
         text.set_fontweight("bold" if effect in chosen else "normal")
     axes.tick_params(axis="y", length=0)
     axes.spines["left"].set_visible(False)
-    label(axes, x="held-out error [noise floors]")
-    legend(figure, [("line", INK, "without"), ("dot", INK, "with the effect"), ("dash", BOTH, "noise floor")])
+    label_axes(axes, x="held-out error [noise floors]")
+    add_legend(
+        figure, [("line", INK, "without"), ("dot", INK, "with the effect"), ("dash", BOTH, "noise floor")]
+    )
     caption = (
         "Each line runs from the error of the present model to the error with that effect added; the longer "
         "it is, the more the effect explains. p is the chance that noise alone makes the best of all "
@@ -211,7 +217,7 @@ def ranking(
     return Plate(figure, caption)
 
 
-def parameters(
+def draw_parameters(
     values: Mapping[str, Estimate], ranges: Mapping[str, tuple[float, float]], units: Mapping[str, str]
 ) -> Plate:
     """Draw fitted parameters with their intervals, each within the range where real cameras lie.
@@ -222,22 +228,24 @@ def parameters(
         units: `effect.parameter` to its unit.
     """
     n = len(values)
-    figure = sheet(
+    figure = titled_figure(
         1.0 + 0.32 * n, "Fitted parameters", "with 90 % confidence intervals, within their plausible ranges"
     )
-    axes = place(figure, 2.2, 0.8, 4.3, 0.32 * n)
+    axes = place_axes(figure, 2.2, 0.8, 4.3, 0.32 * n)
     axes.set(xlim=(-0.06, 1.06), ylim=(-0.6, n - 0.4))
     for row, (name, estimate) in zip(range(n)[::-1], values.items(), strict=True):
         low, high = ranges[name]
         axes.plot([0, 1], [row, row], color=WASH, lw=9, solid_capstyle="butt", zorder=0)
-        at = [_within(v, low, high) for v in (estimate.low, estimate.value, estimate.high)]
+        at = [_place_in_range(v, low, high) for v in (estimate.low, estimate.value, estimate.high)]
         outside = at[1] in (0.0, 1.0)
         axes.plot([at[0], at[2]], [row, row], color=BOTH, lw=2.4, solid_capstyle="butt")
         axes.plot([at[1]], [row], "D" if outside else "o", ms=6.5, color=ON if outside else BOTH)
         for x, value, side in ((0, low, "left"), (1, high, "right")):
-            axes.annotate(number(value), (x, row - 0.36), fontsize=6.5, color=QUIET, ha=side, va="center")
+            axes.annotate(
+                format_number(value), (x, row - 0.36), fontsize=6.5, color=QUIET, ha=side, va="center"
+            )
         unit = "" if units[name] == "1" else f" {units[name]}"
-        said = f"{number(estimate.value)}{unit}   ({number(estimate.low)} to {number(estimate.high)})"
+        said = f"{format_number(estimate.value)}{unit}   ({format_number(estimate.low)} to {format_number(estimate.high)})"
         axes.annotate(
             said, (1.03, row), xycoords=("axes fraction", "data"), fontsize=8.5, color=INK, va="center"
         )
@@ -253,14 +261,14 @@ def parameters(
     return Plate(figure, caption)
 
 
-def _within(value: float, low: float, high: float) -> float:
+def _place_in_range(value: float, low: float, high: float) -> float:
     """Return where a value lies in a range, 0 to 1."""
     if low > 0 and high / low > 10:
         value, low, high = (math.log(max(v, 1e-300)) for v in (value, low, high))
     return min(max((value - low) / (high - low), 0.0), 1.0)
 
 
-def curves(title: str, about: str, panels: Sequence[Curve], caption: str) -> Plate:
+def draw_curves(title: str, about: str, panels: Sequence[Curve], caption: str) -> Plate:
     """Draw statistics over an axis, measured and simulated, a panel each.
 
     Args:
@@ -273,15 +281,15 @@ def curves(title: str, about: str, panels: Sequence[Curve], caption: str) -> Pla
     rows = math.ceil(len(panels) / columns)
     wide = (WIDE - 0.55) / columns
     same_x, same_y = (len({getattr(p, name) for p in panels}) == 1 for name in ("x_label", "y_label"))
-    figure = sheet(0.95 + 2.55 * rows, title, about)
+    figure = titled_figure(0.95 + 2.55 * rows, title, about)
     colours: list[str] = []
     for i, panel in enumerate(panels):
         row, column = divmod(i, columns)
-        axes = place(figure, 0.85 + column * wide, 1.22 + row * 2.55, wide - 0.55, 1.6)
+        axes = place_axes(figure, 0.85 + column * wide, 1.22 + row * 2.55, wide - 0.55, 1.6)
         colours.append(colour_of(panel.title))
-        _curve(axes, panel, colours[-1])
+        _draw_curve(axes, panel, colours[-1])
         words = textwrap.fill(panel.title, round(11.5 * wide))
-        label(axes, "" if same_x else panel.x_label, "" if same_y else panel.y_label, words)
+        label_axes(axes, "" if same_x else panel.x_label, "" if same_y else panel.y_label, words)
     # what all panels have in common stands once
     once = {"fontsize": 9, "color": INK, "ha": "center", "va": "center"}
     tall = figure.get_figheight()
@@ -292,11 +300,11 @@ def curves(title: str, about: str, panels: Sequence[Curve], caption: str) -> Pla
     named = {ON: "model, ON", OFF: "model, OFF", BOTH: "model"}
     entries = [("line", colour, named[colour]) for colour in (ON, OFF, BOTH) if colour in colours]
     dense = any(len(panel.x) > DENSE for panel in panels)
-    legend(figure, [("line" if dense else "dot", INK, "measured"), *entries])
+    add_legend(figure, [("line" if dense else "dot", INK, "measured"), *entries])
     return Plate(figure, caption)
 
 
-def _curve(axes: Axes, panel: Curve, colour: str) -> None:
+def _draw_curve(axes: Axes, panel: Curve, colour: str) -> None:
     x = np.asarray(panel.x, float)
     measured, simulated, error = (
         np.asarray(v, float) for v in (panel.measured, panel.simulated, panel.error)
@@ -321,7 +329,7 @@ def _curve(axes: Axes, panel: Curve, colour: str) -> None:
         axes.set_ylim(bottom=0)
 
 
-def powers(
+def draw_powers(
     tried: Mapping[str, Sequence[tuple[float, float]]], *, enough: float, names: tuple[str, str]
 ) -> Plate:
     """Draw how soon recordings tell two models apart.
@@ -332,10 +340,10 @@ def powers(
         names: Of the models.
     """
     n = len(tried)
-    figure = sheet(
+    figure = titled_figure(
         1.36 + 0.36 * n, f"Which recording tells {names[0]} from {names[1]}", "share of recordings known"
     )
-    axes = place(figure, 1.35, 0.8, WIDE - 1.75, 0.36 * n)
+    axes = place_axes(figure, 1.35, 0.8, WIDE - 1.75, 0.36 * n)
     durations = sorted({seconds for steps in tried.values() for seconds, _ in steps})
     for row, steps in zip(range(n)[::-1], tried.values(), strict=True):
         for seconds, power in steps:
@@ -344,15 +352,17 @@ def powers(
             across, down = (at - 0.48, at + 0.48), (row - 0.42, row + 0.42)
             axes.fill_between(across, *down, color=BOTH, alpha=1.0 if done else 0.05 + 0.45 * power, lw=0)
             colour, weight = ("white", "bold") if done else (INK, "normal")
-            _say(axes, f"{100 * power:.0f} %", (at, row), (0, 0), ha="center", color=colour, weight=weight)
+            _write_beside(
+                axes, f"{100 * power:.0f} %", (at, row), (0, 0), ha="center", color=colour, weight=weight
+            )
     axes.set(xlim=(-0.55, max(len(durations), 6) - 0.45), ylim=(-0.5, n - 0.5))
     axes.yaxis.set_major_locator(FixedLocator(list(range(n)[::-1])))
     axes.set_yticklabels(list(tried), fontsize=9)
     axes.xaxis.set_major_locator(FixedLocator(list(range(len(durations)))))
-    axes.set_xticklabels([number(seconds) for seconds in durations], fontsize=9)
+    axes.set_xticklabels([format_number(seconds) for seconds in durations], fontsize=9)
     axes.tick_params(length=0)
     axes.spines[["left", "bottom"]].set_visible(False)
-    label(axes, x="duration of the recording [s]")
+    label_axes(axes, x="duration of the recording [s]")
     caption = (
         f"Share of recordings of {names[1]} that are known when 5 % of those of {names[0]} are mistaken; "
         f"dark fields are at {100 * enough:.0f} % or more, where the search ends."

@@ -15,7 +15,7 @@ from dase.events import Events
 from dase.figures.style import OFF, ON
 from dase.io.sequence import Sequence, replacing
 from dase.recordings.statistics import Statistics as Statistics
-from dase.recordings.statistics import statistics as statistics
+from dase.recordings.statistics import sequence_statistics as statistics
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 FRAME_RATE = 30.0  # video frames per second where the sequence does not say better
 
 
-def intervals(events: Events) -> NDArray[np.float64]:
+def pixel_intervals(events: Events) -> NDArray[np.float64]:
     """Return the times between successive events of one pixel [s], over all pixels, in no useful order."""
     # one sort of (pixel, index) in 64 bits is several times faster than a stable argsort of the pixels
     key = ((events.y.astype(np.int64) * events.width + events.x) << 32) | np.arange(len(events))
@@ -45,7 +45,7 @@ def default_window(sequence: Sequence) -> float:
     return power * max(step for step in (1, 2, 5) if step * power <= wanted * (1 + 1e-9))
 
 
-def overlay(grey: NDArray[Any] | None, counts: NDArray[np.int32]) -> NDArray[np.uint8]:
+def overlay_events(grey: NDArray[Any] | None, counts: NDArray[np.int32]) -> NDArray[np.uint8]:
     """Lay events over a frame: red ON, blue OFF, the more of them the less of the frame shows through.
 
     Args:
@@ -55,7 +55,7 @@ def overlay(grey: NDArray[Any] | None, counts: NDArray[np.int32]) -> NDArray[np.
     Returns:
         Red, green and blue, shape (H, W, 3).
     """
-    base = np.full(counts.shape[1:], 1.0) if grey is None else 0.22 + 0.7 * (grey / _white(grey)) ** 0.8
+    base = np.full(counts.shape[1:], 1.0) if grey is None else 0.22 + 0.7 * (grey / _white_level(grey)) ** 0.8
     total = counts.sum(0)
     colours = np.array([[int(code[i : i + 2], 16) / 255 for i in (1, 3, 5)] for code in (OFF, ON)])
     mixed = np.tensordot(counts / np.maximum(total, 1), colours, axes=(0, 0))  # (H, W, 3)
@@ -64,14 +64,14 @@ def overlay(grey: NDArray[Any] | None, counts: NDArray[np.int32]) -> NDArray[np.
     return np.rint(255 * blend).astype(np.uint8)
 
 
-def _white(grey: NDArray[Any]) -> float:
+def _white_level(grey: NDArray[Any]) -> float:
     """Return the largest number of the 8, 10, 12, 14 or 16 bits that a frame makes use of."""
     return float(
         (1 << next(bits for bits in (8, 10, 12, 14, 16) if int(grey.max(initial=0)) < 1 << bits)) - 1
     )
 
 
-def draw(
+def draw_sequence(
     sequence: Sequence,
     *,
     title: str = "",
@@ -97,15 +97,17 @@ def draw(
     if at is not None and not begin <= at <= end:
         raise InputError(f"at: must lie in {begin:g}..{end:g} s, got {at:g} s")
     window = _checked_window(sequence, window)
-    between = intervals(sequence.events)
+    between = pixel_intervals(sequence.events)
     times = [at] if at is not None else moment_times(sequence, moments)
     dots = 360 if len(times) > 1 else 1300  # dots across a picture that stay visible on the sheet
     shrink = math.ceil(sequence.events.width / dots)
-    panels = [panel(sequence, time, window, shrink=shrink) for time in times]
-    return contact_sheet.draw(sequence, statistics(sequence), between, panels, times, window, title)
+    panels = [moment_picture(sequence, time, window, shrink=shrink) for time in times]
+    return contact_sheet.draw_contact_sheet(
+        sequence, statistics(sequence), between, panels, times, window, title
+    )
 
 
-def panel(sequence: Sequence, time: float, window: float, *, shrink: int = 1) -> NDArray[np.uint8]:
+def moment_picture(sequence: Sequence, time: float, window: float, *, shrink: int = 1) -> NDArray[np.uint8]:
     """Return the frame nearest to `time` [s] with the events of a window [s] around it over it.
 
     With `shrink`, that many rows and columns become one, and no event is lost. Shape (H, W, 3).
@@ -118,7 +120,7 @@ def panel(sequence: Sequence, time: float, window: float, *, shrink: int = 1) ->
         for axis in (1, 2):
             counts = np.add.reduceat(counts, np.arange(0, counts.shape[axis], shrink), axis)
         frame = None if frame is None else frame[::shrink, ::shrink]
-    return overlay(frame, counts)
+    return overlay_events(frame, counts)
 
 
 def frame_times(sequence: Sequence) -> NDArray[np.float64]:
@@ -139,7 +141,7 @@ def moment_times(sequence: Sequence, count: int) -> list[float]:
     return [float(time) for time in times]
 
 
-def video(sequence: Sequence, path: Path, *, window: float | None = None) -> None:
+def write_video(sequence: Sequence, path: Path, *, window: float | None = None) -> None:
     """Write a video: every frame with the events since the frame before over it.
 
     Frames are shown at their own pace up to 60 per second, faster ones at 30. Without frames each picture
@@ -165,7 +167,7 @@ def video(sequence: Sequence, path: Path, *, window: float | None = None) -> Non
         if not out.isOpened():
             raise InputError(f"{path}: OpenCV cannot write this video")
         try:
-            for picture in _pictures(sequence, begins, ends, scale):
+            for picture in _video_pictures(sequence, begins, ends, scale):
                 out.write(np.ascontiguousarray(picture[: size[1], : size[0], ::-1]))
         finally:
             out.release()
@@ -190,7 +192,7 @@ def _video_times(
     return edges[:-1], edges[1:], FRAME_RATE
 
 
-def _pictures(
+def _video_pictures(
     sequence: Sequence, begins: NDArray[np.float64], ends: NDArray[np.float64], scale: int
 ) -> Iterator[NDArray[np.uint8]]:
     import cv2
@@ -198,7 +200,7 @@ def _pictures(
     for index, (begin, end) in enumerate(zip(begins, ends, strict=True)):
         frame = None if sequence.frames is None else sequence.frames[index]
         edges = np.nextafter((begin, end), math.inf)  # an event at the time of the frame belongs to it
-        picture = overlay(frame, sequence.events.counts(edges)[0])
+        picture = overlay_events(frame, sequence.events.counts(edges)[0])
         picture = picture.repeat(scale, 0).repeat(scale, 1)
         place: dict[str, Any] = {"org": (10, 24), "fontFace": cv2.FONT_HERSHEY_SIMPLEX, "fontScale": 0.6}
         for colour, thickness in ((40, 4), (255, 1)):

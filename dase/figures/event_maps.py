@@ -17,10 +17,22 @@ from scipy.signal import welch
 
 from dase.errors import InputError
 from dase.events import Events
-from dase.figures.diagnosis_figures import curves
-from dase.figures.event_images import overlay
-from dase.figures.style import INK, LINE, OFF, ON, WIDE, Plate, label, legend, number, place, sheet
-from dase.formatting import seconds
+from dase.figures.diagnosis_figures import draw_curves
+from dase.figures.event_images import overlay_events
+from dase.figures.style import (
+    INK,
+    LINE,
+    OFF,
+    ON,
+    WIDE,
+    Plate,
+    add_legend,
+    format_number,
+    label_axes,
+    place_axes,
+    titled_figure,
+)
+from dase.formatting import format_seconds
 from dase.results import Curve
 
 DIVERGING = LinearSegmentedColormap.from_list("dase", ["#1b4f8f", "#86add3", "#f5f5f3", "#dfa67f", "#a23b16"])
@@ -66,7 +78,7 @@ def event_plates(
         raise InputError(f"measured and simulated events must have one size, got {sizes}")
     begin, end = span
     parts = [events.slice(begin, end) for events in (measured, simulated)]
-    window = _window(parts[0], end - begin, count)
+    window = _moment_window(parts[0], end - begin, count)
     times = [begin + (end - begin) * (i + 0.5) / count for i in range(count)]
     counts = [np.concatenate([p.counts([t - window / 2, t + window / 2]) for t in times]) for p in parts]
     seen: list[NDArray[np.uint8] | None] = [None] * count
@@ -74,13 +86,13 @@ def event_plates(
         seen = [frames[int(np.abs(frame_times - t).argmin())] for t in times]
     whole = [p.counts([begin, np.nextafter(end, math.inf)])[0].astype(np.float64) for p in parts]
     return [
-        moments(seen, counts[0], counts[1], times, window),
-        residual_maps(whole[0], whole[1], end - begin),
-        *([spectra(parts[0], parts[1], span)] if end - begin >= 1.5 / SLOWEST else []),
+        draw_moments(seen, counts[0], counts[1], times, window),
+        draw_residual_maps(whole[0], whole[1], end - begin),
+        *([draw_spectra(parts[0], parts[1], span)] if end - begin >= 1.5 / SLOWEST else []),
     ]
 
 
-def _window(events: Events, span: float, count: int) -> float:
+def _moment_window(events: Events, span: float, count: int) -> float:
     """Return a time of 1, 2 or 5 times a power of ten in which about `SHOWN` events come per pixel [s]."""
     rate = max(len(events), 1) / span / (events.width * events.height)
     wanted = min(SHOWN / rate, span / count)
@@ -88,7 +100,7 @@ def _window(events: Events, span: float, count: int) -> float:
     return power * max(step for step in (1, 2, 5) if step * power <= wanted * (1 + 1e-9))
 
 
-def moments(
+def draw_moments(
     frames: Sequence[NDArray[np.uint8] | None],
     measured: NDArray[np.int32],
     simulated: NDArray[np.int32],
@@ -108,18 +120,20 @@ def moments(
     aspect = measured.shape[2] / measured.shape[3]
     across = (WIDE - 0.95 - 0.12 * (n - 1)) / n
     down = across * aspect
-    figure = sheet(
-        1.2 + 2 * down, "Measured and simulated events", f"events of {seconds(window)} around each time"
+    figure = titled_figure(
+        1.2 + 2 * down,
+        "Measured and simulated events",
+        f"events of {format_seconds(window)} around each time",
     )
     for row, (name, counts) in enumerate((("measured", measured), ("simulated", simulated))):
         for i, time in enumerate(times):
-            axes = place(figure, 0.65 + i * (across + 0.12), 1.0 + row * (down + 0.1), across, down)
+            axes = place_axes(figure, 0.65 + i * (across + 0.12), 1.0 + row * (down + 0.1), across, down)
             size = math.ceil(counts.shape[3] / DOTS)  # no event is lost where a dot stands for several pixels
-            _picture(axes, overlay(_calm(frames[i], size), _blocks(counts[i], size)))
-            label(axes, title=f"{time:.3f} s" if row == 0 else "")
+            _show_picture(axes, overlay_events(_calm_frame(frames[i], size), _sum_blocks(counts[i], size)))
+            label_axes(axes, title=f"{time:.3f} s" if row == 0 else "")
             if i == 0:
                 axes.set_ylabel(name, fontsize=10, color=INK, labelpad=6)
-    legend(figure, [("box", ON, "ON"), ("box", OFF, "OFF")])
+    add_legend(figure, [("box", ON, "ON"), ("box", OFF, "OFF")])
     caption = (
         "Pixels that sent events, red ON and blue OFF, over the grey picture the camera saw; above what was "
         "measured, below what the model makes of the same scene."
@@ -127,7 +141,7 @@ def moments(
     return Plate(figure, caption)
 
 
-def spectra(measured: Events, simulated: Events, span: tuple[float, float]) -> Plate:
+def draw_spectra(measured: Events, simulated: Events, span: tuple[float, float]) -> Plate:
     """Draw the spectrum of the event rate: flicker and the rhythm of a readout are peaks in it.
 
     Args:
@@ -152,23 +166,23 @@ def spectra(measured: Events, simulated: Events, span: tuple[float, float]) -> P
         "Power of the fluctuations of the event rate, in units of what events would give that come "
         "independently. Peaks are light that flickers or a clock that ticks; slow power is the scene."
     )
-    return curves("Rhythms of the event rate", f"resolution {SLOWEST:g} Hz", panels, caption)
+    return draw_curves("Rhythms of the event rate", f"resolution {SLOWEST:g} Hz", panels, caption)
 
 
-def _calm(frame: NDArray[np.uint8] | None, size: int) -> NDArray[np.uint8] | None:
+def _calm_frame(frame: NDArray[np.uint8] | None, size: int) -> NDArray[np.uint8] | None:
     """Return every `size`th pixel of a frame, with less contrast, so that events stand out."""
     if frame is None:
         return None
     return (96 + 0.6 * frame[::size, ::size].astype(np.float32)).clip(0, 255).astype(np.uint8)
 
 
-def _picture(axes: Axes, picture: NDArray[np.uint8]) -> None:
+def _show_picture(axes: Axes, picture: NDArray[np.uint8]) -> None:
     axes.imshow(picture.repeat(2, 0).repeat(2, 1), interpolation="none", aspect="auto")
     axes.set(xticks=[], yticks=[])
     axes.spines[:].set(visible=True, color=LINE, linewidth=0.8)
 
 
-def residual_maps(
+def draw_residual_maps(
     measured: NDArray[np.float64], simulated: NDArray[np.float64], seconds_long: float, *, least: float = 50.0
 ) -> Plate:
     """Draw where the model sends too many or too few events.
@@ -179,18 +193,18 @@ def residual_maps(
         seconds_long: Span in which they were counted [s].
         least: Pixels are joined to blocks of about so many events.
     """
-    size = _block(measured, least)
-    m, s = _blocks(measured, size), _blocks(simulated, size)
+    size = _block_side(measured, least)
+    m, s = _sum_blocks(measured, size), _sum_blocks(simulated, size)
     octaves = np.log2((s + 3) / (m + 3))
     octaves *= np.clip(np.abs(s - m) / np.sqrt(s + m + 1) - 1, 0, 1)  # chance stays white
     aspect = measured.shape[1] / measured.shape[2]
     across = (WIDE - 1.75) / 2
     down = across * aspect
     block = f"blocks of {size} × {size} pixels" if size > 1 else "pixel by pixel"
-    about = f"events of the model against those measured in {seconds(seconds_long)}, {block}"
-    figure = sheet(1.2 + down, "Where the model sends too many or too few events", about)
+    about = f"events of the model against those measured in {format_seconds(seconds_long)}, {block}"
+    figure = titled_figure(1.2 + down, "Where the model sends too many or too few events", about)
     for i, (channel, name) in enumerate(((1, "ON"), (0, "OFF"))):
-        axes = place(figure, 0.3 + i * (across + 0.15), 1.0, across, down)
+        axes = place_axes(figure, 0.3 + i * (across + 0.15), 1.0, across, down)
         image = axes.imshow(
             octaves[channel], cmap=DIVERGING, vmin=-MOST, vmax=MOST, aspect="auto", interpolation="none"
         )
@@ -199,10 +213,11 @@ def residual_maps(
         rates = [
             counts[channel].sum() / measured[channel].size / seconds_long for counts in (measured, simulated)
         ]
-        label(
-            axes, title=f"{name} events: {number(rates[0])} measured, {number(rates[1])} simulated [1/(px s)]"
+        label_axes(
+            axes,
+            title=f"{name} events: {format_number(rates[0])} measured, {format_number(rates[1])} simulated [1/(px s)]",
         )
-    bar = place(figure, 0.3 + 2 * across + 0.3, 1.0, 0.16, down)
+    bar = place_axes(figure, 0.3 + 2 * across + 0.3, 1.0, 0.16, down)
     _colour_bar(figure, bar, image)
     caption = (
         "Blue: the model sends too few events; brown: too many; white: as many as measured, or no "
@@ -222,14 +237,14 @@ def _colour_bar(figure: Figure, axes: Axes, image: AxesImage) -> None:
     bar.outline.set_visible(False)
 
 
-def _block(counts: NDArray[np.float64], least: float) -> int:
+def _block_side(counts: NDArray[np.float64], least: float) -> int:
     """Return the side of square blocks that hold `least` events of a polarity on average."""
     mean = counts.sum((1, 2)).max() / counts[0].size
     size = math.ceil(math.sqrt(least / max(mean, 1e-9)))
     return int(min(max(size, 1), max(min(counts.shape[1:]) // 8, 1)))
 
 
-def _blocks(counts: NDArray[Any], size: int) -> NDArray[Any]:
+def _sum_blocks(counts: NDArray[Any], size: int) -> NDArray[Any]:
     for axis in (1, 2):
         counts = np.add.reduceat(counts, np.arange(0, counts.shape[axis], size), axis)
     return counts

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from html import escape
 
-from dase.figures.style import Plate, number
+from dase.figures.style import Plate, format_number
 from dase.results import Cell
 from dase.version import __version__
 
@@ -50,7 +50,7 @@ footer { margin-top: 3rem; border-top: 1px solid var(--line); padding-top: 1rem;
 """
 
 
-def page(title: str, kind: str, body: Iterable[str], seconds: float, foot: str = "") -> str:
+def html_document(title: str, kind: str, body: Iterable[str], seconds: float, foot: str = "") -> str:
     """Return a page.
 
     Args:
@@ -60,7 +60,7 @@ def page(title: str, kind: str, body: Iterable[str], seconds: float, foot: str =
         seconds: Time the work took [s].
         foot: Further words at the end.
     """
-    took = f" in {number(seconds)} s" if seconds else ""
+    took = f" in {format_number(seconds)} s" if seconds else ""
     made = f"Made by dase {escape(__version__)}{took}."
     floor = "1 is the noise floor: the error of two repeats of one measurement."
     return (
@@ -73,18 +73,18 @@ def page(title: str, kind: str, body: Iterable[str], seconds: float, foot: str =
     )
 
 
-def verdict(text: str, *, wrong: bool) -> str:
+def verdict_html(text: str, *, wrong: bool) -> str:
     """Return the sentence that says it all."""
     return f'<p class="verdict{" wrong" if wrong else ""}">{escape(text)}</p>'
 
 
-def figure(plate: Plate) -> str:
+def figure_html(plate: Plate) -> str:
     """Return a figure with its caption."""
     alt, words = escape(f"{plate.title}. {plate.caption}", quote=True), escape(plate.caption)
     return f'<figure><img alt="{alt}" src="{plate.data_uri()}"><figcaption>{words}</figcaption></figure>'
 
 
-def cells(found: Sequence[Cell], nothing: str = "") -> str:
+def cells_html(found: Sequence[Cell], nothing: str = "") -> str:
     """Return a list of cells, worst first; `nothing` is said when there is none."""
     if not found:
         return f"<p>{escape(nothing)}</p>" if nothing else ""
@@ -95,11 +95,11 @@ def cells(found: Sequence[Cell], nothing: str = "") -> str:
         for cell in found
     ]
     first, rest = "".join(items[:FIRST]), "".join(items[FIRST:])
-    more = fold(f"{len(items) - FIRST} more", f'<ol class="cells">{rest}</ol>') if rest else ""
+    more = folded_html(f"{len(items) - FIRST} more", f'<ol class="cells">{rest}</ol>') if rest else ""
     return f'<ol class="cells">{first}</ol>{more}'
 
 
-def table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
+def table_html(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
     """Return a table, empty without rows."""
     lines = ["".join(f"<td>{escape(cell)}</td>" for cell in row) for row in rows]
     if not lines:
@@ -108,12 +108,12 @@ def table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
     return f"<table><tr>{top}</tr>{''.join(f'<tr>{line}</tr>' for line in lines)}</table>"
 
 
-def fold(title: str, html: str) -> str:
+def folded_html(title: str, html: str) -> str:
     """Return HTML that is folded away under a title."""
     return f"<details><summary>{escape(title)}</summary>{html}</details>" if html else ""
 
 
-def notes(found: Sequence[str]) -> str:
+def notes_html(found: Sequence[str]) -> str:
     """Return what the user should keep in mind."""
     items = "".join(f"<li>{escape(note)}</li>" for note in found)
     return f'<h2>To be kept in mind</h2><ul class="notes">{items}</ul>' if items else ""

@@ -16,9 +16,9 @@ from dase.events import Events
 from dase.figures import diagnosis_figures
 from dase.figures import html as html_page
 from dase.figures.event_maps import event_plates
-from dase.figures.style import Plate, number
+from dase.figures.style import Plate, format_number
 from dase.io import replacing
-from dase.probes.statistics import WORDS
+from dase.probes.statistics import FAMILY_WORDS
 from dase.results import Comparison, Diagnosis, Estimate, Step
 from dase.scenes.between_frames import CameraScene
 from dase.simulation.sensor import Sensor
@@ -31,13 +31,15 @@ LONGEST = 2.0
 BELIEVED = "Events are shown only where and when the scene between the frames can be trusted."
 
 
-def write(path: Path, html: str) -> None:
+def write_page(path: Path, html: str) -> None:
     """Write a page, whole or not at all."""
     with replacing(path) as temporary:
         temporary.write_text(html, "utf-8")
 
 
-def pictures(measured: Measurement, sensor: Sensor, *, seed: int = 0, device: str = "cpu") -> list[Plate]:
+def measurement_plates(
+    measured: Measurement, sensor: Sensor, *, seed: int = 0, device: str = "cpu"
+) -> list[Plate]:
     """Return pictures of a measurement beside what a model makes of its scene, its first seconds.
 
     Args:
@@ -58,7 +60,7 @@ def pictures(measured: Measurement, sensor: Sensor, *, seed: int = 0, device: st
     real, made = measured.events, Events.concatenate(parts)
     if not isinstance(measured.scene, CameraScene):
         return event_plates(real, made, (begin, end), frames=frames, frame_times=shown)
-    real, made = measured.scene.believed(real), measured.scene.believed(made)
+    real, made = measured.scene.trusted_events(real), measured.scene.trusted_events(made)
     plates = event_plates(real, made, (begin, end), frames=frames, frame_times=shown)
     return [replace(plate, caption=f"{plate.caption} {BELIEVED}") for plate in plates]
 
@@ -76,15 +78,15 @@ def comparison_page(
     """
     wrong = found.error > found.gate
     body = [
-        html_page.verdict(comparison_verdict(found), wrong=wrong),
-        html_page.table(("", "measured", "simulated", "model / measured"), _plain(found.plain)),
+        html_page.verdict_html(comparison_verdict(found), wrong=wrong),
+        html_page.table_html(("", "measured", "simulated", "model / measured"), _plain_rows(found.plain)),
         "<h2>Where the model fails</h2>",
-        html_page.cells(found.cells, "No single cell differs by more than chance."),
-        *map(html_page.figure, [*plates, *comparison_plates(found)]),
-        _sensor(found.sensor),
-        html_page.notes(found.notes),
+        html_page.cells_html(found.cells, "No single cell differs by more than chance."),
+        *map(html_page.figure_html, [*plates, *comparison_plates(found)]),
+        _sensor_file_html(found.sensor),
+        html_page.notes_html(found.notes),
     ]
-    return html_page.page(
+    return html_page.html_document(
         f"{model or found.sensor.name} against {recording}", "comparison", body, found.seconds
     )
 
@@ -93,30 +95,30 @@ def comparison_verdict(found: Comparison) -> str:
     """Return what a comparison found, in a sentence or two."""
     if found.error <= found.gate:
         return (
-            f"The model cannot be told from the measurement: its error is {number(found.error)} noise "
-            f"floors, and chance alone reaches {number(found.gate)}."
+            f"The model cannot be told from the measurement: its error is {format_number(found.error)} noise "
+            f"floors, and chance alone reaches {format_number(found.gate)}."
         )
     worst = max(found.families, key=lambda name: found.families[name], default="")
     about = f" It is worst in {family_words(worst)}." if worst else ""
     return (
-        f"The model is wrong: its error on held-out pixels and time is {number(found.error)} times the noise "
-        f"floor, where chance alone reaches {number(found.gate)}.{about}"
+        f"The model is wrong: its error on held-out pixels and time is {format_number(found.error)} times the noise "
+        f"floor, where chance alone reaches {format_number(found.gate)}.{about}"
     )
 
 
 def comparison_plates(found: Comparison) -> list[Plate]:
     """Return the figures of a comparison: errors by family, then the curves of each family, worst first."""
     named = {family_words(name): error for name, error in found.families.items()}
-    plates = [diagnosis_figures.families(named, floor=found.floor, gate=found.gate)] if named else []
+    plates = [diagnosis_figures.draw_families(named, floor=found.floor, gate=found.gate)] if named else []
     for name in sorted(found.curves, key=lambda name: -found.families.get(name, 0.0)):
         title = family_words(name)
-        about = f"error {number(found.families[name])}" if name in found.families else ""
+        about = f"error {format_number(found.families[name])}" if name in found.families else ""
         caption = (
             "Points are measured, lines are the model's; the grey band is twice the sampling error of their "
             "difference, so a line outside of it is wrong beyond chance."
         )
         plates.append(
-            diagnosis_figures.curves(title[:1].upper() + title[1:], about, found.curves[name], caption)
+            diagnosis_figures.draw_curves(title[:1].upper() + title[1:], about, found.curves[name], caption)
         )
     return plates
 
@@ -132,42 +134,42 @@ def diagnosis_page(
         model: What to call the model; the name of the sensor if None.
         plates: Pictures of the model that was found, see `dase.figures.event_maps`.
     """
-    body = [html_page.verdict(diagnosis_verdict(found), wrong=found.unexplained is not None)]
-    body += map(html_page.figure, diagnosis_plates(found))
+    body = [html_page.verdict_html(diagnosis_verdict(found), wrong=found.unexplained is not None)]
+    body += map(html_page.figure_html, diagnosis_plates(found))
     if found.history and found.history[0].cells:
-        body += ["<h2>Where the model failed</h2>", html_page.cells(found.history[0].cells)]
+        body += ["<h2>Where the model failed</h2>", html_page.cells_html(found.history[0].cells)]
     if found.unexplained is not None:
         body += ["<h2>What stays unexplained</h2>", f"<p>{escape(found.unexplained.sentence)}.</p>"]
         body += [
-            html_page.cells(
+            html_page.cells_html(
                 found.unexplained.cells, "It is spread over many cells; no single one stands out."
             )
         ]
     body += [
-        *map(html_page.figure, plates),
-        _parameters(found.parameters),
-        _sensor(found.sensor),
-        html_page.notes(found.notes),
+        *map(html_page.figure_html, plates),
+        _parameter_table(found.parameters),
+        _sensor_file_html(found.sensor),
+        html_page.notes_html(found.notes),
     ]
     foot = f"{found.evaluations:,} simulations. " if found.evaluations else ""
-    return html_page.page(
+    return html_page.html_document(
         f"{model or found.sensor.name} against {recording}", "diagnosis", body, found.seconds, foot
     )
 
 
 def diagnosis_verdict(found: Diagnosis) -> str:
     """Return what a diagnosis found, in a sentence or two."""
-    first, last = number(found.errors[0]), number(found.errors[-1])
+    first, last = format_number(found.errors[0]), format_number(found.errors[-1])
     if found.unexplained is not None:
-        left = number(found.unexplained.error)
+        left = format_number(found.unexplained.error)
         near = " and ".join(found.unexplained.nearest)
         tried = f" {near} comes nearest, but leaves {left}: a stand-in, not a finding." if near else ""
         return (
             f"Something is missing that no known effect explains: the error is {first} noise floors, and "
-            f"chance reaches {number(found.gate)}.{tried}"
+            f"chance reaches {format_number(found.gate)}.{tried}"
         )
     if not found.selected:
-        error = f"the error is {first} noise floors, and chance reaches {number(found.gate)}."
+        error = f"the error is {first} noise floors, and chance reaches {format_number(found.gate)}."
         if found.errors[0] > found.gate:
             return f"Nothing of weight is missing: {error} What is left is beyond chance, but small."
         return f"Nothing is missing: {error}"
@@ -179,7 +181,7 @@ def diagnosis_verdict(found: Diagnosis) -> str:
     )
     return (
         f"Missing: {names}. With {'it' if len(found.selected) == 1 else 'them'} the held-out error falls "
-        f"from {first} to {last} noise floors; chance alone reaches {number(found.gate)}.{ties}"
+        f"from {first} to {last} noise floors; chance alone reaches {format_number(found.gate)}.{ties}"
     )
 
 
@@ -195,7 +197,7 @@ def parameters_of(sensor: Sensor, estimates: Mapping[str, Estimate]) -> Plate:
     facts = {f"{e.name}.{p.name}": p for e in sensor.effects for p in e.parameters()}
     known = {name: value for name, value in estimates.items() if name in facts}
     ranges = {name: facts[name].plausible for name in known}
-    return diagnosis_figures.parameters(known, ranges, {name: facts[name].unit for name in known})
+    return diagnosis_figures.draw_parameters(known, ranges, {name: facts[name].unit for name in known})
 
 
 def staircase_of(found: Diagnosis) -> Plate:
@@ -205,7 +207,7 @@ def staircase_of(found: Diagnosis) -> Plate:
         steps, errors = ["as given", "fitted"], [found.before, *errors]
     steps += [f"+ {name}" for name in found.selected]
     names, more = stand_ins(found)
-    return diagnosis_figures.staircase(
+    return diagnosis_figures.draw_staircase(
         [*steps, *names], [*errors, *more], floor=found.floor, gate=found.gate, stand_ins=len(names)
     )
 
@@ -224,7 +226,7 @@ def stand_ins(found: Diagnosis) -> tuple[list[str], list[float]]:
 def ranking_of(step: Step, floor: float) -> Plate:
     """Return how far each candidate of one step brings the error down."""
     full = [rank for rank in step.ranking if rank.refined and math.isfinite(rank.error)]
-    return diagnosis_figures.ranking(
+    return diagnosis_figures.draw_ranking(
         [rank.effect for rank in full],
         [rank.error for rank in full],
         present=step.error,
@@ -238,25 +240,28 @@ def ranking_of(step: Step, floor: float) -> Plate:
 
 def family_words(name: str) -> str:
     """Return a family of statistics in a few words."""
-    return WORDS.get(name, name)
+    return FAMILY_WORDS.get(name, name)
 
 
-def _plain(plain: Mapping[str, tuple[float, float]]) -> list[tuple[str, ...]]:
+def _plain_rows(plain: Mapping[str, tuple[float, float]]) -> list[tuple[str, ...]]:
     # what is left of a count after rounding is none
     whole = {name: [v if abs(v) > 1e-9 else 0.0 for v in pair] for name, pair in plain.items()}
-    return [(name, number(m), number(s), _ratio(m, s)) for name, (m, s) in whole.items()]
+    return [(name, format_number(m), format_number(s), _ratio_text(m, s)) for name, (m, s) in whole.items()]
 
 
-def _ratio(measured: float, simulated: float) -> str:
-    return number(simulated / measured) if measured > 0 and math.isfinite(simulated) else "–"
+def _ratio_text(measured: float, simulated: float) -> str:
+    return format_number(simulated / measured) if measured > 0 and math.isfinite(simulated) else "–"
 
 
-def _parameters(found: Mapping[str, Estimate]) -> str:
-    rows = [(name, number(e.value), f"{number(e.low)} to {number(e.high)}") for name, e in found.items()]
-    return html_page.fold(
-        "Parameters as a table", html_page.table(("parameter", "value", "90 % interval"), rows)
+def _parameter_table(found: Mapping[str, Estimate]) -> str:
+    rows = [
+        (name, format_number(e.value), f"{format_number(e.low)} to {format_number(e.high)}")
+        for name, e in found.items()
+    ]
+    return html_page.folded_html(
+        "Parameters as a table", html_page.table_html(("parameter", "value", "90 % interval"), rows)
     )
 
 
-def _sensor(sensor: Sensor) -> str:
-    return html_page.fold("The model as a sensor file", f"<pre>{escape(dump_sensor(sensor))}</pre>")
+def _sensor_file_html(sensor: Sensor) -> str:
+    return html_page.folded_html("The model as a sensor file", f"<pre>{escape(dump_sensor(sensor))}</pre>")

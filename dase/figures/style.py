@@ -25,7 +25,6 @@ from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 from numpy.typing import NDArray
 
 from dase.recordings.statistics import Statistics as Statistics
-from dase.recordings.statistics import statistics as statistics
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -62,7 +61,7 @@ class Plate:
         alone = Figure(figsize=(width, height + extra), dpi=self.figure.dpi, facecolor="white")
         FigureCanvasAgg(alone)
         axes = alone.add_axes((0, extra / (height + extra), 1, height / (height + extra)))
-        axes.imshow(_pixels(self.figure), aspect="auto", interpolation="none")
+        axes.imshow(_rendered_pixels(self.figure), aspect="auto", interpolation="none")
         axes.axis("off")
         alone.text(
             0.3 / width,
@@ -92,13 +91,13 @@ class Plate:
         return "data:image/svg+xml;base64," + base64.b64encode(self.svg().encode()).decode()
 
 
-def _pixels(figure: Figure) -> NDArray[np.uint8]:
+def _rendered_pixels(figure: Figure) -> NDArray[np.uint8]:
     canvas = FigureCanvasAgg(figure)
     canvas.draw()
     return np.asarray(canvas.buffer_rgba())
 
 
-def sheet(height: float, title: str, about: str = "") -> Figure:
+def titled_figure(height: float, title: str, about: str = "") -> Figure:
     """Return an empty figure with a title and a quieter line under it; axes begin 0.75 inch below the top."""
     figure = Figure(figsize=(WIDE, height), dpi=160, facecolor="white")
     FigureCanvasAgg(figure)
@@ -107,7 +106,7 @@ def sheet(height: float, title: str, about: str = "") -> Figure:
     return figure
 
 
-def place(figure: Figure, left: float, top: float, width: float, height: float) -> Axes:
+def place_axes(figure: Figure, left: float, top: float, width: float, height: float) -> Axes:
     """Return quiet axes; all in inches, `top` from the top."""
     wide, tall = figure.get_size_inches()
     axes = figure.add_axes((left / wide, 1 - (top + height) / tall, width / wide, height / tall))
@@ -117,14 +116,14 @@ def place(figure: Figure, left: float, top: float, width: float, height: float) 
     return axes
 
 
-def label(axes: Axes, x: str = "", y: str = "", title: str = "") -> None:
+def label_axes(axes: Axes, x: str = "", y: str = "", title: str = "") -> None:
     """Name the axes, with units, and the panel."""
     axes.set_xlabel(x, fontsize=9, color=INK, labelpad=4)
     axes.set_ylabel(y, fontsize=9, color=INK, labelpad=4)
     axes.set_title(title, fontsize=9.5, color=INK, loc="left", pad=6)
 
 
-def legend(figure: Figure, entries: Iterable[tuple[str, str, str]], right: float = 0.3) -> None:
+def add_legend(figure: Figure, entries: Iterable[tuple[str, str, str]], right: float = 0.3) -> None:
     """Write a legend into the top right corner: (kind, colour, words), kind one of `dot`, `line`, `box`."""
     wide, tall = figure.get_size_inches()
     x = wide - right
@@ -132,7 +131,7 @@ def legend(figure: Figure, entries: Iterable[tuple[str, str, str]], right: float
         said = figure.text(x / wide, 1 - 0.24 / tall, words, fontsize=9, color=INK, ha="right", va="center")
         box = said.get_window_extent(FigureCanvasAgg(figure).get_renderer())
         x -= box.width / figure.dpi + 0.1
-        mark = place(figure, x - 0.24, 0.14, 0.24, 0.2)
+        mark = place_axes(figure, x - 0.24, 0.14, 0.24, 0.2)
         mark.axis("off")
         mark.set(xlim=(0, 1), ylim=(0, 1))
         if kind == "dot":
@@ -152,7 +151,7 @@ def colour_of(words: str) -> str:
     return ON if on and not off else OFF if off and not on else BOTH
 
 
-def number(value: float) -> str:
+def format_number(value: float) -> str:
     """Return a number with three digits at most, without an exponent where people would not write one."""
     if not math.isfinite(value):
         return "∞" if value > 0 else "−∞" if value < 0 else "?"
@@ -171,7 +170,7 @@ def log_axis(axes: Axes, which: str) -> None:
     low, high = axes.get_xlim() if which == "x" else axes.get_ylim()
     decades = math.log10(high / low) if low > 0 else 3
     axis.set_major_locator(LogLocator(subs=(1,) if decades > 2.5 else (1, 3) if decades > 1.2 else (1, 2, 5)))
-    axis.set_major_formatter(FuncFormatter(lambda value, _: number(value)))
+    axis.set_major_formatter(FuncFormatter(lambda value, _: format_number(value)))
     axis.set_minor_formatter(NullFormatter())
 
 

@@ -14,14 +14,14 @@ from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 
 from dase.errors import InputError
-from dase.figures.contact_sheet import INK, QUIET, paper
+from dase.figures.contact_sheet import INK, QUIET, figure_in_inches
 from dase.figures.style import OFF, ON
 
 EXAMPLES, LOG = "examples.npz", "log.csv"
 COLUMNS = ("scene", "events of the target", "simulated events", "mean threshold", "spread")
 
 
-def draw(folder: Path) -> tuple[Figure, list[tuple[str, str]]]:
+def draw_training(folder: Path) -> tuple[Figure, list[tuple[str, str]]]:
     """Return the picture of a run, and lines of (name, value) that say the same in numbers.
 
     Args:
@@ -35,8 +35,8 @@ def draw(folder: Path) -> tuple[Figure, list[tuple[str, str]]]:
         raise InputError(f"{folder} holds a run that has not ended; go on with it by --resume")
     with np.load(path) as data:
         found = {name: data[name] for name in data.files}
-    rows = _log(folder / LOG)
-    figure, pictures, plots = _layout(len(found["grey"]), found["grey"].shape[2] / found["grey"].shape[1])
+    rows = _read_log(folder / LOG)
+    figure, pictures, plots = _lay_out(len(found["grey"]), found["grey"].shape[2] / found["grey"].shape[1])
     same = np.allclose(found["grey"], found["real_grey"], atol=2e-3)
     titles = [*COLUMNS]
     titles[1] = titles[1] if same else "target, other scenes"
@@ -46,33 +46,35 @@ def draw(folder: Path) -> tuple[Figure, list[tuple[str, str]]]:
         line[0].imshow(found["grey"][n], cmap="gray", vmin=0, vmax=1)
         greys = found["real_grey"][n], found["grey"][n]
         for axes, name, grey in zip(line[1:3], ("real", "simulated"), greys, strict=True):
-            axes.imshow(_events(found[name][n], grey, max(most, 1.0)))
+            axes.imshow(_event_picture(found[name][n], grey, max(most, 1.0)))
         for axes, name in zip(line[3:], ("mu", "sigma"), strict=True):
             low, high = scales[name]
             shown = axes.imshow(found[name][n], cmap="viridis", vmin=low, vmax=max(high, low * 1.01))
             if n == 0:
-                _bar(figure, axes, shown)
+                _draw_scale(figure, axes, shown)
         for axes, title in zip(line, titles, strict=True):
             axes.set(xticks=[], yticks=[])
             if n == 0:
                 axes.set_title(title, fontsize=9, color=INK, loc="left", pad=4)
-    _curves(plots, rows)
+    _draw_curves(plots, rows)
     tall = figure.get_figheight()
     figure.text(0.35 / 11, 1 - 0.3 / tall, folder.name, fontsize=13, color=INK, weight="bold", va="center")
-    lines = _lines(rows[-1], found, same=same)
+    lines = _summary_lines(rows[-1], found, same=same)
     said = "   ".join(f"{name} {value}" for name, value in lines[:4])
     figure.text(0.35 / 11, 1 - 0.57 / tall, said, fontsize=9, color=INK, va="center")
     return figure, lines
 
 
-def _log(path: Path) -> list[dict[str, float]]:
+def _read_log(path: Path) -> list[dict[str, float]]:
     if not path.is_file():
         raise InputError(f"{path} is missing, so the run cannot be drawn")
     with path.open(newline="", encoding="utf-8") as file:
         return [{k: float(v) for k, v in row.items() if v} for row in csv.DictReader(file)]
 
 
-def _lines(row: dict[str, float], found: dict[str, NDArray[Any]], *, same: bool) -> list[tuple[str, str]]:
+def _summary_lines(
+    row: dict[str, float], found: dict[str, NDArray[Any]], *, same: bool
+) -> list[tuple[str, str]]:
     out = [
         ("thresholds", f"{row['mu']:.3f} ± {row['sigma']:.3f}"),
         ("between pixels", f"± {row['mu_spread']:.3f}"),
@@ -87,12 +89,12 @@ def _lines(row: dict[str, float], found: dict[str, NDArray[Any]], *, same: bool)
     return out
 
 
-def _layout(rows: int, aspect: float) -> tuple[Figure, list[list[Axes]], list[Axes]]:
+def _lay_out(rows: int, aspect: float) -> tuple[Figure, list[list[Axes]], list[Axes]]:
     wide, side, gap, head, foot = 11.0, 0.35, 0.12, 1.0, 2.75  # all in inches
     across = (wide - 2 * side - 4 * gap - 0.75) / 5
     down = across / aspect
     tall = head + rows * (down + gap) + foot
-    figure, axes = paper(wide, tall)
+    figure, axes = figure_in_inches(wide, tall)
     pictures = [
         # the maps stand apart, to leave room for their scales
         [
@@ -108,7 +110,7 @@ def _layout(rows: int, aspect: float) -> tuple[Figure, list[list[Axes]], list[Ax
     return figure, pictures, plots
 
 
-def _events(counts: NDArray[Any], grey: NDArray[Any], most: float) -> NDArray[np.float64]:
+def _event_picture(counts: NDArray[Any], grey: NDArray[Any], most: float) -> NDArray[np.float64]:
     """Return counts (2, H, W) in colours over a pale picture, shape (H, W, 3)."""
     pale = np.repeat(0.75 + 0.25 * np.clip(grey, 0, 1)[..., None], 3, -1).astype(np.float64)
     total = counts.sum(0)
@@ -118,7 +120,7 @@ def _events(counts: NDArray[Any], grey: NDArray[Any], most: float) -> NDArray[np
     return np.asarray(pale * (1 - opacity) + colour * opacity)
 
 
-def _bar(figure: Figure, axes: Axes, shown: Any) -> None:
+def _draw_scale(figure: Figure, axes: Axes, shown: Any) -> None:
     """Draw the scale of a map beside its first picture."""
     box = axes.get_position()
     thin = 0.07 / figure.get_figwidth()
@@ -128,7 +130,7 @@ def _bar(figure: Figure, axes: Axes, shown: Any) -> None:
     place.tick_params(labelsize=6.5, colors=INK, length=2, width=0.5, pad=1.5)
 
 
-def _curves(plots: list[Axes], rows: list[dict[str, float]]) -> None:
+def _draw_curves(plots: list[Axes], rows: list[dict[str, float]]) -> None:
     """Draw how the thresholds went, and how far both sides are apart."""
     trained = [row for row in rows if row["step"] >= 0]
     steps = [row["step"] for row in trained]

@@ -10,9 +10,9 @@ from numpy.typing import NDArray
 
 from dase.errors import InputError
 from dase.events import Events
-from dase.figures.event_images import overlay
+from dase.figures.event_images import overlay_events
 from dase.figures.style import OFF, ON
-from dase.formatting import seconds
+from dase.formatting import format_seconds
 from dase.scenes.between_frames import RELATIVE, TOLERANCE, CameraScene
 from dase.scenes.frame_motion import HOPELESS
 
@@ -35,7 +35,7 @@ HATCH = 7
 """Dots from one line of the hatching to the next."""
 
 
-def panel(scene: CameraScene, events: Events, time: float, window: float) -> NDArray[np.uint8]:
+def trust_picture(scene: CameraScene, events: Events, time: float, window: float) -> NDArray[np.uint8]:
     """Return the scene with doubts and the events around a time.
 
     Doubt veils the picture, the more the less confidence there is; what no frame can tell, as it is saturated
@@ -56,18 +56,20 @@ def panel(scene: CameraScene, events: Events, time: float, window: float) -> NDA
     counts = events.counts([time - window / 2, time + window / 2])[0]
     share = 1 - scene.confidence([time])[0]
     hopeless = scene.doubt([time])[0] > 0.01 * HOPELESS  # the frame before and the one after share a doubt
-    large, nothing = (a.repeat(DOTS, 0).repeat(DOTS, 1) for a in (overlay(grey, 0 * counts) / 255, hopeless))
+    large, nothing = (
+        a.repeat(DOTS, 0).repeat(DOTS, 1) for a in (overlay_events(grey, 0 * counts) / 255, hopeless)
+    )
     y, x = np.indices(nothing.shape)
     lines = nothing & ((x + y) % HATCH < 2)
     veil = np.where(nothing, 0.0, 0.75 * share.repeat(DOTS, 0).repeat(DOTS, 1))[..., None]
     out = (1 - veil) * large + veil * np.array(VEIL)
     out[lines] = 0.6 * out[lines] + 0.4 * np.array(BLIND)
     seen = (counts.sum(0) > 0).repeat(DOTS, 0).repeat(DOTS, 1)
-    marked = overlay(grey, counts).repeat(DOTS, 0).repeat(DOTS, 1)
+    marked = overlay_events(grey, counts).repeat(DOTS, 0).repeat(DOTS, 1)
     return np.where(seen[..., None], marked, np.rint(255 * out)).astype(np.uint8)
 
 
-def draw(
+def draw_trust(
     scene: CameraScene,
     events: Events,
     *,
@@ -96,17 +98,17 @@ def draw(
     counts = np.diff(np.searchsorted(events.t, scene.times))
     shown = np.sort(np.argsort(-counts, kind="stable")[:moments])
     trusted = scene.trusted().mean((1, 2))
-    figure, places = _layout(len(shown), scene.height / scene.width)
-    _header(figure, title, window, float(trusted.mean()))
+    figure, places = _lay_out(len(shown), scene.height / scene.width)
+    _draw_header(figure, title, window, float(trusted.mean()))
     for axes, k in zip(places, shown, strict=True):
         time = float(0.5 * (scene.times[k] + scene.times[k + 1]))
-        axes.imshow(panel(scene, events, time, window), aspect="auto")
+        axes.imshow(trust_picture(scene, events, time, window), aspect="auto")
         axes.set_title(f"{time:.3f} s, after frame {k}", fontsize=9, color=INK, loc="left", pad=3)
         axes.set_title(f"{100 * trusted[k]:.0f} % trusted", fontsize=9, color=QUIET, loc="right", pad=3)
     return figure
 
 
-def _layout(count: int, aspect: float) -> tuple[Figure, list[Axes]]:
+def _lay_out(count: int, aspect: float) -> tuple[Figure, list[Axes]]:
     """Return a figure with room for a header, and `count` axes of height / width `aspect`."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
@@ -128,7 +130,7 @@ def _layout(count: int, aspect: float) -> tuple[Figure, list[Axes]]:
     return figure, places
 
 
-def _header(figure: Figure, title: str, window: float, share: float) -> None:
+def _draw_header(figure: Figure, title: str, window: float, share: float) -> None:
     tall = figure.get_figheight()
     left, right = 0.4 / 11, 1 - 0.4 / 11
     figure.text(left, 1 - 0.3 / tall, title, fontsize=13, color=INK, weight="bold", va="center")
@@ -137,7 +139,7 @@ def _header(figure: Figure, title: str, window: float, share: float) -> None:
         f"or {100 * RELATIVE:.0f} % of the change"
     )
     figure.text(left, 1 - 0.57 / tall, facts, fontsize=9, color=INK, va="center")
-    said = f"events of {seconds(window)} around each time"
+    said = f"events of {format_seconds(window)} around each time"
     figure.text(right, 1 - 0.3 / tall, said, fontsize=9, color=INK, va="center", ha="right")
     legend = (
         (right, "\N{BLACK SQUARE} OFF", OFF),

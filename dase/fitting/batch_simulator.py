@@ -16,14 +16,14 @@ from dase.effects.optics import SceneEffect
 from dase.effects.stream import StreamEffect
 from dase.effects.threshold import Threshold
 from dase.events import Events
-from dase.fitting.bus_load import Load
-from dase.fitting.readout_simulator import clock_of, emitted, felt, sent
+from dase.fitting.bus_load import BusLoad
+from dase.fitting.readout_simulator import clock_of, noticeable_effects, pass_readout, simulate_pixels
 from dase.kernels import event_probes as kernels
 from dase.kernels import launch, pixel_codegen_trials
-from dase.probes.accumulators import GROUP, Frame, Sums, fold, over_groups
-from dase.probes.events_by_pixel import by_pixel
+from dase.probes.accumulators import GROUP, ProbeSums, StatisticsFrame, fold_counts, sum_over_groups
+from dase.probes.events_by_pixel import sort_by_pixel
 from dase.probes.stimulus import Stimulus
-from dase.probes.timestamp_patterns import Structure
+from dase.probes.timestamp_patterns import TimestampStructure
 from dase.simulation.sensor import Sensor
 
 LAG_TIMES = (-0.003, -0.001, 0.0, 0.001, 0.002, 0.004, 0.008, 0.016, 0.028, 0.044, 0.063)
@@ -53,14 +53,14 @@ STREAMED = 32
 """Models whose events are stored at a time."""
 
 
-def finer_steps(sensor: Sensor, step: float) -> int:
+def samples_per_step(sensor: Sensor, step: float) -> int:
     """Return how many samples per step the model needs, 0 where those at changes of the light do."""
     longest = sensor.longest_step()
     return 0 if longest == np.inf else int(np.clip(np.ceil(step / longest - 1e-6), 1, FINEST))
 
 
 @dataclass(frozen=True, eq=False)
-class Order:
+class SimulationOrder:
     """Models to run: one sensor at several parameter vectors.
 
     Args:
@@ -78,7 +78,7 @@ class Order:
     seed: int = 0
     reseed: bool = False
     finer: int | None = None
-    frame: Frame | None = None
+    frame: StatisticsFrame | None = None
     ticks: float = 0.0
 
     def seeds(self) -> NDArray[np.int64]:
@@ -87,7 +87,7 @@ class Order:
 
 
 @dataclass(eq=False)
-class Trials:
+class BatchSimulator:
     """Runs models over a stimulus.
 
     Args:
@@ -100,7 +100,7 @@ class Trials:
 
     stimulus: Stimulus
     middle: NDArray[np.float32] = field(default_factory=lambda: np.zeros(4 * kernels.CLASSES, np.float32))
-    structure: Structure = field(default_factory=Structure)
+    structure: TimestampStructure = field(default_factory=TimestampStructure)
     evaluations: int = 0
     work: float = 0.0
     _kernels: dict[Any, tuple[wp.Kernel, NDArray[np.float32], list[int]]] = field(
@@ -122,33 +122,33 @@ class Trials:
         seed: int = 0,
         reseed: bool = False,
         finer: int | None = None,
-    ) -> Sums:
-        """Simulate parameter vectors of one sensor; see `Order`."""
-        return self.run_all([Order(sensor, vectors, seed, reseed, finer)])[0]
+    ) -> ProbeSums:
+        """Simulate parameter vectors of one sensor; see `SimulationOrder`."""
+        return self.run_all([SimulationOrder(sensor, vectors, seed, reseed, finer)])[0]
 
-    def run_all(self, orders: Sequence[Order]) -> list[Sums]:
+    def run_all(self, orders: Sequence[SimulationOrder]) -> list[ProbeSums]:
         """Simulate many models; those that have a kernel in common run together, whatever their effects."""
         together: dict[Any, list[int]] = {}
         step = self.stimulus.grid.step
         for n, order in enumerate(orders):
-            finer = finer_steps(order.sensor, step) if order.finer is None else order.finer
+            finer = samples_per_step(order.sensor, step) if order.finer is None else order.finer
             kernel = self._kernel(order.sensor)[0]
             maps = n if any(effect.maps for effect in order.sensor.effects) else -1
             together.setdefault((finer, id(kernel), maps), []).append(n)
-        out: dict[int, Sums] = {}
+        out: dict[int, ProbeSums] = {}
         for (finer, _, _), members in together.items():
             found = self._run([orders[n] for n in members], self.stimulus.history(finer))
             out.update(zip(members, found, strict=True))
         return [out[n] for n in range(len(orders))]
 
-    def _run(self, orders: Sequence[Order], history: Any) -> list[Sums]:
+    def _run(self, orders: Sequence[SimulationOrder], history: Any) -> list[ProbeSums]:
         """Simulate models that have a kernel in common."""
         kernel, maps = (
             self._kernel(orders[0].sensor)[0],
             orders[0].sensor.maps(self.stimulus.pixels, self.device),
         )
         count, seeds = len(self.stimulus.pixels), np.concatenate([order.seeds() for order in orders])
-        rows = np.concatenate([self._wide(order) for order in orders])
+        rows = np.concatenate([self._kernel_vectors(order) for order in orders])
         ends = np.cumsum([len(order.vectors) for order in orders])
         begins = np.concatenate([[0], ends[:-1]])
         ticks = np.repeat([round(order.ticks * 1e12) for order in orders], ends - begins)
@@ -157,8 +157,8 @@ class Trials:
         pixels = wp.zeros((len(rows), count, kernels.HALVES), dtype=float, device=self.device)
         sums, clock = [], []
         groups: dict[int, tuple[NDArray[np.float32], NDArray[np.int32]]] = {}
-        for first in range(0, len(rows), self._at_once()):
-            part = slice(first, min(first + self._at_once(), len(rows)))
+        for first in range(0, len(rows), self._models_at_once()):
+            part = slice(first, min(first + self._models_at_once(), len(rows)))
             sink = self.sink(pixels[part], ticks[part])
             inputs = [
                 history, self._pixels, self.stimulus.width, self.stimulus.height,
@@ -166,41 +166,41 @@ class Trials:
                 wp.array(rows[part], dtype=float, device=self.device), *maps, sink,
             ]  # fmt: skip
             blocks = -(-len(rows[part]) // self._lanes)
-            launch.run(kernel, count, inputs, self.device, batch=blocks, align=GROUP)
+            launch.run_kernel(kernel, count, inputs, self.device, batch=blocks, align=GROUP)
             grouped = self._grouped(sink.sums)
-            sums.append(over_groups(grouped))
+            sums.append(sum_over_groups(grouped))
             clock.append(self._clock(sink.clock))
             mine = [n for n in apart if part.start <= n < part.stop]
-            groups |= {n: _first(grouped, sink.clock, n - first) for n in mine}
+            groups |= {n: _groups_of_row(grouped, sink.clock, n - first) for n in mine}
         self.evaluations += len(rows)
         self.work += len(rows) * count * self.stimulus.grid.step * (self.stimulus.grid.steps - 1)
-        folded, both, clocks = _folded(orders, pixels), np.concatenate(sums), np.concatenate(clock)
+        folded, both, clocks = _fold_for_frames(orders, pixels), np.concatenate(sums), np.concatenate(clock)
         out = []
         for order, begin, end in zip(orders, begins.tolist(), ends.tolist(), strict=True):
             cut, (of_groups, teams) = slice(begin, end), groups.get(begin, (None, None))
             known = None if folded is None or order.frame is None else folded[cut]
             stamps = self._stamps(order)
             out.append(
-                Sums(both[cut], pixels[cut], clocks[cut], stamps, of_groups, teams, order.frame, known)
+                ProbeSums(both[cut], pixels[cut], clocks[cut], stamps, of_groups, teams, order.frame, known)
             )
         return out
 
-    def _stamps(self, order: Order) -> NDArray[np.float64]:
+    def _stamps(self, order: SimulationOrder) -> NDArray[np.float64]:
         """Return the shares of events that follow regularities: those that a clock has stamped do."""
-        out = np.zeros((len(order.vectors), len(Structure.NAMES)))
+        out = np.zeros((len(order.vectors), len(TimestampStructure.NAMES)))
         out[:, 0] = order.ticks > 0 and self.structure.step > 0
         return out
 
-    def _wide(self, order: Order) -> NDArray[np.float32]:
+    def _kernel_vectors(self, order: SimulationOrder) -> NDArray[np.float32]:
         """Return parameter vectors as the kernel takes them."""
         _, base, at = self._kernel(order.sensor)
         out = np.repeat(base[None], len(order.vectors), 0)
         out[:, at] = order.vectors
         return out
 
-    def _at_once(self) -> int:
+    def _models_at_once(self) -> int:
         """Return how many models there is room for."""
-        count, group = len(self.stimulus.pixels), self._group()
+        count, group = len(self.stimulus.pixels), self._pixels_per_sum()
         numbers = -(-count // group) * kernels.SIZE + -(-count // GROUP) * 2 * self.stimulus.grid.steps
         return max(1, ROOM[self._kind] // (4 * (numbers + count * (kernels.MEMORY + kernels.HALVES))))
 
@@ -209,56 +209,58 @@ class Trials:
         key = tuple((e.name, *(getattr(e, name) for name in e.choices())) for e in sensor.effects)
         if key not in self._kernels:
             stages = sensor.stages()
-            wide = whole(sensor) if len(stages) > ALONE[self._kind] else sensor
+            wide = with_every_effect(sensor) if len(stages) > ALONE[self._kind] else sensor
             names = wide.parameter_names()
             at = [names.index(name) for name in sensor.parameter_names()]
             self._kernels[key] = (
-                pixel_codegen_trials.compose(wide.stages(), lanes=self._lanes),
+                pixel_codegen_trials.compose_trials(wide.stages(), lanes=self._lanes),
                 wide.parameters(),
                 at,
             )
         return self._kernels[key]
 
-    def look(self, events: Events) -> Sums:
+    def look(self, events: Events) -> ProbeSums:
         """Sum up stored events; those of other pixels are left out."""
         return self._look([events])
 
-    def _look(self, streams: Sequence[Events], frame: Frame | None = None) -> Sums:
+    def _look(self, streams: Sequence[Events], frame: StatisticsFrame | None = None) -> ProbeSums:
         """Sum up streams of stored events, one per row."""
         count = len(self.stimulus.pixels)
         pixels = wp.zeros((len(streams), count, kernels.HALVES), dtype=float, device=self.device)
         sink = self.sink(pixels, np.zeros(len(streams), np.int64))
-        inputs = [*by_pixel(self.stimulus, streams), sink]
-        launch.run(kernels.walk, count, inputs, self.device, batch=len(streams), align=GROUP)
+        inputs = [*sort_by_pixel(self.stimulus, streams), sink]
+        launch.run_kernel(
+            kernels.observe_stored_events, count, inputs, self.device, batch=len(streams), align=GROUP
+        )
         grouped = self._grouped(sink.sums)
         folded = None
         if frame is not None:
-            folded = over_groups(fold(pixels, [frame], np.zeros(len(streams), np.int64)))
-        stamps = np.zeros((len(streams), len(Structure.NAMES)))
-        if self.structure != Structure():
-            stamps = np.stack([self.structure.shares(self._mine(events)) for events in streams])
-        return Sums(
-            over_groups(grouped), pixels, self._clock(sink.clock), stamps,
-            *_first(grouped, sink.clock, 0), frame, folded,
+            folded = sum_over_groups(fold_counts(pixels, [frame], np.zeros(len(streams), np.int64)))
+        stamps = np.zeros((len(streams), len(TimestampStructure.NAMES)))
+        if self.structure != TimestampStructure():
+            stamps = np.stack([self.structure.shares(self._events_of_pixels(events)) for events in streams])
+        return ProbeSums(
+            sum_over_groups(grouped), pixels, self._clock(sink.clock), stamps,
+            *_groups_of_row(grouped, sink.clock, 0), frame, folded,
         )  # fmt: skip
 
-    def felt(self, sensor: Sensor) -> tuple[StreamEffect, ...]:
+    def noticeable_effects(self, sensor: Sensor) -> tuple[StreamEffect, ...]:
         """Return the effects behind the pixels that the probes can feel."""
-        return felt(self.stimulus, self.structure, sensor)
+        return noticeable_effects(self.stimulus, self.structure, sensor)
 
     def ticks(self, sensor: Sensor) -> float | None:
         """Return what the kernel needs to know of a sensor's clock, see `clock_of`; None for a readout."""
-        return clock_of(self.felt(sensor), self.structure)
+        return clock_of(self.noticeable_effects(sensor), self.structure)
 
     def stream(
         self, sensor: Sensor, vector: NDArray[Any], effects: Iterable[StreamEffect], *, seed: int
-    ) -> Sums:
+    ) -> ProbeSums:
         """Simulate one parameter vector with effects behind the pixels, and sum up what leaves."""
-        return self.stream_all(Order(sensor, np.atleast_2d(vector), seed), [tuple(effects)])
+        return self.simulate_streams(SimulationOrder(sensor, np.atleast_2d(vector), seed), [tuple(effects)])
 
-    def stream_all(
-        self, order: Order, effects: Sequence[Sequence[StreamEffect]], load: Load | None = None
-    ) -> Sums:
+    def simulate_streams(
+        self, order: SimulationOrder, effects: Sequence[Sequence[StreamEffect]], load: BusLoad | None = None
+    ) -> ProbeSums:
         """Simulate models with effects behind the pixels, given for each, and sum up what leaves.
 
         `load` is what the sensor's other pixels send over a bus that all share, None where it is not known.
@@ -267,20 +269,20 @@ class Trials:
         self.evaluations += rows
         for first in range(0, rows, STREAMED):
             cut = slice(first, first + STREAMED)
-            left = emitted(self.stimulus, order.sensor, order.vectors[cut], seeds[cut])
+            left = simulate_pixels(self.stimulus, order.sensor, order.vectors[cut], seeds[cut])
             each = zip(left, effects[cut], seeds[cut], strict=True)
-            works = [partial(sent, self.stimulus, e, behind, int(s), load) for e, behind, s in each]
-            found.append(self._look(launch.each(works), order.frame))
-        return Sums.join(found)
+            works = [partial(pass_readout, self.stimulus, e, behind, int(s), load) for e, behind, s in each]
+            found.append(self._look(launch.run_concurrently(works), order.frame))
+        return ProbeSums.join(found)
 
-    def _mine(self, events: Events) -> Events:
+    def _events_of_pixels(self, events: Events) -> Events:
         """Return the events of the pixels, within the time that is compared."""
         stimulus = self.stimulus
         own = np.zeros(stimulus.width * stimulus.height, np.bool_)
         own[stimulus.pixels] = True
         return events.select(own[events.y.astype(np.int64) * stimulus.width + events.x])
 
-    def _group(self) -> int:
+    def _pixels_per_sum(self) -> int:
         return 1 if self.device.is_cuda else GROUP
 
     def sink(self, pixels: Any, ticks: NDArray[np.int64]) -> Any:
@@ -291,7 +293,7 @@ class Trials:
             ticks: From tick to tick of the clock that stamps events [ps], 0 for none, shape (B,).
         """
         stimulus, step = self.stimulus, self.stimulus.grid.step
-        out = kernels.Probes()
+        out = kernels.ProbeSums()
         out.cell = stimulus.array("cell", lambda: stimulus.cell)
         out.level = stimulus.array("level", lambda: stimulus.level)
         out.lags = stimulus.array("lags", lambda: np.rint(np.array(LAG_TIMES) / step).astype(np.int32))
@@ -305,7 +307,7 @@ class Trials:
         out.step, out.slack = wp.float64(step * 1e9), wp.float64(SLACK * 1e9)
         out.ticks = wp.array(ticks.astype(np.int64), dtype=wp.int64, device=self.device)
         out.holes = int(stimulus.holes)
-        out.group = self._group()
+        out.group = self._pixels_per_sum()
         out.halves = pixels
         rows, count, _ = pixels.shape
         out.memory = wp.zeros((rows, count, kernels.MEMORY), dtype=float, device=self.device)
@@ -324,34 +326,38 @@ class Trials:
         rows, count, size = sums.shape
         parts = -(-count // GROUP)
         less = wp.empty((rows, parts, size), dtype=float, device=self.device)
-        launch.run(pixel_codegen_trials.total, parts * size, [sums, GROUP, less], self.device, batch=rows)
+        launch.run_kernel(
+            pixel_codegen_trials.sum_pixel_groups, parts * size, [sums, GROUP, less], self.device, batch=rows
+        )
         return less
 
     def _clock(self, teams: Any) -> NDArray[np.int32]:
         """Return the events of each step over all groups, shape (B, 2 T)."""
         rows, _, steps = teams.shape
         out = wp.empty((rows, steps), dtype=int, device=self.device)
-        launch.run(kernels.counted, steps, [teams, out], self.device, batch=rows, slabs=1)
+        launch.run_kernel(kernels.sum_group_counts, steps, [teams, out], self.device, batch=rows, slabs=1)
         found: NDArray[np.int32] = out.numpy()
         return found
 
 
-def _folded(orders: Sequence[Order], pixels: Any) -> NDArray[np.float64] | None:
+def _fold_for_frames(orders: Sequence[SimulationOrder], pixels: Any) -> NDArray[np.float64] | None:
     """Return the counts of pixels folded, as far as it is known for what."""
     frames = list({id(o.frame): o.frame for o in orders if o.frame is not None}.values())
     if not frames:
         return None
     places = {id(frame): n for n, frame in enumerate(frames)}
     which = [places.get(id(order.frame), 0) for order in orders]
-    return over_groups(fold(pixels, frames, np.repeat(which, [len(order.vectors) for order in orders])))
+    return sum_over_groups(
+        fold_counts(pixels, frames, np.repeat(which, [len(order.vectors) for order in orders]))
+    )
 
 
-def _first(grouped: Any, clock: Any, row: int) -> tuple[NDArray[np.float32], NDArray[np.int32]]:
+def _groups_of_row(grouped: Any, clock: Any, row: int) -> tuple[NDArray[np.float32], NDArray[np.int32]]:
     """Return sums and events of each step of the groups of one row."""
     return grouped[row].numpy().copy(), clock[row].numpy().copy()
 
 
-def whole(sensor: Sensor) -> Sensor:
+def with_every_effect(sensor: Sensor) -> Sensor:
     """Return a sensor with every effect of a pixel that dase has, switched off where the sensor lacks it."""
     for name, effect in EFFECTS.items():
         inside = not issubclass(effect, StreamEffect | SceneEffect | Threshold) and not effect.maps

@@ -10,11 +10,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dase.effects.readout import Others
-from dase.effects.stream import StreamEffect, nanoseconds
+from dase.effects.stream import StreamEffect, to_nanoseconds
 from dase.events import Events
 from dase.probes.stimulus import Stimulus
 from dase.scenes.scene import Scene
-from dase.simulation.pixel_array import Pixels
+from dase.simulation.pixel_array import PixelArray
 from dase.simulation.sensor import Sensor
 from dase.simulation.simulate import CHUNK, chunks
 
@@ -30,7 +30,7 @@ KEPT = 3
 
 
 @dataclass(frozen=True, eq=False)
-class Surroundings:
+class WholeSensor:
     """A scene as all pixels see it.
 
     Args:
@@ -44,9 +44,9 @@ class Surroundings:
     times: NDArray[np.float64]
     seed: int
     device: str
-    _loads: list[Load] = field(default_factory=list, repr=False)
+    _loads: list[BusLoad] = field(default_factory=list, repr=False)
 
-    def load(self, sensor: Sensor, stimulus: Stimulus) -> Load:
+    def load(self, sensor: Sensor, stimulus: Stimulus) -> BusLoad:
         """Return what the pixels that are not looked at send in a model; the last few are kept.
 
         A model becomes the present one several times over: descents begin at one place, and what its bus is
@@ -55,7 +55,7 @@ class Surroundings:
         bare = replace(sensor, effects=tuple(e for e in sensor.effects if not isinstance(e, StreamEffect)))
         found = next((load for load in self._loads if load.sensor == bare), None)
         if found is None:
-            found = Load(self, bare, stimulus)
+            found = BusLoad(self, bare, stimulus)
         self._loads[:] = [found, *(load for load in self._loads if load is not found)][:KEPT]
         return found
 
@@ -75,7 +75,7 @@ class Surroundings:
 
     def emitted(self, sensor: Sensor, pixels: NDArray[np.int32], steps: int) -> Events:
         """Return what leaves some pixels up to a point of time, from time 0."""
-        array = Pixels(
+        array = PixelArray(
             sensor, self.scene.width, self.scene.height, pixels=pixels, seed=self.seed, device=self.device
         )
         size = CHUNK["cuda" if array.device.is_cuda else "cpu"]
@@ -85,7 +85,7 @@ class Surroundings:
 
 
 @dataclass(eq=False)
-class Load:
+class BusLoad:
     """What the pixels that are not looked at send, as the present model has it.
 
     Worked out when it is first asked for: most models have no bus.
@@ -96,7 +96,7 @@ class Load:
         stimulus: The pixels that are looked at, and their time.
     """
 
-    around: Surroundings
+    around: WholeSensor
     sensor: Sensor
     stimulus: Stimulus
     _before: dict[tuple[StreamEffect, ...], Others] = field(default_factory=dict, repr=False)
@@ -109,7 +109,7 @@ class Load:
                 than the present one, and so it is taken to do everywhere.
         """
         _, counts, each = self._events
-        return each * (_polarities(events) + 1) / (counts + 1)
+        return each * (_count_polarities(events) + 1) / (counts + 1)
 
     def others(self, effects: Iterable[StreamEffect], seed: int) -> Others:
         """Return the others' events behind some effects."""
@@ -119,7 +119,7 @@ class Load:
             for effect in key:
                 reader = effect.reader(self.stimulus.width, self.stimulus.height, seed)
                 events, until = reader.push(events, until)
-            self._before[key] = Others(1000 * nanoseconds(events.t), events.p.astype(np.uint8))
+            self._before[key] = Others(1000 * to_nanoseconds(events.t), events.p.astype(np.uint8))
         return self._before[key]
 
     @cached_property
@@ -130,10 +130,10 @@ class Load:
         others = self.around.others(chosen, steps, len(mine))
         events = self.around.emitted(self.sensor, others, steps)
         each = (self.stimulus.width * self.stimulus.height - len(chosen)) / len(others)
-        return events, _polarities(mine), each
+        return events, _count_polarities(mine), each
 
 
-def _polarities(events: Events) -> NDArray[np.int64]:
+def _count_polarities(events: Events) -> NDArray[np.int64]:
     """Return the numbers of OFF and ON events."""
     on = np.count_nonzero(events.p)
     return np.array([len(events) - on, on])

@@ -7,10 +7,10 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from dase.fitting.data_split import Evidence
-from dase.fitting.descent import PRIOR, TIGHT, clean_normal, slopes
-from dase.fitting.model import Model
-from dase.fitting.subset import Half
+from dase.fitting.data_split import SplitMeasurement
+from dase.fitting.descent import PRIOR, TIGHT, denoised_normal_matrix, fit_slopes
+from dase.fitting.model import FittedModel
+from dase.fitting.subset import PixelSubset
 from dase.results import Estimate
 
 Array = NDArray[np.float64]
@@ -31,7 +31,9 @@ STEPS = 2
 """Last steps: the first leaves a part of the chance of a single simulation."""
 
 
-def estimates(evidence: Evidence, model: Model, *, seed: int) -> tuple[Model, dict[str, Estimate]]:
+def estimate_parameters(
+    evidence: SplitMeasurement, model: FittedModel, *, seed: int
+) -> tuple[FittedModel, dict[str, Estimate]]:
     """Return the model, its parameters improved by a last step, and their 90 % intervals.
 
     The fit is linearised: statistics run along straight lines in the parameters. The last steps go from the
@@ -49,7 +51,7 @@ def estimates(evidence: Evidence, model: Model, *, seed: int) -> tuple[Model, di
         repeats = model.rebase(half, repeats=REPEATS, seed=seed + 900 + 100 * turn)
         errors.append(half.judge(repeats, seed=seed).error)
         mean = repeats.mean(0)
-        gain = _gain(half, model, repeats, seed=seed + turn)
+        gain = _parameters_per_statistic(half, model, repeats, seed=seed + turn)
         # what the pixels of the measurement make of it, also where the model is not quite right
         seen = (half.left @ gain.T).var(0) * (half.groups - 1)
         step = -gain @ np.where(half.scale.used, mean - half.scale.target, 0.0)
@@ -69,19 +71,21 @@ def estimates(evidence: Evidence, model: Model, *, seed: int) -> tuple[Model, di
     return replace(model, place=place), out
 
 
-def _gain(half: Half, model: Model, repeats: Array, *, seed: int) -> Array:
+def _parameters_per_statistic(half: PixelSubset, model: FittedModel, repeats: Array, *, seed: int) -> Array:
     """Return what a change of the statistics does to the fitted places, shape (P, J)."""
     mean = repeats.mean(0)
     tight = [axis.name.startswith("threshold.") for axis in model.space.axes]
     reach = np.where(tight, TIGHT, 1.0) * REACH[1]
     for turn in range(2):
-        gain = _gain_within(half, model, repeats, reach, seed=seed + 10 * turn)
+        gain = _parameters_per_statistic_within(half, model, repeats, reach, seed=seed + 10 * turn)
         # as wide as the parameters are uncertain: wide enough to see a slope, narrow enough to be straight
         reach = np.clip(4.0 * ((repeats - mean) @ gain.T).std(0), *REACH)
     return gain
 
 
-def _gain_within(half: Half, model: Model, repeats: Array, reach: Array, *, seed: int) -> Array:
+def _parameters_per_statistic_within(
+    half: PixelSubset, model: FittedModel, repeats: Array, reach: Array, *, seed: int
+) -> Array:
     scale, size = half.scale, len(model.place)
     rng = np.random.default_rng([seed, 13])
     low, high = model.space.bounds()
@@ -92,10 +96,10 @@ def _gain_within(half: Half, model: Model, repeats: Array, reach: Array, *, seed
     values = half.run(model.space, places, seed=seed + 1) / scale.sigma
     places, values = places - places.mean(0), values - values.mean(0)
     values = np.where(scale.used, values, 0.0)
-    lines = slopes(places, values)
+    lines = fit_slopes(places, values)
     z = scale.z(repeats.mean(0))
     weights = scale.weights() / np.sqrt(1.0 + z * z)
     noise = repeats.var(0) / scale.sigma**2
-    normal = clean_normal(places, values, lines, weights, noise) + PRIOR * np.eye(size)
+    normal = denoised_normal_matrix(places, values, lines, weights, noise) + PRIOR * np.eye(size)
     out: Array = np.linalg.solve(normal, lines.T * weights) / scale.sigma
     return out

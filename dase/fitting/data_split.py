@@ -12,14 +12,14 @@ from numpy.typing import NDArray
 
 from dase.errors import InputError
 from dase.events import Events
-from dase.fitting.batch_simulator import Trials
-from dase.fitting.bus_load import Surroundings
-from dase.fitting.pixel_selection import look, where_trusted
-from dase.fitting.subset import Array, Half
+from dase.fitting.batch_simulator import BatchSimulator
+from dase.fitting.bus_load import WholeSensor
+from dase.fitting.pixel_selection import choose_trusted_pixels, find_trusted_parts
+from dase.fitting.subset import Array, PixelSubset
 from dase.kernels import event_probes as kernels
 from dase.kernels import launch
-from dase.probes.accumulators import Frame, Sums
-from dase.probes.statistics import peak_of, precise, zones
+from dase.probes.accumulators import ProbeSums, StatisticsFrame
+from dase.probes.statistics import peak_of, refine_frequency, ring_of_pixels
 from dase.probes.stimulus import (
     COARSEST,
     FINEST,
@@ -31,7 +31,7 @@ from dase.probes.stimulus import (
     light_of,
     sort_into_cells,
 )
-from dase.probes.timestamp_patterns import FILE, Structure, find
+from dase.probes.timestamp_patterns import FILE, TimestampStructure, find_structure
 from dase.scenes.between_frames import CameraScene
 from dase.scenes.scene import Scene
 
@@ -54,7 +54,7 @@ BUSY = 2e-3
 
 
 @dataclass(eq=False)
-class Evidence:
+class SplitMeasurement:
     """A measurement and the scene it is of.
 
     Args:
@@ -69,14 +69,14 @@ class Evidence:
         notes: What the data cannot show.
     """
 
-    train: Half
-    held: Half
-    scout: Half
+    train: PixelSubset
+    held: PixelSubset
+    scout: PixelSubset
     bands: Array
-    structure: Structure
+    structure: TimestampStructure
     peak: float
-    busiest: float
-    fastest: float
+    highest_event_rate: float
+    least_bus_rate: float
     notes: tuple[str, ...] = ()
 
     @property
@@ -85,7 +85,7 @@ class Evidence:
         return sum(half.trials.evaluations for half in (self.train, self.held, self.scout))
 
 
-def gather(
+def split_measurement(
     events: Events,
     scene: Scene,
     *,
@@ -94,7 +94,7 @@ def gather(
     pixels: int = PIXELS,
     seed: int = 0,
     device: str = "cpu",
-) -> Evidence:
+) -> SplitMeasurement:
     """Split a measurement into a half that is fitted and a half that judges.
 
     Args:
@@ -111,10 +111,10 @@ def gather(
         InputError: Different sizes, no common time, or too few events.
     """
     if trust is None and isinstance(scene, CameraScene):
-        trust = scene.trusts
+        trust = scene.is_trusted
     grid = common_grid(events, scene)
     try:
-        to = launch.device(device)
+        to = launch.find_device(device)
     except ValueError as error:
         raise InputError(str(error)) from error
     size = scene.width * scene.height
@@ -126,11 +126,11 @@ def gather(
     if trust is None:
         chosen = rng.permutation(size)[: 2 * each].astype(np.int32)
     else:
-        looks = look(events, scene, _times(scene, grid), cut, trust)
-        chosen = where_trusted(looks, each, rng)
+        looks = find_trusted_parts(events, scene, _times_of_grid(scene, grid), cut, trust)
+        chosen = choose_trusted_pixels(looks, each, rng)
         each = len(chosen) // 2
         notes.append(looks.sentence())
-    light = light_of(scene, _times(scene, grid), chosen)
+    light = light_of(scene, _times_of_grid(scene, grid), chosen)
     if not np.all(np.isfinite(light)) or light.min() < 0:
         raise InputError("scene: intensities must be finite and >= 0")
     good = np.ones(light.shape, np.bool_) if trust is None else trust(grid.times, chosen).T.copy()
@@ -138,8 +138,8 @@ def gather(
     bands = band_edges(light, good)
     sorting = partial(sort_into_cells, step=grid.step, bands=bands, log_eps=log_eps)
     works: list[Callable[[], Any]] = [partial(sorting, part) for part in np.array_split(light, 8)]
-    works.append(partial(find, events))
-    *parts, structure = launch.each(works)
+    works.append(partial(find_structure, events))
+    *parts, structure = launch.run_concurrently(works)
     cell = np.concatenate(parts)
     cell[~good] = MASKED
     cell[:, 0] = MASKED
@@ -147,25 +147,25 @@ def gather(
     train_grid = replace(grid, steps=cut)
     late = cell[last].copy()
     late[:, :cut] = MASKED
-    halves: list[Half] = []
+    halves: list[PixelSubset] = []
     for part, span, cells in ((first, train_grid, cell[first, :cut]), (last, grid, late)):
         stimulus = Stimulus(
             chosen[part], scene.width, scene.height, span, light[part, : span.steps], cells, log_eps, to,
             trust is not None,
         )  # fmt: skip
-        halves.append(_half(stimulus, events, cut if span is grid else 0, structure))
-    _enough(halves, events, grid, notes)
-    halves.append(_half(halves[0].trials.stimulus.part(SCOUTS), events, 0, structure))
+        halves.append(_make_subset(stimulus, events, cut if span is grid else 0, structure))
+    _require_enough_events(halves, events, grid, notes)
+    halves.append(_make_subset(halves[0].trials.stimulus.part(SCOUTS), events, 0, structure))
     peak = peak_of(halves[0].found.clock[0], grid.step)
     if trust is None:  # else most events are where the scene is not known
-        peak = precise(events, grid.begin, grid.begin + cut * grid.step, peak)
+        peak = refine_frequency(events, grid.begin, grid.begin + cut * grid.step, peak)
     for half in halves:
         half.frame = replace(half.frame, peak=peak)
         # where the scene is trusted here and there only, nobody knows what all pixels send
-        half.around = Surroundings(scene, _times(scene, grid), seed, device) if trust is None else None
+        half.around = WholeSensor(scene, _times_of_grid(scene, grid), seed, device) if trust is None else None
     train, held, scout = halves
-    rates = busiest(events), fastest(events, structure)
-    return Evidence(train, held, scout, bands, structure, peak, *rates, tuple(notes))
+    rates = highest_event_rate(events), least_bus_rate(events, structure)
+    return SplitMeasurement(train, held, scout, bands, structure, peak, *rates, tuple(notes))
 
 
 def common_grid(events: Events, scene: Scene) -> Grid:
@@ -192,13 +192,13 @@ def common_grid(events: Events, scene: Scene) -> Grid:
     return Grid(begin, h, max(steps, 2))
 
 
-def busiest(events: Events) -> float:
+def highest_event_rate(events: Events) -> float:
     """Return the most events per second [Hz]: the rate of a bus, if it ever was full for long enough."""
     counts = np.bincount(((events.t - events.t[0]) / BUSY).astype(np.int64))
     return float(counts.max()) / BUSY
 
 
-def fastest(events: Events, structure: Structure) -> float:
+def least_bus_rate(events: Events, structure: TimestampStructure) -> float:
     """Return the events per second that a bus can send at least [Hz], as it has sent some as fast as that."""
     if structure.line:
         return 0.0  # stamps tell when a line was read
@@ -207,32 +207,34 @@ def fastest(events: Events, structure: Structure) -> float:
     return max((n / (float((events.t[n:] - events.t[:-n]).min()) + slack) for n in runs), default=0.0)
 
 
-def _times(scene: Scene, grid: Grid) -> NDArray[np.float64]:
+def _times_of_grid(scene: Scene, grid: Grid) -> NDArray[np.float64]:
     """Return the times of the grid, those of the scene itself where they are the same but for rounding."""
     own = scene.sample_times()[: grid.steps]
     same = len(own) == grid.steps and np.allclose(own, grid.times, rtol=0, atol=1e-3 * grid.step)
     return own if same else grid.times
 
 
-def _half(stimulus: Stimulus, events: Events, first: int, structure: Structure) -> Half:
-    trials = Trials(stimulus, structure=structure)
+def _make_subset(
+    stimulus: Stimulus, events: Events, first: int, structure: TimestampStructure
+) -> PixelSubset:
+    trials = BatchSimulator(stimulus, structure=structure)
     trials.middle = typical_changes(trials.look(events))
     found = trials.look(events)
     seconds = stimulus.grid.step * (stimulus.grid.steps - first)
     expected = np.zeros((len(stimulus.pixels), kernels.HALVES))
-    zone = zones(stimulus.pixels, stimulus.width, stimulus.height)
+    zone = ring_of_pixels(stimulus.pixels, stimulus.width, stimulus.height)
     regular = structure.step > 0 or structure.line > 0
-    frame = Frame(expected, zone, seconds, first, stimulus.grid.step, regular=regular)
-    return Half(trials, found, frame)
+    frame = StatisticsFrame(expected, zone, seconds, first, stimulus.grid.step, regular=regular)
+    return PixelSubset(trials, found, frame)
 
 
-def typical_changes(sums: Sums) -> NDArray[np.float32]:
+def typical_changes(sums: ProbeSums) -> NDArray[np.float32]:
     """Return the mean change of the light between two events by polarities and interval, (4 CLASSES,)."""
     pairs = sums.sums[0, kernels.CHANGE : kernels.CHANGE + 12 * kernels.CLASSES].reshape(-1, 3)
     return (pairs[:, 1] / np.maximum(pairs[:, 0], 1)).astype(np.float32)
 
 
-def _enough(halves: list[Half], events: Events, grid: Grid, notes: list[str]) -> None:
+def _require_enough_events(halves: list[PixelSubset], events: Events, grid: Grid, notes: list[str]) -> None:
     for half, name in zip(halves, ("fitting", "judging"), strict=True):
         count = int(half.found.halves.sum())
         if count < LEAST:

@@ -8,10 +8,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from dase.fitting.parameter_space import Space
-from dase.fitting.scheduler import Ask, Work
-from dase.fitting.subset import Half
-from dase.probes.distance import Scale
+from dase.fitting.parameter_space import ParameterSpace
+from dase.fitting.scheduler import SimulationRequest, Work
+from dase.fitting.subset import PixelSubset
+from dase.probes.distance import ErrorScale
 
 Array = NDArray[np.float64]
 
@@ -52,12 +52,12 @@ PRIOR = 2e-3
 """Weight by which parameters that the data say nothing about are held at their start."""
 
 
-Over = Callable[[float, float], bool]
+StopRule = Callable[[float, float], bool]
 """Whether a search may stop, from its loss and that before the last population."""
 
 
 @dataclass(frozen=True)
-class Found:
+class DescentEnd:
     """Where a search ended.
 
     Args:
@@ -77,17 +77,17 @@ class Found:
     tried: Array
 
 
-def searching(
-    half: Half,
-    space: Space,
+def descent_work(
+    half: PixelSubset,
+    space: ParameterSpace,
     start: Array,
     *,
     seed: int,
     iterations: int = 5,
     radius: float = RADIUS,
     patient: bool = False,
-    over: Over | None = None,
-) -> Work[Found]:
+    over: StopRule | None = None,
+) -> Work[DescentEnd]:
     """Descend from one start, see `together`.
 
     Each iteration simulates a population about the present place, with the random numbers in common, fits a
@@ -113,18 +113,18 @@ def searching(
     reach = np.where(tight, TIGHT * radius, radius)
     best_loss, left = np.inf, iterations
     for _ in range(LONGEST if len(centre) else 0):
-        population = np.concatenate([centre[None], centre + reach * _cross(rng, len(centre))])
+        population = np.concatenate([centre[None], centre + reach * _cross_population(rng, len(centre))])
         population = np.clip(population, low, high)
-        (values,) = yield [Ask(half, space, population, seed)]
+        (values,) = yield [SimulationRequest(half, space, population, seed)]
         places, tried = np.concatenate([places, population]), np.concatenate([tried, values])
-        losses = half.scale.loss(tried) + penalty(places, start)
+        losses = half.scale.loss(tried) + distance_penalty(places, start)
         leader = int(np.argmin(losses))
         improved = losses[leader] < best_loss - 1e-3 * abs(losses[leader])
         much = patient and losses[leader] < MUCH * best_loss < np.inf
         behind = over is not None and over(float(losses[leader]), best_loss)
         best, best_loss = places[leader], float(losses[leader])
         near = np.all(np.abs(places - best) <= 2.5 * reach, axis=1)
-        slope = slopes((places[near] - best) / reach, tried[near] - tried[leader]) / reach
+        slope = fit_slopes((places[near] - best) / reach, tried[near] - tried[leader]) / reach
         step, steepness = robust_step(half.scale, tried[leader], slope, best - start)
         beyond = float(np.max(np.abs(step) / reach))
         centre = np.clip(best + step * min(1.0, FARTHEST / max(beyond, 1e-12)), low, high)
@@ -138,20 +138,22 @@ def searching(
         left -= 1
         if left <= 0:
             break
-    (final,) = yield [Ask(half, space, centre[None], seed)]
+    (final,) = yield [SimulationRequest(half, space, centre[None], seed)]
     places, tried = np.concatenate([places, centre[None]]), np.concatenate([tried, final])
-    losses = half.scale.loss(tried) + penalty(places, start)
+    losses = half.scale.loss(tried) + distance_penalty(places, start)
     leader = int(np.argmin(losses))
-    return Found(places[leader], float(half.scale.loss(tried[leader])), tried[leader], slope, places, tried)
+    return DescentEnd(
+        places[leader], float(half.scale.loss(tried[leader])), tried[leader], slope, places, tried
+    )
 
 
-def penalty(places: Array, start: Array) -> Array:
+def distance_penalty(places: Array, start: Array) -> Array:
     """Return what it costs to leave the start, shape (...)."""
     out: Array = PRIOR * ((places - start) ** 2).sum(-1)
     return out
 
 
-def _cross(rng: np.random.Generator, size: int) -> Array:
+def _cross_population(rng: np.random.Generator, size: int) -> Array:
     """Return both ways along the axes of a random frame, and some directions more, shape (2 P + 2, P)."""
     frame, _ = np.linalg.qr(rng.standard_normal((size, size)))
     frame *= np.sqrt(size) / np.maximum(np.abs(frame).max(1, keepdims=True) * np.sqrt(size), 1e-9)
@@ -160,7 +162,7 @@ def _cross(rng: np.random.Generator, size: int) -> Array:
     return np.concatenate([frame, -frame, more, -more])
 
 
-def slopes(places: Array, values: Array) -> Array:
+def fit_slopes(places: Array, values: Array) -> Array:
     """Return the slopes of straight lines through the origin, shape (J, P)."""
     size = places.shape[1]
     ridge = 1e-3 * np.trace(places.T @ places) / size + 1e-12
@@ -169,7 +171,7 @@ def slopes(places: Array, values: Array) -> Array:
     return out
 
 
-def clean_normal(places: Array, values: Array, lines: Array, weights: Array, noise: Array) -> Array:
+def denoised_normal_matrix(places: Array, values: Array, lines: Array, weights: Array, noise: Array) -> Array:
     """Return the weighted product of slopes with themselves, less what noise in them adds to it, (P, P).
 
     Slopes come from simulations whose chance differs. Left in, it would make parameters that the data hardly
@@ -193,7 +195,7 @@ def clean_normal(places: Array, values: Array, lines: Array, weights: Array, noi
     return out
 
 
-def robust_step(scale: Scale, values: Array, slope: Array, offset: Array) -> tuple[Array, Array]:
+def robust_step(scale: ErrorScale, values: Array, slope: Array, offset: Array) -> tuple[Array, Array]:
     """Return the step to the least robust loss of statistics that run along straight lines, (P,).
 
     Also what a unit along each axis, squared, adds to the loss, (P,).
@@ -215,12 +217,12 @@ def robust_step(scale: Scale, values: Array, slope: Array, offset: Array) -> tup
     return step, np.diag(normal).copy()
 
 
-def screening(
-    half: Half, space: Space, starts: Sequence[Array] | Array, *, seed: int
+def ranking_work(
+    half: PixelSubset, space: ParameterSpace, starts: Sequence[Array] | Array, *, seed: int
 ) -> Work[tuple[Array, Array]]:
     """Return places in order of their loss, and the losses, see `together`."""
     places = np.atleast_2d(np.asarray(starts))
-    (values,) = yield [Ask(half, space, places, seed)]
+    (values,) = yield [SimulationRequest(half, space, places, seed)]
     losses = half.scale.loss(values)
     order = np.argsort(losses)
     return places[order], losses[order]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-from dase.fitting.descent import Over
+from dase.fitting.descent import StopRule
 
 LAGS = 1.1
 """A search stops where its loss will stay above this, relative to that of the last candidate that goes on, or
@@ -15,7 +15,7 @@ AHEAD = 2
 
 
 @dataclass(frozen=True, eq=False)
-class Race:
+class CandidateRace:
     """What candidates have reached so far.
 
     Args:
@@ -28,24 +28,24 @@ class Race:
     lags: float = LAGS
     best: dict[str, float] = field(default_factory=dict)
 
-    def over(self, name: str, unit: float = 1.0) -> Over:
+    def over(self, name: str, unit: float = 1.0) -> StopRule:
         """Return what one search of a candidate asks, whose loss is divided by `unit`."""
 
         def over(loss: float, before: float) -> bool:
             self.best[name] = min(loss / unit, self.best.get(name, float("inf")))
             first = sorted(self.best.values())[: self.places]
             last = first[-1] if len(first) == self.places else float("inf")
-            soon = expected(loss, before) / unit
+            soon = expected_loss(loss, before) / unit
             return soon > min(self.lags * last, LAGS * self.best[name])
 
         return over
 
 
-def short_of(goal: float) -> Over:
+def stop_unless_below(goal: float) -> StopRule:
     """Return whether a search will not come below a loss."""
-    return lambda loss, before: expected(loss, before) > goal
+    return lambda loss, before: expected_loss(loss, before) > goal
 
 
-def expected(loss: float, before: float) -> float:
+def expected_loss(loss: float, before: float) -> float:
     """Return the loss some populations ahead; nothing is known of it after the first."""
     return float(loss * min(loss / before, 1.0) ** AHEAD)

@@ -9,10 +9,10 @@ from dataclasses import replace
 import numpy as np
 
 from dase.events import Events
-from dase.fitting.confidence_intervals import estimates
-from dase.fitting.data_split import PIXELS, Evidence, gather
-from dase.fitting.model import Model, fit_present, model_of, settle
-from dase.fitting.parameter_space import Axis
+from dase.fitting.confidence_intervals import estimate_parameters
+from dase.fitting.data_split import PIXELS, SplitMeasurement, split_measurement
+from dase.fitting.model import FittedModel, fit_present_model, model_of, refit_model
+from dase.fitting.parameter_space import SearchAxis
 from dase.probes.distance import Judgement
 from dase.probes.stimulus import Trust
 from dase.results import Estimate, Fit, Progress
@@ -68,19 +68,24 @@ def fit(
     tell = progress or (lambda text, share, error: None)
     model_of(sensor, free)  # refuses names that are not there before anything takes time
     sensor = sensor.bound_to(scene)
-    evidence = gather(
+    evidence = split_measurement(
         events, scene, log_eps=sensor.log_eps, trust=trust, pixels=pixels, seed=seed, device=device
     )
     given = model_of(sensor, free)
     before = given.judge(evidence.held, repeats=REPEATS // 2, seed=seed + 500).error
-    ends = _descend(evidence, sensor, free, seed, lambda text, share: tell(text, share, before))
-    judgement, model = _best(ends)
+    ends = _descend_from_starts(evidence, sensor, free, seed, lambda text, share: tell(text, share, before))
+    judgement, model = _best_end(ends)
     tell("confidence intervals", 0.9, judgement.error)
-    good = _equal(ends)
-    model, values = estimates(evidence, model, seed=seed)
+    good = _equally_good_models(ends)
+    model, values = estimate_parameters(evidence, model, seed=seed)
     judgement = model.judge(evidence.held, repeats=REPEATS, seed=seed + 500)
-    apart = disagreements(model, good, values)
-    notes = [*evidence.notes, *apart, *outside(model), *_remarks(judgement, len(ends), len(good))]
+    apart = notes_on_disagreement(model, good, values)
+    notes = [
+        *evidence.notes,
+        *apart,
+        *notes_on_implausible_values(model),
+        *_notes_on_minimum(judgement, len(ends), len(good)),
+    ]
     return Fit(
         sensor=model.sensor,
         parameters=values,
@@ -96,11 +101,11 @@ def fit(
     )
 
 
-Ends = list[tuple[Judgement, Model]]
+Ends = list[tuple[Judgement, FittedModel]]
 
 
-def _descend(
-    evidence: Evidence,
+def _descend_from_starts(
+    evidence: SplitMeasurement,
     sensor: Sensor,
     free: Sequence[str] | None,
     seed: int,
@@ -108,28 +113,28 @@ def _descend(
 ) -> Ends:
     """Return where several starts end, each with its held-out error."""
     tell("a wide look", 0.1)
-    model = settle(evidence, fit_present(evidence, sensor, free, seed=seed), seed=seed)
+    model = refit_model(evidence, fit_present_model(evidence, sensor, free, seed=seed), seed=seed)
     ends = [(model.judge(evidence.held, repeats=REPEATS, seed=seed + 500), model)]
     for n in range(MOST):
-        if n >= OTHERS and len(_equal(ends)) > 1:
+        if n >= OTHERS and len(_equally_good_models(ends)) > 1:
             break
         tell(f"start {n + 2}", 0.3 + 0.6 * n / MOST)
-        model = settle(evidence, _elsewhere(_best(ends)[1], seed + n), seed=seed + n)
+        model = refit_model(evidence, _move_away(_best_end(ends)[1], seed + n), seed=seed + n)
         ends.append((model.judge(evidence.held, repeats=REPEATS, seed=seed + 500), model))
     return ends
 
 
-def _best(ends: Ends) -> tuple[Judgement, Model]:
+def _best_end(ends: Ends) -> tuple[Judgement, FittedModel]:
     return min(ends, key=lambda pair: pair[0].error)
 
 
-def _equal(ends: Ends) -> list[Model]:
+def _equally_good_models(ends: Ends) -> list[FittedModel]:
     """Return the ends whose error is about that of the best."""
-    least = _best(ends)[0].error
+    least = _best_end(ends)[0].error
     return [model for judged, model in ends if judged.error < max(1.25 * least, least + 0.25)]
 
 
-def _remarks(judgement: Judgement, starts: int, good: int) -> list[str]:
+def _notes_on_minimum(judgement: Judgement, starts: int, good: int) -> list[str]:
     """Return what is to be said of a minimum that may be a poor one, and of an error that stays."""
     out = []
     if good < 2:
@@ -145,7 +150,7 @@ def _remarks(judgement: Judgement, starts: int, good: int) -> list[str]:
     return out
 
 
-def _elsewhere(model: Model, seed: int) -> Model:
+def _move_away(model: FittedModel, seed: int) -> FittedModel:
     """Return the model well away from where it is."""
     rng = np.random.default_rng([seed, 11])
     low, high = model.space.bounds()
@@ -153,7 +158,9 @@ def _elsewhere(model: Model, seed: int) -> Model:
     return replace(model, place=place)
 
 
-def disagreements(best: Model, ends: Sequence[Model], values: dict[str, Estimate]) -> list[str]:
+def notes_on_disagreement(
+    best: FittedModel, ends: Sequence[FittedModel], values: dict[str, Estimate]
+) -> list[str]:
     """Return a sentence for each parameter in which equally good ends differ."""
     out = []
     for n, axis in enumerate(best.space.axes):
@@ -165,15 +172,15 @@ def disagreements(best: Model, ends: Sequence[Model], values: dict[str, Estimate
     return out
 
 
-def outside(model: Model) -> list[str]:
+def notes_on_implausible_values(model: FittedModel) -> list[str]:
     """Return a sentence for each parameter beyond its plausible range."""
     return [
         f"{axis.name} = {value:.3g} {axis.fact.unit} lies outside its plausible range, "
         f"{axis.fact.plausible[0]:g} to {axis.fact.plausible[1]:g}"
-        for axis, value in _values(model)
+        for axis, value in _values_of_axes(model)
         if not axis.fact.plausible[0] * 0.999 <= value <= axis.fact.plausible[1] * 1.001
     ]
 
 
-def _values(model: Model) -> list[tuple[Axis, float]]:
+def _values_of_axes(model: FittedModel) -> list[tuple[SearchAxis, float]]:
     return [(a, float(a.to_value(p))) for a, p in zip(model.space.axes, model.place, strict=True)]

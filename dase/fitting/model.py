@@ -12,11 +12,11 @@ from numpy.typing import NDArray
 from dase.effects.base import Effect
 from dase.effects.flicker import Flicker
 from dase.effects.threshold import Threshold
-from dase.fitting.data_split import Evidence
-from dase.fitting.descent import Over, screening, searching
-from dase.fitting.parameter_space import Axis, Space, axes_of, with_values
-from dase.fitting.scheduler import Ask, Work, alone, simulated, together
-from dase.fitting.subset import Half
+from dase.fitting.data_split import SplitMeasurement
+from dase.fitting.descent import StopRule, descent_work, ranking_work
+from dase.fitting.parameter_space import ParameterSpace, SearchAxis, axes_of, with_values
+from dase.fitting.scheduler import SimulationRequest, Work, answer_requests, run_side_by_side, run_work
+from dase.fitting.subset import PixelSubset
 from dase.probes.distance import Judgement
 from dase.simulation.sensor import Sensor
 
@@ -52,7 +52,7 @@ FEW_STARTS = 0.1
 
 
 @dataclass(frozen=True)
-class Model:
+class FittedModel:
     """A sensor with free parameters at a place.
 
     Args:
@@ -61,7 +61,7 @@ class Model:
         loss: In the fit that found it.
     """
 
-    space: Space
+    space: ParameterSpace
     place: Array
     loss: float = np.inf
 
@@ -70,50 +70,50 @@ class Model:
         """The sensor at the place."""
         return self.space.at(self.place)
 
-    def rebase(self, half: Half, *, repeats: int, seed: int) -> Array:
+    def rebase(self, half: PixelSubset, *, repeats: int, seed: int) -> Array:
         """Make this the present model of a half; return statistics of its repeats, shape (repeats, J)."""
         return half.rebase(self.space, self.place, repeats=repeats, seed=seed)
 
-    def judge(self, half: Half, *, repeats: int, seed: int) -> Judgement:
+    def judge(self, half: PixelSubset, *, repeats: int, seed: int) -> Judgement:
         """Make this the present model of a half and return its error there."""
-        return alone(self.judging(half, repeats=repeats, seed=seed))
+        return run_work(self.judging(half, repeats=repeats, seed=seed))
 
-    def judging(self, half: Half, *, repeats: int, seed: int) -> Work[Judgement]:
-        """Do what `judge` does, see `together`."""
+    def judging(self, half: PixelSubset, *, repeats: int, seed: int) -> Work[Judgement]:
+        """Do what `judge` does, see `run_side_by_side`."""
         values = yield from half.rebasing(self.space, self.place, repeats=repeats, seed=seed)
         return half.judge(values, seed=seed)
 
     def searching(
         self,
-        half: Half,
+        half: PixelSubset,
         *,
         seed: int,
         iterations: int = 4,
         radius: float = 0.2,
         patient: bool = False,
-        over: Over | None = None,
-    ) -> Work[Model]:
-        """Return the model with its parameters improved, see `together`."""
-        found = yield from searching(
+        over: StopRule | None = None,
+    ) -> Work[FittedModel]:
+        """Return the model with its parameters improved, see `run_side_by_side`."""
+        found = yield from descent_work(
             half, self.space, self.place, seed=seed, iterations=iterations, radius=radius, patient=patient,
             over=over,
         )  # fmt: skip
         return replace(self, place=found.place, loss=found.loss)
 
 
-def model_of(sensor: Sensor, free: Sequence[str] | None = None) -> Model:
+def model_of(sensor: Sensor, free: Sequence[str] | None = None) -> FittedModel:
     """Return the model of a sensor at its own parameters."""
-    space = Space(sensor, axes_of(sensor, free))
-    return Model(space, space.places())
+    space = ParameterSpace(sensor, axes_of(sensor, free))
+    return FittedModel(space, space.places())
 
 
-def with_phase(model: Model, phase: float) -> Model:
+def with_phase(model: FittedModel, phase: float) -> FittedModel:
     """Return the model with another spread of the pixels' memories at the start."""
     sensor = with_values(model.space.sensor, {"threshold.phase": phase})
     return replace(model, space=replace(model.space, sensor=sensor))
 
 
-def turned(model: Model, step: float) -> list[Model]:
+def with_lamp_shifted(model: FittedModel, step: float) -> list[FittedModel]:
     """Return a model, and where it has a lamp, also those with the lamp a step of the grid earlier and later.
 
     What probes tell by steps hardly changes when all events are a step off, so a fit may end there.
@@ -134,44 +134,53 @@ def turned(model: Model, step: float) -> list[Model]:
     return out
 
 
-def fit_present(evidence: Evidence, sensor: Sensor, free: Sequence[str] | None, *, seed: int) -> Model:
+def fit_present_model(
+    evidence: SplitMeasurement, sensor: Sensor, free: Sequence[str] | None, *, seed: int
+) -> FittedModel:
     """Fit the free parameters of a sensor: a wide look at thresholds and phase, then descents."""
     model = model_of(sensor, free)
-    looks = [_looking(evidence.scout.view(), with_phase(model, phase), seed=seed) for phase in (0.0, 1.0)]
+    looks = [
+        _threshold_scan_work(evidence.scout.view(), with_phase(model, phase), seed=seed)
+        for phase in (0.0, 1.0)
+    ]
     # each was judged by its own sampling errors; judge both by those of the better one
-    best = sorted(together(looks), key=lambda m: m.loss)
+    best = sorted(run_side_by_side(looks), key=lambda m: m.loss)
     half = evidence.train.view()
     best[0].rebase(half, repeats=12, seed=seed + 100)
-    ends = together([m.searching(half, seed=seed) for m in best])
-    return settle(evidence, min(ends, key=lambda m: m.loss), seed=seed, rounds=1)
+    ends = run_side_by_side([m.searching(half, seed=seed) for m in best])
+    return refit_model(evidence, min(ends, key=lambda m: m.loss), seed=seed, rounds=1)
 
 
-def _looking(half: Half, start: Model, *, seed: int) -> Work[Model]:
+def _threshold_scan_work(half: PixelSubset, start: FittedModel, *, seed: int) -> Work[FittedModel]:
     """Return the best of many thresholds."""
     yield from half.rebasing(start.space, start.place, repeats=12, seed=seed + 100)
     places = np.concatenate([start.place[None], _threshold_starts(start)])
-    places, losses = yield from screening(half, start.space, places, seed=seed)
+    places, losses = yield from ranking_work(half, start.space, places, seed=seed)
     return replace(start, place=places[0], loss=losses[0])
 
 
-def settle(evidence: Evidence, model: Model, *, seed: int, rounds: int = 2) -> Model:
+def refit_model(evidence: SplitMeasurement, model: FittedModel, *, seed: int, rounds: int = 2) -> FittedModel:
     """Refit a model by its own sampling errors, which change with it.
 
     Each of some descents has random numbers of its own, because they end where those happen to lead, and the
     last one begins with the other phase; the best of them by the random numbers of all is taken.
     """
     seeds = [seed + APART * n for n in range(DESCENTS)]
-    works = [settling(evidence, model, seed=each, rounds=rounds) for each in seeds[:-1]]
-    works.append(_from_other_phase(evidence, model, seed=seeds[-1], rounds=rounds))
-    ends = together(works)
+    works = [refit_work(evidence, model, seed=each, rounds=rounds) for each in seeds[:-1]]
+    works.append(_refit_from_other_phase_work(evidence, model, seed=seeds[-1], rounds=rounds))
+    ends = run_side_by_side(works)
     half = evidence.train.view()
     ends[0].rebase(half, repeats=SETTLED, seed=seed + 100)
-    values = simulated([Ask(half, m.space, m.place[None], each) for m in ends for each in seeds])
+    values = answer_requests(
+        [SimulationRequest(half, m.space, m.place[None], each) for m in ends for each in seeds]
+    )
     losses = np.reshape([float(half.scale.loss(value)[0]) for value in values], (len(ends), len(seeds)))
     return ends[int(losses.mean(1).argmin())]
 
 
-def _from_other_phase(evidence: Evidence, model: Model, *, seed: int, rounds: int) -> Work[Model]:
+def _refit_from_other_phase_work(
+    evidence: SplitMeasurement, model: FittedModel, *, seed: int, rounds: int
+) -> Work[FittedModel]:
     """Refit a model from what pixels may have seen otherwise before the start.
 
     Where that is wrong, all else is bent to make up for it, and the right one looks no better before all is
@@ -179,34 +188,34 @@ def _from_other_phase(evidence: Evidence, model: Model, *, seed: int, rounds: in
     """
     half = evidence.train.view()
     yield from half.rebasing(model.space, model.place, repeats=SETTLED, seed=seed + 100)
-    other = yield from _turned(model).searching(half, seed=seed, iterations=3, patient=True)
-    return (yield from settling(evidence, other, seed=seed, rounds=rounds))
+    other = yield from _with_other_phase(model).searching(half, seed=seed, iterations=3, patient=True)
+    return (yield from refit_work(evidence, other, seed=seed, rounds=rounds))
 
 
-def _turned(model: Model) -> Model:
+def _with_other_phase(model: FittedModel) -> FittedModel:
     threshold = model.space.sensor["threshold"]
     assert isinstance(threshold, Threshold)
     return with_phase(model, 1.0 - threshold.phase)
 
 
-def settling(
-    evidence: Evidence,
-    model: Model,
+def refit_work(
+    evidence: SplitMeasurement,
+    model: FittedModel,
     *,
     seed: int,
     rounds: int = 2,
-    half: Half | None = None,
-    over: Over | None = None,
-) -> Work[Model]:
-    """Do what `settle` does, see `together`; `half` is the training half if the model is its present one."""
+    half: PixelSubset | None = None,
+    over: StopRule | None = None,
+) -> Work[FittedModel]:
+    """Do what `refit_model` does, see `run_side_by_side`; `half` is the training half if the model is its present one."""
     for turn in range(rounds):
         if half is None or turn > 0:
             half = evidence.train.view()
             yield from half.rebasing(model.space, model.place, repeats=SETTLED, seed=seed + 100)
-        other = _turned(model)
-        values = yield [Ask(half, m.space, m.place[None], seed) for m in (model, other)]
+        other = _with_other_phase(model)
+        values = yield [SimulationRequest(half, m.space, m.place[None], seed) for m in (model, other)]
         losses = [float(half.scale.loss(value)[0]) for value in values]
-        if losses[1] < losses[0] and (yield from _as_good(evidence, other, losses[0], seed=seed)):
+        if losses[1] < losses[0] and (yield from _as_good_work(evidence, other, losses[0], seed=seed)):
             model = other
         model = yield from model.searching(
             half, seed=seed + turn, radius=0.12 / (1 + turn), patient=True, over=over
@@ -214,7 +223,7 @@ def settling(
     return model
 
 
-def _as_good(evidence: Evidence, model: Model, loss: float, *, seed: int) -> Work[bool]:
+def _as_good_work(evidence: SplitMeasurement, model: FittedModel, loss: float, *, seed: int) -> Work[bool]:
     """Whether a model's loss is about as small by its own sampling errors.
 
     By those of a model with chance in it, one without looks no worse, until it is the present one and its
@@ -222,11 +231,11 @@ def _as_good(evidence: Evidence, model: Model, loss: float, *, seed: int) -> Wor
     """
     half = evidence.train.view()
     yield from half.rebasing(model.space, model.place, repeats=SETTLED, seed=seed + 100)
-    (values,) = yield [Ask(half, model.space, model.place[None], seed)]
+    (values,) = yield [SimulationRequest(half, model.space, model.place[None], seed)]
     return float(half.scale.loss(values)[0]) < ALIKE * loss
 
 
-def _threshold_starts(model: Model) -> Array:
+def _threshold_starts(model: FittedModel) -> Array:
     names = [axis.name for axis in model.space.axes]
     at = [names.index(n) if n in names else -1 for n in ("threshold.on", "threshold.off")]
     if min(at) < 0:
@@ -243,7 +252,7 @@ def free_of(sensor: Sensor, name: str) -> list[str]:
     return [axis.name for axis in axes_of(sensor) if axis.name.split(".")[0] == name]
 
 
-def added(present: Model, effect: Effect) -> Model:
+def with_effect_added(present: FittedModel, effect: Effect) -> FittedModel:
     """Return the present model with an effect added, all of whose parameters are free."""
     sensor = present.sensor.with_effect(effect)
     old = [axis.name for axis in present.space.axes]
@@ -252,7 +261,7 @@ def added(present: Model, effect: Effect) -> Model:
     return model_of(sensor, [*old, *new])
 
 
-def starts(model: Model, effect: Effect, *, few: bool = False) -> Array:
+def starting_places(model: FittedModel, effect: Effect, *, few: bool = False) -> Array:
     """Return places from which an effect is tried: its strength and its character, at several thresholds."""
     axes = model.space.axes
     columns, choices, seen = [], [], False
@@ -260,7 +269,7 @@ def starts(model: Model, effect: Effect, *, few: bool = False) -> Array:
         if axis.name.split(".")[0] == effect.name:
             columns.append(n)
             seen |= axis.fact.seen
-            tried = _tried(axis, float(model.place[n]))
+            tried = _starting_places_of_axis(axis, float(model.place[n]))
             choices.append(tried[::2] if few and axis.main and len(tried) > 2 else tried)
     thresholds = [n for n, axis in enumerate(axes) if axis.name in ("threshold.on", "threshold.off")]
     out = []
@@ -273,7 +282,7 @@ def starts(model: Model, effect: Effect, *, few: bool = False) -> Array:
     return np.array(out)
 
 
-def _tried(axis: Axis, present: float) -> list[float]:
+def _starting_places_of_axis(axis: SearchAxis, present: float) -> list[float]:
     low, high = (float(axis.to_place(v)) for v in axis.fact.plausible)
     if axis.fact.seen:
         return [present, present + ROOM]

@@ -24,7 +24,7 @@ WIDER = 3.0
 
 
 @dataclass(frozen=True)
-class Axis:
+class SearchAxis:
     """One free parameter.
 
     Args:
@@ -68,7 +68,7 @@ class Axis:
         return float(self.to_place(self.low)), float(self.to_place(self.high))
 
 
-def axis(effect: str, fact: Parameter) -> Axis:
+def make_axis(effect: str, fact: Parameter) -> SearchAxis:
     """Return the axis of one parameter, somewhat wider than its plausible range."""
     low, high = fact.plausible
     if fact.unit == "turns":
@@ -78,11 +78,11 @@ def axis(effect: str, fact: Parameter) -> Axis:
         low, high = low / WIDER, high * WIDER
     low, high = max(low, fact.bounds[0]), min(high, fact.bounds[1])
     span = (high - low) / PHASE if fact.unit == "turns" else 2.0
-    return Axis(f"{effect}.{fact.name}", fact, low, high, log, span)
+    return SearchAxis(f"{effect}.{fact.name}", fact, low, high, log, span)
 
 
 @dataclass(frozen=True)
-class Space:
+class ParameterSpace:
     """Free parameters of a sensor.
 
     Args:
@@ -91,7 +91,7 @@ class Space:
     """
 
     sensor: Sensor
-    axes: tuple[Axis, ...]
+    axes: tuple[SearchAxis, ...]
 
     def places(self) -> Array:
         """Return where the sensor lies, shape (P,)."""
@@ -143,7 +143,7 @@ FIXED = (
 """Parameters that a search by small steps cannot find; they are set by other means."""
 
 
-def axes_of(sensor: Sensor, names: Iterable[str] | None = None) -> tuple[Axis, ...]:
+def axes_of(sensor: Sensor, names: Iterable[str] | None = None) -> tuple[SearchAxis, ...]:
     """Return the axes of a sensor's free parameters.
 
     Args:
@@ -154,7 +154,7 @@ def axes_of(sensor: Sensor, names: Iterable[str] | None = None) -> tuple[Axis, .
         InputError: A name that the sensor does not have.
     """
     every = {
-        f"{effect.name}.{p.name}": axis(effect.name, p)
+        f"{effect.name}.{p.name}": make_axis(effect.name, p)
         for effect in sensor.effects
         for p in effect.parameters()
     }
@@ -178,7 +178,7 @@ def axes_of(sensor: Sensor, names: Iterable[str] | None = None) -> tuple[Axis, .
     return tuple(every[n] for n in every if n in chosen)
 
 
-def variants(effect: type[Effect]) -> list[Effect]:
+def effect_variants(effect: type[Effect]) -> list[Effect]:
     """Return an effect with each combination of its words, otherwise at its defaults."""
     out: list[Effect] = [effect()]
     for name, words in effect.choices().items():

@@ -11,7 +11,7 @@ from dase.errors import InputError
 from dase.events import Events
 from dase.probes.stimulus import Trust, light_of
 from dase.scenes.scene import Scene
-from dase.scenes.video import EPS
+from dase.scenes.video import LOG_EPS
 
 LOOKS = 200
 """Times at which it is looked where a scene can be trusted."""
@@ -23,7 +23,7 @@ Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
-class Looks:
+class TrustedParts:
     """Where a scene can be trusted, and how much of it that is.
 
     Args:
@@ -47,7 +47,7 @@ class Looks:
         )
 
 
-def look(events: Events, scene: Scene, times: Array, cut: int, trust: Trust) -> Looks:
+def find_trusted_parts(events: Events, scene: Scene, times: Array, cut: int, trust: Trust) -> TrustedParts:
     """Look at all pixels now and then.
 
     Args:
@@ -64,7 +64,7 @@ def look(events: Events, scene: Scene, times: Array, cut: int, trust: Trust) -> 
     before: NDArray[np.float32] | None = None
     for k, step in enumerate(steps):
         at = times[step : step + 1]
-        level, good = np.log(light_of(scene, at, every)[:, 0] + np.float32(EPS)), trust(at, every)[0]
+        level, good = np.log(light_of(scene, at, every)[:, 0] + np.float32(LOG_EPS)), trust(at, every)[0]
         half = int(step >= cut)
         time[half] += good
         if before is not None:
@@ -74,10 +74,10 @@ def look(events: Events, scene: Scene, times: Array, cut: int, trust: Trust) -> 
         part = slice(*np.searchsorted(events.t, (at[0], min(end, times[-1]))))
         place = events.y[part].astype(np.int64) * events.width + events.x[part]
         inside, total = inside + int(np.count_nonzero(good[place])), total + len(place)
-    return Looks(time, change, float(time.mean(1).sum()) / len(steps), inside / max(total, 1))
+    return TrustedParts(time, change, float(time.mean(1).sum()) / len(steps), inside / max(total, 1))
 
 
-def where_trusted(looks: Looks, each: int, rng: np.random.Generator) -> NDArray[np.int32]:
+def choose_trusted_pixels(looks: TrustedParts, each: int, rng: np.random.Generator) -> NDArray[np.int32]:
     """Choose pixels for two halves by what the scene does where it can be trusted, never by their events.
 
     One in two is drawn by how long it can be trusted, the other by how far its light goes in that time, for

@@ -16,13 +16,13 @@ from dase.effects.row_scan import RowScan
 from dase.effects.stream import StreamEffect
 from dase.effects.timestamp import Timestamp
 from dase.events import Events
-from dase.fitting.bus_load import Load
+from dase.fitting.bus_load import BusLoad
 from dase.kernels import launch, pixel_stages
 from dase.probes.stimulus import Stimulus
-from dase.probes.timestamp_patterns import Structure
+from dase.probes.timestamp_patterns import TimestampStructure
 from dase.scenes.scene import Scene
-from dase.simulation.pixel_array import Pixels
-from dase.simulation.readout_chain import rows_of
+from dase.simulation.pixel_array import PixelArray
+from dase.simulation.readout_chain import split_by_row
 from dase.simulation.sensor import Sensor
 
 ROOM = {"cpu": 2048, "cuda": 64}
@@ -33,7 +33,9 @@ FELT = 0.25
 """Delays below this share of a step of the grid are not felt."""
 
 
-def felt(stimulus: Stimulus, structure: Structure, sensor: Sensor) -> tuple[StreamEffect, ...]:
+def noticeable_effects(
+    stimulus: Stimulus, structure: TimestampStructure, sensor: Sensor
+) -> tuple[StreamEffect, ...]:
     """Return the effects behind the pixels that the probes can feel.
 
     Small errors of the time stamps are far below the steps of the grid; they matter only where their
@@ -45,7 +47,7 @@ def felt(stimulus: Stimulus, structure: Structure, sensor: Sensor) -> tuple[Stre
     return tuple(e for e in sensor.streams() if compared or delay_of(e, lines) > fine)
 
 
-def clock_of(effects: tuple[StreamEffect, ...], structure: Structure) -> float | None:
+def clock_of(effects: tuple[StreamEffect, ...], structure: TimestampStructure) -> float | None:
     """Return the ticks of a clock that is all the probes feel behind the pixels [s], 0 for nothing.
 
     The kernel stamps events by such a clock itself. None where events have to be stored and go through what
@@ -60,7 +62,7 @@ def clock_of(effects: tuple[StreamEffect, ...], structure: Structure) -> float |
     return clock.step if same else None
 
 
-def emitted(
+def simulate_pixels(
     stimulus: Stimulus, sensor: Sensor, vectors: NDArray[Any], seeds: NDArray[np.int64]
 ) -> list[Events]:
     """Return the events that leave the pixels, of each model."""
@@ -68,12 +70,14 @@ def emitted(
     kind = "cuda" if stimulus.device.is_cuda else "cpu"
 
     def out(rows: slice) -> list[Events]:
-        array = Pixels(
+        array = PixelArray(
             bare, stimulus.width, stimulus.height, pixels=stimulus.pixels, parameters=vectors[rows],
             seed=int(seeds[rows.start]), device=str(stimulus.device), room=ROOM[kind],
         )  # fmt: skip
-        scene = _Light(stimulus)
-        parts = [rows_of(*found, array.batch) for found in (array.emit(scene, scene.times), array.flush())]
+        scene = _StimulusScene(stimulus)
+        parts = [
+            split_by_row(*found, array.batch) for found in (array.emit(scene, scene.times), array.flush())
+        ]
         # hardly any effect holds events back
         return [Events.concatenate(row) if len(row[1]) else row[0] for row in zip(*parts, strict=True)]
 
@@ -81,11 +85,18 @@ def emitted(
         return out(slice(0, len(seeds)))
     # on a CPU one after the other: the events of a model are sorted in its caches, those of all are not
     works = [partial(out, slice(n, n + 1)) for n in range(len(seeds))]
-    return [events for (events,) in ([work() for work in works] if kind == "cuda" else launch.each(works))]
+    return [
+        events
+        for (events,) in ([work() for work in works] if kind == "cuda" else launch.run_concurrently(works))
+    ]
 
 
-def sent(
-    stimulus: Stimulus, events: Events, effects: Iterable[StreamEffect], seed: int, load: Load | None = None
+def pass_readout(
+    stimulus: Stimulus,
+    events: Events,
+    effects: Iterable[StreamEffect],
+    seed: int,
+    load: BusLoad | None = None,
 ) -> Events:
     """Return what leaves the sensor.
 
@@ -101,13 +112,13 @@ def sent(
         if load is not None and weight is not None and isinstance(reader, Bus):
             events = reader.beside(events, load.others(before, seed), weight)
         else:
-            reader = scaled(effect, share).reader(stimulus.width, stimulus.height, seed)
+            reader = scale_readout(effect, share).reader(stimulus.width, stimulus.height, seed)
             events, until = reader.push(events, until)
         before.append(effect)
     return replace(events, t=events.t + stimulus.grid.begin)
 
 
-class _Light(Scene):
+class _StimulusScene(Scene):
     """The light of a stimulus as a scene, from time 0."""
 
     def __init__(self, stimulus: Stimulus):
@@ -135,7 +146,7 @@ def delay_of(effect: StreamEffect, lines: int) -> float:
     return lines * effect.line if isinstance(effect, RowScan) else math.inf
 
 
-def scaled(effect: StreamEffect, share: float) -> StreamEffect:
+def scale_readout(effect: StreamEffect, share: float) -> StreamEffect:
     """Return an effect behind the pixels for a share of them."""
     if isinstance(effect, Readout):
         return replace(effect, rate=effect.rate * share, depth=max(1.0, effect.depth * share))

@@ -1,7 +1,7 @@
 """Work that asks for simulations, done side by side: what is asked for at the same time runs in one launch.
 
 A search, a fit, a judgement is a generator: it yields what it wants simulated, gets the answers, and goes on.
-`together` runs as many of them as there are, step by step. Rows of a launch do not know of each other, so the
+`run_side_by_side` runs as many of them as there are, step by step. Rows of a launch do not know of each other, so the
 sums are those that each would get alone, to the bit, and the statistics but for rounding.
 """
 
@@ -14,13 +14,13 @@ from typing import TYPE_CHECKING, Any, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from dase.fitting.batch_simulator import Order, Trials
-from dase.fitting.parameter_space import Space
-from dase.probes.accumulators import Sums, Totals, totals
-from dase.probes.statistics import statistics
+from dase.fitting.batch_simulator import BatchSimulator, SimulationOrder
+from dase.fitting.parameter_space import ParameterSpace
+from dase.probes.accumulators import ProbeSums, ProbeTotals, compute_totals
+from dase.probes.statistics import compute_statistics
 
 if TYPE_CHECKING:
-    from dase.fitting.subset import Half
+    from dase.fitting.subset import PixelSubset
 
 Array = NDArray[np.float64]
 
@@ -28,7 +28,7 @@ Result = TypeVar("Result")
 
 
 @dataclass(frozen=True, eq=False)
-class Ask:
+class SimulationRequest:
     """Models that are to be simulated.
 
     Args:
@@ -40,36 +40,38 @@ class Ask:
             shape (B, J).
     """
 
-    half: Half
-    space: Space
+    half: PixelSubset
+    space: ParameterSpace
     places: Array
     seed: int
     repeats: bool = False
 
 
-Work = Generator[list[Ask], list[Any], Result]
+Work = Generator[list[SimulationRequest], list[Any], Result]
 """Yields lists of what it asks for, and gets a list of the answers."""
 
 
-def together(works: Sequence[Work[Result]], report: Callable[[float], None] | None = None) -> list[Result]:
+def run_side_by_side(
+    works: Sequence[Work[Result]], report: Callable[[float], None] | None = None
+) -> list[Result]:
     """Do all works side by side and return their results; `report` is told the share that is done."""
-    work = beside(works, report)
+    work = side_by_side_work(works, report)
     try:
         asks = next(work)
         while True:
-            asks = work.send(simulated(asks))
+            asks = work.send(answer_requests(asks))
     except StopIteration as stop:
         return list(stop.value)
 
 
-def beside(
+def side_by_side_work(
     works: Sequence[Work[Result]], report: Callable[[float], None] | None = None
 ) -> Work[list[Result]]:
     """Do all works side by side within another work, and return their results."""
     results: dict[int, Result] = {}
     answers: dict[int, list[Any] | None] = dict.fromkeys(range(len(works)))
     while answers:
-        asked: dict[int, list[Ask]] = {}
+        asked: dict[int, list[SimulationRequest]] = {}
         for n, answer in answers.items():
             try:
                 asked[n] = next(works[n]) if answer is None else works[n].send(answer)
@@ -84,48 +86,50 @@ def beside(
     return [results[n] for n in range(len(works))]
 
 
-def alone(work: Work[Result]) -> Result:
+def run_work(work: Work[Result]) -> Result:
     """Do one work."""
-    return together([work])[0]
+    return run_side_by_side([work])[0]
 
 
-def simulated(asks: Sequence[Ask]) -> list[Any]:
+def answer_requests(asks: Sequence[SimulationRequest]) -> list[Any]:
     """Return the answer to each."""
-    orders: dict[int, tuple[Trials, list[int], list[Order]]] = {}
-    sums: dict[int, Sums] = {}
+    orders: dict[int, tuple[BatchSimulator, list[int], list[SimulationOrder]]] = {}
+    sums: dict[int, ProbeSums] = {}
     for n, ask in enumerate(asks):
         trials, frame = ask.half.trials, None if ask.repeats else ask.half.frame
         ticks = trials.ticks(ask.space.sensor)
         if ticks and any(axis.name.startswith("timestamp.") for axis in ask.space.axes):
             ticks = None
         vectors = ask.space.vectors(ask.places)
-        order = Order(ask.space.sensor, vectors, ask.seed, ask.repeats, None, frame, ticks or 0.0)
+        order = SimulationOrder(ask.space.sensor, vectors, ask.seed, ask.repeats, None, frame, ticks or 0.0)
         if ticks is None:
-            effects = [trials.felt(ask.space.at(place)) for place in np.atleast_2d(ask.places)]
-            sums[n] = trials.stream_all(order, effects, ask.half.load)
+            effects = [trials.noticeable_effects(ask.space.at(place)) for place in np.atleast_2d(ask.places)]
+            sums[n] = trials.simulate_streams(order, effects, ask.half.load)
         else:
             _, members, mine = orders.setdefault(id(trials), (trials, [], []))
             members.append(n)
             mine.append(order)
     for trials, members, mine in orders.values():
         sums.update(zip(members, trials.run_all(mine), strict=True))
-    values = _statistics([(n, ask.half, sums[n]) for n, ask in enumerate(asks) if not ask.repeats])
+    values = _statistics_of_requests(
+        [(n, ask.half, sums[n]) for n, ask in enumerate(asks) if not ask.repeats]
+    )
     return [sums[n] if ask.repeats else values[n] for n, ask in enumerate(asks)]
 
 
-def _statistics(found: Sequence[tuple[int, Half, Sums]]) -> dict[int, Array]:
+def _statistics_of_requests(found: Sequence[tuple[int, PixelSubset, ProbeSums]]) -> dict[int, Array]:
     """Return the statistics of models, those that refer to the same worked out at once."""
-    groups: dict[int, list[tuple[int, Half, Sums]]] = {}
+    groups: dict[int, list[tuple[int, PixelSubset, ProbeSums]]] = {}
     for one in found:
         groups.setdefault(id(one[1].frame), []).append(one)
     out: dict[int, Array] = {}
     for members in groups.values():
         frame = members[0][1].frame
-        parts = [totals(sums, frame) for _, _, sums in members]
+        parts = [compute_totals(sums, frame) for _, _, sums in members]
         names = ("sums", "folded", "clock", "stamps")
         joined = [np.concatenate([getattr(p, n) for p in parts]) for n in names]
-        both = Totals(joined[0], joined[1], joined[2], joined[3], parts[0].expected)
+        both = ProbeTotals(joined[0], joined[1], joined[2], joined[3], parts[0].expected)
         ends = np.cumsum([len(p.sums) for p in parts])[:-1]
-        values = np.split(statistics(both, frame)[0], ends)
+        values = np.split(compute_statistics(both, frame)[0], ends)
         out.update(zip([n for n, _, _ in members], values, strict=True))
     return out

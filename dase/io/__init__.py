@@ -75,7 +75,7 @@ HEAD = 1 << 16  # [bytes] of a file that formats are told by
 PART = 1 << 20  # events handed to a writer at once
 
 
-def find(path: str | PathLike[str]) -> Format:
+def find_format(path: str | PathLike[str]) -> Format:
     """Return the format of an existing file or folder: by its content, else by its suffix.
 
     Raises:
@@ -108,8 +108,8 @@ def read(path: str | PathLike[str], *, size: Size | None = None, notes: list[str
     Raises:
         InputError: It is missing, of unknown format, damaged or incomplete, or needs an optional library.
     """
-    source = _source(path, size, notes)
-    return find(path).read(source)
+    source = _make_source(path, size, notes)
+    return find_format(path).read(source)
 
 
 def stream(
@@ -135,8 +135,8 @@ def stream(
     """
     if chunk < 1:
         raise InputError(f"chunk must be at least 1 event, got {chunk}")
-    source = _source(path, size, notes)
-    return find(path).stream(source, chunk)
+    source = _make_source(path, size, notes)
+    return find_format(path).stream(source, chunk)
 
 
 def pictures(
@@ -154,7 +154,7 @@ def pictures(
     Raises:
         InputError: As for `read`.
     """
-    return find(path).pictures(_source(path, size, notes))
+    return find_format(path).pictures(_make_source(path, size, notes))
 
 
 def motion(
@@ -170,7 +170,7 @@ def motion(
     Raises:
         InputError: As for `read`.
     """
-    return find(path).motion(_source(path, size, notes))
+    return find_format(path).motion(_make_source(path, size, notes))
 
 
 def create(path: str | PathLike[str], *, format: str | None = None) -> AbstractContextManager[Writer]:
@@ -186,12 +186,12 @@ def create(path: str | PathLike[str], *, format: str | None = None) -> AbstractC
         InputError: The format is unknown or the folder missing; later, from the writer, on bad content.
     """
     path = Path(path)
-    found = writable(path, format)
+    found = find_writable_format(path, format)
     assert found.create is not None
     return found.create(path)
 
 
-def writable(path: str | PathLike[str], format: str | None = None) -> Format:
+def find_writable_format(path: str | PathLike[str], format: str | None = None) -> Format:
     """Return the format that `create` would write; raises InputError where there is none."""
     writers = [known for known in (s2r.FORMAT, arrays.OWN, *FORMATS) if known.create is not None]
     if format is None:
@@ -210,7 +210,7 @@ def write(path: str | PathLike[str], sequence: Sequence, *, format: str | None =
     Raises:
         InputError: Frames have no times, flow has no frames, or the format holds no frames.
     """
-    keeps = writable(path, format).keeps
+    keeps = find_writable_format(path, format).keeps
     if sequence.frames is not None and sequence.frame_times is None:
         raise InputError(f"{path}: frames cannot be written without their times")
     if sequence.frames is None and sequence.flow is not None:
@@ -257,11 +257,11 @@ def convert(
         InputError: As for `read` and `create`.
     """
     notes = [] if notes is None else notes
-    taken, keeps = _source(source, size, notes), writable(target, format).keeps
+    taken, keeps = _make_source(source, size, notes), find_writable_format(target, format).keeps
     total = 0
     try:
         with create(target, format=format) as writer:
-            for part in find(source).stream(taken, CHUNK):
+            for part in find_format(source).stream(taken, CHUNK):
                 writer.events(part)
                 total += len(part)
                 progress(len(part))
@@ -269,7 +269,7 @@ def convert(
                 _add_frames(taken, writer)
                 _add_beside(taken, writer)
     except TooLateError:
-        sequence = replace(find(source).read(taken), flow=None)
+        sequence = replace(find_format(source).read(taken), flow=None)
         keeps_frames = with_frames and "frames" in keeps and sequence.frame_times is not None
         write(target, sequence if keeps_frames else Sequence(sequence.events), format=format)
         total = len(sequence.events)
@@ -277,21 +277,21 @@ def convert(
 
 
 def _add_frames(source: Source, writer: Writer) -> None:
-    for grey, time, exposure, flow in find(source.path).pictures(source):
+    for grey, time, exposure, flow in find_format(source.path).pictures(source):
         if not isfinite(time):
             return source.note("frames without times cannot be converted: left out", "refused", "frames")
         writer.frame(float(time), grey, flow, exposure=exposure)
 
 
 def _add_beside(source: Source, writer: Writer) -> None:
-    thresholds, configuration = find(source.path).beside(source)
+    thresholds, configuration = find_format(source.path).beside(source)
     if thresholds is not None:
         writer.thresholds(thresholds)
     if configuration is not None:
         writer.configuration(configuration)
 
 
-def _source(path: str | PathLike[str], size: Size | None, notes: list[str] | None) -> Source:
+def _make_source(path: str | PathLike[str], size: Size | None, notes: list[str] | None) -> Source:
     return Source(Path(path), size, [] if notes is None else notes)
 
 

@@ -26,9 +26,9 @@ from numpy.typing import NDArray
 
 from dase.errors import InputError
 from dase.events import Events
-from dase.io.binary import EventWriter, Rollover, records
+from dase.io.binary import EventWriter, Rollover, read_records
 from dase.io.format import camera_format
-from dase.io.sequence import Writer, writing
+from dase.io.sequence import Writer, writing_file
 from dase.io.source import Piece, Size, Source, guess_size
 
 LONGEST = 1 << 21  # [bytes] of a header: jAER stores all its preferences
@@ -86,7 +86,7 @@ class Header:
     chip: str
 
 
-def parse(head: bytes) -> Header:
+def parse_header(head: bytes) -> Header:
     """Parse the first bytes of a file."""
     place, address, chip = 0, 4, ""
     while head[place : place + 1] == b"#":
@@ -107,36 +107,36 @@ def parse(head: bytes) -> Header:
     return Header(place, address, chip)
 
 
-def header(source: Source) -> Header:
+def read_header(source: Source) -> Header:
     """Read the header of a file."""
     with source.path.open("rb") as file:
         head = file.read(LONGEST)
     if not head.startswith(b"#!AER-DAT"):
         raise InputError("has no AEDAT header")
-    return parse(head)
+    return parse_header(head)
 
 
-def _records(source: Source, head: Header) -> Iterator[tuple[NDArray[np.uint32], NDArray[np.uint32]]]:
+def _read_records(source: Source, head: Header) -> Iterator[tuple[NDArray[np.uint32], NDArray[np.uint32]]]:
     kind = np.dtype([("a", f">u{head.address}"), ("t", ">u4")])
-    for block in records(source, head.length, kind):
+    for block in read_records(source, head.length, kind):
         yield block["a"].astype(np.uint32), block["t"].astype(np.uint32)
 
 
-def layout(source: Source) -> tuple[Layout, Size]:
+def find_layout(source: Source) -> tuple[Layout, Size]:
     """Return the layout of the addresses, and columns and rows of the sensor."""
-    head = header(source)
+    head = read_header(source)
     known = [entry for entry in CHIPS if entry[0] in head.chip]
     if known:
         return known[0][1], source.size or known[0][2]
     if head.chip:
         raise InputError(f"chip '{head.chip}' is not known: {', '.join(name for name, *_ in CHIPS)} are")
     used = largest_x = largest_y = 0
-    for address, _ in _records(source, head):
+    for address, _ in _read_records(source, head):
         events = address[address & DAVIS.special == 0]
         used |= int(np.bitwise_or.reduce(address[address < 1 << 31], initial=0))
         if len(events):
-            largest_x = max(largest_x, int(_bits(events, DAVIS.x).max()))
-            largest_y = max(largest_y, int(_bits(events, DAVIS.y).max()))
+            largest_x = max(largest_x, int(_extract_bits(events, DAVIS.x).max()))
+            largest_y = max(largest_y, int(_extract_bits(events, DAVIS.y).max()))
     if (used < 1 << 16 and used & 1023) or not used:
         return DVS128, source.size or (128, 128)
     if used & 1023:
@@ -144,12 +144,12 @@ def layout(source: Source) -> tuple[Layout, Size]:
     return DAVIS, source.size or guess_size(source, (largest_x + 1, largest_y + 1))
 
 
-def pieces(source: Source) -> Iterator[Piece]:
+def read_pieces(source: Source) -> Iterator[Piece]:
     """Yield the events."""
-    form, (width, height) = layout(source)
+    form, (width, height) = find_layout(source)
     turns = Rollover(32)
     samples = special = 0
-    for address, time in _records(source, header(source)):
+    for address, time in _read_records(source, read_header(source)):
         t = turns(time)
         if form.special:
             other = (address & form.special) != 0
@@ -157,8 +157,10 @@ def pieces(source: Source) -> Iterator[Piece]:
                 high = int(np.count_nonzero(address[other] >> 31))
                 samples, special = samples + high, special + int(np.count_nonzero(other)) - high
                 address, t = address[~other], t[~other]
-        x = np.uint16(width - 1) - _bits(address, form.x)  # beyond the sensor it turns over to a large number
-        y = np.uint16(height - 1) - _bits(address, form.y)
+        x = np.uint16(width - 1) - _extract_bits(
+            address, form.x
+        )  # beyond the sensor it turns over to a large number
+        y = np.uint16(height - 1) - _extract_bits(address, form.y)
         yield Piece(t, x, y, (address >> form.p) & 1 == form.on)
     if samples:
         sentence = f"{samples} samples of frames and motion sensors: skipped"
@@ -168,7 +170,7 @@ def pieces(source: Source) -> Iterator[Piece]:
         source.note(sentence, "refused", "special", special)
 
 
-def _bits(address: NDArray[np.uint32], place: tuple[int, int]) -> NDArray[np.uint16]:
+def _extract_bits(address: NDArray[np.uint32], place: tuple[int, int]) -> NDArray[np.uint16]:
     return ((address >> place[0]) & ((1 << place[1]) - 1)).astype(np.uint16)
 
 
@@ -202,7 +204,7 @@ class _Writer(EventWriter):
 
 def create(path: Path) -> AbstractContextManager[Writer]:
     """Open an AEDAT2 file for writing; it appears under its name when the block ends well."""
-    return writing(path, _Writer)
+    return writing_file(path, _Writer)
 
 
 FORMAT = camera_format(
@@ -210,6 +212,6 @@ FORMAT = camera_format(
     suffixes=(".aedat", ".aedat2"),
     create=create,
     matches=lambda path, head: head.startswith(b"#!AER-DAT") and not head.startswith(b"#!AER-DAT4"),
-    pieces=pieces,
-    size=lambda source: layout(source)[1],
+    pieces=read_pieces,
+    size=lambda source: find_layout(source)[1],
 )

@@ -30,7 +30,7 @@ from dase.errors import InputError
 from dase.io import packed
 from dase.io.flatbuffer import Table
 from dase.io.format import camera_format
-from dase.io.source import Motion, Picture, Piece, Size, Source, join
+from dase.io.source import Motion, Picture, Piece, Size, Source, join_pieces
 
 T = TypeVar("T")
 
@@ -58,7 +58,7 @@ class _Header:
         return next(((number, size) for number, name, size in self.streams if name == kind), None)
 
 
-def _header(source: Source) -> _Header:
+def _read_header(source: Source) -> _Header:
     length = source.path.stat().st_size
     with source.path.open("rb") as file:
         head = file.read(len(MAGIC) + 4)
@@ -70,11 +70,11 @@ def _header(source: Source) -> _Header:
         table = Table.root(file.read(size))
     place = table.number(1, "<q", -1)
     begin = len(MAGIC) + 4 + size
-    streams = _streams(table.text(2))
+    streams = _parse_streams(table.text(2))
     return _Header(begin, place if begin <= place <= length else length, table.number(0, "<i", 0), streams)
 
 
-def _streams(text: bytes) -> tuple[tuple[int, str, Size | None], ...]:
+def _parse_streams(text: bytes) -> tuple[tuple[int, str, Size | None], ...]:
     if b"<!" in text:
         raise InputError("its header holds declarations, which are refused")
     try:
@@ -93,25 +93,30 @@ def _streams(text: bytes) -> tuple[tuple[int, str, Size | None], ...]:
     return tuple(sorted(out))
 
 
-def _unpacker(compression: int) -> Callable[[bytes], bytes]:
+def _choose_unpacker(compression: int) -> Callable[[bytes], bytes]:
     if compression == 0:
         return lambda data: data
-    make = {1: packed.lz4, 2: packed.lz4, 3: packed.zstd, 4: packed.zstd}.get(compression)
+    make = {
+        1: packed.lz4_decompressor,
+        2: packed.lz4_decompressor,
+        3: packed.zstd_decompressor,
+        4: packed.zstd_decompressor,
+    }.get(compression)
     if make is None:
         raise InputError(f"its compression has the unknown number {compression}")
     make()  # what is missing is said once, not for every packet
-    return packed.unpacker(make)
+    return packed.make_unpacker(make)
 
 
-def _packets(source: Source, kind: str, parse: Callable[[Table], T]) -> Iterator[T]:
+def _read_packets(source: Source, kind: str, parse: Callable[[Table], T]) -> Iterator[T]:
     """Yield what `parse` makes of each packet of the first stream of a type; damage is noted."""
-    header = _header(source)
+    header = _read_header(source)
     stream = header.first(kind)
     if stream is None:
         return
     if sum(name == kind for _, name, _ in header.streams) > 1:
         source.note(f"holds several streams of type {kind}: the first was read", "assumed", "streams")
-    unpack = _unpacker(header.compression)
+    unpack = _choose_unpacker(header.compression)
     damaged = 0
     with source.path.open("rb") as file:
         place = header.begin
@@ -133,43 +138,43 @@ def _packets(source: Source, kind: str, parse: Callable[[Table], T]) -> Iterator
         source.note(f"{damaged} damaged packets of type {kind}: skipped", "refused", "damage", damaged)
 
 
-def pieces(source: Source) -> Iterator[Piece]:
+def read_pieces(source: Source) -> Iterator[Piece]:
     """Yield the events [us]."""
     waiting: list[NDArray[Any]] = []
     count = 0
-    for events in _packets(source, "EVTS", lambda packet: packet.structs(0, ROW)):
+    for events in _read_packets(source, "EVTS", lambda packet: packet.structs(0, ROW)):
         waiting.append(events)
         count += len(events)
         if count >= PART:
-            yield _piece(waiting)
+            yield _join_packets(waiting)
             waiting, count = [], 0
-    yield _piece(waiting) if waiting else join([])
+    yield _join_packets(waiting) if waiting else join_pieces([])
 
 
-def _piece(parts: list[NDArray[Any]]) -> Piece:
+def _join_packets(parts: list[NDArray[Any]]) -> Piece:
     events = np.concatenate(parts).view(EVENT)
     x, y = (events[name].astype(np.uint16) for name in "xy")  # a negative one becomes large and lies outside
     return Piece(events["t"].astype(np.int64), x, y, events["p"] > 0)
 
 
-def size(source: Source) -> Size | None:
+def read_size(source: Source) -> Size | None:
     """Return columns and rows of the first stream of events, else of frames."""
-    header = _header(source)
+    header = _read_header(source)
     stream = header.first("EVTS") or header.first("FRME")
     if stream is None:
         raise InputError("holds neither events nor frames")
     return stream[1]
 
 
-def pictures(source: Source) -> Iterator[Picture]:
+def read_pictures(source: Source) -> Iterator[Picture]:
     """Yield the frames with their exposures [us]."""
-    for grey, (begin, end) in _packets(source, "FRME", _frame):
+    for grey, (begin, end) in _read_packets(source, "FRME", _parse_frame):
         yield Picture(grey, begin + (end - begin) / 2, (end - begin) / 1e6)
 
 
-def motion(source: Source) -> Motion | None:
+def read_motion(source: Source) -> Motion | None:
     """Read the samples of the motion sensor, times [us]."""
-    rows = [row for rows in _packets(source, "IMUS", _samples) for row in rows]
+    rows = [row for rows in _read_packets(source, "IMUS", _parse_samples) for row in rows]
     if not rows:
         return None
     values = np.array([row[1] for row in rows], np.float64)
@@ -178,7 +183,7 @@ def motion(source: Source) -> Motion | None:
     )
 
 
-def _samples(packet: Table) -> list[tuple[int, list[float]]]:
+def _parse_samples(packet: Table) -> list[tuple[int, list[float]]]:
     """Return time [us], acceleration [g] and rotation [degrees/s] of each sample."""
     return [
         (sample.number(0, "<q", 0), [sample.real(k, "<f", 0.0) for k in range(2, 8)])
@@ -186,7 +191,7 @@ def _samples(packet: Table) -> list[tuple[int, list[float]]]:
     ]
 
 
-def _frame(packet: Table) -> tuple[NDArray[Any], tuple[int, int]]:
+def _parse_frame(packet: Table) -> tuple[NDArray[Any], tuple[int, int]]:
     """Return the pixels as grey of 8 or 16 bits, (H, W), and begin and end of the exposure [us]."""
     width, height = packet.number(6, "<h", 0), packet.number(7, "<h", 0)
     name, channels = PIXELS[packet.number(5, "<b", 0)]
@@ -206,8 +211,8 @@ FORMAT = camera_format(
     suffixes=(".aedat4",),
     extra="aedat",
     matches=lambda path, head: head.startswith(MAGIC[:10]),
-    pieces=pieces,
-    size=size,
-    pictures=pictures,
-    motion=motion,
+    pieces=read_pieces,
+    size=read_size,
+    pictures=read_pictures,
+    motion=read_motion,
 )

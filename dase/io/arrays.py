@@ -21,8 +21,8 @@ from numpy.typing import NDArray
 
 from dase.errors import InputError
 from dase.io import npz, rules
-from dase.io.format import Format, camera_format, largest
-from dase.io.sequence import GREYS, Sequence, coordinates, reading
+from dase.io.format import Format, camera_format, find_extent
+from dase.io.sequence import GREYS, Sequence, checked_coordinates, reading_file
 from dase.io.source import Beside, Picture, Piece, Source, refuse_bomb
 
 NPY = b"\x93NUMPY"
@@ -40,7 +40,7 @@ HEADERS = {
 }
 
 
-def _header(stream: IO[bytes], packed: int, unpacked: int) -> tuple[tuple[int, ...], np.dtype[Any]]:
+def _read_header(stream: IO[bytes], packed: int, unpacked: int) -> tuple[tuple[int, ...], np.dtype[Any]]:
     """Read the header of an array; raises InputError where it holds objects or claims more than there is."""
     version = np.lib.format.read_magic(stream)
     if version not in HEADERS:
@@ -55,7 +55,7 @@ def _header(stream: IO[bytes], packed: int, unpacked: int) -> tuple[tuple[int, .
     return shape, kind
 
 
-def _slices(stream: IO[bytes], count: int, kind: np.dtype[Any], part: int = 0) -> Iterator[NDArray[Any]]:
+def _read_slices(stream: IO[bytes], count: int, kind: np.dtype[Any], part: int = 0) -> Iterator[NDArray[Any]]:
     part = part or PART
     for i in range(0, count, part):
         size = min(part, count - i) * kind.itemsize
@@ -65,13 +65,13 @@ def _slices(stream: IO[bytes], count: int, kind: np.dtype[Any], part: int = 0) -
         yield np.frombuffer(data, kind)
 
 
-def _check(archive: zipfile.ZipFile) -> None:
+def _check_members(archive: zipfile.ZipFile) -> None:
     """Raise InputError where members would unpack to something absurd."""
     for name in npz.KEYS:
         if f"{name}.npy" in archive.NameToInfo:
             info = archive.getinfo(f"{name}.npy")
             with archive.open(info) as stream:
-                _header(stream, info.compress_size, info.file_size)
+                _read_header(stream, info.compress_size, info.file_size)
 
 
 def _own_pieces(source: Source) -> Iterator[Piece]:
@@ -84,27 +84,27 @@ def _own_pieces(source: Source) -> Iterator[Piece]:
         for name in (*npz.EVENT_KEYS, "label") if labelled else npz.EVENT_KEYS:
             info = archive.getinfo(f"{name}.npy")
             stream = stack.enter_context(archive.open(info))
-            shape, kind = _header(stream, info.compress_size, info.file_size)
+            shape, kind = _read_header(stream, info.compress_size, info.file_size)
             if len(shape) != 1 or (lengths and shape[0] != lengths[0]):
                 raise InputError(f"'{name}' must be one number per event, got shape {shape}")
             lengths.append(shape[0])
-            streams.append(_slices(stream, shape[0], kind))
+            streams.append(_read_slices(stream, shape[0], kind))
         for t, x, y, p, *label in zip(*streams, strict=True):
             whole = t.astype(np.int64 if t.dtype.kind in "iu" else np.float64)
-            yield Piece(whole, coordinates(x, "x"), coordinates(y, "y"), p, *label)
+            yield Piece(whole, checked_coordinates(x, "x"), checked_coordinates(y, "y"), p, *label)
 
 
-def _maps(archive: zipfile.ZipFile, name: str, stack: ExitStack) -> Iterator[NDArray[Any]]:
+def _read_maps(archive: zipfile.ZipFile, name: str, stack: ExitStack) -> Iterator[NDArray[Any]]:
     """Yield the frames, (H, W), or the flow, (2, H, W), of an archive one by one."""
     info = archive.getinfo(f"{name}.npy")
     stream = stack.enter_context(archive.open(info))
-    shape, kind = _header(stream, info.compress_size, info.file_size)
+    shape, kind = _read_header(stream, info.compress_size, info.file_size)
     if name == "frames" and (len(shape) != 3 or kind not in GREYS):
         raise InputError(f"'frames' must be uint8 or uint16 (F, H, W), got {kind} {shape}")
     if name == "flow" and len(shape) != 4:
         raise InputError(f"'flow' must have shape (F, 2, H, W), got {shape}")
     count = int(np.prod(shape[1:]))
-    for row in _slices(stream, shape[0] * count, kind, count):
+    for row in _read_slices(stream, shape[0] * count, kind, count):
         yield row.reshape(shape[1:])
 
 
@@ -114,9 +114,9 @@ def _own_pictures(source: Source) -> Iterator[Picture]:
         members = {name for name in npz.KEYS if f"{name}.npy" in archive.NameToInfo}
         if "frames" not in members:
             return
-        small = {name: npz.load(archive, name) for name in npz.FRAME_KEYS[1:] if name in members}
+        small = {name: npz.load_member(archive, name) for name in npz.FRAME_KEYS[1:] if name in members}
         times, exposure = npz.frame_times(small)
-        rows = [_maps(archive, name, stack) for name in ("frames", "flow") if name in members]
+        rows = [_read_maps(archive, name, stack) for name in ("frames", "flow") if name in members]
         for k, (grey, *flow) in enumerate(zip(*rows, strict=True)):
             yield Picture(
                 grey,
@@ -127,28 +127,28 @@ def _own_pictures(source: Source) -> Iterator[Picture]:
 
 
 def _read_own(source: Source) -> Sequence:
-    with reading(source.path, "NumPy archive"), zipfile.ZipFile(source.path) as archive:
-        _check(archive)
+    with reading_file(source.path, "NumPy archive"), zipfile.ZipFile(source.path) as archive:
+        _check_members(archive)
     return npz.read(source)
 
 
-def _beside(source: Source) -> Beside:
-    with reading(source.path, "NumPy archive"), zipfile.ZipFile(source.path) as archive:
-        _check(archive)
+def _read_beside(source: Source) -> Beside:
+    with reading_file(source.path, "NumPy archive"), zipfile.ZipFile(source.path) as archive:
+        _check_members(archive)
         names = (n for n in ("thresholds", "configuration") if f"{n}.npy" in archive.NameToInfo)
-        return npz.beside({name: npz.load(archive, name) for name in names})
+        return npz.parse_beside({name: npz.load_member(archive, name) for name in names})
 
 
 def _own_size(source: Source) -> tuple[int, int] | None:
     """Return columns and rows: of the maps where there are any, else as `wh` says, either way round."""
     with zipfile.ZipFile(source.path) as archive:
-        _check(archive)
+        _check_members(archive)
         known = [name for name in npz.EVENT_KEYS if f"{name}.npy" in archive.NameToInfo]
         for name in ("frames", "flow", "thresholds"):
             if f"{name}.npy" in archive.NameToInfo:
                 info = archive.getinfo(f"{name}.npy")
                 with archive.open(info) as stream:
-                    shape, _ = _header(stream, info.compress_size, info.file_size)
+                    shape, _ = _read_header(stream, info.compress_size, info.file_size)
                 if len(shape) >= 2:
                     return shape[-1], shape[-2]
         if not known:
@@ -162,23 +162,23 @@ def _own_size(source: Source) -> tuple[int, int] | None:
     if wh.shape != (2,) or wh.dtype.kind not in "iu":
         raise InputError(f"'wh' must be two integers, got {wh.dtype} of shape {wh.shape}")
     size = int(wh[0]), int(wh[1])
-    return size if size[0] == size[1] else rules.turned(source, size, largest(_own_pieces(source)))
+    return size if size[0] == size[1] else rules.turned_size(source, size, find_extent(_own_pieces(source)))
 
 
-def _fields(kind: np.dtype[Any]) -> list[str] | None:
+def _event_fields(kind: np.dtype[Any]) -> list[str] | None:
     """Return the names of t, x, y and p in a structured type, None where one is missing."""
     names = {name.lower(): name for name in kind.names or ()}
     found = [next((names[name] for name in known if name in names), None) for known in NAMES]
     return None if None in found else [name for name in found if name is not None]
 
 
-def _table(archive: zipfile.ZipFile) -> tuple[str, int, np.dtype[Any]] | None:
+def _find_table(archive: zipfile.ZipFile) -> tuple[str, int, np.dtype[Any]] | None:
     """Return name, length and type of the first structured array of events."""
     for info in archive.infolist():
         if info.filename.endswith(".npy"):
             with archive.open(info) as stream:
-                shape, kind = _header(stream, info.compress_size, info.file_size)
-            if len(shape) == 1 and _fields(kind):
+                shape, kind = _read_header(stream, info.compress_size, info.file_size)
+            if len(shape) == 1 and _event_fields(kind):
                 return info.filename, shape[0], kind
     return None
 
@@ -188,23 +188,23 @@ def _table_pieces(source: Source) -> Iterator[Piece]:
         if source.path.suffix.lower() == ".npy" or not zipfile.is_zipfile(source.path):
             stream: IO[bytes] = stack.enter_context(source.path.open("rb"))
             length = source.path.stat().st_size
-            shape, kind = _header(stream, length, length)
-            if len(shape) != 1 or not _fields(kind):
+            shape, kind = _read_header(stream, length, length)
+            if len(shape) != 1 or not _event_fields(kind):
                 raise InputError(f"must be a structured array with fields t, x, y, p, got {kind} {shape}")
             count = shape[0]
         else:
             archive = stack.enter_context(zipfile.ZipFile(source.path))
-            found = _table(archive)
+            found = _find_table(archive)
             if found is None:
                 raise InputError("has no structured array with fields t, x, y, p")
             stream = stack.enter_context(archive.open(found[0]))
             count, kind = found[1:]
-            _header(stream, count * kind.itemsize, archive.getinfo(found[0]).file_size)
-        names = _fields(kind) or []
-        for rows in _slices(stream, count, kind):
+            _read_header(stream, count * kind.itemsize, archive.getinfo(found[0]).file_size)
+        names = _event_fields(kind) or []
+        for rows in _read_slices(stream, count, kind):
             t, x, y, p = (rows[name] for name in names)
             time = t.astype(np.float64) if t.dtype.kind == "f" else t.astype(np.int64) / 1e6
-            yield Piece(time, coordinates(x, names[1]), coordinates(y, names[2]), p)
+            yield Piece(time, checked_coordinates(x, names[1]), checked_coordinates(y, names[2]), p)
 
 
 def _matches_table(path: Path, head: bytes) -> bool:
@@ -215,7 +215,7 @@ def _matches_table(path: Path, head: bytes) -> bool:
     try:
         with zipfile.ZipFile(path) as archive:
             own = {f"{name}.npy" for name in npz.KEYS} & set(archive.NameToInfo)
-            return not own and _table(archive) is not None
+            return not own and _find_table(archive) is not None
     except Exception:  # damaged: left to the reader that is tried at last
         return False
 
@@ -236,7 +236,7 @@ OWN = Format(
     read=_read_own,
     stream=_own.stream,
     pictures=_own.pictures,
-    beside=_beside,
+    beside=_read_beside,
     create=npz.create,
     keeps=frozenset({"events", "frames", "flow", "thresholds", "configuration"}),
 )

@@ -20,7 +20,7 @@ BLOCK = 1 << 22  # [bytes] read at once
 MOST_BRIDGES = 1 << 20  # words that may be spent on gaps; EVT3 needs one per 4 s, EVT2 one per 72 min
 
 
-def records(source: Source, begin: int, kind: Any) -> Iterator[NDArray[Any]]:
+def read_records(source: Source, begin: int, kind: Any) -> Iterator[NDArray[Any]]:
     """Yield the records of a file from byte `begin` on, a block at a time; note a broken one at the end."""
     size = np.dtype(kind).itemsize
     with source.path.open("rb") as file:
@@ -78,7 +78,7 @@ def set_bits(octets: NDArray[np.uint8]) -> NDArray[np.intp]:
     return filled.take(bits >> 3) << 3 | bits & 7
 
 
-def bridges(
+def bridge_gaps(
     counts: NDArray[np.int64], last: int, step: int, name: str
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """Return what has to be counted in between so that no jump of a counter is taken for a start over.
@@ -104,7 +104,7 @@ def bridges(
     return index, before[index] + nth * step
 
 
-def weave(
+def weave_words(
     columns: list[tuple[NDArray[np.bool_], NDArray[np.int64]]],
     before: tuple[NDArray[np.int64], NDArray[np.int64]],
 ) -> NDArray[np.int64]:

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dase.errors import InputError
-from dase.io.sequence import coordinates
+from dase.io.sequence import checked_coordinates
 from dase.io.source import Piece, Size, Source, missing_extra, refuse_bomb
 
 HDF5 = b"\x89HDF\r\n\x1a\n"
@@ -38,7 +38,7 @@ TELLING = (
     *("davis/left/events", "davis/right/events"),
     "events",
 )
-"""Datasets that tell layouts apart; what `has` can be asked for."""
+"""Datasets that tell layouts apart; what `has_datasets` can be asked for."""
 
 SETTLED = 2_000_000_000
 """Age [ns] of a change from which on the next one has another time, however coarse the clock of the disk."""
@@ -52,7 +52,7 @@ _sound: dict[Path, tuple[int, ...]] = {}  # files whose heaps were checked, and 
 
 
 @contextmanager
-def opened(path: Path) -> Iterator[Any]:
+def open_hdf5(path: Path) -> Iterator[Any]:
     """Open a file for reading, with the filters of hdf5plugin where that is installed."""
     global _plugin_tried
     if not _plugin_tried:
@@ -103,7 +103,7 @@ def check_heaps(path: Path) -> None:
         return
     now = time.time_ns()
     with path.open("rb") as file:
-        for kind, begin in _heaps(file):
+        for kind, begin in _find_heaps(file):
             (_check_heap if kind == HEAP else _check_names)(file, begin, found.st_size)
     # a small one may change once more before the clock of its times goes on
     if found.st_size > BLOCK or max(state[2:]) < now - SETTLED:
@@ -112,7 +112,7 @@ def check_heaps(path: Path) -> None:
         _sound[place] = state
 
 
-def _heaps(file: BinaryIO) -> Iterator[tuple[bytes, int]]:
+def _find_heaps(file: BinaryIO) -> Iterator[tuple[bytes, int]]:
     """Yield kinds of heaps and where they begin; in blocks, for a file may be larger than the memory."""
     place, tail = 0, b""
     while block := file.read(BLOCK):
@@ -152,18 +152,18 @@ def _check_names(file: BinaryIO, begin: int, length: int) -> None:
         hole = int.from_bytes(file.read(8), "little")
 
 
-def has(path: Path, head: bytes, *names: str) -> bool:
+def has_datasets(path: Path, head: bytes, *names: str) -> bool:
     """Whether a file is HDF5 and holds datasets of all these names."""
     global _asked
     if not head.startswith(HDF5):
         return False
     asked = _asked
     if asked[0] is not head:  # all formats are asked about one file in a row, which need not be opened again
-        asked = _asked = head, _found(path)
+        asked = _asked = head, _telling_datasets(path)
     return set(names) <= asked[1]
 
 
-def _found(path: Path) -> frozenset[str]:
+def _telling_datasets(path: Path) -> frozenset[str]:
     try:
         check_head(path)
         check_heaps(path)
@@ -173,7 +173,7 @@ def _found(path: Path) -> frozenset[str]:
         return frozenset()
 
 
-def dataset(file: Any, name: str, ndim: int | None = None) -> Any:
+def checked_dataset(file: Any, name: str, ndim: int | None = None) -> Any:
     """Return a dataset; raises InputError where it is missing, absurdly large or needs a filter."""
     found = file.get(name)
     if not isinstance(found, h5py.Dataset):
@@ -215,7 +215,7 @@ def _check_filters(found: Any, name: str) -> None:
             raise InputError(f"'{name}' is damaged: its filter has {len(parameters)} parameters")
 
 
-def attribute(node: Any, name: str) -> Any:
+def read_attribute(node: Any, name: str) -> Any:
     """Return the value of an attribute of a file, group or dataset, None where it is absent."""
     if name not in node.attrs:
         return None
@@ -252,25 +252,25 @@ def _little_memory() -> Iterator[None]:
         resource.setrlimit(resource.RLIMIT_AS, limits)
 
 
-def columns(
+def read_columns(
     file: Any, names: tuple[str, str, str, str], beside: tuple[str, ...] = ()
 ) -> Iterator[tuple[NDArray[Any], ...]]:
     """Yield slices of the columns t, x, y, p and others beside; all but x and y as the file holds them."""
-    found = [dataset(file, name, 1) for name in (*names, *beside)]
+    found = [checked_dataset(file, name, 1) for name in (*names, *beside)]
     length = len(found[0])
     for name, column in zip((*names, *beside), found, strict=True):
         if len(column) != length:
             raise InputError(f"'{name}' has {len(column)} entries, '{names[0]}' {length}")
     for i in range(0, length, PART):
         t, x, y, *others = (column[i : i + PART] for column in found)
-        yield t, coordinates(x, names[1]), coordinates(y, names[2]), *others
+        yield t, checked_coordinates(x, names[1]), checked_coordinates(y, names[2]), *others
 
 
-def largest(file: Any, x: str, y: str) -> Size:
+def find_largest(file: Any, x: str, y: str) -> Size:
     """Return one more than the largest column and row."""
     out = []
     for name in (x, y):
-        column = dataset(file, name, 1)
+        column = checked_dataset(file, name, 1)
         parts = (column[i : i + PART] for i in range(0, len(column), PART))
         out.append(max((int(part.max()) for part in parts), default=0) + 1)
     return out[0], out[1]
@@ -278,13 +278,13 @@ def largest(file: Any, x: str, y: str) -> Size:
 
 def size_attribute(file: Any, name: str) -> Size | None:
     """Return columns and rows from an attribute of the file that holds rows and columns, or None."""
-    value = np.asarray(attribute(file, name))
+    value = np.asarray(read_attribute(file, name))
     if value.ndim != 1 or len(value) < 2 or value.dtype.kind not in "iu":
         return None
     return int(value[1]), int(value[0])
 
 
-def scalar(file: Any, name: str) -> int:
+def read_scalar(file: Any, name: str) -> int:
     """Return a whole number that a dataset holds, 0 where it is absent."""
     found = file.get(name)
     if not isinstance(found, h5py.Dataset):
@@ -294,13 +294,13 @@ def scalar(file: Any, name: str) -> int:
     return int(np.asarray(found[()]).reshape(-1)[0])
 
 
-def reader(
+def pieces_reader(
     parts: Callable[[Any, Source], Iterator[Piece]],
 ) -> Callable[[Source], Iterator[Piece]]:
     """Return a reader of pieces that opens the file of a source and keeps it open while it yields."""
 
     def pieces(source: Source) -> Iterator[Piece]:
-        with opened(source.path) as file:
+        with open_hdf5(source.path) as file:
             yield from parts(file, source)
 
     return pieces

@@ -19,9 +19,9 @@ from numpy.typing import NDArray
 from dase.errors import InputError
 from dase.events import Events
 from dase.io import raw
-from dase.io.binary import EventWriter, Rollover, records
+from dase.io.binary import EventWriter, Rollover, read_records
 from dase.io.format import camera_format
-from dase.io.sequence import Writer, writing
+from dase.io.sequence import Writer, writing_file
 from dase.io.source import Piece, Source
 
 TYPES = (0, 12)
@@ -30,18 +30,18 @@ LAYOUTS = {1: (9, 8), 2: (14, 14)}
 """Version to bits of column and row."""
 
 
-def pieces(source: Source) -> Iterator[Piece]:
+def read_pieces(source: Source) -> Iterator[Piece]:
     """Yield the events."""
     with source.path.open("rb") as file:
-        if not matches(source.path, file.read(raw.LONGEST)):
+        if not matches_format(source.path, file.read(raw.LONGEST)):
             raise InputError("has no DAT header")
-    header = raw.header(source)
+    header = raw.read_header(source)
     version = header.keys.get("Version", "2")
     if version not in ("1", "2"):
         raise InputError(f"DAT version {version} is not known, only 1 and 2")
     bits_x, bits_y = LAYOUTS[int(version)]
     turns = Rollover(32)
-    for block in records(source, header.length + 2, np.dtype([("t", "<u4"), ("a", "<u4")])):
+    for block in read_records(source, header.length + 2, np.dtype([("t", "<u4"), ("a", "<u4")])):
         address = block["a"]
         x = (address & ((1 << bits_x) - 1)).astype(np.uint16)
         y = ((address >> bits_x) & ((1 << bits_y) - 1)).astype(np.uint16)
@@ -49,9 +49,9 @@ def pieces(source: Source) -> Iterator[Piece]:
         yield Piece(turns(block["t"]), x, y, polarity > 0)
 
 
-def matches(path: Path, head: bytes) -> bool:
+def matches_format(path: Path, head: bytes) -> bool:
     """Whether the header is followed by type and size of events."""
-    header = raw.parse(head)
+    header = raw.parse_header(head)
     return (
         bool(header.length)
         and header.encoding is None
@@ -78,9 +78,14 @@ class _Writer(EventWriter):
 
 def create(path: Path) -> AbstractContextManager[Writer]:
     """Open a DAT file for writing; it appears under its name when the block ends well."""
-    return writing(path, _Writer)
+    return writing_file(path, _Writer)
 
 
 FORMAT = camera_format(
-    name="DAT", suffixes=(".dat",), create=create, matches=matches, pieces=pieces, size=raw.size
+    name="DAT",
+    suffixes=(".dat",),
+    create=create,
+    matches=matches_format,
+    pieces=read_pieces,
+    size=raw.read_size,
 )

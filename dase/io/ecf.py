@@ -25,9 +25,9 @@ from numpy.typing import NDArray
 
 from dase.errors import InputError
 from dase.io import raw
-from dase.io.columns import PART, attribute, check_whole, has, opened, reader
+from dase.io.columns import PART, check_whole, has_datasets, open_hdf5, pieces_reader, read_attribute
 from dase.io.format import camera_format
-from dase.io.sequence import coordinates
+from dase.io.sequence import checked_coordinates
 from dase.io.source import Piece, Size, Source, refuse_bomb
 
 FILTER = 0x8ECF
@@ -36,7 +36,7 @@ MOST = 65535  # events of a buffer
 Counts = NDArray[np.int64]
 
 
-def unpack(data: bytes) -> Piece:
+def unpack_buffer(data: bytes) -> Piece:
     """Return the events of one buffer [us]; raises InputError where it ends too early."""
     buffer = np.frombuffer(data, np.uint8)
     if len(buffer) < 12:
@@ -45,41 +45,41 @@ def unpack(data: bytes) -> Piece:
     count, all_packed, packed = word >> 2, bool(word & 2), bool(word & 1)
     if count > MOST:
         raise InputError(f"a buffer claims {count} events, ECF holds at most {MOST}")
-    t, place = _times(buffer[4:], count)
+    t, place = _decode_times(buffer[4:], count)
     rest = buffer[4 + place :]
     if all_packed:
-        a, b, c = _take(rest, 3 * -(-count // 4), "<u4").astype(np.int64).reshape(-1, 3).T
+        a, b, c = _take_words(rest, 3 * -(-count // 4), "<u4").astype(np.int64).reshape(-1, 3).T
         four = (a >> 8, (a & 0xFF) | (b >> 16 << 8), (b & 0xFFFF) | (c >> 24 << 16), c & 0xFFFFFF)
         v = np.stack(four, axis=1).reshape(-1)[:count]
-        return Piece(t, _u16(v >> 1 & 2047), _u16(v >> 12 & 2047), (v & 1).astype(np.bool_))
-    y, used = _runs(rest[: len(rest) // 2 * 2].view("<u2"), count, 5)
+        return Piece(t, _as_u16(v >> 1 & 2047), _as_u16(v >> 12 & 2047), (v & 1).astype(np.bool_))
+    y, used = _decode_runs(rest[: len(rest) // 2 * 2].view("<u2"), count, 5)
     rest = rest[2 * used :]
     if packed:
-        a, b, c = _take(rest, 3 * -(-count // 4), "<u2").astype(np.int64).reshape(-1, 3).T
+        a, b, c = _take_words(rest, 3 * -(-count // 4), "<u2").astype(np.int64).reshape(-1, 3).T
         four = (a >> 4, (a & 0xF) | (b >> 8 << 4), (b & 0xFF) | (c >> 12 << 8), c & 0xFFF)
         v = np.stack(four, axis=1).reshape(-1)[:count]
-        return Piece(t, _u16(v >> 1), _u16(y), (v & 1).astype(np.bool_))
-    x, used = _masked(rest[: len(rest) // 2 * 2].view("<u2"), count)
-    p, _ = _runs(rest[2 * used :], count, 7)
-    return Piece(t, _u16(x), _u16(y), p > 0)
+        return Piece(t, _as_u16(v >> 1), _as_u16(y), (v & 1).astype(np.bool_))
+    x, used = _decode_masks(rest[: len(rest) // 2 * 2].view("<u2"), count)
+    p, _ = _decode_runs(rest[2 * used :], count, 7)
+    return Piece(t, _as_u16(x), _as_u16(y), p > 0)
 
 
-def _u16(values: Counts) -> NDArray[np.uint16]:
+def _as_u16(values: Counts) -> NDArray[np.uint16]:
     return values.astype(np.uint16)
 
 
-def _take(buffer: NDArray[np.uint8], count: int, kind: str) -> NDArray[Any]:
+def _take_words(buffer: NDArray[np.uint8], count: int, kind: str) -> NDArray[Any]:
     size = count * np.dtype(kind).itemsize
     if len(buffer) < size:
-        raise _short()
+        raise _too_short()
     return buffer[:size].view(kind)
 
 
-def _short() -> InputError:
+def _too_short() -> InputError:
     return InputError("an ECF buffer ends before its events do")
 
 
-def _escaped(marks: NDArray[np.bool_], follow: int) -> tuple[NDArray[np.intp], NDArray[np.bool_]]:
+def _find_escapes(marks: NDArray[np.bool_], follow: int) -> tuple[NDArray[np.intp], NDArray[np.bool_]]:
     """Return the marks that stand for themselves, not for data of one before, and which words are data."""
     kept = []
     free = 0
@@ -94,7 +94,7 @@ def _escaped(marks: NDArray[np.bool_], follow: int) -> tuple[NDArray[np.intp], N
     return escapes, data[: len(marks)]
 
 
-def _long(words: NDArray[Any], escapes: NDArray[np.intp]) -> Counts:
+def _long_counts(words: NDArray[Any], escapes: NDArray[np.intp]) -> Counts:
     """Return the numbers that follow escapes, as one u16 or as two bytes; 0 beyond the end."""
     padded = np.concatenate((words, np.zeros(2, words.dtype))).astype(np.int64)
     if words.dtype.itemsize == 2:
@@ -102,49 +102,49 @@ def _long(words: NDArray[Any], escapes: NDArray[np.intp]) -> Counts:
     return padded[escapes + 1] | padded[escapes + 2] << 8
 
 
-def _holder(lengths: NDArray[Any], count: int) -> int:
+def _find_holder(lengths: NDArray[Any], count: int) -> int:
     """Return which of the words, each for so many events, holds the last of `count`."""
     total = np.cumsum(lengths)
     last = int(np.searchsorted(total, count))
     if count and last >= len(total):
-        raise _short()
+        raise _too_short()
     return last
 
 
-def _runs(words: NDArray[Any], count: int, bits: int) -> tuple[Counts, int]:
+def _decode_runs(words: NDArray[Any], count: int, bits: int) -> tuple[Counts, int]:
     """Return the values of `count` events coded as runs, and the number of words they took."""
     most = (1 << bits) - 1
     words = words[: count * (3 if words.dtype.itemsize == 1 else 2)]
     lengths = words.astype(np.int64) & most
-    escapes, data = _escaped(lengths == most, 2 if words.dtype.itemsize == 1 else 1)
-    lengths[escapes] = _long(words, escapes)
+    escapes, data = _find_escapes(lengths == most, 2 if words.dtype.itemsize == 1 else 1)
+    lengths[escapes] = _long_counts(words, escapes)
     lengths[data] = 0
-    last = _holder(lengths, count)
+    last = _find_holder(lengths, count)
     values = np.repeat(words[: last + 1].astype(np.int64) >> bits, lengths[: last + 1])[:count]
     follow = int(np.argmin(np.append(data[last + 1 :], False))) if last + 1 < len(data) else 0
     return values, (last + 1 + follow) if count else 0
 
 
-def _masked(words: NDArray[Any], count: int) -> tuple[Counts, int]:
+def _decode_masks(words: NDArray[Any], count: int) -> tuple[Counts, int]:
     words = words[:count].astype(np.int64)
     bits = np.ones((len(words), 6), np.bool_)
     bits[:, 1:] = (words[:, None] >> np.arange(4, -1, -1)) & 1 > 0
-    used = _holder(bits.sum(axis=1), count) + 1 if count else 0
+    used = _find_holder(bits.sum(axis=1), count) + 1 if count else 0
     values = ((words[:used] >> 5)[:, None] + np.arange(6))[bits[:used]]
     return values[:count], used
 
 
-def _times(buffer: NDArray[np.uint8], count: int) -> tuple[Counts, int]:
+def _decode_times(buffer: NDArray[np.uint8], count: int) -> tuple[Counts, int]:
     """Return the times of the events and the number of bytes they took."""
     first = int(buffer[:8].view("<i8")[0])
     bytes_ = buffer[8:]
     high, low = (bytes_ >> 4).astype(np.int64), (bytes_ & 15).astype(np.int64)
-    escapes, data = _escaped((high != 15) & (low == 15), 2)
+    escapes, data = _find_escapes((high != 15) & (low == 15), 2)
     steps = (high == 15) & ~data
     lengths = np.where(steps, 0, low)
-    lengths[escapes] = _long(bytes_, escapes)
+    lengths[escapes] = _long_counts(bytes_, escapes)
     lengths[data] = 0
-    end = _holder(lengths, count) + 1 if count else 0
+    end = _find_holder(lengths, count) + 1 if count else 0
     place = np.arange(end)
     steps = steps[:end]
     before = np.maximum.accumulate(np.where(steps, -1, place))  # last byte that is no step
@@ -157,7 +157,7 @@ def _times(buffer: NDArray[np.uint8], count: int) -> tuple[Counts, int]:
     return np.repeat(t, lengths[:end])[:count], used
 
 
-def _parts(file: Any, source: Source) -> Iterator[Piece]:
+def _read_parts(file: Any, source: Source) -> Iterator[Piece]:
     events = file["CD/events"]
     kinds = {name: events.dtype[name].kind for name in events.dtype.names or ()}
     if events.ndim != 1 or not {"x", "y", "p", "t"} <= set(kinds) or not set(kinds.values()) <= set("biu"):
@@ -168,7 +168,11 @@ def _parts(file: Any, source: Source) -> Iterator[Piece]:
         check_whole(events, "CD/events")
         for i in range(0, len(events), PART):
             part = events[i : i + PART]
-            t, x, y = part["t"].astype(np.int64), coordinates(part["x"], "x"), coordinates(part["y"], "y")
+            t, x, y = (
+                part["t"].astype(np.int64),
+                checked_coordinates(part["x"], "x"),
+                checked_coordinates(part["y"], "y"),
+            )
             yield Piece(t, x, y, part["p"])
         return
     if filters != [FILTER]:
@@ -181,16 +185,16 @@ def _parts(file: Any, source: Source) -> Iterator[Piece]:
             plain = np.frombuffer(data, events.dtype)[: length - i]
             yield Piece(plain["t"].astype(np.int64), plain["x"], plain["y"], plain["p"])
         else:
-            yield unpack(data).take(slice(length - i))
+            yield unpack_buffer(data).take(slice(length - i))
 
 
-def size(source: Source) -> Size | None:
+def read_size(source: Source) -> Size | None:
     """Return columns and rows as the attributes tell them, or None."""
-    with opened(source.path) as file:
+    with open_hdf5(source.path) as file:
         keys = {}
         for node in (file, file["CD"]):
             for name in ("geometry", "format", "system_ID"):
-                value = attribute(node, name)
+                value = read_attribute(node, name)
                 if isinstance(value, bytes):
                     value = value.decode("latin-1")
                 if isinstance(value, str):
@@ -201,7 +205,7 @@ def size(source: Source) -> Size | None:
 FORMAT = camera_format(
     name="Prophesee HDF5",
     suffixes=(".hdf5", ".h5"),
-    matches=lambda path, head: has(path, head, "CD/events"),
-    pieces=reader(_parts),
-    size=size,
+    matches=lambda path, head: has_datasets(path, head, "CD/events"),
+    pieces=pieces_reader(_read_parts),
+    size=read_size,
 )

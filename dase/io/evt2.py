@@ -20,9 +20,9 @@ from numpy.typing import NDArray
 
 from dase.events import Events
 from dase.io import raw
-from dase.io.binary import EventWriter, Rollover, bridges, records, weave
+from dase.io.binary import EventWriter, Rollover, bridge_gaps, read_records, weave_words
 from dase.io.format import camera_format
-from dase.io.sequence import Writer, writing
+from dase.io.sequence import Writer, writing_file
 from dase.io.source import Piece, Source
 
 PART = 1 << 17  # words decoded at once: their arrays stay in the cache
@@ -76,10 +76,10 @@ class Decoder:
             source.note(f"{self.unknown} words of unknown type: skipped", "refused", "damage", self.unknown)
 
 
-def pieces(source: Source) -> Iterator[Piece]:
+def read_pieces(source: Source) -> Iterator[Piece]:
     """Yield the events."""
     decoder = Decoder()
-    for words in records(source, raw.header(source, "EVT2").length, "<u4"):
+    for words in read_records(source, raw.read_header(source, "EVT2").length, "<u4"):
         yield from decoder(words)
     decoder.report(source)
 
@@ -99,12 +99,14 @@ class _Writer(EventWriter):
     def _encoded(self, part: Events, t_us: NDArray[np.int64]) -> bytes:
         high = t_us >> 6
         new = np.diff(high, prepend=self._high) != 0
-        steps = bridges(high, max(self._high, 0), 1 << 26, self.name)
+        steps = bridge_gaps(high, max(self._high, 0), 1 << 26, self.name)
         self._high = int(high[-1])
         event = (
             (part.p.astype(np.int64) << 28) | ((t_us & 63) << 22) | (part.x.astype(np.int64) << 11) | part.y
         )
-        words = weave([(new, time_word(high)), (np.ones_like(new), event)], (steps[0], time_word(steps[1])))
+        words = weave_words(
+            [(new, time_word(high)), (np.ones_like(new), event)], (steps[0], time_word(steps[1]))
+        )
         return words.astype("<u4").tobytes()
 
 
@@ -115,14 +117,14 @@ def time_word(high: NDArray[np.int64]) -> NDArray[np.int64]:
 
 def create(path: Path) -> AbstractContextManager[Writer]:
     """Open an EVT2 file for writing; it appears under its name when the block ends well."""
-    return writing(path, _Writer)
+    return writing_file(path, _Writer)
 
 
 FORMAT = camera_format(
     name="EVT2",
     suffixes=(".evt2",),
     create=create,
-    matches=lambda path, head: raw.parse(head).encoding == "EVT2",
-    pieces=pieces,
-    size=raw.size,
+    matches=lambda path, head: raw.parse_header(head).encoding == "EVT2",
+    pieces=read_pieces,
+    size=raw.read_size,
 )

@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dase.io import raw
-from dase.io.binary import records, set_bits
+from dase.io.binary import read_records, set_bits
 from dase.io.evt2 import HIGH, KNOWN, Decoder
 from dase.io.format import camera_format
 from dase.io.source import Piece, Source
@@ -28,7 +28,7 @@ PART = 1 << 16  # words decoded at once
 DENSE = 1 << 14  # of them, where each may hold many events: their bits stay in the cache
 
 
-def expand(base: Piece, mask: NDArray[np.uint32]) -> Iterator[Piece]:
+def expand_masks(base: Piece, mask: NDArray[np.uint32]) -> Iterator[Piece]:
     """Yield an event at column x + i for every bit i of `mask` (N,) that is set, in this order."""
     if mask.all() and not np.any(mask & (mask - np.uint32(1))):  # one event in every word
         exponent = (mask.astype(np.float32).view(np.uint32) >> 23) - 127
@@ -40,22 +40,22 @@ def expand(base: Piece, mask: NDArray[np.uint32]) -> Iterator[Piece]:
         yield out._replace(x=out.x + (place & 31).astype(np.uint16))
 
 
-def pieces(source: Source) -> Iterator[Piece]:
+def read_pieces(source: Source) -> Iterator[Piece]:
     """Yield the events."""
-    header = raw.header(source, "EVT21")
+    header = raw.read_header(source, "EVT21")
     decoder = Decoder()
     swapped: bool | None = None
-    for block in records(source, header.length, "<u8"):
+    for block in read_records(source, header.length, "<u8"):
         halves = block.view("<u4").reshape(-1, 2)
-        swapped = _swapped(header, halves) if swapped is None else swapped
+        swapped = _halves_swapped(header, halves) if swapped is None else swapped
         word, mask = halves[:, 0 if swapped else 1], halves[:, 1 if swapped else 0]
         for i in range(0, len(word), PART):
             at, base = decoder.part(word[i : i + PART])
-            yield from expand(base, mask[i : i + PART][at])
+            yield from expand_masks(base, mask[i : i + PART][at])
     decoder.report(source)
 
 
-def _swapped(header: raw.Header, halves: NDArray[np.uint32]) -> bool:
+def _halves_swapped(header: raw.Header, halves: NDArray[np.uint32]) -> bool:
     """Whether the half with type, time and place comes first."""
     said = header.options.get("endianness", header.keys.get("endianness", ""))
     if said:
@@ -68,7 +68,7 @@ def _swapped(header: raw.Header, halves: NDArray[np.uint32]) -> bool:
 FORMAT = camera_format(
     name="EVT2.1",
     suffixes=(),
-    matches=lambda path, head: raw.parse(head).encoding == "EVT21",
-    pieces=pieces,
-    size=raw.size,
+    matches=lambda path, head: raw.parse_header(head).encoding == "EVT21",
+    pieces=read_pieces,
+    size=raw.read_size,
 )

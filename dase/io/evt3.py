@@ -26,9 +26,9 @@ from numpy.typing import NDArray
 
 from dase.events import Events
 from dase.io import raw
-from dase.io.binary import EventWriter, Rollover, bridges, records, set_bits, weave
+from dase.io.binary import EventWriter, Rollover, bridge_gaps, read_records, set_bits, weave_words
 from dase.io.format import camera_format
-from dase.io.sequence import Writer, writing
+from dase.io.sequence import Writer, writing_file
 from dase.io.source import Piece, Source
 
 PART = 1 << 18  # words decoded at once; three million events if all are full vectors
@@ -159,10 +159,10 @@ class Decoder:
             source.note(f"{self.unknown} words of unknown type: skipped", "refused", "damage", self.unknown)
 
 
-def pieces(source: Source) -> Iterator[Piece]:
+def read_pieces(source: Source) -> Iterator[Piece]:
     """Yield the events."""
     decoder = Decoder()
-    for words in records(source, raw.header(source, "EVT3").length, "<u2"):
+    for words in read_records(source, raw.read_header(source, "EVT3").length, "<u2"):
         yield from decoder(words)
     decoder.report(source)
 
@@ -185,32 +185,35 @@ class _Writer(EventWriter):
     def _encoded(self, part: Events, t_us: NDArray[np.int64]) -> bytes:
         before = np.concatenate(([self._t], t_us[:-1]))
         high, y = t_us >> 12, part.y.astype(np.int64)
-        at, between = bridges(high, max(self._t, 0) >> 12, 1 << 10, self.name)
+        at, between = bridge_gaps(high, max(self._t, 0) >> 12, 1 << 10, self.name)
         new_high = (high != before >> 12) | (before < 0)
         columns = [
-            (new_high, _word(HIGH, high & 4095)),
-            ((t_us != before) | new_high, _word(LOW, t_us & 4095)),  # not every reader clears them at HIGH
-            (np.diff(y, prepend=self._y) != 0, _word(ADDR_Y, y)),
-            (np.ones(len(y), np.bool_), _word(ADDR_X, part.x | (part.p.astype(np.int64) << 11))),
+            (new_high, _make_words(HIGH, high & 4095)),
+            (
+                (t_us != before) | new_high,
+                _make_words(LOW, t_us & 4095),
+            ),  # not every reader clears them at HIGH
+            (np.diff(y, prepend=self._y) != 0, _make_words(ADDR_Y, y)),
+            (np.ones(len(y), np.bool_), _make_words(ADDR_X, part.x | (part.p.astype(np.int64) << 11))),
         ]
         self._t, self._y = int(t_us[-1]), int(y[-1])
-        return weave(columns, (at, _word(HIGH, between & 4095))).astype("<u2").tobytes()
+        return weave_words(columns, (at, _make_words(HIGH, between & 4095))).astype("<u2").tobytes()
 
 
-def _word(kind: int, value: NDArray[np.int64]) -> NDArray[np.int64]:
+def _make_words(kind: int, value: NDArray[np.int64]) -> NDArray[np.int64]:
     return (kind << 12) | value
 
 
 def create(path: Path) -> AbstractContextManager[Writer]:
     """Open an EVT3 file for writing; it appears under its name when the block ends well."""
-    return writing(path, _Writer)
+    return writing_file(path, _Writer)
 
 
 FORMAT = camera_format(
     name="EVT3",
     suffixes=(".raw", ".evt3"),
     create=create,
-    matches=lambda path, head: raw.parse(head).encoding == "EVT3",
-    pieces=pieces,
-    size=raw.size,
+    matches=lambda path, head: raw.parse_header(head).encoding == "EVT3",
+    pieces=read_pieces,
+    size=raw.read_size,
 )

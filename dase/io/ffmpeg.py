@@ -18,7 +18,7 @@ from typing import Any
 import cv2
 
 from dase.errors import InputError
-from dase.io.image_files import quiet
+from dase.io.image_files import quiet_opencv
 
 TITLES = re.compile(rb"LIST(.{4})INFO", re.DOTALL)
 """A list of titles in an AVI, with its length [bytes]."""
@@ -57,19 +57,19 @@ NO_LIMIT = (1 << 31) - 1
 """Bytes that FFmpeg takes at once, unless told otherwise."""
 
 
-def opened(path: Path) -> Any:
+def open_video(path: Path) -> Any:
     """Open a video with FFmpeg; raises InputError where it cannot be, or its frames are absurdly large."""
     packed = path.stat().st_size
     # without decoders, which would decode a frame to be asked its size; FFmpeg calls that an error
-    with _at_once(FLOOR + 2 * packed), _silent():
-        size = size_of(_capture(path, "codec_whitelist;none"))
+    with _at_once(FLOOR + 2 * packed), _quiet_ffmpeg():
+        size = size_of(_open_capture(path, "codec_whitelist;none"))
     if min(size) < 1:  # of MPEG-4 only the decoder knows it
         size = UNTOLD
-    with _at_once(max(FLOOR, _plane(size, DEPTH_ELSE)) + 2 * packed):
-        return _capture(path)
+    with _at_once(max(FLOOR, _plane_bytes(size, DEPTH_ELSE)) + 2 * packed):
+        return _open_capture(path)
 
 
-def _capture(path: Path, with_options: str | None = None) -> Any:
+def _open_capture(path: Path, with_options: str | None = None) -> Any:
     os.environ.setdefault(LOG_LEVEL, str(QUIET))  # says nothing of its own about damaged files
     # each thread of a decoder keeps frames of its own, and there would be as many as processors
     parameters = [cv2.CAP_PROP_N_THREADS, 1]
@@ -77,7 +77,9 @@ def _capture(path: Path, with_options: str | None = None) -> Any:
     if with_options is not None:
         os.environ[OPTIONS] = with_options
     try:
-        with quiet():  # FFmpeg alone: the others after it take as much memory as a damaged file asks for
+        with (
+            quiet_opencv()
+        ):  # FFmpeg alone: the others after it take as much memory as a damaged file asks for
             capture = cv2.VideoCapture(str(path), cv2.CAP_FFMPEG, parameters)
     finally:
         if with_options is not None:
@@ -94,30 +96,32 @@ def size_of(capture: Any) -> tuple[int, int]:
     return int(capture.get(cv2.CAP_PROP_FRAME_WIDTH)), int(capture.get(cv2.CAP_PROP_FRAME_HEIGHT))
 
 
-def _name(capture: Any, which: int) -> bytes:
+def _four_letters(capture: Any, which: int) -> bytes:
     """Return the four letters of a codec or of a format of pixels."""
     return (int(capture.get(which)) & 0xFFFFFFFF).to_bytes(4, "little")
 
 
-def needed(capture: Any) -> int:
+def decoding_memory(capture: Any) -> int:
     """Return the bytes of memory that decoding takes at most, with `TAKEN` frames of it."""
     width, height = size_of(capture)
-    kept = KEPT.get(_name(capture, cv2.CAP_PROP_FOURCC).lower(), KEPT_ELSE)
-    format = _name(capture, cv2.CAP_PROP_CODEC_PIXEL_FORMAT)
+    kept = KEPT.get(_four_letters(capture, cv2.CAP_PROP_FOURCC).lower(), KEPT_ELSE)
+    format = _four_letters(capture, cv2.CAP_PROP_CODEC_PIXEL_FORMAT)
     depth = DEPTH[b"I420"] if format == UNKNOWN else DEPTH.get(format, DEPTH_ELSE)
     return int((BESIDE + kept * depth) * max(width, 0) * max(height, 0))
 
 
 def pixel_format(capture: Any) -> tuple[bytes, bytes]:
     """Return the names of the codec and of its format of pixels, four bytes each."""
-    return _name(capture, cv2.CAP_PROP_FOURCC), _name(capture, cv2.CAP_PROP_CODEC_PIXEL_FORMAT)
+    return _four_letters(capture, cv2.CAP_PROP_FOURCC), _four_letters(
+        capture, cv2.CAP_PROP_CODEC_PIXEL_FORMAT
+    )
 
 
 def _refuse_huge(path: Path, capture: Any) -> None:
     """Raise InputError where a small file holds frames of an absurd size, or says so."""
     from dase.io.source import BOMB_BYTES, refuse_bomb
 
-    (width, height), memory = size_of(capture), needed(capture)
+    (width, height), memory = size_of(capture), decoding_memory(capture)
     try:
         refuse_bomb(path.stat().st_size, memory)
     except InputError as error:
@@ -127,7 +131,7 @@ def _refuse_huge(path: Path, capture: Any) -> None:
 
 
 @contextmanager
-def bounded(capture: Any, packed: int) -> Iterator[None]:
+def bounded_decoding(capture: Any, packed: int) -> Iterator[None]:
     """Decode frames of no more than about the size that the head of the file says.
 
     A frame may say another size, and OpenCV then shrinks it to that of the head without a word: all that can
@@ -139,18 +143,18 @@ def bounded(capture: Any, packed: int) -> Iterator[None]:
     """
     codec, pixels = pixel_format(capture)
     depth = 1 if codec.lower() in RESIZING and DEPTH.get(pixels, DEPTH_ELSE) <= 3 else DEPTH_ELSE
-    with _at_once(max(FLOOR, _plane(size_of(capture), depth)) + 2 * packed):
+    with _at_once(max(FLOOR, _plane_bytes(size_of(capture), depth)) + 2 * packed):
         yield
 
 
-def _plane(size: tuple[int, int], depth: int) -> int:
+def _plane_bytes(size: tuple[int, int], depth: int) -> int:
     return depth * (max(size[0], 0) + 256) * (max(size[1], 0) + 256)  # FFmpeg adds borders
 
 
 @contextmanager
 def _at_once(most: int) -> Iterator[None]:
     """Let FFmpeg take no more bytes at once, where its library can be told so."""
-    library = _library()
+    library = _find_libavutil()
     if library is None:
         yield
         return
@@ -162,9 +166,9 @@ def _at_once(most: int) -> Iterator[None]:
 
 
 @contextmanager
-def _silent() -> Iterator[None]:
+def _quiet_ffmpeg() -> Iterator[None]:
     """Keep FFmpeg quiet, also where it was used before it could be told so by its environment."""
-    library = _library()
+    library = _find_libavutil()
     if library is not None:
         library.av_log_set_level(QUIET)
     try:
@@ -176,7 +180,7 @@ def _silent() -> Iterator[None]:
 
 
 @lru_cache(maxsize=1)
-def _library() -> Any:
+def _find_libavutil() -> Any:
     """Return the library of FFmpeg that comes with OpenCV; None where it is not a file of its own."""
     home = Path(cv2.__file__).parent
     for folder in (*home.parent.glob("opencv_*.libs"), home / ".dylibs"):  # of wheels for Linux and macOS

@@ -30,14 +30,14 @@ class Table:
     @classmethod
     def root(cls, data: bytes) -> Table:
         """Return the root table of a buffer without its size prefix."""
-        return cls(data, _u32(data, 0))
+        return cls(data, _read_u32(data, 0))
 
     def _field(self, index: int) -> int | None:
         """Return the place of a field, None where it is absent."""
-        fields = self.place - int(_unpack("<i", self.data, self.place))
-        size = int(_unpack("<H", self.data, fields))
+        fields = self.place - int(_unpack_number("<i", self.data, self.place))
+        size = int(_unpack_number("<H", self.data, fields))
         entry = 4 + 2 * index
-        offset = int(_unpack("<H", self.data, fields + entry)) if entry + 2 <= size else 0
+        offset = int(_unpack_number("<H", self.data, fields + entry)) if entry + 2 <= size else 0
         return self.place + offset if offset else None
 
     def number(self, index: int, kind: str, default: int) -> int:
@@ -47,15 +47,15 @@ class Table:
     def real(self, index: int, kind: str, default: float) -> float:
         """Return a number field."""
         place = self._field(index)
-        return default if place is None else _unpack(kind, self.data, place)
+        return default if place is None else _unpack_number(kind, self.data, place)
 
     def structs(self, index: int, kind: np.dtype[Any]) -> NDArray[Any]:
         """Return a vector of structs, (N,); empty where it is absent."""
         place = self._field(index)
         if place is None:
             return np.empty(0, kind)
-        place += _u32(self.data, place)
-        count = _u32(self.data, place)
+        place += _read_u32(self.data, place)
+        count = _read_u32(self.data, place)
         if place + 4 + count * kind.itemsize > len(self.data):
             raise InputError(f"a vector claims {count} elements, more than the packet holds")
         return np.frombuffer(self.data, kind, count, place + 4)
@@ -66,7 +66,7 @@ class Table:
         if not len(offsets):
             return []
         place = self._field(index) or 0
-        first = place + _u32(self.data, place) + 4
+        first = place + _read_u32(self.data, place) + 4
         return [Table(self.data, first + 4 * k + int(offset)) for k, offset in enumerate(offsets)]
 
     def text(self, index: int) -> bytes:
@@ -74,11 +74,11 @@ class Table:
         return self.structs(index, np.dtype("u1")).tobytes()
 
 
-def _u32(data: bytes, place: int) -> int:
-    return int(_unpack("<I", data, place))
+def _read_u32(data: bytes, place: int) -> int:
+    return int(_unpack_number("<I", data, place))
 
 
-def _unpack(kind: str, data: bytes, place: int) -> Any:
+def _unpack_number(kind: str, data: bytes, place: int) -> Any:
     if place < 0:
         raise InputError("a place lies before the buffer")
     return struct.unpack_from(kind, data, place)[0]

@@ -19,8 +19,8 @@ from numpy.typing import NDArray
 from dase.errors import InputError
 from dase.events import Events
 from dase.io import rules
-from dase.io.sequence import Sequence, Writer, reading
-from dase.io.source import Beside, Motion, Picture, Piece, Size, Source, checked_size, guess_size, join
+from dase.io.sequence import Sequence, Writer, reading_file
+from dase.io.source import Beside, Motion, Picture, Piece, Size, Source, checked_size, guess_size, join_pieces
 
 LIMIT = 4 << 30  # [bytes] of frames, or of flow, taken into memory
 
@@ -94,24 +94,24 @@ class _Reader:
     ticks: float
 
     def read(self, source: Source) -> Sequence:
-        with reading(source.path, self.name):
+        with reading_file(source.path, self.name):
             size = self._sensor(source)
-            frames = taken(_fitting(source, self.pictures(source), size))
-            return _read(source, self.pieces(source), frames, size, self.ticks)
+            frames = collect_pictures(_keep_fitting(source, self.pictures(source), size))
+            return _read_whole(source, self.pieces(source), frames, size, self.ticks)
 
     def stream(self, source: Source, chunk: int) -> Iterator[Events]:
-        with reading(source.path, self.name):
-            yield from _stream(source, self.pieces(source), self._sensor(source), self.ticks, chunk)
+        with reading_file(source.path, self.name):
+            yield from _stream_events(source, self.pieces(source), self._sensor(source), self.ticks, chunk)
 
     def shown(self, source: Source) -> Iterator[Picture]:
-        with reading(source.path, self.name):
+        with reading_file(source.path, self.name):
             size, zero = self._sensor(source), None
-            for picture in _fitting(source, self.pictures(source), size):
+            for picture in _keep_fitting(source, self.pictures(source), size):
                 zero = self._begin(source, size, np.array([picture.t])) if zero is None else zero
                 yield picture._replace(t=(picture.t - zero) / self.ticks)
 
     def moved(self, source: Source) -> Motion | None:
-        with reading(source.path, self.name):
+        with reading_file(source.path, self.name):
             found = self.motion(source)
             if found is None:
                 return None
@@ -127,16 +127,16 @@ class _Reader:
         return checked_size(known)
 
     def _extent(self, source: Source) -> Size:
-        return largest(self.pieces(source))
+        return find_extent(self.pieces(source))
 
     def _begin(self, source: Source, size: Size, without_events: NDArray[Any]) -> Any:
         """Return the tick of time zero: of the first event, else of these times."""
-        settled = rules.settled(source, self.pieces(source), size, self.ticks)
-        first = next((piece.t for piece in rules.ordered(source, settled, self.ticks)), without_events)
-        return rules.origin(source, first, self.ticks)
+        settled = rules.settle_pieces(source, self.pieces(source), size, self.ticks)
+        first = next((piece.t for piece in rules.order_pieces(source, settled, self.ticks)), without_events)
+        return rules.find_origin(source, first, self.ticks)
 
 
-def _fitting(source: Source, pictures: Iterable[Picture], size: Size) -> Iterator[Picture]:
+def _keep_fitting(source: Source, pictures: Iterable[Picture], size: Size) -> Iterator[Picture]:
     """Pass on the pictures that are as large as the sensor; note the others."""
     for picture in pictures:
         if picture.grey.shape != size[::-1]:
@@ -150,17 +150,17 @@ def _fitting(source: Source, pictures: Iterable[Picture], size: Size) -> Iterato
         yield picture
 
 
-def _read(
+def _read_whole(
     source: Source, pieces: Iterable[Piece], pictures: list[Picture], size: Size, ticks: float
 ) -> Sequence:
-    piece = rules.by_time(source, join(list(rules.settled(source, pieces, size, ticks))), ticks)
+    piece = rules.by_time(source, join_pieces(list(rules.settle_pieces(source, pieces, size, ticks))), ticks)
     times = np.array([picture.t for picture in pictures])
-    zero = rules.origin(source, piece.t if len(piece.t) else times, ticks)
+    zero = rules.find_origin(source, piece.t if len(piece.t) else times, ticks)
     events = Events((piece.t - zero) / ticks, piece.x, piece.y, piece.p, *size, piece.label)
     return sequence_of(events, pictures, zero, ticks)
 
 
-def taken(pictures: Iterable[Picture]) -> list[Picture]:
+def collect_pictures(pictures: Iterable[Picture]) -> list[Picture]:
     """Return pictures of one size; raises InputError where they differ or fill the memory."""
     out: list[Picture] = []
     total = 0
@@ -208,21 +208,21 @@ def sequence_of(events: Events, pictures: list[Picture], begin: Any = 0, ticks: 
     )
 
 
-def _stream(
+def _stream_events(
     source: Source, pieces: Iterable[Piece], size: Size, ticks: float, chunk: int
 ) -> Iterator[Events]:
     if chunk < 1:
         raise InputError(f"chunk must be at least 1 event, got {chunk}")
     zero = None
-    settled = rules.settled(source, pieces, size, ticks)
-    for piece in _cut(rules.ordered(source, settled, ticks), chunk):
-        zero = rules.origin(source, piece.t, ticks) if zero is None else zero
+    settled = rules.settle_pieces(source, pieces, size, ticks)
+    for piece in _cut_chunks(rules.order_pieces(source, settled, ticks), chunk):
+        zero = rules.find_origin(source, piece.t, ticks) if zero is None else zero
         yield Events((piece.t - zero) / ticks, piece.x, piece.y, piece.p, *size, piece.label)
     if zero is None:
         yield Events.empty(*size)
 
 
-def _cut(pieces: Iterable[Piece], chunk: int) -> Iterator[Piece]:
+def _cut_chunks(pieces: Iterable[Piece], chunk: int) -> Iterator[Piece]:
     """Cut and join pieces to exactly `chunk` events; the last may be shorter."""
     waiting: list[Piece] = []
     missing = chunk
@@ -230,16 +230,16 @@ def _cut(pieces: Iterable[Piece], chunk: int) -> Iterator[Piece]:
         while len(piece.t) >= missing:
             waiting.append(piece.take(slice(missing)))
             piece = piece.take(slice(missing, None))
-            yield join(waiting)
+            yield join_pieces(waiting)
             waiting, missing = [], chunk
         if len(piece.t):
             waiting.append(piece)
             missing -= len(piece.t)
     if waiting:
-        yield join(waiting)
+        yield join_pieces(waiting)
 
 
-def largest(pieces: Iterable[Piece]) -> Size:
+def find_extent(pieces: Iterable[Piece]) -> Size:
     """Return one more than the largest column and row."""
     width = height = 1
     for piece in pieces:

@@ -19,8 +19,8 @@ from numpy.typing import NDArray
 from dase.errors import InputError
 from dase.events import Events
 from dase.io.format import LIMIT, Format
-from dase.io.image_files import SUFFIXES, head, unpack
-from dase.io.sequence import GREYS, Sequence, reading
+from dase.io.image_files import SUFFIXES, decode_bytes, head_size
+from dase.io.sequence import GREYS, Sequence, reading_file
 from dase.io.source import Picture, Source, checked_size, refuse_bomb
 
 if TYPE_CHECKING:
@@ -32,23 +32,23 @@ FRAMES_RATIO = 1000
 a video repeat each other. Moving scenes stay far below."""
 
 
-def grey(data: bytes, name: str) -> NDArray[Any]:
+def decode_grey(data: bytes, name: str) -> NDArray[Any]:
     """Decode a picture to grey of 8 or 16 bits, (H, W); raises InputError where it is damaged or huge."""
     import cv2
 
     try:
-        size = head(data)
+        size = head_size(data)
         if size is not None:
             checked_size(size)
     except InputError as error:
         raise InputError(f"{name}: {error}") from None
-    out = None if size is None else unpack(data, cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH)
+    out = None if size is None else decode_bytes(data, cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH)
     if out is None or out.dtype not in GREYS:
         raise InputError(f"{name}: cannot be decoded as a picture of 8 or 16 bits, damaged or cut short")
     return np.asarray(out)
 
 
-def matches(path: Path, begin: bytes) -> bool:
+def matches_format(path: Path, begin: bytes) -> bool:
     """Whether a file is a video, or a folder holds pictures."""
     if path.is_dir():
         return any(entry.suffix.lower()[1:] in SUFFIXES for entry in path.iterdir())
@@ -56,14 +56,14 @@ def matches(path: Path, begin: bytes) -> bool:
     return avi or begin[4:8] == b"ftyp" or begin.startswith(b"\x1aE\xdf\xa3")
 
 
-def pictures(source: Source) -> Iterator[Picture]:
+def read_pictures(source: Source) -> Iterator[Picture]:
     """Yield the frames; times [s] are not a number where nothing tells them."""
-    reader = _reader(source)
-    for levels, time in zip(reader.levels(), _times(source, reader), strict=True):
+    reader = _open_reader(source)
+    for levels, time in zip(reader.levels(), _frame_times(source, reader), strict=True):
         yield Picture(levels, time)
 
 
-def _reader(source: Source) -> FrameReader:
+def _open_reader(source: Source) -> FrameReader:
     from dase.io.video_file import FrameReader
 
     reader = FrameReader(source.path)
@@ -71,17 +71,17 @@ def _reader(source: Source) -> FrameReader:
     return reader
 
 
-def _shown(source: Source) -> Iterator[Picture]:
-    with reading(source.path, "frames"):
-        yield from pictures(source)
+def _stream_pictures(source: Source) -> Iterator[Picture]:
+    with reading_file(source.path, "frames"):
+        yield from read_pictures(source)
 
 
 def read(source: Source) -> Sequence:
     """Read all frames; times are None where nothing tells them."""
-    with reading(source.path, "frames"):
-        reader = _reader(source)
+    with reading_file(source.path, "frames"):
+        reader = _open_reader(source)
         _refuse_many(reader)
-        times = _times(source, reader)
+        times = _frame_times(source, reader)
         frames = np.empty(reader.shape, np.uint8)  # filled as they come: none is there twice
         coming = reader.levels()
         for k in range(len(frames)):
@@ -105,18 +105,18 @@ def _refuse_many(reader: FrameReader) -> None:
         raise InputError(why) from None
 
 
-def _times(source: Source, reader: FrameReader) -> NDArray[np.float64]:
+def _frame_times(source: Source, reader: FrameReader) -> NDArray[np.float64]:
     """Return the times of the frames [s], not a number where nothing tells them, which is noted."""
     listed = source.path / "timestamps.txt"
     if source.path.is_dir() and listed.is_file():
-        return _listed(listed, len(reader))
+        return _listed_times(listed, len(reader))
     if 0 < reader.rate < 1e7:
         return np.arange(len(reader)) / reader.rate
     source.note("nothing tells the times of the frames", "assumed", "frames")
     return np.full(len(reader), np.nan)
 
 
-def _listed(path: Path, count: int) -> NDArray[np.float64]:
+def _listed_times(path: Path, count: int) -> NDArray[np.float64]:
     rows = [line.split() for line in path.read_text("latin-1").splitlines() if line.split("#")[0].strip()]
     for k in (0, -1):
         try:
@@ -128,19 +128,19 @@ def _listed(path: Path, count: int) -> NDArray[np.float64]:
     raise InputError(f"{path.name}: needs one increasing time for each of the {count} pictures")
 
 
-def stream(source: Source, chunk: int) -> Iterator[Events]:
+def _stream_empty(source: Source, chunk: int) -> Iterator[Events]:
     """Yield the one empty chunk of a file without events."""
-    with reading(source.path, "frames"):
-        shape = _reader(source).shape
+    with reading_file(source.path, "frames"):
+        shape = _open_reader(source).shape
     yield Events.empty(shape[2], shape[1])
 
 
 FORMAT = Format(
     name="frames",
     suffixes=(".avi", ".mp4", ".mov", ".mkv", ".webm"),
-    matches=matches,
+    matches=matches_format,
     read=read,
-    stream=stream,
-    pictures=_shown,
+    stream=_stream_empty,
+    pictures=_stream_pictures,
     keeps=frozenset({"frames"}),
 )

@@ -29,7 +29,7 @@ from dase.errors import InputError
 from dase.events import Events
 from dase.io import columns
 from dase.io.rules import sensor_events
-from dase.io.sequence import GREYS, Grey, Sequence, Writer, coordinates, reading, writing
+from dase.io.sequence import GREYS, Grey, Sequence, Writer, checked_coordinates, reading_file, writing_file
 from dase.io.source import Beside, Piece, Source
 
 CHUNK = 1 << 16  # events; 512 KiB of times fit HDF5's default chunk cache of 1 MiB
@@ -43,10 +43,10 @@ BLOCK = 4 * CHUNK  # events gathered before they are written
 #   gzip-1 + shuffle  4.1 /  6.1          90-115                    355-500
 # lzf would be twice as fast, but reads its hash table uninitialised: the same events give files that differ
 # by some bytes. Smooth flow shrinks by 4.3. Frames do not shrink. Whole chunks go past HDF5's own filter, to
-# ISA-L (`deflated`), which makes the same kind of stream, of about the same size, six to nine times as fast.
+# ISA-L (`deflate_bytes`), which makes the same kind of stream, of about the same size, six to nine times as fast.
 COMPRESSION: dict[str, Any] = {"compression": "gzip", "compression_opts": 1, "shuffle": True}
 
-HEAD = 4  # bytes that `deflated` flushes on their own: enough for a first entry of the hash table, at most 16
+HEAD = 4  # bytes that `deflate_bytes` flushes on their own: enough for a first entry of the hash table, at most 16
 
 LATE = -1  # marks a frame that came after later events had been written
 
@@ -114,7 +114,7 @@ class _Disk:
         self._file.close()
 
 
-def deflated(data: NDArray[np.uint8]) -> bytes:
+def deflate_bytes(data: NDArray[np.uint8]) -> bytes:
     """Return a zlib stream of `data`, shape (N,); the same data give the same bytes in every process.
 
     ISA-L 2.32 for x86-64 enters the third position of a stream in its hash table under the hash of an address
@@ -132,7 +132,7 @@ def put_chunk(dataset: h5py.Dataset, place: int | tuple[int, ...], values: NDArr
     """Write one whole chunk of a dataset, filtered as `COMPRESSION` says: shuffled, then deflated."""
     # the first bytes of all numbers, then the second ones, and so on
     planes = values.reshape(-1).view(np.uint8).reshape(-1, values.itemsize).T
-    packed = deflated(np.ascontiguousarray(planes).reshape(-1))
+    packed = deflate_bytes(np.ascontiguousarray(planes).reshape(-1))
     dataset.id.write_direct_chunk(place if isinstance(place, tuple) else (place,), packed)
 
 
@@ -267,24 +267,24 @@ class _Writer(Writer):
 
 def create(path: Path) -> AbstractContextManager[Writer]:
     """Open an HDF5 file for writing; it appears under its name when the block ends well."""
-    return writing(path, _Writer)
+    return writing_file(path, _Writer)
 
 
 def read(source: Source) -> Sequence:
     """Read an HDF5 file of the S2R layout; raises InputError where it is damaged or incomplete."""
-    with reading(source.path, "HDF5"), h5py.File(source.path, "r") as file:
-        return _parse(source, file)
+    with reading_file(source.path, "HDF5"), h5py.File(source.path, "r") as file:
+        return _parse_file(source, file)
 
 
-def _parse(source: Source, file: Any) -> Sequence:
-    t, x, y, p = (_dataset(file, f"events/{name}")[:] for name in EVENT_TYPES)
+def _parse_file(source: Source, file: Any) -> Sequence:
+    t, x, y, p = (_require_dataset(file, f"events/{name}")[:] for name in EVENT_TYPES)
     label = file["events/labels"][:] if "events/labels" in file else None
-    images, flows = members(file, "images"), members(file, "flow")
-    frames = _stack(images, GREYS, 2) if images else None
-    flow = _flow(images, flows)
+    images, flows = numbered_members(file, "images"), numbered_members(file, "flow")
+    frames = _stack_members(images, GREYS, 2) if images else None
+    flow = _stack_flow(images, flows)
     exposure = np.array([exposure_of(image) for image in images.values()])
     size = columns.size_attribute(file, "sensor_resolution")
-    x, y = coordinates(x, "events/xs"), coordinates(y, "events/ys")
+    x, y = checked_coordinates(x, "events/xs"), checked_coordinates(y, "events/ys")
     found = sensor_events(
         source,
         Piece(t.astype(np.float64, copy=False), x, y, p, label),
@@ -292,17 +292,17 @@ def _parse(source: Source, file: Any) -> Sequence:
         maps=(frames, flow, file.get("dase/thresholds")),
     )
     times = np.array([time_of(image) for image in images.values()]) if images else None
-    return Sequence(found, frames, times, flow, *beside(file), exposure if exposure.any() else None)
+    return Sequence(found, frames, times, flow, *read_beside(file), exposure if exposure.any() else None)
 
 
-def beside(file: Any) -> Beside:
+def read_beside(file: Any) -> Beside:
     """Return the thresholds and the configuration."""
     thresholds = file["dase/thresholds"][:].astype(np.float32) if "dase/thresholds" in file else None
-    configuration = columns.attribute(file["dase"], "configuration") if "dase" in file else None
+    configuration = columns.read_attribute(file["dase"], "configuration") if "dase" in file else None
     return thresholds, None if configuration is None else str(configuration)
 
 
-def _dataset(file: Any, name: str) -> Any:
+def _require_dataset(file: Any, name: str) -> Any:
     if name not in file:
         raise InputError(f"has no '{name}'")
     return file[name]
@@ -310,7 +310,7 @@ def _dataset(file: Any, name: str) -> Any:
 
 def time_of(image: Any) -> float:
     """Return the time of an image or flow [s]; raises InputError where there is none."""
-    value = columns.attribute(image, "timestamp")
+    value = columns.read_attribute(image, "timestamp")
     if value is None:
         raise InputError(f"'{image.name}' has no attribute 'timestamp'")
     return float(value)
@@ -318,26 +318,26 @@ def time_of(image: Any) -> float:
 
 def exposure_of(image: Any) -> float:
     """Return the duration of the exposure of an image [s], 0 where it was taken in an instant."""
-    value = columns.attribute(image, "exposure")
+    value = columns.read_attribute(image, "exposure")
     return 0.0 if value is None else float(value)
 
 
-def members(file: Any, group: str) -> dict[str, Any]:
+def numbered_members(file: Any, group: str) -> dict[str, Any]:
     """Return datasets of a group by the nine digits that end their names, in their order."""
     return {name[-9:]: file[group][name] for name in sorted(file[group])} if group in file else {}
 
 
-def _stack(members: dict[str, Any], kinds: tuple[type[Any], ...], ndim: int) -> NDArray[Any]:
+def _stack_members(members: dict[str, Any], kinds: tuple[type[Any], ...], ndim: int) -> NDArray[Any]:
     first = next(iter(members.values()))
     out = np.empty((len(members), *first.shape), first.dtype)
     for index, member in enumerate(members.values()):
         if member.shape != first.shape or member.dtype != first.dtype:
             raise InputError(f"'{member.name}' must be {first.dtype} of shape {first.shape} like the first")
-        out[index] = checked(member, kinds, ndim)
+        out[index] = checked_member(member, kinds, ndim)
     return out
 
 
-def checked(member: Any, kinds: tuple[type[Any], ...], ndim: int) -> NDArray[Any]:
+def checked_member(member: Any, kinds: tuple[type[Any], ...], ndim: int) -> NDArray[Any]:
     """Return what a dataset holds; raises InputError where it is of another type or number of axes."""
     if member.ndim != ndim or member.dtype not in kinds:
         names = " or ".join(np.dtype(kind).name for kind in kinds)
@@ -345,11 +345,11 @@ def checked(member: Any, kinds: tuple[type[Any], ...], ndim: int) -> NDArray[Any
     return np.asarray(member[:])
 
 
-def _flow(images: dict[str, Any], flows: dict[str, Any]) -> NDArray[np.float32] | None:
+def _stack_flow(images: dict[str, Any], flows: dict[str, Any]) -> NDArray[np.float32] | None:
     """Flow of every image, shape (F, 2, H, W); not a number where an image has none."""
     if not flows:
         return None
-    stacked = _stack(flows, (np.float32,), 3)
+    stacked = _stack_members(flows, (np.float32,), 3)
     if not images or list(images) == list(flows):
         return stacked
     out = np.full((len(images), *stacked.shape[1:]), np.nan, np.float32)

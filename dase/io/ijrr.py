@@ -24,7 +24,7 @@ from dase.events import Events
 from dase.io import frames, text
 from dase.io.binary import EventWriter
 from dase.io.format import LIMIT, camera_format
-from dase.io.sequence import Writer, writing
+from dase.io.sequence import Writer, writing_file
 from dase.io.source import Picture, Piece, Size, Source, refuse_bomb
 
 EVENTS, IMAGES = "events.txt", "images.txt"
@@ -41,7 +41,7 @@ class _Place:
     def __init__(self, path: Path) -> None:
         self.zip = zipfile.ZipFile(path) if path.is_file() and zipfile.is_zipfile(path) else None
         if self.zip is not None:
-            name = _member(self.zip)
+            name = _events_member(self.zip)
             self.folder: Path | PurePosixPath = PurePosixPath(name).parent
             self.events = PurePosixPath(name).name
         elif path.is_dir():
@@ -89,7 +89,7 @@ def _check_name(name: str) -> None:
         raise InputError(f"'{name}' leads out of the folder")
 
 
-def _member(archive: zipfile.ZipFile) -> str:
+def _events_member(archive: zipfile.ZipFile) -> str:
     """Return the name of the text with the events."""
     texts = [
         name for name in archive.namelist() if name.lower().endswith(SUFFIXES) and "__MACOSX" not in name
@@ -102,26 +102,26 @@ def _member(archive: zipfile.ZipFile) -> str:
     return found[0]
 
 
-def pieces(source: Source) -> Iterator[Piece]:
+def read_pieces(source: Source) -> Iterator[Piece]:
     """Yield the events [s]."""
     with _Place(source.path) as place:
-        yield from text.decode(lambda: place.open(place.events))
+        yield from text.decode_text(lambda: place.open(place.events))
 
 
-def size(source: Source) -> Size | None:
+def read_size(source: Source) -> Size | None:
     """Return the size that the text or the first frame tells, or None."""
     with _Place(source.path) as place:
         with place.open(place.events) as file:
             known = text.Layout(file.read(text.HEAD)).size
-        if known is None and (listed := _listed(place)):
+        if known is None and (listed := _listed_frames(place)):
             first = place.read(listed[0][1], LIMIT)
             if first is not None:
-                height, width = frames.grey(first, listed[0][1]).shape
+                height, width = frames.decode_grey(first, listed[0][1]).shape
                 return width, height
         return known
 
 
-def _listed(place: _Place) -> list[tuple[float, str]]:
+def _listed_frames(place: _Place) -> list[tuple[float, str]]:
     """Return time [s] and name of the frames beside events.txt."""
     content = place.read(IMAGES, MOST_TEXT) if place.events == EVENTS else None
     out = []
@@ -136,10 +136,10 @@ def _listed(place: _Place) -> list[tuple[float, str]]:
     return out
 
 
-def pictures(source: Source) -> Iterator[Picture]:
+def read_pictures(source: Source) -> Iterator[Picture]:
     """Yield the frames that images.txt lists [s]; none where one of them is missing."""
     with _Place(source.path) as place:
-        listed = _listed(place)
+        listed = _listed_frames(place)
         times = np.array([time for time, _ in listed])
         if not np.all(np.isfinite(times)) or np.any(np.diff(times) < 0):
             raise InputError(f"{IMAGES}: times of frames must be finite and must not go back")
@@ -148,14 +148,14 @@ def pictures(source: Source) -> Iterator[Picture]:
             sentence = f"{IMAGES} lists '{missing}', which is missing: frames left out"
             return source.note(sentence, "refused", "frames", len(listed))
         for time, name in listed:
-            yield Picture(frames.grey(place.read(name, LIMIT) or b"", name), time)
+            yield Picture(frames.decode_grey(place.read(name, LIMIT) or b"", name), time)
 
 
 def matches_text(path: Path, head: bytes) -> bool:
     """Whether a file or folder holds events as text."""
     if path.is_dir():
         return (path / EVENTS).is_file()
-    return text.matches(head)
+    return text.matches_head(head)
 
 
 def matches_zip(path: Path, head: bytes) -> bool:
@@ -183,7 +183,7 @@ class _Writer(EventWriter):
 
     def _encoded(self, part: Events, t_us: NDArray[np.int64]) -> bytes:
         slices = (slice(i, i + PART) for i in range(0, len(part), PART))
-        return b"".join(text.encode(part.t[k], part.x[k], part.y[k], part.p[k]) for k in slices)
+        return b"".join(text.encode_events(part.t[k], part.x[k], part.y[k], part.p[k]) for k in slices)
 
 
 class _ZipWriter(_Writer):
@@ -216,24 +216,24 @@ class _ZipWriter(_Writer):
                 part.close()
 
 
-def create(path: Path) -> AbstractContextManager[Writer]:
+def create_text(path: Path) -> AbstractContextManager[Writer]:
     """Open a text for writing; it appears under its name when the block ends well."""
-    return writing(path, _Writer)
+    return writing_file(path, _Writer)
 
 
 def create_zip(path: Path) -> AbstractContextManager[Writer]:
     """Open a zip of a text for writing; it appears under its name when the block ends well."""
-    return writing(path, _ZipWriter)
+    return writing_file(path, _ZipWriter)
 
 
 TEXT = camera_format(
     name="text",
     suffixes=SUFFIXES,
-    create=create,
+    create=create_text,
     matches=matches_text,
-    pieces=pieces,
-    size=size,
-    pictures=pictures,
+    pieces=read_pieces,
+    size=read_size,
+    pictures=read_pictures,
     ticks=1.0,
 )
 ZIPPED = camera_format(
@@ -241,8 +241,8 @@ ZIPPED = camera_format(
     suffixes=(".zip",),
     create=create_zip,
     matches=matches_zip,
-    pieces=pieces,
-    size=size,
-    pictures=pictures,
+    pieces=read_pieces,
+    size=read_size,
+    pictures=read_pictures,
     ticks=1.0,
 )

@@ -45,7 +45,7 @@ def to_grey(pixels: NDArray[Any]) -> tuple[NDArray[np.float32], NDArray[np.float
     alpha = planes.pop() / full if len(planes) in (2, 4) else None
     weights = (0.07, 0.72, 0.21) if len(planes) == 3 else (1.0,)  # of BGR; S2R takes luma for intensity
     grey = np.zeros(planes[0].shape, np.float32)
-    for band in _bands(grey.shape):
+    for band in _row_bands(grey.shape):
         for weight, plane in zip(weights, planes, strict=True):
             grey[band] += np.float32(weight) / full * plane[band]
     return grey, alpha
@@ -58,24 +58,24 @@ def to_levels(pixels: NDArray[Any]) -> NDArray[np.uint8]:
         pixels: (H, W) or (H, W, channels), uint8 or uint16, BGR or BGRA.
     """
     out = np.empty(pixels.shape[:2], np.uint8)
-    for band in _bands(pixels.shape):
+    for band in _row_bands(pixels.shape):
         out[band] = np.rint(255 * to_grey(pixels[band])[0])
     return out
 
 
-def _bands(shape: tuple[int, ...]) -> Iterator[slice]:
+def _row_bands(shape: tuple[int, ...]) -> Iterator[slice]:
     rows = max(1, BAND // max(1, shape[1]))
     return (slice(top, top + rows) for top in range(0, shape[0], rows))
 
 
-def decode(path: Path) -> NDArray[Any]:
+def decode_file(path: Path) -> NDArray[Any]:
     """Return pixels as they are in the file: (H, W) or (H, W, channels), uint8 or uint16, BGR or BGRA."""
     try:
         data = path.read_bytes()
     except OSError as error:
         raise InputError(f"images: cannot read '{path}': {error.strerror}") from error
     try:
-        pixels = None if head(data) is None else unpack(data, cv2.IMREAD_UNCHANGED)
+        pixels = None if head_size(data) is None else decode_bytes(data, cv2.IMREAD_UNCHANGED)
     except InputError as error:
         raise InputError(f"images: cannot decode '{path}': {error}") from None
     if pixels is None:
@@ -85,7 +85,7 @@ def decode(path: Path) -> NDArray[Any]:
     return np.asarray(pixels)
 
 
-def head(data: bytes) -> tuple[int, int] | None:
+def head_size(data: bytes) -> tuple[int, int] | None:
     """Return columns and rows of a picture as its head tells them, None where it is damaged.
 
     Nothing is decoded. Raises InputError where a small file claims a picture of absurd size.
@@ -134,17 +134,17 @@ def _tiff_size(data: bytes) -> tuple[int, int] | None:
         return None
 
 
-def unpack(data: bytes, how: int) -> NDArray[Any] | None:
+def decode_bytes(data: bytes, how: int) -> NDArray[Any] | None:
     """Return what OpenCV makes of the bytes of a picture, None where it is damaged.
 
     Args:
         data: The content of a file.
         how: Flags of `cv2.imdecode`.
     """
-    if data.startswith(PNG) and not _whole(data):
+    if data.startswith(PNG) and not _is_whole_png(data):
         return None  # OpenCV 5 takes as much memory as a part says it is long
     try:
-        with quiet():
+        with quiet_opencv():
             pixels: NDArray[Any] | None = cv2.imdecode(np.frombuffer(data, np.uint8), how)
     except cv2.error:  # an empty file, or more pixels than OpenCV takes
         return None
@@ -152,7 +152,7 @@ def unpack(data: bytes, how: int) -> NDArray[Any] | None:
 
 
 @contextmanager
-def quiet() -> Iterator[None]:
+def quiet_opencv() -> Iterator[None]:
     """Keep OpenCV from writing about damaged files to the terminal: our sentence is enough."""
     level = cv2.utils.logging.getLogLevel()
     cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
@@ -162,7 +162,7 @@ def quiet() -> Iterator[None]:
         cv2.utils.logging.setLogLevel(level)
 
 
-def _whole(data: bytes) -> bool:
+def _is_whole_png(data: bytes) -> bool:
     """Whether all parts of a PNG are there: u32 length, 4 letters, content, u32 sum; the last is IEND."""
     place = len(PNG)
     while place + 12 <= len(data):

@@ -26,7 +26,7 @@ from numpy.typing import ArrayLike, NDArray
 from dase.errors import InputError
 from dase.events import Events
 from dase.io.rules import sensor_events
-from dase.io.sequence import GREYS, Grey, Sequence, Writer, coordinates, reading, writing
+from dase.io.sequence import GREYS, Grey, Sequence, Writer, checked_coordinates, reading_file, writing_file
 from dase.io.source import Beside, Piece, Source
 
 # Deflate level 1 takes 7.2 M events of a DAVIS240C from 9.0 to 2.8 bytes each, writing 10 M and reading
@@ -56,7 +56,7 @@ class _Writer(Writer):
         path.touch()  # so that a folder without permission is noticed before the work
 
     def _put_events(self, part: Events) -> None:
-        self._parts.append(_columns(part))
+        self._parts.append(_event_columns(part))
         if part.label is not None:
             self._labels.append(part.label.astype(np.int8))
 
@@ -69,8 +69,8 @@ class _Writer(Writer):
         exposure: float,
     ) -> None:
         self._images.append(grey.copy())
-        self._begin_us.append(_microseconds(time - exposure / 2))
-        self._end_us.append(_microseconds(time + exposure / 2))
+        self._begin_us.append(_to_microseconds(time - exposure / 2))
+        self._end_us.append(_to_microseconds(time + exposure / 2))
         if flow is not None:
             self._flow.append(flow.astype(np.float32))
 
@@ -83,21 +83,21 @@ class _Writer(Writer):
     def finish(self) -> None:
         """Write the archive."""
         assert self.size is not None
-        parts = [_columns(Events.empty(1, 1)), *self._parts]
+        parts = [_event_columns(Events.empty(1, 1)), *self._parts]
         with zipfile.ZipFile(self._path, "w", zipfile.ZIP_DEFLATED, compresslevel=LEVEL) as archive:
             for name, column in zip(EVENT_KEYS, zip(*parts, strict=True), strict=True):
-                _store(archive, name, np.concatenate(column))
+                _store_member(archive, name, np.concatenate(column))
             if self._with_labels:
-                _store(archive, "label", np.concatenate([np.empty(0, np.int8), *self._labels]))
-            _store(archive, "wh", np.array(self.size[::-1], np.int64))
+                _store_member(archive, "label", np.concatenate([np.empty(0, np.int8), *self._labels]))
+            _store_member(archive, "wh", np.array(self.size[::-1], np.int64))
             if self._images:
-                _store(archive, "frames", np.stack(self._images))
-                _store(archive, "frame_begin_us", np.stack(self._begin_us))
-                _store(archive, "frame_end_us", np.stack(self._end_us))
+                _store_member(archive, "frames", np.stack(self._images))
+                _store_member(archive, "frame_begin_us", np.stack(self._begin_us))
+                _store_member(archive, "frame_end_us", np.stack(self._end_us))
             if self._flow:
-                _store(archive, "flow", np.stack(self._flow))
+                _store_member(archive, "flow", np.stack(self._flow))
             for name, value in self._extra.items():
-                _store(archive, name, value)
+                _store_member(archive, name, value)
 
     def abandon(self) -> None:
         """Let go of the parts."""
@@ -105,12 +105,12 @@ class _Writer(Writer):
         self._labels.clear()
 
 
-def _columns(part: Events) -> tuple[NDArray[Any], ...]:
+def _event_columns(part: Events) -> tuple[NDArray[Any], ...]:
     """Copies of t, x, y and p, each (N,), as the archive holds them."""
-    return _microseconds(part.t), part.x.copy(), part.y.copy(), part.p.astype(np.uint8)
+    return _to_microseconds(part.t), part.x.copy(), part.y.copy(), part.p.astype(np.uint8)
 
 
-def _microseconds(seconds: ArrayLike) -> NDArray[np.int32]:
+def _to_microseconds(seconds: ArrayLike) -> NDArray[np.int32]:
     """Round times [s] to whole microseconds; raises InputError where int32 cannot hold them."""
     out = np.rint(np.asarray(seconds, np.float64) * 1e6)
     if out.size and max(-float(out.min()), float(out.max())) >= 2**31:
@@ -119,7 +119,7 @@ def _microseconds(seconds: ArrayLike) -> NDArray[np.int32]:
     return out.astype(np.int32)
 
 
-def _store(archive: zipfile.ZipFile, name: str, array: NDArray[Any]) -> None:
+def _store_member(archive: zipfile.ZipFile, name: str, array: NDArray[Any]) -> None:
     # a member opened by its name is dated 1980, always: the same content gives the same bytes
     with archive.open(f"{name}.npy", "w", force_zip64=True) as stream:
         np.lib.format.write_array(stream, array, allow_pickle=False)
@@ -130,33 +130,33 @@ def create(path: Path) -> AbstractContextManager[Writer]:
 
     The whole sequence waits in memory until then: use HDF5 for long ones.
     """
-    return writing(path, _Writer)
+    return writing_file(path, _Writer)
 
 
 def read(source: Source) -> Sequence:
     """Read an archive; raises InputError where it is damaged or incomplete. Pickled members are refused."""
-    with reading(source.path, "NumPy archive"), zipfile.ZipFile(source.path) as archive:
+    with reading_file(source.path, "NumPy archive"), zipfile.ZipFile(source.path) as archive:
         known = (name for name in KEYS if f"{name}.npy" in archive.namelist())
-        return _parse(source, {name: load(archive, name) for name in known})
+        return _parse_members(source, {name: load_member(archive, name) for name in known})
 
 
-def load(archive: zipfile.ZipFile, name: str) -> NDArray[Any]:
+def load_member(archive: zipfile.ZipFile, name: str) -> NDArray[Any]:
     """Return a member of the archive; never unpickles."""
     with archive.open(f"{name}.npy") as stream:
         return np.asarray(np.lib.format.read_array(stream, allow_pickle=False))
 
 
-def _parse(source: Source, content: dict[str, NDArray[Any]]) -> Sequence:
+def _parse_members(source: Source, content: dict[str, NDArray[Any]]) -> Sequence:
     frames, flow, thresholds = (content.get(name) for name in ("frames", "flow", "thresholds"))
     if frames is not None and (frames.dtype not in GREYS or frames.ndim != 3):
         raise InputError(f"'frames' must be uint8 or uint16 (F, H, W), got {frames.dtype} {frames.shape}")
     if frames is None and not set(EVENT_KEYS) & set(content):
         raise InputError(NOTHING)
-    events = _events(source, content, (frames, flow, thresholds))
+    events = _parse_events(source, content, (frames, flow, thresholds))
     if flow is not None and frames is None:
         flow = flow / max(float(events.t[-1] - events.t[0]), 1e-6) if len(events) else None
     times, exposure = (None, None) if frames is None else frame_times(content)
-    thresholds, configuration = beside(content)
+    thresholds, configuration = parse_beside(content)
     return Sequence(
         events,
         frames,
@@ -168,7 +168,7 @@ def _parse(source: Source, content: dict[str, NDArray[Any]]) -> Sequence:
     )
 
 
-def beside(content: dict[str, NDArray[Any]]) -> Beside:
+def parse_beside(content: dict[str, NDArray[Any]]) -> Beside:
     """Return the thresholds and the configuration."""
     thresholds, configuration = content.get("thresholds"), content.get("configuration")
     return (
@@ -177,7 +177,7 @@ def beside(content: dict[str, NDArray[Any]]) -> Beside:
     )
 
 
-def _events(
+def _parse_events(
     source: Source, content: dict[str, NDArray[Any]], maps: tuple[NDArray[Any] | None, ...]
 ) -> Events:
     if not set(EVENT_KEYS) & set(content):
@@ -190,7 +190,7 @@ def _events(
     wh = content.get("wh")
     if wh is not None and (wh.shape != (2,) or wh.dtype.kind not in "iu"):
         raise InputError(f"'wh' must be two integers, got {wh.dtype} of shape {wh.shape}")
-    x, y = (coordinates(content[name], name) for name in "xy")
+    x, y = (checked_coordinates(content[name], name) for name in "xy")
     piece = Piece(content["t_us"] / 1e6, x, y, content["p"], content.get("label"))
     return sensor_events(source, piece, size=None if wh is None else (int(wh[0]), int(wh[1])), maps=maps)
 

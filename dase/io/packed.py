@@ -23,7 +23,7 @@ _open_bags = 0
 _originals: list[tuple[Any, Any]] = []
 
 
-def unpacker(make: Callable[[], Any]) -> Callable[[bytes], bytes]:
+def make_unpacker(make: Callable[[], Any]) -> Callable[[bytes], bytes]:
     """Return a function that unpacks bytes with a decompressor that `make` gives, to at most `LARGEST`."""
 
     def unpack(data: bytes) -> bytes:
@@ -36,17 +36,17 @@ def unpacker(make: Callable[[], Any]) -> Callable[[bytes], bytes]:
     return unpack
 
 
-def lz4() -> Any:
+def lz4_decompressor() -> Any:
     """Return a decompressor of LZ4; raises InputError naming the extra where it is not installed."""
-    return _library("lz4.frame").LZ4FrameDecompressor()
+    return _import_first("lz4.frame").LZ4FrameDecompressor()
 
 
-def zstd() -> Any:
+def zstd_decompressor() -> Any:
     """Return a decompressor of Zstandard; raises InputError naming the extra where it is not installed."""
-    return _library("compression.zstd", "backports.zstd").ZstdDecompressor()
+    return _import_first("compression.zstd", "backports.zstd").ZstdDecompressor()
 
 
-def _library(*names: str) -> Any:
+def _import_first(*names: str) -> Any:
     """Return the first of these modules that is installed."""
     for name in names:
         with suppress(ImportError):
@@ -68,10 +68,10 @@ class _Counted:
 
 
 @contextmanager
-def _opened(file: Any, mode: str) -> Iterator[_Counted]:
+def _open_counted(file: Any, mode: str) -> Iterator[_Counted]:
     length = file.seek(0, 2)
     file.seek(0)
-    with _library("compression.zstd", "backports.zstd").open(file, mode) as inner:
+    with _import_first("compression.zstd", "backports.zstd").open(file, mode) as inner:
         yield _Counted(inner, length)
 
 
@@ -83,16 +83,16 @@ def bounded_bags() -> Iterator[None]:
     from rosbags.rosbag2 import reader as rosbag2
     from rosbags.rosbag2 import storage_mcap
 
-    unpack_lz4, unpack_zstd = unpacker(lz4), unpacker(zstd)
+    unpack_lz4, unpack_zstd = make_unpacker(lz4_decompressor), make_unpacker(zstd_decompressor)
     with _lock:
         _open_bags += 1
         if _open_bags == 1:
             tables = (rosbag1.decompressors, storage_mcap.DECOMPRESSORS)
             _originals[:] = [(table, dict(table)) for table in tables]
-            tables[0].update(bz2=unpacker(bz2.BZ2Decompressor), lz4=unpack_lz4)
+            tables[0].update(bz2=make_unpacker(bz2.BZ2Decompressor), lz4=unpack_lz4)
             tables[1].update(lz4=lambda x, _: unpack_lz4(x), zstd=lambda x, _: unpack_zstd(x))
             _originals.append((rosbag2, rosbag2.zstd))
-            rosbag2.zstd = SimpleNamespace(decompress=unpack_zstd, open=_opened)
+            rosbag2.zstd = SimpleNamespace(decompress=unpack_zstd, open=_open_counted)
     try:
         yield
     finally:

@@ -73,7 +73,7 @@ class Header:
         return None
 
 
-def parse(head: bytes) -> Header:
+def parse_header(head: bytes) -> Header:
     """Parse the first bytes of a file; a file without header has length 0."""
     keys: dict[str, str] = {}
     place = 0
@@ -90,16 +90,16 @@ def parse(head: bytes) -> Header:
     return Header(place, keys)
 
 
-def header(source: Source, encoding: str | None = None) -> Header:
+def read_header(source: Source, encoding: str | None = None) -> Header:
     """Read the header of a file; raises InputError where it does not name the encoding."""
     with source.path.open("rb") as file:
-        found = parse(file.read(LONGEST))
+        found = parse_header(file.read(LONGEST))
     if encoding is not None and found.encoding != encoding:
         said = f"names the encoding {found.encoding}" if found.encoding else "does not name its encoding"
         raise InputError(f"its header {said}: EVT2, EVT2.1 and EVT3 are read")
     return found
 
 
-def size(source: Source) -> tuple[int, int] | None:
+def read_size(source: Source) -> tuple[int, int] | None:
     """Return columns and rows as the header tells them, or None."""
-    return header(source).size
+    return read_header(source).size

@@ -27,24 +27,24 @@ MAGICS = (ROS1, b"\x89MCAP0\r\n", b"SQLite format 3\0")
 
 
 @contextmanager
-def _opened(source: Source) -> Iterator[tuple[Any, bool]]:
+def _open_bag(source: Source) -> Iterator[tuple[Any, bool]]:
     """Open a bag; yield rosbags' reader and whether its messages are CDR."""
     try:
         from rosbags import rosbag1, rosbag2
     except ImportError:
         raise missing_extra("a ROS bag", "ros") from None
-    cdr = source.path.is_dir() or not _starts(source.path, ROS1)
+    cdr = source.path.is_dir() or not _starts_with(source.path, ROS1)
     reader: Any = rosbag2.Reader(source.path) if cdr else rosbag1.Reader(source.path)
     with packed.bounded_bags(), reader:
         yield reader, cdr
 
 
-def _starts(path: Path, magic: bytes) -> bool:
+def _starts_with(path: Path, magic: bytes) -> bool:
     with path.open("rb") as file:
         return file.read(len(magic)) == magic
 
 
-def _connections(source: Source, reader: Any, kinds: tuple[str, ...], beside: str = "") -> list[Any]:
+def _find_connections(source: Source, reader: Any, kinds: tuple[str, ...], beside: str = "") -> list[Any]:
     """Return the connections of the first topic of these types; of several the nearest to `beside`."""
     found: dict[str, list[Any]] = {}
     for connection in reader.connections:
@@ -65,19 +65,19 @@ def _connections(source: Source, reader: Any, kinds: tuple[str, ...], beside: st
     return found[topic]
 
 
-def _events(source: Source, reader: Any) -> list[Any]:
-    found = _connections(source, reader, ARRAYS + PACKETS)
+def _event_connections(source: Source, reader: Any) -> list[Any]:
+    found = _find_connections(source, reader, ARRAYS + PACKETS)
     if not found:
         known = sorted(f"{c.topic} ({c.msgtype})" for c in reader.connections)
         raise InputError(f"has no topic of events, only {', '.join(known[:8]) or 'none'}")
     return found
 
 
-def pieces(source: Source) -> Iterator[Piece]:
+def read_pieces(source: Source) -> Iterator[Piece]:
     """Yield the events [ns]."""
-    with _opened(source) as (reader, cdr):
+    with _open_bag(source) as (reader, cdr):
         packets = ros_messages.Packets()
-        for connection, _, data in _messages(source, reader, _events(source, reader)):
+        for connection, _, data in _read_messages(source, reader, _event_connections(source, reader)):
             if connection.msgtype in ARRAYS:
                 yield ros_messages.event_array(data, cdr)
             else:
@@ -86,7 +86,7 @@ def pieces(source: Source) -> Iterator[Piece]:
         packets.evt2.report(source)
 
 
-def _messages(source: Source, reader: Any, connections: list[Any]) -> Iterator[tuple[Any, int, bytes]]:
+def _read_messages(source: Source, reader: Any, connections: list[Any]) -> Iterator[tuple[Any, int, bytes]]:
     """Yield messages; a damaged part ends the bag, which is noted."""
     messages = reader.messages(connections)
     while True:
@@ -101,27 +101,27 @@ def _messages(source: Source, reader: Any, connections: list[Any]) -> Iterator[t
         yield message
 
 
-def size(source: Source) -> Size | None:
+def read_size(source: Source) -> Size | None:
     """Return columns and rows as the first message of events tells them."""
-    with _opened(source) as (reader, cdr):
-        for _, _, data in _messages(source, reader, _events(source, reader)):
+    with _open_bag(source) as (reader, cdr):
+        for _, _, data in _read_messages(source, reader, _event_connections(source, reader)):
             found = ros_messages.dvs_size(data, cdr)
             return found if all(found) else None
     return None
 
 
-def pictures(source: Source) -> Iterator[Picture]:
+def read_pictures(source: Source) -> Iterator[Picture]:
     """Yield the images [ns]."""
-    with _opened(source) as (reader, cdr):
-        connections = _connections(source, reader, IMAGES, _events(source, reader)[0].topic)
+    with _open_bag(source) as (reader, cdr):
+        connections = _find_connections(source, reader, IMAGES, _event_connections(source, reader)[0].topic)
         if not connections:
             return  # rosbags takes none for all
-        for connection, _, data in _messages(source, reader, connections):
-            time, grey = ros_messages.image(data, cdr, connection.msgtype == IMAGES[1])
+        for connection, _, data in _read_messages(source, reader, connections):
+            time, grey = ros_messages.decode_image(data, cdr, connection.msgtype == IMAGES[1])
             yield Picture(grey, time)
 
 
-def matches(path: Path, head: bytes) -> bool:
+def matches_format(path: Path, head: bytes) -> bool:
     """Whether a file is a bag, or a folder the bag of ROS 2."""
     return (path / "metadata.yaml").is_file() if path.is_dir() else head.startswith(MAGICS)
 
@@ -130,9 +130,9 @@ FORMAT = camera_format(
     name="ROS bag",
     suffixes=(".bag", ".mcap", ".db3"),
     extra="ros",
-    matches=matches,
-    pieces=pieces,
-    size=size,
-    pictures=pictures,
+    matches=matches_format,
+    pieces=read_pieces,
+    size=read_size,
+    pictures=read_pictures,
     ticks=1e9,
 )

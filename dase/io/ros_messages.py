@@ -27,8 +27,8 @@ from numpy.typing import NDArray
 
 from dase.errors import InputError
 from dase.io import evt2, evt3, frames
-from dase.io.evt21 import expand
-from dase.io.source import Piece, Size, join
+from dase.io.evt21 import expand_masks
+from dase.io.source import Piece, Size, join_pieces
 
 DVS_EVENT = np.dtype([("x", "<u2"), ("y", "<u2"), ("s", "<u4"), ("ns", "<u4"), ("p", "u1")])
 CDR_EVENT = np.dtype(  # from the second event on: 16 bytes apart, begun 2 bytes past a multiple of 4
@@ -86,7 +86,7 @@ class Message:
         if not self._cdr:
             return _dvs_piece(np.frombuffer(self._data, DVS_EVENT, count, self._place))
         if not count:
-            return join([])
+            return join_pieces([])
         whole = np.frombuffer(self._data + b"\0\0\0", CDR_EVENT, count, self._place - 2)
         first = np.frombuffer(self._data, "<u2", 2, self._place)  # the first is not preceded by a gap
         out = _dvs_piece(whole)
@@ -150,21 +150,21 @@ class Packets:
 
     def _decoded(self, encoding: str, data: bytes, base: int) -> Iterator[Piece]:
         if encoding == "evt3":
-            for piece in self.evt3(_words(data, "<u2")):
+            for piece in self.evt3(_as_words(data, "<u2")):
                 yield piece._replace(t=piece.t * 1000)
         elif encoding == "evt2":
-            for piece in self.evt2(_words(data, "<u4")):
+            for piece in self.evt2(_as_words(data, "<u4")):
                 yield piece._replace(t=piece.t * 1000)
         elif encoding == "evt21":
-            halves = _words(data, "<u8").view("<u4").reshape(-1, 2)
+            halves = _as_words(data, "<u8").view("<u4").reshape(-1, 2)
             at, piece = self.evt2.part(halves[:, 1])
-            yield from expand(piece._replace(t=piece.t * 1000), halves[at, 0])
+            yield from expand_masks(piece._replace(t=piece.t * 1000), halves[at, 0])
         elif encoding == "mono":
-            yield _mono(_words(data, "<u8"), base)
+            yield _decode_mono(_as_words(data, "<u8"), base)
         elif encoding == "libcaer":
-            yield _libcaer(_words(data, "<u8"), base)
+            yield _decode_libcaer(_as_words(data, "<u8"), base)
         elif encoding == "libcaer_cmp":
-            yield from self._libcaer_cmp(_words(data, "<u2"), base)
+            yield from self._libcaer_cmp(_as_words(data, "<u2"), base)
         else:
             raise InputError(f"events are encoded as '{encoding}', known: {', '.join(ENCODINGS)}")
 
@@ -175,30 +175,30 @@ class Packets:
             yield Piece((piece.t + base) * 1000, piece.y, piece.x, piece.p)
 
 
-def _words(data: bytes, kind: str) -> NDArray[Any]:
+def _as_words(data: bytes, kind: str) -> NDArray[Any]:
     return np.frombuffer(data, kind, len(data) // np.dtype(kind).itemsize)
 
 
-def _mono(words: NDArray[np.uint64], base: int) -> Piece:
+def _decode_mono(words: NDArray[np.uint64], base: int) -> Piece:
     t = (words & 0xFFFFFFFF).astype(np.int64) + base
     x, y = (((words >> shift) & mask).astype(np.uint16) for shift, mask in ((32, 0xFFFF), (48, 0x7FFF)))
     return Piece(t, x, y, words >> 63 > 0)
 
 
-def _libcaer(words: NDArray[np.uint64], base: int) -> Piece:
+def _decode_libcaer(words: NDArray[np.uint64], base: int) -> Piece:
     valid = words[(words & 1) > 0]
     t = (valid >> 32).astype(np.int64) * 1000 + base
     y, x = (((valid >> shift) & 0x7FFF).astype(np.uint16) for shift in (2, 17))
     return Piece(t, x, y, valid & 2 > 0)
 
 
-def image(data: bytes, cdr: bool, compressed: bool) -> tuple[int, NDArray[Any]]:
+def decode_image(data: bytes, cdr: bool, compressed: bool) -> tuple[int, NDArray[Any]]:
     """Return the time [ns] and the grey values of 8 or 16 bits (H, W) of an Image or a CompressedImage."""
     message = Message(data, cdr)
     time = message.stamp()
     if compressed:
         message.text()
-        return time, frames.grey(message.bytes(), "a compressed image")
+        return time, frames.decode_grey(message.bytes(), "a compressed image")
     height, width = message.number("I"), message.number("I")
     encoding, swapped, step = message.text(), message.number("B"), message.number("I")
     pixels = message.bytes()

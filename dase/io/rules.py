@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from dase.errors import InputError
 from dase.events import LABELS, Events
-from dase.io.source import Piece, Size, Source, join
+from dase.io.source import Piece, Size, Source, join_pieces
 
 LATENESS = 0.1  # [s] an event may come this much after later ones and still be put in its place
 DATE = 1e8  # [s] first times beyond three years are dates: such a file counts from its first event instead
@@ -34,12 +34,12 @@ class TooLateError(InputError):
     """Events come too late to be sorted in a stream; the whole file can be sorted."""
 
 
-def settled(source: Source, pieces: Iterable[Piece], size: Size, ticks: float) -> Iterator[Piece]:
+def settle_pieces(source: Source, pieces: Iterable[Piece], size: Size, ticks: float) -> Iterator[Piece]:
     """Pass on pieces with what can be put right at once: polarity, wraps, bounds; not yet the order."""
-    return inside(source, _unwrapped(source, _polarised(source, pieces), ticks), size)
+    return keep_inside(source, _unwrap_clock(source, _settle_polarity(source, pieces), ticks), size)
 
 
-def _polarised(source: Source, pieces: Iterable[Piece]) -> Iterator[Piece]:
+def _settle_polarity(source: Source, pieces: Iterable[Piece]) -> Iterator[Piece]:
     """Turn numbers into ON and OFF, and check labels."""
     for piece in pieces:
         if piece.label is not None:
@@ -63,7 +63,7 @@ def _labels(label: NDArray[Any]) -> NDArray[np.int8]:
     return label.astype(np.int8, copy=False)
 
 
-def _unwrapped(source: Source, pieces: Iterable[Piece], ticks: float) -> Iterator[Piece]:
+def _unwrap_clock(source: Source, pieces: Iterable[Piece], ticks: float) -> Iterator[Piece]:
     """Continue times that fall from near the top of a 32-bit clock to near its bottom; float or whole.
 
     A single step up again undoes it: the clock of late events has not yet started over.
@@ -81,9 +81,9 @@ def _unwrapped(source: Source, pieces: Iterable[Piece], ticks: float) -> Iterato
         jump = 0.7 * (1 << 31) * ticks / 1e6
         if turns or max(before, float(t.max())) - float(t.min()) > jump:
             earlier = np.concatenate((np.array([before]), t[:-1].astype(np.float64)))
-            clock = clock or _clock(earlier, t.astype(np.float64), ticks)
+            clock = clock or _find_clock(earlier, t.astype(np.float64), ticks)
             if clock is not None:
-                steps = _turns(earlier, t.astype(np.float64), clock)
+                steps = _clock_turns(earlier, t.astype(np.float64), clock)
                 count += int(np.count_nonzero(steps > 0))
                 level = turns + np.cumsum(steps)
                 level -= np.minimum(np.minimum.accumulate(level), 0)  # nothing comes before the first turn
@@ -100,18 +100,18 @@ def _unwrapped(source: Source, pieces: Iterable[Piece], ticks: float) -> Iterato
         )
 
 
-def _clock(
+def _find_clock(
     before: NDArray[np.float64], after: NDArray[np.float64], ticks: float
 ) -> tuple[float, float] | None:
     """Return least value and range [ticks] of the clock that started over between these times, or None."""
     for least, span in CLOCKS:
         clock = (least * ticks / 1e6, span * ticks / 1e6)
-        if np.any(_turns(before, after, clock) > 0):
+        if np.any(_clock_turns(before, after, clock) > 0):
             return clock
     return None
 
 
-def _turns(
+def _clock_turns(
     before: NDArray[np.float64], after: NDArray[np.float64], clock: tuple[float, float]
 ) -> NDArray[np.int64]:
     """Return 1 where a clock started over between two times, -1 where it went back over its start, else 0."""
@@ -122,7 +122,7 @@ def _turns(
     return down.astype(np.int64) - up
 
 
-def inside(source: Source, pieces: Iterable[Piece], size: Size) -> Iterator[Piece]:
+def keep_inside(source: Source, pieces: Iterable[Piece], size: Size) -> Iterator[Piece]:
     """Pass on the events that lie on the sensor; note how many did not.
 
     Raises:
@@ -172,7 +172,7 @@ def in_order(t: NDArray[Any]) -> bool:
     return bool(np.all(t[1:] >= t[:-1]))
 
 
-def ordered(source: Source, pieces: Iterable[Piece], ticks: float) -> Iterator[Piece]:
+def order_pieces(source: Source, pieces: Iterable[Piece], ticks: float) -> Iterator[Piece]:
     """Pass on pieces sorted by time; each waits until nothing is expected to come before its end."""
     held: deque[Piece] = deque()
     newest = done = last = -np.inf
@@ -190,7 +190,7 @@ def ordered(source: Source, pieces: Iterable[Piece], ticks: float) -> Iterator[P
             count += int(np.count_nonzero(piece.t < before))
             ahead = np.maximum(np.maximum.accumulate(before), newest)
             farthest = max(farthest, float(np.max(ahead - piece.t)))
-            merged = join(list(held))
+            merged = join_pieces(list(held))
             merged = merged.take(np.argsort(merged.t, kind="stable"))
             cut = int(np.searchsorted(merged.t, merged.t[-1] - LATENESS * ticks))
             held = deque(
@@ -206,7 +206,7 @@ def ordered(source: Source, pieces: Iterable[Piece], ticks: float) -> Iterator[P
         _note_order(source, count, farthest / ticks)
 
 
-def origin(source: Source, t: NDArray[Any], ticks: float) -> Any:
+def find_origin(source: Source, t: NDArray[Any], ticks: float) -> Any:
     """Return the tick of time zero: that of the file, or its first event where the file counts as a date."""
     if not len(t) or abs(float(t[0])) / ticks < DATE:
         return t.dtype.type(0)
@@ -215,7 +215,7 @@ def origin(source: Source, t: NDArray[Any], ticks: float) -> Any:
     return t[0]
 
 
-def turned(source: Source, size: Size, extent: Size) -> Size:
+def turned_size(source: Source, size: Size, extent: Size) -> Size:
     """Return a size, the other way round where only so all events lie on the sensor.
 
     Args:
@@ -255,11 +255,11 @@ def sensor_events(
         raise InputError("t, x, y and p must have one common shape (N,)")
     if known is None and size is not None:
         extent = (int(piece.x.max()) + 1, int(piece.y.max()) + 1) if len(piece.x) else (0, 0)
-        known = turned(source, size, extent)
+        known = turned_size(source, size, extent)
     if known is None:
         raise InputError("does not say how large the sensor is")
-    good = list(settled(source, [piece], known, 1.0)) or [piece.take(slice(0))]
-    t, x, y, p, label = by_time(source, join(good), 1.0)
+    good = list(settle_pieces(source, [piece], known, 1.0)) or [piece.take(slice(0))]
+    t, x, y, p, label = by_time(source, join_pieces(good), 1.0)
     label = None if label is None else label.astype(np.int8, copy=False)
     return Events(
         t.astype(np.float64, copy=False), x, y, p.astype(np.bool_, copy=False), known[0], known[1], label

@@ -10,50 +10,58 @@ import numpy as np
 
 from dase.errors import InputError
 from dase.io import h5
-from dase.io.columns import HDF5, columns, dataset, largest, opened, reader, size_attribute
+from dase.io.columns import (
+    HDF5,
+    checked_dataset,
+    find_largest,
+    open_hdf5,
+    pieces_reader,
+    read_columns,
+    size_attribute,
+)
 from dase.io.format import Format, camera_format
-from dase.io.rules import turned
-from dase.io.sequence import GREYS, Sequence, reading
+from dase.io.rules import turned_size
+from dase.io.sequence import GREYS, Sequence, reading_file
 from dase.io.source import Beside, Picture, Piece, Size, Source
 
 COLUMNS = ("events/ts", "events/xs", "events/ys", "events/ps")
 LAYOUTS = "S2R, DSEC, MVSEC, v2e, Prophesee"
 
 
-def _parts(file: Any, source: Source) -> Iterator[Piece]:
+def _read_parts(file: Any, source: Source) -> Iterator[Piece]:
     labelled = "events/labels" in file
-    for t, x, y, p, *label in columns(file, COLUMNS, beside=("events/labels",) if labelled else ()):
+    for t, x, y, p, *label in read_columns(file, COLUMNS, beside=("events/labels",) if labelled else ()):
         yield Piece(t.astype(np.float64), x, y, p, *label)
 
 
-def _pictures(source: Source) -> Iterator[Picture]:
+def _read_pictures(source: Source) -> Iterator[Picture]:
     """Yield the frames [s] with the flow at them, not a number where there is none."""
-    with opened(source.path) as file:
-        flows, images = h5.members(file, "flow"), h5.members(file, "images")
+    with open_hdf5(source.path) as file:
+        flows, images = h5.numbered_members(file, "flow"), h5.numbered_members(file, "images")
         for name, image in images.items():
-            grey = h5.checked(image, GREYS, 2)
-            flow = h5.checked(flows[name], (np.float32,), 3) if name in flows else None
+            grey = h5.checked_member(image, GREYS, 2)
+            flow = h5.checked_member(flows[name], (np.float32,), 3) if name in flows else None
             if flow is None and flows:
                 flow = np.full((2, *grey.shape), np.nan, np.float32)
             yield Picture(grey, h5.time_of(image), h5.exposure_of(image), flow)
 
 
-def _size(source: Source) -> Size | None:
+def _read_size(source: Source) -> Size | None:
     """Return columns and rows: of the first map where there is any, else of the attribute, either way."""
-    with opened(source.path) as file:
-        _check(file)
+    with open_hdf5(source.path) as file:
+        _check_layout(file)
         for group in ("images", "flow"):
             for name in file.get(group, ()):
-                shape = dataset(file, f"{group}/{name}").shape
+                shape = checked_dataset(file, f"{group}/{name}").shape
                 if len(shape) >= 2:
                     return shape[-1], shape[-2]
         size = size_attribute(file, "sensor_resolution")
         if size is None:
             raise InputError("does not say how large the sensor is")
-        return turned(source, size, largest(file, COLUMNS[1], COLUMNS[2]))
+        return turned_size(source, size, find_largest(file, COLUMNS[1], COLUMNS[2]))
 
 
-def _check(file: Any) -> None:
+def _check_layout(file: Any) -> None:
     """Raise InputError where nothing of the layout is there, or something is absurdly large."""
     if not any(name in file for name in (*COLUMNS, "images")):
         held: list[str] = []
@@ -62,21 +70,21 @@ def _check(file: Any) -> None:
 
     def check(name: str, found: Any) -> None:
         if isinstance(found, h5py.Dataset) and name.split("/")[0] in ("events", "images", "flow", "dase"):
-            dataset(file, name)
+            checked_dataset(file, name)
 
     file.visititems(check)
 
 
-def _beside(source: Source) -> Beside:
-    with reading(source.path, "HDF5"), opened(source.path) as file:
-        _check(file)
-        return h5.beside(file)
+def _read_beside(source: Source) -> Beside:
+    with reading_file(source.path, "HDF5"), open_hdf5(source.path) as file:
+        _check_layout(file)
+        return h5.read_beside(file)
 
 
 def read(source: Source) -> Sequence:
     """Read a file; raises InputError where it is damaged, incomplete or of no known layout."""
-    with reading(source.path, "HDF5"), opened(source.path) as file:
-        _check(file)
+    with reading_file(source.path, "HDF5"), open_hdf5(source.path) as file:
+        _check_layout(file)
     return h5.read(source)
 
 
@@ -84,9 +92,9 @@ _streamed = camera_format(
     name="HDF5",
     suffixes=(),
     matches=lambda path, head: False,
-    pieces=reader(_parts),
-    size=_size,
-    pictures=_pictures,
+    pieces=pieces_reader(_read_parts),
+    size=_read_size,
+    pictures=_read_pictures,
     ticks=1.0,
 )
 
@@ -97,7 +105,7 @@ FORMAT = Format(
     read=read,
     stream=_streamed.stream,
     pictures=_streamed.pictures,
-    beside=_beside,
+    beside=_read_beside,
     create=h5.create,
     keeps=frozenset({"events", "frames", "flow", "thresholds", "configuration"}),
 )

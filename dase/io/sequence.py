@@ -211,7 +211,7 @@ class Writer(ABC):
 
 
 @contextmanager
-def writing(path: Path, make: Callable[[Path], Writer]) -> Iterator[Writer]:
+def writing_file(path: Path, make: Callable[[Path], Writer]) -> Iterator[Writer]:
     """Yield the writer that `make` opens on a temporary name; see `replacing`."""
     with replacing(path) as temporary:
         writer = make(temporary)
@@ -226,25 +226,25 @@ def writing(path: Path, make: Callable[[Path], Writer]) -> Iterator[Writer]:
 
 
 @contextmanager
-def reading(path: Path, kind: str) -> Iterator[None]:
+def reading_file(path: Path, kind: str) -> Iterator[None]:
     """Turn whatever a damaged file makes its library raise into one sentence that names the file."""
     try:
         yield
     except InputError as error:
-        raise type(error)(f"{path}: {_sentence(error)}") from error
+        raise type(error)(f"{path}: {_one_line(error)}") from error
     except FileNotFoundError:
         raise InputError(f"{path}: no such file") from None
     except Exception as error:  # h5py, zipfile, zlib and numpy have no common error for damaged files
-        why = _sentence(error) or type(error).__name__
+        why = _one_line(error) or type(error).__name__
         raise InputError(f"{path}: cannot be read as {kind}, damaged or cut short ({why})") from error
 
 
-def _sentence(error: Exception) -> str:
+def _one_line(error: Exception) -> str:
     """Return what an error says in one line; names out of a damaged file may hold anything."""
     return "".join(c if c.isprintable() else "?" for c in " ".join(str(error).split()))
 
 
-def coordinates(values: NDArray[Any], name: str) -> NDArray[np.uint16]:
+def checked_coordinates(values: NDArray[Any], name: str) -> NDArray[np.uint16]:
     """Return pixel coordinates, shape (N,), as uint16; raises InputError where they do not fit."""
     if values.dtype.kind not in "iu":
         raise InputError(f"{name} must be integers, got {values.dtype}")

@@ -125,7 +125,7 @@ Beside = tuple[NDArray[np.float32] | None, str | None]
 """Thresholds (2, H, W) and configuration of a simulated sequence; None where unknown."""
 
 
-def join(pieces: list[Piece]) -> Piece:
+def join_pieces(pieces: list[Piece]) -> Piece:
     """Join pieces; none make an empty one. Labels stay where all have them."""
     if len(pieces) == 1:
         return pieces[0]

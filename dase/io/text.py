@@ -54,7 +54,7 @@ class Layout:
                 rows.append(list(match.groups()))
             elif rows and line.strip():
                 break  # left to the decoder, which knows the number of the line
-            elif not rows and not line.startswith(b"#") and line.strip() and not _names(line):
+            elif not rows and not line.startswith(b"#") and line.strip() and not _names_columns(line):
                 raise InputError(f"holds no events: '{line[:40].decode('latin-1')}' is not 't x y p'")
             if not rows:
                 self.begin += len(line) + 1
@@ -67,23 +67,23 @@ class Layout:
         self.micro = bool(times) and not any(set(time) & set(b".eE") for time in times)
 
 
-def _names(line: bytes) -> bool:
+def _names_columns(line: bytes) -> bool:
     """Whether a line names the columns."""
     return bool(re.fullmatch(rb"[A-Za-z_ ,\t\[\]()]+\r?", line))
 
 
-def matches(head: bytes) -> bool:
+def matches_head(head: bytes) -> bool:
     """Whether these first bytes of a file are events as text."""
     if b"\0" in head[:64]:
         return False
     for line in head.split(b"\n")[:-1] or [head]:
-        if line.startswith(b"#") or not line.strip() or _names(line) or SIZE.fullmatch(line):
+        if line.startswith(b"#") or not line.strip() or _names_columns(line) or SIZE.fullmatch(line):
             continue
         return bool(LINE.fullmatch(line))
     return False
 
 
-def decode(open_file: Callable[[], BinaryIO]) -> Iterator[Piece]:
+def decode_text(open_file: Callable[[], BinaryIO]) -> Iterator[Piece]:
     """Yield events [s] of a text; raises InputError with the number of a line that is none."""
     with open_file() as file:
         head = file.read(HEAD)
@@ -96,39 +96,39 @@ def decode(open_file: Callable[[], BinaryIO]) -> Iterator[Piece]:
             if len(text) - end > LONGEST:
                 raise InputError(f"line {line + text.count(10)} is longer than {LONGEST} bytes")
             if end:
-                yield _decoded(text[:end], layout, line)
+                yield _decode_lines(text[:end], layout, line)
             line += text.count(b"\n", 0, end)
             rest = text[end:]
         if rest.strip():
-            yield _decoded(rest + b"\n", layout, line)
+            yield _decode_lines(rest + b"\n", layout, line)
 
 
-def _decoded(text: bytes, layout: Layout, line: int) -> Piece:
+def _decode_lines(text: bytes, layout: Layout, line: int) -> Piece:
     c = np.frombuffer(text, np.uint8)
     blank = (c == 32) | (c == 44) | (c == 9) | (c == 10) | (c == 13)
     edges = np.flatnonzero(blank[1:] != blank[:-1]) + 1
     if not blank[0]:
         edges = np.concatenate(([0], edges))
     begin, end = edges[::2], edges[1::2]  # the text ends with a newline
-    begin, end = _rows(c, begin, end, text, line)
+    begin, end = _split_rows(c, begin, end, text, line)
     k = (0, 1, 2, 3) if layout.time_first else (3, 0, 1, 2)
-    time = _times(c, text, begin[:, k[0]], end[:, k[0]], layout.micro)
-    x, y = (_integers(c, begin[:, i], end[:, i], 6) for i in k[1:3])
-    p = _integers(c, begin[:, k[3]], end[:, k[3]], 2, signed=True)
+    time = _parse_times(c, text, begin[:, k[0]], end[:, k[0]], layout.micro)
+    x, y = (_parse_integers(c, begin[:, i], end[:, i], 6) for i in k[1:3])
+    p = _parse_integers(c, begin[:, k[3]], end[:, k[3]], 2, signed=True)
     good = (time == time) & (x >= 0) & (x < 65536) & (y >= 0) & (y < 65536) & (p >= -1) & (p <= 1)
     if not good.all():
         first = int(begin[np.argmin(good), 0])
-        raise _bad(text, first, line)
+        raise _bad_line(text, first, line)
     return Piece(time, x.astype(np.uint16), y.astype(np.uint16), p)
 
 
-def _bad(text: bytes, place: int, line: int) -> InputError:
+def _bad_line(text: bytes, place: int, line: int) -> InputError:
     begin = text.rfind(b"\n", 0, place) + 1
     shown = text[begin : begin + 40].split(b"\n")[0].strip().decode("latin-1")
     return InputError(f"line {line + text.count(10, 0, place)} is not 't x y p': '{shown}'")
 
 
-def _rows(
+def _split_rows(
     c: NDArray[np.uint8], begin: NDArray[np.intp], end: NDArray[np.intp], text: bytes, line: int
 ) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
     """Return begin and end of the first four words of each line, (N, 4); a fifth is v2e's label of noise."""
@@ -138,12 +138,12 @@ def _rows(
     width = 5 if len(begin) and count[count > 0].min() == 5 else 4
     wrong = np.flatnonzero((count != 0) & (count != width))
     if len(wrong):
-        raise _bad(text, int(newlines[wrong[0]]), line)
+        raise _bad_line(text, int(newlines[wrong[0]]), line)
     shape = (-1, width)
     return begin.reshape(shape)[:, :4], end.reshape(shape)[:, :4]
 
 
-def _integers(
+def _parse_integers(
     c: NDArray[np.uint8],
     begin: NDArray[np.intp],
     end: NDArray[np.intp],
@@ -168,7 +168,7 @@ def _integers(
     return np.where(good, value, -2)
 
 
-def _times(
+def _parse_times(
     c: NDArray[np.uint8], text: bytes, begin: NDArray[np.intp], end: NDArray[np.intp], micro: bool
 ) -> NDArray[np.float64]:
     """Return decimal numbers [s], (N,); not a number where a word is none."""
@@ -195,7 +195,7 @@ def _times(
     return out
 
 
-def encode(
+def encode_events(
     t: NDArray[np.float64], x: NDArray[np.uint16], y: NDArray[np.uint16], p: NDArray[np.bool_]
 ) -> bytes:
     """Return lines `t x y p` of events (N,), with as many decimals of the time [s] as they need."""
@@ -203,14 +203,14 @@ def encode(
         whole = np.rint(t * 10.0**decimals)
         if np.all(whole / 10.0**decimals == t) and np.all((whole >= 0) & (whole < 2**53)):
             seconds, fraction = np.divmod(whole.astype(np.int64), 10**decimals)
-            words = (_digits(seconds), b".", _digits(fraction, decimals))
-            fields = (*words, b" ", _digits(x), b" ", _digits(y), b" ", _digits(p), b"\n")
-            return _lines(len(t), fields)
+            words = (_digits_of(seconds), b".", _digits_of(fraction, decimals))
+            fields = (*words, b" ", _digits_of(x), b" ", _digits_of(y), b" ", _digits_of(p), b"\n")
+            return _join_fields(len(t), fields)
     rows = zip(t.tolist(), x.tolist(), y.tolist(), p.tolist(), strict=True)
     return "".join(f"{a!r} {b} {c} {d:d}\n" for a, b, c, d in rows).encode()
 
 
-def _digits(values: NDArray[np.generic], least: int = 1) -> tuple[NDArray[np.uint8], NDArray[np.bool_]]:
+def _digits_of(values: NDArray[np.generic], least: int = 1) -> tuple[NDArray[np.uint8], NDArray[np.bool_]]:
     """Return the digits of whole numbers >= 0 (N,) as characters, and which of them to show, both (N, K)."""
     rest = values.astype(np.int64)
     width = max(least, len(str(int(rest.max(initial=0)))))
@@ -223,7 +223,9 @@ def _digits(values: NDArray[np.generic], least: int = 1) -> tuple[NDArray[np.uin
     return out, show
 
 
-def _lines(count: int, fields: tuple[bytes | tuple[NDArray[np.uint8], NDArray[np.bool_]], ...]) -> bytes:
+def _join_fields(
+    count: int, fields: tuple[bytes | tuple[NDArray[np.uint8], NDArray[np.bool_]], ...]
+) -> bytes:
     """Return the fields of every line one after the other."""
     full = [
         (np.full((count, 1), ord(field), np.uint8), np.ones((count, 1), np.bool_))

@@ -11,8 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dase.errors import InputError
-from dase.io.ffmpeg import bounded, needed, opened, pixel_format, refuse_titles, size_of
-from dase.io.image_files import decode, list_pictures, to_grey, to_levels
+from dase.io.ffmpeg import bounded_decoding, decoding_memory, open_video, pixel_format, refuse_titles, size_of
+from dase.io.image_files import decode_file, list_pictures, to_grey, to_levels
 
 PLAIN = bytes(4), b"BGR\x18"
 """Code and pixels of an uncompressed AVI: OpenCV 5.0 writes beyond its memory where it turns one over."""
@@ -46,7 +46,7 @@ class FrameReader:
         self._kept: dict[int, NDArray[np.float32]] = {}
         self._next = 0
         if self._files is not None:
-            self._first = decode(self._files[0]).shape[:2]
+            self._first = decode_file(self._files[0]).shape[:2]
         self.shape: tuple[int, ...] = (self._count, *(self._first if size is None else size[::-1]))
         self.ndim = 3
 
@@ -57,7 +57,7 @@ class FrameReader:
         """Return the frames of increasing indices, intensity in [0, 1], shape (K, height, width)."""
         wanted = [int(i) for i in index]
         if self._files is not None:
-            return np.stack([self._grey(decode(self._files[i]), self._files[i]) for i in wanted])
+            return np.stack([self._grey(decode_file(self._files[i]), self._files[i]) for i in wanted])
         out = {i: self._kept[i] for i in wanted if i in self._kept}
         missing = [i for i in wanted if i not in out]
         if missing and missing[0] < self._next:
@@ -73,14 +73,14 @@ class FrameReader:
         """Yield all frames, 0 to 255, shape (height, width), not resized; little but a frame is kept."""
         if self._files is not None:
             for file in self._files:
-                yield to_levels(self._checked(decode(file), file))
+                yield to_levels(self._checked(decode_file(file), file))
             return
         capture = self._open()
         for index in range(self._count):
             yield to_levels(self._checked(self._next_of(capture, index), self._path))
 
     def _open(self) -> Any:
-        capture = opened(self._path)
+        capture = open_video(self._path)
         if self._plain is not None:
             capture.set(cv2.CAP_PROP_FORMAT, -1)  # packets as they are
         return capture
@@ -97,7 +97,7 @@ class FrameReader:
         frame = self._read(capture)
         if frame is None:
             return 0
-        self.decoding = needed(capture)
+        self.decoding = decoding_memory(capture)
         self._first, count = frame.shape[:2], 1  # the number in the header is often wrong
         del frame
         while self._grab(capture) if self._plain is None else self._read(capture) is not None:
@@ -106,14 +106,14 @@ class FrameReader:
 
     def _grab(self, capture: Any) -> bool:
         """Decode the next frame; what is far larger than the head of the file says cannot be decoded."""
-        with bounded(capture, self.packed):
+        with bounded_decoding(capture, self.packed):
             return bool(capture.grab())
 
     def _read(self, capture: Any) -> NDArray[np.uint8] | None:
         while self._grab(capture):
             good, frame = capture.retrieve()
             if good and self._plain is not None:
-                frame = _unpacked(capture, frame.ravel(), self._plain)
+                frame = _unpack_avi_frame(capture, frame.ravel(), self._plain)
                 if frame is None:
                     continue  # a packet of a dropped frame is empty
             return frame if good else None
@@ -147,7 +147,9 @@ class FrameReader:
         return grey
 
 
-def _unpacked(capture: Any, packet: NDArray[np.uint8], size: tuple[int, int]) -> NDArray[np.uint8] | None:
+def _unpack_avi_frame(
+    capture: Any, packet: NDArray[np.uint8], size: tuple[int, int]
+) -> NDArray[np.uint8] | None:
     """Return the frame (H, W, 3) of the bytes of an uncompressed AVI, or None where some are missing."""
     width, height = size
     step = -(-3 * width // 4) * 4  # rows end at multiples of four bytes, in most files

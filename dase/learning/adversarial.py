@@ -1,6 +1,6 @@
 """How unlike simulated and real counts are, and which way the thresholds should move.
 
-Two objectives share the images: `Adversarial`, the paper's bank of critics over hashed patches (Eqs. 10 to
+Two objectives share the images: `AdversarialObjective`, the paper's bank of critics over hashed patches (Eqs. 10 to
 13), and `Moments`, which compares means of fixed features between pixels whose surroundings look alike.
 """
 
@@ -34,7 +34,7 @@ def cut_patches(maps: torch.Tensor, size: int) -> torch.Tensor:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Hash:
+class PatchHash:
     """Which attributes patches are told apart by, and into how many levels.
 
     Args:
@@ -61,10 +61,10 @@ class Hash:
         return self.orientations * self.coherence * self.contrast * self.intensity
 
 
-class Hasher:
+class PatchHasher:
     """Sends patches to classes; boundaries of levels are quantiles of what `calibrate` was shown."""
 
-    def __init__(self, how: Hash):
+    def __init__(self, how: PatchHash):
         self.how = how
         self.boundaries: dict[str, torch.Tensor] = {}
 
@@ -73,7 +73,7 @@ class Hasher:
         found = [self._attributes(pairs) for pairs in sets]
         for name, levels in self._levels():
             pooled = torch.cat([attributes[name] for attributes in found])
-            self.boundaries[name] = _quantiles(pooled, levels)
+            self.boundaries[name] = _quantile_boundaries(pooled, levels)
 
     def classes(self, pairs: Pairs) -> torch.Tensor:
         """Return the class of every patch, int64 (patches,), in the order of `cut_patches`."""
@@ -83,7 +83,7 @@ class Hasher:
         for name, levels in self._levels():
             boundaries = self.boundaries[name]
             if name == "contrast" and self.how.contrast_from == "events-ranked":
-                boundaries = _quantiles(found[name], levels)
+                boundaries = _quantile_boundaries(found[name], levels)
             index = index * levels + torch.bucketize(found[name], boundaries)
         return index
 
@@ -104,7 +104,7 @@ class Hasher:
         return found
 
 
-def _quantiles(values: torch.Tensor, levels: int) -> torch.Tensor:
+def _quantile_boundaries(values: torch.Tensor, levels: int) -> torch.Tensor:
     """Return the boundaries between `levels` equal shares."""
     ordered = torch.sort(values.flatten()).values
     return torch.stack([ordered[round(n / levels * (len(ordered) - 1))] for n in range(1, levels)])
@@ -132,7 +132,7 @@ class Objective(Protocol):
         """Take over what `state` returned."""
 
 
-class Adversarial:
+class AdversarialObjective:
     """The bank of critics (Eqs. 10, 11 and 13).
 
     Args:
@@ -148,7 +148,7 @@ class Adversarial:
 
     def __init__(
         self,
-        how: Hash,
+        how: PatchHash,
         *,
         device: str | torch.device,
         seed: int = 0,
@@ -158,7 +158,7 @@ class Adversarial:
         uniform: float = 0.5,
         image: bool = False,
     ):
-        self.hasher, self.device = Hasher(how), torch.device(device)
+        self.hasher, self.device = PatchHasher(how), torch.device(device)
         self.rate, self.steps, self.penalty, self.uniform, self.image = rate, steps, penalty, uniform, image
         self.generator = torch.Generator(self.device).manual_seed(seed)
         self.seen = torch.zeros(how.classes, device=self.device)
@@ -168,7 +168,7 @@ class Adversarial:
     def calibrate(self, sets: list[tuple[Pairs, Pairs]]) -> None:
         """Place the boundaries of the hash."""
         self.hasher.calibrate(*(pairs for both in sets for pairs in both))
-        distributed.alike(self.hasher.boundaries.values())
+        distributed.broadcast_tensors(self.hasher.boundaries.values())
 
     def begin(self) -> Hashable:
         """All steps are of one kind, where products of groups are one launch."""
@@ -187,10 +187,12 @@ class Adversarial:
 
     def loss(self, fake: Pairs, real: Pairs, *, move: bool) -> tuple[torch.Tensor, dict[str, torch.Tensor]]:
         """Move the critics, then return minus the weighted mean score of the fake patches."""
-        patches, others = (distributed.together(self._patches(pairs)) for pairs in (fake, real))
-        ours, theirs = (distributed.together(self.hasher.classes(pairs)) for pairs in (fake, real))
+        patches, others = (distributed.gather_values(self._patches(pairs)) for pairs in (fake, real))
+        ours, theirs = (distributed.gather_values(self.hasher.classes(pairs)) for pairs in (fake, real))
         number, real_number = (self._number(classes) for classes in (ours, theirs))
-        ours, theirs = (distributed.own(classes, len(self.seen)) for classes in (ours, theirs))
+        ours, theirs = (
+            distributed.mask_foreign_classes(classes, len(self.seen)) for classes in (ours, theirs)
+        )
         self.seen += real_number
         weights = self.weights()
         for _ in range(self.steps):
@@ -199,12 +201,15 @@ class Adversarial:
                 rate=self.rate, penalty=self.penalty, generator=self.generator,
             )  # fmt: skip
         both = (number > 0) & (real_number > 0)
-        distance, lies = distributed.total(found.distance), distributed.total(found.penalty)
+        distance, lies = (
+            distributed.sum_over_processes(found.distance),
+            distributed.sum_over_processes(found.penalty),
+        )
         values = {"distance": distance, "penalty": lies, "classes": both.sum()}
         if not move:
             return fake.counts.new_zeros(()), values
         gain = torch.where(both, -weights / number.clamp_min(1), 0.0)
-        slopes = distributed.total(self.bank.input_gradient(patches.detach(), ours, gain))
+        slopes = distributed.sum_over_processes(self.bank.input_gradient(patches.detach(), ours, gain))
         return (patches * slopes).sum(), values
 
     def _number(self, classes: torch.Tensor) -> torch.Tensor:
@@ -225,9 +230,9 @@ class Adversarial:
     def _bank(self) -> dict[str, Any]:
         """Return the state of all critics, each from the process that looks after it."""
         state = self.bank.state()
-        out: dict[str, Any] = {"steps": distributed.from_owners(state["steps"])}
+        out: dict[str, Any] = {"steps": distributed.gather_from_owners(state["steps"])}
         for kind in ("weights", "square"):
-            out[kind] = {name: distributed.from_owners(value) for name, value in state[kind].items()}
+            out[kind] = {name: distributed.gather_from_owners(value) for name, value in state[kind].items()}
         return out
 
     def load(self, state: dict[str, Any]) -> None:

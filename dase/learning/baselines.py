@@ -8,18 +8,18 @@ from __future__ import annotations
 import numpy as np
 import torch
 
-from dase.learning.scene_batches import Scenery, middle
-from dase.learning.targets import Pairs, draw_noise, simulate
-from dase.networks.threshold_network import Maps, NetworkShape, ThresholdNet
+from dase.learning.scene_batches import Scenery, middle_intensity
+from dase.learning.targets import Pairs, draw_noise, simulate_counts
+from dase.networks.threshold_network import NetworkShape, ThresholdMaps, ThresholdNet
 
 ESIM = 0.18, 0.03
-"""Mean and spread of ESIM's thresholds as it was used to train E2VID [log intensity]; the preset `esim`."""
+"""Mean and spread of ESIM's thresholds as it was used to train E2VID [log intensity]; the preset `esim_thresholds`."""
 
 RANDOM = (0.05, 2.0), 1.5
 """Thresholds and greatest ratio of ON and OFF of broad randomisation (V2V, 2025)."""
 
 
-def constant(mu: float, sigma: float, ratio: float = 1.0) -> ThresholdNet:
+def constant_thresholds(mu: float, sigma: float, ratio: float = 1.0) -> ThresholdNet:
     """Return a network that gives every pixel the same distribution."""
     net = ThresholdNet(NetworkShape(channels=4, depth=1, split=True), mu=mu, sigma=sigma)
     with torch.no_grad():
@@ -28,12 +28,12 @@ def constant(mu: float, sigma: float, ratio: float = 1.0) -> ThresholdNet:
     return net
 
 
-def esim() -> ThresholdNet:
+def esim_thresholds() -> ThresholdNet:
     """Return ESIM's thresholds: what one has without looking at the target."""
-    return constant(*ESIM)
+    return constant_thresholds(*ESIM)
 
 
-def event_rate(
+def match_event_rate(
     target: Pairs, scenery: Scenery, *, scenes: int = 96, spread: float = 0.1, seed: int = 0
 ) -> ThresholdNet:
     """Return the threshold at which simulated scenes have the target's event rate.
@@ -53,26 +53,26 @@ def event_rate(
     low, high = 0.01, 3.0
     for _ in range(18):
         tried = (low * high) ** 0.5
-        if _rate(tried, spread, scenery, scenes, seed) > wanted:
+        if _median_event_rate(tried, spread, scenery, scenes, seed) > wanted:
             low = tried
         else:
             high = tried
-    return constant((low * high) ** 0.5, spread * (low * high) ** 0.5)
+    return constant_thresholds((low * high) ** 0.5, spread * (low * high) ** 0.5)
 
 
 @torch.no_grad()
-def _rate(mu: float, spread: float, scenery: Scenery, scenes: int, seed: int) -> float:
+def _median_event_rate(mu: float, spread: float, scenery: Scenery, scenes: int, seed: int) -> float:
     """Return the median over scenes of the events per pixel."""
     rng, generator = np.random.default_rng(seed), torch.Generator(scenery.device).manual_seed(seed)
     rates = []
     for _ in range(0, scenes, 12):
         log = scenery.draw(rng, 12)
-        level = torch.full_like(middle(log), mu)
-        rates.append(simulate(log, level, spread * mu, draw_noise(log, generator)).mean((1, 2, 3)))
+        level = torch.full_like(middle_intensity(log), mu)
+        rates.append(simulate_counts(log, level, spread * mu, draw_noise(log, generator)).mean((1, 2, 3)))
     return float(torch.cat(rates).median())
 
 
-class Randomised:
+class RandomThresholds:
     """Thresholds drawn anew for every scene over all that cameras have: no adaptation, a strong baseline.
 
     Args:
@@ -84,7 +84,7 @@ class Randomised:
     def __init__(self, seed: int = 0):
         self.seed = seed
 
-    def __call__(self, grey: torch.Tensor) -> Maps:
+    def __call__(self, grey: torch.Tensor) -> ThresholdMaps:
         """Return maps for images (B, H, W)."""
         (low, high), most = RANDOM
         # of the pictures themselves, so that a batch draws the same whatever came before it
@@ -93,4 +93,4 @@ class Randomised:
         mu = torch.from_numpy(rng.uniform(low, high, len(grey)).astype(np.float32)).to(grey.device)
         ratio = torch.tensor(float(most ** rng.uniform(-1, 1)), device=grey.device)
         maps = mu.view(-1, 1, 1).expand_as(grey)
-        return Maps(maps, 0.1 * maps, ratio, torch.zeros(len(grey), 2, 1, 1, device=grey.device))
+        return ThresholdMaps(maps, 0.1 * maps, ratio, torch.zeros(len(grey), 2, 1, 1, device=grey.device))

@@ -10,7 +10,7 @@ from typing import Any
 import torch
 
 from dase.kernels import autograd_critics as bridge
-from dase.networks.threshold_network import SLOPE
+from dase.networks.threshold_network import LEAKY_SLOPE
 
 FEW = 4
 """Rows of a critic, in the mean, up to which a kernel of our own is faster than PyTorch's grouped product:
@@ -39,7 +39,7 @@ class BankShape:
 
 
 @dataclass
-class Sorted:
+class SortedRows:
     """Rows in the order of their critics.
 
     Args:
@@ -53,15 +53,15 @@ class Sorted:
     end: torch.Tensor
 
     @classmethod
-    def by(cls, classes: torch.Tensor, critics: int) -> Sorted:
+    def by(cls, classes: torch.Tensor, critics: int) -> SortedRows:
         """Sort rows of these classes, int64 (R,); nothing waits for the GPU."""
-        of, order = bridge.in_order(classes, below=critics + 1)
+        of, order = bridge.sort_keys(classes, below=critics + 1)
         number = classes.new_zeros(critics + 1).index_add_(0, classes, torch.ones_like(classes))
         return cls(order, of, number[:-1].cumsum(0).int())
 
 
 @dataclass
-class Critique:
+class CriticStep:
     """What one step of the bank found.
 
     Args:
@@ -156,7 +156,7 @@ class CriticBank:
         self.steps.copy_(state["steps"])
         self._copy()
 
-    def _layer(self, name: str) -> torch.Tensor:
+    def _working_weights(self, name: str) -> torch.Tensor:
         """Return a layer's weights in the type that products are taken in, (C, outputs, inputs)."""
         out: torch.Tensor = self.copies[name] if self.working == torch.bfloat16 else getattr(self, name)
         return out
@@ -169,21 +169,23 @@ class CriticBank:
             of: The critic of each, int32 (R,), the number of critics for none.
             end: Where the rows of each critic end, int32 (C,).
         """
-        w2 = self._layer("w2")
-        product = grouped(rows, self._layer("w1").transpose(1, 2), end)
-        first, hidden = bridge.first_layer(product, of, self.b1, slope=SLOPE)
-        product = grouped(hidden, w2.transpose(1, 2), end)
-        second, by_second, back = bridge.second_layer(product, of, self.b2, self.w3, slope=SLOPE)
-        product = grouped(back, w2, end)
-        by_first = bridge.way_back(product, of, first, critics=self.shape.classes, slope=SLOPE)
+        w2 = self._working_weights("w2")
+        product = multiply_groups(rows, self._working_weights("w1").transpose(1, 2), end)
+        first, hidden = bridge.first_layer(product, of, self.b1, slope=LEAKY_SLOPE)
+        product = multiply_groups(hidden, w2.transpose(1, 2), end)
+        second, by_second, back = bridge.second_layer(product, of, self.b2, self.w3, slope=LEAKY_SLOPE)
+        product = multiply_groups(back, w2, end)
+        by_first = bridge.back_through_first_layer(
+            product, of, first, critics=self.shape.classes, slope=LEAKY_SLOPE
+        )
         return Activations(first, hidden, second, by_first, by_second)
 
     def _scores(self, at: Activations, of: torch.Tensor) -> torch.Tensor:
-        return bridge.score(at.second, of, self.w3, self.b3, slope=SLOPE)
+        return bridge.score_rows(at.second, of, self.w3, self.b3, slope=LEAKY_SLOPE)
 
     def scores(self, patches: torch.Tensor, classes: torch.Tensor) -> torch.Tensor:
         """Return the score of each patch (N, inputs) by the critic of its class (N,)."""
-        by = Sorted.by(classes, self.shape.classes)
+        by = SortedRows.by(classes, self.shape.classes)
         score = self._scores(self._forward(patches.to(self.working)[by.order], by.of, by.end), by.of)
         return torch.empty_like(score).index_copy_(0, by.order, score)
 
@@ -201,10 +203,12 @@ class CriticBank:
         gains = torch.cat([gain, gain.new_zeros(1)])
         # a class without gain is none: its critic's weights need not be read
         classes = torch.where(gains[classes] != 0, classes, self.shape.classes)
-        by = Sorted.by(classes, self.shape.classes)
+        by = SortedRows.by(classes, self.shape.classes)
         at = self._forward(patches.to(self.working)[by.order], by.of, by.end)
         gains = gains[by.of.long()]
-        slopes = grouped((at.by_first * gains[:, None]).to(self.working), self._layer("w1"), by.end)
+        slopes = multiply_groups(
+            (at.by_first * gains[:, None]).to(self.working), self._working_weights("w1"), by.end
+        )
         slopes = torch.where((by.of < self.shape.classes)[:, None], slopes.float(), 0.0)
         return torch.empty_like(slopes).index_copy_(0, by.order, slopes)
 
@@ -220,7 +224,7 @@ class CriticBank:
         rate: float | torch.Tensor,
         penalty: float = 1.0,
         generator: torch.Generator | None = None,
-    ) -> Critique:
+    ) -> CriticStep:
         """Move the critics of the classes that both domains have, once.
 
         The loss is Σ weight · (mean fake score - mean real score + penalty · mean |∇D|²), the gradient taken
@@ -237,10 +241,10 @@ class CriticBank:
             generator: Draws the shares.
         """
         share = torch.rand(len(fake), 1, device=self.device, generator=generator)
-        batch = _Batch(self, fake, fake_classes, real, real_classes, weights, share)
+        batch = CriticBatch(self, fake, fake_classes, real, real_classes, weights, share)
         critique = batch.differentiate(penalty)
         speed = rate if isinstance(rate, torch.Tensor) else torch.full((1,), rate, device=self.device)
-        paces = bridge.pace(batch.layout, speed, self.steps, decay=self.decay)
+        paces = bridge.count_steps(batch.layout, speed, self.steps, decay=self.decay)
         for name, (left, right) in batch.outer.items():
             bridge.move_critics(
                 getattr(self, name), self.square[name], self.copies[name], left, right, batch.layout.end[0],
@@ -254,7 +258,7 @@ class CriticBank:
         """Return whether a layer of all critics is one launch on a GPU, and nothing waits for it."""
         return self.device.type == "cuda" and _has_grouped_products(self.device)
 
-    def traffic(self, active: int) -> int:
+    def least_traffic(self, active: int) -> int:
         """Return the bytes that one step has to move at least, `active` critics being in use.
 
         Per weight of the first two layers: the forward pass, the penalty's gradient and its derivative read a
@@ -264,7 +268,7 @@ class CriticBank:
         return active * layers * (3 * 2 + 4 * 4 + 2)
 
 
-class _Batch:
+class CriticBatch:
     """The rows of one step, and the gradients of the loss.
 
     Attributes:
@@ -284,28 +288,28 @@ class _Batch:
         weights: torch.Tensor,
         share: torch.Tensor,
     ):
-        self.bank, self.layout = bank, bridge.lay_out(fake_classes, real_classes, weights)
-        self.rows = bridge.gather(fake, real, share, self.layout, bank.working)
+        self.bank, self.layout = bank, bridge.lay_out_rows(fake_classes, real_classes, weights)
+        self.rows = bridge.gather_rows(fake, real, share, self.layout, bank.working)
 
-    def differentiate(self, penalty: float) -> Critique:
+    def differentiate(self, penalty: float) -> CriticStep:
         """Set `outer` and `sums`."""
         bank, layout, working = self.bank, self.layout, self.bank.working
-        w1, w2 = bank._layer("w1"), bank._layer("w2")
+        w1, w2 = bank._working_weights("w1"), bank._working_weights("w2")
         at = bank._forward(self.rows, layout.of, layout.end[0])
         distance = -(layout.gain * bank._scores(at, layout.of)).sum()
-        left_first, left_second, last = bridge.weigh(
-            at.second, at.by_first, at.by_second, layout, slope=SLOPE, penalty=penalty
+        left_first, left_second, last = bridge.weigh_rows(
+            at.second, at.by_first, at.by_second, layout, slope=LEAKY_SLOPE, penalty=penalty
         )
         # the penalty: g = slope of the first layer times its weights, loss = penalty · held |g|²
         ends = layout.end[1]
-        g = grouped(bridge.half_way(at.by_first, layout, working), w1, ends)
-        by_g = bridge.penalise(g, layout, self.rows)
-        product = grouped(by_g, w1.transpose(1, 2), ends)
-        by_first, square = bridge.again_first(
-            product, at.first, at.by_first, layout, at.hidden, slope=SLOPE, penalty=penalty
+        g = multiply_groups(bridge.rows_half_way(at.by_first, layout, working), w1, ends)
+        by_g = bridge.penalise_gradient(g, layout, self.rows)
+        product = multiply_groups(by_g, w1.transpose(1, 2), ends)
+        by_first, square = bridge.penalty_through_first_layer(
+            product, at.first, at.by_first, layout, at.hidden, slope=LEAKY_SLOPE, penalty=penalty
         )
-        product = grouped(by_first, w2.transpose(1, 2), ends)
-        bridge.again_second(product, at.second, layout, last, slope=SLOPE)
+        product = multiply_groups(by_first, w2.transpose(1, 2), ends)
+        bridge.penalty_through_second_layer(product, at.second, layout, last, slope=LEAKY_SLOPE)
         self.outer = {"w1": (left_first, self.rows), "w2": (left_second, at.hidden)}
         self.sums = {
             "b1": bridge.sum_rows(left_first, layout, between=False),
@@ -313,10 +317,10 @@ class _Batch:
             "w3": bridge.sum_rows(last, layout, between=True),
             "b3": bridge.sum_rows(layout.gain[:, None], layout, between=False),
         }
-        return Critique(distance, square.sum())
+        return CriticStep(distance, square.sum())
 
 
-def grouped(rows: torch.Tensor, weights: torch.Tensor, end: torch.Tensor) -> torch.Tensor:
+def multiply_groups(rows: torch.Tensor, weights: torch.Tensor, end: torch.Tensor) -> torch.Tensor:
     """Multiply each group of rows with a matrix of its own.
 
     Args:
@@ -328,7 +332,7 @@ def grouped(rows: torch.Tensor, weights: torch.Tensor, end: torch.Tensor) -> tor
         Shape (R, N) in the type of the rows; anything in rows behind the last group.
     """
     if rows.is_cuda and weights.stride(2) == 1 and len(rows) <= FEW * len(weights):
-        return bridge.spread(rows, weights, end)
+        return bridge.multiply_by_critic(rows, weights, end)
     if rows.is_cuda and _has_grouped_products(rows.device):
         return torch._grouped_mm(rows, weights, offs=end)
     out = rows.new_zeros(len(rows), weights.shape[2])

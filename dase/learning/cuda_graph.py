@@ -19,7 +19,7 @@ SEEN = 3
 T = TypeVar("T")
 
 
-class Replay:
+class GraphReplay:
     """Runs steps, on a GPU from recordings of them.
 
     What a step reads that differs from one to the next has to lie in tensors that stay where they are, and
@@ -44,7 +44,7 @@ class Replay:
             kind: Steps of one kind do the same; None for one that is not to be recorded.
             step: What to run.
         """
-        if kind is None or self.device.type != "cuda" or distributed.size() > 1:
+        if kind is None or self.device.type != "cuda" or distributed.process_count() > 1:
             return step()
         if kind not in self.recorded:
             self.seen[kind] = self.seen.get(kind, 0) + 1

@@ -15,7 +15,7 @@ import torch
 import torch.distributed as dist
 
 
-def join(backend: str) -> str:
+def join_processes(backend: str) -> str:
     """Meet the other processes that the environment names; return the device of this one.
 
     Args:
@@ -30,90 +30,90 @@ def join(backend: str) -> str:
     return backend
 
 
-def leave() -> None:
+def leave_processes() -> None:
     """Part from the other processes."""
     if dist.is_initialized():
         dist.barrier()
         dist.destroy_process_group()
 
 
-def size() -> int:
+def process_count() -> int:
     """Return how many processes there are."""
     return dist.get_world_size() if dist.is_initialized() else 1
 
 
-def rank() -> int:
+def process_rank() -> int:
     """Return which one this is, from 0."""
     return dist.get_rank() if dist.is_initialized() else 0
 
 
-def together(values: torch.Tensor) -> torch.Tensor:
+def gather_values(values: torch.Tensor) -> torch.Tensor:
     """Return the values of all processes, those of the first in front; (N, ...) becomes (size · N, ...).
 
     Gradients reach the process's own values alone; summed over the processes they are those of all.
     """
-    if size() == 1:
+    if process_count() == 1:
         return values
-    parts = [torch.empty_like(values) for _ in range(size())]
+    parts = [torch.empty_like(values) for _ in range(process_count())]
     dist.all_gather(parts, values.detach().contiguous())
-    parts[rank()] = values
+    parts[process_rank()] = values
     return torch.cat(parts)
 
 
-def total(values: torch.Tensor) -> torch.Tensor:
+def sum_over_processes(values: torch.Tensor) -> torch.Tensor:
     """Return the sum over the processes."""
-    if size() == 1:
+    if process_count() == 1:
         return values
     out = values.detach().clone()
     dist.all_reduce(out)
     return out
 
 
-def total_gradients(parameters: Iterable[torch.Tensor]) -> None:
+def sum_gradients(parameters: Iterable[torch.Tensor]) -> None:
     """Replace gradients by their sums over the processes."""
-    if size() == 1:
+    if process_count() == 1:
         return
     found = [p.grad for p in parameters if p.grad is not None]
-    whole = total(torch.cat([g.flatten() for g in found]))
+    whole = sum_over_processes(torch.cat([g.flatten() for g in found]))
     for gradient, part in zip(found, whole.split([g.numel() for g in found]), strict=True):
         gradient.copy_(part.view_as(gradient))
 
 
-def alike(values: Iterable[torch.Tensor]) -> None:
+def broadcast_tensors(values: Iterable[torch.Tensor]) -> None:
     """Give tensors the values that they have in the first process."""
-    if size() > 1:
+    if process_count() > 1:
         for value in values:
             dist.broadcast(value.detach(), 0)
 
 
-def agreed(value: float) -> float:
+def broadcast_number(value: float) -> float:
     """Return the first process's number."""
-    if size() == 1:
+    if process_count() == 1:
         return value
     told = [value]
     dist.broadcast_object_list(told, 0)
     return told[0]
 
 
-def everybodys(value: Any) -> list[Any]:
+def gather_objects(value: Any) -> list[Any]:
     """Return an object of each process."""
-    if size() == 1:
+    if process_count() == 1:
         return [value]
-    told: list[Any] = [None] * size()
+    told: list[Any] = [None] * process_count()
     dist.all_gather_object(told, value)
     return told
 
 
-def own(classes: torch.Tensor, count: int) -> torch.Tensor:
+def mask_foreign_classes(classes: torch.Tensor, count: int) -> torch.Tensor:
     """Return classes, with `count`, which stands for none, for those that other processes look after."""
-    if size() == 1:
+    if process_count() == 1:
         return classes
-    return torch.where(classes % size() == rank(), classes, count)
+    return torch.where(classes % process_count() == process_rank(), classes, count)
 
 
-def from_owners(values: torch.Tensor) -> torch.Tensor:
+def gather_from_owners(values: torch.Tensor) -> torch.Tensor:
     """Return tensors of all classes (C, ...), each class from the process that looks after it."""
-    if size() == 1:
+    if process_count() == 1:
         return values
-    place = torch.arange(len(values), device=values.device) % size() == rank()
-    return total(torch.where(place.view(-1, *[1] * (values.ndim - 1)), values, 0))
+    place = torch.arange(len(values), device=values.device) % process_count() == process_rank()
+    return sum_over_processes(torch.where(place.view(-1, *[1] * (values.ndim - 1)), values, 0))

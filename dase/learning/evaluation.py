@@ -8,13 +8,13 @@ import numpy as np
 import torch
 from torch.nn import functional as F
 
-from dase.learning.moment_matching import Moments, discrepancy
-from dase.learning.scene_batches import Scenery, middle
-from dase.learning.targets import Pairs, Target, draw_noise, simulate
-from dase.networks.threshold_network import Maps, ThresholdNet
+from dase.learning.moment_matching import Moments, moment_discrepancy
+from dase.learning.scene_batches import Scenery, middle_intensity
+from dase.learning.targets import Pairs, Target, draw_noise, simulate_counts
+from dase.networks.threshold_network import ThresholdMaps, ThresholdNet
 
 
-class Exam:
+class MapEvaluation:
     """Fixed scenes and noise on which networks are compared.
 
     Args:
@@ -27,14 +27,14 @@ class Exam:
     def __init__(self, scenery: Scenery, target: Target, *, scenes: int = 16, seed: int = 12345):
         rng, generator = np.random.default_rng(seed), torch.Generator(scenery.device).manual_seed(seed)
         self.log = scenery.draw(rng, scenes)
-        self.grey = middle(self.log)
+        self.grey = middle_intensity(self.log)
         self.noise = draw_noise(self.log, generator)
         self.truth = None if target.truth is None else target.truth(self.grey)
         mu, sigma = self.truth or (torch.full_like(self.grey, 0.2), 0.05)
-        self.active = simulate(self.log, mu, sigma, self.noise).sum(1) > 0
+        self.active = simulate_counts(self.log, mu, sigma, self.noise).sum(1) > 0
 
     @torch.no_grad()
-    def marks(self, net: ThresholdNet) -> dict[str, float]:
+    def describe_maps(self, net: ThresholdNet) -> dict[str, float]:
         """Return numbers that describe the maps of `net`, and compare them with the truth where known.
 
         KL is that of the learned from the true normal distribution of each pixel's threshold, averaged over
@@ -51,7 +51,7 @@ class Exam:
         }
         return out if self.truth is None else out | self._compare(maps)
 
-    def _compare(self, maps: Maps) -> dict[str, float]:
+    def _compare(self, maps: ThresholdMaps) -> dict[str, float]:
         assert self.truth is not None
         (mu, sigma), (true_mu, true_sigma) = maps.by_polarity(), self.truth
         kl = torch.log(true_sigma / sigma) - 0.5
@@ -74,7 +74,7 @@ class Exam:
         return out
 
 
-class HeldOut:
+class HeldOutScore:
     """Pairs that training never sees, against fixed scenes seen through a network.
 
     The score needs no truth. It compares moments, whatever the objective, because they cannot be learned by
@@ -94,56 +94,58 @@ class HeldOut:
         self.scenery, self.scenes, self.seed = scenery, scenes, seed
         self.real = [pairs.select(slice(n, n + 12)) for n in range(0, len(pairs), 12)]
         self.like = Moments(device=scenery.device, doubt=doubt)
-        first = self.fakes(None)
+        first = self.simulate_fakes(None)
         self.like.calibrate(list(zip(first, self.real, strict=False)))
         for some in self.real:
-            self.like.see_real(some)
+            self.like.add_real(some)
         for fake in first:
-            self.like.see_plain(Pairs(fake.grey, fake.counts, fake.counts), self.like.members(fake.grey))
+            self.like.add_reference(Pairs(fake.grey, fake.counts, fake.counts), self.like.members(fake.grey))
         self.like.weigh()
 
     @torch.no_grad()
-    def fakes(self, net: Callable[[torch.Tensor], Maps] | None) -> list[Pairs]:
+    def simulate_fakes(self, net: Callable[[torch.Tensor], ThresholdMaps] | None) -> list[Pairs]:
         """Return the fixed scenes seen through a network, or at usual thresholds."""
         rng = np.random.default_rng(self.seed)
         generator = torch.Generator(self.scenery.device).manual_seed(self.seed)
         out = []
         for _ in range(0, self.scenes, 12):
             log = self.scenery.draw(rng, 12)
-            grey = middle(log)
+            grey = middle_intensity(log)
             noise = draw_noise(log, generator)
             if net is None:
-                out.append(Pairs(grey, simulate(log, torch.full_like(grey, 0.25), 0.06, noise)))
+                out.append(Pairs(grey, simulate_counts(log, torch.full_like(grey, 0.25), 0.06, noise)))
             else:
-                out.append(Pairs(grey, simulate(log, *net(grey).by_polarity(), noise)))
+                out.append(Pairs(grey, simulate_counts(log, *net(grey).by_polarity(), noise)))
         return out
 
-    def score(self, net: Callable[[torch.Tensor], Maps]) -> float:
+    def score(self, net: Callable[[torch.Tensor], ThresholdMaps]) -> float:
         """Return the weighted square difference of the moments; smaller is better."""
-        return float(discrepancy(self.fakes(net), self.real, self.like))
+        return float(moment_discrepancy(self.simulate_fakes(net), self.real, self.like))
 
-    def statistics(self, net: Callable[[torch.Tensor], Maps]) -> dict[str, float]:
+    def statistics(self, net: Callable[[torch.Tensor], ThresholdMaps]) -> dict[str, float]:
         """Return how counts and 8x8 patches of them differ from the held-out ones, in plain numbers."""
-        fake, real = (torch.cat([pairs.counts for pairs in side]) for side in (self.fakes(net), self.real))
+        fake, real = (
+            torch.cat([pairs.counts for pairs in side]) for side in (self.simulate_fakes(net), self.real)
+        )
         out = {"score": self.score(net), "rate": float(fake.mean() / real.mean().clamp_min(1e-9))}
-        out["counts"] = 0.5 * float((histogram(fake) - histogram(real)).abs().sum())
+        out["counts"] = 0.5 * float((count_histogram(fake) - count_histogram(real)).abs().sum())
         sums = [F.avg_pool2d(side, 8) * 64 for side in (fake, real)]
         spreads = [
             (F.avg_pool2d(side.square(), 8) - F.avg_pool2d(side, 8).square()).clamp_min(0).sqrt()
             for side in (fake, real)
         ]
-        out["patch_sums"] = distance(sums[0], sums[1])
-        out["patch_spreads"] = distance(spreads[0], spreads[1])
+        out["patch_sums"] = log_count_distance(sums[0], sums[1])
+        out["patch_spreads"] = log_count_distance(spreads[0], spreads[1])
         return out
 
 
-def histogram(counts: torch.Tensor, most: int = 12) -> torch.Tensor:
+def count_histogram(counts: torch.Tensor, most: int = 12) -> torch.Tensor:
     """Return the shares of pixels with 0, 1, ... events, `most` and more in the last."""
     whole = counts.round().long().clamp(0, most).flatten()
     return torch.bincount(whole, minlength=most + 1).double() / len(whole)
 
 
-def distance(one: torch.Tensor, other: torch.Tensor) -> float:
+def log_count_distance(one: torch.Tensor, other: torch.Tensor) -> float:
     """Return the mean distance of sorted values of log(1 + x), Wasserstein's of the first order."""
     shares = torch.linspace(0, 1, 2001, device=one.device, dtype=torch.float64)
     values = []

@@ -17,7 +17,15 @@ import torch
 
 from dase.kernels.autograd_counts import STEP
 from dase.learning import distributed
-from dase.learning.moment_matching import LONG, Cells, Moments, of_pixels, summed, with_neighbours, with_next
+from dase.learning.moment_matching import (
+    LONG,
+    CellMoments,
+    Moments,
+    add_neighbour_features,
+    add_next_pixel_features,
+    single_pixel_features,
+    sum_by_cell,
+)
 from dase.learning.targets import Pairs
 from dase.networks.threshold_network import ThresholdNet
 
@@ -31,7 +39,7 @@ LOOSE = tuple(10 ** (n / 4) for n in range(-10, 1))
 """Candidates of the prior spread between neighbouring nodes of the table [in its logarithm]."""
 
 
-class Newton:
+class GaussNewton:
     """Running derivatives of the moments, and the steps.
 
     What is left of the differences, above what chance between scenes explains, says how far the simulator's
@@ -56,7 +64,9 @@ class Newton:
     def see(self, fake: Pairs) -> None:
         """Take in how the counts of a batch answer."""
         assert fake.answers is not None
-        ends = {name: [of_pixels(counts) for counts in both] for name, both in fake.answers.items()}
+        ends = {
+            name: [single_pixel_features(counts) for counts in both] for name, both in fake.answers.items()
+        }
 
         def slope(name: str, add: Callable[[torch.Tensor], torch.Tensor]) -> torch.Tensor:
             above, below = ends[name]
@@ -67,23 +77,23 @@ class Newton:
         self._keep("number", number.sum(0).double())
         # half the memory traffic; what a derivative is off by only makes a step a little longer or shorter
         working = torch.bfloat16 if grey.is_cuda else torch.float32
-        rows, columns = (hats.flatten(2).transpose(1, 2).to(working) for hats in self.net.hats(grey))
+        rows, columns = (hats.flatten(2).transpose(1, 2).to(working) for hats in self.net.node_weights(grey))
         cells, size = number.shape[1], (rows.shape[2], columns.shape[2])
         # a node is a row times a column: half goes to the cells, half to the features
         member = member.to(working)
         places = (member[..., None] * columns[:, :, None]).flatten(2)
         for name in ends:
-            flat = slope(name, with_neighbours).flatten(2).transpose(1, 2).to(working)  # (B, N, F)
+            flat = slope(name, add_neighbour_features).flatten(2).transpose(1, 2).to(working)  # (B, N, F)
             width = flat.shape[2]
             if name == "ratio":
-                total = summed(member, flat).sum(0).view(cells, width, 1)
+                total = sum_by_cell(member, flat).sum(0).view(cells, width, 1)
             else:
                 each = (flat[..., None] * rows[:, :, None]).flatten(2)
-                total = summed(places, each).sum(0).view(cells, size[1], width, size[0])
+                total = sum_by_cell(places, each).sum(0).view(cells, size[1], width, size[0])
                 total = total.permute(0, 2, 3, 1).reshape(cells, width, -1)
             self._keep(name, total.double())
             if self.moments.pattern and name != "ratio":
-                down, across = (slope(name, partial(with_next, axis=axis)) for axis in (-2, -1))
+                down, across = (slope(name, partial(add_next_pixel_features, axis=axis)) for axis in (-2, -1))
                 self._keep(f"column_{name}", down.sum((0, 2)).T.double(), LONG)
                 self._keep(f"row_{name}", across.sum((0, 3)).T.double(), LONG)
         if self.moments.pattern:
@@ -92,7 +102,7 @@ class Newton:
             self._keep("row_number", fake.counts.new_full((height,), batch * width).double(), LONG)
 
     def _keep(self, name: str, value: torch.Tensor, memory: float | None = None) -> None:
-        kept, value = self.kept.get(name), distributed.total(value)
+        kept, value = self.kept.get(name), distributed.sum_over_processes(value)
         self.kept[name] = value if kept is None else kept.mul_(memory or self.memory).add_(value)
 
     def _jacobian(self) -> torch.Tensor:
@@ -118,14 +128,14 @@ class Newton:
         out[:nodes, :nodes] = out[nodes : 2 * nodes, nodes : 2 * nodes] = laplacian
         return out.to(self.moments.device)
 
-    def numbers(self) -> torch.Tensor:
+    def draw_numbers(self) -> torch.Tensor:
         """Return the shared numbers, in the order of the derivatives."""
         net = self.net
         maps = net.level[:, None] if net.shape.table is None else net.table.flatten(1)
         parts = [maps[0], maps[1], *([net.asymmetry.view(1)] if net.shape.split else [])]
         return torch.cat(parts).detach().double()
 
-    def _scenes(self, cells: Cells) -> torch.Tensor:
+    def _scenes(self, cells: CellMoments) -> torch.Tensor:
         """Return how many different real scenes the means are of."""
         return cells.kept["real_scenes"].clamp(1, min(self.moments.scenes, 1e9))
 
@@ -141,7 +151,7 @@ class Newton:
         off = cells.off().flatten()
         curve = jacobian.T @ weight @ jacobian
         pull = jacobian.T @ weight @ off
-        here = self.numbers()
+        here = self.draw_numbers()
         tiny = 1e-6 * torch.eye(len(curve), device=curve.device, dtype=curve.dtype) * curve.diagonal().mean()
         if self.moments.anew and self.net.shape.table is not None:
             self._choose(curve + tiny, curve @ here - pull, prior)
@@ -149,7 +159,7 @@ class Newton:
         # as a table that nothing holds leaves it, or a firm one would look like a bad model
         free = self.excess * curve + prior / LOOSE[-1] ** 2 + tiny
         both = torch.stack([curve + hold + tiny, free])
-        move, fit = _solved(both, torch.stack([-pull - hold @ here, self.excess * pull]))
+        move, fit = _solve_positive_definite(both, torch.stack([-pull - hold @ here, self.excess * pull]))
         rest = off - jacobian @ fit
         excess = rest @ whole @ rest * scenes / cells.kept["usual"]
         self.excess.copy_(torch.lerp(excess, self.excess, self.memory).clamp_min(1.0))
@@ -176,7 +186,7 @@ class Newton:
         scores = []
         for loose in LOOSE:
             whole = curve + prior / loose**2
-            fit = 0.5 * data @ _solved(whole, data)
+            fit = 0.5 * data @ _solve_positive_definite(whole, data)
             scores.append(fit - 0.5 * torch.linalg.slogdet(whole).logabsdet - rank * math.log(loose))
         self.loose.copy_(self._choices.take(torch.stack(scores).argmax()))
 
@@ -207,7 +217,7 @@ class Newton:
             unit = 1 / (scenes * weight.shape[0] * weight.shape[1] * loose**2)
             eye = torch.eye(2, device=curve.device, dtype=curve.dtype)
             here = offsets.T.double()
-            move = -_solved(curve + unit * eye, pull + unit * here)
+            move = -_solve_positive_definite(curve + unit * eye, pull + unit * here)
             move = (0.5 * share * (move - move.mean(0))).clamp(-LONGEST, LONGEST)
             move = (here + move).clamp(-WIDEST, WIDEST) - here
             offsets += move.T.float()
@@ -224,7 +234,7 @@ class Newton:
         self.moments.excess = self.excess
 
 
-def _solved(matrix: torch.Tensor, right: torch.Tensor) -> torch.Tensor:
+def _solve_positive_definite(matrix: torch.Tensor, right: torch.Tensor) -> torch.Tensor:
     """Return the solutions of symmetric positive definite systems, without waiting for the GPU to say so."""
     factor, _ = torch.linalg.cholesky_ex(matrix)
     half = torch.linalg.solve_triangular(factor, right[..., None], upper=False)

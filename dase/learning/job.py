@@ -16,19 +16,19 @@ from dase.effects.learned_threshold import LearnedThreshold
 from dase.effects.mismatch import Mismatch
 from dase.effects.threshold import Threshold
 from dase.errors import InputError, nearest
-from dase.learning.adversarial import Hash
-from dase.learning.baselines import Randomised, esim, event_rate
-from dase.learning.recorded_target import Replayed, open_target
+from dase.learning.adversarial import PatchHash
+from dase.learning.baselines import RandomThresholds, esim_thresholds, match_event_rate
+from dase.learning.recorded_target import ReplayedScenes, open_target
 from dase.learning.run import CHECKPOINT
-from dase.learning.scene_batches import Looks, Scenery, middle
-from dase.learning.targets import Finite, Pairs, Target, Truth, draw_noise, simulate
+from dase.learning.scene_batches import Scenery, SceneSettings, middle_intensity
+from dase.learning.targets import FiniteTarget, Pairs, Target, Truth, draw_noise, simulate_counts
 from dase.learning.training import Recipe, Training
 from dase.networks.threshold_network import NetworkShape, ThresholdNet
 from dase.networks.weights_file import save_net
 from dase.scenes import image_sources
 from dase.scenes.video import VideoScene
 from dase.simulation.sensor import Sensor
-from dase.simulation.sensor_file import dump_sensor, load_sensor, presets
+from dase.simulation.sensor_file import dump_sensor, load_sensor, read_presets
 from dase.simulation.simulate import count
 
 JOB, SENSOR, WEIGHTS, EXAMPLES = "job.json", "sensor.toml", "learned.safetensors", "examples.npz"
@@ -50,7 +50,7 @@ PRESETS: dict[str, Recipe] = {
     "paper": Recipe(
         objective="wgan", steps=20_000, warmup=0, optimizer="adabelief", rate=4e-4, rate_scalars=4e-4,
         critic_rate=4e-4, critic_cosine=True, anchor=0.0, average=0.0, surrogate="interval",
-        hash=Hash(contrast_from="events"), network=NetworkShape(literal=True),
+        hash=PatchHash(contrast_from="events"), network=NetworkShape(literal=True),
     ),
 }  # fmt: skip
 """Recipes by name. `default` is the best found, `paper` the paper's literal setting, `tiny` for a CPU."""
@@ -90,7 +90,9 @@ class Job:
 
     def __post_init__(self) -> None:
         if not self.images:
-            object.__setattr__(self, "images", "builtin" if self.targets and self.of_sensor else "frames")
+            object.__setattr__(
+                self, "images", "builtin" if self.targets and self.targets_sensor else "frames"
+            )
         if self.preset not in PRESETS:
             raise InputError(f"there is no preset '{self.preset}': {nearest(self.preset, PRESETS)}")
         if self.objective not in ("", "moments", "wgan"):
@@ -105,31 +107,31 @@ class Job:
             raise InputError(f"backend '{self.backend}' needs an NVIDIA GPU that PyTorch can use; use 'cpu'")
 
     @property
-    def of_sensor(self) -> bool:
+    def targets_sensor(self) -> bool:
         """Whether the target is a sensor file."""
         first = self.targets[0]
-        return first in presets() or first.endswith(".toml")
+        return first in read_presets() or first.endswith(".toml")
 
     def recipe(self) -> Recipe:
         """Return how to learn."""
         recipe = PRESETS[self.preset]
         if self.objective == "wgan" and recipe.objective != "wgan":
             recipe = replace(
-                recipe, objective="wgan", anchor=5.0, steps=3000, ramp=100, warmup=50, hash=Hash(size=8)
+                recipe, objective="wgan", anchor=5.0, steps=3000, ramp=100, warmup=50, hash=PatchHash(size=8)
             )
         elif self.objective:
             recipe = replace(recipe, objective=self.objective)
         if self.objective == "wgan" and self.preset == "tiny":
-            recipe = replace(recipe, hash=Hash(size=16, orientations=8, coherence=1), steps=600)
-        if not self.of_sensor:
+            recipe = replace(recipe, hash=PatchHash(size=16, orientations=8, coherence=1), steps=600)
+        if not self.targets_sensor:
             recipe = replace(recipe, doubt=RECORDED_DOUBT)
         return replace(recipe, seed=self.seed, steps=self.steps or recipe.steps)
 
-    def looks(self) -> Looks:
+    def scene_settings(self) -> SceneSettings:
         """Return what scenes of textures look like."""
         small = self.preset == "tiny"
         width, height = self.size or ((96, 96) if small else (240, 240))
-        return Looks(
+        return SceneSettings(
             width=width, height=height, window=self.window, samples=12 if small else 24, regime="mixed"
         )
 
@@ -138,7 +140,7 @@ class Job:
         return json.dumps(asdict(self), indent=1)
 
 
-def prepare(
+def open_training(
     job: Job, *, progress: Callable[[str, int, int], None] = lambda what, done, total: None
 ) -> Training:
     """Open what a job names and return the run, at its beginning.
@@ -151,29 +153,29 @@ def prepare(
         InputError: Something is missing, damaged, or does not fit.
     """
     target: Target
-    if job.of_sensor:
+    if job.targets_sensor:
         if len(job.targets) > 1:
             raise InputError(f"one sensor file is one target, got {len(job.targets)}")
-        scenery = _textures(job, job.looks())
-        target = of_sensor(
+        scenery = _textured_scenery(job, job.scene_settings())
+        target = simulate_target(
             load_sensor(job.targets[0]), scenery, job.sequences, seed=job.seed, backend=job.backend,
             progress=lambda done, total: progress("simulating the target", done, total),
         )  # fmt: skip
     else:
-        target, scenery = _recorded(job, progress)
+        target, scenery = _open_recorded(job, progress)
     recipe = job.recipe()
     if job.pattern:
-        size = scenery.looks.width, scenery.looks.height
+        size = scenery.scene_settings.width, scenery.scene_settings.height
         recipe = replace(recipe, network=replace(recipe.network, pattern=size))
-    smallest = min(scenery.looks.width, scenery.looks.height)
+    smallest = min(scenery.scene_settings.width, scenery.scene_settings.height)
     if recipe.objective == "wgan" and smallest < recipe.hash.size:
         raise InputError(
-            f"patches are {recipe.hash.size} px wide, the sensor {scenery.looks.width}x{scenery.looks.height}"
+            f"patches are {recipe.hash.size} px wide, the sensor {scenery.scene_settings.width}x{scenery.scene_settings.height}"
         )
     return Training(recipe, target, scenery)
 
 
-def _textures(job: Job, looks: Looks) -> Scenery:
+def _textured_scenery(job: Job, looks: SceneSettings) -> Scenery:
     if job.images == "frames":
         raise InputError("--images frames needs recordings; a sensor file has no frames")
     source = image_sources.open_images(job.images)
@@ -185,7 +187,7 @@ def _textures(job: Job, looks: Looks) -> Scenery:
     )
 
 
-def _recorded(job: Job, progress: Callable[[str, int, int], None]) -> tuple[Target, Scenery]:
+def _open_recorded(job: Job, progress: Callable[[str, int, int], None]) -> tuple[Target, Scenery]:
     target, scenery = open_target(
         [Path(name) for name in job.targets],
         window=job.window,
@@ -195,11 +197,13 @@ def _recorded(job: Job, progress: Callable[[str, int, int], None]) -> tuple[Targ
     )
     if job.images == "frames":
         return target, scenery
-    looks = replace(job.looks(), width=scenery.looks.width, height=scenery.looks.height)
-    return target, _textures(job, looks)
+    looks = replace(
+        job.scene_settings(), width=scenery.scene_settings.width, height=scenery.scene_settings.height
+    )
+    return target, _textured_scenery(job, looks)
 
 
-def of_sensor(
+def simulate_target(
     sensor: Sensor,
     scenery: Scenery,
     sequences: int,
@@ -207,13 +211,13 @@ def of_sensor(
     seed: int = 0,
     backend: str = "cpu",
     progress: Callable[[int, int], None] = lambda done, total: None,
-) -> Finite:
+) -> FiniteTarget:
     """Simulate sequences with a sensor, as the target of the synthetic experiment.
 
     Its thresholds are known where it has no effect but `threshold` and `mismatch`.
     """
     rng = np.random.default_rng([seed, 4])
-    looks = scenery.looks
+    looks = scenery.scene_settings
     times = np.linspace(0, looks.window, looks.samples)
     grey, counts = [], []
     for n in range(sequences):
@@ -222,15 +226,15 @@ def of_sensor(
         scene = VideoScene(np.clip(frames, 0, 1), times)
         found = count(scene, sensor, (-1.0, looks.window), seed=int(rng.integers(2**31)), device=backend)
         counts.append(torch.from_numpy(found[0, 0].reshape(2, looks.height, looks.width)))
-        grey.append(middle(log)[0].cpu())
+        grey.append(middle_intensity(log)[0].cpu())
         progress(n + 1, sequences)
     pairs = Pairs(
         torch.stack(grey).half().to(backend), torch.stack(counts).clamp_max(2000).half().to(backend)
     )
-    return Finite(pairs, truth=_truth(sensor))
+    return FiniteTarget(pairs, truth=_true_thresholds(sensor))
 
 
-def _truth(sensor: Sensor) -> Truth | None:
+def _true_thresholds(sensor: Sensor) -> Truth | None:
     """Return the thresholds of a sensor, None where other effects change what they mean."""
     known = {"threshold", "mismatch"}
     if any(effect.name not in known and not effect.is_off() for effect in sensor.effects):
@@ -247,7 +251,7 @@ def _truth(sensor: Sensor) -> Truth | None:
     return truth
 
 
-def begin(job: Job, out: Path, *, resume: bool) -> None:
+def record_job(job: Job, out: Path, *, resume: bool) -> None:
     """Leave the record of a job in its folder; raises InputError where another one has a checkpoint there."""
     record = out / JOB
     if out.exists() and not out.is_dir():
@@ -263,7 +267,7 @@ def begin(job: Job, out: Path, *, resume: bool) -> None:
         temporary.write_text(job.text(), "utf-8")
 
 
-def job_in(out: Path) -> Job:
+def read_job(out: Path) -> Job:
     """Return the job of a run; raises InputError where there is none."""
     record = out / JOB
     if not record.is_file():
@@ -287,7 +291,7 @@ def write_sensor(
         name: Of the sensor.
         size: Columns and rows of the camera [px], if it is one.
     """
-    net = net.levelled(mu)
+    net = net.with_level(mu)
     level, ratio = float(net.level[0].exp()), float(net.asymmetry.exp())
     on, off = (float(np.clip(level * ratio**share, 0.01, 10.0)) for share in (0.5, -0.5))
     save_net(out / WEIGHTS, net)
@@ -307,17 +311,17 @@ def write_examples(out: Path, training: Training, *, scenes: int = 3, seed: int 
     """
     scenery, net = training.scenery, training.mean
     rng, generator = np.random.default_rng(seed), torch.Generator(scenery.device).manual_seed(seed)
-    if isinstance(scenery, Replayed) and isinstance(training.target, Finite):
+    if isinstance(scenery, ReplayedScenes) and isinstance(training.target, FiniteTarget):
         busy = training.target.recorded.counts.float().sum((1, 2, 3))
         index = torch.sort(torch.topk(busy, min(4 * scenes, len(busy))).indices).values
         index = index[:: max(len(index) // scenes, 1)][:scenes]
         log, real = scenery.log[index].float(), training.target.recorded.select(index)
     else:
         log, real = scenery.draw(rng, scenes), training.target.draw(rng, scenes)
-    grey = middle(log)
+    grey = middle_intensity(log)
     maps = net(grey)
     mu, sigma = maps.by_polarity()
-    counts = simulate(log, mu, sigma, draw_noise(log, generator))
+    counts = simulate_counts(log, mu, sigma, draw_noise(log, generator))
     arrays = dict(
         grey=grey, real_grey=real.grey, real=real.counts, simulated=counts, mu=maps.mu, sigma=maps.sigma
     )
@@ -325,13 +329,15 @@ def write_examples(out: Path, training: Training, *, scenes: int = 3, seed: int 
         np.savez_compressed(temporary, **{name: value.cpu().numpy() for name, value in arrays.items()})
 
 
-def baseline(
+def make_baseline(
     kind: Literal["esim", "rate", "random"], target: Target, scenery: Scenery, *, seed: int = 0
 ) -> Any:
     """Return thresholds without learning, see `dase.learning.baselines`."""
     if kind == "esim":
-        return esim().to(scenery.device)
+        return esim_thresholds().to(scenery.device)
     if kind == "random":
-        return Randomised(seed)
-    pairs = target.recorded if isinstance(target, Finite) else target.draw(np.random.default_rng(seed), 96)
-    return event_rate(pairs, scenery, seed=seed).to(scenery.device)
+        return RandomThresholds(seed)
+    pairs = (
+        target.recorded if isinstance(target, FiniteTarget) else target.draw(np.random.default_rng(seed), 96)
+    )
+    return match_event_rate(pairs, scenery, seed=seed).to(scenery.device)

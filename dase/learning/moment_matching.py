@@ -24,7 +24,7 @@ from torch.nn import functional as F
 
 from dase.learning import distributed
 from dase.learning.targets import Pairs
-from dase.networks.threshold_network import TINY, gradient_magnitude, looks
+from dase.networks.threshold_network import MAGNITUDE_FLOOR, brightness_and_edge, gradient_magnitude
 
 RIDGE = 0.1
 """Added to the variances before they are inverted, as a share."""
@@ -42,11 +42,11 @@ ANEW = 25
 """Steps after which the weights are worked out again."""
 
 
-Members = tuple[torch.Tensor, torch.Tensor]
+CellMembers = tuple[torch.Tensor, torch.Tensor]
 """See `Moments.members`."""
 
 
-def of_pixels(counts: torch.Tensor) -> torch.Tensor:
+def single_pixel_features(counts: torch.Tensor) -> torch.Tensor:
     """Return features (B, 7, H, W) that depend on the counts (B, 2, H, W) of the pixel alone.
 
     Level, its square, how busy, and how much of both.
@@ -56,7 +56,7 @@ def of_pixels(counts: torch.Tensor) -> torch.Tensor:
     return torch.cat([level, level.square(), counts / (1 + counts), both], 1)
 
 
-def with_neighbours(pixels: torch.Tensor) -> torch.Tensor:
+def add_neighbour_features(pixels: torch.Tensor) -> torch.Tensor:
     """Add features of the level (the first two) between neighbours, which see the same change: (B, 13, H, W).
 
     Their differences tell the spread of the thresholds.
@@ -67,24 +67,24 @@ def with_neighbours(pixels: torch.Tensor) -> torch.Tensor:
     return torch.cat([pixels, rough, rough.square(), near.square()], 1)
 
 
-def with_next(pixels: torch.Tensor, axis: int) -> torch.Tensor:
+def add_next_pixel_features(pixels: torch.Tensor, axis: int) -> torch.Tensor:
     """Add differences of the level to the next pixel along `axis` only, shape (B, 11, H, W).
 
     Those of other columns must not come into what a column is judged by.
     """
     last = (0, 0, 0, 1) if axis == -2 else (0, 1)
     step = F.pad(torch.diff(pixels[:, :2], dim=axis), last)
-    return torch.cat([pixels, torch.sqrt(step.square() + TINY), step.square()], 1)
+    return torch.cat([pixels, torch.sqrt(step.square() + MAGNITUDE_FLOOR), step.square()], 1)
 
 
 def pixel_features(pairs: Pairs) -> torch.Tensor:
     """Return features (B, 7, H, W) of pixels, with gradients where the pairs say how counts answer."""
     if pairs.varied is None:
-        return of_pixels(pairs.counts)
-    return pairs.varied.follow(of_pixels, pairs.counts)
+        return single_pixel_features(pairs.counts)
+    return pairs.varied.with_gradient(single_pixel_features, pairs.counts)
 
 
-class Cells:
+class CellMoments:
     """Running means, covariances and weights of the features in a set of cells.
 
     Args:
@@ -112,7 +112,7 @@ class Cells:
         self.kept |= {"real_scenes": zeros(), "fake_scenes": zeros(), "usual": zeros()}
         self.kept["weight"] = torch.zeros(blocks, size, size, device=device)
 
-    def see_real(self, sums: torch.Tensor, number: torch.Tensor, *, held_out: bool = False) -> None:
+    def add_real(self, sums: torch.Tensor, number: torch.Tensor, *, held_out: bool = False) -> None:
         """Add scenes: sums of the features (B, cells, F) over `number` (B, cells) pixels."""
         side = "held" if held_out else "real"
         self.kept[f"{side}_sum"] += sums.double().sum(0)
@@ -120,7 +120,7 @@ class Cells:
         if not held_out:
             self.kept["real_scenes"] += len(sums)
 
-    def see_plain(self, sums: torch.Tensor, number: torch.Tensor) -> torch.Tensor:
+    def add_reference(self, sums: torch.Tensor, number: torch.Tensor) -> torch.Tensor:
         """Add scenes at the reference thresholds; return by how much each is off the mean of all."""
         kept = self.kept
         sums, number = sums.double(), number.double()
@@ -133,7 +133,7 @@ class Cells:
         kept["scenes"] += len(sums)
         return off
 
-    def see_fake(self, sums: torch.Tensor, number: torch.Tensor, off: torch.Tensor) -> None:
+    def add_fake(self, sums: torch.Tensor, number: torch.Tensor, off: torch.Tensor) -> None:
         """Add scenes that were `off` at the reference thresholds, and forget a part of earlier ones."""
         kept = self.kept
         sums, number = sums.detach().double(), number.double()
@@ -219,20 +219,20 @@ class Moments:
         self.excess: torch.Tensor | float = 1.0
         self.device, self.levels, self.pattern, self.memory = torch.device(device), levels, pattern, memory
         self.boundaries: list[torch.Tensor] = []
-        self.sets: dict[str, Cells] = {}
+        self.sets: dict[str, CellMoments] = {}
         self.calls = 0
         self.held = self.anew = False
 
     def calibrate(self, sets: list[tuple[Pairs, Pairs]]) -> None:
         """Place the boundaries of brightness and edge strength at quantiles of both domains."""
-        found = [looks(pairs.grey) for both in sets for pairs in both]
+        found = [brightness_and_edge(pairs.grey) for both in sets for pairs in both]
         for level, values in zip(self.levels, zip(*found, strict=True), strict=True):
             pooled = torch.sort(
                 torch.cat([v.flatten()[:: max(v.numel() // 50_000, 1)] for v in values])
             ).values
             places = [round(n / level * (len(pooled) - 1)) for n in range(1, level)]
             self.boundaries.append(pooled[places].contiguous())
-        distributed.alike(self.boundaries)
+        distributed.broadcast_tensors(self.boundaries)
         height, across = sets[0][0].grey.shape[1:]
         self._make(across, height)
 
@@ -241,7 +241,7 @@ class Moments:
         if self.pattern:
             sizes |= {"column": across, "row": height}
         self.sets = {
-            name: Cells(
+            name: CellMoments(
                 size,
                 13 if name == "look" else 11,
                 device=self.device,
@@ -251,9 +251,9 @@ class Moments:
             for name, size in sizes.items()
         }
 
-    def members(self, grey: torch.Tensor) -> Members:
+    def members(self, grey: torch.Tensor) -> CellMembers:
         """Return which cells of looks pixels are in, 1 or 0 (B, pixels, cells), and how many (B, cells)."""
-        brightness, edge = looks(grey)
+        brightness, edge = brightness_and_edge(grey)
         cell = torch.bucketize(brightness.contiguous(), self.boundaries[0]) * self.levels[1]
         cell = (cell + torch.bucketize(edge, self.boundaries[1])).flatten(1)[..., None]
         every = torch.arange(self.levels[0] * self.levels[1], device=self.device)
@@ -262,7 +262,7 @@ class Moments:
         return member, member.sum(1)
 
     def sums(
-        self, pairs: Pairs, members: Members | None = None
+        self, pairs: Pairs, members: CellMembers | None = None
     ) -> dict[str, tuple[torch.Tensor, torch.Tensor]]:
         """Return sums (B, cells, F) and numbers of pixels (B, cells) for each set of cells.
 
@@ -272,23 +272,26 @@ class Moments:
         """
         pixels = pixel_features(pairs)
         member, number = self.members(pairs.grey) if members is None else members
-        found = with_neighbours(pixels)
-        out = {"look": (summed(member, found.flatten(2).transpose(1, 2)), number)}
+        found = add_neighbour_features(pixels)
+        out = {"look": (sum_by_cell(member, found.flatten(2).transpose(1, 2)), number)}
         if self.pattern:
             batch, _, height, width = found.shape
-            down, across = with_next(pixels, -2).sum(2), with_next(pixels, -1).sum(3)
+            down, across = (
+                add_next_pixel_features(pixels, -2).sum(2),
+                add_next_pixel_features(pixels, -1).sum(3),
+            )
             out["column"] = down.transpose(1, 2), found.new_full((batch, width), height)
             out["row"] = across.transpose(1, 2), found.new_full((batch, height), width)
         return out
 
     @torch.no_grad()
-    def see_real(self, real: Pairs, *, held_out: bool = False) -> None:
+    def add_real(self, real: Pairs, *, held_out: bool = False) -> None:
         """Take real pairs in, some of them for choosing between priors only."""
         for name, both in self.sums(real).items():
-            self.sets[name].see_real(*map(distributed.together, both), held_out=held_out)
+            self.sets[name].add_real(*map(distributed.gather_values, both), held_out=held_out)
 
     @torch.no_grad()
-    def see_plain(self, fake: Pairs, members: Members) -> dict[str, torch.Tensor]:
+    def add_reference(self, fake: Pairs, members: CellMembers) -> dict[str, torch.Tensor]:
         """Take the reference counts of simulated pairs in; return how far each scene is off.
 
         Args:
@@ -298,7 +301,8 @@ class Moments:
         assert fake.reference is not None
         found = self.sums(Pairs(fake.grey, fake.reference), members)
         return {
-            name: self.sets[name].see_plain(*map(distributed.together, both)) for name, both in found.items()
+            name: self.sets[name].add_reference(*map(distributed.gather_values, both))
+            for name, both in found.items()
         }
 
     def weigh(self) -> None:
@@ -316,14 +320,14 @@ class Moments:
 
     def loss(self, fake: Pairs, real: Pairs, *, move: bool) -> tuple[torch.Tensor, dict[str, torch.Tensor]]:
         """Take both batches in; return the fake means of this batch along what they are off."""
-        self.see_real(real, held_out=self.held)
+        self.add_real(real, held_out=self.held)
         members = self.members(fake.grey)
-        plain = self.see_plain(fake, members)
+        plain = self.add_reference(fake, members)
         if self.anew:
             self.weigh()
         total, distance = fake.counts.new_zeros(()), fake.counts.new_zeros(())
         for name, both in self.sums(fake, members).items():
-            sums, number = map(distributed.together, both)
+            sums, number = map(distributed.gather_values, both)
             cells = self.sets[name]
             # earlier batches say how far off the means are, this one which way they go: no bias by its noise
             off = cells.off()
@@ -331,7 +335,7 @@ class Moments:
                 means = sums.sum(0) / number.sum(0).clamp_min(1)[:, None]
                 total = total + (cells.slope(off) * means).sum()
             distance = distance + cells.distance(off)
-            cells.see_fake(sums, number, plain[name])
+            cells.add_fake(sums, number, plain[name])
         return total, {"distance": distance}
 
     def state(self) -> dict[str, Any]:
@@ -349,7 +353,7 @@ class Moments:
             self.sets[name].kept = {key: value.to(self.device) for key, value in kept.items()}
 
 
-def summed(member: torch.Tensor, values: torch.Tensor) -> torch.Tensor:
+def sum_by_cell(member: torch.Tensor, values: torch.Tensor) -> torch.Tensor:
     """Return the sums of values (B, N, F) over the pixels of each cell (B, N, cells), shape (B, cells, F).
 
     In many pieces, which a GPU works at side by side; in one it took 16 times as long.
@@ -362,7 +366,7 @@ def summed(member: torch.Tensor, values: torch.Tensor) -> torch.Tensor:
 
 
 @torch.no_grad()
-def discrepancy(fake: list[Pairs], real: list[Pairs], like: Moments) -> float:
+def moment_discrepancy(fake: list[Pairs], real: list[Pairs], like: Moments) -> float:
     """Return how far pairs are apart, with the cells and weights of an objective."""
     total = 0.0
     parts = [[like.sums(pairs) for pairs in side] for side in (fake, real)]

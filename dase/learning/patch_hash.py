@@ -81,12 +81,12 @@ def attributes(
     structure = [out[name] for name in ("angle", "coherence", "strength", "energy")]
     over = {"size": rows * columns, "device": where, "batch": batch}
     sums = wp.empty((batch, rows * columns * size), dtype=wp.vec3, device=where)
-    launch.run(
+    launch.run_kernel(
         kernels.structure_rows, sums.shape[1], [image, weight, stride, columns, sums], where, batch=batch
     )
-    launch.run(kernels.structure, inputs=[sums, weight, *structure], **over)
-    contrast = kernels.contrast_of[counts.dtype]
-    launch.run(contrast, inputs=[counts, size, stride, columns, out["contrast"]], **over)
+    launch.run_kernel(kernels.structure_of_patches, inputs=[sums, weight, *structure], **over)
+    contrast = kernels.contrast_kernels[counts.dtype]
+    launch.run_kernel(contrast, inputs=[counts, size, stride, columns, out["contrast"]], **over)
     found = PatchAttributes(**{name: out[name].numpy().reshape(batch, rows, columns) for name in names})
     _check_finite(found.energy, "image")
     _check_finite(found.contrast, "counts")
@@ -218,7 +218,7 @@ def _quantiles(values: list[NDArray[np.float32]], name: str, levels: int) -> tup
 
 def _device(name: str) -> Any:
     try:
-        return launch.device(name)
+        return launch.find_device(name)
     except ValueError as error:
         raise InputError(str(error)) from error
 

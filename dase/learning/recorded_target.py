@@ -16,11 +16,11 @@ import torch
 from numpy.typing import NDArray
 
 from dase.errors import InputError
-from dase.learning.scene_batches import LOG_EPS, Looks, Scenery
-from dase.learning.targets import Finite, Pairs
+from dase.learning.scene_batches import LOG_EPS, Scenery, SceneSettings
+from dase.learning.targets import FiniteTarget, Pairs
 from dase.recordings.recording import Recording, open_recording
 from dase.scenes.between_frames import TOLERANCE, CameraScene
-from dase.scenes.frame_motion import stretched, stretches
+from dase.scenes.frame_motion import estimate_stretches, is_stretched
 
 FEWEST = 0.005
 """Fewest events per pixel and window from which anything can be learned."""
@@ -30,7 +30,7 @@ ROOM = 1 << 31
 
 
 @dataclass(frozen=True)
-class Windows:
+class RecordedWindows:
     """What a camera saw and sent, window by window.
 
     Args:
@@ -46,7 +46,7 @@ class Windows:
     trusted: float
 
 
-def windows_of(
+def cut_windows(
     recording: Recording,
     *,
     window: float = 0.05,
@@ -54,7 +54,7 @@ def windows_of(
     tolerance: float = TOLERANCE,
     most: int | None = None,
     progress: Callable[[int, int], None] = lambda done, total: None,
-) -> Windows:
+) -> RecordedWindows:
     """Cut a recording into windows.
 
     Args:
@@ -86,7 +86,7 @@ def windows_of(
         trusted = recording.mask & (scene.doubt(times[:: max(samples // 4, 1)]).max(0) <= tolerance)
         levels = np.log(scene.frames(times) + np.float32(LOG_EPS))
         log[n] = np.where(trusted, levels, levels[samples // 2])
-        counts[n] = np.where(trusted, _count(recording, start, start + window), 0)
+        counts[n] = np.where(trusted, _count_events(recording, start, start + window), 0)
         kept += float(trusted.mean()) / len(begin)
         progress(n + 1, len(begin))
     rate = float(counts.sum((1, 2, 3)).mean()) / (recording.height * recording.width)
@@ -95,7 +95,7 @@ def windows_of(
             f"the recording has {rate:.2g} events per pixel in windows of {window:g} s where its frames can "
             f"be trusted; learning needs at least {FEWEST:g}"
         )
-    return Windows(begin, log, counts, kept)
+    return RecordedWindows(begin, log, counts, kept)
 
 
 def _scene_of(recording: Recording) -> CameraScene:
@@ -110,13 +110,13 @@ def _scene_of(recording: Recording) -> CameraScene:
             "the frames of the recording have no times, so they cannot be laid beside the events"
         )
     scene = CameraScene(recording.frames, begin, recording.frame_end)
-    if not stretched(recording.frames):
+    if not is_stretched(recording.frames):
         return scene
-    gains = stretches([scene.intensity(k) for k in range(len(scene))])
+    gains = estimate_stretches([scene.intensity(k) for k in range(len(scene))])
     return CameraScene(recording.frames, begin, recording.frame_end, gains=gains)
 
 
-def _count(recording: Recording, begin: float, end: float) -> NDArray[np.float32]:
+def _count_events(recording: Recording, begin: float, end: float) -> NDArray[np.float32]:
     events = recording.events
     first, last = np.searchsorted(events.t, (begin, end))
     some = slice(int(first), int(last))
@@ -127,16 +127,16 @@ def _count(recording: Recording, begin: float, end: float) -> NDArray[np.float32
     return found.reshape(2, recording.height, recording.width).astype(np.float32)
 
 
-class Replayed(Scenery):
+class ReplayedScenes(Scenery):
     """Scenes that are the windows of a recording, on a device."""
 
-    def __init__(self, windows: Windows, *, window: float, device: str | torch.device = "cpu"):
+    def __init__(self, windows: RecordedWindows, *, window: float, device: str | torch.device = "cpu"):
         samples, height, width = windows.log.shape[1:]
-        self.looks = Looks(width=width, height=height, window=window, samples=samples)
+        self.scene_settings = SceneSettings(width=width, height=height, window=window, samples=samples)
         self.device = torch.device(device)
         self.log = torch.from_numpy(windows.log).to(self.device)
 
-    def numbers(self, rng: np.random.Generator, count: int) -> NDArray[np.int32]:
+    def draw_numbers(self, rng: np.random.Generator, count: int) -> NDArray[np.int32]:
         """Choose `count` windows."""
         index = rng.choice(len(self.log), size=count, replace=count > len(self.log))
         return np.asarray(index, np.int32)
@@ -155,7 +155,7 @@ def open_target(
     until: float | None = None,
     device: str | torch.device = "cpu",
     progress: Callable[[int, int], None] = lambda done, total: None,
-) -> tuple[Finite, Replayed]:
+) -> tuple[FiniteTarget, ReplayedScenes]:
     """Open recordings of one camera as a target, and their windows as scenes.
 
     Args:
@@ -170,7 +170,7 @@ def open_target(
     Raises:
         InputError: A file cannot be read, is of another size, or holds too little.
     """
-    found: list[Windows] = []
+    found: list[RecordedWindows] = []
     shape = None
     for path in paths:
         recording = open_recording(path)
@@ -184,15 +184,15 @@ def open_target(
                 f"{path} is of a {size[0]}x{size[1]} sensor, those before it of {shape[0]}x{shape[1]}"
             )
         try:
-            found.append(windows_of(recording, window=window, samples=samples, progress=progress))
+            found.append(cut_windows(recording, window=window, samples=samples, progress=progress))
         except InputError as error:
             raise InputError(f"{path}: {error}") from error
-    return _joined(found, held_out, window, device)
+    return _join_recordings(found, held_out, window, device)
 
 
-def _joined(
-    found: list[Windows], held_out: float, window: float, device: str | torch.device
-) -> tuple[Finite, Replayed]:
+def _join_recordings(
+    found: list[RecordedWindows], held_out: float, window: float, device: str | torch.device
+) -> tuple[FiniteTarget, ReplayedScenes]:
     """Return target and scenes, the held-out windows of all recordings last."""
     order: list[int] = []
     rest: list[int] = []
@@ -208,10 +208,10 @@ def _joined(
     counts = np.concatenate([part.counts for part in found])[chosen]
     begin = np.concatenate([part.begin for part in found])[chosen]
     trusted = float(np.mean([part.trusted for part in found]))
-    every = Windows(begin, log, counts, trusted)
-    scenes = Replayed(every, window=window, device=device)
+    every = RecordedWindows(begin, log, counts, trusted)
+    scenes = ReplayedScenes(every, window=window, device=device)
     middle = np.exp(log[:, log.shape[1] // 2].astype(np.float32)) - np.float32(LOG_EPS)
     pairs = Pairs(
         torch.from_numpy(middle).half().to(device), torch.from_numpy(counts).clamp_max(2000).half().to(device)
     )
-    return Finite(pairs, held_out=len(rest) / start, augment=False), scenes
+    return FiniteTarget(pairs, held_out=len(rest) / start, augment=False), scenes

@@ -15,7 +15,7 @@ import torch
 from dase.atomic_file import replacing
 from dase.errors import InputError
 from dase.learning import distributed
-from dase.learning.evaluation import Exam, HeldOut
+from dase.learning.evaluation import HeldOutScore, MapEvaluation
 from dase.learning.training import Recipe, Training
 
 CHECKPOINT, RESULT, BEST = "checkpoint.pt", "result.pt", "best.pt"
@@ -26,7 +26,7 @@ TIMED = 30
 
 
 @dataclass(frozen=True, kw_only=True)
-class Pace:
+class RunSchedule:
     """How often what is done.
 
     Args:
@@ -42,15 +42,15 @@ class Pace:
     held_out: int = 2
 
 
-class Broken(InputError):
+class TrainingDiverged(InputError):
     """Training met a number that is not finite."""
 
 
-def run(
+def train_in_folder(
     training: Training,
     out: Path,
     *,
-    pace: Pace | None = None,
+    pace: RunSchedule | None = None,
     resume: bool = False,
     look: Callable[[dict[str, float]], None] = lambda row: None,
 ) -> dict[str, float]:
@@ -67,7 +67,7 @@ def run(
         InputError: `out` holds another run, or nothing to resume.
         Broken: A loss or weight is not finite; the last checkpoint is good.
     """
-    pace = pace or Pace()
+    pace = pace or RunSchedule()
     out.mkdir(parents=True, exist_ok=True)
     path = out / CHECKPOINT
     if resume:
@@ -77,53 +77,54 @@ def run(
     elif path.exists():
         raise InputError(f"{out} already holds a run; give --resume to go on with it, or another folder")
     _write_recipe(out, training.recipe)
-    exam = Exam(training.scenery, training.target)
+    exam = MapEvaluation(training.scenery, training.target)
     pairs = training.target.held_out() if pace.held_out else None
-    held = None if pairs is None else HeldOut(training.scenery, pairs)
-    return _Run(training, out, pace, exam, held, look).go()
+    held = None if pairs is None else HeldOutScore(training.scenery, pairs)
+    return _RunLoop(training, out, pace, exam, held, look).go()
 
 
-class _Run:
+class _RunLoop:
     """The loop around the steps."""
 
     def __init__(
         self,
         training: Training,
         out: Path,
-        pace: Pace,
-        exam: Exam,
-        held: HeldOut | None,
+        pace: RunSchedule,
+        exam: MapEvaluation,
+        held: HeldOutScore | None,
         look: Callable[[dict[str, float]], None],
     ):
         self.training, self.out, self.pace = training, out, pace
         self.exam, self.held, self.look = exam, held, look
         self.broken = torch.full((), -1, device=training.device)
-        self.table = None if distributed.rank() else _Table(out / LOG, training.step)
+        self.table = None if distributed.process_rank() else _LogTable(out / LOG, training.step)
 
     def go(self) -> dict[str, float]:
         training = self.training
         begin = time.perf_counter() - training.seconds
         saved = time.perf_counter()
         mark = max(training.step, TIMED), saved
-        row: dict[str, float] = {"step": training.step, "seconds": training.seconds} | self.exam.marks(
-            training.mean
-        )
+        row: dict[str, float] = {
+            "step": training.step,
+            "seconds": training.seconds,
+        } | self.exam.describe_maps(training.mean)
         while training.step < training.recipe.steps:
             values = training.advance()
             wrong = ~torch.isfinite(values["loss"]) & (self.broken < 0)
             self.broken = torch.where(wrong, training.step - 1, self.broken)
             if self.pace.seconds is not None and training.step in (TIMED, 2 * mark[0]):
-                _wait(training.device)
+                _synchronise(training.device)
                 if training.step > TIMED:
                     self._fit_time(*mark, begin)
                 mark = training.step, time.perf_counter()
             last = training.step == training.recipe.steps
             if training.step % self.pace.look == 0 or last:
-                _wait(training.device)
+                _synchronise(training.device)
                 training.seconds = time.perf_counter() - begin
                 row = self._row(values, last)
                 due = time.perf_counter() - saved > self.pace.save or (last and self.pace.save < math.inf)
-                if distributed.agreed(due):
+                if distributed.broadcast_number(due):
                     save(self.out / CHECKPOINT, training.state())
                     saved = time.perf_counter()
         save(self.out / RESULT, {"net": training.mean.state_dict(), "row": row})
@@ -134,8 +135,8 @@ class _Run:
         training = self.training
         assert self.pace.seconds is not None
         now = time.perf_counter()
-        each = distributed.agreed((now - mark) / (training.step - step))
-        left = distributed.agreed(self.pace.seconds - (now - begin))
+        each = distributed.broadcast_number((now - mark) / (training.step - step))
+        left = distributed.broadcast_number(self.pace.seconds - (now - begin))
         training.recipe = replace(training.recipe, steps=training.step + max(int(0.97 * left / each), 1))
         _write_recipe(self.out, training.recipe)
 
@@ -146,8 +147,8 @@ class _Run:
             return {}
         row = {"step": training.step, "seconds": training.seconds}
         row |= {name: float(value) for name, value in values.items()}
-        row |= {f"raw_{name}": value for name, value in self.exam.marks(training.net).items()}
-        row |= self.exam.marks(training.mean)
+        row |= {f"raw_{name}": value for name, value in self.exam.describe_maps(training.net).items()}
+        row |= self.exam.describe_maps(training.mean)
         if self.held is not None and training.step > 0:
             looks = training.step // self.pace.look
             if last or looks % self.pace.held_out == 0:
@@ -172,10 +173,10 @@ class _Run:
         when = f"at step {step}" if step >= 0 else f"by step {training.step}"
         path = self.out / CHECKPOINT
         good = f"the last good checkpoint is {path}" if path.exists() else "there is no checkpoint yet"
-        raise Broken(f"training broke {when}: {culprit} is not finite; {good}")
+        raise TrainingDiverged(f"training broke {when}: {culprit} is not finite; {good}")
 
 
-class _Table:
+class _LogTable:
     """A CSV file of which every line but the last is whole, however a run ends.
 
     Args:
@@ -221,14 +222,14 @@ class _Table:
 
 
 def _write_recipe(out: Path, recipe: Recipe) -> None:
-    if distributed.rank() == 0:
+    if distributed.process_rank() == 0:
         with replacing(out / RECIPE) as temporary:
             temporary.write_text(recipe.text(), "utf-8")
 
 
 def save(path: Path, state: dict[str, Any]) -> None:
     """Write a checkpoint, if this is the first process; it appears whole or not at all."""
-    if distributed.rank():
+    if distributed.process_rank():
         return
     with replacing(path) as temporary:
         torch.save(state, temporary)
@@ -244,7 +245,7 @@ def load(path: Path, device: torch.device | str) -> dict[str, Any]:
     return state
 
 
-def recipe_in(out: Path) -> Recipe:
+def read_recipe(out: Path) -> Recipe:
     """Return the recipe of the run in a folder; raises InputError where there is none."""
     path = out / RECIPE
     if not path.is_file():
@@ -252,6 +253,6 @@ def recipe_in(out: Path) -> Recipe:
     return Recipe.parse(path.read_text("utf-8"))
 
 
-def _wait(device: torch.device) -> None:
+def _synchronise(device: torch.device) -> None:
     if device.type == "cuda":
         torch.cuda.synchronize(device)

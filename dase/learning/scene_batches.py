@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from dase.errors import InputError, nearest
 from dase.kernels import autograd_training as bridge
 from dase.scenes import image_sources
-from dase.scenes.random_scenes import CLIP, MIXED, NAMES, REGIMES, Regime
+from dase.scenes.random_scenes import CLIP, MIXED, REGIME_NAMES, REGIMES, Regime
 
 BACKGROUND = (320, 480)
 """Rows and columns of the backgrounds in the pool [texel]."""
@@ -36,7 +36,7 @@ MOTIONS = {**REGIMES, "shaken": SHAKEN}
 
 
 @dataclass(frozen=True, kw_only=True)
-class Looks:
+class SceneSettings:
     """What random scenes look like.
 
     Args:
@@ -44,7 +44,7 @@ class Looks:
         height: Rows [px].
         window: Duration [s].
         samples: Time samples, the first at 0 and the last at `window`.
-        regime: One of `dase.scenes.random_scenes.NAMES`, or `shaken`.
+        regime: One of `dase.scenes.random_scenes.REGIME_NAMES`, or `shaken`.
         speed: All speeds are multiplied by this.
     """
 
@@ -62,7 +62,7 @@ class Looks:
             raise InputError(
                 f"a window needs 2 samples and more than 0 s, got {self.samples} in {self.window:g} s"
             )
-        known = (*NAMES, "shaken")
+        known = (*REGIME_NAMES, "shaken")
         if self.regime not in known:
             raise InputError(f"there is no regime '{self.regime}': {nearest(self.regime, known)}")
 
@@ -82,16 +82,16 @@ class Scenery:
     def __init__(
         self,
         source: image_sources.ImageSource,
-        looks: Looks,
+        looks: SceneSettings,
         *,
         device: str | torch.device = "cpu",
         seed: int = 0,
         backgrounds: int = 48,
         objects: int = 96,
     ):
-        self.looks, self.device = looks, torch.device(device)
+        self.scene_settings, self.device = looks, torch.device(device)
         rng = np.random.default_rng([seed, 0])
-        grounds = [_ground(source.background(rng).grey) for _ in range(backgrounds)]
+        grounds = [_fit_background(source.background(rng).grey) for _ in range(backgrounds)]
         self._fill(grounds, [source.foreground(rng) for _ in range(objects)])
 
     def _fill(self, grounds: list[NDArray[np.float32]], fronts: list[image_sources.Picture]) -> None:
@@ -107,7 +107,7 @@ class Scenery:
         self.start = np.array([*start, total], np.int32)
         self.size = np.array([*size, (1, 1)], np.int32)
 
-    def with_looks(self, looks: Looks) -> Scenery:
+    def with_looks(self, looks: SceneSettings) -> Scenery:
         """Return scenery of the same textures."""
         other = object.__new__(Scenery)
         other.__dict__.update(self.__dict__, looks=looks)
@@ -116,7 +116,7 @@ class Scenery:
     def split(self, share: float) -> tuple[Scenery, Scenery]:
         """Return two pools without a texture in common; the first gets `share` of the backgrounds."""
         cut = int(round(share * len(self.grey)))
-        first, second = self.with_looks(self.looks), self.with_looks(replace(self.looks))
+        first, second = self.with_looks(self.scene_settings), self.with_looks(replace(self.scene_settings))
         first.grey, second.grey = self.grey[:cut].contiguous(), self.grey[cut:].contiguous()
         cut = int(round(share * (len(self.size) - 1)))
         # the last one is empty
@@ -126,11 +126,11 @@ class Scenery:
 
     def draw(self, rng: np.random.Generator, count: int) -> torch.Tensor:
         """Return log intensities of `count` random scenes, shape (count, samples, height, width)."""
-        return self.render(sent(self.numbers(rng, count), self.device), count)
+        return self.render(send_words(self.draw_numbers(rng, count), self.device), count)
 
-    def numbers(self, rng: np.random.Generator, count: int) -> NDArray[np.int32]:
+    def draw_numbers(self, rng: np.random.Generator, count: int) -> NDArray[np.int32]:
         """Draw `count` scenes; return all that is random in them, for `render`, as words of 4 bytes."""
-        looks = self.looks
+        looks = self.scene_settings
         motion = draw_motion(rng, looks, count)
         layers = motion.x.shape[1]
         front = rng.integers(len(self.size) - 1, size=(count, layers)) if len(self.size) > 1 else 0
@@ -139,21 +139,21 @@ class Scenery:
         size[:, 0] = BACKGROUND[::-1]
         place, box = motion.places(looks, size)
         ground = rng.integers(len(self.grey), size=count).astype(np.int32)
-        return packed(ground, self.start[which], size, place, box)
+        return pack_words(ground, self.start[which], size, place, box)
 
     def render(self, numbers: torch.Tensor, count: int) -> torch.Tensor:
         """Return log intensities (count, samples, height, width) of what `numbers` drew, on the device."""
-        looks, layers = self.looks, most_layers(self.looks)
+        looks, layers = self.scene_settings, most_layers(self.scene_settings)
         pair = (count, layers)
         shapes = (count,), pair, (*pair, 2), (count, looks.samples, layers, 2, 3), (*pair, 4)
-        ground, start, size, place, box = unpacked(numbers, *shapes)
+        ground, start, size, place, box = unpack_words(numbers, *shapes)
         return bridge.render_log(
             self.grey, self.texels, ground, start, size, place.view(torch.float32), box.view(torch.float32),
             width=looks.width, height=looks.height, eps=LOG_EPS,
         )  # fmt: skip
 
 
-def packed(*arrays: NDArray[Any]) -> NDArray[np.int32]:
+def pack_words(*arrays: NDArray[Any]) -> NDArray[np.int32]:
     """Return arrays of 4-byte numbers one behind the other, each from a multiple of LINE on.
 
     Vectors on a GPU may ask for that.
@@ -165,8 +165,8 @@ def packed(*arrays: NDArray[Any]) -> NDArray[np.int32]:
     return flat
 
 
-def unpacked(words: torch.Tensor, *shapes: tuple[int, ...]) -> list[torch.Tensor]:
-    """Return the arrays of these shapes that `packed` put into int32 words."""
+def unpack_words(words: torch.Tensor, *shapes: tuple[int, ...]) -> list[torch.Tensor]:
+    """Return the arrays of these shapes that `pack_words` put into int32 words."""
     out, begin = [], 0
     for shape in shapes:
         size = math.prod(shape)
@@ -175,7 +175,9 @@ def unpacked(words: torch.Tensor, *shapes: tuple[int, ...]) -> list[torch.Tensor
     return out
 
 
-def sent(words: NDArray[np.int32], device: torch.device, to: torch.Tensor | None = None) -> torch.Tensor:
+def send_words(
+    words: NDArray[np.int32], device: torch.device, to: torch.Tensor | None = None
+) -> torch.Tensor:
     """Return words on a device, in the memory of `to` if given; nobody waits for the copy."""
     here = torch.from_numpy(words)
     if device.type == "cuda":
@@ -183,12 +185,12 @@ def sent(words: NDArray[np.int32], device: torch.device, to: torch.Tensor | None
     return here.to(device, non_blocking=True) if to is None else to.copy_(here, non_blocking=True)
 
 
-def middle(log: torch.Tensor) -> torch.Tensor:
+def middle_intensity(log: torch.Tensor) -> torch.Tensor:
     """Return the intensity at the middle sample of log intensities (B, K, H, W), shape (B, H, W)."""
     return torch.exp(log[:, log.shape[1] // 2]) - LOG_EPS
 
 
-def _ground(grey: NDArray[np.float32]) -> NDArray[np.float32]:
+def _fit_background(grey: NDArray[np.float32]) -> NDArray[np.float32]:
     """Return a texture as a background of the pool: turned upright, cut and scaled to one size."""
     import cv2
 
@@ -204,7 +206,7 @@ def _ground(grey: NDArray[np.float32]) -> NDArray[np.float32]:
 
 
 @dataclass(frozen=True)
-class Motions:
+class LayerMotions:
     """Motion of the layers of many scenes; arrays of shape (B, L), and (B, L, 2) from begin to end."""
 
     x: NDArray[np.float64]
@@ -215,7 +217,7 @@ class Motions:
     there: NDArray[np.bool_]
 
     def places(
-        self, looks: Looks, size: NDArray[np.int32]
+        self, looks: SceneSettings, size: NDArray[np.int32]
     ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
         """Return maps from sensor to texture (B, K, L, 2, 3) and boxes (B, L, 4), as `LayerScene` has them.
 
@@ -250,20 +252,20 @@ class Motions:
         return place.astype(np.float32), box.astype(np.float32)
 
 
-def kinds(looks: Looks) -> list[Regime]:
+def drawn_regimes(looks: SceneSettings) -> list[Regime]:
     """Return the regimes that scenes are drawn from."""
     names = list(REGIMES) if looks.regime == MIXED else [looks.regime]
     return [MOTIONS[name] for name in names]
 
 
-def most_layers(looks: Looks) -> int:
+def most_layers(looks: SceneSettings) -> int:
     """Return how many layers a scene has room for: the background and the most objects of any regime."""
-    return 1 + max(int(how.objects[1]) for how in kinds(looks))
+    return 1 + max(int(how.objects[1]) for how in drawn_regimes(looks))
 
 
-def draw_motion(rng: np.random.Generator, looks: Looks, count: int) -> Motions:
+def draw_motion(rng: np.random.Generator, looks: SceneSettings, count: int) -> LayerMotions:
     """Draw the motion of `count` scenes, all at once; see `dase.scenes.random_scenes` for the numbers."""
-    hows = kinds(looks)
+    hows = drawn_regimes(looks)
     odds = np.array([how.scenes for how in hows], float)
     kind = rng.choice(len(hows), size=count, p=odds / odds.sum())
     table = np.array(
@@ -278,18 +280,18 @@ def draw_motion(rng: np.random.Generator, looks: Looks, count: int) -> Motions:
     spin[:, 0] = rng.uniform(table[:, 8], table[:, 9])
     low = np.where(np.arange(shape[1]) == 0, 1.0, 0.2)
     high = np.where(np.arange(shape[1]) == 0, 1.5, 1.2)
-    return _motions(rng, looks, looks.speed * speed, spin, low, high, there)
+    return _straight_paths(rng, looks, looks.speed * speed, spin, low, high, there)
 
 
-def _motions(
+def _straight_paths(
     rng: np.random.Generator,
-    looks: Looks,
+    looks: SceneSettings,
     speed: NDArray[np.float64],
     spin: NDArray[np.float64],
     low: NDArray[np.float64],
     high: NDArray[np.float64],
     there: NDArray[np.bool_],
-) -> Motions:
+) -> LayerMotions:
     """Return straight paths through uniform points of the middle of the picture at uniform times."""
     shape, window = speed.shape, looks.window
     when = rng.uniform(0, window, shape)
@@ -306,7 +308,7 @@ def _motions(
         first, second = rng.uniform(low, high, shape), rng.uniform(low, high, shape)
         ends = [first + (second - first) * t / max(CLIP, window) for t in (begin, begin + window)]
         scales.append(np.stack(ends, -1))
-    return Motions(
+    return LayerMotions(
         np.stack([x - vx * when, x + vx * (window - when)], -1),
         np.stack([y - vy * when, y + vy * (window - when)], -1),
         np.stack([angle, angle + turn], -1),

@@ -13,8 +13,8 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from dase.kernels.autograd_counts import FLOOR, STEP, Surrogate, count_events, thresholds
-from dase.learning.scene_batches import Scenery, middle, sent
+from dase.kernels.autograd_counts import FLOOR, STEP, Surrogate, clipped_thresholds, count_events
+from dase.learning.scene_batches import Scenery, middle_intensity, send_words
 from dase.networks.threshold_network import edge_strength
 
 Truth = Callable[[torch.Tensor], tuple[torch.Tensor, torch.Tensor]]
@@ -22,7 +22,7 @@ Truth = Callable[[torch.Tensor], tuple[torch.Tensor, torch.Tensor]]
 
 
 @dataclass
-class Varied:
+class VariedCounts:
     """Counts at thresholds a little higher and lower, to differentiate anything by central differences.
 
     Args:
@@ -35,7 +35,9 @@ class Varied:
     above: list[torch.Tensor]
     below: list[torch.Tensor]
 
-    def follow(self, value: Callable[[torch.Tensor], torch.Tensor], counts: torch.Tensor) -> torch.Tensor:
+    def with_gradient(
+        self, value: Callable[[torch.Tensor], torch.Tensor], counts: torch.Tensor
+    ) -> torch.Tensor:
         """Return `value` of the counts, with its gradient by the thresholds; it looks at single pixels.
 
         A surrogate for the count itself, put through a curved function, is off by what the curve does inside
@@ -65,7 +67,7 @@ class Pairs:
     grey: torch.Tensor
     counts: torch.Tensor
     reference: torch.Tensor | None = None
-    varied: Varied | None = None
+    varied: VariedCounts | None = None
     answers: dict[str, tuple[torch.Tensor, torch.Tensor]] | None = None
     some: torch.Tensor | None = None
 
@@ -94,7 +96,7 @@ class Target(ABC):
         """Where pairs are."""
 
     @abstractmethod
-    def numbers(self, rng: np.random.Generator, count: int) -> NDArray[np.int32]:
+    def draw_numbers(self, rng: np.random.Generator, count: int) -> NDArray[np.int32]:
         """Draw `count` pairs; return what `pairs` needs to know of them, as words of 4 bytes."""
 
     @abstractmethod
@@ -103,7 +105,7 @@ class Target(ABC):
 
     def draw(self, rng: np.random.Generator, count: int) -> Pairs:
         """Return random pairs."""
-        return self.pairs(sent(self.numbers(rng, count), self.device), count)
+        return self.pairs(send_words(self.draw_numbers(rng, count), self.device), count)
 
     def held_out(self) -> Pairs | None:
         """Return pairs that `draw` never gives, or None where every draw is new."""
@@ -120,7 +122,7 @@ class Target(ABC):
         """Take over what `state` returned."""
 
 
-class Endless(Target):
+class EndlessTarget(Target):
     """Fresh scenes seen by a sensor whose threshold distribution is known.
 
     Args:
@@ -138,17 +140,17 @@ class Endless(Target):
         """Where scenes are rendered."""
         return self.scenery.device
 
-    def numbers(self, rng: np.random.Generator, count: int) -> NDArray[np.int32]:
+    def draw_numbers(self, rng: np.random.Generator, count: int) -> NDArray[np.int32]:
         """Draw scenes."""
-        return self.scenery.numbers(rng, count)
+        return self.scenery.draw_numbers(rng, count)
 
     def pairs(self, numbers: torch.Tensor, count: int) -> Pairs:
         """Render scenes and let the sensor see them."""
         log = self.scenery.render(numbers, count)
-        grey = middle(log)
+        grey = middle_intensity(log)
         assert self.truth is not None
         mu, sigma = self.truth(grey)
-        return Pairs(grey, simulate(log, mu, sigma, draw_noise(log, self.generator)))
+        return Pairs(grey, simulate_counts(log, mu, sigma, draw_noise(log, self.generator)))
 
     def part(self, process: int) -> None:
         """Draw other thresholds and phases than other processes."""
@@ -164,7 +166,7 @@ class Endless(Target):
         self.generator.set_state(state["generator"].cpu())
 
 
-class Finite(Target):
+class FiniteTarget(Target):
     """Pairs that were recorded once.
 
     Args:
@@ -187,7 +189,7 @@ class Finite(Target):
         """Where the pairs were recorded to."""
         return self.recorded.grey.device
 
-    def numbers(self, rng: np.random.Generator, count: int) -> NDArray[np.int32]:
+    def draw_numbers(self, rng: np.random.Generator, count: int) -> NDArray[np.int32]:
         """Choose pairs, and how each is turned and mirrored."""
         index = rng.choice(len(self.recorded), size=count, replace=count > len(self.recorded))
         mirrored = rng.random((2, count)) < 0.5
@@ -198,14 +200,14 @@ class Finite(Target):
         """Return chosen pairs, turned and mirrored where `augment` says so."""
         index, across, along, turned = numbers.view(4, count)
         some = self.recorded.select(index.long())
-        return flipped(some, across > 0, along > 0, turned > 0) if self.augment else some
+        return flip_pairs(some, across > 0, along > 0, turned > 0) if self.augment else some
 
     def held_out(self) -> Pairs | None:
         """Return the pairs kept away from training."""
         return self.rest
 
 
-def flipped(pairs: Pairs, across: torch.Tensor, along: torch.Tensor, turned: torch.Tensor) -> Pairs:
+def flip_pairs(pairs: Pairs, across: torch.Tensor, along: torch.Tensor, turned: torch.Tensor) -> Pairs:
     """Mirror pairs across and along, and transpose them if they are square, where these (B,) say so."""
     out = []
     for maps in (pairs.grey[:, None], pairs.counts):
@@ -217,7 +219,7 @@ def flipped(pairs: Pairs, across: torch.Tensor, along: torch.Tensor, turned: tor
     return Pairs(out[0][:, 0], out[1])
 
 
-def record(target: Target, rng: np.random.Generator, count: int, *, batch: int = 20) -> Pairs:
+def record_pairs(target: Target, rng: np.random.Generator, count: int, *, batch: int = 20) -> Pairs:
     """Return `count` pairs of an endless target, stored compactly."""
     parts = [target.draw(rng, min(batch, count - n)) for n in range(0, count, batch)]
     grey = torch.cat([part.grey for part in parts]).half()
@@ -226,14 +228,14 @@ def record(target: Target, rng: np.random.Generator, count: int, *, batch: int =
 
 
 @dataclass
-class Noise:
+class PixelNoise:
     """What is random in pixels: one normal number for both thresholds, which go together, and the phase."""
 
     z: torch.Tensor
     phase: torch.Tensor
 
 
-def draw_noise(log: torch.Tensor, generator: torch.Generator) -> Noise:
+def draw_noise(log: torch.Tensor, generator: torch.Generator) -> PixelNoise:
     """Draw the noise of pixels that start anywhere between two events.
 
     As if the first change had been going on before, like `effects.threshold.phase`.
@@ -245,14 +247,14 @@ def draw_noise(log: torch.Tensor, generator: torch.Generator) -> Noise:
     shape = (len(log), *log.shape[2:])
     z = torch.randn(shape, device=log.device, generator=generator)
     fraction = torch.rand(shape, device=log.device, generator=generator)
-    return Noise(z, torch.where(log[:, 1] >= log[:, 0], fraction, -fraction))
+    return PixelNoise(z, torch.where(log[:, 1] >= log[:, 0], fraction, -fraction))
 
 
-def simulate(
+def simulate_counts(
     log: torch.Tensor,
     mu: torch.Tensor,
     sigma: torch.Tensor | float,
-    noise: Noise,
+    noise: PixelNoise,
     *,
     surrogate: Surrogate = "expected",
 ) -> torch.Tensor:
@@ -272,9 +274,11 @@ def simulate(
     return counts[:, 0]
 
 
-def vary(log: torch.Tensor, mu: torch.Tensor, sigma: torch.Tensor, noise: Noise) -> Varied:
-    """Return how the counts of `simulate`, with the same arguments, answer to the thresholds."""
-    theta = thresholds(mu, sigma, noise.z, like=log)
+def vary_thresholds(
+    log: torch.Tensor, mu: torch.Tensor, sigma: torch.Tensor, noise: PixelNoise
+) -> VariedCounts:
+    """Return how the counts of `simulate_counts`, with the same arguments, answer to the thresholds."""
+    theta = clipped_thresholds(mu, sigma, noise.z, like=log)
     above: list[torch.Tensor] = []
     below: list[torch.Tensor] = []
     with torch.no_grad():
@@ -284,12 +288,12 @@ def vary(log: torch.Tensor, mu: torch.Tensor, sigma: torch.Tensor, noise: Noise)
                 moved[:, n] *= factor
                 moved = moved[:, 0] if theta.shape[1] == 1 else moved
                 kept.append(count_events(log, moved, 0.0, 0.0, phase=noise.phase)[:, 0])
-    return Varied(theta.log(), above, below)
+    return VariedCounts(theta.log(), above, below)
 
 
 @torch.no_grad()
 def answers(
-    log: torch.Tensor, mu: torch.Tensor, sigma: torch.Tensor, noise: Noise
+    log: torch.Tensor, mu: torch.Tensor, sigma: torch.Tensor, noise: PixelNoise
 ) -> dict[str, tuple[torch.Tensor, torch.Tensor]]:
     """Return counts with all means, and with all spreads, a little higher and lower, and likewise the ratio.
 
@@ -301,19 +305,19 @@ def answers(
     """
     up, down = math.exp(STEP), math.exp(-STEP)
     out = {
-        "mu": (simulate(log, up * mu, sigma, noise), simulate(log, down * mu, sigma, noise)),
-        "sigma": (simulate(log, mu, up * sigma, noise), simulate(log, mu, down * sigma, noise)),
+        "mu": (simulate_counts(log, up * mu, sigma, noise), simulate_counts(log, down * mu, sigma, noise)),
+        "sigma": (simulate_counts(log, mu, up * sigma, noise), simulate_counts(log, mu, down * sigma, noise)),
     }
     if mu.ndim == 4:
         both = []
         for half in (math.sqrt(up), math.sqrt(down)):
             means, spreads = (torch.stack([m[:, 0] / half, m[:, 1] * half], 1) for m in (mu, sigma))
-            both.append(simulate(log, means, spreads, noise))
+            both.append(simulate_counts(log, means, spreads, noise))
         out["ratio"] = both[0], both[1]
     return out
 
 
-def uniform(mu: float = 0.2, sigma: float = 0.05) -> Truth:
+def uniform_thresholds(mu: float = 0.2, sigma: float = 0.05) -> Truth:
     """One distribution for all pixels: the paper's synthetic experiment."""
 
     def truth(grey: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
@@ -323,7 +327,7 @@ def uniform(mu: float = 0.2, sigma: float = 0.05) -> Truth:
     return truth
 
 
-def by_intensity(low: float = 0.12, slope: float = 0.16, spread: float = 0.25) -> Truth:
+def thresholds_by_intensity(low: float = 0.12, slope: float = 0.16, spread: float = 0.25) -> Truth:
     """Thresholds that rise with the image: μ = low + slope · I, σ = spread · μ."""
 
     def truth(grey: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
@@ -333,7 +337,9 @@ def by_intensity(low: float = 0.12, slope: float = 0.16, spread: float = 0.25) -
     return truth
 
 
-def by_edges(low: float = 0.14, gain: float = 0.16, half: float = 0.04, spread: float = 0.25) -> Truth:
+def thresholds_by_edges(
+    low: float = 0.14, gain: float = 0.16, half: float = 0.04, spread: float = 0.25
+) -> Truth:
     """Thresholds that are higher at edges: μ = low + gain · e / (e + half), e the gradient of the image.
 
     The image is blurred twice before, which is not how the networks and cells see edges.
@@ -347,7 +353,7 @@ def by_edges(low: float = 0.14, gain: float = 0.16, half: float = 0.04, spread: 
     return truth
 
 
-def by_column(mu: float = 0.2, spread: float = 0.25, depth: float = 0.25, seed: int = 3) -> Truth:
+def thresholds_by_column(mu: float = 0.2, spread: float = 0.25, depth: float = 0.25, seed: int = 3) -> Truth:
     """A fixed pattern: every column has a factor exp(depth · N(0, 1)) of its own."""
 
     @lru_cache(maxsize=4)
@@ -363,7 +369,7 @@ def by_column(mu: float = 0.2, spread: float = 0.25, depth: float = 0.25, seed: 
     return truth
 
 
-def asymmetric(mu: float = 0.2, sigma: float = 0.05, ratio: float = 1.4) -> Truth:
+def asymmetric_thresholds(mu: float = 0.2, sigma: float = 0.05, ratio: float = 1.4) -> Truth:
     """ON thresholds `ratio` times the OFF thresholds, evenly about `mu` in the logarithm."""
 
     def truth(grey: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
@@ -374,10 +380,10 @@ def asymmetric(mu: float = 0.2, sigma: float = 0.05, ratio: float = 1.4) -> Trut
 
 
 TRUTHS: dict[str, Callable[[], Truth]] = {
-    "uniform": uniform,
-    "intensity": by_intensity,
-    "edges": by_edges,
-    "column": by_column,
-    "asymmetric": asymmetric,
+    "uniform": uniform_thresholds,
+    "intensity": thresholds_by_intensity,
+    "edges": thresholds_by_edges,
+    "column": thresholds_by_column,
+    "asymmetric": asymmetric_thresholds,
 }
 """Sensors of the synthetic experiments."""

@@ -14,13 +14,21 @@ from dase.errors import InputError
 from dase.kernels.autograd_counts import Surrogate
 from dase.learning import distributed
 from dase.learning.adabelief import AdaBelief
-from dase.learning.adversarial import Adversarial, Hash, Objective
-from dase.learning.cuda_graph import Replay
-from dase.learning.gauss_newton import Newton
+from dase.learning.adversarial import AdversarialObjective, Objective, PatchHash
+from dase.learning.cuda_graph import GraphReplay
+from dase.learning.gauss_newton import GaussNewton
 from dase.learning.moment_matching import Moments
-from dase.learning.scene_batches import Scenery, middle, packed, sent, unpacked
-from dase.learning.targets import Noise, Pairs, Target, answers, draw_noise, simulate, vary
-from dase.networks.threshold_network import Maps, NetworkShape, ThresholdNet
+from dase.learning.scene_batches import Scenery, middle_intensity, pack_words, send_words, unpack_words
+from dase.learning.targets import (
+    Pairs,
+    PixelNoise,
+    Target,
+    answers,
+    draw_noise,
+    simulate_counts,
+    vary_thresholds,
+)
+from dase.networks.threshold_network import NetworkShape, ThresholdMaps, ThresholdNet
 
 REFERENCE = 0.25, 0.06
 """Threshold and spread at which scenes are counted once more, to tell busy scenes from low thresholds."""
@@ -89,7 +97,7 @@ class Recipe:
     penalty: float = 1.0
     uniform: float = 0.5
     critic_image: bool = False
-    hash: Hash = field(default_factory=Hash)
+    hash: PatchHash = field(default_factory=PatchHash)
     cells: tuple[int, int] = (6, 5)
     memory: float = 0.95
     doubt: float = 0.0
@@ -105,7 +113,7 @@ class Recipe:
     def parse(cls, text: str) -> Recipe:
         """Return the recipe of a JSON text."""
         table = json.loads(text)
-        table["hash"] = Hash(**table["hash"])
+        table["hash"] = PatchHash(**table["hash"])
         network = table["network"]
         for name in ("pattern", "table"):
             network[name] = None if network[name] is None else tuple(network[name])
@@ -136,17 +144,17 @@ class Training:
         self.optimizer = self._optimizer()
         self.objective = self._objective()
         moments = self.objective
-        self.newton = Newton(moments, self.net) if isinstance(moments, Moments) else None
-        distributed.alike(self.net.state_dict().values())
+        self.newton = GaussNewton(moments, self.net) if isinstance(moments, Moments) else None
+        distributed.broadcast_tensors(self.net.state_dict().values())
         self.generator = torch.Generator(self.device).manual_seed(
-            recipe.seed + 1 + APART * distributed.rank()
+            recipe.seed + 1 + APART * distributed.process_rank()
         )
         # other processes have scenes and phases of their own
-        apart = [distributed.rank()] if distributed.rank() else []
+        apart = [distributed.process_rank()] if distributed.process_rank() else []
         self.scenes = np.random.default_rng([recipe.seed, 1, *apart])
         self.reals = np.random.default_rng([recipe.seed, 2, *apart])
-        target.part(distributed.rank())
-        self.replay = Replay(self.device, self._generators())
+        target.part(distributed.process_rank())
+        self.replay = GraphReplay(self.device, self._generators())
         self.inputs: torch.Tensor | None = None
         self.step = -recipe.warmup
         self.seconds = 0.0
@@ -162,9 +170,9 @@ class Training:
         recipe, cuda = self.recipe, self.device.type == "cuda"
         parts = [(self.net.body(), recipe.rate)]
         if recipe.objective == "wgan":
-            parts.append((self.net.scalars(), recipe.rate_scalars))
+            parts.append((self.net.shared_parameters(), recipe.rate_scalars))
         else:
-            for shared in self.net.scalars():
+            for shared in self.net.shared_parameters():
                 # moved by Newton's steps
                 shared.requires_grad_(False)
         # rates are tensors, which a step that is replayed can read
@@ -188,7 +196,7 @@ class Training:
                 scenes=self.target.scenes,
                 doubt=recipe.doubt,
             )
-        return Adversarial(
+        return AdversarialObjective(
             recipe.hash,
             device=self.device,
             seed=recipe.seed + 2,
@@ -205,30 +213,30 @@ class Training:
         for _ in range(batches):
             with torch.no_grad():
                 log = self.scenery.draw(self.scenes, self.recipe.batch)
-                sets.append((self._fake(log)[0], self.target.draw(self.reals, self.recipe.batch)))
+                sets.append((self.simulate_fake(log)[0], self.target.draw(self.reals, self.recipe.batch)))
         self.objective.calibrate(sets)
         held_out = self.target.held_out()
         if held_out is not None and isinstance(self.objective, Moments):
             for n in range(0, len(held_out), self.recipe.batch):
                 some = held_out.select(slice(n, n + self.recipe.batch))
-                self.objective.see_real(some, held_out=True)
+                self.objective.add_real(some, held_out=True)
         self.calibrated = True
 
-    def _fake(self, log: torch.Tensor, step: torch.Tensor | int = 0) -> tuple[Pairs, Maps]:
+    def simulate_fake(self, log: torch.Tensor, step: torch.Tensor | int = 0) -> tuple[Pairs, ThresholdMaps]:
         """Return pairs simulated from log intensities, and the maps of their thresholds."""
-        grey = middle(log)
+        grey = middle_intensity(log)
         maps = self.net(grey)
         mu, sigma = maps.by_polarity() if self.recipe.network.split else (maps.mu, maps.sigma)
         noise = draw_noise(log, self.generator)
-        counts = simulate(log, mu, sigma, noise, surrogate=self.recipe.surrogate)
+        counts = simulate_counts(log, mu, sigma, noise, surrogate=self.recipe.surrogate)
         if self.recipe.objective != "moments":
             return Pairs(grey, counts), maps
         with torch.no_grad():
             level = torch.full_like(grey, REFERENCE[0])
-            reference = simulate(log, level, REFERENCE[1], noise)
-        varied = vary(log, mu, sigma, noise) if self.recipe.rate > 0 else None
-        some = some_of(len(log), step, log.device)
-        few = Noise(noise.z[some], noise.phase[some])
+            reference = simulate_counts(log, level, REFERENCE[1], noise)
+        varied = vary_thresholds(log, mu, sigma, noise) if self.recipe.rate > 0 else None
+        some = choose_derived_scenes(len(log), step, log.device)
+        few = PixelNoise(noise.z[some], noise.phase[some])
         near = answers(log[some], mu.detach()[some], sigma.detach()[some], few)
         return Pairs(grey, counts, reference, varied, near, some), maps
 
@@ -245,14 +253,14 @@ class Training:
         if not self.calibrated:
             self.calibrate()
         move = self.step >= 0
-        self.inputs = self._drawn(self.rate() if move else 0.0)
+        self.inputs = self._draw_inputs(self.rate() if move else 0.0)
         kind = self.objective.begin()
         # in the middle of a run there is only one kind, or two
-        values = self.replay(kind if kind is None else (move, kind), lambda: self._work(move))
+        values = self.replay(kind if kind is None else (move, kind), lambda: self._step_on_device(move))
         self.step += 1
         return values
 
-    def _drawn(self, share: float) -> torch.Tensor:
+    def _draw_inputs(self, share: float) -> torch.Tensor:
         """Draw scenes; return all that a step reads from the processor, where the last one read it."""
         recipe = self.recipe
         critic_rate = recipe.critic_rate * (share if recipe.critic_cosine and self.step >= 0 else 1.0)
@@ -262,41 +270,41 @@ class Training:
         parts = (
             np.array([share, critic_rate, 1 - keep], np.float32),
             np.array([self.step + recipe.warmup], np.int32),
-            self.scenery.numbers(self.scenes, recipe.batch),
-            self.target.numbers(self.reals, recipe.batch),
+            self.scenery.draw_numbers(self.scenes, recipe.batch),
+            self.target.draw_numbers(self.reals, recipe.batch),
         )
         self.shapes = [part.shape for part in parts]
-        return sent(packed(*parts), self.device, to=self.inputs)
+        return send_words(pack_words(*parts), self.device, to=self.inputs)
 
-    def _work(self, move: bool) -> dict[str, torch.Tensor]:
+    def _step_on_device(self, move: bool) -> dict[str, torch.Tensor]:
         """Do what a step does on the device."""
         recipe, inputs = self.recipe, self.inputs
         assert inputs is not None
-        numbers, step, scenes, reals = unpacked(inputs, *self.shapes)
+        numbers, step, scenes, reals = unpack_words(inputs, *self.shapes)
         share, critic_rate, learn = numbers.view(torch.float32).unbind()
-        if isinstance(self.objective, Adversarial):
+        if isinstance(self.objective, AdversarialObjective):
             self.objective.rate = critic_rate
-        fake, maps = self._fake(self.scenery.render(scenes, recipe.batch), step)
+        fake, maps = self.simulate_fake(self.scenery.render(scenes, recipe.batch), step)
         real = self.target.pairs(reals, recipe.batch)
         loss, values = self.objective.loss(fake, real, move=move)
         if self.newton is not None:
             self.newton.see(fake)
         if move:
-            held = recipe.anchor * maps.residual.square().mean() + recipe.kl * prior(maps)
+            held = recipe.anchor * maps.residual.square().mean() + recipe.kl * threshold_prior(maps)
             if recipe.smooth:
                 held = held + recipe.smooth * self.net.roughness()
             # the objective's part is that of the process's own scenes, to be summed over all
-            loss = loss + held / distributed.size()
+            loss = loss + held / distributed.process_count()
             for group in self.optimizer.param_groups:
                 group["lr"].copy_(share * group["full"])
             self.optimizer.zero_grad(set_to_none=True)
             loss.backward()
-            distributed.total_gradients(self.net.parameters())
+            distributed.sum_gradients(self.net.parameters())
             self.optimizer.step()
             if self.newton is not None:
                 self.newton.step(recipe.newton * share)
                 shared = [v for n, v in self.net.state_dict().items() if not n.startswith("unet.")]
-                distributed.alike(shared)
+                distributed.broadcast_tensors(shared)
             self._average(learn)
         return values | {"loss": loss.detach()}
 
@@ -316,7 +324,7 @@ class Training:
             "optimizer": self.optimizer.state_dict(),
             "newton": None if self.newton is None else self.newton.state(),
             "objective": self.objective.state(),
-            "random": distributed.everybodys(self._random()),
+            "random": distributed.gather_objects(self._random()),
             "step": self.step,
             "seconds": self.seconds,
             "best": self.best,
@@ -334,8 +342,10 @@ class Training:
 
     def load(self, state: dict[str, Any]) -> None:
         """Take over what `state` returned; raises InputError for the state of another number of processes."""
-        if len(state["random"]) != distributed.size():
-            raise InputError(f"the run has {len(state['random'])} processes, not {distributed.size()}")
+        if len(state["random"]) != distributed.process_count():
+            raise InputError(
+                f"the run has {len(state['random'])} processes, not {distributed.process_count()}"
+            )
         self.net.load_state_dict(state["net"])
         self.mean.load_state_dict(state["mean"])
         self.optimizer.load_state_dict(state["optimizer"])
@@ -344,7 +354,7 @@ class Training:
         self.objective.load(state["objective"])
         if self.newton is not None:
             self.newton.load(state["newton"])
-        mine = state["random"][distributed.rank()]
+        mine = state["random"][distributed.process_rank()]
         self.generator.set_state(mine["generator"].cpu())
         self.target.load(mine["target"])
         self.scenes.bit_generator.state = mine["scenes"]
@@ -354,13 +364,13 @@ class Training:
         self.calibrated = state["calibrated"]
 
 
-def some_of(batch: int, step: torch.Tensor | int, device: torch.device) -> torch.Tensor:
+def choose_derived_scenes(batch: int, step: torch.Tensor | int, device: torch.device) -> torch.Tensor:
     """Return which scenes of a batch the derivatives are taken of, others in every step; indices."""
     every = max(batch // DERIVED, 1)
     return (torch.arange(-(-batch // every), device=device) * every + step) % batch
 
 
-def prior(maps: Maps) -> torch.Tensor:
+def threshold_prior(maps: ThresholdMaps) -> torch.Tensor:
     """Return the mean over pixels of KL(N(μ, σ²) ‖ N(0, 1)): Eq. 9, with the sign that keeps it small."""
     mu, sigma = maps.mu, maps.sigma
     return (0.5 * (sigma.square() + mu.square() - 1) - sigma.log()).mean()

@@ -15,10 +15,10 @@ import torch
 from torch import nn
 from torch.nn import functional as F
 
-SLOPE = 0.2
+LEAKY_SLOPE = 0.2
 """Of the leaky rectifiers."""
 
-TINY = 1e-6
+MAGNITUDE_FLOOR = 1e-6
 """Under the root of gradient magnitudes, whose slope at 0 would be infinite."""
 
 EDGE = 0.05
@@ -52,7 +52,7 @@ class NetworkShape:
 
 
 @dataclass
-class Maps:
+class ThresholdMaps:
     """Distributions of thresholds [log intensity].
 
     Args:
@@ -73,7 +73,7 @@ class Maps:
         return self.mu[:, None] * factor, self.sigma[:, None] * factor
 
 
-class Residual(nn.Module):
+class ResidualBlock(nn.Module):
     """Two convolutions added to their input (He et al., Deep residual learning, 2016); no normalisation."""
 
     def __init__(self, channels: int):
@@ -83,7 +83,7 @@ class Residual(nn.Module):
 
     def forward(self, x: torch.Tensor) -> torch.Tensor:
         """Return an image of the same shape."""
-        return F.leaky_relu(x + self.second(F.leaky_relu(self.first(x), SLOPE)), SLOPE)
+        return F.leaky_relu(x + self.second(F.leaky_relu(self.first(x), LEAKY_SLOPE)), LEAKY_SLOPE)
 
 
 class UNet(nn.Module):
@@ -93,7 +93,7 @@ class UNet(nn.Module):
         super().__init__()
         wide = [channels * min(2**level, 4) for level in range(depth + 1)]
         self.stem = nn.Conv2d(inputs, wide[0], 3, padding=1)
-        self.encode = nn.ModuleList(Residual(n) for n in wide)
+        self.encode = nn.ModuleList(ResidualBlock(n) for n in wide)
         self.down = nn.ModuleList(nn.Conv2d(a, b, 3, 2, 1) for a, b in pairwise(wide))
         self.up = nn.ModuleList(nn.Conv2d(b, a, 1) for a, b in pairwise(wide))
         self.decode = nn.ModuleList(nn.Conv2d(n, n, 3, padding=1) for n in wide[:-1])
@@ -103,11 +103,11 @@ class UNet(nn.Module):
 
     def forward(self, x: torch.Tensor) -> torch.Tensor:
         """Return two maps (B, 2, H, W) of an image (B, inputs, H, W) of any size."""
-        x = F.leaky_relu(self.stem(x), SLOPE)
+        x = F.leaky_relu(self.stem(x), LEAKY_SLOPE)
         skips = []
         for encode, down in zip(self.encode, self.down, strict=False):
             skips.append(encode(x))
-            x = F.leaky_relu(down(skips[-1]), SLOPE)
+            x = F.leaky_relu(down(skips[-1]), LEAKY_SLOPE)
         x = self.encode[-1](x)
         for level in reversed(range(len(skips))):
             skip = skips[level]
@@ -116,7 +116,9 @@ class UNet(nn.Module):
             with torch.autocast(x.device.type, enabled=False):
                 x = F.interpolate(x, scale_factor=2, mode="nearest")
             # odd sides come back one pixel too long
-            x = F.leaky_relu(self.decode[level](x[..., : skip.shape[-2], : skip.shape[-1]] + skip), SLOPE)
+            x = F.leaky_relu(
+                self.decode[level](x[..., : skip.shape[-2], : skip.shape[-1]] + skip), LEAKY_SLOPE
+            )
         out: torch.Tensor = self.last(x)
         return out
 
@@ -157,28 +159,28 @@ class ThresholdNet(nn.Module):
             u = self.unet(x.contiguous(memory_format=torch.channels_last))
         return u.float().contiguous()
 
-    def forward(self, grey: torch.Tensor) -> Maps:
+    def forward(self, grey: torch.Tensor) -> ThresholdMaps:
         """Return the maps for images (B, H, W) in [0, 1]."""
         u = self.residual(grey)
         ratio = self.asymmetry.exp()
         if self.shape.literal:
-            return Maps(self.level[0].exp() + u[:, 0], (self.level[1] + u[:, 1]).exp(), ratio, u)
+            return ThresholdMaps(self.level[0].exp() + u[:, 0], (self.level[1] + u[:, 1]).exp(), ratio, u)
         total = self.level.view(1, 2, 1, 1) + u
         if self.shape.table is not None:
-            total = total + look_up(self.table, grey)
+            total = total + interpolate_table(self.table, grey)
         if self.shape.pattern is not None:
             total = total + self.columns.view(1, 2, 1, -1) + self.rows.view(1, 2, -1, 1)
         mu, sigma = total.exp().unbind(1)
-        return Maps(mu, sigma, ratio, u)
+        return ThresholdMaps(mu, sigma, ratio, u)
 
-    def hats(self, grey: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+    def node_weights(self, grey: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         """Return how much rows (B, R, H, W) and columns (B, C, H, W) of the table count in each pixel.
 
         A node counts as much as its row times its column; without a table there is one.
         """
         if self.shape.table is None:
             return torch.ones_like(grey)[:, None], torch.ones_like(grey)[:, None]
-        return table_weights(grey, self.shape.table)
+        return node_weights(grey, self.shape.table)
 
     def roughness(self) -> torch.Tensor:
         """Return the mean square difference between neighbouring nodes of the table, 0 without one."""
@@ -189,7 +191,7 @@ class ThresholdNet(nn.Module):
         )
 
     @torch.no_grad()
-    def levelled(self, mu: float) -> ThresholdNet:
+    def with_level(self, mu: float) -> ThresholdNet:
         """Return the same network with `mu` as its level, where a table can take up the difference."""
         other = copy.deepcopy(self)
         if self.shape.table is not None:
@@ -202,12 +204,12 @@ class ThresholdNet(nn.Module):
         """Return the parameters of the UNet."""
         return list(self.unet.parameters())
 
-    def scalars(self) -> list[nn.Parameter]:
+    def shared_parameters(self) -> list[nn.Parameter]:
         """Return all other parameters that are learned."""
         return [p for n, p in self.named_parameters() if not n.startswith("unet.") and p.requires_grad]
 
 
-def look_up(table: torch.Tensor, grey: torch.Tensor) -> torch.Tensor:
+def interpolate_table(table: torch.Tensor, grey: torch.Tensor) -> torch.Tensor:
     """Interpolate a table by the brightness and the edge strength of every pixel.
 
     Args:
@@ -218,24 +220,24 @@ def look_up(table: torch.Tensor, grey: torch.Tensor) -> torch.Tensor:
     Returns:
         Shape (B, 2, H, W).
     """
-    rows, columns = table_weights(grey, (table.shape[1], table.shape[2]))
+    rows, columns = node_weights(grey, (table.shape[1], table.shape[2]))
     across = torch.einsum("oij,bjn->boin", table, columns.flatten(2))
     return (across * rows.flatten(2)[:, None]).sum(2).view(len(grey), 2, *grey.shape[1:])
 
 
-def table_weights(grey: torch.Tensor, nodes: tuple[int, int]) -> tuple[torch.Tensor, torch.Tensor]:
+def node_weights(grey: torch.Tensor, nodes: tuple[int, int]) -> tuple[torch.Tensor, torch.Tensor]:
     """Return the weights of the nodes of brightness and of edge strength, each (B, nodes, H, W)."""
-    brightness, edge = looks(grey)
-    return _hats(brightness.clamp(0, 1), nodes[0]), _hats(edge / (edge + EDGE), nodes[1])
+    brightness, edge = brightness_and_edge(grey)
+    return _axis_weights(brightness.clamp(0, 1), nodes[0]), _axis_weights(edge / (edge + EDGE), nodes[1])
 
 
-def _hats(share: torch.Tensor, nodes: int) -> torch.Tensor:
+def _axis_weights(share: torch.Tensor, nodes: int) -> torch.Tensor:
     """Return the weights of linear interpolation between evenly spaced nodes, (B, nodes, H, W)."""
     place = share[:, None] * (nodes - 1) - torch.arange(nodes, device=share.device).view(1, -1, 1, 1)
     return (1 - place.abs()).clamp_min(0)
 
 
-def looks(grey: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+def brightness_and_edge(grey: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
     """Return brightness and edge strength of every pixel of images (B, H, W), each of their shape.
 
     Edge strength is the gradient of the image blurred by (1 2 1)/4 along both axes [intensity/pixel].
@@ -262,4 +264,4 @@ def gradient_magnitude(maps: torch.Tensor) -> torch.Tensor:
     """Return |∇| of maps (B, C, H, W) by differences to the right and down, 0 past the border."""
     across = F.pad(maps[..., 1:] - maps[..., :-1], (0, 1))
     down = F.pad(maps[..., 1:, :] - maps[..., :-1, :], (0, 0, 0, 1))
-    return torch.sqrt(across.square() + down.square() + TINY)
+    return torch.sqrt(across.square() + down.square() + MAGNITUDE_FLOOR)

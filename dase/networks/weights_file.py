@@ -41,7 +41,7 @@ def load_net(path: Path) -> ThresholdNet:
             tensors = {name: file.get_tensor(name) for name in names}
         if shape is None:
             raise InputError(f"{path} does not hold learned thresholds")
-        net = ThresholdNet(shape_of(shape))
+        net = ThresholdNet(parse_shape(shape))
         net.load_state_dict(tensors)
     except (SafetensorError, RuntimeError, KeyError, ValueError, TypeError) as error:
         raise InputError(f"{path} does not hold learned thresholds: {error}") from error
@@ -49,7 +49,7 @@ def load_net(path: Path) -> ThresholdNet:
     return net
 
 
-def shape_of(text: str) -> NetworkShape:
+def parse_shape(text: str) -> NetworkShape:
     """Return the shape of a network from JSON."""
     table = json.loads(text)
     fixed: dict[str, Any] = {n: tuple(v) if isinstance(v, list) else v for n, v in table.items()}
@@ -57,17 +57,19 @@ def shape_of(text: str) -> NetworkShape:
 
 
 @lru_cache(maxsize=4)
-def _loaded(path: Path, changed: int) -> ThresholdNet:
+def _load_cached(path: Path, changed: int) -> ThresholdNet:
     return load_net(path)
 
 
-def predict(path: Path, grey: NDArray[np.float32]) -> tuple[NDArray[np.float32], NDArray[np.float32], float]:
+def predict_thresholds(
+    path: Path, grey: NDArray[np.float32]
+) -> tuple[NDArray[np.float32], NDArray[np.float32], float]:
     """Return mean and spread of the thresholds for an image (H, W) in [0, 1], and the level of the mean.
 
     Raises:
         InputError: The file holds no network, or one for a sensor of another size.
     """
-    net = _loaded(path, path.stat().st_mtime_ns) if path.is_file() else load_net(path)
+    net = _load_cached(path, path.stat().st_mtime_ns) if path.is_file() else load_net(path)
     size = grey.shape[1], grey.shape[0]
     if net.shape.pattern not in (None, size):
         made = "x".join(map(str, net.shape.pattern or ()))

@@ -24,7 +24,7 @@ Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
-class Frame:
+class StatisticsFrame:
     """What statistics refer to; the same for measurement and models.
 
     Args:
@@ -55,7 +55,7 @@ class Frame:
 
 
 @dataclass(frozen=True)
-class Sums:
+class ProbeSums:
     """What the kernels have added up, a row for each model.
 
     Args:
@@ -75,11 +75,11 @@ class Sums:
     stamps: Array
     groups: NDArray[np.float32] | None = None
     teams: NDArray[np.int32] | None = None
-    frame: Frame | None = None
+    frame: StatisticsFrame | None = None
     folded: Array | None = None
 
     @classmethod
-    def join(cls, parts: Sequence[Sums]) -> Sums:
+    def join(cls, parts: Sequence[ProbeSums]) -> ProbeSums:
         """Return the rows of all parts; of groups those of the first part's first row."""
         first = parts[0]
         if len(parts) == 1:
@@ -104,7 +104,7 @@ class Sums:
 
 
 @dataclass(frozen=True)
-class Totals:
+class ProbeTotals:
     """What statistics are worked out from, a row for each model.
 
     Args:
@@ -122,7 +122,7 @@ class Totals:
     expected: Array
 
 
-def fold(pixels: Any, frames: Sequence[Frame], which: NDArray[np.int64]) -> Any:
+def fold_counts(pixels: Any, frames: Sequence[StatisticsFrame], which: NDArray[np.int64]) -> Any:
     """Fold the counts of pixels where they are.
 
     Args:
@@ -141,34 +141,34 @@ def fold(pixels: Any, frames: Sequence[Frame], which: NDArray[np.int64]) -> Any:
         pixels, wp.array(expected, device=to), wp.array(which.astype(np.int32), device=to),
         wp.array(frame.zone.astype(np.int32), device=to), 15.0 * frame.seconds, SEEN, GROUP, out,
     ]  # fmt: skip
-    launch.run(kernels.fold, groups, inputs, to, batch=rows, slabs=1)
+    launch.run_kernel(kernels.fold_pixel_counts, groups, inputs, to, batch=rows, slabs=1)
     return out
 
 
-def over_groups(parts: Any) -> Array:
+def sum_over_groups(parts: Any) -> Array:
     """Return the sums over groups of a Warp array (B, G, K), shape (B, K)."""
     rows, _, size = parts.shape
     out = wp.empty((rows, size), dtype=wp.float64, device=parts.device)
-    launch.run(kernels.together, size, [parts, out], parts.device, batch=rows, slabs=1)
+    launch.run_kernel(kernels.sum_groups, size, [parts, out], parts.device, batch=rows, slabs=1)
     found: Array = out.numpy()
     return found
 
 
-def totals(found: Sums, frame: Frame) -> Totals:
+def compute_totals(found: ProbeSums, frame: StatisticsFrame) -> ProbeTotals:
     """Return what the statistics of some models are worked out from."""
     folded = found.folded
     if folded is None or found.frame is not frame:
-        folded = over_groups(fold(found.pixels, [frame], np.zeros(len(found.sums), np.int64)))
-    return Totals(found.sums, folded, found.clock, found.stamps, frame.by_group.sum(0)[None])
+        folded = sum_over_groups(fold_counts(found.pixels, [frame], np.zeros(len(found.sums), np.int64)))
+    return ProbeTotals(found.sums, folded, found.clock, found.stamps, frame.by_group.sum(0)[None])
 
 
-def without(found: Sums, frame: Frame) -> Totals:
+def leave_groups_out(found: ProbeSums, frame: StatisticsFrame) -> ProbeTotals:
     """Return the totals of the first row without one group of pixels after the other, shapes (G, ...)."""
     assert found.groups is not None
     assert found.teams is not None
-    parts = fold(found.pixels[:1], [frame], np.zeros(1, np.int64)).numpy()[0].astype(np.float64)
+    parts = fold_counts(found.pixels[:1], [frame], np.zeros(1, np.int64)).numpy()[0].astype(np.float64)
     expected = frame.by_group
-    return Totals(
+    return ProbeTotals(
         found.sums[0] - found.groups, parts.sum(0) - parts, found.clock[0] - found.teams,
         np.repeat(found.stamps[:1], len(parts), 0), expected.sum(0) - expected,
     )  # fmt: skip

@@ -34,7 +34,7 @@ MUCH_FAMILY = 8.0
 
 
 @dataclass(frozen=True)
-class Scale:
+class ErrorScale:
     """What differences are measured by.
 
     Args:
@@ -49,7 +49,7 @@ class Scale:
 
     def z(self, values: Array) -> Array:
         """Return differences in standard errors, 0 where nothing is compared, shape (..., J)."""
-        return in_errors(values - self.target, self)
+        return in_standard_errors(values - self.target, self)
 
     def weights(self) -> Array:
         """Return the weight of each statistic: families weigh alike, shape (J,)."""
@@ -67,12 +67,12 @@ class Scale:
 
     def loss(self, values: Array) -> Array:
         """Return the robust distance, about 1 where the differences are chance, shape (...)."""
-        out: Array = robust(self.z(values)) @ self.weights()
+        out: Array = pseudo_huber(self.z(values)) @ self.weights()
         return out
 
     def families(self, values: Array) -> dict[str, float]:
         """Return the robust distance of each family that is compared."""
-        rho = robust(self.z(values))
+        rho = pseudo_huber(self.z(values))
         used = {name: part for name, part in LAYOUT.items() if self.used[part].any()}
         return {name: float(rho[part][self.used[part]].mean()) for name, part in used.items()}
 
@@ -102,7 +102,7 @@ class Judgement:
     unit: float
 
 
-def judge(repeats: Array, seen: Scale, chance: Scale, off: Array, *, seed: int) -> Judgement:
+def judge_model(repeats: Array, seen: ErrorScale, chance: ErrorScale, off: Array, *, seed: int) -> Judgement:
     """Compare a measurement with repeats of a model.
 
     The model is the mean of its repeats. Each repeat in turn stands in for the measurement and is compared
@@ -121,10 +121,10 @@ def judge(repeats: Array, seen: Scale, chance: Scale, off: Array, *, seed: int) 
     mean = repeats.mean(0)
     rng = np.random.default_rng([seed, 3])
     apart = (repeats - mean) * (count / (count - 1))
-    rho = robust(in_errors(apart + off * rng.standard_normal(repeats.shape), chance))
+    rho = pseudo_huber(in_standard_errors(apart + off * rng.standard_normal(repeats.shape), chance))
     weights = chance.weights()
     unit = float((rho @ weights).mean())
-    null = robust(in_errors(apart, chance)) @ weights / unit
+    null = pseudo_huber(in_standard_errors(apart, chance)) @ weights / unit
     reach = max(float(np.quantile(null, 0.99)), float(null.mean() + 2.6 * null.std()))
     families = {name: value / unit for name, value in seen.families(mean).items()}
     limits = {}
@@ -138,31 +138,31 @@ def judge(repeats: Array, seen: Scale, chance: Scale, off: Array, *, seed: int) 
     return Judgement(error, gate, reach, level, families, limits, seen.z(mean), unit)
 
 
-def in_errors(apart: Array, scale: Scale) -> Array:
+def in_standard_errors(apart: Array, scale: ErrorScale) -> Array:
     """Return differences in standard errors, 0 where nothing is compared, shape (..., J)."""
     out: Array = np.divide(apart, scale.sigma, out=np.zeros(np.shape(apart)), where=scale.used)
     return out
 
 
-def robust(z: Array) -> Array:
+def pseudo_huber(z: Array) -> Array:
     """Return the pseudo-Huber loss: z² for small z, 2 |z| for large; its slope never vanishes."""
     out: Array = 2.0 * (np.sqrt(1.0 + z * z) - 1.0)
     return out
 
 
-def silent(judgement: Judgement) -> bool:
+def leaves_nothing(judgement: Judgement) -> bool:
     """Whether a model leaves so little that nothing more is looked for."""
-    return judgement.error <= QUIET and explained(judgement)
+    return judgement.error <= QUIET and reaches_floor(judgement)
 
 
-def explained(judgement: Judgement) -> bool:
+def reaches_floor(judgement: Judgement) -> bool:
     """Whether a model is at the floor, altogether and in every family of probes."""
     families = judgement.families
     inside = (families[name] <= max(judgement.limits[name], CLOSE_FAMILY) for name in families)
     return judgement.error <= judgement.gate and all(inside)
 
 
-def announced(judgement: Judgement) -> bool:
+def may_be_announced(judgement: Judgement) -> bool:
     """Whether what was found may be announced: the mean is at the floor, and no family is far off.
 
     A search goes on while a family is above `CLOSE_FAMILY`; that nothing more is found there does not make

@@ -12,11 +12,11 @@ from numpy.typing import NDArray
 
 from dase.events import Events
 from dase.kernels import launch
-from dase.kernels.event_order import to_pixels
+from dase.kernels.event_order import sort_into_pixels
 from dase.probes.stimulus import Stimulus
 
 
-def by_pixel(stimulus: Stimulus, streams: Sequence[Events]) -> tuple[Any, Any, Any]:
+def sort_by_pixel(stimulus: Stimulus, streams: Sequence[Events]) -> tuple[Any, Any, Any]:
     """Return the events of a stimulus' pixels as Warp arrays on its device; those of others are left out.
 
     Returns:
@@ -29,8 +29,8 @@ def by_pixel(stimulus: Stimulus, streams: Sequence[Events]) -> tuple[Any, Any, A
     place = np.full(stimulus.width * stimulus.height, -1, np.int32)
     place[stimulus.pixels] = np.arange(len(stimulus.pixels), dtype=np.int32)
     parts = [slice(int(end) - len(events), int(end)) for events, end in zip(streams, ends, strict=True)]
-    launch.each([
-        partial(_sort, stimulus, events, place, start[n], time[part], polarity[part])
+    launch.run_concurrently([
+        partial(_sort_stream, stimulus, events, place, start[n], time[part], polarity[part])
         for n, (events, part) in enumerate(zip(streams, parts, strict=True))
     ])  # fmt: skip
     start += (ends - [len(events) for events in streams]).astype(np.int32)[:, None]
@@ -39,7 +39,7 @@ def by_pixel(stimulus: Stimulus, streams: Sequence[Events]) -> tuple[Any, Any, A
     return first, times, signs
 
 
-def _sort(
+def _sort_stream(
     stimulus: Stimulus,
     events: Events,
     place: NDArray[np.int32],
@@ -48,7 +48,7 @@ def _sort(
     polarity: NDArray[np.uint8],
 ) -> None:
     """Bring the events of one stream in the order of pixels."""
-    cpu = launch.device("cpu")
+    cpu = launch.find_device("cpu")
 
     def lent(array: NDArray[Any], dtype: Any) -> Any:
         return wp.array(array, dtype=dtype, device=cpu, copy=False)
@@ -59,4 +59,4 @@ def _sort(
         wp.float64(stimulus.grid.begin), lent(start, wp.int32), lent(time, wp.int64),
         lent(polarity, wp.uint8),
     ]  # fmt: skip
-    wp.launch(to_pixels, dim=1, inputs=inputs, device=cpu)
+    wp.launch(sort_into_pixels, dim=1, inputs=inputs, device=cpu)

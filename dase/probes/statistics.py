@@ -33,7 +33,7 @@ from dase.kernels.event_probes import (
     SERIAL,
     ZONES,
 )
-from dase.probes.accumulators import Frame, Sums, Totals, totals
+from dase.probes.accumulators import ProbeSums, ProbeTotals, StatisticsFrame, compute_totals
 
 if TYPE_CHECKING:
     pass
@@ -72,7 +72,7 @@ LOWEST = 8.0
 Array = NDArray[np.float64]
 
 
-def _layout() -> dict[str, slice]:
+def _places_of_families() -> dict[str, slice]:
     sizes = {
         "rate": 2 * CELLS,
         "intervals": 6 * INTERVALS,
@@ -92,14 +92,14 @@ def _layout() -> dict[str, slice]:
     }
 
 
-LAYOUT = _layout()
+LAYOUT = _places_of_families()
 """Place of each family in a vector of statistics."""
 
 SIZE = max(part.stop for part in LAYOUT.values())
 """Statistics in all."""
 
 
-def zones(pixels: NDArray[np.int32], width: int, height: int) -> NDArray[np.int64]:
+def ring_of_pixels(pixels: NDArray[np.int32], width: int, height: int) -> NDArray[np.int64]:
     """Return the ring that each pixel lies in, shape (N,)."""
     x, y = pixels % width - 0.5 * (width - 1), pixels // width - 0.5 * (height - 1)
     radius = np.hypot(x, y)
@@ -107,27 +107,27 @@ def zones(pixels: NDArray[np.int32], width: int, height: int) -> NDArray[np.int6
     return out
 
 
-def statistics(found: Sums | Totals, frame: Frame) -> tuple[Array, Array]:
+def compute_statistics(found: ProbeSums | ProbeTotals, frame: StatisticsFrame) -> tuple[Array, Array]:
     """Return statistics and how many events each rests on.
 
     Returns:
         Statistics, shape (B, J), and events, shape (B, J); of counts, which are given as log(count + 3), the
         count itself.
     """
-    of = totals(found, frame) if isinstance(found, Sums) else found
+    of = compute_totals(found, frame) if isinstance(found, ProbeSums) else found
     a = of.sums
     odd = of.folded[:, ODD : ODD + 4]
     parts = [
-        _counts(a[:, RATE : RATE + 2 * CELLS]),
-        _counts(a[:, ISI : ISI + 6 * INTERVALS]),
-        _means(a[:, LAG : LAG + LAGS * BANDS], np.tile(a[:, LAG_COUNT : LAG_COUNT + BANDS], LAGS)),
-        _repeats(a[:, REPEAT : REPEAT + 3 * BANDS].reshape(-1, BANDS, 3)),
-        _changes(a[:, CHANGE : CHANGE + 12 * CLASSES].reshape(-1, 4 * CLASSES, 3), a[:, SERIAL:]),
-        _spread(of.folded[:, PRODUCTS : PRODUCTS + 12], of.expected),
-        _counts(odd[:, :3]),
-        _counts(odd[:, 3:]),
-        _counts(of.folded[:, RINGS:]),
-        _spectrum(of.clock, frame),
+        _log_counts(a[:, RATE : RATE + 2 * CELLS]),
+        _log_counts(a[:, ISI : ISI + 6 * INTERVALS]),
+        _event_means(a[:, LAG : LAG + LAGS * BANDS], np.tile(a[:, LAG_COUNT : LAG_COUNT + BANDS], LAGS)),
+        _repeat_shares(a[:, REPEAT : REPEAT + 3 * BANDS].reshape(-1, BANDS, 3)),
+        _change_moments(a[:, CHANGE : CHANGE + 12 * CLASSES].reshape(-1, 4 * CLASSES, 3), a[:, SERIAL:]),
+        _count_spread(of.folded[:, PRODUCTS : PRODUCTS + 12], of.expected),
+        _log_counts(odd[:, :3]),
+        _log_counts(odd[:, 3:]),
+        _log_counts(of.folded[:, RINGS:]),
+        _rate_spectrum(of.clock, frame),
         (of.stamps, np.full(of.stamps.shape, 1e9 if frame.regular else 0.0)),
     ]
     values = np.concatenate([value for value, _ in parts], axis=1)
@@ -139,28 +139,28 @@ def statistics(found: Sums | Totals, frame: Frame) -> tuple[Array, Array]:
     return values, weight
 
 
-def _counts(counts: Array) -> tuple[Array, Array]:
+def _log_counts(counts: Array) -> tuple[Array, Array]:
     return np.log(counts + 3.0), counts
 
 
-def _means(total: Array, events: Array) -> tuple[Array, Array]:
+def _event_means(total: Array, events: Array) -> tuple[Array, Array]:
     return total / np.maximum(events, 1.0), events
 
 
-def _repeats(counts: Array) -> tuple[Array, Array]:
-    second, third = (_means(counts[:, :, n], counts[:, :, 0]) for n in (1, 2))
+def _repeat_shares(counts: Array) -> tuple[Array, Array]:
+    second, third = (_event_means(counts[:, :, n], counts[:, :, 0]) for n in (1, 2))
     return np.concatenate([second[0], third[0]], 1), np.concatenate([second[1], third[1]], 1)
 
 
-def _changes(pairs: Array, serial: Array) -> tuple[Array, Array]:
+def _change_moments(pairs: Array, serial: Array) -> tuple[Array, Array]:
     events = pairs[:, :, 0]
-    mean, _ = _means(pairs[:, :, 1], events)
-    deviation, _ = _means(pairs[:, :, 2], events)
-    product, count = _means(serial[:, 1::2], serial[:, 0::2])
+    mean, _ = _event_means(pairs[:, :, 1], events)
+    deviation, _ = _event_means(pairs[:, :, 2], events)
+    product, count = _event_means(serial[:, 1::2], serial[:, 0::2])
     return np.concatenate([mean, deviation, product], 1), np.concatenate([events, events, count], 1)
 
 
-def _spread(products: Array, expected: Array) -> tuple[Array, Array]:
+def _count_spread(products: Array, expected: Array) -> tuple[Array, Array]:
     """Split-half covariances over pixels of what is not expected, and Fano factors."""
     # state (moving, rest), then: products over the halves by their polarities, those of a half with itself
     of = products.reshape(-1, 2, 6)
@@ -176,7 +176,7 @@ def _spread(products: Array, expected: Array) -> tuple[Array, Array]:
     return values, np.broadcast_to(events, values.shape)
 
 
-def _spectrum(clock: NDArray[np.int32], frame: Frame) -> tuple[Array, Array]:
+def _rate_spectrum(clock: NDArray[np.int32], frame: StatisticsFrame) -> tuple[Array, Array]:
     """Logarithms of the power of the net rate in bands of frequency, and its swing at the measured peak."""
     steps = clock.shape[1] // 2
     off, on = clock[:, frame.first : steps], clock[:, steps + frame.first :]
@@ -184,16 +184,16 @@ def _spectrum(clock: NDArray[np.int32], frame: Frame) -> tuple[Array, Array]:
     total = np.maximum((on + off).sum(1), 1)
     net -= net.mean(1, keepdims=True)
     count = net.shape[1]
-    window, mean = _tones(count, frame.step)
+    window, mean = _tone_bands(count, frame.step)
     power = np.abs(rfft(net * window, axis=1)) ** 2 / count
     bands = power @ mean
-    swing = net @ _swing(frame.peak, frame.first, count, frame.step) / total[:, None]
+    swing = net @ _swing_basis(frame.peak, frame.first, count, frame.step) / total[:, None]
     values = np.concatenate([np.log(bands + 0.5), swing], 1).astype(np.float64)
     return values, np.repeat(total[:, None], values.shape[1], 1).astype(np.float64)
 
 
 @lru_cache(maxsize=8)
-def _tones(count: int, step: float) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+def _tone_bands(count: int, step: float) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """Return the window, shape (T,), and what makes means over bands of the power, shape (F, TONES)."""
     edges = np.geomspace(LOWEST, 0.5 / step, TONES + 1)
     inside = np.searchsorted(edges, np.fft.rfftfreq(count, step))[:, None] == np.arange(1, TONES + 1)
@@ -202,7 +202,7 @@ def _tones(count: int, step: float) -> tuple[NDArray[np.float32], NDArray[np.flo
 
 
 @lru_cache(maxsize=8)
-def _swing(peak: float, first: int, count: int, step: float) -> NDArray[np.float32]:
+def _swing_basis(peak: float, first: int, count: int, step: float) -> NDArray[np.float32]:
     """Return cosine and minus sine of a frequency `peak` [Hz] at steps [s] from `first` on, shape (T, 2)."""
     turn = 2 * np.pi * peak * step * (first + np.arange(count))
     return np.stack([np.cos(turn), -np.sin(turn)], 1).astype(np.float32)
@@ -222,7 +222,7 @@ def peak_of(clock: NDArray[np.int64], step: float) -> float:
     return float(frequency[int(above.argmax())])
 
 
-def precise(events: Events, begin: float, end: float, near: float) -> float:
+def refine_frequency(events: Events, begin: float, end: float, near: float) -> float:
     """Return the frequency about `near` at which the net rate of all events swings most in a time [Hz]."""
     step = 1 / (32 * near)
     bins = int((end - begin) / step)
@@ -250,7 +250,7 @@ MEANS = _is_mean()
 """Which statistics are means over events."""
 
 
-def tolerance(measured: Array, events: Array) -> Array:
+def tolerance_of(measured: Array, events: Array) -> Array:
     """Return what each statistic may be off by: it is of no concern, or a matter of one event, (J,)."""
     out = TOLERANCE + 1.0 / (events + 3.0)
     lag = np.abs(measured[LAYOUT["lag"]]).reshape(LAGS, BANDS)
@@ -268,7 +268,7 @@ def tolerance(measured: Array, events: Array) -> Array:
     return out
 
 
-def compared(measured: Array, events: Array) -> NDArray[np.bool_]:
+def is_compared(measured: Array, events: Array) -> NDArray[np.bool_]:
     """Return which statistics rest on enough events of the measurement to be compared, (J,)."""
     out = np.ones(SIZE, np.bool_)
     out[MEANS] = events[MEANS] >= FEW
@@ -278,7 +278,7 @@ def compared(measured: Array, events: Array) -> NDArray[np.bool_]:
     return out
 
 
-WORDS = {
+FAMILY_WORDS = {
     "rate": "how many events come",
     "intervals": "the time between events of a pixel",
     "lag": "how late events come",

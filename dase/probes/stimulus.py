@@ -158,7 +158,7 @@ class Stimulus:
     def _arrays(
         self, start: NDArray[Any], stamp: NDArray[Any], light: NDArray[np.float32], step: float
     ) -> Any:
-        out = pixel_codegen_trials.History()
+        out = pixel_codegen_trials.LightHistory()
         out.start = wp.array(start.astype(np.int32), device=self.device)
         out.stamp = wp.array(stamp.astype(np.int32), device=self.device)
         out.intensity = wp.array(light.astype(np.float32), device=self.device)
@@ -172,7 +172,7 @@ def light_of(scene: Scene, times: NDArray[np.float64], pixels: NDArray[np.int32]
     out = np.empty((len(pixels), len(times)), np.float32)
     for first in range(0, len(times), BLOCK):
         part = times[first : first + BLOCK]
-        name, source = scene.source(part, pixels, launch.device("cpu"))
+        name, source = scene.source(part, pixels, launch.find_device("cpu"))
         if name == "frames":
             values = source.values.numpy()
         else:
@@ -193,7 +193,7 @@ def sort_into_cells(
         log_eps: Added to intensities before the logarithm.
     """
     level = np.log(intensity + np.float32(log_eps))
-    kind = np.searchsorted(EDGES, _change(level, step)).astype(np.uint8) + RESTING
+    kind = np.searchsorted(EDGES, _light_change(level, step)).astype(np.uint8) + RESTING
     for number, time in reversed(list(enumerate(REST))):
         width = max(2, round(time / step))
         # a window that ends at the step; before the first one the light was at rest
@@ -203,7 +203,7 @@ def sort_into_cells(
     return kind * BANDS + np.searchsorted(bands, intensity).astype(np.uint8)
 
 
-def _change(level: NDArray[np.float32], step: float) -> NDArray[np.float32]:
+def _light_change(level: NDArray[np.float32], step: float) -> NDArray[np.float32]:
     back = max(1, round(SPAN / step))
     before = np.concatenate([np.repeat(level[:, :1], back, 1), level[:, :-back]], axis=1)
     out: NDArray[np.float32] = level - before[:, : level.shape[1]]

@@ -36,7 +36,7 @@ DIRECTIONS = ("down", "up", "right", "left")
 
 
 @dataclass(frozen=True)
-class Structure:
+class TimestampStructure:
     """Regularities found in the time stamps of a measurement.
 
     Args:
@@ -62,7 +62,7 @@ class Structure:
         if self.step:
             out[0] = share_at(events.t, self.step)
         if self.line:
-            lines, place = places(events, self.direction)
+            lines, place = readout_lines(events, self.direction)
             out[1] = share_in_scan(events.t, place, self.line, lines)
         return out
 
@@ -80,7 +80,7 @@ def share_in_scan(t: NDArray[np.float64], place: NDArray[np.float64], line: floa
     return share_at(t - place * line, lines * line, BLANK * lines * line)
 
 
-def places(events: Events, direction: str) -> tuple[int, NDArray[np.float64]]:
+def readout_lines(events: Events, direction: str) -> tuple[int, NDArray[np.float64]]:
     """Return the number of lines, and the line of each event."""
     upright = direction in ("down", "up")
     lines = events.height if upright else events.width
@@ -88,30 +88,30 @@ def places(events: Events, direction: str) -> tuple[int, NDArray[np.float64]]:
     return lines, lines - 1 - place if direction in ("up", "left") else place
 
 
-def find(events: Events) -> Structure:
+def find_structure(events: Events) -> TimestampStructure:
     """Return the regularities of a measurement's time stamps: seen in the first events, true of all."""
     first = events.select(slice(ENOUGH))
-    best = Structure()
+    best = TimestampStructure()
     for direction in DIRECTIONS:
         line = line_time(first, direction)
         if line > best.line:
-            best = Structure(line=line, direction=direction)
+            best = TimestampStructure(line=line, direction=direction)
     # all of them tell its length better
     if best.line:
         best = replace(best, line=line_time(events, best.direction))
-    elif ticks(events.t[: SLOW * ENOUGH]):  # the lines of a scan are read at ticks too
-        best = Structure(step=ticks(events.t))
-    return best if best.shares(events).max() >= CERTAIN else Structure()
+    elif clock_period(events.t[: SLOW * ENOUGH]):  # the lines of a scan are read at ticks too
+        best = TimestampStructure(step=clock_period(events.t))
+    return best if best.shares(events).max() >= CERTAIN else TimestampStructure()
 
 
-def ticks(t: NDArray[np.float64]) -> float:
+def clock_period(t: NDArray[np.float64]) -> float:
     """Return the time between the ticks that all stamps are multiples of [s], 0 where there is none."""
     gaps = np.diff(t)
     gaps = gaps[gaps > SHORTEST]
     if len(gaps) < 50:
         return 0.0
     step = float(np.quantile(gaps, 0.02))
-    step = refined(t, step)
+    step = refine_period(t, step)
     regular = share_at(t, step) >= CERTAIN and spread_over(t, step)
     return step if regular and not in_turns(t, step) else 0.0
 
@@ -125,7 +125,7 @@ def in_turns(t: NDArray[np.float64], step: float) -> bool:
     return float(np.mean(np.diff(ticks_) == 1)) >= TURNS
 
 
-def refined(t: NDArray[np.float64], step: float) -> float:
+def refine_period(t: NDArray[np.float64], step: float) -> float:
     """Return the step near `step` that stamps are multiples of, from ever longer stretches of time."""
     for span in np.geomspace(30 * step, max(float(t[-1]), 60 * step), 12):
         part = t[t <= t[0] + span]
@@ -142,7 +142,7 @@ def spread_over(t: NDArray[np.float64], step: float) -> bool:
 
 def line_time(events: Events, direction: str) -> float:
     """Return the time from line to line of a readout [s], 0 where there is none in this direction."""
-    lines, place = places(events, direction)
+    lines, place = readout_lines(events, direction)
     order = np.lexsort((events.t, place))
     t, where = events.t[order], place[order]
     gaps = np.diff(t)[where[1:] == where[:-1]]
@@ -152,6 +152,6 @@ def line_time(events: Events, direction: str) -> float:
     scan = float(np.quantile(gaps, 0.02))
     # all stamps of a line are at one phase of the scan; phases of lines follow each other
     busy = np.bincount(where.astype(np.int64), minlength=lines).argmax()
-    scan = refined(t[where == busy], scan)
+    scan = refine_period(t[where == busy], scan)
     line = scan / lines
     return line if share_in_scan(events.t, place, line, lines) >= CERTAIN else 0.0

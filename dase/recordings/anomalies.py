@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 
-from dase.formatting import grouped, percent, seconds
+from dase.formatting import format_count, format_percent, format_seconds
 from dase.io.source import Note
 from dase.recordings.statistics import Statistics
 
@@ -21,25 +21,25 @@ FLIPS = 0.9  # share of successive events that differ in polarity
 CLIPPED = 0.3  # share of black and white pixels in frames
 
 
-def doubts(s: Statistics) -> list[Note]:
+def find_anomalies(s: Statistics) -> list[Note]:
     """Return what looks odd, as notes of the kind "odd"."""
     if not s.events:
         return [Note("there are no events", "odd", "empty")]
-    return [*_polarity(s), *_places(s), *_times(s), *_frames(s)]
+    return [*_polarity_anomalies(s), *_place_anomalies(s), *_time_anomalies(s), *_frame_anomalies(s)]
 
 
-def _polarity(s: Statistics) -> Iterator[Note]:
+def _polarity_anomalies(s: Statistics) -> Iterator[Note]:
     if s.events >= 100 and not 1 - ONE_SIDED <= s.on_share <= ONE_SIDED:
         name, share = ("ON", s.on_share) if s.on_share > 0.5 else ("OFF", 1 - s.on_share)
-        text = f"{percent(share)} of the events are {name}: their polarity may be lost"
+        text = f"{format_percent(share)} of the events are {name}: their polarity may be lost"
         yield Note(text, "odd", "polarity")
     if s.events >= 1000 and s.flip_share > FLIPS:
-        flips = percent(s.flip_share)
+        flips = format_percent(s.flip_share)
         text = f"{flips} of the successive events of a pixel differ in polarity: flicker, or noise"
         yield Note(text, "odd", "flips")
 
 
-def _places(s: Statistics) -> Iterator[Note]:
+def _place_anomalies(s: Statistics) -> Iterator[Note]:
     x, y, width, height = s.active
     inside = s.silent_pixels - (s.width * s.height - width * height)
     if inside < 0.5 * width * height:
@@ -49,28 +49,28 @@ def _places(s: Statistics) -> Iterator[Note]:
             if bare:
                 yield Note(f"no event in {name} {' and '.join(bare)}", "odd", "bare", all_ - count)
     if s.hot_pixels and (s.hot_share > HOT or s.hot_pixels > HOT_PIXELS * s.width * s.height):
-        share = percent(s.hot_share)
-        text = f"{grouped(s.hot_pixels)} hot pixels send {share} of the events"
+        share = format_percent(s.hot_share)
+        text = f"{format_count(s.hot_pixels)} hot pixels send {share} of the events"
         yield Note(text, "odd", "hot", s.hot_pixels)
 
 
-def _times(s: Statistics) -> Iterator[Note]:
+def _time_anomalies(s: Statistics) -> Iterator[Note]:
     if s.interval_low <= FASTEST:
-        text = f"more than 1 % of the times between events of one pixel are {seconds(FASTEST)} or less"
+        text = f"more than 1 % of the times between events of one pixel are {format_seconds(FASTEST)} or less"
         yield Note(text, "odd", "fast")
     if s.simultaneous > max(0.001 * s.events, 9):
-        text = f"{grouped(s.simultaneous)} events are of the same pixel and time as another"
+        text = f"{format_count(s.simultaneous)} events are of the same pixel and time as another"
         yield Note(text, "odd", "duplicate", s.simultaneous)
     begin, length = s.longest_gap
     if length > max(GAP, GAPS * s.duration / max(s.stamps, 1)):
-        text = f"no event at all for {seconds(length)}, from {begin:.3f} s on: data may be missing"
+        text = f"no event at all for {format_seconds(length)}, from {begin:.3f} s on: data may be missing"
         yield Note(text, "odd", "gap")
     if s.quantum > COARSE:
-        text = f"all time stamps are whole multiples of {seconds(s.quantum)}"
+        text = f"all time stamps are whole multiples of {format_seconds(s.quantum)}"
         yield Note(text, "odd", "coarse")
 
 
-def _frames(s: Statistics) -> Iterator[Note]:
+def _frame_anomalies(s: Statistics) -> Iterator[Note]:
     if not s.frames:
         return
     if math.isnan(s.frame_interval) and s.frames > 1:
@@ -78,7 +78,9 @@ def _frames(s: Statistics) -> Iterator[Note]:
     elif math.isnan(s.exposure[1]):
         yield Note("the exposure of the frames is not known, or an instant", "odd", "exposure")
     elif s.exposure[1] > 1.01 * s.frame_interval:
-        text = f"frames are exposed for {seconds(s.exposure[1])} but come every {seconds(s.frame_interval)}"
+        text = f"frames are exposed for {format_seconds(s.exposure[1])} but come every {format_seconds(s.frame_interval)}"
         yield Note(text, "odd", "exposure")
     if s.clipped > CLIPPED:
-        yield Note(f"{percent(s.clipped)} of the pixels of the frames are black or white", "odd", "clipped")
+        yield Note(
+            f"{format_percent(s.clipped)} of the pixels of the frames are black or white", "odd", "clipped"
+        )

@@ -19,7 +19,7 @@ PEAK = 0.5  # share of intervals in phase that makes a period
 HARMONICS = 4
 
 
-class Intervals:
+class IntervalStatistics:
     """Counts intervals in fine logarithmic bins, and short ones by the microsecond."""
 
     def __init__(self) -> None:
@@ -103,24 +103,26 @@ class Intervals:
             around = np.concatenate((power[k - k // 4 - 4 : k - 2], power[k + 3 : k + k // 4 + 5]))
             if power[k] < 3 * float(np.median(around)):
                 continue  # a hump, no line
-            tone = _refined(self._short, k)
-            shares = [abs(_phase(self._short, m * tone)) for m in range(1, HARMONICS + 1) if m * k <= last]
+            tone = _refine_frequency(self._short, k)
+            shares = [
+                abs(_phase_coherence(self._short, m * tone)) for m in range(1, HARMONICS + 1) if m * k <= last
+            ]
             if min(shares) > PEAK / 2:
                 return 1e-6 / tone, shares[0]
         return math.nan, math.nan
 
 
-def _phase(counts: NDArray[np.int64], tone: float) -> complex:
+def _phase_coherence(counts: NDArray[np.int64], tone: float) -> complex:
     """Return the share of intervals in phase at a frequency [1/us]."""
     at = np.flatnonzero(counts)
     return complex(np.sum(counts[at] * np.exp(-2j * np.pi * tone * at)) / counts.sum())
 
 
-def _refined(counts: NDArray[np.int64], k: int) -> float:
+def _refine_frequency(counts: NDArray[np.int64], k: int) -> float:
     """Return the frequency [1/us] near k / SHORT at which a high harmonic is strongest."""
     tone, reach = k / SHORT, 0.7 / SHORT
     for _ in range(3):
         tones = tone + np.linspace(-reach, reach, 15)
-        tone = float(tones[np.argmax([abs(_phase(counts, one)) for one in tones])])
+        tone = float(tones[np.argmax([abs(_phase_coherence(counts, one)) for one in tones])])
         reach /= 6
     return tone

@@ -26,12 +26,12 @@ from dase.errors import InputError
 from dase.events import Events
 from dase.io.sequence import Sequence
 from dase.io.source import Kind, Motion, Note, Size
-from dase.recordings.anomalies import doubts
-from dase.recordings.statistics import Statistics, survey
+from dase.recordings.anomalies import find_anomalies
+from dase.recordings.statistics import Statistics, survey_sequence
 
 
 @dataclass(frozen=True)
-class Report:
+class RecordingReport:
     """What was noticed when a recording was opened.
 
     Args:
@@ -87,7 +87,7 @@ class Recording:
     end: float
     mask: NDArray[np.bool_]
     hot: NDArray[np.bool_]
-    report: Report
+    report: RecordingReport
     frames: NDArray[Any] | None = None
     frame_times: NDArray[np.float64] | None = None
     frame_begin: NDArray[np.float64] | None = None
@@ -137,7 +137,7 @@ class Recording:
             sequence: Events and frames as a file gives them, or a simulation.
             notes: What reading it said.
         """
-        looked = survey(sequence)
+        looked = survey_sequence(sequence)
         found = looked.statistics()
         said = [note if isinstance(note, Note) else Note(note) for note in notes]
         begin, end = found.begin, np.nextafter(found.begin + found.duration, np.inf)
@@ -154,7 +154,7 @@ class Recording:
             float(end),
             np.ones((sequence.events.height, sequence.events.width), np.bool_),
             looked.hot(),
-            Report((*said, *doubts(found)), found),
+            RecordingReport((*said, *find_anomalies(found)), found),
             sequence.frames,
             times,
             first,

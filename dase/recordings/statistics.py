@@ -20,7 +20,7 @@ from dase.events import LABELS, Events
 from dase.io.rules import TooLateError
 from dase.io.sequence import Sequence
 from dase.io.source import Picture, Size
-from dase.recordings.interval_statistics import Intervals
+from dase.recordings.interval_statistics import IntervalStatistics
 
 BITS = 20  # of the place of an event in a part
 PART = 1 << BITS  # events looked at together
@@ -101,7 +101,7 @@ class Statistics:
     """Share of the events with each of `dase.events.LABELS`; None where events have no labels."""
 
 
-class Survey:
+class RecordingSurvey:
     """Takes the events and frames of a recording, each in order of time.
 
     Args:
@@ -126,7 +126,7 @@ class Survey:
         self._times: list[float] = []
         self._exposures: list[float] = []
         self._clipped: list[float] = []
-        self.intervals = Intervals()
+        self.intervals = IntervalStatistics()
 
     def events(self, part: Events) -> None:
         """Take events."""
@@ -238,11 +238,11 @@ class Survey:
             begin=begin,
             duration=duration,
             events=events,
-            on_rate=_ratio(on, pixels * duration),
-            off_rate=_ratio(events - on, pixels * duration),
-            on_share=_ratio(on, events),
-            flip_share=_ratio(self._flips, self._pairs),
-            alone_rate=_ratio(self._alone, self._asked) * _ratio(events, pixels * duration),
+            on_rate=_ratio_or_nan(on, pixels * duration),
+            off_rate=_ratio_or_nan(events - on, pixels * duration),
+            on_share=_ratio_or_nan(on, events),
+            flip_share=_ratio_or_nan(self._flips, self._pairs),
+            alone_rate=_ratio_or_nan(self._alone, self._asked) * _ratio_or_nan(events, pixels * duration),
             interval_shortest=self.intervals.quantile(0.001),
             interval_low=self.intervals.quantile(0.01),
             interval_median=self.intervals.quantile(0.5),
@@ -255,12 +255,12 @@ class Survey:
             quantum=self._quantum * 1e-9 if self._quantum else math.nan,
             stamps=self._stamps,
             longest_gap=self._gap,
-            active=_active(counts.reshape(self.height, self.width)),
+            active=_active_area(counts.reshape(self.height, self.width)),
             silent_pixels=int(np.count_nonzero(counts == 0)),
-            busiest_rate=_ratio(int(counts[busiest]), duration),
+            busiest_rate=_ratio_or_nan(int(counts[busiest]), duration),
             busiest_pixel=(busiest % self.width, busiest // self.width),
             hot_pixels=int(np.count_nonzero(hot)),
-            hot_share=_ratio(int(counts[hot.reshape(-1)].sum()), events),
+            hot_share=_ratio_or_nan(int(counts[hot.reshape(-1)].sum()), events),
             label_shares=self._shares(events),
         )
 
@@ -281,11 +281,11 @@ class Survey:
         return tuple(float(count) / events for count in self._labels)
 
 
-def _ratio(a: float, b: float) -> float:
+def _ratio_or_nan(a: float, b: float) -> float:
     return a / b if b > 0 else math.nan
 
 
-def _active(counts: NDArray[np.int64]) -> tuple[int, int, int, int]:
+def _active_area(counts: NDArray[np.int64]) -> tuple[int, int, int, int]:
     columns, rows = np.flatnonzero(counts.any(0)), np.flatnonzero(counts.any(1))
     if not len(columns):
         return 0, 0, 0, 0
@@ -299,7 +299,7 @@ def survey_file(
     size: Size | None = None,
     notes: list[str] | None = None,
     progress: Callable[[int], object] = lambda count: None,
-) -> Survey:
+) -> RecordingSurvey:
     """Look at a file piece by piece; only one whose times go back far is held in memory.
 
     Args:
@@ -311,23 +311,23 @@ def survey_file(
     Raises:
         InputError: As for `dase.io.read`.
     """
-    out: Survey | None = None
+    out: RecordingSurvey | None = None
     try:
         for part in io.stream(path, size=size, notes=notes):
-            out = out or Survey(part.width, part.height)
+            out = out or RecordingSurvey(part.width, part.height)
             out.events(part)
             progress(len(part))
     except TooLateError:
-        return survey(io.read(path, size=size, notes=notes))
+        return survey_sequence(io.read(path, size=size, notes=notes))
     assert out is not None  # a stream has at least one part
     for picture in io.pictures(path, size=size, notes=notes):
         out.picture(picture)
     return out
 
 
-def survey(sequence: Sequence) -> Survey:
+def survey_sequence(sequence: Sequence) -> RecordingSurvey:
     """Look at a whole sequence."""
-    out = Survey(sequence.events.width, sequence.events.height)
+    out = RecordingSurvey(sequence.events.width, sequence.events.height)
     out.events(sequence.events)
     if sequence.frames is not None:
         unknown = np.full(len(sequence.frames), math.nan)
@@ -338,6 +338,6 @@ def survey(sequence: Sequence) -> Survey:
     return out
 
 
-def statistics(sequence: Sequence) -> Statistics:
+def sequence_statistics(sequence: Sequence) -> Statistics:
     """Return the statistics of a whole sequence."""
-    return survey(sequence).statistics()
+    return survey_sequence(sequence).statistics()

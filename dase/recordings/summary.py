@@ -6,16 +6,15 @@ import math
 from typing import TYPE_CHECKING, Any
 
 from dase.events import LABELS
-from dase.formatting import grouped, metric, percent, seconds
+from dase.formatting import format_count, format_metric, format_percent, format_seconds
 from dase.io.source import Note
 from dase.recordings.statistics import Statistics as Statistics
-from dase.recordings.statistics import statistics as statistics
 
 if TYPE_CHECKING:
     pass
 
 
-def table(statistics: Statistics) -> list[tuple[str, str]]:
+def statistics_table(statistics: Statistics) -> list[tuple[str, str]]:
     """Return what the statistics say as (name, value with unit)."""
     s = statistics
     pixels = s.width * s.height
@@ -24,60 +23,67 @@ def table(statistics: Statistics) -> list[tuple[str, str]]:
     said = ", ".join(f"{name} {100 * share:.1f} %" for name, share in shares)
     return [
         ("sensor", f"{s.width} x {s.height}"),
-        ("duration", seconds(s.duration) + (f", from {s.begin:.3f} s on" if abs(s.begin) >= 1e-3 else "")),
-        ("events", grouped(s.events)),
+        (
+            "duration",
+            format_seconds(s.duration) + (f", from {s.begin:.3f} s on" if abs(s.begin) >= 1e-3 else ""),
+        ),
+        ("events", format_count(s.events)),
         ("ON rate", f"{s.on_rate:.3g} events/pixel/s"),
         ("OFF rate", f"{s.off_rate:.3g} events/pixel/s"),
         ("ON share", f"{100 * s.on_share:.1f} %" if s.events else "unknown"),
-        ("polarity flips", f"{percent(s.flip_share)} of successive events of a pixel"),
+        ("polarity flips", f"{format_percent(s.flip_share)} of successive events of a pixel"),
         ("isolated events", f"{s.alone_rate:.3g} events/pixel/s" if s.alone_rate >= 0 else "unknown"),
-        ("interval, 0.1 %", seconds(s.interval_shortest)),
-        ("interval, 1 %", seconds(s.interval_low)),
-        ("interval, median", seconds(s.interval_median)),
-        ("interval, 99 %", seconds(s.interval_high)),
-        ("interval, modal", seconds(s.interval_mode)),
-        ("time stamps", _stamps(s)),
-        ("readout period", _period(s)),
-        ("silent pixels", f"{grouped(s.silent_pixels)} ({100 * s.silent_pixels / pixels:.1f} %)"),
-        ("busiest pixel", f"{metric(s.busiest_rate, 'Hz')} at ({x}, {y})" if s.events else "none"),
-        ("hot pixels", _hot(s)),
+        ("interval, 0.1 %", format_seconds(s.interval_shortest)),
+        ("interval, 1 %", format_seconds(s.interval_low)),
+        ("interval, median", format_seconds(s.interval_median)),
+        ("interval, 99 %", format_seconds(s.interval_high)),
+        ("interval, modal", format_seconds(s.interval_mode)),
+        ("time stamps", _describe_stamps(s)),
+        ("readout period", _describe_period(s)),
+        ("silent pixels", f"{format_count(s.silent_pixels)} ({100 * s.silent_pixels / pixels:.1f} %)"),
+        ("busiest pixel", f"{format_metric(s.busiest_rate, 'Hz')} at ({x}, {y})" if s.events else "none"),
+        ("hot pixels", _describe_hot_pixels(s)),
         *([("labels", said)] if said else []),
-        ("frames", _frames(s)),
+        ("frames", _describe_frames(s)),
     ]
 
 
-def _stamps(s: Statistics) -> str:
+def _describe_stamps(s: Statistics) -> str:
     if not s.events or not s.quantum > 0:
         return "unknown"
-    step = f"multiples of {seconds(s.quantum)}" if s.quantum >= 1e-6 else "finer than 1 µs"
+    step = f"multiples of {format_seconds(s.quantum)}" if s.quantum >= 1e-6 else "finer than 1 µs"
     return f"{step}, {s.events / s.stamps:.3g} events at each"
 
 
-def _period(s: Statistics) -> str:
+def _describe_period(s: Statistics) -> str:
     if not s.period > 0:
         return "none seen"
-    return f"{seconds(s.period)} ({percent(s.period_share)} of short intervals are multiples)"
+    return f"{format_seconds(s.period)} ({format_percent(s.period_share)} of short intervals are multiples)"
 
 
-def _hot(s: Statistics) -> str:
+def _describe_hot_pixels(s: Statistics) -> str:
     if not s.hot_pixels:
         return "none"
-    share = percent(s.hot_pixels / (s.width * s.height))
-    return f"{grouped(s.hot_pixels)} ({share}), {percent(s.hot_share)} of the events"
+    share = format_percent(s.hot_pixels / (s.width * s.height))
+    return f"{format_count(s.hot_pixels)} ({share}), {format_percent(s.hot_share)} of the events"
 
 
-def _frames(s: Statistics) -> str:
+def _describe_frames(s: Statistics) -> str:
     if not s.frames:
         return "none"
     short, long = s.exposure
-    pace = f", every {seconds(s.frame_interval)}" if s.frame_interval > 0 else ", times unknown"
+    pace = f", every {format_seconds(s.frame_interval)}" if s.frame_interval > 0 else ", times unknown"
     if not long > 0:
-        return f"{grouped(s.frames)}{pace}, exposure unknown"
-    exposed = seconds(long) if long - short < 0.01 * long else f"{seconds(short)} to {seconds(long)}"
-    return f"{grouped(s.frames)}{pace}, exposed {exposed}"
+        return f"{format_count(s.frames)}{pace}, exposure unknown"
+    exposed = (
+        format_seconds(long)
+        if long - short < 0.01 * long
+        else f"{format_seconds(short)} to {format_seconds(long)}"
+    )
+    return f"{format_count(s.frames)}{pace}, exposed {exposed}"
 
 
-def histogram(statistics: Statistics, *, width: int = 40) -> list[str]:
+def interval_histogram(statistics: Statistics, *, width: int = 40) -> list[str]:
     """Return lines that draw how long the times between events of one pixel are, two bins per decade."""
     bins = statistics.intervals
     total = sum(count for *_, count in bins)
@@ -86,8 +92,8 @@ def histogram(statistics: Statistics, *, width: int = 40) -> list[str]:
     for begin, end, count in bins:
         eighths = max(round(8 * width * count / most), int(count > 0))
         bar = "█" * (eighths // 8) + " ▏▎▍▌▋▊▉"[eighths % 8].strip()
-        span = f"{seconds(_round(begin)):>7} .. {seconds(_round(end)):<7}"
-        out.append(f"{span} {percent(count / total):>7}  {bar}")
+        span = f"{format_seconds(_round_edge(begin)):>7} .. {format_seconds(_round_edge(end)):<7}"
+        out.append(f"{span} {format_percent(count / total):>7}  {bar}")
     return out
 
 
@@ -103,6 +109,6 @@ def as_json(format: str, statistics: Statistics, notes: list[Note]) -> dict[str,
     return {"format": format, **said, "notes": [note.fields() for note in notes]}
 
 
-def _round(value: float) -> float:
+def _round_edge(value: float) -> float:
     """Round an edge of a bin, 1 or 3.16 times a power of ten, to one digit."""
     return float(f"{value:.0e}")

@@ -12,9 +12,9 @@ from dase.errors import InputError
 from dase.events import Events
 from dase.kernels import launch, scene_frames
 from dase.kernels.pixel_stages import Frames
-from dase.scenes.frame_motion import Match, match
+from dase.scenes.frame_motion import FrameMatch, match_frames
 from dase.scenes.scene import Scene
-from dase.scenes.video import EPS
+from dase.scenes.video import LOG_EPS
 
 KEPT = 1 << 28
 """Matches of frames kept in memory [bytes]; others are computed anew when they are asked for."""
@@ -53,7 +53,7 @@ class CameraScene(Scene):
         white: Value of intensity 1; it and higher ones count as saturated. None: the largest of the integer
             type, 1 for real numbers.
         gains: Gain and offset that undo a stretch of each frame's intensities, shape (F, 2), see
-            `dase.scenes.frame_motion.stretches`.
+            `dase.scenes.frame_motion.estimate_stretches`.
         travel: Share of a pixel that things may move between two samples.
         shortest: Lower bound of the time between samples [s].
         longest: Upper bound of it [s].
@@ -78,7 +78,7 @@ class CameraScene(Scene):
         self._raw = np.asarray(frames)
         self.begin = np.asarray(begin, np.float64)
         self.end = self.begin if end is None else np.asarray(end, np.float64)
-        _check(self._raw, self.begin, self.end)
+        _check_frames_and_times(self._raw, self.begin, self.end)
         self.times = 0.5 * (self.begin + self.end)
         if not np.all(np.diff(self.times) > 0):
             raise InputError("camera: the middles of exposures must increase")
@@ -101,7 +101,7 @@ class CameraScene(Scene):
         self.travel, self.shortest, self.longest = travel, shortest, longest
         self.height, self.width = self._raw.shape[1:]
         self.duration = float(self.times[-1] - self.times[0])
-        self._matches: OrderedDict[int, Match] = OrderedDict()
+        self._matches: OrderedDict[int, FrameMatch] = OrderedDict()
         self._speed: dict[int, float] = {}
         self._loaded: tuple[Any, Any] = (None, None)
         self._trusted: NDArray[np.bool_] | None = None
@@ -121,16 +121,16 @@ class CameraScene(Scene):
         raw = self._raw[index]
         return np.asarray((raw > self.black) & (raw < self.white))
 
-    def matched(self, interval: int) -> Match:
+    def matched(self, interval: int) -> FrameMatch:
         """Return the motion between frame `interval` and the next."""
         if interval not in self._matches:
             gap = self.times[interval + 1] - self.times[interval]
             exposure = (self.end - self.begin)[interval : interval + 2] / gap
             pair = interval, interval + 1
-            self._matches[interval] = match(
+            self._matches[interval] = match_frames(
                 self.intensity(pair[0]),
                 self.intensity(pair[1]),
-                eps=EPS,
+                eps=LOG_EPS,
                 exposure=(float(exposure[0]), float(exposure[1])),
                 usable=(self.usable(pair[0]), self.usable(pair[1])),
             )
@@ -174,12 +174,12 @@ class CameraScene(Scene):
         matches, _, at, share = self._prepared(times, device)
         last = times == self.times[-1]  # a frame as well, as which it must come out
         at, share = np.where(last, at + 1, at).astype(np.int32), np.where(last, np.float32(0), share)
-        source.values = scene_frames.render(matches, pixels, at, share, EPS, device)
+        source.values = scene_frames.render_between(matches, pixels, at, share, LOG_EPS, device)
         return "frames", source
 
     def frames(self, times: NDArray[np.float64], device: str = "cpu") -> NDArray[np.float32]:
         """Return intensities at `times` [s], shape (K, height, width)."""
-        _, source = self.source(np.asarray(times, np.float64), self._all(), launch.device(device))
+        _, source = self.source(np.asarray(times, np.float64), self._all_pixels(), launch.find_device(device))
         return np.asarray(source.values.numpy().reshape(-1, self.height, self.width))
 
     def doubt(
@@ -200,10 +200,10 @@ class CameraScene(Scene):
             Shape (K, N), or (K, height, width) for all pixels.
         """
         at = np.asarray(times, np.float64)
-        where = launch.device(device)
+        where = launch.find_device(device)
         matches, first, place, share = self._prepared(at, where)
         doubts = np.stack([self.matched(first + j).doubt for j in range(matches.ahead.shape[0])])
-        chosen = self._all() if pixels is None else np.asarray(pixels, np.int32)
+        chosen = self._all_pixels() if pixels is None else np.asarray(pixels, np.int32)
         out = scene_frames.render_doubt(matches, doubts, chosen, place, share, where)
         return out.reshape(len(at), self.height, self.width) if pixels is None else out
 
@@ -224,7 +224,7 @@ class CameraScene(Scene):
                 much happens, an error that would be an event of its own may still be a small one.
             device: Warp device to compute on.
         """
-        logs = np.log(self.frames(self._moments(interval), device) + np.float32(EPS))
+        logs = np.log(self.frames(self._moments(interval), device) + np.float32(LOG_EPS))
         return np.asarray(np.maximum(np.float32(tolerance), np.float32(relative) * np.ptp(logs, axis=0)))
 
     def confidence(
@@ -251,7 +251,7 @@ class CameraScene(Scene):
             out[k] = self.doubt(self._moments(k), device=device).max(0) <= limit
         return out
 
-    def trusts(self, times: NDArray[np.float64], pixels: NDArray[np.int32]) -> NDArray[np.bool_]:
+    def is_trusted(self, times: NDArray[np.float64], pixels: NDArray[np.int32]) -> NDArray[np.bool_]:
         """Return where the scene is to be trusted, as a comparison asks: never outside the scene.
 
         Args:
@@ -264,7 +264,7 @@ class CameraScene(Scene):
         at, inside = self._within(times)
         return np.asarray(self._kept_trust()[at][:, pixels] & inside[:, None])
 
-    def believed(self, events: Events) -> Events:
+    def trusted_events(self, events: Events) -> Events:
         """Return the events of pixels and times at which the scene is to be trusted, see `trusts`."""
         at, inside = self._within(events.t)
         pixels = events.y.astype(np.int64) * self.width + events.x
@@ -286,12 +286,12 @@ class CameraScene(Scene):
         begin, end = self.times[interval : interval + 2]
         return np.asarray(np.minimum(begin + (end - begin) * MOMENTS, np.nextafter(end, begin)))
 
-    def _all(self) -> NDArray[np.int32]:
+    def _all_pixels(self) -> NDArray[np.int32]:
         return np.arange(self.height * self.width, dtype=np.int32)
 
     def _prepared(
         self, times: NDArray[np.float64], device: Any
-    ) -> tuple[scene_frames.Matches, int, NDArray[np.int32], NDArray[np.float32]]:
+    ) -> tuple[scene_frames.MatchedFrames, int, NDArray[np.int32], NDArray[np.float32]]:
         """Return the matches these times need, the first interval, and interval and share of each time."""
         at = self.interval(times)
         share = (times - self.times[at]) / np.diff(self.times)[at]
@@ -301,7 +301,7 @@ class CameraScene(Scene):
             found = [self.matched(k) for k in range(first, final + 1)]
             frames = np.stack([self.intensity(k) for k in range(first, final + 2)])
             ahead, back = (np.stack([getattr(m, name) for m in found]) for name in ("ahead", "back"))
-            self._loaded = key, scene_frames.upload(frames, ahead, back, EPS, device)
+            self._loaded = key, scene_frames.upload_matches(frames, ahead, back, LOG_EPS, device)
         return self._loaded[1], first, (at - first).astype(np.int32), share.astype(np.float32)
 
 
@@ -310,7 +310,9 @@ def full_scale(frames: NDArray[Any]) -> float:
     return float(np.iinfo(frames.dtype).max) if frames.dtype.kind in "iu" else 1.0
 
 
-def _check(frames: NDArray[Any], begin: NDArray[np.float64], end: NDArray[np.float64]) -> None:
+def _check_frames_and_times(
+    frames: NDArray[Any], begin: NDArray[np.float64], end: NDArray[np.float64]
+) -> None:
     if frames.ndim != 3 or len(frames) < 2 or min(frames.shape) < 1:
         raise InputError(f"camera: needs at least 2 frames of shape (F, height, width), got {frames.shape}")
     if frames.dtype.kind not in "iuf":

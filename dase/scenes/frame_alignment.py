@@ -101,7 +101,7 @@ class Alignment:
         if "flip" in chosen:
             out = out[:, :: -1 if self.flip_y else 1, :: -1 if self.flip_x else 1]
         if "shift" in chosen:
-            out = np.stack([_moved(frame, self.shift) for frame in out])
+            out = np.stack([_shift_frame(frame, self.shift) for frame in out])
         return out, np.asarray(begin, np.float64) + late, np.asarray(end, np.float64) + late
 
     def report(self) -> str:
@@ -184,13 +184,13 @@ def align(
     latest = 1.5 * gap if latest is None else latest
     if not (np.isfinite(latest) and latest >= 0):
         raise InputError(f"align: latest must be >= 0 s, got {latest:g}")
-    search = _Search(events, scene, reach)
+    search = _ShiftSearch(events, scene, reach)
     counts = np.full(len(search.changes), 1 / len(search.changes))
     draws = np.random.default_rng(seed).multinomial(len(counts), counts, RESAMPLES)
-    return _decide(search, *_nearest(search, gap, latest), draws)
+    return _judge_corrections(search, *_search_offsets(search, gap, latest), draws)
 
 
-class _Search:
+class _ShiftSearch:
     """Correlations of events with brightness changes, interval by interval, before they are averaged."""
 
     def __init__(self, events: Events, scene: CameraScene, reach: int):
@@ -204,7 +204,7 @@ class _Search:
         busiest = np.sort(np.argsort(-counts, kind="stable")[:INTERVALS])
         ends = np.stack([scene.begin[:-1], scene.end[:-1], scene.begin[1:], scene.end[1:]], 1)
         self.exposures = ends[busiest]
-        self.changes = [_change(scene, int(k)) for k in busiest]
+        self.changes = [_log_change(scene, int(k)) for k in busiest]
 
     def table(self, offset: float, flips: Sequence[Flip]) -> tuple[Scores, Scores]:
         """Return weighted correlations (J, flips, 2 R + 1, 2 R + 1) and weights (J,) at an offset [s]."""
@@ -235,13 +235,15 @@ class _Search:
         return np.where(np.abs(found) < 1, found, 0.0).astype(np.float64)
 
 
-def _change(scene: CameraScene, interval: int) -> NDArray[np.float32]:
+def _log_change(scene: CameraScene, interval: int) -> NDArray[np.float32]:
     """Return the change of log intensity from a frame to the next, (H, W)."""
     before, after = (np.log(scene.intensity(k) + np.float32(SOFT)) for k in (interval, interval + 1))
     return np.asarray(after - before)
 
 
-def _nearest(search: _Search, gap: float, latest: float) -> tuple[Flip, Place, Scores, Scores, Scores]:
+def _search_offsets(
+    search: _ShiftSearch, gap: float, latest: float
+) -> tuple[Flip, Place, Scores, Scores, Scores]:
     """Search offsets coarsely with all flips and shifts, then finely with the best.
 
     Returns:
@@ -260,8 +262,8 @@ def _nearest(search: _Search, gap: float, latest: float) -> tuple[Flip, Place, S
     return flip, place, offsets, curve, np.array([weights for _, weights in tables])
 
 
-def _decide(
-    search: _Search,
+def _judge_corrections(
+    search: _ShiftSearch,
     flip: Flip,
     place: Place,
     offsets: Scores,
@@ -270,13 +272,13 @@ def _decide(
     draws: NDArray[np.int64],
 ) -> Alignment:
     """Refine offset and shift, and see by resampling how sure they are."""
-    offset = float(_top(offsets, curve.sum(1) / weights.sum(1)))
-    late = np.array([_top(offsets, curve @ d / (weights @ d)) for d in draws]).std()
+    offset = float(_parabola_maximum(offsets, curve.sum(1) / weights.sum(1)))
+    late = np.array([_parabola_maximum(offsets, curve @ d / (weights @ d)) for d in draws]).std()
     scores, weight = search.table(offset, FLIPS)
     mean, number, middle = scores.sum(0) / weight.sum(), FLIPS.index(flip), search.reach
-    peak = _peak(mean[number])
+    peak = _peak_shift(mean[number])
     drawn = np.tensordot(draws, scores, 1) / (draws @ weight)[:, None, None, None]  # (resamples, flips, S, S)
-    spread = np.array([_peak(table[number]) for table in drawn]).std(0)
+    spread = np.array([_peak_shift(table[number]) for table in drawn]).std(0)
     tops = drawn.max((2, 3))
     clear = set()
     if number and np.mean(tops[:, number] > tops[:, 0]) >= SURE:
@@ -304,7 +306,7 @@ def _decide(
     )
 
 
-def _top(x: Scores, y: Scores) -> float:
+def _parabola_maximum(x: Scores, y: Scores) -> float:
     """Return where a curve on an even grid has its maximum, by a parabola through three points."""
     k = int(np.clip(y.argmax(), 1, len(y) - 2))
     bend = y[k - 1] - 2 * y[k] + y[k + 1]
@@ -313,14 +315,14 @@ def _top(x: Scores, y: Scores) -> float:
     return float(x[k] + np.clip(0.5 * (y[k - 1] - y[k + 1]) / bend, -1, 1) * (x[1] - x[0]))
 
 
-def _peak(table: Scores) -> tuple[float, float]:
+def _peak_shift(table: Scores) -> tuple[float, float]:
     """Return the shift in x and y [px] of the maximum of a table, by parabolas through its neighbours."""
     row, column = np.unravel_index(table.argmax(), table.shape)
     grid = np.arange(len(table), dtype=np.float64) - len(table) // 2
-    return _top(grid, table[row]), _top(grid, table[:, column])
+    return _parabola_maximum(grid, table[row]), _parabola_maximum(grid, table[:, column])
 
 
-def _moved(frame: NDArray[Any], shift: tuple[float, float]) -> NDArray[Any]:
+def _shift_frame(frame: NDArray[Any], shift: tuple[float, float]) -> NDArray[Any]:
     """Return a frame moved by columns and rows [px], bilinear; 0 where there is no content."""
     height, width = frame.shape
     matrix = np.array([[1, 0, shift[0]], [0, 1, shift[1]]], np.float64)

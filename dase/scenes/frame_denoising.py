@@ -33,7 +33,9 @@ BANDS = 12
 """Classes of intensity whose noise is measured apart."""
 
 
-def steady(frames: ArrayLike, *, black: float = 0.0, white: float | None = None) -> NDArray[np.float32]:
+def denoise_resting_pixels(
+    frames: ArrayLike, *, black: float = 0.0, white: float | None = None
+) -> NDArray[np.float32]:
     """Return frames in which every pixel keeps one value as long as it rests.
 
     The noise of frames is no change of light, but a sensor model would answer it with events, and nothing
@@ -57,14 +59,14 @@ def steady(frames: ArrayLike, *, black: float = 0.0, white: float | None = None)
         )
     white = full_scale(raw) if white is None else white
     values = (raw.astype(np.float32) - np.float32(black)) / np.float32(white - black)
-    noise = _noise(values, step=1 / (white - black) if raw.dtype.kind in "iu" else 0.0)
+    noise = _measure_noise(values, step=1 / (white - black) if raw.dtype.kind in "iu" else 0.0)
     bounds = np.where(values <= 0, -1, np.where(values >= 1, 1, 0)).astype(np.int8)
     goes_on = np.zeros(raw.shape, np.bool_)
     total, count, limit = values[0].copy(), np.ones(raw.shape[1:], np.float32), bounds[0].copy()
     means, limits = [], []
     for k in range(len(raw)):
         if k:
-            goes_on[k] = _rests(values[k], total / count, count, noise)
+            goes_on[k] = _is_resting(values[k], total / count, count, noise)
             total = np.where(goes_on[k], total, 0) + values[k]
             count = np.where(goes_on[k], count, 0) + 1
             limit = np.where(goes_on[k] & (limit != 0), limit, bounds[k])
@@ -78,7 +80,7 @@ def steady(frames: ArrayLike, *, black: float = 0.0, white: float | None = None)
 
 
 @dataclass(frozen=True)
-class _Noise:
+class _NoiseLevels:
     """Standard deviations of a frame's noise, class by class of intensity, each (BANDS,)."""
 
     light: NDArray[np.float64]
@@ -86,7 +88,7 @@ class _Noise:
     around: NDArray[np.float64]
 
 
-def _noise(values: NDArray[np.float32], step: float) -> _Noise:
+def _measure_noise(values: NDArray[np.float32], step: float) -> _NoiseLevels:
     """Measure noise in the smoothest places of each class of intensity.
 
     That of pixels is what is neither flat nor a slope in the difference: moving cameras and flickering light
@@ -98,28 +100,28 @@ def _noise(values: NDArray[np.float32], step: float) -> _Noise:
     for k in np.unique(np.linspace(0, len(values) - 2, PAIRS).astype(int)):
         change = values[k + 1] - values[k]
         light.append(cv2.blur(values[k], (BLOCK, BLOCK))[inner].ravel())
-        pixel.append(_size(cv2.filter2D(change, cv2.CV_32F, ROUGH))[inner].ravel())
-        around.append(_size(cv2.GaussianBlur(change, (0, 0), AROUND))[inner].ravel() / np.sqrt(2))
+        pixel.append(_local_rms(cv2.filter2D(change, cv2.CV_32F, ROUGH))[inner].ravel())
+        around.append(_local_rms(cv2.GaussianBlur(change, (0, 0), AROUND))[inner].ravel() / np.sqrt(2))
     place, single, mean = (np.concatenate(part) for part in (light, pixel, around))
     parts = [part for part in np.array_split(np.argsort(place, kind="stable"), BANDS) if len(part)]
     # rounding to whole steps hides noise below half a step
     sigma = np.array([max(float(np.percentile(single[p], 20)) / SMOOTHEST, 0.5 * step) for p in parts])
     common = np.array([float(np.percentile(mean[p], 50)) for p in parts])
     independent = sigma / (2 * np.sqrt(np.pi) * AROUND)
-    return _Noise(
+    return _NoiseLevels(
         np.array([float(np.median(place[p])) for p in parts]),
         sigma,
         np.maximum(independent, np.minimum(common, 0.5 * sigma)),
     )
 
 
-def _size(values: NDArray[np.float32]) -> NDArray[np.float32]:
+def _local_rms(values: NDArray[np.float32]) -> NDArray[np.float32]:
     """Return the root mean square around each place."""
     return np.asarray(np.sqrt(np.maximum(cv2.blur(values * values, (BLOCK, BLOCK)), 0)))
 
 
-def _rests(
-    value: NDArray[np.float32], mean: NDArray[np.float32], count: NDArray[np.float32], noise: _Noise
+def _is_resting(
+    value: NDArray[np.float32], mean: NDArray[np.float32], count: NDArray[np.float32], noise: _NoiseLevels
 ) -> NDArray[np.bool_]:
     """Return which pixels of a frame do not differ from the mean of so many frames before, (H, W)."""
     change = value - mean

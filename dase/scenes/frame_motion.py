@@ -32,7 +32,7 @@ FEW = 5e-4
 
 
 @dataclass(frozen=True)
-class Match:
+class FrameMatch:
     """Motion between two frames.
 
     Args:
@@ -47,14 +47,14 @@ class Match:
     doubt: Map
 
 
-def match(
+def match_frames(
     first: Map,
     second: Map,
     *,
     eps: float,
     exposure: tuple[float, float] = (0.0, 0.0),
     usable: tuple[NDArray[np.bool_], NDArray[np.bool_]] | None = None,
-) -> Match:
+) -> FrameMatch:
     """Match two frames.
 
     Doubt is the root of the sum of the squares of three parts, each in units of log intensity: the
@@ -68,43 +68,43 @@ def match(
         exposure: Duration of both exposures as a share of the time between the frames.
         usable: Pixels of both frames that are not saturated, each (H, W); None for all.
     """
-    a, b = _tones(first, second)
-    ahead, back = _ways(a, b), _ways(b, a)
+    a, b = _to_8_bit(first, second)
+    ahead, back = _optical_flow(a, b), _optical_flow(b, a)
     logs = [np.log(frame + np.float32(eps)) for frame in (first, second)]
     good = usable or (np.ones(first.shape, np.bool_), np.ones(first.shape, np.bool_))
     doubt = np.stack(
         [
-            _doubt(logs, (ahead, back), good, exposure[0]),
-            _doubt(logs[::-1], (back, ahead), good[::-1], exposure[1]),
+            _doubt_of_frame(logs, (ahead, back), good, exposure[0]),
+            _doubt_of_frame(logs[::-1], (back, ahead), good[::-1], exposure[1]),
         ]
     )
-    return Match(ahead, back, doubt)
+    return FrameMatch(ahead, back, doubt)
 
 
-def _tones(*frames: Map) -> list[NDArray[np.uint8]]:
+def _to_8_bit(*frames: Map) -> list[NDArray[np.uint8]]:
     """Return frames in 8 bits, stretched alike."""
     low, high = np.percentile(np.stack(frames), (0.5, 99.5))
     scale = 255 / max(float(high - low), 1e-6)
     return [np.clip((frame - low) * scale, 0, 255).astype(np.uint8) for frame in frames]
 
 
-def _ways(first: NDArray[np.uint8], second: NDArray[np.uint8]) -> Map:
+def _optical_flow(first: NDArray[np.uint8], second: NDArray[np.uint8]) -> Map:
     """Return the way of each pixel from one frame to another [px], shape (H, W, 2)."""
     quick = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM).calc(first, second, None)
     flow = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
     flow.setFinestScale(0)  # the presets stop at half the resolution
     flow.setPatchStride(2)
     # begun from what most of the picture does: repeated textures then match the right repetition
-    way = flow.calc(first, second, _dominant(quick))
+    way = flow.calc(first, second, _dominant_affine_flow(quick))
     # blending over the shortest ways is as exact as following them, and rest is cheap to render
     way[np.hypot(way[..., 0], way[..., 1]) < REST] = 0
     return np.asarray(way)
 
 
-def _dominant(way: Map, rounds: int = 20) -> Map:
+def _dominant_affine_flow(way: Map, rounds: int = 20) -> Map:
     """Return the affine motion that most of the ways follow, shape (H, W, 2)."""
     height, width = way.shape[:2]
-    x, y = places(way.shape)
+    x, y = pixel_grid(way.shape)
     design = np.stack([x / width - 0.5, y / height - 0.5, np.ones_like(x)], -1)
     thin = max(1, min(height, width) // 50)
     some, wanted = (part[::thin, ::thin].reshape(-1, part.shape[-1]) for part in (design, way))
@@ -117,32 +117,32 @@ def _dominant(way: Map, rounds: int = 20) -> Map:
     return np.ascontiguousarray(design @ motion, np.float32)
 
 
-def places(shape: tuple[int, ...]) -> tuple[Map, Map]:
+def pixel_grid(shape: tuple[int, ...]) -> tuple[Map, Map]:
     """Return columns and rows of all pixels, each (H, W)."""
     y, x = np.mgrid[: shape[0], : shape[1]].astype(np.float32)
     return x, y
 
 
-def look(values: Map, x: Map, y: Map) -> Map:
+def sample_bicubic(values: Map, x: Map, y: Map) -> Map:
     """Return values at places, bicubic, continued by the outermost ones."""
     out = cv2.remap(values, x, y, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
     return np.asarray(out, np.float32)
 
 
-def _doubt(
+def _doubt_of_frame(
     logs: list[Map], ways: tuple[Map, Map], usable: tuple[NDArray[np.bool_], ...], exposure: float
 ) -> Map:
     """Return the doubt about pixels of the first of two frames, (H, W)."""
     log, (there, back) = logs[0], ways
     height, width = log.shape
-    x, y = places(log.shape)
+    x, y = pixel_grid(log.shape)
     to = x + there[..., 0], y + there[..., 1]
-    residual = log - look(logs[1], *to)
-    returned = there + look(back, *to)
+    residual = log - sample_bicubic(logs[1], *to)
+    returned = there + sample_bicubic(back, *to)
     gradient = np.hypot(cv2.Sobel(log, cv2.CV_32F, 1, 0) / 8, cv2.Sobel(log, cv2.CV_32F, 0, 1) / 8)
     slope = cv2.dilate(gradient, np.ones((3, 3)))
     apart = np.hypot(returned[..., 0], returned[..., 1]) * slope
-    blur = _blurred(log, there * np.float32(exposure)) - log if exposure > 0 else np.zeros_like(log)
+    blur = _blur_along_flow(log, there * np.float32(exposure)) - log if exposure > 0 else np.zeros_like(log)
     square = residual**2 + (WAY_WEIGHT * apart) ** 2 + (BLUR_WEIGHT * blur) ** 2
     out = np.sqrt(np.maximum(cv2.GaussianBlur(square, (0, 0), WITHIN), 0))
     outside = (to[0] < 0) | (to[1] < 0) | (to[0] > width - 1) | (to[1] > height - 1)
@@ -152,16 +152,18 @@ def _doubt(
     return np.where(outside | blind, np.float32(HOPELESS), out.astype(np.float32))
 
 
-def _blurred(log: Map, way: Map) -> Map:
+def _blur_along_flow(log: Map, way: Map) -> Map:
     """Return the log of the mean intensity along a way centred at each pixel [px]."""
-    x, y = places(log.shape)
+    x, y = pixel_grid(log.shape)
     total = np.zeros_like(log)
     for share in (np.arange(LOOKS) + 0.5) / LOOKS - 0.5:
-        total += np.exp(look(log, x + np.float32(share) * way[..., 0], y + np.float32(share) * way[..., 1]))
+        total += np.exp(
+            sample_bicubic(log, x + np.float32(share) * way[..., 0], y + np.float32(share) * way[..., 1])
+        )
     return np.asarray(np.log(total / LOOKS))
 
 
-def stretched(frames: NDArray[Any]) -> bool:
+def is_stretched(frames: NDArray[Any]) -> bool:
     """Return whether each frame, (F, H, W), seems to be stretched to the whole range of its type.
 
     Stretching leaves few pixels at either end, most often one, not always the same; light and shadow beyond
@@ -174,7 +176,7 @@ def stretched(frames: NDArray[Any]) -> bool:
     return bool(0 < least < FEW and 0 < most < FEW and np.ptp(brightest) > 0)
 
 
-def stretches(frames: list[Map] | NDArray[np.float32], *, pull: float = 0.1) -> NDArray[np.float64]:
+def estimate_stretches(frames: list[Map] | NDArray[np.float32], *, pull: float = 0.1) -> NDArray[np.float64]:
     """Return gain and offset that undo each frame's own stretch, shape (F, 2).
 
     Cameras and data sets that stretch every frame to the full range change static intensities from frame to
@@ -202,22 +204,22 @@ def stretches(frames: list[Map] | NDArray[np.float32], *, pull: float = 0.1) -> 
         for level in levels:
             ask({2 * k: pull * level, 2 * k + 1: pull}, pull * level)
         if k + 1 < count:
-            gain, offset = _line(frames[k], frames[k + 1])
+            gain, offset = _gain_and_offset_between(frames[k], frames[k + 1])
             for level in levels:
                 ask({2 * k: level, 2 * k + 1: 1, 2 * k + 2: -(gain * level + offset), 2 * k + 3: -1}, 0.0)
     found = np.linalg.lstsq(np.stack(rows), np.array(wanted), rcond=None)[0]
     return np.asarray(found.reshape(count, 2))
 
 
-def _line(first: Map, second: Map, rounds: int = 20) -> tuple[float, float]:
+def _gain_and_offset_between(first: Map, second: Map, rounds: int = 20) -> tuple[float, float]:
     """Return gain and offset from the intensities of `first` to those it has in `second`."""
-    a8, b8 = _tones(first, second)
-    ahead = _ways(a8, b8)
-    x, y = places(first.shape)
+    a8, b8 = _to_8_bit(first, second)
+    ahead = _optical_flow(a8, b8)
+    x, y = pixel_grid(first.shape)
     to = x + ahead[..., 0], y + ahead[..., 1]
-    returned = ahead + look(_ways(b8, a8), *to)
+    returned = ahead + sample_bicubic(_optical_flow(b8, a8), *to)
     same = np.hypot(returned[..., 0], returned[..., 1]) < 1
-    a, b = first[same], look(second, *to)[same]
+    a, b = first[same], sample_bicubic(second, *to)[same]
     if len(a) < 100 or np.ptp(a) < 1e-3:
         return 1.0, 0.0
     design = np.stack([a, np.ones_like(a)], 1).astype(np.float64)

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dase.errors import InputError
-from dase.io.image_files import SUFFIXES, decode, list_pictures, to_grey
+from dase.io.image_files import SUFFIXES, decode_file, list_pictures, to_grey
 
 LONGEST_SIDE = 1024  # [px] larger pictures are shrunk
 CACHED_PICTURES = 64  # decoded pictures kept per process: at most 4 MiB each, 8 MiB with alpha
@@ -127,12 +127,16 @@ class FolderImages(ImageSource):
     def foreground(self, rng: np.random.Generator) -> Picture:
         """Draw the cut-out of a file, or cut a shape from it."""
         picture = self._draw(rng)
-        return cut(picture.grey, rng) if picture.alpha is None else _trim(picture.grey, picture.alpha)
+        return (
+            cut_random_shape(picture.grey, rng)
+            if picture.alpha is None
+            else _crop_to_alpha(picture.grey, picture.alpha)
+        )
 
     def _draw(self, rng: np.random.Generator) -> Picture:
         if rng.random() < self._drawn_share:
             return Picture(draw_texture(rng))
-        return _read(self._paths[int(rng.integers(len(self._paths)))])
+        return _read_picture(self._paths[int(rng.integers(len(self._paths)))])
 
 
 class CocoImages(ImageSource):
@@ -173,16 +177,16 @@ class CocoImages(ImageSource):
     def background(self, rng: np.random.Generator) -> Picture:
         """Draw a whole image."""
         image = self._images[rng.integers(len(self._images))]
-        return Picture(_read(self._folder / image["file_name"]).grey.copy())
+        return Picture(_read_picture(self._folder / image["file_name"]).grey.copy())
 
     def foreground(self, rng: np.random.Generator) -> Picture:
         """Draw an instance; raises InputError if its outline does not fit its image."""
         instance = self._instances[rng.integers(len(self._instances))]
         image = self._coco.imgs[instance["image_id"]]
-        grey = _read(self._folder / image["file_name"]).grey
+        grey = _read_picture(self._folder / image["file_name"]).grey
         what = f"images: '{self._file}': annotation {instance.get('id')} of '{image['file_name']}'"
         size = image["width"], image["height"]
-        if _shrunk(*size) != grey.shape[::-1]:
+        if _shrunk_size(*size) != grey.shape[::-1]:
             raise InputError(f"{what} must have the size of the image file, got {size[0]}x{size[1]}")
         try:
             with warnings.catch_warnings(action="ignore"):  # pycocotools 2.0.11 warns with NumPy 2
@@ -192,7 +196,7 @@ class CocoImages(ImageSource):
         if not mask.any():
             raise InputError(f"{what} must enclose a pixel, encloses none")
         mask = cv2.resize(mask, grey.shape[::-1], interpolation=cv2.INTER_AREA)
-        return _trim(grey, cv2.GaussianBlur(mask, (3, 3), 0))
+        return _crop_to_alpha(grey, cv2.GaussianBlur(mask, (3, 3), 0))
 
 
 def _read_annotations(path: Path) -> tuple[dict[int, dict[str, Any]], list[dict[str, Any]]]:
@@ -205,7 +209,7 @@ def _read_annotations(path: Path) -> tuple[dict[int, dict[str, Any]], list[dict[
         raise InputError(f"images: annotations '{path}' must be JSON: {error}") from error
     try:
         images = {image["id"]: image for image in content["images"]}
-        instances = [a for a in content["annotations"] if _usable(a, images[a["image_id"]])]
+        instances = [a for a in content["annotations"] if _is_usable_instance(a, images[a["image_id"]])]
         for image in images.values():
             Path(image["file_name"])  # a TypeError unless it is a string
     except (KeyError, TypeError) as error:
@@ -221,7 +225,7 @@ def _read_annotations(path: Path) -> tuple[dict[int, dict[str, Any]], list[dict[
     return images, instances
 
 
-def _usable(instance: dict[str, Any], image: dict[str, Any]) -> bool:
+def _is_usable_instance(instance: dict[str, Any], image: dict[str, Any]) -> bool:
     least = max(COCO_AREA, COCO_SHARE * image["width"] * image["height"])
     return bool(instance.get("segmentation")) and not instance.get("iscrowd") and instance["area"] >= least
 
@@ -235,12 +239,12 @@ def _existing_folder(name: str) -> Path:
 
 
 @lru_cache(maxsize=CACHED_PICTURES)
-def _read(path: Path) -> Picture:
+def _read_picture(path: Path) -> Picture:
     """Decode, grey, shrink and median-filter a file; the arrays are shared, hence read-only."""
-    grey, alpha = to_grey(decode(path))
+    grey, alpha = to_grey(decode_file(path))
     if alpha is not None and (alpha > 0).any():
         grey[alpha == 0] = grey[alpha > 0].mean()  # what is hidden must not leak into edges and backgrounds
-    size = _shrunk(*grey.shape[::-1])
+    size = _shrunk_size(*grey.shape[::-1])
     grey = cv2.resize(grey, size, interpolation=cv2.INTER_AREA)
     alpha = None if alpha is None else cv2.resize(alpha, size, interpolation=cv2.INTER_AREA)
     grey = cv2.medianBlur(np.clip(grey, 0, 1), 3)
@@ -251,20 +255,20 @@ def _read(path: Path) -> Picture:
     return Picture(grey, alpha)
 
 
-def _shrunk(width: int, height: int) -> tuple[int, int]:
+def _shrunk_size(width: int, height: int) -> tuple[int, int]:
     """Return width and height of a picture after shrinking."""
     scale = min(1.0, LONGEST_SIDE / max(width, height))
     return max(1, round(width * scale)), max(1, round(height * scale))
 
 
-def _trim(grey: Grey, alpha: Grey) -> Picture:
+def _crop_to_alpha(grey: Grey, alpha: Grey) -> Picture:
     """Crop to alpha > 0 and put a border of alpha 0 around."""
     rows, columns = (np.flatnonzero((alpha > 0).any(axis)) for axis in (1, 0))
     box = slice(rows[0], rows[-1] + 1), slice(columns[0], columns[-1] + 1)
     return Picture(np.pad(grey[box], 1, mode="edge"), np.clip(np.pad(alpha[box], 1), 0, 1))
 
 
-def cut(grey: Grey, rng: np.random.Generator) -> Picture:
+def cut_random_shape(grey: Grey, rng: np.random.Generator) -> Picture:
     """Cut a random shape from a random place of a picture.
 
     Three in ten are rectangles, as many blobs; the rest are ellipses and polygons, with an edge 2 px soft.
@@ -279,13 +283,13 @@ def cut(grey: Grey, rng: np.random.Generator) -> Picture:
     kind = rng.choice(4, p=(0.3, 0.3, 0.2, 0.2))
     if kind == 0 or min(sides) < SMALLEST_CUT:
         return Picture(part, np.ones_like(part))
-    outline = (_blob, _ellipse, _polygon)[kind - 1](rng)
+    outline = (_blob_outline, _ellipse_outline, _polygon_outline)[kind - 1](rng)
     mask = np.zeros(part.shape, np.uint8)
-    _fill(mask, 2.0 + outline * np.subtract(mask.shape[::-1], 5), 255)  # 2 px for the soft edge
-    return _trim(part, cv2.GaussianBlur(mask, (3, 3), 0) / np.float32(255))
+    _fill_polygon(mask, 2.0 + outline * np.subtract(mask.shape[::-1], 5), 255)  # 2 px for the soft edge
+    return _crop_to_alpha(part, cv2.GaussianBlur(mask, (3, 3), 0) / np.float32(255))
 
 
-def _blob(rng: np.random.Generator) -> NDArray[np.float64]:
+def _blob_outline(rng: np.random.Generator) -> NDArray[np.float64]:
     """Star-convex, the logarithm of the radius a random Fourier series."""
     angle = np.linspace(0, 2 * np.pi, 180, endpoint=False)
     order = np.arange(1, 9)
@@ -293,13 +297,13 @@ def _blob(rng: np.random.Generator) -> NDArray[np.float64]:
     return _unit_square(angle, np.exp(waves @ (rng.normal(0, 0.5, 8) / order)))
 
 
-def _ellipse(rng: np.random.Generator) -> NDArray[np.float64]:
+def _ellipse_outline(rng: np.random.Generator) -> NDArray[np.float64]:
     angle = np.linspace(0, 2 * np.pi, 180, endpoint=False)
     radius = 1 / np.hypot(np.cos(angle), np.sin(angle) / rng.uniform(0.35, 1))
     return _unit_square(angle + rng.uniform(0, np.pi), radius)
 
 
-def _polygon(rng: np.random.Generator) -> NDArray[np.float64]:
+def _polygon_outline(rng: np.random.Generator) -> NDArray[np.float64]:
     """Three to nine corners around a point; often not convex."""
     corners = int(rng.integers(3, 10))
     angle = 2 * np.pi / corners * (np.arange(corners) + rng.uniform(-0.35, 0.35, corners)) + rng.uniform(0, 7)
@@ -313,12 +317,12 @@ def _unit_square(angle: NDArray[np.float64], radius: NDArray[np.float64]) -> NDA
     return np.asarray((points - low) / (points.max(0) - low))
 
 
-def _fixed(points: NDArray[np.float64]) -> NDArray[np.int32]:
+def _fixed_point(points: NDArray[np.float64]) -> NDArray[np.int32]:
     return np.round(points * 16).astype(np.int32)  # OpenCV's coordinates, here with 4 fractional bits
 
 
-def _fill(canvas: NDArray[np.uint8], points: NDArray[np.float64], level: int) -> None:
-    cv2.fillPoly(canvas, [_fixed(points)], level, cv2.LINE_AA, 4)
+def _fill_polygon(canvas: NDArray[np.uint8], points: NDArray[np.float64], level: int) -> None:
+    cv2.fillPoly(canvas, [_fixed_point(points)], level, cv2.LINE_AA, 4)
 
 
 def draw_texture(rng: np.random.Generator) -> Grey:
@@ -327,12 +331,12 @@ def draw_texture(rng: np.random.Generator) -> Grey:
     Returns:
         Intensity in [0, 1], shape DRAWN_SIZE; its darkest and brightest level are random, too.
     """
-    unit = (_fractal, _grating, _polygons, _strokes)[rng.integers(4)](rng)
+    unit = (_fractal_noise, _draw_grating, _draw_polygons, _draw_strokes)[rng.integers(4)](rng)
     levels = rng.permutation([rng.uniform(0, 0.4), rng.uniform(0.6, 1)])
     return np.asarray(cv2.medianBlur(np.float32(levels[0] + (levels[1] - levels[0]) * unit), 3))
 
 
-def _fractal(rng: np.random.Generator) -> NDArray[np.float64]:
+def _fractal_noise(rng: np.random.Generator) -> NDArray[np.float64]:
     """Noise whose amplitude falls as 1/f^slope, from 0.8 (sand) to 2 (clouds)."""
     frequency = np.hypot(np.fft.fftfreq(DRAWN_SIZE[0])[:, None], np.fft.rfftfreq(DRAWN_SIZE[1]))
     frequency[0, 0] = np.inf  # no mean
@@ -341,7 +345,7 @@ def _fractal(rng: np.random.Generator) -> NDArray[np.float64]:
     return np.asarray(np.clip(0.5 + 0.2 * noise / noise.std(), 0, 1))
 
 
-def _grating(rng: np.random.Generator) -> NDArray[np.float64]:
+def _draw_grating(rng: np.random.Generator) -> NDArray[np.float64]:
     """Soft-edged stripes, or a checkerboard of two of them."""
     y, x = np.mgrid[: DRAWN_SIZE[0], : DRAWN_SIZE[1]]
     angle, period = rng.uniform(0, np.pi), rng.uniform(12, 96)
@@ -351,15 +355,15 @@ def _grating(rng: np.random.Generator) -> NDArray[np.float64]:
     return np.asarray(0.5 + 0.5 * np.tanh(wave * rng.uniform(1, period / 4)))
 
 
-def _polygons(rng: np.random.Generator) -> NDArray[np.float64]:
+def _draw_polygons(rng: np.random.Generator) -> NDArray[np.float64]:
     canvas = np.full(DRAWN_SIZE, rng.integers(256), np.uint8)
     for size in np.geomspace(300, 30, int(rng.integers(15, 60))):  # the small ones last, on top
         corner = rng.uniform(-0.5 * size, DRAWN_SIZE[::-1])
-        _fill(canvas, corner + size * _polygon(rng), int(rng.integers(256)))
+        _fill_polygon(canvas, corner + size * _polygon_outline(rng), int(rng.integers(256)))
     return canvas / 255
 
 
-def _strokes(rng: np.random.Generator) -> NDArray[np.float64]:
+def _draw_strokes(rng: np.random.Generator) -> NDArray[np.float64]:
     """Lines of letters of two to four strokes, with spaces between words."""
     canvas = np.zeros(DRAWN_SIZE, np.uint8)
     pitch = int(rng.integers(14, 48))  # from line to line [px]
@@ -367,5 +371,5 @@ def _strokes(rng: np.random.Generator) -> NDArray[np.float64]:
         for left in np.arange(pitch / 2, DRAWN_SIZE[1] - pitch, 0.55 * pitch):
             if rng.random() < 0.85:
                 letter = (left, top) + pitch * rng.uniform(0, (0.45, 0.7), (int(rng.integers(3, 6)), 2))
-                cv2.polylines(canvas, [_fixed(letter)], False, 255, 1 + pitch // 16, cv2.LINE_AA, 4)
+                cv2.polylines(canvas, [_fixed_point(letter)], False, 255, 1 + pitch // 16, cv2.LINE_AA, 4)
     return canvas / 255

@@ -120,7 +120,7 @@ class LayerScene(Scene):
         d = np.zeros_like(m)
         d[..., 0, :] = np.stack([gx * c - sx * s * spin, -gy * s - sy * c * spin, vx + 0 * x], -1)
         d[..., 1, :] = np.stack([gx * s + sx * c * spin, gy * c - sy * s * spin, vy + 0 * y], -1)
-        to_sensor = _plane(self.width, self.height, self.width)
+        to_sensor = _unit_plane_to_pixels(self.width, self.height, self.width)
         from_texture = np.stack(
             [np.linalg.inv(self._texture_plane(layer)) for layer in range(len(self.layers))]
         )
@@ -131,8 +131,8 @@ class LayerScene(Scene):
         h, w = self.layers[layer].picture.grey.shape
         if layer == 0:
             # at scale 1 the background covers the sensor
-            return _plane(w, h, min(w, h * self.width / self.height))
-        return _plane(w, h, max(w, h))
+            return _unit_plane_to_pixels(w, h, min(w, h * self.width / self.height))
+        return _unit_plane_to_pixels(w, h, max(w, h))
 
     def velocity(self, times: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return maps from sensor coordinates to velocity [px/s], shape (T, L, 2, 3)."""
@@ -214,7 +214,7 @@ class LayerScene(Scene):
         """Return textures and motion at `times` on a Warp device."""
         if device.alias not in self._uploaded:
             textures = [(layer.picture.grey, layer.picture.alpha) for layer in self.layers]
-            self._uploaded[device.alias] = kernels.upload(textures, device)
+            self._uploaded[device.alias] = kernels.upload_textures(textures, device)
         m, _ = self.forward(times)
         quad = self._outlines(m)
         # only these samples are looked at, so their outlines bound the layer; the pixel is for float32
@@ -234,19 +234,19 @@ class LayerScene(Scene):
 
     def frames(self, times: NDArray[np.float64], device: str = "cpu") -> NDArray[np.float32]:
         """Return intensities in [0, 1] at `times` [s], shape (K, height, width)."""
-        where = launch.device(device)
+        where = launch.find_device(device)
         out = kernels.render_frames(self.arrays(times, where), self.width, self.height, where)
         return np.asarray(out.numpy().reshape(len(times), self.height, self.width))
 
     def flow(self, times: NDArray[np.float64], device: str = "cpu") -> NDArray[np.float32]:
         """Return the flow of the foremost layer at `times` [px/s], shape (K, 2, height, width)."""
-        where = launch.device(device)
+        where = launch.find_device(device)
         maps = wp.array(self.velocity(times).astype(np.float32), dtype=kernels.Affine, device=where)
         out = kernels.render_flow(self.arrays(times, where), maps, self.width, self.height, where)
         stacked = out.numpy().reshape(len(times), self.height, self.width, 2)
         return np.ascontiguousarray(np.moveaxis(stacked, -1, 1))
 
 
-def _plane(width: int, height: int, unit: float) -> NDArray[np.float64]:
+def _unit_plane_to_pixels(width: int, height: int, unit: float) -> NDArray[np.float64]:
     """Return the map from the plane, whose unit is `unit` pixels, to pixels; centres lie at integers."""
     return np.array([[unit, 0, (width - 1) / 2], [0, unit, (height - 1) / 2], [0, 0, 1]], np.float64)

@@ -50,7 +50,7 @@ REGIMES = {
 MIXED = "mixed"
 """Each scene of a regime drawn by its share of S2R's scenes."""
 
-NAMES = (*REGIMES, MIXED)
+REGIME_NAMES = (*REGIMES, MIXED)
 
 
 def draw_scene(
@@ -61,7 +61,7 @@ def draw_scene(
     Args:
         rng: Draws everything.
         images: Textures.
-        regime: One of `NAMES`.
+        regime: One of `REGIME_NAMES`.
         width: Columns [px].
         height: Rows [px].
         duration: Length [s].
@@ -73,11 +73,11 @@ def draw_scene(
         shares = np.array([r.scenes for r in REGIMES.values()], float)
         regime = str(rng.choice(list(REGIMES), p=shares / shares.sum()))
     if regime not in REGIMES:
-        raise InputError(f"there is no regime '{regime}': {nearest(regime, NAMES)}")
+        raise InputError(f"there is no regime '{regime}': {nearest(regime, REGIME_NAMES)}")
     how = REGIMES[regime]
-    layers = [_background(rng, images, how, width, height, duration)]
+    layers = [_draw_background(rng, images, how, width, height, duration)]
     for _ in range(rng.integers(how.objects[0], how.objects[1] + 1)):
-        layers.append(_foreground(rng, images, how, width, height, duration))
+        layers.append(_draw_foreground(rng, images, how, width, height, duration))
     return LayerScene(layers, width=width, height=height, duration=duration)
 
 
@@ -89,22 +89,24 @@ def draw_speed(rng: np.random.Generator, deviation: float, most: float) -> float
             return float(speed)
 
 
-def _background(
+def _draw_background(
     rng: np.random.Generator, images: ImageSource, how: Regime, width: int, height: int, duration: float
 ) -> Layer:
     speed = rng.uniform(*how.background_speed)
-    motion = _motion(rng, speed, how.background_spin, (1.0, 1.5), width, height, duration)
+    motion = _draw_motion(rng, speed, how.background_spin, (1.0, 1.5), width, height, duration)
     return Layer(images.background(rng), motion)
 
 
-def _foreground(
+def _draw_foreground(
     rng: np.random.Generator, images: ImageSource, how: Regime, width: int, height: int, duration: float
 ) -> Layer:
     speed = draw_speed(rng, *how.speed)
-    return Layer(images.foreground(rng), _motion(rng, speed, how.spin, (0.2, 1.2), width, height, duration))
+    return Layer(
+        images.foreground(rng), _draw_motion(rng, speed, how.spin, (0.2, 1.2), width, height, duration)
+    )
 
 
-def _motion(
+def _draw_motion(
     rng: np.random.Generator,
     speed: float,
     spin: tuple[float, float],

@@ -13,10 +13,10 @@ from numpy.typing import ArrayLike, NDArray
 from dase.errors import InputError
 from dase.io.video_file import FrameReader
 from dase.kernels import pixel_stages
-from dase.kernels.scene_layers import interpolate
+from dase.kernels.scene_layers import interpolate_frames
 from dase.scenes.scene import Scene
 
-EPS = 1e-3
+LOG_EPS = 1e-3
 """Added to intensities before the logarithm between frames; that of sensors unless they say otherwise."""
 
 
@@ -84,7 +84,7 @@ class VideoScene(Scene):
         share = (times - self._times[below]) / np.where(gap > 0, gap, 1.0)
         needed, at = np.unique(np.concatenate([below, above]), return_inverse=True)
         pairs = at.reshape(2, -1).astype(np.int32)
-        return interpolate(self._rows(needed, pixels), pairs, share, EPS, device)
+        return interpolate_frames(self._rows(needed, pixels), pairs, share, LOG_EPS, device)
 
     def _at(self, times: NDArray[np.float64]) -> NDArray[Any]:
         index = np.searchsorted(self._times, times)
@@ -123,7 +123,7 @@ def _is_recording(path: Path) -> bool:
     if not path.is_file():
         return False
     try:
-        return io.find(path) is not frames.FORMAT  # which are videos and pictures
+        return io.find_format(path) is not frames.FORMAT  # which are videos and pictures
     except InputError:
         return False
 

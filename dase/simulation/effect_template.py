@@ -11,9 +11,9 @@ from dase.effects import EFFECTS
 from dase.errors import InputError
 from dase.io import replacing
 from dase.kernels import pixel_stages
-from dase.simulation.user_effects import RESERVED, RETURNS
+from dase.simulation.user_effects import RESERVED_NAMES, STAGE_RETURNS
 
-WHAT = {
+STAGE_MEANINGS = {
     "light": "what reaches the photodiode; 1 is white",
     "respond": "voltage of the photoreceptor [log intensity]",
     "threshold": "thresholds of a pixel, once and for all [log intensity]",
@@ -25,7 +25,7 @@ WHAT = {
 }
 """Stage to what its function returns."""
 
-COMMANDS = (
+TRIAL_COMMANDS = (
     "dase effects show {name} --effects {file}",
     "dase add davis346 {name} --effects {file} -o with_{name}.toml",
     "dase synth out_{name} --sensor with_{name}.toml --effects {file} --sequences 1 --duration 0.5",
@@ -33,7 +33,7 @@ COMMANDS = (
 )
 """What to try, in this order."""
 
-TEMPLATE = '''\
+FILE_TEMPLATE = '''\
 """An effect of your own. It works as it is: fill in your physics and try it again.
 
 {commands}
@@ -109,31 +109,31 @@ def new_effect(name: str, path: Path) -> None:
         raise InputError(f"the name of an effect must be lower-case letters, digits and _, got '{name}'")
     if name in EFFECTS:
         raise InputError(f"effect '{name}' is built in (`dase effects show {name}`); choose another name")
-    if name in RESERVED:
+    if name in RESERVED_NAMES:
         raise InputError(f"'{name}' means something else in sensor files; choose another name")
     if path.suffix != ".py":
         raise InputError(f"output must end with .py, got '{path}'")
     if path.exists():
         raise InputError(f"{path} exists and is not overwritten; choose another name with -o")
     with replacing(path) as temporary:
-        temporary.write_text(text(name, path.name), "utf-8")
+        temporary.write_text(effect_file_text(name, path.name), "utf-8")
 
 
-def text(name: str, file: str) -> str:
+def effect_file_text(name: str, file: str) -> str:
     """Return the text of the file of a new effect; `file` is what the commands in it call the file."""
     wide = max(map(len, pixel_stages.STAGES))
     stages = []
     for stage in pixel_stages.STAGES:
-        returns = ", ".join(RETURNS[stage])
+        returns = ", ".join(STAGE_RETURNS[stage])
         stages.append(
             f"#     {stage:{wide}}  asks {', '.join(pixel_stages.QUANTITIES[stage])}; returns {returns}:"
         )
-        stages.append(f"#     {'':{wide}}  {WHAT[stage]}")
+        stages.append(f"#     {'':{wide}}  {STAGE_MEANINGS[stage]}")
     cls = "".join(part.capitalize() for part in name.split("_")) or name
-    lines = "\n".join(f"    {line}" for line in commands(name, file))
-    return TEMPLATE.format(name=name, cls=cls, stages="\n".join(stages), commands=lines)
+    lines = "\n".join(f"    {line}" for line in trial_commands(name, file))
+    return FILE_TEMPLATE.format(name=name, cls=cls, stages="\n".join(stages), commands=lines)
 
 
-def commands(name: str, file: str) -> list[str]:
+def trial_commands(name: str, file: str) -> list[str]:
     """Return the commands that try an effect out."""
-    return [line.format(name=name, file=shlex.quote(file)) for line in COMMANDS]
+    return [line.format(name=name, file=shlex.quote(file)) for line in TRIAL_COMMANDS]

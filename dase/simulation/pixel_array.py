@@ -13,14 +13,14 @@ from dase.events import Events
 from dase.kernels import event_keys as ordering
 from dase.kernels import launch, pixel_compile, pixel_stages, threshold_events
 from dase.kernels import threshold_counts as counting
-from dase.kernels.random import stream
+from dase.kernels.random import stream_number
 from dase.scenes.scene import Scene
 
 if TYPE_CHECKING:
     from dase.simulation.sensor import Sensor
 
 
-class Pixels:
+class PixelArray:
     """Some pixels of a sensor while time passes: runs the composed kernel chunk by chunk.
 
     Args:
@@ -50,7 +50,7 @@ class Pixels:
         room: int = 4,
     ):
         try:
-            self.device = launch.device(device)
+            self.device = launch.find_device(device)
         except ValueError as error:
             raise InputError(str(error)) from error
         self.sensor, self.width, self.height = sensor, width, height
@@ -86,7 +86,7 @@ class Pixels:
         self.slab = 256 if self.device.is_cuda else 2048
         self._capacity = room * self.slab
         self._buffer: Any = None  # of keys, kept from chunk to chunk
-        self._room = ordering.Room()
+        self._room = ordering.KeyBuffer()
         # nothing but a change detector: counted by a kernel of its own, several pixels per thread
         self._plain = all(stage == "threshold" for effect in self.stages for stage, _ in effect.functions)
         self._vectors = vectors
@@ -113,7 +113,7 @@ class Pixels:
         Returns:
             Warp array of int32, shape (B, W, 2, N): OFF counts in channel 0, ON counts in channel 1.
         """
-        sink = pixel_stages.Counts()
+        sink = pixel_stages.EventCounts()
         if np.any(np.diff(windows[windows >= 0]) < 0):
             raise InputError("windows must not decrease from sample to sample")
         shape = (self.batch, size, 2, self.count)
@@ -136,16 +136,18 @@ class Pixels:
         if first >= len(times):
             out.zero_()
             return
-        lanes = counting.widest(self.count, self.device, name)
+        lanes = counting.widest_block(self.count, self.device, name)
         level, eps = self._thresholds_of_pixels()
         shared = level.shape[2] == 1 and bool(np.all(self._vectors[:, 0] == self._vectors[:, 1]))
-        aligned = counting.aligned(name, source, self.count)
-        kernel = counting.count(lanes, name, shared=shared, states=True, aligned=aligned)
+        aligned = counting.samples_are_aligned(name, source, self.count)
+        kernel = counting.counting_kernel(lanes, name, shared=shared, states=True, aligned=aligned)
         inputs = [
             source, 0, self._pixels, self.count, self.width, first, level, eps, *self._runs(windows), memory,
             self._next[1], self._next[0], out,
         ]  # fmt: skip
-        launch.run(kernel, counting.blocks(self.count, lanes), inputs, self.device, batch=self.batch)
+        launch.run_kernel(
+            kernel, counting.block_count(self.count, lanes), inputs, self.device, batch=self.batch
+        )
 
     def _begin(self, name: str, source: Any, samples: int) -> tuple[int, Any, Any]:
         """Return the first sample to compare, and memories and signals before it."""
@@ -154,11 +156,11 @@ class Pixels:
             return 0, self._state[1], self._state[0]
         level, eps = self._thresholds_of_pixels()
         inputs = [
-            source, self._pixels, self.width, self.samples, samples, self.seed, stream("initial_phase"),
+            source, self._pixels, self.width, self.samples, samples, self.seed, stream_number("initial_phase"),
             level, eps, wp.array(self._vectors[:, 2], dtype=float, device=self.device), self._state[0],
             self._next[1], self._next[0],
         ]  # fmt: skip
-        launch.run(counting.start(name), self.count, inputs, self.device, batch=self.batch)
+        launch.run_kernel(counting.starting_kernel(name), self.count, inputs, self.device, batch=self.batch)
         # blocks may overlap, so what they read must not be what they write
         return first - 1, wp.clone(self._next[1]), wp.clone(self._next[0])
 
@@ -168,20 +170,25 @@ class Pixels:
         clock = self._clock(times, np.zeros(len(times), np.int32))
         name, source = self.sensor.seen(scene).source(times, self.pixels, self.device)
         first, memory, signal = self._begin(name, source, len(times))
-        lanes = counting.widest(self.count, self.device, name)
+        lanes = counting.widest_block(self.count, self.device, name)
         inputs = [
             source, clock, self._pixels, self.count, self.width, first, *self._thresholds_of_pixels(),
             memory, signal, self._next[1], self._next[0], sink,
         ]  # fmt: skip
-        size, align = counting.blocks(self.count, lanes), self.slab // lanes
-        launch.run(
-            threshold_events.emit(lanes, name), size, inputs, self.device, batch=self.batch, align=align
+        size, align = counting.block_count(self.count, lanes), self.slab // lanes
+        launch.run_kernel(
+            threshold_events.emitting_kernel(lanes, name),
+            size,
+            inputs,
+            self.device,
+            batch=self.batch,
+            align=align,
         )
 
     def emit(self, scene: Scene, times: NDArray[np.float64]) -> tuple[Events, NDArray[np.int32] | None]:
         """Advance over `times` and return the events that leave the pixels, and for a batch the row of each.
 
-        Readout effects come behind this, see `dase.simulation.readout_chain.Outlet`.
+        Readout effects come behind this, see `dase.simulation.readout_chain.ReadoutChain`.
 
         Args:
             scene: What the pixels see.
@@ -197,7 +204,9 @@ class Pixels:
         keys, used = self._keys(scene, times)
         top = self._bits + self._low + longest.bit_length()
         self._advance(times)
-        found = ordering.ordered(keys, used, self._bits, self._low, top, self.device, self._late, self._room)
+        found = ordering.keys_in_order(
+            keys, used, self._bits, self._low, top, self.device, self._late, self._room
+        )
         events, row = self._decode(found, begin)
         if self._late is None:
             return events, row
@@ -215,10 +224,10 @@ class Pixels:
         """Run the pixels until all their events fit; return the keys and how many there are per slab."""
         slabs = -(-self.count // self.slab)
         while True:
-            sink = pixel_stages.Keys()
+            sink = pixel_stages.EventKeys()
             shape = (self.batch, slabs, self._capacity)
             if self._buffer is None or self._buffer.shape != shape:
-                self._buffer = launch.room(shape, wp.int64, self.device)
+                self._buffer = launch.new_array(shape, wp.int64, self.device)
             sink.keys = self._buffer
             sink.used = wp.zeros((self.batch, slabs), dtype=int, device=self.device)
             sink.slab, sink.bits, sink.low = self.slab.bit_length() - 1, self._bits, self._low
@@ -258,7 +267,7 @@ class Pixels:
             level = wp.empty((self.batch, 2, self.count), dtype=float, device=self.device)
             inputs = [self._pixels, self.width, self.height, self.seed, self._parameters]
             inputs += [*self._maps(), level]
-            launch.run(kernel, self.count, inputs, self.device, batch=self.batch)
+            launch.run_kernel(kernel, self.count, inputs, self.device, batch=self.batch)
         levels = level, wp.array(self._vectors[:, 3], dtype=float, device=self.device)
         self._levels = levels
         return levels
@@ -275,18 +284,20 @@ class Pixels:
         self.look_at(scene)
         source_name, source = self.sensor.seen(scene).source(times, self.pixels, self.device)
         lanes = self._lanes(source_name)
-        kernel = pixel_compile.compose(self.stages, source_name, sink_name, lanes=lanes)
+        kernel = pixel_compile.compose_pixels(self.stages, source_name, sink_name, lanes=lanes)
         clock = self._clock(times, windows)
         inputs = [
             source, clock, self._pixels, self.width, self.height, self.samples, self.seed,
             self._parameters, *self._maps(), self._state, self._next, sink,
         ]  # fmt: skip
-        size, align = (counting.blocks(self.count, lanes), align // lanes) if lanes else (self.count, align)
-        launch.run(kernel, size, inputs, self.device, batch=self.batch, align=align)
+        size, align = (
+            (counting.block_count(self.count, lanes), align // lanes) if lanes else (self.count, align)
+        )
+        launch.run_kernel(kernel, size, inputs, self.device, batch=self.batch, align=align)
 
     def _lanes(self, source_name: str) -> int:
         """Return how many pixels a thread of the composed kernel works on; 0 for CUDA's kernel."""
-        return 0 if self.device.is_cuda else counting.widest(self.count, self.device, source_name)
+        return 0 if self.device.is_cuda else counting.widest_block(self.count, self.device, source_name)
 
     def _edges(self, times: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the end of the last step and the samples that follow [s], shape (K + 1,)."""
@@ -307,7 +318,7 @@ class Pixels:
     def _clock(self, times: NDArray[np.float64], windows: NDArray[np.int32]) -> Any:
         edges = self._edges(times)
         dt = np.diff(edges)
-        clock = pixel_stages.Clock()
+        clock = pixel_stages.SampleClock()
         if self.samples == 0:
             dt[0] = pixel_stages.REST
         stamps = np.round(edges * 1e9)
@@ -333,14 +344,14 @@ class Pixels:
     def _decode(self, keys: Any, begin: float) -> tuple[Events, NDArray[np.int32] | None]:
         n, to = len(keys), self.device
         each = ordering.EACH["cuda" if to.is_cuda else "cpu"]
-        out = [launch.room(n, d, to) for d in (wp.float64, wp.uint16, wp.uint16, wp.uint8)]
+        out = [launch.new_array(n, d, to) for d in (wp.float64, wp.uint16, wp.uint16, wp.uint8)]
         row = wp.empty(n if self.batch > 1 else 0, dtype=int, device=to)
         label = wp.empty(n if self.sink == "labels" else 0, dtype=wp.int8, device=to)
         inputs = [
             keys, self._bits, self._low, self.count, self._xy,
             wp.int64(round(begin * 1e9)), each, *out, row, label,
         ]  # fmt: skip
-        launch.run(ordering.decode, -(-n // each), inputs, to)
+        launch.run_kernel(ordering.decode_keys, -(-n // each), inputs, to)
         t, x, y, p = (a.numpy() for a in out)
         known = label.numpy() if self.sink == "labels" else None
         events = Events(t, x, y, p.view(np.bool_), self.width, self.height, known)

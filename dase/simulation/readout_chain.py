@@ -9,14 +9,14 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from dase.effects.stream import StreamEffect, nanoseconds
+from dase.effects.stream import StreamEffect, to_nanoseconds
 from dase.errors import InputError
 from dase.events import Events
 
 if TYPE_CHECKING:
     from dase.simulation.sensor import Sensor
 
-LONGEST = 4e6
+LONGEST_TIME = 4e6
 """Readers reckon in whole picoseconds of 64 bits, which hold times up to this [s]."""
 
 
@@ -24,7 +24,7 @@ PART = 1 << 17
 """Events that go through the readers at once: few enough to be sorted within the caches."""
 
 
-class Outlet:
+class ReadoutChain:
     """The way out of a camera: its readout effects in the order in which the sensor has them.
 
     Effects that are switched off are left out, so that the stream passes as it is, bit for bit.
@@ -58,9 +58,9 @@ class Outlet:
         Returns:
             Events sorted by time; they follow those returned before.
         """
-        if self._readers and len(events) and max(-events.t[0], events.t[-1]) > LONGEST:
+        if self._readers and len(events) and max(-events.t[0], events.t[-1]) > LONGEST_TIME:
             raise InputError(
-                f"readout effects need times within {LONGEST:g} s of 0, "
+                f"readout effects need times within {LONGEST_TIME:g} s of 0, "
                 f"got {events.t[0]:g}..{events.t[-1]:g} s"
             )
         if not self._readers:
@@ -81,7 +81,7 @@ class Outlet:
         return self.push(self._empty, math.inf)
 
 
-class Tally:
+class WindowCounter:
     """Counts the events that leave a camera, per window and pixel.
 
     Args:
@@ -92,7 +92,7 @@ class Tally:
     """
 
     def __init__(self, edges: NDArray[np.float64], pixels: NDArray[np.int32], size: int):
-        self._edges = nanoseconds(edges)
+        self._edges = to_nanoseconds(edges)
         self._place = np.full(size, -1)
         self._place[pixels] = np.arange(len(pixels))
         if np.count_nonzero(self._place >= 0) != len(pixels):
@@ -101,7 +101,7 @@ class Tally:
 
     def add(self, events: Events) -> None:
         """Count a part of the stream."""
-        windows = np.searchsorted(self._edges, nanoseconds(events.t), side="left") - 1
+        windows = np.searchsorted(self._edges, to_nanoseconds(events.t), side="left") - 1
         inside = (windows >= 0) & (windows < len(self.counts))
         if not inside.any():
             return
@@ -113,7 +113,7 @@ class Tally:
         self.counts[low:high] += np.bincount(flat, minlength=math.prod(shape)).reshape(shape).astype(np.int32)
 
 
-def rows_of(events: Events, row: NDArray[np.int32] | None, batch: int) -> Sequence[Events]:
+def split_by_row(events: Events, row: NDArray[np.int32] | None, batch: int) -> Sequence[Events]:
     """Return the stream of each row of a batch."""
     if row is None:
         return [events]

@@ -18,7 +18,7 @@ from dase.effects.threshold import Threshold
 from dase.errors import InputError
 from dase.kernels import pixel_stages
 from dase.scenes.scene import Scene
-from dase.simulation.sensor_history import Entry
+from dase.simulation.sensor_history import HistoryEntry
 
 
 @dataclass(frozen=True)
@@ -38,7 +38,7 @@ class Sensor:
     name: str = "ideal"
     size: tuple[int, int] | None = None
     log_eps: float = 1e-3
-    history: tuple[Entry, ...] = field(default=(), compare=False)
+    history: tuple[HistoryEntry, ...] = field(default=(), compare=False)
 
     def __post_init__(self) -> None:
         names = [effect.name for effect in self.effects]
@@ -81,7 +81,7 @@ class Sensor:
         """Return the longest time between samples that still shows all effects [s]."""
         return min(effect.longest_step() for effect in self.effects)
 
-    def stages(self) -> tuple[pixel_stages.Stages, ...]:
+    def stages(self) -> tuple[pixel_stages.EffectStages, ...]:
         """Return the pixels' effects as the kernel composer sees them; the threshold is part of its core."""
         apart = (Threshold, SceneEffect, StreamEffect)
         return tuple(effect.compiled() for effect in self.effects if not isinstance(effect, apart))
@@ -111,7 +111,7 @@ class Sensor:
         values = [effect.map_values(pixels) for effect in self.effects if effect.maps]
         return [wp.array(np.concatenate(values), dtype=float, device=device)] if values else []
 
-    def retimes(self) -> bool:
+    def changes_event_stream(self) -> bool:
         """Whether events leave at other times than their crossings', or not all of them leave."""
         late = (e for e in self.effects if isinstance(e, StreamEffect) or "delay" in e.stages)
         return not all(effect.is_off() for effect in late)

@@ -17,7 +17,7 @@ from dase.errors import InputError, nearest
 from dase.io import replacing
 from dase.simulation.sensor import Sensor
 from dase.simulation.sensor_file import effect_table, parse_sensor, read_sensor
-from dase.simulation.sensor_history import Entry
+from dase.simulation.sensor_history import HistoryEntry
 from dase.version import __version__
 
 
@@ -79,7 +79,7 @@ class SensorText:
         new = "\n\n".join(part for part in (head, tail.rstrip()) if part) + "\n"
         return self._checked(new, after)
 
-    def changed(self, effect: Effect) -> SensorText:
+    def with_values_of(self, effect: Effect) -> SensorText:
         """Return the text with the values of an effect that it has; their comments stay."""
         document = tomlkit.parse(self.text)
         table: Any = document[effect.name]
@@ -102,7 +102,7 @@ class SensorText:
             table[name] = Path(os.path.relpath(getattr(effect, name), folder.resolve())).as_posix()
         return replace(self, folder=folder)._checked(tomlkit.dumps(document), sensor)
 
-    def became(self, sensor: Sensor) -> SensorText:
+    def describing(self, sensor: Sensor) -> SensorText:
         """Return the text that describes another sensor: effects added, removed, or with other values."""
         text = self
         for effect in self.sensor().effects:
@@ -112,10 +112,10 @@ class SensorText:
             if effect.name not in text.sensor():
                 text = text.added(effect)
             elif text.sensor()[effect.name] != effect:
-                text = text.changed(effect)
+                text = text.with_values_of(effect)
         return text
 
-    def noted(self, entry: Entry) -> SensorText:
+    def noted(self, entry: HistoryEntry) -> SensorText:
         """Return the text with one more entry of its history."""
         return self._checked("\n".join([*self._body(), "", entry.text()]), self.sensor())
 
@@ -165,7 +165,7 @@ def _comment_above(lines: list[str], at: int) -> int:
     return at
 
 
-def read(spec: str | Path, effects: Mapping[str, type[Effect]] = EFFECTS) -> SensorText:
+def read_sensor_text(spec: str | Path, effects: Mapping[str, type[Effect]] = EFFECTS) -> SensorText:
     """Return the text of a preset or of a sensor file.
 
     Args:
@@ -178,7 +178,7 @@ def read(spec: str | Path, effects: Mapping[str, type[Effect]] = EFFECTS) -> Sen
     return SensorText(*read_sensor(spec), effects, Path(spec).parent)
 
 
-def write(sensor: SensorText, path: Path | None) -> None:
+def write_sensor_text(sensor: SensorText, path: Path | None) -> None:
     """Write a sensor file, whole or not at all; None prints it."""
     if path is None:
         print(sensor.text, end="")
@@ -187,9 +187,9 @@ def write(sensor: SensorText, path: Path | None) -> None:
         temporary.write_bytes(sensor.moved(path.parent).text.encode())
 
 
-def today(did: str, **facts: Any) -> Entry:
+def history_entry_today(did: str, **facts: Any) -> HistoryEntry:
     """Return a history entry of today."""
-    return Entry(did=did, dase=__version__, date=datetime.date.today(), **facts)
+    return HistoryEntry(did=did, dase=__version__, date=datetime.date.today(), **facts)
 
 
 def parse_values(effect: type[Effect], settings: Mapping[str, str]) -> Effect:

@@ -11,13 +11,13 @@ import tomlkit
 from tomlkit.exceptions import TOMLKitError
 from tomlkit.items import Table
 
-from dase.effects import EFFECTS, Effect, find
+from dase.effects import EFFECTS, Effect, find_effect
 from dase.errors import InputError, nearest
 from dase.simulation.sensor import Sensor
 from dase.simulation.sensor_history import read_history
 
 
-def presets() -> dict[str, str]:
+def read_presets() -> dict[str, str]:
     """Return the built-in sensors: name to TOML text."""
     folder = resources.files("dase.presets")
     files = (f for f in folder.iterdir() if f.name.endswith(".toml"))
@@ -44,7 +44,7 @@ def read_sensor(spec: str | Path) -> tuple[str, str]:
         InputError: No such preset or file, or it is not text.
     """
     path = Path(spec)
-    known = presets()
+    known = read_presets()
     if str(spec) in known:
         return known[str(spec)], f"preset '{spec}'"
     if not path.is_file():
@@ -70,12 +70,12 @@ def parse_sensor(text: str, where: str, effects: Mapping[str, type[Effect]] = EF
     except TOMLKitError as error:
         raise InputError(f"{where} is not TOML: {error}") from error
     try:
-        return _sensor(table, effects)
+        return _sensor_of_table(table, effects)
     except InputError as error:
         raise InputError(f"{where}: {error}") from error
 
 
-def _sensor(table: dict[str, Any], effects: Mapping[str, type[Effect]]) -> Sensor:
+def _sensor_of_table(table: dict[str, Any], effects: Mapping[str, type[Effect]]) -> Sensor:
     found: list[Effect] = []
     plain: dict[str, Any] = {}
     for name, value in table.items():
@@ -86,7 +86,7 @@ def _sensor(table: dict[str, Any], effects: Mapping[str, type[Effect]]) -> Senso
         elif name == "history":
             plain[name] = read_history(value)
         elif isinstance(value, dict):
-            find(name, effects)  # says what there is instead
+            find_effect(name, effects)  # says what there is instead
         elif name in ("name", "size", "log_eps"):
             plain[name] = value
         else:

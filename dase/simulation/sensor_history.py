@@ -14,7 +14,7 @@ from dase.errors import InputError, nearest
 
 
 @dataclass(frozen=True, kw_only=True)
-class Entry:
+class HistoryEntry:
     """One change of a sensor.
 
     Errors are those of a comparison with a recording, 1 being what two repeats of one measurement give.
@@ -45,16 +45,16 @@ class Entry:
         return "\n".join(lines) + "\n"
 
 
-def read_history(value: Any) -> tuple[Entry, ...]:
-    """Return the entries of a sensor file; raises InputError where one is not as `Entry` says."""
+def read_history(value: Any) -> tuple[HistoryEntry, ...]:
+    """Return the entries of a sensor file; raises InputError where one is not as `HistoryEntry` says."""
     if not isinstance(value, list) or not all(isinstance(entry, Mapping) for entry in value):
         raise InputError(f"history must be tables [[history]], got {value!r}")
-    return tuple(_entry(entry) for entry in value)
+    return tuple(_read_entry(entry) for entry in value)
 
 
-def _entry(table: Mapping[str, Any]) -> Entry:
+def _read_entry(table: Mapping[str, Any]) -> HistoryEntry:
     numbers = ("error_before", "error_after", "floor")
-    known = [f.name for f in dataclasses.fields(Entry)]
+    known = [f.name for f in dataclasses.fields(HistoryEntry)]
     for name, value in table.items():
         if name not in known:
             raise InputError(f"history has no entry '{name}': {nearest(name, known)}")
@@ -64,4 +64,4 @@ def _entry(table: Mapping[str, Any]) -> Entry:
             raise InputError(f"history.{name} must be {what}, got {value!r}")
     if "did" not in table:
         raise InputError("history: every entry must say what was done, did = '...'")
-    return Entry(**table)
+    return HistoryEntry(**table)

@@ -10,8 +10,8 @@ from numpy.typing import ArrayLike, NDArray
 from dase.errors import InputError
 from dase.events import Events
 from dase.scenes.scene import Scene
-from dase.simulation.pixel_array import Pixels
-from dase.simulation.readout_chain import Outlet, Tally, rows_of
+from dase.simulation.pixel_array import PixelArray
+from dase.simulation.readout_chain import ReadoutChain, WindowCounter, split_by_row
 from dase.simulation.sensor import Sensor
 
 CHUNK = {"cpu": 64, "cuda": 128}
@@ -61,22 +61,24 @@ def stream(
         Events in order of time. Those that leave the sensor late come with a later chunk, or in one more part
         at the end.
     """
-    array = Pixels(sensor, scene.width, scene.height, pixels=pixels, seed=seed, device=device, labels=labels)
+    array = PixelArray(
+        sensor, scene.width, scene.height, pixels=pixels, seed=seed, device=device, labels=labels
+    )
     for parts in _leaving(scene, array, chunk):
         yield parts[0]
 
 
-def _leaving(scene: Scene, array: Pixels, chunk: int | None = None) -> Iterator[list[Events]]:
+def _leaving(scene: Scene, array: PixelArray, chunk: int | None = None) -> Iterator[list[Events]]:
     """Yield what leaves the camera chunk after chunk, a stream for each row of the batch."""
     outlets = [
-        Outlet(array.sensor, array.width, array.height, pixels=array.count, seed=array.seed)
+        ReadoutChain(array.sensor, array.width, array.height, pixels=array.count, seed=array.seed)
         for _ in range(array.batch)
     ]
     size = chunk or CHUNK["cuda" if array.device.is_cuda else "cpu"]
     for times in chunks(sample_times(scene, array.sensor), size):
-        parts = rows_of(*array.emit(scene, times), array.batch)
+        parts = split_by_row(*array.emit(scene, times), array.batch)
         yield [outlet.push(part, array.begin) for outlet, part in zip(outlets, parts, strict=True)]
-    rest = zip(outlets, rows_of(*array.flush(), array.batch), strict=True)
+    rest = zip(outlets, split_by_row(*array.flush(), array.batch), strict=True)
     last = [Events.concatenate([outlet.push(part, array.begin), outlet.flush()]) for outlet, part in rest]
     if any(len(part) for part in last):
         yield last
@@ -125,10 +127,10 @@ def count(
     edges = np.asarray(edges, np.float64)
     if edges.ndim != 1 or len(edges) < 2 or not np.all(np.diff(edges) > 0):
         raise InputError("window edges must increase, and there must be at least 2")
-    array = Pixels(
+    array = PixelArray(
         sensor, scene.width, scene.height, pixels=pixels, parameters=parameters, seed=seed, device=device
     )
-    if sensor.retimes():
+    if sensor.changes_event_stream():
         return _count_leaving(scene, array, edges)
     total = np.zeros((array.batch, len(edges) - 1, 2, array.count), np.int32)
     for times in chunks(sample_times(scene, sensor), CHUNK["cuda" if array.device.is_cuda else "cpu"]):
@@ -146,9 +148,9 @@ def count(
     return total
 
 
-def _count_leaving(scene: Scene, array: Pixels, edges: NDArray[np.float64]) -> NDArray[np.int32]:
+def _count_leaving(scene: Scene, array: PixelArray, edges: NDArray[np.float64]) -> NDArray[np.int32]:
     """Count what leaves the camera, shape (B, W, 2, N)."""
-    tallies = [Tally(edges, array.pixels, array.width * array.height) for _ in range(array.batch)]
+    tallies = [WindowCounter(edges, array.pixels, array.width * array.height) for _ in range(array.batch)]
     for parts in _leaving(scene, array):
         for tally, part in zip(tallies, parts, strict=True):
             tally.add(part)

@@ -26,13 +26,13 @@ from dase.scenes.video import VideoScene
 from dase.simulation.sensor import Sensor
 from dase.simulation.simulate import simulate
 
-RESERVED = ("name", "size", "log_eps", "history", "sensor")
+RESERVED_NAMES = ("name", "size", "log_eps", "history", "sensor")
 """Other entries of a sensor file; no effect can have such a name."""
 
-NOISE = ("hazard", "rest", "events", "spend", "left")
+NOISE_STATE_NAMES = ("hazard", "rest", "events", "spend", "left")
 """What the composed kernel itself keeps for an effect with noise events, beside its parameters and states."""
 
-RETURNS = {
+STAGE_RETURNS = {
     "light": ("intensity",),
     "respond": ("voltage",),
     "threshold": ("on", "off"),
@@ -58,7 +58,9 @@ def known_effects(paths: Iterable[str | Path] = ()) -> dict[str, type[Effect]]:
     for path in paths:
         for name, effect in load_effects(path).items():
             if name in effects:
-                raise InputError(f"{path}: effect '{name}' is also defined in {_home(effects[name])}")
+                raise InputError(
+                    f"{path}: effect '{name}' is also defined in {_file_of_effect(effects[name])}"
+                )
             effects[name] = effect
     return effects
 
@@ -78,19 +80,19 @@ def load_effects(path: str | Path) -> dict[str, type[Effect]]:
         InputError: Missing file, an error in it (with its line), or an effect that lacks something.
     """
     path = Path(path)
-    return dict(_load(path, _read(path)))
+    return dict(_load_checked(path, _read_effect_file(path)))
 
 
 @lru_cache(maxsize=64)
-def _load(path: Path, text: str) -> dict[str, type[Effect]]:
-    module = _run(path, text)
+def _load_checked(path: Path, text: str) -> dict[str, type[Effect]]:
+    module = _run_effect_file(path, text)
     classes = [c for c in vars(module).values() if isinstance(c, type) and issubclass(c, Effect)]
     own = [c for c in classes if c.__module__ == module.__name__]
     found: dict[str, type[Effect]] = {}
     for effect in own:
         if inspect.isabstract(effect) and "name" not in vars(effect):
             continue  # what several effects of the file have in common
-        definition = _Definition(path, text, effect)
+        definition = _EffectDefinition(path, text, effect)
         definition.check()
         if effect.name in found and found[effect.name] is not effect:
             raise definition.wrong(f"the file defines effect '{effect.name}' twice")
@@ -100,11 +102,11 @@ def _load(path: Path, text: str) -> dict[str, type[Effect]]:
     return found
 
 
-def _home(effect: type[Effect]) -> str:
+def _file_of_effect(effect: type[Effect]) -> str:
     return str(getattr(sys.modules[effect.__module__], "__file__", effect.__module__))
 
 
-def _read(path: Path) -> str:
+def _read_effect_file(path: Path) -> str:
     if not path.is_file():
         raise InputError(f"effect file {path} does not exist")
     try:
@@ -113,7 +115,7 @@ def _read(path: Path) -> str:
         raise InputError(f"effect file {path} is not UTF-8 text") from error
 
 
-def _run(path: Path, text: str) -> ModuleType:
+def _run_effect_file(path: Path, text: str) -> ModuleType:
     # Warp keeps functions by module, so files of one stem, or one file before and after a change, must differ
     key = zlib.crc32(f"{path.resolve()}\n{text}".encode())
     name = f"dase_effects_{re.sub(r'[^0-9a-zA-Z]', '_', path.stem)}_{key:08x}"
@@ -136,7 +138,7 @@ def _run(path: Path, text: str) -> ModuleType:
     return module
 
 
-class _Definition:
+class _EffectDefinition:
     """An effect as it stands in a file, with the checks it has to pass."""
 
     def __init__(self, path: Path, text: str, effect: type[Effect]):
@@ -183,7 +185,7 @@ class _Definition:
             raise self.wrong(f"name must be lower-case letters, digits and _, got {name!r}")
         if name in EFFECTS:
             raise self.wrong(f"effect '{name}' is built in; choose another name")
-        if name in RESERVED:
+        if name in RESERVED_NAMES:
             raise self.wrong(f"'{name}' means something else in sensor files; choose another name")
 
     def check_fields(self) -> None:
@@ -194,7 +196,7 @@ class _Definition:
             if f.name not in known:
                 raise self.wrong(f"{effect.name}.{f.name} must be made by parameter(...) or choice(...)")
         taken = {q for qs in pixel_stages.QUANTITIES.values() for q in qs} | set(pixel_stages.ANYWHERE)
-        taken |= set(NOISE) if "noise" in effect.stages else set()
+        taken |= set(NOISE_STATE_NAMES) if "noise" in effect.stages else set()
         for name in (*known, *effect.states):
             if name in taken or pixel_codegen.DRAW.fullmatch(name):
                 raise self.wrong(f"{effect.name}.{name}: the name is one of dase's own; choose another")
@@ -267,7 +269,7 @@ class _Definition:
             return self.wrong(reason, int(places[-1]))
         stage = next((s for s in self.effect.stages if f"{s}_of_{self.effect.name}(" in said), None)
         if stage is not None:  # the function itself compiles, what calls it does not
-            returns = (*RETURNS[stage], *(self.effect.states if stage in ("light", "respond") else ()))
+            returns = (*STAGE_RETURNS[stage], *(self.effect.states if stage in ("light", "respond") else ()))
             what = f"the function of stage '{stage}' must return {', '.join(returns)}, each a float"
             return self.wrong(what, self.line_of(self.effect.stages[stage]))
         return self.wrong(f"effect '{self.effect.name}' does not run: {reason}")

@@ -23,7 +23,7 @@ from dase.kernels import launch, pixel_stages, threshold_counts
 from dase.scenes.image_sources import open_images
 from dase.scenes.layers import Layer, LayerScene, Motion
 from dase.scenes.scene import Scene
-from dase.simulation.pixel_array import Pixels
+from dase.simulation.pixel_array import PixelArray
 from dase.simulation.sensor import Sensor
 from dase.simulation.sensor_file import load_sensor
 
@@ -40,7 +40,7 @@ class Stored(Scene):
         self.data = pixel_stages.Frames()
         self.data.values = wp.empty((samples, width * height), dtype=float, device=device)
         inputs = [width, int(kind == "log"), self.data.values]
-        launch.run(texture, width * height, inputs, device, batch=samples)
+        launch.run_kernel(texture, width * height, inputs, device, batch=samples)
 
     def sample_times(self) -> np.ndarray:
         return np.arange(self.samples) * 1e-3
@@ -135,7 +135,7 @@ def bench(
     """Return seconds and events of one chunk of `samples`."""
     times = np.arange(samples) * 1e-3
     windows = np.zeros(samples, np.int32)
-    array = Pixels(sensor, scene.width, scene.height, device=device.alias)
+    array = PixelArray(sensor, scene.width, scene.height, device=device.alias)
     found: list[Any] = []
 
     def work() -> None:
@@ -158,9 +158,9 @@ def bench(
 def bench_counts(scene: Stored, repeats: int, device: wp.Device) -> tuple[float, float]:
     """Return seconds and events of the counting kernel that training uses, several pixels per thread."""
     samples, pixels = scene.data.values.shape
-    lanes = threshold_counts.widest(pixels, device, "log")
-    aligned = threshold_counts.aligned("log", scene.data, pixels)
-    kernel = threshold_counts.count(lanes, "log", shared=True, states=False, aligned=aligned)
+    lanes = threshold_counts.widest_block(pixels, device, "log")
+    aligned = threshold_counts.samples_are_aligned("log", scene.data, pixels)
+    kernel = threshold_counts.counting_kernel(lanes, "log", shared=True, states=False, aligned=aligned)
     out = wp.zeros((1, 1, 2, pixels), dtype=float, device=device)
     nothing = wp.empty((1, 0), dtype=float, device=device)
     arguments = [
@@ -174,7 +174,7 @@ def bench_counts(scene: Stored, repeats: int, device: wp.Device) -> tuple[float,
     ]  # fmt: skip
 
     def work() -> None:
-        launch.run(kernel, threshold_counts.blocks(pixels, lanes), arguments, device)
+        launch.run_kernel(kernel, threshold_counts.block_count(pixels, lanes), arguments, device)
 
     took = median_time(work, repeats, device)
     out.zero_()
@@ -194,10 +194,10 @@ def main() -> None:
     parser.add_argument("--size", default="640x480")
     parser.add_argument("--samples", type=int, default=64)
     parser.add_argument("--repeats", type=int, default=7)
-    parser.add_argument("--threads", type=int, default=launch.threads())
+    parser.add_argument("--threads", type=int, default=launch.thread_count())
     options = parser.parse_args()
     width, height = map(int, options.size.split("x"))
-    device = launch.device(options.device)
+    device = launch.find_device(options.device)
     launch.set_threads(options.threads)
     where = f"{device.name}, {options.threads} threads, commit {commit()}"
     print(f"{where}: {options.size}, {options.samples} samples\n")

@@ -17,8 +17,8 @@ import torch
 from torch import nn
 from torch.nn.functional import leaky_relu
 
-from dase.learning.critic_bank import CriticBank, _Batch
-from dase.networks.threshold_network import SLOPE
+from dase.learning.critic_bank import CriticBank, CriticBatch
+from dase.networks.threshold_network import LEAKY_SLOPE
 
 if TYPE_CHECKING:
     from perf.benchmarks.training import Clock
@@ -52,7 +52,7 @@ class Patches:
 
 
 class Loss(NamedTuple):
-    """Both parts of the loss, as in `dase.learning.critic_bank.Critique`."""
+    """Both parts of the loss, as in `dase.learning.critic_bank.CriticStep`."""
 
     distance: torch.Tensor
     penalty: torch.Tensor
@@ -86,7 +86,9 @@ class Loop:
             for n, layer in enumerate((first, second, third), start=1):
                 layer.weight.data.copy_(getattr(bank, f"w{n}")[critic].view_as(layer.weight))
                 layer.bias.data.copy_(getattr(bank, f"b{n}")[critic])
-            self.critics.append(nn.Sequential(first, nn.LeakyReLU(SLOPE), second, nn.LeakyReLU(SLOPE), third))
+            self.critics.append(
+                nn.Sequential(first, nn.LeakyReLU(LEAKY_SLOPE), second, nn.LeakyReLU(LEAKY_SLOPE), third)
+            )
         self.optimizer = _adam([p for critic in self.critics for p in critic.parameters()], bank)
 
     def loss(self, patches: Patches, share: torch.Tensor) -> Loss:
@@ -123,8 +125,8 @@ class Padded:
         """Return the scores (C, P) of rows (C, P, inputs)."""
         w = self.weights
         first = torch.baddbmm(w["b1"][:, None], rows, w["w1"].transpose(1, 2))
-        second = torch.baddbmm(w["b2"][:, None], leaky_relu(first, SLOPE), w["w2"].transpose(1, 2))
-        return torch.baddbmm(w["b3"][:, None], leaky_relu(second, SLOPE), w["w3"][:, :, None])[..., 0]
+        second = torch.baddbmm(w["b2"][:, None], leaky_relu(first, LEAKY_SLOPE), w["w2"].transpose(1, 2))
+        return torch.baddbmm(w["b3"][:, None], leaky_relu(second, LEAKY_SLOPE), w["w3"][:, :, None])[..., 0]
 
     def loss(self, patches: Patches, share: torch.Tensor) -> Loss:
         classes = len(patches.weights)
@@ -222,7 +224,7 @@ def _of_naive(bank: Naive, patches: Patches, share: torch.Tensor, used: list[int
 @torch.no_grad()
 def _of_bank(bank: CriticBank, patches: Patches, share: torch.Tensor) -> tuple[Derived, list[int]]:
     given = (patches.fake, patches.fake_classes, patches.real, patches.real_classes, patches.weights)
-    batch = _Batch(bank, *given, share)
+    batch = CriticBatch(bank, *given, share)
     found = batch.differentiate(1.0)
     rows = [(c, *ends) for c, ends in enumerate(pairwise([0, *batch.layout.end[0].tolist()]))]
     rows = [(c, begin, end) for c, begin, end in rows if end > begin]

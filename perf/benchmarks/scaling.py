@@ -32,7 +32,7 @@ import dase
 from dase.effects.threshold import Threshold
 from dase.kernels import launch
 from dase.scenes.scene import Scene
-from dase.simulation.pixel_array import Pixels
+from dase.simulation.pixel_array import PixelArray
 from dase.simulation.sensor import Sensor
 from dase.simulation.sensor_file import load_sensor
 from perf.benchmarks import numpy_baseline, scaling_page
@@ -93,7 +93,7 @@ class Work:
 def chunked(scene: Scene, sensor: Sensor, times: np.ndarray, device: wp.Device, batch: int = 1) -> Any:
     """Return a function that counts the events of all samples, chunk by chunk."""
     parameters = np.repeat(sensor.parameters()[None], batch, 0)
-    array = Pixels(sensor, scene.width, scene.height, parameters=parameters, device=device.alias)
+    array = PixelArray(sensor, scene.width, scene.height, parameters=parameters, device=device.alias)
     size = min(CHUNK[kind(device)], len(times))
 
     def run() -> list[Any]:
@@ -141,7 +141,7 @@ class Repeated(Stored):
 @lru_cache
 def stored(width: int, height: int, samples: int, alias: str) -> Repeated:
     """Return samples on a device that all who read them share."""
-    return Repeated(width, height, samples, launch.device(alias))
+    return Repeated(width, height, samples, launch.find_device(alias))
 
 
 def case_work(
@@ -170,7 +170,7 @@ def axes(device: wp.Device) -> Iterator[Work]:
             yield case_work("pixels", case, width * height, (width, height), samples, device)
         for length in LENGTHS[where]:
             yield case_work("samples", case, length, fixed, length, device)
-        for threads in scaling_page.powers(launch.threads()) if where == "cpu" else ():
+        for threads in scaling_page.powers(launch.thread_count()) if where == "cpu" else ():
             yield case_work("threads", case, threads, (640, 480), samples, device, threads=threads)
     for batch in BATCHES[where]:
         yield case_work("batch", NOISY, batch, (FEW // 40, 40), CHUNK[where], device, batch=batch)
@@ -195,7 +195,7 @@ def effects(device: wp.Device, size: tuple[int, int] | None = None) -> Iterator[
 
 def compile_some(alias: str, first: int, step: int) -> None:
     """Run some of `effects` on few pixels, so that their kernels are in Warp's cache on disk."""
-    for work in list(effects(launch.device(alias), (64, 48)))[first::step]:
+    for work in list(effects(launch.find_device(alias), (64, 48)))[first::step]:
         work.run()
 
 
@@ -223,7 +223,7 @@ def goals(device: wp.Device) -> Iterator[Work]:
     def summed(found: Any) -> float:
         return float(sum(n.sum() for n in found))
 
-    for threads in scaling_page.powers(launch.threads()):
+    for threads in scaling_page.powers(launch.thread_count()):
 
         def tuned(threads: int = threads) -> Any:
             return numpy_baseline.count_tuned(pictures, samples, 0.2, threads)
@@ -242,14 +242,14 @@ def goals(device: wp.Device) -> Iterator[Work]:
 
 def measured(works: list[Work], rounds: int, device: wp.Device) -> list[dict[str, Any]]:
     """Time all works in turns; the first round, which compiles, counts their events."""
-    threads = launch.threads()
+    threads = launch.thread_count()
     rows = []
     for work in works:
         rows.append({name: getattr(work, name) for name in ("axis", "case", "x", "samples", "read")})
         rows[-1] |= {"events": work.events(work.run()), "seconds": []}
     for _ in range(rounds):
         for work, row in zip(works, rows, strict=True):
-            if launch.threads() != (work.threads or threads):
+            if launch.thread_count() != (work.threads or threads):
                 launch.set_threads(work.threads or threads)
             wp.synchronize_device(device)
             begin = time.perf_counter()
@@ -301,7 +301,9 @@ def measure(device: wp.Device, parts: list[str], rounds: int, out: Path) -> None
             rows.append(row | dict(read=True, events=events, seconds=[took]))
         kept = [row for row in kept if row["axis"] not in PARTS[part]] + rows
         name = processor() if device.is_cpu else device.name
-        found = dict(device=name, kind=kind(device), threads=launch.threads(), commit=commit(), copy=copy)
+        found = dict(
+            device=name, kind=kind(device), threads=launch.thread_count(), commit=commit(), copy=copy
+        )
         found["rows"] = kept
         path.write_text(json.dumps(found, indent=1) + "\n")
         print(f"{part}: {len(rows)} points after {time.perf_counter() - begin:.0f} s", flush=True)
@@ -317,7 +319,7 @@ def main() -> None:
     options = parser.parse_args()
     options.out.mkdir(parents=True, exist_ok=True)
     if not options.draw:
-        measure(launch.device(options.device), options.parts.split(","), options.rounds, options.out)
+        measure(launch.find_device(options.device), options.parts.split(","), options.rounds, options.out)
     scaling_page.write(options.out)
 
 

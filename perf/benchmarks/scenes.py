@@ -23,8 +23,8 @@ from reference.scene_frames import film, moving_picture
 import dase
 from dase.figures import trust_figure
 from dase.kernels import launch
-from dase.scenes.frame_denoising import steady
-from dase.scenes.frame_motion import stretches
+from dase.scenes.frame_denoising import denoise_resting_pixels
+from dase.scenes.frame_motion import estimate_stretches
 
 EPS = 1e-3
 BAD = 0.25
@@ -76,7 +76,7 @@ def speed() -> None:
     """Print how long 0.5 s of a DAVIS346 take at 1 kHz, all pixels and a tenth of them."""
     rng = np.random.default_rng(0)
     begin, end, frames = film(moving_picture(rng, width=346, height=260, duration=0.52), rng)
-    device, size = launch.device("cpu"), 346 * 260
+    device, size = launch.find_device("cpu"), 346 * 260
     for name, pixels in (("all", np.arange(size)), ("a tenth", rng.permutation(size)[: size // 10])):
         camera = dase.CameraScene(frames, begin, end)
         camera.frames(camera.times[:1])  # compiles
@@ -136,16 +136,16 @@ def recordings(folder: Path, picture: Path | None, out: Path | None) -> None:
     print("\ndavis346_cuke_cradle\n" + dase.align(events, frames, begin, end).report())
     scene = dase.CameraScene(frames, begin, end)
     agreement(events, scene, 5e-3)
-    quiet = steady(frames)
+    quiet = denoise_resting_pixels(frames)
     print(f"  steady: {np.mean(np.diff(quiet, axis=0) == 0):.2f} of all pixels rest from a frame to the next")
     if picture is not None:
         picture.parent.mkdir(parents=True, exist_ok=True)
-        trust_figure.draw(scene, events, title="Newton's cradle before a DAVIS346", moments=3).savefig(
+        trust_figure.draw_trust(scene, events, title="Newton's cradle before a DAVIS346", moments=3).savefig(
             picture
         )
     events, frames, begin, end = load(folder, "davis240c_camerashake")
     light = list(frames / np.float32(255))
-    gains = stretches(light)
+    gains = estimate_stretches(light)
     for share in (0.5, 0.75, 1.0):
         exposed = begin + share * (end - begin)
         found = dase.align(events, frames, begin, exposed, gains=gains)
@@ -158,7 +158,7 @@ def recordings(folder: Path, picture: Path | None, out: Path | None) -> None:
     agreement(events, scene, 5e-3)
     if out is not None:
         out.mkdir(parents=True, exist_ok=True)
-        trust_figure.draw(scene, events, title="davis240c_camerashake").savefig(out / "camerashake.png")
+        trust_figure.draw_trust(scene, events, title="davis240c_camerashake").savefig(out / "camerashake.png")
 
 
 def main() -> None:

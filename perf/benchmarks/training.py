@@ -28,11 +28,19 @@ import numpy as np
 import torch
 
 from dase.kernels import autograd_critics as bridge
-from dase.learning.adversarial import Adversarial, Hash, critic_maps, cut_patches
-from dase.learning.critic_bank import BankShape, CriticBank, _Batch, _has_grouped_products
-from dase.learning.cuda_graph import Replay
-from dase.learning.scene_batches import Looks, Scenery, middle, sent
-from dase.learning.targets import TRUTHS, Endless, Pairs, answers, draw_noise, simulate, vary
+from dase.learning.adversarial import AdversarialObjective, PatchHash, critic_maps, cut_patches
+from dase.learning.critic_bank import BankShape, CriticBank, CriticBatch, _has_grouped_products
+from dase.learning.cuda_graph import GraphReplay
+from dase.learning.scene_batches import Scenery, SceneSettings, middle_intensity, send_words
+from dase.learning.targets import (
+    TRUTHS,
+    EndlessTarget,
+    Pairs,
+    answers,
+    draw_noise,
+    simulate_counts,
+    vary_thresholds,
+)
 from dase.learning.training import Recipe, Training
 from dase.networks.threshold_network import NetworkShape
 from dase.scenes import image_sources
@@ -60,7 +68,7 @@ class Clock:
 
     def recorded(self, work: Callable[[], Any]) -> float:
         """Return the median time [s] of what `work` does on the device."""
-        replay = Replay(self.device, self.generators)
+        replay = GraphReplay(self.device, self.generators)
         return self(lambda: replay("all", work), inner=5)
 
     def __call__(self, work: Callable[[], Any], *, inner: int = 1) -> float:
@@ -93,15 +101,15 @@ def copy_rate(clock: Clock, size: int) -> float:
 
 def make(args: argparse.Namespace, objective: str) -> Training:
     """Return a run at the size to be measured, some steps old."""
-    looks = Looks(regime="mixed", **(dict(width=96, height=96, samples=12) if args.small else {}))
+    looks = SceneSettings(regime="mixed", **(dict(width=96, height=96, samples=12) if args.small else {}))
     scenery = Scenery(image_sources.open_images(args.images), looks, device=args.device)
-    how = Hash(size=16, orientations=8, coherence=1) if args.small else Hash()
+    how = PatchHash(size=16, orientations=8, coherence=1) if args.small else PatchHash()
     network = NetworkShape(channels=8, depth=2) if args.small else NetworkShape()
     if objective == "moments":
         network = NetworkShape(**{**network.__dict__, "table": (6, 5)})
     batch = 4 if args.small else 12
     recipe = Recipe(objective=objective, batch=batch, hash=how, network=network, warmup=2, steps=10**6)
-    training = Training(recipe, Endless(scenery, TRUTHS["uniform"]()), scenery)
+    training = Training(recipe, EndlessTarget(scenery, TRUTHS["uniform"]()), scenery)
     for _ in range(30):
         training.advance()
     return training
@@ -112,11 +120,13 @@ def iterations(training: Training, clock: Clock) -> dict[str, float]:
     recipe, scenery, target = training.recipe, training.scenery, training.target
     # moments are weighed anew every 25 steps
     out = {"iteration": clock(training.advance, inner=25)}
-    numbers = scenery.numbers(training.scenes, recipe.batch)
-    words, reals = (sent(n, clock.device) for n in (numbers, target.numbers(training.reals, recipe.batch)))
-    out["host: draw scenes"] = clock(lambda: training._drawn(0.0))
+    numbers = scenery.draw_numbers(training.scenes, recipe.batch)
+    words, reals = (
+        send_words(n, clock.device) for n in (numbers, target.draw_numbers(training.reals, recipe.batch))
+    )
+    out["host: draw scenes"] = clock(lambda: training._draw_inputs(0.0))
     log = scenery.render(words, recipe.batch)
-    grey, noise = middle(log), draw_noise(log, training.generator)
+    grey, noise = middle_intensity(log), draw_noise(log, training.generator)
     out["render fake"] = clock.recorded(lambda: scenery.render(words, recipe.batch))
     out["draw real"] = clock.recorded(lambda: target.pairs(reals, recipe.batch))
     out["network forward"] = clock.recorded(lambda: training.net(grey))
@@ -129,16 +139,16 @@ def iterations(training: Training, clock: Clock) -> dict[str, float]:
     out["network backward"] = clock.recorded(both) - out["network forward"]
     maps = training.net(grey)
     mu, sigma = maps.mu.detach().requires_grad_(), maps.sigma.detach().requires_grad_()
-    out["count"] = clock.recorded(lambda: simulate(log, mu.detach(), sigma.detach(), noise))
+    out["count"] = clock.recorded(lambda: simulate_counts(log, mu.detach(), sigma.detach(), noise))
 
     def gradient() -> None:
         mu.grad = sigma.grad = None
-        simulate(log, mu, sigma, noise).sum().backward()
+        simulate_counts(log, mu, sigma, noise).sum().backward()
 
     out["count gradient"] = clock.recorded(gradient) - out["count"]
     if recipe.objective == "moments":
         out["count anew for derivatives"] = clock.recorded(
-            lambda: (vary(log, mu, sigma, noise), answers(log, mu.detach(), sigma.detach(), noise))
+            lambda: (vary_thresholds(log, mu, sigma, noise), answers(log, mu.detach(), sigma.detach(), noise))
         )
         out |= _moments(training, clock)
     else:
@@ -149,7 +159,7 @@ def iterations(training: Training, clock: Clock) -> dict[str, float]:
 
 
 def _moments(training: Training, clock: Clock) -> dict[str, float]:
-    fake, _ = training._fake(training.scenery.draw(training.scenes, training.recipe.batch))
+    fake, _ = training.simulate_fake(training.scenery.draw(training.scenes, training.recipe.batch))
     real = training.target.draw(training.reals, training.recipe.batch)
     assert training.newton is not None
     newton = training.newton
@@ -163,8 +173,8 @@ def _moments(training: Training, clock: Clock) -> dict[str, float]:
 
 def _critics(training: Training, clock: Clock) -> dict[str, float]:
     objective = training.objective
-    assert isinstance(objective, Adversarial)
-    fake, _ = training._fake(training.scenery.draw(training.scenes, training.recipe.batch))
+    assert isinstance(objective, AdversarialObjective)
+    fake, _ = training.simulate_fake(training.scenery.draw(training.scenes, training.recipe.batch))
     fake = Pairs(fake.grey, fake.counts.detach())
     real = training.target.draw(training.reals, training.recipe.batch)
     size = objective.hasher.how.size
@@ -175,8 +185,8 @@ def _critics(training: Training, clock: Clock) -> dict[str, float]:
     share = torch.rand(len(patches), 1, device=clock.device)
     rate = torch.tensor(1e-9, device=clock.device)
 
-    def sort() -> _Batch:
-        return _Batch(bank, patches, ours, others, theirs, weights, share)
+    def sort() -> CriticBatch:
+        return CriticBatch(bank, patches, ours, others, theirs, weights, share)
 
     batch = sort()
     rows, layout = batch.rows.clone(), batch.layout
@@ -276,10 +286,10 @@ def bank(args: argparse.Namespace, clock: Clock, rate: float, patches: int) -> d
         return made.step(rows[0], classes[0], rows[1], classes[1], weights, rate=1e-9, generator=generator)
 
     seconds = Clock(clock.device, clock.repeats, [generator]).recorded(step)
-    replay = Replay(clock.device, [generator])
+    replay = GraphReplay(clock.device, [generator])
     given = naive_critic_bank.Patches(rows[0], classes[0], rows[1], classes[1], weights)
     naive = naive_critic_bank.compare(made, given, lambda: replay("all", step), step, clock)
-    bound = made.traffic(active) / rate
+    bound = made.least_traffic(active) / rate
     end = torch.arange(1, shape.classes + 1, dtype=torch.int32, device=args.device) * (
         3 * patches // shape.classes
     )

@@ -18,7 +18,7 @@ from click.testing import CliRunner
 from helpers.command_line import SMALL, dase, one_sentence
 
 from dase import Events, InputError, io
-from dase.cli import group
+from dase.cli import dase_group
 
 
 def toml(tmp_path: Path, text: str) -> Path:
@@ -221,7 +221,7 @@ def test_broken_files(tmp_path, name, content, message):
         (tmp_path / name).write_bytes(content)
     path = str(tmp_path / name)
     for command in (["info", path], ["show", path], ["convert", path, str(tmp_path / "b.evt2")]):
-        done = CliRunner().invoke(group, command)
+        done = CliRunner().invoke(dase_group, command)
         assert isinstance(done.exception, InputError)
         assert message in str(done.exception)
         assert path in str(done.exception)

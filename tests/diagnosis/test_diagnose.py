@@ -14,17 +14,24 @@ import warp as wp
 from click.testing import CliRunner
 
 import dase
-from dase.cli import group
+from dase.cli import dase_group
 from dase.cli.options import open_recorded
-from dase.diagnosis.diagnose import diagnose, summary
-from dase.diagnosis.explain_effect import bars
-from dase.diagnosis.state import accounts
+from dase.diagnosis.diagnose import diagnose, summary_line
+from dase.diagnosis.explain_effect import moving_bars
+from dase.diagnosis.state import explains_remainder
 from dase.effects import EFFECTS, Effect, parameter
-from dase.fitting.confidence_intervals import estimates
-from dase.fitting.data_split import gather
-from dase.fitting.fit import _equal, _remarks, fit
-from dase.fitting.model import model_of, settle
-from dase.probes.distance import Judgement, Scale, explained, judge, robust, silent
+from dase.fitting.confidence_intervals import estimate_parameters
+from dase.fitting.data_split import split_measurement
+from dase.fitting.fit import _equally_good_models, _notes_on_minimum, fit
+from dase.fitting.model import model_of, refit_model
+from dase.probes.distance import (
+    ErrorScale,
+    Judgement,
+    judge_model,
+    leaves_nothing,
+    pseudo_huber,
+    reaches_floor,
+)
 from dase.probes.statistics import LAYOUT, SIZE
 from dase.results import Fit
 from dase.scenes.video import VideoScene
@@ -57,7 +64,7 @@ class Popping(Effect):
 
 @pytest.fixture(scope="module")
 def scene() -> VideoScene:
-    return bars()
+    return moving_bars()
 
 
 def hidden(scene, device, *effects: Effect, seed: int = 3) -> dase.Events:
@@ -83,14 +90,14 @@ def test_a_hidden_effect_is_named(scene, device, effect):
     assert abs(got.value / true - 1) < 0.15 or got.low < true < got.high
     assert found.parameters["threshold.on"].value == pytest.approx(0.18, rel=0.05)
     assert json.loads(json.dumps(found.to_json()))["selected"] == [effect.name]
-    assert f"missing: {effect.name}" in summary(found)
+    assert f"missing: {effect.name}" in summary_line(found)
 
 
 def test_nothing_is_invented(scene, device):
     found = diagnose(hidden(scene, device), scene, effects=LIBRARY, pixels=PIXELS, device=device)
     assert found.selected == ()
     assert found.unexplained is None
-    assert "nothing is missing" in summary(found)
+    assert "nothing is missing" in summary_line(found)
 
 
 def test_two_hidden_effects_are_both_found(scene, device):
@@ -146,9 +153,9 @@ def test_intervals_cover_the_truth(scene, device):
     inside = []
     for seed in range(8):
         events = hidden(scene, device, EFFECTS["leak"](rate=4.0, spread=0.1), seed=20 + seed)
-        evidence = gather(events, scene, pixels=500, seed=seed, device=device)
-        model = settle(evidence, model_of(given, list(true)), seed=seed)
-        _, got = estimates(evidence, model, seed=seed)
+        evidence = split_measurement(events, scene, pixels=500, seed=seed, device=device)
+        model = refit_model(evidence, model_of(given, list(true)), seed=seed)
+        _, got = estimate_parameters(evidence, model, seed=seed)
         inside += [got[n].low <= v <= got[n].high for n, v in true.items()]
     assert np.mean(inside) > 0.7
     assert got["leak.rate"].high / got["leak.rate"].low < 1.5
@@ -168,35 +175,35 @@ def test_the_error_of_repeats_is_one(rng):
     sigma = rng.uniform(0.5, 2, SIZE)
     off = 0.3 * sigma
     repeats = rng.normal(0, sigma, (200, SIZE))
-    chance = Scale(np.zeros(SIZE), np.sqrt(sigma**2 * 1.005 + off**2), used)
+    chance = ErrorScale(np.zeros(SIZE), np.sqrt(sigma**2 * 1.005 + off**2), used)
     errors = []
     for _ in range(400):
         target = rng.normal(0, sigma) + off * rng.standard_normal(SIZE)
-        seen = Scale(target, chance.sigma, used)
-        errors.append(judge(repeats, seen, chance, off, seed=0).error)
+        seen = ErrorScale(target, chance.sigma, used)
+        errors.append(judge_model(repeats, seen, chance, off, seed=0).error)
     assert np.mean(errors) == pytest.approx(1.0, abs=0.05)
-    one = judge(repeats, seen, chance, off, seed=0)
+    one = judge_model(repeats, seen, chance, off, seed=0)
     assert np.mean(np.array(errors) < one.gate) >= 0.9
 
 
 def test_the_loss_is_robust_and_its_slope_never_vanishes():
     z = np.linspace(0, 1e4, 1000)
-    np.testing.assert_allclose(robust(np.array([1e-3])), 1e-6, rtol=1e-3)
-    assert np.all(np.diff(robust(z)) > 0)
-    assert robust(np.array(1e4)) < 2e4
+    np.testing.assert_allclose(pseudo_huber(np.array([1e-3])), 1e-6, rtol=1e-3)
+    assert np.all(np.diff(pseudo_huber(z)) > 0)
+    assert pseudo_huber(np.array(1e4)) < 2e4
 
 
 def test_families_weigh_alike():
     used = np.ones(SIZE, np.bool_)
     used[LAYOUT["rate"]] = False
     used[LAYOUT["rate"].start] = True
-    weights = Scale(np.zeros(SIZE), np.ones(SIZE), used).weights()
+    weights = ErrorScale(np.zeros(SIZE), np.ones(SIZE), used).weights()
     sums = [weights[part].sum() for part in LAYOUT.values()]
     np.testing.assert_allclose(sums, 1 / len(LAYOUT))
 
 
 def run(*words: str):
-    return CliRunner().invoke(group, words, standalone_mode=False)
+    return CliRunner().invoke(dase_group, words, standalone_mode=False)
 
 
 def save(path, events, **more):
@@ -279,21 +286,21 @@ def test_a_poor_minimum_is_said(tmp_path, scene, monkeypatch):
     ends = Fit(Sensor(), {}, error=3.0, before=4.0, floor=1.0, gate=1.2, agree=False, poor=True)
     monkeypatch.setattr("dase.fitting.fit.fit", lambda *args, **more: ends)
     words = ["fit", "ideal", str(tmp_path / "r.npz"), "--scene", "static", "-o", str(tmp_path / "f.toml")]
-    result = CliRunner().invoke(group, words)
+    result = CliRunner().invoke(dase_group, words)
     assert result.exit_code == 1
     assert "poor minimum" in result.output
     assert (tmp_path / "f.toml").exists()
     monkeypatch.setattr("dase.fitting.fit.fit", lambda *args, **more: replace(ends, poor=False))
-    assert CliRunner().invoke(group, words).exit_code == 0
+    assert CliRunner().invoke(dase_group, words).exit_code == 0
 
 
 def test_starts_that_end_higher_are_not_counted():
     judgements = [Judgement(error, 1.2, 0.5, 0.3, {}, {}, np.zeros(1), 1.0) for error in (1.1, 5.0, 9.0)]
     ends = [(judgement, model_of(Sensor())) for judgement in judgements]
-    assert len(_equal(ends)) == 1
-    assert "only one came" in _remarks(judgements[0], 3, 1)[0]
-    assert "model lacks something" in _remarks(judgements[1], 3, 2)[0]
-    assert _remarks(judgements[0], 3, 2) == []
+    assert len(_equally_good_models(ends)) == 1
+    assert "only one came" in _notes_on_minimum(judgements[0], 3, 1)[0]
+    assert "model lacks something" in _notes_on_minimum(judgements[1], 3, 2)[0]
+    assert _notes_on_minimum(judgements[0], 3, 2) == []
 
 
 def test_a_clip_is_played_at_the_rate_that_is_given(tmp_path, scene):
@@ -311,9 +318,11 @@ def test_an_effect_of_the_user_is_explained_wherever_its_file_is_named(tmp_path,
     monkeypatch.setattr(
         "dase.simulation.user_effects.known_effects", lambda paths: [path.name for path in paths]
     )
-    monkeypatch.setattr("dase.diagnosis.explain_effect.explanation", lambda name, known: f"{name} of {known}")
+    monkeypatch.setattr(
+        "dase.diagnosis.explain_effect.explain_effect", lambda name, known: f"{name} of {known}"
+    )
     for words in (("--effects", "a.py", "--explain", "x"), ("--explain", "x", "--effects", "a.py")):
-        result = CliRunner().invoke(group, ["diagnose", *words])
+        result = CliRunner().invoke(dase_group, ["diagnose", *words])
         assert result.exit_code == 0, result.output
         assert result.output == "x of ['a.py']\n"
 
@@ -321,7 +330,7 @@ def test_an_effect_of_the_user_is_explained_wherever_its_file_is_named(tmp_path,
 def test_too_small_a_scene_is_refused(scene):
     tiny = VideoScene(scene.frames(scene.sample_times())[:, :4, :4], scene.sample_times())
     with pytest.raises(dase.InputError, match="32 pixels"):
-        gather(dase.simulate(tiny, Sensor()), tiny)
+        split_measurement(dase.simulate(tiny, Sensor()), tiny)
 
 
 def judged(error: float, reach: float = 0.4, level: float = 0.2, **families: float) -> Judgement:
@@ -329,16 +338,16 @@ def judged(error: float, reach: float = 0.4, level: float = 0.2, **families: flo
 
 
 def test_a_search_ends_at_what_chance_gives():
-    assert silent(judged(0.4))
-    assert not silent(judged(0.8))
-    assert explained(judged(0.8))
+    assert leaves_nothing(judged(0.4))
+    assert not leaves_nothing(judged(0.8))
+    assert reaches_floor(judged(0.8))
     # a family far off is looked at, however small the mean
-    assert not silent(judged(0.3, rate=5.0))
+    assert not leaves_nothing(judged(0.3, rate=5.0))
 
 
 def test_little_is_added_only_where_it_accounts_for_most():
-    assert accounts(judged(0.3), judged(0.8))
-    assert accounts(judged(0.45), judged(0.8))  # 0.25 of 0.6 above the level of chance
-    assert not accounts(judged(0.45), judged(0.6))  # 0.25 of 0.4
-    assert not accounts(judged(0.6), judged(1.3))  # more than chance is left
-    assert accounts(judged(0.6, reach=0.7), judged(1.3))
+    assert explains_remainder(judged(0.3), judged(0.8))
+    assert explains_remainder(judged(0.45), judged(0.8))  # 0.25 of 0.6 above the level of chance
+    assert not explains_remainder(judged(0.45), judged(0.6))  # 0.25 of 0.4
+    assert not explains_remainder(judged(0.6), judged(1.3))  # more than chance is left
+    assert explains_remainder(judged(0.6, reach=0.7), judged(1.3))

@@ -9,14 +9,22 @@ import pytest
 
 import dase
 from dase.diagnosis import pruning as reviewing
-from dase.diagnosis.candidates import Tried
-from dase.diagnosis.diagnose import _choose
-from dase.diagnosis.directional_test import AGAIN, AWAY, PLAIN, Way, _nearest, away, closer
-from dase.diagnosis.explain_effect import bars
-from dase.diagnosis.state import Search
+from dase.diagnosis.candidates import Candidate
+from dase.diagnosis.diagnose import _simplest_of_the_best
+from dase.diagnosis.directional_test import (
+    AGAIN,
+    AWAY,
+    PLAIN,
+    RepeatCloud,
+    _most_deviating_effect,
+    deviation_towards,
+    find_hidden_effect,
+)
+from dase.diagnosis.explain_effect import moving_bars
+from dase.diagnosis.state import DiagnosisState
 from dase.effects import EFFECTS
-from dase.fitting.data_split import gather
-from dase.fitting.model import Model, model_of
+from dase.fitting.data_split import split_measurement
+from dase.fitting.model import FittedModel, model_of
 from dase.probes.distance import Judgement
 from dase.simulation.sensor import Sensor
 
@@ -33,66 +41,72 @@ def test_the_distance_along_a_way_is_in_deviations_of_repeats(rng):
     repeats = 0.8 * rng.standard_normal((400, 60))  # the rest of a standard error is tolerance
     ways = rng.standard_normal((300, 60))
     seen = rng.standard_normal((2000, 60))
-    far = np.array([Way(repeats, one).away(ways[:1])[0] for one in seen])
+    far = np.array([RepeatCloud(repeats, one).deviations_along(ways[:1])[0] for one in seen])
     assert far.std() == pytest.approx(1.0, abs=0.07)
     assert abs(far.mean()) < 0.15
     way = ways[0]
-    moved = Way(repeats, 4 * way / np.linalg.norm(way)).away(ways)
+    moved = RepeatCloud(repeats, 4 * way / np.linalg.norm(way)).deviations_along(ways)
     assert moved[0] == pytest.approx(4.0, abs=0.3)
     assert np.abs(moved[1:]).max() < 2.5
 
 
 def test_no_single_statistic_decides_and_no_chance_is_no_certainty():
     way, alike = np.ones((1, 25)), np.zeros((60, 25))
-    assert Way(alike, np.eye(25)[0] * 100).away(way)[0] == pytest.approx(PLAIN / 5)
-    assert Way(alike, np.full(25, 0.5)).away(way)[0] == pytest.approx(2.5)
+    assert RepeatCloud(alike, np.eye(25)[0] * 100).deviations_along(way)[0] == pytest.approx(PLAIN / 5)
+    assert RepeatCloud(alike, np.full(25, 0.5)).deviations_along(way)[0] == pytest.approx(2.5)
 
 
 @pytest.fixture(scope="module")
-def searches(device) -> dict[str, Search]:
-    scene = bars()
+def searches(device) -> dict[str, DiagnosisState]:
+    scene = moving_bars()
     out = {}
     for name, sensor in (("plain", TRUE), ("uneven", TRUE.with_effect(JITTER))):
         events = dase.simulate(scene, sensor, seed=4, device=device)
-        evidence = gather(events, scene, pixels=900, seed=1, device=device)
-        out[name] = Search(evidence, LIBRARY, 1, lambda text, share, error: None, frozenset({"threshold"}))
+        evidence = split_measurement(events, scene, pixels=900, seed=1, device=device)
+        out[name] = DiagnosisState(
+            evidence, LIBRARY, 1, lambda text, share, error: None, frozenset({"threshold"})
+        )
     return out
 
 
 def test_jitter_is_seen_beside_mismatch_and_not_where_there_is_none(searches):
     model = model_of(TRUE)
-    assert _nearest(searches["plain"], model) is None
-    name, start, p_value = _nearest(searches["uneven"], model)
+    assert _most_deviating_effect(searches["plain"], model) is None
+    name, start, p_value = _most_deviating_effect(searches["uneven"], model)
     assert name == "jitter"
     assert p_value == pytest.approx(1 / 61)  # none of the repeats is as far on any way
     assert 0.1 < start.sensor["jitter"].spread < 0.5
     true = model_of(TRUE.with_effect(JITTER))
-    assert away(searches["uneven"].evidence.train, model, true, seed=1) > AWAY
-    assert away(searches["uneven"].evidence.held, model, true, seed=1) > AGAIN
-    assert away(searches["plain"].evidence.held, model, true, seed=1) < AGAIN
+    assert deviation_towards(searches["uneven"].evidence.train, model, true, seed=1) > AWAY
+    assert deviation_towards(searches["uneven"].evidence.held, model, true, seed=1) > AGAIN
+    assert deviation_towards(searches["plain"].evidence.held, model, true, seed=1) < AGAIN
 
 
 def test_nothing_is_looked_at_where_chance_hides_nothing(searches):
     search = searches["uneven"]
     before = search.evidence.evaluations
     for judgement in (judged(0.3, level=0.1), judged(1.2, level=0.4, reach=0.7), judged(2.0, reach=3.0)):
-        assert closer(search, model_of(TRUE), judgement) is None
+        assert find_hidden_effect(search, model_of(TRUE), judgement) is None
     assert search.evidence.evaluations == before
 
 
-def tried(name: str, error: float, parameters: int = 2) -> Tried:
-    return Tried(name, Model(None, np.zeros(parameters)), 0.0, judged=judged(error))
+def tried(name: str, error: float, parameters: int = 2) -> Candidate:
+    return Candidate(name, FittedModel(None, np.zeros(parameters)), 0.0, judged=judged(error))
 
 
 def test_the_simplest_of_those_that_are_not_told_apart_is_chosen():
-    best, ties = _choose([tried("a", 0.3, 4), tried("b", 0.5, 2), tried("c", 0.6, 3)])
+    best, ties = _simplest_of_the_best([tried("a", 0.3, 4), tried("b", 0.5, 2), tried("c", 0.6, 3)])
     assert best.name == "b"
     assert ties == ("a", "c")
-    best, ties = _choose([tried("a", 0.3, 4), tried("b", 0.7, 2)])  # more than TIE behind
+    best, ties = _simplest_of_the_best([tried("a", 0.3, 4), tried("b", 0.7, 2)])  # more than TIE behind
     assert (best.name, ties) == ("a", ())
-    best, ties = _choose([tried("a", 0.9, 4), tried("b", 1.2, 2)])  # not at the floor, the first is
+    best, ties = _simplest_of_the_best(
+        [tried("a", 0.9, 4), tried("b", 1.2, 2)]
+    )  # not at the floor, the first is
     assert (best.name, ties) == ("a", ())
-    best, ties = _choose([tried("a", 5.0, 4), tried("b", 5.4, 2)])  # far off, a tenth is no difference
+    best, ties = _simplest_of_the_best(
+        [tried("a", 5.0, 4), tried("b", 5.4, 2)]
+    )  # far off, a tenth is no difference
     assert (best.name, ties) == ("b", ("a",))
 
 
@@ -116,15 +130,15 @@ def fake(names: str, errors: dict[str, float], monkeypatch, **more) -> tuple:
         judge=lambda m: judged(errors[m.names]), added=lambda m: tuple(m.names), **(defaults | more)
     )
     monkeypatch.setattr(reviewing, "settle", lambda evidence, m, seed: m)
-    monkeypatch.setattr(reviewing, "_near", lambda search, ways, judgement: ways)
+    monkeypatch.setattr(reviewing, "_keep_near_models", lambda search, ways, judgement: ways)
     monkeypatch.setattr(reviewing, "like_of", lambda sensor, m, more: model(str(sensor)))
     monkeypatch.setattr(
-        reviewing, "_droppable",
+        reviewing, "_droppable_models",
         lambda search, m: {n: model(m.names.replace(n, "")) for n in m.names},
     )  # fmt: skip
     monkeypatch.setattr(
         reviewing,
-        "_rivals",
+        "_rival_models",
         lambda search, m, n: {o: model(m.names.replace(n, o)) for o in rivals.get(n, "")},
     )
     rivals: dict[str, str] = more.pop("rivals", {})
@@ -133,34 +147,34 @@ def fake(names: str, errors: dict[str, float], monkeypatch, **more) -> tuple:
 
 def test_what_is_not_needed_is_dropped(monkeypatch):
     search, model, judgement = fake("ab", {"ab": 0.3, "a": 0.35, "b": 6.0}, monkeypatch)
-    left, after = reviewing.review(search, model, judgement)
+    left, after = reviewing.prune_model(search, model, judgement)
     assert (left.names, after.error) == ("a", 0.35)
 
 
 def test_what_is_far_from_the_floor_is_not_reviewed(monkeypatch):
     errors = {"ab": 4.5, "a": 0.3, "b": 6.0}  # the gate is at 1.15
-    assert reviewing.review(*fake("ab", errors, monkeypatch))[0].names == "a"
-    assert reviewing.review(*fake("ab", {**errors, "ab": 4.7}, monkeypatch))[0].names == "ab"
+    assert reviewing.prune_model(*fake("ab", errors, monkeypatch))[0].names == "a"
+    assert reviewing.prune_model(*fake("ab", {**errors, "ab": 4.7}, monkeypatch))[0].names == "ab"
 
 
 def test_what_accounts_for_most_stays_and_so_does_what_only_a_closer_look_shows(monkeypatch):
     search, model, judgement = fake("ab", {"ab": 0.3, "a": 0.8, "b": 6.0}, monkeypatch)
-    assert reviewing.review(search, model, judgement)[0].names == "ab"
+    assert reviewing.prune_model(search, model, judgement)[0].names == "ab"
     search, model, judgement = fake("ab", {"ab": 0.3, "a": 0.35, "b": 6.0}, monkeypatch)
     monkeypatch.setattr(reviewing, "shown", lambda search, less, without, m: less.names == "a")
-    assert reviewing.review(search, model, judgement)[0].names == "ab"
+    assert reviewing.prune_model(search, model, judgement)[0].names == "ab"
 
 
 def test_a_simpler_rival_takes_the_place_and_the_tie_is_told(monkeypatch):
     errors = {"aZ": 0.3, "Z": 9.0, "a": 9.0, "ab": 0.4, "b": 9.0}
     search, model, judgement = fake("aZ", errors, monkeypatch, rivals={"Z": "b"})
-    left, after = reviewing.review(search, model, judgement)
+    left, after = reviewing.prune_model(search, model, judgement)
     assert (left.names, after.error) == ("ab", 0.4)
     assert search.ties == {"b": {"Z"}}
     # one that is no simpler is told, no more
     errors = {"ac": 0.3, "c": 9.0, "a": 9.0, "ab": 0.4, "b": 9.0}
     search, model, judgement = fake("ac", errors, monkeypatch, rivals={"c": "b"})
-    assert reviewing.review(search, model, judgement)[0].names == "ac"
+    assert reviewing.prune_model(search, model, judgement)[0].names == "ac"
     assert search.ties == {"c": {"b"}}
 
 
@@ -168,5 +182,5 @@ def test_no_rival_takes_the_place_of_what_a_closer_look_shows(monkeypatch):
     errors = {"aZ": 0.3, "Z": 9.0, "a": 9.0, "ab": 0.4, "b": 9.0}
     search, model, judgement = fake("aZ", errors, monkeypatch, rivals={"Z": "b"})
     monkeypatch.setattr(reviewing, "shown", lambda search, less, without, m: less.names == "ab")
-    assert reviewing.review(search, model, judgement)[0].names == "aZ"
+    assert reviewing.prune_model(search, model, judgement)[0].names == "aZ"
     assert search.ties == {}

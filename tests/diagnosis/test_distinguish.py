@@ -10,10 +10,10 @@ from helpers.command_line import dase, one_sentence
 from scipy.stats import norm
 
 from dase import InputError, Sensor
-from dase.diagnosis.distinguish import distinguish, rows, separation
-from dase.diagnosis.standard_stimuli import STANDARDS
+from dase.diagnosis.distinguish import distinguish, separating_power, table_rows
+from dase.diagnosis.standard_stimuli import STANDARD_STIMULI
 from dase.effects import EFFECTS
-from dase.probes.statistics import FAMILIES, WORDS
+from dase.probes.statistics import FAMILIES, FAMILY_WORDS
 
 QUICK = {"pixels": 200, "repeats": 12, "longest": 1.0}
 
@@ -30,7 +30,7 @@ def of(found, stimulus):
 
 
 def test_every_family_has_words():
-    assert set(WORDS) == set(FAMILIES)
+    assert set(FAMILY_WORDS) == set(FAMILIES)
 
 
 def test_power_of_a_known_difference(rng):
@@ -40,7 +40,7 @@ def test_power_of_a_known_difference(rng):
         for _ in range(40):
             a, b = rng.normal(size=(2, 24, 100))
             b[:, 7] += shift
-            power, say = separation(a, b, np.zeros(100))
+            power, say = separating_power(a, b, np.zeros(100))
             powers.append(power)
             assert np.argmax(say) == 7
         best = norm.cdf(shift - norm.ppf(0.95))
@@ -48,20 +48,20 @@ def test_power_of_a_known_difference(rng):
 
 
 def test_no_difference_is_never_told(rng):
-    powers = [separation(*rng.normal(size=(2, 24, 300)), np.zeros(300))[0] for _ in range(200)]
+    powers = [separating_power(*rng.normal(size=(2, 24, 300)), np.zeros(300))[0] for _ in range(200)]
     assert max(powers) < 0.6
 
 
 def test_tolerated_differences_do_not_count(rng):
     a, b = 1e-3 * rng.normal(size=(2, 24, 50))
-    assert separation(a, b + 0.01, np.zeros(50))[0] > 0.99
-    assert separation(a, b + 0.01, np.full(50, 0.1))[0] < 0.2
+    assert separating_power(a, b + 0.01, np.zeros(50))[0] > 0.99
+    assert separating_power(a, b + 0.01, np.full(50, 0.1))[0] < 0.2
 
 
 def test_statistics_that_do_not_vary():
     a, b = np.zeros((24, 3)), np.ones((24, 3))
-    assert separation(a, a, np.zeros(3))[0] == pytest.approx(0.05)
-    assert separation(a, b, np.full(3, 0.01))[0] > 0.99
+    assert separating_power(a, a, np.zeros(3))[0] == pytest.approx(0.05)
+    assert separating_power(a, b, np.full(3, 0.01))[0] > 0.99
 
 
 def test_noise_at_rest_is_seen_at_rest():
@@ -103,7 +103,7 @@ def test_identical_models_are_indistinguishable():
     assert found.best is None
     assert all(answer.seconds is None and answer.tried[-1][0] == 1.0 for answer in found.answers)
     assert "indistinguishable in any of these recordings up to 1 s" in found.sentence
-    assert len(list(rows(found, "a", "b"))) == 1 + len(STANDARDS)
+    assert len(list(table_rows(found, "a", "b"))) == 1 + len(STANDARD_STIMULI)
 
 
 def test_clocks_and_busses_are_seen():

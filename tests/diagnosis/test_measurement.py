@@ -9,10 +9,10 @@ from reference.scene_frames import film, moving_picture
 
 import dase
 from dase import io
-from dase.cli import group
+from dase.cli import dase_group
 from dase.diagnosis.compare import compare
 from dase.diagnosis.measurement import open_measurement
-from dase.fitting.data_split import gather
+from dase.fitting.data_split import split_measurement
 from dase.io.sequence import Sequence
 from dase.probes.stimulus import MASKED
 from dase.scenes.video import VideoScene
@@ -55,12 +55,12 @@ def test_frames_far_apart_make_a_scene_with_trust(measured):
     assert isinstance(measured.scene, dase.CameraScene)
     assert measured.trust is not None
     assert any("after the frames" in note and "nothing was corrected" in note for note in measured.notes)
-    evidence = gather(measured.events, measured.scene, trust=measured.trust, pixels=PIXELS)
+    evidence = split_measurement(measured.events, measured.scene, trust=measured.trust, pixels=PIXELS)
     for half in (evidence.train, evidence.held):
         stimulus = half.trials.stimulus
         compared = stimulus.cell != MASKED
         assert 0.3 < compared.mean() < 1 or half is evidence.held
-        trusted = measured.scene.trusts(stimulus.grid.times, stimulus.pixels).T
+        trusted = measured.scene.is_trusted(stimulus.grid.times, stimulus.pixels).T
         assert not (compared & ~trusted).any()
         assert stimulus.holes
     first, second = (half.trials.stimulus.pixels for half in (evidence.train, evidence.held))
@@ -155,19 +155,19 @@ def test_next_to_nothing_to_trust_is_said(measured):
         return np.broadcast_to(few[pixels], (len(times), len(pixels)))
 
     with pytest.raises(dase.InputError, match=r"trusted in 0\.16 % of pixels and times only"):
-        gather(measured.events, measured.scene, trust=nearly_nowhere)
+        split_measurement(measured.events, measured.scene, trust=nearly_nowhere)
     still = measured.events.select(slice(None, None, 200))
     with pytest.raises(dase.InputError, match=r"too few events .* compared is only where the scene can be"):
-        gather(still, measured.scene, pixels=PIXELS)
+        split_measurement(still, measured.scene, pixels=PIXELS)
 
 
 def test_events_that_are_believed(measured):
     scene, events = measured.scene, measured.events
-    got = scene.believed(events)
+    got = scene.trusted_events(events)
     assert 0.2 < len(got) / len(events) < 0.8
     some = np.random.default_rng(1).integers(0, len(events), 2000)
     pixels = (events.y[some].astype(int) * 128 + events.x[some]).astype(np.int32)
-    want = [scene.trusts(events.t[k : k + 1], pixels[n : n + 1])[0, 0] for n, k in enumerate(some)]
+    want = [scene.is_trusted(events.t[k : k + 1], pixels[n : n + 1])[0, 0] for n, k in enumerate(some)]
     kept = set(zip(got.t, got.x, got.y, strict=True))
     assert [row in kept for row in zip(events.t[some], events.x[some], events.y[some], strict=True)] == want
 
@@ -175,7 +175,7 @@ def test_events_that_are_believed(measured):
 def test_the_commands_say_what_is_compared(tmp_path, recording):
     report = tmp_path / "report.html"
     arguments = ["compare", "ideal", str(recording[0]), "--pixels", "300", "-o", str(report), "--quiet"]
-    done = CliRunner().invoke(group, arguments)
+    done = CliRunner().invoke(dase_group, arguments)
     assert done.exit_code == 0, done.output
     for sentence in ("compared is only where the scene can be trusted: ", "after the frames"):
         assert sentence in done.output
@@ -188,7 +188,7 @@ def test_a_davis_and_its_frames(shared):
     path = shared / "recordings" / "native" / "davis346_cuke_cradle.aedat4"
     found = open_measurement(path)
     assert isinstance(found.scene, dase.CameraScene)
-    evidence = gather(found.events, found.scene, trust=found.trust)
+    evidence = split_measurement(found.events, found.scene, trust=found.trust)
     assert min(int(h.found.halves.sum()) for h in (evidence.train, evidence.held)) > 1000
     told = next(note for note in evidence.notes if note.startswith("compared is only"))
     pixels, events = (float(word) for word in told.replace("%", " ").split() if word[0].isdigit())

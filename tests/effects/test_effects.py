@@ -18,8 +18,8 @@ from dase.effects.refractory import Refractory
 from dase.effects.shot import Shot
 from dase.effects.threshold import Threshold
 from dase.kernels import pixel_stages
-from dase.simulation.pixel_array import Pixels
-from dase.simulation.sensor_file import load_sensor, parse_sensor, presets
+from dase.simulation.pixel_array import PixelArray
+from dase.simulation.sensor_file import load_sensor, parse_sensor, read_presets
 from dase.simulation.simulate import chunks
 
 
@@ -150,7 +150,7 @@ def test_rare_events_survive_fine_sampling(device, effect):
     coarse = static(np.full((1, 8), 0.3), 150.0, 31)
     want = dase.simulate(coarse, sensor, device=device)
     times = np.arange(3_000_001) / 20_000
-    array, parts = Pixels(sensor, 8, 1, device=device), []
+    array, parts = PixelArray(sensor, 8, 1, device=device), []
     for part in chunks(times, 200_000):
         parts.append(array.emit(_Still(8, part), part)[0])
     got = dase.Events.concatenate(parts)
@@ -167,20 +167,20 @@ class _Still(reference.LogScene):
 
 def test_mismatch_spreads_thresholds(device):
     sensor = reference.only(Threshold(on=0.2, off=0.3), Mismatch(spread=0.15))
-    off, on = Pixels(sensor, 60, 50, seed=5, device=device).thresholds()[0].astype(float)
+    off, on = PixelArray(sensor, 60, 50, seed=5, device=device).thresholds()[0].astype(float)
     for got, nominal in ((on, 0.2), (off, 0.3)):
         assert got.mean() == pytest.approx(nominal, abs=3 * 0.15 * nominal / np.sqrt(3000))
         assert got.std() == pytest.approx(0.15 * nominal, abs=3 * 0.15 * nominal / np.sqrt(6000))
     assert abs(np.corrcoef(on, off)[0, 1]) < 3 / np.sqrt(3000)
     twin = np.array([reference.thresholds(sensor, i, 5) for i in range(200)]).T
     np.testing.assert_allclose([off[:200], on[:200]], twin, rtol=2e-6)
-    wide = Pixels(reference.only(Mismatch(spread=1.0)), 60, 50, device=device).thresholds()
+    wide = PixelArray(reference.only(Mismatch(spread=1.0)), 60, 50, device=device).thresholds()
     assert wide.min() == np.float32(0.01)
 
 
 def test_mismatched_rates_follow_the_inverse_threshold(device):
     sensor = reference.only(Threshold(on=0.06, off=0.09, phase=0.0), Mismatch(spread=0.2))
-    off, on = Pixels(sensor, 200, 1, seed=2, device=device).thresholds()[0]
+    off, on = PixelArray(sensor, 200, 1, seed=2, device=device).thresholds()[0]
     for change, theta, polarity in ((6.0, on, 1), (-6.0, off, 0)):
         counts = dase.count(ramp(change, 1.0, 200), sensor, [0, 1], seed=2, device=device)[0, 0]
         assert counts[1 - polarity].sum() == 0
@@ -313,7 +313,7 @@ def test_a_file_that_is_no_text_is_named(tmp_path):
         load_sensor(path)
 
 
-@pytest.mark.parametrize("sensor", [*presets(), "identity", "full"])
+@pytest.mark.parametrize("sensor", [*read_presets(), "identity", "full"])
 def test_a_sensor_file_says_everything(tmp_path, sensor):
     made = {
         "identity": reference.only(mode="delay"),

@@ -29,8 +29,8 @@ from dase.effects.threshold import Threshold
 from dase.effects.vignetting import Vignetting
 from dase.effects.voltage_noise import VoltageNoise
 from dase.kernels import launch
-from dase.simulation.pixel_array import Pixels
-from dase.simulation.sensor_file import load_sensor, parse_sensor, presets
+from dase.simulation.pixel_array import PixelArray
+from dase.simulation.sensor_file import load_sensor, parse_sensor, read_presets
 from dase.simulation.simulate import sample_times
 
 
@@ -77,7 +77,7 @@ def test_all_effects_in_chunks_and_counts(device, rng, mode):
 
 def _between(scene: dase.VideoScene, times: np.ndarray, device: str) -> np.ndarray:
     everywhere = np.arange(scene.width * scene.height, dtype=np.int32)
-    source = scene.source(times, everywhere, launch.device(device))[1]
+    source = scene.source(times, everywhere, launch.find_device(device))[1]
     return source.values.numpy().reshape(len(times), scene.height, scene.width)
 
 
@@ -97,7 +97,7 @@ def test_photoreceptors_match_their_twins(device, rng, name):
     scene = flicker(rng, size=(5, 6), step=0.5)
     times = scene.sample_times()
     sensor = every(Threshold(on=0.17, off=0.23), *TWINS[name])
-    array = Pixels(sensor, 6, 5, seed=11, device=device)
+    array = PixelArray(sensor, 6, 5, seed=11, device=device)
     got = by_pixel(array.emit(scene, times)[0])
     want = reference_effects.events(sensor, times, scene.frames(times), 11)
     equal = [np.array_equal(g[:, 1], w[:, 2]) for g, w in zip(got, want, strict=True)]
@@ -153,7 +153,7 @@ def test_between_frames_the_log_intensity_runs_straight(device):
     np.testing.assert_allclose(got, want, rtol=1e-5)
     for outside in (-0.1, 4.1):
         with pytest.raises(dase.InputError, match="outside"):
-            scene.source(np.array([outside]), np.array([0], np.int32), launch.device("cpu"))
+            scene.source(np.array([outside]), np.array([0], np.int32), launch.find_device("cpu"))
 
 
 @pytest.mark.parametrize("loss", [0.3, 0.8])
@@ -225,7 +225,7 @@ def test_an_effect_is_added_where_it_acts():
     assert order == ["linlog", "threshold", "bandwidth", "jitter", "leak", "dead"]
 
 
-@pytest.mark.parametrize("name", presets())
+@pytest.mark.parametrize("name", read_presets())
 def test_every_preset_simulates(device, rng, name):
     sensor = load_sensor(name)
     assert sensor.name == name

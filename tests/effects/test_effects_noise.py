@@ -18,7 +18,7 @@ from dase.effects.mismatch import Mismatch
 from dase.effects.refractory import Refractory
 from dase.effects.shot import Shot
 from dase.effects.threshold import Threshold
-from dase.simulation.pixel_array import Pixels
+from dase.simulation.pixel_array import PixelArray
 
 
 @pytest.mark.parametrize("mode", ["drop", "delay"])
@@ -50,7 +50,7 @@ def test_jitter_averages_out_and_mismatch_does_not(device):
 def test_noise_events_draw_new_thresholds_too(device):
     # a memory reset by a noise event waits for the next threshold, not for the one it had
     sensor = every(Threshold(on=1.0, off=1.0, phase=0.0), Jitter(spread=0.3), Shot(rate=5.0, bright=1.0))
-    array = Pixels(sensor, 50, 1, seed=2, device=device)
+    array = PixelArray(sensor, 50, 1, seed=2, device=device)
     times = np.linspace(0, 2.0, 9)
     array.emit(still(np.full(50, 0.2), 2.0, 9), times)
     from dase.kernels import pixel_stages
@@ -70,7 +70,7 @@ def test_leak_grows_with_light(device):
 
 def test_leak_follows_the_inverse_of_a_pixels_threshold(device):
     sensor = every(Threshold(on=0.2, off=0.4), Leak(rate=2.0, spread=0.0), Mismatch(spread=0.2))
-    theta = Pixels(sensor, 40, 1, device=device).thresholds()[0, 1]
+    theta = PixelArray(sensor, 40, 1, device=device).thresholds()[0, 1]
     on = counts(still(np.full(40, 0.1), 100.0, 101), sensor, 100.0, device)[1]
     np.testing.assert_allclose(on, 200 * 0.2 / theta, atol=1.5)
     assert on.max() > 1.5 * on.min()
@@ -78,7 +78,7 @@ def test_leak_follows_the_inverse_of_a_pixels_threshold(device):
 
 def test_pixels_of_low_threshold_have_more_shot_noise(device):
     sensor = every(Shot(rate=20.0, balance=0.3), Mismatch(spread=0.2))
-    theta = Pixels(sensor, 300, 1, device=device).thresholds()[0].astype(float)
+    theta = PixelArray(sensor, 300, 1, device=device).thresholds()[0].astype(float)
     got = counts(still(np.zeros(300), 20.0, 21), sensor, 20.0, device)
     for polarity, share in ((0, 0.7), (1, 0.3)):
         want = 20.0 * 20.0 * share * 0.2 / theta[polarity]

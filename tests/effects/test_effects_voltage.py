@@ -72,8 +72,8 @@ def test_the_second_order_does_not_depend_on_sampling(device, damping):
 @wp.kernel(enable_backward=False)
 def answers(x: wp.array[float], damping: wp.array[float], out: wp.array2d[float]):
     i = wp.tid()
-    h, dh = second_order.impulse(x[i], damping[i])
-    behind, speed = second_order.lag(x[i], damping[i], h, dh + 2.0 * damping[i] * h)
+    h, dh = second_order.impulse_response(x[i], damping[i])
+    behind, speed = second_order.ramp_lag(x[i], damping[i], h, dh + 2.0 * damping[i] * h)
     out[i, 0] = h
     out[i, 1] = dh
     out[i, 2] = behind

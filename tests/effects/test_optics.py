@@ -11,7 +11,7 @@ from scipy.special import ive
 from scipy.stats import norm
 
 import dase
-from dase.effects.optics_blur import OpticsBlur, Unsharp, weights
+from dase.effects.optics_blur import OpticsBlur, Unsharp, blur_weights
 from dase.effects.threshold import Threshold
 from dase.effects.vignetting import Vignetting
 from dase.kernels import launch, pixel_stages, scene_blur
@@ -37,23 +37,25 @@ def blurred(pictures: np.ndarray, sigma: float) -> np.ndarray:
 
 @pytest.mark.parametrize("sigma", [0.01, 0.3, 1.0, 4.0])
 def test_the_point_spread_has_the_width_asked_for(sigma):
-    line = weights(sigma).astype(np.float64)
+    line = blur_weights(sigma).astype(np.float64)
     n = np.arange(len(line))
     assert line[0] + 2 * line[1:].sum() == pytest.approx(1, abs=1e-6)
     assert 2 * np.sum(line * n**2) == pytest.approx(sigma**2, rel=4e-3)
     assert np.all(line >= 0)
 
 
-@pytest.mark.parametrize("way", [scene_blur.blur, scene_blur.by_kernels], ids=["chosen", "kernels"])
+@pytest.mark.parametrize(
+    "way", [scene_blur.blur_frames, scene_blur.blur_by_kernels], ids=["chosen", "kernels"]
+)
 @pytest.mark.parametrize(("size", "sigma"), [((7, 9), 0.5), ((24, 13), 1.7), ((3, 2), 1.0), ((1, 5), 0.8)])
 def test_the_blur_is_a_convolution(device, rng, way, size, sigma):
     pictures = rng.random((3, *size), np.float32)
     every, some = np.arange(size[0] * size[1], dtype=np.int32), np.array([4, 0, 3], np.int32)
     want = blurred(pictures, sigma).reshape(3, -1)
-    where = launch.device(device)
+    where = launch.find_device(device)
     flat = wp.array(pictures.reshape(3, -1), dtype=float, device=where)
     for pixels in (every, some):
-        got = way(flat, weights(sigma), size[1], pixels, where).numpy()
+        got = way(flat, blur_weights(sigma), size[1], pixels, where).numpy()
         np.testing.assert_allclose(got, want[:, pixels], atol=5e-5)
 
 

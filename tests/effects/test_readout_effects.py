@@ -17,7 +17,7 @@ from dase.effects.row_scan import RowScan
 from dase.effects.shot import Shot
 from dase.effects.threshold import Threshold
 from dase.effects.timestamp import Timestamp
-from dase.simulation.pixel_array import Pixels
+from dase.simulation.pixel_array import PixelArray
 
 # ---- latency
 
@@ -76,14 +76,14 @@ def test_latency_is_never_more_than_a_second(device):
 def test_late_events_wait_in_the_pixels(device, rng):
     scene = moving(rng)
     times = scene.sample_times()
-    array = Pixels(camera(Latency(delay=0.1, light=0.0)), WIDTH, HEIGHT, device=device)
+    array = PixelArray(camera(Latency(delay=0.1, light=0.0)), WIDTH, HEIGHT, device=device)
     first, _ = array.emit(scene, times[:100])
     rest, _ = array.flush()
     assert len(first) > 0
     assert first.t[-1] <= times[99] < rest.t[0]
     assert rest.t[-1] <= times[99] + 0.1
     assert len(array.flush()[0]) == 0
-    plain = Pixels(camera(Latency.identity()), WIDTH, HEIGHT, device=device).emit(scene, times[:100])[0]
+    plain = PixelArray(camera(Latency.identity()), WIDTH, HEIGHT, device=device).emit(scene, times[:100])[0]
     assert len(first) + len(rest) == len(plain)
 
 

@@ -45,7 +45,7 @@ BY_HAND = [(0.0, 0, 0, 1), (0.1, 2, 1, 0), (0.4, 0, 0, 1), (0.5, 0, 0, 0), (1.1,
 
 def test_statistics_by_hand():
     got = event_images.statistics(Sequence(stream(BY_HAND, 3, 2)))
-    between = sorted(event_images.intervals(stream(BY_HAND, 3, 2)))
+    between = sorted(event_images.pixel_intervals(stream(BY_HAND, 3, 2)))
     np.testing.assert_allclose(between, [0.1, 0.4, 1.0])
     assert (got.width, got.height, got.frames, got.events) == (3, 2, 0, 6)
     assert got.duration == 2.0
@@ -64,7 +64,7 @@ def test_intervals_equal_a_loop_over_pixels(rng):
     events = random_sequence(rng).events
     pixel = events.y.astype(int) * events.width + events.x
     want = np.concatenate([np.diff(events.t[pixel == k]) for k in range(events.width * events.height)])
-    np.testing.assert_array_equal(np.sort(event_images.intervals(events)), np.sort(want))
+    np.testing.assert_array_equal(np.sort(event_images.pixel_intervals(events)), np.sort(want))
 
 
 def test_frames_lengthen_the_duration():
@@ -81,8 +81,8 @@ def test_nothing_to_count():
         got = event_images.statistics(sequence)
         assert math.isnan(got.interval_median)
         assert got.silent_pixels == 6 - len(events)
-        assert dict(summary.table(got))["interval, median"] == "unknown"
-        figure = event_images.draw(sequence)
+        assert dict(summary.statistics_table(got))["interval, median"] == "unknown"
+        figure = event_images.draw_sequence(sequence)
         figure.canvas.draw()
 
 
@@ -100,7 +100,7 @@ def test_nothing_to_count():
     ],
 )
 def test_seconds(value, text):
-    assert formatting.seconds(value) == text
+    assert formatting.format_seconds(value) == text
 
 
 def test_default_window_is_a_round_number(rng):
@@ -113,18 +113,18 @@ def test_overlay_colours():
     counts = np.zeros((2, 1, 4), np.int32)
     counts[1, 0, 1] = counts[0, 0, 2] = 1
     counts[1, 0, 3] = 5
-    got = event_images.overlay(None, counts).astype(int)[0]
+    got = event_images.overlay_events(None, counts).astype(int)[0]
     assert tuple(got[0]) == (255, 255, 255)
     assert got[1, 0] > got[1, 2] + 50
     assert got[2, 2] > got[2, 0] + 50
     assert got[3, 1] < got[1, 1]  # more events hide more
-    black = event_images.overlay(np.zeros((1, 4), np.uint8), counts)
+    black = event_images.overlay_events(np.zeros((1, 4), np.uint8), counts)
     assert black[0, 0, 0] < 100
 
 
 def test_panel_loses_no_event_when_it_shrinks(rng):
     sequence = random_sequence(rng, 200, frames=0, width=65, height=49)
-    full, small = (event_images.panel(sequence, 0.25, 0.5, shrink=k) for k in (1, 4))
+    full, small = (event_images.moment_picture(sequence, 0.25, 0.5, shrink=k) for k in (1, 4))
     assert small.shape == (13, 17, 3)
     marked = (full != 255).any(-1)
     for y, x in zip(*np.nonzero(marked), strict=True):
@@ -142,7 +142,7 @@ def assert_nothing_overlaps(figure):
 @pytest.mark.parametrize("frames", [0, 1, 5])
 def test_sheet(tmp_path, rng, frames):
     sequence = random_sequence(rng, frames=frames)
-    figure = event_images.draw(sequence, title="a")
+    figure = event_images.draw_sequence(sequence, title="a")
     pictures = [axes for axes in figure.axes if axes.images]
     assert len(pictures) == (min(frames, 6) or 6)
     assert_nothing_overlaps(figure)
@@ -153,7 +153,7 @@ def test_sheet(tmp_path, rng, frames):
 
 @pytest.mark.parametrize(("width", "height"), [(20, 90), (200, 20), (1, 1)])
 def test_sheet_of_odd_sensors(rng, width, height):
-    figure = event_images.draw(random_sequence(rng, width=width, height=height))
+    figure = event_images.draw_sequence(random_sequence(rng, width=width, height=height))
     figure.canvas.draw()
     assert_nothing_overlaps(figure)
     for picture in (axes for axes in figure.axes if axes.images):
@@ -164,20 +164,20 @@ def test_sheet_of_odd_sensors(rng, width, height):
 
 def test_sheet_of_one_moment_and_of_frames_without_times(rng):
     sequence = random_sequence(rng)
-    figure = event_images.draw(sequence, at=0.1, window=0.01)
+    figure = event_images.draw_sequence(sequence, at=0.1, window=0.01)
     assert sum(bool(axes.images) for axes in figure.axes) == 1
-    figure = event_images.draw(Sequence(sequence.events, sequence.frames))
+    figure = event_images.draw_sequence(Sequence(sequence.events, sequence.frames))
     assert any("unknown" in text.get_text() for text in figure.texts)
     with pytest.raises(InputError, match=r"at: must lie in 0\.\.0\.5 s, got 7 s"):
-        event_images.draw(sequence, at=7.0)
+        event_images.draw_sequence(sequence, at=7.0)
     for window in (0.0, -1.0, math.nan):
         with pytest.raises(InputError, match="window"):
-            event_images.draw(sequence, window=window)
+            event_images.draw_sequence(sequence, window=window)
 
 
 @pytest.mark.parametrize("frames", [0, 1, 7])
 def test_video(tmp_path, rng, frames):
-    event_images.video(random_sequence(rng, frames=frames), tmp_path / "a.mp4")
+    event_images.write_video(random_sequence(rng, frames=frames), tmp_path / "a.mp4")
     film = cv2.VideoCapture(str(tmp_path / "a.mp4"))
     assert film.get(cv2.CAP_PROP_FRAME_COUNT) == (frames or 60)
     assert film.get(cv2.CAP_PROP_FPS) == pytest.approx(12.0 if frames == 7 else 30.0)
@@ -188,8 +188,8 @@ def test_video(tmp_path, rng, frames):
 
 
 def test_video_of_nothing_and_with_a_window(tmp_path, rng):
-    event_images.video(Sequence(Events.empty(3, 2)), tmp_path / "a.mp4")
-    event_images.video(random_sequence(rng, frames=0), tmp_path / "b.mp4", window=0.1)
+    event_images.write_video(Sequence(Events.empty(3, 2)), tmp_path / "a.mp4")
+    event_images.write_video(random_sequence(rng, frames=0), tmp_path / "b.mp4", window=0.1)
     assert cv2.VideoCapture(str(tmp_path / "b.mp4")).get(cv2.CAP_PROP_FRAME_COUNT) == 5
 
 

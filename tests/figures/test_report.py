@@ -18,7 +18,7 @@ from dase import Events, InputError, Sensor, VideoScene, io, simulate
 from dase.effects import EFFECTS
 from dase.figures import diagnosis_figures, event_maps, report
 from dase.figures.plot import plot
-from dase.figures.style import OFF, ON, colour_of, number
+from dase.figures.style import OFF, ON, colour_of, format_number
 from dase.results import Cell, Comparison, Curve, Diagnosis, Estimate, Fit, Rank, Step, Unexplained
 
 CELLS = tuple(
@@ -192,7 +192,7 @@ def test_the_staircase_goes_on_with_stand_ins():
 def test_pages_are_the_same_every_time(tmp_path):
     pages = [report.diagnosis_page(diagnosis(), recording="a") for _ in range(2)]
     assert pages[0] == pages[1]
-    report.write(tmp_path / "report.html", pages[0])
+    report.write_page(tmp_path / "report.html", pages[0])
     assert (tmp_path / "report.html").read_text() == pages[0]
     assert [p.name for p in tmp_path.iterdir()] == ["report.html"]
 
@@ -209,18 +209,20 @@ def plates():
     frame = np.full((24, 32), 90, np.uint8)
     sums = event_counts.sum(0).astype(float)
     return {
-        "staircase": diagnosis_figures.staircase(["fitted", "+ leak"], [6.0, 1.1], gate=1.3),
-        "families": diagnosis_figures.families({"lag": 3.0, "rate": 0.8}, gate=1.3),
-        "ranking": diagnosis_figures.ranking(["leak", "shot"], [1.1, 5.0], present=6.0, p_values=[0.01, 1.0]),
+        "staircase": diagnosis_figures.draw_staircase(["fitted", "+ leak"], [6.0, 1.1], gate=1.3),
+        "families": diagnosis_figures.draw_families({"lag": 3.0, "rate": 0.8}, gate=1.3),
+        "ranking": diagnosis_figures.draw_ranking(
+            ["leak", "shot"], [1.1, 5.0], present=6.0, p_values=[0.01, 1.0]
+        ),
         "parameters": report.parameters_of(SENSOR, PARAMETERS),
-        "curves": diagnosis_figures.curves(
+        "curves": diagnosis_figures.draw_curves(
             "Lag", "", [curve("ON"), curve("OFF", log_x=True, log_y=True)], "What it is."
         ),
-        "powers": diagnosis_figures.powers(
+        "powers": diagnosis_figures.draw_powers(
             {"static": [(0.2, 0.1), (0.5, 0.97)]}, enough=0.95, names=("a", "b")
         ),
-        "moments": event_maps.moments([frame] * 3, event_counts, event_counts, [0.1, 0.2, 0.3], 0.01),
-        "maps": event_maps.residual_maps(sums, 2 * sums, 1.0),
+        "moments": event_maps.draw_moments([frame] * 3, event_counts, event_counts, [0.1, 0.2, 0.3], 0.01),
+        "maps": event_maps.draw_residual_maps(sums, 2 * sums, 1.0),
     }
 
 
@@ -242,7 +244,7 @@ def test_figures_can_be_read_alone(name, tmp_path):
 
 def test_staircase_says_where_it_ends():
     def title(errors, **options):
-        return diagnosis_figures.staircase([""] * len(errors), errors, **options).title
+        return diagnosis_figures.draw_staircase([""] * len(errors), errors, **options).title
 
     assert title([6.0, 1.1], gate=1.3) == "The error falls to the noise floor"
     assert title([6.0, 1.5], gate=1.3) == "The error falls, but not to the noise floor"
@@ -264,7 +266,7 @@ def test_colours_belong_to_polarities():
     ],
 )
 def test_number(value, text):
-    assert number(value) == text
+    assert format_number(value) == text
 
 
 def test_event_plates(rng):
@@ -277,7 +279,7 @@ def test_event_plates(rng):
     assert "Rhythms" in rhythm.title
     assert "measured" in words_of(side)
     rate = np.count_nonzero(~events.p) / (32 * 24)
-    assert f"OFF events: {number(rate)} measured, 0 simulated" in words_of(where)
+    assert f"OFF events: {format_number(rate)} measured, 0 simulated" in words_of(where)
     with pytest.raises(InputError, match="one size"):
         event_maps.event_plates(events, Events.empty(3, 3), (0.0, 1.0))
 
@@ -292,7 +294,7 @@ def test_spectra_show_a_rhythm(rng):
         zero = np.zeros(len(times), np.uint16)
         return Events(times, zero, zero, np.ones(len(times), np.bool_), 4, 4)
 
-    plate = event_maps.spectra(events(t), events(even), (0.0, 2.0))
+    plate = event_maps.draw_spectra(events(t), events(even), (0.0, 2.0))
     simulated, measured = (line.get_xydata() for line in plate.figure.axes[0].get_lines()[:2])
     assert abs(measured[measured[:, 1].argmax(), 0] - 100) < 4
     assert measured[:, 1].max() > 30
@@ -325,7 +327,7 @@ def test_compare_writes_a_report(tmp_path, rng):
     assert "Rhythms of the event rate" in titles
     assert "Where the model sends too many or too few events" in titles
     numbers = json.loads((tmp_path / "report.json").read_text())
-    assert f"{number(numbers['error'])} times the noise floor" in page.words
+    assert f"{format_number(numbers['error'])} times the noise floor" in page.words
     for name in ("report.txt", "nowhere/report.html"):
         said = one_sentence(dase("compare", "mine.toml", "a.h5", "-o", name, cwd=tmp_path))
         assert "must end with .html" in said or "folder 'nowhere' does not exist" in said

@@ -26,7 +26,7 @@ def seen():
 def test_a_panel_shows_events_doubt_and_the_unknown(seen):
     scene, events, *_ = seen
     time = 0.5 * (scene.times[1] + scene.times[2])
-    picture = trust_figure.panel(scene, events, time, 0.005).astype(float)
+    picture = trust_figure.trust_picture(scene, events, time, 0.005).astype(float)
     assert picture.shape == (72 * trust_figure.DOTS, 96 * trust_figure.DOTS, 3)
     pixels = picture[1 :: trust_figure.DOTS, 1 :: trust_figure.DOTS]
     counts = events.counts([time - 0.0025, time + 0.0025])[0]
@@ -47,7 +47,7 @@ def test_a_panel_shows_events_doubt_and_the_unknown(seen):
 
 def test_a_sheet_is_drawn(seen, tmp_path):
     scene, events, *_ = seen
-    figure = trust_figure.draw(scene, events, title="a title", moments=3)
+    figure = trust_figure.draw_trust(scene, events, title="a title", moments=3)
     assert len(figure.axes) == 3
     said = [text.get_text() for text in figure.texts]
     assert said[0] == "a title"
@@ -55,23 +55,23 @@ def test_a_sheet_is_drawn(seen, tmp_path):
     assert any(text.startswith(share) for text in said)
     figure.savefig(tmp_path / "trust.png")
     with pytest.raises(dase.InputError, match="must have the size of the scene, 96x72, got 5x5"):
-        trust_figure.draw(scene, dase.Events.empty(5, 5))
+        trust_figure.draw_trust(scene, dase.Events.empty(5, 5))
     with pytest.raises(dase.InputError, match="moments and window must be > 0"):
-        trust_figure.draw(scene, events, moments=0)
+        trust_figure.draw_trust(scene, events, moments=0)
 
 
 def test_the_command_draws_it(seen, tmp_path):
-    from dase.cli import group
+    from dase.cli import dase_group
 
     _, events, frames, begin, end = seen
     known = {"frame_times": 0.5 * (begin + end), "frame_exposure": end - begin}
     io.write(tmp_path / "made.npz", Sequence(events, frames, **known))
-    done = CliRunner().invoke(group, ["show", str(tmp_path / "made.npz"), "--trust"])
+    done = CliRunner().invoke(dase_group, ["show", str(tmp_path / "made.npz"), "--trust"])
     assert done.exit_code == 0, done.output
     assert "% of pixels and times trusted" in done.output
     assert "ms after the frames and correlate with them at 0." in done.output
     assert (tmp_path / "made.trust.png").stat().st_size > 10_000
     io.write(tmp_path / "bare.npz", Sequence(events))
-    done = CliRunner().invoke(group, ["show", str(tmp_path / "bare.npz"), "--trust"])
+    done = CliRunner().invoke(dase_group, ["show", str(tmp_path / "bare.npz"), "--trust"])
     with pytest.raises(dase.InputError, match="needs at least 2 frames with known times"):
         raise done.exception

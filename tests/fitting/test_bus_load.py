@@ -8,19 +8,19 @@ import numpy as np
 import pytest
 
 import dase
-from dase.diagnosis.candidates import prepared
+from dase.diagnosis.candidates import variants_to_try
 from dase.effects import EFFECTS
 from dase.effects.readout import Others, Readout
 from dase.effects.row_scan import RowScan
-from dase.effects.stream import nanoseconds
+from dase.effects.stream import to_nanoseconds
 from dase.fitting import bus_load
-from dase.fitting.batch_simulator import Order
-from dase.fitting.data_split import BUSY, fastest, gather
+from dase.fitting.batch_simulator import SimulationOrder
+from dase.fitting.data_split import BUSY, least_bus_rate, split_measurement
 from dase.fitting.model import model_of
-from dase.fitting.readout_simulator import emitted
-from dase.fitting.scheduler import Ask, simulated
-from dase.probes.events_by_pixel import by_pixel
-from dase.probes.timestamp_patterns import Structure, find, share_at
+from dase.fitting.readout_simulator import simulate_pixels
+from dase.fitting.scheduler import SimulationRequest, answer_requests
+from dase.probes.events_by_pixel import sort_by_pixel
+from dase.probes.timestamp_patterns import TimestampStructure, find_structure, share_at
 from dase.simulation.sensor import Sensor
 
 WIDTH, HEIGHT, SECONDS = 40, 30, 0.3
@@ -45,7 +45,7 @@ def true() -> Sensor:
 
 @pytest.fixture(scope="module")
 def evidence(scene, true, device):
-    return gather(dase.simulate(scene, true, seed=4), scene, pixels=150, seed=1, device=device)
+    return split_measurement(dase.simulate(scene, true, seed=4), scene, pixels=150, seed=1, device=device)
 
 
 def stream(rng, count: int) -> dase.Events:
@@ -60,7 +60,7 @@ def test_some_events_beside_others_leave_as_from_one_queue(rng, bus):
     events = stream(rng, 3000)
     mine = events.x < 5
     rest = events.select(~mine)
-    others = Others(1000 * nanoseconds(rest.t), rest.p.astype(np.uint8))
+    others = Others(1000 * to_nanoseconds(rest.t), rest.p.astype(np.uint8))
     got = bus.reader(50, 1, 0).beside(events.select(mine), others, np.ones(2))
     whole, _ = bus.reader(50, 1, 0).push(events, np.inf)
     want = whole.select(whole.x < 5)
@@ -74,7 +74,7 @@ def test_some_events_beside_others_leave_as_from_one_queue(rng, bus):
 @pytest.mark.parametrize("weight", [(0.0, 0.0), (0.3, 0.3), (1.7, 0.0), (2.5, 2.5)])
 def test_others_take_as_much_time_as_what_they_stand_for(rng, weight):
     bus, rest = Readout(rate=5e3, depth=1e6), stream(rng, 2000)
-    others = Others(1000 * nanoseconds(rest.t), rest.p.astype(np.uint8))
+    others = Others(1000 * to_nanoseconds(rest.t), rest.p.astype(np.uint8))
     last = replace(rest.select(slice(1)), t=rest.t[-1:] + 1e-9)
     (end,) = bus.reader(50, 1, 0).beside(last, others, np.array(weight)).t
     before = sum(w * np.count_nonzero(rest.p == p) for p, w in enumerate(weight))
@@ -84,8 +84,8 @@ def test_others_take_as_much_time_as_what_they_stand_for(rng, weight):
 
 def busy(half, true, load) -> np.ndarray:
     """Return the events of each 3 ms in the mean over 16 repeats, and those that were measured, (2, K)."""
-    order = Order(true, np.repeat(true.parameters()[None], 16, 0), 9, reseed=True)
-    model = half.trials.stream_all(order, [true.streams()] * 16, load).clock.mean(0)
+    order = SimulationOrder(true, np.repeat(true.parameters()[None], 16, 0), 9, reseed=True)
+    model = half.trials.simulate_streams(order, [true.streams()] * 16, load).clock.mean(0)
     both = np.stack([model, half.found.clock[0]]).reshape(2, 2, -1).sum(1)
     return np.add.reduceat(both, np.arange(0, both.shape[1], 3), axis=1)
 
@@ -110,7 +110,7 @@ def test_a_model_that_sends_more_is_taken_to_do_so_everywhere(evidence, true, sc
     other = true.with_effect(replace(true["threshold"], on=0.4, off=0.3))
     near, far = (half.loaded(*place(s)).load for s in (true, other))
     stimulus = half.trials.stimulus
-    events = emitted(stimulus, true, true.parameters()[None], np.array([5]))[0]
+    events = simulate_pixels(stimulus, true, true.parameters()[None], np.array([5]))[0]
     bare = [np.bincount(load._events[0].p.astype(int), minlength=2) for load in (near, far)]
     ours, theirs = (load.weight(events) * own for load, own in zip((near, far), bare, strict=True))
     np.testing.assert_allclose(theirs, ours, rtol=0.15)
@@ -126,7 +126,7 @@ def test_some_of_many_pixels_stand_for_all(evidence, true, monkeypatch, limit):
     monkeypatch.setattr(bus_load, limit, few[limit])
     half.around._loads.clear()
     some = half.loaded(*place(true)).load
-    events = emitted(half.trials.stimulus, true, true.parameters()[None], np.array([5]))[0]
+    events = simulate_pixels(half.trials.stimulus, true, true.parameters()[None], np.array([5]))[0]
     assert len(some._events[0]) < 0.5 * len(everyone._events[0])
     total = [load.weight(events).sum() / 2 * len(load._events[0]) for load in (some, everyone)]
     assert total[0] == pytest.approx(total[1], rel=0.2)
@@ -149,7 +149,7 @@ def test_events_are_sorted_to_their_pixels(evidence, rng):
         t = stimulus.grid.begin + 1e-9 * np.sort(rng.integers(0, 10**8, count))
         x, y = (at % WIDTH).astype(np.uint16), (at // WIDTH).astype(np.uint16)
         streams.append(dase.Events(t, x, y, rng.random(count) < 0.4, WIDTH, HEIGHT))
-    start, time, polarity = (a.numpy() for a in by_pixel(stimulus, streams))
+    start, time, polarity = (a.numpy() for a in sort_by_pixel(stimulus, streams))
     for n, events in enumerate(streams):
         index = events.y.astype(int) * WIDTH + events.x
         for i, pixel in enumerate(stimulus.pixels):
@@ -173,15 +173,15 @@ def test_answers_do_not_depend_on_what_is_asked_beside(evidence, true):
     half = evidence.scout.view()
     model = model_of(true)
     model.rebase(half, repeats=6, seed=1)
-    asks = [Ask(half, model.space, model.place[None] + d, 3) for d in (0.0, 0.1)]
-    alone_ = [simulated([ask])[0] for ask in asks]
-    for got, want in zip(simulated(asks), alone_, strict=True):
+    asks = [SimulationRequest(half, model.space, model.place[None] + d, 3) for d in (0.0, 0.1)]
+    alone_ = [answer_requests([ask])[0] for ask in asks]
+    for got, want in zip(answer_requests(asks), alone_, strict=True):
         np.testing.assert_allclose(got, want, rtol=1e-6, atol=1e-7)
     assert np.abs(alone_[0] - alone_[1]).max() > 1e-2
 
 
 def test_the_rate_of_a_bus_that_was_full_is_seen(evidence):
-    first = prepared(evidence, Readout)
+    first = variants_to_try(evidence, Readout)
     assert [e.mode for e in first] == ["delay", "drop"]
     assert all(abs(e.rate - BUS.rate) <= 1.01 / BUSY for e in first)
 
@@ -190,14 +190,14 @@ def test_a_bus_is_no_candidate_where_it_is_known_to_be_free(evidence, rng):
     count = 20_000
     x, y = rng.integers(0, 50, (2, count), dtype=np.uint16)
     apart = dase.Events(1e-5 * np.arange(count), x, y, x > 20, 50, 50)
-    assert fastest(apart, Structure()) == pytest.approx(1e5, rel=1e-3)  # the runs of 4096
+    assert least_bus_rate(apart, TimestampStructure()) == pytest.approx(1e5, rel=1e-3)  # the runs of 4096
     bursts = replace(apart, t=np.repeat(0.02 * np.arange(20), 1000))
-    assert fastest(bursts, Structure()) == pytest.approx(512 / 1e-6)
+    assert least_bus_rate(bursts, TimestampStructure()) == pytest.approx(512 / 1e-6)
     # what shares a tick may have been sent at any time of it
-    assert fastest(bursts, Structure(step=1e-3)) == pytest.approx(512 / 1e-3)
-    assert fastest(bursts, Structure(line=1e-5)) == 0
-    assert evidence.fastest <= 1.2 * BUS.rate  # it was full
-    assert prepared(replace(evidence, fastest=200 * evidence.busiest), Readout) == []
+    assert least_bus_rate(bursts, TimestampStructure(step=1e-3)) == pytest.approx(512 / 1e-3)
+    assert least_bus_rate(bursts, TimestampStructure(line=1e-5)) == 0
+    assert evidence.least_bus_rate <= 1.2 * BUS.rate  # it was full
+    assert variants_to_try(replace(evidence, fastest=200 * evidence.highest_event_rate), Readout) == []
 
 
 def test_a_bus_that_is_never_free_is_no_clock(rng):
@@ -206,6 +206,6 @@ def test_a_bus_that_is_never_free_is_no_clock(rng):
     x, y = rng.integers(0, 50, (2, count), dtype=np.uint16)
     full = dase.Events(0.01 + step * np.arange(count), x, y, x > 20, 50, 50)
     assert share_at(full.t, step) == 1
-    assert find(full).step == 0
+    assert find_structure(full).step == 0
     by_chance = np.sort(rng.integers(0, count, count))
-    assert find(replace(full, t=0.01 + step * by_chance)).step == pytest.approx(step, rel=1e-4)
+    assert find_structure(replace(full, t=0.01 + step * by_chance)).step == pytest.approx(step, rel=1e-4)

@@ -9,16 +9,16 @@ import pytest
 
 import dase
 from dase.diagnosis import candidates
-from dase.diagnosis.candidates import FOLLOWED, followed, try_all
-from dase.diagnosis.explain_effect import bars
-from dase.diagnosis.pruning import _near
-from dase.diagnosis.state import Search
+from dase.diagnosis.candidates import FOLLOWED, try_effects, worth_descending
+from dase.diagnosis.explain_effect import moving_bars
+from dase.diagnosis.pruning import _keep_near_models
+from dase.diagnosis.state import DiagnosisState
 from dase.effects import EFFECTS
-from dase.fitting.data_split import gather
-from dase.fitting.descent import searching
-from dase.fitting.early_stopping import Race, short_of
+from dase.fitting.data_split import split_measurement
+from dase.fitting.descent import descent_work
+from dase.fitting.early_stopping import CandidateRace, stop_unless_below
 from dase.fitting.model import model_of
-from dase.fitting.scheduler import alone
+from dase.fitting.scheduler import run_work
 from dase.probes.distance import Judgement
 from dase.simulation.sensor import Sensor
 
@@ -28,7 +28,7 @@ LIBRARY = {name: EFFECTS[name] for name in ("threshold", "mismatch", "leak", "ho
 
 
 def test_what_will_not_come_to_the_front_stops():
-    race = Race(2)
+    race = CandidateRace(2)
     a, b, c = (race.over(name, unit=2.0) for name in "abc")
     assert not any(over(loss, np.inf) for over, loss in ((a, 1.0), (b, 1.6), (c, 8.0)))  # not after the first
     assert not c(4.0, 8.0)  # falls by half: at 1 after two more
@@ -38,7 +38,7 @@ def test_what_will_not_come_to_the_front_stops():
 
 
 def test_of_two_searches_of_a_candidate_the_one_behind_stops():
-    race = Race(2)
+    race = CandidateRace(2)
     one, other = race.over("a"), race.over("a")
     assert not one(1.0, 1.05)
     assert not other(1.4, np.inf)
@@ -47,7 +47,7 @@ def test_of_two_searches_of_a_candidate_the_one_behind_stops():
 
 
 def test_a_goal_out_of_reach():
-    over = short_of(1.0)
+    over = stop_unless_below(1.0)
     assert not over(9.0, np.inf)
     assert not over(3.0, 9.0)  # a third each time
     assert over(2.9, 3.0)
@@ -61,19 +61,19 @@ def look(name: str, share: float, streams: bool = False) -> SimpleNamespace:
 def test_where_one_is_clearly_ahead_the_turn_of_others_comes():
     others = [look(f"e{n}", 0.9 + 0.01 * n) for n in range(12)]
     buses = [look("bus", 0.95, True), look("late", 1.5, True)]
-    got = [one.effect.name for one in followed([*others, *buses, look("best", 0.3)])]
+    got = [one.effect.name for one in worth_descending([*others, *buses, look("best", 0.3)])]
     assert sorted(got) == sorted(["best", "bus", *(f"e{n}" for n in range(6))])
     assert len(got) == FOLLOWED
-    got = [one.effect.name for one in followed([*others, *buses, look("best", 0.8)])]
+    got = [one.effect.name for one in worth_descending([*others, *buses, look("best", 0.8)])]
     assert set(got) == {"best", "bus", *(f"e{n}" for n in range(12))}  # only the bus far behind is left out
 
 
 @pytest.fixture(scope="module")
-def search(device) -> Search:
-    scene = bars()
+def search(device) -> DiagnosisState:
+    scene = moving_bars()
     events = dase.simulate(scene, TRUE, seed=4, device=device)
-    evidence = gather(events, scene, pixels=600, seed=1, device=device)
-    return Search(evidence, LIBRARY, 1, lambda text, share, error: None, frozenset({"threshold"}))
+    evidence = split_measurement(events, scene, pixels=600, seed=1, device=device)
+    return DiagnosisState(evidence, LIBRARY, 1, lambda text, share, error: None, frozenset({"threshold"}))
 
 
 @pytest.mark.parametrize("lacks", [True, False], ids=["lacks mismatch", "lacks nothing"])
@@ -82,7 +82,7 @@ def test_what_chance_does_as_well_is_not_judged(search, lacks):
     repeats = model.rebase(evidence.train, repeats=60, seed=300)
     model.rebase(evidence.scout, repeats=16, seed=200)
     names = ["mismatch", "leak", "hot"] if lacks else ["leak", "hot"]
-    tried = try_all(
+    tried = try_effects(
         evidence, model, LIBRARY, names, repeats=repeats, worst=(), seed=1, report=lambda text, share: None
     )
     assert {t.name for t in tried} == set(names)
@@ -101,8 +101,8 @@ def test_only_what_one_descent_takes_near_is_fitted_in_full(search):
     slow = TRUE.with_effect(EFFECTS["bandwidth"](cutoff=10.0))
     ways = {"far": model_of(slow, ["threshold"]), "near": model_of(TRUE)}
     present = Judgement(0.3, 1.15, 0.5, 0.2, {}, {}, np.zeros(1), 1.0)
-    assert list(_near(search, ways, present)) == ["near"]
-    assert _near(search, {}, present) == {}
+    assert list(_keep_near_models(search, ways, present)) == ["near"]
+    assert _keep_near_models(search, {}, present) == {}
 
 
 def test_a_search_that_is_over_stops(search):
@@ -115,7 +115,7 @@ def test_a_search_that_is_over_stops(search):
         asked.append(loss)
         return len(asked) == 2
 
-    found = alone(searching(half, model.space, model.place + 0.2, seed=1, iterations=6, over=over))
+    found = run_work(descent_work(half, model.space, model.place + 0.2, seed=1, iterations=6, over=over))
     population = 2 * len(model.place) + 3
     assert len(found.places) == 2 * population + 1
     assert found.loss <= asked[-1] + 0.01

@@ -6,14 +6,14 @@ import numpy as np
 import pytest
 
 from dase.effects import EFFECTS
-from dase.fitting.parameter_space import axis
+from dase.fitting.parameter_space import make_axis
 
 FACTS = [(name, fact) for name, effect in EFFECTS.items() for fact in effect.parameters()]
 
 
 @pytest.mark.parametrize(("name", "fact"), FACTS, ids=[f"{name}.{fact.name}" for name, fact in FACTS])
 def test_every_place_has_a_value_that_the_effect_takes(name, fact):
-    line = axis(name, fact)
+    line = make_axis(name, fact)
     low, high = line.bounds()
     for value in np.append(line.to_value(np.linspace(low - 1, high + 1, 101)), [line.to_value(high)]):
         assert fact.bounds[0] <= value <= fact.bounds[1]

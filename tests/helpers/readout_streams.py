@@ -8,7 +8,7 @@ import numpy as np
 
 import dase
 from dase.effects.threshold import Threshold
-from dase.simulation.readout_chain import Outlet
+from dase.simulation.readout_chain import ReadoutChain
 
 WIDTH, HEIGHT = 13, 11
 
@@ -30,7 +30,7 @@ def bunched(rng: np.random.Generator, count: int = 3000, tick: int = 1) -> dase.
 
 def through(sensor: dase.Sensor, events: dase.Events, cuts: list[int] | None = None, seed: int = 0):
     """Return what leaves a sensor whose pixels send `events`, cut into parts before some indices."""
-    outlet = Outlet(sensor, events.width, events.height, seed=seed)
+    outlet = ReadoutChain(sensor, events.width, events.height, seed=seed)
     edges = [0, *(cuts or []), len(events)]
     parts = []
     for begin, end in pairwise(edges):

@@ -5,10 +5,10 @@ from __future__ import annotations
 from dataclasses import replace
 
 from dase.learning import scene_batches
-from dase.learning.adversarial import Hash
+from dase.learning.adversarial import PatchHash
 from dase.learning.targets import (
     TRUTHS,
-    Endless,
+    EndlessTarget,
 )
 from dase.learning.training import Recipe, Training
 from dase.networks.threshold_network import NetworkShape
@@ -21,19 +21,19 @@ TINY = NetworkShape(channels=4, depth=1)
 
 
 def small_scenes() -> scene_batches.Scenery:
-    looks = scene_batches.Looks(width=SIDE, height=SIDE, samples=6, regime="variety")
+    looks = scene_batches.SceneSettings(width=SIDE, height=SIDE, samples=6, regime="variety")
     return scene_batches.Scenery(image_sources.open_images("builtin"), looks, backgrounds=6, objects=8)
 
 
 def a_run(scenes: scene_batches.Scenery, **changes) -> Training:
     recipe = Recipe(objective="moments", steps=40, warmup=6, batch=4, ramp=5, network=TINY, rate=1e-4)
-    target = Endless(scenes, TRUTHS["uniform"](), seed=9)
+    target = EndlessTarget(scenes, TRUTHS["uniform"](), seed=9)
     return Training(replace(recipe, **changes), target, scenes)
 
 
-WGAN = dict(objective="wgan", anchor=5.0, hash=Hash(size=16, orientations=2, coherence=1, contrast=2))
+WGAN = dict(objective="wgan", anchor=5.0, hash=PatchHash(size=16, orientations=2, coherence=1, contrast=2))
 
 
 def a_fake(training):
     log = training.scenery.draw(training.scenes, training.recipe.batch)
-    return training._fake(log, training.step)[0]
+    return training.simulate_fake(log, training.step)[0]

@@ -123,7 +123,7 @@ def test_aedat4_frames_alone_and_of_other_kinds(tmp_path, rng):
         from dase.io import aedat4 as module
 
         table = Table.root(flatbuffer(numbers | {10: (pixels.tobytes(), pixels.nbytes)}))
-        got, span = module._frame(table)
+        got, span = module._parse_frame(table)
         assert span == (UNIX_US, UNIX_US + 5000)
         if want is None:
             want = np.rint(pixels @ [0.07, 0.72, 0.21])

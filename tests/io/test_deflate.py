@@ -9,7 +9,7 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from dase.io.h5 import deflated
+from dase.io.h5 import deflate_bytes
 
 
 def on_stacks(act: Callable[[], bytes], count: int) -> set[bytes]:
@@ -33,7 +33,7 @@ def on_stacks(act: Callable[[], bytes], count: int) -> set[bytes]:
 def test_streams_are_right(rng, size):
     for levels in (1, 4, 256):
         data = rng.integers(0, levels, size).astype(np.uint8)
-        assert zlib.decompress(deflated(data)) == data.tobytes()
+        assert zlib.decompress(deflate_bytes(data)) == data.tobytes()
 
 
 def test_streams_do_not_depend_on_the_stack(rng):
@@ -41,4 +41,4 @@ def test_streams_do_not_depend_on_the_stack(rng):
     for _ in range(5):
         head = rng.integers(0, 256, 8)
         data = np.concatenate([head, rng.integers(0, 4, 8), head, head]).astype(np.uint8)
-        assert len(on_stacks(lambda data=data: deflated(data), 400)) == 1
+        assert len(on_stacks(lambda data=data: deflate_bytes(data), 400)) == 1

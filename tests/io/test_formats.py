@@ -120,9 +120,11 @@ def test_the_format_is_told_by_content_then_by_suffix_then_by_name(tmp_path, rng
     for name, (_, make) in SAMPLES.items():
         if name not in NEEDS:
             make(tmp_path / "recording.xyz.npy", e)
-            found = io.find(tmp_path / "recording.xyz.npy").name
+            found = io.find_format(tmp_path / "recording.xyz.npy").name
             assert found.split()[0] in (name.split()[0], "Prophesee", "structured"), name
-    assert [io.writable(f"a{suffix}").name for suffix in (".raw", ".evt2", ".h5", ".dat", ".csv")] == [
+    assert [
+        io.find_writable_format(f"a{suffix}").name for suffix in (".raw", ".evt2", ".h5", ".dat", ".csv")
+    ] == [
         "EVT3",
         "EVT2",
         "HDF5",

@@ -102,13 +102,13 @@ def test_ecf_buffers(rng, mode):
         y = np.sort(rng.integers(0, 5, n)) if trial % 2 else rng.integers(0, 720, n)
         p = (rng.random(n) < 0.5).astype(np.uint8) if trial % 5 else np.arange(n, dtype=np.uint8) // 150 % 2
         buffer = ecf_buffer(t, x, y, p, mode)
-        got = ecf_module.unpack(buffer)
+        got = ecf_module.unpack_buffer(buffer)
         for a, b in zip(got[:4], (t, x, y, p), strict=True):
             np.testing.assert_array_equal(a, b)
         for length in rng.integers(0, len(buffer), 20):
             if mode == 2 or length < len(buffer) - 8:
                 with pytest.raises(InputError):
-                    ecf_module.unpack(buffer[:length])
+                    ecf_module.unpack_buffer(buffer[:length])
 
 
 @pytest.mark.parametrize("mode", [0, 1, 2])
@@ -168,8 +168,8 @@ def test_a_heap_of_names_whose_holes_go_round_is_no_endless_loop(tmp_path, rng, 
 def test_heaps_are_checked_once_until_the_file_changes(tmp_path, rng, monkeypatch):
     path, searched = tmp_path / "a.h5", []
     written("HDF5")(path, events(rng, 50))
-    heaps = columns._heaps
-    monkeypatch.setattr(columns, "_heaps", lambda file: searched.append(file.name) or heaps(file))
+    heaps = columns._find_heaps
+    monkeypatch.setattr(columns, "_find_heaps", lambda file: searched.append(file.name) or heaps(file))
     io.read(path)
     assert len(searched) > 1  # just written: its time may stay when it changes
     searched.clear()

@@ -8,7 +8,7 @@ import pytest
 
 from dase.errors import InputError
 from dase.io import image_files
-from dase.io.image_files import decode, head
+from dase.io.image_files import decode_file, head_size
 
 
 @pytest.mark.parametrize("suffix", ["png", "tif", "webp", "jpg"])
@@ -19,7 +19,7 @@ def test_small_files_of_huge_pictures_are_refused(tmp_path, suffix):
     with pytest.raises(
         InputError, match=r"cannot decode '.*a\.\w+': a picture of 7000x7000 unpacks .*100 times"
     ):
-        decode(path)
+        decode_file(path)
 
 
 def test_pictures_of_16_bits_and_three_colours_are_read(tmp_path, rng):
@@ -27,8 +27,8 @@ def test_pictures_of_16_bits_and_three_colours_are_read(tmp_path, rng):
     pixels = rng.integers(0, 1 << 16, (6, 8, 3), np.uint16)
     for suffix in ("tif", "png"):
         cv2.imwrite(str(tmp_path / f"a.{suffix}"), pixels)
-        np.testing.assert_array_equal(decode(tmp_path / f"a.{suffix}"), pixels)
-        assert head((tmp_path / f"a.{suffix}").read_bytes()) == (8, 6)
+        np.testing.assert_array_equal(decode_file(tmp_path / f"a.{suffix}"), pixels)
+        assert head_size((tmp_path / f"a.{suffix}").read_bytes()) == (8, 6)
 
 
 def test_levels_are_the_rounded_grey_values(rng, monkeypatch):

@@ -89,7 +89,7 @@ def test_evt3_equals_its_twin_on_random_words_whatever_is_decoded_at_once(tmp_pa
     want = evt3_twin(words)
     (tmp_path / "a.raw").write_bytes(EVT3_HEADER + words.tobytes())
     notes = []
-    pieces = list(evt3.pieces(io.Source(tmp_path / "a.raw", notes=notes)))
+    pieces = list(evt3.read_pieces(io.Source(tmp_path / "a.raw", notes=notes)))
     t, x, y, p = (np.concatenate(column) for column in zip(*(piece[:4] for piece in pieces), strict=True))
     keep = (x < 1280) & (y < 720)
     got = list(zip(t[keep].tolist(), x[keep].tolist(), y[keep].tolist(), p[keep].tolist(), strict=True))
@@ -128,7 +128,7 @@ def test_evt21_masks_and_order_of_halves(tmp_path, rng, legacy, said):
     e = events(rng, 400)
     evt21(tmp_path / "a.raw", e, legacy=legacy, said=said)
     data = bytearray((tmp_path / "a.raw").read_bytes())
-    start = raw.parse(bytes(data)).length
+    start = raw.parse_header(bytes(data)).length
     halves = np.frombuffer(data, "<u4", offset=start).reshape(-1, 2)
     halves[-1, 1 if legacy else 0] = 0x80000001  # the last word now holds two events
     (tmp_path / "a.raw").write_bytes(data)
@@ -190,7 +190,7 @@ def test_counters():
     ],
 )
 def test_headers(text, encoding, size):
-    header = raw.parse(text.encode("latin-1") + b"%\x80\x00\x0a\x00")
+    header = raw.parse_header(text.encode("latin-1") + b"%\x80\x00\x0a\x00")
     assert (header.encoding, header.size) == (encoding, size)
     assert header.length in (len(text), 0)
 

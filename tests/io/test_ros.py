@@ -100,7 +100,7 @@ def test_mcap(tmp_path, rng):
     e = events(rng, 700)
     bag(tmp_path / "a", e, ros=2, storage_plugin=StoragePlugin.MCAP)
     (single,) = (tmp_path / "a").glob("*.mcap")
-    assert io.find(single).name == "ROS bag"
+    assert io.find_format(single).name == "ROS bag"
     assert_same(io.read(single).events, e)
     assert_same(io.read(tmp_path / "a").events, e)
 
@@ -240,7 +240,7 @@ def test_images(rng, encoding, channels, size, swapped):
     name = encoding.encode()
     head = struct.pack("<IIII", 1, 2, 3, 0) + struct.pack("<II", 4, 6)
     head += struct.pack("<I", len(name)) + name + struct.pack("<BII", swapped, pixels.shape[1], pixels.size)
-    time, got = ros_messages.image(head + pixels.tobytes(), False, False)
+    time, got = ros_messages.decode_image(head + pixels.tobytes(), False, False)
     assert time == 2_000_000_003
     rows = pixels[:, :-2]
     if size == 2:

@@ -239,7 +239,7 @@ def test_frames_of_16_bits_stay_so(tmp_path, rng, suffix):
         np.testing.assert_array_equal(got, grey)
         assert got[0].dtype == np.uint16
     grey[0], grey[0, 0, 0] = 2048, 4095  # 12 bits are in use
-    picture = event_images.panel(Sequence(Events.empty(W, H), grey[:1], times[:1]), 0.0, 1e-3)
+    picture = event_images.moment_picture(Sequence(Events.empty(W, H), grey[:1], times[:1]), 0.0, 1e-3)
     assert picture[0, 0].min() > 230
     assert 100 < np.median(picture) < 180
     with io.create(tmp_path / f"b.{suffix}") as writer:

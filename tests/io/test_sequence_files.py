@@ -222,7 +222,7 @@ def test_nothing_is_left_when_a_write_fails(tmp_path, rng, monkeypatch, suffix, 
         raise error
 
     monkeypatch.setattr(h5py.Dataset, "__setitem__", fail)
-    monkeypatch.setattr(npz, "_store", fail)
+    monkeypatch.setattr(npz, "_store_member", fail)
     with pytest.raises(type(error)):
         write(tmp_path / f"a{suffix}", everything(rng))
     assert list(tmp_path.iterdir()) == []

@@ -49,7 +49,7 @@ def test_times_are_read_as_python_reads_them(tmp_path, rng):
     words = [repr(t) if k % 3 else f"{t:.{k % 17}f}" for k, t in enumerate(times.tolist())]
     words += ["1504645177.420018196", "1e2", ".5", "7.", "00012.50", "0.1234567890123456789"]
     content = "".join(f"{word} 1 1 1\n" for word in words)
-    (piece,) = text.decode(lambda: streams.BytesIO(content.encode()))
+    (piece,) = text.decode_text(lambda: streams.BytesIO(content.encode()))
     assert piece.t.tolist() == [float(word) for word in words]
 
 

@@ -9,7 +9,7 @@ torch = pytest.importorskip("torch", reason="the bridge needs torch")
 
 from helpers.layer_gradients import FIELDS, sizes_of
 
-from dase.kernels.autograd_scene_layers import affine_places, render
+from dase.kernels.autograd_scene_layers import affine_places, render_layers
 
 
 def smooth_layers(device):
@@ -57,7 +57,7 @@ def smooth_objective(textures, width=96, height=72):
         return affine_places(m, [0.0, 1.0], sizes_of(textures), width=width, height=height, duration=1.0)
 
     def objective(layers, place):
-        return (render(layers, place, width=width, height=height).double() * weight).sum()
+        return (render_layers(layers, place, width=width, height=height).double() * weight).sum()
 
     return motion, places, objective
 
@@ -126,7 +126,7 @@ def test_descent_finds_a_translation(device):
     true = torch.tensor([[-0.1, 0.13], [0.05, -0.04]], device=device)  # x, y of layer 1 [widths]
     fixed = motion.clone()
     fixed[1, :2] = true
-    target = render(textures, places(fixed), width=96, height=72)
+    target = render_layers(textures, places(fixed), width=96, height=72)
     guess = torch.zeros(2, 2, device=device, requires_grad=True)
     optimiser = torch.optim.LBFGS([guess], max_iter=25, line_search_fn="strong_wolfe")
 
@@ -134,7 +134,7 @@ def test_descent_finds_a_translation(device):
         optimiser.zero_grad()
         moving = motion.clone()
         moving[1, :2] = guess
-        error = (render(textures, places(moving), width=96, height=72) - target).square().sum()
+        error = (render_layers(textures, places(moving), width=96, height=72) - target).square().sum()
         error.backward()
         return error
 

@@ -12,7 +12,7 @@ torch = pytest.importorskip("torch", reason="the bridge needs torch")
 from helpers.layer_gradients import FIELDS, sizes_of
 
 from dase.kernels import launch
-from dase.kernels.autograd_scene_layers import affine_places, render
+from dase.kernels.autograd_scene_layers import affine_places, render_layers
 from dase.scenes.image_sources import Picture
 from dase.scenes.layers import Layer, LayerScene, Motion
 
@@ -100,7 +100,10 @@ def assert_gradients_equal(textures, place, width=WIDTH, height=HEIGHT):
     """Compare value and all gradients with the twin, by random weights."""
     leaves = leaves_of(textures, place.detach())
     place = leaves[-1]
-    got, want = render(textures, place, width=width, height=height), twin(textures, place, width, height)
+    got, want = (
+        render_layers(textures, place, width=width, height=height),
+        twin(textures, place, width, height),
+    )
     torch.testing.assert_close(got.double(), want, rtol=0, atol=1e-5)
     weight = torch.randn(got.shape, generator=torch.Generator().manual_seed(1)).to(got.device)
     pairs = zip(
@@ -135,7 +138,7 @@ def test_nothing_behind_an_opaque_layer_matters_but_to_its_alpha(device):
     grey = torch.full((12, 12), 0.25, device=device, requires_grad=True)
     front, alpha = (torch.full((12, 12), a, device=device, requires_grad=True) for a in (0.75, 1.0))
     place = torch.eye(2, 3, device=device).expand(1, 2, 2, 3)
-    frames = render([(grey, None), (front, alpha)], place, width=12, height=12)
+    frames = render_layers([(grey, None), (front, alpha)], place, width=12, height=12)
     by_grey, by_front, by_alpha = torch.autograd.grad(frames.sum(), (grey, front, alpha))
     assert not by_grey.any()
     torch.testing.assert_close(by_front, torch.ones_like(front))
@@ -146,7 +149,7 @@ def test_moving_a_constant_background_changes_nothing(device):
     # pixels lie on texels exactly, those of the last row and column on the fold
     textures = [(torch.full((6, 9), 0.5, device=device), None)]
     place = torch.eye(2, 3, device=device).repeat(1, 1, 1, 1).requires_grad_()
-    frames = render(textures, place, width=9, height=6)
+    frames = render_layers(textures, place, width=9, height=6)
     weight = torch.arange(54.0, device=device).view(6, 9)
     (gradient,) = torch.autograd.grad((frames * weight).sum(), place)
     torch.testing.assert_close(gradient, torch.zeros_like(place))
@@ -168,10 +171,10 @@ def test_frames_equal_those_of_a_scene(device, rng):
         duration=0.7,
     )
     times = np.linspace(0, 0.7, 6)
-    want = scene.arrays(times, launch.device(device)).place.numpy()
+    want = scene.arrays(times, launch.find_device(device)).place.numpy()
     places = affine_places(motion, times, sizes_of(textures), width=WIDTH, height=HEIGHT, duration=0.7)
     np.testing.assert_allclose(places.cpu(), want, rtol=0, atol=1e-5)
-    frames = render(textures, torch.tensor(want, device=device), width=WIDTH, height=HEIGHT)
+    frames = render_layers(textures, torch.tensor(want, device=device), width=WIDTH, height=HEIGHT)
     np.testing.assert_array_equal(frames.cpu(), scene.frames(times, device))
     assert frames.std() > 0.1
 
@@ -179,28 +182,28 @@ def test_frames_equal_those_of_a_scene(device, rng):
 def test_no_grad_autocast_strides_and_dtypes(device, rng):
     textures, place = random_scene(rng, 2, device)
     place.requires_grad_()
-    want = render(textures, place, width=WIDTH, height=HEIGHT)
+    want = render_layers(textures, place, width=WIDTH, height=HEIGHT)
     (gradient,) = torch.autograd.grad(want.square().sum(), place)
     with torch.no_grad():
-        assert not render(textures, place, width=WIDTH, height=HEIGHT).requires_grad
+        assert not render_layers(textures, place, width=WIDTH, height=HEIGHT).requires_grad
     with torch.inference_mode():
-        render(textures, place, width=WIDTH, height=HEIGHT)
+        render_layers(textures, place, width=WIDTH, height=HEIGHT)
     strided = [tuple(None if t is None else t.mT.contiguous().mT for t in layer) for layer in textures]
     turned = place.permute(3, 2, 1, 0).contiguous().permute(3, 2, 1, 0)
     assert not turned.is_contiguous()
     assert not strided[1][0].is_contiguous()
-    got = render(strided, turned, width=WIDTH, height=HEIGHT)
+    got = render_layers(strided, turned, width=WIDTH, height=HEIGHT)
     torch.testing.assert_close(got, want, rtol=0, atol=0)
     # the sum expands, so its gradient is not contiguous either
     (summed,) = torch.autograd.grad(got.sum(), place)
     assert summed.abs().max() > 1
     with torch.autocast(torch.device(device).type, torch.bfloat16):
-        got = render(textures, place, width=WIDTH, height=HEIGHT)
+        got = render_layers(textures, place, width=WIDTH, height=HEIGHT)
         assert got.dtype == torch.float32
         loss = got.square().sum()
     torch.testing.assert_close(torch.autograd.grad(loss, place)[0], gradient, rtol=1e-4, atol=1e-3)
     double = place.detach().double().requires_grad_()
-    got = render(textures, double, width=WIDTH, height=HEIGHT)
+    got = render_layers(textures, double, width=WIDTH, height=HEIGHT)
     (g,) = torch.autograd.grad(got.square().sum(), double)
     torch.testing.assert_close(g.float(), gradient, rtol=1e-4, atol=1e-3)
 
@@ -217,11 +220,11 @@ def test_autocast_leaves_places_alone(device, rng):
 def test_only_wanted_gradients_are_made(device, rng):
     textures, place = random_scene(rng, 2, device)
     leaves = leaves_of(textures, place.detach())
-    every = torch.autograd.grad(render(textures, leaves[-1], width=WIDTH, height=HEIGHT).sum(), leaves)
+    every = torch.autograd.grad(render_layers(textures, leaves[-1], width=WIDTH, height=HEIGHT).sum(), leaves)
     fixed = [tuple(None if t is None else t.detach() for t in layer) for layer in textures]
-    frames = render(fixed, leaves[-1], width=WIDTH, height=HEIGHT)
+    frames = render_layers(fixed, leaves[-1], width=WIDTH, height=HEIGHT)
     torch.testing.assert_close(torch.autograd.grad(frames.sum(), leaves[-1])[0], every[-1])
-    frames = render(textures, leaves[-1].detach(), width=WIDTH, height=HEIGHT)
+    frames = render_layers(textures, leaves[-1].detach(), width=WIDTH, height=HEIGHT)
     for g, w in zip(torch.autograd.grad(frames.sum(), leaves[:-1]), every[:-1], strict=True):
         torch.testing.assert_close(g, w)
 
@@ -229,11 +232,11 @@ def test_only_wanted_gradients_are_made(device, rng):
 def test_threads_do_not_change_gradients(rng):
     textures, place = random_scene(rng, 4, "cpu", samples=8)
     leaves = leaves_of(textures, place.detach())
-    before, found = launch.threads(), []
+    before, found = launch.thread_count(), []
     try:
         for count in (1, 3, 20):
             launch.set_threads(count)
-            frames = render(textures, leaves[-1], width=WIDTH, height=HEIGHT)
+            frames = render_layers(textures, leaves[-1], width=WIDTH, height=HEIGHT)
             found.append(torch.autograd.grad(frames.sum(), leaves))
     finally:
         launch.set_threads(before)
@@ -246,13 +249,13 @@ def test_threads_do_not_change_gradients(rng):
 def test_places_out_of_reach_stay_inside_the_textures(device, rng, value):
     textures, place = random_scene(rng, 2, device)
     *leaves, lost = leaves_of(textures, torch.full_like(place, value))
-    frames = render(textures, lost, width=WIDTH, height=HEIGHT)
+    frames = render_layers(textures, lost, width=WIDTH, height=HEIGHT)
     of_background, *of_foregrounds, _ = torch.autograd.grad(frames.sum(), [*leaves, lost])
     for gradient in of_foregrounds:  # foregrounds are nowhere in the picture
         torch.testing.assert_close(gradient, torch.zeros_like(gradient))
     if math.isfinite(value):  # the folded background is everywhere: each pixel shows texels of weight 1
         assert of_background.sum().item() == pytest.approx(frames.numel())
-        without = render(textures[:1], lost[:, :1], width=WIDTH, height=HEIGHT)
+        without = render_layers(textures[:1], lost[:, :1], width=WIDTH, height=HEIGHT)
         torch.testing.assert_close(frames, without, rtol=0, atol=0)
     else:  # said, not hidden: 0 · ∞ is no number either
         assert frames[:, 0, 0].isnan().all()
@@ -279,7 +282,7 @@ def test_bad_input_is_refused(change, message):
     given = {"textures": [(torch.zeros(5, 4), None)] * 2, "place": torch.zeros(4, 2, 2, 3)}
     given |= {"width": 6, "height": 5} | change
     with pytest.raises(ValueError, match=message):
-        render(given.pop("textures"), given.pop("place"), **given)
+        render_layers(given.pop("textures"), given.pop("place"), **given)
 
 
 def test_bad_motion_is_refused():

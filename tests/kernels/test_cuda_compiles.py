@@ -37,7 +37,7 @@ def every() -> Sensor:
 
 
 def compiles(module: wp.Module, folder) -> None:
-    launch.device("cpu")  # starts Warp
+    launch.find_device("cpu")  # starts Warp
     wp.compile_aot_module(module, arch=ARCH, module_dir=folder)
     assert any(path.suffix in (".cubin", ".ptx") for path in folder.iterdir())
 
@@ -52,23 +52,24 @@ def test_plain_kernels(name, tmp_path):
     ("source", "sink"), [("frames", "counts"), ("layers", "labels"), ("background", "keys")]
 )
 def test_pixels_with_every_effect(source, sink, tmp_path):
-    compiles(pixel_compile.compose(every().stages(), source, sink).module, tmp_path)
+    compiles(pixel_compile.compose_pixels(every().stages(), source, sink).module, tmp_path)
 
 
 def test_pixels_of_many_models(tmp_path):
-    compiles(pixel_codegen_trials.compose(every().stages()).module, tmp_path)
+    compiles(pixel_codegen_trials.compose_trials(every().stages()).module, tmp_path)
 
 
 @pytest.mark.parametrize(("source", "lanes"), [("log", 4), ("frames", 4), ("background", 4), ("layers", 1)])
 def test_counting(source, lanes, tmp_path):
-    compiles(threshold_counts.count(lanes, source, shared=False, states=True).module, tmp_path)
+    compiles(threshold_counts.counting_kernel(lanes, source, shared=False, states=True).module, tmp_path)
     if source in ("log", "frames"):
         compiles(
-            threshold_counts.count(lanes, source, shared=False, states=True, aligned=True).module, tmp_path
+            threshold_counts.counting_kernel(lanes, source, shared=False, states=True, aligned=True).module,
+            tmp_path,
         )
 
 
 @pytest.mark.parametrize("half", [True, False])
 def test_critics(half, tmp_path):
-    for kernel in (critic_products.adam[half], *vars(critic_layers.layers[half]).values()):
+    for kernel in (critic_products.adam_kernels[half], *vars(critic_layers.layer_kernels[half]).values()):
         compiles(kernel.module, tmp_path)

@@ -9,7 +9,7 @@ from helpers.stored_scenes import scene_of
 import dase
 from dase.effects import EFFECTS
 from dase.events import Events
-from dase.simulation.pixel_array import Pixels
+from dase.simulation.pixel_array import PixelArray
 
 DROP = {
     "threshold": dict(on=0.11, off=0.07),
@@ -48,12 +48,12 @@ def sensor_of(name, kind):
 
 def run(sensor, scene, lanes, monkeypatch, *, labels):
     """Return events by chunks of 17 samples, then counts of the same sensor, and the last states."""
-    monkeypatch.setattr(Pixels, "_lanes", lambda self, source: lanes)
+    monkeypatch.setattr(PixelArray, "_lanes", lambda self, source: lanes)
     times, out = scene.sample_times(), []
-    array = Pixels(sensor, scene.width, scene.height, seed=3, labels=labels)
+    array = PixelArray(sensor, scene.width, scene.height, seed=3, labels=labels)
     for begin in range(0, len(times), 17):
         out.append(array.emit(scene, times[begin : begin + 17])[0])
-    other = Pixels(sensor, scene.width, scene.height, seed=3)
+    other = PixelArray(sensor, scene.width, scene.height, seed=3)
     windows = (np.arange(len(times)) // 9).astype(np.int32)
     counts = other.count_events(scene, times, windows, int(windows[-1]) + 1).numpy()
     return Events.concatenate(out), counts, array._state.numpy(), other._state.numpy()

@@ -16,7 +16,7 @@ from dase.effects.mismatch import Mismatch
 from dase.effects.refractory import Refractory
 from dase.effects.shot import Shot
 from dase.effects.threshold import Threshold
-from dase.simulation.pixel_array import Pixels
+from dase.simulation.pixel_array import PixelArray
 
 OPTIONAL = (Mismatch, Bandwidth, Leak, Shot, Refractory)
 
@@ -47,8 +47,8 @@ def test_an_effect_leaves_the_random_numbers_of_others(device):
     assert len(alone) > 100
     assert len(among) > 2 * len(alone)
     assert {tuple(row) for row in alone} <= {tuple(row) for row in among}
-    few = Pixels(dase.Sensor((Threshold(), Mismatch())), 7, 6, device=device).thresholds()
-    many = Pixels(reference.only(Mismatch(), *others[1:], Shot()), 7, 6, device=device).thresholds()
+    few = PixelArray(dase.Sensor((Threshold(), Mismatch())), 7, 6, device=device).thresholds()
+    many = PixelArray(reference.only(Mismatch(), *others[1:], Shot()), 7, 6, device=device).thresholds()
     np.testing.assert_array_equal(few, many)
 
 

@@ -17,7 +17,7 @@ from dase.effects.refractory import Refractory
 from dase.effects.shot import Shot
 from dase.effects.threshold import Threshold
 from dase.kernels import launch, pixel_compile, pixel_stages
-from dase.simulation.pixel_array import Pixels
+from dase.simulation.pixel_array import PixelArray
 
 
 def walk(rng: np.random.Generator, kind: str) -> tuple[np.ndarray, float, float]:
@@ -151,7 +151,7 @@ def test_time_never_goes_back_from_chunk_to_chunk(device):
 
 def test_threads_do_not_matter(rng):
     scene, sensor = flicker(rng, samples=12, size=(90, 80)), full()
-    before, streams, counts = launch.threads(), [], []
+    before, streams, counts = launch.thread_count(), [], []
     try:
         for threads in (1, 2, 3):
             launch.set_threads(threads)
@@ -189,7 +189,7 @@ def test_a_batch_is_its_rows(device, rng):
     scene = flicker(rng)
     sensors = [full(), full().with_effect(Threshold(on=0.5, off=0.3)), reference.only(Shot(rate=50.0))]
     vectors = np.stack([sensor.parameters() for sensor in sensors])
-    array = Pixels(full(), scene.width, scene.height, parameters=vectors, seed=4, device=device)
+    array = PixelArray(full(), scene.width, scene.height, parameters=vectors, seed=4, device=device)
     together, row = array.emit(scene, scene.sample_times())
     counts = dase.count(scene, full(), [0, 1], seed=4, device=device, parameters=vectors)
     for i, sensor in enumerate(sensors):
@@ -201,7 +201,7 @@ def test_a_batch_is_its_rows(device, rng):
 
 def test_small_buffers_lose_nothing(device, rng):
     scene = flicker(rng)
-    small, large = (Pixels(full(), scene.width, scene.height, device=device) for _ in range(2))
+    small, large = (PixelArray(full(), scene.width, scene.height, device=device) for _ in range(2))
     small._capacity, large._capacity = 2, 10**5
     times = scene.sample_times()
     for part in (times[:20], times[20:]):
@@ -242,7 +242,7 @@ def test_seeds_of_any_size_fit_the_reported_thresholds(device):
     scene = reference.LogScene(level, np.arange(50) * 0.1)
     sensor = reference.only(Threshold(phase=0.0), Mismatch(spread=0.3))
     for seed in (-1, 2**31 + 5):
-        on = Pixels(sensor, 4, 4, seed=seed, device=device).thresholds()[0, 1]
+        on = PixelArray(sensor, 4, 4, seed=seed, device=device).thresholds()[0, 1]
         counts = dase.count(scene, sensor, [0, 5], seed=seed, device=device)[0, 0, 1]
         assert np.all(np.abs(counts - 4 / on) <= 1)
 
@@ -256,12 +256,12 @@ def test_times_must_increase(times):
 @pytest.mark.parametrize("pixels", [[], [-1], [4], [[0, 1]]])
 def test_pixels_must_be_of_the_sensor(pixels):
     with pytest.raises(dase.InputError, match="2x2 sensor"):
-        Pixels(dase.Sensor(), 2, 2, pixels=pixels)
+        PixelArray(dase.Sensor(), 2, 2, pixels=pixels)
 
 
 def test_parameters_must_fit_the_sensor():
     with pytest.raises(dase.InputError, match=r"parameters must have shape \(B, 4\), got \(1, 5\)"):
-        Pixels(dase.Sensor(), 2, 2, parameters=np.ones((1, 5)))
+        PixelArray(dase.Sensor(), 2, 2, parameters=np.ones((1, 5)))
 
 
 def test_the_composer_names_what_it_does_not_know():
@@ -269,7 +269,7 @@ def test_the_composer_names_what_it_does_not_know():
     def odd(voltage: float, temperature: float):
         return voltage
 
-    stages = (pixel_stages.Stages("odd", (("respond", odd),)),)
+    stages = (pixel_stages.EffectStages("odd", (("respond", odd),)),)
     with pytest.raises(ValueError, match="effect 'odd': stage 'respond' has no quantity 'temperature'"):
         pixel_compile.source_text(stages, "frames", "keys")
 

@@ -9,7 +9,7 @@ torch = pytest.importorskip("torch", reason="the bridge needs torch")
 
 from reference import threshold_counts as reference
 
-from dase.kernels.autograd_counts import FLOOR, count_events, thresholds
+from dase.kernels.autograd_counts import FLOOR, clipped_thresholds, count_events
 
 GRID = 2.0**-12
 """Step of the dyadic grid [log intensity], on which float32 rounds nothing here."""
@@ -240,7 +240,7 @@ def test_mixed_polarity_axes(device, rng):
     log = tensor(rng.normal(0, 0.3, (2, 10, 7)).cumsum(1), device)
     mu = tensor(np.full((2, 7), 0.2), device, grad=True)
     z = tensor(rng.normal(size=(2, 2, 7)), device)
-    assert thresholds(mu, 0.05, z, like=log).shape == (2, 2, 7)
+    assert clipped_thresholds(mu, 0.05, z, like=log).shape == (2, 2, 7)
     for name in SURROGATES:
         counts = count_events(log, mu, 0.05, z, surrogate=name)
         (g,) = torch.autograd.grad(counts.sum(), mu)

@@ -12,13 +12,13 @@ from dase.effects.leak import Leak
 from dase.effects.mismatch import Mismatch
 from dase.effects.threshold import Threshold
 from dase.kernels import launch
-from dase.kernels.vector_math import exponential, functions
-from dase.simulation.pixel_array import Pixels
+from dase.kernels.vector_math import exponential, lane_functions
+from dase.simulation.pixel_array import PixelArray
 
 
 def counted(sensor, scene, device, *, chunk=1000, pixels=None, parameters=None):
     """Return counts in windows of 7 samples, what the pixels remember, and whether lanes counted."""
-    array = Pixels(
+    array = PixelArray(
         sensor, scene.width, scene.height, pixels=pixels, parameters=parameters, seed=5, device=device
     )
     times = scene.sample_times()
@@ -95,9 +95,9 @@ def apply(function, values, device):
         _, i = wp.tid()
         out[i + first] = function(x[i + first])
 
-    where = launch.device(device)
+    where = launch.find_device(device)
     out = wp.zeros(len(values), dtype=float, device=where)
-    launch.run(at, len(values), [wp.array(values, dtype=float, device=where), out], where)
+    launch.run_kernel(at, len(values), [wp.array(values, dtype=float, device=where), out], where)
     return out.numpy()
 
 
@@ -113,9 +113,9 @@ def test_exponential_is_within_two_units_of_the_last_place(device):
 def test_logarithm_is_accurate(lanes, device):
     near, far = np.linspace(0.5, 2, 50_000), np.geomspace(1e-30, 1e30, 50_000)
     x = np.concatenate([near, far]).astype(np.float32)[None]
-    where = launch.device(device)
+    where = launch.find_device(device)
     out = wp.zeros(x.size, dtype=float, device=where)
-    f = functions(lanes)
+    f = lane_functions(lanes)
     load, store, logarithm = f.load, f.store, f.logarithm
 
     @wp.kernel(enable_backward=False, module="unique", module_options={"fuse_fp": False})
@@ -124,7 +124,7 @@ def test_logarithm_is_accurate(lanes, device):
         n = wp.static(lanes) * (i + first)
         store(out, n, logarithm(load(x, 0, n), 0.0))
 
-    launch.run(at, x.size // lanes, [wp.array(x, dtype=float, device=where), out], where)
+    launch.run_kernel(at, x.size // lanes, [wp.array(x, dtype=float, device=where), out], where)
     want = np.log(x.astype(np.float64))
     error = np.abs(out.numpy() - want[0])
     unit = np.spacing(np.abs(want[0]).astype(np.float32))

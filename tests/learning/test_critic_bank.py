@@ -12,7 +12,7 @@ import torch
 from torch import nn
 
 from dase.kernels import autograd_critics as bridge
-from dase.learning.critic_bank import BankShape, CriticBank, Sorted, _Batch, grouped
+from dase.learning.critic_bank import BankShape, CriticBank, CriticBatch, SortedRows, multiply_groups
 
 SHAPE = BankShape(classes=5, inputs=64, wide=16, narrow=8)
 FAKE = torch.tensor([0, 0, 1, 1, 1, 3, 3, 0, 4])  # class 2 has no fake patches, 4 no real ones
@@ -67,7 +67,7 @@ def loss_of(critics: list[nn.Sequential], batch: dict[str, torch.Tensor], penalt
 def test_gradients_are_those_of_double_backward(bank, batch):
     critics = networks(bank)
     loss_of(critics, batch, 1.5).backward()
-    work = _Batch(bank, batch["fake"], FAKE, batch["real"], REAL, batch["weights"], batch["share"])
+    work = CriticBatch(bank, batch["fake"], FAKE, batch["real"], REAL, batch["weights"], batch["share"])
     found = work.differentiate(1.5)
     gradients = dict(work.sums)
     for name, (left, right) in work.outer.items():
@@ -182,10 +182,10 @@ def test_moving_by_outer_products(device, dtype):
 
 def test_grouped_products_and_order(rng):
     classes = torch.from_numpy(rng.integers(0, 4, 20))
-    by = Sorted.by(classes, 3)  # class 3 is none
+    by = SortedRows.by(classes, 3)  # class 3 is none
     assert torch.equal(by.end, torch.bincount(classes, minlength=4)[:3].cumsum(0).int())
     rows, weights = torch.randn(20, 8), torch.randn(3, 8, 4)
-    got = grouped(rows[by.order], weights, by.end)
+    got = multiply_groups(rows[by.order], weights, by.end)
     for n, (row, critic) in enumerate(zip(by.order.tolist(), by.of.tolist(), strict=True)):
         if critic < 3:
             close(got[n], rows[row] @ weights[critic])
@@ -198,7 +198,7 @@ def test_few_rows_are_spread_over_columns(rng, device, rows):
     left = torch.from_numpy(rng.normal(size=(many, 24))).bfloat16()
     weights = torch.from_numpy(rng.normal(size=(len(rows), 24, 40))).bfloat16()
     name = "cuda" if "cuda" in device else "cpu"
-    got = bridge.spread(left.to(name), weights.to(name), end.to(name)).cpu().float()
+    got = bridge.multiply_by_critic(left.to(name), weights.to(name), end.to(name)).cpu().float()
     begin = 0
     for critic, stop in enumerate(end.tolist()):
         want = left[begin:stop].float() @ weights[critic].float()
@@ -208,7 +208,7 @@ def test_few_rows_are_spread_over_columns(rng, device, rows):
 
 def test_traffic_counts_what_has_to_move():
     bank = CriticBank(BankShape(classes=2, inputs=16, wide=8, narrow=8))
-    assert bank.traffic(1) == 8 * (16 + 8) * (3 * 2 + 4 * 4 + 2)
-    assert bank.traffic(2) == 2 * bank.traffic(1)
+    assert bank.least_traffic(1) == 8 * (16 + 8) * (3 * 2 + 4 * 4 + 2)
+    assert bank.least_traffic(2) == 2 * bank.least_traffic(1)
     assert BankShape(classes=216).weights() == pytest.approx(361e6, rel=0.01)  # the paper's bank
     assert np.isclose(BankShape(classes=1).weights(), 6400 * 256 + 256 + 256 * 128 + 128 + 128 + 1)

@@ -15,10 +15,10 @@ torch = pytest.importorskip("torch")
 pytest.importorskip("safetensors")
 
 from dase.learning import distributed
-from dase.learning.adversarial import Adversarial, Hash
+from dase.learning.adversarial import AdversarialObjective, PatchHash
 from dase.learning.moment_matching import Moments
-from dase.learning.scene_batches import Looks, Scenery, middle
-from dase.learning.targets import Pairs, draw_noise, simulate
+from dase.learning.scene_batches import Scenery, SceneSettings, middle_intensity
+from dase.learning.targets import Pairs, draw_noise, simulate_counts
 from dase.scenes.image_sources import open_images
 
 LAUNCH = [sys.executable, "-m", "torch.distributed.run", "--nproc-per-node", "2"]
@@ -34,21 +34,21 @@ def launched(*words: str) -> None:
 
 def batches() -> tuple[Pairs, Pairs]:
     """Return four simulated scenes, of a threshold that wants a gradient, and four real ones."""
-    looks = Looks(width=48, height=48, window=0.05, samples=8, regime="mixed")
+    looks = SceneSettings(width=48, height=48, window=0.05, samples=8, regime="mixed")
     scenery = Scenery(open_images("builtin"), looks, device="cpu", seed=1, backgrounds=4, objects=8)
     rng, generator = np.random.default_rng(0), torch.Generator().manual_seed(0)
     out = []
     for level in (0.3, 0.2):
         log = scenery.draw(rng, 4)
-        grey, noise = middle(log), draw_noise(log, generator)
-        counts = simulate(log, torch.full_like(grey, level), 0.05, noise)
-        out.append(Pairs(grey, counts, simulate(log, torch.full_like(grey, 0.25), 0.05, noise)))
+        grey, noise = middle_intensity(log), draw_noise(log, generator)
+        counts = simulate_counts(log, torch.full_like(grey, level), 0.05, noise)
+        out.append(Pairs(grey, counts, simulate_counts(log, torch.full_like(grey, 0.25), 0.05, noise)))
     return out[0], out[1]
 
 
 def objectives() -> dict:
-    how = Hash(size=16, orientations=4, coherence=1)
-    return {"moments": Moments(device="cpu"), "critics": Adversarial(how, device="cpu", seed=3)}
+    how = PatchHash(size=16, orientations=4, coherence=1)
+    return {"moments": Moments(device="cpu"), "critics": AdversarialObjective(how, device="cpu", seed=3)}
 
 
 def part(pairs: Pairs, some: slice) -> Pairs:
@@ -69,7 +69,7 @@ def steps(some: slice) -> dict:
                 Pairs(mine.grey, counts, mine.reference), part(real, some), move=True
             )
             (gradient,) = torch.autograd.grad(loss, counts)
-            gradients.append(distributed.together(gradient))
+            gradients.append(distributed.gather_values(gradient))
         out[name] = {"gradients": gradients, "values": values, "state": objective.state()}
     return out
 
@@ -115,9 +115,9 @@ def test_the_command_on_two_processes(objective, tmp_path):
 
 
 if __name__ == "__main__":
-    distributed.join("cpu")
-    half = slice(2 * distributed.rank(), 2 * distributed.rank() + 2)
+    distributed.join_processes("cpu")
+    half = slice(2 * distributed.process_rank(), 2 * distributed.process_rank() + 2)
     result = steps(half)
-    if distributed.rank() == 0:
+    if distributed.process_rank() == 0:
         torch.save(result, sys.argv[1])
-    distributed.leave()
+    distributed.leave_processes()

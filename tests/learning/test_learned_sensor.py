@@ -19,11 +19,11 @@ from dase.effects.mismatch import Mismatch
 from dase.effects.threshold import Threshold
 from dase.events import Events
 from dase.io.sequence import Sequence
-from dase.learning.recorded_target import open_target, windows_of
+from dase.learning.recorded_target import cut_windows, open_target
 from dase.networks.threshold_network import NetworkShape, ThresholdNet
 from dase.recordings.recording import Recording
 from dase.scenes.video import VideoScene
-from dase.simulation.pixel_array import Pixels
+from dase.simulation.pixel_array import PixelArray
 from dase.simulation.sensor_file import dump_sensor, load_sensor
 
 pytest.importorskip("safetensors", reason="needs safetensors, of the extra `learn`")
@@ -68,7 +68,7 @@ def test_pixels_get_the_thresholds_that_were_learned(folder, scene, device):
     mu, sigma = maps_of(folder, scene)
     draws = []
     for seed in range(300):
-        pixels = Pixels(sensor, 24, 20, seed=seed, device=device)
+        pixels = PixelArray(sensor, 24, 20, seed=seed, device=device)
         pixels.look_at(scene)
         draws.append(pixels.thresholds()[0].reshape(2, 20, 24))
     found = np.stack(draws)
@@ -77,7 +77,7 @@ def test_pixels_get_the_thresholds_that_were_learned(folder, scene, device):
     # ON and OFF of a pixel move together, and the same seed draws the same
     above = found[:, 0] > 0.0101  # the floor, under which none lies
     np.testing.assert_allclose((found[:, 1] / found[:, 0])[above], 1.21, rtol=1e-3)
-    again = Pixels(sensor, 24, 20, seed=7, device=device)
+    again = PixelArray(sensor, 24, 20, seed=7, device=device)
     again.look_at(scene)
     np.testing.assert_array_equal(again.thresholds()[0].reshape(2, 20, 24), draws[7])
 
@@ -214,7 +214,7 @@ def moving(seconds: float = 1.0, rate: float = 0.2) -> Sequence:
 def test_windows_hold_the_scene_and_the_events():
     sequence = moving()
     recording = Recording.of(sequence)
-    windows = windows_of(recording, window=0.1, samples=5)
+    windows = cut_windows(recording, window=0.1, samples=5)
     assert windows.log.shape == (len(windows.begin), 5, 32, 32)
     assert windows.trusted > 0.5
     trusted = np.ptp(windows.log, axis=1) > 0
@@ -256,9 +256,9 @@ def test_bad_targets_are_named(tmp_path):
 
 
 def call(*arguments: str):
-    from dase.cli import group
+    from dase.cli import dase_group
 
-    return CliRunner().invoke(group, arguments, catch_exceptions=True)
+    return CliRunner().invoke(dase_group, arguments, catch_exceptions=True)
 
 
 def test_the_command_learns_from_a_sensor_and_goes_on(tmp_path, monkeypatch):
@@ -271,7 +271,7 @@ def test_the_command_learns_from_a_sensor_and_goes_on(tmp_path, monkeypatch):
         raise KeyboardInterrupt
 
     with monkeypatch.context() as patch:
-        patch.setattr("dase.learning.run.run", killed)
+        patch.setattr("dase.learning.run.train_in_folder", killed)
         call("train", str(sensor), "-o", str(out), *options)
     # there is no checkpoint yet, so it begins anew
     first = call("train", str(sensor), "-o", str(out), *options, "--resume")
@@ -289,7 +289,7 @@ def test_the_command_learns_from_a_sensor_and_goes_on(tmp_path, monkeypatch):
     assert "begun with other options" in str(other.exception)
     again = call("train", str(sensor), "-o", str(out), *options, "--resume")
     assert again.exit_code == 0, again.output
-    figure, lines = training_figure.draw(out)
+    figure, lines = training_figure.draw_training(out)
     assert {"thresholds", "ON / OFF", "KL from truth"} <= {name for name, _ in lines}
     assert len(figure.axes) == 3 * 5 + 2 + 2
     shown = call("show", str(out))

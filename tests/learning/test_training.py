@@ -13,25 +13,31 @@ from helpers.tiny_training import SIDE, a_fake, a_run, small_scenes
 from dase.kernels import autograd_training as bridge
 from dase.learning import patch_hash, scene_batches
 from dase.learning.adabelief import AdaBelief
-from dase.learning.adversarial import Adversarial, Hash, Hasher, critic_maps, cut_patches
-from dase.learning.baselines import Randomised, constant, event_rate
-from dase.learning.evaluation import HeldOut
-from dase.learning.gauss_newton import Newton
-from dase.learning.moment_matching import Moments, of_pixels, with_neighbours
+from dase.learning.adversarial import AdversarialObjective, PatchHash, PatchHasher, critic_maps, cut_patches
+from dase.learning.baselines import RandomThresholds, constant_thresholds, match_event_rate
+from dase.learning.evaluation import HeldOutScore
+from dase.learning.gauss_newton import GaussNewton
+from dase.learning.moment_matching import Moments, add_neighbour_features, single_pixel_features
 from dase.learning.targets import (
     TRUTHS,
-    Endless,
-    Finite,
+    EndlessTarget,
+    FiniteTarget,
     Pairs,
     answers,
     draw_noise,
-    flipped,
-    record,
-    simulate,
-    vary,
+    flip_pairs,
+    record_pairs,
+    simulate_counts,
+    vary_thresholds,
 )
-from dase.learning.training import Recipe, prior
-from dase.networks.threshold_network import Maps, NetworkShape, ThresholdNet, edge_strength, look_up
+from dase.learning.training import Recipe, threshold_prior
+from dase.networks.threshold_network import (
+    NetworkShape,
+    ThresholdMaps,
+    ThresholdNet,
+    edge_strength,
+    interpolate_table,
+)
 from dase.scenes.image_sources import Picture
 from dase.scenes.layers import Layer, LayerScene, Motion
 
@@ -44,7 +50,7 @@ def scenes() -> scene_batches.Scenery:
 def test_batches_show_what_layer_scenes_show(scenes):
     log = scenes.draw(np.random.default_rng(5), 2)
     rng = np.random.default_rng(5)
-    motion = scene_batches.draw_motion(rng, scenes.looks, 2)
+    motion = scene_batches.draw_motion(rng, scenes.scene_settings, 2)
     front = rng.integers(len(scenes.size) - 1, size=motion.there.shape)
     ground = rng.integers(len(scenes.grey), size=2)
     for b in range(2):
@@ -61,8 +67,8 @@ def test_batches_show_what_layer_scenes_show(scenes):
                 light = np.where(alpha > 0, texels[..., 0] / np.maximum(alpha, 1e-9), 0).astype(np.float32)
                 picture = Picture(light, alpha)
             layers.append(Layer(picture, how))
-        scene = LayerScene(layers, width=SIDE, height=SIDE, duration=scenes.looks.window)
-        want = scene.frames(np.linspace(0, scenes.looks.window, 6))
+        scene = LayerScene(layers, width=SIDE, height=SIDE, duration=scenes.scene_settings.window)
+        want = scene.frames(np.linspace(0, scenes.scene_settings.window, 6))
         np.testing.assert_allclose(np.exp(log[b].numpy()) - scene_batches.LOG_EPS, want, atol=1e-5)
 
 
@@ -76,7 +82,7 @@ def test_halves_of_a_pool_share_no_texture(scenes):
 
 
 def test_patches_are_hashed_as_patches_are(scenes, rng):
-    grey = scene_batches.middle(scenes.draw(rng, 3))
+    grey = scene_batches.middle_intensity(scenes.draw(rng, 3))
     counts = torch.from_numpy(rng.poisson(1.0, (3, 2, SIDE, SIDE)).astype(np.float32))
     want = patch_hash.attributes(grey.numpy(), counts.numpy(), size=16)
     got = bridge.patch_structure(grey, size=16, stride=16)
@@ -85,7 +91,7 @@ def test_patches_are_hashed_as_patches_are(scenes, rng):
     contrast = bridge.patch_contrast(counts, size=16, stride=16)
     np.testing.assert_array_equal(contrast.numpy().reshape(3, 3, 3), want.contrast)
     for kind in ("energy", "events"):
-        hasher = Hasher(Hash(size=16, contrast_from=kind))
+        hasher = PatchHasher(PatchHash(size=16, contrast_from=kind))
         hasher.calibrate(Pairs(grey, counts))
         boundaries = {name: tuple(value.tolist()) for name, value in hasher.boundaries.items()}
         other = patch_hash.StructureHash(**boundaries, contrast_from=kind)
@@ -112,7 +118,9 @@ def test_critics_see_logarithms_of_counts_and_gradients():
 
 
 def test_weights_of_classes_are_those_of_eq_13():
-    objective = Adversarial(Hash(size=8, orientations=4, coherence=1, contrast=1), device="cpu", uniform=0.5)
+    objective = AdversarialObjective(
+        PatchHash(size=8, orientations=4, coherence=1, contrast=1), device="cpu", uniform=0.5
+    )
     objective.seen = torch.tensor([6.0, 2.0, 0.0, 0.0])
     assert objective.weights().tolist() == pytest.approx([0.5, 0.25, 0.125, 0.125])
     objective.uniform = 1.0
@@ -121,7 +129,7 @@ def test_weights_of_classes_are_those_of_eq_13():
 
 def test_the_prior_is_minimised_not_maximised():
     mu, sigma = torch.tensor([[0.3]]), torch.tensor([[0.2]], requires_grad=True)
-    value = prior(Maps(mu, sigma, torch.ones(()), mu))
+    value = threshold_prior(ThresholdMaps(mu, sigma, torch.ones(()), mu))
     normal = torch.distributions.Normal
     want = torch.distributions.kl_divergence(normal(mu, sigma), normal(0.0, 1.0)).mean()
     torch.testing.assert_close(value, want)
@@ -151,7 +159,7 @@ def test_a_network_begins_flat_and_a_table_interpolates(rng):
     table = torch.zeros(2, 3, 2)
     table[0] = torch.tensor([[0.0], [1.0], [4.0]])  # of brightness 0, 1/2 and 1
     flat = torch.full((1, 4, 4), 0.75)
-    assert torch.allclose(look_up(table, flat)[0, 0], torch.tensor(2.5))
+    assert torch.allclose(interpolate_table(table, flat)[0, 0], torch.tensor(2.5))
     assert float(edge_strength(flat).max()) == 0
     split = ThresholdNet(NetworkShape(channels=4, depth=1, split=True), mu=0.3, sigma=0.1)
     split.asymmetry.data += math.log(1.44)
@@ -166,12 +174,14 @@ def test_counts_answer_as_central_differences_say(scenes, rng):
     noise = draw_noise(log, generator)
     level = torch.tensor(math.log(0.2), requires_grad=True)
     mu = level.exp().expand(4, SIDE, SIDE)
-    varied = vary(log, mu, 0.25 * mu, noise)
-    counts = simulate(log, mu.detach(), 0.25 * mu.detach(), noise)
-    value = varied.follow(lambda c: c.square(), counts)
+    varied = vary_thresholds(log, mu, 0.25 * mu, noise)
+    counts = simulate_counts(log, mu.detach(), 0.25 * mu.detach(), noise)
+    value = varied.with_gradient(lambda c: c.square(), counts)
     assert torch.equal(value.detach(), counts.square())
     (slope,) = torch.autograd.grad(value.mean(), level)
-    ends = [simulate(log, 0.2 * f * torch.ones_like(mu), 0.05 * f, noise) for f in (1.105171, 0.904837)]
+    ends = [
+        simulate_counts(log, 0.2 * f * torch.ones_like(mu), 0.05 * f, noise) for f in (1.105171, 0.904837)
+    ]
     want = (ends[0].square() - ends[1].square()).mean() / (2 * math.sinh(0.1))
     # spread and level scale together, but where the floor cuts
     torch.testing.assert_close(slope, want, rtol=2e-2, atol=1e-3)
@@ -186,15 +196,15 @@ def test_newton_knows_how_moments_move(scenes):
     jacobian = training.newton._jacobian()
     log, noise = scenes.draw(np.random.default_rng(1), 4), None
     noise = draw_noise(log, torch.Generator().manual_seed(1))
-    grey, even = scene_batches.middle(log), torch.full((4, 2, SIDE, SIDE), 0.2)
-    other = Pairs(grey, simulate(log, even, 0.25 * even, noise))
+    grey, even = scene_batches.middle_intensity(log), torch.full((4, 2, SIDE, SIDE), 0.2)
+    other = Pairs(grey, simulate_counts(log, even, 0.25 * even, noise))
     other.answers = answers(log, even, 0.25 * even, noise)
-    newton = Newton(training.objective, training.net)
+    newton = GaussNewton(training.objective, training.net)
     newton.see(other)
     means = []
     for ratio in (1.04, 1 / 1.04):
         factor = torch.tensor([ratio**-0.5, ratio**0.5]).view(1, 2, 1, 1)
-        counts = simulate(log, even * factor, 0.25 * even * factor, noise)
+        counts = simulate_counts(log, even * factor, 0.25 * even * factor, noise)
         sums, number = training.objective.sums(Pairs(grey, counts))["look"]
         means.append(sums.sum(0) / number.sum(0).clamp_min(1)[:, None])
     slope = ((means[0] - means[1]) / (2 * math.log(1.04))).flatten().double()
@@ -205,13 +215,13 @@ def test_newton_knows_how_moments_move(scenes):
 
 
 def test_weights_of_moments_invert_their_covariance(rng):
-    from dase.learning.moment_matching import RIDGE, UNSURE, Cells
+    from dase.learning.moment_matching import RIDGE, UNSURE, CellMoments
 
-    cells = Cells(2, 3, device=torch.device("cpu"), memory=0.9, joint=True)
+    cells = CellMoments(2, 3, device=torch.device("cpu"), memory=0.9, joint=True)
     scenes_, pixels = 4000, torch.tensor([10.0, 20.0])
     root = torch.from_numpy(rng.normal(size=(6, 6)))
     values = torch.from_numpy(rng.normal(size=(scenes_, 6))) @ root
-    cells.see_plain(values.view(-1, 2, 3) * pixels.view(1, 2, 1), pixels.expand(scenes_, 2))
+    cells.add_reference(values.view(-1, 2, 3) * pixels.view(1, 2, 1), pixels.expand(scenes_, 2))
     cells.weigh()
     covariance = root.T @ root
     loaded = covariance + torch.diag((RIDGE + UNSURE * 6 / scenes_) * covariance.diagonal())
@@ -229,21 +239,24 @@ def test_features_of_neighbours_tell_the_spread(scenes, rng):
     log = scenes.draw(rng, 6)
     noise = draw_noise(log, torch.Generator().manual_seed(3))
     mu = torch.full((6, SIDE, SIDE), 0.2)
-    narrow, wide = (with_neighbours(of_pixels(simulate(log, mu, s, noise))) for s in (0.01, 0.08))
+    narrow, wide = (
+        add_neighbour_features(single_pixel_features(simulate_counts(log, mu, s, noise)))
+        for s in (0.01, 0.08)
+    )
     assert narrow.shape == (6, 13, SIDE, SIDE)
     assert float(wide[:, 9:11].mean()) > 1.1 * float(narrow[:, 9:11].mean())  # of roughness squared
     assert float(wide[:, :2].mean()) == pytest.approx(float(narrow[:, :2].mean()), rel=0.1)
 
 
 def test_finite_targets_hold_out_the_last_and_mirror_the_rest(scenes):
-    endless = Endless(scenes, TRUTHS["uniform"]())
-    pairs = record(endless, np.random.default_rng(0), 10, batch=4)
-    target = Finite(pairs, held_out=0.2)
+    endless = EndlessTarget(scenes, TRUTHS["uniform"]())
+    pairs = record_pairs(endless, np.random.default_rng(0), 10, batch=4)
+    target = FiniteTarget(pairs, held_out=0.2)
     assert (len(target.recorded), len(target.held_out()), target.scenes) == (8, 2, 8.0)
     assert torch.equal(target.held_out().grey, pairs.grey[8:])
     some = pairs.select(slice(3))
     across, along, turn = torch.tensor([[1, 0, 1], [0, 1, 1], [0, 1, 1]], dtype=torch.bool)
-    mirrored = flipped(some, across, along, turn)
+    mirrored = flip_pairs(some, across, along, turn)
     for n in range(3):
         for maps, got in ((some.grey[n], mirrored.grey[n]), (some.counts[n], mirrored.counts[n])):
             want = maps.flip([axis for axis, on in ((-1, across), (-2, along)) if on[n]])
@@ -254,25 +267,25 @@ def test_finite_targets_hold_out_the_last_and_mirror_the_rest(scenes):
 
 
 def test_a_held_out_score_finds_the_nearest(scenes):
-    pairs = record(Endless(scenes, TRUTHS["uniform"]()), np.random.default_rng(0), 48)
-    held = HeldOut(scenes, pairs.select(slice(None)), scenes=48)
-    scores = [held.score(constant(mu, mu / 4)) for mu in (0.1, 0.2, 0.4)]
+    pairs = record_pairs(EndlessTarget(scenes, TRUTHS["uniform"]()), np.random.default_rng(0), 48)
+    held = HeldOutScore(scenes, pairs.select(slice(None)), scenes=48)
+    scores = [held.score(constant_thresholds(mu, mu / 4)) for mu in (0.1, 0.2, 0.4)]
     assert scores[1] < 0.5 * min(scores[0], scores[2])
-    numbers = held.statistics(constant(0.2, 0.05))
+    numbers = held.statistics(constant_thresholds(0.2, 0.05))
     assert numbers["rate"] == pytest.approx(1.0, abs=0.35)
-    assert numbers["counts"] < held.statistics(constant(0.4, 0.1))["counts"]
+    assert numbers["counts"] < held.statistics(constant_thresholds(0.4, 0.1))["counts"]
 
 
 def test_baselines(scenes):
-    pairs = record(Endless(scenes, TRUTHS["uniform"]()), np.random.default_rng(0), 96)
-    tuned = event_rate(pairs, scenes, scenes=36)
+    pairs = record_pairs(EndlessTarget(scenes, TRUTHS["uniform"]()), np.random.default_rng(0), 96)
+    tuned = match_event_rate(pairs, scenes, scenes=36)
     assert float(tuned.level[0].detach().exp()) == pytest.approx(0.2, rel=0.4)
-    maps = Randomised(0)(torch.rand(6, 32, 32))
+    maps = RandomThresholds(0)(torch.rand(6, 32, 32))
     assert len(set(maps.mu[:, 0, 0].tolist())) == 6
     assert 1 / 1.5 <= float(maps.ratio) <= 1.5
 
 
 def test_recipes_survive_their_text():
-    recipe = Recipe(hash=Hash(size=8), network=NetworkShape(table=(6, 5), pattern=(3, 4)), cells=(2, 3))
+    recipe = Recipe(hash=PatchHash(size=8), network=NetworkShape(table=(6, 5), pattern=(3, 4)), cells=(2, 3))
     assert Recipe.parse(recipe.text()) == recipe
     assert json.loads(recipe.text())["network"]["table"] == [6, 5]

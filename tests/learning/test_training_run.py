@@ -11,8 +11,8 @@ from helpers.tiny_training import SIDE, WGAN, a_fake, a_run, small_scenes
 
 from dase.errors import InputError
 from dase.learning import cuda_graph, scene_batches
-from dase.learning.evaluation import Exam
-from dase.learning.run import CHECKPOINT, LOG, Broken, Pace, load, run
+from dase.learning.evaluation import MapEvaluation
+from dase.learning.run import CHECKPOINT, LOG, RunSchedule, TrainingDiverged, load, train_in_folder
 from dase.learning.targets import Pairs
 from dase.networks.threshold_network import NetworkShape
 from dase.scenes import image_sources
@@ -26,11 +26,11 @@ def scenes() -> scene_batches.Scenery:
 @pytest.mark.parametrize("start", [(0.45, 0.12), (0.09, 0.02)])
 def test_a_wrong_start_is_left_behind(scenes, start):
     training = a_run(scenes, mu=start[0], sigma=start[1], steps=60, warmup=10)
-    exam = Exam(scenes, training.target, scenes=4)
-    before = exam.marks(training.net)
+    exam = MapEvaluation(scenes, training.target, scenes=4)
+    before = exam.describe_maps(training.net)
     while training.step < training.recipe.steps:
         training.advance()
-    after = exam.marks(training.mean)
+    after = exam.describe_maps(training.mean)
     assert after["mu_diff"] < 0.1 * before["mu_diff"]
     assert after["kl"] < 0.05
     assert before["kl"] > 1
@@ -120,7 +120,7 @@ def test_replayed_steps_are_the_same_steps(scenes, device, kind, monkeypatch):
     if device == "cpu":
         pytest.skip("steps are replayed on a GPU only; --device cuda:0 asks for one")
     source = image_sources.open_images("builtin")
-    there = scene_batches.Scenery(source, scenes.looks, device=device, backgrounds=6, objects=8)
+    there = scene_batches.Scenery(source, scenes.scene_settings, device=device, backgrounds=6, objects=8)
     ends = []
     for seen in (10**9, 3):
         monkeypatch.setattr(cuda_graph, "SEEN", seen)
@@ -160,18 +160,18 @@ def same(one, other) -> bool:
 def test_a_resumed_run_ends_bit_equal(scenes, tmp_path, changes):
     recipe = {**changes, "steps": 6, "warmup": 2}
     whole, first, second = (a_run(scenes, **recipe) for _ in range(3))
-    pace = Pace(look=2, save=0.0, held_out=0)
-    run(whole, tmp_path / "whole", pace=pace)
+    pace = RunSchedule(look=2, save=0.0, held_out=0)
+    train_in_folder(whole, tmp_path / "whole", pace=pace)
 
     def stop(row: dict[str, float]) -> None:
         if row["step"] == 4:
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        run(first, tmp_path / "cut", pace=pace, look=stop)
+        train_in_folder(first, tmp_path / "cut", pace=pace, look=stop)
     with (tmp_path / "cut" / LOG).open("a") as file:
         file.write("1")  # of a line that was being written when the run was killed
-    run(second, tmp_path / "cut", pace=pace, resume=True)
+    train_in_folder(second, tmp_path / "cut", pace=pace, resume=True)
     states = [load(tmp_path / name / CHECKPOINT, "cpu") for name in ("whole", "cut")]
     for state in states:
         del state["seconds"]
@@ -192,16 +192,18 @@ def test_nan_stops_with_its_step_and_the_last_good_checkpoint(scenes, tmp_path):
         return (loss * float("nan") if training.step == 3 else loss), values
 
     training.objective.loss = poisoned
-    with pytest.raises(Broken, match=r"broke at step 3: .* is not finite; the last good checkpoint is .*pt"):
-        run(training, tmp_path / "run", pace=Pace(look=2, save=0.0, held_out=0))
+    with pytest.raises(
+        TrainingDiverged, match=r"broke at step 3: .* is not finite; the last good checkpoint is .*pt"
+    ):
+        train_in_folder(training, tmp_path / "run", pace=RunSchedule(look=2, save=0.0, held_out=0))
     assert load(tmp_path / "run" / CHECKPOINT, "cpu")["step"] == 2
 
 
 def test_a_folder_is_not_begun_twice(scenes, tmp_path):
     with pytest.raises(InputError, match="no checkpoint to resume"):
-        run(a_run(scenes), tmp_path / "none", resume=True)
+        train_in_folder(a_run(scenes), tmp_path / "none", resume=True)
     (tmp_path / CHECKPOINT).write_bytes(b"not one")
     with pytest.raises(InputError, match="already holds a run"):
-        run(a_run(scenes), tmp_path)
+        train_in_folder(a_run(scenes), tmp_path)
     with pytest.raises(InputError, match="is not a checkpoint"):
-        run(a_run(scenes), tmp_path, resume=True)
+        train_in_folder(a_run(scenes), tmp_path, resume=True)

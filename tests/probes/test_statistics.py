@@ -10,17 +10,17 @@ import numpy as np
 import pytest
 
 import dase
-from dase.diagnosis.explain_effect import bars
+from dase.diagnosis.explain_effect import moving_bars
 from dase.effects import EFFECTS, StreamEffect
 from dase.fitting import descent
-from dase.fitting.batch_simulator import CLASS_TIMES, LAG_TIMES, Order
-from dase.fitting.data_split import gather
+from dase.fitting.batch_simulator import CLASS_TIMES, LAG_TIMES, SimulationOrder
+from dase.fitting.data_split import split_measurement
 from dase.fitting.model import model_of
-from dase.fitting.scheduler import alone, simulated, together
+from dase.fitting.scheduler import answer_requests, run_side_by_side, run_work
 from dase.kernels import event_probes as kernels
-from dase.probes.accumulators import GROUP, SEEN, totals, without
-from dase.probes.statistics import FAMILIES, LAYOUT, precise, statistics
-from dase.probes.timestamp_patterns import Structure, find
+from dase.probes.accumulators import GROUP, SEEN, compute_totals, leave_groups_out
+from dase.probes.statistics import FAMILIES, LAYOUT, compute_statistics, refine_frequency
+from dase.probes.timestamp_patterns import TimestampStructure, find_structure
 from dase.simulation.sensor import Sensor
 
 ON = {
@@ -34,7 +34,7 @@ ON = {
 
 @pytest.fixture(scope="module")
 def scene() -> dase.VideoScene:
-    return bars()
+    return moving_bars()
 
 
 @pytest.fixture(scope="module")
@@ -44,7 +44,7 @@ def events(scene) -> dase.Events:
 
 @pytest.fixture(scope="module")
 def evidence(events, scene, device):
-    return gather(events, scene, pixels=300, seed=1, device=device)
+    return split_measurement(events, scene, pixels=300, seed=1, device=device)
 
 
 def reference(events, stimulus, middle) -> np.ndarray:
@@ -104,7 +104,7 @@ def test_no_pair_of_events_reaches_across_what_is_not_compared(scene, device):
     def trust(times, pixels):
         return spans[np.floor(times / 0.02).astype(int)][:, pixels]
 
-    half = gather(events, scene, trust=trust, pixels=300, seed=1, device=device).train
+    half = split_measurement(events, scene, trust=trust, pixels=300, seed=1, device=device).train
     stimulus = half.trials.stimulus
     want = reference(events, stimulus, half.trials.middle)
     np.testing.assert_allclose(half.found.sums[0], want, rtol=2e-4, atol=2e-3)
@@ -189,7 +189,7 @@ def test_models_side_by_side_are_those_alone(evidence, device, rng):
         vectors = np.repeat(sensor.parameters()[None], 5, 0)
         vectors[:, :2] *= np.exp(rng.uniform(-0.3, 0.3, (5, 2)))
         vectors[:, 2] = rng.choice([0.0, 1.0], 5)
-        orders.append(Order(sensor, vectors, seed=n, reseed=n % 2 > 0, finer=1))
+        orders.append(SimulationOrder(sensor, vectors, seed=n, reseed=n % 2 > 0, finer=1))
     for sums in side_by_side(evidence.scout.trials, orders):
         assert sums.halves.sum() > 500
 
@@ -200,7 +200,7 @@ def test_more_events_than_may_wait(evidence, device, rng):
         pytest.skip("on a GPU no event waits")
     vectors = np.repeat(Sensor().parameters()[None], kernels.LANES, 0)
     vectors[:, :2] = rng.uniform(0.01, 0.02, (kernels.LANES, 2))
-    orders = [Order(Sensor(), vectors, seed=3, ticks=ticks) for ticks in (0.0, 3e-3)]
+    orders = [SimulationOrder(Sensor(), vectors, seed=3, ticks=ticks) for ticks in (0.0, 3e-3)]
     for sums in side_by_side(evidence.scout.trials, orders):
         assert sums.halves.sum((0, 2)).max() > 2 * kernels.QUEUE
 
@@ -210,17 +210,17 @@ def test_a_clock_is_the_same_inside_the_kernel(evidence):
     clock = EFFECTS["timestamp"](step=3e-3, jitter=0.0)
     sensor, trials = Sensor().with_effect(clock), copy(evidence.train.trials)
     vector = sensor.parameters()[None]
-    trials.structure = Structure(step=clock.step)
+    trials.structure = TimestampStructure(step=clock.step)
     ticks = trials.ticks(sensor)
     assert ticks == clock.step
-    got, free = trials.run_all([Order(sensor, vector, 9, finer=1, ticks=t) for t in (ticks, 0.0)])
+    got, free = trials.run_all([SimulationOrder(sensor, vector, 9, finer=1, ticks=t) for t in (ticks, 0.0)])
     want = trials.stream(sensor, vector, sensor.streams(), seed=9)
     many = want.clock.sum()
     assert np.abs(got.clock - want.clock).sum() < 1e-2 * many < 0.5 * np.abs(free.clock - want.clock).sum()
     np.testing.assert_allclose(got.stamps, want.stamps, atol=1e-2)
     # where more than that is to be felt, events have to go through it
     assert trials.ticks(sensor.with_effect(EFFECTS["readout"](rate=1e5))) is None
-    trials.structure = Structure(step=2e-3)
+    trials.structure = TimestampStructure(step=2e-3)
     assert trials.ticks(sensor) is None
 
 
@@ -229,14 +229,14 @@ def test_counts_fold_as_plain_loops_would(evidence, rng):
     half = evidence.train
     expected = half.found.halves[0] * rng.uniform(0.5, 1.5, half.found.halves[0].shape)
     frame = replace(half.frame, expected=expected)
-    counts, got = half.found.halves[0].astype(float), totals(half.found, frame).folded[0]
+    counts, got = half.found.halves[0].astype(float), compute_totals(half.found, frame).folded[0]
     d = (counts - expected).reshape(-1, 2, 2, 2)  # state, half, polarity
     products = np.einsum("nsp,nsq->spq", d[:, :, 0], d[:, :, 1]).reshape(2, 4)
     own = (d**2).sum((0, 2))
     np.testing.assert_allclose(got[:12], np.concatenate([products, own], 1).ravel(), rtol=1e-4, atol=1e-2)
     rings = [counts[frame.zone == z].reshape(-1, 2, 2, 2).sum((0, 2)) for z in range(kernels.ZONES)]
     np.testing.assert_array_equal(got[kernels.RINGS :], np.stack(rings, -1).ravel())
-    left = without(half.found, frame)
+    left = leave_groups_out(half.found, frame)
     keep = np.arange(len(expected)) >= GROUP
     d = d[keep]
     np.testing.assert_allclose(
@@ -265,17 +265,17 @@ def test_searches_side_by_side_end_where_each_ends_alone(evidence, monkeypatch):
     models[0].rebase(half, repeats=6, seed=1)
     seen = [[] for _ in models]
     for model, each in zip(models, seen, strict=True):
-        alone(kept(model.searching(half, seed=3, iterations=1), each))
+        run_work(kept(model.searching(half, seed=3, iterations=1), each))
     assert max(map(len, seen)) > 5
     # beside the first populations of all, every population has the answers it has alone
     first = [each[0][0] for each in seen]
     for ask, want in (pair for each in seen for pair in each):
-        np.testing.assert_allclose(simulated([*first, ask])[-1], want, rtol=1e-6, atol=1e-7)
+        np.testing.assert_allclose(answer_requests([*first, ask])[-1], want, rtol=1e-6, atol=1e-7)
     # the end can be compared after one: a place off by 1e-9 counts an event more or less in the next ones
     monkeypatch.setattr(descent, "LONGEST", 1)
-    ends = together([m.searching(half, seed=3, iterations=1) for m in models])
+    ends = run_side_by_side([m.searching(half, seed=3, iterations=1) for m in models])
     for found, model in zip(ends, models, strict=True):
-        want = alone(model.searching(half, seed=3, iterations=1))
+        want = run_work(model.searching(half, seed=3, iterations=1))
         np.testing.assert_allclose(found.place, want.place, atol=1e-5)
         assert found.loss == pytest.approx(want.loss, rel=1e-4)
 
@@ -290,7 +290,7 @@ def test_silent_pixels_are_counted(evidence, events):
     place = events.y.astype(int) * events.width + events.x
     found = half.trials.look(events.select(~np.isin(place, muted)))
     frame = replace(half.frame, expected=expected)
-    values = [statistics(sums, frame)[0][0, LAYOUT["silent"]] for sums in (half.found, found)]
+    values = [compute_statistics(sums, frame)[0][0, LAYOUT["silent"]] for sums in (half.found, found)]
     np.testing.assert_allclose(np.exp(np.concatenate(values)) - 3, [0, 7], atol=1e-9)
 
 
@@ -307,7 +307,7 @@ def test_families_fill_the_vector():
 )
 def test_regular_time_stamps_are_found(scene, effect):
     events = dase.simulate(scene, Sensor().with_effect(effect), seed=1)
-    found = find(events)
+    found = find_structure(events)
     if effect.name == "timestamp":
         assert found.step == pytest.approx(3e-4, rel=1e-4)
     else:
@@ -324,7 +324,7 @@ def test_a_scan_that_begins_anywhere_and_pauses_is_found(scene):
     place = lines - 1 - events.x.astype(float)
     t = np.ceil((events.t - place * line) / scan) * scan + place * line + 0.37 * scan
     order = np.argsort(t)
-    found = find(replace(events.select(order), t=np.rint(1e6 * t[order]) * 1e-6))
+    found = find_structure(replace(events.select(order), t=np.rint(1e6 * t[order]) * 1e-6))
     assert found.direction == "left"
     assert found.line == pytest.approx(scan / lines, rel=1e-3)
 
@@ -333,11 +333,11 @@ def test_a_regularity_must_last(scene):
     events = dase.simulate(scene, Sensor().with_effect(EFFECTS["timestamp"](step=3e-4, jitter=0.0)), seed=1)
     t = events.t.copy()
     t[len(t) * 3 // 4 :] += 1e-5
-    assert find(replace(events, t=t)).step == 0
+    assert find_structure(replace(events, t=t)).step == 0
 
 
 def test_ordinary_time_stamps_have_no_regularity(scene):
-    found = find(dase.simulate(scene, Sensor(), seed=1))
+    found = find_structure(dase.simulate(scene, Sensor(), seed=1))
     assert found.step == found.line == 0
 
 
@@ -363,7 +363,7 @@ def test_a_lamp_is_known_better_than_a_turn_of_the_window(rng, frequency):
     events = a_lamp(rng, frequency)
     for off in (-0.6, 0.0, 0.8):
         # a window of 0.6 s has frequencies 1.7 Hz apart
-        assert precise(events, 0.0, 0.6, frequency + off) == pytest.approx(frequency, abs=0.08)
+        assert refine_frequency(events, 0.0, 0.6, frequency + off) == pytest.approx(frequency, abs=0.08)
 
 
 def test_slow_clocks_are_seen_in_busy_recordings(rng):
@@ -371,6 +371,6 @@ def test_slow_clocks_are_seen_in_busy_recordings(rng):
     x, y = (rng.integers(0, 64, len(t)) for _ in range(2))
     events = dase.Events(t, x, y, rng.random(len(t)) < 0.5, 64, 64)
     # 50,000 events have 38 ticks, too few
-    assert find(events).step == pytest.approx(1e-3, rel=1e-4)
+    assert find_structure(events).step == pytest.approx(1e-3, rel=1e-4)
     free = dase.Events(np.sort(rng.uniform(0, 0.3, len(t))), x, y, events.p, 64, 64)
-    assert find(free) == Structure()
+    assert find_structure(free) == TimestampStructure()

@@ -14,7 +14,7 @@ from click.testing import CliRunner
 from helpers import sample_files as reference_io
 
 from dase import io
-from dase.cli import group
+from dase.cli import dase_group
 from dase.io.format import Format
 
 ROOT = Path(__file__).parents[2]
@@ -90,9 +90,9 @@ def test_command(tmp_path, rng, monkeypatch, line):
         pytest.importorskip("rosbags")
     make(path, rng)
     monkeypatch.chdir(tmp_path)
-    done = CliRunner().invoke(group, words[1:])
+    done = CliRunner().invoke(dase_group, words[1:])
     assert done.exit_code == 0, done.output
-    assert io.find(path).name == NAMES[path.name]
+    assert io.find_format(path).name == NAMES[path.name]
     if words[1] == "info":
         assert f"format            {NAMES[path.name]}" in done.output
         if "--size" in words:
@@ -119,7 +119,7 @@ def test_what_can_be_written_is_what_is_written_there():
     for name, suffixes in rows:
         known = written[name.replace("HDF5 (S2R)", "HDF5")]
         for suffix in re.findall(r"`(\.\w+)`", suffixes):
-            assert io.writable(f"a{suffix}").name == known.name, suffix
+            assert io.find_writable_format(f"a{suffix}").name == known.name, suffix
 
 
 def test_python(tmp_path, rng, monkeypatch):
@@ -145,5 +145,5 @@ def test_every_format_can_be_drawn(tmp_path, rng, name):
     maker(tmp_path / f"a{suffix}", reference_io.events(rng, 500, *wide))
     sequence = io.read(tmp_path / f"a{suffix}")
     middle = sum(sequence.span) / 2
-    picture = event_images.panel(sequence, middle, sequence.span[1] - sequence.span[0] + 1)
+    picture = event_images.moment_picture(sequence, middle, sequence.span[1] - sequence.span[0] + 1)
     assert np.count_nonzero((picture != 255).any(-1)) > 450  # nearly every event has a pixel of its own

@@ -35,14 +35,14 @@ def test_sensor():
 def test_commands_and_their_options_exist():
     import click
 
-    from dase.cli import group
+    from dase.cli import dase_group
 
-    context = click.Context(group)
+    context = click.Context(dase_group)
     for line in "\n".join(blocks("sh")).splitlines():
         words = shlex.split(line, comments=True)
         if not words or words[0] != "dase":
             continue
-        command = group.get_command(context, words[1])
+        command = dase_group.get_command(context, words[1])
         assert command is not None, line
         known = {name for p in command.params for name in (*p.opts, *p.secondary_opts)}
         assert {w for w in words[2:] if w.startswith("-")} <= known, line

@@ -17,9 +17,9 @@ from dase.events import Events
 from dase.io.sequence import Sequence
 from dase.recordings import interval_statistics, summary
 from dase.recordings import statistics as recording_statistics
-from dase.recordings.anomalies import doubts
-from dase.recordings.interval_statistics import Intervals
-from dase.recordings.statistics import Survey, statistics, survey_file
+from dase.recordings.anomalies import find_anomalies
+from dase.recordings.interval_statistics import IntervalStatistics
+from dase.recordings.statistics import RecordingSurvey, sequence_statistics, survey_file
 
 
 def some(rng, count=4000, width=20, height=15, duration=2.0):
@@ -37,14 +37,14 @@ def by_pixel(e):
 
 
 def odd(s):
-    return {note.rule: note for note in doubts(s)}
+    return {note.rule: note for note in find_anomalies(s)}
 
 
 @pytest.mark.parametrize("part", [1 << 20, 700, 3])
 def test_statistics_equal_loops_whatever_is_looked_at_together(rng, monkeypatch, part):
     monkeypatch.setattr(recording_statistics, "PART", part)
     e = some(rng, 1500)
-    looked = Survey(e.width, e.height)
+    looked = RecordingSurvey(e.width, e.height)
     for i in range(0, len(e), 401):
         looked.events(e.select(slice(i, i + 401)))
     got = looked.statistics()
@@ -75,7 +75,7 @@ def test_isolated_events_equal_a_loop(rng, monkeypatch):
         near = (np.abs(e.x.astype(int) - x) <= 1) & (np.abs(e.y.astype(int) - y) <= 1)
         near &= (e.t >= t - recording_statistics.ALONE) & (e.t <= t + recording_statistics.ALONE)
         alone.append(near.sum() == 1)
-    got = statistics(Sequence(e))
+    got = sequence_statistics(Sequence(e))
     assert 0.5 < np.mean(alone) < 0.99
     assert got.alone_rate == pytest.approx(np.mean(alone) * 3000 / (40 * 30 * got.duration))
 
@@ -94,7 +94,7 @@ def test_hot_pixels_stand_out_from_those_around_them(rng):
         both = np.concatenate([e.t, extra.t])
         order = np.argsort(both, kind="stable")
         columns = (np.concatenate([getattr(e, k), getattr(extra, k)])[order] for k in "xyp")
-        looked = recording_statistics.survey(Sequence(Events(both[order], *columns, 40, 30)))
+        looked = recording_statistics.survey_sequence(Sequence(Events(both[order], *columns, 40, 30)))
         assert np.argwhere(looked.hot()).tolist() == ([[y, x]] if found else [])
         got = looked.statistics()
         assert got.hot_pixels == found
@@ -107,7 +107,7 @@ def test_hot_pixels_stand_out_from_those_around_them(rng):
 def test_quantiles_of_many_intervals_are_good_to_a_percent(rng, monkeypatch):
     monkeypatch.setattr(interval_statistics, "EXACT", 100)
     seconds = np.concatenate([np.exp(rng.normal(-5, 2, 50_000)), np.zeros(100)])
-    got = Intervals()
+    got = IntervalStatistics()
     for part in np.split(rng.permutation(seconds), 10):
         got.add(part)
     assert got.quantile(0.001) == 0.0
@@ -118,7 +118,7 @@ def test_quantiles_of_many_intervals_are_good_to_a_percent(rng, monkeypatch):
 def test_the_period_of_a_readout_is_found_and_none_where_there_is_none(rng):
     turns = rng.geometric(0.02, 20_000)
     for period, jitter in ((195.16e-6, 1e-6), (50e-6, 2e-6), (1e-3, 0.0)):
-        got = Intervals()
+        got = IntervalStatistics()
         got.add(np.rint((turns * period + rng.normal(0, 1, 20_000) * jitter) * 1e6) / 1e6)
         found, share = got.period()
         assert found == pytest.approx(period, rel=2e-3)
@@ -128,54 +128,56 @@ def test_the_period_of_a_readout_is_found_and_none_where_there_is_none(rng):
         rng.gamma(4, 1e-3, 20_000),
         rng.normal(75e-6, 4e-6, 20_000),
     ):
-        got = Intervals()
+        got = IntervalStatistics()
         got.add(np.rint(np.abs(seconds) * 1e6) / 1e6)
         assert math.isnan(got.period()[0])
 
 
 def test_the_modal_interval(rng):
-    got = Intervals()
+    got = IntervalStatistics()
     got.add(
         np.rint(np.concatenate([rng.exponential(0.01, 9000), rng.normal(75, 2, 1000) * 1e-6]) * 1e6) / 1e6
     )
     assert got.mode() == pytest.approx(75e-6, abs=4e-6)
-    assert math.isnan(Intervals().mode())
+    assert math.isnan(IntervalStatistics().mode())
 
 
 def test_coarse_time_stamps(rng):
     e = some(rng)
     for step, finest in ((1e-3, 1e-3), (195e-6, 195e-6)):
         t = np.sort(np.rint(e.t / step)) * step + 0.25
-        got = statistics(Sequence(replace(e, t=t)))
+        got = sequence_statistics(Sequence(replace(e, t=t)))
         assert got.quantum == pytest.approx(finest)
         assert "coarse" in odd(got)
-    assert "coarse" not in odd(statistics(Sequence(e)))
-    fine = statistics(Sequence(replace(e, t=np.sort(rng.random(len(e))))))
-    assert dict(summary.table(fine))["time stamps"].startswith("finer than 1 µs")
+    assert "coarse" not in odd(sequence_statistics(Sequence(e)))
+    fine = sequence_statistics(Sequence(replace(e, t=np.sort(rng.random(len(e))))))
+    assert dict(summary.statistics_table(fine))["time stamps"].startswith("finer than 1 µs")
 
 
 def test_doubts(rng):
     e = some(rng)
-    none = odd(statistics(Sequence(e)))
+    none = odd(sequence_statistics(Sequence(e)))
     assert set(none) == set()
-    assert set(odd(statistics(Sequence(Events.empty(4, 3))))) == {"empty"}
-    everything_on = odd(statistics(Sequence(replace(e, p=np.ones(len(e), bool)))))
+    assert set(odd(sequence_statistics(Sequence(Events.empty(4, 3))))) == {"empty"}
+    everything_on = odd(sequence_statistics(Sequence(replace(e, p=np.ones(len(e), bool)))))
     assert "100 % of the events are ON" in everything_on["polarity"]
-    narrow = odd(statistics(Sequence(replace(e, width=30, x=e.x + np.uint16(2)))))
+    narrow = odd(sequence_statistics(Sequence(replace(e, width=30, x=e.x + np.uint16(2)))))
     assert narrow["bare"] == "no event in columns 22..29"
     assert narrow["bare"].number == 10
-    late = odd(statistics(Sequence(replace(e, t=e.t + np.where(e.t > 1, 0.5, 0.0)))))
+    late = odd(sequence_statistics(Sequence(replace(e, t=e.t + np.where(e.t > 1, 0.5, 0.0)))))
     assert late["gap"].startswith("no event at all for 50")
     twice = odd(
-        statistics(Sequence(e.select(np.repeat(np.arange(len(e)), 1 + (np.arange(len(e)) % 100 == 0)))))
+        sequence_statistics(
+            Sequence(e.select(np.repeat(np.arange(len(e)), 1 + (np.arange(len(e)) % 100 == 0))))
+        )
     )
     assert twice["duplicate"].number >= 40
     flicker = some(rng, 3000, 3, 3)
     pixel = flicker.y.astype(int) * 3 + flicker.x
     order = np.array([np.count_nonzero(pixel[:k] == pixel[k]) for k in range(3000)])
-    assert "100 %" in odd(statistics(Sequence(replace(flicker, p=order % 2 > 0))))["flips"]
+    assert "100 %" in odd(sequence_statistics(Sequence(replace(flicker, p=order % 2 > 0))))["flips"]
     fast = replace(flicker, t=np.arange(3000) // 2 * 1e-6, x=np.repeat(flicker.x[::2], 2), y=flicker.y * 0)
-    assert "fast" in odd(statistics(Sequence(fast)))
+    assert "fast" in odd(sequence_statistics(Sequence(fast)))
 
 
 def test_doubts_about_frames(rng):
@@ -183,7 +185,7 @@ def test_doubts_about_frames(rng):
     times = np.arange(4) * 0.1
 
     def told(frames=grey, times=times, exposure=None):
-        return set(odd(statistics(Sequence(e, frames, times, frame_exposure=exposure))))
+        return set(odd(sequence_statistics(Sequence(e, frames, times, frame_exposure=exposure))))
 
     assert told(exposure=np.full(4, 0.02)) == set()
     assert told() == {"exposure"}
@@ -199,7 +201,7 @@ def test_a_file_streams_through_the_same(tmp_path, rng):
     notes = []
     seen = []
     got = survey_file(tmp_path / "a.aedat4", notes=notes, progress=seen.append).statistics()
-    want = statistics(io.read(tmp_path / "a.aedat4"))
+    want = sequence_statistics(io.read(tmp_path / "a.aedat4"))
     assert sum(seen) == len(e)
     for name, value in vars(want).items():
         if isinstance(value, float):
@@ -212,7 +214,7 @@ def test_a_file_streams_through_the_same(tmp_path, rng):
 
 def test_memory_does_not_grow_with_the_recording(rng):
     e = some(rng, 100_000, 64, 48)
-    looked = Survey(64, 48)
+    looked = RecordingSurvey(64, 48)
 
     def take(count):
         for _ in range(count):

@@ -10,7 +10,7 @@ from reference.scene_frames import bilinear, blend, film, moving_picture, origin
 import dase
 from dase.kernels import launch, scene_frames
 from dase.scenes.between_frames import TOLERANCE
-from dase.scenes.frame_motion import HOPELESS, stretches
+from dase.scenes.frame_motion import HOPELESS, estimate_stretches
 
 EPS = 1e-3
 
@@ -27,16 +27,16 @@ def rms(error):
 
 @pytest.mark.parametrize("size", [(23, 31), (9, 14)])
 def test_rendering_matches_the_twin(device, rng, size):
-    to = launch.device(device)
+    to = launch.find_device(device)
     frames = rng.random((3, *size), np.float32)
     ahead, back = (np.stack([smooth(rng, size, 3.0) for _ in "01"]) for _ in "ab")  # some lead far outside
     ahead[0, :4] = 0
-    matches = scene_frames.upload(frames, ahead, back, EPS, to)
+    matches = scene_frames.upload_matches(frames, ahead, back, EPS, to)
     y, x = np.mgrid[: size[0], : size[1]].reshape(2, -1)
     pixels = rng.permutation(size[0] * size[1])[:100].astype(np.int32)
     places = np.stack([x, y], 1)[pixels].astype(float)
     interval, share = np.array([0, 0, 1, 1], np.int32), np.array([0.0, 0.3, 0.55, 0.9], np.float32)
-    got = scene_frames.render(matches, pixels, interval, share, EPS, to).numpy()
+    got = scene_frames.render_between(matches, pixels, interval, share, EPS, to).numpy()
     doubts = rng.random((2, 2, *size), np.float32)
     doubted = scene_frames.render_doubt(matches, doubts, pixels, interval, share, to)
     for k, (j, s) in enumerate(zip(interval, share, strict=True)):
@@ -85,11 +85,11 @@ def test_any_pixels_and_chunks_give_the_same(filmed, device, rng):
     times = np.sort(rng.uniform(*scene.times[[0, -1]], 9))
     pixels = rng.permutation(scene.width * scene.height)[:500].astype(np.int32)
     whole = scene.frames(times, device).reshape(9, -1)[:, pixels]
-    name, source = scene.source(times, pixels, launch.device(device))
+    name, source = scene.source(times, pixels, launch.find_device(device))
     assert name == "frames"
     np.testing.assert_array_equal(source.values.numpy(), whole)
     apart = [
-        scene.source(times[k : k + 1], pixels, launch.device(device))[1].values.numpy() for k in range(9)
+        scene.source(times[k : k + 1], pixels, launch.find_device(device))[1].values.numpy() for k in range(9)
     ]
     np.testing.assert_array_equal(np.concatenate(apart), whole)
     doubt = scene.doubt(times, device=device).reshape(9, -1)[:, pixels]
@@ -184,7 +184,7 @@ def test_saturation_and_what_only_one_frame_shows_are_not_trusted(rng):
     assert (strict <= trusted).all()
     np.testing.assert_array_equal(strict[0], scene.doubt(np.linspace(0, 0.04 - 1e-9, 9)).max(0) <= TOLERANCE)
     pixels = np.array([5 * 80 + 30, 22 * 80 + 33], np.int32)
-    at_once = scene.trusts(np.array([-0.01, 0.01, 0.05, 0.09]), pixels)
+    at_once = scene.is_trusted(np.array([-0.01, 0.01, 0.05, 0.09]), pixels)
     np.testing.assert_array_equal(at_once, [[0, 0], [1, 0], [1, 0], [0, 0]])
 
 
@@ -234,7 +234,7 @@ def test_stretches_of_frames_are_found():
     gains, offsets = rng.uniform(0.85, 1.1, len(frames)), rng.uniform(-0.04, 0.04, len(frames))
     light = frames / np.float32(255)
     stretched = np.clip(gains[:, None, None] * light + offsets[:, None, None], 0, 1).astype(np.float32)
-    found = stretches(list(stretched))
+    found = estimate_stretches(list(stretched))
     undone = found[:, :1] * np.stack([gains, offsets], 1) + found[:, 1:] * (0, 1)
     # common gain and offset are free; between neighbours they are not
     levels = undone[:, :1] * (0.3, 0.7) + undone[:, 1:]

@@ -11,7 +11,7 @@ from reference.scene_frames import film, moving_picture
 
 import dase
 from dase.scenes.frame_alignment import FLIPS
-from dase.scenes.frame_motion import stretches
+from dase.scenes.frame_motion import estimate_stretches
 
 
 @pytest.fixture(scope="module")
@@ -166,7 +166,7 @@ def test_camera_shake_frames_lie_on_its_events(shared):
     frames, begin, end = (part[:20] for part in arrays)
     exposed = begin + 0.75 * (end - begin)
     light = frames / np.float32(255)
-    found = dase.align(events, frames, begin, exposed, gains=stretches(list(light)))
+    found = dase.align(events, frames, begin, exposed, gains=estimate_stretches(list(light)))
     check_zero_is_best(found)
     assert found.score > 0.85
 

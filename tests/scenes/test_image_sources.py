@@ -87,7 +87,7 @@ def test_same_random_numbers_give_the_same_pictures_whatever_came_before(source)
         rng = np.random.default_rng(seed)
         return [draw(rng) for draw in (source.foreground, source.background) for _ in range(12)]
 
-    image_sources._read.cache_clear()
+    image_sources._read_picture.cache_clear()
     first = draw(3)
     draw(4)
     for picture in draw(3):  # scribbling on what was handed out must not reach the cache
@@ -102,7 +102,7 @@ def test_cut_outs_carry_the_pixels_of_the_picture(rng):
     y, x = np.mgrid[:80, :120].astype(np.float32)
     grey = (y * 120 + x) / 9600  # every value names its place
     for _ in range(30):
-        picture = image_sources.cut(grey, rng)
+        picture = image_sources.cut_random_shape(grey, rng)
         inside = picture.alpha > 0
         at = np.round(picture.grey * 9600).astype(int)
         rows, columns = np.nonzero(inside)
@@ -199,7 +199,7 @@ def test_builtin_photographs_are_installed_and_a_quarter_is_drawn(rng):
     source = open_images("builtin")
     assert source.name == "builtin"
     for path in source._paths:
-        assert image_sources._read(path).grey.std() > 0.02, path
+        assert image_sources._read_picture(path).grey.std() > 0.02, path
     drawn = sum(source.background(rng).grey.shape == image_sources.DRAWN_SIZE for _ in range(200))
     assert 25 < drawn < 75
 

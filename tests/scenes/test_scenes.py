@@ -167,7 +167,7 @@ def test_sampling_of_a_scene_shorter_than_the_bound(rng):
 
 def test_culling_changes_nothing(device, rng):
     made = scene(rng, layers=9, size=(30, 25))
-    where = launch.device(device)
+    where = launch.find_device(device)
     for times in (np.linspace(0, 0.7, 20), np.array([0.1]), np.array([0.3, 0.31])):
         layers = made.arrays(times, where)
         culled = kernels.render_frames(layers, 30, 25, where).numpy()

@@ -21,7 +21,7 @@ from dase.effects.readout import Readout
 from dase.effects.refractory import Refractory
 from dase.effects.row_scan import RowScan
 from dase.effects.shot import Shot
-from dase.effects.stream import order
+from dase.effects.stream import order_events
 from dase.effects.threshold import Threshold
 from dase.effects.timestamp import Timestamp
 from dase.simulation.sensor_file import parse_sensor
@@ -148,7 +148,7 @@ def test_indices_that_sort(rng):
     columns = [rng.integers(-5, 5, 500) for _ in range(3)]
     wide = [rng.integers(-(2**60), 2**60, 500), columns[0]]  # more than 62 bits together
     for some in (columns, wide, columns[:1], [np.zeros(7, int)], [np.empty(0, int)]):
-        np.testing.assert_array_equal(order(*some), np.lexsort(some[::-1]))
+        np.testing.assert_array_equal(order_events(*some), np.lexsort(some[::-1]))
 
 
 # ---- counting

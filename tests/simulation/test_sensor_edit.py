@@ -10,11 +10,11 @@ import pytest
 from helpers.command_line import dase, one_sentence
 
 from dase import InputError, Sensor, VideoScene, dump_sensor, io, load_sensor, simulate
-from dase.diagnosis.sensor_update import rounded
+from dase.diagnosis.sensor_update import round_parameters
 from dase.effects import EFFECTS
-from dase.simulation.sensor_edit import SensorText, parse_values, today
-from dase.simulation.sensor_file import parse_sensor, presets
-from dase.simulation.sensor_history import Entry
+from dase.simulation.sensor_edit import SensorText, history_entry_today, parse_values
+from dase.simulation.sensor_file import parse_sensor, read_presets
+from dase.simulation.sensor_history import HistoryEntry
 
 MINE = """\
 # my camera
@@ -53,13 +53,13 @@ def kept(before: str, after: str) -> bool:
 @pytest.mark.parametrize("name", EFFECTS)
 @pytest.mark.parametrize("base", ["mine", "davis240c", "imx636"])
 def test_add_then_remove(base, name):
-    text = SensorText(MINE if base == "mine" else presets()[base], base)
+    text = SensorText(MINE if base == "mine" else read_presets()[base], base)
     if name in text.sensor():
         with pytest.raises(InputError, match=f"{base} already has effect '{name}'"):
             text.added(EFFECTS[name]())
         return
     effect = EFFECTS[name]()
-    more = text.added(effect).noted(today(f"add {name}"))
+    more = text.added(effect).noted(history_entry_today(f"add {name}"))
     assert more.sensor() == text.sensor().with_effect(effect)
     assert kept(text.text, more.text)
     less = more.removed(name)
@@ -93,7 +93,7 @@ def test_place_and_comments():
 
 def test_changed_values_keep_their_comments():
     text = SensorText(MINE, "mine")
-    new = text.changed(EFFECTS["threshold"](on=0.3, off=0.22, phase=0.5))
+    new = text.with_values_of(EFFECTS["threshold"](on=0.3, off=0.22, phase=0.5))
     assert new.sensor()["threshold"].on == 0.3
     assert "on   = 0.3       # strange spacing" in new.text
     assert "phase = 0.5" in new.text
@@ -105,28 +105,34 @@ def test_becomes_another_sensor():
     text = SensorText(MINE, "mine")
     want = text.sensor().without("leak").with_effect(EFFECTS["shot"](rate=3.0))
     want = want.with_effect(EFFECTS["refractory"](period=0.002)).with_effect(EFFECTS["threshold"](on=0.3))
-    new = text.became(want)
+    new = text.describing(want)
     assert new.sensor() == want
     assert "period = 0.002    # s" in new.text
     assert "on   = 0.3       # strange spacing" in new.text
-    assert text.became(text.sensor()).text == MINE
+    assert text.describing(text.sensor()).text == MINE
 
 
 def test_rounded():
-    sensor = rounded(Sensor().with_effect(EFFECTS["bandwidth"](cutoff=123.456789, dark=1 / 3)))
+    sensor = round_parameters(Sensor().with_effect(EFFECTS["bandwidth"](cutoff=123.456789, dark=1 / 3)))
     assert (sensor["bandwidth"].cutoff, sensor["bandwidth"].dark) == (123.5, 0.3333)
-    assert rounded(Sensor().with_effect(EFFECTS["bandwidth"](cutoff=float("inf"))))["bandwidth"].is_off()
+    assert round_parameters(Sensor().with_effect(EFFECTS["bandwidth"](cutoff=float("inf"))))[
+        "bandwidth"
+    ].is_off()
 
 
 @pytest.mark.parametrize("newline", ["\n", "\r\n"])
 def test_ends_of_lines_stay(newline):
     text = SensorText(MINE.replace("\n", newline), "mine")
-    for new in (text.added(EFFECTS["shot"]()), text.removed("leak"), text.noted(today("nothing"))):
+    for new in (
+        text.added(EFFECTS["shot"]()),
+        text.removed("leak"),
+        text.noted(history_entry_today("nothing")),
+    ):
         assert new.text.count("\n") == new.text.count(newline)
 
 
 def test_history_stays_at_the_end_and_goes_round():
-    entry = Entry(
+    entry = HistoryEntry(
         did="add shot",
         recording='a "quoted" one.h5',
         error_before=4.5,
@@ -136,10 +142,10 @@ def test_history_stays_at_the_end_and_goes_round():
         date=datetime.date(2021, 2, 3),
     )
     text = SensorText(MINE, "mine").added(EFFECTS["shot"]()).noted(entry)
-    text = text.added(EFFECTS["latency"]()).noted(Entry(did="add latency"))
+    text = text.added(EFFECTS["latency"]()).noted(HistoryEntry(did="add latency"))
     assert text.text.index("[latency]") < text.text.index("[[history]]")
     sensor = text.sensor()
-    assert sensor.history == (entry, Entry(did="add latency"))
+    assert sensor.history == (entry, HistoryEntry(did="add latency"))
     again = parse_sensor(dump_sensor(sensor), "dumped")
     assert again == sensor
     assert again.history == sensor.history

@@ -30,7 +30,7 @@ def draw(out: Path, found: Lines, folder: Path) -> list[tuple[Path, str]]:
     """
     shown = []
     for run in sorted(out.glob("real-*/examples.npz")):
-        _save(training_figure.draw(run.parent)[0], run.with_name("learned.png"))
+        _save(training_figure.draw_training(run.parent)[0], run.with_name("learned.png"))
     if any(name.startswith(tuple(COLOURS)) for name in found):
         shown.append((folder / "adaptation-runs.png", "How runs went, what was learned, sizes of patches"))
         _save(_runs(found), shown[-1][0])

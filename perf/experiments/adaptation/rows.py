@@ -57,7 +57,7 @@ DRAWS = range(6)
 """Seeds of rows with finite data, each with textures of its own: chance is in the draw of those."""
 
 BASELINES = ("esim", "rate", "random")
-"""What a learned sensor is compared with, see `dase.learning.job.baseline`."""
+"""What a learned sensor is compared with, see `dase.learning.job.make_baseline`."""
 
 SIZES = (8, 16, 24, 40, 60, 80)
 LOW = dict(mu=0.1, sigma=0.02)

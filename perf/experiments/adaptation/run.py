@@ -32,14 +32,14 @@ import numpy as np
 import torch
 
 from dase.diagnosis.compare import compare
-from dase.learning.adversarial import Hash
-from dase.learning.baselines import Randomised, constant
-from dase.learning.evaluation import HeldOut
-from dase.learning.job import baseline, write_examples, write_sensor
-from dase.learning.recorded_target import Replayed, open_target, windows_of
-from dase.learning.run import Pace, run
-from dase.learning.scene_batches import Looks, Scenery
-from dase.learning.targets import TRUTHS, Endless, Finite, Pairs, Target, record
+from dase.learning.adversarial import PatchHash
+from dase.learning.baselines import RandomThresholds, constant_thresholds
+from dase.learning.evaluation import HeldOutScore
+from dase.learning.job import make_baseline, write_examples, write_sensor
+from dase.learning.recorded_target import ReplayedScenes, cut_windows, open_target
+from dase.learning.run import RunSchedule, train_in_folder
+from dase.learning.scene_batches import Scenery, SceneSettings
+from dase.learning.targets import TRUTHS, EndlessTarget, FiniteTarget, Pairs, Target, record_pairs
 from dase.learning.training import Recipe, Training
 from dase.networks.threshold_network import NetworkShape
 from dase.recordings.recording import open_recording
@@ -65,7 +65,11 @@ OBJECTS = 8
 def prepare(row: Row, args: argparse.Namespace) -> Training:
     """Return the run of a row."""
     device, pictures, small = args.device, args.images, args.small
-    looks = Looks(regime="mixed") if not small else Looks(regime="mixed", width=96, height=96, samples=12)
+    looks = (
+        SceneSettings(regime="mixed")
+        if not small
+        else SceneSettings(regime="mixed", width=96, height=96, samples=12)
+    )
     recipe: dict[str, Any] = {"steps": 10**6, **row.recipe}
     how, network = dict(row.hash), dict(row.network)
     if small:
@@ -74,7 +78,7 @@ def prepare(row: Row, args: argparse.Namespace) -> Training:
         network |= {"channels": 8, "depth": 2}
         if "pattern" in network:
             network["pattern"] = (96, 96)
-    made = Recipe(hash=Hash(**how), network=NetworkShape(**network), **recipe)
+    made = Recipe(hash=PatchHash(**how), network=NetworkShape(**network), **recipe)
     if row.real:
         target, scenes = open_target([Path(args.recording)], until=LEARNED, device=device)
         return Training(made, target, scenes)
@@ -89,10 +93,10 @@ def prepare(row: Row, args: argparse.Namespace) -> Training:
     )
     ours, theirs = scenery.split(0.5) if row.disjoint else (scenery, scenery)
     seed = recipe.get("seed", 0)
-    target: Target = Endless(theirs, TRUTHS[row.truth](), seed=1000 + seed)
+    target: Target = EndlessTarget(theirs, TRUTHS[row.truth](), seed=1000 + seed)
     if row.finite:
-        pairs = record(target, np.random.default_rng([seed, 77]), row.finite)
-        target = Finite(pairs, augment=row.augment, truth=target.truth)
+        pairs = record_pairs(target, np.random.default_rng([seed, 77]), row.finite)
+        target = FiniteTarget(pairs, augment=row.augment, truth=target.truth)
     return Training(made, target, ours)
 
 
@@ -101,14 +105,14 @@ def judge(row: Row, training: Training, args: argparse.Namespace, folder: Path) 
     recording = open_recording(args.recording)
     recording = recording.masked(~recording.hot)
     later = recording.slice(recording.begin + LEARNED, recording.end)
-    windows = windows_of(later)
-    scenes = Replayed(windows, window=0.05, device=args.device)
+    windows = cut_windows(later)
+    scenes = ReplayedScenes(windows, window=0.05, device=args.device)
     grey = np.exp(windows.log[:, windows.log.shape[1] // 2].astype(np.float32)) - np.float32(1e-3)
     pairs = Pairs(torch.from_numpy(grey).to(args.device), torch.from_numpy(windows.counts).to(args.device))
-    held = HeldOut(scenes, pairs, doubt=0.2)
+    held = HeldOutScore(scenes, pairs, doubt=0.2)
     out: dict[str, Any] = {"trusted": windows.trusted}
     for name in row.judged:
-        net = training.mean if name == "adapted" else baseline(name, training.target, training.scenery)
+        net = training.mean if name == "adapted" else make_baseline(name, training.target, training.scenery)
         out[name] = held.statistics(net)
         sensors = [_drawn(n) for n in range(DRAWN)] if name == "random" else [net]
         errors = [_probes(later, name, one, folder) for one in sensors]
@@ -119,9 +123,9 @@ def judge(row: Row, training: Training, args: argparse.Namespace, folder: Path) 
 
 def _drawn(seed: int) -> Any:
     """Return a sensor that broad randomisation may draw: a recording is of one."""
-    maps = Randomised(seed)(torch.zeros(1, 16, 16))
+    maps = RandomThresholds(seed)(torch.zeros(1, 16, 16))
     mu = float(maps.mu.mean())
-    return constant(mu, float(maps.sigma.mean()), float(maps.ratio))
+    return constant_thresholds(mu, float(maps.sigma.mean()), float(maps.ratio))
 
 
 def _probes(later: Any, name: str, net: Any, folder: Path) -> float:
@@ -155,10 +159,10 @@ def measure(name: str, seconds: float, args: argparse.Namespace) -> dict[str, An
             shown = ("step", "seconds", "distance", "raw_kl", "kl", "kl_active", "mu", "slope", "held_out")
             print(name, " ".join(f"{k}={line[k]:.4g}" for k in shown if k in line), flush=True)
 
-    pace = Pace(seconds=seconds, save=math.inf, look=args.look)
+    pace = RunSchedule(seconds=seconds, save=math.inf, look=args.look)
     folder = Path(args.out) / name
     shutil.rmtree(folder, ignore_errors=True)
-    last = run(training, folder, pace=pace, look=look)
+    last = train_in_folder(training, folder, pace=pace, look=look)
     scored = [line for line in history if "held_out" in line]
     best = min(scored, key=lambda line: line["held_out"]) if scored else last
     if training.step and (row.real or row.truth != "uniform"):

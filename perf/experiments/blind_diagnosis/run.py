@@ -169,10 +169,10 @@ def including(name: str) -> list[str]:
 def missing_cells(job: Job, events: Any, scene: Any, sensor: Any) -> list[list[str]]:
     """Return the cells in which data differ from the truth less what is hidden: where it is to be seen."""
     from dase.diagnosis.cell_descriptions import worst_cells
-    from dase.fitting.data_split import gather
+    from dase.fitting.data_split import split_measurement
     from dase.fitting.model import model_of
 
-    evidence = gather(events, scene, seed=job.case.seed, device=job.device)
+    evidence = split_measurement(events, scene, seed=job.case.seed, device=job.device)
     judgement = model_of(sensor.bound_to(scene)).judge(evidence.held, repeats=24, seed=1)
     return [[c.probe, c.where, c.what] for c in worst_cells(evidence, judgement, shown=1000)]
 

@@ -16,8 +16,8 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.ticker import NullFormatter
 
-from dase.figures.event_images import overlay
-from dase.figures.style import BOTH, INK, QUIET, number
+from dase.figures.event_images import overlay_events
+from dase.figures.style import BOTH, INK, QUIET, format_number
 
 
 def write_page(cameras: Mapping[str, Any], log: Path, out: Path) -> None:
@@ -83,7 +83,7 @@ def table(cameras: Mapping[str, Any], found: Mapping[str, Any]) -> str:
     for name, (what, _) in found.items():
         _, errors, _ = path_of(what)
         lines.append(
-            f"| {name} ({cameras[name].sensor}) | {number(errors[0])} | {number(errors[-1])} | "
+            f"| {name} ({cameras[name].sensor}) | {format_number(errors[0])} | {format_number(errors[-1])} | "
             f"{answer(what)} | {what['seconds']:.0f} s |"
         )
     return "\n".join(lines)
@@ -119,8 +119,8 @@ def plain(facts: dict[str, Any]) -> str:
     f = {k: float(facts[k]) for k in ("events", "seconds", "rate", "on", "shortest", "busiest", "hot")}
     return (
         f"{f['events']:,.0f} events in {f['seconds']:.3g} s, {100 * f['on']:.0f} % of them ON; one in a "
-        f"thousand intervals of a pixel is shorter than {number(1e3 * f['shortest'])} ms; the busiest pixel "
-        f"sends {number(f['busiest'])} events per second; {f['hot']:,.0f} pixels send ten times as "
+        f"thousand intervals of a pixel is shorter than {format_number(1e3 * f['shortest'])} ms; the busiest pixel "
+        f"sends {format_number(f['busiest'])} events per second; {f['hot']:,.0f} pixels send ten times as "
         "many as those around them."
     )
 
@@ -181,7 +181,7 @@ def draw_pictures(axes: Sequence[Axes], facts: Mapping[str, Any], window: float)
         axis.set_xticks([])
         axis.set_yticks([])
         axis.spines[:].set(color=QUIET, linewidth=0.5)
-        axis.imshow(_large(overlay(calm, facts[kind])), interpolation="nearest")
+        axis.imshow(_large(overlay_events(calm, facts[kind])), interpolation="nearest")
         axis.set_title(f"{kind}, {1e3 * window:g} ms", fontsize=8.5, color=QUIET, pad=4)
 
 
@@ -211,7 +211,7 @@ def staircase(axis: Axes, found: dict[str, Any]) -> None:
     for k, error in enumerate(errors):
         below = 0.6 < error < 1  # beside the line of the floor, not on it
         axis.annotate(
-            number(error), (k, error), (0, -12 if below else 4), textcoords="offset points", ha="center",
+            format_number(error), (k, error), (0, -12 if below else 4), textcoords="offset points", ha="center",
             weight="bold", fontsize=9, color=INK if k < sure else QUIET,
         )  # fmt: skip
     axis.set_ylim(0.5 * min(1.0, *errors), 2.2 * max(*errors, gate))

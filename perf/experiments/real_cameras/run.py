@@ -27,7 +27,7 @@ import dase
 import dase.io
 from dase.diagnosis.diagnose import diagnose
 from dase.diagnosis.measurement import Measurement, camera_scene, open_measurement
-from dase.recordings.statistics import Survey
+from dase.recordings.statistics import RecordingSurvey
 from dase.scenes.frame_alignment import align
 from dase.simulation.simulate import stream
 from perf.benchmarks.kernels import commit
@@ -93,7 +93,7 @@ def without_times(path: Path) -> Measurement:
     ]
     begin = times + found.offset if "offset" not in found.clear else begin
     scene = camera_scene(frames, begin, begin, notes)
-    return Measurement(events, scene, scene.trusts, tuple(notes))
+    return Measurement(events, scene, scene.is_trusted, tuple(notes))
 
 
 def from_histograms(path: Path, seconds: float = 2.0, side: int = 50) -> Measurement:
@@ -245,9 +245,9 @@ def look(name: str, path: Path, options: argparse.Namespace) -> None:
     found = measured.noted(found)
     (options.log / f"{name}.json").write_text(json.dumps(found.to_json() | {"commit": options.commit}))
     np.savez_compressed(options.log / f"{name}.npz", **pictures(camera, measured, found.sensor))
-    from dase.diagnosis.diagnose import summary
+    from dase.diagnosis.diagnose import summary_line
 
-    print(f"{name}: {found.seconds:.0f} s, {summary(found)}", flush=True)
+    print(f"{name}: {found.seconds:.0f} s, {summary_line(found)}", flush=True)
     for step in found.history:
         ranks = ", ".join(f"{r.effect} {r.error:.2f}" for r in step.ranking[:5])
         print(f"    {step.error:6.2f} gate {step.gate:4.2f} {step.chosen} [{ranks}]", flush=True)
@@ -272,7 +272,7 @@ def pictures(camera: Camera, measured: Measurement, sensor: dase.Sensor) -> dict
     order = np.lexsort((events.t, pixel))
     gaps = np.diff(events.t[order])[np.diff(pixel[order]) == 0]
     counts = np.bincount(pixel, minlength=events.width * events.height)
-    looked = Survey(events.width, events.height)
+    looked = RecordingSurvey(events.width, events.height)
     looked.events(events)
     return {
         "measured": events.counts(edges)[0], "simulated": simulated.counts(edges)[0], "grey": grey,
