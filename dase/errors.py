@@ -14,7 +14,15 @@ class InputError(ValueError):
     """A file, option or value that dase cannot work with.
 
     The message names the thing, the rule and the value. The command line prints it and exits with 2.
+
+    Args:
+        message: One sentence for the user.
+        argument: The argument that cures it, where there is one; a command names its option of that name.
     """
+
+    def __init__(self, message: str = "", *, argument: str | None = None):
+        super().__init__(message)
+        self.argument = argument
 
 
 def nearest(name: str, known: Iterable[str]) -> str:

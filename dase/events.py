@@ -18,7 +18,7 @@ hot pixel. An ON event is the leak's when, since the pixel's memory was last set
 to the threshold than the light did."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Events:
     """A stream of events of one sensor, sorted by time.
 
@@ -53,6 +53,13 @@ class Events:
 
     def __len__(self) -> int:
         return len(self.t)
+
+    def __repr__(self) -> str:
+        size = f"{self.width}x{self.height}"
+        if not len(self):
+            return f"Events(none of {size} pixels)"
+        span = f"{self.t[0]:.6g} s to {self.t[-1]:.6g} s"
+        return f"Events({len(self)} of {size} pixels, {span}, {100 * self.p.mean():.0f} % ON)"
 
     @classmethod
     def empty(cls, width: int, height: int) -> Events:

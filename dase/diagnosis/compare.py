@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import time
+from os import PathLike
 
 import numpy as np
 from numpy.typing import NDArray
 
 from dase.diagnosis.cell_descriptions import band_in_words, worst_cells
-from dase.events import Events
+from dase.diagnosis.settings import DEFAULTS, DiagnosisSettings
 from dase.fitting.batch_simulator import LAG_TIMES
 from dase.fitting.data_split import PIXELS, SplitMeasurement, split_measurement
+from dase.fitting.measurement import Measured, SceneChoice, as_measurement
 from dase.fitting.model import model_of
 from dase.fitting.subset import PixelSubset
 from dase.kernels.event_probes import BANDS, INTERVALS, KINDS, LAGS, RESTING
@@ -18,38 +20,38 @@ from dase.probes.distance import Judgement
 from dase.probes.statistics import LAYOUT
 from dase.probes.stimulus import Trust
 from dase.results import Comparison, Curve, Progress
-from dase.scenes.scene import Scene
 from dase.simulation.sensor import Sensor
+from dase.simulation.sensor_file import as_sensor
 
 Array = NDArray[np.float64]
 
-REPEATS = 60
-"""Simulations with other seeds that tell what chance does."""
-
 
 def compare(
-    events: Events,
-    scene: Scene,
-    sensor: Sensor,
+    measured: Measured,
+    sensor: Sensor | str | PathLike[str],
     *,
+    scene: SceneChoice | None = None,
     trust: Trust | None = None,
     pixels: int = PIXELS,
     seed: int = 0,
     device: str = "cpu",
     progress: Progress | None = None,
+    settings: DiagnosisSettings = DEFAULTS,
 ) -> Comparison:
     """Compare a model with a measurement, as it is: nothing is fitted.
 
     Args:
-        events: What was measured.
-        scene: What the camera saw, on the clock of the events.
-        sensor: The model.
+        measured: A recording or its path, a `Measurement`, or events; see `as_measurement`.
+        sensor: The model, a preset's name, or the path of a sensor file.
+        scene: What the camera saw, on the clock of the events: a scene, a clip's path, or `static` for light
+            that does not change. None for the frames of the recording; events alone need one.
         trust: Where and when the scene is to be trusted; None for everywhere, and for what a
             `CameraScene` trusts of itself.
         pixels: In each half of the measurement.
         seed: Of every random number.
         device: Where kernels run.
         progress: Told how far it is.
+        settings: Of which the number of repeats is taken.
 
     Raises:
         InputError: Measurement and scene do not fit, or there is too little to say anything.
@@ -57,14 +59,18 @@ def compare(
     begin = time.perf_counter()
     tell = progress or (lambda text, share, error: None)
     tell("reading the measurement", 0.0, float("nan"))
-    sensor = sensor.bound_to(scene)
+    model = as_sensor(sensor)
+    measurement = as_measurement(measured, scene, trust)
+    model = model.bound_to(measurement.scene)
     evidence = split_measurement(
-        events, scene, log_eps=sensor.log_eps, trust=trust, pixels=pixels, seed=seed, device=device
-    )
+        measurement.events, measurement.scene, log_eps=model.log_eps, trust=measurement.trust,
+        pixels=pixels, seed=seed, device=device,
+    )  # fmt: skip
     tell("simulating", 0.3, float("nan"))
-    judgement = model_of(sensor).judge(evidence.held, repeats=REPEATS, seed=seed + 500)
+    judgement = model_of(model).judge(evidence.held, repeats=settings.repeats, seed=seed + 500)
     tell("comparing", 1.0, judgement.error)
-    return comparison_of(evidence, judgement, sensor, seconds=time.perf_counter() - begin)
+    found = comparison_of(evidence, judgement, model, seconds=time.perf_counter() - begin)
+    return measurement.noted(found)
 
 
 def comparison_of(

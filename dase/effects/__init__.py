@@ -73,6 +73,7 @@ def find_effect(name: str, effects: Mapping[str, type[Effect]] = EFFECTS) -> typ
     """Return the effect of this name; raises InputError with the nearest known name."""
     if name not in effects:
         raise InputError(
-            f"there is no effect '{name}': {nearest(name, effects)} (your own needs --effects FILE)"
+            f"there is no effect '{name}': {nearest(name, effects)} (your own needs its file)",
+            argument="effects",
         )
     return effects[name]

@@ -201,7 +201,9 @@ class BatchSimulator:
     def _models_at_once(self) -> int:
         """Return how many models there is room for."""
         count, group = len(self.stimulus.pixels), self._pixels_per_sum()
-        numbers = -(-count // group) * kernels.SIZE + -(-count // GROUP) * 2 * self.stimulus.grid.steps
+        numbers = (
+            -(-count // group) * kernels.SumPlace.SIZE + -(-count // GROUP) * 2 * self.stimulus.grid.steps
+        )
         return max(1, ROOM[self._kind] // (4 * (numbers + count * (kernels.MEMORY + kernels.HALVES))))
 
     def _kernel(self, sensor: Sensor) -> tuple[wp.Kernel, NDArray[np.float32], list[int]]:
@@ -314,7 +316,7 @@ class BatchSimulator:
         groups = -(-count // out.group)
         if not self.device.is_cuda:
             out.queue = wp.empty((groups, kernels.QUEUE), dtype=wp.int64, device=self.device)
-        out.sums = wp.zeros((rows, groups, kernels.SIZE), dtype=float, device=self.device)
+        out.sums = wp.zeros((rows, groups, kernels.SumPlace.SIZE), dtype=float, device=self.device)
         out.team, teams = GROUP, -(-count // GROUP)
         out.clock = wp.zeros((rows, teams, 2 * stimulus.grid.steps), dtype=int, device=self.device)
         return out

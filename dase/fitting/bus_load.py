@@ -14,9 +14,8 @@ from dase.effects.stream import StreamEffect, to_nanoseconds
 from dase.events import Events
 from dase.probes.stimulus import Stimulus
 from dase.scenes.scene import Scene
-from dase.simulation.pixel_array import PixelArray
 from dase.simulation.sensor import Sensor
-from dase.simulation.simulate import CHUNK, chunks
+from dase.simulation.sensor_run import SensorRun
 
 MOST = 2.5e7
 """Pixels times points of time that are simulated: of a larger sensor or a longer time, some pixels stand for
@@ -75,12 +74,9 @@ class WholeSensor:
 
     def emitted(self, sensor: Sensor, pixels: NDArray[np.int32], steps: int) -> Events:
         """Return what leaves some pixels up to a point of time, from time 0."""
-        array = PixelArray(
-            sensor, self.scene.width, self.scene.height, pixels=pixels, seed=self.seed, device=self.device
-        )
-        size = CHUNK["cuda" if array.device.is_cuda else "cpu"]
-        parts = [array.emit(self.scene, times)[0] for times in chunks(self.times[:steps], size)]
-        events = Events.concatenate([*parts, array.flush()[0]])
+        (events,) = SensorRun(
+            self.scene, sensor, times=self.times[:steps], pixels=pixels, seed=self.seed, device=self.device
+        ).events()
         return replace(events, t=events.t - float(self.times[0]))
 
 

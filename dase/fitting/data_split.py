@@ -230,7 +230,9 @@ def _make_subset(
 
 def typical_changes(sums: ProbeSums) -> NDArray[np.float32]:
     """Return the mean change of the light between two events by polarities and interval, (4 CLASSES,)."""
-    pairs = sums.sums[0, kernels.CHANGE : kernels.CHANGE + 12 * kernels.CLASSES].reshape(-1, 3)
+    pairs = sums.sums[0, kernels.SumPlace.CHANGE : kernels.SumPlace.CHANGE + 12 * kernels.CLASSES].reshape(
+        -1, 3
+    )
     return (pairs[:, 1] / np.maximum(pairs[:, 0], 1)).astype(np.float32)
 
 

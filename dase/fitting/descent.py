@@ -220,7 +220,7 @@ def robust_step(scale: ErrorScale, values: Array, slope: Array, offset: Array) -
 def ranking_work(
     half: PixelSubset, space: ParameterSpace, starts: Sequence[Array] | Array, *, seed: int
 ) -> Work[tuple[Array, Array]]:
-    """Return places in order of their loss, and the losses, see `together`."""
+    """Return places in order of their loss, and the losses, see `scheduler`."""
     places = np.atleast_2d(np.asarray(starts))
     (values,) = yield [SimulationRequest(half, space, places, seed)]
     losses = half.scale.loss(values)

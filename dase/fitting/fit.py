@@ -5,19 +5,20 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from os import PathLike
 
 import numpy as np
 
-from dase.events import Events
 from dase.fitting.confidence_intervals import estimate_parameters
 from dase.fitting.data_split import PIXELS, SplitMeasurement, split_measurement
+from dase.fitting.measurement import Measured, SceneChoice, as_measurement
 from dase.fitting.model import FittedModel, fit_present_model, model_of, refit_model
 from dase.fitting.parameter_space import SearchAxis
 from dase.probes.distance import Judgement
 from dase.probes.stimulus import Trust
 from dase.results import Estimate, Fit, Progress
-from dase.scenes.scene import Scene
 from dase.simulation.sensor import Sensor
+from dase.simulation.sensor_file import as_sensor
 
 REPEATS = 60
 """Simulations with other seeds that tell what chance does."""
@@ -36,10 +37,10 @@ NEAR = 0.08
 
 
 def fit(
-    events: Events,
-    scene: Scene,
-    sensor: Sensor,
+    measured: Measured,
+    sensor: Sensor | str | PathLike[str],
     *,
+    scene: SceneChoice | None = None,
     free: Sequence[str] | None = None,
     trust: Trust | None = None,
     pixels: int = PIXELS,
@@ -50,9 +51,10 @@ def fit(
     """Fit the parameters of a sensor to a measurement.
 
     Args:
-        events: What was measured.
-        scene: What the camera saw, on the clock of the events.
-        sensor: Its effects are fitted; nothing is added.
+        measured: A recording or its path, a `Measurement`, or events; see `as_measurement`.
+        sensor: Its effects are fitted, nothing is added: a sensor, a preset's name, or a sensor file's path.
+        scene: What the camera saw, on the clock of the events: a scene, a clip's path, or `static` for light
+            that does not change. None for the frames of the recording; events alone need one.
         free: Effects or `effect.parameter` that are fitted; None for all.
         trust: Where and when the scene is to be trusted; None for everywhere, and for what a
             `CameraScene` trusts of itself.
@@ -66,14 +68,17 @@ def fit(
     """
     begin = time.perf_counter()
     tell = progress or (lambda text, share, error: None)
-    model_of(sensor, free)  # refuses names that are not there before anything takes time
-    sensor = sensor.bound_to(scene)
+    start = as_sensor(sensor)
+    model_of(start, free)  # refuses names that are not there before anything takes time
+    measurement = as_measurement(measured, scene, trust)
+    start = start.bound_to(measurement.scene)
     evidence = split_measurement(
-        events, scene, log_eps=sensor.log_eps, trust=trust, pixels=pixels, seed=seed, device=device
-    )
-    given = model_of(sensor, free)
+        measurement.events, measurement.scene, log_eps=start.log_eps, trust=measurement.trust,
+        pixels=pixels, seed=seed, device=device,
+    )  # fmt: skip
+    given = model_of(start, free)
     before = given.judge(evidence.held, repeats=REPEATS // 2, seed=seed + 500).error
-    ends = _descend_from_starts(evidence, sensor, free, seed, lambda text, share: tell(text, share, before))
+    ends = _descend_from_starts(evidence, start, free, seed, lambda text, share: tell(text, share, before))
     judgement, model = _best_end(ends)
     tell("confidence intervals", 0.9, judgement.error)
     good = _equally_good_models(ends)
@@ -86,7 +91,7 @@ def fit(
         *notes_on_implausible_values(model),
         *_notes_on_minimum(judgement, len(ends), len(good)),
     ]
-    return Fit(
+    found = Fit(
         sensor=model.sensor,
         parameters=values,
         error=judgement.error,
@@ -99,6 +104,7 @@ def fit(
         evaluations=evidence.evaluations,
         seconds=time.perf_counter() - begin,
     )
+    return measurement.noted(found)
 
 
 Ends = list[tuple[Judgement, FittedModel]]

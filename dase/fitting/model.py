@@ -207,7 +207,8 @@ def refit_work(
     half: PixelSubset | None = None,
     over: StopRule | None = None,
 ) -> Work[FittedModel]:
-    """Do what `refit_model` does, see `run_side_by_side`; `half` is the training half if the model is its present one."""
+    """Do what `refit_model` does, see `run_side_by_side`; `half` is the training half if the model is its
+    present one."""
     for turn in range(rounds):
         if half is None or turn > 0:
             half = evidence.train.view()

@@ -173,7 +173,7 @@ def axes_of(sensor: Sensor, names: Iterable[str] | None = None) -> tuple[SearchA
         found = [n for n in every if n == name or (n.split(".")[0] == name and n not in FIXED)]
         if not found:
             known = [*every, *(e.name for e in sensor.effects)]
-            raise InputError(f"--free: the sensor has no parameter '{name}': {nearest(name, known)}")
+            raise InputError(f"free: the sensor has no parameter '{name}': {nearest(name, known)}")
         chosen += found
     return tuple(every[n] for n in every if n in chosen)
 

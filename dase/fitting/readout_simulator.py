@@ -21,9 +21,8 @@ from dase.kernels import launch, pixel_stages
 from dase.probes.stimulus import Stimulus
 from dase.probes.timestamp_patterns import TimestampStructure
 from dase.scenes.scene import Scene
-from dase.simulation.pixel_array import PixelArray
-from dase.simulation.readout_chain import split_by_row
 from dase.simulation.sensor import Sensor
+from dase.simulation.sensor_run import SensorRun
 
 ROOM = {"cpu": 2048, "cuda": 64}
 """Events per pixel that there is room for: a model that sends more is run again. On a CPU room costs nothing
@@ -44,7 +43,7 @@ def noticeable_effects(
     fine = FELT * stimulus.grid.step
     lines = max(stimulus.width, stimulus.height)
     compared = structure.step > 0 or structure.line > 0
-    return tuple(e for e in sensor.streams() if compared or delay_of(e, lines) > fine)
+    return tuple(e for e in sensor.readout_effects() if compared or delay_of(e, lines) > fine)
 
 
 def clock_of(effects: tuple[StreamEffect, ...], structure: TimestampStructure) -> float | None:
@@ -70,16 +69,11 @@ def simulate_pixels(
     kind = "cuda" if stimulus.device.is_cuda else "cpu"
 
     def out(rows: slice) -> list[Events]:
-        array = PixelArray(
-            bare, stimulus.width, stimulus.height, pixels=stimulus.pixels, parameters=vectors[rows],
-            seed=int(seeds[rows.start]), device=str(stimulus.device), room=ROOM[kind],
-        )  # fmt: skip
-        scene = _StimulusScene(stimulus)
-        parts = [
-            split_by_row(*found, array.batch) for found in (array.emit(scene, scene.times), array.flush())
-        ]
-        # hardly any effect holds events back
-        return [Events.concatenate(row) if len(row[1]) else row[0] for row in zip(*parts, strict=True)]
+        return SensorRun(
+            _StimulusScene(stimulus), bare, pixels=stimulus.pixels, parameters=vectors[rows],
+            seed=int(seeds[rows.start]), device=str(stimulus.device), events_per_pixel=ROOM[kind],
+            chunk=stimulus.grid.steps,
+        ).events()  # fmt: skip
 
     if kind == "cuda" and np.all(seeds == seeds[0]):
         return out(slice(0, len(seeds)))

@@ -1,8 +1,8 @@
 """Work that asks for simulations, done side by side: what is asked for at the same time runs in one launch.
 
 A search, a fit, a judgement is a generator: it yields what it wants simulated, gets the answers, and goes on.
-`run_side_by_side` runs as many of them as there are, step by step. Rows of a launch do not know of each other, so the
-sums are those that each would get alone, to the bit, and the statistics but for rounding.
+`run_side_by_side` runs as many of them as there are, step by step. Rows of a launch do not know of each
+other, so the sums are those that each would get alone, to the bit, and the statistics but for rounding.
 """
 
 from __future__ import annotations

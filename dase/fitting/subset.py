@@ -52,7 +52,7 @@ class PixelSubset:
     chance: ErrorScale = field(init=False)
     seen: ErrorScale = field(init=False)
     off: Array = field(init=False)
-    simulated: Array = field(init=False)
+    answer_requests: Array = field(init=False)
     left: Array = field(init=False)
 
     def view(self) -> PixelSubset:

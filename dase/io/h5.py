@@ -43,10 +43,12 @@ BLOCK = 4 * CHUNK  # events gathered before they are written
 #   gzip-1 + shuffle  4.1 /  6.1          90-115                    355-500
 # lzf would be twice as fast, but reads its hash table uninitialised: the same events give files that differ
 # by some bytes. Smooth flow shrinks by 4.3. Frames do not shrink. Whole chunks go past HDF5's own filter, to
-# ISA-L (`deflate_bytes`), which makes the same kind of stream, of about the same size, six to nine times as fast.
+# ISA-L (`deflate_bytes`), which makes the same kind of stream, of about the same size, six to nine times as
+# fast.
 COMPRESSION: dict[str, Any] = {"compression": "gzip", "compression_opts": 1, "shuffle": True}
 
-HEAD = 4  # bytes that `deflate_bytes` flushes on their own: enough for a first entry of the hash table, at most 16
+HEAD = 4
+"""Bytes that `deflate_bytes` flushes on their own: enough for a first entry of the hash table, at most 16."""
 
 LATE = -1  # marks a frame that came after later events had been written
 

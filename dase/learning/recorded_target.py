@@ -19,7 +19,7 @@ from dase.errors import InputError
 from dase.learning.scene_batches import LOG_EPS, Scenery, SceneSettings
 from dase.learning.targets import FiniteTarget, Pairs
 from dase.recordings.recording import Recording, open_recording
-from dase.scenes.between_frames import TOLERANCE, CameraScene
+from dase.scenes.between_frames import CameraScene, TrustSettings
 from dase.scenes.frame_motion import estimate_stretches, is_stretched
 
 FEWEST = 0.005
@@ -51,8 +51,10 @@ def cut_windows(
     *,
     window: float = 0.05,
     samples: int = 16,
-    tolerance: float = TOLERANCE,
+    tolerance: float = TrustSettings.tolerance,
     most: int | None = None,
+    memory: int = 1 << 31,
+    fewest: float = 0.005,
     progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> RecordedWindows:
     """Cut a recording into windows.
@@ -62,7 +64,9 @@ def cut_windows(
         window: Duration [s].
         samples: Of the log intensity, in a window.
         tolerance: Doubt up to which a scene is trusted [log intensity].
-        most: Windows, evenly chosen; None for as many as fit into memory.
+        most: Windows, evenly chosen; None for as many as fit into `memory`.
+        memory: For the windows' log intensities [bytes]; of a longer recording only some windows are used.
+        fewest: Events per pixel and window below which nothing can be learned.
         progress: Called with how many windows are done, and of how many.
 
     Raises:
@@ -76,7 +80,7 @@ def cut_windows(
             f"{4 * window:g} s"
         )
     size = 2 * samples * recording.height * recording.width
-    most = min(most or len(begin), max(ROOM // size, 4))
+    most = min(most or len(begin), max(memory // size, 4))
     begin = begin[np.unique(np.round(np.linspace(0, len(begin) - 1, min(most, len(begin)))).astype(int))]
     log = np.empty((len(begin), samples, recording.height, recording.width), np.float16)
     counts = np.empty((len(begin), 2, recording.height, recording.width), np.float32)
@@ -90,10 +94,10 @@ def cut_windows(
         kept += float(trusted.mean()) / len(begin)
         progress(n + 1, len(begin))
     rate = float(counts.sum((1, 2, 3)).mean()) / (recording.height * recording.width)
-    if rate < FEWEST:
+    if rate < fewest:
         raise InputError(
             f"the recording has {rate:.2g} events per pixel in windows of {window:g} s where its frames can "
-            f"be trusted; learning needs at least {FEWEST:g}"
+            f"be trusted; learning needs at least {fewest:g}"
         )
     return RecordedWindows(begin, log, counts, kept)
 

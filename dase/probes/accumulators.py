@@ -136,7 +136,7 @@ def fold_counts(pixels: Any, frames: Sequence[StatisticsFrame], which: NDArray[n
     rows, count, _ = pixels.shape
     groups, to, frame = -(-count // GROUP), pixels.device, frames[0]
     expected = np.stack([f.expected for f in frames]).astype(np.float32)
-    out = wp.empty((rows, groups, kernels.FOLD), dtype=float, device=to)
+    out = wp.empty((rows, groups, kernels.FoldPlace.SIZE), dtype=float, device=to)
     inputs = [
         pixels, wp.array(expected, device=to), wp.array(which.astype(np.int32), device=to),
         wp.array(frame.zone.astype(np.int32), device=to), 15.0 * frame.seconds, SEEN, GROUP, out,

@@ -18,20 +18,12 @@ from dase.events import Events
 from dase.kernels.event_probes import (
     BANDS,
     CELLS,
-    CHANGE,
     CLASSES,
     INTERVALS,
-    ISI,
-    LAG,
-    LAG_COUNT,
     LAGS,
-    ODD,
-    PRODUCTS,
-    RATE,
-    REPEAT,
-    RINGS,
-    SERIAL,
     ZONES,
+    FoldPlace,
+    SumPlace,
 )
 from dase.probes.accumulators import ProbeSums, ProbeTotals, StatisticsFrame, compute_totals
 
@@ -116,17 +108,23 @@ def compute_statistics(found: ProbeSums | ProbeTotals, frame: StatisticsFrame) -
     """
     of = compute_totals(found, frame) if isinstance(found, ProbeSums) else found
     a = of.sums
-    odd = of.folded[:, ODD : ODD + 4]
+    odd = of.folded[:, FoldPlace.ODD : FoldPlace.ODD + 4]
     parts = [
-        _log_counts(a[:, RATE : RATE + 2 * CELLS]),
-        _log_counts(a[:, ISI : ISI + 6 * INTERVALS]),
-        _event_means(a[:, LAG : LAG + LAGS * BANDS], np.tile(a[:, LAG_COUNT : LAG_COUNT + BANDS], LAGS)),
-        _repeat_shares(a[:, REPEAT : REPEAT + 3 * BANDS].reshape(-1, BANDS, 3)),
-        _change_moments(a[:, CHANGE : CHANGE + 12 * CLASSES].reshape(-1, 4 * CLASSES, 3), a[:, SERIAL:]),
-        _count_spread(of.folded[:, PRODUCTS : PRODUCTS + 12], of.expected),
+        _log_counts(a[:, SumPlace.RATE : SumPlace.RATE + 2 * CELLS]),
+        _log_counts(a[:, SumPlace.ISI : SumPlace.ISI + 6 * INTERVALS]),
+        _event_means(
+            a[:, SumPlace.LAG : SumPlace.LAG + LAGS * BANDS],
+            np.tile(a[:, SumPlace.LAG_COUNT : SumPlace.LAG_COUNT + BANDS], LAGS),
+        ),
+        _repeat_shares(a[:, SumPlace.REPEAT : SumPlace.REPEAT + 3 * BANDS].reshape(-1, BANDS, 3)),
+        _change_moments(
+            a[:, SumPlace.CHANGE : SumPlace.CHANGE + 12 * CLASSES].reshape(-1, 4 * CLASSES, 3),
+            a[:, SumPlace.SERIAL :],
+        ),
+        _count_spread(of.folded[:, FoldPlace.PRODUCTS : FoldPlace.PRODUCTS + 12], of.expected),
         _log_counts(odd[:, :3]),
         _log_counts(odd[:, 3:]),
-        _log_counts(of.folded[:, RINGS:]),
+        _log_counts(of.folded[:, FoldPlace.RINGS :]),
         _rate_spectrum(of.clock, frame),
         (of.stamps, np.full(of.stamps.shape, 1e9 if frame.regular else 0.0)),
     ]

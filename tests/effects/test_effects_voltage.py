@@ -128,7 +128,7 @@ def noise_rates(
 @wp.kernel(enable_backward=False)
 def points(turn: wp.array[float], out: wp.array2d[float]):
     i = wp.tid()
-    cosine, sine = voltage_noise.circle(turn[i])
+    cosine, sine = voltage_noise.cosine_and_sine(turn[i])
     out[i, 0] = cosine
     out[i, 1] = sine
 

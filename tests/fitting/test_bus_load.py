@@ -85,7 +85,7 @@ def test_others_take_as_much_time_as_what_they_stand_for(rng, weight):
 def busy(half, true, load) -> np.ndarray:
     """Return the events of each 3 ms in the mean over 16 repeats, and those that were measured, (2, K)."""
     order = SimulationOrder(true, np.repeat(true.parameters()[None], 16, 0), 9, reseed=True)
-    model = half.trials.simulate_streams(order, [true.streams()] * 16, load).clock.mean(0)
+    model = half.trials.simulate_streams(order, [true.readout_effects()] * 16, load).clock.mean(0)
     both = np.stack([model, half.found.clock[0]]).reshape(2, 2, -1).sum(1)
     return np.add.reduceat(both, np.arange(0, both.shape[1], 3), axis=1)
 

@@ -5,12 +5,14 @@ from __future__ import annotations
 from dataclasses import replace
 
 from dase.learning import scene_batches
-from dase.learning.adversarial import PatchHash
+from dase.learning.adversarial import AdversarialSettings, PatchHash
+from dase.learning.job import compose_training
+from dase.learning.recipe import Recipe
 from dase.learning.targets import (
     TRUTHS,
     EndlessTarget,
 )
-from dase.learning.training import Recipe, Training
+from dase.learning.training import Training
 from dase.networks.threshold_network import NetworkShape
 from dase.scenes import image_sources
 
@@ -28,10 +30,11 @@ def small_scenes() -> scene_batches.Scenery:
 def a_run(scenes: scene_batches.Scenery, **changes) -> Training:
     recipe = Recipe(objective="moments", steps=40, warmup=6, batch=4, ramp=5, network=TINY, rate=1e-4)
     target = EndlessTarget(scenes, TRUTHS["uniform"](), seed=9)
-    return Training(replace(recipe, **changes), target, scenes)
+    return compose_training(replace(recipe, **changes), target, scenes)
 
 
-WGAN = dict(objective="wgan", anchor=5.0, hash=PatchHash(size=16, orientations=2, coherence=1, contrast=2))
+CRITICS = AdversarialSettings(hash=PatchHash(size=16, orientations=2, coherence=1, contrast=2))
+WGAN = dict(objective="wgan", anchor=5.0, adversarial=CRITICS)
 
 
 def a_fake(training):

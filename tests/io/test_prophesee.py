@@ -80,10 +80,10 @@ def test_evt3_word_by_word(tmp_path):
 def test_evt3_equals_its_twin_on_random_words_whatever_is_decoded_at_once(tmp_path, rng, monkeypatch, part):
     monkeypatch.setattr(evt3, "PART", part)
     kinds = rng.choice(
-        [0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 14, 15], 1500, p=np.array([4, 1, 6, 3, 6, 6, 8, 1, 2, 1, 1, 1]) / 40
+        [0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 14, 15], 3000, p=np.array([4, 1, 6, 3, 6, 6, 8, 1, 2, 1, 1, 1]) / 40
     )
-    values = rng.integers(0, 4096, 1500)
-    steps = np.cumsum(rng.integers(0, 1500, 1500))  # TIME_HIGH starts over often
+    values = rng.integers(0, 4096, 3000)
+    steps = np.cumsum(rng.integers(0, 1500, 3000))  # TIME_HIGH starts over often
     values[kinds == 8] = steps[kinds == 8] & 4095
     words = (kinds << 12 | values).astype("<u2")
     want = evt3_twin(words)

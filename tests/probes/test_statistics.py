@@ -48,8 +48,8 @@ def evidence(events, scene, device):
 
 
 def reference(events, stimulus, middle) -> np.ndarray:
-    """Add up what `observe` adds up, event by event."""
-    step, out = stimulus.grid.step, np.zeros(kernels.SIZE)
+    """Add up what `observe_event` adds up, event by event."""
+    step, out = stimulus.grid.step, np.zeros(kernels.SumPlace.SIZE)
     lags = np.rint(np.array(LAG_TIMES) / step).astype(int)
     ends = np.rint(np.array(CLASS_TIMES) / step).astype(int)
     level, last = stimulus.level, stimulus.grid.steps - 1
@@ -64,27 +64,35 @@ def reference(events, stimulus, middle) -> np.ndarray:
             cell, apart = int(stimulus.cell[i, k]), None
             if cell != kernels.MASKED:
                 kind, band = divmod(cell, kernels.BANDS)
-                out[kernels.RATE + p * kernels.CELLS + cell] += 1
+                out[kernels.SumPlace.RATE + p * kernels.CELLS + cell] += 1
                 if kind >= kernels.RESTING:
                     seen = level[i, np.clip(k - lags, 0, last)]
-                    out[kernels.LAG + np.arange(kernels.LAGS) * kernels.BANDS + band] += (
+                    out[kernels.SumPlace.LAG + np.arange(kernels.LAGS) * kernels.BANDS + band] += (
                         2 * p - 1
                     ) * -np.diff(seen)
-                    out[kernels.LAG_COUNT + band] += 1
+                    out[kernels.SumPlace.LAG_COUNT + band] += 1
                 broken = stimulus.holes and (stimulus.cell[i, before:k] == kernels.MASKED).any()
                 if before >= 0 and not broken:
                     gap = k - before
                     octave = 0 if gap == 0 else min(int(np.ceil(np.log2(gap))) + 1, kernels.INTERVALS - 1)
                     kin = p if p == polarity else 2
-                    out[kernels.ISI + (3 * (kind < kernels.RESTING) + kin) * kernels.INTERVALS + octave] += 1
+                    out[
+                        kernels.SumPlace.ISI
+                        + (3 * (kind < kernels.RESTING) + kin) * kernels.INTERVALS
+                        + octave
+                    ] += 1
                     group = int(gap > ends[0]) + int(gap > ends[1])
                     pair = (2 * p + polarity) * kernels.CLASSES + group
                     change = (2 * p - 1) * (level[i, k] - level[i, before])
                     apart = np.clip(change - middle[pair], -1, 1)
-                    out[kernels.CHANGE + 3 * pair + np.arange(3)] += 1, change, abs(change - middle[pair])
+                    out[kernels.SumPlace.CHANGE + 3 * pair + np.arange(3)] += (
+                        1,
+                        change,
+                        abs(change - middle[pair]),
+                    )
                     if deviation is not None:
-                        out[kernels.SERIAL + 2 * group + np.arange(2)] += 1, apart * deviation
-                out[kernels.REPEAT + 3 * band + np.arange(min(run, 3))] += 1
+                        out[kernels.SumPlace.SERIAL + 2 * group + np.arange(2)] += 1, apart * deviation
+                out[kernels.SumPlace.REPEAT + 3 * band + np.arange(min(run, 3))] += 1
             before, polarity, deviation = k, p, apart
     return out
 
@@ -109,7 +117,7 @@ def test_no_pair_of_events_reaches_across_what_is_not_compared(scene, device):
     want = reference(events, stimulus, half.trials.middle)
     np.testing.assert_allclose(half.found.sums[0], want, rtol=2e-4, atol=2e-3)
     across = reference(events, replace(stimulus, holes=False), half.trials.middle)
-    isi = slice(kernels.ISI, kernels.LAG)
+    isi = slice(kernels.SumPlace.ISI, kernels.SumPlace.LAG)
     assert want[isi].sum() < across[isi].sum() - 500
 
 
@@ -214,7 +222,7 @@ def test_a_clock_is_the_same_inside_the_kernel(evidence):
     ticks = trials.ticks(sensor)
     assert ticks == clock.step
     got, free = trials.run_all([SimulationOrder(sensor, vector, 9, finer=1, ticks=t) for t in (ticks, 0.0)])
-    want = trials.stream(sensor, vector, sensor.streams(), seed=9)
+    want = trials.stream(sensor, vector, sensor.readout_effects(), seed=9)
     many = want.clock.sum()
     assert np.abs(got.clock - want.clock).sum() < 1e-2 * many < 0.5 * np.abs(free.clock - want.clock).sum()
     np.testing.assert_allclose(got.stamps, want.stamps, atol=1e-2)
@@ -235,7 +243,7 @@ def test_counts_fold_as_plain_loops_would(evidence, rng):
     own = (d**2).sum((0, 2))
     np.testing.assert_allclose(got[:12], np.concatenate([products, own], 1).ravel(), rtol=1e-4, atol=1e-2)
     rings = [counts[frame.zone == z].reshape(-1, 2, 2, 2).sum((0, 2)) for z in range(kernels.ZONES)]
-    np.testing.assert_array_equal(got[kernels.RINGS :], np.stack(rings, -1).ravel())
+    np.testing.assert_array_equal(got[kernels.FoldPlace.RINGS :], np.stack(rings, -1).ravel())
     left = leave_groups_out(half.found, frame)
     keep = np.arange(len(expected)) >= GROUP
     d = d[keep]
@@ -346,7 +354,7 @@ def test_a_bus_is_shared_out(evidence):
     trials = evidence.train.trials
     sensor = Sensor().with_effect(EFFECTS["readout"](rate=1e5, mode="drop"))
     free = trials.stream(sensor, sensor.parameters(), (), seed=1).halves.sum()
-    held = trials.stream(sensor, sensor.parameters(), sensor.streams(), seed=1).halves.sum()
+    held = trials.stream(sensor, sensor.parameters(), sensor.readout_effects(), seed=1).halves.sum()
     assert held < 0.95 * free
 
 
