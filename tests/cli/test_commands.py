@@ -120,7 +120,7 @@ def test_video(tmp_path):
         picture = np.full((24, 32), 60, np.uint8)
         picture[:, i : i + 8] = 220
         cv2.imwrite(str(folder / f"{i:03d}.png"), picture)
-    assert "give its frame rate, fps" in one_sentence(dase("synth", tmp_path / "v.npz", "--video", folder))
+    assert "give fps (--fps)" in one_sentence(dase("synth", tmp_path / "v.npz", "--video", folder))
     done = dase("synth", tmp_path / "v.npz", "--video", folder, "--fps", "100", "--sensor", "ideal")
     assert done.returncode == 0, done.stderr
     events = io.read(tmp_path / "v.npz").events

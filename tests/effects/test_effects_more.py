@@ -31,7 +31,7 @@ from dase.effects.voltage_noise import VoltageNoise
 from dase.kernels import launch
 from dase.simulation.pixel_array import PixelArray
 from dase.simulation.sensor_file import load_sensor, parse_sensor, read_presets
-from dase.simulation.simulate import sample_times
+from dase.simulation.sensor_run import sample_times
 
 
 @pytest.mark.parametrize("effect", FURTHER, ids=lambda effect: effect.name)

@@ -197,7 +197,7 @@ def test_a_bus_is_no_candidate_where_it_is_known_to_be_free(evidence, rng):
     assert least_bus_rate(bursts, TimestampStructure(step=1e-3)) == pytest.approx(512 / 1e-3)
     assert least_bus_rate(bursts, TimestampStructure(line=1e-5)) == 0
     assert evidence.least_bus_rate <= 1.2 * BUS.rate  # it was full
-    assert variants_to_try(replace(evidence, fastest=200 * evidence.highest_event_rate), Readout) == []
+    assert variants_to_try(replace(evidence, least_bus_rate=200 * evidence.highest_event_rate), Readout) == []
 
 
 def test_a_bus_that_is_never_free_is_no_clock(rng):
