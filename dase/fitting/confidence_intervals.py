@@ -74,7 +74,7 @@ def estimate_parameters(
 def _parameters_per_statistic(half: PixelSubset, model: FittedModel, repeats: Array, *, seed: int) -> Array:
     """Return what a change of the statistics does to the fitted places, shape (P, J)."""
     mean = repeats.mean(0)
-    tight = [axis.name.startswith("threshold.") for axis in model.space.axes]
+    tight = [axis.of_threshold for axis in model.space.axes]
     reach = np.where(tight, TIGHT, 1.0) * REACH[1]
     for turn in range(2):
         gain = _parameters_per_statistic_within(half, model, repeats, reach, seed=seed + 10 * turn)

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from dase.effects.base import Observations
 from dase.errors import InputError
 from dase.events import Events
 from dase.fitting.batch_simulator import BatchSimulator
@@ -78,6 +79,18 @@ class SplitMeasurement:
     highest_event_rate: float
     least_bus_rate: float
     notes: tuple[str, ...] = ()
+
+    def observe(self, *, idle_bus: float) -> Observations:
+        """Return what effects may choose their candidates by, see `Observations`."""
+        return Observations(
+            peak_frequency=self.peak,
+            clock_period=self.structure.step,
+            line_time=self.structure.line,
+            scan_direction=self.structure.direction,
+            highest_event_rate=self.highest_event_rate,
+            least_bus_rate=self.least_bus_rate,
+            idle_bus=idle_bus,
+        )
 
     @property
     def evaluations(self) -> int:

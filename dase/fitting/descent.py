@@ -109,7 +109,7 @@ def descent_work(
     centre = np.clip(start, low, high)
     places, tried = np.empty((0, len(centre))), np.empty((0, len(half.scale.target)))
     slope = np.zeros((len(half.scale.target), len(centre)))
-    tight = np.array([axis.name.startswith("threshold.") for axis in space.axes])
+    tight = np.array([axis.of_threshold for axis in space.axes])
     reach = np.where(tight, TIGHT * radius, radius)
     best_loss, left = np.inf, iterations
     for _ in range(LONGEST if len(centre) else 0):

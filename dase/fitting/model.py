@@ -10,7 +10,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dase.effects.base import Effect
-from dase.effects.flicker import Flicker
 from dase.effects.threshold import Threshold
 from dase.fitting.data_split import SplitMeasurement
 from dase.fitting.descent import StopRule, descent_work, ranking_work
@@ -113,24 +112,26 @@ def with_phase(model: FittedModel, phase: float) -> FittedModel:
     return replace(model, space=replace(model.space, sensor=sensor))
 
 
-def with_lamp_shifted(model: FittedModel, step: float) -> list[FittedModel]:
-    """Return a model, and where it has a lamp, also those with the lamp a step of the grid earlier and later.
+def shift_periodic_effects(model: FittedModel, step: float) -> list[FittedModel]:
+    """Return a model, and for each effect that repeats in time those with it earlier and later.
 
     What probes tell by steps hardly changes when all events are a step off, so a fit may end there.
+
+    Args:
+        model: Whose effects are shifted.
+        step: Of the grid of time [s].
     """
-    names = [axis.name for axis in model.space.axes]
-    if "flicker.phase" not in names:
-        return [model]
-    at = names.index("flicker.phase")
-    lamp = model.sensor["flicker"]
-    assert isinstance(lamp, Flicker)
-    turn = step * lamp.frequency
     out = [model]
-    for phase in (-turn, turn):
-        place = model.place.copy()
-        value = float(model.space.axes[at].to_value(place[at])) + phase
-        place[at] = model.space.axes[at].to_place((value + 1.0) % 2.0 - 1.0)
-        out.append(replace(model, place=place))
+    for effect in model.sensor.effects:
+        for seconds in (-step, step):
+            place, moved = model.place.copy(), effect.shifted(seconds)
+            for n, axis in enumerate(model.space.axes):
+                if axis.effect is type(effect) and moved != effect:
+                    value = getattr(moved, axis.fact.name)
+                    if value != getattr(effect, axis.fact.name):
+                        place[n] = axis.to_place(value)
+            if not np.array_equal(place, model.place):
+                out.append(replace(model, place=place))
     return out
 
 
@@ -237,9 +238,8 @@ def _as_good_work(evidence: SplitMeasurement, model: FittedModel, loss: float, *
 
 
 def _threshold_starts(model: FittedModel) -> Array:
-    names = [axis.name for axis in model.space.axes]
-    at = [names.index(n) if n in names else -1 for n in ("threshold.on", "threshold.off")]
-    if min(at) < 0:
+    at = [n for n, axis in enumerate(model.space.axes) if axis.is_threshold]  # ON comes before OFF
+    if len(at) < 2:
         return model.place[None]
     pairs = [(a, b) for a, b in product(THRESHOLDS, THRESHOLDS) if 1 / RATIO < a / b < RATIO]
     out = np.repeat(model.place[None], len(pairs), 0)
@@ -257,25 +257,25 @@ def with_effect_added(present: FittedModel, effect: Effect) -> FittedModel:
     """Return the present model with an effect added, all of whose parameters are free."""
     sensor = present.sensor.with_effect(effect)
     old = [axis.name for axis in present.space.axes]
-    # read off the events of all pixels, a lamp's frequency is better than a fit to a few makes it
-    new = [name for name in free_of(sensor, effect.name) if name != "flicker.frequency"]
+    # read off the events of all pixels, what a fit finds only nearby is better than a fit to a few makes it
+    new = [axis.name for axis in axes_of(sensor) if axis.effect is type(effect) and axis.fact.nearby is None]
     return model_of(sensor, [*old, *new])
 
 
 def starting_places(model: FittedModel, effect: Effect, *, few: bool = False) -> Array:
     """Return places from which an effect is tried: its strength and its character, at several thresholds."""
     axes = model.space.axes
-    columns, choices, seen = [], [], False
+    columns, choices, observed = [], [], False
     for n, axis in enumerate(axes):
-        if axis.name.split(".")[0] == effect.name:
+        if axis.effect is type(effect):
             columns.append(n)
-            seen |= axis.fact.seen
+            observed |= axis.fact.search_starts == "above"
             tried = _starting_places_of_axis(axis, float(model.place[n]))
             choices.append(tried[::2] if few and axis.main and len(tried) > 2 else tried)
-    thresholds = [n for n, axis in enumerate(axes) if axis.name in ("threshold.on", "threshold.off")]
+    thresholds = [n for n, axis in enumerate(axes) if axis.is_threshold]
     out = []
     for combination in product(*choices):
-        for shift in SHIFTS[1::2] if few and not seen else SHIFTS:
+        for shift in SHIFTS[1::2] if few and not observed else SHIFTS:
             place = model.place.copy()
             place[columns] = combination
             place[thresholds] += shift
@@ -285,12 +285,14 @@ def starting_places(model: FittedModel, effect: Effect, *, few: bool = False) ->
 
 def _starting_places_of_axis(axis: SearchAxis, present: float) -> list[float]:
     low, high = (float(axis.to_place(v)) for v in axis.fact.plausible)
-    if axis.fact.seen:
-        return [present, present + ROOM]
-    if axis.main:
-        return list(low + (high - low) * np.linspace(FEW_STARTS, 1 - FEW_STARTS, 6))
-    if axis.fact.unit == "turns":
-        return [float(axis.to_place(turn)) for turn in np.linspace(0, 1, 8, endpoint=False)]
-    if axis.name.split(".")[1] in ("dark", "slope", "damping", "knee", "rate", "cutoff"):
-        return [present, low + 0.9 * (high - low)]
-    return [present]
+    match axis.fact.search_starts:
+        case "above":
+            return [present, present + ROOM]
+        case "spread":
+            return list(low + (high - low) * np.linspace(FEW_STARTS, 1 - FEW_STARTS, 6))
+        case "turn":
+            return [float(axis.to_place(turn)) for turn in np.linspace(0, 1, 8, endpoint=False)]
+        case "ends":
+            return [present, low + 0.9 * (high - low)]
+        case "value":
+            return [present]

@@ -11,8 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from dase.effects.readout import Bus, Readout
-from dase.effects.row_scan import RowScan
+from dase.effects.readout import Bus
 from dase.effects.stream import StreamEffect
 from dase.effects.timestamp import Timestamp
 from dase.events import Events
@@ -43,7 +42,7 @@ def noticeable_effects(
     fine = FELT * stimulus.grid.step
     lines = max(stimulus.width, stimulus.height)
     compared = structure.step > 0 or structure.line > 0
-    return tuple(e for e in sensor.readout_effects() if compared or delay_of(e, lines) > fine)
+    return tuple(e for e in sensor.readout_effects() if compared or e.longest_delay(lines) > fine)
 
 
 def clock_of(effects: tuple[StreamEffect, ...], structure: TimestampStructure) -> float | None:
@@ -106,7 +105,7 @@ def pass_readout(
         if load is not None and weight is not None and isinstance(reader, Bus):
             events = reader.beside(events, load.others(before, seed), weight)
         else:
-            reader = scale_readout(effect, share).reader(stimulus.width, stimulus.height, seed)
+            reader = effect.for_share(share).reader(stimulus.width, stimulus.height, seed)
             events, until = reader.push(events, until)
         before.append(effect)
     return replace(events, t=events.t + stimulus.grid.begin)
@@ -131,17 +130,3 @@ class _StimulusScene(Scene):
 
     def frames(self, times: NDArray[np.float64], device: str = "cpu") -> NDArray[np.float32]:
         raise NotImplementedError("some pixels are no picture")
-
-
-def delay_of(effect: StreamEffect, lines: int) -> float:
-    """Return about how late an effect behind the pixels makes events [s]; infinite where it may lose some."""
-    if isinstance(effect, Timestamp):
-        return max(effect.step, effect.jitter)
-    return lines * effect.line if isinstance(effect, RowScan) else math.inf
-
-
-def scale_readout(effect: StreamEffect, share: float) -> StreamEffect:
-    """Return an effect behind the pixels for a share of them."""
-    if isinstance(effect, Readout):
-        return replace(effect, rate=effect.rate * share, depth=max(1.0, effect.depth * share))
-    return effect

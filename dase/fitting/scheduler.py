@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from dase.effects.timestamp import Timestamp
 from dase.fitting.batch_simulator import BatchSimulator, SimulationOrder
 from dase.fitting.parameter_space import ParameterSpace
 from dase.probes.accumulators import ProbeSums, ProbeTotals, compute_totals
@@ -98,7 +99,7 @@ def answer_requests(asks: Sequence[SimulationRequest]) -> list[Any]:
     for n, ask in enumerate(asks):
         trials, frame = ask.half.trials, None if ask.repeats else ask.half.frame
         ticks = trials.ticks(ask.space.sensor)
-        if ticks and any(axis.name.startswith("timestamp.") for axis in ask.space.axes):
+        if ticks and any(issubclass(axis.effect, Timestamp) for axis in ask.space.axes):
             ticks = None
         vectors = ask.space.vectors(ask.places)
         order = SimulationOrder(ask.space.sensor, vectors, ask.seed, ask.repeats, None, frame, ticks or 0.0)
