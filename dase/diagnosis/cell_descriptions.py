@@ -12,7 +12,7 @@ from dase.fitting.data_split import SplitMeasurement
 from dase.fitting.subset import PixelSubset
 from dase.kernels.event_probes import BANDS, CLASSES, INTERVALS, KINDS, ZONES
 from dase.probes.distance import Judgement
-from dase.probes.statistics import LAYOUT, LOWEST, MEANS, TONES
+from dase.probes.statistics import LAYOUT, MEANS, SPECTRUM
 from dase.probes.timestamp_patterns import TimestampStructure
 from dase.results import Cell
 
@@ -122,9 +122,9 @@ def _ring_words(evidence: SplitMeasurement, n: int) -> StatisticWords:
 
 
 def _spectrum_words(evidence: SplitMeasurement, n: int) -> StatisticWords:
-    if n >= TONES:
+    if n >= SPECTRUM.count:
         return "all pixels", f"swing of the net rate at {evidence.peak:.4g} Hz", "share"
-    ends = np.geomspace(LOWEST, 0.5 / evidence.held.frame.step, TONES + 1)
+    ends = SPECTRUM.edges(evidence.held.frame.step)
     return "all pixels", f"power of the net rate from {ends[n]:.3g} to {ends[n + 1]:.3g} Hz", "log power"
 
 

@@ -28,7 +28,7 @@ from dase.probes.statistics import (
     tolerance_of,
 )
 from dase.probes.stimulus import MASKED, Grid, Stimulus, band_edges, sort_into_cells
-from dase.probes.timestamp_patterns import SHORTEST, TimestampStructure
+from dase.probes.timestamp_patterns import PATTERNS, TimestampStructure
 from dase.results import Answer, Distinction
 from dase.simulation.sensor import Sensor
 
@@ -142,7 +142,7 @@ def _timestamp_structure(models: tuple[Sensor, Sensor]) -> TimestampStructure:
     """Return the regularity of time stamps that a readout of the models makes, if a file could show it."""
     for model in models:
         for effect in model.readout_effects():
-            if isinstance(effect, Timestamp) and effect.step >= SHORTEST:
+            if isinstance(effect, Timestamp) and effect.step >= PATTERNS.shortest:
                 return TimestampStructure(step=effect.step)
             if isinstance(effect, RowScan):
                 return TimestampStructure(line=effect.line, direction=effect.direction)

@@ -22,9 +22,8 @@ from dase.kernels import launch
 from dase.probes.accumulators import ProbeSums, StatisticsFrame
 from dase.probes.statistics import peak_of, refine_frequency, ring_of_pixels
 from dase.probes.stimulus import (
-    COARSEST,
-    FINEST,
     MASKED,
+    STIMULUS,
     Grid,
     Stimulus,
     Trust,
@@ -32,26 +31,36 @@ from dase.probes.stimulus import (
     light_of,
     sort_into_cells,
 )
-from dase.probes.timestamp_patterns import FILE, TimestampStructure, find_structure
+from dase.probes.timestamp_patterns import PATTERNS, TimestampStructure, find_structure
 from dase.scenes.between_frames import CameraScene
 from dase.scenes.scene import Scene
 
 PIXELS = 1500
 """Pixels in each half of the measurement."""
 
-SCOUTS = 500
-"""Pixels of the scout."""
 
-SPLIT = 0.6
-"""Share of the time that is fitted; the rest is held out."""
+@dataclass(frozen=True)
+class SplitSettings:
+    """How a measurement is split, and what there must be of it."""
 
-LEAST = 300
-"""Events that a half must have for anything to be said."""
+    scouts: int = 500
+    """Pixels of the scout, a third of those that are fitted: sampling errors are larger by less than 2."""
 
-COMMON = 1e-3
+    fitted_share: float = 0.6
+    """Share of the time that is fitted; the rest is held out. What judges needs less than what is fitted."""
 
-BUSY = 2e-3
-"""Events are counted for so long to see how fast they come at most [s]."""
+    least_pixels: int = 16
+    """Pixels without which a half says nothing."""
+
+    least_events: int = 300
+    """Events that a half must have for anything to be said."""
+
+    burst: float = 2e-3
+    """Events are counted for so long to see how fast they come at most [s]: long enough for many of them,
+    and short enough for a bus to be full all the time."""
+
+
+SPLIT = SplitSettings()
 
 
 @dataclass(eq=False)
@@ -107,6 +116,7 @@ def split_measurement(
     pixels: int = PIXELS,
     seed: int = 0,
     device: str = "cpu",
+    settings: SplitSettings = SPLIT,
 ) -> SplitMeasurement:
     """Split a measurement into a half that is fitted and a half that judges.
 
@@ -119,6 +129,7 @@ def split_measurement(
         pixels: In each half.
         seed: Of the choice of pixels.
         device: Where kernels run.
+        settings: How it is split.
 
     Raises:
         InputError: Different sizes, no common time, or too few events.
@@ -132,15 +143,18 @@ def split_measurement(
         raise InputError(str(error)) from error
     size = scene.width * scene.height
     each = min(pixels, size // 2)
-    if each < 16:
-        raise InputError(f"a diagnosis needs at least 32 pixels, the scene has {scene.width}x{scene.height}")
+    if each < settings.least_pixels:
+        raise InputError(
+            f"a diagnosis needs at least {2 * settings.least_pixels} pixels, "
+            f"the scene has {scene.width}x{scene.height}"
+        )
     rng, notes = np.random.default_rng([seed, 1]), []
-    cut = max(2, round(SPLIT * grid.steps))
+    cut = max(2, round(settings.fitted_share * grid.steps))
     if trust is None:
         chosen = rng.permutation(size)[: 2 * each].astype(np.int32)
     else:
         looks = find_trusted_parts(events, scene, _times_of_grid(scene, grid), cut, trust)
-        chosen = choose_trusted_pixels(looks, each, rng)
+        chosen = choose_trusted_pixels(looks, each, rng, least=settings.least_pixels)
         each = len(chosen) // 2
         notes.append(looks.sentence())
     light = light_of(scene, _times_of_grid(scene, grid), chosen)
@@ -167,8 +181,8 @@ def split_measurement(
             trust is not None,
         )  # fmt: skip
         halves.append(_make_subset(stimulus, events, cut if span is grid else 0, structure))
-    _require_enough_events(halves, events, grid, notes)
-    halves.append(_make_subset(halves[0].trials.stimulus.part(SCOUTS), events, 0, structure))
+    _require_enough_events(halves, events, grid, notes, settings.least_events)
+    halves.append(_make_subset(halves[0].trials.stimulus.part(settings.scouts), events, 0, structure))
     peak = peak_of(halves[0].found.clock[0], grid.step)
     if trust is None:  # else most events are where the scene is not known
         peak = refine_frequency(events, grid.begin, grid.begin + cut * grid.step, peak)
@@ -198,8 +212,9 @@ def common_grid(events: Events, scene: Scene) -> Grid:
             f"{events.t[-1]:.6g} s and a scene from {begin:.6g} s to {end:.6g} s"
         )
     step = np.diff(times)
-    even = len(step) > 0 and np.ptp(step) < 1e-3 * step.mean() and FINEST <= step.mean() <= COARSEST
-    h = float(step.mean()) if even else COMMON
+    even = len(step) > 0 and np.ptp(step) < 1e-3 * step.mean()
+    own = even and STIMULUS.finest_step <= step.mean() <= STIMULUS.coarsest_step
+    h = float(step.mean()) if own else STIMULUS.common_step
     last = min(end, float(events.t[-1]) + 2 * h)
     steps = int(np.floor((last - begin) / h + 1e-6)) + 1
     return Grid(begin, h, max(steps, 2))
@@ -207,15 +222,15 @@ def common_grid(events: Events, scene: Scene) -> Grid:
 
 def highest_event_rate(events: Events) -> float:
     """Return the most events per second [Hz]: the rate of a bus, if it ever was full for long enough."""
-    counts = np.bincount(((events.t - events.t[0]) / BUSY).astype(np.int64))
-    return float(counts.max()) / BUSY
+    counts = np.bincount(((events.t - events.t[0]) / SPLIT.burst).astype(np.int64))
+    return float(counts.max()) / SPLIT.burst
 
 
 def least_bus_rate(events: Events, structure: TimestampStructure) -> float:
     """Return the events per second that a bus can send at least [Hz], as it has sent some as fast as that."""
     if structure.line:
         return 0.0  # stamps tell when a line was read
-    slack = max(FILE, structure.step)
+    slack = max(PATTERNS.file_step, structure.step)
     runs = (2**n for n in range(13) if 2**n < len(events))
     return max((n / (float((events.t[n:] - events.t[:-n]).min()) + slack) for n in runs), default=0.0)
 
@@ -249,14 +264,16 @@ def typical_changes(sums: ProbeSums) -> NDArray[np.float32]:
     return (pairs[:, 1] / np.maximum(pairs[:, 0], 1)).astype(np.float32)
 
 
-def _require_enough_events(halves: list[PixelSubset], events: Events, grid: Grid, notes: list[str]) -> None:
+def _require_enough_events(
+    halves: list[PixelSubset], events: Events, grid: Grid, notes: list[str], least: int
+) -> None:
     for half, name in zip(halves, ("fitting", "judging"), strict=True):
         count = int(half.found.halves.sum())
-        if count < LEAST:
-            times = max(2.0, np.ceil(LEAST / max(count, 1)))
+        if count < least:
+            times = max(2.0, np.ceil(least / max(count, 1)))
             raise InputError(
                 f"too few events to say anything: {count} of the {len(events)} lie in the part for {name}, "
-                f"at least {LEAST} are needed; record about {times:.0f} times "
+                f"at least {least} are needed; record about {times:.0f} times "
                 f"as long as these {grid.step * (grid.steps - 1):.3g} s, or more motion"
                 + "".join(f"; {note}" for note in notes)
             )

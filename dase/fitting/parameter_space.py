@@ -20,9 +20,6 @@ Array = NDArray[np.float64]
 PHASE = 0.125
 """Unit along a phase [turns]: beyond it, statistics do not run along straight lines."""
 
-WIDER = 3.0
-"""A fit may leave the plausible range by this factor, and then says so."""
-
 
 @dataclass(frozen=True)
 class SearchAxis:
@@ -86,7 +83,7 @@ def make_axis(effect: type[Effect], fact: Parameter) -> SearchAxis:
     low, high = fact.bounds if fact.periodic else fact.plausible
     log = low > 0
     if log:
-        low, high = low / WIDER, high * WIDER
+        low, high = low / 3.0, high * 3.0  # a fit may leave the plausible range, and then says so
     low, high = max(low, fact.bounds[0]), min(high, fact.bounds[1])
     span = (high - low) / PHASE if fact.periodic else 2.0
     return SearchAxis(f"{effect.name}.{fact.name}", fact, low, high, log, span, effect)

@@ -23,23 +23,22 @@ from dase.scenes.scene import Scene
 from dase.simulation.sensor import Sensor
 from dase.simulation.sensor_run import SensorRun
 
-ROOM = {"cpu": 2048, "cuda": 64}
-"""Events per pixel that there is room for: a model that sends more is run again. On a CPU room costs nothing
-before it is used."""
-
-FELT = 0.25
-"""Delays below this share of a step of the grid are not felt."""
-
 
 def noticeable_effects(
-    stimulus: Stimulus, structure: TimestampStructure, sensor: Sensor
+    stimulus: Stimulus, structure: TimestampStructure, sensor: Sensor, *, least_delay: float = 0.25
 ) -> tuple[StreamEffect, ...]:
     """Return the effects behind the pixels that the probes can feel.
 
     Small errors of the time stamps are far below the steps of the grid; they matter only where their
     regularities are compared.
+
+    Args:
+        stimulus: What the pixels see.
+        structure: Regularities of the measured time stamps.
+        sensor: Whose effects.
+        least_delay: Delays up to this are not felt, in steps of the grid.
     """
-    fine = FELT * stimulus.grid.step
+    fine = least_delay * stimulus.grid.step
     lines = max(stimulus.width, stimulus.height)
     compared = structure.step > 0 or structure.line > 0
     return tuple(e for e in sensor.readout_effects() if compared or e.longest_delay(lines) > fine)
@@ -66,11 +65,13 @@ def simulate_pixels(
     """Return the events that leave the pixels, of each model."""
     bare = replace(sensor, effects=tuple(e for e in sensor.effects if not isinstance(e, StreamEffect)))
     kind = "cuda" if stimulus.device.is_cuda else "cpu"
+    # a model that sends more is run again; on a CPU room costs nothing before it is used
+    room = 64 if kind == "cuda" else 2048  # events per pixel
 
     def out(rows: slice) -> list[Events]:
         return SensorRun(
             _StimulusScene(stimulus), bare, pixels=stimulus.pixels, parameters=vectors[rows],
-            seed=int(seeds[rows.start]), device=str(stimulus.device), events_per_pixel=ROOM[kind],
+            seed=int(seeds[rows.start]), device=str(stimulus.device), events_per_pixel=room,
             chunk=stimulus.grid.steps,
         ).events()  # fmt: skip
 
