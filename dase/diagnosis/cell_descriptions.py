@@ -7,10 +7,10 @@ from itertools import pairwise
 
 import numpy as np
 
-from dase.fitting.batch_simulator import LAG_TIMES
 from dase.fitting.data_split import SplitMeasurement
 from dase.fitting.subset import PixelSubset
 from dase.kernels.event_probes import BANDS, CLASSES, INTERVALS, KINDS, ZONES
+from dase.probes.accumulators import PROBE_TIMES
 from dase.probes.distance import Judgement
 from dase.probes.statistics import LAYOUT, MEANS, SPECTRUM
 from dase.probes.timestamp_patterns import TimestampStructure
@@ -73,7 +73,7 @@ def _interval_words(evidence: SplitMeasurement, n: int) -> StatisticWords:
 
 def _lag_words(evidence: SplitMeasurement, n: int) -> StatisticWords:
     lag, where = divmod(n, BANDS)
-    a, b = 1e3 * LAG_TIMES[lag], 1e3 * LAG_TIMES[lag + 1]
+    a, b = 1e3 * PROBE_TIMES.lags[lag], 1e3 * PROBE_TIMES.lags[lag + 1]
     what = f"change of light from {b:g} to {a:g} ms before the event"
     return band_in_words(evidence, where), what, "log intensity"
 

@@ -24,6 +24,28 @@ Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
+class ProbeTimes:
+    """Times by which events are told apart, of some milliseconds to some tens: those of moving edges."""
+
+    lags: tuple[float, ...] = (
+        -0.003, -0.001, 0.0, 0.001, 0.002, 0.004, 0.008, 0.016, 0.028, 0.044, 0.063,
+    )  # fmt: skip
+    """Before an event [s] at which its light is looked at; the differences of neighbours are averaged."""
+
+    classes: tuple[float, float] = (0.012, 0.05)
+    """Intervals between two events are short, middle or long, divided by these [s]."""
+
+    half: float = 0.064
+    """The halves of the time take turns after this [s]."""
+
+    slack: float = 2e-6
+    """Files give whole microseconds: an event up to this after a point of the grid belongs to it [s]."""
+
+
+PROBE_TIMES = ProbeTimes()
+
+
+@dataclass(frozen=True)
 class StatisticsFrame:
     """What statistics refer to; the same for measurement and models.
 

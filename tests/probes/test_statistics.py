@@ -13,12 +13,12 @@ import dase
 from dase.diagnosis.explain_effect import moving_bars
 from dase.effects import EFFECTS, StreamEffect
 from dase.fitting import descent
-from dase.fitting.batch_simulator import CLASS_TIMES, LAG_TIMES, SimulationOrder
+from dase.fitting.batch_simulator import SimulationOrder
 from dase.fitting.data_split import split_measurement
 from dase.fitting.model import model_of
 from dase.fitting.scheduler import answer_requests, run_side_by_side, run_work
 from dase.kernels import event_probes as kernels
-from dase.probes.accumulators import GROUP, SEEN, compute_totals, leave_groups_out
+from dase.probes.accumulators import GROUP, PROBE_TIMES, SEEN, compute_totals, leave_groups_out
 from dase.probes.statistics import FAMILIES, LAYOUT, compute_statistics, refine_frequency
 from dase.probes.timestamp_patterns import TimestampStructure, find_structure
 from dase.simulation.sensor import Sensor
@@ -50,8 +50,8 @@ def evidence(events, scene, device):
 def reference(events, stimulus, middle) -> np.ndarray:
     """Add up what `observe_event` adds up, event by event."""
     step, out = stimulus.grid.step, np.zeros(kernels.SumPlace.SIZE)
-    lags = np.rint(np.array(LAG_TIMES) / step).astype(int)
-    ends = np.rint(np.array(CLASS_TIMES) / step).astype(int)
+    lags = np.rint(np.array(PROBE_TIMES.lags) / step).astype(int)
+    ends = np.rint(np.array(PROBE_TIMES.classes) / step).astype(int)
     level, last = stimulus.level, stimulus.grid.steps - 1
     for i, pixel in enumerate(stimulus.pixels):
         mine = events.select(events.y.astype(int) * events.width + events.x == pixel)
