@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from dase.effects.base import Effect
 from dase.effects.threshold import Threshold
 from dase.fitting.data_split import SplitMeasurement
-from dase.fitting.descent import StopRule, descent_work, ranking_work
+from dase.fitting.descent import DESCENT, DescentSettings, StopRule, descent_work, ranking_work
 from dase.fitting.parameter_space import ParameterSpace, SearchAxis, axes_of, with_values
 from dase.fitting.scheduler import SimulationRequest, Work, answer_requests, run_side_by_side, run_work
 from dase.fitting.subset import PixelSubset
@@ -20,15 +20,6 @@ from dase.probes.distance import Judgement
 from dase.simulation.sensor import Sensor
 
 Array = NDArray[np.float64]
-
-THRESHOLDS = (0.04, 0.06, 0.09, 0.12, 0.15, 0.18, 0.22, 0.27, 0.34, 0.45, 0.65)
-"""Tried for both polarities when a model is fitted from nothing."""
-
-RATIO = 2.2
-"""Most that the thresholds of a pixel differ by at the start."""
-
-SHIFTS = (-0.7, -0.4, -0.15, 0.0, 0.35)
-"""Of the logarithm of the thresholds, when an effect is tried."""
 
 SETTLED = 16
 """Repeats that give a model's sampling errors while it is fitted."""
@@ -42,12 +33,36 @@ APART = 10_007
 ALIKE = 2.0
 """Most by which the loss of another phase may grow where it becomes the present one."""
 
-ROOM = 0.3
-"""Beside a value that is seen in a measurement, one higher by this is tried: of a bus, the most events per
-second are the least it can send."""
 
-FEW_STARTS = 0.1
-"""Share of the plausible range that is left out at both ends when an effect is tried."""
+@dataclass(frozen=True)
+class StartSettings:
+    """Where searches begin."""
+
+    thresholds: tuple[float, ...] = (0.04, 0.06, 0.09, 0.12, 0.15, 0.18, 0.22, 0.27, 0.34, 0.45, 0.65)
+    """Tried for both polarities when a model is fitted from nothing [log intensity]."""
+
+    ratio: float = 2.2
+    """Most that the thresholds of a pixel differ by at the start."""
+
+    shifts: tuple[float, ...] = (-0.7, -0.4, -0.15, 0.0, 0.35)
+    """Of the logarithm of the thresholds, when an effect is tried: most effects make events more or fewer."""
+
+    strengths: int = 6
+    """Places along a parameter that switches its effect off."""
+
+    margin: float = 0.1
+    """Share of the plausible range that is left out at both ends when an effect is tried."""
+
+    turns: int = 8
+    """Phases at which what repeats in time is tried: no farther than a sixteenth of a turn from the right
+    one."""
+
+    above: float = 0.3
+    """Beside a bound that is seen in a measurement, one higher by this is tried, in the units of
+    `SearchAxis.to_place`: of a bus, the most events per second are the least it can send."""
+
+
+STARTS = StartSettings()
 
 
 @dataclass(frozen=True)
@@ -91,11 +106,12 @@ class FittedModel:
         radius: float = 0.2,
         patient: bool = False,
         over: StopRule | None = None,
+        settings: DescentSettings = DESCENT,
     ) -> Work[FittedModel]:
         """Return the model with its parameters improved, see `run_side_by_side`."""
         found = yield from descent_work(
             half, self.space, self.place, seed=seed, iterations=iterations, radius=radius, patient=patient,
-            over=over,
+            over=over, settings=settings,
         )  # fmt: skip
         return replace(self, place=found.place, loss=found.loss)
 
@@ -241,7 +257,9 @@ def _threshold_starts(model: FittedModel) -> Array:
     at = [n for n, axis in enumerate(model.space.axes) if axis.is_threshold]  # ON comes before OFF
     if len(at) < 2:
         return model.place[None]
-    pairs = [(a, b) for a, b in product(THRESHOLDS, THRESHOLDS) if 1 / RATIO < a / b < RATIO]
+    pairs = [
+        (a, b) for a, b in product(STARTS.thresholds, repeat=2) if 1 / STARTS.ratio < a / b < STARTS.ratio
+    ]
     out = np.repeat(model.place[None], len(pairs), 0)
     for column, values in zip(at, np.array(pairs).T, strict=True):
         out[:, column] = model.space.axes[column].to_place(values)
@@ -275,7 +293,7 @@ def starting_places(model: FittedModel, effect: Effect, *, few: bool = False) ->
     thresholds = [n for n, axis in enumerate(axes) if axis.is_threshold]
     out = []
     for combination in product(*choices):
-        for shift in SHIFTS[1::2] if few and not observed else SHIFTS:
+        for shift in STARTS.shifts[1::2] if few and not observed else STARTS.shifts:
             place = model.place.copy()
             place[columns] = combination
             place[thresholds] += shift
@@ -287,12 +305,12 @@ def _starting_places_of_axis(axis: SearchAxis, present: float) -> list[float]:
     low, high = (float(axis.to_place(v)) for v in axis.fact.plausible)
     match axis.fact.search_starts:
         case "above":
-            return [present, present + ROOM]
+            return [present, present + STARTS.above]
         case "spread":
-            return list(low + (high - low) * np.linspace(FEW_STARTS, 1 - FEW_STARTS, 6))
+            return list(low + (high - low) * np.linspace(STARTS.margin, 1 - STARTS.margin, STARTS.strengths))
         case "turn":
-            return [float(axis.to_place(turn)) for turn in np.linspace(0, 1, 8, endpoint=False)]
+            return [float(axis.to_place(turn)) for turn in np.linspace(0, 1, STARTS.turns, endpoint=False)]
         case "ends":
-            return [present, low + 0.9 * (high - low)]
+            return [present, low + (1 - STARTS.margin) * (high - low)]
         case "value":
             return [present]

@@ -12,9 +12,9 @@ import pytest
 import dase
 from dase.diagnosis.explain_effect import moving_bars
 from dase.effects import EFFECTS, StreamEffect
-from dase.fitting import descent
 from dase.fitting.batch_simulator import SimulationOrder
 from dase.fitting.data_split import split_measurement
+from dase.fitting.descent import DESCENT
 from dase.fitting.model import model_of
 from dase.fitting.scheduler import answer_requests, run_side_by_side, run_work
 from dase.kernels import event_probes as kernels
@@ -265,7 +265,7 @@ def kept(work, seen):
         return stop.value
 
 
-def test_searches_side_by_side_end_where_each_ends_alone(evidence, monkeypatch):
+def test_searches_side_by_side_end_where_each_ends_alone(evidence):
     half = evidence.scout.view()
     models = [
         model_of(Sensor().with_effect(EFFECTS[name](**ON[name]))) for name in ("leak", "shot", "linlog")
@@ -280,10 +280,10 @@ def test_searches_side_by_side_end_where_each_ends_alone(evidence, monkeypatch):
     for ask, want in (pair for each in seen for pair in each):
         np.testing.assert_allclose(answer_requests([*first, ask])[-1], want, rtol=1e-6, atol=1e-7)
     # the end can be compared after one: a place off by 1e-9 counts an event more or less in the next ones
-    monkeypatch.setattr(descent, "LONGEST", 1)
-    ends = run_side_by_side([m.searching(half, seed=3, iterations=1) for m in models])
+    one = replace(DESCENT, longest=1)
+    ends = run_side_by_side([m.searching(half, seed=3, iterations=1, settings=one) for m in models])
     for found, model in zip(ends, models, strict=True):
-        want = run_work(model.searching(half, seed=3, iterations=1))
+        want = run_work(model.searching(half, seed=3, iterations=1, settings=one))
         np.testing.assert_allclose(found.place, want.place, atol=1e-5)
         assert found.loss == pytest.approx(want.loss, rel=1e-4)
 
