@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,20 +12,21 @@ from dase.diagnosis.settings import DEFAULTS, CandidateSettings
 from dase.effects.base import Effect
 from dase.effects.optics import SceneEffect
 from dase.effects.threshold import Threshold
-from dase.fitting.data_split import SplitMeasurement
+from dase.fitting.data_split import CalibratedSplit, SplitMeasurement
 from dase.fitting.descent import StopRule, descent_work, ranking_work
 from dase.fitting.early_stopping import CandidateRace
 from dase.fitting.model import (
-    SETTLED,
     FittedModel,
+    calibration_while_fitting,
     refit_work,
     shift_periodic_effects,
     starting_places,
     with_effect_added,
 )
 from dase.fitting.scheduler import SimulationRequest, Work, run_side_by_side, run_work, side_by_side_work
-from dase.fitting.subset import PixelSubset
+from dase.fitting.subset import CalibratedSubset
 from dase.probes.distance import ErrorScale, Judgement
+from dase.probes.random_streams import SimulationStream
 
 Array = NDArray[np.float64]
 
@@ -112,7 +113,7 @@ class Screening:
 
     effect: Effect
     model: FittedModel
-    half: PixelSubset
+    half: CalibratedSubset
     before: Array
     places: Array
     losses: Array
@@ -133,8 +134,30 @@ class Screening:
         return Candidate(self.effect.name, model, loss, loss / self.present_loss)
 
 
+def calibrate_split(
+    evidence: SplitMeasurement, present: FittedModel, *, repeats: int, scout_repeats: int, seed: int
+) -> CalibratedSplit:
+    """Return a measurement with a model as the present one of its training half and its scout.
+
+    Args:
+        evidence: The measurement.
+        present: The model.
+        repeats: Simulations of it on the training half.
+        scout_repeats: The same on the scout.
+        seed: Of every random number.
+    """
+    train = present.calibrate(
+        evidence.train, repeats=repeats, seed=SimulationStream.CALIBRATE_PRESENT.seed(seed)
+    )
+    scout = present.calibrate(
+        evidence.scout, repeats=scout_repeats, seed=SimulationStream.CALIBRATE_SCOUT.seed(seed)
+    )
+    rest = {f.name: getattr(evidence, f.name) for f in fields(evidence) if f.name not in ("train", "scout")}
+    return CalibratedSplit(train=train, scout=scout, **rest)
+
+
 def screen_effect(
-    evidence: SplitMeasurement, present: FittedModel, effect: Effect, *, seed: int
+    evidence: CalibratedSplit, present: FittedModel, effect: Effect, *, seed: int
 ) -> Work[Screening]:
     """Run an effect at many places of its parameters, on some pixels, see `run_side_by_side`."""
     half = evidence.train if acts_on_few_pixels(effect) else evidence.scout
@@ -148,7 +171,7 @@ def screen_effect(
 
 
 def screen_and_descend(
-    evidence: SplitMeasurement, present: FittedModel, effect: Effect, *, seed: int
+    evidence: CalibratedSplit, present: FittedModel, effect: Effect, *, seed: int
 ) -> Candidate:
     """Try one effect on some pixels: many places, then a short descent from the best two."""
     screening = run_work(screen_effect(evidence, present, effect, seed=seed))
@@ -197,7 +220,7 @@ def descend_from_screening(
 
 
 def refine_candidate(
-    evidence: SplitMeasurement, tried: Candidate, race: CandidateRace, *, seed: int
+    evidence: CalibratedSplit, tried: Candidate, race: CandidateRace, *, seed: int
 ) -> Work[Candidate]:
     """Fit a candidate to all pixels of the training half, by the sampling errors of the present model."""
     # a finalist that is still on its way would be judged by where it happens to be
@@ -258,34 +281,34 @@ def _held_out_error(tried: Candidate) -> float:
 
 def _error_where_fitted(
     evidence: SplitMeasurement, tried: Candidate, *, seed: int
-) -> Work[tuple[float, PixelSubset]]:
+) -> Work[tuple[float, CalibratedSubset]]:
     """Return the error on the training half, and that half with the candidate as its present model."""
-    half = evidence.train.view()
-    values = yield from half.rebasing(tried.model.space, tried.model.place, repeats=SETTLED, seed=seed + 100)
-    return half.judge(values, seed=seed).error, half
+    half = yield from calibration_while_fitting(evidence, tried.model, seed=seed)
+    return half.judge(seed).error, half
 
 
 def _settle_and_judge(
     evidence: SplitMeasurement,
     tried: Candidate,
-    half: PixelSubset,
+    half: CalibratedSubset,
     repeats: int,
     over: StopRule | None,
     *,
     seed: int,
 ) -> Work[Candidate]:
     model = yield from refit_work(evidence, tried.model, seed=seed, rounds=1, half=half, over=over)
-    judgement = yield from model.judging(evidence.held.view(), repeats=repeats, seed=seed + 500)
+    judgement = yield from model.judgement_work(
+        evidence.held, repeats=repeats, seed=SimulationStream.JUDGE.seed(seed)
+    )
     return replace(tried, model=model, judgement=judgement)
 
 
 def try_effects(
-    evidence: SplitMeasurement,
+    evidence: CalibratedSplit,
     present: FittedModel,
     effects: Mapping[str, type[Effect]],
     names: Sequence[str],
     *,
-    repeats: Array,
     worst: Sequence[str],
     seed: int,
     report: StepProgress,
@@ -294,12 +317,10 @@ def try_effects(
     """Try each effect: screen all, fit the best, judge those that chance does not explain.
 
     Args:
-        evidence: The measurement; its training half and its scout must have been rebased to the present
-            model.
+        evidence: The measurement, calibrated by the present model.
         present: The model so far.
         effects: All effects known, by name.
         names: Those that are tried.
-        repeats: Statistics of repeats of the present model on the training half, shape (R, J).
         worst: Families in which the present model fails: who helps there is looked at more closely.
         seed: Of every random number.
         report: Told how far it is.
@@ -317,9 +338,9 @@ def try_effects(
     report(f"fitting {', '.join(one.name for one in chosen)}", 0.5)
     last = CandidateRace(1, settings.gives_up)
     refined = run_side_by_side([refine_candidate(evidence, one, last, seed=seed) for one in chosen])
-    finalists = with_p_values(evidence, present, refined, repeats, seed=seed)
+    finalists = with_p_values(evidence, present, refined, seed=seed)
     # what chance does as well is not added, whatever its error; few repeats cannot give a small p-value
-    significant = max(settings.significant, 1.01 / (1 + len(repeats)))
+    significant = max(settings.significant, 1.01 / (1 + len(evidence.train.repeats)))
     certain = [one for one in finalists if one.p_value <= significant]
     report(f"judging {', '.join(one.name for one in certain)}", 0.75)
     done = refit_and_judge(evidence, certain, seed=seed, settings=settings) if certain else []
@@ -329,7 +350,7 @@ def try_effects(
 
 
 def _screen_variants(
-    evidence: SplitMeasurement,
+    evidence: CalibratedSplit,
     present: FittedModel,
     variants: Sequence[Effect],
     *,
@@ -369,17 +390,16 @@ def family_specialists(
 
 
 def with_p_values(
-    evidence: SplitMeasurement,
+    evidence: CalibratedSplit,
     present: FittedModel,
     candidates: Sequence[Candidate],
-    repeats: Array,
     *,
     seed: int,
 ) -> list[Candidate]:
     """Return candidates with the p-values of what they make of the training loss."""
     scale = evidence.train.scale
     standing = evidence.train.run(present.space, present.place[None], seed=seed)[0]
-    p_value = p_value_function(scale, candidates, repeats, standing)
+    p_value = p_value_function(scale, candidates, evidence.train.repeats, standing)
     return [
         replace(one, p_value=p_value(float(scale.loss(standing)) - one.training_loss)) for one in candidates
     ]

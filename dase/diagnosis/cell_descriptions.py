@@ -8,7 +8,6 @@ from itertools import pairwise
 import numpy as np
 
 from dase.fitting.data_split import SplitMeasurement
-from dase.fitting.subset import PixelSubset
 from dase.kernels.event_probes import BANDS, CLASSES, INTERVALS, KINDS, ZONES
 from dase.probes.accumulators import PROBE_TIMES
 from dase.probes.distance import Judgement
@@ -143,7 +142,6 @@ def _octave_words(n: int) -> str:
 def worst_cells(
     evidence: SplitMeasurement,
     judgement: Judgement,
-    half: PixelSubset | None = None,
     *,
     shown: int = 24,
     notable: float = 2.5,
@@ -153,17 +151,15 @@ def worst_cells(
     Args:
         evidence: The measurement.
         judgement: Of the model.
-        half: Of the measurement, with the model as its present one; None for the held-out half.
         shown: Cells at most.
         notable: Standard errors below which a cell is not worth a sentence.
     """
-    half = half or evidence.held
-    simulated, measured = half.simulated, half.seen.target
+    simulated, measured = judgement.simulated, judgement.measured
     out = []
     for family, part in LAYOUT.items():
         for n, j in enumerate(range(part.start, part.stop)):
             z = judgement.z[j]
-            if not half.seen.used[j] or abs(z) < notable:
+            if not judgement.compared[j] or abs(z) < notable:
                 continue
             counts = not MEANS[j] and family not in ("spread", "spectrum", "stamps")
             m, s = (np.exp(v[j]) - 3.0 if counts else v[j] for v in (measured, simulated))

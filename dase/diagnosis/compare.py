@@ -13,10 +13,11 @@ from dase.diagnosis.settings import DEFAULTS, DiagnosisSettings
 from dase.fitting.data_split import PIXELS, SplitMeasurement, split_measurement
 from dase.fitting.measurement import Measured, SceneChoice, as_measurement
 from dase.fitting.model import model_of
-from dase.fitting.subset import PixelSubset
+from dase.fitting.subset import CalibratedSubset
 from dase.kernels.event_probes import BANDS, INTERVALS, KINDS, LAGS, RESTING
 from dase.probes.accumulators import PROBE_TIMES
 from dase.probes.distance import Judgement
+from dase.probes.random_streams import SimulationStream
 from dase.probes.statistics import LAYOUT
 from dase.probes.stimulus import Trust
 from dase.results import Comparison, Curve, Progress
@@ -67,16 +68,31 @@ def compare(
         pixels=pixels, seed=seed, device=device,
     )  # fmt: skip
     tell("simulating", 0.3, float("nan"))
-    judgement = model_of(model).judge(evidence.held, repeats=settings.repeats, seed=seed + 500)
+    stream = SimulationStream.JUDGE.seed(seed)
+    held = model_of(model).calibrate(evidence.held, repeats=settings.repeats, seed=stream)
+    judgement = held.judge(stream)
     tell("comparing", 1.0, judgement.error)
-    found = comparison_of(evidence, judgement, model, seconds=time.perf_counter() - begin)
+    found = comparison_of(evidence, held, judgement, model, seconds=time.perf_counter() - begin)
     return measurement.noted(found)
 
 
 def comparison_of(
-    evidence: SplitMeasurement, judgement: Judgement, sensor: Sensor, *, seconds: float
+    evidence: SplitMeasurement,
+    held: CalibratedSubset,
+    judgement: Judgement,
+    sensor: Sensor,
+    *,
+    seconds: float,
 ) -> Comparison:
-    """Return the comparison with the model that the held-out half was rebased to."""
+    """Return the comparison with the present model of the held-out half.
+
+    Args:
+        evidence: The measurement.
+        held: Its held-out half, calibrated by the model.
+        judgement: Of that half.
+        sensor: The model.
+        seconds: Time it took [s].
+    """
     return Comparison(
         sensor=sensor,
         error=judgement.error,
@@ -84,16 +100,16 @@ def comparison_of(
         gate=judgement.gate,
         families=judgement.families,
         cells=worst_cells(evidence, judgement),
-        plain=plain_numbers(evidence.held),
-        curves=family_curves(evidence),
+        plain=plain_numbers(held),
+        curves=family_curves(evidence, held),
         notes=evidence.notes,
         seconds=seconds,
     )
 
 
-def plain_numbers(half: PixelSubset) -> dict[str, tuple[float, float]]:
+def plain_numbers(half: CalibratedSubset) -> dict[str, tuple[float, float]]:
     """Return measured and simulated values in units that need no explanation."""
-    values = half.seen.target, half.simulated
+    values = half.seen.target, half.repeats.mean(0)
     real, made = (_rate_counts(v) for v in values)
     exposure = half.trials.stimulus.exposure().reshape(KINDS, BANDS)
     time_ = max(float(exposure.sum()), 1e-9)
@@ -144,9 +160,8 @@ def _mean_lag(values: Array) -> float:
     return float(1e3 * (weight * middle).sum() / max(weight.sum(), 1e-12))
 
 
-def family_curves(evidence: SplitMeasurement) -> dict[str, tuple[Curve, ...]]:
-    """Return what figures are drawn from, by family."""
-    half = evidence.held
+def family_curves(evidence: SplitMeasurement, half: CalibratedSubset) -> dict[str, tuple[Curve, ...]]:
+    """Return what figures are drawn from, by family; the present model of `half` is compared."""
     return {
         "rate": _rate_curves(evidence, half),
         "intervals": _interval_curves(half),
@@ -154,11 +169,11 @@ def family_curves(evidence: SplitMeasurement) -> dict[str, tuple[Curve, ...]]:
     }
 
 
-def _rate_curves(evidence: SplitMeasurement, half: PixelSubset) -> tuple[Curve, ...]:
+def _rate_curves(evidence: SplitMeasurement, half: CalibratedSubset) -> tuple[Curve, ...]:
     exposure = np.maximum(half.trials.stimulus.exposure().reshape(KINDS, BANDS), 1e-9)
     middle = np.array([-0.4, -0.12, 0.0, 0.12, 0.4])
     out = []
-    both = [_rate_counts(v) for v in (half.seen.target, half.simulated)]
+    both = [_rate_counts(v) for v in (half.seen.target, half.repeats.mean(0))]
     sigma = half.seen.sigma[LAYOUT["rate"]].reshape(2, KINDS, BANDS)
     for n in range(BANDS):
         for p, polarity in enumerate(("OFF", "ON")):
@@ -171,12 +186,14 @@ def _rate_curves(evidence: SplitMeasurement, half: PixelSubset) -> tuple[Curve, 
     return tuple(out)
 
 
-def _interval_curves(half: PixelSubset) -> tuple[Curve, ...]:
+def _interval_curves(half: CalibratedSubset) -> tuple[Curve, ...]:
     step = half.trials.stimulus.grid.step * 1e3
     ends = _octave_ends(step)
     middle = np.concatenate([[0.35 * step], np.sqrt(ends[:-1] * ends[1:])])
     names = [f"{kin}, {state}" for state in ("moving", "at rest") for kin in ("OFF-OFF", "ON-ON", "opposite")]
-    both = [_family_counts(v, "intervals").reshape(6, INTERVALS) for v in (half.seen.target, half.simulated)]
+    both = [
+        _family_counts(v, "intervals").reshape(6, INTERVALS) for v in (half.seen.target, half.repeats.mean(0))
+    ]
     sigma = half.seen.sigma[LAYOUT["intervals"]].reshape(6, INTERVALS)
     return tuple(
         Curve(f"Intervals {name}", middle, "interval [ms]", "events", both[0][n], both[1][n],
@@ -185,11 +202,11 @@ def _interval_curves(half: PixelSubset) -> tuple[Curve, ...]:
     )  # fmt: skip
 
 
-def _lag_curves(evidence: SplitMeasurement, half: PixelSubset) -> tuple[Curve, ...]:
+def _lag_curves(evidence: SplitMeasurement, half: CalibratedSubset) -> tuple[Curve, ...]:
     times = np.array(PROBE_TIMES.lags)
     width = 1e3 * np.diff(times)
     middle = 1e3 * 0.5 * (times[1:] + times[:-1])
-    both = [v[LAYOUT["lag"]].reshape(LAGS, BANDS) for v in (half.seen.target, half.simulated)]
+    both = [v[LAYOUT["lag"]].reshape(LAGS, BANDS) for v in (half.seen.target, half.repeats.mean(0))]
     sigma = half.seen.sigma[LAYOUT["lag"]].reshape(LAGS, BANDS)
     return tuple(
         Curve(f"Light before an event, {band_in_words(evidence, n)}", middle, "time before the event [ms]",

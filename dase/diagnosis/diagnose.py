@@ -8,7 +8,7 @@ from dataclasses import replace
 from itertools import combinations
 from os import PathLike
 
-from dase.diagnosis.candidates import Candidate, effects_to_try, try_effects
+from dase.diagnosis.candidates import Candidate, calibrate_split, effects_to_try, try_effects
 from dase.diagnosis.cell_descriptions import worst_cells
 from dase.diagnosis.directional_test import find_hidden_effect
 from dase.diagnosis.pruning import prune_model
@@ -21,6 +21,7 @@ from dase.fitting.measurement import Measured, SceneChoice, as_measurement
 from dase.fitting.model import FittedModel, fit_present_model, model_of, refit_model, refit_work
 from dase.fitting.scheduler import run_side_by_side
 from dase.probes.distance import Judgement, leaves_nothing, may_be_announced, reaches_floor, worst_families
+from dase.probes.random_streams import SimulationStream
 from dase.probes.stimulus import Trust
 from dase.results import Cell, Diagnosis, Estimate, Progress, Rank, Step, Unexplained
 from dase.simulation.sensor import Sensor
@@ -75,7 +76,11 @@ def diagnose(
     tell("fitting the present model", 0.0, float("nan"))
     names = frozenset(effect.name for effect in given.effects)
     state = DiagnosisState(evidence, effects, seed, tell, names, settings)
-    before = model_of(given, free).judge(evidence.held, repeats=settings.repeats // 2, seed=seed + 500).error
+    before = (
+        model_of(given, free)
+        .judge(evidence.held, repeats=settings.repeats // 2, seed=SimulationStream.JUDGE.seed(seed))
+        .error
+    )
     start = fit_present_model(evidence, given, free, seed=seed)
     model, judgement, errors = _add_one_by_one(state, start, most)
     if not reaches_floor(judgement) and most > 0:
@@ -125,13 +130,14 @@ def _look_for_effect(
     step = Step(names, judgement.error, judgement.gate, judgement.families, (), None, (), cells)
     if leaves_nothing(judgement) or not more:
         return step, None, False
-    repeats = model.rebase(evidence.train, repeats=settings.repeats, seed=seed + 300)
-    model.rebase(evidence.scout, repeats=settings.scout_repeats, seed=seed + 200)
     open_names = effects_to_try(state.effects, model)
     if not open_names:
         return step, None, False
+    present = calibrate_split(
+        evidence, model, repeats=settings.repeats, scout_repeats=settings.scout_repeats, seed=seed
+    )
     tried = try_effects(
-        evidence, model, state.effects, open_names, repeats=repeats, worst=worst_families(judgement),
+        present, model, state.effects, open_names, worst=worst_families(judgement),
         seed=seed, report=lambda text, share: state.progress(text, share, state.error),
         settings=settings.candidates,
     )  # fmt: skip
@@ -214,13 +220,15 @@ def _add_pair(
     """Where adding one after the other does not reach the floor, try two at once."""
     evidence, seed, settings = state.evidence, state.seed, state.settings
     singles = [one for one in state.first if one.screened_loss < settings.pair_helps_alone][: settings.paired]
-    start.rebase(evidence.scout, repeats=settings.scout_repeats, seed=seed + 200)
+    scout = start.calibrate(
+        evidence.scout, repeats=settings.scout_repeats, seed=SimulationStream.CALIBRATE_SCOUT.seed(seed)
+    )
     pairs = list(combinations(singles, 2))
     works = []
     for one, two in pairs:
         both = one.model.sensor.with_effect(two.model.sensor[two.name])
         pair = with_same_freedom(both, start, (one.name, two.name))
-        works.append(pair.searching(evidence.scout, seed=seed, iterations=4, radius=0.3))
+        works.append(pair.search_work(scout, seed=seed, iterations=4, radius=0.3))
     ends = run_side_by_side(works, lambda share: state.progress("trying pairs", share, state.error))
     tried = [
         (pair.loss, f"{one.name} + {two.name}", pair) for (one, two), pair in zip(pairs, ends, strict=True)

@@ -11,6 +11,7 @@ from dase.effects import Effect
 from dase.fitting.data_split import SplitMeasurement
 from dase.fitting.model import FittedModel, free_of, model_of
 from dase.probes.distance import LIMITS, Judgement, reaches_floor
+from dase.probes.random_streams import SimulationStream
 from dase.results import Progress, Step
 from dase.simulation.sensor import Sensor
 
@@ -50,9 +51,11 @@ class DiagnosisState:
     error: float = float("nan")
 
     def judge(self, model: FittedModel, *, repeats: int | None = None) -> Judgement:
-        """Return the held-out error of a model; makes it the present one of that half."""
+        """Return the held-out error of a model."""
         repeats = self.settings.repeats if repeats is None else repeats
-        judgement = model.judge(self.evidence.held, repeats=repeats, seed=self.seed + 500)
+        judgement = model.judge(
+            self.evidence.held, repeats=repeats, seed=SimulationStream.JUDGE.seed(self.seed)
+        )
         self.error = judgement.error
         self.progress("judging", 0.0, self.error)
         return judgement

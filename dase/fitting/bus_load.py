@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from dase.effects.readout import Others
 from dase.effects.stream import StreamEffect, to_nanoseconds
 from dase.events import Events
+from dase.probes.random_streams import Draw
 from dase.probes.stimulus import Stimulus
 from dase.scenes.scene import Scene
 from dase.simulation.sensor import Sensor
@@ -64,7 +65,7 @@ class WholeSensor:
             sent: Events that those send.
         """
         size = self.scene.width * self.scene.height
-        rng = np.random.default_rng([self.seed, 2])
+        rng = Draw.OTHER_PIXELS.generator(self.seed)
         rest = np.setdiff1d(rng.permutation(size), chosen, assume_unique=True).astype(np.int32)
         by_events = int(self.most_events / max(sent, 1) * len(chosen))
         room = min(int(self.most_samples / steps), by_events) - len(chosen)

@@ -10,7 +10,8 @@ from numpy.typing import NDArray
 from dase.fitting.data_split import SplitMeasurement
 from dase.fitting.descent import DESCENT, denoised_normal_matrix, fit_slopes
 from dase.fitting.model import FittedModel
-from dase.fitting.subset import PixelSubset
+from dase.fitting.subset import CalibratedSubset
+from dase.probes.random_streams import Draw, SimulationStream
 from dase.results import Estimate
 
 Array = NDArray[np.float64]
@@ -56,21 +57,24 @@ def estimate_parameters(
     """
     if not model.space.axes:
         return model, {}
-    half = evidence.train
     low, high = model.space.bounds()
     places, errors = [model.place], []
     for turn in range(CONFIDENCE.steps):
-        repeats = model.rebase(half, repeats=REPEATS, seed=seed + 900 + 100 * turn)
-        errors.append(half.judge(repeats, seed=seed).error)
+        half = model.calibrate(
+            evidence.train, repeats=REPEATS, seed=SimulationStream.CONFIDENCE.seed(seed, turn)
+        )
+        errors.append(half.judge(seed).error)
+        repeats = half.repeats
         mean = repeats.mean(0)
         gain = _parameters_per_statistic(half, model, repeats, seed=seed + turn)
         # what the pixels of the measurement make of it, also where the model is not quite right
-        seen = (half.left @ gain.T).var(0) * (half.groups - 1)
+        seen = (half.left_out @ gain.T).var(0) * (half.groups - 1)
         step = -gain @ np.where(half.scale.used, mean - half.scale.target, 0.0)
         place = np.clip(model.place + np.clip(step, -CONFIDENCE.farthest, CONFIDENCE.farthest), low, high)
         model = replace(model, place=place)
         places.append(place)
-    errors.append(model.judge(half.view(), repeats=REPEATS, seed=seed + 900 + 100 * CONFIDENCE.steps).error)
+    last = SimulationStream.CONFIDENCE.seed(seed, CONFIDENCE.steps)
+    errors.append(model.judge(evidence.train, repeats=REPEATS, seed=last).error)
     place = places[int(np.argmin(errors))]  # where lines are not straight, a step may lead astray
     chance = ((repeats - mean) @ gain.T).var(0, ddof=1) * (1 + 1 / len(repeats))
     deviation = np.sqrt(np.maximum(chance, seen))
@@ -85,7 +89,9 @@ def estimate_parameters(
     return replace(model, place=place), out
 
 
-def _parameters_per_statistic(half: PixelSubset, model: FittedModel, repeats: Array, *, seed: int) -> Array:
+def _parameters_per_statistic(
+    half: CalibratedSubset, model: FittedModel, repeats: Array, *, seed: int
+) -> Array:
     """Return what a change of the statistics does to the fitted places, shape (P, J)."""
     mean = repeats.mean(0)
     tight = [axis.of_threshold for axis in model.space.axes]
@@ -99,10 +105,10 @@ def _parameters_per_statistic(half: PixelSubset, model: FittedModel, repeats: Ar
 
 
 def _parameters_per_statistic_within(
-    half: PixelSubset, model: FittedModel, repeats: Array, reach: Array, *, seed: int
+    half: CalibratedSubset, model: FittedModel, repeats: Array, reach: Array, *, seed: int
 ) -> Array:
     scale, size = half.scale, len(model.place)
-    rng = np.random.default_rng([seed, 13])
+    rng = Draw.SLOPES.generator(seed)
     low, high = model.space.bounds()
     steps = (
         rng.choice([-1.0, 1.0], (2 * size + 4, size)) * rng.uniform(0.3, 1.0, (2 * size + 4, size)) * reach

@@ -16,10 +16,11 @@ from dase.events import Events
 from dase.fitting.batch_simulator import BatchSimulator
 from dase.fitting.bus_load import WholeSensor
 from dase.fitting.pixel_selection import choose_trusted_pixels, find_trusted_parts
-from dase.fitting.subset import Array, PixelSubset
+from dase.fitting.subset import Array, CalibratedSubset, PixelSubset
 from dase.kernels import event_probes as kernels
 from dase.kernels import launch
 from dase.probes.accumulators import ProbeSums, StatisticsFrame
+from dase.probes.random_streams import Draw
 from dase.probes.statistics import peak_of, refine_frequency, ring_of_pixels
 from dase.probes.stimulus import (
     MASKED,
@@ -63,7 +64,7 @@ class SplitSettings:
 SPLIT = SplitSettings()
 
 
-@dataclass(eq=False)
+@dataclass(frozen=True, eq=False)
 class SplitMeasurement:
     """A measurement and the scene it is of.
 
@@ -107,6 +108,14 @@ class SplitMeasurement:
         return sum(half.trials.evaluations for half in (self.train, self.held, self.scout))
 
 
+@dataclass(frozen=True, eq=False)
+class CalibratedSplit(SplitMeasurement):
+    """A measurement with a present model on its training half and its scout, for comparing candidates."""
+
+    train: CalibratedSubset
+    scout: CalibratedSubset
+
+
 def split_measurement(
     events: Events,
     scene: Scene,
@@ -148,7 +157,7 @@ def split_measurement(
             f"a diagnosis needs at least {2 * settings.least_pixels} pixels, "
             f"the scene has {scene.width}x{scene.height}"
         )
-    rng, notes = np.random.default_rng([seed, 1]), []
+    rng, notes = Draw.PIXELS.generator(seed), []
     cut = max(2, round(settings.fitted_share * grid.steps))
     if trust is None:
         chosen = rng.permutation(size)[: 2 * each].astype(np.int32)
@@ -186,11 +195,15 @@ def split_measurement(
     peak = peak_of(halves[0].found.clock[0], grid.step)
     if trust is None:  # else most events are where the scene is not known
         peak = refine_frequency(events, grid.begin, grid.begin + cut * grid.step, peak)
-    for half in halves:
-        half.frame = replace(half.frame, peak=peak)
-        # where the scene is trusted here and there only, nobody knows what all pixels send
-        half.around = WholeSensor(scene, _times_of_grid(scene, grid), seed, device) if trust is None else None
-    train, held, scout = halves
+    train, held, scout = (
+        replace(
+            half,
+            frame=replace(half.frame, peak=peak),
+            # where the scene is trusted here and there only, nobody knows what all pixels send
+            around=WholeSensor(scene, _times_of_grid(scene, grid), seed, device) if trust is None else None,
+        )
+        for half in halves
+    )
     rates = highest_event_rate(events), least_bus_rate(events, structure)
     return SplitMeasurement(train, held, scout, bands, structure, peak, *rates, tuple(notes))
 

@@ -10,8 +10,9 @@ from numpy.typing import NDArray
 
 from dase.fitting.parameter_space import ParameterSpace
 from dase.fitting.scheduler import SimulationRequest, Work
-from dase.fitting.subset import PixelSubset
+from dase.fitting.subset import CalibratedSubset
 from dase.probes.distance import ErrorScale
+from dase.probes.random_streams import Draw
 
 Array = NDArray[np.float64]
 
@@ -90,7 +91,7 @@ class DescentEnd:
 
 
 def descent_work(
-    half: PixelSubset,
+    half: CalibratedSubset,
     space: ParameterSpace,
     start: Array,
     *,
@@ -118,7 +119,7 @@ def descent_work(
         over: Asked after each population, with the loss and that before, whether to stop.
         settings: How populations are laid.
     """
-    rng = np.random.default_rng([seed, 7])
+    rng = Draw.POPULATION.generator(seed)
     low, high = space.bounds()
     centre = np.clip(start, low, high)
     places, tried = np.empty((0, len(centre))), np.empty((0, len(half.scale.target)))
@@ -271,7 +272,7 @@ def robust_step(
 
 
 def ranking_work(
-    half: PixelSubset, space: ParameterSpace, starts: Sequence[Array] | Array, *, seed: int
+    half: CalibratedSubset, space: ParameterSpace, starts: Sequence[Array] | Array, *, seed: int
 ) -> Work[tuple[Array, Array]]:
     """Return places in order of their loss, shape (M, P), and the losses, (M,); see `scheduler`."""
     places = np.atleast_2d(np.asarray(starts))

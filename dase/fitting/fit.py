@@ -15,6 +15,7 @@ from dase.fitting.measurement import Measured, SceneChoice, as_measurement
 from dase.fitting.model import FittedModel, fit_present_model, model_of, refit_model
 from dase.fitting.parameter_space import SearchAxis
 from dase.probes.distance import Judgement
+from dase.probes.random_streams import Draw, SimulationStream
 from dase.probes.stimulus import Trust
 from dase.results import Estimate, Fit, Progress
 from dase.simulation.sensor import Sensor
@@ -82,13 +83,13 @@ def fit(
         pixels=pixels, seed=seed, device=device,
     )  # fmt: skip
     given = model_of(start, free)
-    before = given.judge(evidence.held, repeats=REPEATS // 2, seed=seed + 500).error
+    before = given.judge(evidence.held, repeats=REPEATS // 2, seed=SimulationStream.JUDGE.seed(seed)).error
     ends = _descend_from_starts(evidence, start, free, seed, lambda text, share: tell(text, share, before))
     judgement, model = _best_end(ends)
     tell("confidence intervals", 0.9, judgement.error)
     good = _equally_good_models(ends)
     model, values = estimate_parameters(evidence, model, seed=seed)
-    judgement = model.judge(evidence.held, repeats=REPEATS, seed=seed + 500)
+    judgement = model.judge(evidence.held, repeats=REPEATS, seed=SimulationStream.JUDGE.seed(seed))
     apart = notes_on_disagreement(model, good, values)
     notes = [
         *evidence.notes,
@@ -125,13 +126,15 @@ def _descend_from_starts(
     """Return where several starts end, each with its held-out error."""
     tell("a wide look", 0.1)
     model = refit_model(evidence, fit_present_model(evidence, sensor, free, seed=seed), seed=seed)
-    ends = [(model.judge(evidence.held, repeats=REPEATS, seed=seed + 500), model)]
+    ends = [(model.judge(evidence.held, repeats=REPEATS, seed=SimulationStream.JUDGE.seed(seed)), model)]
     for n in range(FIT.most_starts):
         if n >= FIT.other_starts and len(_equally_good_models(ends)) > 1:
             break
         tell(f"start {n + 2}", 0.3 + 0.6 * n / FIT.most_starts)
         model = refit_model(evidence, _move_away(_best_end(ends)[1], seed + n), seed=seed + n)
-        ends.append((model.judge(evidence.held, repeats=REPEATS, seed=seed + 500), model))
+        ends.append(
+            (model.judge(evidence.held, repeats=REPEATS, seed=SimulationStream.JUDGE.seed(seed)), model)
+        )
     return ends
 
 
@@ -163,7 +166,7 @@ def _notes_on_minimum(judgement: Judgement, starts: int, good: int) -> list[str]
 
 def _move_away(model: FittedModel, seed: int) -> FittedModel:
     """Return the model well away from where it is."""
-    rng = np.random.default_rng([seed, 11])
+    rng = Draw.FAR_START.generator(seed)
     low, high = model.space.bounds()
     place = np.clip(model.place + rng.choice([-0.5, 0.5], len(model.place)), low, high)
     return replace(model, place=place)

@@ -15,8 +15,9 @@ from dase.fitting.data_split import SplitMeasurement
 from dase.fitting.descent import DESCENT, DescentSettings, StopRule, descent_work, ranking_work
 from dase.fitting.parameter_space import ParameterSpace, SearchAxis, axes_of, with_values
 from dase.fitting.scheduler import SimulationRequest, Work, answer_requests, run_side_by_side, run_work
-from dase.fitting.subset import PixelSubset
+from dase.fitting.subset import CalibratedSubset, PixelSubset
 from dase.probes.distance import Judgement
+from dase.probes.random_streams import SimulationStream
 from dase.simulation.sensor import Sensor
 
 Array = NDArray[np.float64]
@@ -84,22 +85,22 @@ class FittedModel:
         """The sensor at the place."""
         return self.space.at(self.place)
 
-    def rebase(self, half: PixelSubset, *, repeats: int, seed: int) -> Array:
-        """Make this the present model of a half; return statistics of its repeats, shape (repeats, J)."""
-        return half.rebase(self.space, self.place, repeats=repeats, seed=seed)
+    def calibrate(self, subset: PixelSubset, *, repeats: int, seed: int) -> CalibratedSubset:
+        """Return the pixels with this as their present model, see `PixelSubset.calibration_work`."""
+        return run_work(subset.calibration_work(self.space, self.place, repeats=repeats, seed=seed))
 
-    def judge(self, half: PixelSubset, *, repeats: int, seed: int) -> Judgement:
-        """Make this the present model of a half and return its error there."""
-        return run_work(self.judging(half, repeats=repeats, seed=seed))
+    def judge(self, subset: PixelSubset, *, repeats: int, seed: int) -> Judgement:
+        """Return the error on some pixels, seen in `repeats` simulations."""
+        return run_work(self.judgement_work(subset, repeats=repeats, seed=seed))
 
-    def judging(self, half: PixelSubset, *, repeats: int, seed: int) -> Work[Judgement]:
-        """Do what `judge` does, see `run_side_by_side`."""
-        values = yield from half.rebasing(self.space, self.place, repeats=repeats, seed=seed)
-        return half.judge(values, seed=seed)
+    def judgement_work(self, subset: PixelSubset, *, repeats: int, seed: int) -> Work[Judgement]:
+        """Do what `judge` does."""
+        calibrated = yield from subset.calibration_work(self.space, self.place, repeats=repeats, seed=seed)
+        return calibrated.judge(seed)
 
-    def searching(
+    def search_work(
         self,
-        half: PixelSubset,
+        half: CalibratedSubset,
         *,
         seed: int,
         iterations: int = 4,
@@ -157,20 +158,20 @@ def fit_present_model(
     """Fit the free parameters of a sensor: a wide look at thresholds and phase, then descents."""
     model = model_of(sensor, free)
     looks = [
-        _threshold_scan_work(evidence.scout.view(), with_phase(model, phase), seed=seed)
-        for phase in (0.0, 1.0)
+        _threshold_scan_work(evidence.scout, with_phase(model, phase), seed=seed) for phase in (0.0, 1.0)
     ]
     # each was judged by its own sampling errors; judge both by those of the better one
     best = sorted(run_side_by_side(looks), key=lambda m: m.loss)
-    half = evidence.train.view()
-    best[0].rebase(half, repeats=12, seed=seed + 100)
-    ends = run_side_by_side([m.searching(half, seed=seed) for m in best])
+    half = best[0].calibrate(evidence.train, repeats=12, seed=SimulationStream.CALIBRATE_FIT.seed(seed))
+    ends = run_side_by_side([m.search_work(half, seed=seed) for m in best])
     return refit_model(evidence, min(ends, key=lambda m: m.loss), seed=seed, rounds=1)
 
 
-def _threshold_scan_work(half: PixelSubset, start: FittedModel, *, seed: int) -> Work[FittedModel]:
+def _threshold_scan_work(subset: PixelSubset, start: FittedModel, *, seed: int) -> Work[FittedModel]:
     """Return the best of many thresholds."""
-    yield from half.rebasing(start.space, start.place, repeats=12, seed=seed + 100)
+    half = yield from subset.calibration_work(
+        start.space, start.place, repeats=12, seed=SimulationStream.CALIBRATE_FIT.seed(seed)
+    )
     places = np.concatenate([start.place[None], _threshold_starts(start)])
     places, losses = yield from ranking_work(half, start.space, places, seed=seed)
     return replace(start, place=places[0], loss=losses[0])
@@ -186,8 +187,7 @@ def refit_model(evidence: SplitMeasurement, model: FittedModel, *, seed: int, ro
     works = [refit_work(evidence, model, seed=each, rounds=rounds) for each in seeds[:-1]]
     works.append(_refit_from_other_phase_work(evidence, model, seed=seeds[-1], rounds=rounds))
     ends = run_side_by_side(works)
-    half = evidence.train.view()
-    ends[0].rebase(half, repeats=SETTLED, seed=seed + 100)
+    half = ends[0].calibrate(evidence.train, repeats=SETTLED, seed=SimulationStream.CALIBRATE_FIT.seed(seed))
     values = answer_requests(
         [SimulationRequest(half, m.space, m.place[None], each) for m in ends for each in seeds]
     )
@@ -203,10 +203,18 @@ def _refit_from_other_phase_work(
     Where that is wrong, all else is bent to make up for it, and the right one looks no better before all is
     fitted again.
     """
-    half = evidence.train.view()
-    yield from half.rebasing(model.space, model.place, repeats=SETTLED, seed=seed + 100)
-    other = yield from _with_other_phase(model).searching(half, seed=seed, iterations=3, patient=True)
+    half = yield from calibration_while_fitting(evidence, model, seed=seed)
+    other = yield from _with_other_phase(model).search_work(half, seed=seed, iterations=3, patient=True)
     return (yield from refit_work(evidence, other, seed=seed, rounds=rounds))
+
+
+def calibration_while_fitting(
+    evidence: SplitMeasurement, model: FittedModel, *, seed: int
+) -> Work[CalibratedSubset]:
+    """Return the training half with a model under fit as its present one."""
+    return evidence.train.calibration_work(
+        model.space, model.place, repeats=SETTLED, seed=SimulationStream.CALIBRATE_FIT.seed(seed)
+    )
 
 
 def _with_other_phase(model: FittedModel) -> FittedModel:
@@ -221,21 +229,19 @@ def refit_work(
     *,
     seed: int,
     rounds: int = 2,
-    half: PixelSubset | None = None,
+    half: CalibratedSubset | None = None,
     over: StopRule | None = None,
 ) -> Work[FittedModel]:
-    """Do what `refit_model` does, see `run_side_by_side`; `half` is the training half if the model is its
-    present one."""
+    """Do what `refit_model` does; `half` is the training half if the model is its present one."""
     for turn in range(rounds):
         if half is None or turn > 0:
-            half = evidence.train.view()
-            yield from half.rebasing(model.space, model.place, repeats=SETTLED, seed=seed + 100)
+            half = yield from calibration_while_fitting(evidence, model, seed=seed)
         other = _with_other_phase(model)
         values = yield [SimulationRequest(half, m.space, m.place[None], seed) for m in (model, other)]
         losses = [float(half.scale.loss(value)[0]) for value in values]
         if losses[1] < losses[0] and (yield from _as_good_work(evidence, other, losses[0], seed=seed)):
             model = other
-        model = yield from model.searching(
+        model = yield from model.search_work(
             half, seed=seed + turn, radius=0.12 / (1 + turn), patient=True, over=over
         )
     return model
@@ -247,8 +253,7 @@ def _as_good_work(evidence: SplitMeasurement, model: FittedModel, loss: float, *
     By those of a model with chance in it, one without looks no worse, until it is the present one and its
     repeats are all alike.
     """
-    half = evidence.train.view()
-    yield from half.rebasing(model.space, model.place, repeats=SETTLED, seed=seed + 100)
+    half = yield from calibration_while_fitting(evidence, model, seed=seed)
     (values,) = yield [SimulationRequest(half, model.space, model.place[None], seed)]
     return float(half.scale.loss(values)[0]) < ALIKE * loss
 

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
+from dase.probes.random_streams import Draw
 from dase.probes.statistics import LAYOUT
 
 Array = NDArray[np.float64]
@@ -100,6 +101,9 @@ class Judgement:
         limits: Error per family that hardly any repeat exceeds in any family.
         z: Difference of each statistic in standard errors, shape (J,).
         unit: Robust distance that is called 1.
+        measured: Statistics of the measurement, shape (J,).
+        simulated: Statistics of the model, the mean over its repeats, shape (J,).
+        compared: Which statistics are compared, shape (J,).
     """
 
     error: float
@@ -110,6 +114,9 @@ class Judgement:
     limits: dict[str, float]
     z: Array
     unit: float
+    measured: Array = field(default_factory=lambda: np.empty(0))
+    simulated: Array = field(default_factory=lambda: np.empty(0))
+    compared: NDArray[np.bool_] = field(default_factory=lambda: np.empty(0, np.bool_))
 
 
 def judge_model(
@@ -138,7 +145,7 @@ def judge_model(
     """
     count = len(repeats)
     mean = repeats.mean(0)
-    rng = np.random.default_rng([seed, 3])
+    rng = Draw.TOLERANCE.generator(seed)
     apart = (repeats - mean) * (count / (count - 1))
     rho = pseudo_huber(in_standard_errors(apart + off * rng.standard_normal(repeats.shape), chance))
     weights = chance.weights()
@@ -154,7 +161,10 @@ def judge_model(
     error = float(seen.loss(mean)) / unit
     level = float(null.mean())
     gate = min(max(settings.close, reach), settings.widest)
-    return Judgement(error, gate, reach, level, families, limits, seen.z(mean), unit)
+    return Judgement(
+        error, gate, reach, level, families, limits, seen.z(mean), unit,
+        measured=seen.target, simulated=mean, compared=seen.used,
+    )  # fmt: skip
 
 
 def in_standard_errors(apart: Array, scale: ErrorScale) -> Array:

@@ -171,9 +171,8 @@ def test_others_go_through_what_is_before_the_bus(evidence, true):
 
 
 def test_answers_do_not_depend_on_what_is_asked_beside(evidence, true):
-    half = evidence.scout.view()
     model = model_of(true)
-    model.rebase(half, repeats=6, seed=1)
+    half = model.calibrate(evidence.scout, repeats=6, seed=1)
     asks = [SimulationRequest(half, model.space, model.place[None] + d, 3) for d in (0.0, 0.1)]
     alone_ = [answer_requests([ask])[0] for ask in asks]
     for got, want in zip(answer_requests(asks), alone_, strict=True):

@@ -266,24 +266,23 @@ def kept(work, seen):
 
 
 def test_searches_side_by_side_end_where_each_ends_alone(evidence):
-    half = evidence.scout.view()
     models = [
         model_of(Sensor().with_effect(EFFECTS[name](**ON[name]))) for name in ("leak", "shot", "linlog")
     ]
-    models[0].rebase(half, repeats=6, seed=1)
+    half = models[0].calibrate(evidence.scout, repeats=6, seed=1)
     seen = [[] for _ in models]
     for model, each in zip(models, seen, strict=True):
-        run_work(kept(model.searching(half, seed=3, iterations=1), each))
+        run_work(kept(model.search_work(half, seed=3, iterations=1), each))
     assert max(map(len, seen)) > 5
     # beside the first populations of all, every population has the answers it has alone
     first = [each[0][0] for each in seen]
     for ask, want in (pair for each in seen for pair in each):
         np.testing.assert_allclose(answer_requests([*first, ask])[-1], want, rtol=1e-6, atol=1e-7)
     # the end can be compared after one: a place off by 1e-9 counts an event more or less in the next ones
-    one = replace(DESCENT, longest=1)
-    ends = run_side_by_side([m.searching(half, seed=3, iterations=1, settings=one) for m in models])
+    once = replace(DESCENT, longest=1)
+    ends = run_side_by_side([m.search_work(half, seed=3, iterations=1, settings=once) for m in models])
     for found, model in zip(ends, models, strict=True):
-        want = run_work(model.searching(half, seed=3, iterations=1, settings=one))
+        want = run_work(model.search_work(half, seed=3, iterations=1, settings=once))
         np.testing.assert_allclose(found.place, want.place, atol=1e-5)
         assert found.loss == pytest.approx(want.loss, rel=1e-4)
 
