@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from dase.diagnosis.cell_descriptions import band_in_words, worst_cells
 from dase.diagnosis.settings import DEFAULTS, DiagnosisSettings
-from dase.fitting.data_split import PIXELS, SplitMeasurement, split_measurement
+from dase.fitting.data_split import SPLIT, SplitMeasurement, split_measurement
 from dase.fitting.measurement import Measured, SceneChoice, as_measurement
 from dase.fitting.model import model_of
 from dase.fitting.subset import CalibratedSubset
@@ -33,7 +33,7 @@ def compare(
     *,
     scene: SceneChoice | None = None,
     trust: Trust | None = None,
-    pixels: int = PIXELS,
+    pixels: int = SPLIT.pixels,
     seed: int = 0,
     device: str = "cpu",
     progress: Progress | None = None,

@@ -15,7 +15,7 @@ from dase.effects.row_scan import RowScan
 from dase.effects.timestamp import Timestamp
 from dase.errors import InputError
 from dase.fitting.batch_simulator import BatchSimulator, SimulationOrder, samples_per_step
-from dase.fitting.data_split import PIXELS, typical_changes
+from dase.fitting.data_split import SPLIT, typical_changes
 from dase.kernels import launch
 from dase.probes.accumulators import ProbeSums, StatisticsFrame
 from dase.probes.statistics import (
@@ -69,7 +69,7 @@ def distinguish(
     *,
     names: tuple[str, str] | None = None,
     longest: float = 60.0,
-    pixels: int = PIXELS,
+    pixels: int = SPLIT.pixels,
     repeats: int = 24,
     seed: int = 0,
     device: str = "cpu",

@@ -22,17 +22,17 @@ from dase.effects.stream import (
 from dase.errors import InputError
 from dase.events import Events
 
-WIDEST = 5.0
-"""Largest jitter, in standard deviations; one normal number in two million lies beyond."""
-
 
 class Stamp(Reader):
     """Gives events the time the clock shows."""
 
+    widest: ClassVar[float] = 5.0
+    """Largest jitter, in standard deviations; one normal number in two million lies beyond."""
+
     def __init__(self, jitter: float, step: float, random: np.random.Generator):
         self._jitter, self._random = jitter * 1e9, random  # [ns]
         self._step = round(step * 1e12)  # [ps]
-        self._reach = math.ceil(WIDEST * self._jitter)
+        self._reach = math.ceil(self.widest * self._jitter)
         self._waiting = Events.empty(1, 1)
         self._at = np.empty(0, np.int64)
 
@@ -47,7 +47,7 @@ class Stamp(Reader):
         return replace(events, t=to_seconds(at)), math.inf if bound == FOREVER else 1e-9 * bound
 
     def _jittered(self, events: Events, at: np.ndarray, bound: int) -> tuple[Events, np.ndarray, int]:
-        error = np.clip(self._random.standard_normal(len(at)), -WIDEST, WIDEST)
+        error = np.clip(self._random.standard_normal(len(at)), -self.widest, self.widest)
         at = at + np.rint(self._jitter * error).astype(np.int64)
         if len(self._at):
             events = Events.concatenate([self._waiting, events])

@@ -49,8 +49,10 @@ class SimulatorSettings:
     """Models whose events are stored at a time: some hundred megabytes where each sends millions."""
 
 
-ON_CPU = SimulatorSettings(own_kernel=1, sums_bytes=1 << 26)  # the sums should stay in the caches
-ON_CUDA = SimulatorSettings(own_kernel=0, sums_bytes=1 << 31)  # so that all candidates run in one launch
+LAUNCHES = {
+    "cpu": SimulatorSettings(own_kernel=1, sums_bytes=1 << 26),  # the sums should stay in the caches
+    "cuda": SimulatorSettings(own_kernel=0, sums_bytes=1 << 31),  # so that all candidates run in one launch
+}
 
 
 def samples_per_step(sensor: Sensor, step: float, *, most: int = 2) -> int:
@@ -121,7 +123,7 @@ class BatchSimulator:
     def __post_init__(self) -> None:
         self.device = self.stimulus.device
         self._middle: tuple[Any, Any] | None = None
-        self._launches = self.settings or (ON_CUDA if self.device.is_cuda else ON_CPU)
+        self._launches = self.settings or LAUNCHES["cuda" if self.device.is_cuda else "cpu"]
         # a CPU works on several models of one pixel in a vector, a GPU has a thread for each
         self._lanes = 1 if self.device.is_cuda else kernels.LANES
         self._pixels = wp.array(self.stimulus.pixels, dtype=int, device=self.device)

@@ -36,13 +36,13 @@ from dase.probes.timestamp_patterns import PATTERNS, TimestampStructure, find_st
 from dase.scenes.between_frames import CameraScene
 from dase.scenes.scene import Scene
 
-PIXELS = 1500
-"""Pixels in each half of the measurement."""
-
 
 @dataclass(frozen=True)
 class SplitSettings:
     """How a measurement is split, and what there must be of it."""
+
+    pixels: int = 1500
+    """Pixels in each half of the measurement."""
 
     scouts: int = 500
     """Pixels of the scout, a third of those that are fitted: sampling errors are larger by less than 2."""
@@ -122,7 +122,7 @@ def split_measurement(
     *,
     log_eps: float = 1e-3,
     trust: Trust | None = None,
-    pixels: int = PIXELS,
+    pixels: int = SPLIT.pixels,
     seed: int = 0,
     device: str = "cpu",
     settings: SplitSettings = SPLIT,
@@ -158,29 +158,35 @@ def split_measurement(
             f"the scene has {scene.width}x{scene.height}"
         )
     rng, notes = Draw.PIXELS.generator(seed), []
+    # time is cut, not drawn: moments between fitted ones would be known from these
     cut = max(2, round(settings.fitted_share * grid.steps))
     if trust is None:
+        # other pixels judge: fixed patterns, such as mismatch, would be known from the fitted ones
         chosen = rng.permutation(size)[: 2 * each].astype(np.int32)
     else:
         looks = find_trusted_parts(events, scene, _times_of_grid(scene, grid), cut, trust)
         chosen = choose_trusted_pixels(looks, each, rng, least=settings.least_pixels)
         each = len(chosen) // 2
         notes.append(looks.sentence())
+    # from the begin of the scene also for the half that judges: filters and memories are settled there
     light = light_of(scene, _times_of_grid(scene, grid), chosen)
     if not np.all(np.isfinite(light)) or light.min() < 0:
         raise InputError("scene: intensities must be finite and >= 0")
     good = np.ones(light.shape, np.bool_) if trust is None else trust(grid.times, chosen).T.copy()
     good[:, 1:] &= good[:, :-1]  # a step is what lies between two points of the grid
+    # both halves have the same bands, or a cell would mean another brightness in each
     bands = band_edges(light, good)
     sorting = partial(sort_into_cells, step=grid.step, bands=bands, log_eps=log_eps)
+    # filters over time go pixel by pixel, so parts of the pixels give the same as all of them
     works: list[Callable[[], Any]] = [partial(sorting, part) for part in np.array_split(light, 8)]
     works.append(partial(find_structure, events))
     *parts, structure = launch.run_concurrently(works)
     cell = np.concatenate(parts)
     cell[~good] = MASKED
-    cell[:, 0] = MASKED
+    cell[:, 0] = MASKED  # no step ends at the first point
     first, last = slice(0, each), slice(each, 2 * each)
     train_grid = replace(grid, steps=cut)
+    # what judges is simulated over all of the time and compared in the later part only
     late = cell[last].copy()
     late[:, :cut] = MASKED
     halves: list[PixelSubset] = []
@@ -192,6 +198,7 @@ def split_measurement(
         halves.append(_make_subset(stimulus, events, cut if span is grid else 0, structure))
     _require_enough_events(halves, events, grid, notes, settings.least_events)
     halves.append(_make_subset(halves[0].trials.stimulus.part(settings.scouts), events, 0, structure))
+    # seen in the fitted half: what judges must not choose
     peak = peak_of(halves[0].found.clock[0], grid.step)
     if trust is None:  # else most events are where the scene is not known
         peak = refine_frequency(events, grid.begin, grid.begin + cut * grid.step, peak)
@@ -209,7 +216,11 @@ def split_measurement(
 
 
 def common_grid(events: Events, scene: Scene) -> Grid:
-    """Return the time that scene and events have in common, in equal steps."""
+    """Return the time that scene and events have in common, in equal steps [s].
+
+    Raises:
+        InputError: Different sizes, no events, or no time in common.
+    """
     if (events.width, events.height) != (scene.width, scene.height):
         raise InputError(
             f"recording and scene must have one size, got {events.width}x{events.height} "
@@ -224,10 +235,12 @@ def common_grid(events: Events, scene: Scene) -> Grid:
             f"recording and scene must overlap in time, got events from {events.t[0]:.6g} s to "
             f"{events.t[-1]:.6g} s and a scene from {begin:.6g} s to {end:.6g} s"
         )
+    # steps of the scene itself need no interpolation, which would smooth what happens between them
     step = np.diff(times)
     even = len(step) > 0 and np.ptp(step) < 1e-3 * step.mean()
     own = even and STIMULUS.finest_step <= step.mean() <= STIMULUS.coarsest_step
     h = float(step.mean()) if own else STIMULUS.common_step
+    # after the last event a step or two of silence count, not minutes: the recording may have ended there
     last = min(end, float(events.t[-1]) + 2 * h)
     steps = int(np.floor((last - begin) / h + 1e-6)) + 1
     return Grid(begin, h, max(steps, 2))
@@ -244,12 +257,14 @@ def least_bus_rate(events: Events, structure: TimestampStructure) -> float:
     if structure.line:
         return 0.0  # stamps tell when a line was read
     slack = max(PATTERNS.file_step, structure.step)
+    # runs of all lengths: the time of short ones is rounded by the clock, long ones have pauses
     runs = (2**n for n in range(13) if 2**n < len(events))
     return max((n / (float((events.t[n:] - events.t[:-n]).min()) + slack) for n in runs), default=0.0)
 
 
 def _times_of_grid(scene: Scene, grid: Grid) -> NDArray[np.float64]:
     """Return the times of the grid, those of the scene itself where they are the same but for rounding."""
+    # a scene that is asked for its own times gives its own frames, to the bit
     own = scene.sample_times()[: grid.steps]
     same = len(own) == grid.steps and np.allclose(own, grid.times, rtol=0, atol=1e-3 * grid.step)
     return own if same else grid.times

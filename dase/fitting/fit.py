@@ -10,7 +10,7 @@ from os import PathLike
 import numpy as np
 
 from dase.fitting.confidence_intervals import REPEATS, estimate_parameters
-from dase.fitting.data_split import PIXELS, SplitMeasurement, split_measurement
+from dase.fitting.data_split import SPLIT, SplitMeasurement, split_measurement
 from dase.fitting.measurement import Measured, SceneChoice, as_measurement
 from dase.fitting.model import FittedModel, fit_present_model, model_of, refit_model
 from dase.fitting.parameter_space import SearchAxis
@@ -49,7 +49,7 @@ def fit(
     scene: SceneChoice | None = None,
     free: Sequence[str] | None = None,
     trust: Trust | None = None,
-    pixels: int = PIXELS,
+    pixels: int = SPLIT.pixels,
     seed: int = 0,
     device: str = "cpu",
     progress: Progress | None = None,

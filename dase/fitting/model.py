@@ -22,17 +22,25 @@ from dase.simulation.sensor import Sensor
 
 Array = NDArray[np.float64]
 
-SETTLED = 16
-"""Repeats that give a model's sampling errors while it is fitted."""
 
-DESCENTS = 3
-"""Descents of which the best is taken."""
+@dataclass(frozen=True)
+class RefitSettings:
+    """How a model is fitted by its own sampling errors."""
 
-APART = 10_007
-"""Between their seeds."""
+    repeats: int = 16
+    """Simulations that give a model's sampling errors while it is fitted."""
 
-ALIKE = 2.0
-"""Most by which the loss of another phase may grow where it becomes the present one."""
+    descents: int = 3
+    """Descents of which the best is taken: each ends where its random numbers happen to lead."""
+
+    seeds_apart: int = 10_007
+    """Between their seeds: farther than those of one descent are from each other."""
+
+    alike: float = 2.0
+    """Most by which the loss of another phase may grow where it becomes the present one."""
+
+
+REFIT = RefitSettings()
 
 
 @dataclass(frozen=True)
@@ -183,11 +191,13 @@ def refit_model(evidence: SplitMeasurement, model: FittedModel, *, seed: int, ro
     Each of some descents has random numbers of its own, because they end where those happen to lead, and the
     last one begins with the other phase; the best of them by the random numbers of all is taken.
     """
-    seeds = [seed + APART * n for n in range(DESCENTS)]
+    seeds = [seed + REFIT.seeds_apart * n for n in range(REFIT.descents)]
     works = [refit_work(evidence, model, seed=each, rounds=rounds) for each in seeds[:-1]]
     works.append(_refit_from_other_phase_work(evidence, model, seed=seeds[-1], rounds=rounds))
     ends = run_side_by_side(works)
-    half = ends[0].calibrate(evidence.train, repeats=SETTLED, seed=SimulationStream.CALIBRATE_FIT.seed(seed))
+    half = ends[0].calibrate(
+        evidence.train, repeats=REFIT.repeats, seed=SimulationStream.CALIBRATE_FIT.seed(seed)
+    )
     values = answer_requests(
         [SimulationRequest(half, m.space, m.place[None], each) for m in ends for each in seeds]
     )
@@ -213,7 +223,7 @@ def calibration_while_fitting(
 ) -> Work[CalibratedSubset]:
     """Return the training half with a model under fit as its present one."""
     return evidence.train.calibration_work(
-        model.space, model.place, repeats=SETTLED, seed=SimulationStream.CALIBRATE_FIT.seed(seed)
+        model.space, model.place, repeats=REFIT.repeats, seed=SimulationStream.CALIBRATE_FIT.seed(seed)
     )
 
 
@@ -255,7 +265,7 @@ def _as_good_work(evidence: SplitMeasurement, model: FittedModel, loss: float, *
     """
     half = yield from calibration_while_fitting(evidence, model, seed=seed)
     (values,) = yield [SimulationRequest(half, model.space, model.place[None], seed)]
-    return float(half.scale.loss(values)[0]) < ALIKE * loss
+    return float(half.scale.loss(values)[0]) < REFIT.alike * loss
 
 
 def _threshold_starts(model: FittedModel) -> Array:

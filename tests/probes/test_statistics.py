@@ -18,7 +18,7 @@ from dase.fitting.descent import DESCENT
 from dase.fitting.model import model_of
 from dase.fitting.scheduler import answer_requests, run_side_by_side, run_work
 from dase.kernels import event_probes as kernels
-from dase.probes.accumulators import GROUP, PROBE_TIMES, SEEN, compute_totals, leave_groups_out
+from dase.probes.accumulators import GROUP, PROBE_TIMES, compute_totals, leave_groups_out
 from dase.probes.statistics import FAMILIES, LAYOUT, compute_statistics, refine_frequency
 from dase.probes.timestamp_patterns import TimestampStructure, find_structure
 from dase.simulation.sensor import Sensor
@@ -291,8 +291,8 @@ def test_silent_pixels_are_counted(evidence, events):
     """A pixel is silent if it sends nothing where at least six events are expected."""
     half = evidence.train
     expected = half.found.halves[0].astype(float)  # as if the model were exact
-    busy = np.flatnonzero(expected.sum(1) >= SEEN)[:7]
-    few = np.flatnonzero((expected.sum(1) < SEEN) & (expected.sum(1) > 0))[:3]
+    busy = np.flatnonzero(expected.sum(1) >= 6)[:7]
+    few = np.flatnonzero((expected.sum(1) < 6) & (expected.sum(1) > 0))[:3]
     muted = half.trials.stimulus.pixels[np.concatenate([busy, few])]
     place = events.y.astype(int) * events.width + events.x
     found = half.trials.look(events.select(~np.isin(place, muted)))
