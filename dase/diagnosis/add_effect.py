@@ -8,7 +8,7 @@ from os import PathLike
 from dase.diagnosis.candidates import calibrate_split, screen_and_descend
 from dase.diagnosis.settings import DEFAULTS
 from dase.effects import Effect
-from dase.fitting.data_split import PIXELS, split_measurement
+from dase.fitting.data_split import SPLIT, split_measurement
 from dase.fitting.fit import fit
 from dase.fitting.measurement import Measured, SceneChoice, as_measurement
 from dase.fitting.model import fit_present_model
@@ -26,7 +26,7 @@ def fit_added(
     *,
     scene: SceneChoice | None = None,
     trust: Trust | None = None,
-    pixels: int = PIXELS,
+    pixels: int = SPLIT.pixels,
     seed: int = 0,
     device: str = "cpu",
     progress: Callable[[str, float, float], None] | None = None,

@@ -10,11 +10,8 @@ from numpy.typing import NDArray
 
 from dase.diagnosis.settings import DEFAULTS, CandidateSettings
 from dase.effects.base import Effect
-from dase.effects.flicker import Flicker
 from dase.effects.optics import SceneEffect
-from dase.effects.readout import Readout
-from dase.effects.row_scan import RowScan
-from dase.effects.timestamp import Timestamp
+from dase.effects.threshold import Threshold
 from dase.fitting.data_split import CalibratedSplit, SplitMeasurement
 from dase.fitting.descent import StopRule, descent_work, ranking_work
 from dase.fitting.early_stopping import CandidateRace
@@ -22,11 +19,10 @@ from dase.fitting.model import (
     FittedModel,
     calibration_while_fitting,
     refit_work,
+    shift_periodic_effects,
     starting_places,
     with_effect_added,
-    with_lamp_shifted,
 )
-from dase.fitting.parameter_space import effect_variants
 from dase.fitting.scheduler import SimulationRequest, Work, run_side_by_side, run_work, side_by_side_work
 from dase.fitting.subset import CalibratedSubset
 from dase.probes.distance import ErrorScale, Judgement
@@ -75,7 +71,9 @@ def effects_to_try(effects: Mapping[str, type[Effect]], present: FittedModel) ->
     # what acts on whole pictures has no place in a parameter vector; what a network has to learn first
     # cannot be tried
     known = [n for n, e in effects.items() if not issubclass(e, SceneEffect) and not e.maps]
-    return [n for n in known if n not in sensor or (sensor[n].is_off() and n != "threshold")]
+    return [
+        n for n in known if n not in sensor or (sensor[n].is_off() and not isinstance(sensor[n], Threshold))
+    ]
 
 
 def variants_to_try(
@@ -92,28 +90,12 @@ def variants_to_try(
         effect: The class.
         idle_bus: Share of what a bus can send below which a readout is no candidate.
     """
-    structure = evidence.structure
-    if effect is Flicker:
-        return [Flicker(frequency=evidence.peak)]
-    if effect is Timestamp:
-        return [Timestamp(step=structure.step, jitter=0.0)] if structure.step else []
-    if effect is RowScan:
-        return [RowScan(line=structure.line, direction=structure.direction)] if structure.line else []
-    if effect is Readout:
-        if evidence.highest_event_rate < idle_bus * evidence.least_bus_rate:
-            return []
-        # events come as fast as the bus can send them, if it ever was full
-        return [
-            replace(e, rate=evidence.highest_event_rate)
-            for e in effect_variants(effect)
-            if isinstance(e, Readout)
-        ]
-    return effect_variants(effect)
+    return list(effect.candidates(evidence.observe(idle_bus=idle_bus)))
 
 
 def acts_on_few_pixels(effect: Effect) -> bool:
-    """Whether an effect acts on a share of the pixels: a few hundred of them do not show it."""
-    return any(p.name == "share" for p in effect.parameters())
+    """Whether an effect acts on so few pixels that some hundred of them do not show it."""
+    return effect.rare
 
 
 @dataclass(frozen=True, eq=False)
@@ -243,7 +225,7 @@ def refine_candidate(
     """Fit a candidate to all pixels of the training half, by the sampling errors of the present model."""
     # a finalist that is still on its way would be judged by where it happens to be
     half = evidence.train.loaded(tried.model.space, tried.model.place)
-    ways = with_lamp_shifted(tried.model, half.frame.step)
+    ways = shift_periodic_effects(tried.model, half.frame.step)
     works = []
     for way in ways:
         over = race.over(tried.name)

@@ -7,11 +7,11 @@ from itertools import pairwise
 
 import numpy as np
 
-from dase.fitting.batch_simulator import LAG_TIMES
 from dase.fitting.data_split import SplitMeasurement
 from dase.kernels.event_probes import BANDS, CLASSES, INTERVALS, KINDS, ZONES
+from dase.probes.accumulators import PROBE_TIMES
 from dase.probes.distance import Judgement
-from dase.probes.statistics import LAYOUT, LOWEST, MEANS, TONES
+from dase.probes.statistics import LAYOUT, MEANS, SPECTRUM
 from dase.probes.timestamp_patterns import TimestampStructure
 from dase.results import Cell
 
@@ -72,7 +72,7 @@ def _interval_words(evidence: SplitMeasurement, n: int) -> StatisticWords:
 
 def _lag_words(evidence: SplitMeasurement, n: int) -> StatisticWords:
     lag, where = divmod(n, BANDS)
-    a, b = 1e3 * LAG_TIMES[lag], 1e3 * LAG_TIMES[lag + 1]
+    a, b = 1e3 * PROBE_TIMES.lags[lag], 1e3 * PROBE_TIMES.lags[lag + 1]
     what = f"change of light from {b:g} to {a:g} ms before the event"
     return band_in_words(evidence, where), what, "log intensity"
 
@@ -121,9 +121,9 @@ def _ring_words(evidence: SplitMeasurement, n: int) -> StatisticWords:
 
 
 def _spectrum_words(evidence: SplitMeasurement, n: int) -> StatisticWords:
-    if n >= TONES:
+    if n >= SPECTRUM.count:
         return "all pixels", f"swing of the net rate at {evidence.peak:.4g} Hz", "share"
-    ends = np.geomspace(LOWEST, 0.5 / evidence.held.frame.step, TONES + 1)
+    ends = SPECTRUM.edges(evidence.held.frame.step)
     return "all pixels", f"power of the net rate from {ends[n]:.3g} to {ends[n + 1]:.3g} Hz", "log power"
 
 

@@ -10,12 +10,12 @@ from numpy.typing import NDArray
 
 from dase.diagnosis.cell_descriptions import band_in_words, worst_cells
 from dase.diagnosis.settings import DEFAULTS, DiagnosisSettings
-from dase.fitting.batch_simulator import LAG_TIMES
-from dase.fitting.data_split import PIXELS, SplitMeasurement, split_measurement
+from dase.fitting.data_split import SPLIT, SplitMeasurement, split_measurement
 from dase.fitting.measurement import Measured, SceneChoice, as_measurement
 from dase.fitting.model import model_of
 from dase.fitting.subset import CalibratedSubset
 from dase.kernels.event_probes import BANDS, INTERVALS, KINDS, LAGS, RESTING
+from dase.probes.accumulators import PROBE_TIMES
 from dase.probes.distance import Judgement
 from dase.probes.random_streams import SimulationStream
 from dase.probes.statistics import LAYOUT
@@ -33,7 +33,7 @@ def compare(
     *,
     scene: SceneChoice | None = None,
     trust: Trust | None = None,
-    pixels: int = PIXELS,
+    pixels: int = SPLIT.pixels,
     seed: int = 0,
     device: str = "cpu",
     progress: Progress | None = None,
@@ -155,7 +155,7 @@ def _median_interval(counts: Array, step: float) -> float:
 
 def _mean_lag(values: Array) -> float:
     change = values[LAYOUT["lag"]].reshape(LAGS, BANDS).mean(1)
-    middle = 0.5 * (np.array(LAG_TIMES[1:]) + np.array(LAG_TIMES[:-1]))
+    middle = 0.5 * (np.array(PROBE_TIMES.lags[1:]) + np.array(PROBE_TIMES.lags[:-1]))
     weight = np.maximum(change, 0.0)
     return float(1e3 * (weight * middle).sum() / max(weight.sum(), 1e-12))
 
@@ -203,7 +203,7 @@ def _interval_curves(half: CalibratedSubset) -> tuple[Curve, ...]:
 
 
 def _lag_curves(evidence: SplitMeasurement, half: CalibratedSubset) -> tuple[Curve, ...]:
-    times = np.array(LAG_TIMES)
+    times = np.array(PROBE_TIMES.lags)
     width = 1e3 * np.diff(times)
     middle = 1e3 * 0.5 * (times[1:] + times[:-1])
     both = [v[LAYOUT["lag"]].reshape(LAGS, BANDS) for v in (half.seen.target, half.repeats.mean(0))]

@@ -16,7 +16,7 @@ from dase.diagnosis.settings import DEFAULTS, DiagnosisSettings
 from dase.diagnosis.state import DiagnosisState, explains_remainder, with_same_freedom
 from dase.effects import EFFECTS, Effect
 from dase.fitting.confidence_intervals import estimate_parameters
-from dase.fitting.data_split import PIXELS, split_measurement
+from dase.fitting.data_split import SPLIT, split_measurement
 from dase.fitting.measurement import Measured, SceneChoice, as_measurement
 from dase.fitting.model import FittedModel, fit_present_model, model_of, refit_model, refit_work
 from dase.fitting.scheduler import run_side_by_side
@@ -37,7 +37,7 @@ def diagnose(
     free: Sequence[str] | None = None,
     trust: Trust | None = None,
     most: int = 4,
-    pixels: int = PIXELS,
+    pixels: int = SPLIT.pixels,
     seed: int = 0,
     device: str = "cpu",
     progress: Progress | None = None,

@@ -10,7 +10,7 @@ from dase.diagnosis.settings import DEFAULTS, DiagnosisSettings
 from dase.effects import Effect
 from dase.fitting.data_split import SplitMeasurement
 from dase.fitting.model import FittedModel, free_of, model_of
-from dase.probes.distance import QUIET, Judgement, reaches_floor
+from dase.probes.distance import LIMITS, Judgement, reaches_floor
 from dase.probes.random_streams import SimulationStream
 from dase.results import Progress, Step
 from dase.simulation.sensor import Sensor
@@ -90,7 +90,7 @@ def explains_remainder(
     That may be the scene's fault, or another simulator's habit, so it must explain most of it.
     """
     level = judgement.level
-    chance = judgement.error <= max(QUIET, judgement.reach) and reaches_floor(judgement)
+    chance = judgement.error <= max(LIMITS.quiet, judgement.reach) and reaches_floor(judgement)
     return chance and judgement.error - level <= settings.remainder * (without.error - level)
 
 

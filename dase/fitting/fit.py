@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from os import PathLike
 
 import numpy as np
 
-from dase.fitting.confidence_intervals import estimate_parameters
-from dase.fitting.data_split import PIXELS, SplitMeasurement, split_measurement
+from dase.fitting.confidence_intervals import REPEATS, estimate_parameters
+from dase.fitting.data_split import SPLIT, SplitMeasurement, split_measurement
 from dase.fitting.measurement import Measured, SceneChoice, as_measurement
 from dase.fitting.model import FittedModel, fit_present_model, model_of, refit_model
 from dase.fitting.parameter_space import SearchAxis
@@ -21,20 +21,25 @@ from dase.results import Estimate, Fit, Progress
 from dase.simulation.sensor import Sensor
 from dase.simulation.sensor_file import as_sensor
 
-REPEATS = 60
-"""Simulations with other seeds that tell what chance does."""
 
-OTHERS = 2
-"""Starts beside the wide look at thresholds."""
+@dataclass(frozen=True)
+class FitSettings:
+    """How many starts a fit has, and when they agree."""
 
-MOST = 5
-"""The same where no two starts come to the same error."""
+    other_starts: int = 2
+    """Starts beside the wide look at thresholds."""
 
-AGREE = 3.0
-"""Starts agree where their ends lie within so many half-widths of the confidence interval, or `NEAR`."""
+    most_starts: int = 5
+    """The same where no two starts come to the same error."""
 
-NEAR = 0.08
-"""Of each other, in the units of `Axis.to_place`."""
+    agree: float = 3.0
+    """Starts agree where their ends lie within so many half-widths of the confidence interval."""
+
+    near: float = 0.08
+    """They agree as well where they lie within this of each other, in the units of `SearchAxis.to_place`."""
+
+
+FIT = FitSettings()
 
 
 def fit(
@@ -44,7 +49,7 @@ def fit(
     scene: SceneChoice | None = None,
     free: Sequence[str] | None = None,
     trust: Trust | None = None,
-    pixels: int = PIXELS,
+    pixels: int = SPLIT.pixels,
     seed: int = 0,
     device: str = "cpu",
     progress: Progress | None = None,
@@ -122,10 +127,10 @@ def _descend_from_starts(
     tell("a wide look", 0.1)
     model = refit_model(evidence, fit_present_model(evidence, sensor, free, seed=seed), seed=seed)
     ends = [(model.judge(evidence.held, repeats=REPEATS, seed=SimulationStream.JUDGE.seed(seed)), model)]
-    for n in range(MOST):
-        if n >= OTHERS and len(_equally_good_models(ends)) > 1:
+    for n in range(FIT.most_starts):
+        if n >= FIT.other_starts and len(_equally_good_models(ends)) > 1:
             break
-        tell(f"start {n + 2}", 0.3 + 0.6 * n / MOST)
+        tell(f"start {n + 2}", 0.3 + 0.6 * n / FIT.most_starts)
         model = refit_model(evidence, _move_away(_best_end(ends)[1], seed + n), seed=seed + n)
         ends.append(
             (model.judge(evidence.held, repeats=REPEATS, seed=SimulationStream.JUDGE.seed(seed)), model)
@@ -175,7 +180,7 @@ def notes_on_disagreement(
     for n, axis in enumerate(best.space.axes):
         places = np.array([m.place[n] for m in ends])
         low, high = (float(axis.to_place(v)) for v in (values[axis.name].low, values[axis.name].high))
-        if np.ptp(places) > max(AGREE * 0.5 * (high - low), NEAR):
+        if np.ptp(places) > max(FIT.agree * 0.5 * (high - low), FIT.near):
             found = ", ".join(f"{float(axis.to_value(p)):.3g}" for p in sorted(places))
             out.append(f"{axis.name}: starts end at {found}; the data do not say which")
     return out

@@ -10,10 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dase.effects.base import Effect
-from dase.effects.flicker import Flicker
 from dase.effects.threshold import Threshold
 from dase.fitting.data_split import SplitMeasurement
-from dase.fitting.descent import StopRule, descent_work, ranking_work
+from dase.fitting.descent import DESCENT, DescentSettings, StopRule, descent_work, ranking_work
 from dase.fitting.parameter_space import ParameterSpace, SearchAxis, axes_of, with_values
 from dase.fitting.scheduler import SimulationRequest, Work, answer_requests, run_side_by_side, run_work
 from dase.fitting.subset import CalibratedSubset, PixelSubset
@@ -23,33 +22,56 @@ from dase.simulation.sensor import Sensor
 
 Array = NDArray[np.float64]
 
-THRESHOLDS = (0.04, 0.06, 0.09, 0.12, 0.15, 0.18, 0.22, 0.27, 0.34, 0.45, 0.65)
-"""Tried for both polarities when a model is fitted from nothing."""
 
-RATIO = 2.2
-"""Most that the thresholds of a pixel differ by at the start."""
+@dataclass(frozen=True)
+class RefitSettings:
+    """How a model is fitted by its own sampling errors."""
 
-SHIFTS = (-0.7, -0.4, -0.15, 0.0, 0.35)
-"""Of the logarithm of the thresholds, when an effect is tried."""
+    repeats: int = 16
+    """Simulations that give a model's sampling errors while it is fitted."""
 
-SETTLED = 16
-"""Repeats that give a model's sampling errors while it is fitted."""
+    descents: int = 3
+    """Descents of which the best is taken: each ends where its random numbers happen to lead."""
 
-DESCENTS = 3
-"""Descents of which the best is taken."""
+    seeds_apart: int = 10_007
+    """Between their seeds: farther than those of one descent are from each other."""
 
-APART = 10_007
-"""Between their seeds."""
+    alike: float = 2.0
+    """Most by which the loss of another phase may grow where it becomes the present one."""
 
-ALIKE = 2.0
-"""Most by which the loss of another phase may grow where it becomes the present one."""
 
-ROOM = 0.3
-"""Beside a value that is seen in a measurement, one higher by this is tried: of a bus, the most events per
-second are the least it can send."""
+REFIT = RefitSettings()
 
-FEW_STARTS = 0.1
-"""Share of the plausible range that is left out at both ends when an effect is tried."""
+
+@dataclass(frozen=True)
+class StartSettings:
+    """Where searches begin."""
+
+    thresholds: tuple[float, ...] = (0.04, 0.06, 0.09, 0.12, 0.15, 0.18, 0.22, 0.27, 0.34, 0.45, 0.65)
+    """Tried for both polarities when a model is fitted from nothing [log intensity]."""
+
+    ratio: float = 2.2
+    """Most that the thresholds of a pixel differ by at the start."""
+
+    shifts: tuple[float, ...] = (-0.7, -0.4, -0.15, 0.0, 0.35)
+    """Of the logarithm of the thresholds, when an effect is tried: most effects make events more or fewer."""
+
+    strengths: int = 6
+    """Places along a parameter that switches its effect off."""
+
+    margin: float = 0.1
+    """Share of the plausible range that is left out at both ends when an effect is tried."""
+
+    turns: int = 8
+    """Phases at which what repeats in time is tried: no farther than a sixteenth of a turn from the right
+    one."""
+
+    above: float = 0.3
+    """Beside a bound that is seen in a measurement, one higher by this is tried, in the units of
+    `SearchAxis.to_place`: of a bus, the most events per second are the least it can send."""
+
+
+STARTS = StartSettings()
 
 
 @dataclass(frozen=True)
@@ -93,11 +115,12 @@ class FittedModel:
         radius: float = 0.2,
         patient: bool = False,
         over: StopRule | None = None,
+        settings: DescentSettings = DESCENT,
     ) -> Work[FittedModel]:
         """Return the model with its parameters improved, see `run_side_by_side`."""
         found = yield from descent_work(
             half, self.space, self.place, seed=seed, iterations=iterations, radius=radius, patient=patient,
-            over=over,
+            over=over, settings=settings,
         )  # fmt: skip
         return replace(self, place=found.place, loss=found.loss)
 
@@ -114,24 +137,26 @@ def with_phase(model: FittedModel, phase: float) -> FittedModel:
     return replace(model, space=replace(model.space, sensor=sensor))
 
 
-def with_lamp_shifted(model: FittedModel, step: float) -> list[FittedModel]:
-    """Return a model, and where it has a lamp, also those with the lamp a step of the grid earlier and later.
+def shift_periodic_effects(model: FittedModel, step: float) -> list[FittedModel]:
+    """Return a model, and for each effect that repeats in time those with it earlier and later.
 
     What probes tell by steps hardly changes when all events are a step off, so a fit may end there.
+
+    Args:
+        model: Whose effects are shifted.
+        step: Of the grid of time [s].
     """
-    names = [axis.name for axis in model.space.axes]
-    if "flicker.phase" not in names:
-        return [model]
-    at = names.index("flicker.phase")
-    lamp = model.sensor["flicker"]
-    assert isinstance(lamp, Flicker)
-    turn = step * lamp.frequency
     out = [model]
-    for phase in (-turn, turn):
-        place = model.place.copy()
-        value = float(model.space.axes[at].to_value(place[at])) + phase
-        place[at] = model.space.axes[at].to_place((value + 1.0) % 2.0 - 1.0)
-        out.append(replace(model, place=place))
+    for effect in model.sensor.effects:
+        for seconds in (-step, step):
+            place, moved = model.place.copy(), effect.shifted(seconds)
+            for n, axis in enumerate(model.space.axes):
+                if axis.effect is type(effect) and moved != effect:
+                    value = getattr(moved, axis.fact.name)
+                    if value != getattr(effect, axis.fact.name):
+                        place[n] = axis.to_place(value)
+            if not np.array_equal(place, model.place):
+                out.append(replace(model, place=place))
     return out
 
 
@@ -166,11 +191,13 @@ def refit_model(evidence: SplitMeasurement, model: FittedModel, *, seed: int, ro
     Each of some descents has random numbers of its own, because they end where those happen to lead, and the
     last one begins with the other phase; the best of them by the random numbers of all is taken.
     """
-    seeds = [seed + APART * n for n in range(DESCENTS)]
+    seeds = [seed + REFIT.seeds_apart * n for n in range(REFIT.descents)]
     works = [refit_work(evidence, model, seed=each, rounds=rounds) for each in seeds[:-1]]
     works.append(_refit_from_other_phase_work(evidence, model, seed=seeds[-1], rounds=rounds))
     ends = run_side_by_side(works)
-    half = ends[0].calibrate(evidence.train, repeats=SETTLED, seed=SimulationStream.CALIBRATE_FIT.seed(seed))
+    half = ends[0].calibrate(
+        evidence.train, repeats=REFIT.repeats, seed=SimulationStream.CALIBRATE_FIT.seed(seed)
+    )
     values = answer_requests(
         [SimulationRequest(half, m.space, m.place[None], each) for m in ends for each in seeds]
     )
@@ -196,7 +223,7 @@ def calibration_while_fitting(
 ) -> Work[CalibratedSubset]:
     """Return the training half with a model under fit as its present one."""
     return evidence.train.calibration_work(
-        model.space, model.place, repeats=SETTLED, seed=SimulationStream.CALIBRATE_FIT.seed(seed)
+        model.space, model.place, repeats=REFIT.repeats, seed=SimulationStream.CALIBRATE_FIT.seed(seed)
     )
 
 
@@ -238,15 +265,16 @@ def _as_good_work(evidence: SplitMeasurement, model: FittedModel, loss: float, *
     """
     half = yield from calibration_while_fitting(evidence, model, seed=seed)
     (values,) = yield [SimulationRequest(half, model.space, model.place[None], seed)]
-    return float(half.scale.loss(values)[0]) < ALIKE * loss
+    return float(half.scale.loss(values)[0]) < REFIT.alike * loss
 
 
 def _threshold_starts(model: FittedModel) -> Array:
-    names = [axis.name for axis in model.space.axes]
-    at = [names.index(n) if n in names else -1 for n in ("threshold.on", "threshold.off")]
-    if min(at) < 0:
+    at = [n for n, axis in enumerate(model.space.axes) if axis.is_threshold]  # ON comes before OFF
+    if len(at) < 2:
         return model.place[None]
-    pairs = [(a, b) for a, b in product(THRESHOLDS, THRESHOLDS) if 1 / RATIO < a / b < RATIO]
+    pairs = [
+        (a, b) for a, b in product(STARTS.thresholds, repeat=2) if 1 / STARTS.ratio < a / b < STARTS.ratio
+    ]
     out = np.repeat(model.place[None], len(pairs), 0)
     for column, values in zip(at, np.array(pairs).T, strict=True):
         out[:, column] = model.space.axes[column].to_place(values)
@@ -262,25 +290,25 @@ def with_effect_added(present: FittedModel, effect: Effect) -> FittedModel:
     """Return the present model with an effect added, all of whose parameters are free."""
     sensor = present.sensor.with_effect(effect)
     old = [axis.name for axis in present.space.axes]
-    # read off the events of all pixels, a lamp's frequency is better than a fit to a few makes it
-    new = [name for name in free_of(sensor, effect.name) if name != "flicker.frequency"]
+    # read off the events of all pixels, what a fit finds only nearby is better than a fit to a few makes it
+    new = [axis.name for axis in axes_of(sensor) if axis.effect is type(effect) and axis.fact.nearby is None]
     return model_of(sensor, [*old, *new])
 
 
 def starting_places(model: FittedModel, effect: Effect, *, few: bool = False) -> Array:
     """Return places from which an effect is tried: its strength and its character, at several thresholds."""
     axes = model.space.axes
-    columns, choices, seen = [], [], False
+    columns, choices, observed = [], [], False
     for n, axis in enumerate(axes):
-        if axis.name.split(".")[0] == effect.name:
+        if axis.effect is type(effect):
             columns.append(n)
-            seen |= axis.fact.seen
+            observed |= axis.fact.search_starts == "above"
             tried = _starting_places_of_axis(axis, float(model.place[n]))
             choices.append(tried[::2] if few and axis.main and len(tried) > 2 else tried)
-    thresholds = [n for n, axis in enumerate(axes) if axis.name in ("threshold.on", "threshold.off")]
+    thresholds = [n for n, axis in enumerate(axes) if axis.is_threshold]
     out = []
     for combination in product(*choices):
-        for shift in SHIFTS[1::2] if few and not seen else SHIFTS:
+        for shift in STARTS.shifts[1::2] if few and not observed else STARTS.shifts:
             place = model.place.copy()
             place[columns] = combination
             place[thresholds] += shift
@@ -290,12 +318,14 @@ def starting_places(model: FittedModel, effect: Effect, *, few: bool = False) ->
 
 def _starting_places_of_axis(axis: SearchAxis, present: float) -> list[float]:
     low, high = (float(axis.to_place(v)) for v in axis.fact.plausible)
-    if axis.fact.seen:
-        return [present, present + ROOM]
-    if axis.main:
-        return list(low + (high - low) * np.linspace(FEW_STARTS, 1 - FEW_STARTS, 6))
-    if axis.fact.unit == "turns":
-        return [float(axis.to_place(turn)) for turn in np.linspace(0, 1, 8, endpoint=False)]
-    if axis.name.split(".")[1] in ("dark", "slope", "damping", "knee", "rate", "cutoff"):
-        return [present, low + 0.9 * (high - low)]
-    return [present]
+    match axis.fact.search_starts:
+        case "above":
+            return [present, present + STARTS.above]
+        case "spread":
+            return list(low + (high - low) * np.linspace(STARTS.margin, 1 - STARTS.margin, STARTS.strengths))
+        case "turn":
+            return [float(axis.to_place(turn)) for turn in np.linspace(0, 1, STARTS.turns, endpoint=False)]
+        case "ends":
+            return [present, low + (1 - STARTS.margin) * (high - low)]
+        case "value":
+            return [present]
