@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dase.events import Events
-from dase.formatting import percent
+from dase.formatting import percent, seconds
 from dase.signatures.calm_events import row_major_pixels
 from dase.signatures.chance import NINETY, sign_flip_tail
 from dase.signatures.result import Answer, Signature, judge_signature, without_answer
@@ -33,6 +33,7 @@ class PatternSettings:
     fewest_pixels: int = 500
     block: int = 8  # [px] neighbours share the scene: blocks are independent, pixels are not
     hot: float = 2e-4  # share of hot pixels above which those not found as hot are a pattern, too
+    shortest: float = 0.3  # [s] below, the halves are parts of one look at the scene
     same_scene: float = 0.9  # correlation of both halves' smooth counts above which they saw the same scene
 
 
@@ -53,6 +54,7 @@ class HalfCounts:
         self.settings = settings or PatternSettings()
         self.counts = np.zeros((2, 2, height, width), np.int64)
         """Events, shape (polarity, half, H, W)."""
+        self.duration = end - begin
         self._begin, self._part = begin, max(end - begin, 1e-9) / self.settings.parts
 
     def push(self, events: Events) -> None:
@@ -67,7 +69,8 @@ class HalfCounts:
 class _Spikes:
     """What one polarity says: excess agreement at no shift, by pixel."""
 
-    signal: NDArray[np.float64]  # (H, W) in standard errors squared, 0 where nothing is known
+    product: NDArray[np.float64]  # (H, W) of both halves, in standard errors squared, 0 where nothing is known
+    signal: NDArray[np.float64]  # (H, W) the same beyond the extrapolation
     spread: NDArray[np.float64]  # (H, W) relative counts squared
     used: NDArray[np.bool_]
 
@@ -103,7 +106,7 @@ def _find_spikes(halves: NDArray[np.int64], good: NDArray[np.bool_], s: PatternS
     errors = np.clip((counts - mean) / np.sqrt(mean + 1), -6, 6) * weight
     relative = np.clip(counts / np.maximum(mean, 1) - 1, -2, 2) * weight
     signal, spread = (np.where(used, _excess_agreement(*pair), 0.0) for pair in (errors, relative))
-    return _Spikes(signal, spread, used)
+    return _Spikes(np.where(used, errors[0] * errors[1], 0.0), signal, spread, used)
 
 
 def _sum_blocks(field: NDArray[np.float64], block: int) -> NDArray[np.float64]:
@@ -126,7 +129,8 @@ def find_fixed_pattern(halves: HalfCounts, hot: NDArray[np.bool_], level: float)
     """Look for a pattern that stays.
 
     The null gives each block of pixels either sign: without a pattern, products of the two halves beyond the
-    extrapolation are as often above zero as below.
+    extrapolation are as often above zero as below. So are the products themselves, which must be beyond
+    chance, too: where shifts agree less than nothing, the extrapolation alone says little.
 
     Args:
         halves: Events by pixel in two halves of the time.
@@ -134,6 +138,9 @@ def find_fixed_pattern(halves: HalfCounts, hot: NDArray[np.bool_], level: float)
         level: p below which it is there.
     """
     s = halves.settings
+    if halves.duration < s.shortest:
+        reason = f"{seconds(halves.duration)} of events are one look at the scene; from {seconds(s.shortest)} on there are two"
+        return without_answer(NAME, reason)
     good = ~hot.reshape(halves.counts.shape[2:])
     spikes = [_find_spikes(pair, good, s) for pair in halves.counts]
     known = [one for one in spikes if one.used.sum() >= s.fewest_pixels]
@@ -141,7 +148,8 @@ def find_fixed_pattern(halves: HalfCounts, hot: NDArray[np.bool_], level: float)
         pixels = max(int(one.used.sum()) for one in spikes)
         reason = f"{pixels} pixels with {s.fewest_events:g} events and more in each half: fewer than {s.fewest_pixels}"
         return without_answer(NAME, reason)
-    signal = _sum_blocks(np.sum([one.signal for one in known], axis=0), s.block)
+    fields = ([one.signal for one in known], [one.product for one in known])
+    p = max(sign_flip_tail(_sum_blocks(np.sum(field, axis=0), s.block)) for field in fields)
     pixels = sum(int(one.used.sum()) for one in known)
     spread = _sum_blocks(np.sum([one.spread for one in known], axis=0), s.block)
     mean, error = float(spread.sum()) / pixels, math.sqrt(float((spread**2).sum())) / pixels
@@ -149,7 +157,7 @@ def find_fixed_pattern(halves: HalfCounts, hot: NDArray[np.bool_], level: float)
     used = np.any([one.used for one in known], axis=0)
     alike = _same_scene(halves.counts, used, good)
     entry = Signature(
-        name=NAME, answer=Answer.NOT_SEEN, p=sign_flip_tail(signal), size=size, low=low, high=high,
+        name=NAME, answer=Answer.NOT_SEEN, p=p, size=size, low=low, high=high,
         unit="relative spread of counts over pixels", least=s.least,
         sentence=f"pixels differ from their neighbours for good: counts spread by {percent(size)}",
         details={"pixels": pixels, "same_scene": alike},

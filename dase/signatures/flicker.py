@@ -141,7 +141,7 @@ def _find_tone(
     if bursts is not None:  # what is left of bursts has lines at multiples of the frame rate
         turns = base * spacing * bursts.interval
         lines = np.abs(turns - np.round(turns)) / bursts.interval < 0.75 / (size * step)
-    best = 0.0, 1.0, 1
+    best = int(base[0]), 1.0, 1
     tests = 2 * 2 * (s.fastest - s.slowest) * size * step
     for many in (1, s.overtones):
         total = np.zeros(len(base))
@@ -154,9 +154,13 @@ def _find_tone(
         p[lines] = 1.0
         at = int(np.lexsort((-total, p))[0])
         chance = min(1.0, tests * float(p[at]))
-        if chance < best[1]:
-            best = float(base[at] * spacing), chance, many
-    return best
+        if chance <= best[1]:
+            best = int(base[at]), chance, many
+    fundamental, chance, many = best
+    # overtones of half a tone are tones, too: the lowest of those that are about as clear as the clearest
+    clear = [float(rayleigh[h * fundamental]) if h * fundamental < len(rayleigh) else 0.0 for h in range(1, many + 1)]
+    tone = 1 + int(np.argmax(np.array(clear) > 0.5 * max(clear)))
+    return tone * fundamental * spacing, chance, many
 
 
 def _refine_tone(
@@ -250,8 +254,6 @@ def find_flicker(
         return without_answer(NAME, f"{events} events, fewer than {s.fewest_events}"), None
     v = rates.net.sum(1) / (rates.usual + 1)
     tone, p_tone, many = _find_tone(v, step, bursts, s)
-    if tone == 0.0:
-        return without_answer(NAME, "no tone to be tried"), None
     p_tiles, agree, tiles = _tiles_in_phase(rates, step, tone, s)
     if stats.binom.sf(tiles - 1, tiles, 2 * s.agree) >= level and p_tone < level:
         reason = f"{tone:.1f} Hz, but only {tiles} of {s.tiles**2} parts of the array have events to agree on it"

@@ -29,6 +29,7 @@ class PairSettings:
     least: float = 2.0  # times as many as by chance
     near: float = 0.02  # [s] a pair
     later: tuple[float, float] = (0.1, 0.4)  # [s] no pair any more, but still the same scene
+    busiest: float = 4.0  # [Hz] of a pixel at rest; of one that sends more, few intervals are long
 
 
 class PairCounts:
@@ -91,24 +92,24 @@ def find_opposite_pairs(
         lamp: Whether the light flickers, which makes opposite pairs.
     """
     s = pairs.settings
-    off, on = pairs.events[:, ~hot]
-    near, later = (int(row[~hot].sum()) for row in pairs.opposite)
+    rest = ~hot & (pairs.events.sum(0) <= max(s.busiest * duration, 10.0))
+    off, on = pairs.events[:, rest]
+    near = int(pairs.opposite[0, rest].sum())
     events = int((off + on).sum())
-    window = s.near / max(duration, s.near)
-    trains = float((off * on).sum() * 2 * window)
-    # a pixel of rate r has exp(r t) times as many intervals below t as above, in the mean over its events
-    rate = float(((off + on) ** 2).sum() / max(events, 1)) / max(duration, 1e-9)
+    trains = float((off * on).sum() * 2 * s.near / max(duration, s.near))
+    # a train of rate r has exp(r t) times as many intervals below t as above
     begin, end = s.later
-    local = later * s.near / (end - begin) * math.exp(min(rate * (begin + end) / 2, 2.0))
+    favour = np.exp((off + on) / max(duration, end) * (begin + end) / 2)
+    local = float((pairs.opposite[1, rest] * favour).sum()) * s.near / (end - begin)
     expected = max(trains, local)
-    rest = f"{percent(near / max(near + int(pairs.same[~hot].sum()), 1))} of near pairs flip"
+    flips = f"{percent(near / max(near + int(pairs.same[rest].sum()), 1))} of near pairs flip"
     p = float(stats.poisson.sf(near - 1, expected)) if near else 1.0
     low, high = (limit / max(expected, 1e-3) for limit in poisson_interval(near))
     known = {
         "p": p, "size": near / max(expected, 1e-3), "low": low, "high": high,
         "unit": "times as many as by chance", "least": s.least,
         "details": {
-            "pairs": near, "expected": expected, "calm_events": events,
+            "pairs": near, "expected": expected, "trains": trains, "local": local, "calm_events": events,
             "on_rate": float(on.sum() / max(duration, 1e-9) / max(len(on), 1)),
             "off_rate": float(off.sum() / max(duration, 1e-9) / max(len(off), 1)),
         },
@@ -119,6 +120,6 @@ def find_opposite_pairs(
     if stats.poisson.sf(math.ceil(2 * s.least * expected) - 1, expected) >= level and p >= level:
         reason = f"{grouped(events)} calm events: {near} pairs, {expected:.2g} by chance, too few to tell"
         return without_answer(NAME, reason, **known)
-    said = f"noise of the pixels at rest: {near} opposite pairs within 20 ms, {expected:.3g} by chance; {rest}"
+    said = f"noise of the pixels at rest: {near} opposite pairs within 20 ms, {expected:.3g} by chance; {flips}"
     unseen = f"{near} opposite pairs at rest, {expected:.3g} by chance"
     return judge_signature(Signature(name=NAME, answer=Answer.NOT_SEEN, sentence=said, **known), level, unseen)

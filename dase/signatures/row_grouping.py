@@ -24,7 +24,7 @@ NAME = "grouping"
 class GroupingSettings:
     """Which events are compared."""
 
-    least: float = 1.25  # times as often
+    least: float = 1.2  # times as often
     lags: tuple[int, ...] = tuple(range(20, 60, 4))  # events later: no group of a bus any more
     span: float = 5e-3  # [s] within which they must come: edges move some pixels in it
     away: int = 4  # [px] neighbours fire together because the scene is smooth
