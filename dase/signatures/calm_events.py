@@ -68,7 +68,47 @@ class CalmFilter:
     ) -> None:
         if not len(t):
             return
-        columns = ((np.ascontiguousarray(t), wp.float64), (pixel, int), (last, wp.float64), (crowded, wp.uint8))
+        columns = (
+            (np.ascontiguousarray(t), wp.float64),
+            (pixel, int),
+            (last, wp.float64),
+            (crowded, wp.uint8),
+        )
         time, place, seen, out = (wp.array(a, dtype=d, device=self._cpu, copy=False) for a, d in columns)
         inputs = [time, place, wp.float64(self.gap), self.reach, events.width, events.height, seen, out]
         wp.launch(mark_crowded, dim=1, inputs=inputs, device=self._cpu)
+
+
+class CalmShare:
+    """Estimates at which share of places and times an event would be calm: what could have been seen.
+
+    Args:
+        width: Columns of the sensor.
+        height: Rows of the sensor.
+        begin: Of the recording [s].
+        filter: What calm means.
+    """
+
+    def __init__(self, width: int, height: int, begin: float, filter: CalmFilter):
+        side = 2 * filter.reach + 1
+        self._columns, self._side = -(-width // side), side
+        self._blocks = self._columns * -(-height // side)
+        self._begin, self._span = begin, 2 * filter.gap
+        self._busy = 0
+        self._newest = np.empty(0, np.int64)
+
+    def push(self, events: Events) -> None:
+        """Take events that follow those before."""
+        if not len(events):
+            return
+        span = ((events.t - self._begin) / self._span).astype(np.int64)
+        block = (events.y // self._side).astype(np.int64) * self._columns + events.x // self._side
+        cells = np.unique(span * self._blocks + block)
+        # the last span of the piece before goes on in this one
+        self._busy += len(cells) - int(np.count_nonzero(np.isin(self._newest, cells, assume_unique=True)))
+        self._newest = cells[cells >= span[-1] * self._blocks]
+
+    def share(self, end: float) -> float:
+        """Return the share of cells of space and time without an event, from begin to `end` [s]."""
+        spans = int((end - self._begin) / self._span) + 1
+        return max(0.0, 1 - self._busy / (spans * self._blocks))

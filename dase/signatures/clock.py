@@ -76,4 +76,5 @@ class ClockCounts:
     @property
     def times(self) -> NDArray[np.float64]:
         """Middle of each step [s], shape (K,)."""
-        return self.begin + (np.arange(self._used) + 0.5) * self.settings.step
+        steps = np.arange(self._used, dtype=np.float64)
+        return self.begin + (steps + 0.5) * self.settings.step

@@ -1,7 +1,7 @@
 """Double events: a pixel sends twice within some microseconds, sooner than its dead time allows.
 
-A handshake that is answered twice. Where the light jumps, events also follow each other fast, but then as many
-per microsecond a little later.
+A handshake that is answered twice. Where the light jumps, events also follow each other fast, but then as
+many per microsecond a little later.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from scipy import stats
 
 from dase.events import Events
-from dase.formatting import grouped, percent
+from dase.formatting import grouped, percent, seconds
 from dase.kernels import launch
 from dase.kernels.event_neighbours import count_short_intervals
 from dase.signatures.calm_events import row_major_pixels
@@ -67,7 +67,9 @@ class IntervalCounts:
         wp.launch(count_short_intervals, dim=1, inputs=inputs, device=self._cpu)
 
 
-def find_double_events(intervals: IntervalCounts, hot: NDArray[np.bool_], level: float) -> Signature:
+def find_double_events(
+    intervals: IntervalCounts, hot: NDArray[np.bool_], level: float, tick: float = 0.0
+) -> Signature:
     """Look for pixels that send twice.
 
     The null has as many intervals per second below 20 µs as from there to 400 µs: binomial.
@@ -76,8 +78,11 @@ def find_double_events(intervals: IntervalCounts, hot: NDArray[np.bool_], level:
         intervals: Counted intervals.
         hot: Pixels to leave out, shape (H * W,).
         level: p below which they are there.
+        tick: Time between the ticks of the stamps [s]: at a slow clock, events that are not double share one.
     """
     s = intervals.settings
+    if tick >= s.near:
+        return without_answer(NAME, f"stamps are {seconds(tick)} apart, which hides what is sooner")
     near, rest = (int(row[~hot].sum()) for row in intervals.counts)
     events = int(intervals.events[~hot].sum())
     if events * s.least < 20:
@@ -91,8 +96,8 @@ def find_double_events(intervals: IntervalCounts, hot: NDArray[np.bool_], level:
     entry = Signature(
         name=NAME, answer=Answer.NOT_SEEN, p=p, size=share, low=low, high=high,
         unit="share of the events", least=s.least,
-        sentence=f"{grouped(near)} events ({percent(share)}) within 20 µs of the same pixel's last, {grouped(rest)} "
-        "from there to 400 µs",
+        sentence=f"{grouped(near)} events ({percent(share)}) within 20 µs of the same pixel's last, "
+        f"{grouped(rest)} from there to 400 µs",
         details={"near": near, "later": rest},
     )  # fmt: skip
     unseen = f"{percent(share)} of the events within 20 µs of the same pixel's last"

@@ -7,6 +7,7 @@ pixel, without the times that coupling explains; hot pixels come first, and are 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass
 from os import PathLike
 from pathlib import Path
 
@@ -20,7 +21,7 @@ from dase.io.rules import TooLateError
 from dase.io.sequence import Sequence
 from dase.io.source import Size
 from dase.recordings.recording import Recording
-from dase.signatures.calm_events import CalmFilter, row_major_pixels
+from dase.signatures.calm_events import CalmFilter, CalmShare, row_major_pixels
 from dase.signatures.clock import ClockCounts
 from dase.signatures.double_events import IntervalCounts, find_double_events
 from dase.signatures.fixed_pattern import HalfCounts, find_fixed_pattern
@@ -46,25 +47,32 @@ PART = 1 << 20
 """Events looked at together."""
 
 
+@dataclass(frozen=True)
 class _Passes:
-    """Events that can be gone through again, in pieces of at most `PART`."""
+    """Events that can be gone through again and again.
 
-    def __init__(
-        self, pieces: Callable[[], Iterable[Events]], begins: NDArray[np.float64] | None, size: Size
-    ):
-        self._pieces, self.begins = pieces, begins
-        self.width, self.height = size
+    Args:
+        pieces: Gives the events anew, piece by piece.
+        begins: When exposures begin [s], shape (F,); None where unknown.
+    """
 
-    def __iter__(self) -> Iterator[Events]:
-        for piece in self._pieces():
+    pieces: Callable[[], Iterable[Events]]
+    begins: NDArray[np.float64] | None
+
+    def parts(self, progress: Progress) -> Iterator[Events]:
+        """Yield parts of at most `PART` events, none of them empty, and tell how many they were."""
+        for piece in self.pieces():
             for i in range(0, len(piece), PART):
-                yield piece.select(slice(i, i + PART))
+                part = piece.select(slice(i, i + PART))
+                yield part
+                progress(len(part))
 
 
 class _FirstPass:
     """What is counted before anything is known."""
 
     def __init__(self, width: int, height: int):
+        self.width, self.height = width, height
         self.clock = ClockCounts(width, height)
         self.count = 0
         self.pixels = np.zeros(width * height, np.int64)
@@ -101,9 +109,11 @@ class _FirstPass:
 class _SecondPass:
     """What is counted by pixel, free of bursts that come with frames."""
 
-    def __init__(self, first: _FirstPass, width: int, height: int, bursts: BurstClock | None, tone: float):
+    def __init__(self, first: _FirstPass, bursts: BurstClock | None, tone: float):
+        width, height = first.width, first.height
         self._bursts = bursts
         self._filter = CalmFilter(width, height)
+        self.quiet = CalmShare(width, height, first.begin, self._filter)
         self.calm = CalmCounts(width, height, (first.begin + first.end) / 2, tone)
         self.pairs = PairCounts(width, height)
         self.halves = HalfCounts(width, height, first.begin, first.end)
@@ -112,11 +122,12 @@ class _SecondPass:
 
     def push(self, events: Events) -> None:
         """Take events."""
+        self.groups.push(events)  # the order in which a burst of all pixels is read tells most of all
         if self._bursts is not None:
             events = events.select(~self._bursts.contains(events.t))
         self.halves.push(events)
-        self.groups.push(events)
         self.intervals.push(events)
+        self.quiet.push(events)
         self._take_calm(*self._filter.push(events))
 
     def finish(self) -> None:
@@ -132,21 +143,23 @@ class _SecondPass:
 def _open_passes(source: Source, size: Size | None, notes: list[str] | None) -> _Passes:
     """Return the events of a source, and the begins of its exposures."""
     if isinstance(source, Events):
-        return _passes_of(source, None)
+        return _Passes(lambda: (source,), None)
     if isinstance(source, Recording):
         begins = source.frame_begin if source.frame_begin is not None else source.frame_times
-        return _passes_of(source.events, begins)
+        return _Passes(lambda: (source.events,), begins)
     if isinstance(source, Sequence):
-        return _passes_of(source.events, _sequence_begins(source))
+        return _Passes(lambda: (source.events,), _sequence_begins(source))
     if not isinstance(source, str | PathLike):
         raise InputError(
             f"signatures: must be of a recording, a sequence, events or a file, got {type(source).__name__}"
         )
-    return _open_file(Path(source), size, notes)
-
-
-def _passes_of(events: Events, begins: NDArray[np.float64] | None) -> _Passes:
-    return _Passes(lambda: (events,), begins, (events.width, events.height))
+    path = Path(source)
+    exposures = np.array([(p.t, p.exposure) for p in io.pictures(path, size=size, notes=notes)]).reshape(
+        -1, 2
+    )
+    begins = exposures[:, 0] - exposures[:, 1] / 2
+    known = len(begins) > 0 and bool(np.all(np.isfinite(begins)))
+    return _Passes(lambda: io.stream(path, size=size, notes=notes), begins if known else None)
 
 
 def _sequence_begins(sequence: Sequence) -> NDArray[np.float64] | None:
@@ -157,22 +170,14 @@ def _sequence_begins(sequence: Sequence) -> NDArray[np.float64] | None:
     return out
 
 
-def _open_file(path: Path, size: Size | None, notes: list[str] | None) -> _Passes:
-    """Return the events of a file, read anew for each pass; one whose times go back far is held in memory."""
-    try:
-        sensor = next(iter(io.stream(path, size=size)))
-        whole = all(True for _ in ()) and sensor is not None
-    except TooLateError:
-        whole = False
-    if not whole:
-        sequence = io.read(path, size=size, notes=notes)
-        return _passes_of(sequence.events, _sequence_begins(sequence))
-    exposures = [(p.t, p.exposure) for p in io.pictures(path, size=size)]
-    begins = np.array([t - exposure / 2 for t, exposure in exposures])
-    known = len(begins) > 0 and bool(np.all(np.isfinite(begins)))
-    return _Passes(
-        lambda: io.stream(path, size=size, notes=notes), begins if known else None, (sensor.width, sensor.height)
-    )
+def _run_first(passes: _Passes, progress: Progress) -> _FirstPass:
+    first: _FirstPass | None = None
+    for part in passes.parts(progress):
+        first = first or _FirstPass(part.width, part.height)
+        first.push(part)
+    if first is None:
+        raise InputError("signatures: there are no events")
+    return first
 
 
 def find_signatures(
@@ -203,22 +208,23 @@ def find_signatures(
     if not 0 < level < 1:
         raise InputError(f"signatures: level must lie between 0 and 1, got {level:g}")
     passes = _open_passes(source, size, notes)
-    width, height = passes.width, passes.height
-    first = _FirstPass(width, height)
-    for part in passes:
-        first.push(part)
-        progress(len(part))
-    if not first.count:
-        raise InputError("signatures: there are no events")
+    try:
+        first = _run_first(passes, progress)
+    except TooLateError:  # times go back too far to be sorted on the way
+        assert isinstance(source, str | PathLike)
+        passes = _open_passes(io.read(source, size=size, notes=notes), size, notes)
+        first = _run_first(passes, progress)
+    width, height = first.width, first.height
     each, duration = level / COUNT, first.end - first.begin
     coupling, bursts = find_frame_coupling(first.clock, each, passes.begins)
     flicker, lamp = find_flicker(first.clock, each, bursts)
-    second = _SecondPass(first, width, height, bursts, lamp.frequency if lamp else 0.0)
-    for part in passes:
+    second = _SecondPass(first, bursts, lamp.frequency if lamp else 0.0)
+    for part in passes.parts(progress):
         second.push(part)
-        progress(len(part))
     second.finish()
-    hot, hot_pixels = find_hot_pixels(second.calm, duration, each)
+    hot, hot_pixels = find_hot_pixels(second.calm, second.quiet.share(first.end), duration, each)
+    stamps = find_time_stamps(first.first_events(), hot_pixels, each, lamp=lamp is not None)
+    tick = max(stamps.details.get(name, 0.0) for name in ("step", "period")) if stamps.found else 0.0
     entries = (
         coupling,
         flicker,
@@ -226,8 +232,8 @@ def find_signatures(
         find_opposite_pairs(second.pairs, hot_pixels, duration, each, lamp=lamp is not None),
         find_fixed_pattern(second.halves, hot_pixels, each),
         find_grouping(second.groups, each),
-        find_time_stamps(first.first_events(), hot_pixels, each, lamp=lamp is not None),
-        find_double_events(second.intervals, hot_pixels, each),
+        stamps,
+        find_double_events(second.intervals, hot_pixels, each, tick),
         find_full_bus(first.clock, each),
     )
     return Signatures(width, height, first.count, duration, level, entries)

@@ -32,7 +32,7 @@ class PatternSettings:
     fewest_events: float = 3.0  # usual count of a pixel in each half
     fewest_pixels: int = 500
     block: int = 8  # [px] neighbours share the scene: blocks are independent, pixels are not
-    hot: float = 2e-4  # share of hot pixels above which those not found as hot are a pattern, too
+    hot: float = 1e-3  # share of hot pixels above which those not found as hot are a pattern, too
     shortest: float = 0.3  # [s] below, the halves are parts of one look at the scene
     same_scene: float = 0.9  # correlation of both halves' smooth counts above which they saw the same scene
 
@@ -69,7 +69,7 @@ class HalfCounts:
 class _Spikes:
     """What one polarity says: excess agreement at no shift, by pixel."""
 
-    product: NDArray[np.float64]  # (H, W) of both halves, in standard errors squared, 0 where nothing is known
+    product: NDArray[np.float64]  # (H, W) of both halves, in standard errors squared, 0 where unknown
     signal: NDArray[np.float64]  # (H, W) the same beyond the extrapolation
     spread: NDArray[np.float64]  # (H, W) relative counts squared
     used: NDArray[np.bool_]
@@ -139,14 +139,14 @@ def find_fixed_pattern(halves: HalfCounts, hot: NDArray[np.bool_], level: float)
     """
     s = halves.settings
     if halves.duration < s.shortest:
-        reason = f"{seconds(halves.duration)} of events are one look at the scene; from {seconds(s.shortest)} on there are two"
+        reason = f"{seconds(halves.duration)} of events are one look at the scene, not two"
         return without_answer(NAME, reason)
     good = ~hot.reshape(halves.counts.shape[2:])
     spikes = [_find_spikes(pair, good, s) for pair in halves.counts]
     known = [one for one in spikes if one.used.sum() >= s.fewest_pixels]
     if not known:
         pixels = max(int(one.used.sum()) for one in spikes)
-        reason = f"{pixels} pixels with {s.fewest_events:g} events and more in each half: fewer than {s.fewest_pixels}"
+        reason = f"{pixels} pixels have {s.fewest_events:g} events in each half, fewer than {s.fewest_pixels}"
         return without_answer(NAME, reason)
     fields = ([one.signal for one in known], [one.product for one in known])
     p = max(sign_flip_tail(_sum_blocks(np.sum(field, axis=0), s.block)) for field in fields)
@@ -167,7 +167,9 @@ def find_fixed_pattern(halves: HalfCounts, hot: NDArray[np.bool_], level: float)
         return entry
     numbers = {"p": entry.p, "size": size, "low": low, "high": high, "unit": entry.unit, "least": s.least}
     if hot.mean() > s.hot:
-        reason = f"spread {percent(size)}, but beside {int(hot.sum())} hot pixels those nearly hot look so, too"
+        reason = (
+            f"spread {percent(size)}, but beside {int(hot.sum())} hot pixels those nearly hot look so, too"
+        )
         return without_answer(NAME, reason, details=entry.details, **numbers)
     if alike > s.same_scene:
         reason = f"spread {percent(size)}, but both halves saw the same scene (correlation {alike:.2f})"

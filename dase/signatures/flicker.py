@@ -73,7 +73,8 @@ def _merge_tiles(counts: NDArray[np.uint32], sides: int, wanted: int) -> NDArray
     """Return counts (K, 2, T) of fewer, larger tiles."""
     part = sides // wanted
     square = counts.reshape(len(counts), 2, wanted, part, wanted, part)
-    return square.sum((3, 5), dtype=np.float64).reshape(len(counts), 2, wanted**2)
+    out: NDArray[np.float64] = square.sum((3, 5), dtype=np.float64).reshape(len(counts), 2, wanted**2)
+    return out
 
 
 def _net_rates(clock: ClockCounts, bursts: BurstClock | None, s: FlickerSettings) -> _Rates:
@@ -91,11 +92,20 @@ def _net_rates(clock: ClockCounts, bursts: BurstClock | None, s: FlickerSettings
     return _Rates(net, usual, kept, events)
 
 
-def _phase_sums(v: NDArray[np.float64], step: float, s: FlickerSettings) -> tuple[NDArray[np.float64], float]:
-    """Return the Rayleigh statistics of the phases of blocks, and the spacing of their frequencies [Hz].
+@dataclass(frozen=True)
+class _Tones:
+    """What the blocks of a segment have in common at frequencies from 0 on, `spacing` apart [Hz]."""
+
+    rayleigh: NDArray[np.float64]  # of the phases of blocks
+    power: NDArray[np.float64]  # of their sum
+    spacing: float
+
+
+def _sum_blocks(v: NDArray[np.float64], step: float, s: FlickerSettings) -> _Tones:
+    """Return what the blocks of a signal, shape (K,), have in common.
 
     The phase of a block at its middle hardly depends on the exact frequency that it is read at, so one
-    transform per block, and one over the blocks, stand for all frequencies. Frequencies begin at 0.
+    transform per block, and one over the blocks, stand for all frequencies.
     """
     length = round(s.block / step)
     blocks = len(v) // length
@@ -114,12 +124,13 @@ def _phase_sums(v: NDArray[np.float64], step: float, s: FlickerSettings) -> tupl
     # and a block's middle turns with the frequency
     frequencies = np.arange(int(0.45 / step / spacing)) * spacing
     nearest = np.rint(frequencies / cell).astype(np.int64)
-    out = np.zeros(len(frequencies))
+    rayleigh, total = np.zeros(len(frequencies)), np.zeros(len(frequencies))
     start = np.flatnonzero(np.diff(nearest, prepend=-1))
     for i, j in zip(start, [*start[1:], len(frequencies)], strict=True):
-        turned = np.fft.fft(phases[:, nearest[i]], many)
-        out[i:j] = np.abs(turned[np.arange(i, j) % many]) ** 2 / filled
-    return out, spacing
+        place = np.arange(i, j) % many
+        rayleigh[i:j] = np.abs(np.fft.fft(phases[:, nearest[i]], many)[place]) ** 2 / filled
+        total[i:j] = np.abs(np.fft.fft(spectrum[:, nearest[i]], many)[place]) ** 2
+    return _Tones(rayleigh, total, spacing)
 
 
 def _find_tone(
@@ -133,15 +144,15 @@ def _find_tone(
     length = round(s.block / step)
     segments = max(1, math.ceil(len(v) * step / s.segment))
     size = len(v) // segments // length * length
-    parts = [_phase_sums(v[i * size : (i + 1) * size], step, s) for i in range(segments)]
-    spacing = parts[0][1]
-    rayleigh = np.sum([part for part, _ in parts], axis=0)
+    parts = [_sum_blocks(v[i * size : (i + 1) * size], step, s) for i in range(segments)]
+    spacing = parts[0].spacing
+    rayleigh = np.sum([part.rayleigh for part in parts], axis=0)
     base = np.arange(math.ceil(s.slowest / spacing), int(s.fastest / spacing) + 1)
     lines = np.zeros(len(base), np.bool_)
     if bursts is not None:  # what is left of bursts has lines at multiples of the frame rate
         turns = base * spacing * bursts.interval
         lines = np.abs(turns - np.round(turns)) / bursts.interval < 0.75 / (size * step)
-    best = int(base[0]), 1.0, 1
+    best = base[:1], 1.0, 1
     tests = 2 * 2 * (s.fastest - s.slowest) * size * step
     for many in (1, s.overtones):
         total = np.zeros(len(base))
@@ -150,17 +161,19 @@ def _find_tone(
             inside = h * base < len(rayleigh)
             total[inside] += rayleigh[h * base[inside]]
             tones += inside
+        total[lines] = 0.0
         p = stats.gamma.sf(total, segments * tones)
-        p[lines] = 1.0
-        at = int(np.lexsort((-total, p))[0])
-        chance = min(1.0, tests * float(p[at]))
+        chance = min(1.0, tests * float(p.min()))
         if chance <= best[1]:
-            best = int(base[at]), chance, many
-    fundamental, chance, many = best
-    # overtones of half a tone are tones, too: the lowest of those that are about as clear as the clearest
-    clear = [float(rayleigh[h * fundamental]) if h * fundamental < len(rayleigh) else 0.0 for h in range(1, many + 1)]
-    tone = 1 + int(np.argmax(np.array(clear) > 0.5 * max(clear)))
-    return tone * fundamental * spacing, chance, many
+            best = base[total >= 0.8 * total[p.argmin()]], chance, many
+    # blocks 50 ms apart see a strong tone in step at every 20 Hz from it, and half a tone has its overtones:
+    # of all that are clear, the strongest is meant
+    candidates, chance, many = best
+    tones = np.unique(np.concatenate([h * candidates for h in range(1, many + 1)]))
+    tones = tones[(tones >= base[0]) & (tones <= base[-1])]
+    power = np.sum([part.power for part in parts], axis=0)[tones]
+    clear = rayleigh[tones] > 0.5 * rayleigh[tones].max()
+    return float(tones[np.where(clear, power, -1.0).argmax()] * spacing), chance, many
 
 
 def _refine_tone(
@@ -256,23 +269,32 @@ def find_flicker(
     tone, p_tone, many = _find_tone(v, step, bursts, s)
     p_tiles, agree, tiles = _tiles_in_phase(rates, step, tone, s)
     if stats.binom.sf(tiles - 1, tiles, 2 * s.agree) >= level and p_tone < level:
-        reason = f"{tone:.1f} Hz, but only {tiles} of {s.tiles**2} parts of the array have events to agree on it"
+        reason = (
+            f"{tone:.1f} Hz, but only {tiles} of {s.tiles**2} tiles have events to agree on it"
+        )
         return without_answer(NAME, reason, p=p_tiles), None
     frequency, error, swings = _refine_tone(rates, step, tone, s)
     mean, low, high = mean_interval(swings)
     entry = Signature(
         name=NAME, answer=Answer.NOT_SEEN, p=max(p_tone, p_tiles), size=mean, low=low, high=high,
         unit="swing, share of the rate", least=s.least,
-        sentence=f"light at {frequency:.2f} Hz, swing {mean:.2g} of the rate, one phase in {agree} of {tiles} tiles",
+        sentence=f"light at {frequency:.2f} Hz, swing {mean:.2g} of the rate, one phase in {agree} of {tiles} "
+        "tiles",
         details={
             "frequency": frequency, "frequency_low": frequency - NINETY * error,
             "frequency_high": frequency + NINETY * error, "tones": many,
             "tiles_in_phase": agree, "tiles": tiles, "p_tone": p_tone, "p_tiles": p_tiles,
         },
     )  # fmt: skip
-    found = judge_signature(entry, level, f"nothing of one phase, {s.slowest:g} to {s.fastest:g} Hz")
+    top = max(high, 0.0)
+    unseen = f"no tone of one phase, {s.slowest:g} to {s.fastest:g} Hz: swing at most {top:.2g}"
+    found = judge_signature(entry, level, unseen)
+        entry,
+        level,
+        f"no tone of one phase, {s.slowest:g} to {s.fastest:g} Hz: swing at most {max(high, 0.0):.2g}",
+    )
     if not found.found:
-        return replace(found, details={}), None
+        return found, None
     left = percent(1 - float(rates.kept.mean()))
     if bursts is not None:
         found = replace(found, sentence=f"{found.sentence}; read off with {left} of the time left out")

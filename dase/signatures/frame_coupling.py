@@ -30,7 +30,7 @@ class CouplingSettings:
     least: float = 2.0  # times the usual rate
     fewest_frames: int = 7  # with less not even the same moment in each frame is significant
     fewest_events: float = 50.0  # per frame interval and polarity
-    usual: float = 0.02  # [s] of which the median is the usual rate: longer than a burst, shorter than a scene
+    usual: float = 0.02  # [s] its median is the usual rate: longer than a burst, shorter than a scene
     shortest: float = 0.014  # [s] what repeats sooner is a lamp: it has 100 or 120 cycles per second
     margin: float = 0.003  # [s] left out on both sides of a burst
     tiles: float = 0.4  # share of the active tiles that take part in a burst of the whole array
@@ -122,7 +122,7 @@ def _is_lamp(mean: NDArray[np.float64], at: int, step: float, s: CouplingSetting
 
 
 def _find_bursts(counts: NDArray[np.uint32], step: float, s: CouplingSettings) -> list[NDArray[np.int64]]:
-    """Return the steps of bursts of the whole array, OFF and ON: many tiles at once, and many times the usual."""
+    """Return the steps of bursts of the whole array, OFF and ON: many tiles, and many times the usual."""
     out = []
     for polarity in range(2):
         per_tile = counts[:, polarity].astype(np.float64)
@@ -183,7 +183,7 @@ def find_frame_coupling(
     if begins is not None and len(begins) >= 2:
         interval = float(np.median(np.diff(begins)))
         begins = np.asarray(begins, np.float64)
-        told = "of frames of known times"
+        told = "frames"
     else:
         found = _search_bursts(clock, s)
         if found is None:
@@ -193,9 +193,9 @@ def find_frame_coupling(
             unseen = "no frame times known, no regular bursts of the whole array"
             return Signature(name=NAME, answer=Answer.NOT_SEEN, p=1.0, least=s.least, sentence=unseen), None
         begins, interval, p = found
-        told = "of bursts alone"
+        told = "bursts"
     if interval < s.shortest:
-        reason = f"frames come every {seconds(interval)}, as often as lamps flicker"
+        reason = f"{told} come every {seconds(interval)}, as often as lamps flicker"
         return without_answer(NAME, reason), None
     length = round(interval / step)
     first = np.round((begins - clock.begin) / step).astype(np.int64)
@@ -240,14 +240,14 @@ def _judge_folds(
     told: str,
 ) -> tuple[Signature, BurstClock | None]:
     """Return the answer of the polarity that shows it best, and all bursts of both."""
-    polarity, best = min(known, key=lambda pair: (pair[1].p, -pair[1].mean.max()))
+    _, best = min(known, key=lambda pair: (pair[1].p, -pair[1].mean.max()))
     p = min(1.0, 2 * best.p) if p is None else p
     mean, low, high = mean_interval(best.score[:, best.at])
     entry = Signature(
         name=NAME, answer=Answer.NOT_SEEN, p=p, size=math.exp(mean), low=math.exp(low), high=math.exp(high),
         unit="times the usual rate", least=s.least,
     )  # fmt: skip
-    size = f"at most {entry.size:.1f} times the usual rate at any time after a frame's begin"
+    size = f"at most {entry.size:.2f} times the usual rate in step with the {told}"
     entry = judge_signature(entry, level, size)
     if not entry.found:
         return entry, None
@@ -283,12 +283,12 @@ def _describe_bursts(
     margin = round(s.margin / step)
     wide = maximum_filter1d(bursty, 2 * margin + 1, mode="wrap")
     edges = np.flatnonzero(np.diff(np.concatenate(([False], wide, [False])).astype(np.int8)))
-    spans = edges.reshape(-1, 2) * step
+    spans = edges.reshape(-1, 2).astype(np.float64) * step
     share = extra / max(events, 1)
     exposure = (peaks["OFF"] - peaks["ON"]) % interval if len(peaks) == 2 else math.nan
     where = ", ".join(f"{name} at {1e3 * at:.1f} ms" for name, at in peaks.items())
-    said = f"bursts of the whole array every {1e3 * interval:.2f} ms ({where}), {entry.size:.3g} times the rate, "
-    said += f"{percent(share)} of the events"
+    said = f"bursts of the whole array every {1e3 * interval:.2f} ms ({where}), "
+    said += f"{entry.size:.3g} times the rate, {percent(share)} of the events"
     details = {
         "interval": interval, "phases": peaks, "share": share, "exposure": exposure, "clock": told,
         "bursts": spans.tolist(),

@@ -30,6 +30,8 @@ class BusSettings:
     above: float = 0.002  # share of the time that may exceed the ceiling
     fewest: int = 20  # steps at the ceiling, and as many below 0.8 of it
     fewest_events: float = 50.0  # per step at the ceiling, for its scatter to be seen
+    steps: int = 8  # of the clock at most that are taken together where fewer events come
+    enough: float = 400.0  # events per step for a ceiling that is narrow
     scatter: float = 0.3  # of the scatter below the ceiling, at most
 
 
@@ -56,6 +58,11 @@ def find_full_bus(clock: ClockCounts, level: float, settings: BusSettings | None
     if len(counts) < 4 * s.fewest:
         return without_answer(NAME, f"{len(counts)} steps of {step * 1e3:g} ms are too few")
     ceiling = float(np.quantile(counts, s.quantile))
+    together = int(np.clip(np.ceil(s.enough / max(ceiling, 1.0)), 1, s.steps))
+    if together > 1:
+        counts = counts[: len(counts) // together * together].reshape(-1, together).sum(1)
+        step *= together
+        ceiling = float(np.quantile(counts, s.quantile))
     most = f"at most {metric(ceiling / step, 'events/s')}"
     if ceiling < s.fewest_events:
         return without_answer(NAME, f"{most}, too few to tell a ceiling from chance")
@@ -71,6 +78,8 @@ def find_full_bus(clock: ClockCounts, level: float, settings: BusSettings | None
         p = float(stats.f.cdf(full / max(min(usual, 1.0), 1e-9), 2 * steps / 3, 2 * others / 3))
         if full > s.scatter * min(usual, 1.0):
             p = 1.0
+    if p == 1.0:
+        share, at = 0.0, np.zeros_like(at)  # whatever the rate does there, it is no ceiling
     low, high = stats.beta.interval(0.9, at.sum() + 0.5, len(at) - at.sum() + 0.5)
     entry = Signature(
         name=NAME, answer=Answer.NOT_SEEN, p=p, size=share, low=float(low), high=float(high),
@@ -78,4 +87,6 @@ def find_full_bus(clock: ClockCounts, level: float, settings: BusSettings | None
         sentence=f"the rate stays at {metric(ceiling / step, 'events/s')} for {100 * share:.0f} % of the time",
         details={"rate": ceiling / step, "scatter": full, "usual_scatter": usual},
     )  # fmt: skip
-    return judge_signature(entry, level, f"no ceiling, {most} ({grouped(int(ceiling))} per {step * 1e3:g} ms)")
+    return judge_signature(
+        entry, level, f"no ceiling, {most} ({grouped(int(ceiling))} per {step * 1e3:g} ms)"
+    )

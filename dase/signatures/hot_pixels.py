@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from scipy import stats
 
 from dase.events import Events
-from dase.formatting import grouped, metric
+from dase.formatting import grouped, metric, percent
 from dase.signatures.calm_events import row_major_pixels
 from dase.signatures.result import Answer, Signature, judge_signature, without_answer
 
@@ -29,8 +29,8 @@ class HotSettings:
     share: float = 0.15  # of its calm events at least in each half of the time
     chance: float = 1e-3  # over all pixels, below which one is counted
     bulk: float = 0.995  # share of the pixels of which the usual spread is taken
-    in_phase: float = 0.5  # of a lamp: a pixel that follows it is not hot
-    fewest: int = 3  # calm events of a hot pixel, below which nothing is significant
+    in_phase: float = 0.5  # of its events, with a lamp: a pixel that follows it is not hot
+    calm: float = 0.05  # share of places and times in which a hot pixel would have been seen alone
 
 
 class CalmCounts:
@@ -87,12 +87,13 @@ def _pixel_chances(
 
 
 def find_hot_pixels(
-    calm: CalmCounts, duration: float, level: float, settings: HotSettings | None = None
+    calm: CalmCounts, quiet: float, duration: float, level: float, settings: HotSettings | None = None
 ) -> tuple[Signature, NDArray[np.bool_]]:
     """Look for pixels that send by themselves.
 
     Args:
         calm: The calm events.
+        quiet: Share of places and times with nothing going on.
         duration: Of the recording [s].
         level: p below which there are any.
         settings: What makes a pixel hot.
@@ -103,11 +104,12 @@ def find_hot_pixels(
     s = settings or HotSettings()
     total = calm.halves.sum(0)
     nothing = np.zeros(len(total), np.bool_)
-    if total.sum() < s.fewest:
-        return without_answer(NAME, f"{int(total.sum())} events with nothing around them: too few"), nothing
     chance, usual = _pixel_chances(total, calm.width, calm.height, s)
     steady = calm.halves.min(0) >= np.maximum(2, s.share * total)
-    alone = steady & (total >= s.ratio * usual) & (np.abs(calm.phase) < s.in_phase * np.maximum(total, 1))
+    alone = steady & (total >= s.ratio * usual)
+    led = alone & (np.abs(calm.phase) >= s.in_phase * total)
+    follow = int(np.count_nonzero(led & (chance < s.chance / len(chance))))
+    alone &= ~led
     chance = np.where(alone, chance, 1.0)
     pixels = len(chance)
     found = chance < s.chance / pixels
@@ -115,7 +117,8 @@ def find_hot_pixels(
     p = min(1.0, pixels * float(np.partition(chance, s.least - 1)[s.least - 1])) if pixels >= s.least else 1.0
     busiest = int(np.where(alone, total, -1).argmax())
     low, high = (int(np.count_nonzero(chance < q / pixels)) for q in (level, 1.0))
-    rate = total[busiest] / max(duration, 1e-9)
+    duration = max(duration, 1e-9)
+    rate = total[busiest] / duration
     entry = Signature(
         name=NAME, answer=Answer.NOT_SEEN, p=p, size=float(found.sum()), low=float(low), high=float(high),
         unit="pixels", least=float(s.least),
@@ -126,7 +129,11 @@ def find_hot_pixels(
             "busiest": float(rate),
         },
     )  # fmt: skip
-    quiet = f"no two pixels stand out; {metric(total.mean() / duration, 'Hz')} of calm events per pixel"
-    entry = judge_signature(entry, level, quiet)
+    unseen = f"no two pixels stand out; {metric(total.mean() / duration, 'Hz')} of calm events per pixel"
+    if follow:
+        unseen += f"; {follow} would, but follow the light that flickers"
+    entry = judge_signature(entry, level, unseen)
+    if not entry.found and quiet < s.calm:
+        reason = f"only {percent(quiet)} of the places and times are calm: hot pixels would not stand out"
+        return without_answer(NAME, reason), nothing
     return entry, found if entry.found else nothing
-

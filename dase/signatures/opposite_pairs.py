@@ -1,20 +1,22 @@
 """Opposite pairs at rest: a pixel with nothing around it sends an event, and soon one of the other polarity.
 
-Noise on the pixel's voltage crosses a threshold and returns. Independent ON and OFF trains, as of leak or of
-single photons that leave no trace in the pixel, come in no pairs.
+Light that passes through a lens cannot rise and fall again at one pixel within some milliseconds and leave
+its 24 neighbours alone; noise can. Shot noise makes ON and OFF events that know nothing of each other: pairs
+come by chance. Noise on the pixel's voltage crosses a threshold and returns: there are more.
 """
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy import stats
 
 from dase.events import Events
-from dase.formatting import grouped, percent
+from dase.formatting import grouped, seconds
 from dase.signatures.calm_events import row_major_pixels
 from dase.signatures.chance import poisson_interval
 from dase.signatures.result import Answer, Signature, judge_signature, without_answer
@@ -26,7 +28,12 @@ NAME = "opposite pairs"
 class PairSettings:
     """What makes a pair."""
 
-    least: float = 2.0  # times as many as by chance
+    least: float = (
+        0.5  # times the pairs of independent ON and OFF events: noise has as many, a scene hardly any
+    )
+    scene: float = 0.1  # times those pairs, a bound for what a scene leaves where it is calm
+    returning: float = 2.0  # times those pairs, from which on noise returns
+    shortest: float = 0.3  # [s] in less, hardly any two events of a pixel are far from each other
     near: float = 0.02  # [s] a pair
     later: tuple[float, float] = (0.1, 0.4)  # [s] no pair any more, but still the same scene
     busiest: float = 4.0  # [Hz] of a pixel at rest; of one that sends more, few intervals are long
@@ -50,8 +57,6 @@ class PairCounts:
         """Calm events, OFF and ON."""
         self.opposite = np.zeros((2, pixels), np.int64)
         """Opposite pairs, near and later."""
-        self.same = np.zeros(pixels, np.int64)
-        """Pairs of one polarity, near."""
 
     def push(self, calm: Events) -> None:
         """Take calm events."""
@@ -69,7 +74,6 @@ class PairCounts:
         size = len(self._time)
         for row, chosen in ((0, near), (1, (gap >= begin) & (gap < end))):
             self.opposite[row] += np.bincount(pixel[chosen & flips], minlength=size)
-        self.same += np.bincount(pixel[near & ~flips], minlength=size)
         for row in range(2):
             self.events[row] += np.bincount(pixel[p == bool(row)], minlength=size)
         last = np.append(first[1:], True)
@@ -81,8 +85,9 @@ def find_opposite_pairs(
 ) -> Signature:
     """Look for opposite pairs at rest.
 
-    The null has ON and OFF trains of each pixel independent: their pairs are then Poisson distributed. A
-    scene makes rates differ over time, so as many are expected, too, as the pairs farther apart tell.
+    The null has a tenth of the pairs that independent ON and OFF trains of each pixel would have, and half a
+    pair: Poisson distributed. Then the same with all of these pairs, or as many as those farther apart tell,
+    says whether noise returns.
 
     Args:
         pairs: Counted pairs.
@@ -102,24 +107,38 @@ def find_opposite_pairs(
     favour = np.exp((off + on) / max(duration, end) * (begin + end) / 2)
     local = float((pairs.opposite[1, rest] * favour).sum()) * s.near / (end - begin)
     expected = max(trains, local)
-    flips = f"{percent(near / max(near + int(pairs.same[rest].sum()), 1))} of near pairs flip"
-    p = float(stats.poisson.sf(near - 1, expected)) if near else 1.0
-    low, high = (limit / max(expected, 1e-3) for limit in poisson_interval(near))
-    known = {
-        "p": p, "size": near / max(expected, 1e-3), "low": low, "high": high,
-        "unit": "times as many as by chance", "least": s.least,
+    bound = s.scene * trains + 0.5
+    p, p_more = (float(stats.poisson.sf(near - 1, mean)) for mean in (bound, expected))
+    low, high = (limit / max(trains, 0.5) for limit in poisson_interval(near))
+    size = near / max(trains, 0.5)
+    rates = [float(row.sum()) / max(duration, 1e-9) / max(len(row), 1) for row in (off, on)]
+    known: dict[str, Any] = {
+        "p": p, "size": size, "low": low, "high": high,
+        "unit": "times the pairs of independent events", "least": s.least,
         "details": {
-            "pairs": near, "expected": expected, "trains": trains, "local": local, "calm_events": events,
-            "on_rate": float(on.sum() / max(duration, 1e-9) / max(len(on), 1)),
-            "off_rate": float(off.sum() / max(duration, 1e-9) / max(len(off), 1)),
+            "pairs": near, "independent": trains, "later": local, "p_returning": p_more,
+            "calm_events": events, "off_rate": rates[0], "on_rate": rates[1],
         },
     }  # fmt: skip
+    if duration < s.shortest:
+        return without_answer(NAME, f"{seconds(duration)} of events: a pixel has no time to rest", **known)
     if lamp:
         return without_answer(NAME, f"{near} pairs, but light that flickers makes them, too", **known)
-    # what would be seen: twice the least size
-    if stats.poisson.sf(math.ceil(2 * s.least * expected) - 1, expected) >= level and p >= level:
-        reason = f"{grouped(events)} calm events: {near} pairs, {expected:.2g} by chance, too few to tell"
+    # what independent trains would have must be seen
+    if stats.poisson.sf(math.ceil(trains) - 1, bound) >= level and p >= level:
+        reason = (
+            f"{grouped(events)} calm events: {near} pairs, independent ones would have {trains:.2g}, too few"
+        )
         return without_answer(NAME, reason, **known)
-    said = f"noise of the pixels at rest: {near} opposite pairs within 20 ms, {expected:.3g} by chance; {flips}"
-    unseen = f"{near} opposite pairs at rest, {expected:.3g} by chance"
-    return judge_signature(Signature(name=NAME, answer=Answer.NOT_SEEN, sentence=said, **known), level, unseen)
+    returns = p_more < level and near >= s.returning * expected
+    kind = (
+        "noise of the pixels at rest that returns"
+        if returns
+        else "noise of the pixels at rest, as shot noise"
+    )
+    said = f"{kind}: {near} opposite pairs within 20 ms, independent events have {trains:.3g}"
+    known["details"] |= {"returns": returns}
+    unseen = f"{near} opposite pairs at rest, independent events would have {trains:.3g}"
+    return judge_signature(
+        Signature(name=NAME, answer=Answer.NOT_SEEN, sentence=said, **known), level, unseen
+    )

@@ -119,11 +119,16 @@ def without_answer(name: str, reason: str, **known: Any) -> Signature:
 def judge_signature(entry: Signature, level: float, unseen: str) -> Signature:
     """Return a measured signature with its answer.
 
+    One that is large, and rare by chance but not rare enough, is no answer.
+
     Args:
         entry: Its sentence is for an effect that is there.
         level: Its p must be below.
         unseen: The sentence for one that is not.
     """
-    if entry.p < level and entry.size >= entry.least:
-        return replace(entry, answer=Answer.FOUND)
+    if entry.size >= entry.least and entry.p < 0.01:
+        if entry.p < level:
+            return replace(entry, answer=Answer.FOUND)
+        reason = f"{unseen}; too little to tell it from chance (p {entry.p:.1g})"
+        return replace(entry, answer=Answer.CANNOT_SAY, sentence=reason)
     return replace(entry, answer=Answer.NOT_SEEN, sentence=unseen)

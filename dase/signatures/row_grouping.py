@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 from scipy import stats
 
 from dase.events import Events
-from dase.formatting import grouped
 from dase.signatures.chance import ratio_interval, sign_flip_tail
 from dase.signatures.result import Answer, Signature, judge_signature, without_answer
 
@@ -27,6 +26,7 @@ class GroupingSettings:
     least: float = 1.2  # times as often
     lags: tuple[int, ...] = tuple(range(20, 60, 4))  # events later: no group of a bus any more
     span: float = 5e-3  # [s] within which they must come: edges move some pixels in it
+    beside: int = 2  # [px] lines that an edge along them has events of, too; a bus takes one at a time
     away: int = 4  # [px] neighbours fire together because the scene is smooth
     run: int = 1 << 14  # events of a run; the scene of one run says nothing of that of another
     most: int = 1 << 20  # events in all, of runs spread evenly
@@ -55,7 +55,7 @@ class GroupCounts:
         self._held: Events | None = None
         self._turn = 0
         self._next: list[NDArray[np.int64]] = []
-        self._later: list[NDArray[np.int64]] = []
+        self._later: list[NDArray[np.float64]] = []
 
     def push(self, events: Events) -> None:
         """Take events."""
@@ -77,12 +77,15 @@ class GroupCounts:
         x, y = x[order], y[order]
 
         def shared(lag: int) -> tuple[NDArray[np.int64], int]:
-            """Return pairs of one row, and of one column, and all pairs, of those soon enough."""
+            """Return pairs of one row and of rows near by, the same of columns, and all pairs soon enough."""
             soon = t[lag:] - t[:-lag] < s.span
             dx, dy = np.abs(x[lag:] - x[:-lag])[soon], np.abs(y[lag:] - y[:-lag])[soon]
-            row = np.count_nonzero((dx > s.away) & (dy == 0))
-            column = np.count_nonzero((dy > s.away) & (dx == 0))
-            return np.array([row, column]), int(soon.sum())
+            many = np.zeros((2, 2), np.int64)
+            for axis, (along, across) in enumerate(((dx, dy), (dy, dx))):
+                line = across[(along > s.away) & (across <= s.beside)]
+                same = np.count_nonzero(line == 0)
+                many[axis] = same, len(line) - same
+            return many, int(soon.sum())
 
         if len(t) <= s.lags[-1]:
             return
@@ -92,24 +95,54 @@ class GroupCounts:
         if pairs < 0.5 * count * len(s.lags):
             return  # too few events for any to come soon
         self._next.append(one)
-        self._later.append(np.sum([many for many, _ in others], axis=0) * (count / pairs * len(s.lags)))
+        self._later.append(np.sum([many for many, _ in others], axis=0) * (count / pairs))
 
     @property
     def runs(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Pairs of successive events, and those of later ones summed over the lags, by run, each (R, 2)."""
-        empty = np.zeros((0, 2))
-        return (
-            np.array(self._next, np.float64) if self._next else empty,
-            np.array(self._later, np.float64) if self._later else empty,
+        """Pairs of successive events, and mean pairs of later ones.
+
+        Each of shape (R, 2, 2): by run; row, column; the same line, lines beside it.
+        """
+        empty = np.zeros((0, 2, 2))
+        if not self._next:
+            return empty, empty
+        return np.array(self._next, np.float64), np.array(self._later, np.float64)
+
+
+def _test_line(
+    near: NDArray[np.float64], later: NDArray[np.float64], lags: int
+) -> tuple[float, tuple[float, float, float]]:
+    """Return the p of one axis, and how many times as many pairs there are as expected, with an interval.
+
+    Args:
+        near: Pairs of successive events, the same line and those beside, shape (R, 2).
+        later: Mean pairs of later ones, shape (R, 2).
+        lags: How many lags the mean is of.
+    """
+    count, beside = near.sum(0)
+    rest, rest_beside = later.sum(0) * lags
+    # an edge along a line makes neighbours of that line fire together, too, as much sooner as the line itself
+    share = rest / max(rest_beside, 1.0)
+    out = []
+    for one, others, usual in ((near[:, 1], beside, share), (later[:, 0], rest, 1 / lags)):
+        scale = share if others is beside else 1.0
+        p = max(
+            float(stats.binom.sf(count - 1, count + round(others), usual / (1 + usual))),
+            sign_flip_tail(near[:, 0] - one * scale),
         )
+        ratio = count / max(others * usual, 1.0)
+        out.append((ratio, p, ratio_interval(int(count), round(others), max(usual, 1e-9))))
+    ratio, _, (low, high) = min(out)
+    return max(p for _, p, _ in out), (ratio, low, high)
 
 
 def find_grouping(groups: GroupCounts, level: float) -> Signature:
     """Look for rows or columns that are read together.
 
-    The null has the next event no more alike than those 20 to 60 later: binomial for all pairs together, and
-    by the signs of the runs' differences, which knows that pairs of one run depend on each other. The larger
-    p counts.
+    Two nulls, each binomial for all pairs together and by the signs of the runs' differences, which knows
+    that pairs of one run depend on each other. Successive events share a line no more often than those 20 to
+    60 later; and no more often, compared with lines beside, than those. The largest p and the smallest size
+    count.
 
     Args:
         groups: Counted pairs.
@@ -117,32 +150,26 @@ def find_grouping(groups: GroupCounts, level: float) -> Signature:
     """
     s = groups.settings
     near, later = groups.runs
-    lags = len(s.lags)
     if len(near) < 16:
-        return without_answer(NAME, f"{len(near)} runs of events that follow each other within {s.span * 1e3:g} ms")
-    total, others = near.sum(0), later.sum(0)
-    if min((total + others / lags).max(), others.max()) < s.fewest:
-        return without_answer(NAME, f"{grouped(int(total.sum()))} successive events share a row or column: too few")
+        return without_answer(
+            NAME, f"{len(near)} runs of events that follow each other within {s.span * 1e3:g} ms"
+        )
     best: Signature | None = None
     for axis, line in enumerate(("row", "column")):
-        if total[axis] + others[axis] < s.fewest:
+        count, expected = float(near[:, axis, 0].sum()), float(later[:, axis, 0].sum())
+        if max(count, expected) < s.fewest or near[:, axis].sum() < s.fewest:
             continue
-        count, rest = int(total[axis]), round(float(others[axis]))
-        p = max(
-            float(stats.binom.sf(count - 1, count + rest, 1 / (1 + lags))),
-            sign_flip_tail(near[:, axis] - later[:, axis] / lags),
-        )
-        ratio = count * lags / max(rest, 1)
-        low, high = ratio_interval(count, rest, 1 / lags)
+        p, (size, low, high) = _test_line(near[:, axis], later[:, axis], len(s.lags))
         entry = Signature(
-            name=NAME, answer=Answer.NOT_SEEN, p=min(1.0, 2 * p), size=ratio, low=low, high=high,
+            name=NAME, answer=Answer.NOT_SEEN, p=min(1.0, 2 * p), size=size, low=low, high=high,
             unit="times as often as by chance", least=s.least,
-            sentence=f"{line}s are read together: the next event is of the same {line} {ratio:.3g} times as often as "
-            "by chance",
-            details={"line": line, "pairs": count},
+            sentence=f"{line}s are read together: the next event is of the same {line} {size:.3g} times "
+            "as often as by chance",
+            details={"line": line, "pairs": int(count)},
         )  # fmt: skip
         if best is None or (entry.p, -entry.size) < (best.p, -best.size):
             best = entry
-    assert best is not None
+    if best is None:
+        return without_answer(NAME, "too few successive events share a row or column")
     unseen = f"the next event shares a {best.details['line']} {best.size:.2f} times as often as by chance"
     return judge_signature(best, level, unseen)

@@ -68,7 +68,8 @@ def _find_pattern(events: Events) -> Signature | None:
 def _find_period(events: Events, s: StampSettings, lamp: bool) -> Signature | None:
     """Return the period of which intervals of pixels are multiples.
 
-    Phases of n intervals have a Rayleigh statistic above R with a chance of exp(-R), for each period.
+    Phases of n intervals have a Rayleigh statistic above R with a chance of exp(-R), for each period. Pixels
+    that see the same send at the same intervals: as many count as there are different multiples.
     """
     intervals = Intervals()
     pixel = row_major_pixels(events)
@@ -81,8 +82,10 @@ def _find_period(events: Events, s: StampSettings, lamp: bool) -> Signature | No
     period, share = intervals.period()
     if not period > 0 or (lamp and period > s.shortest):
         return None
-    p = min(1.0, s.tried * math.exp(-min(len(between) * share**2, 700.0)))
-    error = 1.645 / math.sqrt(2 * len(between))
+    multiples = np.bincount(np.rint(between / period).astype(np.int64))
+    different = float(multiples.sum()) ** 2 / float((multiples.astype(np.float64) ** 2).sum())
+    p = min(1.0, s.tried * math.exp(-min(different * share**2, 700.0)))
+    error = 1.645 / math.sqrt(2 * different)
     return Signature(
         name=NAME, answer=Answer.NOT_SEEN, p=p, size=share, low=share - error, high=min(share + error, 1.0),
         unit="share of short intervals", details={"period": period},
@@ -116,5 +119,7 @@ def find_time_stamps(
         return without_answer(NAME, f"{grouped(len(kept))} events, fewer than {grouped(s.fewest)}")
     entry = _find_pattern(kept) or _find_period(kept, s, lamp)
     if entry is None:
-        return Signature(name=NAME, answer=Answer.NOT_SEEN, p=1.0, least=s.least, sentence="no regularity above 3 µs")
+        return Signature(
+            name=NAME, answer=Answer.NOT_SEEN, p=1.0, least=s.least, sentence="no regularity above 3 µs"
+        )
     return judge_signature(replace(entry, least=s.least), level, "no regularity above 3 µs")
