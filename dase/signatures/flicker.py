@@ -269,17 +269,15 @@ def find_flicker(
     tone, p_tone, many = _find_tone(v, step, bursts, s)
     p_tiles, agree, tiles = _tiles_in_phase(rates, step, tone, s)
     if stats.binom.sf(tiles - 1, tiles, 2 * s.agree) >= level and p_tone < level:
-        reason = (
-            f"{tone:.1f} Hz, but only {tiles} of {s.tiles**2} tiles have events to agree on it"
-        )
+        reason = f"{tone:.1f} Hz, but only {tiles} of {s.tiles**2} tiles have events to agree on it"
         return without_answer(NAME, reason, p=p_tiles), None
     frequency, error, swings = _refine_tone(rates, step, tone, s)
     mean, low, high = mean_interval(swings)
     entry = Signature(
         name=NAME, answer=Answer.NOT_SEEN, p=max(p_tone, p_tiles), size=mean, low=low, high=high,
         unit="swing, share of the rate", least=s.least,
-        sentence=f"light at {frequency:.2f} Hz, swing {mean:.2g} of the rate, one phase in {agree} of {tiles} "
-        "tiles",
+        sentence=f"light at {frequency:.2f} Hz, swing {mean:.2g} of the rate, "
+        f"one phase in {agree} of {tiles} tiles",
         details={
             "frequency": frequency, "frequency_low": frequency - NINETY * error,
             "frequency_high": frequency + NINETY * error, "tones": many,
@@ -289,10 +287,6 @@ def find_flicker(
     top = max(high, 0.0)
     unseen = f"no tone of one phase, {s.slowest:g} to {s.fastest:g} Hz: swing at most {top:.2g}"
     found = judge_signature(entry, level, unseen)
-        entry,
-        level,
-        f"no tone of one phase, {s.slowest:g} to {s.fastest:g} Hz: swing at most {max(high, 0.0):.2g}",
-    )
     if not found.found:
         return found, None
     left = percent(1 - float(rates.kept.mean()))

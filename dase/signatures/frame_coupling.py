@@ -250,6 +250,11 @@ def _judge_folds(
     size = f"at most {entry.size:.2f} times the usual rate in step with the {told}"
     entry = judge_signature(entry, level, size)
     if not entry.found:
+        if entry.size >= s.least:
+            reason = (
+                f"the rate bursts {entry.size:.3g} times, but in step with the {told} by chance (p {p:.1g})"
+            )
+            return without_answer(NAME, reason, p=p), None
         return entry, None
     if _is_lamp(best.mean, best.at, step, s):
         reason = f"the rate peaks evenly over the {seconds(interval)} between frames: light that flickers"

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import stats
 
-from dase.formatting import grouped, metric
+from dase.formatting import grouped, metric, percent
 from dase.signatures.clock import ClockCounts
 from dase.signatures.result import Answer, Signature, judge_signature, without_answer
 
@@ -84,7 +84,7 @@ def find_full_bus(clock: ClockCounts, level: float, settings: BusSettings | None
     entry = Signature(
         name=NAME, answer=Answer.NOT_SEEN, p=p, size=share, low=float(low), high=float(high),
         unit="share of the time", least=s.least,
-        sentence=f"the rate stays at {metric(ceiling / step, 'events/s')} for {100 * share:.0f} % of the time",
+        sentence=f"the rate stays at {metric(ceiling / step, 'events/s')} {percent(share)} of the time",
         details={"rate": ceiling / step, "scatter": full, "usual_scatter": usual},
     )  # fmt: skip
     return judge_signature(

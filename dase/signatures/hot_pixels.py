@@ -118,18 +118,18 @@ def find_hot_pixels(
     busiest = int(np.where(alone, total, -1).argmax())
     low, high = (int(np.count_nonzero(chance < q / pixels)) for q in (level, 1.0))
     duration = max(duration, 1e-9)
-    rate = total[busiest] / duration
+    rate, usually = total[busiest] / duration, metric(total.mean() / duration, "Hz")
     entry = Signature(
         name=NAME, answer=Answer.NOT_SEEN, p=p, size=float(found.sum()), low=float(low), high=float(high),
         unit="pixels", least=float(s.least),
-        sentence=f"{grouped(int(found.sum()))} pixels send by themselves, the busiest {metric(rate, 'Hz')} at "
-        f"({busiest % calm.width}, {busiest // calm.width}); usual is {metric(total.mean() / duration, 'Hz')}",
+        sentence=f"{grouped(int(found.sum()))} pixels send by themselves, the busiest {metric(rate, 'Hz')} "
+        f"at ({busiest % calm.width}, {busiest // calm.width}); usual is {usually}",
         details={
             "pixels": [[int(k % calm.width), int(k // calm.width)] for k in np.flatnonzero(found)[:1000]],
             "busiest": float(rate),
         },
     )  # fmt: skip
-    unseen = f"no two pixels stand out; {metric(total.mean() / duration, 'Hz')} of calm events per pixel"
+    unseen = f"no two pixels stand out; {usually} of calm events per pixel"
     if follow:
         unseen += f"; {follow} would, but follow the light that flickers"
     entry = judge_signature(entry, level, unseen)
