@@ -162,7 +162,8 @@ def find_fixed_pattern(halves: HalfCounts, hot: NDArray[np.bool_], level: float)
         sentence=f"pixels differ from their neighbours for good: counts spread by {percent(size)}",
         details={"pixels": pixels, "same_scene": alike},
     )  # fmt: skip
-    entry = judge_signature(entry, level, f"pixels differ by less than {percent(high)} for good")
+    unseen = f"pixels differ by less than {percent(high)} for good" if high else "no agreement of both halves"
+    entry = judge_signature(entry, level, unseen)
     if not entry.found:
         return entry
     numbers = {"p": entry.p, "size": size, "low": low, "high": high, "unit": entry.unit, "least": s.least}

@@ -251,9 +251,7 @@ def _judge_folds(
     entry = judge_signature(entry, level, size)
     if not entry.found:
         if entry.size >= s.least:
-            reason = (
-                f"the rate bursts {entry.size:.3g} times, but in step with the {told} by chance (p {p:.1g})"
-            )
+            reason = f"the rate rises {entry.size:.3g} times, in step with the {told} by chance (p {p:.1g})"
             return without_answer(NAME, reason, p=p), None
         return entry, None
     if _is_lamp(best.mean, best.at, step, s):
