@@ -27,7 +27,6 @@ class StampSettings:
     most: int = 1 << 20  # events that are looked at, the first ones
     fewest: int = 2000
     tried: int = 1 << 16  # periods of intervals that are looked at
-    shortest: float = 1e-3  # [s] periods above are a lamp's, where there is one
 
 
 def _tolerance(pattern: timestamp_patterns.Structure, events: Events) -> float:
@@ -65,7 +64,7 @@ def _find_pattern(events: Events) -> Signature | None:
     )  # fmt: skip
 
 
-def _find_period(events: Events, s: StampSettings, lamp: bool) -> Signature | None:
+def _find_period(events: Events, s: StampSettings) -> Signature | None:
     """Return the period of which intervals of pixels are multiples.
 
     Phases of n intervals have a Rayleigh statistic above R with a chance of exp(-R), for each period. Pixels
@@ -80,7 +79,7 @@ def _find_period(events: Events, s: StampSettings, lamp: bool) -> Signature | No
     between = between[(between > timestamp_patterns.SHORTEST) & (between < 0.065)]
     intervals.add(between)
     period, share = intervals.period()
-    if not period > 0 or (lamp and period > s.shortest):
+    if not period > 0:
         return None
     multiples = np.bincount(np.rint(between / period).astype(np.int64))
     different = float(multiples.sum()) ** 2 / float((multiples.astype(np.float64) ** 2).sum())
@@ -110,14 +109,14 @@ def find_time_stamps(
         events: The first of the recording, as many as `StampSettings.most`.
         hot: Pixels to leave out, shape (H * W,).
         level: p below which there are any.
-        lamp: Whether the light flickers: its cycles are periods, too.
+        lamp: Whether the light flickers: then pixels that see the same repeat the same intervals.
         settings: How regularities are looked for.
     """
     s = settings or StampSettings()
     kept = events.select(~hot[row_major_pixels(events)])
     if len(kept) < s.fewest:
         return without_answer(NAME, f"{grouped(len(kept))} events, fewer than {grouped(s.fewest)}")
-    entry = _find_pattern(kept) or _find_period(kept, s, lamp)
+    entry = _find_pattern(kept) or (None if lamp else _find_period(kept, s))
     if entry is None:
         return Signature(
             name=NAME, answer=Answer.NOT_SEEN, p=1.0, least=s.least, sentence="no regularity above 3 µs"
