@@ -104,9 +104,10 @@ class CalmShare:
         span = ((events.t - self._begin) / self._span).astype(np.int64)
         block = (events.y // self._side).astype(np.int64) * self._columns + events.x // self._side
         cells = np.unique(span * self._blocks + block)
-        # the last span of the piece before goes on in this one
-        self._busy += len(cells) - int(np.count_nonzero(np.isin(self._newest, cells, assume_unique=True)))
-        self._newest = cells[cells >= span[-1] * self._blocks]
+        # the last span of the piece before may go on in this one, and in the next
+        known = np.union1d(self._newest, cells)
+        self._busy += len(known) - len(self._newest)
+        self._newest = known[known >= span[-1] * self._blocks]
 
     def share(self, end: float) -> float:
         """Return the share of cells of space and time without an event, from begin to `end` [s]."""

@@ -19,7 +19,7 @@ from dase.errors import InputError
 from dase.events import Events
 from dase.io.rules import TooLateError
 from dase.io.sequence import Sequence
-from dase.io.source import Size
+from dase.io.source import CHUNK, Size
 from dase.recordings.recording import Recording
 from dase.signatures.calm_events import CalmFilter, CalmShare, row_major_pixels
 from dase.signatures.clock import ClockCounts
@@ -43,9 +43,6 @@ LEVEL = 1e-4
 COUNT = 9
 """Signatures that are tested, for the correction."""
 
-PART = 1 << 20
-"""Events looked at together."""
-
 
 @dataclass(frozen=True)
 class _Passes:
@@ -59,11 +56,11 @@ class _Passes:
     pieces: Callable[[], Iterable[Events]]
     begins: NDArray[np.float64] | None
 
-    def parts(self, progress: Progress) -> Iterator[Events]:
-        """Yield parts of at most `PART` events, none of them empty, and tell how many they were."""
+    def parts(self, chunk: int, progress: Progress) -> Iterator[Events]:
+        """Yield parts of at most `chunk` events, none of them empty, and tell how many they were."""
         for piece in self.pieces():
-            for i in range(0, len(piece), PART):
-                part = piece.select(slice(i, i + PART))
+            for i in range(0, len(piece), chunk):
+                part = piece.select(slice(i, i + chunk))
                 yield part
                 progress(len(part))
 
@@ -170,9 +167,9 @@ def _sequence_begins(sequence: Sequence) -> NDArray[np.float64] | None:
     return out
 
 
-def _run_first(passes: _Passes, progress: Progress) -> _FirstPass:
+def _run_first(passes: _Passes, chunk: int, progress: Progress) -> _FirstPass:
     first: _FirstPass | None = None
-    for part in passes.parts(progress):
+    for part in passes.parts(chunk, progress):
         first = first or _FirstPass(part.width, part.height)
         first.push(part)
     if first is None:
@@ -187,6 +184,7 @@ def find_signatures(
     notes: list[str] | None = None,
     progress: Progress = lambda count: None,
     level: float = LEVEL,
+    chunk: int = CHUNK,
 ) -> Signatures:
     """Say which effects a recording shows by itself, without a scene or a model.
 
@@ -198,6 +196,7 @@ def find_signatures(
         notes: Gets sentences about what was skipped, repaired or guessed in a file.
         progress: Is told how many events were looked at since it was told last, in both passes.
         level: Chance that a recording without effects announces any; shared out over the signatures.
+        chunk: Events looked at together; the answer does not depend on it.
 
     Returns:
         One answer for each signature, "cannot say" where data are too few.
@@ -207,19 +206,21 @@ def find_signatures(
     """
     if not 0 < level < 1:
         raise InputError(f"signatures: level must lie between 0 and 1, got {level:g}")
+    if chunk < 1:
+        raise InputError(f"signatures: chunk must be at least 1 event, got {chunk}")
     passes = _open_passes(source, size, notes)
     try:
-        first = _run_first(passes, progress)
+        first = _run_first(passes, chunk, progress)
     except TooLateError:  # times go back too far to be sorted on the way
         assert isinstance(source, str | PathLike)
         passes = _open_passes(io.read(source, size=size, notes=notes), size, notes)
-        first = _run_first(passes, progress)
+        first = _run_first(passes, chunk, progress)
     width, height = first.width, first.height
     each, duration = level / COUNT, first.end - first.begin
     coupling, bursts = find_frame_coupling(first.clock, each, passes.begins)
     flicker, lamp = find_flicker(first.clock, each, bursts)
     second = _SecondPass(first, bursts, lamp.frequency if lamp else 0.0)
-    for part in passes.parts(progress):
+    for part in passes.parts(chunk, progress):
         second.push(part)
     second.finish()
     hot, hot_pixels = find_hot_pixels(second.calm, second.quiet.share(first.end), duration, each)
