@@ -27,7 +27,7 @@ NAME = "fixed pattern"
 class PatternSettings:
     """How the pattern is looked for."""
 
-    least: float = 0.02  # spread of counts over pixels, relative
+    least: float = 0.05  # spread of counts over pixels, relative; what a lamp leaves of a scene reaches 0.02
     parts: int = 6  # of the time, in turns for one half and the other
     fewest_events: float = 3.0  # usual count of a pixel in each half
     fewest_pixels: int = 500

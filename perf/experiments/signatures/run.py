@@ -52,6 +52,7 @@ BESIDE = {
     "hot": {"opposite pairs"},  # those that are only warm remain
     "noisy": {"opposite pairs"},  # some shot noise, perhaps too little
     "leak": {"opposite pairs"},
+    "rows": {"double events"},  # as made here, events of one pixel that wait together leave together
     "readout": {"time stamps"},  # a bus that sends at even steps
 }
 """Signatures that an effect may show: counted neither as hits nor as false alarms."""
