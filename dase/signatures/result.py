@@ -90,7 +90,7 @@ class Signatures:
         """Return a table: a line for each signature, below one that says what was looked at."""
         size = f"{self.width}x{self.height}, {grouped(self.events)} events in {seconds(self.duration)}"
         rows = [f"{entry.name:<15} {entry.answer:<10} {entry.sentence}" for entry in self.entries]
-        return [f"signatures      {size}; certain at p < {self.level:.1g}", *rows]
+        return [f"{'signatures':<15} {size}; false alarms below {self.level:.1g}", *rows]
 
     def __repr__(self) -> str:
         return "\n".join(self.lines())
