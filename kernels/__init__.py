@@ -6,7 +6,7 @@ In the order of the pipeline:
 - `scene`: moving textured layers to intensity and flow;
 - `blur`: pictures through a lens;
 - `pixel`: the effects of a sensor composed into one kernel, intensity to counts or events;
-- `events`: sort and decode what `pixel` emitted;
+- `events`: sort and decode what `pixel` emitted, and see what an event has near it;
 - `patches`: the structure of image and count-map patches;
 - `autograd`, `autograd_scene`, `autograd_training`: the bridge to PyTorch, the only files that import it.
 

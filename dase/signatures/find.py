@@ -155,8 +155,7 @@ def _open_passes(source: Source, size: Size | None, notes: list[str] | None) -> 
         -1, 2
     )
     begins = exposures[:, 0] - exposures[:, 1] / 2
-    known = len(begins) > 0 and bool(np.all(np.isfinite(begins)))
-    return _Passes(lambda: io.stream(path, size=size, notes=notes), begins if known else None)
+    return _Passes(lambda: io.stream(path, size=size, notes=notes), begins)
 
 
 def _sequence_begins(sequence: Sequence) -> NDArray[np.float64] | None:
@@ -217,7 +216,10 @@ def find_signatures(
         first = _run_first(passes, chunk, progress)
     width, height = first.width, first.height
     each, duration = level / COUNT, first.end - first.begin
-    coupling, bursts = find_frame_coupling(first.clock, each, passes.begins)
+    begins = passes.begins
+    if begins is not None and not (len(begins) and np.all(np.isfinite(begins))):
+        begins = None  # frames without times
+    coupling, bursts = find_frame_coupling(first.clock, each, begins)
     flicker, lamp = find_flicker(first.clock, each, bursts)
     second = _SecondPass(first, bursts, lamp.frequency if lamp else 0.0)
     for part in passes.parts(chunk, progress):
