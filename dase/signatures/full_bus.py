@@ -78,6 +78,9 @@ def find_full_bus(clock: ClockCounts, level: float, settings: BusSettings | None
         p = float(stats.f.cdf(full / max(min(usual, 1.0), 1e-9), 2 * steps / 3, 2 * others / 3))
         if full > s.scatter * min(usual, 1.0):
             p = 1.0
+    if full < s.scatter and steps >= s.fewest > others:
+        reason = f"the rate hardly leaves {metric(ceiling / step, 'events/s')}: a full bus, or an even scene"
+        return without_answer(NAME, reason)
     if p == 1.0:
         share, at = 0.0, np.zeros_like(at)  # whatever the rate does there, it is no ceiling
     low, high = stats.beta.interval(0.9, at.sum() + 0.5, len(at) - at.sum() + 0.5)

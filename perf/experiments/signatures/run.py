@@ -205,7 +205,7 @@ def make_recording(
         events = double_events(rng, events)
     if "readout" in effects and len(events):
         per_step = np.bincount((events.t / 1e-3).astype(int))
-        rate = max(float(np.quantile(per_step, rng.uniform(0.6, 0.9))) * 1e3, 1.2e5)
+        rate = max(float(np.quantile(per_step, rng.uniform(0.5, 0.9))) * 1e3, 1e3)
         events = Readout(rate=rate).reader(events.width, events.height, 0).push(events, np.inf)[0]
     return events, bool(rng.random() < 0.5)
 
@@ -246,24 +246,26 @@ def limits(count: int, total: int) -> str:
 def print_report(rows: list[dict[str, Any]]) -> None:
     """Print false alarms and hits by signature."""
     names = [entry["name"] for entry in rows[0]["entries"]]
-    print("| signature | false alarms (95 %) | cannot say, absent | hits (95 %) | cannot say, present |")
-    print("|---|---|---|---|---|")
+    print(
+        "| signature | false alarms (95 %) | hits, alone (95 %) | cannot say | hits, with others | cannot say |"
+    )
+    print("|---|---|---|---|---|---|")
     alarmed = []
     for k, name in enumerate(names):
-        absent, present = [], []
+        absent, alone, beside = [], [], []
         for row in rows:
             effects = (*CASES[row["case"]], row["base"])
             answer = row["entries"][k]["answer"]
             if any(name in EXPLAINED.get(effect, ()) for effect in effects):
-                present.append(answer)
+                (alone if len(CASES[row["case"]]) == 1 else beside).append(answer)
             elif not any(name in BESIDE.get(effect, ()) for effect in effects):
                 absent.append(answer)
                 if answer == "found":
                     entry = row["entries"][k]
                     alarmed.append((name, row, entry))
-        cells = [limits(answers.count("found"), len(answers)) for answers in (absent, present)]
-        unsaid = [str(answers.count("cannot say")) for answers in (absent, present)]
-        print(f"| {name} | {cells[0]} | {unsaid[0]} | {cells[1]} | {unsaid[1]} |")
+        cells = [limits(answers.count("found"), len(answers)) for answers in (absent, alone, beside)]
+        unsaid = [str(answers.count("cannot say")) for answers in (alone, beside)]
+        print(f"| {name} | {cells[0]} | {cells[1]} | {unsaid[0]} | {cells[2]} | {unsaid[1]} |")
     wrong = len({(row["case"], row["seed"]) for _, row, _ in alarmed})
     print(f"\n{len(rows)} recordings, {wrong} with a false alarm: {limits(wrong, len(rows))}")
     for name, row, entry in alarmed:
