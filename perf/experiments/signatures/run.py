@@ -246,9 +246,15 @@ def limits(count: int, total: int) -> str:
 def print_report(rows: list[dict[str, Any]]) -> None:
     """Print false alarms and hits by signature."""
     names = [entry["name"] for entry in rows[0]["entries"]]
-    print(
-        "| signature | false alarms (95 %) | hits, alone (95 %) | cannot say | hits, with others | cannot say |"
+    head = (
+        "signature",
+        "false alarms (95 %)",
+        "hits, alone",
+        "cannot say",
+        "hits, with others",
+        "cannot say",
     )
+    print(f"| {' | '.join(head)} |")
     print("|---|---|---|---|---|---|")
     alarmed = []
     for k, name in enumerate(names):
