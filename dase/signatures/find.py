@@ -220,6 +220,8 @@ def find_signatures(
     if begins is not None and not (len(begins) and np.all(np.isfinite(begins))):
         begins = None  # frames without times
     coupling, bursts = find_frame_coupling(first.clock, each, begins)
+    if bursts is not None and begins is None:  # they were seen in the clock's time alone
+        bursts = bursts.extend(first.end)
     flicker, lamp = find_flicker(first.clock, each, bursts)
     second = _SecondPass(first, bursts, lamp.frequency if lamp else 0.0)
     for part in passes.parts(chunk, progress):

@@ -51,6 +51,11 @@ class BurstClock:
     interval: float
     bursts: NDArray[np.float64]
 
+    def extend(self, end: float) -> BurstClock:
+        """Return the clock with as many more frames as begin before `end` [s], at even distances."""
+        more = np.arange(1, max(int((end - self.begins[-1]) / self.interval), 0) + 1)
+        return replace(self, begins=np.concatenate((self.begins, self.begins[-1] + more * self.interval)))
+
     def contains(self, t: NDArray[np.float64]) -> NDArray[np.bool_]:
         """Return which times [s], shape (N,), lie in a burst."""
         out = np.zeros(len(t), np.bool_)

@@ -17,6 +17,7 @@ from dase.effects.readout import Readout
 from dase.errors import InputError
 from dase.events import Events
 from dase.io.sequence import Sequence
+from dase.signatures.frame_coupling import BurstClock
 from perf.experiments.signatures import run as experiment
 
 NAMES = (
@@ -96,6 +97,17 @@ def test_bursts_with_the_frames_show_and_tell_their_times(plain, framed):
     assert entry.found
     assert entry.details["interval"] == pytest.approx(experiment.GAP, rel=2e-3)
     assert set(entry.details["phases"]) == {"ON", "OFF"}
+
+
+def test_bursts_go_on_after_the_clock_ends():
+    clock = BurstClock(np.array([0.0, 1.0, 2.0]), 1.0, np.array([[0.2, 0.3]])).extend(7.5)
+    assert clock.contains(np.array([0.25, 0.31, 6.25, 7.1, 7.25])).tolist() == [
+        True,
+        False,
+        True,
+        False,
+        True,
+    ]
 
 
 def test_a_lamp_is_found_beside_bursts_of_frames():
