@@ -222,7 +222,9 @@ def find_signatures(
     coupling, bursts = find_frame_coupling(first.clock, each, begins)
     if bursts is not None and begins is None:  # they were seen in the clock's time alone
         bursts = bursts.extend(first.end)
-    flicker, lamp = find_flicker(first.clock, each, bursts)
+    # bursts alone that nearly keep time: p decides between them and a lamp no better than that
+    doubtful = coupling.details.get("interval", 0.0) if bursts is None and begins is None else 0.0
+    flicker, lamp = find_flicker(first.clock, each, bursts, doubtful if coupling.p < 0.01 else 0.0)
     second = _SecondPass(first, bursts, lamp.frequency if lamp else 0.0)
     for part in passes.parts(chunk, progress):
         second.push(part)

@@ -245,6 +245,7 @@ def find_flicker(
     clock: ClockCounts,
     level: float,
     bursts: BurstClock | None = None,
+    doubtful: float = 0.0,
     settings: FlickerSettings | None = None,
 ) -> tuple[Signature, Lamp | None]:
     """Look for a tone that the whole array follows.
@@ -253,6 +254,7 @@ def find_flicker(
         clock: The events by time.
         level: p below which it is there.
         bursts: Times to leave out.
+        doubtful: Interval of bursts that may be there [s]: a tone at a multiple of their rate may be theirs.
         settings: How tones are looked for.
     """
     s = settings or FlickerSettings()
@@ -289,6 +291,10 @@ def find_flicker(
     found = judge_signature(entry, level, unseen)
     if not found.found:
         return found, None
+    turns = frequency * doubtful
+    if doubtful and abs(turns - round(turns)) < 0.75 * doubtful / duration:
+        reason = f"{frequency:.2f} Hz, or bursts every {seconds(doubtful)} of which it is a multiple"
+        return replace(found, answer=Answer.CANNOT_SAY, sentence=reason), None
     left = percent(1 - float(rates.kept.mean()))
     if bursts is not None:
         found = replace(found, sentence=f"{found.sentence}; read off with {left} of the time left out")

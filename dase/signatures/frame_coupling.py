@@ -265,7 +265,7 @@ def _judge_folds(
     if not entry.found:
         if entry.size >= s.least:
             reason = f"the rate rises {entry.size:.3g} times, in step with the {told} by chance (p {p:.1g})"
-            return without_answer(NAME, reason, p=p), None
+            return without_answer(NAME, reason, p=p, details={"interval": interval, "clock": told}), None
         return entry, None
     if _is_lamp(best.mean, best.at, step, s):
         reason = f"the rate peaks evenly over the {seconds(interval)} between frames: light that flickers"

@@ -32,7 +32,7 @@ class BusSettings:
     fewest_events: float = 50.0  # per step at the ceiling, for its scatter to be seen
     steps: int = 8  # of the clock at most that are taken together where fewer events come
     enough: float = 400.0  # events per step for a ceiling that is narrow
-    scatter: float = 0.3  # of the scatter below the ceiling, at most
+    scatter: float = 0.2  # of that of chance or below the ceiling, at most: a full bus leaves hardly any
 
 
 def _scatter_of(counts: NDArray[np.float64], chosen: NDArray[np.bool_]) -> tuple[float, int]:

@@ -52,7 +52,8 @@ BESIDE = {
     "hot": {"opposite pairs"},  # those that are only warm remain
     "noisy": {"opposite pairs"},  # some shot noise, perhaps too little
     "leak": {"opposite pairs"},
-    "rows": {"double events"},  # as made here, events of one pixel that wait together leave together
+    # as made here, events of one pixel that wait together leave together, and rows have their turn
+    "rows": {"double events", "time stamps"},
     "readout": {"time stamps"},  # a bus that sends at even steps
 }
 """Signatures that an effect may show: counted neither as hits nor as false alarms."""
