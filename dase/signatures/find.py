@@ -237,7 +237,7 @@ def find_signatures(
         flicker,
         hot,
         find_opposite_pairs(second.pairs, hot_pixels, duration, each, lamp=lamp is not None),
-        find_fixed_pattern(second.halves, hot_pixels, each),
+        find_fixed_pattern(second.halves, hot_pixels, each, lamp=lamp is not None),
         find_grouping(second.groups, each),
         stamps,
         find_double_events(second.intervals, hot_pixels, each, tick),

@@ -125,7 +125,9 @@ def _same_scene(counts: NDArray[np.int64], used: NDArray[np.bool_], good: NDArra
     return float(np.corrcoef(a, b)[0, 1])
 
 
-def find_fixed_pattern(halves: HalfCounts, hot: NDArray[np.bool_], level: float) -> Signature:
+def find_fixed_pattern(
+    halves: HalfCounts, hot: NDArray[np.bool_], level: float, *, lamp: bool = False
+) -> Signature:
     """Look for a pattern that stays.
 
     The null gives each block of pixels either sign: without a pattern, products of the two halves beyond the
@@ -136,6 +138,8 @@ def find_fixed_pattern(halves: HalfCounts, hot: NDArray[np.bool_], level: float)
         halves: Events by pixel in two halves of the time.
         hot: Pixels to leave out, shape (H * W,).
         level: p below which it is there.
+        lamp: Whether the light flickers: how often a still pixel follows depends on where its memory happens to
+            stand, and that stays.
     """
     s = halves.settings
     if halves.duration < s.shortest:
@@ -171,6 +175,9 @@ def find_fixed_pattern(halves: HalfCounts, hot: NDArray[np.bool_], level: float)
         reason = (
             f"spread {percent(size)}, but beside {int(hot.sum())} hot pixels those nearly hot look so, too"
         )
+        return without_answer(NAME, reason, details=entry.details, **numbers)
+    if lamp:
+        reason = f"spread {percent(size)}, but light that flickers leaves each pixel's memory where it is"
         return without_answer(NAME, reason, details=entry.details, **numbers)
     if alike > s.same_scene:
         reason = f"spread {percent(size)}, but both halves saw the same scene (correlation {alike:.2f})"
