@@ -32,7 +32,7 @@ class PatternSettings:
     fewest_events: float = 3.0  # usual count of a pixel in each half
     fewest_pixels: int = 500
     block: int = 8  # [px] neighbours share the scene: blocks are independent, pixels are not
-    hot: float = 1e-3  # share of hot pixels above which those not found as hot are a pattern, too
+    hot: float = 2e-4  # share of hot pixels above which those not found as hot are a pattern, too
     shortest: float = 0.3  # [s] below, the halves are parts of one look at the scene
     same_scene: float = 0.9  # correlation of both halves' smooth counts above which they saw the same scene
 
@@ -138,8 +138,8 @@ def find_fixed_pattern(
         halves: Events by pixel in two halves of the time.
         hot: Pixels to leave out, shape (H * W,).
         level: p below which it is there.
-        lamp: Whether the light flickers: how often a still pixel follows depends on where its memory happens to
-            stand, and that stays.
+        lamp: Whether the light flickers: how often a still pixel follows depends on where its memory happens
+            to stand, and that stays.
     """
     s = halves.settings
     if halves.duration < s.shortest:
