@@ -128,8 +128,8 @@ def find_opposite_pairs(
         return without_answer(NAME, f"{near} pairs, but light that flickers makes them, too", **known)
     # what independent trains would have must be seen
     if stats.poisson.sf(math.ceil(trains) - 1, bound) >= level and p >= level:
-        pairs = f"{near} pairs, independent ones would have {trains:.2g}, too few"
-        reason = f"{format_count(events)} calm events: {pairs}"
+        told = f"{near} pairs, independent ones would have {trains:.2g}, too few"
+        reason = f"{format_count(events)} calm events: {told}"
         return without_answer(NAME, reason, **known)
     returns = p_more < level and near >= s.returning * expected
     kind = (
