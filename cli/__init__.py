@@ -1,4 +1,4 @@
-"""The `dase` command. Each command is a file with a click command called `command`, loaded when it is run."""
+"""The `dase` command. Each command is a file with a click command `NAME_command`, loaded when it is run."""
 
 from __future__ import annotations
 
@@ -71,7 +71,9 @@ class LazyGroup(click.Group):
         """Return the command of this name."""
         if cmd_name not in COMMANDS:
             return None
-        command: click.Command = importlib.import_module(f"dase.cli.{cmd_name}").command
+        command: click.Command = getattr(
+            importlib.import_module(f"dase.cli.{cmd_name}"), f"{cmd_name}_command"
+        )
         return command
 
 
@@ -112,7 +114,7 @@ def main() -> None:
         error.show(file=shown)
         sys.exit(error.exit_code)
     except InputError as error:
-        _exit_with(str(error), 2)
+        _exit_with(f"{error} (--{error.argument})" if error.argument else str(error), 2)
     except BrokenPipeError:
         # the reader of our output has gone; nothing is left to say to it
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from dase.cli.options import effects_option, sensor_output
+from dase.cli.options import device_option, effects_option, sensor_output
 
 if TYPE_CHECKING:
     from dase.effects import Effect
@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     show_default=True,
     help="What the camera saw in RECORDING: its own frames, a video FILE, or static.",
 )
-@click.option("--device", default="cpu", show_default=True, help="cpu or cuda.")
+@device_option
 @click.option("--seed", default=0, show_default=True, help="The same seed gives the same fit.")
 @sensor_output
 @effects_option
@@ -59,12 +59,12 @@ def add_command(
     known = known_effects(effects)
     chosen = sensor_edit.parse_values(find_effect(effect, known), values)
     text = sensor_edit.read_sensor_text(sensor, known)
-    more = text.added(chosen)
+    more = text.with_effect(chosen)
     entry = sensor_edit.history_entry_today(f"add {effect}")
     if recording is not None:
         fitted, entry = _fit_effect(text.sensor(), chosen, recording, scene, device, seed)
         more = more.describing(fitted)
-    sensor_edit.write_sensor_text(more.noted(entry), output)
+    sensor_edit.write_sensor_text(more.with_history(entry), output)
     if output is None:
         return
     click.echo(f"{output}: {effect} added ({describe_values(more.sensor()[effect])})")
@@ -80,15 +80,13 @@ def _fit_effect(
     from dase.cli.diagnose import progress_bar
     from dase.diagnosis import sensor_update
     from dase.diagnosis.add_effect import fit_added
-    from dase.diagnosis.measurement import open_measurement
+    from dase.fitting.measurement import open_measurement
     from dase.simulation import sensor_edit
 
     data = open_measurement(recording, scene)
     with progress_bar(False) as tell:
-        before, found = fit_added(
-            data.events, data.scene, sensor, effect, trust=data.trust, seed=seed, device=device, progress=tell
-        )
-    for note in data.noted(found).notes:
+        before, found = fit_added(data, sensor, effect, seed=seed, device=device, progress=tell)
+    for note in found.notes:
         click.echo(f"note: {note}", err=True)
     entry = sensor_edit.history_entry_today(
         f"add {effect.name}",

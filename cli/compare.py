@@ -7,7 +7,14 @@ from pathlib import Path
 
 import click
 
-from dase.cli.options import check_suffix, effects_option, fps_option, open_recorded, scene_option
+from dase.cli.options import (
+    check_suffix,
+    device_option,
+    effects_option,
+    fps_option,
+    open_recorded,
+    scene_option,
+)
 
 
 @click.command()
@@ -25,7 +32,7 @@ from dase.cli.options import check_suffix, effects_option, fps_option, open_reco
 @fps_option
 @effects_option
 @click.option("--pixels", default=1500, show_default=True, help="In each half of the measurement.")
-@click.option("--device", default="cpu", show_default=True, help="cpu or cuda.")
+@device_option
 @click.option("--seed", default=0, show_default=True, help="The same seed gives the same numbers.")
 @click.option("--quiet", is_flag=True, help="No progress.")
 def compare_command(
@@ -54,11 +61,7 @@ def compare_command(
     model = load_sensor(sensor, known_effects(effects))
     measured = open_recorded(recording, scene, file, fps)
     with progress_bar(quiet) as tell:
-        found = compare(
-            measured.events, measured.scene, model, trust=measured.trust, pixels=pixels, seed=seed,
-            device=device, progress=tell,
-        )  # fmt: skip
-    found = measured.noted(found)
+        found = compare(measured, model, pixels=pixels, seed=seed, device=device, progress=tell)
     click.echo(
         f"error {found.error:.2f}; 1 is what two repeats of the recording give, "
         f"which stay below {found.gate:.2f}"

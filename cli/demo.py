@@ -6,16 +6,18 @@ from pathlib import Path
 
 import click
 
+from dase.cli.options import device_or_backend_option
+
 
 @click.command()
 @click.option(
     "--out", type=click.Path(path_type=Path), default=Path("out/demo"), show_default=True, help="Folder."
 )
-@click.option("--backend", default="cpu", show_default=True, help="cpu or cuda.")
-def demo_command(out: Path, backend: str) -> None:
+@device_or_backend_option
+def demo_command(out: Path, device: str) -> None:
     """Simulate a DAVIS346 before moving photographs, and draw what it sees."""
     from dase.datasets import demo
 
-    picture, events = demo.run_demo(out, backend=backend, say=click.echo)
+    picture, events = demo.run_demo(out, device=device, say=click.echo)
     click.echo(f"Look at the picture  {picture}")
     click.echo(f"and at the events in {events} (dase show {events})")

@@ -6,12 +6,20 @@ import json
 import math
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import click
 
-from dase.cli.options import check_suffix, effects_option, fps_option, open_recorded, scene_option
+from dase.cli.options import (
+    check_suffix,
+    device_option,
+    effects_option,
+    fps_option,
+    open_recorded,
+    scene_option,
+)
 
 if TYPE_CHECKING:
     from dase.results import Diagnosis
@@ -56,7 +64,7 @@ def print_explanation(ctx: click.Context, parameter: click.Parameter, value: str
 @fps_option
 @effects_option
 @click.option("--pixels", default=1500, show_default=True, help="In each half of the measurement.")
-@click.option("--device", default="cpu", show_default=True, help="cpu or cuda.")
+@device_option
 @click.option("--seed", default=0, show_default=True, help="The same seed gives the same findings.")
 @click.option("--quiet", is_flag=True, help="Only the finding, no progress.")
 @click.option("--explain", metavar="EFFECT", callback=print_explanation, expose_value=False,
@@ -85,7 +93,7 @@ def diagnose_command(
     announced unless it brings the error to what two repeats of the recording would give.
     """
     from dase.diagnosis import sensor_update
-    from dase.diagnosis.diagnose import MOST, diagnose
+    from dase.diagnosis.diagnose import diagnose
     from dase.io import replacing
     from dase.simulation import sensor_edit
     from dase.simulation.user_effects import known_effects
@@ -96,11 +104,11 @@ def diagnose_command(
     measured = open_recorded(recording, scene, file, fps)
     names = free.split(",") if free else None
     with progress_bar(quiet) as tell:
-        found = diagnose(
-            measured.events, measured.scene, model, trust=measured.trust, effects=known, free=names,
-            most=MOST if auto else 1, pixels=pixels, seed=seed, device=device, progress=tell,
-        )  # fmt: skip
-    found = measured.noted(found)
+        # without --auto, the first effect that is missing
+        look = diagnose if auto else partial(diagnose, most=1)
+        found = look(
+            measured, model, effects=known, free=names, pixels=pixels, seed=seed, device=device, progress=tell
+        )
     if json_ is not None:
         with replacing(json_) as part:
             part.write_text(json.dumps(found.to_json(), indent=2) + "\n")
@@ -138,9 +146,8 @@ def progress_bar(quiet: bool) -> Iterator[Callable[[str, float, float], None]]:
 
 
 def _print_findings(found: Diagnosis, quiet: bool) -> None:
-    from dase.diagnosis.diagnose import summary_line
 
-    click.echo(summary_line(found))
+    click.echo(found.finding())
     if quiet:
         return
     click.echo(f"error as given {found.before:.2f}; 1 is what two repeats of the recording give")

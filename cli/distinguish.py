@@ -6,7 +6,7 @@ from pathlib import Path
 
 import click
 
-from dase.cli.options import check_suffix, effects_option
+from dase.cli.options import check_suffix, device_option, effects_option
 
 
 @click.command()
@@ -17,7 +17,7 @@ from dase.cli.options import check_suffix, effects_option
     "--pixels", default=1500, show_default=True, help="Of a recording that are looked at, as in a diagnosis."
 )
 @click.option("--seed", default=0, show_default=True, help="Of the simulated recordings.")
-@click.option("--device", default="cpu", show_default=True, help="cpu or cuda.")
+@device_option
 @click.option(
     "-o",
     "--output",

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import click
 
-from dase.cli.options import effects_option, fps_option, open_recorded, scene_option
+from dase.cli.options import device_option, effects_option, fps_option, open_recorded, scene_option
 
 
 @click.command()
@@ -19,7 +19,7 @@ from dase.cli.options import effects_option, fps_option, open_recorded, scene_op
 @fps_option
 @effects_option
 @click.option("--pixels", default=1500, show_default=True, help="In each half of the measurement.")
-@click.option("--device", default="cpu", show_default=True, help="cpu or cuda.")
+@device_option
 @click.option("--seed", default=0, show_default=True, help="The same seed gives the same fit.")
 @click.option("--quiet", is_flag=True, help="No progress.")
 def fit_command(
@@ -51,15 +51,13 @@ def fit_command(
     model = text.sensor()
     measured = open_recorded(recording, scene, file, fps)
     with progress_bar(quiet) as tell:
-        found = fit(
-            measured.events, measured.scene, model, free=free.split(",") if free else None,
-            trust=measured.trust, pixels=pixels, seed=seed, device=device, progress=tell,
-        )  # fmt: skip
+        names = free.split(",") if free else None
+        found = fit(measured, model, free=names, pixels=pixels, seed=seed, device=device, progress=tell)
     sensor_edit.write_sensor_text(sensor_update.with_fit(text, found, recording.name), output)
     click.echo(f"error {found.before:.2f} → {found.error:.2f}; repeats stay below {found.gate:.2f}")
     for name, estimate in found.parameters.items():
         click.echo(f"  {name:24s} {estimate.value:10.4g}   {estimate.low:.4g} to {estimate.high:.4g}")
-    for note in measured.noted(found).notes:
+    for note in found.notes:
         click.echo(f"note: {note}")
     click.echo(f"{output}: {found.evaluations} simulations, {found.seconds:.1f} s")
     if found.poor:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import replace
 from functools import wraps
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -12,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 if TYPE_CHECKING:
-    from dase.diagnosis.measurement import Measurement
+    from dase.fitting.measurement import Measurement
 
 
 def parse_size(ctx: click.Context, param: click.Parameter, value: str | None) -> tuple[int, int] | None:
@@ -104,6 +103,33 @@ sensor_output = click.option(
 """`-o FILE` of commands that write a sensor file; a command gets a path or None."""
 
 
+class _FirstSpelling(click.Option):
+    """An option whose help shows its first spelling only; the others are for those who know them."""
+
+    def get_help_record(self, ctx: click.Context) -> tuple[str, str] | None:
+        """Return the line of the help, with one name."""
+        spellings, self.opts = self.opts, self.opts[:1]
+        try:
+            return super().get_help_record(ctx)
+        finally:
+            self.opts = spellings
+
+
+device_option = click.option("--device", default="cpu", show_default=True, help="cpu or cuda.")
+"""`--device NAME`, where Warp kernels run; a command gets the name."""
+
+device_or_backend_option = click.option(
+    "--device",
+    "--backend",  # what these commands called it at first
+    "device",
+    cls=_FirstSpelling,
+    default="cpu",
+    show_default=True,
+    help="cpu or cuda.",
+)
+"""`--device NAME` of commands that also take it as `--backend`."""
+
+
 def check_suffix(*suffixes: str) -> Callable[[click.Context, click.Parameter, Path | None], Path | None]:
     """Return a callback that refuses another suffix, and a folder that is not there, before any work."""
 
@@ -121,12 +147,17 @@ def open_recorded(
     recording: Path, scene: str, file: Path | None = None, fps: float | None = None
 ) -> Measurement:
     """Open a recording and its scene, with the frame rate of its clip where the user gives it."""
-    from dase.diagnosis.measurement import open_measurement
+    from dase.errors import InputError
+    from dase.fitting.measurement import open_measurement
     from dase.scenes.video import open_video
 
     clip = file if scene == "video" else Path(scene)
-    if fps is None or clip is None:
-        return open_measurement(recording, scene, file)
+    if clip is None:
+        raise InputError("--scene video needs the file: --scene video FILE")
     if scene in ("frames", "static"):
-        raise click.UsageError("--fps goes with --scene video FILE")
-    return replace(open_measurement(recording, "static"), scene=open_video(clip, fps=fps))
+        if file is not None:
+            raise InputError(f"--scene {scene} takes no file, got {file}")
+        if fps is not None:
+            raise click.UsageError("--fps goes with --scene video FILE")
+        return open_measurement(recording, scene)
+    return open_measurement(recording, clip if fps is None else open_video(clip, fps=fps))

@@ -22,7 +22,8 @@ def remove_command(sensor: str, effect: str, output: Path | None, effects: tuple
     from dase.simulation import sensor_edit
     from dase.simulation.user_effects import known_effects
 
-    text = sensor_edit.read_sensor_text(sensor, known_effects(effects)).removed(effect)
-    sensor_edit.write_sensor_text(text.noted(sensor_edit.history_entry_today(f"remove {effect}")), output)
+    text = sensor_edit.read_sensor_text(sensor, known_effects(effects)).without_effect(effect)
+    entry = sensor_edit.history_entry_today(f"remove {effect}")
+    sensor_edit.write_sensor_text(text.with_history(entry), output)
     if output is not None:
         click.echo(f"{output}: {effect} removed")

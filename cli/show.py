@@ -46,6 +46,7 @@ def show_command(
     from dase.errors import InputError, printable
     from dase.figures import event_images
     from dase.recordings import summary
+    from dase.recordings.statistics import sequence_statistics
 
     if file.is_dir() and (file / "job.json").is_file():
         _draw_run(file, output or file / "learned.png")
@@ -67,7 +68,7 @@ def show_command(
         figure = event_images.draw_sequence(sequence, title=printable(file.stem), at=at, window=window)
         with io.replacing(output) as temporary:
             figure.savefig(temporary)
-    for name, value in summary.statistics_table(event_images.statistics(sequence)):
+    for name, value in summary.statistics_table(sequence_statistics(sequence)):
         click.echo(f"{name:<18}{value}")
     click.echo(f"{'written':<18}{output}")
 
@@ -91,8 +92,8 @@ def _draw_run(folder: Path, output: Path) -> None:
 def _draw_trust(sequence: Sequence, output: Path, title: str, window: float | None) -> None:
     """Draw it, and say how much is trusted."""
     from dase import io
-    from dase.diagnosis.measurement import scene_between_frames
     from dase.figures import trust_figure
+    from dase.fitting.measurement import scene_between_frames
 
     notes: list[str] = []
     scene = scene_between_frames(sequence, notes)

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from dase.cli.options import effects_option, parse_size
+from dase.cli.options import device_or_backend_option, effects_option, parse_size
 
 if TYPE_CHECKING:
     from dase.datasets.generate import WorkReport
@@ -52,7 +52,7 @@ if TYPE_CHECKING:
     "--frame-rate", default=60.0, show_default=True, help="Of the frames and the flow that are stored [Hz]."
 )
 @click.option("--labels", is_flag=True, help="Mark events as signal, leak, shot noise or hot pixel.")
-@click.option("--backend", default="cpu", show_default=True, help="cpu or cuda.")
+@device_or_backend_option
 @click.option(
     "--video",
     type=click.Path(path_type=Path),
@@ -74,7 +74,7 @@ def synth_command(
     format_: str,
     frame_rate: float,
     labels: bool,
-    backend: str,
+    device: str,
     video: Path | None,
     fps: float | None,
     resume: bool,
@@ -87,7 +87,7 @@ def synth_command(
     With --video, the events of your own high-speed video are written to the file OUT instead.
     """
     if video is not None:
-        _synth_video(out, video, fps, sensor, effects, size, seed, backend, frame_rate, labels)
+        _synth_video(out, video, fps, sensor, effects, size, seed, device, frame_rate, labels)
         return
     if fps is not None:
         raise click.UsageError("--fps goes with --video")
@@ -107,12 +107,12 @@ def synth_command(
         regime=regime,
         seed=seed,
         format=format_,
-        backend=backend,
+        backend=device,
         frame_rate=frame_rate,
         labels=labels,
         effects=tuple(map(str, effects)),
     )
-    count = jobs if jobs is not None else (1 if backend.startswith("cuda") else os.cpu_count() or 1)
+    count = jobs if jobs is not None else (1 if device.startswith("cuda") else os.cpu_count() or 1)
     with _progress_bar(sequences, "sequences") as advance:
         report = generate.generate_dataset(job, out, jobs=count, resume=resume, progress=advance)
     _print_summary(report)
@@ -127,7 +127,7 @@ def _synth_video(
     effects: tuple[Path, ...],
     size: tuple[int, int] | None,
     seed: int,
-    backend: str,
+    device: str,
     frame_rate: float,
     labels: bool,
 ) -> None:
@@ -135,7 +135,7 @@ def _synth_video(
     from dase.datasets import generate
     from dase.scenes.video import open_video
     from dase.simulation.sensor_file import load_sensor
-    from dase.simulation.simulate import sample_times
+    from dase.simulation.sensor_run import sample_times
     from dase.simulation.user_effects import known_effects
 
     model = load_sensor(sensor, known_effects(effects))
@@ -147,7 +147,7 @@ def _synth_video(
             out,
             frame_rate=frame_rate,
             seed=seed,
-            device=backend,
+            device=device,
             labels=labels,
             progress=advance,
         )

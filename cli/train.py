@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from dase.cli.options import parse_size
+from dase.cli.options import device_or_backend_option, parse_size
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 @click.option("--sequences", default=300, show_default=True, help="Simulated by a sensor file as the target.")
 @click.option("--pattern", is_flag=True, help="Learn an offset for every column and row of the sensor.")
 @click.option("--seed", default=0, show_default=True, help="The same seed learns the same on one device.")
-@click.option("--backend", default="cpu", show_default=True, help="cpu or cuda.")
+@device_or_backend_option
 @click.option("--resume", is_flag=True, help="Go on where an interrupted run stopped.")
 @click.option("--tensorboard", is_flag=True, help="Write the log for TensorBoard, too.")
 def train_command(
@@ -47,7 +47,7 @@ def train_command(
     sequences: int,
     pattern: bool,
     seed: int,
-    backend: str,
+    device: str,
     resume: bool,
     tensorboard: bool,
 ) -> None:
@@ -57,7 +57,7 @@ def train_command(
     `dase compare` and `dase diagnose` take, its weights, a log and checkpoints; `dase show FOLDER` draws the
     learned maps. A sensor file as TARGETS is simulated first: a test with known thresholds.
 
-    On several GPUs: torchrun --nproc-per-node 4 --no-python dase train ... --backend cuda
+    On several GPUs: torchrun --nproc-per-node 4 --no-python dase train ... --device cuda
     """
     from dase.errors import InputError
 
@@ -71,22 +71,22 @@ def train_command(
         raise InputError(f'learning needs {error.name}: pip install "dase[learn]"') from None
     job = learning_job.Job(
         targets=targets, images=images or "", preset=preset, objective=objective, steps=steps, window=window,
-        size=size, sequences=sequences, pattern=pattern, seed=seed, backend=backend,
+        size=size, sequences=sequences, pattern=pattern, seed=seed, backend=device,
     )  # fmt: skip
-    backend = distributed.join_processes(backend)
+    device = distributed.join_processes(device)
     first = distributed.process_rank() == 0
     if first:
         learning_job.record_job(job, output, resume=resume)
     with _OpeningBar(silent=not first) as opened:
-        training = learning_job.open_training(replace(job, backend=backend), progress=opened)
-    looks = 100 if backend.startswith("cuda") else 25
-    pace = RunSchedule(
-        look=10 if preset == "tiny" else looks, seconds=None if minutes is None else 60 * minutes
+        training = learning_job.open_training(replace(job, backend=device), progress=opened)
+    looks = 100 if device.startswith("cuda") else 25
+    schedule = RunSchedule(
+        log_every=10 if preset == "tiny" else looks, seconds=None if minutes is None else 60 * minutes
     )
     with _LiveLine(training, output if tensorboard and first else None, silent=not first) as look:
         # killed before its first checkpoint, a run begins anew
         resume = resume and (output / CHECKPOINT).is_file()
-        last = train_in_folder(training, output, pace=pace, resume=resume, look=look)
+        last = train_in_folder(training, output, schedule=schedule, resume=resume, on_row=look)
     if first:
         _write_results(job, output, training, last)
     distributed.leave_processes()

@@ -33,6 +33,7 @@ if TYPE_CHECKING:
     from dase.simulation.simulate import count as count
     from dase.simulation.simulate import simulate as simulate
     from dase.simulation.simulate import stream as stream
+    from dase.simulation.sweep import sweep as sweep
     from dase.simulation.user_effects import load_effects as load_effects
 
 
@@ -54,6 +55,7 @@ _HOMES = {
     "dase.scenes.scene": ("Scene",),
     "dase.simulation.sensor": ("Sensor",),
     "dase.simulation.simulate": ("count", "simulate", "stream"),
+    "dase.simulation.sweep": ("sweep",),
     "dase.scenes.static": ("StaticScene",),
     "dase.scenes.video": ("VideoScene", "open_video"),
 }

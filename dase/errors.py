@@ -21,7 +21,15 @@ class InputError(ValueError):
 
     The message names the thing, the rule and the value. The command line prints it and exits with 2. What it
     takes from files and their names cannot steer a terminal, see `printable`.
+
+    Args:
+        message: One sentence for the user.
+        argument: The argument that cures it, where there is one; a command names its option of that name.
     """
+
+    def __init__(self, message: str = "", *, argument: str | None = None):
+        super().__init__(message)
+        self.argument = argument
 
     def __str__(self) -> str:
         return printable(super().__str__())

@@ -37,7 +37,7 @@ def _polarities(values: NDArray[Any]) -> NDArray[np.bool_]:
     return values.astype(np.bool_)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Events:
     """A stream of events of one sensor, sorted by time.
 
@@ -89,6 +89,13 @@ class Events:
 
     def __len__(self) -> int:
         return len(self.t)
+
+    def __repr__(self) -> str:
+        size = f"{self.width}x{self.height}"
+        if not len(self):
+            return f"Events(none of {size} pixels)"
+        span = f"{self.t[0]:.6g} s to {self.t[-1]:.6g} s"
+        return f"Events({len(self)} of {size} pixels, {span}, {100 * self.p.mean():.0f} % ON)"
 
     @classmethod
     def empty(cls, width: int, height: int) -> Events:

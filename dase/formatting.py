@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Collection, Iterable, Sequence
 
 SCALES = ((1e9, "G"), (1e6, "M"), (1e3, "k"), (1.0, ""), (1e-3, "m"), (1e-6, "µ"))
 
@@ -34,3 +35,27 @@ def format_percent(share: float) -> str:
     value = 100 * share
     digits = 0 if value >= 99.95 or not value else max(0, 1 - math.floor(math.log10(value)))
     return f"{value:.{min(digits, 4)}f} %"
+
+
+def align_columns(rows: Iterable[Sequence[str]], *, right: Collection[int] = ()) -> list[str]:
+    """Return rows of a table as lines, cells two spaces apart.
+
+    Args:
+        rows: Cells, as many in every row.
+        right: Columns whose cells end below each other, such as numbers.
+    """
+    table = [list(row) for row in rows]
+    widths = [max(map(len, column)) for column in zip(*table, strict=True)]
+    return [
+        "  ".join(
+            cell.rjust(width) if n in right else cell.ljust(width)
+            for n, (cell, width) in enumerate(zip(row, widths, strict=True))
+        ).rstrip()
+        for row in table
+    ]
+
+
+def fit_to_screen(lines: Iterable[str], *, rows: int = 30, columns: int = 100) -> str:
+    """Return lines as a text of at most some rows and columns; what is left out is marked by `…`."""
+    cut = [line if len(line) <= columns else line[: columns - 1] + "…" for line in lines]
+    return "\n".join(cut if len(cut) <= rows else [*cut[: rows - 1], "…"])

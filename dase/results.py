@@ -1,14 +1,21 @@
-"""What comparing, fitting and diagnosing return: frozen, with plain fields."""
+"""What comparing, fitting and diagnosing return: frozen, with plain fields.
+
+What Python prints of a result is a table that fits on a screen and says what was found; `to_json` has all of
+it.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+import math
+import textwrap
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from dase.formatting import align_columns, fit_to_screen
 from dase.simulation.sensor import Sensor
 
 Progress = Callable[[str, float, float], None]
@@ -24,7 +31,7 @@ class Estimate:
     high: float
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Cell:
     """One place at which model and measurement are compared.
 
@@ -48,8 +55,11 @@ class Cell:
     z: float
     sentence: str
 
+    def __repr__(self) -> str:
+        return fit_to_screen([f"Cell({self.sentence}; {self.z:+.1f} standard errors)"])
 
-@dataclass(frozen=True)
+
+@dataclass(frozen=True, repr=False)
 class Curve:
     """A statistic over an axis, measured and simulated, for a figure.
 
@@ -75,8 +85,17 @@ class Curve:
     log_x: bool = False
     log_y: bool = False
 
+    def __repr__(self) -> str:
+        rows = [(self.x_label, "measured", "simulated", "error"), *self._rows()]
+        lines = align_columns(rows, right=(0, 1, 2, 3))
+        return fit_to_screen([f"{self.title} ({self.y_label})", *(f"  {line}" for line in lines)])
 
-@dataclass(frozen=True)
+    def _rows(self) -> Iterator[tuple[str, ...]]:
+        for row in zip(self.x, self.measured, self.simulated, self.error, strict=True):
+            yield tuple(f"{value:.3g}" for value in row)
+
+
+@dataclass(frozen=True, repr=False)
 class Comparison:
     """How far a model is from a measurement, and where.
 
@@ -105,10 +124,29 @@ class Comparison:
     notes: tuple[str, ...] = ()
     seconds: float = 0.0
 
+    def __repr__(self) -> str:
+        ranked = sorted(self.families.items(), key=lambda item: -item[1])
+        families = align_columns([(name, f"{error:.2f}") for name, error in ranked], right=(1,))
+        plain = [
+            (name, f"{measured:.4g}", f"{simulated:.4g}")
+            for name, (measured, simulated) in self.plain.items()
+        ]
+        return fit_to_screen(
+            [
+                f"Comparison of '{self.sensor.name}': {_error_words(self.error, self.gate)}",
+                *_indented("error per family of statistics", families),
+                *_indented("where the model fails most", [cell.sentence for cell in self.cells[:4]]),
+                *align_columns(
+                    [("in plain numbers", "measured", "simulated"), *_pushed(plain)], right=(1, 2)
+                ),
+                *_noted(self.notes),
+            ]
+        )
+
     def to_json(self) -> dict[str, Any]:
         """Return the numbers as JSON objects; figures are left out."""
         return {
-            "sensor": self.sensor.table(),
+            "sensor": self.sensor.to_table(),
             "error": self.error,
             "floor": self.floor,
             "gate": self.gate,
@@ -120,7 +158,7 @@ class Comparison:
         }
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Fit:
     """A sensor fitted to a measurement.
 
@@ -150,15 +188,25 @@ class Fit:
     evaluations: int = 0
     seconds: float = 0.0
 
+    def __repr__(self) -> str:
+        return fit_to_screen(
+            [
+                f"Fit of '{self.sensor.name}': error {self.before:.2f} before",
+                f"  after: {_error_words(self.error, self.gate)}",
+                *_parameter_lines(self.parameters, most=15),
+                *_noted(self.notes),
+            ]
+        )
+
     def to_json(self) -> dict[str, Any]:
         """Return the numbers as JSON objects."""
         out = {name: getattr(self, name) for name in ("error", "before", "floor", "gate", "agree", "poor")}
-        out |= {"sensor": self.sensor.table(), "notes": list(self.notes)}
+        out |= {"sensor": self.sensor.to_table(), "notes": list(self.notes)}
         out |= {"parameters": {name: asdict(e) for name, e in self.parameters.items()}}
         return out | {"evaluations": self.evaluations, "seconds": self.seconds}
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Rank:
     """One candidate of one step of a diagnosis.
 
@@ -180,8 +228,11 @@ class Rank:
     parameters: Mapping[str, Estimate]
     refined: bool = True
 
+    def __repr__(self) -> str:
+        return f"Rank({', '.join(word for word in _rank_words(self) if word)})"
 
-@dataclass(frozen=True)
+
+@dataclass(frozen=True, repr=False)
 class Step:
     """One step of a diagnosis: what was missing in the model so far.
 
@@ -205,8 +256,22 @@ class Step:
     ties: tuple[str, ...]
     cells: tuple[Cell, ...]
 
+    def __repr__(self) -> str:
+        ranked = [rank for rank in self.ranking if not math.isnan(rank.error)]
+        ranking = align_columns([_rank_words(rank) for rank in ranked]) if ranked else []
+        chosen = f"added: {self.chosen}" if self.chosen else "nothing was added"
+        ties = f", which cannot be told apart from {', '.join(self.ties)}" if self.ties else ""
+        return fit_to_screen(
+            [
+                f"Step from {' + '.join(self.model)}: {_error_words(self.error, self.gate)}",
+                f"  {chosen}{ties}",
+                *_indented("candidates that were judged", ranking[:12]),
+                *_indented("where the model fails most", [cell.sentence for cell in self.cells[:4]]),
+            ]
+        )
 
-@dataclass(frozen=True)
+
+@dataclass(frozen=True, repr=False)
 class Unexplained:
     """An error that no effect of the library takes to the floor.
 
@@ -224,8 +289,12 @@ class Unexplained:
     cells: tuple[Cell, ...]
     sentence: str
 
+    def __repr__(self) -> str:
+        lines = textwrap.wrap(f"Unexplained({self.sentence})", 100, subsequent_indent="  ")
+        return fit_to_screen([*lines, *(f"  {cell.sentence}" for cell in self.cells[1:5])])
 
-@dataclass(frozen=True)
+
+@dataclass(frozen=True, repr=False)
 class Diagnosis:
     """Which effects a model lacks.
 
@@ -260,6 +329,30 @@ class Diagnosis:
     evaluations: int = 0
     seconds: float = 0.0
 
+    def __repr__(self) -> str:
+        steps = [("as given", self.before), *zip(("fitted", *self.selected), self.errors, strict=False)]
+        ties = [f"{name}: {', '.join(others)}" for name, others in self.ties.items()]
+        return fit_to_screen(
+            [
+                *textwrap.wrap(f"Diagnosis: {self.finding()}", 100, subsequent_indent="  "),
+                *_indented(
+                    f"error after each step; repeats stay below {self.gate:.2f}",
+                    align_columns([(name, f"{error:.2f}") for name, error in steps], right=(1,)),
+                ),
+                *_indented("cannot be told apart from", ties),
+                *_parameter_lines(self.parameters, most=12),
+                *_noted(self.notes),
+            ]
+        )
+
+    def finding(self) -> str:
+        """Return what was found, in one line."""
+        if self.unexplained is not None:
+            return self.unexplained.sentence
+        if not self.selected:
+            return f"nothing is missing: error {self.errors[0]:.2f}, repeats stay below {self.gate:.2f}"
+        return f"missing: {', '.join(self.selected)}"
+
     def to_json(self) -> dict[str, Any]:
         """Return the findings as JSON objects."""
         return {
@@ -272,14 +365,14 @@ class Diagnosis:
             "ties": {name: list(others) for name, others in self.ties.items()},
             "unexplained": None if self.unexplained is None else asdict(self.unexplained),
             "history": [asdict(step) for step in self.history],
-            "sensor": self.sensor.table(),
+            "sensor": self.sensor.to_table(),
             "notes": list(self.notes),
             "evaluations": self.evaluations,
             "seconds": self.seconds,
         }
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Answer:
     """What one standard recording does for telling two models apart.
 
@@ -301,8 +394,11 @@ class Answer:
     rates: tuple[float, float, float, float]
     tried: tuple[tuple[float, float], ...] = ()
 
+    def __repr__(self) -> str:
+        return f"Answer({', '.join(_answer_words(self))})"
 
-@dataclass(frozen=True)
+
+@dataclass(frozen=True, repr=False)
 class Distinction:
     """Which recording tells two models apart.
 
@@ -319,3 +415,54 @@ class Distinction:
     sentence: str
     pixels: int
     longest: float
+
+    def __repr__(self) -> str:
+        rows = [("recording", "tells apart in", "power", "they differ in"), *map(_answer_words, self.answers)]
+        lines = textwrap.wrap(self.sentence, 98)
+        return fit_to_screen(["Distinction", *(f"  {line}" for line in [*align_columns(rows), *lines])])
+
+
+def _error_words(error: float, gate: float) -> str:
+    """Return an error with what it is to be compared with."""
+    return f"error {error:.2f} noise floors, where repeats stay below {gate:.2f}"
+
+
+def _rank_words(rank: Rank) -> tuple[str, ...]:
+    """Return a candidate as cells of a table."""
+    if math.isnan(rank.error):
+        return rank.effect, "not judged"
+    way = f"{100 * rank.share:.0f} % of the way to the floor"
+    return rank.effect, f"error {rank.error:.2f}", way, f"p {rank.p_value:.3f}"
+
+
+def _answer_words(answer: Answer) -> tuple[str, ...]:
+    """Return an answer as cells of a table."""
+    shortest = "-" if answer.seconds is None else f"{answer.seconds:g} s"
+    return answer.stimulus, shortest, f"{100 * answer.power:.0f} %", answer.differs or "-"
+
+
+def _parameter_lines(parameters: Mapping[str, Estimate], *, most: int) -> list[str]:
+    """Return parameters with their intervals as lines of a table, at most some of them."""
+    rows = [
+        (name, f"{e.value:.4g}", f"{e.low:.4g} to {e.high:.4g}")
+        for name, e in list(parameters.items())[:most]
+    ]
+    left = [(f"and {len(parameters) - most} more", "", "")] if len(parameters) > most else []
+    table = align_columns([*_pushed([*rows, *left])], right=(1,)) if rows else []
+    return ["parameters, with 90 % intervals", *table] if table else []
+
+
+def _noted(notes: Sequence[str]) -> list[str]:
+    """Return notes, the first of them where there are many."""
+    left = [f"note: and {len(notes) - 3} more, see .notes"] if len(notes) > 3 else []
+    return [*(f"note: {note}" for note in notes[:3]), *left]
+
+
+def _indented(title: str, lines: Sequence[str]) -> list[str]:
+    """Return lines under a title; nothing where there are none."""
+    return [title, *(f"  {line}" for line in lines)] if lines else []
+
+
+def _pushed(rows: Iterable[tuple[str, ...]]) -> list[tuple[str, ...]]:
+    """Return rows of a table with the first cell indented."""
+    return [(f"  {first}", *rest) for first, *rest in rows]

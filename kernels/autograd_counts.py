@@ -47,8 +47,8 @@ def count_events(
 ) -> torch.Tensor:
     """Count events exactly, differentiable in the distribution of the thresholds.
 
-    The threshold of a pixel is max(mu + sigma z, 0.01), see `clipped_thresholds`. Gradients go to `mu` and `sigma`.
-    They treat the phase as a fixed fraction of the threshold, and none goes to `log` or `phase`.
+    The threshold of a pixel is max(mu + sigma z, 0.01), see `clipped_thresholds`. Gradients go to `mu` and
+    `sigma`. They treat the phase as a fixed fraction of the threshold, and none goes to `log` or `phase`.
 
     Args:
         log: Samples, shape (B, K, *S) [log intensity]; S are the pixels, e.g. (H, W), and K >= 2.

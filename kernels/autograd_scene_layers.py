@@ -18,9 +18,6 @@ from dase.kernels.scene_layers_gradient import render_gradient
 Texture = tuple[torch.Tensor, torch.Tensor | None]
 """Intensity and alpha of a layer, each of shape (h, w); alpha None is opaque."""
 
-COPIES = 256
-"""Copies of the gradient of `place` on a GPU, so that neighbouring pixels need not wait for each other."""
-
 
 def render_layers(
     textures: Sequence[Texture], place: torch.Tensor, *, width: int, height: int
@@ -130,7 +127,8 @@ class _Render(torch.autograd.Function):
         lots = min(thread_count(), 16)
         stretch = 1 if gradient.is_cuda else -(-gradient.shape[1] // lots)
         wanted = [bool(n) for n in ctx.needs_input_grad[:2]]
-        copies = (1, COPIES) if gradient.is_cuda else (lots, lots)
+        # a GPU's pixels all add to few places: with copies, neighbours need not wait for each other
+        copies = (1, 256) if gradient.is_cuda else (lots, lots)
         by_texels = texels.new_zeros(copies[0], len(texels) * wanted[0], 2)
         by_place = place.new_zeros(copies[1], len(place) * wanted[1], *place.shape[1:])
         outputs = [wp.from_torch(by_texels, dtype=wp.vec2), wp.from_torch(by_place, dtype=_scene.Affine)]

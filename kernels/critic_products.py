@@ -40,7 +40,15 @@ def over_root(slope: float, square: float, tiny: float) -> float:
     ...
 
 
-_OUTER = """
+def _outer_products(*, each: int, on_gpu: str, on_cpu: str) -> str:
+    """Return the C++ that sums up outer products.
+
+    Args:
+        each: Numbers per word of a right row.
+        on_gpu: What sets `b` to four of them.
+        on_cpu: Bits of the n-th of them.
+    """
+    return f"""
     float sum[4][4] = {{}};
     const float* p = &wp::index(left, begin, j);
     const int* q = &wp::index(right, begin, k / {each});
@@ -67,7 +75,7 @@ _OUTER = """
 
 
 @wp.func_native(
-    _OUTER.format(
+    _outer_products(
         each=2,
         on_gpu="""const uint2 w = __ldg(reinterpret_cast<const uint2*>(q));
         b[0] = __uint_as_float(w.x << 16), b[1] = __uint_as_float(w.x & 0xffff0000u);
@@ -83,7 +91,7 @@ def outer_half(
 
 
 @wp.func_native(
-    _OUTER.format(
+    _outer_products(
         each=1,
         on_gpu="""const int4 w = __ldg(reinterpret_cast<const int4*>(q));
         b[0] = __int_as_float(w.x), b[1] = __int_as_float(w.y);

@@ -100,15 +100,15 @@ def decode_keys(
     )  # fmt: skip
 
 
-EACH = {"cpu": 1024, "cuda": 1}
-"""Events that a thread decodes: on the CPU it costs as much to begin a thread as to decode ten."""
-
-RADIX = 9
-"""Bits that a pass of the sort on the CPU looks at: as many write positions as stay in the nearest cache."""
+def events_per_thread(device: wp.Device) -> int:
+    """Return how many events a thread of `decode_keys` takes, its argument `each`."""
+    # on the CPU it costs as much to begin a thread as to decode ten
+    return 1 if device.is_cuda else 1024
 
 
 @wp.func_native(
     """
+    // 9 bits per pass: as many write positions, 512, as stay in the nearest cache
     // the first pass reads the keys where the pixels left them
     auto each = [&](auto look) {
         for (int i = 0; i < late.shape[0]; ++i) look(late.data[i]);
@@ -233,7 +233,8 @@ def keys_in_order(
         halves = out[:total], out[total:]
         before = wp.array(late, dtype=wp.int64, device=device)
         launch.run_kernel(sort_keys, 1, [before, flat, counts, total, begin, top, low, *halves], device)
-        return halves[(-(-(top - begin) // RADIX) + 1) % 2]
+        passes = -(-(top - begin) // 9)  # of 9 bits each, from one half to the other and back
+        return halves[(passes + 1) % 2]
     if len(late):
         out[: len(late)].assign(late)
     start = len(late) + np.concatenate([[0], np.cumsum(used.reshape(-1))[:-1]])

@@ -1,13 +1,15 @@
 """Summary statistics of events, accumulated per pixel, event by event.
 
 The stimulus of a pixel is known on a grid of equal steps: a cell (what the light does there: at rest, or by
-how much it has changed, in which band of intensity) and the log intensity. `observe_event` looks at one event; a
-pixel kernel calls it as its events happen, `observe_stored_events` for events that are stored. Both write the same numbers, so
-that model and measurement are compared like with like. Sums over pixels, and their sampling errors, are
-`dase.probes.statistics`'.
+how much it has changed, in which band of intensity) and the log intensity. `observe_event` looks at one
+event; a pixel kernel calls it as its events happen, `observe_stored_events` for events that are stored. Both
+write the same numbers, so that model and measurement are compared like with like. Sums over pixels, and their
+sampling errors, are worked out in `dase.probes.statistics`.
 """
 
 from __future__ import annotations
+
+from enum import IntEnum
 
 import warp as wp
 
@@ -34,37 +36,44 @@ LAGS = 10
 CLASSES = 3
 """Of intervals, for the change between two events."""
 
-RATE = 0
-ISI = RATE + 2 * CELLS
-LAG = ISI + 6 * INTERVALS
-LAG_COUNT = LAG + LAGS * BANDS
-CHANGE = LAG_COUNT + BANDS
-REPEAT = CHANGE + 3 * 4 * CLASSES
-SERIAL = REPEAT + 3 * BANDS
-SIZE = SERIAL + 2 * CLASSES
-"""Places of the families in the sums, and how many there are."""
+ZONES = 4
+"""Rings about the middle of the sensor, of equal numbers of pixels."""
+
+
+class SumPlace(IntEnum):
+    """Where the families of statistics begin among the sums of a group of pixels, and how many there are."""
+
+    RATE = 0  # events by polarity and cell
+    ISI = RATE + 2 * CELLS  # by at rest or not, kinship of polarities (OFF OFF, ON ON, mixed) and interval
+    LAG = ISI + 6 * INTERVALS  # change of log intensity, times the sign of the event, by lag and band
+    LAG_COUNT = LAG + LAGS * BANDS  # events that those are summed over, by band
+    CHANGE = LAG_COUNT + BANDS  # number, sum, sum of deviations of the change, by polarities and class
+    REPEAT = CHANGE + 3 * 4 * CLASSES  # events, second ones and third ones of a step, by band
+    SERIAL = REPEAT + 3 * BANDS  # number and sum of products of successive deviations, by class
+    SIZE = SERIAL + 2 * CLASSES
+
+
+class FoldPlace(IntEnum):
+    """Where things are in what the counts of pixels are folded into, and how many numbers there are."""
+
+    PRODUCTS = 0  # of what is not expected in the two halves, moving and at rest
+    ODD = 12  # pixels that count oddly: busy at rest, hot, busy at all, silent
+    RINGS = 16  # events by moving or at rest, polarity and zone
+    SIZE = RINGS + 4 * ZONES
+
 
 HALVES = 8
 """Counts kept for every pixel: moving and at rest, even and odd halves of the time, OFF and ON."""
 
 MEMORY = 4
-"""Numbers a pixel remembers from event to event."""
+"""Numbers a pixel remembers from event to event: the step of the last one plus 1 (0: there was none), its
+polarity, how far the change before it was from what is typical (below -1e5: unknown), events of its step."""
 
 LANES = 16
 """Models of a pixel that a CPU thread works on side by side; an event that waits has 4 bits for which."""
 
 QUEUE = 512
 """Their events that wait until they are looked at, a multiple of 8."""
-
-ZONES = 4
-"""Rings about the middle of the sensor, of equal numbers of pixels."""
-
-PRODUCTS, ODD, RINGS = 0, 12, 16
-FOLD = RINGS + 4 * ZONES
-"""Places in what the counts of pixels are folded into, and how many numbers there are: products of what is
-not expected in the two halves, pixels that count oddly, events by zone."""
-
-_ODD, _RINGS, _FOLD, _ZONES = (wp.constant(n) for n in (ODD, RINGS, FOLD, ZONES))
 
 
 @wp.struct
@@ -85,20 +94,19 @@ class ProbeSums:
     team: int  # pixels that share a row of `clock`
     memory: wp.array3d[float]  # (B, N, MEMORY)
     queue: wp.array2d[wp.int64]  # (G, QUEUE) events of a pixel that wait, on a CPU: time [ns], ON, lane
-    sums: wp.array3d[float]  # (B, G, SIZE)
+    sums: wp.array3d[float]  # (B, G, SumPlace.SIZE)
     halves: wp.array3d[float]  # (B, N, HALVES)
     clock: wp.array3d[int]  # (B, G, 2 T) OFF, ON events of each step
 
 
-_PLACES = {
+_names_in_cpp = {
     "BANDS": BANDS, "RESTING": RESTING, "MASKED": MASKED, "INTERVALS": INTERVALS, "LAGS": LAGS,
-    "CLASSES": CLASSES, "CELLS": CELLS, "SIZE": SIZE, "ISI": ISI, "LAG": LAG, "LAG_COUNT": LAG_COUNT,
-    "CHANGE": CHANGE, "REPEAT": REPEAT, "SERIAL": SERIAL, "HALVES": HALVES, "MEMORY": MEMORY, "LANES": LANES,
-    "QUEUE": QUEUE,
+    "CLASSES": CLASSES, "CELLS": CELLS, "HALVES": HALVES, "MEMORY": MEMORY, "LANES": LANES, "QUEUE": QUEUE,
+    **SumPlace.__members__,
 }  # fmt: skip
 
-LOOK = (
-    f"enum {{ {', '.join(f'{name} = {at}' for name, at in _PLACES.items())} }};"
+_observation = (
+    f"enum {{ {', '.join(f'{name} = {at:d}' for name, at in _names_in_cpp.items())} }};"
     """
 const int steps = sink.cell.shape[1];
 const unsigned char* cell = sink.cell.data + (size_t)i * steps;
@@ -107,6 +115,7 @@ const float* level = sink.level.data + (size_t)i * sink.level.shape[1];
 const int* lags = sink.lags.data;
 const int group = i / sink.group;
 const int team = i / sink.team;
+// before and after the time that is looked at the light stands still
 auto INSIDE = [=](int k) { return k < 0 ? 0 : k > end ? end : k; };
 auto OCTAVE = [](int size, int last) {
     // bin of an interval
@@ -127,6 +136,7 @@ auto LOOK_AT = [&](int row, int k, int now, float* memory) {
     if (k < 0 || k >= steps) return;
     const int before = (int)memory[0] - 1;
     const int last = (int)memory[1];
+    // events of one step follow each other more closely than anything that the light does
     const float run = before == k ? memory[3] + 1.0f : 1.0f;
     float apart = -1.0e6f;
     if (cell[k] != MASKED) {
@@ -152,10 +162,12 @@ auto LOOK_AT = [&](int row, int k, int now, float* memory) {
             const int size = k - before;
             sums[ISI + (3 * rest + kinship) * INTERVALS + OCTAVE(size, INTERVALS - 1)] += 1.0f;
             // how the light changed since the last event, and how far from what is typical
+            // longer intervals see larger changes: they are compared class by class
             const int of = (size > sink.classes.data[0]) + (size > sink.classes.data[1]);
             const int pair = (2 * now + last) * CLASSES + of;
             const float change = (now ? 1.0f : -1.0f) * (level[k] - level[before]);
             const float off = change - sink.middle.data[pair];
+            // clipped, so that a few leaps of the light do not outweigh everything else
             apart = off < -1.0f ? -1.0f : off > 1.0f ? 1.0f : off;
             float* changes = sums + CHANGE + 3 * pair;
             changes[0] += 1.0f;
@@ -173,6 +185,7 @@ auto LOOK_AT = [&](int row, int k, int now, float* memory) {
         const int half = 4 * rest + 2 * (k / sink.half % 2) + now;
         sink.halves.data[((size_t)row * sink.halves.shape[1] + i) * HALVES + half] += 1.0f;
         int* clock = sink.clock.data + ((size_t)row * sink.clock.shape[1] + team) * sink.clock.shape[2];
+        // a team is several groups, whose threads count side by side on a GPU; a CPU thread has whole teams
 #ifdef __CUDA_ARCH__
         atomicAdd(clock + now * steps + k, 1);
 #else
@@ -185,6 +198,7 @@ auto LOOK_AT = [&](int row, int k, int now, float* memory) {
     memory[3] = run;
 };
 auto STAMPED = [&](int row, long long time) {
+    // models differ in their clocks, so times are stamped as they are looked at
     const long long tick = sink.ticks.data[row];
     return tick > 0 ? 1000 * time / tick * tick / 1000 : time;
 };
@@ -193,12 +207,13 @@ auto MEMORY_OF = [&](int row) {
 };
 """
 )
-"""What one event of pixel `i` adds to the sums, as C++ that `observe_event` and `observe_queued_events` have in common."""
+"""What one event of pixel `i` adds to the sums: C++ that observing and observing queued events share."""
 
 
 @wp.func_native(
-    LOOK
+    _observation
     + """
+// a step ends at its grid point, which belongs to it: hence rounded up
 const double at = ((double)STAMPED(row, time) - sink.slack) / sink.step;
 LOOK_AT(row, (int)ceil(at), now, MEMORY_OF(row));
 """
@@ -210,6 +225,7 @@ def observe_event(sink: ProbeSums, row: int, i: int, time: wp.int64, now: int):
 
 @wp.func_native(
     """
+// 4 bits of the lane, 1 of the polarity, 59 of the time
 sink.queue.data[(size_t)slot * sink.queue.shape[1] + waiting] = (time << 1 | now) << 4 | lane;
 return waiting + 1;
 """
@@ -220,13 +236,14 @@ def queue_event(sink: ProbeSums, slot: int, waiting: int, lane: int, time: wp.in
 
 
 @wp.func_native(
-    LOOK
+    _observation
     + """
 // all times first, in the CPU's vectors, and then one event after the other
 typedef double Times __attribute__((ext_vector_type(8)));
 typedef long long Longs __attribute__((ext_vector_type(8)));
 typedef int Ints __attribute__((ext_vector_type(8)));
 long long* queue = sink.queue.data + (size_t)group * sink.queue.shape[1];
+// most models have no clock: one question for all of them
 long long ticking = 0;
 const int rows = sink.ticks.shape[0] - start;
 for (int lane = 0; lane < LANES && lane < rows; ++lane) ticking |= sink.ticks.data[start + lane];
@@ -283,13 +300,13 @@ def fold_pixel_counts(
     seen: float,  # events that are expected of a pixel which is called silent if it sends none
     team: int,  # pixels that one thread adds up
     # out
-    out: wp.array3d[float],  # (B, G, FOLD)
+    out: wp.array3d[float],  # (B, G, FoldPlace.SIZE)
 ):
     """Fold the counts of the pixels of each group into a few sums."""
     row, g = wp.tid()
     g += first
     of = frame[row]
-    sums = wp.vector(length=wp.static(FOLD), dtype=float)
+    sums = wp.vector(length=wp.static(int(FoldPlace.SIZE)), dtype=float)
     for i in range(g * team, wp.min((g + 1) * team, halves.shape[1])):
         rest = float(0.0)
         usual = float(0.0)
@@ -304,6 +321,7 @@ def fold_pixel_counts(
                 if state == 1:
                     rest += count
                     usual += mean
+            # products of the two halves: chance has no part in both, what is wrong with a pixel has
             a_off = halves[row, i, 4 * state] - expected[of, i, 4 * state]
             a_on = halves[row, i, 4 * state + 1] - expected[of, i, 4 * state + 1]
             b_off = halves[row, i, 4 * state + 2] - expected[of, i, 4 * state + 2]
@@ -315,18 +333,19 @@ def fold_pixel_counts(
             sums[6 * state + 4] += a_off * a_off + b_off * b_off
             sums[6 * state + 5] += a_on * a_on + b_on * b_on
             for p in range(2):
-                ring = _RINGS + (2 * state + p) * _ZONES + zone[i]
+                ring = FoldPlace.RINGS + (2 * state + p) * ZONES + zone[i]
                 sums[ring] += halves[row, i, 4 * state + p] + halves[row, i, 4 * state + 2 + p]
+        # four standard deviations of a Poisson count, that of no event taken as of one
         bound = usual + 4.0 * wp.sqrt(usual + 1.0)
         if rest > bound + 2.0:
-            sums[_ODD] += 1.0
+            sums[FoldPlace.ODD] += 1.0
         if rest > bound + often:
-            sums[_ODD + 1] += 1.0
+            sums[FoldPlace.ODD + 1] += 1.0
         if every > 3.0 * all_usual + 20.0:
-            sums[_ODD + 2] += 1.0
+            sums[FoldPlace.ODD + 2] += 1.0
         if every == 0.0 and all_usual >= seen:
-            sums[_ODD + 3] += 1.0
-    for n in range(_FOLD):
+            sums[FoldPlace.ODD + 3] += 1.0
+    for n in range(wp.static(int(FoldPlace.SIZE))):
         out[row, g, n] = sums[n]
 
 

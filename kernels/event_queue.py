@@ -5,14 +5,15 @@ from __future__ import annotations
 import warp as wp
 
 NEVER = -(2**62)
-"""Time until when a bus is busy that has not sent anything yet [ps]."""
+"""Time until when a bus is busy that has not sent anything yet [ps]: far from any overflow."""
 
 ONE = 1 << 32
-"""A weight of 1."""
+"""A weight of 1; weights have 32 binary places, so that sums and copies are exact."""
 
 
 @wp.func_native(
     """
+    // picoseconds in 64 bits: buses send an event in fractions of a nanosecond, for hours
     const long long* __restrict__ due = other.data;
     const unsigned char* __restrict__ sign = polarity.data;
     const int count = other.shape[0];
@@ -22,11 +23,13 @@ ONE = 1 << 32
     long long at = count > 0 ? due[0] : 0;  // when the last copy got there
     long long step = 0, rest = 0, part = 0;  // from copy to copy, and what is left over by whole numbers
     for (int i = 0; i < arrival.shape[0]; ++i) {
+        // all others that come before, or at the same time, go first
         const long long mine = 1000 * (long long)rint(1e9 * arrival.data[i]);
         while (turn < count) {
             // the golden ratio, so that any run of numbers is spread evenly: whole, right in the mean
             const long long many = (weight.data[sign[turn]] + ((turn * 2654435769ll) & 0xffffffffll)) >> 32;
             if (many <= 1) {
+                // the common case without a loop over copies, and without a branch on what is lost
                 if (due[turn] > mine) break;
                 at = due[turn++];
                 const long long after = (free > at ? free : at) + service;
@@ -44,6 +47,7 @@ ONE = 1 << 32
                 rest = (due[turn] - at) % many;
                 part = 0;
             }
+            // the copies are interrupted by an event that comes between them, and go on after it
             while (sent < many) {
                 const bool over = part + rest >= many;
                 const long long next = at + step + over;
@@ -62,6 +66,7 @@ ONE = 1 << 32
             through.data[i] = NAN;
         } else {
             free = (free > mine ? free : mine) + service;
+            // rounded down to whole nanoseconds, below zero, too
             const long long whole = free / 1000 - (free % 1000 < 0);
             through.data[i] = 1e-9 * (double)whole;
         }

@@ -1,7 +1,8 @@
 """Where kernels run, and how CPU work is spread over threads.
 
 Warp runs a CPU launch on one thread and releases the GIL meanwhile, so a launch is cut into slabs that a
-thread pool works off. Every kernel that goes through `run_kernel` takes the start of its slab as first argument.
+thread pool works off. Every kernel that goes through `run_kernel` takes the start of its slab as first
+argument.
 """
 
 from __future__ import annotations
@@ -9,6 +10,7 @@ from __future__ import annotations
 import os
 import sys
 import tempfile
+import threading
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any, TypeVar
@@ -21,6 +23,7 @@ wp.config.log_level = wp.LOG_WARNING
 Result = TypeVar("Result")
 
 _pool: ThreadPoolExecutor | None = None
+_starting = threading.Lock()
 _threads = int(os.environ.get("DASE_THREADS", "0")) or os.cpu_count() or 1
 
 
@@ -58,10 +61,26 @@ def find_device(name: str) -> wp.Device:
         raise ValueError(f"backend '{name}' does not exist, here there are: {names}") from error
 
 
+def _forget_threads() -> None:
+    """Leave the parent's pool behind in a forked child, where none of its threads lives."""
+    global _pool, _starting
+    # a lock that another thread of the parent held would stay locked for ever
+    _pool, _starting = None, threading.Lock()
+
+
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(after_in_child=_forget_threads)
+
+
 def _start_warp() -> None:
     """Start Warp without its line on standard error that a machine has no NVIDIA driver."""
-    if wp._src.context.runtime is not None:
-        return
+    # two threads that hold the file descriptor back at once would restore it in the wrong order
+    with _starting:
+        if wp._src.context.runtime is None:
+            _init_quietly()
+
+
+def _init_quietly() -> None:
     # the line comes from native code, so only the file descriptor can be held back
     sys.stderr.flush()
     kept = os.dup(2)
@@ -126,8 +145,8 @@ def run_kernel(
 def run_concurrently(works: Sequence[Callable[[], Result]]) -> list[Result]:
     """Return what works give that pass their time in kernels of the CPU or in NumPy, done on its threads.
 
-    The first is done before the others: what it loads or works out is there for all. Works may use `run_kernel`,
-    whose threads are others.
+    The first is done before the others: what it loads or works out is there for all. Works may use
+    `run_kernel`, whose threads are others.
     """
     if len(works) < 2 or _threads == 1:
         return [work() for work in works]

@@ -169,7 +169,7 @@ def contrast_of_patches(
     contrast_out[b, i] = density_weighted(squares, number)
 
 
-# made here, because `run` loads a module before its threads start, and that builds only kernels it knows
+# made here, because `run_kernel` loads a module before its threads start: that builds only kernels it knows
 contrast_kernels = {
     wp.int32: wp.overload(contrast_of_patches, {"counts": wp.array4d[wp.int32]}),
     wp.float32: wp.overload(contrast_of_patches, {"counts": wp.array4d[wp.float32]}),

@@ -1,218 +1,296 @@
-"""The part of a kernel that runs where a step has events: crossings, noise events, dead times, delays."""
+"""What becomes of a step that has events: crossings, noise events, dead times, delays.
+
+Times within a step are shares of it, 0 at the sample before and 1 at the present one. The change since the
+last event runs straight from `before` to `after`; `moved` is what the events of this step have taken off it
+so far [log intensity].
+"""
 
 from __future__ import annotations
 
-from dase.kernels.pixel_codegen import Text
-from dase.kernels.pixel_stages import LATEST, LEAK, SIGNAL, EffectStages
+from dase.kernels.pixel_codegen import Block, Draw, Guarded, Line, Statement, if_block, lines
+from dase.kernels.pixel_codegen_model import PixelModel
+from dase.kernels.pixel_stages import LATEST, EffectStages, Label
 
-COUNT_ON = "{0} = wp.where({0} < 8388608.0, {0} + 1.0, 1.0)"
-"""Counts events in float32 without coming to a halt where it resolves no more; random numbers then repeat."""
+Statements = tuple[Statement, ...]
 
 
-class Crossings(Text):
-    """Writes what becomes of the change of one step."""
+def count_on(name: str) -> Line:
+    """Return the line that counts an event in a float32.
 
-    def redrawn(self) -> list[str]:
-        """Return the lines that draw the thresholds of the next event, none without such an effect."""
-        draws = [
-            line
-            for effect, function in self.of("redraw")
-            for line in self.unless_off(effect, f"on, off = {self.call('redraw', effect, function)}")
-        ]
-        return ["on = mean_on", "off = mean_off", *draws] if draws else []
+    States are float32, in which a count comes to a halt at 2^24. This one starts anew before, whereupon the
+    random numbers that it indexes repeat.
+    """
+    return Line(f"{name} = wp.where({name} < 8388608.0, {name} + 1.0, 1.0)")
 
-    def busy(self) -> None:
-        """Events of a step that has any: crossings, cut at the noise events between them."""
-        noisy = [effect for effect, _ in self.of("noise")]
-        self.add("moved = float(0.0)", "begun = float(0.0)")
-        if not noisy:
-            self.add("stop = 1.0", "value = after")
-            self.crossings()
-        else:
-            self.add("while begun < 1.0:")
-            self.depth += 1
-            self.add("stop = float(1.0)", "cause = int(0)")
-            for number, effect in enumerate(noisy, start=1):
-                n = effect.name
-                self.add(f"if {n}_spend > {n}_hazard and {n}_hazard < stop * {n}_spend:")
-                self.add(f"    stop = {n}_hazard / {n}_spend", f"    cause = {number}")
-            self.add("value = after", "if cause != 0:", "    value = before + (after - before) * stop")
-            self.crossings()
-            for number, effect in enumerate(noisy, start=1):
-                self.noise_event(number, effect)
-            self.add("begun = stop", "if cause == 0:", "    break")
-            self.depth -= 1
-        self.add("reference += moved")
-        if "leaked" in self.states:
-            self.add(*(["drained += leaked"] if "drained" in self.states else []))
-            # keeps `leaked` small, where float32 resolves slow leaks
-            self.add("reference -= leaked", "leaked = 0.0")
 
-    def crossings(self) -> None:
-        """Exact crossings between `begun` and `stop`, times interpolated; Eqs. (2)-(4) of the paper."""
-        delays = self.delays()
-        begin = "at" if delays else "begun"
-        if delays:
-            self.add("at = begun + 0.0")
-            self.pending()
-        self.add("change = value - moved")
-        self.add(
-            "theta = on", "polarity = int(1)", "if change < 0.0:", "    theta = -off", "    polarity = 0"
-        )
-        self.add(
-            "crossed = int(whole(wp.abs(change), wp.abs(theta), 1.0 / wp.abs(theta)))",
-            *(["passed = int(0)"] if delays else []),
-        )
-        if self.of("redraw"):
-            self.one_by_one(begin)
-            return
-        if self.sink == "counts" and not self.of("gate"):
-            # nobody asks when they happened
-            self.add("on_count += polarity * crossed", "off_count += (1 - polarity) * crossed")
-            self.add("moved += float(crossed) * theta")
-            return
-        self.add(*(["if at > stop:", "    crossed = 0"] if delays else []))
-        self.add("for n in range(crossed):")
-        self.depth += 1
-        self.add(f"share = {begin}", "if after != before:")
-        self.add("    share = (moved + float(n + 1) * theta - before) / (after - before)")
-        self.add(f"share = wp.clamp(share, {begin}, stop)")
-        if delays:
-            self.wait("share")
-            self.add(
-                "if wait > 0.0:", "    share += wait / dt", "if share > stop:", "    break", "passed += 1"
-            )
-            label = self.leaks("share")
-            self.event("share", "polarity", label)
-        else:
-            label = self.leaks("share")
-            self.gated("share", "polarity", label)
-        self.add(*self.memorise())
-        self.depth -= 1
-        self.add(f"moved += float({'passed' if delays else 'crossed'}) * theta")
+def noise_key(effect: EffectStages) -> Draw:
+    """Return the stream of an effect's noise events: when they come."""
+    return Draw(f"{effect.name}_noise", "uniform", effect)
 
-    def one_by_one(self, begin: str) -> None:
-        """Crossings with thresholds drawn anew; equal ones are counted as without drawing, bit for bit."""
-        if not self.delays():
-            self.add("passed = int(0)")
-        else:
-            self.add("if at > stop:", "    crossed = 0")
-        self.add("while passed < crossed:")
-        self.depth += 1
-        self.add(f"share = {begin}", "if after != before:")
-        self.add("    share = (moved + float(passed + 1) * theta - before) / (after - before)")
-        self.add(f"share = wp.clamp(share, {begin}, stop)")
-        if self.delays():
-            self.wait("share")
-            self.add("if wait > 0.0:", "    share += wait / dt", "if share > stop:", "    break")
-            self.event("share", "polarity", self.leaks("share"))
-        else:
-            self.gated("share", "polarity", self.leaks("share"))
-        self.add("passed += 1", *self.memorise(), *self.next_draw())
-        self.add("drawn = on", "if polarity == 0:", "    drawn = -off", "if drawn != theta:")
-        self.add("    moved += float(passed) * theta", "    passed = 0", "    theta = drawn")
-        self.add("    crossed = int(wp.floor((value - moved) / theta))")
-        self.depth -= 1
-        self.add("moved += float(passed) * theta")
 
-    def next_draw(self) -> list[str]:
-        """Return the lines that draw new thresholds after an event."""
-        anew = self.redrawn()
-        return [COUNT_ON.format("redraws"), *anew] if anew else []
+def redraw_thresholds(model: PixelModel) -> Statements:
+    """Return the statements that draw thresholds about the pixel's own ones."""
+    return tuple(
+        Guarded(effect, (Line(f"on, off = {call.text}", call.draws),))
+        for effect, call in model.calls("redraw")
+    )
 
-    def pending(self) -> None:
-        """Crossings from before `begun` that still stand when the pixel comes back to life at `at`."""
-        self.wait("at")
-        self.add("while wait > 0.0:")
-        self.depth += 1
-        self.add("at += wait / dt", "if at > stop:", "    break")
-        self.add("change = before + (after - before) * at - moved")
-        self.add("theta = float(0.0)", "polarity = int(0)")
-        self.add("if change >= on:", "    theta = on", "    polarity = 1")
-        self.add("if change <= -off:", "    theta = -off", "if theta == 0.0:", "    break")
-        self.event("at", "polarity", self.leaks("at"))
-        self.add("moved += theta", *self.memorise(), *self.next_draw())
-        self.wait("at")
-        self.depth -= 1
 
-    def wait(self, share: str) -> None:
-        """Set `wait` to the time the pixel stays dead after `share` of the step."""
-        self.add("wait = float(0.0)", "now = age")
-        self.add(f"age = now + {share} * dt")
-        for effect, function in self.of("gate"):
-            self.add(*self.unless_off(effect, f"wait = wp.max(wait, {self.call('gate', effect, function)})"))
-        self.add("age = now")
+def thresholds_after_event(model: PixelModel) -> Statements:
+    """Return the statements that draw new thresholds after an event, none without such an effect."""
+    anew = redraw_thresholds(model)
+    return (count_on("redraws"), *lines("on = mean_on", "off = mean_off"), *anew) if anew else ()
 
-    def leaks(self, share: str) -> str:
-        """Return the label of a crossing: whether the leak did more for it than the light did."""
-        if "drained" not in self.states:
-            return str(SIGNAL)
-        self.add(f"slipped = leaked_before + (leaked - leaked_before) * {share}", f"label = int({SIGNAL})")
-        self.add("if polarity == 1 and drained + slipped > 0.5 * on:", f"    label = {LEAK}")
-        return "label"
 
-    def memorise(self) -> list[str]:
-        """Return the line that begins to count the leak anew, the memory being set where `leaks` looked."""
-        return ["drained = -slipped"] if "drained" in self.states else []
+def sleep_condition(model: PixelModel) -> tuple[Statements, str]:
+    """Return when a step can have events.
 
-    def leave(self, share: str) -> str:
-        """Return the time at which an event leaves; events of one pixel do not overtake each other."""
-        delays = self.of("delay")
-        if not delays:
-            return self.instant(share, "0.0")
-        self.add("late = float(0.0)")
-        for effect, function in delays:
-            self.add(*self.unless_off(effect, f"late += {self.call('delay', effect, function)}"))
-        self.add(f"late = wp.clamp(late, 0.0, {LATEST})")
-        self.add(f"leaves = wp.max(leaves, {self.instant(share, 'late')})")
-        return "leaves"
+    Returns:
+        Statements that set `asleep` to the rest of the dead time [s], none unless events wait for its end;
+        and the condition.
+    """
+    crossed = "after >= on or after <= -off"
+    asleep: list[Statement] = []
+    if model.delays:
+        asleep.append(Line("asleep = float(0.0)"))
+        for effect, call in model.calls("gate"):
+            asleep.append(Guarded(effect, (Line(f"asleep = wp.max(asleep, {call.text})", call.draws),)))
+        # a crossing that waits for the end of the dead time may come although the signal returns
+        crossed += " or before >= on or before <= -off"
+        # a leak is taken off the reference where there are events, so that it must not sleep
+        # one whose dead time ends with the step must not miss it by rounding: hence a little more than dt
+        awake = "asleep <= 1.0001 * dt" + (" or leaked != 0.0" if "leaked" in model.states else "")
+        crossed = f"({crossed}) and ({awake})"
+    noisy = [f"{effect.name}_spend > {effect.name}_hazard" for effect, _ in model.of("noise")]
+    return tuple(asleep), " or ".join([crossed, *noisy])
 
-    def instant(self, share: str, late: str) -> str:
-        """Return the time `late` after `share` of the step."""
-        return f"leaving_time(clock, k, {share}, {late})"
 
-    def keep(self, time: str, polarity: str, label: str) -> str:
-        """Return the call that keeps an event."""
-        code = f"{polarity} * 4 + {label}" if self.sink == "labels" else polarity
-        return f"deposit(sink, row, i, size, {time}, {code})"
+def step_events(model: PixelModel) -> Statements:
+    """Return the events of a step that has any: crossings, cut at the noise events between them."""
+    noisy = [effect for effect, _ in model.of("noise")]
+    found: list[Statement] = [*lines("moved = float(0.0)", "begun = float(0.0)")]
+    if noisy:
+        found.append(Block("while begun < 1.0:", _until_noise(model, noisy)))
+    else:
+        found += [*lines("stop = 1.0", "value = after"), *_crossings(model)]
+    found.append(Line("reference += moved"))
+    if "leaked" in model.states:
+        found += lines("drained += leaked") if model.labelled else ()
+        # keeps `leaked` small, where float32 resolves slow leaks
+        found += lines("reference -= leaked", "leaked = 0.0")
+    return tuple(found)
 
-    def event(self, share: str, polarity: str, label: str) -> None:
-        """Emit an event after `share` of the step."""
-        if self.sink == "counts":
-            self.add(f"on_count += {polarity}", f"off_count += 1 - {polarity}")
-        else:
-            self.add(self.keep(self.leave(share), polarity, label))
-        if "age" in self.states:
-            self.add(f"age = -{share} * dt")
 
-    def gated(self, share: str, polarity: str, label: str, *then: str) -> None:
-        """Emit an event unless the pixel is dead, and do `then`."""
-        if not self.of("gate"):
-            self.event(share, polarity, label)
-            self.add(*then)
-            return
-        self.wait(share)
-        self.add("if wait <= 0.0:")
-        self.depth += 1
-        self.event(share, polarity, label)
-        self.add(*then)
-        self.depth -= 1
-
-    def noise_event(self, number: int, effect: EffectStages) -> None:
-        """Emit the noise event at `stop`; like any event it makes the pixel memorise the present signal."""
+def _until_noise(model: PixelModel, noisy: list[EffectStages]) -> Statements:
+    """Return the crossings up to the next noise event, and that event."""
+    found: list[Statement] = [*lines("stop = float(1.0)", "cause = int(0)")]
+    for number, effect in enumerate(noisy, start=1):
         n = effect.name
-        self.draws[f"{n}_polarity"] = "uniform"
-        self.add(f"if cause == {number}:")
-        self.depth += 1
-        self.add("polarity = int(0)")
-        self.add(
-            f"if uniform({n}_polarity_key, int({n}_events)) * ({n}_on + {n}_off) < {n}_on:",
-            "    polarity = 1",
-        )
-        if "drained" in self.states:
-            self.add("slipped = leaked_before + (leaked - leaked_before) * stop")
-        then = ["moved = value", *self.memorise(), *self.next_draw()]
-        self.gated("stop", "polarity", str(effect.label), *then)
-        self.add(f"{n}_hazard += waiting({self.noise_key(effect)}, int({n}_events))")
-        self.add(COUNT_ON.format(f"{n}_events"))
-        self.depth -= 1
+        # compared as products first: most steps have no noise event, and a division takes long
+        sooner = f"{n}_spend > {n}_hazard and {n}_hazard < stop * {n}_spend"
+        found.append(if_block(sooner, f"stop = {n}_hazard / {n}_spend", f"cause = {number}"))
+    found += [Line("value = after"), if_block("cause != 0", "value = before + (after - before) * stop")]
+    found += _crossings(model)
+    for number, effect in enumerate(noisy, start=1):
+        found.append(if_block(f"cause == {number}", *_noise_event(model, effect)))
+    return (*found, Line("begun = stop"), if_block("cause == 0", "break"))
+
+
+def _crossings(model: PixelModel) -> Statements:
+    """Return the exact crossings between `begun` and `stop`, times interpolated; Eqs. (2)-(4) of the paper.
+
+    Where events wait for the end of a dead time, `at` is how far the pixel has come: crossings from before
+    `begun` come first, when it is awake again.
+    """
+    found: list[Statement] = []
+    if model.delays:
+        found += [Line("at = begun + 0.0"), *_pending_crossings(model)]
+    found += [
+        *lines("change = value - moved", "theta = on", "polarity = int(1)"),
+        if_block("change < 0.0", "theta = -off", "polarity = 0"),
+        Line("crossed = int(whole(wp.abs(change), wp.abs(theta), 1.0 / wp.abs(theta)))"),
+        *(lines("passed = int(0)") if model.delays else ()),
+    ]
+    # the dearer ways only for sensors that need them
+    if model.of("redraw"):
+        found += _crossings_one_by_one(model)
+    elif model.sink == "counts" and not model.of("gate"):
+        # nobody asks when they happened
+        found += lines("on_count += polarity * crossed", "off_count += (1 - polarity) * crossed")
+        found += lines("moved += float(crossed) * theta")
+    else:
+        passed = "crossed"
+        label, asked = _label_crossing(model, "share")
+        if model.delays:
+            passed = "passed"
+            found.append(if_block("at > stop", "crossed = 0"))
+            event = (*_wait_for_gate(model), Line("passed += 1"), *asked, *_event(model, "share", label))
+        else:
+            event = (*asked, *_unless_dead(model, "share", label))
+        # all crossings of a step have one threshold, so their number is known before the loop
+        body = (*_crossing_time(model, "n"), *event, *_memorise_leak(model))
+        found += [Block("for n in range(crossed):", body), Line(f"moved += float({passed}) * theta")]
+    return tuple(found)
+
+
+def _crossings_one_by_one(model: PixelModel) -> Statements:
+    """Return crossings with thresholds drawn anew; equal ones are counted as without drawing, bit for bit."""
+    label, asked = _label_crossing(model, "share")
+    if model.delays:
+        found = [if_block("at > stop", "crossed = 0")]
+        event = (*_wait_for_gate(model), *asked, *_event(model, "share", label))
+    else:
+        found = [*lines("passed = int(0)")]
+        event = (*asked, *_unless_dead(model, "share", label))
+    body = (
+        *_crossing_time(model, "passed"),
+        *event,
+        *lines("passed += 1"),
+        *_memorise_leak(model),
+        *thresholds_after_event(model),
+        Line("drawn = on"),
+        if_block("polarity == 0", "drawn = -off"),
+        # products of equal thresholds are not summed up one by one, which would round differently
+        if_block(
+            "drawn != theta",
+            "moved += float(passed) * theta",
+            "passed = 0",
+            "theta = drawn",
+            "crossed = int(wp.floor((value - moved) / theta))",
+        ),
+    )
+    return (*found, Block("while passed < crossed:", body), Line("moved += float(passed) * theta"))
+
+
+def _crossing_time(model: PixelModel, number: str) -> Statements:
+    """Return the statements that set `share` to the time of the crossing after `number` others."""
+    begin = "at" if model.delays else "begun"
+    return (
+        Line(f"share = {begin}"),
+        # a change that is all noise or leak stands still: its crossings are due at once
+        if_block(
+            "after != before",
+            f"share = (moved + float({number} + 1) * theta - before) / (after - before)",
+        ),
+        # rounding must not bring an event before another one, or into the next step
+        Line(f"share = wp.clamp(share, {begin}, stop)"),
+    )
+
+
+def _wait_for_gate(model: PixelModel) -> Statements:
+    """Return the statements that put a crossing off to the end of the dead time, or to the next step."""
+    return (
+        *_dead_time(model, "share"),
+        if_block("wait > 0.0", "share += wait / dt"),
+        # still dead: what crosses is looked at again when time has gone on
+        if_block("share > stop", "break"),
+    )
+
+
+def _pending_crossings(model: PixelModel) -> Statements:
+    """Return crossings from before `begun` that still stand when the pixel comes back to life at `at`."""
+    label, asked = _label_crossing(model, "at")
+    body = (
+        Line("at += wait / dt"),
+        if_block("at > stop", "break"),
+        *lines("change = before + (after - before) * at - moved", "theta = float(0.0)", "polarity = int(0)"),
+        # one at a time: each begins a dead time of its own
+        if_block("change >= on", "theta = on", "polarity = 1"),
+        if_block("change <= -off", "theta = -off"),
+        if_block("theta == 0.0", "break"),
+        *asked,
+        *_event(model, "at", label),
+        Line("moved += theta"),
+        *_memorise_leak(model),
+        *thresholds_after_event(model),
+        *_dead_time(model, "at"),
+    )
+    return (*_dead_time(model, "at"), Block("while wait > 0.0:", body))
+
+
+def _dead_time(model: PixelModel, share: str) -> Statements:
+    """Return the statements that set `wait` to the time the pixel stays dead after `share` of the step [s].
+
+    Gates ask for the time since the last event by the name of `age`, which a pixel keeps as of the begin of
+    the step.
+    """
+    gates = [
+        Guarded(effect, (Line(f"wait = wp.max(wait, {call.text})", call.draws),))
+        for effect, call in model.calls("gate")
+    ]
+    return (*lines("wait = float(0.0)", "now = age", f"age = now + {share} * dt"), *gates, Line("age = now"))
+
+
+def _label_crossing(model: PixelModel, share: str) -> tuple[str, Statements]:
+    """Return the label of a crossing, and what it takes: whether the leak did more for it than the light."""
+    if not model.labelled:
+        return f"{Label.SIGNAL:d}", ()
+    return "label", (
+        *lines(
+            f"slipped = leaked_before + (leaked - leaked_before) * {share}", f"label = int({Label.SIGNAL:d})"
+        ),
+        # a leak is towards ON, so OFF events are never its
+        if_block("polarity == 1 and drained + slipped > 0.5 * on", f"label = {Label.LEAK:d}"),
+    )
+
+
+def _memorise_leak(model: PixelModel) -> Statements:
+    """Return what begins to count the leak anew, the memory being set where `_label_crossing` looked."""
+    return lines("drained = -slipped") if model.labelled else ()
+
+
+def _leave_pixel(model: PixelModel, share: str) -> tuple[str, Statements]:
+    """Return the time at which an event leaves, and what it takes to know it.
+
+    Events of one pixel do not overtake each other.
+    """
+    instant = model.outlet.instant
+    delays = model.calls("delay")
+    if not delays:
+        return instant.format(share=share, late="0.0"), ()
+    late = [Guarded(effect, (Line(f"late += {call.text}", call.draws),)) for effect, call in delays]
+    return "leaves", (
+        Line("late = float(0.0)"),
+        *late,
+        # chunks keep what leaves late for so long, and keys have room for it
+        Line(f"late = wp.clamp(late, 0.0, {LATEST})"),
+        Line(f"leaves = wp.max(leaves, {instant.format(share=share, late='late')})"),
+    )
+
+
+def _event(model: PixelModel, share: str, label: str) -> Statements:
+    """Return the emission of an event after `share` of the step."""
+    # negative, as the whole step is added to the age when it is over
+    aged = lines(f"age = -{share} * dt") if "age" in model.states else ()
+    if model.sink == "counts":
+        return (*lines("on_count += polarity", "off_count += 1 - polarity"), *aged, *model.outlet.emitted)
+    time, asked = _leave_pixel(model, share)
+    code = f"polarity * 4 + {label}" if model.sink == "labels" else "polarity"
+    kept = Line(model.outlet.emit.format(time=time, code=code))
+    return (*asked, kept, *aged, *model.outlet.emitted)
+
+
+def _unless_dead(model: PixelModel, share: str, label: str, *then: Statement) -> Statements:
+    """Return the emission of an event, and what follows from it, unless the pixel is dead."""
+    event = (*_event(model, share, label), *then)
+    if not model.of("gate"):
+        return event
+    return (*_dead_time(model, share), if_block("wait <= 0.0", *event))
+
+
+def _noise_event(model: PixelModel, effect: EffectStages) -> Statements:
+    """Return the noise event at `stop`; like any event it makes the pixel memorise the present signal."""
+    n = effect.name
+    polarity, noise = Draw(f"{n}_polarity", "uniform", effect), noise_key(effect)
+    is_on = f"uniform({polarity.key}, int({n}_events)) * ({n}_on + {n}_off) < {n}_on"
+    # only what leaves the pixel resets it: a dead pixel's noise changes nothing
+    then = (Line("moved = value"), *_memorise_leak(model), *thresholds_after_event(model))
+    slipped = "slipped = leaked_before + (leaked - leaked_before) * stop"
+    return (
+        Line("polarity = int(0)"),
+        Block(f"if {is_on}:", lines("polarity = 1"), draws=(polarity,)),
+        *(lines(slipped) if model.labelled else ()),
+        *_unless_dead(model, "stop", f"{effect.label:d}", *then),
+        Line(f"{n}_hazard += waiting({noise.key}, int({n}_events))", (noise,)),
+        count_on(f"{n}_events"),
+    )

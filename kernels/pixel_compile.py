@@ -7,8 +7,9 @@ from typing import Any
 
 import warp as wp
 
-from dase.kernels.pixel_codegen_cpu import Blocks
-from dase.kernels.pixel_codegen_cuda import Writer
+from dase.kernels.pixel_codegen_cpu import lane_scope, print_block_kernel
+from dase.kernels.pixel_codegen_cuda import print_pixel_kernel, print_threshold_kernel
+from dase.kernels.pixel_codegen_model import PixelModel, pixel_scope
 from dase.kernels.pixel_stages import EffectStages
 from dase.kernels.vector_math import function_from_text
 
@@ -24,22 +25,19 @@ def compose_pixels(stages: tuple[EffectStages, ...], source: str, sink: str, *, 
         lanes: Pixels per thread on the CPU; 0 for CUDA, where a thread has one.
 
     Returns:
-        A kernel over (B, N) threads, or (B, blocks of pixels); `Writer.kernel` writes its arguments.
+        A kernel over (B, N) threads, or (B, blocks of pixels); `kernel_head` of
+        `dase.kernels.pixel_codegen_cuda` names its arguments.
     """
-    writer = writer_of(stages, source, sink, lanes)
-    return compile_text(writer.kernel(), "pixel_events", writer.scope)
-
-
-def writer_of(stages: tuple[EffectStages, ...], source: str, sink: str, lanes: int) -> Writer:
-    """Return what writes the kernel that `compose_pixels` compiles."""
-    return Blocks(stages, source, sink, lanes=lanes) if lanes else Writer(stages, source, sink, cuda=True)
+    scope = pixel_scope(PixelModel(stages, source, sink))
+    scope |= lane_scope(lanes, source) if lanes else {}
+    return compile_text(source_text(stages, source, sink, lanes=lanes), "pixel_events", scope)
 
 
 @lru_cache(maxsize=256)
 def compose_thresholds(stages: tuple[EffectStages, ...]) -> wp.Kernel:
     """Return a kernel over (B, N) threads that writes the thresholds of every pixel."""
-    writer = Writer(stages, "frames", "counts", cuda=True)
-    return compile_text(writer.thresholds(), "pixel_thresholds", writer.scope)
+    scope = pixel_scope(PixelModel(stages, "frames", "counts"))
+    return compile_text(thresholds_text(stages), "pixel_thresholds", scope)
 
 
 def compile_text(text: str, name: str, scope: dict[str, Any], **more: Any) -> wp.Kernel:
@@ -55,4 +53,10 @@ def compile_text(text: str, name: str, scope: dict[str, Any], **more: Any) -> wp
 
 def source_text(stages: tuple[EffectStages, ...], source: str, sink: str, *, lanes: int = 0) -> str:
     """Return the text of the kernel that `compose_pixels` compiles."""
-    return writer_of(stages, source, sink, lanes).kernel()
+    model = PixelModel(stages, source, sink)
+    return print_block_kernel(model, lanes) if lanes else print_pixel_kernel(model)
+
+
+def thresholds_text(stages: tuple[EffectStages, ...]) -> str:
+    """Return the text of the kernel that `compose_thresholds` compiles."""
+    return print_threshold_kernel(PixelModel(stages, "frames", "counts"))

@@ -28,6 +28,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from enum import IntEnum
 from typing import Any
 
 import warp as wp
@@ -35,13 +36,19 @@ import warp as wp
 from dase.kernels.scene_layers import Frames as Frames
 
 REST = 1e30
-"""Duration of the rest before the first sample [s]: filters start settled."""
+"""Duration of the step that ends at the first sample [s], so that filters start settled."""
 
 LATEST = 1.0
 """Longest time from a crossing to its event's leaving the pixel [s]."""
 
-SIGNAL, LEAK, SHOT = 0, 1, 2
-"""Labels of events: places in `dase.events.LABELS`."""
+
+class Label(IntEnum):
+    """What events come from, as the change detector knows it: places in `dase.events.LABELS`."""
+
+    SIGNAL = 0
+    LEAK = 1
+    SHOT = 2
+
 
 STAGES = ("light", "respond", "threshold", "redraw", "drift", "noise", "gate", "delay")
 CORE = ("on", "off", "phase", "log_eps")
@@ -83,7 +90,7 @@ class EffectStages:
     parameters: tuple[str, ...] = ()
     states: tuple[str, ...] = ()
     delays: bool = False
-    label: int = SHOT
+    label: int = Label.SHOT
     off: tuple[tuple[str, float], ...] = ()
     maps: tuple[str, ...] = ()
 

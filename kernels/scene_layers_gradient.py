@@ -67,7 +67,7 @@ def spread_layer(
     slot: int,
     texel_gradient_out: wp.array2d[wp.vec2],
 ) -> wp.vec2:
-    """Do `spread_gradient` where `background_at` or `foreground_at` looked; return the gradient by `at` [1/texel]."""
+    """Spread a gradient where a look at a layer took its texels; return the gradient by `at` [1/texel]."""
     size = layers.size[layer]
     if layer > 0:
         if at[0] <= -1.0 or at[1] <= -1.0 or at[0] >= float(size[0]) or at[1] >= float(size[1]):

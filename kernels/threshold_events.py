@@ -15,7 +15,16 @@ from dase.kernels.scene_layers import BackgroundGeometry, background_geometry
 from dase.kernels.threshold_counts import SOURCES, block_functions, log_light_of
 from dase.kernels.vector_math import lane_functions, lane_type, native_function
 
-APPEND = """
+
+@lru_cache(maxsize=8)
+def _append_function(lanes: int) -> Any:
+    """Return the function that appends the events of one step of `lanes` pixels."""
+    arguments = (
+        "events: Lanes, change: Lanes, signal: Lanes, reference: Lanes, on: Lanes, off: Lanes, "
+        "begin: wp.int64, length: float, keys: wp.array3d[wp.int64], used: wp.array2d[int], "
+        "row: int, n: int, size: int, shift: int, bits: int, low: int, from_lane: int"
+    )
+    text = """
 typedef float V __attribute__((ext_vector_type({length})));
 V all;
 __builtin_memcpy(&all, &events, sizeof(V));
@@ -46,18 +55,8 @@ while (busy) {{
     }}
 }}
 """
-
-
-@lru_cache(maxsize=8)
-def _append_function(lanes: int) -> Any:
-    """Return the function that appends the events of one step of `lanes` pixels."""
-    arguments = (
-        "events: Lanes, change: Lanes, signal: Lanes, reference: Lanes, on: Lanes, off: Lanes, "
-        "begin: wp.int64, length: float, keys: wp.array3d[wp.int64], used: wp.array2d[int], "
-        "row: int, n: int, size: int, shift: int, bits: int, low: int, from_lane: int"
-    )
     mask = "unsigned short" if lanes == 16 else "unsigned char"
-    snippet = APPEND.format(length=lanes, mask=mask).replace("from;", "from_lane;")
+    snippet = text.format(length=lanes, mask=mask).replace("from;", "from_lane;")
     return native_function(f"append_{lanes}", snippet, {"Lanes": lane_type(lanes)}, arguments, "None")
 
 

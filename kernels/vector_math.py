@@ -22,7 +22,15 @@ import warp as wp
 
 from dase.kernels.scene_layers import Affine
 
-AT_ONCE = """
+
+class _Cpp:
+    """The C++ of lanewise functions: two wrappers, and bodies that set `result` in terms of `V` and `I`.
+
+    `V` and `I` are floats and integers of all lanes (`at_once`), or of one (`one_by_one`), so that every
+    expression is written once. Braces are doubled where the text goes through `str.format`.
+    """
+
+    at_once = """
 typedef float V __attribute__((ext_vector_type({length})));
 typedef int I __attribute__((ext_vector_type({length})));
 auto FLOOR = [](V a) {{ return __builtin_elementwise_floor(a); }};
@@ -33,6 +41,7 @@ auto WHOLE = [](V a) {{ return __builtin_convertvector(a, I); }};
 auto FLOAT = [](I a) {{ return __builtin_convertvector(a, V); }};
 auto AT = [](const float* a, I i) {{ V v; for (int l = 0; l < {length}; ++l) v[l] = a[i[l]]; return v; }};
 auto PAIR = [](const float* a, I i, V& right) {{
+    // two neighbours in one load of 8 bytes, as many as a double has; then even and odd ones are parted
     typedef double D __attribute__((ext_vector_type({length})));
     D both;
     for (int l = 0; l < {length}; ++l) {{
@@ -45,6 +54,7 @@ auto PAIR = [](const float* a, I i, V& right) {{
     right = flat.odd;
     return (V)flat.even;
 }};
+// a comparison of vectors is -1 in lanes where it holds
 auto ANY = [](I a) {{ return __builtin_reduce_or(a) != 0; }};
 auto HIGHEST = [](unsigned a) {{ return 31 - __builtin_clz(a); }};
 auto IN = [](const wp::vec_t<{length}, float>& a) {{ V v; __builtin_memcpy(&v, &a, sizeof(V)); return v; }};
@@ -54,9 +64,9 @@ wp::vec_t<{length}, float> result_out;
 __builtin_memcpy(&result_out, &result, sizeof(V));
 return result_out;
 """
-"""What a C++ expression finds around it on the CPU; `auto` spares a second version for integers."""
+    """What a C++ expression finds around it on the CPU; `auto` spares a second version for integers."""
 
-ONE_BY_ONE = """
+    one_by_one = """
 typedef float V;
 typedef int I;
 #ifdef __CUDA_ARCH__
@@ -86,7 +96,7 @@ result_out[lane] = result;
 return result_out;
 """
 
-LOGARITHM = """
+    logarithm = """
 // mantissa in [sqrt(1/2), sqrt(2)), so that logarithms near 0 keep their digits
 I bits = __builtin_bit_cast(I, x);
 I exponent = (bits - 0x3f3504f3) >> 23;
@@ -103,9 +113,9 @@ V p = FMA(FMA(fourth, 7.0376836292e-2f, high), fourth, low);
 V tail = FMA(square, -0.5f, FMA(e, -2.12194440e-4f, p * (f * square)));
 V result = FMA(e, 0.693359375f, f + tail);
 """
-"""Natural logarithm of a normal number x > 0 (Moshier: Cephes Mathematical Library, logf, 1992)."""
+    """Natural logarithm of a normal number x > 0 (Moshier: Cephes Mathematical Library, logf, 1992)."""
 
-EXPONENTIAL = """
+    exponential = """
 // x = n log(2) + f, |f| <= log(2) / 2
 V n = FLOOR(FMA(LESSER(x, V(88.0f)), 1.44269504088896341f, 0.5f));
 V f = FMA(n, 2.12194440e-4f, FMA(n, -0.693359375f, x));
@@ -116,23 +126,24 @@ V p = FMA(high, square, low);
 V power = __builtin_bit_cast(V, (WHOLE(n) + 127) << 23);
 V result = x < -87.0f ? V(0.0f) : (FMA(p, square, f) + 1.0f) * power;
 """
-"""e to the x, 0 below e^-87, e^88 above it (Moshier: Cephes Mathematical Library, expf, 1992)."""
+    """e to the x, 0 below e^-87, e^88 above it (Moshier: Cephes Mathematical Library, expf, 1992)."""
 
-SIGNED_EVENTS = """
+    signed_events = """
 // the sum with 1.5 2^23 has no digits behind the point, so that near is the whole number nearest to the
 // quotient, however the inverse rounds; where its product goes beyond the change, the one before is meant
 V near = FMA(change, inverse, V(12582912.0f)) - 12582912.0f;
 V step = change < 0.0f ? V(-1.0f) : V(1.0f);
 V result = ABS(near * threshold) > ABS(change) ? near - step : near;
 """
-"""Events of a change, below 2^21 of them: a division, and a floor on a GPU, are slow."""
+    """Events of a change, below 2^21 of them: a division, and a floor on a GPU, are slow."""
 
-BACKGROUND = """
+    background = """
 // place times (x, y, 1), then reflected, as in dase.kernels.scene_layers.background_at
 V u = (x * place.data[0][0] + y * place.data[0][1]) + place.data[0][2];
 V v = (x * place.data[1][0] + y * place.data[1][1]) + place.data[1][2];
 u = ABS(u - FLOOR(u * inverse[0] + 0.5f) * (2.0f * last[0]));
 v = ABS(v - FLOOR(v * inverse[1] + 0.5f) * (2.0f * last[1]));
+// rounding may end just beyond the last texel
 u = u < last[0] ? u : V(last[0]);
 v = v < last[1] ? v : V(last[1]);
 I iu = LESSER(WHOLE(u), I(corner[0]));
@@ -148,7 +159,7 @@ bottom = bottom + fu * (right - bottom);
 V result = top + fv * (bottom - top);
 """
 
-FOREGROUND = """
+    foreground = """
 // as dase.kernels.scene_layers.in_front does, all pixels of the block layer by layer; no texel is no light
 V sum = x * 0.0f;
 V through = sum + 1.0f;
@@ -162,6 +173,7 @@ while (left != 0) {
     V u = (x * m.data[0][0] + y * m.data[0][1]) + m.data[0][2];
     V v = (x * m.data[1][0] + y * m.data[1][1]) + m.data[1][2];
     I inside = (u > -1.0f) & (v > -1.0f) & (u < (float)width) & (v < (float)height);
+    // a layer covers few blocks; lanes outside look at texel 0 and leave what they find
     if (!ANY(inside)) continue;
     u = inside ? u : V(0.0f);
     v = inside ? v : V(0.0f);
@@ -182,6 +194,7 @@ while (left != 0) {
         opacity = ok ? opacity : V(0.0f);
         return ok ? value : V(0.0f);
     };
+    // bilinear between four texels, of which those outside are transparent: so edges are one texel wide
     V alpha, next, low, low_next;
     V color = LOOK(west & north, at, alpha);
     color = color + fu * (LOOK(east & north, at + 2, next) - color);
@@ -193,12 +206,13 @@ while (left != 0) {
     alpha = alpha + fv * (low - alpha);
     sum = sum + through * color;
     through = through * (1.0f - alpha);
+    // nothing behind an opaque layer is seen
     if (!ANY(through != 0.0f)) break;
 }
 V result = sum + through * light;
 """
 
-LOAD = """
+    load = """
 const float* from = &wp::index(values, k, n);
 #ifdef __CUDA_ARCH__
 if ({length} == 4 && ((size_t)from & 15) == 0) {{
@@ -211,7 +225,7 @@ for (int lane = 0; lane < {length}; ++lane) result[lane] = from[lane];
 return result;
 """
 
-LOAD_FOUR = """
+    load_four = """
 #ifdef __CUDA_ARCH__
 if ({length} == 4) {{
     const float4 q = __ldg(reinterpret_cast<const float4*>(&wp::index(values, k, n)));
@@ -219,9 +233,9 @@ if ({length} == 4) {{
 }}
 #endif
 """
-"""Before `LOAD` where all addresses are multiples of 16: to ask keeps samples from overlapping."""
+    """Before `load` where all addresses are multiples of 16: to ask keeps samples from overlapping."""
 
-STORE = """
+    store = """
 auto* to = values.data + n;
 #ifdef __CUDA_ARCH__
 if ({length} == 4 && ((size_t)to & 15) == 0) {{
@@ -273,13 +287,13 @@ def _lanewise_function(
     """
     names = lanes.split()
     inputs = "\n".join(f"V {n} = {n}_in[lane];" for n in names)
-    gpu = ONE_BY_ONE.format(length=length, body=cuda or body, inputs=inputs)
+    gpu = _Cpp.one_by_one.format(length=length, body=cuda or body, inputs=inputs)
     if length > 1:
         inputs = "\n".join(f"V {n} = IN({n}_in);" for n in names)
-        cpu = AT_ONCE.format(length=length, body=body, inputs=inputs)
+        cpu = _Cpp.at_once.format(length=length, body=body, inputs=inputs)
     else:
         # plain numbers, so that loops which call the function can become vectors
-        cpu = ONE_BY_ONE.format(length=1, body=body, inputs=inputs)
+        cpu = _Cpp.one_by_one.format(length=1, body=body, inputs=inputs)
     arguments = ", ".join([*(f"{n}_in: Lanes" for n in names), *([others] if others else [])])
     snippet = f"#ifdef __CUDA_ARCH__\n{gpu}\n#else\n{cpu}\n#endif\n"
     scope = {"Affine": Affine, "Lanes": lane_type(length)}
@@ -308,10 +322,10 @@ def lane_functions(length: int) -> SimpleNamespace:
     ground = "grey: wp.array[float], place: Affine, last: wp.vec2, corner: wp.vec2i, step: wp.vec2i"
     return SimpleNamespace(
         Lanes=scope["Lanes"],
-        load=plain("load", LOAD, rows, "Lanes"),
-        load_aligned=plain("load_aligned", LOAD_FOUR + LOAD, rows, "Lanes"),
-        store=plain("store", STORE, "values: wp.array[float], n: int, lanes: Lanes", "None"),
-        store_whole=plain("store_whole", STORE, "values: wp.array[int], n: int, lanes: Lanes", "None"),
+        load=plain("load", _Cpp.load, rows, "Lanes"),
+        load_aligned=plain("load_aligned", _Cpp.load_four + _Cpp.load, rows, "Lanes"),
+        store=plain("store", _Cpp.store, "values: wp.array[float], n: int, lanes: Lanes", "None"),
+        store_whole=plain("store_whole", _Cpp.store, "values: wp.array[int], n: int, lanes: Lanes", "None"),
         minus=lanewise("minus", "V result = a - b;", "a b"),
         plus=lanewise("plus", "V result = a + b;", "a b"),
         plus_abs=lanewise("plus_abs", "V result = a + ABS(b);", "a b"),
@@ -320,18 +334,18 @@ def lane_functions(length: int) -> SimpleNamespace:
         inverse=lanewise("inverse", "V result = 1.0f / a;", "a"),
         chosen=lanewise("chosen", "V result = change >= 0.0f ? on : off;", "change on off"),
         advanced=lanewise("advanced", "V result = a + n * step;", "a n step"),
-        signed_events=lanewise("signed_events", SIGNED_EVENTS, "change threshold inverse"),
+        signed_events=lanewise("signed_events", _Cpp.signed_events, "change threshold inverse"),
         logarithm=lanewise(
             "logarithm",
-            "V x = a + eps;" + LOGARITHM,
+            "V x = a + eps;" + _Cpp.logarithm,
             "a",
             "eps: float",
             cuda="V result = __logf(a + eps);",
         ),
-        natural=lanewise("natural", "V x = a;" + LOGARITHM, "a", cuda="V result = logf(a);"),
-        exponential=lanewise("exponential", EXPONENTIAL, "x", cuda="V result = expf(x);"),
-        foreground=lanewise("foreground", FOREGROUND, "light x y", layers),
-        background=lanewise("background", BACKGROUND, "x y", f"{ground}, inverse: wp.vec2, width: int"),
+        natural=lanewise("natural", "V x = a;" + _Cpp.logarithm, "a", cuda="V result = logf(a);"),
+        exponential=lanewise("exponential", _Cpp.exponential, "x", cuda="V result = expf(x);"),
+        foreground=lanewise("foreground", _Cpp.foreground, "light x y", layers),
+        background=lanewise("background", _Cpp.background, "x y", f"{ground}, inverse: wp.vec2, width: int"),
     )
 
 
@@ -354,12 +368,14 @@ def logarithm(x: float) -> float:
 @wp.func
 def cosine_and_sine(turn: float):
     """Cosine and sine of `turn` in [0, 1] turns, within 4e-7: a fifth of the time of the library's."""
+    # the nearest quarter turn, and what is left: at most half a quarter
     quarter = int(4.0 * turn + 0.5)
     f = 4.0 * turn - float(quarter)
     g = f * f
     # Taylor series in quarter turns, |f| <= 1/2
     x = 1.0 + g * (-1.23370055 + g * (0.253669508 + g * (-0.0208634807 + g * 0.000919260274)))
     y = f * (1.57079633 + g * (-0.645964098 + g * (0.0796926262 + g * (-0.00468175414 + g * 0.000160441185))))
+    # odd quarters swap the two, and two of four turn a sign; no table, no branch
     odd = (quarter & 1) != 0
     cosine = wp.where(odd, y, x)
     sine = wp.where(odd, x, y)

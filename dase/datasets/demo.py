@@ -12,12 +12,12 @@ from dase.figures import event_images
 from dase.simulation.sensor_file import dump_sensor, load_sensor
 
 
-def run_demo(out: Path, *, backend: str = "cpu", say: Callable[[str], object] = print) -> tuple[Path, Path]:
+def run_demo(out: Path, *, device: str = "cpu", say: Callable[[str], object] = print) -> tuple[Path, Path]:
     """Simulate one second of photographs before a DAVIS346 and draw it.
 
     Args:
         out: Folder, replaced if it holds an earlier demo.
-        backend: `cpu` or `cuda`.
+        device: `cpu` or `cuda`.
         say: Takes lines meant for the user.
 
     Returns:
@@ -36,7 +36,7 @@ def run_demo(out: Path, *, backend: str = "cpu", say: Callable[[str], object] = 
         duration=1.0,
         regime="medium",
         seed=1,
-        backend=backend,
+        backend=device,
     )
     say("Simulating 1 s of a DAVIS346 before moving photographs (the first run compiles the kernels) ...")
     report = generate.generate_dataset(job, out)

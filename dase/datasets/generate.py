@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 import tomlkit
+from numpy.typing import NDArray
 
 from dase import io
 from dase.datasets.interrupt import DeferredInterrupt, defer_interrupt, ignore_interrupt
@@ -24,10 +25,9 @@ from dase.scenes import image_sources, random_scenes
 from dase.scenes.layers import LayerScene
 from dase.scenes.scene import Scene
 from dase.simulation.pixel_array import PixelArray
-from dase.simulation.readout_chain import ReadoutChain
 from dase.simulation.sensor import Sensor
 from dase.simulation.sensor_file import dump_sensor, parse_sensor
-from dase.simulation.simulate import CHUNK, chunks, sample_times
+from dase.simulation.sensor_run import SensorRun
 from dase.simulation.user_effects import known_effects
 from dase.text_files import read_text_file
 from dase.version import __version__
@@ -154,6 +154,7 @@ def generate_dataset(
     if jobs < 1:
         raise InputError(f"jobs must be >= 1, got {jobs}")
     begin = time.perf_counter()
+    # what cannot work is refused before the folder is made or a process started
     image_sources.open_images(job.images)
     PixelArray(_sensor_of(job), 1, 1, device=job.backend)
     todo = _prepare_folder(job, out, resume)
@@ -174,10 +175,12 @@ def _prepare_folder(job: DatasetJob, out: Path, resume: bool) -> list[int]:
         raise InputError(f"{out} must be a folder, but it is a file")
     if record.exists():
         if not resume:
-            raise InputError(f"{out} already holds a data set; give --resume to finish it, or another folder")
+            raise InputError(
+                f"{out} already holds a data set; resume it, or give another folder", argument="resume"
+            )
         if read_text_file(record, "the record", 1 << 24) != job.text():
             raise InputError(
-                f"{out} was begun with other options (see {record}); --resume needs the same ones"
+                f"{out} was begun with other options (see {record}); to resume takes the same ones"
             )
     out.mkdir(parents=True, exist_ok=True)
     for stale in out.glob(".sequence_*.tmp.*"):  # of a run that was killed
@@ -203,11 +206,13 @@ def _make_sequences(
         with ignore_interrupt():
             left = {pool.submit(_in_worker, job, out, index) for index in todo}
         while left:
+            # not longer, so that Ctrl-C is obeyed at once although nothing finishes
             done, left = wait(left, timeout=0.1, return_when=FIRST_COMPLETED)
             for future in done:
                 yield future.result()
             interrupt.check()
     finally:
+        # workers end at their next chunk and leave no half-written file behind
         if left:
             stop.set()
         pool.shutdown(cancel_futures=True)
@@ -218,15 +223,16 @@ def _warm_up(job: DatasetJob) -> None:
     scene = random_scenes.draw_scene(
         np.random.default_rng(0), source, "background", width=8, height=8, duration=0.02
     )
-    array = PixelArray(_sensor_of(job), 8, 8, device=job.backend, labels=job.labels)
-    ReadoutChain(array.sensor, 8, 8).push(array.emit(scene, scene.sample_times())[0], array.begin)
+    run = SensorRun(scene, _sensor_of(job), device=job.backend, labels=job.labels)
+    run.events()
     scene.frames(np.zeros(1), job.backend)
     scene.flow(np.zeros(1), job.backend)
-    array.thresholds()
+    run.thresholds()
 
 
 def _begin_worker(stop: Any) -> None:
     global _stop
+    # the processes share the cores already; threads of each would compete for them
     launch.set_threads(1)
     _stop = DeferredInterrupt(stop)
 
@@ -270,40 +276,43 @@ def make_sequence(job: DatasetJob, out: Path, index: int, interrupt: DeferredInt
     scene = make_scene(job, index)
     # sequences share neither scene nor pixels' random numbers
     seed = int(np.random.default_rng([job.seed, index, 1]).integers(2**31))
-    array = PixelArray(sensor, job.width, job.height, seed=seed, device=job.backend, labels=job.labels)
+    run = SensorRun(scene, sensor, seed=seed, device=job.backend, labels=job.labels)
     with io.create(job.path(out, index)) as writer:
         writer.configuration(job.text() + f"\n[sequence]\nindex = {index}\nsensor_seed = {seed}\n")
         frame_times = np.arange(0, scene.duration, 1 / job.frame_rate)
-        report = _record_into(scene, array, writer, frame_times, lambda done: interrupt.check())
+        report = _record_into(writer, run, frame_times, lambda done: interrupt.check())
     return replace(report, seconds=time.perf_counter() - begin)
 
 
 def _record_into(
-    scene: Scene,
-    array: PixelArray,
     writer: io.Writer,
-    frame_times: np.ndarray,
+    run: SensorRun,
+    frame_times: NDArray[np.float64],
     progress: Callable[[WorkReport], None],
 ) -> WorkReport:
-    """Write thresholds, frames, flow and events of a scene, in order of time."""
-    outlet = ReadoutChain(array.sensor, scene.width, scene.height, seed=array.seed)
-    array.look_at(scene)
-    writer.thresholds(array.thresholds()[0].reshape(2, scene.height, scene.width))
-    times = sample_times(scene, array.sensor)
+    """Write thresholds, frames, flow and events of a run, in order of time.
+
+    Args:
+        writer: Of the file.
+        run: Sensor and scene.
+        frame_times: When to store frames and flow [s], increasing, shape (F,).
+        progress: Called with the report of each finished chunk.
+    """
+    scene, array = run.scene, run.pixel_array
+    writer.thresholds(run.thresholds()[0].reshape(2, scene.height, scene.width))
     total, shown = WorkReport(sequences=1), 0
-    for part in chunks(times, CHUNK["cuda" if array.device.is_cuda else "cpu"]):
-        due = int(np.searchsorted(frame_times, part[-1], side="right"))
+    for chunk in run.chunks():
+        (events,), samples = chunk.events, len(chunk.times)
+        # frames go before the events of their chunk, so that readers of the file meet both in order of time
+        due = int(np.searchsorted(frame_times, chunk.times[-1], side="right")) if samples else shown
         if due > shown:
             _write_frames(scene, writer, frame_times[shown:due], array.device.alias)
             shown = due
-        events = outlet.push(array.emit(scene, part)[0], array.begin)
         writer.events(events)
-        done = WorkReport(0, len(events), len(part), len(part) * array.count)
+        done = WorkReport(0, len(events), samples, samples * array.count)
         total = total.plus(done)
-        progress(done)
-    for events in (outlet.push(array.flush()[0], array.begin), outlet.flush()):
-        writer.events(events)
-        total = total.plus(WorkReport(0, len(events)))
+        if samples:  # what comes behind the last sample is no work of its own
+            progress(done)
     return total
 
 
@@ -343,15 +352,17 @@ def record_scene(
     times = scene.sample_times()
     # the first sample of each frame period; a slack of 1e-6 of it keeps equal rates equal
     period = np.floor((times - times[0]) * frame_rate + 1e-6)
+    # samples themselves, as a scene of frames is not known between them
     frame_times = times[np.concatenate([[True], np.diff(period) > 0])]
-    array = PixelArray(sensor, scene.width, scene.height, seed=seed, device=device, labels=labels)
+    run = SensorRun(scene, sensor, seed=seed, device=device, labels=labels)
     with defer_interrupt() as interrupt, io.create(path) as writer:
 
         def advance(done: WorkReport) -> None:
             interrupt.check()
             progress(done)
 
+        # its history says how the sensor came to be, which no event depends on
         model = dump_sensor(replace(sensor, history=()))
         writer.configuration(model + f'\n[run]\ndase = "{__version__}"\nseed = {seed}\n')
-        report = _record_into(scene, array, writer, frame_times, advance)
+        report = _record_into(writer, run, frame_times, advance)
     return replace(report, seconds=time.perf_counter() - begin)

@@ -3,27 +3,30 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from os import PathLike
 
-from dase.diagnosis.candidates import screen_and_descend
+from dase.diagnosis.candidates import calibrate_split, screen_and_descend
+from dase.diagnosis.settings import DEFAULTS
 from dase.effects import Effect
-from dase.events import Events
-from dase.fitting.data_split import PIXELS, split_measurement
+from dase.fitting.data_split import SPLIT, split_measurement
 from dase.fitting.fit import fit
+from dase.fitting.measurement import Measured, SceneChoice, as_measurement
 from dase.fitting.model import fit_present_model
+from dase.probes.random_streams import SimulationStream
 from dase.probes.stimulus import Trust
 from dase.results import Fit
-from dase.scenes.scene import Scene
 from dase.simulation.sensor import Sensor
+from dase.simulation.sensor_file import as_sensor
 
 
 def fit_added(
-    events: Events,
-    scene: Scene,
-    sensor: Sensor,
+    measured: Measured,
+    sensor: Sensor | str | PathLike[str],
     effect: Effect,
     *,
+    scene: SceneChoice | None = None,
     trust: Trust | None = None,
-    pixels: int = PIXELS,
+    pixels: int = SPLIT.pixels,
     seed: int = 0,
     device: str = "cpu",
     progress: Callable[[str, float, float], None] | None = None,
@@ -31,10 +34,11 @@ def fit_added(
     """Add an effect to a sensor and fit all its parameters to a measurement.
 
     Args:
-        events: What was measured.
-        scene: What the camera saw, on the clock of the events.
-        sensor: Without the effect.
+        measured: A recording or its path, a `Measurement`, or events; see `as_measurement`.
+        sensor: Without the effect; a sensor, a preset's name, or the path of a sensor file.
         effect: Its values are where the search begins, among others.
+        scene: What the camera saw, on the clock of the events: a scene, a clip's path, or `static` for light
+            that does not change. None for the frames of the recording; events alone need one.
         trust: Where and when the scene is to be trusted; None for everywhere, and for what a
             `CameraScene` trusts of itself.
         pixels: In each half of the measurement.
@@ -46,18 +50,23 @@ def fit_added(
         Held-out error of the sensor without the effect, fitted as well as it can be, and the fit with it.
     """
     tell = progress or (lambda text, share, error: None)
-    sensor, effect = sensor.bound_to(scene), effect.bound_to(scene)
+    without = as_sensor(sensor)
+    measurement = as_measurement(measured, scene, trust)
+    without, effect = without.bound_to(measurement.scene), effect.bound_to(measurement.scene)
     evidence = split_measurement(
-        events, scene, log_eps=sensor.log_eps, trust=trust, pixels=pixels, seed=seed, device=device
-    )
+        measurement.events, measurement.scene, log_eps=without.log_eps, trust=measurement.trust,
+        pixels=pixels, seed=seed, device=device,
+    )  # fmt: skip
     tell("fitting without the effect", 0.0, float("nan"))
-    present = fit_present_model(evidence, sensor, None, seed=seed)
-    before = present.judge(evidence.held, repeats=30, seed=seed + 500).error
+    present = fit_present_model(evidence, without, None, seed=seed)
+    before = present.judge(
+        evidence.held, repeats=DEFAULTS.repeats // 2, seed=SimulationStream.JUDGE.seed(seed)
+    ).error
     tell(f"where to begin with {effect.name}", 0.1, before)
     # far from where it is, a descent could end in the wrong place
-    present.rebase(evidence.scout, repeats=16, seed=seed + 200)
-    start = screen_and_descend(evidence, present, effect, seed=seed).model.sensor
-    fitted = fit(
-        events, scene, start, trust=trust, pixels=pixels, seed=seed, device=device, progress=progress
+    calibrated = calibrate_split(
+        evidence, present, repeats=DEFAULTS.repeats, scout_repeats=DEFAULTS.scout_repeats, seed=seed
     )
+    start = screen_and_descend(calibrated, present, effect, seed=seed).model.sensor
+    fitted = fit(measurement, start, pixels=pixels, seed=seed, device=device, progress=progress)
     return before, fitted

@@ -3,80 +3,32 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
+from dase.diagnosis.settings import DEFAULTS, CandidateSettings
 from dase.effects.base import Effect
-from dase.effects.flicker import Flicker
 from dase.effects.optics import SceneEffect
-from dase.effects.readout import Readout
-from dase.effects.row_scan import RowScan
-from dase.effects.timestamp import Timestamp
-from dase.fitting.data_split import SplitMeasurement
+from dase.effects.threshold import Threshold
+from dase.fitting.data_split import CalibratedSplit, SplitMeasurement
 from dase.fitting.descent import StopRule, descent_work, ranking_work
 from dase.fitting.early_stopping import CandidateRace
 from dase.fitting.model import (
-    SETTLED,
     FittedModel,
+    calibration_while_fitting,
     refit_work,
+    shift_periodic_effects,
     starting_places,
     with_effect_added,
-    with_lamp_shifted,
 )
-from dase.fitting.parameter_space import effect_variants
 from dase.fitting.scheduler import SimulationRequest, Work, run_side_by_side, run_work, side_by_side_work
-from dase.fitting.subset import PixelSubset
+from dase.fitting.subset import CalibratedSubset
 from dase.probes.distance import ErrorScale, Judgement
+from dase.probes.random_streams import SimulationStream
 
 Array = NDArray[np.float64]
-
-FINALISTS = 4
-"""Candidates that are fitted to all pixels of the training half."""
-
-FOLLOWED = 8
-"""Candidates that are followed where a look shows one clearly ahead: the turn of the others comes. Of those
-whose events go through a readout, which takes ten times as long, no more are ever followed."""
-
-CLEAR = 0.6
-"""Loss of such a one, relative to that of the present model."""
-
-SECOND = 1.25
-"""A second start is followed where its loss is below this, relative to the first."""
-
-BEHIND = 1.5
-"""A finalist goes on where its error before the last fit is at most this times the best's, and `CLOSE`."""
-
-CLOSE = 1.0
-"""Such an error that is added to the limit, for errors near the floor say little."""
-
-LOSES = 1.6
-"""A finalist is fitted no further where its loss will not come below this, relative to that of the best."""
-
-GIVES_UP = 2.0
-"""The same before each finalist has sampling errors of its own, by which it may look better."""
-
-AGAIN = 2
-"""Times at most that a finalist is fitted further whose training loss is least but not its held-out error."""
-
-FAR = 3.0
-"""A finalist whose error before the last fit is above this is judged by `FEW` simulations."""
-
-FEW = 12
-"""Simulations by which models are judged that are far from the floor."""
-
-SURELY = 0.8
-"""Its training loss, relative to that of the finalist with the least held-out error."""
-
-IDLE = 0.01
-"""Share of what a bus can send below which it is no candidate: it would lose less than that."""
-
-REPEATS = 30
-"""Simulations with other seeds by which a finalist is judged."""
-
-SIGNIFICANT = 0.05
-"""Largest p-value of an effect that is added; 1 / (repeats + 1) is the smallest there is."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,27 +38,27 @@ class Candidate:
     Args:
         name: Of the effect, names joined by ` + ` for a pair.
         model: With the effect, fitted.
-        fit: Its loss where it was fitted.
-        scouted: Its loss on some of the pixels, relative to that of the present model.
-        families: The same by family.
-        judged: Its error on the held-out half; None where it was not looked at.
+        training_loss: Its loss where it was fitted.
+        screened_loss: Its loss on some of the pixels, relative to that of the present model.
+        family_losses: The same by family.
+        judgement: Its error on the held-out half; None where it was only screened.
         bank: Statistics of all that was tried on the training half, shape (M, J).
         p_value: Of the fall of the loss where it was fitted; 1 where it was only screened.
     """
 
     name: str
     model: FittedModel
-    fit: float
+    training_loss: float
     screened_loss: float = float("nan")
-    families: Mapping[str, float] = field(default_factory=dict)
-    judged: Judgement | None = None
+    family_losses: Mapping[str, float] = field(default_factory=dict)
+    judgement: Judgement | None = None
     bank: Array | None = None
     p_value: float = 1.0
 
     @property
     def error(self) -> float:
         """The held-out error, NaN where it was only screened."""
-        return self.judged.error if self.judged else float("nan")
+        return self.judgement.error if self.judgement else float("nan")
 
 
 StepProgress = Callable[[str, float], None]
@@ -119,48 +71,41 @@ def effects_to_try(effects: Mapping[str, type[Effect]], present: FittedModel) ->
     # what acts on whole pictures has no place in a parameter vector; what a network has to learn first
     # cannot be tried
     known = [n for n, e in effects.items() if not issubclass(e, SceneEffect) and not e.maps]
-    return [n for n in known if n not in sensor or (sensor[n].is_off() and n != "threshold")]
+    return [
+        n for n in known if n not in sensor or (sensor[n].is_off() and not isinstance(sensor[n], Threshold))
+    ]
 
 
-def variants_to_try(evidence: SplitMeasurement, effect: type[Effect]) -> list[Effect]:
+def variants_to_try(
+    evidence: SplitMeasurement, effect: type[Effect], *, idle_bus: float = DEFAULTS.candidates.idle_bus
+) -> list[Effect]:
     """Return the variants of an effect that are tried, with what can be read off the measurement set.
 
     No descent finds the frequency of a lamp or the ticks of a clock, but they can be seen, as can the rate of
     a bus where it is full. Where no regularity is seen in the time stamps, the effects that make one are not
     tried; nor is a bus that is known to be free nearly always.
+
+    Args:
+        evidence: The measurement.
+        effect: The class.
+        idle_bus: Share of what a bus can send below which a readout is no candidate.
     """
-    structure = evidence.structure
-    if effect is Flicker:
-        return [Flicker(frequency=evidence.peak)]
-    if effect is Timestamp:
-        return [Timestamp(step=structure.step, jitter=0.0)] if structure.step else []
-    if effect is RowScan:
-        return [RowScan(line=structure.line, direction=structure.direction)] if structure.line else []
-    if effect is Readout:
-        if evidence.highest_event_rate < IDLE * evidence.least_bus_rate:
-            return []
-        # events come as fast as the bus can send them, if it ever was full
-        return [
-            replace(e, rate=evidence.highest_event_rate)
-            for e in effect_variants(effect)
-            if isinstance(e, Readout)
-        ]
-    return effect_variants(effect)
+    return list(effect.candidates(evidence.observe(idle_bus=idle_bus)))
 
 
 def acts_on_few_pixels(effect: Effect) -> bool:
-    """Whether an effect acts on a share of the pixels: a few hundred of them do not show it."""
-    return any(p.name == "share" for p in effect.parameters())
+    """Whether an effect acts on so few pixels that some hundred of them do not show it."""
+    return effect.rare
 
 
 @dataclass(frozen=True, eq=False)
 class Screening:
-    """Many places at which an effect was tried.
+    """An effect at many places of its parameters, before any descent.
 
     Args:
         effect: What was tried.
         model: The present one with it.
-        half: Where.
+        half: Pixels and time on which it was tried.
         before: Statistics of the present model there, shape (J,).
         places: In order of their loss, shape (M, P).
         losses: Shape (M,).
@@ -168,31 +113,53 @@ class Screening:
 
     effect: Effect
     model: FittedModel
-    half: PixelSubset
+    half: CalibratedSubset
     before: Array
     places: Array
     losses: Array
 
     @property
-    def share(self) -> float:
-        """The least loss relative to that of the present model."""
-        return float(self.losses[0]) / self.present
+    def relative_loss(self) -> float:
+        """The least loss, in units of that of the present model."""
+        return float(self.losses[0]) / self.present_loss
 
     @property
-    def present(self) -> float:
+    def present_loss(self) -> float:
         """Loss of the present model."""
         return float(self.half.scale.loss(self.before))
 
-    def found(self, place: Array, loss: float) -> Candidate:
-        """Return the candidate at a place."""
+    def candidate_at(self, place: Array, loss: float) -> Candidate:
+        """Return the candidate at a place, shape (P,), of which the loss is known."""
         model = replace(self.model, place=place, loss=loss)
-        return Candidate(self.effect.name, model, loss, loss / self.present)
+        return Candidate(self.effect.name, model, loss, loss / self.present_loss)
+
+
+def calibrate_split(
+    evidence: SplitMeasurement, present: FittedModel, *, repeats: int, scout_repeats: int, seed: int
+) -> CalibratedSplit:
+    """Return a measurement with a model as the present one of its training half and its scout.
+
+    Args:
+        evidence: The measurement.
+        present: The model.
+        repeats: Simulations of it on the training half.
+        scout_repeats: The same on the scout.
+        seed: Of every random number.
+    """
+    train = present.calibrate(
+        evidence.train, repeats=repeats, seed=SimulationStream.CALIBRATE_PRESENT.seed(seed)
+    )
+    scout = present.calibrate(
+        evidence.scout, repeats=scout_repeats, seed=SimulationStream.CALIBRATE_SCOUT.seed(seed)
+    )
+    rest = {f.name: getattr(evidence, f.name) for f in fields(evidence) if f.name not in ("train", "scout")}
+    return CalibratedSplit(train=train, scout=scout, **rest)
 
 
 def screen_effect(
-    evidence: SplitMeasurement, present: FittedModel, effect: Effect, *, seed: int
+    evidence: CalibratedSplit, present: FittedModel, effect: Effect, *, seed: int
 ) -> Work[Screening]:
-    """Look at an effect at many places, on some pixels, see `run_side_by_side`."""
+    """Run an effect at many places of its parameters, on some pixels, see `run_side_by_side`."""
     half = evidence.train if acts_on_few_pixels(effect) else evidence.scout
     model = with_effect_added(present, effect)
     (before,) = yield [SimulationRequest(half, present.space, present.place[None], seed)]
@@ -204,33 +171,40 @@ def screen_effect(
 
 
 def screen_and_descend(
-    evidence: SplitMeasurement, present: FittedModel, effect: Effect, *, seed: int
+    evidence: CalibratedSplit, present: FittedModel, effect: Effect, *, seed: int
 ) -> Candidate:
-    """Try one effect on some pixels: a look at many places, then a short descent from the best two."""
-    look = run_work(screen_effect(evidence, present, effect, seed=seed))
-    return run_work(descend_from_screening(look, CandidateRace(1), seed=seed))
+    """Try one effect on some pixels: many places, then a short descent from the best two."""
+    screening = run_work(screen_effect(evidence, present, effect, seed=seed))
+    return run_work(descend_from_screening(screening, CandidateRace(1), seed=seed))
 
 
-def worth_descending(looks: Sequence[Screening]) -> list[Screening]:
-    """Return those looks from which a descent is worth its time."""
+def worth_descending(
+    screenings: Sequence[Screening], settings: CandidateSettings = DEFAULTS.candidates
+) -> list[Screening]:
+    """Return those screenings from which a descent is worth its time."""
     best: dict[str, float] = {}
-    for look in looks:
-        best[look.effect.name] = min(look.share, best.get(look.effect.name, np.inf))
-    first = sorted(best.values())[:FOLLOWED]
-    clear = first[0] < CLEAR
+    for one in screenings:
+        name = one.effect.name
+        best[name] = min(one.relative_loss, best.get(name, np.inf))
+    first = sorted(best.values())[: settings.followed]
+    clear = first[0] < settings.clear_lead
     return [
-        look for look in looks
-        if look.share <= first[-1] or not (clear or look.half.streams(look.model.space))
+        one for one in screenings
+        if one.relative_loss <= first[-1] or not (clear or one.half.streams(one.model.space))
     ]  # fmt: skip
 
 
-def descend_from_screening(look: Screening, race: CandidateRace, *, seed: int) -> Work[Candidate]:
-    """Descend from the best two places of a look, see `run_side_by_side`."""
-    half, places, losses = look.half, look.places, look.losses
-    slow = half.slow(look.model.space) or acts_on_few_pixels(look.effect)
-    apart = np.flatnonzero((np.abs(places - places[0]).max(1) > 0.8) & (losses < SECOND * losses[0]))
-    name, unit, space = look.effect.name, look.present, look.model.space
-    begins = places[[0, *apart[: 0 if slow else 1]]]
+def descend_from_screening(
+    screening: Screening, race: CandidateRace, *, seed: int, settings: CandidateSettings = DEFAULTS.candidates
+) -> Work[Candidate]:
+    """Descend from the best two places of a screening, see `run_side_by_side`."""
+    half, places, losses = screening.half, screening.places, screening.losses
+    name, unit, space = screening.effect.name, screening.present_loss, screening.model.space
+    # one start is enough where a second takes too long
+    slow = half.slow(space) or acts_on_few_pixels(screening.effect)
+    elsewhere = np.abs(places - places[0]).max(1) > settings.apart
+    others = np.flatnonzero(elsewhere & (losses < settings.second_start * losses[0]))
+    begins = places[[0, *others[: 0 if slow else 1]]]
     ends = yield from side_by_side_work(
         [
             descent_work(half, space, begin, seed=seed, iterations=3, over=race.over(name, unit))
@@ -238,20 +212,20 @@ def descend_from_screening(look: Screening, race: CandidateRace, *, seed: int) -
         ]
     )
     best = min(ends, key=lambda found: found.loss)
-    was, now = half.scale.families(look.before), half.scale.families(best.values)
+    was, now = half.scale.families(screening.before), half.scale.families(best.values)
     return replace(
-        look.found(best.place, best.loss),
-        families={name: value / max(was[name], 1e-9) for name, value in now.items()},
+        screening.candidate_at(best.place, best.loss),
+        family_losses={name: value / max(was[name], 1e-9) for name, value in now.items()},
     )
 
 
 def refine_candidate(
-    evidence: SplitMeasurement, tried: Candidate, race: CandidateRace, *, seed: int
+    evidence: CalibratedSplit, tried: Candidate, race: CandidateRace, *, seed: int
 ) -> Work[Candidate]:
     """Fit a candidate to all pixels of the training half, by the sampling errors of the present model."""
     # a finalist that is still on its way would be judged by where it happens to be
     half = evidence.train.loaded(tried.model.space, tried.model.place)
-    ways = with_lamp_shifted(tried.model, half.frame.step)
+    ways = shift_periodic_effects(tried.model, half.frame.step)
     works = []
     for way in ways:
         over = race.over(tried.name)
@@ -264,33 +238,41 @@ def refine_candidate(
     found = min(ends, key=lambda end: end.loss)
     model = replace(tried.model, place=found.place, loss=found.loss)
     bank = np.concatenate([end.tried for end in ends])
-    return replace(tried, model=model, fit=found.loss, bank=bank)
+    return replace(tried, model=model, training_loss=found.loss, bank=bank)
 
 
-def refit_and_judge(evidence: SplitMeasurement, tried: Sequence[Candidate], *, seed: int) -> list[Candidate]:
+def refit_and_judge(
+    evidence: SplitMeasurement,
+    candidates: Sequence[Candidate],
+    *,
+    seed: int,
+    settings: CandidateSettings = DEFAULTS.candidates,
+) -> list[Candidate]:
     """Fit candidates by their own sampling errors and judge them on the held-out half.
 
     Effects that make pixels differ have sampling errors far above those of the model without them, by which
     they would look worse than they are. The repeats that give those of a candidate also tell its error where
     it was fitted so far; candidates far behind the best by that measure go no further.
     """
-    looks = [_error_where_fitted(evidence, t, seed=seed) for t in tried]
-    found = run_side_by_side(looks)
-    limit = BEHIND * min(error for error, _ in found) + CLOSE
-    race = CandidateRace(1, LOSES)
-    works = [
-        _settle_and_judge(evidence, t, half, FEW if error > FAR else REPEATS, race.over(t.name), seed=seed)
-        for t, (error, half) in zip(tried, found, strict=True) if error <= limit
-    ]  # fmt: skip
-    done = {t.name: t for t in run_side_by_side(works)}
-    for _ in range(AGAIN):
-        first, least = (min(done.values(), key=key) for key in (_held_out_error, lambda t: t.model.loss))
-        if least is first or least.model.loss > SURELY * first.model.loss:
+    found = run_side_by_side([_error_where_fitted(evidence, one, seed=seed) for one in candidates])
+    limit = settings.behind * min(error for error, _ in found) + settings.close
+    race = CandidateRace(1, settings.loses)
+    works = []
+    for one, (error, half) in zip(candidates, found, strict=True):
+        if error <= limit:
+            repeats = settings.few_repeats if error > settings.far else settings.repeats
+            works.append(_settle_and_judge(evidence, one, half, repeats, race.over(one.name), seed=seed))
+    done = {one.name: one for one in run_side_by_side(works)}
+    for _ in range(settings.refits):
+        first = min(done.values(), key=_held_out_error)
+        least = min(done.values(), key=lambda one: one.model.loss)
+        if least is first or least.model.loss > settings.surely * first.model.loss:
             break
         # better where it was fitted, worse where it is judged: it is still on its way
         half = run_work(_error_where_fitted(evidence, least, seed=seed))[1]
-        done[least.name] = run_work(_settle_and_judge(evidence, least, half, REPEATS, None, seed=seed))
-    return [done.get(t.name, t) for t in tried]
+        again = _settle_and_judge(evidence, least, half, settings.repeats, None, seed=seed)
+        done[least.name] = run_work(again)
+    return [done.get(one.name, one) for one in candidates]
 
 
 def _held_out_error(tried: Candidate) -> float:
@@ -299,104 +281,132 @@ def _held_out_error(tried: Candidate) -> float:
 
 def _error_where_fitted(
     evidence: SplitMeasurement, tried: Candidate, *, seed: int
-) -> Work[tuple[float, PixelSubset]]:
+) -> Work[tuple[float, CalibratedSubset]]:
     """Return the error on the training half, and that half with the candidate as its present model."""
-    half = evidence.train.view()
-    values = yield from half.rebasing(tried.model.space, tried.model.place, repeats=SETTLED, seed=seed + 100)
-    return half.judge(values, seed=seed).error, half
+    half = yield from calibration_while_fitting(evidence, tried.model, seed=seed)
+    return half.judge(seed).error, half
 
 
 def _settle_and_judge(
     evidence: SplitMeasurement,
     tried: Candidate,
-    half: PixelSubset,
+    half: CalibratedSubset,
     repeats: int,
     over: StopRule | None,
     *,
     seed: int,
 ) -> Work[Candidate]:
     model = yield from refit_work(evidence, tried.model, seed=seed, rounds=1, half=half, over=over)
-    judged = yield from model.judging(evidence.held.view(), repeats=repeats, seed=seed + 500)
-    return replace(tried, model=model, judged=judged)
+    judgement = yield from model.judgement_work(
+        evidence.held, repeats=repeats, seed=SimulationStream.JUDGE.seed(seed)
+    )
+    return replace(tried, model=model, judgement=judgement)
 
 
 def try_effects(
-    evidence: SplitMeasurement,
+    evidence: CalibratedSplit,
     present: FittedModel,
     effects: Mapping[str, type[Effect]],
     names: Sequence[str],
     *,
-    repeats: Array,
     worst: Sequence[str],
     seed: int,
     report: StepProgress,
+    settings: CandidateSettings = DEFAULTS.candidates,
 ) -> list[Candidate]:
-    """Try each effect; return those that were judged in order of their held-out error, then the others.
+    """Try each effect: screen all, fit the best, judge those that chance does not explain.
 
-    `repeats` are those of the present model on the training half, to which that and the scout must have been
-    rebased; `worst` are the families in which it fails: who helps there is looked at more closely.
+    Args:
+        evidence: The measurement, calibrated by the present model.
+        present: The model so far.
+        effects: All effects known, by name.
+        names: Those that are tried.
+        worst: Families in which the present model fails: who helps there is looked at more closely.
+        seed: Of every random number.
+        report: Told how far it is.
+        settings: Numbers by which candidates are chosen.
+
+    Returns:
+        Those that were judged in order of their held-out error, then the others.
     """
-    all_variants = [v for name in names for v in variants_to_try(evidence, effects[name])]
-    order, left = _screen_variants(evidence, present, all_variants, seed=seed, report=report)
-    chosen = [*order[:FINALISTS], *family_specialists(order, worst)]
-    report(f"fitting {', '.join(t.name for t in chosen)}", 0.5)
-    last = CandidateRace(1, GIVES_UP)
-    refined = run_side_by_side([refine_candidate(evidence, tried, last, seed=seed) for tried in chosen])
-    finalists = with_p_values(evidence, present, refined, repeats, seed=seed)
-    # what chance does as well is not added, whatever its error
-    certain = [t for t in finalists if t.p_value <= max(SIGNIFICANT, 1.01 / (1 + len(repeats)))]
-    report(f"judging {', '.join(t.name for t in certain)}", 0.75)
-    done = refit_and_judge(evidence, certain, seed=seed) if certain else []
-    done += [t for t in finalists if t not in certain]
-    done.sort(key=lambda t: (t.error if t.judged else np.inf, t.p_value))
-    return [*done, *(t for t in order if t not in chosen), *left]
+    variants = [
+        v for name in names for v in variants_to_try(evidence, effects[name], idle_bus=settings.idle_bus)
+    ]
+    order, left = _screen_variants(evidence, present, variants, seed=seed, report=report, settings=settings)
+    first = order[: settings.finalists]
+    chosen = [*first, *family_specialists(order, first, worst)]
+    report(f"fitting {', '.join(one.name for one in chosen)}", 0.5)
+    last = CandidateRace(1, settings.gives_up)
+    refined = run_side_by_side([refine_candidate(evidence, one, last, seed=seed) for one in chosen])
+    finalists = with_p_values(evidence, present, refined, seed=seed)
+    # what chance does as well is not added, whatever its error; few repeats cannot give a small p-value
+    significant = max(settings.significant, 1.01 / (1 + len(evidence.train.repeats)))
+    certain = [one for one in finalists if one.p_value <= significant]
+    report(f"judging {', '.join(one.name for one in certain)}", 0.75)
+    done = refit_and_judge(evidence, certain, seed=seed, settings=settings) if certain else []
+    done += [one for one in finalists if one not in certain]
+    done.sort(key=lambda one: (one.error if one.judgement else np.inf, one.p_value))
+    return [*done, *(one for one in order if one not in chosen), *left]
 
 
 def _screen_variants(
-    evidence: SplitMeasurement,
+    evidence: CalibratedSplit,
     present: FittedModel,
     variants: Sequence[Effect],
     *,
     seed: int,
     report: StepProgress,
+    settings: CandidateSettings,
 ) -> tuple[list[Candidate], list[Candidate]]:
-    """Return candidates in order of their loss on some pixels, and those that were only looked at."""
-    looks = run_side_by_side(
+    """Return candidates in order of their loss on some pixels, and those from which nothing descended."""
+    screenings = run_side_by_side(
         [screen_effect(evidence, present, effect, seed=seed) for effect in variants],
         lambda share: report("looking at all effects", 0.2 * share),
     )
-    race, found = CandidateRace(FINALISTS), dict[str, Candidate]()
-    works = [descend_from_screening(look, race, seed=seed) for look in worth_descending(looks)]
+    race, found = CandidateRace(settings.finalists), dict[str, Candidate]()
+    works = [
+        descend_from_screening(one, race, seed=seed, settings=settings)
+        for one in worth_descending(screenings, settings)
+    ]
     for tried in run_side_by_side(works, lambda share: report("trying all effects", 0.2 + 0.3 * share)):
+        # of the variants of an effect the best stands for it
         if tried.name not in found or tried.screened_loss < found[tried.name].screened_loss:
             found[tried.name] = tried
-    left = {look.effect.name: look.found(look.places[0], float(look.losses[0])) for look in looks}
-    first = sorted(found.values(), key=lambda t: t.screened_loss)
+    left = {one.effect.name: one.candidate_at(one.places[0], float(one.losses[0])) for one in screenings}
+    first = sorted(found.values(), key=lambda one: one.screened_loss)
     return first, [tried for name, tried in left.items() if name not in found]
 
 
-def with_p_values(
-    evidence: SplitMeasurement, present: FittedModel, tried: Sequence[Candidate], repeats: Array, *, seed: int
+def family_specialists(
+    order: Sequence[Candidate], first: Sequence[Candidate], worst: Sequence[str]
 ) -> list[Candidate]:
-    """Return candidates with the p-values of what they make of the training loss."""
-    scale = evidence.train.scale
-    standing = evidence.train.run(present.space, present.place[None], seed=seed)[0]
-    p_value = p_value_function(scale, tried, repeats, standing)
-    return [replace(t, p_value=p_value(float(scale.loss(standing)) - t.fit)) for t in tried]
-
-
-def family_specialists(order: Sequence[Candidate], worst: Sequence[str]) -> list[Candidate]:
     """Return those beside the first ones that help most in the families where the present model is worst."""
     out: list[Candidate] = []
     for family in worst:
-        best = min(order, key=lambda t: t.families.get(family, float("inf")))
-        if best not in order[:FINALISTS] and best not in out:
+        best = min(order, key=lambda one: one.family_losses.get(family, float("inf")))
+        if best not in first and best not in out:
             out.append(best)
     return out
 
 
+def with_p_values(
+    evidence: CalibratedSplit,
+    present: FittedModel,
+    candidates: Sequence[Candidate],
+    *,
+    seed: int,
+) -> list[Candidate]:
+    """Return candidates with the p-values of what they make of the training loss."""
+    scale = evidence.train.scale
+    standing = evidence.train.run(present.space, present.place[None], seed=seed)[0]
+    p_value = p_value_function(scale, candidates, evidence.train.repeats, standing)
+    return [
+        replace(one, p_value=p_value(float(scale.loss(standing)) - one.training_loss)) for one in candidates
+    ]
+
+
 def p_value_function(
-    scale: ErrorScale, tried: Sequence[Candidate], repeats: Array, present: Array
+    scale: ErrorScale, candidates: Sequence[Candidate], repeats: Array, present: Array
 ) -> Callable[[float], float]:
     """Return the function from a fall of the training loss to its p-value, corrected over all candidates.
 
@@ -405,11 +415,11 @@ def p_value_function(
 
     Args:
         scale: Of the training half, by which candidates were fitted.
-        tried: Candidates with their banks.
+        candidates: With their banks.
         repeats: Statistics of repeats of the present model on the training half, shape (R, J).
         present: Statistics of the present model as it was compared with the candidates, shape (J,).
     """
-    banks = [t.bank for t in tried if t.bank is not None]
+    banks = [one.bank for one in candidates if one.bank is not None]
     if not banks:
         return lambda fall: 1.0
     bank = np.concatenate(banks)

@@ -7,69 +7,72 @@ from itertools import pairwise
 
 import numpy as np
 
-from dase.fitting.batch_simulator import LAG_TIMES
 from dase.fitting.data_split import SplitMeasurement
-from dase.fitting.subset import PixelSubset
 from dase.kernels.event_probes import BANDS, CLASSES, INTERVALS, KINDS, ZONES
+from dase.probes.accumulators import PROBE_TIMES
 from dase.probes.distance import Judgement
-from dase.probes.statistics import LAYOUT, LOWEST, MEANS, TONES
+from dase.probes.statistics import LAYOUT, MEANS, SPECTRUM
 from dase.probes.timestamp_patterns import TimestampStructure
 from dase.results import Cell
 
-SHOWN = 24
-"""Cells that are listed."""
-
-NOTABLE = 2.5
-"""Standard errors below which a cell is not worth a sentence."""
-
-_KINDS = (
-    "at rest for 200 ms", "at rest for 60 ms", "where the light falls fast", "where the light falls",
-    "where the light changes little", "where the light rises", "where the light rises fast",
-)  # fmt: skip
-_BANDS = ("dark", "dim", "middle", "bright")
-_PAIRS = ("OFF after OFF", "ON after ON", "opposite after each other")
-_ORDER = ("OFF after OFF", "OFF after ON", "ON after OFF", "ON after ON")
-_CLASSES = ("within 12 ms", "within 50 ms", "later than 50 ms")
-_STATES = ("moving", "resting")
-_POLARITY = ("OFF", "ON")
-_SPREADS = (
-    "lasting spread between pixels of OFF events", "lasting spread between pixels of ON events",
-    "shared spread of ON and OFF events", "spread between pixels of OFF events",
-    "spread between pixels of ON events",
-)  # fmt: skip
-_ODD = ("busy pixels at rest", "very busy pixels at rest", "busy pixels")
-
 StatisticWords = tuple[str, str, str]
 """Where a statistic is taken, what it is, and its unit."""
+
+
+_BOTH_POLARITIES = ("OFF", "ON")
+_STATES = ("moving", "resting")
 
 
 def band_in_words(evidence: SplitMeasurement, n: int) -> str:
     """Return a band of intensity in words, in grey values of 8 bits."""
     edges = [f"{255 * e:.0f}" for e in evidence.bands]
     between = [f"{a} to {b} DN" for a, b in pairwise(edges)]
-    return f"{_BANDS[n]} pixels ({[f'below {edges[0]} DN', *between, f'above {edges[-1]} DN'][n]})"
+    name = ("dark", "dim", "middle", "bright")[n]
+    return f"{name} pixels ({[f'below {edges[0]} DN', *between, f'above {edges[-1]} DN'][n]})"
 
 
 def describe_statistic(evidence: SplitMeasurement, family: str, n: int) -> StatisticWords:
     """Return where the `n`-th statistic of a family is taken, what it is, and its unit."""
-    return _PLACES[family](evidence, n)
+    words: dict[str, Callable[[SplitMeasurement, int], StatisticWords]] = {
+        "rate": _rate_words,
+        "intervals": _interval_words,
+        "lag": _lag_words,
+        "repeats": _repeat_words,
+        "change": _change_words,
+        "spread": _spread_words,
+        "pixels": _odd_pixel_words,
+        "silent": _silent_pixel_words,
+        "space": _ring_words,
+        "spectrum": _spectrum_words,
+        "stamps": _timestamp_words,
+    }
+    return words[family](evidence, n)
 
 
 def _rate_words(evidence: SplitMeasurement, n: int) -> StatisticWords:
     polarity, cell = divmod(n, KINDS * BANDS)
-    where = f"{band_in_words(evidence, cell % BANDS)}, {_KINDS[cell // BANDS]}"
-    return where, f"{_POLARITY[polarity]} events", "events"
+    # in the order of the kinds of `dase.kernels.event_probes`
+    kind = (
+        "at rest for 200 ms", "at rest for 60 ms", "where the light falls fast", "where the light falls",
+        "where the light changes little", "where the light rises", "where the light rises fast",
+    )[cell // BANDS]  # fmt: skip
+    return (
+        f"{band_in_words(evidence, cell % BANDS)}, {kind}",
+        f"{_BOTH_POLARITIES[polarity]} events",
+        "events",
+    )
 
 
 def _interval_words(evidence: SplitMeasurement, n: int) -> StatisticWords:
     group, octave = divmod(n, INTERVALS)
     rest, kin = divmod(group, 3)
-    return f"{_STATES[rest]} pixels", f"intervals {_octave_words(octave)} of {_PAIRS[kin]}", "events"
+    pair = ("OFF after OFF", "ON after ON", "opposite after each other")[kin]
+    return f"{_STATES[rest]} pixels", f"intervals {_octave_words(octave)} of {pair}", "events"
 
 
 def _lag_words(evidence: SplitMeasurement, n: int) -> StatisticWords:
     lag, where = divmod(n, BANDS)
-    a, b = 1e3 * LAG_TIMES[lag], 1e3 * LAG_TIMES[lag + 1]
+    a, b = 1e3 * PROBE_TIMES.lags[lag], 1e3 * PROBE_TIMES.lags[lag + 1]
     what = f"change of light from {b:g} to {a:g} ms before the event"
     return band_in_words(evidence, where), what, "log intensity"
 
@@ -82,20 +85,28 @@ def _repeat_words(evidence: SplitMeasurement, n: int) -> StatisticWords:
 
 def _change_words(evidence: SplitMeasurement, n: int) -> StatisticWords:
     kind, rest = divmod(n, 4 * CLASSES)
+    after = ("within 12 ms", "within 50 ms", "later than 50 ms")
     if kind == 2:
-        return _CLASSES[rest], "correlation of successive changes between events", "log intensity²"
+        return after[rest], "correlation of successive changes between events", "log intensity²"
     pair, group = divmod(rest, CLASSES)
     what = ("change between events", "deviation from the mean change between events")[kind]
-    return _CLASSES[group], f"{what}, {_ORDER[pair]}", "log intensity"
+    order = ("OFF after OFF", "OFF after ON", "ON after OFF", "ON after ON")[pair]
+    return after[group], f"{what}, {order}", "log intensity"
 
 
 def _spread_words(evidence: SplitMeasurement, n: int) -> StatisticWords:
-    state, what = divmod(n, len(_SPREADS))
-    return f"{_STATES[state]} pixels", _SPREADS[what], "events² per event"
+    spreads = (
+        "lasting spread between pixels of OFF events", "lasting spread between pixels of ON events",
+        "shared spread of ON and OFF events", "spread between pixels of OFF events",
+        "spread between pixels of ON events",
+    )  # fmt: skip
+    state, what = divmod(n, len(spreads))
+    return f"{_STATES[state]} pixels", spreads[what], "events² per event"
 
 
 def _odd_pixel_words(evidence: SplitMeasurement, n: int) -> StatisticWords:
-    return "single pixels", _ODD[n], "pixels"
+    what = ("busy pixels at rest", "very busy pixels at rest", "busy pixels")[n]
+    return "single pixels", what, "pixels"
 
 
 def _silent_pixel_words(evidence: SplitMeasurement, n: int) -> StatisticWords:
@@ -106,25 +117,18 @@ def _ring_words(evidence: SplitMeasurement, n: int) -> StatisticWords:
     state, ring = divmod(n, ZONES)
     rest, polarity = divmod(state, 2)
     where = f"ring {ring + 1} of {ZONES} from the middle, {_STATES[rest]}"
-    return where, f"{_POLARITY[polarity]} events", "events"
+    return where, f"{_BOTH_POLARITIES[polarity]} events", "events"
 
 
 def _spectrum_words(evidence: SplitMeasurement, n: int) -> StatisticWords:
-    if n >= TONES:
+    if n >= SPECTRUM.count:
         return "all pixels", f"swing of the net rate at {evidence.peak:.4g} Hz", "share"
-    ends = np.geomspace(LOWEST, 0.5 / evidence.held.frame.step, TONES + 1)
+    ends = SPECTRUM.edges(evidence.held.frame.step)
     return "all pixels", f"power of the net rate from {ends[n]:.3g} to {ends[n + 1]:.3g} Hz", "log power"
 
 
 def _timestamp_words(evidence: SplitMeasurement, n: int) -> StatisticWords:
     return "all pixels", TimestampStructure.NAMES[n], "share"
-
-
-_PLACES: dict[str, Callable[[SplitMeasurement, int], StatisticWords]] = {
-    "rate": _rate_words, "intervals": _interval_words, "lag": _lag_words, "repeats": _repeat_words, "change": _change_words,
-    "spread": _spread_words, "pixels": _odd_pixel_words, "silent": _silent_pixel_words,
-    "space": _ring_words, "spectrum": _spectrum_words, "stamps": _timestamp_words,
-}  # fmt: skip
 
 
 def _octave_words(n: int) -> str:
@@ -136,16 +140,26 @@ def _octave_words(n: int) -> str:
 
 
 def worst_cells(
-    evidence: SplitMeasurement, judgement: Judgement, half: PixelSubset | None = None, *, shown: int = SHOWN
+    evidence: SplitMeasurement,
+    judgement: Judgement,
+    *,
+    shown: int = 24,
+    notable: float = 2.5,
 ) -> tuple[Cell, ...]:
-    """Return where model and measurement differ most, worst first."""
-    half = half or evidence.held
-    simulated, measured = half.simulated, half.seen.target
+    """Return where model and measurement differ most, worst first.
+
+    Args:
+        evidence: The measurement.
+        judgement: Of the model.
+        shown: Cells at most.
+        notable: Standard errors below which a cell is not worth a sentence.
+    """
+    simulated, measured = judgement.simulated, judgement.measured
     out = []
     for family, part in LAYOUT.items():
         for n, j in enumerate(range(part.start, part.stop)):
             z = judgement.z[j]
-            if not half.seen.used[j] or abs(z) < NOTABLE:
+            if not judgement.compared[j] or abs(z) < notable:
                 continue
             counts = not MEANS[j] and family not in ("spread", "spectrum", "stamps")
             m, s = (np.exp(v[j]) - 3.0 if counts else v[j] for v in (measured, simulated))

@@ -3,53 +3,56 @@
 from __future__ import annotations
 
 import time
+from os import PathLike
 
 import numpy as np
 from numpy.typing import NDArray
 
 from dase.diagnosis.cell_descriptions import band_in_words, worst_cells
-from dase.events import Events
-from dase.fitting.batch_simulator import LAG_TIMES
-from dase.fitting.data_split import PIXELS, SplitMeasurement, split_measurement
+from dase.diagnosis.settings import DEFAULTS, DiagnosisSettings
+from dase.fitting.data_split import SPLIT, SplitMeasurement, split_measurement
+from dase.fitting.measurement import Measured, SceneChoice, as_measurement
 from dase.fitting.model import model_of
-from dase.fitting.subset import PixelSubset
+from dase.fitting.subset import CalibratedSubset
 from dase.kernels.event_probes import BANDS, INTERVALS, KINDS, LAGS, RESTING
+from dase.probes.accumulators import PROBE_TIMES
 from dase.probes.distance import Judgement
+from dase.probes.random_streams import SimulationStream
 from dase.probes.statistics import LAYOUT
 from dase.probes.stimulus import Trust
 from dase.results import Comparison, Curve, Progress
-from dase.scenes.scene import Scene
 from dase.simulation.sensor import Sensor
+from dase.simulation.sensor_file import as_sensor
 
 Array = NDArray[np.float64]
 
-REPEATS = 60
-"""Simulations with other seeds that tell what chance does."""
-
 
 def compare(
-    events: Events,
-    scene: Scene,
-    sensor: Sensor,
+    measured: Measured,
+    sensor: Sensor | str | PathLike[str],
     *,
+    scene: SceneChoice | None = None,
     trust: Trust | None = None,
-    pixels: int = PIXELS,
+    pixels: int = SPLIT.pixels,
     seed: int = 0,
     device: str = "cpu",
     progress: Progress | None = None,
+    settings: DiagnosisSettings = DEFAULTS,
 ) -> Comparison:
     """Compare a model with a measurement, as it is: nothing is fitted.
 
     Args:
-        events: What was measured.
-        scene: What the camera saw, on the clock of the events.
-        sensor: The model.
+        measured: A recording or its path, a `Measurement`, or events; see `as_measurement`.
+        sensor: The model, a preset's name, or the path of a sensor file.
+        scene: What the camera saw, on the clock of the events: a scene, a clip's path, or `static` for light
+            that does not change. None for the frames of the recording; events alone need one.
         trust: Where and when the scene is to be trusted; None for everywhere, and for what a
             `CameraScene` trusts of itself.
         pixels: In each half of the measurement.
         seed: Of every random number.
         device: Where kernels run.
         progress: Told how far it is.
+        settings: Of which the number of repeats is taken.
 
     Raises:
         InputError: Measurement and scene do not fit, or there is too little to say anything.
@@ -57,20 +60,39 @@ def compare(
     begin = time.perf_counter()
     tell = progress or (lambda text, share, error: None)
     tell("reading the measurement", 0.0, float("nan"))
-    sensor = sensor.bound_to(scene)
+    model = as_sensor(sensor)
+    measurement = as_measurement(measured, scene, trust)
+    model = model.bound_to(measurement.scene)
     evidence = split_measurement(
-        events, scene, log_eps=sensor.log_eps, trust=trust, pixels=pixels, seed=seed, device=device
-    )
+        measurement.events, measurement.scene, log_eps=model.log_eps, trust=measurement.trust,
+        pixels=pixels, seed=seed, device=device,
+    )  # fmt: skip
     tell("simulating", 0.3, float("nan"))
-    judgement = model_of(sensor).judge(evidence.held, repeats=REPEATS, seed=seed + 500)
+    stream = SimulationStream.JUDGE.seed(seed)
+    held = model_of(model).calibrate(evidence.held, repeats=settings.repeats, seed=stream)
+    judgement = held.judge(stream)
     tell("comparing", 1.0, judgement.error)
-    return comparison_of(evidence, judgement, sensor, seconds=time.perf_counter() - begin)
+    found = comparison_of(evidence, held, judgement, model, seconds=time.perf_counter() - begin)
+    return measurement.noted(found)
 
 
 def comparison_of(
-    evidence: SplitMeasurement, judgement: Judgement, sensor: Sensor, *, seconds: float
+    evidence: SplitMeasurement,
+    held: CalibratedSubset,
+    judgement: Judgement,
+    sensor: Sensor,
+    *,
+    seconds: float,
 ) -> Comparison:
-    """Return the comparison with the model that the held-out half was rebased to."""
+    """Return the comparison with the present model of the held-out half.
+
+    Args:
+        evidence: The measurement.
+        held: Its held-out half, calibrated by the model.
+        judgement: Of that half.
+        sensor: The model.
+        seconds: Time it took [s].
+    """
     return Comparison(
         sensor=sensor,
         error=judgement.error,
@@ -78,16 +100,16 @@ def comparison_of(
         gate=judgement.gate,
         families=judgement.families,
         cells=worst_cells(evidence, judgement),
-        plain=plain_numbers(evidence.held),
-        curves=family_curves(evidence),
+        plain=plain_numbers(held),
+        curves=family_curves(evidence, held),
         notes=evidence.notes,
         seconds=seconds,
     )
 
 
-def plain_numbers(half: PixelSubset) -> dict[str, tuple[float, float]]:
+def plain_numbers(half: CalibratedSubset) -> dict[str, tuple[float, float]]:
     """Return measured and simulated values in units that need no explanation."""
-    values = half.seen.target, half.simulated
+    values = half.seen.target, half.repeats.mean(0)
     real, made = (_rate_counts(v) for v in values)
     exposure = half.trials.stimulus.exposure().reshape(KINDS, BANDS)
     time_ = max(float(exposure.sum()), 1e-9)
@@ -133,14 +155,13 @@ def _median_interval(counts: Array, step: float) -> float:
 
 def _mean_lag(values: Array) -> float:
     change = values[LAYOUT["lag"]].reshape(LAGS, BANDS).mean(1)
-    middle = 0.5 * (np.array(LAG_TIMES[1:]) + np.array(LAG_TIMES[:-1]))
+    middle = 0.5 * (np.array(PROBE_TIMES.lags[1:]) + np.array(PROBE_TIMES.lags[:-1]))
     weight = np.maximum(change, 0.0)
     return float(1e3 * (weight * middle).sum() / max(weight.sum(), 1e-12))
 
 
-def family_curves(evidence: SplitMeasurement) -> dict[str, tuple[Curve, ...]]:
-    """Return what figures are drawn from, by family."""
-    half = evidence.held
+def family_curves(evidence: SplitMeasurement, half: CalibratedSubset) -> dict[str, tuple[Curve, ...]]:
+    """Return what figures are drawn from, by family; the present model of `half` is compared."""
     return {
         "rate": _rate_curves(evidence, half),
         "intervals": _interval_curves(half),
@@ -148,11 +169,11 @@ def family_curves(evidence: SplitMeasurement) -> dict[str, tuple[Curve, ...]]:
     }
 
 
-def _rate_curves(evidence: SplitMeasurement, half: PixelSubset) -> tuple[Curve, ...]:
+def _rate_curves(evidence: SplitMeasurement, half: CalibratedSubset) -> tuple[Curve, ...]:
     exposure = np.maximum(half.trials.stimulus.exposure().reshape(KINDS, BANDS), 1e-9)
     middle = np.array([-0.4, -0.12, 0.0, 0.12, 0.4])
     out = []
-    both = [_rate_counts(v) for v in (half.seen.target, half.simulated)]
+    both = [_rate_counts(v) for v in (half.seen.target, half.repeats.mean(0))]
     sigma = half.seen.sigma[LAYOUT["rate"]].reshape(2, KINDS, BANDS)
     for n in range(BANDS):
         for p, polarity in enumerate(("OFF", "ON")):
@@ -165,12 +186,14 @@ def _rate_curves(evidence: SplitMeasurement, half: PixelSubset) -> tuple[Curve, 
     return tuple(out)
 
 
-def _interval_curves(half: PixelSubset) -> tuple[Curve, ...]:
+def _interval_curves(half: CalibratedSubset) -> tuple[Curve, ...]:
     step = half.trials.stimulus.grid.step * 1e3
     ends = _octave_ends(step)
     middle = np.concatenate([[0.35 * step], np.sqrt(ends[:-1] * ends[1:])])
     names = [f"{kin}, {state}" for state in ("moving", "at rest") for kin in ("OFF-OFF", "ON-ON", "opposite")]
-    both = [_family_counts(v, "intervals").reshape(6, INTERVALS) for v in (half.seen.target, half.simulated)]
+    both = [
+        _family_counts(v, "intervals").reshape(6, INTERVALS) for v in (half.seen.target, half.repeats.mean(0))
+    ]
     sigma = half.seen.sigma[LAYOUT["intervals"]].reshape(6, INTERVALS)
     return tuple(
         Curve(f"Intervals {name}", middle, "interval [ms]", "events", both[0][n], both[1][n],
@@ -179,11 +202,11 @@ def _interval_curves(half: PixelSubset) -> tuple[Curve, ...]:
     )  # fmt: skip
 
 
-def _lag_curves(evidence: SplitMeasurement, half: PixelSubset) -> tuple[Curve, ...]:
-    times = np.array(LAG_TIMES)
+def _lag_curves(evidence: SplitMeasurement, half: CalibratedSubset) -> tuple[Curve, ...]:
+    times = np.array(PROBE_TIMES.lags)
     width = 1e3 * np.diff(times)
     middle = 1e3 * 0.5 * (times[1:] + times[:-1])
-    both = [v[LAYOUT["lag"]].reshape(LAGS, BANDS) for v in (half.seen.target, half.simulated)]
+    both = [v[LAYOUT["lag"]].reshape(LAGS, BANDS) for v in (half.seen.target, half.repeats.mean(0))]
     sigma = half.seen.sigma[LAYOUT["lag"]].reshape(LAGS, BANDS)
     return tuple(
         Curve(f"Light before an event, {band_in_words(evidence, n)}", middle, "time before the event [ms]",

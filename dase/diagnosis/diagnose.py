@@ -6,58 +6,50 @@ import time
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from itertools import combinations
+from os import PathLike
 
-from dase.diagnosis.candidates import FEW, Candidate, effects_to_try, try_effects
+from dase.diagnosis.candidates import Candidate, calibrate_split, effects_to_try, try_effects
 from dase.diagnosis.cell_descriptions import worst_cells
 from dase.diagnosis.directional_test import find_hidden_effect
 from dase.diagnosis.pruning import prune_model
-from dase.diagnosis.state import MATERIAL, REPEATS, TIE, DiagnosisState, explains_remainder, with_same_freedom
+from dase.diagnosis.settings import DEFAULTS, DiagnosisSettings
+from dase.diagnosis.state import DiagnosisState, explains_remainder, with_same_freedom
 from dase.effects import EFFECTS, Effect
-from dase.events import Events
 from dase.fitting.confidence_intervals import estimate_parameters
-from dase.fitting.data_split import PIXELS, split_measurement
+from dase.fitting.data_split import SPLIT, split_measurement
+from dase.fitting.measurement import Measured, SceneChoice, as_measurement
 from dase.fitting.model import FittedModel, fit_present_model, model_of, refit_model, refit_work
 from dase.fitting.scheduler import run_side_by_side
 from dase.probes.distance import Judgement, leaves_nothing, may_be_announced, reaches_floor, worst_families
+from dase.probes.random_streams import SimulationStream
 from dase.probes.stimulus import Trust
 from dase.results import Cell, Diagnosis, Estimate, Progress, Rank, Step, Unexplained
-from dase.scenes.scene import Scene
 from dase.simulation.sensor import Sensor
-
-SHARE = 0.1
-"""Least share of the way to the floor."""
-
-ON_ITS_WAY = 2.0
-"""A model with one effect more is judged by fewer simulations where its error is above this, in units of the
-gate."""
-
-MOST = 4
-"""Effects that are added at most."""
-
-PAIRED = 6
-"""Candidates that are tried two at a time where one after the other is not enough."""
+from dase.simulation.sensor_file import as_sensor
 
 
 def diagnose(
-    events: Events,
-    scene: Scene,
-    sensor: Sensor | None = None,
+    measured: Measured,
+    sensor: Sensor | str | PathLike[str] | None = None,
     *,
+    scene: SceneChoice | None = None,
     effects: Mapping[str, type[Effect]] = EFFECTS,
     free: Sequence[str] | None = None,
     trust: Trust | None = None,
-    most: int = MOST,
-    pixels: int = PIXELS,
+    most: int = 4,
+    pixels: int = SPLIT.pixels,
     seed: int = 0,
     device: str = "cpu",
     progress: Progress | None = None,
+    settings: DiagnosisSettings = DEFAULTS,
 ) -> Diagnosis:
     """Find the effects that a model of a camera lacks.
 
     Args:
-        events: What was measured.
-        scene: What the camera saw, on the clock of the events.
-        sensor: The model; None for thresholds alone.
+        measured: A recording or its path, a `Measurement`, or events; see `as_measurement`.
+        sensor: The model, a preset's name, or the path of a sensor file; None for thresholds alone.
+        scene: What the camera saw, on the clock of the events: a scene, a clip's path, or `static` for light
+            that does not change. None for the frames of the recording; events alone need one.
         effects: Candidates, name to class; those of the sensor are left out.
         free: Parameters of the sensor that may be refitted; None for all.
         trust: Where and when the scene is to be trusted; None for everywhere, and for what a
@@ -67,42 +59,56 @@ def diagnose(
         seed: Of every random number.
         device: Where kernels run.
         progress: Told how far it is.
+        settings: Numbers by which effects are added and dropped.
 
     Raises:
         InputError: Measurement and scene do not fit, or there is too little to say anything.
     """
     begin = time.perf_counter()
-    sensor = sensor or Sensor()
-    sensor = sensor.bound_to(scene)
-    evidence = split_measurement(
-        events, scene, log_eps=sensor.log_eps, trust=trust, pixels=pixels, seed=seed, device=device
-    )
     tell = progress or (lambda text, share, error: None)
+    given = Sensor() if sensor is None else as_sensor(sensor)
+    measurement = as_measurement(measured, scene, trust)
+    given = given.bound_to(measurement.scene)
+    evidence = split_measurement(
+        measurement.events, measurement.scene, log_eps=given.log_eps, trust=measurement.trust,
+        pixels=pixels, seed=seed, device=device,
+    )  # fmt: skip
     tell("fitting the present model", 0.0, float("nan"))
-    search = DiagnosisState(evidence, effects, seed, tell, frozenset(e.name for e in sensor.effects))
-    before = model_of(sensor, free).judge(evidence.held, repeats=REPEATS // 2, seed=seed + 500).error
-    start = fit_present_model(evidence, sensor, free, seed=seed)
-    model, judgement, errors = _add_one_by_one(search, start, most)
+    names = frozenset(effect.name for effect in given.effects)
+    state = DiagnosisState(evidence, effects, seed, tell, names, settings)
+    before = (
+        model_of(given, free)
+        .judge(evidence.held, repeats=settings.repeats // 2, seed=SimulationStream.JUDGE.seed(seed))
+        .error
+    )
+    start = fit_present_model(evidence, given, free, seed=seed)
+    model, judgement, errors = _add_one_by_one(state, start, most)
     if not reaches_floor(judgement) and most > 0:
-        model, judgement = _add_pair(search, start, model, judgement)
-    if len(search.added(model)) > 1:
-        model, judgement = prune_model(search, model, judgement)
-    return _conclude_diagnosis(search, start, model, errors, before, begin)
+        model, judgement = _add_pair(state, start, model, judgement)
+    if len(state.added_to(model)) > 1:
+        model, judgement = prune_model(state, model, judgement)
+    found = _conclude_diagnosis(state, start, model, errors, before)
+    return measurement.noted(replace(found, seconds=time.perf_counter() - begin))
 
 
 def _add_one_by_one(
-    search: DiagnosisState, model: FittedModel, most: int
+    state: DiagnosisState, model: FittedModel, most: int
 ) -> tuple[FittedModel, Judgement, list[float]]:
-    """Add the best effect as long as one is missing."""
+    """Add the best effect as long as one is missing.
+
+    Returns:
+        The model, its held-out error, and the errors before the first addition and after each.
+    """
     errors, far = list[float](), False
     for _ in range(most + 1):
-        judgement = search.judge(model, repeats=FEW if far else REPEATS)
+        # what is far from the floor needs no exact error
+        judgement = state.judge(model, repeats=state.settings.candidates.few_repeats if far else None)
         errors.append(judgement.error)
         more = len(errors) <= most
-        step, better, far = _look_for_effect(search, model, judgement, more)
-        if better is None and more and (hidden := find_hidden_effect(search, model, judgement)) is not None:
-            step, better = _note_hidden_effect(search, *hidden, step, judgement), hidden[0].model
-        search.history.append(step)
+        step, better, far = _look_for_effect(state, model, judgement, more)
+        if better is None and more and (hidden := find_hidden_effect(state, model, judgement)) is not None:
+            step, better = _note_hidden_effect(state, *hidden, step, judgement), hidden[0].model
+        state.history.append(step)
         if better is None:
             break
         model = better
@@ -110,7 +116,7 @@ def _add_one_by_one(
 
 
 def _look_for_effect(
-    search: DiagnosisState, model: FittedModel, judgement: Judgement, more: bool
+    state: DiagnosisState, model: FittedModel, judgement: Judgement, more: bool
 ) -> tuple[Step, FittedModel | None, bool]:
     """Try all effects.
 
@@ -118,129 +124,141 @@ def _look_for_effect(
         What was found, the model with the best of them, None if there is none, and whether that is still far
         from the floor.
     """
-    evidence, seed = search.evidence, search.seed
+    evidence, seed, settings = state.evidence, state.seed, state.settings
     names = tuple(e.name for e in model.space.sensor.effects)
     cells = worst_cells(evidence, judgement)
     step = Step(names, judgement.error, judgement.gate, judgement.families, (), None, (), cells)
     if leaves_nothing(judgement) or not more:
         return step, None, False
-    repeats = model.rebase(evidence.train, repeats=REPEATS, seed=seed + 300)
-    model.rebase(evidence.scout, repeats=16, seed=seed + 200)
-    open_names = effects_to_try(search.effects, model)
+    open_names = effects_to_try(state.effects, model)
     if not open_names:
         return step, None, False
-    tried = try_effects(
-        evidence, model, search.effects, open_names, repeats=repeats, worst=worst_families(judgement),
-        seed=seed, report=lambda text, share: search.progress(text, share, search.error),
-    )  # fmt: skip
-    finalists = [t for t in tried if t.judged]
-    step = replace(step, ranking=tuple(_rank_of(t, judgement) for t in tried))
-    if not search.history:
-        search.first = sorted(tried, key=lambda t: t.screened_loss)
-    worthy = [t for t in finalists if t.judged and explains_remainder(t.judged, judgement)]
-    able = worthy if reaches_floor(judgement) else finalists
-    if not able:
-        return step, None, False
-    best, ties = _simplest_of_the_best(able)
-    mine = _rank_of(best, judgement)
-    if not reaches_floor(judgement) and (mine.fall < MATERIAL or mine.share < SHARE):
-        return step, None, False
-    search.note(best, finalists, ties, judgement)
-    step = replace(step, chosen=best.name, ties=ties)
-    return (
-        step,
-        refit_model(evidence, best.model, seed=seed, rounds=1),
-        best.error > ON_ITS_WAY * judgement.gate,
+    present = calibrate_split(
+        evidence, model, repeats=settings.repeats, scout_repeats=settings.scout_repeats, seed=seed
     )
+    tried = try_effects(
+        present, model, state.effects, open_names, worst=worst_families(judgement),
+        seed=seed, report=lambda text, share: state.progress(text, share, state.error),
+        settings=settings.candidates,
+    )  # fmt: skip
+    step = replace(step, ranking=tuple(_rank_of(one, judgement) for one in tried))
+    if not state.history:
+        state.first = sorted(tried, key=lambda one: one.screened_loss)
+    best, ties = _best_candidate(state, tried, judgement)
+    if best is None:
+        return step, None, False
+    state.note_addition(best, [one for one in tried if one.judgement], ties, judgement)
+    step = replace(step, chosen=best.name, ties=ties)
+    far = best.error > settings.on_its_way * judgement.gate
+    return step, refit_model(evidence, best.model, seed=seed, rounds=1), far
+
+
+def _best_candidate(
+    state: DiagnosisState, tried: Sequence[Candidate], judgement: Judgement
+) -> tuple[Candidate | None, tuple[str, ...]]:
+    """Return the candidate that is to be added, None if there is none, and those not told apart from it."""
+    settings = state.settings
+    finalists = [one for one in tried if one.judgement]
+    right = reaches_floor(judgement)
+    if right:
+        finalists = [
+            one for one in finalists
+            if one.judgement and explains_remainder(one.judgement, judgement, settings)
+        ]  # fmt: skip
+    if not finalists:
+        return None, ()
+    best, ties = _simplest_of_the_best(finalists, settings)
+    rank = _rank_of(best, judgement)
+    if not right and (rank.fall < settings.material or rank.share < settings.share):
+        return None, ()
+    return best, ties
 
 
 def _note_hidden_effect(
-    search: DiagnosisState, hidden: Candidate, p_value: float, step: Step, judgement: Judgement
+    state: DiagnosisState, hidden: Candidate, p_value: float, step: Step, judgement: Judgement
 ) -> Step:
-    """Note an effect that only a closer look shows."""
-    search.note(hidden, [hidden], (), judgement)
+    """Return a step with an effect that only a closer look shows as the chosen one."""
+    state.note_addition(hidden, [hidden], (), judgement)
     rank = _rank_of(replace(hidden, p_value=p_value), judgement)
     others = tuple(r for r in step.ranking if r.effect != hidden.name)
     return replace(step, ranking=(rank, *others), chosen=hidden.name)
 
 
-def _simplest_of_the_best(finalists: Sequence[Candidate]) -> tuple[Candidate, tuple[str, ...]]:
+def _simplest_of_the_best(
+    finalists: Sequence[Candidate], settings: DiagnosisSettings = DEFAULTS
+) -> tuple[Candidate, tuple[str, ...]]:
     """Return the best candidate, the simplest of those that are not told apart, and the others of those."""
     first = finalists[0]
-    reach = max(TIE, 0.1 * first.error)
-    good = first.judged is not None and reaches_floor(first.judged)
+    reach = max(settings.tie, settings.tie_share * first.error)
+    good = first.judgement is not None and reaches_floor(first.judgement)
     like = [
-        t for t in finalists
-        if t.error <= first.error + reach and t.judged and (reaches_floor(t.judged) or not good)
+        one for one in finalists
+        if one.error <= first.error + reach and one.judgement and (reaches_floor(one.judgement) or not good)
     ]  # fmt: skip
-    best = min(like, key=lambda t: (len(t.model.place), t.error))
-    return best, tuple(t.name for t in like if t.name != best.name)
+    best = min(like, key=lambda one: (len(one.model.place), one.error))
+    return best, tuple(one.name for one in like if one.name != best.name)
 
 
-def _rank_of(tried: Candidate, judgement: Judgement) -> Rank:
+def _rank_of(candidate: Candidate, judgement: Judgement) -> Rank:
     """Return a candidate as the user sees it."""
-    fall = judgement.error - tried.error
+    fall = judgement.error - candidate.error
     share = fall / max(judgement.error - 1.0, 1e-9)
+    names = candidate.name.split(" + ")
+    # before it is the model, an effect has values without intervals
     mine = {
         axis.name: Estimate(*(3 * (float(axis.to_value(place)),)))
-        for axis, place in zip(tried.model.space.axes, tried.model.place, strict=True)
-        if axis.name.split(".")[0] in tried.name.split(" + ")
+        for axis, place in zip(candidate.model.space.axes, candidate.model.place, strict=True)
+        if axis.name.split(".")[0] in names
     }
-    return Rank(tried.name, tried.error, fall, min(share, 1.0), tried.p_value, mine, tried.judged is not None)
+    refined = candidate.judgement is not None
+    return Rank(candidate.name, candidate.error, fall, min(share, 1.0), candidate.p_value, mine, refined)
 
 
 def _add_pair(
-    search: DiagnosisState, start: FittedModel, model: FittedModel, judgement: Judgement
+    state: DiagnosisState, start: FittedModel, model: FittedModel, judgement: Judgement
 ) -> tuple[FittedModel, Judgement]:
     """Where adding one after the other does not reach the floor, try two at once."""
-    evidence, seed = search.evidence, search.seed
-    singles = [t for t in search.first if t.screened_loss < 0.98][:PAIRED]
-    start.rebase(evidence.scout, repeats=16, seed=seed + 200)
+    evidence, seed, settings = state.evidence, state.seed, state.settings
+    singles = [one for one in state.first if one.screened_loss < settings.pair_helps_alone][: settings.paired]
+    scout = start.calibrate(
+        evidence.scout, repeats=settings.scout_repeats, seed=SimulationStream.CALIBRATE_SCOUT.seed(seed)
+    )
     pairs = list(combinations(singles, 2))
     works = []
     for one, two in pairs:
         both = one.model.sensor.with_effect(two.model.sensor[two.name])
         pair = with_same_freedom(both, start, (one.name, two.name))
-        works.append(pair.searching(evidence.scout, seed=seed, iterations=4, radius=0.3))
-    ends = run_side_by_side(works, lambda share: search.progress("trying pairs", share, search.error))
+        works.append(pair.search_work(scout, seed=seed, iterations=4, radius=0.3))
+    ends = run_side_by_side(works, lambda share: state.progress("trying pairs", share, state.error))
     tried = [
         (pair.loss, f"{one.name} + {two.name}", pair) for (one, two), pair in zip(pairs, ends, strict=True)
     ]
     first = sorted(tried, key=lambda t: t[0])[:2]
     settled = run_side_by_side([refit_work(evidence, pair, seed=seed) for _, _, pair in first])
     for (_, name, _), pair in zip(first, settled, strict=True):
-        judged = search.judge(pair)
-        if judged.error < judgement.error * (1.0 if reaches_floor(judged) else 0.8):
+        judged = state.judge(pair)
+        if judged.error < judgement.error * (1.0 if reaches_floor(judged) else settings.pair_gain):
             model, judgement = pair, judged
-            search.history.append(_pair_step(search.history[0], name))
+            state.history.append(replace(state.history[0], chosen=name, ties=(), ranking=(), cells=()))
     return model, judgement
 
 
-def _pair_step(first: Step, name: str) -> Step:
-    return replace(first, chosen=name, ties=(), ranking=(), cells=())
-
-
 def _conclude_diagnosis(
-    search: DiagnosisState,
-    start: FittedModel,
-    model: FittedModel,
-    errors: list[float],
-    before: float,
-    begin: float,
+    state: DiagnosisState, start: FittedModel, model: FittedModel, errors: list[float], before: float
 ) -> Diagnosis:
     """Return what was found; names are announced only where they bring the error to the floor."""
-    found = search.added(model)
-    chosen = [n for s in search.history if s.chosen for n in s.chosen.split(" + ")]
+    found = state.added_to(model)
+    chosen = [n for s in state.history if s.chosen for n in s.chosen.split(" + ")]
     order = tuple(dict.fromkeys([*(n for n in chosen if n in found), *found]))
-    model, values = estimate_parameters(search.evidence, model, seed=search.seed)
-    last = search.judge(model)
+    model, values = estimate_parameters(state.evidence, model, seed=state.seed)
+    last = state.judge(model)
     unexplained: Unexplained | None = None
     if not may_be_announced(last):
-        cells = worst_cells(search.evidence, last)
-        unexplained = _describe_unexplained(search, order, errors[0], last, cells)
+        cells = worst_cells(state.evidence, last)
+        unexplained = _describe_unexplained(state, order, errors[0], last, cells)
     kept = unexplained is None
-    path = _errors_after_additions(search, order, errors, last.error) if kept else [errors[0]]
-    ties = {n: tuple(sorted(search.ties.get(n, set()) - set(found))) for n in order if kept}
+    path = _errors_after_additions(state, order, errors, last.error) if kept else [errors[0]]
+    ties = {n: tuple(sorted(state.ties.get(n, set()) - set(found))) for n in order if kept}
     return Diagnosis(
         sensor=model.sensor if kept else start.sensor,
         selected=order if kept else (),
@@ -251,29 +269,28 @@ def _conclude_diagnosis(
         parameters=values,
         ties={name: others for name, others in ties.items() if others},
         unexplained=unexplained,
-        history=tuple(search.history),
-        notes=search.evidence.notes,
-        evaluations=search.evidence.evaluations,
-        seconds=time.perf_counter() - begin,
+        history=tuple(state.history),
+        notes=state.evidence.notes,
+        evaluations=state.evidence.evaluations,
     )
 
 
 def _errors_after_additions(
-    search: DiagnosisState, order: tuple[str, ...], errors: list[float], last: float
+    state: DiagnosisState, order: tuple[str, ...], errors: list[float], last: float
 ) -> list[float]:
     """Return the error at the start and after each effect that was kept.
 
     Effects that came in at once, or in place of another, have no error of their own on the way: it is taken
     to fall to the last error with the first of them.
     """
-    after = {step.chosen: e for step, e in zip(search.history, errors[1:], strict=False)}
+    after = {step.chosen: e for step, e in zip(state.history, errors[1:], strict=False)}
     path = [errors[0], *(after.get(name, last) for name in order)]
     path[-1] = last
     return path
 
 
 def _describe_unexplained(
-    search: DiagnosisState, nearest: tuple[str, ...], first: float, last: Judgement, cells: tuple[Cell, ...]
+    state: DiagnosisState, nearest: tuple[str, ...], first: float, last: Judgement, cells: tuple[Cell, ...]
 ) -> Unexplained:
     share = (last.error - 1.0) / max(first - 1.0, 1e-9)
     stand_in = " and ".join(nearest) if nearest else "no effect"
@@ -283,12 +300,3 @@ def _describe_unexplained(
         f"error above the floor), which none of the effects known takes to the floor; worst: {where}"
     )
     return Unexplained(last.error, share, nearest, cells, sentence)
-
-
-def summary_line(found: Diagnosis) -> str:
-    """Return the finding in one line."""
-    if found.unexplained is not None:
-        return found.unexplained.sentence
-    if not found.selected:
-        return f"nothing is missing: error {found.errors[0]:.2f}, repeats stay below {found.gate:.2f}"
-    return f"missing: {', '.join(found.selected)}"

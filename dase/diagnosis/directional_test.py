@@ -8,57 +8,41 @@ them together is known, and along that way a measurement can be far from all rep
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from dase.diagnosis.candidates import Candidate, effects_to_try, variants_to_try
-from dase.diagnosis.state import REPEATS, DiagnosisState
+from dase.diagnosis.settings import DEFAULTS
+from dase.diagnosis.state import DiagnosisState
 from dase.fitting.model import FittedModel, refit_model, with_effect_added
-from dase.fitting.scheduler import SimulationRequest, answer_requests, run_work
-from dase.fitting.subset import PixelSubset
+from dase.fitting.scheduler import SimulationRequest, answer_requests
+from dase.fitting.subset import CalibratedSubset, PixelSubset
 from dase.probes.distance import Judgement, reaches_floor
+from dase.probes.random_streams import SimulationStream
 from dase.probes.statistics import compute_statistics
 
 Array = NDArray[np.float64]
 
-HIDES = 0.3
-"""Error that chance makes of a model in the mean, from which on it may hide an effect."""
-
-STRENGTHS = (0.2, 0.5, 0.8)
-"""At which an effect is looked at, as shares of the plausible range."""
-
-MEANS = 8
-"""Simulations whose mean is looked at."""
-
-AWAY = 4.0
-"""Standard deviations by which a measurement must be away from repeats of a model, on the way to an effect.
-
-Of 40 models that lacked nothing all but one had at most 3.0; those that lacked jitter beside mismatch
-had 4.9 to 10."""
-
-AGAIN = 3.0
-"""The same on the held-out half, on the way to that effect once it is fitted."""
-
-PLAIN = 3.0
-"""Differences beyond this many standard errors count as this: no single statistic decides."""
-
-FARTHEST = 0.2
-"""Most by which what is free otherwise gives way, in the units of `Axis.to_place`."""
-
 
 @dataclass(frozen=True)
 class RepeatCloud:
-    """From repeats of a model to where other models are.
+    """Repeats of a model and the measurement, in standard errors from the repeats' mean.
 
     Args:
-        repeats: Of the model, in standard errors from their mean, shape (R, J).
-        seen: The same of the measurement, shape (J,).
+        repeats: Of the model, shape (R, J).
+        seen: The measurement, shape (J,).
+        most_of_one: Differences beyond this many standard errors count as this.
     """
 
     repeats: Array
     seen: Array
+    most_of_one: float = DEFAULTS.hidden.most_of_one
+
+    def clipped(self, differences: Array) -> Array:
+        """Return differences (..., J), none larger than a single statistic may count."""
+        return np.clip(differences, -self.most_of_one, self.most_of_one)
 
     def deviations_along(self, ways: Array) -> Array:
         """Return how far the measurement is from the repeats along some ways (M, J), in deviations, (M,).
@@ -66,146 +50,170 @@ class RepeatCloud:
         The repeats and the measurement may be off by the tolerance, which their standard errors know: without
         it, a model without chance in it would have no deviation.
         """
-        along = np.clip(self.repeats, -PLAIN, PLAIN) @ ways.T
+        along = self.clipped(self.repeats) @ ways.T
         rest = np.maximum(1.0 - self.repeats.var(0), 0.0)
         spread = np.sqrt(along.var(0) + (rest * ways**2).sum(1))
-        out: Array = (np.clip(self.seen, -PLAIN, PLAIN) @ ways.T - along.mean(0)) / np.maximum(spread, 1e-12)
+        out: Array = (self.clipped(self.seen) @ ways.T - along.mean(0)) / np.maximum(spread, 1e-12)
         return out
 
 
 def find_hidden_effect(
-    search: DiagnosisState, model: FittedModel, judgement: Judgement
+    state: DiagnosisState, model: FittedModel, judgement: Judgement
 ) -> tuple[Candidate, float] | None:
     """Return the effect that chance hid, fitted and judged, and its p-value; None if there is none."""
+    hidden = state.settings.hidden
     # also above what chance does: there no candidate may be certain by the fall of its loss
-    if judgement.level < HIDES or not reaches_floor(judgement):
+    if judgement.level < hidden.hides or not reaches_floor(judgement):
         return None
-    search.progress("looking closer", 0.0, search.error)
-    start = _most_deviating_effect(search, model)
+    state.progress("looking closer", 0.0, state.error)
+    start = _most_deviating_effect(state, model)
     if start is None:
         return None
     name, begin, p_value = start
-    fitted = refit_model(search.evidence, begin, seed=search.seed, rounds=1)
-    judged = run_work(fitted.judging(search.evidence.held.view(), repeats=REPEATS, seed=search.seed + 500))
-    if (
-        not reaches_floor(judged)
-        or deviation_towards(search.evidence.held, model, fitted, seed=search.seed) < AGAIN
-    ):
+    fitted = refit_model(state.evidence, begin, seed=state.seed, rounds=1)
+    repeats = state.settings.repeats
+    judged = fitted.judge(state.evidence.held, repeats=repeats, seed=SimulationStream.JUDGE.seed(state.seed))
+    if not reaches_floor(judged):
         return None
-    return Candidate(name, fitted, fitted.loss, judged=judged), p_value
+    if deviation_towards(state, state.evidence.held, model, fitted) < hidden.away_held_out:
+        return None
+    return Candidate(name, fitted, fitted.loss, judgement=judged), p_value
 
 
-def may_hide_effect(judgement: Judgement) -> bool:
+def may_hide_effect(judgement: Judgement, hides: float = DEFAULTS.hidden.hides) -> bool:
     """Whether the chance of a model may hide an effect: it makes much of the error, and may make all."""
-    return judgement.level >= HIDES and judgement.error <= judgement.reach and reaches_floor(judgement)
+    return judgement.level >= hides and judgement.error <= judgement.reach and reaches_floor(judgement)
 
 
 def lacks_effect_of(
-    search: DiagnosisState, model: FittedModel, judgement: Judgement, other: FittedModel
+    state: DiagnosisState, model: FittedModel, judgement: Judgement, other: FittedModel
 ) -> bool:
     """Whether a closer look shows that a model, which leaves what is judged, lacks what another one has."""
-    if not may_hide_effect(judgement):
+    hidden = state.settings.hidden
+    if not may_hide_effect(judgement, hidden.hides):
         return False
-    ways = ((search.evidence.train, AWAY), (search.evidence.held, AGAIN))
-    return all(deviation_towards(half, model, other, seed=search.seed) >= least for half, least in ways)
+    ways = ((state.evidence.train, hidden.away), (state.evidence.held, hidden.away_held_out))
+    return all(deviation_towards(state, half, model, other) >= least for half, least in ways)
 
 
-def deviation_towards(half: PixelSubset, model: FittedModel, other: FittedModel, *, seed: int) -> float:
+def deviation_towards(
+    state: DiagnosisState, subset: PixelSubset, model: FittedModel, other: FittedModel
+) -> float:
     """Return how far a measurement is from repeats of a model, on the way to another, in their deviations."""
-    half, way = _repeat_cloud(half, model, seed=seed)
-    one, two = _mean_statistics(half, [(model, model.place[None]), (other, other.place[None])], seed=seed)
-    return float(way.deviations_along(_in_standard_errors(half, two - one))[0])
+    half, cloud = _repeat_cloud(state, subset, model)
+    one, two = _mean_statistics(state, half, [(model, model.place[None]), (other, other.place[None])])
+    return float(cloud.deviations_along(_in_standard_errors(half, two - one))[0])
 
 
 def _most_deviating_effect(
-    search: DiagnosisState, model: FittedModel
+    state: DiagnosisState, model: FittedModel
 ) -> tuple[str, FittedModel, float] | None:
     """Return the effect on whose way the measurement is farthest from the model, where to begin, a p-value.
 
     For that, repeats stand in for the measurement, each on the way on which it is farthest.
     """
-    half, way = _repeat_cloud(search.evidence.train, model, seed=search.seed)
-    reach = np.where([a.name.startswith("threshold.") for a in model.space.axes], 0.05, 0.2)
+    hidden = state.settings.hidden
+    half, cloud = _repeat_cloud(state, state.evidence.train, model)
+    threshold = [axis.name.startswith("threshold.") for axis in model.space.axes]
+    reach = np.where(threshold, hidden.threshold_reach, hidden.reach)
     sides = np.concatenate([model.place[None], model.place + np.diag(reach), model.place - np.diag(reach)])
-    tried = _models_to_probe(search, model, half)
-    if not tried:
+    probed = _models_to_probe(state, model, half)
+    if not probed:
         return None
-    here, *there = _mean_statistics(
-        half, [(model, sides), *((m, places) for _, m, places in tried)], seed=search.seed
-    )
+    here, *there = _mean_statistics(state, half, [(model, sides), *((m, places) for _, m, places in probed)])
     plus, minus = np.split(here[1:], 2)
     slopes = _in_standard_errors(half, 0.5 * (plus - minus)).T
-    ways = np.clip(_in_standard_errors(half, np.concatenate(there) - here[0]), -PLAIN, PLAIN)
+    ways = cloud.clipped(_in_standard_errors(half, np.concatenate(there) - here[0]))
     frame, _ = np.linalg.qr(slopes)
     # what the free parameters can do as well tells nothing
     bare = ways - (ways @ frame) @ frame.T
-    far = way.deviations_along(bare)
-    chance = np.array([RepeatCloud(way.repeats, one).deviations_along(bare).max() for one in way.repeats])
+    far = cloud.deviations_along(bare)
+    chance = np.array([replace(cloud, seen=one).deviations_along(bare).max() for one in cloud.repeats])
     first = int(far.argmax())
-    if far[first] < AWAY:
+    if far[first] < hidden.away:
         return None
-    name, other, place = [(n, m, place) for n, m, places in tried for place in places][first]
-    step = (way.seen - ways[first]) @ np.linalg.pinv(slopes).T * reach
+    name, other, place = [(n, m, place) for n, m, places in probed for place in places][first]
+    step = (cloud.seen - ways[first]) @ np.linalg.pinv(slopes).T * reach
     p_value = (1 + np.count_nonzero(chance >= far[first])) / (1 + len(chance))
-    return name, _starting_model(model, other, place, step), float(p_value)
+    return (
+        name,
+        _starting_model(model, other, place, np.clip(step, -hidden.reach, hidden.reach)),
+        float(p_value),
+    )
 
 
 def _starting_model(model: FittedModel, other: FittedModel, place: Array, step: Array) -> FittedModel:
-    """Return the model with an effect more where the rest has given way to it."""
+    """Return the model with an effect more where the rest has given way to it.
+
+    Args:
+        model: Without the effect, P free parameters.
+        other: With the effect.
+        place: Of `other`.
+        step: By which the free parameters of `model` give way, shape (P,).
+    """
     names = [axis.name for axis in other.space.axes]
     place = place.copy()
-    for axis, change in zip(model.space.axes, np.clip(step, -FARTHEST, FARTHEST), strict=True):
+    for axis, change in zip(model.space.axes, step, strict=True):
         place[names.index(axis.name)] += change
     return FittedModel(other.space, place)
 
 
 def _models_to_probe(
-    search: DiagnosisState, model: FittedModel, half: PixelSubset
+    state: DiagnosisState, model: FittedModel, half: PixelSubset
 ) -> list[tuple[str, FittedModel, Array]]:
     """Return effects, the models with them, and the places where those are looked at; none that are slow."""
     out = []
-    effects = search.effects
-    for effect in (
-        e for n in effects_to_try(effects, model) for e in variants_to_try(search.evidence, effects[n])
-    ):
+    effects, idle_bus = state.effects, state.settings.candidates.idle_bus
+    strengths = np.array(state.settings.hidden.strengths)
+    names = effects_to_try(effects, model)
+    for effect in (e for n in names for e in variants_to_try(state.evidence, effects[n], idle_bus=idle_bus)):
         other = with_effect_added(model, effect)
         columns = [
             n for n, a in enumerate(other.space.axes) if a.name.split(".")[0] == effect.name and a.main
         ]
         if half.slow(other.space) or not columns:
             continue
-        places = np.repeat(other.place[None], len(STRENGTHS), 0)
+        places = np.repeat(other.place[None], len(strengths), 0)
         for n in columns:
             low, high = (float(other.space.axes[n].to_place(v)) for v in other.space.axes[n].fact.plausible)
-            places[:, n] = low + (high - low) * np.array(STRENGTHS)
+            places[:, n] = low + (high - low) * strengths
         out.append((effect.name, other, places))
     return out
 
 
-def _repeat_cloud(half: PixelSubset, model: FittedModel, *, seed: int) -> tuple[PixelSubset, RepeatCloud]:
-    half = half.view()
-    repeats = model.rebase(half, repeats=REPEATS, seed=seed + 700)
-    middle = repeats.mean(0)
-    return half, RepeatCloud(
-        _in_standard_errors(half, repeats - middle), _in_standard_errors(half, half.chance.target - middle)
+def _repeat_cloud(
+    state: DiagnosisState, subset: PixelSubset, model: FittedModel
+) -> tuple[CalibratedSubset, RepeatCloud]:
+    """Return a half with a model as its present one, and the repeats of it beside the measurement."""
+    half = model.calibrate(
+        subset, repeats=state.settings.repeats, seed=SimulationStream.CLOUD.seed(state.seed)
     )
+    repeats = half.repeats
+    middle = repeats.mean(0)
+    seen = _in_standard_errors(half, half.chance.target - middle)
+    cloud = RepeatCloud(_in_standard_errors(half, repeats - middle), seen, state.settings.hidden.most_of_one)
+    return half, cloud
 
 
-def _in_standard_errors(half: PixelSubset, apart: Array) -> Array:
-    """Return differences in standard errors, those that are compared."""
+def _in_standard_errors(half: CalibratedSubset, apart: Array) -> Array:
+    """Return differences (..., J) in standard errors, only those that are compared."""
     used = half.chance.used
     out: Array = apart[..., used] / half.chance.sigma[used]
     return out
 
 
 def _mean_statistics(
-    half: PixelSubset, models: Sequence[tuple[FittedModel, Array]], *, seed: int
+    state: DiagnosisState, half: CalibratedSubset, models: Sequence[tuple[FittedModel, Array]]
 ) -> list[Array]:
-    """Return the mean statistics of models at some places, their random numbers in common."""
+    """Return the mean statistics of models at some places, (M, J) each, their random numbers in common."""
+    count = state.settings.hidden.repeats_of_mean
+    seed = SimulationStream.DIRECTIONS.seed(state.seed)
     sums = answer_requests(
         [
-            SimulationRequest(half, m.space, np.repeat(places, MEANS, 0), seed + 900, repeats=True)
+            SimulationRequest(half, m.space, np.repeat(places, count, 0), seed, repeats=True)
             for m, places in models
         ]
     )
-    return [compute_statistics(one, half.frame)[0].reshape(-1, MEANS, len(half.off)).mean(1) for one in sums]
+    return [
+        compute_statistics(one, half.frame)[0].reshape(-1, count, len(half.tolerance)).mean(1) for one in sums
+    ]

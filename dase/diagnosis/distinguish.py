@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator
-from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,7 +15,7 @@ from dase.effects.row_scan import RowScan
 from dase.effects.timestamp import Timestamp
 from dase.errors import InputError, checked_seed
 from dase.fitting.batch_simulator import BatchSimulator, SimulationOrder, samples_per_step
-from dase.fitting.data_split import typical_changes
+from dase.fitting.data_split import SPLIT, typical_changes
 from dase.kernels import launch
 from dase.probes.accumulators import ProbeSums, StatisticsFrame
 from dase.probes.statistics import (
@@ -28,32 +28,39 @@ from dase.probes.statistics import (
     tolerance_of,
 )
 from dase.probes.stimulus import MASKED, Grid, Stimulus, band_edges, sort_into_cells
-from dase.probes.timestamp_patterns import SHORTEST, TimestampStructure
+from dase.probes.timestamp_patterns import PATTERNS, TimestampStructure
 from dase.results import Answer, Distinction
 from dase.simulation.sensor import Sensor
 
-if TYPE_CHECKING:
-    pass
-
-PIXELS = 1500
-"""Pixels of a recording that are looked at, as many as in the half that a diagnosis fits."""
-
-LADDER = (0.2, 0.5, 1.0, 2.0, 5.0, 10.0, 20.0, 30.0, 60.0)
-"""Durations that are tried [s]."""
-
-REPEATS = 24
-"""Recordings of each model that are simulated."""
-
-ALARM, POWER = 0.05, 0.95
-"""Two models are told apart when so few recordings of A are taken for B's, and so many of B's are known."""
-
-ROOM, ROWS = 6e6, 2e7
-"""Samples of light held at once, pixels times steps, and steps of all parts of recordings."""
-
-CLEAR = 3.0
-"""Only statistics that differ by more standard errors have a say; the others would add noise."""
-
 Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class DistinctionSettings:
+    """Which recordings are tried, and when two models count as told apart."""
+
+    durations: tuple[float, ...] = (0.2, 0.5, 1.0, 2.0, 5.0, 10.0, 20.0, 30.0, 60.0)
+    """Durations that are tried [s]."""
+
+    alarm_deviations: float = 1.6448536269514722
+    """Standard deviations above which 5 % of a normal distribution lie: so many recordings of A may be taken
+    for B's."""
+
+    power: float = 0.95
+    """Two models are told apart when so many recordings of B are known."""
+
+    clear: float = 3.0
+    """Only statistics that differ by more standard errors have a say; the others would add noise."""
+
+    samples_at_once: float = 6e6
+    """Samples of light held at once, pixels times steps."""
+
+    steps_at_once: float = 2e7
+    """Steps of all parts of recordings that are simulated at once: their clocks take memory."""
+
+
+DEFAULTS = DistinctionSettings()
+"""What `distinguish` decides by unless it is told otherwise."""
 
 
 def distinguish(
@@ -61,12 +68,13 @@ def distinguish(
     b: Sensor,
     *,
     names: tuple[str, str] | None = None,
-    longest: float = LADDER[-1],
-    pixels: int = PIXELS,
-    repeats: int = REPEATS,
+    longest: float = 60.0,
+    pixels: int = SPLIT.pixels,
+    repeats: int = 24,
     seed: int = 0,
     device: str = "cpu",
     progress: Callable[[str, float, float, bool], None] = lambda stimulus, seconds, power, last: None,
+    settings: DistinctionSettings = DEFAULTS,
 ) -> Distinction:
     """Find the shortest standard recording that tells two models apart.
 
@@ -83,18 +91,22 @@ def distinguish(
         seed: Of everything random.
         device: Where kernels run.
         progress: Called after each step with stimulus, duration [s], power, and whether the stimulus is done.
+        settings: Numbers by which models are told apart.
 
     Raises:
         InputError: The models are of cameras that differ in size, or a number is out of range.
     """
-    size = _check_arguments(a, b, longest, pixels, repeats)
+    shortest = settings.durations[0]
+    size = _check_arguments(a, b, (shortest, longest), pixels, repeats)
+    durations = [t for t in settings.durations if t < longest] + [longest]
     checked_seed(seed, 1 << 30)
-    durations = [t for t in LADDER if t < longest] + [longest]
     answers = []
     for number, standard in enumerate(STANDARD_STIMULI):
         tried: list[tuple[float, float]] = []
         for seconds in durations:
-            bench = _StimulusTest(standard, seconds, size, pixels, (a, b), seed + 1000 * number, device)
+            bench = _StimulusTest(
+                standard, seconds, size, pixels, (a, b), seed + 1000 * number, device, settings
+            )
             answer = bench.judge(repeats)
             tried.append((seconds, answer.power))
             last = answer.seconds is not None or seconds == longest
@@ -108,9 +120,13 @@ def distinguish(
     return Distinction(tuple(answers), best, sentence, pixels, longest)
 
 
-def _check_arguments(a: Sensor, b: Sensor, longest: float, pixels: int, repeats: int) -> tuple[int, int]:
-    if not (LADDER[0] <= longest <= 600):
-        raise InputError(f"longest must lie in [{LADDER[0]:g}, 600] s, got {longest:g}")
+def _check_arguments(
+    a: Sensor, b: Sensor, durations: tuple[float, float], pixels: int, repeats: int
+) -> tuple[int, int]:
+    """Return columns and rows of the cameras; raises InputError where a number is out of range."""
+    shortest, longest = durations
+    if not (shortest <= longest <= 600):
+        raise InputError(f"longest must lie in [{shortest:g}, 600] s, got {longest:g}")
     if pixels < 16:
         raise InputError(f"pixels must be >= 16, got {pixels}")
     if repeats < 8:
@@ -126,8 +142,8 @@ def _check_arguments(a: Sensor, b: Sensor, longest: float, pixels: int, repeats:
 def _timestamp_structure(models: tuple[Sensor, Sensor]) -> TimestampStructure:
     """Return the regularity of time stamps that a readout of the models makes, if a file could show it."""
     for model in models:
-        for effect in model.streams():
-            if isinstance(effect, Timestamp) and effect.step >= SHORTEST:
+        for effect in model.readout_effects():
+            if isinstance(effect, Timestamp) and effect.step >= PATTERNS.shortest:
                 return TimestampStructure(step=effect.step)
             if isinstance(effect, RowScan):
                 return TimestampStructure(line=effect.line, direction=effect.direction)
@@ -146,13 +162,15 @@ class _StimulusTest:
         models: tuple[Sensor, Sensor],
         seed: int,
         device: str,
+        settings: DistinctionSettings,
     ):
+        self.settings = settings
         self.standard, self.models, self.seed = standard, models, seed
         step, (width, height) = standard.step, size
         steps = round(seconds / step) + 1
         finer = max(samples_per_step(model, step) for model in models)
         # a recording is put together of parts, for light takes memory
-        self.parts = max(1, math.ceil(pixels * steps * max(finer, 1) / ROOM))
+        self.parts = max(1, math.ceil(pixels * steps * max(finer, 1) / settings.samples_at_once))
         count = math.ceil(pixels / self.parts)
         rng = np.random.default_rng([seed, 1])
         chosen = np.sort(rng.choice(width * height, count, replace=count > width * height)).astype(np.int32)
@@ -169,7 +187,7 @@ class _StimulusTest:
         cell[:, 0] = MASKED
         self.finer = finer
         # a readout that both have tells nothing
-        self.readout = set(models[0].streams()) != set(models[1].streams())
+        self.readout = set(models[0].readout_effects()) != set(models[1].readout_effects())
         structure = _timestamp_structure(models) if self.readout else TimestampStructure()
         stimulus = Stimulus(chosen, width, height, grid, light, cell, log_eps, to)
         self.trials = BatchSimulator(stimulus, structure=structure)
@@ -189,8 +207,8 @@ class _StimulusTest:
         (a, events), (b, more) = (compute_statistics(sums, frame) for sums in found)
         used = is_compared(a.mean(0), events.mean(0)) | is_compared(b.mean(0), more.mean(0))
         off = tolerance_of(a.mean(0), np.maximum(events.mean(0), more.mean(0)))
-        power, share = separating_power(a * used, b * used, off)
-        told = power >= POWER
+        power, share = separating_power(a * used, b * used, off, self.settings)
+        told = power >= self.settings.power
         says = {name: float(share[part].sum()) for name, part in LAYOUT.items()}
         # the plainest of those that say about as much
         family = next(name for name, say in says.items() if say >= 0.5 * max(says.values()))
@@ -209,7 +227,7 @@ class _StimulusTest:
         """Return what recordings of a model sum up to, one per row."""
         seed = self.seed + 1 + number * 500_000
         # rows that are simulated at once: their clocks take memory
-        at_once = max(1, int(ROWS / (self.trials.stimulus.grid.steps * self.parts)))
+        at_once = max(1, int(self.settings.steps_at_once / (self.trials.stimulus.grid.steps * self.parts)))
         done = []
         for first in range(0, repeats, at_once):
             rows = min(at_once, repeats - first) * self.parts
@@ -222,7 +240,7 @@ class _StimulusTest:
             vectors = np.repeat(vector[None], rows, 0)
             return self.trials.run(model, vectors, seed=seed, reseed=True, finer=self.finer)
         order = SimulationOrder(model, np.repeat(vector[None], rows, 0), seed, reseed=True)
-        return self.trials.simulate_streams(order, [model.streams()] * rows)
+        return self.trials.simulate_streams(order, [model.readout_effects()] * rows)
 
     def _joined(self, sums: ProbeSums) -> ProbeSums:
         """Return recordings put together of their parts, whose pixels do not know of each other."""
@@ -238,13 +256,16 @@ class _StimulusTest:
         )
 
 
-def separating_power(a: Array, b: Array, tolerance: Array) -> tuple[float, Array]:
+def separating_power(
+    a: Array, b: Array, tolerance: Array, settings: DistinctionSettings = DEFAULTS
+) -> tuple[float, Array]:
     """Return how well a linear rule tells two kinds of recordings apart that it has not seen.
 
     Args:
         a: Statistics of recordings of one kind, shape (R, J).
         b: Of the other kind, shape (R, J).
         tolerance: What each statistic may be off by without it meaning anything, shape (J,).
+        settings: Of which the share of alarms is taken, and what differs clearly.
 
     Returns:
         Share of recordings of B that are known when 5 % of A's are taken for B's, and the say of each
@@ -255,26 +276,27 @@ def separating_power(a: Array, b: Array, tolerance: Array) -> tuple[float, Array
         x, y = a[taught], b[taught]
         difference = y.mean(0) - x.mean(0)
         variance = 0.5 * (x.var(0, ddof=1) + y.var(0, ddof=1)) + tolerance**2
-        clear = np.abs(difference) > CLEAR * np.sqrt(2 * variance / len(x))
+        clear = np.abs(difference) > settings.clear * np.sqrt(2 * variance / len(x))
         weight = np.divide(difference, variance, out=np.zeros_like(variance), where=clear)
         say += weight * difference
         powers.append(
-            _power_of_scores(a[judged] @ weight, b[judged] @ weight, float(np.sum((weight * tolerance) ** 2)))
+            _power_of_scores(
+                a[judged] @ weight,
+                b[judged] @ weight,
+                float(np.sum((weight * tolerance) ** 2)),
+                settings.alarm_deviations,
+            )
         )
     return float(np.mean(powers)), say
 
 
-def _power_of_scores(a: Array, b: Array, blur: float) -> float:
+def _power_of_scores(a: Array, b: Array, blur: float, deviations: float) -> float:
     """Return the share of scores of B above what 5 % of A's are above, both taken as normal."""
     wide, high = (math.sqrt(s.var(ddof=1) + blur) for s in (a, b))
     if wide == 0 or high == 0:
-        return ALARM
-    above = (b.mean() - a.mean() - _QUANTILE * wide) / high
+        return 0.05  # by chance
+    above = (b.mean() - a.mean() - deviations * wide) / high
     return 0.5 * math.erfc(-above / math.sqrt(2))
-
-
-_QUANTILE = 1.6448536269514722
-"""Standard deviations above which 5 % of a normal distribution lie."""
 
 
 def _advice_sentence(best: Answer | None, longest: float, pixels: int, a: str, b: str) -> str:

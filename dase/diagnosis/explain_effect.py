@@ -18,14 +18,14 @@ from dase.scenes.video import VideoScene
 from dase.simulation.sensor import Sensor
 from dase.simulation.simulate import simulate
 
-WIDTH, HEIGHT, DURATION, RATE = 72, 48, 0.8, 1000
 
-SHOWN = 6
-"""Cells that are listed."""
+def explain_effect(name: str, effects: Mapping[str, type[Effect]] = EFFECTS, *, shown: int = 6) -> str:
+    """Return what an effect is, what it does to the probes, and where it was described.
 
-
-def explain_effect(name: str, effects: Mapping[str, type[Effect]] = EFFECTS) -> str:
-    """Return what the effect `name` is, what it does to the probes, and where it was described.
+    Args:
+        name: Of the effect.
+        effects: All effects known, by name.
+        shown: Cells at most that are listed.
 
     Raises:
         InputError: There is no such effect.
@@ -44,7 +44,7 @@ def explain_effect(name: str, effects: Mapping[str, type[Effect]] = EFFECTS) -> 
             lines.append(f"  {family:10s} {error:7.1f}  {FAMILIES[family]}")
     if len(lines) == 3:
         lines.append("  nothing that such a recording would show")
-    lines += [f"  - {with_and_without(cell)}" for cell in cells[:SHOWN]]
+    lines += [f"  - {with_and_without(cell)}" for cell in cells[:shown]]
     return "\n".join([*lines, "", f"Source: {effect.source}"])
 
 
@@ -63,7 +63,7 @@ def changes_by_effect(effect: Effect) -> tuple[dict[str, float], tuple[Cell, ...
     scene = moving_bars()
     plain = Sensor(name="without")
     events = simulate(scene, plain.with_effect(effect), seed=1)
-    evidence = split_measurement(events, scene, pixels=WIDTH * HEIGHT // 2)
+    evidence = split_measurement(events, scene, pixels=scene.width * scene.height // 2)
     judgement = model_of(plain).judge(evidence.held, repeats=24, seed=2)
     return judgement.families, worst_cells(evidence, judgement)
 
@@ -75,16 +75,25 @@ def with_and_without(cell: Cell) -> str:
     return f"{cell.where}: {cell.what} {cell.simulated:.3g} without, {cell.measured:.3g} with"
 
 
-def moving_bars() -> VideoScene:
-    """Return bars that move at several speeds over a still background from dark to bright."""
-    x, y = np.meshgrid(np.arange(WIDTH), np.arange(HEIGHT))
-    still = np.exp(np.linspace(np.log(0.01), np.log(0.9), WIDTH))[None] * np.ones((HEIGHT, 1))
-    times = np.arange(round(DURATION * RATE) + 1) / RATE
-    frames = np.empty((len(times), HEIGHT, WIDTH), np.float32)
-    speeds = np.repeat([12.0, 60.0, 250.0, 900.0], HEIGHT // 4)[:, None]
+def moving_bars(
+    *, width: int = 72, height: int = 48, duration: float = 0.8, frame_rate: float = 1000.0
+) -> VideoScene:
+    """Return bars that move at several speeds over a still background from dark to bright.
+
+    Args:
+        width: Columns.
+        height: Rows, a multiple of the four speeds.
+        duration: Length [s].
+        frame_rate: Of the frames that make it up [Hz].
+    """
+    x, y = np.meshgrid(np.arange(width), np.arange(height))
+    still = np.exp(np.linspace(np.log(0.01), np.log(0.9), width))[None] * np.ones((height, 1))
+    times = np.arange(round(duration * frame_rate) + 1) / frame_rate
+    frames = np.empty((len(times), height, width), np.float32)
+    speeds = np.repeat([12.0, 60.0, 250.0, 900.0], height // 4)[:, None]
     for k, t in enumerate(times):
         # each strip of rows has its own speed; bars pass for a while, then the light rests
-        moving = np.where(np.sin(2 * np.pi * (t / 0.4 + y / HEIGHT)) > -0.2, 1.0, 0.0)
+        moving = np.where(np.sin(2 * np.pi * (t / 0.4 + y / height)) > -0.2, 1.0, 0.0)
         wave = 0.5 + 0.5 * np.tanh(4 * np.sin(2 * np.pi * (x - speeds * t) / 24.0))
         frames[k] = still * (1 + moving * (1.5 * wave - 0.5))
     return VideoScene(np.clip(frames, 0, 4), times)

@@ -5,115 +5,104 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 from dase.diagnosis.directional_test import lacks_effect_of
-from dase.diagnosis.state import MATERIAL, TIE, DiagnosisState, explains_remainder, with_same_freedom
+from dase.diagnosis.state import DiagnosisState, explains_remainder, with_same_freedom
 from dase.fitting.early_stopping import stop_unless_below
 from dase.fitting.model import FittedModel, refit_model, refit_work
 from dase.fitting.scheduler import run_side_by_side
 from dase.probes.distance import Judgement, leaves_nothing, may_be_announced, reaches_floor
-
-SWAPPED = 2
-"""Alternatives to an effect that are tried in its place once all others are found."""
-
-NEARBY = 1.6
-"""Only alternatives whose held-out error was about below this, relative to the chosen one's."""
-
-DROPPED = 8.0
-"""An effect is tried to be dropped where the error on the scout without it, quickly fitted, is below this, in
-units of the gate."""
-
-NEAR = 1.5
-"""A model is fitted in full where one descent takes its held-out error below this, in units of the gate or of
-the present model's error."""
-
-LOST = 4.0
-"""A model that is farther off than this, in units of the gate, is not reviewed. In the blind benchmark one
-was taken from 2.9 to the floor, and none of 24 that were beyond 3."""
-
-REPEATS = 16
-"""Simulations by which that is judged."""
-
-QUICK = 2.0
-"""Only alternatives whose error on the scout, quickly fitted, is below this, relative to the model's own."""
+from dase.probes.random_streams import SimulationStream
 
 
 def prune_model(
-    search: DiagnosisState, model: FittedModel, judgement: Judgement
+    state: DiagnosisState, model: FittedModel, judgement: Judgement
 ) -> tuple[FittedModel, Judgement]:
-    """Drop effects that are not needed any more, put simpler ones in place of others, and drop again."""
-    if judgement.error > LOST * judgement.gate:
+    """Drop effects that are not needed any more, put simpler ones in place of others, and drop again.
+
+    Args:
+        state: What the diagnosis has found so far; gets the ties that show here.
+        model: With all effects that were added.
+        judgement: Its held-out error.
+    """
+    if judgement.error > state.settings.pruning.lost * judgement.gate:
         return model, judgement
-    model, judgement = _drop_needless(search, model, judgement)
+    model, judgement = _drop_needless(state, model, judgement)
     before = model
-    for name in search.added(model):
-        for other, swap in _keep_near_models(search, _rival_models(search, model, name), judgement).items():
-            swapped = refit_model(search.evidence, swap, seed=search.seed)
-            judged = search.judge(swapped)
-            without = search.without.get(name)
-            if not reaches_floor(judged) or (without is not None and not explains_remainder(judged, without)):
+    for name in state.added_to(model):
+        for other, swap in _keep_near_models(state, _rival_models(state, model, name), judgement).items():
+            swapped = refit_model(state.evidence, swap, seed=state.seed)
+            judged = state.judge(swapped)
+            without = state.without.get(name)
+            if not reaches_floor(judged):
                 continue
-            if lacks_effect_of(search, swapped, judged, model):
+            if without is not None and not explains_remainder(judged, without, state.settings):
+                continue
+            if lacks_effect_of(state, swapped, judged, model):
                 continue
             simpler = len(swapped.place) < len(model.place)
             if simpler or not reaches_floor(judgement):
                 model, judgement = swapped, judged
-                search.ties[other] = {*search.ties.pop(name, set()), name} - {other}
+                state.ties[other] = {*state.ties.pop(name, set()), name} - {other}
                 break
-            search.ties.setdefault(name, set()).add(other)
-    return _drop_needless(search, model, judgement) if model is not before else (model, judgement)
+            state.ties.setdefault(name, set()).add(other)
+    return _drop_needless(state, model, judgement) if model is not before else (model, judgement)
 
 
 def _drop_needless(
-    search: DiagnosisState, model: FittedModel, judgement: Judgement
+    state: DiagnosisState, model: FittedModel, judgement: Judgement
 ) -> tuple[FittedModel, Judgement]:
     """Drop effects that are not needed any more."""
     whole = model
-    for name, less in _keep_near_models(search, _droppable_models(search, model), judgement).items():
-        if name not in model.sensor or len(search.added(model)) == 1:
+    for name, less in _keep_near_models(state, _droppable_models(state, model), judgement).items():
+        if name not in model.sensor or len(state.added_to(model)) == 1:
             continue
         less = less if model is whole else with_same_freedom(model.sensor.without(name), model, ())
-        fitted = refit_model(search.evidence, less, seed=search.seed)
-        without = search.judge(fitted)
+        fitted = refit_model(state.evidence, less, seed=state.seed)
+        without = state.judge(fitted)
         # what would not be added now is not kept
-        needless = may_be_announced(without) and without.error < judgement.error + MATERIAL
+        needless = may_be_announced(without) and without.error < judgement.error + state.settings.material
         if reaches_floor(without):
-            needless = leaves_nothing(without) or not explains_remainder(judgement, without)
+            needless = leaves_nothing(without) or not explains_remainder(judgement, without, state.settings)
         needless = needless or without.error <= judgement.error
-        if needless and not lacks_effect_of(search, fitted, without, model):
+        if needless and not lacks_effect_of(state, fitted, without, model):
             model, judgement = fitted, without
     return model, judgement
 
 
 def _keep_near_models(
-    search: DiagnosisState, ways: Mapping[str, FittedModel], judgement: Judgement
+    state: DiagnosisState, ways: Mapping[str, FittedModel], judgement: Judgement
 ) -> dict[str, FittedModel]:
     """Return those models that one descent takes near enough to be fitted in full, fitted by it."""
-    evidence, seed = search.evidence, search.seed
+    evidence, seed, pruning = state.evidence, state.seed, state.settings.pruning
+    stream = SimulationStream.JUDGE.seed(seed)
     ends = run_side_by_side([refit_work(evidence, way, seed=seed, rounds=1) for way in ways.values()])
     judged = run_side_by_side(
-        [m.judging(evidence.held.view(), repeats=REPEATS, seed=seed + 500) for m in ends]
+        [m.judgement_work(evidence.held, repeats=pruning.repeats, seed=stream) for m in ends]
     )
-    limit = NEAR * max(judgement.gate, judgement.error)
+    limit = pruning.near * max(judgement.gate, judgement.error)
     return {name: m for name, m, j in zip(ways, ends, judged, strict=True) if j.error < limit}
 
 
-def _droppable_models(search: DiagnosisState, model: FittedModel) -> dict[str, FittedModel]:
+def _droppable_models(state: DiagnosisState, model: FittedModel) -> dict[str, FittedModel]:
     """Return the models without one effect that may do: not far off on the scout, quickly fitted.
 
     Fitting one in full takes as long as trying a dozen; most are far off.
     """
-    scout, seed = search.evidence.scout.view(), search.seed
-    model.rebase(scout, repeats=16, seed=seed + 200)
-    ways = {name: with_same_freedom(model.sensor.without(name), model, ()) for name in search.added(model)}
-    quick = run_side_by_side([way.searching(scout, seed=seed, iterations=2) for way in ways.values()])
-    judged = run_side_by_side([way.judging(scout.view(), repeats=16, seed=seed + 500) for way in quick])
+    seed, repeats = state.seed, state.settings.scout_repeats
+    scout = model.calibrate(
+        state.evidence.scout, repeats=repeats, seed=SimulationStream.CALIBRATE_SCOUT.seed(seed)
+    )
+    ways = {name: with_same_freedom(model.sensor.without(name), model, ()) for name in state.added_to(model)}
+    quick = run_side_by_side([way.search_work(scout, seed=seed, iterations=2) for way in ways.values()])
+    stream = SimulationStream.JUDGE.seed(seed)
+    judged = run_side_by_side([way.judgement_work(scout, repeats=repeats, seed=stream) for way in quick])
     return {
         name: way for name, way, judgement in zip(ways, quick, judged, strict=True)
-        if judgement.error < DROPPED * judgement.gate
+        if judgement.error < state.settings.pruning.droppable * judgement.gate
     }  # fmt: skip
 
 
 def _keep_promising_models(
-    search: DiagnosisState, model: FittedModel, ways: Mapping[str, FittedModel]
+    state: DiagnosisState, model: FittedModel, ways: Mapping[str, FittedModel]
 ) -> dict[str, FittedModel]:
     """Return those models that may do as well as the present one: simpler, or not far off on the scout.
 
@@ -121,13 +110,16 @@ def _keep_promising_models(
     """
     if not ways:
         return {}
-    scout = search.evidence.scout.view()
-    repeats = model.rebase(scout, repeats=16, seed=search.seed + 200)
-    enough = QUICK * float(scout.scale.loss(repeats).mean())
+    scout = model.calibrate(
+        state.evidence.scout,
+        repeats=state.settings.scout_repeats,
+        seed=SimulationStream.CALIBRATE_SCOUT.seed(state.seed),
+    )
+    enough = state.settings.pruning.rival_loss * float(scout.scale.loss(scout.repeats).mean())
     simpler = {name: len(way.place) < len(model.place) for name, way in ways.items()}
     works = [
-        way.searching(
-            scout, seed=search.seed, iterations=2, over=None if simpler[name] else stop_unless_below(enough)
+        way.search_work(
+            scout, seed=state.seed, iterations=2, over=None if simpler[name] else stop_unless_below(enough)
         )
         for name, way in ways.items()
     ]
@@ -135,11 +127,12 @@ def _keep_promising_models(
     return {name: ways[name] for name, found in quick if found.loss < enough or simpler[name]}
 
 
-def _rival_models(search: DiagnosisState, model: FittedModel, name: str) -> dict[str, FittedModel]:
+def _rival_models(state: DiagnosisState, model: FittedModel, name: str) -> dict[str, FittedModel]:
     """Return the models with an alternative in the place of an effect that may do as well."""
-    limit, ways = NEARBY * search.error_of.get(name, 0.0) + TIE, {}
-    for other in search.alternatives.get(name, [])[:SWAPPED]:
+    pruning = state.settings.pruning
+    limit, ways = pruning.rival_error * state.error_of.get(name, 0.0) + state.settings.tie, {}
+    for other in state.alternatives.get(name, [])[: pruning.rivals]:
         if other.name not in model.space.sensor and other.error <= limit:
             sensor = model.sensor.without(name).with_effect(other.model.sensor[other.name])
             ways[other.name] = with_same_freedom(sensor, model, [other.name])
-    return _keep_promising_models(search, model, ways)
+    return _keep_promising_models(state, model, ways)

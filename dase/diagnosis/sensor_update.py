@@ -24,9 +24,8 @@ def with_fit(text: SensorText, found: Fit, recording: str) -> SensorText:
         "error_after": round(found.error, 3),
         "floor": found.floor,
     }
-    return text.describing(round_parameters(found.sensor)).noted(
-        history_entry_today("fit", recording=recording, **facts)
-    )
+    entry = history_entry_today("fit", recording=recording, **facts)
+    return text.describing(round_parameters(found.sensor)).with_history(entry)
 
 
 def with_diagnosis(text: SensorText, found: Diagnosis, recording: str) -> SensorText:
@@ -36,5 +35,5 @@ def with_diagnosis(text: SensorText, found: Diagnosis, recording: str) -> Sensor
     errors = [round(error, 3) for error in (found.before, *found.errors)]
     for did, before, after in zip(steps, errors, errors[1:], strict=False):
         facts = {"error_before": before, "error_after": after, "floor": found.floor}
-        text = text.noted(history_entry_today(did, recording=recording, **facts))
+        text = text.with_history(history_entry_today(did, recording=recording, **facts))
     return text

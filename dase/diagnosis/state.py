@@ -6,33 +6,34 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 from dase.diagnosis.candidates import Candidate
+from dase.diagnosis.settings import DEFAULTS, DiagnosisSettings
 from dase.effects import Effect
 from dase.fitting.data_split import SplitMeasurement
 from dase.fitting.model import FittedModel, free_of, model_of
-from dase.probes.distance import QUIET, Judgement, reaches_floor
+from dase.probes.distance import LIMITS, Judgement, reaches_floor
+from dase.probes.random_streams import SimulationStream
 from dase.results import Progress, Step
 from dase.simulation.sensor import Sensor
-
-REPEATS = 60
-"""Simulations with other seeds that tell what chance does."""
-
-MATERIAL = 0.3
-"""Least fall of the held-out error, in units of the floor."""
-
-TIE = 0.35
-"""Candidates at the floor whose held-out error is within this of the best's are not told apart from it."""
-
-HALF = 0.5
-"""Where the model counts as right without it, an effect is added only if it leaves no more than chance
-may, and at most this share of what was left above the level of chance."""
 
 
 @dataclass
 class DiagnosisState:
-    """What a diagnosis works on.
+    """What a diagnosis works on, and what it has found so far.
 
     Args:
+        evidence: The measurement, split for fitting and judging.
+        effects: All effects that may be added, by name.
+        seed: Of every random number.
+        progress: Told how far it is.
+        given: Names of the effects of the sensor as it was given.
+        settings: Numbers by which effects are added and dropped.
+        history: The steps so far, provisional additions included.
+        alternatives: Effect that was added to the other candidates that were judged with it.
+        error_of: Effect that was added to the held-out error with it.
+        ties: Effect that was added to those that the data cannot tell apart from it.
         without: What the model left before an effect was added to it, where it counted as right already.
+        first: Candidates of the first step in order of their screening, from which pairs are made.
+        error: Held-out error of the model that was judged last.
     """
 
     evidence: SplitMeasurement
@@ -40,6 +41,7 @@ class DiagnosisState:
     seed: int
     progress: Progress
     given: frozenset[str]
+    settings: DiagnosisSettings = DEFAULTS
     history: list[Step] = field(default_factory=list)
     alternatives: dict[str, list[Candidate]] = field(default_factory=dict)
     error_of: dict[str, float] = field(default_factory=dict)
@@ -48,40 +50,58 @@ class DiagnosisState:
     first: list[Candidate] = field(default_factory=list)
     error: float = float("nan")
 
-    def judge(self, model: FittedModel, *, repeats: int = REPEATS) -> Judgement:
-        """Return the held-out error of a model; makes it the present one of that half."""
-        judgement = model.judge(self.evidence.held, repeats=repeats, seed=self.seed + 500)
+    def judge(self, model: FittedModel, *, repeats: int | None = None) -> Judgement:
+        """Return the held-out error of a model."""
+        repeats = self.settings.repeats if repeats is None else repeats
+        judgement = model.judge(
+            self.evidence.held, repeats=repeats, seed=SimulationStream.JUDGE.seed(self.seed)
+        )
         self.error = judgement.error
         self.progress("judging", 0.0, self.error)
         return judgement
 
-    def note(
+    def note_addition(
         self, best: Candidate, finalists: Sequence[Candidate], ties: Sequence[str], without: Judgement
     ) -> None:
-        """Note what a review needs to know of an effect that is added."""
-        self.alternatives[best.name] = [t for t in finalists if t.name != best.name]
+        """Keep what pruning needs to know of an effect that is added.
+
+        Args:
+            best: The candidate that is added.
+            finalists: All candidates that were judged with it.
+            ties: Those that the data cannot tell apart from it.
+            without: The error of the model without it.
+        """
+        self.alternatives[best.name] = [one for one in finalists if one.name != best.name]
         self.error_of[best.name] = best.error
         self.ties[best.name] = set(ties)
         if reaches_floor(without):
             self.without[best.name] = without
 
-    def added(self, model: FittedModel) -> tuple[str, ...]:
-        """Return the effects that were added to the given sensor."""
+    def added_to(self, model: FittedModel) -> tuple[str, ...]:
+        """Return the effects of a model that the given sensor did not have."""
         return tuple(e.name for e in model.space.sensor.effects if e.name not in self.given)
 
 
-def explains_remainder(judgement: Judgement, without: Judgement) -> bool:
+def explains_remainder(
+    judgement: Judgement, without: Judgement, settings: DiagnosisSettings = DEFAULTS
+) -> bool:
     """Whether an effect explains what a model that counts as right leaves without it.
 
     That may be the scene's fault, or another simulator's habit, so it must explain most of it.
     """
     level = judgement.level
-    chance = judgement.error <= max(QUIET, judgement.reach) and reaches_floor(judgement)
-    return chance and judgement.error - level <= HALF * (without.error - level)
+    chance = judgement.error <= max(LIMITS.quiet, judgement.reach) and reaches_floor(judgement)
+    return chance and judgement.error - level <= settings.remainder * (without.error - level)
 
 
 def with_same_freedom(sensor: Sensor, model: FittedModel, more: Sequence[str]) -> FittedModel:
-    """Return the model of a sensor with what is free in another model, and in some effects more."""
+    """Return the model of a sensor in which what is free in another model is free, and all of some effects.
+
+    Args:
+        sensor: May lack effects of the other model and have further ones.
+        model: The other model.
+        more: Names of the effects whose parameters are free beside.
+    """
     names = [a.name for a in model.space.axes if a.name.split(".")[0] in sensor]
     mine = [name for effect in more for name in free_of(sensor, effect)]
     return model_of(sensor, list(dict.fromkeys([*names, *mine])))

@@ -9,6 +9,7 @@ from collections.abc import Mapping
 
 from dase.effects.bandwidth import Bandwidth
 from dase.effects.base import Effect as Effect
+from dase.effects.base import Observations as Observations
 from dase.effects.base import Parameter as Parameter
 from dase.effects.base import choice as choice
 from dase.effects.base import parameter as parameter
@@ -73,6 +74,7 @@ def find_effect(name: str, effects: Mapping[str, type[Effect]] = EFFECTS) -> typ
     """Return the effect of this name; raises InputError with the nearest known name."""
     if name not in effects:
         raise InputError(
-            f"there is no effect '{name}': {nearest(name, effects)} (your own needs --effects FILE)"
+            f"there is no effect '{name}': {nearest(name, effects)} (your own needs its file)",
+            argument="effects",
         )
     return effects[name]

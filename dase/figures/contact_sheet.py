@@ -14,13 +14,11 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import EngFormatter, NullFormatter
 from numpy.typing import NDArray
 
-from dase.figures.style import OFF, ON
+from dase.figures.style import Colour
 from dase.formatting import format_seconds
 from dase.io.sequence import Sequence
 from dase.recordings.statistics import Statistics
 from dase.recordings.summary import statistics_table
-
-INK, QUIET = "#2b2b2b", "#8a8a8a"
 
 
 def draw_contact_sheet(
@@ -54,7 +52,7 @@ def draw_contact_sheet(
         # three dots per pixel keep single events sharp where matplotlib interpolates
         axes.imshow(panel.repeat(3, 0).repeat(3, 1), extent=(0, 1, 0, aspect))
         axes.set(xticks=[], yticks=[])
-        axes.set_title(_time_label(time, end - begin), fontsize=9, color=INK, loc="left", pad=3)
+        axes.set_title(_time_label(time, end - begin), fontsize=9, color=Colour.INK, loc="left", pad=3)
     _draw_rate(rate, sequence, times)
     _draw_intervals(histogram, between)
     return figure
@@ -97,8 +95,8 @@ def figure_in_inches(wide: float, tall: float) -> tuple[Figure, Callable[[float,
 
     def axes(x: float, y: float, width: float, height: float) -> Axes:
         made = figure.add_axes((x / wide, 1 - (y + height) / tall, width / wide, height / tall))
-        made.spines[:].set(color="#bbbbbb", linewidth=0.6)
-        made.tick_params(colors=INK, labelsize=8, color="#bbbbbb", which="both")
+        made.spines[:].set(color=Colour.LINE, linewidth=0.6)
+        made.tick_params(colors=Colour.INK, labelsize=8, color=Colour.LINE, which="both")
         return made
 
     return figure, axes
@@ -111,11 +109,13 @@ def _draw_header(figure: Figure, s: Statistics, title: str, window: float, note:
     facts += [f"{rows['ON share']} ON"] if s.events else []
     facts += [note] if note else []
     left, right, first, second = 0.4 / 11, 1 - 0.4 / 11, 1 - 0.3 / tall, 1 - 0.57 / tall
-    figure.text(left, first, title, fontsize=13, color=INK, weight="bold", va="center", parse_math=False)
-    figure.text(left, second, "   ".join(facts), fontsize=9, color=INK, va="center")
+    figure.text(
+        left, first, title, fontsize=13, color=Colour.INK, weight="bold", va="center", parse_math=False
+    )
+    figure.text(left, second, "   ".join(facts), fontsize=9, color=Colour.INK, va="center")
     said = f"events of {format_seconds(window)} around each time"
-    figure.text(right, first, said, fontsize=9, color=INK, va="center", ha="right")
-    for x, colour, name in ((right - 0.055, ON, "ON"), (right, OFF, "OFF")):
+    figure.text(right, first, said, fontsize=9, color=Colour.INK, va="center", ha="right")
+    for x, colour, name in ((right - 0.055, Colour.ON, "ON"), (right, Colour.OFF, "OFF")):
         figure.text(x, second, f"\N{BLACK SQUARE} {name}", fontsize=9, color=colour, va="center", ha="right")
 
 
@@ -127,27 +127,29 @@ def _time_label(time: float, span: float) -> str:
 
 def _draw_rate(axes: Axes, sequence: Sequence, times: Items[float]) -> None:
     events, (begin, end) = sequence.events, sequence.span
-    axes.set_xlabel("time [s]", fontsize=9, color=INK)
-    axes.set_ylabel("event rate [1/s]", fontsize=9, color=INK)
+    axes.set_xlabel("time [s]", fontsize=9, color=Colour.INK)
+    axes.set_ylabel("event rate [1/s]", fontsize=9, color=Colour.INK)
     if not len(events) or end <= begin:
         return _say_nothing(axes, "no events")
     edges = np.linspace(begin, end, 201)
     bounds = np.searchsorted(events.t, np.append(edges[:-1], np.nextafter(end, math.inf)))
     on = np.diff(np.append(0, np.cumsum(events.p))[bounds])
-    for counts, colour, name in ((on, ON, "ON"), (np.diff(bounds) - on, OFF, "OFF")):
+    for counts, colour, name in ((on, Colour.ON, "ON"), (np.diff(bounds) - on, Colour.OFF, "OFF")):
         axes.stairs(counts / np.diff(edges), edges, baseline=None, color=colour, linewidth=1.0, label=name)
     axes.set_xlim(begin, end)
     axes.set_ylim(bottom=0)
-    axes.plot(times, np.zeros(len(times)), "^", color=QUIET, ms=5, clip_on=False, zorder=3, label="shown")
+    axes.plot(
+        times, np.zeros(len(times)), "^", color=Colour.QUIET, ms=5, clip_on=False, zorder=3, label="shown"
+    )
     axes.yaxis.set_major_formatter(EngFormatter(sep="\N{THIN SPACE}"))
     legend = axes.legend(loc="lower right", bbox_to_anchor=(1.02, 1), ncols=3, fontsize=8, frameon=False)
     for text in legend.get_texts():
-        text.set_color(INK)
+        text.set_color(Colour.INK)
 
 
 def _draw_intervals(axes: Axes, between: NDArray[np.float64]) -> None:
-    axes.set_xlabel("time between events of one pixel", fontsize=9, color=INK)
-    axes.set_ylabel("share of intervals [%]", fontsize=9, color=INK)
+    axes.set_xlabel("time between events of one pixel", fontsize=9, color=Colour.INK)
+    axes.set_ylabel("share of intervals [%]", fontsize=9, color=Colour.INK)
     positive = between[between > 0]
     if not len(positive):
         return _say_nothing(axes, "no pixel with two events")
@@ -155,19 +157,21 @@ def _draw_intervals(axes: Axes, between: NDArray[np.float64]) -> None:
     first, last = math.floor(least), math.floor(most) + 1
     edges = np.logspace(first, last, 12 * (last - first) + 1)
     counts, _ = np.histogram(np.clip(between, edges[0], edges[-1]), edges)  # outliers: in the outer bins
-    axes.stairs(100 * counts / len(between), edges, color=INK, fill=True, alpha=0.25)
-    axes.stairs(100 * counts / len(between), edges, color=INK, linewidth=0.8)
+    axes.stairs(100 * counts / len(between), edges, color=Colour.INK, fill=True, alpha=0.25)
+    axes.stairs(100 * counts / len(between), edges, color=Colour.INK, linewidth=0.8)
     low, median, high = np.percentile(between, (1, 50, 99))
-    axes.axvline(median, color=INK, linewidth=1.0, linestyle="--")
+    axes.axvline(median, color=Colour.INK, linewidth=1.0, linestyle="--")
     axes.set_xscale("log")
     axes.set_xlim(edges[0], edges[-1])
     axes.set_ylim(bottom=0)
     axes.xaxis.set_major_formatter(EngFormatter("s", sep="\N{THIN SPACE}"))
     axes.xaxis.set_minor_formatter(NullFormatter())
     said = f"median {format_seconds(median)},  1 to 99 %: {format_seconds(low)} to {format_seconds(high)}"
-    axes.set_title(said, fontsize=8, color=INK, loc="right", pad=5)
+    axes.set_title(said, fontsize=8, color=Colour.INK, loc="right", pad=5)
 
 
 def _say_nothing(axes: Axes, why: str) -> None:
     axes.set(xticks=[], yticks=[])
-    axes.text(0.5, 0.5, why, transform=axes.transAxes, ha="center", va="center", color=QUIET, fontsize=9)
+    axes.text(
+        0.5, 0.5, why, transform=axes.transAxes, ha="center", va="center", color=Colour.QUIET, fontsize=9
+    )

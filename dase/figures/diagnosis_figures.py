@@ -12,14 +12,8 @@ from matplotlib.axes import Axes
 from matplotlib.ticker import FixedLocator, NullLocator
 
 from dase.figures.style import (
-    BOTH,
-    INK,
-    LINE,
-    OFF,
-    ON,
-    QUIET,
-    WASH,
     WIDE,
+    Colour,
     Plate,
     add_legend,
     colour_of,
@@ -31,18 +25,12 @@ from dase.figures.style import (
 )
 from dase.results import Curve, Estimate
 
-TINY = 1e-6
-"""Values below this share of the largest are nothing, on a logarithmic axis."""
-
-DENSE = 60
-"""Points of a curve that are drawn as a line when there are more."""
-
 
 def _write_beside(
     axes: Axes, text: str, at: tuple[float, float], shift: tuple[float, float], **how: Any
 ) -> None:
     """Write words beside a point of the data, `shift` in points."""
-    how = {"fontsize": 8.5, "color": INK, "va": "center", **how}
+    how = {"fontsize": 8.5, "color": Colour.INK, "va": "center", **how}
     axes.annotate(text, at, shift, textcoords="offset points", **how)
 
 
@@ -75,8 +63,8 @@ def draw_staircase(
     n = len(errors)
     bottom, top = 0.66 * min(floor, *errors), 1.45 * max(*errors, below)
     axes.set(xlim=(-0.5, n - 0.5), ylim=(bottom, top))
-    axes.axhspan(bottom, below, color=BOTH, alpha=0.10, lw=0)
-    axes.axhline(floor, color=BOTH, lw=1.2, ls=(0, (4, 2)))
+    axes.axhspan(bottom, below, color=Colour.BOTH, alpha=0.10, lw=0)
+    axes.axhline(floor, color=Colour.BOTH, lw=1.2, ls=(0, (4, 2)))
     _draw_stairs(axes, errors, n - stand_ins, bottom)
     for i, error in enumerate(errors):
         # beside the line of the floor, not on it
@@ -88,18 +76,26 @@ def draw_staircase(
         closed = (errors[i - 1] - error) / above if above > 0 else 0.0
         if closed > 0.2 and n < 7 and errors[i - 1] > 1.8 * error:  # else there is no room for words
             said = f"{100 * min(closed, 1.0):.0f} % of the way\nto the floor"
-            _write_beside(axes, said, (i - 0.5, errors[i - 1]), (6, -1), fontsize=7.5, color=QUIET, va="top")
+            _write_beside(
+                axes, said, (i - 0.5, errors[i - 1]), (6, -1), fontsize=7.5, color=Colour.QUIET, va="top"
+            )
     log_axis(axes, "y")
     axes.xaxis.set_major_locator(FixedLocator(list(range(n))))
     axes.set_xticklabels([textwrap.fill(step, max(10, 110 // n)) for step in steps], fontsize=9.5)
     axes.tick_params(axis="x", length=0)
     label_axes(axes, y="held-out error [noise floors]")
-    shown = [("line", INK, "error"), ("dash", BOTH, "noise floor"), ("box", "#dcefe8", "chance")]
-    add_legend(figure, [*shown[:1], *([("dash", QUIET, "with a stand-in")] if stand_ins else []), *shown[1:]])
+    shown = [
+        ("line", Colour.INK, "error"),
+        ("dash", Colour.BOTH, "noise floor"),
+        ("box", Colour.CHANCE, "chance"),
+    ]
+    add_legend(
+        figure, [*shown[:1], *([("dash", Colour.QUIET, "with a stand-in")] if stand_ins else []), *shown[1:]]
+    )
     caption = (
         "Each step adds one physical effect and fits all parameters again. "
-        f"The dashed line is the noise floor ({format_number(floor)}); inside the green band the model differs from "
-        "the measurement by no more than another recording would."
+        f"The dashed line is the noise floor ({format_number(floor)}); inside the green band the model "
+        "differs from the measurement by no more than another recording would."
     )
     if stand_ins:
         caption += " Stand-ins are what comes nearest of all effects known; they are not announced as found."
@@ -109,12 +105,12 @@ def draw_staircase(
 def _draw_stairs(axes: Axes, errors: Sequence[float], sure: int, bottom: float) -> None:
     """Draw the steps; from the `sure`-th on they are dashed."""
     edges = np.arange(len(errors) + 1) - 0.5
-    axes.stairs(errors, edges, baseline=bottom, color=INK, fill=True, alpha=0.07, lw=0)
-    axes.stairs(errors[:sure], edges[: sure + 1], baseline=None, color=INK, lw=2.2)
+    axes.stairs(errors, edges, baseline=bottom, color=Colour.INK, fill=True, alpha=0.07, lw=0)
+    axes.stairs(errors[:sure], edges[: sure + 1], baseline=None, color=Colour.INK, lw=2.2)
     if sure < len(errors):
         x = np.repeat(edges[sure:], 2)[:-1]
         y = np.concatenate([[errors[sure - 1]], np.repeat(errors[sure:], 2)])
-        axes.plot(x, y, color=QUIET, lw=1.8, ls=(0, (3, 1.5)))
+        axes.plot(x, y, color=Colour.QUIET, lw=1.8, ls=(0, (3, 1.5)))
 
 
 def draw_families(errors: dict[str, float], *, floor: float = 1.0, gate: float | None = None) -> Plate:
@@ -132,9 +128,9 @@ def draw_families(errors: dict[str, float], *, floor: float = 1.0, gate: float |
     axes = place_axes(figure, 2.9, 0.8, WIDE - 3.5, 0.27 * len(ranked))
     values = [max(value, 0.0) for _, value in ranked]
     limit = gate if gate is not None and math.isfinite(gate) else 2 * floor
-    colours = [INK if value > limit else LINE for value in values]
+    colours = [Colour.INK if value > limit else Colour.LINE for value in values]
     axes.barh(range(len(ranked)), values, color=colours, height=0.62)
-    axes.axvline(floor, color=BOTH, lw=1.2, ls=(0, (4, 2)))
+    axes.axvline(floor, color=Colour.BOTH, lw=1.2, ls=(0, (4, 2)))
     for i, value in enumerate(values):
         _write_beside(axes, format_number(value), (value, i), (4, 0), bbox={"color": "white", "pad": 0.8})
     axes.set(xlim=(0, 1.12 * max([*values, 2 * floor])), ylim=(-0.6, len(ranked) - 0.4))
@@ -144,7 +140,12 @@ def draw_families(errors: dict[str, float], *, floor: float = 1.0, gate: float |
     axes.spines["left"].set_visible(False)
     label_axes(axes, x="held-out error [noise floors]")
     add_legend(
-        figure, [("box", INK, "beyond chance"), ("box", LINE, "within chance"), ("dash", BOTH, "noise floor")]
+        figure,
+        [
+            ("box", Colour.INK, "beyond chance"),
+            ("box", Colour.LINE, "within chance"),
+            ("dash", Colour.BOTH, "noise floor"),
+        ],
     )
     caption = (
         "Each bar is the distance between model and measurement in one kind of statistic, in units of what "
@@ -185,7 +186,7 @@ def draw_ranking(
     rows = np.arange(n)[::-1]
     low, high = 0.75 * min(floor, *errors), 1.3 * max(present, *errors)
     for row, effect, error, p in zip(rows, effects, errors, p_values, strict=True):
-        colour = INK if effect in chosen else QUIET if effect in ties else LINE
+        colour = Colour.INK if effect in chosen else Colour.QUIET if effect in ties else Colour.LINE
         axes.plot([present, error], [row, row], color=colour, lw=1.6, solid_capstyle="butt")
         axes.plot([error], [row], "o", ms=6, color=colour)
         note = f"{format_number(error)}   " + (
@@ -193,10 +194,10 @@ def draw_ranking(
         )
         note += "   found" if effect in chosen else "   as good" if effect in ties else ""
         axes.annotate(
-            note, (1.02, row), xycoords=("axes fraction", "data"), fontsize=8.5, color=INK, va="center"
+            note, (1.02, row), xycoords=("axes fraction", "data"), fontsize=8.5, color=Colour.INK, va="center"
         )
-    axes.axvline(present, color=INK, lw=1)
-    axes.axvline(floor, color=BOTH, lw=1.2, ls=(0, (4, 2)))
+    axes.axvline(present, color=Colour.INK, lw=1)
+    axes.axvline(floor, color=Colour.BOTH, lw=1.2, ls=(0, (4, 2)))
     axes.set(xlim=(low, high), ylim=(-0.7, n - 0.3))
     log_axis(axes, "x")
     axes.yaxis.set_major_locator(FixedLocator(list(rows)))
@@ -207,7 +208,12 @@ def draw_ranking(
     axes.spines["left"].set_visible(False)
     label_axes(axes, x="held-out error [noise floors]")
     add_legend(
-        figure, [("line", INK, "without"), ("dot", INK, "with the effect"), ("dash", BOTH, "noise floor")]
+        figure,
+        [
+            ("line", Colour.INK, "without"),
+            ("dot", Colour.INK, "with the effect"),
+            ("dash", Colour.BOTH, "noise floor"),
+        ],
     )
     caption = (
         "Each line runs from the error of the present model to the error with that effect added; the longer "
@@ -235,19 +241,22 @@ def draw_parameters(
     axes.set(xlim=(-0.06, 1.06), ylim=(-0.6, n - 0.4))
     for row, (name, estimate) in zip(range(n)[::-1], values.items(), strict=True):
         low, high = ranges[name]
-        axes.plot([0, 1], [row, row], color=WASH, lw=9, solid_capstyle="butt", zorder=0)
+        axes.plot([0, 1], [row, row], color=Colour.WASH, lw=9, solid_capstyle="butt", zorder=0)
         at = [_place_in_range(v, low, high) for v in (estimate.low, estimate.value, estimate.high)]
         outside = at[1] in (0.0, 1.0)
-        axes.plot([at[0], at[2]], [row, row], color=BOTH, lw=2.4, solid_capstyle="butt")
-        axes.plot([at[1]], [row], "D" if outside else "o", ms=6.5, color=ON if outside else BOTH)
+        axes.plot([at[0], at[2]], [row, row], color=Colour.BOTH, lw=2.4, solid_capstyle="butt")
+        axes.plot(
+            [at[1]], [row], "D" if outside else "o", ms=6.5, color=Colour.ON if outside else Colour.BOTH
+        )
         for x, value, side in ((0, low, "left"), (1, high, "right")):
             axes.annotate(
-                format_number(value), (x, row - 0.36), fontsize=6.5, color=QUIET, ha=side, va="center"
+                format_number(value), (x, row - 0.36), fontsize=6.5, color=Colour.QUIET, ha=side, va="center"
             )
         unit = "" if units[name] == "1" else f" {units[name]}"
-        said = f"{format_number(estimate.value)}{unit}   ({format_number(estimate.low)} to {format_number(estimate.high)})"
+        interval = f"{format_number(estimate.low)} to {format_number(estimate.high)}"
+        said = f"{format_number(estimate.value)}{unit}   ({interval})"
         axes.annotate(
-            said, (1.03, row), xycoords=("axes fraction", "data"), fontsize=8.5, color=INK, va="center"
+            said, (1.03, row), xycoords=("axes fraction", "data"), fontsize=8.5, color=Colour.INK, va="center"
         )
     axes.yaxis.set_major_locator(FixedLocator(list(range(n)[::-1])))
     axes.set_yticklabels(list(values), fontsize=9)
@@ -291,17 +300,26 @@ def draw_curves(title: str, about: str, panels: Sequence[Curve], caption: str) -
         words = textwrap.fill(panel.title, round(11.5 * wide))
         label_axes(axes, "" if same_x else panel.x_label, "" if same_y else panel.y_label, words)
     # what all panels have in common stands once
-    once = {"fontsize": 9, "color": INK, "ha": "center", "va": "center"}
+    once = {"fontsize": 9, "color": Colour.INK, "ha": "center", "va": "center"}
     tall = figure.get_figheight()
     if same_x:
         figure.text(0.5 + 0.15 / WIDE, 0.22 / tall, panels[0].x_label, once)
     if same_y:
         figure.text(0.28 / WIDE, 0.5 - 0.35 / tall, panels[0].y_label, once, rotation=90)
-    named = {ON: "model, ON", OFF: "model, OFF", BOTH: "model"}
-    entries = [("line", colour, named[colour]) for colour in (ON, OFF, BOTH) if colour in colours]
-    dense = any(len(panel.x) > DENSE for panel in panels)
-    add_legend(figure, [("line" if dense else "dot", INK, "measured"), *entries])
+    named = {Colour.ON: "model, ON", Colour.OFF: "model, OFF", Colour.BOTH: "model"}
+    entries = [
+        ("line", colour, named[colour])
+        for colour in (Colour.ON, Colour.OFF, Colour.BOTH)
+        if colour in colours
+    ]
+    dense = any(_is_dense(panel) for panel in panels)
+    add_legend(figure, [("line" if dense else "dot", Colour.INK, "measured"), *entries])
     return Plate(figure, caption)
+
+
+def _is_dense(panel: Curve) -> bool:
+    """Whether the points of a curve are too many to be drawn as dots."""
+    return len(panel.x) > 60
 
 
 def _draw_curve(axes: Axes, panel: Curve, colour: str) -> None:
@@ -311,16 +329,19 @@ def _draw_curve(axes: Axes, panel: Curve, colour: str) -> None:
     )
     if panel.log_y:
         both = np.concatenate([measured, simulated])
-        positive = both[both > TINY * max(both.max(), TINY)]
+        # on a logarithmic axis, less than a millionth of the largest is nothing
+        positive = both[both > 1e-6 * max(both.max(), 1e-6)]
         least = 0.6 * positive.min() if len(positive) else 0.1
         measured, simulated = np.maximum(measured, least), np.maximum(simulated, least)
     low, high = measured - 2 * error, measured + 2 * error
-    axes.fill_between(x, np.maximum(low, least) if panel.log_y else low, high, color=INK, alpha=0.13, lw=0)
-    axes.plot(x, simulated, color=colour, lw=1.2 if len(x) > DENSE else 2, zorder=3)
-    if len(x) > DENSE:
-        axes.plot(x, measured, color=INK, lw=0.8, alpha=0.8)
+    axes.fill_between(
+        x, np.maximum(low, least) if panel.log_y else low, high, color=Colour.INK, alpha=0.13, lw=0
+    )
+    axes.plot(x, simulated, color=colour, lw=1.2 if _is_dense(panel) else 2, zorder=3)
+    if _is_dense(panel):
+        axes.plot(x, measured, color=Colour.INK, lw=0.8, alpha=0.8)
     else:
-        axes.plot(x, measured, "o", color=INK, ms=3.2, zorder=4, clip_on=False)
+        axes.plot(x, measured, "o", color=Colour.INK, ms=3.2, zorder=4, clip_on=False)
     if panel.log_x:
         log_axis(axes, "x")
     if panel.log_y:
@@ -350,8 +371,10 @@ def draw_powers(
             done = power >= enough
             at = durations.index(seconds)
             across, down = (at - 0.48, at + 0.48), (row - 0.42, row + 0.42)
-            axes.fill_between(across, *down, color=BOTH, alpha=1.0 if done else 0.05 + 0.45 * power, lw=0)
-            colour, weight = ("white", "bold") if done else (INK, "normal")
+            axes.fill_between(
+                across, *down, color=Colour.BOTH, alpha=1.0 if done else 0.05 + 0.45 * power, lw=0
+            )
+            colour, weight = ("white", "bold") if done else (Colour.INK, "normal")
             _write_beside(
                 axes, f"{100 * power:.0f} %", (at, row), (0, 0), ha="center", color=colour, weight=weight
             )

@@ -12,15 +12,16 @@ from numpy.typing import NDArray
 
 from dase.errors import InputError
 from dase.events import Events
-from dase.figures.style import OFF, ON
+from dase.figures import contact_sheet
+from dase.figures.style import Colour
 from dase.io.sequence import Sequence, replacing
-from dase.recordings.statistics import Statistics as Statistics
-from dase.recordings.statistics import sequence_statistics as statistics
+from dase.recordings.statistics import sequence_statistics
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-FRAME_RATE = 30.0  # video frames per second where the sequence does not say better
+DEFAULT_FRAME_RATE = 30.0
+"""Pictures per second of a video where the sequence does not say better [Hz]."""
 
 
 def pixel_intervals(events: Events) -> NDArray[np.float64]:
@@ -37,7 +38,7 @@ def default_window(sequence: Sequence) -> float:
     """Return a window [s] of 1, 2 or 5 times a power of ten that shows about one event in ten pixels."""
     begin, end = sequence.span
     events = sequence.events
-    wanted = 1 / FRAME_RATE
+    wanted = 1 / DEFAULT_FRAME_RATE
     if len(events) and end > begin:
         rate = len(events) / (end - begin) / (events.width * events.height)
         wanted = min(0.1 / rate, wanted, end - begin)
@@ -57,7 +58,9 @@ def overlay_events(grey: NDArray[Any] | None, counts: NDArray[np.int32]) -> NDAr
     """
     base = np.full(counts.shape[1:], 1.0) if grey is None else 0.22 + 0.7 * (grey / _white_level(grey)) ** 0.8
     total = counts.sum(0)
-    colours = np.array([[int(code[i : i + 2], 16) / 255 for i in (1, 3, 5)] for code in (OFF, ON)])
+    colours = np.array(
+        [[int(code[i : i + 2], 16) / 255 for i in (1, 3, 5)] for code in (Colour.OFF, Colour.ON)]
+    )
     mixed = np.tensordot(counts / np.maximum(total, 1), colours, axes=(0, 0))  # (H, W, 3)
     alpha = np.where(total > 0, 1 - 0.35 * 0.5 ** (total - 1.0), 0.0)[..., None]
     blend: NDArray[np.float64] = (1 - alpha) * base[..., None] + alpha * mixed
@@ -91,8 +94,6 @@ def draw_sequence(
     Raises:
         InputError: `at` lies outside the sequence, or `window` is not positive.
     """
-    from dase.figures import contact_sheet
-
     begin, end = sequence.span
     if at is not None and not begin <= at <= end:
         raise InputError(f"at: must lie in {begin:g}..{end:g} s, got {at:g} s")
@@ -103,7 +104,7 @@ def draw_sequence(
     shrink = math.ceil(sequence.events.width / dots)
     panels = [moment_picture(sequence, time, window, shrink=shrink) for time in times]
     return contact_sheet.draw_contact_sheet(
-        sequence, statistics(sequence), between, panels, times, window, title
+        sequence, sequence_statistics(sequence), between, panels, times, window, title
     )
 
 
@@ -181,15 +182,15 @@ def _video_times(
     if sequence.frames is not None and len(sequence.frames):
         ends = frame_times(sequence)
         pace = float(np.median(np.diff(ends))) if len(ends) > 1 else 0.0
-        rate = 1 / pace if pace >= 1 / 60.5 else FRAME_RATE
+        rate = 1 / pace if pace >= 1 / 60.5 else DEFAULT_FRAME_RATE
         begins = np.append(ends[0] - pace, ends[:-1]) if window is None else ends - window
         return begins, ends, rate
     if window is None:
-        window = min(1 / FRAME_RATE, (end - begin) / 60) or 1 / FRAME_RATE
+        window = min(1 / DEFAULT_FRAME_RATE, (end - begin) / 60) or 1 / DEFAULT_FRAME_RATE
     count = max(1, math.ceil((end - begin) / window - 1e-9))
     edges = begin + np.cumsum(np.append(0.0, np.full(count, window)))
     edges[0], edges[-1] = np.nextafter(begin, -math.inf), max(edges[-1], end)
-    return edges[:-1], edges[1:], FRAME_RATE
+    return edges[:-1], edges[1:], DEFAULT_FRAME_RATE
 
 
 def _video_pictures(

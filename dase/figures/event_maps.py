@@ -8,7 +8,6 @@ from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.colors import LinearSegmentedColormap
 from matplotlib.figure import Figure
 from matplotlib.image import AxesImage
 from matplotlib.ticker import FixedLocator
@@ -20,11 +19,9 @@ from dase.events import Events
 from dase.figures.diagnosis_figures import draw_curves
 from dase.figures.event_images import overlay_events
 from dase.figures.style import (
-    INK,
-    LINE,
-    OFF,
-    ON,
+    TOO_FEW_TO_TOO_MANY,
     WIDE,
+    Colour,
     Plate,
     add_legend,
     format_number,
@@ -34,21 +31,6 @@ from dase.figures.style import (
 )
 from dase.formatting import format_seconds
 from dase.results import Curve
-
-DIVERGING = LinearSegmentedColormap.from_list("dase", ["#1b4f8f", "#86add3", "#f5f5f3", "#dfa67f", "#a23b16"])
-"""Too few to too many."""
-
-SLOWEST, FASTEST = 4.0, 1000.0
-"""Resolution and end of spectra [Hz]."""
-
-SHOWN = 0.05
-"""Events per pixel in a picture."""
-
-DOTS = 400
-"""Most columns of a picture."""
-
-MOST = 3.0
-"""Octaves at which the colours of a map end."""
 
 
 def event_plates(
@@ -88,14 +70,14 @@ def event_plates(
     return [
         draw_moments(seen, counts[0], counts[1], times, window),
         draw_residual_maps(whole[0], whole[1], end - begin),
-        *([draw_spectra(parts[0], parts[1], span)] if end - begin >= 1.5 / SLOWEST else []),
+        *draw_spectra(parts[0], parts[1], span),
     ]
 
 
-def _moment_window(events: Events, span: float, count: int) -> float:
-    """Return a time of 1, 2 or 5 times a power of ten in which about `SHOWN` events come per pixel [s]."""
+def _moment_window(events: Events, span: float, count: int, *, shown: float = 0.05) -> float:
+    """Return a time of 1, 2 or 5 times a power of ten in which about `shown` events come per pixel [s]."""
     rate = max(len(events), 1) / span / (events.width * events.height)
-    wanted = min(SHOWN / rate, span / count)
+    wanted = min(shown / rate, span / count)
     power = 10.0 ** math.floor(math.log10(wanted))
     return power * max(step for step in (1, 2, 5) if step * power <= wanted * (1 + 1e-9))
 
@@ -128,12 +110,13 @@ def draw_moments(
     for row, (name, counts) in enumerate((("measured", measured), ("simulated", simulated))):
         for i, time in enumerate(times):
             axes = place_axes(figure, 0.65 + i * (across + 0.12), 1.0 + row * (down + 0.1), across, down)
-            size = math.ceil(counts.shape[3] / DOTS)  # no event is lost where a dot stands for several pixels
+            # more than 400 columns cannot be seen; no event is lost where a dot stands for several pixels
+            size = math.ceil(counts.shape[3] / 400)
             _show_picture(axes, overlay_events(_calm_frame(frames[i], size), _sum_blocks(counts[i], size)))
             label_axes(axes, title=f"{time:.3f} s" if row == 0 else "")
             if i == 0:
-                axes.set_ylabel(name, fontsize=10, color=INK, labelpad=6)
-    add_legend(figure, [("box", ON, "ON"), ("box", OFF, "OFF")])
+                axes.set_ylabel(name, fontsize=10, color=Colour.INK, labelpad=6)
+    add_legend(figure, [("box", Colour.ON, "ON"), ("box", Colour.OFF, "OFF")])
     caption = (
         "Pixels that sent events, red ON and blue OFF, over the grey picture the camera saw; above what was "
         "measured, below what the model makes of the same scene."
@@ -141,22 +124,36 @@ def draw_moments(
     return Plate(figure, caption)
 
 
-def draw_spectra(measured: Events, simulated: Events, span: tuple[float, float]) -> Plate:
+def draw_spectra(
+    measured: Events,
+    simulated: Events,
+    span: tuple[float, float],
+    *,
+    resolution: float = 4.0,
+    end: float = 1000.0,
+) -> list[Plate]:
     """Draw the spectrum of the event rate: flicker and the rhythm of a readout are peaks in it.
 
     Args:
         measured: Events of the camera.
         simulated: Events of the model.
         span: Begin and end of what is compared [s].
+        resolution: Of the spectra [Hz].
+        end: Of the spectra [Hz].
+
+    Returns:
+        One figure; none where the span is too short for the resolution.
     """
+    if span[1] - span[0] < 1.5 / resolution:
+        return []
     panels = []
-    bins = np.arange(span[0], span[1], 0.5 / FASTEST)
+    bins = np.arange(span[0], span[1], 0.5 / end)
     for name, on in (("ON events", True), ("OFF events", False)):
         powers = []
         for events in (measured, simulated):
-            rate = np.histogram(events.t[events.p == on], bins)[0] * 2 * FASTEST
-            across = min(round(2 * FASTEST / SLOWEST), len(rate))
-            frequency, power = welch(rate, fs=2 * FASTEST, nperseg=across, detrend="constant")
+            rate = np.histogram(events.t[events.p == on], bins)[0] * 2 * end
+            across = min(round(2 * end / resolution), len(rate))
+            frequency, power = welch(rate, fs=2 * end, nperseg=across, detrend="constant")
             # 1 is what independent events of this rate would give
             powers.append(power[1:] / max(2 * rate.mean(), 1e-9))
         zero = np.zeros(len(frequency) - 1)
@@ -166,7 +163,7 @@ def draw_spectra(measured: Events, simulated: Events, span: tuple[float, float])
         "Power of the fluctuations of the event rate, in units of what events would give that come "
         "independently. Peaks are light that flickers or a clock that ticks; slow power is the scene."
     )
-    return draw_curves("Rhythms of the event rate", f"resolution {SLOWEST:g} Hz", panels, caption)
+    return [draw_curves("Rhythms of the event rate", f"resolution {resolution:g} Hz", panels, caption)]
 
 
 def _calm_frame(frame: NDArray[np.uint8] | None, size: int) -> NDArray[np.uint8] | None:
@@ -179,11 +176,16 @@ def _calm_frame(frame: NDArray[np.uint8] | None, size: int) -> NDArray[np.uint8]
 def _show_picture(axes: Axes, picture: NDArray[np.uint8]) -> None:
     axes.imshow(picture.repeat(2, 0).repeat(2, 1), interpolation="none", aspect="auto")
     axes.set(xticks=[], yticks=[])
-    axes.spines[:].set(visible=True, color=LINE, linewidth=0.8)
+    axes.spines[:].set(visible=True, color=Colour.LINE, linewidth=0.8)
 
 
 def draw_residual_maps(
-    measured: NDArray[np.float64], simulated: NDArray[np.float64], seconds_long: float, *, least: float = 50.0
+    measured: NDArray[np.float64],
+    simulated: NDArray[np.float64],
+    seconds_long: float,
+    *,
+    least: float = 50.0,
+    octaves_shown: int = 3,
 ) -> Plate:
     """Draw where the model sends too many or too few events.
 
@@ -192,6 +194,7 @@ def draw_residual_maps(
         simulated: The same of the model.
         seconds_long: Span in which they were counted [s].
         least: Pixels are joined to blocks of about so many events.
+        octaves_shown: Too many or too few at which the colours end.
     """
     size = _block_side(measured, least)
     m, s = _sum_blocks(measured, size), _sum_blocks(simulated, size)
@@ -206,19 +209,25 @@ def draw_residual_maps(
     for i, (channel, name) in enumerate(((1, "ON"), (0, "OFF"))):
         axes = place_axes(figure, 0.3 + i * (across + 0.15), 1.0, across, down)
         image = axes.imshow(
-            octaves[channel], cmap=DIVERGING, vmin=-MOST, vmax=MOST, aspect="auto", interpolation="none"
+            octaves[channel],
+            cmap=TOO_FEW_TO_TOO_MANY,
+            vmin=-octaves_shown,
+            vmax=octaves_shown,
+            aspect="auto",
+            interpolation="none",
         )
         axes.set(xticks=[], yticks=[])
-        axes.spines[:].set(visible=True, color=LINE, linewidth=0.8)
+        axes.spines[:].set(visible=True, color=Colour.LINE, linewidth=0.8)
         rates = [
             counts[channel].sum() / measured[channel].size / seconds_long for counts in (measured, simulated)
         ]
         label_axes(
             axes,
-            title=f"{name} events: {format_number(rates[0])} measured, {format_number(rates[1])} simulated [1/(px s)]",
+            title=f"{name} events: {format_number(rates[0])} measured, "
+            f"{format_number(rates[1])} simulated [1/(px s)]",
         )
     bar = place_axes(figure, 0.3 + 2 * across + 0.3, 1.0, 0.16, down)
-    _colour_bar(figure, bar, image)
+    _colour_bar(figure, bar, image, octaves_shown)
     caption = (
         "Blue: the model sends too few events; brown: too many; white: as many as measured, or no "
         "further off than chance takes them."
@@ -226,9 +235,9 @@ def draw_residual_maps(
     return Plate(figure, caption)
 
 
-def _colour_bar(figure: Figure, axes: Axes, image: AxesImage) -> None:
+def _colour_bar(figure: Figure, axes: Axes, image: AxesImage, octaves: int) -> None:
     bar = figure.colorbar(image, cax=axes)
-    ticks = np.arange(-MOST, MOST + 1)
+    ticks = np.arange(-octaves, octaves + 1.0)
     bar.locator = FixedLocator(list(ticks))
     bar.update_ticks()
     words = [f"{2 ** abs(t):.0f} × too {'many' if t > 0 else 'few'}" if t else "equal" for t in ticks]

@@ -4,17 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from html import escape
+from string import Template
 
-from dase.figures.style import Plate, format_number
+from dase.figures.style import Colour, Plate, format_number
 from dase.results import Cell
 from dase.version import __version__
 
-FIRST = 12
-"""Cells that are listed at once; the others are folded away."""
-
-STYLE = """
-:root { color-scheme: light; --ink: #262b30; --quiet: #6b7278; --line: #e2e5e8;
-  --wash: #f6f7f8; --green: #1d8a6b; }
+PAGE_STYLE = Template("""
+:root { color-scheme: light; --ink: $INK; --quiet: $PAGE_QUIET; --line: $PAGE_LINE;
+  --wash: $PAGE_WASH; --green: $BOTH; }
 * { box-sizing: border-box; }
 html { background: #fff; color: var(--ink); font: 17px/1.55 system-ui, -apple-system, "Segoe UI", Roboto,
   "Helvetica Neue", "DejaVu Sans", sans-serif; -webkit-text-size-adjust: 100%; }
@@ -26,7 +24,7 @@ h2 { font-size: 1.2rem; margin: 2.75rem 0 0.75rem; font-weight: 650; }
 p { margin: 0.5rem 0; max-width: 46rem; }
 .small, figcaption, footer { color: var(--quiet); font-size: 0.85rem; line-height: 1.5; }
 .verdict { font-size: 1.15rem; border-left: 4px solid var(--green); padding: 0.15rem 0 0.15rem 1rem; }
-.verdict.wrong { border-color: #c0392b; }
+.verdict.wrong { border-color: $ON; }
 figure { margin: 1.5rem 0 2.25rem; }
 figure img { width: 100%; height: auto; display: block; border: 1px solid var(--line); border-radius: 6px; }
 figcaption { margin-top: 0.6rem; max-width: 46rem; }
@@ -47,7 +45,8 @@ pre { background: var(--wash); padding: 1rem; border-radius: 6px; overflow-x: au
 ul.notes { padding-left: 1.1rem; }
 footer { margin-top: 3rem; border-top: 1px solid var(--line); padding-top: 1rem; }
 @media print { body { max-width: none; padding: 0; } figure, li { break-inside: avoid; } }
-"""
+""")
+"""Its colours are names of `Colour`."""
 
 
 def html_document(title: str, kind: str, body: Iterable[str], seconds: float, foot: str = "") -> str:
@@ -62,11 +61,12 @@ def html_document(title: str, kind: str, body: Iterable[str], seconds: float, fo
     """
     took = f" in {format_number(seconds)} s" if seconds else ""
     made = f"Made by dase {escape(__version__)}{took}."
+    style = PAGE_STYLE.substitute({colour.name: colour.value for colour in Colour})
     floor = "1 is the noise floor: the error of two repeats of one measurement."
     return (
         '<!doctype html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'
         '<meta name="viewport" content="width=device-width, initial-scale=1">\n'
-        f"<title>{escape(title)}</title>\n<style>{STYLE}</style>\n</head>\n<body>\n"
+        f"<title>{escape(title)}</title>\n<style>{style}</style>\n</head>\n<body>\n"
         f'<header><div class="small">dase {escape(kind)}</div>\n<h1>{escape(title)}</h1>\n</header>\n'
         + "\n".join(part for part in body if part)
         + f"\n<footer>{escape(foot)} {made} {floor}</footer>\n</body>\n</html>\n"
@@ -84,8 +84,14 @@ def figure_html(plate: Plate) -> str:
     return f'<figure><img alt="{alt}" src="{plate.data_uri()}"><figcaption>{words}</figcaption></figure>'
 
 
-def cells_html(found: Sequence[Cell], nothing: str = "") -> str:
-    """Return a list of cells, worst first; `nothing` is said when there is none."""
+def cells_html(found: Sequence[Cell], nothing: str = "", *, first: int = 12) -> str:
+    """Return a list of cells, worst first.
+
+    Args:
+        found: At least those that are notable.
+        nothing: What is said when there is none.
+        first: Cells that are listed at once; the others are folded away.
+    """
     if not found:
         return f"<p>{escape(nothing)}</p>" if nothing else ""
     most = max(abs(cell.z) for cell in found) or 1.0
@@ -94,9 +100,9 @@ def cells_html(found: Sequence[Cell], nothing: str = "") -> str:
         f'<div class="bar" style="width:{100 * abs(cell.z) / most:.1f}%"></div></li>'
         for cell in found
     ]
-    first, rest = "".join(items[:FIRST]), "".join(items[FIRST:])
-    more = folded_html(f"{len(items) - FIRST} more", f'<ol class="cells">{rest}</ol>') if rest else ""
-    return f'<ol class="cells">{first}</ol>{more}'
+    listed, rest = "".join(items[:first]), "".join(items[first:])
+    more = folded_html(f"{len(items) - first} more", f'<ol class="cells">{rest}</ol>') if rest else ""
+    return f'<ol class="cells">{listed}</ol>{more}'
 
 
 def table_html(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:

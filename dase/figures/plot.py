@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from matplotlib.figure import Figure
 
-from dase.diagnosis.distinguish import POWER
+from dase.diagnosis import distinguish
 from dase.figures import diagnosis_figures, report
 from dase.results import Comparison, Diagnosis, Distinction, Fit
 
@@ -30,5 +30,5 @@ def plot(found: Comparison | Fit | Diagnosis | Distinction, *, names: tuple[str,
         return report.staircase_of(found).alone()
     if isinstance(found, Distinction):
         tried = {answer.stimulus: answer.tried for answer in found.answers}
-        return diagnosis_figures.draw_powers(tried, enough=POWER, names=names).alone()
+        return diagnosis_figures.draw_powers(tried, enough=distinguish.DEFAULTS.power, names=names).alone()
     raise TypeError(f"nothing to draw of a {type(found).__name__}")

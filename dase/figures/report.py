@@ -11,12 +11,12 @@ from pathlib import Path
 
 import numpy as np
 
-from dase.diagnosis.measurement import Measurement
 from dase.events import Events
 from dase.figures import diagnosis_figures
 from dase.figures import html as html_page
 from dase.figures.event_maps import event_plates
 from dase.figures.style import Plate, format_number
+from dase.fitting.measurement import Measurement
 from dase.io import replacing
 from dase.probes.statistics import FAMILY_WORDS
 from dase.results import Comparison, Diagnosis, Estimate, Step
@@ -24,11 +24,6 @@ from dase.scenes.between_frames import CameraScene
 from dase.simulation.sensor import Sensor
 from dase.simulation.sensor_file import dump_sensor
 from dase.simulation.simulate import stream
-
-LONGEST = 2.0
-"""Of what is pictured [s]."""
-
-BELIEVED = "Events are shown only where and when the scene between the frames can be trusted."
 
 
 def write_page(path: Path, html: str) -> None:
@@ -38,7 +33,7 @@ def write_page(path: Path, html: str) -> None:
 
 
 def measurement_plates(
-    measured: Measurement, sensor: Sensor, *, seed: int = 0, device: str = "cpu"
+    measured: Measurement, sensor: Sensor, *, seed: int = 0, device: str = "cpu", longest: float = 2.0
 ) -> list[Plate]:
     """Return pictures of a measurement beside what a model makes of its scene, its first seconds.
 
@@ -47,9 +42,10 @@ def measurement_plates(
         sensor: The model.
         seed: Of every random number of the simulation.
         device: `cpu`, `cuda` or a Warp name.
+        longest: Of what is pictured [s].
     """
     times = measured.scene.sample_times()
-    begin, end = float(times[0]), min(float(times[-1]), float(times[0]) + LONGEST)
+    begin, end = float(times[0]), min(float(times[-1]), float(times[0]) + longest)
     parts = []
     for part in stream(measured.scene, sensor, seed=seed, device=device):
         parts.append(part)
@@ -62,7 +58,8 @@ def measurement_plates(
         return event_plates(real, made, (begin, end), frames=frames, frame_times=shown)
     real, made = measured.scene.trusted_events(real), measured.scene.trusted_events(made)
     plates = event_plates(real, made, (begin, end), frames=frames, frame_times=shown)
-    return [replace(plate, caption=f"{plate.caption} {BELIEVED}") for plate in plates]
+    believed = "Events are shown only where and when the scene between the frames can be trusted."
+    return [replace(plate, caption=f"{plate.caption} {believed}") for plate in plates]
 
 
 def comparison_page(
@@ -101,8 +98,8 @@ def comparison_verdict(found: Comparison) -> str:
     worst = max(found.families, key=lambda name: found.families[name], default="")
     about = f" It is worst in {family_words(worst)}." if worst else ""
     return (
-        f"The model is wrong: its error on held-out pixels and time is {format_number(found.error)} times the noise "
-        f"floor, where chance alone reaches {format_number(found.gate)}.{about}"
+        f"The model is wrong: its error on held-out pixels and time is {format_number(found.error)} "
+        f"times the noise floor, where chance alone reaches {format_number(found.gate)}.{about}"
     )
 
 

@@ -13,25 +13,73 @@ import re
 import textwrap
 from collections.abc import Iterable
 from dataclasses import dataclass
+from enum import StrEnum
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 from matplotlib import rc_context
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.colors import LinearSegmentedColormap
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 from numpy.typing import NDArray
 
-from dase.recordings.statistics import Statistics as Statistics
 
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
+class Colour(StrEnum):
+    """Every colour of a figure or a page."""
+
+    INK = "#262b30"
+    """Words, and what was measured."""
+
+    QUIET = "#80868c"
+    """Words and lines that stand behind."""
+
+    LINE = "#c4c8cc"
+    """Axes and frames."""
+
+    WASH = "#f3f4f5"
+    """Surfaces behind marks."""
+
+    ON = "#c0392b"
+    """ON events of a model; also what is wrong."""
+
+    OFF = "#2f6fb5"
+    """OFF events of a model."""
+
+    BOTH = "#1d8a6b"
+    """Events of both polarities; also the noise floor and what is right."""
+
+    CHANCE = "#dcefe8"
+    """`BOTH` at the opacity of the band of chance, for legends."""
+
+    DOUBT = "#c9952b"
+    """Where a scene is in doubt, as words."""
+
+    VEIL = "#edc25c"
+    """The same laid over a picture."""
+
+    BLIND = "#6f6f6f"
+    """Where no frame tells anything, as words."""
+
+    HATCH = "#cccccc"
+    """The same as lines over a picture."""
+
+    PAGE_QUIET = "#6b7278"
+    """`QUIET` for small letters of a page, which need more contrast."""
+
+    PAGE_LINE = "#e2e5e8"
+    """Lines of a page."""
+
+    PAGE_WASH = "#f6f7f8"
+    """Surfaces of a page."""
 
 
-INK, QUIET, LINE, WASH = "#262b30", "#80868c", "#c4c8cc", "#f3f4f5"
-ON, OFF, BOTH = "#c0392b", "#2f6fb5", "#1d8a6b"
+TOO_FEW_TO_TOO_MANY = LinearSegmentedColormap.from_list(
+    "dase", ["#1b4f8f", "#86add3", "#f5f5f3", "#dfa67f", "#a23b16"]
+)
+"""Colours of a map of differences, equal in the middle."""
+
 WIDE = 9.6
 """Width of a figure [inch]."""
 
@@ -69,7 +117,7 @@ class Plate:
             "\n".join(lines),
             va="top",
             fontsize=8.5,
-            color=QUIET,
+            color=Colour.QUIET,
             linespacing=1.35,
         )
         return alone
@@ -101,8 +149,10 @@ def titled_figure(height: float, title: str, about: str = "") -> Figure:
     """Return an empty figure with a title and a quieter line under it; axes begin 0.75 inch below the top."""
     figure = Figure(figsize=(WIDE, height), dpi=160, facecolor="white")
     FigureCanvasAgg(figure)
-    figure.text(0.3 / WIDE, 1 - 0.24 / height, title, fontsize=12.5, color=INK, weight="bold", va="center")
-    figure.text(0.3 / WIDE, 1 - 0.5 / height, about, fontsize=9, color=QUIET, va="center")
+    figure.text(
+        0.3 / WIDE, 1 - 0.24 / height, title, fontsize=12.5, color=Colour.INK, weight="bold", va="center"
+    )
+    figure.text(0.3 / WIDE, 1 - 0.5 / height, about, fontsize=9, color=Colour.QUIET, va="center")
     return figure
 
 
@@ -111,16 +161,16 @@ def place_axes(figure: Figure, left: float, top: float, width: float, height: fl
     wide, tall = figure.get_size_inches()
     axes = figure.add_axes((left / wide, 1 - (top + height) / tall, width / wide, height / tall))
     axes.spines[["top", "right"]].set_visible(False)
-    axes.spines[["left", "bottom"]].set(color=LINE, linewidth=0.8)
-    axes.tick_params(colors=INK, labelsize=8.5, color=LINE, which="both", length=3)
+    axes.spines[["left", "bottom"]].set(color=Colour.LINE, linewidth=0.8)
+    axes.tick_params(colors=Colour.INK, labelsize=8.5, color=Colour.LINE, which="both", length=3)
     return axes
 
 
 def label_axes(axes: Axes, x: str = "", y: str = "", title: str = "") -> None:
     """Name the axes, with units, and the panel."""
-    axes.set_xlabel(x, fontsize=9, color=INK, labelpad=4)
-    axes.set_ylabel(y, fontsize=9, color=INK, labelpad=4)
-    axes.set_title(title, fontsize=9.5, color=INK, loc="left", pad=6)
+    axes.set_xlabel(x, fontsize=9, color=Colour.INK, labelpad=4)
+    axes.set_ylabel(y, fontsize=9, color=Colour.INK, labelpad=4)
+    axes.set_title(title, fontsize=9.5, color=Colour.INK, loc="left", pad=6)
 
 
 def add_legend(figure: Figure, entries: Iterable[tuple[str, str, str]], right: float = 0.3) -> None:
@@ -128,7 +178,9 @@ def add_legend(figure: Figure, entries: Iterable[tuple[str, str, str]], right: f
     wide, tall = figure.get_size_inches()
     x = wide - right
     for kind, colour, words in reversed(list(entries)):
-        said = figure.text(x / wide, 1 - 0.24 / tall, words, fontsize=9, color=INK, ha="right", va="center")
+        said = figure.text(
+            x / wide, 1 - 0.24 / tall, words, fontsize=9, color=Colour.INK, ha="right", va="center"
+        )
         box = said.get_window_extent(FigureCanvasAgg(figure).get_renderer())
         x -= box.width / figure.dpi + 0.1
         mark = place_axes(figure, x - 0.24, 0.14, 0.24, 0.2)
@@ -148,7 +200,7 @@ def add_legend(figure: Figure, entries: Iterable[tuple[str, str, str]], right: f
 def colour_of(words: str) -> str:
     """Return the colour of what a model makes: red where the words are about ON events, blue for OFF."""
     on, off = (bool(re.search(rf"\b{word}\b", words)) for word in ("ON", "OFF"))
-    return ON if on and not off else OFF if off and not on else BOTH
+    return Colour.ON if on and not off else Colour.OFF if off and not on else Colour.BOTH
 
 
 def format_number(value: float) -> str:
@@ -172,6 +224,3 @@ def log_axis(axes: Axes, which: str) -> None:
     axis.set_major_locator(LogLocator(subs=(1,) if decades > 2.5 else (1, 3) if decades > 1.2 else (1, 2, 5)))
     axis.set_major_formatter(FuncFormatter(lambda value, _: format_number(value)))
     axis.set_minor_formatter(NullFormatter())
-
-
-ON, OFF = "#c0392b", "#2f6fb5"

@@ -14,11 +14,8 @@ from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 
 from dase.errors import InputError
-from dase.figures.contact_sheet import INK, QUIET, figure_in_inches
-from dase.figures.style import OFF, ON
-
-EXAMPLES, LOG = "examples.npz", "log.csv"
-COLUMNS = ("scene", "events of the target", "simulated events", "mean threshold", "spread")
+from dase.figures.contact_sheet import figure_in_inches
+from dase.figures.style import Colour
 
 
 def draw_training(folder: Path) -> tuple[Figure, list[tuple[str, str]]]:
@@ -30,16 +27,16 @@ def draw_training(folder: Path) -> tuple[Figure, list[tuple[str, str]]]:
     Raises:
         InputError: The run has not come to its end.
     """
-    path = folder / EXAMPLES
+    path = folder / "examples.npz"  # as a training run leaves it
     if not path.is_file():
-        raise InputError(f"{folder} holds a run that has not ended; go on with it by --resume")
+        raise InputError(f"{folder} holds a run that has not ended; resume it first")
     with np.load(path) as data:
         found = {name: data[name] for name in data.files}
-    rows = _read_log(folder / LOG)
+    rows = _read_log(folder / "log.csv")
     figure, pictures, plots = _lay_out(len(found["grey"]), found["grey"].shape[2] / found["grey"].shape[1])
     same = np.allclose(found["grey"], found["real_grey"], atol=2e-3)
-    titles = [*COLUMNS]
-    titles[1] = titles[1] if same else "target, other scenes"
+    target = "events of the target" if same else "target, other scenes"
+    titles = ("scene", target, "simulated events", "mean threshold", "spread")
     scales = {name: tuple(np.percentile(found[name], (1, 99))) for name in ("mu", "sigma")}
     most = float(np.percentile(np.concatenate([found["real"], found["simulated"]]).sum(1), 99.5))
     for n, line in enumerate(pictures):
@@ -55,7 +52,7 @@ def draw_training(folder: Path) -> tuple[Figure, list[tuple[str, str]]]:
         for axes, title in zip(line, titles, strict=True):
             axes.set(xticks=[], yticks=[])
             if n == 0:
-                axes.set_title(title, fontsize=9, color=INK, loc="left", pad=4)
+                axes.set_title(title, fontsize=9, color=Colour.INK, loc="left", pad=4)
     _draw_curves(plots, rows)
     tall = figure.get_figheight()
     figure.text(
@@ -63,14 +60,14 @@ def draw_training(folder: Path) -> tuple[Figure, list[tuple[str, str]]]:
         1 - 0.3 / tall,
         folder.name,
         fontsize=13,
-        color=INK,
+        color=Colour.INK,
         weight="bold",
         va="center",
         parse_math=False,
     )
     lines = _summary_lines(rows[-1], found, same=same)
     said = "   ".join(f"{name} {value}" for name, value in lines[:4])
-    figure.text(0.35 / 11, 1 - 0.57 / tall, said, fontsize=9, color=INK, va="center")
+    figure.text(0.35 / 11, 1 - 0.57 / tall, said, fontsize=9, color=Colour.INK, va="center")
     return figure, lines
 
 
@@ -124,7 +121,7 @@ def _event_picture(counts: NDArray[Any], grey: NDArray[Any], most: float) -> NDA
     pale = np.repeat(0.75 + 0.25 * np.clip(grey, 0, 1)[..., None], 3, -1).astype(np.float64)
     total = counts.sum(0)
     on = (counts[1] / np.maximum(total, 1e-9))[..., None]
-    colour = on * np.array(to_rgb(ON)) + (1 - on) * np.array(to_rgb(OFF))
+    colour = on * np.array(to_rgb(Colour.ON)) + (1 - on) * np.array(to_rgb(Colour.OFF))
     opacity = np.where(total > 0, 0.35 + 0.65 * np.minimum(total / most, 1), 0)[..., None]
     return np.asarray(pale * (1 - opacity) + colour * opacity)
 
@@ -136,27 +133,27 @@ def _draw_scale(figure: Figure, axes: Axes, shown: Any) -> None:
     place = figure.add_axes((box.x1 + 0.6 * thin, box.y0, thin, box.height))
     bar = figure.colorbar(shown, cax=place, ticks=MaxNLocator(4, prune="both"))
     bar.outline.set_visible(False)
-    place.tick_params(labelsize=6.5, colors=INK, length=2, width=0.5, pad=1.5)
+    place.tick_params(labelsize=6.5, colors=Colour.INK, length=2, width=0.5, pad=1.5)
 
 
 def _draw_curves(plots: list[Axes], rows: list[dict[str, float]]) -> None:
     """Draw how the thresholds went, and how far both sides are apart."""
     trained = [row for row in rows if row["step"] >= 0]
     steps = [row["step"] for row in trained]
-    for name, label, colour in (("mu", "mean", INK), ("sigma", "spread", QUIET)):
+    for name, label, colour in (("mu", "mean", Colour.INK), ("sigma", "spread", Colour.QUIET)):
         plots[0].plot(steps, [row[name] for row in trained], color=colour, linewidth=1.2, label=label)
     plots[0].set_ylim(bottom=0)
-    plots[0].set_ylabel("threshold [log intensity]", fontsize=9, color=INK)
-    shown = [("distance", "distance", QUIET)]
-    shown += [("kl", "KL from the truth", ON)] if "kl" in trained[-1] else []
-    shown += [("held_out", "held out", OFF)] if any("held_out" in row for row in trained) else []
+    plots[0].set_ylabel("threshold [log intensity]", fontsize=9, color=Colour.INK)
+    shown = [("distance", "distance", Colour.QUIET)]
+    shown += [("kl", "KL from the truth", Colour.ON)] if "kl" in trained[-1] else []
+    shown += [("held_out", "held out", Colour.OFF)] if any("held_out" in row for row in trained) else []
     for name, label, colour in shown:
         known = [(row["step"], row[name]) for row in trained if row.get(name, 0) > 0]
         if known:
             plots[1].plot(*zip(*known, strict=True), color=colour, linewidth=1.2, label=label)
     plots[1].set_yscale("log")
     for plot in plots:
-        plot.set_xlabel("step", fontsize=9, color=INK)
+        plot.set_xlabel("step", fontsize=9, color=Colour.INK)
         legend = plot.legend(loc="lower right", bbox_to_anchor=(1.02, 1), ncols=3, fontsize=8, frameon=False)
         for text in legend.get_texts():
-            text.set_color(INK)
+            text.set_color(Colour.INK)

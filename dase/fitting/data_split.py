@@ -10,20 +10,21 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from dase.effects.base import Observations
 from dase.errors import InputError, checked_seed
 from dase.events import Events
 from dase.fitting.batch_simulator import BatchSimulator
 from dase.fitting.bus_load import WholeSensor
 from dase.fitting.pixel_selection import choose_trusted_pixels, find_trusted_parts
-from dase.fitting.subset import Array, PixelSubset
+from dase.fitting.subset import Array, CalibratedSubset, PixelSubset
 from dase.kernels import event_probes as kernels
 from dase.kernels import launch
 from dase.probes.accumulators import ProbeSums, StatisticsFrame
+from dase.probes.random_streams import Draw
 from dase.probes.statistics import peak_of, refine_frequency, ring_of_pixels
 from dase.probes.stimulus import (
-    COARSEST,
-    FINEST,
     MASKED,
+    STIMULUS,
     Grid,
     Stimulus,
     Trust,
@@ -31,29 +32,39 @@ from dase.probes.stimulus import (
     light_of,
     sort_into_cells,
 )
-from dase.probes.timestamp_patterns import FILE, TimestampStructure, find_structure
+from dase.probes.timestamp_patterns import PATTERNS, TimestampStructure, find_structure
 from dase.scenes.between_frames import CameraScene
 from dase.scenes.scene import Scene
 
-PIXELS = 1500
-"""Pixels in each half of the measurement."""
 
-SCOUTS = 500
-"""Pixels of the scout."""
+@dataclass(frozen=True)
+class SplitSettings:
+    """How a measurement is split, and what there must be of it."""
 
-SPLIT = 0.6
-"""Share of the time that is fitted; the rest is held out."""
+    pixels: int = 1500
+    """Pixels in each half of the measurement."""
 
-LEAST = 300
-"""Events that a half must have for anything to be said."""
+    scouts: int = 500
+    """Pixels of the scout, a third of those that are fitted: sampling errors are larger by less than 2."""
 
-COMMON = 1e-3
+    fitted_share: float = 0.6
+    """Share of the time that is fitted; the rest is held out. What judges needs less than what is fitted."""
 
-BUSY = 2e-3
-"""Events are counted for so long to see how fast they come at most [s]."""
+    least_pixels: int = 16
+    """Pixels without which a half says nothing."""
+
+    least_events: int = 300
+    """Events that a half must have for anything to be said."""
+
+    burst: float = 2e-3
+    """Events are counted for so long to see how fast they come at most [s]: long enough for many of them,
+    and short enough for a bus to be full all the time."""
 
 
-@dataclass(eq=False)
+SPLIT = SplitSettings()
+
+
+@dataclass(frozen=True, eq=False)
 class SplitMeasurement:
     """A measurement and the scene it is of.
 
@@ -79,10 +90,30 @@ class SplitMeasurement:
     least_bus_rate: float
     notes: tuple[str, ...] = ()
 
+    def observe(self, *, idle_bus: float) -> Observations:
+        """Return what effects may choose their candidates by, see `Observations`."""
+        return Observations(
+            peak_frequency=self.peak,
+            clock_period=self.structure.step,
+            line_time=self.structure.line,
+            scan_direction=self.structure.direction,
+            highest_event_rate=self.highest_event_rate,
+            least_bus_rate=self.least_bus_rate,
+            idle_bus=idle_bus,
+        )
+
     @property
     def evaluations(self) -> int:
         """Models run so far."""
         return sum(half.trials.evaluations for half in (self.train, self.held, self.scout))
+
+
+@dataclass(frozen=True, eq=False)
+class CalibratedSplit(SplitMeasurement):
+    """A measurement with a present model on its training half and its scout, for comparing candidates."""
+
+    train: CalibratedSubset
+    scout: CalibratedSubset
 
 
 def split_measurement(
@@ -91,9 +122,10 @@ def split_measurement(
     *,
     log_eps: float = 1e-3,
     trust: Trust | None = None,
-    pixels: int = PIXELS,
+    pixels: int = SPLIT.pixels,
     seed: int = 0,
     device: str = "cpu",
+    settings: SplitSettings = SPLIT,
 ) -> SplitMeasurement:
     """Split a measurement into a half that is fitted and a half that judges.
 
@@ -106,6 +138,7 @@ def split_measurement(
         pixels: In each half.
         seed: Of the choice of pixels.
         device: Where kernels run.
+        settings: How it is split.
 
     Raises:
         InputError: Different sizes, no common time, or too few events.
@@ -121,32 +154,41 @@ def split_measurement(
         raise InputError(str(error)) from error
     size = scene.width * scene.height
     each = min(pixels, size // 2)
-    if each < 16:
-        raise InputError(f"a diagnosis needs at least 32 pixels, the scene has {scene.width}x{scene.height}")
-    rng, notes = np.random.default_rng([seed, 1]), []
-    cut = max(2, round(SPLIT * grid.steps))
+    if each < settings.least_pixels:
+        raise InputError(
+            f"a diagnosis needs at least {2 * settings.least_pixels} pixels, "
+            f"the scene has {scene.width}x{scene.height}"
+        )
+    rng, notes = Draw.PIXELS.generator(seed), []
+    # time is cut, not drawn: moments between fitted ones would be known from these
+    cut = max(2, round(settings.fitted_share * grid.steps))
     if trust is None:
+        # other pixels judge: fixed patterns, such as mismatch, would be known from the fitted ones
         chosen = rng.permutation(size)[: 2 * each].astype(np.int32)
     else:
         looks = find_trusted_parts(events, scene, _times_of_grid(scene, grid), cut, trust)
-        chosen = choose_trusted_pixels(looks, each, rng)
+        chosen = choose_trusted_pixels(looks, each, rng, least=settings.least_pixels)
         each = len(chosen) // 2
         notes.append(looks.sentence())
+    # from the begin of the scene also for the half that judges: filters and memories are settled there
     light = light_of(scene, _times_of_grid(scene, grid), chosen)
     if not np.all(np.isfinite(light)) or light.min() < 0:
         raise InputError("scene: intensities must be finite and >= 0")
     good = np.ones(light.shape, np.bool_) if trust is None else trust(grid.times, chosen).T.copy()
     good[:, 1:] &= good[:, :-1]  # a step is what lies between two points of the grid
+    # both halves have the same bands, or a cell would mean another brightness in each
     bands = band_edges(light, good)
     sorting = partial(sort_into_cells, step=grid.step, bands=bands, log_eps=log_eps)
+    # filters over time go pixel by pixel, so parts of the pixels give the same as all of them
     works: list[Callable[[], Any]] = [partial(sorting, part) for part in np.array_split(light, 8)]
     works.append(partial(find_structure, events))
     *parts, structure = launch.run_concurrently(works)
     cell = np.concatenate(parts)
     cell[~good] = MASKED
-    cell[:, 0] = MASKED
+    cell[:, 0] = MASKED  # no step ends at the first point
     first, last = slice(0, each), slice(each, 2 * each)
     train_grid = replace(grid, steps=cut)
+    # what judges is simulated over all of the time and compared in the later part only
     late = cell[last].copy()
     late[:, :cut] = MASKED
     halves: list[PixelSubset] = []
@@ -156,22 +198,31 @@ def split_measurement(
             trust is not None,
         )  # fmt: skip
         halves.append(_make_subset(stimulus, events, cut if span is grid else 0, structure))
-    _require_enough_events(halves, events, grid, notes)
-    halves.append(_make_subset(halves[0].trials.stimulus.part(SCOUTS), events, 0, structure))
+    _require_enough_events(halves, events, grid, notes, settings.least_events)
+    halves.append(_make_subset(halves[0].trials.stimulus.part(settings.scouts), events, 0, structure))
+    # seen in the fitted half: what judges must not choose
     peak = peak_of(halves[0].found.clock[0], grid.step)
     if trust is None:  # else most events are where the scene is not known
         peak = refine_frequency(events, grid.begin, grid.begin + cut * grid.step, peak)
-    for half in halves:
-        half.frame = replace(half.frame, peak=peak)
-        # where the scene is trusted here and there only, nobody knows what all pixels send
-        half.around = WholeSensor(scene, _times_of_grid(scene, grid), seed, device) if trust is None else None
-    train, held, scout = halves
+    train, held, scout = (
+        replace(
+            half,
+            frame=replace(half.frame, peak=peak),
+            # where the scene is trusted here and there only, nobody knows what all pixels send
+            around=WholeSensor(scene, _times_of_grid(scene, grid), seed, device) if trust is None else None,
+        )
+        for half in halves
+    )
     rates = highest_event_rate(events), least_bus_rate(events, structure)
     return SplitMeasurement(train, held, scout, bands, structure, peak, *rates, tuple(notes))
 
 
 def common_grid(events: Events, scene: Scene) -> Grid:
-    """Return the time that scene and events have in common, in equal steps."""
+    """Return the time that scene and events have in common, in equal steps [s].
+
+    Raises:
+        InputError: Different sizes, no events, or no time in common.
+    """
     if (events.width, events.height) != (scene.width, scene.height):
         raise InputError(
             f"recording and scene must have one size, got {events.width}x{events.height} "
@@ -186,9 +237,12 @@ def common_grid(events: Events, scene: Scene) -> Grid:
             f"recording and scene must overlap in time, got events from {events.t[0]:.6g} s to "
             f"{events.t[-1]:.6g} s and a scene from {begin:.6g} s to {end:.6g} s"
         )
+    # steps of the scene itself need no interpolation, which would smooth what happens between them
     step = np.diff(times)
-    even = len(step) > 0 and np.ptp(step) < 1e-3 * step.mean() and FINEST <= step.mean() <= COARSEST
-    h = float(step.mean()) if even else COMMON
+    even = len(step) > 0 and np.ptp(step) < 1e-3 * step.mean()
+    own = even and STIMULUS.finest_step <= step.mean() <= STIMULUS.coarsest_step
+    h = float(step.mean()) if own else STIMULUS.common_step
+    # after the last event a step or two of silence count, not minutes: the recording may have ended there
     last = min(end, float(events.t[-1]) + 2 * h)
     steps = int(np.floor((last - begin) / h + 1e-6)) + 1
     return Grid(begin, h, max(steps, 2))
@@ -196,21 +250,23 @@ def common_grid(events: Events, scene: Scene) -> Grid:
 
 def highest_event_rate(events: Events) -> float:
     """Return the most events per second [Hz]: the rate of a bus, if it ever was full for long enough."""
-    counts = np.bincount(((events.t - events.t[0]) / BUSY).astype(np.int64))
-    return float(counts.max()) / BUSY
+    counts = np.bincount(((events.t - events.t[0]) / SPLIT.burst).astype(np.int64))
+    return float(counts.max()) / SPLIT.burst
 
 
 def least_bus_rate(events: Events, structure: TimestampStructure) -> float:
     """Return the events per second that a bus can send at least [Hz], as it has sent some as fast as that."""
     if structure.line:
         return 0.0  # stamps tell when a line was read
-    slack = max(FILE, structure.step)
+    slack = max(PATTERNS.file_step, structure.step)
+    # runs of all lengths: the time of short ones is rounded by the clock, long ones have pauses
     runs = (2**n for n in range(13) if 2**n < len(events))
     return max((n / (float((events.t[n:] - events.t[:-n]).min()) + slack) for n in runs), default=0.0)
 
 
 def _times_of_grid(scene: Scene, grid: Grid) -> NDArray[np.float64]:
     """Return the times of the grid, those of the scene itself where they are the same but for rounding."""
+    # a scene that is asked for its own times gives its own frames, to the bit
     own = scene.sample_times()[: grid.steps]
     same = len(own) == grid.steps and np.allclose(own, grid.times, rtol=0, atol=1e-3 * grid.step)
     return own if same else grid.times
@@ -232,18 +288,22 @@ def _make_subset(
 
 def typical_changes(sums: ProbeSums) -> NDArray[np.float32]:
     """Return the mean change of the light between two events by polarities and interval, (4 CLASSES,)."""
-    pairs = sums.sums[0, kernels.CHANGE : kernels.CHANGE + 12 * kernels.CLASSES].reshape(-1, 3)
+    pairs = sums.sums[0, kernels.SumPlace.CHANGE : kernels.SumPlace.CHANGE + 12 * kernels.CLASSES].reshape(
+        -1, 3
+    )
     return (pairs[:, 1] / np.maximum(pairs[:, 0], 1)).astype(np.float32)
 
 
-def _require_enough_events(halves: list[PixelSubset], events: Events, grid: Grid, notes: list[str]) -> None:
+def _require_enough_events(
+    halves: list[PixelSubset], events: Events, grid: Grid, notes: list[str], least: int
+) -> None:
     for half, name in zip(halves, ("fitting", "judging"), strict=True):
         count = int(half.found.halves.sum())
-        if count < LEAST:
-            times = max(2.0, np.ceil(LEAST / max(count, 1)))
+        if count < least:
+            times = max(2.0, np.ceil(least / max(count, 1)))
             raise InputError(
                 f"too few events to say anything: {count} of the {len(events)} lie in the part for {name}, "
-                f"at least {LEAST} are needed; record about {times:.0f} times "
+                f"at least {least} are needed; record about {times:.0f} times "
                 f"as long as these {grid.step * (grid.steps - 1):.3g} s, or more motion"
                 + "".join(f"; {note}" for note in notes)
             )

@@ -4,45 +4,52 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from os import PathLike
 
 import numpy as np
 
-from dase.events import Events
-from dase.fitting.confidence_intervals import estimate_parameters
-from dase.fitting.data_split import PIXELS, SplitMeasurement, split_measurement
+from dase.fitting.confidence_intervals import REPEATS, estimate_parameters
+from dase.fitting.data_split import SPLIT, SplitMeasurement, split_measurement
+from dase.fitting.measurement import Measured, SceneChoice, as_measurement
 from dase.fitting.model import FittedModel, fit_present_model, model_of, refit_model
 from dase.fitting.parameter_space import SearchAxis
 from dase.probes.distance import Judgement
+from dase.probes.random_streams import Draw, SimulationStream
 from dase.probes.stimulus import Trust
 from dase.results import Estimate, Fit, Progress
-from dase.scenes.scene import Scene
 from dase.simulation.sensor import Sensor
+from dase.simulation.sensor_file import as_sensor
 
-REPEATS = 60
-"""Simulations with other seeds that tell what chance does."""
 
-OTHERS = 2
-"""Starts beside the wide look at thresholds."""
+@dataclass(frozen=True)
+class FitSettings:
+    """How many starts a fit has, and when they agree."""
 
-MOST = 5
-"""The same where no two starts come to the same error."""
+    other_starts: int = 2
+    """Starts beside the wide look at thresholds."""
 
-AGREE = 3.0
-"""Starts agree where their ends lie within so many half-widths of the confidence interval, or `NEAR`."""
+    most_starts: int = 5
+    """The same where no two starts come to the same error."""
 
-NEAR = 0.08
-"""Of each other, in the units of `Axis.to_place`."""
+    agree: float = 3.0
+    """Starts agree where their ends lie within so many half-widths of the confidence interval."""
+
+    near: float = 0.08
+    """They agree as well where they lie within this of each other, in the units of `SearchAxis.to_place`."""
+
+
+FIT = FitSettings()
 
 
 def fit(
-    events: Events,
-    scene: Scene,
-    sensor: Sensor,
+    measured: Measured,
+    sensor: Sensor | str | PathLike[str],
     *,
+    scene: SceneChoice | None = None,
     free: Sequence[str] | None = None,
     trust: Trust | None = None,
-    pixels: int = PIXELS,
+    pixels: int = SPLIT.pixels,
     seed: int = 0,
     device: str = "cpu",
     progress: Progress | None = None,
@@ -50,9 +57,10 @@ def fit(
     """Fit the parameters of a sensor to a measurement.
 
     Args:
-        events: What was measured.
-        scene: What the camera saw, on the clock of the events.
-        sensor: Its effects are fitted; nothing is added.
+        measured: A recording or its path, a `Measurement`, or events; see `as_measurement`.
+        sensor: Its effects are fitted, nothing is added: a sensor, a preset's name, or a sensor file's path.
+        scene: What the camera saw, on the clock of the events: a scene, a clip's path, or `static` for light
+            that does not change. None for the frames of the recording; events alone need one.
         free: Effects or `effect.parameter` that are fitted; None for all.
         trust: Where and when the scene is to be trusted; None for everywhere, and for what a
             `CameraScene` trusts of itself.
@@ -66,19 +74,22 @@ def fit(
     """
     begin = time.perf_counter()
     tell = progress or (lambda text, share, error: None)
-    model_of(sensor, free)  # refuses names that are not there before anything takes time
-    sensor = sensor.bound_to(scene)
+    start = as_sensor(sensor)
+    model_of(start, free)  # refuses names that are not there before anything takes time
+    measurement = as_measurement(measured, scene, trust)
+    start = start.bound_to(measurement.scene)
     evidence = split_measurement(
-        events, scene, log_eps=sensor.log_eps, trust=trust, pixels=pixels, seed=seed, device=device
-    )
-    given = model_of(sensor, free)
-    before = given.judge(evidence.held, repeats=REPEATS // 2, seed=seed + 500).error
-    ends = _descend_from_starts(evidence, sensor, free, seed, lambda text, share: tell(text, share, before))
+        measurement.events, measurement.scene, log_eps=start.log_eps, trust=measurement.trust,
+        pixels=pixels, seed=seed, device=device,
+    )  # fmt: skip
+    given = model_of(start, free)
+    before = given.judge(evidence.held, repeats=REPEATS // 2, seed=SimulationStream.JUDGE.seed(seed)).error
+    ends = _descend_from_starts(evidence, start, free, seed, lambda text, share: tell(text, share, before))
     judgement, model = _best_end(ends)
     tell("confidence intervals", 0.9, judgement.error)
     good = _equally_good_models(ends)
     model, values = estimate_parameters(evidence, model, seed=seed)
-    judgement = model.judge(evidence.held, repeats=REPEATS, seed=seed + 500)
+    judgement = model.judge(evidence.held, repeats=REPEATS, seed=SimulationStream.JUDGE.seed(seed))
     apart = notes_on_disagreement(model, good, values)
     notes = [
         *evidence.notes,
@@ -86,7 +97,7 @@ def fit(
         *notes_on_implausible_values(model),
         *_notes_on_minimum(judgement, len(ends), len(good)),
     ]
-    return Fit(
+    found = Fit(
         sensor=model.sensor,
         parameters=values,
         error=judgement.error,
@@ -99,6 +110,7 @@ def fit(
         evaluations=evidence.evaluations,
         seconds=time.perf_counter() - begin,
     )
+    return measurement.noted(found)
 
 
 Ends = list[tuple[Judgement, FittedModel]]
@@ -114,13 +126,15 @@ def _descend_from_starts(
     """Return where several starts end, each with its held-out error."""
     tell("a wide look", 0.1)
     model = refit_model(evidence, fit_present_model(evidence, sensor, free, seed=seed), seed=seed)
-    ends = [(model.judge(evidence.held, repeats=REPEATS, seed=seed + 500), model)]
-    for n in range(MOST):
-        if n >= OTHERS and len(_equally_good_models(ends)) > 1:
+    ends = [(model.judge(evidence.held, repeats=REPEATS, seed=SimulationStream.JUDGE.seed(seed)), model)]
+    for n in range(FIT.most_starts):
+        if n >= FIT.other_starts and len(_equally_good_models(ends)) > 1:
             break
-        tell(f"start {n + 2}", 0.3 + 0.6 * n / MOST)
+        tell(f"start {n + 2}", 0.3 + 0.6 * n / FIT.most_starts)
         model = refit_model(evidence, _move_away(_best_end(ends)[1], seed + n), seed=seed + n)
-        ends.append((model.judge(evidence.held, repeats=REPEATS, seed=seed + 500), model))
+        ends.append(
+            (model.judge(evidence.held, repeats=REPEATS, seed=SimulationStream.JUDGE.seed(seed)), model)
+        )
     return ends
 
 
@@ -152,7 +166,7 @@ def _notes_on_minimum(judgement: Judgement, starts: int, good: int) -> list[str]
 
 def _move_away(model: FittedModel, seed: int) -> FittedModel:
     """Return the model well away from where it is."""
-    rng = np.random.default_rng([seed, 11])
+    rng = Draw.FAR_START.generator(seed)
     low, high = model.space.bounds()
     place = np.clip(model.place + rng.choice([-0.5, 0.5], len(model.place)), low, high)
     return replace(model, place=place)
@@ -166,7 +180,7 @@ def notes_on_disagreement(
     for n, axis in enumerate(best.space.axes):
         places = np.array([m.place[n] for m in ends])
         low, high = (float(axis.to_place(v)) for v in (values[axis.name].low, values[axis.name].high))
-        if np.ptp(places) > max(AGREE * 0.5 * (high - low), NEAR):
+        if np.ptp(places) > max(FIT.agree * 0.5 * (high - low), FIT.near):
             found = ", ".join(f"{float(axis.to_value(p)):.3g}" for p in sorted(places))
             out.append(f"{axis.name}: starts end at {found}; the data do not say which")
     return out

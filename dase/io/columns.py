@@ -66,7 +66,7 @@ class Hdf5Group:
     """
 
     def __init__(self, group: Any) -> None:
-        self._group = group
+        self._h5 = group
         self.attrs = group.attrs
         self.name = group.name
 
@@ -76,7 +76,7 @@ class Hdf5Group:
         Raises:
             InputError: It lies in another file, or links lead nowhere for too long.
         """
-        found = self._reach(self._group, name, [MOST_LINKS], name)
+        found = self._reach(self._h5, name, [MOST_LINKS], name)
         return default if found is None else found
 
     def __getitem__(self, name: str) -> Any:
@@ -89,7 +89,7 @@ class Hdf5Group:
         return self.get(name) is not None
 
     def __iter__(self) -> Iterator[str]:
-        return iter(self._group)
+        return iter(self._h5)
 
     def _reach(self, node: Any, name: str, left: list[int], asked: str) -> Any:
         """Walk from a group along a name; `left[0]` counts down the links that may still be followed.
@@ -111,7 +111,7 @@ class Hdf5Group:
                     raise InputError(f"'{asked}' is a link to a link, again and again")
                 target = node.id.links.get_val(part.encode()).decode("utf-8", "replace")
                 node = self._reach(node, target, left, asked)
-                node = node._group if isinstance(node, Hdf5Group) else node
+                node = node._h5 if isinstance(node, Hdf5Group) else node
             elif kind == h5py.h5l.TYPE_HARD:
                 node = node[part]
             else:

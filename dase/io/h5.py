@@ -47,7 +47,8 @@ BLOCK = 4 * CHUNK  # events gathered before they are written
 # fast.
 COMPRESSION: dict[str, Any] = {"compression": "gzip", "compression_opts": 1, "shuffle": True}
 
-HEAD = 4  # bytes that `deflate_bytes` flushes on their own: for a first entry of the hash table, at most 16
+HEAD = 4
+"""Bytes that `deflate_bytes` flushes on their own: enough for a first entry of the hash table, at most 16."""
 
 LATE = -1  # marks a frame that came after later events had been written
 

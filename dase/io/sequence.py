@@ -22,7 +22,7 @@ GREYS = (np.uint8, np.uint16)
 """Types of grey images; white is their largest number."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Sequence:
     """Events of one sensor and what is known beside them.
 
@@ -55,6 +55,12 @@ class Sequence:
             _check_shape(name, getattr(self, name), (*leading, *size))
         for name in ("frame_times", "frame_exposure"):
             _check_shape(name, getattr(self, name), (count,))
+
+    def __repr__(self) -> str:
+        names = ("frames", "frame_times", "flow", "thresholds", "frame_exposure")
+        arrays = [(name, getattr(self, name)) for name in names]
+        there = [f"  {name} {array.shape} {array.dtype}" for name, array in arrays if array is not None]
+        return "\n".join(["Sequence", f"  {self.events}", *there])
 
     @property
     def span(self) -> tuple[float, float]:

@@ -1,22 +1,21 @@
-"""How unlike simulated and real counts are, and which way the thresholds should move.
+"""The paper's objective: a bank of critics over hashed patches (Eqs. 10 to 13).
 
-Two objectives share the images: `AdversarialObjective`, the paper's bank of critics over hashed patches (Eqs. 10 to
-13), and `Moments`, which compares means of fixed features between pixels whose surroundings look alike.
+The other objective, which needs no adversary, is `dase.learning.moment_matching`.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Hashable
+from collections.abc import Hashable, Iterable
 from dataclasses import dataclass
-from typing import Any, Literal, Protocol
+from typing import Any, Literal
 
 import torch
 
 from dase.kernels import autograd_training as bridge
 from dase.learning import distributed
 from dase.learning.critic_bank import BankShape, CriticBank
-from dase.learning.targets import Pairs
+from dase.learning.targets import Pairs, PixelNoise
 from dase.networks.threshold_network import gradient_magnitude
 
 
@@ -62,7 +61,14 @@ class PatchHash:
 
 
 class PatchHasher:
-    """Sends patches to classes; boundaries of levels are quantiles of what `calibrate` was shown."""
+    """Sends patches to classes; boundaries of levels are quantiles of what `calibrate` was shown.
+
+    Args:
+        how: The attributes and their levels.
+
+    Attributes:
+        boundaries: Between the levels of an attribute by its name, float32 (levels - 1,).
+    """
 
     def __init__(self, how: PatchHash):
         self.how = how
@@ -96,6 +102,7 @@ class PatchHasher:
         size = self.how.size
         found = bridge.patch_structure(pairs.grey, size=size, stride=size)
         found = {name: value.flatten() for name, value in found.items()}
+        # without events the hash cannot depend on the thresholds that are being learned
         found["contrast"] = found["energy"]
         if self.how.contrast_from != "energy":
             found["contrast"] = bridge.patch_contrast(pairs.counts, size=size, stride=size).flatten()
@@ -105,88 +112,110 @@ class PatchHasher:
 
 
 def _quantile_boundaries(values: torch.Tensor, levels: int) -> torch.Tensor:
-    """Return the boundaries between `levels` equal shares."""
+    """Return the boundaries between `levels` equal shares of values of any shape, (levels - 1,)."""
     ordered = torch.sort(values.flatten()).values
     return torch.stack([ordered[round(n / levels * (len(ordered) - 1))] for n in range(1, levels)])
 
 
-class Objective(Protocol):
-    """What the loop asks of an objective."""
+@dataclass(frozen=True, kw_only=True)
+class AdversarialSettings:
+    """What can be chosen about the critics; the names are those of a run's `recipe.json`.
 
-    def calibrate(self, sets: list[tuple[Pairs, Pairs]]) -> None:
-        """Look at pairs of a fake and a real batch before training."""
+    Args:
+        critic_rate: Learning rate of the critics.
+        critic_cosine: Whether it falls as the generator's does, so that critics settle with it.
+        critic_steps: Steps of the critics in a step; more keep up with the generator better.
+        penalty: Weight of the gradient penalty.
+        uniform: α of Eq. 13: share of the weights that all classes have alike; 1 turns re-weighting off.
+        critic_image: Whether critics see the image too.
+        hash: Of the patches.
+    """
 
-    def begin(self) -> Hashable:
-        """Count a step that is about to come; return its kind, see `dase.learning.cuda_graph`."""
-
-    def loss(self, fake: Pairs, real: Pairs, *, move: bool) -> tuple[torch.Tensor, dict[str, torch.Tensor]]:
-        """Learn from both batches; return a loss whose gradient by the fake counts leads towards the real.
-
-        Without `move` the objective alone learns and the loss has no gradient.
-        """
-
-    def state(self) -> dict[str, Any]:
-        """Return all that the next step depends on."""
-
-    def load(self, state: dict[str, Any]) -> None:
-        """Take over what `state` returned."""
+    critic_rate: float = 2e-4
+    critic_cosine: bool = False
+    critic_steps: int = 1
+    penalty: float = 1.0
+    uniform: float = 0.5
+    critic_image: bool = False
+    hash: PatchHash = PatchHash()
 
 
 class AdversarialObjective:
     """The bank of critics (Eqs. 10, 11 and 13).
 
     Args:
-        how: The hash of patches.
+        settings: The hash of patches, and how critics learn.
         device: PyTorch device.
         seed: Of weights and shares.
-        rate: Learning rate of the critics; a tensor may be changed between steps that are replayed.
-        steps: Steps of the critics for each call.
-        penalty: Weight of the gradient penalty.
-        uniform: α of Eq. 13: share of the weights that all classes have alike.
-        image: Whether critics see the image too.
+
+    Attributes:
+        seen: Real patches of each class seen so far, float32 (classes,).
     """
 
-    def __init__(
-        self,
-        how: PatchHash,
-        *,
-        device: str | torch.device,
-        seed: int = 0,
-        rate: float | torch.Tensor = 2e-4,
-        steps: int = 1,
-        penalty: float = 1.0,
-        uniform: float = 0.5,
-        image: bool = False,
-    ):
-        self.hasher, self.device = PatchHasher(how), torch.device(device)
-        self.rate, self.steps, self.penalty, self.uniform, self.image = rate, steps, penalty, uniform, image
+    moves_shared = False
+
+    def __init__(self, settings: AdversarialSettings, *, device: str | torch.device, seed: int = 0):
+        self.settings, self.device = settings, torch.device(device)
+        how = settings.hash
+        self.hasher = PatchHasher(how)
         self.generator = torch.Generator(self.device).manual_seed(seed)
+        self.generators = [self.generator]
         self.seen = torch.zeros(how.classes, device=self.device)
-        shape = BankShape(classes=how.classes, inputs=(4 + image) * how.size**2)
+        # counts and gradient magnitudes of both polarities, and the image
+        channels = 4 + settings.critic_image
+        shape = BankShape(classes=how.classes, inputs=channels * how.size**2)
         self.bank = CriticBank(shape, device=self.device, generator=self.generator)
 
-    def calibrate(self, sets: list[tuple[Pairs, Pairs]]) -> None:
-        """Place the boundaries of the hash."""
+    def calibrate(self, sets: list[tuple[Pairs, Pairs]], held_out: Iterable[Pairs] = ()) -> None:
+        """Place the boundaries of the hash; held-out pairs are not looked at."""
         self.hasher.calibrate(*(pairs for both in sets for pairs in both))
         distributed.broadcast_tensors(self.hasher.boundaries.values())
 
-    def begin(self) -> Hashable:
+    def begin_step(self) -> Hashable:
         """All steps are of one kind, where products of groups are one launch."""
         return "all" if self.bank.one_launch() else None
 
+    def step_rates(self, share: float, *, move: bool) -> list[float]:
+        """Return the learning rate of the critics: the full one before the generator moves."""
+        falls = self.settings.critic_cosine and move
+        return [self.settings.critic_rate * (share if falls else 1.0)]
+
+    def extend_fake(
+        self,
+        fake: Pairs,
+        log: torch.Tensor,
+        mu: torch.Tensor,
+        sigma: torch.Tensor,
+        noise: PixelNoise,
+        step: torch.Tensor | int,
+    ) -> Pairs:
+        """Return the pairs as they are: critics look at images and counts alone."""
+        return fake
+
     def weights(self) -> torch.Tensor:
-        """Return ω of Eq. 13, from the real patches seen so far."""
+        """Return ω of Eq. 13, float32 (classes,), from the real patches seen so far."""
+        uniform = self.settings.uniform
         share = self.seen / self.seen.sum().clamp_min(1)
-        return self.uniform / len(share) + (1 - self.uniform) * share
+        return uniform / len(share) + (1 - uniform) * share
 
     def _patches(self, pairs: Pairs) -> torch.Tensor:
         maps = critic_maps(pairs.counts)
-        if self.image:
+        if self.settings.critic_image:
             maps = torch.cat([maps, pairs.grey[:, None]], 1)
         return cut_patches(maps, self.hasher.how.size)
 
-    def loss(self, fake: Pairs, real: Pairs, *, move: bool) -> tuple[torch.Tensor, dict[str, torch.Tensor]]:
-        """Move the critics, then return minus the weighted mean score of the fake patches."""
+    def loss(
+        self, fake: Pairs, real: Pairs, *, move: bool, rates: torch.Tensor | None = None
+    ) -> tuple[torch.Tensor, dict[str, torch.Tensor]]:
+        """Move the critics, then return minus the weighted mean score of the fake patches.
+
+        Args:
+            fake: Simulated pairs, whose counts have a gradient where `move`.
+            real: Pairs of the target.
+            move: Whether the network moves in this step; else the loss is 0.
+            rates: Learning rate of the critics, float32 (1,); None for that of the settings.
+        """
+        rate = self.settings.critic_rate if rates is None else rates[0]
         patches, others = (distributed.gather_values(self._patches(pairs)) for pairs in (fake, real))
         ours, theirs = (distributed.gather_values(self.hasher.classes(pairs)) for pairs in (fake, real))
         number, real_number = (self._number(classes) for classes in (ours, theirs))
@@ -195,10 +224,10 @@ class AdversarialObjective:
         )
         self.seen += real_number
         weights = self.weights()
-        for _ in range(self.steps):
+        for _ in range(self.settings.critic_steps):
             found = self.bank.step(
                 patches.detach(), ours, others, theirs, weights,
-                rate=self.rate, penalty=self.penalty, generator=self.generator,
+                rate=rate, penalty=self.settings.penalty, generator=self.generator,
             )  # fmt: skip
         both = (number > 0) & (real_number > 0)
         distance, lies = (
@@ -208,8 +237,10 @@ class AdversarialObjective:
         values = {"distance": distance, "penalty": lies, "classes": both.sum()}
         if not move:
             return fake.counts.new_zeros(()), values
+        # every class counts by its weight, however many patches it has in this batch
         gain = torch.where(both, -weights / number.clamp_min(1), 0.0)
         slopes = distributed.sum_over_processes(self.bank.input_gradient(patches.detach(), ours, gain))
+        # a sum whose gradient by the patches is `slopes`: autograd goes on from here to the counts
         return (patches * slopes).sum(), values
 
     def _number(self, classes: torch.Tensor) -> torch.Tensor:
@@ -218,14 +249,19 @@ class AdversarialObjective:
             0, classes, torch.ones_like(classes, dtype=torch.float32)
         )
 
+    def move_shared(self, share: torch.Tensor) -> None:
+        """Move nothing: descent moves all parameters."""
+
     def state(self) -> dict[str, Any]:
-        """Return the bank, the hash and the random numbers."""
-        return {
+        """Return the bank, the hash and the random numbers, as the entry `objective` of a checkpoint."""
+        own = {
             "bank": self._bank(),
             "boundaries": self.hasher.boundaries,
             "seen": self.seen,
             "generator": self.generator.get_state(),
         }
+        # checkpoints of all objectives have the same entries
+        return {"newton": None, "objective": own}
 
     def _bank(self) -> dict[str, Any]:
         """Return the state of all critics, each from the process that looks after it."""
@@ -236,8 +272,9 @@ class AdversarialObjective:
         return out
 
     def load(self, state: dict[str, Any]) -> None:
-        """Take over what `state` returned."""
-        self.bank.load(state["bank"])
-        self.hasher.boundaries = {name: value.to(self.device) for name, value in state["boundaries"].items()}
-        self.seen.copy_(state["seen"])
-        self.generator.set_state(state["generator"].cpu())
+        """Take over its entry of a checkpoint."""
+        own = state["objective"]
+        self.bank.load(own["bank"])
+        self.hasher.boundaries = {name: value.to(self.device) for name, value in own["boundaries"].items()}
+        self.seen.copy_(own["seen"])
+        self.generator.set_state(own["generator"].cpu())

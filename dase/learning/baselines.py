@@ -12,12 +12,6 @@ from dase.learning.scene_batches import Scenery, middle_intensity
 from dase.learning.targets import Pairs, draw_noise, simulate_counts
 from dase.networks.threshold_network import NetworkShape, ThresholdMaps, ThresholdNet
 
-ESIM = 0.18, 0.03
-"""Mean and spread of ESIM's thresholds as it was used to train E2VID [log intensity]; the preset `esim_thresholds`."""
-
-RANDOM = (0.05, 2.0), 1.5
-"""Thresholds and greatest ratio of ON and OFF of broad randomisation (V2V, 2025)."""
-
 
 def constant_thresholds(mu: float, sigma: float, ratio: float = 1.0) -> ThresholdNet:
     """Return a network that gives every pixel the same distribution."""
@@ -29,8 +23,11 @@ def constant_thresholds(mu: float, sigma: float, ratio: float = 1.0) -> Threshol
 
 
 def esim_thresholds() -> ThresholdNet:
-    """Return ESIM's thresholds: what one has without looking at the target."""
-    return constant_thresholds(*ESIM)
+    """Return ESIM's thresholds: what one has without looking at the target.
+
+    They are those that it was used with to train E2VID, and of the preset `esim`.
+    """
+    return constant_thresholds(mu=0.18, sigma=0.03)
 
 
 def match_event_rate(
@@ -77,20 +74,21 @@ class RandomThresholds:
 
     Args:
         seed: Of the draws; the same scenes get the same thresholds every time.
+        bounds: Of the mean thresholds [log intensity], as in V2V, 2025.
+        most: Greatest ratio of ON and OFF, either way.
     """
 
     shape = NetworkShape(split=True)
 
-    def __init__(self, seed: int = 0):
-        self.seed = seed
+    def __init__(self, seed: int = 0, *, bounds: tuple[float, float] = (0.05, 2.0), most: float = 1.5):
+        self.seed, self.bounds, self.most = seed, bounds, most
 
     def __call__(self, grey: torch.Tensor) -> ThresholdMaps:
         """Return maps for images (B, H, W)."""
-        (low, high), most = RANDOM
         # of the pictures themselves, so that a batch draws the same whatever came before it
         key = int(torch.sum(grey[:, ::16, ::16] * 1e4).item())
         rng = np.random.default_rng([self.seed, key])
-        mu = torch.from_numpy(rng.uniform(low, high, len(grey)).astype(np.float32)).to(grey.device)
-        ratio = torch.tensor(float(most ** rng.uniform(-1, 1)), device=grey.device)
+        mu = torch.from_numpy(rng.uniform(*self.bounds, len(grey)).astype(np.float32)).to(grey.device)
+        ratio = torch.tensor(float(self.most ** rng.uniform(-1, 1)), device=grey.device)
         maps = mu.view(-1, 1, 1).expand_as(grey)
         return ThresholdMaps(maps, 0.1 * maps, ratio, torch.zeros(len(grey), 2, 1, 1, device=grey.device))

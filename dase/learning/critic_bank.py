@@ -12,10 +12,6 @@ import torch
 from dase.kernels import autograd_critics as bridge
 from dase.networks.threshold_network import LEAKY_SLOPE
 
-FEW = 4
-"""Rows of a critic, in the mean, up to which a kernel of our own is faster than PyTorch's grouped product:
-with 2 of them that reads the weights at 45 % of a copy on an H200, since its tiles are for many."""
-
 
 @dataclass(frozen=True, kw_only=True)
 class BankShape:
@@ -23,7 +19,7 @@ class BankShape:
 
     Args:
         classes: Number of critics.
-        inputs: Numbers in a patch; a multiple of 8.
+        inputs: Numbers in a patch; a multiple of 8, as products of groups on a GPU ask for.
         wide: Outputs of the first layer; a multiple of 8.
         narrow: Outputs of the second layer; a multiple of 8.
     """
@@ -53,7 +49,7 @@ class SortedRows:
     end: torch.Tensor
 
     @classmethod
-    def by(cls, classes: torch.Tensor, critics: int) -> SortedRows:
+    def of_classes(cls, classes: torch.Tensor, critics: int) -> SortedRows:
         """Sort rows of these classes, int64 (R,); nothing waits for the GPU."""
         of, order = bridge.sort_keys(classes, below=critics + 1)
         number = classes.new_zeros(critics + 1).index_add_(0, classes, torch.ones_like(classes))
@@ -65,8 +61,8 @@ class CriticStep:
     """What one step of the bank found.
 
     Args:
-        distance: Weighted difference of the critics' means, real minus fake: what Eq. 10 maximises.
-        penalty: Weighted mean squared gradient between the domains.
+        distance: Weighted difference of the critics' means, real minus fake, a scalar: what Eq. 10 maximises.
+        penalty: Weighted mean squared gradient between the domains, a scalar.
     """
 
     distance: torch.Tensor
@@ -79,10 +75,10 @@ class Activations:
 
     Args:
         first: Sums of the first layer, float32 (R, wide).
-        hidden: What goes on from it, in the type of the products.
+        hidden: The same behind its rectifiers, (R, wide) in the type of the products.
         second: Sums of the second layer, float32 (R, narrow).
-        by_first: Derivative of the scores by the sums of the first layer.
-        by_second: That by those of the second.
+        by_first: Derivative of the scores by the sums of the first layer, (R, wide).
+        by_second: Derivative of the scores by the sums of the second layer, (R, narrow).
     """
 
     first: torch.Tensor
@@ -105,6 +101,14 @@ class CriticBank:
         device: PyTorch device.
         generator: Draws the weights.
         decay: Of Adam's mean square; there is no momentum.
+
+    Attributes:
+        w1, b1: Weights and biases of the first layer, float32 (C, wide, inputs) and (C, wide).
+        w2, b2: Those of the second layer, (C, narrow, wide) and (C, narrow).
+        w3, b3: Those of the last layer, (C, narrow) and (C, 1).
+        square: Adam's mean square of the gradient of each, by its name and of its shape.
+        steps: Steps that each critic has made, float32 (C,).
+        copies: w1 and w2 as bfloat16, which products on a GPU read; as new as the weights after every step.
     """
 
     def __init__(
@@ -131,30 +135,30 @@ class CriticBank:
         self.w2, self.b2 = drawn(shape.narrow, shape.wide)
         w3, self.b3 = drawn(1, shape.narrow)
         self.w3 = w3[:, 0].contiguous()
-        self.square = {name: torch.zeros_like(getattr(self, name)) for name in self.names()}
+        self.square = {name: torch.zeros_like(getattr(self, name)) for name in self.parameter_names()}
         self.steps = torch.zeros(shape.classes, device=self.device)
-        self._copy()
+        self._refresh_copies()
 
-    def _copy(self) -> None:
+    def _refresh_copies(self) -> None:
         self.copies = {"w1": self.w1.bfloat16(), "w2": self.w2.bfloat16()}
 
     @staticmethod
-    def names() -> tuple[str, ...]:
+    def parameter_names() -> tuple[str, ...]:
         """Return the names of the weights and biases."""
         return ("w1", "b1", "w2", "b2", "w3", "b3")
 
     def state(self) -> dict[str, Any]:
         """Return everything that the next step depends on."""
-        weights = {name: getattr(self, name) for name in self.names()}
+        weights = {name: getattr(self, name) for name in self.parameter_names()}
         return {"weights": weights, "square": self.square, "steps": self.steps}
 
     def load(self, state: dict[str, Any]) -> None:
         """Take over what `state` returned."""
-        for name in self.names():
+        for name in self.parameter_names():
             getattr(self, name).copy_(state["weights"][name])
             self.square[name].copy_(state["square"][name])
         self.steps.copy_(state["steps"])
-        self._copy()
+        self._refresh_copies()
 
     def _working_weights(self, name: str) -> torch.Tensor:
         """Return a layer's weights in the type that products are taken in, (C, outputs, inputs)."""
@@ -185,7 +189,7 @@ class CriticBank:
 
     def scores(self, patches: torch.Tensor, classes: torch.Tensor) -> torch.Tensor:
         """Return the score of each patch (N, inputs) by the critic of its class (N,)."""
-        by = SortedRows.by(classes, self.shape.classes)
+        by = SortedRows.of_classes(classes, self.shape.classes)
         score = self._scores(self._forward(patches.to(self.working)[by.order], by.of, by.end), by.of)
         return torch.empty_like(score).index_copy_(0, by.order, score)
 
@@ -203,7 +207,7 @@ class CriticBank:
         gains = torch.cat([gain, gain.new_zeros(1)])
         # a class without gain is none: its critic's weights need not be read
         classes = torch.where(gains[classes] != 0, classes, self.shape.classes)
-        by = SortedRows.by(classes, self.shape.classes)
+        by = SortedRows.of_classes(classes, self.shape.classes)
         at = self._forward(patches.to(self.working)[by.order], by.of, by.end)
         gains = gains[by.of.long()]
         slopes = multiply_groups(
@@ -240,6 +244,7 @@ class CriticBank:
             penalty: Weight of the penalty.
             generator: Draws the shares.
         """
+        # as many numbers whatever the classes, so that a step that is replayed draws as one that is not
         share = torch.rand(len(fake), 1, device=self.device, generator=generator)
         batch = CriticBatch(self, fake, fake_classes, real, real_classes, weights, share)
         critique = batch.differentiate(penalty)
@@ -271,11 +276,21 @@ class CriticBank:
 class CriticBatch:
     """The rows of one step, and the gradients of the loss.
 
+    Args:
+        bank: The critics.
+        fake: Patches of the simulator, shape (N, inputs).
+        fake_classes: Their classes, int64 (N,).
+        real: Patches of the target, shape (M, inputs).
+        real_classes: Their classes, int64 (M,).
+        weights: Of each class, shape (C,).
+        share: Where between fake and real the penalty is taken, in [0, 1], shape (N, 1).
+
     Attributes:
         layout: Where the rows of each critic lie: fake, real, and half way between.
-        rows: They, (R, inputs).
-        outer: Layer to the left and right rows of its gradient.
-        sums: Gradients of all other weights.
+        rows: All rows in that order, (R, inputs).
+        outer: By the name of a layer, left (R, outputs) and right rows (R, inputs) whose outer products,
+            summed over the rows of a critic, are the gradient of its weights.
+        sums: Gradients of all other weights, by name and of their shapes.
     """
 
     def __init__(
@@ -292,7 +307,11 @@ class CriticBatch:
         self.rows = bridge.gather_rows(fake, real, share, self.layout, bank.working)
 
     def differentiate(self, penalty: float) -> CriticStep:
-        """Set `outer` and `sums`."""
+        """Set `outer` and `sums`; return the distance and the penalty.
+
+        Args:
+            penalty: Weight of the gradient penalty.
+        """
         bank, layout, working = self.bank, self.layout, self.bank.working
         w1, w2 = bank._working_weights("w1"), bank._working_weights("w2")
         at = bank._forward(self.rows, layout.of, layout.end[0])
@@ -300,7 +319,8 @@ class CriticBatch:
         left_first, left_second, last = bridge.weigh_rows(
             at.second, at.by_first, at.by_second, layout, slope=LEAKY_SLOPE, penalty=penalty
         )
-        # the penalty: g = slope of the first layer times its weights, loss = penalty · held |g|²
+        # the penalty: g = slope of the first layer times its weights, loss = penalty · held |g|²; what comes
+        # back from it passes the same matrices as the scores, and the kinks add nothing
         ends = layout.end[1]
         g = multiply_groups(bridge.rows_half_way(at.by_first, layout, working), w1, ends)
         by_g = bridge.penalise_gradient(g, layout, self.rows)
@@ -320,21 +340,27 @@ class CriticBatch:
         return CriticStep(distance, square.sum())
 
 
-def multiply_groups(rows: torch.Tensor, weights: torch.Tensor, end: torch.Tensor) -> torch.Tensor:
+def multiply_groups(
+    rows: torch.Tensor, weights: torch.Tensor, end: torch.Tensor, *, few: int = 4
+) -> torch.Tensor:
     """Multiply each group of rows with a matrix of its own.
 
     Args:
         rows: Shape (R, K), group by group.
         weights: Shape (C, K, N).
         end: Where groups end, int32 (C,).
+        few: Rows of a group, in the mean, up to which a kernel of our own is faster than PyTorch's grouped
+            product: with 2 of them that reads the weights at 45 % of a copy on an H200, since its tiles are
+            for many.
 
     Returns:
         Shape (R, N) in the type of the rows; anything in rows behind the last group.
     """
-    if rows.is_cuda and weights.stride(2) == 1 and len(rows) <= FEW * len(weights):
+    if rows.is_cuda and weights.stride(2) == 1 and len(rows) <= few * len(weights):
         return bridge.multiply_by_critic(rows, weights, end)
     if rows.is_cuda and _has_grouped_products(rows.device):
         return torch._grouped_mm(rows, weights, offs=end)
+    # slow but right: on a CPU, and on GPUs whose PyTorch lacks the product
     out = rows.new_zeros(len(rows), weights.shape[2])
     begin = 0
     for critic, stop in enumerate(end.tolist()):

@@ -13,9 +13,6 @@ import torch
 
 from dase.learning import distributed
 
-SEEN = 3
-"""Times that a kind of step runs as usual before it is recorded: libraries make their choices meanwhile."""
-
 T = TypeVar("T")
 
 
@@ -28,10 +25,12 @@ class GraphReplay:
     Args:
         device: Where steps run; on a CPU they are simply called.
         generators: Random numbers that steps draw.
+        plain_runs: Times that a kind of step runs as usual before it is recorded: libraries make their
+            choices meanwhile.
     """
 
-    def __init__(self, device: torch.device, generators: Sequence[torch.Generator]):
-        self.device, self.generators = device, generators
+    def __init__(self, device: torch.device, generators: Sequence[torch.Generator], *, plain_runs: int = 3):
+        self.device, self.generators, self.plain_runs = device, generators, plain_runs
         self.seen: dict[Hashable, int] = {}
         self.recorded: dict[Hashable, tuple[torch.cuda.CUDAGraph, Any]] = {}
         # steps follow one another, so they may use the same memory
@@ -48,7 +47,7 @@ class GraphReplay:
             return step()
         if kind not in self.recorded:
             self.seen[kind] = self.seen.get(kind, 0) + 1
-            if self.seen[kind] <= SEEN:
+            if self.seen[kind] <= self.plain_runs:
                 return step()
             self.recorded[kind] = self._record(step)
         values: T

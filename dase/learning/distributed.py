@@ -43,8 +43,14 @@ def process_count() -> int:
 
 
 def process_rank() -> int:
-    """Return which one this is, from 0."""
+    """Return which of the processes this is, from 0."""
     return dist.get_rank() if dist.is_initialized() else 0
+
+
+def process_seed(seed: int) -> int:
+    """Return the seed of this process's own random numbers; the first has `seed` itself."""
+    # far apart, so that no process has the numbers of another run whose seed is a little larger
+    return seed + 1_000_003 * process_rank()
 
 
 def gather_values(values: torch.Tensor) -> torch.Tensor:
@@ -70,7 +76,7 @@ def sum_over_processes(values: torch.Tensor) -> torch.Tensor:
 
 
 def sum_gradients(parameters: Iterable[torch.Tensor]) -> None:
-    """Replace gradients by their sums over the processes."""
+    """Replace the gradients of parameters by their sums over the processes, in one message."""
     if process_count() == 1:
         return
     found = [p.grad for p in parameters if p.grad is not None]
@@ -80,7 +86,7 @@ def sum_gradients(parameters: Iterable[torch.Tensor]) -> None:
 
 
 def broadcast_tensors(values: Iterable[torch.Tensor]) -> None:
-    """Give tensors the values that they have in the first process."""
+    """Give tensors the values that they have in the first process, in place."""
     if process_count() > 1:
         for value in values:
             dist.broadcast(value.detach(), 0)
@@ -105,7 +111,12 @@ def gather_objects(value: Any) -> list[Any]:
 
 
 def mask_foreign_classes(classes: torch.Tensor, count: int) -> torch.Tensor:
-    """Return classes, with `count`, which stands for none, for those that other processes look after."""
+    """Return classes, those of other processes' critics replaced by none.
+
+    Args:
+        classes: Class of each patch, int64 (N,); class c is that of process c modulo `process_count()`.
+        count: Number of classes, which stands for none.
+    """
     if process_count() == 1:
         return classes
     return torch.where(classes % process_count() == process_rank(), classes, count)

@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from torch.nn import functional as F
 
-from dase.learning.moment_matching import Moments, moment_discrepancy
+from dase.learning.moment_matching import REFERENCE, Moments, MomentSettings, moment_discrepancy
 from dase.learning.scene_batches import Scenery, middle_intensity
 from dase.learning.targets import Pairs, Target, draw_noise, simulate_counts
 from dase.networks.threshold_network import ThresholdMaps, ThresholdNet
@@ -86,34 +86,45 @@ class HeldOutScore:
         scenes: How many to compare them with.
         seed: Of scenes and noise.
         doubt: Share by which means may differ for reasons that thresholds cannot cure.
+        batch: Scenes that are simulated and compared at a time, which bounds the memory.
     """
 
     def __init__(
-        self, scenery: Scenery, pairs: Pairs, *, scenes: int = 96, seed: int = 54321, doubt: float = 0.05
+        self,
+        scenery: Scenery,
+        pairs: Pairs,
+        *,
+        scenes: int = 96,
+        seed: int = 54321,
+        doubt: float = 0.05,
+        batch: int = 12,
     ):
-        self.scenery, self.scenes, self.seed = scenery, scenes, seed
-        self.real = [pairs.select(slice(n, n + 12)) for n in range(0, len(pairs), 12)]
-        self.like = Moments(device=scenery.device, doubt=doubt)
+        self.scenery, self.scenes, self.seed, self.batch = scenery, scenes, seed, batch
+        self.real = [pairs.select(slice(n, n + batch)) for n in range(0, len(pairs), batch)]
+        self.like = Moments(MomentSettings(doubt=doubt), device=scenery.device)
         first = self.simulate_fakes(None)
         self.like.calibrate(list(zip(first, self.real, strict=False)))
         for some in self.real:
             self.like.add_real(some)
         for fake in first:
-            self.like.add_reference(Pairs(fake.grey, fake.counts, fake.counts), self.like.members(fake.grey))
+            self.like.add_reference(
+                Pairs(fake.grey, fake.counts, fake.counts), self.like.cell_members(fake.grey)
+            )
         self.like.weigh()
 
     @torch.no_grad()
     def simulate_fakes(self, net: Callable[[torch.Tensor], ThresholdMaps] | None) -> list[Pairs]:
-        """Return the fixed scenes seen through a network, or at usual thresholds."""
+        """Return batches of the fixed scenes seen through a network, or at usual thresholds without one."""
         rng = np.random.default_rng(self.seed)
         generator = torch.Generator(self.scenery.device).manual_seed(self.seed)
         out = []
-        for _ in range(0, self.scenes, 12):
-            log = self.scenery.draw(rng, 12)
+        for _ in range(0, self.scenes, self.batch):
+            log = self.scenery.draw(rng, self.batch)
             grey = middle_intensity(log)
             noise = draw_noise(log, generator)
             if net is None:
-                out.append(Pairs(grey, simulate_counts(log, torch.full_like(grey, 0.25), 0.06, noise)))
+                level = torch.full_like(grey, REFERENCE[0])
+                out.append(Pairs(grey, simulate_counts(log, level, REFERENCE[1], noise)))
             else:
                 out.append(Pairs(grey, simulate_counts(log, *net(grey).by_polarity(), noise)))
         return out
@@ -140,7 +151,7 @@ class HeldOutScore:
 
 
 def count_histogram(counts: torch.Tensor, most: int = 12) -> torch.Tensor:
-    """Return the shares of pixels with 0, 1, ... events, `most` and more in the last."""
+    """Return the shares of pixels with 0, 1, ... events, (most + 1,); the last has `most` and more."""
     whole = counts.round().long().clamp(0, most).flatten()
     return torch.bincount(whole, minlength=most + 1).double() / len(whole)
 

@@ -16,13 +16,15 @@ from dase.effects.learned_threshold import LearnedThreshold
 from dase.effects.mismatch import Mismatch
 from dase.effects.threshold import Threshold
 from dase.errors import InputError, checked_seed, nearest
-from dase.learning.adversarial import PatchHash
+from dase.learning.adversarial import AdversarialObjective, AdversarialSettings, PatchHash
 from dase.learning.baselines import RandomThresholds, esim_thresholds, match_event_rate
+from dase.learning.moment_objective import MomentObjective
+from dase.learning.recipe import Recipe
 from dase.learning.recorded_target import ReplayedScenes, open_target
 from dase.learning.run import CHECKPOINT
-from dase.learning.scene_batches import Scenery, SceneSettings, middle_intensity
-from dase.learning.targets import FiniteTarget, Pairs, Target, Truth, draw_noise, simulate_counts
-from dase.learning.training import Recipe, Training
+from dase.learning.scene_batches import LOG_EPS, Scenery, SceneSettings, middle_intensity
+from dase.learning.targets import FiniteTarget, Target, Truth, draw_noise, simulate_counts, store_pairs
+from dase.learning.training import Objective, Training, make_network
 from dase.networks.threshold_network import NetworkShape, ThresholdNet
 from dase.networks.weights_file import save_net
 from dase.scenes import image_sources
@@ -34,24 +36,21 @@ from dase.text_files import parse_json, read_text_file
 
 JOB, SENSOR, WEIGHTS, EXAMPLES = "job.json", "sensor.toml", "learned.safetensors", "examples.npz"
 
-TABLE = 6, 5
-"""Nodes of brightness and edge strength in the default recipe."""
-
-RECORDED_DOUBT = 0.2
-"""Share by which the moments of a recording may differ because of what its frames do not show."""
-
 PRESETS: dict[str, Recipe] = {
     "default": Recipe(
-        objective="moments", steps=600, rate=1e-4, anchor=1.0, network=NetworkShape(table=TABLE, split=True)
+        objective="moments", steps=600, rate=1e-4, anchor=1.0,
+        network=NetworkShape(table=(6, 5), split=True),
     ),
     "tiny": Recipe(
         objective="moments", steps=120, warmup=20, batch=4, rate=1e-4, anchor=1.0, ramp=20,
-        network=NetworkShape(channels=8, depth=2, table=TABLE, split=True),
+        network=NetworkShape(channels=8, depth=2, table=(6, 5), split=True),
     ),
     "paper": Recipe(
         objective="wgan", steps=20_000, warmup=0, optimizer="adabelief", rate=4e-4, rate_scalars=4e-4,
-        critic_rate=4e-4, critic_cosine=True, anchor=0.0, average=0.0, surrogate="interval",
-        hash=PatchHash(contrast_from="events"), network=NetworkShape(literal=True),
+        anchor=0.0, average=0.0, surrogate="interval", network=NetworkShape(literal=True),
+        adversarial=AdversarialSettings(
+            critic_rate=4e-4, critic_cosine=True, hash=PatchHash(contrast_from="events")
+        ),
     ),
 }  # fmt: skip
 """Recipes by name. `default` is the best found, `paper` the paper's literal setting, `tiny` for a CPU."""
@@ -117,16 +116,20 @@ class Job:
     def recipe(self) -> Recipe:
         """Return how to learn."""
         recipe = PRESETS[self.preset]
+        # small patches learn best; a tiny scene has too few of them for so many classes
+        how = PatchHash(size=8)
+        if self.preset == "tiny":
+            how = PatchHash(size=16, orientations=8, coherence=1)
         if self.objective == "wgan" and recipe.objective != "wgan":
             recipe = replace(
-                recipe, objective="wgan", anchor=5.0, steps=3000, ramp=100, warmup=50, hash=PatchHash(size=8)
-            )
+                recipe, objective="wgan", anchor=5.0, steps=600 if self.preset == "tiny" else 3000, ramp=100,
+                warmup=50, adversarial=AdversarialSettings(hash=how),
+            )  # fmt: skip
         elif self.objective:
             recipe = replace(recipe, objective=self.objective)
-        if self.objective == "wgan" and self.preset == "tiny":
-            recipe = replace(recipe, hash=PatchHash(size=16, orientations=8, coherence=1), steps=600)
         if not self.targets_sensor:
-            recipe = replace(recipe, doubt=RECORDED_DOUBT)
+            # by about so much the moments of a recording differ for what its frames do not show
+            recipe = replace(recipe, moments=replace(recipe.moments, doubt=0.2))
         return replace(recipe, seed=self.seed, steps=self.steps or recipe.steps)
 
     def scene_settings(self) -> SceneSettings:
@@ -169,17 +172,33 @@ def open_training(
     if job.pattern:
         size = scenery.scene_settings.width, scenery.scene_settings.height
         recipe = replace(recipe, network=replace(recipe.network, pattern=size))
-    smallest = min(scenery.scene_settings.width, scenery.scene_settings.height)
-    if recipe.objective == "wgan" and smallest < recipe.hash.size:
-        raise InputError(
-            f"patches are {recipe.hash.size} px wide, the sensor {scenery.scene_settings.width}x{scenery.scene_settings.height}"
-        )
-    return Training(recipe, target, scenery)
+    width, height = scenery.scene_settings.width, scenery.scene_settings.height
+    if recipe.objective == "wgan" and min(width, height) < recipe.adversarial.hash.size:
+        raise InputError(f"patches are {recipe.adversarial.hash.size} px wide, the sensor {width}x{height}")
+    return compose_training(recipe, target, scenery)
+
+
+def compose_training(recipe: Recipe, target: Target, scenery: Scenery) -> Training:
+    """Return a run at its beginning: the loop with a new network and the objective that the recipe names.
+
+    Args:
+        recipe: How to learn.
+        target: What to become like.
+        scenery: Draws the simulator's scenes, on the device that learns.
+    """
+    net = make_network(recipe, scenery.device)
+    objective: Objective
+    if recipe.objective == "moments":
+        objective = MomentObjective(recipe.moments, net, scenes=target.scenes, trains_network=recipe.rate > 0)
+    else:
+        # the loop draws with the seeds up to this one
+        objective = AdversarialObjective(recipe.adversarial, device=scenery.device, seed=recipe.seed + 2)
+    return Training(recipe, net, objective, target, scenery)
 
 
 def _textured_scenery(job: Job, looks: SceneSettings) -> Scenery:
     if job.images == "frames":
-        raise InputError("--images frames needs recordings; a sensor file has no frames")
+        raise InputError("images: frames are those of recordings; a sensor file has none", argument="images")
     source = image_sources.open_images(job.images)
     small = job.preset == "tiny"
     # a scene shows ten objects, so few of them make few different scenes, unlike the target's
@@ -224,15 +243,13 @@ def simulate_target(
     grey, counts = [], []
     for n in range(sequences):
         log = scenery.draw(rng, 1)
-        frames = torch.exp(log[0]).cpu().numpy() - np.float32(1e-3)
+        frames = torch.exp(log[0]).cpu().numpy() - np.float32(LOG_EPS)
         scene = VideoScene(np.clip(frames, 0, 1), times)
         found = count(scene, sensor, (-1.0, looks.window), seed=int(rng.integers(2**31)), device=backend)
         counts.append(torch.from_numpy(found[0, 0].reshape(2, looks.height, looks.width)))
         grey.append(middle_intensity(log)[0].cpu())
         progress(n + 1, sequences)
-    pairs = Pairs(
-        torch.stack(grey).half().to(backend), torch.stack(counts).clamp_max(2000).half().to(backend)
-    )
+    pairs = store_pairs(torch.stack(grey), torch.stack(counts), backend)
     return FiniteTarget(pairs, truth=_true_thresholds(sensor))
 
 
@@ -261,9 +278,9 @@ def record_job(job: Job, out: Path, *, resume: bool) -> None:
     if resume and not record.is_file():
         raise InputError(f"{out} holds no run to resume")
     if resume and read_text_file(record, "the record", 1 << 24) != job.text():
-        raise InputError(f"{out} was begun with other options (see {record}); --resume needs the same ones")
+        raise InputError(f"{out} was begun with other options (see {record}); to resume takes the same ones")
     if not resume and (out / CHECKPOINT).exists():
-        raise InputError(f"{out} already holds a run; give --resume to go on with it, or another folder")
+        raise InputError(f"{out} already holds a run; resume it, or give another folder", argument="resume")
     out.mkdir(parents=True, exist_ok=True)
     with replacing(record) as temporary:
         temporary.write_text(job.text(), "utf-8")

@@ -17,6 +17,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Hashable
+from dataclasses import dataclass
 from typing import Any
 
 import torch
@@ -26,24 +27,58 @@ from dase.learning import distributed
 from dase.learning.targets import Pairs
 from dase.networks.threshold_network import MAGNITUDE_FLOOR, brightness_and_edge, gradient_magnitude
 
-RIDGE = 0.1
-"""Added to the variances before they are inverted, as a share."""
+REFERENCE = 0.25, 0.06
+"""Usual mean and spread, at which scenes are counted once more to tell busy scenes from low thresholds
+[log intensity]."""
 
-UNSURE = 0.1
-"""The same for each feature per scene that has been seen: few scenes tell little of their covariance."""
 
-LONG = 0.99
-"""The same of the moments of columns and rows."""
+@dataclass(frozen=True, kw_only=True)
+class MomentSettings:
+    """What can be chosen about the moments; the names are those of a run's `recipe.json`.
 
-FORGET = 0.99
-"""Share of the regression on the reference that stays from step to step."""
+    Args:
+        cells: Levels of brightness and of edge strength by which pixels are compared.
+        memory: Share of the fake moments that stays from step to step: less follows the thresholds sooner,
+            more averages over more scenes.
+        doubt: Share by which means of features may differ for reasons that thresholds cannot cure, such as
+            what a recording's frames do not show.
+        newton: Share of a Gauss-Newton step that is taken; a whole one would follow the noise of a batch.
+    """
 
-ANEW = 25
-"""Steps after which the weights are worked out again."""
+    cells: tuple[int, int] = (6, 5)
+    memory: float = 0.95
+    doubt: float = 0.0
+    newton: float = 0.2
+
+
+@dataclass(frozen=True, kw_only=True)
+class MomentWeighting:
+    """How moments are averaged and weighed; the method's own numbers, not a run's.
+
+    Args:
+        ridge: Added to the variances before they are inverted, as a share: the features are nearly dependent.
+        scarce_ridge: The same for each feature per scene that has been seen: few scenes tell little of their
+            covariance.
+        floor: Added to the variances before they are inverted: a feature that never varies says nothing.
+        floor_share: The same as a share of their mean.
+        regression_memory: Share of the regression on the reference counts that stays from step to step.
+        pattern_memory: Share of the moments of columns and rows that stays; one of them sees few pixels.
+        interval: Steps after which the weights are worked out again, which takes longer than a step.
+        hold_out_every: Real batches of which one is held out, where real scenes never come again.
+    """
+
+    ridge: float = 0.1
+    scarce_ridge: float = 0.1
+    floor: float = 1e-6
+    floor_share: float = 1e-3
+    regression_memory: float = 0.99
+    pattern_memory: float = 0.99
+    interval: int = 25
+    hold_out_every: int = 8
 
 
 CellMembers = tuple[torch.Tensor, torch.Tensor]
-"""See `Moments.members`."""
+"""See `Moments.cell_members`."""
 
 
 def single_pixel_features(counts: torch.Tensor) -> torch.Tensor:
@@ -93,10 +128,25 @@ class CellMoments:
         device: PyTorch device.
         memory: Share of the fake means that stays from step to step.
         joint: Whether the covariance is that of all cells together; else each cell has its own.
+        weighting: How moments are averaged and weighed.
+
+    Attributes:
+        kept: All running sums, float64, which a checkpoint holds: with C cells and F features, `*_sum`,
+            `both` and `square` (C, F), `*_number` (C,) [pixels], `*_scenes` and `usual` scalars, `products`
+            and `weight` (1, C · F, C · F) where `joint`, else (C, F, F).
     """
 
-    def __init__(self, cells: int, width: int, *, device: torch.device, memory: float, joint: bool):
-        self.memory, self.joint = memory, joint
+    def __init__(
+        self,
+        cells: int,
+        width: int,
+        *,
+        device: torch.device,
+        memory: float,
+        joint: bool,
+        weighting: MomentWeighting = MomentWeighting(),
+    ):
+        self.memory, self.joint, self.weighting = memory, joint, weighting
         blocks, size = (1, cells * width) if joint else (cells, width)
 
         def zeros(*shape: int) -> torch.Tensor:
@@ -113,7 +163,13 @@ class CellMoments:
         self.kept["weight"] = torch.zeros(blocks, size, size, device=device)
 
     def add_real(self, sums: torch.Tensor, number: torch.Tensor, *, held_out: bool = False) -> None:
-        """Add scenes: sums of the features (B, cells, F) over `number` (B, cells) pixels."""
+        """Add real scenes.
+
+        Args:
+            sums: Of the features over the pixels of a cell, shape (B, cells, F).
+            number: Of these pixels, shape (B, cells).
+            held_out: Whether the scenes are kept apart from those that are learned from.
+        """
         side = "held" if held_out else "real"
         self.kept[f"{side}_sum"] += sums.double().sum(0)
         self.kept[f"{side}_number"] += number.double().sum(0)
@@ -121,7 +177,11 @@ class CellMoments:
             self.kept["real_scenes"] += len(sums)
 
     def add_reference(self, sums: torch.Tensor, number: torch.Tensor) -> torch.Tensor:
-        """Add scenes at the reference thresholds; return by how much each is off the mean of all."""
+        """Add simulated scenes at the reference thresholds; arguments as those of `add_real`.
+
+        Returns:
+            By how much the sums of each scene are off what the mean of all would make them, (B, cells, F).
+        """
         kept = self.kept
         sums, number = sums.double(), number.double()
         kept["plain_sum"] += sums.sum(0)
@@ -134,22 +194,30 @@ class CellMoments:
         return off
 
     def add_fake(self, sums: torch.Tensor, number: torch.Tensor, off: torch.Tensor) -> None:
-        """Add scenes that were `off` at the reference thresholds, and forget a part of earlier ones."""
+        """Add simulated scenes, and forget a part of earlier ones.
+
+        Args:
+            sums: Of the features, shape (B, cells, F).
+            number: Of pixels, shape (B, cells).
+            off: What `add_reference` returned for the same scenes, shape (B, cells, F).
+        """
         kept = self.kept
         sums, number = sums.detach().double(), number.double()
         mean = sums.sum(0) / number.sum(0).clamp_min(1)[:, None]
-        kept["both"].mul_(FORGET).add_((off * (sums - number[..., None] * mean)).sum(0))
-        kept["square"].mul_(FORGET).add_(off.square().sum(0))
+        memory = self.weighting.regression_memory
+        kept["both"].mul_(memory).add_((off * (sums - number[..., None] * mean)).sum(0))
+        kept["square"].mul_(memory).add_(off.square().sum(0))
+        # the control variate: a scene busy at the reference is busy now, which says nothing of the thresholds
         slope = kept["both"] / kept["square"].clamp_min(1e-12)
         kept["fake_sum"].mul_(self.memory).add_((sums - slope * off).sum(0))
         kept["fake_number"].mul_(self.memory).add_(number.sum(0))
         kept["fake_scenes"].mul_(self.memory).add_(len(sums))
 
-    def shift(self, means: torch.Tensor) -> None:
+    def shift_fake_means(self, means: torch.Tensor) -> None:
         """Add to the fake means (cells, F) what a move of the thresholds does to them."""
         self.kept["fake_sum"] += self.kept["fake_number"][:, None] * means
 
-    def off(self, *, held_out: bool = False) -> torch.Tensor:
+    def mean_difference(self, *, held_out: bool = False) -> torch.Tensor:
         """Return fake minus real means, shape (cells, F); 0 where one has no pixel."""
         kept, side = self.kept, "held" if held_out else "real"
         known = (kept[f"{side}_number"] > 0) & (kept["fake_number"] > 0)
@@ -171,12 +239,13 @@ class CellMoments:
         total = total.reshape(kept["products"].shape[:2]) / kept["scenes"]
         covariance = kept["products"] / (total[:, :, None] * total[:, None, :] * kept["scenes"])
         diagonal = covariance.diagonal(dim1=-2, dim2=-1)
-        # a feature that never varies says nothing
-        floor = 1e-6 + 1e-3 * diagonal.mean(-1, keepdim=True)
-        ridge = excess * (RIDGE + UNSURE * diagonal.shape[-1] / kept["scenes"])
+        how = self.weighting
+        floor = how.floor + how.floor_share * diagonal.mean(-1, keepdim=True)
+        ridge = excess * (how.ridge + how.scarce_ridge * diagonal.shape[-1] / kept["scenes"])
         mean = kept["real_sum"] / kept["real_number"].clamp_min(1)[:, None]
         wrong = (doubt * mean).square().reshape(diagonal.shape) * kept["real_scenes"]
         weight, _ = torch.linalg.inv_ex(covariance + torch.diag_embed(ridge * diagonal + floor + wrong))
+        # `usual` is what chance makes of the distance of one scene, by which the excess is measured
         kept["usual"].copy_((weight * covariance).sum())
         kept["weight"].copy_(weight / (cells * width))
 
@@ -194,12 +263,10 @@ class Moments:
     """Compare means of features in cells; see the module.
 
     Args:
+        settings: What to compare; its `newton` is not used here.
         device: PyTorch device.
-        levels: Levels of brightness, and of edge strength.
         pattern: Whether to compare columns and rows of the sensor as well.
-        memory: Share of the fake means that stays from step to step.
         scenes: How many different real scenes there are.
-        doubt: Share by which a mean may differ for reasons that thresholds cannot cure.
 
     Attributes:
         excess: See `Cells.weigh`; set by what moves the thresholds.
@@ -207,26 +274,25 @@ class Moments:
 
     def __init__(
         self,
+        settings: MomentSettings = MomentSettings(),
         *,
         device: str | torch.device,
-        levels: tuple[int, int] = (6, 5),
         pattern: bool = False,
-        memory: float = 0.95,
         scenes: float = math.inf,
-        doubt: float = 0.0,
+        weighting: MomentWeighting = MomentWeighting(),
     ):
-        self.scenes, self.doubt = scenes, doubt
+        self.settings, self.weighting = settings, weighting
         self.excess: torch.Tensor | float = 1.0
-        self.device, self.levels, self.pattern, self.memory = torch.device(device), levels, pattern, memory
+        self.device, self.pattern, self.scenes = torch.device(device), pattern, scenes
         self.boundaries: list[torch.Tensor] = []
         self.sets: dict[str, CellMoments] = {}
         self.calls = 0
-        self.held = self.anew = False
+        self.holds_out = self.reweighs = False
 
     def calibrate(self, sets: list[tuple[Pairs, Pairs]]) -> None:
         """Place the boundaries of brightness and edge strength at quantiles of both domains."""
         found = [brightness_and_edge(pairs.grey) for both in sets for pairs in both]
-        for level, values in zip(self.levels, zip(*found, strict=True), strict=True):
+        for level, values in zip(self.settings.cells, zip(*found, strict=True), strict=True):
             pooled = torch.sort(
                 torch.cat([v.flatten()[:: max(v.numel() // 50_000, 1)] for v in values])
             ).values
@@ -234,10 +300,11 @@ class Moments:
             self.boundaries.append(pooled[places].contiguous())
         distributed.broadcast_tensors(self.boundaries)
         height, across = sets[0][0].grey.shape[1:]
-        self._make(across, height)
+        self._make_cells(across, height)
 
-    def _make(self, across: int, height: int) -> None:
-        sizes = {"look": self.levels[0] * self.levels[1]}
+    def _make_cells(self, across: int, height: int) -> None:
+        """Begin anew, for a sensor of `across` columns and `height` rows."""
+        sizes = {"look": self.settings.cells[0] * self.settings.cells[1]}
         if self.pattern:
             sizes |= {"column": across, "row": height}
         self.sets = {
@@ -245,33 +312,34 @@ class Moments:
                 size,
                 13 if name == "look" else 11,
                 device=self.device,
-                memory=self.memory if name == "look" else LONG,
+                memory=self.settings.memory if name == "look" else self.weighting.pattern_memory,
                 joint=name == "look",
+                weighting=self.weighting,
             )
             for name, size in sizes.items()
         }
 
-    def members(self, grey: torch.Tensor) -> CellMembers:
-        """Return which cells of looks pixels are in, 1 or 0 (B, pixels, cells), and how many (B, cells)."""
+    def cell_members(self, grey: torch.Tensor) -> CellMembers:
+        """Return which cells of `look` pixels are in, 1 or 0 (B, pixels, cells), and how many (B, cells)."""
         brightness, edge = brightness_and_edge(grey)
-        cell = torch.bucketize(brightness.contiguous(), self.boundaries[0]) * self.levels[1]
+        cell = torch.bucketize(brightness.contiguous(), self.boundaries[0]) * self.settings.cells[1]
         cell = (cell + torch.bucketize(edge, self.boundaries[1])).flatten(1)[..., None]
-        every = torch.arange(self.levels[0] * self.levels[1], device=self.device)
+        every = torch.arange(self.settings.cells[0] * self.settings.cells[1], device=self.device)
         # numbers at once: truth values first would be another pass
         member = torch.eq(cell, every, out=grey.new_empty((*cell.shape[:2], len(every))))
         return member, member.sum(1)
 
-    def sums(
+    def cell_sums(
         self, pairs: Pairs, members: CellMembers | None = None
     ) -> dict[str, tuple[torch.Tensor, torch.Tensor]]:
         """Return sums (B, cells, F) and numbers of pixels (B, cells) for each set of cells.
 
         Args:
             pairs: Of which counts are summed.
-            members: What `members` returned for their images, where it is known.
+            members: What `cell_members` returned for their images, where it is known.
         """
         pixels = pixel_features(pairs)
-        member, number = self.members(pairs.grey) if members is None else members
+        member, number = self.cell_members(pairs.grey) if members is None else members
         found = add_neighbour_features(pixels)
         out = {"look": (sum_by_cell(member, found.flatten(2).transpose(1, 2)), number)}
         if self.pattern:
@@ -287,7 +355,7 @@ class Moments:
     @torch.no_grad()
     def add_real(self, real: Pairs, *, held_out: bool = False) -> None:
         """Take real pairs in, some of them for choosing between priors only."""
-        for name, both in self.sums(real).items():
+        for name, both in self.cell_sums(real).items():
             self.sets[name].add_real(*map(distributed.gather_values, both), held_out=held_out)
 
     @torch.no_grad()
@@ -296,10 +364,10 @@ class Moments:
 
         Args:
             fake: With their reference counts.
-            members: What `members` returned for their images.
+            members: What `cell_members` returned for their images.
         """
         assert fake.reference is not None
-        found = self.sums(Pairs(fake.grey, fake.reference), members)
+        found = self.cell_sums(Pairs(fake.grey, fake.reference), members)
         return {
             name: self.sets[name].add_reference(*map(distributed.gather_values, both))
             for name, both in found.items()
@@ -308,29 +376,30 @@ class Moments:
     def weigh(self) -> None:
         """Work out the weights."""
         for cells in self.sets.values():
-            cells.weigh(self.doubt, self.excess)
+            cells.weigh(self.settings.doubt, self.excess)
 
-    def begin(self) -> Hashable:
+    def begin_step(self) -> Hashable:
         """Count a step that is about to come; return its kind, see `dase.learning.cuda_graph`."""
         # where real scenes never come again, some batches are held out
-        self.held = self.scenes == math.inf and self.calls % 8 == 7
-        self.anew = self.calls % ANEW == 0
+        every = self.weighting.hold_out_every
+        self.holds_out = self.scenes == math.inf and self.calls % every == every - 1
+        self.reweighs = self.calls % self.weighting.interval == 0
         self.calls += 1
-        return None if self.anew else self.held
+        return None if self.reweighs else self.holds_out
 
     def loss(self, fake: Pairs, real: Pairs, *, move: bool) -> tuple[torch.Tensor, dict[str, torch.Tensor]]:
         """Take both batches in; return the fake means of this batch along what they are off."""
-        self.add_real(real, held_out=self.held)
-        members = self.members(fake.grey)
+        self.add_real(real, held_out=self.holds_out)
+        members = self.cell_members(fake.grey)
         plain = self.add_reference(fake, members)
-        if self.anew:
+        if self.reweighs:
             self.weigh()
         total, distance = fake.counts.new_zeros(()), fake.counts.new_zeros(())
-        for name, both in self.sums(fake, members).items():
+        for name, both in self.cell_sums(fake, members).items():
             sums, number = map(distributed.gather_values, both)
             cells = self.sets[name]
             # earlier batches say how far off the means are, this one which way they go: no bias by its noise
-            off = cells.off()
+            off = cells.mean_difference()
             if move:
                 means = sums.sum(0) / number.sum(0).clamp_min(1)[:, None]
                 total = total + (cells.slope(off) * means).sum()
@@ -348,7 +417,7 @@ class Moments:
         self.boundaries = [b.to(self.device) for b in state["boundaries"]]
         self.calls = state["calls"]
         sizes = [len(state["sets"][name]["real_sum"]) if self.pattern else 0 for name in ("column", "row")]
-        self._make(*sizes)
+        self._make_cells(*sizes)
         for name, kept in state["sets"].items():
             self.sets[name].kept = {key: value.to(self.device) for key, value in kept.items()}
 
@@ -356,7 +425,7 @@ class Moments:
 def sum_by_cell(member: torch.Tensor, values: torch.Tensor) -> torch.Tensor:
     """Return the sums of values (B, N, F) over the pixels of each cell (B, N, cells), shape (B, cells, F).
 
-    In many pieces, which a GPU works at side by side; in one it took 16 times as long.
+    Pixels are summed in many pieces, which a GPU works at side by side; in one it took 16 times as long.
     """
     batch, pixels = member.shape[:2]
     pieces = next(n for n in range(min(64, pixels), 0, -1) if pixels % n == 0)
@@ -367,9 +436,9 @@ def sum_by_cell(member: torch.Tensor, values: torch.Tensor) -> torch.Tensor:
 
 @torch.no_grad()
 def moment_discrepancy(fake: list[Pairs], real: list[Pairs], like: Moments) -> float:
-    """Return how far pairs are apart, with the cells and weights of an objective."""
+    """Return how far simulated and real batches are apart, by the cells and weights of `like`."""
     total = 0.0
-    parts = [[like.sums(pairs) for pairs in side] for side in (fake, real)]
+    parts = [[like.cell_sums(pairs) for pairs in side] for side in (fake, real)]
     for name, cells in like.sets.items():
         means = []
         for side in parts:

@@ -17,16 +17,10 @@ from numpy.typing import NDArray
 
 from dase.errors import InputError
 from dase.learning.scene_batches import LOG_EPS, Scenery, SceneSettings
-from dase.learning.targets import FiniteTarget, Pairs
+from dase.learning.targets import FiniteTarget, store_pairs
 from dase.recordings.recording import Recording, open_recording
-from dase.scenes.between_frames import TOLERANCE, CameraScene
+from dase.scenes.between_frames import CameraScene, TrustSettings
 from dase.scenes.frame_motion import estimate_stretches, is_stretched
-
-FEWEST = 0.005
-"""Fewest events per pixel and window from which anything can be learned."""
-
-ROOM = 1 << 31
-"""Most memory of the windows' log intensities [bytes]; of a longer recording only some windows are used."""
 
 
 @dataclass(frozen=True)
@@ -51,8 +45,10 @@ def cut_windows(
     *,
     window: float = 0.05,
     samples: int = 16,
-    tolerance: float = TOLERANCE,
+    tolerance: float = TrustSettings.tolerance,
     most: int | None = None,
+    memory: int = 1 << 31,
+    fewest: float = 0.005,
     progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> RecordedWindows:
     """Cut a recording into windows.
@@ -62,7 +58,9 @@ def cut_windows(
         window: Duration [s].
         samples: Of the log intensity, in a window.
         tolerance: Doubt up to which a scene is trusted [log intensity].
-        most: Windows, evenly chosen; None for as many as fit into memory.
+        most: Windows, evenly chosen; None for as many as fit into `memory`.
+        memory: For the windows' log intensities [bytes]; of a longer recording only some windows are used.
+        fewest: Events per pixel and window below which nothing can be learned.
         progress: Called with how many windows are done, and of how many.
 
     Raises:
@@ -76,7 +74,7 @@ def cut_windows(
             f"{4 * window:g} s"
         )
     size = 2 * samples * recording.height * recording.width
-    most = min(most or len(begin), max(ROOM // size, 4))
+    most = min(most or len(begin), max(memory // size, 4))
     begin = begin[np.unique(np.round(np.linspace(0, len(begin) - 1, min(most, len(begin)))).astype(int))]
     log = np.empty((len(begin), samples, recording.height, recording.width), np.float16)
     counts = np.empty((len(begin), 2, recording.height, recording.width), np.float32)
@@ -90,10 +88,10 @@ def cut_windows(
         kept += float(trusted.mean()) / len(begin)
         progress(n + 1, len(begin))
     rate = float(counts.sum((1, 2, 3)).mean()) / (recording.height * recording.width)
-    if rate < FEWEST:
+    if rate < fewest:
         raise InputError(
             f"the recording has {rate:.2g} events per pixel in windows of {window:g} s where its frames can "
-            f"be trusted; learning needs at least {FEWEST:g}"
+            f"be trusted; learning needs at least {fewest:g}"
         )
     return RecordedWindows(begin, log, counts, kept)
 
@@ -211,7 +209,5 @@ def _join_recordings(
     every = RecordedWindows(begin, log, counts, trusted)
     scenes = ReplayedScenes(every, window=window, device=device)
     middle = np.exp(log[:, log.shape[1] // 2].astype(np.float32)) - np.float32(LOG_EPS)
-    pairs = Pairs(
-        torch.from_numpy(middle).half().to(device), torch.from_numpy(counts).clamp_max(2000).half().to(device)
-    )
+    pairs = store_pairs(torch.from_numpy(middle), torch.from_numpy(counts), device)
     return FiniteTarget(pairs, held_out=len(rest) / start, augment=False), scenes

@@ -16,13 +16,11 @@ from dase.atomic_file import replacing
 from dase.errors import InputError
 from dase.learning import distributed
 from dase.learning.evaluation import HeldOutScore, MapEvaluation
-from dase.learning.training import Recipe, Training
+from dase.learning.recipe import Recipe
+from dase.learning.training import Training, TrainingSettings
 
 CHECKPOINT, RESULT, BEST = "checkpoint.pt", "result.pt", "best.pt"
 LOG, RECIPE = "log.csv", "recipe.json"
-
-TIMED = 30
-"""Steps from which, and over which, the speed is measured first where a run is to take a given time."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -30,16 +28,19 @@ class RunSchedule:
     """How often what is done.
 
     Args:
-        look: Steps between lines of the log.
-        save: Seconds between checkpoints; infinite for none, not even at the end.
-        seconds: Time the run may take, which sets its number of steps; None keeps the recipe's.
-        held_out: Looks between scores on held-out pairs; 0 for none.
+        log_every: Steps between lines of the log.
+        save_every: Time between checkpoints [s]; infinite for none, not even at the end.
+        score_every: Lines of the log between scores on held-out pairs; 0 for none.
+        seconds: Time the run may take [s], which sets its number of steps; None keeps the recipe's.
+        timed_steps: Steps from which, and over which, the speed is measured first where `seconds` is given:
+            the first steps are slower, while kernels are compiled and recorded.
     """
 
-    look: int = 50
-    save: float = 30.0
+    log_every: int = 50
+    save_every: float = 30.0
+    score_every: int = 2
     seconds: float | None = None
-    held_out: int = 2
+    timed_steps: int = 30
 
 
 class TrainingDiverged(InputError):
@@ -50,37 +51,36 @@ def train_in_folder(
     training: Training,
     out: Path,
     *,
-    pace: RunSchedule | None = None,
+    schedule: RunSchedule = RunSchedule(),
     resume: bool = False,
-    look: Callable[[dict[str, float]], None] = lambda row: None,
+    on_row: Callable[[dict[str, float]], None] = lambda row: None,
 ) -> dict[str, float]:
     """Train to the end, in the folder `out`; return the last line of the log.
 
     Args:
         training: The run.
         out: Folder, made if missing.
-        pace: How often to log, look and save.
+        schedule: How often to log, score and save.
         resume: Go on from the checkpoint in `out`.
-        look: Called with each line of the log.
+        on_row: Called with each line of the log.
 
     Raises:
         InputError: `out` holds another run, or nothing to resume.
-        Broken: A loss or weight is not finite; the last checkpoint is good.
+        TrainingDiverged: A loss or weight is not finite; the last checkpoint is good.
     """
-    pace = pace or RunSchedule()
     out.mkdir(parents=True, exist_ok=True)
     path = out / CHECKPOINT
     if resume:
         if not path.is_file():
             raise InputError(f"{out} holds no checkpoint to resume")
-        training.load(load(path, training.device))
+        training.load(load_checkpoint(path, training.device))
     elif path.exists():
-        raise InputError(f"{out} already holds a run; give --resume to go on with it, or another folder")
+        raise InputError(f"{out} already holds a run; resume it, or give another folder", argument="resume")
     _write_recipe(out, training.recipe)
     exam = MapEvaluation(training.scenery, training.target)
-    pairs = training.target.held_out() if pace.held_out else None
+    pairs = training.target.held_out() if schedule.score_every else None
     held = None if pairs is None else HeldOutScore(training.scenery, pairs)
-    return _RunLoop(training, out, pace, exam, held, look).go()
+    return _RunLoop(training, out, schedule, exam, held, on_row).run_steps()
 
 
 class _RunLoop:
@@ -90,21 +90,23 @@ class _RunLoop:
         self,
         training: Training,
         out: Path,
-        pace: RunSchedule,
+        schedule: RunSchedule,
         exam: MapEvaluation,
         held: HeldOutScore | None,
-        look: Callable[[dict[str, float]], None],
+        on_row: Callable[[dict[str, float]], None],
     ):
-        self.training, self.out, self.pace = training, out, pace
-        self.exam, self.held, self.look = exam, held, look
+        self.training, self.out, self.schedule = training, out, schedule
+        self.exam, self.held, self.on_row = exam, held, on_row
         self.broken = torch.full((), -1, device=training.device)
         self.table = None if distributed.process_rank() else _LogTable(out / LOG, training.step)
 
-    def go(self) -> dict[str, float]:
-        training = self.training
+    def run_steps(self) -> dict[str, float]:
+        """Train to the end; return the last line of the log."""
+        training, schedule = self.training, self.schedule
+        timed = schedule.timed_steps
         begin = time.perf_counter() - training.seconds
         saved = time.perf_counter()
-        mark = max(training.step, TIMED), saved
+        mark = max(training.step, timed), saved
         row: dict[str, float] = {
             "step": training.step,
             "seconds": training.seconds,
@@ -113,36 +115,38 @@ class _RunLoop:
             values = training.advance()
             wrong = ~torch.isfinite(values["loss"]) & (self.broken < 0)
             self.broken = torch.where(wrong, training.step - 1, self.broken)
-            if self.pace.seconds is not None and training.step in (TIMED, 2 * mark[0]):
+            if self.schedule.seconds is not None and training.step in (timed, 2 * mark[0]):
                 _synchronise(training.device)
-                if training.step > TIMED:
+                if training.step > timed:
                     self._fit_time(*mark, begin)
                 mark = training.step, time.perf_counter()
             last = training.step == training.recipe.steps
-            if training.step % self.pace.look == 0 or last:
+            if training.step % schedule.log_every == 0 or last:
                 _synchronise(training.device)
                 training.seconds = time.perf_counter() - begin
-                row = self._row(values, last)
-                due = time.perf_counter() - saved > self.pace.save or (last and self.pace.save < math.inf)
-                if distributed.broadcast_number(due):
-                    save(self.out / CHECKPOINT, training.state())
+                row = self._log_row(values, last)
+                waited = time.perf_counter() - saved > schedule.save_every
+                # clocks differ, and processes must save together, since each tells its random state
+                if distributed.broadcast_number(waited or (last and schedule.save_every < math.inf)):
+                    save_checkpoint(self.out / CHECKPOINT, training.state())
                     saved = time.perf_counter()
-        save(self.out / RESULT, {"net": training.mean.state_dict(), "row": row})
+        save_checkpoint(self.out / RESULT, {"net": training.mean.state_dict(), "row": row})
         return row
 
     def _fit_time(self, step: int, mark: float, begin: float) -> None:
         """Set the number of steps so that the run takes the time it may, by its speed since `mark`."""
         training = self.training
-        assert self.pace.seconds is not None
+        assert self.schedule.seconds is not None
         now = time.perf_counter()
         each = distributed.broadcast_number((now - mark) / (training.step - step))
-        left = distributed.broadcast_number(self.pace.seconds - (now - begin))
+        left = distributed.broadcast_number(self.schedule.seconds - (now - begin))
         training.recipe = replace(training.recipe, steps=training.step + max(int(0.97 * left / each), 1))
         _write_recipe(self.out, training.recipe)
 
-    def _row(self, values: dict[str, torch.Tensor], last: bool) -> dict[str, float]:
+    def _log_row(self, values: dict[str, torch.Tensor], last: bool) -> dict[str, float]:
+        """Write a line of the log, and the best network so far; return the line, empty in other processes."""
         training = self.training
-        self._check()
+        self._check_finite()
         if self.table is None:
             return {}
         row = {"step": training.step, "seconds": training.seconds}
@@ -150,18 +154,18 @@ class _RunLoop:
         row |= {f"raw_{name}": value for name, value in self.exam.describe_maps(training.net).items()}
         row |= self.exam.describe_maps(training.mean)
         if self.held is not None and training.step > 0:
-            looks = training.step // self.pace.look
-            if last or looks % self.pace.held_out == 0:
+            lines = training.step // self.schedule.log_every
+            if last or lines % self.schedule.score_every == 0:
                 row["held_out"] = self.held.score(training.mean)
                 if row["held_out"] < training.best:
                     training.best = row["held_out"]
-                    save(self.out / BEST, {"net": training.mean.state_dict(), "row": row})
+                    save_checkpoint(self.out / BEST, {"net": training.mean.state_dict(), "row": row})
         self.table.add(row)
-        self.look(row)
+        self.on_row(row)
         return row
 
-    def _check(self) -> None:
-        """Raise Broken where a number is not finite."""
+    def _check_finite(self) -> None:
+        """Raise TrainingDiverged where a number is not finite."""
         training, step = self.training, int(self.broken)
         culprit = "the loss" if step >= 0 else None
         for name, value in training.net.named_parameters():
@@ -221,13 +225,13 @@ class _LogTable:
             writer.writerows(self.rows)
 
 
-def _write_recipe(out: Path, recipe: Recipe) -> None:
+def _write_recipe(out: Path, recipe: TrainingSettings) -> None:
     if distributed.process_rank() == 0:
         with replacing(out / RECIPE) as temporary:
             temporary.write_text(recipe.text(), "utf-8")
 
 
-def save(path: Path, state: dict[str, Any]) -> None:
+def save_checkpoint(path: Path, state: dict[str, Any]) -> None:
     """Write a checkpoint, if this is the first process; it appears whole or not at all."""
     if distributed.process_rank():
         return
@@ -235,7 +239,7 @@ def save(path: Path, state: dict[str, Any]) -> None:
         torch.save(state, temporary)
 
 
-def load(path: Path, device: torch.device | str) -> dict[str, Any]:
+def load_checkpoint(path: Path, device: torch.device | str) -> dict[str, Any]:
     """Return a checkpoint; raises InputError where it is none."""
     try:
         # random states are kept as Python objects of NumPy's

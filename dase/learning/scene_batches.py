@@ -18,21 +18,21 @@ from numpy.typing import NDArray
 from dase.errors import InputError, nearest
 from dase.kernels import autograd_training as bridge
 from dase.scenes import image_sources
-from dase.scenes.random_scenes import CLIP, MIXED, REGIME_NAMES, REGIMES, Regime
+from dase.scenes.random_scenes import MIXED, REGIME_NAMES, REGIMES, Regime
+from dase.simulation.sensor import Sensor
 
 BACKGROUND = (320, 480)
 """Rows and columns of the backgrounds in the pool [texel]."""
 
-LOG_EPS = 1e-3
-"""Added to intensities before the logarithm, as `Sensor.log_eps` is by default."""
+LOG_EPS = Sensor.log_eps
+"""Added to intensities before the logarithm, as sensors do by default."""
 
-LINE = 32
-"""Numbers of 4 bytes in a line of a GPU's memory."""
-
-SHAKEN = Regime(1, (0, 8), (400.0, 1400.0), (0.0, 60.0), (20.0, 300.0), (0.0, 60.0))
-"""A camera in motion before moving things: most pixels see a change in a short window."""
-
-MOTIONS = {**REGIMES, "shaken": SHAKEN}
+MOTIONS = {
+    **REGIMES,
+    "shaken": Regime(1, (0, 8), (400.0, 1400.0), (0.0, 60.0), (20.0, 300.0), (0.0, 60.0)),
+}
+"""Regimes by name: those of `dase.scenes.random_scenes`, and a camera in motion before moving things, so that
+most pixels see a change in a short window."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -102,6 +102,8 @@ class Scenery:
             start.append(total)
             size.append(front.grey.shape[::-1])
             total += front.grey.size
+        # intensities of layers in front are stored times their alpha, as compositing wants them; the last
+        # texture is one transparent texel, for the layers that a scene lacks
         self.grey = torch.from_numpy(np.stack(grounds).reshape(len(grounds), -1)).to(self.device)
         self.texels = torch.from_numpy(np.concatenate([*flat, np.zeros((1, 2), np.float32)])).to(self.device)
         self.start = np.array([*start, total], np.int32)
@@ -137,7 +139,7 @@ class Scenery:
         which = np.where(motion.there, front, len(self.size) - 1)
         size = self.size[which]
         size[:, 0] = BACKGROUND[::-1]
-        place, box = motion.places(looks, size)
+        place, box = motion.texture_maps(looks, size)
         ground = rng.integers(len(self.grey), size=count).astype(np.int32)
         return pack_words(ground, self.start[which], size, place, box)
 
@@ -154,15 +156,21 @@ class Scenery:
 
 
 def pack_words(*arrays: NDArray[Any]) -> NDArray[np.int32]:
-    """Return arrays of 4-byte numbers one behind the other, each from a multiple of LINE on.
+    """Return arrays of 4-byte numbers one behind the other, each from the begin of a line of GPU memory.
 
     Vectors on a GPU may ask for that.
     """
-    begin = np.cumsum([0, *(-(-a.size // LINE) * LINE for a in arrays)])
+    begin = np.cumsum([0, *(_whole_lines(a.size) for a in arrays)])
     flat = np.zeros(begin[-1], np.int32)
     for array, start in zip(arrays, begin, strict=False):
         flat[start : start + array.size] = np.ascontiguousarray(array).view(np.int32).ravel()
     return flat
+
+
+def _whole_lines(words: int) -> int:
+    """Return how many words of 4 bytes the lines of a GPU's memory have that so many words fill."""
+    line = 32
+    return -(-words // line) * line
 
 
 def unpack_words(words: torch.Tensor, *shapes: tuple[int, ...]) -> list[torch.Tensor]:
@@ -171,7 +179,7 @@ def unpack_words(words: torch.Tensor, *shapes: tuple[int, ...]) -> list[torch.Te
     for shape in shapes:
         size = math.prod(shape)
         out.append(words[begin : begin + size].view(shape))
-        begin += -(-size // LINE) * LINE
+        begin += _whole_lines(size)
     return out
 
 
@@ -192,6 +200,7 @@ def middle_intensity(log: torch.Tensor) -> torch.Tensor:
 
 def _fit_background(grey: NDArray[np.float32]) -> NDArray[np.float32]:
     """Return a texture as a background of the pool: turned upright, cut and scaled to one size."""
+    # heavy, and wanted only where a pool is made: recordings bring their own scenes
     import cv2
 
     if grey.shape[0] > grey.shape[1]:
@@ -216,7 +225,7 @@ class LayerMotions:
     scale_y: NDArray[np.float64]
     there: NDArray[np.bool_]
 
-    def places(
+    def texture_maps(
         self, looks: SceneSettings, size: NDArray[np.int32]
     ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
         """Return maps from sensor to texture (B, K, L, 2, 3) and boxes (B, L, 4), as `LayerScene` has them.
@@ -302,11 +311,11 @@ def _straight_paths(
     angle = rng.uniform(0, 2 * np.pi, shape)
     turn = np.radians(spin) * rng.choice((-1, 1), shape) * window
     # a short window is a piece of S2R's clip, so that it does not zoom faster
-    begin = rng.uniform(0, CLIP - window, shape) if window < CLIP else np.zeros(shape)
+    begin = rng.uniform(0, Regime.clip - window, shape) if window < Regime.clip else np.zeros(shape)
     scales = []
     for _ in range(2):
         first, second = rng.uniform(low, high, shape), rng.uniform(low, high, shape)
-        ends = [first + (second - first) * t / max(CLIP, window) for t in (begin, begin + window)]
+        ends = [first + (second - first) * t / max(Regime.clip, window) for t in (begin, begin + window)]
         scales.append(np.stack(ends, -1))
     return LayerMotions(
         np.stack([x - vx * when, x + vx * (window - when)], -1),
@@ -326,6 +335,7 @@ def _half_normal(
 ) -> NDArray[np.float64]:
     """Return half-normal numbers up to `most`, drawn again where they are above it."""
     out = np.abs(rng.normal(size=shape)) * deviation
+    # as good as certain to end before: 64 draws all above `most` would need a bound far below the deviation
     for _ in range(64):
         high = out > most
         if not high.any():

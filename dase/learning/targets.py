@@ -44,6 +44,7 @@ class VariedCounts:
         the step; the difference of the function's values is not.
         """
         out = value(counts.detach())
+        # a slope by the logarithm; between e^-STEP and e^STEP lie 2 sinh(STEP) of a threshold
         for n, (above, below) in enumerate(zip(self.above, self.below, strict=True)):
             slope = (value(above) - value(below)) / (2 * math.sinh(STEP))
             log = self.log[:, n : n + 1]
@@ -79,6 +80,18 @@ class Pairs:
         return Pairs(self.grey[index].float(), self.counts[index].float())
 
 
+def store_pairs(grey: torch.Tensor, counts: torch.Tensor, device: str | torch.device) -> Pairs:
+    """Return pairs as float16 on a device, which halves the memory of a data set.
+
+    Args:
+        grey: Images in [0, 1], shape (B, H, W).
+        counts: Shape (B, 2, H, W), OFF before ON; more than 2000 are not told apart.
+        device: Where training draws them.
+    """
+    # float16 holds whole numbers exactly up to 2048
+    return Pairs(grey.half().to(device), counts.clamp_max(2000).half().to(device))
+
+
 class Target(ABC):
     """What the simulator is to be like.
 
@@ -111,7 +124,7 @@ class Target(ABC):
         """Return pairs that `draw` never gives, or None where every draw is new."""
         return None
 
-    def part(self, process: int) -> None:  # noqa: B027  # most have nothing to do here
+    def set_process(self, process: int) -> None:  # noqa: B027  # most have nothing to do here
         """Become different from the same target in other processes, but for what is recorded."""
 
     def state(self) -> dict[str, Any]:
@@ -152,7 +165,7 @@ class EndlessTarget(Target):
         mu, sigma = self.truth(grey)
         return Pairs(grey, simulate_counts(log, mu, sigma, draw_noise(log, self.generator)))
 
-    def part(self, process: int) -> None:
+    def set_process(self, process: int) -> None:
         """Draw other thresholds and phases than other processes."""
         if process:
             self.generator.manual_seed(self.generator.initial_seed() + process)
@@ -229,7 +242,12 @@ def record_pairs(target: Target, rng: np.random.Generator, count: int, *, batch:
 
 @dataclass
 class PixelNoise:
-    """What is random in pixels: one normal number for both thresholds, which go together, and the phase."""
+    """What is random in pixels.
+
+    Args:
+        z: Normal numbers, one for both thresholds of a pixel, which go together, shape (B, H, W).
+        phase: Where between two events a pixel begins, in (-1, 1), shape (B, H, W).
+    """
 
     z: torch.Tensor
     phase: torch.Tensor
@@ -292,7 +310,7 @@ def vary_thresholds(
 
 
 @torch.no_grad()
-def answers(
+def vary_parameters(
     log: torch.Tensor, mu: torch.Tensor, sigma: torch.Tensor, noise: PixelNoise
 ) -> dict[str, tuple[torch.Tensor, torch.Tensor]]:
     """Return counts with all means, and with all spreads, a little higher and lower, and likewise the ratio.

@@ -1,11 +1,17 @@
-"""The training loop: scenes, thresholds, counts, what tells them from real ones, and the way back."""
+"""The training loop: scenes, thresholds, counts, an objective's loss, and the way back.
+
+A step is `Training.advance`, to be read from there downwards. The loop draws scenes, lets the network tell
+thresholds, counts events, asks the objective what the counts cost, and moves the network's weights. What the
+objective compares and what it learns itself is its own affair, see `Objective`.
+"""
 
 from __future__ import annotations
 
-import json
 import math
-from dataclasses import asdict, dataclass, field, fields
-from typing import Any, Literal
+from abc import ABC, abstractmethod
+from collections.abc import Hashable, Iterable, Sequence
+from dataclasses import dataclass, field
+from typing import Any, Literal, Protocol, Self
 
 import numpy as np
 import torch
@@ -14,38 +20,17 @@ from dase.errors import InputError
 from dase.kernels.autograd_counts import Surrogate
 from dase.learning import distributed
 from dase.learning.adabelief import AdaBelief
-from dase.learning.adversarial import AdversarialObjective, Objective, PatchHash
 from dase.learning.cuda_graph import GraphReplay
-from dase.learning.gauss_newton import GaussNewton
-from dase.learning.moment_matching import Moments
 from dase.learning.scene_batches import Scenery, middle_intensity, pack_words, send_words, unpack_words
-from dase.learning.targets import (
-    Pairs,
-    PixelNoise,
-    Target,
-    answers,
-    draw_noise,
-    simulate_counts,
-    vary_thresholds,
-)
+from dase.learning.targets import Pairs, PixelNoise, Target, draw_noise, simulate_counts
 from dase.networks.threshold_network import NetworkShape, ThresholdMaps, ThresholdNet
-
-REFERENCE = 0.25, 0.06
-"""Threshold and spread at which scenes are counted once more, to tell busy scenes from low thresholds."""
-
-APART = 1_000_003
-"""Between the seeds of one process and the next."""
-
-DERIVED = 4
-"""Scenes of a step, at least, that are counted at other thresholds as well, to see how the moments answer."""
 
 
 @dataclass(frozen=True, kw_only=True)
-class Recipe:
-    """Everything about a training run but its data.
+class TrainingSettings(ABC):
+    """What the loop has to know, whatever the objective; see `dase.learning.recipe`.
 
     Args:
-        objective: `wgan`, the paper's bank of critics, or `moments`.
         steps: Generator steps.
         warmup: Steps before them in which the objective alone learns.
         batch: Scenes of either domain in a step.
@@ -53,7 +38,7 @@ class Recipe:
         sigma: Standard deviation to begin with [log intensity].
         optimizer: Of the generator: `adam` (0.5, 0.99) or `adabelief` (0.9, 0.999).
         rate: Learning rate of the UNet.
-        rate_scalars: Learning rate of the global numbers.
+        rate_scalars: Learning rate of the parameters that all pixels share, where descent moves them.
         ramp: Steps over which the rates rise from 0, at most a quarter of all; a cosine takes them back to 0
             at the end.
         average: Decay of the running mean of the weights that is the result; 0 takes the last weights.
@@ -61,22 +46,10 @@ class Recipe:
         smooth: Weight of the roughness of the table.
         kl: λ of Eq. 9, which is added to the loss.
         surrogate: Of the gradient of counts.
-        critic_rate: Learning rate of the critics.
-        critic_cosine: Whether it falls as the generator's does.
-        critic_steps: Steps of the critics in a step.
-        penalty: Weight of the gradient penalty.
-        uniform: α of Eq. 13; 1 turns re-weighting off.
-        critic_image: Whether critics see the image.
-        hash: Of the patches.
-        cells: Levels of brightness and contrast of the moments.
-        memory: Of the fake moments from step to step.
-        doubt: Share by which means of features may differ for reasons that thresholds cannot cure.
-        newton: Share of a Gauss-Newton step that is taken with the moments.
         network: Of the generator.
         seed: Of everything random.
     """
 
-    objective: Literal["wgan", "moments"] = "wgan"
     steps: int = 3000
     warmup: int = 50
     batch: int = 12
@@ -91,35 +64,104 @@ class Recipe:
     smooth: float = 0.1
     kl: float = 1e-5
     surrogate: Surrogate = "expected"
-    critic_rate: float = 2e-4
-    critic_cosine: bool = False
-    critic_steps: int = 1
-    penalty: float = 1.0
-    uniform: float = 0.5
-    critic_image: bool = False
-    hash: PatchHash = field(default_factory=PatchHash)
-    cells: tuple[int, int] = (6, 5)
-    memory: float = 0.95
-    doubt: float = 0.0
-    newton: float = 0.2
     network: NetworkShape = field(default_factory=NetworkShape)
     seed: int = 0
 
+    @abstractmethod
     def text(self) -> str:
-        """Return the recipe as JSON."""
-        return json.dumps(asdict(self), indent=1)
+        """Return all that a checkpoint keeps of the settings, as JSON."""
 
     @classmethod
-    def parse(cls, text: str) -> Recipe:
-        """Return the recipe of a JSON text."""
-        table = json.loads(text)
-        table["hash"] = PatchHash(**table["hash"])
-        network = table["network"]
-        for name in ("pattern", "table"):
-            network[name] = None if network[name] is None else tuple(network[name])
-        table["network"] = NetworkShape(**network)
-        table["cells"] = tuple(table["cells"])
-        return cls(**{f.name: table[f.name] for f in fields(cls) if f.name in table})
+    @abstractmethod
+    def parse(cls, text: str) -> Self:
+        """Return the settings of what `text` returned."""
+
+
+class Objective(Protocol):
+    """What a step costs, and what the objective itself learns or moves in a step.
+
+    `Training.advance` calls, in this order: `step_rates` and `begin_step` on the processor; then, on the
+    device and perhaps from a recording (see `dase.learning.cuda_graph`), `extend_fake`, `loss`, and, where
+    the network moves, `move_shared`.
+    """
+
+    @property
+    def moves_shared(self) -> bool:
+        """Whether `move_shared` moves the parameters that all pixels share, and descent does not."""
+
+    @property
+    def generators(self) -> Sequence[torch.Generator]:
+        """Random numbers that a step draws on the device."""
+
+    def calibrate(self, sets: list[tuple[Pairs, Pairs]], held_out: Iterable[Pairs] = ()) -> None:
+        """Look at pairs of a fake and a real batch, and at held-out real batches, before training."""
+
+    def begin_step(self) -> Hashable:
+        """Count a step that is about to come; return its kind, or None for one that is not recorded."""
+
+    def step_rates(self, share: float, *, move: bool) -> list[float]:
+        """Return the numbers that `loss` needs of this step and that differ from step to step.
+
+        Args:
+            share: Of the full learning rates, see `Training.learning_share`.
+            move: Whether the network moves.
+        """
+
+    def extend_fake(
+        self,
+        fake: Pairs,
+        log: torch.Tensor,
+        mu: torch.Tensor,
+        sigma: torch.Tensor,
+        noise: PixelNoise,
+        step: torch.Tensor | int,
+    ) -> Pairs:
+        """Return simulated pairs with all that `loss` has to see of them beside their counts.
+
+        Args:
+            fake: Images and counts.
+            log: Log intensities of their scenes, shape (B, K, H, W).
+            mu: Mean thresholds [log intensity], shape (B, H, W), or (B, 2, H, W) with OFF before ON.
+            sigma: Their standard deviation, shaped alike.
+            noise: That the counts were made with.
+            step: Number of the step.
+        """
+
+    def loss(
+        self, fake: Pairs, real: Pairs, *, move: bool, rates: torch.Tensor | None = None
+    ) -> tuple[torch.Tensor, dict[str, torch.Tensor]]:
+        """Learn from both batches; return the loss, and numbers for the log.
+
+        Without `move` the objective alone learns and the loss has no gradient.
+
+        Args:
+            fake: Simulated pairs.
+            real: Pairs of the target.
+            move: Whether the network moves in this step.
+            rates: What `step_rates` returned, float32 on the device; None for the full rates.
+
+        Returns:
+            A scalar whose gradient by the fake counts leads towards the real ones (of this process's scenes:
+            gradients are summed over processes), and scalars by their names in the log.
+        """
+
+    def move_shared(self, share: torch.Tensor) -> None:
+        """Move the parameters that all pixels share, if `moves_shared`; `share` is as in `step_rates`."""
+
+    def state(self) -> dict[str, Any]:
+        """Return entries of the checkpoint that hold all that the next step depends on."""
+
+    def load(self, state: dict[str, Any]) -> None:
+        """Take over its entries of a checkpoint."""
+
+
+def make_network(settings: TrainingSettings, device: torch.device) -> ThresholdNet:
+    """Return the network at its beginning; its weights depend on the seed only."""
+    torch.manual_seed(settings.seed)
+    net = ThresholdNet(settings.network, mu=settings.mu, sigma=settings.sigma)
+    net.to(device)
+    net.to(memory_format=torch.channels_last)
+    return net
 
 
 class Training:
@@ -127,54 +169,55 @@ class Training:
 
     Args:
         recipe: How to learn.
+        net: What learns, of `make_network`.
+        objective: What a step costs.
         target: What to become like.
         scenery: Draws the simulator's scenes.
     """
 
-    def __init__(self, recipe: Recipe, target: Target, scenery: Scenery):
-        self.recipe, self.target, self.scenery, self.device = recipe, target, scenery, scenery.device
-        torch.manual_seed(recipe.seed)
-        self.net = ThresholdNet(recipe.network, mu=recipe.mu, sigma=recipe.sigma).to(self.device)
-        self.net = self.net.to(memory_format=torch.channels_last)
+    def __init__(
+        self,
+        recipe: TrainingSettings,
+        net: ThresholdNet,
+        objective: Objective,
+        target: Target,
+        scenery: Scenery,
+    ):
+        self.recipe, self.net, self.objective = recipe, net, objective
+        self.target, self.scenery, self.device = target, scenery, scenery.device
         self.mean = ThresholdNet(recipe.network).to(self.device).to(memory_format=torch.channels_last)
         self.mean.load_state_dict(self.net.state_dict())
         if self.device.type == "cuda":
             # every step has the same shapes, so trying convolutions out once pays
             torch.backends.cudnn.benchmark = True
-        self.optimizer = self._optimizer()
-        self.objective = self._objective()
-        moments = self.objective
-        self.newton = GaussNewton(moments, self.net) if isinstance(moments, Moments) else None
+        self.optimizer = self._make_optimizer()
         distributed.broadcast_tensors(self.net.state_dict().values())
-        self.generator = torch.Generator(self.device).manual_seed(
-            recipe.seed + 1 + APART * distributed.process_rank()
-        )
+        self.generator = torch.Generator(self.device).manual_seed(distributed.process_seed(recipe.seed + 1))
         # other processes have scenes and phases of their own
         apart = [distributed.process_rank()] if distributed.process_rank() else []
         self.scenes = np.random.default_rng([recipe.seed, 1, *apart])
         self.reals = np.random.default_rng([recipe.seed, 2, *apart])
-        target.part(distributed.process_rank())
-        self.replay = GraphReplay(self.device, self._generators())
+        target.set_process(distributed.process_rank())
+        self.replay = GraphReplay(self.device, self.generators())
         self.inputs: torch.Tensor | None = None
         self.step = -recipe.warmup
         self.seconds = 0.0
         self.best = math.inf
         self.calibrated = False
 
-    def _generators(self) -> list[torch.Generator]:
+    def generators(self) -> list[torch.Generator]:
         """Return all random numbers that a step draws on the device."""
-        parts = self, self.target, self.objective
-        return [part.generator for part in parts if hasattr(part, "generator")]
+        own = [part.generator for part in (self, self.target) if hasattr(part, "generator")]
+        return [*own, *self.objective.generators]
 
-    def _optimizer(self) -> torch.optim.Optimizer:
+    def _make_optimizer(self) -> torch.optim.Optimizer:
         recipe, cuda = self.recipe, self.device.type == "cuda"
-        parts = [(self.net.body(), recipe.rate)]
-        if recipe.objective == "wgan":
-            parts.append((self.net.shared_parameters(), recipe.rate_scalars))
-        else:
+        parts = [(self.net.unet_parameters(), recipe.rate)]
+        if self.objective.moves_shared:
             for shared in self.net.shared_parameters():
-                # moved by Newton's steps
                 shared.requires_grad_(False)
+        else:
+            parts.append((self.net.shared_parameters(), recipe.rate_scalars))
         # rates are tensors, which a step that is replayed can read
         groups = [
             {"params": params, "lr": torch.tensor(rate, device=self.device), "full": rate}
@@ -184,63 +227,36 @@ class Training:
             return AdaBelief(groups, betas=(0.9, 0.999))
         return torch.optim.Adam(groups, betas=(0.5, 0.99), fused=cuda, capturable=cuda)
 
-    def _objective(self) -> Objective:
-        recipe = self.recipe
-        if recipe.objective == "moments":
-            pattern = recipe.network.pattern is not None
-            return Moments(
-                device=self.device,
-                levels=recipe.cells,
-                pattern=pattern,
-                memory=recipe.memory,
-                scenes=self.target.scenes,
-                doubt=recipe.doubt,
-            )
-        return AdversarialObjective(
-            recipe.hash,
-            device=self.device,
-            seed=recipe.seed + 2,
-            rate=recipe.critic_rate,
-            steps=recipe.critic_steps,
-            penalty=recipe.penalty,
-            uniform=recipe.uniform,
-            image=recipe.critic_image,
-        )
+    def advance(self) -> dict[str, torch.Tensor]:
+        """Do one step; return what is worth logging, still on the device and until the next step."""
+        if not self.calibrated:
+            self.calibrate()
+        move = self.step >= 0
+        self.inputs = self._draw_inputs(self.learning_share() if move else 0.0)
+        kind = self.objective.begin_step()
+        # in the middle of a run there is only one kind, or two
+        values = self.replay(kind if kind is None else (move, kind), lambda: self._step_on_device(move))
+        self.step += 1
+        return values
 
     def calibrate(self, batches: int = 4) -> None:
-        """Show the objective what patches of both domains look like."""
+        """Show the objective what both domains look like."""
         sets = []
         for _ in range(batches):
             with torch.no_grad():
                 log = self.scenery.draw(self.scenes, self.recipe.batch)
                 sets.append((self.simulate_fake(log)[0], self.target.draw(self.reals, self.recipe.batch)))
-        self.objective.calibrate(sets)
-        held_out = self.target.held_out()
-        if held_out is not None and isinstance(self.objective, Moments):
-            for n in range(0, len(held_out), self.recipe.batch):
-                some = held_out.select(slice(n, n + self.recipe.batch))
-                self.objective.add_real(some, held_out=True)
+        self.objective.calibrate(sets, self._held_out_batches())
         self.calibrated = True
 
-    def simulate_fake(self, log: torch.Tensor, step: torch.Tensor | int = 0) -> tuple[Pairs, ThresholdMaps]:
-        """Return pairs simulated from log intensities, and the maps of their thresholds."""
-        grey = middle_intensity(log)
-        maps = self.net(grey)
-        mu, sigma = maps.by_polarity() if self.recipe.network.split else (maps.mu, maps.sigma)
-        noise = draw_noise(log, self.generator)
-        counts = simulate_counts(log, mu, sigma, noise, surrogate=self.recipe.surrogate)
-        if self.recipe.objective != "moments":
-            return Pairs(grey, counts), maps
-        with torch.no_grad():
-            level = torch.full_like(grey, REFERENCE[0])
-            reference = simulate_counts(log, level, REFERENCE[1], noise)
-        varied = vary_thresholds(log, mu, sigma, noise) if self.recipe.rate > 0 else None
-        some = choose_derived_scenes(len(log), step, log.device)
-        few = PixelNoise(noise.z[some], noise.phase[some])
-        near = answers(log[some], mu.detach()[some], sigma.detach()[some], few)
-        return Pairs(grey, counts, reference, varied, near, some), maps
+    def _held_out_batches(self) -> Iterable[Pairs]:
+        held_out = self.target.held_out()
+        if held_out is not None:
+            # one at a time: as float32 all of them might not fit into memory
+            for n in range(0, len(held_out), self.recipe.batch):
+                yield held_out.select(slice(n, n + self.recipe.batch))
 
-    def rate(self) -> float:
+    def learning_share(self) -> float:
         """Return the share of the full learning rates at this step."""
         step, steps = self.step, self.recipe.steps
         ramp = min(self.recipe.ramp, max(steps // 4, 1))
@@ -248,27 +264,20 @@ class Training:
         cosine = 0.5 * (1 + math.cos(math.pi * min(max(step - ramp, 0) / fall, 1)))
         return min((step + 1) / max(ramp, 1), 1) * cosine
 
-    def advance(self) -> dict[str, torch.Tensor]:
-        """Do one step; return what is worth logging, still on the device and until the next step."""
-        if not self.calibrated:
-            self.calibrate()
-        move = self.step >= 0
-        self.inputs = self._draw_inputs(self.rate() if move else 0.0)
-        kind = self.objective.begin()
-        # in the middle of a run there is only one kind, or two
-        values = self.replay(kind if kind is None else (move, kind), lambda: self._step_on_device(move))
-        self.step += 1
-        return values
-
     def _draw_inputs(self, share: float) -> torch.Tensor:
-        """Draw scenes; return all that a step reads from the processor, where the last one read it."""
+        """Draw scenes; return all that a step reads from the processor, where the last one read it.
+
+        Returns:
+            Words of 4 bytes, int32: learning rates, number of the step, and what is random in the scenes. The
+            memory is the same in every step, because a step that is replayed reads where it was recorded.
+        """
         recipe = self.recipe
-        critic_rate = recipe.critic_rate * (share if recipe.critic_cosine and self.step >= 0 else 1.0)
         # the first steps are forgotten soon, as if the mean had begun later
         step = max(self.step, 0)
         keep = min(recipe.average, (step + 1) / (step + 10)) if recipe.average else 0.0
+        rates = self.objective.step_rates(share, move=self.step >= 0)
         parts = (
-            np.array([share, critic_rate, 1 - keep], np.float32),
+            np.array([share, 1 - keep, *rates], np.float32),
             np.array([self.step + recipe.warmup], np.int32),
             self.scenery.draw_numbers(self.scenes, recipe.batch),
             self.target.draw_numbers(self.reals, recipe.batch),
@@ -277,18 +286,15 @@ class Training:
         return send_words(pack_words(*parts), self.device, to=self.inputs)
 
     def _step_on_device(self, move: bool) -> dict[str, torch.Tensor]:
-        """Do what a step does on the device."""
+        """Do what a step does on the device; nothing here may wait for it, or a recording would fail."""
         recipe, inputs = self.recipe, self.inputs
         assert inputs is not None
         numbers, step, scenes, reals = unpack_words(inputs, *self.shapes)
-        share, critic_rate, learn = numbers.view(torch.float32).unbind()
-        if isinstance(self.objective, AdversarialObjective):
-            self.objective.rate = critic_rate
+        numbers = numbers.view(torch.float32)
+        share, learn, rates = numbers[0], numbers[1], numbers[2:]
         fake, maps = self.simulate_fake(self.scenery.render(scenes, recipe.batch), step)
         real = self.target.pairs(reals, recipe.batch)
-        loss, values = self.objective.loss(fake, real, move=move)
-        if self.newton is not None:
-            self.newton.see(fake)
+        loss, values = self.objective.loss(fake, real, move=move, rates=rates)
         if move:
             held = recipe.anchor * maps.residual.square().mean() + recipe.kl * threshold_prior(maps)
             if recipe.smooth:
@@ -301,15 +307,22 @@ class Training:
             loss.backward()
             distributed.sum_gradients(self.net.parameters())
             self.optimizer.step()
-            if self.newton is not None:
-                self.newton.step(recipe.newton * share)
-                shared = [v for n, v in self.net.state_dict().items() if not n.startswith("unet.")]
-                distributed.broadcast_tensors(shared)
-            self._average(learn)
+            self.objective.move_shared(share)
+            self._average_weights(learn)
         return values | {"loss": loss.detach()}
 
+    def simulate_fake(self, log: torch.Tensor, step: torch.Tensor | int = 0) -> tuple[Pairs, ThresholdMaps]:
+        """Return pairs simulated from log intensities (B, K, H, W), and the maps of their thresholds."""
+        grey = middle_intensity(log)
+        maps = self.net(grey)
+        mu, sigma = maps.by_polarity() if self.recipe.network.split else (maps.mu, maps.sigma)
+        noise = draw_noise(log, self.generator)
+        counts = simulate_counts(log, mu, sigma, noise, surrogate=self.recipe.surrogate)
+        return self.objective.extend_fake(Pairs(grey, counts), log, mu, sigma, noise, step), maps
+
     @torch.no_grad()
-    def _average(self, learn: torch.Tensor) -> None:
+    def _average_weights(self, learn: torch.Tensor) -> None:
+        """Move the running mean of the weights by the share `learn` towards them."""
         mine, theirs = list(self.mean.parameters()), list(self.net.parameters())
         apart = torch._foreach_sub(theirs, mine)
         torch._foreach_mul_(apart, learn)
@@ -322,16 +335,15 @@ class Training:
             "net": self.net.state_dict(),
             "mean": self.mean.state_dict(),
             "optimizer": self.optimizer.state_dict(),
-            "newton": None if self.newton is None else self.newton.state(),
-            "objective": self.objective.state(),
-            "random": distributed.gather_objects(self._random()),
+            **self.objective.state(),
+            "random": distributed.gather_objects(self._random_state()),
             "step": self.step,
             "seconds": self.seconds,
             "best": self.best,
             "calibrated": self.calibrated,
         }
 
-    def _random(self) -> dict[str, Any]:
+    def _random_state(self) -> dict[str, Any]:
         """Return what makes this process's scenes its own."""
         return {
             "generator": self.generator.get_state(),
@@ -351,23 +363,15 @@ class Training:
         self.optimizer.load_state_dict(state["optimizer"])
         for group in self.optimizer.param_groups:
             group["lr"] = torch.as_tensor(group["lr"], device=self.device)
-        self.objective.load(state["objective"])
-        if self.newton is not None:
-            self.newton.load(state["newton"])
+        self.objective.load(state)
         mine = state["random"][distributed.process_rank()]
         self.generator.set_state(mine["generator"].cpu())
         self.target.load(mine["target"])
         self.scenes.bit_generator.state = mine["scenes"]
         self.reals.bit_generator.state = mine["reals"]
         self.step, self.seconds, self.best = state["step"], state["seconds"], state["best"]
-        self.recipe = Recipe.parse(state["recipe"])
+        self.recipe = self.recipe.parse(state["recipe"])
         self.calibrated = state["calibrated"]
-
-
-def choose_derived_scenes(batch: int, step: torch.Tensor | int, device: torch.device) -> torch.Tensor:
-    """Return which scenes of a batch the derivatives are taken of, others in every step; indices."""
-    every = max(batch // DERIVED, 1)
-    return (torch.arange(-(-batch // every), device=device) * every + step) % batch
 
 
 def threshold_prior(maps: ThresholdMaps) -> torch.Tensor:

@@ -21,12 +21,6 @@ LEAKY_SLOPE = 0.2
 MAGNITUDE_FLOOR = 1e-6
 """Under the root of gradient magnitudes, whose slope at 0 would be infinite."""
 
-EDGE = 0.05
-"""Edge strength in the middle of a table [intensity/pixel]."""
-
-GREY_MEAN, GREY_SPREAD = 0.449, 0.226
-"""Of natural images; the network sees (grey - mean) / spread."""
-
 
 @dataclass(frozen=True, kw_only=True)
 class NetworkShape:
@@ -87,7 +81,13 @@ class ResidualBlock(nn.Module):
 
 
 class UNet(nn.Module):
-    """Residual encoder, skips, two outputs that begin at zero (Ronneberger et al., U-Net, 2015)."""
+    """Residual encoder, skips, two outputs that begin at zero (Ronneberger et al., U-Net, 2015).
+
+    Args:
+        inputs: Channels of the image.
+        channels: Channels at full resolution; they double with every level, four times as many at most.
+        depth: How often the resolution is halved.
+    """
 
     def __init__(self, inputs: int, channels: int, depth: int):
         super().__init__()
@@ -149,7 +149,8 @@ class ThresholdNet(nn.Module):
 
     def residual(self, grey: torch.Tensor) -> torch.Tensor:
         """Return u of the UNet, shape (B, 2, H, W) float32, for images (B, H, W) in [0, 1]."""
-        x = ((grey - GREY_MEAN) / GREY_SPREAD)[:, None]
+        # mean and spread of natural images
+        x = ((grey - 0.449) / 0.226)[:, None]
         if self.shape.coordinates:
             height, width = grey.shape[-2:]
             across = torch.linspace(-1, 1, width, device=grey.device).expand(len(grey), 1, height, width)
@@ -200,7 +201,7 @@ class ThresholdNet(nn.Module):
             other.table[0] -= off
         return other
 
-    def body(self) -> list[nn.Parameter]:
+    def unet_parameters(self) -> list[nn.Parameter]:
         """Return the parameters of the UNet."""
         return list(self.unet.parameters())
 
@@ -214,7 +215,7 @@ def interpolate_table(table: torch.Tensor, grey: torch.Tensor) -> torch.Tensor:
 
     Args:
         table: Shape (2, nodes of brightness, nodes of edge strength). Brightness goes from 0 to 1, edge
-            strength e from 0 to infinity, evenly in e / (e + EDGE).
+            strength e from 0 to infinity, evenly in e / (e + 0.05), see `node_weights`.
         grey: Images in [0, 1], shape (B, H, W).
 
     Returns:
@@ -225,10 +226,20 @@ def interpolate_table(table: torch.Tensor, grey: torch.Tensor) -> torch.Tensor:
     return (across * rows.flatten(2)[:, None]).sum(2).view(len(grey), 2, *grey.shape[1:])
 
 
-def node_weights(grey: torch.Tensor, nodes: tuple[int, int]) -> tuple[torch.Tensor, torch.Tensor]:
-    """Return the weights of the nodes of brightness and of edge strength, each (B, nodes, H, W)."""
+def node_weights(
+    grey: torch.Tensor, nodes: tuple[int, int], *, middle_edge: float = 0.05
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """Return the weights of the nodes of brightness and of edge strength, each (B, nodes, H, W).
+
+    Args:
+        grey: Images in [0, 1], shape (B, H, W).
+        nodes: Numbers of nodes of brightness and of edge strength.
+        middle_edge: Edge strength in the middle of the table [intensity/pixel]. Tables are files' content:
+            they have to be read with the value that they were learned with.
+    """
     brightness, edge = brightness_and_edge(grey)
-    return _axis_weights(brightness.clamp(0, 1), nodes[0]), _axis_weights(edge / (edge + EDGE), nodes[1])
+    along = _axis_weights(edge / (edge + middle_edge), nodes[1])
+    return _axis_weights(brightness.clamp(0, 1), nodes[0]), along
 
 
 def _axis_weights(share: torch.Tensor, nodes: int) -> torch.Tensor:

@@ -24,13 +24,14 @@ from numpy.typing import ArrayLike, NDArray
 from dase import io
 from dase.errors import InputError, checked_seed
 from dase.events import Events
+from dase.formatting import fit_to_screen
 from dase.io.sequence import Sequence
 from dase.io.source import Kind, Motion, Note, ReadOptions
 from dase.recordings.anomalies import find_anomalies
 from dase.recordings.statistics import Statistics, survey_sequence
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class RecordingReport:
     """What was noticed when a recording was opened.
 
@@ -41,6 +42,11 @@ class RecordingReport:
 
     notes: tuple[Note, ...]
     statistics: Statistics
+
+    def __repr__(self) -> str:
+        count = len(self.notes)
+        notes = [f"  {note.kind}: {note}" for note in self.notes]
+        return fit_to_screen([f"Report of {count} note{'s' if count != 1 else ''}", *notes], rows=20)
 
     def _of(self, kind: Kind) -> tuple[Note, ...]:
         return tuple(note for note in self.notes if note.kind == kind)
@@ -61,7 +67,7 @@ class RecordingReport:
         return self._of("odd")
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Recording:
     """What a camera recorded.
 
@@ -129,6 +135,18 @@ class Recording:
         ):
             raise InputError("recording: an exposure must not end before it begins")
 
+    def __repr__(self) -> str:
+        frames = "no frames" if self.frames is None else f"{len(self.frames)} frames"
+        masked = self.mask.size - int(self.mask.sum())
+        lines = [
+            f"Recording of {self.width}x{self.height} pixels, {self.begin:.6g} s to {self.end:.6g} s",
+            f"  {self.events}",
+            f"  {frames}, {'no ' if self.motion is None else ''}samples of the motion sensor",
+            f"  {int(self.hot.sum())} hot pixels, {masked} masked",
+            *(f"  {note.kind}: {note}" for note in self.report.notes),
+        ]
+        return fit_to_screen(lines)
+
     @classmethod
     def of(cls, sequence: Sequence, notes: Iterable[str] = ()) -> Recording:
         """Return the recording of a sequence, with a report of what looks odd.
@@ -140,6 +158,7 @@ class Recording:
         looked = survey_sequence(sequence)
         found = looked.statistics()
         said = [note if isinstance(note, Note) else Note(note) for note in notes]
+        # spans are half-open, so that the last event lies in them only if they end behind it
         begin, end = found.begin, np.nextafter(found.begin + found.duration, np.inf)
         if len(sequence.events):
             end = max(end, np.nextafter(sequence.events.t[-1], np.inf))
@@ -153,7 +172,7 @@ class Recording:
             float(begin),
             float(end),
             np.ones((sequence.events.height, sequence.events.width), np.bool_),
-            looked.hot(),
+            looked.hot_pixels(),
             RecordingReport((*said, *find_anomalies(found)), found),
             sequence.frames,
             times,
@@ -200,7 +219,7 @@ class Recording:
             raise InputError(f"crop: must lie on the {sensor} sensor, got {part}")
         e = self.events
         kept = (e.x >= x) & (e.x < x + width) & (e.y >= y) & (e.y < y + height)
-        e = e.select(kept)
+        e = e.select(kept)  # before the shift, which would wrap around below 0 in uint16
         moved = Events(e.t, e.x - np.uint16(x), e.y - np.uint16(y), e.p, width, height, e.label)
         window = (slice(y, y + height), slice(x, x + width))
         frames = None if self.frames is None else self.frames[:, *window]

@@ -22,13 +22,31 @@ from dase.io.sequence import Sequence
 from dase.io.source import Picture, ReadOptions
 from dase.recordings.interval_statistics import IntervalStatistics
 
-BITS = 20  # of the place of an event in a part
-PART = 1 << BITS  # events looked at together
-SAMPLE = 1 << 14  # of the first that are asked whether they are alone; of later ones an eighth
-ALONE = 0.01  # [s] around an event in which its 3x3 pixels see no other
-LEAST_GAP = 0.01  # [s] without any event; shorter ones are no gaps
-MOST_GAPS = 1000  # that are remembered, the longest
-HOT_EVENTS, HOT_RATIO = 10, 10.0  # a hot pixel has that many events, and that many times those around it
+
+@dataclass(frozen=True)
+class SurveySettings:
+    """How events are looked at."""
+
+    part: int = 1 << 20
+    """Events looked at together; their keys of pixel and place in the part must fit into 64 bits."""
+    asked: int = 1 << 14
+    """Events of the first part that are asked whether they are alone; of later parts an eighth as many."""
+    alone: float = 0.01
+    """Time around an event in which its 3x3 pixels see no other where it is alone [s]."""
+    hot_events: int = 10
+    """Events that a hot pixel has at least."""
+    hot_ratio: float = 10.0
+    """Times the events of those around it that a hot pixel has at least."""
+
+    least_gap: float = 0.01
+    """Time without any event [s] that is remembered; shorter ones are no gaps."""
+    most_gaps: int = 1000
+    """Gaps that are remembered, the longest."""
+
+    @property
+    def place_bits(self) -> int:
+        """Bits of the place of an event in a part."""
+        return (self.part - 1).bit_length()
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -111,9 +129,11 @@ class RecordingSurvey:
     Args:
         width: Columns of the sensor.
         height: Rows of the sensor.
+        settings: How events are looked at.
     """
 
-    def __init__(self, width: int, height: int) -> None:
+    def __init__(self, width: int, height: int, settings: SurveySettings = SurveySettings()) -> None:
+        self.settings = settings
         self.width, self.height = width, height
         pixels = width * height
         self._on = np.zeros(pixels, np.int64)  # zeros take no memory before they are written to
@@ -133,49 +153,55 @@ class RecordingSurvey:
         self._clipped: list[float] = []
         self.intervals = IntervalStatistics()
 
-    def events(self, part: Events) -> None:
+    def add_events(self, part: Events) -> None:
         """Take events."""
-        for i in range(0, len(part), PART):
-            self._part(part.select(slice(i, i + PART)))
+        size = self.settings.part
+        for i in range(0, len(part), size):
+            self._add_part(part.select(slice(i, i + size)))
 
-    def picture(self, picture: Picture) -> None:
+    def add_frame(self, picture: Picture) -> None:
         """Take a frame."""
         if math.isfinite(picture.t):
-            self._reach(float(picture.t), float(picture.t))
+            self._extend_span(float(picture.t), float(picture.t))
         self._times.append(float(picture.t))
         self._exposures.append(float(picture.exposure))
         white = np.iinfo(picture.grey.dtype).max if picture.grey.dtype.kind in "iu" else 1.0
         self._clipped.append(float(np.mean((picture.grey == 0) | (picture.grey == white))))
 
-    def hot(self) -> NDArray[np.bool_]:
+    def hot_pixels(self) -> NDArray[np.bool_]:
         """Return which pixels have ten times the events of those around them, shape (H, W)."""
         counts = (self._on + self._off).reshape(self.height, self.width)
+        # the median of 3x3 pixels, so that a hot pixel does not count among those around its neighbour
         around = cv2.medianBlur(counts.astype(np.float32), 3)
-        found: NDArray[np.bool_] = (counts >= HOT_EVENTS) & (counts > HOT_RATIO * (around + 1))
+        found: NDArray[np.bool_] = counts > self.settings.hot_ratio * (around + 1)
+        found &= counts >= self.settings.hot_events
         return found
 
-    def _reach(self, begin: float, end: float) -> None:
+    def _extend_span(self, begin: float, end: float) -> None:
         self._span = min(self._span[0], begin), max(self._span[1], end)
 
-    def _part(self, part: Events) -> None:
+    def _add_part(self, part: Events) -> None:
         t = part.t
         pixel = part.y.astype(np.int64) * self.width + part.x
-        key = (pixel << BITS) | np.arange(len(t))  # one sort of 64 bits is faster than a stable one of pixels
+        # one sort of 64 bits is faster than a stable one of pixels
+        key = (pixel << self.settings.place_bits) | np.arange(len(t))
         key.sort()
-        self._stamp(t)
-        self._ask(part, key)
-        self._pixels(part, key)
+        self._look_at_stamps(t)
+        self._ask_whether_alone(part, key)
+        self._count_by_pixel(part, key)
         if part.label is None:
             self._labels = None
         elif self._labels is not None:
             self._labels += np.bincount(part.label, minlength=len(LABELS))
-        self._reach(float(t[0]), float(t[-1]))
+        self._extend_span(float(t[0]), float(t[-1]))
         self._newest = float(t[-1])
 
-    def _pixels(self, part: Events, key: NDArray[np.int64]) -> None:
+    def _count_by_pixel(self, part: Events, key: NDArray[np.int64]) -> None:
         """Count the events, intervals and changes of polarity of every pixel."""
-        pixel, index = key >> BITS, key & ((1 << BITS) - 1)
+        bits = self.settings.place_bits
+        pixel, index = key >> bits, key & ((1 << bits) - 1)
         t, p = part.t[index], part.p[index]
+        # runs of one pixel in the sorted keys; what it sent last in earlier parts joins the parts
         first = np.ones(len(t), np.bool_)
         first[1:] = pixel[1:] != pixel[:-1]
         begin = np.flatnonzero(first)
@@ -193,7 +219,7 @@ class RecordingSurvey:
         self._on[place] += on
         self._off[place] += total - on
 
-    def _stamp(self, t: NDArray[np.float64]) -> None:
+    def _look_at_stamps(self, t: NDArray[np.float64]) -> None:
         """Look at steps from one time to the next."""
         before = np.append(t[0] if math.isnan(self._newest) else self._newest, t[:-1])
         steps = t - before
@@ -201,30 +227,33 @@ class RecordingSurvey:
         longest = int(np.argmax(steps))
         if steps[longest] > self._gap[1]:
             self._gap = float(before[longest]), float(steps[longest])
-        for place in np.flatnonzero(steps > LEAST_GAP).tolist():
+        for place in np.flatnonzero(steps > self.settings.least_gap).tolist():
             self._gaps.append((float(before[place]), float(steps[place])))
-        if len(self._gaps) > 2 * MOST_GAPS:  # only the longest can be worth a word
-            self._gaps = sorted(self._gaps, key=lambda gap: -gap[1])[:MOST_GAPS]
+        if len(self._gaps) > 2 * self.settings.most_gaps:  # only the longest can be worth a word
+            self._gaps = sorted(self._gaps, key=lambda gap: -gap[1])[: self.settings.most_gaps]
         if self._quantum == 0 or self._quantum > 1000:  # finer than a microsecond is of no interest
+            # the greatest common divisor needs whole numbers; offsets of the clock cancel in steps
             steps_ns = np.rint(steps * 1e9).astype(np.int64)
             if self._quantum == 0 or np.any(steps_ns % self._quantum):
                 self._quantum = int(np.gcd.reduce(np.append(np.unique(steps_ns), self._quantum)))
 
-    def _ask(self, part: Events, key: NDArray[np.int64]) -> None:
+    def _ask_whether_alone(self, part: Events, key: NDArray[np.int64]) -> None:
         """Ask some events whether they are alone; those near the ends of the part would not know."""
-        t = part.t
-        first, last = np.searchsorted(t, (t[0] + ALONE, t[-1] - ALONE))
+        t, alone, most = part.t, self.settings.alone, self.settings.asked
+        first, last = np.searchsorted(t, (t[0] + alone, t[-1] - alone))
         if last <= first:
             return
-        count = min(SAMPLE if not self._asked else SAMPLE // 8, last - first)
+        # fewer of later parts, so that long recordings do not pay for what short ones need
+        count = min(most if not self._asked else most // 8, last - first)
         asked = np.unique(np.linspace(first, last - 1, count).astype(np.int64))
-        after = np.searchsorted(t, t[asked] + ALONE, side="right")
-        before = np.searchsorted(t, t[asked] - ALONE)
+        after = np.searchsorted(t, t[asked] + alone, side="right")
+        before = np.searchsorted(t, t[asked] - alone)
         found = np.zeros(len(asked), np.int64)
         x, y = part.x[asked].astype(np.int64), part.y[asked].astype(np.int64)
         for dy in (-1, 0, 1):
             for dx in (-1, 0, 1):
-                near = ((y + dy) * self.width + x + dx) << BITS
+                # all events of a pixel stand together and in order of time: two searches count those near
+                near = ((y + dy) * self.width + x + dx) << self.settings.place_bits
                 good = (x + dx >= 0) & (x + dx < self.width) & (y + dy >= 0) & (y + dy < self.height)
                 count = np.searchsorted(key, near | after) - np.searchsorted(key, near | before)
                 found += np.where(good, count, 0)
@@ -237,13 +266,13 @@ class RecordingSurvey:
         events, on, pixels = int(counts.sum()), int(self._on.sum()), len(counts)
         begin, end = self._span if self._span[0] <= self._span[1] else (0.0, 0.0)
         duration = end - begin
-        hot = self.hot()
+        hot = self.hot_pixels()
         busiest = int(counts.argmax())
         period, period_share = self.intervals.period()
         return Statistics(
             width=self.width,
             height=self.height,
-            **self._frames(),
+            **self._frame_statistics(),
             begin=begin,
             duration=duration,
             events=events,
@@ -264,17 +293,17 @@ class RecordingSurvey:
             quantum=self._quantum * 1e-9 if self._quantum else math.nan,
             stamps=self._stamps,
             longest_gap=self._gap,
-            gaps=tuple(sorted(sorted(self._gaps, key=lambda gap: -gap[1])[:MOST_GAPS])),
+            gaps=tuple(sorted(sorted(self._gaps, key=lambda gap: -gap[1])[: self.settings.most_gaps])),
             active=_active_area(counts.reshape(self.height, self.width)),
             silent_pixels=int(np.count_nonzero(counts == 0)),
             busiest_rate=_ratio_or_nan(int(counts[busiest]), duration),
             busiest_pixel=(busiest % self.width, busiest // self.width),
             hot_pixels=int(np.count_nonzero(hot)),
             hot_share=_ratio_or_nan(int(counts[hot.reshape(-1)].sum()), events),
-            label_shares=self._shares(events),
+            label_shares=self._label_shares(events),
         )
 
-    def _frames(self) -> dict[str, Any]:
+    def _frame_statistics(self) -> dict[str, Any]:
         times, exposures = np.array(self._times), np.array(self._exposures)
         return {
             "frames": len(times),
@@ -285,7 +314,7 @@ class RecordingSurvey:
             "clipped": float(np.mean(self._clipped)) if self._clipped else math.nan,
         }
 
-    def _shares(self, events: int) -> tuple[float, ...] | None:
+    def _label_shares(self, events: int) -> tuple[float, ...] | None:
         if self._labels is None or not events:
             return None
         return tuple(float(count) / events for count in self._labels)
@@ -325,26 +354,26 @@ def survey_file(
     try:
         for part in io.stream(path, notes=notes, **options):
             out = out or RecordingSurvey(part.width, part.height)
-            out.events(part)
+            out.add_events(part)
             progress(len(part))
     except TooLateError:
         return survey_sequence(io.read(path, notes=notes, **options))
     assert out is not None  # a stream has at least one part
     for picture in io.pictures(path, notes=notes, **options):
-        out.picture(picture)
+        out.add_frame(picture)
     return out
 
 
-def survey_sequence(sequence: Sequence) -> RecordingSurvey:
+def survey_sequence(sequence: Sequence, settings: SurveySettings = SurveySettings()) -> RecordingSurvey:
     """Look at a whole sequence."""
-    out = RecordingSurvey(sequence.events.width, sequence.events.height)
-    out.events(sequence.events)
+    out = RecordingSurvey(sequence.events.width, sequence.events.height, settings)
+    out.add_events(sequence.events)
     if sequence.frames is not None:
         unknown = np.full(len(sequence.frames), math.nan)
         times = unknown if sequence.frame_times is None else sequence.frame_times
         exposures = np.zeros(len(unknown)) if sequence.frame_exposure is None else sequence.frame_exposure
         for grey, time, exposure in zip(sequence.frames, times, exposures, strict=True):
-            out.picture(Picture(grey, time, float(exposure)))
+            out.add_frame(Picture(grey, time, float(exposure)))
     return out
 
 

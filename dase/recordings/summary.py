@@ -3,15 +3,12 @@
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from dase.events import LABELS
 from dase.formatting import format_count, format_metric, format_percent, format_seconds
 from dase.io.source import Note
-from dase.recordings.statistics import Statistics as Statistics
-
-if TYPE_CHECKING:
-    pass
+from dase.recordings.statistics import Statistics
 
 
 def statistics_table(statistics: Statistics) -> list[tuple[str, str]]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import OrderedDict
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -13,26 +14,34 @@ from dase.events import Events
 from dase.kernels import launch, scene_frames
 from dase.kernels.pixel_stages import Frames
 from dase.scenes.frame_motion import FrameMatch, match_frames
-from dase.scenes.scene import Scene
+from dase.scenes.scene import SamplingSettings, Scene
 from dase.scenes.video import LOG_EPS
 
-KEPT = 1 << 28
-"""Matches of frames kept in memory [bytes]; others are computed anew when they are asked for."""
 
-FEWEST_KEPT = 4
-"""Matches that are kept whatever their size."""
+@dataclass(frozen=True)
+class TrustSettings:
+    """Up to which expected error the intensities between frames are trusted."""
 
-TOLERANCE = 0.2
-"""Expected error up to which intensities are trusted [log intensity]: a usual contrast threshold."""
+    tolerance: float = 0.2
+    """Expected error that is accepted of every pixel [log intensity]: a usual contrast threshold."""
+    relative: float = 0.5
+    """Expected error that is accepted as a share of what the pixel changes by between two frames: where much
+    happens, an error that would be an event of its own may still be a small one."""
+    moments: int = 9
+    """Times between two frames, evenly from one to the other, at which a pixel must be trusted to be trusted
+    throughout."""
 
-RELATIVE = 0.5
-"""Expected error, as a share of the change between two frames, up to which intensities are trusted."""
 
-MOMENTS = np.linspace(0, 1, 9)
-"""Shares of the time between two frames at which a pixel must be trusted to be trusted throughout."""
+@dataclass(frozen=True)
+class MatchSettings:
+    """What is kept of the matches of frames, and how they set the sampling."""
 
-FASTEST = 99.8
-"""Percentile of the lengths of all ways that sets how often to sample: single wild ways do not count."""
+    kept: int = 1 << 28
+    """Matches kept in memory [bytes]; others are computed anew when they are asked for."""
+    fewest_kept: int = 4
+    """Matches that are kept whatever their size: what a chunk of samples touches must not thrash."""
+    speed_percentile: float = 99.8
+    """Percentile of the lengths of all ways that sets how often to sample: single wild ways do not count."""
 
 
 class CameraScene(Scene):
@@ -57,6 +66,8 @@ class CameraScene(Scene):
         travel: Share of a pixel that things may move between two samples.
         shortest: Lower bound of the time between samples [s].
         longest: Upper bound of it [s].
+        matching: What is kept of matches, and how they set the sampling.
+        trust: Up to which expected error intensities are trusted.
     """
 
     anytime = True
@@ -71,9 +82,11 @@ class CameraScene(Scene):
         black: float = 0.0,
         white: float | None = None,
         gains: ArrayLike | None = None,
-        travel: float = 0.5,
-        shortest: float = 1e-3,
-        longest: float = 1 / 72,
+        travel: float = SamplingSettings.travel,
+        shortest: float = SamplingSettings.shortest,
+        longest: float = SamplingSettings.longest,
+        matching: MatchSettings = MatchSettings(),
+        trust: TrustSettings = TrustSettings(),
     ):
         self._raw = np.asarray(frames)
         self.begin = np.asarray(begin, np.float64)
@@ -101,6 +114,7 @@ class CameraScene(Scene):
         self.travel, self.shortest, self.longest = travel, shortest, longest
         self.height, self.width = self._raw.shape[1:]
         self.duration = float(self.times[-1] - self.times[0])
+        self.matching, self.trust = matching, trust
         self._matches: OrderedDict[int, FrameMatch] = OrderedDict()
         self._speed: dict[int, float] = {}
         self._loaded: tuple[Any, Any] = (None, None)
@@ -136,7 +150,7 @@ class CameraScene(Scene):
             )
             found = self._matches[interval]
             size = found.ahead.nbytes + found.back.nbytes + found.doubt.nbytes
-            while len(self._matches) > max(KEPT // size, FEWEST_KEPT):
+            while len(self._matches) > max(self.matching.kept // size, self.matching.fewest_kept):
                 self._matches.popitem(last=False)
         self._matches.move_to_end(interval)
         return self._matches[interval]
@@ -148,7 +162,7 @@ class CameraScene(Scene):
             if k not in self._speed:
                 found = self.matched(k)
                 lengths = [np.linalg.norm(way, axis=-1) for way in (found.ahead, found.back)]
-                self._speed[k] = float(np.percentile(np.stack(lengths), FASTEST))
+                self._speed[k] = float(np.percentile(np.stack(lengths), self.matching.speed_percentile))
             most, least = np.floor(gap / self.shortest + 1e-9), np.ceil(gap / self.longest - 1e-9)
             pieces = int(max(np.clip(np.ceil(self._speed[k] / self.travel), least, max(most, least)), 1))
             out.append(self.times[k] + gap * np.arange(pieces) / pieces)
@@ -211,24 +225,26 @@ class CameraScene(Scene):
         self,
         interval: int,
         *,
-        tolerance: float = TOLERANCE,
-        relative: float = RELATIVE,
+        tolerance: float | None = None,
+        relative: float | None = None,
         device: str = "cpu",
     ) -> NDArray[np.float32]:
         """Return the doubt accepted of each pixel between two frames [log intensity], (height, width).
 
         Args:
             interval: The frame before.
-            tolerance: Doubt that is accepted of every pixel [log intensity].
-            relative: Doubt that is accepted as a share of what the pixel changes by between the frames: where
-                much happens, an error that would be an event of its own may still be a small one.
+            tolerance: Doubt that is accepted of every pixel [log intensity]; None takes that of `trust`.
+            relative: Doubt that is accepted as a share of what the pixel changes by between the frames; None
+                takes that of `trust`.
             device: Warp device to compute on.
         """
+        tolerance = self.trust.tolerance if tolerance is None else tolerance
+        relative = self.trust.relative if relative is None else relative
         logs = np.log(self.frames(self._moments(interval), device) + np.float32(LOG_EPS))
         return np.asarray(np.maximum(np.float32(tolerance), np.float32(relative) * np.ptp(logs, axis=0)))
 
     def confidence(
-        self, times: ArrayLike, *, tolerance: float = TOLERANCE, relative: float = RELATIVE
+        self, times: ArrayLike, *, tolerance: float | None = None, relative: float | None = None
     ) -> NDArray[np.float32]:
         """Return confidence, 1 without any doubt, 1/2 where it equals `limit`, (K, height, width)."""
         place = self.interval(times)
@@ -239,7 +255,7 @@ class CameraScene(Scene):
         return np.asarray(1 / (1 + share * share))
 
     def trusted(
-        self, *, tolerance: float = TOLERANCE, relative: float = RELATIVE, device: str = "cpu"
+        self, *, tolerance: float | None = None, relative: float | None = None, device: str = "cpu"
     ) -> NDArray[np.bool_]:
         """Return which pixels can be trusted all the time between two frames, shape (F - 1, height, width).
 
@@ -284,7 +300,8 @@ class CameraScene(Scene):
     def _moments(self, interval: int) -> NDArray[np.float64]:
         """Return times from a frame to just before the next [s]."""
         begin, end = self.times[interval : interval + 2]
-        return np.asarray(np.minimum(begin + (end - begin) * MOMENTS, np.nextafter(end, begin)))
+        moments = begin + (end - begin) * np.linspace(0, 1, self.trust.moments)
+        return np.asarray(np.minimum(moments, np.nextafter(end, begin)))
 
     def _all_pixels(self) -> NDArray[np.int32]:
         return np.arange(self.height * self.width, dtype=np.int32)

@@ -14,40 +14,44 @@ from dase.errors import InputError, checked_seed
 from dase.events import Events
 from dase.scenes.between_frames import CameraScene
 
-SOFT = 0.03
-"""Added to intensities before the logarithm: frames say little about changes in what is darker."""
 
-MOST_EVENTS = 20.0
-"""More net events of a pixel between two frames count as this many, so that hot pixels do not decide."""
+@dataclass(frozen=True)
+class AlignmentSettings:
+    """How events and frames are compared, and when a correction is clear."""
 
-INTERVALS = 40
-"""Times between frames that are looked at, those with most events; enough to decide on any file."""
+    soft: float = 0.03
+    """Added to intensities before the logarithm: frames say little about changes in what is darker."""
+    most_events: float = 20.0
+    """More net events of a pixel between two frames count as this many, so that hot pixels do not decide."""
+    intervals: int = 40
+    """Times between frames that are looked at, those with most events; enough to decide on any file."""
+    resamples: int = 1000
+    """Resamples of these intervals."""
+    sure: float = 0.99
+    """Share of the resamples in which a correction must win to be clear."""
+    spreads: float = 3.0
+    """Times its spread over resamples that a shift or an offset must be away from none."""
+    least_score: float = 0.1
+    """Below this correlation nothing is clear."""
+    least_intervals: int = 5
+    """With fewer intervals to resample nothing is clear."""
+    least_shift: float = 0.5
+    """Shifts below this are not corrected unasked [px]."""
+    early: float = 1e-3
+    """Events this much before the light changes are on another clock [s]."""
+    lag: float = 0.02
+    """Delay that a pixel's own bandwidth and latency may cause [s]; it is the sensor's to explain."""
+
 
 Flip = tuple[bool, bool]
 Place = tuple[int, int]
 Scores = NDArray[np.float64]
 
 FLIPS: tuple[Flip, ...] = ((False, False), (True, False), (False, True), (True, True))
-SHOWN = (-4, -2, -1, 0, 1, 2, 4)
-"""Shifts in the table of a report [px]."""
-
-RESAMPLES = 1000
-SURE = 0.99
-"""Share of the resamples in which a correction must win to be clear."""
-
-LEAST_SCORE, LEAST_INTERVALS = 0.1, 5
-"""Below this correlation, or with fewer intervals to resample, nothing is clear."""
-
-LEAST_SHIFT = 0.5
-"""Shifts below this are not corrected unasked [px]."""
-
-EARLY = 1e-3
-"""Events this much before the light changes are on another clock [s]."""
-
-LAG = 0.02
-"""Delay that a pixel's own bandwidth and latency may cause [s]; it is the sensor's to explain."""
+"""Left to right, top to bottom."""
 
 PARTS = ("flip", "shift", "offset")
+"""Corrections, in the order in which they are applied."""
 
 
 @dataclass(frozen=True)
@@ -117,7 +121,7 @@ class Alignment:
             f"clear        {clear}",
         ]
         reach = self.shifts.shape[1] // 2
-        shown = [n for n in SHOWN if abs(n) <= reach]
+        shown = [n for n in (-4, -2, -1, 0, 1, 2, 4) if abs(n) <= reach]
         for (flip_x, flip_y), scores in zip(FLIPS, self.shifts, strict=True):
             lines += ["", f"mirror: {flip[flip_x, flip_y]}", "  y \\ x" + "".join(f"{x:+8d}" for x in shown)]
             for y in shown:
@@ -139,6 +143,7 @@ def align(
     reach: int = 6,
     latest: float | None = None,
     seed: int = 0,
+    settings: AlignmentSettings = AlignmentSettings(),
 ) -> Alignment:
     """Estimate how frames must be mirrored, moved and delayed to lie on the events.
 
@@ -150,9 +155,9 @@ def align(
 
     A flip or a shift is clear if it wins in 99 % of resamples of the intervals; a shift must also be half a
     pixel, and three times its spread. An offset is clear only if, beyond that, no pixel could cause it:
-    events that come before the light changes, or later than `LAG`. Smaller delays belong to the sensor's
-    bandwidth and latency, and taking them away here would hide these. Nothing is
-    clear where the correlation stays below 0.1, or with fewer than 5 intervals.
+    events that come before the light changes, or later than a sensor may answer. Smaller delays belong to the
+    sensor's bandwidth and latency, and taking them away here would hide these. Nothing is clear where the
+    correlation stays below 0.1, or with fewer than 5 intervals. `AlignmentSettings` holds these numbers.
 
     Args:
         events: Events on a clock near that of the frames.
@@ -166,6 +171,7 @@ def align(
         reach: Largest shift that is tried [px].
         latest: Largest offset that is tried, either way [s]; None: one and a half times between frames.
         seed: Of the resamples.
+        settings: How events and frames are compared, and when a correction is clear.
 
     Raises:
         InputError: Shapes disagree, or there are no events between frames.
@@ -184,38 +190,38 @@ def align(
     latest = 1.5 * gap if latest is None else latest
     if not (np.isfinite(latest) and latest >= 0):
         raise InputError(f"align: latest must be >= 0 s, got {latest:g}")
-    search = _ShiftSearch(events, scene, reach)
+    search = _ShiftSearch(events, scene, reach, settings)
     counts = np.full(len(search.changes), 1 / len(search.changes))
-    draws = np.random.default_rng(checked_seed(seed)).multinomial(len(counts), counts, RESAMPLES)
+    draws = np.random.default_rng(checked_seed(seed)).multinomial(len(counts), counts, settings.resamples)
     return _judge_corrections(search, *_search_offsets(search, gap, latest), draws)
 
 
 class _ShiftSearch:
     """Correlations of events with brightness changes, interval by interval, before they are averaged."""
 
-    def __init__(self, events: Events, scene: CameraScene, reach: int):
-        self.events, self.reach = events, reach
+    def __init__(self, events: Events, scene: CameraScene, reach: int, settings: AlignmentSettings):
+        self.events, self.reach, self.settings = events, reach, settings
         self.flat = events.y.astype(np.int64) * events.width + events.x
         self.sign = np.where(events.p, 1.0, -1.0)
         self.shape = events.height, events.width
         counts = np.diff(np.searchsorted(events.t, scene.times))
         if not counts.any():
             raise InputError("align: there are no events between the frames; are both on one clock?")
-        busiest = np.sort(np.argsort(-counts, kind="stable")[:INTERVALS])
+        busiest = np.sort(np.argsort(-counts, kind="stable")[: settings.intervals])
         ends = np.stack([scene.begin[:-1], scene.end[:-1], scene.begin[1:], scene.end[1:]], 1)
         self.exposures = ends[busiest]
-        self.changes = [_log_change(scene, int(k)) for k in busiest]
+        self.changes = [_log_change(scene, int(k), settings.soft) for k in busiest]
 
     def table(self, offset: float, flips: Sequence[Flip]) -> tuple[Scores, Scores]:
         """Return weighted correlations (J, flips, 2 R + 1, 2 R + 1) and weights (J,) at an offset [s]."""
         scores, weights = [], []
         for exposures, change in zip(self.exposures, self.changes, strict=True):
-            image = self._image(exposures, offset)
+            image = self._event_image(exposures, offset)
             weights.append(float(image.std()) * float(change.std()) + 1e-12)
             scores.append([weights[-1] * self._shifts(image, change, flip) for flip in flips])
         return np.array(scores), np.array(weights)
 
-    def _image(self, exposures: Scores, offset: float) -> NDArray[np.float32]:
+    def _event_image(self, exposures: Scores, offset: float) -> NDArray[np.float32]:
         """Return what the events of each pixel say of the change between two exposures, (H, W)."""
         b0, e0, b1, e1 = exposures
         part = slice(*np.searchsorted(self.events.t, (b0 + offset, e1 + offset)))
@@ -224,7 +230,8 @@ class _ShiftSearch:
         begun = np.clip((t - b1) / (e1 - b1), 0, 1) if e1 > b1 else 0.0
         size = self.shape[0] * self.shape[1]
         image = np.bincount(self.flat[part], self.sign[part] * (over - begun), minlength=size)
-        return np.clip(image, -MOST_EVENTS, MOST_EVENTS).astype(np.float32).reshape(self.shape)
+        most = self.settings.most_events
+        return np.clip(image, -most, most).astype(np.float32).reshape(self.shape)
 
     def _shifts(self, image: NDArray[np.float32], change: NDArray[np.float32], flip: Flip) -> Scores:
         """Return the correlations of all shifts, every one over as many pixels."""
@@ -235,9 +242,9 @@ class _ShiftSearch:
         return np.where(np.abs(found) < 1, found, 0.0).astype(np.float64)
 
 
-def _log_change(scene: CameraScene, interval: int) -> NDArray[np.float32]:
+def _log_change(scene: CameraScene, interval: int, soft: float) -> NDArray[np.float32]:
     """Return the change of log intensity from a frame to the next, (H, W)."""
-    before, after = (np.log(scene.intensity(k) + np.float32(SOFT)) for k in (interval, interval + 1))
+    before, after = (np.log(scene.intensity(k) + np.float32(soft)) for k in (interval, interval + 1))
     return np.asarray(after - before)
 
 
@@ -272,6 +279,7 @@ def _judge_corrections(
     draws: NDArray[np.int64],
 ) -> Alignment:
     """Refine offset and shift, and see by resampling how sure they are."""
+    limits = search.settings
     offset = float(_parabola_maximum(offsets, curve.sum(1) / weights.sum(1)))
     late = np.array([_parabola_maximum(offsets, curve @ d / (weights @ d)) for d in draws]).std()
     scores, weight = search.table(offset, FLIPS)
@@ -281,14 +289,14 @@ def _judge_corrections(
     spread = np.array([_peak_shift(table[number]) for table in drawn]).std(0)
     tops = drawn.max((2, 3))
     clear = set()
-    if number and np.mean(tops[:, number] > tops[:, 0]) >= SURE:
+    if number and np.mean(tops[:, number] > tops[:, 0]) >= limits.sure:
         clear.add("flip")
     wins = np.mean(drawn[:, number, *place] >= drawn[:, number, middle, middle])
-    if np.hypot(*peak) > max(LEAST_SHIFT, 3 * np.hypot(*spread)) and wins >= SURE:
+    if np.hypot(*peak) > max(limits.least_shift, limits.spreads * np.hypot(*spread)) and wins >= limits.sure:
         clear.add("shift")
-    if offset + 3 * late < -EARLY or offset - 3 * late > LAG:
+    if offset + limits.spreads * late < -limits.early or offset - limits.spreads * late > limits.lag:
         clear.add("offset")
-    if mean[number].max() < LEAST_SCORE or len(search.changes) < LEAST_INTERVALS:
+    if mean[number].max() < limits.least_score or len(search.changes) < limits.least_intervals:
         clear.clear()
     as_is, as_is_weight = search.table(0.0, FLIPS[:1])
     return Alignment(

@@ -14,21 +14,21 @@ Map = NDArray[np.float32]
 HOPELESS = 1e3
 """Doubt of what cannot be known at all: saturated, or outside the other frame [log intensity]."""
 
-WITHIN = 1.0
-"""Doubts are a root mean square over so many pixels around (a Gaussian's sigma) [px]."""
 
-BLUR_WEIGHT, WAY_WEIGHT = 3.0, 0.3
-"""Weights of the doubts by blur and by disagreeing ways beside that by intensity; docs/scenes.md says why."""
+@dataclass(frozen=True)
+class MotionSettings:
+    """How frames are matched, and what makes a match doubtful."""
 
-REST = 0.25
-"""Ways shorter than this are none [px]."""
-
-LOOKS = 5
-"""Places along a blur at which it is sampled."""
-
-
-FEW = 5e-4
-"""Share of a frame's pixels that stretching may leave at either end of the range."""
+    within: float = 1.0
+    """Doubts are a root mean square over so many pixels around (a Gaussian's sigma) [px]."""
+    blur_weight: float = 3.0
+    """Weight of the doubt by blur beside that by intensity; docs/scenes.md says why."""
+    way_weight: float = 0.3
+    """Weight of the doubt by disagreeing ways beside that by intensity; docs/scenes.md says why."""
+    rest: float = 0.25
+    """Ways shorter than this are none [px]."""
+    blur_samples: int = 5
+    """Places along a blur at which it is sampled."""
 
 
 @dataclass(frozen=True)
@@ -54,6 +54,7 @@ def match_frames(
     eps: float,
     exposure: tuple[float, float] = (0.0, 0.0),
     usable: tuple[NDArray[np.bool_], NDArray[np.bool_]] | None = None,
+    settings: MotionSettings = MotionSettings(),
 ) -> FrameMatch:
     """Match two frames.
 
@@ -67,15 +68,16 @@ def match_frames(
         eps: Added to intensities before the logarithm.
         exposure: Duration of both exposures as a share of the time between the frames.
         usable: Pixels of both frames that are not saturated, each (H, W); None for all.
+        settings: How frames are matched, and what makes a match doubtful.
     """
     a, b = _to_8_bit(first, second)
-    ahead, back = _optical_flow(a, b), _optical_flow(b, a)
+    ahead, back = _optical_flow(a, b, settings.rest), _optical_flow(b, a, settings.rest)
     logs = [np.log(frame + np.float32(eps)) for frame in (first, second)]
     good = usable or (np.ones(first.shape, np.bool_), np.ones(first.shape, np.bool_))
     doubt = np.stack(
         [
-            _doubt_of_frame(logs, (ahead, back), good, exposure[0]),
-            _doubt_of_frame(logs[::-1], (back, ahead), good[::-1], exposure[1]),
+            _doubt_of_frame(logs, (ahead, back), good, exposure[0], settings),
+            _doubt_of_frame(logs[::-1], (back, ahead), good[::-1], exposure[1], settings),
         ]
     )
     return FrameMatch(ahead, back, doubt)
@@ -88,7 +90,9 @@ def _to_8_bit(*frames: Map) -> list[NDArray[np.uint8]]:
     return [np.clip((frame - low) * scale, 0, 255).astype(np.uint8) for frame in frames]
 
 
-def _optical_flow(first: NDArray[np.uint8], second: NDArray[np.uint8]) -> Map:
+def _optical_flow(
+    first: NDArray[np.uint8], second: NDArray[np.uint8], rest: float = MotionSettings.rest
+) -> Map:
     """Return the way of each pixel from one frame to another [px], shape (H, W, 2)."""
     quick = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM).calc(first, second, None)
     flow = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
@@ -97,7 +101,7 @@ def _optical_flow(first: NDArray[np.uint8], second: NDArray[np.uint8]) -> Map:
     # begun from what most of the picture does: repeated textures then match the right repetition
     way = flow.calc(first, second, _dominant_affine_flow(quick))
     # blending over the shortest ways is as exact as following them, and rest is cheap to render
-    way[np.hypot(way[..., 0], way[..., 1]) < REST] = 0
+    way[np.hypot(way[..., 0], way[..., 1]) < rest] = 0
     return np.asarray(way)
 
 
@@ -130,7 +134,11 @@ def sample_bicubic(values: Map, x: Map, y: Map) -> Map:
 
 
 def _doubt_of_frame(
-    logs: list[Map], ways: tuple[Map, Map], usable: tuple[NDArray[np.bool_], ...], exposure: float
+    logs: list[Map],
+    ways: tuple[Map, Map],
+    usable: tuple[NDArray[np.bool_], ...],
+    exposure: float,
+    settings: MotionSettings,
 ) -> Map:
     """Return the doubt about pixels of the first of two frames, (H, W)."""
     log, (there, back) = logs[0], ways
@@ -142,9 +150,11 @@ def _doubt_of_frame(
     gradient = np.hypot(cv2.Sobel(log, cv2.CV_32F, 1, 0) / 8, cv2.Sobel(log, cv2.CV_32F, 0, 1) / 8)
     slope = cv2.dilate(gradient, np.ones((3, 3)))
     apart = np.hypot(returned[..., 0], returned[..., 1]) * slope
-    blur = _blur_along_flow(log, there * np.float32(exposure)) - log if exposure > 0 else np.zeros_like(log)
-    square = residual**2 + (WAY_WEIGHT * apart) ** 2 + (BLUR_WEIGHT * blur) ** 2
-    out = np.sqrt(np.maximum(cv2.GaussianBlur(square, (0, 0), WITHIN), 0))
+    blur = np.zeros_like(log)
+    if exposure > 0:
+        blur = _blur_along_flow(log, there * np.float32(exposure), settings.blur_samples) - log
+    square = residual**2 + (settings.way_weight * apart) ** 2 + (settings.blur_weight * blur) ** 2
+    out = np.sqrt(np.maximum(cv2.GaussianBlur(square, (0, 0), settings.within), 0))
     outside = (to[0] < 0) | (to[1] < 0) | (to[0] > width - 1) | (to[1] > height - 1)
     bad = (~usable[0]).astype(np.uint8), (~usable[1]).astype(np.uint8)
     blind = cv2.dilate(bad[0], np.ones((3, 3))) > 0  # bicubic looks at the neighbours
@@ -152,28 +162,32 @@ def _doubt_of_frame(
     return np.where(outside | blind, np.float32(HOPELESS), out.astype(np.float32))
 
 
-def _blur_along_flow(log: Map, way: Map) -> Map:
+def _blur_along_flow(log: Map, way: Map, samples: int) -> Map:
     """Return the log of the mean intensity along a way centred at each pixel [px]."""
     x, y = pixel_grid(log.shape)
     total = np.zeros_like(log)
-    for share in (np.arange(LOOKS) + 0.5) / LOOKS - 0.5:
+    for share in (np.arange(samples) + 0.5) / samples - 0.5:
         total += np.exp(
             sample_bicubic(log, x + np.float32(share) * way[..., 0], y + np.float32(share) * way[..., 1])
         )
-    return np.asarray(np.log(total / LOOKS))
+    return np.asarray(np.log(total / samples))
 
 
-def is_stretched(frames: NDArray[Any]) -> bool:
+def is_stretched(frames: NDArray[Any], few: float = 5e-4) -> bool:
     """Return whether each frame, (F, H, W), seems to be stretched to the whole range of its type.
 
     Stretching leaves few pixels at either end, most often one, not always the same; light and shadow beyond
     the range of a camera leave many.
+
+    Args:
+        frames: Of any type; only whole numbers without a sign have a range, shape (F, H, W).
+        few: Share of a frame's pixels that stretching may leave at either end of the range.
     """
     if frames.dtype.kind != "u":
         return False
     least, most = (np.median((frames == end).mean((1, 2))) for end in (0, np.iinfo(frames.dtype).max))
     brightest = frames.reshape(len(frames), -1).argmax(1)
-    return bool(0 < least < FEW and 0 < most < FEW and np.ptp(brightest) > 0)
+    return bool(0 < least < few and 0 < most < few and np.ptp(brightest) > 0)
 
 
 def estimate_stretches(frames: list[Map] | NDArray[np.float32], *, pull: float = 0.1) -> NDArray[np.float64]:

@@ -19,8 +19,6 @@ from dase.errors import InputError, checked_integer
 from dase.io.image_files import SUFFIXES, decode_file, list_pictures, to_grey
 from dase.text_files import parse_json, stands_for
 
-LONGEST_SIDE = 1024  # [px] larger pictures are shrunk
-CACHED_PICTURES = 64  # decoded pictures kept per process: at most 4 MiB each, 8 MiB with alpha
 # fmt: off
 PHOTOGRAPHS = (  # inside the wheel of scikit-image; its other files are silhouettes, charts and duplicates
     "astronaut.png", "brick.png", "camera.png", "chelsea.png", "coffee.png", "coins.png", "grass.png",
@@ -28,14 +26,31 @@ PHOTOGRAPHS = (  # inside the wheel of scikit-image; its other files are silhoue
     "rocket.jpg", "text.png",
 )
 # fmt: on
-DRAWN_SHARE = 0.25  # share of procedural textures among the built-in pictures
-DRAWN_SIZE = (384, 512)  # (H, W) of a procedural texture [px]
-SMALLEST_CUT = 16  # [px] no side of a crop is shorter, unless the picture is
-MOST_POLYGONS, MOST_NUMBERS = 2000, 400_000  # of one outline; those of COCO have below 50 of 10 000
-MOST_PIXELS = 200_000_000  # of a picture that is annotated
-COCO_SHARE, COCO_AREA = 0.005, 400  # an instance must cover this share of its picture and these pixels
-
 Grey = NDArray[np.float32]
+
+
+@dataclass(frozen=True)
+class ImageSettings:
+    """What becomes of picture files, and what is drawn and cut from them."""
+
+    longest_side: int = 1024
+    """Larger pictures are shrunk to this [px]: sensors have seldom more columns."""
+    drawn_share: float = 0.25
+    """Share of procedural textures among the built-in pictures."""
+    drawn_size: tuple[int, int] = (384, 512)
+    """Rows and columns of a procedural texture [px]."""
+    smallest_cut: int = 16
+    """No side of a crop is shorter [px], unless the picture is."""
+    coco_share: float = 0.005
+    """Share of its picture that an instance must cover."""
+    coco_area: int = 400
+    """Pixels that an instance must cover."""
+    most_polygons: int = 2000
+    """Polygons of one outline; those of COCO have below 50."""
+    most_numbers: int = 400_000
+    """Numbers of all polygons of one outline; those of COCO have below 10 000."""
+    most_pixels: int = 200_000_000
+    """Pixels of a picture that is annotated: its outlines are drawn so large."""
 
 
 @dataclass(frozen=True)
@@ -90,7 +105,8 @@ def open_images(spec: str) -> ImageSource:
     if spec == "builtin":
         package = find_spec("skimage")
         folder = Path(package.origin if package and package.origin else "skimage").parent / "data"
-        return FolderImages(spec, [folder / name for name in PHOTOGRAPHS], drawn_share=DRAWN_SHARE)
+        files = [folder / name for name in PHOTOGRAPHS]
+        return FolderImages(spec, files, drawn_share=ImageSettings.drawn_share)
     if spec.startswith("coco:"):
         annotations, _, directory = spec.removeprefix("coco:").rpartition(",")
         if not annotations or not directory:
@@ -228,8 +244,9 @@ def _read_annotations(path: Path) -> tuple[dict[int, dict[str, Any]], list[dict[
         ) from error
     if not instances:
         raise InputError(
-            f"images: annotations '{path}' must hold an instance, not a crowd, of at least {COCO_AREA} px "
-            f"and {COCO_SHARE:.1%} of its image, found none among {len(content['annotations'])}"
+            f"images: annotations '{path}' must hold an instance, not a crowd, "
+            f"of at least {ImageSettings.coco_area} px "
+            f"and {ImageSettings.coco_share:.1%} of its image, found none among {len(content['annotations'])}"
         )
     return images, instances
 
@@ -250,10 +267,10 @@ def _check_image_size(image: dict[str, Any], annotations: Path) -> None:
     """Raise InputError where a picture claims a size that none has: its outlines are drawn so large."""
     for name in ("width", "height"):
         checked_integer(f"images: '{annotations}': {name} of '{image['file_name']}'", image[name], 1, 1 << 15)
-    if image["width"] * image["height"] > MOST_PIXELS:
+    if image["width"] * image["height"] > ImageSettings.most_pixels:
         raise InputError(
             f"images: '{annotations}': '{image['file_name']}' claims {image['width']}x{image['height']}, "
-            f"more than {MOST_PIXELS / 1e6:.0f} million pixels"
+            f"more than {ImageSettings.most_pixels / 1e6:.0f} million pixels"
         )
 
 
@@ -272,10 +289,10 @@ def check_outline(outline: Any, width: int, height: int) -> None:
     if not isinstance(outline, list) or not all(isinstance(polygon, list) for polygon in outline):
         raise InputError("it is neither a list of polygons nor a table")
     numbers = sum(len(polygon) for polygon in outline)
-    if len(outline) > MOST_POLYGONS or numbers > MOST_NUMBERS:
+    if len(outline) > ImageSettings.most_polygons or numbers > ImageSettings.most_numbers:
         raise InputError(
             f"it has {len(outline)} polygons of {numbers} numbers, "
-            f"at most {MOST_POLYGONS} of {MOST_NUMBERS} are read"
+            f"at most {ImageSettings.most_polygons} of {ImageSettings.most_numbers} are read"
         )
     reach = 2 * max(width, height)
     for polygon in outline:
@@ -322,7 +339,7 @@ def _unpacked_runs(text: str) -> list[int]:
 
 
 def _is_usable_instance(instance: dict[str, Any], image: dict[str, Any]) -> bool:
-    least = max(COCO_AREA, COCO_SHARE * image["width"] * image["height"])
+    least = max(ImageSettings.coco_area, ImageSettings.coco_share * image["width"] * image["height"])
     return bool(instance.get("segmentation")) and not instance.get("iscrowd") and instance["area"] >= least
 
 
@@ -334,7 +351,7 @@ def _existing_folder(name: str) -> Path:
     return Path(name)
 
 
-@lru_cache(maxsize=CACHED_PICTURES)
+@lru_cache(maxsize=64)  # per process: at most 4 MiB each, 8 MiB with alpha
 def _read_picture(path: Path) -> Picture:
     """Decode, grey, shrink and median-filter a file; the arrays are shared, hence read-only."""
     grey, alpha = to_grey(decode_file(path))
@@ -351,9 +368,9 @@ def _read_picture(path: Path) -> Picture:
     return Picture(grey, alpha)
 
 
-def _shrunk_size(width: int, height: int) -> tuple[int, int]:
+def _shrunk_size(width: int, height: int, longest: int = ImageSettings.longest_side) -> tuple[int, int]:
     """Return width and height of a picture after shrinking."""
-    scale = min(1.0, LONGEST_SIDE / max(width, height))
+    scale = min(1.0, longest / max(width, height))
     return max(1, round(width * scale)), max(1, round(height * scale))
 
 
@@ -364,7 +381,9 @@ def _crop_to_alpha(grey: Grey, alpha: Grey) -> Picture:
     return Picture(np.pad(grey[box], 1, mode="edge"), np.clip(np.pad(alpha[box], 1), 0, 1))
 
 
-def cut_random_shape(grey: Grey, rng: np.random.Generator) -> Picture:
+def cut_random_shape(
+    grey: Grey, rng: np.random.Generator, smallest: int = ImageSettings.smallest_cut
+) -> Picture:
     """Cut a random shape from a random place of a picture.
 
     Three in ten are rectangles, as many blobs; the rest are ellipses and polygons, with an edge 2 px soft.
@@ -372,12 +391,13 @@ def cut_random_shape(grey: Grey, rng: np.random.Generator) -> Picture:
     Args:
         grey: Intensity in [0, 1], shape (H, W).
         rng: Random numbers.
+        smallest: No side of the shape's box is shorter, unless the picture is [px].
     """
-    sides = [max(min(n, SMALLEST_CUT), round(n * rng.uniform(0.3, 1))) for n in grey.shape]
+    sides = [max(min(n, smallest), round(n * rng.uniform(0.3, 1))) for n in grey.shape]
     top, left = (int(rng.integers(n - side + 1)) for n, side in zip(grey.shape, sides, strict=True))
     part = grey[top : top + sides[0], left : left + sides[1]].copy()
     kind = rng.choice(4, p=(0.3, 0.3, 0.2, 0.2))
-    if kind == 0 or min(sides) < SMALLEST_CUT:
+    if kind == 0 or min(sides) < smallest:
         return Picture(part, np.ones_like(part))
     outline = (_blob_outline, _ellipse_outline, _polygon_outline)[kind - 1](rng)
     mask = np.zeros(part.shape, np.uint8)
@@ -421,29 +441,33 @@ def _fill_polygon(canvas: NDArray[np.uint8], points: NDArray[np.float64], level:
     cv2.fillPoly(canvas, [_fixed_point(points)], level, cv2.LINE_AA, 4)
 
 
-def draw_texture(rng: np.random.Generator) -> Grey:
+def draw_texture(rng: np.random.Generator, size: tuple[int, int] = ImageSettings.drawn_size) -> Grey:
     """Draw fractal noise, a grating or checkerboard, polygons, or strokes like writing.
 
+    Args:
+        rng: Random numbers.
+        size: Rows and columns [px].
+
     Returns:
-        Intensity in [0, 1], shape DRAWN_SIZE; its darkest and brightest level are random, too.
+        Intensity in [0, 1], shape `size`; its darkest and brightest level are random, too.
     """
-    unit = (_fractal_noise, _draw_grating, _draw_polygons, _draw_strokes)[rng.integers(4)](rng)
+    unit = (_fractal_noise, _draw_grating, _draw_polygons, _draw_strokes)[rng.integers(4)](rng, size)
     levels = rng.permutation([rng.uniform(0, 0.4), rng.uniform(0.6, 1)])
     return np.asarray(cv2.medianBlur(np.float32(levels[0] + (levels[1] - levels[0]) * unit), 3))
 
 
-def _fractal_noise(rng: np.random.Generator) -> NDArray[np.float64]:
+def _fractal_noise(rng: np.random.Generator, size: tuple[int, int]) -> NDArray[np.float64]:
     """Noise whose amplitude falls as 1/f^slope, from 0.8 (sand) to 2 (clouds)."""
-    frequency = np.hypot(np.fft.fftfreq(DRAWN_SIZE[0])[:, None], np.fft.rfftfreq(DRAWN_SIZE[1]))
+    frequency = np.hypot(np.fft.fftfreq(size[0])[:, None], np.fft.rfftfreq(size[1]))
     frequency[0, 0] = np.inf  # no mean
-    spectrum = np.fft.rfft2(rng.standard_normal(DRAWN_SIZE)) * frequency ** -rng.uniform(0.8, 2)
-    noise = np.fft.irfft2(spectrum, DRAWN_SIZE)
+    spectrum = np.fft.rfft2(rng.standard_normal(size)) * frequency ** -rng.uniform(0.8, 2)
+    noise = np.fft.irfft2(spectrum, size)
     return np.asarray(np.clip(0.5 + 0.2 * noise / noise.std(), 0, 1))
 
 
-def _draw_grating(rng: np.random.Generator) -> NDArray[np.float64]:
+def _draw_grating(rng: np.random.Generator, size: tuple[int, int]) -> NDArray[np.float64]:
     """Soft-edged stripes, or a checkerboard of two of them."""
-    y, x = np.mgrid[: DRAWN_SIZE[0], : DRAWN_SIZE[1]]
+    y, x = np.mgrid[: size[0], : size[1]]
     angle, period = rng.uniform(0, np.pi), rng.uniform(12, 96)
     along = 2 * np.pi / period * (x * np.cos(angle) + y * np.sin(angle)) + rng.uniform(0, 7)
     across = 2 * np.pi / period * (y * np.cos(angle) - x * np.sin(angle)) + rng.uniform(0, 7)
@@ -451,20 +475,20 @@ def _draw_grating(rng: np.random.Generator) -> NDArray[np.float64]:
     return np.asarray(0.5 + 0.5 * np.tanh(wave * rng.uniform(1, period / 4)))
 
 
-def _draw_polygons(rng: np.random.Generator) -> NDArray[np.float64]:
-    canvas = np.full(DRAWN_SIZE, rng.integers(256), np.uint8)
-    for size in np.geomspace(300, 30, int(rng.integers(15, 60))):  # the small ones last, on top
-        corner = rng.uniform(-0.5 * size, DRAWN_SIZE[::-1])
-        _fill_polygon(canvas, corner + size * _polygon_outline(rng), int(rng.integers(256)))
+def _draw_polygons(rng: np.random.Generator, size: tuple[int, int]) -> NDArray[np.float64]:
+    canvas = np.full(size, rng.integers(256), np.uint8)
+    for width in np.geomspace(300, 30, int(rng.integers(15, 60))):  # the small ones last, on top
+        corner = rng.uniform(-0.5 * width, size[::-1])
+        _fill_polygon(canvas, corner + width * _polygon_outline(rng), int(rng.integers(256)))
     return canvas / 255
 
 
-def _draw_strokes(rng: np.random.Generator) -> NDArray[np.float64]:
+def _draw_strokes(rng: np.random.Generator, size: tuple[int, int]) -> NDArray[np.float64]:
     """Lines of letters of two to four strokes, with spaces between words."""
-    canvas = np.zeros(DRAWN_SIZE, np.uint8)
+    canvas = np.zeros(size, np.uint8)
     pitch = int(rng.integers(14, 48))  # from line to line [px]
-    for top in range(pitch // 4, DRAWN_SIZE[0] - pitch, pitch):
-        for left in np.arange(pitch / 2, DRAWN_SIZE[1] - pitch, 0.55 * pitch):
+    for top in range(pitch // 4, size[0] - pitch, pitch):
+        for left in np.arange(pitch / 2, size[1] - pitch, 0.55 * pitch):
             if rng.random() < 0.85:
                 letter = (left, top) + pitch * rng.uniform(0, (0.45, 0.7), (int(rng.integers(3, 6)), 2))
                 cv2.polylines(canvas, [_fixed_point(letter)], False, 255, 1 + pitch // 16, cv2.LINE_AA, 4)

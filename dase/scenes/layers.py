@@ -14,7 +14,7 @@ from dase.errors import InputError
 from dase.kernels import launch
 from dase.kernels import scene_layers as kernels
 from dase.scenes.image_sources import Picture
-from dase.scenes.scene import Scene
+from dase.scenes.scene import SamplingSettings, Scene
 
 Pair = tuple[float, float]
 
@@ -81,9 +81,9 @@ class LayerScene(Scene):
         width: int,
         height: int,
         duration: float,
-        travel: float = 0.5,
-        shortest: float = 1e-3,
-        longest: float = 1 / 72,
+        travel: float = SamplingSettings.travel,
+        shortest: float = SamplingSettings.shortest,
+        longest: float = SamplingSettings.longest,
     ):
         if not 1 <= len(layers) <= kernels.MAX_LAYERS:
             raise InputError(f"a scene needs 1 to {kernels.MAX_LAYERS} layers, got {len(layers)}")
@@ -120,6 +120,7 @@ class LayerScene(Scene):
         d = np.zeros_like(m)
         d[..., 0, :] = np.stack([gx * c - sx * s * spin, -gy * s - sy * c * spin, vx + 0 * x], -1)
         d[..., 1, :] = np.stack([gx * s + sx * c * spin, gy * c - sy * s * spin, vy + 0 * y], -1)
+        # motions are in units of the sensor's width, so a scene looks the same at any size
         to_sensor = _unit_plane_to_pixels(self.width, self.height, self.width)
         from_texture = np.stack(
             [np.linalg.inv(self._texture_plane(layer)) for layer in range(len(self.layers))]
@@ -196,7 +197,9 @@ class LayerScene(Scene):
         cells = max(int(np.ceil(self.duration / self.shortest)), 1)
         grid = np.linspace(0, self.duration, min(cells, 100_000) + 1)
         speed = np.concatenate([self.speed(part) for part in np.array_split(grid, max(len(grid) // 512, 1))])
+        # the larger of both ends, so that no step moves further than asked while things get faster
         held = np.maximum(speed[:-1], speed[1:])
+        # the way travelled grows with time, so it can be inverted; 1e-9 keeps it growing at rest
         way = np.concatenate([[0.0], np.cumsum(np.maximum(held, 1e-9) * np.diff(grid))])
         times = [0.0]
         while times[-1] < self.duration:

@@ -15,9 +15,6 @@ from dase.errors import InputError, nearest
 from dase.scenes.image_sources import ImageSource
 from dase.scenes.layers import Layer, LayerScene, Motion
 
-CLIP = 10.0
-"""Duration of S2R's clips [s], over which a layer goes from its first to its second scale."""
-
 
 @dataclass(frozen=True)
 class Regime:
@@ -30,6 +27,7 @@ class Regime:
         spin: Least and greatest foreground rotation [°/s].
         background_speed: Least and greatest [px/s].
         background_spin: Least and greatest [°/s].
+        clip: Duration of S2R's clips [s], over which a layer goes from its first to its second scale.
     """
 
     scenes: int
@@ -38,6 +36,7 @@ class Regime:
     spin: tuple[float, float]
     background_speed: tuple[float, float]
     background_spin: tuple[float, float]
+    clip: float = 10.0
 
 
 REGIMES = {
@@ -123,7 +122,7 @@ def _draw_motion(
     angle = rng.uniform(0, 2 * np.pi)
     turn = np.radians(rng.uniform(*spin)) * rng.choice((-1, 1)) * duration
     # a short scene is a piece of S2R's clip, so that it does not zoom faster
-    clip = max(CLIP, duration)
+    clip = max(Regime.clip, duration)
     begin = rng.uniform(0, clip - duration) if clip > duration else 0.0
     first, second = rng.uniform(*scale, (2, 2))
     begin_scale, end_scale = (first + (second - first) * t / clip for t in (begin, begin + duration))

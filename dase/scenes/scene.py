@@ -3,10 +3,23 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+
+
+@dataclass(frozen=True)
+class SamplingSettings:
+    """How densely a scene that is known at any time is sampled (Eq. 5 of Stoffregen et al., 2020)."""
+
+    travel: float = 0.5
+    """Share of a pixel that anything may move between two samples (λ): less would be no change to a pixel."""
+    shortest: float = 1e-3
+    """Lower bound of the time between samples [s] (δ), so that something fast does not cost without bound."""
+    longest: float = 1 / 72
+    """Upper bound of it [s], so that effects of time show at rest; S2R samples at 72 Hz at least."""
 
 
 class Scene(ABC):
@@ -23,6 +36,9 @@ class Scene(ABC):
     height: int
     duration: float
     anytime: bool = False
+
+    def __repr__(self) -> str:
+        return f"{type(self).__name__}({self.width}x{self.height} pixels, {self.duration:g} s)"
 
     @abstractmethod
     def sample_times(self) -> NDArray[np.float64]:

@@ -10,7 +10,9 @@ import numpy as np
 import warp as wp
 from numpy.typing import ArrayLike, NDArray
 
+from dase import io
 from dase.errors import InputError
+from dase.io import frames as picture_frames
 from dase.io.video_file import FrameReader
 from dase.kernels import pixel_stages
 from dase.kernels.scene_layers import interpolate_frames
@@ -93,6 +95,48 @@ class VideoScene(Scene):
         return self._frames[index]
 
 
+def as_scene(scene: Scene | ArrayLike, *, fps: float | None = None, times: ArrayLike | None = None) -> Scene:
+    """Return a scene however it is given: as it is, or made of frames.
+
+    Args:
+        scene: A `Scene`, or frames of linear intensity, shape (F, height, width). Whole numbers without a
+            sign are taken by the range of their type (255 or 65535 is white), others must lie in [0, 1].
+        fps: Frames per second; the first frame is at 0 s. For frames only.
+        times: Times of the frames [s], increasing, shape (F,), instead of `fps`.
+
+    Raises:
+        InputError: Frames without a rate or times, or with both; a scene with either; values out of range.
+    """
+    if isinstance(scene, Scene):
+        if fps is not None or times is not None:
+            raise InputError("scene: knows its own times; fps and times go with frames, shape (F, H, W)")
+        return scene
+    frames: NDArray[Any] = np.asarray(scene)
+    if frames.ndim != 3 or frames.dtype.kind not in "uf":
+        raise InputError(
+            "scene: must be a dase.Scene, or frames of shape (F, height, width), uint8, uint16 or float, "
+            f"got {type(scene).__name__} of type {frames.dtype} and shape {frames.shape}"
+        )
+    if (fps is None) == (times is None):
+        raise InputError("scene: frames need either fps, such as fps=1000, or times, one for each frame [s]")
+    if frames.dtype.kind == "u":
+        frames = frames / np.float32(np.iinfo(frames.dtype).max)
+    elif frames.size and not (frames.min() >= 0 and frames.max() <= 1):
+        raise InputError(
+            f"scene: frames of real numbers must lie in [0, 1], got {frames.min():g}..{frames.max():g}; "
+            "divide them by the value of white"
+        )
+    if fps is None:
+        return VideoScene(frames, np.asarray(times, np.float64))
+    _check_rate(fps)
+    return VideoScene(frames, np.arange(len(frames)) / fps)
+
+
+def _check_rate(fps: float | None) -> None:
+    if fps is not None and not (np.isfinite(fps) and fps > 0):
+        raise InputError(f"fps must be a number > 0, got {fps:g}")
+
+
 def open_video(path: Path, *, fps: float | None = None, size: tuple[int, int] | None = None) -> VideoScene:
     """Return the scene of a video file, of a folder of frames, or of the frames of a recording.
 
@@ -104,34 +148,28 @@ def open_video(path: Path, *, fps: float | None = None, size: tuple[int, int] | 
     Raises:
         InputError: Missing or undecodable, or a folder without a rate.
     """
-    if fps is not None and not (np.isfinite(fps) and fps > 0):
-        raise InputError(f"fps must be a number > 0, got {fps:g}")
+    _check_rate(fps)
     path = Path(path)
     if _is_recording(path):
         return _scene_of(path, fps, size)
     reader = FrameReader(path, size)
     rate = fps or reader.rate
     if not rate > 0:
-        raise InputError(f"{path} does not say how many frames it has per second: give --fps")
+        raise InputError(f"{path} does not say how many frames it has per second: give fps", argument="fps")
     return VideoScene(reader, np.arange(len(reader)) / rate)
 
 
 def _is_recording(path: Path) -> bool:
-    from dase import io
-    from dase.io import frames
-
     if not path.is_file():
         return False
     try:
-        return io.find_format(path) is not frames.FORMAT  # which are videos and pictures
+        return io.find_format(path) is not picture_frames.FORMAT  # which are videos and pictures
     except InputError:
         return False
 
 
 def _scene_of(path: Path, fps: float | None, size: tuple[int, int] | None) -> VideoScene:
     """Return the scene of a recording's frames."""
-    from dase import io
-
     sequence = io.read(path)
     if sequence.frames is None or len(sequence.frames) < 2:
         raise InputError(f"video {path}: the recording must have at least 2 frames to be taken for a video")
@@ -139,7 +177,7 @@ def _scene_of(path: Path, fps: float | None, size: tuple[int, int] | None) -> Vi
     if size is not None:
         frames = np.stack([cv2.resize(frame, size, interpolation=cv2.INTER_AREA) for frame in frames])
     if fps is None and sequence.frame_times is None:
-        raise InputError(f"{path} does not say when its frames were taken: give --fps")
+        raise InputError(f"{path} does not say when its frames were taken: give fps", argument="fps")
     times = sequence.frame_times if fps is None else np.arange(len(frames)) / fps
     assert times is not None
     return VideoScene(frames / np.float32(255), times - times[0])

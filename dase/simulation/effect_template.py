@@ -25,14 +25,6 @@ STAGE_MEANINGS = {
 }
 """Stage to what its function returns."""
 
-TRIAL_COMMANDS = (
-    "dase effects show {name} --effects {file}",
-    "dase add davis346 {name} --effects {file} -o with_{name}.toml",
-    "dase synth out_{name} --sensor with_{name}.toml --effects {file} --sequences 1 --duration 0.5",
-    "dase show out_{name}/sequence_00000.h5",
-)
-"""What to try, in this order."""
-
 FILE_TEMPLATE = '''\
 """An effect of your own. It works as it is: fill in your physics and try it again.
 
@@ -91,6 +83,7 @@ class {cls}(Effect):
         bounds=(0.0, 100.0),  # values outside are refused
         plausible=(0.05, 5.0),  # where `dase diagnose` looks
         about="white light gives 1 / (1 + strength) of the photocurrent it would give without saturation",
+        # where a fit begins and what it may change: starts=, fitted=, ..., see `dase.effects.Parameter`
     )
 '''
 
@@ -114,7 +107,7 @@ def new_effect(name: str, path: Path) -> None:
     if path.suffix != ".py":
         raise InputError(f"output must end with .py, got '{path}'")
     if path.exists():
-        raise InputError(f"{path} exists and is not overwritten; choose another name with -o")
+        raise InputError(f"{path} exists and is not overwritten; choose another name")
     with replacing(path) as temporary:
         temporary.write_text(effect_file_text(name, path.name), "utf-8")
 
@@ -135,5 +128,11 @@ def effect_file_text(name: str, file: str) -> str:
 
 
 def trial_commands(name: str, file: str) -> list[str]:
-    """Return the commands that try an effect out."""
-    return [line.format(name=name, file=shlex.quote(file)) for line in TRIAL_COMMANDS]
+    """Return the commands that try an effect out, in this order."""
+    quoted = shlex.quote(file)
+    return [
+        f"dase effects show {name} --effects {quoted}",
+        f"dase add davis346 {name} --effects {quoted} -o with_{name}.toml",
+        f"dase synth out_{name} --sensor with_{name}.toml --effects {quoted} --sequences 1 --duration 0.5",
+        f"dase show out_{name}/sequence_00000.h5",
+    ]

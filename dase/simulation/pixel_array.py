@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import warp as wp
@@ -15,9 +15,7 @@ from dase.kernels import launch, pixel_compile, pixel_stages, threshold_events
 from dase.kernels import threshold_counts as counting
 from dase.kernels.random import stream_number
 from dase.scenes.scene import Scene
-
-if TYPE_CHECKING:
-    from dase.simulation.sensor import Sensor
+from dase.simulation.sensor import Sensor
 
 
 def _pixel_indices(pixels: ArrayLike | None, width: int, height: int) -> NDArray[np.int32]:
@@ -46,7 +44,7 @@ class PixelArray:
         seed: Of every random number.
         device: `cpu`, `cuda` or a Warp name.
         labels: Whether events are marked with what they came from.
-        room: Events per pixel of a chunk that there is room for at first; with more, it runs again.
+        events_per_pixel: Room for events of a chunk at first; a chunk with more runs again with more room.
     """
 
     def __init__(
@@ -60,7 +58,7 @@ class PixelArray:
         seed: int = 0,
         device: str = "cpu",
         labels: bool = False,
-        room: int = 4,
+        events_per_pixel: int = 4,
     ):
         try:
             self.device = launch.find_device(device)
@@ -90,17 +88,22 @@ class PixelArray:
         self._next = wp.zeros(shape, dtype=float, device=self.device)
         self.samples = 0
         self.begin = 0.0
+        # consecutive pixels whose keys share a counter and a stretch of the buffer
         self.slab = 256 if self.device.is_cuda else 2048
-        self._capacity = room * self.slab
+        self._capacity = events_per_pixel * self.slab
         self._buffer: Any = None  # of keys, kept from chunk to chunk
         self._room = ordering.KeyBuffer()
         # nothing but a change detector: counted by a kernel of its own, several pixels per thread
-        self._plain = all(stage == "threshold" for effect in self.stages for stage, _ in effect.functions)
+        self._thresholds_only = all(
+            stage == "threshold" for effect in self.stages for stage, _ in effect.functions
+        )
         self._vectors = vectors
         self._levels: tuple[Any, Any] | None = None
-        self._mapped: list[Any] | None = None
-        self._bits = max((self.batch * self.count - 1).bit_length(), 1)
-        self._low = 3 if labels else 1
+        self._maps_of_scene: list[Any] | None = None
+        # a key is an integer: time since the begin of the chunk [ns], pixel of the batch, label and polarity;
+        # sorted keys are events sorted by time, and of one time by pixel, whatever the device did first
+        self._pixel_bits = max((self.batch * self.count - 1).bit_length(), 1)
+        self._low_bits = 3 if labels else 1
         delays = any(stage == "delay" for effect in self.stages for stage, _ in effect.functions)
         # keys of events that leave after the chunk, counted from its end
         self._late = np.empty(0, np.int64) if delays else None
@@ -127,19 +130,21 @@ class PixelArray:
         # the kernel writes each window it meets, whole
         new = wp.empty if len(np.unique(windows[windows >= 0])) == size else wp.zeros
         sink.counts = new(shape, dtype=int, device=self.device)
-        if self._plain:
-            self._count(sink.counts, scene, times, windows)
+        if self._thresholds_only:
+            self._count_thresholds_only(sink.counts, scene, times, windows)
         else:
             self._launch("counts", sink, scene, times, windows, align=16)
         self._advance(times)
         return sink.counts
 
-    def _count(self, out: Any, scene: Scene, times: NDArray[np.float64], windows: NDArray[np.int32]) -> None:
-        """Count with nothing but thresholds."""
-        self.look_at(scene)
-        self._edges(times)
-        name, source = self.sensor.seen(scene).source(times, self.pixels, self.device)
-        first, memory, _ = self._begin(name, source, len(times))
+    def _count_thresholds_only(
+        self, out: Any, scene: Scene, times: NDArray[np.float64], windows: NDArray[np.int32]
+    ) -> None:
+        """Count into `out`, shape (B, W, 2, N), with a kernel that knows nothing but thresholds."""
+        self.bind_scene(scene)
+        self._step_edges(times)
+        name, source = self.sensor.through_optics(scene).source(times, self.pixels, self.device)
+        first, memory, _ = self._state_before(name, source, len(times))
         if first >= len(times):
             out.zero_()
             return
@@ -149,34 +154,35 @@ class PixelArray:
         aligned = counting.samples_are_aligned(name, source, self.count)
         kernel = counting.counting_kernel(lanes, name, shared=shared, states=True, aligned=aligned)
         inputs = [
-            source, 0, self._pixels, self.count, self.width, first, level, eps, *self._runs(windows), memory,
-            self._next[1], self._next[0], out,
+            source, 0, self._pixels, self.count, self.width, first, level, eps, *self._window_runs(windows),
+            memory, self._next[1], self._next[0], out,
         ]  # fmt: skip
         launch.run_kernel(
             kernel, counting.block_count(self.count, lanes), inputs, self.device, batch=self.batch
         )
 
-    def _begin(self, name: str, source: Any, samples: int) -> tuple[int, Any, Any]:
+    def _state_before(self, name: str, source: Any, samples: int) -> tuple[int, Any, Any]:
         """Return the first sample to compare, and memories and signals before it."""
         first = max(2 - self.samples, 0)
         if not first:
             return 0, self._state[1], self._state[0]
         level, eps = self._thresholds_of_pixels()
         inputs = [
-            source, self._pixels, self.width, self.samples, samples, self.seed, stream_number("initial_phase"),
-            level, eps, wp.array(self._vectors[:, 2], dtype=float, device=self.device), self._state[0],
+            source, self._pixels, self.width, self.samples, samples, self.seed,
+            stream_number("initial_phase"), level, eps,
+            wp.array(self._vectors[:, 2], dtype=float, device=self.device), self._state[0],
             self._next[1], self._next[0],
         ]  # fmt: skip
         launch.run_kernel(counting.starting_kernel(name), self.count, inputs, self.device, batch=self.batch)
         # blocks may overlap, so what they read must not be what they write
         return first - 1, wp.clone(self._next[1]), wp.clone(self._next[0])
 
-    def _emit(self, sink: Any, scene: Scene, times: NDArray[np.float64]) -> None:
-        """Emit with nothing but thresholds."""
-        self.look_at(scene)
-        clock = self._clock(times, np.zeros(len(times), np.int32))
-        name, source = self.sensor.seen(scene).source(times, self.pixels, self.device)
-        first, memory, signal = self._begin(name, source, len(times))
+    def _emit_thresholds_only(self, sink: Any, scene: Scene, times: NDArray[np.float64]) -> None:
+        """Emit keys with a kernel that knows nothing but thresholds."""
+        self.bind_scene(scene)
+        clock = self._upload_clock(times, np.zeros(len(times), np.int32))
+        name, source = self.sensor.through_optics(scene).source(times, self.pixels, self.device)
+        first, memory, signal = self._state_before(name, source, len(times))
         lanes = counting.widest_block(self.count, self.device, name)
         inputs = [
             source, clock, self._pixels, self.count, self.width, first, *self._thresholds_of_pixels(),
@@ -203,31 +209,33 @@ class PixelArray:
         """
         begin = self.begin if self.samples else float(times[0])
         span = round(float(times[-1]) * 1e9) - round(begin * 1e9)
+        # an event that is held back may leave long after its chunk, and its key has to hold that time
         longest = span if self._late is None else span + round(pixel_stages.LATEST * 1e9)
-        if self._bits + self._low + longest.bit_length() > 63:
+        if self._pixel_bits + self._low_bits + longest.bit_length() > 63:
             raise InputError(
                 f"a chunk of {span * 1e-9:g} s with {self.batch * self.count} pixels is too long"
             )
-        keys, used = self._keys(scene, times)
-        top = self._bits + self._low + longest.bit_length()
+        keys, used = self._emit_keys(scene, times)
+        top = self._pixel_bits + self._low_bits + longest.bit_length()
         self._advance(times)
         found = ordering.keys_in_order(
-            keys, used, self._bits, self._low, top, self.device, self._late, self._room
+            keys, used, self._pixel_bits, self._low_bits, top, self.device, self._late, self._room
         )
-        events, row = self._decode(found, begin)
+        events, row = self._decode_keys(found, begin)
         if self._late is None:
             return events, row
+        # what leaves after the chunk waits, with its time counted from the next chunk's begin
         now = int(np.searchsorted(events.t, 1e-9 * float(round(self.begin * 1e9)), side="right"))
-        self._late = found.numpy()[now:] - (span << (self._bits + self._low))
+        self._late = found.numpy()[now:] - (span << (self._pixel_bits + self._low_bits))
         return events.select(slice(now)), None if row is None else row[:now]
 
     def flush(self) -> tuple[Events, NDArray[np.int32] | None]:
         """Return the events that have not left the pixels yet, as `emit` does; time is over."""
         late = np.empty(0, np.int64) if self._late is None else self._late
         self._late = None if self._late is None else late[:0]
-        return self._decode(wp.array(late, dtype=wp.int64, device=self.device), self.begin)
+        return self._decode_keys(wp.array(late, dtype=wp.int64, device=self.device), self.begin)
 
-    def _keys(self, scene: Scene, times: NDArray[np.float64]) -> tuple[Any, NDArray[np.int32]]:
+    def _emit_keys(self, scene: Scene, times: NDArray[np.float64]) -> tuple[Any, NDArray[np.int32]]:
         """Run the pixels until all their events fit; return the keys and how many there are per slab."""
         slabs = -(-self.count // self.slab)
         while True:
@@ -237,28 +245,32 @@ class PixelArray:
                 self._buffer = launch.new_array(shape, wp.int64, self.device)
             sink.keys = self._buffer
             sink.used = wp.zeros((self.batch, slabs), dtype=int, device=self.device)
-            sink.slab, sink.bits, sink.low = self.slab.bit_length() - 1, self._bits, self._low
-            if self._plain and self.device.is_cpu:
-                self._emit(sink, scene, times)
+            sink.slab, sink.bits, sink.low = self.slab.bit_length() - 1, self._pixel_bits, self._low_bits
+            if self._thresholds_only and self.device.is_cpu:
+                self._emit_thresholds_only(sink, scene, times)
             else:
                 self._launch(self.sink, sink, scene, times, np.zeros(len(times), np.int32), align=self.slab)
             used = sink.used.numpy()
             if used.max() <= self._capacity:
                 return sink.keys, used
+            # states were not advanced, so the chunk runs again from where it began; a quarter more spares the
+            # next, slightly busier chunk the same
             self._capacity = int(1.25 * used.max()) + 1
 
-    def look_at(self, scene: Scene) -> None:
+    def bind_scene(self, scene: Scene) -> None:
         """Work out what pixels owe to the scene, once; it is done before the first sample in any case."""
-        if self._mapped is None:
-            self._mapped = self.sensor.bound_to(scene).maps(self.pixels, self.device)
+        if self._maps_of_scene is None:
+            self._maps_of_scene = self.sensor.bound_to(scene).maps(self.pixels, self.device)
 
     def _maps(self) -> list[Any]:
-        return self.sensor.maps(self.pixels, self.device) if self._mapped is None else self._mapped
+        return (
+            self.sensor.maps(self.pixels, self.device) if self._maps_of_scene is None else self._maps_of_scene
+        )
 
     def thresholds(self) -> NDArray[np.float32]:
         """Return the thresholds of each pixel [log intensity], shape (B, 2, N): OFF, ON.
 
-        Where they depend on the scene, `look_at` it first.
+        Where they depend on the scene, `bind_scene` it first.
         """
         level = self._thresholds_of_pixels()[0].numpy()
         return np.array(np.broadcast_to(level, (self.batch, 2, self.count)))
@@ -288,11 +300,11 @@ class PixelArray:
         windows: NDArray[np.int32],
         align: int,
     ) -> None:
-        self.look_at(scene)
-        source_name, source = self.sensor.seen(scene).source(times, self.pixels, self.device)
-        lanes = self._lanes(source_name)
+        self.bind_scene(scene)
+        source_name, source = self.sensor.through_optics(scene).source(times, self.pixels, self.device)
+        lanes = self._count_lanes(source_name)
         kernel = pixel_compile.compose_pixels(self.stages, source_name, sink_name, lanes=lanes)
-        clock = self._clock(times, windows)
+        clock = self._upload_clock(times, windows)
         inputs = [
             source, clock, self._pixels, self.width, self.height, self.samples, self.seed,
             self._parameters, *self._maps(), self._state, self._next, sink,
@@ -302,11 +314,11 @@ class PixelArray:
         )
         launch.run_kernel(kernel, size, inputs, self.device, batch=self.batch, align=align)
 
-    def _lanes(self, source_name: str) -> int:
+    def _count_lanes(self, source_name: str) -> int:
         """Return how many pixels a thread of the composed kernel works on; 0 for CUDA's kernel."""
         return 0 if self.device.is_cuda else counting.widest_block(self.count, self.device, source_name)
 
-    def _edges(self, times: NDArray[np.float64]) -> NDArray[np.float64]:
+    def _step_edges(self, times: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the end of the last step and the samples that follow [s], shape (K + 1,)."""
         first = self.samples == 0
         edges = np.concatenate([[float(times[0]) if first else self.begin], times])
@@ -314,7 +326,7 @@ class PixelArray:
             raise InputError("sample times must increase")
         return edges
 
-    def _runs(self, windows: NDArray[np.int32]) -> tuple[Any, Any]:
+    def _window_runs(self, windows: NDArray[np.int32]) -> tuple[Any, Any]:
         """Return where runs of one window begin, so that a pixel writes its counts once, and the windows."""
         run = np.flatnonzero(np.diff(windows, prepend=windows[0] - 1))
         ends = np.append(run, len(windows)).astype(np.int32)
@@ -322,12 +334,13 @@ class PixelArray:
             wp.array(a, dtype=int, device=self.device) for a in (ends, windows[run].astype(np.int32))
         )
 
-    def _clock(self, times: NDArray[np.float64], windows: NDArray[np.int32]) -> Any:
-        edges = self._edges(times)
+    def _upload_clock(self, times: NDArray[np.float64], windows: NDArray[np.int32]) -> Any:
+        edges = self._step_edges(times)
         dt = np.diff(edges)
         clock = pixel_stages.SampleClock()
         if self.samples == 0:
             dt[0] = pixel_stages.REST
+        # times in whole nanoseconds, counted from the begin of the chunk: float32 could not tell them apart
         stamps = np.round(edges * 1e9)
         begin, length = stamps[:-1] - stamps[0], np.diff(stamps)
         # rounded down, so that no event comes after the end of its step
@@ -340,7 +353,7 @@ class PixelArray:
         clock.begin = wp.array(begin.astype(np.int64), dtype=wp.int64, device=to)
         clock.span = wp.int64(int(stamps[-1] - stamps[0]))
         clock.length = wp.array(short, dtype=float, device=to)
-        clock.run, clock.window = self._runs(windows)
+        clock.run, clock.window = self._window_runs(windows)
         return clock
 
     def _advance(self, times: NDArray[np.float64]) -> None:
@@ -348,14 +361,14 @@ class PixelArray:
         self.samples += len(times)
         self.begin = float(times[-1])
 
-    def _decode(self, keys: Any, begin: float) -> tuple[Events, NDArray[np.int32] | None]:
+    def _decode_keys(self, keys: Any, begin: float) -> tuple[Events, NDArray[np.int32] | None]:
         n, to = len(keys), self.device
-        each = ordering.EACH["cuda" if to.is_cuda else "cpu"]
+        each = ordering.events_per_thread(to)
         out = [launch.new_array(n, d, to) for d in (wp.float64, wp.uint16, wp.uint16, wp.uint8)]
         row = wp.empty(n if self.batch > 1 else 0, dtype=int, device=to)
         label = wp.empty(n if self.sink == "labels" else 0, dtype=wp.int8, device=to)
         inputs = [
-            keys, self._bits, self._low, self.count, self._xy,
+            keys, self._pixel_bits, self._low_bits, self.count, self._xy,
             wp.int64(round(begin * 1e9)), each, *out, row, label,
         ]  # fmt: skip
         launch.run_kernel(ordering.decode_keys, -(-n // each), inputs, to)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,16 +11,7 @@ from numpy.typing import NDArray
 from dase.effects.stream import StreamEffect, to_nanoseconds
 from dase.errors import InputError
 from dase.events import Events
-
-if TYPE_CHECKING:
-    from dase.simulation.sensor import Sensor
-
-LONGEST_TIME = 4e6
-"""Readers reckon in whole picoseconds of 64 bits, which hold times up to this [s]."""
-
-
-PART = 1 << 17
-"""Events that go through the readers at once: few enough to be sorted within the caches."""
+from dase.simulation.sensor import Sensor
 
 
 class ReadoutChain:
@@ -35,9 +25,19 @@ class ReadoutChain:
         height: Rows of the sensor.
         pixels: How many pixels are simulated; None for all.
         seed: Of every random number.
+        part: Events that go through the effects at once: few enough to be sorted within the caches.
     """
 
-    def __init__(self, sensor: Sensor, width: int, height: int, *, pixels: int | None = None, seed: int = 0):
+    def __init__(
+        self,
+        sensor: Sensor,
+        width: int,
+        height: int,
+        *,
+        pixels: int | None = None,
+        seed: int = 0,
+        part: int = 1 << 17,
+    ):
         effects = [e for e in sensor.effects if isinstance(e, StreamEffect) and not e.is_off()]
         for effect in effects:
             if not effect.per_pixel and pixels not in (None, width * height):
@@ -45,6 +45,7 @@ class ReadoutChain:
                     f"effect '{effect.name}' needs all {width * height} pixels of the sensor, got {pixels}; "
                     "leave it out or simulate them all"
                 )
+        self._part = part
         self._empty = Events.empty(width, height)
         self._readers = [effect.reader(width, height, seed) for effect in effects]
 
@@ -58,27 +59,31 @@ class ReadoutChain:
         Returns:
             Events sorted by time; they follow those returned before.
         """
-        if self._readers and len(events) and max(-events.t[0], events.t[-1]) > LONGEST_TIME:
-            raise InputError(
-                f"readout effects need times within {LONGEST_TIME:g} s of 0, "
-                f"got {events.t[0]:g}..{events.t[-1]:g} s"
-            )
         if not self._readers:
             return events
+        latest = (
+            4e6  # [s] readers reckon in whole picoseconds of 64 bits, which hold some nine million seconds
+        )
+        if len(events) and max(-events.t[0], events.t[-1]) > latest:
+            raise InputError(
+                f"readout effects need times within {latest:g} s of 0, "
+                f"got {events.t[0]:g}..{events.t[-1]:g} s"
+            )
         out = []
-        for i in range(0, max(len(events), 1), PART):
-            end = float(events.t[i + PART]) if i + PART < len(events) else until
-            out.append(self._through(events.select(slice(i, i + PART)), end))
+        for i in range(0, max(len(events), 1), self._part):
+            # of a part, too, it is known that nothing earlier than the next event follows
+            end = float(events.t[i + self._part]) if i + self._part < len(events) else until
+            out.append(self._through_readers(events.select(slice(i, i + self._part)), end))
         return Events.concatenate(out)
 
-    def _through(self, events: Events, until: float) -> Events:
+    def _through_readers(self, events: Events, until: float) -> Events:
         for reader in self._readers:
             events, until = reader.push(events, until)
         return events
 
     def flush(self) -> Events:
         """Return what is still inside; the stream is over."""
-        return self.push(self._empty, math.inf)
+        return self.push(self._empty, math.inf)  # nothing earlier than the end of time can follow
 
 
 class WindowCounter:
@@ -107,6 +112,7 @@ class WindowCounter:
             return
         events, windows = events.select(inside), windows[inside]
         place = self._place[events.y.astype(np.int64) * events.width + events.x]
+        # times ascend, and with them windows: only those of this part are touched
         low, high = int(windows[0]), int(windows[-1]) + 1
         shape = (high - low, *self.counts.shape[1:])
         flat = np.ravel_multi_index((windows - low, events.p.astype(np.int64), place), shape)
@@ -117,7 +123,7 @@ def split_by_row(events: Events, row: NDArray[np.int32] | None, batch: int) -> S
     """Return the stream of each row of a batch."""
     if row is None:
         return [events]
-    # rows as small integers, which are sorted by their digits
+    # stable, so that each stream stays in order of time; rows as small integers are sorted by their digits
     order = np.argsort(row.astype(np.uint16) if batch <= 1 << 16 else row, kind="stable")
     parts = np.split(order, np.cumsum(np.bincount(row, minlength=batch))[:-1])
     return [events.select(part) for part in parts]

@@ -19,6 +19,7 @@ from dase.errors import InputError
 from dase.events import LARGEST_SIDE
 from dase.kernels import pixel_stages
 from dase.scenes.scene import Scene
+from dase.scenes.video import LOG_EPS
 from dase.simulation.sensor_history import HistoryEntry
 
 
@@ -38,7 +39,7 @@ class Sensor:
     effects: tuple[Effect, ...] = (Threshold(),)
     name: str = "ideal"
     size: tuple[int, int] | None = None
-    log_eps: float = 1e-3
+    log_eps: float = LOG_EPS
     history: tuple[HistoryEntry, ...] = field(default=(), compare=False)
 
     def __post_init__(self) -> None:
@@ -86,13 +87,13 @@ class Sensor:
         apart = (Threshold, SceneEffect, StreamEffect)
         return tuple(effect.compiled() for effect in self.effects if not isinstance(effect, apart))
 
-    def seen(self, scene: Scene) -> Scene:
+    def through_optics(self, scene: Scene) -> Scene:
         """Return what the pixels see of `scene`."""
         for effect in self.effects:
             scene = effect.seen(scene) if isinstance(effect, SceneEffect) else scene
         return scene
 
-    def streams(self) -> tuple[StreamEffect, ...]:
+    def readout_effects(self) -> tuple[StreamEffect, ...]:
         """Return the effects behind the pixels that are not off."""
         return tuple(e for e in self.effects if isinstance(e, StreamEffect) and not e.is_off())
 
@@ -129,7 +130,7 @@ class Sensor:
         ]
         return np.array(values, np.float32)
 
-    def table(self) -> dict[str, Any]:
+    def to_table(self) -> dict[str, Any]:
         """Return the sensor as it stands in a sensor file."""
         out: dict[str, Any] = {"name": self.name}
         if self.size is not None:

@@ -41,7 +41,7 @@ class SensorText:
         """Return the sensor that the text describes."""
         return parse_sensor(self.text, self.where, self.effects).located(self.folder)
 
-    def added(self, effect: Effect) -> SensorText:
+    def with_effect(self, effect: Effect) -> SensorText:
         """Return the text with the table of an effect, placed where it acts.
 
         Raises:
@@ -62,7 +62,7 @@ class SensorText:
         new = "\n\n".join(part for part in (head, block.rstrip(), tail.rstrip()) if part) + "\n"
         return self._checked(new, after)
 
-    def removed(self, name: str) -> SensorText:
+    def without_effect(self, name: str) -> SensorText:
         """Return the text without the table of an effect and the comment that stands right above it.
 
         Raises:
@@ -90,7 +90,7 @@ class SensorText:
                 table[name] = value
         return self._checked(tomlkit.dumps(document), before.with_effect(effect))
 
-    def moved(self, folder: Path) -> SensorText:
+    def in_folder(self, folder: Path) -> SensorText:
         """Return the text as it stands in another folder: paths of files lead to where they are."""
         sensor = self.sensor()  # which says what is wrong with the text
         document = tomlkit.parse(self.text)
@@ -107,15 +107,15 @@ class SensorText:
         text = self
         for effect in self.sensor().effects:
             if effect.name not in sensor:
-                text = text.removed(effect.name)
+                text = text.without_effect(effect.name)
         for effect in sensor.effects:
             if effect.name not in text.sensor():
-                text = text.added(effect)
+                text = text.with_effect(effect)
             elif text.sensor()[effect.name] != effect:
                 text = text.with_values_of(effect)
         return text
 
-    def noted(self, entry: HistoryEntry) -> SensorText:
+    def with_history(self, entry: HistoryEntry) -> SensorText:
         """Return the text with one more entry of its history."""
         return self._checked("\n".join([*self._body(), "", entry.text()]), self.sensor())
 
@@ -184,7 +184,7 @@ def write_sensor_text(sensor: SensorText, path: Path | None) -> None:
         print(sensor.text, end="")
         return
     with replacing(path) as temporary:
-        temporary.write_bytes(sensor.moved(path.parent).text.encode())
+        temporary.write_bytes(sensor.in_folder(path.parent).text.encode())
 
 
 def history_entry_today(did: str, **facts: Any) -> HistoryEntry:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from importlib import resources
+from os import PathLike, fspath
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +13,7 @@ from tomlkit.items import Table
 
 from dase.effects import EFFECTS, Effect, find_effect
 from dase.errors import InputError, nearest
+from dase.scenes.video import LOG_EPS
 from dase.simulation.sensor import Sensor
 from dase.simulation.sensor_history import read_history
 from dase.text_files import parse_toml, read_text_file
@@ -35,6 +37,25 @@ def load_sensor(spec: str | Path, effects: Mapping[str, type[Effect]] = EFFECTS)
         InputError: No such preset or file, not TOML, or a name or value that does not exist.
     """
     return parse_sensor(*read_sensor(spec), effects).located(Path(spec).parent)
+
+
+def as_sensor(sensor: Sensor | str | PathLike[str]) -> Sensor:
+    """Return a sensor however it is given: as it is, or loaded.
+
+    Every function that users call takes its sensor through this one.
+
+    Args:
+        sensor: A `Sensor`, the name of a preset, or the path of a sensor file.
+
+    Raises:
+        InputError: As `load_sensor`.
+        TypeError: It is none of these.
+    """
+    if isinstance(sensor, Sensor):
+        return sensor
+    if isinstance(sensor, str | PathLike):
+        return load_sensor(fspath(sensor))
+    raise TypeError(f"sensor: expected a Sensor, a preset's name or a path, got {type(sensor).__name__}")
 
 
 def read_sensor(spec: str | Path) -> tuple[str, str]:
@@ -66,7 +87,7 @@ def parse_sensor(text: str, where: str, effects: Mapping[str, type[Effect]] = EF
     try:
         return _sensor_of_table(table, effects)
     except InputError as error:
-        raise InputError(f"{where}: {error}") from error
+        raise InputError(f"{where}: {error}", argument=error.argument) from error
 
 
 def _sensor_of_table(table: dict[str, Any], effects: Mapping[str, type[Effect]]) -> Sensor:
@@ -93,7 +114,7 @@ def _sensor_of_table(table: dict[str, Any], effects: Mapping[str, type[Effect]])
         plain["size"] = (size[0], size[1])
     if not isinstance(plain.get("name", ""), str):
         raise InputError(f"name must be a text, got {plain['name']!r}")
-    eps = plain.get("log_eps", 0.001)
+    eps = plain.get("log_eps", LOG_EPS)
     if isinstance(eps, bool) or not isinstance(eps, int | float):
         raise InputError(f"log_eps must be a number, got {eps!r}")
     return Sensor(effects=tuple(found), **{"name": "unnamed", **plain})
@@ -102,7 +123,7 @@ def _sensor_of_table(table: dict[str, Any], effects: Mapping[str, type[Effect]])
 def dump_sensor(sensor: Sensor) -> str:
     """Return a sensor as TOML text, every parameter with its unit and meaning."""
     document = tomlkit.document()
-    for name, value in sensor.table().items():
+    for name, value in sensor.to_table().items():
         if isinstance(value, dict):
             break
         document.add(name, value)

@@ -3,43 +3,26 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from os import PathLike
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from dase.errors import InputError, checked_integer
+from dase.errors import checked_integer
 from dase.events import Events
 from dase.scenes.scene import Scene
-from dase.simulation.pixel_array import PixelArray
-from dase.simulation.readout_chain import ReadoutChain, WindowCounter, split_by_row
+from dase.scenes.video import as_scene
 from dase.simulation.sensor import Sensor
-
-CHUNK = {"cpu": 64, "cuda": 128}
-"""Samples per chunk: few enough that layers far from a pixel are skipped, enough to amortise a launch."""
-
-
-def sample_times(scene: Scene, sensor: Sensor) -> NDArray[np.float64]:
-    """Return when to sample [s]: as the scene asks and, where it can, often enough for all effects."""
-    times, step = scene.sample_times(), sensor.longest_step()
-    if not scene.anytime or not np.isfinite(step):
-        return times
-    pieces = np.maximum(np.ceil(np.diff(times) / step - 1e-9), 1)
-    if np.all(pieces == 1):
-        return times
-    at = np.concatenate([[0], np.cumsum(pieces)])
-    return np.interp(np.arange(at[-1] + 1), at, times)
-
-
-def chunks(times: NDArray[np.float64], size: int) -> Iterator[NDArray[np.float64]]:
-    """Cut sample times into runs of `size`."""
-    for i in range(0, len(times), size):
-        yield times[i : i + size]
+from dase.simulation.sensor_file import as_sensor
+from dase.simulation.sensor_run import SensorRun
 
 
 def stream(
-    scene: Scene,
-    sensor: Sensor,
+    scene: Scene | ArrayLike,
+    sensor: Sensor | str | PathLike[str],
     *,
+    fps: float | None = None,
+    times: ArrayLike | None = None,
     seed: int = 0,
     device: str = "cpu",
     pixels: ArrayLike | None = None,
@@ -49,11 +32,14 @@ def stream(
     """Simulate a scene and yield its events chunk after chunk, in memory that does not grow.
 
     Args:
-        scene: What the sensor sees.
-        sensor: What it does.
+        scene: What the sensor sees: a scene, or frames of linear intensity, shape (F, H, W). Whole numbers
+            without a sign are taken by the range of their type (255 or 65535 is white), others in [0, 1].
+        sensor: What it does: a `Sensor`, the name of a preset, or the path of a sensor file.
+        fps: Frames per second, for frames.
+        times: Times of the frames [s], shape (F,), instead of `fps`.
         seed: Of every random number; the same seed gives the same events, whatever `chunk` is.
         device: `cpu`, `cuda` or a Warp name.
-        pixels: Row-major indices of the pixels to simulate; None for all.
+        pixels: Row-major indices of the pixels to simulate, shape (N,); None for all.
         chunk: Samples per chunk, at least 1; None for what suits the device.
         labels: Whether events are marked with what they came from.
 
@@ -63,46 +49,44 @@ def stream(
     """
     if chunk is not None:
         chunk = checked_integer("chunk", chunk, 1)
-    array = PixelArray(
-        sensor, scene.width, scene.height, pixels=pixels, seed=seed, device=device, labels=labels
-    )
-    return (parts[0] for parts in _leaving(scene, array, chunk))
-
-
-def _leaving(scene: Scene, array: PixelArray, chunk: int | None = None) -> Iterator[list[Events]]:
-    """Yield what leaves the camera chunk after chunk, a stream for each row of the batch."""
-    outlets = [
-        ReadoutChain(array.sensor, array.width, array.height, pixels=array.count, seed=array.seed)
-        for _ in range(array.batch)
-    ]
-    size = chunk or CHUNK["cuda" if array.device.is_cuda else "cpu"]
-    for times in chunks(sample_times(scene, array.sensor), size):
-        parts = split_by_row(*array.emit(scene, times), array.batch)
-        yield [outlet.push(part, array.begin) for outlet, part in zip(outlets, parts, strict=True)]
-    rest = zip(outlets, split_by_row(*array.flush(), array.batch), strict=True)
-    last = [Events.concatenate([outlet.push(part, array.begin), outlet.flush()]) for outlet, part in rest]
-    if any(len(part) for part in last):
-        yield last
+    run = SensorRun(
+        as_scene(scene, fps=fps, times=times), as_sensor(sensor), pixels=pixels, seed=seed, device=device,
+        labels=labels, chunk=chunk,
+    )  # fmt: skip
+    return (part.events[0] for part in run.chunks())
 
 
 def simulate(
-    scene: Scene,
-    sensor: Sensor,
+    scene: Scene | ArrayLike,
+    sensor: Sensor | str | PathLike[str],
     *,
+    fps: float | None = None,
+    times: ArrayLike | None = None,
     seed: int = 0,
     device: str = "cpu",
     pixels: ArrayLike | None = None,
     labels: bool = False,
 ) -> Events:
-    """Simulate a scene: light → photoreceptor → change detector → readout; see `stream` for the arguments."""
-    return Events.concatenate(stream(scene, sensor, seed=seed, device=device, pixels=pixels, labels=labels))
+    """Simulate a scene, or frames: light → photoreceptor → change detector → readout.
+
+        events = dase.simulate(frames, "davis346", fps=1000)
+
+    See `stream` for the arguments.
+    """
+    return Events.concatenate(
+        stream(
+            scene, sensor, fps=fps, times=times, seed=seed, device=device, pixels=pixels, labels=labels
+        )
+    )  # fmt: skip
 
 
 def count(
-    scene: Scene,
-    sensor: Sensor,
+    scene: Scene | ArrayLike,
+    sensor: Sensor | str | PathLike[str],
     edges: ArrayLike,
     *,
+    fps: float | None = None,
+    times: ArrayLike | None = None,
     seed: int = 0,
     device: str = "cpu",
     pixels: ArrayLike | None = None,
@@ -114,9 +98,11 @@ def count(
     detector, latency and readout effects; then a window holds the events with edge < t <= next edge.
 
     Args:
-        scene: What the sensor sees.
-        sensor: What it does.
+        scene: What the sensor sees, a scene or frames; see `stream`.
+        sensor: What it does; see `stream`.
         edges: Window edges [s], increasing, shape (W + 1,); a step counts for the window its end lies in.
+        fps: Frames per second, for frames.
+        times: Times of the frames [s], shape (F,), instead of `fps`.
         seed: Of every random number.
         device: `cpu`, `cuda` or a Warp name.
         pixels: Row-major indices of the pixels to simulate, N of them; None for all.
@@ -125,34 +111,8 @@ def count(
     Returns:
         Shape (B, W, 2, N): OFF counts in channel 0, ON counts in channel 1.
     """
-    edges = np.asarray(edges, np.float64)
-    if edges.ndim != 1 or len(edges) < 2 or not np.all(np.diff(edges) > 0):
-        raise InputError("window edges must increase, and there must be at least 2")
-    array = PixelArray(
-        sensor, scene.width, scene.height, pixels=pixels, parameters=parameters, seed=seed, device=device
-    )
-    if sensor.changes_event_stream():
-        return _count_leaving(scene, array, edges)
-    total = np.zeros((array.batch, len(edges) - 1, 2, array.count), np.int32)
-    for times in chunks(sample_times(scene, sensor), CHUNK["cuda" if array.device.is_cuda else "cpu"]):
-        windows = (np.searchsorted(edges, times, side="left") - 1).astype(np.int32)
-        windows[(windows < 0) | (windows >= len(edges) - 1)] = -1
-        seen = windows[windows >= 0]
-        if len(seen) == 0:
-            array.count_events(scene, times, windows, 1)
-            continue
-        low, high = seen.min(), seen.max() + 1
-        part = array.count_events(
-            scene, times, np.where(windows >= 0, windows - low, -1).astype(np.int32), high - low
-        )
-        total[:, low:high] += part.numpy()
-    return total
-
-
-def _count_leaving(scene: Scene, array: PixelArray, edges: NDArray[np.float64]) -> NDArray[np.int32]:
-    """Count what leaves the camera, shape (B, W, 2, N)."""
-    tallies = [WindowCounter(edges, array.pixels, array.width * array.height) for _ in range(array.batch)]
-    for parts in _leaving(scene, array):
-        for tally, part in zip(tallies, parts, strict=True):
-            tally.add(part)
-    return np.stack([tally.counts for tally in tallies])
+    run = SensorRun(
+        as_scene(scene, fps=fps, times=times), as_sensor(sensor), pixels=pixels, parameters=parameters,
+        seed=seed, device=device,
+    )  # fmt: skip
+    return run.count(edges)

@@ -21,7 +21,7 @@ import warp as wp
 from dase.effects import EFFECTS, Effect, StreamEffect
 from dase.errors import InputError, nearest
 from dase.events import LABELS
-from dase.kernels import pixel_codegen, pixel_compile, pixel_stages
+from dase.kernels import pixel_codegen_model, pixel_compile, pixel_stages
 from dase.scenes.video import VideoScene
 from dase.simulation.sensor import Sensor
 from dase.simulation.simulate import simulate
@@ -29,9 +29,6 @@ from dase.text_files import read_text_file
 
 RESERVED_NAMES = ("name", "size", "log_eps", "history", "sensor")
 """Other entries of a sensor file; no effect can have such a name."""
-
-NOISE_STATE_NAMES = ("hazard", "rest", "events", "spend", "left")
-"""What the composed kernel itself keeps for an effect with noise events, beside its parameters and states."""
 
 STAGE_RETURNS = {
     "light": ("intensity",),
@@ -194,9 +191,11 @@ class _EffectDefinition:
             if f.name not in known:
                 raise self.wrong(f"{effect.name}.{f.name} must be made by parameter(...) or choice(...)")
         taken = {q for qs in pixel_stages.QUANTITIES.values() for q in qs} | set(pixel_stages.ANYWHERE)
-        taken |= set(NOISE_STATE_NAMES) if "noise" in effect.stages else set()
+        if "noise" in effect.stages:
+            # what the composed kernel itself keeps for an effect with noise events
+            taken |= {"hazard", "rest", "events", "spend", "left"}
         for name in (*known, *effect.states):
-            if name in taken or pixel_codegen.DRAW.fullmatch(name):
+            if name in taken or pixel_codegen_model.random_number(name):
                 raise self.wrong(f"{effect.name}.{name}: the name is one of dase's own; choose another")
         if len({*known, *effect.states}) != len(known) + len(effect.states):
             raise self.wrong(f"effect '{effect.name}': parameters and states must have names of their own")

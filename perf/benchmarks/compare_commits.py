@@ -1,9 +1,9 @@
 """Speed before and after a change, in one run and as ratios, so that the machine's mood cancels.
 
-    python perf/benchmarks/compare_commits.py ../before ../after                       all figures, on one core
-    python perf/benchmarks/compare_commits.py ../before ../after --device cuda:0
-    python perf/benchmarks/compare_commits.py ../before ../after --only count simulate --rounds 5
-    python perf/benchmarks/compare_commits.py ../before ../after --only diagnose --hidden FOLDER --case a_01
+    python -m perf.benchmarks.compare_commits ../before ../after
+    python -m perf.benchmarks.compare_commits ../before ../after --device cuda:0
+    python -m perf.benchmarks.compare_commits ../before ../after --only count simulate --rounds 5
+    python -m perf.benchmarks.compare_commits ../before ../after --only diagnose --hidden FOLDER --case a_01
 
 In each round each checkout gets a fresh process with its own PYTHONPATH. Both are on the same core and take
 turns, so that only one works at a time: A B, B A, A B, ... Each call is warm and waits for the device at its

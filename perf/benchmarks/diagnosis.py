@@ -33,7 +33,7 @@ def seconds(events: dase.Events, names: tuple[str, ...], pixels: int, device: st
     clock = time.process_time if device == "cpu" else time.perf_counter
     for _ in range(2):
         begin = clock()
-        found = diagnose(events, scene_of(0), effects=library, most=1, pixels=pixels, device=device)
+        found = diagnose(events, scene=scene_of(0), effects=library, most=1, pixels=pixels, device=device)
         spent = clock() - begin
     return spent, found.evaluations
 

@@ -118,7 +118,7 @@ class Padded:
     """
 
     def __init__(self, bank: CriticBank):
-        self.weights = {name: getattr(bank, name).clone().requires_grad_() for name in bank.names()}
+        self.weights = {name: getattr(bank, name).clone().requires_grad_() for name in bank.parameter_names()}
         self.optimizer = _adam(list(self.weights.values()), bank)
 
     def scores(self, rows: torch.Tensor) -> torch.Tensor:

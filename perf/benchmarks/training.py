@@ -28,23 +28,33 @@ import numpy as np
 import torch
 
 from dase.kernels import autograd_critics as bridge
-from dase.learning.adversarial import AdversarialObjective, PatchHash, critic_maps, cut_patches
+from dase.learning.adversarial import (
+    AdversarialObjective,
+    AdversarialSettings,
+    PatchHash,
+    critic_maps,
+    cut_patches,
+)
 from dase.learning.critic_bank import BankShape, CriticBank, CriticBatch, _has_grouped_products
 from dase.learning.cuda_graph import GraphReplay
+from dase.learning.job import compose_training
+from dase.learning.moment_objective import MomentObjective
+from dase.learning.recipe import Recipe
 from dase.learning.scene_batches import Scenery, SceneSettings, middle_intensity, send_words
 from dase.learning.targets import (
     TRUTHS,
     EndlessTarget,
     Pairs,
-    answers,
     draw_noise,
     simulate_counts,
+    vary_parameters,
     vary_thresholds,
 )
-from dase.learning.training import Recipe, Training
+from dase.learning.training import Training
 from dase.networks.threshold_network import NetworkShape
 from dase.scenes import image_sources
 from perf.benchmarks import naive_critic_bank
+from perf.data_folder import default_images
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -107,8 +117,11 @@ def make(args: argparse.Namespace, objective: str) -> Training:
     if objective == "moments":
         network = NetworkShape(**{**network.__dict__, "table": (6, 5)})
     batch = 4 if args.small else 12
-    recipe = Recipe(objective=objective, batch=batch, hash=how, network=network, warmup=2, steps=10**6)
-    training = Training(recipe, EndlessTarget(scenery, TRUTHS["uniform"]()), scenery)
+    critics = AdversarialSettings(hash=how)
+    recipe = Recipe(
+        objective=objective, batch=batch, adversarial=critics, network=network, warmup=2, steps=10**6
+    )
+    training = compose_training(recipe, EndlessTarget(scenery, TRUTHS["uniform"]()), scenery)
     for _ in range(30):
         training.advance()
     return training
@@ -147,26 +160,30 @@ def iterations(training: Training, clock: Clock) -> dict[str, float]:
     out["count gradient"] = clock.recorded(gradient) - out["count"]
     if recipe.objective == "moments":
         out["count anew for derivatives"] = clock.recorded(
-            lambda: (vary_thresholds(log, mu, sigma, noise), answers(log, mu.detach(), sigma.detach(), noise))
+            lambda: (
+                vary_thresholds(log, mu, sigma, noise),
+                vary_parameters(log, mu.detach(), sigma.detach(), noise),
+            )
         )
         out |= _moments(training, clock)
     else:
         out |= _critics(training, clock)
     learn = torch.zeros((), device=clock.device)
-    out["optimiser"] = clock.recorded(lambda: (training.optimizer.step(), training._average(learn)))
+    out["optimiser"] = clock.recorded(lambda: (training.optimizer.step(), training._average_weights(learn)))
     return out
 
 
 def _moments(training: Training, clock: Clock) -> dict[str, float]:
     fake, _ = training.simulate_fake(training.scenery.draw(training.scenes, training.recipe.batch))
     real = training.target.draw(training.reals, training.recipe.batch)
-    assert training.newton is not None
-    newton = training.newton
-    while training.objective.begin() is None:
+    objective = training.objective
+    assert isinstance(objective, MomentObjective)
+    newton = objective.newton
+    while objective.begin_step() is None:
         pass
     return {
-        "moments": clock.recorded(lambda: training.objective.loss(fake, real, move=True)),
-        "newton": clock.recorded(lambda: (newton.see(fake), newton.step(0.0))),
+        "moments": clock.recorded(lambda: objective.moments.loss(fake, real, move=True)),
+        "newton": clock.recorded(lambda: (newton.add_answers(fake), newton.step(0.0))),
     }
 
 
@@ -324,10 +341,9 @@ def provenance(device: str, commit: str | None) -> dict[str, str]:
 
 def main() -> None:
     """Measure and print."""
-    beside = ROOT.parent / "shared" / "photos"
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument("--device", default="cuda" if torch.cuda.is_available() else "cpu")
-    parser.add_argument("--images", default=str(beside) if beside.is_dir() else "builtin")
+    parser.add_argument("--images", default=default_images())
     parser.add_argument("--small", action="store_true")
     parser.add_argument("--repeats", type=int, default=15)
     parser.add_argument("--out", type=Path)
@@ -350,7 +366,7 @@ def main() -> None:
         faults += naive_critic_bank.faults(line["naive"])
     for objective in ("wgan", "moments"):
         training = make(args, objective)
-        clock.generators = training._generators()
+        clock.generators = training.generators()
         parts = iterations(training, clock)
         whole = parts["iteration"]
         parts |= host(training, clock)

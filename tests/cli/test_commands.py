@@ -15,24 +15,10 @@ import cv2
 import numpy as np
 import pytest
 from click.testing import CliRunner
+from helpers.command_line import SMALL, dase, one_sentence
 
 from dase import Events, InputError, io
 from dase.cli import dase_group
-
-SMALL = ("--size", "32x24", "--duration", "0.1", "--sequences", "1", "--jobs", "1", "--regime", "slow")
-
-
-def dase(*arguments: object, **options) -> subprocess.CompletedProcess[str]:
-    command = [sys.executable, "-c", "from dase.cli import main; main()", *map(str, arguments)]
-    return subprocess.run(command, capture_output=True, text=True, timeout=300, **options)
-
-
-def one_sentence(done: subprocess.CompletedProcess[str], code: int = 2) -> str:
-    assert done.returncode == code, done.stderr
-    assert "Traceback" not in done.stderr
-    said = [line for line in done.stderr.splitlines() if not re.match(r"Usage:|Try |$", line)]
-    assert len(said) == 1, done.stderr
-    return said[0]
 
 
 def toml(tmp_path: Path, text: str) -> Path:
@@ -72,7 +58,7 @@ def test_cuda_without_a_gpu(tmp_path):
 
     if wp.is_cuda_available():
         pytest.skip("needs a machine without a GPU")
-    assert "needs an NVIDIA GPU" in one_sentence(dase("synth", tmp_path / "out", *SMALL, "--backend", "cuda"))
+    assert "needs an NVIDIA GPU" in one_sentence(dase("synth", tmp_path / "out", *SMALL, "--device", "cuda"))
 
 
 @pytest.mark.parametrize(
@@ -123,7 +109,7 @@ def test_synth_then_show(tmp_path):
     assert shown.returncode == 0, shown.stderr
     assert cv2.imread(str(out / "sequence_00000.png")) is not None
     # a second run must not overwrite the first
-    assert "--resume" in one_sentence(dase("synth", out, *SMALL))
+    assert "resume it" in one_sentence(dase("synth", out, *SMALL))
     assert "other options" in one_sentence(dase("synth", out, *SMALL, "--resume", "--seed", "9"))
 
 
@@ -134,7 +120,7 @@ def test_video(tmp_path):
         picture = np.full((24, 32), 60, np.uint8)
         picture[:, i : i + 8] = 220
         cv2.imwrite(str(folder / f"{i:03d}.png"), picture)
-    assert "give --fps" in one_sentence(dase("synth", tmp_path / "v.npz", "--video", folder))
+    assert "give fps (--fps)" in one_sentence(dase("synth", tmp_path / "v.npz", "--video", folder))
     done = dase("synth", tmp_path / "v.npz", "--video", folder, "--fps", "100", "--sensor", "ideal")
     assert done.returncode == 0, done.stderr
     events = io.read(tmp_path / "v.npz").events
@@ -246,3 +232,10 @@ def test_broken_files(tmp_path, name, content, message):
 def test_a_broken_file_is_one_sentence_and_exit_code_2(tmp_path):
     (tmp_path / "a.txt").write_bytes(BROKEN[5][1])
     assert BROKEN[5][2] in one_sentence(dase("info", tmp_path / "a.txt"))
+
+
+def test_help_shows_one_spelling_of_the_device():
+    for name in ("synth", "train", "demo"):
+        text = CliRunner().invoke(dase_group, [name, "--help"]).output
+        assert "--device" in text
+        assert "--backend" not in text

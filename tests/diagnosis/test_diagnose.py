@@ -16,7 +16,7 @@ from click.testing import CliRunner
 import dase
 from dase.cli import dase_group
 from dase.cli.options import open_recorded
-from dase.diagnosis.diagnose import diagnose, summary_line
+from dase.diagnosis.diagnose import diagnose
 from dase.diagnosis.explain_effect import moving_bars
 from dase.diagnosis.state import explains_remainder
 from dase.effects import EFFECTS, Effect, parameter
@@ -81,7 +81,7 @@ def hidden(scene, device, *effects: Effect, seed: int = 3) -> dase.Events:
 )
 def test_a_hidden_effect_is_named(scene, device, effect):
     events = hidden(scene, device, effect)
-    found = diagnose(events, scene, effects=LIBRARY, pixels=PIXELS, device=device)
+    found = diagnose(events, scene=scene, effects=LIBRARY, pixels=PIXELS, device=device)
     assert found.selected == (effect.name,)
     assert found.unexplained is None
     assert found.errors[1] - 1 < 0.1 * (found.errors[0] - 1)
@@ -90,19 +90,19 @@ def test_a_hidden_effect_is_named(scene, device, effect):
     assert abs(got.value / true - 1) < 0.15 or got.low < true < got.high
     assert found.parameters["threshold.on"].value == pytest.approx(0.18, rel=0.05)
     assert json.loads(json.dumps(found.to_json()))["selected"] == [effect.name]
-    assert f"missing: {effect.name}" in summary_line(found)
+    assert f"missing: {effect.name}" in found.finding()
 
 
 def test_nothing_is_invented(scene, device):
-    found = diagnose(hidden(scene, device), scene, effects=LIBRARY, pixels=PIXELS, device=device)
+    found = diagnose(hidden(scene, device), scene=scene, effects=LIBRARY, pixels=PIXELS, device=device)
     assert found.selected == ()
     assert found.unexplained is None
-    assert "nothing is missing" in summary_line(found)
+    assert "nothing is missing" in found.finding()
 
 
 def test_two_hidden_effects_are_both_found(scene, device):
     events = hidden(scene, device, EFFECTS["mismatch"](spread=0.25), EFFECTS["leak"](rate=5.0))
-    found = diagnose(events, scene, effects=LIBRARY, pixels=PIXELS, device=device)
+    found = diagnose(events, scene=scene, effects=LIBRARY, pixels=PIXELS, device=device)
     assert sorted(found.selected) == ["leak", "mismatch"]
     assert len(found.errors) == 3
     assert found.errors[0] > 2 > found.errors[2]
@@ -110,11 +110,11 @@ def test_two_hidden_effects_are_both_found(scene, device):
 
 def test_an_unknown_effect_is_unexplained_until_it_is_given(scene, device):
     events = hidden(scene, device, Popping(rate=25.0))
-    found = diagnose(events, scene, effects=LIBRARY, pixels=500, device=device, most=1)
+    found = diagnose(events, scene=scene, effects=LIBRARY, pixels=500, device=device, most=1)
     assert found.selected == ()
     assert found.unexplained is not None
     assert any("bright" in cell.where for cell in found.unexplained.cells[:8])
-    known = diagnose(events, scene, effects=LIBRARY | {"popping": Popping}, pixels=500, device=device)
+    known = diagnose(events, scene=scene, effects=LIBRARY | {"popping": Popping}, pixels=500, device=device)
     assert known.selected == ("popping",)
     assert known.parameters["popping.rate"].value == pytest.approx(25.0, rel=0.15)
 
@@ -122,7 +122,7 @@ def test_an_unknown_effect_is_unexplained_until_it_is_given(scene, device):
 def test_the_same_seed_gives_the_same_findings(scene, device):
     events = hidden(scene, device, EFFECTS["leak"](rate=4.0))
     one, two = (
-        diagnose(events, scene, effects=LIBRARY, pixels=300, most=1, seed=5, device=device).to_json()
+        diagnose(events, scene=scene, effects=LIBRARY, pixels=300, most=1, seed=5, device=device).to_json()
         for _ in range(2)
     )
     if device == "cpu":
@@ -140,7 +140,7 @@ def test_another_simulator(shared, device):
         t, x, y, p = (data[k] for k in ("t_us", "x", "y", "p"))
     events = dase.Events(t * 1e-6, x, y, p.astype(bool), scene.width, scene.height)
     library = LIBRARY | {"linlog": EFFECTS["linlog"]}
-    found = diagnose(events, scene, effects=library, pixels=PIXELS, device=device)
+    found = diagnose(events, scene=scene, effects=library, pixels=PIXELS, device=device)
     assert sorted(found.selected) == ["leak", "linlog"]
     assert found.parameters["linlog.knee"].value == pytest.approx(20 / 255, rel=0.05)
     assert found.parameters["linlog.slope"].value == pytest.approx(np.log(20), rel=0.05)
@@ -164,7 +164,7 @@ def test_intervals_cover_the_truth(scene, device):
 def test_a_fit_from_far_away(scene, device):
     events = hidden(scene, device, EFFECTS["leak"](rate=4.0))
     given = Sensor(effects=(EFFECTS["threshold"](on=0.5, off=0.1),)).with_effect(EFFECTS["leak"](rate=0.3))
-    got = fit(events, scene, given, pixels=PIXELS, device=device)
+    got = fit(events, given, scene=scene, pixels=PIXELS, device=device)
     assert got.error < 1 < got.before
     assert got.sensor["threshold"].off == pytest.approx(0.22, rel=0.05)
     assert got.parameters["leak.rate"].value == pytest.approx(4.0, rel=0.15)

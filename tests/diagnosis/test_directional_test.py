@@ -12,15 +12,13 @@ from dase.diagnosis import pruning as reviewing
 from dase.diagnosis.candidates import Candidate
 from dase.diagnosis.diagnose import _simplest_of_the_best
 from dase.diagnosis.directional_test import (
-    AGAIN,
-    AWAY,
-    PLAIN,
     RepeatCloud,
     _most_deviating_effect,
     deviation_towards,
     find_hidden_effect,
 )
 from dase.diagnosis.explain_effect import moving_bars
+from dase.diagnosis.settings import DEFAULTS
 from dase.diagnosis.state import DiagnosisState
 from dase.effects import EFFECTS
 from dase.fitting.data_split import split_measurement
@@ -52,7 +50,9 @@ def test_the_distance_along_a_way_is_in_deviations_of_repeats(rng):
 
 def test_no_single_statistic_decides_and_no_chance_is_no_certainty():
     way, alike = np.ones((1, 25)), np.zeros((60, 25))
-    assert RepeatCloud(alike, np.eye(25)[0] * 100).deviations_along(way)[0] == pytest.approx(PLAIN / 5)
+    assert RepeatCloud(alike, np.eye(25)[0] * 100).deviations_along(way)[0] == pytest.approx(
+        DEFAULTS.hidden.most_of_one / 5
+    )
     assert RepeatCloud(alike, np.full(25, 0.5)).deviations_along(way)[0] == pytest.approx(2.5)
 
 
@@ -77,9 +77,10 @@ def test_jitter_is_seen_beside_mismatch_and_not_where_there_is_none(searches):
     assert p_value == pytest.approx(1 / 61)  # none of the repeats is as far on any way
     assert 0.1 < start.sensor["jitter"].spread < 0.5
     true = model_of(TRUE.with_effect(JITTER))
-    assert deviation_towards(searches["uneven"].evidence.train, model, true, seed=1) > AWAY
-    assert deviation_towards(searches["uneven"].evidence.held, model, true, seed=1) > AGAIN
-    assert deviation_towards(searches["plain"].evidence.held, model, true, seed=1) < AGAIN
+    uneven, plain, hidden = searches["uneven"], searches["plain"], DEFAULTS.hidden
+    assert deviation_towards(uneven, uneven.evidence.train, model, true) > hidden.away
+    assert deviation_towards(uneven, uneven.evidence.held, model, true) > hidden.away_held_out
+    assert deviation_towards(plain, plain.evidence.held, model, true) < hidden.away_held_out
 
 
 def test_nothing_is_looked_at_where_chance_hides_nothing(searches):
@@ -91,7 +92,7 @@ def test_nothing_is_looked_at_where_chance_hides_nothing(searches):
 
 
 def tried(name: str, error: float, parameters: int = 2) -> Candidate:
-    return Candidate(name, FittedModel(None, np.zeros(parameters)), 0.0, judged=judged(error))
+    return Candidate(name, FittedModel(None, np.zeros(parameters)), 0.0, judgement=judged(error))
 
 
 def test_the_simplest_of_those_that_are_not_told_apart_is_chosen():
@@ -125,13 +126,15 @@ def fake(names: str, errors: dict[str, float], monkeypatch, **more) -> tuple:
         def without(self, name: str) -> str:
             return self.replace(name, "")
 
-    defaults = dict(without={}, ties={}, alternatives={}, error_of={}, evidence=None, seed=0)
+    defaults = dict(
+        settings=DEFAULTS, without={}, ties={}, alternatives={}, error_of={}, evidence=None, seed=0
+    )
     search = SimpleNamespace(
-        judge=lambda m: judged(errors[m.names]), added=lambda m: tuple(m.names), **(defaults | more)
+        judge=lambda m: judged(errors[m.names]), added_to=lambda m: tuple(m.names), **(defaults | more)
     )
     monkeypatch.setattr(reviewing, "settle", lambda evidence, m, seed: m)
     monkeypatch.setattr(reviewing, "_keep_near_models", lambda search, ways, judgement: ways)
-    monkeypatch.setattr(reviewing, "like_of", lambda sensor, m, more: model(str(sensor)))
+    monkeypatch.setattr(reviewing, "with_same_freedom", lambda sensor, m, more: model(str(sensor)))
     monkeypatch.setattr(
         reviewing, "_droppable_models",
         lambda search, m: {n: model(m.names.replace(n, "")) for n in m.names},
@@ -161,7 +164,7 @@ def test_what_accounts_for_most_stays_and_so_does_what_only_a_closer_look_shows(
     search, model, judgement = fake("ab", {"ab": 0.3, "a": 0.8, "b": 6.0}, monkeypatch)
     assert reviewing.prune_model(search, model, judgement)[0].names == "ab"
     search, model, judgement = fake("ab", {"ab": 0.3, "a": 0.35, "b": 6.0}, monkeypatch)
-    monkeypatch.setattr(reviewing, "shown", lambda search, less, without, m: less.names == "a")
+    monkeypatch.setattr(reviewing, "lacks_effect_of", lambda search, less, without, m: less.names == "a")
     assert reviewing.prune_model(search, model, judgement)[0].names == "ab"
 
 
@@ -181,6 +184,6 @@ def test_a_simpler_rival_takes_the_place_and_the_tie_is_told(monkeypatch):
 def test_no_rival_takes_the_place_of_what_a_closer_look_shows(monkeypatch):
     errors = {"aZ": 0.3, "Z": 9.0, "a": 9.0, "ab": 0.4, "b": 9.0}
     search, model, judgement = fake("aZ", errors, monkeypatch, rivals={"Z": "b"})
-    monkeypatch.setattr(reviewing, "shown", lambda search, less, without, m: less.names == "ab")
+    monkeypatch.setattr(reviewing, "lacks_effect_of", lambda search, less, without, m: less.names == "ab")
     assert reviewing.prune_model(search, model, judgement)[0].names == "aZ"
     assert search.ties == {}

@@ -11,8 +11,8 @@ import dase
 from dase import io
 from dase.cli import dase_group
 from dase.diagnosis.compare import compare
-from dase.diagnosis.measurement import open_measurement
 from dase.fitting.data_split import split_measurement
+from dase.fitting.measurement import Measurement, as_measurement, measurement_of, open_measurement
 from dase.io.sequence import Sequence
 from dase.probes.stimulus import MASKED
 from dase.scenes.video import VideoScene
@@ -71,17 +71,19 @@ def test_frames_far_apart_make_a_scene_with_trust(measured):
 def test_the_true_model_is_wrong_only_where_frames_are(recording, measured):
     """A mask that left in what the frames do not show, or a scene without it, would blame the model."""
     path, events = recording
-    masked = compare(events, measured.scene, SENSOR, pixels=PIXELS)  # a scene's own trust is what is taken
-    bare = compare(events, measured.scene, SENSOR, pixels=PIXELS, trust=everywhere)
+    masked = compare(
+        events, SENSOR, scene=measured.scene, pixels=PIXELS
+    )  # a scene's own trust is what is taken
+    bare = compare(events, SENSOR, scene=measured.scene, pixels=PIXELS, trust=everywhere)
     sequence = io.read(path)
     straight = VideoScene(sequence.frames / np.float32(255), sequence.frame_times)
-    before = compare(events, straight, SENSOR, pixels=PIXELS)
-    told = compare(events, moving_picture(np.random.default_rng(5), **PICTURE), SENSOR, pixels=PIXELS)
+    before = compare(events, SENSOR, scene=straight, pixels=PIXELS)
+    told = compare(events, SENSOR, scene=moving_picture(np.random.default_rng(5), **PICTURE), pixels=PIXELS)
     print(*(f"{found.error:.2f}" for found in (masked, bare, before, told)))
     assert masked.error < 0.65 * bare.error
     assert masked.error < 0.55 * before.error
     assert masked.error < 1.4 * told.error  # whose light is taken at each millisecond only
-    wrong = compare(events, measured.scene, SENSOR.with_effect(slow()), pixels=PIXELS)
+    wrong = compare(events, SENSOR.with_effect(slow()), scene=measured.scene, pixels=PIXELS)
     assert wrong.error > 2 * masked.error  # and yet it sees what is wrong
 
 
@@ -111,7 +113,7 @@ def test_events_where_nothing_is_known_change_nothing(measured):
         events.height,
     )
     assert len(t) > 10_000
-    plain, other = (compare(e, scene, SENSOR, pixels=PIXELS) for e in (events, flooded))
+    plain, other = (compare(e, SENSOR, scene=scene, pixels=PIXELS) for e in (events, flooded))
     assert other.error == plain.error
     assert other.families == plain.families
     assert other.plain == plain.plain
@@ -194,3 +196,51 @@ def test_a_davis_and_its_frames(shared):
     pixels, events = (float(word) for word in told.replace("%", " ").split() if word[0].isdigit())
     assert 40 < pixels < 80
     assert 5 < events < 40
+
+
+def test_a_recording_its_path_and_its_measurement_give_the_same(recording, measured):
+    path, events = recording
+    opened = dase.open_recording(path)
+    made = measurement_of(opened)
+    assert made.notes == measured.notes
+    np.testing.assert_array_equal(made.scene.frames([0.1, 0.2]), measured.scene.frames([0.1, 0.2]))
+    found = [dase.compare(what, "ideal", pixels=300) for what in (path, str(path), opened, made, measured)]
+    assert len({one.error for one in found}) == 1
+    assert len({one.notes for one in found}) == 1
+    assert found[0].notes[: len(measured.notes)] == measured.notes
+    told = dase.compare(events, SENSOR, scene=measured.scene, pixels=300)
+    assert told.error == found[0].error
+    assert told.notes == found[0].notes[len(measured.notes) :]
+
+
+def test_the_scene_is_chosen_beside_the_recording(tmp_path, recording, measured):
+    path, events = recording
+    for what in (path, dase.open_recording(path), events, measured):
+        still = as_measurement(what, "static")
+        assert isinstance(still.scene, VideoScene)
+        assert still.trust is None
+        assert as_measurement(what, measured.scene).scene is measured.scene
+    assert as_measurement(measured) is measured
+    assert as_measurement(measured, trust=everywhere).trust is everywhere
+    with pytest.raises(dase.InputError, match="events do not say what the camera saw") as refused:
+        dase.fit(events, "ideal")
+    assert refused.value.argument == "scene"
+    with pytest.raises(dase.InputError, match="has no frames to take the scene from"):
+        measurement_of(Sequence(events))
+    with pytest.raises(TypeError, match="expected a recording"):
+        dase.diagnose(measured.scene, SENSOR)
+    with pytest.raises(TypeError, match="sensor: expected"):
+        dase.compare(events, measured.scene)
+
+
+def test_masked_pixels_take_part_in_nothing(recording):
+    opened = dase.open_recording(recording[0])
+    mask = np.ones((96, 128), bool)
+    mask[:, :40] = False
+    for scene in ("frames", "static"):
+        found = measurement_of(opened.masked(mask), scene)
+        pixels = np.arange(96 * 128, dtype=np.int32)
+        assert isinstance(found, Measurement)
+        trusted = found.trust(np.array([0.1, 0.3]), pixels)
+        assert not trusted[:, ~mask.reshape(-1)].any()
+        assert trusted[:, mask.reshape(-1)].any()

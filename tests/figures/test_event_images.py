@@ -17,6 +17,7 @@ from dase.events import Events
 from dase.figures import event_images
 from dase.io.sequence import Sequence
 from dase.recordings import summary
+from dase.recordings.statistics import sequence_statistics
 
 
 def stream(rows, width, height):
@@ -44,7 +45,7 @@ BY_HAND = [(0.0, 0, 0, 1), (0.1, 2, 1, 0), (0.4, 0, 0, 1), (0.5, 0, 0, 0), (1.1,
 
 
 def test_statistics_by_hand():
-    got = event_images.statistics(Sequence(stream(BY_HAND, 3, 2)))
+    got = sequence_statistics(Sequence(stream(BY_HAND, 3, 2)))
     between = sorted(event_images.pixel_intervals(stream(BY_HAND, 3, 2)))
     np.testing.assert_allclose(between, [0.1, 0.4, 1.0])
     assert (got.width, got.height, got.frames, got.events) == (3, 2, 0, 6)
@@ -69,16 +70,13 @@ def test_intervals_equal_a_loop_over_pixels(rng):
 
 def test_frames_lengthen_the_duration():
     frames = np.zeros((2, 2, 3), np.uint8)
-    assert (
-        event_images.statistics(Sequence(stream(BY_HAND, 3, 2), frames, np.array([-1.0, 3.0]))).duration
-        == 4.0
-    )
+    assert sequence_statistics(Sequence(stream(BY_HAND, 3, 2), frames, np.array([-1.0, 3.0]))).duration == 4.0
 
 
 def test_nothing_to_count():
     for events in (Events.empty(3, 2), stream(BY_HAND[:1], 3, 2)):
         sequence = Sequence(events)
-        got = event_images.statistics(sequence)
+        got = sequence_statistics(sequence)
         assert math.isnan(got.interval_median)
         assert got.silent_pixels == 6 - len(events)
         assert dict(summary.statistics_table(got))["interval, median"] == "unknown"
@@ -131,17 +129,21 @@ def test_panel_loses_no_event_when_it_shrinks(rng):
         assert (small[y // 4, x // 4] != 255).any()
 
 
+def assert_nothing_overlaps(figure):
+    boxes = [axes.get_tightbbox() for axes in figure.axes]
+    for k, one in enumerate(boxes):
+        assert not any(one.overlaps(other) for other in boxes[k + 1 :])
+        assert figure.bbox.containsx(one.x0)
+        assert figure.bbox.containsx(one.x1)
+
+
 @pytest.mark.parametrize("frames", [0, 1, 5])
 def test_sheet(tmp_path, rng, frames):
     sequence = random_sequence(rng, frames=frames)
     figure = event_images.draw_sequence(sequence, title="a")
     pictures = [axes for axes in figure.axes if axes.images]
     assert len(pictures) == (min(frames, 6) or 6)
-    boxes = [axes.get_tightbbox() for axes in figure.axes]
-    for k, one in enumerate(boxes):
-        assert not any(one.overlaps(other) for other in boxes[k + 1 :])
-        assert figure.bbox.containsx(one.x0)
-        assert figure.bbox.containsx(one.x1)
+    assert_nothing_overlaps(figure)
     figure.savefig(tmp_path / "a.png")
     assert 20_000 < (tmp_path / "a.png").stat().st_size < 3_000_000
     assert cv2.imread(str(tmp_path / "a.png")).shape[1] == 1650
@@ -149,7 +151,13 @@ def test_sheet(tmp_path, rng, frames):
 
 @pytest.mark.parametrize(("width", "height"), [(20, 90), (200, 20), (1, 1)])
 def test_sheet_of_odd_sensors(rng, width, height):
-    event_images.draw_sequence(random_sequence(rng, width=width, height=height)).canvas.draw()
+    figure = event_images.draw_sequence(random_sequence(rng, width=width, height=height))
+    figure.canvas.draw()
+    assert_nothing_overlaps(figure)
+    for picture in (axes for axes in figure.axes if axes.images):
+        box = picture.get_window_extent()
+        assert box.height / box.width == pytest.approx(height / width, rel=0.01)  # pixels are square
+        assert min(box.width, box.height) > 20  # and can be seen
 
 
 def test_sheet_of_one_moment_and_of_frames_without_times(rng):
@@ -193,7 +201,7 @@ def test_every_event_is_in_one_picture_of_the_video(rng):
 
 
 def test_command(tmp_path, rng):
-    command = importlib.import_module("dase.cli.show").command
+    command = importlib.import_module("dase.cli.show").show_command
     io.write(tmp_path / "a.h5", random_sequence(rng))
     done = CliRunner().invoke(command, [str(tmp_path / "a.h5")])
     assert done.exit_code == 0, done.output
@@ -212,11 +220,11 @@ def test_command(tmp_path, rng):
 def test_ten_million_events_take_seconds(rng):
     sequence = random_sequence(rng, 10_000_000, frames=0, width=640, height=480, end=10.0)
     begin = time.perf_counter()
-    event_images.statistics(sequence)
+    sequence_statistics(sequence)
     assert time.perf_counter() - begin < 10.0
 
 
 def test_shared_recording(shared):
-    got = event_images.statistics(io.read(shared / "recordings" / "dvx_noise_static.npz"))
+    got = sequence_statistics(io.read(shared / "recordings" / "dvx_noise_static.npz"))
     assert 0.2 < got.on_rate + got.off_rate < 1.0
     assert got.busiest_rate > 1000.0  # its stuck pixel

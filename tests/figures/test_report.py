@@ -12,13 +12,13 @@ from html.parser import HTMLParser
 import cv2
 import numpy as np
 import pytest
-from test_commands import dase, one_sentence
+from helpers.command_line import dase, one_sentence
 
 from dase import Events, InputError, Sensor, VideoScene, io, simulate
 from dase.effects import EFFECTS
 from dase.figures import diagnosis_figures, event_maps, report
 from dase.figures.plot import plot
-from dase.figures.style import OFF, ON, colour_of, format_number
+from dase.figures.style import Colour, colour_of, format_number
 from dase.results import Cell, Comparison, Curve, Diagnosis, Estimate, Fit, Rank, Step, Unexplained
 
 CELLS = tuple(
@@ -253,9 +253,9 @@ def test_staircase_says_where_it_ends():
 
 
 def test_colours_belong_to_polarities():
-    assert colour_of("ON events, dark") == ON
-    assert colour_of("OFF after OFF") == OFF
-    assert colour_of("ON after OFF") == colour_of("lag of Onset") not in (ON, OFF)
+    assert colour_of("ON events, dark") == Colour.ON
+    assert colour_of("OFF after OFF") == Colour.OFF
+    assert colour_of("ON after OFF") == colour_of("lag of Onset") not in (Colour.ON, Colour.OFF)
 
 
 @pytest.mark.parametrize(
@@ -294,7 +294,7 @@ def test_spectra_show_a_rhythm(rng):
         zero = np.zeros(len(times), np.uint16)
         return Events(times, zero, zero, np.ones(len(times), np.bool_), 4, 4)
 
-    plate = event_maps.draw_spectra(events(t), events(even), (0.0, 2.0))
+    (plate,) = event_maps.draw_spectra(events(t), events(even), (0.0, 2.0))
     simulated, measured = (line.get_xydata() for line in plate.figure.axes[0].get_lines()[:2])
     assert abs(measured[measured[:, 1].argmax(), 0] - 100) < 4
     assert measured[:, 1].max() > 30

@@ -27,8 +27,8 @@ def test_a_panel_shows_events_doubt_and_the_unknown(seen):
     scene, events, *_ = seen
     time = 0.5 * (scene.times[1] + scene.times[2])
     picture = trust_figure.trust_picture(scene, events, time, 0.005).astype(float)
-    assert picture.shape == (72 * trust_figure.DOTS, 96 * trust_figure.DOTS, 3)
-    pixels = picture[1 :: trust_figure.DOTS, 1 :: trust_figure.DOTS]
+    assert picture.shape == (72 * 3, 96 * 3, 3)
+    pixels = picture[1::3, 1::3]
     counts = events.counts([time - 0.0025, time + 0.0025])[0]
     on, off = (counts[1] > 0) & (counts[0] == 0), (counts[0] > 0) & (counts[1] == 0)
     assert min(on.sum(), off.sum()) > 20
@@ -39,9 +39,7 @@ def test_a_panel_shows_events_doubt_and_the_unknown(seen):
     limit = scene.limit(1)
     assert yellow[silent & (doubt > 2 * limit) & (doubt < 5)].mean() > 30
     assert np.abs(yellow[silent & (doubt < 0.1 * limit)]).mean() < 3
-    hatched = picture[
-        6 * trust_figure.DOTS : 11 * trust_figure.DOTS, 6 * trust_figure.DOTS : 11 * trust_figure.DOTS, 0
-    ]
+    hatched = picture[6 * 3 : 11 * 3, 6 * 3 : 11 * 3, 0]
     assert len(np.unique(hatched)) >= 2  # lines over the white that is saturated
 
 

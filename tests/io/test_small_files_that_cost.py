@@ -15,8 +15,8 @@ from helpers import sample_files as reference_io
 import dase
 from dase import io
 from dase.cli import dase_group
-from dase.diagnosis.measurement import open_clip
 from dase.errors import InputError
+from dase.fitting.measurement import open_clip
 from dase.text_files import parse_json, parse_toml, read_text_file
 
 

@@ -113,7 +113,7 @@ def test_naive_banks_differentiate_the_same_loss(bank, batch, kind, monkeypatch)
 
 
 def test_a_step_is_adams_and_leaves_other_critics_alone(bank, batch):
-    before = {name: getattr(bank, name).clone() for name in bank.names()}
+    before = {name: getattr(bank, name).clone() for name in bank.parameter_names()}
     critics = networks(bank)
     optimizers = [torch.optim.Adam(c.parameters(), lr=1e-3, betas=(0.0, 0.9)) for c in critics]
     generator = torch.Generator().manual_seed(7)
@@ -182,7 +182,7 @@ def test_moving_by_outer_products(device, dtype):
 
 def test_grouped_products_and_order(rng):
     classes = torch.from_numpy(rng.integers(0, 4, 20))
-    by = SortedRows.by(classes, 3)  # class 3 is none
+    by = SortedRows.of_classes(classes, 3)  # class 3 is none
     assert torch.equal(by.end, torch.bincount(classes, minlength=4)[:3].cumsum(0).int())
     rows, weights = torch.randn(20, 8), torch.randn(3, 8, 4)
     got = multiply_groups(rows[by.order], weights, by.end)

@@ -15,7 +15,7 @@ torch = pytest.importorskip("torch")
 pytest.importorskip("safetensors")
 
 from dase.learning import distributed
-from dase.learning.adversarial import AdversarialObjective, PatchHash
+from dase.learning.adversarial import AdversarialObjective, AdversarialSettings, PatchHash
 from dase.learning.moment_matching import Moments
 from dase.learning.scene_batches import Scenery, SceneSettings, middle_intensity
 from dase.learning.targets import Pairs, draw_noise, simulate_counts
@@ -48,7 +48,10 @@ def batches() -> tuple[Pairs, Pairs]:
 
 def objectives() -> dict:
     how = PatchHash(size=16, orientations=4, coherence=1)
-    return {"moments": Moments(device="cpu"), "critics": AdversarialObjective(how, device="cpu", seed=3)}
+    return {
+        "moments": Moments(device="cpu"),
+        "critics": AdversarialObjective(AdversarialSettings(hash=how), device="cpu", seed=3),
+    }
 
 
 def part(pairs: Pairs, some: slice) -> Pairs:
@@ -98,6 +101,7 @@ def test_two_processes_do_what_one_does_with_all_scenes(tmp_path):
             assert float((found[name] - value).abs().max()) <= 2e-4 * size + 1e-9, name
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("objective", ["moments", "wgan"])
 def test_the_command_on_two_processes(objective, tmp_path):
     out = tmp_path / "run"

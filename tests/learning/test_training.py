@@ -9,28 +9,43 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from helpers.tiny_training import SIDE, a_fake, a_run, small_scenes
 
 from dase.kernels import autograd_training as bridge
 from dase.learning import patch_hash, scene_batches
 from dase.learning.adabelief import AdaBelief
-from dase.learning.adversarial import AdversarialObjective, PatchHash, PatchHasher, critic_maps, cut_patches
+from dase.learning.adversarial import (
+    AdversarialObjective,
+    AdversarialSettings,
+    PatchHash,
+    PatchHasher,
+    critic_maps,
+    cut_patches,
+)
 from dase.learning.baselines import RandomThresholds, constant_thresholds, match_event_rate
 from dase.learning.evaluation import HeldOutScore
 from dase.learning.gauss_newton import GaussNewton
-from dase.learning.moment_matching import Moments, add_neighbour_features, single_pixel_features
+from dase.learning.moment_matching import (
+    CellMoments,
+    MomentWeighting,
+    add_neighbour_features,
+    single_pixel_features,
+)
+from dase.learning.moment_objective import MomentObjective
+from dase.learning.recipe import Recipe
 from dase.learning.targets import (
     TRUTHS,
     EndlessTarget,
     FiniteTarget,
     Pairs,
-    answers,
     draw_noise,
     flip_pairs,
     record_pairs,
     simulate_counts,
+    vary_parameters,
     vary_thresholds,
 )
-from dase.learning.training import Recipe, Training, threshold_prior
+from dase.learning.training import threshold_prior
 from dase.networks.threshold_network import (
     NetworkShape,
     ThresholdMaps,
@@ -38,31 +53,13 @@ from dase.networks.threshold_network import (
     edge_strength,
     interpolate_table,
 )
-from dase.scenes import image_sources
 from dase.scenes.image_sources import Picture
 from dase.scenes.layers import Layer, LayerScene, Motion
-
-SIDE = 48
-TINY = NetworkShape(channels=4, depth=1)
-
-
-def small_scenes() -> scene_batches.Scenery:
-    looks = scene_batches.SceneSettings(width=SIDE, height=SIDE, samples=6, regime="variety")
-    return scene_batches.Scenery(image_sources.open_images("builtin"), looks, backgrounds=6, objects=8)
 
 
 @pytest.fixture(scope="module")
 def scenes() -> scene_batches.Scenery:
     return small_scenes()
-
-
-def a_run(scenes: scene_batches.Scenery, **changes) -> Training:
-    recipe = Recipe(objective="moments", steps=40, warmup=6, batch=4, ramp=5, network=TINY, rate=1e-4)
-    target = EndlessTarget(scenes, TRUTHS["uniform"](), seed=9)
-    return Training(replace(recipe, **changes), target, scenes)
-
-
-WGAN = dict(objective="wgan", anchor=5.0, hash=PatchHash(size=16, orientations=2, coherence=1, contrast=2))
 
 
 def test_batches_show_what_layer_scenes_show(scenes):
@@ -136,12 +133,11 @@ def test_critics_see_logarithms_of_counts_and_gradients():
 
 
 def test_weights_of_classes_are_those_of_eq_13():
-    objective = AdversarialObjective(
-        PatchHash(size=8, orientations=4, coherence=1, contrast=1), device="cpu", uniform=0.5
-    )
+    how = PatchHash(size=8, orientations=4, coherence=1, contrast=1)
+    objective = AdversarialObjective(AdversarialSettings(hash=how, uniform=0.5), device="cpu")
     objective.seen = torch.tensor([6.0, 2.0, 0.0, 0.0])
     assert objective.weights().tolist() == pytest.approx([0.5, 0.25, 0.125, 0.125])
-    objective.uniform = 1.0
+    objective.settings = replace(objective.settings, uniform=1.0)
     assert objective.weights().tolist() == pytest.approx([0.25] * 4)
 
 
@@ -205,30 +201,25 @@ def test_counts_answer_as_central_differences_say(scenes, rng):
     torch.testing.assert_close(slope, want, rtol=2e-2, atol=1e-3)
 
 
-def a_fake(training):
-    log = training.scenery.draw(training.scenes, training.recipe.batch)
-    return training.simulate_fake(log, training.step)[0]
-
-
 def test_newton_knows_how_moments_move(scenes):
     training = a_run(scenes, network=NetworkShape(channels=4, depth=1, split=True), mu=0.2, sigma=0.05)
     training.calibrate()
-    assert isinstance(training.objective, Moments)
-    assert training.newton is not None
-    training.newton.see(a_fake(training))
-    jacobian = training.newton._jacobian()
+    assert isinstance(training.objective, MomentObjective)
+    training.objective.newton.add_answers(a_fake(training))
+    jacobian = training.objective.newton._jacobian()
+    moments = training.objective.moments
     log, noise = scenes.draw(np.random.default_rng(1), 4), None
     noise = draw_noise(log, torch.Generator().manual_seed(1))
     grey, even = scene_batches.middle_intensity(log), torch.full((4, 2, SIDE, SIDE), 0.2)
     other = Pairs(grey, simulate_counts(log, even, 0.25 * even, noise))
-    other.answers = answers(log, even, 0.25 * even, noise)
-    newton = GaussNewton(training.objective, training.net)
-    newton.see(other)
+    other.answers = vary_parameters(log, even, 0.25 * even, noise)
+    newton = GaussNewton(moments, training.net)
+    newton.add_answers(other)
     means = []
     for ratio in (1.04, 1 / 1.04):
         factor = torch.tensor([ratio**-0.5, ratio**0.5]).view(1, 2, 1, 1)
         counts = simulate_counts(log, even * factor, 0.25 * even * factor, noise)
-        sums, number = training.objective.sums(Pairs(grey, counts))["look"]
+        sums, number = moments.cell_sums(Pairs(grey, counts))["look"]
         means.append(sums.sum(0) / number.sum(0).clamp_min(1)[:, None])
     slope = ((means[0] - means[1]) / (2 * math.log(1.04))).flatten().double()
     got = newton._jacobian()[:, 2]
@@ -238,8 +229,6 @@ def test_newton_knows_how_moments_move(scenes):
 
 
 def test_weights_of_moments_invert_their_covariance(rng):
-    from dase.learning.moment_matching import RIDGE, UNSURE, CellMoments
-
     cells = CellMoments(2, 3, device=torch.device("cpu"), memory=0.9, joint=True)
     scenes_, pixels = 4000, torch.tensor([10.0, 20.0])
     root = torch.from_numpy(rng.normal(size=(6, 6)))
@@ -247,7 +236,8 @@ def test_weights_of_moments_invert_their_covariance(rng):
     cells.add_reference(values.view(-1, 2, 3) * pixels.view(1, 2, 1), pixels.expand(scenes_, 2))
     cells.weigh()
     covariance = root.T @ root
-    loaded = covariance + torch.diag((RIDGE + UNSURE * 6 / scenes_) * covariance.diagonal())
+    how = MomentWeighting()
+    loaded = covariance + torch.diag((how.ridge + how.scarce_ridge * 6 / scenes_) * covariance.diagonal())
     want = torch.linalg.inv(loaded) / 6
     torch.testing.assert_close(
         cells.kept["weight"][0].double(), want, rtol=0.2, atol=0.02 * float(want.max())
@@ -309,6 +299,8 @@ def test_baselines(scenes):
 
 
 def test_recipes_survive_their_text():
-    recipe = Recipe(hash=PatchHash(size=8), network=NetworkShape(table=(6, 5), pattern=(3, 4)), cells=(2, 3))
+    network = NetworkShape(table=(6, 5), pattern=(3, 4))
+    recipe = Recipe.from_names(hash=PatchHash(size=8), network=network, cells=(2, 3), steps=7)
+    assert (recipe.adversarial.hash.size, recipe.moments.cells, recipe.steps) == (8, (2, 3), 7)
     assert Recipe.parse(recipe.text()) == recipe
     assert json.loads(recipe.text())["network"]["table"] == [6, 5]

@@ -3,16 +3,17 @@
 from __future__ import annotations
 
 import re
+from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
-from test_training import SIDE, WGAN, a_fake, a_run, small_scenes
+from helpers.tiny_training import CRITICS, SIDE, WGAN, a_fake, a_run, small_scenes
 
 from dase.errors import InputError
-from dase.learning import cuda_graph, scene_batches
+from dase.learning import scene_batches
 from dase.learning.evaluation import MapEvaluation
-from dase.learning.run import CHECKPOINT, LOG, RunSchedule, TrainingDiverged, load, train_in_folder
+from dase.learning.run import CHECKPOINT, LOG, RunSchedule, TrainingDiverged, load_checkpoint, train_in_folder
 from dase.learning.targets import Pairs
 from dase.networks.threshold_network import NetworkShape
 from dase.scenes import image_sources
@@ -58,7 +59,7 @@ def test_rates_rise_and_fall_within_the_steps_there_are(scenes):
         training = a_run(scenes, steps=steps, ramp=ramp)
         shares = []
         for training.step in range(steps):
-            shares.append(training.rate())
+            shares.append(training.learning_share())
         top = int(np.argmax(shares))
         assert top == min(ramp, max(steps // 4, 1)) - 1
         assert shares[top] == 1
@@ -92,7 +93,7 @@ KINDS = {
     "moments": dict(network=NetworkShape(channels=4, depth=1, split=True, table=(3, 3))),
     "patterns": dict(network=NetworkShape(channels=4, depth=1, pattern=(SIDE, SIDE))),
     "adabelief": dict(optimizer="adabelief"),
-    "critics": dict(WGAN, critic_cosine=True, batch=6),
+    "critics": dict(WGAN, adversarial=replace(CRITICS, critic_cosine=True), batch=6),
 }
 
 
@@ -116,15 +117,15 @@ def test_steps_leave_everything_where_it_was(scenes, kind):
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_replayed_steps_are_the_same_steps(scenes, device, kind, monkeypatch):
+def test_replayed_steps_are_the_same_steps(scenes, device, kind):
     if device == "cpu":
         pytest.skip("steps are replayed on a GPU only; --device cuda:0 asks for one")
     source = image_sources.open_images("builtin")
     there = scene_batches.Scenery(source, scenes.scene_settings, device=device, backgrounds=6, objects=8)
     ends = []
     for seen in (10**9, 3):
-        monkeypatch.setattr(cuda_graph, "SEEN", seen)
         training = a_run(there, **KINDS[kind], steps=60, warmup=8)
+        training.replay.plain_runs = seen
         for _ in range(40):
             values = training.advance()
         assert bool(training.replay.recorded) == (seen == 3)
@@ -153,26 +154,26 @@ def same(one, other) -> bool:
     [
         {"network": NetworkShape(channels=4, depth=1, table=(3, 2), split=True, pattern=(SIDE, SIDE))},
         WGAN,
-        {**WGAN, "optimizer": "adabelief", "critic_image": True},
+        {**WGAN, "optimizer": "adabelief", "adversarial": replace(CRITICS, critic_image=True)},
     ],
     ids=["moments", "wgan", "adabelief"],
 )
 def test_a_resumed_run_ends_bit_equal(scenes, tmp_path, changes):
-    recipe = {**changes, "steps": 8, "warmup": 2}
+    recipe = {**changes, "steps": 6, "warmup": 2}
     whole, first, second = (a_run(scenes, **recipe) for _ in range(3))
-    pace = RunSchedule(look=2, save=0.0, held_out=0)
-    train_in_folder(whole, tmp_path / "whole", pace=pace)
+    schedule = RunSchedule(log_every=2, save_every=0.0, score_every=0)
+    train_in_folder(whole, tmp_path / "whole", schedule=schedule)
 
     def stop(row: dict[str, float]) -> None:
         if row["step"] == 4:
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        train_in_folder(first, tmp_path / "cut", pace=pace, look=stop)
+        train_in_folder(first, tmp_path / "cut", schedule=schedule, on_row=stop)
     with (tmp_path / "cut" / LOG).open("a") as file:
         file.write("1")  # of a line that was being written when the run was killed
-    train_in_folder(second, tmp_path / "cut", pace=pace, resume=True)
-    states = [load(tmp_path / name / CHECKPOINT, "cpu") for name in ("whole", "cut")]
+    train_in_folder(second, tmp_path / "cut", schedule=schedule, resume=True)
+    states = [load_checkpoint(tmp_path / name / CHECKPOINT, "cpu") for name in ("whole", "cut")]
     for state in states:
         del state["seconds"]
     assert same(*states)
@@ -187,16 +188,18 @@ def test_nan_stops_with_its_step_and_the_last_good_checkpoint(scenes, tmp_path):
     training = a_run(scenes, steps=30, warmup=1)
     plain = training.objective.loss
 
-    def poisoned(fake: Pairs, real: Pairs, *, move: bool):
-        loss, values = plain(fake, real, move=move)
-        return (loss * float("nan") if training.step == 7 else loss), values
+    def poisoned(fake: Pairs, real: Pairs, *, move: bool, rates: torch.Tensor):
+        loss, values = plain(fake, real, move=move, rates=rates)
+        return (loss * float("nan") if training.step == 3 else loss), values
 
     training.objective.loss = poisoned
     with pytest.raises(
-        TrainingDiverged, match=r"broke at step 7: .* is not finite; the last good checkpoint is .*pt"
+        TrainingDiverged, match=r"broke at step 3: .* is not finite; the last good checkpoint is .*pt"
     ):
-        train_in_folder(training, tmp_path / "run", pace=RunSchedule(look=5, save=0.0, held_out=0))
-    assert load(tmp_path / "run" / CHECKPOINT, "cpu")["step"] == 5
+        train_in_folder(
+            training, tmp_path / "run", schedule=RunSchedule(log_every=2, save_every=0.0, score_every=0)
+        )
+    assert load_checkpoint(tmp_path / "run" / CHECKPOINT, "cpu")["step"] == 2
 
 
 def test_a_folder_is_not_begun_twice(scenes, tmp_path):

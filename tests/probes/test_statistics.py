@@ -12,13 +12,13 @@ import pytest
 import dase
 from dase.diagnosis.explain_effect import moving_bars
 from dase.effects import EFFECTS, StreamEffect
-from dase.fitting import descent
-from dase.fitting.batch_simulator import CLASS_TIMES, LAG_TIMES, SimulationOrder
+from dase.fitting.batch_simulator import SimulationOrder
 from dase.fitting.data_split import split_measurement
+from dase.fitting.descent import DESCENT
 from dase.fitting.model import model_of
 from dase.fitting.scheduler import answer_requests, run_side_by_side, run_work
 from dase.kernels import event_probes as kernels
-from dase.probes.accumulators import GROUP, SEEN, compute_totals, leave_groups_out
+from dase.probes.accumulators import GROUP, PROBE_TIMES, compute_totals, leave_groups_out
 from dase.probes.statistics import FAMILIES, LAYOUT, compute_statistics, refine_frequency
 from dase.probes.timestamp_patterns import TimestampStructure, find_structure
 from dase.simulation.sensor import Sensor
@@ -48,10 +48,10 @@ def evidence(events, scene, device):
 
 
 def reference(events, stimulus, middle) -> np.ndarray:
-    """Add up what `observe` adds up, event by event."""
-    step, out = stimulus.grid.step, np.zeros(kernels.SIZE)
-    lags = np.rint(np.array(LAG_TIMES) / step).astype(int)
-    ends = np.rint(np.array(CLASS_TIMES) / step).astype(int)
+    """Add up what `observe_event` adds up, event by event."""
+    step, out = stimulus.grid.step, np.zeros(kernels.SumPlace.SIZE)
+    lags = np.rint(np.array(PROBE_TIMES.lags) / step).astype(int)
+    ends = np.rint(np.array(PROBE_TIMES.classes) / step).astype(int)
     level, last = stimulus.level, stimulus.grid.steps - 1
     for i, pixel in enumerate(stimulus.pixels):
         mine = events.select(events.y.astype(int) * events.width + events.x == pixel)
@@ -64,27 +64,35 @@ def reference(events, stimulus, middle) -> np.ndarray:
             cell, apart = int(stimulus.cell[i, k]), None
             if cell != kernels.MASKED:
                 kind, band = divmod(cell, kernels.BANDS)
-                out[kernels.RATE + p * kernels.CELLS + cell] += 1
+                out[kernels.SumPlace.RATE + p * kernels.CELLS + cell] += 1
                 if kind >= kernels.RESTING:
                     seen = level[i, np.clip(k - lags, 0, last)]
-                    out[kernels.LAG + np.arange(kernels.LAGS) * kernels.BANDS + band] += (
+                    out[kernels.SumPlace.LAG + np.arange(kernels.LAGS) * kernels.BANDS + band] += (
                         2 * p - 1
                     ) * -np.diff(seen)
-                    out[kernels.LAG_COUNT + band] += 1
+                    out[kernels.SumPlace.LAG_COUNT + band] += 1
                 broken = stimulus.holes and (stimulus.cell[i, before:k] == kernels.MASKED).any()
                 if before >= 0 and not broken:
                     gap = k - before
                     octave = 0 if gap == 0 else min(int(np.ceil(np.log2(gap))) + 1, kernels.INTERVALS - 1)
                     kin = p if p == polarity else 2
-                    out[kernels.ISI + (3 * (kind < kernels.RESTING) + kin) * kernels.INTERVALS + octave] += 1
+                    out[
+                        kernels.SumPlace.ISI
+                        + (3 * (kind < kernels.RESTING) + kin) * kernels.INTERVALS
+                        + octave
+                    ] += 1
                     group = int(gap > ends[0]) + int(gap > ends[1])
                     pair = (2 * p + polarity) * kernels.CLASSES + group
                     change = (2 * p - 1) * (level[i, k] - level[i, before])
                     apart = np.clip(change - middle[pair], -1, 1)
-                    out[kernels.CHANGE + 3 * pair + np.arange(3)] += 1, change, abs(change - middle[pair])
+                    out[kernels.SumPlace.CHANGE + 3 * pair + np.arange(3)] += (
+                        1,
+                        change,
+                        abs(change - middle[pair]),
+                    )
                     if deviation is not None:
-                        out[kernels.SERIAL + 2 * group + np.arange(2)] += 1, apart * deviation
-                out[kernels.REPEAT + 3 * band + np.arange(min(run, 3))] += 1
+                        out[kernels.SumPlace.SERIAL + 2 * group + np.arange(2)] += 1, apart * deviation
+                out[kernels.SumPlace.REPEAT + 3 * band + np.arange(min(run, 3))] += 1
             before, polarity, deviation = k, p, apart
     return out
 
@@ -109,7 +117,7 @@ def test_no_pair_of_events_reaches_across_what_is_not_compared(scene, device):
     want = reference(events, stimulus, half.trials.middle)
     np.testing.assert_allclose(half.found.sums[0], want, rtol=2e-4, atol=2e-3)
     across = reference(events, replace(stimulus, holes=False), half.trials.middle)
-    isi = slice(kernels.ISI, kernels.LAG)
+    isi = slice(kernels.SumPlace.ISI, kernels.SumPlace.LAG)
     assert want[isi].sum() < across[isi].sum() - 500
 
 
@@ -214,7 +222,7 @@ def test_a_clock_is_the_same_inside_the_kernel(evidence):
     ticks = trials.ticks(sensor)
     assert ticks == clock.step
     got, free = trials.run_all([SimulationOrder(sensor, vector, 9, finer=1, ticks=t) for t in (ticks, 0.0)])
-    want = trials.stream(sensor, vector, sensor.streams(), seed=9)
+    want = trials.stream(sensor, vector, sensor.readout_effects(), seed=9)
     many = want.clock.sum()
     assert np.abs(got.clock - want.clock).sum() < 1e-2 * many < 0.5 * np.abs(free.clock - want.clock).sum()
     np.testing.assert_allclose(got.stamps, want.stamps, atol=1e-2)
@@ -235,7 +243,7 @@ def test_counts_fold_as_plain_loops_would(evidence, rng):
     own = (d**2).sum((0, 2))
     np.testing.assert_allclose(got[:12], np.concatenate([products, own], 1).ravel(), rtol=1e-4, atol=1e-2)
     rings = [counts[frame.zone == z].reshape(-1, 2, 2, 2).sum((0, 2)) for z in range(kernels.ZONES)]
-    np.testing.assert_array_equal(got[kernels.RINGS :], np.stack(rings, -1).ravel())
+    np.testing.assert_array_equal(got[kernels.FoldPlace.RINGS :], np.stack(rings, -1).ravel())
     left = leave_groups_out(half.found, frame)
     keep = np.arange(len(expected)) >= GROUP
     d = d[keep]
@@ -257,25 +265,24 @@ def kept(work, seen):
         return stop.value
 
 
-def test_searches_side_by_side_end_where_each_ends_alone(evidence, monkeypatch):
-    half = evidence.scout.view()
+def test_searches_side_by_side_end_where_each_ends_alone(evidence):
     models = [
         model_of(Sensor().with_effect(EFFECTS[name](**ON[name]))) for name in ("leak", "shot", "linlog")
     ]
-    models[0].rebase(half, repeats=6, seed=1)
+    half = models[0].calibrate(evidence.scout, repeats=6, seed=1)
     seen = [[] for _ in models]
     for model, each in zip(models, seen, strict=True):
-        run_work(kept(model.searching(half, seed=3, iterations=1), each))
+        run_work(kept(model.search_work(half, seed=3, iterations=1), each))
     assert max(map(len, seen)) > 5
     # beside the first populations of all, every population has the answers it has alone
     first = [each[0][0] for each in seen]
     for ask, want in (pair for each in seen for pair in each):
         np.testing.assert_allclose(answer_requests([*first, ask])[-1], want, rtol=1e-6, atol=1e-7)
     # the end can be compared after one: a place off by 1e-9 counts an event more or less in the next ones
-    monkeypatch.setattr(descent, "LONGEST", 1)
-    ends = run_side_by_side([m.searching(half, seed=3, iterations=1) for m in models])
+    once = replace(DESCENT, longest=1)
+    ends = run_side_by_side([m.search_work(half, seed=3, iterations=1, settings=once) for m in models])
     for found, model in zip(ends, models, strict=True):
-        want = run_work(model.searching(half, seed=3, iterations=1))
+        want = run_work(model.search_work(half, seed=3, iterations=1, settings=once))
         np.testing.assert_allclose(found.place, want.place, atol=1e-5)
         assert found.loss == pytest.approx(want.loss, rel=1e-4)
 
@@ -284,8 +291,8 @@ def test_silent_pixels_are_counted(evidence, events):
     """A pixel is silent if it sends nothing where at least six events are expected."""
     half = evidence.train
     expected = half.found.halves[0].astype(float)  # as if the model were exact
-    busy = np.flatnonzero(expected.sum(1) >= SEEN)[:7]
-    few = np.flatnonzero((expected.sum(1) < SEEN) & (expected.sum(1) > 0))[:3]
+    busy = np.flatnonzero(expected.sum(1) >= 6)[:7]
+    few = np.flatnonzero((expected.sum(1) < 6) & (expected.sum(1) > 0))[:3]
     muted = half.trials.stimulus.pixels[np.concatenate([busy, few])]
     place = events.y.astype(int) * events.width + events.x
     found = half.trials.look(events.select(~np.isin(place, muted)))
@@ -346,7 +353,7 @@ def test_a_bus_is_shared_out(evidence):
     trials = evidence.train.trials
     sensor = Sensor().with_effect(EFFECTS["readout"](rate=1e5, mode="drop"))
     free = trials.stream(sensor, sensor.parameters(), (), seed=1).halves.sum()
-    held = trials.stream(sensor, sensor.parameters(), sensor.streams(), seed=1).halves.sum()
+    held = trials.stream(sensor, sensor.parameters(), sensor.readout_effects(), seed=1).halves.sum()
     assert held < 0.95 * free
 
 

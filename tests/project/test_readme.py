@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import ast
+import inspect
 import re
 import shlex
 from pathlib import Path
 
+import dase
 from dase.effects import EFFECTS
 from dase.simulation.sensor_file import parse_sensor
 
@@ -17,7 +20,7 @@ def blocks(language: str) -> list[str]:
 
 
 def test_python():
-    (code,) = blocks("python")
+    code = blocks("python")[0]
     scope: dict = {}
     exec(compile(code, "README.md", "exec"), scope)
     assert len(scope["events"]) > 1000
@@ -25,6 +28,18 @@ def test_python():
     # an event in the first nanosecond of a window may count for the one before
     assert abs(int(scope["counts"].sum()) - len(scope["events"])) <= 2
     assert scope["grid"].shape == (5, 260, 346)
+
+
+def test_the_calls_on_a_recording_fit_their_functions():
+    """Without running them: they would take minutes."""
+    (code,) = (block for block in blocks("python") if "open_recording" in block)
+    calls = [node for node in ast.walk(ast.parse(code)) if isinstance(node, ast.Call)]
+    assert {ast.unparse(call.func) for call in calls} == {
+        f"dase.{name}" for name in ("open_recording", "compare", "fit", "diagnose")
+    }
+    for call in calls:
+        function = getattr(dase, ast.unparse(call.func).removeprefix("dase."))
+        inspect.signature(function).bind(*call.args, **{k.arg: k.value for k in call.keywords if k.arg})
 
 
 def test_sensor():

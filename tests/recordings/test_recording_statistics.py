@@ -15,11 +15,16 @@ from helpers.sample_files import aedat4
 from dase import io
 from dase.events import Events
 from dase.io.sequence import Sequence
-from dase.recordings import interval_statistics, summary
-from dase.recordings import statistics as recording_statistics
+from dase.recordings import summary
 from dase.recordings.anomalies import find_anomalies
-from dase.recordings.interval_statistics import IntervalStatistics
-from dase.recordings.statistics import RecordingSurvey, sequence_statistics, survey_file
+from dase.recordings.interval_statistics import IntervalSettings, IntervalStatistics
+from dase.recordings.statistics import (
+    RecordingSurvey,
+    SurveySettings,
+    sequence_statistics,
+    survey_file,
+    survey_sequence,
+)
 
 
 def some(rng, count=4000, width=20, height=15, duration=2.0):
@@ -41,12 +46,11 @@ def odd(s):
 
 
 @pytest.mark.parametrize("part", [1 << 20, 700, 3])
-def test_statistics_equal_loops_whatever_is_looked_at_together(rng, monkeypatch, part):
-    monkeypatch.setattr(recording_statistics, "PART", part)
+def test_statistics_equal_loops_whatever_is_looked_at_together(rng, part):
     e = some(rng, 1500)
-    looked = RecordingSurvey(e.width, e.height)
+    looked = RecordingSurvey(e.width, e.height, SurveySettings(part=part))
     for i in range(0, len(e), 401):
-        looked.events(e.select(slice(i, i + 401)))
+        looked.add_events(e.select(slice(i, i + 401)))
     got = looked.statistics()
     pixels = by_pixel(e)
     between = np.concatenate([np.diff(t) for t, _ in pixels])
@@ -66,16 +70,16 @@ def test_statistics_equal_loops_whatever_is_looked_at_together(rng, monkeypatch,
     assert got.busiest_rate == pytest.approx(max(len(t) for t, _ in pixels) / got.duration)
 
 
-def test_isolated_events_equal_a_loop(rng, monkeypatch):
-    monkeypatch.setattr(recording_statistics, "SAMPLE", 1 << 20)  # ask all of them
+def test_isolated_events_equal_a_loop(rng):
+    every = SurveySettings(asked=1 << 20)
     e = some(rng, 3000, 40, 30)
-    inner = (e.t >= e.t[0] + recording_statistics.ALONE) & (e.t < e.t[-1] - recording_statistics.ALONE)
+    inner = (e.t >= e.t[0] + every.alone) & (e.t < e.t[-1] - every.alone)
     alone = []
     for t, x, y in zip(e.t[inner], e.x[inner].astype(int), e.y[inner].astype(int), strict=True):
         near = (np.abs(e.x.astype(int) - x) <= 1) & (np.abs(e.y.astype(int) - y) <= 1)
-        near &= (e.t >= t - recording_statistics.ALONE) & (e.t <= t + recording_statistics.ALONE)
+        near &= (e.t >= t - every.alone) & (e.t <= t + every.alone)
         alone.append(near.sum() == 1)
-    got = sequence_statistics(Sequence(e))
+    got = survey_sequence(Sequence(e), every).statistics()
     assert 0.5 < np.mean(alone) < 0.99
     assert got.alone_rate == pytest.approx(np.mean(alone) * 3000 / (40 * 30 * got.duration))
 
@@ -94,8 +98,8 @@ def test_hot_pixels_stand_out_from_those_around_them(rng):
         both = np.concatenate([e.t, extra.t])
         order = np.argsort(both, kind="stable")
         columns = (np.concatenate([getattr(e, k), getattr(extra, k)])[order] for k in "xyp")
-        looked = recording_statistics.survey_sequence(Sequence(Events(both[order], *columns, 40, 30)))
-        assert np.argwhere(looked.hot()).tolist() == ([[y, x]] if found else [])
+        looked = survey_sequence(Sequence(Events(both[order], *columns, 40, 30)))
+        assert np.argwhere(looked.hot_pixels()).tolist() == ([[y, x]] if found else [])
         got = looked.statistics()
         assert got.hot_pixels == found
         assert ("hot" in odd(got)) == found
@@ -104,10 +108,9 @@ def test_hot_pixels_stand_out_from_those_around_them(rng):
             assert got.busiest_pixel == (x, y)
 
 
-def test_quantiles_of_many_intervals_are_good_to_a_percent(rng, monkeypatch):
-    monkeypatch.setattr(interval_statistics, "EXACT", 100)
+def test_quantiles_of_many_intervals_are_good_to_a_percent(rng):
     seconds = np.concatenate([np.exp(rng.normal(-5, 2, 50_000)), np.zeros(100)])
-    got = IntervalStatistics()
+    got = IntervalStatistics(IntervalSettings(exact=100))
     for part in np.split(rng.permutation(seconds), 10):
         got.add(part)
     assert got.quantile(0.001) == 0.0
@@ -218,7 +221,7 @@ def test_memory_does_not_grow_with_the_recording(rng):
 
     def take(count):
         for _ in range(count):
-            looked.events(replace(e, t=e.t + looked._span[1] if math.isfinite(looked._span[1]) else e.t))
+            looked.add_events(replace(e, t=e.t + looked._span[1] if math.isfinite(looked._span[1]) else e.t))
 
     take(12)  # as many as are kept exactly
     tracemalloc.start()
@@ -234,7 +237,7 @@ def test_memory_does_not_grow_with_the_recording(rng):
 def test_info_prints_and_writes_json(tmp_path, rng):
     import importlib
 
-    command = importlib.import_module("dase.cli.info").command
+    command = importlib.import_module("dase.cli.info").info_command
     e = some(rng, 5000, 64, 48)
     (tmp_path / "a.txt").write_text(
         "".join(f"{t:.6f} {x} {y} 1\n" for t, x, y in zip(e.t, e.x, e.y, strict=True))

@@ -9,7 +9,7 @@ from reference.scene_frames import bilinear, blend, film, moving_picture, origin
 
 import dase
 from dase.kernels import launch, scene_frames
-from dase.scenes.between_frames import TOLERANCE
+from dase.scenes.between_frames import TrustSettings
 from dase.scenes.frame_motion import HOPELESS, estimate_stretches
 
 EPS = 1e-3
@@ -124,7 +124,7 @@ def test_between_frames_it_is_near_the_truth_and_says_where_not():
         for out, part in zip((errors, straights, doubts), found, strict=True):
             out.append(part.ravel())
     error, straight, doubt = (np.concatenate(part) for part in (errors, straights, doubts))
-    trusted, bad = doubt <= TOLERANCE, np.abs(error) > 0.25
+    trusted, bad = doubt <= TrustSettings.tolerance, np.abs(error) > 0.25
     recall, share = (bad & ~trusted).sum() / bad.sum(), bad.mean()
     precision = (bad & ~trusted).sum() / (~trusted).sum()
     print(
@@ -182,7 +182,8 @@ def test_saturation_and_what_only_one_frame_shows_are_not_trusted(rng):
     np.testing.assert_array_equal(confidence[0] >= 0.5, scene.doubt([0.02])[0] <= scene.limit(0))
     strict = scene.trusted(relative=0)
     assert (strict <= trusted).all()
-    np.testing.assert_array_equal(strict[0], scene.doubt(np.linspace(0, 0.04 - 1e-9, 9)).max(0) <= TOLERANCE)
+    doubt = scene.doubt(np.linspace(0, 0.04 - 1e-9, 9)).max(0)
+    np.testing.assert_array_equal(strict[0], doubt <= TrustSettings.tolerance)
     pixels = np.array([5 * 80 + 30, 22 * 80 + 33], np.int32)
     at_once = scene.is_trusted(np.array([-0.01, 0.01, 0.05, 0.09]), pixels)
     np.testing.assert_array_equal(at_once, [[0, 0], [1, 0], [1, 0], [0, 0]])

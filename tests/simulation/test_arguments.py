@@ -17,14 +17,20 @@ def scene():
     return dase.VideoScene(np.stack([np.full((4, 6), level, np.float32) for level in (0.1, 0.9)]), [0.0, 0.1])
 
 
+def some_events():
+    t = np.arange(20) * 1e-3
+    x = np.zeros(20, np.uint16)
+    return Events(t, x, x, x > 0, 6, 4)
+
+
 @pytest.mark.parametrize("seed", [-1, 2**31, 1.5, 1.0, True, "1", None, np.int64(-5)])
 def test_a_seed_is_never_taken_modulo(seed):
     for act in (
         lambda: dase.simulate(scene(), SENSOR, seed=seed),
         lambda: dase.count(scene(), SENSOR, [0, 0.1], seed=seed),
-        lambda: dase.compare(Events.empty(6, 4), scene(), SENSOR, seed=seed),
-        lambda: dase.fit(Events.empty(6, 4), scene(), SENSOR, seed=seed),
-        lambda: dase.diagnose(Events.empty(6, 4), scene(), SENSOR, seed=seed),
+        lambda: dase.compare(some_events(), SENSOR, scene=scene(), seed=seed),
+        lambda: dase.fit(some_events(), SENSOR, scene=scene(), seed=seed),
+        lambda: dase.diagnose(some_events(), SENSOR, scene=scene(), seed=seed),
     ):
         with pytest.raises(InputError, match=r"seed must be a whole number in 0\.\."):
             act()

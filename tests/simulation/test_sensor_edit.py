@@ -7,7 +7,7 @@ import datetime
 import cv2
 import numpy as np
 import pytest
-from test_commands import dase, one_sentence
+from helpers.command_line import dase, one_sentence
 
 from dase import InputError, Sensor, VideoScene, dump_sensor, io, load_sensor, simulate
 from dase.diagnosis.sensor_update import round_parameters
@@ -56,20 +56,24 @@ def test_add_then_remove(base, name):
     text = SensorText(MINE if base == "mine" else read_presets()[base], base)
     if name in text.sensor():
         with pytest.raises(InputError, match=f"{base} already has effect '{name}'"):
-            text.added(EFFECTS[name]())
+            text.with_effect(EFFECTS[name]())
         return
     effect = EFFECTS[name]()
-    more = text.added(effect).noted(history_entry_today(f"add {name}"))
+    more = text.with_effect(effect).with_history(history_entry_today(f"add {name}"))
     assert more.sensor() == text.sensor().with_effect(effect)
     assert kept(text.text, more.text)
-    less = more.removed(name)
+    less = more.without_effect(name)
     assert less.sensor() == text.sensor()
     assert kept(text.text, less.text)
     assert f"[{name}]" not in less.text
 
 
 def test_place_and_comments():
-    more = SensorText(MINE, "mine").added(EFFECTS["bandwidth"]()).added(EFFECTS["mismatch"](spread=0.2))
+    more = (
+        SensorText(MINE, "mine")
+        .with_effect(EFFECTS["bandwidth"]())
+        .with_effect(EFFECTS["mismatch"](spread=0.2))
+    )
     lines = [line for line in more.text.splitlines() if line.startswith(("[", "#"))]
     assert [line.split("]")[0].strip("[ ") for line in lines] == [
         "# my camera",
@@ -85,7 +89,7 @@ def test_place_and_comments():
         "# about nothing",
         '"refractory"',
     ]
-    less = SensorText(MINE, "mine").removed("leak")
+    less = SensorText(MINE, "mine").without_effect("leak")
     for gone in ("leak", "of last week"):
         assert gone not in less.text
     assert kept("# ---- noise ----\n# about nothing\n", less.text)
@@ -124,9 +128,9 @@ def test_rounded():
 def test_ends_of_lines_stay(newline):
     text = SensorText(MINE.replace("\n", newline), "mine")
     for new in (
-        text.added(EFFECTS["shot"]()),
-        text.removed("leak"),
-        text.noted(history_entry_today("nothing")),
+        text.with_effect(EFFECTS["shot"]()),
+        text.without_effect("leak"),
+        text.with_history(history_entry_today("nothing")),
     ):
         assert new.text.count("\n") == new.text.count(newline)
 
@@ -141,8 +145,8 @@ def test_history_stays_at_the_end_and_goes_round():
         dase="0.1.0",
         date=datetime.date(2021, 2, 3),
     )
-    text = SensorText(MINE, "mine").added(EFFECTS["shot"]()).noted(entry)
-    text = text.added(EFFECTS["latency"]()).noted(HistoryEntry(did="add latency"))
+    text = SensorText(MINE, "mine").with_effect(EFFECTS["shot"]()).with_history(entry)
+    text = text.with_effect(EFFECTS["latency"]()).with_history(HistoryEntry(did="add latency"))
     assert text.text.index("[latency]") < text.text.index("[[history]]")
     sensor = text.sensor()
     assert sensor.history == (entry, HistoryEntry(did="add latency"))
@@ -179,7 +183,7 @@ def test_wrong_history(history, message):
     ],
 )
 def test_what_cannot_be_edited_is_refused(text):
-    for edit in (lambda t: t.removed("leak"), lambda t: t.added(EFFECTS["mismatch"]())):
+    for edit in (lambda t: t.without_effect("leak"), lambda t: t.with_effect(EFFECTS["mismatch"]())):
         with pytest.raises(InputError, match="write each effect as a table"):
             edit(SensorText(text, "mine"))
 

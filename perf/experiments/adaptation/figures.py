@@ -12,13 +12,12 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from dase.figures import training_figure
-from dase.figures.contact_sheet import INK, QUIET
-from dase.figures.style import OFF, ON
+from dase.figures.style import Colour
 from dase.learning.targets import TRUTHS
 
 Lines = dict[str, dict[str, Any]]
 
-COLOURS = {"moments": ON, "full": OFF}
+COLOURS = {"moments": Colour.ON, "full": Colour.OFF}
 MAPS = {"intensity": "rise with brightness", "edges": "higher at edges", "column": "by column"}
 
 
@@ -53,13 +52,13 @@ def _figure(wide: float, tall: float) -> Figure:
 
 def _quiet(plot: Axes, title: str, x: str, y: str) -> None:
     plot.spines[["top", "right"]].set_visible(False)
-    plot.spines[:].set(color="#bbbbbb", linewidth=0.6)
-    plot.tick_params(colors=INK, labelsize=8, color="#bbbbbb", which="both")
-    plot.set_title(title, fontsize=10, color=INK, loc="left")
-    plot.set_xlabel(x, fontsize=9, color=INK)
-    plot.set_ylabel(y, fontsize=9, color=INK)
+    plot.spines[:].set(color=Colour.LINE, linewidth=0.6)
+    plot.tick_params(colors=Colour.INK, labelsize=8, color=Colour.LINE, which="both")
+    plot.set_title(title, fontsize=10, color=Colour.INK, loc="left")
+    plot.set_xlabel(x, fontsize=9, color=Colour.INK)
+    plot.set_ylabel(y, fontsize=9, color=Colour.INK)
     if plot.get_legend_handles_labels()[0]:
-        plot.legend(fontsize=8, frameon=False, labelcolor=INK)
+        plot.legend(fontsize=8, frameon=False, labelcolor=Colour.INK)
 
 
 def _runs(found: Lines) -> Figure:
@@ -72,15 +71,15 @@ def _runs(found: Lines) -> Figure:
             points = [(s, kl) for s, _, kl, _ in line["curve"] if kl is not None and s > 0]
             label = names[kind] if n == 0 else None
             curves.plot(*zip(*points, strict=True), color=colour, linewidth=1, alpha=0.8, label=label)
-    curves.axhline(1.5, color=QUIET, linewidth=0.8, linestyle=":")
-    curves.text(15, 1.7, "the paper's full model", fontsize=7, color=QUIET)
-    curves.axhline(0.01, color=QUIET, linewidth=0.8, linestyle=":")
+    curves.axhline(1.5, color=Colour.QUIET, linewidth=0.8, linestyle=":")
+    curves.text(15, 1.7, "the paper's full model", fontsize=7, color=Colour.QUIET)
+    curves.axhline(0.01, color=Colour.QUIET, linewidth=0.8, linestyle=":")
     curves.set_yscale("log")
     _quiet(curves, "all seeds, both starts", "seconds, others at the same time", "KL from the truth")
     _densities(densities, found)
     points = sorted((int(n[5:]), line["last"]["kl"]) for n, line in found.items() if n.startswith("fig5-"))
     if points:
-        sizes.plot(*zip(*points, strict=True), "o-", color=OFF, linewidth=1.2, markersize=4)
+        sizes.plot(*zip(*points, strict=True), "o-", color=Colour.OFF, linewidth=1.2, markersize=4)
         sizes.set_yscale("log")
     _quiet(sizes, "sizes of patches (Fig. 5)", "side of a patch [px]", "KL from the truth")
     return figure
@@ -94,11 +93,11 @@ def _densities(plot: Axes, found: Lines) -> None:
 
     plot.fill_between(theta, normal(0.2, 0.05), color="#dddddd", linewidth=0, label="truth")
     shown = {
-        "full-s0": ("critics", OFF, "-"),
-        "moments-s0": ("moments", ON, "-"),
-        "fig3-no-kl": ("critics, no KL term", OFF, "--"),
-        "fig3-literal": ("straight from the network", INK, "-"),
-        "fig3-literal-no-kl": ("the same, no KL term", INK, "--"),
+        "full-s0": ("critics", Colour.OFF, "-"),
+        "moments-s0": ("moments", Colour.ON, "-"),
+        "fig3-no-kl": ("critics, no KL term", Colour.OFF, "--"),
+        "fig3-literal": ("straight from the network", Colour.INK, "-"),
+        "fig3-literal-no-kl": ("the same, no KL term", Colour.INK, "--"),
     }
     for name, (label, colour, style) in shown.items():
         if name in found:
@@ -120,13 +119,13 @@ def _maps(out: Path, names: list[str]) -> Figure:
         want = TRUTHS[name]()(torch.from_numpy(grey))[0].mean(1).numpy()
         if name == "column":
             want, got = want[0, 0], got.mean((0, 1))
-            plot.plot(want, got, ".", color=OFF, markersize=3, label="a column each")
+            plot.plot(want, got, ".", color=Colour.OFF, markersize=3, label="a column each")
             low, high = want.min(), want.max()
         else:
             low, high = np.percentile(want, (0.1, 99.9))
             image, x, y = np.histogram2d(want.ravel(), got.ravel(), 120, [(low, high)] * 2)
             plot.pcolormesh(x, y, np.log1p(image.T), cmap="Blues", rasterized=True)
-        plot.plot((low, high), (low, high), color=ON, linewidth=0.8, label="right")
+        plot.plot((low, high), (low, high), color=Colour.ON, linewidth=0.8, label="right")
         plot.set(xlim=(low, high), ylim=(low, high), aspect="equal")
         _quiet(plot, f"thresholds: {MAPS[name]}", "true mean threshold", "learned")
     return figure

@@ -35,22 +35,23 @@ from dase.diagnosis.compare import compare
 from dase.learning.adversarial import PatchHash
 from dase.learning.baselines import RandomThresholds, constant_thresholds
 from dase.learning.evaluation import HeldOutScore
-from dase.learning.job import make_baseline, write_examples, write_sensor
+from dase.learning.job import compose_training, make_baseline, write_examples, write_sensor
+from dase.learning.recipe import Recipe
 from dase.learning.recorded_target import ReplayedScenes, cut_windows, open_target
 from dase.learning.run import RunSchedule, train_in_folder
-from dase.learning.scene_batches import Scenery, SceneSettings
+from dase.learning.scene_batches import LOG_EPS, Scenery, SceneSettings
 from dase.learning.targets import TRUTHS, EndlessTarget, FiniteTarget, Pairs, Target, record_pairs
-from dase.learning.training import Recipe, Training
+from dase.learning.training import Training
 from dase.networks.threshold_network import NetworkShape
 from dase.recordings.recording import open_recording
 from dase.scenes import image_sources
-from dase.scenes.between_frames import TOLERANCE, CameraScene
+from dase.scenes.between_frames import CameraScene, TrustSettings
 from dase.simulation.sensor_file import load_sensor
+from perf.data_folder import data_folder, default_images
 from perf.experiments.adaptation import jobs
 from perf.experiments.adaptation.rows import Planned, Row, plan, rows
 
 ROOT = Path(__file__).resolve().parents[3]
-SHARED = ROOT.parent / "shared"
 
 LEARNED = 8.0
 """Seconds of the recording that are learned from."""
@@ -78,10 +79,10 @@ def prepare(row: Row, args: argparse.Namespace) -> Training:
         network |= {"channels": 8, "depth": 2}
         if "pattern" in network:
             network["pattern"] = (96, 96)
-    made = Recipe(hash=PatchHash(**how), network=NetworkShape(**network), **recipe)
+    made = Recipe.from_names(hash=PatchHash(**how), network=NetworkShape(**network), **recipe)
     if row.real:
         target, scenes = open_target([Path(args.recording)], until=LEARNED, device=device)
-        return Training(made, target, scenes)
+        return compose_training(made, target, scenes)
     source = image_sources.open_images(pictures)
     scenery = Scenery(
         source,
@@ -97,7 +98,7 @@ def prepare(row: Row, args: argparse.Namespace) -> Training:
     if row.finite:
         pairs = record_pairs(target, np.random.default_rng([seed, 77]), row.finite)
         target = FiniteTarget(pairs, augment=row.augment, truth=target.truth)
-    return Training(made, target, ours)
+    return compose_training(made, target, ours)
 
 
 def judge(row: Row, training: Training, args: argparse.Namespace, folder: Path) -> dict[str, Any]:
@@ -107,7 +108,7 @@ def judge(row: Row, training: Training, args: argparse.Namespace, folder: Path) 
     later = recording.slice(recording.begin + LEARNED, recording.end)
     windows = cut_windows(later)
     scenes = ReplayedScenes(windows, window=0.05, device=args.device)
-    grey = np.exp(windows.log[:, windows.log.shape[1] // 2].astype(np.float32)) - np.float32(1e-3)
+    grey = np.exp(windows.log[:, windows.log.shape[1] // 2].astype(np.float32)) - np.float32(LOG_EPS)
     pairs = Pairs(torch.from_numpy(grey).to(args.device), torch.from_numpy(windows.counts).to(args.device))
     held = HeldOutScore(scenes, pairs, doubt=0.2)
     out: dict[str, Any] = {"trusted": windows.trusted}
@@ -140,9 +141,9 @@ def _probes(later: Any, name: str, net: Any, folder: Path) -> float:
 
     def trust(times: Any, pixels: Any) -> Any:
         at = np.clip(times, scene.times[0], scene.times[-1])
-        return scene.doubt(at, pixels=pixels) <= TOLERANCE
+        return scene.doubt(at, pixels=pixels) <= TrustSettings.tolerance
 
-    return compare(later.events, scene, sensor, trust=trust, pixels=800).error
+    return compare(later.events, sensor, scene=scene, trust=trust, pixels=800).error
 
 
 def measure(name: str, seconds: float, args: argparse.Namespace) -> dict[str, Any]:
@@ -159,10 +160,10 @@ def measure(name: str, seconds: float, args: argparse.Namespace) -> dict[str, An
             shown = ("step", "seconds", "distance", "raw_kl", "kl", "kl_active", "mu", "slope", "held_out")
             print(name, " ".join(f"{k}={line[k]:.4g}" for k in shown if k in line), flush=True)
 
-    pace = RunSchedule(seconds=seconds, save=math.inf, look=args.look)
+    schedule = RunSchedule(seconds=seconds, save_every=math.inf, log_every=args.look)
     folder = Path(args.out) / name
     shutil.rmtree(folder, ignore_errors=True)
-    last = train_in_folder(training, folder, pace=pace, look=look)
+    last = train_in_folder(training, folder, schedule=schedule, on_row=look)
     scored = [line for line in history if "held_out" in line]
     best = min(scored, key=lambda line: line["held_out"]) if scored else last
     if training.step and (row.real or row.truth != "uniform"):
@@ -250,11 +251,6 @@ def _brief(line: dict[str, Any]) -> str:
     )
 
 
-def _default_images() -> str:
-    beside = SHARED / "photos"
-    return str(beside) if beside.is_dir() else "builtin"
-
-
 def parse(argv: list[str] | None = None) -> argparse.Namespace:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument("--row", action="append", default=[], help="name or pattern; may be repeated")
@@ -269,9 +265,9 @@ def parse(argv: list[str] | None = None) -> argparse.Namespace:
     parser.add_argument(
         "--device", default="cuda" if torch.cuda.is_available() else "cpu", help="or some: cuda:0,cuda:1"
     )
-    parser.add_argument("--images", default=_default_images())
+    parser.add_argument("--images", default=default_images())
     parser.add_argument(
-        "--recording", default=str(ROOT.parent / "shared/recordings/davis240c_camerashake.npz")
+        "--recording", default=str((data_folder() or Path()) / "recordings/davis240c_camerashake.npz")
     )
     parser.add_argument("--look", type=int, default=100, help="steps between lines of the log")
     parser.add_argument("--small", action="store_true", help="tiny scenes, to try things on a CPU")

@@ -135,7 +135,7 @@ def run_case(job: Job) -> dict[str, Any]:
     removed = {case.removed, *(including(case.removed) if case.kind == "unknown" else ())}
     library = {name: effect for name, effect in EFFECTS.items() if name not in removed}
     begin = time.perf_counter()
-    found = diagnose(events, scene, given, effects=library, seed=case.seed, device=job.device)
+    found = diagnose(events, given, scene=scene, effects=library, seed=case.seed, device=job.device)
     seconds = time.perf_counter() - begin
     truth = (
         {} if true is None else

@@ -17,7 +17,7 @@ from matplotlib.axes import Axes
 from matplotlib.ticker import NullFormatter
 
 from dase.figures.event_images import overlay_events
-from dase.figures.style import BOTH, INK, QUIET, format_number
+from dase.figures.style import Colour, format_number
 
 
 def write_page(cameras: Mapping[str, Any], log: Path, out: Path) -> None:
@@ -119,9 +119,9 @@ def plain(facts: dict[str, Any]) -> str:
     f = {k: float(facts[k]) for k in ("events", "seconds", "rate", "on", "shortest", "busiest", "hot")}
     return (
         f"{f['events']:,.0f} events in {f['seconds']:.3g} s, {100 * f['on']:.0f} % of them ON; one in a "
-        f"thousand intervals of a pixel is shorter than {format_number(1e3 * f['shortest'])} ms; the busiest pixel "
-        f"sends {format_number(f['busiest'])} events per second; {f['hot']:,.0f} pixels send ten times as "
-        "many as those around them."
+        f"thousand intervals of a pixel is shorter than {format_number(1e3 * f['shortest'])} ms; the busiest "
+        f"pixel sends {format_number(f['busiest'])} events per second; {f['hot']:,.0f} pixels send ten "
+        "times as many as those around them."
     )
 
 
@@ -180,13 +180,13 @@ def draw_pictures(axes: Sequence[Axes], facts: Mapping[str, Any], window: float)
     for axis, kind in zip(axes, ("measured", "simulated"), strict=True):
         axis.set_xticks([])
         axis.set_yticks([])
-        axis.spines[:].set(color=QUIET, linewidth=0.5)
+        axis.spines[:].set(color=Colour.QUIET, linewidth=0.5)
         axis.imshow(_large(overlay_events(calm, facts[kind])), interpolation="nearest")
-        axis.set_title(f"{kind}, {1e3 * window:g} ms", fontsize=8.5, color=QUIET, pad=4)
+        axis.set_title(f"{kind}, {1e3 * window:g} ms", fontsize=8.5, color=Colour.QUIET, pad=4)
 
 
 def _name(axis: Axes, name: str) -> None:
-    axis.set_title(f"{name}\n", fontsize=10.5, color=INK, weight="bold", loc="left", pad=2)
+    axis.set_title(f"{name}\n", fontsize=10.5, color=Colour.INK, weight="bold", loc="left", pad=2)
 
 
 def _large(picture: np.ndarray) -> np.ndarray:
@@ -201,18 +201,20 @@ def staircase(axis: Axes, found: dict[str, Any]) -> None:
     n, gate = len(errors), max(found["gate"], 1.0)
     sure, edges = n - stand_ins, np.arange(n + 1) - 0.5
     axis.set_yscale("log")
-    axis.axhspan(1e-3, gate, color=BOTH, alpha=0.10, lw=0)
-    axis.axhline(1, color=BOTH, lw=1.2, ls=(0, (4, 2)))
-    axis.stairs(errors, edges, baseline=1e-3, fill=True, color=INK, alpha=0.07, lw=0)
-    axis.stairs(errors[:sure], edges[: sure + 1], baseline=None, color=INK, lw=2)
+    axis.axhspan(1e-3, gate, color=Colour.BOTH, alpha=0.10, lw=0)
+    axis.axhline(1, color=Colour.BOTH, lw=1.2, ls=(0, (4, 2)))
+    axis.stairs(errors, edges, baseline=1e-3, fill=True, color=Colour.INK, alpha=0.07, lw=0)
+    axis.stairs(errors[:sure], edges[: sure + 1], baseline=None, color=Colour.INK, lw=2)
     if stand_ins:
         x = np.repeat(edges[sure:], 2)[:-1]
-        axis.plot(x, [errors[sure - 1], *np.repeat(errors[sure:], 2)], color=QUIET, lw=1.7, ls=(0, (3, 1.5)))
+        axis.plot(
+            x, [errors[sure - 1], *np.repeat(errors[sure:], 2)], color=Colour.QUIET, lw=1.7, ls=(0, (3, 1.5))
+        )
     for k, error in enumerate(errors):
         below = 0.6 < error < 1  # beside the line of the floor, not on it
         axis.annotate(
-            format_number(error), (k, error), (0, -12 if below else 4), textcoords="offset points", ha="center",
-            weight="bold", fontsize=9, color=INK if k < sure else QUIET,
+            format_number(error), (k, error), (0, -12 if below else 4), textcoords="offset points",
+            ha="center", weight="bold", fontsize=9, color=Colour.INK if k < sure else Colour.QUIET,
         )  # fmt: skip
     axis.set_ylim(0.5 * min(1.0, *errors), 2.2 * max(*errors, gate))
     axis.set_xlim(-0.5, max(n, 3) - 0.5)
@@ -224,7 +226,7 @@ def staircase(axis: Axes, found: dict[str, Any]) -> None:
     axis.spines[["top", "right"]].set_visible(False)
     axis.set_title(
         "error on held-out pixels and time" + (" (dashed: stand-ins)" if stand_ins else ""),
-        fontsize=8.5, color=QUIET, pad=4,
+        fontsize=8.5, color=Colour.QUIET, pad=4,
     )  # fmt: skip
 
 

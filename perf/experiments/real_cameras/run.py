@@ -26,7 +26,7 @@ import numpy as np
 import dase
 import dase.io
 from dase.diagnosis.diagnose import diagnose
-from dase.diagnosis.measurement import Measurement, camera_scene, open_measurement
+from dase.fitting.measurement import Measurement, camera_scene, open_measurement
 from dase.recordings.statistics import RecordingSurvey
 from dase.scenes.frame_alignment import align
 from dase.simulation.simulate import stream
@@ -239,15 +239,11 @@ def look(name: str, path: Path, options: argparse.Namespace) -> None:
     """Diagnose one recording and keep what was found."""
     camera = CAMERAS[name]
     measured = camera.open(path)
-    found = diagnose(
-        measured.events, measured.scene, trust=measured.trust, pixels=camera.pixels, device=options.device
-    )
-    found = measured.noted(found)
+    found = diagnose(measured, pixels=camera.pixels, device=options.device)
     (options.log / f"{name}.json").write_text(json.dumps(found.to_json() | {"commit": options.commit}))
     np.savez_compressed(options.log / f"{name}.npz", **pictures(camera, measured, found.sensor))
-    from dase.diagnosis.diagnose import summary_line
 
-    print(f"{name}: {found.seconds:.0f} s, {summary_line(found)}", flush=True)
+    print(f"{name}: {found.seconds:.0f} s, {found.finding()}", flush=True)
     for step in found.history:
         ranks = ", ".join(f"{r.effect} {r.error:.2f}" for r in step.ranking[:5])
         print(f"    {step.error:6.2f} gate {step.gate:4.2f} {step.chosen} [{ranks}]", flush=True)
@@ -273,13 +269,13 @@ def pictures(camera: Camera, measured: Measurement, sensor: dase.Sensor) -> dict
     gaps = np.diff(events.t[order])[np.diff(pixel[order]) == 0]
     counts = np.bincount(pixel, minlength=events.width * events.height)
     looked = RecordingSurvey(events.width, events.height)
-    looked.events(events)
+    looked.add_events(events)
     return {
         "measured": events.counts(edges)[0], "simulated": simulated.counts(edges)[0], "grey": grey,
         "rate": np.array(len(events) / (events.t[-1] - events.t[0])),
         "on": np.array(events.p.mean()), "shortest": np.array(np.quantile(gaps, 1e-3)),
         "busiest": np.array(counts.max() / (events.t[-1] - events.t[0])),
-        "hot": np.array(np.count_nonzero(looked.hot())),
+        "hot": np.array(np.count_nonzero(looked.hot_pixels())),
         "seconds": np.array(events.t[-1] - events.t[0]), "events": np.array(len(events)),
     }  # fmt: skip
 

@@ -1,0 +1,174 @@
+"""Every number that a diagnosis decides by, with the reason for it; a study gives `diagnose` another set."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+
+@dataclass(frozen=True)
+class CandidateSettings:
+    """How candidates are screened, fitted and judged."""
+
+    finalists: int = 4
+    """Candidates that are fitted to all pixels of the training half."""
+
+    followed: int = 8
+    """Candidates that are followed where screening shows one clearly ahead: the turn of the others comes. Of
+    those whose events go through a readout, which takes ten times as long, no more are ever followed."""
+
+    clear_lead: float = 0.6
+    """Loss of a candidate that is clearly ahead, in units of the present model's."""
+
+    second_start: float = 1.25
+    """A second start is followed where its loss is below this, in units of the first's."""
+
+    apart: float = 0.8
+    """It must differ from the first by more in some parameter, in the units of `Axis.to_place`."""
+
+    loses: float = 1.6
+    """A finalist is fitted no further where its loss will not come below this, in units of the best's."""
+
+    gives_up: float = 2.0
+    """The same before each finalist has sampling errors of its own, by which it may look better."""
+
+    behind: float = 1.5
+    """A finalist goes on where its error before the last fit is at most this times the best's, and
+    `close`."""
+
+    close: float = 1.0
+    """Error that is added to that limit [noise floors], for errors near the floor say little."""
+
+    far: float = 3.0
+    """Error before the last fit [noise floors] above which a finalist is judged by `few_repeats`."""
+
+    few_repeats: int = 12
+    """Simulations by which models are judged that are far from the floor."""
+
+    repeats: int = 30
+    """Simulations with other seeds by which a finalist is judged."""
+
+    refits: int = 2
+    """Times at most that a finalist is fitted further whose training loss is least but not its held-out
+    error."""
+
+    surely: float = 0.8
+    """Its training loss, in units of that of the finalist with the least held-out error."""
+
+    idle_bus: float = 0.01
+    """Share of what a bus can send below which a readout is no candidate: it would lose less than that."""
+
+    significant: float = 0.05
+    """Largest p-value of an effect that is added; 1 / (repeats + 1) is the smallest there is."""
+
+
+@dataclass(frozen=True)
+class HiddenEffectSettings:
+    """When the directional test looks for an effect that the model's own chance may hide."""
+
+    hides: float = 0.3
+    """Error that chance makes of a model in the mean, from which on it may hide an effect [noise floors]."""
+
+    strengths: tuple[float, ...] = (0.2, 0.5, 0.8)
+    """At which an effect is looked at, as shares of the plausible range."""
+
+    repeats_of_mean: int = 8
+    """Simulations whose mean is looked at."""
+
+    away: float = 4.0
+    """Standard deviations by which a measurement must be away from repeats of a model, on the way to an
+    effect.
+
+    Of 40 models that lacked nothing all but one had at most 3.0; those that lacked jitter beside mismatch
+    had 4.9 to 10."""
+
+    away_held_out: float = 3.0
+    """The same on the held-out half, on the way to that effect once it is fitted."""
+
+    most_of_one: float = 3.0
+    """Differences beyond this many standard errors count as this: no single statistic decides."""
+
+    threshold_reach: float = 0.05
+    """By which a threshold is moved to see what it does to the statistics, in the units of
+    `Axis.to_place`."""
+
+    reach: float = 0.2
+    """The same for all else that is free, and most by which it gives way to an effect."""
+
+
+@dataclass(frozen=True)
+class PruningSettings:
+    """Which of the effects that were added are tried without, and what is tried in their place."""
+
+    rivals: int = 2
+    """Alternatives to an effect that are tried in its place once all others are found."""
+
+    rival_error: float = 1.6
+    """Only alternatives whose held-out error was about below this, in units of the chosen one's."""
+
+    rival_loss: float = 2.0
+    """Only alternatives whose loss on the scout, quickly fitted, is below this, in units of the model's
+    own."""
+
+    droppable: float = 8.0
+    """An effect is tried to be dropped where the error on the scout without it, quickly fitted, is below this
+    [gates]."""
+
+    near: float = 1.5
+    """A model is fitted in full where one descent takes its held-out error below this, in units of the gate
+    or of the present model's error."""
+
+    lost: float = 4.0
+    """A model that is farther off than this is not reviewed [gates]. In the blind benchmark one was taken
+    from 2.9 to the floor, and none of 24 that were beyond 3."""
+
+    repeats: int = 16
+    """Simulations by which a model is judged that is not fitted in full."""
+
+
+@dataclass(frozen=True)
+class DiagnosisSettings:
+    """When an effect is added to a model and when the search ends."""
+
+    repeats: int = 60
+    """Simulations with other seeds that tell what chance does."""
+
+    scout_repeats: int = 16
+    """The same on the scout, for what need not be exact."""
+
+    material: float = 0.3
+    """Least fall of the held-out error for which an effect is added [noise floors]."""
+
+    share: float = 0.1
+    """Least share of the way to the floor for which an effect is added."""
+
+    remainder: float = 0.5
+    """Where the model counts as right without it, an effect is added only if it leaves no more than chance
+    may, and at most this share of what was left above the level of chance."""
+
+    tie: float = 0.35
+    """Candidates at the floor whose held-out error is within this of the best's are not told apart from
+    it."""
+
+    tie_share: float = 0.1
+    """The same far from the floor, as a share of the best's error."""
+
+    on_its_way: float = 2.0
+    """A model with one effect more is judged by fewer simulations where its error is above this [gates]."""
+
+    paired: int = 6
+    """Candidates that are tried two at a time where one after the other is not enough."""
+
+    pair_helps_alone: float = 0.98
+    """Only those whose screening brought the loss below this, in units of the present model's."""
+
+    pair_gain: float = 0.8
+    """A pair that does not reach the floor must bring the error below this, in units of the present one."""
+
+    candidates: CandidateSettings = field(default_factory=CandidateSettings)
+    hidden: HiddenEffectSettings = field(default_factory=HiddenEffectSettings)
+    pruning: PruningSettings = field(default_factory=PruningSettings)
+
+
+DEFAULTS = DiagnosisSettings()
+"""What `diagnose` decides by unless it is told otherwise; all rows of `docs/diagnosis.md` are made with
+it."""

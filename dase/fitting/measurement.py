@@ -1,0 +1,321 @@
+"""From a file to a measurement: events and the scene they are of, on one clock.
+
+`Recording` is what a file holds, `Measurement` adds what the camera saw while it recorded, and `compare`,
+`fit` and `diagnose` take either (see `as_measurement`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
+from os import PathLike
+from pathlib import Path
+from typing import Any, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dase import io
+from dase.errors import InputError
+from dase.events import Events
+from dase.formatting import fit_to_screen
+from dase.io.arrays import check_archive
+from dase.io.sequence import Sequence
+from dase.probes.stimulus import STIMULUS, Trust
+from dase.recordings.recording import Recording
+from dase.results import Comparison, Diagnosis, Fit
+from dase.scenes.between_frames import CameraScene
+from dase.scenes.frame_alignment import PARTS, align
+from dase.scenes.frame_denoising import denoise_resting_pixels
+from dase.scenes.frame_motion import estimate_stretches, is_stretched
+from dase.scenes.scene import Scene
+from dase.scenes.video import VideoScene, open_video
+
+Found = TypeVar("Found", Comparison, Diagnosis, Fit)
+
+
+@dataclass(frozen=True, repr=False)
+class Measurement:
+    """Events and the scene they are of, on one clock.
+
+    Args:
+        events: What was measured.
+        scene: What the camera saw.
+        trust: Where and when the scene is to be trusted; None for everywhere.
+        notes: What was noticed while reading.
+    """
+
+    events: Events
+    scene: Scene
+    trust: Trust | None = None
+    notes: tuple[str, ...] = ()
+
+    def __repr__(self) -> str:
+        trust = "everywhere" if self.trust is None else "in part"
+        lines = [f"Measurement, its scene trusted {trust}", f"  {self.events}", f"  {self.scene}"]
+        return fit_to_screen([*lines, *(f"  note: {note}" for note in self.notes)])
+
+    def noted(self, found: Found) -> Found:
+        """Return a finding with what was noticed while reading before its own notes."""
+        return replace(found, notes=(*self.notes, *found.notes))
+
+
+Measured = Measurement | Recording | Events | str | PathLike[str]
+"""What `compare`, `fit` and `diagnose` take: see `as_measurement`."""
+
+SceneChoice = Scene | str | PathLike[str]
+"""A scene, `frames` for the recording's own, `static` for light that does not change, or a clip's path."""
+
+
+def as_measurement(
+    measured: Measured, scene: SceneChoice | None = None, trust: Trust | None = None
+) -> Measurement:
+    """Return events and the scene they are of.
+
+    Args:
+        measured: A measurement, a recording, its path, or events.
+        scene: What the camera saw. None for what `measured` knows: the scene of a measurement, the frames of
+            a recording. Events alone know none.
+        trust: Where and when the scene is to be trusted; None for what the scene and `measured` say of it.
+
+    Raises:
+        InputError: Events come without a scene, or the recording has no frames to take it from.
+    """
+    if isinstance(measured, Measurement):
+        found = measured
+        if scene is not None:
+            found = replace(measured, scene=_chosen_scene(scene, measured.events), trust=None)
+    elif isinstance(measured, Recording):
+        found = measurement_of(measured, "frames" if scene is None else scene)
+    elif isinstance(measured, Events):
+        if scene is None or scene == "frames":
+            raise InputError("events do not say what the camera saw: give the scene", argument="scene")
+        found = Measurement(measured, _chosen_scene(scene, measured))
+    elif isinstance(measured, str | PathLike):
+        found = open_measurement(Path(measured), "frames" if scene is None else scene)
+    else:
+        raise TypeError(f"expected a recording, its path, or events, got {type(measured).__name__}")
+    return found if trust is None else replace(found, trust=trust)
+
+
+def open_measurement(path: Path, scene: SceneChoice = "frames") -> Measurement:
+    """Open a recording and its scene, see `measurement_of`; `Measurement.notes` say what reading noticed.
+
+    Raises:
+        InputError: Something is missing or damaged.
+    """
+    notes: list[str] = []
+    # not `open_recording`: its survey of all events would be thrown away here
+    return measurement_of(io.read(path, notes=notes), scene, notes=notes, name=str(path))
+
+
+def measurement_of(
+    recorded: Recording | Sequence,
+    scene: SceneChoice = "frames",
+    *,
+    notes: Iterable[str] = (),
+    name: str = "the recording",
+) -> Measurement:
+    """Return a recording with its scene.
+
+    Frames of a camera are too far apart to tell all that happened between them: there the scene follows the
+    motion from frame to frame, and `Measurement.trust` says where it can be trusted. Frames as dense as the
+    steps of a comparison, as those of a simulation may be, are joined by straight lines.
+
+    Args:
+        recorded: Events, and where it has them frames. Pixels outside the mask of a `Recording` are not
+            trusted.
+        scene: What the camera saw: `frames` for the recording's own, `static` for light that does not change,
+            the path of a clip, or a scene on the clock of the events.
+        notes: What reading it said, beside what a `Recording` reports.
+        name: What messages call it.
+
+    Raises:
+        InputError: It has no events, or no frames to take the scene from, or the clip cannot be read.
+    """
+    said = list(notes)
+    if isinstance(recorded, Recording):
+        # what looks odd is the report's to say: it changes nothing here
+        said += [note for note in recorded.report.notes if note.kind != "odd"]
+    if len(recorded.events) == 0:
+        raise InputError(f"{name} has no events, so there is nothing to compare")
+    own = scene == "frames"
+    seen = scene_of_frames(recorded, name, said) if own else _chosen_scene(scene, recorded.events)
+    trust: Trust | None = seen.is_trusted if isinstance(seen, CameraScene) else None
+    if isinstance(recorded, Recording) and not recorded.mask.all():
+        trust = _trust_within(recorded.mask, trust)
+    return Measurement(recorded.events, seen, trust, tuple(said))
+
+
+def _chosen_scene(scene: SceneChoice, events: Events) -> Scene:
+    if isinstance(scene, Scene):
+        return scene
+    return static_scene(events) if scene == "static" else open_clip(Path(scene))
+
+
+def _trust_within(mask: NDArray[np.bool_], trust: Trust | None) -> Trust:
+    """Return a trust that ends where a mask of pixels does, shape (H, W)."""
+    inside = mask.reshape(-1)
+
+    def within(times: NDArray[np.float64], pixels: NDArray[np.int32]) -> NDArray[np.bool_]:
+        everywhen = np.broadcast_to(inside[pixels], (len(times), len(pixels)))
+        return everywhen if trust is None else everywhen & trust(times, pixels)
+
+    return within
+
+
+def static_scene(events: Events, *, intensity: float = 0.5) -> VideoScene:
+    """Return light of one intensity that does not change, as long as the events last.
+
+    Args:
+        events: At least one; the scene has their size and begins with the first.
+        intensity: Of all pixels, in [0, 1]. How bright it was nobody knows: the middle of the range.
+    """
+    frames = np.full((2, events.height, events.width), intensity, np.float32)
+    begin, end = float(events.t[0]), float(events.t[-1])
+    return VideoScene(frames, [begin, max(end, begin + 1e-3)])
+
+
+def scene_of_frames(recorded: Recording | Sequence, name: str, notes: list[str]) -> Scene:
+    """Return the scene of a recording's own frames.
+
+    Args:
+        recorded: Events and frames.
+        name: What messages call it.
+        notes: Gets what was found out about the frames.
+
+    Raises:
+        InputError: There are not two frames, or their times are not known.
+    """
+    if recorded.frames is None or len(recorded.frames) < 2:
+        raise InputError(
+            f"{name} has no frames to take the scene from; give a clip of what the camera saw, or 'static' "
+            "where it saw nothing move",
+            argument="scene",
+        )
+    times = recorded.frame_times
+    if times is None:
+        raise InputError(f"{name}: its frames have no times, so they cannot be laid beside the events")
+    # also frames that come exactly as slowly as the slowest steps of a comparison are joined by lines
+    if float(np.median(np.diff(times))) <= STIMULUS.coarsest_step * (1 + 1e-6):
+        return VideoScene(linear_intensity(recorded.frames, name), times)
+    return scene_between_frames(recorded, notes)
+
+
+def scene_between_frames(recorded: Recording | Sequence, notes: list[str]) -> CameraScene:
+    """Return the scene between the frames of a recording, laid on its events.
+
+    Args:
+        recorded: Events and frames.
+        notes: Gets what was found out about the frames.
+
+    Raises:
+        InputError: There are not two frames, or their times are not known.
+    """
+    times = recorded.frame_times
+    if recorded.frames is None or len(recorded.frames) < 2 or times is None:
+        raise InputError("the scene between frames needs at least 2 frames with known times")
+    begin, end = _exposures(recorded, times)
+    frames, begin, end = align_with_events(recorded.events, recorded.frames, begin, end, notes)
+    return camera_scene(frames, begin, end, notes)
+
+
+def _exposures(
+    recorded: Recording | Sequence, times: NDArray[np.float64]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return begin and end of each exposure [s], (F,) each: an instant where the exposure is not known."""
+    if isinstance(recorded, Sequence):
+        half = 0.5 * (np.zeros(len(times)) if recorded.frame_exposure is None else recorded.frame_exposure)
+        return times - half, times + half
+    if recorded.frame_begin is None or recorded.frame_end is None:
+        return times, times
+    return recorded.frame_begin, recorded.frame_end
+
+
+def align_with_events(
+    events: Events,
+    frames: NDArray[Any],
+    begin: NDArray[np.float64],
+    end: NDArray[np.float64],
+    notes: list[str],
+) -> tuple[NDArray[Any], NDArray[np.float64], NDArray[np.float64]]:
+    """Return frames and exposures [s] where the events are: corrected in what clearly lies elsewhere."""
+    try:
+        found = align(events, frames, begin, end)
+    except InputError as error:
+        notes.append(f"whether frames and events fit could not be seen ({error})")
+        return frames, begin, end
+    done = ", ".join(part for part in PARTS if part in found.clear)
+    notes.append(
+        f"events come {1e3 * found.offset:.1f} ms after the frames and correlate with them at "
+        f"{found.score:.2f}: " + (f"corrected {done}" if done else "nothing was corrected")
+    )
+    return found.apply(frames, begin, end)
+
+
+def camera_scene(
+    frames: NDArray[Any], begin: NDArray[np.float64], end: NDArray[np.float64], notes: list[str]
+) -> CameraScene:
+    """Return the scene between a camera's frames.
+
+    Where the camera itself rests, what differs from frame to frame by no more than noise rests as well; where
+    all moves slowly that would make steps of it.
+    """
+    gains = None
+    scene = CameraScene(frames, begin, end)
+    if is_stretched(frames):
+        gains = estimate_stretches([scene.intensity(k) for k in range(len(scene))])
+        notes.append("each frame was stretched to the full range of grey: undone as far as they tell")
+        scene = CameraScene(frames, begin, end, gains=gains)
+    return (
+        CameraScene(denoise_resting_pixels(frames), begin, end, gains=gains) if camera_rests(scene) else scene
+    )
+
+
+def camera_rests(scene: CameraScene, *, looks: int = 8, movement: float = 0.1) -> bool:
+    """Return whether most of the picture does not move in most of the times between frames.
+
+    Args:
+        scene: Between frames.
+        looks: Times between frames that are looked at, spread evenly.
+        movement: Half of all pixels must move by less from one frame to the next [px].
+    """
+    chosen = np.unique(np.linspace(0, len(scene) - 2, looks).astype(int))
+    ways = [np.linalg.norm(scene.matched(int(k)).ahead, axis=-1) for k in chosen]
+    return bool(np.median([np.median(way) for way in ways]) < movement)
+
+
+def open_clip(path: Path) -> VideoScene:
+    """Return the scene of a video, of a folder of pictures, or of an archive with `frames` and `frame_us`."""
+    if not path.exists():
+        raise InputError(f"scene {path} does not exist")
+    if path.suffix.lower() != ".npz":
+        return open_video(path)
+    try:
+        check_archive(path, ("frames", "frame_us"))
+        with np.load(path, allow_pickle=False) as data:
+            missing = [name for name in ("frames", "frame_us") if name not in data]
+            if missing:
+                raise InputError(f"scene {path} has no '{missing[0]}', got {', '.join(data) or 'nothing'}")
+            frames, times = data["frames"], data["frame_us"] * 1e-6
+    except InputError as error:
+        raise InputError(f"scene {path}: {error}" if str(path) not in str(error) else str(error)) from error
+    except Exception as error:  # numpy, zipfile and zlib have no common error for damaged files
+        raise InputError(f"scene {path} cannot be read as an archive of frames: {error}") from error
+    return VideoScene(linear_intensity(frames, path), times)
+
+
+def linear_intensity(frames: NDArray[Any], path: Path | str) -> NDArray[np.float32]:
+    """Return frames as intensities in [0, 1]; whole numbers are shares of the largest their type holds."""
+    if frames.dtype.kind == "u":
+        shares: NDArray[np.float32] = frames.astype(np.float32) / np.float32(np.iinfo(frames.dtype).max)
+        return shares
+    out = frames.astype(np.float32)
+    bad = ~np.isfinite(out) | (out < 0)
+    if bad.any():
+        first = int(np.argwhere(bad)[0][0])
+        raise InputError(
+            f"scene {path}: frame {first} has {int(bad[first].sum())} values below 0 or not numbers; "
+            "intensities must be finite and >= 0"
+        )
+    return out
