@@ -194,7 +194,7 @@ def test_heaps_are_checked_once_until_the_file_changes(tmp_path, rng, monkeypatc
 def test_names_in_a_file_cannot_break_the_sentence(tmp_path):
     with h5py.File(tmp_path / "a.h5", "w") as file:
         file["two\nlines and \x1b[31mred"] = np.zeros(3)
-    with pytest.raises(InputError, match=r"holds two lines and \?\[31mred$"):
+    with pytest.raises(InputError, match=r"holds two lines and \\x1b\[31mred$"):
         io.read(tmp_path / "a.h5")
 
 
@@ -214,11 +214,11 @@ def test_layouts_nobody_knows(tmp_path):
     [
         (dsec, ("events/x", np.zeros(7, np.uint16)), "'events/x' has 7 entries"),
         (dsec, ("events/x", np.full(500, -1, np.int32)), "must lie in 0..65535"),
-        (dsec, ("events/x", np.zeros(500)), "must be integers"),
+        (dsec, ("events/x", np.full(500, 1.5)), r"must be whole numbers, got 1\.5"),
         (dsec, ("events/t", np.zeros((500, 2))), "must have 1 axes"),
         (dsec, ("events/p", np.array([b"a"] * 500)), "must hold numbers"),
         (mvsec, ("davis/left/events", np.zeros((5, 3))), r"shape \(N, 4\)"),
-        (mvsec, ("davis/left/events", np.full((5, 4), np.nan)), "not a finite number|0..65535"),
+        (mvsec, ("davis/left/events", np.full((5, 4), np.nan)), "must be whole numbers, got nan"),
         (v2e, ("events", np.zeros((5, 4))), "whole numbers of shape"),
         (v2e, ("events", np.zeros((5, 3), np.uint32)), r"shape \(N, 4\)"),
         (ecf, ("CD/events", np.zeros(5)), "must have the fields"),
