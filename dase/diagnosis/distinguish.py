@@ -11,8 +11,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dase.diagnosis.standard_stimuli import STANDARD_STIMULI, StandardStimulus
-from dase.effects.row_scan import RowScan
-from dase.effects.timestamp import Timestamp
 from dase.errors import InputError
 from dase.fitting.batch_simulator import BatchSimulator, SimulationOrder, samples_per_step
 from dase.fitting.data_split import SPLIT, typical_changes
@@ -142,10 +140,10 @@ def _timestamp_structure(models: tuple[Sensor, Sensor]) -> TimestampStructure:
     """Return the regularity of time stamps that a readout of the models makes, if a file could show it."""
     for model in models:
         for effect in model.readout_effects():
-            if isinstance(effect, Timestamp) and effect.step >= PATTERNS.shortest:
-                return TimestampStructure(step=effect.step)
-            if isinstance(effect, RowScan):
-                return TimestampStructure(line=effect.line, direction=effect.direction)
+            pattern = effect.stamp_pattern()
+            # shorter ticks cannot be told from those of the file
+            if pattern is not None and (not pattern.period or pattern.period >= PATTERNS.shortest):
+                return TimestampStructure(pattern.period, pattern.line_time, pattern.direction)
     return TimestampStructure()
 
 
