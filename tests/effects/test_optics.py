@@ -64,7 +64,7 @@ def test_switched_off_it_changes_nothing(device, rng, kind):
     scene, plain = SCENES[kind](rng), dase.Sensor((Threshold(), Vignetting()))
     off = plain.with_effect(OpticsBlur.identity())
     assert off.effects[0].name == "optics_blur"
-    assert off.seen(scene) is scene
+    assert off.through_optics(scene) is scene
     want = dase.simulate(scene, plain, device=device)
     same(dase.simulate(scene, off, device=device), want)
     edges = [0.0, scene.duration / 3, scene.duration]

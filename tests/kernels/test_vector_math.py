@@ -29,7 +29,7 @@ def counted(sensor, scene, device, *, chunk=1000, pixels=None, parameters=None):
         low = windows[0]
         new = array.count_events(scene, part, windows - low, windows[-1] - low + 1).numpy()
         total[:, low : windows[-1] + 1] += new
-    return total, array._state.numpy()[:2], array._plain
+    return total, array._state.numpy()[:2], array._thresholds_only
 
 
 @pytest.mark.parametrize("kind", ["log", "frames", "background", "layers"])

@@ -302,7 +302,7 @@ def test_the_command_learns_from_a_sensor_and_goes_on(tmp_path, monkeypatch):
     [
         (("missing.npz",), "missing.npz"),
         (("ideal", "--preset", "fast"), "there is no preset 'fast'"),
-        (("ideal", "--images", "frames"), "a sensor file has no frames"),
+        (("ideal", "--images", "frames"), "a sensor file has none"),
         (("ideal", "--window", "-1"), "window must be a number > 0 s, got -1"),
         (("ideal", "ideal"), "one sensor file is one target, got 2"),
         (("ideal", "--objective", "magic"), "objective must be moments or wgan"),
