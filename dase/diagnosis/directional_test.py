@@ -114,7 +114,7 @@ def _most_deviating_effect(
     """
     hidden = state.settings.hidden
     half, cloud = _repeat_cloud(state, state.evidence.train, model)
-    threshold = [axis.name.startswith("threshold.") for axis in model.space.axes]
+    threshold = [axis.of_threshold for axis in model.space.axes]
     reach = np.where(threshold, hidden.threshold_reach, hidden.reach)
     sides = np.concatenate([model.place[None], model.place + np.diag(reach), model.place - np.diag(reach)])
     probed = _models_to_probe(state, model, half)

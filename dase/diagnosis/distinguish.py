@@ -11,13 +11,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dase.diagnosis.standard_stimuli import STANDARD_STIMULI, StandardStimulus
-from dase.effects.row_scan import RowScan
-from dase.effects.timestamp import Timestamp
 from dase.errors import InputError, checked_seed
 from dase.fitting.batch_simulator import BatchSimulator, SimulationOrder, samples_per_step
 from dase.fitting.data_split import SPLIT, typical_changes
 from dase.kernels import launch
 from dase.probes.accumulators import ProbeSums, StatisticsFrame
+from dase.probes.random_streams import Draw, SimulationStream
 from dase.probes.statistics import (
     FAMILY_WORDS,
     LAYOUT,
@@ -105,7 +104,14 @@ def distinguish(
         tried: list[tuple[float, float]] = []
         for seconds in durations:
             bench = _StimulusTest(
-                standard, seconds, size, pixels, (a, b), seed + 1000 * number, device, settings
+                standard,
+                seconds,
+                size,
+                pixels,
+                (a, b),
+                SimulationStream.STIMULUS.seed(seed, number),
+                device,
+                settings,
             )
             answer = bench.judge(repeats)
             tried.append((seconds, answer.power))
@@ -143,10 +149,10 @@ def _timestamp_structure(models: tuple[Sensor, Sensor]) -> TimestampStructure:
     """Return the regularity of time stamps that a readout of the models makes, if a file could show it."""
     for model in models:
         for effect in model.readout_effects():
-            if isinstance(effect, Timestamp) and effect.step >= PATTERNS.shortest:
-                return TimestampStructure(step=effect.step)
-            if isinstance(effect, RowScan):
-                return TimestampStructure(line=effect.line, direction=effect.direction)
+            pattern = effect.stamp_pattern()
+            # shorter ticks cannot be told from those of the file
+            if pattern is not None and (not pattern.period or pattern.period >= PATTERNS.shortest):
+                return TimestampStructure(pattern.period, pattern.line_time, pattern.direction)
     return TimestampStructure()
 
 
@@ -172,7 +178,7 @@ class _StimulusTest:
         # a recording is put together of parts, for light takes memory
         self.parts = max(1, math.ceil(pixels * steps * max(finer, 1) / settings.samples_at_once))
         count = math.ceil(pixels / self.parts)
-        rng = np.random.default_rng([seed, 1])
+        rng = Draw.PIXELS.generator(seed)
         chosen = np.sort(rng.choice(width * height, count, replace=count > width * height)).astype(np.int32)
         grid = Grid(0.0, step, steps)
         try:
@@ -225,7 +231,7 @@ class _StimulusTest:
 
     def _recordings(self, number: int, repeats: int) -> ProbeSums:
         """Return what recordings of a model sum up to, one per row."""
-        seed = self.seed + 1 + number * 500_000
+        seed = SimulationStream.RECORDING.seed(self.seed, number)
         # rows that are simulated at once: their clocks take memory
         at_once = max(1, int(self.settings.steps_at_once / (self.trials.stimulus.grid.steps * self.parts)))
         done = []

@@ -11,26 +11,13 @@ import warp as wp
 from numpy.typing import NDArray
 
 from dase.effects.base import Observations, choice, parameter
-from dase.effects.stream import Reader, StreamEffect
+from dase.effects.stream import Others, SharedReader, StreamEffect
 from dase.events import Events
 from dase.kernels import launch
 from dase.kernels.event_queue import NEVER, ONE, send_over_bus
 
 
-@dataclass(frozen=True, eq=False)
-class Others:
-    """Events that take their turns on a bus and are not looked at.
-
-    Args:
-        time: When they get there, not decreasing [ps], shape (M,).
-        polarity: 1 for ON, shape (M,).
-    """
-
-    time: NDArray[np.int64]
-    polarity: NDArray[np.uint8]
-
-
-class Bus(Reader):
+class Bus(SharedReader):
     """Sends events one after the other."""
 
     def __init__(self, service: int, patience: int):
@@ -44,13 +31,7 @@ class Bus(Reader):
         return self.beside(events, empty, np.ones(2)), until
 
     def beside(self, events: Events, others: Others, weight: NDArray[np.float64]) -> Events:
-        """Return those of some events that find room beside others that go the same way.
-
-        Args:
-            events: Sorted by time.
-            others: They take room and time, and are not returned.
-            weight: How many OFF and ON events each of the others stands for, shape (2,).
-        """
+        """Return those of some events that find room beside others, see `SharedReader.beside`."""
         through = np.empty(len(events))
         columns = (
             (events.t, wp.float64), (others.time, wp.int64), (others.polarity, wp.uint8),

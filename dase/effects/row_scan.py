@@ -9,7 +9,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dase.effects.base import Observations, choice, parameter
-from dase.effects.stream import Reader, StreamEffect, order_events, to_nanosecond, to_nanoseconds, to_seconds
+from dase.effects.stream import (
+    Reader,
+    StampPattern,
+    StreamEffect,
+    order_events,
+    to_nanosecond,
+    to_nanoseconds,
+    to_seconds,
+)
 from dase.errors import InputError
 from dase.events import Events
 
@@ -97,6 +105,10 @@ class RowScan(StreamEffect):
     def longest_delay(self, lines: int) -> float:
         """Return about how late it makes events: the time of a scan [s]."""
         return lines * self.line
+
+    def stamp_pattern(self) -> StampPattern | None:
+        """Return the times at which lines are read."""
+        return StampPattern(line_time=self.line, direction=self.direction)
 
     def reader(self, width: int, height: int, seed: int) -> Scan:
         """Return the scan of one sensor."""

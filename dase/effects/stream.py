@@ -38,6 +38,48 @@ class Reader(ABC):
         """
 
 
+@dataclass(frozen=True, eq=False)
+class Others:
+    """Events that take their turns on a bus and are not looked at.
+
+    Args:
+        time: When they get there, not decreasing [ps], shape (M,).
+        polarity: 1 for ON, shape (M,).
+    """
+
+    time: NDArray[np.int64]
+    polarity: NDArray[np.uint8]
+
+
+class SharedReader(Reader):
+    """A readout effect in which the events of all pixels take turns: those of some depend on the others'."""
+
+    @abstractmethod
+    def beside(self, events: Events, others: Others, weight: NDArray[np.float64]) -> Events:
+        """Return those of some events that find room beside others that go the same way.
+
+        Args:
+            events: Sorted by time.
+            others: They take room and time, and are not returned.
+            weight: How many OFF and ON events each of the others stands for, shape (2,).
+        """
+
+
+@dataclass(frozen=True)
+class StampPattern:
+    """A regularity that a readout gives to time stamps.
+
+    Args:
+        period: From tick to tick of a clock [s], 0 for none.
+        line_time: From line to line of a readout that visits them in turn [s], 0 for none.
+        direction: Where that readout goes: down, up, right or left.
+    """
+
+    period: float = 0.0
+    line_time: float = 0.0
+    direction: str = "down"
+
+
 @dataclass(frozen=True, kw_only=True)
 class StreamEffect(Effect):
     """A physical effect between the pixels and the file.
@@ -62,6 +104,17 @@ class StreamEffect(Effect):
     def for_share(self, share: float) -> StreamEffect:
         """Return this effect as a share of the pixels feels it, where all others are left out."""
         return self
+
+    def clock_period(self) -> float | None:
+        """Return the ticks to which times are rounded down [s], None where the effect does anything else.
+
+        Kernels stamp events by such a clock themselves, ten times as fast as events are stored and read out.
+        """
+        return None
+
+    def stamp_pattern(self) -> StampPattern | None:
+        """Return the regularity that the time stamps get, None for none."""
+        return None
 
     @abstractmethod
     def reader(self, width: int, height: int, seed: int) -> Reader:

@@ -12,6 +12,7 @@ from dase.effects.base import Observations, parameter
 from dase.effects.stream import (
     FOREVER,
     Reader,
+    StampPattern,
     StreamEffect,
     order_events,
     random_numbers,
@@ -110,6 +111,14 @@ class Timestamp(StreamEffect):
     def longest_delay(self, lines: int) -> float:
         """Return about how late it makes events [s]."""
         return max(self.step, self.jitter)
+
+    def clock_period(self) -> float | None:
+        """Return the ticks to which times are rounded down [s], None where there is jitter as well."""
+        return None if self.jitter or not self.step else self.step
+
+    def stamp_pattern(self) -> StampPattern | None:
+        """Return the ticks of the clock."""
+        return StampPattern(period=self.step) if self.step else None
 
     def reader(self, width: int, height: int, seed: int) -> Stamp:
         """Return the clock of one sensor."""

@@ -17,6 +17,7 @@ from dase.effects.stream import StreamEffect
 from dase.effects.threshold import Threshold
 from dase.events import Events
 from dase.fitting.bus_load import BusLoad
+from dase.fitting.parameter_space import SearchAxis
 from dase.fitting.readout_simulator import clock_of, noticeable_effects, pass_readout, simulate_pixels
 from dase.kernels import event_probes as kernels
 from dase.kernels import launch, pixel_codegen_trials
@@ -276,6 +277,11 @@ class BatchSimulator:
     def noticeable_effects(self, sensor: Sensor) -> tuple[StreamEffect, ...]:
         """Return the effects behind the pixels that the probes can feel."""
         return noticeable_effects(self.stimulus, self.structure, sensor)
+
+    def has_free_readout(self, sensor: Sensor, axes: Iterable[SearchAxis]) -> bool:
+        """Whether a fit along some axes changes an effect behind the pixels that the probes can feel."""
+        free = {axis.effect for axis in axes}
+        return any(type(effect) in free for effect in self.noticeable_effects(sensor))
 
     def ticks(self, sensor: Sensor) -> float | None:
         """Return what the kernel needs to know of a sensor's clock, see `clock_of`; None for a readout."""

@@ -9,8 +9,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from dase.effects.readout import Others
-from dase.effects.stream import StreamEffect, to_nanoseconds
+from dase.effects.stream import Others, StreamEffect, to_nanoseconds
 from dase.events import Events
 from dase.probes.random_streams import Draw
 from dase.probes.stimulus import Stimulus

@@ -66,7 +66,7 @@ def estimate_parameters(
         errors.append(half.judge(seed).error)
         repeats = half.repeats
         mean = repeats.mean(0)
-        gain = _parameters_per_statistic(half, model, repeats, seed=seed + turn)
+        gain = _parameters_per_statistic(half, model, repeats, seed=SimulationStream.FIT.seed(seed, turn))
         # what the pixels of the measurement make of it, also where the model is not quite right
         seen = (half.left_out @ gain.T).var(0) * (half.groups - 1)
         step = -gain @ np.where(half.scale.used, mean - half.scale.target, 0.0)
@@ -97,7 +97,8 @@ def _parameters_per_statistic(
     tight = [axis.of_threshold for axis in model.space.axes]
     reach = np.where(tight, DESCENT.tight, 1.0) * CONFIDENCE.widest
     for turn in range(2):
-        gain = _parameters_per_statistic_within(half, model, repeats, reach, seed=seed + 10 * turn)
+        own = SimulationStream.SLOPES.seed(seed, turn)
+        gain = _parameters_per_statistic_within(half, model, repeats, reach, seed=own)
         # as wide as the parameters are uncertain: wide enough to see a slope, narrow enough to be straight
         uncertain = ((repeats - mean) @ gain.T).std(0)
         reach = np.clip(4.0 * uncertain, CONFIDENCE.narrowest, CONFIDENCE.widest)
@@ -114,7 +115,7 @@ def _parameters_per_statistic_within(
         rng.choice([-1.0, 1.0], (2 * size + 4, size)) * rng.uniform(0.3, 1.0, (2 * size + 4, size)) * reach
     )
     places = np.clip(model.place + np.concatenate([steps, -steps]), low, high)
-    values = half.run(model.space, places, seed=seed + 1) / scale.sigma
+    values = half.run(model.space, places, seed=SimulationStream.SLOPE_MODELS.seed(seed)) / scale.sigma
     places, values = places - places.mean(0), values - values.mean(0)
     values = np.where(scale.used, values, 0.0)
     lines = fit_slopes(places, values)

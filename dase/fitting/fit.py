@@ -131,7 +131,8 @@ def _descend_from_starts(
         if n >= FIT.other_starts and len(_equally_good_models(ends)) > 1:
             break
         tell(f"start {n + 2}", 0.3 + 0.6 * n / FIT.most_starts)
-        model = refit_model(evidence, _move_away(_best_end(ends)[1], seed + n), seed=seed + n)
+        own = SimulationStream.FIT.seed(seed, n)
+        model = refit_model(evidence, _move_away(_best_end(ends)[1], own), seed=own)
         ends.append(
             (model.judge(evidence.held, repeats=REPEATS, seed=SimulationStream.JUDGE.seed(seed)), model)
         )

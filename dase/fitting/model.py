@@ -33,9 +33,6 @@ class RefitSettings:
     descents: int = 3
     """Descents of which the best is taken: each ends where its random numbers happen to lead."""
 
-    seeds_apart: int = 10_007
-    """Between their seeds: farther than those of one descent are from each other."""
-
     alike: float = 2.0
     """Most by which the loss of another phase may grow where it becomes the present one."""
 
@@ -191,7 +188,7 @@ def refit_model(evidence: SplitMeasurement, model: FittedModel, *, seed: int, ro
     Each of some descents has random numbers of its own, because they end where those happen to lead, and the
     last one begins with the other phase; the best of them by the random numbers of all is taken.
     """
-    seeds = [seed + REFIT.seeds_apart * n for n in range(REFIT.descents)]
+    seeds = [SimulationStream.DESCENT.seed(seed, n) for n in range(REFIT.descents)]
     works = [refit_work(evidence, model, seed=each, rounds=rounds) for each in seeds[:-1]]
     works.append(_refit_from_other_phase_work(evidence, model, seed=seeds[-1], rounds=rounds))
     ends = run_side_by_side(works)
@@ -252,7 +249,11 @@ def refit_work(
         if losses[1] < losses[0] and (yield from _as_good_work(evidence, other, losses[0], seed=seed)):
             model = other
         model = yield from model.search_work(
-            half, seed=seed + turn, radius=0.12 / (1 + turn), patient=True, over=over
+            half,
+            seed=SimulationStream.FIT.seed(seed, turn),
+            radius=0.12 / (1 + turn),
+            patient=True,
+            over=over,
         )
     return model
 

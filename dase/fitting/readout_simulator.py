@@ -11,9 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from dase.effects.readout import Bus
-from dase.effects.stream import StreamEffect
-from dase.effects.timestamp import Timestamp
+from dase.effects.stream import SharedReader, StreamEffect
 from dase.events import Events
 from dase.fitting.bus_load import BusLoad
 from dase.kernels import launch, pixel_stages
@@ -52,11 +50,10 @@ def clock_of(effects: tuple[StreamEffect, ...], structure: TimestampStructure) -
     """
     if not effects:
         return 0.0
-    clock = effects[0]
-    if len(effects) > 1 or not isinstance(clock, Timestamp) or clock.jitter or not clock.step:
-        return None
-    same = structure.line == 0 and structure.step in (0.0, clock.step)
-    return clock.step if same else None
+    period = effects[0].clock_period() if len(effects) == 1 else None
+    # where the measurement has another regularity, the shares of events that follow it have to be counted
+    same = structure.line == 0 and structure.step in (0.0, period)
+    return period if same else None
 
 
 def simulate_pixels(
@@ -103,7 +100,7 @@ def pass_readout(
     before: list[StreamEffect] = []
     for effect in effects:
         reader = effect.reader(stimulus.width, stimulus.height, seed)
-        if load is not None and weight is not None and isinstance(reader, Bus):
+        if load is not None and weight is not None and isinstance(reader, SharedReader):
             events = reader.beside(events, load.others(before, seed), weight)
         else:
             reader = effect.for_share(share).reader(stimulus.width, stimulus.height, seed)

@@ -14,7 +14,6 @@ from typing import TYPE_CHECKING, Any, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from dase.effects.timestamp import Timestamp
 from dase.fitting.batch_simulator import BatchSimulator, SimulationOrder
 from dase.fitting.parameter_space import ParameterSpace
 from dase.probes.accumulators import ProbeSums, ProbeTotals, compute_totals
@@ -104,7 +103,7 @@ def answer_requests(asks: Sequence[SimulationRequest]) -> list[Any]:
         trials, frame = ask.half.trials, None if ask.repeats else ask.half.frame
         ticks = trials.ticks(ask.space.sensor)
         # a kernel has one clock for all rows of an order: where the fit changes it, events are stored instead
-        if ticks and any(issubclass(axis.effect, Timestamp) for axis in ask.space.axes):
+        if ticks and trials.has_free_readout(ask.space.sensor, ask.space.axes):
             ticks = None
         vectors = ask.space.vectors(ask.places)
         order = SimulationOrder(ask.space.sensor, vectors, ask.seed, ask.repeats, None, frame, ticks or 0.0)

@@ -16,10 +16,6 @@ from dase.probes.accumulators import ProbeSums, StatisticsFrame, leave_groups_ou
 from dase.probes.distance import ErrorScale, Judgement, judge_model
 from dase.probes.statistics import compute_statistics, is_compared, tolerance_of
 
-FEW_REPEATS = 24
-"""Repeats of a model that needs many samples, or whose events go through a readout: both take longer."""
-
-
 Array = NDArray[np.float64]
 
 
@@ -66,17 +62,20 @@ class PixelSubset:
         return self.streams(space) or samples_per_step(space.sensor, self.frame.step) > 0
 
     def calibration_work(
-        self, space: ParameterSpace, place: Array, *, repeats: int, seed: int
+        self, space: ParameterSpace, place: Array, *, repeats: int, seed: int, few_repeats: int = 24
     ) -> Work[CalibratedSubset]:
         """Calibrate by a model: expectations and sampling errors are its own.
 
         Args:
             space: The model's free parameters.
             place: Where they are, shape (P,).
-            repeats: Simulations of it with seeds of their own; fewer where it is slow.
+            repeats: Simulations of it with seeds of their own.
             seed: Of the first of them.
+            few_repeats: Simulations at most of a model that needs many samples, or whose events go through a
+                readout: both take longer.
         """
-        repeats = min(repeats, FEW_REPEATS) if self.slow(space) else repeats
+        repeats = min(repeats, few_repeats) if self.slow(space) else repeats
+        # the load is the model's own: beside another model's its bus would be too full or too free
         loaded = self.loaded(space, place)
         places = np.repeat(np.atleast_2d(place), repeats, 0)
         (sums,) = yield [SimulationRequest(loaded, space, places, seed, repeats=True)]
@@ -117,16 +116,19 @@ class CalibratedSubset(PixelSubset):
 
 def _calibrate_by_repeats(subset: PixelSubset, sums: ProbeSums) -> CalibratedSubset:
     """Return a subset whose present model is the one with these repeats, R of them."""
+    # also where the subset is calibrated already: nothing of the model before is left
     expected = sums.halves.mean(0, dtype=np.float64)
     bare = replace(subset.frame, expected=expected, measured=None)
     target, events = compute_statistics(subset.found, bare)
     # means of models with few events are drawn to those of the measurement, so these come first
     frame = replace(bare, measured=target[0])
     values, _ = compute_statistics(sums, frame)
+    # variances add up: that of chance, and the square of what is of no concern
     square = np.maximum(tolerance_of(target[0], events[0]), 1e-9) ** 2
     # two single simulations differ by twice the variance of one
     between = 2.0 * values.var(0, ddof=1)
     used = is_compared(target[0], events[0])
+    # sums over groups exist of the first repeat only, so one simulation stands against the measurement
     measured, present = (
         compute_statistics(leave_groups_out(one, frame), frame)[0] for one in (subset.found, sums)
     )

@@ -2,49 +2,69 @@
 
 from __future__ import annotations
 
-from enum import IntEnum
+from enum import Enum, IntEnum
 
 import numpy as np
 
 
-class SimulationStream(IntEnum):
-    """What simulations are for; the number is added to the user's seed.
+class SimulationStream(Enum):
+    """What simulations are for: what is added to the user's seed, and what for each further turn.
 
     Models that are compared with one another share their random numbers, so that only what they differ in
-    shows. Repeats that calibrate or judge a model must not be those by which it was fitted.
+    shows. Repeats that calibrate or judge a model must not be those by which it was fitted. The numbers are
+    part of the results: a diagnosis can be repeated to the last digit as long as they stay as they are.
     """
 
-    FIT = 0
-    """Populations of a descent."""
-    CALIBRATE_FIT = 100
+    FIT = (0, 1)
+    """Populations of a descent; a turn is a round of a refit, a start of a fit, or a last step."""
+    DESCENT = (0, 10_007)
+    """Descents of one refit: farther apart than the rounds of one are from each other."""
+    CALIBRATE_FIT = (100, 0)
     """Repeats of a model under fit, which give its sampling errors."""
-    CALIBRATE_SCOUT = 200
+    CALIBRATE_SCOUT = (200, 0)
     """Repeats of the present model on the scout."""
-    CALIBRATE_PRESENT = 300
+    CALIBRATE_PRESENT = (300, 0)
     """Repeats of the present model on the training half, which stand in for the measurement in a test."""
-    JUDGE = 500
+    JUDGE = (500, 0)
     """Repeats of a model on the held-out half."""
-    CLOUD = 700
+    CLOUD = (700, 0)
     """Repeats in which a closer look sees what chance does."""
-    DIRECTIONS = 900
+    DIRECTIONS = (900, 0)
     """Means of models, which give the ways on which a closer look is taken."""
-    CONFIDENCE = 900
-    """Repeats of the fitted model that give its intervals; a hundred further for each last step."""
+    CONFIDENCE = (900, 100)
+    """Repeats of the fitted model that give its intervals; a turn is a last step."""
+    SLOPES = (0, 10)
+    """Slopes of statistics that intervals are taken from; a turn is a width at which they are seen."""
+    SLOPE_MODELS = (1, 0)
+    """Models that give these slopes."""
+    STIMULUS = (0, 1000)
+    """Standard recordings; a turn is a stimulus."""
+    RECORDING = (1, 500_000)
+    """Recordings of a model that is told apart from another; a turn is a model, with room for all of its."""
+
+    def __init__(self, distance: int, per_turn: int):
+        self.distance, self.per_turn = distance, per_turn
 
     def seed(self, seed: int, turn: int = 0) -> int:
         """Return the seed of this purpose for a user's seed; `turn` counts repetitions of the purpose."""
-        return seed + int(self) + 100 * turn
+        return seed + self.distance + self.per_turn * turn
 
 
 class Draw(IntEnum):
     """What is drawn on the host; the number is the second word of the generator's seed."""
 
     PIXELS = 1
+    """Which pixels are looked at, and the light of a standard recording."""
     OTHER_PIXELS = 2
+    """Which pixels stand for all that are not looked at."""
     TOLERANCE = 3
+    """By how much repeats are off by what is of no concern."""
     POPULATION = 7
+    """Directions of the populations of a descent."""
     FAR_START = 11
+    """Where further starts of a fit begin."""
     SLOPES = 13
+    """Places at which slopes of statistics are seen."""
 
     def generator(self, seed: int) -> np.random.Generator:
         """Return the random numbers of this purpose for a user's seed."""

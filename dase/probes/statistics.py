@@ -42,12 +42,6 @@ FAMILIES = {
 }
 """Families of statistics, each with the weight of all others."""
 
-TOLERANCE = 0.015
-"""Relative difference that is of no concern."""
-
-FEW = 25.0
-"""Events below which a mean over events is not compared."""
-
 Array = NDArray[np.float64]
 
 
@@ -258,9 +252,15 @@ MEANS = _is_mean()
 """Which statistics are means over events."""
 
 
-def tolerance_of(measured: Array, events: Array) -> Array:
-    """Return what each statistic may be off by: it is of no concern, or a matter of one event, (J,)."""
-    out = TOLERANCE + 1.0 / (events + 3.0)
+def tolerance_of(measured: Array, events: Array, *, relative: float = 0.015) -> Array:
+    """Return what each statistic may be off by: it is of no concern, or a matter of one event, (J,).
+
+    Args:
+        measured: Statistics of the measurement, shape (J,).
+        events: That they rest on, shape (J,).
+        relative: Difference that is of no concern, as a share.
+    """
+    out = relative + 1.0 / (events + 3.0)
     lag = np.abs(measured[LAYOUT["lag"]]).reshape(LAGS, BANDS)
     scale = np.repeat(lag.max(0)[None], LAGS, 0).reshape(-1)
     out[LAYOUT["lag"]] *= scale
@@ -276,12 +276,18 @@ def tolerance_of(measured: Array, events: Array) -> Array:
     return out
 
 
-def is_compared(measured: Array, events: Array) -> NDArray[np.bool_]:
-    """Return which statistics rest on enough events of the measurement to be compared, (J,)."""
+def is_compared(measured: Array, events: Array, *, least_events: float = 25.0) -> NDArray[np.bool_]:
+    """Return which statistics rest on enough events of the measurement to be compared, (J,).
+
+    Args:
+        measured: Statistics of the measurement, shape (J,).
+        events: That they rest on, shape (J,).
+        least_events: Below which a mean over events is not compared; the spectrum needs ten times as many.
+    """
     out = np.ones(SIZE, np.bool_)
-    out[MEANS] = events[MEANS] >= FEW
-    out[LAYOUT["spread"]] = events[LAYOUT["spread"]] >= FEW
-    out[LAYOUT["spectrum"]] = events[LAYOUT["spectrum"]] >= 10 * FEW
+    out[MEANS] = events[MEANS] >= least_events
+    out[LAYOUT["spread"]] = events[LAYOUT["spread"]] >= least_events
+    out[LAYOUT["spectrum"]] = events[LAYOUT["spectrum"]] >= 10 * least_events
     out[LAYOUT["stamps"]] = (events[LAYOUT["stamps"]] > 0) & (measured[LAYOUT["stamps"]] > 0)
     return out
 

@@ -8,7 +8,6 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from dase.effects.row_scan import DIRECTIONS
 from dase.events import Events
 
 
@@ -100,7 +99,7 @@ def find_structure(events: Events) -> TimestampStructure:
     """Return the regularities of a measurement's time stamps: seen in the first events, true of all."""
     first = events.select(slice(PATTERNS.scanned))
     best = TimestampStructure()
-    for direction in DIRECTIONS:
+    for direction in ("down", "up", "right", "left"):
         line = line_time(first, direction)
         if line > best.line:
             best = TimestampStructure(line=line, direction=direction)

@@ -10,9 +10,9 @@ import pytest
 import dase
 from dase.diagnosis.candidates import variants_to_try
 from dase.effects import EFFECTS
-from dase.effects.readout import Others, Readout
+from dase.effects.readout import Readout
 from dase.effects.row_scan import RowScan
-from dase.effects.stream import to_nanoseconds
+from dase.effects.stream import Others, to_nanoseconds
 from dase.fitting.batch_simulator import SimulationOrder
 from dase.fitting.data_split import SPLIT, least_bus_rate, split_measurement
 from dase.fitting.model import model_of
