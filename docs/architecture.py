@@ -37,7 +37,7 @@ COLUMN = {
     **dict.fromkeys(("datasets", "learning", "simulation", "effects", "scenes", "networks"), 0),
     **dict.fromkeys(("formatting", "errors"), 0),
     **dict.fromkeys(("cli", "results", "io", "events", "kernels"), 1),
-    **dict.fromkeys(("figures", "diagnosis", "fitting", "probes", "recordings"), 2),
+    **dict.fromkeys(("figures", "diagnosis", "fitting", "signatures", "probes", "recordings"), 2),
     **dict.fromkeys(("presets", "atomic_file", "text_files", "version"), 2),
 }
 """Where a package lies on its floor: what makes events is left, what asks about recordings is right."""

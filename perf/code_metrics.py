@@ -62,7 +62,10 @@ FLOORS: tuple[tuple[tuple[str, ...], str], ...] = (
     (("diagnosis",), "What a model lacks is asked with many fits."),
     (("fitting",), "Parameters are fitted by simulating many models and comparing statistics."),
     (("results", "learning"), "Results hold sensors; learning makes thresholds for them, without any fit."),
-    (("simulation",), "A sensor puts effects together and runs them over a scene."),
+    (
+        ("simulation", "signatures"),
+        "A sensor puts effects together and runs them over a scene; signatures need neither.",
+    ),
     (("probes", "effects"), "An effect knows scenes and kernels, not the sensor; a statistic only events."),
     (("recordings", "scenes"), "What a camera wrote, and what a camera looks at, both from files or made."),
     (("io", "networks", "presets"), "Files know events, not what they are used for."),
