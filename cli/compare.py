@@ -52,7 +52,7 @@ def compare_command(
 
     1 is the error that two repeats of the recording would have. Nothing is fitted: `dase fit` does that.
     """
-    from dase.cli.diagnose import progress_bar
+    from dase.cli.diagnose import plates_or_note, progress_bar
     from dase.diagnosis.compare import compare
     from dase.io import replacing
     from dase.simulation.sensor_file import load_sensor
@@ -78,9 +78,9 @@ def compare_command(
     if output is not None:
         from dase.figures import report
 
-        plates = report.measurement_plates(measured, model, seed=seed, device=device)
-        page = report.comparison_page(found, recording=recording.name, model=Path(sensor).stem, plates=plates)
-        report.write_page(output, page)
         with replacing(output.with_suffix(".json")) as part:
             part.write_text(json.dumps(found.to_json(), indent=2) + "\n")
+        plates = plates_or_note(measured, model, seed=seed, device=device)
+        page = report.comparison_page(found, recording=recording.name, model=Path(sensor).stem, plates=plates)
+        report.write_page(output, page)
         click.echo(f"{output}: open it in a browser")

@@ -22,7 +22,10 @@ from dase.cli.options import (
 )
 
 if TYPE_CHECKING:
+    from dase.figures.style import Plate
+    from dase.fitting.measurement import Measurement
     from dase.results import Diagnosis
+    from dase.simulation.sensor import Sensor
 
 
 def print_explanation(ctx: click.Context, parameter: click.Parameter, value: str | None) -> None:
@@ -114,18 +117,42 @@ def diagnose_command(
             part.write_text(json.dumps(found.to_json(), indent=2) + "\n")
     if output is not None:
         sensor_edit.write_sensor_text(sensor_update.with_diagnosis(text, found, recording.name), output)
-    if draw is not None:
-        from dase.figures.plot import plot
-
-        with replacing(draw) as part:
-            plot(found).savefig(part)
+    _print_findings(found, quiet)
+    # what was found took minutes and is said and written by now: a picture that fails costs the picture
+    drawn = draw is None or draw_or_say(draw, found)
     if report is not None:
         from dase.figures import report as pages
 
-        plates = pages.measurement_plates(measured, found.sensor, seed=seed, device=device)
+        plates = plates_or_note(measured, found.sensor, seed=seed, device=device)
         page = pages.diagnosis_page(found, recording=recording.name, model=Path(sensor).stem, plates=plates)
         pages.write_page(report, page)
-    _print_findings(found, quiet)
+    if not drawn:
+        click.get_current_context().exit(1)
+
+
+def draw_or_say(path: Path, found: Diagnosis) -> bool:
+    """Draw what was found into a file; say why where that fails, and return whether it did not."""
+    from dase.figures.plot import plot
+    from dase.io import replacing
+
+    try:
+        with replacing(path) as part:
+            plot(found).savefig(part)
+    except Exception as error:  # whatever matplotlib stumbles over
+        click.echo(f"dase: {path} could not be drawn: {type(error).__name__}: {error}", err=True)
+        return False
+    return True
+
+
+def plates_or_note(measured: Measurement, sensor: Sensor, *, seed: int, device: str) -> list[Plate]:
+    """Return pictures of a measurement beside what a model makes of it; none and a note if that fails."""
+    from dase.figures.report import measurement_plates
+
+    try:
+        return measurement_plates(measured, sensor, seed=seed, device=device)
+    except Exception as error:  # whatever a scene or matplotlib stumbles over
+        click.echo(f"note: no pictures of the events: {type(error).__name__}: {error}")
+        return []
 
 
 @contextmanager

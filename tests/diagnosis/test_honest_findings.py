@@ -1,0 +1,57 @@
+"""What was found is said whatever happens, and nothing is announced that the data contradict."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+
+import dase
+from dase.cli import dase_group
+from dase.figures import report
+from dase.results import Diagnosis, Estimate, Step
+from dase.simulation.sensor import Sensor
+
+
+@pytest.fixture
+def recording(tmp_path):
+    """Path of a few events of a sensor at rest."""
+    rng = np.random.default_rng(1)
+    t = np.sort(rng.uniform(0, 1, 400))
+    xy = rng.integers(0, 16, (2, 400))
+    events = dase.Events(t, xy[0].astype(np.uint16), xy[1].astype(np.uint16), rng.random(400) < 0.5, 16, 16)
+    dase.io.write(tmp_path / "rest.h5", dase.io.Sequence(events))
+    return tmp_path / "rest.h5"
+
+
+def found_nothing() -> Diagnosis:
+    step = Step(("threshold",), 6.0, 1.3, {"rate": 6.0}, (), None, (), ())
+    values = {"threshold.on": Estimate(0.2, 0.19, 0.21)}
+    return Diagnosis(Sensor(), (), (6.0,), 9.0, 1.0, 1.3, values, {}, None, (step,))
+
+
+def test_a_picture_that_fails_costs_the_picture(recording, tmp_path, monkeypatch):
+    """The finding is printed, the numbers are written, and the page has all but the figure."""
+
+    def fails(*args, **options):
+        raise TypeError("'float' object is not iterable")
+
+    monkeypatch.setattr("dase.diagnosis.diagnose.diagnose", lambda *args, **options: found_nothing())
+    monkeypatch.setattr(report, "staircase_of", fails)
+    monkeypatch.setattr(report, "measurement_plates", fails)
+    out = {name: tmp_path / f"out.{name}" for name in ("json", "html", "toml", "png")}
+    words = ["--json", out["json"], "-o", out["toml"], "--report", out["html"], "--draw", out["png"]]
+    result = CliRunner().invoke(
+        dase_group, ["diagnose", "ideal", str(recording), "--scene", "static", *map(str, words)]
+    )
+    assert result.exit_code == 1  # a file that was asked for is not there
+    assert "nothing is missing: error 6.00" in result.output
+    assert "out.png could not be drawn" in result.output
+    assert "Traceback" not in result.output
+    assert json.loads(out["json"].read_text())["before"] == 9.0
+    assert "threshold" in out["toml"].read_text()
+    assert "A figure could not be drawn here" in out["html"].read_text()
+    assert not out["png"].exists()
