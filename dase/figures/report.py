@@ -83,7 +83,7 @@ def comparison_page(
         html_page.table_html(("", "measured", "simulated", "model / measured"), _plain_rows(found.plain)),
         "<h2>Where the model fails</h2>",
         html_page.cells_html(found.cells, "No single cell differs by more than chance."),
-        *_figures_html(plates, comparison_drawings(found)),
+        *_figures_html([*plates, *comparison_drawings(found)]),
         _sensor_file_html(found.sensor),
         html_page.notes_html(found.notes),
     ]
@@ -130,23 +130,19 @@ def comparison_drawings(found: Comparison) -> list[Drawing]:
     return out
 
 
-def _figures_html(plates: Iterable[Plate], drawings: Iterable[Drawing]) -> list[str]:
+def _figures_html(figures: Iterable[Plate | Drawing]) -> list[str]:
     """Return figures with their captions; where one fails, a sentence in its place.
 
     What a report says took minutes to find out, so a figure that fails costs that figure and nothing else.
     """
     out = []
-    for draw in (*(partial(_itself, plate) for plate in plates), *drawings):
+    for one in figures:
         try:
-            out.append(html_page.figure_html(draw()))
+            out.append(html_page.figure_html(one if isinstance(one, Plate) else one()))
         except Exception as error:  # whatever matplotlib stumbles over
             said = f"A figure could not be drawn here ({type(error).__name__}: {error})."
             out.append(f"<p>{escape(said)}</p>")
     return out
-
-
-def _itself(plate: Plate) -> Plate:
-    return plate
 
 
 def diagnosis_page(
@@ -161,7 +157,7 @@ def diagnosis_page(
         plates: Pictures of the model that was found, see `dase.figures.event_maps`.
     """
     body = [html_page.verdict_html(diagnosis_verdict(found), wrong=found.unexplained is not None)]
-    body += _figures_html((), diagnosis_drawings(found))
+    body += _figures_html(diagnosis_drawings(found))
     if found.history and found.history[0].cells:
         body += ["<h2>Where the model failed</h2>", html_page.cells_html(found.history[0].cells)]
     if found.unexplained is not None:
@@ -172,7 +168,7 @@ def diagnosis_page(
             )
         ]
     body += [
-        *_figures_html(plates, ()),
+        *_figures_html(plates),
         _parameter_table(found.parameters),
         _sensor_file_html(found.sensor),
         html_page.notes_html(found.notes),

@@ -14,7 +14,16 @@ from dase.fitting.parameter_space import ParameterSpace
 from dase.fitting.scheduler import SimulationRequest, Work, answer_requests, run_work
 from dase.probes.accumulators import ProbeSums, StatisticsFrame, leave_groups_out
 from dase.probes.distance import ErrorScale, Judgement, judge_model
-from dase.probes.statistics import compute_statistics, is_compared, tolerance_of
+from dase.probes.statistics import (
+    LAYOUT,
+    compute_statistics,
+    events_of_spread,
+    is_compared,
+    lacks_events,
+    sampling_variance,
+    shortfall_of,
+    tolerance_of,
+)
 
 FEW_REPEATS = 24
 """Repeats of a model that needs many samples, or whose events go through a readout: both take longer."""
@@ -101,10 +110,14 @@ class PixelSubset:
         bare = replace(self.frame, expected=sums.halves.mean(0, dtype=np.float64), measured=None)
         target, events = compute_statistics(self.found, bare)
         self.frame = replace(bare, measured=target[0])
-        values, _ = compute_statistics(sums, self.frame)
+        values, sent = compute_statistics(sums, self.frame)
         off = np.maximum(tolerance_of(target[0], events[0]), 1e-9) ** 2
         repeats = 2.0 * values.var(0, ddof=1)
-        used = is_compared(target[0], events[0])
+        counted, here = events[0].copy(), sent.mean(0)
+        # the weight of these is what the model sends
+        counted[LAYOUT["spread"]] = events_of_spread(self.found.halves.sum(1, dtype=np.float64))[0]
+        least = shortfall_of(counted, here)
+        used = is_compared(target[0], events[0]) | (least > 0)
         self.off = np.sqrt(off)
         self.chance = ErrorScale(target[0], np.sqrt((0.5 + 0.5 / len(values)) * repeats + off), used)
         self.simulated = values.mean(0)
@@ -116,7 +129,10 @@ class PixelSubset:
         self.scale = ErrorScale(target[0], np.sqrt(np.maximum(repeats, scatter) + off), used)
         # of the difference from the mean of the repeats, which has nearly no sampling error of its own
         seen = np.maximum((0.5 + 0.5 / len(values)) * repeats, scatter - (0.5 - 0.5 / len(values)) * repeats)
-        self.seen = ErrorScale(target[0], np.sqrt(seen + off), used)
+        # by the scatter of a model that sends too few, it would be close to everything
+        own = sampling_variance(measured, counted)
+        seen = np.where(lacks_events(counted, here), np.minimum(seen, own), seen)
+        self.seen = ErrorScale(target[0], np.sqrt(seen + off), used, least)
         return values
 
     @property

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -10,7 +11,11 @@ from click.testing import CliRunner
 
 import dase
 from dase.cli import dase_group
+from dase.diagnosis.compare import compare
+from dase.diagnosis.explain_effect import moving_bars
+from dase.effects import EFFECTS
 from dase.figures import report
+from dase.probes.statistics import MEANS, SIZE, lacks_events, shortfall_of
 from dase.results import Diagnosis, Estimate, Step
 from dase.simulation.sensor import Sensor
 
@@ -54,3 +59,29 @@ def test_a_picture_that_fails_costs_the_picture(recording, tmp_path, monkeypatch
     assert "threshold" in out["toml"].read_text()
     assert "A figure could not be drawn here" in out["html"].read_text()
     assert not out["png"].exists()
+
+
+def test_a_model_that_sends_hardly_an_event_is_the_worst():
+    """The unit of the error is the measurement's: by its own, a silent model is close to everything."""
+    scene, true = moving_bars(), Sensor().with_effect(EFFECTS["leak"](rate=4.0))
+    events = dase.simulate(scene, true, seed=4)
+
+    def error(**threshold: float) -> float:
+        sensor = true.with_effect(replace(true["threshold"], **threshold))
+        sensor = sensor.with_effect(EFFECTS["leak"](rate=0.01)) if threshold else sensor
+        return compare(events, sensor, scene=scene, pixels=400, seed=4).error
+
+    assert error() < 0.5
+    errors = [error(on=c, off=c) for c in (0.1, 0.4, 0.8, 1.6, 8.0)]
+    assert errors[1:4] == sorted(errors[1:4])
+    assert errors[-1] > 0.98 * max(errors)  # the last two send next to nothing
+
+
+def test_events_that_a_model_does_not_send_are_a_difference():
+    measured, sent = np.full(SIZE, 400.0), np.full(SIZE, 400.0)
+    assert not lacks_events(measured, sent).any()
+    assert not shortfall_of(measured, sent).any()
+    few = shortfall_of(measured, np.full(SIZE, 10.0))
+    assert np.all(few[MEANS] > 10)
+    assert np.all(shortfall_of(measured, np.zeros(SIZE)) >= few)
+    assert not lacks_events(np.full(SIZE, 20.0), np.zeros(SIZE)).any()  # too few to say
