@@ -52,7 +52,7 @@ def compare_command(
 
     1 is the error that two repeats of the recording would have. Nothing is fitted: `dase fit` does that.
     """
-    from dase.cli.diagnose import plates_or_note, progress_bar
+    from dase.cli.diagnose import plates_or_note, print_plain_numbers, progress_bar
     from dase.diagnosis.compare import compare
     from dase.io import replacing
     from dase.simulation.sensor_file import load_sensor
@@ -71,8 +71,7 @@ def compare_command(
         click.echo(f"  {name:{width}s} {error:7.2f}")
     for cell in found.cells[:8]:
         click.echo(f"  {cell.sentence}")
-    for name, (real, made) in found.plain.items():
-        click.echo(f"  {name:34s} measured {real:9.4g}   simulated {made:9.4g}")
+    print_plain_numbers(found.plain)
     for note in found.notes:
         click.echo(f"note: {note}")
     if output is not None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
@@ -172,6 +172,14 @@ def progress_bar(quiet: bool) -> Iterator[Callable[[str, float, float], None]]:
         yield tell
 
 
+def print_plain_numbers(plain: Mapping[str, tuple[float, float]]) -> None:
+    """Print what measurement and model have in units that need no explanation."""
+    from dase.results import plain_rows
+
+    for name, measured, simulated in plain_rows(plain):
+        click.echo(f"  {name:34s} measured {measured:>9s}   simulated {simulated:>9s}")
+
+
 def _print_findings(found: Diagnosis, quiet: bool) -> None:
 
     click.echo(found.finding())
@@ -195,6 +203,7 @@ def _print_findings(found: Diagnosis, quiet: bool) -> None:
     click.echo("\nparameters, with 90 % intervals")
     for name, estimate in found.parameters.items():
         click.echo(f"  {name:24s} {estimate.value:10.4g}   {estimate.low:.4g} to {estimate.high:.4g}")
+    print_plain_numbers(found.plain)
     for note in found.notes:
         click.echo(f"note: {note}")
     click.echo(f"{found.evaluations} simulations, {found.seconds:.1f} s")

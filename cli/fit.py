@@ -21,6 +21,7 @@ from dase.cli.options import device_option, effects_option, fps_option, open_rec
 @click.option("--pixels", default=1500, show_default=True, help="In each half of the measurement.")
 @device_option
 @click.option("--seed", default=0, show_default=True, help="The same seed gives the same fit.")
+@click.option("--force", is_flag=True, help="Write the file also where the fit is worse than SENSOR.")
 @click.option("--quiet", is_flag=True, help="No progress.")
 def fit_command(
     sensor: str,
@@ -34,14 +35,18 @@ def fit_command(
     pixels: int,
     device: str,
     seed: int,
+    force: bool,
     quiet: bool,
 ) -> None:
     """Fit the parameters of the model SENSOR to RECORDING; the comments of its file stay.
 
+    A fit that is worse than SENSOR on pixels and time that it has not seen does not generalise: nothing is
+    written without --force, this is said, and the exit code is 1.
+
     Where only one of the starts came to the error of the best, the minimum may be a poor one: the file is
     written, this is said, and the exit code is 1.
     """
-    from dase.cli.diagnose import progress_bar
+    from dase.cli.diagnose import print_plain_numbers, progress_bar
     from dase.diagnosis import sensor_update
     from dase.fitting.fit import fit
     from dase.simulation import sensor_edit
@@ -53,12 +58,20 @@ def fit_command(
     with progress_bar(quiet) as tell:
         names = free.split(",") if free else None
         found = fit(measured, model, free=names, pixels=pixels, seed=seed, device=device, progress=tell)
-    sensor_edit.write_sensor_text(sensor_update.with_fit(text, found, recording.name), output)
     click.echo(f"error {found.before:.2f} → {found.error:.2f}; repeats stay below {found.gate:.2f}")
     for name, estimate in found.parameters.items():
         click.echo(f"  {name:24s} {estimate.value:10.4g}   {estimate.low:.4g} to {estimate.high:.4g}")
+    print_plain_numbers(found.plain)
     for note in found.notes:
         click.echo(f"note: {note}")
+    if found.worse and not force:
+        click.echo(
+            f"dase: {output} was not written: the fit is worse than {sensor} on held-out data "
+            f"(error {found.error:.2f}, before {found.before:.2f}); --force writes it all the same",
+            err=True,
+        )
+        click.get_current_context().exit(1)
+    sensor_edit.write_sensor_text(sensor_update.with_fit(text, found, recording.name), output)
     click.echo(f"{output}: {found.evaluations} simulations, {found.seconds:.1f} s")
     if found.poor:
         click.echo("dase: the fit may have ended in a poor minimum, see the note above", err=True)

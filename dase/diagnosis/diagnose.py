@@ -19,10 +19,11 @@ from dase.fitting.confidence_intervals import estimate_parameters
 from dase.fitting.data_split import PIXELS, split_measurement
 from dase.fitting.measurement import Measured, SceneChoice, as_measurement
 from dase.fitting.model import FittedModel, fit_present_model, model_of, refit_model, refit_work
+from dase.fitting.plain_numbers import plain_numbers
 from dase.fitting.scheduler import run_side_by_side
 from dase.probes.distance import Judgement, leaves_nothing, may_be_announced, reaches_floor, worst_families
 from dase.probes.stimulus import Trust
-from dase.results import Cell, Diagnosis, Estimate, Progress, Rank, Step, Unexplained
+from dase.results import Cell, Diagnosis, Estimate, Progress, Rank, Step, Unexplained, is_worse
 from dase.simulation.sensor import Sensor
 from dase.simulation.sensor_file import as_sensor
 
@@ -76,7 +77,7 @@ def diagnose(
     names = frozenset(effect.name for effect in given.effects)
     state = DiagnosisState(evidence, effects, seed, tell, names, settings)
     before = model_of(given, free).judge(evidence.held, repeats=settings.repeats // 2, seed=seed + 500).error
-    start = fit_present_model(evidence, given, free, seed=seed)
+    start = _fitted_unless_worse(state, given, free, before)
     model, judgement, errors = _add_one_by_one(state, start, most)
     if not reaches_floor(judgement) and most > 0:
         model, judgement = _add_pair(state, start, model, judgement)
@@ -84,6 +85,29 @@ def diagnose(
         model, judgement = prune_model(state, model, judgement)
     found = _conclude_diagnosis(state, start, model, errors, before)
     return measurement.noted(replace(found, seconds=time.perf_counter() - begin))
+
+
+def _fitted_unless_worse(
+    state: DiagnosisState, given: Sensor, free: Sequence[str] | None, before: float
+) -> FittedModel:
+    """Return the sensor as it was given, fitted; as it is where the fit does not generalise.
+
+    Args:
+        state: Gets a note of a fit that was not kept.
+        given: The sensor.
+        free: Its parameters that may be refitted; None for all.
+        before: Its held-out error.
+    """
+    evidence, seed = state.evidence, state.seed
+    fitted = fit_present_model(evidence, given, free, seed=seed)
+    judged = fitted.judge(evidence.held, repeats=state.settings.repeats // 2, seed=seed + 500)
+    if not is_worse(judged.error, before, judged.gate):
+        return fitted
+    state.notes.append(
+        f"fitted again, the sensor as given is worse on pixels and time that no fit has seen (error "
+        f"{judged.error:.2f} instead of {before:.2f}): the search began from the sensor as given"
+    )
+    return model_of(given, free)
 
 
 def _add_one_by_one(
@@ -262,7 +286,8 @@ def _conclude_diagnosis(
         ties={name: others for name, others in ties.items() if others},
         unexplained=unexplained,
         history=tuple(state.history),
-        notes=state.evidence.notes,
+        notes=(*state.notes, *state.evidence.notes),
+        plain=plain_numbers(state.evidence.held),
         evaluations=state.evidence.evaluations,
     )
 

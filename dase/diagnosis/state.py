@@ -32,6 +32,7 @@ class DiagnosisState:
         ties: Effect that was added to those that the data cannot tell apart from it.
         without: What the model left before an effect was added to it, where it counted as right already.
         first: Candidates of the first step in order of their screening, from which pairs are made.
+        notes: What the user should know of the search.
         error: Held-out error of the model that was judged last.
     """
 
@@ -47,6 +48,7 @@ class DiagnosisState:
     ties: dict[str, set[str]] = field(default_factory=dict)
     without: dict[str, Judgement] = field(default_factory=dict)
     first: list[Candidate] = field(default_factory=list)
+    notes: list[str] = field(default_factory=list)
     error: float = float("nan")
 
     def judge(self, model: FittedModel, *, repeats: int | None = None) -> Judgement:

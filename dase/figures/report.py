@@ -169,6 +169,7 @@ def diagnosis_page(
         ]
     body += [
         *_figures_html(plates),
+        html_page.table_html(("", "measured", "simulated", "model / measured"), _plain_rows(found.plain)),
         _parameter_table(found.parameters),
         _sensor_file_html(found.sensor),
         html_page.notes_html(found.notes),
@@ -279,7 +280,13 @@ def family_words(name: str) -> str:
 def _plain_rows(plain: Mapping[str, tuple[float, float]]) -> list[tuple[str, ...]]:
     # what is left of a count after rounding is none
     whole = {name: [v if abs(v) > 1e-9 else 0.0 for v in pair] for name, pair in plain.items()}
-    return [(name, format_number(m), format_number(s), _ratio_text(m, s)) for name, (m, s) in whole.items()]
+    return [
+        (name, _number_or_dash(m), _number_or_dash(s), _ratio_text(m, s)) for name, (m, s) in whole.items()
+    ]
+
+
+def _number_or_dash(value: float) -> str:
+    return "–" if math.isnan(value) else format_number(value)
 
 
 def _ratio_text(measured: float, simulated: float) -> str:

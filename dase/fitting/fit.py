@@ -14,9 +14,10 @@ from dase.fitting.data_split import PIXELS, SplitMeasurement, split_measurement
 from dase.fitting.measurement import Measured, SceneChoice, as_measurement
 from dase.fitting.model import FittedModel, fit_present_model, model_of, refit_model
 from dase.fitting.parameter_space import SearchAxis
+from dase.fitting.plain_numbers import plain_numbers
 from dase.probes.distance import Judgement
 from dase.probes.stimulus import Trust
-from dase.results import Estimate, Fit, Progress
+from dase.results import Estimate, Fit, Progress, is_worse
 from dase.simulation.sensor import Sensor
 from dase.simulation.sensor_file import as_sensor
 
@@ -84,8 +85,11 @@ def fit(
     good = _equally_good_models(ends)
     model, values = estimate_parameters(evidence, model, seed=seed)
     judgement = model.judge(evidence.held, repeats=REPEATS, seed=seed + 500)
+    plain = plain_numbers(evidence.held)
     apart = notes_on_disagreement(model, good, values)
+    values = widen_intervals(model, good, values)
     notes = [
+        *_notes_on_held_out_error(judgement, before),
         *evidence.notes,
         *apart,
         *notes_on_implausible_values(model),
@@ -103,6 +107,7 @@ def fit(
         notes=tuple(notes),
         evaluations=evidence.evaluations,
         seconds=time.perf_counter() - begin,
+        plain=plain,
     )
     return measurement.noted(found)
 
@@ -169,13 +174,49 @@ def notes_on_disagreement(
 ) -> list[str]:
     """Return a sentence for each parameter in which equally good ends differ."""
     out = []
-    for n, axis in enumerate(best.space.axes):
-        places = np.array([m.place[n] for m in ends])
-        low, high = (float(axis.to_place(v)) for v in (values[axis.name].low, values[axis.name].high))
-        if np.ptp(places) > max(AGREE * 0.5 * (high - low), NEAR):
-            found = ", ".join(f"{float(axis.to_value(p)):.3g}" for p in sorted(places))
-            out.append(f"{axis.name}: starts end at {found}; the data do not say which")
+    for n in _disagreeing_axes(best, ends, values):
+        axis = best.space.axes[n]
+        found = ", ".join(f"{float(axis.to_value(p)):.3g}" for p in sorted(m.place[n] for m in ends))
+        out.append(f"{axis.name}: starts end at {found}; the data do not say which")
     return out
+
+
+def _disagreeing_axes(
+    best: FittedModel, ends: Sequence[FittedModel], values: dict[str, Estimate]
+) -> list[int]:
+    """Return the indices of the axes on which equally good ends are apart."""
+    out = []
+    for n, axis in enumerate(best.space.axes):
+        low, high = (float(axis.to_place(v)) for v in (values[axis.name].low, values[axis.name].high))
+        if np.ptp([m.place[n] for m in ends]) > max(AGREE * 0.5 * (high - low), NEAR):
+            out.append(n)
+    return out
+
+
+def widen_intervals(
+    best: FittedModel, ends: Sequence[FittedModel], values: dict[str, Estimate]
+) -> dict[str, Estimate]:
+    """Return estimates whose intervals reach all ends where equally good ends differ.
+
+    An interval beside one end says what the data tell near that end; where others are as good, it is not all
+    that the data leave open.
+    """
+    out = dict(values)
+    for n in _disagreeing_axes(best, ends, values):
+        axis, estimate = best.space.axes[n], values[best.space.axes[n].name]
+        found = [float(axis.to_value(m.place[n])) for m in ends]
+        low, high = min(estimate.low, *found), max(estimate.high, *found)
+        out[axis.name] = replace(estimate, low=low, high=high)
+    return out
+
+
+def _notes_on_held_out_error(judgement: Judgement, before: float) -> list[str]:
+    if not is_worse(judgement.error, before, judgement.gate):
+        return []
+    return [
+        f"the fit does not generalise: on pixels and time that it has not seen its error is "
+        f"{judgement.error:.2f}, that of the sensor as it was given {before:.2f}; keep that one"
+    ]
 
 
 def notes_on_implausible_values(model: FittedModel) -> list[str]:

@@ -12,11 +12,14 @@ from click.testing import CliRunner
 import dase
 from dase.cli import dase_group
 from dase.diagnosis.compare import compare
+from dase.diagnosis.diagnose import diagnose
 from dase.diagnosis.explain_effect import moving_bars
 from dase.effects import EFFECTS
 from dase.figures import report
+from dase.fitting.fit import notes_on_disagreement, widen_intervals
+from dase.fitting.model import model_of
 from dase.probes.statistics import MEANS, SIZE, lacks_events, shortfall_of
-from dase.results import Diagnosis, Estimate, Step
+from dase.results import Diagnosis, Estimate, Fit, Step
 from dase.simulation.sensor import Sensor
 
 
@@ -85,3 +88,47 @@ def test_events_that_a_model_does_not_send_are_a_difference():
     assert np.all(few[MEANS] > 10)
     assert np.all(shortfall_of(measured, np.zeros(SIZE)) >= few)
     assert not lacks_events(np.full(SIZE, 20.0), np.zeros(SIZE)).any()  # too few to say
+
+
+def test_a_fit_that_is_worse_than_what_was_given_is_written_when_asked_twice(
+    recording, tmp_path, monkeypatch
+):
+    worse = Fit(Sensor(), {}, 3.42, 2.39, 1.0, 1.2, plain={"ON events [1/(px s)]": (2.0, 1.0)})
+    assert worse.worse
+    assert not replace(worse, before=3.4).worse  # repeats differ by as much
+    assert not replace(worse, error=1.1, before=0.3).worse  # both count as right
+    monkeypatch.setattr("dase.fitting.fit.fit", lambda *args, **options: worse)
+    out = tmp_path / "f.toml"
+    words = ["fit", "ideal", str(recording), "--scene", "static", "-o", str(out)]
+    result = CliRunner().invoke(dase_group, words)
+    assert result.exit_code == 1
+    assert "was not written" in result.output
+    assert "--force" in result.output
+    assert "ON events" in result.output
+    assert not out.exists()
+    assert CliRunner().invoke(dase_group, [*words, "--force"]).exit_code == 0
+    assert out.exists()
+
+
+def test_an_interval_reaches_all_starts_that_are_as_good():
+    model = model_of(Sensor(), ["threshold.on"])
+    axis = model.space.axes[0]
+    ends = [replace(model, place=np.array([axis.to_place(v)])) for v in (0.18, 0.426, 0.499)]
+    values = {"threshold.on": Estimate(0.426, 0.42, 0.43)}
+    assert "0.18, 0.426, 0.499" in notes_on_disagreement(ends[1], ends, values)[0]
+    wide = widen_intervals(ends[1], ends, values)["threshold.on"]
+    assert (wide.low, wide.high) == pytest.approx((0.18, 0.499))
+    assert widen_intervals(ends[1], ends[1:2], values) == values
+
+
+def test_a_search_begins_with_what_was_given_where_the_fit_is_worse(monkeypatch):
+    """A refit that held-out data contradict is not kept, and said."""
+    scene = moving_bars()
+    events = dase.simulate(scene, Sensor(), seed=4)
+    off = model_of(Sensor().with_effect(replace(Sensor()["threshold"], on=0.3, off=0.3)))
+    monkeypatch.setattr("dase.diagnosis.diagnose.fit_present_model", lambda *args, **options: off)
+    found = diagnose(events, scene=scene, pixels=200, most=0)
+    assert found.sensor["threshold"].on == pytest.approx(0.2, rel=0.05)
+    assert found.errors[0] < 1.1 * found.before
+    assert any("began from the sensor as given" in note for note in found.notes)
+    assert found.plain
