@@ -21,7 +21,7 @@ from dase.cli.options import device_option, effects_option, fps_option, open_rec
 @click.option("--pixels", default=1500, show_default=True, help="In each half of the measurement.")
 @device_option
 @click.option("--seed", default=0, show_default=True, help="The same seed gives the same fit.")
-@click.option("--force", is_flag=True, help="Write the file also where the fit is worse than SENSOR.")
+@click.option("--force", is_flag=True, help="Write the file also where the fit should not be kept.")
 @click.option("--quiet", is_flag=True, help="No progress.")
 def fit_command(
     sensor: str,
@@ -40,8 +40,9 @@ def fit_command(
 ) -> None:
     """Fit the parameters of the model SENSOR to RECORDING; the comments of its file stay.
 
-    A fit that is worse than SENSOR on pixels and time that it has not seen does not generalise: nothing is
-    written without --force, this is said, and the exit code is 1.
+    A fit that is worse than SENSOR on pixels and time that it has not seen does not generalise, and one to a
+    scene that the events contradict says nothing: nothing is written without --force, this is said, and the
+    exit code is 1.
 
     Where only one of the starts came to the error of the best, the minimum may be a poor one: the file is
     written, this is said, and the exit code is 1.
@@ -64,11 +65,9 @@ def fit_command(
     print_plain_numbers(found.plain)
     for note in found.notes:
         click.echo(f"note: {note}")
-    if found.worse and not force:
+    if found.refusal() and not force:
         click.echo(
-            f"dase: {output} was not written: the fit is worse than {sensor} on held-out data "
-            f"(error {found.error:.2f}, before {found.before:.2f}); --force writes it all the same",
-            err=True,
+            f"dase: {output} was not written: {found.refusal()}; --force writes it all the same", err=True
         )
         click.get_current_context().exit(1)
     sensor_edit.write_sensor_text(sensor_update.with_fit(text, found, recording.name), output)

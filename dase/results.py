@@ -169,6 +169,7 @@ class Fit:
         evaluations: Simulations that were run.
         seconds: Time it took.
         plain: Name with unit to (measured, simulated), such as `ON events [1/(px s)]`.
+        contradiction: Why the events cannot be of the scene, in a sentence; empty where they may.
     """
 
     sensor: Sensor
@@ -183,6 +184,18 @@ class Fit:
     evaluations: int = 0
     seconds: float = 0.0
     plain: Mapping[str, tuple[float, float]] = field(default_factory=dict)
+    contradiction: str = ""
+
+    def refusal(self) -> str:
+        """Return why the fit is not to be kept unless the user insists, in words; empty where it is."""
+        if self.contradiction:
+            return self.contradiction
+        if self.worse:
+            return (
+                "the fit is worse than the sensor as it was given on held-out data "
+                f"(error {self.error:.2f}, before {self.before:.2f})"
+            )
+        return ""
 
     @property
     def worse(self) -> bool:
@@ -205,7 +218,7 @@ class Fit:
         out = {name: getattr(self, name) for name in ("error", "before", "floor", "gate", "agree", "poor")}
         out |= {"sensor": self.sensor.to_table(), "notes": list(self.notes)}
         out |= {"parameters": {name: asdict(e) for name, e in self.parameters.items()}}
-        out |= {"worse": self.worse, "plain": _plain_json(self.plain)}
+        out |= {"worse": self.worse, "contradiction": self.contradiction, "plain": _plain_json(self.plain)}
         return out | {"evaluations": self.evaluations, "seconds": self.seconds}
 
 

@@ -21,6 +21,7 @@ from dase.fitting.measurement import Measured, SceneChoice, as_measurement
 from dase.fitting.model import FittedModel, fit_present_model, model_of, refit_model, refit_work
 from dase.fitting.plain_numbers import plain_numbers
 from dase.fitting.scheduler import run_side_by_side
+from dase.fitting.search_ends import parameters_at_bounds
 from dase.probes.distance import Judgement, leaves_nothing, may_be_announced, reaches_floor, worst_families
 from dase.probes.stimulus import Trust
 from dase.results import Cell, Diagnosis, Estimate, Progress, Rank, Step, Unexplained, is_worse
@@ -78,8 +79,10 @@ def diagnose(
     state = DiagnosisState(evidence, effects, seed, tell, names, settings)
     before = model_of(given, free).judge(evidence.held, repeats=settings.repeats // 2, seed=seed + 500).error
     start = _fitted_unless_worse(state, given, free, before)
-    model, judgement, errors = _add_one_by_one(state, start, most)
-    if not reaches_floor(judgement) and most > 0:
+    # what is not of this scene has no effects to be found
+    limit = 0 if evidence.contradiction else most
+    model, judgement, errors = _add_one_by_one(state, start, limit)
+    if not reaches_floor(judgement) and limit > 0:
         model, judgement = _add_pair(state, start, model, judgement)
     if len(state.added_to(model)) > 1:
         model, judgement = prune_model(state, model, judgement)
@@ -269,9 +272,12 @@ def _conclude_diagnosis(
     model, values = estimate_parameters(state.evidence, model, seed=state.seed)
     last = state.judge(model)
     unexplained: Unexplained | None = None
-    if not may_be_announced(last):
+    doubts = _doubts_about(state, model, order)
+    if not may_be_announced(last) or doubts:
         cells = worst_cells(state.evidence, last)
         unexplained = _describe_unexplained(state, order, errors[0], last, cells)
+        if doubts:
+            unexplained = replace(unexplained, sentence=_sentence_of_doubts(order, doubts, last))
     kept = unexplained is None
     path = _errors_after_additions(state, order, errors, last.error) if kept else [errors[0]]
     ties = {n: tuple(sorted(state.ties.get(n, set()) - set(found))) for n in order if kept}
@@ -286,10 +292,22 @@ def _conclude_diagnosis(
         ties={name: others for name, others in ties.items() if others},
         unexplained=unexplained,
         history=tuple(state.history),
-        notes=(*state.notes, *state.evidence.notes),
+        notes=(*state.notes, *parameters_at_bounds(model), *state.evidence.notes),
         plain=plain_numbers(state.evidence.held),
         evaluations=state.evidence.evaluations,
     )
+
+
+def _doubts_about(state: DiagnosisState, model: FittedModel, found: tuple[str, ...]) -> list[str]:
+    """Return what forbids to announce effects although the error may be at the floor, in words."""
+    if state.evidence.contradiction:
+        return [state.evidence.contradiction]
+    return parameters_at_bounds(model) if found else []
+
+
+def _sentence_of_doubts(found: tuple[str, ...], doubts: list[str], last: Judgement) -> str:
+    fits = f"; with {' and '.join(found)} the error is {last.error:.2g}" if found else ""
+    return f"nothing is announced: {'; '.join(doubts)}{fits}"
 
 
 def _errors_after_additions(

@@ -14,6 +14,7 @@ from dase.errors import InputError
 from dase.events import Events
 from dase.fitting.batch_simulator import BatchSimulator
 from dase.fitting.bus_load import WholeSensor
+from dase.fitting.contradictions import contradiction_of_rest
 from dase.fitting.pixel_selection import choose_trusted_pixels, find_trusted_parts
 from dase.fitting.subset import Array, PixelSubset
 from dase.kernels import event_probes as kernels
@@ -67,6 +68,7 @@ class SplitMeasurement:
         busiest: Most events per second of all pixels [Hz].
         fastest: Events per second that a bus, if there is one, can send at least [Hz].
         notes: What the data cannot show.
+        contradiction: Why the events cannot be of the scene, in a sentence; empty where they may.
     """
 
     train: PixelSubset
@@ -78,6 +80,7 @@ class SplitMeasurement:
     highest_event_rate: float
     least_bus_rate: float
     notes: tuple[str, ...] = ()
+    contradiction: str = ""
 
     @property
     def evaluations(self) -> int:
@@ -165,7 +168,10 @@ def split_measurement(
         half.around = WholeSensor(scene, _times_of_grid(scene, grid), seed, device) if trust is None else None
     train, held, scout = halves
     rates = highest_event_rate(events), least_bus_rate(events, structure)
-    return SplitMeasurement(train, held, scout, bands, structure, peak, *rates, tuple(notes))
+    contradiction = contradiction_of_rest(events, light)
+    if contradiction:
+        notes.insert(0, contradiction)
+    return SplitMeasurement(train, held, scout, bands, structure, peak, *rates, tuple(notes), contradiction)
 
 
 def common_grid(events: Events, scene: Scene) -> Grid:
@@ -237,13 +243,34 @@ def typical_changes(sums: ProbeSums) -> NDArray[np.float32]:
 
 
 def _require_enough_events(halves: list[PixelSubset], events: Events, grid: Grid, notes: list[str]) -> None:
-    for half, name in zip(halves, ("fitting", "judging"), strict=True):
-        count = int(half.found.halves.sum())
+    counts = [int(half.found.halves.sum()) for half in halves]
+    for half, count, name in zip(halves, counts, ("fitting", "judging"), strict=True):
         if count < LEAST:
-            times = max(2.0, np.ceil(LEAST / max(count, 1)))
             raise InputError(
                 f"too few events to say anything: {count} of the {len(events)} lie in the part for {name}, "
-                f"at least {LEAST} are needed; record about {times:.0f} times "
-                f"as long as these {grid.step * (grid.steps - 1):.3g} s, or more motion"
+                f"at least {LEAST} are needed; {_what_helps(half, count, max(counts), events, grid)}"
                 + "".join(f"; {note}" for note in notes)
             )
+
+
+def _what_helps(half: PixelSubset, count: int, other: int, events: Events, grid: Grid) -> str:
+    """Return what would give a part of a measurement enough events."""
+    stimulus, first = half.trials.stimulus, half.frame.first
+    begin, end = (grid.begin + grid.step * n for n in (first, stimulus.grid.steps))
+    inside = int(np.count_nonzero((events.t >= begin) & (events.t < end)))
+    size, looked = stimulus.width * stimulus.height, len(stimulus.pixels)
+    # twice as many as are missing on the average: pixels differ
+    wanted = int(np.ceil(2 * LEAST / max(count, 1) * looked / 100) * 100)
+    if stimulus.holes and inside * looked >= 2 * LEAST * size:
+        return (
+            "most lie where the scene is not known: frames more often, shorter exposures or less motion help"
+        )
+    if count and wanted <= size // 2 and inside >= 2 * LEAST:
+        return f"looking at more pixels helps, {wanted} instead of {looked} (pixels)"
+    span = f"{begin:.3g} s to {end:.3g} s"
+    if inside < len(events) // 20 and other >= LEAST:
+        return f"nearly all others come before or after {span}: record what goes on over the whole time"
+    times = max(2.0, np.ceil(LEAST / max(count, 1)))
+    if count * times < LEAST or times > 50:
+        return f"from {span} the camera saw next to nothing: record more motion or more light"
+    return f"record about {times:.0f} times as long as these {grid.step * (grid.steps - 1):.3g} s, or more motion"

@@ -186,6 +186,8 @@ def denoised_normal_matrix(places: Array, values: Array, lines: Array, weights: 
     """
     rest = ((values - places @ lines.T) ** 2).sum(0) / max(len(places) - places.shape[1], 1)
     normal = lines.T @ (weights[:, None] * lines)
+    if not normal.any():  # no parameter changes anything, as thresholds of a scene at rest
+        return normal
     excess = (weights * np.minimum(rest, noise)).sum() * np.linalg.pinv(places.T @ places)
     # along each direction at least LEFT of what was seen stays
     root = np.linalg.cholesky(normal + 1e-9 * np.trace(normal) * np.eye(len(normal)))

@@ -15,6 +15,7 @@ from dase.fitting.measurement import Measured, SceneChoice, as_measurement
 from dase.fitting.model import FittedModel, fit_present_model, model_of, refit_model
 from dase.fitting.parameter_space import SearchAxis
 from dase.fitting.plain_numbers import plain_numbers
+from dase.fitting.search_ends import is_where_it_began, parameters_at_bounds
 from dase.probes.distance import Judgement
 from dase.probes.stimulus import Trust
 from dase.results import Estimate, Fit, Progress, is_worse
@@ -85,6 +86,7 @@ def fit(
     good = _equally_good_models(ends)
     model, values = estimate_parameters(evidence, model, seed=seed)
     judgement = model.judge(evidence.held, repeats=REPEATS, seed=seed + 500)
+    stuck = is_where_it_began(model, given) and judgement.error > judgement.gate
     plain = plain_numbers(evidence.held)
     apart = notes_on_disagreement(model, good, values)
     values = widen_intervals(model, good, values)
@@ -92,6 +94,8 @@ def fit(
         *_notes_on_held_out_error(judgement, before),
         *evidence.notes,
         *apart,
+        *(["no descent left the start: the values are those that were given"] if stuck else []),
+        *parameters_at_bounds(model),
         *notes_on_implausible_values(model),
         *_notes_on_minimum(judgement, len(ends), len(good)),
     ]
@@ -108,6 +112,7 @@ def fit(
         evaluations=evidence.evaluations,
         seconds=time.perf_counter() - begin,
         plain=plain,
+        contradiction=evidence.contradiction,
     )
     return measurement.noted(found)
 

@@ -16,10 +16,14 @@ from dase.diagnosis.diagnose import diagnose
 from dase.diagnosis.explain_effect import moving_bars
 from dase.effects import EFFECTS
 from dase.figures import report
+from dase.fitting.contradictions import motion_at_rest
+from dase.fitting.data_split import split_measurement
 from dase.fitting.fit import notes_on_disagreement, widen_intervals
 from dase.fitting.model import model_of
+from dase.fitting.search_ends import is_where_it_began, parameters_at_bounds
 from dase.probes.statistics import MEANS, SIZE, lacks_events, shortfall_of
 from dase.results import Diagnosis, Estimate, Fit, Step
+from dase.scenes.static import StaticScene
 from dase.simulation.sensor import Sensor
 
 
@@ -132,3 +136,78 @@ def test_a_search_begins_with_what_was_given_where_the_fit_is_worse(monkeypatch)
     assert found.errors[0] < 1.1 * found.before
     assert any("began from the sensor as given" in note for note in found.notes)
     assert found.plain
+
+
+def test_a_moving_recording_that_is_declared_static_is_seen_by_its_neighbours():
+    """Nothing is announced, and a fit to it is not written."""
+    moving = dase.simulate(moving_bars(), Sensor(), seed=4)
+    found = diagnose(moving, scene="static", pixels=200)
+    assert found.selected == ()
+    assert found.unexplained is not None
+    assert "contradict a scene at rest" in found.finding()
+    assert any("contradict a scene at rest" in note for note in found.notes)
+    assert "contradict" in Fit(Sensor(), {}, 0.5, 0.6, 1.0, 1.2, contradiction="they contradict").refusal()
+
+
+@pytest.mark.parametrize(
+    "noise",
+    [
+        [EFFECTS["shot"](rate=3.0)],
+        [EFFECTS["shot"](rate=3.0), EFFECTS["hot"](share=0.01, rate=200.0)],
+        [EFFECTS["leak"](rate=1.0), EFFECTS["flicker"](frequency=100.0, depth=0.3)],
+        [EFFECTS["shot"](rate=3.0), EFFECTS["row_scan"]()],
+    ],
+    ids=lambda effects: "+".join(effect.name for effect in effects),
+)
+def test_noise_at_rest_contradicts_nothing(noise, rng):
+    scene = StaticScene(48, 40, 2.0, 0.1 + 0.8 * rng.random((40, 48)))
+    sensor = Sensor()
+    for effect in noise:
+        sensor = sensor.with_effect(effect)
+    assert motion_at_rest(dase.simulate(scene, sensor, seed=2)) == 0
+
+
+def test_what_is_at_the_end_of_its_search_is_not_announced(monkeypatch):
+    sensor = Sensor().with_effect(EFFECTS["leak"](rate=5.0))
+    model = model_of(sensor)
+    assert parameters_at_bounds(model) == []
+    place = model.place.copy()
+    names = [axis.name for axis in model.space.axes]
+    place[names.index("threshold.on")] = model.space.bounds()[1, names.index("threshold.on")]
+    place[names.index("leak.spread")] = model.space.bounds()[0, names.index("leak.spread")]
+    said = parameters_at_bounds(replace(model, place=place))
+    assert len(said) == 1
+    assert said[0].startswith("threshold.on = 3 ")
+    scene = moving_bars()
+    events = dase.simulate(scene, sensor, seed=4)
+    monkeypatch.setattr("dase.diagnosis.diagnose.parameters_at_bounds", lambda model: said)
+    library = {name: EFFECTS[name] for name in ("threshold", "leak")}
+    found = diagnose(events, scene=scene, effects=library, pixels=300)
+    assert found.selected == ()
+    assert "nothing is announced: threshold.on = 3" in found.finding()
+
+
+def test_a_model_that_no_descent_moved_is_known():
+    given = model_of(Sensor())
+    assert is_where_it_began(given, given)
+    assert not is_where_it_began(replace(given, place=given.place + 0.01), given)
+
+
+def test_too_few_events_says_what_helps():
+    rng = np.random.default_rng(2)
+
+    def events(count: int, begin: float = 0.0, end: float = 1.0, side: int = 64) -> dase.Events:
+        t, xy = np.sort(rng.uniform(begin, end, count)), rng.integers(0, side, (2, count), dtype=np.uint16)
+        return dase.Events(t, xy[0], xy[1], rng.random(count) < 0.5, side, side)
+
+    def sentence(of: dase.Events, pixels: int, length: float = 1.0) -> str:
+        scene = StaticScene(of.width, of.height, length)
+        with pytest.raises(dase.InputError, match="too few events") as caught:
+            split_measurement(of, scene, pixels=pixels)
+        return str(caught.value)
+
+    assert "looking at more pixels helps" in sentence(events(20_000), 32)
+    assert "times as long" in sentence(events(300), 2000)
+    early = events(20_000, 0.0, 0.5)
+    tail = events(20, 0.5, 1.0)
+    assert "record what goes on over the whole time" in sentence(dase.Events.concatenate([early, tail]), 2000)
