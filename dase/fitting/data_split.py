@@ -262,9 +262,7 @@ def _what_helps(half: PixelSubset, count: int, other: int, events: Events, grid:
     # twice as many as are missing on the average: pixels differ
     wanted = int(np.ceil(2 * LEAST / max(count, 1) * looked / 100) * 100)
     if stimulus.holes and inside * looked >= 2 * LEAST * size:
-        return (
-            "most lie where the scene is not known: frames more often, shorter exposures or less motion help"
-        )
+        return "most lie where the scene is not known: frames more often or less motion help"
     if count and wanted <= size // 2 and inside >= 2 * LEAST:
         return f"looking at more pixels helps, {wanted} instead of {looked} (pixels)"
     span = f"{begin:.3g} s to {end:.3g} s"
@@ -273,4 +271,5 @@ def _what_helps(half: PixelSubset, count: int, other: int, events: Events, grid:
     times = max(2.0, np.ceil(LEAST / max(count, 1)))
     if count * times < LEAST or times > 50:
         return f"from {span} the camera saw next to nothing: record more motion or more light"
-    return f"record about {times:.0f} times as long as these {grid.step * (grid.steps - 1):.3g} s, or more motion"
+    length = grid.step * (grid.steps - 1)
+    return f"record about {times:.0f} times as long as these {length:.3g} s, or more motion"
