@@ -192,9 +192,10 @@ def _print_findings(found: Diagnosis, quiet: bool) -> None:
             if math.isnan(rank.error):  # given up before it was judged
                 continue
             mark = "+" if rank.effect == step.chosen else " "
+            chance = "" if math.isnan(rank.p_value) else f"  p {rank.p_value:.3f}"
             click.echo(
                 f"  {mark} {rank.effect:14s} error {rank.error:6.2f}  {100 * rank.share:3.0f} % of the way "
-                f"to the floor  p {rank.p_value:.3f}"
+                f"to the floor{chance}"
             )
         if step.ties:
             click.echo(f"    cannot be told apart from {step.chosen}: {', '.join(step.ties)}")

@@ -231,7 +231,8 @@ class Rank:
         error: Held-out error with the effect added and everything refitted.
         fall: By how much the held-out error falls.
         share: The fall as a share of the way from the present error to the floor.
-        p_value: Chance of such a fall when the present model is true, for the best of all candidates.
+        p_value: Chance of such a fall when the present model is true, for the best of all candidates; not a
+            number for pairs.
         parameters: `effect.parameter` of what was added to its estimate.
         refined: Whether it was fitted in full; weak candidates are only screened.
     """
@@ -463,7 +464,8 @@ def _rank_words(rank: Rank) -> tuple[str, ...]:
     if math.isnan(rank.error):
         return rank.effect, "not judged"
     way = f"{100 * rank.share:.0f} % of the way to the floor"
-    return rank.effect, f"error {rank.error:.2f}", way, f"p {rank.p_value:.3f}"
+    chance = "" if math.isnan(rank.p_value) else f"p {rank.p_value:.3f}"
+    return rank.effect, f"error {rank.error:.2f}", way, chance
 
 
 def _answer_words(answer: Answer) -> tuple[str, ...]:

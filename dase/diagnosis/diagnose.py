@@ -254,12 +254,32 @@ def _add_pair(
     ]
     first = sorted(tried, key=lambda t: t[0])[:2]
     settled = run_side_by_side([refit_work(evidence, pair, seed=seed) for _, _, pair in first])
+    ranking: list[Rank] = []
     for (_, name, _), pair in zip(first, settled, strict=True):
         judged = state.judge(pair)
+        ranking = sorted([*ranking, _rank_of_pair(name, pair, judged, state.history[0])], key=_error_of_rank)
         if judged.error < judgement.error * (1.0 if reaches_floor(judged) else settings.pair_gain):
             model, judgement = pair, judged
-            state.history.append(replace(state.history[0], chosen=name, ties=(), ranking=(), cells=()))
+            state.history.append(
+                replace(state.history[0], chosen=name, ties=(), ranking=tuple(ranking), cells=())
+            )
     return model, judgement
+
+
+def _rank_of_pair(name: str, pair: FittedModel, judged: Judgement, first: Step) -> Rank:
+    """Return two effects that came in at once as the user sees them; there is no null of pairs, so no p."""
+    fall = first.error - judged.error
+    share = min(fall / max(first.error - 1.0, 1e-9), 1.0)
+    mine = {
+        axis.name: Estimate(*(3 * (float(axis.to_value(place)),)))
+        for axis, place in zip(pair.space.axes, pair.place, strict=True)
+        if axis.name.split(".")[0] in name.split(" + ")
+    }
+    return Rank(name, judged.error, fall, share, float("nan"), mine)
+
+
+def _error_of_rank(rank: Rank) -> float:
+    return rank.error
 
 
 def _conclude_diagnosis(

@@ -189,9 +189,8 @@ def draw_ranking(
         colour = Colour.INK if effect in chosen else Colour.QUIET if effect in ties else Colour.LINE
         axes.plot([present, error], [row, row], color=colour, lw=1.6, solid_capstyle="butt")
         axes.plot([error], [row], "o", ms=6, color=colour)
-        note = f"{format_number(error)}   " + (
-            f"p ≤ {format_number(p)}" if p < 0.05 else "by chance" if p > 0.5 else f"p = {p:.2f}"
-        )
+        said = f"p ≤ {format_number(p)}" if p < 0.05 else "by chance" if p > 0.5 else f"p = {p:.2f}"
+        note = f"{format_number(error)}   {'' if math.isnan(p) else said}"
         note += "   found" if effect in chosen else "   as good" if effect in ties else ""
         axes.annotate(
             note, (1.02, row), xycoords=("axes fraction", "data"), fontsize=8.5, color=Colour.INK, va="center"

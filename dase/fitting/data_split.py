@@ -129,14 +129,15 @@ def split_measurement(
     if trust is None:
         chosen = rng.permutation(size)[: 2 * each].astype(np.int32)
     else:
-        looks = find_trusted_parts(events, scene, _times_of_grid(scene, grid), cut, trust)
+        looks = find_trusted_parts(events, scene, times_of_grid(scene, grid), cut, trust)
         chosen = choose_trusted_pixels(looks, each, rng)
         each = len(chosen) // 2
         notes.append(looks.sentence())
-    light = light_of(scene, _times_of_grid(scene, grid), chosen)
+    times = times_of_grid(scene, grid)
+    light = light_of(scene, times, chosen)
     if not np.all(np.isfinite(light)) or light.min() < 0:
         raise InputError("scene: intensities must be finite and >= 0")
-    good = np.ones(light.shape, np.bool_) if trust is None else trust(grid.times, chosen).T.copy()
+    good = np.ones(light.shape, np.bool_) if trust is None else trust(times, chosen).T.copy()
     good[:, 1:] &= good[:, :-1]  # a step is what lies between two points of the grid
     bands = band_edges(light, good)
     sorting = partial(sort_into_cells, step=grid.step, bands=bands, log_eps=log_eps)
@@ -165,7 +166,7 @@ def split_measurement(
     for half in halves:
         half.frame = replace(half.frame, peak=peak)
         # where the scene is trusted here and there only, nobody knows what all pixels send
-        half.around = WholeSensor(scene, _times_of_grid(scene, grid), seed, device) if trust is None else None
+        half.around = WholeSensor(scene, times_of_grid(scene, grid), seed, device) if trust is None else None
     train, held, scout = halves
     rates = highest_event_rate(events), least_bus_rate(events, structure)
     contradiction = contradiction_of_rest(events, light)
@@ -213,11 +214,13 @@ def least_bus_rate(events: Events, structure: TimestampStructure) -> float:
     return max((n / (float((events.t[n:] - events.t[:-n]).min()) + slack) for n in runs), default=0.0)
 
 
-def _times_of_grid(scene: Scene, grid: Grid) -> NDArray[np.float64]:
+def times_of_grid(scene: Scene, grid: Grid) -> NDArray[np.float64]:
     """Return the times of the grid, those of the scene itself where they are the same but for rounding."""
     own = scene.sample_times()[: grid.steps]
-    same = len(own) == grid.steps and np.allclose(own, grid.times, rtol=0, atol=1e-3 * grid.step)
-    return own if same else grid.times
+    if len(own) == grid.steps and np.allclose(own, grid.times, rtol=0, atol=1e-3 * grid.step):
+        return own
+    # the last point may lie beyond the scene by a rounding
+    return np.clip(grid.times, *(float(time) for time in scene.sample_times()[[0, -1]]))
 
 
 def _make_subset(

@@ -12,18 +12,21 @@ from click.testing import CliRunner
 import dase
 from dase.cli import dase_group
 from dase.diagnosis.compare import compare
-from dase.diagnosis.diagnose import diagnose
+from dase.diagnosis.diagnose import _rank_of_pair, diagnose
 from dase.diagnosis.explain_effect import moving_bars
 from dase.effects import EFFECTS
 from dase.figures import report
 from dase.fitting.contradictions import motion_at_rest
-from dase.fitting.data_split import split_measurement
+from dase.fitting.data_split import common_grid, split_measurement, times_of_grid
 from dase.fitting.fit import notes_on_disagreement, widen_intervals
 from dase.fitting.model import model_of
 from dase.fitting.search_ends import is_where_it_began, parameters_at_bounds
+from dase.probes.distance import Judgement
 from dase.probes.statistics import MEANS, SIZE, lacks_events, shortfall_of
+from dase.probes.stimulus import Grid
 from dase.results import Diagnosis, Estimate, Fit, Step
 from dase.scenes.static import StaticScene
+from dase.scenes.video import VideoScene
 from dase.simulation.sensor import Sensor
 
 
@@ -211,3 +214,27 @@ def test_too_few_events_says_what_helps():
     early = events(20_000, 0.0, 0.5)
     tail = events(20, 0.5, 1.0)
     assert "record what goes on over the whole time" in sentence(dase.Events.concatenate([early, tail]), 2000)
+
+
+def test_the_last_point_of_the_grid_lies_within_the_scene():
+    """284 steps of 1 ms end at 0.28400000000000003 s."""
+    scene = moving_bars()
+    times = np.linspace(0, 0.284, 9)
+    frames = scene.frames(scene.sample_times()[: 9 * 35 : 35])
+    short = VideoScene(frames, times)
+    grid = common_grid(dase.simulate(short, Sensor(), seed=1), short)
+    grid = Grid(0.0, 1e-3, 285) if grid.step != 1e-3 else grid
+    assert times_of_grid(short, grid)[-1] <= 0.284
+    assert compare(dase.simulate(short, Sensor(), seed=1), "ideal", scene=short, pixels=300).error < 20
+
+
+def test_a_pair_that_was_found_is_in_the_table():
+    step = Step(("threshold",), 6.0, 1.3, {"rate": 6.0}, (), None, (), ())
+    model = model_of(Sensor().with_effect(EFFECTS["leak"](rate=5.0)).with_effect(EFFECTS["shot"](rate=2.0)))
+    judged = Judgement(1.0, 1.2, 0.5, 0.3, {}, {}, np.zeros(1), 1.0)
+    rank = _rank_of_pair("leak + shot", model, judged, step)
+    assert rank.share == 1.0
+    assert rank.parameters["leak.rate"].value == pytest.approx(5.0)
+    assert "nan" not in repr(rank)
+    found = replace(found_nothing(), history=(replace(step, ranking=(rank,), chosen=rank.effect),))
+    assert "leak + shot" in report.diagnosis_page(found, recording="a")
