@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from typing import Any
 
 import click
 
@@ -13,6 +14,7 @@ from dase.cli.options import (
     effects_option,
     fps_option,
     open_recorded,
+    part_options,
     scene_option,
 )
 
@@ -30,6 +32,7 @@ from dase.cli.options import (
 )
 @scene_option
 @fps_option
+@part_options
 @effects_option
 @click.option("--pixels", default=1500, show_default=True, help="In each half of the measurement.")
 @device_option
@@ -42,6 +45,7 @@ def compare_command(
     output: Path | None,
     scene: str,
     fps: float | None,
+    compared: dict[str, Any],
     effects: tuple[Path, ...],
     pixels: int,
     device: str,
@@ -59,7 +63,7 @@ def compare_command(
     from dase.simulation.user_effects import known_effects
 
     model = load_sensor(sensor, known_effects(effects))
-    measured = open_recorded(recording, scene, file, fps)
+    measured = open_recorded(recording, scene, file, fps, compared)
     with progress_bar(quiet) as tell:
         found = compare(measured, model, pixels=pixels, seed=seed, device=device, progress=tell)
     click.echo(

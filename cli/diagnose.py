@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import click
 
@@ -18,6 +18,7 @@ from dase.cli.options import (
     effects_option,
     fps_option,
     open_recorded,
+    part_options,
     scene_option,
 )
 
@@ -65,6 +66,7 @@ def print_explanation(ctx: click.Context, parameter: click.Parameter, value: str
     help="Draw the falling error into this PNG, SVG or PDF.",
 )
 @fps_option
+@part_options
 @effects_option
 @click.option("--pixels", default=1500, show_default=True, help="In each half of the measurement.")
 @device_option
@@ -78,6 +80,7 @@ def diagnose_command(
     file: Path | None,
     scene: str,
     fps: float | None,
+    compared: dict[str, Any],
     auto: bool,
     free: str | None,
     json_: Path | None,
@@ -104,7 +107,7 @@ def diagnose_command(
     known = known_effects(effects)
     text = sensor_edit.read_sensor_text(sensor, known)
     model = text.sensor()
-    measured = open_recorded(recording, scene, file, fps)
+    measured = open_recorded(recording, scene, file, fps, compared)
     names = free.split(",") if free else None
     with progress_bar(quiet) as tell:
         # without --auto, the first effect that is missing

@@ -3,10 +3,18 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import click
 
-from dase.cli.options import device_option, effects_option, fps_option, open_recorded, scene_option
+from dase.cli.options import (
+    device_option,
+    effects_option,
+    fps_option,
+    open_recorded,
+    part_options,
+    scene_option,
+)
 
 
 @click.command()
@@ -17,6 +25,7 @@ from dase.cli.options import device_option, effects_option, fps_option, open_rec
 @click.option("--free", help="Effects or effect.parameter to fit, with commas between.  [default: all]")
 @scene_option
 @fps_option
+@part_options
 @effects_option
 @click.option("--pixels", default=1500, show_default=True, help="In each half of the measurement.")
 @device_option
@@ -31,6 +40,7 @@ def fit_command(
     free: str | None,
     scene: str,
     fps: float | None,
+    compared: dict[str, Any],
     effects: tuple[Path, ...],
     pixels: int,
     device: str,
@@ -55,7 +65,7 @@ def fit_command(
 
     text = sensor_edit.read_sensor_text(sensor, known_effects(effects))
     model = text.sensor()
-    measured = open_recorded(recording, scene, file, fps)
+    measured = open_recorded(recording, scene, file, fps, compared)
     with progress_bar(quiet) as tell:
         names = free.split(",") if free else None
         found = fit(measured, model, free=names, pixels=pixels, seed=seed, device=device, progress=tell)

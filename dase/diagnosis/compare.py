@@ -65,7 +65,7 @@ def compare(
     model = model.bound_to(measurement.scene)
     evidence = split_measurement(
         measurement.events, measurement.scene, log_eps=model.log_eps, trust=measurement.trust,
-        pixels=pixels, seed=seed, device=device,
+        span=measurement.span, pixels=pixels, seed=seed, device=device,
     )  # fmt: skip
     tell("simulating", 0.3, float("nan"))
     judgement = model_of(model).judge(evidence.held, repeats=settings.repeats, seed=seed + 500)

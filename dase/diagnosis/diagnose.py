@@ -72,7 +72,7 @@ def diagnose(
     given = given.bound_to(measurement.scene)
     evidence = split_measurement(
         measurement.events, measurement.scene, log_eps=given.log_eps, trust=measurement.trust,
-        pixels=pixels, seed=seed, device=device,
+        span=measurement.span, pixels=pixels, seed=seed, device=device,
     )  # fmt: skip
     tell("fitting the present model", 0.0, float("nan"))
     names = frozenset(effect.name for effect in given.effects)
@@ -292,7 +292,7 @@ def _conclude_diagnosis(
     model, values = estimate_parameters(state.evidence, model, seed=state.seed)
     last = state.judge(model)
     unexplained: Unexplained | None = None
-    doubts = _doubts_about(state, model, order)
+    doubts = _doubts_about(state, model, values, order)
     if not may_be_announced(last) or doubts:
         cells = worst_cells(state.evidence, last)
         unexplained = _describe_unexplained(state, order, errors[0], last, cells)
@@ -312,17 +312,19 @@ def _conclude_diagnosis(
         ties={name: others for name, others in ties.items() if others},
         unexplained=unexplained,
         history=tuple(state.history),
-        notes=(*state.notes, *parameters_at_bounds(model), *state.evidence.notes),
+        notes=(*state.notes, *parameters_at_bounds(model, values), *state.evidence.notes),
         plain=plain_numbers(state.evidence.held),
         evaluations=state.evidence.evaluations,
     )
 
 
-def _doubts_about(state: DiagnosisState, model: FittedModel, found: tuple[str, ...]) -> list[str]:
+def _doubts_about(
+    state: DiagnosisState, model: FittedModel, values: Mapping[str, Estimate], found: tuple[str, ...]
+) -> list[str]:
     """Return what forbids to announce effects although the error may be at the floor, in words."""
     if state.evidence.contradiction:
         return [state.evidence.contradiction]
-    return parameters_at_bounds(model) if found else []
+    return parameters_at_bounds(model, values) if found else []
 
 
 def _sentence_of_doubts(found: tuple[str, ...], doubts: list[str], last: Judgement) -> str:

@@ -17,6 +17,13 @@ from dase.fitting.bus_load import WholeSensor
 from dase.fitting.contradictions import contradiction_of_rest
 from dase.fitting.pixel_selection import choose_trusted_pixels, find_trusted_parts
 from dase.fitting.subset import Array, PixelSubset
+from dase.fitting.time_window import (
+    choose_window,
+    outside_gaps,
+    repeated_gaps,
+    sentence_of_window,
+    within_span,
+)
 from dase.kernels import event_probes as kernels
 from dase.kernels import launch
 from dase.probes.accumulators import ProbeSums, StatisticsFrame
@@ -94,6 +101,7 @@ def split_measurement(
     *,
     log_eps: float = 1e-3,
     trust: Trust | None = None,
+    span: tuple[float, float] | None = None,
     pixels: int = PIXELS,
     seed: int = 0,
     device: str = "cpu",
@@ -106,6 +114,8 @@ def split_measurement(
         log_eps: Added to intensities before the logarithm.
         trust: Where and when the scene is to be trusted, all else is left out; None for everywhere, and for
             what a `CameraScene` trusts of itself.
+        span: First and last time that is compared [s]; None for all, of which a long recording has a part
+            chosen.
         pixels: In each half.
         seed: Of the choice of pixels.
         device: Where kernels run.
@@ -115,7 +125,13 @@ def split_measurement(
     """
     if trust is None and isinstance(scene, CameraScene):
         trust = scene.is_trusted
-    grid = common_grid(events, scene)
+    whole = common_grid(events, scene)
+    asked = within_span(whole, span)
+    grid = choose_window(events, scene, asked, pixels)
+    if grid is not whole:
+        inside = (events.t >= grid.begin) & (events.t <= grid.begin + grid.step * (grid.steps + 1))
+        events = events.select(inside)
+    gaps = repeated_gaps(events.t)
     try:
         to = launch.find_device(device)
     except ValueError as error:
@@ -124,7 +140,9 @@ def split_measurement(
     each = min(pixels, size // 2)
     if each < 16:
         raise InputError(f"a diagnosis needs at least 32 pixels, the scene has {scene.width}x{scene.height}")
-    rng, notes = np.random.default_rng([seed, 1]), []
+    rng, notes = np.random.default_rng([seed, 1]), list[str]()
+    if grid is not asked:
+        notes.append(sentence_of_window(asked, grid))
     cut = max(2, round(SPLIT * grid.steps))
     if trust is None:
         chosen = rng.permutation(size)[: 2 * each].astype(np.int32)
@@ -138,6 +156,10 @@ def split_measurement(
     if not np.all(np.isfinite(light)) or light.min() < 0:
         raise InputError("scene: intensities must be finite and >= 0")
     good = np.ones(light.shape, np.bool_) if trust is None else trust(times, chosen).T.copy()
+    if len(gaps):
+        good &= outside_gaps(gaps)(times)
+        length = 1e3 * float(np.median(np.diff(gaps, axis=1)))
+        notes.append(f"{len(gaps)} gaps of {length:.3g} ms without any event: data are missing, and left out")
     good[:, 1:] &= good[:, :-1]  # a step is what lies between two points of the grid
     bands = band_edges(light, good)
     sorting = partial(sort_into_cells, step=grid.step, bands=bands, log_eps=log_eps)
@@ -152,12 +174,12 @@ def split_measurement(
     late = cell[last].copy()
     late[:, :cut] = MASKED
     halves: list[PixelSubset] = []
-    for part, span, cells in ((first, train_grid, cell[first, :cut]), (last, grid, late)):
+    for part, stretch, cells in ((first, train_grid, cell[first, :cut]), (last, grid, late)):
         stimulus = Stimulus(
-            chosen[part], scene.width, scene.height, span, light[part, : span.steps], cells, log_eps, to,
-            trust is not None,
+            chosen[part], scene.width, scene.height, stretch, light[part, : stretch.steps], cells, log_eps,
+            to, trust is not None or len(gaps) > 0,
         )  # fmt: skip
-        halves.append(_make_subset(stimulus, events, cut if span is grid else 0, structure))
+        halves.append(_make_subset(stimulus, events, cut if stretch is grid else 0, structure))
     _require_enough_events(halves, events, grid, notes)
     halves.append(_make_subset(halves[0].trials.stimulus.part(SCOUTS), events, 0, structure))
     peak = peak_of(halves[0].found.clock[0], grid.step)
@@ -216,11 +238,15 @@ def least_bus_rate(events: Events, structure: TimestampStructure) -> float:
 
 def times_of_grid(scene: Scene, grid: Grid) -> NDArray[np.float64]:
     """Return the times of the grid, those of the scene itself where they are the same but for rounding."""
-    own = scene.sample_times()[: grid.steps]
+    own = scene.sample_times()
+    first = int(np.searchsorted(own, grid.begin - 0.5 * grid.step))
+    own = own[first : first + grid.steps]
     if len(own) == grid.steps and np.allclose(own, grid.times, rtol=0, atol=1e-3 * grid.step):
         return own
     # the last point may lie beyond the scene by a rounding
-    return np.clip(grid.times, *(float(time) for time in scene.sample_times()[[0, -1]]))
+    begin, end = (float(time) for time in scene.sample_times()[[0, -1]])
+    inside: NDArray[np.float64] = np.clip(grid.times, begin, end)
+    return inside
 
 
 def _make_subset(

@@ -76,7 +76,7 @@ def fit(
     start = start.bound_to(measurement.scene)
     evidence = split_measurement(
         measurement.events, measurement.scene, log_eps=start.log_eps, trust=measurement.trust,
-        pixels=pixels, seed=seed, device=device,
+        span=measurement.span, pixels=pixels, seed=seed, device=device,
     )  # fmt: skip
     given = model_of(start, free)
     before = given.judge(evidence.held, repeats=REPEATS // 2, seed=seed + 500).error
@@ -95,7 +95,7 @@ def fit(
         *evidence.notes,
         *apart,
         *(["no descent left the start: the values are those that were given"] if stuck else []),
-        *parameters_at_bounds(model),
+        *parameters_at_bounds(model, values),
         *notes_on_implausible_values(model),
         *_notes_on_minimum(judgement, len(ends), len(good)),
     ]

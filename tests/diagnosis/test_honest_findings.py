@@ -19,8 +19,10 @@ from dase.figures import report
 from dase.fitting.contradictions import motion_at_rest
 from dase.fitting.data_split import common_grid, split_measurement, times_of_grid
 from dase.fitting.fit import notes_on_disagreement, widen_intervals
+from dase.fitting.measurement import as_measurement
 from dase.fitting.model import model_of
 from dase.fitting.search_ends import is_where_it_began, parameters_at_bounds
+from dase.fitting.time_window import repeated_gaps
 from dase.probes.distance import Judgement
 from dase.probes.statistics import MEANS, SIZE, lacks_events, shortfall_of
 from dase.probes.stimulus import Grid
@@ -173,17 +175,21 @@ def test_noise_at_rest_contradicts_nothing(noise, rng):
 def test_what_is_at_the_end_of_its_search_is_not_announced(monkeypatch):
     sensor = Sensor().with_effect(EFFECTS["leak"](rate=5.0))
     model = model_of(sensor)
-    assert parameters_at_bounds(model) == []
+    sure = {axis.name: Estimate(0.2, 0.19, 0.21) for axis in model.space.axes}
+    assert parameters_at_bounds(model, sure) == []
     place = model.place.copy()
     names = [axis.name for axis in model.space.axes]
     place[names.index("threshold.on")] = model.space.bounds()[1, names.index("threshold.on")]
     place[names.index("leak.spread")] = model.space.bounds()[0, names.index("leak.spread")]
-    said = parameters_at_bounds(replace(model, place=place))
+    at_end = replace(model, place=place)
+    said = parameters_at_bounds(at_end, sure)
+    unknown = sure | {"threshold.on": Estimate(3.0, 0.02, 3.0)}
+    assert parameters_at_bounds(at_end, unknown) == []
     assert len(said) == 1
     assert said[0].startswith("threshold.on = 3 ")
     scene = moving_bars()
     events = dase.simulate(scene, sensor, seed=4)
-    monkeypatch.setattr("dase.diagnosis.diagnose.parameters_at_bounds", lambda model: said)
+    monkeypatch.setattr("dase.diagnosis.diagnose.parameters_at_bounds", lambda model, values: said)
     library = {name: EFFECTS[name] for name in ("threshold", "leak")}
     found = diagnose(events, scene=scene, effects=library, pixels=300)
     assert found.selected == ()
@@ -238,3 +244,57 @@ def test_a_pair_that_was_found_is_in_the_table():
     assert "nan" not in repr(rank)
     found = replace(found_nothing(), history=(replace(step, ranking=(rank,), chosen=rank.effect),))
     assert "leak + shot" in report.diagnosis_page(found, recording="a")
+
+
+def at_rest(length: float, rate: float, side: int = 64) -> dase.Events:
+    sensor = Sensor().with_effect(EFFECTS["shot"](rate=rate))
+    return dase.simulate(StaticScene(side, side, length), sensor, seed=3)
+
+
+def test_of_a_long_recording_a_part_is_compared():
+    """Memory and time do not grow with the recording; which part it was is said."""
+    events = at_rest(60.0, 2.0)
+    evidence = split_measurement(events, StaticScene(64, 64, 60.0), pixels=600)
+    assert evidence.held.trials.stimulus.grid.steps <= 5000
+    assert " s of 60 s are compared" in evidence.notes[0]
+    assert int(evidence.held.found.halves.sum()) > 1000
+    few = split_measurement(at_rest(60.0, 0.1), StaticScene(64, 64, 60.0), pixels=600)
+    assert few.held.trials.stimulus.grid.steps > 20_000  # so that there are enough events
+
+
+def test_the_part_that_is_compared_can_be_chosen():
+    events = at_rest(3.0, 20.0)
+    part = as_measurement(events, "static").part(1.0, 2.5, (8, 4, 32, 40))
+    assert part.trust is not None
+    evidence = split_measurement(part.events, part.scene, trust=part.trust, span=part.span, pixels=300)
+    stimulus = evidence.held.trials.stimulus
+    assert stimulus.grid.begin == pytest.approx(1.0, abs=2e-3)
+    assert stimulus.grid.times[-1] == pytest.approx(2.5, abs=2e-3)
+    x, y = stimulus.pixels % 64, stimulus.pixels // 64
+    assert (x.min(), y.min()) >= (8, 4)
+    assert x.max() < 40
+    assert y.max() < 44
+    with pytest.raises(dase.InputError, match="not on the 64x64 sensor"):
+        part.part(region=(40, 0, 32, 8))
+    with pytest.raises(dase.InputError, match="must not be empty"):
+        part.part(2.0, 1.0)
+    with pytest.raises(dase.InputError, match="in common"):
+        split_measurement(events, part.scene, span=(9.0, 10.0))
+
+
+def test_gaps_that_repeat_are_left_out():
+    """Missing data are not what the model gets wrong."""
+    events = at_rest(4.0, 20.0)
+    missing = (events.t % 0.3) < 0.018
+    cut = events.select(~missing)
+    gaps = repeated_gaps(cut.t)
+    assert len(gaps) == 13  # the first is before the first event
+    assert np.diff(gaps, axis=1) == pytest.approx(0.018, rel=0.05)
+    scene, sensor = StaticScene(64, 64, 4.0), Sensor().with_effect(EFFECTS["shot"](rate=20.0))
+    evidence = split_measurement(cut, scene, pixels=600)
+    assert any("13 gaps of 18" in note for note in evidence.notes)
+    found = compare(cut, sensor, scene=scene, pixels=600)
+    assert found.error < found.gate
+    assert len(repeated_gaps(events.t)) == 0
+    frames = np.repeat(np.arange(0, 4, 0.02), 200)
+    assert len(repeated_gaps(frames)) == 0  # stamps of whole frames, nothing is missing
