@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 import math
+import sys
+import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from functools import partial
@@ -100,24 +102,39 @@ def diagnose_command(
     """
     from dase.diagnosis import sensor_update
     from dase.diagnosis.diagnose import diagnose
-    from dase.io import replacing
     from dase.simulation import sensor_edit
     from dase.simulation.user_effects import known_effects
 
-    known = known_effects(effects)
-    text = sensor_edit.read_sensor_text(sensor, known)
+    library = known_effects(effects)
+    text = sensor_edit.read_sensor_text(sensor, library)
     model = text.sensor()
     measured = open_recorded(recording, scene, file, fps, compared)
     names = free.split(",") if free else None
-    with progress_bar(quiet) as tell:
-        # without --auto, the first effect that is missing
-        look = diagnose if auto else partial(diagnose, most=1)
-        found = look(
-            measured, model, effects=known, free=names, pixels=pixels, seed=seed, device=device, progress=tell
-        )
-    if json_ is not None:
-        with replacing(json_) as part:
-            part.write_text(json.dumps(found.to_json(), indent=2) + "\n")
+    # without --auto, the first effect that is missing
+    look = diagnose if auto else partial(diagnose, most=1)
+    known: list[Diagnosis] = []
+
+    def keep(interim: Diagnosis) -> None:
+        known.append(interim)
+        if auto:
+            if not quiet:
+                click.echo(f"so far: {interim.finding()}", err=True)
+            write_findings(json_, interim)
+
+    try:
+        with progress_bar(quiet) as tell:
+            found = look(
+                measured, model, effects=library, free=names, pixels=pixels, seed=seed, device=device,
+                progress=tell, so_far=keep,
+            )  # fmt: skip
+    except KeyboardInterrupt:
+        if not known:
+            raise
+        # hours may have gone into it: what is known is said, and nothing is written as if it were found
+        write_findings(json_, known[-1])
+        _print_findings(known[-1], quiet)
+        click.get_current_context().exit(130)
+    write_findings(json_, found)
     if output is not None:
         sensor_edit.write_sensor_text(sensor_update.with_diagnosis(text, found, recording.name), output)
     _print_findings(found, quiet)
@@ -131,6 +148,15 @@ def diagnose_command(
         pages.write_page(report, page)
     if not drawn:
         click.get_current_context().exit(1)
+
+
+def write_findings(path: Path | None, found: Diagnosis) -> None:
+    """Write findings as JSON, if a file for them was asked for."""
+    from dase.io import replacing
+
+    if path is not None:
+        with replacing(path) as part:
+            part.write_text(json.dumps(found.to_json(), indent=2) + "\n")
 
 
 def draw_or_say(path: Path, found: Diagnosis) -> bool:
@@ -159,17 +185,28 @@ def plates_or_note(measured: Measurement, sensor: Sensor, *, seed: int, device: 
 
 
 @contextmanager
-def progress_bar(quiet: bool) -> Iterator[Callable[[str, float, float], None]]:
-    """Show on a terminal what is being done, how far it is, and the present error."""
+def progress_bar(quiet: bool, *, pause: float = 10.0) -> Iterator[Callable[[str, float, float], None]]:
+    """Show what is being done, how far it is, and the present error: a bar, or in a pipe a line now and then.
+
+    Args:
+        quiet: Whether to show nothing.
+        pause: Least time between two lines in a pipe [s].
+    """
     from tqdm import tqdm
 
     layout = "{desc:32.32} |{bar}| {postfix}"
+    piped, last = not quiet and not sys.stderr.isatty(), time.monotonic()
     with tqdm(total=1.0, disable=True if quiet else None, bar_format=layout, leave=False) as shown:
 
         def tell(text: str, share: float, error: float) -> None:
+            nonlocal last
+            known = "" if error != error else f"error {error:.2f}"
+            if piped and time.monotonic() - last >= pause:
+                last = time.monotonic()
+                click.echo(", ".join(filter(None, (text, f"{100 * share:.0f} %", known))), err=True)
             shown.n = share
             shown.set_description_str(text, refresh=False)
-            shown.set_postfix_str("" if error != error else f"error {error:.2f}", refresh=False)
+            shown.set_postfix_str(known, refresh=False)
             shown.refresh()
 
         yield tell

@@ -331,6 +331,7 @@ class Diagnosis:
         evaluations: Simulations that were run.
         seconds: Time it took.
         plain: Name with unit to (measured, simulated) of the last model, such as `ON events [1/(px s)]`.
+        finished: Whether the search came to its end; before, nothing is announced.
     """
 
     sensor: Sensor
@@ -347,6 +348,7 @@ class Diagnosis:
     evaluations: int = 0
     seconds: float = 0.0
     plain: Mapping[str, tuple[float, float]] = field(default_factory=dict)
+    finished: bool = True
 
     def __repr__(self) -> str:
         steps = [("as given", self.before), *zip(("fitted", *self.selected), self.errors, strict=False)]
@@ -367,6 +369,10 @@ class Diagnosis:
 
     def finding(self) -> str:
         """Return what was found, in one line."""
+        if not self.finished:
+            added = [step.chosen for step in self.history if step.chosen]
+            tried = f"; nearest so far: {', '.join(added)}, not yet checked" if added else ""
+            return f"not finished: error {self.history[-1].error:.2f} after {len(self.history)} steps{tried}"
         if self.unexplained is not None:
             return self.unexplained.sentence
         if not self.selected:
@@ -385,6 +391,7 @@ class Diagnosis:
             "ties": {name: list(others) for name, others in self.ties.items()},
             "unexplained": None if self.unexplained is None else asdict(self.unexplained),
             "history": [asdict(step) for step in self.history],
+            "finished": self.finished,
             "plain": _plain_json(self.plain),
             "sensor": self.sensor.to_table(),
             "notes": list(self.notes),

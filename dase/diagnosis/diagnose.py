@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from itertools import combinations
 from os import PathLike
@@ -42,6 +42,7 @@ def diagnose(
     seed: int = 0,
     device: str = "cpu",
     progress: Progress | None = None,
+    so_far: Callable[[Diagnosis], None] | None = None,
     settings: DiagnosisSettings = DEFAULTS,
 ) -> Diagnosis:
     """Find the effects that a model of a camera lacks.
@@ -60,6 +61,7 @@ def diagnose(
         seed: Of every random number.
         device: Where kernels run.
         progress: Told how far it is.
+        so_far: Given what is known after each step of the search, before it is finished.
         settings: Numbers by which effects are added and dropped.
 
     Raises:
@@ -77,6 +79,10 @@ def diagnose(
     tell("fitting the present model", 0.0, float("nan"))
     names = frozenset(effect.name for effect in given.effects)
     state = DiagnosisState(evidence, effects, seed, tell, names, settings)
+    if so_far is not None:
+        state.after_step = lambda model, errors: so_far(
+            measurement.noted(_known_so_far(state, model, errors, before, time.perf_counter() - begin))
+        )
     before = model_of(given, free).judge(evidence.held, repeats=settings.repeats // 2, seed=seed + 500).error
     start = _fitted_unless_worse(state, given, free, before)
     # what is not of this scene has no effects to be found
@@ -131,6 +137,7 @@ def _add_one_by_one(
         if better is None and more and (hidden := find_hidden_effect(state, model, judgement)) is not None:
             step, better = _note_hidden_effect(state, *hidden, step, judgement), hidden[0].model
         state.history.append(step)
+        state.after_step(model if better is None else better, errors)
         if better is None:
             break
         model = better
@@ -280,6 +287,28 @@ def _rank_of_pair(name: str, pair: FittedModel, judged: Judgement, first: Step) 
 
 def _error_of_rank(rank: Rank) -> float:
     return rank.error
+
+
+def _known_so_far(
+    state: DiagnosisState, model: FittedModel, errors: list[float], before: float, seconds: float
+) -> Diagnosis:
+    """Return what a search knows after a step: the nearest model, nothing of which is announced yet."""
+    return Diagnosis(
+        sensor=model.sensor,
+        selected=(),
+        errors=(errors[0],),
+        before=before,
+        floor=1.0,
+        gate=state.history[-1].gate,
+        parameters={},
+        ties={},
+        unexplained=None,
+        history=tuple(state.history),
+        notes=(*state.notes, *state.evidence.notes),
+        evaluations=state.evidence.evaluations,
+        seconds=seconds,
+        finished=False,
+    )
 
 
 def _conclude_diagnosis(

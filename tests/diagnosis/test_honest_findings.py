@@ -11,6 +11,7 @@ from click.testing import CliRunner
 
 import dase
 from dase.cli import dase_group
+from dase.cli.diagnose import progress_bar
 from dase.diagnosis.compare import compare
 from dase.diagnosis.diagnose import _rank_of_pair, diagnose
 from dase.diagnosis.explain_effect import moving_bars
@@ -298,3 +299,48 @@ def test_gaps_that_repeat_are_left_out():
     assert len(repeated_gaps(events.t)) == 0
     frames = np.repeat(np.arange(0, 4, 0.02), 200)
     assert len(repeated_gaps(frames)) == 0  # stamps of whole frames, nothing is missing
+
+
+def test_what_is_known_is_written_as_it_is_found_and_when_the_user_stops(recording, tmp_path, monkeypatch):
+    interim = replace(found_nothing(), finished=False)
+    interim = replace(interim, history=(replace(interim.history[0], chosen="leak"),))
+
+    def stopped(*args, so_far, **options):
+        so_far(interim)
+        assert json.loads(out.read_text())["finished"] is False
+        raise KeyboardInterrupt
+
+    out = tmp_path / "f.json"
+    monkeypatch.setattr("dase.diagnosis.diagnose.diagnose", stopped)
+    words = ["diagnose", "ideal", str(recording), "--scene", "static", "--auto", "--json", str(out), "-o"]
+    result = CliRunner().invoke(dase_group, [*words, str(tmp_path / "s.toml")])
+    assert result.exit_code == 130
+    assert "not finished: error 6.00 after 1 steps; nearest so far: leak, not yet checked" in result.output
+    assert not (tmp_path / "s.toml").exists()
+
+
+def test_each_step_of_a_search_is_told():
+    scene, known = moving_bars(), []
+    events = dase.simulate(scene, Sensor().with_effect(EFFECTS["leak"](rate=5.0)), seed=4)
+    library = {name: EFFECTS[name] for name in ("threshold", "leak")}
+    found = diagnose(events, scene=scene, effects=library, pixels=300, so_far=known.append)
+    assert found.finished
+    assert [one.finished for one in known] == [False] * len(known)
+    assert known[0].history[0].chosen == "leak"
+    assert "leak" in known[0].sensor
+
+
+def test_progress_in_a_pipe_is_a_line_now_and_then(capsys, monkeypatch):
+    now = [0.0]
+    monkeypatch.setattr("dase.cli.diagnose.time.monotonic", lambda: now[0])
+    with progress_bar(False) as tell:
+        for second in range(35):
+            now[0] = float(second)
+            tell("fitting", second / 35, 2.0)
+    lines = capsys.readouterr().err.splitlines()
+    assert len(lines) == 3
+    assert lines[0] == "fitting, 29 %, error 2.00"
+    with progress_bar(True) as tell:
+        now[0] = 1000.0
+        tell("fitting", 0.5, 2.0)
+    assert capsys.readouterr().err == ""
