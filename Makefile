@@ -1,8 +1,11 @@
-# make demo, make test, make lint, make perf: each sets up .venv if it is missing.
+# make demo, test, test-all, lint, perf: each sets up .venv if it is missing. JOBS=4 make test takes four processes.
 PYTHON ?= python3
 BIN := .venv/bin
+JOBS ?= 2
+# a file's tests stay in one process, where they share what they compile and simulate
+PYTEST := $(BIN)/python -m pytest -q -n $(JOBS) --dist loadfile --no-loadscope-reorder
 
-.PHONY: demo test lint perf clean
+.PHONY: demo test test-all lint perf clean
 
 .venv/ready: pyproject.toml constraints.txt
 	$(PYTHON) -m venv .venv
@@ -14,7 +17,10 @@ demo: .venv/ready
 	$(BIN)/dase demo
 
 test: .venv/ready
-	$(BIN)/python -m pytest -q
+	$(PYTEST) -m "not slow"
+
+test-all: .venv/ready
+	$(PYTEST)
 
 lint: .venv/ready
 	$(BIN)/ruff check .
@@ -22,7 +28,7 @@ lint: .venv/ready
 	$(BIN)/mypy
 
 perf: .venv/ready
-	$(BIN)/python -m perf.benchmarks.kernels
+	$(BIN)/python -m perf.benchmarks
 
 clean:
 	rm -rf .venv build dist *.egg-info out

@@ -17,8 +17,13 @@ from dase.cli.options import parse_size
     metavar="WxH",
     help="Columns x rows.  [default: as FILE says]",
 )
+@click.option(
+    "--signatures",
+    is_flag=True,
+    help="Also say which effects FILE shows by itself, without a scene or a model.",
+)
 @click.option("--json", "as_json", is_flag=True, help="Print one JSON object, for programs.")
-def info_command(file: Path, size: tuple[int, int] | None, as_json: bool) -> None:
+def info_command(file: Path, size: tuple[int, int] | None, signatures: bool, as_json: bool) -> None:
     """Say what is in FILE: rates, intervals, hot pixels, frames, what was repaired and what looks odd.
 
     FILE streams through, whatever its size. Isolated events are counted on a sample; all else on all events.
@@ -31,20 +36,29 @@ def info_command(file: Path, size: tuple[int, int] | None, as_json: bool) -> Non
     from dase.recordings import summary
     from dase.recordings.anomalies import find_anomalies
     from dase.recordings.statistics import survey_file
+    from dase.signatures.find import find_signatures
 
     notes: list[str] = []
     name = io.find_format(file).name
     with tqdm(unit=" events", unit_scale=True, delay=1.0, leave=False, disable=None) as bar:
         found = survey_file(file, size=size, notes=notes, progress=bar.update).statistics()
+        shown = find_signatures(file, size=size, progress=bar.update) if signatures and found.events else None
     said = [note for note in (*notes, *find_anomalies(found)) if isinstance(note, io.Note)]
     if as_json:
-        return click.echo(json.dumps(summary.as_json(name, found, said), indent=1))
+        content = summary.as_json(name, found, said)
+        if shown is not None:
+            content["signatures"] = shown.to_json()
+        return click.echo(json.dumps(content, indent=1))
     click.echo(f"{'format':<18}{name}")
     for key, value in summary.statistics_table(found):
         click.echo(f"{key:<18}{value}")
     click.echo("\ntime between successive events of one pixel")
     for line in summary.interval_histogram(found):
         click.echo(line)
+    if shown is not None:
+        click.echo()
+        for line in shown.lines():
+            click.echo(line)
     if said:
         click.echo()
     for note in said:

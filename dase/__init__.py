@@ -27,6 +27,7 @@ if TYPE_CHECKING:
     from dase.scenes.static import StaticScene as StaticScene
     from dase.scenes.video import VideoScene as VideoScene
     from dase.scenes.video import open_video as open_video
+    from dase.signatures.find import find_signatures as find_signatures
     from dase.simulation.sensor import Sensor as Sensor
     from dase.simulation.sensor_file import dump_sensor as dump_sensor
     from dase.simulation.sensor_file import load_sensor as load_sensor
@@ -53,6 +54,7 @@ _HOMES = {
     "dase.scenes.layers": ("Layer", "LayerScene", "Motion"),
     "dase.recordings.recording": ("Recording", "open_recording"),
     "dase.scenes.scene": ("Scene",),
+    "dase.signatures.find": ("find_signatures",),
     "dase.simulation.sensor": ("Sensor",),
     "dase.simulation.simulate": ("count", "simulate", "stream"),
     "dase.simulation.sweep": ("sweep",),

@@ -12,7 +12,7 @@ In the order of the pipeline:
 - `pixel_compile`: the printed kernels, compiled;
 - `threshold_counts`, `threshold_events`, `threshold_surrogates`: pixels that are nothing but a change
   detector;
-- `event_keys`, `event_order`, `event_queue`, `event_probes`: what becomes of events;
+- `event_keys`, `event_order`, `event_queue`, `event_probes`, `event_neighbours`: what becomes of events;
 - `patch_structure`, `critic_*`: what training needs;
 - `autograd_*`: the bridge to PyTorch, the only files that import it.
 

@@ -68,9 +68,10 @@ pack() { # without networks, and without examples that no page shows; whole at a
 for step in "${steps[@]}"; do
     case $step in
     tests) run tests "$python" -m pytest -q -p no:cacheprovider --device "$first" \
-        tests/test_{pixel,pixel_invariants,lanes,effects,effects_more,effects_voltage,effects_noise,pairs}.py \
-        tests/test_{readout,readout_stages,labels,counts,scene,autograd_scene,autograd_scene_differences}.py \
-        tests/test_{patches,probes,optics,camera,static,starts,video,critics,learned,training_run}.py ;;
+        tests/{kernels,effects,probes} tests/fitting/test_descent.py \
+        tests/simulation/test_{readout_chain,labels}.py \
+        tests/scenes/test_{scenes,between_frames,static,video}.py \
+        tests/learning/test_{critic_bank,learned_sensor,training_run}.py ;;
     kernels)
         run kernels_4k "$python" -m perf.benchmarks.kernels --device cuda --size 3840x2160
         run kernels_vga "$python" -m perf.benchmarks.kernels --device cuda --size 640x480 ;;

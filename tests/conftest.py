@@ -5,12 +5,33 @@ from __future__ import annotations
 import os
 from pathlib import Path
 
+# Libraries read these when they are loaded. Tensors of tests are so small that threads of PyTorch only wait
+# for each other, ten times as long where something else wants the cores; threads of dase share them fairly.
+os.environ.setdefault("OMP_NUM_THREADS", "1")
+_PROCESSES = int(os.environ.get("PYTEST_XDIST_WORKER_COUNT", "1"))
+if _PROCESSES > 1:
+    os.environ.setdefault("DASE_THREADS", str(max((os.cpu_count() or 1) // _PROCESSES, 1)))
+
 import numpy as np
 import pytest
+from helpers.scripts import load_script
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
     parser.addoption("--device", default="cpu", help="Warp device the kernels are tested on: cpu or cuda:0")
+
+
+LONGEST = (
+    *("test_training_run", "test_diagnose", "test_tutorial", "test_learned_sensor", "test_distributed"),
+    *("test_video", "test_training", "test_commands", "test_user_effects", "test_sensor_edit"),
+)
+"""Files that take longest, in this order: where processes share the work, these are begun first."""
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Begin with what takes longest; the order of other files, and that inside of files, stays."""
+    rank = {name: k for k, name in enumerate(LONGEST)}
+    items.sort(key=lambda item: rank.get(item.path.stem, len(rank)))
 
 
 @pytest.fixture(scope="session")
@@ -29,10 +50,9 @@ def rng(request: pytest.FixtureRequest) -> np.random.Generator:
 def shared() -> Path:
     """Folder of recordings and photographs that are no part of the project; skips where it is absent.
 
-    `DASE_DATA` names it; without it, it is the folder `shared` beside the checkout.
+    `DASE_DATA` names it, see perf/data_folder.py.
     """
-    beside = Path(__file__).parents[2] / "shared"
-    path = Path(os.environ.get("DASE_DATA", beside))
-    if not (path / "photos").is_dir():
+    path = load_script("perf/data_folder.py").data_folder()
+    if path is None or not (path / "photos").is_dir():
         pytest.skip("needs recordings and photographs that are no part of the project: set DASE_DATA")
     return path

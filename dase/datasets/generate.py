@@ -176,11 +176,11 @@ def _prepare_folder(job: DatasetJob, out: Path, resume: bool) -> list[int]:
     if record.exists():
         if not resume:
             raise InputError(
-                f"{out} already holds a data set; resume it to finish it, or choose another folder"
+                f"{out} already holds a data set; resume it, or give another folder", argument="resume"
             )
         if record.read_text("utf-8") != job.text():
             raise InputError(
-                f"{out} was begun with other options (see {record}); only the same ones can resume it"
+                f"{out} was begun with other options (see {record}); to resume takes the same ones"
             )
     out.mkdir(parents=True, exist_ok=True)
     for stale in out.glob(".sequence_*.tmp.*"):  # of a run that was killed

@@ -5,13 +5,14 @@ from __future__ import annotations
 from collections.abc import Callable
 from os import PathLike
 
-from dase.diagnosis.candidates import screen_and_descend
+from dase.diagnosis.candidates import calibrate_split, screen_and_descend
 from dase.diagnosis.settings import DEFAULTS
 from dase.effects import Effect
-from dase.fitting.data_split import PIXELS, split_measurement
+from dase.fitting.data_split import SPLIT, split_measurement
 from dase.fitting.fit import fit
 from dase.fitting.measurement import Measured, SceneChoice, as_measurement
 from dase.fitting.model import fit_present_model
+from dase.probes.random_streams import SimulationStream
 from dase.probes.stimulus import Trust
 from dase.results import Fit
 from dase.simulation.sensor import Sensor
@@ -25,7 +26,7 @@ def fit_added(
     *,
     scene: SceneChoice | None = None,
     trust: Trust | None = None,
-    pixels: int = PIXELS,
+    pixels: int = SPLIT.pixels,
     seed: int = 0,
     device: str = "cpu",
     progress: Callable[[str, float, float], None] | None = None,
@@ -58,10 +59,14 @@ def fit_added(
     )  # fmt: skip
     tell("fitting without the effect", 0.0, float("nan"))
     present = fit_present_model(evidence, without, None, seed=seed)
-    before = present.judge(evidence.held, repeats=DEFAULTS.repeats // 2, seed=seed + 500).error
+    before = present.judge(
+        evidence.held, repeats=DEFAULTS.repeats // 2, seed=SimulationStream.JUDGE.seed(seed)
+    ).error
     tell(f"where to begin with {effect.name}", 0.1, before)
     # far from where it is, a descent could end in the wrong place
-    present.rebase(evidence.scout, repeats=DEFAULTS.scout_repeats, seed=seed + 200)
-    start = screen_and_descend(evidence, present, effect, seed=seed).model.sensor
+    calibrated = calibrate_split(
+        evidence, present, repeats=DEFAULTS.repeats, scout_repeats=DEFAULTS.scout_repeats, seed=seed
+    )
+    start = screen_and_descend(calibrated, present, effect, seed=seed).model.sensor
     fitted = fit(measurement, start, pixels=pixels, seed=seed, device=device, progress=progress)
     return before, fitted

@@ -3,33 +3,30 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from dase.diagnosis.settings import DEFAULTS, CandidateSettings
 from dase.effects.base import Effect
-from dase.effects.flicker import Flicker
 from dase.effects.optics import SceneEffect
-from dase.effects.readout import Readout
-from dase.effects.row_scan import RowScan
-from dase.effects.timestamp import Timestamp
-from dase.fitting.data_split import SplitMeasurement
+from dase.effects.threshold import Threshold
+from dase.fitting.data_split import CalibratedSplit, SplitMeasurement
 from dase.fitting.descent import StopRule, descent_work, ranking_work
 from dase.fitting.early_stopping import CandidateRace
 from dase.fitting.model import (
-    SETTLED,
     FittedModel,
+    calibration_while_fitting,
     refit_work,
+    shift_periodic_effects,
     starting_places,
     with_effect_added,
-    with_lamp_shifted,
 )
-from dase.fitting.parameter_space import effect_variants
 from dase.fitting.scheduler import SimulationRequest, Work, run_side_by_side, run_work, side_by_side_work
-from dase.fitting.subset import PixelSubset
+from dase.fitting.subset import CalibratedSubset
 from dase.probes.distance import ErrorScale, Judgement
+from dase.probes.random_streams import SimulationStream
 
 Array = NDArray[np.float64]
 
@@ -74,7 +71,9 @@ def effects_to_try(effects: Mapping[str, type[Effect]], present: FittedModel) ->
     # what acts on whole pictures has no place in a parameter vector; what a network has to learn first
     # cannot be tried
     known = [n for n, e in effects.items() if not issubclass(e, SceneEffect) and not e.maps]
-    return [n for n in known if n not in sensor or (sensor[n].is_off() and n != "threshold")]
+    return [
+        n for n in known if n not in sensor or (sensor[n].is_off() and not isinstance(sensor[n], Threshold))
+    ]
 
 
 def variants_to_try(
@@ -91,28 +90,12 @@ def variants_to_try(
         effect: The class.
         idle_bus: Share of what a bus can send below which a readout is no candidate.
     """
-    structure = evidence.structure
-    if effect is Flicker:
-        return [Flicker(frequency=evidence.peak)]
-    if effect is Timestamp:
-        return [Timestamp(step=structure.step, jitter=0.0)] if structure.step else []
-    if effect is RowScan:
-        return [RowScan(line=structure.line, direction=structure.direction)] if structure.line else []
-    if effect is Readout:
-        if evidence.highest_event_rate < idle_bus * evidence.least_bus_rate:
-            return []
-        # events come as fast as the bus can send them, if it ever was full
-        return [
-            replace(e, rate=evidence.highest_event_rate)
-            for e in effect_variants(effect)
-            if isinstance(e, Readout)
-        ]
-    return effect_variants(effect)
+    return list(effect.candidates(evidence.observe(idle_bus=idle_bus)))
 
 
 def acts_on_few_pixels(effect: Effect) -> bool:
-    """Whether an effect acts on a share of the pixels: a few hundred of them do not show it."""
-    return any(p.name == "share" for p in effect.parameters())
+    """Whether an effect acts on so few pixels that some hundred of them do not show it."""
+    return effect.rare
 
 
 @dataclass(frozen=True, eq=False)
@@ -130,7 +113,7 @@ class Screening:
 
     effect: Effect
     model: FittedModel
-    half: PixelSubset
+    half: CalibratedSubset
     before: Array
     places: Array
     losses: Array
@@ -151,8 +134,30 @@ class Screening:
         return Candidate(self.effect.name, model, loss, loss / self.present_loss)
 
 
+def calibrate_split(
+    evidence: SplitMeasurement, present: FittedModel, *, repeats: int, scout_repeats: int, seed: int
+) -> CalibratedSplit:
+    """Return a measurement with a model as the present one of its training half and its scout.
+
+    Args:
+        evidence: The measurement.
+        present: The model.
+        repeats: Simulations of it on the training half.
+        scout_repeats: The same on the scout.
+        seed: Of every random number.
+    """
+    train = present.calibrate(
+        evidence.train, repeats=repeats, seed=SimulationStream.CALIBRATE_PRESENT.seed(seed)
+    )
+    scout = present.calibrate(
+        evidence.scout, repeats=scout_repeats, seed=SimulationStream.CALIBRATE_SCOUT.seed(seed)
+    )
+    rest = {f.name: getattr(evidence, f.name) for f in fields(evidence) if f.name not in ("train", "scout")}
+    return CalibratedSplit(train=train, scout=scout, **rest)
+
+
 def screen_effect(
-    evidence: SplitMeasurement, present: FittedModel, effect: Effect, *, seed: int
+    evidence: CalibratedSplit, present: FittedModel, effect: Effect, *, seed: int
 ) -> Work[Screening]:
     """Run an effect at many places of its parameters, on some pixels, see `run_side_by_side`."""
     half = evidence.train if acts_on_few_pixels(effect) else evidence.scout
@@ -166,7 +171,7 @@ def screen_effect(
 
 
 def screen_and_descend(
-    evidence: SplitMeasurement, present: FittedModel, effect: Effect, *, seed: int
+    evidence: CalibratedSplit, present: FittedModel, effect: Effect, *, seed: int
 ) -> Candidate:
     """Try one effect on some pixels: many places, then a short descent from the best two."""
     screening = run_work(screen_effect(evidence, present, effect, seed=seed))
@@ -215,12 +220,12 @@ def descend_from_screening(
 
 
 def refine_candidate(
-    evidence: SplitMeasurement, tried: Candidate, race: CandidateRace, *, seed: int
+    evidence: CalibratedSplit, tried: Candidate, race: CandidateRace, *, seed: int
 ) -> Work[Candidate]:
     """Fit a candidate to all pixels of the training half, by the sampling errors of the present model."""
     # a finalist that is still on its way would be judged by where it happens to be
     half = evidence.train.loaded(tried.model.space, tried.model.place)
-    ways = with_lamp_shifted(tried.model, half.frame.step)
+    ways = shift_periodic_effects(tried.model, half.frame.step)
     works = []
     for way in ways:
         over = race.over(tried.name)
@@ -276,34 +281,34 @@ def _held_out_error(tried: Candidate) -> float:
 
 def _error_where_fitted(
     evidence: SplitMeasurement, tried: Candidate, *, seed: int
-) -> Work[tuple[float, PixelSubset]]:
+) -> Work[tuple[float, CalibratedSubset]]:
     """Return the error on the training half, and that half with the candidate as its present model."""
-    half = evidence.train.view()
-    values = yield from half.rebasing(tried.model.space, tried.model.place, repeats=SETTLED, seed=seed + 100)
-    return half.judge(values, seed=seed).error, half
+    half = yield from calibration_while_fitting(evidence, tried.model, seed=seed)
+    return half.judge(seed).error, half
 
 
 def _settle_and_judge(
     evidence: SplitMeasurement,
     tried: Candidate,
-    half: PixelSubset,
+    half: CalibratedSubset,
     repeats: int,
     over: StopRule | None,
     *,
     seed: int,
 ) -> Work[Candidate]:
     model = yield from refit_work(evidence, tried.model, seed=seed, rounds=1, half=half, over=over)
-    judgement = yield from model.judging(evidence.held.view(), repeats=repeats, seed=seed + 500)
+    judgement = yield from model.judgement_work(
+        evidence.held, repeats=repeats, seed=SimulationStream.JUDGE.seed(seed)
+    )
     return replace(tried, model=model, judgement=judgement)
 
 
 def try_effects(
-    evidence: SplitMeasurement,
+    evidence: CalibratedSplit,
     present: FittedModel,
     effects: Mapping[str, type[Effect]],
     names: Sequence[str],
     *,
-    repeats: Array,
     worst: Sequence[str],
     seed: int,
     report: StepProgress,
@@ -312,12 +317,10 @@ def try_effects(
     """Try each effect: screen all, fit the best, judge those that chance does not explain.
 
     Args:
-        evidence: The measurement; its training half and its scout must have been rebased to the present
-            model.
+        evidence: The measurement, calibrated by the present model.
         present: The model so far.
         effects: All effects known, by name.
         names: Those that are tried.
-        repeats: Statistics of repeats of the present model on the training half, shape (R, J).
         worst: Families in which the present model fails: who helps there is looked at more closely.
         seed: Of every random number.
         report: Told how far it is.
@@ -335,9 +338,9 @@ def try_effects(
     report(f"fitting {', '.join(one.name for one in chosen)}", 0.5)
     last = CandidateRace(1, settings.gives_up)
     refined = run_side_by_side([refine_candidate(evidence, one, last, seed=seed) for one in chosen])
-    finalists = with_p_values(evidence, present, refined, repeats, seed=seed)
+    finalists = with_p_values(evidence, present, refined, seed=seed)
     # what chance does as well is not added, whatever its error; few repeats cannot give a small p-value
-    significant = max(settings.significant, 1.01 / (1 + len(repeats)))
+    significant = max(settings.significant, 1.01 / (1 + len(evidence.train.repeats)))
     certain = [one for one in finalists if one.p_value <= significant]
     report(f"judging {', '.join(one.name for one in certain)}", 0.75)
     done = refit_and_judge(evidence, certain, seed=seed, settings=settings) if certain else []
@@ -347,7 +350,7 @@ def try_effects(
 
 
 def _screen_variants(
-    evidence: SplitMeasurement,
+    evidence: CalibratedSplit,
     present: FittedModel,
     variants: Sequence[Effect],
     *,
@@ -387,17 +390,16 @@ def family_specialists(
 
 
 def with_p_values(
-    evidence: SplitMeasurement,
+    evidence: CalibratedSplit,
     present: FittedModel,
     candidates: Sequence[Candidate],
-    repeats: Array,
     *,
     seed: int,
 ) -> list[Candidate]:
     """Return candidates with the p-values of what they make of the training loss."""
     scale = evidence.train.scale
     standing = evidence.train.run(present.space, present.place[None], seed=seed)[0]
-    p_value = p_value_function(scale, candidates, repeats, standing)
+    p_value = p_value_function(scale, candidates, evidence.train.repeats, standing)
     return [
         replace(one, p_value=p_value(float(scale.loss(standing)) - one.training_loss)) for one in candidates
     ]

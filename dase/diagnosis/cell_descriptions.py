@@ -7,12 +7,11 @@ from itertools import pairwise
 
 import numpy as np
 
-from dase.fitting.batch_simulator import LAG_TIMES
 from dase.fitting.data_split import SplitMeasurement
-from dase.fitting.subset import PixelSubset
 from dase.kernels.event_probes import BANDS, CLASSES, INTERVALS, KINDS, ZONES
+from dase.probes.accumulators import PROBE_TIMES
 from dase.probes.distance import Judgement
-from dase.probes.statistics import LAYOUT, LOWEST, MEANS, TONES
+from dase.probes.statistics import LAYOUT, MEANS, SPECTRUM
 from dase.probes.timestamp_patterns import TimestampStructure
 from dase.results import Cell
 
@@ -73,7 +72,7 @@ def _interval_words(evidence: SplitMeasurement, n: int) -> StatisticWords:
 
 def _lag_words(evidence: SplitMeasurement, n: int) -> StatisticWords:
     lag, where = divmod(n, BANDS)
-    a, b = 1e3 * LAG_TIMES[lag], 1e3 * LAG_TIMES[lag + 1]
+    a, b = 1e3 * PROBE_TIMES.lags[lag], 1e3 * PROBE_TIMES.lags[lag + 1]
     what = f"change of light from {b:g} to {a:g} ms before the event"
     return band_in_words(evidence, where), what, "log intensity"
 
@@ -122,9 +121,9 @@ def _ring_words(evidence: SplitMeasurement, n: int) -> StatisticWords:
 
 
 def _spectrum_words(evidence: SplitMeasurement, n: int) -> StatisticWords:
-    if n >= TONES:
+    if n >= SPECTRUM.count:
         return "all pixels", f"swing of the net rate at {evidence.peak:.4g} Hz", "share"
-    ends = np.geomspace(LOWEST, 0.5 / evidence.held.frame.step, TONES + 1)
+    ends = SPECTRUM.edges(evidence.held.frame.step)
     return "all pixels", f"power of the net rate from {ends[n]:.3g} to {ends[n + 1]:.3g} Hz", "log power"
 
 
@@ -143,7 +142,6 @@ def _octave_words(n: int) -> str:
 def worst_cells(
     evidence: SplitMeasurement,
     judgement: Judgement,
-    half: PixelSubset | None = None,
     *,
     shown: int = 24,
     notable: float = 2.5,
@@ -153,17 +151,15 @@ def worst_cells(
     Args:
         evidence: The measurement.
         judgement: Of the model.
-        half: Of the measurement, with the model as its present one; None for the held-out half.
         shown: Cells at most.
         notable: Standard errors below which a cell is not worth a sentence.
     """
-    half = half or evidence.held
-    simulated, measured = half.simulated, half.seen.target
+    simulated, measured = judgement.simulated, judgement.measured
     out = []
     for family, part in LAYOUT.items():
         for n, j in enumerate(range(part.start, part.stop)):
             z = judgement.z[j]
-            if not half.seen.used[j] or abs(z) < notable:
+            if not judgement.compared[j] or abs(z) < notable:
                 continue
             counts = not MEANS[j] and family not in ("spread", "spectrum", "stamps")
             m, s = (np.exp(v[j]) - 3.0 if counts else v[j] for v in (measured, simulated))

@@ -10,14 +10,15 @@ from numpy.typing import NDArray
 
 from dase.diagnosis.cell_descriptions import band_in_words, worst_cells
 from dase.diagnosis.settings import DEFAULTS, DiagnosisSettings
-from dase.fitting.batch_simulator import LAG_TIMES
-from dase.fitting.data_split import PIXELS, SplitMeasurement, split_measurement
+from dase.fitting.data_split import SPLIT, SplitMeasurement, split_measurement
 from dase.fitting.measurement import Measured, SceneChoice, as_measurement
 from dase.fitting.model import model_of
 from dase.fitting.plain_numbers import family_counts, octave_ends, plain_numbers, rate_counts
-from dase.fitting.subset import PixelSubset
+from dase.fitting.subset import CalibratedSubset
 from dase.kernels.event_probes import BANDS, INTERVALS, KINDS, LAGS, RESTING
+from dase.probes.accumulators import PROBE_TIMES
 from dase.probes.distance import Judgement
+from dase.probes.random_streams import SimulationStream
 from dase.probes.statistics import LAYOUT
 from dase.probes.stimulus import Trust
 from dase.results import Comparison, Curve, Progress
@@ -33,7 +34,7 @@ def compare(
     *,
     scene: SceneChoice | None = None,
     trust: Trust | None = None,
-    pixels: int = PIXELS,
+    pixels: int = SPLIT.pixels,
     seed: int = 0,
     device: str = "cpu",
     progress: Progress | None = None,
@@ -68,16 +69,31 @@ def compare(
         span=measurement.span, pixels=pixels, seed=seed, device=device,
     )  # fmt: skip
     tell("simulating", 0.3, float("nan"))
-    judgement = model_of(model).judge(evidence.held, repeats=settings.repeats, seed=seed + 500)
+    stream = SimulationStream.JUDGE.seed(seed)
+    held = model_of(model).calibrate(evidence.held, repeats=settings.repeats, seed=stream)
+    judgement = held.judge(stream)
     tell("comparing", 1.0, judgement.error)
-    found = comparison_of(evidence, judgement, model, seconds=time.perf_counter() - begin)
+    found = comparison_of(evidence, held, judgement, model, seconds=time.perf_counter() - begin)
     return measurement.noted(found)
 
 
 def comparison_of(
-    evidence: SplitMeasurement, judgement: Judgement, sensor: Sensor, *, seconds: float
+    evidence: SplitMeasurement,
+    held: CalibratedSubset,
+    judgement: Judgement,
+    sensor: Sensor,
+    *,
+    seconds: float,
 ) -> Comparison:
-    """Return the comparison with the model that the held-out half was rebased to."""
+    """Return the comparison with the present model of the held-out half.
+
+    Args:
+        evidence: The measurement.
+        held: Its held-out half, calibrated by the model.
+        judgement: Of that half.
+        sensor: The model.
+        seconds: Time it took [s].
+    """
     return Comparison(
         sensor=sensor,
         error=judgement.error,
@@ -85,16 +101,15 @@ def comparison_of(
         gate=judgement.gate,
         families=judgement.families,
         cells=worst_cells(evidence, judgement),
-        plain=plain_numbers(evidence.held),
-        curves=family_curves(evidence),
+        plain=plain_numbers(held),
+        curves=family_curves(evidence, held),
         notes=evidence.notes,
         seconds=seconds,
     )
 
 
-def family_curves(evidence: SplitMeasurement) -> dict[str, tuple[Curve, ...]]:
-    """Return what figures are drawn from, by family."""
-    half = evidence.held
+def family_curves(evidence: SplitMeasurement, half: CalibratedSubset) -> dict[str, tuple[Curve, ...]]:
+    """Return what figures are drawn from, by family; the present model of `half` is compared."""
     return {
         "rate": _rate_curves(evidence, half),
         "intervals": _interval_curves(half),
@@ -102,11 +117,11 @@ def family_curves(evidence: SplitMeasurement) -> dict[str, tuple[Curve, ...]]:
     }
 
 
-def _rate_curves(evidence: SplitMeasurement, half: PixelSubset) -> tuple[Curve, ...]:
+def _rate_curves(evidence: SplitMeasurement, half: CalibratedSubset) -> tuple[Curve, ...]:
     exposure = np.maximum(half.trials.stimulus.exposure().reshape(KINDS, BANDS), 1e-9)
     middle = np.array([-0.4, -0.12, 0.0, 0.12, 0.4])
     out = []
-    both = [rate_counts(v) for v in (half.seen.target, half.simulated)]
+    both = [rate_counts(v) for v in (half.seen.target, half.repeats.mean(0))]
     sigma = half.seen.sigma[LAYOUT["rate"]].reshape(2, KINDS, BANDS)
     for n in range(BANDS):
         for p, polarity in enumerate(("OFF", "ON")):
@@ -119,12 +134,14 @@ def _rate_curves(evidence: SplitMeasurement, half: PixelSubset) -> tuple[Curve, 
     return tuple(out)
 
 
-def _interval_curves(half: PixelSubset) -> tuple[Curve, ...]:
+def _interval_curves(half: CalibratedSubset) -> tuple[Curve, ...]:
     step = half.trials.stimulus.grid.step * 1e3
     ends = octave_ends(step)
     middle = np.concatenate([[0.35 * step], np.sqrt(ends[:-1] * ends[1:])])
     names = [f"{kin}, {state}" for state in ("moving", "at rest") for kin in ("OFF-OFF", "ON-ON", "opposite")]
-    both = [family_counts(v, "intervals").reshape(6, INTERVALS) for v in (half.seen.target, half.simulated)]
+    both = [
+        family_counts(v, "intervals").reshape(6, INTERVALS) for v in (half.seen.target, half.repeats.mean(0))
+    ]
     sigma = half.seen.sigma[LAYOUT["intervals"]].reshape(6, INTERVALS)
     return tuple(
         Curve(f"Intervals {name}", middle, "interval [ms]", "events", both[0][n], both[1][n],
@@ -133,11 +150,11 @@ def _interval_curves(half: PixelSubset) -> tuple[Curve, ...]:
     )  # fmt: skip
 
 
-def _lag_curves(evidence: SplitMeasurement, half: PixelSubset) -> tuple[Curve, ...]:
-    times = np.array(LAG_TIMES)
+def _lag_curves(evidence: SplitMeasurement, half: CalibratedSubset) -> tuple[Curve, ...]:
+    times = np.array(PROBE_TIMES.lags)
     width = 1e3 * np.diff(times)
     middle = 1e3 * 0.5 * (times[1:] + times[:-1])
-    both = [v[LAYOUT["lag"]].reshape(LAGS, BANDS) for v in (half.seen.target, half.simulated)]
+    both = [v[LAYOUT["lag"]].reshape(LAGS, BANDS) for v in (half.seen.target, half.repeats.mean(0))]
     sigma = half.seen.sigma[LAYOUT["lag"]].reshape(LAGS, BANDS)
     return tuple(
         Curve(f"Light before an event, {band_in_words(evidence, n)}", middle, "time before the event [ms]",

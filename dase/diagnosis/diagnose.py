@@ -8,7 +8,7 @@ from dataclasses import replace
 from itertools import combinations
 from os import PathLike
 
-from dase.diagnosis.candidates import Candidate, effects_to_try, try_effects
+from dase.diagnosis.candidates import Candidate, calibrate_split, effects_to_try, try_effects
 from dase.diagnosis.cell_descriptions import worst_cells
 from dase.diagnosis.directional_test import find_hidden_effect
 from dase.diagnosis.pruning import prune_model
@@ -16,13 +16,14 @@ from dase.diagnosis.settings import DEFAULTS, DiagnosisSettings
 from dase.diagnosis.state import DiagnosisState, explains_remainder, with_same_freedom
 from dase.effects import EFFECTS, Effect
 from dase.fitting.confidence_intervals import estimate_parameters
-from dase.fitting.data_split import PIXELS, split_measurement
+from dase.fitting.data_split import SPLIT, split_measurement
 from dase.fitting.measurement import Measured, SceneChoice, as_measurement
 from dase.fitting.model import FittedModel, fit_present_model, model_of, refit_model, refit_work
 from dase.fitting.plain_numbers import plain_numbers
 from dase.fitting.scheduler import run_side_by_side
 from dase.fitting.search_ends import parameters_at_bounds
 from dase.probes.distance import Judgement, leaves_nothing, may_be_announced, reaches_floor, worst_families
+from dase.probes.random_streams import SimulationStream
 from dase.probes.stimulus import Trust
 from dase.results import Cell, Diagnosis, Estimate, Progress, Rank, Step, Unexplained, is_worse
 from dase.simulation.sensor import Sensor
@@ -38,7 +39,7 @@ def diagnose(
     free: Sequence[str] | None = None,
     trust: Trust | None = None,
     most: int = 4,
-    pixels: int = PIXELS,
+    pixels: int = SPLIT.pixels,
     seed: int = 0,
     device: str = "cpu",
     progress: Progress | None = None,
@@ -83,7 +84,11 @@ def diagnose(
         state.after_step = lambda model, errors: so_far(
             measurement.noted(_known_so_far(state, model, errors, before, time.perf_counter() - begin))
         )
-    before = model_of(given, free).judge(evidence.held, repeats=settings.repeats // 2, seed=seed + 500).error
+    before = (
+        model_of(given, free)
+        .judge(evidence.held, repeats=settings.repeats // 2, seed=SimulationStream.JUDGE.seed(seed))
+        .error
+    )
     start = _fitted_unless_worse(state, given, free, before)
     # what is not of this scene has no effects to be found
     limit = 0 if evidence.contradiction else most
@@ -109,7 +114,8 @@ def _fitted_unless_worse(
     """
     evidence, seed = state.evidence, state.seed
     fitted = fit_present_model(evidence, given, free, seed=seed)
-    judged = fitted.judge(evidence.held, repeats=state.settings.repeats // 2, seed=seed + 500)
+    stream = SimulationStream.JUDGE.seed(seed)
+    judged = fitted.judge(evidence.held, repeats=state.settings.repeats // 2, seed=stream)
     if not is_worse(judged.error, before, judged.gate):
         return fitted
     state.notes.append(
@@ -159,13 +165,14 @@ def _look_for_effect(
     step = Step(names, judgement.error, judgement.gate, judgement.families, (), None, (), cells)
     if leaves_nothing(judgement) or not more:
         return step, None, False
-    repeats = model.rebase(evidence.train, repeats=settings.repeats, seed=seed + 300)
-    model.rebase(evidence.scout, repeats=settings.scout_repeats, seed=seed + 200)
     open_names = effects_to_try(state.effects, model)
     if not open_names:
         return step, None, False
+    present = calibrate_split(
+        evidence, model, repeats=settings.repeats, scout_repeats=settings.scout_repeats, seed=seed
+    )
     tried = try_effects(
-        evidence, model, state.effects, open_names, repeats=repeats, worst=worst_families(judgement),
+        present, model, state.effects, open_names, worst=worst_families(judgement),
         seed=seed, report=lambda text, share: state.progress(text, share, state.error),
         settings=settings.candidates,
     )  # fmt: skip
@@ -248,13 +255,15 @@ def _add_pair(
     """Where adding one after the other does not reach the floor, try two at once."""
     evidence, seed, settings = state.evidence, state.seed, state.settings
     singles = [one for one in state.first if one.screened_loss < settings.pair_helps_alone][: settings.paired]
-    start.rebase(evidence.scout, repeats=settings.scout_repeats, seed=seed + 200)
+    scout = start.calibrate(
+        evidence.scout, repeats=settings.scout_repeats, seed=SimulationStream.CALIBRATE_SCOUT.seed(seed)
+    )
     pairs = list(combinations(singles, 2))
     works = []
     for one, two in pairs:
         both = one.model.sensor.with_effect(two.model.sensor[two.name])
         pair = with_same_freedom(both, start, (one.name, two.name))
-        works.append(pair.searching(evidence.scout, seed=seed, iterations=4, radius=0.3))
+        works.append(pair.search_work(scout, seed=seed, iterations=4, radius=0.3))
     ends = run_side_by_side(works, lambda share: state.progress("trying pairs", share, state.error))
     tried = [
         (pair.loss, f"{one.name} + {two.name}", pair) for (one, two), pair in zip(pairs, ends, strict=True)
@@ -319,7 +328,9 @@ def _conclude_diagnosis(
     chosen = [n for s in state.history if s.chosen for n in s.chosen.split(" + ")]
     order = tuple(dict.fromkeys([*(n for n in chosen if n in found), *found]))
     model, values = estimate_parameters(state.evidence, model, seed=state.seed)
-    last = state.judge(model)
+    stream = SimulationStream.JUDGE.seed(state.seed)
+    held = model.calibrate(state.evidence.held, repeats=state.settings.repeats, seed=stream)
+    last = held.judge(stream)
     unexplained: Unexplained | None = None
     doubts = _doubts_about(state, model, values, order)
     if not may_be_announced(last) or doubts:
@@ -342,7 +353,7 @@ def _conclude_diagnosis(
         unexplained=unexplained,
         history=tuple(state.history),
         notes=(*state.notes, *parameters_at_bounds(model, values), *state.evidence.notes),
-        plain=plain_numbers(state.evidence.held),
+        plain=plain_numbers(held),
         evaluations=state.evidence.evaluations,
     )
 

@@ -17,9 +17,10 @@ from dase.diagnosis.candidates import Candidate, effects_to_try, variants_to_try
 from dase.diagnosis.settings import DEFAULTS
 from dase.diagnosis.state import DiagnosisState
 from dase.fitting.model import FittedModel, refit_model, with_effect_added
-from dase.fitting.scheduler import SimulationRequest, answer_requests, run_work
-from dase.fitting.subset import PixelSubset
+from dase.fitting.scheduler import SimulationRequest, answer_requests
+from dase.fitting.subset import CalibratedSubset, PixelSubset
 from dase.probes.distance import Judgement, reaches_floor
+from dase.probes.random_streams import SimulationStream
 from dase.probes.statistics import compute_statistics
 
 Array = NDArray[np.float64]
@@ -71,7 +72,7 @@ def find_hidden_effect(
     name, begin, p_value = start
     fitted = refit_model(state.evidence, begin, seed=state.seed, rounds=1)
     repeats = state.settings.repeats
-    judged = run_work(fitted.judging(state.evidence.held.view(), repeats=repeats, seed=state.seed + 500))
+    judged = fitted.judge(state.evidence.held, repeats=repeats, seed=SimulationStream.JUDGE.seed(state.seed))
     if not reaches_floor(judged):
         return None
     if deviation_towards(state, state.evidence.held, model, fitted) < hidden.away_held_out:
@@ -96,10 +97,10 @@ def lacks_effect_of(
 
 
 def deviation_towards(
-    state: DiagnosisState, half: PixelSubset, model: FittedModel, other: FittedModel
+    state: DiagnosisState, subset: PixelSubset, model: FittedModel, other: FittedModel
 ) -> float:
     """Return how far a measurement is from repeats of a model, on the way to another, in their deviations."""
-    half, cloud = _repeat_cloud(state, half, model)
+    half, cloud = _repeat_cloud(state, subset, model)
     one, two = _mean_statistics(state, half, [(model, model.place[None]), (other, other.place[None])])
     return float(cloud.deviations_along(_in_standard_errors(half, two - one))[0])
 
@@ -181,18 +182,20 @@ def _models_to_probe(
 
 
 def _repeat_cloud(
-    state: DiagnosisState, half: PixelSubset, model: FittedModel
-) -> tuple[PixelSubset, RepeatCloud]:
+    state: DiagnosisState, subset: PixelSubset, model: FittedModel
+) -> tuple[CalibratedSubset, RepeatCloud]:
     """Return a half with a model as its present one, and the repeats of it beside the measurement."""
-    half = half.view()
-    repeats = model.rebase(half, repeats=state.settings.repeats, seed=state.seed + 700)
+    half = model.calibrate(
+        subset, repeats=state.settings.repeats, seed=SimulationStream.CLOUD.seed(state.seed)
+    )
+    repeats = half.repeats
     middle = repeats.mean(0)
     seen = _in_standard_errors(half, half.chance.target - middle)
     cloud = RepeatCloud(_in_standard_errors(half, repeats - middle), seen, state.settings.hidden.most_of_one)
     return half, cloud
 
 
-def _in_standard_errors(half: PixelSubset, apart: Array) -> Array:
+def _in_standard_errors(half: CalibratedSubset, apart: Array) -> Array:
     """Return differences (..., J) in standard errors, only those that are compared."""
     used = half.chance.used
     out: Array = apart[..., used] / half.chance.sigma[used]
@@ -200,14 +203,17 @@ def _in_standard_errors(half: PixelSubset, apart: Array) -> Array:
 
 
 def _mean_statistics(
-    state: DiagnosisState, half: PixelSubset, models: Sequence[tuple[FittedModel, Array]]
+    state: DiagnosisState, half: CalibratedSubset, models: Sequence[tuple[FittedModel, Array]]
 ) -> list[Array]:
     """Return the mean statistics of models at some places, (M, J) each, their random numbers in common."""
-    count, seed = state.settings.hidden.repeats_of_mean, state.seed
+    count = state.settings.hidden.repeats_of_mean
+    seed = SimulationStream.DIRECTIONS.seed(state.seed)
     sums = answer_requests(
         [
-            SimulationRequest(half, m.space, np.repeat(places, count, 0), seed + 900, repeats=True)
+            SimulationRequest(half, m.space, np.repeat(places, count, 0), seed, repeats=True)
             for m, places in models
         ]
     )
-    return [compute_statistics(one, half.frame)[0].reshape(-1, count, len(half.off)).mean(1) for one in sums]
+    return [
+        compute_statistics(one, half.frame)[0].reshape(-1, count, len(half.tolerance)).mean(1) for one in sums
+    ]

@@ -15,7 +15,7 @@ from dase.effects.row_scan import RowScan
 from dase.effects.timestamp import Timestamp
 from dase.errors import InputError
 from dase.fitting.batch_simulator import BatchSimulator, SimulationOrder, samples_per_step
-from dase.fitting.data_split import PIXELS, typical_changes
+from dase.fitting.data_split import SPLIT, typical_changes
 from dase.kernels import launch
 from dase.probes.accumulators import ProbeSums, StatisticsFrame
 from dase.probes.statistics import (
@@ -28,7 +28,7 @@ from dase.probes.statistics import (
     tolerance_of,
 )
 from dase.probes.stimulus import MASKED, Grid, Stimulus, band_edges, sort_into_cells
-from dase.probes.timestamp_patterns import SHORTEST, TimestampStructure
+from dase.probes.timestamp_patterns import PATTERNS, TimestampStructure
 from dase.results import Answer, Distinction
 from dase.simulation.sensor import Sensor
 
@@ -69,7 +69,7 @@ def distinguish(
     *,
     names: tuple[str, str] | None = None,
     longest: float = 60.0,
-    pixels: int = PIXELS,
+    pixels: int = SPLIT.pixels,
     repeats: int = 24,
     seed: int = 0,
     device: str = "cpu",
@@ -142,7 +142,7 @@ def _timestamp_structure(models: tuple[Sensor, Sensor]) -> TimestampStructure:
     """Return the regularity of time stamps that a readout of the models makes, if a file could show it."""
     for model in models:
         for effect in model.readout_effects():
-            if isinstance(effect, Timestamp) and effect.step >= SHORTEST:
+            if isinstance(effect, Timestamp) and effect.step >= PATTERNS.shortest:
                 return TimestampStructure(step=effect.step)
             if isinstance(effect, RowScan):
                 return TimestampStructure(line=effect.line, direction=effect.direction)

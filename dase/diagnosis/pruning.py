@@ -10,6 +10,7 @@ from dase.fitting.early_stopping import stop_unless_below
 from dase.fitting.model import FittedModel, refit_model, refit_work
 from dase.fitting.scheduler import run_side_by_side
 from dase.probes.distance import Judgement, leaves_nothing, may_be_announced, reaches_floor
+from dase.probes.random_streams import SimulationStream
 
 
 def prune_model(
@@ -72,9 +73,10 @@ def _keep_near_models(
 ) -> dict[str, FittedModel]:
     """Return those models that one descent takes near enough to be fitted in full, fitted by it."""
     evidence, seed, pruning = state.evidence, state.seed, state.settings.pruning
+    stream = SimulationStream.JUDGE.seed(seed)
     ends = run_side_by_side([refit_work(evidence, way, seed=seed, rounds=1) for way in ways.values()])
     judged = run_side_by_side(
-        [m.judging(evidence.held.view(), repeats=pruning.repeats, seed=seed + 500) for m in ends]
+        [m.judgement_work(evidence.held, repeats=pruning.repeats, seed=stream) for m in ends]
     )
     limit = pruning.near * max(judgement.gate, judgement.error)
     return {name: m for name, m, j in zip(ways, ends, judged, strict=True) if j.error < limit}
@@ -85,11 +87,14 @@ def _droppable_models(state: DiagnosisState, model: FittedModel) -> dict[str, Fi
 
     Fitting one in full takes as long as trying a dozen; most are far off.
     """
-    scout, seed, repeats = state.evidence.scout.view(), state.seed, state.settings.scout_repeats
-    model.rebase(scout, repeats=repeats, seed=seed + 200)
+    seed, repeats = state.seed, state.settings.scout_repeats
+    scout = model.calibrate(
+        state.evidence.scout, repeats=repeats, seed=SimulationStream.CALIBRATE_SCOUT.seed(seed)
+    )
     ways = {name: with_same_freedom(model.sensor.without(name), model, ()) for name in state.added_to(model)}
-    quick = run_side_by_side([way.searching(scout, seed=seed, iterations=2) for way in ways.values()])
-    judged = run_side_by_side([way.judging(scout.view(), repeats=repeats, seed=seed + 500) for way in quick])
+    quick = run_side_by_side([way.search_work(scout, seed=seed, iterations=2) for way in ways.values()])
+    stream = SimulationStream.JUDGE.seed(seed)
+    judged = run_side_by_side([way.judgement_work(scout, repeats=repeats, seed=stream) for way in quick])
     return {
         name: way for name, way, judgement in zip(ways, quick, judged, strict=True)
         if judgement.error < state.settings.pruning.droppable * judgement.gate
@@ -105,12 +110,15 @@ def _keep_promising_models(
     """
     if not ways:
         return {}
-    scout = state.evidence.scout.view()
-    repeats = model.rebase(scout, repeats=state.settings.scout_repeats, seed=state.seed + 200)
-    enough = state.settings.pruning.rival_loss * float(scout.scale.loss(repeats).mean())
+    scout = model.calibrate(
+        state.evidence.scout,
+        repeats=state.settings.scout_repeats,
+        seed=SimulationStream.CALIBRATE_SCOUT.seed(state.seed),
+    )
+    enough = state.settings.pruning.rival_loss * float(scout.scale.loss(scout.repeats).mean())
     simpler = {name: len(way.place) < len(model.place) for name, way in ways.items()}
     works = [
-        way.searching(
+        way.search_work(
             scout, seed=state.seed, iterations=2, over=None if simpler[name] else stop_unless_below(enough)
         )
         for name, way in ways.items()

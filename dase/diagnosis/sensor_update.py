@@ -24,9 +24,8 @@ def with_fit(text: SensorText, found: Fit, recording: str) -> SensorText:
         "error_after": round(found.error, 3),
         "floor": found.floor,
     }
-    return text.describing(round_parameters(found.sensor)).with_history(
-        history_entry_today("fit", recording=recording, **facts)
-    )
+    entry = history_entry_today("fit", recording=recording, **facts)
+    return text.describing(round_parameters(found.sensor)).with_history(entry)
 
 
 def with_diagnosis(text: SensorText, found: Diagnosis, recording: str) -> SensorText:

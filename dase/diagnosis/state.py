@@ -10,7 +10,8 @@ from dase.diagnosis.settings import DEFAULTS, DiagnosisSettings
 from dase.effects import Effect
 from dase.fitting.data_split import SplitMeasurement
 from dase.fitting.model import FittedModel, free_of, model_of
-from dase.probes.distance import QUIET, Judgement, reaches_floor
+from dase.probes.distance import LIMITS, Judgement, reaches_floor
+from dase.probes.random_streams import SimulationStream
 from dase.results import Progress, Step
 from dase.simulation.sensor import Sensor
 
@@ -54,9 +55,11 @@ class DiagnosisState:
     error: float = float("nan")
 
     def judge(self, model: FittedModel, *, repeats: int | None = None) -> Judgement:
-        """Return the held-out error of a model; makes it the present one of that half."""
+        """Return the held-out error of a model."""
         repeats = self.settings.repeats if repeats is None else repeats
-        judgement = model.judge(self.evidence.held, repeats=repeats, seed=self.seed + 500)
+        judgement = model.judge(
+            self.evidence.held, repeats=repeats, seed=SimulationStream.JUDGE.seed(self.seed)
+        )
         self.error = judgement.error
         self.progress("judging", 0.0, self.error)
         return judgement
@@ -91,7 +94,7 @@ def explains_remainder(
     That may be the scene's fault, or another simulator's habit, so it must explain most of it.
     """
     level = judgement.level
-    chance = judgement.error <= max(QUIET, judgement.reach) and reaches_floor(judgement)
+    chance = judgement.error <= max(LIMITS.quiet, judgement.reach) and reaches_floor(judgement)
     return chance and judgement.error - level <= settings.remainder * (without.error - level)
 
 

@@ -9,6 +9,7 @@ from collections.abc import Mapping
 
 from dase.effects.bandwidth import Bandwidth
 from dase.effects.base import Effect as Effect
+from dase.effects.base import Observations as Observations
 from dase.effects.base import Parameter as Parameter
 from dase.effects.base import choice as choice
 from dase.effects.base import parameter as parameter

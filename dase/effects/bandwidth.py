@@ -59,4 +59,5 @@ class Bandwidth(Effect):
         bounds=(1e-4, 1.0),
         plausible=(0.01, 1.0),
         about="cutoff at intensity 0 relative to that at intensity 1; 1 makes the bandwidth constant",
+        starts="ends",
     )

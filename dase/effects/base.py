@@ -9,7 +9,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar, Literal, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,9 +22,20 @@ if TYPE_CHECKING:
     from dase.scenes.scene import Scene
 
 
+Starts = Literal["value", "ends", "spread", "turn", "above"]
+"""Where a search begins along a parameter of an effect that is tried:
+
+- `value`: where the effect has it, for what a descent finds from anywhere;
+- `ends`: there and near the upper end of the plausible range, for what changes the character of the effect;
+- `spread`: all over the plausible range, for the strength of an effect;
+- `turn`: all round a turn, for a phase [turns];
+- `above`: where the effect has it and somewhat above, for a bound that the measurement shows from below.
+"""
+
+
 @dataclass(frozen=True)
 class Parameter:
-    """One number of an effect.
+    """One number of an effect, and all that a search needs to know of it.
 
     Args:
         name: As in the sensor file.
@@ -34,7 +45,15 @@ class Parameter:
         bounds: Values outside are refused.
         plausible: Where real cameras lie; a diagnosis looks for the effect in this range.
         about: One line.
-        seen: Whether a diagnosis sees about where it is in the measurement, and begins there.
+        starts: Where a search begins, see `Starts`; "" for `spread` where there is a value at which the
+            effect is off, else `value`.
+        periodic: Whether it is a phase [turns]: what statistics do along it goes round, so steps are small,
+            and the search may go through all of the bounds.
+        fitted: Whether a fit may change it unless it is named; False for what a search by small steps cannot
+            find, which is set by other means.
+        nearby: Relative range about its value to which a fit keeps, for what is read off the measurement
+            better than a fit can find it; such a parameter stays as it is while its effect is tried. None
+            for the whole range.
     """
 
     name: str
@@ -44,7 +63,15 @@ class Parameter:
     bounds: tuple[float, float]
     plausible: tuple[float, float]
     about: str
-    seen: bool = False
+    starts: Starts | Literal[""] = ""
+    periodic: bool = False
+    fitted: bool = True
+    nearby: float | None = None
+
+    @property
+    def search_starts(self) -> Starts:
+        """Where a search begins, worked out where it was not said."""
+        return self.starts or ("value" if self.off is None else "spread")
 
 
 def parameter(
@@ -55,12 +82,16 @@ def parameter(
     off: float | None = None,
     bounds: tuple[float, float] = (0.0, math.inf),
     plausible: tuple[float, float],
-    seen: bool = False,
+    starts: Starts | Literal[""] = "",
+    periodic: bool = False,
+    fitted: bool = True,
+    nearby: float | None = None,
 ) -> Any:
     """Declare a parameter of an effect; see `Parameter`."""
     facts = dict(
-        unit=unit, default=default, off=off, bounds=bounds, plausible=plausible, about=about, seen=seen
-    )
+        unit=unit, default=default, off=off, bounds=bounds, plausible=plausible, about=about, starts=starts,
+        periodic=periodic, fitted=fitted, nearby=nearby,
+    )  # fmt: skip
     return field(default=default, metadata={"parameter": facts})
 
 
@@ -77,6 +108,34 @@ def asset(*, about: str) -> Any:
 def hidden() -> Any:
     """Declare what an effect carries along that is not in sensor files."""
     return field(default=None, repr=False, compare=False, metadata={"hidden": True})
+
+
+@dataclass(frozen=True)
+class Observations:
+    """What can be read off a measurement without any model, from which an effect may choose its candidates.
+
+    Args:
+        peak_frequency: At which the net event rate of all pixels swings most [Hz].
+        clock_period: Time between the ticks that all time stamps are multiples of [s], 0 for none.
+        line_time: Time from line to line of a readout that visits them in turn [s], 0 for none.
+        scan_direction: Where that readout goes: down, up, right or left.
+        highest_event_rate: Most events per second of all pixels together, over some milliseconds [Hz].
+        least_bus_rate: Events per second that a bus, if there is one, can send at least [Hz].
+        idle_bus: Share of what a bus can send below which it is idle: it would hardly lose anything.
+    """
+
+    peak_frequency: float
+    clock_period: float
+    line_time: float
+    scan_direction: str
+    highest_event_rate: float
+    least_bus_rate: float
+    idle_bus: float
+
+    @property
+    def bus_is_idle(self) -> bool:
+        """Whether a bus, if there is one, is free nearly always."""
+        return self.highest_event_rate < self.idle_bus * self.least_bus_rate
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -100,6 +159,8 @@ class Effect:
     """Names of effects that this one becomes at the end of its range: it explains all that they do."""
     maps: ClassVar[tuple[str, ...]] = ()
     """Quantities of which every pixel has its own value, depending on the scene; see `bound_to`."""
+    rare: ClassVar[bool] = False
+    """Whether it acts on so few pixels that some hundred of them do not show it."""
     label: ClassVar[str] = "shot"
     """What the events of its `noise` stage are marked as, one of `dase.events.LABELS`."""
 
@@ -127,6 +188,30 @@ class Effect:
     def choices(cls) -> dict[str, tuple[str, ...]]:
         """Return the words an option of this effect may take."""
         return {f.name: f.metadata["choice"] for f in dataclasses.fields(cls) if "choice" in f.metadata}
+
+    @classmethod
+    def variants(cls) -> list[Self]:
+        """Return this effect with each combination of its words, its numbers at their defaults."""
+        out = [cls()]
+        for name, words in cls.choices().items():
+            out = [dataclasses.replace(effect, **{name: word}) for effect in out for word in words]
+        return out
+
+    @classmethod
+    def candidates(cls, observed: Observations) -> list[Self]:
+        """Return the variants of this effect with which a diagnosis tries to explain a measurement.
+
+        An effect sets here what no search by small steps finds but the measurement shows, and returns nothing
+        where the measurement shows that it is not there.
+        """
+        return cls.variants()
+
+    def shifted(self, seconds: float) -> Effect:
+        """Return this effect as it is on a clock that shows `seconds` less.
+
+        Only what repeats in time by a phase of its own need do so: a descent may end a step of the grid off.
+        """
+        return self
 
     @classmethod
     def assets(cls) -> dict[str, str]:

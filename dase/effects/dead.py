@@ -27,6 +27,7 @@ class Dead(Effect):
     name: ClassVar[str] = "dead"
     source: ClassVar[str] = "Gallego et al.: Event-based vision, a survey, 2022 (non-idealities)"
     stages: ClassVar = {"gate": silence_pixel}
+    rare: ClassVar[bool] = True
 
     share: float = parameter(
         0.001,

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
-from typing import ClassVar
+from dataclasses import dataclass, replace
+from typing import ClassVar, Self
 
 import warp as wp
 
-from dase.effects.base import Effect, parameter
+from dase.effects.base import Effect, Observations, parameter
 from dase.kernels.vector_math import cosine_and_sine
 
 
@@ -48,6 +48,7 @@ class Flicker(Effect):
         bounds=(0.0, 1e5),
         plausible=(50.0, 1000.0),
         about="of the light, twice that of the mains",
+        nearby=0.01,  # farther off, the phase turns within the measurement
     )
     depth: float = parameter(
         0.1,
@@ -63,7 +64,18 @@ class Flicker(Effect):
         bounds=(-1.0, 1.0),
         plausible=(0.0, 1.0),
         about="of the sine at time 0",
+        starts="turn",
+        periodic=True,
     )
+
+    @classmethod
+    def candidates(cls, observed: Observations) -> list[Self]:
+        """Return a lamp of the frequency at which the event rate swings most."""
+        return [cls(frequency=observed.peak_frequency)]
+
+    def shifted(self, seconds: float) -> Flicker:
+        """Return the lamp on a clock that shows `seconds` less; its phase stays within the bounds."""
+        return replace(self, phase=(self.phase + seconds * self.frequency + 1.0) % 2.0 - 1.0)
 
     def longest_step(self) -> float:
         """Return the longest time between samples that still shows the effect [s]."""

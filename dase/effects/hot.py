@@ -39,6 +39,7 @@ class Hot(Effect):
         "cameras, 2020 (shares of hot pixels)"
     )
     label: ClassVar[str] = "hot"
+    rare: ClassVar[bool] = True
     stages: ClassVar = {"noise": hot_rates}
 
     share: float = parameter(
@@ -55,6 +56,7 @@ class Hot(Effect):
         bounds=(0.0, 1e5),
         plausible=(5.0, 5000.0),
         about="median over hot pixels of the events per second, both polarities together",
+        starts="ends",
     )
     spread: float = parameter(
         1.0,

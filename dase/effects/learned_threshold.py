@@ -62,6 +62,7 @@ class LearnedThreshold(Effect):
         if not self.weights or self.bound is not None:
             return self
         try:
+            # PyTorch is optional, and takes seconds to load: only sensors with learned thresholds need it
             from dase.networks.weights_file import predict_thresholds
         except ImportError:
             raise InputError(

@@ -55,4 +55,5 @@ class Linlog(Effect):
         bounds=(0.0, 10.0),
         plausible=(0.5, 3.5),
         about="of the linear part at the knee, relative to that of the logarithm; 1 is smooth",
+        starts="ends",
     )

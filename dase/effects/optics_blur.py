@@ -18,9 +18,6 @@ from dase.kernels.scene_blur import blur_frames
 from dase.kernels.scene_layers import render_frames
 from dase.scenes.scene import Scene
 
-WIDEST = 20.0
-"""Greatest sigma [px]."""
-
 
 def blur_weights(sigma: float) -> NDArray[np.float32]:
     """Return the discrete Gaussian of variance sigma² [px²]: middle, first neighbours and so on, (R + 1,).
@@ -102,7 +99,7 @@ class OpticsBlur(SceneEffect):
         0.7,
         unit="px",
         off=0.0,
-        bounds=(0.0, WIDEST),
+        bounds=(0.0, 20.0),  # wider, the window of the blur would be slow and no lens
         plausible=(0.3, 3.0),
         about="standard deviation of the point spread",
     )

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from typing import ClassVar
+from typing import ClassVar, Self
 
 import numpy as np
 import warp as wp
 from numpy.typing import NDArray
 
-from dase.effects.base import choice, parameter
+from dase.effects.base import Observations, choice, parameter
 from dase.effects.stream import Reader, StreamEffect
 from dase.events import Events
 from dase.kernels import launch
@@ -94,7 +94,7 @@ class Readout(StreamEffect):
         bounds=(1.0, math.inf),
         plausible=(5e5, 1e9),
         about="most events per second, of the whole sensor",
-        seen=True,
+        starts="above",  # the most events per second that were seen are the least it can send
     )
     depth: float = parameter(
         4096.0,
@@ -102,8 +102,20 @@ class Readout(StreamEffect):
         bounds=(1.0, math.inf),
         plausible=(1.0, 1e6),
         about="events that the queue holds in mode delay",
+        fitted=False,  # of a queue that is never full, nothing tells the length
     )
     mode: str = choice("delay", among=("delay", "drop"), about="what becomes of events while the bus is busy")
+
+    @classmethod
+    def candidates(cls, observed: Observations) -> list[Self]:
+        """Return buses of the highest rate that was seen, none where even that leaves any bus idle."""
+        if observed.bus_is_idle:
+            return []
+        return [replace(bus, rate=observed.highest_event_rate) for bus in cls.variants()]
+
+    def for_share(self, share: float) -> Readout:
+        """Return the bus with as much of its bandwidth and of its queue as a share of the pixels has."""
+        return replace(self, rate=self.rate * share, depth=max(1.0, self.depth * share))
 
     def reader(self, width: int, height: int, seed: int) -> Bus:
         """Return the bus of one sensor."""

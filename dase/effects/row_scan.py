@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import ClassVar
+from typing import ClassVar, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
-from dase.effects.base import choice, parameter
+from dase.effects.base import Observations, choice, parameter
 from dase.effects.stream import Reader, StreamEffect, order_events, to_nanosecond, to_nanoseconds, to_seconds
 from dase.errors import InputError
 from dase.events import Events
@@ -80,6 +80,7 @@ class RowScan(StreamEffect):
         bounds=(0.0, 0.1),
         plausible=(3e-8, 3e-5),
         about="time from row to row",
+        fitted=False,  # the scans of any other line time soon are out of step with the measured ones
     )
     direction: str = choice("down", among=DIRECTIONS, about="where the scan goes; right and left: columns")
 
@@ -87,6 +88,15 @@ class RowScan(StreamEffect):
         super().__post_init__()
         if 0 < self.line < 1e-9:
             raise InputError(f"row_scan.line must be 0 or at least 1e-09 s, got {self.line:g}")
+
+    @classmethod
+    def candidates(cls, observed: Observations) -> list[Self]:
+        """Return the scan that is seen in the time stamps, if any is."""
+        return [cls(line=observed.line_time, direction=observed.scan_direction)] if observed.line_time else []
+
+    def longest_delay(self, lines: int) -> float:
+        """Return about how late it makes events: the time of a scan [s]."""
+        return lines * self.line
 
     def reader(self, width: int, height: int, seed: int) -> Scan:
         """Return the scan of one sensor."""

@@ -123,6 +123,7 @@ class SecondOrder(Effect):
         bounds=(0.05, 20.0),
         plausible=(0.3, 5.0),
         about="below 1 the response overshoots",
+        starts="ends",
     )
     dark: float = parameter(
         20 / 275,
@@ -130,4 +131,5 @@ class SecondOrder(Effect):
         bounds=(1e-4, 1.0),
         plausible=(0.01, 1.0),
         about="natural frequency at intensity 0 relative to that at intensity 1; 1 makes it constant",
+        starts="ends",
     )

@@ -51,6 +51,17 @@ class StreamEffect(Effect):
     """Whether what becomes of an event does not depend on other pixels, so that some of them can be
     simulated alone."""
 
+    def longest_delay(self, lines: int) -> float:
+        """Return about how late it makes events of a sensor of so many lines [s]; infinity for any time.
+
+        Where that is far below the steps in which statistics see time, a fit leaves the effect out.
+        """
+        return math.inf
+
+    def for_share(self, share: float) -> StreamEffect:
+        """Return this effect as a share of the pixels feels it, where all others are left out."""
+        return self
+
     @abstractmethod
     def reader(self, width: int, height: int, seed: int) -> Reader:
         """Return a reader for one stream of a sensor of `width` columns and `height` rows."""

@@ -49,4 +49,5 @@ class Threshold(Effect):
         bounds=(0.0, 1.0),
         plausible=(0.0, 1.0),
         about="spread of the pixels' memories at the start, as a share of the threshold",
+        fitted=False,  # both ends are tried instead
     )

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from typing import ClassVar
+from typing import ClassVar, Self
 
 import numpy as np
 
-from dase.effects.base import parameter
+from dase.effects.base import Observations, parameter
 from dase.effects.stream import (
     FOREVER,
     Reader,
@@ -22,17 +22,17 @@ from dase.effects.stream import (
 from dase.errors import InputError
 from dase.events import Events
 
-WIDEST = 5.0
-"""Largest jitter, in standard deviations; one normal number in two million lies beyond."""
-
 
 class Stamp(Reader):
     """Gives events the time the clock shows."""
 
+    widest: ClassVar[float] = 5.0
+    """Largest jitter, in standard deviations; one normal number in two million lies beyond."""
+
     def __init__(self, jitter: float, step: float, random: np.random.Generator):
         self._jitter, self._random = jitter * 1e9, random  # [ns]
         self._step = round(step * 1e12)  # [ps]
-        self._reach = math.ceil(WIDEST * self._jitter)
+        self._reach = math.ceil(self.widest * self._jitter)
         self._waiting = Events.empty(1, 1)
         self._at = np.empty(0, np.int64)
 
@@ -47,7 +47,7 @@ class Stamp(Reader):
         return replace(events, t=to_seconds(at)), math.inf if bound == FOREVER else 1e-9 * bound
 
     def _jittered(self, events: Events, at: np.ndarray, bound: int) -> tuple[Events, np.ndarray, int]:
-        error = np.clip(self._random.standard_normal(len(at)), -WIDEST, WIDEST)
+        error = np.clip(self._random.standard_normal(len(at)), -self.widest, self.widest)
         at = at + np.rint(self._jitter * error).astype(np.int64)
         if len(self._at):
             events = Events.concatenate([self._waiting, events])
@@ -85,6 +85,7 @@ class Timestamp(StreamEffect):
         bounds=(0.0, 0.1),
         plausible=(1e-7, 1e-3),
         about="standard deviation of the time stamps",
+        fitted=False,  # mostly far below the steps in which statistics see time
     )
     step: float = parameter(
         1e-6,
@@ -93,12 +94,22 @@ class Timestamp(StreamEffect):
         bounds=(0.0, 1.0),
         plausible=(1e-7, 1e-3),
         about="from tick to tick of the clock",
+        fitted=False,  # stamps are at the ticks of one step only, and at none of those beside it
     )
 
     def __post_init__(self) -> None:
         super().__post_init__()
         if 0 < self.step < 1e-9:
             raise InputError(f"timestamp.step must be 0 or at least 1e-09 s, got {self.step:g}")
+
+    @classmethod
+    def candidates(cls, observed: Observations) -> list[Self]:
+        """Return the clock that is seen in the time stamps, if any is."""
+        return [cls(step=observed.clock_period, jitter=0.0)] if observed.clock_period else []
+
+    def longest_delay(self, lines: int) -> float:
+        """Return about how late it makes events [s]."""
+        return max(self.step, self.jitter)
 
     def reader(self, width: int, height: int, seed: int) -> Stamp:
         """Return the clock of one sensor."""

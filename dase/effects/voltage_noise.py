@@ -100,6 +100,7 @@ class VoltageNoise(Effect):
         bounds=(0.01, 1e6),
         plausible=(10.0, 3000.0),
         about="corner frequency in bright light, set by the bias",
+        starts="ends",
     )
     knee: float = parameter(
         0.1,
@@ -107,6 +108,7 @@ class VoltageNoise(Effect):
         bounds=(1e-6, 1e6),
         plausible=(1e-3, 1.0),
         about="where the corner of the photocurrent equals that of the bias",
+        starts="ends",
     )
     dark: float = parameter(
         0.003,
@@ -114,6 +116,7 @@ class VoltageNoise(Effect):
         bounds=(1e-6, 10.0),
         plausible=(1e-4, 0.1),
         about="dark current, as the intensity that makes as much; keeps the corner above 0",
+        fitted=False,  # it shows in the darkest pixels only, which hardly send events
     )
 
     def longest_step(self) -> float:

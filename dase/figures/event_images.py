@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from dase.errors import InputError
 from dase.events import Events
+from dase.figures import contact_sheet
 from dase.figures.style import Colour
 from dase.io.sequence import Sequence, replacing
 from dase.recordings.statistics import sequence_statistics
@@ -93,8 +94,6 @@ def draw_sequence(
     Raises:
         InputError: `at` lies outside the sequence, or `window` is not positive.
     """
-    from dase.figures import contact_sheet
-
     begin, end = sequence.span
     if at is not None and not begin <= at <= end:
         raise InputError(f"at: must lie in {begin:g}..{end:g} s, got {at:g} s")

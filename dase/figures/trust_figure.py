@@ -123,7 +123,8 @@ def _draw_header(figure: Figure, title: str, window: float, share: float) -> Non
     figure.text(left, 1 - 0.3 / tall, title, fontsize=13, color=Colour.INK, weight="bold", va="center")
     facts = (
         f"{100 * share:.0f} % of pixels and times trusted: expected error up to "
-        f"{TrustSettings.tolerance:g} log intensity or {100 * TrustSettings.relative:.0f} % of the change"
+        f"{TrustSettings.tolerance:g} log intensity "
+        f"or {100 * TrustSettings.relative:.0f} % of the change"
     )
     figure.text(left, 1 - 0.57 / tall, facts, fontsize=9, color=Colour.INK, va="center")
     said = f"events of {format_seconds(window)} around each time"

@@ -20,43 +20,53 @@ from dase.fitting.bus_load import BusLoad
 from dase.fitting.readout_simulator import clock_of, noticeable_effects, pass_readout, simulate_pixels
 from dase.kernels import event_probes as kernels
 from dase.kernels import launch, pixel_codegen_trials
-from dase.probes.accumulators import GROUP, ProbeSums, StatisticsFrame, fold_counts, sum_over_groups
+from dase.probes.accumulators import (
+    GROUP,
+    PROBE_TIMES,
+    ProbeSums,
+    StatisticsFrame,
+    fold_counts,
+    sum_over_groups,
+)
 from dase.probes.events_by_pixel import sort_by_pixel
 from dase.probes.stimulus import Stimulus
 from dase.probes.timestamp_patterns import TimestampStructure
 from dase.simulation.sensor import Sensor
 
-LAG_TIMES = (-0.003, -0.001, 0.0, 0.001, 0.002, 0.004, 0.008, 0.016, 0.028, 0.044, 0.063)
-"""Before an event [s] at which its light is looked at; the differences of neighbours are averaged."""
 
-CLASS_TIMES = (0.012, 0.05)
-"""Intervals between two events are short, middle or long, divided by these [s]."""
+@dataclass(frozen=True)
+class SimulatorSettings:
+    """How launches are made up; speed and memory depend on it, results do not."""
 
-HALF = 0.064
-"""The halves of the time take turns after this [s]."""
+    own_kernel: int
+    """Effects up to which a sensor has a kernel of its own, up to twice as fast. Those with more share one
+    that has all effects: it is compiled once, and not for each of hundreds of combinations."""
 
-SLACK = 2e-6
-"""Files give whole microseconds: an event up to this after a point of the grid belongs to it [s]."""
+    sums_bytes: int
+    """Memory for the sums of one launch [bytes]."""
 
-FINEST = 2
-"""Samples per step of the grid at most: models that ask for more are simulated a little too coarsely."""
-
-ALONE = {"cpu": 1, "cuda": 0}
-"""Effects up to which a sensor has a kernel of its own, up to twice as fast. Those with more share one that
-has all effects: it is compiled once, and not for each of hundreds of combinations. On a GPU all do, so that
-all candidates run in one launch."""
-
-ROOM = {"cpu": 1 << 26, "cuda": 1 << 31}
-"""Memory for the sums of one launch [bytes]; on a CPU they should stay in the caches."""
-
-STREAMED = 32
-"""Models whose events are stored at a time."""
+    streamed: int = 32
+    """Models whose events are stored at a time: some hundred megabytes where each sends millions."""
 
 
-def samples_per_step(sensor: Sensor, step: float) -> int:
-    """Return how many samples per step the model needs, 0 where those at changes of the light do."""
+LAUNCHES = {
+    "cpu": SimulatorSettings(own_kernel=1, sums_bytes=1 << 26),  # the sums should stay in the caches
+    "cuda": SimulatorSettings(own_kernel=0, sums_bytes=1 << 31),  # so that all candidates run in one launch
+}
+
+
+def samples_per_step(sensor: Sensor, step: float, *, most: int = 2) -> int:
+    """Return how many samples per step a model needs, 0 where those at changes of the light do.
+
+    Args:
+        sensor: The model.
+        step: Of the grid [s].
+        most: Samples at most: models that ask for more are simulated a little too coarsely, or they would
+            take most of the time of a diagnosis.
+    """
     longest = sensor.longest_step()
-    return 0 if longest == np.inf else int(np.clip(np.ceil(step / longest - 1e-6), 1, FINEST))
+    # a ratio that is whole but for rounding does not take one sample more
+    return 0 if longest == np.inf else int(np.clip(np.ceil(step / longest - 1e-6), 1, most))
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,6 +93,7 @@ class SimulationOrder:
 
     def seeds(self) -> NDArray[np.int64]:
         """Return the seed of each vector, shape (B,)."""
+        # kernels take seeds as 32-bit integers, and these must not be negative
         return (self.seed + int(self.reseed) * np.arange(len(self.vectors))) & 0x3FFFFFFF
 
 
@@ -92,10 +103,11 @@ class BatchSimulator:
 
     Args:
         stimulus: What the pixels see.
-        middle: Typical change of the light between two events, shape (4 CLASSES,).
+        middle: Typical change of the light between two events, shape (4 CLASSES,) [log intensity].
         structure: Regularities of the measured time stamps.
         evaluations: Models run so far.
-        work: Pixels times seconds run so far.
+        work: Pixels times seconds run so far [px s].
+        settings: How launches are made up; None for what suits the device.
     """
 
     stimulus: Stimulus
@@ -103,6 +115,7 @@ class BatchSimulator:
     structure: TimestampStructure = field(default_factory=TimestampStructure)
     evaluations: int = 0
     work: float = 0.0
+    settings: SimulatorSettings | None = None
     _kernels: dict[Any, tuple[wp.Kernel, NDArray[np.float32], list[int]]] = field(
         default_factory=dict, repr=False
     )
@@ -110,7 +123,8 @@ class BatchSimulator:
     def __post_init__(self) -> None:
         self.device = self.stimulus.device
         self._middle: tuple[Any, Any] | None = None
-        self._kind = "cuda" if self.device.is_cuda else "cpu"
+        self._launches = self.settings or LAUNCHES["cuda" if self.device.is_cuda else "cpu"]
+        # a CPU works on several models of one pixel in a vector, a GPU has a thread for each
         self._lanes = 1 if self.device.is_cuda else kernels.LANES
         self._pixels = wp.array(self.stimulus.pixels, dtype=int, device=self.device)
 
@@ -123,7 +137,7 @@ class BatchSimulator:
         reseed: bool = False,
         finer: int | None = None,
     ) -> ProbeSums:
-        """Simulate parameter vectors of one sensor; see `SimulationOrder`."""
+        """Simulate parameter vectors of one sensor, shape (B, P); see `SimulationOrder`."""
         return self.run_all([SimulationOrder(sensor, vectors, seed, reseed, finer)])[0]
 
     def run_all(self, orders: Sequence[SimulationOrder]) -> list[ProbeSums]:
@@ -133,7 +147,9 @@ class BatchSimulator:
         for n, order in enumerate(orders):
             finer = samples_per_step(order.sensor, step) if order.finer is None else order.finer
             kernel = self._kernel(order.sensor)[0]
+            # maps are of one sensor, so a launch has either none or those of a single order
             maps = n if any(effect.maps for effect in order.sensor.effects) else -1
+            # the same stages give the same kernel object, whatever the sensor
             together.setdefault((finer, id(kernel), maps), []).append(n)
         out: dict[int, ProbeSums] = {}
         for (finer, _, _), members in together.items():
@@ -151,12 +167,15 @@ class BatchSimulator:
         rows = np.concatenate([self._kernel_vectors(order) for order in orders])
         ends = np.cumsum([len(order.vectors) for order in orders])
         begins = np.concatenate([[0], ends[:-1]])
+        # in whole picoseconds, as the clock of a readout has them: the same stamps to the bit
         ticks = np.repeat([round(order.ticks * 1e12) for order in orders], ends - begins)
-        # the first of repeats shows how groups of pixels differ
+        # the first of repeats shows how groups of pixels differ; groups of all models would fill the memory
         apart = [int(begin) for begin, order in zip(begins, orders, strict=True) if order.reseed]
+        # counts of pixels stay on the device, whole: what they are folded for may change later
         pixels = wp.zeros((len(rows), count, kernels.HALVES), dtype=float, device=self.device)
         sums, clock = [], []
         groups: dict[int, tuple[NDArray[np.float32], NDArray[np.int32]]] = {}
+        # all else is added up part by part, for the sums of many models would not fit
         for first in range(0, len(rows), self._models_at_once()):
             part = slice(first, min(first + self._models_at_once(), len(rows)))
             sink = self.sink(pixels[part], ticks[part])
@@ -165,6 +184,8 @@ class BatchSimulator:
                 wp.array(seeds[part].astype(np.int32), dtype=int, device=self.device),
                 wp.array(rows[part], dtype=float, device=self.device), *maps, sink,
             ]  # fmt: skip
+            # `align`: one thread of a CPU has whole groups, so no two add to the same sum, and the order in
+            # which floating-point numbers are added never changes
             blocks = -(-len(rows[part]) // self._lanes)
             launch.run_kernel(kernel, count, inputs, self.device, batch=blocks, align=GROUP)
             grouped = self._grouped(sink.sums)
@@ -187,12 +208,13 @@ class BatchSimulator:
 
     def _stamps(self, order: SimulationOrder) -> NDArray[np.float64]:
         """Return the shares of events that follow regularities: those that a clock has stamped do."""
+        # a scan is no clock of the kernel's: models that have one are stored and looked at, see `_look`
         out = np.zeros((len(order.vectors), len(TimestampStructure.NAMES)))
         out[:, 0] = order.ticks > 0 and self.structure.step > 0
         return out
 
     def _kernel_vectors(self, order: SimulationOrder) -> NDArray[np.float32]:
-        """Return parameter vectors as the kernel takes them."""
+        """Return parameter vectors as the kernel takes them, shape (B, all parameters of the kernel)."""
         _, base, at = self._kernel(order.sensor)
         out = np.repeat(base[None], len(order.vectors), 0)
         out[:, at] = order.vectors
@@ -201,17 +223,21 @@ class BatchSimulator:
     def _models_at_once(self) -> int:
         """Return how many models there is room for."""
         count, group = len(self.stimulus.pixels), self._pixels_per_sum()
+        # float32 and int32 of a model: sums of each group, events of each step, memory of each pixel
         numbers = (
             -(-count // group) * kernels.SumPlace.SIZE + -(-count // GROUP) * 2 * self.stimulus.grid.steps
         )
-        return max(1, ROOM[self._kind] // (4 * (numbers + count * (kernels.MEMORY + kernels.HALVES))))
+        numbers += count * (kernels.MEMORY + kernels.HALVES)
+        return max(1, self._launches.sums_bytes // (4 * numbers))
 
     def _kernel(self, sensor: Sensor) -> tuple[wp.Kernel, NDArray[np.float32], list[int]]:
         """Return the kernel of a sensor, a parameter vector for it, and the places of the sensor's own."""
+        # words choose what is compiled, numbers do not: they come with the parameter vector
         key = tuple((e.name, *(getattr(e, name) for name in e.choices())) for e in sensor.effects)
         if key not in self._kernels:
             stages = sensor.stages()
-            wide = with_every_effect(sensor) if len(stages) > ALONE[self._kind] else sensor
+            wide = with_every_effect(sensor) if len(stages) > self._launches.own_kernel else sensor
+            # what the sensor lacks is off in the wide one, and off changes nothing, bit for bit
             names = wide.parameter_names()
             at = [names.index(name) for name in sensor.parameter_names()]
             self._kernels[key] = (
@@ -222,7 +248,7 @@ class BatchSimulator:
         return self._kernels[key]
 
     def look(self, events: Events) -> ProbeSums:
-        """Sum up stored events; those of other pixels are left out."""
+        """Sum up stored events, as one row; those of other pixels are left out."""
         return self._look([events])
 
     def _look(self, streams: Sequence[Events], frame: StatisticsFrame | None = None) -> ProbeSums:
@@ -239,6 +265,7 @@ class BatchSimulator:
         if frame is not None:
             folded = sum_over_groups(fold_counts(pixels, [frame], np.zeros(len(streams), np.int64)))
         stamps = np.zeros((len(streams), len(TimestampStructure.NAMES)))
+        # shares take a pass over all events, so only where the measurement follows a regularity
         if self.structure != TimestampStructure():
             stamps = np.stack([self.structure.shares(self._events_of_pixels(events)) for events in streams])
         return ProbeSums(
@@ -263,16 +290,20 @@ class BatchSimulator:
     def simulate_streams(
         self, order: SimulationOrder, effects: Sequence[Sequence[StreamEffect]], load: BusLoad | None = None
     ) -> ProbeSums:
-        """Simulate models with effects behind the pixels, given for each, and sum up what leaves.
+        """Simulate models with effects behind the pixels and sum up what leaves.
 
-        `load` is what the sensor's other pixels send over a bus that all share, None where it is not known.
+        Args:
+            order: Models, B vectors.
+            effects: Behind the pixels of each, B in all.
+            load: What the sensor's other pixels send over a bus that all share, None where it is not known.
         """
         seeds, rows, found = order.seeds(), len(order.vectors), []
         self.evaluations += rows
-        for first in range(0, rows, STREAMED):
-            cut = slice(first, first + STREAMED)
+        for first in range(0, rows, self._launches.streamed):
+            cut = slice(first, first + self._launches.streamed)
             left = simulate_pixels(self.stimulus, order.sensor, order.vectors[cut], seeds[cut])
             each = zip(left, effects[cut], seeds[cut], strict=True)
+            # readouts take one event after the other, so each model is a thread of its own
             works = [partial(pass_readout, self.stimulus, e, behind, int(s), load) for e, behind, s in each]
             found.append(self._look(launch.run_concurrently(works), order.frame))
         return ProbeSums.join(found)
@@ -285,6 +316,7 @@ class BatchSimulator:
         return events.select(own[events.y.astype(np.int64) * stimulus.width + events.x])
 
     def _pixels_per_sum(self) -> int:
+        # on a GPU every pixel has sums of its own, or threads would wait for each other; see `_grouped`
         return 1 if self.device.is_cuda else GROUP
 
     def sink(self, pixels: Any, ticks: NDArray[np.int64]) -> Any:
@@ -298,15 +330,16 @@ class BatchSimulator:
         out = kernels.ProbeSums()
         out.cell = stimulus.array("cell", lambda: stimulus.cell)
         out.level = stimulus.array("level", lambda: stimulus.level)
-        out.lags = stimulus.array("lags", lambda: np.rint(np.array(LAG_TIMES) / step).astype(np.int32))
+        out.lags = stimulus.array("lags", lambda: np.rint(np.array(PROBE_TIMES.lags) / step).astype(np.int32))
         out.classes = stimulus.array(
-            "classes", lambda: np.rint(np.array(CLASS_TIMES) / step).astype(np.int32)
+            "classes", lambda: np.rint(np.array(PROBE_TIMES.classes) / step).astype(np.int32)
         )
+        # moved once for each `middle`, which is set anew after a first look at the measurement
         if self._middle is None or self._middle[0] is not self.middle:
             self._middle = self.middle, wp.array(self.middle, dtype=float, device=self.device)
         out.middle = self._middle[1]
-        out.half = max(1, round(HALF / step))
-        out.step, out.slack = wp.float64(step * 1e9), wp.float64(SLACK * 1e9)
+        out.half = max(1, round(PROBE_TIMES.half / step))
+        out.step, out.slack = wp.float64(step * 1e9), wp.float64(PROBE_TIMES.slack * 1e9)
         out.ticks = wp.array(ticks.astype(np.int64), dtype=wp.int64, device=self.device)
         out.holes = int(stimulus.holes)
         out.group = self._pixels_per_sum()
@@ -314,6 +347,7 @@ class BatchSimulator:
         rows, count, _ = pixels.shape
         out.memory = wp.zeros((rows, count, kernels.MEMORY), dtype=float, device=self.device)
         groups = -(-count // out.group)
+        # events of a pixel wait here, so that the CPU's vectors work out their times several at once
         if not self.device.is_cuda:
             out.queue = wp.empty((groups, kernels.QUEUE), dtype=wp.int64, device=self.device)
         out.sums = wp.zeros((rows, groups, kernels.SumPlace.SIZE), dtype=float, device=self.device)
@@ -325,6 +359,7 @@ class BatchSimulator:
         """Return the sums over groups of pixels, a Warp array of shape (B, G, SIZE)."""
         if not self.device.is_cuda:
             return sums
+        # in the order of the pixels, as a CPU adds them: no atomic additions, whose order changes
         rows, count, size = sums.shape
         parts = -(-count // GROUP)
         less = wp.empty((rows, parts, size), dtype=float, device=self.device)

@@ -12,20 +12,11 @@ from numpy.typing import NDArray
 from dase.effects.readout import Others
 from dase.effects.stream import StreamEffect, to_nanoseconds
 from dase.events import Events
+from dase.probes.random_streams import Draw
 from dase.probes.stimulus import Stimulus
 from dase.scenes.scene import Scene
 from dase.simulation.sensor import Sensor
 from dase.simulation.sensor_run import SensorRun
-
-MOST = 2.5e7
-"""Pixels times points of time that are simulated: of a larger sensor or a longer time, some pixels stand for
-all."""
-
-SENT = 6e6
-"""Events that all of them send: of a model that sends more, some stand for all, too."""
-
-KEPT = 3
-"""Present models whose load is kept."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,12 +28,19 @@ class WholeSensor:
         times: Points of the grid of time [s], shape (T,).
         seed: Of the random numbers, and of which pixels stand for all.
         device: Where kernels run.
+        most_samples: Pixels times points of time that are simulated: of a larger sensor or a longer time,
+            some pixels stand for all.
+        most_events: Events that all of them send: of a model that sends more, some stand for all, too.
+        kept: Present models whose load is kept.
     """
 
     scene: Scene
     times: NDArray[np.float64]
     seed: int
     device: str
+    most_samples: float = 2.5e7
+    most_events: float = 6e6
+    kept: int = 3
     _loads: list[BusLoad] = field(default_factory=list, repr=False)
 
     def load(self, sensor: Sensor, stimulus: Stimulus) -> BusLoad:
@@ -55,7 +53,7 @@ class WholeSensor:
         found = next((load for load in self._loads if load.sensor == bare), None)
         if found is None:
             found = BusLoad(self, bare, stimulus)
-        self._loads[:] = [found, *(load for load in self._loads if load is not found)][:KEPT]
+        self._loads[:] = [found, *(load for load in self._loads if load is not found)][: self.kept]
         return found
 
     def others(self, chosen: NDArray[np.int32], steps: int, sent: int) -> NDArray[np.int32]:
@@ -67,9 +65,10 @@ class WholeSensor:
             sent: Events that those send.
         """
         size = self.scene.width * self.scene.height
-        rng = np.random.default_rng([self.seed, 2])
+        rng = Draw.OTHER_PIXELS.generator(self.seed)
         rest = np.setdiff1d(rng.permutation(size), chosen, assume_unique=True).astype(np.int32)
-        room = min(int(MOST / steps), int(SENT / max(sent, 1) * len(chosen))) - len(chosen)
+        by_events = int(self.most_events / max(sent, 1) * len(chosen))
+        room = min(int(self.most_samples / steps), by_events) - len(chosen)
         return np.sort(rest[: max(len(chosen), room)])
 
     def emitted(self, sensor: Sensor, pixels: NDArray[np.int32], steps: int) -> Events:

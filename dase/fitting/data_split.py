@@ -10,13 +10,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from dase.effects.base import Observations
 from dase.errors import InputError
 from dase.events import Events
 from dase.fitting.batch_simulator import BatchSimulator
 from dase.fitting.bus_load import WholeSensor
 from dase.fitting.contradictions import contradiction_of_rest
 from dase.fitting.pixel_selection import choose_trusted_pixels, find_trusted_parts
-from dase.fitting.subset import Array, PixelSubset
+from dase.fitting.subset import Array, CalibratedSubset, PixelSubset
 from dase.fitting.time_window import (
     choose_window,
     outside_gaps,
@@ -27,11 +28,11 @@ from dase.fitting.time_window import (
 from dase.kernels import event_probes as kernels
 from dase.kernels import launch
 from dase.probes.accumulators import ProbeSums, StatisticsFrame
+from dase.probes.random_streams import Draw
 from dase.probes.statistics import peak_of, refine_frequency, ring_of_pixels
 from dase.probes.stimulus import (
-    COARSEST,
-    FINEST,
     MASKED,
+    STIMULUS,
     Grid,
     Stimulus,
     Trust,
@@ -39,29 +40,39 @@ from dase.probes.stimulus import (
     light_of,
     sort_into_cells,
 )
-from dase.probes.timestamp_patterns import FILE, TimestampStructure, find_structure
+from dase.probes.timestamp_patterns import PATTERNS, TimestampStructure, find_structure
 from dase.scenes.between_frames import CameraScene
 from dase.scenes.scene import Scene
 
-PIXELS = 1500
-"""Pixels in each half of the measurement."""
 
-SCOUTS = 500
-"""Pixels of the scout."""
+@dataclass(frozen=True)
+class SplitSettings:
+    """How a measurement is split, and what there must be of it."""
 
-SPLIT = 0.6
-"""Share of the time that is fitted; the rest is held out."""
+    pixels: int = 1500
+    """Pixels in each half of the measurement."""
 
-LEAST = 300
-"""Events that a half must have for anything to be said."""
+    scouts: int = 500
+    """Pixels of the scout, a third of those that are fitted: sampling errors are larger by less than 2."""
 
-COMMON = 1e-3
+    fitted_share: float = 0.6
+    """Share of the time that is fitted; the rest is held out. What judges needs less than what is fitted."""
 
-BUSY = 2e-3
-"""Events are counted for so long to see how fast they come at most [s]."""
+    least_pixels: int = 16
+    """Pixels without which a half says nothing."""
+
+    least_events: int = 300
+    """Events that a half must have for anything to be said."""
+
+    burst: float = 2e-3
+    """Events are counted for so long to see how fast they come at most [s]: long enough for many of them,
+    and short enough for a bus to be full all the time."""
 
 
-@dataclass(eq=False)
+SPLIT = SplitSettings()
+
+
+@dataclass(frozen=True, eq=False)
 class SplitMeasurement:
     """A measurement and the scene it is of.
 
@@ -89,10 +100,30 @@ class SplitMeasurement:
     notes: tuple[str, ...] = ()
     contradiction: str = ""
 
+    def observe(self, *, idle_bus: float) -> Observations:
+        """Return what effects may choose their candidates by, see `Observations`."""
+        return Observations(
+            peak_frequency=self.peak,
+            clock_period=self.structure.step,
+            line_time=self.structure.line,
+            scan_direction=self.structure.direction,
+            highest_event_rate=self.highest_event_rate,
+            least_bus_rate=self.least_bus_rate,
+            idle_bus=idle_bus,
+        )
+
     @property
     def evaluations(self) -> int:
         """Models run so far."""
         return sum(half.trials.evaluations for half in (self.train, self.held, self.scout))
+
+
+@dataclass(frozen=True, eq=False)
+class CalibratedSplit(SplitMeasurement):
+    """A measurement with a present model on its training half and its scout, for comparing candidates."""
+
+    train: CalibratedSubset
+    scout: CalibratedSubset
 
 
 def split_measurement(
@@ -102,9 +133,10 @@ def split_measurement(
     log_eps: float = 1e-3,
     trust: Trust | None = None,
     span: tuple[float, float] | None = None,
-    pixels: int = PIXELS,
+    pixels: int = SPLIT.pixels,
     seed: int = 0,
     device: str = "cpu",
+    settings: SplitSettings = SPLIT,
 ) -> SplitMeasurement:
     """Split a measurement into a half that is fitted and a half that judges.
 
@@ -119,6 +151,7 @@ def split_measurement(
         pixels: In each half.
         seed: Of the choice of pixels.
         device: Where kernels run.
+        settings: How it is split.
 
     Raises:
         InputError: Different sizes, no common time, or too few events.
@@ -138,19 +171,25 @@ def split_measurement(
         raise InputError(str(error)) from error
     size = scene.width * scene.height
     each = min(pixels, size // 2)
-    if each < 16:
-        raise InputError(f"a diagnosis needs at least 32 pixels, the scene has {scene.width}x{scene.height}")
-    rng, notes = np.random.default_rng([seed, 1]), list[str]()
+    if each < settings.least_pixels:
+        raise InputError(
+            f"a diagnosis needs at least {2 * settings.least_pixels} pixels, "
+            f"the scene has {scene.width}x{scene.height}"
+        )
+    rng, notes = Draw.PIXELS.generator(seed), list[str]()
     if grid is not asked:
         notes.append(sentence_of_window(asked, grid))
-    cut = max(2, round(SPLIT * grid.steps))
+    # time is cut, not drawn: moments between fitted ones would be known from these
+    cut = max(2, round(settings.fitted_share * grid.steps))
     if trust is None:
+        # other pixels judge: fixed patterns, such as mismatch, would be known from the fitted ones
         chosen = rng.permutation(size)[: 2 * each].astype(np.int32)
     else:
         looks = find_trusted_parts(events, scene, times_of_grid(scene, grid), cut, trust)
-        chosen = choose_trusted_pixels(looks, each, rng)
+        chosen = choose_trusted_pixels(looks, each, rng, least=settings.least_pixels)
         each = len(chosen) // 2
         notes.append(looks.sentence())
+    # from the begin of the scene also for the half that judges: filters and memories are settled there
     times = times_of_grid(scene, grid)
     light = light_of(scene, times, chosen)
     if not np.all(np.isfinite(light)) or light.min() < 0:
@@ -161,16 +200,19 @@ def split_measurement(
         length = 1e3 * float(np.median(np.diff(gaps, axis=1)))
         notes.append(f"{len(gaps)} gaps of {length:.3g} ms without any event: data are missing, and left out")
     good[:, 1:] &= good[:, :-1]  # a step is what lies between two points of the grid
+    # both halves have the same bands, or a cell would mean another brightness in each
     bands = band_edges(light, good)
     sorting = partial(sort_into_cells, step=grid.step, bands=bands, log_eps=log_eps)
+    # filters over time go pixel by pixel, so parts of the pixels give the same as all of them
     works: list[Callable[[], Any]] = [partial(sorting, part) for part in np.array_split(light, 8)]
     works.append(partial(find_structure, events))
     *parts, structure = launch.run_concurrently(works)
     cell = np.concatenate(parts)
     cell[~good] = MASKED
-    cell[:, 0] = MASKED
+    cell[:, 0] = MASKED  # no step ends at the first point
     first, last = slice(0, each), slice(each, 2 * each)
     train_grid = replace(grid, steps=cut)
+    # what judges is simulated over all of the time and compared in the later part only
     late = cell[last].copy()
     late[:, :cut] = MASKED
     halves: list[PixelSubset] = []
@@ -180,16 +222,21 @@ def split_measurement(
             to, trust is not None or len(gaps) > 0,
         )  # fmt: skip
         halves.append(_make_subset(stimulus, events, cut if stretch is grid else 0, structure))
-    _require_enough_events(halves, events, grid, notes)
-    halves.append(_make_subset(halves[0].trials.stimulus.part(SCOUTS), events, 0, structure))
+    _require_enough_events(halves, events, grid, notes, settings.least_events)
+    halves.append(_make_subset(halves[0].trials.stimulus.part(settings.scouts), events, 0, structure))
+    # seen in the fitted half: what judges must not choose
     peak = peak_of(halves[0].found.clock[0], grid.step)
     if trust is None:  # else most events are where the scene is not known
         peak = refine_frequency(events, grid.begin, grid.begin + cut * grid.step, peak)
-    for half in halves:
-        half.frame = replace(half.frame, peak=peak)
-        # where the scene is trusted here and there only, nobody knows what all pixels send
-        half.around = WholeSensor(scene, times_of_grid(scene, grid), seed, device) if trust is None else None
-    train, held, scout = halves
+    train, held, scout = (
+        replace(
+            half,
+            frame=replace(half.frame, peak=peak),
+            # where the scene is trusted here and there only, nobody knows what all pixels send
+            around=WholeSensor(scene, times_of_grid(scene, grid), seed, device) if trust is None else None,
+        )
+        for half in halves
+    )
     rates = highest_event_rate(events), least_bus_rate(events, structure)
     contradiction = contradiction_of_rest(events, light)
     if contradiction:
@@ -198,7 +245,11 @@ def split_measurement(
 
 
 def common_grid(events: Events, scene: Scene) -> Grid:
-    """Return the time that scene and events have in common, in equal steps."""
+    """Return the time that scene and events have in common, in equal steps [s].
+
+    Raises:
+        InputError: Different sizes, no events, or no time in common.
+    """
     if (events.width, events.height) != (scene.width, scene.height):
         raise InputError(
             f"recording and scene must have one size, got {events.width}x{events.height} "
@@ -213,9 +264,12 @@ def common_grid(events: Events, scene: Scene) -> Grid:
             f"recording and scene must overlap in time, got events from {events.t[0]:.6g} s to "
             f"{events.t[-1]:.6g} s and a scene from {begin:.6g} s to {end:.6g} s"
         )
+    # steps of the scene itself need no interpolation, which would smooth what happens between them
     step = np.diff(times)
-    even = len(step) > 0 and np.ptp(step) < 1e-3 * step.mean() and FINEST <= step.mean() <= COARSEST
-    h = float(step.mean()) if even else COMMON
+    even = len(step) > 0 and np.ptp(step) < 1e-3 * step.mean()
+    own = even and STIMULUS.finest_step <= step.mean() <= STIMULUS.coarsest_step
+    h = float(step.mean()) if own else STIMULUS.common_step
+    # after the last event a step or two of silence count, not minutes: the recording may have ended there
     last = min(end, float(events.t[-1]) + 2 * h)
     steps = int(np.floor((last - begin) / h + 1e-6)) + 1
     return Grid(begin, h, max(steps, 2))
@@ -223,15 +277,16 @@ def common_grid(events: Events, scene: Scene) -> Grid:
 
 def highest_event_rate(events: Events) -> float:
     """Return the most events per second [Hz]: the rate of a bus, if it ever was full for long enough."""
-    counts = np.bincount(((events.t - events.t[0]) / BUSY).astype(np.int64))
-    return float(counts.max()) / BUSY
+    counts = np.bincount(((events.t - events.t[0]) / SPLIT.burst).astype(np.int64))
+    return float(counts.max()) / SPLIT.burst
 
 
 def least_bus_rate(events: Events, structure: TimestampStructure) -> float:
     """Return the events per second that a bus can send at least [Hz], as it has sent some as fast as that."""
     if structure.line:
         return 0.0  # stamps tell when a line was read
-    slack = max(FILE, structure.step)
+    slack = max(PATTERNS.file_step, structure.step)
+    # runs of all lengths: the time of short ones is rounded by the clock, long ones have pauses
     runs = (2**n for n in range(13) if 2**n < len(events))
     return max((n / (float((events.t[n:] - events.t[:-n]).min()) + slack) for n in runs), default=0.0)
 
@@ -271,34 +326,36 @@ def typical_changes(sums: ProbeSums) -> NDArray[np.float32]:
     return (pairs[:, 1] / np.maximum(pairs[:, 0], 1)).astype(np.float32)
 
 
-def _require_enough_events(halves: list[PixelSubset], events: Events, grid: Grid, notes: list[str]) -> None:
+def _require_enough_events(
+    halves: list[PixelSubset], events: Events, grid: Grid, notes: list[str], least: int
+) -> None:
     counts = [int(half.found.halves.sum()) for half in halves]
     for half, count, name in zip(halves, counts, ("fitting", "judging"), strict=True):
-        if count < LEAST:
+        if count < least:
+            helps = _what_helps(half, count, max(counts), events, grid, least)
             raise InputError(
                 f"too few events to say anything: {count} of the {len(events)} lie in the part for {name}, "
-                f"at least {LEAST} are needed; {_what_helps(half, count, max(counts), events, grid)}"
-                + "".join(f"; {note}" for note in notes)
+                f"at least {least} are needed; {helps}" + "".join(f"; {note}" for note in notes)
             )
 
 
-def _what_helps(half: PixelSubset, count: int, other: int, events: Events, grid: Grid) -> str:
+def _what_helps(half: PixelSubset, count: int, other: int, events: Events, grid: Grid, least: int) -> str:
     """Return what would give a part of a measurement enough events."""
     stimulus, first = half.trials.stimulus, half.frame.first
     begin, end = (grid.begin + grid.step * n for n in (first, stimulus.grid.steps))
     inside = int(np.count_nonzero((events.t >= begin) & (events.t < end)))
     size, looked = stimulus.width * stimulus.height, len(stimulus.pixels)
     # twice as many as are missing on the average: pixels differ
-    wanted = int(np.ceil(2 * LEAST / max(count, 1) * looked / 100) * 100)
-    if stimulus.holes and inside * looked >= 2 * LEAST * size:
+    wanted = int(np.ceil(2 * least / max(count, 1) * looked / 100) * 100)
+    if stimulus.holes and inside * looked >= 2 * least * size:
         return "most lie where the scene is not known: frames more often or less motion help"
-    if count and wanted <= size // 2 and inside >= 2 * LEAST:
+    if count and wanted <= size // 2 and inside >= 2 * least:
         return f"looking at more pixels helps, {wanted} instead of {looked} (pixels)"
     span = f"{begin:.3g} s to {end:.3g} s"
-    if inside < len(events) // 20 and other >= LEAST:
+    if inside < len(events) // 20 and other >= least:
         return f"nearly all others come before or after {span}: record what goes on over the whole time"
-    times = max(2.0, np.ceil(LEAST / max(count, 1)))
-    if count * times < LEAST or times > 50:
+    times = max(2.0, np.ceil(least / max(count, 1)))
+    if count * times < least or times > 50:
         return f"from {span} the camera saw next to nothing: record more motion or more light"
     length = grid.step * (grid.steps - 1)
     return f"record about {times:.0f} times as long as these {length:.3g} s, or more motion"

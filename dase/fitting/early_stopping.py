@@ -6,13 +6,6 @@ from dataclasses import dataclass, field
 
 from dase.fitting.descent import StopRule
 
-LAGS = 1.1
-"""A search stops where its loss will stay above this, relative to that of the last candidate that goes on, or
-of another search of its own."""
-
-AHEAD = 2
-"""Populations ahead for which the loss is taken to fall as by the last one."""
-
 
 @dataclass(frozen=True, eq=False)
 class CandidateRace:
@@ -20,12 +13,14 @@ class CandidateRace:
 
     Args:
         places: Candidates that go on.
-        lags: Loss of one that is behind, relative to that of the last of those.
+        lags: A search stops where its loss will stay above this, relative to that of the last of those.
+        own_lags: The same relative to another search of its own candidate.
         best: The least loss of each candidate.
     """
 
     places: int
-    lags: float = LAGS
+    lags: float = 1.1
+    own_lags: float = 1.1
     best: dict[str, float] = field(default_factory=dict)
 
     def over(self, name: str, unit: float = 1.0) -> StopRule:
@@ -36,7 +31,7 @@ class CandidateRace:
             first = sorted(self.best.values())[: self.places]
             last = first[-1] if len(first) == self.places else float("inf")
             soon = expected_loss(loss, before) / unit
-            return soon > min(self.lags * last, LAGS * self.best[name])
+            return soon > min(self.lags * last, self.own_lags * self.best[name])
 
         return over
 
@@ -46,6 +41,9 @@ def stop_unless_below(goal: float) -> StopRule:
     return lambda loss, before: expected_loss(loss, before) > goal
 
 
-def expected_loss(loss: float, before: float) -> float:
-    """Return the loss some populations ahead; nothing is known of it after the first."""
-    return float(loss * min(loss / before, 1.0) ** AHEAD)
+def expected_loss(loss: float, before: float, *, ahead: int = 2) -> float:
+    """Return the loss so many populations ahead, if it goes on to fall by factors as by the last one.
+
+    After the first population `before` is infinite: nothing is known, and the loss expected is 0.
+    """
+    return float(loss * min(loss / before, 1.0) ** ahead)

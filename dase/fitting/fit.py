@@ -4,38 +4,44 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from os import PathLike
 
 import numpy as np
 
-from dase.fitting.confidence_intervals import estimate_parameters
-from dase.fitting.data_split import PIXELS, SplitMeasurement, split_measurement
+from dase.fitting.confidence_intervals import REPEATS, estimate_parameters
+from dase.fitting.data_split import SPLIT, SplitMeasurement, split_measurement
 from dase.fitting.measurement import Measured, SceneChoice, as_measurement
 from dase.fitting.model import FittedModel, fit_present_model, model_of, refit_model
 from dase.fitting.parameter_space import SearchAxis
 from dase.fitting.plain_numbers import plain_numbers
 from dase.fitting.search_ends import is_where_it_began, parameters_at_bounds
 from dase.probes.distance import Judgement
+from dase.probes.random_streams import Draw, SimulationStream
 from dase.probes.stimulus import Trust
 from dase.results import Estimate, Fit, Progress, is_worse
 from dase.simulation.sensor import Sensor
 from dase.simulation.sensor_file import as_sensor
 
-REPEATS = 60
-"""Simulations with other seeds that tell what chance does."""
 
-OTHERS = 2
-"""Starts beside the wide look at thresholds."""
+@dataclass(frozen=True)
+class FitSettings:
+    """How many starts a fit has, and when they agree."""
 
-MOST = 5
-"""The same where no two starts come to the same error."""
+    other_starts: int = 2
+    """Starts beside the wide look at thresholds."""
 
-AGREE = 3.0
-"""Starts agree where their ends lie within so many half-widths of the confidence interval, or `NEAR`."""
+    most_starts: int = 5
+    """The same where no two starts come to the same error."""
 
-NEAR = 0.08
-"""Of each other, in the units of `Axis.to_place`."""
+    agree: float = 3.0
+    """Starts agree where their ends lie within so many half-widths of the confidence interval."""
+
+    near: float = 0.08
+    """They agree as well where they lie within this of each other, in the units of `SearchAxis.to_place`."""
+
+
+FIT = FitSettings()
 
 
 def fit(
@@ -45,7 +51,7 @@ def fit(
     scene: SceneChoice | None = None,
     free: Sequence[str] | None = None,
     trust: Trust | None = None,
-    pixels: int = PIXELS,
+    pixels: int = SPLIT.pixels,
     seed: int = 0,
     device: str = "cpu",
     progress: Progress | None = None,
@@ -79,15 +85,17 @@ def fit(
         span=measurement.span, pixels=pixels, seed=seed, device=device,
     )  # fmt: skip
     given = model_of(start, free)
-    before = given.judge(evidence.held, repeats=REPEATS // 2, seed=seed + 500).error
+    before = given.judge(evidence.held, repeats=REPEATS // 2, seed=SimulationStream.JUDGE.seed(seed)).error
     ends = _descend_from_starts(evidence, start, free, seed, lambda text, share: tell(text, share, before))
     judgement, model = _best_end(ends)
     tell("confidence intervals", 0.9, judgement.error)
     good = _equally_good_models(ends)
     model, values = estimate_parameters(evidence, model, seed=seed)
-    judgement = model.judge(evidence.held, repeats=REPEATS, seed=seed + 500)
+    stream = SimulationStream.JUDGE.seed(seed)
+    held = model.calibrate(evidence.held, repeats=REPEATS, seed=stream)
+    judgement = held.judge(stream)
     stuck = is_where_it_began(model, given) and judgement.error > judgement.gate
-    plain = plain_numbers(evidence.held)
+    plain = plain_numbers(held)
     apart = notes_on_disagreement(model, good, values)
     values = widen_intervals(model, good, values)
     notes = [
@@ -130,13 +138,15 @@ def _descend_from_starts(
     """Return where several starts end, each with its held-out error."""
     tell("a wide look", 0.1)
     model = refit_model(evidence, fit_present_model(evidence, sensor, free, seed=seed), seed=seed)
-    ends = [(model.judge(evidence.held, repeats=REPEATS, seed=seed + 500), model)]
-    for n in range(MOST):
-        if n >= OTHERS and len(_equally_good_models(ends)) > 1:
+    ends = [(model.judge(evidence.held, repeats=REPEATS, seed=SimulationStream.JUDGE.seed(seed)), model)]
+    for n in range(FIT.most_starts):
+        if n >= FIT.other_starts and len(_equally_good_models(ends)) > 1:
             break
-        tell(f"start {n + 2}", 0.3 + 0.6 * n / MOST)
+        tell(f"start {n + 2}", 0.3 + 0.6 * n / FIT.most_starts)
         model = refit_model(evidence, _move_away(_best_end(ends)[1], seed + n), seed=seed + n)
-        ends.append((model.judge(evidence.held, repeats=REPEATS, seed=seed + 500), model))
+        ends.append(
+            (model.judge(evidence.held, repeats=REPEATS, seed=SimulationStream.JUDGE.seed(seed)), model)
+        )
     return ends
 
 
@@ -168,7 +178,7 @@ def _notes_on_minimum(judgement: Judgement, starts: int, good: int) -> list[str]
 
 def _move_away(model: FittedModel, seed: int) -> FittedModel:
     """Return the model well away from where it is."""
-    rng = np.random.default_rng([seed, 11])
+    rng = Draw.FAR_START.generator(seed)
     low, high = model.space.bounds()
     place = np.clip(model.place + rng.choice([-0.5, 0.5], len(model.place)), low, high)
     return replace(model, place=place)
@@ -193,7 +203,7 @@ def _disagreeing_axes(
     out = []
     for n, axis in enumerate(best.space.axes):
         low, high = (float(axis.to_place(v)) for v in (values[axis.name].low, values[axis.name].high))
-        if np.ptp([m.place[n] for m in ends]) > max(AGREE * 0.5 * (high - low), NEAR):
+        if np.ptp([m.place[n] for m in ends]) > max(FIT.agree * 0.5 * (high - low), FIT.near):
             out.append(n)
     return out
 

@@ -20,7 +20,7 @@ from dase.errors import InputError
 from dase.events import Events
 from dase.formatting import fit_to_screen
 from dase.io.sequence import Sequence
-from dase.probes.stimulus import COARSEST, Trust
+from dase.probes.stimulus import STIMULUS, Trust
 from dase.recordings.recording import Recording
 from dase.results import Comparison, Diagnosis, Fit
 from dase.scenes.between_frames import CameraScene
@@ -232,7 +232,7 @@ def scene_of_frames(recorded: Recording | Sequence, name: str, notes: list[str])
     if times is None:
         raise InputError(f"{name}: its frames have no times, so they cannot be laid beside the events")
     # also frames that come exactly as slowly as the slowest steps of a comparison are joined by lines
-    if float(np.median(np.diff(times))) <= COARSEST * (1 + 1e-6):
+    if float(np.median(np.diff(times))) <= STIMULUS.coarsest_step * (1 + 1e-6):
         return VideoScene(linear_intensity(recorded.frames, name), times)
     return scene_between_frames(recorded, notes)
 

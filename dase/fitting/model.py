@@ -10,45 +10,68 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dase.effects.base import Effect
-from dase.effects.flicker import Flicker
 from dase.effects.threshold import Threshold
 from dase.fitting.data_split import SplitMeasurement
-from dase.fitting.descent import StopRule, descent_work, ranking_work
+from dase.fitting.descent import DESCENT, DescentSettings, StopRule, descent_work, ranking_work
 from dase.fitting.parameter_space import ParameterSpace, SearchAxis, axes_of, with_values
 from dase.fitting.scheduler import SimulationRequest, Work, answer_requests, run_side_by_side, run_work
-from dase.fitting.subset import PixelSubset
+from dase.fitting.subset import CalibratedSubset, PixelSubset
 from dase.probes.distance import Judgement
+from dase.probes.random_streams import SimulationStream
 from dase.simulation.sensor import Sensor
 
 Array = NDArray[np.float64]
 
-THRESHOLDS = (0.04, 0.06, 0.09, 0.12, 0.15, 0.18, 0.22, 0.27, 0.34, 0.45, 0.65)
-"""Tried for both polarities when a model is fitted from nothing."""
 
-RATIO = 2.2
-"""Most that the thresholds of a pixel differ by at the start."""
+@dataclass(frozen=True)
+class RefitSettings:
+    """How a model is fitted by its own sampling errors."""
 
-SHIFTS = (-0.7, -0.4, -0.15, 0.0, 0.35)
-"""Of the logarithm of the thresholds, when an effect is tried."""
+    repeats: int = 16
+    """Simulations that give a model's sampling errors while it is fitted."""
 
-SETTLED = 16
-"""Repeats that give a model's sampling errors while it is fitted."""
+    descents: int = 3
+    """Descents of which the best is taken: each ends where its random numbers happen to lead."""
 
-DESCENTS = 3
-"""Descents of which the best is taken."""
+    seeds_apart: int = 10_007
+    """Between their seeds: farther than those of one descent are from each other."""
 
-APART = 10_007
-"""Between their seeds."""
+    alike: float = 2.0
+    """Most by which the loss of another phase may grow where it becomes the present one."""
 
-ALIKE = 2.0
-"""Most by which the loss of another phase may grow where it becomes the present one."""
 
-ROOM = 0.3
-"""Beside a value that is seen in a measurement, one higher by this is tried: of a bus, the most events per
-second are the least it can send."""
+REFIT = RefitSettings()
 
-FEW_STARTS = 0.1
-"""Share of the plausible range that is left out at both ends when an effect is tried."""
+
+@dataclass(frozen=True)
+class StartSettings:
+    """Where searches begin."""
+
+    thresholds: tuple[float, ...] = (0.04, 0.06, 0.09, 0.12, 0.15, 0.18, 0.22, 0.27, 0.34, 0.45, 0.65)
+    """Tried for both polarities when a model is fitted from nothing [log intensity]."""
+
+    ratio: float = 2.2
+    """Most that the thresholds of a pixel differ by at the start."""
+
+    shifts: tuple[float, ...] = (-0.7, -0.4, -0.15, 0.0, 0.35)
+    """Of the logarithm of the thresholds, when an effect is tried: most effects make events more or fewer."""
+
+    strengths: int = 6
+    """Places along a parameter that switches its effect off."""
+
+    margin: float = 0.1
+    """Share of the plausible range that is left out at both ends when an effect is tried."""
+
+    turns: int = 8
+    """Phases at which what repeats in time is tried: no farther than a sixteenth of a turn from the right
+    one."""
+
+    above: float = 0.3
+    """Beside a bound that is seen in a measurement, one higher by this is tried, in the units of
+    `SearchAxis.to_place`: of a bus, the most events per second are the least it can send."""
+
+
+STARTS = StartSettings()
 
 
 @dataclass(frozen=True)
@@ -70,33 +93,34 @@ class FittedModel:
         """The sensor at the place."""
         return self.space.at(self.place)
 
-    def rebase(self, half: PixelSubset, *, repeats: int, seed: int) -> Array:
-        """Make this the present model of a half; return statistics of its repeats, shape (repeats, J)."""
-        return half.rebase(self.space, self.place, repeats=repeats, seed=seed)
+    def calibrate(self, subset: PixelSubset, *, repeats: int, seed: int) -> CalibratedSubset:
+        """Return the pixels with this as their present model, see `PixelSubset.calibration_work`."""
+        return run_work(subset.calibration_work(self.space, self.place, repeats=repeats, seed=seed))
 
-    def judge(self, half: PixelSubset, *, repeats: int, seed: int) -> Judgement:
-        """Make this the present model of a half and return its error there."""
-        return run_work(self.judging(half, repeats=repeats, seed=seed))
+    def judge(self, subset: PixelSubset, *, repeats: int, seed: int) -> Judgement:
+        """Return the error on some pixels, seen in `repeats` simulations."""
+        return run_work(self.judgement_work(subset, repeats=repeats, seed=seed))
 
-    def judging(self, half: PixelSubset, *, repeats: int, seed: int) -> Work[Judgement]:
-        """Do what `judge` does, see `run_side_by_side`."""
-        values = yield from half.rebasing(self.space, self.place, repeats=repeats, seed=seed)
-        return half.judge(values, seed=seed)
+    def judgement_work(self, subset: PixelSubset, *, repeats: int, seed: int) -> Work[Judgement]:
+        """Do what `judge` does."""
+        calibrated = yield from subset.calibration_work(self.space, self.place, repeats=repeats, seed=seed)
+        return calibrated.judge(seed)
 
-    def searching(
+    def search_work(
         self,
-        half: PixelSubset,
+        half: CalibratedSubset,
         *,
         seed: int,
         iterations: int = 4,
         radius: float = 0.2,
         patient: bool = False,
         over: StopRule | None = None,
+        settings: DescentSettings = DESCENT,
     ) -> Work[FittedModel]:
         """Return the model with its parameters improved, see `run_side_by_side`."""
         found = yield from descent_work(
             half, self.space, self.place, seed=seed, iterations=iterations, radius=radius, patient=patient,
-            over=over,
+            over=over, settings=settings,
         )  # fmt: skip
         return replace(self, place=found.place, loss=found.loss)
 
@@ -113,24 +137,26 @@ def with_phase(model: FittedModel, phase: float) -> FittedModel:
     return replace(model, space=replace(model.space, sensor=sensor))
 
 
-def with_lamp_shifted(model: FittedModel, step: float) -> list[FittedModel]:
-    """Return a model, and where it has a lamp, also those with the lamp a step of the grid earlier and later.
+def shift_periodic_effects(model: FittedModel, step: float) -> list[FittedModel]:
+    """Return a model, and for each effect that repeats in time those with it earlier and later.
 
     What probes tell by steps hardly changes when all events are a step off, so a fit may end there.
+
+    Args:
+        model: Whose effects are shifted.
+        step: Of the grid of time [s].
     """
-    names = [axis.name for axis in model.space.axes]
-    if "flicker.phase" not in names:
-        return [model]
-    at = names.index("flicker.phase")
-    lamp = model.sensor["flicker"]
-    assert isinstance(lamp, Flicker)
-    turn = step * lamp.frequency
     out = [model]
-    for phase in (-turn, turn):
-        place = model.place.copy()
-        value = float(model.space.axes[at].to_value(place[at])) + phase
-        place[at] = model.space.axes[at].to_place((value + 1.0) % 2.0 - 1.0)
-        out.append(replace(model, place=place))
+    for effect in model.sensor.effects:
+        for seconds in (-step, step):
+            place, moved = model.place.copy(), effect.shifted(seconds)
+            for n, axis in enumerate(model.space.axes):
+                if axis.effect is type(effect) and moved != effect:
+                    value = getattr(moved, axis.fact.name)
+                    if value != getattr(effect, axis.fact.name):
+                        place[n] = axis.to_place(value)
+            if not np.array_equal(place, model.place):
+                out.append(replace(model, place=place))
     return out
 
 
@@ -140,20 +166,20 @@ def fit_present_model(
     """Fit the free parameters of a sensor: a wide look at thresholds and phase, then descents."""
     model = model_of(sensor, free)
     looks = [
-        _threshold_scan_work(evidence.scout.view(), with_phase(model, phase), seed=seed)
-        for phase in (0.0, 1.0)
+        _threshold_scan_work(evidence.scout, with_phase(model, phase), seed=seed) for phase in (0.0, 1.0)
     ]
     # each was judged by its own sampling errors; judge both by those of the better one
     best = sorted(run_side_by_side(looks), key=lambda m: m.loss)
-    half = evidence.train.view()
-    best[0].rebase(half, repeats=12, seed=seed + 100)
-    ends = run_side_by_side([m.searching(half, seed=seed) for m in best])
+    half = best[0].calibrate(evidence.train, repeats=12, seed=SimulationStream.CALIBRATE_FIT.seed(seed))
+    ends = run_side_by_side([m.search_work(half, seed=seed) for m in best])
     return refit_model(evidence, min(ends, key=lambda m: m.loss), seed=seed, rounds=1)
 
 
-def _threshold_scan_work(half: PixelSubset, start: FittedModel, *, seed: int) -> Work[FittedModel]:
+def _threshold_scan_work(subset: PixelSubset, start: FittedModel, *, seed: int) -> Work[FittedModel]:
     """Return the best of many thresholds."""
-    yield from half.rebasing(start.space, start.place, repeats=12, seed=seed + 100)
+    half = yield from subset.calibration_work(
+        start.space, start.place, repeats=12, seed=SimulationStream.CALIBRATE_FIT.seed(seed)
+    )
     places = np.concatenate([start.place[None], _threshold_starts(start)])
     places, losses = yield from ranking_work(half, start.space, places, seed=seed)
     return replace(start, place=places[0], loss=losses[0])
@@ -165,12 +191,13 @@ def refit_model(evidence: SplitMeasurement, model: FittedModel, *, seed: int, ro
     Each of some descents has random numbers of its own, because they end where those happen to lead, and the
     last one begins with the other phase; the best of them by the random numbers of all is taken.
     """
-    seeds = [seed + APART * n for n in range(DESCENTS)]
+    seeds = [seed + REFIT.seeds_apart * n for n in range(REFIT.descents)]
     works = [refit_work(evidence, model, seed=each, rounds=rounds) for each in seeds[:-1]]
     works.append(_refit_from_other_phase_work(evidence, model, seed=seeds[-1], rounds=rounds))
     ends = run_side_by_side(works)
-    half = evidence.train.view()
-    ends[0].rebase(half, repeats=SETTLED, seed=seed + 100)
+    half = ends[0].calibrate(
+        evidence.train, repeats=REFIT.repeats, seed=SimulationStream.CALIBRATE_FIT.seed(seed)
+    )
     values = answer_requests(
         [SimulationRequest(half, m.space, m.place[None], each) for m in ends for each in seeds]
     )
@@ -186,10 +213,18 @@ def _refit_from_other_phase_work(
     Where that is wrong, all else is bent to make up for it, and the right one looks no better before all is
     fitted again.
     """
-    half = evidence.train.view()
-    yield from half.rebasing(model.space, model.place, repeats=SETTLED, seed=seed + 100)
-    other = yield from _with_other_phase(model).searching(half, seed=seed, iterations=3, patient=True)
+    half = yield from calibration_while_fitting(evidence, model, seed=seed)
+    other = yield from _with_other_phase(model).search_work(half, seed=seed, iterations=3, patient=True)
     return (yield from refit_work(evidence, other, seed=seed, rounds=rounds))
+
+
+def calibration_while_fitting(
+    evidence: SplitMeasurement, model: FittedModel, *, seed: int
+) -> Work[CalibratedSubset]:
+    """Return the training half with a model under fit as its present one."""
+    return evidence.train.calibration_work(
+        model.space, model.place, repeats=REFIT.repeats, seed=SimulationStream.CALIBRATE_FIT.seed(seed)
+    )
 
 
 def _with_other_phase(model: FittedModel) -> FittedModel:
@@ -204,21 +239,19 @@ def refit_work(
     *,
     seed: int,
     rounds: int = 2,
-    half: PixelSubset | None = None,
+    half: CalibratedSubset | None = None,
     over: StopRule | None = None,
 ) -> Work[FittedModel]:
-    """Do what `refit_model` does, see `run_side_by_side`; `half` is the training half if the model is its
-    present one."""
+    """Do what `refit_model` does; `half` is the training half if the model is its present one."""
     for turn in range(rounds):
         if half is None or turn > 0:
-            half = evidence.train.view()
-            yield from half.rebasing(model.space, model.place, repeats=SETTLED, seed=seed + 100)
+            half = yield from calibration_while_fitting(evidence, model, seed=seed)
         other = _with_other_phase(model)
         values = yield [SimulationRequest(half, m.space, m.place[None], seed) for m in (model, other)]
         losses = [float(half.scale.loss(value)[0]) for value in values]
         if losses[1] < losses[0] and (yield from _as_good_work(evidence, other, losses[0], seed=seed)):
             model = other
-        model = yield from model.searching(
+        model = yield from model.search_work(
             half, seed=seed + turn, radius=0.12 / (1 + turn), patient=True, over=over
         )
     return model
@@ -230,18 +263,18 @@ def _as_good_work(evidence: SplitMeasurement, model: FittedModel, loss: float, *
     By those of a model with chance in it, one without looks no worse, until it is the present one and its
     repeats are all alike.
     """
-    half = evidence.train.view()
-    yield from half.rebasing(model.space, model.place, repeats=SETTLED, seed=seed + 100)
+    half = yield from calibration_while_fitting(evidence, model, seed=seed)
     (values,) = yield [SimulationRequest(half, model.space, model.place[None], seed)]
-    return float(half.scale.loss(values)[0]) < ALIKE * loss
+    return float(half.scale.loss(values)[0]) < REFIT.alike * loss
 
 
 def _threshold_starts(model: FittedModel) -> Array:
-    names = [axis.name for axis in model.space.axes]
-    at = [names.index(n) if n in names else -1 for n in ("threshold.on", "threshold.off")]
-    if min(at) < 0:
+    at = [n for n, axis in enumerate(model.space.axes) if axis.is_threshold]  # ON comes before OFF
+    if len(at) < 2:
         return model.place[None]
-    pairs = [(a, b) for a, b in product(THRESHOLDS, THRESHOLDS) if 1 / RATIO < a / b < RATIO]
+    pairs = [
+        (a, b) for a, b in product(STARTS.thresholds, repeat=2) if 1 / STARTS.ratio < a / b < STARTS.ratio
+    ]
     out = np.repeat(model.place[None], len(pairs), 0)
     for column, values in zip(at, np.array(pairs).T, strict=True):
         out[:, column] = model.space.axes[column].to_place(values)
@@ -257,25 +290,25 @@ def with_effect_added(present: FittedModel, effect: Effect) -> FittedModel:
     """Return the present model with an effect added, all of whose parameters are free."""
     sensor = present.sensor.with_effect(effect)
     old = [axis.name for axis in present.space.axes]
-    # read off the events of all pixels, a lamp's frequency is better than a fit to a few makes it
-    new = [name for name in free_of(sensor, effect.name) if name != "flicker.frequency"]
+    # read off the events of all pixels, what a fit finds only nearby is better than a fit to a few makes it
+    new = [axis.name for axis in axes_of(sensor) if axis.effect is type(effect) and axis.fact.nearby is None]
     return model_of(sensor, [*old, *new])
 
 
 def starting_places(model: FittedModel, effect: Effect, *, few: bool = False) -> Array:
     """Return places from which an effect is tried: its strength and its character, at several thresholds."""
     axes = model.space.axes
-    columns, choices, seen = [], [], False
+    columns, choices, observed = [], [], False
     for n, axis in enumerate(axes):
-        if axis.name.split(".")[0] == effect.name:
+        if axis.effect is type(effect):
             columns.append(n)
-            seen |= axis.fact.seen
+            observed |= axis.fact.search_starts == "above"
             tried = _starting_places_of_axis(axis, float(model.place[n]))
             choices.append(tried[::2] if few and axis.main and len(tried) > 2 else tried)
-    thresholds = [n for n, axis in enumerate(axes) if axis.name in ("threshold.on", "threshold.off")]
+    thresholds = [n for n, axis in enumerate(axes) if axis.is_threshold]
     out = []
     for combination in product(*choices):
-        for shift in SHIFTS[1::2] if few and not seen else SHIFTS:
+        for shift in STARTS.shifts[1::2] if few and not observed else STARTS.shifts:
             place = model.place.copy()
             place[columns] = combination
             place[thresholds] += shift
@@ -285,12 +318,14 @@ def starting_places(model: FittedModel, effect: Effect, *, few: bool = False) ->
 
 def _starting_places_of_axis(axis: SearchAxis, present: float) -> list[float]:
     low, high = (float(axis.to_place(v)) for v in axis.fact.plausible)
-    if axis.fact.seen:
-        return [present, present + ROOM]
-    if axis.main:
-        return list(low + (high - low) * np.linspace(FEW_STARTS, 1 - FEW_STARTS, 6))
-    if axis.fact.unit == "turns":
-        return [float(axis.to_place(turn)) for turn in np.linspace(0, 1, 8, endpoint=False)]
-    if axis.name.split(".")[1] in ("dark", "slope", "damping", "knee", "rate", "cutoff"):
-        return [present, low + 0.9 * (high - low)]
-    return [present]
+    match axis.fact.search_starts:
+        case "above":
+            return [present, present + STARTS.above]
+        case "spread":
+            return list(low + (high - low) * np.linspace(STARTS.margin, 1 - STARTS.margin, STARTS.strengths))
+        case "turn":
+            return [float(axis.to_place(turn)) for turn in np.linspace(0, 1, STARTS.turns, endpoint=False)]
+        case "ends":
+            return [present, low + (1 - STARTS.margin) * (high - low)]
+        case "value":
+            return [present]

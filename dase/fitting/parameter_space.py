@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from dase.effects.base import Effect, Parameter
+from dase.effects.threshold import Threshold
 from dase.errors import InputError, nearest
 from dase.simulation.sensor import Sensor
 
@@ -18,9 +19,6 @@ Array = NDArray[np.float64]
 
 PHASE = 0.125
 """Unit along a phase [turns]: beyond it, statistics do not run along straight lines."""
-
-WIDER = 3.0
-"""A fit may leave the plausible range by this factor, and then says so."""
 
 
 @dataclass(frozen=True)
@@ -34,6 +32,7 @@ class SearchAxis:
         high: Largest value of the search.
         log: Whether the search goes by factors.
         span: How long the range is in units of the search, where it does not go by factors.
+        effect: Whose parameter it is.
     """
 
     name: str
@@ -42,11 +41,22 @@ class SearchAxis:
     high: float
     log: bool
     span: float = 2.0
+    effect: type[Effect] = Effect
 
     @property
     def main(self) -> bool:
         """Whether it switches its effect off."""
         return self.fact.off is not None
+
+    @property
+    def of_threshold(self) -> bool:
+        """Whether it belongs to the change detector: every event depends on it."""
+        return issubclass(self.effect, Threshold)
+
+    @property
+    def is_threshold(self) -> bool:
+        """Whether it is the ON or the OFF threshold."""
+        return self.of_threshold and self.fact.fitted
 
     def to_place(self, value: Any) -> Any:
         """Return where a value lies: a unit is a factor e, or a part of the range."""
@@ -68,17 +78,25 @@ class SearchAxis:
         return float(self.to_place(self.low)), float(self.to_place(self.high))
 
 
-def make_axis(effect: str, fact: Parameter) -> SearchAxis:
-    """Return the axis of one parameter, somewhat wider than its plausible range."""
-    low, high = fact.plausible
-    if fact.unit == "turns":
-        low, high = fact.bounds
+def make_axis(effect: type[Effect], fact: Parameter) -> SearchAxis:
+    """Return the axis of one parameter of an effect, somewhat wider than its plausible range."""
+    low, high = fact.bounds if fact.periodic else fact.plausible
     log = low > 0
     if log:
-        low, high = low / WIDER, high * WIDER
+        low, high = low / 3.0, high * 3.0  # a fit may leave the plausible range, and then says so
     low, high = max(low, fact.bounds[0]), min(high, fact.bounds[1])
-    span = (high - low) / PHASE if fact.unit == "turns" else 2.0
-    return SearchAxis(f"{effect}.{fact.name}", fact, low, high, log, span)
+    span = (high - low) / PHASE if fact.periodic else 2.0
+    return SearchAxis(f"{effect.name}.{fact.name}", fact, low, high, log, span, effect)
+
+
+def axis_of(effect: Effect, fact: Parameter) -> SearchAxis:
+    """Return the axis of one parameter of an effect, as far from its present value as a fit may go."""
+    axis = make_axis(type(effect), fact)
+    if fact.nearby is None:
+        return axis
+    value = float(getattr(effect, fact.name))
+    low, high = value * (1 - fact.nearby), value * (1 + fact.nearby)
+    return replace(axis, low=low, high=high, log=False, span=2.0 / PHASE)
 
 
 @dataclass(frozen=True)
@@ -133,59 +151,31 @@ def with_values(sensor: Sensor, values: Mapping[str, float]) -> Sensor:
     return sensor
 
 
-NEARBY = 0.01
-"""Relative range about its start in which the frequency of a lamp is fitted."""
-
-FIXED = (
-    "threshold.phase", "voltage_noise.dark", "row_scan.line", "timestamp.step",
-    "timestamp.jitter", "readout.depth",
-)  # fmt: skip
-"""Parameters that a search by small steps cannot find; they are set by other means."""
-
-
 def axes_of(sensor: Sensor, names: Iterable[str] | None = None) -> tuple[SearchAxis, ...]:
     """Return the axes of a sensor's free parameters.
 
     Args:
         sensor: Whose parameters.
-        names: Effects or `effect.parameter`; None for all parameters of all effects that are not off.
+        names: Effects or `effect.parameter`; None for all effects that are not off. Of an effect all
+            parameters but those with `Parameter.fitted` False, which must be named.
 
     Raises:
         InputError: A name that the sensor does not have.
     """
     every = {
-        f"{effect.name}.{p.name}": make_axis(effect.name, p)
+        f"{effect.name}.{p.name}": axis_of(effect, p)
         for effect in sensor.effects
         for p in effect.parameters()
     }
-    if "flicker.frequency" in every:
-        # a fit finds it only nearby: elsewhere the phase has turned
-        value = value_of(sensor, "flicker.frequency")
-        every["flicker.frequency"] = replace(
-            every["flicker.frequency"], low=value * (1 - NEARBY), high=value * (1 + NEARBY), log=False,
-            span=2.0 / PHASE,
-        )  # fmt: skip
     if names is None:
-        off = {effect.name for effect in sensor.effects if effect.is_off() and effect.name != "threshold"}
-        return tuple(a for n, a in every.items() if n not in FIXED and n.split(".")[0] not in off)
+        # a change detector whose phase is 0 is not off
+        off = {e.name for e in sensor.effects if e.is_off() and not isinstance(e, Threshold)}
+        return tuple(a for a in every.values() if a.fact.fitted and a.effect.name not in off)
     chosen = []
     for name in names:
-        found = [n for n in every if n == name or (n.split(".")[0] == name and n not in FIXED)]
+        found = [n for n in every if n == name or (n.split(".")[0] == name and every[n].fact.fitted)]
         if not found:
             known = [*every, *(e.name for e in sensor.effects)]
             raise InputError(f"free: the sensor has no parameter '{name}': {nearest(name, known)}")
         chosen += found
     return tuple(every[n] for n in every if n in chosen)
-
-
-def effect_variants(effect: type[Effect]) -> list[Effect]:
-    """Return an effect with each combination of its words, otherwise at its defaults."""
-    out: list[Effect] = [effect()]
-    for name, words in effect.choices().items():
-        out = [replace(e, **{name: word}) for e in out for word in words]
-    return out
-
-
-def default_values(effect: Effect) -> dict[str, Any]:
-    """Return the fields of an effect."""
-    return {f.name: getattr(effect, f.name) for f in fields(effect)}

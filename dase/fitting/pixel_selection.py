@@ -13,12 +13,6 @@ from dase.probes.stimulus import Trust, light_of
 from dase.scenes.scene import Scene
 from dase.scenes.video import LOG_EPS
 
-LOOKS = 200
-"""Times at which it is looked where a scene can be trusted."""
-
-LEAST = 16
-"""Pixels without which nothing is compared."""
-
 Array = NDArray[np.float64]
 
 
@@ -47,7 +41,9 @@ class TrustedParts:
         )
 
 
-def find_trusted_parts(events: Events, scene: Scene, times: Array, cut: int, trust: Trust) -> TrustedParts:
+def find_trusted_parts(
+    events: Events, scene: Scene, times: Array, cut: int, trust: Trust, *, most: int = 200
+) -> TrustedParts:
     """Look at all pixels now and then.
 
     Args:
@@ -56,8 +52,9 @@ def find_trusted_parts(events: Events, scene: Scene, times: Array, cut: int, tru
         times: Steps of the comparison [s], shape (T,).
         cut: The step at which the time begins that judges.
         trust: Where and when the scene is to be trusted.
+        most: Times at most at which it is looked, for rendering all pixels takes long.
     """
-    steps = np.unique(np.linspace(0, len(times) - 1, min(LOOKS, len(times))).astype(np.int64))
+    steps = np.unique(np.linspace(0, len(times) - 1, min(most, len(times))).astype(np.int64))
     every = np.arange(scene.width * scene.height, dtype=np.int32)
     time, change = np.zeros((2, len(every))), np.zeros((2, len(every)))
     inside = total = 0
@@ -77,7 +74,9 @@ def find_trusted_parts(events: Events, scene: Scene, times: Array, cut: int, tru
     return TrustedParts(time, change, float(time.mean(1).sum()) / len(steps), inside / max(total, 1))
 
 
-def choose_trusted_pixels(looks: TrustedParts, each: int, rng: np.random.Generator) -> NDArray[np.int32]:
+def choose_trusted_pixels(
+    looks: TrustedParts, each: int, rng: np.random.Generator, *, least: int
+) -> NDArray[np.int32]:
     """Choose pixels for two halves by what the scene does where it can be trusted, never by their events.
 
     One in two is drawn by how long it can be trusted, the other by how far its light goes in that time, for
@@ -87,6 +86,7 @@ def choose_trusted_pixels(looks: TrustedParts, each: int, rng: np.random.Generat
         looks: Where it can be trusted.
         each: Pixels in each half; there are fewer where fewer can be trusted.
         rng: Random numbers.
+        least: Pixels in each half without which nothing is compared.
 
     Returns:
         Row-major indices, those of the first half before those of the second.
@@ -95,10 +95,10 @@ def choose_trusted_pixels(looks: TrustedParts, each: int, rng: np.random.Generat
         InputError: There are next to none.
     """
     each = min(each, *(np.count_nonzero(looks.time, 1) // 2).tolist())
-    if each < LEAST:
+    if each < least:
         raise InputError(
             f"the scene can be trusted in {100 * looks.share:.2g} % of pixels and times only, "
-            f"which leaves {max(each, 0)} pixels to fit and to judge; at least {LEAST} are needed"
+            f"which leaves {max(each, 0)} pixels to fit and to judge; at least {least} are needed"
         )
     chosen: list[NDArray[np.int64]] = []
     free = np.ones(looks.time.shape[1])

@@ -4,15 +4,15 @@ from __future__ import annotations
 
 import numpy as np
 
-from dase.fitting.batch_simulator import LAG_TIMES
-from dase.fitting.subset import Array, PixelSubset
+from dase.fitting.subset import Array, CalibratedSubset
 from dase.kernels.event_probes import BANDS, INTERVALS, KINDS, LAGS, RESTING
+from dase.probes.accumulators import PROBE_TIMES
 from dase.probes.statistics import LAYOUT
 
 
-def plain_numbers(half: PixelSubset) -> dict[str, tuple[float, float]]:
+def plain_numbers(half: CalibratedSubset) -> dict[str, tuple[float, float]]:
     """Return measured and simulated values in units that need no explanation."""
-    values = half.seen.target, half.simulated
+    values = half.seen.target, half.repeats.mean(0)
     real, made = (rate_counts(v) for v in values)
     exposure = half.trials.stimulus.exposure().reshape(KINDS, BANDS)
     time_ = max(float(exposure.sum()), 1e-9)
@@ -62,6 +62,6 @@ def _median_interval(counts: Array, step: float) -> float:
 
 def _mean_lag(values: Array) -> float:
     change = values[LAYOUT["lag"]].reshape(LAGS, BANDS).mean(1)
-    middle = 0.5 * (np.array(LAG_TIMES[1:]) + np.array(LAG_TIMES[:-1]))
+    middle = 0.5 * (np.array(PROBE_TIMES.lags[1:]) + np.array(PROBE_TIMES.lags[:-1]))
     weight = np.maximum(change, 0.0)
     return float(1e3 * (weight * middle).sum() / max(weight.sum(), 1e-12))

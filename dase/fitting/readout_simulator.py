@@ -11,8 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from dase.effects.readout import Bus, Readout
-from dase.effects.row_scan import RowScan
+from dase.effects.readout import Bus
 from dase.effects.stream import StreamEffect
 from dase.effects.timestamp import Timestamp
 from dase.events import Events
@@ -24,26 +23,25 @@ from dase.scenes.scene import Scene
 from dase.simulation.sensor import Sensor
 from dase.simulation.sensor_run import SensorRun
 
-ROOM = {"cpu": 2048, "cuda": 64}
-"""Events per pixel that there is room for: a model that sends more is run again. On a CPU room costs nothing
-before it is used."""
-
-FELT = 0.25
-"""Delays below this share of a step of the grid are not felt."""
-
 
 def noticeable_effects(
-    stimulus: Stimulus, structure: TimestampStructure, sensor: Sensor
+    stimulus: Stimulus, structure: TimestampStructure, sensor: Sensor, *, least_delay: float = 0.25
 ) -> tuple[StreamEffect, ...]:
     """Return the effects behind the pixels that the probes can feel.
 
     Small errors of the time stamps are far below the steps of the grid; they matter only where their
     regularities are compared.
+
+    Args:
+        stimulus: What the pixels see.
+        structure: Regularities of the measured time stamps.
+        sensor: Whose effects.
+        least_delay: Delays up to this are not felt, in steps of the grid.
     """
-    fine = FELT * stimulus.grid.step
+    fine = least_delay * stimulus.grid.step
     lines = max(stimulus.width, stimulus.height)
     compared = structure.step > 0 or structure.line > 0
-    return tuple(e for e in sensor.readout_effects() if compared or delay_of(e, lines) > fine)
+    return tuple(e for e in sensor.readout_effects() if compared or e.longest_delay(lines) > fine)
 
 
 def clock_of(effects: tuple[StreamEffect, ...], structure: TimestampStructure) -> float | None:
@@ -67,11 +65,13 @@ def simulate_pixels(
     """Return the events that leave the pixels, of each model."""
     bare = replace(sensor, effects=tuple(e for e in sensor.effects if not isinstance(e, StreamEffect)))
     kind = "cuda" if stimulus.device.is_cuda else "cpu"
+    # a model that sends more is run again; on a CPU room costs nothing before it is used
+    room = 64 if kind == "cuda" else 2048  # events per pixel
 
     def out(rows: slice) -> list[Events]:
         return SensorRun(
             _StimulusScene(stimulus), bare, pixels=stimulus.pixels, parameters=vectors[rows],
-            seed=int(seeds[rows.start]), device=str(stimulus.device), events_per_pixel=ROOM[kind],
+            seed=int(seeds[rows.start]), device=str(stimulus.device), events_per_pixel=room,
             chunk=stimulus.grid.steps,
         ).events()  # fmt: skip
 
@@ -106,7 +106,7 @@ def pass_readout(
         if load is not None and weight is not None and isinstance(reader, Bus):
             events = reader.beside(events, load.others(before, seed), weight)
         else:
-            reader = scale_readout(effect, share).reader(stimulus.width, stimulus.height, seed)
+            reader = effect.for_share(share).reader(stimulus.width, stimulus.height, seed)
             events, until = reader.push(events, until)
         before.append(effect)
     return replace(events, t=events.t + stimulus.grid.begin)
@@ -131,17 +131,3 @@ class _StimulusScene(Scene):
 
     def frames(self, times: NDArray[np.float64], device: str = "cpu") -> NDArray[np.float32]:
         raise NotImplementedError("some pixels are no picture")
-
-
-def delay_of(effect: StreamEffect, lines: int) -> float:
-    """Return about how late an effect behind the pixels makes events [s]; infinite where it may lose some."""
-    if isinstance(effect, Timestamp):
-        return max(effect.step, effect.jitter)
-    return lines * effect.line if isinstance(effect, RowScan) else math.inf
-
-
-def scale_readout(effect: StreamEffect, share: float) -> StreamEffect:
-    """Return an effect behind the pixels for a share of them."""
-    if isinstance(effect, Readout):
-        return replace(effect, rate=effect.rate * share, depth=max(1.0, effect.depth * share))
-    return effect

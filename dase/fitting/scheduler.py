@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from dase.effects.timestamp import Timestamp
 from dase.fitting.batch_simulator import BatchSimulator, SimulationOrder
 from dase.fitting.parameter_space import ParameterSpace
 from dase.probes.accumulators import ProbeSums, ProbeTotals, compute_totals
@@ -69,14 +70,17 @@ def side_by_side_work(
 ) -> Work[list[Result]]:
     """Do all works side by side within another work, and return their results."""
     results: dict[int, Result] = {}
+    # a work is asked with its last answers; None begins it, as generators want it
     answers: dict[int, list[Any] | None] = dict.fromkeys(range(len(works)))
     while answers:
+        # works keep step: the requests of all go out as one list, whose launches are as wide as can be
         asked: dict[int, list[SimulationRequest]] = {}
         for n, answer in answers.items():
             try:
                 asked[n] = next(works[n]) if answer is None else works[n].send(answer)
             except StopIteration as stop:
                 results[n] = stop.value
+        # answers come in the order of the requests, whoever runs them, so works may lie within works
         if asked:
             found = iter((yield [ask for asks in asked.values() for ask in asks]))
             answers = {n: [next(found) for _ in asks] for n, asks in asked.items()}
@@ -92,16 +96,19 @@ def run_work(work: Work[Result]) -> Result:
 
 
 def answer_requests(asks: Sequence[SimulationRequest]) -> list[Any]:
-    """Return the answer to each."""
+    """Return the answer to each: statistics, shape (B, J), or sums where repeats are asked for."""
+    # by simulator: pixels and time are those of a launch
     orders: dict[int, tuple[BatchSimulator, list[int], list[SimulationOrder]]] = {}
     sums: dict[int, ProbeSums] = {}
     for n, ask in enumerate(asks):
         trials, frame = ask.half.trials, None if ask.repeats else ask.half.frame
         ticks = trials.ticks(ask.space.sensor)
-        if ticks and any(axis.name.startswith("timestamp.") for axis in ask.space.axes):
+        # a kernel has one clock for all rows of an order: where the fit changes it, events are stored instead
+        if ticks and any(issubclass(axis.effect, Timestamp) for axis in ask.space.axes):
             ticks = None
         vectors = ask.space.vectors(ask.places)
         order = SimulationOrder(ask.space.sensor, vectors, ask.seed, ask.repeats, None, frame, ticks or 0.0)
+        # events have to go through a readout, which takes ten times as long
         if ticks is None:
             effects = [trials.noticeable_effects(ask.space.at(place)) for place in np.atleast_2d(ask.places)]
             sums[n] = trials.simulate_streams(order, effects, ask.half.load)
@@ -119,11 +126,13 @@ def answer_requests(asks: Sequence[SimulationRequest]) -> list[Any]:
 
 def _statistics_of_requests(found: Sequence[tuple[int, PixelSubset, ProbeSums]]) -> dict[int, Array]:
     """Return the statistics of models, those that refer to the same worked out at once."""
+    # one call for all that share a frame: many rows at once take less time than row by row
     groups: dict[int, list[tuple[int, PixelSubset, ProbeSums]]] = {}
     for one in found:
         groups.setdefault(id(one[1].frame), []).append(one)
     out: dict[int, Array] = {}
     for members in groups.values():
+        # expectations are the frame's, so those of the first stand for all
         frame = members[0][1].frame
         parts = [compute_totals(sums, frame) for _, _, sums in members]
         names = ("sums", "folded", "clock", "stamps")

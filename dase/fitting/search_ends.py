@@ -25,7 +25,7 @@ def parameters_at_bounds(model: FittedModel, values: Mapping[str, Estimate]) -> 
         low, high = axis.bounds()
         estimate = values[axis.name]
         wide = float(axis.to_place(estimate.high)) - float(axis.to_place(estimate.low)) > 0.3 * (high - low)
-        if decides and not wide and not axis.fact.seen and _is_at_bound(axis, float(place)):
+        if decides and not wide and axis.fact.search_starts != "above" and _is_at_bound(axis, float(place)):
             value = float(axis.to_value(place))
             out.append(f"{axis.name} = {value:.3g} {axis.fact.unit}, the end of its search")
     return out

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from copy import copy
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
+from typing import Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from dase.fitting.batch_simulator import BatchSimulator, samples_per_step
 from dase.fitting.bus_load import BusLoad, WholeSensor
 from dase.fitting.parameter_space import ParameterSpace
-from dase.fitting.scheduler import SimulationRequest, Work, answer_requests, run_work
+from dase.fitting.scheduler import SimulationRequest, Work, answer_requests
 from dase.probes.accumulators import ProbeSums, StatisticsFrame, leave_groups_out
 from dase.probes.distance import ErrorScale, Judgement, judge_model
 from dase.probes.statistics import (
@@ -32,7 +32,7 @@ FEW_REPEATS = 24
 Array = NDArray[np.float64]
 
 
-@dataclass(eq=False)
+@dataclass(frozen=True, eq=False)
 class PixelSubset:
     """Some pixels over some time: models are run, and compared with what was measured there.
 
@@ -41,15 +41,7 @@ class PixelSubset:
         found: What was measured.
         frame: What statistics refer to.
         around: What all pixels see; None where that is not known.
-        load: What the pixels that are not looked at send in the present model.
-        scale: What differences are measured by in a fit: sampling errors as they are seen between groups of
-            pixels, also where the model is wrong.
-        chance: What differences are measured by in a test: sampling errors of the present model.
-        seen: As `scale`, for the mean of many repeats of the present model.
-        off: What each statistic may be off by.
-        simulated: Statistics of the present model, the mean over its repeats.
-        left: Statistics of the measurement less a repeat of the present model, without one group of pixels
-            after the other, shape (G, J).
+        load: What the pixels that are not looked at send in some model; None where no model was named.
     """
 
     trials: BatchSimulator
@@ -57,26 +49,20 @@ class PixelSubset:
     frame: StatisticsFrame
     around: WholeSensor | None = None
     load: BusLoad | None = None
-    scale: ErrorScale = field(init=False)
-    chance: ErrorScale = field(init=False)
-    seen: ErrorScale = field(init=False)
-    off: Array = field(init=False)
-    answer_requests: Array = field(init=False)
-    left: Array = field(init=False)
 
-    def view(self) -> PixelSubset:
-        """Return the same half, which may have another present model."""
-        return copy(self)
+    def loaded(self, space: ParameterSpace, place: Array) -> Self:
+        """Return the same pixels, where those that are not looked at send what they do in some model.
 
-    def loaded(self, space: ParameterSpace, place: Array) -> PixelSubset:
-        """Return the same half, where the pixels that are not looked at send what they do in some model."""
-        out = self.view()
-        if self.around is not None:
-            out.load = self.around.load(space.at(place), self.trials.stimulus)
-        return out
+        Args:
+            space: The model's free parameters.
+            place: Where they are, shape (P,).
+        """
+        if self.around is None:
+            return self
+        return replace(self, load=self.around.load(space.at(place), self.trials.stimulus))
 
     def run(self, space: ParameterSpace, places: Array, *, seed: int) -> Array:
-        """Return the statistics of the models at some places, shape (B, J)."""
+        """Return the statistics of the models at some places (B, P), shape (B, J)."""
         found: Array = answer_requests([SimulationRequest(self, space, np.atleast_2d(places), seed)])[0]
         return found
 
@@ -88,58 +74,95 @@ class PixelSubset:
         """Whether models take many samples, or their events go through a readout."""
         return self.streams(space) or samples_per_step(space.sensor, self.frame.step) > 0
 
-    def rebase(self, space: ParameterSpace, place: Array, *, repeats: int, seed: int) -> Array:
-        """Make a model the present one: expectations and sampling errors are its own.
+    def calibration_work(
+        self, space: ParameterSpace, place: Array, *, repeats: int, seed: int
+    ) -> Work[CalibratedSubset]:
+        """Calibrate by a model: expectations and sampling errors are its own.
 
-        Returns:
-            Statistics of `repeats` simulations of it with other seeds, shape (repeats, J).
+        Args:
+            space: The model's free parameters.
+            place: Where they are, shape (P,).
+            repeats: Simulations of it with seeds of their own; fewer where it is slow.
+            seed: Of the first of them.
         """
-        return run_work(self.rebasing(space, place, repeats=repeats, seed=seed))
-
-    def rebasing(self, space: ParameterSpace, place: Array, *, repeats: int, seed: int) -> Work[Array]:
-        """Do what `rebase` does, see `together`."""
         repeats = min(repeats, FEW_REPEATS) if self.slow(space) else repeats
-        self.load = self.loaded(space, place).load
-        sums = yield [
-            SimulationRequest(self, space, np.repeat(np.atleast_2d(place), repeats, 0), seed, repeats=True)
-        ]
-        return self.take(sums[0])
+        loaded = self.loaded(space, place)
+        places = np.repeat(np.atleast_2d(place), repeats, 0)
+        (sums,) = yield [SimulationRequest(loaded, space, places, seed, repeats=True)]
+        return _calibrate_by_repeats(loaded, sums)
 
-    def take(self, sums: ProbeSums) -> Array:
-        """Make the model with these repeats the present one; return their statistics."""
-        bare = replace(self.frame, expected=sums.halves.mean(0, dtype=np.float64), measured=None)
-        target, events = compute_statistics(self.found, bare)
-        self.frame = replace(bare, measured=target[0])
-        values, sent = compute_statistics(sums, self.frame)
-        off = np.maximum(tolerance_of(target[0], events[0]), 1e-9) ** 2
-        repeats = 2.0 * values.var(0, ddof=1)
-        counted, here = events[0].copy(), sent.mean(0)
-        # the weight of these is what the model sends
-        counted[LAYOUT["spread"]] = events_of_spread(self.found.halves.sum(1, dtype=np.float64))[0]
-        least = shortfall_of(counted, here)
-        used = is_compared(target[0], events[0]) | (least > 0)
-        self.off = np.sqrt(off)
-        self.chance = ErrorScale(target[0], np.sqrt((0.5 + 0.5 / len(values)) * repeats + off), used)
-        self.simulated = values.mean(0)
-        measured, present = (
-            compute_statistics(leave_groups_out(one, self.frame), self.frame)[0] for one in (self.found, sums)
-        )
-        self.left = measured - present
-        scatter = (len(self.left) - 1) * self.left.var(0)
-        self.scale = ErrorScale(target[0], np.sqrt(np.maximum(repeats, scatter) + off), used)
-        # of the difference from the mean of the repeats, which has nearly no sampling error of its own
-        seen = np.maximum((0.5 + 0.5 / len(values)) * repeats, scatter - (0.5 - 0.5 / len(values)) * repeats)
-        # by the scatter of a model that sends too few, it would be close to everything
-        own = sampling_variance(measured, counted)
-        seen = np.where(lacks_events(counted, here), np.minimum(seen, own), seen)
-        self.seen = ErrorScale(target[0], np.sqrt(seen + off), used, least)
-        return values
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class CalibratedSubset(PixelSubset):
+    """Pixels with a present model, by whose expectations and sampling errors others are measured.
+
+    Args:
+        scale: What differences are measured by in a fit: sampling errors as they are seen between groups of
+            pixels, also where the model is wrong.
+        chance: What differences are measured by in a test: sampling errors of the present model.
+        seen: As `scale`, for the mean of many repeats of the present model.
+        tolerance: What each statistic may be off by, shape (J,).
+        repeats: Statistics of simulations of the present model with other seeds, shape (R, J).
+        left_out: Statistics of the measurement less a repeat of the present model, without one group of
+            pixels after the other, shape (G, J).
+    """
+
+    scale: ErrorScale
+    chance: ErrorScale
+    seen: ErrorScale
+    tolerance: Array
+    repeats: Array
+    left_out: Array
 
     @property
     def groups(self) -> int:
         """Number of groups of pixels."""
-        return len(self.left)
+        return len(self.left_out)
 
-    def judge(self, repeats: Array, *, seed: int) -> Judgement:
-        """Return the error of the present model, whose repeats are given."""
-        return judge_model(repeats, self.seen, self.chance, self.off, seed=seed)
+    def judge(self, seed: int) -> Judgement:
+        """Return the error of the present model; `seed` draws the random part of the tolerance."""
+        return judge_model(self.repeats, self.seen, self.chance, self.tolerance, seed=seed)
+
+
+def _calibrate_by_repeats(subset: PixelSubset, sums: ProbeSums) -> CalibratedSubset:
+    """Return a subset whose present model is the one with these repeats, R of them."""
+    expected = sums.halves.mean(0, dtype=np.float64)
+    bare = replace(subset.frame, expected=expected, measured=None)
+    target, events = compute_statistics(subset.found, bare)
+    # means of models with few events are drawn to those of the measurement, so these come first
+    frame = replace(bare, measured=target[0])
+    values, sent = compute_statistics(sums, frame)
+    square = np.maximum(tolerance_of(target[0], events[0]), 1e-9) ** 2
+    # two single simulations differ by twice the variance of one
+    between = 2.0 * values.var(0, ddof=1)
+    counted, here = events[0].copy(), sent.mean(0)
+    # the weight of these is what the model sends
+    counted[LAYOUT["spread"]] = events_of_spread(subset.found.halves.sum(1, dtype=np.float64))[0]
+    least = shortfall_of(counted, here)
+    used = is_compared(target[0], events[0]) | (least > 0)
+    measured, present = (
+        compute_statistics(leave_groups_out(one, frame), frame)[0] for one in (subset.found, sums)
+    )
+    left_out = measured - present
+    # the jackknife: it sees what the measurement's own pixels make of a statistic
+    scatter = (len(left_out) - 1) * left_out.var(0)
+    # a measurement against the mean of R repeats has the variance of one and the R-th part of one
+    share = 0.5 + 0.5 / len(values)
+    # the mean of the repeats has nearly no sampling error of its own, which the jackknife of one repeat has
+    seen = np.maximum(share * between, scatter - (0.5 - 0.5 / len(values)) * between)
+    # by the scatter of a model that sends too few, it would be close to everything
+    own = sampling_variance(measured, counted)
+    seen = np.where(lacks_events(counted, here), np.minimum(seen, own), seen)
+    return CalibratedSubset(
+        subset.trials,
+        subset.found,
+        frame,
+        subset.around,
+        subset.load,
+        scale=ErrorScale(target[0], np.sqrt(np.maximum(between, scatter) + square), used),
+        chance=ErrorScale(target[0], np.sqrt(share * between + square), used),
+        seen=ErrorScale(target[0], np.sqrt(seen + square), used, least),
+        tolerance=np.sqrt(square),
+        repeats=values,
+        left_out=left_out,
+    )

@@ -19,6 +19,7 @@ import cv2
 
 from dase.errors import InputError
 from dase.io.image_files import quiet_opencv
+from dase.io.source import BOMB_BYTES, refuse_bomb
 
 TITLES = re.compile(rb"LIST(.{4})INFO", re.DOTALL)
 """A list of titles in an AVI, with its length [bytes]."""
@@ -119,8 +120,6 @@ def pixel_format(capture: Any) -> tuple[bytes, bytes]:
 
 def _refuse_huge(path: Path, capture: Any) -> None:
     """Raise InputError where a small file holds frames of an absurd size, or says so."""
-    from dase.io.source import BOMB_BYTES, refuse_bomb
-
     (width, height), memory = size_of(capture), decoding_memory(capture)
     try:
         refuse_bomb(path.stat().st_size, memory)

@@ -11,21 +11,19 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from dase.errors import InputError
 from dase.events import Events
+from dase.io.ffmpeg import TAKEN
 from dase.io.format import LIMIT, Format
 from dase.io.image_files import SUFFIXES, decode_bytes, head_size
 from dase.io.sequence import GREYS, Sequence, reading_file
 from dase.io.source import Picture, Source, checked_size, refuse_bomb
-
-if TYPE_CHECKING:
-    from dase.io.video_file import FrameReader
-
+from dase.io.video_file import FrameReader
 
 FRAMES_RATIO = 1000
 """How many times its size the frames of a file may take together: ten times what one alone may, as frames of
@@ -64,8 +62,6 @@ def read_pictures(source: Source) -> Iterator[Picture]:
 
 
 def _open_reader(source: Source) -> FrameReader:
-    from dase.io.video_file import FrameReader
-
     reader = FrameReader(source.path)
     checked_size((reader.shape[2], reader.shape[1]))
     return reader
@@ -92,8 +88,6 @@ def read(source: Source) -> Sequence:
 
 def _refuse_many(reader: FrameReader) -> None:
     """Raise InputError where the frames would fill the memory, or are absurdly many for their file."""
-    from dase.io.ffmpeg import TAKEN
-
     total = math.prod(reader.shape)
     if total > LIMIT:
         raise InputError(f"its frames need more than {LIMIT >> 30} GiB of memory: cut it into parts")

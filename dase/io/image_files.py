@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dase.errors import InputError
+from dase.io.source import refuse_bomb
 
 SUFFIXES = ("jpg", "jpeg", "png", "bmp", "tif", "tiff", "webp", "ppm", "pgm")
 """Picture files, whatever their case."""
@@ -94,8 +95,6 @@ def head_size(data: bytes) -> tuple[int, int] | None:
         data: The content of a file.
     """
     from PIL import Image
-
-    from dase.io.source import refuse_bomb
 
     size: tuple[int, int] | None
     limit, Image.MAX_IMAGE_PIXELS = Image.MAX_IMAGE_PIXELS, None  # ours goes with the size of the file

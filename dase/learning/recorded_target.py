@@ -17,16 +17,10 @@ from numpy.typing import NDArray
 
 from dase.errors import InputError
 from dase.learning.scene_batches import LOG_EPS, Scenery, SceneSettings
-from dase.learning.targets import FiniteTarget, Pairs
+from dase.learning.targets import FiniteTarget, store_pairs
 from dase.recordings.recording import Recording, open_recording
 from dase.scenes.between_frames import CameraScene, TrustSettings
 from dase.scenes.frame_motion import estimate_stretches, is_stretched
-
-FEWEST = 0.005
-"""Fewest events per pixel and window from which anything can be learned."""
-
-ROOM = 1 << 31
-"""Most memory of the windows' log intensities [bytes]; of a longer recording only some windows are used."""
 
 
 @dataclass(frozen=True)
@@ -215,7 +209,5 @@ def _join_recordings(
     every = RecordedWindows(begin, log, counts, trusted)
     scenes = ReplayedScenes(every, window=window, device=device)
     middle = np.exp(log[:, log.shape[1] // 2].astype(np.float32)) - np.float32(LOG_EPS)
-    pairs = Pairs(
-        torch.from_numpy(middle).half().to(device), torch.from_numpy(counts).clamp_max(2000).half().to(device)
-    )
+    pairs = store_pairs(torch.from_numpy(middle), torch.from_numpy(counts), device)
     return FiniteTarget(pairs, held_out=len(rest) / start, augment=False), scenes

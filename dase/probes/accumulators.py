@@ -17,10 +17,29 @@ from dase.kernels import launch
 GROUP = 64
 """Neighbours in the list of pixels that form a group; on a CPU one thread works on all of them."""
 
-SEEN = 6.0
-"""Events that are expected of a pixel which is called silent if it sends none."""
-
 Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class ProbeTimes:
+    """Times by which events are told apart, of some milliseconds to some tens: those of moving edges."""
+
+    lags: tuple[float, ...] = (
+        -0.003, -0.001, 0.0, 0.001, 0.002, 0.004, 0.008, 0.016, 0.028, 0.044, 0.063,
+    )  # fmt: skip
+    """Before an event [s] at which its light is looked at; the differences of neighbours are averaged."""
+
+    classes: tuple[float, float] = (0.012, 0.05)
+    """Intervals between two events are short, middle or long, divided by these [s]."""
+
+    half: float = 0.064
+    """The halves of the time take turns after this [s]."""
+
+    slack: float = 2e-6
+    """Files give whole microseconds: an event up to this after a point of the grid belongs to it [s]."""
+
+
+PROBE_TIMES = ProbeTimes()
 
 
 @dataclass(frozen=True)
@@ -122,13 +141,17 @@ class ProbeTotals:
     expected: Array
 
 
-def fold_counts(pixels: Any, frames: Sequence[StatisticsFrame], which: NDArray[np.int64]) -> Any:
+def fold_counts(
+    pixels: Any, frames: Sequence[StatisticsFrame], which: NDArray[np.int64], *, silent_from: float = 6.0
+) -> Any:
     """Fold the counts of pixels where they are.
 
     Args:
         pixels: Counts, a Warp array of shape (B, N, HALVES).
         frames: What they are compared with; the same pixels and time.
         which: Frame of each row, shape (B,).
+        silent_from: Events that are expected of a pixel which is called silent if it sends none: by chance
+            a quarter of a percent of such pixels send none.
 
     Returns:
         A Warp array of shape (B, G, FOLD).
@@ -139,7 +162,7 @@ def fold_counts(pixels: Any, frames: Sequence[StatisticsFrame], which: NDArray[n
     out = wp.empty((rows, groups, kernels.FoldPlace.SIZE), dtype=float, device=to)
     inputs = [
         pixels, wp.array(expected, device=to), wp.array(which.astype(np.int32), device=to),
-        wp.array(frame.zone.astype(np.int32), device=to), 15.0 * frame.seconds, SEEN, GROUP, out,
+        wp.array(frame.zone.astype(np.int32), device=to), 15.0 * frame.seconds, silent_from, GROUP, out,
     ]  # fmt: skip
     launch.run_kernel(kernels.fold_pixel_counts, groups, inputs, to, batch=rows, slabs=1)
     return out

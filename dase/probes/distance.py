@@ -2,35 +2,45 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
+from dase.probes.random_streams import Draw
 from dase.probes.statistics import LAYOUT
 
 Array = NDArray[np.float64]
 
-FAR = 4.0
-"""Standard deviations above the mean that the error of a family of a true model hardly ever reaches."""
+
+@dataclass(frozen=True)
+class JudgementLimits:
+    """Errors up to which a model counts as right [noise floors], and what a family of statistics may have."""
+
+    far: float = 4.0
+    """Standard deviations above the mean that the error of a family of a true model hardly ever reaches."""
+
+    close: float = 1.15
+    """A model up to this error counts as right also where its repeats differ by less: the rest is no
+    matter."""
+
+    widest: float = 1.25
+    """Highest gate. Repeats may be further apart where some pixels matter much, as hot ones do; but of 1,100
+    true models none ended above 1.08, and stand-ins for effects that are not known at 1.6 and 1.7."""
+
+    quiet: float = 0.5
+    """Error up to which nothing more is looked for: 100 models that lacked nothing had 0.13 to 0.38."""
+
+    close_family: float = 4.0
+    """Error of one family up to which nothing is looked for: what few statistics show the mean hides."""
+
+    much_family: float = 8.0
+    """Error of one family above which a finding is not announced, although the mean is at the floor."""
 
 
-CLOSE = 1.15
-"""A model up to this error counts as right also where its repeats differ by less: the rest is no matter."""
-
-WIDEST = 1.25
-"""Highest gate. Repeats may be further apart where some pixels matter much, as hot ones do; but of 1,100 true
-models none ended above 1.08, and stand-ins for effects that are not known at 1.6 and 1.7."""
-
-QUIET = 0.5
-"""Error up to which nothing more is looked for: 100 models that lacked nothing had 0.13 to 0.38."""
-
-CLOSE_FAMILY = 4.0
-"""Error of one family up to which nothing is looked for: what few statistics show the mean hides."""
-
-MUCH_FAMILY = 8.0
-"""Error of one family above which a finding is not announced, although the mean is at the floor."""
+LIMITS = JudgementLimits()
+"""What models are judged by unless it is told otherwise."""
 
 
 @dataclass(frozen=True)
@@ -90,13 +100,17 @@ class Judgement:
 
     Args:
         error: 1 is what two repeats of one measurement give, each of them off by what is of no concern.
-        gate: Error up to which the model counts as right: 99 of 100 repeats stay below; `CLOSE` to `WIDEST`.
+        gate: Error up to which the model counts as right: 99 of 100 repeats stay below; `close` to
+            `widest` of `JudgementLimits`.
         reach: Error that 99 of 100 repeats stay below.
         level: Error of a repeat, in the mean.
         families: Error per family.
         limits: Error per family that hardly any repeat exceeds in any family.
         z: Difference of each statistic in standard errors, shape (J,).
         unit: Robust distance that is called 1.
+        measured: Statistics of the measurement, shape (J,).
+        simulated: Statistics of the model, the mean over its repeats, shape (J,).
+        compared: Which statistics are compared, shape (J,).
     """
 
     error: float
@@ -107,9 +121,20 @@ class Judgement:
     limits: dict[str, float]
     z: Array
     unit: float
+    measured: Array = field(default_factory=lambda: np.empty(0))
+    simulated: Array = field(default_factory=lambda: np.empty(0))
+    compared: NDArray[np.bool_] = field(default_factory=lambda: np.empty(0, np.bool_))
 
 
-def judge_model(repeats: Array, seen: ErrorScale, chance: ErrorScale, off: Array, *, seed: int) -> Judgement:
+def judge_model(
+    repeats: Array,
+    seen: ErrorScale,
+    chance: ErrorScale,
+    off: Array,
+    *,
+    seed: int,
+    settings: JudgementLimits = LIMITS,
+) -> Judgement:
     """Compare a measurement with repeats of a model.
 
     The model is the mean of its repeats. Each repeat in turn stands in for the measurement and is compared
@@ -126,10 +151,11 @@ def judge_model(repeats: Array, seen: ErrorScale, chance: ErrorScale, off: Array
         chance: Sampling errors of the model.
         off: The tolerance, shape (J,).
         seed: Of the random part of the tolerance.
+        settings: Limits of the gate.
     """
     count = len(repeats)
     mean = repeats.mean(0)
-    rng = np.random.default_rng([seed, 3])
+    rng = Draw.TOLERANCE.generator(seed)
     apart = (repeats - mean) * (count / (count - 1))
     rho = pseudo_huber(in_standard_errors(apart + off * rng.standard_normal(repeats.shape), chance))
     weights = chance.weights()
@@ -141,14 +167,17 @@ def judge_model(repeats: Array, seen: ErrorScale, chance: ErrorScale, off: Array
     for name in families:
         part = LAYOUT[name]
         own = rho[:, part][:, chance.used[part]].mean(1) / unit
-        limits[name] = max(float(own.max()), float(own.mean() + FAR * own.std()))
+        limits[name] = max(float(own.max()), float(own.mean() + settings.far * own.std()))
     error = float(seen.loss(mean)) / unit
     level = float(null.mean())
-    gate = min(max(CLOSE, reach), WIDEST)
+    gate = min(max(settings.close, reach), settings.widest)
     z = seen.z(mean)
     if seen.least is not None:
         z = np.where(seen.least > 0, 0.0, z)  # nothing is to be said of a mean over events that are not there
-    return Judgement(error, gate, reach, level, families, limits, z, unit)
+    return Judgement(
+        error, gate, reach, level, families, limits, z, unit,
+        measured=seen.target, simulated=mean, compared=seen.used,
+    )  # fmt: skip
 
 
 def in_standard_errors(apart: Array, scale: ErrorScale) -> Array:
@@ -165,24 +194,24 @@ def pseudo_huber(z: Array) -> Array:
 
 def leaves_nothing(judgement: Judgement) -> bool:
     """Whether a model leaves so little that nothing more is looked for."""
-    return judgement.error <= QUIET and reaches_floor(judgement)
+    return judgement.error <= LIMITS.quiet and reaches_floor(judgement)
 
 
 def reaches_floor(judgement: Judgement) -> bool:
     """Whether a model is at the floor, altogether and in every family of probes."""
     families = judgement.families
-    inside = (families[name] <= max(judgement.limits[name], CLOSE_FAMILY) for name in families)
+    inside = (families[name] <= max(judgement.limits[name], LIMITS.close_family) for name in families)
     return judgement.error <= judgement.gate and all(inside)
 
 
 def may_be_announced(judgement: Judgement) -> bool:
     """Whether what was found may be announced: the mean is at the floor, and no family is far off.
 
-    A search goes on while a family is above `CLOSE_FAMILY`; that nothing more is found there does not make
-    what was found a stand-in.
+    A search goes on while a family is above `JudgementLimits.close_family`; that nothing more is found there
+    does not make what was found a stand-in.
     """
     families = judgement.families
-    inside = (families[name] <= max(judgement.limits[name], MUCH_FAMILY) for name in families)
+    inside = (families[name] <= max(judgement.limits[name], LIMITS.much_family) for name in families)
     return judgement.error <= judgement.gate and all(inside)
 
 

@@ -6,8 +6,8 @@ measurement are compared. Each belongs to a family, a row of `FAMILIES`.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from functools import lru_cache
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,10 +26,6 @@ from dase.kernels.event_probes import (
     SumPlace,
 )
 from dase.probes.accumulators import ProbeSums, ProbeTotals, StatisticsFrame, compute_totals
-
-if TYPE_CHECKING:
-    pass
-
 
 FAMILIES = {
     "rate": "events per polarity, by what the light does and how bright it is",
@@ -52,16 +48,29 @@ TOLERANCE = 0.015
 FEW = 25.0
 """Events below which a mean over events is not compared."""
 
-SHRINK = 3.0
-"""Events of the measurement that are added to a mean of the model, which may have none."""
-
-TONES = 12
-"""Bands of frequency, from `LOWEST` to half the sampling rate."""
-
-LOWEST = 8.0
-"""[Hz]"""
-
 Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class SpectrumBands:
+    """Bands of frequency in which the power of the net event rate is compared, each as wide by factors."""
+
+    count: int = 12
+    """About half an octave each: lamps and scans stand out, and noise averages over many frequencies."""
+
+    lowest: float = 8.0
+    """Lower end of the first [Hz]; what is slower is motion, of which few periods are seen."""
+
+    def edges(self, step: float) -> Array:
+        """Return the ends of the bands up to half the sampling rate, shape (count + 1,) [Hz].
+
+        Args:
+            step: From sample to sample [s].
+        """
+        return np.geomspace(self.lowest, 0.5 / step, self.count + 1)
+
+
+SPECTRUM = SpectrumBands()
 
 
 def _places_of_families() -> dict[str, slice]:
@@ -75,7 +84,7 @@ def _places_of_families() -> dict[str, slice]:
         "pixels": 3,
         "silent": 1,
         "space": 4 * ZONES,
-        "spectrum": TONES + 2,
+        "spectrum": SPECTRUM.count + 2,
         "stamps": 2,
     }
     ends = np.cumsum(list(sizes.values()))
@@ -132,7 +141,8 @@ def compute_statistics(found: ProbeSums | ProbeTotals, frame: StatisticsFrame) -
     weight = np.concatenate([events for _, events in parts], axis=1)
     if frame.measured is not None:
         means = MEANS
-        drawn = (values * weight + SHRINK * frame.measured) / (weight + SHRINK)
+        # a mean over few events of the model is drawn to the measured one, as if by these events more
+        drawn = (values * weight + 3.0 * frame.measured) / (weight + 3.0)
         values[:, means] = drawn[:, means]
     return values, weight
 
@@ -205,9 +215,9 @@ def _rate_spectrum(clock: NDArray[np.int32], frame: StatisticsFrame) -> tuple[Ar
 
 @lru_cache(maxsize=8)
 def _tone_bands(count: int, step: float) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Return the window, shape (T,), and what makes means over bands of the power, shape (F, TONES)."""
-    edges = np.geomspace(LOWEST, 0.5 / step, TONES + 1)
-    inside = np.searchsorted(edges, np.fft.rfftfreq(count, step))[:, None] == np.arange(1, TONES + 1)
+    """Return the window, shape (T,), and what makes means over bands of the power, shape (F, bands)."""
+    bands = np.searchsorted(SPECTRUM.edges(step), np.fft.rfftfreq(count, step))
+    inside = bands[:, None] == np.arange(1, SPECTRUM.count + 1)
     mean = (inside / np.maximum(inside.sum(0), 1)).astype(np.float32)
     return np.hanning(count).astype(np.float32), mean
 
@@ -273,7 +283,7 @@ def tolerance_of(measured: Array, events: Array) -> Array:
     out[LAYOUT["change"]][-CLASSES:] *= typical
     out[LAYOUT["repeats"]] *= np.maximum(measured[LAYOUT["repeats"]], 0.1)
     out[LAYOUT["spectrum"]] = 0.1
-    out[LAYOUT["spectrum"]][TONES:] = 0.005
+    out[LAYOUT["spectrum"]][SPECTRUM.count :] = 0.005
     out[LAYOUT["stamps"]] = 0.02
     out[LAYOUT["spread"]] = 0.015 * np.maximum(1.0, np.abs(measured[LAYOUT["spread"]]))
     return out

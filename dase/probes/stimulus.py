@@ -15,27 +15,42 @@ from dase.kernels import launch, pixel_codegen_trials
 from dase.kernels.event_probes import BANDS, CELLS, KINDS, MASKED, RESTING
 from dase.scenes.scene import Scene
 
-STILL = 0.02
-"""Light that changes by less is at rest [log intensity]."""
-
-REST = (0.2, 0.06)
-"""How long the light has been at rest for the first two kinds of cells [s]."""
-
-SPAN = 0.016
-"""The light's change is taken over this time [s]."""
-
-EDGES = (-0.25, -0.04, 0.04, 0.25)
-"""Between the five bins of the change [log intensity]."""
-
-GROWTH = 0.3
-"""Steps grow by this share of the time since the light of a pixel last changed: coarse where nothing happens,
-yet fine enough for filters that still settle."""
-
-BLOCK = 256
-"""Frames rendered at once."""
-
 Trust = Callable[[NDArray[np.float64], NDArray[np.int32]], NDArray[np.bool_]]
 """Times (K,) and pixels (N,) to whether the scene is to be trusted there, shape (K, N)."""
+
+
+@dataclass(frozen=True)
+class StimulusSettings:
+    """How light is sampled, and by what its changes are sorted into cells."""
+
+    common_step: float = 1e-3
+    """Steps of the grid [s] where a scene has none of its own that are equal and neither too fine nor too
+    coarse."""
+
+    finest_step: float = 2.5e-4
+    """Finest steps of a scene that are taken [s]: finer ones would take long and show nothing more."""
+
+    coarsest_step: float = 2e-3
+    """Coarsest steps of a scene that are taken [s]: coarser ones miss what fast pixels show."""
+
+    growth: float = 0.3
+    """Samples grow apart by this share of the time since the light of a pixel last changed: coarse where
+    nothing happens, yet fine enough for filters that still settle."""
+
+    still: float = 0.02
+    """Light that changes by less is at rest [log intensity]."""
+
+    rest: tuple[float, float] = (0.2, 0.06)
+    """How long the light has been at rest for the first two kinds of cells [s]."""
+
+    span: float = 0.016
+    """The light's change is taken over this time [s]."""
+
+    edges: tuple[float, float, float, float] = (-0.25, -0.04, 0.04, 0.25)
+    """Between the five bins of the change [log intensity]."""
+
+
+STIMULUS = StimulusSettings()
 
 
 @dataclass(frozen=True)
@@ -131,7 +146,7 @@ class Stimulus:
         since = index - np.maximum.accumulate(np.where(changed, index, 0), axis=1)
         gaps = [0]
         while gaps[-1] < steps:
-            gaps.append(gaps[-1] + max(1, int(GROWTH * gaps[-1])))
+            gaps.append(gaps[-1] + max(1, int(STIMULUS.growth * gaps[-1])))
         due = np.zeros(steps + 1, np.bool_)
         due[[gap for gap in gaps if gap <= steps]] = True
         keep = due[since]
@@ -167,17 +182,26 @@ class Stimulus:
         return out
 
 
-def light_of(scene: Scene, times: NDArray[np.float64], pixels: NDArray[np.int32]) -> NDArray[np.float32]:
-    """Return the linear intensity of some pixels at some times, shape (N, T)."""
+def light_of(
+    scene: Scene, times: NDArray[np.float64], pixels: NDArray[np.int32], *, at_once: int = 256
+) -> NDArray[np.float32]:
+    """Return the linear intensity of some pixels at some times, shape (N, T).
+
+    Args:
+        scene: What they see.
+        times: Increasing [s], shape (T,).
+        pixels: Row-major indices, shape (N,).
+        at_once: Frames that are rendered together, for their memory.
+    """
     out = np.empty((len(pixels), len(times)), np.float32)
-    for first in range(0, len(times), BLOCK):
-        part = times[first : first + BLOCK]
+    for first in range(0, len(times), at_once):
+        part = times[first : first + at_once]
         name, source = scene.source(part, pixels, launch.find_device("cpu"))
         if name == "frames":
             values = source.values.numpy()
         else:
             values = scene.frames(part).reshape(len(part), -1)[:, pixels]
-        out[:, first : first + BLOCK] = values.T
+        out[:, first : first + at_once] = values.T
     return out
 
 
@@ -193,18 +217,18 @@ def sort_into_cells(
         log_eps: Added to intensities before the logarithm.
     """
     level = np.log(intensity + np.float32(log_eps))
-    kind = np.searchsorted(EDGES, _light_change(level, step)).astype(np.uint8) + RESTING
-    for number, time in reversed(list(enumerate(REST))):
+    kind = np.searchsorted(STIMULUS.edges, _light_change(level, step)).astype(np.uint8) + RESTING
+    for number, time in reversed(list(enumerate(STIMULUS.rest))):
         width = max(2, round(time / step))
         # a window that ends at the step; before the first one the light was at rest
         shift = dict(size=width, axis=1, mode="nearest", origin=(width - 1) // 2)
         spread = maximum_filter1d(level, **shift) - minimum_filter1d(level, **shift)
-        kind[spread < STILL] = number
+        kind[spread < STIMULUS.still] = number
     return kind * BANDS + np.searchsorted(bands, intensity).astype(np.uint8)
 
 
 def _light_change(level: NDArray[np.float32], step: float) -> NDArray[np.float32]:
-    back = max(1, round(SPAN / step))
+    back = max(1, round(STIMULUS.span / step))
     before = np.concatenate([np.repeat(level[:, :1], back, 1), level[:, :-back]], axis=1)
     out: NDArray[np.float32] = level - before[:, : level.shape[1]]
     return out
@@ -219,7 +243,3 @@ def band_edges(intensity: NDArray[np.float32], cell_free: NDArray[np.bool_]) -> 
 __all__ = [
     "CELLS", "KINDS", "MASKED", "Grid", "Stimulus", "Trust", "band_edges", "light_of", "sort_into_cells",
 ]  # fmt: skip
-
-
-FINEST, COARSEST = 2.5e-4, 2e-3
-"""A scene's own steps are taken when they are equal and lie between these [s]; else `COMMON`."""

@@ -8,31 +8,39 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
+from dase.effects.row_scan import DIRECTIONS
 from dase.events import Events
 
-FILE = 1e-6
-"""Files give whole microseconds: stamps are off by half of it [s]."""
 
-SHORTEST = 3e-6
-"""Shorter regularities cannot be told from the file's own [s]."""
+@dataclass(frozen=True)
+class PatternSettings:
+    """What counts as a regularity of time stamps."""
 
-BLANK = 0.02
-"""Share of a scan by which lines may be off: readouts pause between scans, which the lines here share out."""
+    file_step: float = 1e-6
+    """Files give whole microseconds: stamps are off by half of it [s]."""
 
-CERTAIN = 0.97
-"""Share of events that must follow a regularity."""
+    shortest: float = 3e-6
+    """Shorter regularities cannot be told from the file's own [s]."""
 
-ENOUGH = 50_000
-"""Events in which a readout's lines are looked for."""
+    pause: float = 0.02
+    """Share of a scan by which lines may be off: readouts pause between scans, which the lines here share
+    out."""
 
-SLOW = 20
-"""Times as many in which ticks are looked for: of a slow clock, thousands of events share one."""
+    certain: float = 0.97
+    """Share of events that must follow a regularity."""
 
-TURNS = 0.8
-"""Least share of events one step behind the one before that tells a bus from a clock, which has at most 0.41
-of them by chance."""
+    scanned: int = 50_000
+    """Events in which a readout's lines are looked for."""
 
-DIRECTIONS = ("down", "up", "right", "left")
+    ticked: int = 1_000_000
+    """Events in which ticks are looked for: of a slow clock, thousands of events share one."""
+
+    in_turns: float = 0.8
+    """Least share of events one step behind the one before that tells a bus from a clock, which has at most
+    0.41 of them by chance."""
+
+
+PATTERNS = PatternSettings()
 
 
 @dataclass(frozen=True)
@@ -72,12 +80,12 @@ def share_at(t: NDArray[np.float64], step: float, slack: float = 0.0) -> float:
     turn = t / step
     phase = np.angle(np.exp(2j * np.pi * (turn - np.floor(turn))).mean()) / (2 * np.pi)
     off = np.abs(turn - phase - np.round(turn - phase)) * step
-    return float(np.mean(off <= max(min(1.1 * FILE, 0.2 * step), slack)))
+    return float(np.mean(off <= max(min(1.1 * PATTERNS.file_step, 0.2 * step), slack)))
 
 
 def share_in_scan(t: NDArray[np.float64], place: NDArray[np.float64], line: float, lines: int) -> float:
     """Return the share of times at which a readout that goes from line to line is at the pixel's."""
-    return share_at(t - place * line, lines * line, BLANK * lines * line)
+    return share_at(t - place * line, lines * line, PATTERNS.pause * lines * line)
 
 
 def readout_lines(events: Events, direction: str) -> tuple[int, NDArray[np.float64]]:
@@ -90,7 +98,7 @@ def readout_lines(events: Events, direction: str) -> tuple[int, NDArray[np.float
 
 def find_structure(events: Events) -> TimestampStructure:
     """Return the regularities of a measurement's time stamps: seen in the first events, true of all."""
-    first = events.select(slice(ENOUGH))
+    first = events.select(slice(PATTERNS.scanned))
     best = TimestampStructure()
     for direction in DIRECTIONS:
         line = line_time(first, direction)
@@ -99,20 +107,20 @@ def find_structure(events: Events) -> TimestampStructure:
     # all of them tell its length better
     if best.line:
         best = replace(best, line=line_time(events, best.direction))
-    elif clock_period(events.t[: SLOW * ENOUGH]):  # the lines of a scan are read at ticks too
+    elif clock_period(events.t[: PATTERNS.ticked]):  # the lines of a scan are read at ticks too
         best = TimestampStructure(step=clock_period(events.t))
-    return best if best.shares(events).max() >= CERTAIN else TimestampStructure()
+    return best if best.shares(events).max() >= PATTERNS.certain else TimestampStructure()
 
 
 def clock_period(t: NDArray[np.float64]) -> float:
     """Return the time between the ticks that all stamps are multiples of [s], 0 where there is none."""
     gaps = np.diff(t)
-    gaps = gaps[gaps > SHORTEST]
+    gaps = gaps[gaps > PATTERNS.shortest]
     if len(gaps) < 50:
         return 0.0
     step = float(np.quantile(gaps, 0.02))
     step = refine_period(t, step)
-    regular = share_at(t, step) >= CERTAIN and spread_over(t, step)
+    regular = share_at(t, step) >= PATTERNS.certain and spread_over(t, step)
     return step if regular and not in_turns(t, step) else 0.0
 
 
@@ -122,7 +130,7 @@ def in_turns(t: NDArray[np.float64], step: float) -> bool:
     To a clock, events come by chance: where there is one per tick in the mean, many ticks have several.
     """
     ticks_ = np.round((t - t[0]) / step)
-    return float(np.mean(np.diff(ticks_) == 1)) >= TURNS
+    return float(np.mean(np.diff(ticks_) == 1)) >= PATTERNS.in_turns
 
 
 def refine_period(t: NDArray[np.float64], step: float) -> float:
@@ -146,7 +154,7 @@ def line_time(events: Events, direction: str) -> float:
     order = np.lexsort((events.t, place))
     t, where = events.t[order], place[order]
     gaps = np.diff(t)[where[1:] == where[:-1]]
-    gaps = gaps[gaps > SHORTEST]
+    gaps = gaps[gaps > PATTERNS.shortest]
     if len(gaps) < 50:
         return 0.0
     scan = float(np.quantile(gaps, 0.02))
@@ -154,4 +162,4 @@ def line_time(events: Events, direction: str) -> float:
     busy = np.bincount(where.astype(np.int64), minlength=lines).argmax()
     scan = refine_period(t[where == busy], scan)
     line = scan / lines
-    return line if share_in_scan(events.t, place, line, lines) >= CERTAIN else 0.0
+    return line if share_in_scan(events.t, place, line, lines) >= PATTERNS.certain else 0.0

@@ -31,7 +31,7 @@ class AnomalySettings:
     """Share of the events that hot pixels may send."""
     hot_pixels: float = 0.001
     """Share of the pixels that may be hot."""
-    fastest: float = 2e-6
+    shortest_interval: float = 2e-6
     """Time in which no pixel sends two events [s]."""
     simultaneous: float = 0.001
     """Share of the events that may be of the same pixel and time as another."""
@@ -91,9 +91,9 @@ def _place_anomalies(s: Statistics, limits: AnomalySettings) -> Iterator[Note]:
 
 
 def _time_anomalies(s: Statistics, limits: AnomalySettings) -> Iterator[Note]:
-    if s.interval_low <= limits.fastest:
-        fastest = format_seconds(limits.fastest)
-        text = f"more than 1 % of the times between events of one pixel are {fastest} or less"
+    if s.interval_low <= limits.shortest_interval:
+        soon = format_seconds(limits.shortest_interval)
+        text = f"more than 1 % of the times between events of one pixel are {soon} or less"
         yield Note(text, "odd", "fast")
     if s.simultaneous > max(limits.simultaneous * s.events, limits.least_simultaneous):
         text = f"{format_count(s.simultaneous)} events are of the same pixel and time as another"

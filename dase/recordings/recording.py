@@ -31,7 +31,7 @@ from dase.recordings.anomalies import find_anomalies
 from dase.recordings.statistics import Statistics, survey_sequence
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class RecordingReport:
     """What was noticed when a recording was opened.
 

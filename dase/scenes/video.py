@@ -155,7 +155,7 @@ def open_video(path: Path, *, fps: float | None = None, size: tuple[int, int] | 
     reader = FrameReader(path, size)
     rate = fps or reader.rate
     if not rate > 0:
-        raise InputError(f"{path} does not say how many frames it has per second: give its frame rate, fps")
+        raise InputError(f"{path} does not say how many frames it has per second: give fps", argument="fps")
     return VideoScene(reader, np.arange(len(reader)) / rate)
 
 
@@ -177,7 +177,7 @@ def _scene_of(path: Path, fps: float | None, size: tuple[int, int] | None) -> Vi
     if size is not None:
         frames = np.stack([cv2.resize(frame, size, interpolation=cv2.INTER_AREA) for frame in frames])
     if fps is None and sequence.frame_times is None:
-        raise InputError(f"{path} does not say when its frames were taken: give their rate, fps")
+        raise InputError(f"{path} does not say when its frames were taken: give fps", argument="fps")
     times = sequence.frame_times if fps is None else np.arange(len(frames)) / fps
     assert times is not None
     return VideoScene(frames / np.float32(255), times - times[0])

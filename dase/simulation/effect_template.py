@@ -83,6 +83,7 @@ class {cls}(Effect):
         bounds=(0.0, 100.0),  # values outside are refused
         plausible=(0.05, 5.0),  # where `dase diagnose` looks
         about="white light gives 1 / (1 + strength) of the photocurrent it would give without saturation",
+        # where a fit begins and what it may change: starts=, fitted=, ..., see `dase.effects.Parameter`
     )
 '''
 

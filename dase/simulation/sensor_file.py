@@ -48,16 +48,14 @@ def as_sensor(sensor: Sensor | str | PathLike[str]) -> Sensor:
         sensor: A `Sensor`, the name of a preset, or the path of a sensor file.
 
     Raises:
-        InputError: It is none of these, or as `load_sensor`.
+        InputError: As `load_sensor`.
+        TypeError: It is none of these.
     """
     if isinstance(sensor, Sensor):
         return sensor
     if isinstance(sensor, str | PathLike):
         return load_sensor(fspath(sensor))
-    raise InputError(
-        "sensor: must be a dase.Sensor, the name of a preset or the path of a sensor file, "
-        f"got {type(sensor).__name__}"
-    )
+    raise TypeError(f"sensor: expected a Sensor, a preset's name or a path, got {type(sensor).__name__}")
 
 
 def read_sensor(spec: str | Path) -> tuple[str, str]:

@@ -36,7 +36,7 @@ class Clip:
         self.times = np.load(folder / "times.npy")
         self.files = sorted(str(f) for f in (folder / "pictures").iterdir())
         self.moved = (folder / "moved").exists()
-        """Whether the pictures are those of `bench_kernels.moving_layers`, which can be made anew."""
+        """Whether the pictures are those of `kernels.moving_layers`, which can be made anew."""
 
 
 def dase_runs(clip: Clip, options: argparse.Namespace) -> dict[str, dict[str, Run]]:

@@ -20,6 +20,7 @@ import subprocess
 import sys
 import tempfile
 from collections.abc import Iterator
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -29,7 +30,10 @@ import numpy as np
 import dase
 from perf.benchmarks import kernels
 
-HERE = Path(__file__).parent
+ROOT = Path(__file__).resolve().parents[2]
+
+INSTALLED = {"v2e": "v2ecore", "openeb": "metavision_core_ml", "esim": "esim_py"}
+"""Simulators by the module that is there where they are installed."""
 
 
 class Worker:
@@ -43,14 +47,14 @@ class Worker:
     """
 
     def __init__(self, peer: str, clip: Path, threads: int, path: Path | None):
-        command = [sys.executable, str(HERE / "peer_worker.py"), peer, str(clip), "--threads", str(threads)]
-        command += ["--path", str(path)] if path else []
+        command = [sys.executable, "-m", "perf.benchmarks.peer_worker", peer, str(clip)]
+        command += ["--threads", str(threads), *(["--path", str(path.resolve())] if path else [])]
         limits = ("OMP", "MKL", "OPENBLAS", "NUMBA")
         several = {f"{name}_NUM_THREADS": str(threads) for name in limits}
         self._log = tempfile.TemporaryFile("w+")  # noqa: SIM115  # it lives as long as the process
         self._process = subprocess.Popen(
             command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=self._log, text=True,
-            env={**os.environ, **several, "DASE_THREADS": str(threads)},
+            env={**os.environ, **several, "DASE_THREADS": str(threads)}, cwd=ROOT,
         )  # fmt: skip
         self.runs: dict[str, list[str]] = self._answer()
 
@@ -173,10 +177,13 @@ def main() -> None:
     peers: dict[str, Path | None] = {"dase": None, "numpy": None}
     for name in ("v2e", "openeb", "esim"):
         given = getattr(options, name)
-        if given:
-            peers[name] = given if isinstance(given, Path) else None
+        installed = find_spec(INSTALLED[name])
+        if isinstance(given, Path):
+            peers[name] = given
+        elif installed is not None and installed.origin is not None:
+            peers[name] = Path(installed.origin).parents[1]
         else:
-            print(f"{name}: not given")
+            print(f"{name}: neither given nor installed")
     lines = []
     with tempfile.TemporaryDirectory() as folder:
         samples, height, width = make_clip(Path(folder), options)

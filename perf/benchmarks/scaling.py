@@ -32,7 +32,8 @@ import dase
 from dase.effects.threshold import Threshold
 from dase.kernels import launch
 from dase.scenes.scene import Scene
-from dase.simulation.sensor import Pixels, Sensor
+from dase.simulation.pixel_array import PixelArray
+from dase.simulation.sensor import Sensor
 from dase.simulation.sensor_file import load_sensor
 from perf.benchmarks import numpy_baseline, scaling_page
 from perf.benchmarks.kernels import Stored, bench_counts, commit, moving_layers
@@ -92,7 +93,7 @@ class Work:
 def chunked(scene: Scene, sensor: Sensor, times: np.ndarray, device: wp.Device, batch: int = 1) -> Any:
     """Return a function that counts the events of all samples, chunk by chunk."""
     parameters = np.repeat(sensor.parameters()[None], batch, 0)
-    array = Pixels(sensor, scene.width, scene.height, parameters=parameters, device=device.alias)
+    array = PixelArray(sensor, scene.width, scene.height, parameters=parameters, device=device.alias)
     size = min(CHUNK[kind(device)], len(times))
 
     def run() -> list[Any]:

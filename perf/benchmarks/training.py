@@ -54,6 +54,7 @@ from dase.learning.training import Training
 from dase.networks.threshold_network import NetworkShape
 from dase.scenes import image_sources
 from perf.benchmarks import naive_critic_bank
+from perf.data_folder import default_images
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -340,10 +341,9 @@ def provenance(device: str, commit: str | None) -> dict[str, str]:
 
 def main() -> None:
     """Measure and print."""
-    beside = ROOT.parent / "shared" / "photos"
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument("--device", default="cuda" if torch.cuda.is_available() else "cpu")
-    parser.add_argument("--images", default=str(beside) if beside.is_dir() else "builtin")
+    parser.add_argument("--images", default=default_images())
     parser.add_argument("--small", action="store_true")
     parser.add_argument("--repeats", type=int, default=15)
     parser.add_argument("--out", type=Path)

@@ -15,24 +15,10 @@ import cv2
 import numpy as np
 import pytest
 from click.testing import CliRunner
+from helpers.command_line import SMALL, dase, one_sentence
 
 from dase import Events, InputError, io
 from dase.cli import dase_group
-
-SMALL = ("--size", "32x24", "--duration", "0.1", "--sequences", "1", "--jobs", "1", "--regime", "slow")
-
-
-def dase(*arguments: object, **options) -> subprocess.CompletedProcess[str]:
-    command = [sys.executable, "-c", "from dase.cli import main; main()", *map(str, arguments)]
-    return subprocess.run(command, capture_output=True, text=True, timeout=300, **options)
-
-
-def one_sentence(done: subprocess.CompletedProcess[str], code: int = 2) -> str:
-    assert done.returncode == code, done.stderr
-    assert "Traceback" not in done.stderr
-    said = [line for line in done.stderr.splitlines() if not re.match(r"Usage:|Try |$", line)]
-    assert len(said) == 1, done.stderr
-    return said[0]
 
 
 def toml(tmp_path: Path, text: str) -> Path:
@@ -134,7 +120,7 @@ def test_video(tmp_path):
         picture = np.full((24, 32), 60, np.uint8)
         picture[:, i : i + 8] = 220
         cv2.imwrite(str(folder / f"{i:03d}.png"), picture)
-    assert "give its frame rate, fps" in one_sentence(dase("synth", tmp_path / "v.npz", "--video", folder))
+    assert "give fps (--fps)" in one_sentence(dase("synth", tmp_path / "v.npz", "--video", folder))
     done = dase("synth", tmp_path / "v.npz", "--video", folder, "--fps", "100", "--sensor", "ideal")
     assert done.returncode == 0, done.stderr
     events = io.read(tmp_path / "v.npz").events

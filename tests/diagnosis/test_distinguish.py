@@ -6,8 +6,8 @@ import math
 
 import numpy as np
 import pytest
+from helpers.command_line import dase, one_sentence
 from scipy.stats import norm
-from test_commands import dase, one_sentence
 
 from dase import InputError, Sensor
 from dase.diagnosis.distinguish import distinguish, separating_power, table_rows

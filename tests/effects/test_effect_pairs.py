@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from test_effects import tracks
-from test_effects_more import STRONG, every, still
-from test_pixel_kernel import flicker, same
+from helpers.event_comparison import same, tracks
+from helpers.sensors import STRONG, every
+from helpers.small_scenes import flicker, still
 
 import dase
 from dase.effects.bandwidth import Bandwidth

@@ -6,6 +6,8 @@ import re
 
 import numpy as np
 import pytest
+from helpers.event_comparison import KS, distance, tracks
+from helpers.small_scenes import ramp, static
 from reference import pixel as reference
 
 import dase
@@ -18,39 +20,6 @@ from dase.effects.threshold import Threshold
 from dase.kernels import pixel_stages
 from dase.simulation.pixel_array import PixelArray
 from dase.simulation.sensor_file import load_sensor, parse_sensor, read_presets
-from dase.simulation.simulate import chunks
-
-
-def static(light: np.ndarray, seconds: float, samples: int) -> dase.VideoScene:
-    """Return a scene in which nothing moves; light is the intensity of each pixel, shape (H, W)."""
-    frames = np.broadcast_to(np.asarray(light, np.float32), (samples, *light.shape))
-    return dase.VideoScene(frames, np.linspace(0, seconds, samples))
-
-
-def ramp(change: float, seconds: float, pixels: int, samples: int = 41) -> dase.VideoScene:
-    """Return pixels whose log(intensity + 0.001) all run straight over `change`."""
-    level = np.linspace(0, change, samples) + np.log(0.0011) - min(change, 0)
-    frames = (np.exp(level) - 1e-3)[:, None, None] * np.ones((1, pixels))
-    return dase.VideoScene(frames, np.linspace(0, seconds, samples))
-
-
-def tracks(events: dase.Events) -> list[np.ndarray]:
-    """Return the event times of every pixel [s]."""
-    place = events.y.astype(int) * events.width + events.x
-    order = np.argsort(place, kind="stable")
-    ends = np.cumsum(np.bincount(place, minlength=events.width * events.height))
-    return np.split(events.t[order], ends[:-1])
-
-
-def distance(values: np.ndarray, distribution: np.ndarray) -> float:
-    """Return the Kolmogorov-Smirnov distance of sorted values to their distribution function, times √n."""
-    n = len(values)
-    steps = np.arange(n + 1) / n
-    return float(max(np.max(steps[1:] - distribution), np.max(distribution - steps[:-1])) * np.sqrt(n))
-
-
-KS = 1.63
-"""Kolmogorov-Smirnov distance that one sample in a hundred exceeds."""
 
 
 @pytest.mark.parametrize("light", [0.8, 0.05])
@@ -181,7 +150,7 @@ def test_rare_events_survive_fine_sampling(device, effect):
     want = dase.simulate(coarse, sensor, device=device)
     times = np.arange(3_000_001) / 20_000
     array, parts = PixelArray(sensor, 8, 1, device=device), []
-    for part in chunks(times, 200_000):
+    for part in np.array_split(times, np.arange(200_000, len(times), 200_000)):
         parts.append(array.emit(_Still(8, part), part)[0])
     got = dase.Events.concatenate(parts)
     assert len(want) > 10

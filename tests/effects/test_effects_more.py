@@ -2,22 +2,22 @@
 
 from __future__ import annotations
 
-import importlib.util
 from pathlib import Path
 
 import numpy as np
 import pytest
+from helpers.event_comparison import by_pixel, rows, same
+from helpers.scripts import load_script
+from helpers.sensors import FURTHER, STRONG, counts, every
+from helpers.small_scenes import flicker, static, still
 from reference import effects as reference_effects
 from reference import pixel as reference
-from test_effects import static
-from test_pixel_kernel import by_pixel, flicker, rows, same
 
 import dase
 from dase.effects.bandwidth import Bandwidth
 from dase.effects.dark import Dark
 from dase.effects.dead import Dead
 from dase.effects.flicker import Flicker
-from dase.effects.hot import Hot
 from dase.effects.jitter import Jitter
 from dase.effects.leak import Leak
 from dase.effects.linlog import Linlog
@@ -31,38 +31,7 @@ from dase.effects.voltage_noise import VoltageNoise
 from dase.kernels import launch
 from dase.simulation.pixel_array import PixelArray
 from dase.simulation.sensor_file import load_sensor, parse_sensor, read_presets
-from dase.simulation.simulate import sample_times
-
-FURTHER = (Flicker, Vignetting, Dark, Linlog, SecondOrder, VoltageNoise, Jitter, Hot, Dead)
-STRONG = {
-    "flicker": Flicker(frequency=40.0, depth=0.5),
-    "vignetting": Vignetting(loss=0.6),
-    "dark": Dark(current=0.02, spread=0.5),
-    "linlog": Linlog(knee=0.08, slope=1.5),
-    "second_order": SecondOrder(cutoff=60.0, damping=0.4, dark=0.3),
-    "voltage_noise": VoltageNoise(sigma=0.3, cutoff=300.0),
-    "jitter": Jitter(spread=0.3),
-    "hot": Hot(share=0.2, rate=300.0),
-    "dead": Dead(share=0.3),
-}
-
-
-def every(*effects: dase.Effect, mode: str = "drop", log_eps: float = 1e-3) -> dase.Sensor:
-    """Return a sensor that has every effect, those not given switched off: one kernel serves many tests."""
-    off = [effect.identity() for effect in dase.EFFECTS.values() if effect is not Refractory]
-    known = {effect.name: effect for effect in (*off, Refractory(period=0.0, mode=mode), *effects)}
-    return dase.Sensor(tuple(known[name] for name in dase.EFFECTS), log_eps=log_eps)
-
-
-def still(light: np.ndarray, seconds: float, samples: int, start: float = 0.0) -> dase.VideoScene:
-    """Return pixels of constant light, one row, sampled evenly."""
-    frames = np.broadcast_to(np.asarray(light, np.float32), (samples, 1, np.size(light)))
-    return dase.VideoScene(frames, start + np.linspace(0, seconds, samples))
-
-
-def counts(scene: dase.Scene, sensor: dase.Sensor, seconds: float, device: str, **options) -> np.ndarray:
-    """Return events of every pixel in (0, seconds], shape (2, N): OFF, ON."""
-    return dase.count(scene, sensor, [0, seconds], device=device, **options)[0, 0]
+from dase.simulation.sensor_run import sample_times
 
 
 @pytest.mark.parametrize("effect", FURTHER, ids=lambda effect: effect.name)
@@ -267,23 +236,14 @@ def test_every_preset_simulates(device, rng, name):
     assert 0.2 < events.p.mean() < 0.8
 
 
-def script(path: str):
-    """Return a script of the checkout as a module."""
-    file = Path(__file__).parents[2] / path
-    spec = importlib.util.spec_from_file_location(file.stem, file)
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
-
-
 def test_the_page_of_effects_is_that_of_the_code():
     page = (Path(__file__).parents[2] / "docs" / "effects.md").read_text("utf-8")
-    assert page == script("docs/effects.py").page(), "run python docs/effects.py"
+    assert page == load_script("docs/effects.py").page(), "run python docs/effects.py"
 
 
 @pytest.mark.parametrize(("level", "pixels"), [("0.1lux", 600), ("161lux", 900), ("3klux", 900)])
 def test_noise_is_like_that_of_a_camera(shared, level, pixels):
-    noise = script("perf/experiments/noise/run.py")
+    noise = load_script("perf/experiments/noise/run.py")
     sensor = parse_sensor(noise.SENSOR, "sensor")
     want = noise.measured(shared / "recordings" / "noise_iebcs.npz")[level]
     got = noise.simulated(sensor, level, pixels=pixels)

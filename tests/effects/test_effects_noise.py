@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from helpers.event_comparison import KS, distance, tracks
+from helpers.sensors import counts, every
+from helpers.small_scenes import ramp, still
 from reference import pixel as reference
-from test_effects import KS, distance, ramp, tracks
-from test_effects_more import counts, every, still
 
 import dase
 from dase.effects.dead import Dead

@@ -5,12 +5,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import warp as wp
+from helpers.event_comparison import KS, by_pixel, distance
+from helpers.sensors import counts, every
+from helpers.small_scenes import ramp, still
 from reference import effects as reference_effects
 from scipy.linalg import expm
 from scipy.stats import norm
-from test_effects import KS, distance, ramp
-from test_effects_more import counts, every, still
-from test_pixel_kernel import by_pixel
 
 import dase
 from dase.effects import second_order, voltage_noise

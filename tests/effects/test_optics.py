@@ -5,9 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import warp as wp
+from helpers.event_comparison import by_pixel, same
+from helpers.small_scenes import flicker, layers
 from scipy.special import ive
 from scipy.stats import norm
-from test_pixel_kernel import by_pixel, flicker, layers, same
 
 import dase
 from dase.effects.optics_blur import OpticsBlur, Unsharp, blur_weights
@@ -63,7 +64,7 @@ def test_switched_off_it_changes_nothing(device, rng, kind):
     scene, plain = SCENES[kind](rng), dase.Sensor((Threshold(), Vignetting()))
     off = plain.with_effect(OpticsBlur.identity())
     assert off.effects[0].name == "optics_blur"
-    assert off.seen(scene) is scene
+    assert off.through_optics(scene) is scene
     want = dase.simulate(scene, plain, device=device)
     same(dase.simulate(scene, off, device=device), want)
     edges = [0.0, scene.duration / 3, scene.duration]

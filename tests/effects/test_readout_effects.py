@@ -7,8 +7,8 @@ from fractions import Fraction
 
 import numpy as np
 import pytest
+from helpers.readout_streams import HEIGHT, WIDTH, bunched, camera, moving, ns, same, through
 from reference import pixel as reference
-from test_readout_chain import HEIGHT, WIDTH, bunched, camera, moving, ns, same, through
 
 import dase
 from dase.effects.latency import Latency

@@ -129,17 +129,21 @@ def test_panel_loses_no_event_when_it_shrinks(rng):
         assert (small[y // 4, x // 4] != 255).any()
 
 
+def assert_nothing_overlaps(figure):
+    boxes = [axes.get_tightbbox() for axes in figure.axes]
+    for k, one in enumerate(boxes):
+        assert not any(one.overlaps(other) for other in boxes[k + 1 :])
+        assert figure.bbox.containsx(one.x0)
+        assert figure.bbox.containsx(one.x1)
+
+
 @pytest.mark.parametrize("frames", [0, 1, 5])
 def test_sheet(tmp_path, rng, frames):
     sequence = random_sequence(rng, frames=frames)
     figure = event_images.draw_sequence(sequence, title="a")
     pictures = [axes for axes in figure.axes if axes.images]
     assert len(pictures) == (min(frames, 6) or 6)
-    boxes = [axes.get_tightbbox() for axes in figure.axes]
-    for k, one in enumerate(boxes):
-        assert not any(one.overlaps(other) for other in boxes[k + 1 :])
-        assert figure.bbox.containsx(one.x0)
-        assert figure.bbox.containsx(one.x1)
+    assert_nothing_overlaps(figure)
     figure.savefig(tmp_path / "a.png")
     assert 20_000 < (tmp_path / "a.png").stat().st_size < 3_000_000
     assert cv2.imread(str(tmp_path / "a.png")).shape[1] == 1650
@@ -147,7 +151,13 @@ def test_sheet(tmp_path, rng, frames):
 
 @pytest.mark.parametrize(("width", "height"), [(20, 90), (200, 20), (1, 1)])
 def test_sheet_of_odd_sensors(rng, width, height):
-    event_images.draw_sequence(random_sequence(rng, width=width, height=height)).canvas.draw()
+    figure = event_images.draw_sequence(random_sequence(rng, width=width, height=height))
+    figure.canvas.draw()
+    assert_nothing_overlaps(figure)
+    for picture in (axes for axes in figure.axes if axes.images):
+        box = picture.get_window_extent()
+        assert box.height / box.width == pytest.approx(height / width, rel=0.01)  # pixels are square
+        assert min(box.width, box.height) > 20  # and can be seen
 
 
 def test_sheet_of_one_moment_and_of_frames_without_times(rng):

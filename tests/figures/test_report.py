@@ -12,7 +12,7 @@ from html.parser import HTMLParser
 import cv2
 import numpy as np
 import pytest
-from test_commands import dase, one_sentence
+from helpers.command_line import dase, one_sentence
 
 from dase import Events, InputError, Sensor, VideoScene, io, simulate
 from dase.effects import EFFECTS

@@ -13,9 +13,8 @@ from dase.effects import EFFECTS
 from dase.effects.readout import Others, Readout
 from dase.effects.row_scan import RowScan
 from dase.effects.stream import to_nanoseconds
-from dase.fitting import bus_load
 from dase.fitting.batch_simulator import SimulationOrder
-from dase.fitting.data_split import BUSY, least_bus_rate, split_measurement
+from dase.fitting.data_split import SPLIT, least_bus_rate, split_measurement
 from dase.fitting.model import model_of
 from dase.fitting.readout_simulator import simulate_pixels
 from dase.fitting.scheduler import SimulationRequest, answer_requests
@@ -117,15 +116,17 @@ def test_a_model_that_sends_more_is_taken_to_do_so_everywhere(evidence, true, sc
     assert np.all(bare[1] < 0.8 * bare[0])
 
 
-@pytest.mark.parametrize("limit", ["MOST", "SENT"])
-def test_some_of_many_pixels_stand_for_all(evidence, true, monkeypatch, limit):
+@pytest.mark.parametrize("limit", ["most_samples", "most_events"])
+def test_some_of_many_pixels_stand_for_all(evidence, true, limit):
     half = evidence.train
     everyone = half.loaded(*place(true)).load
     assert len(everyone._events[0]) > 0  # before there is less room
-    few = {"MOST": 500 * half.trials.stimulus.grid.steps, "SENT": 0.4 * len(everyone._events[0])}
-    monkeypatch.setattr(bus_load, limit, few[limit])
-    half.around._loads.clear()
-    some = half.loaded(*place(true)).load
+    few = {
+        "most_samples": 500 * half.trials.stimulus.grid.steps,
+        "most_events": 0.4 * len(everyone._events[0]),
+    }
+    fewer = replace(half.around, **{limit: few[limit]}, _loads=[])
+    some = fewer.load(true, half.trials.stimulus)
     events = simulate_pixels(half.trials.stimulus, true, true.parameters()[None], np.array([5]))[0]
     assert len(some._events[0]) < 0.5 * len(everyone._events[0])
     total = [load.weight(events).sum() / 2 * len(load._events[0]) for load in (some, everyone)]
@@ -170,9 +171,8 @@ def test_others_go_through_what_is_before_the_bus(evidence, true):
 
 
 def test_answers_do_not_depend_on_what_is_asked_beside(evidence, true):
-    half = evidence.scout.view()
     model = model_of(true)
-    model.rebase(half, repeats=6, seed=1)
+    half = model.calibrate(evidence.scout, repeats=6, seed=1)
     asks = [SimulationRequest(half, model.space, model.place[None] + d, 3) for d in (0.0, 0.1)]
     alone_ = [answer_requests([ask])[0] for ask in asks]
     for got, want in zip(answer_requests(asks), alone_, strict=True):
@@ -183,7 +183,7 @@ def test_answers_do_not_depend_on_what_is_asked_beside(evidence, true):
 def test_the_rate_of_a_bus_that_was_full_is_seen(evidence):
     first = variants_to_try(evidence, Readout)
     assert [e.mode for e in first] == ["delay", "drop"]
-    assert all(abs(e.rate - BUS.rate) <= 1.01 / BUSY for e in first)
+    assert all(abs(e.rate - BUS.rate) <= 1.01 / SPLIT.burst for e in first)
 
 
 def test_a_bus_is_no_candidate_where_it_is_known_to_be_free(evidence, rng):
@@ -197,7 +197,7 @@ def test_a_bus_is_no_candidate_where_it_is_known_to_be_free(evidence, rng):
     assert least_bus_rate(bursts, TimestampStructure(step=1e-3)) == pytest.approx(512 / 1e-3)
     assert least_bus_rate(bursts, TimestampStructure(line=1e-5)) == 0
     assert evidence.least_bus_rate <= 1.2 * BUS.rate  # it was full
-    assert variants_to_try(replace(evidence, fastest=200 * evidence.highest_event_rate), Readout) == []
+    assert variants_to_try(replace(evidence, least_bus_rate=200 * evidence.highest_event_rate), Readout) == []
 
 
 def test_a_bus_that_is_never_free_is_no_clock(rng):

@@ -18,9 +18,9 @@ from dase.fitting.model import (
     model_of,
     refit_model,
     refit_work,
+    shift_periodic_effects,
     starting_places,
     with_effect_added,
-    with_lamp_shifted,
     with_phase,
 )
 from dase.fitting.scheduler import run_work
@@ -39,15 +39,15 @@ def phases(models) -> np.ndarray:
 
 
 def test_a_lamp_is_also_looked_for_one_step_earlier_and_later(lit):
-    got = phases(with_lamp_shifted(model_of(lit), 1e-3)) % 1.0
+    got = phases(shift_periodic_effects(model_of(lit), 1e-3)) % 1.0
     np.testing.assert_allclose(got, [0.05, 0.95, 0.15], atol=1e-6)
     bare = model_of(Sensor())
-    assert with_lamp_shifted(bare, 1e-3) == [bare]
+    assert shift_periodic_effects(bare, 1e-3) == [bare]
 
 
 def test_a_lamp_at_the_end_of_the_range_of_phases_stays_within(lit):
     end = lit.with_effect(replace(LAMP, phase=0.95))
-    got = phases(with_lamp_shifted(model_of(end), 1e-3))
+    got = phases(shift_periodic_effects(model_of(end), 1e-3))
     assert np.all(np.abs(got) <= 1.0)
     np.testing.assert_allclose(got % 1.0, [0.95, 0.85, 0.05], atol=1e-6)
 

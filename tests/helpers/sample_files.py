@@ -351,3 +351,15 @@ def mutated(data: bytes, rng) -> bytes:
         else:
             del out[at : at + int(rng.integers(0, 9))]
     return bytes(out)
+
+
+NEEDS = {"ROS 1": "rosbags", "ROS 2": "rosbags", "MCAP": "rosbags"}
+
+
+def sample(tmp_path, name, e):
+    if name in NEEDS:
+        pytest.importorskip(NEEDS[name])
+    suffix, make = SAMPLES[name]
+    path = tmp_path / f"sample{suffix}"
+    make(path, e)
+    return path

@@ -8,8 +8,7 @@ import zipfile
 
 import numpy as np
 import pytest
-from helpers.sample_files import SAMPLES, events, measured, mutated
-from test_formats import NEEDS, sample
+from helpers.sample_files import NEEDS, SAMPLES, events, measured, mutated, sample
 
 from dase import io
 from dase.errors import InputError

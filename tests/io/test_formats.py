@@ -8,7 +8,7 @@ import cv2
 import h5py
 import numpy as np
 import pytest
-from helpers.sample_files import SAMPLES, H, W, events, microseconds, table
+from helpers.sample_files import NEEDS, SAMPLES, H, W, events, microseconds, sample, table
 
 from dase import io
 from dase.errors import InputError
@@ -16,17 +16,7 @@ from dase.events import Events
 from dase.io import arrays, binary, evt2, evt3, evt21, source, text
 from dase.io.sequence import Sequence
 
-NEEDS = {"ROS 1": "rosbags", "ROS 2": "rosbags", "MCAP": "rosbags"}
 WRITTEN = ("EVT2", "EVT3", "DAT", "AEDAT2", "text", "zip of text", "HDF5", "NumPy archive")
-
-
-def sample(tmp_path, name, e):
-    if name in NEEDS:
-        pytest.importorskip(NEEDS[name])
-    suffix, make = SAMPLES[name]
-    path = tmp_path / f"sample{suffix}"
-    make(path, e)
-    return path
 
 
 def assert_same(got, want, *, shifted=True):

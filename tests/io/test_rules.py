@@ -206,7 +206,7 @@ def test_converting_frames_needs_no_memory_for_all_of_them(tmp_path):
     script = """
 import sys
 import numpy as np
-from dase import io, show
+from dase import io
 from dase.events import Events
 n = np.arange(1000)
 def make(path, count):

@@ -7,7 +7,7 @@ import pytest
 
 torch = pytest.importorskip("torch", reason="the bridge needs torch")
 
-from test_autograd_scene_layers import FIELDS, sizes_of
+from helpers.layer_gradients import FIELDS, sizes_of
 
 from dase.kernels.autograd_scene_layers import affine_places, render_layers
 

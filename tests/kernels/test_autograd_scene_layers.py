@@ -9,13 +9,14 @@ import pytest
 
 torch = pytest.importorskip("torch", reason="the bridge needs torch")
 
+from helpers.layer_gradients import FIELDS, sizes_of
+
 from dase.kernels import launch
 from dase.kernels.autograd_scene_layers import affine_places, render_layers
 from dase.scenes.image_sources import Picture
 from dase.scenes.layers import Layer, LayerScene, Motion
 
 WIDTH, HEIGHT = 40, 30
-FIELDS = ("x", "y", "angle", "scale_x", "scale_y")
 
 
 def random_layers(rng, count, device):
@@ -37,10 +38,6 @@ def random_motion(rng, layers, device):
     motion[:, 2] *= 4  # angle [rad]
     motion[:, 3:] = rng.uniform(0.5, 0.9, (layers, 2, 2))
     return torch.tensor(motion, dtype=torch.float32, device=device)
-
-
-def sizes_of(textures):
-    return [tuple(grey.shape) for grey, _ in textures]
 
 
 def random_scene(rng, count, device, samples=3):
@@ -248,11 +245,20 @@ def test_threads_do_not_change_gradients(rng):
             torch.testing.assert_close(g, w, rtol=1e-4, atol=1e-4 * w.abs().max().item())
 
 
-def test_places_that_are_not_numbers_stay_inside_the_textures(device, rng):
+@pytest.mark.parametrize("value", [1e30, -1e30, math.nan, math.inf])
+def test_places_out_of_reach_stay_inside_the_textures(device, rng, value):
     textures, place = random_scene(rng, 2, device)
-    for value in (math.nan, math.inf, 1e30):
-        lost = torch.full_like(place, value).requires_grad_()
-        render_layers(textures, lost, width=WIDTH, height=HEIGHT).sum().backward()
+    *leaves, lost = leaves_of(textures, torch.full_like(place, value))
+    frames = render_layers(textures, lost, width=WIDTH, height=HEIGHT)
+    of_background, *of_foregrounds, _ = torch.autograd.grad(frames.sum(), [*leaves, lost])
+    for gradient in of_foregrounds:  # foregrounds are nowhere in the picture
+        torch.testing.assert_close(gradient, torch.zeros_like(gradient))
+    if math.isfinite(value):  # the folded background is everywhere: each pixel shows texels of weight 1
+        assert of_background.sum().item() == pytest.approx(frames.numel())
+        without = render_layers(textures[:1], lost[:, :1], width=WIDTH, height=HEIGHT)
+        torch.testing.assert_close(frames, without, rtol=0, atol=0)
+    else:  # said, not hidden: 0 · ∞ is no number either
+        assert frames[:, 0, 0].isnan().all()
 
 
 @pytest.mark.parametrize(

@@ -22,8 +22,8 @@ ARCH = 90
 """Compute capability that is compiled for: H100 and H200."""
 
 MODULES = (
-    "critic_layers", "critic_products", "critic_rows", "event_keys", "event_order", "event_probes",
-    "event_queue", "patch_structure", "pixel_codegen_trials", "scene_batch", "scene_blur",
+    "critic_layers", "critic_products", "critic_rows", "event_keys", "event_neighbours", "event_order",
+    "event_probes", "event_queue", "patch_structure", "pixel_codegen_trials", "scene_batch", "scene_blur",
     "scene_frames", "scene_layers", "scene_layers_gradient", "threshold_surrogates",
 )  # fmt: skip
 """Those whose kernels are not made by functions."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from test_vector_math import scene_of
+from helpers.stored_scenes import scene_of
 
 import dase
 from dase.effects import EFFECTS
@@ -48,7 +48,7 @@ def sensor_of(name, kind):
 
 def run(sensor, scene, lanes, monkeypatch, *, labels):
     """Return events by chunks of 17 samples, then counts of the same sensor, and the last states."""
-    monkeypatch.setattr(PixelArray, "_lanes", lambda self, source: lanes)
+    monkeypatch.setattr(PixelArray, "_count_lanes", lambda self, source: lanes)
     times, out = scene.sample_times(), []
     array = PixelArray(sensor, scene.width, scene.height, seed=3, labels=labels)
     for begin in range(0, len(times), 17):

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from helpers.event_comparison import differing, rows, same
+from helpers.sensors import full
+from helpers.small_scenes import flicker
 from reference import pixel as reference
-from test_pixel_kernel import differing, flicker, full, rows, same
 
 import dase
 from dase.effects.bandwidth import Bandwidth

@@ -5,77 +5,19 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import warp as wp
+from helpers.event_comparison import by_pixel, differing, rows, same
+from helpers.sensors import full
+from helpers.small_scenes import flicker, layers
 from reference import pixel as reference
 from reference import threshold_counts as reference_counts
 
 import dase
-from dase.effects.bandwidth import Bandwidth
-from dase.effects.leak import Leak
 from dase.effects.mismatch import Mismatch
 from dase.effects.refractory import Refractory
 from dase.effects.shot import Shot
 from dase.effects.threshold import Threshold
 from dase.kernels import launch, pixel_compile, pixel_stages
 from dase.simulation.pixel_array import PixelArray
-
-
-def full(mode: str = "drop") -> dase.Sensor:
-    """Return a sensor on which every effect is strong."""
-    return reference.only(
-        Threshold(on=0.17, off=0.23),
-        Mismatch(spread=0.1),
-        Bandwidth(cutoff=400.0),
-        Leak(rate=8.0, spread=0.3),
-        Shot(rate=60.0, balance=0.6),
-        Refractory(period=3e-3, mode=mode),
-    )
-
-
-def flicker(rng: np.random.Generator, samples: int = 60, size: tuple[int, int] = (8, 10), step: float = 0.25):
-    """Return a video whose log intensities wander, unevenly sampled; times are whole 2^-12 s."""
-    level = np.cumsum(rng.normal(0, step, (samples, *size)), 0) + rng.uniform(-4, -0.5, size)
-    level = -np.abs(level)  # stays below white
-    times = np.cumsum(rng.integers(4, 24, samples)) / 4096
-    return dase.VideoScene(np.exp(level).astype(np.float32), times)
-
-
-def layers(rng: np.random.Generator, size: tuple[int, int] = (24, 20)) -> dase.LayerScene:
-    """Return a background and two turning, half transparent objects."""
-    made = []
-    for n, scale in enumerate((1.3, 0.5, 0.3)):
-        grey = rng.random((18, 22), np.float32)
-        alpha = None if n == 0 else rng.random((18, 22), np.float32).round() * np.float32(0.7)
-        x, y = rng.uniform(-0.4, 0.4, (2, 2)).tolist()
-        zoom = (scale, 1.2 * scale)
-        motion = dase.Motion(x=tuple(x), y=tuple(y), angle=(0.3 * n, n), scale_x=zoom, scale_y=zoom[::-1])
-        made.append(dase.Layer(dase.Picture(grey, alpha), motion))
-    return dase.LayerScene(made, width=size[0], height=size[1], duration=0.2)
-
-
-def rows(events: dase.Events) -> np.ndarray:
-    """Return events as whole numbers (t [ns], x, y, p), shape (N, 4)."""
-    return np.stack([np.round(events.t * 1e9).astype(np.int64), events.x, events.y, events.p], -1)
-
-
-def same(a: dase.Events, b: dase.Events) -> None:
-    """Assert that two streams are equal, bit for bit."""
-    assert len(a) > 0
-    for name in "txyp":
-        np.testing.assert_array_equal(getattr(a, name), getattr(b, name))
-
-
-def by_pixel(events: dase.Events) -> list[np.ndarray]:
-    """Return (t, p) of every pixel's events, in order."""
-    place = events.y.astype(int) * events.width + events.x
-    pairs = np.stack([events.t, events.p], -1)
-    return [pairs[place == i] for i in range(events.width * events.height)]
-
-
-def differing(a: np.ndarray, b: np.ndarray) -> float:
-    """Return the share of counts that differ."""
-    assert a.shape == b.shape
-    assert a.sum() > 0
-    return float(np.mean(a != b))
 
 
 def walk(rng: np.random.Generator, kind: str) -> tuple[np.ndarray, float, float]:

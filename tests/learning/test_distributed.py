@@ -101,6 +101,7 @@ def test_two_processes_do_what_one_does_with_all_scenes(tmp_path):
             assert float((found[name] - value).abs().max()) <= 2e-4 * size + 1e-9, name
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("objective", ["moments", "wgan"])
 def test_the_command_on_two_processes(objective, tmp_path):
     out = tmp_path / "run"

@@ -69,7 +69,7 @@ def test_pixels_get_the_thresholds_that_were_learned(folder, scene, device):
     draws = []
     for seed in range(300):
         pixels = PixelArray(sensor, 24, 20, seed=seed, device=device)
-        pixels.look_at(scene)
+        pixels.bind_scene(scene)
         draws.append(pixels.thresholds()[0].reshape(2, 20, 24))
     found = np.stack(draws)
     np.testing.assert_allclose(found.mean(0), mu, rtol=0.06)
@@ -78,7 +78,7 @@ def test_pixels_get_the_thresholds_that_were_learned(folder, scene, device):
     above = found[:, 0] > 0.0101  # the floor, under which none lies
     np.testing.assert_allclose((found[:, 1] / found[:, 0])[above], 1.21, rtol=1e-3)
     again = PixelArray(sensor, 24, 20, seed=7, device=device)
-    again.look_at(scene)
+    again.bind_scene(scene)
     np.testing.assert_array_equal(again.thresholds()[0].reshape(2, 20, 24), draws[7])
 
 
@@ -302,7 +302,7 @@ def test_the_command_learns_from_a_sensor_and_goes_on(tmp_path, monkeypatch):
     [
         (("missing.npz",), "missing.npz"),
         (("ideal", "--preset", "fast"), "there is no preset 'fast'"),
-        (("ideal", "--images", "frames"), "a sensor file has no frames"),
+        (("ideal", "--images", "frames"), "a sensor file has none"),
         (("ideal", "--window", "-1"), "window must be a number > 0 s, got -1"),
         (("ideal", "ideal"), "one sensor file is one target, got 2"),
         (("ideal", "--objective", "magic"), "objective must be moments or wgan"),

@@ -9,6 +9,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from helpers.tiny_training import SIDE, a_fake, a_run, small_scenes
 
 from dase.kernels import autograd_training as bridge
 from dase.learning import patch_hash, scene_batches
@@ -24,7 +25,6 @@ from dase.learning.adversarial import (
 from dase.learning.baselines import RandomThresholds, constant_thresholds, match_event_rate
 from dase.learning.evaluation import HeldOutScore
 from dase.learning.gauss_newton import GaussNewton
-from dase.learning.job import compose_training
 from dase.learning.moment_matching import (
     CellMoments,
     MomentWeighting,
@@ -45,7 +45,7 @@ from dase.learning.targets import (
     vary_parameters,
     vary_thresholds,
 )
-from dase.learning.training import Training, threshold_prior
+from dase.learning.training import threshold_prior
 from dase.networks.threshold_network import (
     NetworkShape,
     ThresholdMaps,
@@ -53,32 +53,13 @@ from dase.networks.threshold_network import (
     edge_strength,
     interpolate_table,
 )
-from dase.scenes import image_sources
 from dase.scenes.image_sources import Picture
 from dase.scenes.layers import Layer, LayerScene, Motion
-
-SIDE = 48
-TINY = NetworkShape(channels=4, depth=1)
-
-
-def small_scenes() -> scene_batches.Scenery:
-    looks = scene_batches.SceneSettings(width=SIDE, height=SIDE, samples=6, regime="variety")
-    return scene_batches.Scenery(image_sources.open_images("builtin"), looks, backgrounds=6, objects=8)
 
 
 @pytest.fixture(scope="module")
 def scenes() -> scene_batches.Scenery:
     return small_scenes()
-
-
-def a_run(scenes: scene_batches.Scenery, **changes) -> Training:
-    recipe = Recipe(objective="moments", steps=40, warmup=6, batch=4, ramp=5, network=TINY, rate=1e-4)
-    target = EndlessTarget(scenes, TRUTHS["uniform"](), seed=9)
-    return compose_training(replace(recipe, **changes), target, scenes)
-
-
-CRITICS = AdversarialSettings(hash=PatchHash(size=16, orientations=2, coherence=1, contrast=2))
-WGAN = dict(objective="wgan", anchor=5.0, adversarial=CRITICS)
 
 
 def test_batches_show_what_layer_scenes_show(scenes):
@@ -218,11 +199,6 @@ def test_counts_answer_as_central_differences_say(scenes, rng):
     want = (ends[0].square() - ends[1].square()).mean() / (2 * math.sinh(0.1))
     # spread and level scale together, but where the floor cuts
     torch.testing.assert_close(slope, want, rtol=2e-2, atol=1e-3)
-
-
-def a_fake(training):
-    log = training.scenery.draw(training.scenes, training.recipe.batch)
-    return training.simulate_fake(log, training.step)[0]
 
 
 def test_newton_knows_how_moments_move(scenes):

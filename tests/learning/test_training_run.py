@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from test_training import CRITICS, SIDE, WGAN, a_fake, a_run, small_scenes
+from helpers.tiny_training import CRITICS, SIDE, WGAN, a_fake, a_run, small_scenes
 
 from dase.errors import InputError
 from dase.learning import scene_batches
@@ -159,7 +159,7 @@ def same(one, other) -> bool:
     ids=["moments", "wgan", "adabelief"],
 )
 def test_a_resumed_run_ends_bit_equal(scenes, tmp_path, changes):
-    recipe = {**changes, "steps": 8, "warmup": 2}
+    recipe = {**changes, "steps": 6, "warmup": 2}
     whole, first, second = (a_run(scenes, **recipe) for _ in range(3))
     schedule = RunSchedule(log_every=2, save_every=0.0, score_every=0)
     train_in_folder(whole, tmp_path / "whole", schedule=schedule)
@@ -190,16 +190,16 @@ def test_nan_stops_with_its_step_and_the_last_good_checkpoint(scenes, tmp_path):
 
     def poisoned(fake: Pairs, real: Pairs, *, move: bool, rates: torch.Tensor):
         loss, values = plain(fake, real, move=move, rates=rates)
-        return (loss * float("nan") if training.step == 7 else loss), values
+        return (loss * float("nan") if training.step == 3 else loss), values
 
     training.objective.loss = poisoned
     with pytest.raises(
-        TrainingDiverged, match=r"broke at step 7: .* is not finite; the last good checkpoint is .*pt"
+        TrainingDiverged, match=r"broke at step 3: .* is not finite; the last good checkpoint is .*pt"
     ):
         train_in_folder(
-            training, tmp_path / "run", schedule=RunSchedule(log_every=5, save_every=0.0, score_every=0)
+            training, tmp_path / "run", schedule=RunSchedule(log_every=2, save_every=0.0, score_every=0)
         )
-    assert load_checkpoint(tmp_path / "run" / CHECKPOINT, "cpu")["step"] == 5
+    assert load_checkpoint(tmp_path / "run" / CHECKPOINT, "cpu")["step"] == 2
 
 
 def test_a_folder_is_not_begun_twice(scenes, tmp_path):

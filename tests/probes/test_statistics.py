@@ -12,13 +12,13 @@ import pytest
 import dase
 from dase.diagnosis.explain_effect import moving_bars
 from dase.effects import EFFECTS, StreamEffect
-from dase.fitting import descent
-from dase.fitting.batch_simulator import CLASS_TIMES, LAG_TIMES, SimulationOrder
+from dase.fitting.batch_simulator import SimulationOrder
 from dase.fitting.data_split import split_measurement
+from dase.fitting.descent import DESCENT
 from dase.fitting.model import model_of
 from dase.fitting.scheduler import answer_requests, run_side_by_side, run_work
 from dase.kernels import event_probes as kernels
-from dase.probes.accumulators import GROUP, SEEN, compute_totals, leave_groups_out
+from dase.probes.accumulators import GROUP, PROBE_TIMES, compute_totals, leave_groups_out
 from dase.probes.statistics import FAMILIES, LAYOUT, compute_statistics, refine_frequency
 from dase.probes.timestamp_patterns import TimestampStructure, find_structure
 from dase.simulation.sensor import Sensor
@@ -50,8 +50,8 @@ def evidence(events, scene, device):
 def reference(events, stimulus, middle) -> np.ndarray:
     """Add up what `observe_event` adds up, event by event."""
     step, out = stimulus.grid.step, np.zeros(kernels.SumPlace.SIZE)
-    lags = np.rint(np.array(LAG_TIMES) / step).astype(int)
-    ends = np.rint(np.array(CLASS_TIMES) / step).astype(int)
+    lags = np.rint(np.array(PROBE_TIMES.lags) / step).astype(int)
+    ends = np.rint(np.array(PROBE_TIMES.classes) / step).astype(int)
     level, last = stimulus.level, stimulus.grid.steps - 1
     for i, pixel in enumerate(stimulus.pixels):
         mine = events.select(events.y.astype(int) * events.width + events.x == pixel)
@@ -265,25 +265,24 @@ def kept(work, seen):
         return stop.value
 
 
-def test_searches_side_by_side_end_where_each_ends_alone(evidence, monkeypatch):
-    half = evidence.scout.view()
+def test_searches_side_by_side_end_where_each_ends_alone(evidence):
     models = [
         model_of(Sensor().with_effect(EFFECTS[name](**ON[name]))) for name in ("leak", "shot", "linlog")
     ]
-    models[0].rebase(half, repeats=6, seed=1)
+    half = models[0].calibrate(evidence.scout, repeats=6, seed=1)
     seen = [[] for _ in models]
     for model, each in zip(models, seen, strict=True):
-        run_work(kept(model.searching(half, seed=3, iterations=1), each))
+        run_work(kept(model.search_work(half, seed=3, iterations=1), each))
     assert max(map(len, seen)) > 5
     # beside the first populations of all, every population has the answers it has alone
     first = [each[0][0] for each in seen]
     for ask, want in (pair for each in seen for pair in each):
         np.testing.assert_allclose(answer_requests([*first, ask])[-1], want, rtol=1e-6, atol=1e-7)
     # the end can be compared after one: a place off by 1e-9 counts an event more or less in the next ones
-    monkeypatch.setattr(descent, "LONGEST", 1)
-    ends = run_side_by_side([m.searching(half, seed=3, iterations=1) for m in models])
+    once = replace(DESCENT, longest=1)
+    ends = run_side_by_side([m.search_work(half, seed=3, iterations=1, settings=once) for m in models])
     for found, model in zip(ends, models, strict=True):
-        want = run_work(model.searching(half, seed=3, iterations=1))
+        want = run_work(model.search_work(half, seed=3, iterations=1, settings=once))
         np.testing.assert_allclose(found.place, want.place, atol=1e-5)
         assert found.loss == pytest.approx(want.loss, rel=1e-4)
 
@@ -292,8 +291,8 @@ def test_silent_pixels_are_counted(evidence, events):
     """A pixel is silent if it sends nothing where at least six events are expected."""
     half = evidence.train
     expected = half.found.halves[0].astype(float)  # as if the model were exact
-    busy = np.flatnonzero(expected.sum(1) >= SEEN)[:7]
-    few = np.flatnonzero((expected.sum(1) < SEEN) & (expected.sum(1) > 0))[:3]
+    busy = np.flatnonzero(expected.sum(1) >= 6)[:7]
+    few = np.flatnonzero((expected.sum(1) < 6) & (expected.sum(1) > 0))[:3]
     muted = half.trials.stimulus.pixels[np.concatenate([busy, few])]
     place = events.y.astype(int) * events.width + events.x
     found = half.trials.look(events.select(~np.isin(place, muted)))

@@ -1,18 +1,20 @@
-"""What is installed is what is in the tree, and imports go one way."""
+"""What is installed is what is in the tree, and importing it costs little."""
 
 from __future__ import annotations
 
 import ast
+import importlib
+import json
+import re
 import subprocess
 import sys
 import tomllib
-from pathlib import Path
 
 import pytest
+from helpers.scripts import ROOT, load_script
+from PIL import Image
 
 import dase
-
-ROOT = Path(__file__).parents[2]
 
 
 def declared() -> dict:
@@ -36,28 +38,6 @@ def test_public_names_are_exported_once_and_documented():
         _ = dase.nonsense
 
 
-def imported(path: Path) -> set[str]:
-    tree = ast.parse(path.read_text())
-    names = {a.name for node in ast.walk(tree) if isinstance(node, ast.Import) for a in node.names}
-    return names | {
-        node.module for node in ast.walk(tree) if isinstance(node, ast.ImportFrom) and node.module
-    }
-
-
-def test_imports_go_one_way():
-    for path in (ROOT / "kernels").glob("*.py"):
-        assert all(
-            n == "dase.kernels" or n.startswith("dase.kernels.") or not n.startswith("dase")
-            for n in imported(path)
-        ), path
-    for path in (ROOT / "dase").glob("*.py"):
-        assert not any(n.startswith("dase.cli") for n in imported(path)), path
-    torch = [
-        p.name for p in (ROOT / "kernels").glob("*.py") if any(n.startswith("torch") for n in imported(p))
-    ]
-    assert all(name.startswith("autograd") for name in torch)
-
-
 def test_help_loads_nothing_heavy():
     script = (
         "import sys; sys.argv = ['dase', '--help']\n"
@@ -75,3 +55,59 @@ def test_help_loads_nothing_heavy():
 def test_kernels_refuse_a_second_name():
     done = subprocess.run([sys.executable, "-c", "import kernels"], cwd=ROOT, capture_output=True, text=True)
     assert "import dase.kernels, not kernels" in done.stderr
+
+
+def test_the_page_of_the_architecture_is_that_of_the_code():
+    script = load_script("docs/architecture.py")
+    page = (ROOT / "docs" / "architecture.md").read_text("utf-8")
+    assert page == script.page(), "run python docs/architecture.py"
+    with Image.open(ROOT / "docs" / "architecture.png") as picture:
+        drawn = json.loads(picture.text["Description"])["packages"]
+    assert drawn == sorted(script.find_packages()), "run python docs/architecture.py"
+    for steps in script.WAYS.values():
+        assert set(dict(steps)) <= set(drawn)
+
+
+def test_hooks_run_what_make_lint_runs():
+    recipe = (ROOT / "Makefile").read_text().split("\nlint: .venv/ready\n")[1].split("\n\n")[0]
+    commands = [line.strip().replace("$(BIN)", ".venv/bin") for line in recipe.splitlines()]
+    hooks = (ROOT / ".pre-commit-config.yaml").read_text()
+    assert re.findall(r"entry: (.*)", hooks) == commands
+
+
+def test_contributors_are_told_of_targets_that_are_there():
+    text = (ROOT / "CONTRIBUTING.md").read_text("utf-8")
+    targets = set(re.findall(r"^([\w-]+):", (ROOT / "Makefile").read_text(), flags=re.MULTILINE))
+    asked = set(re.findall(r"^make ([a-z-]+)", text, flags=re.MULTILINE))
+    assert asked
+    assert asked <= targets
+
+
+def is_there(name: str) -> bool:
+    """Whether a dotted name leads to a module or to something in it."""
+    parts = name.split(".")
+    for k in range(len(parts), 0, -1):
+        try:
+            found = importlib.import_module(".".join(parts[:k]))
+        except ImportError:
+            continue
+        for part in parts[k:]:
+            if not hasattr(found, part):
+                return False
+            found = getattr(found, part)
+        return True
+    return False
+
+
+PAGES = sorted(str(path.relative_to(ROOT)) for path in (*ROOT.glob("*.md"), *(ROOT / "docs").glob("*.md")))
+
+
+@pytest.mark.parametrize("page", PAGES)
+def test_pages_name_what_is_there(page):
+    text = (ROOT / page).read_text("utf-8")
+    names = re.findall(r"`(dase(?:\.\w+)+)", text)
+    assert not [name for name in names if not is_there(name)]
+    paths = re.findall(r"`((?:dase|kernels|cli|tests|perf|docs)/[\w/.]*)`", text)
+    assert not [path for path in paths if "NAME" not in path and not (ROOT / path).exists()]
+    links = re.findall(r"\]\(([^)#:]+)\)", text)
+    assert not [to for to in links if not ((ROOT / page).parent / to).exists()]

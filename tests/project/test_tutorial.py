@@ -9,7 +9,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from test_commands import dase
+from helpers.command_line import dase
 
 from dase import InputError, VideoScene, count, load_effects, load_sensor
 from dase.simulation.sensor import Sensor
@@ -33,6 +33,7 @@ def folder(tmp_path_factory) -> Path:
     return path
 
 
+@pytest.mark.slow
 def test_commands(folder):
     lines = [line for block in blocks("sh")[1:] for line in block.splitlines()]
     for line in lines:

@@ -7,7 +7,7 @@ import datetime
 import cv2
 import numpy as np
 import pytest
-from test_commands import dase, one_sentence
+from helpers.command_line import dase, one_sentence
 
 from dase import InputError, Sensor, VideoScene, dump_sensor, io, load_sensor, simulate
 from dase.diagnosis.sensor_update import round_parameters

@@ -71,7 +71,7 @@ def test_what_is_no_scene_is_one_sentence(frames, change, options, says):
 def test_what_is_no_sensor_is_one_sentence(frames):
     with pytest.raises(dase.InputError, match="did you mean 'davis346'"):
         dase.simulate(frames, "davis34", fps=10)
-    with pytest.raises(dase.InputError, match="path of a sensor file, got int"):
+    with pytest.raises(TypeError, match="a preset's name or a path, got int"):
         dase.simulate(frames, 346, fps=10)  # type: ignore[arg-type]
 
 

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from test_commands import SMALL, dase, one_sentence
+from helpers.command_line import SMALL, dase, one_sentence
 
 from dase import InputError, Sensor, VideoScene, io, load_sensor, simulate
 from dase.effects import EFFECTS

@@ -47,11 +47,11 @@ from dase.recordings.recording import open_recording
 from dase.scenes import image_sources
 from dase.scenes.between_frames import CameraScene, TrustSettings
 from dase.simulation.sensor_file import load_sensor
+from perf.data_folder import data_folder, default_images
 from perf.experiments.adaptation import jobs
 from perf.experiments.adaptation.rows import Planned, Row, plan, rows
 
 ROOT = Path(__file__).resolve().parents[3]
-SHARED = ROOT.parent / "shared"
 
 LEARNED = 8.0
 """Seconds of the recording that are learned from."""
@@ -251,11 +251,6 @@ def _brief(line: dict[str, Any]) -> str:
     )
 
 
-def _default_images() -> str:
-    beside = SHARED / "photos"
-    return str(beside) if beside.is_dir() else "builtin"
-
-
 def parse(argv: list[str] | None = None) -> argparse.Namespace:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument("--row", action="append", default=[], help="name or pattern; may be repeated")
@@ -270,9 +265,9 @@ def parse(argv: list[str] | None = None) -> argparse.Namespace:
     parser.add_argument(
         "--device", default="cuda" if torch.cuda.is_available() else "cpu", help="or some: cuda:0,cuda:1"
     )
-    parser.add_argument("--images", default=_default_images())
+    parser.add_argument("--images", default=default_images())
     parser.add_argument(
-        "--recording", default=str(ROOT.parent / "shared/recordings/davis240c_camerashake.npz")
+        "--recording", default=str((data_folder() or Path()) / "recordings/davis240c_camerashake.npz")
     )
     parser.add_argument("--look", type=int, default=100, help="steps between lines of the log")
     parser.add_argument("--small", action="store_true", help="tiny scenes, to try things on a CPU")

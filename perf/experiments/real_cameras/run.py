@@ -269,7 +269,7 @@ def pictures(camera: Camera, measured: Measurement, sensor: dase.Sensor) -> dict
     gaps = np.diff(events.t[order])[np.diff(pixel[order]) == 0]
     counts = np.bincount(pixel, minlength=events.width * events.height)
     looked = RecordingSurvey(events.width, events.height)
-    looked.events(events)
+    looked.add_events(events)
     return {
         "measured": events.counts(edges)[0], "simulated": simulated.counts(edges)[0], "grey": grey,
         "rate": np.array(len(events) / (events.t[-1] - events.t[0])),

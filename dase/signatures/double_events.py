@@ -1,0 +1,108 @@
+"""Double events: a pixel sends twice within some microseconds, sooner than its dead time allows.
+
+A handshake that is answered twice. Where the light jumps, events also follow each other fast, but then as
+many per microsecond a little later.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import warp as wp
+from numpy.typing import NDArray
+from scipy import stats
+
+from dase.events import Events
+from dase.formatting import format_count, format_percent, format_seconds
+from dase.kernels import launch
+from dase.kernels.event_neighbours import count_short_intervals
+from dase.signatures.calm_events import row_major_pixels
+from dase.signatures.chance import poisson_interval
+from dase.signatures.result import Answer, Signature, judge_signature, without_answer
+
+NAME = "double events"
+
+
+@dataclass(frozen=True)
+class DoubleSettings:
+    """What is a double event."""
+
+    least: float = 1e-3  # share of the events
+    near: float = 20e-6  # [s]
+    far: float = 400e-6  # [s] dead times begin to show beyond it
+    ratio: float = 2.0  # times as many per second below `near` as from there to `far`
+
+
+class IntervalCounts:
+    """Counts short intervals between events of each pixel.
+
+    Args:
+        width: Columns of the sensor.
+        height: Rows of the sensor.
+        settings: What is a double event.
+    """
+
+    def __init__(self, width: int, height: int, settings: DoubleSettings | None = None):
+        self.settings = settings or DoubleSettings()
+        self.counts = np.zeros((2, width * height), np.int32)
+        """Intervals below `near`, and from it to below `far`, shape (2, H * W)."""
+        self.events = np.zeros(width * height, np.int64)
+        self._last = np.full(width * height, -np.inf)
+        self._cpu = launch.find_device("cpu")
+
+    def push(self, events: Events) -> None:
+        """Take events."""
+        if not len(events):
+            return
+        pixel = row_major_pixels(events)
+        self.events += np.bincount(pixel, minlength=len(self.events))
+        time, place, last, out = (
+            wp.array(a, dtype=d, device=self._cpu, copy=False)
+            for a, d in ((events.t, wp.float64), (pixel, int), (self._last, wp.float64), (self.counts, int))
+        )
+        # whole microseconds as floating point numbers: 20 of them are not less than 20
+        near, far = (wp.float64(value - 1e-9) for value in (self.settings.near, self.settings.far))
+        inputs = [time, place, near, far, last, out]
+        wp.launch(count_short_intervals, dim=1, inputs=inputs, device=self._cpu)
+
+
+def find_double_events(
+    intervals: IntervalCounts, hot: NDArray[np.bool_], level: float, tick: float = 0.0
+) -> Signature:
+    """Look for pixels that send twice.
+
+    The null has as many intervals per second below 20 µs as from there to 400 µs: binomial.
+
+    Args:
+        intervals: Counted intervals.
+        hot: Pixels to leave out, shape (H * W,).
+        level: p below which they are there.
+        tick: Time between the ticks of the stamps [s]: at a slow clock, events that are not double share one.
+    """
+    s = intervals.settings
+    if tick >= s.near:
+        return without_answer(NAME, f"stamps are {format_seconds(tick)} apart, which hides what is sooner")
+    near, rest = (int(row[~hot].sum()) for row in intervals.counts)
+    events = int(intervals.events[~hot].sum())
+    if events * s.least < 20:
+        return without_answer(
+            NAME, f"{format_count(events)} events, too few for a share of {format_percent(s.least)}"
+        )
+    chance = s.near / s.far
+    p = float(stats.binom.sf(near - 1, near + rest, chance)) if near else 1.0
+    if near * (1 / chance - 1) < s.ratio * rest:
+        p = 1.0  # fast, but no faster than fast
+    low, high = (limit / events for limit in poisson_interval(near))
+    share = near / events
+    entry = Signature(
+        name=NAME, answer=Answer.NOT_SEEN, p=p, size=share, low=low, high=high,
+        unit="share of the events", least=s.least,
+        sentence=f"{format_count(near)} events ({format_percent(share)}) within 20 µs of the same pixel's "
+        f"last, {format_count(rest)} from there to 400 µs",
+        details={"near": near, "later": rest},
+    )  # fmt: skip
+    unseen = f"{format_percent(share)} of the events within 20 µs of the same pixel's last"
+    if rest > 2 * near * (1 / chance - 1) / s.ratio:
+        unseen += f"; many more, {format_count(rest)}, within 400 µs"
+    return judge_signature(entry, level, unseen)

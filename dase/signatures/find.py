@@ -1,0 +1,246 @@
+"""Looking for all signatures of a recording, in two passes over its events.
+
+The first pass counts events by time; coupling with frames and flicker come from these. The second counts by
+pixel, without the times that coupling explains; hot pixels come first, and are left out of what follows.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass
+from os import PathLike
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dase import io
+from dase.errors import InputError
+from dase.events import Events
+from dase.io.rules import TooLateError
+from dase.io.sequence import Sequence
+from dase.io.source import CHUNK, Size
+from dase.recordings.recording import Recording
+from dase.signatures.calm_events import CalmFilter, CalmShare, row_major_pixels
+from dase.signatures.clock import ClockCounts
+from dase.signatures.double_events import IntervalCounts, find_double_events
+from dase.signatures.fixed_pattern import HalfCounts, find_fixed_pattern
+from dase.signatures.flicker import find_flicker
+from dase.signatures.frame_coupling import BurstClock, find_frame_coupling
+from dase.signatures.full_bus import find_full_bus
+from dase.signatures.hot_pixels import CalmCounts, find_hot_pixels
+from dase.signatures.opposite_pairs import PairCounts, find_opposite_pairs
+from dase.signatures.result import Signatures
+from dase.signatures.row_grouping import GroupCounts, find_grouping
+from dase.signatures.time_stamps import StampSettings, find_time_stamps
+
+Source = Recording | Sequence | Events | str | PathLike[str]
+Progress = Callable[[int], object]
+
+LEVEL = 1e-4
+"""Chance that a recording without any effect announces one."""
+
+COUNT = 9
+"""Signatures that are tested, for the correction."""
+
+
+@dataclass(frozen=True)
+class _Passes:
+    """Events that can be gone through again and again.
+
+    Args:
+        pieces: Gives the events anew, piece by piece.
+        begins: When exposures begin [s], shape (F,); None where unknown.
+    """
+
+    pieces: Callable[[], Iterable[Events]]
+    begins: NDArray[np.float64] | None
+
+    def parts(self, chunk: int, progress: Progress) -> Iterator[Events]:
+        """Yield parts of at most `chunk` events, none of them empty, and tell how many they were."""
+        for piece in self.pieces():
+            for i in range(0, len(piece), chunk):
+                part = piece.select(slice(i, i + chunk))
+                yield part
+                progress(len(part))
+
+
+class _FirstPass:
+    """What is counted before anything is known."""
+
+    def __init__(self, width: int, height: int):
+        self.width, self.height = width, height
+        self.clock = ClockCounts(width, height)
+        self.count = 0
+        self.pixels = np.zeros(width * height, np.int64)
+        self.begin = self.end = 0.0
+        self._first: list[Events] = []
+
+    def push(self, events: Events) -> None:
+        """Take events; raises InputError where they are not those of the sensor, or go back in time."""
+        if not self.count:
+            self.begin = self.end = float(events.t[0])
+        if not (np.all(np.isfinite(events.t)) and events.t[0] >= self.end and np.all(np.diff(events.t) >= 0)):
+            raise InputError("signatures: times of events must be finite and sorted")
+        if int(events.x.max()) >= events.width or int(events.y.max()) >= events.height:
+            raise InputError(f"signatures: events must lie on the {events.width}x{events.height} sensor")
+        room = StampSettings.most - self.count
+        if room > 0:
+            self._first.append(events.select(slice(0, room)))
+        self.count += len(events)
+        self.end = float(events.t[-1])
+        self.clock.push(events)
+        self.pixels += np.bincount(row_major_pixels(events), minlength=len(self.pixels))
+
+    def first_events(self) -> Events:
+        """Return the first events, of which time stamps are looked at."""
+        return Events.concatenate(self._first)
+
+    def flooding(self) -> NDArray[np.bool_]:
+        """Return pixels that send a hundred times the usual, shape (H * W,): their like flood any group."""
+        active = self.pixels[self.pixels > 0]
+        usual = float(active.mean()) if len(active) else 0.0
+        return self.pixels > 100 * max(usual, 1.0)
+
+
+class _SecondPass:
+    """What is counted by pixel, free of bursts that come with frames."""
+
+    def __init__(self, first: _FirstPass, bursts: BurstClock | None, tone: float):
+        width, height = first.width, first.height
+        self._bursts = bursts
+        self._filter = CalmFilter(width, height)
+        self.quiet = CalmShare(width, height, first.begin, self._filter)
+        self.calm = CalmCounts(width, height, (first.begin + first.end) / 2, tone)
+        self.pairs = PairCounts(width, height)
+        self.halves = HalfCounts(width, height, first.begin, first.end)
+        self.groups = GroupCounts(first.count, first.flooding())
+        self.intervals = IntervalCounts(width, height)
+
+    def push(self, events: Events) -> None:
+        """Take events."""
+        self.groups.push(events)  # the order in which a burst of all pixels is read tells most of all
+        if self._bursts is not None:
+            events = events.select(~self._bursts.contains(events.t))
+        self.halves.push(events)
+        self.intervals.push(events)
+        self.quiet.push(events)
+        self._take_calm(*self._filter.push(events))
+
+    def finish(self) -> None:
+        """Take the events that were held back."""
+        self._take_calm(*self._filter.flush())
+
+    def _take_calm(self, events: Events, calm: NDArray[np.bool_]) -> None:
+        chosen = events.select(calm)
+        self.calm.push(chosen)
+        self.pairs.push(chosen)
+
+
+def _open_passes(source: Source, size: Size | None, notes: list[str] | None) -> _Passes:
+    """Return the events of a source, and the begins of its exposures."""
+    if isinstance(source, Events):
+        return _Passes(lambda: (source,), None)
+    if isinstance(source, Recording):
+        begins = source.frame_begin if source.frame_begin is not None else source.frame_times
+        return _Passes(lambda: (source.events,), begins)
+    if isinstance(source, Sequence):
+        return _Passes(lambda: (source.events,), _sequence_begins(source))
+    if not isinstance(source, str | PathLike):
+        raise InputError(
+            f"signatures: must be of a recording, a sequence, events or a file, got {type(source).__name__}"
+        )
+    path = Path(source)
+    exposures = np.array([(p.t, p.exposure) for p in io.pictures(path, size=size, notes=notes)]).reshape(
+        -1, 2
+    )
+    begins = exposures[:, 0] - exposures[:, 1] / 2
+    return _Passes(lambda: io.stream(path, size=size, notes=notes), begins)
+
+
+def _sequence_begins(sequence: Sequence) -> NDArray[np.float64] | None:
+    if sequence.frame_times is None:
+        return None
+    half = 0.0 if sequence.frame_exposure is None else sequence.frame_exposure / 2
+    out: NDArray[np.float64] = sequence.frame_times - half
+    return out
+
+
+def _run_first(passes: _Passes, chunk: int, progress: Progress) -> _FirstPass:
+    first: _FirstPass | None = None
+    for part in passes.parts(chunk, progress):
+        first = first or _FirstPass(part.width, part.height)
+        first.push(part)
+    if first is None:
+        raise InputError("signatures: there are no events")
+    return first
+
+
+def find_signatures(
+    source: Source,
+    *,
+    size: Size | None = None,
+    notes: list[str] | None = None,
+    progress: Progress = lambda count: None,
+    level: float = LEVEL,
+    chunk: int = CHUNK,
+) -> Signatures:
+    """Say which effects a recording shows by itself, without a scene or a model.
+
+    All events are gone through twice, in memory that does not grow with the recording.
+
+    Args:
+        source: A recording, a sequence, events, or the path of a file, which streams through.
+        size: Columns and rows of the sensor, where a file does not say or says it wrongly.
+        notes: Gets sentences about what was skipped, repaired or guessed in a file.
+        progress: Is told how many events were looked at since it was told last, in both passes.
+        level: Chance that a recording without effects announces any; shared out over the signatures.
+        chunk: Events looked at together; the answer does not depend on it.
+
+    Returns:
+        One answer for each signature, "cannot say" where data are too few.
+
+    Raises:
+        InputError: The file cannot be read, or events are not sorted or lie outside the sensor.
+    """
+    if not 0 < level < 1:
+        raise InputError(f"signatures: level must lie between 0 and 1, got {level:g}")
+    if chunk < 1:
+        raise InputError(f"signatures: chunk must be at least 1 event, got {chunk}")
+    passes = _open_passes(source, size, notes)
+    try:
+        first = _run_first(passes, chunk, progress)
+    except TooLateError:  # times go back too far to be sorted on the way
+        assert isinstance(source, str | PathLike)
+        passes = _open_passes(io.read(source, size=size, notes=notes), size, notes)
+        first = _run_first(passes, chunk, progress)
+    width, height = first.width, first.height
+    each, duration = level / COUNT, first.end - first.begin
+    begins = passes.begins
+    if begins is not None and not (len(begins) and np.all(np.isfinite(begins))):
+        begins = None  # frames without times
+    coupling, bursts = find_frame_coupling(first.clock, each, begins)
+    if bursts is not None and begins is None:  # they were seen in the clock's time alone
+        bursts = bursts.extend(first.end)
+    # bursts alone that nearly keep time: p decides between them and a lamp no better than that
+    doubtful = coupling.details.get("interval", 0.0) if bursts is None and begins is None else 0.0
+    flicker, lamp = find_flicker(first.clock, each, bursts, doubtful if coupling.p < 0.01 else 0.0)
+    second = _SecondPass(first, bursts, lamp.frequency if lamp else 0.0)
+    for part in passes.parts(chunk, progress):
+        second.push(part)
+    second.finish()
+    hot, hot_pixels = find_hot_pixels(second.calm, second.quiet.share(first.end), duration, each)
+    stamps = find_time_stamps(first.first_events(), hot_pixels, each, lamp=lamp is not None)
+    tick = max(stamps.details.get(name, 0.0) for name in ("step", "period")) if stamps.found else 0.0
+    entries = (
+        coupling,
+        flicker,
+        hot,
+        find_opposite_pairs(second.pairs, hot_pixels, duration, each, lamp=lamp is not None),
+        find_fixed_pattern(second.halves, hot_pixels, each, lamp=lamp is not None),
+        find_grouping(second.groups, each),
+        stamps,
+        find_double_events(second.intervals, hot_pixels, each, tick),
+        find_full_bus(first.clock, each),
+    )
+    return Signatures(width, height, first.count, duration, level, entries)

@@ -1,0 +1,302 @@
+"""Light that flickers: the whole array brightens and dims with one phase.
+
+What moves in the scene has another phase in each stretch of time; a lamp keeps its own. Bursts that come with
+a camera's frames are left out before the frequency is read.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import stats
+from scipy.ndimage import uniform_filter1d
+
+from dase.formatting import format_percent, format_seconds
+from dase.signatures.chance import NINETY, mean_interval
+from dase.signatures.clock import ClockCounts
+from dase.signatures.frame_coupling import BurstClock
+from dase.signatures.result import Answer, Signature, judge_signature, without_answer
+
+NAME = "flicker"
+
+
+@dataclass(frozen=True)
+class FlickerSettings:
+    """How tones are looked for."""
+
+    least: float = 0.02  # swing, share of the rate
+    slowest: float = 20.0  # [Hz] one cycle in a block
+    fastest: float = 450.0  # [Hz]
+    block: float = 0.05  # [s] longer than a lamp's cycles, shorter than what moves keeps its phase
+    smooth: float = 0.03  # [s] over which the usual rate is taken
+    segment: float = 16.0  # [s] the mains keep their phase no longer
+    overtones: int = 3  # a lamp's light is no sine
+    fewest_blocks: int = 9
+    fewest_events: int = 2000
+    tiles: int = 4  # on each side: what moves is larger than the tiles of the clock
+    agree: float = 0.125  # turns by which a tile may differ from the others
+    spacing: float = 0.25  # of tried frequencies, relative to what the length resolves
+
+
+@dataclass(frozen=True)
+class Lamp:
+    """The tone that was found.
+
+    Args:
+        frequency: [Hz].
+    """
+
+    frequency: float
+
+
+@dataclass(frozen=True)
+class _Rates:
+    """What the events of all polarities do over time, free of bursts.
+
+    Args:
+        net: ON minus OFF events, beyond the usual balance, by step and tile, shape (K, T).
+        usual: Usual events of all tiles, shape (K,).
+        kept: Which steps are free of bursts, shape (K,).
+        events: All events of these steps, shape (K, T).
+    """
+
+    net: NDArray[np.float64]
+    usual: NDArray[np.float64]
+    kept: NDArray[np.bool_]
+    events: NDArray[np.float64]
+
+
+def _merge_tiles(counts: NDArray[np.uint32], sides: int, wanted: int) -> NDArray[np.float64]:
+    """Return counts (K, 2, T) of fewer, larger tiles."""
+    part = sides // wanted
+    square = counts.reshape(len(counts), 2, wanted, part, wanted, part)
+    out: NDArray[np.float64] = square.sum((3, 5), dtype=np.float64).reshape(len(counts), 2, wanted**2)
+    return out
+
+
+def _net_rates(clock: ClockCounts, bursts: BurstClock | None, s: FlickerSettings) -> _Rates:
+    counts = _merge_tiles(clock.counts, clock.settings.tiles, s.tiles)
+    kept = np.ones(len(counts), np.bool_) if bursts is None else ~bursts.contains(clock.times)
+    counts[~kept] = 0
+    events = counts.sum(1)
+    net = counts[:, 1] - counts[:, 0]
+    window = round(s.smooth / clock.settings.step)
+    share = np.maximum(uniform_filter1d(kept.astype(np.float64), window), 1e-9)
+    usual = uniform_filter1d(events.sum(1), window) / share
+    # what ticks in the time stamps alone moves ON and OFF events together, and leaves their balance
+    balance = uniform_filter1d(net.sum(1), window) / share / np.maximum(usual, 1e-9)
+    net = net - events * balance[:, None]
+    return _Rates(net, usual, kept, events)
+
+
+@dataclass(frozen=True)
+class _Tones:
+    """What the blocks of a segment have in common at frequencies from 0 on, `spacing` apart [Hz]."""
+
+    rayleigh: NDArray[np.float64]  # of the phases of blocks
+    power: NDArray[np.float64]  # of their sum
+    spacing: float
+
+
+def _sum_blocks(v: NDArray[np.float64], step: float, s: FlickerSettings) -> _Tones:
+    """Return what the blocks of a signal, shape (K,), have in common.
+
+    The phase of a block at its middle hardly depends on the exact frequency that it is read at, so one
+    transform per block, and one over the blocks, stand for all frequencies.
+    """
+    length = round(s.block / step)
+    blocks = len(v) // length
+    v = v[: blocks * length].reshape(blocks, length)
+    pad = 8 * length  # cells of 2.5 Hz
+    spectrum = np.fft.rfft(v * np.hanning(length), pad)
+    cell = 1 / (pad * step)
+    middle = np.exp(2j * np.pi * np.arange(spectrum.shape[1]) * cell * (length - 1) / 2 * step)
+    spectrum *= middle
+    power = np.abs(spectrum)
+    phases = np.where(power > 1e-12, spectrum / np.maximum(power, 1e-12), 0)
+    filled = max(int(np.count_nonzero(power.max(1) > 1e-12)), 1)
+    many = 1 << math.ceil(math.log2(max(blocks / s.spacing, 8)))
+    spacing = 1 / (s.block * many)
+    # over blocks 50 ms apart, frequencies repeat every 20 Hz: each cell takes those next to it
+    # and a block's middle turns with the frequency
+    frequencies = np.arange(int(0.45 / step / spacing)) * spacing
+    nearest = np.rint(frequencies / cell).astype(np.int64)
+    rayleigh, total = np.zeros(len(frequencies)), np.zeros(len(frequencies))
+    start = np.flatnonzero(np.diff(nearest, prepend=-1))
+    for i, j in zip(start, [*start[1:], len(frequencies)], strict=True):
+        place = np.arange(i, j) % many
+        rayleigh[i:j] = np.abs(np.fft.fft(phases[:, nearest[i]], many)[place]) ** 2 / filled
+        total[i:j] = np.abs(np.fft.fft(spectrum[:, nearest[i]], many)[place]) ** 2
+    return _Tones(rayleigh, total, spacing)
+
+
+def _find_tone(
+    v: NDArray[np.float64], step: float, bursts: BurstClock | None, s: FlickerSettings
+) -> tuple[float, float, int]:
+    """Return the tone [Hz] that keeps its phase best, its p, and with how many overtones.
+
+    Sums of Rayleigh statistics of independent phases are gamma distributed; as many tones are tried as there
+    are independent ones, twice for those between, and with and without overtones.
+    """
+    length = round(s.block / step)
+    segments = max(1, math.ceil(len(v) * step / s.segment))
+    size = len(v) // segments // length * length
+    parts = [_sum_blocks(v[i * size : (i + 1) * size], step, s) for i in range(segments)]
+    spacing = parts[0].spacing
+    rayleigh = np.sum([part.rayleigh for part in parts], axis=0)
+    base = np.arange(math.ceil(s.slowest / spacing), int(s.fastest / spacing) + 1)
+    lines = np.zeros(len(base), np.bool_)
+    if bursts is not None:  # what is left of bursts has lines at multiples of the frame rate
+        turns = base * spacing * bursts.interval
+        lines = np.abs(turns - np.round(turns)) / bursts.interval < 0.75 / (size * step)
+    best = base[:1], 1.0, 1
+    tests = 2 * 2 * (s.fastest - s.slowest) * size * step
+    for many in (1, s.overtones):
+        total = np.zeros(len(base))
+        tones = np.zeros(len(base), np.int64)
+        for h in range(1, many + 1):
+            inside = h * base < len(rayleigh)
+            total[inside] += rayleigh[h * base[inside]]
+            tones += inside
+        total[lines] = 0.0
+        p = stats.gamma.sf(total, segments * tones)
+        chance = min(1.0, tests * float(p.min()))
+        if chance <= best[1]:
+            best = base[total >= 0.8 * total[p.argmin()]], chance, many
+    # blocks 50 ms apart see a strong tone in step at every 20 Hz from it, and half a tone has its overtones:
+    # of all that are clear, the strongest is meant
+    candidates, chance, many = best
+    tones = np.unique(np.concatenate([h * candidates for h in range(1, many + 1)]))
+    tones = tones[(tones >= base[0]) & (tones <= base[-1])]
+    power = np.sum([part.power for part in parts], axis=0)[tones]
+    clear = rayleigh[tones] > 0.5 * rayleigh[tones].max()
+    return float(tones[np.where(clear, power, -1.0).argmax()] * spacing), chance, many
+
+
+def _refine_tone(
+    rates: _Rates, step: float, frequency: float, s: FlickerSettings
+) -> tuple[float, float, NDArray[np.float64]]:
+    """Return frequency [Hz], its standard error, and the swing of each block, from the phases of blocks."""
+    length = round(s.block / step)
+    blocks = len(rates.usual) // length
+    rows = blocks * length
+    net = rates.net[:rows].sum(1).reshape(blocks, length)
+    count = rates.events[:rows].sum(1).reshape(blocks, length).sum(1)
+    time = (np.arange(rows).reshape(blocks, length) + 0.5) * step
+    middle = time.mean(1)
+    size = max(1, round(s.segment / s.block))
+    value, error = frequency, math.inf
+    for _ in range(3):
+        z = (net * np.exp(-2j * np.pi * value * time)).sum(1)
+        slopes, weights = [], []
+        for i in range(0, blocks, size):
+            part, at = z[i : i + size], middle[i : i + size]
+            if len(part) < s.fewest_blocks:
+                continue
+            turn = np.angle(part * np.conj(part.sum())) / (2 * np.pi)
+            near = (np.abs(turn) < 0.25) & (count[i : i + size] > 0)
+            if near.sum() < 4:
+                continue
+            away = at[near] - at[near].mean()
+            slope = float((away * turn[near]).sum() / (away**2).sum())
+            rest = turn[near] - turn[near].mean() - slope * away
+            weights.append(float((away**2).sum() / max((rest**2).sum() / max(near.sum() - 2, 1), 1e-12)))
+            slopes.append(slope)
+        if not slopes:
+            break
+        value += float(np.average(slopes, weights=weights))
+        error = 1 / math.sqrt(sum(weights))
+    z = (net * np.exp(-2j * np.pi * value * time)).sum(1)
+    swing = []
+    for i in range(0, blocks, size):
+        part, n = z[i : i + size], count[i : i + size]
+        if abs(part.sum()) > 0:
+            # relative to the mean events of a block: few events count little
+            swing.append((part * np.conj(part.sum())).real / abs(part.sum()) / max(n.mean(), 1e-9))
+    return value, error, np.concatenate(swing) if swing else np.zeros(2)
+
+
+def _tiles_in_phase(
+    rates: _Rates, step: float, frequency: float, s: FlickerSettings
+) -> tuple[float, int, int]:
+    """Return the chance that tiles agree so well with the others, how many do, and how many there are.
+
+    Edges that move have a phase of their own in each tile: within an eighth of a turn of the others' by a
+    chance of 1/4.
+    """
+    time = (np.arange(len(rates.usual)) + 0.5) * step
+    size = round(s.segment / step)
+    relation = np.zeros(rates.net.shape[1], np.complex128)
+    for i in range(0, len(time), size):
+        turn = np.exp(-2j * np.pi * frequency * time[i : i + size])
+        z = turn @ rates.net[i : i + size]
+        relation += z * np.conj(z.sum() - z)
+    count = rates.events.sum(0)
+    good = count > max(200.0, 0.003 * count.sum())
+    away = np.angle(relation[good]) / (2 * np.pi)
+    agree = int(np.count_nonzero(np.abs(away) < s.agree))
+    return float(stats.binom.sf(agree - 1, len(away), 2 * s.agree)), agree, len(away)
+
+
+def find_flicker(
+    clock: ClockCounts,
+    level: float,
+    bursts: BurstClock | None = None,
+    doubtful: float = 0.0,
+    settings: FlickerSettings | None = None,
+) -> tuple[Signature, Lamp | None]:
+    """Look for a tone that the whole array follows.
+
+    Args:
+        clock: The events by time.
+        level: p below which it is there.
+        bursts: Times to leave out.
+        doubtful: Interval of bursts that may be there [s]: a tone at a multiple of their rate may be theirs.
+        settings: How tones are looked for.
+    """
+    s = settings or FlickerSettings()
+    step = clock.settings.step
+    duration = len(clock.counts) * step
+    if duration < s.fewest_blocks * s.block:
+        blocks = f"{s.fewest_blocks} blocks of {format_seconds(s.block)}"
+        reason = f"{format_seconds(duration)} of events: less than {blocks}"
+        return without_answer(NAME, reason), None
+    rates = _net_rates(clock, bursts, s)
+    events = int(rates.events.sum())
+    if events < s.fewest_events:
+        return without_answer(NAME, f"{events} events, fewer than {s.fewest_events}"), None
+    v = rates.net.sum(1) / (rates.usual + 1)
+    tone, p_tone, many = _find_tone(v, step, bursts, s)
+    p_tiles, agree, tiles = _tiles_in_phase(rates, step, tone, s)
+    if stats.binom.sf(tiles - 1, tiles, 2 * s.agree) >= level and p_tone < level:
+        reason = f"{tone:.1f} Hz, but only {tiles} of {s.tiles**2} tiles have events to agree on it"
+        return without_answer(NAME, reason, p=p_tiles), None
+    frequency, error, swings = _refine_tone(rates, step, tone, s)
+    mean, low, high = mean_interval(swings)
+    entry = Signature(
+        name=NAME, answer=Answer.NOT_SEEN, p=max(p_tone, p_tiles), size=mean, low=low, high=high,
+        unit="swing, share of the rate", least=s.least,
+        sentence=f"light at {frequency:.2f} Hz, swing {mean:.2g} of the rate, "
+        f"one phase in {agree} of {tiles} tiles",
+        details={
+            "frequency": frequency, "frequency_low": frequency - NINETY * error,
+            "frequency_high": frequency + NINETY * error, "tones": many,
+            "tiles_in_phase": agree, "tiles": tiles, "p_tone": p_tone, "p_tiles": p_tiles,
+        },
+    )  # fmt: skip
+    top = max(high, 0.0)
+    unseen = f"no tone of one phase, {s.slowest:g} to {s.fastest:g} Hz: swing at most {top:.2g}"
+    found = judge_signature(entry, level, unseen)
+    if not found.found:
+        return found, None
+    turns = frequency * doubtful
+    if doubtful and abs(turns - round(turns)) < 0.75 * doubtful / duration:
+        reason = f"{frequency:.2f} Hz, or bursts every {format_seconds(doubtful)} of which it is a multiple"
+        return replace(found, answer=Answer.CANNOT_SAY, sentence=reason), None
+    left = format_percent(1 - float(rates.kept.mean()))
+    if bursts is not None:
+        found = replace(found, sentence=f"{found.sentence}; read off with {left} of the time left out")
+    return found, Lamp(frequency)

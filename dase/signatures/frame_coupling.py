@@ -1,0 +1,314 @@
+"""Bursts of the whole array in step with the frames of the same camera.
+
+A DAVIS exposes frames with the photodiodes that make its events. In some, opening and closing the shutter
+couples into all pixels: a burst of one polarity at one time after each frame's begin, once per pixel, over
+light and dark alike. Where the times of frames are unknown, the bursts tell them.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import stats
+from scipy.ndimage import maximum_filter1d, median_filter
+
+from dase.formatting import format_percent, format_seconds
+from dase.signatures.chance import mean_interval
+from dase.signatures.clock import ClockCounts
+from dase.signatures.result import Answer, Signature, judge_signature, without_answer
+
+NAME = "frame coupling"
+
+
+@dataclass(frozen=True)
+class CouplingSettings:
+    """What counts as a burst, and as a clock."""
+
+    least: float = 2.0  # times the usual rate
+    fewest_frames: int = 7  # with less not even the same moment in each frame is significant
+    fewest_events: float = 50.0  # per frame interval and polarity
+    usual: float = 0.02  # [s] its median is the usual rate: longer than a burst, shorter than a scene
+    shortest: float = 0.014  # [s] what repeats sooner is a lamp: it has 100 or 120 cycles per second
+    margin: float = 0.003  # [s] left out on both sides of a burst
+    tiles: float = 0.4  # share of the active tiles that take part in a burst of the whole array
+    lamp: float = 0.5  # peaks this high relative to the highest, evenly over the frame, belong to a lamp
+
+
+@dataclass(frozen=True)
+class BurstClock:
+    """When bursts come.
+
+    Args:
+        begins: Begins of the frames [s], shape (F,); where they are unknown, times of the bursts of a phase.
+        interval: Time from one to the next [s].
+        bursts: Spans after each begin in which events are left out [s], shape (B, 2).
+    """
+
+    begins: NDArray[np.float64]
+    interval: float
+    bursts: NDArray[np.float64]
+
+    def extend(self, end: float) -> BurstClock:
+        """Return the clock with as many more frames as begin before `end` [s], at even distances."""
+        more = np.arange(1, max(int((end - self.begins[-1]) / self.interval), 0) + 1)
+        return replace(self, begins=np.concatenate((self.begins, self.begins[-1] + more * self.interval)))
+
+    def contains(self, t: NDArray[np.float64]) -> NDArray[np.bool_]:
+        """Return which times [s], shape (N,), lie in a burst."""
+        out = np.zeros(len(t), np.bool_)
+        if not len(self.begins) or not len(t):
+            return out
+        spans = (self.begins[:, None, None] + self.bursts).reshape(-1, 2)
+        spans = spans[np.argsort(spans[:, 0])]
+        # every time lies in a span that began before it, the last of those that reach farthest
+        at = np.searchsorted(spans[:, 0], t, side="right") - 1
+        reach = np.maximum.accumulate(spans[:, 1])
+        return (at >= 0) & (t < reach[at])
+
+
+@dataclass(frozen=True)
+class _Folded:
+    """The rate over the interval between frames, for one polarity."""
+
+    score: NDArray[np.float64]  # (F, M) log of rate / usual rate
+    p: float
+    at: int
+    excess: NDArray[np.float64]  # (M,) events above the usual, all frames together
+
+    @property
+    def mean(self) -> NDArray[np.float64]:
+        out: NDArray[np.float64] = self.score.mean(0)
+        return out
+
+
+def _usual_rate(counts: NDArray[np.float64], step: float, settings: CouplingSettings) -> NDArray[np.float64]:
+    out: NDArray[np.float64] = median_filter(counts, 2 * round(settings.usual / step / 2) + 1, mode="nearest")
+    return out
+
+
+def _fold(
+    counts: NDArray[np.float64], first: NDArray[np.int64], length: int, step: float, s: CouplingSettings
+) -> _Folded | None:
+    """Fold the counts of a polarity on the frames that begin at steps `first`, and test their common phase.
+
+    In each frame the phases are ranked by their rate. If the frames had nothing to do with it, their clocks
+    could be turned by any amount, so ranks of one phase are independent and uniform over the frames: minus
+    the sum of their logarithms is gamma distributed (Fisher's combination), for each of the phases.
+    """
+    # bursts come some tenths of a millisecond early or late
+    smooth = maximum_filter1d(np.convolve(counts, np.ones(3) / 3, "same"), 3)
+    usual = _usual_rate(counts, step, s)
+    places = first[:, None] + np.arange(length)
+    kept = counts[places].sum(1) >= s.fewest_events
+    if kept.sum() < s.fewest_frames:
+        return None
+    places = places[kept]
+    score = np.log((smooth[places] + 1) / (usual[places] + 1))
+    order = np.sort(score, axis=1)
+    above = np.stack([length - np.searchsorted(o, v) for o, v in zip(order, score, strict=True)])
+    p = stats.gamma.sf(-np.log(above / length).sum(0), len(score))
+    at = int(p.argmin() if p.min() > 0 else score.mean(0).argmax())
+    excess = (counts - usual)[places].sum(0)
+    return _Folded(score, min(1.0, length * float(p.min())), at, excess)
+
+
+def _is_lamp(mean: NDArray[np.float64], at: int, step: float, s: CouplingSettings) -> bool:
+    """Whether the rate over a frame has the same peak at even distances: light whose cycles fit into it."""
+    length = len(mean)
+    wide = maximum_filter1d(mean, 5, mode="wrap")
+    for cycles in range(2, int(length * step / 0.0025) + 1):
+        mates = (at + np.round(np.arange(1, cycles) * length / cycles).astype(int)) % length
+        if wide[mates].min() > s.lamp * mean[at]:
+            return True
+    return False
+
+
+def _find_bursts(counts: NDArray[np.uint32], step: float, s: CouplingSettings) -> list[NDArray[np.int64]]:
+    """Return the steps of bursts of the whole array, OFF and ON: many tiles, and many times the usual."""
+    out = []
+    for polarity in range(2):
+        per_tile = counts[:, polarity].astype(np.float64)
+        total = per_tile.sum(1)
+        usual = _usual_rate(total, step, s)
+        share = per_tile.mean(0) / max(per_tile.mean(), 1e-12) / per_tile.shape[1]
+        rows = np.flatnonzero((total > 4 * usual + 20) & (total - usual > 10 * np.sqrt(usual + 1)))
+        peaks = []
+        for group in np.split(rows, np.flatnonzero(np.diff(rows) > 4) + 1):
+            if not len(group):
+                continue
+            wanted = 2 * usual[group].sum() * share + 2
+            wide = (per_tile[group].sum(0) > wanted)[share > 0.1 / len(share)]
+            if wide.mean() > s.tiles:
+                peaks.append(group[total[group].argmax()])
+        out.append(np.array(peaks, np.int64))
+    return out
+
+
+def _find_period(times: NDArray[np.float64]) -> tuple[float, float]:
+    """Return the period of bursts [s] and the chance of one as good.
+
+    Phases of n bursts at a period that was not looked for have a Rayleigh statistic above R with a chance of
+    exp(-R). Periods are looked for: not more of them than there are pairs of bursts.
+    """
+    count = len(times)
+    median = float(np.median(np.diff(times)))
+    # fine enough that the first and the last keep step
+    reach = 0.03 * median
+    tried = np.arange(-reach, reach, 0.1 * median**2 / (times[-1] - times[0] + median)) + median
+    phases = np.exp(2j * np.pi * (times - times[0])[None] / tried[:, None])
+    rayleigh = np.abs(phases.sum(1)) ** 2 / count
+    best = int(rayleigh.argmax())
+    period = float(tried[best])
+    # bursts that keep step, counted from the middle one, tell the period better than the grid does
+    turns = (times - times[count // 2]) / period
+    turns -= np.angle(np.exp(2j * np.pi * turns).sum()) / (2 * np.pi)
+    cycle = np.round(turns)
+    steady = np.abs(turns - cycle) < 0.15
+    if steady.sum() > 2 and np.ptp(cycle[steady]) > 0:
+        period = float(np.polyfit(cycle[steady], times[steady], 1)[0])
+    return period, min(1.0, count**2 * math.exp(-float(rayleigh[best])))
+
+
+def find_frame_coupling(
+    clock: ClockCounts,
+    level: float,
+    begins: NDArray[np.float64] | None = None,
+    settings: CouplingSettings | None = None,
+) -> tuple[Signature, BurstClock | None]:
+    """Look for bursts in step with frames.
+
+    Args:
+        clock: The events by time.
+        level: p below which they are there.
+        begins: When exposures begin [s], shape (F,); None where unknown.
+        settings: What counts as a burst.
+
+    Returns:
+        The signature, and when the bursts are, where there are any.
+    """
+    s = settings or CouplingSettings()
+    step = clock.settings.step
+    counts = clock.counts
+    p = None
+    if begins is not None and len(begins) >= 2:
+        interval = float(np.median(np.diff(begins)))
+        begins = np.asarray(begins, np.float64)
+        told = "frames"
+    else:
+        found = _search_bursts(clock, s)
+        if found is None:
+            if len(counts) * step < 0.3:
+                reason = f"{format_seconds(len(counts) * step)} without known frame times, too short"
+                return without_answer(NAME, reason), None
+            unseen = "no frame times known, no regular bursts of the whole array"
+            return Signature(name=NAME, answer=Answer.NOT_SEEN, p=1.0, least=s.least, sentence=unseen), None
+        begins, interval, p = found
+        told = "bursts"
+    if interval < s.shortest:
+        reason = f"{told} come every {format_seconds(interval)}, as often as lamps flicker"
+        return without_answer(NAME, reason), None
+    length = round(interval / step)
+    first = np.round((begins - clock.begin) / step).astype(np.int64)
+    whole = (first >= 0) & (first + length <= len(counts))
+    folded = [_fold(counts[:, k].sum(1, dtype=np.float64), first[whole], length, step, s) for k in range(2)]
+    known = [(k, f) for k, f in enumerate(folded) if f is not None]
+    if not known:
+        frames = int(whole.sum())
+        reason = f"{frames} whole frames with {s.fewest_events:g} events of a polarity, too few"
+        return without_answer(NAME, reason), None
+    return _judge_folds(known, begins, interval, step, p, int(counts.sum()), level, s, told)
+
+
+def _search_bursts(
+    clock: ClockCounts, s: CouplingSettings
+) -> tuple[NDArray[np.float64], float, float] | None:
+    """Return times in step with bursts of the whole array [s], their interval [s], and its p."""
+    best = None
+    for peaks in _find_bursts(clock.counts, clock.settings.step, s):
+        if len(peaks) < s.fewest_frames:
+            continue
+        times = clock.times[peaks]
+        period, p = _find_period(times)
+        if best is None or p < best[2]:
+            turn = float(np.angle(np.exp(2j * np.pi * times / period).sum()) / (2 * np.pi))
+            last = clock.times[-1]
+            # a quarter after the begin: the burst is not cut in two
+            begins = np.arange(math.ceil(clock.begin / period - turn), last / period - turn) + turn - 0.25
+            best = begins * period, period, min(1.0, 2 * p)
+    return best
+
+
+def _judge_folds(
+    known: list[tuple[int, _Folded]],
+    begins: NDArray[np.float64],
+    interval: float,
+    step: float,
+    p: float | None,
+    events: int,
+    level: float,
+    s: CouplingSettings,
+    told: str,
+) -> tuple[Signature, BurstClock | None]:
+    """Return the answer of the polarity that shows it best, and all bursts of both."""
+    _, best = min(known, key=lambda pair: (pair[1].p, -pair[1].mean.max()))
+    p = min(1.0, 2 * best.p) if p is None else p
+    mean, low, high = mean_interval(best.score[:, best.at])
+    entry = Signature(
+        name=NAME, answer=Answer.NOT_SEEN, p=p, size=math.exp(mean), low=math.exp(low), high=math.exp(high),
+        unit="times the usual rate", least=s.least,
+    )  # fmt: skip
+    size = f"at most {entry.size:.2f} times the usual rate in step with the {told}"
+    entry = judge_signature(entry, level, size)
+    if not entry.found:
+        if entry.size >= s.least:
+            reason = f"the rate rises {entry.size:.3g} times, in step with the {told} by chance (p {p:.1g})"
+            return without_answer(NAME, reason, p=p, details={"interval": interval, "clock": told}), None
+        return entry, None
+    if _is_lamp(best.mean, best.at, step, s):
+        reason = (
+            f"the rate peaks evenly over the {format_seconds(interval)} between frames: light that flickers"
+        )
+        return without_answer(NAME, reason, p=p), None
+    return _describe_bursts(entry, known, begins, interval, step, events, told, s)
+
+
+def _describe_bursts(
+    entry: Signature,
+    known: list[tuple[int, _Folded]],
+    begins: NDArray[np.float64],
+    interval: float,
+    step: float,
+    events: int,
+    told: str,
+    s: CouplingSettings,
+) -> tuple[Signature, BurstClock]:
+    """Return the signature with what is known of the bursts, and when they are."""
+    length = len(known[0][1].mean)
+    bursty = np.zeros(length, np.bool_)
+    peaks: dict[str, float] = {}
+    extra = 0.0
+    for polarity, fold in known:
+        error = fold.score.std(0, ddof=1) / math.sqrt(len(fold.score))
+        high = fold.mean > np.maximum(math.log(entry.least), 4 * error)
+        extra += float(fold.excess[high].clip(0).sum())
+        bursty |= high
+        if high.any():
+            at = int(fold.mean.argmax())
+            peaks["ON" if polarity else "OFF"] = (at + 0.5) * step
+    margin = round(s.margin / step)
+    wide = maximum_filter1d(bursty, 2 * margin + 1, mode="wrap")
+    edges = np.flatnonzero(np.diff(np.concatenate(([False], wide, [False])).astype(np.int8)))
+    spans = edges.reshape(-1, 2).astype(np.float64) * step
+    share = extra / max(events, 1)
+    exposure = (peaks["OFF"] - peaks["ON"]) % interval if len(peaks) == 2 else math.nan
+    where = ", ".join(f"{name} at {1e3 * at:.1f} ms" for name, at in peaks.items())
+    said = f"bursts of the whole array every {1e3 * interval:.2f} ms ({where}), "
+    said += f"{entry.size:.3g} times the rate, {format_percent(share)} of the events"
+    details = {
+        "interval": interval, "phases": peaks, "share": share, "exposure": exposure, "clock": told,
+        "bursts": spans.tolist(),
+    }  # fmt: skip
+    return replace(entry, sentence=said, details=details), BurstClock(begins, interval, spans)

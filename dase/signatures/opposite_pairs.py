@@ -1,0 +1,145 @@
+"""Opposite pairs at rest: a pixel with nothing around it sends an event, and soon one of the other polarity.
+
+Light that passes through a lens cannot rise and fall again at one pixel within some milliseconds and leave
+its 24 neighbours alone; noise can. Shot noise makes ON and OFF events that know nothing of each other: pairs
+come by chance. Noise on the pixel's voltage crosses a threshold and returns: there are more.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import stats
+
+from dase.events import Events
+from dase.formatting import format_count, format_seconds
+from dase.signatures.calm_events import row_major_pixels
+from dase.signatures.chance import poisson_interval
+from dase.signatures.result import Answer, Signature, judge_signature, without_answer
+
+NAME = "opposite pairs"
+
+
+@dataclass(frozen=True)
+class PairSettings:
+    """What makes a pair."""
+
+    least: float = (
+        0.5  # times the pairs of independent ON and OFF events: noise has as many, a scene hardly any
+    )
+    scene: float = 0.1  # times those pairs, a bound for what a scene leaves where it is calm
+    returning: float = 2.0  # times those pairs, from which on noise returns
+    shortest: float = 0.3  # [s] in less, hardly any two events of a pixel are far from each other
+    near: float = 0.02  # [s] a pair
+    later: tuple[float, float] = (0.1, 0.4)  # [s] no pair any more, but still the same scene
+    busiest: float = 4.0  # [Hz] of a pixel at rest; of one that sends more, few intervals are long
+
+
+class PairCounts:
+    """Counts successive calm events of each pixel by their distance.
+
+    Args:
+        width: Columns of the sensor.
+        height: Rows of the sensor.
+        settings: What makes a pair.
+    """
+
+    def __init__(self, width: int, height: int, settings: PairSettings | None = None):
+        self.settings = settings or PairSettings()
+        pixels = width * height
+        self._time = np.full(pixels, -np.inf)
+        self._polarity = np.zeros(pixels, np.bool_)
+        self.events = np.zeros((2, pixels), np.int64)
+        """Calm events, OFF and ON."""
+        self.opposite = np.zeros((2, pixels), np.int64)
+        """Opposite pairs, near and later."""
+
+    def push(self, calm: Events) -> None:
+        """Take calm events."""
+        if not len(calm):
+            return
+        pixel = row_major_pixels(calm)
+        order = np.argsort(pixel, kind="stable")
+        pixel, t, p = pixel[order], calm.t[order], calm.p[order]
+        first = np.concatenate(([True], pixel[1:] != pixel[:-1]))
+        before = np.where(first, self._time[pixel], np.roll(t, 1))
+        flips = p != np.where(first, self._polarity[pixel], np.roll(p, 1))
+        gap = t - before
+        near = gap < self.settings.near
+        begin, end = self.settings.later
+        size = len(self._time)
+        for row, chosen in ((0, near), (1, (gap >= begin) & (gap < end))):
+            self.opposite[row] += np.bincount(pixel[chosen & flips], minlength=size)
+        for row in range(2):
+            self.events[row] += np.bincount(pixel[p == bool(row)], minlength=size)
+        last = np.append(first[1:], True)
+        self._time[pixel[last]], self._polarity[pixel[last]] = t[last], p[last]
+
+
+def find_opposite_pairs(
+    pairs: PairCounts, hot: NDArray[np.bool_], duration: float, level: float, *, lamp: bool = False
+) -> Signature:
+    """Look for opposite pairs at rest.
+
+    The null has a tenth of the pairs that independent ON and OFF trains of each pixel would have, and half a
+    pair: Poisson distributed. Then the same with all of these pairs, or as many as those farther apart tell,
+    says whether noise returns.
+
+    Args:
+        pairs: Counted pairs.
+        hot: Pixels to leave out, shape (H * W,).
+        duration: Of the recording [s].
+        level: p below which they are there.
+        lamp: Whether the light flickers, which makes opposite pairs.
+    """
+    s = pairs.settings
+    rest = ~hot & (pairs.events.sum(0) <= max(s.busiest * duration, 10.0))
+    off, on = pairs.events[:, rest]
+    near = int(pairs.opposite[0, rest].sum())
+    events = int((off + on).sum())
+    trains = float((off * on).sum() * 2 * s.near / max(duration, s.near))
+    # a train of rate r has exp(r t) times as many intervals below t as above
+    begin, end = s.later
+    favour = np.exp((off + on) / max(duration, end) * (begin + end) / 2)
+    local = float((pairs.opposite[1, rest] * favour).sum()) * s.near / (end - begin)
+    expected = max(trains, local)
+    bound = s.scene * trains + 0.5
+    p, p_more = (float(stats.poisson.sf(near - 1, mean)) for mean in (bound, expected))
+    low, high = (limit / max(trains, 0.5) for limit in poisson_interval(near))
+    size = near / max(trains, 0.5)
+    rates = [float(row.sum()) / max(duration, 1e-9) / max(len(row), 1) for row in (off, on)]
+    known: dict[str, Any] = {
+        "p": p, "size": size, "low": low, "high": high,
+        "unit": "times the pairs of independent events", "least": s.least,
+        "details": {
+            "pairs": near, "independent": trains, "later": local, "p_returning": p_more,
+            "calm_events": events, "off_rate": rates[0], "on_rate": rates[1],
+        },
+    }  # fmt: skip
+    if duration < s.shortest:
+        return without_answer(
+            NAME, f"{format_seconds(duration)} of events: a pixel has no time to rest", **known
+        )
+    if lamp:
+        return without_answer(NAME, f"{near} pairs, but light that flickers makes them, too", **known)
+    # what independent trains would have must be seen
+    if stats.poisson.sf(math.ceil(trains) - 1, bound) >= level and p >= level:
+        told = f"{near} pairs, independent ones would have {trains:.2g}, too few"
+        reason = f"{format_count(events)} calm events: {told}"
+        return without_answer(NAME, reason, **known)
+    returns = p_more < level and near >= s.returning * expected
+    kind = (
+        "noise of the pixels at rest that returns"
+        if returns
+        else "noise of the pixels at rest, as shot noise"
+    )
+    said = f"{kind}: {near} opposite pairs within 20 ms, independent events have {trains:.3g}"
+    known["details"] |= {"returns": returns}
+    unseen = f"{near} opposite pairs at rest, independent events would have {trains:.3g}"
+    return judge_signature(
+        Signature(name=NAME, answer=Answer.NOT_SEEN, sentence=said, **known), level, unseen
+    )

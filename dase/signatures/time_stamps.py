@@ -1,0 +1,127 @@
+"""Regular time stamps: a clock that ticks slowly, or a readout that goes from row to row."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import stats
+
+from dase.events import Events
+from dase.formatting import format_count, format_percent, format_seconds
+from dase.probes import timestamp_patterns
+from dase.recordings.interval_statistics import IntervalStatistics
+from dase.signatures.calm_events import row_major_pixels
+from dase.signatures.result import Answer, Signature, judge_signature, without_answer
+
+NAME = "time stamps"
+
+
+@dataclass(frozen=True)
+class StampSettings:
+    """How regularities are looked for."""
+
+    least: float = 0.5  # share of the events that follow it
+    most: int = 1 << 20  # events that are looked at, the first ones
+    fewest: int = 2000
+    tried: int = 1 << 16  # periods of intervals that are looked at
+
+
+def _tolerance(pattern: timestamp_patterns.TimestampStructure, events: Events) -> float:
+    """Return the share of stamps that follow a pattern by chance."""
+    p = timestamp_patterns
+    if pattern.line:
+        scan = pattern.line * p.readout_lines(events, pattern.direction)[0]
+        file_step = min(1.1 * p.PATTERNS.file_step, 0.2 * scan)
+        return min(1.0, 2 * max(file_step, p.PATTERNS.pause * scan) / scan)
+    return min(1.0, 2 * min(1.1 * p.PATTERNS.file_step, 0.2 * pattern.step) / pattern.step)
+
+
+def _find_pattern(events: Events) -> Signature | None:
+    """Return the pattern of the first half of the stamps, as the second half follows it."""
+    half = len(events) // 2
+    first, second = events.select(slice(0, half)), events.select(slice(half, None))
+    pattern = timestamp_patterns.find_structure(first)
+    if not pattern.step and not pattern.line:
+        return None
+    share = float(pattern.shares(second).max())
+    count = round(share * len(second))
+    p = float(stats.binom.sf(count - 1, len(second), _tolerance(pattern, second)))
+    low, high = stats.beta.interval(0.9, count + 0.5, len(second) - count + 0.5)
+    if pattern.line:
+        lines = timestamp_patterns.readout_lines(second, pattern.direction)[0]
+        what = "rows" if lines == events.height and pattern.direction in ("down", "up") else "columns"
+        period = pattern.line * lines
+        said = f"a readout scans the {what} in {format_seconds(period)} ({pattern.direction})"
+        details = {"line": pattern.line, "period": period, "direction": pattern.direction}
+    else:
+        said = f"stamps are multiples of {format_seconds(pattern.step)}"
+        details = {"step": pattern.step}
+    return Signature(
+        name=NAME, answer=Answer.NOT_SEEN, p=p, size=share, low=float(low), high=float(high),
+        unit="share of the events",
+        sentence=f"{said}: {format_percent(share)} of the events", details=details,
+    )  # fmt: skip
+
+
+def _find_period(events: Events, s: StampSettings) -> Signature | None:
+    """Return the period of which intervals of pixels are multiples.
+
+    Phases of n intervals have a Rayleigh statistic above R with a chance of exp(-R), for each period. Pixels
+    that see the same send at the same intervals: as many count as there are different multiples.
+    """
+    intervals = IntervalStatistics()
+    pixel = row_major_pixels(events)
+    order = np.argsort(pixel, kind="stable")
+    pixel, t = pixel[order], events.t[order]
+    between = np.diff(t)[pixel[1:] == pixel[:-1]]
+    # of a pixel that sends twice, the second says nothing of the scan
+    between = between[(between > timestamp_patterns.PATTERNS.shortest) & (between < 0.065)]
+    intervals.add(between)
+    period, share = intervals.period()
+    if not period > 0:
+        return None
+    multiples = np.bincount(np.rint(between / period).astype(np.int64))
+    different = float(multiples.sum()) ** 2 / float((multiples.astype(np.float64) ** 2).sum())
+    p = min(1.0, s.tried * math.exp(-min(different * share**2, 700.0)))
+    error = 1.645 / math.sqrt(2 * different)
+    return Signature(
+        name=NAME, answer=Answer.NOT_SEEN, p=p, size=share, low=share - error, high=min(share + error, 1.0),
+        unit="share of short intervals", details={"period": period},
+        sentence=f"short intervals of a pixel are multiples of {format_seconds(period)}: "
+        f"{format_percent(share)}",
+    )  # fmt: skip
+
+
+def find_time_stamps(
+    events: Events,
+    hot: NDArray[np.bool_],
+    level: float,
+    *,
+    lamp: bool = False,
+    settings: StampSettings | None = None,
+) -> Signature:
+    """Look for regularities of the time stamps.
+
+    A pattern is read off the first half of the events; the others follow it by chance as often as its
+    tolerance is wide.
+
+    Args:
+        events: The first of the recording, as many as `StampSettings.most`.
+        hot: Pixels to leave out, shape (H * W,).
+        level: p below which there are any.
+        lamp: Whether the light flickers: then pixels that see the same repeat the same intervals.
+        settings: How regularities are looked for.
+    """
+    s = settings or StampSettings()
+    kept = events.select(~hot[row_major_pixels(events)])
+    if len(kept) < s.fewest:
+        return without_answer(NAME, f"{format_count(len(kept))} events, fewer than {format_count(s.fewest)}")
+    entry = _find_pattern(kept) or (None if lamp else _find_period(kept, s))
+    if entry is None:
+        return Signature(
+            name=NAME, answer=Answer.NOT_SEEN, p=1.0, least=s.least, sentence="no regularity above 3 µs"
+        )
+    return judge_signature(replace(entry, least=s.least), level, "no regularity above 3 µs")

@@ -1,0 +1,74 @@
+"""What an event has near it: others of the same few pixels, and the one before of its own pixel.
+
+Events are looked at one after the other, as they come, by one thread: each needs what the one before left.
+"""
+
+import warp as wp
+
+wp.set_module_options({"enable_backward": False})
+
+
+@wp.func
+def has_neighbour(
+    time: wp.float64,
+    place: int,
+    last: wp.array[wp.float64],  # (H * W,) [s]
+    gap: wp.float64,
+    reach: int,
+    width: int,
+    height: int,
+):
+    """Whether another pixel up to `reach` columns and rows away was last seen at most `gap` before."""
+    y = place // width
+    x = place - y * width
+    found = int(0)
+    for row in range(wp.max(y - reach, 0), wp.min(y + reach + 1, height)):
+        for column in range(wp.max(x - reach, 0), wp.min(x + reach + 1, width)):
+            other = row * width + column
+            if other != place and time - last[other] <= gap:
+                found = 1
+        if found == 1:
+            break
+    return found
+
+
+@wp.kernel
+def mark_crowded(
+    # in
+    time: wp.array[wp.float64],  # (N,) [s], not decreasing
+    pixel: wp.array[int],  # (N,) row-major
+    gap: wp.float64,  # [s]
+    reach: int,  # [px]
+    width: int,
+    height: int,
+    # in and out
+    last: wp.array[wp.float64],  # (H * W,) [s], when each pixel was last seen
+    crowded_out: wp.array[wp.uint8],  # (N,) 1 where an event before is near
+):
+    """Mark events that follow one of a pixel nearby. Called with dim=1."""
+    for i in range(time.shape[0]):
+        if has_neighbour(time[i], pixel[i], last, gap, reach, width, height) == 1:
+            crowded_out[i] = wp.uint8(1)
+        last[pixel[i]] = time[i]
+
+
+@wp.kernel
+def count_short_intervals(
+    # in
+    time: wp.array[wp.float64],  # (N,) [s], not decreasing
+    pixel: wp.array[int],  # (N,) row-major
+    near: wp.float64,  # [s]
+    far: wp.float64,  # [s]
+    # in and out
+    last: wp.array[wp.float64],  # (H * W,) [s], when each pixel was last seen
+    count_out: wp.array2d[int],  # (2, H * W) intervals below `near`, and from it to below `far`
+):
+    """Count how often a pixel is soon seen again. Called with dim=1."""
+    for i in range(time.shape[0]):
+        place = pixel[i]
+        interval = time[i] - last[place]
+        if interval < near:
+            count_out[0, place] += 1
+        elif interval < far:
+            count_out[1, place] += 1
+        last[place] = time[i]

@@ -1,0 +1,22 @@
+"""The command line as a user meets it: a process of its own, and what it says when something is wrong."""
+
+from __future__ import annotations
+
+import re
+import subprocess
+import sys
+
+SMALL = ("--size", "32x24", "--duration", "0.1", "--sequences", "1", "--jobs", "1", "--regime", "slow")
+
+
+def dase(*arguments: object, **options) -> subprocess.CompletedProcess[str]:
+    command = [sys.executable, "-c", "from dase.cli import main; main()", *map(str, arguments)]
+    return subprocess.run(command, capture_output=True, text=True, timeout=300, **options)
+
+
+def one_sentence(done: subprocess.CompletedProcess[str], code: int = 2) -> str:
+    assert done.returncode == code, done.stderr
+    assert "Traceback" not in done.stderr
+    said = [line for line in done.stderr.splitlines() if not re.match(r"Usage:|Try |$", line)]
+    assert len(said) == 1, done.stderr
+    return said[0]

@@ -1,0 +1,275 @@
+"""Every signature is found in a made recording that has its effect, and not in one that has not."""
+
+from __future__ import annotations
+
+import json
+import tracemalloc
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+
+import dase
+from dase.cli import dase_group
+from dase.effects import EFFECTS
+from dase.effects.readout import Readout
+from dase.errors import InputError
+from dase.events import Events
+from dase.io.sequence import Sequence
+from dase.signatures.frame_coupling import BurstClock
+from perf.experiments.signatures import run as experiment
+
+NAMES = (
+    "frame coupling", "flicker", "hot pixels", "opposite pairs", "fixed pattern", "grouping", "time stamps",
+    "double events", "full bus",
+)  # fmt: skip
+
+
+def made(seed=3, kind="shake", **effects):
+    """Events of a sensor with some effects."""
+    sensor = dase.Sensor().with_effect(EFFECTS["threshold"](on=0.2, off=0.22))
+    for name, values in effects.items():
+        sensor = sensor.with_effect(EFFECTS[name](**values))
+    scene = experiment.draw_scene(np.random.default_rng(seed), kind, 1.0)
+    return dase.simulate(scene, sensor, seed=seed)
+
+
+@pytest.fixture(scope="module")
+def plain():
+    return made()
+
+
+def found(source):
+    return {entry.name for entry in dase.find_signatures(source).found}
+
+
+def bursts(plain):
+    return experiment.add_bursts(np.random.default_rng(1), plain, 0.003)
+
+
+def with_frames(events):
+    times = np.arange(0.003, 0.95, experiment.GAP)
+    frames = np.zeros((len(times), events.height, events.width), np.uint8)
+    return Sequence(events, frames, times + 0.005, frame_exposure=np.full(len(times), 0.01))
+
+
+def test_a_plain_sensor_shows_nothing(plain):
+    looked = dase.find_signatures(with_frames(plain))
+    assert not looked.found
+    assert tuple(entry.name for entry in looked.entries) == NAMES
+    assert found(plain) == set()
+
+
+CASES = {
+    "flicker": {"flicker": {"frequency": 100.14, "depth": 0.2, "phase": 0.3}},
+    "hot pixels": {"hot": {"share": 0.003, "rate": 100.0}},
+    "fixed pattern": {"mismatch": {"spread": 0.2}},
+    "time stamps": {"timestamp": {"step": 1e-3}},
+}
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_an_effect_of_the_sensor_shows(name):
+    assert name in found(made(**CASES[name]))
+
+
+def test_frequency_and_swing_of_a_lamp():
+    entry = dase.find_signatures(made(**CASES["flicker"]))["flicker"]
+    assert entry.details["frequency"] == pytest.approx(100.14, abs=0.15)
+    assert entry.low <= entry.size <= entry.high
+    assert entry.sentence.startswith("light at 100.")
+
+
+def test_noise_at_rest_shows_and_says_of_which_kind():
+    still = made(kind="objects", shot={"rate": 3.0})
+    entry = dase.find_signatures(still)["opposite pairs"]
+    assert entry.found
+    again = dase.find_signatures(made(kind="objects", voltage_noise={"sigma": 0.065, "cutoff": 80.0}))
+    assert again["opposite pairs"].found
+    assert again["opposite pairs"].details["returns"]
+
+
+@pytest.mark.parametrize("framed", [False, True])
+def test_bursts_with_the_frames_show_and_tell_their_times(plain, framed):
+    events = bursts(plain)
+    entry = dase.find_signatures(with_frames(events) if framed else events)["frame coupling"]
+    assert entry.found
+    assert entry.details["interval"] == pytest.approx(experiment.GAP, rel=2e-3)
+    assert set(entry.details["phases"]) == {"ON", "OFF"}
+
+
+def test_bursts_go_on_after_the_clock_ends():
+    clock = BurstClock(np.array([0.0, 1.0, 2.0]), 1.0, np.array([[0.2, 0.3]])).extend(7.5)
+    assert clock.contains(np.array([0.25, 0.31, 6.25, 7.1, 7.25])).tolist() == [
+        True,
+        False,
+        True,
+        False,
+        True,
+    ]
+
+
+def test_a_lamp_is_found_beside_bursts_of_frames():
+    events = bursts(made(**CASES["flicker"] | {}))
+    looked = dase.find_signatures(events)
+    assert looked["flicker"].details["frequency"] == pytest.approx(100.14, abs=0.3)
+
+
+def test_what_is_put_into_the_events_shows(plain):
+    rng = np.random.default_rng(2)
+    assert found(experiment.read_rows(rng, plain)) == {"grouping"}
+    assert found(experiment.double_events(rng, plain)) == {"double events"}
+
+
+def test_a_full_bus_shows():
+    events = made(kind="turn")
+    rate = np.quantile(np.bincount((events.t / 1e-3).astype(int)), 0.5) * 1e3
+    sent, _ = Readout(rate=rate).reader(events.width, events.height, 0).push(events, np.inf)
+    entry = dase.find_signatures(sent)["full bus"]
+    assert entry.found
+    assert entry.details["rate"] == pytest.approx(rate, rel=0.05)
+    assert not dase.find_signatures(events)["full bus"].found
+
+
+def test_order_within_a_stamp_is_no_readout(plain):
+    coarse = replace(plain, t=np.floor(plain.t / 5e-4) * 5e-4)
+    order = np.lexsort((coarse.x, coarse.y, coarse.t))
+    assert not dase.find_signatures(coarse.select(order))["grouping"].found
+
+
+def test_pieces_and_files_give_what_the_whole_gives(plain, tmp_path):
+    events = bursts(made(**CASES["hot pixels"]))
+    events = replace(events, t=np.rint(events.t * 1e6) / 1e6)
+    whole = dase.find_signatures(events)
+    assert dase.find_signatures(events, chunk=1777) == whole
+    path = tmp_path / "a.npz"
+    with dase.io.create(path) as writer:
+        writer.events(events)
+    told = []
+    assert dase.find_signatures(path, progress=told.append, size=(events.width, events.height)) == whole
+    assert sum(told) == 2 * len(events)
+    assert dase.find_signatures(dase.Recording.of(Sequence(events))) == whole
+
+
+def test_memory_does_not_grow_with_the_recording(rng):
+    def peak(seconds):
+        count = int(5e5 * seconds)
+        t = np.sort(rng.random(count)) * 70 * seconds
+        x, y = (rng.integers(0, n, count, np.uint16) for n in (64, 48))
+        events = Events(t, x, y, rng.random(count) < 0.5, 64, 48)
+        tracemalloc.start()
+        dase.find_signatures(events, chunk=1 << 16)
+        most = tracemalloc.get_traced_memory()[1]
+        tracemalloc.stop()
+        return most
+
+    assert peak(4) < 1.25 * peak(2)
+
+
+def test_the_answer_is_short_frozen_and_json(plain):
+    looked = dase.find_signatures(plain)
+    assert len(repr(looked).splitlines()) <= 20
+    content = json.loads(json.dumps(looked.to_json(), allow_nan=False))
+    assert [entry["name"] for entry in content["entries"]] == list(NAMES)
+    assert {entry["answer"] for entry in content["entries"]} <= {"found", "not seen", "cannot say"}
+    with pytest.raises(AttributeError):
+        looked.events = 3
+    with pytest.raises(KeyError, match="known are frame coupling"):
+        looked["nonsense"]
+
+
+def test_few_events_are_no_answer(plain):
+    looked = dase.find_signatures(plain.select(slice(0, 300)))
+    silent = {entry.name for entry in looked.entries if entry.answer == "cannot say"}
+    assert {
+        "frame coupling",
+        "flicker",
+        "fixed pattern",
+        "grouping",
+        "time stamps",
+        "double events",
+    } <= silent
+    assert all(entry.sentence for entry in looked.entries)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"t": np.array([1.0, 0.5, 2.0])}, "sorted"),
+        ({"t": np.array([0.0, 0.5, np.nan])}, "finite"),
+        ({"x": np.array([0, 7, 1], np.uint16)}, "on the 4x3 sensor"),
+    ],
+)
+def test_bad_events_are_refused(change, message):
+    columns = np.zeros((3, 3), np.uint16)
+    events = Events(np.arange(3.0), columns[0], columns[1], columns[2] > 0, 4, 3)
+    with pytest.raises(InputError, match=message):
+        dase.find_signatures(replace(events, **change))
+
+
+def test_bad_arguments_are_refused(plain):
+    with pytest.raises(InputError, match="there are no events"):
+        dase.find_signatures(Events.empty(4, 3))
+    with pytest.raises(InputError, match="got int"):
+        dase.find_signatures(3)
+    with pytest.raises(InputError, match="level"):
+        dase.find_signatures(plain, level=1.0)
+    with pytest.raises(InputError, match="chunk"):
+        dase.find_signatures(plain, chunk=0)
+
+
+def test_info_prints_signatures(plain, tmp_path):
+    path = tmp_path / "a.npz"
+    with dase.io.create(path) as writer:
+        writer.events(plain)
+    size = ["--size", f"{plain.width}x{plain.height}"]
+    done = CliRunner().invoke(dase_group, ["info", str(path), "--signatures", *size])
+    assert done.exit_code == 0, done.output
+    assert "\nframe coupling  not seen" in done.output
+    done = CliRunner().invoke(dase_group, ["info", str(path), "--signatures", "--json", *size])
+    assert len(json.loads(done.output)["signatures"]["entries"]) == len(NAMES)
+
+
+def recorded(shared, name):
+    looked = dase.find_signatures(shared / "recordings" / f"{name}.npz")
+    return looked, {entry.name for entry in looked.found}
+
+
+def test_camera_shake(shared):
+    looked, names = recorded(shared, "davis240c_camerashake")
+    assert {"frame coupling", "flicker", "grouping"} <= names
+    assert looked["flicker"].details["frequency"] == pytest.approx(100.14, abs=0.05)
+    assert looked["frame coupling"].details["exposure"] == pytest.approx(0.0985, abs=0.002)
+    assert looked["grouping"].details["line"] == "row"
+
+
+def test_checkerboard_with_unknown_frame_times(shared):
+    looked, names = recorded(shared, "davis240b_evbench1")
+    assert {"frame coupling", "flicker", "hot pixels", "grouping", "double events"} <= names
+    assert looked["frame coupling"].details["interval"] == pytest.approx(0.051, abs=2e-4)
+    assert looked["flicker"].details["frequency"] == pytest.approx(120.1, abs=0.3)
+    assert looked["hot pixels"].low <= 5 <= looked["hot pixels"].high + 1
+
+
+def test_cradle(shared):
+    looked, names = recorded(shared, "davis346_cuke_cradle")
+    assert names == {"hot pixels", "opposite pairs", "grouping"}
+    assert looked["hot pixels"].size == 17
+    assert looked["opposite pairs"].details["pairs"] == 101
+    assert looked["opposite pairs"].details["independent"] == pytest.approx(26, abs=0.5)
+    assert looked["grouping"].details["line"] == "column"
+
+
+def test_noise_of_a_still_scene(shared):
+    looked, names = recorded(shared, "dvx_noise_static")
+    assert names == {"hot pixels", "opposite pairs", "time stamps"}
+    assert looked["time stamps"].details["period"] == pytest.approx(195e-6, rel=0.01)
+    assert not looked["opposite pairs"].details["returns"]
+
+
+def test_circling_dot(shared):
+    looked, names = recorded(shared, "psee_gen31_dot")
+    assert names == {"hot pixels", "grouping"}
+    assert looked["hot pixels"].size == 7
+    assert looked["fixed pattern"].answer == "cannot say"
