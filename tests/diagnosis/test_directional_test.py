@@ -132,7 +132,7 @@ def fake(names: str, errors: dict[str, float], monkeypatch, **more) -> tuple:
     search = SimpleNamespace(
         judge=lambda m: judged(errors[m.names]), added_to=lambda m: tuple(m.names), **(defaults | more)
     )
-    monkeypatch.setattr(reviewing, "settle", lambda evidence, m, seed: m)
+    monkeypatch.setattr(reviewing, "refit_model", lambda evidence, m, seed: m)
     monkeypatch.setattr(reviewing, "_keep_near_models", lambda search, ways, judgement: ways)
     monkeypatch.setattr(reviewing, "with_same_freedom", lambda sensor, m, more: model(str(sensor)))
     monkeypatch.setattr(
