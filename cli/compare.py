@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from typing import Any
 
 import click
 
@@ -13,6 +14,7 @@ from dase.cli.options import (
     effects_option,
     fps_option,
     open_recorded,
+    part_options,
     scene_option,
 )
 
@@ -30,6 +32,7 @@ from dase.cli.options import (
 )
 @scene_option
 @fps_option
+@part_options
 @effects_option
 @click.option("--pixels", default=1500, show_default=True, help="In each half of the measurement.")
 @device_option
@@ -42,6 +45,7 @@ def compare_command(
     output: Path | None,
     scene: str,
     fps: float | None,
+    compared: dict[str, Any],
     effects: tuple[Path, ...],
     pixels: int,
     device: str,
@@ -52,14 +56,14 @@ def compare_command(
 
     1 is the error that two repeats of the recording would have. Nothing is fitted: `dase fit` does that.
     """
-    from dase.cli.diagnose import progress_bar
+    from dase.cli.diagnose import plates_or_note, print_plain_numbers, progress_bar
     from dase.diagnosis.compare import compare
     from dase.io import replacing
     from dase.simulation.sensor_file import load_sensor
     from dase.simulation.user_effects import known_effects
 
     model = load_sensor(sensor, known_effects(effects))
-    measured = open_recorded(recording, scene, file, fps)
+    measured = open_recorded(recording, scene, file, fps, compared)
     with progress_bar(quiet) as tell:
         found = compare(measured, model, pixels=pixels, seed=seed, device=device, progress=tell)
     click.echo(
@@ -71,16 +75,15 @@ def compare_command(
         click.echo(f"  {name:{width}s} {error:7.2f}")
     for cell in found.cells[:8]:
         click.echo(f"  {cell.sentence}")
-    for name, (real, made) in found.plain.items():
-        click.echo(f"  {name:34s} measured {real:9.4g}   simulated {made:9.4g}")
+    print_plain_numbers(found.plain)
     for note in found.notes:
         click.echo(f"note: {note}")
     if output is not None:
         from dase.figures import report
 
-        plates = report.measurement_plates(measured, model, seed=seed, device=device)
-        page = report.comparison_page(found, recording=recording.name, model=Path(sensor).stem, plates=plates)
-        report.write_page(output, page)
         with replacing(output.with_suffix(".json")) as part:
             part.write_text(json.dumps(found.to_json(), indent=2) + "\n")
+        plates = plates_or_note(measured, model, seed=seed, device=device)
+        page = report.comparison_page(found, recording=recording.name, model=Path(sensor).stem, plates=plates)
+        report.write_page(output, page)
         click.echo(f"{output}: open it in a browser")

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Callable, Iterator
+import sys
+import time
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import click
 
@@ -18,11 +20,15 @@ from dase.cli.options import (
     effects_option,
     fps_option,
     open_recorded,
+    part_options,
     scene_option,
 )
 
 if TYPE_CHECKING:
+    from dase.figures.style import Plate
+    from dase.fitting.measurement import Measurement
     from dase.results import Diagnosis
+    from dase.simulation.sensor import Sensor
 
 
 def print_explanation(ctx: click.Context, parameter: click.Parameter, value: str | None) -> None:
@@ -62,6 +68,7 @@ def print_explanation(ctx: click.Context, parameter: click.Parameter, value: str
     help="Draw the falling error into this PNG, SVG or PDF.",
 )
 @fps_option
+@part_options
 @effects_option
 @click.option("--pixels", default=1500, show_default=True, help="In each half of the measurement.")
 @device_option
@@ -75,6 +82,7 @@ def diagnose_command(
     file: Path | None,
     scene: str,
     fps: float | None,
+    compared: dict[str, Any],
     auto: bool,
     free: str | None,
     json_: Path | None,
@@ -94,55 +102,122 @@ def diagnose_command(
     """
     from dase.diagnosis import sensor_update
     from dase.diagnosis.diagnose import diagnose
-    from dase.io import replacing
     from dase.simulation import sensor_edit
     from dase.simulation.user_effects import known_effects
 
-    known = known_effects(effects)
-    text = sensor_edit.read_sensor_text(sensor, known)
+    library = known_effects(effects)
+    text = sensor_edit.read_sensor_text(sensor, library)
     model = text.sensor()
-    measured = open_recorded(recording, scene, file, fps)
+    measured = open_recorded(recording, scene, file, fps, compared)
     names = free.split(",") if free else None
-    with progress_bar(quiet) as tell:
-        # without --auto, the first effect that is missing
-        look = diagnose if auto else partial(diagnose, most=1)
-        found = look(
-            measured, model, effects=known, free=names, pixels=pixels, seed=seed, device=device, progress=tell
-        )
-    if json_ is not None:
-        with replacing(json_) as part:
-            part.write_text(json.dumps(found.to_json(), indent=2) + "\n")
+    # without --auto, the first effect that is missing
+    look = diagnose if auto else partial(diagnose, most=1)
+    known: list[Diagnosis] = []
+
+    def keep(interim: Diagnosis) -> None:
+        known.append(interim)
+        if auto:
+            if not quiet:
+                click.echo(f"so far: {interim.finding()}", err=True)
+            write_findings(json_, interim)
+
+    try:
+        with progress_bar(quiet) as tell:
+            found = look(
+                measured, model, effects=library, free=names, pixels=pixels, seed=seed, device=device,
+                progress=tell, so_far=keep,
+            )  # fmt: skip
+    except KeyboardInterrupt:
+        if not known:
+            raise
+        # hours may have gone into it: what is known is said, and nothing is written as if it were found
+        write_findings(json_, known[-1])
+        _print_findings(known[-1], quiet)
+        click.get_current_context().exit(130)
+    write_findings(json_, found)
     if output is not None:
         sensor_edit.write_sensor_text(sensor_update.with_diagnosis(text, found, recording.name), output)
-    if draw is not None:
-        from dase.figures.plot import plot
-
-        with replacing(draw) as part:
-            plot(found).savefig(part)
+    _print_findings(found, quiet)
+    # what was found took minutes and is said and written by now: a picture that fails costs the picture
+    drawn = draw is None or draw_or_say(draw, found)
     if report is not None:
         from dase.figures import report as pages
 
-        plates = pages.measurement_plates(measured, found.sensor, seed=seed, device=device)
+        plates = plates_or_note(measured, found.sensor, seed=seed, device=device)
         page = pages.diagnosis_page(found, recording=recording.name, model=Path(sensor).stem, plates=plates)
         pages.write_page(report, page)
-    _print_findings(found, quiet)
+    if not drawn:
+        click.get_current_context().exit(1)
+
+
+def write_findings(path: Path | None, found: Diagnosis) -> None:
+    """Write findings as JSON, if a file for them was asked for."""
+    from dase.io import replacing
+
+    if path is not None:
+        with replacing(path) as part:
+            part.write_text(json.dumps(found.to_json(), indent=2) + "\n")
+
+
+def draw_or_say(path: Path, found: Diagnosis) -> bool:
+    """Draw what was found into a file; say why where that fails, and return whether it did not."""
+    from dase.figures.plot import plot
+    from dase.io import replacing
+
+    try:
+        with replacing(path) as part:
+            plot(found).savefig(part)
+    except Exception as error:  # whatever matplotlib stumbles over
+        click.echo(f"dase: {path} could not be drawn: {type(error).__name__}: {error}", err=True)
+        return False
+    return True
+
+
+def plates_or_note(measured: Measurement, sensor: Sensor, *, seed: int, device: str) -> list[Plate]:
+    """Return pictures of a measurement beside what a model makes of it; none and a note if that fails."""
+    from dase.figures.report import measurement_plates
+
+    try:
+        return measurement_plates(measured, sensor, seed=seed, device=device)
+    except Exception as error:  # whatever a scene or matplotlib stumbles over
+        click.echo(f"note: no pictures of the events: {type(error).__name__}: {error}")
+        return []
 
 
 @contextmanager
-def progress_bar(quiet: bool) -> Iterator[Callable[[str, float, float], None]]:
-    """Show on a terminal what is being done, how far it is, and the present error."""
+def progress_bar(quiet: bool, *, pause: float = 10.0) -> Iterator[Callable[[str, float, float], None]]:
+    """Show what is being done, how far it is, and the present error: a bar, or in a pipe a line now and then.
+
+    Args:
+        quiet: Whether to show nothing.
+        pause: Least time between two lines in a pipe [s].
+    """
     from tqdm import tqdm
 
     layout = "{desc:32.32} |{bar}| {postfix}"
+    piped, last = not quiet and not sys.stderr.isatty(), time.monotonic()
     with tqdm(total=1.0, disable=True if quiet else None, bar_format=layout, leave=False) as shown:
 
         def tell(text: str, share: float, error: float) -> None:
+            nonlocal last
+            known = "" if error != error else f"error {error:.2f}"
+            if piped and time.monotonic() - last >= pause:
+                last = time.monotonic()
+                click.echo(", ".join(filter(None, (text, f"{100 * share:.0f} %", known))), err=True)
             shown.n = share
             shown.set_description_str(text, refresh=False)
-            shown.set_postfix_str("" if error != error else f"error {error:.2f}", refresh=False)
+            shown.set_postfix_str(known, refresh=False)
             shown.refresh()
 
         yield tell
+
+
+def print_plain_numbers(plain: Mapping[str, tuple[float, float]]) -> None:
+    """Print what measurement and model have in units that need no explanation."""
+    from dase.results import plain_rows
+
+    for name, measured, simulated in plain_rows(plain):
+        click.echo(f"  {name:34s} measured {measured:>9s}   simulated {simulated:>9s}")
 
 
 def _print_findings(found: Diagnosis, quiet: bool) -> None:
@@ -157,9 +232,10 @@ def _print_findings(found: Diagnosis, quiet: bool) -> None:
             if math.isnan(rank.error):  # given up before it was judged
                 continue
             mark = "+" if rank.effect == step.chosen else " "
+            chance = "" if math.isnan(rank.p_value) else f"  p {rank.p_value:.3f}"
             click.echo(
                 f"  {mark} {rank.effect:14s} error {rank.error:6.2f}  {100 * rank.share:3.0f} % of the way "
-                f"to the floor  p {rank.p_value:.3f}"
+                f"to the floor{chance}"
             )
         if step.ties:
             click.echo(f"    cannot be told apart from {step.chosen}: {', '.join(step.ties)}")
@@ -168,6 +244,7 @@ def _print_findings(found: Diagnosis, quiet: bool) -> None:
     click.echo("\nparameters, with 90 % intervals")
     for name, estimate in found.parameters.items():
         click.echo(f"  {name:24s} {estimate.value:10.4g}   {estimate.low:.4g} to {estimate.high:.4g}")
+    print_plain_numbers(found.plain)
     for note in found.notes:
         click.echo(f"note: {note}")
     click.echo(f"{found.evaluations} simulations, {found.seconds:.1f} s")

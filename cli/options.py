@@ -143,10 +143,55 @@ def check_suffix(*suffixes: str) -> Callable[[click.Context, click.Parameter, Pa
     return check
 
 
+def parse_region(
+    ctx: click.Context, param: click.Parameter, value: str | None
+) -> tuple[int, int, int, int] | None:
+    """Return (x, y, columns, rows) of a text such as 0,0,320,240."""
+    if value is None:
+        return None
+    try:
+        x, y, width, height = (int(part) for part in value.split(","))
+    except ValueError:
+        raise click.BadParameter(f"{value!r} is not of the form x,y,w,h, such as 0,0,320,240") from None
+    return x, y, width, height
+
+
+def part_options(command: Callable[..., Any]) -> Callable[..., Any]:
+    """Add the part of a recording that is compared; a command gets it as the mapping `compared`.
+
+    The mapping is the keywords of `dase.fitting.measurement.Measurement.part`.
+    """
+
+    @wraps(command)
+    def gathered(*args: Any, **given: Any) -> Any:
+        return command(
+            *args, compared={name: given.pop(name) for name in ("begin", "end", "region")}, **given
+        )
+
+    options = (
+        click.option("--from", "begin", type=float, metavar="SECONDS", help="Compare from this time on."),
+        click.option("--to", "end", type=float, metavar="SECONDS", help="Compare up to this time."),
+        click.option(
+            "--region", callback=parse_region, metavar="X,Y,W,H", help="Compare W x H pixels from X,Y only."
+        ),
+    )
+    for option in reversed(options):
+        gathered = option(gathered)
+    return gathered
+
+
 def open_recorded(
-    recording: Path, scene: str, file: Path | None = None, fps: float | None = None
+    recording: Path,
+    scene: str,
+    file: Path | None = None,
+    fps: float | None = None,
+    part: dict[str, Any] | None = None,
 ) -> Measurement:
-    """Open a recording and its scene, with the frame rate of its clip where the user gives it."""
+    """Open a part of a recording and its scene, with the frame rate of its clip where the user gives it."""
+    return _open_whole(recording, scene, file, fps).part(**(part or {}))
+
+
+def _open_whole(recording: Path, scene: str, file: Path | None, fps: float | None) -> Measurement:
     from dase.errors import InputError
     from dase.fitting.measurement import open_measurement
     from dase.scenes.video import open_video

@@ -127,18 +127,12 @@ class Comparison:
     def __repr__(self) -> str:
         ranked = sorted(self.families.items(), key=lambda item: -item[1])
         families = align_columns([(name, f"{error:.2f}") for name, error in ranked], right=(1,))
-        plain = [
-            (name, f"{measured:.4g}", f"{simulated:.4g}")
-            for name, (measured, simulated) in self.plain.items()
-        ]
         return fit_to_screen(
             [
                 f"Comparison of '{self.sensor.name}': {_error_words(self.error, self.gate)}",
                 *_indented("error per family of statistics", families),
                 *_indented("where the model fails most", [cell.sentence for cell in self.cells[:4]]),
-                *align_columns(
-                    [("in plain numbers", "measured", "simulated"), *_pushed(plain)], right=(1, 2)
-                ),
+                *_plain_lines(self.plain),
                 *_noted(self.notes),
             ]
         )
@@ -152,7 +146,7 @@ class Comparison:
             "gate": self.gate,
             "families": dict(self.families),
             "cells": [asdict(cell) for cell in self.cells],
-            "plain": {k: {"measured": m, "simulated": s} for k, (m, s) in self.plain.items()},
+            "plain": _plain_json(self.plain),
             "notes": list(self.notes),
             "seconds": self.seconds,
         }
@@ -174,6 +168,8 @@ class Fit:
         notes: Parameters that left their plausible range, starts that disagree, what the data cannot show.
         evaluations: Simulations that were run.
         seconds: Time it took.
+        plain: Name with unit to (measured, simulated), such as `ON events [1/(px s)]`.
+        contradiction: Why the events cannot be of the scene, in a sentence; empty where they may.
     """
 
     sensor: Sensor
@@ -187,6 +183,24 @@ class Fit:
     notes: tuple[str, ...] = ()
     evaluations: int = 0
     seconds: float = 0.0
+    plain: Mapping[str, tuple[float, float]] = field(default_factory=dict)
+    contradiction: str = ""
+
+    def refusal(self) -> str:
+        """Return why the fit is not to be kept unless the user insists, in words; empty where it is."""
+        if self.contradiction:
+            return self.contradiction
+        if self.worse:
+            return (
+                "the fit is worse than the sensor as it was given on held-out data "
+                f"(error {self.error:.2f}, before {self.before:.2f})"
+            )
+        return ""
+
+    @property
+    def worse(self) -> bool:
+        """Whether pixels and time that no fit has seen speak for the sensor as it was before the fit."""
+        return is_worse(self.error, self.before, self.gate)
 
     def __repr__(self) -> str:
         return fit_to_screen(
@@ -194,6 +208,7 @@ class Fit:
                 f"Fit of '{self.sensor.name}': error {self.before:.2f} before",
                 f"  after: {_error_words(self.error, self.gate)}",
                 *_parameter_lines(self.parameters, most=15),
+                *_plain_lines(self.plain),
                 *_noted(self.notes),
             ]
         )
@@ -203,6 +218,7 @@ class Fit:
         out = {name: getattr(self, name) for name in ("error", "before", "floor", "gate", "agree", "poor")}
         out |= {"sensor": self.sensor.to_table(), "notes": list(self.notes)}
         out |= {"parameters": {name: asdict(e) for name, e in self.parameters.items()}}
+        out |= {"worse": self.worse, "contradiction": self.contradiction, "plain": _plain_json(self.plain)}
         return out | {"evaluations": self.evaluations, "seconds": self.seconds}
 
 
@@ -215,7 +231,8 @@ class Rank:
         error: Held-out error with the effect added and everything refitted.
         fall: By how much the held-out error falls.
         share: The fall as a share of the way from the present error to the floor.
-        p_value: Chance of such a fall when the present model is true, for the best of all candidates.
+        p_value: Chance of such a fall when the present model is true, for the best of all candidates; not a
+            number for pairs.
         parameters: `effect.parameter` of what was added to its estimate.
         refined: Whether it was fitted in full; weak candidates are only screened.
     """
@@ -313,6 +330,8 @@ class Diagnosis:
         notes: What the user should know.
         evaluations: Simulations that were run.
         seconds: Time it took.
+        plain: Name with unit to (measured, simulated) of the last model, such as `ON events [1/(px s)]`.
+        finished: Whether the search came to its end; before, nothing is announced.
     """
 
     sensor: Sensor
@@ -328,6 +347,8 @@ class Diagnosis:
     notes: tuple[str, ...] = ()
     evaluations: int = 0
     seconds: float = 0.0
+    plain: Mapping[str, tuple[float, float]] = field(default_factory=dict)
+    finished: bool = True
 
     def __repr__(self) -> str:
         steps = [("as given", self.before), *zip(("fitted", *self.selected), self.errors, strict=False)]
@@ -341,12 +362,17 @@ class Diagnosis:
                 ),
                 *_indented("cannot be told apart from", ties),
                 *_parameter_lines(self.parameters, most=12),
+                *_plain_lines(self.plain),
                 *_noted(self.notes),
             ]
         )
 
     def finding(self) -> str:
         """Return what was found, in one line."""
+        if not self.finished:
+            added = [step.chosen for step in self.history if step.chosen]
+            tried = f"; nearest so far: {', '.join(added)}, not yet checked" if added else ""
+            return f"not finished: error {self.history[-1].error:.2f} after {len(self.history)} steps{tried}"
         if self.unexplained is not None:
             return self.unexplained.sentence
         if not self.selected:
@@ -365,6 +391,8 @@ class Diagnosis:
             "ties": {name: list(others) for name, others in self.ties.items()},
             "unexplained": None if self.unexplained is None else asdict(self.unexplained),
             "history": [asdict(step) for step in self.history],
+            "finished": self.finished,
+            "plain": _plain_json(self.plain),
             "sensor": self.sensor.to_table(),
             "notes": list(self.notes),
             "evaluations": self.evaluations,
@@ -422,6 +450,17 @@ class Distinction:
         return fit_to_screen(["Distinction", *(f"  {line}" for line in [*align_columns(rows), *lines])])
 
 
+def is_worse(error: float, before: float, gate: float) -> bool:
+    """Whether held-out data speak against a model in place of another, beyond what repeats differ by.
+
+    Args:
+        error: Of the model.
+        before: Of the other.
+        gate: Error up to which a model counts as right; which of two right ones has less does not matter.
+    """
+    return error > gate and error > max(1.1 * before, before + 0.1)
+
+
 def _error_words(error: float, gate: float) -> str:
     """Return an error with what it is to be compared with."""
     return f"error {error:.2f} noise floors, where repeats stay below {gate:.2f}"
@@ -432,7 +471,8 @@ def _rank_words(rank: Rank) -> tuple[str, ...]:
     if math.isnan(rank.error):
         return rank.effect, "not judged"
     way = f"{100 * rank.share:.0f} % of the way to the floor"
-    return rank.effect, f"error {rank.error:.2f}", way, f"p {rank.p_value:.3f}"
+    chance = "" if math.isnan(rank.p_value) else f"p {rank.p_value:.3f}"
+    return rank.effect, f"error {rank.error:.2f}", way, chance
 
 
 def _answer_words(answer: Answer) -> tuple[str, ...]:
@@ -450,6 +490,30 @@ def _parameter_lines(parameters: Mapping[str, Estimate], *, most: int) -> list[s
     left = [(f"and {len(parameters) - most} more", "", "")] if len(parameters) > most else []
     table = align_columns([*_pushed([*rows, *left])], right=(1,)) if rows else []
     return ["parameters, with 90 % intervals", *table] if table else []
+
+
+def _plain_json(plain: Mapping[str, tuple[float, float]]) -> dict[str, dict[str, float | None]]:
+    """Return plain numbers as JSON objects, None where nothing can be said."""
+    return {
+        name: {
+            key: None if math.isnan(value) else value
+            for key, value in zip(("measured", "simulated"), pair, strict=True)
+        }
+        for name, pair in plain.items()
+    }
+
+
+def plain_rows(plain: Mapping[str, tuple[float, float]]) -> list[tuple[str, str, str]]:
+    """Return plain numbers as rows of name, measured and simulated; `-` where nothing can be said."""
+    words = [(name, *("-" if math.isnan(v) else f"{v:.4g}" for v in pair)) for name, pair in plain.items()]
+    return [(name, measured, simulated) for name, measured, simulated in words]
+
+
+def _plain_lines(plain: Mapping[str, tuple[float, float]]) -> list[str]:
+    """Return plain numbers as lines of a table; nothing where there are none."""
+    rows = plain_rows(plain)
+    head = ("in plain numbers", "measured", "simulated")
+    return align_columns([head, *_pushed(rows)], right=(1, 2)) if rows else []
 
 
 def _noted(notes: Sequence[str]) -> list[str]:

@@ -13,6 +13,7 @@ from dase.diagnosis.settings import DEFAULTS, DiagnosisSettings
 from dase.fitting.data_split import SPLIT, SplitMeasurement, split_measurement
 from dase.fitting.measurement import Measured, SceneChoice, as_measurement
 from dase.fitting.model import model_of
+from dase.fitting.plain_numbers import family_counts, octave_ends, plain_numbers, rate_counts
 from dase.fitting.subset import CalibratedSubset
 from dase.kernels.event_probes import BANDS, INTERVALS, KINDS, LAGS, RESTING
 from dase.probes.accumulators import PROBE_TIMES
@@ -65,7 +66,7 @@ def compare(
     model = model.bound_to(measurement.scene)
     evidence = split_measurement(
         measurement.events, measurement.scene, log_eps=model.log_eps, trust=measurement.trust,
-        pixels=pixels, seed=seed, device=device,
+        span=measurement.span, pixels=pixels, seed=seed, device=device,
     )  # fmt: skip
     tell("simulating", 0.3, float("nan"))
     stream = SimulationStream.JUDGE.seed(seed)
@@ -107,59 +108,6 @@ def comparison_of(
     )
 
 
-def plain_numbers(half: CalibratedSubset) -> dict[str, tuple[float, float]]:
-    """Return measured and simulated values in units that need no explanation."""
-    values = half.seen.target, half.repeats.mean(0)
-    real, made = (_rate_counts(v) for v in values)
-    exposure = half.trials.stimulus.exposure().reshape(KINDS, BANDS)
-    time_ = max(float(exposure.sum()), 1e-9)
-    rest = max(float(exposure[:RESTING].sum()), 1e-9)
-    names = ("OFF", "ON")
-    out = {
-        f"{names[n]} events [1/(px s)]": (float(real[n].sum() / time_), float(made[n].sum() / time_))
-        for n in range(2)
-    }
-    for n in range(2):
-        slow = real[n, :RESTING].sum() / rest, made[n, :RESTING].sum() / rest
-        out[f"{names[n]} events at rest [1/(px s)]"] = float(slow[0]), float(slow[1])
-    step = 1e3 * half.trials.stimulus.grid.step
-    a, b = (_median_interval(_family_counts(v, "intervals"), step) for v in values)
-    out["median interval of a pixel [ms]"] = a, b
-    a, b = (_mean_lag(v) for v in values)
-    out["mean lag behind the light [ms]"] = a, b
-    return out
-
-
-def _family_counts(values: Array, family: str) -> Array:
-    return np.maximum(np.exp(values[LAYOUT[family]]) - 3.0, 0.0)
-
-
-def _rate_counts(values: Array) -> Array:
-    return _family_counts(values, "rate").reshape(2, KINDS, BANDS)
-
-
-def _octave_ends(step: float) -> Array:
-    """Return the upper ends of the bins of intervals, in units of `step`."""
-    return step * np.concatenate([[0.5], 2.0 ** np.arange(INTERVALS - 1)])
-
-
-def _median_interval(counts: Array, step: float) -> float:
-    """Return the median interval, on a logarithmic scale within its bin."""
-    total = counts.reshape(-1, INTERVALS).sum(0)
-    if total.sum() == 0:
-        return float("nan")
-    share = np.concatenate([[0.0], np.cumsum(total) / total.sum()])
-    ends = np.log(np.concatenate([[0.25 * step], _octave_ends(step)]))
-    return float(np.exp(np.interp(0.5, share, ends)))
-
-
-def _mean_lag(values: Array) -> float:
-    change = values[LAYOUT["lag"]].reshape(LAGS, BANDS).mean(1)
-    middle = 0.5 * (np.array(PROBE_TIMES.lags[1:]) + np.array(PROBE_TIMES.lags[:-1]))
-    weight = np.maximum(change, 0.0)
-    return float(1e3 * (weight * middle).sum() / max(weight.sum(), 1e-12))
-
-
 def family_curves(evidence: SplitMeasurement, half: CalibratedSubset) -> dict[str, tuple[Curve, ...]]:
     """Return what figures are drawn from, by family; the present model of `half` is compared."""
     return {
@@ -173,7 +121,7 @@ def _rate_curves(evidence: SplitMeasurement, half: CalibratedSubset) -> tuple[Cu
     exposure = np.maximum(half.trials.stimulus.exposure().reshape(KINDS, BANDS), 1e-9)
     middle = np.array([-0.4, -0.12, 0.0, 0.12, 0.4])
     out = []
-    both = [_rate_counts(v) for v in (half.seen.target, half.repeats.mean(0))]
+    both = [rate_counts(v) for v in (half.seen.target, half.repeats.mean(0))]
     sigma = half.seen.sigma[LAYOUT["rate"]].reshape(2, KINDS, BANDS)
     for n in range(BANDS):
         for p, polarity in enumerate(("OFF", "ON")):
@@ -188,11 +136,11 @@ def _rate_curves(evidence: SplitMeasurement, half: CalibratedSubset) -> tuple[Cu
 
 def _interval_curves(half: CalibratedSubset) -> tuple[Curve, ...]:
     step = half.trials.stimulus.grid.step * 1e3
-    ends = _octave_ends(step)
+    ends = octave_ends(step)
     middle = np.concatenate([[0.35 * step], np.sqrt(ends[:-1] * ends[1:])])
     names = [f"{kin}, {state}" for state in ("moving", "at rest") for kin in ("OFF-OFF", "ON-ON", "opposite")]
     both = [
-        _family_counts(v, "intervals").reshape(6, INTERVALS) for v in (half.seen.target, half.repeats.mean(0))
+        family_counts(v, "intervals").reshape(6, INTERVALS) for v in (half.seen.target, half.repeats.mean(0))
     ]
     sigma = half.seen.sigma[LAYOUT["intervals"]].reshape(6, INTERVALS)
     return tuple(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from itertools import combinations
 from os import PathLike
@@ -19,11 +19,13 @@ from dase.fitting.confidence_intervals import estimate_parameters
 from dase.fitting.data_split import SPLIT, split_measurement
 from dase.fitting.measurement import Measured, SceneChoice, as_measurement
 from dase.fitting.model import FittedModel, fit_present_model, model_of, refit_model, refit_work
+from dase.fitting.plain_numbers import plain_numbers
 from dase.fitting.scheduler import run_side_by_side
+from dase.fitting.search_ends import parameters_at_bounds
 from dase.probes.distance import Judgement, leaves_nothing, may_be_announced, reaches_floor, worst_families
 from dase.probes.random_streams import SimulationStream
 from dase.probes.stimulus import Trust
-from dase.results import Cell, Diagnosis, Estimate, Progress, Rank, Step, Unexplained
+from dase.results import Cell, Diagnosis, Estimate, Progress, Rank, Step, Unexplained, is_worse
 from dase.simulation.sensor import Sensor
 from dase.simulation.sensor_file import as_sensor
 
@@ -41,6 +43,7 @@ def diagnose(
     seed: int = 0,
     device: str = "cpu",
     progress: Progress | None = None,
+    so_far: Callable[[Diagnosis], None] | None = None,
     settings: DiagnosisSettings = DEFAULTS,
 ) -> Diagnosis:
     """Find the effects that a model of a camera lacks.
@@ -59,6 +62,7 @@ def diagnose(
         seed: Of every random number.
         device: Where kernels run.
         progress: Told how far it is.
+        so_far: Given what is known after each step of the search, before it is finished.
         settings: Numbers by which effects are added and dropped.
 
     Raises:
@@ -71,24 +75,54 @@ def diagnose(
     given = given.bound_to(measurement.scene)
     evidence = split_measurement(
         measurement.events, measurement.scene, log_eps=given.log_eps, trust=measurement.trust,
-        pixels=pixels, seed=seed, device=device,
+        span=measurement.span, pixels=pixels, seed=seed, device=device,
     )  # fmt: skip
     tell("fitting the present model", 0.0, float("nan"))
     names = frozenset(effect.name for effect in given.effects)
     state = DiagnosisState(evidence, effects, seed, tell, names, settings)
+    if so_far is not None:
+        state.after_step = lambda model, errors: so_far(
+            measurement.noted(_known_so_far(state, model, errors, before, time.perf_counter() - begin))
+        )
     before = (
         model_of(given, free)
         .judge(evidence.held, repeats=settings.repeats // 2, seed=SimulationStream.JUDGE.seed(seed))
         .error
     )
-    start = fit_present_model(evidence, given, free, seed=seed)
-    model, judgement, errors = _add_one_by_one(state, start, most)
-    if not reaches_floor(judgement) and most > 0:
+    start = _fitted_unless_worse(state, given, free, before)
+    # what is not of this scene has no effects to be found
+    limit = 0 if evidence.contradiction else most
+    model, judgement, errors = _add_one_by_one(state, start, limit)
+    if not reaches_floor(judgement) and limit > 0:
         model, judgement = _add_pair(state, start, model, judgement)
     if len(state.added_to(model)) > 1:
         model, judgement = prune_model(state, model, judgement)
     found = _conclude_diagnosis(state, start, model, errors, before)
     return measurement.noted(replace(found, seconds=time.perf_counter() - begin))
+
+
+def _fitted_unless_worse(
+    state: DiagnosisState, given: Sensor, free: Sequence[str] | None, before: float
+) -> FittedModel:
+    """Return the sensor as it was given, fitted; as it is where the fit does not generalise.
+
+    Args:
+        state: Gets a note of a fit that was not kept.
+        given: The sensor.
+        free: Its parameters that may be refitted; None for all.
+        before: Its held-out error.
+    """
+    evidence, seed = state.evidence, state.seed
+    fitted = fit_present_model(evidence, given, free, seed=seed)
+    stream = SimulationStream.JUDGE.seed(seed)
+    judged = fitted.judge(evidence.held, repeats=state.settings.repeats // 2, seed=stream)
+    if not is_worse(judged.error, before, judged.gate):
+        return fitted
+    state.notes.append(
+        f"fitted again, the sensor as given is worse on pixels and time that no fit has seen (error "
+        f"{judged.error:.2f} instead of {before:.2f}): the search began from the sensor as given"
+    )
+    return model_of(given, free)
 
 
 def _add_one_by_one(
@@ -109,6 +143,7 @@ def _add_one_by_one(
         if better is None and more and (hidden := find_hidden_effect(state, model, judgement)) is not None:
             step, better = _note_hidden_effect(state, *hidden, step, judgement), hidden[0].model
         state.history.append(step)
+        state.after_step(model if better is None else better, errors)
         if better is None:
             break
         model = better
@@ -235,12 +270,54 @@ def _add_pair(
     ]
     first = sorted(tried, key=lambda t: t[0])[:2]
     settled = run_side_by_side([refit_work(evidence, pair, seed=seed) for _, _, pair in first])
+    ranking: list[Rank] = []
     for (_, name, _), pair in zip(first, settled, strict=True):
         judged = state.judge(pair)
+        ranking = sorted([*ranking, _rank_of_pair(name, pair, judged, state.history[0])], key=_error_of_rank)
         if judged.error < judgement.error * (1.0 if reaches_floor(judged) else settings.pair_gain):
             model, judgement = pair, judged
-            state.history.append(replace(state.history[0], chosen=name, ties=(), ranking=(), cells=()))
+            state.history.append(
+                replace(state.history[0], chosen=name, ties=(), ranking=tuple(ranking), cells=())
+            )
     return model, judgement
+
+
+def _rank_of_pair(name: str, pair: FittedModel, judged: Judgement, first: Step) -> Rank:
+    """Return two effects that came in at once as the user sees them; there is no null of pairs, so no p."""
+    fall = first.error - judged.error
+    share = min(fall / max(first.error - 1.0, 1e-9), 1.0)
+    mine = {
+        axis.name: Estimate(*(3 * (float(axis.to_value(place)),)))
+        for axis, place in zip(pair.space.axes, pair.place, strict=True)
+        if axis.name.split(".")[0] in name.split(" + ")
+    }
+    return Rank(name, judged.error, fall, share, float("nan"), mine)
+
+
+def _error_of_rank(rank: Rank) -> float:
+    return rank.error
+
+
+def _known_so_far(
+    state: DiagnosisState, model: FittedModel, errors: list[float], before: float, seconds: float
+) -> Diagnosis:
+    """Return what a search knows after a step: the nearest model, nothing of which is announced yet."""
+    return Diagnosis(
+        sensor=model.sensor,
+        selected=(),
+        errors=(errors[0],),
+        before=before,
+        floor=1.0,
+        gate=state.history[-1].gate,
+        parameters={},
+        ties={},
+        unexplained=None,
+        history=tuple(state.history),
+        notes=(*state.notes, *state.evidence.notes),
+        evaluations=state.evidence.evaluations,
+        seconds=seconds,
+        finished=False,
+    )
 
 
 def _conclude_diagnosis(
@@ -251,11 +328,16 @@ def _conclude_diagnosis(
     chosen = [n for s in state.history if s.chosen for n in s.chosen.split(" + ")]
     order = tuple(dict.fromkeys([*(n for n in chosen if n in found), *found]))
     model, values = estimate_parameters(state.evidence, model, seed=state.seed)
-    last = state.judge(model)
+    stream = SimulationStream.JUDGE.seed(state.seed)
+    held = model.calibrate(state.evidence.held, repeats=state.settings.repeats, seed=stream)
+    last = held.judge(stream)
     unexplained: Unexplained | None = None
-    if not may_be_announced(last):
+    doubts = _doubts_about(state, model, values, order)
+    if not may_be_announced(last) or doubts:
         cells = worst_cells(state.evidence, last)
         unexplained = _describe_unexplained(state, order, errors[0], last, cells)
+        if doubts:
+            unexplained = replace(unexplained, sentence=_sentence_of_doubts(order, doubts, last))
     kept = unexplained is None
     path = _errors_after_additions(state, order, errors, last.error) if kept else [errors[0]]
     ties = {n: tuple(sorted(state.ties.get(n, set()) - set(found))) for n in order if kept}
@@ -270,9 +352,24 @@ def _conclude_diagnosis(
         ties={name: others for name, others in ties.items() if others},
         unexplained=unexplained,
         history=tuple(state.history),
-        notes=state.evidence.notes,
+        notes=(*state.notes, *parameters_at_bounds(model, values), *state.evidence.notes),
+        plain=plain_numbers(held),
         evaluations=state.evidence.evaluations,
     )
+
+
+def _doubts_about(
+    state: DiagnosisState, model: FittedModel, values: Mapping[str, Estimate], found: tuple[str, ...]
+) -> list[str]:
+    """Return what forbids to announce effects although the error may be at the floor, in words."""
+    if state.evidence.contradiction:
+        return [state.evidence.contradiction]
+    return parameters_at_bounds(model, values) if found else []
+
+
+def _sentence_of_doubts(found: tuple[str, ...], doubts: list[str], last: Judgement) -> str:
+    fits = f"; with {' and '.join(found)} the error is {last.error:.2g}" if found else ""
+    return f"nothing is announced: {'; '.join(doubts)}{fits}"
 
 
 def _errors_after_additions(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 
 from dase.diagnosis.candidates import Candidate
@@ -33,6 +33,8 @@ class DiagnosisState:
         ties: Effect that was added to those that the data cannot tell apart from it.
         without: What the model left before an effect was added to it, where it counted as right already.
         first: Candidates of the first step in order of their screening, from which pairs are made.
+        notes: What the user should know of the search.
+        after_step: Told the model and the errors so far after each step.
         error: Held-out error of the model that was judged last.
     """
 
@@ -48,6 +50,8 @@ class DiagnosisState:
     ties: dict[str, set[str]] = field(default_factory=dict)
     without: dict[str, Judgement] = field(default_factory=dict)
     first: list[Candidate] = field(default_factory=list)
+    notes: list[str] = field(default_factory=list)
+    after_step: Callable[[FittedModel, list[float]], None] = lambda model, errors: None
     error: float = float("nan")
 
     def judge(self, model: FittedModel, *, repeats: int | None = None) -> Judgement:

@@ -61,7 +61,7 @@ def draw_staircase(
     )
     axes = place_axes(figure, 0.85, 0.85, WIDE - 1.2, 2.4)
     n = len(errors)
-    bottom, top = 0.66 * min(floor, *errors), 1.45 * max(*errors, below)
+    bottom, top = 0.66 * min([floor, *errors]), 1.45 * max([*errors, below])
     axes.set(xlim=(-0.5, n - 0.5), ylim=(bottom, top))
     axes.axhspan(bottom, below, color=Colour.BOTH, alpha=0.10, lw=0)
     axes.axhline(floor, color=Colour.BOTH, lw=1.2, ls=(0, (4, 2)))
@@ -184,14 +184,13 @@ def draw_ranking(
     figure = titled_figure(1.42 + 0.25 * n, found, about)
     axes = place_axes(figure, 1.6, 0.85, WIDE - 3.6, 0.25 * n)
     rows = np.arange(n)[::-1]
-    low, high = 0.75 * min(floor, *errors), 1.3 * max(present, *errors)
+    low, high = 0.75 * min([floor, *errors]), 1.3 * max([present, *errors])
     for row, effect, error, p in zip(rows, effects, errors, p_values, strict=True):
         colour = Colour.INK if effect in chosen else Colour.QUIET if effect in ties else Colour.LINE
         axes.plot([present, error], [row, row], color=colour, lw=1.6, solid_capstyle="butt")
         axes.plot([error], [row], "o", ms=6, color=colour)
-        note = f"{format_number(error)}   " + (
-            f"p ≤ {format_number(p)}" if p < 0.05 else "by chance" if p > 0.5 else f"p = {p:.2f}"
-        )
+        said = f"p ≤ {format_number(p)}" if p < 0.05 else "by chance" if p > 0.5 else f"p = {p:.2f}"
+        note = f"{format_number(error)}   {'' if math.isnan(p) else said}"
         note += "   found" if effect in chosen else "   as good" if effect in ties else ""
         axes.annotate(
             note, (1.02, row), xycoords=("axes fraction", "data"), fontsize=8.5, color=Colour.INK, va="center"

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 from html import escape
 from itertools import pairwise
 from pathlib import Path
@@ -19,11 +20,14 @@ from dase.figures.style import Plate, format_number
 from dase.fitting.measurement import Measurement
 from dase.io import replacing
 from dase.probes.statistics import FAMILY_WORDS
-from dase.results import Comparison, Diagnosis, Estimate, Step
+from dase.results import Comparison, Diagnosis, Estimate, Rank, Step
 from dase.scenes.between_frames import CameraScene
 from dase.simulation.sensor import Sensor
 from dase.simulation.sensor_file import dump_sensor
 from dase.simulation.simulate import stream
+
+Drawing = Callable[[], Plate]
+"""Draws one figure."""
 
 
 def write_page(path: Path, html: str) -> None:
@@ -79,7 +83,7 @@ def comparison_page(
         html_page.table_html(("", "measured", "simulated", "model / measured"), _plain_rows(found.plain)),
         "<h2>Where the model fails</h2>",
         html_page.cells_html(found.cells, "No single cell differs by more than chance."),
-        *map(html_page.figure_html, [*plates, *comparison_plates(found)]),
+        *_figures_html([*plates, *comparison_drawings(found)]),
         _sensor_file_html(found.sensor),
         html_page.notes_html(found.notes),
     ]
@@ -105,8 +109,15 @@ def comparison_verdict(found: Comparison) -> str:
 
 def comparison_plates(found: Comparison) -> list[Plate]:
     """Return the figures of a comparison: errors by family, then the curves of each family, worst first."""
+    return [draw() for draw in comparison_drawings(found)]
+
+
+def comparison_drawings(found: Comparison) -> list[Drawing]:
+    """Return what draws the figures of a comparison, one function for each."""
     named = {family_words(name): error for name, error in found.families.items()}
-    plates = [diagnosis_figures.draw_families(named, floor=found.floor, gate=found.gate)] if named else []
+    out: list[Drawing] = []
+    if named:
+        out.append(partial(diagnosis_figures.draw_families, named, floor=found.floor, gate=found.gate))
     for name in sorted(found.curves, key=lambda name: -found.families.get(name, 0.0)):
         title = family_words(name)
         about = f"error {format_number(found.families[name])}" if name in found.families else ""
@@ -114,10 +125,24 @@ def comparison_plates(found: Comparison) -> list[Plate]:
             "Points are measured, lines are the model's; the grey band is twice the sampling error of their "
             "difference, so a line outside of it is wrong beyond chance."
         )
-        plates.append(
-            diagnosis_figures.draw_curves(title[:1].upper() + title[1:], about, found.curves[name], caption)
-        )
-    return plates
+        title = title[:1].upper() + title[1:]
+        out.append(partial(diagnosis_figures.draw_curves, title, about, found.curves[name], caption))
+    return out
+
+
+def _figures_html(figures: Iterable[Plate | Drawing]) -> list[str]:
+    """Return figures with their captions; where one fails, a sentence in its place.
+
+    What a report says took minutes to find out, so a figure that fails costs that figure and nothing else.
+    """
+    out = []
+    for one in figures:
+        try:
+            out.append(html_page.figure_html(one if isinstance(one, Plate) else one()))
+        except Exception as error:  # whatever matplotlib stumbles over
+            said = f"A figure could not be drawn here ({type(error).__name__}: {error})."
+            out.append(f"<p>{escape(said)}</p>")
+    return out
 
 
 def diagnosis_page(
@@ -132,7 +157,7 @@ def diagnosis_page(
         plates: Pictures of the model that was found, see `dase.figures.event_maps`.
     """
     body = [html_page.verdict_html(diagnosis_verdict(found), wrong=found.unexplained is not None)]
-    body += map(html_page.figure_html, diagnosis_plates(found))
+    body += _figures_html(diagnosis_drawings(found))
     if found.history and found.history[0].cells:
         body += ["<h2>Where the model failed</h2>", html_page.cells_html(found.history[0].cells)]
     if found.unexplained is not None:
@@ -143,7 +168,8 @@ def diagnosis_page(
             )
         ]
     body += [
-        *map(html_page.figure_html, plates),
+        *_figures_html(plates),
+        html_page.table_html(("", "measured", "simulated", "model / measured"), _plain_rows(found.plain)),
         _parameter_table(found.parameters),
         _sensor_file_html(found.sensor),
         html_page.notes_html(found.notes),
@@ -184,9 +210,15 @@ def diagnosis_verdict(found: Diagnosis) -> str:
 
 def diagnosis_plates(found: Diagnosis) -> list[Plate]:
     """Return the figures of a diagnosis: the staircase, the candidates of each step, the parameters."""
-    plates = [staircase_of(found)]
-    plates += [ranking_of(step, found.floor) for step in found.history if step.ranking]
-    return plates + ([parameters_of(found.sensor, found.parameters)] if found.parameters else [])
+    return [draw() for draw in diagnosis_drawings(found)]
+
+
+def diagnosis_drawings(found: Diagnosis) -> list[Drawing]:
+    """Return what draws the figures of a diagnosis, one function for each."""
+    judged = [step for step in found.history if _judged_ranks(step)]
+    out: list[Drawing] = [partial(staircase_of, found)]
+    out += [partial(ranking_of, step, found.floor) for step in judged]
+    return out + ([partial(parameters_of, found.sensor, found.parameters)] if found.parameters else [])
 
 
 def parameters_of(sensor: Sensor, estimates: Mapping[str, Estimate]) -> Plate:
@@ -222,7 +254,7 @@ def stand_ins(found: Diagnosis) -> tuple[list[str], list[float]]:
 
 def ranking_of(step: Step, floor: float) -> Plate:
     """Return how far each candidate of one step brings the error down."""
-    full = [rank for rank in step.ranking if rank.refined and math.isfinite(rank.error)]
+    full = _judged_ranks(step)
     return diagnosis_figures.draw_ranking(
         [rank.effect for rank in full],
         [rank.error for rank in full],
@@ -235,6 +267,11 @@ def ranking_of(step: Step, floor: float) -> Plate:
     )
 
 
+def _judged_ranks(step: Step) -> list[Rank]:
+    """Return the candidates of a step that were judged: none where the first look ruled all of them out."""
+    return [rank for rank in step.ranking if rank.refined and math.isfinite(rank.error)]
+
+
 def family_words(name: str) -> str:
     """Return a family of statistics in a few words."""
     return FAMILY_WORDS.get(name, name)
@@ -243,7 +280,13 @@ def family_words(name: str) -> str:
 def _plain_rows(plain: Mapping[str, tuple[float, float]]) -> list[tuple[str, ...]]:
     # what is left of a count after rounding is none
     whole = {name: [v if abs(v) > 1e-9 else 0.0 for v in pair] for name, pair in plain.items()}
-    return [(name, format_number(m), format_number(s), _ratio_text(m, s)) for name, (m, s) in whole.items()]
+    return [
+        (name, _number_or_dash(m), _number_or_dash(s), _ratio_text(m, s)) for name, (m, s) in whole.items()
+    ]
+
+
+def _number_or_dash(value: float) -> str:
+    return "–" if math.isnan(value) else format_number(value)
 
 
 def _ratio_text(measured: float, simulated: float) -> str:

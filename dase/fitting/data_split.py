@@ -15,8 +15,16 @@ from dase.errors import InputError, checked_seed
 from dase.events import Events
 from dase.fitting.batch_simulator import BatchSimulator
 from dase.fitting.bus_load import WholeSensor
+from dase.fitting.contradictions import contradiction_of_rest
 from dase.fitting.pixel_selection import choose_trusted_pixels, find_trusted_parts
 from dase.fitting.subset import Array, CalibratedSubset, PixelSubset
+from dase.fitting.time_window import (
+    choose_window,
+    outside_gaps,
+    repeated_gaps,
+    sentence_of_window,
+    within_span,
+)
 from dase.kernels import event_probes as kernels
 from dase.kernels import launch
 from dase.probes.accumulators import ProbeSums, StatisticsFrame
@@ -78,6 +86,7 @@ class SplitMeasurement:
         busiest: Most events per second of all pixels [Hz].
         fastest: Events per second that a bus, if there is one, can send at least [Hz].
         notes: What the data cannot show.
+        contradiction: Why the events cannot be of the scene, in a sentence; empty where they may.
     """
 
     train: PixelSubset
@@ -89,6 +98,7 @@ class SplitMeasurement:
     highest_event_rate: float
     least_bus_rate: float
     notes: tuple[str, ...] = ()
+    contradiction: str = ""
 
     def observe(self, *, idle_bus: float) -> Observations:
         """Return what effects may choose their candidates by, see `Observations`."""
@@ -122,6 +132,7 @@ def split_measurement(
     *,
     log_eps: float = 1e-3,
     trust: Trust | None = None,
+    span: tuple[float, float] | None = None,
     pixels: int = SPLIT.pixels,
     seed: int = 0,
     device: str = "cpu",
@@ -135,6 +146,8 @@ def split_measurement(
         log_eps: Added to intensities before the logarithm.
         trust: Where and when the scene is to be trusted, all else is left out; None for everywhere, and for
             what a `CameraScene` trusts of itself.
+        span: First and last time that is compared [s]; None for all, of which a long recording has a part
+            chosen.
         pixels: In each half.
         seed: Of the choice of pixels.
         device: Where kernels run.
@@ -147,7 +160,13 @@ def split_measurement(
     checked_seed(seed, 1 << 30)
     if trust is None and isinstance(scene, CameraScene):
         trust = scene.is_trusted
-    grid = common_grid(events, scene)
+    whole = common_grid(events, scene)
+    asked = within_span(whole, span)
+    grid = choose_window(events, scene, asked, pixels)
+    if grid is not whole:
+        inside = (events.t >= grid.begin) & (events.t <= grid.begin + grid.step * (grid.steps + 1))
+        events = events.select(inside)
+    gaps = repeated_gaps(events.t)
     try:
         to = launch.find_device(device)
     except ValueError as error:
@@ -159,22 +178,29 @@ def split_measurement(
             f"a diagnosis needs at least {2 * settings.least_pixels} pixels, "
             f"the scene has {scene.width}x{scene.height}"
         )
-    rng, notes = Draw.PIXELS.generator(seed), []
+    rng, notes = Draw.PIXELS.generator(seed), list[str]()
+    if grid is not asked:
+        notes.append(sentence_of_window(asked, grid))
     # time is cut, not drawn: moments between fitted ones would be known from these
     cut = max(2, round(settings.fitted_share * grid.steps))
     if trust is None:
         # other pixels judge: fixed patterns, such as mismatch, would be known from the fitted ones
         chosen = rng.permutation(size)[: 2 * each].astype(np.int32)
     else:
-        looks = find_trusted_parts(events, scene, _times_of_grid(scene, grid), cut, trust)
+        looks = find_trusted_parts(events, scene, times_of_grid(scene, grid), cut, trust)
         chosen = choose_trusted_pixels(looks, each, rng, least=settings.least_pixels)
         each = len(chosen) // 2
         notes.append(looks.sentence())
     # from the begin of the scene also for the half that judges: filters and memories are settled there
-    light = light_of(scene, _times_of_grid(scene, grid), chosen)
+    times = times_of_grid(scene, grid)
+    light = light_of(scene, times, chosen)
     if not np.all(np.isfinite(light)) or light.min() < 0:
         raise InputError("scene: intensities must be finite and >= 0")
-    good = np.ones(light.shape, np.bool_) if trust is None else trust(grid.times, chosen).T.copy()
+    good = np.ones(light.shape, np.bool_) if trust is None else trust(times, chosen).T.copy()
+    if len(gaps):
+        good &= outside_gaps(gaps)(times)
+        length = 1e3 * float(np.median(np.diff(gaps, axis=1)))
+        notes.append(f"{len(gaps)} gaps of {length:.3g} ms without any event: data are missing, and left out")
     good[:, 1:] &= good[:, :-1]  # a step is what lies between two points of the grid
     # both halves have the same bands, or a cell would mean another brightness in each
     bands = band_edges(light, good)
@@ -192,12 +218,12 @@ def split_measurement(
     late = cell[last].copy()
     late[:, :cut] = MASKED
     halves: list[PixelSubset] = []
-    for part, span, cells in ((first, train_grid, cell[first, :cut]), (last, grid, late)):
+    for part, stretch, cells in ((first, train_grid, cell[first, :cut]), (last, grid, late)):
         stimulus = Stimulus(
-            chosen[part], scene.width, scene.height, span, light[part, : span.steps], cells, log_eps, to,
-            trust is not None,
+            chosen[part], scene.width, scene.height, stretch, light[part, : stretch.steps], cells, log_eps,
+            to, trust is not None or len(gaps) > 0,
         )  # fmt: skip
-        halves.append(_make_subset(stimulus, events, cut if span is grid else 0, structure))
+        halves.append(_make_subset(stimulus, events, cut if stretch is grid else 0, structure))
     _require_enough_events(halves, events, grid, notes, settings.least_events)
     halves.append(_make_subset(halves[0].trials.stimulus.part(settings.scouts), events, 0, structure))
     # seen in the fitted half: what judges must not choose
@@ -209,12 +235,15 @@ def split_measurement(
             half,
             frame=replace(half.frame, peak=peak),
             # where the scene is trusted here and there only, nobody knows what all pixels send
-            around=WholeSensor(scene, _times_of_grid(scene, grid), seed, device) if trust is None else None,
+            around=WholeSensor(scene, times_of_grid(scene, grid), seed, device) if trust is None else None,
         )
         for half in halves
     )
     rates = highest_event_rate(events), least_bus_rate(events, structure)
-    return SplitMeasurement(train, held, scout, bands, structure, peak, *rates, tuple(notes))
+    contradiction = contradiction_of_rest(events, light)
+    if contradiction:
+        notes.insert(0, contradiction)
+    return SplitMeasurement(train, held, scout, bands, structure, peak, *rates, tuple(notes), contradiction)
 
 
 def common_grid(events: Events, scene: Scene) -> Grid:
@@ -264,12 +293,17 @@ def least_bus_rate(events: Events, structure: TimestampStructure) -> float:
     return max((n / (float((events.t[n:] - events.t[:-n]).min()) + slack) for n in runs), default=0.0)
 
 
-def _times_of_grid(scene: Scene, grid: Grid) -> NDArray[np.float64]:
+def times_of_grid(scene: Scene, grid: Grid) -> NDArray[np.float64]:
     """Return the times of the grid, those of the scene itself where they are the same but for rounding."""
-    # a scene that is asked for its own times gives its own frames, to the bit
-    own = scene.sample_times()[: grid.steps]
-    same = len(own) == grid.steps and np.allclose(own, grid.times, rtol=0, atol=1e-3 * grid.step)
-    return own if same else grid.times
+    own = scene.sample_times()
+    first = int(np.searchsorted(own, grid.begin - 0.5 * grid.step))
+    own = own[first : first + grid.steps]
+    if len(own) == grid.steps and np.allclose(own, grid.times, rtol=0, atol=1e-3 * grid.step):
+        return own
+    # the last point may lie beyond the scene by a rounding
+    begin, end = (float(time) for time in scene.sample_times()[[0, -1]])
+    inside: NDArray[np.float64] = np.clip(grid.times, begin, end)
+    return inside
 
 
 def _make_subset(
@@ -297,13 +331,33 @@ def typical_changes(sums: ProbeSums) -> NDArray[np.float32]:
 def _require_enough_events(
     halves: list[PixelSubset], events: Events, grid: Grid, notes: list[str], least: int
 ) -> None:
-    for half, name in zip(halves, ("fitting", "judging"), strict=True):
-        count = int(half.found.halves.sum())
+    counts = [int(half.found.halves.sum()) for half in halves]
+    for half, count, name in zip(halves, counts, ("fitting", "judging"), strict=True):
         if count < least:
-            times = max(2.0, np.ceil(least / max(count, 1)))
+            helps = _what_helps(half, count, max(counts), events, grid, least)
             raise InputError(
                 f"too few events to say anything: {count} of the {len(events)} lie in the part for {name}, "
-                f"at least {least} are needed; record about {times:.0f} times "
-                f"as long as these {grid.step * (grid.steps - 1):.3g} s, or more motion"
-                + "".join(f"; {note}" for note in notes)
+                f"at least {least} are needed; {helps}" + "".join(f"; {note}" for note in notes)
             )
+
+
+def _what_helps(half: PixelSubset, count: int, other: int, events: Events, grid: Grid, least: int) -> str:
+    """Return what would give a part of a measurement enough events."""
+    stimulus, first = half.trials.stimulus, half.frame.first
+    begin, end = (grid.begin + grid.step * n for n in (first, stimulus.grid.steps))
+    inside = int(np.count_nonzero((events.t >= begin) & (events.t < end)))
+    size, looked = stimulus.width * stimulus.height, len(stimulus.pixels)
+    # twice as many as are missing on the average: pixels differ
+    wanted = int(np.ceil(2 * least / max(count, 1) * looked / 100) * 100)
+    if stimulus.holes and inside * looked >= 2 * least * size:
+        return "most lie where the scene is not known: frames more often or less motion help"
+    if count and wanted <= size // 2 and inside >= 2 * least:
+        return f"looking at more pixels helps, {wanted} instead of {looked} (pixels)"
+    span = f"{begin:.3g} s to {end:.3g} s"
+    if inside < len(events) // 20 and other >= least:
+        return f"nearly all others come before or after {span}: record what goes on over the whole time"
+    times = max(2.0, np.ceil(least / max(count, 1)))
+    if count * times < least or times > 50:
+        return f"from {span} the camera saw next to nothing: record more motion or more light"
+    length = grid.step * (grid.steps - 1)
+    return f"record about {times:.0f} times as long as these {length:.3g} s, or more motion"

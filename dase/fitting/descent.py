@@ -227,6 +227,8 @@ def denoised_normal_matrix(
     # what lines leave is chance, but for what runs along no line: the bound keeps that out
     rest = ((values - places @ lines.T) ** 2).sum(0) / max(len(places) - places.shape[1], 1)
     normal = lines.T @ (weights[:, None] * lines)
+    if not normal.any():  # no parameter changes anything, as thresholds of a scene at rest
+        return normal
     excess = (weights * np.minimum(rest, noise)).sum() * np.linalg.pinv(places.T @ places)
     # as `normal` sees directions, what it measures is 1 along each; a part of that stays at least, for less
     # would not be positive, and with it nothing could be solved

@@ -14,10 +14,12 @@ from dase.fitting.data_split import SPLIT, SplitMeasurement, split_measurement
 from dase.fitting.measurement import Measured, SceneChoice, as_measurement
 from dase.fitting.model import FittedModel, fit_present_model, model_of, refit_model
 from dase.fitting.parameter_space import SearchAxis
+from dase.fitting.plain_numbers import plain_numbers
+from dase.fitting.search_ends import is_where_it_began, parameters_at_bounds
 from dase.probes.distance import Judgement
 from dase.probes.random_streams import Draw, SimulationStream
 from dase.probes.stimulus import Trust
-from dase.results import Estimate, Fit, Progress
+from dase.results import Estimate, Fit, Progress, is_worse
 from dase.simulation.sensor import Sensor
 from dase.simulation.sensor_file import as_sensor
 
@@ -80,7 +82,7 @@ def fit(
     start = start.bound_to(measurement.scene)
     evidence = split_measurement(
         measurement.events, measurement.scene, log_eps=start.log_eps, trust=measurement.trust,
-        pixels=pixels, seed=seed, device=device,
+        span=measurement.span, pixels=pixels, seed=seed, device=device,
     )  # fmt: skip
     given = model_of(start, free)
     before = given.judge(evidence.held, repeats=REPEATS // 2, seed=SimulationStream.JUDGE.seed(seed)).error
@@ -89,11 +91,19 @@ def fit(
     tell("confidence intervals", 0.9, judgement.error)
     good = _equally_good_models(ends)
     model, values = estimate_parameters(evidence, model, seed=seed)
-    judgement = model.judge(evidence.held, repeats=REPEATS, seed=SimulationStream.JUDGE.seed(seed))
+    stream = SimulationStream.JUDGE.seed(seed)
+    held = model.calibrate(evidence.held, repeats=REPEATS, seed=stream)
+    judgement = held.judge(stream)
+    stuck = is_where_it_began(model, given) and judgement.error > judgement.gate
+    plain = plain_numbers(held)
     apart = notes_on_disagreement(model, good, values)
+    values = widen_intervals(model, good, values)
     notes = [
+        *_notes_on_held_out_error(judgement, before),
         *evidence.notes,
         *apart,
+        *(["no descent left the start: the values are those that were given"] if stuck else []),
+        *parameters_at_bounds(model, values),
         *notes_on_implausible_values(model),
         *_notes_on_minimum(judgement, len(ends), len(good)),
     ]
@@ -109,6 +119,8 @@ def fit(
         notes=tuple(notes),
         evaluations=evidence.evaluations,
         seconds=time.perf_counter() - begin,
+        plain=plain,
+        contradiction=evidence.contradiction,
     )
     return measurement.noted(found)
 
@@ -178,13 +190,49 @@ def notes_on_disagreement(
 ) -> list[str]:
     """Return a sentence for each parameter in which equally good ends differ."""
     out = []
-    for n, axis in enumerate(best.space.axes):
-        places = np.array([m.place[n] for m in ends])
-        low, high = (float(axis.to_place(v)) for v in (values[axis.name].low, values[axis.name].high))
-        if np.ptp(places) > max(FIT.agree * 0.5 * (high - low), FIT.near):
-            found = ", ".join(f"{float(axis.to_value(p)):.3g}" for p in sorted(places))
-            out.append(f"{axis.name}: starts end at {found}; the data do not say which")
+    for n in _disagreeing_axes(best, ends, values):
+        axis = best.space.axes[n]
+        found = ", ".join(f"{float(axis.to_value(p)):.3g}" for p in sorted(m.place[n] for m in ends))
+        out.append(f"{axis.name}: starts end at {found}; the data do not say which")
     return out
+
+
+def _disagreeing_axes(
+    best: FittedModel, ends: Sequence[FittedModel], values: dict[str, Estimate]
+) -> list[int]:
+    """Return the indices of the axes on which equally good ends are apart."""
+    out = []
+    for n, axis in enumerate(best.space.axes):
+        low, high = (float(axis.to_place(v)) for v in (values[axis.name].low, values[axis.name].high))
+        if np.ptp([m.place[n] for m in ends]) > max(FIT.agree * 0.5 * (high - low), FIT.near):
+            out.append(n)
+    return out
+
+
+def widen_intervals(
+    best: FittedModel, ends: Sequence[FittedModel], values: dict[str, Estimate]
+) -> dict[str, Estimate]:
+    """Return estimates whose intervals reach all ends where equally good ends differ.
+
+    An interval beside one end says what the data tell near that end; where others are as good, it is not all
+    that the data leave open.
+    """
+    out = dict(values)
+    for n in _disagreeing_axes(best, ends, values):
+        axis, estimate = best.space.axes[n], values[best.space.axes[n].name]
+        found = [float(axis.to_value(m.place[n])) for m in ends]
+        low, high = min(estimate.low, *found), max(estimate.high, *found)
+        out[axis.name] = replace(estimate, low=low, high=high)
+    return out
+
+
+def _notes_on_held_out_error(judgement: Judgement, before: float) -> list[str]:
+    if not is_worse(judgement.error, before, judgement.gate):
+        return []
+    return [
+        f"the fit does not generalise: on pixels and time that it has not seen its error is "
+        f"{judgement.error:.2f}, that of the sensor as it was given {before:.2f}; keep that one"
+    ]
 
 
 def notes_on_implausible_values(model: FittedModel) -> list[str]:

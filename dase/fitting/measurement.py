@@ -43,17 +43,53 @@ class Measurement:
         scene: What the camera saw.
         trust: Where and when the scene is to be trusted; None for everywhere.
         notes: What was noticed while reading.
+        span: First and last time that is compared [s]; None for all.
     """
 
     events: Events
     scene: Scene
     trust: Trust | None = None
     notes: tuple[str, ...] = ()
+    span: tuple[float, float] | None = None
 
     def __repr__(self) -> str:
         trust = "everywhere" if self.trust is None else "in part"
         lines = [f"Measurement, its scene trusted {trust}", f"  {self.events}", f"  {self.scene}"]
         return fit_to_screen([*lines, *(f"  note: {note}" for note in self.notes)])
+
+    def part(
+        self,
+        begin: float | None = None,
+        end: float | None = None,
+        region: tuple[int, int, int, int] | None = None,
+    ) -> Measurement:
+        """Return the same measurement, of which only a part is compared.
+
+        Args:
+            begin: First time [s]; None for that of the measurement.
+            end: Last time [s]; None for that of the measurement.
+            region: First column and row, columns and rows; None for all pixels.
+
+        Raises:
+            InputError: The end is not after the begin, or the region is not on the sensor.
+        """
+        out = self
+        if begin is not None or end is not None:
+            span = -np.inf if begin is None else begin, np.inf if end is None else end
+            if not span[0] < span[1]:
+                raise InputError(f"the time to compare must not be empty, got {span[0]:g}..{span[1]:g} s")
+            out = replace(out, span=span)
+        if region is not None:
+            x, y, width, height = region
+            if min(x, y) < 0 or min(width, height) < 1:
+                raise InputError(f"a region must be x,y,w,h with w and h at least 1, got {region}")
+            if x + width > self.events.width or y + height > self.events.height:
+                size = f"{self.events.width}x{self.events.height}"
+                raise InputError(f"the region {width}x{height} from {x},{y} is not on the {size} sensor")
+            mask = np.zeros((self.events.height, self.events.width), np.bool_)
+            mask[y : y + height, x : x + width] = True
+            out = replace(out, trust=_trust_within(mask, out.trust))
+        return out
 
     def noted(self, found: Found) -> Found:
         """Return a finding with what was noticed while reading before its own notes."""

@@ -14,7 +14,16 @@ from dase.fitting.parameter_space import ParameterSpace
 from dase.fitting.scheduler import SimulationRequest, Work, answer_requests
 from dase.probes.accumulators import ProbeSums, StatisticsFrame, leave_groups_out
 from dase.probes.distance import ErrorScale, Judgement, judge_model
-from dase.probes.statistics import compute_statistics, is_compared, tolerance_of
+from dase.probes.statistics import (
+    LAYOUT,
+    compute_statistics,
+    events_of_spread,
+    is_compared,
+    lacks_events,
+    sampling_variance,
+    shortfall_of,
+    tolerance_of,
+)
 
 Array = NDArray[np.float64]
 
@@ -122,12 +131,16 @@ def _calibrate_by_repeats(subset: PixelSubset, sums: ProbeSums) -> CalibratedSub
     target, events = compute_statistics(subset.found, bare)
     # means of models with few events are drawn to those of the measurement, so these come first
     frame = replace(bare, measured=target[0])
-    values, _ = compute_statistics(sums, frame)
+    values, sent = compute_statistics(sums, frame)
     # variances add up: that of chance, and the square of what is of no concern
     square = np.maximum(tolerance_of(target[0], events[0]), 1e-9) ** 2
     # two single simulations differ by twice the variance of one
     between = 2.0 * values.var(0, ddof=1)
-    used = is_compared(target[0], events[0])
+    counted, here = events[0].copy(), sent.mean(0)
+    # the weight of these is what the model sends
+    counted[LAYOUT["spread"]] = events_of_spread(subset.found.halves.sum(1, dtype=np.float64))[0]
+    least = shortfall_of(counted, here)
+    used = is_compared(target[0], events[0]) | (least > 0)
     # sums over groups exist of the first repeat only, so one simulation stands against the measurement
     measured, present = (
         compute_statistics(leave_groups_out(one, frame), frame)[0] for one in (subset.found, sums)
@@ -139,6 +152,9 @@ def _calibrate_by_repeats(subset: PixelSubset, sums: ProbeSums) -> CalibratedSub
     share = 0.5 + 0.5 / len(values)
     # the mean of the repeats has nearly no sampling error of its own, which the jackknife of one repeat has
     seen = np.maximum(share * between, scatter - (0.5 - 0.5 / len(values)) * between)
+    # by the scatter of a model that sends too few, it would be close to everything
+    own = sampling_variance(measured, counted)
+    seen = np.where(lacks_events(counted, here), np.minimum(seen, own), seen)
     return CalibratedSubset(
         subset.trials,
         subset.found,
@@ -147,7 +163,7 @@ def _calibrate_by_repeats(subset: PixelSubset, sums: ProbeSums) -> CalibratedSub
         subset.load,
         scale=ErrorScale(target[0], np.sqrt(np.maximum(between, scatter) + square), used),
         chance=ErrorScale(target[0], np.sqrt(share * between + square), used),
-        seen=ErrorScale(target[0], np.sqrt(seen + square), used),
+        seen=ErrorScale(target[0], np.sqrt(seen + square), used, least),
         tolerance=np.sqrt(square),
         repeats=values,
         left_out=left_out,

@@ -51,11 +51,14 @@ class ErrorScale:
         target: Statistics of the measurement, shape (J,).
         sigma: Standard error of a difference, tolerance included, shape (J,).
         used: Which statistics are compared, shape (J,).
+        least: Standard errors that differences count as at least, shape (J,): a model that hardly sends the
+            events that a mean is taken over is not right about it. None for 0.
     """
 
     target: Array
     sigma: Array
     used: NDArray[np.bool_]
+    least: Array | None = None
 
     def z(self, values: Array) -> Array:
         """Return differences in standard errors, 0 where nothing is compared, shape (..., J)."""
@@ -77,12 +80,16 @@ class ErrorScale:
 
     def loss(self, values: Array) -> Array:
         """Return the robust distance, about 1 where the differences are chance, shape (...)."""
-        out: Array = pseudo_huber(self.z(values)) @ self.weights()
+        out: Array = self._rho(values) @ self.weights()
         return out
+
+    def _rho(self, values: Array) -> Array:
+        size = np.abs(self.z(values))
+        return pseudo_huber(size if self.least is None else np.maximum(size, self.least))
 
     def families(self, values: Array) -> dict[str, float]:
         """Return the robust distance of each family that is compared."""
-        rho = pseudo_huber(self.z(values))
+        rho = self._rho(values)
         used = {name: part for name, part in LAYOUT.items() if self.used[part].any()}
         return {name: float(rho[part][self.used[part]].mean()) for name, part in used.items()}
 
@@ -135,6 +142,9 @@ def judge_model(
     tolerance does not count as an error, and a model without any chance in it still has a floor. The gate is
     of chance alone: a measurement that the model is true of is not off by the tolerance.
 
+    The unit must not be the model's own: by its scatter, one that hardly sends an event would be close to
+    everything. So `seen` has the measurement's sampling errors where a model sends too few events.
+
     Args:
         repeats: Statistics of simulations with different seeds, shape (R, J).
         seen: Sampling errors of the difference between measurement and model.
@@ -161,8 +171,11 @@ def judge_model(
     error = float(seen.loss(mean)) / unit
     level = float(null.mean())
     gate = min(max(settings.close, reach), settings.widest)
+    z = seen.z(mean)
+    if seen.least is not None:
+        z = np.where(seen.least > 0, 0.0, z)  # nothing is to be said of a mean over events that are not there
     return Judgement(
-        error, gate, reach, level, families, limits, seen.z(mean), unit,
+        error, gate, reach, level, families, limits, z, unit,
         measured=seen.target, simulated=mean, compared=seen.used,
     )  # fmt: skip
 

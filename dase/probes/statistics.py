@@ -166,16 +166,29 @@ def _count_spread(products: Array, expected: Array) -> tuple[Array, Array]:
     """Split-half covariances over pixels of what is not expected, and Fano factors."""
     # state (moving, rest), then: products over the halves by their polarities, those of a half with itself
     of = products.reshape(-1, 2, 6)
-    e = expected.reshape(-1, 2, 2, 2)  # state, half, polarity
-    total = np.maximum(e.sum(2), 1.0)  # (B or 1, state, polarity)
-    both = np.sqrt(total[..., 0] * total[..., 1])
+    total, both = _counts_of_spread(expected)
     diagonal, own = of[..., [0, 3]], of[..., 4:]
     same = diagonal * 2 / total
     cross = (of[..., 1] + of[..., 2]) / both
     fano = (own + 2 * diagonal) / total
     values = np.concatenate([same, cross[..., None], fano], -1).reshape(len(of), -1)
-    events = np.concatenate([total, both[..., None], total], -1).reshape(len(e), -1)
-    return values, np.broadcast_to(events, values.shape)
+    return values, np.broadcast_to(events_of_spread(expected), values.shape)
+
+
+def _counts_of_spread(counts: Array) -> tuple[Array, Array]:
+    """Return events by state and polarity, at least one, (B, 2, 2), and means of both polarities, (B, 2)."""
+    total = np.maximum(counts.reshape(-1, 2, 2, 2).sum(2), 1.0)  # of state, half, polarity
+    return total, np.sqrt(total[..., 0] * total[..., 1])
+
+
+def events_of_spread(counts: Array) -> Array:
+    """Return how many events each statistic of `spread` rests on.
+
+    Args:
+        counts: Events of all pixels by state, half and polarity, shape (B, HALVES).
+    """
+    total, both = _counts_of_spread(counts)
+    return np.concatenate([total, both[..., None], total], -1).reshape(len(total), -1)
 
 
 def _rate_spectrum(clock: NDArray[np.int32], frame: StatisticsFrame) -> tuple[Array, Array]:
@@ -274,6 +287,58 @@ def tolerance_of(measured: Array, events: Array, *, relative: float = 0.015) -> 
     out[LAYOUT["stamps"]] = 0.02
     out[LAYOUT["spread"]] = 0.015 * np.maximum(1.0, np.abs(measured[LAYOUT["spread"]]))
     return out
+
+
+def sampling_variance(left: Array, events: Array) -> Array:
+    """Return the variance of statistics of the measurement, seen between groups of its pixels, shape (J,).
+
+    Args:
+        left: Statistics of the measurement without one group after the other, shape (G, J).
+        events: That each rests on, shape (J,).
+    """
+    out: Array = (len(left) - 1) * left.var(0)
+    # counts scatter at least by chance; where few came, groups may be alike by chance
+    counts = ~MEANS
+    for name in ("spread", "spectrum", "stamps"):
+        counts[LAYOUT[name]] = False
+    out[counts] = np.maximum(out, (events + 2.0) / (events + 3.0) ** 2)[counts]
+    return out
+
+
+def lacks_events(measured: Array, sent: Array, *, least_events: float = 25.0) -> NDArray[np.bool_]:
+    """Return where a model sends less than half of the events that a statistic rests on, (J,).
+
+    There the scatter of its repeats says nothing of that of the measurement. Only where enough was measured:
+    half of it is no chance of a true model then.
+
+    Args:
+        measured: Events of the measurement, shape (J,).
+        sent: Events of the model, shape (J,).
+        least_events: Of the measurement, below which nothing is said.
+    """
+    out: NDArray[np.bool_] = (measured >= least_events) & (sent < 0.5 * measured)
+    return out
+
+
+def shortfall_of(
+    measured: Array, sent: Array, *, least_events: float = 25.0, relative: float = 0.015
+) -> Array:
+    """Return by how many standard errors events are too few for a mean over them to be compared, (J,).
+
+    A mean over events that a model does not send is drawn to the measured one, so it would look right. From
+    a fourth of the events on, the lack of events is taken for the difference.
+
+    Args:
+        measured: Events of the measurement, shape (J,).
+        sent: Events of the model, shape (J,).
+        least_events: Of the measurement, below which nothing is said.
+        relative: Difference that is of no concern, as a share.
+    """
+    lack = np.log((measured + 3.0) / (sent + 3.0)) - np.log(4.0)
+    z = lack / np.sqrt((measured + 2.0) / (measured + 3.0) ** 2 + relative**2)
+    means = MEANS.copy()
+    means[LAYOUT["spread"]] = True
+    return np.where(means & (measured >= least_events), np.maximum(z, 0.0), 0.0)
 
 
 def is_compared(measured: Array, events: Array, *, least_events: float = 25.0) -> NDArray[np.bool_]:

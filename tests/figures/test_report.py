@@ -125,6 +125,33 @@ def checked(text: str) -> Page:
     return page
 
 
+def test_a_step_without_a_judged_candidate_has_no_figure():
+    """All candidates may be ruled out by the first look: there is nothing to draw then."""
+    ruled_out = tuple(
+        Rank(name, float("nan"), 0.0, 0.0, 1.0, {}, refined=False) for name in ("leak", "shot", "hot")
+    )
+    step = Step(("threshold",), 6.0, 1.3, {"rate": 6.0}, ruled_out, None, (), CELLS)
+    found = diagnosis(selected=(), errors=(6.0,), history=(step,))
+    page = checked(report.diagnosis_page(found, recording="office.h5"))
+    assert len(page.pictures) == 2
+    assert len(report.diagnosis_plates(found)) == 2
+
+
+def test_a_figure_that_fails_costs_the_figure(monkeypatch):
+    def fails(*args, **options):
+        raise RuntimeError("no <font>")
+
+    monkeypatch.setattr(report.diagnosis_figures, "draw_families", fails)
+    page = checked(report.comparison_page(comparison(), recording="office.h5"))
+    assert "The model is wrong" in page.words
+    assert "A figure could not be drawn here (RuntimeError: no <font>)" in page.words
+    assert len(page.pictures) == 2
+    monkeypatch.setattr(report, "ranking_of", fails)
+    page = checked(report.diagnosis_page(diagnosis(), recording="office.h5"))
+    assert "Missing: leak" in page.words
+    assert "RuntimeError" in page.words
+
+
 def test_comparison_page():
     page = checked(report.comparison_page(comparison(), recording="office.h5"))
     assert "The model is wrong" in page.words
