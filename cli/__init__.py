@@ -69,11 +69,18 @@ def dase_group() -> None:
 
 
 def main() -> None:
-    """Run the command line; wrong input is one sentence and exit code 2, an interrupt is exit code 130."""
+    """Run the command line.
+
+    Wrong input is one sentence and exit code 2; an interrupt is exit code 130, SIGTERM 143, SIGHUP 129.
+    """
+    from dase.datasets.interrupt import Terminated, raising_signals
     from dase.errors import InputError
 
     try:
-        code = dase_group.main(standalone_mode=False)
+        with raising_signals():
+            code = dase_group.main(standalone_mode=False)
+    except Terminated as signalled:
+        _exit_with(f"ended by {signalled}", 128 + signalled.number)
     except click.exceptions.Abort:
         _exit_with("interrupted", 130)
     except KeyboardInterrupt:

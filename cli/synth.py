@@ -114,7 +114,9 @@ def synth_command(
     )
     count = jobs if jobs is not None else (1 if device.startswith("cuda") else os.cpu_count() or 1)
     with _progress_bar(sequences, "sequences") as advance:
-        report = generate.generate_dataset(job, out, jobs=count, resume=resume, progress=advance)
+        report = generate.generate_dataset(
+            job, out, jobs=count, resume=resume, progress=advance, say=lambda line: click.echo(line, err=True)
+        )
     _print_summary(report)
     click.echo(f"Look at one: dase show {job.path(out, 0)}")
 

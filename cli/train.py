@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -60,11 +61,11 @@ def train_command(
     On several GPUs: torchrun --nproc-per-node 4 --no-python dase train ... --device cuda
     """
     from dase.errors import InputError
+    from dase.folder_lock import locking_folder
 
     try:
         from dase.learning import distributed
         from dase.learning import job as learning_job
-        from dase.learning.run import CHECKPOINT, RunSchedule, train_in_folder
     except ModuleNotFoundError as error:
         if error.name not in ("torch", "safetensors"):
             raise
@@ -75,13 +76,32 @@ def train_command(
     )  # fmt: skip
     device = distributed.join_processes(device)
     first = distributed.process_rank() == 0
+    with locking_folder(output) if first else nullcontext():
+        _train_job(job, output, device, minutes=minutes, resume=resume, tensorboard=tensorboard, first=first)
+    distributed.leave_processes()
+
+
+def _train_job(
+    job: Any,
+    output: Path,
+    device: str,
+    *,
+    minutes: float | None,
+    resume: bool,
+    tensorboard: bool,
+    first: bool,
+) -> None:
+    """Learn, in a folder that no other run writes to."""
+    from dase.learning import job as learning_job
+    from dase.learning.run import CHECKPOINT, RunSchedule, train_in_folder
+
     if first:
         learning_job.record_job(job, output, resume=resume)
     with _OpeningBar(silent=not first) as opened:
         training = learning_job.open_training(replace(job, backend=device), progress=opened)
     looks = 100 if device.startswith("cuda") else 25
     schedule = RunSchedule(
-        log_every=10 if preset == "tiny" else looks, seconds=None if minutes is None else 60 * minutes
+        log_every=10 if job.preset == "tiny" else looks, seconds=None if minutes is None else 60 * minutes
     )
     with _LiveLine(training, output if tensorboard and first else None, silent=not first) as look:
         # killed before its first checkpoint, a run begins anew
@@ -89,7 +109,6 @@ def train_command(
         last = train_in_folder(training, output, schedule=schedule, resume=resume, on_row=look)
     if first:
         _write_results(job, output, training, last)
-    distributed.leave_processes()
 
 
 def _write_results(job: Any, output: Path, training: Any, last: dict[str, float]) -> None:

@@ -92,9 +92,9 @@ def _is_job_of_demo(job: generate.DatasetJob, text: str | None) -> bool:
     return text is not None and identity(text) == identity(job.text())
 
 
-def _software_of(picture: Path) -> str | None:
+def _software_of(picture: Path) -> str:
     """Return which program a PNG says it was made with."""
     from PIL import Image
 
     with Image.open(picture) as opened:
-        return opened.info.get("Software")
+        return str(opened.info.get("Software"))
