@@ -90,6 +90,8 @@ def main() -> None:
         sys.exit(error.exit_code)
     except InputError as error:
         _exit_with(f"{error} (--{error.argument})" if error.argument else str(error), 2)
+    except MemoryError as error:
+        _exit_with(f"not enough memory: {error}" if str(error) else "not enough memory", 2)
     except BrokenPipeError:
         # the reader of our output has gone; nothing is left to say to it
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())

@@ -6,12 +6,12 @@ from pathlib import Path
 
 import click
 
-from dase.cli.options import parse_size
+from dase.cli.options import check_output, parse_size
 
 
 @click.command()
 @click.argument("source", type=click.Path(path_type=Path))
-@click.argument("target", type=click.Path(path_type=Path))
+@click.argument("target", type=click.Path(path_type=Path), callback=check_output)
 @click.option("--format", "format_", help="Format of TARGET.  [default: by its suffix]")
 @click.option("--size", callback=parse_size, metavar="WxH", help="Columns x rows.  [default: as SOURCE says]")
 @click.option("--events-only", is_flag=True, help="Leave frames behind.")

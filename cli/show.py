@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from dase.cli.options import parse_size
+from dase.cli.options import check_output, parse_size
 
 if TYPE_CHECKING:
     from dase.io.sequence import Sequence
@@ -15,7 +15,13 @@ if TYPE_CHECKING:
 
 @click.command()
 @click.argument("file", type=click.Path(path_type=Path))
-@click.option("-o", "--output", type=click.Path(path_type=Path), help="PNG or MP4.  [default: FILE as .png]")
+@click.option(
+    "-o",
+    "--output",
+    type=click.Path(path_type=Path),
+    callback=check_output,
+    help="PNG or MP4.  [default: FILE as .png]",
+)
 @click.option("--at", type=float, metavar="SECONDS", help="Show this time only.")
 @click.option(
     "--window",

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from dase.cli.options import device_or_backend_option, effects_option, parse_size
+from dase.cli.options import device_or_backend_option, effects_option, parse_size, refuse_beside
 
 if TYPE_CHECKING:
     from dase.datasets.generate import WorkReport
@@ -87,6 +87,7 @@ def synth_command(
     With --video, the events of your own high-speed video are written to the file OUT instead.
     """
     if video is not None:
+        refuse_beside("--video", "images", "sequences", "duration", "regime", "jobs", "format_", "resume")
         _synth_video(out, video, fps, sensor, effects, size, seed, device, frame_rate, labels)
         return
     if fps is not None:
@@ -134,12 +135,16 @@ def _synth_video(
     labels: bool,
 ) -> None:
     """Simulate one video into the file `out`."""
+    from dase.atomic_file import refuse_unwritable
     from dase.datasets import generate
+    from dase.io import find_writable_format
     from dase.scenes.video import open_video
     from dase.simulation.sensor_file import load_sensor
     from dase.simulation.sensor_run import sample_times
     from dase.simulation.user_effects import known_effects
 
+    refuse_unwritable(out)
+    find_writable_format(out)
     model = load_sensor(sensor, known_effects(effects))
     scene = open_video(video, fps=fps, size=size)
     with _progress_bar(len(sample_times(scene, model)), "frames") as advance:

@@ -60,7 +60,7 @@ def train_command(
 
     On several GPUs: torchrun --nproc-per-node 4 --no-python dase train ... --device cuda
     """
-    from dase.errors import InputError
+    from dase.errors import InputError, how_to_install
     from dase.folder_lock import locking_folder
 
     try:
@@ -69,7 +69,7 @@ def train_command(
     except ModuleNotFoundError as error:
         if error.name not in ("torch", "safetensors"):
             raise
-        raise InputError(f'learning needs {error.name}: pip install "dase[learn]"') from None
+        raise InputError(f"learning needs {error.name}: {how_to_install('learn')}") from None
     job = learning_job.Job(
         targets=targets, images=images or "", preset=preset, objective=objective, steps=steps, window=window,
         size=size, sequences=sequences, pattern=pattern, seed=seed, backend=device,

@@ -25,6 +25,11 @@ class InputError(ValueError):
         self.argument = argument
 
 
+def how_to_install(extra: str) -> str:
+    """Return how optional dependencies are installed: no package index has dase, its checkout has."""
+    return f'in the checkout of dase, pip install ".[{extra}]"'
+
+
 def nearest(name: str, known: Iterable[str]) -> str:
     """Return a hint for a misspelt `name`: the nearest known name, or the list of all of them."""
     known = sorted(known)

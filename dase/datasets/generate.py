@@ -37,6 +37,10 @@ from dase.version import __version__
 
 RECORD_FILE = "synth.toml"
 """File beside the sequences that holds everything that made them."""
+LONGEST_SEQUENCE = 36000.0
+"""Of one sequence [s]: times of all samples are held in memory, up to 1000 of them in a second."""
+MOST_FRAMES = 10_000_000
+"""Stored with one sequence."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -82,6 +86,15 @@ class DatasetJob:
             value = getattr(self, name)
             if not np.isfinite(value) or value <= 0:
                 raise InputError(f"{name.replace('_', ' ')} must be a number > 0, got {value:g}")
+        if self.duration > LONGEST_SEQUENCE:
+            raise InputError(
+                f"duration must be at most {LONGEST_SEQUENCE:g} s, got {self.duration:g}: make more sequences"
+            )
+        if self.duration * self.frame_rate > MOST_FRAMES:
+            raise InputError(
+                f"frame rate must give at most {MOST_FRAMES:,} frames in {self.duration:g} s, "
+                f"got {self.frame_rate:g}"
+            )
         if self.regime not in random_scenes.REGIME_NAMES:
             raise InputError(
                 f"there is no regime '{self.regime}': {nearest(self.regime, random_scenes.REGIME_NAMES)}"

@@ -9,7 +9,7 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from dase.errors import InputError
+from dase.errors import InputError, how_to_install
 
 Size = tuple[int, int]
 """Columns and rows."""
@@ -170,4 +170,4 @@ def refuse_bomb(packed: int, unpacked: int, ratio: int = BOMB_RATIO) -> None:
 
 def missing_extra(what: str, extra: str) -> InputError:
     """Return the error for a library that is not installed."""
-    return InputError(f'{what} needs an optional library: pip install "dase[{extra}]"')
+    return InputError(f"{what} needs an optional library: {how_to_install(extra)}")
