@@ -27,7 +27,10 @@ if TYPE_CHECKING:
 @effects_option
 @click.option("--sequences", default=10, show_default=True, help="How many sequences.")
 @click.option(
-    "--size", callback=parse_size, metavar="WxH", help="Columns x rows.  [default: the sensor's, or 346x260]"
+    "--size",
+    callback=parse_size,
+    metavar="WxH",
+    help="Columns x rows.  [default: the sensor's, else 346x260 or the video's]",
 )
 @click.option("--duration", default=1.0, show_default=True, help="Of each sequence [s].")
 @click.option(
@@ -59,6 +62,18 @@ if TYPE_CHECKING:
     help="Simulate this instead: a video, a folder of frames, or a recording with frames.",
 )
 @click.option("--fps", type=float, help="Frames per second of --video.  [default: what the file says]")
+@click.option(
+    "--gamma",
+    type=float,
+    help="Light is value ** gamma in --video.  [default: what the file says, else 2.2; 1 for a recording]",
+)
+@click.option(
+    "--between",
+    type=click.Choice(["auto", "motion", "lines"]),
+    default="auto",
+    show_default=True,
+    help="Between the frames of --video: follow their motion, or straight lines. auto: motion if over 2 ms.",
+)
 @click.option("--resume", is_flag=True, help="Finish what an interrupted run left in OUT.")
 def synth_command(
     out: Path,
@@ -77,6 +92,8 @@ def synth_command(
     device: str,
     video: Path | None,
     fps: float | None,
+    gamma: float | None,
+    between: str,
     resume: bool,
 ) -> None:
     """Simulate event sequences into the folder OUT.
@@ -88,10 +105,11 @@ def synth_command(
     """
     if video is not None:
         refuse_beside("--video", "images", "sequences", "duration", "regime", "jobs", "format_", "resume")
-        _synth_video(out, video, fps, sensor, effects, size, seed, device, frame_rate, labels)
+        _synth_video(out, video, fps, sensor, effects, size, seed, device, frame_rate, labels, gamma, between)
         return
-    if fps is not None:
-        raise click.UsageError("--fps goes with --video")
+    given = {"--fps": fps is not None, "--gamma": gamma is not None, "--between": between != "auto"}
+    for option in (name for name in given if given[name]):
+        raise click.UsageError(f"{option} goes with --video")
     from dase.datasets import generate
     from dase.simulation.sensor_file import dump_sensor, load_sensor
     from dase.simulation.user_effects import known_effects
@@ -133,6 +151,8 @@ def _synth_video(
     device: str,
     frame_rate: float,
     labels: bool,
+    gamma: float | None,
+    between: str,
 ) -> None:
     """Simulate one video into the file `out`."""
     from dase.atomic_file import refuse_unwritable
@@ -146,7 +166,10 @@ def _synth_video(
     refuse_unwritable(out)
     find_writable_format(out)
     model = load_sensor(sensor, known_effects(effects))
-    scene = open_video(video, fps=fps, size=size)
+    notes: list[str] = []
+    scene = open_video(video, fps=fps, size=size or model.size, gamma=gamma, between=between, notes=notes)
+    for note in notes:
+        click.echo(note)
     with _progress_bar(len(sample_times(scene, model)), "frames") as advance:
         report = generate.record_scene(
             scene,
