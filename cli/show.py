@@ -68,7 +68,10 @@ def show_command(
     if trust:
         _draw_trust(sequence, output, file.stem, window)
     elif suffix == ".mp4":
-        event_images.write_video(sequence, output, window=window)
+        if not event_images.write_video(sequence, output, window=window).plays_in_browsers:
+            click.echo(
+                "this OpenCV has neither H.264 nor VP9: the video is MPEG-4, which browsers do not play"
+            )
     else:
         figure = event_images.draw_sequence(sequence, title=file.stem, at=at, window=window)
         with io.replacing(output) as temporary:
