@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import os
+import subprocess
+import sys
+
 import cv2
 import numpy as np
 import pytest
@@ -107,3 +111,34 @@ def test_comments_about_a_parameter_stay_as_they_are():
     text = SensorText(dump_sensor(sensor), "here")
     fitted = text.describing(sensor.with_effect(type(sensor["threshold"])(on=0.25, off=0.3)))
     assert "(was " not in fitted.text
+
+
+def started(script: str, *arguments: object, **environment: str) -> subprocess.CompletedProcess[str]:
+    """Run a shell script in which "$@" is the command dase."""
+    command = ["sh", "-c", script, "sh", sys.executable, "-c", "from dase.cli import main; main()"]
+    return subprocess.run(
+        [*command, *map(str, arguments)],
+        capture_output=True,
+        text=True,
+        timeout=300,
+        check=False,
+        env=os.environ | environment,
+    )
+
+
+@pytest.mark.parametrize("closed", ["2>&-", ">&-", "<&-", "<&- >&- 2>&-"])
+def test_closed_streams_change_nothing(tmp_path, closed):
+    options = ("--size", "8x6", "--sequences", "1", "--duration", "0.05", "--jobs", "1")
+    done = started(f'"$@" {closed}', "synth", tmp_path / "out", *options)
+    assert done.returncode == 0, done.stderr
+    assert len(io.read(tmp_path / "out" / "sequence_00000.h5").frames) == 3
+    assert started(f'"$@" {closed}', "info", tmp_path / "none").returncode == 2
+
+
+def test_a_kernel_cache_that_cannot_be_written_names_its_variable(tmp_path):
+    (tmp_path / "file").touch()
+    options = ("--size", "8x6", "--sequences", "1", "--duration", "0.05", "--jobs", "1")
+    done = started('"$@"', "synth", tmp_path / "out", *options, WARP_CACHE_PATH=str(tmp_path / "file" / "x"))
+    assert done.returncode == 2
+    assert "WARP_CACHE_PATH names another folder" in done.stderr
+    assert len(done.stderr.splitlines()) == 1
