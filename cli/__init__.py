@@ -100,11 +100,19 @@ def dase_group() -> None:
 
 
 def main() -> None:
-    """Run the command line; wrong input is one sentence and exit code 2, an interrupt is exit code 130."""
+    """Run the command line.
+
+    Wrong input is one sentence and exit code 2; an interrupt is exit code 130, SIGTERM 143, SIGHUP 129.
+    """
+    _open_closed_streams()
+    from dase.datasets.interrupt import Terminated, raising_signals
     from dase.errors import InputError
 
     try:
-        code = dase_group.main(standalone_mode=False)
+        with raising_signals():
+            code = dase_group.main(standalone_mode=False)
+    except Terminated as signalled:
+        _exit_with(f"ended by {signalled}", 128 + signalled.number)
     except click.exceptions.Abort:
         _exit_with("interrupted", 130)
     except KeyboardInterrupt:
@@ -115,6 +123,8 @@ def main() -> None:
         sys.exit(error.exit_code)
     except InputError as error:
         _exit_with(f"{error} (--{error.argument})" if error.argument else str(error), 2)
+    except MemoryError as error:
+        _exit_with(f"not enough memory: {error}" if str(error) else "not enough memory", 2)
     except BrokenPipeError:
         # the reader of our output has gone; nothing is left to say to it
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
@@ -123,8 +133,34 @@ def main() -> None:
         reason = (
             "no space left on the disk" if error.errno == errno.ENOSPC else (error.strerror or str(error))
         )
+        if error.filename and _is_of_kernel_cache(str(error.filename)):
+            reason += ": compiled kernels cannot be kept there; WARP_CACHE_PATH names another folder"
         _exit_with(f"{error.filename}: {reason}" if error.filename else reason, 2)
     sys.exit(code if isinstance(code, int) else 0)
+
+
+def _open_closed_streams() -> None:
+    """Give standard streams that the caller has closed to the null device, like any that nobody reads.
+
+    Else the next file that is opened would get their number, and what is printed would go into it.
+    """
+    for number, name in enumerate(("stdin", "stdout", "stderr")):
+        try:
+            os.fstat(number)
+        except OSError:
+            os.open(os.devnull, os.O_RDWR)  # gets the lowest number that is free, which is this one
+        if getattr(sys, name) is None:
+            setattr(sys, name, os.fdopen(number, "w" if number else "r", closefd=False))
+
+
+def _is_of_kernel_cache(name: str) -> bool:
+    """Whether a path is in the folder of compiled kernels, or above it."""
+    warp = sys.modules.get("warp")
+    place = (warp and warp.config.kernel_cache_dir) or os.environ.get("WARP_CACHE_PATH")
+    if not place:
+        return False
+    one, other = os.path.realpath(name), os.path.realpath(place)
+    return os.path.commonpath([one, other]) in (one, other)
 
 
 def _exit_with(message: str, code: int) -> None:

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from dase.cli.options import reading_options
+from dase.cli.options import check_output, reading_options
 
 if TYPE_CHECKING:
     from dase.io.source import ReadOptions
@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
 @click.command()
 @click.argument("source", type=click.Path(path_type=Path))
-@click.argument("target", type=click.Path(path_type=Path))
+@click.argument("target", type=click.Path(path_type=Path), callback=check_output)
 @click.option("--format", "format_", help="Format of TARGET.  [default: by its suffix]")
 @click.option("--events-only", is_flag=True, help="Leave frames behind.")
 @reading_options

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from dase.cli.options import (
+    check_output,
     check_suffix,
     device_option,
     effects_option,
@@ -53,8 +54,20 @@ def print_explanation(ctx: click.Context, parameter: click.Parameter, value: str
 @scene_option
 @click.option("--auto", is_flag=True, help="Add what is found and go on until nothing is missing.")
 @click.option("--free", help="Parameters that may be refitted, with commas between.  [default: all]")
-@click.option("--json", "json_", type=click.Path(path_type=Path), help="Write the findings to this file.")
-@click.option("-o", "--output", type=click.Path(path_type=Path), help="Write the sensor with what was found.")
+@click.option(
+    "--json",
+    "json_",
+    type=click.Path(path_type=Path),
+    callback=check_output,
+    help="Write the findings to this file.",
+)
+@click.option(
+    "-o",
+    "--output",
+    type=click.Path(path_type=Path),
+    callback=check_output,
+    help="Write the sensor with what was found.",
+)
 @click.option(
     "--report",
     type=click.Path(path_type=Path),

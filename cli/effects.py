@@ -6,7 +6,7 @@ from pathlib import Path
 
 import click
 
-from dase.cli.options import effects_option
+from dase.cli.options import check_output, effects_option
 
 
 @click.group()
@@ -53,7 +53,13 @@ def show_effect(name: str, effects: tuple[Path, ...]) -> None:
 
 @effects_command.command("new")
 @click.argument("name")
-@click.option("-o", "--output", type=click.Path(path_type=Path), help="Python file.  [default: NAME.py]")
+@click.option(
+    "-o",
+    "--output",
+    type=click.Path(path_type=Path),
+    callback=check_output,
+    help="Python file.  [default: NAME.py]",
+)
 def new_effect(name: str, output: Path | None) -> None:
     """Write a Python file with a new effect NAME to fill in. It works as it is."""
     from dase.simulation import effect_template

@@ -8,6 +8,7 @@ from typing import Any
 import click
 
 from dase.cli.options import (
+    check_output,
     device_option,
     effects_option,
     fps_option,
@@ -21,7 +22,14 @@ from dase.cli.options import (
 @click.argument("sensor")
 @click.argument("recording", type=click.Path(path_type=Path))
 @click.argument("file", required=False, type=click.Path(path_type=Path))
-@click.option("-o", "--output", required=True, type=click.Path(path_type=Path), help="The fitted sensor.")
+@click.option(
+    "-o",
+    "--output",
+    required=True,
+    type=click.Path(path_type=Path),
+    callback=check_output,
+    help="The fitted sensor.",
+)
 @click.option("--free", help="Effects or effect.parameter to fit, with commas between.  [default: all]")
 @scene_option
 @fps_option

@@ -94,10 +94,25 @@ fps_option = click.option(
 )
 """`--fps N` of commands that compare with a recording, for `open_recorded`."""
 
+
+def check_output(ctx: click.Context, parameter: click.Parameter, value: Path | None) -> Path | None:
+    """Refuse a file that could not be written in the end, before any work."""
+    from dase.atomic_file import refuse_unwritable
+    from dase.errors import InputError
+
+    if value is not None:
+        try:
+            refuse_unwritable(value)
+        except InputError as error:
+            raise click.BadParameter(str(error)) from None
+    return value
+
+
 sensor_output = click.option(
     "-o",
     "--output",
     type=click.Path(path_type=Path),
+    callback=check_output,
     help="Sensor file to write; may be SENSOR itself.  [default: print it]",
 )
 """`-o FILE` of commands that write a sensor file; a command gets a path or None."""
@@ -136,9 +151,7 @@ def check_suffix(*suffixes: str) -> Callable[[click.Context, click.Parameter, Pa
     def check(ctx: click.Context, parameter: click.Parameter, value: Path | None) -> Path | None:
         if value is not None and value.suffix.lower() not in suffixes:
             raise click.BadParameter(f"'{value}' must end with {' or '.join(suffixes)}")
-        if value is not None and not value.parent.is_dir():
-            raise click.BadParameter(f"the folder '{value.parent}' does not exist")
-        return value
+        return check_output(ctx, parameter, value)
 
     return check
 
@@ -178,6 +191,15 @@ def part_options(command: Callable[..., Any]) -> Callable[..., Any]:
     for option in reversed(options):
         gathered = option(gathered)
     return gathered
+
+
+def refuse_beside(option: str, *names: str) -> None:
+    """Raise UsageError where the user gave one of these parameters, which do nothing beside an option."""
+    context = click.get_current_context()
+    for parameter in context.command.params:
+        given = context.get_parameter_source(parameter.name or "")
+        if parameter.name in names and given is click.core.ParameterSource.COMMANDLINE:
+            raise click.UsageError(f"{parameter.opts[0]} has no meaning beside {option}")
 
 
 def open_recorded(

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from dase.cli.options import reading_options
+from dase.cli.options import check_output, reading_options
 
 if TYPE_CHECKING:
     from dase.io.sequence import Sequence
@@ -16,7 +16,13 @@ if TYPE_CHECKING:
 
 @click.command()
 @click.argument("file", type=click.Path(path_type=Path))
-@click.option("-o", "--output", type=click.Path(path_type=Path), help="PNG or MP4.  [default: FILE as .png]")
+@click.option(
+    "-o",
+    "--output",
+    type=click.Path(path_type=Path),
+    callback=check_output,
+    help="PNG or MP4.  [default: FILE as .png]",
+)
 @click.option("--at", type=float, metavar="SECONDS", help="Show this time only.")
 @click.option(
     "--window",
@@ -63,7 +69,10 @@ def show_command(
     if trust:
         _draw_trust(sequence, output, printable(file.stem), window)
     elif suffix == ".mp4":
-        event_images.write_video(sequence, output, window=window)
+        if not event_images.write_video(sequence, output, window=window).plays_in_browsers:
+            click.echo(
+                "this OpenCV has neither H.264 nor VP9: the video is MPEG-4, which browsers do not play"
+            )
     else:
         figure = event_images.draw_sequence(sequence, title=printable(file.stem), at=at, window=window)
         with io.replacing(output) as temporary:

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from dase.cli.options import device_or_backend_option, effects_option, parse_size
+from dase.cli.options import device_or_backend_option, effects_option, parse_size, refuse_beside
 
 if TYPE_CHECKING:
     from dase.datasets.generate import WorkReport
@@ -27,7 +27,10 @@ if TYPE_CHECKING:
 @effects_option
 @click.option("--sequences", default=10, show_default=True, help="How many sequences.")
 @click.option(
-    "--size", callback=parse_size, metavar="WxH", help="Columns x rows.  [default: the sensor's, or 346x260]"
+    "--size",
+    callback=parse_size,
+    metavar="WxH",
+    help="Columns x rows.  [default: the sensor's, else 346x260 or the video's]",
 )
 @click.option("--duration", default=1.0, show_default=True, help="Of each sequence [s].")
 @click.option(
@@ -59,6 +62,18 @@ if TYPE_CHECKING:
     help="Simulate this instead: a video, a folder of frames, or a recording with frames.",
 )
 @click.option("--fps", type=float, help="Frames per second of --video.  [default: what the file says]")
+@click.option(
+    "--gamma",
+    type=float,
+    help="Light is value ** gamma in --video.  [default: what the file says, else 2.2; 1 for a recording]",
+)
+@click.option(
+    "--between",
+    type=click.Choice(["auto", "motion", "lines"]),
+    default="auto",
+    show_default=True,
+    help="Between the frames of --video: follow their motion, or straight lines. auto: motion if over 2 ms.",
+)
 @click.option("--resume", is_flag=True, help="Finish what an interrupted run left in OUT.")
 def synth_command(
     out: Path,
@@ -77,6 +92,8 @@ def synth_command(
     device: str,
     video: Path | None,
     fps: float | None,
+    gamma: float | None,
+    between: str,
     resume: bool,
 ) -> None:
     """Simulate event sequences into the folder OUT.
@@ -87,10 +104,12 @@ def synth_command(
     With --video, the events of your own high-speed video are written to the file OUT instead.
     """
     if video is not None:
-        _synth_video(out, video, fps, sensor, effects, size, seed, device, frame_rate, labels)
+        refuse_beside("--video", "images", "sequences", "duration", "regime", "jobs", "format_", "resume")
+        _synth_video(out, video, fps, sensor, effects, size, seed, device, frame_rate, labels, gamma, between)
         return
-    if fps is not None:
-        raise click.UsageError("--fps goes with --video")
+    given = {"--fps": fps is not None, "--gamma": gamma is not None, "--between": between != "auto"}
+    for option in (name for name in given if given[name]):
+        raise click.UsageError(f"{option} goes with --video")
     from dase.datasets import generate
     from dase.simulation.sensor_file import dump_sensor, load_sensor
     from dase.simulation.user_effects import known_effects
@@ -114,7 +133,9 @@ def synth_command(
     )
     count = jobs if jobs is not None else (1 if device.startswith("cuda") else os.cpu_count() or 1)
     with _progress_bar(sequences, "sequences") as advance:
-        report = generate.generate_dataset(job, out, jobs=count, resume=resume, progress=advance)
+        report = generate.generate_dataset(
+            job, out, jobs=count, resume=resume, progress=advance, say=lambda line: click.echo(line, err=True)
+        )
     _print_summary(report)
     click.echo(f"Look at one: dase show {job.path(out, 0)}")
 
@@ -130,16 +151,25 @@ def _synth_video(
     device: str,
     frame_rate: float,
     labels: bool,
+    gamma: float | None,
+    between: str,
 ) -> None:
     """Simulate one video into the file `out`."""
+    from dase.atomic_file import refuse_unwritable
     from dase.datasets import generate
+    from dase.io import find_writable_format
     from dase.scenes.video import open_video
     from dase.simulation.sensor_file import load_sensor
     from dase.simulation.sensor_run import sample_times
     from dase.simulation.user_effects import known_effects
 
+    refuse_unwritable(out)
+    find_writable_format(out)
     model = load_sensor(sensor, known_effects(effects))
-    scene = open_video(video, fps=fps, size=size)
+    notes: list[str] = []
+    scene = open_video(video, fps=fps, size=size or model.size, gamma=gamma, between=between, notes=notes)
+    for note in notes:
+        click.echo(note)
     with _progress_bar(len(sample_times(scene, model)), "frames") as advance:
         report = generate.record_scene(
             scene,

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import time
+from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -25,7 +27,7 @@ if TYPE_CHECKING:
 @click.option("--preset", default="default", show_default=True, help="default, tiny (for a CPU) or paper.")
 @click.option("--objective", default="", help="moments or wgan.  [default: the preset's]")
 @click.option("--steps", default=0, help="Generator steps.  [default: the preset's]")
-@click.option("--minutes", type=float, help="Time to take instead of a number of steps.")
+@click.option("--minutes", type=float, help="Time to take, reading included, instead of a number of steps.")
 @click.option("--window", default=0.05, show_default=True, help="Time in which events are counted [s].")
 @click.option("--size", callback=parse_size, metavar="WxH", help="Of scenes, if the target is a sensor file.")
 @click.option("--sequences", default=300, show_default=True, help="Simulated by a sensor file as the target.")
@@ -55,56 +57,92 @@ def train_command(
 
     Nothing has to be paired or calibrated. The folder gets sensor.toml, which `dase synth --sensor`,
     `dase compare` and `dase diagnose` take, its weights, a log and checkpoints; `dase show FOLDER` draws the
-    learned maps. A sensor file as TARGETS is simulated first: a test with known thresholds.
+    learned maps. What is learned so far is there from the first minute on. A sensor file as TARGETS is
+    simulated first: a test with known thresholds.
 
     On several GPUs: torchrun --nproc-per-node 4 --no-python dase train ... --device cuda
     """
-    from dase.errors import InputError
+    from dase.errors import InputError, how_to_install
+    from dase.folder_lock import locking_folder
 
     try:
         from dase.learning import distributed
         from dase.learning import job as learning_job
-        from dase.learning.run import CHECKPOINT, RunSchedule, train_in_folder
     except ModuleNotFoundError as error:
         if error.name not in ("torch", "safetensors"):
             raise
-        raise InputError(f'learning needs {error.name}: pip install "dase[learn]"') from None
+        raise InputError(f"learning needs {error.name}: {how_to_install('learn')}") from None
     job = learning_job.Job(
         targets=targets, images=images or "", preset=preset, objective=objective, steps=steps, window=window,
         size=size, sequences=sequences, pattern=pattern, seed=seed, backend=device,
     )  # fmt: skip
     device = distributed.join_processes(device)
     first = distributed.process_rank() == 0
+    with locking_folder(output) if first else nullcontext():
+        _train_job(job, output, device, minutes=minutes, resume=resume, tensorboard=tensorboard, first=first)
+    distributed.leave_processes()
+
+
+def _train_job(
+    job: Any,
+    output: Path,
+    device: str,
+    *,
+    minutes: float | None,
+    resume: bool,
+    tensorboard: bool,
+    first: bool,
+) -> None:
+    """Learn, in a folder that no other run writes to."""
+    began = time.monotonic()
+    from dase.learning import job as learning_job
+    from dase.learning.run import CHECKPOINT, RunSchedule, train_in_folder
+
     if first:
         learning_job.record_job(job, output, resume=resume)
     with _OpeningBar(silent=not first) as opened:
         training = learning_job.open_training(replace(job, backend=device), progress=opened)
     looks = 100 if device.startswith("cuda") else 25
     schedule = RunSchedule(
-        log_every=10 if preset == "tiny" else looks, seconds=None if minutes is None else 60 * minutes
+        log_every=10 if job.preset == "tiny" else looks,
+        seconds=None if minutes is None else max(60 * minutes - (time.monotonic() - began), 1.0),
     )
     with _LiveLine(training, output if tensorboard and first else None, silent=not first) as look:
         # killed before its first checkpoint, a run begins anew
         resume = resume and (output / CHECKPOINT).is_file()
-        last = train_in_folder(training, output, schedule=schedule, resume=resume, on_row=look)
+        last = train_in_folder(
+            training,
+            output,
+            schedule=schedule,
+            resume=resume,
+            on_row=look,
+            on_result=lambda row: _write_sensor(job, output, training, row),
+        )
     if first:
         _write_results(job, output, training, last)
-    distributed.leave_processes()
 
 
 def _write_results(job: Any, output: Path, training: Any, last: dict[str, float]) -> None:
     """Write the sensor and say what was learned."""
     from dase.learning import job as learning_job
 
-    width, height = training.scenery.scene_settings.width, training.scenery.scene_settings.height
-    recorded = None if job.targets_sensor else (width, height)
-    path = learning_job.write_sensor(
-        output, training.mean, mu=last["mu"], name=output.name or "learned", size=recorded
-    )
+    path = _write_sensor(job, output, training, last)
     learning_job.write_examples(output, training)
     for line in summary_of_run(last):
         click.echo(line)
     click.echo(f"{path}: try dase synth --sensor {path}, or look at it: dase show {output}")
+
+
+def _write_sensor(job: Any, output: Path, training: Any, row: dict[str, float]) -> Path:
+    """Write what has been learned so far as a sensor."""
+    from dase.learning import job as learning_job
+
+    width, height = training.scenery.scene_settings.width, training.scenery.scene_settings.height
+    recorded = None if job.targets_sensor else (width, height)
+    path: Path = learning_job.write_sensor(
+        output, training.mean, mu=row["mu"], name=output.name or "learned", size=recorded
+    )
+    return path
 
 
 def summary_of_run(row: dict[str, float]) -> list[str]:

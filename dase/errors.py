@@ -48,6 +48,11 @@ def printable(text: str) -> str:
     return text
 
 
+def how_to_install(extra: str) -> str:
+    """Return how optional dependencies are installed: no package index has dase, its checkout has."""
+    return f'in the checkout of dase, pip install ".[{extra}]"'
+
+
 def nearest(name: str, known: Iterable[str]) -> str:
     """Return a hint for a misspelt `name`: the nearest known name, or the list of all of them."""
     known = sorted(known)

@@ -82,8 +82,12 @@ def _start_warp() -> None:
 
 def _init_quietly() -> None:
     # the line comes from native code, so only the file descriptor can be held back
-    sys.stderr.flush()
-    kept = os.dup(2)
+    try:
+        sys.stderr.flush()
+        kept = os.dup(2)
+    except (AttributeError, OSError):  # closed: there is nothing to hold back
+        wp.init()
+        return
     with tempfile.TemporaryFile() as said:
         os.dup2(said.fileno(), 2)
         try:

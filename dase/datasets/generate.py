@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import os
 import time
 from collections.abc import Callable, Generator
 from concurrent.futures import FIRST_COMPLETED, ProcessPoolExecutor, wait
+from concurrent.futures.process import BrokenProcessPool
 from contextlib import closing
 from dataclasses import asdict, dataclass, replace
 from functools import lru_cache
@@ -18,8 +20,10 @@ import tomlkit
 from numpy.typing import NDArray
 
 from dase import io
-from dase.datasets.interrupt import DeferredInterrupt, defer_interrupt, ignore_interrupt
+from dase.datasets.interrupt import DeferredInterrupt, WorkerLife, defer_interrupt, ignore_interrupt
 from dase.errors import InputError, checked_integer, nearest
+from dase.folder_lock import locking_folder
+from dase.io.source import Source
 from dase.kernels import launch
 from dase.scenes import image_sources, random_scenes
 from dase.scenes.layers import LayerScene
@@ -34,6 +38,10 @@ from dase.version import __version__
 
 RECORD_FILE = "synth.toml"
 """File beside the sequences that holds everything that made them."""
+LONGEST_SEQUENCE = 36000.0
+"""Of one sequence [s]: times of all samples are held in memory, up to 1000 of them in a second."""
+MOST_FRAMES = 10_000_000
+"""Stored with one sequence."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -79,6 +87,15 @@ class DatasetJob:
             value = getattr(self, name)
             if not np.isfinite(value) or value <= 0:
                 raise InputError(f"{name.replace('_', ' ')} must be a number > 0, got {value:g}")
+        if self.duration > LONGEST_SEQUENCE:
+            raise InputError(
+                f"duration must be at most {LONGEST_SEQUENCE:g} s, got {self.duration:g}: make more sequences"
+            )
+        if self.duration * self.frame_rate > MOST_FRAMES:
+            raise InputError(
+                f"frame rate must give at most {MOST_FRAMES:,} frames in {self.duration:g} s, "
+                f"got {self.frame_rate:g}"
+            )
         if self.regime not in random_scenes.REGIME_NAMES:
             raise InputError(
                 f"there is no regime '{self.regime}': {nearest(self.regime, random_scenes.REGIME_NAMES)}"
@@ -138,6 +155,7 @@ def generate_dataset(
     jobs: int = 1,
     resume: bool = False,
     progress: Callable[[WorkReport], None] = lambda report: None,
+    say: Callable[[str], object] = lambda line: None,
 ) -> WorkReport:
     """Make all sequences of a job, each an atomic file, and return what they cost.
 
@@ -145,11 +163,15 @@ def generate_dataset(
         job: What to make; the same job gives the same bytes whatever `jobs` is.
         out: Folder, made if missing.
         jobs: Processes that share the work.
-        resume: Keep the sequences that an interrupted run of the same job has left.
+        resume: Keep the sequences that an interrupted run of the same job has left. They are known by the
+            record of the job in each file, and read through: what is damaged is made again, what is of
+            another job is set aside.
         progress: Called with the report of each finished sequence.
+        say: Takes lines about what was damaged or set aside.
 
     Raises:
-        InputError: `out` holds other work, or something in the job does not exist.
+        InputError: `out` holds other work or is being written by another process, something in the job does
+            not exist, or a worker process was ended from outside.
     """
     if jobs < 1:
         raise InputError(f"jobs must be >= 1, got {jobs}")
@@ -157,19 +179,20 @@ def generate_dataset(
     # what cannot work is refused before the folder is made or a process started
     image_sources.open_images(job.images)
     PixelArray(_sensor_of(job), 1, 1, device=job.backend)
-    todo = _prepare_folder(job, out, resume)
+    _check_record(job, out, resume)
     total = WorkReport()
-    jobs = min(jobs, max(len(todo), 1))
-    # closing ends the processes when `progress` raises
-    with defer_interrupt() as interrupt, closing(_make_sequences(job, out, todo, jobs, interrupt)) as reports:
-        for report in reports:
-            total = total.plus(report)
-            progress(report)
+    with defer_interrupt() as interrupt, locking_folder(out):
+        todo = _prepare_folder(job, out, resume, say)
+        # closing ends the processes when `progress` raises
+        with closing(_make_sequences(job, out, todo, min(jobs, max(len(todo), 1)), interrupt)) as reports:
+            for report in reports:
+                total = total.plus(report)
+                progress(report)
     return replace(total, seconds=time.perf_counter() - begin)
 
 
-def _prepare_folder(job: DatasetJob, out: Path, resume: bool) -> list[int]:
-    """Check the folder, leave the record in it, and return the sequences still to be made."""
+def _check_record(job: DatasetJob, out: Path, resume: bool) -> None:
+    """Raise InputError where the folder holds other work."""
     record = out / RECORD_FILE
     if out.exists() and not out.is_dir():
         raise InputError(f"{out} must be a folder, but it is a file")
@@ -182,12 +205,45 @@ def _prepare_folder(job: DatasetJob, out: Path, resume: bool) -> list[int]:
             raise InputError(
                 f"{out} was begun with other options (see {record}); to resume takes the same ones"
             )
-    out.mkdir(parents=True, exist_ok=True)
-    for stale in out.glob(".sequence_*.tmp.*"):  # of a run that was killed
-        stale.unlink()
-    with io.replacing(record) as temporary:
-        temporary.write_text(job.text(), "utf-8")
-    return [i for i in range(job.sequences) if not job.path(out, i).exists()]
+    elif not resume:
+        there = next((path for i in range(job.sequences) if (path := job.path(out, i)).exists()), None)
+        if there is not None:
+            raise InputError(
+                f"{out} holds '{there.name}', but no {RECORD_FILE} that says what made it: "
+                "choose another folder, or resume to keep what is of this job"
+            )
+
+
+def _prepare_folder(job: DatasetJob, out: Path, resume: bool, say: Callable[[str], object]) -> list[int]:
+    """Leave the record in a folder that is locked, and return the sequences still to be made."""
+    _check_record(job, out, resume)  # again: another run may just have ended
+    with io.replacing(out / RECORD_FILE) as temporary:
+        temporary.write_bytes(job.text().encode())
+    return [i for i in range(job.sequences) if not _is_made(job, out, i, say)]
+
+
+def _is_made(job: DatasetJob, out: Path, index: int, say: Callable[[str], object]) -> bool:
+    """Whether a sequence is there: whole, and by its own record of this job."""
+    path = job.path(out, index)
+    if not path.exists():
+        return False
+    try:
+        for _ in io.stream(path):
+            pass  # to the end: a file may be cut or damaged anywhere
+        for _ in io.pictures(path):
+            pass
+        found = io.find_format(path).beside(Source(path, None, []))[1]
+    except InputError as error:
+        say(f"{error}: made again")
+        return False
+    if found == _configuration(job, index):
+        return True
+    aside = next(
+        place for n in range(10**6) if not (place := path.with_name(f"{path.name}.other{n or ''}")).exists()
+    )
+    os.rename(path, aside)
+    say(f"{path} is of another job: set aside as '{aside.name}', and made again")
+    return False
 
 
 def _make_sequences(
@@ -200,8 +256,10 @@ def _make_sequences(
     # compiles the kernels once, before the processes race for it
     _warm_up(job)
     context = get_context("spawn")
-    stop = context.Event()
-    pool = ProcessPoolExecutor(jobs, mp_context=context, initializer=_begin_worker, initargs=(stop,))
+    stop = context.RawValue("b", 0)  # no lock with it, which a worker that is killed could hold for ever
+    pool = ProcessPoolExecutor(
+        jobs, mp_context=context, initializer=_begin_worker, initargs=(os.getpid(), stop)
+    )
     try:
         with ignore_interrupt():
             left = {pool.submit(_in_worker, job, out, index) for index in todo}
@@ -211,10 +269,16 @@ def _make_sequences(
             for future in done:
                 yield future.result()
             interrupt.check()
+    except BrokenProcessPool:
+        interrupt.check()  # a signal to the whole group ends the workers, too
+        raise InputError(
+            f"{out}: a worker process was ended from outside, perhaps for want of memory: "
+            "resume with fewer processes",
+            argument="jobs",
+        ) from None
     finally:
         # workers end at their next chunk and leave no half-written file behind
-        if left:
-            stop.set()
+        stop.value = 1
         pool.shutdown(cancel_futures=True)
 
 
@@ -230,20 +294,21 @@ def _warm_up(job: DatasetJob) -> None:
     run.thresholds()
 
 
-def _begin_worker(stop: Any) -> None:
-    global _stop
+def _begin_worker(parent: int, stop: Any) -> None:
+    global _life
     # the processes share the cores already; threads of each would compete for them
     launch.set_threads(1)
-    _stop = DeferredInterrupt(stop)
+    _life = WorkerLife(parent, stop)
 
 
-_stop: DeferredInterrupt | None = None
-"""In a worker process: whether the others want it to end."""
+_life: WorkerLife | None = None
+"""In a worker process: what ends it."""
 
 
 def _in_worker(job: DatasetJob, out: Path, index: int) -> WorkReport:
-    assert _stop is not None
-    return make_sequence(job, out, index, _stop)
+    assert _life is not None
+    with _life.busy:
+        return make_sequence(job, out, index, _life.interrupt)
 
 
 @lru_cache(maxsize=1)
@@ -269,16 +334,25 @@ def make_scene(job: DatasetJob, index: int) -> LayerScene:
     )
 
 
+def _sensor_seed(job: DatasetJob, index: int) -> int:
+    """Return the seed of the sensor: sequences share neither scene nor pixels' random numbers."""
+    return int(np.random.default_rng([job.seed, index, 1]).integers(2**31))
+
+
+def _configuration(job: DatasetJob, index: int) -> str:
+    """Return the text in the file of a sequence, which says of what job it is."""
+    return job.text() + f"\n[sequence]\nindex = {index}\nsensor_seed = {_sensor_seed(job, index)}\n"
+
+
 def make_sequence(job: DatasetJob, out: Path, index: int, interrupt: DeferredInterrupt) -> WorkReport:
     """Simulate one sequence and write its file; an interrupt leaves nothing and raises KeyboardInterrupt."""
     begin = time.perf_counter()
     sensor = _sensor_of(job)
     scene = make_scene(job, index)
-    # sequences share neither scene nor pixels' random numbers
-    seed = int(np.random.default_rng([job.seed, index, 1]).integers(2**31))
+    seed = _sensor_seed(job, index)
     run = SensorRun(scene, sensor, seed=seed, device=job.backend, labels=job.labels)
     with io.create(job.path(out, index)) as writer:
-        writer.configuration(job.text() + f"\n[sequence]\nindex = {index}\nsensor_seed = {seed}\n")
+        writer.configuration(_configuration(job, index))
         frame_times = np.arange(0, scene.duration, 1 / job.frame_rate)
         report = _record_into(writer, run, frame_times, lambda done: interrupt.check())
     return replace(report, seconds=time.perf_counter() - begin)

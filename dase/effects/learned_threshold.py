@@ -10,7 +10,7 @@ import numpy as np
 import warp as wp
 
 from dase.effects.base import Effect, asset, hidden, parameter
-from dase.errors import InputError
+from dase.errors import InputError, how_to_install
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -66,7 +66,7 @@ class LearnedThreshold(Effect):
             from dase.networks.weights_file import predict_thresholds
         except ImportError:
             raise InputError(
-                f"effect '{self.name}' needs PyTorch and safetensors: pip install \"dase[learn]\""
+                f"effect '{self.name}' needs PyTorch and safetensors: {how_to_install('learn')}"
             ) from None
         times = scene.sample_times()
         grey = scene.frames(times[len(times) // 2 :][:1])[0]

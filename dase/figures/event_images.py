@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -142,7 +143,24 @@ def moment_times(sequence: Sequence, count: int) -> list[float]:
     return [float(time) for time in times]
 
 
-def write_video(sequence: Sequence, path: Path, *, window: float | None = None) -> None:
+@dataclass(frozen=True)
+class VideoCodec:
+    """How a video is packed.
+
+    Args:
+        letters: Four, by which OpenCV knows it.
+        plays_in_browsers: Whether browsers play it.
+    """
+
+    letters: str
+    plays_in_browsers: bool
+
+
+CODECS = (VideoCodec("avc1", True), VideoCodec("vp09", True), VideoCodec("mp4v", False))
+"""H.264, VP9 and MPEG-4, of which builds of OpenCV for free software often lack the first."""
+
+
+def write_video(sequence: Sequence, path: Path, *, window: float | None = None) -> VideoCodec:
     """Write a video: every frame with the events since the frame before over it.
 
     Frames are shown at their own pace up to 60 per second, faster ones at 30. Without frames each picture
@@ -153,25 +171,42 @@ def write_video(sequence: Sequence, path: Path, *, window: float | None = None) 
         path: An .mp4 file; appears when it is complete.
         window: Span of events in each picture [s]; default: the time between frames, or 1/30 s.
 
+    Returns:
+        What it is packed in: the first of `CODECS` that OpenCV has here.
+
     Raises:
         InputError: `window` is not positive, or no video can be written here.
     """
-    import cv2
-
     if window is not None:
         _checked_window(sequence, window)
     begins, ends, rate = _video_times(sequence, window)
     scale = max(1, math.ceil(480 / sequence.events.width))
     size = tuple(n * scale // 2 * 2 for n in (sequence.events.width, sequence.events.height))
     with replacing(path) as temporary:
-        out = cv2.VideoWriter(str(temporary), cv2.VideoWriter.fourcc(*"mp4v"), rate, size)
-        if not out.isOpened():
+        out, codec = _open_video_writer(temporary, rate, size)
+        if out is None:
             raise InputError(f"{path}: OpenCV cannot write this video")
         try:
             for picture in _video_pictures(sequence, begins, ends, scale):
                 out.write(np.ascontiguousarray(picture[: size[1], : size[0], ::-1]))
         finally:
             out.release()
+    return codec
+
+
+def _open_video_writer(path: Path, rate: float, size: tuple[int, ...]) -> tuple[Any, VideoCodec]:
+    """Return a writer with the first codec that opens, None where none does, and the codec."""
+    import cv2
+
+    from dase.io.ffmpeg import quiet_ffmpeg
+    from dase.io.image_files import quiet_opencv
+
+    for codec in CODECS:
+        with quiet_ffmpeg(), quiet_opencv():  # what is missing is tried, not an error
+            out = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*codec.letters), rate, size)
+        if out.isOpened():
+            return out, codec
+    return None, CODECS[-1]
 
 
 def _video_times(

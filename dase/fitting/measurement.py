@@ -321,7 +321,7 @@ def camera_rests(scene: CameraScene, *, looks: int = 8, movement: float = 0.1) -
     return bool(np.median([np.median(way) for way in ways]) < movement)
 
 
-def open_clip(path: Path) -> VideoScene:
+def open_clip(path: Path) -> Scene:
     """Return the scene of a video, of a folder of pictures, or of an archive with `frames` and `frame_us`."""
     if not path.exists():
         raise InputError(f"scene {path} does not exist")

@@ -62,7 +62,7 @@ def open_video(path: Path) -> Any:
     """Open a video with FFmpeg; raises InputError where it cannot be, or its frames are absurdly large."""
     packed = path.stat().st_size
     # without decoders, which would decode a frame to be asked its size; FFmpeg calls that an error
-    with _at_once(FLOOR + 2 * packed), _quiet_ffmpeg():
+    with _at_once(FLOOR + 2 * packed), quiet_ffmpeg():
         size = size_of(_open_capture(path, "codec_whitelist;none"))
     if min(size) < 1:  # of MPEG-4 only the decoder knows it
         size = UNTOLD
@@ -165,7 +165,7 @@ def _at_once(most: int) -> Iterator[None]:
 
 
 @contextmanager
-def _quiet_ffmpeg() -> Iterator[None]:
+def quiet_ffmpeg() -> Iterator[None]:
     """Keep FFmpeg quiet, also where it was used before it could be told so by its environment."""
     library = _find_libavutil()
     if library is not None:

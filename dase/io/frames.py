@@ -26,6 +26,8 @@ from dase.io.source import Picture, Source, checked_size, refuse_bomb
 from dase.io.video_file import FrameReader
 from dase.text_files import stands_for
 
+TIMES = "timestamps.txt"
+"""File in a folder of pictures with their times."""
 FRAMES_RATIO = 1000
 """How many times its size the frames of a file may take together: ten times what one alone may, as frames of
 a video repeat each other. Moving scenes stay far below."""
@@ -105,16 +107,19 @@ def _refuse_many(reader: FrameReader) -> None:
 
 def _frame_times(source: Source, reader: FrameReader) -> NDArray[np.float64]:
     """Return the times of the frames [s], not a number where nothing tells them, which is noted."""
-    listed = source.path / "timestamps.txt"
+    listed = source.path / TIMES
     if source.path.is_dir() and listed.is_file():
-        return _listed_times(listed, len(reader))
+        return listed_times(listed, len(reader))
+    if reader.times is not None:
+        return reader.times
     if 0 < reader.rate < 1e7:
         return np.arange(len(reader)) / reader.rate
     source.note("nothing tells the times of the frames", "assumed", "frames")
     return np.full(len(reader), np.nan)
 
 
-def _listed_times(path: Path, count: int) -> NDArray[np.float64]:
+def listed_times(path: Path, count: int) -> NDArray[np.float64]:
+    """Return the times of pictures [s] that a text says; raises InputError where it does not."""
     rows = [line.split() for line in path.read_text("latin-1").splitlines() if line.split("#")[0].strip()]
     for k in (0, -1):
         try:

@@ -65,6 +65,16 @@ def to_levels(pixels: NDArray[Any]) -> NDArray[np.uint8]:
     return out
 
 
+def cut_and_resize(picture: NDArray[Any], size: tuple[int, int]) -> NDArray[Any]:
+    """Return the middle of a picture (H, W), cut to the shape of `size` (columns, rows), in that size."""
+    height, width = picture.shape
+    columns = min(width, max(1, round(height * size[0] / size[1])))
+    rows = min(height, max(1, round(width * size[1] / size[0])))
+    left, top = (width - columns) // 2, (height - rows) // 2
+    part = picture[top : top + rows, left : left + columns]
+    return np.asarray(cv2.resize(part, size, interpolation=cv2.INTER_AREA))
+
+
 def _row_bands(shape: tuple[int, ...]) -> Iterator[slice]:
     rows = max(1, BAND // max(1, shape[1]))
     return (slice(top, top + rows) for top in range(0, shape[0], rows))

@@ -10,7 +10,7 @@ from typing import Any, Literal, NamedTuple, TypedDict
 import numpy as np
 from numpy.typing import NDArray
 
-from dase.errors import InputError, checked_integer, printable
+from dase.errors import InputError, checked_integer, how_to_install, printable
 
 Size = tuple[int, int]
 """Columns and rows."""
@@ -220,4 +220,4 @@ def refuse_bomb(packed: int, unpacked: int, ratio: int = BOMB_RATIO) -> None:
 
 def missing_extra(what: str, extra: str) -> InputError:
     """Return the error for a library that is not installed."""
-    return InputError(f'{what} needs an optional library: pip install "dase[{extra}]"')
+    return InputError(f"{what} needs an optional library: {how_to_install(extra)}")

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from dase.errors import InputError
 from dase.io.ffmpeg import bounded_decoding, decoding_memory, open_video, pixel_format, refuse_titles, size_of
-from dase.io.image_files import decode_file, list_pictures, to_grey, to_levels
+from dase.io.image_files import cut_and_resize, decode_file, list_pictures, to_grey, to_levels
 from dase.text_files import stands_for
 
 PLAIN = bytes(4), b"BGR\x18"
@@ -24,7 +24,7 @@ class FrameReader:
 
     Args:
         path: Video file, or folder of pictures in the order of their names.
-        size: Columns and rows to resize to, or None.
+        size: Columns and rows to cut the middle to and resize to, or None.
     """
 
     def __init__(self, path: Path, size: tuple[int, int] | None = None):
@@ -40,6 +40,8 @@ class FrameReader:
         self._capture: Any = None
         self._plain: tuple[int, int] | None = None
         self.rate = 0.0
+        self.times: NDArray[np.float64] | None = None
+        """Of the frames of a video [s], from 0, where it does not say that they come evenly at `rate`."""
         self.packed = sum(file.stat().st_size for file in self._files or [path])
         """Bytes of all files."""
         self.decoding = 0
@@ -104,11 +106,13 @@ class FrameReader:
         if frame is None:
             return 0
         self.decoding = decoding_memory(capture)
-        self._first, count = frame.shape[:2], 1  # the number in the header is often wrong
+        self._first = frame.shape[:2]
         del frame
+        times = [float(capture.get(cv2.CAP_PROP_POS_MSEC))]  # the number in the header is often wrong
         while self._grab(capture) if self._plain is None else self._read(capture) is not None:
-            count += 1
-        return count
+            times.append(float(capture.get(cv2.CAP_PROP_POS_MSEC)))
+        self.times = _uneven_times(np.array(times) * 1e-3, self.rate)
+        return len(times)
 
     def _grab(self, capture: Any) -> bool:
         """Decode the next frame; what is far larger than the head of the file says cannot be decoded."""
@@ -149,8 +153,17 @@ class FrameReader:
     def _grey(self, pixels: NDArray[Any], path: Path) -> NDArray[np.float32]:
         if self._size is None:
             return to_grey(self._checked(pixels, path))[0]
-        grey: NDArray[np.float32] = cv2.resize(to_grey(pixels)[0], self._size, interpolation=cv2.INTER_AREA)
-        return grey
+        return cut_and_resize(to_grey(self._checked(pixels, path))[0], self._size)
+
+
+def _uneven_times(times: NDArray[np.float64], rate: float) -> NDArray[np.float64] | None:
+    """Return the times that frames say [s], from 0; None where they say none, or those of the rate."""
+    times = times - times[0]
+    if not (np.all(np.isfinite(times)) and np.all(np.diff(times) > 0)):
+        return None
+    # containers round times, Matroska to 1 ms
+    even = 0 < rate < 1e7 and np.allclose(times, np.arange(len(times)) / rate, rtol=0, atol=1.1e-3)
+    return None if even else times
 
 
 def _unpack_avi_frame(

@@ -33,7 +33,10 @@ class RunSchedule:
         score_every: Lines of the log between scores on held-out pairs; 0 for none.
         seconds: Time the run may take [s], which sets its number of steps; None keeps the recipe's.
         timed_steps: Steps from which, and over which, the speed is measured first where `seconds` is given:
-            the first steps are slower, while kernels are compiled and recorded.
+            the first steps are slower, while kernels are compiled and recorded. Where they take more than
+            `first_share` of the time, it is measured then.
+        first_share: See `timed_steps`.
+        result_every: Time between results for the user to take meanwhile [s].
     """
 
     log_every: int = 50
@@ -41,6 +44,8 @@ class RunSchedule:
     score_every: int = 2
     seconds: float | None = None
     timed_steps: int = 30
+    first_share: float = 0.25
+    result_every: float = 25.0
 
 
 class TrainingDiverged(InputError):
@@ -54,6 +59,7 @@ def train_in_folder(
     schedule: RunSchedule = RunSchedule(),
     resume: bool = False,
     on_row: Callable[[dict[str, float]], None] = lambda row: None,
+    on_result: Callable[[dict[str, float]], object] = lambda row: None,
 ) -> dict[str, float]:
     """Train to the end, in the folder `out`; return the last line of the log.
 
@@ -63,11 +69,14 @@ def train_in_folder(
         schedule: How often to log, score and save.
         resume: Go on from the checkpoint in `out`.
         on_row: Called with each line of the log.
+        on_result: Called now and then in the first process with what the maps of `training.mean` are, so that
+            there is a result long before the end.
 
     Raises:
         InputError: `out` holds another run, or nothing to resume.
         TrainingDiverged: A loss or weight is not finite; the last checkpoint is good.
     """
+    began = time.perf_counter()  # all that follows is part of the time the run may take
     out.mkdir(parents=True, exist_ok=True)
     path = out / CHECKPOINT
     if resume:
@@ -80,7 +89,7 @@ def train_in_folder(
     exam = MapEvaluation(training.scenery, training.target)
     pairs = training.target.held_out() if schedule.score_every else None
     held = None if pairs is None else HeldOutScore(training.scenery, pairs)
-    return _RunLoop(training, out, schedule, exam, held, on_row).run_steps()
+    return _RunLoop(training, out, schedule, exam, held, on_row, on_result).run_steps(began)
 
 
 class _RunLoop:
@@ -94,24 +103,30 @@ class _RunLoop:
         exam: MapEvaluation,
         held: HeldOutScore | None,
         on_row: Callable[[dict[str, float]], None],
+        on_result: Callable[[dict[str, float]], object],
     ):
         self.training, self.out, self.schedule = training, out, schedule
-        self.exam, self.held, self.on_row = exam, held, on_row
+        self.exam, self.held, self.on_row, self.on_result = exam, held, on_row, on_result
         self.broken = torch.full((), -1, device=training.device)
+        self._over = False
+        """Whether the time is over."""
+        self._planned = False
+        """Whether the first steps were so slow that the end was planned by them."""
         self.table = None if distributed.process_rank() else _LogTable(out / LOG, training.step)
 
-    def run_steps(self) -> dict[str, float]:
-        """Train to the end; return the last line of the log."""
+    def run_steps(self, began: float) -> dict[str, float]:
+        """Train to the end; return the last line of the log. The run began at this `time.perf_counter`."""
         training, schedule = self.training, self.schedule
         timed = schedule.timed_steps
-        begin = time.perf_counter() - training.seconds
-        saved = time.perf_counter()
+        begin = began - training.seconds
+        saved = shown = time.perf_counter()
         mark = max(training.step, timed), saved
+        first = training.step, time.perf_counter()
         row: dict[str, float] = {
             "step": training.step,
             "seconds": training.seconds,
         } | self.exam.describe_maps(training.mean)
-        while training.step < training.recipe.steps:
+        while training.step < training.recipe.steps and not self._over:
             values = training.advance()
             wrong = ~torch.isfinite(values["loss"]) & (self.broken < 0)
             self.broken = torch.where(wrong, training.step - 1, self.broken)
@@ -120,7 +135,8 @@ class _RunLoop:
                 if training.step > timed:
                     self._fit_time(*mark, begin)
                 mark = training.step, time.perf_counter()
-            last = training.step == training.recipe.steps
+            self._keep_time(first, begin)
+            last = training.step == training.recipe.steps or self._over
             if training.step % schedule.log_every == 0 or last:
                 _synchronise(training.device)
                 training.seconds = time.perf_counter() - begin
@@ -130,8 +146,33 @@ class _RunLoop:
                 if distributed.broadcast_number(waited or (last and schedule.save_every < math.inf)):
                     save_checkpoint(self.out / CHECKPOINT, training.state())
                     saved = time.perf_counter()
+            if self.table is not None and time.perf_counter() - shown > schedule.result_every:
+                self.on_result(self.exam.describe_maps(training.mean))
+                shown = time.perf_counter()
         save_checkpoint(self.out / RESULT, {"net": training.mean.state_dict(), "row": row})
         return row
+
+    def _keep_time(self, first: tuple[int, float], begin: float) -> None:
+        """End the run when its time is over, and plan its end early where steps are slow.
+
+        Args:
+            first: Step and time at which the first step began.
+            begin: Of the run.
+        """
+        training, seconds = self.training, self.schedule.seconds
+        steps = training.step - first[0]
+        if seconds is None or (steps > self.schedule.timed_steps and training.step % self.schedule.log_every):
+            return  # by then the end was planned by the speed; processes agree here, which takes a while
+        elapsed = distributed.broadcast_number(time.perf_counter() - begin)
+        if elapsed >= seconds:
+            self._over = True
+            training.recipe = replace(training.recipe, steps=max(training.step, 1))
+            _write_recipe(self.out, training.recipe)
+            return
+        slow = 0 < steps < self.schedule.timed_steps and elapsed >= self.schedule.first_share * seconds
+        if slow and not self._planned:
+            self._fit_time(*first, begin)
+            self._planned = True
 
     def _fit_time(self, step: int, mark: float, begin: float) -> None:
         """Set the number of steps so that the run takes the time it may, by its speed since `mark`."""
@@ -140,7 +181,8 @@ class _RunLoop:
         now = time.perf_counter()
         each = distributed.broadcast_number((now - mark) / (training.step - step))
         left = distributed.broadcast_number(self.schedule.seconds - (now - begin))
-        training.recipe = replace(training.recipe, steps=training.step + max(int(0.97 * left / each), 1))
+        steps = training.step + max(int(0.97 * left / each), 1)  # below 1 while critics warm up
+        training.recipe = replace(training.recipe, steps=max(steps, 1))
         _write_recipe(self.out, training.recipe)
 
     def _log_row(self, values: dict[str, torch.Tensor], last: bool) -> dict[str, float]:

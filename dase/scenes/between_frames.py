@@ -14,8 +14,7 @@ from dase.events import Events
 from dase.kernels import launch, scene_frames
 from dase.kernels.pixel_stages import Frames
 from dase.scenes.frame_motion import FrameMatch, match_frames
-from dase.scenes.scene import SamplingSettings, Scene
-from dase.scenes.video import LOG_EPS
+from dase.scenes.scene import LOG_EPS, SamplingSettings, Scene
 
 
 @dataclass(frozen=True)

@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from dase.errors import InputError, checked_integer
+from dase.errors import InputError, checked_integer, how_to_install
 from dase.io.image_files import SUFFIXES, decode_file, list_pictures, to_grey
 from dase.text_files import parse_json, stands_for
 
@@ -175,7 +175,7 @@ class CocoImages(ImageSource):
         try:
             from pycocotools.coco import COCO
         except ImportError:
-            raise InputError('images: coco: needs pycocotools; pip install "dase[coco]"') from None
+            raise InputError(f"images: coco: needs pycocotools: {how_to_install('coco')}") from None
         self.name = name
         self._file, self._folder = annotations, directory
         images, instances = _read_annotations(annotations)

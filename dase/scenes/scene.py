@@ -9,6 +9,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+LOG_EPS = 1e-3
+"""Added to intensities before the logarithm between frames; that of sensors unless they say otherwise."""
+
 
 @dataclass(frozen=True)
 class SamplingSettings:

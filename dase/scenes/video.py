@@ -5,7 +5,6 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 import warp as wp
 from numpy.typing import ArrayLike, NDArray
@@ -13,26 +12,33 @@ from numpy.typing import ArrayLike, NDArray
 from dase import io
 from dase.errors import InputError
 from dase.io import frames as picture_frames
+from dase.io.image_files import cut_and_resize, list_pictures
 from dase.io.video_file import FrameReader
 from dase.kernels import pixel_stages
 from dase.kernels.scene_layers import interpolate_frames
+from dase.scenes.between_frames import CameraScene
+from dase.scenes.light import SRGB_GAMMA, check_gamma, check_light, to_light
+from dase.scenes.scene import LOG_EPS as LOG_EPS
 from dase.scenes.scene import Scene
-
-LOG_EPS = 1e-3
-"""Added to intensities before the logarithm between frames; that of sensors unless they say otherwise."""
 
 
 class VideoScene(Scene):
     """Frames at given times; between two frames the log intensity of a pixel runs straight.
 
     Args:
-        frames: Linear intensity in [0, 1], shape (F, height, width).
+        frames: Intensity, shape (F, height, width). Whole numbers without a sign are taken by the range of
+            their type (255 or 65535 is white), real numbers by 1.
         times: Times of the frames [s], increasing, shape (F,); the scene begins with the first.
+        gamma: Linear intensity is value ** gamma: 1 for linear values, 2.2 for pictures and videos.
+
+    Raises:
+        InputError: Shapes or times do not fit, or a value cannot be light.
     """
 
     anytime = True
 
-    def __init__(self, frames: ArrayLike | FrameReader, times: ArrayLike):
+    def __init__(self, frames: ArrayLike | FrameReader, times: ArrayLike, *, gamma: float = 1.0):
+        self.gamma = check_gamma(gamma)
         self._frames = frames if isinstance(frames, FrameReader) else np.asarray(frames)
         self._times = np.asarray(times, np.float64)
         if self._frames.ndim != 3 or min(self._frames.shape) < 1:
@@ -41,10 +47,8 @@ class VideoScene(Scene):
             raise InputError(f"video: {len(self._frames)} frames need as many times, got {self._times.shape}")
         if not np.all(np.isfinite(self._times)) or not np.all(np.diff(self._times) > 0):
             raise InputError("video: frame times must be finite and increase")
-        if isinstance(self._frames, np.ndarray) and not (
-            np.all(np.isfinite(self._frames)) and self._frames.min() >= 0
-        ):
-            raise InputError("video: intensities must be finite and >= 0")
+        if isinstance(self._frames, np.ndarray):
+            check_light(self._frames, "video")
         self.height, self.width = self._frames.shape[1:]
         self.duration = float(self._times[-1] - self._times[0])
 
@@ -65,7 +69,7 @@ class VideoScene(Scene):
 
     def frames(self, times: NDArray[np.float64], device: str = "cpu") -> NDArray[np.float32]:
         """Return the frames at `times`, which must be times of frames, shape (K, height, width)."""
-        return np.asarray(self._at(times), np.float32)
+        return to_light(self._at(times), gamma=self.gamma)
 
     def _rows(self, index: NDArray[np.int64], pixels: NDArray[np.int32]) -> NDArray[np.float32]:
         if isinstance(self._frames, np.ndarray) and np.all(np.diff(index) == 1):
@@ -74,7 +78,7 @@ class VideoScene(Scene):
             frames = self._frames[index]
         flat = frames.reshape(len(index), -1)
         every = np.array_equal(pixels, np.arange(flat.shape[1]))
-        return np.ascontiguousarray(flat if every else flat[:, pixels], np.float32)
+        return np.ascontiguousarray(to_light(flat if every else flat[:, pixels], gamma=self.gamma))
 
     def _between(
         self, times: NDArray[np.float64], above: NDArray[np.int64], pixels: NDArray[np.int32], device: Any
@@ -119,13 +123,7 @@ def as_scene(scene: Scene | ArrayLike, *, fps: float | None = None, times: Array
         )
     if (fps is None) == (times is None):
         raise InputError("scene: frames need either fps, such as fps=1000, or times, one for each frame [s]")
-    if frames.dtype.kind == "u":
-        frames = frames / np.float32(np.iinfo(frames.dtype).max)
-    elif frames.size and not (frames.min() >= 0 and frames.max() <= 1):
-        raise InputError(
-            f"scene: frames of real numbers must lie in [0, 1], got {frames.min():g}..{frames.max():g}; "
-            "divide them by the value of white"
-        )
+    check_light(frames, "scene", most=1.0)
     if fps is None:
         return VideoScene(frames, np.asarray(times, np.float64))
     _check_rate(fps)
@@ -137,26 +135,111 @@ def _check_rate(fps: float | None) -> None:
         raise InputError(f"fps must be a number > 0, got {fps:g}")
 
 
-def open_video(path: Path, *, fps: float | None = None, size: tuple[int, int] | None = None) -> VideoScene:
+COARSEST = 2e-3
+"""Time between frames [s] up to which straight lines between them say enough; beyond it is motion."""
+
+
+def open_video(
+    path: Path,
+    *,
+    fps: float | None = None,
+    size: tuple[int, int] | None = None,
+    gamma: float | None = None,
+    between: str = "auto",
+    notes: list[str] | None = None,
+) -> VideoScene | CameraScene:
     """Return the scene of a video file, of a folder of frames, or of the frames of a recording.
 
     Args:
         path: File or folder; the events of a recording, such as a sequence of `dase synth`, do not matter.
-        fps: Frames per second; None takes what the file says.
-        size: Columns and rows to resize to; None keeps the video's.
+        fps: Frames per second; None takes the times that the file, or `timestamps.txt` in the folder, says.
+        size: Columns and rows to cut to shape and resize to; None keeps the video's.
+        gamma: Linear intensity is value ** gamma. None takes the file's: 2.2 for pictures and videos unless
+            they say otherwise, 1 for recordings.
+        between: `lines` joins the frames by straight lines, `motion` follows the motion from frame to frame,
+            `auto` takes motion where frames are more than 2 ms apart.
+        notes: Gets sentences about what was assumed.
 
     Raises:
         InputError: Missing or undecodable, or a folder without a rate.
     """
     _check_rate(fps)
-    path = Path(path)
+    if between not in BETWEEN:
+        raise InputError(f"between must be one of {', '.join(BETWEEN)}, got '{between}'")
+    path, notes = Path(path), [] if notes is None else notes
+    frames: Any
     if _is_recording(path):
-        return _scene_of(path, fps, size)
-    reader = FrameReader(path, size)
-    rate = fps or reader.rate
-    if not rate > 0:
-        raise InputError(f"{path} does not say how many frames it has per second: give fps", argument="fps")
-    return VideoScene(reader, np.arange(len(reader)) / rate)
+        frames, times = _frames_of_recording(path, fps, size)
+        found = 1.0
+    else:
+        frames = FrameReader(path, size)
+        times = _video_times(path, frames, fps)
+        found = _file_gamma(path)
+    if gamma is None:
+        gamma = found
+        notes.append(f"light is taken as value ** {gamma:g}: give gamma where that is wrong")
+    gap = float(np.median(np.diff(times)))
+    if between == "lines" or (between == "auto" and gap <= COARSEST * (1 + 1e-6)):
+        if gap > COARSEST:
+            notes.append(f"frames are {1e3 * gap:.1f} ms apart and joined by straight lines")
+        return VideoScene(frames, times, gamma=gamma)
+    kept = frames if isinstance(frames, np.ndarray) else _all_frames(frames)
+    scene = CameraScene(kept, times, gamma=gamma)
+    share = scene.trusted().mean()
+    notes.append(
+        f"frames are {1e3 * gap:.1f} ms apart: the motion from one to the next is followed, "
+        f"{100 * share:.0f} % of pixels and times are to be trusted (dase show --trust draws them)"
+    )
+    return scene
+
+
+BETWEEN = ("auto", "motion", "lines")
+"""What may be between frames, see `open_video`."""
+
+
+def _video_times(path: Path, reader: FrameReader, fps: float | None) -> NDArray[np.float64]:
+    """Return the times of frames [s], from 0: what the user says, else what lies beside or in the file."""
+    if fps is not None:
+        return np.arange(len(reader)) / fps
+    listed = path / picture_frames.TIMES
+    if path.is_dir() and listed.is_file():
+        times = picture_frames.listed_times(listed, len(reader))
+        return np.asarray(times - times[0])
+    if reader.times is not None:
+        return reader.times
+    if not reader.rate > 0:
+        raise InputError(f"{path} does not say how many frames it has per second: give its frame rate, fps")
+    return np.arange(len(reader)) / reader.rate
+
+
+def _file_gamma(path: Path) -> float:
+    """Return the gamma that the first picture of a folder says, else that of sRGB."""
+    from PIL import Image
+
+    first = next(iter(list_pictures(path)), None) if path.is_dir() else None
+    if first is None:
+        return SRGB_GAMMA
+    try:
+        with Image.open(first) as picture:
+            said = picture.info.get("gamma")  # of PNG: the power that the values are of light
+    except OSError:
+        return SRGB_GAMMA
+    return 1 / said if isinstance(said, float) and 0.1 <= said <= 10 else SRGB_GAMMA
+
+
+def _all_frames(reader: FrameReader, most: int = 8 << 30) -> NDArray[np.uint16]:
+    """Return all frames, of 16 bits, as motion is looked for in all of them."""
+    size = 2 * int(np.prod(reader.shape))
+    if size > most:
+        raise InputError(
+            f"video: its frames need {size / (1 << 30):.1f} GiB of memory to follow their motion, more than "
+            f"{most >> 30}: cut it into parts, give a smaller size, or join frames by lines",
+            argument="between",
+        )
+    out = np.empty(reader.shape, np.uint16)
+    for index in range(len(reader)):
+        out[index] = np.rint(np.float32(65535) * reader[np.array([index])][0])
+    return out
 
 
 def _is_recording(path: Path) -> bool:
@@ -168,16 +251,18 @@ def _is_recording(path: Path) -> bool:
         return False
 
 
-def _scene_of(path: Path, fps: float | None, size: tuple[int, int] | None) -> VideoScene:
-    """Return the scene of a recording's frames."""
+def _frames_of_recording(
+    path: Path, fps: float | None, size: tuple[int, int] | None
+) -> tuple[NDArray[Any], NDArray[np.float64]]:
+    """Return a recording's frames and their times [s] from 0."""
     sequence = io.read(path)
     if sequence.frames is None or len(sequence.frames) < 2:
         raise InputError(f"video {path}: the recording must have at least 2 frames to be taken for a video")
-    frames = sequence.frames
+    frames: NDArray[Any] = sequence.frames
     if size is not None:
-        frames = np.stack([cv2.resize(frame, size, interpolation=cv2.INTER_AREA) for frame in frames])
+        frames = np.stack([cut_and_resize(frame, size) for frame in frames])
     if fps is None and sequence.frame_times is None:
         raise InputError(f"{path} does not say when its frames were taken: give fps", argument="fps")
     times = sequence.frame_times if fps is None else np.arange(len(frames)) / fps
     assert times is not None
-    return VideoScene(frames / np.float32(255), times - times[0])
+    return frames, times - times[0]

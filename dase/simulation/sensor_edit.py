@@ -80,14 +80,23 @@ class SensorText:
         return self._checked(new, after)
 
     def with_values_of(self, effect: Effect) -> SensorText:
-        """Return the text with the values of an effect that it has; their comments stay."""
-        before = self.sensor()
+        """Return the text with the values of an effect that it has.
+
+        Comments stay. One that is about a value that changes, and not about the parameter, says which it was:
+        `on = 0.23 # from the data sheet (was 0.2)`.
+        """
         document = tomlkit.parse(self.text)
         table: Any = document[effect.name]
+        before = self.sensor()
+        about: Any = effect_table(effect)
         for name in effect.settings():
-            value = getattr(effect, name)
-            if value != getattr(before[effect.name], name):
-                table[name] = value
+            value, old = getattr(effect, name), getattr(before[effect.name], name)
+            if value == old:
+                continue
+            table[name] = value
+            comment = table[name].trivia.comment
+            if comment and comment != about[name].trivia.comment and " (was " not in comment:
+                table[name].trivia.comment = f"{comment} (was {old})"
         return self._checked(tomlkit.dumps(document), before.with_effect(effect))
 
     def in_folder(self, folder: Path) -> SensorText:

@@ -44,7 +44,6 @@ def toml(tmp_path: Path, text: str) -> Path:
         (("--sensor", "missing.toml"), "missing.toml does not exist"),
         (("--backend", "gpu"), "backend 'gpu' does not exist"),
         (("--fps", "30"), "--fps goes with --video"),
-        (("--video", "nowhere.mp4"), "nowhere.mp4 does not exist"),
     ],
 )
 def test_wrong_option(options, message, tmp_path):
@@ -120,8 +119,12 @@ def test_video(tmp_path):
         picture = np.full((24, 32), 60, np.uint8)
         picture[:, i : i + 8] = 220
         cv2.imwrite(str(folder / f"{i:03d}.png"), picture)
-    assert "give fps (--fps)" in one_sentence(dase("synth", tmp_path / "v.npz", "--video", folder))
-    done = dase("synth", tmp_path / "v.npz", "--video", folder, "--fps", "100", "--sensor", "ideal")
+    said = one_sentence(dase("synth", tmp_path / "v.npz", "--video", "nowhere.mp4"))
+    assert "nowhere.mp4 does not exist" in said
+    assert "give its frame rate" in one_sentence(dase("synth", tmp_path / "v.npz", "--video", folder))
+    done = dase(
+        "synth", tmp_path / "v.npz", "--video", folder, "--fps", "1000", "--sensor", "ideal", "--gamma", "1"
+    )
     assert done.returncode == 0, done.stderr
     events = io.read(tmp_path / "v.npz").events
     assert (events.width, events.height) == (32, 24)

@@ -228,3 +228,19 @@ def test_shared_recording(shared):
     got = sequence_statistics(io.read(shared / "recordings" / "dvx_noise_static.npz"))
     assert 0.2 < got.on_rate + got.off_rate < 1.0
     assert got.busiest_rate > 1000.0  # its stuck pixel
+
+
+def test_videos_play_in_browsers_where_opencv_can_write_such(rng, tmp_path, capfd, monkeypatch):
+    codec = event_images.write_video(random_sequence(rng, frames=3), tmp_path / "a.mp4")
+    assert capfd.readouterr().err == ""  # what OpenCV lacks is nothing to tell
+    capture = cv2.VideoCapture(str(tmp_path / "a.mp4"))
+    letters = int(capture.get(cv2.CAP_PROP_FOURCC)).to_bytes(4, "little").lower()
+    browsers = (b"avc1", b"h264", b"vp09", b"vp90")
+    assert (letters in browsers) == codec.plays_in_browsers
+    has = [
+        cv2.VideoWriter(str(tmp_path / "b.mp4"), cv2.VideoWriter.fourcc(*code), 30.0, (64, 48)).isOpened()
+        for code in ("avc1", "vp09")
+    ]
+    assert codec.plays_in_browsers == any(has)
+    monkeypatch.setattr(event_images, "CODECS", event_images.CODECS[-1:])
+    assert not event_images.write_video(random_sequence(rng, frames=3), tmp_path / "c.mp4").plays_in_browsers

@@ -190,7 +190,7 @@ def test_without_the_library_the_extra_is_named(tmp_path, rng, monkeypatch):
 
     aedat4(tmp_path / "a.aedat4", events(rng, 50), compression=1)
     monkeypatch.setattr(packed, "import_module", missing)
-    with pytest.raises(InputError, match=r'pip install "dase\[aedat\]"'):
+    with pytest.raises(InputError, match=r'in the checkout of dase, pip install "\.\[aedat\]"'):
         io.read(tmp_path / "a.aedat4")
 
 

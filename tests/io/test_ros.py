@@ -301,7 +301,7 @@ def test_without_the_library_the_extra_is_named(tmp_path, rng, monkeypatch):
     monkeypatch.setitem(sys.modules, "rosbags", None)
     for name in ("rosbags.rosbag1", "rosbags.rosbag2"):
         monkeypatch.delitem(sys.modules, name, raising=False)
-    with pytest.raises(InputError, match=r'pip install "dase\[ros\]"'):
+    with pytest.raises(InputError, match=r'in the checkout of dase, pip install "\.\[ros\]"'):
         io.read(tmp_path / "a.bag")
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import time
 from dataclasses import replace
 
 import numpy as np
@@ -210,3 +211,26 @@ def test_a_folder_is_not_begun_twice(scenes, tmp_path):
         train_in_folder(a_run(scenes), tmp_path)
     with pytest.raises(InputError, match="is not a checkpoint"):
         train_in_folder(a_run(scenes), tmp_path, resume=True)
+
+
+@pytest.mark.parametrize("slow_from", [-100, 5])
+def test_the_time_is_kept_where_steps_are_slow(scenes, tmp_path, monkeypatch, slow_from):
+    """The clock was looked at after 30 steps, however long those took."""
+    training = a_run(scenes, steps=500, warmup=0)
+    advance = training.advance
+
+    def slow_advance():
+        if training.step >= slow_from:
+            time.sleep(0.3)
+        return advance()
+
+    monkeypatch.setattr(training, "advance", slow_advance)
+    results = []
+    began = time.monotonic()
+    schedule = RunSchedule(seconds=3.0, result_every=0.5, score_every=0)
+    row = train_in_folder(training, tmp_path, schedule=schedule, on_result=results.append)
+    assert time.monotonic() - began < 9
+    assert 1 <= training.step < 100
+    assert row["step"] == training.step == training.recipe.steps
+    assert results  # long before the end
+    assert all("mu" in found for found in results)

@@ -6,6 +6,7 @@ import ast
 import inspect
 import re
 import shlex
+import subprocess
 from pathlib import Path
 
 import dase
@@ -62,3 +63,12 @@ def test_commands_and_their_options_exist():
         known = {name for p in command.params for name in (*p.opts, *p.secondary_opts)}
         assert {w for w in words[2:] if w.startswith("-")} <= known, line
     assert set(re.findall(r"dase effects show (\w+)", README)) <= set(EFFECTS)
+
+
+def test_shell_blocks_are_shell():
+    """What stands there to be copied must be read by a shell, with no <placeholders>."""
+    for block in blocks("sh"):
+        done = subprocess.run(["sh", "-n"], input=block, text=True, capture_output=True, check=False)
+        assert done.returncode == 0, done.stderr
+        code = [line.split("#")[0] for line in block.splitlines()]
+        assert not any(re.search(r"<\w", line) for line in code)

@@ -345,7 +345,7 @@ def test_coco_without_two_parts_is_refused(spec):
 
 def test_missing_pycocotools_names_the_extra(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "pycocotools.coco", None)
-    with pytest.raises(InputError, match=r'pip install "dase\[coco\]"'):
+    with pytest.raises(InputError, match=r'in the checkout of dase, pip install "\.\[coco\]"'):
         open_images(coco(tmp_path))
 
 

@@ -17,7 +17,8 @@ import dase
 import dase.io
 from dase.io import ffmpeg
 from dase.io.video_file import FrameReader
-from dase.scenes.video import open_video
+from dase.kernels import launch
+from dase.scenes.video import as_scene, open_video
 
 
 def test_a_video_is_its_frames(rng):
@@ -50,11 +51,11 @@ def test_a_folder_of_pictures_is_read_by_name(tmp_path, device):
         cv2.imwrite(str(tmp_path / f"{n:03d}.png"), np.full((6, 8), 40 * (n + 1), np.uint8))
     with pytest.raises(dase.InputError, match="does not say how many frames"):
         open_video(tmp_path)
-    video = open_video(tmp_path, fps=100)
+    video = open_video(tmp_path, fps=100, gamma=1, between="lines")
     want = np.arange(1, 4)[:, None, None] * 40 / 255 * np.ones((1, 6, 8))
     np.testing.assert_allclose(video.frames(video.sample_times()), want, rtol=1e-6)
     np.testing.assert_allclose(video.sample_times(), [0, 0.01, 0.02])
-    small = open_video(tmp_path, fps=100, size=(4, 3))
+    small = open_video(tmp_path, fps=100, size=(4, 3), between="lines")
     assert small.frames(small.sample_times()).shape == (3, 3, 4)
     sensor = dase.Sensor((dase.EFFECTS["threshold"](phase=0.0),))
     events = dase.simulate(video, sensor, device=device)
@@ -77,7 +78,7 @@ def test_a_video_file_is_read_frame_by_frame(tmp_path, suffix, code):
     for n in range(9):
         writer.write(np.full((24, 32, 3), 25 * n, np.uint8))
     writer.release()
-    video = open_video(path)
+    video = open_video(path, gamma=1, between="lines")
     np.testing.assert_allclose(video.sample_times(), np.arange(9) / 50)
     want = np.arange(9) * 25 / 255
     whole = video.frames(video.sample_times())
@@ -103,10 +104,10 @@ def test_frames_of_a_recording_are_a_scene(tmp_path, rng):
     dase.io.write(
         tmp_path / "a.h5", dase.io.Sequence(dase.Events.empty(8, 6), frames=frames, frame_times=times)
     )
-    scene = open_video(tmp_path / "a.h5")
+    scene = open_video(tmp_path / "a.h5", between="lines")
     np.testing.assert_allclose(scene.sample_times(), times - 0.5)
     np.testing.assert_array_equal(scene.frames(scene.sample_times()), frames / np.float32(255))
-    small = open_video(tmp_path / "a.h5", size=(4, 3), fps=10)
+    small = open_video(tmp_path / "a.h5", size=(4, 3), fps=10, between="lines")
     assert (small.width, small.height, small.duration) == (4, 3, 0.4)
     dase.io.write(tmp_path / "b.h5", dase.io.Sequence(dase.Events.empty(8, 6)))
     with pytest.raises(dase.InputError, match="must have at least 2 frames"):
@@ -343,3 +344,115 @@ print(*dase.io.read(sys.argv[1]).frames.shape, peak() - before)
     assert bounded[:3] == ["2", "240", "320"]
     assert float(bounded[3]) < 25
     assert float(free[3]) > 30  # as without the bound
+
+
+def test_frames_of_16_bits_are_light_by_their_range(tmp_path, rng):
+    frames = rng.integers(0, 1 << 16, (4, 6, 8), dtype=np.uint16)
+    times = np.arange(4) / 1000
+    dase.io.write(
+        tmp_path / "a.npz", dase.io.Sequence(dase.Events.empty(8, 6), frames=frames, frame_times=times)
+    )
+    want = frames / np.float32(65535)
+    for scene in (
+        open_video(tmp_path / "a.npz"),
+        dase.VideoScene(frames, times),
+        dase.VideoScene(want, times),
+        as_scene(frames, times=times),
+    ):
+        np.testing.assert_array_equal(scene.frames(times), want)
+    pixels = np.arange(48, dtype=np.int32)
+    got = dase.VideoScene(frames, times).source(times, pixels, launch.find_device("cpu"))[1].values.numpy()
+    np.testing.assert_array_equal(got, want.reshape(4, -1))
+
+
+def test_bytes_are_light_by_their_range_and_gamma(rng):
+    frames, times = rng.integers(0, 256, (3, 4, 5), dtype=np.uint8), [0.0, 1.0, 2.0]
+    want = (frames / np.float32(255)) ** np.float32(2.2)
+    np.testing.assert_allclose(dase.VideoScene(frames, times, gamma=2.2).frames(np.array(times)), want)
+    with pytest.raises(dase.InputError, match=r"gamma must lie in 0.1..10"):
+        dase.VideoScene(frames, times, gamma=0.0)
+
+
+@pytest.mark.parametrize("values", [np.full((2, 3, 4), 255.0), np.full((2, 3, 4), 200)])
+def test_numbers_that_cannot_be_light_are_refused(values):
+    with pytest.raises(dase.InputError, match=r"divide them by the value of white|must be uint8"):
+        dase.VideoScene(values, [0.0, 1.0])
+
+
+def moving(tmp_path, rate, frames=12):
+    """Write pictures of a texture that moves at 120 px/s; return their folder and the truth at any time."""
+    rng = np.random.default_rng(1)
+    texture = cv2.GaussianBlur(rng.random((48, 400)).astype(np.float32), (0, 0), 2)
+    texture = 0.1 + 0.8 * (texture - texture.min()) / np.ptp(texture)
+
+    def truth(time):
+        shift = np.array([[1, 0, -120 * time], [0, 1, 0]])
+        return cv2.warpAffine(texture, shift, (64, 48), flags=cv2.INTER_LINEAR)
+
+    folder = tmp_path / "clip"
+    folder.mkdir()
+    for n in range(frames):
+        cv2.imwrite(str(folder / f"{n:03d}.png"), np.rint(255 * truth(n / rate)).astype(np.uint8))
+    return folder, truth
+
+
+def test_frames_of_a_slow_video_follow_the_motion_and_say_so(tmp_path):
+    folder, truth = moving(tmp_path, 30)
+    notes: list[str] = []
+    scene = open_video(folder, fps=30, gamma=1, notes=notes)
+    assert isinstance(scene, dase.CameraScene)
+    assert re.search(
+        r"frames are 33.3 ms apart: the motion .* \d+ % of pixels and times are to be trusted", notes[0]
+    )
+    lines = open_video(folder, fps=30, gamma=1, between="lines", notes=notes)
+    assert "joined by straight lines" in notes[-1]
+    at = np.array([5.5 / 30])
+    pixels = np.arange(64 * 48, dtype=np.int32)
+    straight = lines.source(at, pixels, launch.find_device("cpu"))[1].values.numpy().reshape(48, 64)
+    inner = np.s_[8:-8, 8:-8]
+    errors = [np.abs(got - truth(at[0]))[inner].mean() for got in (scene.frames(at)[0], straight)]
+    assert errors[0] < 0.3 * errors[1]
+    assert isinstance(open_video(folder, fps=1000), dase.VideoScene)
+
+
+def test_gamma_is_that_of_the_file_and_said(tmp_path):
+    folder, _ = moving(tmp_path, 1000, frames=3)
+    notes: list[str] = []
+    scene = open_video(folder, fps=1000, notes=notes)
+    assert scene.gamma == 2.2
+    assert "light is taken as value ** 2.2" in notes[0]
+    from PIL import Image, PngImagePlugin
+
+    linear = PngImagePlugin.PngInfo()
+    linear.add(b"gAMA", (100_000).to_bytes(4, "big"))
+    with Image.open(folder / "000.png") as picture:
+        picture.load()
+        picture.save(folder / "000.png", pnginfo=linear)
+    assert open_video(folder, fps=1000).gamma == 1
+
+
+def test_times_beside_pictures_count(tmp_path):
+    folder, _ = moving(tmp_path, 1000, frames=4)
+    (folder / "timestamps.txt").write_text("000.png 5.0\n001.png 5.001\n002.png 5.0025\n003.png 5.003\n")
+    np.testing.assert_allclose(open_video(folder).sample_times(), [0, 0.001, 0.0025, 0.003], atol=1e-12)
+    np.testing.assert_allclose(open_video(folder, fps=1000).sample_times(), np.arange(4) / 1000)
+
+
+def test_times_of_a_video_of_variable_rate_are_the_true_ones(tmp_path, rng):
+    """An AVI tells a dropped frame by an empty packet: the frames after it are later."""
+    grey, path = rng.integers(0, 256, (4, 6, 8), np.uint8), tmp_path / "a.avi"
+    content = avi(grey)
+    second = content.index(b"00db", content.index(b"00db") + 1)
+    path.write_bytes(content[:second] + 2 * chunk(b"00db", b"") + content[second:])
+    want = np.array([0, 3, 4, 5]) / 25
+    np.testing.assert_allclose(open_video(path, between="lines").sample_times(), want)
+    np.testing.assert_allclose(dase.io.read(path).frame_times, want)
+
+
+def test_a_video_is_cut_to_the_shape_of_the_sensor(tmp_path):
+    picture = np.zeros((20, 60), np.uint8)
+    picture[:, 20:40] = 255
+    for n in range(2):
+        cv2.imwrite(str(tmp_path / f"{n}.png"), picture)
+    scene = open_video(tmp_path, fps=1000, size=(10, 10))
+    np.testing.assert_array_equal(scene.frames(scene.sample_times()), np.ones((2, 10, 10)))

@@ -1,0 +1,217 @@
+"""Kill small runs at random moments and resume them: the same bytes, no process and no temporary left.
+
+    python perf/kills.py --kills 20 --starts 20              of synth, convert and train each; --only convert
+
+Each round starts a command, sends SIGKILL, SIGTERM or SIGHUP at a random moment of its life, waits until all
+its processes are gone, and lets it run again, with `--resume` where there is such. A start is two `synth`
+into one folder at once. Linux only: processes are found in /proc.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import random
+import shutil
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from dataclasses import dataclass
+from pathlib import Path
+
+SIGNALS = (signal.SIGKILL, signal.SIGTERM, signal.SIGHUP)
+EXITS = {signal.SIGKILL: -9, signal.SIGTERM: 143, signal.SIGHUP: 129}
+GRACE = 8.0
+"""Time in which all processes of a killed run must be gone [s]."""
+
+
+@dataclass(frozen=True)
+class Subject:
+    """A command under test.
+
+    Args:
+        arguments: Of `dase`; `{out}` is the folder it writes to, `{source}` a recording.
+        resume: Arguments that make it go on.
+        compared: Names of files whose bytes must be those of a run that nobody disturbed; empty for all.
+    """
+
+    arguments: tuple[str, ...]
+    resume: tuple[str, ...] = ()
+    compared: tuple[str, ...] = ()
+
+
+SYNTH = ("synth", "{out}", "--size", "64x48", "--duration", "0.3", "--regime", "slow")
+SUBJECTS = {
+    "synth": Subject((*SYNTH, "--sequences", "6", "--jobs", "2"), ("--resume",)),
+    "convert": Subject(("convert", "{source}", "{out}/events.npz")),
+    "train": Subject(
+        ("train", "davis346", "-o", "{out}", "--preset", "tiny", "--steps", "12", "--size", "48x36",
+         "--sequences", "5"),
+        ("--resume",),
+        ("sensor.toml", "learned.safetensors", "job.json", "recipe.json"),
+    ),
+}  # fmt: skip
+
+
+def command(arguments: tuple[str, ...], out: Path, source: Path) -> list[str]:
+    """Return a command line."""
+    filled = [part.format(out=out, source=source) for part in arguments]
+    return [sys.executable, "-c", "from dase.cli import main; main()", *filled]
+
+
+def start(line: list[str]) -> subprocess.Popen[str]:
+    """Start a command in a group of its own."""
+    return subprocess.Popen(
+        line, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True, start_new_session=True
+    )
+
+
+def group_members(group: int) -> list[int]:
+    """Return the processes of a group that run."""
+    out = []
+    for stat in Path("/proc").glob("[0-9]*/stat"):
+        try:
+            fields = stat.read_text("latin-1").rpartition(")")[2].split()
+        except OSError:
+            continue
+        if int(fields[2]) == group and fields[0] not in "ZX":
+            out.append(int(stat.parent.name))
+    return out
+
+
+def orphans(group: int) -> list[int]:
+    """Return what still runs of a group after `GRACE`, and end it."""
+    deadline = time.monotonic() + GRACE
+    while (left := group_members(group)) and time.monotonic() < deadline:
+        time.sleep(0.05)
+    for pid in left:
+        os.kill(pid, signal.SIGKILL)
+    return left
+
+
+def contents(folder: Path, names: tuple[str, ...] = ()) -> dict[str, bytes]:
+    """Return the files of a folder."""
+    return {path.name: path.read_bytes() for path in folder.iterdir() if not names or path.name in names}
+
+
+def hidden_files(folder: Path) -> list[str]:
+    """Return temporaries and locks."""
+    return [path.name for path in folder.iterdir() if path.name.startswith(".") or ".tmp" in path.name]
+
+
+def undisturbed(subject: Subject, place: Path, source: Path) -> tuple[dict[str, bytes], float]:
+    """Return what a command writes, and how long it takes [s]."""
+    out = fresh_folder(place / "whole", subject)
+    begin = time.monotonic()
+    subprocess.run(command(subject.arguments, out, source), check=True, stdout=subprocess.DEVNULL)
+    return contents(out, subject.compared), time.monotonic() - begin
+
+
+def fresh_folder(parent: Path, subject: Subject) -> Path:
+    """Return a folder that is not there, or empty where the command wants one."""
+    out = parent / "out"  # sensors are called by it
+    out.mkdir(parents=True)
+    if subject.resume:
+        out.rmdir()
+    return out
+
+
+def kill_once(
+    subject: Subject, place: Path, source: Path, want: dict[str, bytes], span: float, rng: random.Random
+) -> tuple[str, list[str]]:
+    """Kill a run, resume it, and return how it was killed and what is wrong."""
+    out = fresh_folder(place, subject)
+    number, delay, wrong = rng.choice(SIGNALS), rng.uniform(0, 1.1 * span), []
+    process = start(command(subject.arguments, out, source))
+    try:
+        said = process.communicate(timeout=delay)[1]
+        ended = "before the signal"
+    except subprocess.TimeoutExpired:
+        process.send_signal(number)
+        said = process.communicate(timeout=60)[1]
+        ended = f"{signal.Signals(number).name} at {delay:.2f} s"
+        # before Python and dase are up, the signal has its plain effect
+        if process.returncode not in (0, EXITS[number], -number):
+            wrong.append(f"exit code {process.returncode}: {said[-300:]}")
+    if "Traceback" in said and process.returncode not in (-number,):
+        wrong.append(f"traceback: {said[-300:]}")
+    if left := orphans(process.pid):
+        wrong.append(f"{len(left)} processes left")
+    begun = (out / "synth.toml").exists() or (out / "job.json").exists()
+    again = subprocess.run(
+        command(subject.arguments + (subject.resume if begun else ()), out, source),
+        capture_output=True, text=True, check=False,
+    )  # fmt: skip
+    if again.returncode:
+        wrong.append(f"not resumed: {again.stderr[-300:]}")
+        return ended, wrong
+    got = contents(out, subject.compared)
+    different = [name for name in want if got.get(name) != want[name]] + sorted(set(got) - set(want))
+    if different:
+        wrong.append(f"other bytes: {', '.join(different)}")
+    if hidden := hidden_files(out):
+        wrong.append(f"left: {', '.join(hidden)}")
+    return ended, wrong
+
+
+def start_two(place: Path, source: Path, want: dict[str, bytes], rng: random.Random) -> tuple[str, list[str]]:
+    """Start two runs into one folder; return how they ended and what is wrong."""
+    subject = SUBJECTS["synth"]
+    out, wrong = fresh_folder(place, subject), []
+    line = command(subject.arguments + subject.resume, out, source)
+    one = start(line)
+    time.sleep(rng.uniform(0, 0.5))
+    other = start(line)
+    said = [process.communicate(timeout=300)[1] for process in (one, other)]
+    codes = [one.returncode, other.returncode]
+    for code, text in zip(codes, said, strict=True):
+        if code not in (0, 2) or (code == 2 and "is being written by process" not in text):
+            wrong.append(f"exit code {code}: {text[-300:]}")
+    if 0 not in codes:
+        wrong.append("none finished")
+    if contents(out) != want:
+        wrong.append(f"other files: {sorted(contents(out))}")
+    return f"exit codes {codes}", wrong
+
+
+def main() -> None:
+    """Run all, print what is wrong, and exit with 1 if anything is."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--kills", type=int, default=20)
+    parser.add_argument("--starts", type=int, default=20)
+    parser.add_argument("--only", choices=[*SUBJECTS, "starts"])
+    parser.add_argument("--seed", type=int, default=0)
+    options = parser.parse_args()
+    failures = 0
+    with tempfile.TemporaryDirectory() as folder:
+        base = Path(folder)
+        source = base / "source" / "sequence_00000.h5"
+        made = ("synth", str(source.parent), "--sequences", "1", "--jobs", "1", "--duration", "1")
+        subprocess.run(command(made, base, base), check=True, stdout=subprocess.DEVNULL)
+        for name in [*SUBJECTS, "starts"]:
+            if options.only not in (None, name):
+                continue
+            rng = random.Random(f"{options.seed} {name}")
+            subject = SUBJECTS.get(name, SUBJECTS["synth"])
+            want, span = undisturbed(subject, base / name, source)
+            rounds = options.starts if name == "starts" else options.kills
+            bad = 0
+            for n in range(rounds):
+                place = base / name / str(n)
+                if name == "starts":
+                    how, wrong = start_two(place, source, want, rng)
+                else:
+                    how, wrong = kill_once(subject, place, source, want, span, rng)
+                bad += bool(wrong)
+                if wrong:
+                    print(f"{name} {n}: {how}: {'; '.join(wrong)}", flush=True)
+                shutil.rmtree(place)
+            print(f"{name}: {rounds} rounds of {span:.1f} s, {bad} wrong", flush=True)
+            failures += bad
+    sys.exit(1 if failures else 0)
+
+
+if __name__ == "__main__":
+    main()
