@@ -97,8 +97,8 @@ fps_option = click.option(
 
 def check_output(ctx: click.Context, parameter: click.Parameter, value: Path | None) -> Path | None:
     """Refuse a file that could not be written in the end, before any work."""
-    from dase.atomic_file import refuse_unwritable
     from dase.errors import InputError
+    from dase.files.atomic_file import refuse_unwritable
 
     if value is not None:
         try:

@@ -155,8 +155,8 @@ def _synth_video(
     between: str,
 ) -> None:
     """Simulate one video into the file `out`."""
-    from dase.atomic_file import refuse_unwritable
     from dase.datasets import generate
+    from dase.files.atomic_file import refuse_unwritable
     from dase.io import find_writable_format
     from dase.scenes.video import open_video
     from dase.simulation.sensor_file import load_sensor

@@ -63,7 +63,7 @@ def train_command(
     On several GPUs: torchrun --nproc-per-node 4 --no-python dase train ... --device cuda
     """
     from dase.errors import InputError, how_to_install
-    from dase.folder_lock import locking_folder
+    from dase.files.folder_lock import locking_folder
 
     try:
         from dase.learning import distributed

@@ -38,7 +38,7 @@ COLUMN = {
     **dict.fromkeys(("formatting", "errors"), 0),
     **dict.fromkeys(("cli", "results", "io", "events", "kernels"), 1),
     **dict.fromkeys(("figures", "diagnosis", "fitting", "signatures", "probes", "recordings"), 2),
-    **dict.fromkeys(("presets", "atomic_file", "text_files", "folder_lock", "version"), 2),
+    **dict.fromkeys(("presets", "files", "version"), 2),
 }
 """Where a package lies on its floor: what makes events is left, what asks about recordings is right."""
 

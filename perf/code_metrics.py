@@ -70,7 +70,7 @@ FLOORS: tuple[tuple[tuple[str, ...], str], ...] = (
     (("recordings", "scenes"), "What a camera wrote, and what a camera looks at, both from files or made."),
     (("io", "networks", "presets"), "Files know events, not what they are used for."),
     (
-        ("events", "formatting", "atomic_file", "text_files", "folder_lock"),
+        ("events", "formatting", "files"),
         "What everybody speaks of: events, readable numbers, whole files.",
     ),
     (("errors", "version", "kernels"), "Kernels know nothing of dase, so that each can be read by itself."),

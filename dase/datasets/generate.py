@@ -22,7 +22,8 @@ from numpy.typing import NDArray
 from dase import io
 from dase.datasets.interrupt import DeferredInterrupt, WorkerLife, defer_interrupt, ignore_interrupt
 from dase.errors import InputError, checked_integer, nearest
-from dase.folder_lock import locking_folder
+from dase.files.folder_lock import locking_folder
+from dase.files.text_files import read_text_file
 from dase.io.source import Source
 from dase.kernels import launch
 from dase.scenes import image_sources, random_scenes
@@ -33,7 +34,6 @@ from dase.simulation.sensor import Sensor
 from dase.simulation.sensor_file import dump_sensor, parse_sensor
 from dase.simulation.sensor_run import SensorRun
 from dase.simulation.user_effects import known_effects
-from dase.text_files import read_text_file
 from dase.version import __version__
 
 RECORD_FILE = "synth.toml"

@@ -15,6 +15,8 @@ from dase.errors import InputError
 from dase.events import Events
 from dase.figures import contact_sheet
 from dase.figures.style import Colour
+from dase.io.ffmpeg import quiet_ffmpeg
+from dase.io.image_files import quiet_opencv
 from dase.io.sequence import Sequence, replacing
 from dase.recordings.statistics import sequence_statistics
 
@@ -197,9 +199,6 @@ def write_video(sequence: Sequence, path: Path, *, window: float | None = None) 
 def _open_video_writer(path: Path, rate: float, size: tuple[int, ...]) -> tuple[Any, VideoCodec]:
     """Return a writer with the first codec that opens, None where none does, and the codec."""
     import cv2
-
-    from dase.io.ffmpeg import quiet_ffmpeg
-    from dase.io.image_files import quiet_opencv
 
     for codec in CODECS:
         with quiet_ffmpeg(), quiet_opencv():  # what is missing is tried, not an error

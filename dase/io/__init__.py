@@ -22,6 +22,7 @@ from typing import Unpack
 
 from dase.errors import InputError, checked_integer, nearest
 from dase.events import Events
+from dase.files.text_files import stands_for
 from dase.io import (
     aedat2,
     aedat3,
@@ -60,7 +61,6 @@ from dase.io.source import Note as Note
 from dase.io.source import Part as Part
 from dase.io.source import Picture as Picture
 from dase.io.source import ReadOptions as ReadOptions
-from dase.text_files import stands_for
 
 FORMATS: tuple[Format, ...] = (
     ecf.FORMAT,

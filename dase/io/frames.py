@@ -18,13 +18,13 @@ from numpy.typing import NDArray
 
 from dase.errors import InputError
 from dase.events import Events
+from dase.files.text_files import stands_for
 from dase.io.ffmpeg import TAKEN
 from dase.io.format import LIMIT, Format
 from dase.io.image_files import SUFFIXES, decode_bytes, head_size
 from dase.io.sequence import GREYS, Sequence, reading_file
 from dase.io.source import Picture, Source, checked_size, refuse_bomb
 from dase.io.video_file import FrameReader
-from dase.text_files import stands_for
 
 TIMES = "timestamps.txt"
 """File in a folder of pictures with their times."""

@@ -13,8 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dase.errors import InputError
+from dase.files.text_files import stands_for
 from dase.io.source import refuse_bomb
-from dase.text_files import stands_for
 
 SUFFIXES = ("jpg", "jpeg", "png", "bmp", "tif", "tiff", "webp", "ppm", "pgm")
 """Picture files, whatever their case."""

@@ -13,9 +13,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from dase.atomic_file import replacing as replacing
 from dase.errors import InputError
 from dase.events import Events
+from dase.files.atomic_file import replacing as replacing
 
 Grey = np.uint8 | np.uint16
 GREYS = (np.uint8, np.uint16)

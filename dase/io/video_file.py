@@ -11,9 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dase.errors import InputError
+from dase.files.text_files import stands_for
 from dase.io.ffmpeg import bounded_decoding, decoding_memory, open_video, pixel_format, refuse_titles, size_of
 from dase.io.image_files import cut_and_resize, decode_file, list_pictures, to_grey, to_levels
-from dase.text_files import stands_for
 
 PLAIN = bytes(4), b"BGR\x18"
 """Code and pixels of an uncompressed AVI: OpenCV 5.0 writes beyond its memory where it turns one over."""

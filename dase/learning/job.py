@@ -11,11 +11,12 @@ from typing import Any, Literal
 import numpy as np
 import torch
 
-from dase.atomic_file import replacing
 from dase.effects.learned_threshold import LearnedThreshold
 from dase.effects.mismatch import Mismatch
 from dase.effects.threshold import Threshold
 from dase.errors import InputError, checked_seed, nearest
+from dase.files.atomic_file import replacing
+from dase.files.text_files import parse_json, read_text_file
 from dase.learning.adversarial import AdversarialObjective, AdversarialSettings, PatchHash
 from dase.learning.baselines import RandomThresholds, esim_thresholds, match_event_rate
 from dase.learning.moment_objective import MomentObjective
@@ -32,7 +33,6 @@ from dase.scenes.video import VideoScene
 from dase.simulation.sensor import Sensor
 from dase.simulation.sensor_file import dump_sensor, load_sensor, read_presets
 from dase.simulation.simulate import count
-from dase.text_files import parse_json, read_text_file
 
 JOB, SENSOR, WEIGHTS, EXAMPLES = "job.json", "sensor.toml", "learned.safetensors", "examples.npz"
 

@@ -12,8 +12,8 @@ from typing import Any
 
 import torch
 
-from dase.atomic_file import replacing
 from dase.errors import InputError
+from dase.files.atomic_file import replacing
 from dase.learning import distributed
 from dase.learning.evaluation import HeldOutScore, MapEvaluation
 from dase.learning.recipe import Recipe

@@ -14,11 +14,11 @@ from numpy.typing import NDArray
 from safetensors import SafetensorError, safe_open
 from safetensors.torch import save
 
-from dase.atomic_file import replacing
 from dase.errors import InputError, checked_integer
 from dase.events import LARGEST_SIDE
+from dase.files.atomic_file import replacing
+from dase.files.text_files import parse_json, stands_for
 from dase.networks.threshold_network import NetworkShape, ThresholdNet
-from dase.text_files import parse_json, stands_for
 
 KIND = "dase.learned_threshold"
 """Name of the file's only entry of metadata, the shape as JSON; of several the order is up to chance."""

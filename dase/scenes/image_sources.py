@@ -16,8 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dase.errors import InputError, checked_integer, how_to_install
+from dase.files.text_files import parse_json, stands_for
 from dase.io.image_files import SUFFIXES, decode_file, list_pictures, to_grey
-from dase.text_files import parse_json, stands_for
 
 # fmt: off
 PHOTOGRAPHS = (  # inside the wheel of scikit-image; its other files are silhouettes, charts and duplicates

@@ -13,10 +13,10 @@ from tomlkit.items import Table
 
 from dase.effects import EFFECTS, Effect, find_effect
 from dase.errors import InputError, nearest
+from dase.files.text_files import parse_toml, read_text_file
 from dase.scenes.video import LOG_EPS
 from dase.simulation.sensor import Sensor
 from dase.simulation.sensor_history import read_history
-from dase.text_files import parse_toml, read_text_file
 
 
 def read_presets() -> dict[str, str]:

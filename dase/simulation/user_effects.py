@@ -21,11 +21,11 @@ import warp as wp
 from dase.effects import EFFECTS, Effect, StreamEffect
 from dase.errors import InputError, nearest
 from dase.events import LABELS
+from dase.files.text_files import read_text_file
 from dase.kernels import pixel_codegen_model, pixel_compile, pixel_stages
 from dase.scenes.video import VideoScene
 from dase.simulation.sensor import Sensor
 from dase.simulation.simulate import simulate
-from dase.text_files import read_text_file
 
 RESERVED_NAMES = ("name", "size", "log_eps", "history", "sensor")
 """Other entries of a sensor file; no effect can have such a name."""

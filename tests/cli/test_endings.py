@@ -15,10 +15,10 @@ from pathlib import Path
 import pytest
 
 from dase import Events, InputError, io
-from dase.atomic_file import replacing
 from dase.datasets import generate
-from dase.folder_lock import LOCK_FILE, locking_folder
-from dase.processes import ProcessIdentity
+from dase.files.atomic_file import replacing
+from dase.files.folder_lock import LOCK_FILE, locking_folder
+from dase.files.processes import ProcessIdentity
 
 JOB = generate.DatasetJob(
     images="builtin", sensor="[threshold]\n", sequences=3, width=16, height=12, duration=0.05, regime="slow"
@@ -56,7 +56,7 @@ def group_members(group: int) -> list[int]:
 
 def dead_identity() -> ProcessIdentity:
     """Return a process of this machine that has ended."""
-    code = "from dase.processes import ProcessIdentity as P; print(P.own())"
+    code = "from dase.files.processes import ProcessIdentity as P; print(P.own())"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     return ProcessIdentity.parse(done.stdout.strip())
 
@@ -133,7 +133,7 @@ def test_a_folder_has_one_run(tmp_path):
         [
             sys.executable,
             "-c",
-            "import sys, pathlib\nfrom dase.folder_lock import locking_folder\n"
+            "import sys, pathlib\nfrom dase.files.folder_lock import locking_folder\n"
             "with locking_folder(pathlib.Path(sys.argv[1])):\n"
             "    print('held', flush=True)\n    sys.stdin.read()",
             str(tmp_path / "out"),

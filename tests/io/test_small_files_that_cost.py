@@ -16,8 +16,8 @@ import dase
 from dase import io
 from dase.cli import dase_group
 from dase.errors import InputError
+from dase.files.text_files import parse_json, parse_toml, read_text_file
 from dase.fitting.measurement import open_clip
-from dase.text_files import parse_json, parse_toml, read_text_file
 
 
 @pytest.fixture(autouse=True)

@@ -14,9 +14,9 @@ try:
 except ImportError:  # Windows
     fcntl = None  # type: ignore[assignment]
 
-from dase.atomic_file import remove_stale_temporaries
 from dase.errors import InputError
-from dase.processes import ProcessIdentity
+from dase.files.atomic_file import remove_stale_temporaries
+from dase.files.processes import ProcessIdentity
 
 LOCK_FILE = ".dase.lock"
 _held: set[Path] = set()

@@ -11,7 +11,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from dase.errors import InputError
-from dase.processes import ProcessIdentity
+from dase.files.processes import ProcessIdentity
 
 _TEMPORARY = re.compile(
     r"\.(?P<stem>.+)\.(?P<owner>[0-9a-f]{8}-\d+-\w*)\.\d+\.tmp(?P<suffix>(\.[^.]*)?)", re.DOTALL
