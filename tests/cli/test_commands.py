@@ -37,7 +37,7 @@ def toml(tmp_path: Path, text: str) -> Path:
         (("--duration", "nan"), "duration must be a number > 0, got nan"),
         (("--duration", "0"), "duration must be a number > 0, got 0"),
         (("--frame-rate", "-1"), "frame rate must be a number > 0, got -1"),
-        (("--seed", "-1"), "seed must be >= 0, got -1"),
+        (("--seed", "-1"), "seed must be a whole number >= 0, got -1"),
         (("--jobs", "0"), "jobs must be >= 1, got 0"),
         (("--regime", "fats"), "did you mean 'fast'?"),
         (("--sensor", "davis345"), "did you mean 'davis346'?"),
@@ -73,7 +73,7 @@ def test_cuda_without_a_gpu(tmp_path):
             "refractory.mode must be one of drop, delay, got 'lose'",
         ),
         ("[leak]\nrate = 1.0", "needs the effect 'threshold'"),
-        ("size = [0, 3]\n[threshold]", "size must be at least 1x1, got 0x3"),
+        ("size = [0, 3]\n[threshold]", "size must lie between 1x1 and 16384x16384, got 0x3"),
         ("not toml at all", "is not TOML"),
     ],
 )

@@ -120,11 +120,11 @@ def test_sequences_without_a_record_are_not_taken_for_done(whole, tmp_path):
     assert contents(out) == contents(whole)
 
 
-def test_a_record_that_is_no_text_is_another_one(whole, tmp_path):
+def test_a_record_that_is_no_text_is_refused(whole, tmp_path):
     out = tmp_path / "out"
     shutil.copytree(whole, out)
     (out / "synth.toml").write_bytes(b"\xff\xfe")
-    with pytest.raises(InputError, match="other options"):
+    with pytest.raises(InputError, match="not UTF-8 text"):
         generate.generate_dataset(JOB, out, resume=True)
 
 

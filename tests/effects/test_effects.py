@@ -268,7 +268,7 @@ OUTSIDE = [
     (lambda: dase.Sensor((Leak(),)), "needs the effect 'threshold', got leak"),
     (lambda: dase.Sensor((Threshold(), Leak(), Leak())), "each effect may appear once, got"),
     (lambda: dase.Sensor(log_eps=float("nan")), r"log_eps must lie in \(0, 1\), got nan"),
-    (lambda: dase.Sensor(size=(0, 4)), "size must be at least 1x1, got 0x4"),
+    (lambda: dase.Sensor(size=(0, 4)), "size must lie between 1x1 and 16384x16384, got 0x4"),
     (lambda: load_sensor("davis345"), "'davis345' is neither a preset nor a file: did you mean 'davis346'"),
     (lambda: load_sensor("no/such.toml"), r"sensor file no/such\.toml does not exist"),
 ]

@@ -103,7 +103,7 @@ def test_leak_and_shot_superpose(device):
 
 
 def test_hot_pixels_are_few_and_log_normal(device):
-    share, rate, spread, seconds, pixels = 0.05, 30.0, 0.8, 40.0, 20_000
+    share, rate, spread, seconds, pixels = 0.05, 30.0, 0.8, 40.0, 16_000
     sensor = every(Hot(share=share, rate=rate, spread=spread, balance=0.8))
     off, on = counts(still(np.full(pixels, 0.3), seconds, 3), sensor, seconds, device)
     hot = np.flatnonzero(on + off)
