@@ -96,6 +96,11 @@ def contents(folder: Path, names: tuple[str, ...] = ()) -> dict[str, bytes]:
     return {path.name: path.read_bytes() for path in folder.iterdir() if not names or path.name in names}
 
 
+def differing_names(got: dict[str, bytes], want: dict[str, bytes]) -> list[str]:
+    """Return the files that differ, are missing, or should not be there."""
+    return sorted(name for name in got.keys() | want.keys() if got.get(name) != want.get(name))
+
+
 def hidden_files(folder: Path) -> list[str]:
     """Return temporaries and locks."""
     return [path.name for path in folder.iterdir() if path.name.startswith(".") or ".tmp" in path.name]
@@ -128,6 +133,11 @@ def kill_once(
     try:
         said = process.communicate(timeout=delay)[1]
         ended = "before the signal"
+        # nobody killed this one: what is wrong here is not the resuming's fault
+        if process.returncode:
+            wrong.append(f"exit code {process.returncode}: {said[-300:]}")
+        elif changed := differing_names(contents(out, subject.compared), want):
+            wrong.append(f"other bytes without a kill: {', '.join(changed)}")
     except subprocess.TimeoutExpired:
         process.send_signal(number)
         said = process.communicate(timeout=60)[1]
@@ -148,9 +158,8 @@ def kill_once(
         wrong.append(f"not resumed: {again.stderr[-300:]}")
         return ended, wrong
     got = contents(out, subject.compared)
-    different = [name for name in want if got.get(name) != want[name]] + sorted(set(got) - set(want))
-    if different:
-        wrong.append(f"other bytes: {', '.join(different)}")
+    if changed := differing_names(got, want):
+        wrong.append(f"other bytes: {', '.join(changed)}")
     if hidden := hidden_files(out):
         wrong.append(f"left: {', '.join(hidden)}")
     return ended, wrong
