@@ -27,9 +27,10 @@ def parse_size(ctx: click.Context, param: click.Parameter, value: str | None) ->
     return width, height
 
 
-def _parse_region(
+def parse_region(
     ctx: click.Context, param: click.Parameter, value: str | None
 ) -> tuple[int, int, int, int] | None:
+    """Return (x, y, columns, rows) of a text such as 0,0,320,240."""
     if value is None:
         return None
     try:
@@ -61,7 +62,7 @@ def reading_options(command: Callable[..., Any]) -> Callable[..., Any]:
         click.option("--size", callback=parse_size, metavar="WxH", help="Columns x rows, else the file's."),
         click.option("--from", "begin", type=float, metavar="SECONDS", help="Read from this time on."),
         click.option("--to", "end", type=float, metavar="SECONDS", help="Read up to this time."),
-        click.option("--region", callback=_parse_region, metavar="X,Y,W,H", help="Read these pixels."),
+        click.option("--region", callback=parse_region, metavar="X,Y,W,H", help="Read these pixels."),
         click.option("--chip", metavar="NAME", help="Chip of an AEDAT 1 or 2 that names none, as davis240."),
         click.option("--columns", metavar="ORDER", help="Order of columns without names, as txyp."),
     )  # fmt: skip
@@ -154,19 +155,6 @@ def check_suffix(*suffixes: str) -> Callable[[click.Context, click.Parameter, Pa
         return check_output(ctx, parameter, value)
 
     return check
-
-
-def parse_region(
-    ctx: click.Context, param: click.Parameter, value: str | None
-) -> tuple[int, int, int, int] | None:
-    """Return (x, y, columns, rows) of a text such as 0,0,320,240."""
-    if value is None:
-        return None
-    try:
-        x, y, width, height = (int(part) for part in value.split(","))
-    except ValueError:
-        raise click.BadParameter(f"{value!r} is not of the form x,y,w,h, such as 0,0,320,240") from None
-    return x, y, width, height
 
 
 def part_options(command: Callable[..., Any]) -> Callable[..., Any]:

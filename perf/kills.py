@@ -69,7 +69,7 @@ def start(line: list[str]) -> subprocess.Popen[str]:
 
 
 def group_members(group: int) -> list[int]:
-    """Return the processes of a group that run."""
+    """Return the processes of a group that run; Linux only."""
     out = []
     for stat in Path("/proc").glob("[0-9]*/stat"):
         try:

@@ -234,7 +234,7 @@ def scene_of_frames(recorded: Recording | Sequence, name: str, notes: list[str])
         raise InputError(f"{name}: its frames have no times, so they cannot be laid beside the events")
     # also frames that come exactly as slowly as the slowest steps of a comparison are joined by lines
     if float(np.median(np.diff(times))) <= STIMULUS.coarsest_step * (1 + 1e-6):
-        return VideoScene(linear_intensity(recorded.frames, name), times)
+        return _scene_of_values(recorded.frames, times, name)
     return scene_between_frames(recorded, notes)
 
 
@@ -338,20 +338,12 @@ def open_clip(path: Path) -> Scene:
         raise InputError(f"scene {path}: {error}" if str(path) not in str(error) else str(error)) from error
     except Exception as error:  # numpy, zipfile and zlib have no common error for damaged files
         raise InputError(f"scene {path} cannot be read as an archive of frames: {error}") from error
-    return VideoScene(linear_intensity(frames, path), times)
+    return _scene_of_values(frames, times, path)
 
 
-def linear_intensity(frames: NDArray[Any], path: Path | str) -> NDArray[np.float32]:
-    """Return frames as intensities in [0, 1]; whole numbers are shares of the largest their type holds."""
-    if frames.dtype.kind == "u":
-        shares: NDArray[np.float32] = frames.astype(np.float32) / np.float32(np.iinfo(frames.dtype).max)
-        return shares
-    out = frames.astype(np.float32)
-    bad = ~np.isfinite(out) | (out < 0)
-    if bad.any():
-        first = int(np.argwhere(bad)[0][0])
-        raise InputError(
-            f"scene {path}: frame {first} has {int(bad[first].sum())} values below 0 or not numbers; "
-            "intensities must be finite and >= 0"
-        )
-    return out
+def _scene_of_values(frames: NDArray[Any], times: NDArray[np.float64], name: Path | str) -> VideoScene:
+    """Return the scene of frames (F, H, W) at times (F,) [s]; messages say whose frames they are."""
+    try:
+        return VideoScene(frames, times)
+    except InputError as error:
+        raise InputError(f"scene {name}: {error}") from None

@@ -19,6 +19,7 @@ from dase.datasets import generate
 from dase.files.atomic_file import replacing
 from dase.files.folder_lock import LOCK_FILE, locking_folder
 from dase.files.processes import ProcessIdentity
+from perf.kills import group_members
 
 JOB = generate.DatasetJob(
     images="builtin", sensor="[threshold]\n", sequences=3, width=16, height=12, duration=0.05, regime="slow"
@@ -39,19 +40,6 @@ def wait_for(what, seconds: float = 120.0):
         assert time.monotonic() < deadline, "waited too long"
         time.sleep(0.01)
     return found
-
-
-def group_members(group: int) -> list[int]:
-    """Return the processes of a group that run; Linux only."""
-    out = []
-    for stat in Path("/proc").glob("[0-9]*/stat"):
-        try:
-            fields = stat.read_text("latin-1").rpartition(")")[2].split()
-        except OSError:
-            continue
-        if int(fields[2]) == group and fields[0] not in "ZX":
-            out.append(int(stat.parent.name))
-    return out
 
 
 def dead_identity() -> ProcessIdentity:
