@@ -35,12 +35,21 @@ def check_light(values: NDArray[Any], what: str, *, most: float = BRIGHTEST) -> 
     if values.dtype.kind != "f":
         raise InputError(f"{what} must be uint8, uint16 or real numbers, got {values.dtype}")
     if values.size and not (np.all(np.isfinite(values)) and values.min() >= 0):
-        raise InputError(f"{what}: intensities must be finite and >= 0")
+        raise InputError(f"{what}: {_place_of_bad(values)}intensities must be finite and >= 0")
     if values.size and values.max() > most:
         raise InputError(
             f"{what}: real numbers must lie in [0, 1], got up to {values.max():g}: "
             "divide them by the value of white"
         )
+
+
+def _place_of_bad(values: NDArray[Any]) -> str:
+    """Return the first frame that is no light, and of how many values, where values (F, H, W) are frames."""
+    if values.ndim != 3:
+        return ""
+    bad = ~np.isfinite(values) | (values < 0)
+    first = int(np.argmax(bad.any(axis=(1, 2))))
+    return f"frame {first} has {int(bad[first].sum())} values below 0 or not numbers; "
 
 
 def to_light(values: NDArray[Any], *, gamma: float = 1.0) -> NDArray[np.float32]:
