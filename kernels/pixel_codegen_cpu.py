@@ -100,6 +100,7 @@ class Lanes:
     ) -> Block:
         """Return statements for one lane after the other, or for the one that `lane` finds while `head`."""
         body = resolve_guards(body, ask=self.asks if ask is None else ask)
+        # a name that the body sets before it reads it need not be fetched; one that it sets must be put back
         needed, written = names_needed(body), names_written(body)
         # all else is the same for all lanes, or is born and dies in the body
         shared = [name for name in needed if name in self.kinds]
@@ -120,6 +121,7 @@ class Lanes:
         if part.handover:
             # the lanes before have worked along, but must not write: the other thread may be ahead
             body = (if_block("lane >= new", *body),)
+        # `then` is of the whole block, such as the length of the step: it comes once, after the last lane
         loops = (*self._loops(body), *part.then)
         # a condition that lanes do not share cannot stand around the loop
         when = [condition for condition in part.when if not self._differs(condition)]
@@ -134,9 +136,11 @@ class Lanes:
         # a number, not a truth value: so the loop that asks becomes vectors, and few lanes answer yes
         condition = Line(f"busy = wp.where({program.busy}, 1.0, 0.0)")
         found = f"lane = within(lowest_bit(bits), {self.size})"
+        # takes the lowest bit away, whose lane `found` has just fetched: `head` ends with the last busy lane
         events = (Line("bits = bits & (bits - 1)"), *program.events)
         return (
             *self._loops((*program.asleep, condition)),
+            # lanes before `new` are left out: the thread of the block before has written their events
             Line(self.busy),
             self.loop(events, head="while bits != 0:", lane=found),
         )
@@ -148,6 +152,7 @@ class Lanes:
         """Return a loop over the lanes, or several, so that effects which no lane has are skipped."""
         if not self.asks:
             return (self.loop(body),)
+        # a question around a loop costs one branch for the block, inside of it one per lane and no vectors
         found: list[Statement] = []
         together: list[Statement] = []
         for statement in resolve_guards(body, ask=True):
@@ -197,6 +202,8 @@ def lane_kinds(
     floats += [*model.states, *maps]
     floats += [f"{effect.name}_{q}" for effect, _ in model.of("noise") for q in ("on", "off", "spend")]
     floats += [draw.name for draw in program.draws if draw.per_pixel]
+    # keys of streams are of a pixel, so every lane has its own; events come at times in whole nanoseconds,
+    # which 32 bits hold for 2 s only
     whole = [*ints, *(draw.key for draw in program.draws)]
     kinds = {"Floats": floats, "Ints": whole, "Longs": ["leaves"]}
     return {name: kind for kind, names in kinds.items() for name in names}
@@ -220,6 +227,7 @@ def print_block_kernel(model: PixelModel, lanes: int) -> str:
         *_look(model),
         *layout.lay_out_all(intensity_of_log(model)),
         *layout.lay_out_all(program.light),
+        # of all lanes at once, as one by one they cost most of a step without events
         *(lines("voltage_lanes = logarithms(intensity_lanes, log_eps)") if model.source != "log" else ()),
         *layout.lay_out_all(program.respond),
         *layout.lay_out_all(program.change),
@@ -260,10 +268,12 @@ def _prepare_block(program: Program, layout: Lanes) -> tuple[Statement, ...]:
         *lines(
             "x_lanes = columns(pixels, start, width)",
             "y_lanes = rows(pixels, start, width)",
+            # Warp wants a value and a type of names that sources without layers never set
             "near = int(0)",
             "ground = Ground()",
         ),
         *(lines("ground = ground_of(source)") if model.source in ("layers", "background") else ()),
+        # bits of the layers that may come near any of the lanes; all others are never looked at
         *(lines("near = layers_of(source, x_lanes, y_lanes)") if model.source == "layers" else ()),
         layout.loop(own),
     )

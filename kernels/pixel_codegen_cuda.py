@@ -30,6 +30,8 @@ from dase.kernels.pixel_codegen_program import (
     zero_counts,
 )
 
+# A load of a GPU takes hundreds of cycles, a sample without events some tens; more samples take registers
+# from other threads
 SAMPLES_AHEAD = 4
 """Stored samples of a pixel that are under way from memory at a time."""
 
@@ -46,6 +48,8 @@ class OnePixel:
 
     def lay_out(self, part: Part) -> tuple[Statement, ...]:
         """Return the statements of a part."""
+        # a pixel is its own block: `then` belongs to the same condition, and no other thread may be
+        # ahead, which is all that `handover` is about
         body = (*resolve_guards(part.body, ask=self.asks), *part.then)
         return (if_block(" and ".join(part.when), *body),) if part.when else body
 
@@ -66,6 +70,7 @@ def print_pixel_kernel(model: PixelModel) -> str:
         *_look(model),
         *layout.lay_out_all(intensity_of_log(model)),
         *layout.lay_out_all(program.light),
+        # light that is stored as logarithms already came as the voltage
         *(lines(VOLTAGE) if model.source != "log" else ()),
         *layout.lay_out_all(program.respond),
         *layout.lay_out_all(program.change),
@@ -98,6 +103,8 @@ def print_threshold_kernel(model: PixelModel) -> str:
     ]
     thresholds = assign_thresholds(model)
     body = (
+        # keys of streams depend on names alone, so that these thresholds are those of the kernel of events
+        # although nothing else is drawn here
         *lines("row, i = wp.tid()", "i += first"),
         *place_alone(model),
         *draw_numbers(draws_of(thresholds)),

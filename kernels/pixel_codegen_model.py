@@ -61,6 +61,7 @@ def call_stage(stage: str, effect: EffectStages, function: Any) -> Call:
     Raises:
         ValueError: It asks for a quantity that the stage does not have.
     """
+    # a Warp function keeps the Python function it was made from, whose names are all that is asked for
     names = inspect.signature(function.func).parameters
     arguments = [_argument(stage, effect, name) for name in names]
     text = f"{call_name(stage, effect)}({', '.join(argument.text for argument in arguments)})"
@@ -69,6 +70,7 @@ def call_stage(stage: str, effect: EffectStages, function: Any) -> Call:
 
 def random_number(name: str) -> re.Match[str] | None:
     """Return the parts of a name that asks for a random number, `pixel_` or None and the kind, else None."""
+    # the digit is for functions that want several independent numbers of one kind
     return re.fullmatch(r"(pixel_)?(uniform|normal)(_\d)?", name)
 
 
@@ -143,6 +145,7 @@ class PixelModel:
     @cached_property
     def parameters(self) -> list[str]:
         """Names in the order of the parameter vector."""
+        # with the effect's name before it, as several effects may have a `rate`
         own = [f"{effect.name}_{name}" for effect in self.stages for name in effect.parameters]
         return [*CORE, *own]
 
@@ -197,6 +200,7 @@ def pixel_scope(model: PixelModel) -> dict[str, Any]:
         "Ground": BackgroundGeometry,
         "ground_of": background_geometry,
         "background_at": background_at,
+        # one lane of the vectors' own function, so that a pixel alone and one of a block get the same bits
         "logarithm": lane_functions(1).logarithm,
         "Lane": lane_functions(1).Lanes,
         "whole": whole_quotient,

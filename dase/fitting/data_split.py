@@ -178,6 +178,7 @@ def split_measurement(
             f"a diagnosis needs at least {2 * settings.least_pixels} pixels, "
             f"the scene has {scene.width}x{scene.height}"
         )
+    # a stream of its own: the same pixels are chosen whatever else is drawn from the seed
     rng, notes = Draw.PIXELS.generator(seed), list[str]()
     if grid is not asked:
         notes.append(sentence_of_window(asked, grid))
@@ -310,9 +311,11 @@ def _make_subset(
     stimulus: Stimulus, events: Events, first: int, structure: TimestampStructure
 ) -> PixelSubset:
     trials = BatchSimulator(stimulus, structure=structure)
+    # looked at twice: sums of deviations from the typical change need that change, which the first look tells
     trials.middle = typical_changes(trials.look(events))
     found = trials.look(events)
     seconds = stimulus.grid.step * (stimulus.grid.steps - first)
+    # no model has been run yet; `calibrate` puts what the present one expects in place of these zeros
     expected = np.zeros((len(stimulus.pixels), kernels.HALVES))
     zone = ring_of_pixels(stimulus.pixels, stimulus.width, stimulus.height)
     regular = structure.step > 0 or structure.line > 0
