@@ -39,13 +39,8 @@ from dase.io.format import camera_format
 from dase.io.sequence import Writer, writing_file
 from dase.io.source import Picture, Piece, Size, Source, guess_size
 
-SAMPLE_BITS = 10
-APS, READ_SHIFT = np.uint32(1 << 31), 10
-MOST_MISFITS = 0.01
-"""Share of addresses, damaged ones, that may not fit a layout that is taken for possible."""
 LEAST_READ = 0.5
 """Share of the pixels that must have been read twice; frames with less, cut off, are left out."""
-LONGEST = 1 << 21  # [bytes] of a header: jAER stores all its preferences
 END = b"#End Of ASCII Header\r\n"
 
 
@@ -68,9 +63,34 @@ class Layout:
     special: int
 
 
+@dataclass(frozen=True)
+class SampleLayout:
+    """Bits of an address that is a sample of a frame, first bit and number of bits of each.
+
+    Args:
+        frame: 1 in samples.
+        y: Row.
+        x: Column.
+        read: Which read of the pixel it is.
+        value: What the converter says.
+    """
+
+    frame: tuple[int, int]
+    y: tuple[int, int]
+    x: tuple[int, int]
+    read: tuple[int, int]
+    value: tuple[int, int]
+
+    @property
+    def white(self) -> int:
+        """Largest value of the converter."""
+        return (1 << self.value[1]) - 1
+
+
 DAVIS = Layout((12, 10), (22, 9), 11, 1, 1 << 31 | 1 << 10)
 DVS128 = Layout((1, 7), (8, 7), 0, 0, 1 << 15)
 DVS640 = Layout((1, 10), (11, 10), 0, 1, 0)
+SAMPLES = SampleLayout(frame=(31, 1), y=(22, 9), x=(12, 10), read=(10, 2), value=(0, 10))
 
 CHIPS: tuple[tuple[str, Layout, Size], ...] = (
     ("davis240", DAVIS, (240, 180)),
@@ -124,7 +144,7 @@ def parse_header(head: bytes) -> Header:
 def read_header(source: Source) -> Header:
     """Read the header of a file."""
     with source.path.open("rb") as file:
-        head = file.read(LONGEST)
+        head = file.read(1 << 21)  # so long, as jAER stores all its preferences in a header
     if not head.startswith(b"#!AER-DAT"):
         raise InputError("has no AEDAT header")
     return parse_header(head)
@@ -163,7 +183,7 @@ def _told_from_addresses(source: Source, head: Header) -> tuple[Layout, Size]:
             if len(events):
                 x, y = (int(_extract_bits(events, place).max()) for place in (form.x, form.y))
                 largest[form] = max(largest[form][0], x), max(largest[form][1], y)
-    possible = [form for form in fits if fits[form] >= (1 - MOST_MISFITS) * total]
+    possible = [form for form in fits if fits[form] >= 0.99 * total]  # damaged addresses fit none
     form = possible[0] if possible else max(fits, key=lambda one: fits[one])
     chips = [
         (name, one, size)
@@ -206,10 +226,11 @@ def read_pieces(source: Source) -> Iterator[Piece]:
         if form.special:
             other = (address & form.special) != 0
             if other.any():
-                high = address[other] >> READ_SHIFT  # the top bit and the kind of read
-                if form is DAVIS:
-                    motion += int(np.count_nonzero((high >> 21 > 0) & (high & 3 > 1)))
-                special += int(np.count_nonzero(high >> 21 == 0))
+                marked = address[other]
+                sample = _extract_bits(marked, SAMPLES.frame) > 0
+                if form is DAVIS:  # reads 0 and 1 are of frames
+                    motion += int(np.count_nonzero(sample & (_extract_bits(marked, SAMPLES.read) > 1)))
+                special += int(np.count_nonzero(~sample))
                 address, t = address[~other], t[~other]
         # what lies beyond the sensor turns over to a large number, and is left out as that
         x = np.uint16(width - 1) - _extract_bits(address, form.x)
@@ -266,12 +287,14 @@ def _frame_samples(source: Source, size: Size) -> Iterator[_Samples]:
     held = _Samples(none, none, none)
     for address, time in _read_records(source, read_header(source)):
         t = turns(time)
-        read = (address >> READ_SHIFT) & 3
-        x, y = (_extract_bits(address, place).astype(np.int64) for place in (DAVIS.x, DAVIS.y))
-        chosen = np.flatnonzero((address & APS > 0) & (read < 2) & (x < size[0]) & (y < size[1]))
-        key = (read[chosen] * pixels + (size[1] - 1 - y[chosen]) * size[0] + x[chosen]).astype(np.int64)
-        value = (address[chosen] & ((1 << SAMPLE_BITS) - 1)).astype(np.int64)
-        pairs = zip(held, (key, value, t[chosen]), strict=True)
+        read, x, y, value = (
+            _extract_bits(address, place).astype(np.int64)
+            for place in (SAMPLES.read, SAMPLES.x, SAMPLES.y, SAMPLES.value)
+        )
+        is_sample = _extract_bits(address, SAMPLES.frame) > 0
+        chosen = np.flatnonzero(is_sample & (read < 2) & (x < size[0]) & (y < size[1]))
+        key = read[chosen] * pixels + (size[1] - 1 - y[chosen]) * size[0] + x[chosen]
+        pairs = zip(held, (key, value[chosen], t[chosen]), strict=True)
         held = _Samples(*(np.concatenate(pair) for pair in pairs))
         begin = 0
         for end in _frame_ends(held.key):
@@ -307,7 +330,7 @@ def _picture_of(samples: _Samples, size: Size) -> Picture | None:
         return None
     # light takes charge away; noise makes some of the darkest negative
     grey = np.where(both, np.clip(reads[:pixels] - reads[pixels:], 0, None), 0)
-    scaled = np.rint(grey * (65535 / ((1 << SAMPLE_BITS) - 1))).astype(np.uint16)
+    scaled = np.rint(grey * (65535 / SAMPLES.white)).astype(np.uint16)
     begin, end = float(np.median(t[key < pixels])), float(np.median(t[key >= pixels]))
     return Picture(scaled.reshape(size[::-1]), (begin + end) / 2, max(end - begin, 0.0) / 1e6)
 

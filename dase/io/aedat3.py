@@ -19,6 +19,7 @@ import re
 import struct
 from collections.abc import Iterator
 from dataclasses import dataclass
+from enum import IntEnum
 from pathlib import Path
 from typing import Any
 
@@ -27,14 +28,11 @@ from numpy.typing import NDArray
 
 from dase.errors import InputError
 from dase.io.format import camera_format
-from dase.io.source import Motion, Picture, Piece, Size, Source
+from dase.io.source import STANDARD_GRAVITY, Motion, Picture, Piece, Size, Source
 
 MAGIC = b"#!AER-DAT3."
 END = b"#!END-HEADER\r\n"
-LONGEST = 1 << 20  # [bytes] of the header, and of an event that is no frame
-POLARITY, FRAME, IMU6 = 1, 2, 3
 FRAME_HEAD = struct.Struct("<I8i")
-GRAVITY = 9.80665  # [m/s^2]
 SIZES: tuple[tuple[str, Size], ...] = (
     ("dvs128", (128, 128)),
     ("davis240", (240, 180)),
@@ -47,6 +45,14 @@ SIZES: tuple[tuple[str, Size], ...] = (
 """Part of the name of a source, in small letters, to columns and rows."""
 
 
+class Packet(IntEnum):
+    """Types of packets that are read."""
+
+    POLARITY = 1
+    FRAME = 2
+    IMU6 = 3
+
+
 @dataclass(frozen=True)
 class _Header:
     """Where packets begin, and what the sources are called, in small letters."""
@@ -57,7 +63,7 @@ class _Header:
 
 def _read_header(source: Source) -> _Header:
     with source.path.open("rb") as file:
-        head = file.read(LONGEST)
+        head = file.read(1 << 20)
     if not head.startswith(MAGIC):
         raise InputError("has no AEDAT 3 header")
     if not head.startswith(MAGIC + b"1"):
@@ -73,7 +79,7 @@ def _read_header(source: Source) -> _Header:
     return _Header(end + len(END), tuple(re.findall(r"^#source +\d+: *(\S+)", text.lower(), re.MULTILINE)))
 
 
-def _read_packets(source: Source, kind: int) -> Iterator[tuple[bytes, int, int, int]]:
+def _read_packets(source: Source, kind: Packet) -> Iterator[tuple[bytes, int, int, int]]:
     """Yield the bytes of each packet of a kind, bytes of an event, their number, overflows of the clock."""
     length = source.path.stat().st_size
     place = _read_header(source).length
@@ -96,7 +102,7 @@ def _read_packets(source: Source, kind: int) -> Iterator[tuple[bytes, int, int, 
 def read_pieces(source: Source) -> Iterator[Piece]:
     """Yield the events [us]."""
     invalid = 0
-    for data, size, number, overflows in _read_packets(source, POLARITY):
+    for data, size, number, overflows in _read_packets(source, Packet.POLARITY):
         if size != 8:
             raise InputError(f"a packet claims {size} bytes for an event of 8")
         words = np.frombuffer(data, "<u4").reshape(number, 2)
@@ -123,7 +129,7 @@ def read_size(source: Source) -> Size | None:
 def read_pictures(source: Source) -> Iterator[Picture]:
     """Yield the frames with their exposures [us]."""
     damaged = 0
-    for data, size, number, overflows in _read_packets(source, FRAME):
+    for data, size, number, overflows in _read_packets(source, Packet.FRAME):
         for k in range(number):
             picture = _frame_of(data[k * size : (k + 1) * size], overflows)
             if picture is None:
@@ -157,7 +163,7 @@ def read_motion(source: Source) -> Motion | None:
     """Read the samples of the motion sensor, times [us]."""
     kind = np.dtype([("info", "<u4"), ("t", "<i4"), ("a", "<f4", 3), ("w", "<f4", 3), ("temperature", "<f4")])
     found = []
-    for data, size, number, overflows in _read_packets(source, IMU6):
+    for data, size, number, overflows in _read_packets(source, Packet.IMU6):
         if size != kind.itemsize:
             raise InputError(f"a packet claims {size} bytes for a sample of {kind.itemsize}")
         samples = np.frombuffer(data, kind, number)
@@ -167,7 +173,7 @@ def read_motion(source: Source) -> Motion | None:
     if not found:
         return None
     t, a, w = (np.concatenate(column) for column in zip(*found, strict=True))
-    return Motion(t, GRAVITY * a, np.deg2rad(w)) if len(t) else None
+    return Motion(t, STANDARD_GRAVITY * a, np.deg2rad(w)) if len(t) else None
 
 
 def matches_format(path: Path, head: bytes) -> bool:

@@ -30,16 +30,12 @@ from dase.errors import InputError
 from dase.io import packed
 from dase.io.flatbuffer import Table
 from dase.io.format import camera_format
-from dase.io.source import Motion, Picture, Piece, Size, Source, join_pieces
+from dase.io.source import STANDARD_GRAVITY, Motion, Picture, Piece, Size, Source, join_pieces
 
 T = TypeVar("T")
 
 MAGIC = b"#!AER-DAT4.0\r\n"
-LONGEST = 1 << 24  # [bytes] of the header
-PART = 1 << 17  # events joined before they are handed on: packets hold a few hundred
 EVENT = np.dtype([("t", "<i8"), ("x", "<i2"), ("y", "<i2"), ("p", "u1"), ("", "V3")])
-ROW = np.dtype("V16")  # NumPy joins these faster than fields
-GRAVITY = 9.80665  # [m/s^2]
 PIXELS = {0: ("u1", 1), 16: ("u1", 3), 24: ("u1", 4), 2: ("<u2", 1), 18: ("<u2", 3), 26: ("<u2", 4)}
 """Format of a frame, a type of OpenCV, to NumPy type and channels."""
 
@@ -65,7 +61,7 @@ def _read_header(source: Source) -> _Header:
         if not head.startswith(MAGIC) or len(head) < len(MAGIC) + 4:
             raise InputError("has no AEDAT 4 header")
         size = int.from_bytes(head[len(MAGIC) :], "little")
-        if size > min(LONGEST, length):
+        if size > min(1 << 24, length):
             raise InputError(f"its header claims {size} bytes of {length}")
         table = Table.root(file.read(size))
     place = table.number(1, "<q", -1)
@@ -142,10 +138,11 @@ def read_pieces(source: Source) -> Iterator[Piece]:
     """Yield the events [us]."""
     waiting: list[NDArray[Any]] = []
     count = 0
-    for events in _read_packets(source, "EVTS", lambda packet: packet.structs(0, ROW)):
+    row = np.dtype(("V", EVENT.itemsize))  # NumPy joins these faster than fields
+    for events in _read_packets(source, "EVTS", lambda packet: packet.structs(0, row)):
         waiting.append(events)
         count += len(events)
-        if count >= PART:
+        if count >= 1 << 17:  # packets hold a few hundred
             yield _join_packets(waiting)
             waiting, count = [], 0
     yield _join_packets(waiting) if waiting else join_pieces([])
@@ -179,7 +176,9 @@ def read_motion(source: Source) -> Motion | None:
         return None
     values = np.array([row[1] for row in rows], np.float64)
     return Motion(
-        np.array([row[0] for row in rows], np.int64), GRAVITY * values[:, :3], np.deg2rad(values[:, 3:])
+        np.array([row[0] for row in rows], np.int64),
+        STANDARD_GRAVITY * values[:, :3],
+        np.deg2rad(values[:, 3:]),
     )
 
 

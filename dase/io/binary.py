@@ -17,7 +17,6 @@ from dase.io.sequence import Writer
 from dase.io.source import Source
 
 BLOCK = 1 << 22  # [bytes] read at once
-MOST_BRIDGES = 1 << 20  # words that may be spent on gaps; EVT3 needs one per 4 s, EVT2 one per 72 min
 
 
 def read_records(source: Source, begin: int, kind: Any) -> Iterator[NDArray[Any]]:
@@ -95,7 +94,8 @@ def bridge_gaps(
     before = np.concatenate(([last], counts[:-1]))
     extra = np.maximum((counts - before - 1) // step, 0)
     total = int(extra.sum())
-    if total > MOST_BRIDGES:
+    # EVT3 needs a word per 4 s of a gap, EVT2 one per 72 min: a million are no recording's any more
+    if total > 1 << 20:
         raise InputError(
             f"{name}: times are too large or have too long a gap for this format, write .h5 instead"
         )

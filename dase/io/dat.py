@@ -24,10 +24,8 @@ from dase.io.format import camera_format
 from dase.io.sequence import Writer, writing_file
 from dase.io.source import Piece, Source
 
-TYPES = (0, 12)
-RECORD = 8  # [bytes]
-LAYOUTS = {1: (9, 8), 2: (14, 14)}
-"""Version to bits of column and row."""
+EVENTS = bytes((12, 8))
+"""What stands between header and records: their type, 12 (or 0) for changes of contrast, and their bytes."""
 
 
 def read_pieces(source: Source) -> Iterator[Piece]:
@@ -39,7 +37,7 @@ def read_pieces(source: Source) -> Iterator[Piece]:
     version = header.keys.get("Version", "2")
     if version not in ("1", "2"):
         raise InputError(f"DAT version {version} is not known, only 1 and 2")
-    bits_x, bits_y = LAYOUTS[int(version)]
+    bits_x, bits_y = (9, 8) if version == "1" else (14, 14)
     turns = Rollover(32)
     for block in read_records(source, header.length + 2, np.dtype([("t", "<u4"), ("a", "<u4")])):
         address = block["a"]
@@ -55,7 +53,7 @@ def matches_format(path: Path, head: bytes) -> bool:
     return (
         bool(header.length)
         and header.encoding is None
-        and head[header.length : header.length + 2] in (bytes((kind, RECORD)) for kind in TYPES)
+        and head[header.length : header.length + 2] in (EVENTS, bytes((0, 8)))
     )
 
 
@@ -65,7 +63,7 @@ class _Writer(EventWriter):
     def _header(self, width: int, height: int) -> bytes:
         self._limit(width, height, 1 << 14)
         text = f"% Data file containing CD events.\n% Version 2\n% Height {height}\n% Width {width}\n"
-        return text.encode() + bytes((TYPES[1], RECORD))
+        return text.encode() + EVENTS
 
     def _encoded(self, part: Events, t_us: NDArray[np.int64]) -> bytes:
         if t_us[-1] >= 2**32:

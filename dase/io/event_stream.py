@@ -14,6 +14,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from enum import IntEnum
 from pathlib import Path
 
 import numpy as np
@@ -25,14 +26,20 @@ from dase.io.source import Piece, Size, Source
 
 MAGIC = b"Event Stream"
 HEADER = len(MAGIC) + 8  # [bytes]
-DVS, ATIS = 1, 2
+
+
+class Kind(IntEnum):
+    """Types of streams whose events have a polarity."""
+
+    DVS = 1
+    ATIS = 2
 
 
 @dataclass(frozen=True)
 class _Header:
     """Type of the stream, and columns and rows."""
 
-    kind: int
+    kind: Kind
     size: Size
 
 
@@ -43,10 +50,11 @@ def _read_header(source: Source) -> _Header:
         raise InputError("has no header of an Event Stream")
     if head[12] != 2:
         raise InputError(f"is Event Stream {head[12]}.{head[13]}.{head[14]}, of which version 2 is read")
-    if head[15] not in (DVS, ATIS):
+    if head[15] not in list(Kind):
         name = {0: "generic", 3: "colour (amd)", 4: "colour"}.get(head[15], f"unknown ({head[15]})")
         raise InputError(f"holds events of the type {name}, which have no polarity: DVS and ATIS are read")
-    return _Header(head[15], (int.from_bytes(head[16:18], "little"), int.from_bytes(head[18:20], "little")))
+    size = int.from_bytes(head[16:18], "little"), int.from_bytes(head[18:20], "little")
+    return _Header(Kind(head[15]), size)
 
 
 def read_pieces(source: Source) -> Iterator[Piece]:
@@ -67,7 +75,7 @@ def read_pieces(source: Source) -> Iterator[Piece]:
             place, byte, steps, is_event = place[whole], byte[whole], steps[whole], is_event[whole]
             t = time + np.cumsum(steps)
             time = int(t[-1]) if len(t) else time
-            if kind == ATIS:
+            if kind == Kind.ATIS:
                 light = byte & 1 == 0
                 exposures += int(np.count_nonzero(is_event & ~light))
                 is_event = is_event & light
@@ -76,7 +84,7 @@ def read_pieces(source: Source) -> Iterator[Piece]:
                 data[at + k].astype(np.uint16) | data[at + k + 1].astype(np.uint16) << np.uint16(8)
                 for k in (1, 3)
             )
-            on = byte[is_event] & (1 if kind == DVS else 2) > 0
+            on = byte[is_event] & (1 if kind == Kind.DVS else 2) > 0
             yield Piece(t[is_event], x, y, on)
     if rest:
         source.note(f"{len(rest)} bytes at the end are no whole event: skipped", "refused", "damage", 1)
@@ -85,20 +93,20 @@ def read_pieces(source: Source) -> Iterator[Piece]:
         source.note(sentence, "refused", "exposures", exposures)
 
 
-def _is_step(byte: NDArray[np.uint8], kind: int) -> NDArray[np.bool_]:
+def _is_step(byte: NDArray[np.uint8], kind: Kind) -> NDArray[np.bool_]:
     """Whether bytes at the begin of a record are only steps of time."""
-    return byte >= (0xFE if kind == DVS else 0xFC)
+    return byte >= (0xFE if kind == Kind.DVS else 0xFC)
 
 
-def _steps(byte: NDArray[np.uint8], kind: int) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
+def _steps(byte: NDArray[np.uint8], kind: Kind) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
     """Return how far each record moves the time [us], and which of them are events, each (N,)."""
     first, step = byte.astype(np.int64), _is_step(byte, kind)
-    if kind == DVS:
+    if kind == Kind.DVS:
         return np.where(step, np.where(first == 0xFF, 127, 0), first >> 1), ~step
     return np.where(step, 63 * (first & 3), first >> 2), ~step
 
 
-def _begins(data: NDArray[np.uint8], kind: int) -> NDArray[np.int64]:
+def _begins(data: NDArray[np.uint8], kind: Kind) -> NDArray[np.int64]:
     """Return where records begin, (N,): each tells how long it is, so the next is known from it alone.
 
     All places are followed at once, and twice as far with every round: from the first 1, 2, 4, ... records

@@ -13,6 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import AbstractContextManager
+from enum import IntEnum
 from pathlib import Path
 
 import numpy as np
@@ -26,9 +27,21 @@ from dase.io.sequence import Writer, writing_file
 from dase.io.source import Piece, Source
 
 PART = 1 << 17  # words decoded at once: their arrays stay in the cache
-HIGH, TRIGGER, OTHERS, CONTINUED = 8, 10, 14, 15
-KNOWN = np.isin(np.arange(16), (0, 1, HIGH, TRIGGER, OTHERS, CONTINUED))
-LARGEST = 2048  # columns and rows that 11 bits can number
+
+
+class Word(IntEnum):
+    """Types of words."""
+
+    CD_OFF = 0
+    CD_ON = 1
+    TIME_HIGH = 8
+    EXT_TRIGGER = 10
+    OTHERS = 14
+    CONTINUED = 15
+
+
+KNOWN = np.isin(np.arange(16), list(Word))
+"""Which of the 16 types there are."""
 
 
 class Decoder:
@@ -50,8 +63,8 @@ class Decoder:
         kind = (words >> 28).astype(np.uint8)
         if not KNOWN[kind].all():
             self.unknown += int(np.count_nonzero(~KNOWN[kind]))
-        is_high = kind == HIGH
-        at = np.flatnonzero(kind <= 1)
+        is_high = kind == Word.TIME_HIGH
+        at = np.flatnonzero(kind <= Word.CD_ON)
         high = np.empty(np.count_nonzero(is_high) + 1, np.int64)
         high[0] = -1 if self._high is None else self._high
         high[1:] = self._turns(words[is_high] & 0xFFFFFFF)
@@ -92,7 +105,7 @@ class _Writer(EventWriter):
         self._high = -1
 
     def _header(self, width: int, height: int) -> bytes:
-        self._limit(width, height, LARGEST)
+        self._limit(width, height, 1 << 11)  # 11 bits number columns and rows
         text = f"% evt 2.0\n% format EVT2;height={height};width={width}\n% geometry {width}x{height}\n% end\n"
         return text.encode()
 
@@ -112,7 +125,7 @@ class _Writer(EventWriter):
 
 def time_word(high: NDArray[np.int64]) -> NDArray[np.int64]:
     """Return TIME_HIGH words of high parts of times, (N,)."""
-    return (HIGH << 28) | (high & 0xFFFFFFF)
+    return (Word.TIME_HIGH << 28) | (high & 0xFFFFFFF)
 
 
 def create(path: Path) -> AbstractContextManager[Writer]:

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from dase.io import raw
 from dase.io.binary import read_records, set_bits
-from dase.io.evt2 import HIGH, KNOWN, Decoder
+from dase.io.evt2 import KNOWN, Decoder, Word
 from dase.io.format import camera_format
 from dase.io.source import Piece, Source
 
@@ -60,7 +60,9 @@ def _halves_swapped(header: raw.Header, halves: NDArray[np.uint32]) -> bool:
     said = header.options.get("endianness", header.keys.get("endianness", ""))
     if said:
         return said == "legacy"
-    times = [np.count_nonzero((halves[:, i] >> 28 == HIGH) & (halves[:, 1 - i] == 0)) for i in (0, 1)]
+    times = [
+        np.count_nonzero((halves[:, i] >> 28 == Word.TIME_HIGH) & (halves[:, 1 - i] == 0)) for i in (0, 1)
+    ]
     known = [np.count_nonzero(KNOWN[halves[:, i] >> 28]) for i in (0, 1)]
     return (times[0], known[0]) > (times[1], known[1])
 

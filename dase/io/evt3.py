@@ -19,6 +19,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import AbstractContextManager
+from enum import IntEnum
 from pathlib import Path
 
 import numpy as np
@@ -32,18 +33,33 @@ from dase.io.sequence import Writer, writing_file
 from dase.io.source import Piece, Source
 
 PART = 1 << 18  # words decoded at once; three million events if all are full vectors
-ADDR_Y, OTHER_Y, ADDR_X, BASE_X, VECT_12, VECT_8, LOW, HIGH = 0, 1, 2, 3, 4, 5, 6, 8
-UNKNOWN = (9, 11, 12, 13)
 NOWHERE = 65535  # row of events that have none
 UNDATED = -(1 << 40)  # high part of the time before there is any
-LARGEST = 2048  # columns and rows that 11 bits can number
+
+
+class Word(IntEnum):
+    """Types of words."""
+
+    ADDR_Y = 0
+    OTHER_Y = 1
+    ADDR_X = 2
+    VECT_BASE_X = 3
+    VECT_12 = 4
+    VECT_8 = 5
+    TIME_LOW = 6
+    CONTINUED_4 = 7
+    TIME_HIGH = 8
+    EXT_TRIGGER = 10
+    OTHERS = 14
+    CONTINUED_12 = 15
+
 
 # one running sum counts row words and words that set the low bits of the time at the same time
 COUNTED = np.zeros(16, np.int64)
-COUNTED[[ADDR_Y, OTHER_Y]] = 1
-COUNTED[LOW] = 1 << 32
+COUNTED[[Word.ADDR_Y, Word.OTHER_Y]] = 1
+COUNTED[Word.TIME_LOW] = 1 << 32
 STEP = np.zeros(16, np.int64)
-STEP[VECT_12], STEP[VECT_8] = 12, 8
+STEP[Word.VECT_12], STEP[Word.VECT_8] = 12, 8
 BITS = np.array([bin(mask).count("1") for mask in range(4096)], np.int64)
 
 
@@ -71,13 +87,13 @@ class Decoder:
 
     def _part(self, words: NDArray[np.uint16]) -> Piece:
         kind = (words >> 12).astype(np.uint8)
-        self.unknown += sum(int(np.count_nonzero(kind == unknown)) for unknown in UNKNOWN)
+        self.unknown += sum(int(np.count_nonzero(kind == free)) for free in set(range(16)) - set(Word))
         counted = COUNTED.take(kind)
         undated = self._high == UNDATED
         rows, times = self._rows(words, kind), self._times(words, kind, counted)
-        at = np.flatnonzero((kind == ADDR_X) | (kind == VECT_12) | (kind == VECT_8))
+        at = np.flatnonzero((kind == Word.ADDR_X) | (kind == Word.VECT_12) | (kind == Word.VECT_8))
         if undated:
-            dated = int(np.argmax(kind == HIGH)) if self._high != UNDATED else len(kind)
+            dated = int(np.argmax(kind == Word.TIME_HIGH)) if self._high != UNDATED else len(kind)
             early = int(np.searchsorted(at, dated))
             self.undated += early
             at = at[early:]
@@ -94,10 +110,10 @@ class Decoder:
 
     def _rows(self, words: NDArray[np.uint16], kind: NDArray[np.uint8]) -> NDArray[np.uint16]:
         """Return the row before the first word and after each row word."""
-        at = np.flatnonzero(kind <= OTHER_Y)
+        at = np.flatnonzero(kind <= Word.OTHER_Y)
         out = np.empty(len(at) + 1, np.uint16)
         out[0] = self._y
-        out[1:] = np.where(kind[at] == ADDR_Y, words[at] & 2047, NOWHERE)
+        out[1:] = np.where(kind[at] == Word.ADDR_Y, words[at] & 2047, NOWHERE)
         self._y = int(out[-1])
         return out
 
@@ -108,12 +124,12 @@ class Decoder:
 
         TIME_HIGH words that change the high bits do so too; they are added to `counted`.
         """
-        at_high = np.flatnonzero(kind == HIGH)
+        at_high = np.flatnonzero(kind == Word.TIME_HIGH)
         highs = self._turns(words.take(at_high) & 4095)
         changes = np.flatnonzero(np.diff(highs, prepend=self._high))
         at_high, highs = at_high[changes], highs[changes]
         counted[at_high] = 1 << 32
-        sets = kind == LOW
+        sets = kind == Word.TIME_LOW
         sets[at_high] = True
         at = np.flatnonzero(sets)
         places = np.searchsorted(at, at_high)
@@ -139,12 +155,12 @@ class Decoder:
         """Return column, polarity and, where there are vectors, the mask of each event word."""
         kinds, value = kind[at], words[at]
         x, on = value & np.uint16(2047), (value & 2048).astype(np.bool_)
-        vectors = np.flatnonzero((kind >= BASE_X) & (kind <= VECT_8))
+        vectors = np.flatnonzero((kind >= Word.VECT_BASE_X) & (kind <= Word.VECT_8))
         if not len(vectors):
             return x, on, None
         step = STEP[kind[vectors]]
         moved = np.cumsum(step) - step  # by the vectors before
-        is_base = kind[vectors] == BASE_X
+        is_base = kind[vectors] == Word.VECT_BASE_X
         nth = np.cumsum(is_base)
         bases = np.concatenate(([self._base[0]], words[vectors][is_base] & 2047)).astype(np.int64)
         start = bases - np.concatenate(([0], moved[is_base]))
@@ -154,10 +170,10 @@ class Decoder:
         self._base = (min(end, NOWHERE), bool(ons[nth[-1]]))
         late = vectors[~is_base]
         kept = late >= at[0] if len(at) else np.zeros(len(late), np.bool_)
-        is_vector = kinds >= VECT_12
+        is_vector = kinds >= Word.VECT_12
         x[is_vector] = column[~is_base][kept]
         on[is_vector] = ons[nth[~is_base]][kept]
-        mask = np.where(is_vector, value & np.where(kinds == VECT_8, 255, 4095), 1).astype(np.uint16)
+        mask = np.where(is_vector, value & np.where(kinds == Word.VECT_8, 255, 4095), 1).astype(np.uint16)
         return x, on, mask
 
     def report(self, source: Source) -> None:
@@ -188,7 +204,7 @@ class _Writer(EventWriter):
         self._y = -1
 
     def _header(self, width: int, height: int) -> bytes:
-        self._limit(width, height, LARGEST)
+        self._limit(width, height, 1 << 11)  # 11 bits number columns and rows
         text = f"% evt 3.0\n% format EVT3;height={height};width={width}\n% geometry {width}x{height}\n% end\n"
         return text.encode()
 
@@ -198,19 +214,17 @@ class _Writer(EventWriter):
         at, between = bridge_gaps(high, max(self._t, 0) >> 12, 1 << 10, self.name)
         new_high = (high != before >> 12) | (before < 0)
         columns = [
-            (new_high, _make_words(HIGH, high & 4095)),
-            (
-                (t_us != before) | new_high,
-                _make_words(LOW, t_us & 4095),
-            ),  # not every reader clears them at HIGH
-            (np.diff(y, prepend=self._y) != 0, _make_words(ADDR_Y, y)),
-            (np.ones(len(y), np.bool_), _make_words(ADDR_X, part.x | (part.p.astype(np.int64) << 11))),
+            (new_high, _make_words(Word.TIME_HIGH, high & 4095)),
+            # also after a new TIME_HIGH, as not every reader clears the low bits there
+            ((t_us != before) | new_high, _make_words(Word.TIME_LOW, t_us & 4095)),
+            (np.diff(y, prepend=self._y) != 0, _make_words(Word.ADDR_Y, y)),
+            (np.ones(len(y), np.bool_), _make_words(Word.ADDR_X, part.x | (part.p.astype(np.int64) << 11))),
         ]
         self._t, self._y = int(t_us[-1]), int(y[-1])
-        return weave_words(columns, (at, _make_words(HIGH, between & 4095))).astype("<u2").tobytes()
+        return weave_words(columns, (at, _make_words(Word.TIME_HIGH, between & 4095))).astype("<u2").tobytes()
 
 
-def _make_words(kind: int, value: NDArray[np.int64]) -> NDArray[np.int64]:
+def _make_words(kind: Word, value: NDArray[np.int64]) -> NDArray[np.int64]:
     return (kind << 12) | value
 
 

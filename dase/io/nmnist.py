@@ -21,15 +21,14 @@ from dase.io.format import camera_format, find_extent
 from dase.io.source import Piece, Size, Source
 
 RECORD = np.dtype([("x", "u1"), ("y", "u1"), ("t", "u1", 3)])
-OVERFLOW_ROW, OVERFLOW = 240, 1 << 13  # [us]
 SMALL = (34, 34)  # of N-MNIST
 
 
 def _decode(block: NDArray[np.void], begin: int) -> tuple[Piece, int]:
     """Return the events of records, and how far overflows moved the time so far [us]."""
     high, middle, low = block["t"].astype(np.int64).T
-    over = block["y"] == OVERFLOW_ROW
-    moved = begin + np.cumsum(over) * OVERFLOW
+    over = block["y"] == 240  # no row: the time goes on by 2^13 us
+    moved = begin + np.cumsum(over) * (1 << 13)
     t = ((high & 127) << 16 | middle << 8 | low) + moved
     good = np.flatnonzero(~over)
     x, y = (block[name][good].astype(np.uint16) for name in "xy")

@@ -17,6 +17,7 @@ Size = tuple[int, int]
 
 CHUNK = 1 << 20  # events that `stream` hands on at once
 LARGEST = 8192  # columns or rows of a sensor that a file may claim
+STANDARD_GRAVITY = 9.80665  # [m/s^2]
 SIZES: tuple[Size, ...] = (
     (128, 128),
     (240, 180),

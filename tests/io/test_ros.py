@@ -35,7 +35,7 @@ def encoded_evt3(tmp_path):
         if not path.exists():
             io.write(path, Sequence(e))
         words = np.frombuffer(path.read_bytes().partition(b"% end\n")[2], "<u2")
-        ends = np.flatnonzero(words >> 12 == evt3.ADDR_X) + 1
+        ends = np.flatnonzero(words >> 12 == evt3.Word.ADDR_X) + 1
         begin = ends[k.start - 1] if k.start else 0
         return words[begin : ends[min(k.stop, len(e)) - 1]].tobytes(), 0
 
