@@ -16,6 +16,12 @@ if TYPE_CHECKING:
     from dase.fitting.fit import fit as fit
     from dase.recordings.recording import Recording as Recording
     from dase.recordings.recording import open_recording as open_recording
+    from dase.representations import AveragedTimeSurface as AveragedTimeSurface
+    from dase.representations import CountImage as CountImage
+    from dase.representations import EventFrame as EventFrame
+    from dase.representations import StackedHistogram as StackedHistogram
+    from dase.representations import TimeSurface as TimeSurface
+    from dase.representations import Voxels as Voxels
     from dase.scenes.between_frames import CameraScene as CameraScene
     from dase.scenes.frame_alignment import align as align
     from dase.scenes.image_sources import Picture as Picture
@@ -50,6 +56,14 @@ _HOMES = {
     "dase.events": ("Events",),
     "dase.figures.plot": ("plot",),
     "dase.fitting.fit": ("fit",),
+    "dase.representations": (
+        "AveragedTimeSurface",
+        "CountImage",
+        "EventFrame",
+        "StackedHistogram",
+        "TimeSurface",
+        "Voxels",
+    ),
     "dase.scenes.image_sources": ("Picture", "open_images"),
     "dase.scenes.layers": ("Layer", "LayerScene", "Motion"),
     "dase.recordings.recording": ("Recording", "open_recording"),

@@ -155,25 +155,3 @@ class Events:
         for window, (i, j) in enumerate(pairwise(bounds)):
             out[window] = np.bincount(flat[i:j], minlength=size).reshape(2, self.height, self.width)
         return out
-
-    def voxel_grid(self, bins: int, begin: float, end: float) -> NDArray[np.float32]:
-        """Spread polarities linearly over time bins (Zhu et al., Unsupervised event-based learning, 2019).
-
-        Args:
-            bins: Number of time bins B.
-            begin: Time of bin 0 [s].
-            end: Time of bin B - 1 [s].
-
-        Returns:
-            Shape (B, height, width): sum over events of ±max(0, 1 - |b - (B - 1)(t - begin)/(end - begin)|).
-        """
-        part = self.slice(begin, np.nextafter(end, np.inf))
-        size = self.height * self.width
-        out = np.zeros((bins + 1) * size)  # one spare bin takes the zero weight of t = end
-        at = (bins - 1) * (part.t - begin) / (end - begin)
-        low = np.floor(at).astype(np.int64)
-        sign = np.where(part.p, 1.0, -1.0)
-        flat = low * size + part.y.astype(np.int64) * self.width + part.x
-        out += np.bincount(flat, sign * (low + 1 - at), minlength=out.size)
-        out += np.bincount(flat + size, sign * (at - low), minlength=out.size)
-        return out[: bins * size].reshape(bins, self.height, self.width).astype(np.float32)

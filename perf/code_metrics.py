@@ -68,7 +68,10 @@ FLOORS: tuple[tuple[tuple[str, ...], str], ...] = (
     ),
     (("probes", "effects"), "An effect knows scenes and kernels, not the sensor; a statistic only events."),
     (("recordings", "scenes"), "What a camera wrote, and what a camera looks at, both from files or made."),
-    (("io", "networks", "presets"), "Files know events, not what they are used for."),
+    (
+        ("io", "networks", "presets", "representations"),
+        "Files and representations know events, not what they are used for.",
+    ),
     (
         ("events", "formatting", "files"),
         "What everybody speaks of: events, readable numbers, whole files.",
