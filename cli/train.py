@@ -96,7 +96,7 @@ def _train_job(
     """Learn, in a folder that no other run writes to."""
     began = time.monotonic()
     from dase.learning import job as learning_job
-    from dase.learning.run import CHECKPOINT, RunSchedule, train_in_folder
+    from dase.learning.run import RunFile, RunSchedule, train_in_folder
 
     if first:
         learning_job.record_job(job, output, resume=resume)
@@ -109,7 +109,7 @@ def _train_job(
     )
     with _LiveLine(training, output if tensorboard and first else None, silent=not first) as look:
         # killed before its first checkpoint, a run begins anew
-        resume = resume and (output / CHECKPOINT).is_file()
+        resume = resume and (output / RunFile.CHECKPOINT).is_file()
         last = train_in_folder(
             training,
             output,

@@ -29,12 +29,6 @@ FILTERS = {1: 1, 2: 0, 3: 0, 32000: 0, 32001: 4, 32004: 0, 32015: 0, 32026: 4}
 """Number of a filter to how many parameters it needs: gzip, shuffle, Fletcher's sum, LZF; of hdf5plugin
 Blosc, LZ4, Zstandard, Blosc 2. Blosc crashes without its parameters."""
 
-MOST_LINKS = 16
-"""Links within a file that are followed on the way to one name; HDF5 itself takes as many."""
-
-PLAIN = (h5py.h5t.INTEGER, h5py.h5t.FLOAT, h5py.h5t.STRING, h5py.h5t.ENUM)
-"""Kinds of attributes that are read. HDF5 2.0 crashes on a list whose kind of length is unknown."""
-
 TELLING = (
     "CD/events",
     *("events/t", "events/x", "events/y", "events/p"),
@@ -46,9 +40,6 @@ TELLING = (
 
 SETTLED = 2_000_000_000
 """Age [ns] of a change from which on the next one has another time, however coarse the clock of the disk."""
-
-MOST_SOUND = 1000
-"""Files that are remembered."""
 
 _asked: tuple[bytes, frozenset[str]] = b"", frozenset()  # first bytes of a file, and which of these it holds
 _plugin_tried = False
@@ -76,7 +67,7 @@ class Hdf5Group:
         Raises:
             InputError: It lies in another file, or links lead nowhere for too long.
         """
-        found = self._reach(self._h5, name, [MOST_LINKS], name)
+        found = self._reach(self._h5, name, [16], name)  # HDF5 itself follows as many links
         return default if found is None else found
 
     def __getitem__(self, name: str) -> Any:
@@ -196,7 +187,7 @@ def check_heaps(path: Path) -> None:
                 _check_names(file, begin, found.st_size, base)
     # a small one may change once more before the clock of its times goes on
     if found.st_size > BLOCK or max(state[2:]) < now - SETTLED:
-        if len(_sound) >= MOST_SOUND:
+        if len(_sound) >= 1000:  # a run over a data set need not remember all of it
             _sound.clear()
         _sound[place] = state
 
@@ -319,7 +310,9 @@ def read_attribute(node: Any, name: str) -> Any:
     found = node.attrs.get_id(name)
     if found.get_storage_size() > MOST_TEXT:
         raise InputError(f"its attribute '{name}' has {found.get_storage_size()} bytes")
-    if found.get_type().get_class() not in PLAIN:
+    # HDF5 2.0 crashes on a list whose kind of length is unknown
+    plain = (h5py.h5t.INTEGER, h5py.h5t.FLOAT, h5py.h5t.STRING, h5py.h5t.ENUM)
+    if found.get_type().get_class() not in plain:
         raise InputError(f"its attribute '{name}' holds neither numbers nor a text")
     with _little_memory() if found.dtype.hasobject else nullcontext():
         return node.attrs[name]

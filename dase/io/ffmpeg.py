@@ -11,6 +11,7 @@ import os
 import re
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -21,52 +22,73 @@ from dase.errors import InputError
 from dase.io.image_files import quiet_opencv
 from dase.io.source import BOMB_BYTES, refuse_bomb
 
-TITLES = re.compile(rb"LIST(.{4})INFO", re.DOTALL)
-"""A list of titles in an AVI, with its length [bytes]."""
-LONGEST = 1 << 24
-"""Bytes of titles that do no harm, whatever a damaged file claims."""
-KEPT = {b"vp90": 10, b"fmp4": 6} | dict.fromkeys(
-    (b"vp80", b"mjpg", b"ffv1", b"hfyu", b"ffvh", b"mpng", b"rle ", b"dib ", b"avdn", b"apch"), 5
-)
-"""Frames that decoders keep at most, by the names that OpenCV has for them, in small letters."""
-KEPT_ELSE = 26
-"""Those of H.264 and HEVC: sixteen to refer to, the others on their way."""
-DEPTH = {b"I420": 1.5, b"Y800": 1, b"Y42B": 2, b"444P": 3, b"BGR\x18": 3, b"RGB\x18": 3, b"BGR\0": 4}
-"""Bytes of a pixel in a frame that a decoder keeps, by its format."""
-DEPTH_ELSE = 8
-UNKNOWN = b"\xff\xff\xff\xff"
-"""The format before anything was decoded."""
 TAKEN = 10
 """Frames that are kept as grey at once, at least: of a byte per pixel each."""
-BESIDE = 7 + TAKEN
-"""Bytes of a pixel beside the decoder: blue, green and red twice, as OpenCV has them, and grey."""
+PIECE = 1 << 22
+"""Bytes of a file that are looked at together."""
 OPTIONS = "OPENCV_FFMPEG_CAPTURE_OPTIONS"
 """Environment variable with options of FFmpeg."""
 LOG_LEVEL = "OPENCV_FFMPEG_LOGLEVEL"
 """Environment variable with the level of FFmpeg's messages."""
 QUIET = -8
 """The level of none at all."""
-PIECE = 1 << 22
-"""Bytes of a file that are looked at together."""
-FLOOR = 4 << 20
-"""Bytes that FFmpeg may always take at once: a frame of 4 megapixels, of which even 26 stay below 200 MiB."""
-UNTOLD = 2048, 2048
-"""Columns and rows that FFmpeg may decode, in any format, where the head of a file does not tell them."""
-RESIZING = frozenset((b"vp80", b"vp90", b"h264", b"hevc"))
-"""Codecs whose frames may change their size on the way, which take nothing larger than a plane at once."""
-NO_LIMIT = (1 << 31) - 1
-"""Bytes that FFmpeg takes at once, unless told otherwise."""
+
+
+@dataclass(frozen=True)
+class AllocationLimits:
+    """How much FFmpeg may take at once, see `_at_once`."""
+
+    always: int = 4 << 20
+    """Bytes that it may always take: a frame of 4 megapixels, of which even 26 stay below 200 MiB."""
+
+    untold_size: tuple[int, int] = (2048, 2048)
+    """Columns and rows that it may decode, in any format, where the head of a file does not tell them."""
+
+    border: int = 256
+    """Columns and rows that it adds to a frame at most [px]."""
+
+    none: int = (1 << 31) - 1
+    """Bytes that it takes unless told otherwise."""
+
+
+ALLOCATION = AllocationLimits()
+
+
+@dataclass(frozen=True)
+class DecodedPixel:
+    """What a pixel takes while it is decoded [bytes]."""
+
+    deepest: int = 8
+    """In a frame of any format."""
+
+    beside: int = 7 + TAKEN
+    """Beside the decoder: blue, green and red twice, as OpenCV has them, and grey."""
+
+    def in_format(self, name: bytes) -> float:
+        """Return what a decoder keeps of it in a frame of a format, by the four letters of OpenCV."""
+        known = {b"I420": 1.5, b"Y800": 1, b"Y42B": 2, b"444P": 3, b"BGR\x18": 3, b"RGB\x18": 3, b"BGR\0": 4}
+        return known.get(name, self.deepest)
+
+
+PIXEL = DecodedPixel()
+
+
+def frames_kept(codec: bytes) -> int:
+    """Return how many frames a decoder keeps at most; `codec` is OpenCV's name for it, in small letters."""
+    few = (b"vp80", b"mjpg", b"ffv1", b"hfyu", b"ffvh", b"mpng", b"rle ", b"dib ", b"avdn", b"apch")
+    # all others as H.264 and HEVC: sixteen to refer to, ten on their way
+    return {b"vp90": 10, b"fmp4": 6, **dict.fromkeys(few, 5)}.get(codec, 26)
 
 
 def open_video(path: Path) -> Any:
     """Open a video with FFmpeg; raises InputError where it cannot be, or its frames are absurdly large."""
     packed = path.stat().st_size
     # without decoders, which would decode a frame to be asked its size; FFmpeg calls that an error
-    with _at_once(FLOOR + 2 * packed), quiet_ffmpeg():
+    with _at_once(ALLOCATION.always + 2 * packed), quiet_ffmpeg():
         size = size_of(_open_capture(path, "codec_whitelist;none"))
     if min(size) < 1:  # of MPEG-4 only the decoder knows it
-        size = UNTOLD
-    with _at_once(max(FLOOR, _plane_bytes(size, DEPTH_ELSE)) + 2 * packed):
+        size = ALLOCATION.untold_size
+    with _at_once(max(ALLOCATION.always, _plane_bytes(size, PIXEL.deepest)) + 2 * packed):
         return _open_capture(path)
 
 
@@ -78,9 +100,8 @@ def _open_capture(path: Path, with_options: str | None = None) -> Any:
     if with_options is not None:
         os.environ[OPTIONS] = with_options
     try:
-        with (
-            quiet_opencv()
-        ):  # FFmpeg alone: the others after it take as much memory as a damaged file asks for
+        # FFmpeg alone: the others after it take as much memory as a damaged file asks for
+        with quiet_opencv():
             capture = cv2.VideoCapture(str(path), cv2.CAP_FFMPEG, parameters)
     finally:
         if with_options is not None:
@@ -105,10 +126,11 @@ def _four_letters(capture: Any, which: int) -> bytes:
 def decoding_memory(capture: Any) -> int:
     """Return the bytes of memory that decoding takes at most, with `TAKEN` frames of it."""
     width, height = size_of(capture)
-    kept = KEPT.get(_four_letters(capture, cv2.CAP_PROP_FOURCC).lower(), KEPT_ELSE)
+    kept = frames_kept(_four_letters(capture, cv2.CAP_PROP_FOURCC).lower())
     format = _four_letters(capture, cv2.CAP_PROP_CODEC_PIXEL_FORMAT)
-    depth = DEPTH[b"I420"] if format == UNKNOWN else DEPTH.get(format, DEPTH_ELSE)
-    return int((BESIDE + kept * depth) * max(width, 0) * max(height, 0))
+    # four times FF before anything was decoded: most videos are I420
+    depth = PIXEL.in_format(b"I420" if format == b"\xff\xff\xff\xff" else format)
+    return int((PIXEL.beside + kept * depth) * max(width, 0) * max(height, 0))
 
 
 def pixel_format(capture: Any) -> tuple[bytes, bytes]:
@@ -141,13 +163,15 @@ def bounded_decoding(capture: Any, packed: int) -> Iterator[None]:
         packed: Bytes of the file; its tables and packets may take as much.
     """
     codec, pixels = pixel_format(capture)
-    depth = 1 if codec.lower() in RESIZING and DEPTH.get(pixels, DEPTH_ELSE) <= 3 else DEPTH_ELSE
-    with _at_once(max(FLOOR, _plane_bytes(size_of(capture), depth)) + 2 * packed):
+    # frames of these may change their size on the way, and take nothing larger than a plane at once
+    resizing = codec.lower() in (b"vp80", b"vp90", b"h264", b"hevc")
+    depth = 1 if resizing and PIXEL.in_format(pixels) <= 3 else PIXEL.deepest
+    with _at_once(max(ALLOCATION.always, _plane_bytes(size_of(capture), depth)) + 2 * packed):
         yield
 
 
 def _plane_bytes(size: tuple[int, int], depth: int) -> int:
-    return depth * (max(size[0], 0) + 256) * (max(size[1], 0) + 256)  # FFmpeg adds borders
+    return depth * (max(size[0], 0) + ALLOCATION.border) * (max(size[1], 0) + ALLOCATION.border)
 
 
 @contextmanager
@@ -157,11 +181,11 @@ def _at_once(most: int) -> Iterator[None]:
     if library is None:
         yield
         return
-    library.av_max_alloc(min(most, NO_LIMIT))
+    library.av_max_alloc(min(most, ALLOCATION.none))
     try:
         yield
     finally:
-        library.av_max_alloc(NO_LIMIT)
+        library.av_max_alloc(ALLOCATION.none)
 
 
 @contextmanager
@@ -197,15 +221,16 @@ def refuse_titles(path: Path) -> None:
     It follows damaged sizes to wherever they lead, so the list may lie anywhere.
     """
     length = path.stat().st_size
+    titles = re.compile(rb"LIST(.{4})INFO", re.DOTALL)  # with the length of the list [bytes]
     with path.open("rb") as file:
         kept = file.read(12)
         if kept[:4] not in (b"RIFF", b"ON2 "):
             return
         while more := file.read(PIECE):
             kept += more
-            for found in TITLES.finditer(kept):
+            for found in titles.finditer(kept):
                 claimed = int.from_bytes(found[1], "little")
-                if claimed > max(length, LONGEST):
+                if claimed > max(length, 1 << 24):  # so much does no harm, whatever a damaged file claims
                     sizes = f"{claimed:,} bytes of titles in a file of {length:,}"
                     raise InputError(f"video {path} is damaged: it claims {sizes}")
             kept = kept[-11:]  # all but one byte of what is looked for

@@ -47,9 +47,6 @@ BLOCK = 4 * CHUNK  # events gathered before they are written
 # fast.
 COMPRESSION: dict[str, Any] = {"compression": "gzip", "compression_opts": 1, "shuffle": True}
 
-HEAD = 4
-"""Bytes that `deflate_bytes` flushes on their own: enough for a first entry of the hash table, at most 16."""
-
 LATE = -1  # marks a frame that came after later events had been written
 
 EVENT_TYPES: dict[str, type[np.generic]] = {
@@ -126,8 +123,9 @@ def deflate_bytes(data: NDArray[np.uint8]) -> bytes:
     begins with a few bytes that are flushed on their own. It costs 4 % of the time of deflating, and no room.
     """
     stream = isal_zlib.compressobj(1)
-    head = stream.compress(data[:HEAD]) + stream.flush(isal_zlib.Z_SYNC_FLUSH)
-    return b"".join((head, stream.compress(data[HEAD:]), stream.flush()))
+    few = 4  # enough for a first entry of the hash table, and at most 16
+    head = stream.compress(data[:few]) + stream.flush(isal_zlib.Z_SYNC_FLUSH)
+    return b"".join((head, stream.compress(data[few:]), stream.flush()))
 
 
 def put_chunk(dataset: h5py.Dataset, place: int | tuple[int, ...], values: NDArray[Any]) -> None:

@@ -30,7 +30,6 @@ from dase.io.source import Picture, Piece, Size, Source, refuse_bomb
 EVENTS, IMAGES = "events.txt", "images.txt"
 OTHERS = (IMAGES, "calib.txt", "groundtruth.txt", "imu.txt", "readme.txt", "timestamps.txt")
 SUFFIXES = (".txt", ".csv")
-MOST_TEXT = 1 << 26  # [bytes] of images.txt
 PART = 1 << 16  # events turned into text at once
 ZIP = b"PK\x03\x04"
 
@@ -124,7 +123,7 @@ def read_size(source: Source) -> Size | None:
 
 def _listed_frames(place: _Place) -> list[tuple[float, str]]:
     """Return time [s] and name of the frames beside events.txt."""
-    content = place.read(IMAGES, MOST_TEXT) if place.events == EVENTS else None
+    content = place.read(IMAGES, most=1 << 26) if place.events == EVENTS else None
     out = []
     for number, line in enumerate((content or b"").decode("latin-1").splitlines(), 1):
         words = line.split()

@@ -20,13 +20,8 @@ SUFFIXES = ("jpg", "jpeg", "png", "bmp", "tif", "tiff", "webp", "ppm", "pgm")
 """Picture files, whatever their case."""
 
 PNG = b"\x89PNG\r\n\x1a\n"
-TIFF = b"II*\0", b"MM\0*", b"II+\0", b"MM\0+"
 BAND = 1 << 18
 """Pixels turned to grey at once: the numbers in between take little memory, and stay in the cache."""
-SHALLOW = frozenset(("1", "L", "LA", "P", "PA", "RGB", "RGBA", "RGBX", "CMYK", "YCbCr"))
-"""Pillow's names of pixels whose values have 8 bits."""
-TAKEN = 13, 20
-"""Bytes that a pixel takes at most, of 8 and of 16 bits per value: decoded, as it is, as grey and alpha."""
 
 
 def list_pictures(folder: Path) -> list[Path]:
@@ -115,7 +110,8 @@ def head_size(data: bytes) -> tuple[int, int] | None:
     try:
         with Image.open(io.BytesIO(data)) as picture:
             size = int(picture.size[0]), int(picture.size[1])
-            shallow = picture.mode in SHALLOW
+            # Pillow's names of pixels whose values have 8 bits
+            shallow = picture.mode in ("1", "L", "LA", "P", "PA", "RGB", "RGBA", "RGBX", "CMYK", "YCbCr")
     except Exception:  # whatever Pillow makes of a damaged head
         size, shallow = _tiff_size(data), False
     finally:
@@ -124,8 +120,9 @@ def head_size(data: bytes) -> tuple[int, int] | None:
         return None
     if data.startswith(PNG) and data[24:25] == b"\x10":
         shallow = False
+    taken = 13 if shallow else 20  # bytes of a pixel at most: decoded, as it is, as grey and as alpha
     try:
-        refuse_bomb(len(data), TAKEN[not shallow] * size[0] * size[1])
+        refuse_bomb(len(data), taken * size[0] * size[1])
     except InputError as error:
         raise InputError(f"a picture of {size[0]}x{size[1]} {error}") from None
     return size
@@ -135,7 +132,7 @@ def _tiff_size(data: bytes) -> tuple[int, int] | None:
     """Return columns and rows of a TIFF that Pillow cannot decode, as of three colours of 16 bits."""
     from PIL.TiffImagePlugin import IMAGELENGTH, IMAGEWIDTH, ImageFileDirectory_v2
 
-    if not data.startswith(TIFF):
+    if not data.startswith((b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")):  # + in those of 64 bits
         return None
     try:
         tags = ImageFileDirectory_v2(data[: 16 if b"+" in data[2:4] else 8])

@@ -18,6 +18,7 @@ import math
 import struct
 import zlib
 from collections.abc import Iterator
+from enum import IntEnum
 from pathlib import Path
 from typing import Any
 
@@ -32,12 +33,25 @@ from dase.io.format import camera_format
 from dase.io.sequence import checked_coordinates
 from dase.io.source import BOMB_BYTES, BOMB_RATIO, Piece, Source, refuse_bomb
 
-MAGIC, MAGIC_73 = b"MATLAB 5.0 MAT-file", b"MATLAB 7.3 MAT-file"
+MAGIC_73 = b"MATLAB 7.3 MAT-file"
 NUMBERS = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 9: "f8", 12: "i8", 13: "u8"}
 """Number of a type in the file to that of NumPy, without the order of its bytes."""
-NUMERIC = range(6, 16)
-"""Classes of arrays of numbers; in the file they may have a smaller type than in MATLAB, and keep it here."""
-STRUCTURE, MATRIX, PACKED = 2, 14, 15
+
+
+class ElementType(IntEnum):
+    """Types of elements that are no numbers."""
+
+    MATRIX = 14
+    PACKED = 15
+
+
+class ArrayClass(IntEnum):
+    """Classes of arrays; numbers may have a smaller type in the file than in MATLAB, and keep it here."""
+
+    STRUCTURE = 2
+    FIRST_OF_NUMBERS = 6
+    LAST_OF_NUMBERS = 15
+
 
 Columns = dict[str, NDArray[Any]]
 """Values (N,) by the letters t, x, y and p."""
@@ -64,7 +78,7 @@ class _Elements:
         else:
             begin = self._place + 8
             # packed elements are not padded
-            self._place = begin + (size if kind == PACKED else -(-size // 8) * 8)
+            self._place = begin + (size if kind == ElementType.PACKED else -(-size // 8) * 8)
         if begin + size > len(self._data):
             raise InputError("a variable claims more bytes than the file has")
         return kind, self._data[begin : begin + size]
@@ -98,12 +112,12 @@ def _read_matrix(data: memoryview, order: str, depth: int = 0) -> tuple[str, Any
     _, name = parts.take()
     text = bytes(name).decode("latin-1")
     kind = int(flags[0]) & 255 if len(flags) else 0
-    if kind in NUMERIC:
+    if ArrayClass.FIRST_OF_NUMBERS <= kind <= ArrayClass.LAST_OF_NUMBERS:
         values = parts.draw_numbers()
         if math.prod(sizes.tolist()) != len(values):
             raise InputError(f"'{text}' must have {math.prod(sizes.tolist())} numbers, has {len(values)}")
         return text, values
-    if kind == STRUCTURE and depth == 0 and math.prod(sizes.tolist()) == 1:
+    if kind == ArrayClass.STRUCTURE and depth == 0 and math.prod(sizes.tolist()) == 1:
         (width,) = parts.draw_numbers().tolist()
         _, names = parts.take()
         if not 0 < width <= 64:
@@ -112,7 +126,7 @@ def _read_matrix(data: memoryview, order: str, depth: int = 0) -> tuple[str, Any
         for i in range(0, len(names) // width * width, width):
             field = bytes(names[i : i + width]).split(b"\0")[0].decode("latin-1")
             inner, matrix = parts.take()
-            if inner == MATRIX:
+            if inner == ElementType.MATRIX:
                 fields[field] = _read_matrix(matrix, order, depth + 1)[1]
         return text, fields
     return text, None
@@ -127,12 +141,12 @@ def _variables(source: Source) -> dict[str, Any]:
     out: dict[str, Any] = {}
     unpacked = 0
     for kind, element in _Elements(data[128:], order):
-        if kind == PACKED:
+        if kind == ElementType.PACKED:
             content = _unpack(element)
             unpacked += len(content)
             refuse_bomb(len(data), unpacked)
             kind, element = _Elements(content, order).take()
-        if kind == MATRIX:
+        if kind == ElementType.MATRIX:
             name, values = _read_matrix(element, order)
             out[name] = values
     return out
@@ -215,7 +229,7 @@ def read_pieces(source: Source) -> Iterator[Piece]:
 
 def matches_format(path: Path, head: bytes) -> bool:
     """Whether a file begins as those of MATLAB do."""
-    return head.startswith((MAGIC, MAGIC_73))
+    return head.startswith((b"MATLAB 5.0 MAT-file", MAGIC_73))
 
 
 FORMAT = camera_format(

@@ -28,7 +28,6 @@ from dase.io.format import camera_format
 from dase.io.sequence import checked_coordinates
 from dase.io.source import Picture, Piece, Size, Source
 
-SIZE = (346, 260)
 CAMERAS = ("davis/left", "davis/right")
 FLOW_LIMIT = 1 << 30  # [bytes] of flow taken into memory
 
@@ -97,7 +96,8 @@ def read_size(source: Source) -> Size | None:
     """Return the size of the frames, or that of a DAVIS346."""
     with open_hdf5(source.path) as file:
         images = file.get(f"{_find_camera(file)}/image_raw")
-        return (images.shape[2], images.shape[1]) if images is not None and images.ndim == 3 else SIZE
+        found = images is not None and images.ndim == 3
+        return (images.shape[2], images.shape[1]) if found else (346, 260)
 
 
 def matches_format(path: Path, head: bytes) -> bool:

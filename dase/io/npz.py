@@ -29,10 +29,6 @@ from dase.io.rules import sensor_events
 from dase.io.sequence import GREYS, Grey, Sequence, Writer, checked_coordinates, reading_file, writing_file
 from dase.io.source import Beside, Piece, Source
 
-# Deflate level 1 takes 7.2 M events of a DAVIS240C from 9.0 to 2.8 bytes each, writing 10 M and reading
-# 41 M events/s on one core; level 6 takes 2.5 bytes but writes 2 M events/s.
-LEVEL = 1
-
 EVENT_KEYS = ("t_us", "x", "y", "p")
 FRAME_KEYS = ("frames", "frame_begin_us", "frame_end_us", "frame_us")
 KEYS = (*EVENT_KEYS, "label", "wh", *FRAME_KEYS, "flow", "thresholds", "configuration")
@@ -84,7 +80,9 @@ class _Writer(Writer):
         """Write the archive."""
         assert self.size is not None
         parts = [_event_columns(Events.empty(1, 1)), *self._parts]
-        with zipfile.ZipFile(self._path, "w", zipfile.ZIP_DEFLATED, compresslevel=LEVEL) as archive:
+        # deflate level 1 takes 7.2 M events of a DAVIS240C from 9.0 to 2.8 bytes each, writing 10 M and
+        # reading 41 M events/s on one core; level 6 takes 2.5 bytes but writes 2 M events/s
+        with zipfile.ZipFile(self._path, "w", zipfile.ZIP_DEFLATED, compresslevel=1) as archive:
             for name, column in zip(EVENT_KEYS, zip(*parts, strict=True), strict=True):
                 _store_member(archive, name, np.concatenate(column))
             if self._with_labels:

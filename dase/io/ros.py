@@ -23,7 +23,6 @@ ARRAYS = ("dvs_msgs/msg/EventArray", "prophesee_event_msgs/msg/EventArray")
 PACKETS = ("event_camera_msgs/msg/EventPacket", "event_array_msgs/msg/EventArray")
 IMAGES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
 ROS1 = b"#ROSBAG V"
-MAGICS = (ROS1, b"\x89MCAP0\r\n", b"SQLite format 3\0")
 
 
 @contextmanager
@@ -150,7 +149,9 @@ def read_pictures(source: Source) -> Iterator[Picture]:
 
 def matches_format(path: Path, head: bytes) -> bool:
     """Whether a file is a bag, or a folder the bag of ROS 2."""
-    return (path / "metadata.yaml").is_file() if path.is_dir() else head.startswith(MAGICS)
+    if path.is_dir():
+        return (path / "metadata.yaml").is_file()
+    return head.startswith((ROS1, b"\x89MCAP0\r\n", b"SQLite format 3\0"))
 
 
 FORMAT = camera_format(

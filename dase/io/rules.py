@@ -15,6 +15,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -24,10 +25,25 @@ from dase.errors import InputError
 from dase.events import LABELS, Events
 from dase.io.source import Piece, Size, Source, join_pieces
 
-LATENESS = 0.1  # [s] an event may come this much after later ones and still be put in its place
-DATE = 1e8  # [s] first times beyond three years are dates: such a file counts from its first event instead
-CLOCKS = ((0, 1 << 31), (0, 1 << 32), (-(1 << 31), 1 << 32))  # least value and range [us] of such clocks
-MARGIN = 0.1  # of the range: how near its ends a clock was before and after it started over
+
+@dataclass(frozen=True)
+class TimeRules:
+    """When a time is late, a date, or from a clock that started over."""
+
+    lateness: float = 0.1
+    """An event may come this much [s] after later ones and still be put in its place."""
+
+    date: float = 1e8
+    """First times [s] beyond three years are dates: such a file counts from its first event instead."""
+
+    clocks: tuple[tuple[int, int], ...] = ((0, 1 << 31), (0, 1 << 32), (-(1 << 31), 1 << 32))
+    """Least value and range [us] of clocks that start over."""
+
+    margin: float = 0.1
+    """Share of its range that a clock is from its ends at most, before and after it started over."""
+
+
+TIME_RULES = TimeRules()
 
 
 class TooLateError(InputError):
@@ -104,7 +120,7 @@ def _find_clock(
     before: NDArray[np.float64], after: NDArray[np.float64], ticks: float
 ) -> tuple[float, float] | None:
     """Return least value and range [ticks] of the clock that started over between these times, or None."""
-    for least, span in CLOCKS:
+    for least, span in TIME_RULES.clocks:
         clock = (least * ticks / 1e6, span * ticks / 1e6)
         if np.any(_clock_turns(before, after, clock) > 0):
             return clock
@@ -116,7 +132,8 @@ def _clock_turns(
 ) -> NDArray[np.int64]:
     """Return 1 where a clock started over between two times, -1 where it went back over its start, else 0."""
     least, span = clock
-    low, high, top = least + MARGIN * span, least + (1 - MARGIN) * span, least + span
+    margin, top = TIME_RULES.margin, least + span
+    low, high = least + margin * span, least + (1 - margin) * span
     down = (before >= high) & (before < top) & (after >= least) & (after < low)
     up = (after >= high) & (after < top) & (before >= least) & (before < low)
     return down.astype(np.int64) - up
@@ -192,13 +209,13 @@ def order_pieces(source: Source, pieces: Iterable[Piece], ticks: float) -> Itera
             farthest = max(farthest, float(np.max(ahead - piece.t)))
             merged = join_pieces(list(held))
             merged = merged.take(np.argsort(merged.t, kind="stable"))
-            cut = int(np.searchsorted(merged.t, merged.t[-1] - LATENESS * ticks))
+            cut = int(np.searchsorted(merged.t, merged.t[-1] - TIME_RULES.lateness * ticks))
             held = deque(
                 part for part in (merged.take(slice(cut)), merged.take(slice(cut, None))) if len(part.t)
             )
         last = float(piece.t[-1])
         newest = float(held[-1].t[-1])
-        while held[0].t[-1] < newest - LATENESS * ticks:
+        while held[0].t[-1] < newest - TIME_RULES.lateness * ticks:
             done = float(held[0].t[-1])
             yield held.popleft()
     yield from held
@@ -208,7 +225,7 @@ def order_pieces(source: Source, pieces: Iterable[Piece], ticks: float) -> Itera
 
 def find_origin(source: Source, t: NDArray[Any], ticks: float) -> Any:
     """Return the tick of time zero: that of the file, or its first event where the file counts as a date."""
-    if not len(t) or abs(float(t[0])) / ticks < DATE:
+    if not len(t) or abs(float(t[0])) / ticks < TIME_RULES.date:
         return t.dtype.type(0)
     sentence = f"times count from the first event, which the file dates {float(t[0]) / ticks:.6f} s"
     source.note(sentence, "said", "origin")

@@ -27,7 +27,6 @@ from dase.io.sequence import GREYS, Sequence, reading_file
 from dase.io.source import Beside, Picture, Piece, Size, Source
 
 COLUMNS = ("events/ts", "events/xs", "events/ys", "events/ps")
-LAYOUTS = "S2R, DSEC, MVSEC, v2e, Prophesee"
 
 
 def _read_parts(file: Any, source: Source) -> Iterator[Piece]:
@@ -67,7 +66,9 @@ def _check_layout(file: Any) -> None:
     """Raise InputError where nothing of the layout is there, or something is absurdly large."""
     if not any(name in file for name in (*COLUMNS, "images")):
         held = ", ".join(islice(_list_names(file), 6))
-        raise InputError(f"is HDF5 of no known layout ({LAYOUTS}): holds {held or 'nothing'}")
+        raise InputError(
+            f"is HDF5 of no known layout (S2R, DSEC, MVSEC, v2e, Prophesee): holds {held or 'nothing'}"
+        )
     # of each group only what a reader takes from it; what lies deeper is never asked for
     for name in (*COLUMNS, "events/labels", "dase/thresholds"):
         if name in file:

@@ -28,12 +28,10 @@ BLOCK = 1 << 20  # [bytes] decoded at once
 LONGEST = 200  # [bytes] of a line
 HEAD = 1 << 14  # [bytes] looked at to tell the columns
 DIGITS = 17  # of a time, point included, that fit the fast path
-POWERS = 10.0 ** np.arange(DIGITS + 1)
 
 # every text has one way to match: two, as of digits before and after a missing point, take quadratic time
 NUMBER = rb"[-+]?(?:\d+(?:\.\d*)?|\.\d+)(?:[eE][-+]?\d+)?"
 LINE = re.compile(rb"[ \t]*" + rb"[ \t,]+".join([b"(" + NUMBER + b")"] * 4) + rb"(?:[ \t,]+\d+)?[ \t,]*\r?")
-WORD = re.compile(NUMBER)
 SIZE = re.compile(rb"(?:# *)?(\d{1,6})[ \t,]+(\d{1,6})(?: columns and rows.*)?\r?")
 
 
@@ -210,11 +208,12 @@ def _parse_times(
         good &= is_digit | is_point | ~within
         value = np.where(is_digit, value * 10 + digit, value)
         point += (point > 0) & within | is_point
-    out = value / POWERS.take(np.maximum(point - 1, 0))
+    powers = 10.0 ** np.arange(DIGITS + 1)
+    out = value / powers.take(np.maximum(point - 1, 0))
     slow = np.flatnonzero(~good | (value >= 2**53) | (length <= (point > 0)))
     for i in slow:
         word = text[begin[i] : end[i]]
-        out[i] = float(word) if WORD.fullmatch(word) else np.nan
+        out[i] = float(word) if re.fullmatch(NUMBER, word) else np.nan
     if micro:
         out /= 1e6
     out[~np.isfinite(out)] = np.nan

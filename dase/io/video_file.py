@@ -15,9 +15,6 @@ from dase.files.text_files import stands_for
 from dase.io.ffmpeg import bounded_decoding, decoding_memory, open_video, pixel_format, refuse_titles, size_of
 from dase.io.image_files import cut_and_resize, decode_file, list_pictures, to_grey, to_levels
 
-PLAIN = bytes(4), b"BGR\x18"
-"""Code and pixels of an uncompressed AVI: OpenCV 5.0 writes beyond its memory where it turns one over."""
-
 
 class FrameReader:
     """Frames of a file or folder, decoded when they are asked for, so that long videos need no memory.
@@ -98,7 +95,8 @@ class FrameReader:
         capture = self._open()
         size = size_of(capture)
         kind = pixel_format(capture)
-        self._plain = size if kind == PLAIN else None
+        # an uncompressed AVI: OpenCV 5.0 writes beyond its memory where it turns one over
+        self._plain = size if kind == (bytes(4), b"BGR\x18") else None
         self.rate = float(capture.get(cv2.CAP_PROP_FPS))
         if self._plain is not None:
             capture = self._open()

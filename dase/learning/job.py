@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
+from enum import StrEnum
 from pathlib import Path
 from typing import Any, Literal
 
@@ -22,7 +23,7 @@ from dase.learning.baselines import RandomThresholds, esim_thresholds, match_eve
 from dase.learning.moment_objective import MomentObjective
 from dase.learning.recipe import Recipe
 from dase.learning.recorded_target import ReplayedScenes, open_target
-from dase.learning.run import CHECKPOINT
+from dase.learning.run import RunFile
 from dase.learning.scene_batches import LOG_EPS, Scenery, SceneSettings, middle_intensity
 from dase.learning.targets import FiniteTarget, Target, Truth, draw_noise, simulate_counts, store_pairs
 from dase.learning.training import Objective, Training, make_network
@@ -34,7 +35,15 @@ from dase.simulation.sensor import Sensor
 from dase.simulation.sensor_file import dump_sensor, load_sensor, read_presets
 from dase.simulation.simulate import count
 
-JOB, SENSOR, WEIGHTS, EXAMPLES = "job.json", "sensor.toml", "learned.safetensors", "examples.npz"
+
+class JobFile(StrEnum):
+    """Files in the folder of a job, beside those of its training."""
+
+    JOB = "job.json"
+    SENSOR = "sensor.toml"
+    WEIGHTS = "learned.safetensors"
+    EXAMPLES = "examples.npz"
+
 
 PRESETS: dict[str, Recipe] = {
     "default": Recipe(
@@ -272,14 +281,14 @@ def _true_thresholds(sensor: Sensor) -> Truth | None:
 
 def record_job(job: Job, out: Path, *, resume: bool) -> None:
     """Leave the record of a job in its folder; raises InputError where another one has a checkpoint there."""
-    record = out / JOB
+    record = out / JobFile.JOB
     if out.exists() and not out.is_dir():
         raise InputError(f"{out} must be a folder, but it is a file")
     if resume and not record.is_file():
         raise InputError(f"{out} holds no run to resume")
     if resume and read_text_file(record, "the record", 1 << 24) != job.text():
         raise InputError(f"{out} was begun with other options (see {record}); to resume takes the same ones")
-    if not resume and (out / CHECKPOINT).exists():
+    if not resume and (out / RunFile.CHECKPOINT).exists():
         raise InputError(f"{out} already holds a run; resume it, or give another folder", argument="resume")
     out.mkdir(parents=True, exist_ok=True)
     with replacing(record) as temporary:
@@ -288,9 +297,9 @@ def record_job(job: Job, out: Path, *, resume: bool) -> None:
 
 def read_job(out: Path) -> Job:
     """Return the job of a run; raises InputError where there is none."""
-    record = out / JOB
+    record = out / JobFile.JOB
     if not record.is_file():
-        raise InputError(f"{out} holds no training run: {JOB} is missing")
+        raise InputError(f"{out} holds no training run: {JobFile.JOB} is missing")
     table = parse_json(read_text_file(record, "the record", 1 << 24), str(record))
     try:
         table["targets"] = tuple(table["targets"])
@@ -316,13 +325,15 @@ def write_sensor(
     net = net.with_level(mu)
     level, ratio = float(net.level[0].exp()), float(net.asymmetry.exp())
     on, off = (float(np.clip(level * ratio**share, 0.01, 10.0)) for share in (0.5, -0.5))
-    save_net(out / WEIGHTS, net)
+    save_net(out / JobFile.WEIGHTS, net)
     sensor = Sensor(
-        effects=(Threshold(on=on, off=off), LearnedThreshold(weights=WEIGHTS)), name=name, size=size
+        effects=(Threshold(on=on, off=off), LearnedThreshold(weights=JobFile.WEIGHTS.value)),
+        name=name,
+        size=size,
     )
-    with replacing(out / SENSOR) as temporary:
+    with replacing(out / JobFile.SENSOR) as temporary:
         temporary.write_text(dump_sensor(sensor), "utf-8")
-    return out / SENSOR
+    return out / JobFile.SENSOR
 
 
 @torch.no_grad()
@@ -347,7 +358,7 @@ def write_examples(out: Path, training: Training, *, scenes: int = 3, seed: int 
     arrays = dict(
         grey=grey, real_grey=real.grey, real=real.counts, simulated=counts, mu=maps.mu, sigma=maps.sigma
     )
-    with replacing(out / EXAMPLES) as temporary:
+    with replacing(out / JobFile.EXAMPLES) as temporary:
         np.savez_compressed(temporary, **{name: value.cpu().numpy() for name, value in arrays.items()})
 
 

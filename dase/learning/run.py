@@ -7,6 +7,7 @@ import math
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from enum import StrEnum
 from pathlib import Path
 from typing import Any
 
@@ -19,8 +20,15 @@ from dase.learning.evaluation import HeldOutScore, MapEvaluation
 from dase.learning.recipe import Recipe
 from dase.learning.training import Training, TrainingSettings
 
-CHECKPOINT, RESULT, BEST = "checkpoint.pt", "result.pt", "best.pt"
-LOG, RECIPE = "log.csv", "recipe.json"
+
+class RunFile(StrEnum):
+    """Files in the folder of a training."""
+
+    CHECKPOINT = "checkpoint.pt"
+    RESULT = "result.pt"
+    BEST = "best.pt"
+    LOG = "log.csv"
+    RECIPE = "recipe.json"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -78,7 +86,7 @@ def train_in_folder(
     """
     began = time.perf_counter()  # all that follows is part of the time the run may take
     out.mkdir(parents=True, exist_ok=True)
-    path = out / CHECKPOINT
+    path = out / RunFile.CHECKPOINT
     if resume:
         if not path.is_file():
             raise InputError(f"{out} holds no checkpoint to resume")
@@ -112,7 +120,7 @@ class _RunLoop:
         """Whether the time is over."""
         self._planned = False
         """Whether the first steps were so slow that the end was planned by them."""
-        self.table = None if distributed.process_rank() else _LogTable(out / LOG, training.step)
+        self.table = None if distributed.process_rank() else _LogTable(out / RunFile.LOG, training.step)
 
     def run_steps(self, began: float) -> dict[str, float]:
         """Train to the end; return the last line of the log. The run began at this `time.perf_counter`."""
@@ -144,12 +152,12 @@ class _RunLoop:
                 waited = time.perf_counter() - saved > schedule.save_every
                 # clocks differ, and processes must save together, since each tells its random state
                 if distributed.broadcast_number(waited or (last and schedule.save_every < math.inf)):
-                    save_checkpoint(self.out / CHECKPOINT, training.state())
+                    save_checkpoint(self.out / RunFile.CHECKPOINT, training.state())
                     saved = time.perf_counter()
             if self.table is not None and time.perf_counter() - shown > schedule.result_every:
                 self.on_result(self.exam.describe_maps(training.mean))
                 shown = time.perf_counter()
-        save_checkpoint(self.out / RESULT, {"net": training.mean.state_dict(), "row": row})
+        save_checkpoint(self.out / RunFile.RESULT, {"net": training.mean.state_dict(), "row": row})
         return row
 
     def _keep_time(self, first: tuple[int, float], begin: float) -> None:
@@ -201,7 +209,7 @@ class _RunLoop:
                 row["held_out"] = self.held.score(training.mean)
                 if row["held_out"] < training.best:
                     training.best = row["held_out"]
-                    save_checkpoint(self.out / BEST, {"net": training.mean.state_dict(), "row": row})
+                    save_checkpoint(self.out / RunFile.BEST, {"net": training.mean.state_dict(), "row": row})
         self.table.add(row)
         self.on_row(row)
         return row
@@ -217,7 +225,7 @@ class _RunLoop:
         if culprit is None:
             return
         when = f"at step {step}" if step >= 0 else f"by step {training.step}"
-        path = self.out / CHECKPOINT
+        path = self.out / RunFile.CHECKPOINT
         good = f"the last good checkpoint is {path}" if path.exists() else "there is no checkpoint yet"
         raise TrainingDiverged(f"training broke {when}: {culprit} is not finite; {good}")
 
@@ -269,7 +277,7 @@ class _LogTable:
 
 def _write_recipe(out: Path, recipe: TrainingSettings) -> None:
     if distributed.process_rank() == 0:
-        with replacing(out / RECIPE) as temporary:
+        with replacing(out / RunFile.RECIPE) as temporary:
             temporary.write_text(recipe.text(), "utf-8")
 
 
@@ -293,9 +301,9 @@ def load_checkpoint(path: Path, device: torch.device | str) -> dict[str, Any]:
 
 def read_recipe(out: Path) -> Recipe:
     """Return the recipe of the run in a folder; raises InputError where there is none."""
-    path = out / RECIPE
+    path = out / RunFile.RECIPE
     if not path.is_file():
-        raise InputError(f"{out} holds no training run: {RECIPE} is missing")
+        raise InputError(f"{out} holds no training run: {RunFile.RECIPE} is missing")
     return Recipe.parse(path.read_text("utf-8"))
 
 

@@ -53,7 +53,7 @@ def folder(tmp_path) -> Path:
 
 
 def maps_of(folder: Path, scene: VideoScene):
-    net = weights_file.load_net(folder / learning_job.WEIGHTS)
+    net = weights_file.load_net(folder / learning_job.JobFile.WEIGHTS)
     times = scene.sample_times()
     grey = scene.frames(times[len(times) // 2 :][:1])
     with torch.no_grad():
@@ -62,7 +62,7 @@ def maps_of(folder: Path, scene: VideoScene):
 
 
 def test_pixels_get_the_thresholds_that_were_learned(folder, scene, device):
-    sensor = load_sensor(folder / learning_job.SENSOR)
+    sensor = load_sensor(folder / learning_job.JobFile.SENSOR)
     assert sensor["threshold"].on == pytest.approx(0.3 * 1.1)
     assert sensor["threshold"].off == pytest.approx(0.3 / 1.1)
     mu, sigma = maps_of(folder, scene)
@@ -83,7 +83,7 @@ def test_pixels_get_the_thresholds_that_were_learned(folder, scene, device):
 
 
 def test_events_and_counts_come_from_those_thresholds(folder, scene, device):
-    sensor = load_sensor(folder / learning_job.SENSOR)
+    sensor = load_sensor(folder / learning_job.JobFile.SENSOR)
     events = dase.simulate(scene, sensor, seed=3, device=device)
     counts = dase.count(scene, sensor, (-1.0, 1.0), seed=3, device=device)[0, 0].reshape(2, 20, 24)
     np.testing.assert_array_equal(events.counts([-1.0, 1.0])[0], counts)
@@ -100,7 +100,7 @@ def test_events_and_counts_come_from_those_thresholds(folder, scene, device):
 def test_off_and_without_weights_nothing_changes(folder, scene, device):
     plain = dase.Sensor((Threshold(on=0.3, off=0.2),))
     want = dase.simulate(scene, plain, device=device)
-    path = str(folder / learning_job.WEIGHTS)
+    path = str(folder / learning_job.JobFile.WEIGHTS)
     for effect in (LearnedThreshold(), LearnedThreshold(weights=path, strength=0.0)):
         got = dase.simulate(scene, plain.with_effect(effect), device=device)
         np.testing.assert_array_equal(got.t, want.t)
@@ -108,11 +108,11 @@ def test_off_and_without_weights_nothing_changes(folder, scene, device):
 
 
 def test_a_sensor_file_finds_its_weights_wherever_it_lies(folder, scene, monkeypatch):
-    text = (folder / learning_job.SENSOR).read_text()
+    text = (folder / learning_job.JobFile.SENSOR).read_text()
     assert str(folder) not in text
     monkeypatch.chdir(folder.parent)
-    sensor = load_sensor(Path(folder.name) / learning_job.SENSOR)
-    assert Path(sensor["learned_threshold"].weights) == (folder / learning_job.WEIGHTS).resolve()
+    sensor = load_sensor(Path(folder.name) / learning_job.JobFile.SENSOR)
+    assert Path(sensor["learned_threshold"].weights) == (folder / learning_job.JobFile.WEIGHTS).resolve()
     assert len(dase.simulate(scene, sensor)) > 0
     assert "bound" not in dump_sensor(sensor.bound_to(scene))
 
@@ -125,15 +125,15 @@ def test_an_effect_is_fitted_beside_learned_thresholds(folder, rng, monkeypatch)
     grey = np.stack([texture[:, round(200 * time) :][:, :24] for time in t])
     frames = np.round(255 * grey).astype(np.uint8)
     np.savez(folder / "clip.npz", frames=frames, frame_us=np.round(t * 1e6).astype(np.int64))
-    sensor = load_sensor(folder / learning_job.SENSOR)
+    sensor = load_sensor(folder / learning_job.JobFile.SENSOR)
     truth, scene = sensor.with_effect(Leak(rate=8.0)), VideoScene(frames / np.float32(255), t)
     io.write(folder / "recording.h5", Sequence(dase.simulate(scene, truth, seed=3)))
     (folder / "other").mkdir()
     monkeypatch.chdir(folder / "other")
     options = ("--fit", "../recording.h5", "--scene", "../clip.npz", "-o", "more.toml")
-    done = call("add", f"../{learning_job.SENSOR}", "leak", *options)
+    done = call("add", f"../{learning_job.JobFile.SENSOR}", "leak", *options)
     assert done.exit_code == 0, done.output
-    assert f'weights = "../{learning_job.WEIGHTS}"' in Path("more.toml").read_text()
+    assert f'weights = "../{learning_job.JobFile.WEIGHTS}"' in Path("more.toml").read_text()
     monkeypatch.chdir("/")
     more = load_sensor(folder / "other/more.toml")
     # a share that grows with the light and one that does not are alike where the light is much the same
@@ -144,7 +144,7 @@ def test_an_effect_is_fitted_beside_learned_thresholds(folder, rng, monkeypatch)
 
 
 def test_a_sensor_file_edited_in_place_keeps_the_name_of_its_weights(folder, monkeypatch):
-    path = folder / learning_job.SENSOR
+    path = folder / learning_job.JobFile.SENSOR
     said = next(line for line in path.read_text().splitlines() if line.startswith("weights"))
     monkeypatch.chdir("/")
     for command in ("add", "remove"):
@@ -156,20 +156,20 @@ def test_a_sensor_file_edited_in_place_keeps_the_name_of_its_weights(folder, mon
 
 def test_files_of_the_same_weights_are_the_same(folder, tmp_path):
     """To the byte, and whoever may read the sensor file may read them."""
-    net = weights_file.load_net(folder / learning_job.WEIGHTS)
+    net = weights_file.load_net(folder / learning_job.JobFile.WEIGHTS)
     written = []
     for n in range(8):
         path = tmp_path / f"{n}.safetensors"
         weights_file.save_net(path, net)
         written.append(path.read_bytes())
     assert len(set(written)) == 1
-    assert path.stat().st_mode == (folder / learning_job.SENSOR).stat().st_mode
+    assert path.stat().st_mode == (folder / learning_job.JobFile.SENSOR).stat().st_mode
 
 
 def test_bad_weights_are_named(folder, scene):
-    path = folder / learning_job.SENSOR
+    path = folder / learning_job.JobFile.SENSOR
     sensor = load_sensor(path)
-    file = folder / learning_job.WEIGHTS
+    file = folder / learning_job.JobFile.WEIGHTS
     whole = file.read_bytes()
     file.write_bytes(whole[:100])
     with pytest.raises(dase.InputError, match="does not hold learned thresholds"):
@@ -277,9 +277,9 @@ def test_the_command_learns_from_a_sensor_and_goes_on(tmp_path, monkeypatch):
     first = call("train", str(sensor), "-o", str(out), *options, "--resume")
     assert first.exit_code == 0, first.output
     assert "KL" in first.output
-    job = json.loads((out / learning_job.JOB).read_text())
+    job = json.loads((out / learning_job.JobFile.JOB).read_text())
     assert job["images"] == "builtin"
-    made = load_sensor(out / learning_job.SENSOR)
+    made = load_sensor(out / learning_job.JobFile.SENSOR)
     # began at 0.5; so few steps and scenes bring it most of the way, to 0.14 to 0.24 by the seed
     assert 0.1 < made["threshold"].on < 0.35
     twice = call("train", str(sensor), "-o", str(out), *options)

@@ -14,7 +14,7 @@ from helpers.tiny_training import CRITICS, SIDE, WGAN, a_fake, a_run, small_scen
 from dase.errors import InputError
 from dase.learning import scene_batches
 from dase.learning.evaluation import MapEvaluation
-from dase.learning.run import CHECKPOINT, LOG, RunSchedule, TrainingDiverged, load_checkpoint, train_in_folder
+from dase.learning.run import RunFile, RunSchedule, TrainingDiverged, load_checkpoint, train_in_folder
 from dase.learning.targets import Pairs
 from dase.networks.threshold_network import NetworkShape
 from dase.scenes import image_sources
@@ -171,15 +171,15 @@ def test_a_resumed_run_ends_bit_equal(scenes, tmp_path, changes):
 
     with pytest.raises(KeyboardInterrupt):
         train_in_folder(first, tmp_path / "cut", schedule=schedule, on_row=stop)
-    with (tmp_path / "cut" / LOG).open("a") as file:
+    with (tmp_path / "cut" / RunFile.LOG).open("a") as file:
         file.write("1")  # of a line that was being written when the run was killed
     train_in_folder(second, tmp_path / "cut", schedule=schedule, resume=True)
-    states = [load_checkpoint(tmp_path / name / CHECKPOINT, "cpu") for name in ("whole", "cut")]
+    states = [load_checkpoint(tmp_path / name / RunFile.CHECKPOINT, "cpu") for name in ("whole", "cut")]
     for state in states:
         del state["seconds"]
     assert same(*states)
     steps = [
-        [line.split(",")[0] for line in (tmp_path / name / LOG).read_text().splitlines()]
+        [line.split(",")[0] for line in (tmp_path / name / RunFile.LOG).read_text().splitlines()]
         for name in ("whole", "cut")
     ]
     assert steps[0] == steps[1]
@@ -200,13 +200,13 @@ def test_nan_stops_with_its_step_and_the_last_good_checkpoint(scenes, tmp_path):
         train_in_folder(
             training, tmp_path / "run", schedule=RunSchedule(log_every=2, save_every=0.0, score_every=0)
         )
-    assert load_checkpoint(tmp_path / "run" / CHECKPOINT, "cpu")["step"] == 2
+    assert load_checkpoint(tmp_path / "run" / RunFile.CHECKPOINT, "cpu")["step"] == 2
 
 
 def test_a_folder_is_not_begun_twice(scenes, tmp_path):
     with pytest.raises(InputError, match="no checkpoint to resume"):
         train_in_folder(a_run(scenes), tmp_path / "none", resume=True)
-    (tmp_path / CHECKPOINT).write_bytes(b"not one")
+    (tmp_path / RunFile.CHECKPOINT).write_bytes(b"not one")
     with pytest.raises(InputError, match="already holds a run"):
         train_in_folder(a_run(scenes), tmp_path)
     with pytest.raises(InputError, match="is not a checkpoint"):

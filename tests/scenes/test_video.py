@@ -336,7 +336,7 @@ import dase.io, dase.scenes.video
 from dase.io import ffmpeg
 before = peak()
 print(*dase.io.read(sys.argv[1]).frames.shape, peak() - before)
-ffmpeg.FLOOR = 1 << 30
+ffmpeg.ALLOCATION = ffmpeg.AllocationLimits(always=1 << 30)
 before = peak()
 print(*dase.io.read(sys.argv[1]).frames.shape, peak() - before)
 """
