@@ -30,10 +30,29 @@ from dase.kernels.scene_layers import (
     background_geometry,
     layers_near,
 )
-from dase.kernels.vector_math import lane_functions
+from dase.kernels.stored_levels import Levels
+from dase.kernels.vector_math import lane_functions, native_function
 
-SOURCES = {"frames": Frames, "log": Frames, "layers": Layers, "background": Layers}
-"""What pixels see, by name: stored intensities, stored log intensities, moving layers, one layer."""
+SOURCES = {"frames": Frames, "levels": Levels, "log": Frames, "layers": Layers, "background": Layers}
+"""What pixels see, by name: stored intensities, stored levels (on a CPU alone), stored log intensities,
+moving layers, one layer."""
+
+STORED = ("frames", "levels", "log")
+"""Sources that hold a sample for every pixel."""
+
+
+@lru_cache(maxsize=8)
+def _load_levels(lanes: int) -> Any:
+    """Return the function that looks up the light of stored levels of `lanes` neighbouring pixels."""
+    text = f"""
+const unsigned char* from = values.data + (size_t)k * (size_t)values.strides[0] + n;
+wp::vec_t<{lanes}, float> result;
+for (int lane = 0; lane < {lanes}; ++lane) result[lane] = light.data[from[lane]];
+return result;
+"""
+    arguments = "values: wp.array2d[wp.uint8], light: wp.array[float], k: int, n: int"
+    scope = {"Lanes": lane_functions(lanes).Lanes}
+    return native_function(f"load_levels_{lanes}", text, scope, arguments, "Lanes")
 
 
 @lru_cache(maxsize=32)
@@ -48,6 +67,13 @@ def light_of(lanes: int, source: str, *, aligned: bool = False) -> Any:
         @wp.func
         def light(seen: Source, ground: BackgroundGeometry, k: int, n: int, x: Lanes, y: Lanes, near: int):
             return load(seen.values, k, n)
+
+    elif source == "levels":
+        look_up = _load_levels(lanes)
+
+        @wp.func
+        def light(seen: Source, ground: BackgroundGeometry, k: int, n: int, x: Lanes, y: Lanes, near: int):
+            return look_up(seen.values, seen.light, k, n)
 
     else:
 
@@ -148,7 +174,7 @@ def counting_kernel(
     thresholds, columns, rows_of = start_of.thresholds, start_of.columns, start_of.rows
     layers_of = start_of.layers_of
     Number = wp.int32 if states else wp.float32
-    stored, layered = source in ("frames", "log"), source == "layers"
+    stored, layered = source in STORED, source == "layers"
 
     @wp.kernel(enable_backward=False, module="unique", module_options={"fuse_fp": False})
     def count_events(
@@ -228,7 +254,7 @@ def starting_kernel(source: str) -> wp.Kernel:
     f = lane_functions(1)
     Source = SOURCES[source]
     look, Lane = log_light_of(1, source), f.Lanes
-    stored, layered = source in ("frames", "log"), source == "layers"
+    stored, layered = source in STORED, source == "layers"
 
     @wp.kernel(enable_backward=False, module="unique", module_options={"fuse_fp": False})
     def start_counting(

@@ -12,8 +12,32 @@ import warp as wp
 
 from dase.kernels.pixel_stages import EventKeys, SampleClock
 from dase.kernels.scene_layers import BackgroundGeometry, background_geometry
-from dase.kernels.threshold_counts import SOURCES, block_functions, log_light_of
+from dase.kernels.threshold_counts import SOURCES, STORED, block_functions, log_light_of
 from dase.kernels.vector_math import lane_functions, lane_type, native_function
+
+DEPOSIT_EVENTS = """
+auto deposit = [&](float events, float change, float before, float on, float off, long long begin,
+                   float length, int i) {
+    const int crossed = (int)__builtin_fabsf(events);
+    const bool rises = events > 0.0f;
+    const float theta = rises ? on : -off;
+    const float way = change - before;
+    const long long code = (long long)(rises ? 1 : 0) << (sink.low - 1);
+    const long long place = (((long long)row * size + i) << sink.low) | code;
+    const int slab = i >> sink.slab;
+    int* met = sink.used.data + row * sink.used.shape[1] + slab;
+    long long* slots = sink.keys.data + ((size_t)row * sink.keys.shape[1] + slab) * sink.keys.shape[2];
+    for (int m = 1; m <= crossed; ++m) {
+        float share = way != 0.0f ? ((float)m * theta - before) / way : 0.0f;
+        share = share < 0.0f ? 0.0f : (share > 1.0f ? 1.0f : share);
+        const float at = share * length;
+        const long long time = begin + (long long)(at < length ? at : length);
+        const int slot = (*met)++;
+        if (slot < sink.keys.shape[2]) slots[slot] = (time << (sink.bits + sink.low)) | place;
+    }
+};
+"""
+"""C++ that keeps the events of pixel `i` in a step; asks for `sink`, `row` and `size` around it."""
 
 
 @lru_cache(maxsize=8)
@@ -21,43 +45,27 @@ def _append_function(lanes: int) -> Any:
     """Return the function that appends the events of one step of `lanes` pixels."""
     arguments = (
         "events: Lanes, change: Lanes, signal: Lanes, reference: Lanes, on: Lanes, off: Lanes, "
-        "begin: wp.int64, length: float, keys: wp.array3d[wp.int64], used: wp.array2d[int], "
-        "row: int, n: int, size: int, shift: int, bits: int, low: int, from_lane: int"
+        "begin: wp.int64, length: float, sink: EventKeys, row: int, n: int, size: int, first_lane: int"
     )
     text = """
-typedef float V __attribute__((ext_vector_type({length})));
+typedef float V __attribute__((ext_vector_type(@lanes@)));
 V all;
 __builtin_memcpy(&all, &events, sizeof(V));
-typedef bool B __attribute__((ext_vector_type({length})));
-unsigned busy = __builtin_bit_cast({mask}, __builtin_convertvector(all != 0.0f, B)) & ((1u << {length}) - 1);
-// lanes before `from` belong to the block before
-busy &= ~0u << from;
-while (busy) {{
+typedef bool B __attribute__((ext_vector_type(@lanes@)));
+unsigned busy = __builtin_bit_cast(@mask@, __builtin_convertvector(all != 0.0f, B)) & ((1u << @lanes@) - 1);
+// lanes before belong to the block before
+busy &= ~0u << first_lane;
+while (busy) {
     const int lane = __builtin_ctz(busy);
     busy &= busy - 1;
-    const int crossed = (int)__builtin_fabsf(events[lane]);
-    const bool rises = events[lane] > 0.0f;
-    const float theta = rises ? on[lane] : -off[lane];
-    const float before = signal[lane] - reference[lane];
-    const float way = change[lane] - before;
-    const long long code = (long long)(rises ? 1 : 0) << (low - 1);
-    const long long place = (((long long)row * size + n + lane) << low) | code;
-    const int slab = (n + lane) >> shift;
-    int* met = used.data + row * used.shape[1] + slab;
-    long long* slots = keys.data + ((size_t)row * keys.shape[1] + slab) * keys.shape[2];
-    for (int m = 1; m <= crossed; ++m) {{
-        float share = way != 0.0f ? ((float)m * theta - before) / way : 0.0f;
-        share = share < 0.0f ? 0.0f : (share > 1.0f ? 1.0f : share);
-        const float at = share * length;
-        const long long time = begin + (long long)(at < length ? at : length);
-        const int slot = (*met)++;
-        if (slot < keys.shape[2]) slots[slot] = (time << (bits + low)) | place;
-    }}
-}}
+    deposit(events[lane], change[lane], signal[lane] - reference[lane], on[lane], off[lane], begin, length,
+            n + lane);
+}
 """
     mask = "unsigned short" if lanes == 16 else "unsigned char"
-    snippet = text.format(length=lanes, mask=mask).replace("from;", "from_lane;")
-    return native_function(f"append_{lanes}", snippet, {"Lanes": lane_type(lanes)}, arguments, "None")
+    snippet = DEPOSIT_EVENTS + text.replace("@lanes@", str(lanes)).replace("@mask@", mask)
+    scope = {"Lanes": lane_type(lanes), "EventKeys": EventKeys}
+    return native_function(f"append_{lanes}", snippet, scope, arguments, "None")
 
 
 @lru_cache(maxsize=32)
@@ -70,7 +78,7 @@ def emitting_kernel(lanes: int, source: str) -> wp.Kernel:
     chosen, inverse, signed_events = f.chosen, f.inverse, f.signed_events
     thresholds, columns, rows_of = start_of.thresholds, start_of.columns, start_of.rows
     layers_of = start_of.layers_of
-    stored, layered = source in ("frames", "log"), source == "layers"
+    stored, layered = source in STORED, source == "layers"
 
     @wp.kernel(enable_backward=False, module="unique", module_options={"fuse_fp": False})
     def emit_events(
@@ -117,8 +125,8 @@ def emitting_kernel(lanes: int, source: str) -> wp.Kernel:
             theta = chosen(change, on, off)
             events = signed_events(change, theta, chosen(change, per_on, per_off))
             append(
-                events, change, signal, reference, on, off, clock.begin[k], clock.length[k], sink.keys,
-                sink.used, b, n, size, sink.slab, sink.bits, sink.low, new,
+                events, change, signal, reference, on, off, clock.begin[k], clock.length[k], sink, b, n,
+                size, new,
             )  # fmt: skip
             reference = advanced(reference, events, theta)
             signal = sample

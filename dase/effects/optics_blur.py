@@ -16,6 +16,7 @@ from dase.errors import InputError
 from dase.kernels import launch, pixel_stages
 from dase.kernels.scene_blur import blur_frames
 from dase.kernels.scene_layers import render_frames
+from dase.kernels.stored_levels import light_of_levels
 from dase.scenes.scene import Scene
 
 
@@ -60,6 +61,8 @@ class Unsharp(Scene):
             pictures = render_frames(source, self.width, self.height, device)
         elif kind == "frames":
             pictures = source.values
+        elif kind == "levels":
+            pictures = light_of_levels(source, device)
         else:
             raise InputError("optics_blur needs intensities, and this scene gives log intensities")
         frames = pixel_stages.Frames()

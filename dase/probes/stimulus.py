@@ -199,6 +199,8 @@ def light_of(
         name, source = scene.source(part, pixels, launch.find_device("cpu"))
         if name == "frames":
             values = source.values.numpy()
+        elif name == "levels":
+            values = source.light.numpy()[source.values.numpy()]
         else:
             values = scene.frames(part).reshape(len(part), -1)[:, pixels]
         out[:, first : first + at_once] = values.T

@@ -16,6 +16,7 @@ from dase.io.image_files import cut_and_resize, list_pictures
 from dase.io.video_file import FrameReader
 from dase.kernels import pixel_stages
 from dase.kernels.scene_layers import interpolate_frames
+from dase.kernels.stored_levels import LEVELS, light_of_levels, upload_levels
 from dase.scenes.between_frames import CameraScene
 from dase.scenes.light import SRGB_GAMMA, check_gamma, check_light, to_light
 from dase.scenes.scene import LOG_EPS as LOG_EPS
@@ -49,6 +50,9 @@ class VideoScene(Scene):
             raise InputError("video: frame times must be finite and increase")
         if isinstance(self._frames, np.ndarray):
             check_light(self._frames, "video")
+        self._light_of_level: NDArray[np.float32] | None = None
+        if isinstance(self._frames, np.ndarray) and self._frames.dtype == np.uint8:
+            self._light_of_level = to_light(np.arange(LEVELS, dtype=np.uint8), gamma=self.gamma)
         self.height, self.width = self._frames.shape[1:]
         self.duration = float(self._times[-1] - self._times[0])
 
@@ -57,10 +61,16 @@ class VideoScene(Scene):
         return self._times
 
     def source(self, times: NDArray[np.float64], pixels: NDArray[np.int32], device: Any) -> tuple[str, Any]:
-        """Return the stored intensities of these pixels."""
+        """Return the stored intensities of these pixels; on a CPU those of 8 bits as the levels they are."""
         source = pixel_stages.Frames()
         above = np.minimum(np.searchsorted(self._times, times), len(self._times) - 1)
         if np.array_equal(self._times[above], times):
+            if self._light_of_level is not None:
+                levels = upload_levels(self._values(above, pixels), self._light_of_level, device)
+                if device.is_cpu:
+                    return "levels", levels
+                source.values = light_of_levels(levels, device)
+                return "frames", source
             # on a CPU the frames themselves: a copy would take longer than the events
             source.values = wp.array(self._rows(above, pixels), dtype=float, device=device, copy=False)
         else:
@@ -71,14 +81,18 @@ class VideoScene(Scene):
         """Return the frames at `times`, which must be times of frames, shape (K, height, width)."""
         return to_light(self._at(times), gamma=self.gamma)
 
-    def _rows(self, index: NDArray[np.int64], pixels: NDArray[np.int32]) -> NDArray[np.float32]:
+    def _values(self, index: NDArray[np.int64], pixels: NDArray[np.int32]) -> NDArray[Any]:
+        """Return frames as they are given, for these pixels, shape (K, N)."""
         if isinstance(self._frames, np.ndarray) and np.all(np.diff(index) == 1):
             frames = self._frames[index[0] : index[0] + len(index)]  # no copy
         else:
             frames = self._frames[index]
         flat = frames.reshape(len(index), -1)
         every = np.array_equal(pixels, np.arange(flat.shape[1]))
-        return np.ascontiguousarray(to_light(flat if every else flat[:, pixels], gamma=self.gamma))
+        return np.ascontiguousarray(flat if every else flat[:, pixels])
+
+    def _rows(self, index: NDArray[np.int64], pixels: NDArray[np.int32]) -> NDArray[np.float32]:
+        return to_light(self._values(index, pixels), gamma=self.gamma)
 
     def _between(
         self, times: NDArray[np.float64], above: NDArray[np.int64], pixels: NDArray[np.int32], device: Any

@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 from dase.errors import InputError, checked_seed
 from dase.events import LARGEST_SIDE, Events
 from dase.kernels import event_keys as ordering
-from dase.kernels import launch, pixel_compile, pixel_stages, threshold_events
+from dase.kernels import launch, pixel_compile, pixel_stages, threshold_events, threshold_levels
 from dase.kernels import threshold_counts as counting
 from dase.kernels.random import stream_number
 from dase.scenes.scene import Scene
@@ -99,6 +99,7 @@ class PixelArray:
         )
         self._vectors = vectors
         self._levels: tuple[Any, Any] | None = None
+        self._logs: tuple[NDArray[np.float32], Any] | None = None  # light of levels, and its logarithms
         self._maps_of_scene: list[Any] | None = None
         # a key is an integer: time since the begin of the chunk [ns], pixel of the batch, label and polarity;
         # sorted keys are events sorted by time, and of one time by pixel, whatever the device did first
@@ -144,9 +145,17 @@ class PixelArray:
         self.bind_scene(scene)
         self._step_edges(times)
         name, source = self.sensor.through_optics(scene).source(times, self.pixels, self.device)
-        first, memory, _ = self._state_before(name, source, len(times))
+        first, memory, signal = self._state_before(name, source, len(times))
         if first >= len(times):
             out.zero_()
+            return
+        logs = self._logarithms_in_order(name, source)
+        if logs is not None:
+            inputs = [
+                source.values, logs, self.count, first, self._thresholds_of_pixels()[0],
+                *self._window_runs(windows), memory, signal, self._next[1], self._next[0], out,
+            ]  # fmt: skip
+            self._launch_level_blocks(threshold_levels.count_level_events, inputs, align=1)
             return
         lanes = counting.widest_block(self.count, self.device, name)
         level, eps = self._thresholds_of_pixels()
@@ -160,6 +169,21 @@ class PixelArray:
         launch.run_kernel(
             kernel, counting.block_count(self.count, lanes), inputs, self.device, batch=self.batch
         )
+
+    def _launch_level_blocks(self, kernel: wp.Kernel, inputs: list[Any], *, align: int) -> None:
+        blocks = counting.block_count(self.count, threshold_levels.LANES)
+        launch.run_kernel(kernel, blocks, inputs, self.device, batch=self.batch, align=align)
+
+    def _logarithms_in_order(self, name: str, source: Any) -> Any:
+        """Return the log intensities of stored levels, or None where `threshold_levels` cannot take them."""
+        if name != "levels" or self.count < threshold_levels.LANES:
+            return None
+        light = source.light.numpy()
+        if self._logs is None or not np.array_equal(self._logs[0], light):
+            _, eps = self._thresholds_of_pixels()
+            logs = threshold_levels.logarithms_of_levels(source, eps, self.device)
+            self._logs = light.copy(), logs if threshold_levels.have_intervals(logs) else None
+        return self._logs[1]
 
     def _state_before(self, name: str, source: Any, samples: int) -> tuple[int, Any, Any]:
         """Return the first sample to compare, and memories and signals before it."""
@@ -183,6 +207,15 @@ class PixelArray:
         clock = self._upload_clock(times, np.zeros(len(times), np.int32))
         name, source = self.sensor.through_optics(scene).source(times, self.pixels, self.device)
         first, memory, signal = self._state_before(name, source, len(times))
+        logs = self._logarithms_in_order(name, source)
+        if logs is not None:
+            inputs = [
+                source.values, logs, clock, self.count, first, self._thresholds_of_pixels()[0], memory,
+                signal, self._next[1], self._next[0], sink,
+            ]  # fmt: skip
+            align = self.slab // threshold_levels.LANES
+            self._launch_level_blocks(threshold_levels.emit_level_events, inputs, align=align)
+            return
         lanes = counting.widest_block(self.count, self.device, name)
         inputs = [
             source, clock, self._pixels, self.count, self.width, first, *self._thresholds_of_pixels(),

@@ -23,7 +23,7 @@ class Pictures:
     """Bands of the pictures of a scene of one layer, looked up in its texture; or of stored pictures.
 
     Args:
-        scene: A background and nothing else, or pictures of shape (K, height, width), linear intensity.
+        scene: A background and nothing else, or pictures of 8 bits of shape (K, height, width), linear.
         times: Samples [s], shape (K,).
     """
 
@@ -31,21 +31,27 @@ class Pictures:
         self.stored = scene if isinstance(scene, np.ndarray) else None
         if isinstance(scene, np.ndarray):
             _, self.height, self.width = scene.shape
+            self.logs = np.log(np.arange(256, dtype=np.float32) / 255 + EPS)
         else:
             self.width, self.height = scene.width, scene.height
             self.texture = np.ascontiguousarray(scene.layers[0].picture.grey)
             self.places = np.linalg.inv(scene.forward(times)[0])[:, 0, :2]
 
     def look(self, k: int, top: int, out: np.ndarray) -> np.ndarray:
-        """Write the rows from `top` on of picture k."""
-        if self.stored is not None:
-            np.copyto(out, self.stored[k, top : top + len(out)])
-            return out
+        """Write the rows from `top` on of picture k: linear intensity."""
         place = self.places[k].copy()
         place[:, 2] += place[:, 1] * top
         how = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
         size = out.shape[::-1]
         return cv2.warpAffine(self.texture, place, size, out, how, cv2.BORDER_REFLECT_101)
+
+    def log(self, k: int, top: int, out: np.ndarray) -> np.ndarray:
+        """Write the logarithms of these rows; those of stored pictures are looked up by level."""
+        if self.stored is not None:
+            return cv2.LUT(self.stored[k, top : top + len(out)], self.logs, out)
+        self.look(k, top, out)
+        out += EPS
+        return cv2.log(out, out)  # twice as fast as np.log
 
 
 def count_plain(pictures: Pictures, samples: int, theta: float) -> tuple[np.ndarray, np.ndarray]:
@@ -87,9 +93,7 @@ def _count_band(
     level, crossed, reference = (np.empty_like(both) for _ in range(3))
     step, inverse = np.float32(theta), np.float32(1 / theta)
     for k in range(samples):
-        pictures.look(k, top, level)
-        level += EPS
-        cv2.log(level, level)  # twice as fast as np.log
+        pictures.log(k, top, level)
         if k == 0:
             reference[:] = level
             continue
@@ -110,9 +114,7 @@ def events(pictures: Pictures, times: np.ndarray, theta: float) -> tuple[np.ndar
     step, inverse = np.float32(theta), np.float32(1 / theta)
     parts = []
     for k, now in enumerate(times):
-        pictures.look(k, 0, level)
-        level += EPS
-        cv2.log(level, level)
+        pictures.log(k, 0, level)
         if k > 0:
             np.subtract(level, reference, out=crossed)
             crossed *= inverse

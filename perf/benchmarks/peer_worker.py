@@ -48,13 +48,12 @@ def dase_runs(clip: Clip, options: argparse.Namespace) -> dict[str, dict[str, Ru
     from dase.simulation.sensor_file import load_sensor
 
     launch.set_threads(options.threads)
-    frames = clip.frames.astype(np.float32) / 255
     ideal = dase.Sensor((Threshold(on=0.2, off=0.2, phase=0.0),))
     noisy = load_sensor("v2e-noisy").with_effect(Refractory(period=NOISY["dead"]))
     sensors = {"clean": ideal, "noisy": noisy, "as v2e": load_sensor("v2e-clean")}
 
     def given() -> dase.Scene:
-        return dase.VideoScene(frames, clip.times)
+        return dase.VideoScene(clip.frames, clip.times)
 
     def moved() -> dase.Scene:
         return photograph(clip)
@@ -88,7 +87,6 @@ def numpy_runs(clip: Clip, options: argparse.Namespace) -> dict[str, dict[str, R
     from perf.benchmarks import numpy_baseline
 
     theta, samples = CLEAN["theta"], len(clip.times)
-    frames = clip.frames.astype(np.float32) / 255
 
     def emit(of: Any) -> dict[str, Run]:
         return {
@@ -108,7 +106,7 @@ def numpy_runs(clip: Clip, options: argparse.Namespace) -> dict[str, dict[str, R
     def pictures() -> numpy_baseline.Pictures:
         return numpy_baseline.Pictures(photograph(clip), clip.times)
 
-    out = {"NumPy, pictures given": emit(frames)}
+    out = {"NumPy, pictures given": emit(clip.frames)}
     if clip.moved:
         out["NumPy, photograph moved"] = emit(photograph(clip))
         out["NumPy plain, photograph moved, counted"] = {"clean": plain}
