@@ -1,16 +1,20 @@
 # make demo, test, test-all, lint, perf: each sets up .venv if it is missing. JOBS=4 make test takes four processes.
 PYTHON ?= python3
 BIN := .venv/bin
+PIP := $(BIN)/python -m pip --disable-pip-version-check
 JOBS ?= 2
 # a file's tests stay in one process, where they share what they compile and simulate
 PYTEST := $(BIN)/python -m pytest -q -n $(JOBS) --dist loadfile --no-loadscope-reorder
 
 .PHONY: demo test test-all lint perf clean
 
-.venv/ready: pyproject.toml constraints.txt
+.venv/ready: pyproject.toml constraints.txt constraints-cuda.txt
 	$(PYTHON) -m venv .venv
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt torch
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt --editable ".[learn,coco,hdf5,aedat,ros,dev]"
+	$(PIP) install --quiet --no-deps --require-hashes --requirement constraints.txt
+	if $(BIN)/python -c "import importlib.metadata as m, sys; sys.exit('cuda' not in str(m.requires('torch')))"; then \
+	    $(PIP) install --quiet --no-deps --require-hashes --requirement constraints-cuda.txt; fi
+	$(PIP) install --quiet --no-deps --no-build-isolation --editable .
+	$(PIP) check
 	touch $@
 
 demo: .venv/ready

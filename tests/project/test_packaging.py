@@ -12,6 +12,8 @@ import tomllib
 
 import pytest
 from helpers.scripts import ROOT, load_script
+from packaging.requirements import Requirement
+from packaging.utils import canonicalize_name
 from PIL import Image
 
 import dase
@@ -81,6 +83,27 @@ def test_contributors_are_told_of_targets_that_are_there():
     asked = set(re.findall(r"^make ([a-z-]+)", text, flags=re.MULTILINE))
     assert asked
     assert asked <= targets
+
+
+def test_every_dependency_is_pinned_with_hashes():
+    pin = load_script(".ci/pin.py")
+    texts = [path.read_text() for path in pin.FILES]
+    pins, of_cuda = map(pin.read_pins, texts)
+    project = declared()
+    asked = [*project["project"]["dependencies"], *project["build-system"]["requires"]]
+    asked += [one for extra in project["project"]["optional-dependencies"].values() for one in extra]
+    for requirement in map(Requirement, asked):
+        version, _, hashes = pins[canonicalize_name(requirement.name)]
+        assert requirement.specifier.contains(version), requirement
+        assert hashes, requirement
+    # hashes of all, or pip would refuse the file; nothing but pins, so that no line can name another index
+    for text, some, head in zip(texts, (pins, of_cuda), pin.HEADS, strict=True):
+        assert all(hashes for _, _, hashes in some.values())
+        assert text == pin.write_pins(some, head)
+    assert all(name.startswith(pin.OF_CUDA) for name in of_cuda)
+    recipe = (ROOT / "Makefile").read_text().split("\n.venv/ready:")[1].split("\n\n")[0]
+    for line in recipe.splitlines():
+        assert "install" not in line or "--require-hashes" in line or line.endswith("--editable ."), line
 
 
 def is_there(name: str) -> bool:
