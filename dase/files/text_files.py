@@ -9,21 +9,14 @@ from typing import Any
 
 from dase.errors import InputError
 
-LARGEST_TOML = 1 << 18
-"""Bytes of a file of TOML; a sensor with every effect and a long history has some 20 000."""
 
-
-MOST_POINTS = 100
-"""Points in a line of TOML: each may be one of a name, as in `a.b.c = 1`."""
-
-
-def read_text_file(path: Path, what: str, largest: int = LARGEST_TOML) -> str:
+def read_text_file(path: Path, what: str, largest: int = 1 << 18) -> str:
     """Return the text of a file; ends of lines stay as they are.
 
     Args:
         path: The file.
         what: What it is, for messages, as "sensor file".
-        largest: Bytes that it may have.
+        largest: Bytes that it may have. A sensor with every effect and a long history has some 20 000.
 
     Raises:
         InputError: It cannot be read, is no UTF-8, or larger than such a file can be.
@@ -46,9 +39,10 @@ def read_text_file(path: Path, what: str, largest: int = LARGEST_TOML) -> str:
 
 def parse_toml(text: str, where: str) -> dict[str, Any]:
     """Return the tables of a TOML text; raises InputError where it is none, or nested too deeply."""
-    # a name of 100 000 parts takes tomllib minutes, and each part nests one table more
-    if any(line.count(".") > MOST_POINTS for line in text.splitlines()):
-        raise InputError(f"{where} is not TOML that can be read: a line has more than {MOST_POINTS} points")
+    # a name of 100 000 parts, as in `a.b.c = 1`, takes tomllib minutes, and each part nests one table more
+    most = 100
+    if any(line.count(".") > most for line in text.splitlines()):
+        raise InputError(f"{where} is not TOML that can be read: a line has more than {most} points")
     try:
         return tomllib.loads(text)
     except RecursionError:

@@ -6,6 +6,7 @@ import math
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, nullcontext, suppress
+from enum import Enum
 from importlib import import_module
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -19,8 +20,6 @@ from dase.io.sequence import checked_coordinates
 from dase.io.source import Piece, Size, Source, missing_extra, refuse_bomb
 
 HDF5 = b"\x89HDF\r\n\x1a\n"
-HEAP = b"GCOL\x01\0\0\0"
-NAMES = b"HEAP\0\0\0\0"
 USER_BLOCK = 512  # [bytes] that MATLAB puts before the mark of HDF5
 PART = 1 << 20  # events read at once
 BLOCK = 1 << 24  # [bytes] searched at once
@@ -44,6 +43,13 @@ SETTLED = 2_000_000_000
 _asked: tuple[bytes, frozenset[str]] = b"", frozenset()  # first bytes of a file, and which of these it holds
 _plugin_tried = False
 _sound: dict[Path, tuple[int, ...]] = {}  # files whose heaps were checked, and their state then
+
+
+class HeapMark(Enum):
+    """The first bytes of a heap."""
+
+    TEXTS = b"GCOL\x01\0\0\0"
+    NAMES = b"HEAP\0\0\0\0"
 
 
 class Hdf5Group:
@@ -181,7 +187,7 @@ def check_heaps(path: Path) -> None:
         base = 0 if file.read(len(HDF5)) == HDF5 else USER_BLOCK
         file.seek(0)
         for kind, begin in _find_heaps(file):
-            if kind == HEAP:
+            if kind is HeapMark.TEXTS:
                 _check_heap(file, begin, found.st_size)
             else:
                 _check_names(file, begin, found.st_size, base)
@@ -192,17 +198,17 @@ def check_heaps(path: Path) -> None:
         _sound[place] = state
 
 
-def _find_heaps(file: BinaryIO) -> Iterator[tuple[bytes, int]]:
+def _find_heaps(file: BinaryIO) -> Iterator[tuple[HeapMark, int]]:
     """Yield kinds of heaps and where they begin; in blocks, for a file may be larger than the memory."""
     place, tail = 0, b""
     while block := file.read(BLOCK):
         text = tail + block
-        for kind in (HEAP, NAMES):
+        for kind in HeapMark:
             found = -1
-            while (found := text.find(kind, found + 1)) >= 0:
+            while (found := text.find(kind.value, found + 1)) >= 0:
                 yield kind, place - len(tail) + found
         file.seek(place := place + len(block))
-        tail = text[1 - len(HEAP) :]
+        tail = text[-7:]  # all but one byte of what is looked for
 
 
 def _check_heap(file: BinaryIO, begin: int, length: int) -> None:

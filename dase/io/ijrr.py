@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from dase.errors import InputError
 from dase.events import Events
-from dase.io import frames, text
+from dase.io import arrays, frames, text
 from dase.io.binary import EventWriter
 from dase.io.format import LIMIT, camera_format
 from dase.io.sequence import Writer, writing_file
@@ -31,7 +31,6 @@ EVENTS, IMAGES = "events.txt", "images.txt"
 OTHERS = (IMAGES, "calib.txt", "groundtruth.txt", "imu.txt", "readme.txt", "timestamps.txt")
 SUFFIXES = (".txt", ".csv")
 PART = 1 << 16  # events turned into text at once
-ZIP = b"PK\x03\x04"
 
 
 class _Place:
@@ -160,7 +159,7 @@ def matches_text(path: Path, head: bytes) -> bool:
 
 def matches_zip(path: Path, head: bytes) -> bool:
     """Whether a zip holds a text."""
-    if not head.startswith(ZIP):
+    if not head.startswith(arrays.ZIP):
         return False
     try:
         with zipfile.ZipFile(path) as archive:

@@ -37,7 +37,6 @@ CDR_EVENT = np.dtype(  # from the second event on: 16 bytes apart, begun 2 bytes
 LIBCAER_CMP = np.array([8, 6, 0, 2, 3, 5, 4] + [9] * 9, np.uint16)
 """Word type of libcaer_cmp to that of EVT3, with rows and columns exchanged; 9 is unknown to it."""
 
-ENCODINGS = ("evt3", "evt2", "evt21", "mono", "libcaer", "libcaer_cmp")
 CHANNELS = {"mono8": 1, "8UC1": 1, "mono16": 1, "16UC1": 1, "bgr8": 3, "rgb8": 3, "8UC3": 3}
 
 
@@ -166,7 +165,8 @@ class Packets:
         elif encoding == "libcaer_cmp":
             yield from self._libcaer_cmp(_as_words(data, "<u2"), base)
         else:
-            raise InputError(f"events are encoded as '{encoding}', known: {', '.join(ENCODINGS)}")
+            known = "evt3, evt2, evt21, mono, libcaer, libcaer_cmp"
+            raise InputError(f"events are encoded as '{encoding}', known: {known}")
 
     def _libcaer_cmp(self, words: NDArray[np.uint16], base: int) -> Iterator[Piece]:
         """Yield the events [ns]: counted in microseconds from a time base in nanoseconds.

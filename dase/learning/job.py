@@ -24,12 +24,13 @@ from dase.learning.moment_objective import MomentObjective
 from dase.learning.recipe import Recipe
 from dase.learning.recorded_target import ReplayedScenes, open_target
 from dase.learning.run import RunFile
-from dase.learning.scene_batches import LOG_EPS, Scenery, SceneSettings, middle_intensity
+from dase.learning.scene_batches import Scenery, SceneSettings, middle_intensity
 from dase.learning.targets import FiniteTarget, Target, Truth, draw_noise, simulate_counts, store_pairs
 from dase.learning.training import Objective, Training, make_network
 from dase.networks.threshold_network import NetworkShape, ThresholdNet
 from dase.networks.weights_file import save_net
 from dase.scenes import image_sources
+from dase.scenes.scene import LOG_EPS
 from dase.scenes.video import VideoScene
 from dase.simulation.sensor import Sensor
 from dase.simulation.sensor_file import dump_sensor, load_sensor, read_presets

@@ -16,11 +16,12 @@ import torch
 from numpy.typing import NDArray
 
 from dase.errors import InputError
-from dase.learning.scene_batches import LOG_EPS, Scenery, SceneSettings
+from dase.learning.scene_batches import Scenery, SceneSettings
 from dase.learning.targets import FiniteTarget, store_pairs
 from dase.recordings.recording import Recording, open_recording
 from dase.scenes.between_frames import CameraScene, TrustSettings
 from dase.scenes.frame_motion import estimate_stretches, is_stretched
+from dase.scenes.scene import LOG_EPS
 
 
 @dataclass(frozen=True)

@@ -19,13 +19,10 @@ from dase.errors import InputError, nearest
 from dase.kernels import autograd_training as bridge
 from dase.scenes import image_sources
 from dase.scenes.random_scenes import MIXED, REGIME_NAMES, REGIMES, Regime
-from dase.simulation.sensor import Sensor
+from dase.scenes.scene import LOG_EPS
 
 BACKGROUND = (320, 480)
 """Rows and columns of the backgrounds in the pool [texel]."""
-
-LOG_EPS = Sensor.log_eps
-"""Added to intensities before the logarithm, as sensors do by default."""
 
 MOTIONS = {
     **REGIMES,

@@ -38,9 +38,6 @@ from dase.signatures.time_stamps import StampSettings, find_time_stamps
 Source = Recording | Sequence | Events | str | PathLike[str]
 Progress = Callable[[int], object]
 
-LEVEL = 1e-4
-"""Chance that a recording without any effect announces one."""
-
 COUNT = 9
 """Signatures that are tested, for the correction."""
 
@@ -182,7 +179,7 @@ def find_signatures(
     *,
     notes: list[str] | None = None,
     progress: Progress = lambda count: None,
-    level: float = LEVEL,
+    level: float = 1e-4,
     chunk: int = CHUNK,
     **options: Unpack[ReadOptions],
 ) -> Signatures:

@@ -140,7 +140,9 @@ def test_a_heap_of_texts_with_an_empty_hole_is_no_endless_loop(tmp_path, rng, ma
         with h5py.File(path, "r+") as file:
             file.require_group("dase").attrs["configuration"] = "a = 1\n"
     content = path.read_bytes()
-    place = content.index(columns.HEAP) + 16  # the first object: its length now leads into the hole
+    place = (
+        content.index(columns.HeapMark.TEXTS.value) + 16
+    )  # the first object: its length now leads into the hole
     path.write_bytes(content[: place + 8] + b"\x2f" + content[place + 9 :])
     for act in (io.read, lambda path: list(io.stream(path))):
         with pytest.raises(InputError, match="heap of texts is damaged"):
@@ -153,7 +155,7 @@ def test_a_heap_of_names_whose_holes_go_round_is_no_endless_loop(tmp_path, rng, 
     path = tmp_path / "a.h5"
     written("HDF5")(path, events(rng, 50))
     content = bytearray(path.read_bytes())
-    heap = content.index(columns.NAMES)
+    heap = content.index(columns.HeapMark.NAMES.value)
     size, hole, data = (int.from_bytes(content[heap + n : heap + n + 8], "little") for n in (8, 16, 24))
     assert hole + 16 * ring <= size
     for n in range(ring):
@@ -182,7 +184,7 @@ def test_heaps_are_checked_once_until_the_file_changes(tmp_path, rng, monkeypatc
     io.read(path)
     assert len(searched) == 1
     content, state = bytearray(path.read_bytes()), path.stat()
-    heap = content.index(columns.NAMES)
+    heap = content.index(columns.HeapMark.NAMES.value)
     hole, data = (int.from_bytes(content[heap + n : heap + n + 8], "little") for n in (16, 24))
     content[data + hole : data + hole + 8] = hole.to_bytes(8, "little")
     path.write_bytes(content)
@@ -282,7 +284,7 @@ def test_a_text_that_claims_to_be_large_takes_no_memory(tmp_path, rng):
     path = tmp_path / "a.hdf5"
     ecf(path, events(rng, 50))
     content = path.read_bytes()
-    where = content.index(struct.pack("<IQ", len(f"{W}x{H}"), content.index(columns.HEAP)))
+    where = content.index(struct.pack("<IQ", len(f"{W}x{H}"), content.index(columns.HeapMark.TEXTS.value)))
     path.write_bytes(content[:where] + struct.pack("<I", 0xF0000000) + content[where + 4 :])
     script = """
 import sys
