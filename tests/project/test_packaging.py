@@ -106,6 +106,23 @@ def test_every_dependency_is_pinned_with_hashes():
         assert "install" not in line or "--require-hashes" in line or line.endswith("--editable ."), line
 
 
+def test_the_page_of_licences_has_every_dependency():
+    script, pin = load_script("docs/licences.py"), load_script(".ci/pin.py")
+    text = (ROOT / "docs" / "licences.md").read_text("utf-8")
+    parts = dict(part.split("\n", 1) for part in text.split("\n## ")[1:])
+    rows = {
+        title: re.findall(r"^\| `([\w-]+)` \| (.*) \| (\w+) \|$", part, re.M) for title, part in parts.items()
+    }
+    for title, asked in script.groups().items():
+        direct = {name for name, _, by in rows[title] if by == "dase"}
+        assert direct <= {canonicalize_name(Requirement(one).name) for one in asked}
+    found = {name for part in rows.values() for name, _, _ in part}
+    # pins are found by another program, from the index instead of what is installed
+    assert found == set(pin.read_pins(pin.FILES[0].read_text())) - {"colorama"}, "run python docs/licences.py"
+    for title in rows.keys() - {"Developers"}:
+        assert not [name for name, licence, _ in rows[title] if "GPL" in licence or not licence], title
+
+
 def is_there(name: str) -> bool:
     """Whether a dotted name leads to a module or to something in it."""
     parts = name.split(".")
