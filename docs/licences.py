@@ -33,9 +33,10 @@ LONGEST = 40
 
 HEAD = """# Licences of what dase depends on
 
-dase is under the [MIT licence](../LICENSE). This page has the packages that `pip install dase` brings, those of its
-extras, and those that only developers need, each with what it says of its own licence; `docs/licences.py` writes it
-from the metadata of the installed packages. None that dase imports is under the GPL.
+dase is under the [MIT licence](../LICENSE). This page has the packages that `pip install dase` brings, those
+of its extras, and those that only developers need, each with what it says of its own licence;
+`docs/licences.py` writes it from the metadata of the installed packages. None that dase imports is under the
+GPL.
 """
 TAIL = """
 ## Inside of their wheels
@@ -43,9 +44,10 @@ TAIL = """
 Wheels carry compiled libraries with licences of their own, which lie beside them. Worth knowing:
 
 - `opencv-python-headless` has FFmpeg, LGPL-2.1.
-- `numpy`, `scipy` and `opencv-python-headless` have OpenBLAS, BSD-3-Clause, with libgfortran and libquadmath: GPL-3.0
-  with the GCC Runtime Library Exception, and LGPL-2.1.
-- `warp-lang` has LLVM, Apache-2.0 with LLVM exception, and NVIDIA's compiler for run time under NVIDIA's own terms.
+- `numpy`, `scipy` and `opencv-python-headless` have OpenBLAS, BSD-3-Clause, with libgfortran and libquadmath:
+  GPL-3.0 with the GCC Runtime Library Exception, and LGPL-2.1.
+- `warp-lang` has LLVM, Apache-2.0 with LLVM exception, and NVIDIA's compiler for run time under NVIDIA's own
+  terms.
 - `hdf5plugin` has one library per filter of HDF5, each under the licence of its authors.
 - Where `torch` is a build with CUDA, NVIDIA's libraries come with it, under NVIDIA's own terms
   (`constraints-cuda.txt` has their names), and `triton`, MIT.
