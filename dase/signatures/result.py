@@ -48,6 +48,13 @@ class Signature:
     sentence: str = ""
     details: dict[str, Any] = field(default_factory=dict)
 
+    def __eq__(self, other: object) -> bool:
+        """Compare all fields; numbers that are not known are alike, which no NaN is to itself."""
+        if not isinstance(other, Signature):
+            return NotImplemented
+        mine, theirs = _as_plain(asdict(self)), _as_plain(asdict(other))
+        return bool(mine == theirs)
+
     @property
     def found(self) -> bool:
         """Whether the effect is there."""

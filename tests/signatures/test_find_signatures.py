@@ -18,6 +18,7 @@ from dase.errors import InputError
 from dase.events import Events
 from dase.io.sequence import Sequence
 from dase.signatures.frame_coupling import BurstClock
+from dase.signatures.result import Answer, Signature
 from perf.experiments.signatures import run as experiment
 
 NAMES = (
@@ -165,6 +166,13 @@ def test_memory_does_not_grow_with_the_recording(rng):
         return most
 
     assert peak(4) < 1.25 * peak(2)
+
+
+def test_what_is_not_known_equals_what_is_not_known():
+    nothing = Signature(name="a", answer=Answer.NOT_SEEN, p=float("nan"))
+    assert nothing == Signature(name="a", answer=Answer.NOT_SEEN, p=float("nan"))
+    assert nothing != Signature(name="a", answer=Answer.NOT_SEEN, p=0.5)
+    assert nothing != "a"
 
 
 def test_the_answer_is_short_frozen_and_json(plain):
