@@ -11,7 +11,7 @@ from dase.kernels.pixel_codegen_cpu import lane_scope, print_block_kernel
 from dase.kernels.pixel_codegen_cuda import print_pixel_kernel, print_threshold_kernel
 from dase.kernels.pixel_codegen_model import PixelModel, pixel_scope
 from dase.kernels.pixel_stages import EffectStages
-from dase.kernels.vector_math import function_from_text
+from dase.kernels.vector_math import function_from_text, lane_options
 
 
 @lru_cache(maxsize=256)
@@ -30,7 +30,8 @@ def compose_pixels(stages: tuple[EffectStages, ...], source: str, sink: str, *, 
     """
     scope = pixel_scope(PixelModel(stages, source, sink))
     scope |= lane_scope(lanes, source) if lanes else {}
-    return compile_text(source_text(stages, source, sink, lanes=lanes), "pixel_events", scope)
+    options = lane_options() if lanes else {}
+    return compile_text(source_text(stages, source, sink, lanes=lanes), "pixel_events", scope, **options)
 
 
 @lru_cache(maxsize=256)

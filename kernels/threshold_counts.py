@@ -31,7 +31,7 @@ from dase.kernels.scene_layers import (
     layers_near,
 )
 from dase.kernels.stored_levels import Levels
-from dase.kernels.vector_math import lane_functions, native_function
+from dase.kernels.vector_math import lane_functions, lane_options, native_function
 
 SOURCES = {"frames": Frames, "levels": Levels, "log": Frames, "layers": Layers, "background": Layers}
 """What pixels see, by name: stored intensities, stored levels (on a CPU alone), stored log intensities,
@@ -46,6 +46,8 @@ def _load_levels(lanes: int) -> Any:
     """Return the function that looks up the light of stored levels of `lanes` neighbouring pixels."""
     text = f"""
 const unsigned char* from = values.data + (size_t)k * (size_t)values.strides[0] + n;
+// samples of a pixel lie a picture apart, which no CPU foresees: this is the line of the blocks to come
+__builtin_prefetch(from + 64);
 wp::vec_t<{lanes}, float> result;
 for (int lane = 0; lane < {lanes}; ++lane) result[lane] = light.data[from[lane]];
 return result;
@@ -176,7 +178,7 @@ def counting_kernel(
     Number = wp.int32 if states else wp.float32
     stored, layered = source in STORED, source == "layers"
 
-    @wp.kernel(enable_backward=False, module="unique", module_options={"fuse_fp": False})
+    @wp.kernel(enable_backward=False, module="unique", module_options=lane_options())
     def count_events(
         first: int,
         # in
@@ -256,7 +258,7 @@ def starting_kernel(source: str) -> wp.Kernel:
     look, Lane = log_light_of(1, source), f.Lanes
     stored, layered = source in STORED, source == "layers"
 
-    @wp.kernel(enable_backward=False, module="unique", module_options={"fuse_fp": False})
+    @wp.kernel(enable_backward=False, module="unique", module_options=lane_options())
     def start_counting(
         first: int,
         # in

@@ -13,7 +13,7 @@ import warp as wp
 from dase.kernels.pixel_stages import EventKeys, SampleClock
 from dase.kernels.scene_layers import BackgroundGeometry, background_geometry
 from dase.kernels.threshold_counts import SOURCES, STORED, block_functions, log_light_of
-from dase.kernels.vector_math import lane_functions, lane_type, native_function
+from dase.kernels.vector_math import lane_functions, lane_options, lane_type, native_function
 
 DEPOSIT_EVENTS = """
 auto deposit = [&](float events, float change, float before, float on, float off, long long begin,
@@ -80,7 +80,7 @@ def emitting_kernel(lanes: int, source: str) -> wp.Kernel:
     layers_of = start_of.layers_of
     stored, layered = source in STORED, source == "layers"
 
-    @wp.kernel(enable_backward=False, module="unique", module_options={"fuse_fp": False})
+    @wp.kernel(enable_backward=False, module="unique", module_options=lane_options())
     def emit_events(
         first: int,
         # in

@@ -18,7 +18,7 @@ from dase.kernels import launch
 from dase.kernels.pixel_stages import EventKeys, SampleClock
 from dase.kernels.stored_levels import LEVELS, Levels
 from dase.kernels.threshold_events import DEPOSIT_EVENTS
-from dase.kernels.vector_math import lane_functions, native_function
+from dase.kernels.vector_math import lane_functions, lane_options, native_function
 
 LANES = 64
 """Neighbouring pixels of a thread: their levels fill a line of the cache."""
@@ -165,7 +165,7 @@ _count_block = _function(
 )
 
 
-@wp.kernel(enable_backward=False, module="unique", module_options={"fuse_fp": False})
+@wp.kernel(enable_backward=False, module="unique", module_options=lane_options())
 def emit_level_events(
     first: int,
     # in
@@ -192,7 +192,7 @@ def emit_level_events(
     )  # fmt: skip
 
 
-@wp.kernel(enable_backward=False, module="unique", module_options={"fuse_fp": False})
+@wp.kernel(enable_backward=False, module="unique", module_options=lane_options())
 def count_level_events(
     first: int,
     # in
@@ -224,7 +224,7 @@ def count_level_events(
 def _logarithm_kernel() -> wp.Kernel:
     logarithm, Lane = lane_functions(1).logarithm, lane_functions(1).Lanes
 
-    @wp.kernel(enable_backward=False, module="unique", module_options={"fuse_fp": False})
+    @wp.kernel(enable_backward=False, module="unique", module_options=lane_options())
     def take_logarithms(
         first: int,
         # in

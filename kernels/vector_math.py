@@ -23,6 +23,14 @@ import warp as wp
 from dase.kernels.scene_layers import Affine
 
 
+def lane_options() -> dict[str, Any]:
+    """Return the options of a module whose kernels work on lanes: no contraction, vectors of any width."""
+    flags = wp.config.cpu_compiler_flags
+    # LLVM shuns vectors of 512 bits on Intel by itself, and needs twice the instructions; bits are the same
+    wide = f"{'-march=native' if flags is None else flags} -mprefer-vector-width=512"
+    return {"fuse_fp": False, "cpu_compiler_flags": wide}
+
+
 class _Cpp:
     """The C++ of lanewise functions: two wrappers, and bodies that set `result` in terms of `V` and `I`.
 
@@ -214,6 +222,10 @@ V result = sum + through * light;
 
     load = """
 const float* from = &wp::index(values, k, n);
+#ifndef __CUDA_ARCH__
+// samples of a pixel lie a picture apart, which no CPU foresees: this is the block after the next
+__builtin_prefetch(from + 2 * {length});
+#endif
 #ifdef __CUDA_ARCH__
 if ({length} == 4 && ((size_t)from & 15) == 0) {{
     const float4 q = __ldg(reinterpret_cast<const float4*>(from));
