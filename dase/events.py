@@ -126,7 +126,7 @@ class Events:
         return cls(t, x, y, p, first.width, first.height, label)
 
     def select(self, index: slice | NDArray[Any]) -> Events:
-        """Return the events that a slice, a mask or indices choose; they must stay sorted by time."""
+        """Return the events that a slice, a mask (N,) or indices (K,) choose, in order of time."""
         if not isinstance(index, slice) and index.dtype == np.bool_:
             index = np.flatnonzero(index)  # once, not for each column
         label = None if self.label is None else self.label[index]

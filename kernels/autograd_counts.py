@@ -211,7 +211,7 @@ def launch_on_tensors(
 ) -> None:
     """Run `kernel` on a thread for each of the first and last axis of `over`, else of the first output.
 
-    `size` stands in for the length of the last axis.
+    Tensors have whatever shape the kernel asks for; `size` stands in for the length of the last axis.
     """
     shape = outputs[0] if over is None else over
     # detached: Warp would ask a tensor that requires a gradient for its .grad
@@ -274,7 +274,7 @@ def _window_indices(windows: Sequence[int] | torch.Tensor | None, intervals: int
 
 @lru_cache(maxsize=64)
 def indices_on_device(indices: tuple[int, ...], device: torch.device) -> torch.Tensor:
-    """Return `indices` as int32 on `device`, kept so that a training loop copies them once."""
+    """Return `indices` as int32 (N,) on `device`, kept so that a training loop copies them once."""
     # a tensor born in inference mode could not be saved for a later backward pass
     with torch.inference_mode(False):
         return torch.tensor(indices, dtype=torch.int32, device=device)

@@ -191,7 +191,19 @@ def weigh_rows(
     slope: float,
     penalty: float,
 ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-    """Return the left rows of both layers' gradients, and the terms of the third's but for rows half way."""
+    """Return the left rows of both layers' gradients, and the terms of the third's but for rows half way.
+
+    Args:
+        second: Sums of the second layer, shape (R, J).
+        by_first: Derivative of the scores by the first layer's sums, shape (R, J).
+        by_second: Derivative of the scores by the second layer's sums, shape (R, J).
+        layout: Where rows lie.
+        slope: Of units below 0.
+        penalty: Weight of the mean squared gradient half way.
+
+    Returns:
+        Three tensors of shape (R, J).
+    """
     order, gain, between = layout.order, layout.gain, layout.sides
     left_first, left_second, last = (torch.empty_like(v) for v in (by_first, by_second, second))
     launch_on_tensors(_critics.weigh_first, [by_first, order, gain, between, penalty], [left_first])

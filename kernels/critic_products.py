@@ -102,7 +102,7 @@ def outer_half(
 def outer_full(
     left: wp.array2d[float], right: wp.array2d[int], begin: int, end: int, j: int, k: int
 ) -> wp.mat44:
-    """Return the same of right rows that hold float32."""
+    """Return the same of right rows that hold float32: left (R, J), right (R, K) as words."""
     ...
 
 

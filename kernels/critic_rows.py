@@ -13,7 +13,7 @@ wp.set_module_options({"enable_backward": False})
 
 @wp.func
 def count_below(keys: wp.array[int], key: int) -> int:
-    """Return how many of the keys, which are in order, are less."""
+    """Return how many of the keys (N,), which are in order, are less."""
     place = wp.lower_bound(keys, key)
     # where all are less, Warp returns the last place
     return place + wp.where(keys[place] < key, 1, 0)
@@ -27,7 +27,7 @@ def pairs_of(number: wp.array2d[int], c: int) -> int:
 
 @wp.func
 def rows_of(number: wp.array2d[int], c: int) -> int:
-    """Rows of a critic; without rows of both sides it has none."""
+    """Rows of a critic, of those of each class (2, C); without rows of both sides it has none."""
     pairs = pairs_of(number, c)
     return wp.where(pairs > 0, number[0, c] + number[1, c] + pairs, 0)
 

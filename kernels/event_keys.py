@@ -69,7 +69,7 @@ def unpack_keys(
     row_out: wp.array[int],
     label_out: wp.array[wp.int8],
 ):
-    """Decode keys `first` to `last_in`."""
+    """Decode keys `first` to `last_in`; arguments have the shape and unit that `decode_keys` says."""
     ...
 
 
@@ -77,7 +77,7 @@ def unpack_keys(
 def decode_keys(
     # in
     first: int,
-    keys: wp.array[wp.int64],
+    keys: wp.array[wp.int64],  # (M,)
     bits: int,  # of the place
     low: int,  # bits below the place
     size: int,  # pixels per row of the batch
@@ -85,12 +85,12 @@ def decode_keys(
     begin: wp.int64,  # of the chunk [ns]
     each: int,  # events per thread
     # out
-    t_out: wp.array[wp.float64],  # [s], from whole nanoseconds, so that it never goes back
-    x_out: wp.array[wp.uint16],
-    y_out: wp.array[wp.uint16],
-    p_out: wp.array[wp.uint8],
-    row_out: wp.array[int],  # of the batch; of length 0 when nobody asks
-    label_out: wp.array[wp.int8],  # of length 0 when nobody asks
+    t_out: wp.array[wp.float64],  # (M,) [s], from whole nanoseconds, so that it never goes back
+    x_out: wp.array[wp.uint16],  # (M,)
+    y_out: wp.array[wp.uint16],  # (M,)
+    p_out: wp.array[wp.uint8],  # (M,)
+    row_out: wp.array[int],  # (M,) of the batch; of length 0 when nobody asks
+    label_out: wp.array[wp.int8],  # (M,) or of length 0 when nobody asks
 ):
     """Unpack keys: time, pixel, polarity and label of each event."""
     _, n = wp.tid()
@@ -161,7 +161,10 @@ def radix_sort(
     one: wp.array[wp.int64],
     other: wp.array[wp.int64],
 ):
-    """Sort stably by time, then by place; after an even number of passes the result is in `other`."""
+    """Sort stably by time, then by place; after an even number of passes the result is in `other`.
+
+    Arguments have the shape that `sort_keys` says.
+    """
     ...
 
 
@@ -169,7 +172,7 @@ def radix_sort(
 def sort_keys(
     first: int,
     # in
-    late: wp.array[wp.int64],
+    late: wp.array[wp.int64],  # (L,)
     keys: wp.array2d[wp.int64],  # (S, capacity)
     used: wp.array[int],  # (S,)
     count: int,  # of all keys
@@ -177,8 +180,8 @@ def sort_keys(
     end: int,  # bits of all
     low: int,  # bits below the place
     # out
-    one: wp.array[wp.int64],
-    other: wp.array[wp.int64],
+    one: wp.array[wp.int64],  # (count,)
+    other: wp.array[wp.int64],  # (count,)
 ):
     """Sort on one thread of a CPU, three times as fast as Warp's sort of pairs."""
     radix_sort(late, keys, used, count, begin, end, low, one, other)
@@ -191,7 +194,7 @@ class KeyBuffer:
         self._kept: wp.array | None = None
 
     def take(self, size: int, device: wp.Device) -> wp.array:
-        """Return an array of `size` keys; what was taken before is overwritten."""
+        """Return an array of `size` keys, shape (size,); what was taken before is overwritten."""
         if self._kept is None or len(self._kept) < size:
             self._kept = launch.new_array(size + size // 4, wp.int64, device)
         return self._kept[:size] if size else wp.empty(0, dtype=wp.int64, device=device)

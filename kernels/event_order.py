@@ -38,7 +38,7 @@ def counting_sort(
     time: wp.array[wp.int64],
     polarity: wp.array[wp.uint8],
 ):
-    """Do what `sort_into_pixels` does."""
+    """Do what `sort_into_pixels` does; arguments have the shape and unit that it says."""
     ...
 
 

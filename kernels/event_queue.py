@@ -84,7 +84,7 @@ def send_in_turn(
     busy: wp.array[wp.int64],
     through: wp.array[wp.float64],
 ):
-    """Do what `send_over_bus` does."""
+    """Do what `send_over_bus` does; arguments have the shape and unit that it says."""
     ...
 
 

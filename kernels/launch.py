@@ -160,7 +160,7 @@ def run_concurrently(works: Sequence[Callable[[], Result]]) -> list[Result]:
 
 
 def new_array(shape: int | tuple[int, ...], dtype: Any, device: wp.Device) -> wp.array:
-    """Return new memory; on a CPU NumPy's, which asks for large pages: small ones cost as much as work."""
+    """Return new memory of a shape; on a CPU NumPy's, with large pages: small ones cost as much as work."""
     if device.is_cuda:
         return wp.empty(shape, dtype=dtype, device=device)
     return wp.array(np.empty(shape, wp.dtype_to_numpy(dtype)), dtype=dtype, device=device, copy=False)

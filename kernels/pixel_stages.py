@@ -163,7 +163,7 @@ def leaving_time(clock: SampleClock, k: int, at: float, late: float) -> wp.int64
 def append_key(
     keys: wp.array3d[wp.int64], used: wp.array2d[int], row: int, i: int, shift: int, key: wp.int64
 ):
-    """Append a key to those of the pixel's slab, or only count it where there is no room."""
+    """Append a key to those of the pixel's slab, keys (B, slabs, room), used (B, slabs), or only count it."""
     ...
 
 

@@ -86,7 +86,7 @@ def blur_frames(
 def blur_by_kernels(
     pictures: wp.array, weights: NDArray[np.float32], width: int, pixels: NDArray[np.int32], device: wp.Device
 ) -> wp.array:
-    """Do `blur_frames` on any device."""
+    """Do `blur_frames` on any device; arguments have the shape that it says."""
     samples, size = pictures.shape
     on, where = (wp.array(a, dtype=d, device=device) for a, d in ((weights, float), (pixels, int)))
     half = wp.empty((samples, size), dtype=float, device=device)

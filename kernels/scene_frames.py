@@ -31,7 +31,7 @@ class MatchedFrames:
 
 @wp.func
 def way_at(ways: wp.array3d[wp.vec2], j: int, at: wp.vec2) -> wp.vec2:
-    """Way at a place, bilinear, constant beyond the border."""
+    """Way [px] at a place, of ways (J, H, W), bilinear, constant beyond the border."""
     bottom = ways.shape[1] - 1
     right = ways.shape[2] - 1
     x = wp.clamp(at[0], 0.0, float(right))
@@ -48,7 +48,7 @@ def way_at(ways: wp.array3d[wp.vec2], j: int, at: wp.vec2) -> wp.vec2:
 
 @wp.func
 def origin_of_pixel(ways: wp.array3d[wp.vec2], j: int, share: float, x: wp.vec2) -> wp.vec2:
-    """Place from which the content of pixel `x`, at integers, came, having gone this share of its way."""
+    """Place [px] from which the content of pixel `x`, at integers, came, after this share of its way."""
     way = ways[j, int(x[1]), int(x[0])]
     if way[0] == 0.0 and way[1] == 0.0:
         return x  # where the iteration would stay
@@ -71,7 +71,7 @@ def cubic_weights(f: float) -> wp.vec4:
 
 @wp.func
 def value_at(maps: wp.array3d[float], j: int, at: wp.vec2) -> float:
-    """Value at a place, bicubic, constant beyond the border."""
+    """Value at a place [px], of maps (J, H, W), bicubic, constant beyond the border."""
     bottom = maps.shape[1] - 1
     right = maps.shape[2] - 1
     x = wp.clamp(at[0], 0.0, float(right))
@@ -96,7 +96,7 @@ def value_at(maps: wp.array3d[float], j: int, at: wp.vec2) -> float:
 
 @wp.func
 def inside_weight(maps: wp.array3d[float], at: wp.vec2) -> float:
-    """1 inside the frame, falling to almost 0 over a pixel beyond its border."""
+    """1 inside the frame, of maps (J, H, W), falling to almost 0 over a pixel beyond its border."""
     x = wp.max(-at[0], at[0] - float(maps.shape[2] - 1))
     y = wp.max(-at[1], at[1] - float(maps.shape[1] - 1))
     return wp.clamp(1.0 - wp.max(x, y), 1.0e-3, 1.0)

@@ -249,5 +249,9 @@ def logarithms_of_levels(levels: Levels, eps: wp.array, device: wp.Device) -> wp
 
 
 def have_intervals(logs: wp.array) -> bool:
-    """Return whether what a level brings is decided by intervals: no logarithm below that of a darker one."""
+    """Return whether what a level brings is decided by intervals: no logarithm below that of a darker one.
+
+    Args:
+        logs: Log intensity of every level, shape (B, 256).
+    """
     return bool(np.all(np.diff(logs.numpy()) >= 0))

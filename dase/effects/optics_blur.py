@@ -55,7 +55,7 @@ class Unsharp(Scene):
         return self.scene.sample_times()
 
     def source(self, times: NDArray[np.float64], pixels: NDArray[np.int32], device: Any) -> tuple[str, Any]:
-        """Return the blurred intensities of these pixels."""
+        """Return the blurred intensities of these pixels, shape (K, N); see `Scene.source`."""
         kind, source = self.scene.source(times, self._every, device)
         if kind in ("layers", "background"):
             pictures = render_frames(source, self.width, self.height, device)

@@ -31,7 +31,13 @@ class Bus(SharedReader):
         return self.beside(events, empty, np.ones(2)), until
 
     def beside(self, events: Events, others: Others, weight: NDArray[np.float64]) -> Events:
-        """Return those of some events that find room beside others, see `SharedReader.beside`."""
+        """Return those of some events that find room beside others, see `SharedReader.beside`.
+
+        Args:
+            events: Sorted by time.
+            others: They take room and time, and are not returned.
+            weight: How many OFF and ON events each of the others stands for, shape (2,).
+        """
         through = np.empty(len(events))
         columns = (
             (events.t, wp.float64), (others.time, wp.int64), (others.polarity, wp.uint8),

@@ -127,7 +127,7 @@ def random_numbers(seed: int, name: str) -> np.random.Generator:
 
 
 def to_nanoseconds(seconds: ArrayLike) -> NDArray[np.int64]:
-    """Return times as whole nanoseconds, in which readers reckon, so that nothing depends on rounding."""
+    """Return times [s], of any shape, as whole nanoseconds, in which readers reckon without rounding."""
     return np.rint(np.multiply(seconds, 1e9)).astype(np.int64)
 
 
@@ -137,7 +137,7 @@ def to_nanosecond(seconds: float) -> int:
 
 
 def to_seconds(nanoseconds: NDArray[np.int64]) -> NDArray[np.float64]:
-    """Return whole nanoseconds as the pixels do, to the bit."""
+    """Return whole nanoseconds, of any shape, in seconds as the pixels do, to the bit."""
     out: NDArray[np.float64] = 1e-9 * nanoseconds.astype(np.float64)
     return out
 

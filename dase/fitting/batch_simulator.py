@@ -290,7 +290,7 @@ class BatchSimulator:
     def stream(
         self, sensor: Sensor, vector: NDArray[Any], effects: Iterable[StreamEffect], *, seed: int
     ) -> ProbeSums:
-        """Simulate one parameter vector with effects behind the pixels, and sum up what leaves."""
+        """Simulate one parameter vector (P,) with effects behind the pixels, and sum up what leaves."""
         return self.simulate_streams(SimulationOrder(sensor, np.atleast_2d(vector), seed), [tuple(effects)])
 
     def simulate_streams(

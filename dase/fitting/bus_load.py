@@ -71,7 +71,13 @@ class WholeSensor:
         return np.sort(rest[: max(len(chosen), room)])
 
     def emitted(self, sensor: Sensor, pixels: NDArray[np.int32], steps: int) -> Events:
-        """Return what leaves some pixels up to a point of time, from time 0."""
+        """Return what leaves some pixels in the first steps, in times [s] from the first sample on.
+
+        Args:
+            sensor: With the effects behind the pixels.
+            pixels: Row-major indices, shape (N,).
+            steps: Samples of the scene that are run.
+        """
         (events,) = SensorRun(
             self.scene, sensor, times=self.times[:steps], pixels=pixels, seed=self.seed, device=self.device
         ).events()

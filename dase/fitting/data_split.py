@@ -295,7 +295,7 @@ def least_bus_rate(events: Events, structure: TimestampStructure) -> float:
 
 
 def times_of_grid(scene: Scene, grid: Grid) -> NDArray[np.float64]:
-    """Return the times of the grid, those of the scene itself where they are the same but for rounding."""
+    """Return the times of the grid [s], shape (T,), the scene's own where they differ by rounding only."""
     own = scene.sample_times()
     first = int(np.searchsorted(own, grid.begin - 0.5 * grid.step))
     own = own[first : first + grid.steps]

@@ -296,6 +296,12 @@ def camera_scene(
 
     Where the camera itself rests, what differs from frame to frame by no more than noise rests as well; where
     all moves slowly that would make steps of it.
+
+    Args:
+        frames: Grey values, of any real type, shape (F, H, W).
+        begin: Begin of each exposure [s], shape (F,).
+        end: End of each exposure [s], shape (F,).
+        notes: Gets a sentence where frames were stretched.
     """
     gains = None
     scene = CameraScene(frames, begin, end)

@@ -297,7 +297,16 @@ def with_effect_added(present: FittedModel, effect: Effect) -> FittedModel:
 
 
 def starting_places(model: FittedModel, effect: Effect, *, few: bool = False) -> Array:
-    """Return places from which an effect is tried: its strength and its character, at several thresholds."""
+    """Return places from which an effect is tried: its strength and its character, at several thresholds.
+
+    Args:
+        model: With the effect, at its present place.
+        effect: What is tried.
+        few: Whether fewer places do.
+
+    Returns:
+        M places, shape (M, P).
+    """
     axes = model.space.axes
     columns, choices, observed = [], [], False
     for n, axis in enumerate(axes):

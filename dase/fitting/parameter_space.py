@@ -130,7 +130,7 @@ class ParameterSpace:
         return out
 
     def at(self, place: Array) -> Sensor:
-        """Return the sensor at a place."""
+        """Return the sensor at a place, shape (P,)."""
         return with_values(
             self.sensor,
             {axis.name: float(axis.to_value(p)) for axis, p in zip(self.axes, place, strict=True)},

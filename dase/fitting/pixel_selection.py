@@ -89,7 +89,7 @@ def choose_trusted_pixels(
         least: Pixels in each half without which nothing is compared.
 
     Returns:
-        Row-major indices, those of the first half before those of the second.
+        Row-major indices, shape (2 · `each`,), those of the first half before those of the second.
 
     Raises:
         InputError: There are next to none.

@@ -36,7 +36,7 @@ def plain_numbers(half: CalibratedSubset) -> dict[str, tuple[float, float]]:
 
 
 def family_counts(values: Array, family: str) -> Array:
-    """Return the events that statistics of a family count."""
+    """Return the events that statistics (J,) of a family count, one for each statistic of the family."""
     return np.maximum(np.exp(values[LAYOUT[family]]) - 3.0, 0.0)
 
 
@@ -46,7 +46,7 @@ def rate_counts(values: Array) -> Array:
 
 
 def octave_ends(step: float) -> Array:
-    """Return the upper ends of the bins of intervals, in units of `step`."""
+    """Return the upper ends of the bins of intervals, shape (INTERVALS,), in units of `step`."""
     return step * np.concatenate([[0.5], 2.0 ** np.arange(INTERVALS - 1)])
 
 

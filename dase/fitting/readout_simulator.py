@@ -59,7 +59,14 @@ def clock_of(effects: tuple[StreamEffect, ...], structure: TimestampStructure) -
 def simulate_pixels(
     stimulus: Stimulus, sensor: Sensor, vectors: NDArray[Any], seeds: NDArray[np.int64]
 ) -> list[Events]:
-    """Return the events that leave the pixels, of each model."""
+    """Return the events that leave the pixels, of each model.
+
+    Args:
+        stimulus: What the pixels see.
+        sensor: Its effects; those behind the pixels are left out.
+        vectors: Parameters of the models, shape (B, P).
+        seeds: Of the models, shape (B,).
+    """
     bare = replace(sensor, effects=tuple(e for e in sensor.effects if not isinstance(e, StreamEffect)))
     kind = "cuda" if stimulus.device.is_cuda else "cpu"
     # a model that sends more is run again; on a CPU room costs nothing before it is used

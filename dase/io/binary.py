@@ -20,7 +20,7 @@ BLOCK = 1 << 22  # [bytes] read at once
 
 
 def read_records(source: Source, begin: int, kind: Any) -> Iterator[NDArray[Any]]:
-    """Yield the records of a file from byte `begin` on, a block at a time; note a broken one at the end."""
+    """Yield the records of a file from byte `begin` on, in blocks (N,); note a broken one at the end."""
     size = np.dtype(kind).itemsize
     with source.path.open("rb") as file:
         file.seek(begin)

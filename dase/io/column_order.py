@@ -91,5 +91,5 @@ def note_order(source: Source, order: str) -> None:
 
 
 def is_micro(times: NDArray[Any]) -> bool:
-    """Whether times are microseconds: whole numbers, of whatever type."""
+    """Whether times (N,) are microseconds: whole numbers, of whatever type."""
     return times.dtype.kind in "iu" or bool(np.all(times == np.floor(times)) and np.any(times > 1))

@@ -351,7 +351,7 @@ def _little_memory() -> Iterator[None]:
 def read_columns(
     file: Any, names: tuple[str, str, str, str], beside: tuple[str, ...] = ()
 ) -> Iterator[tuple[NDArray[Any], ...]]:
-    """Yield slices of the columns t, x, y, p and others beside; all but x and y as the file holds them."""
+    """Yield slices (n,) of columns t, x, y, p and others beside; all but x and y as the file holds them."""
     found = [checked_dataset(file, name, 1) for name in (*names, *beside)]
     length = len(found[0])
     for name, column in zip((*names, *beside), found, strict=True):

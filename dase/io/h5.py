@@ -129,7 +129,7 @@ def deflate_bytes(data: NDArray[np.uint8]) -> bytes:
 
 
 def put_chunk(dataset: h5py.Dataset, place: int | tuple[int, ...], values: NDArray[Any]) -> None:
-    """Write one whole chunk of a dataset, filtered as `COMPRESSION` says: shuffled, then deflated."""
+    """Write one chunk, `values` having its shape, filtered as `COMPRESSION` says: shuffled, then deflated."""
     # the first bytes of all numbers, then the second ones, and so on
     planes = values.reshape(-1).view(np.uint8).reshape(-1, values.itemsize).T
     packed = deflate_bytes(np.ascontiguousarray(planes).reshape(-1))
@@ -347,7 +347,7 @@ def _stack_members(members: dict[str, Any], kinds: tuple[type[Any], ...], ndim: 
 
 
 def checked_member(member: Any, kinds: tuple[type[Any], ...], ndim: int) -> NDArray[Any]:
-    """Return what a dataset holds; raises InputError where it is of another type or number of axes."""
+    """Return what a dataset holds, of any shape; raises InputError for another type or number of axes."""
     if member.ndim != ndim or member.dtype not in kinds:
         names = " or ".join(np.dtype(kind).name for kind in kinds)
         raise InputError(f"'{member.name}' must be {names} with {ndim} axes")

@@ -150,6 +150,9 @@ def decode_bytes(data: bytes, how: int) -> NDArray[Any] | None:
     Args:
         data: The content of a file.
         how: Flags of `cv2.imdecode`.
+
+    Returns:
+        Pixels, shape (H, W) or (H, W, channels), BGR or BGRA, of the type of the file unless `how` asks else.
     """
     if data.startswith(PNG) and not _is_whole_png(data):
         return None  # OpenCV 5 takes as much memory as a part says it is long

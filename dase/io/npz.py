@@ -139,7 +139,7 @@ def read(source: Source) -> Sequence:
 
 
 def load_member(archive: zipfile.ZipFile, name: str) -> NDArray[Any]:
-    """Return a member of the archive; never unpickles."""
+    """Return a member of the archive, of whatever shape; never unpickles."""
     with archive.open(f"{name}.npy") as stream:
         return np.asarray(np.lib.format.read_array(stream, allow_pickle=False))
 
@@ -167,7 +167,7 @@ def _parse_members(source: Source, content: dict[str, NDArray[Any]]) -> Sequence
 
 
 def parse_beside(content: dict[str, NDArray[Any]]) -> Beside:
-    """Return the thresholds and the configuration."""
+    """Return the thresholds [log intensity], shape (2, H, W), and the configuration, None where absent."""
     thresholds, configuration = content.get("thresholds"), content.get("configuration")
     return (
         None if thresholds is None else thresholds.astype(np.float32, copy=False),

@@ -185,7 +185,7 @@ def _note_order(source: Source, count: int, back: float) -> None:
 
 
 def in_order(t: NDArray[Any]) -> bool:
-    """Whether times never go back."""
+    """Whether times (N,) never go back."""
     return bool(np.all(t[1:] >= t[:-1]))
 
 
@@ -224,7 +224,13 @@ def order_pieces(source: Source, pieces: Iterable[Piece], ticks: float) -> Itera
 
 
 def find_origin(source: Source, t: NDArray[Any], ticks: float) -> Any:
-    """Return the tick of time zero: that of the file, or its first event where the file counts as a date."""
+    """Return the tick of time zero: that of the file, or its first event where the file counts as a date.
+
+    Args:
+        source: Gets a note of the date.
+        t: Times of the first events [ticks], shape (N,).
+        ticks: In a second.
+    """
     if not len(t) or abs(float(t[0])) / ticks < TIME_RULES.date:
         return t.dtype.type(0)
     sentence = f"times count from the first event, which the file dates {float(t[0]) / ticks:.6f} s"

@@ -189,7 +189,10 @@ class AdversarialObjective:
         noise: PixelNoise,
         step: torch.Tensor | int,
     ) -> Pairs:
-        """Return the pairs as they are: critics look at images and counts alone."""
+        """Return the pairs as they are: critics look at images and counts alone.
+
+        Arguments have the shape and unit that `Objective.extend_fake` says.
+        """
         return fake
 
     def weights(self) -> torch.Tensor:
@@ -250,7 +253,7 @@ class AdversarialObjective:
         )
 
     def move_shared(self, share: torch.Tensor) -> None:
-        """Move nothing: descent moves all parameters."""
+        """Move nothing, whatever `share` (a scalar) is: descent moves all parameters."""
 
     def state(self) -> dict[str, Any]:
         """Return the bank, the hash and the random numbers, as the entry `objective` of a checkpoint."""

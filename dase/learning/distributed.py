@@ -67,7 +67,7 @@ def gather_values(values: torch.Tensor) -> torch.Tensor:
 
 
 def sum_over_processes(values: torch.Tensor) -> torch.Tensor:
-    """Return the sum over the processes."""
+    """Return the sum over the processes, of the shape of `values`."""
     if process_count() == 1:
         return values
     out = values.detach().clone()
@@ -76,7 +76,7 @@ def sum_over_processes(values: torch.Tensor) -> torch.Tensor:
 
 
 def sum_gradients(parameters: Iterable[torch.Tensor]) -> None:
-    """Replace the gradients of parameters by their sums over the processes, in one message."""
+    """Replace the gradients of parameters, of any shape, by their sums over the processes, in one message."""
     if process_count() == 1:
         return
     found = [p.grad for p in parameters if p.grad is not None]
@@ -86,7 +86,7 @@ def sum_gradients(parameters: Iterable[torch.Tensor]) -> None:
 
 
 def broadcast_tensors(values: Iterable[torch.Tensor]) -> None:
-    """Give tensors the values that they have in the first process, in place."""
+    """Give tensors of any shape the values that they have in the first process, in place."""
     if process_count() > 1:
         for value in values:
             dist.broadcast(value.detach(), 0)

@@ -114,7 +114,11 @@ class HeldOutScore:
 
     @torch.no_grad()
     def simulate_fakes(self, net: Callable[[torch.Tensor], ThresholdMaps] | None) -> list[Pairs]:
-        """Return batches of the fixed scenes seen through a network, or at usual thresholds without one."""
+        """Return batches of the fixed scenes seen through a network, or at usual thresholds without one.
+
+        Args:
+            net: From images in [0, 1], shape (B, H, W), to thresholds.
+        """
         rng = np.random.default_rng(self.seed)
         generator = torch.Generator(self.scenery.device).manual_seed(self.seed)
         out = []
@@ -130,11 +134,19 @@ class HeldOutScore:
         return out
 
     def score(self, net: Callable[[torch.Tensor], ThresholdMaps]) -> float:
-        """Return the weighted square difference of the moments; smaller is better."""
+        """Return the weighted square difference of the moments; smaller is better.
+
+        Args:
+            net: From images in [0, 1], shape (B, H, W), to thresholds.
+        """
         return float(moment_discrepancy(self.simulate_fakes(net), self.real, self.like))
 
     def statistics(self, net: Callable[[torch.Tensor], ThresholdMaps]) -> dict[str, float]:
-        """Return how counts and 8x8 patches of them differ from the held-out ones, in plain numbers."""
+        """Return how counts and 8x8 patches of them differ from the held-out ones, in plain numbers.
+
+        Args:
+            net: From images in [0, 1], shape (B, H, W), to thresholds.
+        """
         fake, real = (
             torch.cat([pairs.counts for pairs in side]) for side in (self.simulate_fakes(net), self.real)
         )
@@ -157,7 +169,12 @@ def count_histogram(counts: torch.Tensor, most: int = 12) -> torch.Tensor:
 
 
 def log_count_distance(one: torch.Tensor, other: torch.Tensor) -> float:
-    """Return the mean distance of sorted values of log(1 + x), Wasserstein's of the first order."""
+    """Return the mean distance of sorted values of log(1 + x), Wasserstein's of the first order.
+
+    Args:
+        one: Counts, of any shape.
+        other: Counts, of any shape.
+    """
     shares = torch.linspace(0, 1, 2001, device=one.device, dtype=torch.float64)
     values = []
     for side in (one, other):

@@ -162,7 +162,7 @@ class GaussNewton:
         return out.to(self.moments.device)
 
     def shared_numbers(self) -> torch.Tensor:
-        """Return the shared numbers, in the order of the derivatives."""
+        """Return the shared numbers, shape (p,), in the order of the derivatives."""
         net = self.net
         maps = net.level[:, None] if net.shape.table is None else net.table.flatten(1)
         parts = [maps[0], maps[1], *([net.asymmetry.view(1)] if net.shape.split else [])]
@@ -178,6 +178,9 @@ class GaussNewton:
 
         With the Jacobian J of the moments, their weights W, differences d, and numbers x with prior P, the
         whole step is -(JᵀWJ + P)⁻¹ (JᵀWd + Px).
+
+        Args:
+            share: A number, or a scalar on the device.
         """
         cells = self.moments.sets["look"]
         jacobian, prior = self._jacobian(), self.prior

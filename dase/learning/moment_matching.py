@@ -231,7 +231,8 @@ class CellMoments:
         Args:
             doubt: Share of themselves by which means differ for reasons that thresholds cannot cure.
             excess: By how much more than chance they differ after a linear step. Where it is large, what
-                varies little is not what tells most, and the weights become those of single features.
+                varies little is not what tells most, and the weights become those of single features. A
+                number, or a scalar on the device.
         """
         kept = self.kept
         cells, width = kept["plain_sum"].shape
@@ -255,7 +256,14 @@ class CellMoments:
         return torch.einsum("nfg,ng->nf", self.kept["weight"], flat).reshape(off.shape)
 
     def distance(self, off: torch.Tensor) -> torch.Tensor:
-        """Return the weighted square difference, in variances of a scene, mean over cells and features."""
+        """Return the weighted square difference, in variances of a scene, mean over cells and features.
+
+        Args:
+            off: Fake minus real means, shape (cells, F).
+
+        Returns:
+            A scalar.
+        """
         return (self.slope(off) * off).sum()
 
 
@@ -365,6 +373,9 @@ class Moments:
         Args:
             fake: With their reference counts.
             members: What `cell_members` returned for their images.
+
+        Returns:
+            For each set of cells what `CellMoments.add_reference` returns, shape (B, cells, F).
         """
         assert fake.reference is not None
         found = self.cell_sums(Pairs(fake.grey, fake.reference), members)
@@ -388,7 +399,16 @@ class Moments:
         return None if self.reweighs else self.holds_out
 
     def loss(self, fake: Pairs, real: Pairs, *, move: bool) -> tuple[torch.Tensor, dict[str, torch.Tensor]]:
-        """Take both batches in; return the fake means of this batch along what they are off."""
+        """Take both batches in; return the fake means of this batch along what they are off.
+
+        Args:
+            fake: Simulated pairs with their reference counts.
+            real: Pairs of the target.
+            move: Whether the network moves; else the loss is 0.
+
+        Returns:
+            A scalar, and by their names numbers for the log, each a scalar.
+        """
         self.add_real(real, held_out=self.holds_out)
         members = self.cell_members(fake.grey)
         plain = self.add_reference(fake, members)

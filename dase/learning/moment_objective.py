@@ -102,13 +102,17 @@ class MomentObjective:
     def loss(
         self, fake: Pairs, real: Pairs, *, move: bool, rates: torch.Tensor | None = None
     ) -> tuple[torch.Tensor, dict[str, torch.Tensor]]:
-        """Take both batches in; return the loss of `Moments.loss` and its distance."""
+        """Take both batches in; see `Moments.loss` for the loss and the distance, each a scalar."""
         loss, values = self.moments.loss(fake, real, move=move)
         self.newton.add_answers(fake)
         return loss, values
 
     def move_shared(self, share: torch.Tensor) -> None:
-        """Take a share of a Gauss-Newton step of the shared parameters, scaled by that of the rates."""
+        """Take a share of a Gauss-Newton step of the shared parameters.
+
+        Args:
+            share: Of the step that the settings ask for, a scalar on the device.
+        """
         self.newton.step(self.settings.newton * share)
         # every process has solved the same equations, but sums on a GPU are taken in any order
         shared = [v for n, v in self.net.state_dict().items() if not n.startswith("unet.")]

@@ -136,7 +136,7 @@ class ReplayedScenes(Scenery):
         self.log = torch.from_numpy(windows.log).to(self.device)
 
     def draw_numbers(self, rng: np.random.Generator, count: int) -> NDArray[np.int32]:
-        """Choose `count` windows."""
+        """Choose `count` windows; return their indices, (count,)."""
         index = rng.choice(len(self.log), size=count, replace=count > len(self.log))
         return np.asarray(index, np.int32)
 

@@ -128,7 +128,7 @@ class Scenery:
         return self.render(send_words(self.draw_numbers(rng, count), self.device), count)
 
     def draw_numbers(self, rng: np.random.Generator, count: int) -> NDArray[np.int32]:
-        """Draw `count` scenes; return all that is random in them, for `render`, as words of 4 bytes."""
+        """Draw `count` scenes; return all that is random in them for `render`, as words of 4 bytes, (N,)."""
         looks = self.scene_settings
         motion = draw_motion(rng, looks, count)
         layers = motion.x.shape[1]
@@ -153,9 +153,9 @@ class Scenery:
 
 
 def pack_words(*arrays: NDArray[Any]) -> NDArray[np.int32]:
-    """Return arrays of 4-byte numbers one behind the other, each from the begin of a line of GPU memory.
+    """Return arrays of 4-byte numbers, of any shape, one behind the other, as words (N,).
 
-    Vectors on a GPU may ask for that.
+    Each begins with a line of GPU memory: vectors on a GPU may ask for that.
     """
     begin = np.cumsum([0, *(_whole_lines(a.size) for a in arrays)])
     flat = np.zeros(begin[-1], np.int32)
@@ -171,7 +171,7 @@ def _whole_lines(words: int) -> int:
 
 
 def unpack_words(words: torch.Tensor, *shapes: tuple[int, ...]) -> list[torch.Tensor]:
-    """Return the arrays of these shapes that `pack_words` put into int32 words."""
+    """Return the arrays of these shapes that `pack_words` put into int32 words (N,)."""
     out, begin = [], 0
     for shape in shapes:
         size = math.prod(shape)
@@ -183,7 +183,7 @@ def unpack_words(words: torch.Tensor, *shapes: tuple[int, ...]) -> list[torch.Te
 def send_words(
     words: NDArray[np.int32], device: torch.device, to: torch.Tensor | None = None
 ) -> torch.Tensor:
-    """Return words on a device, in the memory of `to` if given; nobody waits for the copy."""
+    """Return words (N,) on a device, in the memory of `to` (N,) if given; nobody waits for the copy."""
     here = torch.from_numpy(words)
     if device.type == "cuda":
         here = here.pin_memory()

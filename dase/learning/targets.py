@@ -42,6 +42,10 @@ class VariedCounts:
 
         A surrogate for the count itself, put through a curved function, is off by what the curve does inside
         the step; the difference of the function's values is not.
+
+        Args:
+            value: From counts (B, 2, H, W) to features (B, F, H, W).
+            counts: At the thresholds themselves, shape (B, 2, H, W).
         """
         out = value(counts.detach())
         # a slope by the logarithm; between e^-STEP and e^STEP lie 2 sinh(STEP) of a threshold
@@ -76,7 +80,7 @@ class Pairs:
         return len(self.grey)
 
     def select(self, index: torch.Tensor | slice) -> Pairs:
-        """Return some of the pairs, as float32."""
+        """Return some of the pairs, by a slice or indices (K,), as float32."""
         return Pairs(self.grey[index].float(), self.counts[index].float())
 
 
@@ -110,11 +114,11 @@ class Target(ABC):
 
     @abstractmethod
     def draw_numbers(self, rng: np.random.Generator, count: int) -> NDArray[np.int32]:
-        """Draw `count` pairs; return what `pairs` needs to know of them, as words of 4 bytes."""
+        """Draw `count` pairs; return what `pairs` needs to know of them, as words of 4 bytes, (words,)."""
 
     @abstractmethod
     def pairs(self, numbers: torch.Tensor, count: int) -> Pairs:
-        """Return the pairs that `numbers` drew; the processor decides nothing here."""
+        """Return the pairs that `numbers` (words,) drew; the processor decides nothing here."""
 
     def draw(self, rng: np.random.Generator, count: int) -> Pairs:
         """Return random pairs."""
@@ -154,11 +158,11 @@ class EndlessTarget(Target):
         return self.scenery.device
 
     def draw_numbers(self, rng: np.random.Generator, count: int) -> NDArray[np.int32]:
-        """Draw scenes."""
+        """Draw scenes; return them as words of 4 bytes, (words,)."""
         return self.scenery.draw_numbers(rng, count)
 
     def pairs(self, numbers: torch.Tensor, count: int) -> Pairs:
-        """Render scenes and let the sensor see them."""
+        """Render the scenes that `numbers` (words,) drew, and let the sensor see them."""
         log = self.scenery.render(numbers, count)
         grey = middle_intensity(log)
         assert self.truth is not None
@@ -203,14 +207,14 @@ class FiniteTarget(Target):
         return self.recorded.grey.device
 
     def draw_numbers(self, rng: np.random.Generator, count: int) -> NDArray[np.int32]:
-        """Choose pairs, and how each is turned and mirrored."""
+        """Choose pairs, and how each is turned and mirrored; return it as words of 4 bytes, (4 · count,)."""
         index = rng.choice(len(self.recorded), size=count, replace=count > len(self.recorded))
         mirrored = rng.random((2, count)) < 0.5
         turned = np.full(count, rng.random() < 0.5)
         return np.stack([index, *mirrored, turned]).astype(np.int32).ravel()
 
     def pairs(self, numbers: torch.Tensor, count: int) -> Pairs:
-        """Return chosen pairs, turned and mirrored where `augment` says so."""
+        """Return the pairs that `numbers` (4 · count,) chose, turned and mirrored where `augment` says so."""
         index, across, along, turned = numbers.view(4, count)
         some = self.recorded.select(index.long())
         return flip_pairs(some, across > 0, along > 0, turned > 0) if self.augment else some
@@ -295,7 +299,7 @@ def simulate_counts(
 def vary_thresholds(
     log: torch.Tensor, mu: torch.Tensor, sigma: torch.Tensor, noise: PixelNoise
 ) -> VariedCounts:
-    """Return how the counts of `simulate_counts`, with the same arguments, answer to the thresholds."""
+    """Return how the counts of `simulate_counts`, for arguments of that shape, answer to the thresholds."""
     theta = clipped_thresholds(mu, sigma, noise.z, like=log)
     above: list[torch.Tensor] = []
     below: list[torch.Tensor] = []

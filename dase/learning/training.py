@@ -146,7 +146,11 @@ class Objective(Protocol):
         """
 
     def move_shared(self, share: torch.Tensor) -> None:
-        """Move the parameters that all pixels share, if `moves_shared`; `share` is as in `step_rates`."""
+        """Move the parameters that all pixels share, if `moves_shared`.
+
+        Args:
+            share: Of the full learning rates, as in `step_rates`, a scalar on the device.
+        """
 
     def state(self) -> dict[str, Any]:
         """Return entries of the checkpoint that hold all that the next step depends on."""
@@ -228,7 +232,7 @@ class Training:
         return torch.optim.Adam(groups, betas=(0.5, 0.99), fused=cuda, capturable=cuda)
 
     def advance(self) -> dict[str, torch.Tensor]:
-        """Do one step; return what is worth logging, still on the device and until the next step."""
+        """Do one step; return what is worth logging, each a scalar on the device, until the next step."""
         if not self.calibrated:
             self.calibrate()
         move = self.step >= 0

@@ -184,7 +184,7 @@ class ThresholdNet(nn.Module):
         return node_weights(grey, self.shape.table)
 
     def roughness(self) -> torch.Tensor:
-        """Return the mean square difference between neighbouring nodes of the table, 0 without one."""
+        """Return the mean square difference of neighbouring nodes of the table, a scalar, 0 without one."""
         if self.shape.table is None:
             return self.level.new_zeros(())
         return sum(

@@ -88,7 +88,7 @@ class ErrorScale:
         return pseudo_huber(size if self.least is None else np.maximum(size, self.least))
 
     def families(self, values: Array) -> dict[str, float]:
-        """Return the robust distance of each family that is compared."""
+        """Return the robust distance of each family that is compared, of statistics (J,)."""
         rho = self._rho(values)
         used = {name: part for name, part in LAYOUT.items() if self.used[part].any()}
         return {name: float(rho[part][self.used[part]].mean()) for name, part in used.items()}
@@ -187,7 +187,7 @@ def in_standard_errors(apart: Array, scale: ErrorScale) -> Array:
 
 
 def pseudo_huber(z: Array) -> Array:
-    """Return the pseudo-Huber loss: z² for small z, 2 |z| for large; its slope never vanishes."""
+    """Return the pseudo-Huber loss, of any shape: z² for small z, 2 |z| for large; it never gets flat."""
     out: Array = 2.0 * (np.sqrt(1.0 + z * z) - 1.0)
     return out
 

@@ -133,7 +133,7 @@ class Stimulus:
         return self._kept[name]
 
     def array(self, name: str, make: Callable[[], NDArray[Any]]) -> Any:
-        """Return an array on the device, moved there once."""
+        """Return an array on the device, of the shape that `make` gives it; made and moved there once."""
         if name not in self._kept:
             self._kept[name] = wp.array(np.ascontiguousarray(make()), device=self.device)
         return self._kept[name]
@@ -236,9 +236,14 @@ def _light_change(level: NDArray[np.float32], step: float) -> NDArray[np.float32
     return out
 
 
-def band_edges(intensity: NDArray[np.float32], cell_free: NDArray[np.bool_]) -> NDArray[np.float64]:
-    """Return the intensities between the bands: quantiles over the pixels and times that are compared."""
-    values = intensity[cell_free]
+def band_edges(intensity: NDArray[np.float32], compared: NDArray[np.bool_]) -> NDArray[np.float64]:
+    """Return the intensities between the bands, shape (BANDS - 1,): quantiles of what is compared.
+
+    Args:
+        intensity: Of pixels and times, shape (N, T).
+        compared: Which of these are, shape (N, T).
+    """
+    values = intensity[compared]
     return np.quantile(values, (0.15, 0.4, 0.7)) if len(values) else np.array([0.1, 0.3, 0.6])
 
 

@@ -83,12 +83,19 @@ def share_at(t: NDArray[np.float64], step: float, slack: float = 0.0) -> float:
 
 
 def share_in_scan(t: NDArray[np.float64], place: NDArray[np.float64], line: float, lines: int) -> float:
-    """Return the share of times at which a readout that goes from line to line is at the pixel's."""
+    """Return the share of times at which a readout that goes from line to line is at the pixel's.
+
+    Args:
+        t: Times of events [s], shape (N,).
+        place: Their lines in the order of the readout, shape (N,).
+        line: Time of a line [s].
+        lines: In a scan.
+    """
     return share_at(t - place * line, lines * line, PATTERNS.pause * lines * line)
 
 
 def readout_lines(events: Events, direction: str) -> tuple[int, NDArray[np.float64]]:
-    """Return the number of lines, and the line of each event."""
+    """Return the number of lines, and the line of each event in the order of the readout, (N,)."""
     upright = direction in ("down", "up")
     lines = events.height if upright else events.width
     place = (events.y if upright else events.x).astype(np.float64)
@@ -133,7 +140,7 @@ def in_turns(t: NDArray[np.float64], step: float) -> bool:
 
 
 def refine_period(t: NDArray[np.float64], step: float) -> float:
-    """Return the step near `step` that stamps are multiples of, from ever longer stretches of time."""
+    """Return the step [s] near `step` that stamps (N,) are multiples of, from ever longer stretches."""
     for span in np.geomspace(30 * step, max(float(t[-1]), 60 * step), 12):
         part = t[t <= t[0] + span]
         ticks_ = np.round((part - part[0]) / step)
@@ -143,7 +150,7 @@ def refine_period(t: NDArray[np.float64], step: float) -> float:
 
 
 def spread_over(t: NDArray[np.float64], step: float) -> bool:
-    """Whether stamps at multiples are no accident of few distinct times."""
+    """Whether stamps (N,) [s] at multiples of `step` are no accident of few distinct times."""
     return len(np.unique(np.round(t / step))) >= 20
 
 

@@ -300,7 +300,7 @@ class Recording:
             seed: Of the random numbers.
 
         Returns:
-            Row-major indices, each increasing.
+            Row-major indices, (N,) and (M,), each increasing.
         """
         _check_share(share)
         pixels = np.random.default_rng(checked_seed(seed)).permutation(self.pixels)

@@ -182,7 +182,7 @@ class CameraScene(Scene):
         return np.minimum(np.searchsorted(self.times, at, "right") - 1, len(self.times) - 2)
 
     def source(self, times: NDArray[np.float64], pixels: NDArray[np.int32], device: Any) -> tuple[str, Any]:
-        """Return the intensities of these pixels."""
+        """Return the intensities of these pixels, shape (K, N); see `Scene.source`."""
         source = Frames()
         matches, _, at, share = self._prepared(times, device)
         last = times == self.times[-1]  # a frame as well, as which it must come out
@@ -322,7 +322,7 @@ class CameraScene(Scene):
 
 
 def full_scale(frames: NDArray[Any]) -> float:
-    """Return the value of intensity 1: the largest of an integer type, 1 for real numbers."""
+    """Return the value of intensity 1, for frames of any shape: the largest of an integer type, else 1."""
     return float(np.iinfo(frames.dtype).max) if frames.dtype.kind in "iu" else 1.0
 
 

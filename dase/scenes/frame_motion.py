@@ -128,7 +128,13 @@ def pixel_grid(shape: tuple[int, ...]) -> tuple[Map, Map]:
 
 
 def sample_bicubic(values: Map, x: Map, y: Map) -> Map:
-    """Return values at places, bicubic, continued by the outermost ones."""
+    """Return values at places, bicubic, continued by the outermost ones, in the shape of the places.
+
+    Args:
+        values: Shape (H, W).
+        x: Columns [px].
+        y: Rows [px].
+    """
     out = cv2.remap(values, x, y, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
     return np.asarray(out, np.float32)
 

@@ -214,7 +214,7 @@ class LayerScene(Scene):
         return np.array(times)
 
     def arrays(self, times: NDArray[np.float64], device: wp.Device) -> kernels.Layers:
-        """Return textures and motion at `times` on a Warp device."""
+        """Return textures and motion at `times` [s], shape (K,), on a Warp device."""
         if device.alias not in self._uploaded:
             textures = [(layer.picture.grey, layer.picture.alpha) for layer in self.layers]
             self._uploaded[device.alias] = kernels.upload_textures(textures, device)
@@ -232,7 +232,10 @@ class LayerScene(Scene):
         return layers
 
     def source(self, times: NDArray[np.float64], pixels: NDArray[np.int32], device: Any) -> tuple[str, Any]:
-        """Return the layers themselves: the pixel kernel warps, so no frame is ever stored."""
+        """Return the layers themselves: the pixel kernel warps, so no frame is ever stored.
+
+        Arguments have the shape and unit that `Scene.source` says.
+        """
         return "background" if len(self.layers) == 1 else "layers", self.arrays(times, device)
 
     def frames(self, times: NDArray[np.float64], device: str = "cpu") -> NDArray[np.float32]:

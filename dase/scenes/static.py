@@ -52,7 +52,7 @@ class StaticScene(Scene):
         return np.linspace(0, self.duration, int(np.ceil(self.duration / self.longest)) + 1)
 
     def source(self, times: NDArray[np.float64], pixels: NDArray[np.int32], device: Any) -> tuple[str, Any]:
-        """Return the intensity of these pixels once for each time."""
+        """Return the intensity of these pixels once for each time, shape (K, N); see `Scene.source`."""
         source = Frames()
         light = self.intensity.reshape(-1)[pixels]
         source.values = wp.array(np.tile(light, (len(times), 1)), dtype=float, device=device)

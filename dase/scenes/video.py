@@ -61,7 +61,10 @@ class VideoScene(Scene):
         return self._times
 
     def source(self, times: NDArray[np.float64], pixels: NDArray[np.int32], device: Any) -> tuple[str, Any]:
-        """Return the stored intensities of these pixels; on a CPU those of 8 bits as the levels they are."""
+        """Return the stored intensities of these pixels, shape (K, N); see `Scene.source`.
+
+        On a CPU those of 8 bits are the levels that they are.
+        """
         source = pixel_stages.Frames()
         above = np.minimum(np.searchsorted(self._times, times), len(self._times) - 1)
         if np.array_equal(self._times[above], times):

@@ -45,7 +45,7 @@ class CalmFilter:
         return self._release(int(np.searchsorted(self._held.t, newest - self.gap)))
 
     def flush(self) -> tuple[Events, NDArray[np.bool_]]:
-        """Return the events held back, when nothing follows them."""
+        """Return the events held back, when nothing follows them, and which of them are calm, shape (N,)."""
         return self._release(len(self._held))
 
     def _release(self, count: int) -> tuple[Events, NDArray[np.bool_]]:

@@ -263,7 +263,7 @@ class PixelArray:
         return events.select(slice(now)), None if row is None else row[:now]
 
     def flush(self) -> tuple[Events, NDArray[np.int32] | None]:
-        """Return the events that have not left the pixels yet, as `emit` does; time is over."""
+        """Return the events that have not left yet, and their rows (N,), as `emit` does; time is over."""
         late = np.empty(0, np.int64) if self._late is None else self._late
         self._late = None if self._late is None else late[:0]
         return self._decode_keys(wp.array(late, dtype=wp.int64, device=self.device), self.begin)

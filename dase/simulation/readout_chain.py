@@ -120,7 +120,7 @@ class WindowCounter:
 
 
 def split_by_row(events: Events, row: NDArray[np.int32] | None, batch: int) -> Sequence[Events]:
-    """Return the stream of each row of a batch."""
+    """Return the stream of each row of a batch; `row` (N,) has that of each event, None all in one."""
     if row is None:
         return [events]
     # stable, so that each stream stays in order of time; rows as small integers are sorted by their digits

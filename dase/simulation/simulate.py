@@ -71,7 +71,18 @@ def simulate(
 
         events = dase.simulate(frames, "davis346", fps=1000)
 
-    See `stream` for the arguments.
+    Args:
+        scene: What the sensor sees: a scene, or frames of linear intensity, shape (F, H, W), see `stream`.
+        sensor: What it does: a `Sensor`, the name of a preset, or the path of a sensor file.
+        fps: Frames per second, for frames.
+        times: Times of the frames [s], shape (F,), instead of `fps`.
+        seed: Of every random number; the same seed gives the same events.
+        device: `cpu`, `cuda` or a Warp name.
+        pixels: Row-major indices of the pixels to simulate, shape (N,); None for all.
+        labels: Whether events are marked with what they came from.
+
+    Returns:
+        Events in order of time. `stream` gives the same in parts, as they are made.
     """
     return Events.concatenate(
         stream(
