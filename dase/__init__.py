@@ -28,7 +28,9 @@ if TYPE_CHECKING:
     from dase.scenes.image_sources import open_images as open_images
     from dase.scenes.layers import Layer as Layer
     from dase.scenes.layers import LayerScene as LayerScene
+    from dase.scenes.layers import Lighting as Lighting
     from dase.scenes.layers import Motion as Motion
+    from dase.scenes.layers import Wave as Wave
     from dase.scenes.scene import Scene as Scene
     from dase.scenes.static import StaticScene as StaticScene
     from dase.scenes.video import VideoScene as VideoScene
@@ -65,7 +67,7 @@ _HOMES = {
         "Voxels",
     ),
     "dase.scenes.image_sources": ("Picture", "open_images"),
-    "dase.scenes.layers": ("Layer", "LayerScene", "Motion"),
+    "dase.scenes.layers": ("Layer", "LayerScene", "Lighting", "Motion", "Wave"),
     "dase.recordings.recording": ("Recording", "open_recording"),
     "dase.scenes.scene": ("Scene",),
     "dase.signatures.find": ("find_signatures",),
@@ -82,6 +84,8 @@ __all__ = list(_MODULE_OF)
 
 
 def __getattr__(name: str) -> Any:
+    if name == "torch":  # the package of that name in here, which needs PyTorch
+        return import_module("dase.torch")
     if name not in _MODULE_OF:
         raise AttributeError(f"module 'dase' has no attribute '{name}'")
     return getattr(import_module(_MODULE_OF[name]), name)

@@ -19,9 +19,9 @@ from torch.autograd.function import once_differentiable
 from dase.kernels import scene_layers as _scene
 from dase.kernels import threshold_counts as _counts
 from dase.kernels import threshold_surrogates as _surrogates
-from dase.kernels.launch import run_kernel
+from dase.kernels.launch import find_device, run_kernel
 
-wp.init()  # a bare wp.from_torch fails without it
+find_device("cpu")  # starts Warp; a bare wp.from_torch fails before
 
 Surrogate = Literal["interval", "events", "expected"]
 SURROGATE: Surrogate = "expected"
@@ -217,7 +217,7 @@ def launch_on_tensors(
     # detached: Warp would ask a tensor that requires a gradient for its .grad
     arguments = [wp.from_torch(a.detach()) if isinstance(a, torch.Tensor) else a for a in (*inputs, *outputs)]
     device = wp.device_from_torch(shape.device)
-    with _follow_torch_stream(shape.device):
+    with follow_torch_stream(shape.device):
         run_kernel(
             kernel,
             shape.shape[-1] if size is None else size,
@@ -228,7 +228,7 @@ def launch_on_tensors(
         )
 
 
-def _follow_torch_stream(device: torch.device) -> AbstractContextManager[Any]:
+def follow_torch_stream(device: torch.device) -> AbstractContextManager[Any]:
     """Make Warp follow PyTorch's current stream of a CUDA `device`."""
     if device.type != "cuda":
         return nullcontext()

@@ -61,7 +61,10 @@ FLOORS: tuple[tuple[tuple[str, ...], str], ...] = (
     (("figures",), "Pictures and pages show what was found; nothing that is computed depends on them."),
     (("diagnosis",), "What a model lacks is asked with many fits."),
     (("fitting",), "Parameters are fitted by simulating many models and comparing statistics."),
-    (("results", "learning"), "Results hold sensors; learning makes thresholds for them, without any fit."),
+    (
+        ("results", "learning", "torch"),
+        "Results hold sensors; learning makes thresholds for them, without any fit; batches need sensors.",
+    ),
     (
         ("simulation", "signatures"),
         "A sensor puts effects together and runs them over a scene; signatures need neither.",

@@ -493,3 +493,15 @@ def _draw_strokes(rng: np.random.Generator, size: tuple[int, int]) -> NDArray[np
                 letter = (left, top) + pitch * rng.uniform(0, (0.45, 0.7), (int(rng.integers(3, 6)), 2))
                 cv2.polylines(canvas, [_fixed_point(letter)], False, 255, 1 + pitch // 16, cv2.LINE_AA, 4)
     return canvas / 255
+
+
+def fit_picture(grey: Grey, rows: int, columns: int) -> Grey:
+    """Return a picture (H, W) turned upright or level as asked for, scaled and cut to (rows, columns)."""
+    if (grey.shape[0] > grey.shape[1]) != (rows > columns) and rows != columns:
+        grey = np.rot90(grey)
+    scale = max(rows / grey.shape[0], columns / grey.shape[1])
+    size = max(columns, round(scale * grey.shape[1])), max(rows, round(scale * grey.shape[0]))
+    way = cv2.INTER_AREA if scale < 1 else cv2.INTER_LINEAR
+    scaled = cv2.resize(np.ascontiguousarray(grey), size, interpolation=way)
+    top, left = (scaled.shape[0] - rows) // 2, (scaled.shape[1] - columns) // 2
+    return np.ascontiguousarray(np.clip(scaled[top : top + rows, left : left + columns], 0, 1), np.float32)

@@ -18,12 +18,39 @@ from dase.scenes.scene import SamplingSettings, Scene
 
 Pair = tuple[float, float]
 
+QUANTITIES = ("x", "y", "angle", "scale_x", "scale_y")
+"""What a motion says, in this order wherever it becomes an array."""
+
+
+@dataclass(frozen=True)
+class Wave:
+    """A sine that sways one quantity of a motion: amplitude · sin(2π frequency t + phase).
+
+    Args:
+        quantity: One of `QUANTITIES`.
+        amplitude: In the unit of the quantity.
+        frequency: [Hz].
+        phase: [rad].
+    """
+
+    quantity: str
+    amplitude: float
+    frequency: float
+    phase: float = 0.0
+
+    def __post_init__(self) -> None:
+        if self.quantity not in QUANTITIES:
+            raise InputError(f"wave: quantity must be one of {', '.join(QUANTITIES)}, got '{self.quantity}'")
+        if not np.all(np.isfinite((self.amplitude, self.frequency, self.phase))):
+            raise InputError("wave: amplitude, frequency and phase must be finite")
+
 
 @dataclass(frozen=True, kw_only=True)
 class Motion:
-    """Affine motion, linear in time: each pair holds the value at the beginning and at the end of a scene.
+    """Affine motion: each pair holds the value at the beginning and at the end of a scene, straight between.
 
-    Lengths are in widths of the sensor, so that a scene keeps its looks when the sensor size changes.
+    Lengths are in widths of the sensor, so that a scene keeps its looks when the sensor size changes. Waves
+    sway what would go straight, as a hand does; in a pause everything stands still, and goes on behind it.
 
     Args:
         x: Horizontal place of the centre, 0 is the middle of the picture.
@@ -31,6 +58,8 @@ class Motion:
         angle: Rotation [rad].
         scale_x: Horizontal scale; at 1 the texture is as wide as the sensor.
         scale_y: Vertical scale.
+        waves: Added to the straight line; their phases are those at the beginning.
+        pauses: Begin and end of each [s], one after the other.
     """
 
     x: Pair = (0.0, 0.0)
@@ -38,13 +67,73 @@ class Motion:
     angle: Pair = (0.0, 0.0)
     scale_x: Pair = (1.0, 1.0)
     scale_y: Pair = (1.0, 1.0)
+    waves: tuple[Wave, ...] = ()
+    pauses: tuple[Pair, ...] = ()
 
     def __post_init__(self) -> None:
-        for name in ("x", "y", "angle", "scale_x", "scale_y"):
+        for name in QUANTITIES:
             if not np.all(np.isfinite(getattr(self, name))):
                 raise InputError(f"motion: {name} must be finite, got {getattr(self, name)}")
-        if min(*self.scale_x, *self.scale_y) <= 0:
-            raise InputError(f"motion: scales must be > 0, got {self.scale_x} and {self.scale_y}")
+        for name in ("scale_x", "scale_y"):
+            sway = sum(abs(wave.amplitude) for wave in self.waves if wave.quantity == name)
+            if min(getattr(self, name)) - sway <= 0:
+                swayed = f" swayed by {sway:g}" if sway else ""
+                raise InputError(f"motion: scales must be > 0, got {self.scale_x} and {self.scale_y}{swayed}")
+        edges = [edge for pause in self.pauses for edge in pause]
+        if not np.all(np.isfinite(edges)) or not np.all(np.diff(edges) >= 0):
+            raise InputError(f"motion: pauses must follow each other, got {self.pauses}")
+
+    def path(
+        self, times: NDArray[np.float64], duration: float
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Return the quantities at `times` [s] of a scene of `duration` [s] and their rates [1/s], (5, T)."""
+        awake, moving = np.asarray(times, np.float64), np.ones(np.shape(times))
+        for begin, end in self.pauses:
+            awake = awake - np.clip(times - begin, 0, end - begin)
+            moving[(times >= begin) & (times < end)] = 0
+        ends = np.array([getattr(self, name) for name in QUANTITIES], np.float64)
+        way = (ends[:, 1] - ends[:, 0])[:, None]
+        value = ends[:, :1] + (awake / duration) * way
+        rate = way / duration + 0 * value
+        for wave in self.waves:
+            turn = 2 * np.pi * wave.frequency
+            row = QUANTITIES.index(wave.quantity)
+            value[row] += wave.amplitude * np.sin(turn * awake + wave.phase)
+            rate[row] += wave.amplitude * turn * np.cos(turn * awake + wave.phase)
+        return value, rate * moving
+
+
+@dataclass(frozen=True)
+class Lighting:
+    """Light on a scene that changes: all intensities are multiplied by one factor in (0, 1].
+
+    The factor is 2 to the power of -stops (1 + sin(2π frequency t + phase)) / 2, and of `drops` beside it.
+
+    Args:
+        stops: How far it sways, in powers of two, at least 0.
+        frequency: [Hz].
+        phase: [rad].
+        drops: Times [s] at which it changes at once, and by how many powers of two from then on; the sums
+            of them stay at most 0.
+    """
+
+    stops: float = 0.0
+    frequency: float = 1.0
+    phase: float = 0.0
+    drops: tuple[Pair, ...] = ()
+
+    def __post_init__(self) -> None:
+        sums = np.cumsum([0.0, *(drop for _, drop in sorted(self.drops))])
+        if not (self.stops >= 0 and np.all(sums <= 1e-9)):
+            raise InputError(
+                "lighting: nothing may be brighter than full light: stops >= 0, sums of drops <= 0"
+            )
+
+    def factor(self, times: NDArray[np.float64]) -> NDArray[np.float32]:
+        """Return what intensities are multiplied by at `times` [s], shape (T,)."""
+        sway = 0.5 * self.stops * (1 + np.sin(2 * np.pi * self.frequency * np.asarray(times) + self.phase))
+        level = sum((np.where(np.asarray(times) >= at, drop, 0.0) for at, drop in self.drops), -sway)
+        return np.exp2(np.minimum(level, 0)).astype(np.float32)
 
 
 @dataclass(frozen=True)
@@ -60,13 +149,17 @@ class LayerScene(Scene):
 
     The renderer of S2R (Stoffregen et al., Reducing the sim-to-real gap for event cameras, 2020): rotation,
     translation and x and y scale are linear in time, layers are composited back to front, the background is
-    continued by reflection. Unlike there, textures keep their aspect ratio.
+    continued by reflection. Unlike there, textures keep their aspect ratio, motions may be swayed by waves,
+    and a camera may move before all of them.
 
     Args:
         layers: Background first, at most 32.
         width: Columns [px].
         height: Rows [px].
         duration: Length [s].
+        camera: Motion of the picture as a whole, after that of each layer: rotation and scale are about the
+            middle of the picture. None for a camera at rest.
+        lighting: Light on the scene, None for full light all the time.
         travel: Share of a pixel that anything may move between two samples (λ of Eq. 5 of the paper).
         shortest: Lower bound of the time between samples [s] (δ of Eq. 5).
         longest: Upper bound of it [s]; S2R samples at 72 Hz at least.
@@ -81,6 +174,8 @@ class LayerScene(Scene):
         width: int,
         height: int,
         duration: float,
+        camera: Motion | None = None,
+        lighting: Lighting | None = None,
         travel: float = SamplingSettings.travel,
         shortest: float = SamplingSettings.shortest,
         longest: float = SamplingSettings.longest,
@@ -98,28 +193,16 @@ class LayerScene(Scene):
             )
         self.layers = tuple(layers)
         self.width, self.height, self.duration = width, height, duration
+        self.camera, self.lighting = camera, lighting
         self.travel, self.shortest, self.longest = travel, shortest, longest
         self._uploaded: dict[str, Any] = {}
 
     def forward(self, times: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return texture-to-sensor maps M(t) and their time derivatives, each of shape (T, L, 3, 3)."""
-        share = np.asarray(times, np.float64)[:, None] / self.duration
-        rows = [
-            [getattr(layer.motion, n) for layer in self.layers]
-            for n in ("x", "y", "angle", "scale_x", "scale_y")
-        ]
-        ends = np.array(rows, np.float64)  # (5, L, 2)
-        rate = (ends[..., 1] - ends[..., 0]) / self.duration
-        x, y, angle, sx, sy = (ends[i, :, 0] + share * (ends[i, :, 1] - ends[i, :, 0]) for i in range(5))
-        vx, vy, spin, gx, gy = (rate[i] for i in range(5))
-        c, s = np.cos(angle), np.sin(angle)
-        m = np.zeros((*x.shape, 3, 3))
-        m[..., 0, :] = np.stack([sx * c, -sy * s, x], -1)
-        m[..., 1, :] = np.stack([sx * s, sy * c, y], -1)
-        m[..., 2, 2] = 1
-        d = np.zeros_like(m)
-        d[..., 0, :] = np.stack([gx * c - sx * s * spin, -gy * s - sy * c * spin, vx + 0 * x], -1)
-        d[..., 1, :] = np.stack([gx * s + sx * c * spin, gy * c - sy * s * spin, vy + 0 * y], -1)
+        m, d = _affine_maps([layer.motion for layer in self.layers], times, self.duration)
+        if self.camera is not None:
+            camera, camera_rate = _affine_maps([self.camera], times, self.duration)
+            m, d = camera @ m, camera_rate @ m + camera @ d
         # motions are in units of the sensor's width, so a scene looks the same at any size
         to_sensor = _unit_plane_to_pixels(self.width, self.height, self.width)
         from_texture = np.stack(
@@ -234,15 +317,24 @@ class LayerScene(Scene):
     def source(self, times: NDArray[np.float64], pixels: NDArray[np.int32], device: Any) -> tuple[str, Any]:
         """Return the layers themselves: the pixel kernel warps, so no frame is ever stored.
 
-        Arguments have the shape and unit that `Scene.source` says.
+        Under light that changes, frames. Arguments have the shape and unit that `Scene.source` says.
         """
+        if self.lighting is not None:
+            seen = kernels.Frames()
+            lit = self._lit_frames(times, device)
+            seen.values = wp.array(np.ascontiguousarray(lit[:, pixels]), dtype=float, device=device)
+            return "frames", seen
         return "background" if len(self.layers) == 1 else "layers", self.arrays(times, device)
 
     def frames(self, times: NDArray[np.float64], device: str = "cpu") -> NDArray[np.float32]:
         """Return intensities in [0, 1] at `times` [s], shape (K, height, width)."""
-        where = launch.find_device(device)
-        out = kernels.render_frames(self.arrays(times, where), self.width, self.height, where)
-        return np.asarray(out.numpy().reshape(len(times), self.height, self.width))
+        lit = self._lit_frames(times, launch.find_device(device))
+        return lit.reshape(len(times), self.height, self.width)
+
+    def _lit_frames(self, times: NDArray[np.float64], device: wp.Device) -> NDArray[np.float32]:
+        """Return intensities at `times` [s], shape (K, height · width)."""
+        out = kernels.render_frames(self.arrays(times, device), self.width, self.height, device).numpy()
+        return np.asarray(out if self.lighting is None else out * self.lighting.factor(times)[:, None])
 
     def flow(self, times: NDArray[np.float64], device: str = "cpu") -> NDArray[np.float32]:
         """Return the flow of the foremost layer at `times` [px/s], shape (K, 2, height, width)."""
@@ -251,6 +343,23 @@ class LayerScene(Scene):
         out = kernels.render_flow(self.arrays(times, where), maps, self.width, self.height, where)
         stacked = out.numpy().reshape(len(times), self.height, self.width, 2)
         return np.ascontiguousarray(np.moveaxis(stacked, -1, 1))
+
+
+def _affine_maps(
+    motions: Sequence[Motion], times: NDArray[np.float64], duration: float
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return the affine maps of motions and their time derivatives, each of shape (T, L, 3, 3)."""
+    paths = [motion.path(np.asarray(times, np.float64), duration) for motion in motions]
+    (x, y, angle, sx, sy), (vx, vy, spin, gx, gy) = (np.stack(part, -1) for part in zip(*paths, strict=True))
+    c, s = np.cos(angle), np.sin(angle)
+    m = np.zeros((*x.shape, 3, 3))
+    m[..., 0, :] = np.stack([sx * c, -sy * s, x], -1)
+    m[..., 1, :] = np.stack([sx * s, sy * c, y], -1)
+    m[..., 2, 2] = 1
+    d = np.zeros_like(m)
+    d[..., 0, :] = np.stack([gx * c - sx * s * spin, -gy * s - sy * c * spin, vx], -1)
+    d[..., 1, :] = np.stack([gx * s + sx * c * spin, gy * c - sy * s * spin, vy], -1)
+    return m, d
 
 
 def _unit_plane_to_pixels(width: int, height: int, unit: float) -> NDArray[np.float64]:

@@ -2,16 +2,18 @@
 
 Numbers of objects, speeds, rotations and scales are those of the 281 scene files that Stoffregen et al.
 published with Reducing the sim-to-real gap for event cameras, 2020. Their speeds are normally distributed;
-the widths here reproduce the published percentiles. Speeds are in px/s whatever the size of the sensor.
+the widths here reproduce the published percentiles. Speeds are in px/s whatever the size of the sensor. There
+things go straight on; the regime `shake` has a camera that moves as in a hand or on a vehicle.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from dase.errors import InputError, nearest
+from dase.scenes.camera_motions import Shake, draw_cameras
 from dase.scenes.image_sources import ImageSource
 from dase.scenes.layers import Layer, LayerScene, Motion
 
@@ -28,6 +30,7 @@ class Regime:
         background_speed: Least and greatest [px/s].
         background_spin: Least and greatest [°/s].
         clip: Duration of S2R's clips [s], over which a layer goes from its first to its second scale.
+        shake: How the camera moves, None where it is at rest.
     """
 
     scenes: int
@@ -37,6 +40,7 @@ class Regime:
     background_speed: tuple[float, float]
     background_spin: tuple[float, float]
     clip: float = 10.0
+    shake: Shake | None = None
 
 
 REGIMES = {
@@ -49,7 +53,12 @@ REGIMES = {
 MIXED = "mixed"
 """Each scene of a regime drawn by its share of S2R's scenes."""
 
-REGIME_NAMES = (*REGIMES, MIXED)
+SHAKEN = {
+    "shake": Regime(1, (0, 9), (85.0, 268.0), (0.0, 15.0), (0.0, 15.0), (0.0, 11.0), shake=Shake()),
+}
+"""Regimes with a moving camera, which are no part of `mixed`."""
+
+REGIME_NAMES = (*REGIMES, MIXED, *SHAKEN)
 
 
 def draw_scene(
@@ -71,13 +80,19 @@ def draw_scene(
     if regime == MIXED:
         shares = np.array([r.scenes for r in REGIMES.values()], float)
         regime = str(rng.choice(list(REGIMES), p=shares / shares.sum()))
-    if regime not in REGIMES:
+    known = REGIMES | SHAKEN
+    if regime not in known:
         raise InputError(f"there is no regime '{regime}': {nearest(regime, REGIME_NAMES)}")
-    how = REGIMES[regime]
+    how = known[regime]
     layers = [_draw_background(rng, images, how, width, height, duration)]
     for _ in range(rng.integers(how.objects[0], how.objects[1] + 1)):
         layers.append(_draw_foreground(rng, images, how, width, height, duration))
-    return LayerScene(layers, width=width, height=height, duration=duration)
+    camera = None
+    if how.shake is not None:
+        camera = draw_cameras(rng, [how.shake], width=width, duration=duration).motion(0)
+        # in a pause everything stands still
+        layers = [replace(one, motion=replace(one.motion, pauses=camera.pauses)) for one in layers]
+    return LayerScene(layers, width=width, height=height, duration=duration, camera=camera)
 
 
 def draw_speed(rng: np.random.Generator, deviation: float, most: float) -> float:

@@ -15,6 +15,7 @@ from dase.kernels import launch, pixel_compile, pixel_stages, threshold_events, 
 from dase.kernels import threshold_counts as counting
 from dase.kernels.random import stream_number
 from dase.scenes.scene import Scene
+from dase.simulation.sample_clock import upload_clock
 from dase.simulation.sensor import Sensor
 
 
@@ -369,25 +370,7 @@ class PixelArray:
 
     def _upload_clock(self, times: NDArray[np.float64], windows: NDArray[np.int32]) -> Any:
         edges = self._step_edges(times)
-        dt = np.diff(edges)
-        clock = pixel_stages.SampleClock()
-        if self.samples == 0:
-            dt[0] = pixel_stages.REST
-        # times in whole nanoseconds, counted from the begin of the chunk: float32 could not tell them apart
-        stamps = np.round(edges * 1e9)
-        begin, length = stamps[:-1] - stamps[0], np.diff(stamps)
-        # rounded down, so that no event comes after the end of its step
-        short = length.astype(np.float32)
-        short = np.where(short > length, np.nextafter(short, np.float32(0)), short)
-        to = self.device
-        clock.t = wp.array(times.astype(np.float32), dtype=float, device=to)
-        clock.t64 = wp.array(times, dtype=wp.float64, device=to)
-        clock.dt = wp.array(dt.astype(np.float32), dtype=float, device=to)
-        clock.begin = wp.array(begin.astype(np.int64), dtype=wp.int64, device=to)
-        clock.span = wp.int64(int(stamps[-1] - stamps[0]))
-        clock.length = wp.array(short, dtype=float, device=to)
-        clock.run, clock.window = self._window_runs(windows)
-        return clock
+        return upload_clock(edges, self.samples == 0, *self._window_runs(windows), self.device)
 
     def _advance(self, times: NDArray[np.float64]) -> None:
         self._state, self._next = self._next, self._state

@@ -246,16 +246,39 @@ class LogScene(dase.Scene):
         return np.exp(self.values[np.searchsorted(self.times, times)])
 
 
+def quantities(motion: dase.Motion, time: float, duration: float) -> dict[str, float]:
+    """Return x, y, angle and scales of a motion at a time, pauses taken out of it."""
+    awake = time
+    for begin, end in motion.pauses:
+        awake -= max(min(time, end) - begin, 0.0)
+    share = awake / duration
+    pairs = {name: getattr(motion, name) for name in ("x", "y", "angle", "scale_x", "scale_y")}
+    at = {name: (1 - share) * pair[0] + share * pair[1] for name, pair in pairs.items()}
+    for wave in motion.waves:
+        turns = wave.frequency * awake + wave.phase / (2 * np.pi)
+        at[wave.quantity] += wave.amplitude * np.sin(2 * np.pi * turns)
+    return at
+
+
+def turned(at: dict[str, float]) -> np.ndarray:
+    """Return the linear part of a motion: scaled, then rotated."""
+    turn = np.array([[np.cos(at["angle"]), -np.sin(at["angle"])], [np.sin(at["angle"]), np.cos(at["angle"])]])
+    return turn @ np.diag([at["scale_x"], at["scale_y"]])
+
+
 def pose(scene: dase.LayerScene, number: int, time: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return linear part [px/texel], centre on the sensor [px] and centre of the texture [texel]."""
-    layer, share = scene.layers[number], time / scene.duration
-    at = {name: (1 - share) * pair[0] + share * pair[1] for name, pair in vars(layer.motion).items()}
+    layer = scene.layers[number]
+    at = quantities(layer.motion, time, scene.duration)
     h, w = layer.picture.grey.shape
     unit = max(w, h) if number else min(w, h * scene.width / scene.height)
-    turn = np.array([[np.cos(at["angle"]), -np.sin(at["angle"])], [np.sin(at["angle"]), np.cos(at["angle"])]])
-    linear = scene.width / unit * turn @ np.diag([at["scale_x"], at["scale_y"]])
+    linear = scene.width / unit * turned(at)
     middle = np.array([scene.width - 1, scene.height - 1]) / 2
     centre = middle + scene.width * np.array([at["x"], at["y"]])
+    if scene.camera is not None:
+        view = quantities(scene.camera, time, scene.duration)
+        centre = middle + turned(view) @ (centre - middle) + scene.width * np.array([view["x"], view["y"]])
+        linear = turned(view) @ linear
     return linear, centre, np.array([w - 1, h - 1]) / 2
 
 
@@ -314,7 +337,14 @@ def frame(scene: dase.LayerScene, time: float) -> np.ndarray:
         paint = grey if alpha is None or number == 0 else grey * alpha
         light = bilinear(paint, to_texture(scene, number, time, grid(scene)), reflects=number == 0)
         out = light + (1 - covers(scene, number, time)) * out
-    return out
+    return out if scene.lighting is None else out * brightness(scene.lighting, time)
+
+
+def brightness(lighting: dase.Lighting, time: float) -> float:
+    """Return the factor of a light that sways and drops."""
+    stops = -0.5 * lighting.stops * (1 + np.sin(2 * np.pi * lighting.frequency * time + lighting.phase))
+    stops += sum(drop for at, drop in lighting.drops if time >= at)
+    return float(2.0**stops)
 
 
 def flow(scene: dase.LayerScene, time: float, step: float = 1e-6) -> np.ndarray:

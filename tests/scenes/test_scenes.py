@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
 import pytest
+import warp as wp
 from reference import pixel as reference
 
 import dase
@@ -45,6 +47,62 @@ def scene(rng: np.random.Generator, layers: int = 5, size: tuple[int, int] = (21
         texture = picture(rng, SIZES[n % len(SIZES)], ("soft", "hole", "none")[n % 3])
         made.append(dase.Layer(texture, motion(rng, (0.2, 0.8))))
     return dase.LayerScene(made, width=size[0], height=size[1], duration=0.7)
+
+
+def shaken(rng: np.random.Generator, **options) -> dase.LayerScene:
+    """Return a scene whose camera sways, turns, zooms and pauses before layers, one of which does so too."""
+    made = scene(rng)
+    quantities = ("x", "y", "angle", "scale_x", "scale_y", "x", "angle")
+    waves = tuple(
+        dase.Wave(name, rng.uniform(0.02, 0.08), rng.uniform(0.5, 4), rng.uniform(0, 6))
+        for name in quantities
+    )
+    pauses = ((0.11, 0.19), (0.19, 0.2), (0.4, 0.6))
+    camera = dase.Motion(x=(0.0, 0.1), scale_x=(1.1, 0.9), angle=(0.2, -0.1), waves=waves, pauses=pauses)
+    layers = list(made.layers)
+    swaying = replace(layers[1].motion, waves=waves[:3], pauses=((0.3, 0.35),))
+    layers[1] = replace(layers[1], motion=swaying)
+    size = {"width": made.width, "height": made.height, "duration": made.duration}
+    return dase.LayerScene(layers, **size, camera=camera, **options)
+
+
+def test_a_moving_camera_and_light_match_the_twin(device, rng):
+    light = dase.Lighting(stops=1.5, frequency=1.7, phase=0.4, drops=((0.2, -1.0), (0.5, 0.5)))
+    made = shaken(rng, lighting=light)
+    times = np.linspace(0, made.duration, 9)
+    want = np.stack([reference.frame(made, t) for t in times])
+    np.testing.assert_allclose(made.frames(times, device), want, atol=1e-5)
+    assert want.std() > 0.02
+    # what pixels see is what frames show
+    pixels = np.arange(3, 40, dtype=np.int32)
+    name, seen = made.source(times, pixels, wp.get_device(device))
+    assert name == "frames"
+    np.testing.assert_allclose(seen.values.numpy(), want.reshape(len(times), -1)[:, pixels], atol=1e-5)
+
+
+def test_flow_before_a_moving_camera_is_the_derivative_of_the_motion(device, rng):
+    made = shaken(rng)
+    times = np.array([0.05, 0.15, 0.25, 0.33, 0.5, 0.65])  # in a pause of the camera, of a layer, in none
+    got, want = made.flow(times, device), np.stack([reference.flow(made, t) for t in times])
+    wrong = np.abs(got - want).max(1) > 1e-4 * np.abs(want).max()
+    assert wrong.mean() < 0.003
+    assert np.abs(want).max() > 20
+    assert np.all(np.abs(made.flow(times, device)).max((1, 2, 3)) <= made.speed(times).max() * 1.001)
+
+
+def test_shake_is_a_regime(rng):
+    images = dase.open_images("builtin")
+    speeds = []
+    for _ in range(20):
+        made = random_scenes.draw_scene(rng, images, "shake", width=64, height=48, duration=2.0)
+        pauses = made.camera.pauses
+        grid = np.linspace(0, 2, 400)
+        still = any(a <= t < b for t in grid for a, b in pauses)
+        _, rate = made.camera.path(grid, 2.0)
+        assert (np.abs(rate).max(0) == 0).any() == still
+        assert np.sum(np.diff(np.sign(rate[0])) != 0) >= 2  # it turns back
+        speeds.append(64 * np.sqrt(np.mean(np.sum(rate[:2] ** 2, 0))))
+    assert 10 < min(speeds) < 100 < max(speeds) < 2000
 
 
 @pytest.mark.parametrize("size", [(21, 16), (9, 20), (1, 1)])
