@@ -54,8 +54,11 @@ def render_log(
 
 
 def patch_structure(image: torch.Tensor, *, size: int, stride: int) -> dict[str, torch.Tensor]:
-    """Return angle, coherence, strength and energy of every patch, as `dase.learning.patch_hash.attributes`
-    does.
+    """Return angle, coherence, strength and energy of every patch.
+
+    Gradients are central differences. Means over a patch have Gaussian weights about its centre, of sigma =
+    size/4 [px] and sum 1. λ1 >= λ2 are the eigenvalues of the mean of [gx gy]ᵀ[gx gy] (Romano et al., RAISR:
+    Rapid and Accurate Image Super Resolution, 2017).
 
     Args:
         image: Intensity, shape (B, H, W).
@@ -63,7 +66,10 @@ def patch_structure(image: torch.Tensor, *, size: int, stride: int) -> dict[str,
         stride: Step from patch to patch [px].
 
     Returns:
-        Name to float32 of shape (B, patches), row by row of the grid.
+        Name to float32 of shape (B, patches), row by row of the grid: `angle`, the direction of the strongest
+        gradient, across the edge, in [0, π), 0 along x [rad]; `coherence`, (√λ1 - √λ2)/(√λ1 + √λ2), 1 for
+        stripes, 0 for isotropic and flat patches; `strength`, √λ1 [intensity/px]; `energy`, λ1 + λ2
+        [intensity²/px²].
     """
     batch, columns, number = _patch_grid(image, size, stride)
     weight = _gaussian_window(size, image.device)
@@ -87,8 +93,8 @@ def patch_contrast(counts: torch.Tensor, *, size: int, stride: int) -> torch.Ten
     """Return the contrast of Eq. 12 of every patch of counts (B, C, H, W), shape (B, patches) [events]."""
     batch, columns, number = _patch_grid(counts, size, stride)
     out = counts.new_empty(batch, number, dtype=torch.float32)
-    kernel = _patches.contrast_kernels[wp.float32]
-    launch_on_tensors(kernel, [counts.detach().float().contiguous(), size, stride, columns], [out])
+    inputs = [counts.detach().float().contiguous(), size, stride, columns]
+    launch_on_tensors(_patches.contrast_of_patches, inputs, [out])
     return out
 
 

@@ -5,8 +5,6 @@ alone are too few to keep a GPU busy. Patch i of a map lies at
 row i // columns and column i % columns of the grid. Nothing here is differentiated: a hash has no gradient.
 """
 
-from typing import Any
-
 import warp as wp
 
 wp.set_module_options({"enable_backward": False})
@@ -107,11 +105,11 @@ def structure_of_patches(
 
 
 @wp.func
-def total_count(counts: wp.array4d[Any], b: int, y: int, x: int) -> float:
+def total_count(counts: wp.array4d[float], b: int, y: int, x: int) -> float:
     """Events of a pixel, all polarities [events]."""
     events = float(0.0)
     for channel in range(counts.shape[1]):
-        events += float(counts[b, channel, y, x])
+        events += counts[b, channel, y, x]
     return events
 
 
@@ -139,7 +137,7 @@ def density_weighted(squares: Bins, number: Bins) -> float:
 def contrast_of_patches(
     first: int,
     # in
-    counts: wp.array4d[Any],  # (B, C, H, W) [events], int32 or float32
+    counts: wp.array4d[float],  # (B, C, H, W) [events]
     size: int,  # S [pixel]
     stride: int,  # [pixel]
     columns: int,  # of the grid of patches
@@ -167,10 +165,3 @@ def contrast_of_patches(
                 number[bin_of(g)] += 1.0
                 here = next
     contrast_out[b, i] = density_weighted(squares, number)
-
-
-# made here, because `run_kernel` loads a module before its threads start: that builds only kernels it knows
-contrast_kernels = {
-    wp.int32: wp.overload(contrast_of_patches, {"counts": wp.array4d[wp.int32]}),
-    wp.float32: wp.overload(contrast_of_patches, {"counts": wp.array4d[wp.float32]}),
-}

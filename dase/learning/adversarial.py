@@ -38,12 +38,13 @@ class PatchHash:
 
     Args:
         size: Side of a patch [px].
-        orientations: Bins of angle.
+        orientations: Bins of angle, centred so that edges along the pixel grid fall into one of them.
         coherence: Levels of coherence.
         contrast: Levels of contrast.
-        contrast_from: `energy` of the image gradient; `events`, Eq. 12 of the paper, see
-            `dase.learning.patch_hash.StructureHash` for why not; `events-ranked`, the same with boundaries of
-            its own for each domain and batch.
+        contrast_from: `energy` of the image gradient; `events`, Eq. 12 of the paper; `events-ranked`, the
+            same with boundaries of its own for each domain and batch. Counts of events depend on the
+            thresholds that are being learned: a change of thresholds moves patches from class to class,
+            comparing inside of classes misleads, and training can settle on wrong thresholds.
         intensity: Levels of mean intensity.
     """
 

@@ -5,7 +5,7 @@
     python -m perf.benchmarks.compare_commits ../before ../after --only count simulate --rounds 5
     python -m perf.benchmarks.compare_commits ../before ../after --only diagnose --hidden FOLDER --case a_01
 
-In each round each checkout gets a fresh process with its own PYTHONPATH. Both are on the same core and take
+In each round each checkout gets a fresh process, itself in front of the PYTHONPATH. Both are on the same core and take
 turns, so that only one works at a time: A B, B A, A B, ... Each call is warm and waits for the device at its
 end. On a CPU the processor time of the process is taken, which other work on the machine hardly changes; on a
 GPU the time on the clock. A ratio is the time after divided by the time before of one pair: below 1 is
@@ -205,7 +205,7 @@ class Worker:
             stderr=None if options.verbose else subprocess.DEVNULL,
             text=True,
             cwd=checkout,
-            env=os.environ | one | {"PYTHONPATH": str(checkout.resolve())},
+            env=os.environ | one | {"PYTHONPATH": python_path(checkout)},
             preexec_fn=lambda: pin(options.core),
         )
 
@@ -222,6 +222,16 @@ class Worker:
         assert self.process.stdin
         self.process.stdin.close()
         self.process.wait()
+
+
+def python_path(checkout: Path) -> str:
+    """Return the PYTHONPATH of a checkout: itself first, then what lies there now, such as a Warp of its own.
+
+    Other checkouts on it are left out: dase must come from this one, and from nowhere if it is not here.
+    """
+    places = [place for place in os.environ.get("PYTHONPATH", "").split(os.pathsep) if place]
+    others = [place for place in places if not (Path(place) / "dase").is_dir()]
+    return os.pathsep.join([str(checkout.resolve()), *others])
 
 
 def pin(core: int | None) -> None:

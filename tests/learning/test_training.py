@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 import torch
 from helpers.tiny_training import SIDE, a_fake, a_run, small_scenes
+from reference import patch_structure
 
-from dase.kernels import autograd_training as bridge
-from dase.learning import patch_hash, scene_batches
+from dase.learning import scene_batches
 from dase.learning.adabelief import AdaBelief
 from dase.learning.adversarial import (
     AdversarialObjective,
@@ -96,21 +96,47 @@ def test_halves_of_a_pool_share_no_texture(scenes):
     assert second.draw(np.random.default_rng(0), 1).shape == (1, 6, SIDE, SIDE)
 
 
-def test_patches_are_hashed_as_patches_are(scenes, rng):
+def hasher_of(**how):
+    return PatchHasher(PatchHash(size=16, **how))
+
+
+@pytest.mark.parametrize("contrast_from", ["energy", "events"])
+def test_classes_are_levels_of_the_twins_attributes(scenes, rng, contrast_from):
     grey = scene_batches.middle_intensity(scenes.draw(rng, 3))
     counts = torch.from_numpy(rng.poisson(1.0, (3, 2, SIDE, SIDE)).astype(np.float32))
-    want = patch_hash.attributes(grey.numpy(), counts.numpy(), size=16)
-    got = bridge.patch_structure(grey, size=16, stride=16)
-    for name, values in got.items():
-        np.testing.assert_array_equal(values.numpy().reshape(3, 3, 3), getattr(want, name))
-    contrast = bridge.patch_contrast(counts, size=16, stride=16)
-    np.testing.assert_array_equal(contrast.numpy().reshape(3, 3, 3), want.contrast)
-    for kind in ("energy", "events"):
-        hasher = PatchHasher(PatchHash(size=16, contrast_from=kind))
-        hasher.calibrate(Pairs(grey, counts))
-        boundaries = {name: tuple(value.tolist()) for name, value in hasher.boundaries.items()}
-        other = patch_hash.StructureHash(**boundaries, contrast_from=kind)
-        np.testing.assert_array_equal(hasher.classes(Pairs(grey, counts)), other.bucket(want).flatten())
+    angle, coherence, _, energy, contrast = patch_structure.attributes(grey.numpy(), counts.numpy(), 16, 16)
+    hasher = hasher_of(contrast_from=contrast_from)
+    hasher.calibrate(Pairs(grey, counts))
+    levels = {"coherence": coherence, "contrast": energy if contrast_from == "energy" else contrast}
+    want = np.floor(angle.ravel() * 24 / np.pi + 0.5).astype(int) % 24
+    for name, values in levels.items():
+        edges = hasher.boundaries[name].numpy().astype(float)
+        # the boundaries are values of patches, which the twin has but for rounding
+        above = (values.ravel()[:, None] > edges * (1 + 1e-4)).sum(1)
+        assert np.bincount(above, minlength=3).min() >= 7  # thirds of 27 patches, boundaries below
+        want = 3 * want + above
+    np.testing.assert_array_equal(hasher.classes(Pairs(grey, counts)), want)
+
+
+@pytest.mark.parametrize("edge", [1, 5, 12, 23])
+def test_bins_of_orientation_meet_where_they_should(edge):
+    y, x = np.indices((48, 48))
+    for offset, bucket in ((-0.02, edge - 1), (0.02, edge)):
+        angle = (edge - 0.5) * np.pi / 24 + offset
+        along = np.arcsin(0.5 * np.cos(angle)) * x + np.arcsin(0.5 * np.sin(angle)) * y
+        some = Pairs(
+            torch.from_numpy(np.sin(along + 0.3)[None].astype(np.float32)), torch.zeros(1, 2, 48, 48)
+        )
+        # of nine patches that in the middle, which touches no border
+        assert hasher_of(coherence=1, contrast=1).classes(some)[4] == bucket
+
+
+def test_a_level_more_than_the_attribute_has_values_stays_empty(rng):
+    quiet = Pairs(torch.from_numpy(rng.random((2, 32, 32)).astype(np.float32)), torch.zeros(2, 2, 32, 32))
+    hasher = hasher_of(orientations=1, coherence=1, contrast_from="events")
+    hasher.calibrate(quiet)
+    assert (hasher.classes(quiet) == 0).all()
+    assert (hasher.classes(Pairs(quiet.grey, torch.eye(16).tile(2, 2, 2, 2))) == 2).all()
 
 
 def test_patches_are_cut_in_the_order_of_their_hash():
