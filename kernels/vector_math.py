@@ -31,11 +31,11 @@ def lane_options() -> dict[str, Any]:
     return {"fuse_fp": False, "cpu_compiler_flags": wide}
 
 
-# `background` and `foreground` compute what `dase.kernels.scene_layers` has as Warp functions, and both must stay:
-# compilers make no vectors of Warp's functions, which have a branch wherever a texel may be missing; and one lane
-# of the texts below would lack just these branches, which spare a GPU's thread masked looks at texels, and give the
-# gradient, which goes to texels one by one, nothing to build on. tests/kernels/test_pixel_codegen_cpu.py holds both
-# to the same events, to the last bit.
+# `background` and `foreground` compute what `dase.kernels.scene_layers` has as Warp functions, and both
+# must stay: compilers make no vectors of Warp's functions, which have a branch wherever a texel may be
+# missing; and one lane of the texts below would lack just these branches, which spare a GPU's thread masked
+# looks at texels, and give the gradient, which goes to texels one by one, nothing to build on.
+# tests/kernels/test_pixel_codegen_cpu.py holds both to the same events, to the last bit.
 class _Cpp:
     """The C++ of lanewise functions: two wrappers, and bodies that set `result` in terms of `V` and `I`.
 

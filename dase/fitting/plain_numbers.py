@@ -37,7 +37,9 @@ def plain_numbers(half: CalibratedSubset) -> dict[str, tuple[float, float]]:
 
 def family_counts(values: Array, family: str) -> Array:
     """Return the events that statistics (J,) of a family count, one for each statistic of the family."""
-    return np.maximum(np.exp(values[LAYOUT[family]]) - 3.0, 0.0)
+    counts = np.exp(values[LAYOUT[family]]) - 3.0
+    # log(0 + 3) is rounded, so that no event may come back as 4e-16 of one
+    return np.where(counts < 1e-9, 0.0, counts)
 
 
 def rate_counts(values: Array) -> Array:

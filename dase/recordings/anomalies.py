@@ -148,7 +148,9 @@ def _frame_anomalies(s: Statistics, limits: AnomalySettings) -> Iterator[Note]:
     if math.isnan(s.frame_interval) and s.frames > 1:
         yield Note("the times of the frames are not known", "odd", "frames")
     elif math.isnan(s.exposure[1]):
-        yield Note("the exposure of the frames is not known, or an instant", "odd", "exposure")
+        # a simulator's frames are of an instant, cameras' files may not tell: both come without an exposure
+        text = "no exposure is given for the frames: they count as light of one instant"
+        yield Note(text, "odd", "exposure")
     elif s.exposure[1] > limits.exposure * s.frame_interval:
         exposure, interval = format_seconds(s.exposure[1]), format_seconds(s.frame_interval)
         text = f"frames are exposed for {exposure} but come every {interval}"

@@ -5,13 +5,14 @@
     python -m perf.benchmarks.compare_commits ../before ../after --only count simulate --rounds 5
     python -m perf.benchmarks.compare_commits ../before ../after --only diagnose --hidden FOLDER --case a_01
 
-In each round each checkout gets a fresh process, itself in front of the PYTHONPATH. Both are on the same core and take
-turns, so that only one works at a time: A B, B A, A B, ... Each call is warm and waits for the device at its
-end. On a CPU the processor time of the process is taken, which other work on the machine hardly changes; on a
-GPU the time on the clock. A ratio is the time after divided by the time before of one pair: below 1 is
-faster. Printed are the median of all pairs and its 90 % interval, the times themselves, and whether both
-compute the same. The interval is a bootstrap over rounds and the pairs in them, for two processes of the same
-code differ by some per cent as long as they live. A figure that a checkout cannot run is named and left out.
+In each round each checkout gets a fresh process, itself in front of the PYTHONPATH. Both are on the same core
+and take turns, so that only one works at a time: A B, B A, A B, ... Each call is warm and waits for the
+device at its end. On a CPU the processor time of the process is taken, which other work on the machine hardly
+changes; on a GPU the time on the clock. A ratio is the time after divided by the time before of one pair:
+below 1 is faster. Printed are the median of all pairs and its 90 % interval, the times themselves, and
+whether both compute the same. The interval is a bootstrap over rounds and the pairs in them, for two
+processes of the same code differ by some per cent as long as they live. A figure that a checkout cannot run
+is named and left out.
 
 `--hidden FOLDER --case a_01` diagnoses a case of another simulator, `a_01.npz` with `clip_a.npz` beside it,
 as hidden_effects.py reads them, instead of a made one.
