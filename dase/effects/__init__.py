@@ -15,7 +15,9 @@ from dase.effects.base import choice as choice
 from dase.effects.base import parameter as parameter
 from dase.effects.dark import Dark
 from dase.effects.dead import Dead
+from dase.effects.exposure import Exposure
 from dase.effects.flicker import Flicker
+from dase.effects.high_pass import HighPass
 from dase.effects.hot import Hot
 from dase.effects.jitter import Jitter
 from dase.effects.latency import Latency
@@ -49,6 +51,8 @@ _ORDER = (
     Bandwidth,
     SecondOrder,
     VoltageNoise,
+    HighPass,
+    Exposure,
     # change detector
     Threshold,
     LearnedThreshold,

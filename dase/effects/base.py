@@ -122,6 +122,9 @@ class Observations:
         highest_event_rate: Most events per second of all pixels together, over some milliseconds [Hz].
         least_bus_rate: Events per second that a bus, if there is one, can send at least [Hz].
         idle_bus: Share of what a bus can send below which it is idle: it would hardly lose anything.
+        frame_interval: Time between bursts of the whole array in step with frames [s], 0 for none.
+        frame_begin: When one of the bursts of ON events comes [s].
+        frame_exposure: From there to the next burst of OFF events [s].
     """
 
     peak_frequency: float
@@ -131,6 +134,9 @@ class Observations:
     highest_event_rate: float
     least_bus_rate: float
     idle_bus: float
+    frame_interval: float = 0.0
+    frame_begin: float = 0.0
+    frame_exposure: float = 0.0
 
     @property
     def bus_is_idle(self) -> bool:

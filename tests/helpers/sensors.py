@@ -9,7 +9,9 @@ import dase
 from dase.effects.bandwidth import Bandwidth
 from dase.effects.dark import Dark
 from dase.effects.dead import Dead
+from dase.effects.exposure import Exposure
 from dase.effects.flicker import Flicker
+from dase.effects.high_pass import HighPass
 from dase.effects.hot import Hot
 from dase.effects.jitter import Jitter
 from dase.effects.leak import Leak
@@ -35,7 +37,9 @@ def full(mode: str = "drop") -> dase.Sensor:
     )
 
 
-FURTHER = (Flicker, Vignetting, Dark, Linlog, SecondOrder, VoltageNoise, Jitter, Hot, Dead)
+FURTHER = (
+    Flicker, Vignetting, Dark, Linlog, SecondOrder, VoltageNoise, HighPass, Exposure, Jitter, Hot, Dead
+)  # fmt: skip
 
 
 STRONG = {
@@ -45,6 +49,8 @@ STRONG = {
     "linlog": Linlog(knee=0.08, slope=1.5),
     "second_order": SecondOrder(cutoff=60.0, damping=0.4, dark=0.3),
     "voltage_noise": VoltageNoise(sigma=0.3, cutoff=300.0),
+    "high_pass": HighPass(cutoff=30.0),
+    "exposure": Exposure(amplitude=0.5, spread=0.5, period=0.013, exposure=0.004, begin=0.002),
     "jitter": Jitter(spread=0.3),
     "hot": Hot(share=0.2, rate=300.0),
     "dead": Dead(share=0.3),

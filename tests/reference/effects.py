@@ -93,6 +93,25 @@ def voltage_noise(
     return out
 
 
+def high_pass(times: np.ndarray, level: np.ndarray, cutoff: float) -> np.ndarray:
+    """Return level behind s / (s + 2π cutoff), settled at the first sample, by integrating its equation."""
+    out, rate = np.zeros_like(level), 2 * np.pi * cutoff
+    for k in range(1, len(times)):
+        dt = times[k] - times[k - 1]
+        slope = (level[k] - level[k - 1]) / dt
+        # dv/dt = slope - rate v has the solution v = slope / rate + (v0 - slope / rate) e^(-rate t)
+        out[k] = slope / rate + (out[k - 1] - slope / rate) * np.exp(-rate * dt)
+    return out
+
+
+def exposed(times: np.ndarray, period: float, exposure: float, begin: float) -> np.ndarray:
+    """Return at which samples a frame is exposed, frame by frame, shape (K,)."""
+    out = np.zeros(len(times), bool)
+    for n in range(int((times[0] - begin) // period) - 1, int((times[-1] - begin) // period) + 2):
+        out |= (times > begin + n * period) & (times <= begin + n * period + min(exposure, period))
+    return out
+
+
 def voltage(sensor: dase.Sensor, times: np.ndarray, intensity: np.ndarray, seed: int) -> np.ndarray:
     """Return the voltage at the change detector, shape (K, N), of the intensity at the photodiode."""
     level = np.log(intensity + sensor.log_eps)
@@ -115,6 +134,15 @@ def voltage(sensor: dase.Sensor, times: np.ndarray, intensity: np.ndarray, seed:
         radius, angle = np.sqrt(-2 * np.log(1 - first)), 2 * np.pi * second
         normals = radius * np.cos(angle), radius * np.sin(angle)
         level = level + voltage_noise(times, intensity, sensor, np.array(normals))
+    if setting(sensor, "high_pass", "cutoff", 0.0) > 0:
+        level = high_pass(times, level, sensor["high_pass"].cutoff)
+    if setting(sensor, "exposure", "amplitude", 0.0) != 0:
+        frames = sensor["exposure"]
+        normal = np.array(
+            [Stream("exposure_respond_pixel_normal", seed, i).normal() for i in range(intensity.shape[1])]
+        )
+        high = exposed(times, frames.period, frames.exposure, frames.begin)
+        level = level + high[:, None] * frames.amplitude * (1 + frames.spread * normal)
     return level
 
 

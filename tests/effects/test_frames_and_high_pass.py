@@ -1,0 +1,139 @@
+"""Frames that couple into the events, and slow changes that are forgotten: their laws and recorded shares."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.stats import norm
+
+import dase
+from dase.effects.bandwidth import Bandwidth
+from dase.effects.base import Observations
+from dase.effects.exposure import Exposure
+from dase.effects.high_pass import HighPass
+from dase.effects.threshold import Threshold
+from dase.effects.voltage_noise import VoltageNoise
+from dase.fitting.parameter_space import axes_of
+from dase.simulation.sensor import Sensor
+
+
+def still(pixels: int, seconds: float, level: float = 0.3) -> dase.VideoScene:
+    """Return a scene at rest, sampled each millisecond, of one row of pixels."""
+    samples = round(seconds * 1000) + 1
+    return dase.VideoScene(np.full((samples, 1, pixels), level, np.float32), np.arange(samples) * 1e-3)
+
+
+def sensor(*effects: dase.Effect, on: float = 0.2, off: float = 0.2) -> dase.Sensor:
+    out = dase.Sensor((Threshold(on=on, off=off, phase=0.0),))
+    for effect in effects:
+        out = out.with_effect(effect)
+    return out
+
+
+def test_bursts_come_at_the_begin_and_the_end_of_every_exposure(device):
+    frames = Exposure(amplitude=0.45, spread=0.0, period=0.1, exposure=0.03, begin=0.0205)
+    # the way back is two ON thresholds long, so that of OFF is a little smaller
+    events = dase.simulate(still(64, 1.0), sensor(frames, off=0.199), device=device)
+    on, off = events.t[events.p], events.t[~events.p]
+    # two thresholds fit into the step; the last frame's end is seen, too
+    assert len(on) == len(off) == 64 * 10 * 2
+    for found, offset in ((on, 0.0205), (off, 0.0505)):
+        late = (found - offset) % 0.1
+        assert np.all(np.minimum(late, 0.1 - late) < 1.01e-3)
+
+
+@pytest.mark.parametrize("spread", [0.1, 0.4, 1.0])
+def test_the_share_of_pixels_that_fire_is_that_of_a_normal_coupling(device, spread):
+    frames = Exposure(amplitude=0.2, spread=spread, period=0.1, exposure=0.05, begin=0.01)
+    events = dase.simulate(still(10_000, 0.04), sensor(frames, on=0.25, off=0.25), seed=3, device=device)
+    fire = len(np.unique(events.x[events.p])) / 10_000
+    want = norm.sf((0.25 - 0.2) / (0.2 * spread))
+    assert abs(fire - want) < 4 * np.sqrt(want * (1 - want) / 10_000) + 1e-4
+
+
+def test_exposures_couple_behind_the_photoreceptor(device):
+    """A slow photoreceptor does not smear the bursts."""
+    frames = Exposure(amplitude=0.45, spread=0.0, period=0.1, exposure=0.03, begin=0.0205)
+    alone = dase.simulate(still(16, 0.5), sensor(frames), device=device)
+    slow = dase.simulate(still(16, 0.5), sensor(frames, Bandwidth(cutoff=3.0)), device=device)
+    np.testing.assert_allclose(slow.t, alone.t, atol=1e-6)
+
+
+def test_frames_hours_later_are_in_step(device):
+    frames = Exposure(amplitude=0.45, spread=0.0, period=0.0511, exposure=0.0125, begin=0.0)
+    start = 7200.0
+    times = start + np.arange(301) * 1e-3
+    scene = dase.VideoScene(np.full((301, 1, 4), 0.3, np.float32), times)
+    events = dase.simulate(scene, sensor(frames), device=device)
+    late = (events.t[events.p] - 0.0) % 0.0511
+    assert len(late) > 0
+    assert np.all(np.minimum(late, 0.0511 - late) < 1.1e-3)
+
+
+def test_a_search_tries_the_frames_that_are_seen_and_none_where_none_are():
+    seen = Observations(100.0, 0.0, 0.0, "down", 1e5, 1e6, 0.1)
+    assert Exposure.candidates(seen) == []
+    seen = replace(seen, frame_interval=0.1, frame_begin=7.23, frame_exposure=0.04)
+    (found,) = Exposure.candidates(seen)
+    assert (found.period, found.exposure) == (0.1, 0.04)
+    assert found.begin == pytest.approx(0.03)
+    moved = found.shifted(7.0)  # whole periods change nothing
+    assert min(moved.begin - 0.03, 0.13 - moved.begin, key=abs) == pytest.approx(0.0, abs=1e-9)
+    assert found.shifted(0.01).begin == pytest.approx(0.02)
+    assert [axis.name for axis in axes_of(Sensor((Threshold(), found))) if axis.effect is Exposure] == [
+        "exposure.amplitude",
+        "exposure.spread",
+    ]
+
+
+@pytest.mark.parametrize("cutoff", [0.5, 5.0, 50.0])
+def test_a_step_fades(device, cutoff):
+    """After the step's ON events its decay makes as many OFF events, the n-th when n thresholds are gone."""
+    samples, contrast, theta = 4001, 1.05, 0.1
+    frames = np.full((samples, 1, 3), 0.2, np.float32)
+    frames[100:] *= np.exp(contrast)
+    scene = dase.VideoScene(frames, np.arange(samples) * 2e-4)
+    events = dase.simulate(scene, sensor(HighPass(cutoff=cutoff), on=theta, off=theta), device=device)
+    mine = events.select(events.x == 1)
+    rate = 2 * np.pi * cutoff
+    kept = contrast * (1 - np.exp(-rate * 2e-4)) / (rate * 2e-4)  # of a step that takes one sample
+    ups = int(kept / theta)
+    assert mine.p.sum() == ups
+    begin = 100 * 2e-4
+    # the memory stands at ups thresholds; eps of the logarithm takes a little of the contrast
+    level = theta * ups - theta * np.arange(1, ups + 1)
+    want = np.array([begin + np.log(kept / left) / rate for left in level if left > 1e-9])
+    want = want[want < scene.sample_times()[-1]]
+    got = mine.t[~mine.p][: len(want)]
+    assert len(got) == len(want)
+    np.testing.assert_allclose(got, want, rtol=0, atol=0.03 / rate + 2e-4)
+
+
+def test_slow_ramps_are_lost_and_fast_ones_stay(device):
+    seconds, theta, cutoff = 2.0, 0.2, 1.0
+    times = np.arange(2001) * 1e-3
+    slopes = np.array(
+        [0.5, 1.1, 1.4, 5.0]
+    )  # a slope s ends at s / (2π): below the threshold for the first two
+    frames = 0.05 * np.exp(0.5 * slopes[None, None] * times[:, None, None])
+    scene = dase.VideoScene(frames.astype(np.float32), times)
+    events = dase.simulate(scene, sensor(HighPass(cutoff=cutoff), on=theta, off=theta), device=device)
+    counts = np.bincount(events.x, minlength=4)
+    level = 0.5 * slopes / (2 * np.pi * cutoff) * (1 - np.exp(-2 * np.pi * cutoff * seconds))
+    assert np.all((counts > 0) == (level > theta))
+    assert np.all(counts <= np.floor(level / theta + 0.05))
+
+
+def test_a_high_pass_cuts_what_is_slow_of_the_noise_and_leaves_what_is_fast(device):
+    """Noise behind two poles far above the cutoff keeps its variance; far below, it loses nearly all."""
+    noise = VoltageNoise(sigma=0.1, cutoff=200.0, knee=1.0, dark=1e-3)
+    scene = still(400, 1.0, 0.5)
+    rates = [
+        len(dase.simulate(scene, sensor(noise, HighPass(cutoff=c), on=0.15, off=0.15), seed=5, device=device))
+        for c in (0.0, 0.5, 20_000.0)
+    ]
+    assert rates[0] > 2000
+    assert abs(rates[1] / rates[0] - 1) < 0.1
+    assert rates[2] < 0.2 * rates[0]
