@@ -27,6 +27,7 @@ from dase.kernels.pixel_compile import compile_text
 from dase.kernels.pixel_stages import EffectStages
 from dase.kernels.scene_layers import Frames
 from dase.kernels.scene_windows import LayerScenes, layers_of_scene
+from dase.kernels.vector_math import lane_functions, lane_options
 from dase.kernels.window_sinks import DEPOSITS, WindowGrids
 
 
@@ -58,7 +59,8 @@ def compose_scenes(
 
     Its arguments are `first`, the scenes of `SCENES`, a `SampleClock` whose runs are the windows, places of
     pixels (B, N), width, height, samples seen before, seeds (B,), parameters (B, P), maps (B, M, N) where an
-    effect has any, states before and after (S, B, N), `WindowGrids`.
+    effect has any, states before and after (S, B, N), intensities at the ends of windows (W, B, N), and
+    `WindowGrids`.
 
     Args:
         stages: Effects, in order.
@@ -68,9 +70,12 @@ def compose_scenes(
     """
     model = PixelModel(stages, source, "keys")
     kind, of_row = SCENES[source]
-    scope = pixel_scope(model) | (lane_scope(lanes, source) if lanes else {})
+    scope = pixel_scope(model)
+    if lanes:
+        scope |= lane_scope(lanes, source) | {"store": lane_functions(lanes).store}
     scope |= {"Scenes": kind, "scene_of": of_row, "Sink": WindowGrids, "deposit": DEPOSITS[deposit]}
-    return compile_text(source_text(stages, source, lanes=lanes), "pixel_scenes", scope)
+    options = lane_options() if lanes else {}
+    return compile_text(source_text(stages, source, lanes=lanes), "pixel_scenes", scope, **options)
 
 
 def source_text(stages: tuple[EffectStages, ...], source: str, *, lanes: int = 0) -> str:
@@ -85,7 +90,8 @@ def _head(model: PixelModel) -> list[str]:
         "def pixel_scenes(first: int, scenes: Scenes, clock: Clock, places: wp.array2d[int], width: int,",
         "                 height: int, begin: int, seeds: wp.array[int], parameters: wp.array2d[float],",
         *(["                 all_maps: wp.array3d[float],"] if model.maps else []),
-        "                 state_in: wp.array3d[float], state_out: wp.array3d[float], sink: Sink):",
+        "                 state_in: wp.array3d[float], state_out: wp.array3d[float],",
+        "                 frames: wp.array3d[float], sink: Sink):",
     ]
 
 
@@ -116,7 +122,7 @@ def _print_pixels(program: Program) -> str:
         look, window = _lit("stored(source.values, k, i)"), ()
     samples = (
         *step_quantities(model),
-        Line(f"intensity = {look}"),
+        *lines(f"seen = {look}", "intensity = seen + 0.0"),
         *layout.lay_out_all(program.light),
         Line(VOLTAGE),
         *layout.lay_out_all(program.respond),
@@ -129,7 +135,8 @@ def _print_pixels(program: Program) -> str:
         *_of_row(model),
         *place_pixel(program),
         *resolve_guards(program.begin, ask=False),
-        loop_over_windows(lines(*window), samples, ()),
+        Line("seen = float(0.0)"),
+        loop_over_windows(lines(*window), samples, lines("frames[part, row, i] = seen")),
         *layout.lay_out(keep_states(model)),
     )
     return print_kernel(_head(model), body)
@@ -152,7 +159,7 @@ def _print_blocks(program: Program, size: int) -> str:
         look, window = "load(source.values, k, start)", ()
     samples = (
         *step_quantities(model),
-        Line(f"intensity_lanes = {_lit(look)}"),
+        *lines(f"seen_lanes = {_lit(look)}", "intensity_lanes = seen_lanes + Floats()"),
         *layout.lay_out_all(program.light),
         Line("voltage_lanes = logarithms(intensity_lanes, log_eps)"),
         *layout.lay_out_all(program.respond),
@@ -162,7 +169,9 @@ def _print_blocks(program: Program, size: int) -> str:
     )
     body = (
         *_prepare_block(program, layout),
-        loop_over_windows(lines(*window), samples, ()),
+        Line("seen_lanes = Floats()"),
+        # of two blocks that overlap both write the same
+        loop_over_windows(lines(*window), samples, lines("store(frames[part, row], start, seen_lanes)")),
         *layout.lay_out(keep_states(model)),
     )
     return print_kernel(_head(model), body)

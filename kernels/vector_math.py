@@ -289,7 +289,7 @@ def native_function(name: str, snippet: str, scope: dict[str, Any], arguments: s
     return function_from_text(text, name, {**scope, "wp": wp, "snippet": snippet})
 
 
-def _lanewise_function(
+def lanewise_function(
     name: str, length: int, body: str, lanes: str, others: str = "", cuda: str | None = None
 ) -> Any:
     """Return a function from Warp vectors to a Warp vector, from C++ that sets `result`.
@@ -328,7 +328,7 @@ def lane_functions(length: int) -> SimpleNamespace:
     scope = {"Lanes": lane_type(length)}
 
     def lanewise(name: str, body: str, lanes: str, others: str = "", cuda: str | None = None) -> Any:
-        return _lanewise_function(f"{name}_{length}", length, body, lanes, others, cuda)
+        return lanewise_function(f"{name}_{length}", length, body, lanes, others, cuda)
 
     def plain(name: str, snippet: str, arguments: str, returns: str) -> Any:
         return native_function(f"{name}_{length}", snippet.format(length=length), scope, arguments, returns)

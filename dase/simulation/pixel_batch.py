@@ -91,7 +91,9 @@ class PixelBatch:
         windows = wp.array(np.arange(len(run) - 1, dtype=np.int32), dtype=int, device=self.device)
         return upload_clock(edges, self.samples == 0, begins, windows, self.device)
 
-    def advance(self, source: str, scenes: Any, clock: Any, times: Any, grids: Any, bins: int) -> None:
+    def advance(
+        self, source: str, scenes: Any, clock: Any, times: Any, frames: Any, grids: Any, bins: int
+    ) -> None:
         """Advance over samples and add the events to grids.
 
         Args:
@@ -99,6 +101,7 @@ class PixelBatch:
             scenes: What the pixels of each row see.
             clock: Of the samples, see `clock`.
             times: Samples [s], shape (K,).
+            frames: Warp array (W, B, N) for the intensities at the ends of windows.
             grids: Warp array (W, B, C, N) of at least as many windows as the clock has, of one duration.
             bins: Bins of time in a window.
         """
@@ -112,7 +115,7 @@ class PixelBatch:
         kernel = pixel_codegen_scenes.compose_scenes(self.stages, source, self.deposit, lanes=lanes)
         inputs = [
             scenes, clock, self.places, self.width, self.height, self.samples, self._seeds, self._parameters,
-            *([self._maps] if self.maps else []), self._state, self._next, sink,
+            *([self._maps] if self.maps else []), self._state, self._next, frames, sink,
         ]  # fmt: skip
         size = counting.block_count(self.count, lanes) if lanes else self.count
         launch.run_kernel(kernel, size, inputs, self.device, batch=self.batch)

@@ -18,9 +18,10 @@ from torch.utils.data import IterableDataset, get_worker_info
 from dase.effects.learned_threshold import LearnedThreshold
 from dase.errors import InputError, checked_integer, checked_seed
 from dase.kernels import launch, scene_paths
+from dase.kernels import threshold_counts as counting
 from dase.kernels.autograd_counts import follow_torch_stream
 from dase.kernels.scene_layers import Affine
-from dase.kernels.scene_windows import LayerScenes, render_window_ends
+from dase.kernels.scene_windows import LayerScenes, flow_kernel, render_scenes
 from dase.networks.weights_file import load_net
 from dase.representations import Representation, Voxels
 from dase.scenes.image_sources import ImageSource, open_images
@@ -273,6 +274,7 @@ class BatchMaker:
         self._coming: dict[int, Future[DecodedPictures]] = {}
         self._pool: tuple[int, TexturePool] | None = None
         self._group, self._part = -1, 0
+        self._clocks: dict[int, Any] = {}
         self._kept: dict[str, Any] = {}  # memory of work that is done anew in every batch
         self._late: torch.Tensor | None = None
         self._before: torch.Tensor | None = None
@@ -316,6 +318,7 @@ class BatchMaker:
         places = self._send(drawn.places(self.plan), wp.int32)
         maps = self._maps_of_scenes(drawn) if self.pixels.maps else None
         parameters = self._send(drawn.parameters, wp.float32)
+        self._vectors = wp.to_torch(parameters)
         self.pixels.reset(places, parameters, self._send(drawn.seeds, wp.int32), maps)
 
     def _load_pool(self, number: int) -> TexturePool:
@@ -365,30 +368,38 @@ class BatchMaker:
         times, count = self.stream.times(self._part), self.pixels.count
         run = np.arange(steps + 1, dtype=np.int32) * self.stream.samples
         run[1:] += self._part == 0  # the very first sample
-        clock = self.pixels.clock(times, run)
+        # a scene has the same clock as the one before
+        if self._part not in self._clocks:
+            self._clocks[self._part] = self.pixels.clock(times, run)
+        clock = self._clocks[self._part]
         velocity = self._place(clock.t64, clock.run)
-        light = np.ones((batch, len(times)), np.float32)
-        for slot, lighting in enumerate(self._drawn.lighting):
-            if lighting is not None:
-                light[slot] = lighting.factor(times)
-        self._scenes.light = self._send(light, wp.float32)
+        self._scenes.light = self._light(times)
         late = self.pixels.late_windows(plan.window)
         grids = torch.zeros(steps + late, batch, self.stream.represent.channels, count, device=self.device)
         if self._late is not None:
             grids[:late] += self._late
         bins = getattr(self.stream.represent, "bins", 1)
-        self.pixels.advance("layers", self._scenes, clock, times, wp.from_torch(grids), bins)
         frames = torch.empty(steps, batch, count, device=self.device)
         flow = torch.empty(steps, batch, 2, count, device=self.device)
+        lent = wp.from_torch(frames), wp.from_torch(grids)
+        self.pixels.advance("layers", self._scenes, clock, times, *lent, bins)
+        lanes = counting.widest_block(count, self.where, "layers")
         inputs = [
-            self._scenes, velocity, clock.run, self.pixels.places, plan.view[0], wp.from_torch(frames),
-            wp.from_torch(flow),
+            self._scenes, velocity, clock.run, self.pixels.places, plan.view[0], wp.from_torch(flow)
         ]  # fmt: skip
-        launch.run_kernel(render_window_ends, steps * count, inputs, self.where, batch=batch)
+        blocks = steps * counting.block_count(count, lanes)
+        launch.run_kernel(flow_kernel(lanes), blocks, inputs, self.where, batch=batch)
         self._part += 1
         self._late = grids[steps:].clone() if late else None
-        self._clock = clock  # until its kernels are done
         return grids[:steps], frames, flow
+
+    def _light(self, times: NDArray[np.float64]) -> wp.array:
+        """Return what intensities are multiplied by at samples [s], shape (B, K)."""
+        light = np.ones((self.plan.batch, len(times)), np.float32)
+        for slot, lighting in enumerate(self._drawn.lighting):
+            if lighting is not None:
+                light[slot] = lighting.factor(times)
+        return self._send(light, wp.float32)
 
     def _finish(self, number: int, grids: torch.Tensor, frames: torch.Tensor, flow: torch.Tensor) -> Batch:
         """Return the batch of what was simulated."""
@@ -401,7 +412,7 @@ class BatchMaker:
         begins = torch.zeros(shape, dtype=torch.bool, device=self.device)
         begins[0] = self._part == 1
         names = self.stream.sensor.parameter_names()
-        vectors = torch.from_numpy(self._drawn.parameters).to(self.device)
+        vectors = self._vectors
         batch = Batch(
             inputs=inputs,
             frames=frames.view(*shape, 1, height, width),
@@ -432,17 +443,11 @@ class BatchMaker:
         total = self.plan.windows * self.stream.samples + 1
         time = np.array([total // 2 * (self.plan.window / self.stream.samples)])
         run = self._send(np.array([0, 1], np.int32), wp.int32)
-        velocity = self._place(self._send(time, wp.float64), run)
-        light = [1.0 if one is None else float(one.factor(time)[0]) for one in self._drawn.lighting]
-        self._scenes.light = self._send(np.array(light, np.float32)[:, None], wp.float32)
-        places = np.repeat(np.arange(width * height, dtype=np.int32)[None], batch, 0)
+        self._place(self._send(time, wp.float64), run)
+        self._scenes.light = self._light(time)
         frames = torch.empty(1, batch, width * height, device=self.device)
-        flow = torch.empty(1, batch, 2, width * height, device=self.device)
-        inputs = [
-            self._scenes, velocity, run, self._send(places, wp.int32), width, wp.from_torch(frames),
-            wp.from_torch(flow),
-        ]  # fmt: skip
-        launch.run_kernel(render_window_ends, width * height, inputs, self.where, batch=batch)
+        inputs = [self._scenes, width, wp.from_torch(frames)]
+        launch.run_kernel(render_scenes, width * height, inputs, self.where, batch=batch)
         return frames.view(batch, height, width)
 
     def _learned_maps(
