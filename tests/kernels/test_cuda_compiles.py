@@ -12,8 +12,10 @@ from dase.kernels import (
     critic_layers,
     critic_products,
     launch,
+    pixel_codegen_scenes,
     pixel_codegen_trials,
     pixel_compile,
+    scene_windows,
     threshold_counts,
 )
 from dase.simulation.sensor import Sensor
@@ -24,7 +26,8 @@ ARCH = 90
 MODULES = (
     "critic_layers", "critic_products", "critic_rows", "event_keys", "event_neighbours", "event_order",
     "event_probes", "event_queue", "patch_structure", "pixel_codegen_trials", "scene_batch", "scene_blur",
-    "scene_frames", "scene_layers", "scene_layers_gradient", "threshold_surrogates",
+    "scene_frames", "scene_layers", "scene_layers_gradient", "scene_paths", "scene_windows",
+    "threshold_surrogates",
 )  # fmt: skip
 """Those whose kernels are not made by functions."""
 
@@ -53,6 +56,14 @@ def test_plain_kernels(name, tmp_path):
 )
 def test_pixels_with_every_effect(source, sink, tmp_path):
     compiles(pixel_compile.compose_pixels(every().stages(), source, sink).module, tmp_path)
+
+
+def test_pixels_of_many_scenes(tmp_path):
+    compiles(pixel_codegen_scenes.compose_scenes(every().stages(), "layers", "voxels").module, tmp_path)
+
+
+def test_flow_of_many_scenes(tmp_path):
+    compiles(scene_windows.flow_kernel(1).module, tmp_path)
 
 
 def test_pixels_of_many_models(tmp_path):
