@@ -1,10 +1,13 @@
 """Kill small runs at random moments and resume them: the same bytes, no process and no temporary left.
 
     python perf/kills.py --kills 20 --starts 20              of synth, convert and train each; --only convert
+    python perf/kills.py --kills 100 --starts 60 --jobs 6 --minutes 9    six at once; says how to go on
+    python perf/kills.py --only train --first 17 --kills 1   one round again
 
 Each round starts a command, sends SIGKILL, SIGTERM or SIGHUP at a random moment of its life, waits until all
 its processes are gone, and lets it run again, with `--resume` where there is such. A start is two `synth`
-into one folder at once. Linux only: processes are found in /proc.
+into one folder at once. Rounds have random numbers of their own, by seed and number. All runs compute on the
+processor, where the same seed gives the same bytes. Linux only: processes are found in /proc.
 """
 
 from __future__ import annotations
@@ -18,6 +21,7 @@ import subprocess
 import sys
 import tempfile
 import time
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -185,40 +189,94 @@ def start_two(place: Path, source: Path, want: dict[str, bytes], rng: random.Ran
     return f"exit codes {codes}", wrong
 
 
+@dataclass
+class Rounds:
+    """All rounds of one subject.
+
+    Args:
+        name: Of the subject, or `starts`.
+        want: What an undisturbed run writes.
+        span: How long it takes among as many others as there will be [s].
+        done: Rounds that were made, in whatever order.
+        bad: Of these, those where something was wrong.
+    """
+
+    name: str
+    want: dict[str, bytes]
+    span: float
+    done: int = 0
+    bad: int = 0
+
+    def run(self, number: int, seed: int, base: Path, source: Path, keep: Path | None) -> None:
+        """Make one round; print and keep what is wrong."""
+        rng, place = random.Random(f"{seed} {self.name} {number}"), base / self.name / str(number)
+        if self.name == "starts":
+            how, wrong = start_two(place, source, self.want, rng)
+        else:
+            how, wrong = kill_once(SUBJECTS[self.name], place, source, self.want, self.span, rng)
+        if wrong:
+            print(f"{self.name} {number}, seed {seed}: {how}: {'; '.join(wrong)}", flush=True)
+            if keep is not None:
+                shutil.copytree(place, keep / f"{self.name}_{seed}_{number}", dirs_exist_ok=True)
+        shutil.rmtree(place)
+        self.done += 1
+        self.bad += bool(wrong)
+
+
+def prepare_rounds(name: str, jobs: int, base: Path, source: Path) -> Rounds:
+    """Return a subject's rounds with what an undisturbed run writes, once it has compiled its kernels."""
+    subject = SUBJECTS.get(name, SUBJECTS["synth"])
+    want, span = undisturbed(subject, base / name, source)
+    with ThreadPoolExecutor(jobs) as pool:  # many at once take longer, and kills must hit all of their life
+        again = list(
+            pool.map(lambda n: undisturbed(subject, base / name / f"at once {n}", source), range(jobs))
+        )
+    if others := [n for n, (got, _) in enumerate(again) if differing_names(got, want)]:
+        print(
+            f"{name}: {len(others)} of {jobs} undisturbed runs wrote other bytes than the first", flush=True
+        )
+    return Rounds(name, want, max(taken for _, taken in again) if jobs > 1 else span)
+
+
 def main() -> None:
     """Run all, print what is wrong, and exit with 1 if anything is."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument("--kills", type=int, default=20)
     parser.add_argument("--starts", type=int, default=20)
-    parser.add_argument("--only", choices=[*SUBJECTS, "starts"])
+    parser.add_argument("--only", choices=[*SUBJECTS, "starts"], action="append")
     parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--first", type=int, default=0, help="the number of the first round")
+    parser.add_argument("--jobs", type=int, default=1, help="rounds at once")
+    parser.add_argument("--minutes", type=float, default=float("inf"), help="after which no round begins")
+    parser.add_argument("--keep", type=Path, help="a folder for what a failed round left")
     options = parser.parse_args()
+    end = time.monotonic() + 60 * options.minutes
+    os.environ["CUDA_VISIBLE_DEVICES"] = ""
     failures = 0
     with tempfile.TemporaryDirectory() as folder:
         base = Path(folder)
         source = base / "source" / "sequence_00000.h5"
         made = ("synth", str(source.parent), "--sequences", "1", "--jobs", "1", "--duration", "1")
         subprocess.run(command(made, base, base), check=True, stdout=subprocess.DEVNULL)
-        for name in [*SUBJECTS, "starts"]:
-            if options.only not in (None, name):
+        for name in options.only or [*SUBJECTS, "starts"]:
+            if time.monotonic() > end:
+                print(f"{name}: not begun; go on with --only {name} --first {options.first}", flush=True)
                 continue
-            rng = random.Random(f"{options.seed} {name}")
-            subject = SUBJECTS.get(name, SUBJECTS["synth"])
-            want, span = undisturbed(subject, base / name, source)
-            rounds = options.starts if name == "starts" else options.kills
-            bad = 0
-            for n in range(rounds):
-                place = base / name / str(n)
-                if name == "starts":
-                    how, wrong = start_two(place, source, want, rng)
-                else:
-                    how, wrong = kill_once(subject, place, source, want, span, rng)
-                bad += bool(wrong)
-                if wrong:
-                    print(f"{name} {n}: {how}: {'; '.join(wrong)}", flush=True)
-                shutil.rmtree(place)
-            print(f"{name}: {rounds} rounds of {span:.1f} s, {bad} wrong", flush=True)
-            failures += bad
+            rounds = prepare_rounds(name, options.jobs, base, source)
+
+            def one(number: int, rounds: Rounds = rounds) -> bool:
+                if time.monotonic() > end:
+                    return False
+                rounds.run(number, options.seed, base, source, options.keep)
+                return True
+
+            count = options.starts if name == "starts" else options.kills
+            with ThreadPoolExecutor(options.jobs) as pool:
+                made_all = list(pool.map(one, range(options.first, options.first + count)))
+            print(f"{name}: {rounds.done} rounds of {rounds.span:.1f} s, {rounds.bad} wrong", flush=True)
+            if not all(made_all):
+                print(f"    go on with --only {name} --first {options.first + sum(made_all)}", flush=True)
+            failures += rounds.bad
     sys.exit(1 if failures else 0)
 
 
