@@ -3,6 +3,7 @@
     python -m perf.fuzz_io                        100 000 files of every format
     python -m perf.fuzz_io --format EVT3 --files 1000 --seed 7
     python -m perf.fuzz_io --format EVT3 --only 4711 --keep .      one file again, and keep it
+    python -m perf.fuzz_io --jobs 16 --minutes 9 --state out/fuzz.json   call again to go on
 
 Files are damaged in memory, lie on a disk in memory, and are read whole and as a stream by turns. Every
 format runs in a process of its own that a second one watches: a crash, or a file that takes too long or too
@@ -13,20 +14,23 @@ the next file. Each file has random numbers of its own, so any one can be made a
 from __future__ import annotations
 
 import argparse
+import importlib.util
+import json
 import multiprocessing
 import os
 import shutil
 import sys
 import tempfile
+import threading
 import time
 import warnings
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
 import cv2
 import h5py
-import hdf5plugin
-import lz4.frame
 import numpy as np
 
 from perf.benchmarks.kernels import commit
@@ -77,7 +81,15 @@ def write_aedat4(path: Path, e, frames) -> None:
     spans = np.rint(frames[0] * 1e6).astype(int).tolist()
     frames = [(t, t + 900, grey) for t, grey in zip(spans, frames[1], strict=True)]
     motion = [(1000 * k, (0.0, 0.0, 1.0), (1.0, 2.0, 3.0)) for k in range(5)]
+    import lz4.frame
+
     reference_io.aedat4(path, e, frames=frames, motion=motion, compression=1, compress=lz4.frame.compress)
+
+
+def write_packed_dsec(path: Path, e) -> None:
+    import hdf5plugin
+
+    reference_io.dsec(path, e, **hdf5plugin.Blosc(cname="zstd"))
 
 
 def video_maker(codec: str):
@@ -132,7 +144,7 @@ SAMPLES = {
     "ECF": (".hdf5", reference_io.ecf),
     "ECF, columns packed": (".hdf5", lambda path, e: reference_io.ecf(path, e, mode=1)),
     "ECF, not packed": (".hdf5", lambda path, e: reference_io.ecf(path, e, mode=0)),
-    "DSEC packed": (".h5", lambda path, e: reference_io.dsec(path, e, **hdf5plugin.Blosc(cname="zstd"))),
+    "DSEC packed": (".h5", write_packed_dsec),
     "MVSEC with frames": (".hdf5", with_frames(lambda path, e, f: reference_io.mvsec(path, e, frames=f))),
     "v2e with frames": (".h5", with_frames(lambda path, e, f: reference_io.v2e(path, e, frames=f))),
     "HDF5 with frames": (".h5", with_frames(write_full)),
@@ -161,6 +173,16 @@ SAMPLES = {
     "text with PNG": (".folder", with_frames(write_pictures)),
 } | reference_io.SAMPLES
 """Those that hold most first, then what is left of those of the tests; small sensors keep them small."""
+NEEDS = {
+    **reference_io.NEEDS,
+    "ROS 1 packed": "rosbags",
+    "DSEC packed": "hdf5plugin",
+    "AEDAT4 packed": "lz4",
+    "COCO": "pycocotools",
+}
+"""Packages without which a sample cannot be made or read."""
+BLOCK = 2500
+"""Files that a process reads before it ends, where several work side by side."""
 W, H = 48, 36
 
 
@@ -282,8 +304,9 @@ def secret_of(path: Path) -> Path:
 
 
 def run_files(name: str, folder: Path, files: int, seed: int, keep: Path, told, errors) -> None:
-    """Damage and read files of one format from number told[NEXT] on, and tell what happens."""
+    """Damage and read files of one format from number told[NEXT] to `files`, and tell what happens."""
     warnings.simplefilter("error")
+    cv2.setNumThreads(1)
     sample, inner = prepare_sample(name, folder, seed)
     opened = opens_of(secret_of(sample)) if "tangled" in name else lambda: False
     for turn in (0, 1):
@@ -322,6 +345,55 @@ def kept_name(name: str, number: int, path: Path) -> str:
     return f"fuzz_{name.replace(' ', '_').replace(',', '')}_{number}{path.suffix}"
 
 
+@dataclass
+class Row:
+    """What happened to the files of one format.
+
+    Args:
+        blocks: First numbers of the blocks that are done.
+        files: How many were read.
+        whole: Files read without a word.
+        noted: Read with a report of what was put right or left out.
+        refused: Refused with a sentence.
+        failed: All others.
+        slowest: Time that one took [s].
+        peak: Most memory that one took [MB].
+        spent: Time of processor [s].
+        said: Sentences about those that failed.
+    """
+
+    blocks: list[int] = field(default_factory=list)
+    files: int = 0
+    whole: int = 0
+    noted: int = 0
+    refused: int = 0
+    failed: int = 0
+    slowest: float = 0.0
+    peak: float = 0.0
+    spent: float = 0.0
+    said: list[str] = field(default_factory=list)
+
+    def add(self, first: int, files: int, told, said: list[str]) -> None:
+        """Take in a block of files."""
+        self.blocks.append(first)
+        self.files += files
+        self.whole += int(told[WHOLE])
+        self.noted += int(told[NOTED])
+        self.refused += int(told[REFUSED])
+        self.failed += int(told[FAILED])
+        self.slowest, self.peak = max(self.slowest, told[SLOWEST]), max(self.peak, told[PEAK])
+        self.spent += told[SPENT]
+        self.said += said
+
+    def text(self, name: str) -> str:
+        """Return a row of the table, and what was said below it."""
+        numbers = (self.files, self.whole, self.noted, self.refused, self.failed)
+        counts = " | ".join(f"{number:,}" for number in numbers)
+        speed = self.files / max(self.spent, 1e-9)
+        row = f"| {name} | {counts} | {self.slowest:.2f} s | {self.peak:.0f} MB | {speed:.0f} |"
+        return "\n".join([row, *(f"    {sentence}" for sentence in self.said[:20])])
+
+
 def main() -> int:
     """Run all formats; return how many failed."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
@@ -330,22 +402,72 @@ def main() -> int:
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--keep", type=Path, default=Path(tempfile.gettempdir()))
     parser.add_argument("--only", type=int, help="the number of a file that is made, kept and read again")
+    parser.add_argument("--jobs", type=int, default=1, help="processes at once")
+    parser.add_argument("--minutes", type=float, default=float("inf"), help="after which no block begins")
+    parser.add_argument("--state", type=Path, help="a file that keeps what is done, to go on with")
     options = parser.parse_args()
     os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
-    failed = 0
+    names = [name for name in options.format or SAMPLES if is_possible(name)]
+    if options.only is not None:
+        with tempfile.TemporaryDirectory(dir=in_memory()) as folder:
+            for name in names:
+                repeat_file(name, Path(folder), options.only, options.seed, options.keep)
+        return 0
+    rows = {name: Row() for name in names}
+    if options.state and options.state.exists():
+        old = json.loads(options.state.read_text())
+        if old["seed"] == options.seed:
+            rows |= {name: Row(**row) for name, row in old["rows"].items() if name in rows}
+    run_rows(rows, options)
     print(f"commit {commit()}, {EVENTS} events in a file, seed {options.seed}\n")
     print("| decoder | files | read | read, with a report | refused | failed | slowest | memory | files/s |")
     print(f"|{'---|' * 9}")
-    for name in options.format or SAMPLES:
-        folder = Path(tempfile.mkdtemp(dir="/dev/shm" if Path("/dev/shm").is_dir() else None))
+    print("\n".join(row.text(name) for name, row in rows.items()))
+    if left := {name: options.files - row.files for name, row in rows.items() if row.files < options.files}:
+        print(f"\nto be read yet: {sum(left.values()):,} files of {', '.join(left)}; call again with --state")
+    return sum(bool(row.said) for row in rows.values())
+
+
+def is_possible(name: str) -> bool:
+    """Return whether the packages that a sample needs are there; say it where they are not."""
+    need = NEEDS.get(name)
+    if need is None or importlib.util.find_spec(need) is not None:
+        return True
+    print(f"{name} is left out: it needs {need}")
+    return False
+
+
+def in_memory() -> str | None:
+    """Return the folder of a disk in memory, None where there is none."""
+    return "/dev/shm" if Path("/dev/shm").is_dir() else None
+
+
+def run_rows(rows: dict[str, Row], options: argparse.Namespace) -> None:
+    """Read what is left of all formats, block by block, and keep what is done."""
+    end, lock = time.monotonic() + 60 * options.minutes, threading.Lock()
+
+    def run_block(task: tuple[str, int]) -> None:
+        if time.monotonic() > end:
+            return
+        (name, first), folder = task, Path(tempfile.mkdtemp(dir=in_memory()))
+        behind = min(first + BLOCK, options.files)
         try:
-            if options.only is None:
-                failed += watch_format(name, folder, options.files, options.seed, options.keep)
-            else:
-                repeat_file(name, folder, options.only, options.seed, options.keep)
+            told, said = watch_block(name, folder, first, behind, options.seed, options.keep)
         finally:
             shutil.rmtree(folder)
-    return failed
+        with lock:
+            rows[name].add(first, behind - first, told, said)
+            if options.state:
+                kept = {"seed": options.seed, "rows": {n: asdict(r) for n, r in rows.items()}}
+                options.state.parent.mkdir(parents=True, exist_ok=True)
+                part = options.state.with_suffix(".part")
+                part.write_text(json.dumps(kept))
+                part.replace(options.state)
+
+    tasks = [(name, n) for name in rows for n in range(0, options.files, BLOCK) if n not in rows[name].blocks]
+    tasks.sort(key=lambda task: "tangled" not in task[0])  # what takes longest first
+    with ThreadPoolExecutor(options.jobs) as pool:
+        list(pool.map(run_block, tasks))
 
 
 def repeat_file(name: str, folder: Path, number: int, seed: int, keep: Path) -> None:
@@ -366,17 +488,27 @@ def process_status(pid: int) -> tuple[float, float]:
     return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK"), pages / 2**20
 
 
-def watch_format(name: str, folder: Path, files: int, seed: int, keep: Path) -> bool:
-    """Read all files of a format in as many processes as it takes; print a row, return whether any failed."""
+def watch_block(name: str, folder: Path, first: int, end: int, seed: int, keep: Path):
+    """Read files of a format in as many processes as it takes; return what they told, and said.
+
+    Args:
+        name: Of the sample.
+        folder: For the files.
+        first: Number of the first file.
+        end: Behind the last one.
+        seed: Of all of them.
+        keep: A folder for those that fail.
+    """
     context = multiprocessing.get_context("spawn")
     told = context.Array("d", 8, lock=False)
+    told[NEXT] = first
     errors, said = context.SimpleQueue(), []
-    while told[NEXT] < files:
+    while told[NEXT] < end:
         place = Path(tempfile.mkdtemp(dir=folder))
-        process = context.Process(target=run_files, args=(name, place, files, seed, keep, told, errors))
+        process = context.Process(target=run_files, args=(name, place, end, seed, keep, told, errors))
         process.start()
         why = wait_for(process, told, errors, said)
-        if told[NEXT] < files:
+        if told[NEXT] < end:
             number = int(told[NEXT])
             said.append(f"file {number}: {why}")
             for path in (path for path in place.rglob("*") if path.is_file()):
@@ -384,12 +516,7 @@ def watch_format(name: str, folder: Path, files: int, seed: int, keep: Path) -> 
             told[FAILED] += 1
             told[NEXT] += 1
         shutil.rmtree(place)
-    counts = " | ".join(f"{int(told[kind]):,}" for kind in (NEXT, WHOLE, NOTED, REFUSED, FAILED))
-    speed = told[NEXT] / max(told[SPENT], 1e-9)
-    print(f"| {name} | {counts} | {told[SLOWEST]:.2f} s | {told[PEAK]:.0f} MB | {speed:.0f} |", flush=True)
-    for sentence in said[:20]:
-        print(f"    {sentence}", flush=True)
-    return bool(said)
+    return told, said
 
 
 def wait_for(process, told, errors, said: list[str]) -> str:
