@@ -1,4 +1,4 @@
-"""Moving textured layers: bilinear warping, alpha compositing, flow.
+"""Moving textured layers: bilinear warping, alpha compositing.
 
 A layer is a texture and, at every time sample, an affine map from sensor to texture coordinates (pixel
 centres at integers). Layer 0 is the opaque background, continued by reflection about its outermost texels
@@ -197,32 +197,6 @@ def render_intensity(
     )
 
 
-@wp.kernel(enable_backward=False)
-def foremost_velocity(
-    # in
-    first: int,
-    layers: Layers,
-    velocity: wp.array2d[Affine],  # (K, L) sensor coordinates to velocity [px/s]
-    width: int,
-    # out
-    flow_out: wp.array2d[wp.vec2],  # (K, H · W) [px/s]
-):
-    """Velocity of the foremost layer with alpha > 0."""
-    k, i = wp.tid()
-    i += first
-    x = float(i % width)
-    y = float(i / width)
-    near = layers_near(layers, x, y)
-    top = int(0)
-    while near != 0:
-        layer = highest_bit(near)
-        near ^= 1 << layer
-        if foreground_at(layers, layer, k, x, y)[1] > 0.0:
-            top = layer
-            near = 0
-    flow_out[k, i] = velocity[k, top] * wp.vec3(x, y, 1.0)
-
-
 def upload_textures(
     textures: list[tuple[np.ndarray, np.ndarray | None]], device: wp.Device
 ) -> tuple[wp.array, wp.array, wp.array, wp.array]:
@@ -245,7 +219,7 @@ def upload_textures(
     return (
         # one more, as the neighbour of the last texel is looked at even where it does not count
         wp.array(np.append(flat[0][:, 0], np.float32(0.0)), dtype=float, device=device),
-        wp.array(np.concatenate(flat), dtype=wp.vec2, device=device),
+        wp.array(np.concatenate([*flat, np.zeros((1, 2), np.float32)]), dtype=wp.vec2, device=device),
         wp.array(start, dtype=int, device=device),
         wp.array(np.array(size), dtype=wp.vec2i, device=device),
     )
@@ -288,22 +262,4 @@ def interpolate_frames(
         for a, kind in ((frames, float), (at, int), (share.astype(np.float32), float))
     ]
     launch.run_kernel(mix_frames, pixels, [*arrays, eps, out], device, batch=samples)
-    return out
-
-
-def render_frames(layers: Layers, width: int, height: int, device: wp.Device) -> wp.array:
-    """Return intensities of all samples, shape (K, H · W)."""
-    samples = layers.place.shape[0]
-    out = wp.empty((samples, height * width), dtype=float, device=device)
-    launch.run_kernel(render_intensity, height * width, [layers, width, out], device, batch=samples)
-    return out
-
-
-def render_flow(layers: Layers, velocity: wp.array, width: int, height: int, device: wp.Device) -> wp.array:
-    """Return the flow of all samples [px/s], shape (K, H · W) of vec2."""
-    samples = layers.place.shape[0]
-    out = wp.empty((samples, height * width), dtype=wp.vec2, device=device)
-    launch.run_kernel(
-        foremost_velocity, height * width, [layers, velocity, width, out], device, batch=samples
-    )
     return out

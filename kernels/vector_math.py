@@ -67,6 +67,27 @@ auto PAIR = [](const float* a, I i, V& right) {{
     right = flat.odd;
     return (V)flat.even;
 }};
+auto QUAD = [](const float* a, I i, V& a0, V& c1, V& a1) {{
+    // four numbers in one load, those of every fourth lane side by side; then 4 by 4 are turned over
+    typedef float Q __attribute__((ext_vector_type(4)));
+    auto GATHER = [&](int j) {{
+        Q q[4];
+        for (int g = 0; g < 4; ++g) __builtin_memcpy(&q[g], a + i[4 * g + j], 16);
+        const auto low = __builtin_shufflevector(q[0], q[1], 0, 1, 2, 3, 4, 5, 6, 7);
+        const auto high = __builtin_shufflevector(q[2], q[3], 0, 1, 2, 3, 4, 5, 6, 7);
+        return __builtin_shufflevector(low, high, 0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15);
+    }};
+    const V p0 = GATHER(0), p1 = GATHER(1), p2 = GATHER(2), p3 = GATHER(3);
+    const V l01 = __builtin_shufflevector(p0, p1, 0, 16, 1, 17, 4, 20, 5, 21, 8, 24, 9, 25, 12, 28, 13, 29);
+    const V h01 = __builtin_shufflevector(p0, p1, 2, 18, 3, 19, 6, 22, 7, 23, 10, 26, 11, 27, 14, 30, 15, 31);
+    const V l23 = __builtin_shufflevector(p2, p3, 0, 16, 1, 17, 4, 20, 5, 21, 8, 24, 9, 25, 12, 28, 13, 29);
+    const V h23 = __builtin_shufflevector(p2, p3, 2, 18, 3, 19, 6, 22, 7, 23, 10, 26, 11, 27, 14, 30, 15, 31);
+    a0 = __builtin_shufflevector(l01, l23, 2, 3, 18, 19, 6, 7, 22, 23, 10, 11, 26, 27, 14, 15, 30, 31);
+    c1 = __builtin_shufflevector(h01, h23, 0, 1, 16, 17, 4, 5, 20, 21, 8, 9, 24, 25, 12, 13, 28, 29);
+    a1 = __builtin_shufflevector(h01, h23, 2, 3, 18, 19, 6, 7, 22, 23, 10, 11, 26, 27, 14, 15, 30, 31);
+    const V c0 = __builtin_shufflevector(l01, l23, 0, 1, 16, 17, 4, 5, 20, 21, 8, 9, 24, 25, 12, 13, 28, 29);
+    return c0;
+}};
 // a comparison of vectors is -1 in lanes where it holds
 auto ANY = [](I a) {{ return __builtin_reduce_or(a) != 0; }};
 auto HIGHEST = [](unsigned a) {{ return 31 - __builtin_clz(a); }};
@@ -98,6 +119,12 @@ auto WHOLE = [](V a) {{ return (I)a; }};
 auto FLOAT = [](I a) {{ return (V)a; }};
 auto AT = [](const float* a, I i) {{ return a[i]; }};
 auto PAIR = [](const float* a, I i, V& right) {{ right = a[i + 1]; return a[i]; }};
+auto QUAD = [](const float* a, I i, V& a0, V& c1, V& a1) {{
+    a0 = a[i + 1];
+    c1 = a[i + 2];
+    a1 = a[i + 3];
+    return a[i];
+}};
 auto ANY = [](I a) {{ return a != 0; }};
 wp::vec_t<{length}, float> result_out;
 #pragma unroll
@@ -167,15 +194,13 @@ I i = iv * width + iu;
 V right;
 V top = PAIR(grey.data, i, right);
 top = top + fu * (right - top);
-V bottom = PAIR(grey.data, i + step[1], right);
+V bottom = PAIR(grey.data + step[1], i, right);
 bottom = bottom + fu * (right - bottom);
 V result = top + fv * (bottom - top);
 """
 
-    foreground = """
+    walk_layers = """
 // as dase.kernels.scene_layers.in_front does, all pixels of the block layer by layer; no texel is no light
-V sum = x * 0.0f;
-V through = sum + 1.0f;
 unsigned left = (unsigned)near;
 while (left != 0) {
     const int layer = HIGHEST(left);
@@ -197,32 +222,60 @@ while (left != 0) {
     I iu = WHOLE(whole_u);
     I iv = WHOLE(whole_v);
     const float* from = (const float*)(texels.data + start.data[layer]);
-    I at = 2 * (iv * width + iu);
+    I first = iu < 0;
+    I at = 2 * (iv * width + (first ? I(0) : iu));
     I west = inside & (iu >= 0);
     I east = inside & (iu + 1 < width);
-    I north = iv >= 0;
-    I south = iv + 1 < height;
-    auto LOOK = [=](I ok, I i, V& opacity) {
-        const V value = PAIR(from, ok ? i : I(0), opacity);
-        opacity = ok ? opacity : V(0.0f);
-        return ok ? value : V(0.0f);
+    // two texels of a row: the one after the last of all is there, the one before the first is not
+    auto LOOK = [=](I row, I i, V& alpha, V& next_color, V& next_alpha) {
+        V color = QUAD(from, row ? i : I(0), alpha, next_color, next_alpha);
+        next_color = first ? color : next_color;
+        next_alpha = first ? alpha : next_alpha;
+        color = west & row ? color : V(0.0f);
+        alpha = west & row ? alpha : V(0.0f);
+        next_color = east & row ? next_color : V(0.0f);
+        next_alpha = east & row ? next_alpha : V(0.0f);
+        return color;
     };
     // bilinear between four texels, of which those outside are transparent: so edges are one texel wide
-    V alpha, next, low, low_next;
-    V color = LOOK(west & north, at, alpha);
-    color = color + fu * (LOOK(east & north, at + 2, next) - color);
+    V alpha, low, right, next;
+    V color = LOOK(inside & (iv >= 0), at, alpha, right, next);
+    color = color + fu * (right - color);
     alpha = alpha + fu * (next - alpha);
-    V below = LOOK(west & south, at + 2 * width, low);
-    below = below + fu * (LOOK(east & south, at + 2 * width + 2, low_next) - below);
-    low = low + fu * (low_next - low);
+    V below = LOOK(inside & (iv + 1 < height), at + 2 * width, low, right, next);
+    below = below + fu * (right - below);
+    low = low + fu * (next - low);
     color = color + fv * (below - color);
     alpha = alpha + fv * (low - alpha);
+"""
+    """Goes through the layers in front of the background, the foremost first: `color` and `alpha` of each."""
+
+    foreground = f"""
+V sum = x * 0.0f;
+V through = sum + 1.0f;
+{walk_layers}
     sum = sum + through * color;
     through = through * (1.0f - alpha);
     // nothing behind an opaque layer is seen
     if (!ANY(through != 0.0f)) break;
-}
+}}
 V result = sum + through * light;
+"""
+
+    foremost = f"""
+// velocity of the foremost layer that is not wholly transparent, along one axis [px/s]
+auto ALONG = [&](int layer) {{
+    const auto& m = wp::index(velocity, k, layer);
+    return V((x * m.data[axis][0] + y * m.data[axis][1]) + m.data[axis][2]);
+}};
+V result = ALONG(0);
+I open = x == x;
+{walk_layers}
+    const I hit = open & (alpha > 0.0f);
+    result = hit ? ALONG(layer) : result;
+    open = open & (alpha <= 0.0f);
+    if (!ANY(open)) break;
+}}
 """
 
     load = """
@@ -362,6 +415,9 @@ def lane_functions(length: int) -> SimpleNamespace:
         natural=lanewise("natural", "V x = a;" + _Cpp.logarithm, "a", cuda="V result = logf(a);"),
         exponential=lanewise("exponential", _Cpp.exponential, "x", cuda="V result = expf(x);"),
         foreground=lanewise("foreground", _Cpp.foreground, "light x y", layers),
+        foremost=lanewise(
+            "foremost", _Cpp.foremost, "x y", f"{layers}, velocity: wp.array2d[Affine], axis: int"
+        ),
         background=lanewise("background", _Cpp.background, "x y", f"{ground}, inverse: wp.vec2, width: int"),
     )
 

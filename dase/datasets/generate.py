@@ -391,7 +391,9 @@ def _record_into(
 
 
 def _write_frames(scene: Scene, writer: io.Writer, times: np.ndarray, device: str) -> None:
-    frames = np.clip(np.round(scene.frames(times, device) * 255), 0, 255).astype(np.uint8)
+    levels = scene.frames(times, device) * np.float32(255)
+    np.rint(levels, out=levels)  # in place, as memory costs more than arithmetic here
+    frames = np.clip(levels, 0, 255, out=levels).astype(np.uint8)
     flow = scene.flow(times, device)
     for i, at in enumerate(times):
         writer.frame(float(at), frames[i], None if flow is None else flow[i])

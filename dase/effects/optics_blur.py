@@ -15,7 +15,7 @@ from dase.effects.optics import SceneEffect
 from dase.errors import InputError
 from dase.kernels import launch, pixel_stages
 from dase.kernels.scene_blur import blur_frames
-from dase.kernels.scene_layers import render_frames
+from dase.kernels.scene_render import render_frames
 from dase.kernels.stored_levels import light_of_levels
 from dase.scenes.scene import Scene
 

@@ -11,7 +11,7 @@ import warp as wp
 from numpy.typing import NDArray
 
 from dase.errors import InputError
-from dase.kernels import launch
+from dase.kernels import launch, scene_render
 from dase.kernels import scene_layers as kernels
 from dase.scenes.image_sources import Picture
 from dase.scenes.scene import SamplingSettings, Scene
@@ -333,16 +333,15 @@ class LayerScene(Scene):
 
     def _lit_frames(self, times: NDArray[np.float64], device: wp.Device) -> NDArray[np.float32]:
         """Return intensities at `times` [s], shape (K, height · width)."""
-        out = kernels.render_frames(self.arrays(times, device), self.width, self.height, device).numpy()
+        out = scene_render.render_frames(self.arrays(times, device), self.width, self.height, device).numpy()
         return np.asarray(out if self.lighting is None else out * self.lighting.factor(times)[:, None])
 
     def flow(self, times: NDArray[np.float64], device: str = "cpu") -> NDArray[np.float32]:
         """Return the flow of the foremost layer at `times` [px/s], shape (K, 2, height, width)."""
         where = launch.find_device(device)
         maps = wp.array(self.velocity(times).astype(np.float32), dtype=kernels.Affine, device=where)
-        out = kernels.render_flow(self.arrays(times, where), maps, self.width, self.height, where)
-        stacked = out.numpy().reshape(len(times), self.height, self.width, 2)
-        return np.ascontiguousarray(np.moveaxis(stacked, -1, 1))
+        out = scene_render.render_flow(self.arrays(times, where), maps, self.width, self.height, where)
+        return np.asarray(out.numpy().reshape(len(times), 2, self.height, self.width))
 
 
 def _affine_maps(

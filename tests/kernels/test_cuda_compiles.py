@@ -15,6 +15,7 @@ from dase.kernels import (
     pixel_codegen_scenes,
     pixel_codegen_trials,
     pixel_compile,
+    scene_render,
     scene_windows,
     threshold_counts,
 )
@@ -78,6 +79,11 @@ def test_counting(source, lanes, tmp_path):
             threshold_counts.counting_kernel(lanes, source, shared=False, states=True, aligned=True).module,
             tmp_path,
         )
+
+
+def test_pictures_of_layers(tmp_path):
+    compiles(scene_render.rendering_kernel(1).module, tmp_path)
+    compiles(scene_render.flow_kernel(1).module, tmp_path)
 
 
 @pytest.mark.parametrize("half", [True, False])

@@ -11,8 +11,7 @@ import warp as wp
 from reference import pixel as reference
 
 import dase
-from dase.kernels import launch
-from dase.kernels import scene_layers as kernels
+from dase.kernels import launch, scene_render
 from dase.scenes import random_scenes
 from dase.scenes.image_sources import ImageSource
 
@@ -228,11 +227,11 @@ def test_culling_changes_nothing(device, rng):
     where = launch.find_device(device)
     for times in (np.linspace(0, 0.7, 20), np.array([0.1]), np.array([0.3, 0.31])):
         layers = made.arrays(times, where)
-        culled = kernels.render_frames(layers, 30, 25, where).numpy()
+        culled = scene_render.render_frames(layers, 30, 25, where).numpy()
         box = layers.box.numpy()
         assert np.any(box[1:, 0] > 0) or np.any(box[1:, 2] < 29)
         layers.box.assign(np.tile(np.array([-1e9, -1e9, 1e9, 1e9], np.float32), (9, 1)))
-        np.testing.assert_array_equal(kernels.render_frames(layers, 30, 25, where).numpy(), culled)
+        np.testing.assert_array_equal(scene_render.render_frames(layers, 30, 25, where).numpy(), culled)
 
 
 def test_32_layers_are_seen_and_33_refused(device, rng):
