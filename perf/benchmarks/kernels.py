@@ -183,9 +183,12 @@ def bench_counts(scene: Stored, repeats: int, device: wp.Device) -> tuple[float,
 
 
 def commit() -> str:
-    """Return what was measured."""
+    """Return what was measured; "unknown" where there is no git."""
     command = ["git", "describe", "--always", "--dirty"]
-    return subprocess.run(command, capture_output=True, text=True).stdout.strip()
+    try:
+        return subprocess.run(command, capture_output=True, text=True).stdout.strip() or "unknown"
+    except FileNotFoundError:
+        return "unknown"
 
 
 def main() -> None:
