@@ -95,6 +95,23 @@ class Representation(ABC):
 
     def _windows(self, events: EventColumns, edges: Any, *, closed: bool) -> Any:
         """Return the grids of windows, of which the last one holds its end where `closed`."""
+        grids = self.raw_grids(events, edges, closed=closed)
+        return self.finish(grids, float(edges[-1] - edges[0]) / (len(edges) - 1))
+
+    def raw_grids(self, events: EventColumns, edges: Any, *, closed: bool = False) -> Any:
+        """Return the grids of windows before `finish`.
+
+        Args:
+            events: Any; those outside of the windows count for nothing.
+            edges: Window edges, in the unit of the times, float64, shape (W + 1,).
+            closed: Whether the last window holds its end.
+
+        Returns:
+            Shape (W, C, H, W) float32.
+
+        Raises:
+            InputError: Edges do not increase.
+        """
         if edges.ndim != 1 or len(edges) < 2 or not np.all(np.diff(edges) > 0):
             raise InputError("window edges must increase, and there must be at least 2")
         arrays = events.arrays
@@ -107,8 +124,7 @@ class Representation(ABC):
         window = arrays.module.searchsorted(at, part.t, side="right") - 1
         window = window.clip(0, last)
         share = (part.t - at[window]) / (at[window + 1] - at[window])
-        grids = self.sums(part, window, share, at)
-        return self.finish(grids, float(edges[-1] - edges[0]) / (last + 1))
+        return self.sums(part, window, share, at)
 
 
 def grid_of(events: EventColumns, windows: int, channels: int, index: Any, weight: Any) -> Any:

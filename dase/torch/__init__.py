@@ -9,6 +9,7 @@ It needs PyTorch (extra `learn`), which `import dase` alone does not load.
 from __future__ import annotations
 
 from dase.torch.batch import Batch as Batch
+from dase.torch.recordings import Recordings as Recordings
 from dase.torch.scene_numbers import S2R as S2R
 from dase.torch.scene_numbers import Augment as Augment
 from dase.torch.stream import Stream as Stream

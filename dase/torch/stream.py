@@ -170,7 +170,7 @@ class Stream(IterableDataset[Batch]):
             augment=augment,
         )  # fmt: skip
         self.plan.most_layers()
-        self.device = _choose_device(device)
+        self.device = choose_device(device)
         self.left_out = tuple(effect.name for effect in self.sensor.readout_effects())
         # what cannot work is refused here and not in the loop
         draw_scene_numbers(np.random.default_rng(0), self.plan, self.sensor, 1, self.objects)
@@ -244,7 +244,7 @@ class Stream(IterableDataset[Batch]):
         return StoredScene(scene, made, int(drawn.seeds[slot]), times, drawn.places(self.plan)[slot], flips)
 
 
-def _choose_device(device: str | torch.device | None) -> torch.device:
+def choose_device(device: str | torch.device | None) -> torch.device:
     """Return a PyTorch device; raises InputError where it is not there."""
     if device is None:
         device = "cuda" if torch.cuda.is_available() else "cpu"
