@@ -1,5 +1,6 @@
 """A learned, physical event-camera simulator."""
 
+from difflib import get_close_matches
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
@@ -84,12 +85,27 @@ __all__ = list(_MODULE_OF)
 
 
 def __getattr__(name: str) -> Any:
-    if name == "torch":  # the package of that name in here, which needs PyTorch
-        return import_module("dase.torch")
+    if name in ("io", "torch"):  # packages; that of the name torch needs PyTorch
+        return import_module(f"dase.{name}")
     if name not in _MODULE_OF:
-        raise AttributeError(f"module 'dase' has no attribute '{name}'")
+        raise AttributeError(f"module 'dase' has no attribute '{name}'{_hint(name)}")
     return getattr(import_module(_MODULE_OF[name]), name)
 
 
 def __dir__() -> list[str]:
-    return sorted([*globals(), *__all__])
+    return sorted([*globals(), "io", *__all__])
+
+
+def _hint(name: str) -> str:
+    """Return what somebody may have looked for who asked for a name that is not there."""
+    files = {
+        **dict.fromkeys(("load", "open", "read"), "dase.open_recording(path)"),
+        **dict.fromkeys(("save", "write"), "dase.io.write(path, events)"),
+        "convert": "dase.io.convert(source, target)",
+        "show": "dase.plot(what)",
+        "presets": "dase.load_sensor(name)",
+        "signatures": "dase.find_signatures(recording)",
+    }
+    near = get_close_matches(name, __all__, 1)
+    likely = files.get(name.lower()) or (f"dase.{near[0]}" if near else "")
+    return f"; {likely} may be meant" if likely else ""

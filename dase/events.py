@@ -90,6 +90,10 @@ class Events:
     def __len__(self) -> int:
         return len(self.t)
 
+    def __getitem__(self, index: object) -> None:
+        # else Python itself would say no more than that it cannot be done
+        raise TypeError("events: take events.select(index) for some of them, events.t[index] for a column")
+
     def __repr__(self) -> str:
         size = f"{self.width}x{self.height}"
         if not len(self):

@@ -53,12 +53,12 @@ def find_device(name: str) -> wp.Device:
     """
     _start_warp()
     if name.startswith("cuda") and not wp.is_cuda_available():
-        raise ValueError(f"backend '{name}' needs an NVIDIA GPU with a driver, none was found; use 'cpu'")
+        raise ValueError(f"device '{name}' needs an NVIDIA GPU with a driver, none was found; use 'cpu'")
     try:
         return wp.get_device("cuda:0" if name == "cuda" else name)
     except ValueError as error:
         names = ", ".join(d.alias for d in wp.get_devices())
-        raise ValueError(f"backend '{name}' does not exist, here there are: {names}") from error
+        raise ValueError(f"device '{name}' does not exist, here there are: {names}") from error
 
 
 def _forget_threads() -> None:

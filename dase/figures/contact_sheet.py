@@ -14,7 +14,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import EngFormatter, NullFormatter
 from numpy.typing import NDArray
 
-from dase.figures.style import Colour
+from dase.figures.style import Colour, ShownFigure
 from dase.formatting import format_seconds
 from dase.io.sequence import Sequence
 from dase.recordings.statistics import Statistics
@@ -90,7 +90,7 @@ def figure_in_inches(wide: float, tall: float) -> tuple[Figure, Callable[[float,
         wide: Width of the figure.
         tall: Its height.
     """
-    figure = Figure(figsize=(wide, tall), dpi=150, facecolor="white")
+    figure = ShownFigure(figsize=(wide, tall), dpi=150, facecolor="white")
     FigureCanvasAgg(figure)
 
     def axes(x: float, y: float, width: float, height: float) -> Axes:

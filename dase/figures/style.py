@@ -84,6 +84,15 @@ WIDE = 9.6
 """Width of a figure [inch]."""
 
 
+class ShownFigure(Figure):
+    """A figure that notebooks show although nobody has imported pyplot."""
+
+    def _repr_png_(self) -> bytes:
+        out = io.BytesIO()
+        self.savefig(out, format="png")
+        return out.getvalue()
+
+
 @dataclass(frozen=True)
 class Plate:
     """A figure and the words under it.
@@ -106,7 +115,7 @@ class Plate:
         lines = textwrap.wrap(self.caption, 125)
         extra = 0.16 * len(lines) + 0.3
         width, height = self.figure.get_size_inches()
-        alone = Figure(figsize=(width, height + extra), dpi=self.figure.dpi, facecolor="white")
+        alone = ShownFigure(figsize=(width, height + extra), dpi=self.figure.dpi, facecolor="white")
         FigureCanvasAgg(alone)
         axes = alone.add_axes((0, extra / (height + extra), 1, height / (height + extra)))
         axes.imshow(_rendered_pixels(self.figure), aspect="auto", interpolation="none")
@@ -147,7 +156,7 @@ def _rendered_pixels(figure: Figure) -> NDArray[np.uint8]:
 
 def titled_figure(height: float, title: str, about: str = "") -> Figure:
     """Return an empty figure with a title and a quieter line under it; axes begin 0.75 inch below the top."""
-    figure = Figure(figsize=(WIDE, height), dpi=160, facecolor="white")
+    figure = ShownFigure(figsize=(WIDE, height), dpi=160, facecolor="white")
     FigureCanvasAgg(figure)
     figure.text(
         0.3 / WIDE, 1 - 0.24 / height, title, fontsize=12.5, color=Colour.INK, weight="bold", va="center"

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from dase.errors import InputError
 from dase.events import Events
 from dase.figures.event_images import overlay_events
-from dase.figures.style import Colour
+from dase.figures.style import Colour, ShownFigure
 from dase.formatting import format_seconds
 from dase.scenes.between_frames import CameraScene, TrustSettings
 from dase.scenes.frame_motion import HOPELESS
@@ -105,7 +105,7 @@ def _lay_out(count: int, aspect: float) -> tuple[Figure, list[Axes]]:
     across = (wide - 2 * side - pad * (columns - 1)) / columns
     down = across * aspect
     tall = head + math.ceil(count / columns) * (down + label) + 0.15
-    figure = Figure(figsize=(wide, tall), dpi=150, facecolor="white")
+    figure = ShownFigure(figsize=(wide, tall), dpi=150, facecolor="white")
     FigureCanvasAgg(figure)
     places = []
     for n in range(count):

@@ -175,8 +175,8 @@ def split_measurement(
     each = min(pixels, size // 2)
     if each < settings.least_pixels:
         raise InputError(
-            f"a diagnosis needs at least {2 * settings.least_pixels} pixels, "
-            f"the scene has {scene.width}x{scene.height}"
+            f"a diagnosis needs at least {settings.least_pixels} pixels to fit and as many to judge, "
+            f"got {pixels} of {scene.width}x{scene.height}"
         )
     # a stream of its own: the same pixels are chosen whatever else is drawn from the seed
     rng, notes = Draw.PIXELS.generator(seed), list[str]()

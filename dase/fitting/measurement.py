@@ -124,7 +124,7 @@ def as_measurement(
     elif isinstance(measured, Recording):
         found = measurement_of(measured, "frames" if scene is None else scene)
     elif isinstance(measured, Events):
-        if scene is None or scene == "frames":
+        if scene is None or (isinstance(scene, str) and scene == "frames"):
             raise InputError("events do not say what the camera saw: give the scene", argument="scene")
         found = Measurement(measured, _chosen_scene(scene, measured))
     elif isinstance(measured, str | PathLike):
@@ -175,7 +175,7 @@ def measurement_of(
         said += [note for note in recorded.report.notes if note.kind != "odd"]
     if len(recorded.events) == 0:
         raise InputError(f"{name} has no events, so there is nothing to compare")
-    own = scene == "frames"
+    own = isinstance(scene, str) and scene == "frames"
     seen = scene_of_frames(recorded, name, said) if own else _chosen_scene(scene, recorded.events)
     trust: Trust | None = seen.is_trusted if isinstance(seen, CameraScene) else None
     if isinstance(recorded, Recording) and not recorded.mask.all():
@@ -186,6 +186,12 @@ def measurement_of(
 def _chosen_scene(scene: SceneChoice, events: Events) -> Scene:
     if isinstance(scene, Scene):
         return scene
+    if not isinstance(scene, str | PathLike):
+        raise InputError(
+            f"scene: must be a dase.Scene, 'frames', 'static' or a path, got {type(scene).__name__}; "
+            "dase.VideoScene(frames, times) makes one of frames",
+            argument="scene",
+        )
     return static_scene(events) if scene == "static" else open_clip(Path(scene))
 
 

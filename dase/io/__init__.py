@@ -255,8 +255,8 @@ def find_writable_format(path: str | PathLike[str], format: str | None = None) -
     raise InputError(f"format '{format}' cannot be written, {nearest(format, [w.name for w in writers])}")
 
 
-def write(path: str | PathLike[str], sequence: Sequence, *, format: str | None = None) -> None:
-    """Write a whole sequence.
+def write(path: str | PathLike[str], sequence: Sequence | Events, *, format: str | None = None) -> None:
+    """Write a whole sequence, or events alone.
 
     Thresholds and configuration are left out where the format has no place for them.
 
@@ -264,6 +264,7 @@ def write(path: str | PathLike[str], sequence: Sequence, *, format: str | None =
         InputError: Frames have no times, flow has no frames, or the format holds no frames.
     """
     keeps = find_writable_format(path, format).keeps
+    sequence = Sequence(sequence) if isinstance(sequence, Events) else sequence
     if sequence.frames is not None and sequence.frame_times is None:
         raise InputError(f"{path}: frames cannot be written without their times")
     if sequence.frames is None and sequence.flow is not None:

@@ -115,7 +115,7 @@ class Job:
         if not self.targets:
             raise InputError("name at least one recording, or a sensor file")
         if self.backend.startswith("cuda") and not torch.cuda.is_available():
-            raise InputError(f"backend '{self.backend}' needs an NVIDIA GPU that PyTorch can use; use 'cpu'")
+            raise InputError(f"device '{self.backend}' needs an NVIDIA GPU that PyTorch can use; use 'cpu'")
 
     @property
     def targets_sensor(self) -> bool:

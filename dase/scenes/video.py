@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from os import PathLike
 from pathlib import Path
 from typing import Any
 
@@ -132,6 +133,8 @@ def as_scene(scene: Scene | ArrayLike, *, fps: float | None = None, times: Array
         if fps is not None or times is not None:
             raise InputError("scene: knows its own times; fps and times go with frames, shape (F, H, W)")
         return scene
+    if isinstance(scene, str | PathLike):
+        raise InputError(f"scene: '{scene}' is a path; dase.open_video(path) makes a scene of a video")
     frames: NDArray[Any] = np.asarray(scene)
     if frames.ndim != 3 or frames.dtype.kind not in "uf":
         raise InputError(

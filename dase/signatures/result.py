@@ -101,7 +101,8 @@ class Signatures:
         return [f"{'signatures':<15} {size}; false alarms below {self.level:.1g}", *rows]
 
     def __repr__(self) -> str:
-        return "\n".join(self.lines())
+        # a screen has some 100 columns; `lines` has all of it
+        return "\n".join(line if len(line) <= 100 else f"{line[:99]}…" for line in self.lines())
 
     def to_json(self) -> dict[str, Any]:
         """Return what is to be written for machines to read: None where a number is not known."""

@@ -23,7 +23,11 @@ from dase.scenes.video import LOG_EPS
 from dase.simulation.sensor_history import HistoryEntry
 
 
-@dataclass(frozen=True)
+def _readable(value: Any) -> str:
+    return f"{value:.4g}" if isinstance(value, float) else str(value)
+
+
+@dataclass(frozen=True, repr=False)
 class Sensor:
     """An event camera: a threshold and any further effects, in the order in which they act.
 
@@ -56,17 +60,39 @@ class Sensor:
             size, most = f"{self.size[0]}x{self.size[1]}", f"{LARGEST_SIDE}x{LARGEST_SIDE}"
             raise InputError(f"sensor '{self.name}': size must lie between 1x1 and {most}, got {size}")
 
+    def __repr__(self) -> str:
+        """Return a table with a line for each effect; `dump_sensor` writes all of it."""
+        size = "" if self.size is None else f", {self.size[0]}x{self.size[1]}"
+        rows = [
+            (e.name, ", ".join(f"{n} {_readable(getattr(e, n))}" for n in e.settings())) for e in self.effects
+        ]
+        width = max(len(name) for name, _ in rows)
+        lines = [
+            f"Sensor '{self.name}'{size}",
+            *(f"  {name:<{width}}  {text}".rstrip() for name, text in rows),
+        ]
+        if self.history:
+            lines.append(f"  {len(self.history)} entries in .history")
+        return "\n".join(line if len(line) <= 100 else f"{line[:99]}…" for line in lines)
+
     def __getitem__(self, name: str) -> Effect:
         for effect in self.effects:
             if effect.name == name:
                 return effect
-        raise KeyError(f"sensor '{self.name}' has no effect '{name}'")
+        has = ", ".join(effect.name for effect in self.effects)
+        raise KeyError(f"sensor '{self.name}' has no effect '{name}', it has {has}")
 
     def __contains__(self, name: str) -> bool:
         return any(effect.name == name for effect in self.effects)
 
     def with_effect(self, effect: Effect) -> Sensor:
-        """Return the sensor with `effect` added where it acts, or in place of the one of the same name."""
+        """Return the sensor with `effect` added where it acts, or in place of the one of the same name.
+
+        Raises:
+            InputError: It is no effect.
+        """
+        if not isinstance(effect, Effect):
+            raise InputError(f"effect: must be one, such as EFFECTS['leak'](rate=0.1), got {effect!r}")
         if effect.name in self:
             return replace(self, effects=tuple(effect if e.name == effect.name else e for e in self.effects))
         place = {name: i for i, name in enumerate(EFFECTS)}

@@ -42,7 +42,7 @@ def toml(tmp_path: Path, text: str) -> Path:
         (("--regime", "fats"), "did you mean 'fast'?"),
         (("--sensor", "davis345"), "did you mean 'davis346'?"),
         (("--sensor", "missing.toml"), "missing.toml does not exist"),
-        (("--backend", "gpu"), "backend 'gpu' does not exist"),
+        (("--backend", "gpu"), "device 'gpu' does not exist"),
         (("--fps", "30"), "--fps goes with --video"),
     ],
 )
