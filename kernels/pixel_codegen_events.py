@@ -3,6 +3,10 @@
 Times within a step are shares of it, 0 at the sample before and 1 at the present one. The change since the
 last event runs straight from `before` to `after`; `moved` is what the events of this step have taken off it
 so far [log intensity].
+
+There are three rules for crossings in the dead time of a pixel: they are lost although its memory follows
+them; they come when it ends; or, as in a real pixel, the change detector is held in reset meanwhile, so that
+it begins with the signal at the share `at` at which the dead time ends.
 """
 
 from __future__ import annotations
@@ -51,10 +55,15 @@ def sleep_condition(model: PixelModel) -> tuple[Statements, str]:
     """
     crossed = "after >= on or after <= -off"
     asleep: list[Statement] = []
-    if model.delays:
+    if model.delays or model.resets:
         asleep.append(Line("asleep = float(0.0)"))
         for effect, call in model.calls("gate"):
             asleep.append(Guarded(effect, (Line(f"asleep = wp.max(asleep, {call.text})", call.draws),)))
+    if model.resets:
+        # the end of a dead time asks for work without any crossing: then the pixel memorises the signal;
+        # rounding must not let it fall between two steps
+        crossed = f"asleep <= 1.0001 * dt and (asleep > 0.0 or {crossed})"
+    if model.delays:
         # a crossing that waits for the end of the dead time may come although the signal returns
         crossed += " or before >= on or before <= -off"
         # a leak is taken off the reference where there are events, so that it must not sleep
@@ -69,6 +78,8 @@ def step_events(model: PixelModel) -> Statements:
     """Return the events of a step that has any: crossings, cut at the noise events between them."""
     noisy = [effect for effect, _ in model.of("noise")]
     found: list[Statement] = [*lines("moved = float(0.0)", "begun = float(0.0)")]
+    if model.resets:
+        found += [Line("at = float(0.0)"), if_block("asleep > 0.0", *_memorise_at_end(model, "asleep / dt"))]
     if noisy:
         found.append(Block("while begun < 1.0:", _until_noise(model, noisy)))
     else:
@@ -112,7 +123,9 @@ def _crossings(model: PixelModel) -> Statements:
         *(lines("passed = int(0)") if model.delays else ()),
     ]
     # the dearer ways only for sensors that need them
-    if model.of("redraw"):
+    if model.resets:
+        found += _crossings_between_resets(model)
+    elif model.of("redraw"):
         found += _crossings_one_by_one(model)
     elif model.sink == "counts" and not model.of("gate"):
         # nobody asks when they happened
@@ -162,9 +175,65 @@ def _crossings_one_by_one(model: PixelModel) -> Statements:
     return (*found, Block("while passed < crossed:", body), Line("moved += float(passed) * theta"))
 
 
+def _memorise_at_end(model: PixelModel, share: str) -> Statements:
+    """Return the statements for a dead time that ends at a share of the step, maybe beyond its end."""
+    # one that ends beyond is seen to in its own step, unless rounding makes it end between the two
+    return (
+        *lines(f"at = {share}", "until = wp.min(at, 1.0)", "moved = before + (after - before) * until"),
+        *(lines("slipped = leaked_before + (leaked - leaked_before) * until") if model.labelled else ()),
+        *_memorise_leak(model),
+    )
+
+
+def _crossings_between_resets(model: PixelModel) -> Statements:
+    """Return crossings after each of which the pixel is held in reset.
+
+    Without a dead time they are those of pixels that are never held, bit for bit.
+    """
+    label, asked = _label_crossing(model, "share")
+    anew = (
+        *lines("passed = 0", "change = value - moved", "theta = on", "polarity = 1"),
+        if_block("change < 0.0", "theta = -off", "polarity = 0"),
+        Line("crossed = int(whole(wp.abs(change), wp.abs(theta), 1.0 / wp.abs(theta)))"),
+        if_block("at > stop", "crossed = 0"),
+    )
+    redrawn = (
+        Line("drawn = on"),
+        if_block("polarity == 0", "drawn = -off"),
+        if_block(
+            "drawn != theta",
+            "moved += float(passed) * theta",
+            "passed = 0",
+            "theta = drawn",
+            "crossed = int(wp.floor((value - moved) / theta))",
+        ),
+    )
+    body = (
+        *_crossing_time(model, "passed"),
+        *asked,
+        *_event(model, "share", label),
+        Line("passed += 1"),
+        *_memorise_leak(model),
+        *thresholds_after_event(model),
+        *_dead_time(model, "share"),
+        Block(
+            "if wait > 0.0:",
+            # what is left of the step begins at the end of the dead time
+            (*_memorise_at_end(model, "share + wait / dt"), *anew),
+            redrawn if model.of("redraw") else (),
+        ),
+    )
+    return (
+        *lines("passed = int(0)"),
+        if_block("at > stop", "crossed = 0"),
+        Block("while passed < crossed:", body),
+        Line("moved += float(passed) * theta"),
+    )
+
+
 def _crossing_time(model: PixelModel, number: str) -> Statements:
     """Return the statements that set `share` to the time of the crossing after `number` others."""
-    begin = "at" if model.delays else "begun"
+    begin = "at" if model.delays else "wp.max(at, begun)" if model.resets else "begun"
     return (
         Line(f"share = {begin}"),
         # a change that is all noise or leak stands still: its crossings are due at once
@@ -262,6 +331,7 @@ def _event(model: PixelModel, share: str, label: str) -> Statements:
     """Return the emission of an event after `share` of the step."""
     # negative, as the whole step is added to the age when it is over
     aged = lines(f"age = -{share} * dt") if "age" in model.states else ()
+    aged += lines("fired_on = float(polarity)") if "fired_on" in model.states else ()
     if model.sink == "counts":
         return (*lines("on_count += polarity", "off_count += 1 - polarity"), *aged, *model.outlet.emitted)
     time, asked = _leave_pixel(model, share)
@@ -284,7 +354,10 @@ def _noise_event(model: PixelModel, effect: EffectStages) -> Statements:
     polarity, noise = Draw(f"{n}_polarity", "uniform", effect), noise_key(effect)
     is_on = f"uniform({polarity.key}, int({n}_events)) * ({n}_on + {n}_off) < {n}_on"
     # only what leaves the pixel resets it: a dead pixel's noise changes nothing
-    then = (Line("moved = value"), *_memorise_leak(model), *thresholds_after_event(model))
+    then: Statements = (Line("moved = value"), *_memorise_leak(model), *thresholds_after_event(model))
+    if model.resets:
+        held = if_block("wait > 0.0", *_memorise_at_end(model, "stop + wait / dt"))
+        then = (*then, *_dead_time(model, "stop"), held)
     slipped = "slipped = leaked_before + (leaked - leaked_before) * stop"
     return (
         Line("polarity = int(0)"),

@@ -162,7 +162,12 @@ class PixelModel:
     @property
     def delays(self) -> bool:
         """Whether events that a gate holds back come later."""
-        return any(effect.delays for effect, _ in self.of("gate"))
+        return any(effect.delays for effect, _ in self.of("gate")) and not self.resets
+
+    @property
+    def resets(self) -> bool:
+        """Whether a pixel memorises the signal when its dead time ends."""
+        return any(effect.resets for effect, _ in self.of("gate"))
 
     def of(self, stage: str) -> list[tuple[EffectStages, Any]]:
         """Return the functions of a stage with their effects."""

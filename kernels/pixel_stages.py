@@ -10,7 +10,7 @@ A pixel turns light into events in this order; each effect adds Warp functions a
     drift      (intensity, on, off, ...)  -> drift                of the change towards ON [log intensity/s]
     noise      (intensity, on, off, ...)  -> rate_on, rate_off    of events without a change [Hz]
     count      exact threshold crossings of the change since the last event
-    gate       (age, ...)                 -> wait                 time the pixel stays dead [s]
+    gate       (age, fired_on, ...)       -> wait                 time the pixel stays dead [s]
     delay      (intensity, polarity, ...) -> delay                until the event leaves the pixel [s]
 
 A stage function asks for what it needs by the names of its arguments: the quantities above, `t`, `dt`, `x`,
@@ -26,6 +26,7 @@ pixel and sample: they do not depend on the other effects, on chunks, threads or
 
 from __future__ import annotations
 
+import inspect
 from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import IntEnum
@@ -61,7 +62,7 @@ QUANTITIES = {
     "redraw": ("on", "off"),
     "drift": ("intensity", "on", "off"),
     "noise": ("intensity", "on", "off"),
-    "gate": ("age",),
+    "gate": ("age", "fired_on"),
     "delay": ("intensity", "polarity"),
 }
 """What the functions of a stage may ask for beside parameters, states, random numbers and `ANYWHERE`."""
@@ -80,6 +81,7 @@ class EffectStages:
         parameters: Names, in the order of their places in the parameter vector.
         states: Names of what a pixel remembers from sample to sample; all zero at the start.
         delays: Whether the events that `gate` holds back come later; otherwise they are lost.
+        resets: Whether the pixel memorises the signal at the end of the time for which `gate` holds it.
         label: Of the events that `noise` makes.
         off: (parameter, value) pairs; an effect with all of them changes nothing.
         maps: Names of quantities that every pixel has its own value of, handed over as arrays.
@@ -90,6 +92,7 @@ class EffectStages:
     parameters: tuple[str, ...] = ()
     states: tuple[str, ...] = ()
     delays: bool = False
+    resets: bool = False
     label: int = Label.SHOT
     off: tuple[tuple[str, float], ...] = ()
     maps: tuple[str, ...] = ()
@@ -184,6 +187,7 @@ def states(stages: Sequence[EffectStages], sink: str = "keys") -> list[str]:
     names = ["signal", "reference"]
     names += ["leaked", "leaked_rest"] if "drift" in kinds else []
     names += ["age"] if "gate" in kinds else []
+    names += ["fired_on"] if _gates_ask(stages, "fired_on") else []
     names += ["redraws"] if "redraw" in kinds else []
     names += ["leaving"] if "delay" in kinds else []
     names += ["drained"] if "drift" in kinds and sink == "labels" else []
@@ -192,3 +196,8 @@ def states(stages: Sequence[EffectStages], sink: str = "keys") -> list[str]:
             names += [f"{effect.name}_hazard", f"{effect.name}_rest", f"{effect.name}_events"]
         names += [f"{effect.name}_{state}" for state in effect.states]
     return names
+
+
+def _gates_ask(stages: Sequence[EffectStages], quantity: str) -> bool:
+    gates = [f for effect in stages for stage, f in effect.functions if stage == "gate"]
+    return any(quantity in inspect.signature(gate.func).parameters for gate in gates)

@@ -265,6 +265,10 @@ class Effect:
         """Whether events that this effect holds back come later instead of being lost."""
         return False
 
+    def resets(self) -> bool:
+        """Whether this effect holds a pixel in reset: it memorises the light at the end of its dead time."""
+        return False
+
     def longest_step(self) -> float:
         """Return the longest time between samples that still shows the effect [s]."""
         return math.inf
@@ -281,6 +285,7 @@ class Effect:
             parameters=tuple(p.name for p in self.parameters()),
             states=self.states,
             delays=self.delays(),
+            resets=self.resets(),
             label=LABELS.index(self.label),
             maps=self.maps,
             off=tuple((p.name, p.off) for p in self.parameters() if p.off is not None),

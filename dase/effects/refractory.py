@@ -11,9 +11,12 @@ from dase.effects.base import Effect, choice, parameter
 
 
 @wp.func
-def dead_time_left(age: float, period: float):
+def dead_time_left(
+    age: float, fired_on: float, period: float, after_off: float, spread: float, pixel_normal: float
+):
     """Time the pixel stays dead [s]; none when not positive."""
-    return period - age
+    own = period * wp.max(1.0 + spread * pixel_normal, 0.0)
+    return own * (after_off + (1.0 - after_off) * fired_on) - age
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -21,17 +24,24 @@ class Refractory(Effect):
     """Dead time after each event.
 
     After an event a pixel is held in reset for a while and cannot send another. Fast, strong edges lose
-    events, and no two events of a pixel are closer than the dead time.
+    events, and no two events of a pixel are closer than the dead time. It differs from pixel to pixel, and
+    may be longer or shorter after an OFF event than after an ON event.
 
-    With `mode = "drop"`, crossings during the dead time are lost although the memory follows them (ESIM).
-    With `mode = "delay"`, the pixel sends a crossing that still stands when the dead time ends.
+    With `mode = "reset"`, as in real pixels, the change detector is held meanwhile: when the dead time ends,
+    it memorises the light of that moment, and what has changed before is forgotten. On a ramp whose log
+    intensity rises by s per second, an event comes every threshold / s + period seconds.
+
+    Two rules of other simulators send more events. With `mode = "drop"`, crossings during the dead time are
+    lost although the memory follows them, one threshold each (ESIM): the ramp has an event at the first
+    crossing after the dead time, whatever was left of the way. With `mode = "delay"`, the pixel sends a
+    crossing that still stands when the dead time ends: every max(threshold / s, period).
     """
 
     name: ClassVar[str] = "refractory"
     source: ClassVar[str] = (
-        "Rebecq, Gehrig, Scaramuzza: ESIM, an open event camera simulator, 2018; "
         "Lichtsteiner, Posch, Delbruck: A 128x128 120 dB 15 us latency asynchronous "
-        "temporal contrast vision sensor, 2008"
+        "temporal contrast vision sensor, 2008 (reset); "
+        "Rebecq, Gehrig, Scaramuzza: ESIM, an open event camera simulator, 2018 (drop)"
     )
     stages: ClassVar = {"gate": dead_time_left}
 
@@ -41,10 +51,32 @@ class Refractory(Effect):
         off=0.0,
         bounds=(0.0, 1.0),
         plausible=(1e-5, 2e-2),
-        about="dead time",
+        about="dead time after an ON event",
     )
-    mode: str = choice("drop", among=("drop", "delay"), about="what becomes of crossings in the dead time")
+    after_off: float = parameter(
+        1.0,
+        unit="1",
+        bounds=(0.01, 100.0),
+        plausible=(0.3, 3.0),
+        about="dead time after an OFF event, relative to that after an ON event",
+        fitted=False,  # a fit asks for it where the measurement has fast events of both polarities
+    )
+    spread: float = parameter(
+        0.0,
+        unit="1",
+        bounds=(0.0, 1.0),
+        plausible=(0.0, 0.3),
+        about="standard deviation of the dead time over pixels, relative to it",
+        fitted=False,
+    )
+    mode: str = choice(
+        "reset", among=("reset", "drop", "delay"), about="what becomes of changes in the dead time"
+    )
 
     def delays(self) -> bool:
         """Whether crossings in the dead time come later instead of being lost."""
         return self.mode == "delay"
+
+    def resets(self) -> bool:
+        """Whether the pixel is held in reset."""
+        return self.mode == "reset"

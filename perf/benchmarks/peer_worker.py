@@ -49,7 +49,7 @@ def dase_runs(clip: Clip, options: argparse.Namespace) -> dict[str, dict[str, Ru
 
     launch.set_threads(options.threads)
     ideal = dase.Sensor((Threshold(on=0.2, off=0.2, phase=0.0),))
-    noisy = load_sensor("v2e-noisy").with_effect(Refractory(period=NOISY["dead"]))
+    noisy = load_sensor("v2e-noisy").with_effect(Refractory(period=NOISY["dead"], mode="drop"))
     sensors = {"clean": ideal, "noisy": noisy, "as v2e": load_sensor("v2e-clean")}
 
     def given() -> dase.Scene:

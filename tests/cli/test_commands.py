@@ -70,7 +70,7 @@ def test_cuda_without_a_gpu(tmp_path):
         ("[threshold]\n[leak]\nrate = nan", "leak.rate must lie in [0, 100000] Hz, got nan"),
         (
             "[threshold]\n[refractory]\nmode = 'lose'",
-            "refractory.mode must be one of drop, delay, got 'lose'",
+            "refractory.mode must be one of reset, drop, delay, got 'lose'",
         ),
         ("[leak]\nrate = 1.0", "needs the effect 'threshold'"),
         ("size = [0, 3]\n[threshold]", "size must lie between 1x1 and 16384x16384, got 0x3"),

@@ -51,7 +51,7 @@ def all_on(mode: str) -> dase.Sensor:
     return sensor
 
 
-@pytest.mark.parametrize("mode", ["drop", "delay"])
+@pytest.mark.parametrize("mode", ["reset", "drop", "delay"])
 def test_all_effects_on(device, rng, mode):
     scene, sensor = flicker(rng), all_on(mode)
     whole = dase.Events.concatenate(dase.stream(scene, sensor, seed=3, device=device, chunk=10**6))
@@ -139,7 +139,7 @@ def test_noise_in_the_dead_time_is_lost(device):
     assert got.sum() == pytest.approx(want, abs=4 * np.sqrt(want))
 
 
-@pytest.mark.parametrize("mode", ["drop", "delay"])
+@pytest.mark.parametrize("mode", ["reset", "drop", "delay"])
 def test_a_constant_latency_keeps_the_dead_time(device, rng, mode):
     scene, dead = flicker(rng), Refractory(period=4e-3, mode=mode)
     alone = dase.simulate(scene, every(Threshold(), dead, mode=mode), device=device)

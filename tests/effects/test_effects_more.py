@@ -46,7 +46,7 @@ def test_an_effect_switched_off_changes_nothing(device, rng, effect):
     assert len(on) != len(want) or not np.array_equal(on.t, want.t)
 
 
-@pytest.mark.parametrize("mode", ["drop", "delay"])
+@pytest.mark.parametrize("mode", ["reset", "drop", "delay"])
 def test_all_effects_switched_off_change_nothing(device, rng, mode):
     scene = flicker(rng)
     ideal = dase.simulate(scene, dase.Sensor((Threshold(),)), device=device)
@@ -57,7 +57,7 @@ def test_all_effects_switched_off_change_nothing(device, rng, mode):
     same(dase.simulate(scene, every(Threshold(), *busy, mode=mode), device=device), few)
 
 
-@pytest.mark.parametrize("mode", ["drop", "delay"])
+@pytest.mark.parametrize("mode", ["reset", "drop", "delay"])
 def test_all_effects_in_chunks_and_counts(device, rng, mode):
     scene = flicker(rng)
     busy = (*STRONG.values(), Shot(rate=60.0), Leak(rate=8.0, light=3.0), Mismatch(), Bandwidth())

@@ -147,7 +147,7 @@ def test_a_dead_time_that_delays_loses_nothing_and_one_that_drops_does(device, s
         for mode, others in (
             ("drop", ()),
             ("delay", (Refractory(period=4e-3, mode="delay"),)),
-            ("drop", (Refractory(period=4e-3),)),
+            ("drop", (Refractory(period=4e-3, mode="drop"),)),
         )
     )
     assert np.all(ideal == 21) if spread == 0 else len(np.unique(ideal)) > 3

@@ -25,7 +25,7 @@ from dase.effects.vignetting import Vignetting
 from dase.effects.voltage_noise import VoltageNoise
 
 
-def full(mode: str = "drop") -> dase.Sensor:
+def full(mode: str = "reset") -> dase.Sensor:
     """Return a sensor on which every effect is strong."""
     return reference.only(
         Threshold(on=0.17, off=0.23),
@@ -57,7 +57,7 @@ STRONG = {
 }
 
 
-def every(*effects: dase.Effect, mode: str = "drop", log_eps: float = 1e-3) -> dase.Sensor:
+def every(*effects: dase.Effect, mode: str = "reset", log_eps: float = 1e-3) -> dase.Sensor:
     """Return a sensor that has every effect, those not given switched off: one kernel serves many tests."""
     off = [effect.identity() for effect in dase.EFFECTS.values() if effect is not Refractory]
     known = {effect.name: effect for effect in (*off, Refractory(period=0.0, mode=mode), *effects)}

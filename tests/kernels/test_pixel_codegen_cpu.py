@@ -37,6 +37,11 @@ SENSORS = {
     },
     "all, drop": DROP,
     "all, delay, jitter": DROP | {"refractory": dict(period=2e-3, mode="delay"), "jitter": dict(spread=0.1)},
+    "all, reset, jitter": DROP
+    | {
+        "refractory": dict(period=2e-3, after_off=1.5, spread=0.2, mode="reset"),
+        "jitter": dict(spread=0.1),
+    },
 }
 
 

@@ -33,7 +33,7 @@ def test_an_effect_switched_off_changes_nothing(device, rng, effect):
 def test_all_effects_switched_off_change_nothing(device, rng):
     scene = flicker(rng)
     want = dase.simulate(scene, dase.Sensor((Threshold(),)), device=device)
-    for mode in ("drop", "delay"):
+    for mode in ("reset", "drop", "delay"):
         same(dase.simulate(scene, reference.only(Threshold(), mode=mode), device=device), want)
 
 

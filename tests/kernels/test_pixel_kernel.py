@@ -52,7 +52,7 @@ def test_counts_are_the_recursion_of_the_paper(device, rng, kind):
             np.testing.assert_array_equal(got[:, :, i], reference_counts.exact(whole, 48, 80))
 
 
-@pytest.mark.parametrize("mode", ["drop", "delay"])
+@pytest.mark.parametrize("mode", ["reset", "drop", "delay"])
 def test_emission_gives_the_counts_of_counting(device, rng, mode):
     scene, sensor = flicker(rng), full(mode)
     parts = list(dase.stream(scene, sensor, seed=3, device=device, chunk=1))[1:]
@@ -90,7 +90,7 @@ def test_times_are_linear_interpolations(device, rng, kind, error):
         assert np.all(got[:, 0] >= scene.times[want[:, 0].astype(int) - 1] - 1e-9)
 
 
-@pytest.mark.parametrize("mode", ["drop", "delay"])
+@pytest.mark.parametrize("mode", ["reset", "drop", "delay"])
 def test_all_effects_match_the_twin(device, rng, mode):
     scene, sensor = flicker(rng), full(mode)
     times = scene.sample_times()

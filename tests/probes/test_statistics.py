@@ -28,7 +28,7 @@ ON = {
     "linlog": dict(knee=0.1), "bandwidth": dict(cutoff=80.0), "second_order": dict(cutoff=80.0, damping=0.5),
     "voltage_noise": dict(sigma=0.08, cutoff=60.0), "mismatch": dict(spread=0.2), "jitter": dict(spread=0.2),
     "leak": dict(rate=3.0), "shot": dict(rate=5.0), "hot": dict(share=0.05), "dead": dict(share=0.1),
-    "refractory": dict(period=4e-3), "latency": dict(delay=2e-3),
+    "refractory": dict(period=4e-3, after_off=1.5, spread=0.2), "latency": dict(delay=2e-3),
 }  # fmt: skip
 
 

@@ -83,6 +83,8 @@ class Detector:
         leak: Drift towards ON [log intensity/s].
         period: Dead time [s].
         delays: Whether a dead pixel looks again when the dead time ends; else its memory goes on.
+        resets: Whether it memorises the signal of that moment.
+        after_off: Dead time after an OFF event, relative to that after an ON event.
         waiting: Hazard before noise event n.
         bright: Uniform number that decides the polarity of noise event n >= 1.
     """
@@ -94,6 +96,8 @@ class Detector:
     leak: float = 0.0
     period: float = 0.0
     delays: bool = False
+    resets: bool = False
+    after_off: float = 1.0
     waiting: Callable[[int], float] = lambda n: np.inf
     bright: Callable[[int], float] = lambda n: 0.0
 
@@ -125,20 +129,22 @@ class Detector:
         """
         level = signal + self.leak * (times - times[0])
         memory = self.start(level[0], level[1])
-        last, hazard, drawn = -np.inf, self.waiting(0), 1
+        alive_from, held, hazard, drawn = -np.inf, False, self.waiting(0), 1
         out: list[tuple[float, ...]] = []
         for k in range(1, len(times)):
             now, end, total = times[k - 1], times[k], rates[k].sum()
             slope = (level[k] - level[k - 1]) / (end - now)
             noise = now + hazard / total if total > 0 else np.inf
             while True:
-                look = max(now, last + self.period) if self.delays else now
+                if held and alive_from <= min(end, noise):
+                    memory, held, now = level[k] + slope * (alive_from - end), False, alive_from
+                look = max(now, alive_from) if self.delays else now
                 change = level[k] + slope * (look - end) - memory
-                crossing, theta = self.crossing(look, change, slope)
+                crossing, theta = (np.inf, 0.0) if held else self.crossing(look, change, slope)
                 now = min(crossing, noise)
                 if now > end:
                     break
-                alive = self.delays * (now == crossing) or now - last >= self.period
+                alive = self.delays * (now == crossing) or now >= alive_from
                 if now == crossing:
                     memory += theta
                     row = (k, now, float(theta > 0), abs(slope))
@@ -148,7 +154,8 @@ class Detector:
                     noise, drawn = now + self.waiting(drawn) / total, drawn + 1
                 if alive:
                     out.append(row)
-                    last = now
+                    alive_from = now + self.period * (1.0 if row[2] else self.after_off)
+                    held = self.resets and alive_from > now
             hazard = (noise - end) * total if total > 0 else hazard
         return np.array(out, np.float64).reshape(-1, 4)
 
@@ -170,10 +177,12 @@ def setting(sensor: dase.Sensor, effect: str, name: str, missing: Any) -> Any:
 def detector(sensor: dase.Sensor, index: int, seed: int) -> Detector:
     """Return the change detector of one pixel."""
     off, on = thresholds(sensor, index, seed)
-    start, noise, polarity, leak = (
-        Stream(name, seed, index)
-        for name in ("initial_phase", "shot_noise", "shot_polarity", "leak_drift_pixel_normal")
-    )
+    names = (
+        "initial_phase", "shot_noise", "shot_polarity", "leak_drift_pixel_normal",
+        "refractory_gate_pixel_normal",
+    )  # fmt: skip
+    start, noise, polarity, leak, dead = (Stream(name, seed, index) for name in names)
+    dead_spread = setting(sensor, "refractory", "spread", 0.0)
     rate, nominal_on = setting(sensor, "leak", "rate", 0.0), sensor["threshold"].on
     return Detector(
         on=on,
@@ -181,8 +190,10 @@ def detector(sensor: dase.Sensor, index: int, seed: int) -> Detector:
         lead=sensor["threshold"].phase * start.uniform(0),
         falls=start.uniform(1) < 0.5,
         leak=max(rate * (1 + setting(sensor, "leak", "spread", 0.0) * leak.normal()), 0.0) * nominal_on,
-        period=setting(sensor, "refractory", "period", 0.0),
+        period=setting(sensor, "refractory", "period", 0.0) * max(1 + dead.normal() * dead_spread, 0.0),
+        after_off=setting(sensor, "refractory", "after_off", 1.0),
         delays=setting(sensor, "refractory", "mode", "drop") == "delay",
+        resets=setting(sensor, "refractory", "mode", "drop") == "reset",
         waiting=noise.waiting,
         bright=polarity.uniform,
     )
@@ -213,7 +224,7 @@ def events(sensor: dase.Sensor, times: np.ndarray, intensity: np.ndarray, seed: 
     return [detector(sensor, i, seed).run(times, level[:, i], rates[:, i]) for i in range(intensity.shape[1])]
 
 
-def only(*effects: dase.Effect, mode: str = "drop", log_eps: float = 1e-3) -> dase.Sensor:
+def only(*effects: dase.Effect, mode: str = "reset", log_eps: float = 1e-3) -> dase.Sensor:
     """Return a sensor with these effects and the common ones switched off: one kernel serves many tests."""
     every = {name: dase.EFFECTS[name].identity() for name in COMMON}
     every["refractory"] = dase.EFFECTS["refractory"](period=0.0, mode=mode)

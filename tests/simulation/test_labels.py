@@ -47,7 +47,7 @@ def slope(change: float, pixels: int = 40, samples: int = 41) -> reference.LogSc
     return reference.LogScene(level, np.linspace(0, 1, samples))
 
 
-def noisy(mode: str = "drop") -> dase.Sensor:
+def noisy(mode: str = "reset") -> dase.Sensor:
     return reference.only(
         Mismatch(spread=0.1),
         Bandwidth(cutoff=400.0),
@@ -98,7 +98,7 @@ def test_a_still_scene_with_both(device):
     assert both.p[both.label == LEAK].all()
 
 
-@pytest.mark.parametrize("mode", ["drop", "delay"])
+@pytest.mark.parametrize("mode", ["reset", "drop", "delay"])
 def test_a_moving_scene_without_noise(device, rng, mode):
     sensor = reference.only(Mismatch(spread=0.2), Bandwidth(), Refractory(period=2e-3, mode=mode), mode=mode)
     got = labels(dase.simulate(moving(rng), sensor, device=device, labels=True))
@@ -118,7 +118,7 @@ def test_a_moving_scene_without_noise(device, rng, mode):
     ],
 )
 @pytest.mark.parametrize("phase", [0.0, 1.0])
-@pytest.mark.parametrize("mode", ["drop", "delay"])
+@pytest.mark.parametrize("mode", ["reset", "drop", "delay"])
 def test_the_greater_share_decides(device, change, leak, want, phase, mode):
     # light moves the pixel by `change` in a second, the leak by `leak`; ON events where the sum rises
     sensor = reference.only(
@@ -192,7 +192,7 @@ def test_a_noise_effect_names_its_events(device):
     assert events.p[events.label == HOT].all()
 
 
-@pytest.mark.parametrize("mode", ["drop", "delay"])
+@pytest.mark.parametrize("mode", ["reset", "drop", "delay"])
 def test_labels_change_no_event(device, rng, mode):
     scene, sensor = moving(rng), noisy(mode)
     want = dase.simulate(scene, sensor, device=device)
