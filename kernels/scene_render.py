@@ -72,7 +72,7 @@ def flow_kernel(lanes: int) -> wp.Kernel:
     """Return the kernel that renders flow, over blocks of `lanes` pixels."""
     f, start_of = lane_functions(lanes), block_functions(lanes)
     columns, rows = _places(lanes)
-    layers_of, foremost, store = start_of.layers_of, f.foremost, f.store
+    layers_of, foremost = start_of.layers_of, f.foremost
 
     @wp.kernel(enable_backward=False, module="unique", module_options=lane_options())
     def render_velocity(
@@ -92,11 +92,11 @@ def flow_kernel(lanes: int) -> wp.Kernel:
         y = rows(n, width)
         near = layers_of(layers, x, y)
         for k in range(out.shape[0]):
-            for axis in range(2):
-                along = foremost(
-                    x, y, layers.texels, layers.start, layers.size, layers.place, k, near, velocity, axis
-                )
-                store(out[k, axis], n, along)
+            top = foremost(x, y, layers.texels, layers.start, layers.size, layers.place, k, near)
+            for lane in range(wp.static(lanes)):
+                flow = velocity[k, int(top[lane])] * wp.vec3(x[lane], y[lane], 1.0)
+                out[k, 0, n + lane] = flow[0]
+                out[k, 1, n + lane] = flow[1]
 
     return render_velocity
 

@@ -17,7 +17,7 @@ from dase.kernels.scene_layers import (
     layers_near,
 )
 from dase.kernels.threshold_counts import block_functions
-from dase.kernels.vector_math import lane_options, lanewise_function
+from dase.kernels.vector_math import lane_functions, lane_options
 
 
 @wp.struct
@@ -69,60 +69,15 @@ def render_scenes(
         frame_out[k, b, i] = layer_intensity(layers, ground, near, k, x, y) * scenes.light[b, k]
 
 
-FOREMOST = """
-// as dase.kernels.scene_layers.foremost_velocity looks for it, all pixels of the block layer by layer
-V result = x * 0.0f;
-I open = x == x;
-unsigned left = (unsigned)near;
-while (left != 0) {
-    const int layer = HIGHEST(left);
-    left ^= 1u << layer;
-    const auto& m = wp::index(place, k, layer);
-    const int width = size.data[layer][0];
-    const int height = size.data[layer][1];
-    V u = (x * m.data[0][0] + y * m.data[0][1]) + m.data[0][2];
-    V v = (x * m.data[1][0] + y * m.data[1][1]) + m.data[1][2];
-    I inside = open & (u > -1.0f) & (v > -1.0f) & (u < (float)width) & (v < (float)height);
-    if (!ANY(inside)) continue;
-    u = inside ? u : V(0.0f);
-    v = inside ? v : V(0.0f);
-    V whole_u = FLOOR(u);
-    V whole_v = FLOOR(v);
-    V fu = u - whole_u;
-    V fv = v - whole_v;
-    I iu = WHOLE(whole_u);
-    I iv = WHOLE(whole_v);
-    const float* alphas = (const float*)(texels.data + start.data[layer]) + 1;
-    I at = 2 * (iv * width + iu);
-    I west = inside & (iu >= 0);
-    I east = inside & (iu + 1 < width);
-    I north = iv >= 0;
-    I south = iv + 1 < height;
-    auto LOOK = [=](I ok, I i) { return ok ? AT(alphas, ok ? i : I(0)) : V(0.0f); };
-    V upper = LOOK(west & north, at);
-    upper = upper + fu * (LOOK(east & north, at + 2) - upper);
-    V lower = LOOK(west & south, at + 2 * width);
-    lower = lower + fu * (LOOK(east & south, at + 2 * width + 2) - lower);
-    I found = inside & (upper + fv * (lower - upper) > 0.0f);
-    result = found ? V((float)layer) : result;
-    open = open & (found == 0);
-    if (!ANY(open)) break;
-}
-"""
-"""C++ of the number of the foremost layer with alpha > 0, see `dase.kernels.vector_math`."""
-
-
 @lru_cache(maxsize=4)
 def flow_kernel(lanes: int) -> wp.Kernel:
     """Return the kernel of the flow at the ends of runs, over (B, runs · blocks of `lanes` pixels) threads.
 
     The last block of a run ends with the last pixel and may overlap the one before.
     """
-    layers = "texels: wp.array[wp.vec2], start: wp.array[int], size: wp.array[wp.vec2i], "
-    layers += "place: wp.array2d[Affine], k: int, near: int"
-    foremost = lanewise_function(f"foremost_{lanes}", lanes, FOREMOST, "x y", layers)
     start_of = block_functions(lanes)
     columns, rows, layers_of = start_of.columns, start_of.rows, start_of.layers_of
+    foremost = lane_functions(lanes).foremost
 
     @wp.kernel(enable_backward=False, module="unique", module_options=lane_options())
     def flow_at_ends(

@@ -263,16 +263,12 @@ V result = sum + through * light;
 """
 
     foremost = f"""
-// velocity of the foremost layer that is not wholly transparent, along one axis [px/s]
-auto ALONG = [&](int layer) {{
-    const auto& m = wp::index(velocity, k, layer);
-    return V((x * m.data[axis][0] + y * m.data[axis][1]) + m.data[axis][2]);
-}};
-V result = ALONG(0);
+// number of the foremost layer that is not wholly transparent, 0 for the background
+V result = x * 0.0f;
 I open = x == x;
 {walk_layers}
     const I hit = open & (alpha > 0.0f);
-    result = hit ? ALONG(layer) : result;
+    result = hit ? V((float)layer) : result;
     open = open & (alpha <= 0.0f);
     if (!ANY(open)) break;
 }}
@@ -342,7 +338,7 @@ def native_function(name: str, snippet: str, scope: dict[str, Any], arguments: s
     return function_from_text(text, name, {**scope, "wp": wp, "snippet": snippet})
 
 
-def lanewise_function(
+def _lanewise_function(
     name: str, length: int, body: str, lanes: str, others: str = "", cuda: str | None = None
 ) -> Any:
     """Return a function from Warp vectors to a Warp vector, from C++ that sets `result`.
@@ -381,7 +377,7 @@ def lane_functions(length: int) -> SimpleNamespace:
     scope = {"Lanes": lane_type(length)}
 
     def lanewise(name: str, body: str, lanes: str, others: str = "", cuda: str | None = None) -> Any:
-        return lanewise_function(f"{name}_{length}", length, body, lanes, others, cuda)
+        return _lanewise_function(f"{name}_{length}", length, body, lanes, others, cuda)
 
     def plain(name: str, snippet: str, arguments: str, returns: str) -> Any:
         return native_function(f"{name}_{length}", snippet.format(length=length), scope, arguments, returns)
@@ -415,9 +411,7 @@ def lane_functions(length: int) -> SimpleNamespace:
         natural=lanewise("natural", "V x = a;" + _Cpp.logarithm, "a", cuda="V result = logf(a);"),
         exponential=lanewise("exponential", _Cpp.exponential, "x", cuda="V result = expf(x);"),
         foreground=lanewise("foreground", _Cpp.foreground, "light x y", layers),
-        foremost=lanewise(
-            "foremost", _Cpp.foremost, "x y", f"{layers}, velocity: wp.array2d[Affine], axis: int"
-        ),
+        foremost=lanewise("foremost", _Cpp.foremost, "x y", layers),
         background=lanewise("background", _Cpp.background, "x y", f"{ground}, inverse: wp.vec2, width: int"),
     )
 
