@@ -66,6 +66,7 @@ def show_command(
     if trust and (suffix == ".mp4" or at is not None):
         raise InputError("trust: is a picture of several moments, which takes neither --at nor .mp4")
     sequence = io.read(file, **reading)
+    statistics = sequence_statistics(sequence)
     if trust:
         _draw_trust(sequence, output, printable(file.stem), window)
     elif suffix == ".mp4":
@@ -74,10 +75,12 @@ def show_command(
                 "this OpenCV has neither H.264 nor VP9: the video is MPEG-4, which browsers do not play"
             )
     else:
-        figure = event_images.draw_sequence(sequence, title=printable(file.stem), at=at, window=window)
+        figure = event_images.draw_sequence(
+            sequence, title=printable(file.stem), at=at, window=window, statistics=statistics
+        )
         with io.replacing(output) as temporary:
             figure.savefig(temporary)
-    for name, value in summary.statistics_table(sequence_statistics(sequence)):
+    for name, value in summary.statistics_table(statistics):
         click.echo(f"{name:<18}{value}")
     click.echo(f"{'written':<18}{output}")
 

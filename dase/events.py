@@ -155,7 +155,7 @@ class Events:
         bounds = np.searchsorted(self.t, edges)
         out = np.zeros((len(edges) - 1, 2, self.height, self.width), np.int32)
         size = 2 * self.height * self.width
-        flat = (self.p * self.height + self.y.astype(np.int64)) * self.width + self.x
         for window, (i, j) in enumerate(pairwise(bounds)):
-            out[window] = np.bincount(flat[i:j], minlength=size).reshape(2, self.height, self.width)
+            flat = (self.p[i:j] * self.height + self.y[i:j].astype(np.int64)) * self.width + self.x[i:j]
+            out[window] = np.bincount(flat, minlength=size).reshape(2, self.height, self.width)
         return out

@@ -18,7 +18,7 @@ from dase.figures.style import Colour
 from dase.io.ffmpeg import quiet_ffmpeg
 from dase.io.image_files import quiet_opencv
 from dase.io.sequence import Sequence, replacing
-from dase.recordings.statistics import sequence_statistics
+from dase.recordings.statistics import Statistics, sequence_statistics
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -84,6 +84,7 @@ def draw_sequence(
     at: float | None = None,
     window: float | None = None,
     moments: int = 6,
+    statistics: Statistics | None = None,
 ) -> Figure:
     """Draw moments of a sequence, its event rate and the intervals between events of one pixel.
 
@@ -93,6 +94,7 @@ def draw_sequence(
         at: Show this time only [s].
         window: Events of this span around each moment are shown [s]; default: `default_window`.
         moments: How many moments to show.
+        statistics: Of the sequence, where they are known; else they are worked out.
 
     Raises:
         InputError: `at` lies outside the sequence, or `window` is not positive.
@@ -106,9 +108,8 @@ def draw_sequence(
     dots = 360 if len(times) > 1 else 1300  # dots across a picture that stay visible on the sheet
     shrink = math.ceil(sequence.events.width / dots)
     panels = [moment_picture(sequence, time, window, shrink=shrink) for time in times]
-    return contact_sheet.draw_contact_sheet(
-        sequence, sequence_statistics(sequence), between, panels, times, window, title
-    )
+    statistics = sequence_statistics(sequence) if statistics is None else statistics
+    return contact_sheet.draw_contact_sheet(sequence, statistics, between, panels, times, window, title)
 
 
 def moment_picture(sequence: Sequence, time: float, window: float, *, shrink: int = 1) -> NDArray[np.uint8]:
