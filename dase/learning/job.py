@@ -73,8 +73,8 @@ class Job:
     Args:
         targets: Recordings, or one sensor file or preset.
         images: Textures of the simulator's scenes, as `dase.scenes.image_sources.open_images` takes them;
-        `frames` for the
-            windows of the recordings themselves; "" for `frames`, or `builtin` if there are none.
+            `frames` for the windows of the recordings themselves; "" for `frames`, or `builtin` if there are
+            none.
         preset: One of `PRESETS`.
         objective: `moments`, `wgan`, or "" for that of the preset.
         window: Duration of a window [s].

@@ -22,6 +22,7 @@ from __future__ import annotations
 
 import argparse
 import hashlib
+import inspect
 import json
 import os
 import platform
@@ -57,13 +58,13 @@ class Work:
 
 
 def located(modules: tuple[str, ...]) -> Any:
-    """Return the first of the modules that is there."""
+    """Return the first of the modules that this checkout, the working directory, has.
+
+    Whether one can be imported does not tell: an editable installation lends those of its own checkout.
+    """
     for module in modules:
-        try:
+        if Path(*module.split(".")).with_suffix(".py").is_file():
             return import_module(module)
-        except ModuleNotFoundError as error:
-            if error.name is None or not module.startswith(error.name):
-                raise
     raise ModuleNotFoundError(f"none of {', '.join(modules)} is there")
 
 
@@ -122,8 +123,12 @@ def make_diagnose(options: argparse.Namespace) -> Work:
         true = dase.Sensor(effects=(threshold(on=0.22, off=0.19),)).with_effect(bandwidth(cutoff=40.0))
         events = dase.simulate(scene, true, seed=5, device="cpu")
 
+    # the scene was the second argument once
+    named = "scene" in inspect.getfullargspec(dase.diagnose).kwonlyargs
+    asked = ((events, given), {"scene": scene}) if named else ((events, scene, given), {})
+
     def call() -> Any:
-        found = dase.diagnose(events, scene, given, most=1, pixels=pixels, device=options.device)
+        found = dase.diagnose(*asked[0], **asked[1], most=1, pixels=pixels, device=options.device)
         return [sorted(found.selected), list(found.errors), found.evaluations]
 
     return Work(call)
@@ -132,7 +137,9 @@ def make_diagnose(options: argparse.Namespace) -> Work:
 def make_train(options: argparse.Namespace) -> Work:
     """Steps of learning thresholds; its state goes on, so each call is the next step of both."""
     job = located(TRAINING)
-    training = job.prepare(
+    # it was called `prepare` once
+    open_training = getattr(job, "open_training", None) or job.prepare
+    training = open_training(
         job.Job(targets=("esim",), preset="tiny", sequences=24, steps=100_000, backend=options.device)
     )
     for _ in range(30):
