@@ -171,21 +171,29 @@ def open_training(
     if job.targets_sensor:
         if len(job.targets) > 1:
             raise InputError(f"one sensor file is one target, got {len(job.targets)}")
-        scenery = _textured_scenery(job, job.scene_settings())
+        looks = job.scene_settings()
+        _check_patches(job, looks)  # before the work of making textures
+        scenery = _textured_scenery(job, looks)
         target = simulate_target(
             load_sensor(job.targets[0]), scenery, job.sequences, seed=job.seed, backend=job.backend,
             progress=lambda done, total: progress("simulating the target", done, total),
         )  # fmt: skip
     else:
         target, scenery = _open_recorded(job, progress)
+        _check_patches(job, scenery.scene_settings)
     recipe = job.recipe()
     if job.pattern:
         size = scenery.scene_settings.width, scenery.scene_settings.height
         recipe = replace(recipe, network=replace(recipe.network, pattern=size))
-    width, height = scenery.scene_settings.width, scenery.scene_settings.height
-    if recipe.objective == "wgan" and min(width, height) < recipe.adversarial.hash.size:
-        raise InputError(f"patches are {recipe.adversarial.hash.size} px wide, the sensor {width}x{height}")
     return compose_training(recipe, target, scenery)
+
+
+def _check_patches(job: Job, looks: SceneSettings) -> None:
+    """Raise InputError where not one patch fits on the sensor."""
+    recipe = job.recipe()
+    size = recipe.adversarial.hash.size
+    if recipe.objective == "wgan" and min(looks.width, looks.height) < size:
+        raise InputError(f"patches are {size} px wide, the sensor {looks.width}x{looks.height}")
 
 
 def compose_training(recipe: Recipe, target: Target, scenery: Scenery) -> Training:

@@ -100,6 +100,7 @@ def test_nothing_is_invented(scene, device):
     assert "nothing is missing" in found.finding()
 
 
+@pytest.mark.slow
 def test_two_hidden_effects_are_both_found(scene, device):
     events = hidden(scene, device, EFFECTS["mismatch"](spread=0.25), EFFECTS["leak"](rate=5.0))
     found = diagnose(events, scene=scene, effects=LIBRARY, pixels=PIXELS, device=device)
@@ -146,6 +147,7 @@ def test_another_simulator(shared, device):
     assert found.parameters["linlog.slope"].value == pytest.approx(np.log(20), rel=0.05)
 
 
+@pytest.mark.slow
 def test_intervals_cover_the_truth(scene, device):
     """Over several measurements, a 90 % interval holds the truth about as often as it says."""
     true = {"threshold.on": 0.18, "threshold.off": 0.22, "leak.rate": 4.0}
@@ -161,6 +163,7 @@ def test_intervals_cover_the_truth(scene, device):
     assert got["leak.rate"].high / got["leak.rate"].low < 1.5
 
 
+@pytest.mark.slow
 def test_a_fit_from_far_away(scene, device):
     events = hidden(scene, device, EFFECTS["leak"](rate=4.0))
     given = Sensor(effects=(EFFECTS["threshold"](on=0.5, off=0.1),)).with_effect(EFFECTS["leak"](rate=0.3))

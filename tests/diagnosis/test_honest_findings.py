@@ -252,6 +252,7 @@ def at_rest(length: float, rate: float, side: int = 64) -> dase.Events:
     return dase.simulate(StaticScene(side, side, length), sensor, seed=3)
 
 
+@pytest.mark.slow
 def test_of_a_long_recording_a_part_is_compared():
     """Memory and time do not grow with the recording; which part it was is said."""
     events = at_rest(60.0, 2.0)

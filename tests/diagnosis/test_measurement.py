@@ -204,11 +204,11 @@ def test_a_recording_its_path_and_its_measurement_give_the_same(recording, measu
     made = measurement_of(opened)
     assert made.notes == measured.notes
     np.testing.assert_array_equal(made.scene.frames([0.1, 0.2]), measured.scene.frames([0.1, 0.2]))
-    found = [dase.compare(what, "ideal", pixels=300) for what in (path, str(path), opened, made, measured)]
+    found = [dase.compare(what, "ideal", pixels=100) for what in (path, str(path), opened, made, measured)]
     assert len({one.error for one in found}) == 1
     assert len({one.notes for one in found}) == 1
     assert found[0].notes[: len(measured.notes)] == measured.notes
-    told = dase.compare(events, SENSOR, scene=measured.scene, pixels=300)
+    told = dase.compare(events, SENSOR, scene=measured.scene, pixels=100)
     assert told.error == found[0].error
     assert told.notes == found[0].notes[len(measured.notes) :]
 

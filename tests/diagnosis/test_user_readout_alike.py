@@ -114,11 +114,12 @@ class OneMode(Readout):
 @pytest.mark.parametrize(
     ("hidden", "own", "users"),
     [
-        (Timestamp(step=5e-4, jitter=0.0), Timestamp, Ticker),
-        (RowScan(line=1e-5, direction="right"), RowScan, Sweep),
-        (Readout(rate=2e5), OneMode, Post),
+        pytest.param(Timestamp(step=5e-4, jitter=0.0), Timestamp, Ticker, id="clock"),
+        pytest.param(
+            RowScan(line=1e-5, direction="right"), RowScan, Sweep, id="scan", marks=pytest.mark.slow
+        ),
+        pytest.param(Readout(rate=2e5), OneMode, Post, id="bus", marks=pytest.mark.slow),
     ],
-    ids=["clock", "scan", "bus"],
 )
 def test_a_users_readout_is_diagnosed_as_that_of_dase(hidden, own, users, device):
     scene = moving_bars(duration=0.5)

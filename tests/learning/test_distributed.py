@@ -88,6 +88,7 @@ def flat(value, at=""):
             yield from flat(inner, f"{at}/{key}")
 
 
+@pytest.mark.slow
 def test_two_processes_do_what_one_does_with_all_scenes(tmp_path):
     launched(str(Path(__file__)), str(tmp_path / "two.pt"))
     two = torch.load(tmp_path / "two.pt", weights_only=True)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ast
 import re
+from functools import cache
 
 import pytest
 from helpers.scripts import ROOT, load_script
@@ -35,6 +36,7 @@ def file_of(module: str):
     return path / "__init__.py" if path.is_dir() else path.with_suffix(".py")
 
 
+@cache
 def outside(module: str) -> set[str]:
     """Return the packages other than dase that a module imports at its top."""
     found = set()
