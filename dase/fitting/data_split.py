@@ -20,6 +20,7 @@ from dase.fitting.pixel_selection import choose_trusted_pixels, find_trusted_par
 from dase.fitting.subset import Array, CalibratedSubset, PixelSubset
 from dase.fitting.time_window import (
     choose_window,
+    is_constant,
     outside_gaps,
     repeated_gaps,
     sentence_of_window,
@@ -194,24 +195,32 @@ def split_measurement(
         notes.append(looks.sentence())
     # from the begin of the scene also for the half that judges: filters and memories are settled there
     times = times_of_grid(scene, grid)
-    light = light_of(scene, times, chosen)
+    # light that does not change is not stored step by step
+    still = is_constant(scene)
+    light = light_of(scene, times[:1] if still else times, chosen)
     if not np.all(np.isfinite(light)) or light.min() < 0:
         raise InputError("scene: intensities must be finite and >= 0")
-    good = np.ones(light.shape, np.bool_) if trust is None else trust(times, chosen).T.copy()
+    light = np.broadcast_to(light, (len(chosen), len(times))) if still else light
+    # a row for all pixels where all are trusted alike
+    good = np.ones((1, len(times)), np.bool_) if trust is None else trust(times, chosen).T.copy()
     if len(gaps):
         good &= outside_gaps(gaps)(times)
         length = 1e3 * float(np.median(np.diff(gaps, axis=1)))
         notes.append(f"{len(gaps)} gaps of {length:.3g} ms without any event: data are missing, and left out")
     good[:, 1:] &= good[:, :-1]  # a step is what lies between two points of the grid
     # both halves have the same bands, or a cell would mean another brightness in each
-    bands = band_edges(light, good)
+    bands = band_edges(light, np.broadcast_to(good, light.shape))
     sorting = partial(sort_into_cells, step=grid.step, bands=bands, log_eps=log_eps)
     # filters over time go pixel by pixel, so parts of the pixels give the same as all of them
     works: list[Callable[[], Any]] = [partial(sorting, part) for part in np.array_split(light, 8)]
     works.append(partial(find_structure, events))
     *parts, structure = launch.run_concurrently(works)
     cell = np.concatenate(parts)
-    cell[~good] = MASKED
+    del parts
+    if len(good) == 1:
+        cell[:, ~good[0]] = MASKED
+    else:
+        cell[~good] = MASKED
     cell[:, 0] = MASKED  # no step ends at the first point
     first, last = slice(0, each), slice(each, 2 * each)
     train_grid = replace(grid, steps=cut)
@@ -219,7 +228,9 @@ def split_measurement(
     late = cell[last].copy()
     late[:, :cut] = MASKED
     halves: list[PixelSubset] = []
-    for part, stretch, cells in ((first, train_grid, cell[first, :cut]), (last, grid, late)):
+    early = cell[first, :cut].copy()
+    del cell, good  # as large as each other, and no longer needed
+    for part, stretch, cells in ((first, train_grid, early), (last, grid, late)):
         stimulus = Stimulus(
             chosen[part], scene.width, scene.height, stretch, light[part, : stretch.steps], cells, log_eps,
             to, trust is not None or len(gaps) > 0,
@@ -241,7 +252,7 @@ def split_measurement(
         for half in halves
     )
     rates = highest_event_rate(events), least_bus_rate(events, structure)
-    contradiction = contradiction_of_rest(events, light)
+    contradiction = contradiction_of_rest(events, light[:, :1] if still else light)
     if contradiction:
         notes.insert(0, contradiction)
     return SplitMeasurement(train, held, scout, bands, structure, peak, *rates, tuple(notes), contradiction)

@@ -247,7 +247,10 @@ def refine_frequency(events: Events, begin: float, end: float, near: float) -> f
     net = (net - net.mean()) * np.hanning(bins)
     # finer than a Fourier transform of this time has them
     frequency = near + np.linspace(-1.5, 1.5, 121) / (end - begin)
-    power = np.abs(np.exp(-2j * np.pi * frequency[:, None] * step * np.arange(bins)) @ net) ** 2
+    power = np.empty(len(frequency))
+    for few in np.array_split(np.arange(len(frequency)), 31):  # all at once would not fit into memory
+        turns = np.exp(-2j * np.pi * frequency[few, None] * step * np.arange(bins))
+        power[few] = np.abs(turns @ net) ** 2
     top = int(power[1:-1].argmax()) + 1
     left, middle, right = np.log(power[top - 1 : top + 2] + 1e-300)
     shift = 0.5 * (left - right) / min(left - 2 * middle + right, -1e-12)

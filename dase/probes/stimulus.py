@@ -51,6 +51,8 @@ class StimulusSettings:
 
 
 STIMULUS = StimulusSettings()
+AT_ONCE = 128
+"""Pixels whose steps are looked at together, for the memory that takes."""
 
 
 @dataclass(frozen=True)
@@ -83,7 +85,7 @@ class Stimulus:
         width: Columns of the sensor.
         height: Rows of the sensor.
         grid: The time.
-        intensity: Linear, float32, shape (N, T).
+        intensity: Linear, float32, shape (N, T); a view of one column where no light ever changes.
         cell: Cell of each pixel and step, uint8, shape (N, T); `MASKED` where nothing is compared.
         log_eps: Added to intensities before the logarithm.
         device: Where kernels run.
@@ -103,13 +105,21 @@ class Stimulus:
 
     @property
     def level(self) -> NDArray[np.float32]:
-        """Log intensity, shape (N, T)."""
-        out: NDArray[np.float32] = np.log(self.intensity + np.float32(self.log_eps))
+        """Log intensity, shape (N, T); a view of one column where the light is one."""
+        light = self.intensity
+        if light.strides[1] == 0:  # at rest: as many logarithms as pixels
+            return np.broadcast_to(np.log(light[:, :1] + np.float32(self.log_eps)), light.shape)
+        out: NDArray[np.float32] = np.log(light + np.float32(self.log_eps))
         return out
 
     def exposure(self) -> NDArray[np.float64]:
         """Return the time spent in each cell, summed over pixels [px s], shape (CELLS,)."""
-        steps = np.bincount(self.cell.reshape(-1), minlength=256)[:CELLS]
+        # counting makes 8 bytes of each, so some pixels at a time
+        parts = (
+            np.bincount(self.cell[n : n + AT_ONCE].reshape(-1), minlength=256)
+            for n in range(0, len(self.cell), AT_ONCE)
+        )
+        steps = sum(parts, np.zeros(256, np.int64))[:CELLS]
         out: NDArray[np.float64] = np.float64(self.grid.step) * steps
         return out
 
@@ -135,51 +145,75 @@ class Stimulus:
     def array(self, name: str, make: Callable[[], NDArray[Any]]) -> Any:
         """Return an array on the device, of the shape that `make` gives it; made and moved there once."""
         if name not in self._kept:
-            self._kept[name] = wp.array(np.ascontiguousarray(make()), device=self.device)
+            # on a CPU the array itself is taken, not a copy: nothing here is ever written to
+            self._kept[name] = wp.array(np.ascontiguousarray(make()), device=self.device, copy=False)
         return self._kept[name]
 
     def _sparse(self) -> Any:
         count, steps = self.intensity.shape
-        changed = np.zeros((count, steps), np.bool_)
-        changed[:, 1:] = self.intensity[:, 1:] != self.intensity[:, :-1]
-        index = np.arange(steps)
-        since = index - np.maximum.accumulate(np.where(changed, index, 0), axis=1)
         gaps = [0]
         while gaps[-1] < steps:
             gaps.append(gaps[-1] + max(1, int(STIMULUS.growth * gaps[-1])))
         due = np.zeros(steps + 1, np.bool_)
         due[[gap for gap in gaps if gap <= steps]] = True
-        keep = due[since]
-        keep[:, :-1] |= changed[:, 1:]  # the end of each rest
-        keep[:, [0, 1, -1]] = True  # a pixel's phase is set by where the light goes in the first step
-        start = np.concatenate([[0], np.cumsum(keep.sum(1))])
-        row, at = np.nonzero(keep)
-        return self._arrays(start, at, self.intensity[row, at], self.grid.step)
+        # some pixels at a time: what is kept is little, what tells it is large
+        parts = [
+            _kept_samples(self.intensity[n : n + AT_ONCE], due) for n in range(0, max(count, 1), AT_ONCE)
+        ]
+        many, at, light = (np.concatenate(column) for column in zip(*parts, strict=True))
+        start = np.concatenate([[0], np.cumsum(many)])
+        return self._arrays(start, at, light, self.grid.step)
 
     def _dense(self, finer: int) -> Any:
         count, steps = self.intensity.shape
         points = (steps - 1) * finer + 1
-        level = self.level
         at = np.arange(points) / finer
         below = np.minimum(at.astype(np.int64), steps - 2)
         share = (at - below).astype(np.float32)
-        between = level[:, below] * (1 - share) + level[:, below + 1] * share
-        light = np.maximum(np.exp(between) - np.float32(self.log_eps), 0)
+        level, eps = self.level, np.float32(self.log_eps)
+        light = np.empty((count, points), np.float32)
+        for n in range(0, count, AT_ONCE):
+            few = level[n : n + AT_ONCE]
+            between = few[:, below] * (1 - share) + few[:, below + 1] * share
+            light[n : n + AT_ONCE] = np.maximum(np.exp(between) - eps, 0)
         start = points * np.arange(count + 1)
-        return self._arrays(
-            start, np.tile(np.arange(points), count), light.reshape(-1), self.grid.step / finer
-        )
+        stamp = np.broadcast_to(np.arange(points, dtype=np.int32), (count, points)).reshape(-1)
+        return self._arrays(start, stamp, light.reshape(-1), self.grid.step / finer)
 
     def _arrays(
         self, start: NDArray[Any], stamp: NDArray[Any], light: NDArray[np.float32], step: float
     ) -> Any:
         out = pixel_codegen_trials.LightHistory()
-        out.start = wp.array(start.astype(np.int32), device=self.device)
-        out.stamp = wp.array(stamp.astype(np.int32), device=self.device)
-        out.intensity = wp.array(light.astype(np.float32), device=self.device)
-        out.voltage = wp.array(np.log(light + np.float32(self.log_eps)), device=self.device)
+        voltage = np.log(light + np.float32(self.log_eps))
+        out.start = wp.array(start.astype(np.int32), device=self.device, copy=False)
+        out.stamp = wp.array(stamp.astype(np.int32, copy=False), device=self.device, copy=False)
+        out.intensity = wp.array(light.astype(np.float32, copy=False), device=self.device, copy=False)
+        out.voltage = wp.array(voltage, device=self.device, copy=False)
         out.step = step
         return out
+
+
+def _kept_samples(
+    light: NDArray[np.float32], due: NDArray[np.bool_]
+) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.float32]]:
+    """Return which samples of some pixels are kept.
+
+    Args:
+        light: Linear, shape (N, T).
+        due: Whether a sample is kept so many steps after the light last changed, shape (T + 1,).
+
+    Returns:
+        Samples of each pixel, shape (N,); their steps and intensities, pixel by pixel, shape (S,).
+    """
+    changed = np.zeros(light.shape, np.bool_)
+    changed[:, 1:] = light[:, 1:] != light[:, :-1]
+    index = np.arange(light.shape[1], dtype=np.int32)
+    since = index - np.maximum.accumulate(np.where(changed, index, np.int32(0)), axis=1)
+    keep = due[since]
+    keep[:, :-1] |= changed[:, 1:]  # the end of each rest
+    keep[:, [0, 1, -1]] = True  # a pixel's phase is set by where the light goes in the first step
+    row, at = np.nonzero(keep)
+    return keep.sum(1), at, light[row, at]
 
 
 def light_of(
@@ -218,6 +252,9 @@ def sort_into_cells(
         bands: Intensities between the bands, shape (BANDS - 1,).
         log_eps: Added to intensities before the logarithm.
     """
+    if intensity.strides[1] == 0:  # at rest from the begin on, and never in another band
+        cell = np.searchsorted(bands, intensity[:, 0]).astype(np.uint8)
+        return np.repeat(cell[:, None], intensity.shape[1], 1)
     level = np.log(intensity + np.float32(log_eps))
     kind = np.searchsorted(STIMULUS.edges, _light_change(level, step)).astype(np.uint8) + RESTING
     for number, time in reversed(list(enumerate(STIMULUS.rest))):
@@ -243,7 +280,8 @@ def band_edges(intensity: NDArray[np.float32], compared: NDArray[np.bool_]) -> N
         intensity: Of pixels and times, shape (N, T).
         compared: Which of these are, shape (N, T).
     """
-    values = intensity[compared]
+    # of light that never changes all times have the same quantiles
+    values = intensity[:, 0] if intensity.strides[1] == 0 else intensity[compared]
     return np.quantile(values, (0.15, 0.4, 0.7)) if len(values) else np.array([0.1, 0.3, 0.6])
 
 
