@@ -18,28 +18,24 @@ from typing import Any, TypeVar
 import numpy as np
 import warp as wp
 
+from dase.kernels.threads import keep_thread_count
+from dase.kernels.threads import thread_count as thread_count
+
 wp.config.log_level = wp.LOG_WARNING
 
 Result = TypeVar("Result")
 
 _pool: ThreadPoolExecutor | None = None
 _starting = threading.Lock()
-_threads = int(os.environ.get("DASE_THREADS", "0")) or os.cpu_count() or 1
-
-
-def thread_count() -> int:
-    """Return the number of CPU threads that `run_kernel` uses."""
-    return _threads
 
 
 def set_threads(count: int) -> None:
     """Use `count` CPU threads from now on; worker processes use one each."""
-    global _pool, _threads
-    if count < 1:
-        raise ValueError(f"threads must be >= 1, got {count}")
+    global _pool
+    keep_thread_count(count)
     if _pool is not None:
         _pool.shutdown()
-    _pool, _threads = None, count
+    _pool = None
 
 
 def find_device(name: str) -> wp.Device:
@@ -129,7 +125,7 @@ def run_kernel(
         return
     # load before the threads race for it
     kernel.module.load(device, block_dim=1)  # the variant that CPU launches use
-    pieces = 1 if _threads == 1 else min(slabs * _threads, -(-size // align))
+    pieces = 1 if thread_count() == 1 else min(slabs * thread_count(), -(-size // align))
     step = align * -(-size // (align * pieces))
     starts = range(0, size, step)
 
@@ -141,7 +137,7 @@ def run_kernel(
         return
     global _pool
     if _pool is None:
-        _pool = ThreadPoolExecutor(_threads, thread_name_prefix="dase")
+        _pool = ThreadPoolExecutor(thread_count(), thread_name_prefix="dase")
     for done in _pool.map(work, starts):
         assert done is None
 
@@ -152,10 +148,10 @@ def run_concurrently(works: Sequence[Callable[[], Result]]) -> list[Result]:
     The first is done before the others: what it loads or works out is there for all. Works may use
     `run_kernel`, whose threads are others.
     """
-    if len(works) < 2 or _threads == 1:
+    if len(works) < 2 or thread_count() == 1:
         return [work() for work in works]
     first = works[0]()
-    with ThreadPoolExecutor(_threads, thread_name_prefix="dase works") as pool:
+    with ThreadPoolExecutor(thread_count(), thread_name_prefix="dase works") as pool:
         return [first, *pool.map(lambda work: work(), works[1:])]
 
 

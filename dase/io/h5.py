@@ -15,6 +15,9 @@ to the events, and `exposure` [s] to the attributes of an image that was not tak
 from __future__ import annotations
 
 import math
+from collections import deque
+from collections.abc import Callable, Iterable
+from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import AbstractContextManager, suppress
 from io import FileIO
 from pathlib import Path
@@ -31,6 +34,7 @@ from dase.io import columns
 from dase.io.rules import sensor_events
 from dase.io.sequence import GREYS, Grey, Sequence, Writer, checked_coordinates, reading_file, writing_file
 from dase.io.source import Beside, Piece, Source, refuse_bomb
+from dase.kernels.threads import thread_count
 
 CHUNK = 1 << 16  # events; 512 KiB of times fit HDF5's default chunk cache of 1 MiB
 BLOCK = 4 * CHUNK  # events gathered before they are written
@@ -128,12 +132,57 @@ def deflate_bytes(data: NDArray[np.uint8]) -> bytes:
     return b"".join((head, stream.compress(data[few:]), stream.flush()))
 
 
-def put_chunk(dataset: h5py.Dataset, place: int | tuple[int, ...], values: NDArray[Any]) -> None:
-    """Write one chunk, `values` having its shape, filtered as `COMPRESSION` says: shuffled, then deflated."""
+def pack_chunk(values: NDArray[Any]) -> bytes:
+    """Return one whole chunk of a dataset, filtered as `COMPRESSION` says: shuffled, then deflated."""
     # the first bytes of all numbers, then the second ones, and so on
     planes = values.reshape(-1).view(np.uint8).reshape(-1, values.itemsize).T
-    packed = deflate_bytes(np.ascontiguousarray(planes).reshape(-1))
-    dataset.id.write_direct_chunk(place if isinstance(place, tuple) else (place,), packed)
+    return deflate_bytes(np.ascontiguousarray(planes).reshape(-1))
+
+
+class _PackingLine:
+    """Steps that write to a file, in the order in which they came, each as soon as its chunks are packed.
+
+    Chunks are packed on as many threads as kernels use, beside whatever the caller does next; the steps
+    themselves run on the caller's thread. With one thread all is done at once. The file is the same.
+
+    Args:
+        most: Steps that may wait; more hold the caller up, so that memory does not grow.
+    """
+
+    def __init__(self, most: int = 16) -> None:
+        threads = thread_count()
+        self._pool = ThreadPoolExecutor(threads, thread_name_prefix="dase pack") if threads > 1 else None
+        self._most = most
+        self._steps: deque[tuple[list[Future[bytes]], Callable[[list[bytes]], None]]] = deque()
+
+    def add(self, chunks: Iterable[NDArray[Any]], write: Callable[[list[bytes]], None]) -> None:
+        """Pack chunks, which must not change any more, and have `write` called with what became of them."""
+        if self._pool is None:
+            write([pack_chunk(chunk) for chunk in chunks])
+            return
+        self._steps.append(([self._pool.submit(pack_chunk, chunk) for chunk in chunks], write))
+        while self._steps and (len(self._steps) > self._most or all(f.done() for f in self._steps[0][0])):
+            self._write_next()
+
+    def keep(self, values: NDArray[Any]) -> NDArray[Any]:
+        """Return values that stay as they are although the caller may change his."""
+        return values if self._pool is None else values.copy()
+
+    def finish(self) -> None:
+        """Write what still waits."""
+        while self._steps:
+            self._write_next()
+        self.abandon()
+
+    def abandon(self) -> None:
+        """Forget what still waits."""
+        self._steps.clear()
+        if self._pool is not None:
+            self._pool.shutdown(cancel_futures=True)
+
+    def _write_next(self) -> None:
+        packed, write = self._steps.popleft()
+        write([chunk.result() for chunk in packed])
 
 
 class _Writer(Writer):
@@ -143,6 +192,7 @@ class _Writer(Writer):
         super().__init__()
         self._disk = _Disk(path)
         self._file = h5py.File(self._disk, "w")
+        self._line = _PackingLine()
         self._types = dict(EVENT_TYPES)
         for name in EVENT_TYPES:
             self._create(name)
@@ -184,16 +234,24 @@ class _Writer(Writer):
         end = self._written + count
         for index, more in enumerate(np.searchsorted(columns[0][:count], self._times)):
             self._before[index] += int(more) if self._before[index] != LATE else 0
-        for name, column in zip(self._types, columns, strict=True):
-            if f"events/{name}" not in self._file:
-                self._create(name)
-            dataset = self._file[f"events/{name}"]
-            dataset.resize((end,))
-            whole = count // CHUNK * CHUNK
-            for begin in range(0, whole, CHUNK):
-                put_chunk(dataset, self._written + begin, column[begin : begin + CHUNK])
-            if whole < count:
-                dataset[self._written + whole : end] = column[whole:count]
+        whole = count // CHUNK * CHUNK
+        cuts = [slice(begin, begin + CHUNK) for begin in range(0, whole, CHUNK)]
+        named = dict(zip(self._types, columns, strict=True))
+        written = self._written
+
+        def write(packed: list[bytes]) -> None:
+            left = iter(packed)
+            for name, column in named.items():
+                if f"events/{name}" not in self._file:
+                    self._create(name)
+                dataset = self._file[f"events/{name}"]
+                dataset.resize((end,))
+                for cut in cuts:
+                    dataset.id.write_direct_chunk((written + cut.start,), next(left))
+                if whole < count:
+                    dataset[written + whole : end] = column[whole:count]
+
+        self._line.add((column[cut] for column in columns for cut in cuts), write)
         self._written, self._last_written = end, float(columns[0][count - 1])
         self._waiting -= count
         self._parts = [tuple(column[count:].copy() for column in columns)] if self._waiting else []
@@ -207,32 +265,44 @@ class _Writer(Writer):
         flow: NDArray[np.float32] | None,
         exposure: float,
     ) -> None:
-        image = self._file.create_dataset(f"images/image{index:09d}", data=grey)
-        image.attrs["size"] = grey.shape
-        image.attrs["timestamp"] = float(time)
-        image.attrs["type"] = "greyscale"
-        if exposure:
-            image.attrs["exposure"] = float(exposure)
+        grey = self._line.keep(grey)
+        fields = [] if flow is None else [self._line.keep(flow.astype(np.float32, copy=False))]
+
+        def write(packed: list[bytes]) -> None:
+            image = self._file.create_dataset(f"images/image{index:09d}", data=grey)
+            image.attrs["size"] = grey.shape
+            image.attrs["timestamp"] = float(time)
+            image.attrs["type"] = "greyscale"
+            if exposure:
+                image.attrs["exposure"] = float(exposure)
+            for values, chunk in zip(fields, packed, strict=True):
+                shape = values.shape
+                field = self._file.create_dataset(
+                    f"flow/flow{index:09d}", shape, np.float32, chunks=shape, **COMPRESSION
+                )
+                field.id.write_direct_chunk((0, 0, 0), chunk)
+                field.attrs["size"] = shape
+                field.attrs["timestamp"] = float(time)
+
         self._times.append(float(time))
         self._before.append(self._written if time > self._last_written else LATE)
-        if flow is not None:
-            field = self._file.create_dataset(
-                f"flow/flow{index:09d}", flow.shape, np.float32, chunks=flow.shape, **COMPRESSION
-            )
-            put_chunk(field, (0, 0, 0), flow.astype(np.float32, copy=False))
-            field.attrs["size"] = flow.shape
-            field.attrs["timestamp"] = float(time)
+        self._line.add(fields, write)
         self._disk.check()
 
     def _put_thresholds(self, values: NDArray[np.float32]) -> None:
-        self._file.create_dataset("dase/thresholds", data=values)
+        values = self._line.keep(values)
+        self._line.add((), lambda _: self._file.create_dataset("dase/thresholds", data=values))
 
     def _put_configuration(self, text: str) -> None:
-        self._file.require_group("dase").attrs["configuration"] = text
+        def write(_: list[bytes]) -> None:
+            self._file.require_group("dase").attrs["configuration"] = text
+
+        self._line.add((), write)
 
     def finish(self) -> None:
         """Write the rest of the events, the index of every frame and the totals."""
         self._flush(self._waiting)
+        self._line.finish()
         if self._with_labels and not self._written:
             self._types = EVENT_TYPES | LABEL_TYPE
             self._create("labels")
@@ -260,6 +330,7 @@ class _Writer(Writer):
 
     def abandon(self) -> None:
         """Close the file handles."""
+        self._line.abandon()
         with suppress(Exception):
             self._file.close()
         self._disk.close()

@@ -9,7 +9,10 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
+from dase import io
+from dase.events import Events
 from dase.io.h5 import deflate_bytes
+from dase.kernels.threads import keep_thread_count, thread_count
 
 
 def on_stacks(act: Callable[[], bytes], count: int) -> set[bytes]:
@@ -42,3 +45,58 @@ def test_streams_do_not_depend_on_the_stack(rng):
         head = rng.integers(0, 256, 8)
         data = np.concatenate([head, rng.integers(0, 4, 8), head, head]).astype(np.uint8)
         assert len(on_stacks(lambda data=data: deflate_bytes(data), 400)) == 1
+
+
+def write_sequence(path, rng, threads):
+    """Write events and frames in turns; the arrays are overwritten after each call."""
+    before = thread_count()
+    keep_thread_count(threads)
+    try:
+        with io.create(path) as writer:
+            writer.configuration("x = 1\n")
+            thresholds = rng.random((2, 30, 40), np.float32)
+            writer.thresholds(thresholds)
+            thresholds[:] = 0
+            for k, count in enumerate((0, 300_000, 10, 70_000, 600_000, 5)):
+                grey = rng.integers(0, 256, (30, 40), dtype=np.uint8)
+                flow = rng.normal(size=(2, 30, 40)).astype(np.float32)
+                writer.frame(float(k), grey, flow)
+                t = k + np.sort(rng.random(count))
+                x, y = rng.integers(0, 30, (2, count)).astype(np.uint16)
+                writer.events(Events(t, x, y, rng.random(count) < 0.5, 40, 30))
+                for array in (grey, flow, t, x, y):
+                    array[:] = 0
+    finally:
+        keep_thread_count(before)
+    return path.read_bytes()
+
+
+def test_files_do_not_depend_on_how_many_threads_pack_them(tmp_path):
+    one, four = (write_sequence(tmp_path / f"{n}.h5", np.random.default_rng(5), n) for n in (1, 4))
+    assert one == four
+    sequence = io.read(tmp_path / "4.h5")
+    assert len(sequence.events) == 970_015
+    assert sequence.frames.shape == (6, 30, 40)
+    assert np.all(np.diff(sequence.events.t) >= 0)
+    rng = np.random.default_rng(5)
+    np.testing.assert_array_equal(sequence.thresholds, rng.random((2, 30, 40), np.float32))
+    np.testing.assert_array_equal(sequence.frames[0], rng.integers(0, 256, (30, 40), dtype=np.uint8))
+
+
+def test_an_abandoned_file_leaves_nothing_to_wait_for(tmp_path):
+    before = thread_count()
+    keep_thread_count(3)
+    try:
+        with pytest.raises(RuntimeError, match="enough"):
+            begin_and_fail(tmp_path / "a.h5")
+    finally:
+        keep_thread_count(before)
+    assert list(tmp_path.iterdir()) == []
+    assert not [t for t in threading.enumerate() if t.name.startswith("dase pack")]
+
+
+def begin_and_fail(path):
+    with io.create(path) as writer:
+        for k in range(40):
+            writer.frame(float(k), np.zeros((30, 40), np.uint8), np.zeros((2, 30, 40), np.float32))
+        raise RuntimeError("enough")
