@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from dase.cli.options import device_or_backend_option, parse_size
+from dase.cli.options import device_or_backend_option, parse_region, parse_size
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -32,6 +32,9 @@ if TYPE_CHECKING:
 @click.option("--size", callback=parse_size, metavar="WxH", help="Of scenes, if the target is a sensor file.")
 @click.option("--sequences", default=300, show_default=True, help="Simulated by a sensor file as the target.")
 @click.option("--pattern", is_flag=True, help="Learn an offset for every column and row of the sensor.")
+@click.option("--from", "begin", type=float, metavar="SECONDS", help="Learn from this time on.")
+@click.option("--to", "end", type=float, metavar="SECONDS", help="Learn up to this time.")
+@click.option("--region", callback=parse_region, metavar="X,Y,W,H", help="Learn from these pixels alone.")
 @click.option("--seed", default=0, show_default=True, help="The same seed learns the same on one device.")
 @device_or_backend_option
 @click.option("--resume", is_flag=True, help="Go on where an interrupted run stopped.")
@@ -48,6 +51,9 @@ def train_command(
     size: tuple[int, int] | None,
     sequences: int,
     pattern: bool,
+    begin: float | None,
+    end: float | None,
+    region: tuple[int, int, int, int] | None,
     seed: int,
     device: str,
     resume: bool,
@@ -75,6 +81,7 @@ def train_command(
     job = learning_job.Job(
         targets=targets, images=images or "", preset=preset, objective=objective, steps=steps, window=window,
         size=size, sequences=sequences, pattern=pattern, seed=seed, backend=device,
+        begin=begin, end=end, region=region,
     )  # fmt: skip
     device = distributed.join_processes(device)
     first = distributed.process_rank() == 0

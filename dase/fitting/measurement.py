@@ -22,7 +22,7 @@ from dase.formatting import fit_to_screen
 from dase.io.arrays import check_archive
 from dase.io.sequence import Sequence
 from dase.probes.stimulus import STIMULUS, Trust
-from dase.recordings.recording import Recording
+from dase.recordings.recording import Recording, mask_of_region
 from dase.results import Comparison, Diagnosis, Fit
 from dase.scenes.between_frames import CameraScene
 from dase.scenes.frame_alignment import PARTS, align
@@ -80,14 +80,7 @@ class Measurement:
                 raise InputError(f"the time to compare must not be empty, got {span[0]:g}..{span[1]:g} s")
             out = replace(out, span=span)
         if region is not None:
-            x, y, width, height = region
-            if min(x, y) < 0 or min(width, height) < 1:
-                raise InputError(f"a region must be x,y,w,h with w and h at least 1, got {region}")
-            if x + width > self.events.width or y + height > self.events.height:
-                size = f"{self.events.width}x{self.events.height}"
-                raise InputError(f"the region {width}x{height} from {x},{y} is not on the {size} sensor")
-            mask = np.zeros((self.events.height, self.events.width), np.bool_)
-            mask[y : y + height, x : x + width] = True
+            mask = mask_of_region(region, self.events.width, self.events.height)
             out = replace(out, trust=_trust_within(mask, out.trust))
         return out
 

@@ -84,6 +84,9 @@ class Job:
         steps: Generator steps; 0 for those of the preset.
         seed: Of everything random.
         backend: `cpu` or `cuda`.
+        begin: Time of the recordings from which on is learned [s]; None for their begin.
+        end: Time at which learning stops [s]; None for their end.
+        region: First column and row, columns and rows of what is learned from; None for all pixels.
     """
 
     targets: tuple[str, ...]
@@ -97,6 +100,9 @@ class Job:
     steps: int = 0
     seed: int = 0
     backend: str = "cpu"
+    begin: float | None = None
+    end: float | None = None
+    region: tuple[int, int, int, int] | None = None
 
     def __post_init__(self) -> None:
         if not self.images:
@@ -114,6 +120,8 @@ class Job:
             raise InputError(f"steps must be >= 0 and sequences >= 5, got {self.steps} and {self.sequences}")
         if not self.targets:
             raise InputError("name at least one recording, or a sensor file")
+        if self.targets_sensor and (self.begin, self.end, self.region) != (None, None, None):
+            raise InputError("a part of time or of the pixels is that of a recording; a sensor file has none")
         if self.backend.startswith("cuda") and not torch.cuda.is_available():
             raise InputError(f"device '{self.backend}' needs an NVIDIA GPU that PyTorch can use; use 'cpu'")
 
@@ -231,6 +239,9 @@ def _open_recorded(job: Job, progress: Callable[[str, int, int], None]) -> tuple
         [Path(name) for name in job.targets],
         window=job.window,
         samples=12 if job.preset == "tiny" else 16,
+        begin=job.begin,
+        end=job.end,
+        region=job.region,
         device=job.backend,
         progress=lambda done, total: progress("reading the recordings", done, total),
     )
@@ -312,7 +323,8 @@ def read_job(out: Path) -> Job:
     table = parse_json(read_text_file(record, "the record", 1 << 24), str(record))
     try:
         table["targets"] = tuple(table["targets"])
-        table["size"] = None if table["size"] is None else tuple(table["size"])
+        for name in ("size", "region"):
+            table[name] = None if table[name] is None else tuple(table[name])
         return Job(**table)
     except (TypeError, KeyError) as error:
         raise InputError(f"{record} is no record of a training run: {error}") from error

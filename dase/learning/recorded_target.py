@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from dase.errors import InputError
 from dase.learning.scene_batches import Scenery, SceneSettings
 from dase.learning.targets import FiniteTarget, store_pairs
-from dase.recordings.recording import Recording, open_recording
+from dase.recordings.recording import Recording, mask_of_region, open_recording
 from dase.scenes.between_frames import CameraScene, TrustSettings
 from dase.scenes.frame_motion import estimate_stretches, is_stretched
 from dase.scenes.scene import LOG_EPS
@@ -151,7 +151,9 @@ def open_target(
     window: float = 0.05,
     samples: int = 16,
     held_out: float = 0.2,
-    until: float | None = None,
+    begin: float | None = None,
+    end: float | None = None,
+    region: tuple[int, int, int, int] | None = None,
     device: str | torch.device = "cpu",
     progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> tuple[FiniteTarget, ReplayedScenes]:
@@ -162,7 +164,10 @@ def open_target(
         window: Duration of a window [s].
         samples: Of the log intensity, in a window.
         held_out: Share of the windows kept for choosing between models: the last ones of each recording.
-        until: Time at which learning stops in each recording [s from its begin]; None for its end.
+        begin: Time of each recording from which on is learned [s]; None for its begin.
+        end: Time at which learning stops [s]; None for its end.
+        region: First column and row, columns and rows of what is learned from; None for all pixels. What lies
+            outside is not trusted, and the sensor keeps its size.
         device: PyTorch device.
         progress: Called with how many windows are done, and of how many.
 
@@ -174,8 +179,14 @@ def open_target(
     for path in paths:
         recording = open_recording(path)
         recording = recording.masked(~recording.hot)
-        if until is not None:
-            recording = recording.slice(recording.begin, recording.begin + until)
+        try:
+            if begin is not None or end is not None:
+                span = -np.inf if begin is None else begin, np.inf if end is None else end
+                recording = recording.slice(*span)
+            if region is not None:
+                recording = recording.masked(mask_of_region(region, recording.width, recording.height))
+        except InputError as error:
+            raise InputError(f"{path}: {error}") from error
         size = (recording.width, recording.height)
         shape = shape or size
         if size != shape:

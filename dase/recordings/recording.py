@@ -31,6 +31,27 @@ from dase.recordings.anomalies import find_anomalies
 from dase.recordings.statistics import Statistics, survey_sequence
 
 
+def mask_of_region(region: tuple[int, int, int, int], width: int, height: int) -> NDArray[np.bool_]:
+    """Return which pixels of a sensor lie in a region, shape (height, width).
+
+    Args:
+        region: First column and row, columns and rows.
+        width: Columns of the sensor.
+        height: Rows of the sensor.
+
+    Raises:
+        InputError: The region is empty or not on the sensor.
+    """
+    x, y, columns, rows = region
+    if min(x, y) < 0 or min(columns, rows) < 1:
+        raise InputError(f"a region must be x,y,w,h with w and h at least 1, got {region}")
+    if x + columns > width or y + rows > height:
+        raise InputError(f"the region {columns}x{rows} from {x},{y} is not on the {width}x{height} sensor")
+    mask = np.zeros((height, width), np.bool_)
+    mask[y : y + rows, x : x + columns] = True
+    return mask
+
+
 @dataclass(frozen=True, repr=False)
 class RecordingReport:
     """What was noticed when a recording was opened.

@@ -255,6 +255,40 @@ def test_bad_targets_are_named(tmp_path):
         open_target([one, other])
 
 
+def test_a_part_of_a_recording_is_learned_from(tmp_path):
+    path = written(tmp_path / "one.npz", moving(0.8))
+    _, whole = open_target([path])
+    target, part = open_target([path], begin=0.2, end=0.65, region=(4, 8, 16, 12))
+    assert len(part.log) < len(whole.log)
+    counts = target.recorded.counts
+    outside = np.ones((32, 32), np.bool_)
+    outside[8:20, 4:20] = False
+    assert counts[..., torch.from_numpy(~outside)].sum() > 0
+    assert counts[..., torch.from_numpy(outside)].sum() == 0
+    log = part.log.float().numpy()
+    assert np.ptp(log[..., outside], axis=1).max() == 0  # still outside, on the simulator's side, too
+    with pytest.raises(
+        dase.InputError, match=r"one.npz: the region 40x4 from 0,0 is not on the 32x32 sensor"
+    ):
+        open_target([path], region=(0, 0, 40, 4))
+    with pytest.raises(dase.InputError, match=r"one.npz: slice: must overlap"):
+        open_target([path], begin=5.0)
+
+
+def test_a_part_of_a_recording_is_asked_for_in_the_command(tmp_path):
+    path = written(tmp_path / "one.npz", moving(0.8))
+    out = tmp_path / "out"
+    found = call(
+        "train", str(path), "-o", str(out), "--preset", "tiny", "--steps", "1",
+        "--from", "0.2", "--to", "0.65", "--region", "4,8,16,12",
+    )  # fmt: skip
+    assert found.exit_code == 0, found.output
+    job = learning_job.read_job(out)
+    assert (job.begin, job.end, job.region) == (0.2, 0.65, (4, 8, 16, 12))
+    with pytest.raises(dase.InputError, match="a sensor file has none"):
+        learning_job.Job(targets=("davis346",), begin=1.0)
+
+
 def call(*arguments: str):
     from dase.cli import dase_group
 

@@ -81,7 +81,8 @@ def prepare(row: Row, args: argparse.Namespace) -> Training:
             network["pattern"] = (96, 96)
     made = Recipe.from_names(hash=PatchHash(**how), network=NetworkShape(**network), **recipe)
     if row.real:
-        target, scenes = open_target([Path(args.recording)], until=LEARNED, device=device)
+        path = Path(args.recording)
+        target, scenes = open_target([path], end=open_recording(path).begin + LEARNED, device=device)
         return compose_training(made, target, scenes)
     source = image_sources.open_images(pictures)
     scenery = Scenery(
