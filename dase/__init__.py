@@ -85,7 +85,7 @@ __all__ = list(_MODULE_OF)
 
 
 def __getattr__(name: str) -> Any:
-    if name in ("io", "torch"):  # packages; that of the name torch needs PyTorch
+    if name in ("io", "tasks", "torch"):  # packages; the last two need PyTorch
         return import_module(f"dase.{name}")
     if name not in _MODULE_OF:
         raise AttributeError(f"module 'dase' has no attribute '{name}'{_hint(name)}")

@@ -57,7 +57,10 @@ ARRAYS = r"ndarray|NDArray|ArrayLike|Tensor|wp\.array\w*|array[1-4]d"
 
 FLOORS: tuple[tuple[tuple[str, ...], str], ...] = (
     (("cli",), "Commands may use everything; nothing uses them."),
-    (("datasets",), "Whole data sets are written with all of the below, pictures included."),
+    (
+        ("datasets", "tasks"),
+        "Whole data sets are written, networks trained and tested with all of the below, pictures included.",
+    ),
     (("figures",), "Pictures and pages show what was found; nothing that is computed depends on them."),
     (("diagnosis",), "What a model lacks is asked with many fits."),
     (("fitting",), "Parameters are fitted by simulating many models and comparing statistics."),

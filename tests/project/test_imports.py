@@ -25,7 +25,7 @@ HEAVY = {
 }
 """Packages that are optional or slow to load: for their sake an import may wait until it is needed."""
 
-OF_TORCH = r"dase\.(learning|networks|torch)\b|dase\.kernels\.autograd_|dase\.figures\.training_figure"
+OF_TORCH = r"dase\.(learning|networks|tasks|torch)\b|dase\.kernels\.autograd_|dase\.figures\.training_figure"
 """Modules that may need PyTorch to be imported at all."""
 
 

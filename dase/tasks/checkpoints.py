@@ -1,0 +1,87 @@
+"""Files of trainings: the network, the average of its weights, and all that going on needs."""
+
+from __future__ import annotations
+
+import pickle
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from dase.errors import InputError
+from dase.files.atomic_file import replacing
+from dase.files.text_files import stands_for
+from dase.tasks.event_networks import NETWORKS, EventNetwork
+
+KIND = "dase.tasks 1"
+"""What a file calls itself."""
+
+
+def save_checkpoint(
+    path: Path,
+    network: EventNetwork,
+    averaged: EventNetwork,
+    optimizer: torch.optim.Optimizer,
+    *,
+    step: int,
+    steps: int,
+    window: float,
+) -> None:
+    """Write a training so that it can go on as if it had not stopped; the file appears whole or not at all.
+
+    Args:
+        path: File.
+        network: With the weights of the last step.
+        averaged: The same network with the average of the weights, for users.
+        optimizer: Of the network.
+        step: Steps done.
+        steps: Steps that the learning rate was laid out for.
+        window: Duration of the windows [s].
+    """
+    content = {
+        "kind": KIND, "network": network.kind, "shape": network.shape, "weights": network.state_dict(),
+        "averaged": averaged.state_dict(), "optimizer": optimizer.state_dict(), "step": step, "steps": steps,
+        "window": window,
+    }  # fmt: skip
+    with replacing(path) as temporary:
+        torch.save(content, temporary)
+
+
+def read_checkpoint(path: str | Path, device: str | torch.device = "cpu") -> dict[str, Any]:
+    """Return what `save_checkpoint` wrote; raises InputError where the file is none."""
+    path = Path(path)
+    if not path.is_file():
+        raise InputError(f"{path}: there is no such checkpoint")
+    with path.open("rb") as head:
+        pointer = stands_for(head.read(1024))
+    if pointer:
+        raise InputError(f"{path}: {pointer}")
+    try:
+        found = torch.load(path, map_location=device, weights_only=True)  # tensors and numbers, no code
+    except (RuntimeError, EOFError, pickle.UnpicklingError, ValueError, KeyError) as error:
+        raise InputError(f"{path}: is no checkpoint of dase.tasks: {str(error).splitlines()[0]}") from error
+    if not isinstance(found, dict) or found.get("kind") != KIND or found.get("network") not in NETWORKS:
+        raise InputError(f"{path}: is no checkpoint of dase.tasks")
+    return found
+
+
+def load_network(path: str | Path, device: str | torch.device = "cpu") -> tuple[EventNetwork, float]:
+    """Return the trained network, with averaged weights, and the windows that it was trained on [s].
+
+    Args:
+        path: `checkpoint.pt` of a training.
+        device: Where it computes.
+
+    Raises:
+        InputError: The file holds none.
+    """
+    found = read_checkpoint(path, device)
+    try:
+        network = NETWORKS[found["network"]](**found["shape"])
+        network.load_state_dict(found["averaged"])
+        window = float(found["window"])
+    except (RuntimeError, KeyError, TypeError, ValueError) as error:
+        raise InputError(
+            f"{path}: the weights do not fit their network: {str(error).splitlines()[0]}"
+        ) from error
+    return network.to(device).eval(), window

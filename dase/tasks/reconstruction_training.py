@@ -1,0 +1,164 @@
+"""Training a network that reconstructs intensity from events: one loop, top to bottom."""
+
+from __future__ import annotations
+
+import copy
+import json
+from dataclasses import dataclass
+from os import PathLike
+from pathlib import Path
+
+import torch
+
+from dase.errors import InputError
+from dase.learning import distributed
+from dase.tasks.checkpoints import read_checkpoint, save_checkpoint
+from dase.tasks.event_networks import EventNetwork
+from dase.tasks.image_metrics import Lpips, structural_similarity, temporal_inconsistency
+from dase.tasks.optimisation import BatchSource, Optimisation, average_weights, mean_gradients
+from dase.torch.batch import Batch
+
+
+@dataclass(frozen=True, kw_only=True)
+class ReconstructionTraining(Optimisation):
+    """How a reconstruction network is trained.
+
+    Args:
+        l1: Weight of the mean absolute error.
+        ssim: Weight of 1 - SSIM.
+        temporal: Weight of the temporal inconsistency (S2R, 2020).
+        lpips: Weight of the perceptual distance, where a file of its weights is named.
+        lpips_weights: That file, see `Lpips`; None for no perceptual distance.
+        skip: First windows of a sequence that only the temporal loss counts: nothing is known there yet.
+    """
+
+    l1: float = 1.0
+    ssim: float = 0.5
+    temporal: float = 1.0
+    lpips: float = 0.5
+    lpips_weights: str | None = None
+    skip: int = 2
+
+
+def train_reconstruction(
+    network: EventNetwork,
+    batches: BatchSource,
+    folder: str | PathLike[str],
+    settings: ReconstructionTraining = ReconstructionTraining(),
+) -> EventNetwork:
+    """Train a network, or go on where `folder` has a checkpoint; return it with averaged weights.
+
+    The same batches and settings give the same weights, however often the training was stopped, on one
+    processor or GPU as far as PyTorch's kernels repeat themselves.
+
+    Args:
+        network: With any weights; they are drawn anew from the seed.
+        batches: Returns batches from a number on, as `lambda first: dase.torch.Stream(first_batch=first)`.
+            Each batch is a whole sequence: what is remembered begins anew with it.
+        folder: Gets `checkpoint.pt` and `log.jsonl`, a JSON object per line.
+        settings: How it is trained.
+
+    Raises:
+        InputError: The folder holds another training, or a loss is not finite.
+    """
+    if network.task != "reconstruction":
+        raise InputError(f"{network.kind} is a network for {network.task}, not for reconstruction")
+    folder = Path(folder)
+    folder.mkdir(parents=True, exist_ok=True)
+    path = folder / "checkpoint.pt"
+    device = distributed.join_processes(settings.device)
+
+    # the same first weights whatever was drawn before
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(settings.seed)
+        network = type(network)(**network.shape).to(device)
+    averaged = copy.deepcopy(network)
+    optimizer = torch.optim.AdamW(
+        network.parameters(), lr=settings.learning_rate, weight_decay=settings.weight_decay
+    )
+    perceptual = None if settings.lpips_weights is None else Lpips(settings.lpips_weights).to(device)
+
+    first = 0
+    if path.exists():
+        found = read_checkpoint(path, device)
+        asked = network.kind, network.shape, settings.steps, settings.window
+        if (found["network"], found["shape"], found["steps"], found["window"]) != asked:
+            raise InputError(f"{folder} holds another training: take its settings, or another folder")
+        network.load_state_dict(found["weights"])
+        averaged.load_state_dict(found["averaged"])
+        optimizer.load_state_dict(found["optimizer"])
+        first = found["step"]
+
+    if first < settings.last_step:
+        source = iter(batches(first))
+        half = settings.mixed_precision and device.startswith("cuda")
+        for step in range(first, settings.last_step):
+            batch = next(source).to(device)
+            for group in optimizer.param_groups:
+                group["lr"] = settings.rate(step)
+            with torch.autocast(torch.device(device).type, torch.bfloat16, enabled=half):
+                made, _ = network.sequence(batch.inputs, batch.reset)
+            losses = reconstruction_losses(made.float(), batch, settings, perceptual)
+            optimizer.zero_grad(set_to_none=True)
+            losses["loss"].backward()
+            mean_gradients(network)
+            norm = torch.nn.utils.clip_grad_norm_(network.parameters(), settings.clip)
+            optimizer.step()
+            average_weights(averaged, network, step, settings.average)
+
+            done = step + 1
+            last = done == settings.last_step
+            if done % settings.log_every == 0 or last:
+                row = {name: round(float(value.detach()), 6) for name, value in losses.items()}
+                if not torch.isfinite(losses["loss"]):
+                    raise InputError(
+                        f"{folder}: the loss of step {done} is {row['loss']}; lower learning_rate"
+                    )
+                if distributed.process_rank() == 0:
+                    line = {"step": done, **row, "gradient": round(float(norm), 6)}
+                    with (folder / "log.jsonl").open("a", encoding="utf-8") as log:
+                        log.write(json.dumps(line) + "\n")
+            if (done % settings.save_every == 0 or last) and distributed.process_rank() == 0:
+                save_checkpoint(
+                    path,
+                    network,
+                    averaged,
+                    optimizer,
+                    step=done,
+                    steps=settings.steps,
+                    window=settings.window,
+                )
+    distributed.leave_processes()
+    averaged.eval()
+    return averaged
+
+
+def reconstruction_losses(
+    made: torch.Tensor, batch: Batch, settings: ReconstructionTraining, perceptual: Lpips | None
+) -> dict[str, torch.Tensor]:
+    """Return the weighted sum `loss` and its parts, scalars.
+
+    Args:
+        made: Reconstructions, shape (T, B, 1, H, W).
+        batch: What they are of.
+        settings: Weights of the parts.
+        perceptual: LPIPS, where its weights are known.
+    """
+    skip = min(settings.skip, len(made) - 1)
+    seen, real = made[skip:].flatten(0, 1), batch.frames[skip:].flatten(0, 1)
+    losses = {"l1": (seen - real).abs().mean(), "ssim": (1 - structural_similarity(seen, real)).mean()}
+    losses["loss"] = settings.l1 * losses["l1"] + settings.ssim * losses["ssim"]
+    if settings.temporal and len(made) > 1:
+        parts = made[1:], made[:-1], batch.frames[1:], batch.frames[:-1]
+        a, b, c, d = (one.flatten(0, 1) for one in parts)
+        moved = settings.window * batch.flow[1:].flatten(0, 1)
+        # a window that begins another scene has nothing to agree with
+        same = (~batch.reset[1:]).flatten().float()
+        losses["temporal"] = (same * temporal_inconsistency(a, b, c, d, moved)).sum() / same.sum().clamp_min(
+            1
+        )
+        losses["loss"] = losses["loss"] + settings.temporal * losses["temporal"]
+    if perceptual is not None:
+        losses["lpips"] = perceptual(seen, real).mean()
+        losses["loss"] = losses["loss"] + settings.lpips * losses["lpips"]
+    return losses

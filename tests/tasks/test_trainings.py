@@ -1,0 +1,128 @@
+"""Trainings: the same weights however often they stop, less loss, sentences; on batches made here."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+
+import pytest
+
+torch = pytest.importorskip("torch")
+
+from dase.errors import InputError
+from dase.tasks.checkpoints import load_network, read_checkpoint
+from dase.tasks.event_networks import E2VidNet, EvFlowNet, FireNet
+from dase.tasks.flow_training import FlowTraining, flow_loss, train_flow
+from dase.tasks.optimisation import Optimisation
+from dase.tasks.reconstruction_training import ReconstructionTraining, train_reconstruction
+from dase.torch.batch import Batch
+
+RECONSTRUCTION = ReconstructionTraining(steps=6, warm_up=2, average=0.5, save_every=2, log_every=1)
+FLOW = FlowTraining(steps=6, warm_up=2, average=0.5, save_every=2, log_every=1)
+
+
+def made_batch(number: int) -> Batch:
+    """Return a batch that its number decides: events where frames are bright, flow everywhere alike."""
+    generator = torch.Generator().manual_seed(number % 2)
+    frames = torch.rand(3, 2, 1, 16, 16, generator=generator)
+    flow = torch.full((3, 2, 2, 16, 16), 60.0)
+    reset = torch.zeros(3, 2, dtype=torch.bool)
+    reset[0] = True
+    return Batch(frames.expand(3, 2, 5, 16, 16), frames, flow, reset, torch.ones(2, 2))
+
+
+def batches(first):
+    while True:
+        yield made_batch(first)
+        first += 1
+
+
+def weights(network):
+    return torch.cat([p.flatten() for p in network.parameters()])
+
+
+TASKS = [(train_reconstruction, FireNet(5, 4), RECONSTRUCTION), (train_flow, EvFlowNet(5, 4), FLOW)]
+
+
+@pytest.mark.parametrize(("train", "network", "settings"), TASKS, ids=["reconstruction", "flow"])
+def test_stopped_and_resumed_gives_the_same_weights(train, network, settings, tmp_path):
+    torch.manual_seed(5)
+    whole = train(network, batches, tmp_path / "whole", settings)
+    torch.manual_seed(6)
+    drawn = torch.rand(1)
+    torch.manual_seed(6)
+    for stop in (1, 4, None):
+        parts = train(network, batches, tmp_path / "parts", replace(settings, stop_at=stop))
+    assert torch.equal(drawn, torch.rand(1))  # the caller's random numbers are left alone
+    assert torch.equal(weights(whole), weights(parts))
+    rows = [
+        [json.loads(s) for s in (tmp_path / n / "log.jsonl").read_text().splitlines()]
+        for n in ("whole", "parts")
+    ]
+    assert rows[0] == rows[1]
+    assert [row["step"] for row in rows[0]] == [1, 2, 3, 4, 5, 6]
+    loaded, window = load_network(tmp_path / "parts" / "checkpoint.pt")
+    assert window == settings.window
+    assert torch.equal(weights(loaded), weights(whole))
+    found = read_checkpoint(tmp_path / "parts" / "checkpoint.pt")
+    last = torch.cat([found["weights"][name].flatten() for name, _ in whole.named_parameters()])
+    assert not torch.equal(last, weights(whole))  # averaged ones are others
+    other = train(network, batches, tmp_path / "other", replace(settings, seed=1))
+    assert not torch.equal(weights(other), weights(whole))
+    with pytest.raises(InputError, match="holds another training"):
+        train(network, batches, tmp_path / "parts", replace(settings, steps=9))
+
+
+@pytest.mark.parametrize(
+    ("train", "network", "settings"),
+    [(train_reconstruction, E2VidNet(5, 4), RECONSTRUCTION), (train_flow, EvFlowNet(5, 8), FLOW)],
+    ids=["reconstruction", "flow"],
+)
+def test_the_loss_falls(train, network, settings, tmp_path):
+    train(network, batches, tmp_path, replace(settings, steps=60, learning_rate=5e-3, log_every=10))
+    losses = [json.loads(line)["loss"] for line in (tmp_path / "log.jsonl").read_text().splitlines()]
+    assert losses[-1] < 0.7 * losses[0]
+
+
+def test_flow_loss_by_hand():
+    batch = made_batch(0)
+    batch.flow[0, 0, :, 0, 0] = float("nan")
+    made = torch.zeros(6, 2, 16, 16, requires_grad=True)
+    loss, error = flow_loss(made, batch, 1 / 30)
+    far = 8**0.5  # 2 px in x and y
+    assert loss.item() == pytest.approx(4 / (1 + far), rel=1e-5)
+    assert error.item() == pytest.approx(far, rel=1e-5)
+    loss.backward()
+    assert made.grad.isfinite().all()
+
+
+def test_rate_rises_and_falls():
+    how = Optimisation(steps=100, warm_up=10, learning_rate=1.0)
+    assert how.rate(0) == pytest.approx(0.1)
+    assert how.rate(9) == max(how.rate(k) for k in range(100))
+    assert how.rate(50) == pytest.approx(0.5)
+    assert how.rate(99) < 1e-3
+
+
+def test_refusals(tmp_path):
+    with pytest.raises(InputError, match="evflownet is a network for flow"):
+        train_reconstruction(EvFlowNet(5, 2), batches, tmp_path)
+    with pytest.raises(InputError, match="average must lie in"):
+        Optimisation(average=1.0)
+    (tmp_path / "checkpoint.pt").write_text("no")
+    with pytest.raises(InputError, match=r"is no checkpoint of dase\.tasks"):
+        load_network(tmp_path / "checkpoint.pt")
+    with pytest.raises(InputError, match="no such checkpoint"):
+        load_network(tmp_path / "other.pt")
+
+
+def broken(first):
+    for batch in batches(first):
+        yield replace(batch, inputs=batch.inputs * float("nan"))
+
+
+@pytest.mark.parametrize(("train", "network", "settings"), TASKS, ids=["reconstruction", "flow"])
+def test_a_loss_that_is_no_number_ends_the_training(train, network, settings, tmp_path):
+    with pytest.raises(InputError, match="lower learning_rate"):
+        train(network, broken, tmp_path, settings)
+    assert not (tmp_path / "checkpoint.pt").exists()
