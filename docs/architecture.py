@@ -39,7 +39,7 @@ COLUMN = {
     **dict.fromkeys(("cli", "results", "signatures", "io", "events", "kernels"), 1),
     **dict.fromkeys(("figures", "diagnosis", "fitting", "probes", "recordings"), 2),
     **dict.fromkeys(("presets", "files", "version"), 2),
-    **dict.fromkeys(("representations", "torch"), 3),
+    **dict.fromkeys(("representations", "tasks", "torch"), 3),
 }
 """Where a package lies on its floor: what makes events is left, what asks about recordings is right."""
 
