@@ -21,7 +21,7 @@ from dase.events import Events
 from dase.formatting import fit_to_screen
 from dase.io.arrays import check_archive
 from dase.io.sequence import Sequence
-from dase.probes.stimulus import STIMULUS, Trust
+from dase.probes.stimulus import Trust
 from dase.recordings.recording import Recording, mask_of_region
 from dase.results import Comparison, Diagnosis, Fit
 from dase.scenes.between_frames import CameraScene
@@ -29,7 +29,7 @@ from dase.scenes.frame_alignment import PARTS, align
 from dase.scenes.frame_denoising import denoise_resting_pixels
 from dase.scenes.frame_motion import estimate_stretches, is_stretched
 from dase.scenes.scene import Scene
-from dase.scenes.video import VideoScene, open_video
+from dase.scenes.video import VideoScene, are_dense, join_frames, open_video
 
 Found = TypeVar("Found", Comparison, Diagnosis, Fit)
 
@@ -113,13 +113,16 @@ def as_measurement(
     if isinstance(measured, Measurement):
         found = measured
         if scene is not None:
-            found = replace(measured, scene=_chosen_scene(scene, measured.events), trust=None)
+            said = list(measured.notes)
+            chosen = _chosen_scene(scene, measured.events, said)
+            found = replace(measured, scene=chosen, trust=None, notes=tuple(said))
     elif isinstance(measured, Recording):
         found = measurement_of(measured, "frames" if scene is None else scene)
     elif isinstance(measured, Events):
         if scene is None or (isinstance(scene, str) and scene == "frames"):
             raise InputError("events do not say what the camera saw: give the scene", argument="scene")
-        found = Measurement(measured, _chosen_scene(scene, measured))
+        said = []
+        found = Measurement(measured, _chosen_scene(scene, measured, said), notes=tuple(said))
     elif isinstance(measured, str | PathLike):
         found = open_measurement(Path(measured), "frames" if scene is None else scene)
     else:
@@ -169,14 +172,14 @@ def measurement_of(
     if len(recorded.events) == 0:
         raise InputError(f"{name} has no events, so there is nothing to compare")
     own = isinstance(scene, str) and scene == "frames"
-    seen = scene_of_frames(recorded, name, said) if own else _chosen_scene(scene, recorded.events)
+    seen = scene_of_frames(recorded, name, said) if own else _chosen_scene(scene, recorded.events, said)
     trust: Trust | None = seen.is_trusted if isinstance(seen, CameraScene) else None
     if isinstance(recorded, Recording) and not recorded.mask.all():
         trust = _trust_within(recorded.mask, trust)
     return Measurement(recorded.events, seen, trust, tuple(said))
 
 
-def _chosen_scene(scene: SceneChoice, events: Events) -> Scene:
+def _chosen_scene(scene: SceneChoice, events: Events, notes: list[str]) -> Scene:
     if isinstance(scene, Scene):
         return scene
     if not isinstance(scene, str | PathLike):
@@ -185,7 +188,7 @@ def _chosen_scene(scene: SceneChoice, events: Events) -> Scene:
             "dase.VideoScene(frames, times) makes one of frames",
             argument="scene",
         )
-    return static_scene(events) if scene == "static" else open_clip(Path(scene))
+    return static_scene(events) if scene == "static" else open_clip(Path(scene), notes)
 
 
 def _trust_within(mask: NDArray[np.bool_], trust: Trust | None) -> Trust:
@@ -231,9 +234,8 @@ def scene_of_frames(recorded: Recording | Sequence, name: str, notes: list[str])
     times = recorded.frame_times
     if times is None:
         raise InputError(f"{name}: its frames have no times, so they cannot be laid beside the events")
-    # also frames that come exactly as slowly as the slowest steps of a comparison are joined by lines
-    if float(np.median(np.diff(times))) <= STIMULUS.coarsest_step * (1 + 1e-6):
-        return _scene_of_values(recorded.frames, times, name)
+    if are_dense(times):
+        return _scene_of_values(recorded.frames, times, name, notes)
     return scene_between_frames(recorded, notes)
 
 
@@ -326,12 +328,17 @@ def camera_rests(scene: CameraScene, *, looks: int = 8, movement: float = 0.1) -
     return bool(np.median([np.median(way) for way in ways]) < movement)
 
 
-def open_clip(path: Path) -> Scene:
-    """Return the scene of a video, of a folder of pictures, or of an archive with `frames` and `frame_us`."""
+def open_clip(path: Path, notes: list[str] | None = None) -> Scene:
+    """Return the scene of a video, of a folder of pictures, or of an archive with `frames` and `frame_us`.
+
+    Args:
+        path: Of the clip.
+        notes: Gets sentences about what was assumed, as of what is between frames that are far apart.
+    """
     if not path.exists():
         raise InputError(f"scene {path} does not exist")
     if path.suffix.lower() != ".npz":
-        return open_video(path)
+        return open_video(path, notes=notes)
     try:
         check_archive(path, ("frames", "frame_us"))
         with np.load(path, allow_pickle=False) as data:
@@ -343,12 +350,14 @@ def open_clip(path: Path) -> Scene:
         raise InputError(f"scene {path}: {error}" if str(path) not in str(error) else str(error)) from error
     except Exception as error:  # numpy, zipfile and zlib have no common error for damaged files
         raise InputError(f"scene {path} cannot be read as an archive of frames: {error}") from error
-    return _scene_of_values(frames, times, path)
+    return _scene_of_values(frames, times, path, notes)
 
 
-def _scene_of_values(frames: NDArray[Any], times: NDArray[np.float64], name: Path | str) -> VideoScene:
+def _scene_of_values(
+    frames: NDArray[Any], times: NDArray[np.float64], name: Path | str, notes: list[str] | None
+) -> Scene:
     """Return the scene of frames (F, H, W) at times (F,) [s]; messages say whose frames they are."""
     try:
-        return VideoScene(frames, times)
+        return join_frames(frames, times, notes=notes)
     except InputError as error:
         raise InputError(f"scene {name}: {error}") from None

@@ -198,19 +198,50 @@ def open_video(
     if gamma is None:
         gamma = found
         notes.append(f"light is taken as value ** {gamma:g}: give gamma where that is wrong")
-    gap = float(np.median(np.diff(times)))
-    if between == "lines" or (between == "auto" and gap <= COARSEST * (1 + 1e-6)):
-        if gap > COARSEST:
-            notes.append(f"frames are {1e3 * gap:.1f} ms apart and joined by straight lines")
+    return join_frames(frames, times, gamma=gamma, between=between, notes=notes)
+
+
+def join_frames(
+    frames: Any,
+    times: NDArray[np.float64],
+    *,
+    gamma: float = 1.0,
+    between: str = "auto",
+    notes: list[str] | None = None,
+) -> VideoScene | CameraScene:
+    """Return the scene of frames at moments: joined by lines where they are dense, else following the motion.
+
+    Args:
+        frames: Grey values, shape (F, H, W), or a `FrameReader`.
+        times: Of the frames [s], shape (F,).
+        gamma: Linear intensity is value ** gamma.
+        between: As `open_video` takes it.
+        notes: Gets sentences about what is between them.
+
+    Raises:
+        InputError: Fewer than two frames, or times that do not increase.
+    """
+    notes = [] if notes is None else notes
+    if between == "lines" or (between == "auto" and are_dense(times)):
+        if not are_dense(times):
+            gap = 1e3 * float(np.median(np.diff(times)))
+            notes.append(f"frames are {gap:.1f} ms apart and joined by straight lines")
         return VideoScene(frames, times, gamma=gamma)
-    kept = frames if isinstance(frames, np.ndarray) else _all_frames(frames)
+    kept = _all_frames(frames) if isinstance(frames, FrameReader) else frames
     scene = CameraScene(kept, times, gamma=gamma)
     share = scene.trusted().mean()
+    gap = 1e3 * float(np.median(np.diff(times)))
     notes.append(
-        f"frames are {1e3 * gap:.1f} ms apart: the motion from one to the next is followed, "
+        f"frames are {gap:.1f} ms apart: the motion from one to the next is followed, "
         f"{100 * share:.0f} % of pixels and times are to be trusted (dase show --trust draws them)"
     )
     return scene
+
+
+def are_dense(times: NDArray[np.float64]) -> bool:
+    """Return whether frames at these times [s], (F,), are so dense that straight lines may join them."""
+    # those that come exactly as slowly as the slowest steps of a comparison are
+    return len(times) < 2 or float(np.median(np.diff(times))) <= COARSEST * (1 + 1e-6)
 
 
 BETWEEN = ("auto", "motion", "lines")

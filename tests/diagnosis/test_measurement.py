@@ -12,7 +12,13 @@ from dase import io
 from dase.cli import dase_group
 from dase.diagnosis.compare import compare
 from dase.fitting.data_split import split_measurement
-from dase.fitting.measurement import Measurement, as_measurement, measurement_of, open_measurement
+from dase.fitting.measurement import (
+    Measurement,
+    as_measurement,
+    measurement_of,
+    open_clip,
+    open_measurement,
+)
 from dase.io.sequence import Sequence
 from dase.probes.stimulus import MASKED
 from dase.scenes.video import VideoScene
@@ -147,6 +153,27 @@ def test_dense_frames_are_joined_by_lines(tmp_path):
     assert isinstance(found.scene, VideoScene)
     assert found.trust is None
     np.testing.assert_allclose(found.scene.frames(2e-3 * np.arange(9)), frames / 255, atol=1e-6)
+
+
+def test_an_archive_of_frames_is_joined_as_all_others_are(tmp_path):
+    """Far apart the motion is followed, which is said; it used to be straight lines whatever the gap."""
+    truth = moving_picture(np.random.default_rng(3), speed=1.0, width=48, height=36, duration=0.2)
+    times = np.arange(0, 0.2, 0.02)
+    frames = np.rint(255 * truth.frames(times)).astype(np.uint8)
+    for name, step in (("far", 20_000), ("dense", 2000)):
+        np.savez(tmp_path / f"{name}.npz", frames=frames, frame_us=step * np.arange(len(frames)))
+    notes = []
+    far = open_clip(tmp_path / "far.npz", notes)
+    assert isinstance(far, dase.CameraScene)
+    assert "20.0 ms apart: the motion from one to the next is followed" in notes[0]
+    between = times[:-1] + 0.01
+    want = dase.CameraScene(frames, times).frames(between)
+    np.testing.assert_array_equal(far.frames(between), want)
+    assert isinstance(open_clip(tmp_path / "dense.npz"), VideoScene)
+    events = dase.simulate(truth, SENSOR, seed=1)
+    measured = as_measurement(events, tmp_path / "far.npz")
+    assert measured.notes == tuple(notes)  # so that a comparison says them
+    assert isinstance(measured.scene, dase.CameraScene)
 
 
 def test_next_to_nothing_to_trust_is_said(measured):
