@@ -35,13 +35,17 @@ def info_command(file: Path, signatures: bool, as_json: bool, reading: ReadOptio
     from dase.recordings import summary
     from dase.recordings.anomalies import find_anomalies
     from dase.recordings.statistics import survey_file
-    from dase.signatures.find import find_signatures
 
     notes: list[str] = []
+    shown = None
     name = io.find_format(file).name
     with tqdm(unit=" events", unit_scale=True, delay=1.0, leave=False, disable=None) as bar:
         found = survey_file(file, notes=notes, progress=bar.update, **reading).statistics()
-        shown = find_signatures(file, progress=bar.update, **reading) if signatures and found.events else None
+        if signatures and found.events:
+            # only here, as its statistical distributions take longer to load than most files to read
+            from dase.signatures.find import find_signatures
+
+            shown = find_signatures(file, progress=bar.update, **reading)
     said = [note for note in (*notes, *find_anomalies(found)) if isinstance(note, io.Note)]
     if as_json:
         content = summary.as_json(name, found, said)
