@@ -198,7 +198,17 @@ def lane_kinds(
         ints: Whole numbers.
     """
     model = program.model
-    floats = [*before, "intensity", "voltage", "before", "after", "leaked_before", "asleep", "busy"]
+    floats = [
+        *before,
+        "intensity",
+        "illumination",
+        "voltage",
+        "before",
+        "after",
+        "leaked_before",
+        "asleep",
+        "busy",
+    ]
     floats += [*model.states, *maps]
     floats += [f"{effect.name}_{q}" for effect, _ in model.of("noise") for q in ("on", "off", "spend")]
     floats += [draw.name for draw in program.draws if draw.per_pixel]

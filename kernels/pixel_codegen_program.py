@@ -75,12 +75,17 @@ def intensity_of_log(model: PixelModel) -> tuple[Part, ...]:
     """
     if model.source != "log":
         return ()
-    if model.of("light"):
+    if model.of("light") or model.of("current"):
         raise ValueError("effects on light need intensities, not log intensities")
-    if not model.asks("intensity", stages=("respond", "drift", "noise", "delay")):
+    if not model.asks("intensity", "illumination", stages=("respond", "drift", "noise", "delay")):
         return ()
     # before the photoreceptor changes the voltage
-    return (Part(lines("intensity = exponential(voltage) - log_eps")),)
+    return (Part(lines("intensity = exponential(voltage) - log_eps")), *_keep_illumination(model))
+
+
+def _keep_illumination(model: PixelModel) -> tuple[Part, ...]:
+    """Return the part that keeps the light before currents of the dark are added, none if nobody asks."""
+    return (Part(lines("illumination = intensity + 0.0")),) if model.asks("illumination") else ()
 
 
 def assign_thresholds(model: PixelModel) -> tuple[Statement, ...]:
@@ -135,6 +140,8 @@ def all_draws(*parts: Iterable[Part | Statement]) -> tuple[Draw, ...]:
 def make_program(model: PixelModel) -> Program:
     """Return what a pixel does."""
     light = pass_through(model, "light", "intensity")
+    light += _keep_illumination(model) if model.source != "log" else ()
+    light += pass_through(model, "current", "intensity")
     respond = pass_through(model, "respond", "voltage")
     change = change_since_event(model)
     asleep, busy = sleep_condition(model)

@@ -244,7 +244,7 @@ def _samples(program: Program, layout: OnePixel | Lanes) -> tuple[Statement, ...
 
 def _voltage_of_light(model: PixelModel) -> tuple[Part, ...]:
     """Return the part that takes the logarithm of light which an effect has changed; the others' is known."""
-    effects = tuple(effect for effect, _ in model.of("light"))
+    effects = tuple(effect for stage in ("light", "current") for effect, _ in model.of(stage))
     if not effects:
         return ()
     asked = all(effect.off for effect in effects)

@@ -3,12 +3,14 @@
 A pixel turns light into events in this order; each effect adds Warp functions at some of these stages:
 
     light      (intensity, ...)           -> intensity            what reaches the photodiode
+    current    (intensity, ...)           -> intensity            what flows in it, as the light that makes it
     log        voltage = log(intensity + log_eps)
     respond    (voltage, intensity, log_eps, ...) -> voltage      photoreceptor
     threshold  (on, off, ...)             -> on, off              once per pixel [log intensity]
     redraw     (on, off, ...)             -> on, off              anew after each event; random numbers too
     drift      (intensity, on, off, ...)  -> drift                of the change towards ON [log intensity/s]
     noise      (intensity, on, off, ...)  -> rate_on, rate_off    of events without a change [Hz]
+               both may also ask for the illumination: the light alone, without currents of the dark
     count      exact threshold crossings of the change since the last event
     gate       (age, fired_on, ...)       -> wait                 time the pixel stays dead [s]
     delay      (intensity, polarity, ...) -> delay                until the event leaves the pixel [s]
@@ -51,17 +53,18 @@ class Label(IntEnum):
     SHOT = 2
 
 
-STAGES = ("light", "respond", "threshold", "redraw", "drift", "noise", "gate", "delay")
+STAGES = ("light", "current", "respond", "threshold", "redraw", "drift", "noise", "gate", "delay")
 CORE = ("on", "off", "phase", "log_eps")
 """Parameters of the change detector itself; they lead the parameter vector."""
 
 QUANTITIES = {
     "light": ("intensity",),
+    "current": ("intensity",),
     "respond": ("voltage", "intensity", "log_eps"),
     "threshold": ("on", "off"),
     "redraw": ("on", "off"),
-    "drift": ("intensity", "on", "off"),
-    "noise": ("intensity", "on", "off"),
+    "drift": ("intensity", "illumination", "on", "off"),
+    "noise": ("intensity", "illumination", "on", "off"),
     "gate": ("age", "fired_on"),
     "delay": ("intensity", "polarity"),
 }

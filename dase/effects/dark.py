@@ -25,7 +25,8 @@ class Dark(Effect):
     the darkest parts of a scene shrink and make fewer events. Warmth doubles it every few degrees.
 
     The current is given as the intensity that makes as much photocurrent. It is log-normally distributed over
-    pixels. Every later stage, such as the bandwidth, sees the sum.
+    pixels. Every later stage, such as the bandwidth, sees the sum; the parasitic photocurrent of `leak` flows
+    in another junction.
     """
 
     name: ClassVar[str] = "dark"
@@ -34,7 +35,7 @@ class Dark(Effect):
         "temporal contrast vision sensor, 2008; "
         "Nozaki, Delbruck: Temperature and parasitic photocurrent effects in dynamic vision sensors, 2017"
     )
-    stages: ClassVar = {"light": add_dark_current}
+    stages: ClassVar = {"current": add_dark_current}
 
     current: float = parameter(
         0.003,

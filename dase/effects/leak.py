@@ -12,10 +12,17 @@ from dase.effects.base import Effect, parameter
 
 @wp.func
 def leak_drift(
-    intensity: float, nominal_on: float, rate: float, spread: float, light: float, pixel_normal: float
+    illumination: float,
+    nominal_on: float,
+    rate: float,
+    spread: float,
+    light: float,
+    threshold: float,
+    pixel_normal: float,
 ):
     """Speed at which the pixel's memory leaks away, towards ON [log intensity/s]."""
-    return wp.max(rate * (1.0 + spread * pixel_normal), 0.0) * nominal_on * (1.0 + light * intensity)
+    way = wp.where(threshold > 0.0, threshold, nominal_on)
+    return wp.max(rate * (1.0 + spread * pixel_normal), 0.0) * way * (1.0 + light * illumination)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -27,9 +34,11 @@ class Leak(Effect):
     OFF events. The leak differs from pixel to pixel.
 
     Two currents leak: that of the switch's junction, and a parasitic photocurrent, since light also falls on
-    the switch. The latter grows with the intensity, so bright scenes leak more. Both move the memory at a
-    speed of their own; a pixel of low ON threshold sends more leak events, in proportion to 1 / threshold.
-    (v2e gives every pixel the same rate whatever its threshold.)
+    the switch. The latter grows with the light on it, so bright scenes leak more; the photodiode's dark
+    current is none of it. Both move the memory at a speed of their own; a pixel of low ON threshold sends
+    more leak events, in proportion to 1 / threshold. (v2e gives every pixel the same rate whatever its
+    threshold.) So does a camera whose biases lower all thresholds, if `threshold` says at which one `rate`
+    was measured: the speed is rate · threshold. Without it the rate is that of the sensor's own threshold.
     """
 
     name: ClassVar[str] = "leak"
@@ -59,4 +68,12 @@ class Leak(Effect):
         bounds=(0.0, 1e4),
         plausible=(0.0, 30.0),
         about="parasitic photocurrent at intensity 1, relative to the leak in the dark",
+    )
+    threshold: float = parameter(
+        0.0,
+        unit="log intensity",
+        bounds=(0.0, 10.0),
+        plausible=(0.0, 1.0),
+        about="ON threshold at which `rate` was measured; 0 for the sensor's own",
+        fitted=False,  # events show the product of the two
     )

@@ -15,6 +15,7 @@ from dase.simulation.user_effects import RESERVED_NAMES, STAGE_RETURNS
 
 STAGE_MEANINGS = {
     "light": "what reaches the photodiode; 1 is white",
+    "current": "what flows in the photodiode, as the light that makes as much",
     "respond": "voltage of the photoreceptor [log intensity]",
     "threshold": "thresholds of a pixel, once and for all [log intensity]",
     "redraw": "thresholds of a pixel, anew after each event [log intensity]",

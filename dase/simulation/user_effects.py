@@ -32,6 +32,7 @@ RESERVED_NAMES = ("name", "size", "log_eps", "history", "sensor")
 
 STAGE_RETURNS = {
     "light": ("intensity",),
+    "current": ("intensity",),
     "respond": ("voltage",),
     "threshold": ("on", "off"),
     "redraw": ("on", "off"),
@@ -40,7 +41,7 @@ STAGE_RETURNS = {
     "gate": ("wait",),
     "delay": ("delay",),
 }
-"""What the function of a stage returns; those of `light` and `respond` also return the effect's states."""
+"""What the function of a stage returns; those of the first three also return the effect's states."""
 
 
 def known_effects(paths: Iterable[str | Path] = ()) -> dict[str, type[Effect]]:
@@ -266,7 +267,10 @@ class _EffectDefinition:
             return self.wrong(reason, int(places[-1]))
         stage = next((s for s in self.effect.stages if f"{s}_of_{self.effect.name}(" in said), None)
         if stage is not None:  # the function itself compiles, what calls it does not
-            returns = (*STAGE_RETURNS[stage], *(self.effect.states if stage in ("light", "respond") else ()))
+            returns = (
+                *STAGE_RETURNS[stage],
+                *(self.effect.states if stage in ("light", "current", "respond") else ()),
+            )
             what = f"the function of stage '{stage}' must return {', '.join(returns)}, each a float"
             return self.wrong(what, self.line_of(self.effect.stages[stage]))
         return self.wrong(f"effect '{self.effect.name}' does not run: {reason}")

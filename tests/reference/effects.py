@@ -31,7 +31,7 @@ def light(sensor: dase.Sensor, times: np.ndarray, frames: np.ndarray, seed: int)
     out = out * np.cos(np.arctan(np.tan(corner) * np.sqrt(square))) ** 4
     out = out.reshape(len(times), -1)
     current, spread = (setting(sensor, "dark", name, 0.0) for name in ("current", "spread"))
-    normal = [Stream("dark_light_pixel_normal", seed, i).normal() for i in range(width * height)]
+    normal = [Stream("dark_current_pixel_normal", seed, i).normal() for i in range(width * height)]
     return out + current * np.exp(spread * np.array(normal))
 
 

@@ -165,9 +165,9 @@ dark and 25 s else agree with the sums of the intervals.
   by a factor of about 3 from 161 to 3000 lux. OFF noise is gone.
 - **Hot pixels**, about one in a hundred, are ON in both bright recordings. At 161 lux the few hottest have
   most of the intervals, so the median interval there is that of a handful of pixels.
-- `voltage_noise` does all three levels with one set of parameters. `shot` cannot: its rate falls linearly
-  with the intensity to `bright` times that in the dark, so at 161 of 3000 lux it is hardly lower. Where the
-  light of a scene spans less than a decade it is as good, and needs no fine sampling. The column *shot* has
+- `voltage_noise` does all three levels with one set of parameters. `shot` cannot while its rate falls in a
+  straight line, as v2e's does: at 161 of 3000 lux it is hardly lower. With a knee of 3 lux it has the OFF
+  events of all three levels, and needs no fine sampling. The column *shot* has
   `shot` with rate {rate:g} Hz and bright 0 in place of the voltage noise.
 
 The numbers of the sensor were set by hand, so this shows that the effects can be like a camera, not that a
