@@ -1,0 +1,289 @@
+"""Networks for one sensor trained on another: how much does it matter what is simulated?
+
+    python -m perf.experiments.downstream.run --photos FOLDER --out OUT --device cuda --minutes 8
+    python -m perf.experiments.downstream.table OUT/results.jsonl
+
+Four targets with physics beyond thresholds (`sensors.py`) are recorded for 60 s each. Networks are trained on
+ESIM's default, on broad randomisation, and for each target on S2R's tuned threshold, on what `dase.fit` makes of
+the recording, and on the true sensor; then tested on each target's simulated scenes of photographs that no
+training has seen. The same seed has the same first weights and scenes whatever the sensor. Each training stands
+alone: it is checkpointed, `--minutes` ends a call, the same call goes on, and several machines may take `--seeds`
+apart. `results.jsonl` has a line for each network and target, `sensors/` what was tuned and fitted. `--photos`
+may be a tar of pictures.
+"""
+
+from __future__ import annotations
+
+import argparse
+import itertools
+import json
+import tarfile
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import torch
+
+import dase
+from dase.tasks.flow_metrics import flow_errors
+from dase.tasks.image_metrics import structural_similarity
+from dase.torch import Batch
+from perf.experiments.downstream.sensors import (
+    FAST,
+    KINDS,
+    OF_NO_TARGET,
+    TARGETS,
+    VIEW,
+    Training,
+    broad_thresholds,
+    fit_target,
+    plain_sensor,
+    record_target,
+    tune_threshold,
+    tuned_thresholds,
+)
+
+
+class OutOfTime(Exception):
+    """A call has come to its end; the last checkpoint is good."""
+
+
+@dataclass(frozen=True)
+class Size:
+    """How large the study is.
+
+    Args:
+        crop: Columns and rows of training and tests [px].
+        windows: Of a sequence for reconstruction.
+        batch: Sequences of a batch for reconstruction.
+        flow_batch: Sequences, of `flow_windows` each, of a batch for flow.
+        flow_windows: See `flow_batch`.
+        reconstruction_channels: Of the networks.
+        flow_channels: Of the networks.
+        reconstruction_steps: Batches of a training.
+        flow_steps: Batches of a training.
+        samples: Of a window.
+        recorded: Duration of a target's recording [s].
+        test_batches: On each target.
+        backgrounds: Pictures in a pool.
+        objects: Cut-outs in a pool.
+    """
+
+    crop: tuple[int, int] = (128, 128)
+    windows: int = 24
+    batch: int = 12
+    flow_batch: int = 24
+    flow_windows: int = 3
+    reconstruction_channels: int = 16
+    flow_channels: int = 32
+    reconstruction_steps: int = 800
+    flow_steps: int = 2000
+    samples: int = 16
+    recorded: float = 60.0
+    test_batches: int = 4
+    backgrounds: int = 48
+    objects: int = 96
+
+
+SMALL = Size(
+    crop=(32, 32), windows=4, batch=2, flow_batch=2, flow_windows=2, reconstruction_channels=4,
+    flow_channels=4,
+    reconstruction_steps=4,
+    flow_steps=4, samples=8, recorded=1.0, test_batches=1, backgrounds=3, objects=4,
+)  # fmt: skip
+"""As little as shows that all parts work together."""
+
+
+@dataclass
+class Study:
+    """What is to be done and where.
+
+    Args:
+        train: Folder of photographs for training and recordings.
+        test: Folder of photographs for tests.
+        out: Folder of all results.
+        device: PyTorch's and dase's.
+        size: How large it is.
+        deadline: When the call ends, on `time.monotonic`.
+    """
+
+    train: str
+    test: str
+    out: Path
+    device: str
+    size: Size
+    deadline: float
+    _tests: dict[tuple[str, str], list[Batch]] = field(default_factory=dict)
+
+    def stream(self, task: str, how: Training, images: str, seed: int, first: int = 0) -> dase.torch.Stream:
+        """Return batches of a task."""
+        size, flow = self.size, task == "flow"
+        return dase.torch.Stream(
+            images, how.sensor, batch=size.flow_batch if flow else size.batch, size=size.crop, view=VIEW,
+            steps=size.flow_windows if flow else size.windows, window=1 / 30 if flow else 1 / 60,
+            samples=2 * size.samples if flow else size.samples, randomise=how.randomise, augment=how.augment,
+            device=self.device, seed=seed, regimes=FAST, backgrounds=size.backgrounds, objects=size.objects,
+            first_batch=first,
+        )  # fmt: skip
+
+    def timed(self, batches: dase.torch.Stream) -> Iterator[Batch]:
+        """Yield batches until the call ends."""
+        for batch in batches:
+            if time.monotonic() > self.deadline:
+                raise OutOfTime
+            yield batch
+
+    def adapt(self, target: str) -> dict[str, Any]:
+        """Return what was learned of a target from its recording, from the file where there is one."""
+        path = self.out / "sensors" / f"{target}.json"
+        toml = path.with_suffix(".toml")
+        if not path.exists():
+            path.parent.mkdir(parents=True, exist_ok=True)
+            begin = time.monotonic()
+            recorded = record_target(TARGETS[target], self.train, self.size.recorded, self.device)
+            scenes, windows = (4, 6) if self.size is SMALL else (16, 60)
+            base = tune_threshold(recorded.rate, self.train, self.device, scenes=scenes, windows=windows)
+            tuned = time.monotonic()
+            toml.write_text(dase.dump_sensor(fit_target(recorded, self.device)))
+            found = {
+                "target": target, "events": len(recorded.events), "rate": recorded.rate, "tuned": base,
+                "seconds": {"record and tune": tuned - begin, "fit": time.monotonic() - tuned},
+            }  # fmt: skip
+            path.write_text(json.dumps(found, indent=1) + "\n")
+        return json.loads(path.read_text()) | {"fitted": dase.load_sensor(toml)}
+
+    def training(self, kind: str, target: str) -> Training:
+        """Return what is trained on."""
+        if kind == "esim":
+            return Training(dase.load_sensor("esim"))
+        if kind == "broad":
+            augment = dase.torch.Augment(flips=0.5, noise=0.05, hot=5e-4)
+            return Training(plain_sensor(0.2), broad_thresholds, augment)
+        if kind == "true":
+            return Training(TARGETS[target])
+        found = self.adapt(target)
+        if kind == "tuned":
+            return Training(plain_sensor(found["tuned"]), tuned_thresholds(found["tuned"]))
+        return Training(found["fitted"])
+
+    def train_one(self, task: str, kind: str, target: str, seed: int) -> torch.nn.Module:
+        """Return a trained network, gone on with where the last call stopped."""
+        how, size = self.training(kind, target), self.size
+        folder = self.out / "runs" / "-".join(filter(None, (task, kind, target, str(seed))))
+
+        def batches(first: int) -> Iterator[Batch]:
+            return self.timed(self.stream(task, how, self.train, seed, first))
+
+        options = {"seed": seed, "device": self.device, "save_every": 100}
+        if task == "flow":
+            settings = dase.tasks.FlowTraining(steps=size.flow_steps, average=0.998, **options)
+            return dase.tasks.train_flow(
+                dase.tasks.EvFlowNet(5, size.flow_channels), batches, folder, settings
+            )
+        steps = size.reconstruction_steps
+        settings = dase.tasks.ReconstructionTraining(steps=steps, average=0.995, **options)
+        network = dase.tasks.E2VidNet(5, size.reconstruction_channels)
+        return dase.tasks.train_reconstruction(network, batches, folder, settings)
+
+    def test_batches(self, task: str, target: str) -> list[Batch]:
+        """Return the batches that all networks are tested with."""
+        if (task, target) not in self._tests:
+            stream = self.stream(task, Training(TARGETS[target]), self.test, 1_000_000)
+            self._tests[task, target] = list(itertools.islice(stream, self.size.test_batches))
+        return self._tests[task, target]
+
+    @torch.no_grad()
+    def test_one(self, network: torch.nn.Module, task: str, target: str) -> dict[str, float]:
+        """Return what a network is worth on a target."""
+        rows: list[dict[str, float]] = []
+        for batch in self.test_batches(task, target):
+            made, _ = network.sequence(batch.inputs, batch.reset)
+            if task == "flow":
+                truth = batch.flow.flatten(0, 1) / 30
+                seen = batch.inputs.flatten(0, 1).abs().sum(1) > 0
+                found = flow_errors(made.flatten(0, 1), truth, seen)
+                rows.append({name: float(value) for name, value in found.items()})
+            else:
+                half = len(made) // 2  # before, little is known
+                a, b = made[half:].flatten(0, 1).clamp(0, 1), batch.frames[half:].flatten(0, 1)
+                rows.append(
+                    {"l1": float((a - b).abs().mean()), "ssim": float(structural_similarity(a, b).mean())}
+                )
+        return {name: sum(row[name] for row in rows) / len(rows) for name in rows[0]}
+
+
+def unpack_photos(photos: Path, out: Path) -> tuple[str, str]:
+    """Return folders of photographs for training and, every fifth, for tests."""
+    if photos.is_file():
+        with tarfile.open(photos) as archive:
+            archive.extractall(out / "photos", filter="data")
+        photos = out / "photos"
+    folders = [out / "split" / name for name in ("train", "test")]
+    for folder in folders:
+        folder.mkdir(parents=True, exist_ok=True)
+    for number, path in enumerate(sorted(one for one in photos.iterdir() if one.suffix in (".jpg", ".png"))):
+        place = folders[number % 5 == 4] / path.name
+        if not place.exists():
+            place.write_bytes(path.read_bytes())
+    return str(folders[0]), str(folders[1])
+
+
+def main() -> None:
+    """Run what is left to do."""
+    ask = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    ask.add_argument("--photos", type=Path, required=True)
+    ask.add_argument("--out", type=Path, required=True)
+    ask.add_argument("--device", default="cuda")
+    ask.add_argument("--minutes", type=float, default=1e6)
+    ask.add_argument("--tasks", default="reconstruction,flow")
+    ask.add_argument("--kinds", default=",".join(KINDS))
+    ask.add_argument("--targets", default=",".join(TARGETS))
+    ask.add_argument("--seeds", default="0,1,2")
+    ask.add_argument("--small", action="store_true", help="A minute on two cores: do all parts work?")
+    args = ask.parse_args()
+    args.out.mkdir(parents=True, exist_ok=True)
+    train, test = unpack_photos(args.photos, args.out)
+    deadline = time.monotonic() + 60 * args.minutes
+    study = Study(train, test, args.out, args.device, SMALL if args.small else Size(), deadline)
+    log = args.out / "results.jsonl"
+    lines = log.read_text().splitlines() if log.exists() else []
+    done = {tuple(json.loads(line)[n] for n in ("task", "kind", "trained_for", "seed")) for line in lines}
+    kinds, targets = args.kinds.split(","), args.targets.split(",")
+    plan = [
+        (task, kind, target, int(seed))
+        for seed in args.seeds.split(",")
+        for place, target in enumerate(targets)
+        for task in args.tasks.split(",")
+        for kind in kinds
+        if kind not in OF_NO_TARGET or place == 0
+    ]
+    try:
+        for task, kind, target, seed in plan:
+            trained_for = "" if kind in OF_NO_TARGET else target
+            if (task, kind, trained_for, seed) in done:
+                continue
+            if time.monotonic() > deadline:
+                raise OutOfTime
+            begin = time.monotonic()
+            network = study.train_one(task, kind, trained_for, seed)
+            seconds = round(time.monotonic() - begin, 1)
+            rows = []
+            for tested in TARGETS if not trained_for else [trained_for]:
+                found = study.test_one(network, task, tested)
+                rows.append(
+                    {"task": task, "kind": kind, "trained_for": trained_for, "target": tested, "seed": seed,
+                     **{name: round(value, 5) for name, value in found.items()}, "seconds": seconds,
+                     "device": args.device, "torch": torch.__version__}
+                )  # fmt: skip
+            # all lines of a network together, so that none is left out where a call is ended
+            with log.open("a") as file:
+                file.write("".join(json.dumps(row) + "\n" for row in rows))
+            print(*map(json.dumps, rows), sep="\n", flush=True)
+    except OutOfTime:
+        print("the time is over; the same call goes on", flush=True)
+
+
+if __name__ == "__main__":
+    main()
