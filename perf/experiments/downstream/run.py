@@ -3,13 +3,13 @@
     python -m perf.experiments.downstream.run --photos FOLDER --out OUT --device cuda --minutes 8
     python -m perf.experiments.downstream.table OUT/results.jsonl
 
-Four targets with physics beyond thresholds (`sensors.py`) are recorded for 60 s each. Networks are trained on
-ESIM's default, on broad randomisation, and for each target on S2R's tuned threshold, on what `dase.fit` makes of
-the recording, and on the true sensor; then tested on each target's simulated scenes of photographs that no
-training has seen. The same seed has the same first weights and scenes whatever the sensor. Each training stands
-alone: it is checkpointed, `--minutes` ends a call, the same call goes on, and several machines may take `--seeds`
-apart. `results.jsonl` has a line for each network and target, `sensors/` what was tuned and fitted. `--photos`
-may be a tar of pictures.
+Four targets with physics beyond thresholds (`sensors.py`) are recorded for 60 s each. Networks are
+trained on ESIM's default, on broad randomisation, and for each target on S2R's tuned threshold, on what
+`dase.fit` makes of the recording, and on the true sensor; then tested on each target's simulated scenes
+of photographs that no training has seen. The same seed has the same first weights and scenes whatever
+the sensor. Each training stands alone: it is checkpointed, `--minutes` ends a call, the same call goes
+on, and several machines may take `--seeds` apart. `results.jsonl` has a line for each network and
+target, `sensors/` what was tuned and fitted. `--photos` may be a tar of pictures.
 """
 
 from __future__ import annotations

@@ -1,0 +1,36 @@
+"""The study's table."""
+
+from __future__ import annotations
+
+import pytest
+
+pytest.importorskip("torch")
+
+from perf.experiments.downstream.sensors import TARGETS, tuned_thresholds
+from perf.experiments.downstream.table import closed_gaps, mean_text, tables
+
+
+def test_gaps_are_of_pairs():
+    found = {("tuned", "slow"): {0: 0.5, 1: 0.6}, ("true", "slow"): {0: 0.3, 1: 0.4, 2: 0.1},
+             ("fitted", "slow"): {0: 0.35, 1: 0.6, 2: 0.2}}  # fmt: skip
+    assert closed_gaps(found, "fitted", "slow") == pytest.approx([75, 0])
+    assert closed_gaps(found, "true", "slow") == pytest.approx([100, 100])
+    assert mean_text([1.0, 2.0, 3.0], 2) == "2.00 ± 2.48"  # 4.303 / √3
+    assert mean_text([], 2) == "–"
+    rows = [{"task": "flow", "kind": kind, "target": "slow", "seed": seed, "aee": value}
+            for (kind, _), values in found.items() for seed, value in values.items()]  # fmt: skip
+    assert "| tuned | 0.550 ± 0.635 | – | – | – |" in tables(rows)
+
+
+def test_what_is_tuned_is_one_polarity(rng):
+    drawn = tuned_thresholds(0.2)(rng, 4000)
+    on, off = drawn["threshold.on"], drawn["threshold.off"]
+    assert ((on == 0.2) ^ (off == 0.2)).all()
+    assert (on != 0.2).mean() == pytest.approx(0.5, abs=0.05)
+    assert (on / 0.2)[on != 0.2].std() == pytest.approx(0.1, rel=0.1)
+
+
+def test_targets_have_physics_beyond_thresholds():
+    plain = {"threshold", "mismatch"}
+    assert len(TARGETS) == 4
+    assert all({effect.name for effect in sensor.effects} > plain for sensor in TARGETS.values())
