@@ -83,7 +83,7 @@ def print_explanation(ctx: click.Context, parameter: click.Parameter, value: str
 @fps_option
 @part_options
 @effects_option
-@click.option("--pixels", default=1500, show_default=True, help="In each half of the measurement.")
+@click.option("--pixels", default=1500, show_default=True, help="In each part of the measurement.")
 @device_option
 @click.option("--seed", default=0, show_default=True, help="The same seed gives the same findings.")
 @click.option("--quiet", is_flag=True, help="Only the finding, no progress.")
@@ -110,8 +110,9 @@ def diagnose_command(
 ) -> None:
     """Find the effect that the model SENSOR lacks to explain RECORDING.
 
-    Every effect that the sensor does not have is fitted, and judged on pixels and time held out. Nothing is
-    announced unless it brings the error to what two repeats of the recording would give.
+    Every effect that the sensor does not have is fitted, and judged on pixels and time held out. An effect is
+    announced where the events alone show it (certain), or where next to nothing of the error is left with it
+    and its own test holds (supported); else what it cannot be told apart from is said.
     """
     from dase.diagnosis import sensor_update
     from dase.diagnosis.diagnose import diagnose
@@ -238,6 +239,8 @@ def _print_findings(found: Diagnosis, quiet: bool) -> None:
     click.echo(found.finding())
     if quiet:
         return
+    for one in (*found.findings, *found.stand_ins):
+        click.echo(f"  {one.sentence()}")
     click.echo(f"error as given {found.before:.2f}; 1 is what two repeats of the recording give")
     for step in found.history:
         click.echo(f"\n{' + '.join(step.model)}: error {step.error:.2f}, repeats stay below {step.gate:.2f}")
@@ -245,10 +248,9 @@ def _print_findings(found: Diagnosis, quiet: bool) -> None:
             if math.isnan(rank.error):  # given up before it was judged
                 continue
             mark = "+" if rank.effect == step.chosen else " "
-            chance = "" if math.isnan(rank.p_value) else f"  p {rank.p_value:.3f}"
             click.echo(
                 f"  {mark} {rank.effect:14s} error {rank.error:6.2f}  {100 * rank.share:3.0f} % of the way "
-                f"to the floor{chance}"
+                f"to the floor"
             )
         if step.ties:
             click.echo(f"    cannot be told apart from {step.chosen}: {', '.join(step.ties)}")

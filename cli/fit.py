@@ -35,7 +35,7 @@ from dase.cli.options import (
 @fps_option
 @part_options
 @effects_option
-@click.option("--pixels", default=1500, show_default=True, help="In each half of the measurement.")
+@click.option("--pixels", default=1500, show_default=True, help="In each part of the measurement.")
 @device_option
 @click.option("--seed", default=0, show_default=True, help="The same seed gives the same fit.")
 @click.option("--force", is_flag=True, help="Write the file also where the fit should not be kept.")

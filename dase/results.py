@@ -10,6 +10,7 @@ import math
 import textwrap
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
+from enum import StrEnum
 from typing import Any
 
 import numpy as np
@@ -288,14 +289,89 @@ class Step:
         )
 
 
+class Grade(StrEnum):
+    """How sure a diagnosis is of an effect."""
+
+    CERTAIN = "certain"
+    """Seen in the events alone: it holds whatever is known of the scene and whatever else the camera does."""
+
+    SUPPORTED = "supported"
+    """Given the scene: the effect's own test holds on pixels by which nothing was chosen, nothing else does
+    as well in its place, and with it next to nothing of the error is left."""
+
+    EITHER = "either"
+    """As much speaks for another effect, or so little for any that something unknown may look like it."""
+
+    STAND_IN = "stand-in"
+    """It takes some of the error away and is not found: something else may be behind that."""
+
+
+@dataclass(frozen=True, repr=False)
+class Finding:
+    """What a diagnosis says of one effect.
+
+    Args:
+        effect: Its name.
+        grade: How sure that is.
+        alternatives: Effects that do nearly as well in its place.
+        unknown: Whether something that is not in the library may look like it at this strength.
+        error_without: Error of the model without it, all else fitted again; not a number where that was not
+            seen.
+        error_with: Error of the model with it.
+        deviation: Standard deviations by which the measurement is away from the model without it, along its
+            way; not a number where that was not seen.
+        parameters: `effect.parameter` to its estimate.
+        seen: What the events show of it without a scene, in a sentence; empty where that is nothing.
+    """
+
+    effect: str
+    grade: Grade
+    alternatives: tuple[str, ...] = ()
+    unknown: bool = False
+    error_without: float = math.nan
+    error_with: float = math.nan
+    deviation: float = math.nan
+    parameters: Mapping[str, Estimate] = field(default_factory=dict)
+    seen: str = ""
+
+    def __repr__(self) -> str:
+        return fit_to_screen([f"Finding({self.sentence()})"])
+
+    def words(self) -> str:
+        """Return the effect, and what it cannot be told from."""
+        others = [*self.alternatives, *(["something that is not in the library"] if self.unknown else [])]
+        if self.grade is not Grade.EITHER:
+            return self.effect
+        return f"either {self.effect} or {' or '.join(others)}"
+
+    def sentence(self) -> str:
+        """Return what is said of the effect, and why."""
+        why = [self.seen] if self.seen else []
+        if not math.isnan(self.error_without):
+            why.append(
+                f"without it the error is {self.error_without:.3g}, with it {self.error_with:.3g}, and the "
+                f"measurement is {self.deviation:.1f} standard deviations off along its way"
+            )
+        grade = "" if self.grade is Grade.EITHER else f"{self.grade}: "
+        return f"{grade}{self.words()}" + (f" ({'; '.join(why)})" if why else "")
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the finding as a JSON object: None where a number is not known."""
+        out = asdict(self) | {"grade": str(self.grade), "sentence": self.sentence()}
+        plain = ("error_without", "error_with", "deviation")
+        return out | {name: None if math.isnan(out[name]) else out[name] for name in plain}
+
+
 @dataclass(frozen=True, repr=False)
 class Unexplained:
     """An error that no effect of the library takes to the floor.
 
     Args:
-        error: What is left with the best that was found.
-        share: What is left as a share of the error of the model before the search, both above the floor.
-        nearest: Effects that come nearest to an explanation; stand-ins, not findings.
+        error: What is left with the best that was found, stand-ins included.
+        share: What is left as a share of the error of the model before the search, both above the level of
+            chance.
+        nearest: Effects that come nearest to an explanation of what the findings leave; stand-ins, not
+            findings.
         cells: Where what is left sits, worst first.
         sentence: The finding as one sentence.
     """
@@ -317,21 +393,25 @@ class Diagnosis:
 
     Args:
         sensor: The model with all that was found, fitted; the refitted model where nothing was found.
-        selected: Names of the effects found, in the order added. Empty when nothing is missing, and when the
-            error stays unexplained: a stand-in is never announced as found.
-        errors: Held-out error of the refitted model at the start and after each addition to `selected`.
-        before: Held-out error of the model as it was given, before any fit.
+        selected: Names of the effects that are certain or supported and in `sensor`, in the order added.
+        errors: Error of the refitted model at the start and after each addition to `selected`, like `before`
+            on pixels by which nothing was chosen.
+        before: Error of the model as it was given, before any fit.
         floor: The error of repeats, 1 by construction.
         gate: Error that 99 of 100 repeats of the last model stay below.
         parameters: `effect.parameter` to its estimate, of all fitted parameters of `sensor`.
-        ties: Effect found to those that explain the data as well.
-        unexplained: What is left, or None.
+        unexplained: What is left, or None; there may be findings beside it.
         history: One entry per step of the search, provisional additions included.
         notes: What the user should know.
         evaluations: Simulations that were run.
         seconds: Time it took.
         plain: Name with unit to (measured, simulated) of the last model, such as `ON events [1/(px s)]`.
         finished: Whether the search came to its end; before, nothing is announced.
+        findings: What is said of each effect, with its grade: those of `selected`, those that cannot be told
+            from others, and those that the events alone show but that no model was fitted with.
+        stand_ins: The same of effects that came nearest and are not found.
+        level: Error of a repeat of the last model, in the mean.
+        reach: Error that 99 of 100 repeats of it stay below, however little that is.
     """
 
     sensor: Sensor
@@ -341,7 +421,6 @@ class Diagnosis:
     floor: float
     gate: float
     parameters: Mapping[str, Estimate]
-    ties: Mapping[str, tuple[str, ...]]
     unexplained: Unexplained | None
     history: tuple[Step, ...]
     notes: tuple[str, ...] = ()
@@ -349,10 +428,22 @@ class Diagnosis:
     seconds: float = 0.0
     plain: Mapping[str, tuple[float, float]] = field(default_factory=dict)
     finished: bool = True
+    findings: tuple[Finding, ...] = ()
+    stand_ins: tuple[Finding, ...] = ()
+    level: float = 0.0
+    reach: float = 0.0
+
+    @property
+    def ties(self) -> dict[str, tuple[str, ...]]:
+        """Effect found to those that do nearly as well in its place."""
+        return {one.effect: one.alternatives for one in self.findings if one.alternatives}
+
+    def of_grade(self, grade: Grade) -> tuple[Finding, ...]:
+        """Return the findings of a grade."""
+        return tuple(one for one in self.findings if one.grade is grade)
 
     def __repr__(self) -> str:
         steps = [("as given", self.before), *zip(("fitted", *self.selected), self.errors, strict=False)]
-        ties = [f"{name}: {', '.join(others)}" for name, others in self.ties.items()]
         return fit_to_screen(
             [
                 *textwrap.wrap(f"Diagnosis: {self.finding()}", 100, subsequent_indent="  "),
@@ -360,7 +451,7 @@ class Diagnosis:
                     f"error after each step; repeats stay below {self.gate:.2f}",
                     align_columns([(name, f"{error:.2f}") for name, error in steps], right=(1,)),
                 ),
-                *_indented("cannot be told apart from", ties),
+                *_indented("findings", [one.sentence() for one in self.findings[:6]]),
                 *_parameter_lines(self.parameters, most=12),
                 *_plain_lines(self.plain),
                 *_noted(self.notes),
@@ -373,16 +464,25 @@ class Diagnosis:
             added = [step.chosen for step in self.history if step.chosen]
             tried = f"; nearest so far: {', '.join(added)}, not yet checked" if added else ""
             return f"not finished: error {self.history[-1].error:.2f} after {len(self.history)} steps{tried}"
+        said = []
+        for grade in (Grade.CERTAIN, Grade.SUPPORTED, Grade.EITHER):
+            names = [one.words() for one in self.of_grade(grade)]
+            if names:
+                said.append(", ".join(names) + ("" if grade is Grade.EITHER else f" ({grade})"))
         if self.unexplained is not None:
-            return self.unexplained.sentence
-        if not self.selected:
+            return "; ".join([*([f"missing: {'; '.join(said)}"] if said else []), self.unexplained.sentence])
+        if not said:
             return f"nothing is missing: error {self.errors[0]:.2f}, repeats stay below {self.gate:.2f}"
-        return f"missing: {', '.join(self.selected)}"
+        return f"missing: {'; '.join(said)}"
 
     def to_json(self) -> dict[str, Any]:
         """Return the findings as JSON objects."""
         return {
             "selected": list(self.selected),
+            "findings": [one.to_json() for one in self.findings],
+            "stand_ins": [one.to_json() for one in self.stand_ins],
+            "level": self.level,
+            "reach": self.reach,
             "errors": list(self.errors),
             "before": self.before,
             "floor": self.floor,
@@ -471,8 +571,7 @@ def _rank_words(rank: Rank) -> tuple[str, ...]:
     if math.isnan(rank.error):
         return rank.effect, "not judged"
     way = f"{100 * rank.share:.0f} % of the way to the floor"
-    chance = "" if math.isnan(rank.p_value) else f"p {rank.p_value:.3f}"
-    return rank.effect, f"error {rank.error:.2f}", way, chance
+    return rank.effect, f"error {rank.error:.2f}", way
 
 
 def _answer_words(answer: Answer) -> tuple[str, ...]:

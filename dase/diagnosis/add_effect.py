@@ -41,7 +41,7 @@ def fit_added(
             that does not change. None for the frames of the recording; events alone need one.
         trust: Where and when the scene is to be trusted; None for everywhere, and for what a
             `CameraScene` trusts of itself.
-        pixels: In each half of the measurement.
+        pixels: In each part of the measurement.
         seed: Of every random number.
         device: Where kernels run.
         progress: Told how far it is.
@@ -60,7 +60,7 @@ def fit_added(
     tell("fitting without the effect", 0.0, float("nan"))
     present = fit_present_model(evidence, without, None, seed=seed)
     before = present.judge(
-        evidence.held, repeats=DEFAULTS.repeats // 2, seed=SimulationStream.JUDGE.seed(seed)
+        evidence.report, repeats=DEFAULTS.repeats // 2, seed=SimulationStream.JUDGE.seed(seed)
     ).error
     tell(f"where to begin with {effect.name}", 0.1, before)
     # far from where it is, a descent could end in the wrong place

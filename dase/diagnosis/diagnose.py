@@ -11,7 +11,14 @@ from os import PathLike
 from dase.diagnosis.candidates import Candidate, calibrate_split, effects_to_try, try_effects
 from dase.diagnosis.cell_descriptions import worst_cells
 from dase.diagnosis.directional_test import find_hidden_effect
+from dase.diagnosis.grading import ModelOnReport, grade_effects, judge_on_report
 from dase.diagnosis.pruning import prune_model
+from dase.diagnosis.seen_effects import (
+    SeenEffects,
+    find_seen_effects,
+    without_the_explained,
+    without_the_scene,
+)
 from dase.diagnosis.settings import DEFAULTS, DiagnosisSettings
 from dase.diagnosis.state import DiagnosisState, explains_remainder, with_same_freedom
 from dase.effects import EFFECTS, Effect
@@ -20,12 +27,25 @@ from dase.fitting.data_split import SPLIT, split_measurement
 from dase.fitting.measurement import Measured, SceneChoice, as_measurement
 from dase.fitting.model import FittedModel, fit_present_model, model_of, refit_model, refit_work
 from dase.fitting.plain_numbers import plain_numbers
+from dase.fitting.scene_doubt import is_guessed, with_scene_doubt
 from dase.fitting.scheduler import run_side_by_side
 from dase.fitting.search_ends import parameters_at_bounds
 from dase.probes.distance import Judgement, leaves_nothing, may_be_announced, reaches_floor, worst_families
 from dase.probes.random_streams import SimulationStream
 from dase.probes.stimulus import Trust
-from dase.results import Cell, Diagnosis, Estimate, Progress, Rank, Step, Unexplained, is_worse
+from dase.results import (
+    Cell,
+    Diagnosis,
+    Estimate,
+    Finding,
+    Grade,
+    Progress,
+    Rank,
+    Step,
+    Unexplained,
+    is_worse,
+)
+from dase.scenes.between_frames import CameraScene
 from dase.simulation.sensor import Sensor
 from dase.simulation.sensor_file import as_sensor
 
@@ -58,7 +78,7 @@ def diagnose(
         trust: Where and when the scene is to be trusted; None for everywhere, and for what a
             `CameraScene` trusts of itself.
         most: Effects that are added at most.
-        pixels: In each half of the measurement.
+        pixels: In each part of the measurement.
         seed: Of every random number.
         device: Where kernels run.
         progress: Told how far it is.
@@ -73,9 +93,12 @@ def diagnose(
     given = Sensor() if sensor is None else as_sensor(sensor)
     measurement = as_measurement(measured, scene, trust)
     given = given.bound_to(measurement.scene)
+    tell("looking at the events alone", 0.0, float("nan"))
+    seen = find_seen_effects(measurement)
     evidence = split_measurement(
         measurement.events, measurement.scene, log_eps=given.log_eps, trust=measurement.trust,
-        span=measurement.span, pixels=pixels, seed=seed, device=device,
+        span=measurement.span, left_out=seen.bursts.contains if seen.bursts else None, lamp=seen.lamp,
+        pixels=pixels, seed=seed, device=device,
     )  # fmt: skip
     tell("fitting the present model", 0.0, float("nan"))
     names = frozenset(effect.name for effect in given.effects)
@@ -86,55 +109,65 @@ def diagnose(
         )
     before = (
         model_of(given, free)
-        .judge(evidence.held, repeats=settings.repeats // 2, seed=SimulationStream.JUDGE.seed(seed))
+        .judge(evidence.report, repeats=settings.repeats // 2, seed=SimulationStream.JUDGE.seed(seed))
         .error
     )
-    start = _fitted_unless_worse(state, given, free, before)
+    start = _fitted_unless_worse(state, given, free)
+    seen = without_the_scene(seen, measurement, start.sensor, seed)
+    if isinstance(measurement.scene, CameraScene) and is_guessed(measurement.scene):
+        tell("how well the scene is known", 0.0, before)
+        evidence = with_scene_doubt(evidence, measurement.scene, start, seed=seed)
+        state.evidence = evidence
+        before = (
+            model_of(given, free)
+            .judge(evidence.report, repeats=settings.repeats // 2, seed=SimulationStream.JUDGE.seed(seed))
+            .error
+        )
+        start = _fitted_unless_worse(state, start.sensor, free)
+    state.certain = frozenset(seen.effects) - names
+    if seen.bursts is not None:
+        state.notes.append("the bursts that come with the frames are left out of all that is compared")
     # what is not of this scene has no effects to be found
     limit = 0 if evidence.contradiction else most
-    model, judgement, errors = _add_one_by_one(state, start, limit)
+    model, judgement = _add_one_by_one(state, start, limit)
     if not reaches_floor(judgement) and limit > 0:
-        model, judgement = _add_pair(state, start, model, judgement)
+        model, judgement = _add_pair(state, model, judgement)
     if len(state.added_to(model)) > 1:
         model, judgement = prune_model(state, model, judgement)
-    found = _conclude_diagnosis(state, start, model, errors, before)
+    seen = without_the_explained(seen, measurement, model.sensor, seed)
+    found = _conclude_diagnosis(state, start, model, before, seen)
     return measurement.noted(replace(found, seconds=time.perf_counter() - begin))
 
 
-def _fitted_unless_worse(
-    state: DiagnosisState, given: Sensor, free: Sequence[str] | None, before: float
-) -> FittedModel:
+def _fitted_unless_worse(state: DiagnosisState, given: Sensor, free: Sequence[str] | None) -> FittedModel:
     """Return the sensor as it was given, fitted; as it is where the fit does not generalise.
 
     Args:
         state: Gets a note of a fit that was not kept.
         given: The sensor.
         free: Its parameters that may be refitted; None for all.
-        before: Its held-out error.
     """
     evidence, seed = state.evidence, state.seed
     fitted = fit_present_model(evidence, given, free, seed=seed)
     stream = SimulationStream.JUDGE.seed(seed)
-    judged = fitted.judge(evidence.held, repeats=state.settings.repeats // 2, seed=stream)
-    if not is_worse(judged.error, before, judged.gate):
+    asked = model_of(given, free)
+    judged, as_given = (
+        one.judge(evidence.held, repeats=state.settings.repeats // 2, seed=stream) for one in (fitted, asked)
+    )
+    if not is_worse(judged.error, as_given.error, judged.gate):
         return fitted
     state.notes.append(
         f"fitted again, the sensor as given is worse on pixels and time that no fit has seen (error "
-        f"{judged.error:.2f} instead of {before:.2f}): the search began from the sensor as given"
+        f"{judged.error:.2f} instead of {as_given.error:.2f}): the search began from the sensor as given"
     )
-    return model_of(given, free)
+    return asked
 
 
-def _add_one_by_one(
-    state: DiagnosisState, model: FittedModel, most: int
-) -> tuple[FittedModel, Judgement, list[float]]:
-    """Add the best effect as long as one is missing.
-
-    Returns:
-        The model, its held-out error, and the errors before the first addition and after each.
-    """
+def _add_one_by_one(state: DiagnosisState, model: FittedModel, most: int) -> tuple[FittedModel, Judgement]:
+    """Add the best effect as long as one is missing; return the model and its held-out error."""
     errors, far = list[float](), False
     for _ in range(most + 1):
+        state.path.append(model)
         # what is far from the floor needs no exact error
         judgement = state.judge(model, repeats=state.settings.candidates.few_repeats if far else None)
         errors.append(judgement.error)
@@ -147,7 +180,7 @@ def _add_one_by_one(
         if better is None:
             break
         model = better
-    return model, judgement, errors
+    return model, judgement
 
 
 def _look_for_effect(
@@ -166,6 +199,10 @@ def _look_for_effect(
     if leaves_nothing(judgement) or not more:
         return step, None, False
     open_names = effects_to_try(state.effects, model)
+    # what is certain comes first, and by itself: everything else is judged beside it
+    certain = [name for name in open_names if name in state.certain - state.tried_alone]
+    state.tried_alone |= frozenset(certain)
+    open_names = certain or open_names
     if not open_names:
         return step, None, False
     present = calibrate_split(
@@ -177,9 +214,11 @@ def _look_for_effect(
         settings=settings.candidates,
     )  # fmt: skip
     step = replace(step, ranking=tuple(_rank_of(one, judgement) for one in tried))
-    if not state.history:
-        state.first = sorted(tried, key=lambda one: one.screened_loss)
+    if not state.first and not certain:
+        state.first, state.first_step = sorted(tried, key=lambda one: one.screened_loss), len(state.history)
     best, ties = _best_candidate(state, tried, judgement)
+    if best is None and certain:
+        return _look_for_effect(state, model, judgement, more)
     if best is None:
         return step, None, False
     state.note_addition(best, [one for one in tried if one.judgement], ties, judgement)
@@ -250,10 +289,13 @@ def _rank_of(candidate: Candidate, judgement: Judgement) -> Rank:
 
 
 def _add_pair(
-    state: DiagnosisState, start: FittedModel, model: FittedModel, judgement: Judgement
+    state: DiagnosisState, model: FittedModel, judgement: Judgement
 ) -> tuple[FittedModel, Judgement]:
     """Where adding one after the other does not reach the floor, try two at once."""
     evidence, seed, settings = state.evidence, state.seed, state.settings
+    if not state.first:
+        return model, judgement
+    before, start = state.history[state.first_step], state.path[state.first_step]
     singles = [one for one in state.first if one.screened_loss < settings.pair_helps_alone][: settings.paired]
     scout = start.calibrate(
         evidence.scout, repeats=settings.scout_repeats, seed=SimulationStream.CALIBRATE_SCOUT.seed(seed)
@@ -273,12 +315,10 @@ def _add_pair(
     ranking: list[Rank] = []
     for (_, name, _), pair in zip(first, settled, strict=True):
         judged = state.judge(pair)
-        ranking = sorted([*ranking, _rank_of_pair(name, pair, judged, state.history[0])], key=_error_of_rank)
+        ranking = sorted([*ranking, _rank_of_pair(name, pair, judged, before)], key=_error_of_rank)
         if judged.error < judgement.error * (1.0 if reaches_floor(judged) else settings.pair_gain):
             model, judgement = pair, judged
-            state.history.append(
-                replace(state.history[0], chosen=name, ties=(), ranking=tuple(ranking), cells=())
-            )
+            state.history.append(replace(before, chosen=name, ties=(), ranking=tuple(ranking), cells=()))
     return model, judgement
 
 
@@ -310,7 +350,6 @@ def _known_so_far(
         floor=1.0,
         gate=state.history[-1].gate,
         parameters={},
-        ties={},
         unexplained=None,
         history=tuple(state.history),
         notes=(*state.notes, *state.evidence.notes),
@@ -321,50 +360,94 @@ def _known_so_far(
 
 
 def _conclude_diagnosis(
-    state: DiagnosisState, start: FittedModel, model: FittedModel, errors: list[float], before: float
+    state: DiagnosisState, start: FittedModel, model: FittedModel, before: float, seen: SeenEffects
 ) -> Diagnosis:
-    """Return what was found; names are announced only where they bring the error to the floor."""
+    """Return what was found, judged by the part of the measurement by which nothing was chosen."""
     found = state.added_to(model)
     chosen = [n for s in state.history if s.chosen for n in s.chosen.split(" + ")]
     order = tuple(dict.fromkeys([*(n for n in chosen if n in found), *found]))
     model, values = estimate_parameters(state.evidence, model, seed=state.seed)
-    stream = SimulationStream.JUDGE.seed(state.seed)
-    held = model.calibrate(state.evidence.held, repeats=state.settings.repeats, seed=stream)
-    last = held.judge(stream)
+    stream, repeats = SimulationStream.JUDGE.seed(state.seed), state.settings.repeats
+    report = model.calibrate(state.evidence.report, repeats=repeats, seed=stream)
+    last = report.judge(stream)
+    way = _judged_way(state)
+    first = way.get(frozenset()) or judge_on_report(state, [start], repeats=repeats)[0]
+    at_bounds = parameters_at_bounds(model, values)
+    judged_effects: dict[str, Finding] = {}
+    if not state.evidence.contradiction:
+        judged_effects = grade_effects(
+            state, model, order, way, first, last, report=report, values=values, at_bounds=at_bounds
+        )
+    said = seen.findings(judged_effects.values(), state.given)
+    findings = {one.effect: one for one in said if one.grade is not Grade.STAND_IN}
+    kept = tuple(n for n in order if n in findings and findings[n].grade is not Grade.EITHER)
+    nearest = tuple(n for n in order if n not in findings)
+    final, error, estimates, plain = model, last.error, values, plain_numbers(report)
+    if set(kept) != set(order):
+        final = _model_with_only(state, start, model, kept)
+        final, estimates = estimate_parameters(state.evidence, final, seed=state.seed)
+        bare = final.calibrate(state.evidence.report, repeats=repeats, seed=stream)
+        judged = bare.judge(stream)
+        error, plain = judged.error, plain_numbers(bare)
+    cells = worst_cells(state.evidence, last)
     unexplained: Unexplained | None = None
-    doubts = _doubts_about(state, model, values, order)
-    if not may_be_announced(last) or doubts:
-        cells = worst_cells(state.evidence, last)
-        unexplained = _describe_unexplained(state, order, errors[0], last, cells)
-        if doubts:
-            unexplained = replace(unexplained, sentence=_sentence_of_doubts(order, doubts, last))
-    kept = unexplained is None
-    path = _errors_after_additions(state, order, errors, last.error) if kept else [errors[0]]
-    ties = {n: tuple(sorted(state.ties.get(n, set()) - set(found))) for n in order if kept}
+    doubts = [state.evidence.contradiction] if state.evidence.contradiction else at_bounds
+    if (doubts and order and not findings) or state.evidence.contradiction:
+        unexplained = replace(
+            describe_unexplained(order, findings, first.judgement, last, cells),
+            sentence=_sentence_of_doubts(order, doubts, last),
+        )
+    elif nearest or not may_be_announced(last):
+        unexplained = describe_unexplained(nearest, findings, first.judgement, last, cells)
     return Diagnosis(
-        sensor=model.sensor if kept else start.sensor,
-        selected=order if kept else (),
-        errors=tuple(path),
+        sensor=final.sensor,
+        selected=kept,
+        errors=_errors_after_additions(way, kept, first.judgement.error, error),
         before=before,
         floor=1.0,
         gate=last.gate,
-        parameters=values,
-        ties={name: others for name, others in ties.items() if others},
+        parameters=estimates,
         unexplained=unexplained,
-        history=tuple(state.history),
-        notes=(*state.notes, *parameters_at_bounds(model, values), *state.evidence.notes),
-        plain=plain_numbers(held),
+        history=_with_reported_errors(state, way),
+        notes=(*state.notes, *at_bounds, *state.evidence.notes),
+        plain=plain,
         evaluations=state.evidence.evaluations,
+        findings=tuple(findings.values()),
+        stand_ins=tuple(one for one in said if one.grade is Grade.STAND_IN),
+        level=last.level,
+        reach=last.reach,
     )
 
 
-def _doubts_about(
-    state: DiagnosisState, model: FittedModel, values: Mapping[str, Estimate], found: tuple[str, ...]
-) -> list[str]:
-    """Return what forbids to announce effects although the error may be at the floor, in words."""
-    if state.evidence.contradiction:
-        return [state.evidence.contradiction]
-    return parameters_at_bounds(model, values) if found else []
+def _judged_way(state: DiagnosisState) -> dict[frozenset[str], ModelOnReport]:
+    """Return the models of the search by what they had added, on the part that reports."""
+    models = {frozenset(state.added_to(one)): one for one in state.path}
+    judged = judge_on_report(state, list(models.values()), repeats=state.settings.repeats)
+    return dict(zip(models, judged, strict=True))
+
+
+def _model_with_only(
+    state: DiagnosisState, start: FittedModel, model: FittedModel, names: tuple[str, ...]
+) -> FittedModel:
+    """Return the model with only some of the effects that were added, fitted."""
+    for one in (start, *state.path):
+        if set(state.added_to(one)) == set(names):
+            return one
+    sensor = model.sensor
+    for name in state.added_to(model):
+        sensor = sensor if name in names else sensor.without(name)
+    return refit_model(state.evidence, with_same_freedom(sensor, model, ()), seed=state.seed)
+
+
+def _with_reported_errors(
+    state: DiagnosisState, way: Mapping[frozenset[str], ModelOnReport]
+) -> tuple[Step, ...]:
+    """Return the steps of the search with the errors of the part that reports, so that each model has one."""
+    out = []
+    for step in state.history:
+        mine = way.get(frozenset(step.model) - state.given)
+        out.append(replace(step, error=mine.judgement.error, gate=mine.judgement.gate) if mine else step)
+    return tuple(out)
 
 
 def _sentence_of_doubts(found: tuple[str, ...], doubts: list[str], last: Judgement) -> str:
@@ -373,27 +456,47 @@ def _sentence_of_doubts(found: tuple[str, ...], doubts: list[str], last: Judgeme
 
 
 def _errors_after_additions(
-    state: DiagnosisState, order: tuple[str, ...], errors: list[float], last: float
-) -> list[float]:
+    way: Mapping[frozenset[str], ModelOnReport], kept: tuple[str, ...], first: float, last: float
+) -> tuple[float, ...]:
     """Return the error at the start and after each effect that was kept.
 
     Effects that came in at once, or in place of another, have no error of their own on the way: it is taken
     to fall to the last error with the first of them.
     """
-    after = {step.chosen: e for step, e in zip(state.history, errors[1:], strict=False)}
-    path = [errors[0], *(after.get(name, last) for name in order)]
-    path[-1] = last
-    return path
+    if not kept:
+        return (first,)
+    known = (way.get(frozenset(kept[: n + 1])) for n in range(len(kept) - 1))
+    return (first, *(one.judgement.error if one else last for one in known), last)
 
 
-def _describe_unexplained(
-    state: DiagnosisState, nearest: tuple[str, ...], first: float, last: Judgement, cells: tuple[Cell, ...]
+def describe_unexplained(
+    nearest: Sequence[str],
+    findings: Mapping[str, Finding],
+    first: Judgement,
+    last: Judgement,
+    cells: tuple[Cell, ...],
+    usual: float = DEFAULTS.grades.usual,
 ) -> Unexplained:
-    share = (last.error - 1.0) / max(first - 1.0, 1e-9)
-    stand_in = " and ".join(nearest) if nearest else "no effect"
-    where = cells[0].sentence if cells else "no single cell stands out"
-    sentence = (
-        f"unexplained: with {stand_in} an error of {last.error:.2g} is left ({100 * share:.0f} % of the "
-        f"error above the floor), which none of the effects known takes to the floor; worst: {where}"
-    )
-    return Unexplained(last.error, share, nearest, cells, sentence)
+    """Return what is left, how much of the error that is, and where it sits.
+
+    Args:
+        nearest: Stand-ins: effects of the last model that are not found.
+        findings: What was found.
+        first: Error of the model before the search.
+        last: Error of the last model.
+        cells: Where it fails.
+        usual: Error that true models have.
+    """
+    level = max(last.level, usual)
+    share = max(last.error - level, 0.0) / max(first.error - level, 1e-9)
+    where = f"; worst: {cells[0].sentence}" if cells else "; no single cell stands out"
+    left = f"an error of {last.error:.2g}, {100 * share:.0f} % of that before the search"
+    if findings:
+        beside = (
+            f" even with {' and '.join(nearest)}, which come nearest and are not found," if nearest else ""
+        )
+        sentence = f"beside that{beside} {left}, stays unexplained{where}"
+    else:
+        beside = f"with {' and '.join(nearest)}, which come nearest, " if nearest else "with no effect "
+        sentence = f"unexplained: {beside}{left}, is left{where}"
+    return Unexplained(last.error, share, tuple(nearest), cells, sentence)

@@ -34,11 +34,15 @@ class RepeatCloud:
         repeats: Of the model, shape (R, J).
         seen: The measurement, shape (J,).
         most_of_one: Differences beyond this many standard errors count as this.
+        doubt: Standard errors by which each statistic may be off for other reasons than chance, shape (J,).
+        drift: The same as one way that all of them may go together, with signs, shape (J,).
     """
 
     repeats: Array
     seen: Array
     most_of_one: float = DEFAULTS.hidden.most_of_one
+    doubt: Array | None = None
+    drift: Array | None = None
 
     def clipped(self, differences: Array) -> Array:
         """Return differences (..., J), none larger than a single statistic may count."""
@@ -52,7 +56,12 @@ class RepeatCloud:
         """
         along = self.clipped(self.repeats) @ ways.T
         rest = np.maximum(1.0 - self.repeats.var(0), 0.0)
-        spread = np.sqrt(along.var(0) + (rest * ways**2).sum(1))
+        if self.doubt is not None:
+            rest = rest + np.minimum(self.doubt, self.most_of_one) ** 2
+        square = along.var(0) + (rest * ways**2).sum(1)
+        if self.drift is not None:
+            square = square + (self.clipped(self.drift) @ ways.T) ** 2
+        spread = np.sqrt(square)
         out: Array = (self.clipped(self.seen) @ ways.T - along.mean(0)) / np.maximum(spread, 1e-12)
         return out
 
@@ -63,7 +72,9 @@ def find_hidden_effect(
     """Return the effect that chance hid, fitted and judged, and its p-value; None if there is none."""
     hidden = state.settings.hidden
     # also above what chance does: there no candidate may be certain by the fall of its loss
-    if judgement.level < hidden.hides or not reaches_floor(judgement):
+    # what the scene is not known to hides effects as chance does
+    hides = judgement.level >= hidden.hides or state.evidence.train.doubt is not None
+    if not hides or not reaches_floor(judgement):
         return None
     state.progress("looking closer", 0.0, state.error)
     start = _most_deviating_effect(state, model)
@@ -97,12 +108,28 @@ def lacks_effect_of(
 
 
 def deviation_towards(
-    state: DiagnosisState, subset: PixelSubset, model: FittedModel, other: FittedModel
+    state: DiagnosisState,
+    subset: PixelSubset,
+    model: FittedModel,
+    other: FittedModel,
+    *,
+    doubt: Array | None = None,
 ) -> float:
-    """Return how far a measurement is from repeats of a model, on the way to another, in their deviations."""
+    """Return how far a measurement is from repeats of a model, on the way to another, in their deviations.
+
+    Args:
+        state: Seeds and settings.
+        subset: Where both are run.
+        model: Whose repeats the measurement is compared with.
+        other: Towards which.
+        doubt: What each statistic may be off by for other reasons than chance, shape (J,).
+    """
     half, cloud = _repeat_cloud(state, subset, model)
+    if doubt is not None:
+        cloud = replace(cloud, doubt=_in_standard_errors(half, doubt))
     one, two = _mean_statistics(state, half, [(model, model.place[None]), (other, other.place[None])])
-    return float(cloud.deviations_along(_in_standard_errors(half, two - one))[0])
+    # a way far along few statistics would count only these, of which none may decide
+    return float(cloud.deviations_along(cloud.clipped(_in_standard_errors(half, two - one)))[0])
 
 
 def _most_deviating_effect(
@@ -191,7 +218,10 @@ def _repeat_cloud(
     repeats = half.repeats
     middle = repeats.mean(0)
     seen = _in_standard_errors(half, half.chance.target - middle)
-    cloud = RepeatCloud(_in_standard_errors(half, repeats - middle), seen, state.settings.hidden.most_of_one)
+    drift = None if half.drift is None else _in_standard_errors(half, half.drift)
+    cloud = RepeatCloud(
+        _in_standard_errors(half, repeats - middle), seen, state.settings.hidden.most_of_one, drift=drift
+    )
     return half, cloud
 
 

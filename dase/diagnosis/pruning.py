@@ -27,7 +27,7 @@ def prune_model(
         return model, judgement
     model, judgement = _drop_needless(state, model, judgement)
     before = model
-    for name in state.added_to(model):
+    for name in (n for n in state.added_to(model) if n not in state.certain):
         for other, swap in _keep_near_models(state, _rival_models(state, model, name), judgement).items():
             swapped = refit_model(state.evidence, swap, seed=state.seed)
             judged = state.judge(swapped)
@@ -53,7 +53,7 @@ def _drop_needless(
     """Drop effects that are not needed any more."""
     whole = model
     for name, less in _keep_near_models(state, _droppable_models(state, model), judgement).items():
-        if name not in model.sensor or len(state.added_to(model)) == 1:
+        if name not in model.sensor or name in state.certain or len(state.added_to(model)) == 1:
             continue
         less = less if model is whole else with_same_freedom(model.sensor.without(name), model, ())
         fitted = refit_model(state.evidence, less, seed=state.seed)

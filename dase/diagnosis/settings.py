@@ -126,6 +126,51 @@ class PruningSettings:
 
 
 @dataclass(frozen=True)
+class GradeSettings:
+    """How sure a diagnosis must be of an effect.
+
+    Chosen on the development sets of `docs/hidden-effects.md`.
+    """
+
+    away: float = 2.5
+    """Standard deviations by which the measurement must be away from the model without an effect, along the
+    effect's way, on the part that reports."""
+
+    usual: float = 0.25
+    """Error that true models have in the median; what is left is what is above it, or above the level of
+    chance where that is higher."""
+
+    total_left: float = 0.1
+    """Share of the error before the search up to which a model that is not at the
+    floor is taken for the right one before a slightly wrong world: right effects left 2 to 6 %, stand-ins for
+    strong effects that were not in the library 14 % and more, voltage noise for shot noise apart."""
+
+    own_left: float = 0.3
+    """The same, as a share of what is left without the effect: what explains less may explain the wrong
+    world."""
+
+    weak: float = 0.5
+    """What is left without an effect below which something that is not in the library
+    could look like it."""
+
+    rival: float = 2.0
+    """A rival is tried in the place of an effect if it left no more than this times what the effect left when
+    it was added."""
+
+    rivals: int = 3
+    """Rivals tried at most for each effect."""
+
+    tie: float = 0.15
+    """A rival that leaves no more than this beyond what the effect leaves is not told apart from it."""
+
+    tie_share: float = 1.5
+    """The same, in units of what the effect leaves."""
+
+    repeats: int = 30
+    """Simulations by which the models are judged."""
+
+
+@dataclass(frozen=True)
 class DiagnosisSettings:
     """When an effect is added to a model and when the search ends."""
 
@@ -167,6 +212,7 @@ class DiagnosisSettings:
     candidates: CandidateSettings = field(default_factory=CandidateSettings)
     hidden: HiddenEffectSettings = field(default_factory=HiddenEffectSettings)
     pruning: PruningSettings = field(default_factory=PruningSettings)
+    grades: GradeSettings = field(default_factory=GradeSettings)
 
 
 DEFAULTS = DiagnosisSettings()

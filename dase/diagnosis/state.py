@@ -32,7 +32,12 @@ class DiagnosisState:
         error_of: Effect that was added to the held-out error with it.
         ties: Effect that was added to those that the data cannot tell apart from it.
         without: What the model left before an effect was added to it, where it counted as right already.
-        first: Candidates of the first step in order of their screening, from which pairs are made.
+        first: Candidates of the first step in which all were tried, in order of their screening, from which
+            pairs are made.
+        first_step: Which step that was.
+        certain: Effects that the events alone show; they are not dropped.
+        tried_alone: Those of them that were tried before all others.
+        path: Models that were fitted in full on the way, the first one without any addition.
         notes: What the user should know of the search.
         after_step: Told the model and the errors so far after each step.
         error: Held-out error of the model that was judged last.
@@ -50,6 +55,10 @@ class DiagnosisState:
     ties: dict[str, set[str]] = field(default_factory=dict)
     without: dict[str, Judgement] = field(default_factory=dict)
     first: list[Candidate] = field(default_factory=list)
+    certain: frozenset[str] = frozenset()
+    tried_alone: frozenset[str] = frozenset()
+    first_step: int = 0
+    path: list[FittedModel] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
     after_step: Callable[[FittedModel, list[float]], None] = lambda model, errors: None
     error: float = float("nan")

@@ -20,7 +20,7 @@ from dase.figures.style import Plate, format_number
 from dase.fitting.measurement import Measurement
 from dase.io import replacing
 from dase.probes.statistics import FAMILY_WORDS
-from dase.results import Comparison, Diagnosis, Estimate, Rank, Step
+from dase.results import Comparison, Diagnosis, Estimate, Finding, Grade, Rank, Step
 from dase.scenes.between_frames import CameraScene
 from dase.simulation.sensor import Sensor
 from dase.simulation.sensor_file import dump_sensor
@@ -156,7 +156,13 @@ def diagnosis_page(
         model: What to call the model; the name of the sensor if None.
         plates: Pictures of the model that was found, see `dase.figures.event_maps`.
     """
-    body = [html_page.verdict_html(diagnosis_verdict(found), wrong=found.unexplained is not None)]
+    mute = found.unexplained is not None and not found.findings
+    body = [html_page.verdict_html(diagnosis_verdict(found), wrong=mute)]
+    if found.findings or found.stand_ins:
+        head = ("effect", "how sure", "error without it", "error with it", "why")
+        body += [
+            html_page.table_html(head, [_finding_row(one) for one in (*found.findings, *found.stand_ins)])
+        ]
     body += _figures_html(diagnosis_drawings(found))
     if found.history and found.history[0].cells:
         body += ["<h2>Where the model failed</h2>", html_page.cells_html(found.history[0].cells)]
@@ -183,7 +189,7 @@ def diagnosis_page(
 def diagnosis_verdict(found: Diagnosis) -> str:
     """Return what a diagnosis found, in a sentence or two."""
     first, last = format_number(found.errors[0]), format_number(found.errors[-1])
-    if found.unexplained is not None:
+    if found.unexplained is not None and not found.findings:
         left = format_number(found.unexplained.error)
         near = " and ".join(found.unexplained.nearest)
         tried = f" {near} comes nearest, but leaves {left}: a stand-in, not a finding." if near else ""
@@ -191,21 +197,44 @@ def diagnosis_verdict(found: Diagnosis) -> str:
             f"Something is missing that no known effect explains: the error is {first} noise floors, and "
             f"chance reaches {format_number(found.gate)}.{tried}"
         )
-    if not found.selected:
+    if not found.findings:
         error = f"the error is {first} noise floors, and chance reaches {format_number(found.gate)}."
         if found.errors[0] > found.gate:
             return f"Nothing of weight is missing: {error} What is left is beyond chance, but small."
         return f"Nothing is missing: {error}"
-    names = " and ".join(found.selected)
-    ties = "".join(
-        f" The data cannot tell {name} from {' or '.join(others)}."
-        for name, others in found.ties.items()
-        if others
-    )
+    said = [
+        f"{text}: {', '.join(one.words() for one in mine)}."
+        for grade, text in GRADE_WORDS.items() if (mine := found.of_grade(grade))
+    ]  # fmt: skip
+    if found.selected:
+        it = "it" if len(found.selected) == 1 else "them"
+        said.append(
+            f"With {it} the error falls from {first} to {last} noise floors; "
+            f"chance alone reaches {format_number(found.gate)}."
+        )
+    if found.unexplained is not None:
+        said.append(f"{100 * found.unexplained.share:.0f} % of the error stays unexplained.")
+    return " ".join(said)
+
+
+GRADE_WORDS = {
+    Grade.CERTAIN: "Missing, and certain without the scene",
+    Grade.SUPPORTED: "Missing, and supported given the scene",
+    Grade.EITHER: "Missing, but the data do not tell what",
+}
+"""How a verdict begins for each grade."""
+
+
+def _finding_row(one: Finding) -> tuple[str, ...]:
+    """Return what is said of an effect as cells of a table."""
+    sure = {Grade.EITHER: "cannot be told apart", Grade.STAND_IN: "comes nearest, not found"}
+    why = [one.seen] if one.seen else []
+    if math.isfinite(one.deviation):
+        why.append(f"{one.deviation:.1f} standard deviations along its way")
     return (
-        f"Missing: {names}. With {'it' if len(found.selected) == 1 else 'them'} the held-out error falls "
-        f"from {first} to {last} noise floors; chance alone reaches {format_number(found.gate)}.{ties}"
-    )
+        one.words(), sure.get(one.grade, str(one.grade)), _number_or_dash(one.error_without),
+        _number_or_dash(one.error_with), "; ".join(why),
+    )  # fmt: skip
 
 
 def diagnosis_plates(found: Diagnosis) -> list[Plate]:
@@ -247,7 +276,8 @@ def stand_ins(found: Diagnosis) -> tuple[list[str], list[float]]:
         return [], []
     last, nearest = found.unexplained.error, found.unexplained.nearest
     after = {a.chosen: b.error for a, b in pairwise(found.history) if a.chosen and a.chosen in b.model}
-    if not all(name in after for name in nearest[:-1]):
+    # beside what is found, stand-ins have no error of their own on the way
+    if found.selected or not all(name in after for name in nearest[:-1]):
         return [f"+ {' + '.join(nearest)}"], [last]
     return [f"+ {name}" for name in nearest], [*(after[name] for name in nearest[:-1]), last]
 

@@ -1,4 +1,4 @@
-"""A measurement, split for fitting and for judging: other pixels and another time."""
+"""A measurement, split in three: what is fitted, what chooses between models, and what reports."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ class SplitSettings:
     """How a measurement is split, and what there must be of it."""
 
     pixels: int = 1500
-    """Pixels in each half of the measurement."""
+    """Pixels in each part of the measurement."""
 
     scouts: int = 500
     """Pixels of the scout, a third of those that are fitted: sampling errors are larger by less than 2."""
@@ -60,10 +60,10 @@ class SplitSettings:
     """Share of the time that is fitted; the rest is held out. What judges needs less than what is fitted."""
 
     least_pixels: int = 16
-    """Pixels without which a half says nothing."""
+    """Pixels without which a part says nothing."""
 
     least_events: int = 300
-    """Events that a half must have for anything to be said."""
+    """Events that a part must have for anything to be said."""
 
     burst: float = 2e-3
     """Events are counted for so long to see how fast they come at most [s]: long enough for many of them,
@@ -72,6 +72,9 @@ class SplitSettings:
 
 SPLIT = SplitSettings()
 
+PARTS = 3
+"""Groups of pixels: those that are fitted, that choose between models, and that report."""
+
 
 @dataclass(frozen=True, eq=False)
 class SplitMeasurement:
@@ -79,7 +82,9 @@ class SplitMeasurement:
 
     Args:
         train: Pixels and time that are fitted.
-        held: Other pixels, at a later time, which judge.
+        held: Other pixels, at a later time, which choose between models.
+        report: Again other pixels, at that later time: nothing is chosen by them, so what they say of the
+            chosen model is not better than it is.
         scout: Some of the pixels that are fitted, for what need not be exact.
         bands: Intensities between the bands, shape (BANDS - 1,).
         structure: Regularities of the time stamps.
@@ -92,6 +97,7 @@ class SplitMeasurement:
 
     train: PixelSubset
     held: PixelSubset
+    report: PixelSubset
     scout: PixelSubset
     bands: Array
     structure: TimestampStructure
@@ -116,7 +122,7 @@ class SplitMeasurement:
     @property
     def evaluations(self) -> int:
         """Models run so far."""
-        return sum(half.trials.evaluations for half in (self.train, self.held, self.scout))
+        return sum(half.trials.evaluations for half in (self.train, self.held, self.report, self.scout))
 
 
 @dataclass(frozen=True, eq=False)
@@ -134,12 +140,14 @@ def split_measurement(
     log_eps: float = 1e-3,
     trust: Trust | None = None,
     span: tuple[float, float] | None = None,
+    left_out: Callable[[Array], NDArray[np.bool_]] | None = None,
+    lamp: float | None = None,
     pixels: int = SPLIT.pixels,
     seed: int = 0,
     device: str = "cpu",
     settings: SplitSettings = SPLIT,
 ) -> SplitMeasurement:
-    """Split a measurement into a half that is fitted and a half that judges.
+    """Split a measurement into what is fitted, what chooses between models, and what reports.
 
     Args:
         events: What was measured.
@@ -149,7 +157,9 @@ def split_measurement(
             what a `CameraScene` trusts of itself.
         span: First and last time that is compared [s]; None for all, of which a long recording has a part
             chosen.
-        pixels: In each half.
+        left_out: Tells which times [s], shape (T,), are left out; None for none.
+        lamp: Frequency of light that flickers [Hz] where all events have told it; None to look for it here.
+        pixels: In each part.
         seed: Of the choice of pixels.
         device: Where kernels run.
         settings: How it is split.
@@ -173,11 +183,11 @@ def split_measurement(
     except ValueError as error:
         raise InputError(str(error)) from error
     size = scene.width * scene.height
-    each = min(pixels, size // 2)
+    each = min(pixels, size // PARTS)
     if each < settings.least_pixels:
         raise InputError(
-            f"a diagnosis needs at least {settings.least_pixels} pixels to fit and as many to judge, "
-            f"got {pixels} of {scene.width}x{scene.height}"
+            f"a diagnosis needs at least {settings.least_pixels} pixels to fit, as many to choose by and as "
+            f"many to report by, got {pixels} of {scene.width}x{scene.height}"
         )
     # a stream of its own: the same pixels are chosen whatever else is drawn from the seed
     rng, notes = Draw.PIXELS.generator(seed), list[str]()
@@ -187,11 +197,11 @@ def split_measurement(
     cut = max(2, round(settings.fitted_share * grid.steps))
     if trust is None:
         # other pixels judge: fixed patterns, such as mismatch, would be known from the fitted ones
-        chosen = rng.permutation(size)[: 2 * each].astype(np.int32)
+        chosen = rng.permutation(size)[: PARTS * each].astype(np.int32)
     else:
         looks = find_trusted_parts(events, scene, times_of_grid(scene, grid), cut, trust)
         chosen = choose_trusted_pixels(looks, each, rng, least=settings.least_pixels)
-        each = len(chosen) // 2
+        each = len(chosen) // PARTS
         notes.append(looks.sentence())
     # from the begin of the scene also for the half that judges: filters and memories are settled there
     times = times_of_grid(scene, grid)
@@ -207,9 +217,12 @@ def split_measurement(
         good &= outside_gaps(gaps)(times)
         length = 1e3 * float(np.median(np.diff(gaps, axis=1)))
         notes.append(f"{len(gaps)} gaps of {length:.3g} ms without any event: data are missing, and left out")
+    if left_out is not None:
+        good &= ~left_out(times)
     good[:, 1:] &= good[:, :-1]  # a step is what lies between two points of the grid
-    # both halves have the same bands, or a cell would mean another brightness in each
-    bands = band_edges(light, np.broadcast_to(good, light.shape))
+    # all parts have the same bands, or a cell would mean another brightness in each; what reports has no say
+    several = light[: 2 * each]
+    bands = band_edges(several, np.broadcast_to(good[: 2 * each], several.shape))
     sorting = partial(sort_into_cells, step=grid.step, bands=bands, log_eps=log_eps)
     # filters over time go pixel by pixel, so parts of the pixels give the same as all of them
     works: list[Callable[[], Any]] = [partial(sorting, part) for part in np.array_split(light, 8)]
@@ -222,27 +235,30 @@ def split_measurement(
     else:
         cell[~good] = MASKED
     cell[:, 0] = MASKED  # no step ends at the first point
-    first, last = slice(0, each), slice(each, 2 * each)
+    first, *last = (slice(n * each, (n + 1) * each) for n in range(PARTS))
     train_grid = replace(grid, steps=cut)
     # what judges is simulated over all of the time and compared in the later part only
-    late = cell[last].copy()
+    late = cell[each:].copy()
     late[:, :cut] = MASKED
     halves: list[PixelSubset] = []
-    early = cell[first, :cut].copy()
+    pieces = [(first, train_grid, cell[first, :cut].copy())]
     del cell, good  # as large as each other, and no longer needed
-    for part, stretch, cells in ((first, train_grid, early), (last, grid, late)):
+    pieces += [(part, grid, cells) for part, cells in zip(last, np.split(late, len(last)), strict=True)]
+    for part, stretch, cells in pieces:
         stimulus = Stimulus(
             chosen[part], scene.width, scene.height, stretch, light[part, : stretch.steps], cells, log_eps,
-            to, trust is not None or len(gaps) > 0,
+            to, trust is not None or len(gaps) > 0 or left_out is not None,
         )  # fmt: skip
-        halves.append(_make_subset(stimulus, events, cut if stretch is grid else 0, structure))
+        halves.append(make_subset(stimulus, events, cut if stretch is grid else 0, structure))
     _require_enough_events(halves, events, grid, notes, settings.least_events)
-    halves.append(_make_subset(halves[0].trials.stimulus.part(settings.scouts), events, 0, structure))
+    halves.append(make_subset(halves[0].trials.stimulus.part(settings.scouts), events, 0, structure))
     # seen in the fitted half: what judges must not choose
     peak = peak_of(halves[0].found.clock[0], grid.step)
-    if trust is None:  # else most events are where the scene is not known
+    if lamp is not None:
+        peak = lamp
+    elif trust is None:  # else most events are where the scene is not known
         peak = refine_frequency(events, grid.begin, grid.begin + cut * grid.step, peak)
-    train, held, scout = (
+    train, held, last_part, scout = (
         replace(
             half,
             frame=replace(half.frame, peak=peak),
@@ -255,7 +271,9 @@ def split_measurement(
     contradiction = contradiction_of_rest(events, light[:, :1] if still else light)
     if contradiction:
         notes.insert(0, contradiction)
-    return SplitMeasurement(train, held, scout, bands, structure, peak, *rates, tuple(notes), contradiction)
+    return SplitMeasurement(
+        train, held, last_part, scout, bands, structure, peak, *rates, tuple(notes), contradiction
+    )  # fmt: skip
 
 
 def common_grid(events: Events, scene: Scene) -> Grid:
@@ -318,9 +336,15 @@ def times_of_grid(scene: Scene, grid: Grid) -> NDArray[np.float64]:
     return inside
 
 
-def _make_subset(
-    stimulus: Stimulus, events: Events, first: int, structure: TimestampStructure
-) -> PixelSubset:
+def make_subset(stimulus: Stimulus, events: Events, first: int, structure: TimestampStructure) -> PixelSubset:
+    """Return what was measured of some pixels.
+
+    Args:
+        stimulus: Their light.
+        events: Of the whole sensor, or of these pixels.
+        first: Step from which on they are compared.
+        structure: Regularities of the time stamps.
+    """
     trials = BatchSimulator(stimulus, structure=structure)
     # looked at twice: sums of deviations from the typical change need that change, which the first look tells
     trials.middle = typical_changes(trials.look(events))
@@ -346,7 +370,7 @@ def _require_enough_events(
     halves: list[PixelSubset], events: Events, grid: Grid, notes: list[str], least: int
 ) -> None:
     counts = [int(half.found.halves.sum()) for half in halves]
-    for half, count, name in zip(halves, counts, ("fitting", "judging"), strict=True):
+    for half, count, name in zip(halves, counts, ("fitting", "judging", "reporting"), strict=True):
         if count < least:
             helps = _what_helps(half, count, max(counts), events, grid, least)
             raise InputError(
@@ -365,7 +389,7 @@ def _what_helps(half: PixelSubset, count: int, other: int, events: Events, grid:
     wanted = int(np.ceil(2 * least / max(count, 1) * looked / 100) * 100)
     if stimulus.holes and inside * looked >= 2 * least * size:
         return "most lie where the scene is not known: frames more often or less motion help"
-    if count and wanted <= size // 2 and inside >= 2 * least:
+    if count and wanted <= size // PARTS and inside >= 2 * least:
         return f"looking at more pixels helps, {wanted} instead of {looked} (pixels)"
     span = f"{begin:.3g} s to {end:.3g} s"
     if inside < len(events) // 20 and other >= least:

@@ -66,7 +66,7 @@ def fit(
         free: Effects or `effect.parameter` that are fitted; None for all.
         trust: Where and when the scene is to be trusted; None for everywhere, and for what a
             `CameraScene` trusts of itself.
-        pixels: In each half of the measurement.
+        pixels: In each part of the measurement.
         seed: Of every random number.
         device: Where kernels run.
         progress: Told how far it is.
@@ -85,17 +85,18 @@ def fit(
         span=measurement.span, pixels=pixels, seed=seed, device=device,
     )  # fmt: skip
     given = model_of(start, free)
-    before = given.judge(evidence.held, repeats=REPEATS // 2, seed=SimulationStream.JUDGE.seed(seed)).error
+    # by the part that nothing is chosen by: the starts that are compared below are chosen by another
+    before = given.judge(evidence.report, repeats=REPEATS // 2, seed=SimulationStream.JUDGE.seed(seed)).error
     ends = _descend_from_starts(evidence, start, free, seed, lambda text, share: tell(text, share, before))
     judgement, model = _best_end(ends)
     tell("confidence intervals", 0.9, judgement.error)
     good = _equally_good_models(ends)
     model, values = estimate_parameters(evidence, model, seed=seed)
     stream = SimulationStream.JUDGE.seed(seed)
-    held = model.calibrate(evidence.held, repeats=REPEATS, seed=stream)
-    judgement = held.judge(stream)
+    report = model.calibrate(evidence.report, repeats=REPEATS, seed=stream)
+    judgement = report.judge(stream)
     stuck = is_where_it_began(model, given) and judgement.error > judgement.gate
-    plain = plain_numbers(held)
+    plain = plain_numbers(report)
     apart = notes_on_disagreement(model, good, values)
     values = widen_intervals(model, good, values)
     notes = [

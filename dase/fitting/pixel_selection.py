@@ -77,24 +77,24 @@ def find_trusted_parts(
 def choose_trusted_pixels(
     looks: TrustedParts, each: int, rng: np.random.Generator, *, least: int
 ) -> NDArray[np.int32]:
-    """Choose pixels for two halves by what the scene does where it can be trusted, never by their events.
+    """Choose pixels for three parts by what the scene does where it can be trusted, never by their events.
 
     One in two is drawn by how long it can be trusted, the other by how far its light goes in that time, for
     in most pixels of most recordings nothing happens.
 
     Args:
         looks: Where it can be trusted.
-        each: Pixels in each half; there are fewer where fewer can be trusted.
+        each: Pixels in each part; there are fewer where fewer can be trusted.
         rng: Random numbers.
-        least: Pixels in each half without which nothing is compared.
+        least: Pixels in each part without which nothing is compared.
 
     Returns:
-        Row-major indices, shape (2 · `each`,), those of the first half before those of the second.
+        Row-major indices, shape (3 · `each`,): what is fitted, then two parts at the later time.
 
     Raises:
         InputError: There are next to none.
     """
-    each = min(each, *(np.count_nonzero(looks.time, 1) // 2).tolist())
+    each = min(each, *(np.count_nonzero(looks.time, 1) // 3).tolist())
     if each < least:
         raise InputError(
             f"the scene can be trusted in {100 * looks.share:.2g} % of pixels and times only, "
@@ -102,7 +102,8 @@ def choose_trusted_pixels(
         )
     chosen: list[NDArray[np.int64]] = []
     free = np.ones(looks.time.shape[1])
-    for time, change in zip(looks.time, looks.change, strict=True):
+    for half in (0, 1, 1):
+        time, change = looks.time[half], looks.change[half]
         weight = free * (time / time.sum() + change / max(change.sum(), 1e-9)) * (time > 0)
         mine = rng.choice(len(free), each, replace=False, p=weight / weight.sum())
         chosen.append(rng.permutation(mine))  # those of much weight are drawn first

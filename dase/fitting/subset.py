@@ -38,6 +38,8 @@ class PixelSubset:
         frame: What statistics refer to.
         around: What all pixels see; None where that is not known.
         load: What the pixels that are not looked at send in some model; None where no model was named.
+        doubt: What each statistic may be off by because the scene is only guessed, shape (J,); None for 0.
+        drift: The same as one way that all of them go together, with signs, shape (J,); None for 0.
     """
 
     trials: BatchSimulator
@@ -45,6 +47,8 @@ class PixelSubset:
     frame: StatisticsFrame
     around: WholeSensor | None = None
     load: BusLoad | None = None
+    doubt: Array | None = None
+    drift: Array | None = None
 
     def loaded(self, space: ParameterSpace, place: Array) -> Self:
         """Return the same pixels, where those that are not looked at send what they do in some model.
@@ -134,6 +138,8 @@ def _calibrate_by_repeats(subset: PixelSubset, sums: ProbeSums) -> CalibratedSub
     values, sent = compute_statistics(sums, frame)
     # variances add up: that of chance, and the square of what is of no concern
     square = np.maximum(tolerance_of(target[0], events[0]), 1e-9) ** 2
+    if subset.doubt is not None:
+        square = square + subset.doubt**2
     # two single simulations differ by twice the variance of one
     between = 2.0 * values.var(0, ddof=1)
     counted, here = events[0].copy(), sent.mean(0)
@@ -161,6 +167,8 @@ def _calibrate_by_repeats(subset: PixelSubset, sums: ProbeSums) -> CalibratedSub
         frame,
         subset.around,
         subset.load,
+        subset.doubt,
+        subset.drift,
         scale=ErrorScale(target[0], np.sqrt(np.maximum(between, scatter) + square), used),
         chance=ErrorScale(target[0], np.sqrt(share * between + square), used),
         seen=ErrorScale(target[0], np.sqrt(seen + square), used, least),

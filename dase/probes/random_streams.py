@@ -37,6 +37,8 @@ class SimulationStream(Enum):
     """Slopes of statistics that intervals are taken from; a turn is a width at which they are seen."""
     SLOPE_MODELS = (1, 0)
     """Models that give these slopes."""
+    SCENE_DOUBT = (1100, 1)
+    """Events of a model over its own scene, and with a turn more the model over half of the frames."""
     STIMULUS = (0, 1000)
     """Standard recordings; a turn is a stimulus."""
     RECORDING = (1, 500_000)

@@ -122,6 +122,15 @@ class CameraScene(Scene):
     def __len__(self) -> int:
         return len(self._raw)
 
+    def every(self, step: int) -> CameraScene:
+        """Return the scene between each `step`-th frame only."""
+        kept = slice(None, None, step)
+        return CameraScene(
+            self._raw[kept], self.begin[kept], self.end[kept], gamma=self.gamma, black=self.black,
+            white=self.white, gains=self._gains[kept], travel=self.travel, shortest=self.shortest,
+            longest=self.longest, matching=self.matching, trust=self.trust,
+        )  # fmt: skip
+
     def intensity(self, index: int) -> NDArray[np.float32]:
         """Return the linear intensity of a frame in [0, 1], shape (height, width)."""
         span = np.float32(self.white - self.black)

@@ -177,6 +177,7 @@ def _run_first(passes: _Passes, chunk: int, progress: Progress) -> _FirstPass:
 def find_signatures(
     source: Source,
     *,
+    begins: NDArray[np.float64] | None = None,
     notes: list[str] | None = None,
     progress: Progress = lambda count: None,
     level: float = 1e-4,
@@ -189,6 +190,8 @@ def find_signatures(
 
     Args:
         source: A recording, a sequence, events, or the path of a file, which streams through.
+        begins: Begins of the exposures of frames on the clock of the events [s], shape (F,); None for those
+            of the source.
         notes: Gets sentences about what was skipped, repaired or guessed in a file.
         progress: Is told how many events were looked at since it was told last, in both passes.
         level: Chance that a recording without effects announces any; shared out over the signatures.
@@ -214,7 +217,7 @@ def find_signatures(
         first = _run_first(passes, chunk, progress)
     width, height = first.width, first.height
     each, duration = level / COUNT, first.end - first.begin
-    begins = passes.begins
+    begins = passes.begins if begins is None else begins
     if begins is not None and not (len(begins) and np.all(np.isfinite(begins))):
         begins = None  # frames without times
     coupling, bursts = find_frame_coupling(first.clock, each, begins)

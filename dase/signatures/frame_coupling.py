@@ -309,6 +309,6 @@ def _describe_bursts(
     said += f"{entry.size:.3g} times the rate, {format_percent(share)} of the events"
     details = {
         "interval": interval, "phases": peaks, "share": share, "exposure": exposure, "clock": told,
-        "bursts": spans.tolist(),
+        "bursts": spans.tolist(), "begins": begins.tolist(),
     }  # fmt: skip
     return replace(entry, sentence=said, details=details), BurstClock(begins, interval, spans)

@@ -127,7 +127,14 @@ def fake(names: str, errors: dict[str, float], monkeypatch, **more) -> tuple:
             return self.replace(name, "")
 
     defaults = dict(
-        settings=DEFAULTS, without={}, ties={}, alternatives={}, error_of={}, evidence=None, seed=0
+        settings=DEFAULTS,
+        without={},
+        ties={},
+        alternatives={},
+        error_of={},
+        evidence=None,
+        seed=0,
+        certain=frozenset(),
     )
     search = SimpleNamespace(
         judge=lambda m: judged(errors[m.names]), added_to=lambda m: tuple(m.names), **(defaults | more)

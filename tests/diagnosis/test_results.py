@@ -16,7 +16,9 @@ from dase.results import (
     Diagnosis,
     Distinction,
     Estimate,
+    Finding,
     Fit,
+    Grade,
     Rank,
     Step,
     Unexplained,
@@ -36,6 +38,13 @@ NOTES = tuple(f"note {n} {LONG}" for n in range(9))
 ANSWERS = tuple(Answer(f"edge {n}", LONG, 0.5, 0.97, "how many events come", (1, 2, 3, 4)) for n in range(5))
 
 
+FINDINGS = (
+    Finding("leak", Grade.EITHER, ("shot",), True, 6.0, 2.5, 5.0),
+    Finding("bandwidth", Grade.SUPPORTED, (), False, 2.5, 1.04, 9.0),
+    Finding("flicker", Grade.CERTAIN, seen=f"light at 100 Hz {LONG}"),
+)
+
+
 def comparison() -> Comparison:
     plain = {f"{name} events [1/(px s)]": (1.25, 2.5) for name in "ABCDEF"}
     return Comparison(Sensor(), 5.754, 1.0, 1.15, FAMILIES, CELLS, plain, {"rate": (CURVE,) * 9}, NOTES)
@@ -44,7 +53,7 @@ def comparison() -> Comparison:
 def diagnosis(**more) -> Diagnosis:
     found = dict(
         sensor=Sensor(), selected=("leak", "bandwidth"), errors=(6.0, 2.5, 1.04), before=9.0, floor=1.0,
-        gate=1.2, parameters=PARAMETERS, ties={"leak": ("shot",)}, unexplained=None, history=(STEP,) * 5,
+        gate=1.2, parameters=PARAMETERS, findings=FINDINGS, unexplained=None, history=(STEP,) * 5,
         notes=NOTES,
     )  # fmt: skip
     return Diagnosis(**(found | more))
@@ -59,11 +68,17 @@ RESULTS = {
         Fit(Sensor(), PARAMETERS, 1.3, 6.4, 1.0, 1.2, notes=NOTES),
         ("6.40", "1.30", "effect3.parameter"),
     ),
-    "diagnosis": (diagnosis(), ("missing: leak, bandwidth", "as given", "1.04", "leak: shot")),
-    "nothing": (diagnosis(selected=(), errors=(1.0,), ties={}), ("nothing is missing: error 1.00",)),
-    "unexplained": (diagnosis(selected=(), errors=(6.0,), unexplained=LEFT), ("an error of 3.5 is left",)),
+    "diagnosis": (
+        diagnosis(),
+        ("missing: flicker (certain); bandwidth (supported); either leak or shot", "as given", "1.04"),
+    ),
+    "nothing": (diagnosis(selected=(), errors=(1.0,), findings=()), ("nothing is missing: error 1.00",)),
+    "unexplained": (
+        diagnosis(selected=(), errors=(6.0,), findings=(), unexplained=LEFT),
+        ("an error of 3.5 is left",),
+    ),
     "left": (LEFT, ("an error of 3.5 is left",)),
-    "step": (STEP, ("added: leak", "shot", "error 1.50", "p 0.016")),
+    "step": (STEP, ("added: leak", "shot", "error 1.50")),
     "rank": (RANKS[0], ("effect0", "error 1.50", "80 %")),
     "screened": (SCREENED, ("linlog", "not judged")),
     "cell": (CELLS[0], ("pixels of a very long",)),

@@ -19,7 +19,19 @@ from dase.effects import EFFECTS
 from dase.figures import diagnosis_figures, event_maps, report
 from dase.figures.plot import plot
 from dase.figures.style import Colour, colour_of, format_number
-from dase.results import Cell, Comparison, Curve, Diagnosis, Estimate, Fit, Rank, Step, Unexplained
+from dase.results import (
+    Cell,
+    Comparison,
+    Curve,
+    Diagnosis,
+    Estimate,
+    Finding,
+    Fit,
+    Grade,
+    Rank,
+    Step,
+    Unexplained,
+)
 
 CELLS = tuple(
     Cell("rate", "dark pixels", f"OFF events {i}", 10.0, 1.0, "events", -9.0 + i, f"dark <pixels>: {i} & few")
@@ -70,7 +82,7 @@ def diagnosis(**changes: object) -> Diagnosis:
         floor=1.0,
         gate=1.3,
         parameters=PARAMETERS,
-        ties={"leak": ("shot",)},
+        findings=(Finding("leak", Grade.SUPPORTED, (), False, 6.0, 1.05, 7.5),),
         unexplained=None,
         history=steps,
     )
@@ -148,7 +160,7 @@ def test_a_figure_that_fails_costs_the_figure(monkeypatch):
     assert len(page.pictures) == 2
     monkeypatch.setattr(report, "ranking_of", fails)
     page = checked(report.diagnosis_page(diagnosis(), recording="office.h5"))
-    assert "Missing: leak" in page.words
+    assert "supported given the scene: leak" in page.words
     assert "RuntimeError" in page.words
 
 
@@ -173,30 +185,44 @@ def test_comparison_within_chance():
 
 def test_diagnosis_page():
     page = checked(report.diagnosis_page(diagnosis(), recording="office.h5"))
-    assert "Missing: leak. With it the held-out error falls from 6 to 1.05" in page.words
-    assert "The data cannot tell leak from shot" in page.words
+    assert "supported given the scene: leak. With it the error falls from 6 to 1.05" in page.words
+    assert "7.5 standard deviations along its way" in page.words
     assert "Where the model failed" in page.words
     assert len(page.pictures) == 3  # staircase, ranking, parameters
     assert "0.2 to 0.22" in page.words
 
 
+def test_what_cannot_be_told_apart_and_what_is_certain_stand_beside_what_is_left():
+    left = Unexplained(3.0, 0.04, ("hot",), CELLS[:2], "beside that an error of 3 stays unexplained")
+    findings = (
+        Finding("flicker", Grade.CERTAIN, seen="light at 100.1 Hz"),
+        Finding("leak", Grade.EITHER, ("shot",), True, 6.0, 3.0, 4.0),
+    )
+    found = diagnosis(selected=(), errors=(6.0,), findings=findings, unexplained=left)
+    words = checked(report.diagnosis_page(found, recording="office.h5")).words
+    assert "certain without the scene: flicker" in words
+    assert "either leak or shot or something that is not in the library" in words
+    assert "4 % of the error stays unexplained" in words
+    assert "Something is missing that no known effect explains" not in words
+
+
 def test_nothing_missing():
     first = Step(("threshold",), 1.1, 1.3, {}, (), None, (), ())
-    found = diagnosis(selected=(), errors=(1.1,), ties={}, history=(first,), before=float("nan"))
+    found = diagnosis(selected=(), errors=(1.1,), findings=(), history=(first,), before=float("nan"))
     page = checked(report.diagnosis_page(found, recording="office.h5"))
     assert "Nothing is missing: the error is 1.1 noise floors" in page.words
     assert "unexplained" not in page.words
-    small = diagnosis(selected=(), errors=(1.6,), ties={}, history=(first,))
+    small = diagnosis(selected=(), errors=(1.6,), findings=(), history=(first,))
     assert "Nothing of weight is missing" in checked(report.diagnosis_page(small, recording="a")).words
 
 
 def test_unexplained_names_nothing_as_found():
     left = Unexplained(3.0, 0.4, ("shot",), CELLS[:2], "unexplained: with shot an error of 3 is left")
-    found = diagnosis(selected=(), errors=(6.0,), ties={}, unexplained=left)
+    found = diagnosis(selected=(), errors=(6.0,), findings=(), unexplained=left)
     page = checked(report.diagnosis_page(found, recording="office.h5"))
     assert "Something is missing that no known effect explains" in page.words
     assert "shot comes nearest, but leaves 3: a stand-in, not a finding" in page.words
-    assert "Missing:" not in page.words
+    assert "Missing, and" not in page.words
     assert "What stays unexplained" in page.words
 
 
@@ -207,7 +233,7 @@ def test_the_staircase_goes_on_with_stand_ins():
         Step(("threshold", "shot"), 4.0, 1.3, {}, (), "hot", (), ()),
         Step(("threshold", "shot", "hot"), 3.1, 1.3, {}, (), None, (), ()),
     )
-    found = diagnosis(selected=(), errors=(6.0,), ties={}, unexplained=left, history=steps)
+    found = diagnosis(selected=(), errors=(6.0,), findings=(), unexplained=left, history=steps)
     assert report.stand_ins(found) == (["+ shot", "+ hot"], [4.0, 3.0])
     assert "not announced" in report.staircase_of(found).caption
     # found as a pair: there is no error with the first of them alone

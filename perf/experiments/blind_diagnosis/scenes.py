@@ -12,12 +12,16 @@ WIDTH, HEIGHT, RATE = 144, 108, 1000
 
 @lru_cache(maxsize=4)
 def scene_of(number: int) -> Any:
+    """Return a scene of the development set by its number."""
+    return draw_scene(np.random.default_rng([number, 2024]))
+
+
+def draw_scene(rng: np.random.Generator) -> Any:
     """Return a scene with fast, slow and resting content over a wide range of light, 1 s at 1 kHz."""
     import cv2
 
     import dase
 
-    rng = np.random.default_rng([number, 2024])
     images = dase.open_images("builtin")
     still = cv2.resize(images.background(rng).grey, (WIDTH, HEIGHT), interpolation=cv2.INTER_AREA)
     x, y = np.meshgrid(np.linspace(-1, 1, WIDTH), np.linspace(-1, 1, HEIGHT))

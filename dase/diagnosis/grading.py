@@ -1,0 +1,203 @@
+"""How sure a diagnosis is of each effect that it put into a model.
+
+The search chooses by pixels that fit and pixels that select. What is said in the end is judged by a third
+part, by which nothing was chosen. Each effect has to earn its grade there:
+
+- *supported*: the measurement is away from the model without the effect, along the way that the effect goes,
+  by more than chance and the misfit that stays could make; without it several times as much is left, however
+  well the rest is fitted again; nothing else does nearly as well in its place; and of the error of the model
+  before the search next to nothing is left.
+- *either ... or*: the same, but another effect does nearly as well in its place, or so little was there to be
+  explained that something which is not in the library could look like it.
+
+An effect that earns neither is a stand-in: it is named as what comes nearest, and not found.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dase.diagnosis.directional_test import deviation_towards
+from dase.diagnosis.settings import GradeSettings
+from dase.diagnosis.state import DiagnosisState, with_same_freedom
+from dase.fitting.model import FittedModel, refit_work
+from dase.fitting.scene_doubt import misfit_beyond_chance
+from dase.fitting.scheduler import run_side_by_side
+from dase.fitting.subset import CalibratedSubset
+from dase.probes.distance import LIMITS, Judgement, may_be_announced
+from dase.probes.random_streams import SimulationStream
+from dase.results import Estimate, Finding, Grade
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class ModelOnReport:
+    """A model and its error on the part that reports."""
+
+    model: FittedModel
+    judgement: Judgement
+
+
+def judge_on_report(
+    state: DiagnosisState, models: Sequence[FittedModel], *, repeats: int
+) -> list[ModelOnReport]:
+    """Return the errors of models on the part by which nothing is chosen."""
+    stream = SimulationStream.JUDGE.seed(state.seed)
+    works = [m.judgement_work(state.evidence.report, repeats=repeats, seed=stream) for m in models]
+    return [ModelOnReport(m, j) for m, j in zip(models, run_side_by_side(works), strict=True)]
+
+
+def grade_effects(
+    state: DiagnosisState,
+    model: FittedModel,
+    found: Sequence[str],
+    way: Mapping[frozenset[str], ModelOnReport],
+    start: ModelOnReport,
+    last: Judgement,
+    *,
+    report: CalibratedSubset,
+    values: Mapping[str, Estimate],
+    at_bounds: Sequence[str],
+) -> dict[str, Finding]:
+    """Return what is to be said of each effect that a search has added.
+
+    Args:
+        state: What the search has found.
+        model: With all effects.
+        found: Their names, in the order in which they are announced.
+        way: Models of the search by what they had added.
+        start: The model before the search.
+        last: The error of `model` on the part that reports.
+        report: That part, with `model` as its present one.
+        values: Estimates of its parameters.
+        at_bounds: Sentences on parameters that ended where their search does.
+    """
+    if not found:
+        return {}
+    settings = state.settings.grades
+    without = _models_without(state, model, found, {frozenset(): start, **way})
+    rivals = _equally_good_rivals(state, model, found)
+    misfit = misfit_beyond_chance(report)
+    out: dict[str, Finding] = {}
+    for name in found:
+        bare = without[name]
+        deviation = deviation_towards(state, state.evidence.report, bare.model, model, doubt=misfit)
+        mine = {axis: value for axis, value in values.items() if axis.split(".")[0] == name}
+        stopped = any(text.startswith((f"{name}.", "threshold.")) for text in at_bounds)
+        grade, unknown = grade_of(
+            start.judgement, bare.judgement, last, deviation, has_rivals=bool(rivals[name]), settings=settings
+        )
+        out[name] = Finding(
+            effect=name,
+            grade=Grade.STAND_IN if stopped else grade,
+            alternatives=rivals[name],
+            unknown=unknown,
+            error_without=bare.judgement.error,
+            error_with=last.error,
+            deviation=deviation,
+            parameters=mine,
+        )
+    return out
+
+
+def grade_of(
+    start: Judgement,
+    without: Judgement,
+    last: Judgement,
+    deviation: float,
+    *,
+    has_rivals: bool,
+    settings: GradeSettings,
+) -> tuple[Grade, bool]:
+    """Return the grade of an effect, and whether something unknown may look like it.
+
+    Args:
+        start: Error of the model before the search.
+        without: Error of the last model without the effect, the rest fitted again.
+        last: Error of the last model.
+        deviation: Of the measurement from the model without the effect, along the effect's way.
+        has_rivals: Whether another effect does nearly as well in its place.
+        settings: Limits.
+    """
+    level = max(last.level, settings.usual)
+    left = max(last.error - level, 0.0)
+    total = left / max(start.error - level, 1e-9)
+    own = left / max(without.error - level, 1e-9)
+    if deviation < settings.away or without.error <= last.error:
+        return Grade.STAND_IN, False
+    at_floor = may_be_announced(last)
+    chance = at_floor and last.error <= max(LIMITS.quiet, last.reach)
+    explained = total <= settings.total_left and own <= settings.own_left
+    if not (at_floor or explained):
+        return Grade.STAND_IN, False
+    # at the floor, but not within chance: what is left tells that the world is another than the model's
+    sure = chance or explained
+    weak = without.error - level < settings.weak
+    if has_rivals or weak or not sure:
+        return Grade.EITHER, weak or not sure
+    return Grade.SUPPORTED, False
+
+
+def _models_without(
+    state: DiagnosisState,
+    model: FittedModel,
+    found: Sequence[str],
+    way: Mapping[frozenset[str], ModelOnReport],
+) -> dict[str, ModelOnReport]:
+    """Return for each effect the best model without it: the last one, fitted again, or one of the search."""
+    wanted = {name: frozenset(found) - {name} for name in found}
+    missing = [name for name in found if wanted[name] not in way]
+    less = [with_same_freedom(model.sensor.without(name), model, ()) for name in missing]
+    fitted = run_side_by_side([refit_work(state.evidence, one, seed=state.seed, rounds=2) for one in less])
+    judged = judge_on_report(state, fitted, repeats=state.settings.grades.repeats)
+    every = [*way.items(), *((wanted[n], one) for n, one in zip(missing, judged, strict=True))]
+    return {
+        name: min((one for names, one in every if names <= wanted[name]), key=lambda one: one.judgement.error)
+        for name in found
+    }
+
+
+def _equally_good_rivals(
+    state: DiagnosisState, model: FittedModel, found: Sequence[str]
+) -> dict[str, tuple[str, ...]]:
+    """Return for each effect those that do nearly as well in its place, the rest fitted again.
+
+    An effect that includes it as a special case is none: the simpler of the two is said.
+    """
+    settings, seed = state.settings.grades, state.seed
+    asked: list[tuple[str, str, FittedModel]] = []
+    for name in found:
+        tried = 0
+        for other in state.alternatives.get(name, []):
+            includes = name in state.effects[other.name].includes if other.name in state.effects else False
+            if other.name in model.space.sensor or includes or other.judgement is None:
+                continue
+            level = max(other.judgement.level, settings.usual)
+            near = settings.rival * max(state.error_of.get(name, 0.0) - level, 0.0) + settings.tie
+            if other.error - level > near or tried >= settings.rivals:
+                continue
+            tried += 1
+            sensor = model.sensor.without(name).with_effect(other.model.sensor[other.name])
+            asked.append((name, other.name, with_same_freedom(sensor, model, [other.name])))
+    out: dict[str, list[str]] = {name: [] for name in found}
+    if asked:
+        fitted = run_side_by_side(
+            [refit_work(state.evidence, one, seed=seed, rounds=2) for _, _, one in asked]
+        )
+        stream = SimulationStream.JUDGE.seed(seed)
+        works = [
+            m.judgement_work(state.evidence.held, repeats=settings.repeats, seed=stream)
+            for m in (model, *fitted)
+        ]
+        mine, *others = run_side_by_side(works)
+        for (name, other_name, _), judged in zip(asked, others, strict=True):
+            level = max(mine.level, settings.usual)
+            left = max(mine.error - level, 0.0)
+            if judged.error - level <= max(settings.tie_share * left, left + settings.tie):
+                out[name].append(other_name)
+    return {name: tuple(others) for name, others in out.items()}

@@ -1,0 +1,170 @@
+"""What the events of a measurement show by themselves, before any search: see `dase.signatures`.
+
+No scene and no model is needed for it, so it holds where the scene is known badly: what is found here is
+certain. What the scene itself does, such as light that flickers in a clip, is no effect of the camera.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+from dataclasses import dataclass
+
+import numpy as np
+
+from dase.errors import InputError
+from dase.events import Events
+from dase.fitting.measurement import Measurement
+from dase.results import Finding, Grade
+from dase.scenes.between_frames import CameraScene
+from dase.scenes.scene import Scene
+from dase.signatures.find import find_signatures
+from dase.signatures.frame_coupling import BurstClock
+from dase.signatures.result import Signature
+from dase.simulation.sensor import Sensor
+from dase.simulation.simulate import simulate
+
+KINDS: dict[str, tuple[str, ...]] = {
+    "flicker": ("flicker",),
+    "hot pixels": ("hot",),
+    "full bus": ("readout",),
+    "time stamps": ("timestamp", "row_scan"),
+    "opposite pairs": ("shot", "voltage_noise"),
+    "fixed pattern": ("mismatch",),
+    "grouping": ("readout", "row_scan"),
+    "frame coupling": (),
+    "double events": (),
+}
+"""Signature to the effects that make it; nothing where the library has none that does."""
+
+NAMED = ("flicker", "hot pixels", "full bus", "time stamps")
+"""Signatures that tell which effect it is; the others tell what there is, and not what makes it."""
+
+
+@dataclass(frozen=True)
+class SeenEffects:
+    """What the events show by themselves.
+
+    Args:
+        entries: The signatures that are there and not of the scene.
+        bursts: When the whole array sends in step with the frames, which no model explains; None for never.
+    """
+
+    entries: tuple[Signature, ...] = ()
+    bursts: BurstClock | None = None
+
+    @property
+    def lamp(self) -> float | None:
+        """Frequency of light that flickers [Hz]; None where there is none."""
+        for entry in self.entries:
+            if entry.name == "flicker":
+                return float(entry.details["frequency"])
+        return None
+
+    @property
+    def effects(self) -> dict[str, str]:
+        """Effects of the library that are certain, each to what shows it."""
+        return {name: entry.sentence for entry in self.entries for name in _effects_of(entry)}
+
+    def findings(self, graded: Collection[Finding], given: Collection[str]) -> list[Finding]:
+        """Return findings in which all that is seen is certain.
+
+        Args:
+            graded: What the search says of each effect of the last model.
+            given: Effects that the sensor had before.
+        """
+        seen = self.effects
+        out = []
+        for one in graded:
+            if one.effect in seen:
+                one = Finding(
+                    one.effect, Grade.CERTAIN, (), False, one.error_without, one.error_with, one.deviation,
+                    one.parameters, seen[one.effect],
+                )  # fmt: skip
+            out.append(one)
+        named = {one.effect for one in out if one.grade in (Grade.CERTAIN, Grade.SUPPORTED)}
+        for entry in self.entries:
+            if named.intersection(KINDS[entry.name]) or set(given).intersection(KINDS[entry.name]):
+                continue
+            for name in _effects_of(entry) or (entry.name,):
+                out = [one for one in out if one.effect != name]
+                out.append(Finding(name, Grade.CERTAIN, seen=entry.sentence))
+        return out
+
+
+def find_seen_effects(measurement: Measurement) -> SeenEffects:
+    """Return what the events of a measurement show by themselves."""
+    events, scene = _compared_events(measurement), measurement.scene
+    begins = scene.begin if isinstance(scene, CameraScene) else None
+    try:
+        found = find_signatures(events, begins=begins)
+    except InputError:
+        return SeenEffects()
+    entries = found.found
+    coupling = [entry for entry in entries if entry.name == "frame coupling"]
+    bursts = None
+    if coupling:
+        details = coupling[0].details
+        bursts = BurstClock(np.asarray(details["begins"]), details["interval"], np.asarray(details["bursts"]))
+        if begins is None:
+            bursts = bursts.extend(float(events.t[-1]))
+    return SeenEffects(entries, bursts)
+
+
+def without_the_scene(seen: SeenEffects, measurement: Measurement, sensor: Sensor, seed: int) -> SeenEffects:
+    """Return what is seen and not of the scene: a sensor that has no such effect would show that, too.
+
+    Args:
+        seen: In the events of the measurement.
+        measurement: Its scene is simulated where it is known at each step of time.
+        sensor: The model before the search.
+        seed: Of its random numbers.
+    """
+    if not seen.entries or isinstance(measurement.scene, CameraScene):
+        return seen
+    also = _signatures_of(measurement.scene, sensor, seed)
+    kept = tuple(entry for entry in seen.entries if entry.name not in also)
+    return SeenEffects(kept, seen.bursts if any(e.name == "frame coupling" for e in kept) else None)
+
+
+def without_the_explained(
+    seen: SeenEffects, measurement: Measurement, sensor: Sensor, seed: int
+) -> SeenEffects:
+    """Return what is seen less what tells no single effect and is there with the last model, too.
+
+    Args:
+        seen: In the events of the measurement.
+        measurement: Its scene is simulated where it is known at each step of time.
+        sensor: The model after the search.
+        seed: Of its random numbers.
+    """
+    open_ = {entry.name for entry in seen.entries if entry.name not in NAMED}
+    if not open_ or isinstance(measurement.scene, CameraScene):
+        return seen
+    also = open_ & _signatures_of(measurement.scene, sensor, seed)
+    return SeenEffects(tuple(entry for entry in seen.entries if entry.name not in also), seen.bursts)
+
+
+def _signatures_of(scene: Scene, sensor: Sensor, seed: int) -> set[str]:
+    """Return the names of the signatures that the events of a sensor show, if only by a hint.
+
+    What is not beyond all doubt here is enough to doubt that it is the camera's.
+    """
+    made = simulate(scene, sensor, seed=seed)
+    entries = find_signatures(made).entries if len(made) else ()
+    return {entry.name for entry in entries if entry.found or (entry.size >= entry.least and entry.p < 0.05)}
+
+
+def _compared_events(measurement: Measurement) -> Events:
+    events = measurement.events
+    if measurement.span is None:
+        return events
+    return events.select((events.t >= measurement.span[0]) & (events.t <= measurement.span[1]))
+
+
+def _effects_of(entry: Signature) -> tuple[str, ...]:
+    """Return the effects of the library that a signature names; none where it only tells what there is."""
+    if entry.name == "time stamps":
+        if "line" in entry.details:
+            return ("row_scan",)
+        return ("timestamp",) if "step" in entry.details else ()
+    return KINDS[entry.name] if entry.name in NAMED else ()

@@ -1,0 +1,484 @@
+"""The sealed benchmark of the diagnosis: a key draws scenes, strengths and seeds that nobody has seen before.
+
+    # every kind, on a GPU, in pieces: what is in the log is not run again
+    python -m perf.experiments.blind_diagnosis.sealed --key KEY --device cuda:0 --jobs 8 --minutes 8 --log LOG
+    # other simulators' sets
+    python -m perf.experiments.blind_diagnosis.sealed --kinds other --hidden $DASE_DATA/hidden --log LOG.jsonl
+    # the table from the log
+    python -m perf.experiments.blind_diagnosis.sealed --report --log LOG.jsonl
+
+A new key makes a new benchmark. What was changed after a run is run with another key. The diagnosis sees
+events, scene and a sensor that lacks what was hidden; the truth is compared with its answer afterwards.
+"""
+
+from __future__ import annotations
+
+import argparse
+import hashlib
+import json
+import multiprocessing
+import os
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import asdict, dataclass, replace
+from functools import lru_cache, partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from perf.experiments.blind_diagnosis.report import HIDDEN, STRENGTHS
+from perf.experiments.blind_diagnosis.scenes import draw_scene
+
+Line = dict[str, Any]
+
+KINDS = ("other", "nothing", "single", "pair", "triple", "unknown", "noisy", "frames", "foreign")
+
+FRAMES = {"25": 0.04, "100": 0.01}
+"""Name of a camera's frame rate to the time from frame to frame [s]."""
+
+CLASHES = ({"bandwidth", "second_order"}, {"shot", "voltage_noise"}, {"timestamp", "row_scan"},
+           {"timestamp", "readout"}, {"row_scan", "readout"}, {"linlog", "dark"})  # fmt: skip
+"""Effects of which only one is hidden at a time: two poles beside one, two clocks of one readout."""
+
+HABITS = {"linlog", "timestamp"}
+"""What v2e does in all of its cases, and what may be named there."""
+
+
+@dataclass(frozen=True)
+class Case:
+    """One run: what is hidden beside which base, and how the scene is known.
+
+    Args:
+        kind: Row of the table.
+        effects: What is hidden; of another simulator nothing is said before the answer is in.
+        strength: Of `STRENGTHS`; of another simulator the name of the case.
+        number: Draws all else.
+        removed: Effect that is taken out of the library.
+        noisy: Whether the sensor that is handed over has noise, mismatch and bandwidth of its own.
+        frames: Frame rate of the camera by which the scene is known [Hz], "" for 1 kHz without noise.
+    """
+
+    kind: str
+    effects: tuple[str, ...]
+    strength: str
+    number: int
+    removed: str = ""
+    noisy: bool = False
+    frames: str = ""
+
+    @property
+    def name(self) -> str:
+        """Name in the log."""
+        hidden = "+".join(self.effects) or "nothing"
+        base = "noisy" if self.noisy else "plain"
+        return f"{self.kind}/{hidden}/{self.strength}/{base}/{self.frames or 'exact'}/{self.number}"
+
+
+@dataclass(frozen=True)
+class Job:
+    """A case, and how it is run; `until` is when no case may begin any more [s since 1970]."""
+
+    case: Case
+    key: int
+    device: str
+    threads: int
+    folder: Path | None = None
+    until: float = float("inf")
+
+
+def number_of(key: str) -> int:
+    """Return the number that a key stands for."""
+    return int.from_bytes(hashlib.sha256(key.encode()).digest()[:6], "big")
+
+
+@lru_cache(maxsize=3)
+def _scene(key: int, number: int) -> Any:
+    return draw_scene(np.random.default_rng([key, number, 1]))
+
+
+def truth_of(case: Case, key: int) -> tuple[Any, Any]:
+    """Return the sensor that makes the data, and the one that the diagnosis begins with."""
+    from dase.effects import EFFECTS, Threshold
+    from dase.simulation.sensor import Sensor
+
+    rng = np.random.default_rng([key, case.number, 2])
+    on, off = 0.2 * np.exp(rng.uniform(-0.35, 0.35, 2))
+    true = Sensor(effects=(Threshold(on=float(on), off=float(off)),), name="truth")
+    given = Sensor(effects=(Threshold(on=0.25, off=0.25),), name="given")
+
+    def both(name: str, there: dict[str, float], here: dict[str, float]) -> None:
+        nonlocal true, given
+        true, given = true.with_effect(EFFECTS[name](**there)), given.with_effect(EFFECTS[name](**here))
+
+    if case.noisy:
+        base = {
+            "bandwidth": dict(cutoff=300.0), "mismatch": dict(spread=0.08), "leak": dict(rate=0.2),
+            "shot": dict(rate=1.0), "refractory": dict(period=1e-3),
+        }  # fmt: skip
+        for name, usual in base.items():
+            if name not in case.effects and not any({name, e} in CLASHES for e in case.effects):
+                wrong = {k: v * float(np.exp(rng.uniform(-0.5, 0.5))) for k, v in usual.items()}
+                both(name, wrong, usual)
+    # is seen only by what depends on the light
+    if "vignetting" in case.effects and "bandwidth" not in true:
+        both("bandwidth", dict(cutoff=80.0, dark=0.02), dict(cutoff=120.0, dark=0.05))
+    for name in case.effects:
+        values: dict[str, Any] = {
+            k: v * float(np.exp(rng.uniform(-0.2, 0.2))) if isinstance(v, float) and v else v
+            for k, v in HIDDEN[name][STRENGTHS.index(case.strength)].items()
+        }
+        if name == "flicker":
+            values |= dict(phase=float(rng.uniform(0, 1)), frequency=float(rng.choice([100.0, 120.0])))
+        if name == "refractory":
+            values["mode"] = str(rng.choice(["drop", "delay"]))
+        if name == "readout":
+            values["rate"] *= 6e5
+        true = true.with_effect(EFFECTS[name](**values))
+    return true, given
+
+
+def known_by_frames(scene: Any, rate: str, rng: np.random.Generator) -> Any:
+    """Return a scene as a camera's frames show it: some time apart, exposed, with noise, in 8 bits."""
+    from dase.fitting.measurement import camera_scene
+
+    times = scene.sample_times()
+    dense = scene.frames(times)
+    dense = dense / dense.max()
+    gap = FRAMES[rate]
+    exposure = gap * float(rng.uniform(0.05, 0.5))
+    begins = np.arange(times[0], times[-1] - exposure, gap)
+    frames = []
+    for begin in begins:
+        part = dense[(times >= begin - 1e-9) & (times < begin + max(exposure, 1.1e-3) - 1e-9)]
+        frames.append(part.mean(0) + 0.004 * rng.standard_normal(part.shape[1:]))
+    grey = np.clip(np.rint(np.array(frames) * 255), 0, 255).astype(np.uint8)
+    return camera_scene(grey, begins, begins + exposure, [])
+
+
+def measured(job: Job) -> tuple[Any, Any, Any, Any]:
+    """Return events, their scene, the sensor that the diagnosis begins with, and the true one if known."""
+    import dase
+
+    case = job.case
+    if case.kind == "foreign":
+        return *_foreign(case, job.key), None, None
+    if case.kind != "other":
+        exact = _scene(job.key, case.number)
+        true, given = truth_of(case, job.key)
+        events = dase.simulate(exact, true, seed=case.number + job.key % 100_000, device=job.device)
+        rng = np.random.default_rng([job.key, case.number, 3])
+        return events, known_by_frames(exact, case.frames, rng) if case.frames else exact, given, true
+    assert job.folder is not None
+    with np.load(job.folder / f"clip_{case.strength[0]}.npz") as data:
+        scene = dase.VideoScene(data["frames"].astype(np.float32) / 255, data["frame_us"] * 1e-6)
+    with np.load(job.folder / f"{case.strength}.npz") as data:
+        t, x, y, p = (data[k] for k in ("t_us", "x", "y", "p"))
+    return dase.Events(t * 1e-6, x, y, p.astype(bool), scene.width, scene.height), scene, None, None
+
+
+def _foreign(case: Case, key: int) -> tuple[Any, Any]:
+    """Return events of a simulator with other habits, and their scene."""
+    from perf.experiments.blind_diagnosis import foreign
+
+    rng = np.random.default_rng([key, case.number, 5])
+    scene = _scene(key, case.number)
+    ends = {name: np.log(foreign.HIDEABLE[name]) for name in case.effects}
+    effects = {name: float(np.exp(rng.uniform(*some))) for name, some in ends.items()}
+    habits, (on, off) = foreign.draw_habits(rng), 0.2 * np.exp(rng.uniform(-0.25, 0.25, 2))
+    times = scene.sample_times()
+    frames = np.rint(255 * scene.frames(times) / scene.frames(times).max()) / 255
+    events = foreign.simulate(frames, times, float(on), float(off), effects, habits, case.number)
+    return events, type(scene)(frames.astype(np.float32), times)
+
+
+def run_case(job: Job) -> Line:
+    """Make the data of a case, diagnose them, and note the truth beside the answer."""
+    from dase.diagnosis.diagnose import diagnose
+    from dase.effects import EFFECTS
+    from dase.kernels import launch
+
+    launch.set_threads(job.threads)
+    case = job.case
+    events, scene, given, true = measured(job)
+    removed = {case.removed, *(n for n, e in EFFECTS.items() if case.removed in e.includes)}
+    library = {name: effect for name, effect in EFFECTS.items() if name not in removed}
+    begin = time.perf_counter()
+    found = diagnose(events, given, scene=scene, effects=library, seed=case.number, device=job.device)
+    truth = (
+        {} if true is None else
+        {f"{e.name}.{p.name}": float(getattr(e, p.name)) for e in true.effects for p in e.parameters()}
+    )  # fmt: skip
+    answer = found.to_json()
+    return {
+        "name": case.name, "case": asdict(case), "seconds": time.perf_counter() - begin, "truth": truth,
+        "events": len(events), "finding": found.finding(),
+        "answer": {k: v for k, v in answer.items() if k not in ("history", "sensor", "plain", "unexplained")},
+        "unexplained": None if found.unexplained is None else found.unexplained.error,
+        "steps": [
+            {"error": s.error, "chosen": s.chosen, "ties": s.ties,
+             "ranking": [(r.effect, r.error) for r in s.ranking[:5] if r.error == r.error]}
+            for s in found.history
+        ],
+    }  # fmt: skip
+
+
+def cases(options: argparse.Namespace) -> Iterator[Case]:
+    """Yield the runs that are asked for: kinds take turns, each in proportion to what it has to do."""
+    from perf.experiments.blind_diagnosis import foreign
+
+    rng = np.random.default_rng([number_of(options.key), 4])
+    names = [n for n in HIDDEN if not options.only or n in options.only.split(",")]
+    kinds: dict[str, list[Case]] = {kind: [] for kind in KINDS}
+    count = 0
+
+    def add(kind: str, effects: tuple[str, ...], strength: str, **more: Any) -> None:
+        nonlocal count
+        kinds[kind].append(Case(kind, effects, strength, count, **more))
+        count += 1
+
+    for _ in range(options.repeats):
+        for name in names:
+            for strength in STRENGTHS:
+                add("single", (name,), strength)
+                add("unknown", (name,), strength, removed=name)
+            strength = STRENGTHS[int(rng.integers(1, 3))]
+            add("noisy", (name,), strength, noisy=True)
+            add("frames", (name,), strength, frames=str(rng.choice(["25", "100"])))
+            add("pair", _together(rng, names, 2), "medium")
+            add("triple", _together(rng, names, 3), "medium")
+            add("nothing", (), "none")
+        for n in range(len(names)):
+            add("noisy", (), "none", noisy=True)
+            add("frames", (), "none", frames=("25", "100")[n % 2], noisy=n % 4 > 1)
+        for name in foreign.HIDEABLE:
+            add("foreign", (name,), "drawn")
+            add("foreign", (), "drawn")
+            add("foreign", _together(rng, list(foreign.HIDEABLE), 2), "drawn")
+    found = sorted(options.hidden.glob("[a-z]_*.npz")) if options.hidden else ()
+    kinds["other"] = [Case("other", (), path.stem, 0) for path in found]
+    asked = options.kinds.split(",")
+    turns = [
+        ((n + 0.5) / len(group), kind, case)
+        for kind, group in kinds.items() if kind in asked for n, case in enumerate(group)
+    ]  # fmt: skip
+    yield from (case for _, _, case in sorted(turns, key=lambda turn: turn[:2]))
+
+
+def _together(rng: np.random.Generator, names: list[str], many: int) -> tuple[str, ...]:
+    """Draw effects that can be hidden together."""
+    while True:
+        some = {str(n) for n in rng.choice(names, many, replace=False)}
+        if not any(len(clash & some) > 1 for clash in CLASHES):
+            return tuple(sorted(some))
+
+
+def true_effects(folder: Path, name: str) -> tuple[tuple[str, ...], tuple[str, ...]]:
+    """Return what is hidden in a case of another simulator by dase's names, and what may be named beside."""
+    case = json.loads((folder / "truth.json").read_text())[name]
+    values = {key: float(value or 0) for key, value in case["params"].items() if not isinstance(value, str)}
+    of = {
+        "sigma_thres": "mismatch", "cutoff_hz": "bandwidth", "leak_rate_hz": "leak",
+        "shot_noise_rate_hz": "shot", "refractory_period_s": "refractory",
+    }  # fmt: skip
+    hidden = {effect for key, effect in of.items() if values.get(key, 0) > 0}
+    if values.get("photoreceptor_noise"):  # then its shot noise is noise of the voltage
+        hidden = (hidden - {"shot"}) | {"voltage_noise"}
+    if "2nd_order" in case["case"]:
+        hidden = (hidden - {"bandwidth"}) | {"second_order"}
+    return tuple(sorted(hidden)), tuple(sorted(HABITS)) if "v2e " in case["generator"] else ()
+
+
+@dataclass(frozen=True)
+class Score:
+    """An answer beside the truth.
+
+    Args:
+        announced: Effects said to be certain or supported.
+        wrong: Those of them that are not there.
+        found: Hidden effects that are announced.
+        offered: Hidden effects that are one of an either ... or, and not announced.
+        hidden: How many are hidden.
+    """
+
+    announced: int
+    wrong: int
+    found: int
+    offered: int
+    hidden: int
+
+
+def score(line: Line) -> Score:
+    """Compare an answer with the truth; where the effect was removed, all that is announced is wrong."""
+    want = set(line["case"]["effects"])
+    allowed = want | set(line.get("allowed", ()))
+    findings = line["answer"]["findings"]
+    sure = {one["effect"] for one in findings if one["grade"] in ("certain", "supported")}
+    offered = {
+        n for one in findings if one["grade"] == "either" for n in (one["effect"], *one["alternatives"][:1])
+    }
+    if line["case"]["removed"]:
+        want, allowed = set(), set()
+    habits = sure & (allowed - want)
+    return Score(
+        len(sure - habits), len(sure - allowed), len(want & sure), len((want & offered) - sure), len(want)
+    )
+
+
+def interval(good: int, count: int) -> str:
+    """Return a share with its 95 % limits by Clopper and Pearson."""
+    from scipy.stats import beta
+
+    if not count:
+        return "-"
+    low = beta.ppf(0.025, good, count - good + 1) if good else 0.0
+    high = beta.ppf(0.975, good + 1, count - good) if good < count else 1.0
+    return f"{good} of {count} ({100 * low:.0f} to {100 * high:.0f} %)"
+
+
+def table(lines: list[Line]) -> list[str]:
+    """Return the table of results: a row for each kind of case."""
+    good = [line for line in lines if "failed" not in line]
+
+    def of(kind: str, strength: str = "", **more: Any) -> list[Line]:
+        return [
+            n for n in good
+            if n["case"]["kind"] == kind and strength in ("", n["case"]["strength"])
+            and all(n["case"][k] == v for k, v in more.items())
+        ]  # fmt: skip
+
+    rows: list[tuple[str, list[Line]]] = [(f"one effect, {s}", of("single", s)) for s in STRENGTHS]
+    rows += [("two effects", of("pair")), ("three effects", of("triple"))]
+    rows += [(f"not in the library, {s}", of("unknown", s)) for s in STRENGTHS]
+    rows += [("nothing hidden", of("nothing"))]
+    for words, kind in (("noisy base", "noisy"), ("scene known at 25 or 100 Hz", "frames")):
+        rows += [(f"{words}, one effect", [n for n in of(kind) if n["case"]["effects"]])]
+        rows += [(f"{words}, nothing hidden", [n for n in of(kind) if not n["case"]["effects"]])]
+    for words, some in (("nothing hidden", 0), ("one effect", 1), ("two effects", 2)):
+        rows += [
+            (f"worlds slightly off, {words}", [n for n in of("foreign") if len(n["case"]["effects"]) == some])
+        ]
+    letters = sorted({n["case"]["strength"][0] for n in of("other")})
+    rows += [
+        (f"other simulators, set {x}", [n for n in of("other") if n["case"]["strength"][0] == x])
+        for x in letters
+    ]
+    out = [
+        "| cases | of them with something wrong announced | announced and true | hidden effects announced "
+        "| ... or in an either ... or |", "|---|---|---|---|---|",
+    ]  # fmt: skip
+    for words, mine in rows:
+        scores = [score(line) for line in mine]
+        if scores:
+            announced, wrong = (sum(getattr(s, n) for s in scores) for n in ("announced", "wrong"))
+            hidden, found, offered = (
+                sum(getattr(s, n) for s in scores) for n in ("hidden", "found", "offered")
+            )
+            out.append(
+                f"| {words} | {interval(sum(s.wrong > 0 for s in scores), len(scores))} "
+                f"| {interval(announced - wrong, announced)} | {interval(found, hidden)} "
+                f"| {interval(found + offered, hidden)} |"
+            )
+    return out
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--key", default="development", help="draws scenes, strengths and seeds")
+    parser.add_argument("--log", type=Path, default=Path("out/sealed.jsonl"))
+    parser.add_argument("--hidden", type=Path, help="folder of other simulators' cases")
+    parser.add_argument("--kinds", default=",".join(KINDS))
+    parser.add_argument("--only", default="", help="effects, with commas between")
+    parser.add_argument("--repeats", type=int, default=1, help="of every kind and effect")
+    parser.add_argument("--device", default="cpu", help="or some, which share the runs: cuda:0,cuda:1")
+    parser.add_argument("--jobs", type=int, default=1)
+    parser.add_argument("--minutes", type=float, default=float("inf"), help="no run begins after these")
+    parser.add_argument("--report", action="store_true", help="only print the table of the log")
+    options = parser.parse_args()
+    if not options.report:
+        _run(options)
+    lines = [json.loads(text) for text in options.log.read_text().splitlines() if text.strip()]
+    print("\n".join(table(lines)))
+
+
+def _run(options: argparse.Namespace) -> None:
+    begin = time.time()
+    options.log.parent.mkdir(parents=True, exist_ok=True)
+    done = set()
+    if options.log.exists():
+        lines = [json.loads(text) for text in options.log.read_text().splitlines() if text.strip()]
+        done = {line["name"] for line in lines if "failed" not in line and line["key"] == options.key}
+    todo = [case for case in cases(options) if case.name not in done]
+    threads = max(1, (os.cpu_count() or 1) // options.jobs)
+    devices = options.device.split(",")
+    make = partial(
+        Job, key=number_of(options.key), device=devices[0], threads=threads, folder=options.hidden,
+        until=begin + 60 * options.minutes,
+    )  # fmt: skip
+    jobs = [make(case) for case in todo]
+    print(f"{len(done)} runs in the log, {len(jobs)} to do", flush=True)
+    note = partial(_note, options=options)
+    with options.log.open("a") as log:
+        if options.jobs == 1:
+            for job in jobs:
+                note(log, _safely(job))
+            return
+        context = multiprocessing.get_context("spawn")
+        places = context.SimpleQueue()
+        for n in range(options.jobs):
+            places.put(devices[n % len(devices)])
+        with context.Pool(options.jobs, _settle, (places,)) as pool:
+            for line in pool.imap_unordered(_safely, jobs):
+                note(log, line)
+
+
+def _note(log: Any, line: Line, *, options: argparse.Namespace) -> None:
+    """Write a run to the log, and a word about it; looks up the truth of another simulator's cases."""
+    if "late" in line:
+        return
+    line["key"] = options.key
+    if line["case"]["kind"] == "foreign":
+        line["allowed"] = sorted(HABITS)
+    if line["case"]["kind"] == "other":
+        line["case"]["effects"], line["allowed"] = true_effects(options.hidden, line["case"]["strength"])
+    log.write(json.dumps(line) + "\n")
+    log.flush()
+    if "failed" in line:
+        print(f"{line['name']}: {line['failed']}", flush=True)
+        return
+    one = score(line)
+    mark = (
+        "WRONG"
+        if one.wrong
+        else "ok   "
+        if one.found == one.hidden
+        else "part "
+        if one.found + one.offered
+        else "mute "
+    )
+    print(f"{mark} {line['name']:46s} {line['seconds']:5.1f} s {line['finding'][:150]}", flush=True)
+
+
+_place: list[str] = []
+"""The device of this process, if it has one to itself or shares it with others."""
+
+
+def _settle(places: Any) -> None:
+    _place[:] = [places.get()]
+
+
+def _safely(job: Job, run: Callable[[Job], Line] = run_case) -> Line:
+    if time.time() > job.until:
+        return {"late": job.case.name}
+    job = replace(job, device=_place[0]) if _place else job
+    try:
+        return run(job)
+    except Exception as error:  # one bad run must not end the others
+        import traceback
+
+        said = f"{error!r} {traceback.format_exc()[-600:]}"
+        return {"name": job.case.name, "case": asdict(job.case), "failed": said}
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,147 @@
+"""How sure a diagnosis is: grades, a part that chooses nothing, and what the events show by themselves."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import dase
+from dase.diagnosis.diagnose import diagnose
+from dase.diagnosis.explain_effect import moving_bars
+from dase.diagnosis.grading import grade_of
+from dase.diagnosis.seen_effects import (
+    SeenEffects,
+    find_seen_effects,
+    without_the_explained,
+    without_the_scene,
+)
+from dase.diagnosis.settings import GradeSettings
+from dase.effects import EFFECTS
+from dase.fitting.data_split import split_measurement
+from dase.fitting.measurement import Measurement
+from dase.probes.distance import Judgement
+from dase.results import Finding, Grade
+from dase.scenes.video import VideoScene
+from dase.signatures.result import Answer, Signature
+from dase.simulation.sensor import Sensor
+
+LIBRARY = {name: EFFECTS[name] for name in ("threshold", "leak", "shot")}
+
+
+@pytest.fixture(scope="module")
+def scene() -> VideoScene:
+    return moving_bars()
+
+
+def judged(error: float, *, level: float = 0.25, reach: float = 0.4) -> Judgement:
+    return Judgement(error, 1.15, reach, level, {}, {}, np.zeros(1), 1.0)
+
+
+@pytest.mark.parametrize(
+    ("start", "without", "last", "deviation", "rivals", "grade", "unknown"),
+    [
+        # at the floor
+        (8.0, 8.0, 0.3, 6.0, False, Grade.SUPPORTED, False),
+        (8.0, 8.0, 0.3, 6.0, True, Grade.EITHER, False),
+        # before a slightly wrong world: 4 % are left, and far more without the effect
+        (40.0, 30.0, 1.9, 6.0, False, Grade.SUPPORTED, False),
+        # ... one that helps a little may explain the wrong world
+        (40.0, 3.0, 1.9, 6.0, False, Grade.STAND_IN, False),
+        # a stand-in for something strong
+        (40.0, 40.0, 8.0, 20.0, False, Grade.STAND_IN, False),
+        # it does not hold where nothing was chosen
+        (8.0, 8.0, 0.3, 1.0, False, Grade.STAND_IN, False),
+        (8.0, 0.2, 0.3, 6.0, False, Grade.STAND_IN, False),
+        # so little that something unknown may look like it
+        (0.7, 0.7, 0.3, 6.0, False, Grade.EITHER, True),
+        # at the floor, but neither within chance nor near to nothing of what there was
+        (4.0, 4.0, 1.0, 6.0, False, Grade.EITHER, True),
+    ],
+)
+def test_grades(start, without, last, deviation, rivals, grade, unknown):
+    found = grade_of(
+        judged(start), judged(without), judged(last), deviation, has_rivals=rivals, settings=GradeSettings()
+    )
+    assert found == (grade, unknown)
+
+
+def test_what_reports_has_pixels_of_its_own_at_the_later_time(scene):
+    events = dase.simulate(scene, Sensor(), seed=1)
+    evidence = split_measurement(events, scene, pixels=700)
+    parts = [evidence.train, evidence.held, evidence.report]
+    pixels = [set(part.trials.stimulus.pixels.tolist()) for part in parts]
+    assert [len(some) for some in pixels] == [700] * 3
+    assert len(set.union(*pixels)) == 2100
+    assert evidence.report.frame.first == evidence.held.frame.first > 0
+
+
+def test_what_reports_chooses_nothing(scene):
+    """The search goes the same way whatever the pixels saw that report; what is said of its end differs."""
+    sensor = Sensor().with_effect(EFFECTS["leak"](rate=4.0))
+    events = dase.simulate(scene, sensor, seed=3)
+    apart = split_measurement(events, scene, pixels=400).report.trials.stimulus.pixels
+    rng = np.random.default_rng(0)
+    mine = np.isin(events.y.astype(np.int64) * scene.width + events.x, apart)
+    # at the time that reports; what comes before tells how fast a lamp flickers, wherever it is seen
+    others = events.select(~mine | (events.t < 0.5) | (rng.random(len(events)) < 0.7))
+    found = [diagnose(e, scene=scene, effects=LIBRARY, pixels=400, most=1) for e in (events, others)]
+    ways = [[(r.effect, r.error) for s in one.history for r in s.ranking] for one in found]
+    assert ways[0]
+    assert repr(ways[0]) == repr(ways[1])
+    assert found[1].errors[-1] > found[0].errors[-1] + 1
+
+
+def test_each_model_has_one_error(scene):
+    events = dase.simulate(scene, Sensor().with_effect(EFFECTS["leak"](rate=4.0)), seed=3)
+    found = diagnose(events, scene=scene, effects=LIBRARY, pixels=400)
+    assert [one.grade for one in found.findings] == [Grade.SUPPORTED]
+    assert found.history[0].error == found.errors[0]
+    assert found.findings[0].error_without == found.errors[0]
+    assert found.findings[0].error_with == found.errors[1]
+    assert found.finding() == "missing: leak (supported)"
+    assert found.to_json()["findings"][0]["grade"] == "supported"
+
+
+def test_what_the_last_model_shows_as_well_is_explained(scene):
+    """A slow pixel sends pairs that look like noise; the model of it sends them, too."""
+    slow = Sensor().with_effect(EFFECTS["bandwidth"](cutoff=60.0))
+    pairs = Signature(name="opposite pairs", answer=Answer.FOUND)
+    measurement = Measurement(dase.simulate(scene, slow, seed=3), scene)
+    seen = SeenEffects((pairs, lamp({"frequency": 100.0})))
+    assert without_the_explained(seen, measurement, slow, 5).entries == seen.entries[1:]
+    assert without_the_explained(seen, measurement, Sensor(), 5).entries == seen.entries
+
+
+def lamp(details: dict[str, float]) -> Signature:
+    return Signature(name="flicker", answer=Answer.FOUND, sentence="light at 100 Hz", details=details)
+
+
+def test_what_the_events_show_is_certain_whatever_the_search_says():
+    seen = SeenEffects((lamp({"frequency": 100.0}), replace(lamp({}), name="frame coupling")))
+    weak = Finding("flicker", Grade.STAND_IN, error_without=3.0, error_with=2.0, deviation=1.0)
+    leak = Finding("leak", Grade.SUPPORTED)
+    found = {one.effect: one for one in seen.findings([weak, leak], ())}
+    assert found["flicker"].grade is Grade.CERTAIN
+    assert found["flicker"].error_with == 2.0
+    assert found["flicker"].seen == "light at 100 Hz"
+    assert found["leak"] == leak
+    assert found["frame coupling"].grade is Grade.CERTAIN
+    # what the sensor has is not missing
+    assert [one.effect for one in seen.findings([], ("flicker",))] == ["frame coupling"]
+
+
+def test_light_that_flickers_in_the_clip_is_not_of_the_camera(scene):
+    """The events show it, but the sensor without any effect would show it as well."""
+    times = scene.sample_times()
+    swing = 1 + 0.5 * np.sin(2 * np.pi * 100 * times)
+    waving = VideoScene((scene.frames(times) * swing[:, None, None]).astype(np.float32), times)
+    lit = Sensor().with_effect(EFFECTS["flicker"](frequency=100.0, depth=0.3))
+    of_scene = Measurement(dase.simulate(waving, Sensor(), seed=1), waving)
+    of_camera = Measurement(dase.simulate(scene, lit, seed=1), scene)
+    for measurement, left in ((of_scene, False), (of_camera, True)):
+        seen = find_seen_effects(measurement)
+        assert seen.lamp == pytest.approx(100.0, abs=0.3)
+        kept = without_the_scene(seen, measurement, Sensor(), 5)
+        assert ("flicker" in kept.effects) == left
