@@ -8,7 +8,13 @@ from dataclasses import replace
 from itertools import combinations
 from os import PathLike
 
-from dase.diagnosis.candidates import Candidate, calibrate_split, effects_to_try, try_effects
+from dase.diagnosis.candidates import (
+    Candidate,
+    calibrate_split,
+    effects_to_try,
+    try_effects,
+    variants_to_try,
+)
 from dase.diagnosis.cell_descriptions import worst_cells
 from dase.diagnosis.directional_test import find_hidden_effect
 from dase.diagnosis.grading import ModelOnReport, grade_effects, judge_on_report
@@ -95,9 +101,10 @@ def diagnose(
     given = given.bound_to(measurement.scene)
     tell("looking at the events alone", 0.0, float("nan"))
     seen = find_seen_effects(measurement)
+    bursts = None if "exposure" in given else seen.bursts
     evidence = split_measurement(
         measurement.events, measurement.scene, log_eps=given.log_eps, trust=measurement.trust,
-        span=measurement.span, left_out=seen.bursts.contains if seen.bursts else None, lamp=seen.lamp,
+        span=measurement.span, left_out=bursts.contains if bursts else None, lamp=seen.lamp,
         pixels=pixels, seed=seed, device=device,
     )  # fmt: skip
     tell("fitting the present model", 0.0, float("nan"))
@@ -125,7 +132,7 @@ def diagnose(
         )
         start = _fitted_unless_worse(state, start.sensor, free)
     state.certain = frozenset(seen.effects) - names
-    if seen.bursts is not None:
+    if bursts is not None:
         state.notes.append("the bursts that come with the frames are left out of all that is compared")
     # what is not of this scene has no effects to be found
     limit = 0 if evidence.contradiction else most
@@ -200,7 +207,11 @@ def _look_for_effect(
         return step, None, False
     open_names = effects_to_try(state.effects, model)
     # what is certain comes first, and by itself: everything else is judged beside it
-    certain = [name for name in open_names if name in state.certain - state.tried_alone]
+    certain = [
+        name for name in open_names
+        if name in state.certain - state.tried_alone
+        and variants_to_try(evidence, state.effects[name], idle_bus=settings.candidates.idle_bus)
+    ]  # fmt: skip
     state.tried_alone |= frozenset(certain)
     open_names = certain or open_names
     if not open_names:

@@ -31,12 +31,12 @@ KINDS: dict[str, tuple[str, ...]] = {
     "opposite pairs": ("shot", "voltage_noise"),
     "fixed pattern": ("mismatch",),
     "grouping": ("readout", "row_scan"),
-    "frame coupling": (),
+    "frame coupling": ("exposure",),
     "double events": (),
 }
 """Signature to the effects that make it; nothing where the library has none that does."""
 
-NAMED = ("flicker", "hot pixels", "full bus", "time stamps")
+NAMED = ("flicker", "hot pixels", "full bus", "time stamps", "frame coupling")
 """Signatures that tell which effect it is; the others tell what there is, and not what makes it."""
 
 

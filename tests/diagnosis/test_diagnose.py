@@ -333,7 +333,7 @@ def test_an_effect_of_the_user_is_explained_wherever_its_file_is_named(tmp_path,
 
 def test_too_small_a_scene_is_refused(scene):
     tiny = VideoScene(scene.frames(scene.sample_times())[:, :4, :4], scene.sample_times())
-    with pytest.raises(dase.InputError, match="48 pixels"):
+    with pytest.raises(dase.InputError, match="16 pixels"):
         split_measurement(dase.simulate(tiny, Sensor()), tiny)
 
 

@@ -127,9 +127,9 @@ def test_what_the_events_show_is_certain_whatever_the_search_says():
     assert found["flicker"].error_with == 2.0
     assert found["flicker"].seen == "light at 100 Hz"
     assert found["leak"] == leak
-    assert found["frame coupling"].grade is Grade.CERTAIN
+    assert found["exposure"].grade is Grade.CERTAIN
     # what the sensor has is not missing
-    assert [one.effect for one in seen.findings([], ("flicker",))] == ["frame coupling"]
+    assert [one.effect for one in seen.findings([], ("flicker",))] == ["exposure"]
 
 
 def test_light_that_flickers_in_the_clip_is_not_of_the_camera(scene):
