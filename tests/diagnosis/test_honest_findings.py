@@ -47,7 +47,7 @@ def recording(tmp_path):
 def found_nothing() -> Diagnosis:
     step = Step(("threshold",), 6.0, 1.3, {"rate": 6.0}, (), None, (), ())
     values = {"threshold.on": Estimate(0.2, 0.19, 0.21)}
-    return Diagnosis(Sensor(), (), (6.0,), 9.0, 1.0, 1.3, values, {}, None, (step,))
+    return Diagnosis(Sensor(), (), (6.0,), 9.0, 1.0, 1.3, values, None, (step,))
 
 
 def test_a_picture_that_fails_costs_the_picture(recording, tmp_path, monkeypatch):

@@ -1,0 +1,92 @@
+"""What half of the frames make of a scene is added to what statistics may be off by."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pytest
+
+import dase
+from dase.effects import EFFECTS
+from dase.fitting.data_split import SplitMeasurement, split_measurement
+from dase.fitting.measurement import camera_scene
+from dase.fitting.model import FittedModel, fit_present_model
+from dase.fitting.scene_doubt import is_guessed, with_scene_doubt
+from dase.scenes.between_frames import CameraScene
+from dase.scenes.video import VideoScene
+from dase.simulation.sensor import Sensor
+
+WIDTH, HEIGHT, GAP, EXPOSURE = 96, 72, 0.04, 0.01
+TRUE = Sensor(effects=(EFFECTS["threshold"](on=0.2, off=0.22),))
+
+
+def shaking(seconds: float = 0.9) -> VideoScene:
+    """Return a soft texture that shakes by some pixels."""
+    rng = np.random.default_rng(4)
+    texture = cv2.GaussianBlur(rng.random((HEIGHT + 40, WIDTH + 40), np.float32), (0, 0), 2.5)
+    texture = 0.03 + 0.9 * (texture - texture.min()) / np.ptp(texture)
+    times = np.arange(0, seconds, 1e-3)
+    frames = np.empty((len(times), HEIGHT, WIDTH), np.float32)
+    for k, t in enumerate(times):
+        x, y = 8 * np.sin(2 * np.pi * 2.3 * t), 6 * np.sin(2 * np.pi * 3.1 * t + 1)
+        move = np.array([[1, 0, x - 20], [0, 1, y - 20]], np.float32)
+        frames[k] = cv2.warpAffine(texture, move, (WIDTH, HEIGHT), flags=cv2.INTER_LINEAR)
+    return VideoScene(frames, times)
+
+
+def filmed(scene: VideoScene) -> CameraScene:
+    """Return the scene between the frames of a camera of 8 bits."""
+    times = scene.sample_times()
+    dense = scene.frames(times)
+    begins = np.arange(0, times[-1] - EXPOSURE, GAP)
+    shown = [dense[(times >= b - 1e-9) & (times < b + EXPOSURE - 1e-9)].mean(0) for b in begins]
+    grey = np.rint(255 * np.array(shown)).astype(np.uint8)
+    return camera_scene(grey, begins, begins + EXPOSURE, [])
+
+
+@pytest.fixture(scope="module")
+def measured() -> tuple[SplitMeasurement, CameraScene, FittedModel]:
+    scene = shaking()
+    camera = filmed(scene)
+    evidence = split_measurement(dase.simulate(scene, TRUE, seed=1), camera, pixels=500)
+    return evidence, camera, fit_present_model(evidence, Sensor(), None, seed=0)
+
+
+def test_a_right_model_counts_as_right_where_frames_are_all_that_is_known(measured):
+    evidence, camera, model = measured
+    bare = model.judge(evidence.report, repeats=24, seed=7)
+    doubted = with_scene_doubt(evidence, camera, model, seed=0)
+    judged = model.judge(doubted.report, repeats=24, seed=7)
+    assert bare.error > bare.gate  # a perfect sensor would be unexplained
+    assert judged.error < judged.gate
+    assert evidence.report.doubt is None
+
+
+def test_what_a_scene_does_not_explain_is_still_seen(measured):
+    """Pixels that rest for 10 ms after each event: the scene between frames does not hide that."""
+    evidence, camera, model = measured
+    doubted = with_scene_doubt(evidence, camera, model, seed=0)
+    slow = TRUE.with_effect(EFFECTS["refractory"](period=0.01))
+    other = split_measurement(dase.simulate(shaking(), slow, seed=1), camera, pixels=500)
+    same = replace(other.report, doubt=doubted.report.doubt, drift=doubted.report.drift)
+    judged = model.judge(same, repeats=24, seed=7)
+    assert judged.error > 2 * judged.gate
+
+
+def test_only_scenes_between_frames_are_guessed():
+    scene = shaking(0.3)
+    assert not is_guessed(scene)
+    assert is_guessed(filmed(scene))
+    times = scene.sample_times()[:20]
+    grey = np.rint(255 * scene.frames(times)).astype(np.uint8)
+    assert not is_guessed(CameraScene(grey, times, times))
+
+
+def test_every_second_frame_is_the_same_camera():
+    camera = filmed(shaking(0.5))
+    half = camera.every(2)
+    np.testing.assert_array_equal(half.times, camera.times[::2])
+    np.testing.assert_array_equal(half.intensity(1), camera.intensity(2))
+    assert half.trust == camera.trust
