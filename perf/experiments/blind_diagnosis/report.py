@@ -50,11 +50,7 @@ def right(line: dict[str, Any]) -> bool:
         return bool(selected) and named_first(line)
     if case["kind"] in ("other", "time"):
         ties = {t for name in selected for t in answer["ties"].get(name, ())}
-        return (
-            want <= {*selected, *ties}
-            and set(selected) - ALLOWED - ties <= want
-            and answer["unexplained"] is None
-        )
+        return want <= {*selected, *ties} and set(selected) - ALLOWED - ties <= want
     return set(selected) == want if case["kind"] != "pair" else want <= set(selected)
 
 
