@@ -100,7 +100,7 @@ def diagnose(
     measurement = as_measurement(measured, scene, trust)
     given = given.bound_to(measurement.scene)
     tell("looking at the events alone", 0.0, float("nan"))
-    seen = find_seen_effects(measurement)
+    seen = find_seen_effects(measurement, effects)
     bursts = None if "exposure" in given else seen.bursts
     evidence = split_measurement(
         measurement.events, measurement.scene, log_eps=given.log_eps, trust=measurement.trust,

@@ -7,10 +7,11 @@ certain. What the scene itself does, such as light that flickers in a clip, is n
 from __future__ import annotations
 
 from collections.abc import Collection
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
+from dase.effects import EFFECTS
 from dase.errors import InputError
 from dase.events import Events
 from dase.fitting.measurement import Measurement
@@ -47,10 +48,12 @@ class SeenEffects:
     Args:
         entries: The signatures that are there and not of the scene.
         bursts: When the whole array sends in step with the frames, which no model explains; None for never.
+        library: Effects that may be named.
     """
 
     entries: tuple[Signature, ...] = ()
     bursts: BurstClock | None = None
+    library: frozenset[str] = frozenset(EFFECTS)
 
     @property
     def lamp(self) -> float | None:
@@ -63,7 +66,11 @@ class SeenEffects:
     @property
     def effects(self) -> dict[str, str]:
         """Effects of the library that are certain, each to what shows it."""
-        return {name: entry.sentence for entry in self.entries for name in _effects_of(entry)}
+        return {name: entry.sentence for entry in self.entries for name in self.named_by(entry)}
+
+    def named_by(self, entry: Signature) -> tuple[str, ...]:
+        """Return the effects of the library that a signature names; there may be none."""
+        return tuple(name for name in _effects_of(entry) if name in self.library)
 
     def findings(self, graded: Collection[Finding], given: Collection[str]) -> list[Finding]:
         """Return findings in which all that is seen is certain.
@@ -85,14 +92,14 @@ class SeenEffects:
         for entry in self.entries:
             if named.intersection(KINDS[entry.name]) or set(given).intersection(KINDS[entry.name]):
                 continue
-            for name in _effects_of(entry) or (entry.name,):
+            for name in self.named_by(entry) or (entry.name,):
                 out = [one for one in out if one.effect != name]
                 out.append(Finding(name, Grade.CERTAIN, seen=entry.sentence))
         return out
 
 
-def find_seen_effects(measurement: Measurement) -> SeenEffects:
-    """Return what the events of a measurement show by themselves."""
+def find_seen_effects(measurement: Measurement, library: Collection[str]) -> SeenEffects:
+    """Return what the events of a measurement show by themselves; only effects of a library are named."""
     events, scene = _compared_events(measurement), measurement.scene
     begins = scene.begin if isinstance(scene, CameraScene) else None
     try:
@@ -107,7 +114,7 @@ def find_seen_effects(measurement: Measurement) -> SeenEffects:
         bursts = BurstClock(np.asarray(details["begins"]), details["interval"], np.asarray(details["bursts"]))
         if begins is None:
             bursts = bursts.extend(float(events.t[-1]))
-    return SeenEffects(entries, bursts)
+    return SeenEffects(entries, bursts, frozenset(library))
 
 
 def without_the_scene(seen: SeenEffects, measurement: Measurement, sensor: Sensor, seed: int) -> SeenEffects:
@@ -123,7 +130,8 @@ def without_the_scene(seen: SeenEffects, measurement: Measurement, sensor: Senso
         return seen
     also = _signatures_of(measurement.scene, sensor, seed)
     kept = tuple(entry for entry in seen.entries if entry.name not in also)
-    return SeenEffects(kept, seen.bursts if any(e.name == "frame coupling" for e in kept) else None)
+    coupled = any(entry.name == "frame coupling" for entry in kept)
+    return replace(seen, entries=kept, bursts=seen.bursts if coupled else None)
 
 
 def without_the_explained(
@@ -137,11 +145,11 @@ def without_the_explained(
         sensor: The model after the search.
         seed: Of its random numbers.
     """
-    open_ = {entry.name for entry in seen.entries if entry.name not in NAMED}
+    open_ = {entry.name for entry in seen.entries if not seen.named_by(entry)}
     if not open_ or isinstance(measurement.scene, CameraScene):
         return seen
     also = open_ & _signatures_of(measurement.scene, sensor, seed)
-    return SeenEffects(tuple(entry for entry in seen.entries if entry.name not in also), seen.bursts)
+    return replace(seen, entries=tuple(entry for entry in seen.entries if entry.name not in also))
 
 
 def _signatures_of(scene: Scene, sensor: Sensor, seed: int) -> set[str]:
@@ -162,7 +170,7 @@ def _compared_events(measurement: Measurement) -> Events:
 
 
 def _effects_of(entry: Signature) -> tuple[str, ...]:
-    """Return the effects of the library that a signature names; none where it only tells what there is."""
+    """Return the effects of dase that a signature names; none where it only tells what there is."""
     if entry.name == "time stamps":
         if "line" in entry.details:
             return ("row_scan",)

@@ -141,7 +141,7 @@ def test_light_that_flickers_in_the_clip_is_not_of_the_camera(scene):
     of_scene = Measurement(dase.simulate(waving, Sensor(), seed=1), waving)
     of_camera = Measurement(dase.simulate(scene, lit, seed=1), scene)
     for measurement, left in ((of_scene, False), (of_camera, True)):
-        seen = find_seen_effects(measurement)
+        seen = find_seen_effects(measurement, EFFECTS)
         assert seen.lamp == pytest.approx(100.0, abs=0.3)
         kept = without_the_scene(seen, measurement, Sensor(), 5)
         assert ("flicker" in kept.effects) == left
