@@ -106,4 +106,6 @@ def _blur_by_opencv(
     for picture, place in zip(pictures.numpy().reshape(shape), out.reshape(shape), strict=True):
         cv2.sepFilter2D(picture, -1, line, line, dst=place, borderType=cv2.BORDER_REFLECT_101)
     every = len(pixels) == size and np.array_equal(pixels, np.arange(size))
-    return wp.array(out if every else out[:, pixels], dtype=float, device=device, copy=False)
+    # NumPy chooses columns into memory that runs down them, and kernels read along rows
+    chosen = out if every else np.ascontiguousarray(out[:, pixels])
+    return wp.array(chosen, dtype=float, device=device, copy=False)

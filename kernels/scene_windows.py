@@ -9,14 +9,8 @@ from functools import lru_cache
 
 import warp as wp
 
-from dase.kernels.scene_layers import (
-    Affine,
-    Layers,
-    background_geometry,
-    layer_intensity,
-    layers_near,
-)
-from dase.kernels.threshold_counts import block_functions
+from dase.kernels.scene_layers import Affine, Layers, background_geometry
+from dase.kernels.threshold_counts import block_functions, light_of
 from dase.kernels.vector_math import lane_functions, lane_options
 
 
@@ -48,25 +42,44 @@ def layers_of_scene(scenes: LayerScenes, row: int) -> Layers:
     return layers
 
 
-@wp.kernel(enable_backward=False)
-def render_scenes(
-    first: int,
-    # in
-    scenes: LayerScenes,
-    width: int,
-    # out
-    frame_out: wp.array3d[float],  # (K, B, N)
-):
-    """Intensity of a pixel of a whole view at all samples, which are one run."""
-    b, i = wp.tid()
-    i += first
-    layers = layers_of_scene(scenes, b)
-    x = float(i % width)
-    y = float(i / width)
-    near = layers_near(layers, x, y)
-    ground = background_geometry(layers)
-    for k in range(frame_out.shape[0]):
-        frame_out[k, b, i] = layer_intensity(layers, ground, near, k, x, y) * scenes.light[b, k]
+@lru_cache(maxsize=4)
+def rendering_kernel(lanes: int) -> wp.Kernel:
+    """Return the kernel that renders scenes, over (B, runs · blocks of `lanes` pixels) threads.
+
+    The last block of a run ends with the last pixel and may overlap the one before.
+    """
+    start_of, light = block_functions(lanes), light_of(lanes, "layers")
+    columns, rows, layers_of = start_of.columns, start_of.rows, start_of.layers_of
+    store = lane_functions(lanes).store
+
+    @wp.kernel(enable_backward=False, module="unique", module_options=lane_options())
+    def render_runs(
+        first: int,
+        # in
+        scenes: LayerScenes,
+        run: wp.array[int],  # (R + 1,) samples at which runs begin, and K
+        places: wp.array2d[int],  # (B, N) row-major indices of pixels of the view
+        width: int,  # of the view
+        # out
+        out: wp.array3d[float],  # (B, K, N)
+    ):
+        """Render the intensity of a block of pixels in full light, at all samples of a run."""
+        b, i = wp.tid()
+        i += first
+        size = places.shape[1]
+        blocks = (size + wp.static(lanes - 1)) / wp.static(lanes)
+        r = i / blocks
+        n = wp.min((i % blocks) * wp.static(lanes), size - wp.static(lanes))
+        layers = layers_of_scene(scenes, b)
+        layers.box = scenes.box[b, r]
+        x = columns(places[b], n, width)
+        y = rows(places[b], n, width)
+        near = layers_of(layers, x, y)
+        ground = background_geometry(layers)
+        for k in range(run[r], run[r + 1]):
+            store(out[b, k], n, light(layers, ground, k, n, x, y, near))
+
+    return render_runs
 
 
 @lru_cache(maxsize=4)

@@ -8,8 +8,6 @@ import numpy as np
 import warp as wp
 from numpy.typing import NDArray
 
-from dase.effects.optics import SceneEffect
-from dase.errors import InputError
 from dase.kernels import launch, pixel_codegen_scenes, pixel_stages
 from dase.kernels import threshold_counts as counting
 from dase.kernels.window_sinks import WindowGrids
@@ -31,9 +29,6 @@ class PixelBatch:
         height: Rows of the camera [px].
         deposit: What is done with an event, one of `dase.kernels.window_sinks.DEPOSITS`.
         device: Warp device.
-
-    Raises:
-        InputError: The sensor has an effect that mixes pixels before they see anything.
     """
 
     def __init__(
@@ -47,12 +42,6 @@ class PixelBatch:
         deposit: str,
         device: wp.Device,
     ):
-        mixing = [e.name for e in sensor.effects if isinstance(e, SceneEffect) and not e.is_off()]
-        if mixing:
-            raise InputError(
-                f"sensor '{sensor.name}': {', '.join(mixing)} mixes pixels of stored frames, of which many "
-                "scenes at once have none: remove it, or use dase.simulate"
-            )
         self.stages, self.device, self.deposit = sensor.stages(), device, deposit
         self.width, self.height = width, height
         self.batch, self.count = batch, count

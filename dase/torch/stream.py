@@ -16,12 +16,14 @@ from numpy.typing import NDArray
 from torch.utils.data import IterableDataset, get_worker_info
 
 from dase.effects.learned_threshold import LearnedThreshold
+from dase.effects.optics import SceneEffect
 from dase.errors import InputError, checked_integer, checked_seed
 from dase.kernels import launch, scene_paths
 from dase.kernels import threshold_counts as counting
 from dase.kernels.autograd_counts import follow_torch_stream
+from dase.kernels.pixel_codegen_scenes import StoredScenes
 from dase.kernels.scene_layers import Affine
-from dase.kernels.scene_windows import LayerScenes, flow_kernel, render_scenes
+from dase.kernels.scene_windows import LayerScenes, flow_kernel, rendering_kernel
 from dase.networks.weights_file import load_net
 from dase.representations import Representation, Voxels
 from dase.scenes.image_sources import ImageSource, open_images
@@ -33,6 +35,7 @@ from dase.simulation.sensor_file import as_sensor
 from dase.torch.augmentation import augmented
 from dase.torch.batch import Batch
 from dase.torch.pictures import BACKGROUND, DecodedPictures, TexturePool, decode_pictures
+from dase.torch.rendered_scene import RenderedScene
 from dase.torch.scene_numbers import (
     Augment,
     Randomise,
@@ -42,6 +45,8 @@ from dase.torch.scene_numbers import (
     sensor_of,
 )
 
+MEMORY = 1 << 28
+"""Bytes of whole pictures that are held at once where a lens needs them."""
 VOXELS = Voxels(5)
 """What networks are given unless something else is asked for."""
 NOTHING = Augment()
@@ -174,9 +179,6 @@ class Stream(IterableDataset[Batch]):
         self.left_out = tuple(effect.name for effect in self.sensor.readout_effects())
         # what cannot work is refused here and not in the loop
         draw_scene_numbers(np.random.default_rng(0), self.plan, self.sensor, 1, self.objects)
-        PixelBatch(
-            self.sensor, 1, 1, width=1, height=1, deposit=represent.deposit, device=launch.find_device("cpu")
-        )
 
     def __iter__(self) -> Iterator[Batch]:
         """Yield batches without end, beginning with number `first_batch`."""
@@ -270,11 +272,13 @@ class BatchMaker:
             stream.sensor, self.plan.batch, self.plan.size[0] * self.plan.size[1], width=width, height=height,
             deposit=stream.represent.deposit, device=self.where,
         )  # fmt: skip
+        optics = (effect for effect in stream.sensor.effects if isinstance(effect, SceneEffect))
+        self._mixing = any(not effect.is_off() for effect in optics)
         self._decoder = ThreadPoolExecutor(1, thread_name_prefix="dase pictures")
         self._coming: dict[int, Future[DecodedPictures]] = {}
         self._pool: tuple[int, TexturePool] | None = None
         self._group, self._part = -1, 0
-        self._clocks: dict[int, Any] = {}
+        self._clocks: dict[tuple[int, int], Any] = {}
         self._kept: dict[str, Any] = {}  # memory of work that is done anew in every batch
         self._late: torch.Tensor | None = None
         self._before: torch.Tensor | None = None
@@ -364,34 +368,92 @@ class BatchMaker:
 
     def _advance(self) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
         """Simulate the next batch of the scenes; return grids (T, B, C, N), frames and flow."""
-        plan, steps, batch = self.plan, self.stream.steps, self.plan.batch
-        times, count = self.stream.times(self._part), self.pixels.count
-        run = np.arange(steps + 1, dtype=np.int32) * self.stream.samples
-        run[1:] += self._part == 0  # the very first sample
-        # a scene has the same clock as the one before
-        if self._part not in self._clocks:
-            self._clocks[self._part] = self.pixels.clock(times, run)
-        clock = self._clocks[self._part]
-        velocity = self._place(clock.t64, clock.run)
-        self._scenes.light = self._light(times)
+        plan, steps, batch, count = self.plan, self.stream.steps, self.plan.batch, self.pixels.count
         late = self.pixels.late_windows(plan.window)
         grids = torch.zeros(steps + late, batch, self.stream.represent.channels, count, device=self.device)
         if self._late is not None:
             grids[:late] += self._late
-        bins = getattr(self.stream.represent, "bins", 1)
         frames = torch.empty(steps, batch, count, device=self.device)
         flow = torch.empty(steps, batch, 2, count, device=self.device)
-        lent = wp.from_torch(frames), wp.from_torch(grids)
-        self.pixels.advance("layers", self._scenes, clock, times, *lent, bins)
-        lanes = counting.widest_block(count, self.where, "layers")
-        inputs = [
-            self._scenes, velocity, clock.run, self.pixels.places, plan.view[0], wp.from_torch(flow)
-        ]  # fmt: skip
-        blocks = steps * counting.block_count(count, lanes)
-        launch.run_kernel(flow_kernel(lanes), blocks, inputs, self.where, batch=batch)
+        each = self._windows_at_once()
+        for first in range(0, steps, each):
+            last = min(first + each, steps)
+            parts = grids[first : last + late], frames[first:last], flow[first:last]
+            self._advance_windows(first, last, *parts)
         self._part += 1
         self._late = grids[steps:].clone() if late else None
         return grids[:steps], frames, flow
+
+    def _windows_at_once(self) -> int:
+        """Return how many windows are simulated by one launch."""
+        if not self._mixing:
+            return self.stream.steps
+        width, height = self.plan.view
+        window = 4 * self.plan.batch * self.stream.samples * width * height
+        return max(1, min(self.stream.steps, MEMORY // window))
+
+    def _advance_windows(
+        self, first: int, last: int, grids: torch.Tensor, frames: torch.Tensor, flow: torch.Tensor
+    ) -> None:
+        """Simulate windows of a batch: add their events to grids (W, B, C, N), fill frames and flow."""
+        each, count = self.stream.samples, self.pixels.count
+        # the very first sample belongs to the first window, and begins no step
+        fresh = int(self._part == 0)
+        times = self.stream.times(self._part)[first * each + fresh * (first > 0) : last * each + fresh]
+        run = np.arange(last - first + 1, dtype=np.int32) * each
+        run[1:] += fresh * (first == 0)
+        # scenes have the same clocks as those before them
+        if (self._part, first) not in self._clocks:
+            self._clocks[self._part, first] = self.pixels.clock(times, run)
+        clock = self._clocks[self._part, first]
+        velocity = self._place(clock.t64, clock.run)
+        self._scenes.light = self._light(times)
+        lent, bins = (wp.from_torch(frames), wp.from_torch(grids)), getattr(self.stream.represent, "bins", 1)
+        if self._mixing:
+            sharp = self._render(clock.run, len(times))
+            self.pixels.advance("frames", self._through_optics(sharp, times), clock, times, *lent, bins)
+            # a label is what there is to be seen, not what a lens makes of it
+            self._show(sharp, run[1:] - 1, frames)
+        else:
+            self.pixels.advance("layers", self._scenes, clock, times, *lent, bins)
+        lanes = counting.widest_block(count, self.where, "layers")
+        inputs = [
+            self._scenes, velocity, clock.run, self.pixels.places, self.plan.view[0], wp.from_torch(flow)
+        ]  # fmt: skip
+        blocks = (last - first) * counting.block_count(count, lanes)
+        launch.run_kernel(flow_kernel(lanes), blocks, inputs, self.where, batch=self.plan.batch)
+
+    def _render(self, run: wp.array, samples: int) -> wp.array:
+        """Return what the whole cameras see in full light, shape (B, samples, pixels of the view)."""
+        batch, (width, height) = self.plan.batch, self.plan.view
+        if "every" not in self._kept:
+            every = np.arange(width * height, dtype=np.int32)
+            self._kept["every"] = self._send(np.repeat(every[None], batch, 0), wp.int32)
+        out = self._memory("sharp", (batch, samples, width * height), wp.float32)
+        lanes = counting.widest_block(width * height, self.where, "layers")
+        blocks = (run.shape[0] - 1) * counting.block_count(width * height, lanes)
+        inputs = [self._scenes, run, self._kept["every"], width, out]
+        launch.run_kernel(rendering_kernel(lanes), blocks, inputs, self.where, batch=batch)
+        return out
+
+    def _through_optics(self, sharp: wp.array, times: NDArray[np.float64]) -> StoredScenes:
+        """Return what pixels see of whole pictures (B, K, pixels) through effects that mix neighbours."""
+        seen = StoredScenes()
+        seen.light = self._scenes.light
+        seen.values = self._memory("seen", (self.plan.batch, len(times), self.pixels.count), wp.float32)
+        for slot, pixels in enumerate(self._drawn.places(self.plan)):
+            picture = RenderedScene(self.plan.view, sharp[slot])
+            _, mixed = self.stream.sensor.through_optics(picture).source(times, pixels, self.where)
+            wp.copy(seen.values[slot], mixed.values)
+        return seen
+
+    def _show(self, sharp: wp.array, samples: NDArray[np.int32], frames: torch.Tensor) -> None:
+        """Write what there is to be seen at some samples (W,) of whole pictures into frames (W, B, N)."""
+        at = torch.from_numpy(samples.astype(np.int64)).to(self.device)
+        pictures = wp.to_torch(sharp)[:, at].transpose(0, 1)
+        light = wp.to_torch(self._scenes.light)[:, at].T[..., None]
+        places = wp.to_torch(self.pixels.places).long().expand(len(at), -1, -1)
+        frames.copy_(pictures.gather(2, places) * light)
 
     def _light(self, times: NDArray[np.float64]) -> wp.array:
         """Return what intensities are multiplied by at samples [s], shape (B, K)."""
@@ -445,9 +507,7 @@ class BatchMaker:
         run = self._send(np.array([0, 1], np.int32), wp.int32)
         self._place(self._send(time, wp.float64), run)
         self._scenes.light = self._light(time)
-        frames = torch.empty(1, batch, width * height, device=self.device)
-        inputs = [self._scenes, width, wp.from_torch(frames)]
-        launch.run_kernel(render_scenes, width * height, inputs, self.where, batch=batch)
+        frames = wp.to_torch(self._render(run, 1))[:, 0] * wp.to_torch(self._scenes.light)
         return frames.view(batch, height, width)
 
     def _learned_maps(

@@ -102,6 +102,18 @@ def test_chunks_and_pixels_do_not_matter(device, rng, kind):
         np.testing.assert_array_equal(part[i], every[i])
 
 
+def test_some_of_the_pixels_see_what_they_see_among_all(device, rng):
+    """Enough of them for blocks of pixels, which read along rows of memory."""
+    scene, sensor = layers(rng), dase.Sensor((OpticsBlur(sigma=0.6), Threshold()))
+    pixels = np.arange(100, 180)
+    every, some = (
+        dase.count(scene, sensor, [0, scene.duration], device=device, pixels=chosen)[0, 0]
+        for chosen in (None, pixels)
+    )
+    np.testing.assert_array_equal(some, every[:, pixels])
+    assert some.sum() > 20
+
+
 @pytest.mark.parametrize("sigma", [2.0, 3.0])
 def test_an_edge_becomes_a_ramp_of_the_width_of_the_lens(device, sigma):
     dark, bright, speed, theta = 0.1, 0.8, 40.0, 0.25
