@@ -27,7 +27,7 @@ ARCH = 90
 MODULES = (
     "critic_layers", "critic_products", "critic_rows", "event_keys", "event_neighbours", "event_order",
     "event_probes", "event_queue", "patch_structure", "pixel_codegen_trials", "scene_batch", "scene_blur",
-    "scene_frames", "scene_layers", "scene_layers_gradient", "scene_paths", "scene_windows",
+    "scene_frames", "scene_layers", "scene_layers_gradient", "scene_paths",
     "threshold_surrogates",
 )  # fmt: skip
 """Those whose kernels are not made by functions."""
@@ -63,8 +63,9 @@ def test_pixels_of_many_scenes(tmp_path):
     compiles(pixel_codegen_scenes.compose_scenes(every().stages(), "layers", "voxels").module, tmp_path)
 
 
-def test_flow_of_many_scenes(tmp_path):
-    compiles(scene_windows.flow_kernel(1).module, tmp_path)
+@pytest.mark.parametrize("kernel", [scene_windows.flow_kernel, scene_windows.rendering_kernel])
+def test_pictures_of_many_scenes(kernel, tmp_path):
+    compiles(kernel(1).module, tmp_path)
 
 
 def test_pixels_of_many_models(tmp_path):
