@@ -219,7 +219,9 @@ def main() -> None:
     parser.add_argument("clip", type=Path)
     parser.add_argument("--threads", type=int, required=True)
     parser.add_argument("--path", type=Path)
+    parser.add_argument("--processor-time", action="store_true")
     options = parser.parse_args()
+    clock = time.process_time if options.processor_time else time.perf_counter
     # simulators may print what they like, the answers go where the parent reads
     answers = os.fdopen(os.dup(1), "w")
     os.dup2(2, 1)
@@ -232,9 +234,9 @@ def main() -> None:
         task, setting = json.loads(line)
         forget()
         before = memory()
-        begin = time.perf_counter()
+        begin = clock()
         events = runs[task][setting]()
-        took = time.perf_counter() - begin
+        took = clock() - begin
         print(json.dumps(dict(s=took, events=events, peak=memory(), before=before)), file=answers, flush=True)
 
 

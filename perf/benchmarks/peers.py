@@ -1,12 +1,13 @@
 r"""Compares dase with other simulators that the user has, side by side in one run, on the same clip.
 
     python -m perf.benchmarks.peers --v2e PATH --openeb PATH --esim \
-        [--clip FILE] [--size 346x260] [--json OUT]
+        [--clip FILE] [--size 346x260] [--json OUT] [--processor-time]
 
 PATH is a checkout; `--esim` needs the module esim_py. Each runs in a process of its own with what it needs
 installed; one that is not given is said to be so. Runs take turns, so that all see the same state of the
 machine. Every simulator gets 8-bit pictures in memory (esim_py: in files) and returns events in memory.
-`photograph moved` makes the pictures itself, by warping a photograph; its time includes that.
+`photograph moved` makes the pictures itself, by warping a photograph; its time includes that. On a machine
+that others use, too, `--processor-time` counts what the process works, on one thread.
 """
 
 from __future__ import annotations
@@ -44,11 +45,15 @@ class Worker:
         clip: Folder of the clip.
         threads: How many the simulator may use.
         path: Of its checkout.
+        processor_time: Whether the time that counts is that of the processor, not that on the clock.
     """
 
-    def __init__(self, peer: str, clip: Path, threads: int, path: Path | None):
+    def __init__(
+        self, peer: str, clip: Path, threads: int, path: Path | None, *, processor_time: bool = False
+    ):
         command = [sys.executable, "-m", "perf.benchmarks.peer_worker", peer, str(clip)]
         command += ["--threads", str(threads), *(["--path", str(path.resolve())] if path else [])]
+        command += ["--processor-time"] if processor_time else []
         limits = ("OMP", "MKL", "OPENBLAS", "NUMBA")
         several = {f"{name}_NUM_THREADS": str(threads) for name in limits}
         self._log = tempfile.TemporaryFile("w+")  # noqa: SIM115  # it lives as long as the process
@@ -100,13 +105,13 @@ def make_clip(folder: Path, options: argparse.Namespace) -> tuple[int, int, int]
 
 
 def measure(
-    clip: Path, threads: int, peers: dict[str, Path | None], rounds: int
+    clip: Path, threads: int, peers: dict[str, Path | None], rounds: int, *, processor_time: bool
 ) -> Iterator[tuple[str, str, list[dict[str, float]]]]:
     """Yield task, setting and runs of every simulator, without the first run of each, which compiles."""
     workers: dict[str, Worker] = {}
     for peer, path in peers.items():
         try:
-            workers[peer] = Worker(peer, clip, threads, path)
+            workers[peer] = Worker(peer, clip, threads, path, processor_time=processor_time)
         except RuntimeError as error:
             print(f"{peer}: does not start: {error}")
     for setting in ("clean", "as v2e", "noisy"):
@@ -149,6 +154,18 @@ def row(task: str, setting: str, threads: int, runs: list[dict[str, float]], wor
     }
 
 
+def processor_name() -> str:
+    """Return what the system calls the processor, with family and model where it says them."""
+    try:
+        lines = [line.split(":", 1) for line in Path("/proc/cpuinfo").read_text().splitlines() if ":" in line]
+    except OSError:
+        return platform.processor() or platform.machine()
+    said = {name.strip(): value.strip() for name, value in reversed(lines)}
+    if "model name" not in said:
+        return platform.processor() or platform.machine()
+    return f"{said['model name']} (family {said.get('cpu family')}, model {said.get('model')})"
+
+
 def shown(line: dict[str, Any]) -> str:
     """Return a line of the table in Markdown."""
     speed = f"{line['Mpx-samples/s']:.1f} ({line['slowest']:.1f} to {line['fastest']:.1f})"
@@ -173,6 +190,7 @@ def main() -> None:
     parser.add_argument("--samples", type=int, default=200, help="pictures")
     parser.add_argument("--rounds", type=int, default=3)
     parser.add_argument("--json", type=Path)
+    parser.add_argument("--processor-time", action="store_true", help="of one thread")
     options = parser.parse_args()
     peers: dict[str, Path | None] = {"dase": None, "numpy": None}
     for name in ("v2e", "openeb", "esim"):
@@ -187,15 +205,18 @@ def main() -> None:
     lines = []
     with tempfile.TemporaryDirectory() as folder:
         samples, height, width = make_clip(Path(folder), options)
-        about = f"{width}x{height}, {samples} pictures, {platform.processor() or platform.machine()}, "
+        about = f"{width}x{height}, {samples} pictures, {processor_name()}, "
         about += f"{os.cpu_count()} cores, commit {kernels.commit()}"
+        about += ", processor time" if options.processor_time else ""
         print(f"\n{about}; median of {options.rounds} rounds (slowest to fastest)\n")
         print(
             "| simulator | setting | threads | Mpx-samples/s | Mevents/s | events | peak MiB | of the run |"
         )
         print("|---|---|---|---|---|---|---|---|")
-        for threads in sorted({1, os.cpu_count() or 1}):
-            for task, setting, runs in measure(Path(folder), threads, peers, options.rounds):
+        for threads in sorted({1, 1 if options.processor_time else os.cpu_count() or 1}):
+            for task, setting, runs in measure(
+                Path(folder), threads, peers, options.rounds, processor_time=options.processor_time
+            ):
                 lines.append(row(task, setting, threads, runs, samples * height * width))
                 print(shown(lines[-1]), flush=True)
     if options.json:

@@ -262,17 +262,18 @@ def section(found: Row) -> str:
 
 
 def beside(folder: Path) -> list[str]:
-    """Return what `peers.py` and `memory.py` found, if their results are in the folder."""
+    """Return what `peers.py` found on each machine, and `memory.py`, if their results are in the folder."""
     parts = []
-    peers, memory = folder / "peers.json", folder / "memory.json"
-    if peers.exists():
+    memory = folder / "memory.json"
+    for place, peers in enumerate(sorted(folder.glob("peers*.json"))):
         found = json.loads(peers.read_text())
+        parts += [] if place else ["## Beside other simulators", PEERS]
         names = ("simulator", "setting", "threads", "Mpx-samples/s", "Mevents/s", "events", "peak MiB")
         lines = [f"| {' | '.join(names)} |", "|---" * len(names) + "|"]
         for row in found["rows"]:
             cells = [f"{row[n]:.3g}" if isinstance(row[n], float) else str(row[n]) for n in names]
             lines.append(f"| {' | '.join(cells)} |")
-        parts += ["## Beside other simulators", PEERS, found["about"] + ":", "\n".join(lines)]
+        parts += [found["about"] + ":", "\n".join(lines)]
     if memory.exists():
         found = json.loads(memory.read_text())
         last = found["rows"][-1]
