@@ -71,6 +71,7 @@ def compose_scenes(
     model = PixelModel(stages, source, "keys")
     kind, of_row = SCENES[source]
     scope = pixel_scope(model)
+    # a light of layers or of frames, never of logarithms: the windows' ends are handed over as intensities
     if lanes:
         scope |= lane_scope(lanes, source) | {"store": lane_functions(lanes).store}
     scope |= {"Scenes": kind, "scene_of": of_row, "Sink": WindowGrids, "deposit": DEPOSITS[deposit]}
@@ -97,6 +98,7 @@ def _head(model: PixelModel) -> list[str]:
 
 def _of_row(model: PixelModel) -> tuple[Statement, ...]:
     """Return what a row has of its own, under the names that statements of one scene ask for."""
+    # views and numbers, no copies: the statements of one scene then serve as they are
     return lines(
         "seed = seeds[row]",
         "pixels = places[row]",
@@ -115,6 +117,7 @@ def _lit(intensity: str) -> str:
 def _print_pixels(program: Program) -> str:
     """Return the text of the kernel for CUDA: one pixel of a scene per thread."""
     model, layout = program.model, OnePixel()
+    # a box holds what a layer covers during one window: which layers are near is asked anew for each
     if model.source == "layers":
         look = _lit("layer_intensity(source, ground, near, k, float(x), float(y))")
         window = ("source.box = scenes.box[row, part]", "near = layers_near(source, float(x), float(y))")
@@ -122,6 +125,7 @@ def _print_pixels(program: Program) -> str:
         look, window = _lit("stored(source.values, k, i)"), ()
     samples = (
         *step_quantities(model),
+        # a copy: effects change the intensity, and `seen` is what the window hands over
         *lines(f"seen = {look}", "intensity = seen + 0.0"),
         *layout.lay_out_all(program.light),
         Line(VOLTAGE),
@@ -135,6 +139,7 @@ def _print_pixels(program: Program) -> str:
         *_of_row(model),
         *place_pixel(program),
         *resolve_guards(program.begin, ask=False),
+        # a window without samples hands 0 over; Warp wants the name to have a value before the loop
         Line("seen = float(0.0)"),
         loop_over_windows(lines(*window), samples, lines("frames[part, row, i] = seen")),
         *layout.lay_out(keep_states(model)),
@@ -152,6 +157,7 @@ def _print_blocks(program: Program, size: int) -> str:
         ints=("pixel",),
     )
     layout = Lanes(size, kinds)
+    # as in `_print_pixels`, for all lanes at once: a layer is near the block where it is near any of them
     if model.source == "layers":
         look = "light_of(source, ground, k, start, x_lanes, y_lanes, near)"
         window = ("source.box = scenes.box[row, part]", "near = layers_of(source, x_lanes, y_lanes)")
@@ -159,6 +165,7 @@ def _print_blocks(program: Program, size: int) -> str:
         look, window = "load(source.values, k, start)", ()
     samples = (
         *step_quantities(model),
+        # one factor for the row: the same expression serves numbers and vectors
         *lines(f"seen_lanes = {_lit(look)}", "intensity_lanes = seen_lanes + Floats()"),
         *layout.lay_out_all(program.light),
         Line("voltage_lanes = logarithms(intensity_lanes, log_eps)"),

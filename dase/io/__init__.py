@@ -88,9 +88,6 @@ FORMATS: tuple[Format, ...] = (
 )
 """All formats. Content is asked in this order; of several with one suffix the first that can is taken."""
 
-HEAD = 1 << 16  # [bytes] of a file that formats are told by
-PART = 1 << 20  # events handed to a writer at once
-
 
 def find_format(path: str | PathLike[str]) -> Format:
     """Return the format of an existing file or folder: by its content, else by its suffix.
@@ -103,7 +100,7 @@ def find_format(path: str | PathLike[str]) -> Format:
         head = b""
         if not path.is_dir():
             with path.open("rb") as file:
-                head = file.read(HEAD)
+                head = file.read(1 << 16)  # enough for every format to be told by
         pointer = stands_for(head)
         if pointer:
             raise InputError(f"{path}: {pointer}")
@@ -275,8 +272,10 @@ def write(path: str | PathLike[str], sequence: Sequence | Events, *, format: str
             for index, (time, grey) in enumerate(zip(sequence.frame_times, sequence.frames, strict=True)):
                 span = 0.0 if exposure is None else float(exposure[index])
                 writer.frame(float(time), grey, None if flow is None else flow[index], exposure=span)
-        for i in range(0, max(len(events), 1), PART):
-            writer.events(events.select(slice(i, i + PART)))
+        # in parts, as a writer makes copies; once also where there are none, for the size of the sensor
+        part = 1 << 20
+        for i in range(0, max(len(events), 1), part):
+            writer.events(events.select(slice(i, i + part)))
         if sequence.thresholds is not None and "thresholds" in keeps:
             writer.thresholds(sequence.thresholds)
         if sequence.configuration is not None and "configuration" in keeps:

@@ -16,9 +16,6 @@ from numpy.typing import NDArray
 from dase.errors import InputError
 from dase.io.source import Source
 
-ORDERS = ("txyp", "xypt", "xytp", *("".join(order) for order in permutations("txyp")))
-"""Orders of columns; those that tools write first, so that of two that fit the likelier one is taken."""
-
 LETTERS = {
     "t": "t", "ts": "t", "time": "t", "times": "t", "timestamp": "t", "timestamps": "t",
     "x": "x", "xs": "x", "col": "x", "column": "x",
@@ -58,7 +55,9 @@ def recognised_order(table: NDArray[Any]) -> str | None:
     ]
     different = [len(np.unique(rows[:, k])) for k in at]
     fitting = []
-    for order in dict.fromkeys(ORDERS):
+    # those that tools write come first, so that of two that fit the likelier one is taken
+    orders = ("txyp", "xypt", "xytp", *("".join(order) for order in permutations("txyp")))
+    for order in dict.fromkeys(orders):
         t, x, y, p = (order.index(letter) for letter in "txyp")
         if binary[p] and sorted_[t] and places[x] and places[y] and x < y:
             fitting.append((-different[t], order))

@@ -133,7 +133,7 @@ def deflate_bytes(data: NDArray[np.uint8]) -> bytes:
 
 
 def pack_chunk(values: NDArray[Any]) -> bytes:
-    """Return one whole chunk of a dataset, filtered as `COMPRESSION` says: shuffled, then deflated."""
+    """Return a whole chunk, `values` having its shape, as `COMPRESSION` says: shuffled, then deflated."""
     # the first bytes of all numbers, then the second ones, and so on
     planes = values.reshape(-1).view(np.uint8).reshape(-1, values.itemsize).T
     return deflate_bytes(np.ascontiguousarray(planes).reshape(-1))

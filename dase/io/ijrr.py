@@ -28,7 +28,6 @@ from dase.io.sequence import Writer, writing_file
 from dase.io.source import Picture, Piece, Size, Source, refuse_bomb
 
 EVENTS, IMAGES = "events.txt", "images.txt"
-OTHERS = (IMAGES, "calib.txt", "groundtruth.txt", "imu.txt", "readme.txt", "timestamps.txt")
 SUFFIXES = (".txt", ".csv")
 PART = 1 << 16  # events turned into text at once
 
@@ -94,7 +93,8 @@ def _events_member(archive: zipfile.ZipFile) -> str:
     ]
     # by hand: an archive may have 60 000 members, and a path of each would take a second
     named = [name for name in texts if name.rpartition("/")[2] == EVENTS]
-    others = [name for name in texts if name.rpartition("/")[2].lower() not in OTHERS]
+    known = (IMAGES, "calib.txt", "groundtruth.txt", "imu.txt", "readme.txt", "timestamps.txt")
+    others = [name for name in texts if name.rpartition("/")[2].lower() not in known]
     found = named or others
     if len(found) != 1:
         raise InputError(f"a zip of events must hold one text of them, got {len(found)}")

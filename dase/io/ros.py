@@ -20,7 +20,6 @@ from dase.io.format import camera_format
 from dase.io.source import Picture, Piece, Size, Source, missing_extra
 
 ARRAYS = ("dvs_msgs/msg/EventArray", "prophesee_event_msgs/msg/EventArray")
-PACKETS = ("event_camera_msgs/msg/EventPacket", "event_array_msgs/msg/EventArray")
 IMAGES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
 ROS1 = b"#ROSBAG V"
 
@@ -92,7 +91,9 @@ def _find_connections(source: Source, reader: Any, kinds: tuple[str, ...], besid
 
 
 def _event_connections(source: Source, reader: Any) -> list[Any]:
-    found = _find_connections(source, reader, ARRAYS + PACKETS)
+    # packed by the drivers of event_camera_msgs, under their name and under that of before
+    packets = ("event_camera_msgs/msg/EventPacket", "event_array_msgs/msg/EventArray")
+    found = _find_connections(source, reader, ARRAYS + packets)
     if not found:
         known = sorted(f"{c.topic} ({c.msgtype})" for c in reader.connections)
         raise InputError(f"has no topic of events, only {', '.join(known[:8]) or 'none'}")

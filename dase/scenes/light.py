@@ -11,8 +11,6 @@ from dase.errors import InputError
 
 SRGB_GAMMA = 2.2
 """Of pictures and videos that do not say: their values are no light, but about its root of this order."""
-BRIGHTEST = 10.0
-"""Light that real numbers may hold, where 1 is white: more are values 0 to 255 that were not divided."""
 
 
 def check_gamma(gamma: float) -> float:
@@ -22,13 +20,13 @@ def check_gamma(gamma: float) -> float:
     return float(gamma)
 
 
-def check_light(values: NDArray[Any], what: str, *, most: float = BRIGHTEST) -> None:
+def check_light(values: NDArray[Any], what: str, *, most: float = 10.0) -> None:
     """Raise InputError where values cannot be light.
 
     Args:
         values: Of any shape. Whole numbers without a sign are light by the range of their type.
         what: What messages call them.
-        most: Largest real number, where 1 is white.
+        most: Largest real number, where 1 is white; more are values 0 to 255 that were not divided.
     """
     if values.dtype.kind == "u":
         return
