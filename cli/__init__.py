@@ -25,6 +25,7 @@ COMMANDS = (
     "info",
     "remove",
     "show",
+    "stimulus",
     "synth",
     "train",
 )

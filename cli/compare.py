@@ -16,6 +16,7 @@ from dase.cli.options import (
     open_recorded,
     part_options,
     scene_option,
+    stimulus_option,
 )
 
 
@@ -31,6 +32,7 @@ from dase.cli.options import (
     help="Report, one HTML file; its numbers go beside it as .json.",
 )
 @scene_option
+@stimulus_option
 @fps_option
 @part_options
 @effects_option
@@ -44,6 +46,7 @@ def compare_command(
     file: Path | None,
     output: Path | None,
     scene: str,
+    stimulus: Path | None,
     fps: float | None,
     compared: dict[str, Any],
     effects: tuple[Path, ...],
@@ -63,7 +66,7 @@ def compare_command(
     from dase.simulation.user_effects import known_effects
 
     model = load_sensor(sensor, known_effects(effects))
-    measured = open_recorded(recording, scene, file, fps, compared)
+    measured = open_recorded(recording, scene, file, fps, compared, stimulus)
     with progress_bar(quiet) as tell:
         found = compare(measured, model, pixels=pixels, seed=seed, device=device, progress=tell)
     click.echo(

@@ -23,6 +23,7 @@ from dase.cli.options import (
     open_recorded,
     part_options,
     scene_option,
+    stimulus_option,
 )
 
 if TYPE_CHECKING:
@@ -52,6 +53,7 @@ def print_explanation(ctx: click.Context, parameter: click.Parameter, value: str
 @click.argument("recording", type=click.Path(path_type=Path))
 @click.argument("file", required=False, type=click.Path(path_type=Path))
 @scene_option
+@stimulus_option
 @click.option("--auto", is_flag=True, help="Add what is found and go on until nothing is missing.")
 @click.option("--free", help="Parameters that may be refitted, with commas between.  [default: all]")
 @click.option(
@@ -94,6 +96,7 @@ def diagnose_command(
     recording: Path,
     file: Path | None,
     scene: str,
+    stimulus: Path | None,
     fps: float | None,
     compared: dict[str, Any],
     auto: bool,
@@ -122,7 +125,7 @@ def diagnose_command(
     library = known_effects(effects)
     text = sensor_edit.read_sensor_text(sensor, library)
     model = text.sensor()
-    measured = open_recorded(recording, scene, file, fps, compared)
+    measured = open_recorded(recording, scene, file, fps, compared, stimulus)
     names = free.split(",") if free else None
     # without --auto, the first effect that is missing
     look = diagnose if auto else partial(diagnose, most=1)

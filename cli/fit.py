@@ -15,6 +15,7 @@ from dase.cli.options import (
     open_recorded,
     part_options,
     scene_option,
+    stimulus_option,
 )
 
 
@@ -32,6 +33,7 @@ from dase.cli.options import (
 )
 @click.option("--free", help="Effects or effect.parameter to fit, with commas between.  [default: all]")
 @scene_option
+@stimulus_option
 @fps_option
 @part_options
 @effects_option
@@ -47,6 +49,7 @@ def fit_command(
     output: Path,
     free: str | None,
     scene: str,
+    stimulus: Path | None,
     fps: float | None,
     compared: dict[str, Any],
     effects: tuple[Path, ...],
@@ -73,7 +76,7 @@ def fit_command(
 
     text = sensor_edit.read_sensor_text(sensor, known_effects(effects))
     model = text.sensor()
-    measured = open_recorded(recording, scene, file, fps, compared)
+    measured = open_recorded(recording, scene, file, fps, compared, stimulus)
     with progress_bar(quiet) as tell:
         names = free.split(",") if free else None
         found = fit(measured, model, free=names, pixels=pixels, seed=seed, device=device, progress=tell)

@@ -90,6 +90,14 @@ scene_option = click.option(
 )
 """`--scene NAME` of commands that compare with a recording, for `open_recorded`."""
 
+stimulus_option = click.option(
+    "--stimulus",
+    type=click.Path(path_type=Path),
+    metavar="JSON",
+    help="What the camera saw: the video of `dase stimulus`, of which this JSON tells; found in the events.",
+)
+"""`--stimulus JSON` of commands that compare with a recording, for `open_recorded`."""
+
 fps_option = click.option(
     "--fps", type=float, help="Frames per second of the clip of --scene.  [default: what the file says]"
 )
@@ -196,8 +204,19 @@ def open_recorded(
     file: Path | None = None,
     fps: float | None = None,
     part: dict[str, Any] | None = None,
+    stimulus: Path | None = None,
 ) -> Measurement:
     """Open a part of a recording and its scene, with the frame rate of its clip where the user gives it."""
+    if stimulus is not None:
+        refuse_beside("--stimulus", "scene", "file", "fps")
+        from dase.errors import InputError
+        from dase.fitting.measurement import open_measurement
+
+        if stimulus.suffix.lower() != ".json":
+            raise InputError(
+                f"--stimulus takes the JSON that lies beside the video, got {stimulus}", argument="stimulus"
+            )
+        return open_measurement(recording, stimulus).part(**(part or {}))
     return _open_whole(recording, scene, file, fps).part(**(part or {}))
 
 

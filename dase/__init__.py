@@ -33,6 +33,7 @@ if TYPE_CHECKING:
     from dase.scenes.layers import Motion as Motion
     from dase.scenes.layers import Wave as Wave
     from dase.scenes.scene import Scene as Scene
+    from dase.scenes.screen_scene import open_stimulus as open_stimulus
     from dase.scenes.static import StaticScene as StaticScene
     from dase.scenes.video import VideoScene as VideoScene
     from dase.scenes.video import open_video as open_video
@@ -71,6 +72,7 @@ _HOMES = {
     "dase.scenes.layers": ("Layer", "LayerScene", "Lighting", "Motion", "Wave"),
     "dase.recordings.recording": ("Recording", "open_recording"),
     "dase.scenes.scene": ("Scene",),
+    "dase.scenes.screen_scene": ("open_stimulus",),
     "dase.signatures.find": ("find_signatures",),
     "dase.simulation.sensor": ("Sensor",),
     "dase.simulation.simulate": ("count", "simulate", "stream"),

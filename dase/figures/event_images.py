@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -15,9 +14,8 @@ from dase.errors import InputError
 from dase.events import Events
 from dase.figures import contact_sheet
 from dase.figures.style import Colour
-from dase.io.ffmpeg import quiet_ffmpeg
-from dase.io.image_files import quiet_opencv
 from dase.io.sequence import Sequence, replacing
+from dase.io.video_writer import VideoCodec, open_video_writer
 from dase.recordings.statistics import Statistics, sequence_statistics
 
 if TYPE_CHECKING:
@@ -146,19 +144,6 @@ def moment_times(sequence: Sequence, count: int) -> list[float]:
     return [float(time) for time in times]
 
 
-@dataclass(frozen=True)
-class VideoCodec:
-    """How a video is packed.
-
-    Args:
-        letters: Four, by which OpenCV knows it.
-        plays_in_browsers: Whether browsers play it.
-    """
-
-    letters: str
-    plays_in_browsers: bool
-
-
 CODECS = (VideoCodec("avc1", True), VideoCodec("vp09", True), VideoCodec("mp4v", False))
 """H.264, VP9 and MPEG-4, of which builds of OpenCV for free software often lack the first."""
 
@@ -186,7 +171,7 @@ def write_video(sequence: Sequence, path: Path, *, window: float | None = None) 
     scale = max(1, math.ceil(480 / sequence.events.width))
     size = tuple(n * scale // 2 * 2 for n in (sequence.events.width, sequence.events.height))
     with replacing(path) as temporary:
-        out, codec = _open_video_writer(temporary, rate, size)
+        out, codec = open_video_writer(temporary, rate, size, CODECS)
         if out is None:
             raise InputError(f"{path}: OpenCV cannot write this video")
         try:
@@ -195,18 +180,6 @@ def write_video(sequence: Sequence, path: Path, *, window: float | None = None) 
         finally:
             out.release()
     return codec
-
-
-def _open_video_writer(path: Path, rate: float, size: tuple[int, ...]) -> tuple[Any, VideoCodec]:
-    """Return a writer with the first codec that opens, None where none does, and the codec."""
-    import cv2
-
-    for codec in CODECS:
-        with quiet_ffmpeg(), quiet_opencv():  # what is missing is tried, not an error
-            out = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*codec.letters), rate, size)
-        if out.isOpened():
-            return out, codec
-    return None, CODECS[-1]
 
 
 def _video_times(

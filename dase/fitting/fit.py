@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -15,11 +16,13 @@ from dase.fitting.measurement import Measured, SceneChoice, as_measurement
 from dase.fitting.model import FittedModel, fit_present_model, model_of, refit_model
 from dase.fitting.parameter_space import SearchAxis
 from dase.fitting.plain_numbers import plain_numbers
+from dase.fitting.screen_limits import limits_of_screen
 from dase.fitting.search_ends import is_where_it_began, parameters_at_bounds
 from dase.probes.distance import Judgement
 from dase.probes.random_streams import Draw, SimulationStream
 from dase.probes.stimulus import Trust
 from dase.results import Estimate, Fit, Progress, is_worse
+from dase.scenes.screen_scene import ScreenScene
 from dase.simulation.sensor import Sensor
 from dase.simulation.sensor_file import as_sensor
 
@@ -43,6 +46,9 @@ class FitSettings:
 
 FIT = FitSettings()
 
+STANDARD_ERRORS_OF_90 = 1.6448536269514722
+"""Half of an interval of 90 % of a normal distribution, in standard errors."""
+
 
 def fit(
     measured: Measured,
@@ -61,8 +67,9 @@ def fit(
     Args:
         measured: A recording or its path, a `Measurement`, or events; see `as_measurement`.
         sensor: Its effects are fitted, nothing is added: a sensor, a preset's name, or a sensor file's path.
-        scene: What the camera saw, on the clock of the events: a scene, a clip's path, or `static` for light
-            that does not change. None for the frames of the recording; events alone need one.
+        scene: What the camera saw, on the clock of the events: a scene, a clip's path, `static` for light
+            that does not change, or the JSON of a stimulus that was shown. None for the frames of the
+            recording; events alone need one.
         free: Effects or `effect.parameter` that are fitted; None for all.
         trust: Where and when the scene is to be trusted; None for everywhere, and for what a
             `CameraScene` trusts of itself.
@@ -79,9 +86,10 @@ def fit(
     start = as_sensor(sensor)
     model_of(start, free)  # refuses names that are not there before anything takes time
     measurement = as_measurement(measured, scene, trust)
-    start = start.bound_to(measurement.scene)
+    scene = measurement.scene
+    start = start.bound_to(scene)
     evidence = split_measurement(
-        measurement.events, measurement.scene, log_eps=start.log_eps, trust=measurement.trust,
+        measurement.events, scene, log_eps=start.log_eps, trust=measurement.trust,
         span=measurement.span, pixels=pixels, seed=seed, device=device,
     )  # fmt: skip
     given = model_of(start, free)
@@ -99,6 +107,8 @@ def fit(
     plain = plain_numbers(report)
     apart = notes_on_disagreement(model, good, values)
     values = widen_intervals(model, good, values)
+    if isinstance(scene, ScreenScene):
+        values = widen_by_gamma(values, scene)
     notes = [
         *_notes_on_held_out_error(judgement, before),
         *evidence.notes,
@@ -107,6 +117,7 @@ def fit(
         *parameters_at_bounds(model, values),
         *notes_on_implausible_values(model),
         *_notes_on_minimum(judgement, len(ends), len(good)),
+        *(limits_of_screen(model.sensor, scene.stimulus) if isinstance(scene, ScreenScene) else []),
     ]
     found = Fit(
         sensor=model.sensor,
@@ -224,6 +235,20 @@ def widen_intervals(
         found = [float(axis.to_value(m.place[n])) for m in ends]
         low, high = min(estimate.low, *found), max(estimate.high, *found)
         out[axis.name] = replace(estimate, low=low, high=high)
+    return out
+
+
+def widen_by_gamma(values: dict[str, Estimate], scene: ScreenScene) -> dict[str, Estimate]:
+    """Return estimates whose thresholds are as uncertain as the gamma of the screen makes them.
+
+    All changes of log light go in proportion to the gamma, and so do thresholds.
+    """
+    out, share = dict(values), STANDARD_ERRORS_OF_90 * scene.gamma_error / scene.gamma
+    for name in ("threshold.on", "threshold.off"):
+        if name in out and share > 0:
+            e = out[name]
+            low, high = (math.hypot(end - e.value, share * e.value) for end in (e.low, e.high))
+            out[name] = replace(e, low=e.value - low, high=e.value + high)
     return out
 
 

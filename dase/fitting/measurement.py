@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from dase import io
 from dase.errors import InputError
 from dase.events import Events
+from dase.fitting.screen_alignment import screen_scene
 from dase.formatting import fit_to_screen
 from dase.io.arrays import check_archive
 from dase.io.sequence import Sequence
@@ -29,6 +30,8 @@ from dase.scenes.frame_alignment import PARTS, align
 from dase.scenes.frame_denoising import denoise_resting_pixels
 from dase.scenes.frame_motion import estimate_stretches, is_stretched
 from dase.scenes.scene import Scene
+from dase.scenes.screen_scene import ScreenScene
+from dase.scenes.screen_stimulus import read_stimulus
 from dase.scenes.video import VideoScene, are_dense, join_frames, open_video
 
 Found = TypeVar("Found", Comparison, Diagnosis, Fit)
@@ -93,7 +96,8 @@ Measured = Measurement | Recording | Events | str | PathLike[str]
 """What `compare`, `fit` and `diagnose` take: see `as_measurement`."""
 
 SceneChoice = Scene | str | PathLike[str]
-"""A scene, `frames` for the recording's own, `static` for light that does not change, or a clip's path."""
+"""A scene, `frames` for the recording's own, `static` for light that does not change, or the path of a clip
+or of the JSON of a stimulus that was shown."""
 
 
 def as_measurement(
@@ -114,15 +118,16 @@ def as_measurement(
         found = measured
         if scene is not None:
             said = list(measured.notes)
-            chosen = _chosen_scene(scene, measured.events, said)
-            found = replace(measured, scene=chosen, trust=None, notes=tuple(said))
+            seen = _chosen_scene(scene, measured.events, said)
+            found = replace(measured, scene=seen, trust=_trust_of_scene(seen), notes=tuple(said))
     elif isinstance(measured, Recording):
         found = measurement_of(measured, "frames" if scene is None else scene)
     elif isinstance(measured, Events):
         if scene is None or (isinstance(scene, str) and scene == "frames"):
             raise InputError("events do not say what the camera saw: give the scene", argument="scene")
         said = []
-        found = Measurement(measured, _chosen_scene(scene, measured, said), notes=tuple(said))
+        seen = _chosen_scene(scene, measured, said)
+        found = Measurement(measured, seen, _trust_of_scene(seen), tuple(said))
     elif isinstance(measured, str | PathLike):
         found = open_measurement(Path(measured), "frames" if scene is None else scene)
     else:
@@ -158,7 +163,8 @@ def measurement_of(
         recorded: Events, and where it has them frames. Pixels outside the mask of a `Recording` are not
             trusted.
         scene: What the camera saw: `frames` for the recording's own, `static` for light that does not change,
-            the path of a clip, or a scene on the clock of the events.
+            the path of a clip, a scene on the clock of the events, or the JSON of a stimulus, which is found
+            in the events.
         notes: What reading it said, beside what a `Recording` reports.
         name: What messages call it.
 
@@ -173,7 +179,7 @@ def measurement_of(
         raise InputError(f"{name} has no events, so there is nothing to compare")
     own = isinstance(scene, str) and scene == "frames"
     seen = scene_of_frames(recorded, name, said) if own else _chosen_scene(scene, recorded.events, said)
-    trust: Trust | None = seen.is_trusted if isinstance(seen, CameraScene) else None
+    trust = _trust_of_scene(seen)
     if isinstance(recorded, Recording) and not recorded.mask.all():
         trust = _trust_within(recorded.mask, trust)
     return Measurement(recorded.events, seen, trust, tuple(said))
@@ -188,7 +194,17 @@ def _chosen_scene(scene: SceneChoice, events: Events, notes: list[str]) -> Scene
             "dase.VideoScene(frames, times) makes one of frames",
             argument="scene",
         )
-    return static_scene(events) if scene == "static" else open_clip(Path(scene), notes)
+    if scene == "static":
+        return static_scene(events)
+    path = Path(scene)
+    if path.suffix.lower() == ".json" and not path.is_dir():
+        return screen_scene(events, read_stimulus(path), notes)
+    return open_clip(path, notes)
+
+
+def _trust_of_scene(scene: Scene) -> Trust | None:
+    """Return what a scene says of where and when it can be trusted, None for everywhere."""
+    return scene.is_trusted if isinstance(scene, CameraScene | ScreenScene) else None
 
 
 def _trust_within(mask: NDArray[np.bool_], trust: Trust | None) -> Trust:
