@@ -144,7 +144,7 @@ def test_full_disk(tmp_path):
     assert [p.name for p in (tmp_path / "out").iterdir()] == ["synth.toml"]
 
 
-@pytest.mark.parametrize("jobs", [1, 2])
+@pytest.mark.parametrize("jobs", [pytest.param(1, marks=pytest.mark.slow), 2])
 def test_interrupt_then_resume(jobs, tmp_path):
     out, whole = tmp_path / "out", tmp_path / "whole"
     options = ("--size", "64x48", "--duration", "0.3", "--sequences", "6", "--jobs", jobs, "--regime", "slow")

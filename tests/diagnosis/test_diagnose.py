@@ -109,6 +109,7 @@ def test_two_hidden_effects_are_both_found(scene, device):
     assert found.errors[0] > 2 > found.errors[2]
 
 
+@pytest.mark.slow
 def test_an_unknown_effect_is_unexplained_until_it_is_given(scene, device):
     events = hidden(scene, device, Popping(rate=25.0))
     found = diagnose(events, scene=scene, effects=LIBRARY, pixels=500, device=device, most=1)

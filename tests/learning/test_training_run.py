@@ -39,6 +39,7 @@ def test_a_wrong_start_is_left_behind(scenes, start):
     assert set(after) >= {"kl_active", "kl_idle", "mu_spread", "sigma_spread"}
 
 
+@pytest.mark.slow
 def test_critics_push_towards_the_target(scenes):
     training = a_run(scenes, **WGAN, warmup=30, batch=6, mu=0.4, sigma=0.1)
     for _ in range(30):
