@@ -41,7 +41,7 @@ floor below its logarithm, so black pixels send more events.
 
 To run it: check out prophesee-ai/openeb (5.1 here; Numba is all it needs) and SensorsINI/v2e (cac6384 here),
 give their folders as `--openeb` and `--v2e`, and `--processor-time` on a machine that others use, too. On the
-AMD EPYC, at 0a91c46, dase and NumPy still got real numbers in place of bytes, made outside of what is timed."""
+AMD EPYC, at 0a91c46, dase and NumPy still got real numbers for bytes, made outside of what is timed."""
 
 
 def powers(most: int) -> list[int]:
