@@ -21,6 +21,7 @@ COMMANDS = (
     "diagnose",
     "distinguish",
     "effects",
+    "evaluate",
     "fit",
     "info",
     "remove",

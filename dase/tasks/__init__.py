@@ -9,6 +9,8 @@ It needs PyTorch (extra `learn`), which `import dase` alone does not load.
 from __future__ import annotations
 
 from dase.tasks.checkpoints import load_network as load_network
+from dase.tasks.evaluation import Evaluation as Evaluation
+from dase.tasks.evaluation import evaluate as evaluate
 from dase.tasks.event_networks import E2VidNet as E2VidNet
 from dase.tasks.event_networks import EvFlowNet as EvFlowNet
 from dase.tasks.event_networks import FireNet as FireNet

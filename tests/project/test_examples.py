@@ -51,7 +51,27 @@ def test_an_effect_of_ones_own(run):
     assert "supply_drop  drop 0.6" in out
 
 
+@pytest.mark.slow
+def test_a_network_for_reconstruction(run):
+    pytest.importorskip("torch")
+    found, out = run("train_reconstruction.py")
+    assert found["fitted"].sensor["threshold"].on == pytest.approx(0.3, rel=0.1)
+    assert "recording.h5: reconstruction, 74 judged" in out
+    assert found["found"].metrics["mse_affine"] < found["found"].metrics["mse"]
+    assert cv2.imread("reconstruction/recording.h5.png").shape == (6 * 48, 2 * 64, 3)
+    assert Path("reconstruction/recording.h5.mp4").stat().st_size > 0
+
+
+@pytest.mark.slow
+def test_a_network_for_flow(run):
+    pytest.importorskip("torch")
+    found, out = run("train_flow.py")
+    assert "recording.h5: flow" in out
+    assert found["found"].metrics["aee_zero"] == pytest.approx(2.0, rel=1e-3)  # 60 px/s in 1/30 s
+    assert found["found"].metrics["aee"] < 4
+
+
 def test_all_of_them_are_named():
     readme = (EXAMPLES.parent / "README.md").read_text("utf-8")
     assert all(f"examples/{path.name}" in readme for path in EXAMPLES.glob("*.py"))
-    assert len(list(EXAMPLES.glob("*.py"))) == 3
+    assert len(list(EXAMPLES.glob("*.py"))) == 5
