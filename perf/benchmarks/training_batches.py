@@ -1,0 +1,111 @@
+"""How fast `dase.torch.Stream` makes batches, kernel by kernel, and whether its memory stays.
+
+    python -m perf.benchmarks.training_batches --device cuda --batch 64 --steps 24
+    python -m perf.benchmarks.training_batches --device cpu --batch 4 --steps 6 --regimes shake
+    python -m perf.benchmarks.training_batches --device cuda --memory 10000
+
+A line of JSON each. A GPU is measured by the clock on the wall, several batches in a row; a CPU, which others
+may share, by the time that this process worked, on one thread.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import time
+from collections import Counter
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import torch
+
+import dase
+from dase.kernels import launch
+from dase.torch.stream import BatchMaker
+
+
+def measure_speed(stream: dase.torch.Stream, repeats: int) -> dict[str, Any]:
+    """Return windows and pixel samples per second, and what the kernels cost [ms per batch]."""
+    on_gpu = stream.device.type == "cuda"
+    clock: Callable[[], float] = time.perf_counter if on_gpu else time.process_time
+    wait: Callable[[], None] = torch.cuda.synchronize if on_gpu else lambda: None
+    maker = BatchMaker(stream)
+    for number in range(3):
+        maker.make(number)
+    wait()
+    begin = clock()
+    for number in range(3, 3 + repeats):
+        batch = maker.make(number)
+    wait()
+    each = (clock() - begin) / repeats
+    mass = float(batch.inputs.abs().sum() / batch.frames.numel())
+    spent: Counter[str] = Counter()
+    plain = launch.run_kernel
+
+    def timed(kernel: Any, *arguments: Any, **options: Any) -> None:
+        wait()
+        begin = clock()
+        plain(kernel, *arguments, **options)
+        wait()
+        spent[kernel.key] += clock() - begin
+
+    launch.run_kernel = timed
+    try:
+        for number in range(3 + repeats, 6 + repeats):
+            maker.make(number)
+    finally:
+        launch.run_kernel = plain
+        maker.close()
+    windows = stream.steps * stream.plan.batch
+    samples = windows * stream.samples * stream.plan.size[0] * stream.plan.size[1]
+    return {
+        "batch_ms": round(1e3 * each, 2),
+        "windows_per_s": round(windows / each),
+        "Gsample_per_s": round(1e-9 * samples / each, 4),
+        "absolute_sum_per_pixel_and_window": round(mass, 3),
+        "kernels_ms": {name: round(1e3 * value / 3, 2) for name, value in spent.items()},
+    }
+
+
+def watch_memory(stream: dase.torch.Stream, batches: int) -> dict[str, Any]:
+    """Return the memory of the process [MiB], and of the GPU, after tenths of so many batches."""
+    found = []
+    for number, _ in enumerate(stream):
+        if number % max(batches // 10, 1) == 0:
+            resident = int(Path("/proc/self/statm").read_text().split()[1]) * 4096
+            row = {"batches": number, "resident": round(resident / 2**20, 1)}
+            if stream.device.type == "cuda":
+                free, total = torch.cuda.mem_get_info()
+                row["gpu"] = round((total - free) / 2**20, 1)
+            found.append(row)
+        if number >= batches:
+            return {"memory": found}
+    raise AssertionError("a stream has no end")
+
+
+def main() -> None:
+    ask = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    ask.add_argument("--device", default="cpu")
+    ask.add_argument("--sensor", default="davis240c")
+    ask.add_argument("--images", default="builtin")
+    ask.add_argument("--batch", type=int, default=12)
+    ask.add_argument("--steps", type=int, default=24)
+    ask.add_argument("--side", type=int, default=128)
+    ask.add_argument("--regimes", default="shake,mixed")
+    ask.add_argument("--repeats", type=int, default=10)
+    ask.add_argument("--memory", type=int, default=0, help="batches to watch the memory over, instead")
+    args = ask.parse_args()
+    if args.device == "cpu":
+        launch.set_threads(1)
+        torch.set_num_threads(1)
+    stream = dase.torch.Stream(
+        args.images, args.sensor, batch=args.batch, steps=args.steps, size=(args.side, args.side),
+        regimes=tuple(args.regimes.split(",")), device=args.device, renew=500 if args.memory else 0,
+    )  # fmt: skip
+    found = watch_memory(stream, args.memory) if args.memory else measure_speed(stream, args.repeats)
+    print(json.dumps(vars(args) | found))
+
+
+if __name__ == "__main__":
+    main()
