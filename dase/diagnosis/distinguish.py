@@ -311,7 +311,11 @@ def _advice_sentence(best: Answer | None, longest: float, pixels: int, a: str, b
             f"{a} and {b} are indistinguishable in any of these recordings up to {longest:g} s "
             f"({pixels} pixels): none of them is worth making."
         )
-    return f"Record {best.stimulus} for {best.seconds:g} s, {best.how}: {a} and {b} differ in {best.differs}."
+    command = next(s.command for s in STANDARD_STIMULI if s.name == best.stimulus)
+    return (
+        f"Record {best.stimulus} for {best.seconds:g} s, {best.how}: {a} and {b} differ in {best.differs}. "
+        f"What to show, or how: {command}"
+    )
 
 
 def table_rows(found: Distinction, a: str, b: str) -> Iterator[tuple[str, ...]]:

@@ -22,12 +22,14 @@ class StandardStimulus:
         how: To make it, in words.
         step: Between samples [s].
         light: Random numbers, pixels N and times (T,) to linear intensity, shape (N, T).
+        command: Writes what shows it on a screen or a print, or what says how to make it.
     """
 
     name: str
     how: str
     step: float
     light: Light
+    command: str
 
 
 def _static_light(low: float, high: float) -> Light:
@@ -63,22 +65,39 @@ def _flicker_light(frequency: float, depth: float) -> Light:
 
 STANDARD_STIMULI = (
     StandardStimulus(
-        "static dark", "a scene at rest in little light, 0.2 to 2 % of white", 1e-3, _static_light(2e-3, 2e-2)
+        "static dark",
+        "a scene at rest in little light, 0.2 to 2 % of white",
+        1e-3,
+        _static_light(2e-3, 2e-2),
+        "dase stimulus protocol.md",
     ),
     StandardStimulus(
-        "static bright", "a scene at rest in full light, 30 to 100 % of white", 1e-3, _static_light(0.3, 1.0)
+        "static bright",
+        "a scene at rest in full light, 30 to 100 % of white",
+        1e-3,
+        _static_light(0.3, 1.0),
+        "dase stimulus protocol.md",
     ),
     StandardStimulus(
-        "slow edge", "bars of many greys that go by at 20 px/s, 20 px wide", 1e-3, _edge_light(20, 20)
+        "slow edge",
+        "bars of many greys that go by at 20 px/s, 20 px wide",
+        1e-3,
+        _edge_light(20, 20),
+        "dase stimulus edges.mkv --parts edges",
     ),
     StandardStimulus(
-        "fast edge", "bars of many greys that go by at 1000 px/s, 100 px wide", 5e-4, _edge_light(1000, 100)
+        "fast edge",
+        "bars of many greys that go by at 1000 px/s, 100 px wide",
+        5e-4,
+        _edge_light(1000, 100),
+        "dase stimulus sheet.pdf",  # a screen would jump by many pixels from frame to frame
     ),
     StandardStimulus(
         "flicker",
         "a scene at rest, its light going up and down by 50 % at 10 Hz",
         1e-3,
         _flicker_light(10, 0.5),
+        "dase stimulus chirp.mkv --parts chirp",
     ),
 )
 """What is tried, the easiest to record first."""

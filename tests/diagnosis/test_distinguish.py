@@ -10,10 +10,13 @@ from helpers.command_line import dase, one_sentence
 from scipy.stats import norm
 
 from dase import InputError, Sensor
+from dase.cli.stimulus import stimulus_command
+from dase.datasets.stimulus_files import PROTOCOLS, SHEETS, VIDEOS
 from dase.diagnosis.distinguish import distinguish, separating_power, table_rows
 from dase.diagnosis.standard_stimuli import STANDARD_STIMULI
 from dase.effects import EFFECTS
 from dase.probes.statistics import FAMILIES, FAMILY_WORDS
+from dase.scenes.screen_stimulus import PARTS
 
 QUICK = {"pixels": 200, "repeats": 12, "longest": 1.0}
 
@@ -31,6 +34,16 @@ def of(found, stimulus):
 
 def test_every_family_has_words():
     assert set(FAMILY_WORDS) == set(FAMILIES)
+
+
+@pytest.mark.parametrize("standard", STANDARD_STIMULI, ids=lambda standard: standard.name)
+def test_the_command_of_a_stimulus_is_one(standard):
+    program, name, *arguments = standard.command.split()
+    assert (program, name) == ("dase", "stimulus")
+    given = stimulus_command.make_context("stimulus", arguments).params
+    assert given["out"].suffix in (*VIDEOS, *SHEETS, *PROTOCOLS)
+    if given["parts"] is not None:
+        assert set(given["parts"]) <= set(PARTS)
 
 
 def test_power_of_a_known_difference(rng):
@@ -75,6 +88,7 @@ def test_noise_at_rest_is_seen_at_rest():
     assert found.best == dark
     assert "Record static dark for 0.2 s" in found.sentence
     assert "how many events come" in found.sentence
+    assert "dase stimulus protocol.md" in found.sentence
 
 
 def test_the_duration_follows_the_rate():
