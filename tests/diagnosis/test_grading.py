@@ -77,25 +77,31 @@ def test_what_reports_has_pixels_of_its_own_at_the_later_time(scene):
     assert evidence.report.frame.first == evidence.held.frame.first > 0
 
 
-def test_what_reports_chooses_nothing(scene):
+@pytest.fixture(scope="module")
+def events(scene) -> dase.Events:
+    return dase.simulate(scene, Sensor().with_effect(EFFECTS["leak"](rate=4.0)), seed=3)
+
+
+@pytest.fixture(scope="module")
+def found(scene, events) -> dase.Diagnosis:
+    return diagnose(events, scene=scene, effects=LIBRARY, pixels=400, most=1)
+
+
+def test_what_reports_chooses_nothing(scene, events, found):
     """The search goes the same way whatever the pixels saw that report; what is said of its end differs."""
-    sensor = Sensor().with_effect(EFFECTS["leak"](rate=4.0))
-    events = dase.simulate(scene, sensor, seed=3)
     apart = split_measurement(events, scene, pixels=400).report.trials.stimulus.pixels
     rng = np.random.default_rng(0)
     mine = np.isin(events.y.astype(np.int64) * scene.width + events.x, apart)
     # at the time that reports; what comes before tells how fast a lamp flickers, wherever it is seen
     others = events.select(~mine | (events.t < 0.5) | (rng.random(len(events)) < 0.7))
-    found = [diagnose(e, scene=scene, effects=LIBRARY, pixels=400, most=1) for e in (events, others)]
-    ways = [[(r.effect, r.error) for s in one.history for r in s.ranking] for one in found]
+    other = diagnose(others, scene=scene, effects=LIBRARY, pixels=400, most=1)
+    ways = [[(r.effect, r.error) for s in one.history for r in s.ranking] for one in (found, other)]
     assert ways[0]
     assert repr(ways[0]) == repr(ways[1])
-    assert found[1].errors[-1] > found[0].errors[-1] + 1
+    assert other.errors[-1] > found.errors[-1] + 1
 
 
-def test_each_model_has_one_error(scene):
-    events = dase.simulate(scene, Sensor().with_effect(EFFECTS["leak"](rate=4.0)), seed=3)
-    found = diagnose(events, scene=scene, effects=LIBRARY, pixels=400)
+def test_each_model_has_one_error(found):
     assert [one.grade for one in found.findings] == [Grade.SUPPORTED]
     assert found.history[0].error == found.errors[0]
     assert found.findings[0].error_without == found.errors[0]

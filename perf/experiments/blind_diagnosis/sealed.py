@@ -309,7 +309,7 @@ class Score:
 
 
 def score(line: Line) -> Score:
-    """Compare an answer with the truth; where the effect was removed, all that is announced is wrong."""
+    """Compare an answer with the truth; a removed effect need not be found."""
     want = set(line["case"]["effects"])
     allowed = want | set(line.get("allowed", ()))
     findings = line["answer"]["findings"]
@@ -318,7 +318,7 @@ def score(line: Line) -> Score:
         n for one in findings if one["grade"] == "either" for n in (one["effect"], *one["alternatives"][:1])
     }
     if line["case"]["removed"]:
-        want, allowed = set(), set()
+        want = set()  # no model can name it; the events alone may show it, which is true
     habits = sure & (allowed - want)
     return Score(
         len(sure - habits), len(sure - allowed), len(want & sure), len((want & offered) - sure), len(want)
