@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import json
+import subprocess
+import sys
 from dataclasses import replace
+from pathlib import Path
 
 import pytest
 
@@ -126,3 +129,14 @@ def test_a_loss_that_is_no_number_ends_the_training(train, network, settings, tm
     with pytest.raises(InputError, match="lower learning_rate"):
         train(network, broken, tmp_path, settings)
     assert not (tmp_path / "checkpoint.pt").exists()
+
+
+@pytest.mark.slow
+def test_two_processes_are_one_with_all_slots(tmp_path):
+    script = [str(Path(__file__).with_name("process_of_training.py"))]
+    pair = ["-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2"]
+    for name, how in (("one", []), ("two", pair)):
+        subprocess.run([sys.executable, *how, *script, str(tmp_path / name)], check=True, capture_output=True)
+    one, two = (weights(load_network(tmp_path / name / "checkpoint.pt")[0]) for name in ("one", "two"))
+    assert torch.allclose(one, two, atol=2e-5)
+    assert len((tmp_path / "two" / "log.jsonl").read_text().splitlines()) == 1
