@@ -44,6 +44,7 @@ from dase.probes.stimulus import (
 from dase.probes.timestamp_patterns import PATTERNS, TimestampStructure, find_structure
 from dase.scenes.between_frames import CameraScene
 from dase.scenes.scene import Scene
+from dase.scenes.screen_scene import ScreenScene
 
 
 @dataclass(frozen=True)
@@ -177,7 +178,8 @@ def split_measurement(
     if grid is not whole:
         inside = (events.t >= grid.begin) & (events.t <= grid.begin + grid.step * (grid.steps + 1))
         events = events.select(inside)
-    gaps = repeated_gaps(events.t)
+    # a stimulus pauses by the clock
+    gaps = np.zeros((0, 2)) if isinstance(scene, ScreenScene) else repeated_gaps(events.t)
     try:
         to = launch.find_device(device)
     except ValueError as error:

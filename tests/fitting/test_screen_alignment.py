@@ -10,10 +10,12 @@ import pytest
 
 import dase
 from dase import EFFECTS, Events, InputError, Sensor
+from dase.fitting.data_split import split_measurement
 from dase.fitting.fit import widen_by_gamma
 from dase.fitting.measurement import as_measurement
 from dase.fitting.screen_alignment import align_screen
 from dase.fitting.screen_limits import SCREEN_LIMITS, limits_of_screen
+from dase.fitting.time_window import repeated_gaps
 from dase.results import Estimate
 from dase.scenes.screen_scene import ScreenScene, ScreenView, apply_homography
 from dase.scenes.screen_stimulus import ScreenStimulus, truth_text
@@ -140,6 +142,14 @@ def test_a_recording_and_the_file_are_a_measurement(short, tmp_path):
     assert not inside[0][:5].any()
     share = cv2.contourArea(np.float32(PLACES["straight"])) / (64 * 48)
     assert share - 0.2 < inside[0].mean() < share
+
+
+def test_pauses_of_a_stimulus_are_not_missing_data(short):
+    true = view_of("straight", offset=0.4)
+    events = recorded(short, true, shot={"rate": 0.01})
+    assert len(repeated_gaps(events.t))
+    split = split_measurement(events, ScreenScene(short, true), pixels=100)
+    assert not any("data are missing" in note for note in split.notes)
 
 
 def test_thresholds_are_as_uncertain_as_gamma(short):
