@@ -318,6 +318,7 @@ def run_files(name: str, folder: Path, files: int, seed: int, keep: Path, told, 
     for number in range(int(told[NEXT]), files):
         path = write_damaged(name, inner, number, seed)
         opened()  # by the making
+        memory.forget()  # what making it took
         begin, outcome = time.process_time(), FAILED
         try:
             outcome = read_any(name, sample, number)

@@ -43,11 +43,17 @@ def load_net(path: Path) -> ThresholdNet:
     try:
         with safe_open(path, "pt") as file:
             shape = (file.metadata() or {}).get(KIND)
-            names = file.keys()
+            if shape is None:
+                raise InputError(f"{path} does not hold learned thresholds")
+            of_shape, names = parse_shape(shape), file.keys()
+            with torch.device("meta"):  # without memory: a small file may claim a large network
+                wanted = {
+                    name: list(value.shape) for name, value in ThresholdNet(of_shape).state_dict().items()
+                }
+            if wanted != {name: file.get_slice(name).get_shape() for name in names}:
+                raise InputError(f"{path} does not hold the weights of the network that it says it holds")
             tensors = {name: file.get_tensor(name) for name in names}
-        if shape is None:
-            raise InputError(f"{path} does not hold learned thresholds")
-        net = ThresholdNet(parse_shape(shape))
+        net = ThresholdNet(of_shape)
         net.load_state_dict(tensors)
     except (SafetensorError, RuntimeError, KeyError, ValueError, TypeError) as error:
         raise InputError(f"{path} does not hold learned thresholds: {error}") from error

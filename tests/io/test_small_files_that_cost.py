@@ -178,6 +178,7 @@ def test_weights(tmp_path):
         ({"pattern": [10**9, 2]}, "pattern must be a whole number"),
         ({"pattern": 5}, "pattern must be two"),
         ({"split": 5}, "split must be true or false"),
+        ({"channels": 1024, "depth": 8}, "does not hold the weights of the network that it says"),
         ([1, 2], "must be a table"),
         ("a", "must be a table"),
     ):
