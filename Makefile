@@ -10,6 +10,9 @@ PYTEST := $(BIN)/python -m pytest -q -n $(JOBS) --dist loadfile --no-loadscope-r
 
 .venv/ready: pyproject.toml constraints.txt constraints-cuda.txt
 	$(PYTHON) -m venv .venv
+	# PyTorch without CUDA, a tenth of the size, where pip is told of a place that has it; else what comes next
+	sed -n '/^torch==/,/[^\\]$$/p' constraints.txt | sed '1s/ /+cpu /' > .venv/torch-cpu.txt
+	$(PIP) install --quiet --no-deps --require-hashes --requirement .venv/torch-cpu.txt 2>/dev/null || true
 	$(PIP) install --quiet --no-deps --require-hashes --requirement constraints.txt
 	if $(BIN)/python -c "import importlib.metadata as m, sys; sys.exit('cuda' not in str(m.requires('torch')))"; then \
 	    $(PIP) install --quiet --no-deps --require-hashes --requirement constraints-cuda.txt; fi
