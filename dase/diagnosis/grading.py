@@ -136,7 +136,7 @@ def grade_of(
     if not (at_floor or explained):
         return Grade.STAND_IN, False
     # at the floor, but not within chance: what is left tells that the world is another than the model's
-    sure = chance or explained
+    sure = chance or (explained and total <= settings.sure_left)
     weak = without.error - level < settings.weak
     if has_rivals or weak or not sure:
         return Grade.EITHER, weak or not sure

@@ -135,4 +135,9 @@ def _rival_models(state: DiagnosisState, model: FittedModel, name: str) -> dict[
         if other.name not in model.space.sensor and other.error <= limit:
             sensor = model.sensor.without(name).with_effect(other.model.sensor[other.name])
             ways[other.name] = with_same_freedom(sensor, model, [other.name])
+    # one that the effect becomes at the end of its range may have lost the race to it by a bad start
+    for simple in model.sensor[name].simpler():
+        if simple.name in state.effects and simple.name not in model.space.sensor:
+            sensor = model.sensor.without(name).with_effect(simple)
+            ways[simple.name] = with_same_freedom(sensor, model, [simple.name])
     return _keep_promising_models(state, model, ways)

@@ -145,6 +145,10 @@ class GradeSettings:
     floor is taken for the right one before a slightly wrong world: right effects left 2 to 6 %, stand-ins for
     strong effects that were not in the library 14 % and more, voltage noise for shot noise apart."""
 
+    sure_left: float = 0.06
+    """The same, up to which that is said without "or something that is not in the library": shot noise in the
+    place of voltage noise left 7 and 8 %, right effects before a slightly wrong world at most this."""
+
     own_left: float = 0.3
     """The same, as a share of what is left without the effect: what explains less may explain the wrong
     world."""

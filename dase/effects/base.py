@@ -261,6 +261,10 @@ class Effect:
                 raise InputError(f"{cls.name}.{name} must be the path of a file, got {value!r}")
         return cls(**table)
 
+    def simpler(self) -> tuple[Effect, ...]:
+        """Return the effects of `includes` as they do most nearly what this one does."""
+        return ()
+
     def delays(self) -> bool:
         """Whether events that this effect holds back come later instead of being lost."""
         return False

@@ -8,6 +8,7 @@ from typing import ClassVar
 
 import warp as wp
 
+from dase.effects.bandwidth import Bandwidth
 from dase.effects.base import Effect, parameter
 from dase.kernels.vector_math import cosine_and_sine, exponential
 
@@ -133,3 +134,7 @@ class SecondOrder(Effect):
         about="natural frequency at intensity 0 relative to that at intensity 1; 1 makes it constant",
         starts="ends",
     )
+
+    def simpler(self) -> tuple[Effect, ...]:
+        """Return the one low-pass that is as late behind a ramp: by 2 damping / (2π cutoff)."""
+        return (Bandwidth(cutoff=max(self.cutoff / (2 * self.damping), 0.01), dark=self.dark),)

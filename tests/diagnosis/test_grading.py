@@ -47,6 +47,8 @@ def judged(error: float, *, level: float = 0.25, reach: float = 0.4) -> Judgemen
         (8.0, 8.0, 0.3, 6.0, True, Grade.EITHER, False),
         # before a slightly wrong world: 4 % are left, and far more without the effect
         (40.0, 30.0, 1.9, 6.0, False, Grade.SUPPORTED, False),
+        # ... between 6 and 10 %: shot noise in the place of voltage noise
+        (40.0, 30.0, 3.2, 6.0, False, Grade.EITHER, True),
         # ... one that helps a little may explain the wrong world
         (40.0, 3.0, 1.9, 6.0, False, Grade.STAND_IN, False),
         # a stand-in for something strong

@@ -258,3 +258,23 @@ def test_noise_is_like_that_of_a_camera(shared, level, pixels):
     if level == "0.1lux":  # without what makes noise in the dark, there is next to none
         quiet = noise.simulated(sensor.without("voltage_noise"), level, pixels=pixels)
         assert quiet.sum() < 0.05 * got.sum()
+
+
+@pytest.mark.parametrize("effect", [e for e in dase.EFFECTS.values() if e.includes], ids=lambda e: e.name)
+def test_what_an_effect_includes_is_what_it_gives_as_simpler(effect):
+    assert tuple(simple.name for simple in effect().simpler()) == effect.includes
+
+
+def test_a_strongly_damped_second_order_is_the_low_pass_that_it_gives(device):
+    """The events of both come at the same times but for the faster pole's delay."""
+    slow = SecondOrder(cutoff=120.0, damping=6.0, dark=1.0)
+    (simple,) = slow.simpler()
+    assert simple == Bandwidth(cutoff=10.0, dark=1.0)
+    times = np.linspace(0, 0.3, 1201)
+    light = np.where(times > 0.02, 0.9, 0.1).astype(np.float32)
+    scene = dase.VideoScene(np.repeat(light[:, None, None], 4, axis=2), times)
+    plain = dase.Sensor((Threshold(on=0.1, off=0.1, phase=0.0),))
+    first, second = (dase.simulate(scene, plain.with_effect(one), device=device).t for one in (slow, simple))
+    assert len(first) == len(second) > 20
+    # 1 / (2π 2 damping cutoff) s for the other pole
+    assert np.max(np.abs(first - second)) < 4 * 1 / (2 * np.pi * 2 * 6.0 * 120.0)
