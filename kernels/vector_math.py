@@ -68,6 +68,7 @@ auto PAIR = [](const float* a, I i, V& right) {{
     return (V)flat.even;
 }};
 auto QUAD = [](const float* a, I i, V& a0, V& c1, V& a1) {{
+#if {length} == 16
     // four numbers in one load, those of every fourth lane side by side; then 4 by 4 are turned over
     typedef float Q __attribute__((ext_vector_type(4)));
     auto GATHER = [&](int j) {{
@@ -86,6 +87,13 @@ auto QUAD = [](const float* a, I i, V& a0, V& c1, V& a1) {{
     c1 = __builtin_shufflevector(h01, h23, 0, 1, 16, 17, 4, 5, 20, 21, 8, 9, 24, 25, 12, 13, 28, 29);
     a1 = __builtin_shufflevector(h01, h23, 2, 3, 18, 19, 6, 7, 22, 23, 10, 11, 26, 27, 14, 15, 30, 31);
     const V c0 = __builtin_shufflevector(l01, l23, 0, 1, 16, 17, 4, 5, 20, 21, 8, 9, 24, 25, 12, 13, 28, 29);
+#else
+    V c0;
+    for (int l = 0; l < {length}; ++l) {{
+        const float* four = a + i[l];
+        c0[l] = four[0], a0[l] = four[1], c1[l] = four[2], a1[l] = four[3];
+    }}
+#endif
     return c0;
 }};
 // a comparison of vectors is -1 in lanes where it holds
