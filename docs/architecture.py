@@ -36,10 +36,10 @@ metrics = _load_metrics()
 COLUMN = {
     **dict.fromkeys(("datasets", "learning", "simulation", "effects", "scenes", "networks"), 0),
     **dict.fromkeys(("formatting", "errors"), 0),
-    **dict.fromkeys(("cli", "tasks", "results", "signatures", "io", "events", "kernels"), 1),
+    **dict.fromkeys(("cli", "tasks", "results", "signatures", "representations"), 1),
+    **dict.fromkeys(("io", "events", "kernels"), 1),
     **dict.fromkeys(("figures", "diagnosis", "fitting", "probes", "recordings"), 2),
     **dict.fromkeys(("presets", "files", "version", "torch"), 2),
-    **dict.fromkeys(("representations",), 3),
 }
 """Where a package lies on its floor: what makes events is left, what asks about recordings is right."""
 

@@ -73,11 +73,11 @@ FLOORS: tuple[tuple[tuple[str, ...], str], ...] = (
         "A sensor puts effects together and runs them over a scene; signatures need neither.",
     ),
     (("probes", "effects"), "An effect knows scenes and kernels, not the sensor; a statistic only events."),
-    (("recordings", "scenes"), "What a camera wrote, and what a camera looks at, both from files or made."),
     (
-        ("io", "networks", "presets", "representations"),
-        "Files and representations know events, not what they are used for.",
+        ("recordings", "scenes", "representations"),
+        "What a camera wrote, what it looks at, and what networks are given of its events.",
     ),
+    (("io", "networks", "presets"), "Files know events, not what they are used for."),
     (
         ("events", "formatting", "files"),
         "What everybody speaks of: events, readable numbers, whole files.",
