@@ -4,6 +4,7 @@ from difflib import get_close_matches
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
+from dase.errors import how_to_install
 from dase.version import __version__ as __version__
 
 if TYPE_CHECKING:
@@ -88,7 +89,12 @@ __all__ = list(_MODULE_OF)
 
 def __getattr__(name: str) -> Any:
     if name in ("io", "tasks", "torch"):  # packages; the last two need PyTorch
-        return import_module(f"dase.{name}")
+        try:
+            return import_module(f"dase.{name}")
+        except ModuleNotFoundError as error:
+            if (error.name or "").split(".")[0] != "torch":
+                raise
+            raise ImportError(f"dase.{name} needs PyTorch: {how_to_install('learn')}") from None
     if name not in _MODULE_OF:
         raise AttributeError(f"module 'dase' has no attribute '{name}'{_hint(name)}")
     return getattr(import_module(_MODULE_OF[name]), name)

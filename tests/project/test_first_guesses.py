@@ -73,3 +73,11 @@ def test_events_are_written_and_drawn_as_they_are(tmp_path, events):
         assert figure._repr_png_().startswith(b"\x89PNG")  # what a notebook asks for
     (axes,) = figure.axes
     np.testing.assert_array_equal([line.get_ydata() for line in axes.lines], [swept.on, swept.off])
+
+
+@pytest.mark.parametrize("package", ["torch", "tasks"])
+def test_without_pytorch_the_extra_is_named(package):
+    code = f"import sys; sys.modules['torch'] = None; import dase; dase.{package}.Stream"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert done.stderr.splitlines()[-1].startswith(f"ImportError: dase.{package} needs PyTorch: ")
+    assert "[learn]" in done.stderr
