@@ -76,7 +76,11 @@ def hidden(scene, device, *effects: Effect, seed: int = 3) -> dase.Events:
 
 @pytest.mark.parametrize(
     "effect",
-    [EFFECTS["leak"](rate=4.0), EFFECTS["mismatch"](spread=0.25), EFFECTS["bandwidth"](cutoff=60.0)],
+    [
+        EFFECTS["leak"](rate=4.0),
+        pytest.param(EFFECTS["mismatch"](spread=0.25), marks=pytest.mark.slow),
+        EFFECTS["bandwidth"](cutoff=60.0),
+    ],
     ids=lambda e: e.name,
 )
 def test_a_hidden_effect_is_named(scene, device, effect):
@@ -132,6 +136,7 @@ def test_the_same_seed_gives_the_same_findings(scene, device):
         assert json.dumps({**one, "seconds": 0}) == json.dumps({**two, "seconds": 0})
 
 
+@pytest.mark.slow
 def test_another_simulator(shared, device):
     """Of an independent simulator the effect is named, and its lin-log mapping as well."""
     with np.load(shared / "hidden" / "clip_a.npz") as data:

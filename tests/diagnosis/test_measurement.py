@@ -212,6 +212,7 @@ def test_the_commands_say_what_is_compared(tmp_path, recording):
     assert "Events are shown only where" in report.read_text()
 
 
+@pytest.mark.slow
 def test_a_davis_and_its_frames(shared):
     """20 ms exposures every 40 ms leave little to trust, yet enough to compare."""
     path = shared / "recordings" / "native" / "davis346_cuke_cradle.aedat4"
