@@ -161,6 +161,14 @@ def _crossings_one_by_one(model: PixelModel) -> Statements:
         *lines("passed += 1"),
         *_memorise_leak(model),
         *thresholds_after_event(model),
+        *_take_drawn_threshold(),
+    )
+    return (*found, Block("while passed < crossed:", body), Line("moved += float(passed) * theta"))
+
+
+def _take_drawn_threshold() -> Statements:
+    """Return the statements by which crossings go on with the threshold that was drawn after an event."""
+    return (
         Line("drawn = on"),
         if_block("polarity == 0", "drawn = -off"),
         # products of equal thresholds are not summed up one by one, which would round differently
@@ -172,7 +180,6 @@ def _crossings_one_by_one(model: PixelModel) -> Statements:
             "crossed = int(wp.floor((value - moved) / theta))",
         ),
     )
-    return (*found, Block("while passed < crossed:", body), Line("moved += float(passed) * theta"))
 
 
 def _memorise_at_end(model: PixelModel, share: str) -> Statements:
@@ -197,17 +204,6 @@ def _crossings_between_resets(model: PixelModel) -> Statements:
         Line("crossed = int(whole(wp.abs(change), wp.abs(theta), 1.0 / wp.abs(theta)))"),
         if_block("at > stop", "crossed = 0"),
     )
-    redrawn = (
-        Line("drawn = on"),
-        if_block("polarity == 0", "drawn = -off"),
-        if_block(
-            "drawn != theta",
-            "moved += float(passed) * theta",
-            "passed = 0",
-            "theta = drawn",
-            "crossed = int(wp.floor((value - moved) / theta))",
-        ),
-    )
     body = (
         *_crossing_time(model, "passed"),
         *asked,
@@ -220,7 +216,7 @@ def _crossings_between_resets(model: PixelModel) -> Statements:
             "if wait > 0.0:",
             # what is left of the step begins at the end of the dead time
             (*_memorise_at_end(model, "share + wait / dt"), *anew),
-            redrawn if model.of("redraw") else (),
+            _take_drawn_threshold() if model.of("redraw") else (),
         ),
     )
     return (

@@ -65,6 +65,34 @@ def read_checkpoint(path: str | Path, device: str | torch.device = "cpu") -> dic
     return found
 
 
+def restore_training(
+    path: Path,
+    network: EventNetwork,
+    averaged: EventNetwork,
+    optimizer: torch.optim.Optimizer,
+    *,
+    steps: int,
+    window: float,
+    device: str | torch.device,
+) -> int:
+    """Put a training where `path` says that it stopped, and return the steps done; 0 where there is no file.
+
+    Raises:
+        InputError: The file is of another network, number of steps or duration of windows [s].
+    """
+    if not path.exists():
+        return 0
+    found = read_checkpoint(path, device)
+    asked = network.kind, network.shape, steps, window
+    if (found["network"], found["shape"], found["steps"], found["window"]) != asked:
+        raise InputError(f"{path.parent} holds another training: take its settings, or another folder")
+    network.load_state_dict(found["weights"])
+    averaged.load_state_dict(found["averaged"])
+    optimizer.load_state_dict(found["optimizer"])
+    step: int = found["step"]
+    return step
+
+
 def load_network(path: str | Path, device: str | torch.device = "cpu") -> tuple[EventNetwork, float]:
     """Return the trained network, with averaged weights, and the windows that it was trained on [s].
 

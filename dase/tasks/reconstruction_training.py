@@ -12,7 +12,7 @@ import torch
 
 from dase.errors import InputError
 from dase.learning import distributed
-from dase.tasks.checkpoints import read_checkpoint, save_checkpoint
+from dase.tasks.checkpoints import restore_training, save_checkpoint
 from dase.tasks.event_networks import EventNetwork
 from dase.tasks.image_metrics import Lpips, structural_similarity, temporal_inconsistency
 from dase.tasks.optimisation import BatchSource, Optimisation, average_weights, mean_gradients
@@ -78,17 +78,9 @@ def train_reconstruction(
     )
     perceptual = None if settings.lpips_weights is None else Lpips(settings.lpips_weights).to(device)
 
-    first = 0
-    if path.exists():
-        found = read_checkpoint(path, device)
-        asked = network.kind, network.shape, settings.steps, settings.window
-        if (found["network"], found["shape"], found["steps"], found["window"]) != asked:
-            raise InputError(f"{folder} holds another training: take its settings, or another folder")
-        network.load_state_dict(found["weights"])
-        averaged.load_state_dict(found["averaged"])
-        optimizer.load_state_dict(found["optimizer"])
-        first = found["step"]
-
+    first = restore_training(
+        path, network, averaged, optimizer, steps=settings.steps, window=settings.window, device=device
+    )
     if first < settings.last_step:
         source = iter(batches(first))
         half = settings.mixed_precision and device.startswith("cuda")
