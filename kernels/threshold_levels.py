@@ -23,9 +23,6 @@ from dase.kernels.vector_math import lane_functions, lane_options, native_functi
 LANES = 64
 """Neighbouring pixels of a thread: their levels fill a line of the cache."""
 
-_NEXT_BLOCK = 2 * LANES
-"""Levels ahead of the present ones that memory is asked for: those of the block after the next."""
-
 _INTERVALS = """
 typedef unsigned char L __attribute__((ext_vector_type(64)));
 typedef bool B __attribute__((ext_vector_type(64)));
@@ -85,7 +82,7 @@ auto crossings = [&](int lane, float change) {
     reference[lane] = reference[lane] + events * theta;
     return events;
 };
-""".replace("@AHEAD@", str(_NEXT_BLOCK))
+""".replace("@AHEAD@", str(2 * LANES))  # memory is asked for the block after the next
 """What both kernels do: the interval of every pixel, and which pixels have left theirs."""
 
 _KEEP = """

@@ -6,6 +6,7 @@ import math
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, nullcontext, suppress
+from dataclasses import dataclass
 from enum import Enum
 from importlib import import_module
 from pathlib import Path
@@ -22,8 +23,6 @@ from dase.io.source import Piece, Size, Source, missing_extra, refuse_bomb
 HDF5 = b"\x89HDF\r\n\x1a\n"
 USER_BLOCK = 512  # [bytes] that MATLAB puts before the mark of HDF5
 PART = 1 << 20  # events read at once
-BLOCK = 1 << 24  # [bytes] searched at once
-MOST_TEXT = 1 << 26  # [bytes] of an attribute
 FILTERS = {1: 1, 2: 0, 3: 0, 32000: 0, 32001: 4, 32004: 0, 32015: 0, 32026: 4}
 """Number of a filter to how many parameters it needs: gzip, shuffle, Fletcher's sum, LZF; of hdf5plugin
 Blosc, LZ4, Zstandard, Blosc 2. Blosc crashes without its parameters."""
@@ -37,8 +36,22 @@ TELLING = (
 )
 """Datasets that tell layouts apart; what `has_datasets` can be asked for."""
 
-SETTLED = 2_000_000_000
-"""Age [ns] of a change from which on the next one has another time, however coarse the clock of the disk."""
+
+@dataclass(frozen=True)
+class Hdf5Checks:
+    """What the checks of a file before anything of it is read take and refuse."""
+
+    block: int = 1 << 24
+    """Bytes searched at once."""
+
+    text: int = 1 << 26
+    """Bytes of the largest attribute."""
+
+    settled: int = 2_000_000_000
+    """Age of a change from which on the next has another time, however coarse the clock of the disk [ns]."""
+
+
+CHECKS = Hdf5Checks()
 
 _asked: tuple[bytes, frozenset[str]] = b"", frozenset()  # first bytes of a file, and which of these it holds
 _plugin_tried = False
@@ -192,7 +205,7 @@ def check_heaps(path: Path) -> None:
             else:
                 _check_names(file, begin, found.st_size, base)
     # a small one may change once more before the clock of its times goes on
-    if found.st_size > BLOCK or max(state[2:]) < now - SETTLED:
+    if found.st_size > CHECKS.block or max(state[2:]) < now - CHECKS.settled:
         if len(_sound) >= 1000:  # a run over a data set need not remember all of it
             _sound.clear()
         _sound[place] = state
@@ -201,7 +214,7 @@ def check_heaps(path: Path) -> None:
 def _find_heaps(file: BinaryIO) -> Iterator[tuple[HeapMark, int]]:
     """Yield kinds of heaps and where they begin; in blocks, for a file may be larger than the memory."""
     place, tail = 0, b""
-    while block := file.read(BLOCK):
+    while block := file.read(CHECKS.block):
         text = tail + block
         for kind in HeapMark:
             found = -1
@@ -314,7 +327,7 @@ def read_attribute(node: Any, name: str) -> Any:
     if name not in node.attrs:
         return None
     found = node.attrs.get_id(name)
-    if found.get_storage_size() > MOST_TEXT:
+    if found.get_storage_size() > CHECKS.text:
         raise InputError(f"its attribute '{name}' has {found.get_storage_size()} bytes")
     # HDF5 2.0 crashes on a list whose kind of length is unknown
     plain = (h5py.h5t.INTEGER, h5py.h5t.FLOAT, h5py.h5t.STRING, h5py.h5t.ENUM)
@@ -338,7 +351,7 @@ def _little_memory() -> Iterator[None]:
         yield
         return
     limits = resource.getrlimit(resource.RLIMIT_AS)
-    most = taken + MOST_TEXT
+    most = taken + CHECKS.text
     if limits[0] != resource.RLIM_INFINITY:
         most = min(most, limits[0])
     resource.setrlimit(resource.RLIMIT_AS, (most, limits[1]))

@@ -26,12 +26,23 @@ TAKEN = 10
 """Frames that are kept as grey at once, at least: of a byte per pixel each."""
 PIECE = 1 << 22
 """Bytes of a file that are looked at together."""
-OPTIONS = "OPENCV_FFMPEG_CAPTURE_OPTIONS"
-"""Environment variable with options of FFmpeg."""
-LOG_LEVEL = "OPENCV_FFMPEG_LOGLEVEL"
-"""Environment variable with the level of FFmpeg's messages."""
-QUIET = -8
-"""The level of none at all."""
+
+
+@dataclass(frozen=True)
+class FfmpegEnvironment:
+    """How FFmpeg inside of OpenCV is told what to do."""
+
+    options: str = "OPENCV_FFMPEG_CAPTURE_OPTIONS"
+    """Variable with its options."""
+
+    log_level: str = "OPENCV_FFMPEG_LOGLEVEL"
+    """Variable with the level of its messages."""
+
+    quiet: int = -8
+    """The level of none at all."""
+
+
+ENVIRONMENT = FfmpegEnvironment()
 
 
 @dataclass(frozen=True)
@@ -93,20 +104,22 @@ def open_video(path: Path) -> Any:
 
 
 def _open_capture(path: Path, with_options: str | None = None) -> Any:
-    os.environ.setdefault(LOG_LEVEL, str(QUIET))  # says nothing of its own about damaged files
+    os.environ.setdefault(
+        ENVIRONMENT.log_level, str(ENVIRONMENT.quiet)
+    )  # says nothing of its own about damaged files
     # each thread of a decoder keeps frames of its own, and there would be as many as processors
     parameters = [cv2.CAP_PROP_N_THREADS, 1]
-    before = os.environ.get(OPTIONS)
+    before = os.environ.get(ENVIRONMENT.options)
     if with_options is not None:
-        os.environ[OPTIONS] = with_options
+        os.environ[ENVIRONMENT.options] = with_options
     try:
         # FFmpeg alone: the others after it take as much memory as a damaged file asks for
         with quiet_opencv():
             capture = cv2.VideoCapture(str(path), cv2.CAP_FFMPEG, parameters)
     finally:
         if with_options is not None:
-            del os.environ[OPTIONS]
-            os.environ.update({} if before is None else {OPTIONS: before})
+            del os.environ[ENVIRONMENT.options]
+            os.environ.update({} if before is None else {ENVIRONMENT.options: before})
     if not capture.isOpened():
         raise InputError(f"video {path} cannot be decoded")
     _refuse_huge(path, capture)
@@ -193,11 +206,11 @@ def quiet_ffmpeg() -> Iterator[None]:
     """Keep FFmpeg quiet, also where it was used before it could be told so by its environment."""
     library = _find_libavutil()
     if library is not None:
-        library.av_log_set_level(QUIET)
+        library.av_log_set_level(ENVIRONMENT.quiet)
     try:
         yield
     finally:
-        wanted = os.environ.get(LOG_LEVEL, "")
+        wanted = os.environ.get(ENVIRONMENT.log_level, "")
         if library is not None and wanted.lstrip("-").isdigit():
             library.av_log_set_level(int(wanted))
 

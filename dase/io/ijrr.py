@@ -111,7 +111,7 @@ def read_size(source: Source) -> Size | None:
     """Return the size that the text or the first frame tells, or None."""
     with _Place(source.path) as place:
         with place.open(place.events) as file:
-            known = text.Layout(file.read(text.HEAD)).size
+            known = text.Layout(file.read(text.LIMITS.head)).size
         if known is None and (listed := _listed_frames(place)):
             first = place.read(listed[0][1], LIMIT)
             if first is not None:

@@ -15,6 +15,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Iterator
+from dataclasses import dataclass
 from typing import BinaryIO
 
 import numpy as np
@@ -24,10 +25,25 @@ from dase.errors import InputError
 from dase.io.column_order import checked_order, named_order, note_order, recognised_order
 from dase.io.source import Piece, Size, Source
 
-BLOCK = 1 << 20  # [bytes] decoded at once
-LONGEST = 200  # [bytes] of a line
-HEAD = 1 << 14  # [bytes] looked at to tell the columns
-DIGITS = 17  # of a time, point included, that fit the fast path
+
+@dataclass(frozen=True)
+class TextLimits:
+    """How much of a text is looked at together."""
+
+    block: int = 1 << 20
+    """Bytes decoded at once."""
+
+    line: int = 200
+    """Bytes of the longest line."""
+
+    head: int = 1 << 14
+    """Bytes that are looked at to tell the columns."""
+
+    digits: int = 17
+    """Of a time, point included, that fit the fast path."""
+
+
+LIMITS = TextLimits()
 
 # every text has one way to match: two, as of digits before and after a missing point, take quadratic time
 NUMBER = rb"[-+]?(?:\d+(?:\.\d*)?|\.\d+)(?:[eE][-+]?\d+)?"
@@ -110,15 +126,15 @@ def decode_text(open_file: Callable[[], BinaryIO], source: Source | None = None)
         source: What the user says about it; gets a note of what was told from the values.
     """
     with open_file() as file:
-        head = file.read(HEAD)
+        head = file.read(LIMITS.head)
         layout = Layout(head, source)
         line = head[: layout.begin].count(b"\n") + 1
         rest = head[layout.begin :]
-        while block := file.read(BLOCK):
+        while block := file.read(LIMITS.block):
             text = rest + block
             end = text.rfind(b"\n") + 1
-            if len(text) - end > LONGEST:
-                raise InputError(f"line {line + text.count(10)} is longer than {LONGEST} bytes")
+            if len(text) - end > LIMITS.line:
+                raise InputError(f"line {line + text.count(10)} is longer than {LIMITS.line} bytes")
             if end:
                 yield _decode_lines(text[:end], layout, line)
             line += text.count(b"\n", 0, end)
@@ -199,8 +215,8 @@ def _parse_times(
     length = end - begin
     value = np.zeros(len(begin), np.int64)
     point = np.zeros(len(begin), np.int64)  # digits and one more since the point, 0 before it
-    good = length <= DIGITS
-    for k in range(min(DIGITS, int(length.max(initial=0)))):
+    good = length <= LIMITS.digits
+    for k in range(min(LIMITS.digits, int(length.max(initial=0)))):
         digit = c.take(np.minimum(begin + k, end - 1)) - 48
         within = length > k
         is_digit = (digit < 10) & within
@@ -208,7 +224,7 @@ def _parse_times(
         good &= is_digit | is_point | ~within
         value = np.where(is_digit, value * 10 + digit, value)
         point += (point > 0) & within | is_point
-    powers = 10.0 ** np.arange(DIGITS + 1)
+    powers = 10.0 ** np.arange(LIMITS.digits + 1)
     out = value / powers.take(np.maximum(point - 1, 0))
     slow = np.flatnonzero(~good | (value >= 2**53) | (length <= (point > 0)))
     for i in slow:

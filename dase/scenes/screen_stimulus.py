@@ -37,7 +37,7 @@ VERSION = 1
 
 @dataclass(frozen=True)
 class ProgrammeSettings:
-    """Lengths and strengths of what is shown; those of a file of another `VERSION` may have been others."""
+    """Lengths and strengths of what is shown; those of a file of another version may have been others."""
 
     rest: float = 0.4
     """Grey before the first flash and after the last [s]: pixels settle."""

@@ -46,8 +46,8 @@ def test_chunks_are_of_the_length_asked_for_whatever_is_read_at_once(tmp_path, r
     path = sample(tmp_path, name, events(rng))
     want = io.read(path, size=(W, H)).events
     for chunk, block in ((1 << 20, 1 << 22), (1000, 4096), (7, 333)):
-        for module, what in ((binary, "BLOCK"), (text, "BLOCK")):
-            monkeypatch.setattr(module, what, block)
+        monkeypatch.setattr(binary, "BLOCK", block)
+        monkeypatch.setattr(text, "LIMITS", text.TextLimits(block=block))
         for module in (evt2, evt3, evt21, arrays, io.ros.ros_messages.evt3):
             monkeypatch.setattr(module, "PART", block // 8)
         parts = list(io.stream(path, chunk=chunk, size=(W, H)))

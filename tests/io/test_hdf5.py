@@ -177,7 +177,7 @@ def test_heaps_are_checked_once_until_the_file_changes(tmp_path, rng, monkeypatc
     searched.clear()
     with monkeypatch.context() as later:
         now = time.time_ns
-        later.setattr(time, "time_ns", lambda: now() + 2 * columns.SETTLED)
+        later.setattr(time, "time_ns", lambda: now() + 2 * columns.CHECKS.settled)
         for _ in range(3):
             io.read(path)
     assert len(searched) == 1

@@ -102,8 +102,7 @@ def test_what_a_written_text_looks_like(tmp_path):
 )
 def test_a_line_that_is_no_event_is_named(tmp_path, monkeypatch, line, match):
     for head, block in ((1 << 14, 1 << 20), (30, 8)):
-        monkeypatch.setattr(text, "HEAD", head)
-        monkeypatch.setattr(text, "BLOCK", block)
+        monkeypatch.setattr(text, "LIMITS", text.TextLimits(head=head, block=block))
         with pytest.raises(InputError, match=match):
             read(tmp_path, f"# comment\n0.1 1 1 1\n0.2 1 1 1\n{line}\n0.6 1 1 1\n")
 

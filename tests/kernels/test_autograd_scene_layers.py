@@ -175,7 +175,9 @@ def test_frames_equal_those_of_a_scene(device, rng):
     places = affine_places(motion, times, sizes_of(textures), width=WIDTH, height=HEIGHT, duration=0.7)
     np.testing.assert_allclose(places.cpu(), want, rtol=0, atol=1e-5)
     frames = render_layers(textures, torch.tensor(want, device=device), width=WIDTH, height=HEIGHT)
-    np.testing.assert_array_equal(frames.cpu(), scene.frames(times, device))
+    # a GPU's compiler joins products and sums in other places of the two kernels
+    tolerance = 0 if str(device) == "cpu" else 1e-5
+    np.testing.assert_allclose(frames.cpu(), scene.frames(times, device), rtol=0, atol=tolerance)
     assert frames.std() > 0.1
 
 
