@@ -13,6 +13,9 @@ from numpy.typing import NDArray
 
 from dase.kernels import launch
 
+# as in the kernels of `dase.kernels.scene_render`: pictures are the same, to the last bit, on a GPU as well
+wp.set_module_options({"fuse_fp": False})
+
 MAX_LAYERS = 32
 """A pixel keeps one bit per layer."""
 

@@ -31,6 +31,13 @@ def share_of(sink: WindowGrids, time: wp.int64, window: int) -> float:
 
 
 @wp.func
+def add_to_own(sink: WindowGrids, window: int, row: int, channel: int, i: int, weight: float):
+    """Add to a number that no other thread changes."""
+    # not `+=`, which is atomic: on an H100 adding so took 3.5 times as long as setting numbers
+    sink.grids[window, row, channel, i] = sink.grids[window, row, channel, i] + weight
+
+
+@wp.func
 def deposit_voxels(sink: WindowGrids, row: int, i: int, size: int, time: wp.int64, code: int):
     """Spread a polarity linearly over two bins."""
     w = window_of(sink, time)
@@ -38,15 +45,15 @@ def deposit_voxels(sink: WindowGrids, row: int, i: int, size: int, time: wp.int6
     low = wp.min(int(at), sink.bins - 1)
     upper = at - float(low)
     sign = float(2 * code - 1)
-    sink.grids[w, row, low, i] += sign * (1.0 - upper)
+    add_to_own(sink, w, row, low, i, sign * (1.0 - upper))
     if low + 1 < sink.bins:
-        sink.grids[w, row, low + 1, i] += sign * upper
+        add_to_own(sink, w, row, low + 1, i, sign * upper)
 
 
 @wp.func
 def deposit_counts(sink: WindowGrids, row: int, i: int, size: int, time: wp.int64, code: int):
     """Count an event by its polarity."""
-    sink.grids[window_of(sink, time), row, code, i] += 1.0
+    add_to_own(sink, window_of(sink, time), row, code, i, 1.0)
 
 
 @wp.func
@@ -54,7 +61,7 @@ def deposit_histogram(sink: WindowGrids, row: int, i: int, size: int, time: wp.i
     """Count an event by its polarity and bin of time."""
     w = window_of(sink, time)
     b = wp.min(int(share_of(sink, time, w) * float(sink.bins)), sink.bins - 1)
-    sink.grids[w, row, code * sink.bins + b, i] += 1.0
+    add_to_own(sink, w, row, code * sink.bins + b, i, 1.0)
 
 
 @wp.func

@@ -7,23 +7,22 @@ from dataclasses import replace
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 
 from dase.torch.batch import Batch
 from dase.torch.scene_numbers import Augment
 
 
-def augmented(batch: Batch, how: Augment, flips: NDArray[np.bool_], seed: Sequence[int]) -> Batch:
+def augmented(batch: Batch, how: Augment, flips: torch.Tensor, seed: Sequence[int]) -> Batch:
     """Return a batch with mirrored slots, noise and hot pixels.
 
     Args:
         batch: As it was simulated.
         how: What to do.
-        flips: Whether a slot is mirrored left to right and top to bottom, shape (B, 2).
+        flips: Whether a slot is mirrored left to right and top to bottom, bool, shape (B, 2), on the device.
         seed: Of the noise.
     """
     if how.flips:
-        batch = mirrored(batch, torch.from_numpy(flips).to(batch.inputs.device))
+        batch = mirrored(batch, flips)
     if not (how.noise or how.hot):
         return batch
     device, shape = batch.inputs.device, batch.inputs.shape

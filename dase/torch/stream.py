@@ -323,6 +323,7 @@ class BatchMaker:
         maps = self._maps_of_scenes(drawn) if self.pixels.maps else None
         parameters = self._send(drawn.parameters, wp.float32)
         self._vectors = wp.to_torch(parameters)
+        self._flips = self._upload(drawn.flips)
         self.pixels.reset(places, parameters, self._send(drawn.seeds, wp.int32), maps)
 
     def _load_pool(self, number: int) -> TexturePool:
@@ -336,12 +337,16 @@ class BatchMaker:
             self._coming[number + 1] = self._decoder.submit(self.stream.decode, number + 1)
         return self._pool[1]
 
-    def _send(self, values: NDArray[Any], dtype: Any) -> wp.array:
-        """Return numbers as a Warp array on the device, in memory of PyTorch; nobody waits for the copy."""
+    def _upload(self, values: NDArray[Any]) -> torch.Tensor:
+        """Return numbers on the device; nobody waits for the copy."""
         here = torch.from_numpy(np.ascontiguousarray(values))
         if self.device.type == "cuda":
             here = here.pin_memory()
-        return wp.from_torch(here.to(self.device, non_blocking=True), dtype=dtype)
+        return here.to(self.device, non_blocking=True)
+
+    def _send(self, values: NDArray[Any], dtype: Any) -> wp.array:
+        """Return numbers as a Warp array on the device, in memory of PyTorch; nobody waits for the copy."""
+        return wp.from_torch(self._upload(values), dtype=dtype)
 
     def _memory(self, name: str, shape: tuple[int, ...], dtype: Any) -> wp.array:
         """Return memory of a shape that is used again by the next batch that wants it."""
@@ -475,15 +480,17 @@ class BatchMaker:
         begins[0] = self._part == 1
         names = self.stream.sensor.parameter_names()
         vectors = self._vectors
+        # taken one by one: a list of places would be sent, and the GPU waited for
+        nominal = [vectors[:, names.index(f"threshold.{which}")] for which in ("off", "on")]
         batch = Batch(
             inputs=inputs,
             frames=frames.view(*shape, 1, height, width),
             flow=flow.view(*shape, 2, height, width),
             reset=begins,
-            thresholds=vectors[:, [names.index("threshold.off"), names.index("threshold.on")]],
+            thresholds=torch.stack(nominal, 1),
             parameters={name: vectors[:, place] for place, name in enumerate(names)},
         )
-        return augmented(batch, plan.augment, self._drawn.flips, [self.stream.seed, 2, number])
+        return augmented(batch, plan.augment, self._flips, [self.stream.seed, 2, number])
 
     def _maps_of_scenes(self, drawn: SceneNumbers) -> wp.array:
         """Return what effects have for each pixel of each scene, shape (B, M, N)."""
@@ -523,7 +530,9 @@ class BatchMaker:
             raise InputError(
                 f"{effect.weights} was learned for a {made} sensor, the view is {size[0]}x{size[1]}"
             )
-        maps = net(frames.clamp(0, 1))
+        # convolutions of a GPU have 10 bits of fractions unless told otherwise: thresholds differ by 1e-3
+        with torch.backends.cudnn.flags(enabled=torch.backends.cudnn.enabled, allow_tf32=False):
+            maps = net(frames.clamp(0, 1))
         both = torch.stack([maps.mu / net.level[0].exp(), maps.sigma / maps.mu], 1).flatten(2)
         at = torch.from_numpy(places.astype(np.int64)).to(self.device)
         return both.gather(2, at[:, None].expand(-1, 2, -1))

@@ -192,6 +192,7 @@ def test_the_same_seed_gives_the_same_batches():
     assert torch.equal(next(iter(streamed(batch=2, renew=2, first_batch=2))).inputs, first[2].inputs)
 
 
+@pytest.mark.filterwarnings("ignore:This DataLoader will create")  # where the machine has one processor
 @pytest.mark.parametrize("method", ["fork", "spawn"])
 def test_workers(method):
     """Several processes give the batches of one, in the same order."""

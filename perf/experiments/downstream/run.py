@@ -1,6 +1,6 @@
 """Networks for one sensor trained on another: how much does it matter what is simulated?
 
-    python -m perf.experiments.downstream.run --photos FOLDER --out OUT --device cuda --minutes 8
+    python -m perf.experiments.downstream.run --photos FOLDER --out OUT --devices cuda:0 --jobs 5
     python -m perf.experiments.downstream.table OUT/results.jsonl
 
 Four targets with physics beyond thresholds (`sensors.py`) are recorded for 60 s each. Networks are
@@ -8,8 +8,10 @@ trained on ESIM's default, on broad randomisation, and for each target on S2R's 
 `dase.fit` makes of the recording, and on the true sensor; then tested on each target's simulated scenes
 of photographs that no training has seen. The same seed has the same first weights and scenes whatever
 the sensor. Each training stands alone: it is checkpointed, `--minutes` ends a call, the same call goes
-on, and several machines may take `--seeds` apart. `results.jsonl` has a line for each network and
-target, `sensors/` what was tuned and fitted. `--photos` may be a tar of pictures.
+on, and several machines may take `--seeds` apart. `--jobs` trainings share a device: each is small, and
+waits for Python more than for the GPU. Seeds come one after the other, so that a call that ends early
+leaves whole tables of fewer seeds. `results.jsonl` has a line for each network and target, `sensors/`
+what was tuned and fitted: with both in OUT, another machine goes on. `--photos` may be a tar of pictures.
 """
 
 from __future__ import annotations
@@ -17,12 +19,17 @@ from __future__ import annotations
 import argparse
 import itertools
 import json
+import multiprocessing
+import os
+import sys
 import tarfile
 import time
-from collections.abc import Iterator
+import traceback
+from collections.abc import Iterator, Sequence
+from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 
@@ -31,6 +38,7 @@ from dase.tasks.flow_metrics import flow_errors
 from dase.tasks.image_metrics import structural_similarity
 from dase.torch import Batch
 from perf.experiments.downstream.sensors import (
+    ADAPTED,
     FAST,
     KINDS,
     OF_NO_TARGET,
@@ -72,14 +80,14 @@ class Size:
     """
 
     crop: tuple[int, int] = (128, 128)
-    windows: int = 24
+    windows: int = 16
     batch: int = 12
     flow_batch: int = 24
     flow_windows: int = 3
     reconstruction_channels: int = 16
     flow_channels: int = 32
-    reconstruction_steps: int = 800
-    flow_steps: int = 2000
+    reconstruction_steps: int = 600
+    flow_steps: int = 1500
     samples: int = 16
     recorded: float = 60.0
     test_batches: int = 4
@@ -104,7 +112,7 @@ class Study:
         train: Folder of photographs for training and recordings.
         test: Folder of photographs for tests.
         out: Folder of all results.
-        device: PyTorch's and dase's.
+        device: PyTorch's and dase's, of the process that works.
         size: How large it is.
         deadline: When the call ends, on `time.monotonic`.
     """
@@ -134,6 +142,10 @@ class Study:
             if time.monotonic() > self.deadline:
                 raise OutOfTime
             yield batch
+
+    def adapted(self, target: str) -> bool:
+        """Return whether a target's recording has been learned from."""
+        return (self.out / "sensors" / f"{target}.json").exists()
 
     def adapt(self, target: str) -> dict[str, Any]:
         """Return what was learned of a target from its recording, from the file where there is one."""
@@ -204,14 +216,36 @@ class Study:
                 truth = batch.flow.flatten(0, 1) / 30
                 seen = batch.inputs.flatten(0, 1).abs().sum(1) > 0
                 found = flow_errors(made.flatten(0, 1), truth, seen)
-                rows.append({name: float(value) for name, value in found.items()})
             else:
                 half = len(made) // 2  # before, little is known
                 a, b = made[half:].flatten(0, 1).clamp(0, 1), batch.frames[half:].flatten(0, 1)
-                rows.append(
-                    {"l1": float((a - b).abs().mean()), "ssim": float(structural_similarity(a, b).mean())}
-                )
+                found = {
+                    "l1": (a - b).abs().mean(), "ssim": structural_similarity(a, b).mean(),
+                    # what is to be had without any event: one grey for everything
+                    "l1_grey": (b - b.median()).abs().mean(),
+                }  # fmt: skip
+            rows.append({name: float(value) for name, value in found.items()})
         return {name: sum(row[name] for row in rows) / len(rows) for name in rows[0]}
+
+    def do(self, job: Job) -> list[dict[str, Any]]:
+        """Train a network and return its line for each target it is tested on; or adapt, and return none."""
+        if job.task == "adapt":
+            self.adapt(job.target)
+            return []
+        begin = time.monotonic()
+        network = self.train_one(*job)
+        seconds = round(time.monotonic() - begin, 1)
+        where = torch.cuda.get_device_name() if self.device == "cuda" else self.device
+        steps = self.size.flow_steps if job.task == "flow" else self.size.reconstruction_steps
+        rows = []
+        for tested in [job.target] if job.target else TARGETS:
+            found = self.test_one(network, job.task, tested)
+            rows.append(
+                {"task": job.task, "kind": job.kind, "trained_for": job.target, "target": tested,
+                 "seed": job.seed, **{name: round(value, 5) for name, value in found.items()}, "steps": steps,
+                 "seconds": seconds, "device": where, "torch": torch.__version__}
+            )  # fmt: skip
+        return rows
 
 
 def unpack_photos(photos: Path, out: Path) -> tuple[str, str]:
@@ -230,12 +264,123 @@ def unpack_photos(photos: Path, out: Path) -> tuple[str, str]:
     return str(folders[0]), str(folders[1])
 
 
+class Job(NamedTuple):
+    """A training and its tests; or with the task `adapt` what is learned of a target from its recording."""
+
+    task: str
+    kind: str
+    target: str  # that is trained for; empty for kinds that know none
+    seed: int
+
+
+def study_plan(
+    tasks: Sequence[str], kinds: Sequence[str], targets: Sequence[str], seeds: Sequence[int]
+) -> list[Job]:
+    """Return all jobs in the order in which they are wanted: what others wait for, then seed by seed."""
+    known = [kind for kind in kinds if kind not in OF_NO_TARGET]
+    jobs = [Job("adapt", "", target, 0) for target in targets if ADAPTED & set(kinds)]
+    for seed in seeds:
+        each = [(kind, target) for target in targets for kind in known]
+        each += [(kind, "") for kind in kinds if kind in OF_NO_TARGET]
+        jobs += [Job(task, kind, target, seed) for kind, target in each for task in tasks]
+    return jobs
+
+
+def next_job(waiting: Sequence[Job], adapted: set[str], left: float, longest: dict[str, float]) -> Job | None:
+    """Return the first job that can be done now.
+
+    Args:
+        waiting: Jobs in the order in which they are wanted.
+        adapted: Targets whose recordings have been learned from.
+        left: Time left to this call [s].
+        longest: Time that a job of a task took [s]; one that cannot come to its end is not begun.
+    """
+    for job in waiting:
+        if (job.kind not in ADAPTED or job.target in adapted) and longest.get(job.task, 0.0) < left:
+            return job
+    return None
+
+
+_study: Study | None = None
+"""Of a process that does jobs: what it has tested on stays in its memory."""
+
+
+def begin_process(study: Study, device: str) -> None:
+    """Prepare a process that does jobs on one device."""
+    global _study
+    kind, _, number = device.partition(":")
+    if number:
+        # before CUDA is asked for: nothing then depends on which device is the current one
+        os.environ["CUDA_VISIBLE_DEVICES"] = number
+    torch.set_num_threads(1)
+    _study = study
+    study.device = kind
+
+
+def do_job(job: Job) -> list[dict[str, Any]] | None:
+    """Return lines of results, none for an adaptation; None where the time was over."""
+    assert _study is not None
+    try:
+        return _study.do(job)
+    except OutOfTime:
+        return None
+
+
+def run_jobs(study: Study, plan: Sequence[Job], devices: Sequence[str], jobs: int) -> int:
+    """Do jobs in processes of their own, append lines to `results.jsonl`; return how many failed."""
+    context = multiprocessing.get_context("spawn")
+    pools = {
+        device: ProcessPoolExecutor(jobs, context, initializer=begin_process, initargs=(study, device))
+        for device in devices
+    }
+    waiting, failed = list(plan), 0
+    running: dict[Future[Any], tuple[Job, str, float]] = {}
+    longest: dict[str, float] = {}
+    adapted = {target for target in TARGETS if study.adapted(target)}
+    while True:
+        for place in range(jobs * len(devices)):
+            device = devices[place % len(devices)]
+            left = study.deadline - time.monotonic()
+            job = next_job(waiting, adapted, left, longest)
+            if job is None or left < 0:
+                break
+            if sum(where == device for _, where, _ in running.values()) < jobs:
+                waiting.remove(job)
+                running[pools[device].submit(do_job, job)] = job, device, time.monotonic()
+        if not running:
+            break
+        for one in wait(running, return_when=FIRST_COMPLETED).done:
+            job, _, begin = running.pop(one)
+            try:
+                rows = one.result()
+            except Exception:
+                failed += 1
+                print(job, traceback.format_exc(), file=sys.stderr, flush=True)
+                continue
+            if rows is None:
+                continue
+            seconds = time.monotonic() - begin
+            longest[job.task] = max(longest.get(job.task, 0.0), seconds)
+            if job.task == "adapt":
+                adapted.add(job.target)
+            print(f"{seconds:6.1f} s {' '.join(map(str, job))}", flush=True)
+            # all lines of a network together, so that none is left out where a call is ended
+            with (study.out / "results.jsonl").open("a") as file:
+                file.write("".join(json.dumps(row) + "\n" for row in rows))
+    for pool in pools.values():
+        pool.shutdown()
+    if waiting:
+        print(f"{len(waiting)} jobs are left; the same call goes on", flush=True)
+    return failed
+
+
 def main() -> None:
     """Run what is left to do."""
     ask = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     ask.add_argument("--photos", type=Path, required=True)
     ask.add_argument("--out", type=Path, required=True)
-    ask.add_argument("--device", default="cuda")
+    ask.add_argument("--devices", default="cuda:0", help="`cpu`, or GPUs: cuda:0,cuda:1")
+    ask.add_argument("--jobs", type=int, default=1, help="trainings side by side on each device")
     ask.add_argument("--minutes", type=float, default=1e6)
     ask.add_argument("--tasks", default="reconstruction,flow")
     ask.add_argument("--kinds", default=",".join(KINDS))
@@ -243,46 +388,20 @@ def main() -> None:
     ask.add_argument("--seeds", default="0,1,2")
     ask.add_argument("--small", action="store_true", help="A minute on two cores: do all parts work?")
     args = ask.parse_args()
+    deadline = time.monotonic() + 60 * args.minutes
     args.out.mkdir(parents=True, exist_ok=True)
     train, test = unpack_photos(args.photos, args.out)
-    deadline = time.monotonic() + 60 * args.minutes
-    study = Study(train, test, args.out, args.device, SMALL if args.small else Size(), deadline)
+    study = Study(train, test, args.out, "cpu", SMALL if args.small else Size(), deadline)
     log = args.out / "results.jsonl"
     lines = log.read_text().splitlines() if log.exists() else []
-    done = {tuple(json.loads(line)[n] for n in ("task", "kind", "trained_for", "seed")) for line in lines}
-    kinds, targets = args.kinds.split(","), args.targets.split(",")
-    plan = [
-        (task, kind, target, int(seed))
-        for seed in args.seeds.split(",")
-        for place, target in enumerate(targets)
-        for task in args.tasks.split(",")
-        for kind in kinds
-        if kind not in OF_NO_TARGET or place == 0
-    ]
-    try:
-        for task, kind, target, seed in plan:
-            trained_for = "" if kind in OF_NO_TARGET else target
-            if (task, kind, trained_for, seed) in done:
-                continue
-            if time.monotonic() > deadline:
-                raise OutOfTime
-            begin = time.monotonic()
-            network = study.train_one(task, kind, trained_for, seed)
-            seconds = round(time.monotonic() - begin, 1)
-            rows = []
-            for tested in TARGETS if not trained_for else [trained_for]:
-                found = study.test_one(network, task, tested)
-                rows.append(
-                    {"task": task, "kind": kind, "trained_for": trained_for, "target": tested, "seed": seed,
-                     **{name: round(value, 5) for name, value in found.items()}, "seconds": seconds,
-                     "device": args.device, "torch": torch.__version__}
-                )  # fmt: skip
-            # all lines of a network together, so that none is left out where a call is ended
-            with log.open("a") as file:
-                file.write("".join(json.dumps(row) + "\n" for row in rows))
-            print(*map(json.dumps, rows), sep="\n", flush=True)
-    except OutOfTime:
-        print("the time is over; the same call goes on", flush=True)
+    found = map(json.loads, lines)
+    done = {Job(row["task"], row["kind"], row["trained_for"], row["seed"]) for row in found}
+    done |= {Job("adapt", "", target, 0) for target in TARGETS if study.adapted(target)}
+    asked = (one.split(",") for one in (args.tasks, args.kinds, args.targets))
+    seeds = [int(seed) for seed in args.seeds.split(",")]
+    plan = [job for job in study_plan(*asked, seeds) if job not in done]
+    if run_jobs(study, plan, args.devices.split(","), args.jobs):
+        sys.exit(1)
 
 
 if __name__ == "__main__":

@@ -51,7 +51,8 @@ START = sensor_with(
 KINDS = ("esim", "broad", "tuned", "fitted", "true")
 """What is trained on; the first two do not know their target."""
 OF_NO_TARGET = KINDS[:2]
-
+ADAPTED = {"tuned", "fitted"}
+"""What is learned from a target's recording."""
 
 FLIPS = dase.torch.Augment(flips=0.5)
 
