@@ -6,6 +6,7 @@ import pytest
 
 pytest.importorskip("torch")
 
+from perf.experiments.downstream.run import Job, next_job, study_plan
 from perf.experiments.downstream.sensors import TARGETS, tuned_thresholds
 from perf.experiments.downstream.table import closed_gaps, mean_text, tables
 
@@ -34,3 +35,25 @@ def test_targets_have_physics_beyond_thresholds():
     plain = {"threshold", "mismatch"}
     assert len(TARGETS) == 4
     assert all({effect.name for effect in sensor.effects} > plain for sensor in TARGETS.values())
+
+
+def test_seeds_come_one_after_the_other():
+    plan = study_plan(("reconstruction", "flow"), ("esim", "fitted", "true"), ("slow", "all"), (0, 1))
+    assert plan[:2] == [Job("adapt", "", "slow", 0), Job("adapt", "", "all", 0)]
+    half = 2 * (2 * 2 + 1)
+    assert [job.seed for job in plan[2:]] == [0] * half + [1] * half
+    assert len(set(plan)) == len(plan)
+    assert Job("flow", "esim", "", 1) in plan
+    assert not any(job.task == "adapt" for job in study_plan(("flow",), ("esim", "true"), ("slow",), (0,)))
+
+
+def test_what_is_not_known_yet_or_takes_too_long_waits():
+    waiting = [
+        Job("flow", "fitted", "slow", 0),
+        Job("reconstruction", "true", "slow", 0),
+        Job("flow", "esim", "", 0),
+    ]
+    assert next_job(waiting, set(), 100.0, {}) == waiting[1]
+    assert next_job(waiting, {"slow"}, 100.0, {}) == waiting[0]
+    assert next_job(waiting, set(), 100.0, {"reconstruction": 120.0}) == waiting[2]
+    assert next_job(waiting, {"slow"}, 100.0, {"reconstruction": 120.0, "flow": 101.0}) is None
