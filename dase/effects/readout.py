@@ -4,16 +4,16 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from typing import ClassVar, Self
+from typing import Any, ClassVar, Self
 
 import numpy as np
 import warp as wp
 from numpy.typing import NDArray
 
 from dase.effects.base import Observations, choice, parameter
-from dase.effects.stream import Others, SharedReader, StreamEffect
+from dase.effects.stream import Others, SharedReader, StreamEffect, to_nanosecond, to_nanoseconds
 from dase.events import Events
-from dase.kernels import launch
+from dase.kernels import launch, line_arbiter
 from dase.kernels.event_queue import NEVER, ONE, send_over_bus
 
 
@@ -27,8 +27,7 @@ class Bus(SharedReader):
 
     def push(self, events: Events, until: float) -> tuple[Events, float]:
         """Give all events that find room, at the times at which they are through, be it after `until`."""
-        empty = Others(np.empty(0, np.int64), np.empty(0, np.uint8))
-        return self.beside(events, empty, np.ones(2)), until
+        return self.beside(events, Others.none(), np.ones(2)), until
 
     def beside(self, events: Events, others: Others, weight: NDArray[np.float64]) -> Events:
         """Return those of some events that find room beside others, see `SharedReader.beside`.
@@ -52,22 +51,112 @@ class Bus(SharedReader):
         return replace(events, t=through)
 
 
+class LineArbiter(SharedReader):
+    """Reads a line of pixels at a time, and holds those that wait.
+
+    Args:
+        per_line: Time to take a line [ps].
+        per_event: Time to send one of its events [ps].
+        width: Columns of the sensor.
+        height: Rows of the sensor.
+        by_columns: Whether lines are columns.
+    """
+
+    def __init__(self, per_line: int, per_event: int, width: int, height: int, by_columns: bool):
+        self._per_line, self._per_event, self._by_columns = per_line, per_event, by_columns
+        self._width, self._height = width, height
+        lines, self._across = (width, height) if by_columns else (height, width)
+        size = width * height
+        self._labelled = False
+        times = np.full((size, 4), line_arbiter.NEVER, np.int64)
+        times[:, line_arbiter.INTERVAL] = 0
+        numbers = np.zeros(8, np.int64)
+        numbers[line_arbiter.FREE] = line_arbiter.NEVER
+        self._other = np.zeros(size, np.uint8)
+        self._state: dict[str, NDArray[Any]] = {
+            "times": times, "flags": np.zeros((size, 4), np.uint8),
+            "waiting": np.zeros((lines, -(-self._across // 64)), np.int64),
+            "line_since": np.zeros(lines, np.int64), "line_count": np.zeros(lines, np.int32),
+            "line_queue": np.zeros(lines, np.int32), "heap_due": np.zeros(2 * size + 64, np.int64),
+            "heap_what": np.zeros(2 * size + 64, np.int32),
+            "recent": np.zeros(line_arbiter.RECENT, np.int32), "numbers": numbers,
+        }  # fmt: skip
+
+    def push(self, events: Events, until: float) -> tuple[Events, float]:
+        """Give the events of lines that are taken before `until`."""
+        return self._read(events, Others.none(), np.ones(2), until), until
+
+    def beside(self, events: Events, others: Others, weight: NDArray[np.float64]) -> Events:
+        """Return those of some events that find room beside others, see `SharedReader.beside`."""
+        return self._read(events, others, weight, math.inf)
+
+    def _read(self, events: Events, others: Others, weight: NDArray[np.float64], until: float) -> Events:
+        self._labelled |= events.label is not None
+        label = np.zeros(len(events), np.int8) if events.label is None else events.label
+        self._other[self._places(others.x, others.y)] = 1
+        held = int(np.count_nonzero(self._state["flags"][:, line_arbiter.STATUS]))
+        room = len(events) + held
+        out_time, out_place = np.empty(room, np.float64), np.empty(room, np.int32)
+        out_polarity, out_label = np.empty(room, np.uint8), np.empty(room, np.int8)
+        end = line_arbiter.END if until == math.inf else 1000 * to_nanosecond(until)
+        device = launch.find_device("cpu")
+
+        def array(values: NDArray[Any], dtype: Any) -> Any:
+            return wp.array(np.ascontiguousarray(values), dtype=dtype, device=device, copy=False)
+
+        inputs = [
+            array(1000 * to_nanoseconds(events.t), wp.int64),
+            array(self._places(events.x, events.y), wp.int32), array(events.p.astype(np.uint8), wp.uint8),
+            array(label, wp.int8), array(others.time, wp.int64),
+            array(self._places(others.x, others.y), wp.int32), array(others.polarity, wp.uint8),
+            array(np.rint(weight * ONE).astype(np.int64), wp.int64), wp.int64(end), self._across,
+            wp.int64(self._per_line), wp.int64(self._per_event), array(self._other, wp.uint8),
+            *(array(v, wp.dtype_from_numpy(v.dtype)) for v in self._state.values()),
+            array(out_time, wp.float64), array(out_place, wp.int32), array(out_polarity, wp.uint8),
+            array(out_label, wp.int8),
+        ]  # fmt: skip
+        wp.launch(line_arbiter.send_by_lines, dim=1, inputs=inputs, device=device)
+        sent = int(self._state["numbers"][line_arbiter.SENT])
+        line, across = np.divmod(out_place[:sent], self._across)
+        x, y = (line, across) if self._by_columns else (across, line)
+        return Events(
+            out_time[:sent], x.astype(np.uint16), y.astype(np.uint16), out_polarity[:sent].astype(np.bool_),
+            self._width, self._height, out_label[:sent] if self._labelled else None,
+        )  # fmt: skip
+
+    def _places(self, x: NDArray[np.uint16], y: NDArray[np.uint16]) -> NDArray[np.int32]:
+        line, across = (x, y) if self._by_columns else (y, x)
+        return line.astype(np.int32) * self._across + across
+
+
 @dataclass(frozen=True, kw_only=True)
 class Readout(StreamEffect):
     """A bus of limited bandwidth between the pixels and the file.
 
-    All pixels share one way out, which takes one event at a time. When many ask at once, as when the whole
-    scene moves or flickers, events queue up and come late, and when the queue is full they are lost. Then
-    the event rate stays at its limit whatever happens in the scene.
+    All pixels share one way out. When many ask at once, as when the whole scene moves or flickers, events
+    queue up and come late, and what finds no room is lost. Then the event rate stays at its limit whatever
+    happens in the scene.
 
-    Sending an event takes 1/`rate`, and its time is that at which it is through. With `mode = "delay"`, up
-    to `depth` events are in the queue, the one being sent among them; an event that finds no place is lost.
-    With `mode = "drop"` there is no queue: an event that finds the bus busy is lost.
+    With `mode = "rows"` or `"columns"` an arbiter takes a line of pixels at a time, as those of DAVIS cameras
+    do: the line whose first request is oldest, with all its pixels that ask by then. Their events get one
+    time stamp, that at which the line is taken, so many events tie with the one before. Reading it takes
+    `line` and 1/`rate` for each event. A pixel that waits or is being read is held in reset: it asks once,
+    however much the light changes meanwhile, and its memory is the light at the end. On a steady ramp it
+    sends at intervals of its own plus the time for which it was held. A sensor that all pixels fill sends
+    W / (`line` + W / `rate`) events per second from lines of W pixels, each pixel one in L (`line` +
+    W / `rate`) of L lines. Pixels are simulated before the readout, so how far the light has gone on when a
+    pixel is let go is told by its own events, by a parabola through three of them.
+
+    With `mode = "delay"` events are sent one by one whatever row they come from, each in 1/`rate`, and its
+    time is that at which it is through. Up to `depth` events are in the queue, the one being sent among them;
+    an event that finds no place is lost. With `mode = "drop"` there is no queue: an event that finds the bus
+    busy is lost.
     """
 
     name: ClassVar[str] = "readout"
     source: ClassVar[str] = (
         "Boahen: Point-to-point connectivity between neuromorphic chips using address events, 2000; "
+        "Boahen: A burst-mode word-serial address-event link, 2004 (a row at a time); "
         "Finateu et al.: A 1280x720 back-illuminated stacked temporal contrast event-based vision sensor "
         "with 4.86 um pixels, 1.066 GEPS readout, programmable event-rate controller and compressive "
         "data-formatting pipeline, 2020"
@@ -91,21 +180,46 @@ class Readout(StreamEffect):
         about="events that the queue holds in mode delay",
         fitted=False,  # of a queue that is never full, nothing tells the length
     )
-    mode: str = choice("delay", among=("delay", "drop"), about="what becomes of events while the bus is busy")
+    line: float = parameter(
+        4.2e-7,
+        unit="s",
+        bounds=(0.0, 1e-2),
+        plausible=(1e-8, 5e-6),
+        about="time to take a row or column, in modes rows and columns; default from a DAVIS240C whose bus "
+        "was never free: 0.53 us for 1.27 events",
+        fitted=False,  # beside the rate, it needs lines of few and of many events, each on a full bus
+    )
+    mode: str = choice(
+        "delay",
+        among=("delay", "drop", "rows", "columns"),
+        about="what becomes of events while the bus is busy",
+    )
 
     @classmethod
     def candidates(cls, observed: Observations) -> list[Self]:
         """Return buses of the highest rate that was seen, none where even that leaves any bus idle."""
         if observed.bus_is_idle:
             return []
-        return [replace(bus, rate=observed.highest_event_rate) for bus in cls.variants()]
+        rate = observed.highest_event_rate
+        # taking lines must leave time for as many events as were seen
+        return [replace(bus, rate=rate, line=min(bus.line, 0.1 / rate)) for bus in cls.variants()]
 
     def for_share(self, share: float) -> Readout:
-        """Return the bus with as much of its bandwidth and of its queue as a share of the pixels has."""
+        """Return the bus with as much of its bandwidth and of its queue as a share of the pixels has.
+
+        Lines are taken as often: while the bus is full, each has fewer events.
+        """
         return replace(self, rate=self.rate * share, depth=max(1.0, self.depth * share))
 
-    def reader(self, width: int, height: int, seed: int) -> Bus:
+    @property
+    def by_lines(self) -> bool:
+        """Whether it reads a row or column at a time."""
+        return self.mode in ("rows", "columns")
+
+    def reader(self, width: int, height: int, seed: int) -> SharedReader:
         """Return the bus of one sensor."""
         service = 0 if self.rate == math.inf else round(1e12 / self.rate)
+        if self.by_lines:
+            return LineArbiter(round(1e12 * self.line), service, width, height, self.mode == "columns")
         room = 0.0 if self.mode == "drop" else self.depth - 1
         return Bus(service, round(min(room * service, 2.0**61)) if service else 0)

@@ -45,10 +45,25 @@ class Others:
     Args:
         time: When they get there, not decreasing [ps], shape (M,).
         polarity: 1 for ON, shape (M,).
+        x: Columns of their pixels, shape (M,).
+        y: Rows of their pixels, shape (M,).
     """
 
     time: NDArray[np.int64]
     polarity: NDArray[np.uint8]
+    x: NDArray[np.uint16]
+    y: NDArray[np.uint16]
+
+    @classmethod
+    def of(cls, events: Events) -> Others:
+        """Return events as such that are not looked at."""
+        time, polarity = 1000 * to_nanoseconds(events.t), events.p.astype(np.uint8)
+        return cls(time, polarity, events.x, events.y)
+
+    @classmethod
+    def none(cls) -> Others:
+        """Return no others."""
+        return cls.of(Events.empty(1, 1))
 
 
 class SharedReader(Reader):

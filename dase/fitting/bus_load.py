@@ -9,7 +9,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from dase.effects.stream import Others, StreamEffect, to_nanoseconds
+from dase.effects.stream import Others, StreamEffect
 from dase.events import Events
 from dase.probes.random_streams import Draw
 from dase.probes.stimulus import Stimulus
@@ -119,7 +119,7 @@ class BusLoad:
             for effect in key:
                 reader = effect.reader(self.stimulus.width, self.stimulus.height, seed)
                 events, until = reader.push(events, until)
-            self._before[key] = Others(1000 * to_nanoseconds(events.t), events.p.astype(np.uint8))
+            self._before[key] = Others.of(events)
         return self._before[key]
 
     @cached_property

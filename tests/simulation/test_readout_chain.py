@@ -61,7 +61,7 @@ def test_switched_off_it_is_not_there(device, rng, effect):
     assert len(on) != len(want) or not np.array_equal(on.t, want.t)
 
 
-@pytest.mark.parametrize("mode", ["delay", "drop"])
+@pytest.mark.parametrize("mode", ["delay", "drop", "rows"])
 @pytest.mark.parametrize("labels", [False, True])
 def test_chunks_do_not_matter(device, rng, mode, labels):
     scene, sensor = moving(rng), everything(mode)
@@ -84,6 +84,8 @@ def test_chunks_do_not_matter(device, rng, mode, labels):
         RowScan(line=3.7e-6, direction="left"),
         Readout(rate=1e6, depth=30),
         Readout(rate=1e6, mode="drop"),
+        Readout(rate=1e6, mode="rows"),
+        Readout(rate=1e6, line=5e-6, mode="columns"),
         Timestamp(jitter=3e-6, step=0.0),
         Timestamp(jitter=3e-6, step=7e-7),
         Timestamp(jitter=0.0, step=7e-7),
@@ -224,7 +226,10 @@ def test_sensor_files_keep_them_in_order():
         (lambda: Latency(dark=0.0), r"latency\.dark must lie in \[0\.0001, 1\] 1, got 0"),
         (lambda: Readout(rate=0.0), r"readout\.rate must lie in \[1, inf\] Hz, got 0"),
         (lambda: Readout(depth=0.0), r"readout\.depth must lie in \[1, inf\] 1, got 0"),
-        (lambda: Readout(mode="wait"), r"readout\.mode must be one of delay, drop, got 'wait'"),
+        (
+            lambda: Readout(mode="wait"),
+            r"readout\.mode must be one of delay, drop, rows, columns, got 'wait'",
+        ),
         (lambda: RowScan(line=float("nan")), r"row_scan\.line must lie in \[0, 0\.1\] s, got nan"),
         (lambda: RowScan(line=1e-10), r"row_scan\.line must be 0 or at least 1e-09 s, got 1e-10"),
         (lambda: RowScan(direction="back"), r"row_scan\.direction must be one of down, up, right, left"),

@@ -1,0 +1,134 @@
+"""Plain twins of readout effects: loops over events, from what the effects say they do."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from fractions import Fraction
+
+import numpy as np
+
+Event = tuple[int, int, int, int]
+"""Time [ns], column, row, polarity."""
+
+
+@dataclass
+class Held:
+    """A pixel behind an arbiter: its own events, and when the arbiter let it go."""
+
+    last: Fraction | None = None
+    polarity: int = -1
+    interval: Fraction = Fraction(0)
+    freed: Fraction = Fraction(-(10**18))
+    asks: tuple[Fraction, int] | None = None  # late request: when, which
+    waits: int | None = None
+
+
+def until_share(held: Fraction, interval: Fraction, one_before: Fraction) -> Fraction | None:
+    """Return in how long light goes on by held / interval of a threshold, None where it turns before [ns].
+
+    The thresholds at -2, -1 and 0 were crossed after `one_before` and `interval`; a parabola goes through.
+    """
+    if not one_before or float(interval) > 2.414 * float(one_before):
+        return held
+    times = np.array([-float((interval + one_before) / interval), -1.0, 0.0])
+    bend, speed, _ = np.polyfit(times, [-2.0, -1.0, 0.0], 2)
+    roots = (
+        np.roots([bend, speed, -float(held / interval)]) if abs(bend) > 1e-12 else [float(held / interval)]
+    )
+    ahead = [float(np.real(r)) for r in roots if abs(np.imag(r)) < 1e-12 and np.real(r) > 0]
+    return Fraction(min(ahead)) * interval if ahead and speed > 0 else None
+
+
+def read_by_lines(events: list[Event], line: Fraction, event: Fraction, across: bool = False) -> list[Event]:
+    """Return what an arbiter sends that takes a row (column, if `across`) at a time.
+
+    Args:
+        events: In order of time.
+        line: Time to take a row [ns].
+        event: Time to send one of its events [ns].
+        across: Whether it reads columns.
+    """
+    pixels: dict[tuple[int, int], Held] = {}
+    since: dict[int, Fraction] = {}  # rows with requests, in the order of their first
+    free, out, ahead = Fraction(-(10**18)), [], list(events)
+
+    def ask(place: tuple[int, int], at: Fraction, polarity: int) -> None:
+        pixels[place].waits, pixels[place].asks = polarity, None
+        since.setdefault(place[0], at)
+
+    while True:
+        due = min(((p.asks[0], place) for place, p in pixels.items() if p.asks), default=(math.inf, (0, 0)))
+        raw = Fraction(ahead[0][0]) if ahead else math.inf
+        taken = next(iter(since), None)
+        begin = math.inf if taken is None else max(free, since[taken])
+        if begin < min(due[0], raw):
+            there = sorted(place for place, p in pixels.items() if p.waits is not None and place[0] == taken)
+            free = begin + line + len(there) * event
+            for place in there:
+                x, y = place if across else place[::-1]
+                out.append((math.floor(begin), x, y, pixels[place].waits))
+                pixels[place].waits, pixels[place].freed = None, free
+            del since[taken]
+        elif due[0] <= raw and due[0] < math.inf:
+            ask(due[1], due[0], pixels[due[1]].asks[1])
+        elif ahead:
+            _, x, y, polarity = ahead.pop(0)
+            place = (x, y) if across else (y, x)
+            pixel = pixels.setdefault(place, Held())
+            before, again = pixel.last, pixel.polarity == polarity
+            one_before = pixel.interval
+            pixel.last, pixel.polarity = raw, polarity
+            pixel.interval = raw - before if again else Fraction(0)
+            if pixel.waits is not None or raw < pixel.freed:
+                continue
+            if pixel.asks:
+                wanted, pixel.asks = pixel.asks[1], None
+                if wanted == polarity:
+                    ask(place, raw, polarity)
+            elif before is not None and again and pixel.freed > before:
+                late = until_share(pixel.freed - before, pixel.interval, one_before)
+                pixel.asks = (math.inf if late is None else raw + late, polarity)
+            else:
+                ask(place, raw, polarity)
+        else:
+            return out
+
+
+def watch_light(
+    level: np.ndarray, step: float, threshold: float, line: float, event: float, width: int
+) -> list[tuple[float, int, int]]:
+    """Return what an arbiter sends whose pixels see the light themselves: (t [s], pixel, polarity).
+
+    A pixel compares the light with its memory at each step; while it waits or is read it does not, and its
+    memory is the light at the end.
+
+    Args:
+        level: Log intensity, in steps short beside all else, shape (K, N), row after row.
+        step: [s]
+        threshold: Of both polarities [log intensity].
+        line: Time to take a row [s].
+        event: Time to send one of its events [s].
+        width: Pixels of a row.
+    """
+    memory, held = level[0].copy(), np.full(level.shape[1], -math.inf)
+    asks, since = np.zeros(level.shape[1], int), {}
+    free, out = -math.inf, []
+    for k in range(1, len(level)):
+        t = k * step
+        while since and max(free, since[next(iter(since))]) <= t:
+            row = next(iter(since))
+            begin = max(free, since.pop(row))
+            there = [i for i in range(row * width, (row + 1) * width) if asks[i]]
+            free = begin + line + len(there) * event
+            for i in there:
+                out.append((begin, i, int(asks[i] > 0)))
+                asks[i], held[i] = 0, free
+                memory[i] = np.nan  # until it is let go
+        let_go = np.isnan(memory) & (held <= t)
+        memory[let_go] = level[k, let_go]
+        change = np.nan_to_num(level[k] - memory)
+        for i in np.flatnonzero((np.abs(change) >= threshold) & (asks == 0)):
+            asks[i] = int(np.sign(change[i]))
+            since.setdefault(i // width, t)
+    return out
