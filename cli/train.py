@@ -26,6 +26,10 @@ if TYPE_CHECKING:
 )
 @click.option("--preset", default="default", show_default=True, help="default, tiny (for a CPU) or paper.")
 @click.option("--objective", default="", help="moments or wgan.  [default: the preset's]")
+@click.option(
+    "--sensor", default="", metavar="TEXT", help="Preset or sensor file of what is known of the camera, as "
+    "`dase fit` writes it: thresholds are learned on top of its other effects."
+)  # fmt: skip
 @click.option("--steps", default=0, help="Generator steps.  [default: the preset's]")
 @click.option("--minutes", type=float, help="Time to take, reading included, instead of a number of steps.")
 @click.option("--window", default=0.05, show_default=True, help="Time in which events are counted [s].")
@@ -45,6 +49,7 @@ def train_command(
     images: str | None,
     preset: str,
     objective: Any,
+    sensor: str,
     steps: int,
     minutes: float | None,
     window: float,
@@ -81,7 +86,7 @@ def train_command(
     job = learning_job.Job(
         targets=targets, images=images or "", preset=preset, objective=objective, steps=steps, window=window,
         size=size, sequences=sequences, pattern=pattern, seed=seed, backend=device,
-        begin=begin, end=end, region=region,
+        begin=begin, end=end, region=region, sensor=sensor,
     )  # fmt: skip
     device = distributed.join_processes(device)
     first = distributed.process_rank() == 0
@@ -109,6 +114,8 @@ def _train_job(
         learning_job.record_job(job, output, resume=resume)
     with _OpeningBar(silent=not first) as opened:
         training = learning_job.open_training(replace(job, backend=device), progress=opened)
+    if first and training.physics is not None and training.physics.left_out:
+        click.echo(f"left out while learning: {', '.join(training.physics.left_out)}")
     looks = 100 if device.startswith("cuda") else 25
     schedule = RunSchedule(
         log_every=10 if job.preset == "tiny" else looks,
@@ -147,8 +154,9 @@ def _write_sensor(job: Any, output: Path, training: Any, row: dict[str, float]) 
     width, height = training.scenery.scene_settings.width, training.scenery.scene_settings.height
     recorded = None if job.targets_sensor else (width, height)
     path: Path = learning_job.write_sensor(
-        output, training.mean, mu=row["mu"], name=output.name or "learned", size=recorded
-    )
+        output, training.mean, mu=row["mu"], name=output.name or "learned", size=recorded,
+        known=None if training.physics is None else training.physics.given,
+    )  # fmt: skip
     return path
 
 

@@ -8,6 +8,7 @@ import numpy as np
 import torch
 from torch.nn import functional as F
 
+from dase.learning.known_physics import KnownPhysics
 from dase.learning.moment_matching import REFERENCE, Moments, MomentSettings, moment_discrepancy
 from dase.learning.scene_batches import Scenery, middle_intensity
 from dase.learning.targets import Pairs, Target, draw_noise, simulate_counts
@@ -98,7 +99,9 @@ class HeldOutScore:
         seed: int = 54321,
         doubt: float = 0.05,
         batch: int = 12,
+        physics: KnownPhysics | None = None,
     ):
+        self.physics = None if physics is None else physics.with_batch(batch, seed)
         self.scenery, self.scenes, self.seed, self.batch = scenery, scenes, seed, batch
         self.real = [pairs.select(slice(n, n + batch)) for n in range(0, len(pairs), batch)]
         self.like = Moments(MomentSettings(doubt=doubt), device=scenery.device)
@@ -121,6 +124,8 @@ class HeldOutScore:
         """
         rng = np.random.default_rng(self.seed)
         generator = torch.Generator(self.scenery.device).manual_seed(self.seed)
+        if self.physics is not None:
+            self.physics.generator.manual_seed(self.seed)
         out = []
         for _ in range(0, self.scenes, self.batch):
             log = self.scenery.draw(rng, self.batch)
@@ -129,6 +134,8 @@ class HeldOutScore:
             if net is None:
                 level = torch.full_like(grey, REFERENCE[0])
                 out.append(Pairs(grey, simulate_counts(log, level, REFERENCE[1], noise)))
+            elif self.physics is not None:
+                out.append(Pairs(grey, self.physics.count(log, net(grey))))
             else:
                 out.append(Pairs(grey, simulate_counts(log, *net(grey).by_polarity(), noise)))
         return out

@@ -12,14 +12,15 @@ from typing import Any, Literal
 import numpy as np
 import torch
 
-from dase.effects.learned_threshold import LearnedThreshold
 from dase.effects.mismatch import Mismatch
 from dase.effects.threshold import Threshold
 from dase.errors import InputError, checked_seed, nearest
 from dase.files.atomic_file import replacing
 from dase.files.text_files import parse_json, read_text_file
+from dase.learning import distributed
 from dase.learning.adversarial import AdversarialObjective, AdversarialSettings, PatchHash
 from dase.learning.baselines import RandomThresholds, esim_thresholds, match_event_rate
+from dase.learning.known_physics import KnownPhysics, with_learned_thresholds
 from dase.learning.moment_objective import MomentObjective
 from dase.learning.recipe import Recipe
 from dase.learning.recorded_target import ReplayedScenes, open_target
@@ -87,6 +88,7 @@ class Job:
         begin: Time of the recordings from which on is learned [s]; None for their begin.
         end: Time at which learning stops [s]; None for their end.
         region: First column and row, columns and rows of what is learned from; None for all pixels.
+        sensor: Preset or sensor file of what is known of the camera beside its thresholds; "" for nothing.
     """
 
     targets: tuple[str, ...]
@@ -103,6 +105,7 @@ class Job:
     begin: float | None = None
     end: float | None = None
     region: tuple[int, int, int, int] | None = None
+    sensor: str = ""
 
     def __post_init__(self) -> None:
         if not self.images:
@@ -193,7 +196,7 @@ def open_training(
     if job.pattern:
         size = scenery.scene_settings.width, scenery.scene_settings.height
         recipe = replace(recipe, network=replace(recipe.network, pattern=size))
-    return compose_training(recipe, target, scenery)
+    return compose_training(recipe, target, scenery, load_sensor(job.sensor) if job.sensor else None)
 
 
 def _check_patches(job: Job, looks: SceneSettings) -> None:
@@ -204,14 +207,24 @@ def _check_patches(job: Job, looks: SceneSettings) -> None:
         raise InputError(f"patches are {size} px wide, the sensor {looks.width}x{looks.height}")
 
 
-def compose_training(recipe: Recipe, target: Target, scenery: Scenery) -> Training:
+def compose_training(
+    recipe: Recipe, target: Target, scenery: Scenery, sensor: Sensor | None = None
+) -> Training:
     """Return a run at its beginning: the loop with a new network and the objective that the recipe names.
 
     Args:
         recipe: How to learn.
         target: What to become like.
         scenery: Draws the simulator's scenes, on the device that learns.
+        sensor: What is known of the camera beside its thresholds; None for nothing.
     """
+    physics = None
+    if sensor is not None:
+        # the loop and the objective draw with the seeds up to this one; processes differ as their scenes do
+        physics = KnownPhysics(
+            sensor, scenery.scene_settings, batch=recipe.batch, device=scenery.device,
+            seed=distributed.process_seed(recipe.seed + 3),
+        )  # fmt: skip
     net = make_network(recipe, scenery.device)
     objective: Objective
     if recipe.objective == "moments":
@@ -219,7 +232,7 @@ def compose_training(recipe: Recipe, target: Target, scenery: Scenery) -> Traini
     else:
         # the loop draws with the seeds up to this one
         objective = AdversarialObjective(recipe.adversarial, device=scenery.device, seed=recipe.seed + 2)
-    return Training(recipe, net, objective, target, scenery)
+    return Training(recipe, net, objective, target, scenery, physics)
 
 
 def _textured_scenery(job: Job, looks: SceneSettings) -> Scenery:
@@ -332,8 +345,9 @@ def read_job(out: Path) -> Job:
 
 @torch.no_grad()
 def write_sensor(
-    out: Path, net: ThresholdNet, *, mu: float, name: str, size: tuple[int, int] | None = None
-) -> Path:
+    out: Path, net: ThresholdNet, *, mu: float, name: str, size: tuple[int, int] | None = None,
+    known: Sensor | None = None,
+) -> Path:  # fmt: skip
     """Write what was learned as a sensor file with its weights beside it; return its path.
 
     Args:
@@ -342,16 +356,14 @@ def write_sensor(
         mu: Typical mean threshold [log intensity], which becomes the level that the maps are relative to.
         name: Of the sensor.
         size: Columns and rows of the camera [px], if it is one.
+        known: What the thresholds were learned on top of; None for nothing.
     """
     net = net.with_level(mu)
     level, ratio = float(net.level[0].exp()), float(net.asymmetry.exp())
     on, off = (float(np.clip(level * ratio**share, 0.01, 10.0)) for share in (0.5, -0.5))
     save_net(out / JobFile.WEIGHTS, net)
-    sensor = Sensor(
-        effects=(Threshold(on=on, off=off), LearnedThreshold(weights=JobFile.WEIGHTS.value)),
-        name=name,
-        size=size,
-    )
+    learned = with_learned_thresholds(known or Sensor(), on=on, off=off, weights=JobFile.WEIGHTS.value)
+    sensor = replace(learned, name=name, size=size or learned.size)
     with replacing(out / JobFile.SENSOR) as temporary:
         temporary.write_text(dump_sensor(sensor), "utf-8")
     return out / JobFile.SENSOR
@@ -376,6 +388,8 @@ def write_examples(out: Path, training: Training, *, scenes: int = 3, seed: int 
     maps = net(grey)
     mu, sigma = maps.by_polarity()
     counts = simulate_counts(log, mu, sigma, draw_noise(log, generator))
+    if training.physics is not None:
+        counts = training.physics.with_batch(len(log), seed).count(log, maps)
     arrays = dict(
         grey=grey, real_grey=real.grey, real=real.counts, simulated=counts, mu=maps.mu, sigma=maps.sigma
     )

@@ -96,7 +96,7 @@ def train_in_folder(
     _write_recipe(out, training.recipe)
     exam = MapEvaluation(training.scenery, training.target)
     pairs = training.target.held_out() if schedule.score_every else None
-    held = None if pairs is None else HeldOutScore(training.scenery, pairs)
+    held = None if pairs is None else HeldOutScore(training.scenery, pairs, physics=training.physics)
     return _RunLoop(training, out, schedule, exam, held, on_row, on_result).run_steps(began)
 
 

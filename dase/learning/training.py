@@ -21,6 +21,7 @@ from dase.kernels.autograd_counts import Surrogate
 from dase.learning import distributed
 from dase.learning.adabelief import AdaBelief
 from dase.learning.cuda_graph import GraphReplay
+from dase.learning.known_physics import KnownPhysics
 from dase.learning.scene_batches import Scenery, middle_intensity, pack_words, send_words, unpack_words
 from dase.learning.targets import Pairs, PixelNoise, Target, draw_noise, simulate_counts
 from dase.networks.threshold_network import NetworkShape, ThresholdMaps, ThresholdNet
@@ -177,6 +178,7 @@ class Training:
         objective: What a step costs.
         target: What to become like.
         scenery: Draws the simulator's scenes.
+        physics: What else the camera does, which counts are made with; None for thresholds alone.
     """
 
     def __init__(
@@ -186,7 +188,9 @@ class Training:
         objective: Objective,
         target: Target,
         scenery: Scenery,
+        physics: KnownPhysics | None = None,
     ):
+        self.physics = physics
         self.recipe, self.net, self.objective = recipe, net, objective
         self.target, self.scenery, self.device = target, scenery, scenery.device
         self.mean = ThresholdNet(recipe.network).to(self.device).to(memory_format=torch.channels_last)
@@ -212,6 +216,7 @@ class Training:
     def generators(self) -> list[torch.Generator]:
         """Return all random numbers that a step draws on the device."""
         own = [part.generator for part in (self, self.target) if hasattr(part, "generator")]
+        own += [] if self.physics is None else [self.physics.generator]
         return [*own, *self.objective.generators]
 
     def _make_optimizer(self) -> torch.optim.Optimizer:
@@ -322,6 +327,9 @@ class Training:
         mu, sigma = maps.by_polarity() if self.recipe.network.split else (maps.mu, maps.sigma)
         noise = draw_noise(log, self.generator)
         counts = simulate_counts(log, mu, sigma, noise, surrogate=self.recipe.surrogate)
+        if self.physics is not None:
+            # what all effects make of the scenes; how thresholds move counts is told by thresholds alone
+            counts = counts + (self.physics.count(log, maps) - counts).detach()
         return self.objective.extend_fake(Pairs(grey, counts), log, mu, sigma, noise, step), maps
 
     @torch.no_grad()
@@ -351,6 +359,7 @@ class Training:
         """Return what makes this process's scenes its own."""
         return {
             "generator": self.generator.get_state(),
+            "physics": None if self.physics is None else self.physics.generator.get_state(),
             "target": self.target.state(),
             "scenes": self.scenes.bit_generator.state,
             "reals": self.reals.bit_generator.state,
@@ -370,6 +379,8 @@ class Training:
         self.objective.load(state)
         mine = state["random"][distributed.process_rank()]
         self.generator.set_state(mine["generator"].cpu())
+        if self.physics is not None:
+            self.physics.generator.set_state(mine["physics"].cpu())
         self.target.load(mine["target"])
         self.scenes.bit_generator.state = mine["scenes"]
         self.reals.bit_generator.state = mine["reals"]
