@@ -4,7 +4,8 @@ The search chooses by pixels that fit and pixels that select. What is said in th
 part, by which nothing was chosen. Each effect has to earn its grade there:
 
 - *supported*: the measurement is away from the model without the effect, along the way that the effect goes,
-  by more than chance and the misfit that stays could make; without it several times as much is left, however
+  by more than chance and the misfit that stays could make, or so far that next to nothing of it is left with
+  the effect; without it several times as much is left, however
   well the rest is fitted again; nothing else does nearly as well in its place; and of the error of the model
   before the search next to nothing is left.
 - *either ... or*: the same, but another effect does nearly as well in its place, or so little was there to be
@@ -128,10 +129,11 @@ def grade_of(
     left = max(last.error - level, 0.0)
     total = left / max(start.error - level, 1e-9)
     own = left / max(without.error - level, 1e-9)
-    if deviation < settings.away or without.error <= last.error:
-        return Grade.STAND_IN, False
     at_floor = may_be_announced(last)
-    chance = at_floor and last.error <= max(LIMITS.quiet, last.reach)
+    clear = without.error > last.gate and own <= settings.clear_left
+    if without.error <= last.error or (deviation < settings.away and not clear):
+        return Grade.STAND_IN, False
+    chance = at_floor and last.error <= max(LIMITS.quiet, min(last.reach, settings.wide))
     explained = total <= settings.total_left and own <= settings.own_left
     if not (at_floor or explained):
         return Grade.STAND_IN, False

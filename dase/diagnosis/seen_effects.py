@@ -30,7 +30,7 @@ KINDS: dict[str, tuple[str, ...]] = {
     "full bus": ("readout",),
     "time stamps": ("timestamp", "row_scan"),
     "opposite pairs": ("shot", "voltage_noise"),
-    "fixed pattern": ("mismatch",),
+    "fixed pattern": ("mismatch", "dead"),
     "grouping": ("readout", "row_scan"),
     "frame coupling": ("exposure",),
     "double events": (),
@@ -128,8 +128,8 @@ def without_the_scene(seen: SeenEffects, measurement: Measurement, sensor: Senso
     """
     if not seen.entries or isinstance(measurement.scene, CameraScene):
         return seen
-    also = _signatures_of(measurement.scene, sensor, seed)
-    kept = tuple(entry for entry in seen.entries if entry.name not in also)
+    made = _signatures_of(measurement.scene, sensor, seed)
+    kept = tuple(entry for entry in seen.entries if not shows_in(made, entry))
     coupled = any(entry.name == "frame coupling" for entry in kept)
     return replace(seen, entries=kept, bursts=seen.bursts if coupled else None)
 
@@ -145,21 +145,39 @@ def without_the_explained(
         sensor: The model after the search.
         seed: Of its random numbers.
     """
-    open_ = {entry.name for entry in seen.entries if not seen.named_by(entry)}
+    open_ = [entry for entry in seen.entries if not seen.named_by(entry)]
     if not open_ or isinstance(measurement.scene, CameraScene):
         return seen
-    also = open_ & _signatures_of(measurement.scene, sensor, seed)
-    return replace(seen, entries=tuple(entry for entry in seen.entries if entry.name not in also))
+    made = _signatures_of(measurement.scene, sensor, seed)
+    kept = tuple(entry for entry in seen.entries if entry not in open_ or not shows_in(made, entry))
+    return replace(seen, entries=kept)
 
 
-def _signatures_of(scene: Scene, sensor: Sensor, seed: int) -> set[str]:
-    """Return the names of the signatures that the events of a sensor show, if only by a hint.
-
-    What is not beyond all doubt here is enough to doubt that it is the camera's.
-    """
+def _signatures_of(scene: Scene, sensor: Sensor, seed: int) -> tuple[Signature, ...]:
+    """Return the signatures of the events of a sensor."""
     made = simulate(scene, sensor, seed=seed)
-    entries = find_signatures(made).entries if len(made) else ()
-    return {entry.name for entry in entries if entry.found or (entry.size >= entry.least and entry.p < 0.05)}
+    return find_signatures(made).entries if len(made) else ()
+
+
+def shows_in(made: Collection[Signature], seen: Signature, share: float = 0.3) -> bool:
+    """Whether what is seen shows in simulated events as well, if only by a hint.
+
+    What is not beyond all doubt there is enough to doubt that it is the camera's, if it is not far smaller:
+    many events of a model whose thresholds are too low hint at everything.
+
+    Args:
+        made: Signatures of simulated events.
+        seen: In the measurement.
+        share: Of the size seen that must show.
+    """
+    for entry in made:
+        if entry.name != seen.name or not (entry.found or (entry.size >= entry.least and entry.p < 0.05)):
+            continue
+        other = entry.details.get("frequency", 0.0) if seen.name == "flicker" else 0.0
+        if other and abs(other / seen.details["frequency"] - 1) > 0.02:
+            continue
+        return not entry.size < share * seen.size  # sizes may be unknown
+    return False
 
 
 def _compared_events(measurement: Measurement) -> Events:

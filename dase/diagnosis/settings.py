@@ -145,13 +145,21 @@ class GradeSettings:
     floor is taken for the right one before a slightly wrong world: right effects left 2 to 6 %, stand-ins for
     strong effects that were not in the library 14 % and more, voltage noise for shot noise apart."""
 
-    sure_left: float = 0.06
+    sure_left: float = 0.045
     """The same, up to which that is said without "or something that is not in the library": shot noise in the
-    place of voltage noise left 7 and 8 %, right effects before a slightly wrong world at most this."""
+    place of voltage noise left 5 to 8 %, and so did some right effects before a slightly wrong world."""
 
     own_left: float = 0.3
     """The same, as a share of what is left without the effect: what explains less may explain the wrong
     world."""
+
+    clear_left: float = 0.15
+    """The same, below which an effect without which the model is not at the floor needs no deviation along
+    its way: there statistics are far off that a single one may not decide by, as those of dead pixels."""
+
+    wide: float = 0.8
+    """Error above which chance alone is no excuse for what is left, however far repeats are apart: hot or
+    dead pixels as stand-ins make them so."""
 
     weak: float = 0.5
     """What is left without an effect below which something that is not in the library

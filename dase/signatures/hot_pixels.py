@@ -30,6 +30,7 @@ class HotSettings:
     chance: float = 1e-3  # over all pixels, below which one is counted
     bulk: float = 0.995  # share of the pixels of which the usual spread is taken
     in_phase: float = 0.5  # of its events, with a lamp: a pixel that follows it is not hot
+    border: int = 2  # pixels from the edge: what passes outside nobody sees, and there it looks calm
     calm: float = 0.05  # share of places and times in which a hot pixel would have been seen alone
 
 
@@ -68,6 +69,13 @@ def _usual_counts(total: NDArray[np.int64], width: int, height: int) -> NDArray[
     ring = (wide - core) / 72
     out: NDArray[np.float64] = np.maximum(ring.reshape(-1), total.mean())
     return out
+
+
+def _has_all_neighbours(width: int, height: int, border: int) -> NDArray[np.bool_]:
+    """Return which pixels are that far from the edge at least, shape (H * W,)."""
+    out = np.zeros((height, width), np.bool_)
+    out[border : height - border, border : width - border] = True
+    return out.reshape(-1)
 
 
 def _pixel_chances(
@@ -109,7 +117,7 @@ def find_hot_pixels(
     alone = steady & (total >= s.ratio * usual)
     led = alone & (np.abs(calm.phase) >= s.in_phase * total)
     follow = int(np.count_nonzero(led & (chance < s.chance / len(chance))))
-    alone &= ~led
+    alone &= ~led & _has_all_neighbours(calm.width, calm.height, s.border)
     chance = np.where(alone, chance, 1.0)
     pixels = len(chance)
     found = chance < s.chance / pixels

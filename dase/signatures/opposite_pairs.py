@@ -32,6 +32,8 @@ class PairSettings:
         0.5  # times the pairs of independent ON and OFF events: noise has as many, a scene hardly any
     )
     scene: float = 0.1  # times those pairs, a bound for what a scene leaves where it is calm
+    left: float = 2.0  # pairs beside that: ten simulated scenes left none to three
+    bulk: float = 0.98  # share of the pixels that must have the pairs without the busiest
     returning: float = 2.0  # times those pairs, from which on noise returns
     shortest: float = 0.3  # [s] in less, hardly any two events of a pixel are far from each other
     near: float = 0.02  # [s] a pair
@@ -80,13 +82,20 @@ class PairCounts:
         self._time[pixel[last]], self._polarity[pixel[last]] = t[last], p[last]
 
 
+def _pairs_of_trains(events: NDArray[np.int64], duration: float, s: PairSettings) -> float:
+    """Return the near pairs of independent trains of OFF and ON events, counts of shape (2, N)."""
+    off, on = events
+    return float((off * on).sum() * 2 * s.near / max(duration, s.near))
+
+
 def find_opposite_pairs(
     pairs: PairCounts, hot: NDArray[np.bool_], duration: float, level: float, *, lamp: bool = False
 ) -> Signature:
     """Look for opposite pairs at rest.
 
-    The null has a tenth of the pairs that independent ON and OFF trains of each pixel would have, and half a
-    pair: Poisson distributed. Then the same with all of these pairs, or as many as those farther apart tell,
+    The null has a tenth of the pairs that independent ON and OFF trains of each pixel would have, and two
+    pairs: Poisson distributed. It must fail without the busiest pixels, too: of a hot pixel amid things that
+    move only bursts are calm. Then the same with all of these pairs, or as many as those farther apart tell,
     says whether noise returns.
 
     Args:
@@ -97,18 +106,22 @@ def find_opposite_pairs(
         lamp: Whether the light flickers, which makes opposite pairs.
     """
     s = pairs.settings
-    rest = ~hot & (pairs.events.sum(0) <= max(s.busiest * duration, 10.0))
+    total = pairs.events.sum(0)
+    rest = ~hot & (total <= max(s.busiest * duration, 10.0))
+    usual = rest & (total <= max(float(np.quantile(total[~hot], s.bulk)) if np.any(~hot) else 0.0, 2.0))
     off, on = pairs.events[:, rest]
     near = int(pairs.opposite[0, rest].sum())
     events = int((off + on).sum())
-    trains = float((off * on).sum() * 2 * s.near / max(duration, s.near))
+    trains, trains_of_usual = (_pairs_of_trains(pairs.events[:, some], duration, s) for some in (rest, usual))
     # a train of rate r has exp(r t) times as many intervals below t as above
     begin, end = s.later
     favour = np.exp((off + on) / max(duration, end) * (begin + end) / 2)
     local = float((pairs.opposite[1, rest] * favour).sum()) * s.near / (end - begin)
     expected = max(trains, local)
-    bound = s.scene * trains + 0.5
+    bound = s.scene * trains + s.left
     p, p_more = (float(stats.poisson.sf(near - 1, mean)) for mean in (bound, expected))
+    near_of_usual = int(pairs.opposite[0, usual].sum())
+    p = max(p, float(stats.poisson.sf(near_of_usual - 1, s.scene * trains_of_usual + s.left)))
     low, high = (limit / max(trains, 0.5) for limit in poisson_interval(near))
     size = near / max(trains, 0.5)
     rates = [float(row.sum()) / max(duration, 1e-9) / max(len(row), 1) for row in (off, on)]

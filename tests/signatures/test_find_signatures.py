@@ -117,6 +117,18 @@ def test_a_lamp_is_found_beside_bursts_of_frames():
     assert looked["flicker"].details["frequency"] == pytest.approx(100.14, abs=0.3)
 
 
+@pytest.mark.parametrize(("corner", "there"), [((40, 30), True), ((0, 1), False)])
+def test_pixels_at_the_edge_are_not_called_hot(plain, corner, there):
+    """What passes outside nobody sees: an edge that comes no further looks calm."""
+    x, y = np.repeat([corner[0], corner[0] + 7], 20), np.repeat([corner[1], corner[1]], 20)
+    t = np.tile(np.linspace(plain.t[0], plain.t[-1], 20), 2)
+    calm = plain.select((plain.x > 80) & (plain.y > 60))
+    t, x, y = (np.concatenate(pair) for pair in ((t, calm.t), (x, calm.x), (y, calm.y)))
+    order = np.argsort(t)
+    events = dase.Events(t[order], x[order], y[order], t[order] > 0.5, plain.width, plain.height)
+    assert ("hot pixels" in found(events)) == there
+
+
 def test_what_is_put_into_the_events_shows(plain):
     rng = np.random.default_rng(2)
     assert found(experiment.read_rows(rng, plain)) == {"grouping"}

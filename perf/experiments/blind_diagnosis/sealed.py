@@ -27,6 +27,7 @@ from typing import Any
 
 import numpy as np
 
+from dase.diagnosis.seen_effects import KINDS as KINDS_OF_SIGNATURES
 from perf.experiments.blind_diagnosis.report import HIDDEN, STRENGTHS
 from perf.experiments.blind_diagnosis.scenes import draw_scene
 
@@ -314,6 +315,8 @@ def score(line: Line) -> Score:
     allowed = want | set(line.get("allowed", ()))
     findings = line["answer"]["findings"]
     sure = {one["effect"] for one in findings if one["grade"] in ("certain", "supported")}
+    # "opposite pairs" or "fixed pattern" says what there is, and is true of any effect that makes it
+    sure -= {name for name in sure - want if allowed.intersection(KINDS_OF_SIGNATURES.get(name, ()))}
     offered = {
         n for one in findings if one["grade"] == "either" for n in (one["effect"], *one["alternatives"][:1])
     }
