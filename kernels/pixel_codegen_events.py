@@ -50,8 +50,8 @@ def sleep_condition(model: PixelModel) -> tuple[Statements, str]:
     """Return when a step can have events.
 
     Returns:
-        Statements that set `asleep` to the rest of the dead time [s], none unless events wait for its end;
-        and the condition.
+        Statements that set `asleep` to the rest of the dead time [s], none unless its end matters, and let
+        pixels that are held in reset follow the signal; and the condition.
     """
     crossed = "after >= on or after <= -off"
     asleep: list[Statement] = []
@@ -60,9 +60,9 @@ def sleep_condition(model: PixelModel) -> tuple[Statements, str]:
         for effect, call in model.calls("gate"):
             asleep.append(Guarded(effect, (Line(f"asleep = wp.max(asleep, {call.text})", call.draws),)))
     if model.resets:
-        # the end of a dead time asks for work without any crossing: then the pixel memorises the signal;
-        # rounding must not let it fall between two steps
-        crossed = f"asleep <= 1.0001 * dt and (asleep > 0.0 or {crossed})"
+        # seen to in all steps alike: the end of a dead time has no event, and a step that counts as busy is
+        # dear, on a GPU for all pixels of a group
+        asleep.append(if_block("asleep > 0.0", *_follow_signal(model)))
     if model.delays:
         # a crossing that waits for the end of the dead time may come although the signal returns
         crossed += " or before >= on or before <= -off"
@@ -79,7 +79,7 @@ def step_events(model: PixelModel) -> Statements:
     noisy = [effect for effect, _ in model.of("noise")]
     found: list[Statement] = [*lines("moved = float(0.0)", "begun = float(0.0)")]
     if model.resets:
-        found += [Line("at = float(0.0)"), if_block("asleep > 0.0", *_memorise_at_end(model, "asleep / dt"))]
+        found += [Line("at = float(0.0)"), if_block("asleep > 0.0", "at = asleep / dt")]
     if noisy:
         found.append(Block("while begun < 1.0:", _until_noise(model, noisy)))
     else:
@@ -182,9 +182,22 @@ def _take_drawn_threshold() -> Statements:
     )
 
 
+def _follow_signal(model: PixelModel) -> Statements:
+    """Return the statements by which the memory of a pixel in reset is the signal, up to the end of that.
+
+    What is left of the step is seen from the new memory. One that sleeps on sees no change at all.
+    """
+    return (
+        *lines("until = wp.min(asleep / dt, 1.0)", "shift = before + (after - before) * until"),
+        *lines("reference += shift", "before -= shift", "after -= shift"),
+        *(lines("slipped = leaked_before + (leaked - leaked_before) * until") if model.labelled else ()),
+        *_memorise_leak(model),
+    )
+
+
 def _memorise_at_end(model: PixelModel, share: str) -> Statements:
     """Return the statements for a dead time that ends at a share of the step, maybe beyond its end."""
-    # one that ends beyond is seen to in its own step, unless rounding makes it end between the two
+    # one that ends beyond goes on in the next step
     return (
         *lines(f"at = {share}", "until = wp.min(at, 1.0)", "moved = before + (after - before) * until"),
         *(lines("slipped = leaked_before + (leaked - leaked_before) * until") if model.labelled else ()),
