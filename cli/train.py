@@ -32,6 +32,7 @@ if TYPE_CHECKING:
 )  # fmt: skip
 @click.option("--steps", default=0, help="Generator steps.  [default: the preset's]")
 @click.option("--minutes", type=float, help="Time to take, reading included, instead of a number of steps.")
+@click.option("--samples", default=0, help="Time samples of scenes in a window.  [default: the preset's]")
 @click.option("--window", default=0.05, show_default=True, help="Time in which events are counted [s].")
 @click.option("--size", callback=parse_size, metavar="WxH", help="Of scenes, if the target is a sensor file.")
 @click.option("--sequences", default=300, show_default=True, help="Simulated by a sensor file as the target.")
@@ -52,6 +53,7 @@ def train_command(
     sensor: str,
     steps: int,
     minutes: float | None,
+    samples: int,
     window: float,
     size: tuple[int, int] | None,
     sequences: int,
@@ -87,6 +89,7 @@ def train_command(
         targets=targets, images=images or "", preset=preset, objective=objective, steps=steps, window=window,
         size=size, sequences=sequences, pattern=pattern, seed=seed, backend=device,
         begin=begin, end=end, region=region, sensor=sensor,
+        samples=samples,
     )  # fmt: skip
     device = distributed.join_processes(device)
     first = distributed.process_rank() == 0

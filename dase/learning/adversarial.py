@@ -19,9 +19,15 @@ from dase.learning.targets import Pairs, PixelNoise
 from dase.networks.threshold_network import gradient_magnitude
 
 
-def critic_maps(counts: torch.Tensor) -> torch.Tensor:
-    """Return what critics see, log(1 + x)/2 of counts and of their gradient magnitudes, (B, 4, H, W)."""
-    return 0.5 * torch.log1p(torch.cat([counts, gradient_magnitude(counts)], 1))
+def critic_maps(counts: torch.Tensor, *, plain: bool = False) -> torch.Tensor:
+    """Return what critics see, (B, 4, H, W): log(1 + x)/2 of counts and of their gradient magnitudes.
+
+    Args:
+        counts: Shape (B, 2, H, W).
+        plain: Whether the numbers are left as they are, as in the paper.
+    """
+    maps = torch.cat([counts, gradient_magnitude(counts)], 1)
+    return maps if plain else 0.5 * torch.log1p(maps)
 
 
 def cut_patches(maps: torch.Tensor, size: int) -> torch.Tensor:
@@ -129,6 +135,7 @@ class AdversarialSettings:
         penalty: Weight of the gradient penalty.
         uniform: α of Eq. 13: share of the weights that all classes have alike; 1 turns re-weighting off.
         critic_image: Whether critics see the image too.
+        plain_counts: Whether they see counts, as in the paper, and not logarithms of them.
         hash: Of the patches.
     """
 
@@ -138,6 +145,7 @@ class AdversarialSettings:
     penalty: float = 1.0
     uniform: float = 0.5
     critic_image: bool = False
+    plain_counts: bool = False
     hash: PatchHash = PatchHash()
 
 
@@ -203,7 +211,7 @@ class AdversarialObjective:
         return uniform / len(share) + (1 - uniform) * share
 
     def _patches(self, pairs: Pairs) -> torch.Tensor:
-        maps = critic_maps(pairs.counts)
+        maps = critic_maps(pairs.counts, plain=self.settings.plain_counts)
         if self.settings.critic_image:
             maps = torch.cat([maps, pairs.grey[:, None]], 1)
         return cut_patches(maps, self.hasher.how.size)

@@ -336,6 +336,7 @@ def test_the_command_learns_from_a_sensor_and_goes_on(tmp_path, monkeypatch):
     [
         (("missing.npz",), "missing.npz"),
         (("ideal", "--preset", "fast"), "there is no preset 'fast'"),
+        (("ideal", "--samples", "1"), "samples must lie in 2 to 4096, or be 0, got 1"),
         (("ideal", "--images", "frames"), "a sensor file has none"),
         (("ideal", "--window", "-1"), "window must be a number > 0 s, got -1"),
         (("ideal", "ideal"), "one sensor file is one target, got 2"),

@@ -25,6 +25,7 @@ from dase.learning.adversarial import (
 from dase.learning.baselines import RandomThresholds, constant_thresholds, match_event_rate
 from dase.learning.evaluation import HeldOutScore
 from dase.learning.gauss_newton import GaussNewton
+from dase.learning.job import Job
 from dase.learning.moment_matching import (
     CellMoments,
     MomentWeighting,
@@ -330,3 +331,26 @@ def test_recipes_survive_their_text():
     assert (recipe.adversarial.hash.size, recipe.moments.cells, recipe.steps) == (8, (2, 3), 7)
     assert Recipe.parse(recipe.text()) == recipe
     assert json.loads(recipe.text())["network"]["table"] == [6, 5]
+
+
+def test_samples_follow_each_other_as_the_paper_asks():
+    paper = Job(targets=("esim",), preset="paper", window=1 / 30).scene_settings()
+    assert paper.samples == 35  # 34 steps of at most 1 ms
+    assert Job(targets=("esim",), window=0.05).scene_settings().samples == 24
+    assert Job(targets=("esim",), preset="paper", samples=400).scene_settings().samples == 400
+    recipe = Job(targets=("esim",), preset="paper").recipe()
+    assert recipe.batch == 48
+    assert recipe.adversarial.plain_counts
+    assert Recipe.parse(recipe.text()) == recipe
+
+
+def test_critics_see_counts_or_logarithms(scenes):
+    counts = torch.tensor([[[[0.0, 3.0], [1.0, 0.0]]] * 2])
+    plain = critic_maps(counts, plain=True)
+    assert torch.equal(plain[:, :2], counts)
+    torch.testing.assert_close(critic_maps(counts), 0.5 * torch.log1p(plain))
+    run = a_run(
+        scenes, objective="wgan", adversarial=AdversarialSettings(plain_counts=True, hash=PatchHash(size=16))
+    )
+    fake = a_fake(run)
+    assert torch.equal(run.objective._patches(fake), cut_patches(critic_maps(fake.counts, plain=True), 16))
