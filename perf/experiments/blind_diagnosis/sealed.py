@@ -183,14 +183,21 @@ def _foreign(case: Case, key: int) -> tuple[Any, Any]:
     from perf.experiments.blind_diagnosis import foreign
 
     rng = np.random.default_rng([key, case.number, 5])
-    scene = _scene(key, case.number)
+    habits, (on, off) = foreign.draw_habits(rng), 0.2 * np.exp(rng.uniform(-0.25, 0.25, 2))
     ends = {name: np.log(foreign.HIDEABLE[name]) for name in case.effects}
     effects = {name: float(np.exp(rng.uniform(*some))) for name, some in ends.items()}
-    habits, (on, off) = foreign.draw_habits(rng), 0.2 * np.exp(rng.uniform(-0.25, 0.25, 2))
+    scene = _scene(key, case.number)
     times = scene.sample_times()
-    frames = np.rint(255 * scene.frames(times) / scene.frames(times).max()) / 255
+    frames, times = foreign.clip_of(scene.frames(times), times, habits, rng)
     events = foreign.simulate(frames, times, float(on), float(off), effects, habits, case.number)
     return events, type(scene)(frames.astype(np.float32), times)
+
+
+def _habits_of(case: Case, key: int) -> list[str]:
+    """Return what a world of another simulator does by habit, and what may be named there."""
+    from perf.experiments.blind_diagnosis import foreign
+
+    return sorted(foreign.draw_habits(np.random.default_rng([key, case.number, 5])).named())
 
 
 def run_case(job: Job) -> Line:
@@ -253,7 +260,8 @@ def cases(options: argparse.Namespace) -> Iterator[Case]:
             add("noisy", (), "none", noisy=True)
             add("frames", (), "none", frames=("25", "100")[n % 2], noisy=n % 4 > 1)
         for name in foreign.HIDEABLE:
-            add("foreign", (name,), "drawn")
+            for _ in range(3):
+                add("foreign", (name,), "drawn")
             add("foreign", (), "drawn")
             add("foreign", _together(rng, list(foreign.HIDEABLE), 2), "drawn")
     found = sorted(options.hidden.glob("[a-z]_*.npz")) if options.hidden else ()
@@ -441,7 +449,7 @@ def _note(log: Any, line: Line, *, options: argparse.Namespace) -> None:
         return
     line["key"] = options.key
     if line["case"]["kind"] == "foreign":
-        line["allowed"] = sorted(HABITS)
+        line["allowed"] = _habits_of(Case(**line["case"]), number_of(options.key))
     if line["case"]["kind"] == "other":
         line["case"]["effects"], line["allowed"] = true_effects(options.hidden, line["case"]["strength"])
     log.write(json.dumps(line) + "\n")
