@@ -2,13 +2,13 @@
 
 Three kinds of them, after what other simulators do, and habits that are drawn for each:
 
-- *frames* (as v2e): from frame to frame; several events of a pixel between two frames are spread evenly, and each
-  takes its turn at the dead time; intensities may be linear below a knee; a low-pass goes in steps of a frame
-  and may follow the light; leak moves the memory once a frame, and noise is drawn once a frame.
-- *lines* (as ESIM): the logarithm goes in straight lines between frames, crossings are exact on them, and events in
-  the dead time are lost while the memory follows.
-- *circuit*: a tenth of a frame at a time; the low-pass works on the light before the logarithm; an event resets the memory
-  to the level of the moment, as does the end of the dead time; noise is on the voltage.
+- *frames* (as v2e): from frame to frame; several events of a pixel between two frames are spread evenly, and
+  each takes its turn at the dead time; intensities may be linear below a knee; a low-pass goes in steps of a
+  frame and may follow the light; leak moves the memory once a frame, and noise is drawn once a frame.
+- *lines* (as ESIM): the logarithm goes in straight lines between frames, crossings are exact on them, and
+  events in the dead time are lost while the memory follows.
+- *circuit*: a tenth of a frame at a time; the low-pass works on the light before the logarithm; an event sets
+  the memory to the level of the moment, as does the end of the dead time.
 
 The clips may be of fewer frames, with a lamp in them. Nothing of it is shared with dase's kernels.
 """
@@ -28,7 +28,7 @@ HIDEABLE: dict[str, tuple[float, float]] = {
     "bandwidth": (25.0, 150.0), "leak": (0.5, 6.0), "shot": (2.0, 30.0), "mismatch": (0.08, 0.3),
     "refractory": (2e-3, 15e-3),
 }  # fmt: skip
-"""Effects that all have and the ends of their strengths: cutoff, rates [Hz], share of a threshold, time [s]."""
+"""Effects that all have, and the ends of their strengths: cutoff, rates [Hz], share of a threshold, [s]."""
 
 
 @dataclass(frozen=True)
@@ -58,11 +58,11 @@ class Habits:
     every: int
 
     def named(self) -> set[str]:
-        """Return the effects of dase that this world does have as habits, and that may be named."""
-        out = {"timestamp"} if self.style != "lines" else set()
-        return (
-            out | ({"linlog"} if self.knee else set()) | ({"linlog", "dark"} if self.floor > 2e-3 else set())
-        )
+        """Return the effects of dase that this world does have by habit, and that may be named."""
+        out = {"timestamp"} if self.style != "lines" else set[str]()
+        if self.knee:
+            out |= {"linlog"}
+        return out | {"linlog", "dark"} if self.floor > 2e-3 else out
 
 
 def draw_habits(rng: np.random.Generator) -> Habits:
@@ -82,7 +82,7 @@ def draw_habits(rng: np.random.Generator) -> Habits:
 
 
 def clip_of(frames: Array, times: Array, habits: Habits, rng: np.random.Generator) -> tuple[Array, Array]:
-    """Return the clip that is simulated and handed over: frames of 8 bits, shape (T, H, W), and their times."""
+    """Return the clip that is simulated and handed over: frames of 8 bits, (T, H, W), and their times."""
     wave = np.sin(2 * np.pi * (rng.choice([100.0, 120.0]) * times + rng.uniform()))
     rows, columns = np.mgrid[: frames.shape[1], : frames.shape[2]] / frames.shape[2]
     x, y, width = rng.uniform((0.2, 0.2, 0.1), (0.8, 0.6, 0.3))
