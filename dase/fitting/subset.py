@@ -66,6 +66,12 @@ class PixelSubset:
         found: Array = answer_requests([SimulationRequest(self, space, np.atleast_2d(places), seed)])[0]
         return found
 
+    def run_repeats(self, space: ParameterSpace, places: Array, *, seed: int) -> Array:
+        """Do what `run` does, where each model has random numbers of its own."""
+        request = SimulationRequest(self, space, np.atleast_2d(places), seed, repeats=True)
+        found: Array = compute_statistics(answer_requests([request])[0], self.frame)[0]
+        return found
+
     def streams(self, space: ParameterSpace) -> bool:
         """Whether the events of models go through a readout."""
         return self.trials.ticks(space.sensor) is None

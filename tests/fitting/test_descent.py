@@ -24,6 +24,8 @@ from dase.fitting.model import (
     with_phase,
 )
 from dase.fitting.scheduler import run_work
+from dase.probes.distance import ErrorScale
+from dase.probes.statistics import SIZE
 from dase.simulation.sensor import Sensor
 
 LAMP = EFFECTS["flicker"](frequency=100.0, depth=0.2, phase=0.05)
@@ -94,15 +96,17 @@ def evidence(lit, device):
 
 def test_a_last_step_that_leads_astray_is_taken_back(evidence, lit, monkeypatch):
     model = model_of(lit, ["threshold", "flicker.depth", "flicker.phase"])
-    gain = confidence_intervals._parameters_per_statistic
+    estimator = confidence_intervals._linear_estimator
 
-    def wrong(half, model, repeats, *, seed):
-        out = gain(half, model, repeats, seed=seed)
-        return -40.0 * out
+    def wrong(half, model, way, *, seed):
+        out = estimator(half, model, way, seed=seed)
+        return replace(out, gain=-40.0 * out.gain)
 
-    monkeypatch.setattr(confidence_intervals, "_parameters_per_statistic", wrong)
+    monkeypatch.setattr(confidence_intervals, "_linear_estimator", wrong)
     stays, values = estimate_parameters(evidence, model, seed=0)
-    np.testing.assert_array_equal(stays.place, model.place)
+    names = [axis.name for axis in stays.space.axes]
+    stayed = [stays.place[names.index(axis.name)] for axis in model.space.axes]
+    np.testing.assert_allclose(stayed, model.place, rtol=1e-12)
     assert values["flicker.phase"].value == pytest.approx(0.05, abs=1e-6)
 
 
@@ -113,3 +117,51 @@ def test_a_last_step_that_helps_is_taken(evidence, lit):
     assert values["threshold.on"].value == pytest.approx(lit["threshold"].on, rel=0.03)
     assert values["threshold.off"].value == pytest.approx(lit["threshold"].off, rel=0.03)
     assert not np.array_equal(moved.place, model.place)
+
+
+class LinearHalf:
+    """Pixels whose statistics run along straight lines with normal errors; two columns are nearly alike."""
+
+    doubt = drift = None
+    groups = 2
+
+    def __init__(self, model, statistics, rng):
+        self.rng, self.model = rng, model
+        self.lines = rng.standard_normal((statistics, len(model.place)))
+        self.lines[:, 1] = self.lines[:, 0] + 0.4 * self.lines[:, 1]
+        true = model.place + rng.uniform(-0.05, 0.05, len(model.place))
+        target = self.run(None, true[None], seed=0)[0]
+        # with all of what chance does in each
+        self.scale = ErrorScale(target, np.ones(len(target)), np.ones(len(target), np.bool_))
+        self.repeats = self.run(None, np.repeat(model.place[None], 60, 0), seed=0)
+        self.left_out = np.zeros((2, len(target)))
+        self.true = true
+
+    def run(self, space, places, *, seed):
+        return (places - self.model.place) @ self.lines.T + self.rng.standard_normal(
+            (len(places), len(self.lines))
+        )
+
+    run_repeats = run
+
+
+def test_intervals_hold_where_slopes_are_noisy_and_parameters_make_up_for_each_other(lit):
+    """Slopes of few simulations of many statistics fall short along that way; the interval knows it."""
+    model = model_of(lit, ["threshold", "flicker.depth"])
+    rng, inside, falls_short, width = np.random.default_rng(1), [], [], []
+    for seed in range(100):
+        half = LinearHalf(model, SIZE, rng)
+        way = np.diag([0.3, 0.3, 0.3])
+        found = confidence_intervals._linear_estimator(half, model, way, seed=seed)
+        deviation = confidence_intervals._standard_deviations(half, found)
+        estimate = model.place + found.gain @ (half.scale.target - half.repeats.mean(0))
+        inside.append(np.abs(estimate - half.true) < 1.645 * deviation)
+        weighed = half.lines.T * half.scale.weights()  # families alike, however many statistics they have
+        exact = np.linalg.solve(weighed @ half.lines, weighed)
+        width.append(deviation / np.sqrt((exact**2).sum(1)))
+        raw = way @ confidence_intervals._steps_per_statistic(half, model, way, seed=seed)
+        falls_short.append(np.linalg.eigvals(raw @ half.lines).real.min())
+    assert np.median(falls_short) < 0.7  # else the test would show nothing
+    assert np.all(np.mean(inside, axis=0) > 0.8)
+    # and is not much wider than it must be
+    assert np.all(np.median(width, axis=0) < 2)
