@@ -39,12 +39,12 @@ def test_targets_have_physics_beyond_thresholds():
 
 def test_seeds_come_one_after_the_other():
     plan = study_plan(("reconstruction", "flow"), ("esim", "fitted", "true"), ("slow", "all"), (0, 1))
-    assert plan[:2] == [Job("adapt", "", "slow", 0), Job("adapt", "", "all", 0)]
+    assert plan[:2] == [Job("fit", "", "slow", 0), Job("fit", "", "all", 0)]
     half = 2 * (2 * 2 + 1)
     assert [job.seed for job in plan[2:]] == [0] * half + [1] * half
     assert len(set(plan)) == len(plan)
     assert Job("flow", "esim", "", 1) in plan
-    assert not any(job.task == "adapt" for job in study_plan(("flow",), ("esim", "true"), ("slow",), (0,)))
+    assert not any(job.task == "fit" for job in study_plan(("flow",), ("esim", "true"), ("slow",), (0,)))
 
 
 def test_what_is_not_known_yet_or_takes_too_long_waits():
@@ -54,6 +54,8 @@ def test_what_is_not_known_yet_or_takes_too_long_waits():
         Job("flow", "esim", "", 0),
     ]
     assert next_job(waiting, set(), 100.0, {}) == waiting[1]
-    assert next_job(waiting, {"slow"}, 100.0, {}) == waiting[0]
+    assert next_job(waiting, {("tune", "slow")}, 100.0, {}) == waiting[1]
+    learned = {("fit", "slow")}
+    assert next_job(waiting, learned, 100.0, {}) == waiting[0]
     assert next_job(waiting, set(), 100.0, {"reconstruction": 120.0}) == waiting[2]
-    assert next_job(waiting, {"slow"}, 100.0, {"reconstruction": 120.0, "flow": 101.0}) is None
+    assert next_job(waiting, learned, 100.0, {"reconstruction": 120.0, "flow": 101.0}) is None

@@ -34,13 +34,14 @@ from typing import Any, NamedTuple
 import torch
 
 import dase
+from dase.files.atomic_file import replacing
 from dase.tasks.flow_metrics import flow_errors
 from dase.tasks.image_metrics import structural_similarity
 from dase.torch import Batch
 from perf.experiments.downstream.sensors import (
-    ADAPTED,
     FAST,
     KINDS,
+    LEARNED_BY,
     OF_NO_TARGET,
     TARGETS,
     VIEW,
@@ -143,28 +144,29 @@ class Study:
                 raise OutOfTime
             yield batch
 
-    def adapted(self, target: str) -> bool:
-        """Return whether a target's recording has been learned from."""
-        return (self.out / "sensors" / f"{target}.json").exists()
+    def learned_file(self, task: str, target: str) -> Path:
+        """Return the file of what `tune` or `fit` has learned from a target's recording."""
+        return self.out / "sensors" / f"{target}{'.json' if task == 'tune' else '.toml'}"
 
-    def adapt(self, target: str) -> dict[str, Any]:
-        """Return what was learned of a target from its recording, from the file where there is one."""
-        path = self.out / "sensors" / f"{target}.json"
-        toml = path.with_suffix(".toml")
-        if not path.exists():
-            path.parent.mkdir(parents=True, exist_ok=True)
-            begin = time.monotonic()
-            recorded = record_target(TARGETS[target], self.train, self.size.recorded, self.device)
+    def learned(self) -> set[tuple[str, str]]:
+        """Return the tasks of LEARNED_BY that are done, each with its target."""
+        tasks = itertools.product(LEARNED_BY.values(), TARGETS)
+        return {(task, target) for task, target in tasks if self.learned_file(task, target).exists()}
+
+    def learn(self, task: str, target: str) -> None:
+        """Tune or fit to a target's recording, and leave a file."""
+        path = self.learned_file(task, target)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        recorded = record_target(TARGETS[target], self.train, self.size.recorded, self.device)
+        if task == "fit":
+            text = dase.dump_sensor(fit_target(recorded, self.device))
+        else:
             scenes, windows = (4, 6) if self.size is SMALL else (16, 60)
             base = tune_threshold(recorded.rate, self.train, self.device, scenes=scenes, windows=windows)
-            tuned = time.monotonic()
-            toml.write_text(dase.dump_sensor(fit_target(recorded, self.device)))
-            found = {
-                "target": target, "events": len(recorded.events), "rate": recorded.rate, "tuned": base,
-                "seconds": {"record and tune": tuned - begin, "fit": time.monotonic() - tuned},
-            }  # fmt: skip
-            path.write_text(json.dumps(found, indent=1) + "\n")
-        return json.loads(path.read_text()) | {"fitted": dase.load_sensor(toml)}
+            found = {"target": target, "events": len(recorded.events), "rate": recorded.rate, "tuned": base}
+            text = json.dumps(found, indent=1) + "\n"
+        with replacing(path) as temporary:
+            temporary.write_text(text, "utf-8")
 
     def training(self, kind: str, target: str) -> Training:
         """Return what is trained on."""
@@ -175,10 +177,10 @@ class Study:
             return Training(plain_sensor(0.2), broad_thresholds, augment)
         if kind == "true":
             return Training(TARGETS[target])
-        found = self.adapt(target)
         if kind == "tuned":
-            return Training(plain_sensor(found["tuned"]), tuned_thresholds(found["tuned"]))
-        return Training(found["fitted"])
+            base = json.loads(self.learned_file("tune", target).read_text("utf-8"))["tuned"]
+            return Training(plain_sensor(base), tuned_thresholds(base))
+        return Training(dase.load_sensor(self.learned_file("fit", target)))
 
     def train_one(self, task: str, kind: str, target: str, seed: int) -> torch.nn.Module:
         """Return a trained network, gone on with where the last call stopped."""
@@ -228,9 +230,9 @@ class Study:
         return {name: sum(row[name] for row in rows) / len(rows) for name in rows[0]}
 
     def do(self, job: Job) -> list[dict[str, Any]]:
-        """Train a network and return its line for each target it is tested on; or adapt, and return none."""
-        if job.task == "adapt":
-            self.adapt(job.target)
+        """Train a network and return its line for each target it is tested on; or learn, and return none."""
+        if job.task in LEARNED_BY.values():
+            self.learn(job.task, job.target)
             return []
         begin = time.monotonic()
         network = self.train_one(*job)
@@ -265,7 +267,7 @@ def unpack_photos(photos: Path, out: Path) -> tuple[str, str]:
 
 
 class Job(NamedTuple):
-    """A training and its tests; or with the task `adapt` what is learned of a target from its recording."""
+    """A training and its tests; or with a task of LEARNED_BY what is learned from a target's recording."""
 
     task: str
     kind: str
@@ -278,7 +280,8 @@ def study_plan(
 ) -> list[Job]:
     """Return all jobs in the order in which they are wanted: what others wait for, then seed by seed."""
     known = [kind for kind in kinds if kind not in OF_NO_TARGET]
-    jobs = [Job("adapt", "", target, 0) for target in targets if ADAPTED & set(kinds)]
+    tasks_before = [LEARNED_BY[kind] for kind in kinds if kind in LEARNED_BY]
+    jobs = [Job(task, "", target, 0) for task in tasks_before for target in targets]
     for seed in seeds:
         each = [(kind, target) for target in targets for kind in known]
         each += [(kind, "") for kind in kinds if kind in OF_NO_TARGET]
@@ -286,17 +289,20 @@ def study_plan(
     return jobs
 
 
-def next_job(waiting: Sequence[Job], adapted: set[str], left: float, longest: dict[str, float]) -> Job | None:
+def next_job(
+    waiting: Sequence[Job], learned: set[tuple[str, str]], left: float, longest: dict[str, float]
+) -> Job | None:
     """Return the first job that can be done now.
 
     Args:
         waiting: Jobs in the order in which they are wanted.
-        adapted: Targets whose recordings have been learned from.
+        learned: Tasks of LEARNED_BY that are done, and their targets.
         left: Time left to this call [s].
         longest: Time that a job of a task took [s]; one that cannot come to its end is not begun.
     """
     for job in waiting:
-        if (job.kind not in ADAPTED or job.target in adapted) and longest.get(job.task, 0.0) < left:
+        needs = LEARNED_BY.get(job.kind)
+        if (needs is None or (needs, job.target) in learned) and longest.get(job.task, 0.0) < left:
             return job
     return None
 
@@ -318,7 +324,7 @@ def begin_process(study: Study, device: str) -> None:
 
 
 def do_job(job: Job) -> list[dict[str, Any]] | None:
-    """Return lines of results, none for an adaptation; None where the time was over."""
+    """Return lines of results, none for what is learned; None where the time was over."""
     assert _study is not None
     try:
         return _study.do(job)
@@ -336,12 +342,12 @@ def run_jobs(study: Study, plan: Sequence[Job], devices: Sequence[str], jobs: in
     waiting, failed = list(plan), 0
     running: dict[Future[Any], tuple[Job, str, float]] = {}
     longest: dict[str, float] = {}
-    adapted = {target for target in TARGETS if study.adapted(target)}
+    learned = study.learned()
     while True:
         for place in range(jobs * len(devices)):
             device = devices[place % len(devices)]
             left = study.deadline - time.monotonic()
-            job = next_job(waiting, adapted, left, longest)
+            job = next_job(waiting, learned, left, longest)
             if job is None or left < 0:
                 break
             if sum(where == device for _, where, _ in running.values()) < jobs:
@@ -361,8 +367,8 @@ def run_jobs(study: Study, plan: Sequence[Job], devices: Sequence[str], jobs: in
                 continue
             seconds = time.monotonic() - begin
             longest[job.task] = max(longest.get(job.task, 0.0), seconds)
-            if job.task == "adapt":
-                adapted.add(job.target)
+            if not job.kind:
+                learned.add((job.task, job.target))
             print(f"{seconds:6.1f} s {' '.join(map(str, job))}", flush=True)
             # all lines of a network together, so that none is left out where a call is ended
             with (study.out / "results.jsonl").open("a") as file:
@@ -396,7 +402,7 @@ def main() -> None:
     lines = log.read_text().splitlines() if log.exists() else []
     found = map(json.loads, lines)
     done = {Job(row["task"], row["kind"], row["trained_for"], row["seed"]) for row in found}
-    done |= {Job("adapt", "", target, 0) for target in TARGETS if study.adapted(target)}
+    done |= {Job(task, "", target, 0) for task, target in study.learned()}
     asked = (one.split(",") for one in (args.tasks, args.kinds, args.targets))
     seeds = [int(seed) for seed in args.seeds.split(",")]
     plan = [job for job in study_plan(*asked, seeds) if job not in done]

@@ -51,8 +51,8 @@ START = sensor_with(
 KINDS = ("esim", "broad", "tuned", "fitted", "true")
 """What is trained on; the first two do not know their target."""
 OF_NO_TARGET = KINDS[:2]
-ADAPTED = {"tuned", "fitted"}
-"""What is learned from a target's recording."""
+LEARNED_BY = {"tuned": "tune", "fitted": "fit"}
+"""What is learned from a target's recording, and the task that does so."""
 
 FLIPS = dase.torch.Augment(flips=0.5)
 
