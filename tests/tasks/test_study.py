@@ -8,19 +8,36 @@ pytest.importorskip("torch")
 
 from perf.experiments.downstream.run import Job, next_job, study_plan
 from perf.experiments.downstream.sensors import TARGETS, tuned_thresholds
-from perf.experiments.downstream.table import closed_gaps, mean_text, tables
+from perf.experiments.downstream.table import mean_text, paired_gaps, share_interval, share_text, tables
 
 
 def test_gaps_are_of_pairs():
     found = {("tuned", "slow"): {0: 0.5, 1: 0.6}, ("true", "slow"): {0: 0.3, 1: 0.4, 2: 0.1},
              ("fitted", "slow"): {0: 0.35, 1: 0.6, 2: 0.2}}  # fmt: skip
-    assert closed_gaps(found, "fitted", "slow") == pytest.approx([75, 0])
-    assert closed_gaps(found, "true", "slow") == pytest.approx([100, 100])
+    part, whole = paired_gaps(found, "fitted", "slow")
+    assert part == pytest.approx([-0.15, 0.0])
+    assert whole == pytest.approx([-0.2, -0.2])
+    assert share_text(whole, whole) == "100 (100 to 100)"
     assert mean_text([1.0, 2.0, 3.0], 2) == "2.00 ± 2.48"  # 4.303 / √3
     assert mean_text([], 2) == "–"
     rows = [{"task": "flow", "kind": kind, "target": "slow", "seed": seed, "aee": value}
             for (kind, _), values in found.items() for seed, value in values.items()]  # fmt: skip
     assert "| tuned | 0.550 ± 0.635 | – | – | – |" in tables(rows)
+
+
+def test_intervals_of_shares_hold_the_truth_as_often_as_they_say(rng):
+    """And there is none where the gap may be 0; two pairs are few, and say little."""
+    held, count = 0, 4000
+    for _ in range(count):
+        whole = rng.normal(-1.0, 0.2, 5)
+        part = 0.8 * whole + rng.normal(0.0, 0.1, 5)
+        low, high = share_interval(list(part), list(whole))
+        held += low <= 0.8 <= high
+    assert held / count == pytest.approx(0.95, abs=0.015)
+    assert share_interval([0.1, 0.1], [0.1, -0.2]) is None
+    assert share_text([0.1, 0.1], [0.1, -0.2]).endswith("(no clear gap)")
+    assert share_text([-0.08], [-0.1]) == "80"
+    assert share_text([], []) == "–"
 
 
 def test_what_is_tuned_is_one_polarity(rng):

@@ -3,7 +3,8 @@
     python -m perf.experiments.downstream.table RESULTS.jsonl
 
 The gap is that between the tuned and the true sensor of the same seed; 100 % is as good as the true one.
-Intervals are those of the mean over seeds (Student's t, 95 %), none for one seed. Prints Markdown.
+Intervals are those of the mean over seeds (Student's t, 95 %), none for one seed; those of shares are
+Fieller's, of paired seeds, and there is none where the gap itself may be 0. Prints Markdown.
 """
 
 from __future__ import annotations
@@ -17,8 +18,13 @@ from scipy.stats import t as student
 
 from perf.experiments.downstream.sensors import KINDS, TARGETS
 
-MEASURES = (("reconstruction", "l1", 4), ("reconstruction", "ssim", 3), ("flow", "aee", 3))
-"""Task, column and decimals of each table."""
+MEASURES = (
+    ("reconstruction", "l1", "l1_grey", 4), ("reconstruction", "ssim", "", 3), ("flow", "aee", "aee_zero", 3),
+)  # fmt: skip
+"""Task, column, column of what is to be had without a network, and decimals of each table."""
+
+Found = dict[tuple[str, str], dict[int, float]]
+"""Values by kind and target, and by seed."""
 
 
 def mean_text(values: list[float], decimals: int) -> str:
@@ -32,21 +38,57 @@ def mean_text(values: list[float], decimals: int) -> str:
     return f"{text} ± {half:.{decimals}f}"
 
 
-def closed_gaps(found: dict[tuple[str, str], dict[int, float]], kind: str, target: str) -> list[float]:
-    """Return the share of the gap between `tuned` and `true` that a kind closes [%], one for each seed."""
+def paired_gaps(found: Found, kind: str, target: str) -> tuple[list[float], list[float]]:
+    """Return how much better than `tuned` a kind is, and `true` is, one number for each seed of all three."""
     mine, tuned, true = (found.get((one, target), {}) for one in (kind, "tuned", "true"))
     seeds = sorted(mine.keys() & tuned.keys() & true.keys())
-    return [100 * (mine[s] - tuned[s]) / (true[s] - tuned[s]) for s in seeds if true[s] != tuned[s]]
+    return [mine[s] - tuned[s] for s in seeds], [true[s] - tuned[s] for s in seeds]
+
+
+def share_interval(part: list[float], whole: list[float]) -> tuple[float, float] | None:
+    """Return Fieller's interval (95 %) of the mean of `part` over that of `whole`, whose numbers are pairs.
+
+    None for fewer than two pairs, and where the mean of `whole` may be 0.
+    """
+    if len(part) < 2:
+        return None
+    times = student.ppf(0.975, len(part) - 1) ** 2 / len(part)
+    (vp, cov), (_, vw) = times * np.cov(part, whole)
+    p, w = np.mean(part), np.mean(whole)
+    # all shares r for which the mean of part - r · whole may be 0
+    a, b, c = w * w - vw, p * w - cov, p * p - vp
+    if a <= 0:
+        return None
+    root = np.sqrt(max(b * b - a * c, 0.0))
+    return float((b - root) / a), float((b + root) / a)
+
+
+def share_text(part: list[float], whole: list[float]) -> str:
+    """Return the share of a gap that is closed, with its interval [%]."""
+    if not part or np.mean(whole) == 0:
+        return "–"
+    share, interval = 100 * np.mean(part) / np.mean(whole), share_interval(part, whole)
+    if len(part) < 2:
+        return f"{share:.0f}"
+    return f"{share:.0f} (no clear gap)" if interval is None else (
+        f"{share:.0f} ({100 * interval[0]:.0f} to {100 * interval[1]:.0f})"
+    )  # fmt: skip
+
+
+def values_of(rows: list[dict], task: str, column: str) -> Found:
+    """Return the values of a column by kind and target, and by seed."""
+    found: Found = {}
+    for row in rows:
+        if row["task"] == task and column in row:
+            found.setdefault((row["kind"], row["target"]), {})[row["seed"]] = row[column]
+    return found
 
 
 def tables(rows: list[dict]) -> str:
     """Return all tables in Markdown."""
     out = []
-    for task, column, decimals in MEASURES:
-        found: dict[tuple[str, str], dict[int, float]] = {}
-        for row in rows:
-            if row["task"] == task:
-                found.setdefault((row["kind"], row["target"]), {})[row["seed"]] = row[column]
+    for task, column, without, decimals in MEASURES:
+        found = values_of(rows, task, column)
         if not found:
             continue
         seeds = sorted({seed for values in found.values() for seed in values})
@@ -55,8 +97,16 @@ def tables(rows: list[dict]) -> str:
         for kind in KINDS:
             cells = [mean_text(list(found.get((kind, t), {}).values()), decimals) for t in TARGETS]
             out.append(f"| {kind} | {' | '.join(cells)} |")
-        cells = [mean_text(closed_gaps(found, "fitted", t), 0) for t in TARGETS]
-        out += [f"| gap closed by fitted [%] | {' | '.join(cells)} |", ""]
+        floor = values_of(rows, task, without)
+        if floor:
+            # the same for all networks
+            each = [[v for (_, t), seeds in floor.items() if t == target for v in seeds.values()]
+                    for target in TARGETS]  # fmt: skip
+            cells = [mean_text(values[:1], decimals) for values in each]
+            out.append(f"| nothing ({without}) | {' | '.join(cells)} |")
+        gaps = [paired_gaps(found, "fitted", t) for t in TARGETS]
+        out.append(f"| gap closed by fitted [%] | {' | '.join(share_text(*gap) for gap in gaps)} |")
+        out.append("")
     return "\n".join(out)
 
 
