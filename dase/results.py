@@ -348,10 +348,11 @@ class Finding:
         """Return what is said of the effect, and why."""
         why = [self.seen] if self.seen else []
         if not math.isnan(self.error_without):
-            why.append(
-                f"without it the error is {self.error_without:.3g}, with it {self.error_with:.3g}, and the "
-                f"measurement is {self.deviation:.1f} standard deviations off along its way"
-            )
+            why.append(f"without it the error is {self.error_without:.3g}, with it {self.error_with:.3g}")
+            if not math.isnan(self.deviation):
+                why[-1] += (
+                    f", and the measurement is {self.deviation:.1f} standard deviations off along its way"
+                )
         grade = "" if self.grade is Grade.EITHER else f"{self.grade}: "
         return f"{grade}{self.words()}" + (f" ({'; '.join(why)})" if why else "")
 

@@ -22,16 +22,26 @@ from dase.diagnosis.pruning import prune_model
 from dase.diagnosis.seen_effects import (
     SeenEffects,
     find_seen_effects,
+    strength_of_bursts,
+    with_effect_of_bursts,
     without_the_explained,
     without_the_scene,
 )
 from dase.diagnosis.settings import DEFAULTS, DiagnosisSettings
 from dase.diagnosis.state import DiagnosisState, explains_remainder, with_same_freedom
 from dase.effects import EFFECTS, Effect
+from dase.fitting.burst_strength import follows_frames, put_in_step
 from dase.fitting.confidence_intervals import estimate_parameters
 from dase.fitting.data_split import SPLIT, split_measurement
 from dase.fitting.measurement import Measured, SceneChoice, as_measurement
-from dase.fitting.model import FittedModel, fit_present_model, model_of, refit_model, refit_work
+from dase.fitting.model import (
+    FittedModel,
+    fit_present_model,
+    model_of,
+    refit_model,
+    refit_work,
+    with_fixed_effect,
+)
 from dase.fitting.plain_numbers import plain_numbers
 from dase.fitting.scene_doubt import is_guessed, with_scene_doubt
 from dase.fitting.scheduler import run_side_by_side
@@ -101,12 +111,15 @@ def diagnose(
     given = given.bound_to(measurement.scene)
     tell("looking at the events alone", 0.0, float("nan"))
     seen = find_seen_effects(measurement, effects)
+    # a sensor that has them already is compared with them
+    frames = seen.times_of_bursts(measurement) if follows_frames(given) else None
     bursts = None if "exposure" in given else seen.bursts
     evidence = split_measurement(
         measurement.events, measurement.scene, log_eps=given.log_eps, trust=measurement.trust,
         span=measurement.span, left_out=bursts.contains if bursts else None, lamp=seen.lamp,
-        pixels=pixels, seed=seed, device=device,
+        frames=frames, pixels=pixels, seed=seed, device=device,
     )  # fmt: skip
+    given = put_in_step(given, evidence)
     tell("fitting the present model", 0.0, float("nan"))
     names = frozenset(effect.name for effect in given.effects)
     state = DiagnosisState(evidence, effects, seed, tell, names, settings)
@@ -132,6 +145,13 @@ def diagnose(
         )
         start = _fitted_unless_worse(state, start.sensor, free)
     state.certain = frozenset(seen.effects) - names
+    strength = None if evidence.contradiction else strength_of_bursts(
+        seen, measurement, start.sensor, effects, pixels=pixels, seed=seed, device=device
+    )  # fmt: skip
+    if strength is not None:
+        # pixels remember the bursts between them, too
+        start = with_fixed_effect(start, strength.effect)
+        state.given |= {strength.effect.name}
     if bursts is not None:
         state.notes.append("the bursts that come with the frames are left out of all that is compared")
     # what is not of this scene has no effects to be found
@@ -142,7 +162,15 @@ def diagnose(
     if len(state.added_to(model)) > 1:
         model, judgement = prune_model(state, model, judgement)
     seen = without_the_explained(seen, measurement, model.sensor, seed)
-    found = _conclude_diagnosis(state, start, model, before, seen)
+    found = _conclude_diagnosis(state, start, model, before, seen, names)
+    if strength is not None:
+        tell("how strong the bursts are", 0.95, found.errors[-1])
+        # beside other effects it may be another
+        last = strength_of_bursts(
+            seen, measurement, found.sensor.without(strength.effect.name), effects,
+            pixels=pixels, seed=seed, device=device,
+        )  # fmt: skip
+        found = with_effect_of_bursts(found, last or strength)
     return measurement.noted(replace(found, seconds=time.perf_counter() - begin))
 
 
@@ -371,7 +399,12 @@ def _known_so_far(
 
 
 def _conclude_diagnosis(
-    state: DiagnosisState, start: FittedModel, model: FittedModel, before: float, seen: SeenEffects
+    state: DiagnosisState,
+    start: FittedModel,
+    model: FittedModel,
+    before: float,
+    seen: SeenEffects,
+    names: frozenset[str],
 ) -> Diagnosis:
     """Return what was found, judged by the part of the measurement by which nothing was chosen."""
     found = state.added_to(model)
@@ -389,7 +422,7 @@ def _conclude_diagnosis(
         judged_effects = grade_effects(
             state, model, order, way, first, last, report=report, values=values, at_bounds=at_bounds
         )
-    said = seen.findings(judged_effects.values(), state.given)
+    said = seen.findings(judged_effects.values(), names)
     findings = {one.effect: one for one in said if one.grade is not Grade.STAND_IN}
     kept = tuple(n for n in order if n in findings and findings[n].grade is not Grade.EITHER)
     nearest = tuple(n for n in order if n not in findings)

@@ -6,18 +6,20 @@ certain. What the scene itself does, such as light that flickers in a clip, is n
 
 from __future__ import annotations
 
-from collections.abc import Collection
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
 
-from dase.effects import EFFECTS
+from dase.effects import EFFECTS, Effect
 from dase.errors import InputError
 from dase.events import Events
+from dase.fitting.burst_strength import BurstStrength, burst_times_of, fit_bursts
 from dase.fitting.measurement import Measurement
-from dase.results import Finding, Grade
+from dase.results import Diagnosis, Finding, Grade
 from dase.scenes.between_frames import CameraScene
 from dase.scenes.scene import Scene
+from dase.signatures.burst_times import BurstTimes
 from dase.signatures.find import find_signatures
 from dase.signatures.frame_coupling import BurstClock
 from dase.signatures.result import Signature
@@ -67,6 +69,13 @@ class SeenEffects:
     def effects(self) -> dict[str, str]:
         """Effects of the library that are certain, each to what shows it."""
         return {name: entry.sentence for entry in self.entries for name in self.named_by(entry)}
+
+    def times_of_bursts(self, measurement: Measurement) -> BurstTimes | None:
+        """Return when the bursts of a measurement come; None where there are none at even times."""
+        for entry in self.entries:
+            if entry.name == "frame coupling":
+                return burst_times_of(measurement, entry)
+        return None
 
     def named_by(self, entry: Signature) -> tuple[str, ...]:
         """Return the effects of the library that a signature names; there may be none."""
@@ -151,6 +160,61 @@ def without_the_explained(
     made = _signatures_of(measurement.scene, sensor, seed)
     kept = tuple(entry for entry in seen.entries if entry not in open_ or not shows_in(made, entry))
     return replace(seen, entries=kept)
+
+
+def strength_of_bursts(
+    seen: SeenEffects,
+    measurement: Measurement,
+    sensor: Sensor,
+    library: Mapping[str, type[Effect]],
+    *,
+    pixels: int,
+    seed: int,
+    device: str,
+) -> BurstStrength | None:
+    """Return the effect that makes the bursts; None where there are none, or they do not tell its strength.
+
+    Args:
+        seen: In the events.
+        measurement: With the bursts.
+        sensor: Without the effect.
+        library: Effects, name to class.
+        pixels: In each part of the measurement.
+        seed: Of every random number.
+        device: Where kernels run.
+    """
+    times = seen.times_of_bursts(measurement)
+    if seen.bursts is None or times is None:
+        return None
+    for name in KINDS["frame coupling"]:
+        if name in library and name not in sensor:
+            return fit_bursts(
+                measurement, sensor, library[name], seen.bursts, times,
+                pixels=pixels, seed=seed, device=device,
+            )  # fmt: skip
+    return None
+
+
+def with_effect_of_bursts(found: Diagnosis, strength: BurstStrength) -> Diagnosis:
+    """Return a diagnosis, made without the bursts, with the effect that makes them."""
+    name = strength.effect.name
+    findings = tuple(
+        replace(
+            one, error_without=strength.error_without, error_with=strength.error_with,
+            parameters=strength.parameters,
+        )
+        if one.effect == name
+        else one
+        for one in found.findings
+    )  # fmt: skip
+    return replace(
+        found,
+        sensor=found.sensor.with_effect(strength.effect),
+        selected=(*found.selected, name),
+        errors=(*found.errors, found.errors[-1]),
+        parameters={**found.parameters, **strength.parameters},
+        findings=findings,
+    )
 
 
 def _signatures_of(scene: Scene, sensor: Sensor, seed: int) -> tuple[Signature, ...]:

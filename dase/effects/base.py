@@ -219,6 +219,13 @@ class Effect:
         """
         return self
 
+    def in_step(self, observed: Observations) -> Effect:
+        """Return this effect at the times of what comes from outside, as a measurement shows them.
+
+        Only what follows a clock that no sensor file knows, such as that of the frames, need do so.
+        """
+        return self
+
     @classmethod
     def assets(cls) -> dict[str, str]:
         """Return the files this effect needs, name to what they are."""

@@ -10,6 +10,9 @@ import warp as wp
 
 from dase.effects.base import Effect, Observations, parameter
 
+BURST = 1e-3
+"""Longest time between samples at an edge [s]: bursts of recorded cameras last 1 to 3 ms."""
+
 
 @wp.func
 def coupled(
@@ -103,6 +106,12 @@ class Exposure(Effect):
         begin = observed.frame_begin % observed.frame_interval
         return [cls(period=observed.frame_interval, exposure=observed.frame_exposure, begin=begin)]
 
+    def in_step(self, observed: Observations) -> Exposure:
+        """Return the same coupling at the times of the frames that are seen; as it is where none are."""
+        for seen in type(self).candidates(observed):
+            return replace(self, period=seen.period, exposure=seen.exposure, begin=seen.begin)
+        return self
+
     def shifted(self, seconds: float) -> Exposure:
         """Return the frames on a clock that shows `seconds` less."""
         return replace(self, begin=(self.begin - seconds) % self.period)
@@ -112,4 +121,4 @@ class Exposure(Effect):
         if not self.amplitude:
             return math.inf
         lasts = [span for span in (self.exposure, self.period - self.exposure) if span > 0]
-        return min(lasts, default=self.period) / 8
+        return min(min(lasts, default=self.period) / 8, BURST)

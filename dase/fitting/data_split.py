@@ -45,6 +45,7 @@ from dase.probes.timestamp_patterns import PATTERNS, TimestampStructure, find_st
 from dase.scenes.between_frames import CameraScene
 from dase.scenes.scene import Scene
 from dase.scenes.screen_scene import ScreenScene
+from dase.signatures.burst_times import BurstTimes
 
 
 @dataclass(frozen=True)
@@ -94,6 +95,7 @@ class SplitMeasurement:
         fastest: Events per second that a bus, if there is one, can send at least [Hz].
         notes: What the data cannot show.
         contradiction: Why the events cannot be of the scene, in a sentence; empty where they may.
+        frames: When the bursts come that are in step with frames, where they are compared.
     """
 
     train: PixelSubset
@@ -107,9 +109,11 @@ class SplitMeasurement:
     least_bus_rate: float
     notes: tuple[str, ...] = ()
     contradiction: str = ""
+    frames: BurstTimes | None = None
 
     def observe(self, *, idle_bus: float) -> Observations:
         """Return what effects may choose their candidates by, see `Observations`."""
+        frames = self.frames
         return Observations(
             peak_frequency=self.peak,
             clock_period=self.structure.step,
@@ -118,6 +122,9 @@ class SplitMeasurement:
             highest_event_rate=self.highest_event_rate,
             least_bus_rate=self.least_bus_rate,
             idle_bus=idle_bus,
+            frame_interval=frames.interval if frames else 0.0,
+            frame_begin=frames.begin if frames else 0.0,
+            frame_exposure=frames.exposure if frames else 0.0,
         )
 
     @property
@@ -143,6 +150,7 @@ def split_measurement(
     span: tuple[float, float] | None = None,
     left_out: Callable[[Array], NDArray[np.bool_]] | None = None,
     lamp: float | None = None,
+    frames: BurstTimes | None = None,
     pixels: int = SPLIT.pixels,
     seed: int = 0,
     device: str = "cpu",
@@ -160,6 +168,7 @@ def split_measurement(
             chosen.
         left_out: Tells which times [s], shape (T,), are left out; None for none.
         lamp: Frequency of light that flickers [Hz] where all events have told it; None to look for it here.
+        frames: When the bursts come that are in step with frames; None where there are none, or left out.
         pixels: In each part.
         seed: Of the choice of pixels.
         device: Where kernels run.
@@ -274,7 +283,7 @@ def split_measurement(
     if contradiction:
         notes.insert(0, contradiction)
     return SplitMeasurement(
-        train, held, last_part, scout, bands, structure, peak, *rates, tuple(notes), contradiction
+        train, held, last_part, scout, bands, structure, peak, *rates, tuple(notes), contradiction, frames
     )  # fmt: skip
 
 

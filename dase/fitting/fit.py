@@ -10,6 +10,7 @@ from os import PathLike
 
 import numpy as np
 
+from dase.fitting.burst_strength import find_frame_times, follows_frames, put_in_step
 from dase.fitting.confidence_intervals import REPEATS, estimate_parameters
 from dase.fitting.data_split import SPLIT, SplitMeasurement, split_measurement
 from dase.fitting.measurement import Measured, SceneChoice, as_measurement
@@ -45,6 +46,10 @@ class FitSettings:
 
 
 FIT = FitSettings()
+
+NO_FRAME_TIMES = (
+    "no bursts at even times in step with frames are seen: the times of `exposure` stay as they were given"
+)
 
 STANDARD_ERRORS_OF_90 = 1.6448536269514722
 """Half of an interval of 90 % of a normal distribution, in standard errors."""
@@ -88,10 +93,13 @@ def fit(
     measurement = as_measurement(measured, scene, trust)
     scene = measurement.scene
     start = start.bound_to(scene)
+    follows = follows_frames(start)
+    frames = find_frame_times(measurement) if follows else None
     evidence = split_measurement(
         measurement.events, scene, log_eps=start.log_eps, trust=measurement.trust,
-        span=measurement.span, pixels=pixels, seed=seed, device=device,
+        span=measurement.span, frames=frames, pixels=pixels, seed=seed, device=device,
     )  # fmt: skip
+    start = put_in_step(start, evidence)
     given = model_of(start, free)
     # by the part that nothing is chosen by: the starts that are compared below are chosen by another
     before = given.judge(evidence.report, repeats=REPEATS // 2, seed=SimulationStream.JUDGE.seed(seed)).error
@@ -112,6 +120,7 @@ def fit(
     notes = [
         *_notes_on_held_out_error(judgement, before),
         *evidence.notes,
+        *([NO_FRAME_TIMES] if follows and frames is None else []),
         *apart,
         *(["no descent left the start: the values are those that were given"] if stuck else []),
         *parameters_at_bounds(model, values),

@@ -296,6 +296,13 @@ def with_effect_added(present: FittedModel, effect: Effect) -> FittedModel:
     return model_of(sensor, [*old, *new])
 
 
+def with_fixed_effect(present: FittedModel, effect: Effect) -> FittedModel:
+    """Return the present model with an effect added, none of whose parameters is free."""
+    return replace(
+        present, space=replace(present.space, sensor=present.space.sensor.with_effect(effect)), loss=np.inf
+    )
+
+
 def starting_places(model: FittedModel, effect: Effect, *, few: bool = False) -> Array:
     """Return places from which an effect is tried: its strength and its character, at several thresholds.
 

@@ -1,0 +1,152 @@
+"""How strongly frames couple into the events: fitted to the bursts alone.
+
+Bursts last some milliseconds, so what the scene does meanwhile matters little, and a scene that is known
+badly does not hide them. Everything else is better fitted without them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dase.effects.base import Effect
+from dase.errors import InputError
+from dase.fitting.confidence_intervals import REPEATS, estimate_parameters
+from dase.fitting.data_split import SPLIT, SplitMeasurement, split_measurement
+from dase.fitting.descent import ranking_work
+from dase.fitting.measurement import Measurement
+from dase.fitting.model import FittedModel, model_of, refit_model, starting_places
+from dase.fitting.parameter_space import axes_of
+from dase.fitting.scheduler import run_work
+from dase.probes.random_streams import SimulationStream
+from dase.results import Estimate
+from dase.scenes.between_frames import CameraScene
+from dase.signatures.burst_times import BurstTimes, find_burst_times
+from dase.signatures.find import find_signatures
+from dase.signatures.frame_coupling import NAME, BurstClock
+from dase.signatures.result import Signature
+from dase.simulation.sensor import Sensor
+
+
+@dataclass(frozen=True)
+class BurstStrength:
+    """What the bursts say of the effect that makes them.
+
+    Args:
+        effect: With the values fitted.
+        parameters: `effect.parameter` to its estimate; how uncertain the thresholds are is not in it.
+        error_without: Of the bursts, with the sensor as it was, on pixels by which nothing was chosen.
+        error_with: The same with the effect.
+    """
+
+    effect: Effect
+    parameters: Mapping[str, Estimate]
+    error_without: float
+    error_with: float
+
+
+def burst_times_of(measurement: Measurement, coupling: Signature) -> BurstTimes | None:
+    """Return when the bursts of a measurement come; None where that is not at even times.
+
+    Args:
+        measurement: Its events have them; where one edge alone shows, its frames tell the exposure.
+        coupling: The signature that was found.
+    """
+    scene, exposure = measurement.scene, None
+    if isinstance(scene, CameraScene):
+        lasts = float(np.median(scene.end - scene.begin))
+        exposure = lasts if lasts > 0 else None
+    return find_burst_times(measurement.events, coupling.details, exposure)
+
+
+def find_frame_times(measurement: Measurement) -> BurstTimes | None:
+    """Return when bursts in step with frames come in a measurement; None where there are none."""
+    scene = measurement.scene
+    begins = scene.begin if isinstance(scene, CameraScene) else None
+    try:
+        found = find_signatures(measurement.events, begins=begins).found
+    except InputError:
+        return None
+    for entry in found:
+        if entry.name == NAME:
+            return burst_times_of(measurement, entry)
+    return None
+
+
+def follows_frames(sensor: Sensor) -> bool:
+    """Whether an effect of a sensor follows a clock that the measurement tells."""
+    return any(type(effect).in_step is not Effect.in_step for effect in sensor.effects)
+
+
+def put_in_step(sensor: Sensor, evidence: SplitMeasurement, *, idle_bus: float = 0.0) -> Sensor:
+    """Return the sensor with what follows the frames at the times of a measurement's."""
+    observed = evidence.observe(idle_bus=idle_bus)
+    for effect in sensor.effects:
+        sensor = sensor.with_effect(effect.in_step(observed))
+    return sensor
+
+
+def fit_bursts(
+    measurement: Measurement,
+    sensor: Sensor,
+    kind: type[Effect],
+    bursts: BurstClock,
+    times: BurstTimes,
+    *,
+    pixels: int = SPLIT.pixels,
+    seed: int = 0,
+    device: str = "cpu",
+) -> BurstStrength | None:
+    """Fit the effect that makes the bursts to them; None where they have too few events.
+
+    Args:
+        measurement: Events and scene.
+        sensor: All else, which is not fitted.
+        kind: The effect.
+        bursts: What is compared.
+        times: When the bursts come.
+        pixels: In each part of the measurement.
+        seed: Of every random number.
+        device: Where kernels run.
+    """
+
+    def between_bursts(t: NDArray[np.float64]) -> NDArray[np.bool_]:
+        return ~bursts.contains(t)
+
+    try:
+        evidence = split_measurement(
+            measurement.events, measurement.scene, log_eps=sensor.log_eps, trust=measurement.trust,
+            span=measurement.span, left_out=between_bursts, frames=times,
+            pixels=pixels, seed=seed, device=device,
+        )  # fmt: skip
+    except InputError:
+        return None
+    tried = kind.candidates(evidence.observe(idle_bus=0.0))
+    if not tried:
+        return None
+    models = [_fitted_to_bursts(evidence, sensor, effect, seed=seed) for effect in tried]
+    model, values = estimate_parameters(evidence, min(models, key=lambda m: m.loss), seed=seed)
+    without, with_it = (
+        one.judge(evidence.report, repeats=REPEATS // 2, seed=SimulationStream.JUDGE.seed(seed)).error
+        for one in (model_of(sensor, ()), model)
+    )
+    if not with_it < without:
+        return None
+    return BurstStrength(model.sensor[kind.name], values, without, with_it)
+
+
+def _fitted_to_bursts(
+    evidence: SplitMeasurement, sensor: Sensor, effect: Effect, *, seed: int
+) -> FittedModel:
+    """Return the sensor with the effect, whose parameters alone are fitted."""
+    together = sensor.with_effect(effect)
+    free: Sequence[str] = [axis.name for axis in axes_of(together) if axis.effect is type(effect)]
+    model = model_of(together, free)
+    stream = SimulationStream.CALIBRATE_FIT.seed(seed)
+    half = model.calibrate(evidence.scout, repeats=12, seed=stream)
+    places, losses = run_work(ranking_work(half, model.space, starting_places(model, effect), seed=seed))
+    found = FittedModel(model.space, places[0], losses[0])
+    return refit_model(evidence, found, seed=seed, rounds=1)
