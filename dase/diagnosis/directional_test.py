@@ -74,6 +74,8 @@ def find_hidden_effect(
     # also above what chance does: there no candidate may be certain by the fall of its loss
     # what the scene is not known to hides effects as chance does
     hides = judgement.level >= hidden.hides or state.evidence.train.doubt is not None
+    # nor does chance explain what is left, though it is little
+    hides = hides or (judgement.level >= hidden.some and judgement.error > judgement.reach)
     if not hides or not reaches_floor(judgement):
         return None
     state.progress("looking closer", 0.0, state.error)
