@@ -244,6 +244,10 @@ def _print_findings(found: Diagnosis, quiet: bool) -> None:
         return
     for one in (*found.findings, *found.stand_ins):
         click.echo(f"  {one.sentence()}")
+    for text in found.unexplained.whereabouts() if found.unexplained else ():
+        click.echo(f"  {text}")
+    for text in found.record:
+        click.echo(f"record next: {text}")
     click.echo(f"error as given {found.before:.2f}; 1 is what two repeats of the recording give")
     for step in found.history:
         click.echo(f"\n{' + '.join(step.model)}: error {step.error:.2f}, repeats stay below {step.gate:.2f}")
@@ -262,6 +266,10 @@ def _print_findings(found: Diagnosis, quiet: bool) -> None:
     click.echo("\nparameters, with 90 % intervals")
     for name, estimate in found.parameters.items():
         click.echo(f"  {name:24s} {estimate.value:10.4g}   {estimate.low:.4g} to {estimate.high:.4g}")
+    if found.not_seen:
+        click.echo("\nnot seen")
+        for limit in found.not_seen:
+            click.echo(f"  {limit.sentence}")
     print_plain_numbers(found.plain)
     for note in found.notes:
         click.echo(f"note: {note}")

@@ -364,6 +364,31 @@ class Finding:
 
 
 @dataclass(frozen=True, repr=False)
+class DetectionLimit:
+    """What a measurement would have shown of an effect that was not found.
+
+    Args:
+        effect: Its name.
+        parameter: `effect.parameter` that makes it strong; empty where the events alone tell.
+        strength: Least value of it that nine of ten such recordings would have shown; None for none in the
+            range of real cameras.
+        unit: Of the value.
+        rises: Whether the effect is stronger where the value is higher.
+        sentence: The same as a sentence.
+    """
+
+    effect: str
+    parameter: str
+    strength: float | None
+    unit: str
+    rises: bool
+    sentence: str
+
+    def __repr__(self) -> str:
+        return fit_to_screen([f"DetectionLimit({self.sentence})"])
+
+
+@dataclass(frozen=True, repr=False)
 class Unexplained:
     """An error that no effect of the library takes to the floor.
 
@@ -375,6 +400,9 @@ class Unexplained:
             findings.
         cells: Where what is left sits, worst first.
         sentence: The finding as one sentence.
+        of_scene: Share of what the model is off by that the scene may be blamed for, as it is only guessed
+            between frames.
+        places: Share of what is left by the pixels in which it sits: `moving`, `resting`, or `all` at once.
     """
 
     error: float
@@ -382,10 +410,31 @@ class Unexplained:
     nearest: tuple[str, ...]
     cells: tuple[Cell, ...]
     sentence: str
+    of_scene: float = 0.0
+    places: Mapping[str, float] = field(default_factory=dict)
 
     def __repr__(self) -> str:
         lines = textwrap.wrap(f"Unexplained({self.sentence})", 100, subsequent_indent="  ")
-        return fit_to_screen([*lines, *(f"  {cell.sentence}" for cell in self.cells[1:5])])
+        cells = (f"  {cell.sentence}" for cell in self.cells[1:5])
+        return fit_to_screen([*lines, *(f"  {text}" for text in self.whereabouts()), *cells])
+
+    def whereabouts(self) -> tuple[str, ...]:
+        """Return in which pixels it sits and what of it the scene may be blamed for, in sentences."""
+        words = {
+            "moving": "pixels whose light changes",
+            "resting": "pixels at rest",
+            "all": "all pixels at once",
+        }
+        sits = [
+            f"{100 * share:.0f} % in {words[kind]}" for kind, share in self.places.items() if share >= 0.05
+        ]
+        out = [f"what is left sits to {', '.join(sits)}"] if sits else []
+        if self.of_scene >= 0.05:
+            out.append(
+                f"the scene between frames may be blamed for {100 * self.of_scene:.0f} % of what the model "
+                "is off by; that much is left out of the error above"
+            )
+        return tuple(out)
 
 
 @dataclass(frozen=True, repr=False)
@@ -411,6 +460,8 @@ class Diagnosis:
         findings: What is said of each effect, with its grade: those of `selected`, those that cannot be told
             from others, and those that the events alone show but that no model was fitted with.
         stand_ins: The same of effects that came nearest and are not found.
+        record: What to record next so that more can be said, most useful first.
+        not_seen: What the measurement would have shown of each effect that is neither found nor a stand-in.
         level: Error of a repeat of the last model, in the mean.
         reach: Error that 99 of 100 repeats of it stay below, however little that is.
     """
@@ -431,6 +482,8 @@ class Diagnosis:
     finished: bool = True
     findings: tuple[Finding, ...] = ()
     stand_ins: tuple[Finding, ...] = ()
+    not_seen: tuple[DetectionLimit, ...] = ()
+    record: tuple[str, ...] = ()
     level: float = 0.0
     reach: float = 0.0
 
@@ -453,6 +506,8 @@ class Diagnosis:
                     align_columns([(name, f"{error:.2f}") for name, error in steps], right=(1,)),
                 ),
                 *_indented("findings", [one.sentence() for one in self.findings[:6]]),
+                *_indented("record next", self.record),
+                *_indented("not seen", [one.sentence for one in self.not_seen[:6]]),
                 *_parameter_lines(self.parameters, most=12),
                 *_plain_lines(self.plain),
                 *_noted(self.notes),
@@ -482,6 +537,8 @@ class Diagnosis:
             "selected": list(self.selected),
             "findings": [one.to_json() for one in self.findings],
             "stand_ins": [one.to_json() for one in self.stand_ins],
+            "record": list(self.record),
+            "not_seen": [asdict(one) for one in self.not_seen],
             "level": self.level,
             "reach": self.reach,
             "errors": list(self.errors),

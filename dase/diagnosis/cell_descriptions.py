@@ -31,6 +31,30 @@ def band_in_words(evidence: SplitMeasurement, n: int) -> str:
     return f"{name} pixels ({[f'below {edges[0]} DN', *between, f'above {edges[-1]} DN'][n]})"
 
 
+KINDS_OF_PIXELS = ("moving", "resting", "all")
+"""Whose statistics they are: of pixels whose light changes, of those at rest, of all together."""
+
+
+def kind_of_pixels(family: str, n: int) -> str:
+    """Return of which pixels the `n`-th statistic of a family is, one of `KINDS_OF_PIXELS`."""
+    match family:
+        case "rate":
+            resting = (n % (KINDS * BANDS)) // BANDS < 2  # the first two kinds of cells are at rest
+        case "intervals":
+            resting = n // INTERVALS // 3 == 1
+        case "spread":
+            resting = n // 5 == 1
+        case "space":
+            resting = n // ZONES // 2 == 1
+        case "pixels":
+            resting = n < 2
+        case "lag" | "repeats" | "change":
+            resting = False
+        case _:
+            return "all"
+    return "resting" if resting else "moving"
+
+
 def describe_statistic(evidence: SplitMeasurement, family: str, n: int) -> StatisticWords:
     """Return where the `n`-th statistic of a family is taken, what it is, and its unit."""
     words: dict[str, Callable[[SplitMeasurement, int], StatisticWords]] = {

@@ -16,9 +16,11 @@ from dase.diagnosis.candidates import (
     variants_to_try,
 )
 from dase.diagnosis.cell_descriptions import worst_cells
+from dase.diagnosis.detection_limits import find_detection_limits
 from dase.diagnosis.directional_test import find_hidden_effect
 from dase.diagnosis.grading import ModelOnReport, grade_effects, judge_on_report
 from dase.diagnosis.pruning import prune_model
+from dase.diagnosis.remainder import describe_unexplained, share_of_scene, what_to_record
 from dase.diagnosis.seen_effects import (
     SeenEffects,
     find_seen_effects,
@@ -50,7 +52,7 @@ from dase.probes.distance import Judgement, leaves_nothing, may_be_announced, re
 from dase.probes.random_streams import SimulationStream
 from dase.probes.stimulus import Trust
 from dase.results import (
-    Cell,
+    DetectionLimit,
     Diagnosis,
     Estimate,
     Finding,
@@ -62,6 +64,7 @@ from dase.results import (
     is_worse,
 )
 from dase.scenes.between_frames import CameraScene
+from dase.scenes.scene import Scene
 from dase.simulation.sensor import Sensor
 from dase.simulation.sensor_file import as_sensor
 
@@ -162,7 +165,7 @@ def diagnose(
     if len(state.added_to(model)) > 1:
         model, judgement = prune_model(state, model, judgement)
     seen = without_the_explained(seen, measurement, model.sensor, seed)
-    found = _conclude_diagnosis(state, start, model, before, seen, names)
+    found = _conclude_diagnosis(state, start, model, before, seen, names, measurement.scene)
     if strength is not None:
         tell("how strong the bursts are", 0.95, found.errors[-1])
         # beside other effects it may be another
@@ -405,6 +408,7 @@ def _conclude_diagnosis(
     before: float,
     seen: SeenEffects,
     names: frozenset[str],
+    scene: Scene,
 ) -> Diagnosis:
     """Return what was found, judged by the part of the measurement by which nothing was chosen."""
     found = state.added_to(model)
@@ -426,6 +430,11 @@ def _conclude_diagnosis(
     findings = {one.effect: one for one in said if one.grade is not Grade.STAND_IN}
     kept = tuple(n for n in order if n in findings and findings[n].grade is not Grade.EITHER)
     nearest = tuple(n for n in order if n not in findings)
+    limits: tuple[DetectionLimit, ...] = ()
+    if not state.evidence.contradiction:
+        named = {*state.given, *findings, *nearest}
+        limits = find_detection_limits(state, model, report, first.judgement, last, named)
+        limits += seen.limits({*named, *(one.effect for one in limits)})
     final, error, estimates, plain = model, last.error, values, plain_numbers(report)
     if set(kept) != set(order):
         final = _model_with_only(state, start, model, kept)
@@ -435,14 +444,15 @@ def _conclude_diagnosis(
         error, plain = judged.error, plain_numbers(bare)
     cells = worst_cells(state.evidence, last)
     unexplained: Unexplained | None = None
+    of_scene = share_of_scene(state, model, last)
     doubts = [state.evidence.contradiction] if state.evidence.contradiction else at_bounds
     if (doubts and order and not findings) or state.evidence.contradiction:
         unexplained = replace(
-            describe_unexplained(order, findings, first.judgement, last, cells),
+            describe_unexplained(order, findings, first.judgement, last, cells, of_scene),
             sentence=_sentence_of_doubts(order, doubts, last),
         )
     elif nearest or not may_be_announced(last):
-        unexplained = describe_unexplained(nearest, findings, first.judgement, last, cells)
+        unexplained = describe_unexplained(nearest, findings, first.judgement, last, cells, of_scene)
     return Diagnosis(
         sensor=final.sensor,
         selected=kept,
@@ -458,6 +468,10 @@ def _conclude_diagnosis(
         evaluations=state.evidence.evaluations,
         findings=tuple(findings.values()),
         stand_ins=tuple(one for one in said if one.grade is Grade.STAND_IN),
+        not_seen=limits,
+        record=what_to_record(
+            scene, list(findings.values()), unexplained, contradiction=bool(state.evidence.contradiction)
+        ),
         level=last.level,
         reach=last.reach,
     )
@@ -511,36 +525,3 @@ def _errors_after_additions(
         return (first,)
     known = (way.get(frozenset(kept[: n + 1])) for n in range(len(kept) - 1))
     return (first, *(one.judgement.error if one else last for one in known), last)
-
-
-def describe_unexplained(
-    nearest: Sequence[str],
-    findings: Mapping[str, Finding],
-    first: Judgement,
-    last: Judgement,
-    cells: tuple[Cell, ...],
-    usual: float = DEFAULTS.grades.usual,
-) -> Unexplained:
-    """Return what is left, how much of the error that is, and where it sits.
-
-    Args:
-        nearest: Stand-ins: effects of the last model that are not found.
-        findings: What was found.
-        first: Error of the model before the search.
-        last: Error of the last model.
-        cells: Where it fails.
-        usual: Error that true models have.
-    """
-    level = max(last.level, usual)
-    share = max(last.error - level, 0.0) / max(first.error - level, 1e-9)
-    where = f"; worst: {cells[0].sentence}" if cells else "; no single cell stands out"
-    left = f"an error of {last.error:.2g}, {100 * share:.0f} % of that before the search"
-    if findings:
-        beside = (
-            f" even with {' and '.join(nearest)}, which come nearest and are not found," if nearest else ""
-        )
-        sentence = f"beside that{beside} {left}, stays unexplained{where}"
-    else:
-        beside = f"with {' and '.join(nearest)}, which come nearest, " if nearest else "with no effect "
-        sentence = f"unexplained: {beside}{left}, is left{where}"
-    return Unexplained(last.error, share, tuple(nearest), cells, sentence)

@@ -16,13 +16,13 @@ from dase.errors import InputError
 from dase.events import Events
 from dase.fitting.burst_strength import BurstStrength, burst_times_of, fit_bursts
 from dase.fitting.measurement import Measurement
-from dase.results import Diagnosis, Finding, Grade
+from dase.results import DetectionLimit, Diagnosis, Finding, Grade
 from dase.scenes.between_frames import CameraScene
 from dase.scenes.scene import Scene
 from dase.signatures.burst_times import BurstTimes
 from dase.signatures.find import find_signatures
 from dase.signatures.frame_coupling import BurstClock
-from dase.signatures.result import Signature
+from dase.signatures.result import Answer, Signature
 from dase.simulation.sensor import Sensor
 from dase.simulation.simulate import simulate
 
@@ -50,11 +50,13 @@ class SeenEffects:
     Args:
         entries: The signatures that are there and not of the scene.
         bursts: When the whole array sends in step with the frames, which no model explains; None for never.
+        absent: Signatures that would have been there, and are not.
         library: Effects that may be named.
     """
 
     entries: tuple[Signature, ...] = ()
     bursts: BurstClock | None = None
+    absent: tuple[Signature, ...] = ()
     library: frozenset[str] = frozenset(EFFECTS)
 
     @property
@@ -106,6 +108,14 @@ class SeenEffects:
                 out.append(Finding(name, Grade.CERTAIN, seen=entry.sentence))
         return out
 
+    def limits(self, named: Collection[str]) -> tuple[DetectionLimit, ...]:
+        """Return what the events alone would have shown of effects; of none of those that are named."""
+        return tuple(
+            DetectionLimit(name, "", None, "", True, f"{entry.name}: {entry.sentence}")
+            for entry in self.absent if entry.name in NAMED
+            for name in KINDS[entry.name][:1] if name in self.library and name not in named
+        )  # fmt: skip
+
 
 def find_seen_effects(measurement: Measurement, library: Collection[str]) -> SeenEffects:
     """Return what the events of a measurement show by themselves; only effects of a library are named."""
@@ -123,7 +133,8 @@ def find_seen_effects(measurement: Measurement, library: Collection[str]) -> See
         bursts = BurstClock(np.asarray(details["begins"]), details["interval"], np.asarray(details["bursts"]))
         if begins is None:
             bursts = bursts.extend(float(events.t[-1]))
-    return SeenEffects(entries, bursts, frozenset(library))
+    absent = tuple(entry for entry in found.entries if entry.answer is Answer.NOT_SEEN)
+    return SeenEffects(entries, bursts, absent, frozenset(library))
 
 
 def without_the_scene(seen: SeenEffects, measurement: Measurement, sensor: Sensor, seed: int) -> SeenEffects:

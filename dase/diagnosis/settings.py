@@ -186,6 +186,26 @@ class GradeSettings:
 
 
 @dataclass(frozen=True)
+class DetectionSettings:
+    """How the smallest strength is found that a measurement would have shown."""
+
+    repeats: int = 10
+    """Measurements with an effect that are simulated at each strength."""
+
+    baseline: int = 30
+    """The same with next to nothing of it, to which the others are compared."""
+
+    power: float = 0.9
+    """Share of them that must show it."""
+
+    steps: int = 5
+    """Halvings of the range of strengths: to a thirty-second part of it, a factor of 1.3 for most effects."""
+
+    slow_steps: int = 3
+    """The same of effects that take ten times as long to simulate."""
+
+
+@dataclass(frozen=True)
 class DiagnosisSettings:
     """When an effect is added to a model and when the search ends."""
 
@@ -228,6 +248,7 @@ class DiagnosisSettings:
     hidden: HiddenEffectSettings = field(default_factory=HiddenEffectSettings)
     pruning: PruningSettings = field(default_factory=PruningSettings)
     grades: GradeSettings = field(default_factory=GradeSettings)
+    detection: DetectionSettings = field(default_factory=DetectionSettings)
 
 
 DEFAULTS = DiagnosisSettings()

@@ -168,10 +168,19 @@ def diagnosis_page(
         body += ["<h2>Where the model failed</h2>", html_page.cells_html(found.history[0].cells)]
     if found.unexplained is not None:
         body += ["<h2>What stays unexplained</h2>", f"<p>{escape(found.unexplained.sentence)}.</p>"]
+        body += [f"<p>{escape(text[:1].upper() + text[1:])}.</p>" for text in found.unexplained.whereabouts()]
         body += [
             html_page.cells_html(
                 found.unexplained.cells, "It is spread over many cells; no single one stands out."
             )
+        ]
+    if found.record:
+        items = "".join(f"<li>{escape(text)}</li>" for text in found.record)
+        body += ["<h2>What to record next</h2>", f"<ul>{items}</ul>"]
+    if found.not_seen:
+        limits = [(one.effect, one.sentence) for one in found.not_seen]
+        body += [
+            html_page.folded_html("What was not seen", html_page.table_html(("effect", "limit"), limits))
         ]
     body += [
         *_figures_html(plates),

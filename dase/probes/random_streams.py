@@ -39,6 +39,8 @@ class SimulationStream(Enum):
     """Models that give these slopes."""
     SCENE_DOUBT = (1100, 1)
     """Events of a model over its own scene, and with a turn more the model over half of the frames."""
+    DETECTION = (1300, 1)
+    """Measurements with an effect that was not found; a turn is a strength."""
     STIMULUS = (0, 1000)
     """Standard recordings; a turn is a stimulus."""
     RECORDING = (1, 500_000)

@@ -1,0 +1,263 @@
+"""What a recording would have shown: the smallest strength of each effect that was not found.
+
+"Not found" says nothing without it: a recording of half a second at rest shows no refractory period, however
+long. So the effect is simulated in the last model at strengths that close in on the least one that is seen,
+where what the free parameters could do as well is taken out, and what the last model leaves stays in: the
+error and the deviation that the measurement would have had then go through the rules by which effects are
+graded.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dase.diagnosis.candidates import effects_to_try, variants_to_try
+from dase.diagnosis.directional_test import RepeatCloud
+from dase.diagnosis.grading import grade_of
+from dase.diagnosis.settings import DiagnosisSettings
+from dase.diagnosis.state import DiagnosisState, explains_remainder
+from dase.effects.base import Effect
+from dase.fitting.model import FittedModel, with_effect_added
+from dase.fitting.parameter_space import SearchAxis
+from dase.fitting.scene_doubt import misfit_beyond_chance
+from dase.fitting.scheduler import SimulationRequest, Work, run_side_by_side
+from dase.fitting.subset import CalibratedSubset
+from dase.formatting import format_metric
+from dase.probes.distance import Judgement, leaves_nothing, pseudo_huber, reaches_floor
+from dase.probes.random_streams import SimulationStream
+from dase.probes.statistics import LAYOUT, compute_statistics
+from dase.results import DetectionLimit, Grade
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class ReportedModel:
+    """The last model on the part that reports, and what makes a synthetic measurement of it.
+
+    Args:
+        half: With the model as its present one.
+        model: The last one of the search.
+        start: Error of the model before the search.
+        last: Error of the last model.
+        absorbed: An orthonormal base of what the free parameters can do, in standard errors, shape (J, P).
+        misfit: What the model is off by beyond chance, with its sign, shape (J,).
+    """
+
+    half: CalibratedSubset
+    model: FittedModel
+    start: Judgement
+    last: Judgement
+    absorbed: Array
+    misfit: Array
+
+
+def find_detection_limits(
+    state: DiagnosisState,
+    model: FittedModel,
+    report: CalibratedSubset,
+    start: Judgement,
+    last: Judgement,
+    named: Collection[str],
+) -> tuple[DetectionLimit, ...]:
+    """Return for each effect that is not found the smallest strength that would have been.
+
+    Args:
+        state: What the search has found.
+        model: The last one.
+        report: The part that reports, with `model` as its present one.
+        start: Error of the model before the search.
+        last: Error of the last model.
+        named: Effects that are found, or named as what comes nearest.
+    """
+    known = _reported_model(state, model, report, start, last)
+    works, asked = [], []
+    for name in effects_to_try(state.effects, model):
+        if name in named:
+            continue
+        tried = variants_to_try(
+            state.evidence, state.effects[name], idle_bus=state.settings.candidates.idle_bus
+        )
+        # the events show by themselves that there is none
+        if not tried or (axis := main_axis(model, tried[0])) is None:
+            continue
+        asked.append((tried[0], axis))
+        works.append(_limit_work(state, known, tried[0], axis))
+    places = run_side_by_side(
+        works, lambda share: state.progress("what would have been seen", share, last.error)
+    )
+    return tuple(
+        describe_limit(effect, axis, place) for (effect, axis), place in zip(asked, places, strict=True)
+    )
+
+
+def main_axis(model: FittedModel, effect: Effect) -> SearchAxis | None:
+    """Return the parameter that makes an effect strong; None where that is not fitted."""
+    axes = with_effect_added(model, effect).space.axes
+    mine = [axis for axis in axes if axis.effect is type(effect) and axis.main]
+    return mine[0] if mine else None
+
+
+def describe_limit(effect: Effect, axis: SearchAxis, place: float | None) -> DetectionLimit:
+    """Return a limit in words.
+
+    Args:
+        effect: Which one.
+        axis: Of its strength.
+        place: Of the smallest strength that would have been seen; None for none.
+    """
+    above = _rises(axis)
+    weak, strong = _range_of(axis)
+    unit = "" if axis.fact.unit == "1" else axis.fact.unit
+    words = axis.name.replace(".", " ")
+    side = "above" if above else "below"
+    end = _number(float(axis.to_value(strong)), unit)
+    if place is None:
+        sentence = f"no {words} up to {end} would have been seen" if above else (
+            f"no {words} down to {end} would have been seen"
+        )  # fmt: skip
+        return DetectionLimit(effect.name, axis.name, None, axis.fact.unit, above, sentence)
+    value = float(axis.to_value(place))
+    least = " (the least that was tried)" if place == weak else ""
+    sentence = f"{words} {side} {_number(value, unit)} would have been seen{least}"
+    return DetectionLimit(effect.name, axis.name, value, axis.fact.unit, above, sentence)
+
+
+def _number(value: float, unit: str) -> str:
+    return format_metric(value, unit) if unit in ("Hz", "s") else f"{value:.2g} {unit}".strip()
+
+
+def _rises(axis: SearchAxis) -> bool:
+    """Whether the effect is stronger where the value is higher."""
+    off = axis.fact.off
+    return off is not None and off <= axis.low
+
+
+def _range_of(axis: SearchAxis) -> tuple[float, float]:
+    """Return the places of the weakest strength that is tried and of the strongest."""
+    low, high = axis.bounds()
+    far = float(axis.to_place(axis.fact.plausible[1])), float(axis.to_place(axis.fact.plausible[0]))
+    return (low, far[0]) if _rises(axis) else (high, far[1])
+
+
+def _reported_model(
+    state: DiagnosisState, model: FittedModel, half: CalibratedSubset, start: Judgement, last: Judgement
+) -> ReportedModel:
+    hidden, count = state.settings.hidden, state.settings.hidden.repeats_of_mean
+    tight = [axis.of_threshold for axis in model.space.axes]
+    reach = np.diag(np.where(tight, hidden.threshold_reach, hidden.reach))
+    sides = np.concatenate([model.place + reach, model.place - reach])
+    seed = SimulationStream.DIRECTIONS.seed(state.seed)
+    values = half.run_repeats(model.space, np.repeat(sides, count, 0), seed=seed)
+    plus, minus = np.split(values.reshape(len(sides), count, -1).mean(1), 2)
+    slopes = _in_standard_errors(half, plus - minus).T
+    frame = np.linalg.qr(slopes)[0] if slopes.shape[1] else np.zeros((slopes.shape[0], 0))
+    off = half.scale.target - half.repeats.mean(0)
+    doubt = misfit_beyond_chance(half)
+    misfit = np.where(half.seen.used, np.sign(off) * np.minimum(np.abs(off), doubt), 0.0)
+    return ReportedModel(half, model, start, last, frame, misfit)
+
+
+def _in_standard_errors(half: CalibratedSubset, apart: Array) -> Array:
+    out: Array = np.where(half.seen.used, apart / half.seen.sigma, 0.0)
+    return out
+
+
+def _limit_work(
+    state: DiagnosisState, known: ReportedModel, effect: Effect, axis: SearchAxis
+) -> Work[float | None]:
+    """Return the place of the smallest strength that is seen; None where not even the largest is."""
+    settings = state.settings.detection
+    other = with_effect_added(known.model, effect)
+    column = [a.name for a in other.space.axes].index(axis.name)
+    weak, strong = _range_of(axis)
+
+    def statistics_work(strength: float, turn: int, repeats: int) -> Work[Array]:
+        place = other.place.copy()
+        place[column] = strength
+        places = np.repeat(place[None], repeats, 0)
+        seed = SimulationStream.DETECTION.seed(state.seed, turn)
+        (sums,) = yield [SimulationRequest(known.half, other.space, places, seed, repeats=True)]
+        return compute_statistics(sums, known.half.frame)[0]
+
+    # what the effect does to events by its place in the kernel alone, however weak it is, is not its strength
+    nothing = yield from statistics_work(weak, 0, settings.baseline)
+    offset = nothing.mean(0) - known.half.repeats.mean(0)
+
+    def seen_work(strength: float, turn: int) -> Work[bool]:
+        values = yield from statistics_work(strength, turn, settings.repeats)
+        return float(np.mean(would_be_seen(known, values - offset, state.settings))) >= settings.power
+
+    if not (yield from seen_work(strong, 1)):
+        return None
+    steps = settings.slow_steps if known.half.slow(other.space) else settings.steps
+    for turn in range(steps):
+        middle = 0.5 * (weak + strong)
+        if (yield from seen_work(middle, turn + 2)):
+            strong = middle
+        else:
+            weak = middle
+    return strong
+
+
+def would_be_seen(known: ReportedModel, values: Array, settings: DiagnosisSettings) -> NDArray[np.bool_]:
+    """Return whether a diagnosis would have named an effect in measurements with these statistics, (R,).
+
+    Args:
+        known: The last model.
+        values: Of simulations with the effect, shape (R, J).
+        settings: Of the diagnosis.
+    """
+    half, last = known.half, known.last
+    middle = half.repeats.mean(0)
+    apart = _in_standard_errors(half, values - middle)
+    # the free parameters give way to the effect before anything is missing
+    apart = apart - (apart @ known.absorbed) @ known.absorbed.T
+    used = half.chance.used
+    ratio = half.seen.sigma / half.chance.sigma
+    cloud = RepeatCloud(
+        ((half.repeats - middle) / half.chance.sigma)[:, used],
+        np.zeros(np.count_nonzero(used)),
+        settings.hidden.most_of_one,
+        doubt=(misfit_beyond_chance(half) / half.chance.sigma)[used],
+        drift=None if half.drift is None else (half.drift / half.chance.sigma)[used],
+    )
+    out = np.zeros(len(values), np.bool_)
+    weights = half.seen.weights()
+    left = _in_standard_errors(half, known.misfit)
+    for n, one in enumerate(apart):
+        rho = pseudo_huber(one + left)
+        families = {name: float(rho[part][half.seen.used[part]].mean()) / last.unit
+                    for name, part in LAYOUT.items() if half.seen.used[part].any()}  # fmt: skip
+        without = replace(last, error=float(rho @ weights) / last.unit, families=families)
+        seen = replace(cloud, seen=(one * ratio)[used])
+        # the way is that of the other measurements: its own chance would make each lie on it
+        way = (apart.sum(0) - one) / max(len(apart) - 1, 1)
+        deviation = float(seen.deviations_along(cloud.clipped((way * ratio)[used])[None])[0])
+        # where the scene is guessed a closer look is always taken
+        closer = half.doubt is not None and deviation >= settings.hidden.away
+        looked = closer or would_be_added(last, without, settings)
+        start = max(known.start, without, key=lambda judged: judged.error)
+        grade, _ = grade_of(start, without, last, deviation, has_rivals=False, settings=settings.grades)
+        out[n] = looked and grade is not Grade.STAND_IN
+    return out
+
+
+def would_be_added(last: Judgement, without: Judgement, settings: DiagnosisSettings) -> bool:
+    """Whether a search would add an effect: the same rules by which it adds the best of its candidates.
+
+    Args:
+        last: Error of the model with the effect.
+        without: Error of the model without it.
+        settings: Of the diagnosis.
+    """
+    if leaves_nothing(without):
+        return False
+    if reaches_floor(without):
+        return explains_remainder(last, without, settings)
+    fall = without.error - last.error
+    return fall >= settings.material and fall >= settings.share * (without.error - 1.0)

@@ -1,0 +1,137 @@
+"""What a measurement would have shown of effects that were not found, and what to record next."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import dase
+from dase.diagnosis.cell_descriptions import kind_of_pixels
+from dase.diagnosis.detection_limits import describe_limit, main_axis, would_be_added
+from dase.diagnosis.diagnose import diagnose
+from dase.diagnosis.explain_effect import moving_bars
+from dase.diagnosis.remainder import shares_by_pixels, what_to_record
+from dase.diagnosis.settings import DEFAULTS
+from dase.effects import EFFECTS
+from dase.fitting.model import model_of
+from dase.probes.distance import Judgement
+from dase.probes.statistics import LAYOUT, SIZE
+from dase.results import Finding, Grade, Unexplained
+from dase.scenes.between_frames import CameraScene
+from dase.scenes.video import VideoScene
+from dase.simulation.sensor import Sensor
+
+LIBRARY = {name: EFFECTS[name] for name in ("threshold", "leak", "shot")}
+
+
+@pytest.fixture(scope="module")
+def scene() -> VideoScene:
+    return moving_bars()
+
+
+def look(scene, *effects, seed: int = 3, library=LIBRARY) -> dase.Diagnosis:
+    sensor = Sensor()
+    for effect in effects:
+        sensor = sensor.with_effect(effect)
+    events = dase.simulate(scene, sensor, seed=seed)
+    return diagnose(events, scene=scene, effects=library, pixels=400, most=1, seed=seed)
+
+
+def judged(error: float) -> Judgement:
+    return Judgement(error, 1.15, 0.4, 0.25, {}, {}, np.zeros(1), 1.0)
+
+
+def test_what_was_not_found_has_a_limit_and_what_was_has_none(scene):
+    found = look(scene, EFFECTS["leak"](rate=4.0))
+    (limit,) = [one for one in found.not_seen if one.parameter]
+    assert limit.effect == "shot"
+    assert limit.strength is not None
+    # pixels at rest here see some seconds in all: far less than an event of each, far more than none of all
+    assert 0.02 < limit.strength < 4
+    assert limit.sentence in repr(found)
+    assert json.loads(json.dumps(found.to_json()))["not_seen"][0]["sentence"] == limit.sentence
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["shot", "mismatch"])
+def test_limits_agree_with_simulation(scene, name):
+    """Twice the limit is named in most recordings, a quarter of it in few."""
+    library = {n: EFFECTS[n] for n in ("threshold", name)}
+    (limit,) = [one for one in look(scene, library=library).not_seen if one.parameter]
+    assert limit.strength is not None
+    field = limit.parameter.split(".")[1]
+    named = {}
+    for share in (2.0, 0.25):
+        effect = EFFECTS[name](**{field: share * limit.strength})
+        found = [look(scene, effect, seed=20 + k, library=library) for k in range(4)]
+        named[share] = sum(bool(one.findings) for one in found)
+    assert named[2.0] >= 3
+    assert named[0.25] <= 1
+
+
+def test_limits_in_words():
+    leak, bandwidth, present = EFFECTS["leak"](), EFFECTS["bandwidth"](), model_of(Sensor())
+    axis = main_axis(present, leak)
+    limit = describe_limit(leak, axis, axis.to_place(0.6))
+    assert limit.sentence == "leak rate above 600 mHz would have been seen"
+    assert limit.rises
+    assert describe_limit(leak, axis, None).sentence == "no leak rate up to 20 Hz would have been seen"
+    axis = main_axis(present, bandwidth)
+    limit = describe_limit(bandwidth, axis, axis.to_place(300.0))
+    assert limit.sentence == "bandwidth cutoff below 300 Hz would have been seen"
+    assert not limit.rises
+    assert describe_limit(bandwidth, axis, None).strength is None
+
+
+def test_what_a_search_would_not_add_is_not_seen():
+    assert not would_be_added(judged(0.3), judged(0.45), DEFAULTS)  # nothing is looked for
+    assert would_be_added(judged(0.3), judged(0.9), DEFAULTS)
+    assert not would_be_added(judged(0.8), judged(0.9), DEFAULTS)  # explains too little of what is left
+    assert would_be_added(judged(2.0), judged(9.0), DEFAULTS)
+    assert not would_be_added(judged(2.0), judged(2.1), DEFAULTS)
+
+
+def test_each_statistic_is_of_one_kind_of_pixels():
+    seen = {family: {kind_of_pixels(family, n) for n in range(part.stop - part.start)}
+            for family, part in LAYOUT.items()}  # fmt: skip
+    assert seen["rate"] == seen["intervals"] == seen["space"] == seen["spread"] == {"moving", "resting"}
+    assert seen["lag"] == seen["change"] == {"moving"}
+    assert seen["spectrum"] == seen["stamps"] == {"all"}
+
+
+def test_where_an_error_sits_is_told_by_pixels():
+    z = np.zeros(SIZE)
+    z[LAYOUT["lag"]] = 3.0
+    compared = np.ones(SIZE, np.bool_)
+    one = replace(judged(3.0), z=z, compared=compared)
+    assert shares_by_pixels(one) == pytest.approx({"moving": 1.0, "resting": 0.0, "all": 0.0})
+
+
+def frames(exposure: float) -> CameraScene:
+    begin = 0.04 * np.arange(6)
+    return CameraScene(np.full((6, 8, 8), 90, np.uint8), begin, begin + exposure)
+
+
+def left(of_scene: float, **places: float) -> Unexplained:
+    return Unexplained(3.0, 0.4, (), (), "", of_scene, places)
+
+
+def test_what_to_record_next(scene):
+    lamp = Finding("flicker", Grade.CERTAIN)
+    either = Finding("leak", Grade.EITHER, ("shot",))
+    assert what_to_record(scene, [lamp], None) == ()
+    texts = what_to_record(frames(0.02), [lamp], left(0.6, moving=0.3, resting=0.1))
+    assert [text.split(",")[0].split(" (")[0] for text in texts] == [
+        "frames more often than every 40 ms", "exposures below 10 ms",
+        "the same under light that does not flicker",
+    ]  # fmt: skip
+    (text,) = what_to_record(frames(0.001), [], left(0.0, moving=0.1, resting=0.9))
+    assert "lens cap" in text
+    (text,) = what_to_record(scene, [], left(0.0, moving=0.9))
+    assert "dase stimulus" in text
+    (text,) = what_to_record(scene, [either], None)
+    assert "dase distinguish" in text
+    assert "what the camera saw" in what_to_record(scene, [], None, contradiction=True)[0]
