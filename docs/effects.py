@@ -39,6 +39,22 @@ def stage(effect: type[Effect]) -> str:
     return ", ".join(effect.stages) or "count"
 
 
+PICTURES = """
+## What events look like
+
+Drawn by `docs/effect_pictures.py`: the same light without and with each effect, stronger than usual where
+that shows more. A raster has a pixel in each row and a dot for each event; a picture counts the events of 12
+to 50 ms. What `learned_threshold` does is in [adaptation.md](adaptation.md).
+"""
+
+
+def pictures() -> str:
+    """Return the pictures of all effects that have one."""
+    folder = Path(__file__).parent / "effects"
+    names = (name for name in dase.EFFECTS if (folder / f"{name}.png").is_file())
+    return PICTURES + "".join(f"\n![{name}: without and with](effects/{name}.png)\n" for name in names)
+
+
 RECORDINGS = """
 ## What recordings ask for
 
@@ -85,7 +101,7 @@ def page() -> str:
     for name, effect in dase.EFFECTS.items():
         what = effect.about().splitlines()[0]
         rows.append(f"| `{name}` | {what} | {stage(effect)} | {parameters(effect)} | {effect.source} |")
-    return HEAD + "\n".join(rows) + "\n" + RECORDINGS
+    return HEAD + "\n".join(rows) + "\n" + pictures() + RECORDINGS
 
 
 if __name__ == "__main__":
