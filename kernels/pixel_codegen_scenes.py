@@ -76,7 +76,12 @@ def compose_scenes(
         scope |= lane_scope(lanes, source) | {"store": lane_functions(lanes).store}
     scope |= {"Scenes": kind, "scene_of": of_row, "Sink": WindowGrids, "deposit": DEPOSITS[deposit]}
     options = lane_options() if lanes else {}
-    return compile_text(source_text(stages, source, lanes=lanes), "pixel_scenes", scope, **options)
+    # left alone, the compiler takes 190 for noise, and a multiprocessor then runs 8 warps; with 128 it runs
+    # 16, which took two thirds of the time on an H100. Sensors without noise were slower with a bound
+    noisy = any(stage == "noise" for effect in stages for stage, _ in effect.functions)
+    registers = 128 if noisy and not lanes else None
+    text = source_text(stages, source, lanes=lanes)
+    return compile_text(text, "pixel_scenes", scope, registers=registers, **options)
 
 
 def source_text(stages: tuple[EffectStages, ...], source: str, *, lanes: int = 0) -> str:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import json
+import math
 from dataclasses import dataclass
 from os import PathLike
 from pathlib import Path
@@ -14,7 +15,8 @@ from dase.errors import InputError
 from dase.learning import distributed
 from dase.tasks.checkpoints import restore_training, save_checkpoint
 from dase.tasks.event_networks import EventNetwork
-from dase.tasks.optimisation import BatchSource, Optimisation, average_weights, mean_gradients
+from dase.tasks.optimisation import BatchSource, Optimisation
+from dase.tasks.training_step import Losses, TrainingStep
 from dase.torch.batch import Batch
 
 
@@ -58,56 +60,36 @@ def train_flow(
         torch.manual_seed(settings.seed)
         network = type(network)(**network.shape).to(device)
     averaged = copy.deepcopy(network)
-    optimizer = torch.optim.AdamW(
-        network.parameters(), lr=settings.learning_rate, weight_decay=settings.weight_decay
-    )
 
-    first = restore_training(
-        path, network, averaged, optimizer, steps=settings.steps, window=settings.window, device=device
-    )
+    def forward(batch: Batch) -> torch.Tensor:
+        made: torch.Tensor = network(batch.inputs.flatten(0, 1))[0]
+        return made
+
+    def losses(made: torch.Tensor, batch: Batch) -> Losses:
+        loss, error = flow_loss(made, batch, settings.window)
+        return {"loss": loss, "error": error}
+
+    take_step = TrainingStep(network, averaged, settings, device, forward, losses)
+    optimizer, steps, window = take_step.optimizer, settings.steps, settings.window
+    first = restore_training(path, network, averaged, optimizer, steps=steps, window=window, device=device)
     if first < settings.last_step:
         source = iter(batches(first))
-        half = settings.mixed_precision and device.startswith("cuda")
         for step in range(first, settings.last_step):
-            batch = next(source).to(device)
-            for group in optimizer.param_groups:
-                group["lr"] = settings.rate(step)
-            with torch.autocast(torch.device(device).type, torch.bfloat16, enabled=half):
-                made, _ = network(batch.inputs.flatten(0, 1))
-            loss, error = flow_loss(made.float(), batch, settings.window)
-            optimizer.zero_grad(set_to_none=True)
-            loss.backward()
-            mean_gradients(network)
-            norm = torch.nn.utils.clip_grad_norm_(network.parameters(), settings.clip)
-            optimizer.step()
-            average_weights(averaged, network, step, settings.average)
+            values = take_step(next(source), step)
 
             done = step + 1
             last = done == settings.last_step
             if done % settings.log_every == 0 or last:
-                row = {
-                    "step": done,
-                    "loss": float(loss.detach()),
-                    "error": float(error),
-                    "gradient": float(norm),
-                }
-                if not torch.isfinite(loss):
+                row = {name: round(float(value), 6) for name, value in values.items()}
+                if not math.isfinite(row["loss"]):
                     raise InputError(
                         f"{folder}: the loss of step {done} is {row['loss']}; lower learning_rate"
                     )
                 if distributed.process_rank() == 0:
                     with (folder / "log.jsonl").open("a", encoding="utf-8") as log:
-                        log.write(json.dumps({name: round(value, 6) for name, value in row.items()}) + "\n")
+                        log.write(json.dumps({"step": done, **row}) + "\n")
             if (done % settings.save_every == 0 or last) and distributed.process_rank() == 0:
-                save_checkpoint(
-                    path,
-                    network,
-                    averaged,
-                    optimizer,
-                    step=done,
-                    steps=settings.steps,
-                    window=settings.window,
-                )
+                save_checkpoint(path, network, averaged, optimizer, step=done, steps=steps, window=window)
     distributed.leave_processes()
     averaged.eval()
     return averaged
@@ -126,9 +108,11 @@ def flow_loss(made: torch.Tensor, batch: Batch, window: float) -> tuple[torch.Te
     """
     truth = window * batch.flow.flatten(0, 1)
     known = truth.isfinite().all(1)
-    apart = (made - torch.nan_to_num(truth)).permute(0, 2, 3, 1)[known]
-    far = torch.nan_to_num(truth).permute(0, 2, 3, 1)[known].square().sum(1).sqrt()
+    truth = torch.nan_to_num(truth)
+    # masked, not chosen: how many there are is a number that the processor would have to wait for
+    apart = torch.where(known[:, None], made - truth, 0.0)
+    far = truth.square().sum(1).sqrt()
     # no pixel at all is no loss, and not the mean of nothing
-    some = max(len(apart), 1)
+    some = known.sum().clamp_min(1)
     loss = (apart.abs().sum(1) / (1 + far)).sum() / some
     return loss, apart.detach().square().sum(1).sqrt().sum() / some

@@ -1,4 +1,4 @@
-"""What trainings of networks share: the learning rate, the averaged weights, numbers of all processes."""
+"""What trainings of networks share: where batches come from, and how weights are moved."""
 
 from __future__ import annotations
 
@@ -6,10 +6,7 @@ import math
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 
-import torch
-
 from dase.errors import InputError, checked_integer
-from dase.learning import distributed
 from dase.torch.batch import Batch
 
 BatchSource = Callable[[int], Iterable[Batch]]
@@ -71,21 +68,3 @@ class Optimisation:
         """Return the learning rate of a step, counted from 0."""
         rise = min(1.0, (step + 1) / max(self.warm_up, 1))
         return self.learning_rate * rise * 0.5 * (1 + math.cos(math.pi * step / self.steps))
-
-
-@torch.no_grad()
-def average_weights(averaged: torch.nn.Module, network: torch.nn.Module, step: int, most: float) -> None:
-    """Move the averaged weights towards those after a step, counted from 0."""
-    kept = min(most, (1 + step) / (10 + step))
-    for mean, last in zip(averaged.parameters(), network.parameters(), strict=True):
-        mean.lerp_(last, 1 - kept)
-
-
-def mean_gradients(network: torch.nn.Module) -> None:
-    """Replace the gradients by their means over all processes."""
-    count = distributed.process_count()
-    if count > 1:
-        distributed.sum_gradients(network.parameters())
-        for parameter in network.parameters():
-            if parameter.grad is not None:
-                parameter.grad /= count

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import json
+import math
 from dataclasses import dataclass
 from os import PathLike
 from pathlib import Path
@@ -15,7 +16,8 @@ from dase.learning import distributed
 from dase.tasks.checkpoints import restore_training, save_checkpoint
 from dase.tasks.event_networks import EventNetwork
 from dase.tasks.image_metrics import Lpips, structural_similarity, temporal_inconsistency
-from dase.tasks.optimisation import BatchSource, Optimisation, average_weights, mean_gradients
+from dase.tasks.optimisation import BatchSource, Optimisation
+from dase.tasks.training_step import Losses, TrainingStep
 from dase.torch.batch import Batch
 
 
@@ -73,53 +75,35 @@ def train_reconstruction(
         torch.manual_seed(settings.seed)
         network = type(network)(**network.shape).to(device)
     averaged = copy.deepcopy(network)
-    optimizer = torch.optim.AdamW(
-        network.parameters(), lr=settings.learning_rate, weight_decay=settings.weight_decay
-    )
     perceptual = None if settings.lpips_weights is None else Lpips(settings.lpips_weights).to(device)
 
-    first = restore_training(
-        path, network, averaged, optimizer, steps=settings.steps, window=settings.window, device=device
-    )
+    def forward(batch: Batch) -> torch.Tensor:
+        return network.sequence(batch.inputs, batch.reset)[0]
+
+    def losses(made: torch.Tensor, batch: Batch) -> Losses:
+        return reconstruction_losses(made, batch, settings, perceptual)
+
+    take_step = TrainingStep(network, averaged, settings, device, forward, losses)
+    optimizer, steps, window = take_step.optimizer, settings.steps, settings.window
+    first = restore_training(path, network, averaged, optimizer, steps=steps, window=window, device=device)
     if first < settings.last_step:
         source = iter(batches(first))
-        half = settings.mixed_precision and device.startswith("cuda")
         for step in range(first, settings.last_step):
-            batch = next(source).to(device)
-            for group in optimizer.param_groups:
-                group["lr"] = settings.rate(step)
-            with torch.autocast(torch.device(device).type, torch.bfloat16, enabled=half):
-                made, _ = network.sequence(batch.inputs, batch.reset)
-            losses = reconstruction_losses(made.float(), batch, settings, perceptual)
-            optimizer.zero_grad(set_to_none=True)
-            losses["loss"].backward()
-            mean_gradients(network)
-            norm = torch.nn.utils.clip_grad_norm_(network.parameters(), settings.clip)
-            optimizer.step()
-            average_weights(averaged, network, step, settings.average)
+            values = take_step(next(source), step)
 
             done = step + 1
             last = done == settings.last_step
             if done % settings.log_every == 0 or last:
-                row = {name: round(float(value.detach()), 6) for name, value in losses.items()}
-                if not torch.isfinite(losses["loss"]):
+                row = {name: round(float(value), 6) for name, value in values.items()}
+                if not math.isfinite(row["loss"]):
                     raise InputError(
                         f"{folder}: the loss of step {done} is {row['loss']}; lower learning_rate"
                     )
                 if distributed.process_rank() == 0:
-                    line = {"step": done, **row, "gradient": round(float(norm), 6)}
                     with (folder / "log.jsonl").open("a", encoding="utf-8") as log:
-                        log.write(json.dumps(line) + "\n")
+                        log.write(json.dumps({"step": done, **row}) + "\n")
             if (done % settings.save_every == 0 or last) and distributed.process_rank() == 0:
-                save_checkpoint(
-                    path,
-                    network,
-                    averaged,
-                    optimizer,
-                    step=done,
-                    steps=settings.steps,
-                    window=settings.window,
-                )
+                save_checkpoint(path, network, averaged, optimizer, step=done, steps=steps, window=window)
     distributed.leave_processes()
     averaged.eval()
     return averaged

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
@@ -47,6 +48,8 @@ from dase.torch.scene_numbers import (
 
 MEMORY = 1 << 28
 """Bytes of whole pictures that are held at once where a lens needs them."""
+GPU_MEMORY = 1 << 30
+"""Bytes of pictures that are held at once on a GPU."""
 VOXELS = Voxels(5)
 """What networks are given unless something else is asked for."""
 NOTHING = Augment()
@@ -274,6 +277,9 @@ class BatchMaker:
         )  # fmt: skip
         optics = (effect for effect in stream.sensor.effects if isinstance(effect, SceneEffect))
         self._mixing = any(not effect.is_off() for effect in optics)
+        # a thread that looks layers up and is a pixel needs so many registers that a GPU runs few of them:
+        # on an H100 two kernels, with light between them, are a third faster
+        self._rendering = self.device.type == "cuda" and not self._mixing
         self._decoder = ThreadPoolExecutor(1, thread_name_prefix="dase pictures")
         self._coming: dict[int, Future[DecodedPictures]] = {}
         self._pool: tuple[int, TexturePool] | None = None
@@ -349,10 +355,11 @@ class BatchMaker:
         return wp.from_torch(self._upload(values), dtype=dtype)
 
     def _memory(self, name: str, shape: tuple[int, ...], dtype: Any) -> wp.array:
-        """Return memory of a shape that is used again by the next batch that wants it."""
-        if name not in self._kept or self._kept[name].shape != shape:
-            self._kept[name] = wp.empty(shape, dtype=dtype, device=self.where)
-        return self._kept[name]
+        """Return memory of a shape that is used again by the next one that wants as much, or less, of it."""
+        count = math.prod(shape)
+        if name not in self._kept or self._kept[name].shape[0] < count:
+            self._kept[name] = wp.empty(count, dtype=dtype, device=self.where)
+        return self._kept[name][:count].reshape(shape)
 
     def _place(self, times: wp.array, run: wp.array) -> wp.array:
         """Work out where layers are at samples (K,) in runs (R + 1,); return their velocities (B, R, L)."""
@@ -391,11 +398,12 @@ class BatchMaker:
 
     def _windows_at_once(self) -> int:
         """Return how many windows are simulated by one launch."""
-        if not self._mixing:
+        if not (self._mixing or self._rendering):
             return self.stream.steps
-        width, height = self.plan.view
+        width, height = self.plan.view if self._mixing else self.plan.size
         window = 4 * self.plan.batch * self.stream.samples * width * height
-        return max(1, min(self.stream.steps, MEMORY // window))
+        most = MEMORY if self._mixing else GPU_MEMORY
+        return max(1, min(self.stream.steps, most // window))
 
     def _advance_windows(
         self, first: int, last: int, grids: torch.Tensor, frames: torch.Tensor, flow: torch.Tensor
@@ -415,10 +423,15 @@ class BatchMaker:
         self._scenes.light = self._light(times)
         lent, bins = (wp.from_torch(frames), wp.from_torch(grids)), getattr(self.stream.represent, "bins", 1)
         if self._mixing:
-            sharp = self._render(clock.run, len(times))
+            sharp = self._render(clock.run, len(times), self._whole_view())
             self.pixels.advance("frames", self._through_optics(sharp, times), clock, times, *lent, bins)
             # a label is what there is to be seen, not what a lens makes of it
             self._show(sharp, run[1:] - 1, frames)
+        elif self._rendering:
+            seen = StoredScenes()
+            seen.light = self._scenes.light
+            seen.values = self._render(clock.run, len(times), self.pixels.places)
+            self.pixels.advance("frames", seen, clock, times, *lent, bins)
         else:
             self.pixels.advance("layers", self._scenes, clock, times, *lent, bins)
         lanes = counting.widest_block(count, self.where, "layers")
@@ -428,16 +441,21 @@ class BatchMaker:
         blocks = (last - first) * counting.block_count(count, lanes)
         launch.run_kernel(flow_kernel(lanes), blocks, inputs, self.where, batch=self.plan.batch)
 
-    def _render(self, run: wp.array, samples: int) -> wp.array:
-        """Return what the whole cameras see in full light, shape (B, samples, pixels of the view)."""
-        batch, (width, height) = self.plan.batch, self.plan.view
+    def _whole_view(self) -> wp.array:
+        """Return indices of all pixels of the cameras, shape (B, pixels of the view)."""
         if "every" not in self._kept:
-            every = np.arange(width * height, dtype=np.int32)
-            self._kept["every"] = self._send(np.repeat(every[None], batch, 0), wp.int32)
-        out = self._memory("sharp", (batch, samples, width * height), wp.float32)
-        lanes = counting.widest_block(width * height, self.where, "layers")
-        blocks = (run.shape[0] - 1) * counting.block_count(width * height, lanes)
-        inputs = [self._scenes, run, self._kept["every"], width, out]
+            indices = np.arange(self.plan.view[0] * self.plan.view[1], dtype=np.int32)
+            self._kept["every"] = self._send(np.repeat(indices[None], self.plan.batch, 0), wp.int32)
+        every: wp.array = self._kept["every"]
+        return every
+
+    def _render(self, run: wp.array, samples: int, places: wp.array) -> wp.array:
+        """Return what pixels (B, N) of the cameras see in full light, shape (B, samples, N)."""
+        batch, count = places.shape
+        out = self._memory("sharp", (batch, samples, count), wp.float32)
+        lanes = counting.widest_block(count, self.where, "layers")
+        blocks = (run.shape[0] - 1) * counting.block_count(count, lanes)
+        inputs = [self._scenes, run, places, self.plan.view[0], out]
         launch.run_kernel(rendering_kernel(lanes), blocks, inputs, self.where, batch=batch)
         return out
 
@@ -514,7 +532,7 @@ class BatchMaker:
         run = self._send(np.array([0, 1], np.int32), wp.int32)
         self._place(self._send(time, wp.float64), run)
         self._scenes.light = self._light(time)
-        frames = wp.to_torch(self._render(run, 1))[:, 0] * wp.to_torch(self._scenes.light)
+        frames = wp.to_torch(self._render(run, 1, self._whole_view()))[:, 0] * wp.to_torch(self._scenes.light)
         return frames.view(batch, height, width)
 
     def _learned_maps(

@@ -18,6 +18,7 @@ from dase.tasks.event_networks import E2VidNet, EvFlowNet, FireNet
 from dase.tasks.flow_training import FlowTraining, flow_loss, train_flow
 from dase.tasks.optimisation import Optimisation
 from dase.tasks.reconstruction_training import ReconstructionTraining, train_reconstruction
+from dase.tasks.training_step import TrainingStep
 from dase.torch.batch import Batch
 
 RECONSTRUCTION = ReconstructionTraining(steps=6, warm_up=2, average=0.5, save_every=2, log_every=1)
@@ -97,6 +98,49 @@ def test_flow_loss_by_hand():
     assert error.item() == pytest.approx(far, rel=1e-5)
     loss.backward()
     assert made.grad.isfinite().all()
+
+
+def a_step(device: str, settings: FlowTraining) -> TrainingStep:
+    torch.manual_seed(3)
+    network, averaged = (EvFlowNet(5, 4).to(device) for _ in range(2))
+    averaged.load_state_dict(network.state_dict())
+
+    def losses(made, batch):
+        loss, error = flow_loss(made, batch, settings.window)
+        return {"loss": loss, "error": error}
+
+    return TrainingStep(
+        network, averaged, settings, device, lambda batch: network(batch.inputs.flatten(0, 1))[0], losses
+    )
+
+
+def test_a_step_by_hand():
+    """AdamW's first step goes as far as the rate, whatever the gradient; the mean takes its share."""
+    settings = replace(FLOW, steps=10, warm_up=1, weight_decay=0.0, average=0.9, clip=0.1)
+    take = a_step("cpu", settings)
+    before = weights(take.network).clone()
+    assert torch.equal(weights(take.averaged), before)
+    values = take(made_batch(0), 0)
+    moved = weights(take.network) - before
+    gradient = torch.cat([p.grad.flatten() for p in take.network.parameters()])
+    assert float(values["gradient"]) > settings.clip  # that of before it was clipped
+    assert float(gradient.norm()) == pytest.approx(settings.clip, rel=1e-3)
+    clear = gradient.abs() > 1e-5
+    torch.testing.assert_close(moved[clear], -settings.rate(0) * gradient[clear].sign(), rtol=2e-3, atol=0)
+    torch.testing.assert_close(weights(take.averaged) - before, 0.9 * moved, rtol=1e-3, atol=1e-7)
+
+
+def test_replayed_steps_are_the_same_steps(device):
+    if device == "cpu":
+        pytest.skip("steps are replayed on a GPU only; --device cuda:0 asks for one")
+    found = []
+    for plain_runs in (10**9, 3):
+        take = a_step(device, replace(FLOW, steps=40, mixed_precision=False))
+        take._replay.plain_runs = plain_runs
+        found.append([float(take(made_batch(n), n)["loss"]) for n in range(20)])
+        assert bool(take._replay.recorded) == (plain_runs == 3)
+    assert found[1] == pytest.approx(found[0], rel=1e-2)
+    assert found[1][-1] < found[1][0]
 
 
 def test_rate_rises_and_falls():

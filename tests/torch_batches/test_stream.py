@@ -17,6 +17,7 @@ from dase.effects.readout import Readout
 from dase.effects.vignetting import Vignetting
 from dase.simulation.sensor_run import SensorRun
 from dase.torch.augmentation import mirrored
+from dase.torch.stream import BatchMaker
 
 WINDOW = 1 / 60
 NOISY = dase.load_sensor("davis240c")
@@ -283,3 +284,23 @@ def test_memory_stays():
     size = batch.inputs.nbytes + batch.frames.nbytes + batch.flow.nbytes
     grown = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - most
     assert 1024 * grown < 10 * size < 40 * size
+
+
+def test_pictures_rendered_first_give_the_same_batches(monkeypatch):
+    """As a GPU works: some windows at a time, light between two kernels; learned maps beside them."""
+    plain = [b for b, _ in zip(streamed(view=(44, 34), scene_batches=2), range(2), strict=False)]
+    begin = BatchMaker.__init__
+
+    def renders_first(self, stream):
+        begin(self, stream)
+        self._rendering = True
+
+    monkeypatch.setattr(BatchMaker, "__init__", renders_first)
+    monkeypatch.setattr(dase.torch.stream, "GPU_MEMORY", 2 * 4 * 3 * 16 * 32 * 24)  # two windows
+    first = [b for b, _ in zip(streamed(view=(44, 34), scene_batches=2), range(2), strict=False)]
+    for a, b in zip(plain, first, strict=True):
+        assert torch.equal(a.frames, b.frames)
+        assert torch.equal(a.flow, b.flow)
+        # a window is cut out of the samples of its launch, whose times are rounded
+        assert ((a.inputs - b.inputs).abs() > 1e-4).float().mean() < 1e-4
+        assert a.inputs.abs().sum() > 500
