@@ -3,8 +3,8 @@
 The kernel has every effect that any of the models has. An effect whose parameters are at their off values is
 skipped, which changes nothing, bit for bit; so all models run through one compiled kernel. It differs from
 the kernel of `dase.kernels.pixel_codegen_cuda` in two more ways. Its time samples are the pixel's own: none
-where the light of the pixel does not change. And an event is not stored but looked at, see
-`dase.kernels.event_probes`.
+where the light of the pixel does not change, unless an effect needs samples in between. And an event is not
+stored but looked at, see `dase.kernels.event_probes`.
 """
 
 from __future__ import annotations
@@ -50,7 +50,9 @@ class LightHistory:
     stamp: wp.array[int]  # (M,) time of each sample [steps]; that of a pixel's first is 0
     intensity: wp.array[float]  # (M,) linear
     voltage: wp.array[float]  # (M,) logarithm of intensity + log_eps
-    step: float  # [s]
+    log_eps: float  # added to intensities before the logarithm
+    finer: int  # samples that are taken per step of a stamp; 0 for those that are here alone
+    step: float  # time between these, that of a stamp if there are none [s]
 
 
 @lru_cache(maxsize=64)
@@ -218,18 +220,21 @@ def _acts(effect: EffectStages) -> tuple[Line, ...]:
 
 
 def _samples(program: Program, layout: OnePixel | Lanes) -> tuple[Statement, ...]:
-    """Return the loop over the samples of the pixel, which stand where its light changes."""
+    """Return the loop over the samples of the pixel: where its light changes, and in between if asked for."""
     model = program.model
-    steps = (
-        *lines("steps = source.stamp[k] - stamp", "dt = float(steps) * source.step", "sample = k - begin_at"),
-        if_block("sample == 0", f"dt = {REST}"),
-    )
-    times = ("t64 = wp.float64(source.stamp[k]) * wp.float64(source.step)", "t = float(t64)")
+    times = ("t64 = wp.float64(stamp + steps) * wp.float64(source.step)", "t = float(t64)")
     seen = Part(lines("intensity = seen + 0.0", "voltage = level + 0.0"))
     body = (
-        *steps,
+        *lines("dt = float(steps) * source.step"),
+        if_block("sample == 0", f"dt = {REST}"),
         *(lines(*times) if model.asks("t", "t64") else ()),
         *lines("seen = source.intensity[k]", "level = source.voltage[k]"),
+        # between the samples that are stored, where these differ
+        if_block(
+            "part + 1 < parts and level != level_before",
+            "level = level_before + (level - level_before) * (float(part + 1) / float(parts))",
+            "seen = wp.max(exponential(level) - source.log_eps, 0.0)",
+        ),
         *layout.lay_out(seen),
         *layout.lay_out_all(program.light),
         *layout.lay_out_all(_voltage_of_light(model)),
@@ -237,9 +242,19 @@ def _samples(program: Program, layout: OnePixel | Lanes) -> tuple[Statement, ...
         *layout.lay_out_all(program.change),
         *layout.lay_out_events(program),
         *layout.lay_out(program.settle),
-        Line("stamp = source.stamp[k]"),
+        *lines("stamp += steps", "sample += 1"),
     )
-    return Line("stamp = int(0)"), Block("for k in range(begin_at, end_at):", body)
+    stored = (
+        *lines("gap = source.stamp[k] * wp.max(source.finer, 1) - stamp"),
+        # a pixel's first sample is at time 0
+        *lines("parts = wp.where(source.finer == 0, 1, wp.max(gap, 1))", "steps = gap / parts"),
+        Block("for part in range(parts):", body),
+        Line("level_before = source.voltage[k]"),
+    )
+    return (
+        *lines("stamp = int(0)", "sample = int(0)", "level_before = float(0.0)"),
+        Block("for k in range(begin_at, end_at):", stored),
+    )
 
 
 def _voltage_of_light(model: PixelModel) -> tuple[Part, ...]:

@@ -12,8 +12,9 @@ from numpy.typing import NDArray
 
 from dase.diagnosis.standard_stimuli import STANDARD_STIMULI, StandardStimulus
 from dase.errors import InputError, checked_seed
-from dase.fitting.batch_simulator import BatchSimulator, SimulationOrder, samples_per_step
+from dase.fitting.batch_simulator import BatchSimulator, SimulationOrder
 from dase.fitting.data_split import SPLIT, typical_changes
+from dase.fitting.trial_sampling import samples_per_step
 from dase.kernels import launch
 from dase.probes.accumulators import ProbeSums, StatisticsFrame
 from dase.probes.random_streams import Draw, SimulationStream
@@ -176,7 +177,7 @@ class _StimulusTest:
         steps = round(seconds / step) + 1
         finer = max(samples_per_step(model, step) for model in models)
         # a recording is put together of parts, for light takes memory
-        self.parts = max(1, math.ceil(pixels * steps * max(finer, 1) / settings.samples_at_once))
+        self.parts = max(1, math.ceil(pixels * steps / settings.samples_at_once))
         count = math.ceil(pixels / self.parts)
         rng = Draw.PIXELS.generator(seed)
         chosen = np.sort(rng.choice(width * height, count, replace=count > width * height)).astype(np.int32)

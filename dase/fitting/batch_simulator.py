@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Any
 
@@ -19,6 +19,7 @@ from dase.events import Events
 from dase.fitting.bus_load import BusLoad
 from dase.fitting.parameter_space import SearchAxis
 from dase.fitting.readout_simulator import clock_of, noticeable_effects, pass_readout, simulate_pixels
+from dase.fitting.trial_sampling import samples_per_step_of_rows
 from dase.kernels import event_probes as kernels
 from dase.kernels import launch, pixel_codegen_trials
 from dase.probes.accumulators import (
@@ -56,30 +57,16 @@ LAUNCHES = {
 }
 
 
-def samples_per_step(sensor: Sensor, step: float, *, most: int = 2) -> int:
-    """Return how many samples per step a model needs, 0 where those at changes of the light do.
-
-    Args:
-        sensor: The model.
-        step: Of the grid [s].
-        most: Samples at most: models that ask for more are simulated a little too coarsely, or they would
-            take most of the time of a diagnosis.
-    """
-    longest = sensor.longest_step()
-    # a ratio that is whole but for rounding does not take one sample more
-    return 0 if longest == np.inf else int(np.clip(np.ceil(step / longest - 1e-6), 1, most))
-
-
 @dataclass(frozen=True, eq=False)
 class SimulationOrder:
     """Models to run: one sensor at several parameter vectors.
 
     Args:
-        sensor: Names the effects; its own parameters do not matter but for the sampling.
+        sensor: Names the effects; its own parameters do not matter.
         vectors: Shape (B, P).
         seed: Of the random numbers.
         reseed: Whether each vector gets random numbers of its own.
-        finer: Samples per step; None chooses by the sensor.
+        finer: Samples per step; None chooses by each model, and by the one that needs most for repeats.
         frame: What the counts of pixels are folded for; None where that is not known yet.
         ticks: From tick to tick of the clock that stamps the events [s], 0 for none.
     """
@@ -91,6 +78,14 @@ class SimulationOrder:
     finer: int | None = None
     frame: StatisticsFrame | None = None
     ticks: float = 0.0
+
+    def samples_per_step(self, step: float) -> NDArray[np.int64]:
+        """Return how many samples each vector takes per step of the grid, shape (B,)."""
+        rows = len(self.vectors)
+        if self.finer is not None:
+            return np.full(rows, self.finer)
+        found = samples_per_step_of_rows(self.sensor, self.vectors, step)
+        return np.full(rows, found.max(initial=0)) if self.reseed else found
 
     def seeds(self) -> NDArray[np.int64]:
         """Return the seed of each vector, shape (B,)."""
@@ -143,20 +138,26 @@ class BatchSimulator:
 
     def run_all(self, orders: Sequence[SimulationOrder]) -> list[ProbeSums]:
         """Simulate many models; those that have a kernel in common run together, whatever their effects."""
-        together: dict[Any, list[int]] = {}
-        step = self.stimulus.grid.step
+        together: dict[Any, list[tuple[int, NDArray[np.int64]]]] = {}
         for n, order in enumerate(orders):
-            finer = samples_per_step(order.sensor, step) if order.finer is None else order.finer
+            each = order.samples_per_step(self.stimulus.grid.step)
             kernel = self._kernel(order.sensor)[0]
             # maps are of one sensor, so a launch has either none or those of a single order
             maps = n if any(effect.maps for effect in order.sensor.effects) else -1
-            # the same stages give the same kernel object, whatever the sensor
-            together.setdefault((finer, id(kernel), maps), []).append(n)
-        out: dict[int, ProbeSums] = {}
+            for finer in np.unique(each).tolist():
+                # the same stages give the same kernel object, whatever the sensor
+                together.setdefault((finer, id(kernel), maps), []).append((n, np.flatnonzero(each == finer)))
+        parts: list[list[tuple[NDArray[np.int64], ProbeSums]]] = [[] for _ in orders]
         for (finer, _, _), members in together.items():
-            found = self._run([orders[n] for n in members], self.stimulus.history(finer))
-            out.update(zip(members, found, strict=True))
-        return [out[n] for n in range(len(orders))]
+            cut = [replace(orders[n], vectors=orders[n].vectors[rows], finer=finer) for n, rows in members]
+            for (n, rows), sums in zip(members, self._run(cut, self.stimulus.history(finer)), strict=True):
+                parts[n].append((rows, sums))
+        out = []
+        for found in parts:
+            joined = ProbeSums.join([sums for _, sums in found])
+            order_of_rows = np.argsort(np.concatenate([rows for rows, _ in found]))
+            out.append(joined if len(found) == 1 else joined.select(order_of_rows))
+        return out
 
     def _run(self, orders: Sequence[SimulationOrder], history: Any) -> list[ProbeSums]:
         """Simulate models that have a kernel in common."""
@@ -304,10 +305,11 @@ class BatchSimulator:
             load: What the sensor's other pixels send over a bus that all share, None where it is not known.
         """
         seeds, rows, found = order.seeds(), len(order.vectors), []
+        finer = np.maximum(order.samples_per_step(self.stimulus.grid.step), 1)
         self.evaluations += rows
         for first in range(0, rows, self._launches.streamed):
             cut = slice(first, first + self._launches.streamed)
-            left = simulate_pixels(self.stimulus, order.sensor, order.vectors[cut], seeds[cut])
+            left = simulate_pixels(self.stimulus, order.sensor, order.vectors[cut], seeds[cut], finer[cut])
             each = zip(left, effects[cut], seeds[cut], strict=True)
             # readouts take one event after the other, so each model is a thread of its own
             works = [partial(pass_readout, self.stimulus, e, behind, int(s), load) for e, behind, s in each]

@@ -9,11 +9,13 @@ from functools import partial
 from typing import Any
 
 import numpy as np
+import warp as wp
 from numpy.typing import NDArray
 
 from dase.effects.stream import SharedReader, StreamEffect
 from dase.events import Events
 from dase.fitting.bus_load import BusLoad
+from dase.fitting.trial_sampling import samples_per_step_of_rows
 from dase.kernels import launch, pixel_stages
 from dase.probes.stimulus import Stimulus
 from dase.probes.timestamp_patterns import TimestampStructure
@@ -57,7 +59,11 @@ def clock_of(effects: tuple[StreamEffect, ...], structure: TimestampStructure) -
 
 
 def simulate_pixels(
-    stimulus: Stimulus, sensor: Sensor, vectors: NDArray[Any], seeds: NDArray[np.int64]
+    stimulus: Stimulus,
+    sensor: Sensor,
+    vectors: NDArray[Any],
+    seeds: NDArray[np.int64],
+    finer: NDArray[np.int64] | None = None,
 ) -> list[Events]:
     """Return the events that leave the pixels, of each model.
 
@@ -66,20 +72,24 @@ def simulate_pixels(
         sensor: Its effects; those behind the pixels are left out.
         vectors: Parameters of the models, shape (B, P).
         seeds: Of the models, shape (B,).
+        finer: Samples that each takes per step, shape (B,); None for as many as it needs.
     """
+    if finer is None:
+        finer = np.maximum(samples_per_step_of_rows(sensor, vectors, stimulus.grid.step), 1)
     bare = replace(sensor, effects=tuple(e for e in sensor.effects if not isinstance(e, StreamEffect)))
     kind = "cuda" if stimulus.device.is_cuda else "cpu"
     # a model that sends more is run again; on a CPU room costs nothing before it is used
     room = 64 if kind == "cuda" else 2048  # events per pixel
 
     def out(rows: slice) -> list[Events]:
+        scene = _StimulusScene(stimulus, int(finer[rows.start]))
         return SensorRun(
-            _StimulusScene(stimulus), bare, pixels=stimulus.pixels, parameters=vectors[rows],
+            scene, bare, pixels=stimulus.pixels, parameters=vectors[rows],
             seed=int(seeds[rows.start]), device=str(stimulus.device), events_per_pixel=room,
             chunk=stimulus.grid.steps,
         ).events()  # fmt: skip
 
-    if kind == "cuda" and np.all(seeds == seeds[0]):
+    if kind == "cuda" and np.all(seeds == seeds[0]) and np.all(finer == finer[0]):
         return out(slice(0, len(seeds)))
     # on a CPU one after the other: the events of a model are sorted in its caches, those of all are not
     works = [partial(out, slice(n, n + 1)) for n in range(len(seeds))]
@@ -117,12 +127,13 @@ def pass_readout(
 
 
 class _StimulusScene(Scene):
-    """The light of a stimulus as a scene, from time 0."""
+    """The light of a stimulus as a scene, from time 0, some samples per step."""
 
-    def __init__(self, stimulus: Stimulus):
-        self._stimulus = stimulus
+    def __init__(self, stimulus: Stimulus, finer: int):
+        self._stimulus, self._finer = stimulus, finer
         self.width, self.height = stimulus.width, stimulus.height
-        self.times: NDArray[np.float64] = np.float64(stimulus.grid.step) * np.arange(stimulus.grid.steps)
+        points = (stimulus.grid.steps - 1) * finer + 1
+        self.times: NDArray[np.float64] = np.float64(stimulus.grid.step / finer) * np.arange(points)
         self.duration = float(self.times[-1])
 
     def sample_times(self) -> NDArray[np.float64]:
@@ -130,7 +141,13 @@ class _StimulusScene(Scene):
 
     def source(self, times: NDArray[np.float64], pixels: NDArray[np.int32], device: Any) -> tuple[str, Any]:
         out = pixel_stages.Frames()
-        out.values = self._stimulus.array("light", lambda: self._stimulus.intensity.T)
+        stimulus = self._stimulus
+        if self._finer == 1 and len(times) == len(self.times):
+            out.values = stimulus.array("light", lambda: stimulus.intensity.T)
+        else:
+            points = np.searchsorted(self.times, times)
+            light = np.ascontiguousarray(stimulus.light_at(points, self._finer).T)
+            out.values = wp.array(light, dtype=float, device=device)
         return "frames", out
 
     def frames(self, times: NDArray[np.float64], device: str = "cpu") -> NDArray[np.float32]:

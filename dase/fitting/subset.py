@@ -8,10 +8,11 @@ from typing import Self
 import numpy as np
 from numpy.typing import NDArray
 
-from dase.fitting.batch_simulator import BatchSimulator, samples_per_step
+from dase.fitting.batch_simulator import BatchSimulator
 from dase.fitting.bus_load import BusLoad, WholeSensor
 from dase.fitting.parameter_space import ParameterSpace
 from dase.fitting.scheduler import SimulationRequest, Work, answer_requests
+from dase.fitting.trial_sampling import samples_per_step
 from dase.probes.accumulators import ProbeSums, StatisticsFrame, leave_groups_out
 from dase.probes.distance import ErrorScale, Judgement, judge_model
 from dase.probes.statistics import (

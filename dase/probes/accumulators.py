@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
@@ -113,6 +113,17 @@ class ProbeSums:
         return cls(
             rest[0], pixels, rest[1], rest[2], first.groups, first.teams, first.frame if whole else None,
             np.concatenate(folded) if whole else None,
+        )  # fmt: skip
+
+    def select(self, rows: NDArray[np.int64]) -> ProbeSums:
+        """Return some rows (B',) in a new order; groups stay those of the first row there was."""
+        pixels = wp.empty((len(rows), *self.pixels.shape[1:]), dtype=float, device=self.pixels.device)
+        for to, row in enumerate(rows.tolist()):
+            wp.copy(pixels[to : to + 1], self.pixels[row : row + 1])
+        folded = None if self.folded is None else self.folded[rows]
+        return replace(
+            self, sums=self.sums[rows], pixels=pixels, clock=self.clock[rows], stamps=self.stamps[rows],
+            folded=folded,
         )  # fmt: skip
 
     @property

@@ -135,12 +135,35 @@ class Stimulus:
         """Return the light as a kernel of many models takes it.
 
         Args:
-            finer: 0 leaves out samples where nothing changes; n > 0 takes n samples per step everywhere.
+            finer: 0 leaves out samples where nothing changes; n > 0 takes n samples per step everywhere, by
+                straight lines between those that are stored.
         """
-        name = f"history {finer}"
-        if name not in self._kept:
-            self._kept[name] = self._dense(finer) if finer else self._sparse()
-        return self._kept[name]
+        if "history" not in self._kept:
+            self._kept["history"] = self._sparse()
+        out, stored = pixel_codegen_trials.LightHistory(), self._kept["history"]
+        out.start, out.stamp = stored["start"], stored["stamp"]
+        out.intensity, out.voltage = stored["intensity"], stored["voltage"]
+        out.log_eps, out.finer, out.step = self.log_eps, finer, self.grid.step / max(finer, 1)
+        return out
+
+    def light_at(self, points: NDArray[np.int64], finer: int) -> NDArray[np.float32]:
+        """Return the intensity at points of a finer grid, between whose own its logarithm runs straight.
+
+        Args:
+            points: Places on the finer grid, shape (K,).
+            finer: Its points per step.
+
+        Returns:
+            Linear intensities, shape (N, K).
+        """
+        below = np.minimum(points // finer, self.intensity.shape[1] - 2)
+        share = (points / finer - below).astype(np.float32)
+        low, high = self.intensity[:, below], self.intensity[:, below + 1]
+        eps = np.float32(self.log_eps)
+        between = np.exp(np.log(low + eps) * (1 - share) + np.log(high + eps) * share) - eps
+        # what is on the grid itself, or at rest, stays as it is
+        out: NDArray[np.float32] = np.where(share == 0, low, np.where(share == 1, high, between))
+        return np.maximum(np.where(low == high, low, out), 0)
 
     def array(self, name: str, make: Callable[[], NDArray[Any]]) -> Any:
         """Return an array on the device, of the shape that `make` gives it; made and moved there once."""
@@ -149,7 +172,7 @@ class Stimulus:
             self._kept[name] = wp.array(np.ascontiguousarray(make()), device=self.device, copy=False)
         return self._kept[name]
 
-    def _sparse(self) -> Any:
+    def _sparse(self) -> dict[str, Any]:
         count, steps = self.intensity.shape
         gaps = [0]
         while gaps[-1] < steps:
@@ -162,35 +185,12 @@ class Stimulus:
         ]
         many, at, light = (np.concatenate(column) for column in zip(*parts, strict=True))
         start = np.concatenate([[0], np.cumsum(many)])
-        return self._arrays(start, at, light, self.grid.step)
-
-    def _dense(self, finer: int) -> Any:
-        count, steps = self.intensity.shape
-        points = (steps - 1) * finer + 1
-        at = np.arange(points) / finer
-        below = np.minimum(at.astype(np.int64), steps - 2)
-        share = (at - below).astype(np.float32)
-        level, eps = self.level, np.float32(self.log_eps)
-        light = np.empty((count, points), np.float32)
-        for n in range(0, count, AT_ONCE):
-            few = level[n : n + AT_ONCE]
-            between = few[:, below] * (1 - share) + few[:, below + 1] * share
-            light[n : n + AT_ONCE] = np.maximum(np.exp(between) - eps, 0)
-        start = points * np.arange(count + 1)
-        stamp = np.broadcast_to(np.arange(points, dtype=np.int32), (count, points)).reshape(-1)
-        return self._arrays(start, stamp, light.reshape(-1), self.grid.step / finer)
-
-    def _arrays(
-        self, start: NDArray[Any], stamp: NDArray[Any], light: NDArray[np.float32], step: float
-    ) -> Any:
-        out = pixel_codegen_trials.LightHistory()
-        voltage = np.log(light + np.float32(self.log_eps))
-        out.start = wp.array(start.astype(np.int32), device=self.device, copy=False)
-        out.stamp = wp.array(stamp.astype(np.int32, copy=False), device=self.device, copy=False)
-        out.intensity = wp.array(light.astype(np.float32, copy=False), device=self.device, copy=False)
-        out.voltage = wp.array(voltage, device=self.device, copy=False)
-        out.step = step
-        return out
+        kinds = {"start": (start, np.int32), "stamp": (at, np.int32), "intensity": (light, np.float32)}
+        kinds["voltage"] = (np.log(light + np.float32(self.log_eps)), np.float32)
+        return {
+            name: wp.array(values.astype(kind, copy=False), device=self.device, copy=False)
+            for name, (values, kind) in kinds.items()
+        }
 
 
 def _kept_samples(

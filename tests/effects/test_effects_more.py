@@ -141,7 +141,7 @@ def test_scenes_are_sampled_often_enough(device):
         assert counts(scene, lamp, 1.0, device).sum() == pytest.approx(100 * 2 * 5, rel=0.05)
     assert len(sample_times(scene, dase.Sensor((Threshold(), Flicker.identity())))) == 31
     noisy = dase.Sensor((Threshold(), VoltageNoise(cutoff=50.0)))
-    assert np.diff(sample_times(scene, noisy)).max() <= 1 / 800 + 1e-9
+    assert np.diff(sample_times(scene, noisy)).max() <= 1 / 400 + 1e-9
 
 
 def test_between_frames_the_log_intensity_runs_straight(device):

@@ -15,6 +15,7 @@ from scipy.stats import norm
 import dase
 from dase.effects import second_order, voltage_noise
 from dase.effects.bandwidth import Bandwidth
+from dase.effects.refractory import Refractory
 from dase.effects.second_order import SecondOrder
 from dase.effects.threshold import Threshold
 from dase.effects.voltage_noise import VoltageNoise
@@ -191,10 +192,82 @@ def test_voltage_noise_is_stationary_and_returns(device):
     assert len(flips) > 2000
 
 
-def test_the_rate_of_voltage_noise_does_not_depend_on_sampling(device):
-    effect = VoltageNoise(sigma=0.12, cutoff=60.0, knee=0.1, dark=1e-3)
-    asked, finer = (
-        counts(still(np.full(2000, 0.1), 2.0, samples), every(effect), 2.0, device).sum()
-        for samples in (2, 8001)
-    )
-    assert asked == pytest.approx(finer, rel=0.06)
+@wp.kernel(enable_backward=False)
+def noise_paths(step: float, sigma: float, samples: int, out: wp.array2d[float]):
+    """Noise at light far above nothing and a knee far above the light, (samples, pixels)."""
+    i = wp.tid()
+    noise, speed, voltage = float(0.0), float(0.0), float(0.0)
+    key = wp.rand_init(7, i)
+    for k in range(samples):
+        dt = step
+        if k == 0:
+            dt = 1.0e30
+        first, second = wp.randf(key), wp.randf(key)
+        voltage, noise, speed = voltage_noise.noisy_voltage(
+            0.0, 1.0, dt, sigma, 1.0, 1.0e6, 999999.0, noise, speed, first, second
+        )
+        out[k, i] = voltage
+
+
+@pytest.mark.parametrize("per_period", [20, 30, 40, 60, 100])
+def test_levels_are_passed_as_often_as_rice_says(device, per_period):
+    # half of the variance and of the corner, as dark current and knee are alike
+    samples, pixels, sigma = 100 * per_period, 1000, 0.3
+    out = wp.empty((samples, pixels), dtype=float, device=device)
+    wp.launch(noise_paths, pixels, inputs=[2.0 / per_period, sigma, samples, out], device=device)
+    voltage, deviation = out.numpy(), sigma * np.sqrt(0.5)
+    for level in (2.0, 2.5, 3.0):
+        above = voltage > level * deviation
+        passed = np.count_nonzero(above[1:] & ~above[:-1])
+        # coarser steps miss that a voltage comes back at once, which makes no event.
+        # E|speed| / 2 times the density there: the speed's deviation is that of the noise times the pole
+        pole = 2 * np.pi / np.sqrt(np.sqrt(2) - 1)
+        want = pole / (2 * np.pi) * np.exp(-0.5 * level**2) * 100 * pixels
+        assert passed == pytest.approx(want, rel=0.03 + 3 / np.sqrt(want))
+
+
+def noise_events(thresholds: np.ndarray, time: float, rng: np.random.Generator) -> np.ndarray:
+    """Return events per time constant of a change detector under noise of deviation 1, in small steps.
+
+    Args:
+        thresholds: Shape (P,).
+        time: Looked at [time constants].
+        rng: Draws the noise and where the memories begin.
+    """
+    fine = 0.05
+    step = expm(np.array([[0, 1], [-1, -2]]) * fine)
+    fresh = np.linalg.cholesky(np.eye(2) - step @ step.T)
+    state = rng.standard_normal((2, len(thresholds)))
+    memory, events = state[0] - rng.uniform(-1, 1, len(thresholds)) * thresholds, np.zeros(len(thresholds))
+    for _ in range(round(time / fine)):
+        state = step @ state + fresh @ rng.standard_normal(state.shape)
+        crossed = np.trunc((state[0] - memory) / thresholds)
+        memory += crossed * thresholds
+        events += np.abs(crossed)
+    return events / time
+
+
+def test_events_of_noise_are_those_of_small_steps(device, rng):
+    pixels, time, light = 4000, 60.0, 0.1
+    effect = VoltageNoise(sigma=0.2, cutoff=100.0, knee=0.1, dark=1e-6)
+    deviation, pole = 0.2 * np.sqrt(0.5), 50.0 * 2 * np.pi / np.sqrt(np.sqrt(2) - 1)
+    for ratio in (1.0, 2.0, 3.0):
+        want = noise_events(np.full(pixels, ratio), time, rng)
+        sensor = every(Threshold(on=ratio * deviation, off=ratio * deviation), effect)
+        scene = still(np.full(pixels, light), time / pole, 2)
+        got = counts(scene, sensor, time / pole, device).sum(0) / time
+        error = np.hypot(got.std(), want.std()) / np.sqrt(pixels)
+        assert got.mean() == pytest.approx(want.mean(), rel=0.03, abs=3 * error)
+
+
+def likeness_of_halves(sensor: dase.Sensor, device: str) -> float:
+    """Return how the events of pixels that are alike correlate between two halves of the time."""
+    scene = still(np.full(300, 0.05), 12.0, 2)
+    return float(np.corrcoef(dase.count(scene, sensor, [0, 6, 12], device=device)[0].sum(1))[0, 1])
+
+
+def test_a_pixel_held_in_reset_forgets_its_phase(device):
+    noisy = every(Threshold(on=0.35, off=0.35), VoltageNoise(sigma=0.15, cutoff=60.0))
+    assert likeness_of_halves(noisy, device) > 0.7
+    # a time constant
+    assert likeness_of_halves(noisy.with_effect(Refractory(period=5e-3)), device) < 0.3

@@ -17,6 +17,7 @@ from dase.fitting.data_split import split_measurement
 from dase.fitting.descent import DESCENT
 from dase.fitting.model import model_of
 from dase.fitting.scheduler import answer_requests, run_side_by_side, run_work
+from dase.fitting.trial_sampling import samples_per_step
 from dase.kernels import event_probes as kernels
 from dase.probes.accumulators import GROUP, PROBE_TIMES, compute_totals, leave_groups_out
 from dase.probes.statistics import FAMILIES, LAYOUT, compute_statistics, refine_frequency
@@ -126,7 +127,8 @@ def test_a_trial_gives_the_events_of_the_simulator(evidence, name):
     """Sampled alike, the kernel of many models emits what the simulator emits, for each effect."""
     trials = evidence.scout.trials
     sensor = Sensor() if name == "threshold" else Sensor().with_effect(EFFECTS[name](**ON[name]))
-    got = trials.run(sensor, sensor.parameters()[None], seed=9, finer=1)
+    finer = max(samples_per_step(sensor, trials.stimulus.grid.step), 1)
+    got = trials.run(sensor, sensor.parameters()[None], seed=9, finer=finer)
     want = trials.stream(sensor, sensor.parameters(), (), seed=9)
     assert want.halves.sum() > 500
     # times are rounded differently in the last bit: an event at the end of a step may fall into the next one

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 from reference import pixel as reference
 from reference.pixel import Stream, setting
+from scipy.interpolate import CubicHermiteSpline
 from scipy.linalg import cholesky, expm
 
 import dase
@@ -69,6 +70,8 @@ def voltage_noise(
 ) -> np.ndarray:
     """Return the noise of two equal poles from its covariance, shape (K, N).
 
+    A step that turns ends at its turn, which is that of the cubic through its ends, and a little beyond.
+
     Args:
         times: Samples [s], shape (K,).
         intensity: Linear, shape (K, N).
@@ -88,8 +91,14 @@ def voltage_noise(
             # noise and its slope over the pole; d²n = -2 λ dn - λ² n + white noise
             step = expm(np.array([[0, 1], [-1, -2]]) * pole[k, i] * (times[k] - times[k - 1]))
             fresh = np.eye(2) - step @ step.T
+            before, constants = state, min(pole[k, i] * (times[k] - times[k - 1]), 2.0)
             state = step @ state + sigma[k, i] * cholesky(fresh, lower=True) @ normals[:, k, i]
             out[k, i] = state[0]
+            if before[1] * state[1] < 0:
+                slopes = constants * before[1], constants * state[1]
+                way = CubicHermiteSpline([0.0, 1.0], [before[0], state[0]], slopes)
+                (turn,) = (t for t in way.derivative().roots() if 0 <= t <= 1)
+                out[k, i] = way(turn) + np.sign(before[1]) * 0.05 * constants**1.5 * sigma[k, i]
     return out
 
 

@@ -1,0 +1,87 @@
+"""What a fit simulates is what `dase.simulate` does, however fast the pixels' voltage changes."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+import dase
+from dase.effects.flicker import Flicker
+from dase.effects.readout import Readout
+from dase.effects.threshold import Threshold
+from dase.effects.voltage_noise import VoltageNoise
+from dase.fitting.batch_simulator import BatchSimulator, SimulationOrder
+from dase.fitting.trial_sampling import samples_per_step, samples_per_step_of_rows
+from dase.kernels import launch
+from dase.probes.stimulus import Grid, Stimulus, sort_into_cells
+
+STEP, SIZE, SECONDS = 1e-3, (20, 16), 0.3
+
+
+@pytest.fixture(scope="module")
+def trials(device):
+    """A simulator of trials whose pixels are all of a sensor's, some of which see light that changes."""
+    pixels, steps = SIZE[0] * SIZE[1], round(SECONDS / STEP) + 1
+    wave = 0.2 * np.sin(2 * np.pi * STEP * np.arange(steps))
+    light = (0.1 * np.exp(wave * (np.arange(pixels) % 2)[:, None])).astype(np.float32)
+    cell = sort_into_cells(light, STEP, np.array([0.05, 0.2, 0.5]), 1e-3)
+    numbers = np.arange(pixels, dtype=np.int32)
+    grid = Grid(0.0, STEP, steps)
+    return BatchSimulator(Stimulus(numbers, *SIZE, grid, light, cell, 1e-3, launch.find_device(device)))
+
+
+@pytest.fixture(scope="module")
+def scene(trials):
+    """The same light as a video."""
+    light = trials.stimulus.intensity.T.reshape(-1, SIZE[1], SIZE[0])
+    return dase.VideoScene(light, trials.stimulus.grid.times)
+
+
+def sensor_with(*effects):
+    return dase.Sensor((Threshold(on=0.2, off=0.2), *effects))
+
+
+SPEEDS = ((0.4, 10.0), (0.17, 120.0), (0.12, 700.0), (0.1, 3000.0))
+NOISES = [VoltageNoise(sigma=sigma, cutoff=cutoff) for sigma, cutoff in SPEEDS]
+DEPTHS = ((0.9, 50.0), (0.3, 100.0), (0.25, 333.0), (0.5, 1000.0))
+LAMPS = [Flicker(depth=depth, frequency=frequency) for depth, frequency in DEPTHS]
+
+
+@pytest.mark.parametrize("effect", [*NOISES, *LAMPS], ids=lambda effect: effect.name)
+def test_a_trial_sends_as_many_events_as_a_simulation(trials, scene, device, effect):
+    sensor = sensor_with(effect)
+    got = trials.run(sensor, sensor.parameters()[None], seed=3).halves.sum()
+    stored = trials.stream(sensor, sensor.parameters(), (), seed=3).halves.sum()
+    want = len(dase.simulate(scene, sensor, seed=3, device=device))
+    assert want > 500
+    # samples stand elsewhere where a step is not cut into the same number, and noise has other numbers then
+    assert got == pytest.approx(want, rel=0.03, abs=3 * np.sqrt(2 * want))
+    assert stored == pytest.approx(got, rel=2e-3)
+
+
+def test_a_trial_fills_a_bus_as_a_simulation_does(trials, scene, device):
+    lamp, bus = Flicker(frequency=400.0, depth=0.5), Readout(rate=2e5, depth=64)
+    sensor = sensor_with(lamp, bus)
+    got = trials.stream(sensor, sensor.parameters(), sensor.readout_effects(), seed=3).halves.sum()
+    want = len(dase.simulate(scene, sensor, seed=3, device=device))
+    free = len(dase.simulate(scene, sensor_with(lamp), seed=3, device=device))
+    assert want < 0.8 * free
+    assert got == pytest.approx(want, rel=0.03)
+
+
+def test_models_are_sampled_as_each_of_them_needs(trials):
+    sensor = sensor_with(VoltageNoise())
+    vectors = np.repeat(sensor.parameters()[None], 4, 0)
+    at = sensor.parameter_names().index("voltage_noise.cutoff")
+    vectors[:, at] = 3000.0, 20.0, 400.0, 1000.0
+    assert samples_per_step_of_rows(sensor, vectors, STEP).tolist() == [24, 1, 4, 8]
+    assert samples_per_step(sensor, STEP) == 2
+    together = trials.run(sensor, vectors, seed=5)
+    for n in range(4):
+        alone = trials.run(sensor, vectors[n : n + 1], seed=5)
+        np.testing.assert_array_equal(together.sums[n], alone.sums[0])
+        np.testing.assert_array_equal(together.halves[n], alone.halves[0])
+        np.testing.assert_array_equal(together.clock[n], alone.clock[0])
+    # repeats of a model all take the same samples, each with random numbers of its own
+    repeats = SimulationOrder(sensor, vectors, 5, reseed=True)
+    assert repeats.samples_per_step(STEP).tolist() == [24] * 4
