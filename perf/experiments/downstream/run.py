@@ -80,18 +80,18 @@ class Size:
         objects: Cut-outs in a pool.
     """
 
-    crop: tuple[int, int] = (128, 128)
+    crop: tuple[int, int] = (112, 112)
     windows: int = 16
-    batch: int = 12
-    flow_batch: int = 24
+    batch: int = 6
+    flow_batch: int = 16
     flow_windows: int = 3
     reconstruction_channels: int = 16
-    flow_channels: int = 32
-    reconstruction_steps: int = 600
-    flow_steps: int = 1500
+    flow_channels: int = 16
+    reconstruction_steps: int = 500
+    flow_steps: int = 1800
     samples: int = 16
     recorded: float = 60.0
-    test_batches: int = 4
+    test_batches: int = 8
     backgrounds: int = 48
     objects: int = 96
 
