@@ -18,6 +18,8 @@ from dase.diagnosis.candidates import (
 from dase.diagnosis.cell_descriptions import worst_cells
 from dase.diagnosis.detection_limits import find_detection_limits
 from dase.diagnosis.directional_test import find_hidden_effect
+from dase.diagnosis.few_hot_pixels import NAME as HOT
+from dase.diagnosis.few_hot_pixels import few_hot_pixels, hot_effect_of, with_hot_pixels
 from dase.diagnosis.grading import ModelOnReport, grade_effects, judge_on_report
 from dase.diagnosis.pruning import prune_model
 from dase.diagnosis.remainder import describe_unexplained, share_of_scene, what_to_record
@@ -35,7 +37,7 @@ from dase.effects import EFFECTS, Effect
 from dase.fitting.burst_strength import follows_frames, put_in_step
 from dase.fitting.confidence_intervals import estimate_parameters
 from dase.fitting.data_split import SPLIT, split_measurement
-from dase.fitting.measurement import Measured, SceneChoice, as_measurement
+from dase.fitting.measurement import Measured, Measurement, SceneChoice, as_measurement
 from dase.fitting.model import (
     FittedModel,
     fit_present_model,
@@ -64,7 +66,6 @@ from dase.results import (
     is_worse,
 )
 from dase.scenes.between_frames import CameraScene
-from dase.scenes.scene import Scene
 from dase.simulation.sensor import Sensor
 from dase.simulation.sensor_file import as_sensor
 
@@ -117,15 +118,18 @@ def diagnose(
     # a sensor that has them already is compared with them
     frames = seen.times_of_bursts(measurement) if follows_frames(given) else None
     bursts = None if "exposure" in given else seen.bursts
+    hot = few_hot_pixels(seen, measurement.events, pixels) if HOT not in given else None
     evidence = split_measurement(
         measurement.events, measurement.scene, log_eps=given.log_eps, trust=measurement.trust,
-        span=measurement.span, left_out=bursts.contains if bursts else None, lamp=seen.lamp,
+        span=measurement.span, left_out=bursts.contains if bursts else None, odd_pixels=hot, lamp=seen.lamp,
         frames=frames, pixels=pixels, seed=seed, device=device,
     )  # fmt: skip
     given = put_in_step(given, evidence)
     tell("fitting the present model", 0.0, float("nan"))
     names = frozenset(effect.name for effect in given.effects)
-    state = DiagnosisState(evidence, effects, seed, tell, names, settings)
+    # what is left out of all that is compared cannot be tried
+    tried = {name: effect for name, effect in effects.items() if hot is None or name != HOT}
+    state = DiagnosisState(evidence, tried, seed, tell, names, settings)
     if so_far is not None:
         state.after_step = lambda model, errors: so_far(
             measurement.noted(_known_so_far(state, model, errors, before, time.perf_counter() - begin))
@@ -147,7 +151,11 @@ def diagnose(
             .error
         )
         start = _fitted_unless_worse(state, start.sensor, free)
-    state.certain = frozenset(seen.effects) - names
+    state.certain = frozenset(seen.effects) & frozenset(tried) - names
+    if hot is not None:
+        state.notes.append(
+            f"{len(hot)} hot pixels are left out of all that is compared, and counted among all pixels"
+        )
     strength = None if evidence.contradiction else strength_of_bursts(
         seen, measurement, start.sensor, effects, pixels=pixels, seed=seed, device=device
     )  # fmt: skip
@@ -164,8 +172,9 @@ def diagnose(
         model, judgement = _add_pair(state, model, judgement)
     if len(state.added_to(model)) > 1:
         model, judgement = prune_model(state, model, judgement)
-    seen = without_the_explained(seen, measurement, model.sensor, seed)
-    found = _conclude_diagnosis(state, start, model, before, seen, names, measurement.scene)
+    found = _conclude_diagnosis(state, start, model, before, seen, names, measurement)
+    if hot is not None:
+        found = with_hot_pixels(found, *hot_effect_of(measurement.events, hot))
     if strength is not None:
         tell("how strong the bursts are", 0.95, found.errors[-1])
         # beside other effects it may be another
@@ -408,7 +417,7 @@ def _conclude_diagnosis(
     before: float,
     seen: SeenEffects,
     names: frozenset[str],
-    scene: Scene,
+    measurement: Measurement,
 ) -> Diagnosis:
     """Return what was found, judged by the part of the measurement by which nothing was chosen."""
     found = state.added_to(model)
@@ -426,6 +435,11 @@ def _conclude_diagnosis(
         judged_effects = grade_effects(
             state, model, order, way, first, last, report=report, values=values, at_bounds=at_bounds
         )
+    explained = model.sensor
+    for name, one in judged_effects.items():
+        # a stand-in explains nothing that the events show
+        explained = explained.without(name) if one.grade is Grade.STAND_IN else explained
+    seen = without_the_explained(seen, measurement, explained, state.seed)
     said = seen.findings(judged_effects.values(), names)
     findings = {one.effect: one for one in said if one.grade is not Grade.STAND_IN}
     kept = tuple(n for n in order if n in findings and findings[n].grade is not Grade.EITHER)
@@ -470,7 +484,10 @@ def _conclude_diagnosis(
         stand_ins=tuple(one for one in said if one.grade is Grade.STAND_IN),
         not_seen=limits,
         record=what_to_record(
-            scene, list(findings.values()), unexplained, contradiction=bool(state.evidence.contradiction)
+            measurement.scene,
+            list(findings.values()),
+            unexplained,
+            contradiction=bool(state.evidence.contradiction),
         ),
         level=last.level,
         reach=last.reach,

@@ -149,6 +149,7 @@ def split_measurement(
     trust: Trust | None = None,
     span: tuple[float, float] | None = None,
     left_out: Callable[[Array], NDArray[np.bool_]] | None = None,
+    odd_pixels: NDArray[np.int64] | None = None,
     lamp: float | None = None,
     frames: BurstTimes | None = None,
     pixels: int = SPLIT.pixels,
@@ -167,6 +168,7 @@ def split_measurement(
         span: First and last time that is compared [s]; None for all, of which a long recording has a part
             chosen.
         left_out: Tells which times [s], shape (T,), are left out; None for none.
+        odd_pixels: Row-major indices of pixels that are left out, shape (K,); None for none.
         lamp: Frequency of light that flickers [Hz] where all events have told it; None to look for it here.
         frames: When the bursts come that are in step with frames; None where there are none, or left out.
         pixels: In each part.
@@ -194,7 +196,7 @@ def split_measurement(
     except ValueError as error:
         raise InputError(str(error)) from error
     size = scene.width * scene.height
-    each = min(pixels, size // PARTS)
+    each = min(pixels, (size - (0 if odd_pixels is None else len(odd_pixels))) // PARTS)
     if each < settings.least_pixels:
         raise InputError(
             f"a diagnosis needs at least {settings.least_pixels} pixels to fit, as many to choose by and as "
@@ -208,8 +210,13 @@ def split_measurement(
     cut = max(2, round(settings.fitted_share * grid.steps))
     if trust is None:
         # other pixels judge: fixed patterns, such as mismatch, would be known from the fitted ones
-        chosen = rng.permutation(size)[: PARTS * each].astype(np.int32)
+        order = rng.permutation(size)
+        if odd_pixels is not None:
+            order = order[~np.isin(order, odd_pixels)]
+        chosen = order[: PARTS * each].astype(np.int32)
     else:
+        if odd_pixels is not None:
+            trust = partial(_trust_but_in, odd_pixels, trust)
         looks = find_trusted_parts(events, scene, times_of_grid(scene, grid), cut, trust)
         chosen = choose_trusted_pixels(looks, each, rng, least=settings.least_pixels)
         each = len(chosen) // PARTS
@@ -285,6 +292,13 @@ def split_measurement(
     return SplitMeasurement(
         train, held, last_part, scout, bands, structure, peak, *rates, tuple(notes), contradiction, frames
     )  # fmt: skip
+
+
+def _trust_but_in(
+    odd_pixels: NDArray[np.int64], trust: Trust, times: Array, pixels: NDArray[np.int32]
+) -> NDArray[np.bool_]:
+    """Return what a trust says, and that some pixels are not to be trusted, shape (T, N)."""
+    return trust(times, pixels) & ~np.isin(pixels, odd_pixels)
 
 
 def common_grid(events: Events, scene: Scene) -> Grid:

@@ -1,0 +1,54 @@
+"""Hot pixels that are too few for a fit are left out of it and counted among all pixels."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+import dase
+from dase.diagnosis.diagnose import diagnose
+from dase.diagnosis.few_hot_pixels import few_hot_pixels, hot_effect_of
+from dase.diagnosis.seen_effects import find_seen_effects
+from dase.effects import EFFECTS
+from dase.fitting.measurement import Measurement, static_scene
+from dase.simulation.sensor import Sensor
+
+LIBRARY = {name: EFFECTS[name] for name in ("threshold", "shot", "leak", "hot")}
+HOT = EFFECTS["hot"](share=4e-4, rate=300.0, spread=1.2, balance=0.7)
+
+
+@pytest.fixture(scope="module")
+def events() -> dase.Events:
+    """Of a large sensor at rest: noise, and a dozen hot pixels, of which 400 would have a sixth of one."""
+    scene = dase.VideoScene(np.full((2, 160, 200), 0.5, np.float32), [0.0, 1.5])
+    sensor = Sensor().with_effect(EFFECTS["shot"](rate=4.0)).with_effect(HOT)
+    return dase.simulate(scene, sensor, seed=2)
+
+
+def test_few_hot_pixels_are_counted_and_their_law_is_found(events):
+    scene = static_scene(events)
+    seen = find_seen_effects(Measurement(events, scene), LIBRARY)
+    pixels = few_hot_pixels(seen, events, 400)
+    assert pixels is not None
+    busy = np.bincount(events.y.astype(np.int64) * events.width + events.x, minlength=200 * 160)
+    assert np.isin(np.flatnonzero(busy > 100), pixels).mean() > 0.7
+    assert busy[pixels].min() > 3 * busy.mean()
+    _, values = hot_effect_of(events, pixels)
+    for name in ("share", "rate", "spread", "balance"):
+        value = values[f"hot.{name}"]
+        # few pixels tell little, and those that are hardly hot are not among them
+        assert value.low / 1.5 <= getattr(HOT, name) <= 1.5 * value.high, name
+    # where a part has many of them, a fit tells more
+    assert few_hot_pixels(seen, events, 20_000) is None
+
+
+def test_noise_is_found_beside_a_few_hot_pixels(events):
+    scene = static_scene(events)
+    found = diagnose(events, scene=scene, effects=LIBRARY, pixels=400, most=2)
+    grades = {one.effect: str(one.grade) for one in found.findings}
+    assert grades["hot"] == "certain"
+    assert "hot" in found.selected
+    assert "hot" in found.sensor
+    assert "shot" in found.selected
+    assert found.errors[-1] < found.gate
+    assert any("left out" in note for note in found.notes)
