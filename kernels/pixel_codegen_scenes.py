@@ -23,7 +23,7 @@ from dase.kernels.pixel_codegen_program import (
     make_program,
     pixel_places,
 )
-from dase.kernels.pixel_compile import compile_text
+from dase.kernels.pixel_compile import compile_text, register_bound
 from dase.kernels.pixel_stages import EffectStages
 from dase.kernels.scene_layers import Frames
 from dase.kernels.scene_windows import LayerScenes, layers_of_scene
@@ -76,10 +76,7 @@ def compose_scenes(
         scope |= lane_scope(lanes, source) | {"store": lane_functions(lanes).store}
     scope |= {"Scenes": kind, "scene_of": of_row, "Sink": WindowGrids, "deposit": DEPOSITS[deposit]}
     options = lane_options() if lanes else {}
-    # left alone, the compiler takes 190 for noise, and a multiprocessor then runs 8 warps; with 128 it runs
-    # 16, which took two thirds of the time on an H100. Sensors without noise were slower with a bound
-    noisy = any(stage == "noise" for effect in stages for stage, _ in effect.functions)
-    registers = 128 if noisy and not lanes else None
+    registers = register_bound(stages, lanes)
     text = source_text(stages, source, lanes=lanes)
     return compile_text(text, "pixel_scenes", scope, registers=registers, **options)
 
