@@ -9,7 +9,7 @@ from dase.diagnosis.state import DiagnosisState, explains_remainder, with_same_f
 from dase.fitting.early_stopping import stop_unless_below
 from dase.fitting.model import FittedModel, refit_model, refit_work
 from dase.fitting.scheduler import run_side_by_side
-from dase.probes.distance import Judgement, leaves_nothing, may_be_announced, reaches_floor
+from dase.probes.distance import LIMITS, Judgement, leaves_nothing, may_be_announced, reaches_floor
 from dase.probes.random_streams import SimulationStream
 
 
@@ -33,6 +33,9 @@ def prune_model(
             judged = state.judge(swapped)
             without = state.without.get(name)
             if not reaches_floor(judged):
+                continue
+            # at the floor is not enough where chance is far below: dark current at 1.08 for leak at 0.35
+            if judged.error > max(LIMITS.quiet, judged.reach, judgement.error + state.settings.tie):
                 continue
             if without is not None and not explains_remainder(judged, without, state.settings):
                 continue

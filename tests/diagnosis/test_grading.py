@@ -51,6 +51,7 @@ def judged(error: float, *, level: float = 0.25, reach: float = 0.4) -> Judgemen
         # ... between 4.5 and 10 %: shot noise in the place of voltage noise
         (40.0, 30.0, 2.2, 6.0, False, Grade.EITHER, True),
         (40.0, 30.0, 3.2, 6.0, False, Grade.EITHER, True),
+        (40.0, 30.0, 5.5, 6.0, False, Grade.EITHER, True),
         # ... one that helps a little may explain the wrong world
         (40.0, 3.0, 1.9, 6.0, False, Grade.STAND_IN, False),
         # a stand-in for something strong
