@@ -7,6 +7,9 @@ import warp as wp
 
 from dase.kernels import launch
 
+GAP_THREADS = 64
+"""Threads that copy the keys of one slab: neighbours take neighbouring keys, as a GPU's memory wants it."""
+
 
 @wp.kernel(enable_backward=False)
 def close_gaps(
@@ -15,14 +18,16 @@ def close_gaps(
     keys: wp.array2d[wp.int64],  # (S, capacity)
     used: wp.array[int],  # (S,)
     start: wp.array[int],  # (S,) exclusive sum of used
+    before: int,  # keys that lie in front of all
     # out
     keys_out: wp.array[wp.int64],
 ):
-    """Close the gaps between slabs, one slab per row."""
-    n, slab = wp.tid()
-    slab += first
-    if n < used[slab]:
-        keys_out[start[slab] + n] = keys[slab, n]
+    """Close the gaps between slabs, with `GAP_THREADS` threads for each."""
+    _, thread = wp.tid()
+    thread += first
+    slab = thread / wp.static(GAP_THREADS)
+    for n in range(thread - slab * wp.static(GAP_THREADS), used[slab], wp.static(GAP_THREADS)):
+        keys_out[before + start[slab] + n] = keys[slab, n]
 
 
 @wp.func_native(
@@ -191,17 +196,19 @@ class KeyBuffer:
     """Memory that is kept from chunk to chunk: new memory costs as much as a sort."""
 
     def __init__(self) -> None:
-        self._kept: wp.array | None = None
+        self._kept: dict[str, wp.array] = {}
 
-    def take(self, size: int, device: wp.Device) -> wp.array:
-        """Return an array of `size` keys, shape (size,); what was taken before is overwritten."""
-        if self._kept is None or len(self._kept) < size:
-            self._kept = launch.new_array(size + size // 4, wp.int64, device)
-        return self._kept[:size] if size else wp.empty(0, dtype=wp.int64, device=device)
+    def take(self, what: str, size: int, device: wp.Device, dtype: type = wp.int64) -> wp.array:
+        """Return an array of `size` numbers, shape (size,), which was that of `what` before, too."""
+        kept = self._kept.get(what)
+        if kept is None or len(kept) < size:
+            kept = self._kept[what] = launch.new_array(size + size // 4, dtype, device)
+        return kept[:size] if size else wp.empty(0, dtype=dtype, device=device)
 
 
 def keys_in_order(
     keys: wp.array,
+    counts: wp.array,
     used: np.ndarray,
     bits: int,
     low: int,
@@ -216,7 +223,8 @@ def keys_in_order(
 
     Args:
         keys: Shape (B, slabs, capacity), int64: time [ns], place, polarity and label.
-        used: Shape (B, slabs), not above the capacity.
+        counts: How many of them each slab has, shape (B, slabs), int32, not above the capacity.
+        used: The same on the host.
         bits: Of the place.
         low: Bits below the place.
         top: Bits of all.
@@ -227,11 +235,11 @@ def keys_in_order(
     begin = low if late is not None else bits + low if device.is_cpu else 0
     late = np.empty(0, np.int64) if late is None else late
     total = len(late) + int(used.sum())
-    out = (room or KeyBuffer()).take(2 * total, device)
+    room = room or KeyBuffer()
+    out = room.take("keys", 2 * total, device)
     if total == 0:
         return out
-    counts = wp.array(used.reshape(-1), dtype=int, device=device)
-    flat = keys.reshape((keys.shape[0] * keys.shape[1], keys.shape[2]))
+    flat, counts = keys.reshape((keys.shape[0] * keys.shape[1], keys.shape[2])), counts.flatten()
     if device.is_cpu:
         halves = out[:total], out[total:]
         before = wp.array(late, dtype=wp.int64, device=device)
@@ -240,10 +248,12 @@ def keys_in_order(
         return halves[(passes + 1) % 2]
     if len(late):
         out[: len(late)].assign(late)
-    start = len(late) + np.concatenate([[0], np.cumsum(used.reshape(-1))[:-1]])
     if used.any():
-        arguments = [flat, counts, wp.array(start, dtype=int, device=device), out]
-        launch.run_kernel(close_gaps, len(start), arguments, device, batch=int(used.max()))
-    idle = wp.empty(2 * total, dtype=wp.int32, device=device)
+        start = room.take("start", len(counts), device, wp.int32)
+        wp.utils.array_scan(counts, start, inclusive=False)
+        arguments = [flat, counts, start, len(late), out]
+        launch.run_kernel(close_gaps, len(counts) * GAP_THREADS, arguments, device)
+    # Warp's sort takes numbers along with the keys; nobody reads these
+    idle = room.take("idle", 2 * total, device, wp.int32)
     wp.utils.radix_sort_pairs(out, idle, total, begin_bit=begin, end_bit=top)
     return out[:total]

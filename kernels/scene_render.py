@@ -38,11 +38,12 @@ def _places(lanes: int) -> tuple[Any, Any]:
 
 
 @lru_cache(maxsize=8)
-def rendering_kernel(lanes: int) -> wp.Kernel:
-    """Return the kernel that renders light, over blocks of `lanes` pixels."""
+def rendering_kernel(lanes: int, grey: bool = False) -> wp.Kernel:
+    """Return the kernel that renders light, over blocks of `lanes` pixels, or greys of 8 bits."""
     f, start_of, light = lane_functions(lanes), block_functions(lanes), light_of(lanes, "layers")
     columns, rows = _places(lanes)
-    layers_of, store = start_of.layers_of, f.store
+    layers_of, store = start_of.layers_of, f.store_grey if grey else f.store
+    Level = wp.uint8 if grey else wp.float32
 
     @wp.kernel(enable_backward=False, module="unique", module_options=lane_options())
     def render_light(
@@ -52,7 +53,7 @@ def rendering_kernel(lanes: int) -> wp.Kernel:
         size: int,  # N
         width: int,
         # out
-        out: wp.array2d[float],  # (K, N) linear intensity
+        out: wp.array2d[Level],  # (K, N) linear intensity, or its share of 255
     ):
         """Render the intensity of a block of pixels at all samples."""
         _, i = wp.tid()
@@ -101,13 +102,15 @@ def flow_kernel(lanes: int) -> wp.Kernel:
     return render_velocity
 
 
-def render_frames(layers: Layers, width: int, height: int, device: wp.Device) -> wp.array:
-    """Return intensities of all samples, shape (K, H · W)."""
+def render_frames(
+    layers: Layers, width: int, height: int, device: wp.Device, *, grey: bool = False
+) -> wp.array:
+    """Return intensities of all samples, shape (K, H · W), or greys of 8 bits with 255 for intensity 1."""
     samples, size = layers.place.shape[0], height * width
-    out = launch.new_array((samples, size), wp.float32, device)
+    out = launch.new_array((samples, size), wp.uint8 if grey else wp.float32, device)
     lanes = widest_block(size, device, "layers")
     inputs = [layers, size, width, out]
-    launch.run_kernel(rendering_kernel(lanes), block_count(size, lanes), inputs, device)
+    launch.run_kernel(rendering_kernel(lanes, grey), block_count(size, lanes), inputs, device)
     return out
 
 

@@ -320,6 +320,13 @@ if ({length} == 4 && ((size_t)to & 15) == 0) {{
 #endif
 for (int lane = 0; lane < {length}; ++lane) to[lane] = lanes[lane];
 """
+    # halves to even, as NumPy's rint has it
+    store_grey = """
+for (int lane = 0; lane < {length}; ++lane) {{
+    const float level = rintf(lanes[lane] * 255.0f);
+    values.data[n + lane] = (unsigned char)(level < 0.0f ? 0.0f : level > 255.0f ? 255.0f : level);
+}}
+"""
 
 
 @wp.func
@@ -399,6 +406,9 @@ def lane_functions(length: int) -> SimpleNamespace:
         load=plain("load", _Cpp.load, rows, "Lanes"),
         load_aligned=plain("load_aligned", _Cpp.load_four + _Cpp.load, rows, "Lanes"),
         store=plain("store", _Cpp.store, "values: wp.array[float], n: int, lanes: Lanes", "None"),
+        store_grey=plain(
+            "store_grey", _Cpp.store_grey, "values: wp.array[wp.uint8], n: int, lanes: Lanes", "None"
+        ),
         store_whole=plain("store_whole", _Cpp.store, "values: wp.array[int], n: int, lanes: Lanes", "None"),
         minus=lanewise("minus", "V result = a - b;", "a b"),
         plus=lanewise("plus", "V result = a + b;", "a b"),

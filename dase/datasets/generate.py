@@ -289,7 +289,7 @@ def _warm_up(job: DatasetJob) -> None:
     )
     run = SensorRun(scene, _sensor_of(job), device=job.backend, labels=job.labels)
     run.events()
-    scene.frames(np.zeros(1), job.backend)
+    scene.grey_frames(np.zeros(1), job.backend)
     scene.flow(np.zeros(1), job.backend)
     run.thresholds()
 
@@ -391,9 +391,7 @@ def _record_into(
 
 
 def _write_frames(scene: Scene, writer: io.Writer, times: np.ndarray, device: str) -> None:
-    levels = scene.frames(times, device) * np.float32(255)
-    np.rint(levels, out=levels)  # in place, as memory costs more than arithmetic here
-    frames = np.clip(levels, 0, 255, out=levels).astype(np.uint8)
+    frames = scene.grey_frames(times, device)
     flow = scene.flow(times, device)
     for i, at in enumerate(times):
         writer.frame(float(at), frames[i], None if flow is None else flow[i])

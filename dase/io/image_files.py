@@ -37,13 +37,15 @@ def to_grey(pixels: NDArray[Any]) -> tuple[NDArray[np.float32], NDArray[np.float
     Args:
         pixels: (H, W) or (H, W, channels), uint8 or uint16, BGR or BGRA.
     """
-    planes = list(np.moveaxis(np.atleast_3d(pixels), 2, 0))
+    # each plane by itself: numbers that lie side by side become vectors, every third one does not
+    planes = list(cv2.split(pixels))
     full = np.float32(np.iinfo(pixels.dtype).max)
     alpha = planes.pop() / full if len(planes) in (2, 4) else None
     weights = (0.07, 0.72, 0.21) if len(planes) == 3 else (1.0,)  # of BGR; S2R takes luma for intensity
-    grey = np.zeros(planes[0].shape, np.float32)
+    grey = np.empty(planes[0].shape, np.float32)
     for band in _row_bands(grey.shape):
-        for weight, plane in zip(weights, planes, strict=True):
+        np.multiply(planes[0][band], np.float32(weights[0]) / full, out=grey[band])
+        for weight, plane in zip(weights[1:], planes[1:], strict=True):
             grey[band] += np.float32(weight) / full * plane[band]
     return grey, alpha
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -47,8 +48,9 @@ class FrameReader:
         self._count = len(self._files) if self._files is not None else self._count_frames()
         if self._count < 2:
             raise InputError(f"video {path} must have at least 2 frames, got {self._count}")
-        # the chunk before and the one asked for may overlap by the frames that are stored
-        self._kept: dict[int, NDArray[np.float32]] = {}
+        # of the last few calls: frames are also stored, which are asked for after those of the next chunk
+        # where pixels are ahead of their events
+        self._kept: deque[dict[int, NDArray[np.float32]]] = deque(maxlen=4)
         self._next = 0
         if self._files is not None:
             self._first = decode_file(self._files[0]).shape[:2]
@@ -59,20 +61,27 @@ class FrameReader:
         return self._count
 
     def __getitem__(self, index: NDArray[np.int64]) -> NDArray[np.float32]:
-        """Return the frames of increasing indices, intensity in [0, 1], shape (K, height, width)."""
+        """Return the frames of increasing indices, intensity in [0, 1], shape (K, height, width).
+
+        They are not to be changed: later calls take from them.
+        """
         wanted = [int(i) for i in index]
         if self._files is not None:
             return np.stack([self._grey(decode_file(self._files[i]), self._files[i]) for i in wanted])
-        out = {i: self._kept[i] for i in wanted if i in self._kept}
-        missing = [i for i in wanted if i not in out]
+        place = {i: n for n, i in enumerate(wanted)}
+        out = np.empty((len(wanted), *self.shape[1:]), np.float32)
+        known = {i: frame for kept in self._kept for i, frame in kept.items() if i in place}
+        for i, frame in known.items():
+            out[place[i]] = frame
+        missing = sorted(place.keys() - known.keys())
         if missing and missing[0] < self._next:
             self._capture, self._next = None, 0
         for i in range(self._next, missing[-1] + 1 if missing else 0):
             frame = self._decode(i)
-            if i in missing:
-                out[i] = frame
-        self._kept = {i: out[i] for i in wanted}
-        return np.stack([out[i] for i in wanted])
+            if i in place:
+                out[place[i]] = frame
+        self._kept.append(dict(zip(wanted, out, strict=True)))
+        return out
 
     def levels(self) -> Iterator[NDArray[np.uint8]]:
         """Yield all frames, 0 to 255, shape (height, width), not resized; little but a frame is kept."""

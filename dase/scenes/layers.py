@@ -11,7 +11,7 @@ import warp as wp
 from numpy.typing import NDArray
 
 from dase.errors import InputError
-from dase.kernels import launch, scene_render
+from dase.kernels import host_blocks, launch, scene_render
 from dase.kernels import scene_layers as kernels
 from dase.scenes.image_sources import Picture
 from dase.scenes.scene import SamplingSettings, Scene
@@ -331,9 +331,19 @@ class LayerScene(Scene):
         lit = self._lit_frames(times, launch.find_device(device))
         return lit.reshape(len(times), self.height, self.width)
 
+    def grey_frames(self, times: NDArray[np.float64], device: str = "cpu") -> NDArray[np.uint8]:
+        """Return frames of 8 bits, rendered as such; see `Scene.grey_frames`."""
+        if self.lighting is not None:
+            return super().grey_frames(times, device)
+        where = launch.find_device(device)
+        layers = self.arrays(times, where)
+        out = scene_render.render_frames(layers, self.width, self.height, where, grey=True)
+        return host_blocks.copy_to_host(out).reshape(len(times), self.height, self.width)
+
     def _lit_frames(self, times: NDArray[np.float64], device: wp.Device) -> NDArray[np.float32]:
         """Return intensities at `times` [s], shape (K, height · width)."""
-        out = scene_render.render_frames(self.arrays(times, device), self.width, self.height, device).numpy()
+        layers = self.arrays(times, device)
+        out = host_blocks.copy_to_host(scene_render.render_frames(layers, self.width, self.height, device))
         return np.asarray(out if self.lighting is None else out * self.lighting.factor(times)[:, None])
 
     def flow(self, times: NDArray[np.float64], device: str = "cpu") -> NDArray[np.float32]:
@@ -341,7 +351,7 @@ class LayerScene(Scene):
         where = launch.find_device(device)
         maps = wp.array(self.velocity(times).astype(np.float32), dtype=kernels.Affine, device=where)
         out = scene_render.render_flow(self.arrays(times, where), maps, self.width, self.height, where)
-        return np.asarray(out.numpy().reshape(len(times), 2, self.height, self.width))
+        return host_blocks.copy_to_host(out).reshape(len(times), 2, self.height, self.width)
 
 
 def _affine_maps(

@@ -64,6 +64,12 @@ class Scene(ABC):
     def frames(self, times: NDArray[np.float64], device: str = "cpu") -> NDArray[np.float32]:
         """Return intensities in [0, 1] at `times` [s], shape (K, height, width)."""
 
+    def grey_frames(self, times: NDArray[np.float64], device: str = "cpu") -> NDArray[np.uint8]:
+        """Return frames of 8 bits at `times` [s], shape (K, height, width): 255 is intensity 1 and above."""
+        levels = self.frames(times, device) * np.float32(255)
+        np.rint(levels, out=levels)  # in place, as memory costs more than arithmetic here
+        return np.clip(levels, 0, 255, out=levels).astype(np.uint8)
+
     def flow(self, times: NDArray[np.float64], device: str = "cpu") -> NDArray[np.float32] | None:
         """Return the flow at `times` [px/s], shape (K, 2, height, width), x then y; None where unknown."""
         return None

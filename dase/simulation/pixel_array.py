@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
-from typing import Any
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import AbstractContextManager, nullcontext
+from dataclasses import dataclass
+from typing import Any, TypeAlias
 
 import numpy as np
 import warp as wp
@@ -13,6 +16,7 @@ from dase.events import LARGEST_SIDE, Events
 from dase.kernels import event_keys as ordering
 from dase.kernels import launch, pixel_compile, pixel_stages, threshold_events, threshold_levels
 from dase.kernels import threshold_counts as counting
+from dase.kernels.event_columns import EventColumns
 from dase.kernels.random import stream_number
 from dase.scenes.scene import Scene
 from dase.simulation.sample_clock import upload_clock
@@ -32,6 +36,52 @@ def _pixel_indices(pixels: ArrayLike | None, width: int, height: int) -> NDArray
     return given.astype(np.int32)
 
 
+@dataclass(frozen=True)
+class KeyRoom:
+    """Room for the events of a chunk before any is known.
+
+    Too little costs a second run of the pixels; too much costs nothing but addresses on a CPU, where memory
+    that nobody touches is none, and memory on a GPU.
+    """
+
+    most: int = 32
+    """Events of a pixel; fast scenes have some 6 in 64 samples."""
+    least: int = 4
+    """Events of a pixel, whatever memory they take."""
+    keys_cpu: int = 1 << 25
+    """In all, of 8 bytes each."""
+    keys_gpu: int = 1 << 27
+    """In all."""
+
+    def per_pixel(self, pixels: int, *, on_gpu: bool) -> int:
+        """Return the room of a pixel of so many in the batch [events]."""
+        keys = self.keys_gpu if on_gpu else self.keys_cpu
+        return min(max(keys // pixels, self.least), self.most)
+
+
+EventsOfChunk: TypeAlias = tuple[Events, NDArray[np.int32] | None]
+"""Events in order of time, and for a batch the row of each, shape (N,)."""
+
+
+@dataclass
+class _Launched:
+    """A chunk on which pixels are at work.
+
+    Args:
+        run: Runs the pixels once more, from where the chunk began, into a sink.
+        begin: When the last chunk ended [s].
+        end: When this one ends [s].
+        sink: Where the keys go.
+        done: On a GPU, comes when the keys are there.
+    """
+
+    run: Callable[[Any], None]
+    begin: float
+    end: float
+    sink: Any
+    done: Any = None
+
+
 class PixelArray:
     """Some pixels of a sensor while time passes: runs the composed kernel chunk by chunk.
 
@@ -46,6 +96,7 @@ class PixelArray:
         device: `cpu`, `cuda` or a Warp name.
         labels: Whether events are marked with what they came from.
         events_per_pixel: Room for events of a chunk at first; a chunk with more runs again with more room.
+            None for what `KeyRoom` says.
     """
 
     def __init__(
@@ -59,7 +110,7 @@ class PixelArray:
         seed: int = 0,
         device: str = "cpu",
         labels: bool = False,
-        events_per_pixel: int = 4,
+        events_per_pixel: int | None = None,
     ):
         try:
             self.device = launch.find_device(device)
@@ -87,13 +138,19 @@ class PixelArray:
         # two copies, so that a chunk whose events overran their buffer can be run again
         self._state = wp.zeros(shape, dtype=float, device=self.device)
         self._next = wp.zeros(shape, dtype=float, device=self.device)
+        # what is to be written after `_next`, where pixels run a chunk ahead of their events
+        self._idle: list[Any] = []
         self.samples = 0
         self.begin = 0.0
+        self.emitted_again = 0  # chunks that had more events than there was room for
         # consecutive pixels whose keys share a counter and a stretch of the buffer
         self.slab = 256 if self.device.is_cuda else 2048
+        if events_per_pixel is None:
+            events_per_pixel = KeyRoom().per_pixel(self.batch * self.count, on_gpu=self.device.is_cuda)
         self._capacity = events_per_pixel * self.slab
-        self._buffer: Any = None  # of keys, kept from chunk to chunk
+        self._buffers: list[Any] = [None, None]  # of keys, kept from chunk to chunk, in turns
         self._room = ordering.KeyBuffer()
+        self._ordering: Any = None  # stream of a GPU on which events are ordered, decoded and copied
         # nothing but a change detector: counted by a kernel of its own, several pixels per thread
         self._thresholds_only = all(
             stage == "threshold" for effect in self.stages for stage, _ in effect.functions
@@ -109,6 +166,9 @@ class PixelArray:
         delays = any(stage == "delay" for effect in self.stages for stage, _ in effect.functions)
         # keys of events that leave after the chunk, counted from its end
         self._late = np.empty(0, np.int64) if delays else None
+        asked = {"row": self.batch > 1, "label": labels}
+        absent = frozenset(name for name, given in asked.items() if not given)
+        self._columns = EventColumns(self.device, absent)
 
     def count_events(
         self, scene: Scene, times: NDArray[np.float64], windows: NDArray[np.int32], size: int
@@ -135,7 +195,7 @@ class PixelArray:
         if self._thresholds_only:
             self._count_thresholds_only(sink.counts, scene, times, windows)
         else:
-            self._launch("counts", sink, scene, times, windows, align=16)
+            self._prepare_launch("counts", scene, times, windows, align=16)(sink)
         self._advance(times)
         return sink.counts
 
@@ -202,8 +262,8 @@ class PixelArray:
         # blocks may overlap, so what they read must not be what they write
         return first - 1, wp.clone(self._next[1]), wp.clone(self._next[0])
 
-    def _emit_thresholds_only(self, sink: Any, scene: Scene, times: NDArray[np.float64]) -> None:
-        """Emit keys with a kernel that knows nothing but thresholds."""
+    def _prepare_thresholds_only(self, scene: Scene, times: NDArray[np.float64]) -> Callable[[Any], None]:
+        """Return what emits keys into a sink with a kernel that knows nothing but thresholds."""
         self.bind_scene(scene)
         clock = self._upload_clock(times, np.zeros(len(times), np.int32))
         name, source = self.sensor.through_optics(scene).source(times, self.pixels, self.device)
@@ -212,27 +272,22 @@ class PixelArray:
         if logs is not None:
             inputs = [
                 source.values, logs, clock, self.count, first, self._thresholds_of_pixels()[0], memory,
-                signal, self._next[1], self._next[0], sink,
+                signal, self._next[1], self._next[0],
             ]  # fmt: skip
-            align = self.slab // threshold_levels.LANES
-            self._launch_level_blocks(threshold_levels.emit_level_events, inputs, align=align)
-            return
-        lanes = counting.widest_block(self.count, self.device, name)
-        inputs = [
-            source, clock, self._pixels, self.count, self.width, first, *self._thresholds_of_pixels(),
-            memory, signal, self._next[1], self._next[0], sink,
-        ]  # fmt: skip
+            kernel, lanes = threshold_levels.emit_level_events, threshold_levels.LANES
+        else:
+            lanes = counting.widest_block(self.count, self.device, name)
+            inputs = [
+                source, clock, self._pixels, self.count, self.width, first, *self._thresholds_of_pixels(),
+                memory, signal, self._next[1], self._next[0],
+            ]  # fmt: skip
+            kernel = threshold_events.emitting_kernel(lanes, name)
         size, align = counting.block_count(self.count, lanes), self.slab // lanes
-        launch.run_kernel(
-            threshold_events.emitting_kernel(lanes, name),
-            size,
-            inputs,
-            self.device,
-            batch=self.batch,
-            align=align,
+        return lambda sink: launch.run_kernel(
+            kernel, size, [*inputs, sink], self.device, batch=self.batch, align=align
         )
 
-    def emit(self, scene: Scene, times: NDArray[np.float64]) -> tuple[Events, NDArray[np.int32] | None]:
+    def emit(self, scene: Scene, times: NDArray[np.float64]) -> EventsOfChunk:
         """Advance over `times` and return the events that leave the pixels, and for a batch the row of each.
 
         Readout effects come behind this, see `dase.simulation.readout_chain.ReadoutChain`.
@@ -241,55 +296,128 @@ class PixelArray:
             scene: What the pixels see.
             times: Samples [s], shape (K,), following the last ones.
         """
+        return self._collect(self._start(scene, times))
+
+    def emit_chunks(
+        self, scene: Scene, chunks: Iterable[NDArray[np.float64]], *, ahead: bool | None = None
+    ) -> Iterator[tuple[NDArray[np.float64], EventsOfChunk]]:
+        """Yield chunks of samples with what `emit` returns of them.
+
+        Args:
+            scene: What the pixels see.
+            chunks: Samples [s], each of shape (K,), one chunk following the other.
+            ahead: Whether pixels begin with the next chunk before the events of this one are ordered and
+                copied, which a GPU does at the same time; None for where there is a GPU. Events are the same.
+        """
+        if not (self.device.is_cuda if ahead is None else ahead):
+            for times in chunks:
+                yield times, self.emit(scene, times)
+            return
+        if not self._idle:
+            # a chunk may have to run again after the next one has begun, and needs its own begin for that
+            self._idle.append(wp.zeros_like(self._state))
+        before: tuple[NDArray[np.float64], _Launched] | None = None
+        for times in chunks:
+            launched = self._start(scene, times)
+            if before is not None:
+                yield before[0], self._collect(before[1])
+            before = times, launched
+        if before is not None:
+            yield before[0], self._collect(before[1])
+
+    def _start(self, scene: Scene, times: NDArray[np.float64]) -> _Launched:
+        """Set the pixels to work on a chunk, and advance over it."""
         begin = self.begin if self.samples else float(times[0])
-        span = round(float(times[-1]) * 1e9) - round(begin * 1e9)
+        self._check_length(begin, float(times[-1]))
+        run = self._prepare_emission(scene, times)
+        launched = _Launched(run, begin, float(times[-1]), None)
+        self._fill(launched)
+        self._advance(times)
+        return launched
+
+    def _check_length(self, begin: float, end: float) -> int:
+        """Return how many bits keys of a chunk from `begin` to `end` [s] have; raises InputError above 63."""
+        span = round(end * 1e9) - round(begin * 1e9)
         # an event that is held back may leave long after its chunk, and its key has to hold that time
         longest = span if self._late is None else span + round(pixel_stages.LATEST * 1e9)
-        if self._pixel_bits + self._low_bits + longest.bit_length() > 63:
+        top = self._pixel_bits + self._low_bits + longest.bit_length()
+        if top > 63:
             raise InputError(
                 f"a chunk of {span * 1e-9:g} s with {self.batch * self.count} pixels is too long"
             )
-        keys, used = self._emit_keys(scene, times)
-        top = self._pixel_bits + self._low_bits + longest.bit_length()
-        self._advance(times)
-        found = ordering.keys_in_order(
-            keys, used, self._pixel_bits, self._low_bits, top, self.device, self._late, self._room
-        )
-        events, row = self._decode_keys(found, begin)
-        if self._late is None:
-            return events, row
-        # what leaves after the chunk waits, with its time counted from the next chunk's begin
-        now = int(np.searchsorted(events.t, 1e-9 * float(round(self.begin * 1e9)), side="right"))
-        self._late = found.numpy()[now:] - (span << (self._pixel_bits + self._low_bits))
-        return events.select(slice(now)), None if row is None else row[:now]
+        return top
 
-    def flush(self) -> tuple[Events, NDArray[np.int32] | None]:
+    def _prepare_emission(self, scene: Scene, times: NDArray[np.float64]) -> Callable[[Any], None]:
+        """Return what emits the keys of a chunk into a sink, as often as it is called."""
+        if self._thresholds_only and self.device.is_cpu:
+            return self._prepare_thresholds_only(scene, times)
+        return self._prepare_launch(self.sink, scene, times, np.zeros(len(times), np.int32), align=self.slab)
+
+    def _fill(self, launched: _Launched) -> None:
+        """Run the pixels of a chunk with as much room as there is now."""
+        shape = (self.batch, -(-self.count // self.slab), self._capacity)
+        if launched.sink is None:
+            # the other one may hold keys of the chunk before, which nobody has ordered yet
+            self._buffers.reverse()
+            if self._buffers[0] is None or self._buffers[0].shape != shape:
+                self._buffers[0] = launch.new_array(shape, wp.int64, self.device)
+            keys = self._buffers[0]
+        else:
+            # a second run is rare: the buffers that are kept stay those of their turns
+            keys = launch.new_array(shape, wp.int64, self.device)
+        sink = pixel_stages.EventKeys()
+        sink.keys = keys
+        sink.used = wp.zeros(shape[:2], dtype=int, device=self.device)
+        sink.slab, sink.bits, sink.low = self.slab.bit_length() - 1, self._pixel_bits, self._low_bits
+        launched.run(sink)
+        launched.sink = sink
+        launched.done = self.device.stream.record_event() if self.device.is_cuda else None
+
+    def _collect(self, launched: _Launched) -> EventsOfChunk:
+        """Return the events of a chunk, once its pixels are done with it."""
+        with self._ordering_after(launched):
+            used = launched.sink.used.numpy()
+        while used.max() > launched.sink.keys.shape[2]:
+            # a quarter more spares the next, slightly busier chunk the same
+            self._capacity = max(self._capacity, int(1.25 * used.max()) + 1)
+            self.emitted_again += 1
+            self._fill(launched)
+            with self._ordering_after(launched):
+                used = launched.sink.used.numpy()
+        with self._ordering_after(launched):
+            top = self._check_length(launched.begin, launched.end)
+            sink = launched.sink
+            found = ordering.keys_in_order(
+                sink.keys, sink.used, used, self._pixel_bits, self._low_bits, top, self.device, self._late,
+                self._room,
+            )  # fmt: skip
+            events, row = self._decode_keys(found, launched.begin)
+            if self._late is None:
+                return events, row
+            # what leaves after the chunk waits, with its time counted from the next chunk's begin
+            end = round(launched.end * 1e9)
+            now = int(np.searchsorted(events.t, 1e-9 * float(end), side="right"))
+            span = end - round(launched.begin * 1e9)
+            late = found[now:].numpy() if now < len(events) else np.empty(0, np.int64)
+            self._late = late - (span << (self._pixel_bits + self._low_bits))
+            return events.select(slice(now)), None if row is None else row[:now]
+
+    def _ordering_after(self, launched: _Launched) -> AbstractContextManager[Any]:
+        """Return what lets a GPU do what follows once a chunk is done, beside the pixels of the next."""
+        if self.device.is_cpu:
+            return nullcontext()
+        if self._ordering is None:
+            # its short kernels go before the rest of a long one, or they would wait for the next chunk
+            self._ordering = wp.Stream(self.device, priority=-1)
+        self._ordering.wait_event(launched.done)
+        beside: AbstractContextManager[Any] = wp.ScopedStream(self._ordering, sync_enter=False)
+        return beside
+
+    def flush(self) -> EventsOfChunk:
         """Return the events that have not left yet, and their rows (N,), as `emit` does; time is over."""
         late = np.empty(0, np.int64) if self._late is None else self._late
         self._late = None if self._late is None else late[:0]
         return self._decode_keys(wp.array(late, dtype=wp.int64, device=self.device), self.begin)
-
-    def _emit_keys(self, scene: Scene, times: NDArray[np.float64]) -> tuple[Any, NDArray[np.int32]]:
-        """Run the pixels until all their events fit; return the keys and how many there are per slab."""
-        slabs = -(-self.count // self.slab)
-        while True:
-            sink = pixel_stages.EventKeys()
-            shape = (self.batch, slabs, self._capacity)
-            if self._buffer is None or self._buffer.shape != shape:
-                self._buffer = launch.new_array(shape, wp.int64, self.device)
-            sink.keys = self._buffer
-            sink.used = wp.zeros((self.batch, slabs), dtype=int, device=self.device)
-            sink.slab, sink.bits, sink.low = self.slab.bit_length() - 1, self._pixel_bits, self._low_bits
-            if self._thresholds_only and self.device.is_cpu:
-                self._emit_thresholds_only(sink, scene, times)
-            else:
-                self._launch(self.sink, sink, scene, times, np.zeros(len(times), np.int32), align=self.slab)
-            used = sink.used.numpy()
-            if used.max() <= self._capacity:
-                return sink.keys, used
-            # states were not advanced, so the chunk runs again from where it began; a quarter more spares the
-            # next, slightly busier chunk the same
-            self._capacity = int(1.25 * used.max()) + 1
 
     def bind_scene(self, scene: Scene) -> None:
         """Work out what pixels owe to the scene, once; it is done before the first sample in any case."""
@@ -325,15 +453,15 @@ class PixelArray:
         self._levels = levels
         return levels
 
-    def _launch(
+    def _prepare_launch(
         self,
         sink_name: str,
-        sink: Any,
         scene: Scene,
         times: NDArray[np.float64],
         windows: NDArray[np.int32],
         align: int,
-    ) -> None:
+    ) -> Callable[[Any], None]:
+        """Return what runs the composed kernel over a chunk into a sink, as often as it is called."""
         self.bind_scene(scene)
         source_name, source = self.sensor.through_optics(scene).source(times, self.pixels, self.device)
         lanes = self._count_lanes(source_name)
@@ -341,12 +469,14 @@ class PixelArray:
         clock = self._upload_clock(times, windows)
         inputs = [
             source, clock, self._pixels, self.width, self.height, self.samples, self.seed,
-            self._parameters, *self._maps(), self._state, self._next, sink,
+            self._parameters, *self._maps(), self._state, self._next,
         ]  # fmt: skip
         size, align = (
             (counting.block_count(self.count, lanes), align // lanes) if lanes else (self.count, align)
         )
-        launch.run_kernel(kernel, size, inputs, self.device, batch=self.batch, align=align)
+        return lambda sink: launch.run_kernel(
+            kernel, size, [*inputs, sink], self.device, batch=self.batch, align=align
+        )
 
     def _count_lanes(self, source_name: str) -> int:
         """Return how many pixels a thread of the composed kernel works on; 0 for CUDA's kernel."""
@@ -373,22 +503,22 @@ class PixelArray:
         return upload_clock(edges, self.samples == 0, *self._window_runs(windows), self.device)
 
     def _advance(self, times: NDArray[np.float64]) -> None:
-        self._state, self._next = self._next, self._state
+        self._idle.append(self._state)
+        self._state, self._next = self._next, self._idle.pop(0)
         self.samples += len(times)
         self.begin = float(times[-1])
 
-    def _decode_keys(self, keys: Any, begin: float) -> tuple[Events, NDArray[np.int32] | None]:
+    def _decode_keys(self, keys: Any, begin: float) -> EventsOfChunk:
         n, to = len(keys), self.device
         each = ordering.events_per_thread(to)
-        out = [launch.new_array(n, d, to) for d in (wp.float64, wp.uint16, wp.uint16, wp.uint8)]
-        row = wp.empty(n if self.batch > 1 else 0, dtype=int, device=to)
-        label = wp.empty(n if self.sink == "labels" else 0, dtype=wp.int8, device=to)
         inputs = [
-            keys, self._pixel_bits, self._low_bits, self.count, self._xy,
-            wp.int64(round(begin * 1e9)), each, *out, row, label,
+            keys, self._pixel_bits, self._low_bits, self.count, self._xy, wp.int64(round(begin * 1e9)), each,
         ]  # fmt: skip
+        out = self._columns.take(n)
+        inputs += [out[name] for name in ("t", "x", "y", "p", "row", "label")]
         launch.run_kernel(ordering.decode_keys, -(-n // each), inputs, to)
-        t, x, y, p = (a.numpy() for a in out)
-        known = label.numpy() if self.sink == "labels" else None
+        found = self._columns.bring(n)
+        known = found["label"] if self.sink == "labels" else None
+        t, x, y, p = (found[name] for name in "txyp")
         events = Events(t, x, y, p.view(np.bool_), self.width, self.height, known)
-        return events, row.numpy() if self.batch > 1 else None
+        return events, found["row"] if self.batch > 1 else None

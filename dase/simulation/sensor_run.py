@@ -18,7 +18,7 @@ from dase.simulation.sensor import Sensor
 
 @dataclass(frozen=True)
 class ChunkSettings:
-    """How many samples pixels take at once.
+    """How many samples pixels take at once, and when they take the next.
 
     Few enough that layers which stay far from a pixel are skipped, enough to amortise a launch; events do not
     depend on it.
@@ -28,6 +28,8 @@ class ChunkSettings:
     """Samples per chunk on a CPU, where a chunk's frames should stay within the caches."""
     cuda: int = 128
     """Samples per chunk on a GPU, where a launch costs more."""
+    ahead: bool | None = None
+    """Whether pixels run a chunk ahead of the order of their events; None for where there is a GPU."""
 
 
 @dataclass(frozen=True)
@@ -61,6 +63,7 @@ class SensorRun:
         labels: Whether events are marked with what they came from.
         chunk: Samples per chunk; None takes what `settings` say of the device.
         events_per_pixel: Room for events of a chunk at first; a chunk with more runs again with more room.
+            None for what `dase.simulation.pixel_array.KeyRoom` says.
         settings: Sizes of chunks.
 
     Raises:
@@ -79,7 +82,7 @@ class SensorRun:
         device: str = "cpu",
         labels: bool = False,
         chunk: int | None = None,
-        events_per_pixel: int = 4,
+        events_per_pixel: int | None = None,
         settings: ChunkSettings = ChunkSettings(),
     ):
         self.scene, self.sensor = scene, sensor
@@ -89,6 +92,7 @@ class SensorRun:
         )  # fmt: skip
         self.times = sample_times(scene, sensor) if times is None else times
         self.chunk = chunk or (settings.cuda if self.pixel_array.device.is_cuda else settings.cpu)
+        self.ahead = settings.ahead
 
     def thresholds(self) -> NDArray[np.float32]:
         """Return the thresholds of each pixel before this scene [log intensity], shape (B, 2, N): OFF, ON."""
@@ -105,12 +109,11 @@ class SensorRun:
             ReadoutChain(self.sensor, array.width, array.height, pixels=array.count, seed=array.seed)
             for _ in range(array.batch)
         ]
-        for times in self._cut_times():
-            parts = split_by_row(*array.emit(self.scene, times), array.batch)
+        for times, found in array.emit_chunks(self.scene, self._cut_times(), ahead=self.ahead):
+            parts, end = split_by_row(*found, array.batch), float(times[-1])
             # nothing emitted later is earlier than the last sample, which lets the readout hand events on
             yield RunChunk(
-                times,
-                [readout.push(part, array.begin) for readout, part in zip(readouts, parts, strict=True)],
+                times, [readout.push(part, end) for readout, part in zip(readouts, parts, strict=True)]
             )
         # first the pixels give up what they hold back, then the readout
         rest = zip(readouts, split_by_row(*array.flush(), array.batch), strict=True)

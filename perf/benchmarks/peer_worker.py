@@ -4,17 +4,19 @@ from __future__ import annotations
 
 import argparse
 import json
+import math
 import os
 import resource
 import sys
 import time
 import types
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from importlib import import_module
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 CLEAN = dict(theta=0.2, sigma=0.0, cutoff=0.0, leak=0.0, shot=0.0, dead=0.0)
 NOISY = dict(theta=0.2, sigma=0.05, cutoff=30.0, leak=0.1, shot=5.0, dead=1e-3)
@@ -28,20 +30,36 @@ class Clip:
     """The pictures that every simulator gets.
 
     Args:
-        folder: Holds `frames.npy` (uint8, shape (K, H, W)), `times.npy` [s], and `pictures/` with the same.
+        folder: Holds `frames.npy` (uint8, shape (K, H, W)), `times.npy` [s], and the same as `pictures/` and,
+            with losses, as `video.avi`.
     """
 
     def __init__(self, folder: Path):
         self.frames = np.load(folder / "frames.npy")
         self.times = np.load(folder / "times.npy")
         self.files = sorted(str(f) for f in (folder / "pictures").iterdir())
+        self.video = folder / "video.avi"
+        self.out = folder / "out"
+        """Folder for what simulators write."""
         self.moved = (folder / "moved").exists()
         """Whether the pictures are those of `kernels.moving_layers`, which can be made anew."""
+
+    def read_video(self) -> Iterator[tuple[NDArray[np.uint8], float]]:
+        """Yield the pictures of the video and their times [s], as simulators without a reader get them."""
+        import cv2
+
+        video = cv2.VideoCapture(str(self.video))
+        for t in self.times:
+            found, picture = video.read()
+            if not found:
+                raise RuntimeError("the video is shorter than the clip")
+            yield cv2.cvtColor(picture, cv2.COLOR_BGR2GRAY), float(t)
 
 
 def dase_runs(clip: Clip, options: argparse.Namespace) -> dict[str, dict[str, Run]]:
     """Return what dase does by task and setting."""
     import dase
+    from dase.datasets.generate import record_scene
     from dase.effects.refractory import Refractory
     from dase.effects.threshold import Threshold
     from dase.kernels import launch
@@ -65,7 +83,29 @@ def dase_runs(clip: Clip, options: argparse.Namespace) -> dict[str, dict[str, Ru
         edges = clip.times[[0, -1]]
         return lambda: int(dase.count(scene(), sensor, edges).sum())
 
+    def write(sensor: dase.Sensor, suffix: str) -> Run:
+        def run() -> int:
+            scene = dase.open_video(clip.video, gamma=1.0, between="lines")
+            return record_scene(scene, sensor, clip.out / f"dase{suffix}").events
+
+        return run
+
+    def convert(sensor: dase.Sensor, suffix: str) -> Run:
+        def run() -> int:
+            scene = dase.open_video(clip.video, gamma=1.0, between="lines")
+            with dase.io.create(clip.out / f"dase_events{suffix}") as writer:
+                count = 0
+                for part in dase.stream(scene, sensor):
+                    writer.events(part)
+                    count += len(part)
+            return count
+
+        return run
+
     out = {"dase, pictures given": {n: emit(given, s) for n, s in sensors.items()}}
+    out["dase, video to HDF5 with frames"] = {n: write(s, ".h5") for n, s in sensors.items()}
+    out["dase, video to HDF5"] = {n: convert(s, ".h5") for n, s in sensors.items()}
+    out["dase, video to DAT"] = {n: convert(s, ".dat") for n, s in sensors.items()}
     if clip.moved:
         out["dase, photograph moved"] = {n: emit(moved, s) for n, s in sensors.items()}
         out["dase, photograph moved, counted"] = {n: count(moved, s) for n, s in sensors.items()}
@@ -106,7 +146,10 @@ def numpy_runs(clip: Clip, options: argparse.Namespace) -> dict[str, dict[str, R
     def pictures() -> numpy_baseline.Pictures:
         return numpy_baseline.Pictures(photograph(clip), clip.times)
 
-    out = {"NumPy, pictures given": emit(clip.frames)}
+    def read() -> int:
+        return sum(len(picture) < 0 for picture, _ in clip.read_video())
+
+    out = {"NumPy, pictures given": emit(clip.frames), "reading the video alone": {"clean": read}}
     if clip.moved:
         out["NumPy, photograph moved"] = emit(photograph(clip))
         out["NumPy plain, photograph moved, counted"] = {"clean": plain}
@@ -134,7 +177,23 @@ def v2e_runs(clip: Clip, options: argparse.Namespace) -> dict[str, dict[str, Run
         parts = [emulator.generate_events(f, float(t)) for f, t in zip(clip.frames, clip.times, strict=True)]
         return sum(len(part) for part in parts if part is not None)
 
-    return {"v2e": {name: lambda name=name: run(name) for name in ("clean", "noisy")}}
+    def write(setting: str) -> int:
+        # as `v2e.py` does it with `--dvs_h5`: pictures of a video one by one, events appended as they come
+        emulator = EventEmulator(device="cpu", seed=1, output_folder=str(clip.out), dvs_h5="v2e.h5")
+        emulator.set_dvs_params("noisy" if setting == "noisy" else "clean")
+        if setting == "noisy":
+            emulator.refractory_period_s = NOISY["dead"]
+        count = 0
+        for frame, t in clip.read_video():
+            part = emulator.generate_events(frame, t)
+            count += 0 if part is None else len(part)
+        emulator.cleanup()
+        return count
+
+    return {
+        "v2e": {name: lambda name=name: run(name) for name in ("clean", "noisy")},
+        "v2e, video to HDF5": {name: lambda name=name: write(name) for name in ("clean", "noisy")},
+    }
 
 
 def openeb_runs(clip: Clip, options: argparse.Namespace) -> dict[str, dict[str, Run]]:
@@ -155,18 +214,49 @@ def openeb_runs(clip: Clip, options: argparse.Namespace) -> dict[str, dict[str, 
         sys.modules["metavision_sdk_base"] = types.SimpleNamespace(EventCD=event)
     from metavision_core_ml.video_to_event.simulator import EventSimulator
 
-    def run(setting: dict[str, float]) -> int:
+    def start(setting: dict[str, float]) -> Any:
         height, width = clip.frames.shape[1:]
-        simulator = EventSimulator(
+        return EventSimulator(
             height, width, setting["theta"], setting["theta"], setting["dead"] * 1e6,
             sigma_threshold=setting["sigma"], cutoff_hz=setting["cutoff"],
             leak_rate_hz=setting["leak"], shot_noise_rate_hz=setting["shot"],
         )  # fmt: skip
+
+    def run(setting: dict[str, float]) -> int:
+        simulator = start(setting)
         for frame, t in zip(clip.frames, clip.times, strict=True):
             simulator.image_callback(frame, round(t * 1e6))
         return len(simulator.get_events())
 
-    return {"openeb": {name: lambda setting=s: run(setting) for name, s in SETTINGS.items()}}
+    def write(setting: dict[str, float], most: float) -> int:
+        # as `viz_video_to_event_simulator.py --no_display -o` does it, but for the picture it draws of events
+        simulator, count = start(setting), 0
+        with open(clip.out / "openeb.dat", "wb") as file:
+
+            def put() -> int:
+                events = simulator.get_events()
+                # the records of its `DatWriter`
+                packed = np.empty((len(events), 2), np.uint32)
+                packed[:, 0] = events["t"]
+                xyp = events["x"].astype(np.uint32) | events["y"].astype(np.uint32) << np.uint32(14)
+                packed[:, 1] = xyp | events["p"].astype(np.uint32) << np.uint32(28)
+                file.write(packed.tobytes())
+                return len(events)
+
+            for frame, t in clip.read_video():
+                if simulator.image_callback(frame, round(t * 1e6)) >= most:
+                    count += put()
+                    simulator.flush_events()
+            return count + put()
+
+    return {
+        "openeb": {name: lambda setting=s: run(setting) for name, s in SETTINGS.items()},
+        # its `flush_events` writes zeros over room for 10^8 events, so it is also timed without
+        "openeb, video to DAT": {n: lambda setting=s: write(setting, 50000) for n, s in SETTINGS.items()},
+        "openeb, video to DAT at the end": {
+            n: lambda setting=s: write(setting, math.inf) for n, s in SETTINGS.items()
+        },
+    }
 
 
 def esim_runs(clip: Clip, options: argparse.Namespace) -> dict[str, dict[str, Run]]:

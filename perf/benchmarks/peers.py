@@ -5,9 +5,11 @@ r"""Compares dase with other simulators that the user has, side by side in one r
 
 PATH is a checkout; `--esim` needs the module esim_py. Each runs in a process of its own with what it needs
 installed; one that is not given is said to be so. Runs take turns, so that all see the same state of the
-machine. Every simulator gets 8-bit pictures in memory (esim_py: in files) and returns events in memory.
-`photograph moved` makes the pictures itself, by warping a photograph; its time includes that. On a machine
-that others use, too, `--processor-time` counts what the process works, on one thread.
+machine. Every simulator gets 8-bit pictures in memory (esim_py: in files) and returns events in memory;
+`video to HDF5` and `video to DAT` are whole jobs, from a file of pictures to a file of events, each in the
+way of the simulator's own command. `photograph moved` makes the pictures itself, by warping a photograph;
+its time includes that. On a machine that others use, too, `--processor-time` counts what the process works,
+on one thread.
 """
 
 from __future__ import annotations
@@ -101,6 +103,11 @@ def make_clip(folder: Path, options: argparse.Namespace) -> tuple[int, int, int]
     (folder / "pictures").mkdir()
     for k, frame in enumerate(frames):
         cv2.imwrite(str(folder / "pictures" / f"{k:06d}.bmp"), frame)
+    video = cv2.VideoWriter(str(folder / "video.avi"), cv2.VideoWriter.fourcc(*"MJPG"), 1000, (width, height))
+    for frame in frames:
+        video.write(cv2.cvtColor(frame, cv2.COLOR_GRAY2BGR))
+    video.release()
+    (folder / "out").mkdir()
     return len(frames), height, width
 
 

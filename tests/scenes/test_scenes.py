@@ -113,6 +113,22 @@ def test_frames_match_the_twin(device, rng, size):
     assert want.std() > 0.05 or size == (1, 1)
 
 
+@pytest.mark.parametrize("size", [(21, 16), (1, 1)])
+def test_greys_are_rounded_frames(device, rng, size):
+    made = scene(rng, size=size)
+    # from 0 to 255 and beyond, with levels half way between two
+    halves = dase.Picture(((np.arange(256, dtype=np.float32) - 0.5) / 255 * 1.01).reshape(16, 16))
+    still = dase.Motion(scale_x=(1.0, 1.0), scale_y=(1.0, 1.0))
+    steps = dase.LayerScene([dase.Layer(halves, still)], width=16, height=16, duration=0.1)
+    times = np.linspace(0, 0.1, 3)
+    for one in (made, steps, shaken(rng, lighting=dase.Lighting(stops=1.0))):
+        want = np.clip(np.rint(one.frames(times, device) * np.float32(255)), 0, 255)
+        got = one.grey_frames(times, device)
+        assert got.dtype == np.uint8
+        np.testing.assert_array_equal(got, want)
+    assert np.ptp(steps.grey_frames(times, device)) == 255
+
+
 def test_a_background_of_one_texel_fills_the_picture(device):
     still = dase.Layer(dase.Picture(np.full((1, 1), 0.3, np.float32)), dase.Motion(x=(0.0, 2.0)))
     made = dase.LayerScene([still], width=5, height=4, duration=1.0)
