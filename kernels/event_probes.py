@@ -81,7 +81,7 @@ class ProbeSums:
     """Sink that keeps sums over events instead of events."""
 
     cell: wp.array2d[wp.uint8]  # (N, T) of each step; step k ends at grid point k
-    level: wp.array2d[float]  # (N, T) log intensity at the grid points
+    level: wp.array2d[float]  # (N, T) log intensity at the grid points; (N, 1) where it never changes
     lags: wp.array[int]  # (LAGS + 1,) steps before an event at which its light is looked at
     middle: wp.array[float]  # (4 CLASSES,) typical change between two events
     classes: wp.array[int]  # (CLASSES - 1,) steps that end a class of intervals
@@ -115,7 +115,7 @@ const float* level = sink.level.data + (size_t)i * sink.level.shape[1];
 const int* lags = sink.lags.data;
 const int group = i / sink.group;
 const int team = i / sink.team;
-// before and after the time that is looked at the light stands still
+// before and after the time that is looked at the light stands still; light at rest is one column
 auto INSIDE = [=](int k) { return k < 0 ? 0 : k > end ? end : k; };
 auto OCTAVE = [](int size, int last) {
     // bin of an interval
@@ -165,7 +165,7 @@ auto LOOK_AT = [&](int row, int k, int now, float* memory) {
             // longer intervals see larger changes: they are compared class by class
             const int of = (size > sink.classes.data[0]) + (size > sink.classes.data[1]);
             const int pair = (2 * now + last) * CLASSES + of;
-            const float change = (now ? 1.0f : -1.0f) * (level[k] - level[before]);
+            const float change = (now ? 1.0f : -1.0f) * (level[INSIDE(k)] - level[INSIDE(before)]);
             const float off = change - sink.middle.data[pair];
             // clipped, so that a few leaps of the light do not outweigh everything else
             apart = off < -1.0f ? -1.0f : off > 1.0f ? 1.0f : off;

@@ -160,3 +160,10 @@ def new_array(shape: int | tuple[int, ...], dtype: Any, device: wp.Device) -> wp
     if device.is_cuda:
         return wp.empty(shape, dtype=dtype, device=device)
     return wp.array(np.empty(shape, wp.dtype_to_numpy(dtype)), dtype=dtype, device=device, copy=False)
+
+
+def new_zeros(shape: int | tuple[int, ...], dtype: Any, device: wp.Device) -> wp.array:
+    """Return zeros of a shape; on a CPU pages that nothing is written to cost next to nothing."""
+    if device.is_cuda:
+        return wp.zeros(shape, dtype=dtype, device=device)
+    return wp.array(np.zeros(shape, wp.dtype_to_numpy(dtype)), dtype=dtype, device=device, copy=False)

@@ -230,7 +230,8 @@ class BatchSimulator:
             -(-count // group) * kernels.SumPlace.SIZE + -(-count // GROUP) * 2 * self.stimulus.grid.steps
         )
         numbers += count * (kernels.MEMORY + kernels.HALVES)
-        return max(1, self._launches.sums_bytes // (4 * numbers))
+        # a thread takes as long for one model as for all its lanes
+        return max(self._lanes, self._launches.sums_bytes // (4 * numbers))
 
     def _kernel(self, sensor: Sensor) -> tuple[wp.Kernel, NDArray[np.float32], list[int]]:
         """Return the kernel of a sensor, a parameter vector for it, and the places of the sensor's own."""
@@ -353,14 +354,14 @@ class BatchSimulator:
         out.group = self._pixels_per_sum()
         out.halves = pixels
         rows, count, _ = pixels.shape
-        out.memory = wp.zeros((rows, count, kernels.MEMORY), dtype=float, device=self.device)
+        out.memory = launch.new_zeros((rows, count, kernels.MEMORY), wp.float32, self.device)
         groups = -(-count // out.group)
         # events of a pixel wait here, so that the CPU's vectors work out their times several at once
         if not self.device.is_cuda:
             out.queue = wp.empty((groups, kernels.QUEUE), dtype=wp.int64, device=self.device)
-        out.sums = wp.zeros((rows, groups, kernels.SumPlace.SIZE), dtype=float, device=self.device)
+        out.sums = launch.new_zeros((rows, groups, kernels.SumPlace.SIZE), wp.float32, self.device)
         out.team, teams = GROUP, -(-count // GROUP)
-        out.clock = wp.zeros((rows, teams, 2 * stimulus.grid.steps), dtype=int, device=self.device)
+        out.clock = launch.new_zeros((rows, teams, 2 * stimulus.grid.steps), wp.int32, self.device)
         return out
 
     def _grouped(self, sums: Any) -> Any:

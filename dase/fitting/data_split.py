@@ -74,6 +74,9 @@ class SplitSettings:
 
 SPLIT = SplitSettings()
 
+ROWS = 512
+"""Pixels whose steps are sorted into cells at a time, for the memory that takes."""
+
 PARTS = 3
 """Groups of pixels: those that are fitted, that choose between models, and that report."""
 
@@ -242,26 +245,31 @@ def split_measurement(
     several = light[: 2 * each]
     bands = band_edges(several, np.broadcast_to(good[: 2 * each], several.shape))
     sorting = partial(sort_into_cells, step=grid.step, bands=bands, log_eps=log_eps)
-    # filters over time go pixel by pixel, so parts of the pixels give the same as all of them
-    works: list[Callable[[], Any]] = [partial(sorting, part) for part in np.array_split(light, 8)]
-    works.append(partial(find_structure, events))
-    *parts, structure = launch.run_concurrently(works)
-    cell = np.concatenate(parts)
-    del parts
-    if len(good) == 1:
-        cell[:, ~good[0]] = MASKED
-    else:
-        cell[~good] = MASKED
-    cell[:, 0] = MASKED  # no step ends at the first point
     first, *last = (slice(n * each, (n + 1) * each) for n in range(PARTS))
+    # filters over time go pixel by pixel, so parts of the pixels give the same as all of them
+    cell = [np.empty((each, len(times)), np.uint8) for _ in range(PARTS)]
+
+    works: list[Callable[[], Any]] = [
+        partial(_sort_into, cells[n : n + ROWS], light[part * each + n :], sorting)
+        for part, cells in enumerate(cell)
+        for n in range(0, each, ROWS)
+    ]
+    works.append(partial(find_structure, events))
+    *_, structure = launch.run_concurrently(works)
+    for n, cells in enumerate(cell):
+        if len(good) == 1:
+            cells[:, ~good[0]] = MASKED
+        else:
+            cells[~good[n * each : (n + 1) * each]] = MASKED
+        cells[:, 0] = MASKED  # no step ends at the first point
+        # what judges is simulated over all of the time and compared in the later part only
+        if n > 0:
+            cells[:, :cut] = MASKED
     train_grid = replace(grid, steps=cut)
-    # what judges is simulated over all of the time and compared in the later part only
-    late = cell[each:].copy()
-    late[:, :cut] = MASKED
+    pieces = [(first, train_grid, cell[0][:, :cut].copy())]
+    pieces += [(part, grid, cells) for part, cells in zip(last, cell[1:], strict=True)]
+    del cell, cells, works, good  # large, and no longer needed
     halves: list[PixelSubset] = []
-    pieces = [(first, train_grid, cell[first, :cut].copy())]
-    del cell, good  # as large as each other, and no longer needed
-    pieces += [(part, grid, cells) for part, cells in zip(last, np.split(late, len(last)), strict=True)]
     for part, stretch, cells in pieces:
         stimulus = Stimulus(
             chosen[part], scene.width, scene.height, stretch, light[part, : stretch.steps], cells, log_eps,
@@ -299,6 +307,15 @@ def _trust_but_in(
 ) -> NDArray[np.bool_]:
     """Return what a trust says, and that some pixels are not to be trusted, shape (T, N)."""
     return trust(times, pixels) & ~np.isin(pixels, odd_pixels)
+
+
+def _sort_into(
+    cells: NDArray[np.uint8],
+    light: NDArray[np.float32],
+    sorting: Callable[[NDArray[np.float32]], NDArray[np.uint8]],
+) -> None:
+    """Sort the steps of pixels into cells, shape (N, T), by their light, at least as many rows."""
+    cells[:] = sorting(light[: len(cells)])
 
 
 def common_grid(events: Events, scene: Scene) -> Grid:

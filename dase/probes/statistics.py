@@ -55,6 +55,9 @@ class SpectrumBands:
     lowest: float = 8.0
     """Lower end of the first [Hz]; what is slower is motion, of which few periods are seen."""
 
+    at_once: int = 1 << 22
+    """Numbers of clocks whose spectra are taken together, for the memory that takes."""
+
     def edges(self, step: float) -> Array:
         """Return the ends of the bands up to half the sampling rate, shape (count + 1,) [Hz].
 
@@ -193,6 +196,15 @@ def events_of_spread(counts: Array) -> Array:
 
 def _rate_spectrum(clock: NDArray[np.int32], frame: StatisticsFrame) -> tuple[Array, Array]:
     """Logarithms of the power of the net rate in bands of frequency, and its swing at the measured peak."""
+    # some rows at a time: their spectra take several times the memory of the clocks
+    rows = max(1, SPECTRUM.at_once // clock.shape[1])
+    parts = [_spectrum_of_rows(clock[n : n + rows], frame) for n in range(0, max(len(clock), 1), rows)]
+    values, total = (np.concatenate(column) for column in zip(*parts, strict=True))
+    return values, np.repeat(total[:, None], values.shape[1], 1).astype(np.float64)
+
+
+def _spectrum_of_rows(clock: NDArray[np.int32], frame: StatisticsFrame) -> tuple[Array, NDArray[np.int64]]:
+    """Return the statistics of `_rate_spectrum`, shape (B, J), and the events of each row, shape (B,)."""
     steps = clock.shape[1] // 2
     off, on = clock[:, frame.first : steps], clock[:, steps + frame.first :]
     net = (on - off).astype(np.float32)
@@ -203,8 +215,7 @@ def _rate_spectrum(clock: NDArray[np.int32], frame: StatisticsFrame) -> tuple[Ar
     power = np.abs(rfft(net * window, axis=1)) ** 2 / count
     bands = power @ mean
     swing = net @ _swing_basis(frame.peak, frame.first, count, frame.step) / total[:, None]
-    values = np.concatenate([np.log(bands + 0.5), swing], 1).astype(np.float64)
-    return values, np.repeat(total[:, None], values.shape[1], 1).astype(np.float64)
+    return np.concatenate([np.log(bands + 0.5), swing], 1).astype(np.float64), total
 
 
 @lru_cache(maxsize=8)

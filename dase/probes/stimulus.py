@@ -104,11 +104,14 @@ class Stimulus:
     _kept: dict[str, Any] = field(default_factory=dict, repr=False)
 
     @property
+    def at_rest(self) -> bool:
+        """Whether no light ever changes."""
+        return self.intensity.strides[1] == 0
+
+    @property
     def level(self) -> NDArray[np.float32]:
-        """Log intensity, shape (N, T); a view of one column where the light is one."""
-        light = self.intensity
-        if light.strides[1] == 0:  # at rest: as many logarithms as pixels
-            return np.broadcast_to(np.log(light[:, :1] + np.float32(self.log_eps)), light.shape)
+        """Log intensity, shape (N, T), or (N, 1) where it never changes."""
+        light = self.intensity[:, :1] if self.at_rest else self.intensity
         out: NDArray[np.float32] = np.log(light + np.float32(self.log_eps))
         return out
 
