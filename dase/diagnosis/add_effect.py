@@ -55,7 +55,7 @@ def fit_added(
     without, effect = without.bound_to(measurement.scene), effect.bound_to(measurement.scene)
     evidence = split_measurement(
         measurement.events, measurement.scene, log_eps=without.log_eps, trust=measurement.trust,
-        pixels=pixels, seed=seed, device=device,
+        unbroken=without.unbroken or effect.unbroken, pixels=pixels, seed=seed, device=device,
     )  # fmt: skip
     tell("fitting without the effect", 0.0, float("nan"))
     present = fit_present_model(evidence, without, None, seed=seed)

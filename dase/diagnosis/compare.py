@@ -66,7 +66,7 @@ def compare(
     model = model.bound_to(measurement.scene)
     evidence = split_measurement(
         measurement.events, measurement.scene, log_eps=model.log_eps, trust=measurement.trust,
-        span=measurement.span, pixels=pixels, seed=seed, device=device,
+        span=measurement.span, unbroken=model.unbroken, pixels=pixels, seed=seed, device=device,
     )  # fmt: skip
     tell("simulating", 0.3, float("nan"))
     stream = SimulationStream.JUDGE.seed(seed)

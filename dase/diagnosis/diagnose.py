@@ -122,7 +122,7 @@ def diagnose(
     evidence = split_measurement(
         measurement.events, measurement.scene, log_eps=given.log_eps, trust=measurement.trust,
         span=measurement.span, left_out=bursts.contains if bursts else None, odd_pixels=hot, lamp=seen.lamp,
-        frames=frames, pixels=pixels, seed=seed, device=device,
+        frames=frames, unbroken=given.unbroken, pixels=pixels, seed=seed, device=device,
     )  # fmt: skip
     given = put_in_step(given, evidence)
     tell("fitting the present model", 0.0, float("nan"))

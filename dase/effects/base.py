@@ -165,6 +165,9 @@ class Effect:
     """Names of effects that this one becomes at the end of its range: it explains all that they do."""
     maps: ClassVar[tuple[str, ...]] = ()
     """Quantities of which every pixel has its own value, depending on the scene; see `bound_to`."""
+    unbroken: ClassVar[bool] = False
+    """Whether it goes by a clock of its own or remembers for seconds: a recording is then compared in one
+    stretch of time, see `dase.fitting.time_window`."""
     rare: ClassVar[bool] = False
     """Whether it acts on so few pixels that some hundred of them do not show it."""
     label: ClassVar[str] = "shot"

@@ -51,6 +51,7 @@ class Exposure(Effect):
     """
 
     name: ClassVar[str] = "exposure"
+    unbroken: ClassVar[bool] = True
     source: ClassVar[str] = (
         "Brandli, Berner, Yang, Liu, Delbruck: A 240x180 130 dB 3 us latency global shutter spatiotemporal "
         "vision sensor, 2014 (frames and events of one photodiode); seen in recordings of DAVIS240B and 240C"

@@ -36,6 +36,7 @@ class Flicker(Effect):
     """
 
     name: ClassVar[str] = "flicker"
+    unbroken: ClassVar[bool] = True
     source: ClassVar[str] = (
         "IEEE Std 1789: Recommended practices for modulating current in high-brightness LEDs, 2015 "
         "(depth and frequency of lamps)"

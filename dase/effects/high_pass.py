@@ -41,6 +41,7 @@ class HighPass(Effect):
     """
 
     name: ClassVar[str] = "high_pass"
+    unbroken: ClassVar[bool] = True
     source: ClassVar[str] = (
         "Finateu et al.: A 1280x720 back-illuminated stacked temporal contrast event-based vision sensor "
         "with 4.86 um pixels, 2020; Prophesee: Metavision documentation, biases (bias_hpf), 2024"

@@ -75,6 +75,7 @@ class RowScan(StreamEffect):
     """
 
     name: ClassVar[str] = "row_scan"
+    unbroken: ClassVar[bool] = True
     source: ClassVar[str] = (
         "Son et al.: A 640x480 dynamic vision sensor with a 9 um pixel and 300 Meps address-event "
         "representation, 2017; default from a recording of a 640x480 camera that visits its 640 columns "

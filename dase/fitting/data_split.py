@@ -17,13 +17,15 @@ from dase.fitting.batch_simulator import BatchSimulator
 from dase.fitting.bus_load import WholeSensor
 from dase.fitting.contradictions import contradiction_of_rest
 from dase.fitting.pixel_selection import choose_trusted_pixels, find_trusted_parts
+from dase.fitting.spliced_time import SplicedScene, SplicedTime
 from dase.fitting.subset import Array, CalibratedSubset, PixelSubset
 from dase.fitting.time_window import (
-    choose_window,
+    WindowSettings,
+    choose_windows,
     is_constant,
     outside_gaps,
     repeated_gaps,
-    sentence_of_window,
+    sentence_of_windows,
     within_span,
 )
 from dase.kernels import event_probes as kernels
@@ -96,6 +98,8 @@ class SplitMeasurement:
         peak: Frequency at which the rate swings most [Hz].
         busiest: Most events per second of all pixels [Hz].
         fastest: Events per second that a bus, if there is one, can send at least [Hz].
+        when: Times of the points of the grid on the clock of the scene [s], shape (T,): windows of a long
+            recording are laid end to end.
         notes: What the data cannot show.
         contradiction: Why the events cannot be of the scene, in a sentence; empty where they may.
         frames: When the bursts come that are in step with frames, where they are compared.
@@ -110,6 +114,7 @@ class SplitMeasurement:
     peak: float
     highest_event_rate: float
     least_bus_rate: float
+    when: Array
     notes: tuple[str, ...] = ()
     contradiction: str = ""
     frames: BurstTimes | None = None
@@ -155,6 +160,7 @@ def split_measurement(
     odd_pixels: NDArray[np.int64] | None = None,
     lamp: float | None = None,
     frames: BurstTimes | None = None,
+    unbroken: bool = False,
     pixels: int = SPLIT.pixels,
     seed: int = 0,
     device: str = "cpu",
@@ -168,12 +174,15 @@ def split_measurement(
         log_eps: Added to intensities before the logarithm.
         trust: Where and when the scene is to be trusted, all else is left out; None for everywhere, and for
             what a `CameraScene` trusts of itself.
-        span: First and last time that is compared [s]; None for all, of which a long recording has a part
-            chosen.
+        span: First and last time that is compared [s]; None for all. Of a long time windows are chosen, see
+            `choose_windows`.
         left_out: Tells which times [s], shape (T,), are left out; None for none.
         odd_pixels: Row-major indices of pixels that are left out, shape (K,); None for none.
         lamp: Frequency of light that flickers [Hz] where all events have told it; None to look for it here.
         frames: When the bursts come that are in step with frames; None where there are none, or left out.
+        unbroken: Whether a long recording is compared in one window, not in several over its length, as
+            models with a clock of their own need it, see `Sensor.unbroken`; so it is where there is a lamp
+            or bursts with frames, where times are left out, and where time stamps follow a regularity.
         pixels: In each part.
         seed: Of the choice of pixels.
         device: Where kernels run.
@@ -188,12 +197,29 @@ def split_measurement(
         trust = scene.is_trusted
     whole = common_grid(events, scene)
     asked = within_span(whole, span)
-    grid = choose_window(events, scene, asked, pixels)
-    if grid is not whole:
-        inside = (events.t >= grid.begin) & (events.t <= grid.begin + grid.step * (grid.steps + 1))
-        events = events.select(inside)
+    # the phase of what goes by a clock of its own would not go on from window to window
+    unbroken = unbroken or lamp is not None or left_out is not None or frames is not None
+    windows = choose_windows(events, scene, asked, pixels, unbroken=unbroken)
+    if len(windows) > 1 and find_structure(_within(events, windows[0])) != TimestampStructure():
+        windows = choose_windows(events, scene, asked, pixels, unbroken=True)
+    grid = windows[0]
+    when = times_of_grid(scene, grid)
+    # light that does not change is not stored step by step
+    still = is_constant(scene)
     # a stimulus pauses by the clock
-    gaps = np.zeros((0, 2)) if isinstance(scene, ScreenScene) else repeated_gaps(events.t)
+    pauses = isinstance(scene, ScreenScene)
+    settled = None
+    if len(windows) > 1:
+        when = np.concatenate([times_of_grid(scene, one) for one in windows])
+        settle = 2 if still else round(WindowSettings.settle / grid.step)
+        spliced = SplicedTime(windows, when, settle)
+        events, scene, grid = spliced.events(events), SplicedScene(scene, spliced), spliced.grid
+        settled = spliced.settled
+        if trust is not None:
+            trust = partial(_trust_on_clock, trust, spliced)
+    elif grid is not whole:
+        events = _within(events, grid)
+    gaps = np.zeros((0, 2)) if pauses else repeated_gaps(events.t)
     try:
         to = launch.find_device(device)
     except ValueError as error:
@@ -207,8 +233,8 @@ def split_measurement(
         )
     # a stream of its own: the same pixels are chosen whatever else is drawn from the seed
     rng, notes = Draw.PIXELS.generator(seed), list[str]()
-    if grid is not asked:
-        notes.append(sentence_of_window(asked, grid))
+    if windows != (asked,):
+        notes.append(sentence_of_windows(asked, windows))
     # time is cut, not drawn: moments between fitted ones would be known from these
     cut = max(2, round(settings.fitted_share * grid.steps))
     if trust is None:
@@ -226,8 +252,6 @@ def split_measurement(
         notes.append(looks.sentence())
     # from the begin of the scene also for the half that judges: filters and memories are settled there
     times = times_of_grid(scene, grid)
-    # light that does not change is not stored step by step
-    still = is_constant(scene)
     light = light_of(scene, times[:1] if still else times, chosen)
     if not np.all(np.isfinite(light)) or light.min() < 0:
         raise InputError("scene: intensities must be finite and >= 0")
@@ -240,6 +264,8 @@ def split_measurement(
         notes.append(f"{len(gaps)} gaps of {length:.3g} ms without any event: data are missing, and left out")
     if left_out is not None:
         good &= ~left_out(times)
+    if settled is not None:
+        good &= settled(times)
     good[:, 1:] &= good[:, :-1]  # a step is what lies between two points of the grid
     # all parts have the same bands, or a cell would mean another brightness in each; what reports has no say
     several = light[: 2 * each]
@@ -273,7 +299,7 @@ def split_measurement(
     for part, stretch, cells in pieces:
         stimulus = Stimulus(
             chosen[part], scene.width, scene.height, stretch, light[part, : stretch.steps], cells, log_eps,
-            to, trust is not None or len(gaps) > 0 or left_out is not None,
+            to, trust is not None or len(gaps) > 0 or left_out is not None or settled is not None,
         )  # fmt: skip
         halves.append(make_subset(stimulus, events, cut if stretch is grid else 0, structure))
     _require_enough_events(halves, events, grid, notes, settings.least_events)
@@ -298,8 +324,22 @@ def split_measurement(
     if contradiction:
         notes.insert(0, contradiction)
     return SplitMeasurement(
-        train, held, last_part, scout, bands, structure, peak, *rates, tuple(notes), contradiction, frames
+        train, held, last_part, scout, bands, structure, peak, *rates, when, tuple(notes),
+        contradiction, frames,
     )  # fmt: skip
+
+
+def _within(events: Events, grid: Grid) -> Events:
+    """Return the events of a stretch of time."""
+    inside = (events.t >= grid.begin) & (events.t <= grid.begin + grid.step * (grid.steps + 1))
+    return events.select(inside)
+
+
+def _trust_on_clock(
+    trust: Trust, clock: SplicedTime, times: Array, pixels: NDArray[np.int32]
+) -> NDArray[np.bool_]:
+    """Return where a scene is trusted, shape (K, N), at times of the spliced clock [s], shape (K,)."""
+    return trust(clock.real(times), pixels)
 
 
 def _trust_but_in(

@@ -97,7 +97,8 @@ def fit(
     frames = find_frame_times(measurement) if follows else None
     evidence = split_measurement(
         measurement.events, scene, log_eps=start.log_eps, trust=measurement.trust,
-        span=measurement.span, frames=frames, pixels=pixels, seed=seed, device=device,
+        span=measurement.span, frames=frames, unbroken=start.unbroken,
+        pixels=pixels, seed=seed, device=device,
     )  # fmt: skip
     start = put_in_step(start, evidence)
     given = model_of(start, free)

@@ -101,7 +101,7 @@ def _differences(
     """Return how far off the model is over half of the frames, beyond chance and with its sign, (J,) each."""
     seen = part.trials.stimulus
     events = _own_events(seen, model, SimulationStream.SCENE_DOUBT.seed(seed))
-    times = seen.grid.times
+    times = evidence.when[: seen.grid.steps]
     inside = np.clip(times, thinned.times[0], thinned.times[-1])
     light = light_of(thinned, inside, seen.pixels)
     good = thinned.is_trusted(times, seen.pixels).T & (seen.cell != MASKED)

@@ -1,4 +1,4 @@
-"""Which part of a recording's time is compared: a long one would cost much and tell little more."""
+"""Which windows of a recording's time are compared: a long one would cost much and tell little more."""
 
 from __future__ import annotations
 
@@ -27,10 +27,21 @@ class WindowSettings:
     is like another."""
     enough: float = 1200.0
     """Events that the judging half should have."""
-    looks: int = 40
+    windows: int = 4
+    """Windows over the length that are compared at most, as long as `longest` together: light and motion at
+    one time of a recording may be others than at another."""
+    shortest: float = 2.0
+    """They last so long at least [s]: what is slow would not be seen, and each begins anew."""
+    settle: float = 0.5
+    """Time at the begin of all windows but the first that is not compared [s]: filters forget the light of
+    the window before, and rest is known to be rest."""
+    looks: int = 60
     """Windows over the length that are looked at."""
     quantile: float = 0.75
-    """The window is taken in which this share of them has fewer events: neither a flash nor a pause."""
+    """Usual is a window of which this share has fewer events: neither a flash nor a pause."""
+    like: float = 2.0
+    """Windows are taken that have at most so many times the events of the usual one, and at least the same
+    part of them."""
     gap: float = 0.005
     """Shortest time without any event [s] that may be missing data."""
     around: int = 50
@@ -71,16 +82,23 @@ def within_span(grid: Grid, span: tuple[float, float] | None) -> Grid:
     return replace(grid, begin=float(times[first]), steps=int(last - first))
 
 
-def choose_window(
-    events: Events, scene: Scene, grid: Grid, pixels: int, settings: WindowSettings = WindowSettings()
-) -> Grid:
-    """Return the part of a grid of time that is compared.
+def choose_windows(
+    events: Events,
+    scene: Scene,
+    grid: Grid,
+    pixels: int,
+    *,
+    unbroken: bool = False,
+    settings: WindowSettings = WindowSettings(),
+) -> tuple[Grid, ...]:
+    """Return the windows of a grid of time that are compared, in order: all of it where it is short.
 
     Args:
         events: What was measured.
         scene: What the camera saw.
         grid: All time that both have.
-        pixels: That are looked at, in each half.
+        pixels: That are looked at, in each part.
+        unbroken: Whether time must go on without a break, so that there is one window.
         settings: How much is compared.
     """
     most = settings.longest
@@ -90,21 +108,56 @@ def choose_window(
         needed = settings.enough / max(0.4 * pixels * rate, 1e-9)
         most = int(min(max(settings.rest, needed) / grid.step, 2.5 * most))
     if grid.steps <= 1.25 * most:
-        return grid
-    first = np.unique(np.linspace(0, grid.steps - most, settings.looks).astype(np.int64))
+        return (grid,)
+    count = 1 if unbroken else max(1, min(settings.windows, int(most * grid.step / settings.shortest)))
+    for number in range(count, 1, -1):
+        each = most // number
+        first, counts, usual = _count_windows(events, grid, each, settings)
+        alike = first[(counts >= usual / settings.like) & (counts <= usual * settings.like)]
+        chosen = _spread_apart(alike, number, each)
+        if len(chosen) == number:
+            return tuple(replace(grid, begin=grid.begin + grid.step * at, steps=each) for at in chosen)
+    first, counts, usual = _count_windows(events, grid, most, settings)
+    at = int(first[np.argmin(np.abs(counts - usual))])
+    return (replace(grid, begin=grid.begin + grid.step * at, steps=most),)
+
+
+def _count_windows(
+    events: Events, grid: Grid, steps: int, settings: WindowSettings
+) -> tuple[NDArray[np.int64], NDArray[np.int64], float]:
+    """Return first steps of windows over the length, the events of each, (K,), and those of a usual one."""
+    first = np.unique(np.linspace(0, grid.steps - steps, settings.looks).astype(np.int64))
     begin = grid.begin + grid.step * first
-    counts = np.searchsorted(events.t, begin + grid.step * most) - np.searchsorted(events.t, begin)
-    wanted = np.quantile(counts, settings.quantile)
-    chosen = int(np.argmin(np.abs(counts - wanted)))
-    return replace(grid, begin=float(begin[chosen]), steps=most)
+    counts = np.searchsorted(events.t, begin + grid.step * steps) - np.searchsorted(events.t, begin)
+    return first, counts, float(np.quantile(counts, settings.quantile))
 
 
-def sentence_of_window(whole: Grid, part: Grid) -> str:
+def _spread_apart(first: NDArray[np.int64], number: int, steps: int) -> list[int]:
+    """Return first steps of windows that do not overlap, spread over those there are; maybe fewer.
+
+    Args:
+        first: Of the windows to choose from, increasing, shape (K,).
+        number: Windows wanted.
+        steps: Of each.
+    """
+    chosen: list[int] = []
+    for place in np.linspace(0, len(first) - 1, number):
+        free = [at for at in first.tolist() if not chosen or at >= chosen[-1] + steps]
+        if not free:
+            break
+        wanted = int(first[int(place)])
+        chosen.append(min(free, key=lambda at: abs(at - wanted)))
+    return chosen
+
+
+def sentence_of_windows(whole: Grid, windows: tuple[Grid, ...]) -> str:
     """Return which part of the time is compared, in words."""
-    end = part.begin + part.step * (part.steps - 1)
+    length = sum(one.step * (one.steps - 1) for one in windows)
+    ends = [(one.begin, one.begin + one.step * (one.steps - 1)) for one in windows]
+    parts = [f"from {begin:.3g} s to {end:.3g} s" for begin, end in ends]
     return (
-        f"{end - part.begin:.3g} s of {whole.step * (whole.steps - 1):.3g} s are compared, from "
-        f"{part.begin:.3g} s to {end:.3g} s; another part is chosen by its times (--from, --to)"
+        f"{length:.3g} s of {whole.step * (whole.steps - 1):.3g} s are compared, {', '.join(parts)}; "
+        "another part is chosen by its times (--from, --to)"
     )
 
 

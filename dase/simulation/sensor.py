@@ -104,6 +104,11 @@ class Sensor:
         """Return the sensor without the effect `name`."""
         return replace(self, effects=tuple(e for e in self.effects if e.name != name))
 
+    @property
+    def unbroken(self) -> bool:
+        """Whether some effect needs time to go on without a break, see `Effect.unbroken`."""
+        return any(effect.unbroken for effect in self.effects)
+
     def longest_step(self) -> float:
         """Return the longest time between samples that still shows all effects [s]."""
         return min(effect.longest_step() for effect in self.effects)
