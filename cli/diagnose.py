@@ -238,6 +238,7 @@ def print_plain_numbers(plain: Mapping[str, tuple[float, float]]) -> None:
 
 
 def _print_findings(found: Diagnosis, quiet: bool) -> None:
+    from dase.results import NO_CLAIM
 
     click.echo(found.finding())
     if quiet:
@@ -263,9 +264,10 @@ def _print_findings(found: Diagnosis, quiet: bool) -> None:
             click.echo(f"    cannot be told apart from {step.chosen}: {', '.join(step.ties)}")
         for cell in step.cells[:3]:
             click.echo(f"    {cell.sentence}")
-    click.echo("\nparameters, with 90 % intervals")
+    click.echo("\nparameters, with 90 % intervals" if found.parameters_hold else f"\n{NO_CLAIM}")
     for name, estimate in found.parameters.items():
-        click.echo(f"  {name:24s} {estimate.value:10.4g}   {estimate.low:.4g} to {estimate.high:.4g}")
+        interval = f"   {estimate.low:.4g} to {estimate.high:.4g}" if found.parameters_hold else ""
+        click.echo(f"  {name:24s} {estimate.value:10.4g}{interval}")
     if found.not_seen:
         click.echo("\nnot seen")
         for limit in found.not_seen:

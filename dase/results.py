@@ -492,6 +492,14 @@ class Diagnosis:
         """Effect found to those that do nearly as well in its place."""
         return {one.effect: one.alternatives for one in self.findings if one.alternatives}
 
+    @property
+    def parameters_hold(self) -> bool:
+        """Whether the sensor explains so much of the measurement that its parameters may be the camera's.
+
+        Else they are only what makes a wrong model least wrong.
+        """
+        return self.errors[-1] <= max(self.gate, 0.1 * self.errors[0])
+
     def of_grade(self, grade: Grade) -> tuple[Finding, ...]:
         """Return the findings of a grade."""
         return tuple(one for one in self.findings if one.grade is grade)
@@ -508,7 +516,7 @@ class Diagnosis:
                 *_indented("findings", [one.sentence() for one in self.findings[:6]]),
                 *_indented("record next", self.record),
                 *_indented("not seen", [one.sentence for one in self.not_seen[:6]]),
-                *_parameter_lines(self.parameters, most=12),
+                *_parameter_lines(self.parameters, most=12, hold=self.parameters_hold),
                 *_plain_lines(self.plain),
                 *_noted(self.notes),
             ]
@@ -537,6 +545,7 @@ class Diagnosis:
             "selected": list(self.selected),
             "findings": [one.to_json() for one in self.findings],
             "stand_ins": [one.to_json() for one in self.stand_ins],
+            "parameters_hold": self.parameters_hold,
             "record": list(self.record),
             "not_seen": [asdict(one) for one in self.not_seen],
             "level": self.level,
@@ -608,6 +617,10 @@ class Distinction:
         return fit_to_screen(["Distinction", *(f"  {line}" for line in [*align_columns(rows), *lines])])
 
 
+NO_CLAIM = "parameters of the nearest model, which leaves too much: no claim about the camera"
+"""Above parameters of a model that does not explain the measurement."""
+
+
 def is_worse(error: float, before: float, gate: float) -> bool:
     """Whether held-out data speak against a model in place of another, beyond what repeats differ by.
 
@@ -638,15 +651,22 @@ def _answer_words(answer: Answer) -> tuple[str, ...]:
     return answer.stimulus, shortest, f"{100 * answer.power:.0f} %", answer.differs or "-"
 
 
-def _parameter_lines(parameters: Mapping[str, Estimate], *, most: int) -> list[str]:
-    """Return parameters with their intervals as lines of a table, at most some of them."""
+def _parameter_lines(parameters: Mapping[str, Estimate], *, most: int, hold: bool = True) -> list[str]:
+    """Return parameters with their intervals as lines of a table, at most some of them.
+
+    Args:
+        parameters: By name.
+        most: Of them.
+        hold: Whether they may be the camera's; else they have no intervals.
+    """
     rows = [
-        (name, f"{e.value:.4g}", f"{e.low:.4g} to {e.high:.4g}")
+        (name, f"{e.value:.4g}", f"{e.low:.4g} to {e.high:.4g}" if hold else "")
         for name, e in list(parameters.items())[:most]
     ]
     left = [(f"and {len(parameters) - most} more", "", "")] if len(parameters) > most else []
     table = align_columns([*_pushed([*rows, *left])], right=(1,)) if rows else []
-    return ["parameters, with 90 % intervals", *table] if table else []
+    head = "parameters, with 90 % intervals" if hold else NO_CLAIM
+    return [head, *table] if table else []
 
 
 def _plain_json(plain: Mapping[str, tuple[float, float]]) -> dict[str, dict[str, float | None]]:

@@ -20,7 +20,7 @@ from dase.figures.style import Plate, format_number
 from dase.fitting.measurement import Measurement
 from dase.io import replacing
 from dase.probes.statistics import FAMILY_WORDS
-from dase.results import Comparison, Diagnosis, Estimate, Finding, Grade, Rank, Step
+from dase.results import NO_CLAIM, Comparison, Diagnosis, Estimate, Finding, Grade, Rank, Step
 from dase.scenes.between_frames import CameraScene
 from dase.simulation.sensor import Sensor
 from dase.simulation.sensor_file import dump_sensor
@@ -185,6 +185,7 @@ def diagnosis_page(
     body += [
         *_figures_html(plates),
         html_page.table_html(("", "measured", "simulated", "model / measured"), _plain_rows(found.plain)),
+        "" if found.parameters_hold else f"<p>{escape(NO_CLAIM[:1].upper() + NO_CLAIM[1:])}.</p>",
         _parameter_table(found.parameters),
         _sensor_file_html(found.sensor),
         html_page.notes_html(found.notes),
@@ -256,7 +257,8 @@ def diagnosis_drawings(found: Diagnosis) -> list[Drawing]:
     judged = [step for step in found.history if _judged_ranks(step)]
     out: list[Drawing] = [partial(staircase_of, found)]
     out += [partial(ranking_of, step, found.floor) for step in judged]
-    return out + ([partial(parameters_of, found.sensor, found.parameters)] if found.parameters else [])
+    shown = found.parameters and found.parameters_hold
+    return out + ([partial(parameters_of, found.sensor, found.parameters)] if shown else [])
 
 
 def parameters_of(sensor: Sensor, estimates: Mapping[str, Estimate]) -> Plate:

@@ -40,12 +40,17 @@ def look(scene, *effects, seed: int = 3, library=LIBRARY) -> dase.Diagnosis:
     return diagnose(events, scene=scene, effects=library, pixels=400, most=1, seed=seed)
 
 
+@pytest.fixture(scope="module")
+def leaky(scene) -> dase.Diagnosis:
+    return look(scene, EFFECTS["leak"](rate=4.0))
+
+
 def judged(error: float) -> Judgement:
     return Judgement(error, 1.15, 0.4, 0.25, {}, {}, np.zeros(1), 1.0)
 
 
-def test_what_was_not_found_has_a_limit_and_what_was_has_none(scene):
-    found = look(scene, EFFECTS["leak"](rate=4.0))
+def test_what_was_not_found_has_a_limit_and_what_was_has_none(leaky):
+    found = leaky
     (limit,) = [one for one in found.not_seen if one.parameter]
     assert limit.effect == "shot"
     assert limit.strength is not None
@@ -135,3 +140,15 @@ def test_what_to_record_next(scene):
     (text,) = what_to_record(scene, [either], None)
     assert "dase distinguish" in text
     assert "what the camera saw" in what_to_record(scene, [], None, contradiction=True)[0]
+
+
+def test_parameters_of_a_model_that_leaves_too_much_are_no_claim(leaky):
+    found = leaky
+    assert found.parameters_hold
+    assert "with 90 % intervals" in repr(found)
+    off = replace(found, errors=(6.0, 5.0))
+    assert not off.parameters_hold
+    assert "no claim" in repr(off)
+    assert off.to_json()["parameters_hold"] is False
+    # next to nothing of much is left: another world's habits
+    assert replace(found, errors=(40.0, 2.0)).parameters_hold

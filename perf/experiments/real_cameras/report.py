@@ -50,12 +50,19 @@ def made_at(found: Mapping[str, Any]) -> str:
 
 
 def answer(found: dict[str, Any]) -> str:
-    """Return what a diagnosis found, in a few words."""
+    """Return what a diagnosis found, in a few words: effects by how sure they are, and what is left."""
+    said = []
+    for grade in ("certain", "supported", "either"):
+        names = [
+            " or ".join((one["effect"], *one["alternatives"], *one["unknown"] * ("something unknown",)))
+            for one in found["findings"] if one["grade"] == grade
+        ]  # fmt: skip
+        said += [f"{grade}: {', '.join(names)}"] if names else []
     left = found["unexplained"]
     if left is not None:
-        near = " + ".join(left["nearest"])
-        return f"unexplained; nearest {near}" if near else "unexplained"
-    return ", ".join(found["selected"]) or "nothing is missing"
+        near = f", nearest {' + '.join(left['nearest'])}" if left["nearest"] else ""
+        said.append(f"{100 * left['share']:.0f} % unexplained{near}")
+    return "; ".join(said) or "nothing is missing"
 
 
 def path_of(found: dict[str, Any]) -> tuple[list[str], list[float], int]:
@@ -99,16 +106,25 @@ def section(name: str, camera: Any, found: dict[str, Any], facts: dict[str, Any]
         "|---|---|",
     ]
     near = found["unexplained"]["nearest"] if found["unexplained"] else []
+    grades = {one["effect"]: one["grade"] for one in found["findings"]}
     for words, effects in camera.visible:
-        said = [e for e in effects if e in found["selected"]]
+        said = [f"{e} ({grades[e]})" for e in effects if e in grades]
         stand = [e for e in effects if e in near]
-        verdict = (
-            f"found: {', '.join(said)}" if said else f"stand-in: {', '.join(stand)}" if stand else "not found"
-        )
+        verdict = ", ".join(said) if said else f"stand-in: {', '.join(stand)}" if stand else "not found"
         lines.append(f"| {words} | {_threshold(found) if effects == ('threshold',) else verdict} |")
-    cells = found["unexplained"]["cells"] if found["unexplained"] else []
-    if cells:
-        lines += ["", "What stays unexplained, worst first:", "", *(f"- {c['sentence']}" for c in cells[:4])]
+    seen = [one["seen"] for one in found["findings"] if one["seen"]]
+    if seen:
+        lines += ["", "The events alone show:", "", *(f"- {text}" for text in seen)]
+    left = found["unexplained"]
+    if left and left["cells"]:
+        sits = ", ".join(f"{kind} pixels {100 * share:.0f} %" for kind, share in left["places"].items())
+        scene = f"; the scene may be blamed for {100 * left['of_scene']:.0f} % of what the model is off by"
+        lines += ["", f"What stays unexplained ({sits}{scene if left['of_scene'] else ''}), worst first:", ""]
+        lines += [f"- {c['sentence']}" for c in left["cells"][:3]]
+    if found["record"]:
+        lines += ["", "Record next:", "", *(f"- {text}" for text in found["record"])]
+    if found["not_seen"]:
+        lines += ["", f"Not seen: {'; '.join(one['sentence'] for one in found['not_seen'])}."]
     if found["notes"]:
         lines += ["", *(f"- note: {note}" for note in found["notes"])]
     return "\n".join(lines)
@@ -126,6 +142,8 @@ def plain(facts: dict[str, Any]) -> str:
 
 
 def _threshold(found: dict[str, Any]) -> str:
+    if not found["parameters_hold"]:
+        return "no claim: too much is left"
     both = [found["parameters"].get(f"threshold.{p}") for p in ("on", "off")]
     if None in both:
         return "not fitted"
@@ -135,9 +153,10 @@ def _threshold(found: dict[str, Any]) -> str:
 
 def _estimates(found: dict[str, Any]) -> str:
     chosen = [(n, e) for n, e in found["parameters"].items()]
+    if not found["parameters_hold"]:
+        return "Too much is left for any claim about thresholds and other values."
     said = [f"`{n}` {e['value']:.3g} ({e['low']:.3g} to {e['high']:.3g})" for n, e in chosen]
-    what = "Fitted with the stand-ins" if found["unexplained"] else "Fitted"
-    return f"{what}, with 90 % intervals: {', '.join(said)}." if said else ""
+    return f"Fitted, with 90 % intervals: {', '.join(said)}." if said else ""
 
 
 OPEN = {"davis346_cuke_cradle", "dvx_noise_static"}
@@ -241,14 +260,16 @@ seen; 1 is what two repeats of the recording would have.{made}
 {left}
 ![measured events, simulated events, and the falling error of each recording](real-cameras.png)
 
-Left: measured. Middle: what the announced model makes of the same scene at the same time; thresholds alone
-where the error stays unexplained. Right: the error with each effect added; the green band is what chance
-reaches, dashed steps are stand-ins that do not reach it and are not announced. Red is ON, blue is OFF. Of
-recordings that have no licence for it no events are shown, only the error.
+Left: measured. Middle: what the announced model makes of the same scene at the same time. Right:
+the error with each effect added; the green band is what chance reaches, dashed steps are stand-ins
+that are not announced. Red is ON, blue is OFF. Of recordings that have no licence for it no events
+are shown, only the error.
 
-The scene between two frames of a camera is a guess. Only where it can be trusted anything is compared (see
-[scenes](scenes.md)), and where that is not enough, an error stays that is the scene's and not the sensor's:
-it is called unexplained.
+What is *certain* the events show without any scene; all else is said given the scene. The scene
+between two frames of a camera is a guess: only where it can be trusted anything is compared (see
+[scenes](scenes.md)), and what it may be blamed for is said beside what stays unexplained.
+Thresholds are no claim where more than a tenth of the error is left. [How to read
+this](reading-a-diagnosis.md).
 
 {parts}
 

@@ -201,23 +201,27 @@ CAMERAS = {
     "davis346_cuke_cradle": Camera(
         with_frames, "DAVIS346", "Newton's cradle, camera at rest, 0.5 s, 13 frames with exposures",
         (("shortest interval of a pixel about 1 ms", ("refractory",)), ("hot pixels", ("hot",)),
-         ("events where nothing moves", ("leak", "shot", "voltage_noise", "hot"))),
+         ("noise of pixels at rest", ("opposite pairs", "leak", "shot", "voltage_noise"))),
     ),
     "davis240c_camerashake": Camera(
         with_frames, "DAVIS240C", "box and mug, camera shaken by hand, 12 s, of which a part is compared",
-        (("shortest interval of a pixel about 1 ms", ("refractory",)), ("hot pixels", ("hot",))),
+        (("bursts of the whole array with the frames", ("exposure",)), ("lamps at 100 Hz", ("flicker",)),
+         ("rows that are read together", ("grouping", "readout")),
+         ("shortest interval of a pixel about 1 ms", ("refractory",))),
         0.005,
     ),
     "davis240b_evbench1": Camera(
         without_times, "DAVIS240B", "pan and tilt over a checkerboard, 1.07 s, frames without times",
-        (("only 30 % ON events", ("threshold",)), ("hot pixels", ("hot",)),
+        (("bursts of the whole array every 51 ms", ("exposure",)), ("lamps at 120 Hz", ("flicker",)),
+         ("hot pixels", ("hot",)), ("rows that are read together", ("grouping", "readout")),
+         ("only 30 % ON events", ("threshold",)),
          ("no events in columns 190 to 239", ("dead",))),
         0.01,
     ),
     "dvx_noise_static": Camera(
         static, "iniVation, 640x480", "nothing moves, 2 s: noise alone, about 0.5 Hz per pixel",
         (("noise of both polarities", ("shot", "voltage_noise")),
-         ("a pixel that is stuck, one of 307,200: it is not among those compared", ("hot",)),
+         ("hot pixels, one of them stuck", ("hot",)),
          ("columns that are read every 195 µs", ("row_scan", "timestamp"))),
         0.2,
     ),
@@ -229,7 +233,8 @@ CAMERAS = {
     ),
     "psee_gen31_dot": Camera(
         of_a_dot, "Prophesee Gen3.1", "a bright dot in circles, 50 ms, no frames",
-        (("a pixel at 66 kHz", ("hot",)), ("modal interval of a pixel 75 µs", ("refractory",))),
+        (("a pixel at 66 kHz", ("hot",)), ("rows that are read together", ("grouping", "readout")),
+         ("modal interval of a pixel 75 µs", ("refractory",))),
         0.001,
     ),
 }  # fmt: skip
