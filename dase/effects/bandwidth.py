@@ -3,27 +3,73 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
-from typing import ClassVar
+from dataclasses import dataclass, replace
+from typing import ClassVar, Self
 
 import warp as wp
 
-from dase.effects.base import Effect, parameter
-from dase.kernels.vector_math import exponential
+from dase.effects.base import Effect, Observations, choice, parameter
+from dase.kernels.pixel_stages import EffectStages
+from dase.kernels.vector_math import exponential, logarithm
+
+
+@wp.func
+def time_constants(
+    intensity: float, dt: float, cutoff: float, dark: float, spread: float, pixel_normal: float
+):
+    """Length of a step in time constants of the pixel's photoreceptor."""
+    x = 2.0 * wp.pi * cutoff * (dark + (1.0 - dark) * wp.clamp(intensity, 0.0, 1.0)) * dt
+    # a pixel of hardly any bandwidth would be a dead one
+    return x * wp.max(1.0 + spread * pixel_normal, 0.1)
 
 
 @wp.func
 def lowpass_voltage(
-    voltage: float, intensity: float, dt: float, cutoff: float, dark: float, input: float, output: float
+    voltage: float,
+    intensity: float,
+    dt: float,
+    cutoff: float,
+    dark: float,
+    spread: float,
+    input: float,
+    output: float,
+    pixel_normal: float,
 ):
     """First-order low-pass, exact for an input that runs straight between samples."""
-    x = 2.0 * wp.pi * cutoff * (dark + (1.0 - dark) * wp.clamp(intensity, 0.0, 1.0)) * dt
+    x = time_constants(intensity, dt, cutoff, dark, spread, pixel_normal)
     decay = exponential(-x)
     # share of the input's step by which the output lags behind a ramp; (1 - e^-x)/x loses digits near 0
     lag = 1.0 - 0.5 * x
     if x > 1.0e-3:
         lag = (1.0 - decay) / x
     settled = voltage - (voltage - input) * lag + (output - input) * decay
+    return settled, voltage, settled
+
+
+@wp.func
+def follower_voltage(
+    voltage: float,
+    intensity: float,
+    dt: float,
+    cutoff: float,
+    dark: float,
+    spread: float,
+    input: float,
+    output: float,
+    pixel_normal: float,
+):
+    """Source follower, exact for an input that runs straight between samples.
+
+    Its equation is linear in e^(input - output): the photocurrent over what the voltage lets through.
+    """
+    x = time_constants(intensity, dt, cutoff, dark, spread, pixel_normal)
+    # in a ramp upwards the photocurrent runs away from that current
+    left = x - (voltage - input)
+    decay = exponential(-left)
+    mean = wp.where(wp.abs(left) > 1.0e-3, (1.0 - decay) / left, 1.0 - 0.5 * left)
+    excess = exponential(input - output) * decay + x * mean
+    # of infinity times nothing nothing is known, and who is that fast follows at once
+    settled = wp.where(x > 1.0e6, voltage, voltage - logarithm(excess))
     return settled, voltage, settled
 
 
@@ -35,12 +81,22 @@ class Bandwidth(Effect):
     the light. Fast changes are smoothed and come late, most of all in dark pixels, where edges trail long
     tails of events.
 
-    The cutoff is `cutoff` at intensity 1 (white) and falls linearly to `dark * cutoff` at intensity 0.
+    The cutoff is `cutoff` at intensity 1 (white) and falls linearly to `dark * cutoff` at intensity 0. It
+    differs from pixel to pixel by `spread`.
+
+    With `signal = "small"` the voltage v follows the logarithm u of the light by dv/dt = w (u - v), where
+    w is 2π times the cutoff at the present light: an edge of a factor c downwards is slower than one upwards
+    by c. That holds for small contrasts only. With `signal = "large"` it is the equation of a source
+    follower, whose node is charged by the photocurrent and discharged by one that grows as e^v: dv/dt =
+    w (1 - e^(v - u)). Half way through an edge of a decade it is after 0.143 / w upwards and 0.274 / w
+    downwards, w at the darker light: 1.9 times as long. Small contrasts it treats alike.
     """
 
     name: ClassVar[str] = "bandwidth"
     source: ClassVar[str] = (
-        "Hu, Liu, Delbruck: v2e, from video frames to realistic DVS events, 2021 (finite bandwidth)"
+        "Hu, Liu, Delbruck: v2e, from video frames to realistic DVS events, 2021 (finite bandwidth); "
+        "Delbruck, Mead: Analog VLSI adaptive, logarithmic, wide-dynamic-range photoreceptor, 1994 "
+        "(source follower)"
     )
     stages: ClassVar = {"respond": lowpass_voltage}
     states: ClassVar = ("input", "output")
@@ -61,3 +117,26 @@ class Bandwidth(Effect):
         about="cutoff at intensity 0 relative to that at intensity 1; 1 makes the bandwidth constant",
         starts="ends",
     )
+    spread: float = parameter(
+        0.0,
+        unit="1",
+        bounds=(0.0, 1.0),
+        plausible=(0.0, 0.3),
+        about="standard deviation of the cutoff over pixels, relative to it",
+        fitted=False,  # it shows as blurred edges do, which a fit takes for another cutoff
+    )
+    signal: str = choice(
+        "small", among=("small", "large"), about="equation: linear in log light, or a source follower's"
+    )
+
+    @classmethod
+    def candidates(cls, observed: Observations) -> list[Self]:
+        """Return the low-pass that is linear: contrasts at which the other differs are rare."""
+        return [cls()]
+
+    def compiled(self) -> EffectStages:
+        """Return what the kernel composer needs to know."""
+        stages = super().compiled()
+        return (
+            replace(stages, functions=(("respond", follower_voltage),)) if self.signal == "large" else stages
+        )

@@ -65,12 +65,15 @@ def second_order_voltage(
     cutoff: float,
     damping: float,
     dark: float,
+    spread: float,
     input: float,
     output: float,
     slope: float,
+    pixel_normal: float,
 ):
     """Second-order low-pass, exact for an input that runs straight between samples."""
     omega = 2.0 * wp.pi * cutoff * (dark + (1.0 - dark) * wp.clamp(intensity, 0.0, 1.0))
+    omega *= wp.max(1.0 + spread * pixel_normal, 0.1)
     x = omega * dt
     step = voltage - input
     settled = voltage
@@ -97,7 +100,8 @@ class SecondOrder(Effect):
     falls linearly to `dark * cutoff` at intensity 0; the damping is held constant, although in the circuit
     it changes with the light. The quality factor is Q = 1 / (2 damping); at damping 0.71 the natural
     frequency is the -3 dB frequency. Exact at any sampling, for under-, over- and critical damping. Strongly
-    damped it is one low-pass with the cutoff `cutoff / (2 damping)`: `bandwidth`.
+    damped it is one low-pass with the cutoff `cutoff / (2 damping)`: `bandwidth`. The natural frequency
+    differs from pixel to pixel by `spread`.
     """
 
     name: ClassVar[str] = "second_order"
@@ -134,7 +138,16 @@ class SecondOrder(Effect):
         about="natural frequency at intensity 0 relative to that at intensity 1; 1 makes it constant",
         starts="ends",
     )
+    spread: float = parameter(
+        0.0,
+        unit="1",
+        bounds=(0.0, 1.0),
+        plausible=(0.0, 0.3),
+        about="standard deviation of the natural frequency over pixels, relative to it",
+        fitted=False,  # as that of `bandwidth`
+    )
 
     def simpler(self) -> tuple[Effect, ...]:
         """Return the one low-pass that is as late behind a ramp: by 2 damping / (2π cutoff)."""
-        return (Bandwidth(cutoff=max(self.cutoff / (2 * self.damping), 0.01), dark=self.dark),)
+        cutoff = max(self.cutoff / (2 * self.damping), 0.01)
+        return (Bandwidth(cutoff=cutoff, dark=self.dark, spread=self.spread),)

@@ -88,6 +88,12 @@ TWINS = {
     "critical": (SecondOrder(cutoff=50.0, damping=1.0),),
     "overdamped": (SecondOrder(cutoff=200.0, damping=6.0),),
     "noise": (VoltageNoise(sigma=0.2, cutoff=30.0),),
+    "uneven": (Bandwidth(cutoff=60.0, spread=0.4), SecondOrder(cutoff=90.0, spread=0.3)),
+    "follower": (Bandwidth(cutoff=200.0, dark=0.02, signal="large"),),
+    "noisy follower": (
+        Bandwidth(cutoff=30.0, spread=0.3, signal="large"),
+        VoltageNoise(sigma=0.2, cutoff=30.0),
+    ),
     "all": (*(STRONG[n] for n in ("flicker", "vignetting", "dark", "linlog", "second_order")), Mismatch()),
 }
 

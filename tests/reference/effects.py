@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 from reference import pixel as reference
 from reference.pixel import Stream, setting
+from scipy.integrate import solve_ivp
 from scipy.interpolate import CubicHermiteSpline
 from scipy.linalg import cholesky, expm
 
@@ -62,6 +63,35 @@ def second_order(times: np.ndarray, level: np.ndarray, omega: np.ndarray, dampin
             flow[1] = [-w * w, -2 * damping * w, w * w, 0]
             state = expm(flow * dt) @ state
             out[k, i] = state[0]
+    return out
+
+
+def own_speed(slow: dase.Effect, pixels: int, seed: int) -> np.ndarray:
+    """Return the cutoff of each pixel relative to the nominal one, shape (N,)."""
+    name = f"{slow.name}_respond_pixel_normal"
+    normal = np.array([Stream(name, seed, i).normal() for i in range(pixels)])
+    return np.maximum(1 + slow.spread * normal, 0.1)
+
+
+def follower(times: np.ndarray, level: np.ndarray, cutoff: np.ndarray) -> np.ndarray:
+    """Return the voltage v of dv/dt = ω (1 - e^(v - level)), by integrating that, shape (K, N).
+
+    Args:
+        times: Samples [s], shape (K,).
+        level: Straight between samples, shape (K, N).
+        cutoff: During the step that ends at each sample [Hz], shape (K, N).
+    """
+    out = np.array(level, np.float64)
+    for i in range(level.shape[1]):
+        for k in range(1, len(times)):
+            dt, omega = times[k] - times[k - 1], 2 * np.pi * cutoff[k, i]
+
+            def speed(share, v, k=k, i=i, omega=omega, dt=dt):
+                now = level[k - 1, i] + (level[k, i] - level[k - 1, i]) * share
+                return omega * dt * (1 - np.exp(v - now))
+
+            way = solve_ivp(speed, (0, 1), [out[k - 1, i]], method="Radau", rtol=1e-8, atol=1e-8)
+            out[k, i] = way.y[0, -1]
     return out
 
 
@@ -129,10 +159,14 @@ def voltage(sensor: dase.Sensor, times: np.ndarray, intensity: np.ndarray, seed:
         level = linlog(level, sensor["linlog"].knee, sensor["linlog"].slope, sensor.log_eps)
     if np.isfinite(setting(sensor, "bandwidth", "cutoff", np.inf)):
         slow = sensor["bandwidth"]
-        level = reference.lowpass(times, level, slow.cutoff * (slow.dark + (1 - slow.dark) * bright))
+        cutoff = (
+            slow.cutoff * (slow.dark + (1 - slow.dark) * bright) * own_speed(slow, intensity.shape[1], seed)
+        )
+        level = (follower if slow.signal == "large" else reference.lowpass)(times, level, cutoff)
     if np.isfinite(setting(sensor, "second_order", "cutoff", np.inf)):
         slow = sensor["second_order"]
         omega = 2 * np.pi * slow.cutoff * (slow.dark + (1 - slow.dark) * bright)
+        omega = omega * own_speed(slow, intensity.shape[1], seed)
         level = second_order(times, level, omega, slow.damping)
     if setting(sensor, "voltage_noise", "sigma", 0.0) > 0:
         streams = ("voltage_noise_respond_uniform", "voltage_noise_respond_uniform_2")
