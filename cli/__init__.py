@@ -24,6 +24,7 @@ COMMANDS = (
     "evaluate",
     "fit",
     "info",
+    "presets",
     "remove",
     "show",
     "stimulus",
