@@ -9,8 +9,6 @@ from __future__ import annotations
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass, replace
 
-import numpy as np
-
 from dase.effects import EFFECTS, Effect
 from dase.errors import InputError
 from dase.events import Events
@@ -129,8 +127,7 @@ def find_seen_effects(measurement: Measurement, library: Collection[str]) -> See
     coupling = [entry for entry in entries if entry.name == "frame coupling"]
     bursts = None
     if coupling:
-        details = coupling[0].details
-        bursts = BurstClock(np.asarray(details["begins"]), details["interval"], np.asarray(details["bursts"]))
+        bursts = BurstClock.of(coupling[0].details)
         if begins is None:
             bursts = bursts.extend(float(events.t[-1]))
     absent = tuple(entry for entry in found.entries if entry.answer is Answer.NOT_SEEN)
@@ -200,7 +197,7 @@ def strength_of_bursts(
     for name in KINDS["frame coupling"]:
         if name in library and name not in sensor:
             return fit_bursts(
-                measurement, sensor, library[name], seen.bursts, times,
+                measurement, sensor, library[name], times,
                 pixels=pixels, seed=seed, device=device,
             )  # fmt: skip
     return None

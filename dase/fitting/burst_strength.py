@@ -26,9 +26,16 @@ from dase.results import Estimate
 from dase.scenes.between_frames import CameraScene
 from dase.signatures.burst_times import BurstTimes, find_burst_times
 from dase.signatures.find import find_signatures
-from dase.signatures.frame_coupling import NAME, BurstClock
+from dase.signatures.frame_coupling import NAME
 from dase.signatures.result import Signature
 from dase.simulation.sensor import Sensor
+
+REACH = 2e-3
+"""Before and after an edge is compared [s]: recorded bursts last 1 to 3 ms."""
+
+LEAST_FALL = 0.9
+"""Share of the bursts' error that may be left: where it hardly falls, the model is too far off all else for
+the strength to mean anything."""
 
 
 @dataclass(frozen=True)
@@ -93,7 +100,6 @@ def fit_bursts(
     measurement: Measurement,
     sensor: Sensor,
     kind: type[Effect],
-    bursts: BurstClock,
     times: BurstTimes,
     *,
     pixels: int = SPLIT.pixels,
@@ -106,19 +112,23 @@ def fit_bursts(
         measurement: Events and scene.
         sensor: All else, which is not fitted.
         kind: The effect.
-        bursts: What is compared.
-        times: When the bursts come.
+        times: When the bursts come; little else is compared.
         pixels: In each part of the measurement.
         seed: Of every random number.
         device: Where kernels run.
     """
+    events, scene, trust = measurement.events, measurement.scene, measurement.trust
+    if isinstance(scene, CameraScene):
+        # what is wrong between frames is little beside a burst, and where it is trusted are few of these
+        trust = everywhere
+    bursts = times.around(float(events.t[0]), float(events.t[-1]), REACH)
 
     def between_bursts(t: NDArray[np.float64]) -> NDArray[np.bool_]:
         return ~bursts.contains(t)
 
     try:
         evidence = split_measurement(
-            measurement.events, measurement.scene, log_eps=sensor.log_eps, trust=measurement.trust,
+            events, scene, log_eps=sensor.log_eps, trust=trust,
             span=measurement.span, left_out=between_bursts, frames=times,
             pixels=pixels, seed=seed, device=device,
         )  # fmt: skip
@@ -133,9 +143,14 @@ def fit_bursts(
         one.judge(evidence.report, repeats=REPEATS // 2, seed=SimulationStream.JUDGE.seed(seed)).error
         for one in (model_of(sensor, ()), model)
     )
-    if not with_it < without:
+    if not with_it < LEAST_FALL * without:
         return None
     return BurstStrength(model.sensor[kind.name], values, without, with_it)
+
+
+def everywhere(times: NDArray[np.float64], pixels: NDArray[np.int32]) -> NDArray[np.bool_]:
+    """Trust in a scene at all times (T,) and pixels (N,), shape (T, N)."""
+    return np.ones((len(times), len(pixels)), np.bool_)
 
 
 def _fitted_to_bursts(

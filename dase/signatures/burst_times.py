@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dase.events import Events
+from dase.signatures.frame_coupling import BurstClock
 
 
 @dataclass(frozen=True)
@@ -26,6 +27,13 @@ class BurstTimes:
     interval: float
     begin: float
     exposure: float
+
+    def around(self, begin: float, end: float, reach: float) -> BurstClock:
+        """Return when bursts come between two times [s], `reach` [s] before and after both edges."""
+        first, last = (math.floor((t - self.begin) / self.interval) for t in (begin, end))
+        begins = self.begin + self.interval * np.arange(first - 1, last + 1)
+        edges = np.array([0.0, self.exposure])[:, None]
+        return BurstClock(begins, self.interval, edges + np.array([-reach, reach]))
 
 
 @dataclass(frozen=True)

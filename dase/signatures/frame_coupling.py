@@ -8,7 +8,9 @@ light and dark alike. Where the times of frames are unknown, the bursts tell the
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -50,6 +52,11 @@ class BurstClock:
     begins: NDArray[np.float64]
     interval: float
     bursts: NDArray[np.float64]
+
+    @classmethod
+    def of(cls, details: Mapping[str, Any]) -> BurstClock:
+        """Return the clock that the details of a signature tell."""
+        return cls(np.asarray(details["begins"]), details["interval"], np.asarray(details["bursts"]))
 
     def extend(self, end: float) -> BurstClock:
         """Return the clock with as many more frames as begin before `end` [s], at even distances."""

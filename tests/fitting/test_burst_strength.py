@@ -18,7 +18,6 @@ from dase.results import Grade
 from dase.scenes import image_sources, random_scenes
 from dase.signatures.burst_times import BurstTimes, find_burst_times
 from dase.signatures.find import find_signatures
-from dase.signatures.frame_coupling import BurstClock
 
 FRAMES = Exposure(amplitude=0.25, spread=0.3, period=0.1, exposure=0.031, begin=0.0223)
 TIMES = BurstTimes(0.1, 0.0223, 0.031)
@@ -80,11 +79,8 @@ def test_the_strength_is_that_of_the_sensor(scene, device, amplitude, spread):
     """With thresholds known: within a tenth for the step, within a third for its spread over pixels."""
     true = replace(FRAMES, amplitude=amplitude, spread=spread)
     events = dase.simulate(scene, dase.Sensor().with_effect(true), seed=1, device=device)
-    begins = 0.0223 + 0.1 * np.arange(20)
-    clock = BurstClock(begins, 0.1, np.array([[-4e-3, 5e-3], [27e-3, 36e-3]]))
-    found = fit_bursts(
-        Measurement(events, scene), dase.Sensor(), Exposure, clock, TIMES, pixels=300, device=device
-    )
+    measured = Measurement(events, scene)
+    found = fit_bursts(measured, dase.Sensor(), Exposure, TIMES, pixels=300, device=device)
     assert found is not None
     assert found.error_with < 0.5 * found.error_without
     got = found.effect

@@ -6,13 +6,13 @@ from pathlib import Path
 
 import pytest
 from click.testing import CliRunner
+from helpers.scripts import load_script
 
 import dase
 from dase.cli.presets import presets_command
 from dase.errors import InputError
 from dase.simulation.preset_sources import preset_sources
 from dase.simulation.sensor_file import load_sensor, read_presets
-from helpers.scripts import load_script
 
 PRESETS = sorted(read_presets())
 
