@@ -9,9 +9,9 @@ from dase.simulation.sensor_file import read_presets
 
 HEAD = """# Presets
 
-Built-in sensors: every value with its unit, and where it comes from. `docs/presets.py` writes this page from the
-files in `dase/presets`, which `dase presets show NAME` prints as well; edit the text there. What no source is given
-for beside a value is said in the text above its table. How close the presets come to recordings is in
+Built-in sensors: every value with its unit, and where it comes from. `docs/presets.py` writes this page from
+the files in `dase/presets`, which `dase presets show NAME` prints, too; edit them. What no source
+is given for beside a value is said in the text above its table. How close presets come to recordings is in
 [effects.md](effects.md). A preset is where to begin: `dase fit` fits it to a recording of your own camera.
 """
 

@@ -32,8 +32,8 @@ class BurstTimes:
         """Return when bursts come between two times [s], `reach` [s] before and after both edges."""
         first, last = (math.floor((t - self.begin) / self.interval) for t in (begin, end))
         begins = self.begin + self.interval * np.arange(first - 1, last + 1)
-        edges = np.array([0.0, self.exposure])[:, None]
-        return BurstClock(begins, self.interval, edges + np.array([-reach, reach]))
+        bursts = [[edge - reach, edge + reach] for edge in (0.0, self.exposure)]
+        return BurstClock(begins, self.interval, np.array(bursts, np.float64))
 
 
 @dataclass(frozen=True)
