@@ -31,7 +31,7 @@ class BurstTimes:
     def around(self, begin: float, end: float, reach: float) -> BurstClock:
         """Return when bursts come between two times [s], `reach` [s] before and after both edges."""
         first, last = (math.floor((t - self.begin) / self.interval) for t in (begin, end))
-        begins = self.begin + self.interval * np.arange(first - 1, last + 1)
+        begins: NDArray[np.float64] = self.begin + self.interval * np.arange(first - 1.0, last + 1.0)
         bursts = [[edge - reach, edge + reach] for edge in (0.0, self.exposure)]
         return BurstClock(begins, self.interval, np.array(bursts, np.float64))
 
