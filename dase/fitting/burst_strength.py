@@ -30,8 +30,9 @@ from dase.signatures.frame_coupling import NAME
 from dase.signatures.result import Signature
 from dase.simulation.sensor import Sensor
 
-REACH = 2e-3
-"""Before and after an edge is compared [s]: recorded bursts last 1 to 3 ms."""
+REACH = 5e-3
+"""Compared before and after an edge [s]: recorded bursts last 1 to 3 ms, and what pixels do without one
+has to be seen, too."""
 
 LEAST_FALL = 0.9
 """Share of the bursts' error that may be left: where it hardly falls, the model is too far off all else for
