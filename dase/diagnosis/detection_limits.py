@@ -85,11 +85,16 @@ def find_detection_limits(
         # the events show by themselves that there is none
         if not tried or (axis := main_axis(model, tried[0])) is None:
             continue
+        # event by event through a readout, one effect would take as long as the whole search
+        if report.streams(with_effect_added(model, tried[0]).space):
+            continue
         asked.append((tried[0], axis))
         works.append(_limit_work(state, known, tried[0], axis))
-    places = run_side_by_side(
-        works, lambda share: state.progress("what would have been seen", share, last.error)
-    )
+    # a few at a time: all of them side by side would hold the events of hundreds of simulations
+    size, places = state.settings.detection.side_by_side, list[float | None]()
+    for n in range(0, len(works), size):
+        state.progress("what would have been seen", n / len(works), last.error)
+        places += run_side_by_side(works[n : n + size])
     return tuple(
         describe_limit(effect, axis, place) for (effect, axis), place in zip(asked, places, strict=True)
     )
@@ -185,7 +190,8 @@ def _limit_work(
         return compute_statistics(sums, known.half.frame)[0]
 
     # what the effect does to events by its place in the kernel alone, however weak it is, is not its strength
-    nothing = yield from statistics_work(weak, 0, settings.baseline)
+    slow = known.half.slow(other.space)
+    nothing = yield from statistics_work(weak, 0, settings.repeats if slow else settings.baseline)
     offset = nothing.mean(0) - known.half.repeats.mean(0)
 
     def seen_work(strength: float, turn: int) -> Work[bool]:
@@ -194,7 +200,7 @@ def _limit_work(
 
     if not (yield from seen_work(strong, 1)):
         return None
-    steps = settings.slow_steps if known.half.slow(other.space) else settings.steps
+    steps = settings.slow_steps if slow else settings.steps
     for turn in range(steps):
         middle = 0.5 * (weak + strong)
         if (yield from seen_work(middle, turn + 2)):

@@ -204,6 +204,9 @@ class DetectionSettings:
     slow_steps: int = 3
     """The same of effects that take ten times as long to simulate."""
 
+    side_by_side: int = 4
+    """Effects that are looked at in one launch."""
+
 
 @dataclass(frozen=True)
 class DiagnosisSettings:
