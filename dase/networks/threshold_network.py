@@ -156,7 +156,9 @@ class ThresholdNet(nn.Module):
             across = torch.linspace(-1, 1, width, device=grey.device).expand(len(grey), 1, height, width)
             along = torch.linspace(-1, 1, height, device=grey.device)[:, None].expand_as(across)
             x = torch.cat([x, across, along], 1)
-        with torch.autocast(grey.device.type, torch.bfloat16, enabled=grey.is_cuda):
+        # to learn with alone: what was learned gives thresholds in full precision, as on a CPU
+        half = grey.is_cuda and torch.is_grad_enabled()
+        with torch.autocast(grey.device.type, torch.bfloat16, enabled=half):
             u = self.unet(x.contiguous(memory_format=torch.channels_last))
         return u.float().contiguous()
 

@@ -9,7 +9,7 @@ import pytest
 torch = pytest.importorskip("torch")
 
 from dase.errors import InputError
-from dase.tasks.event_networks import ConvGru, ConvLstm, E2VidNet, EvFlowNet, FireNet
+from dase.tasks.event_networks import ConvGru, ConvLstm, E2VidNet, EvFlowNet, FireNet, enlarged
 
 
 def small(kind):
@@ -98,3 +98,13 @@ def test_wrong_inputs_are_one_sentence():
         small(E2VidNet)(torch.zeros(1, 4, 8, 8))
     with pytest.raises(InputError, match="channels"):
         FireNet(5, 0)
+
+
+@pytest.mark.parametrize("size", [(1, 1), (1, 5), (4, 3)])
+def test_enlarged_is_bilinear(size):
+    x = torch.randn(2, 3, *size, dtype=torch.float64, requires_grad=True)
+    want = torch.nn.functional.interpolate(x, scale_factor=2.0, mode="bilinear", align_corners=False)
+    torch.testing.assert_close(enlarged(x), want)
+    weight = torch.randn_like(want)
+    (ours,), (theirs,) = (torch.autograd.grad((y * weight).sum(), x) for y in (enlarged(x), want))
+    torch.testing.assert_close(ours, theirs)

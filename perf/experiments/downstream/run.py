@@ -11,7 +11,9 @@ the sensor. Each training stands alone: it is checkpointed, `--minutes` ends a c
 on, and several machines may take `--seeds` apart. `--jobs` trainings share a device: each is small, and
 waits for Python more than for the GPU. Seeds come one after the other, so that a call that ends early
 leaves whole tables of fewer seeds. `results.jsonl` has a line for each network and target, `sensors/`
-what was tuned and fitted: with both in OUT, another machine goes on. `--photos` may be a tar of pictures.
+what was tuned and fitted: with both in OUT, another machine goes on. `results.jsonl` and
+`learned_sensors/` of this folder are of photographs that are no part of the project. `--photos` may be a
+tar of pictures.
 """
 
 from __future__ import annotations
@@ -88,12 +90,16 @@ class Size:
     reconstruction_channels: int = 16
     flow_channels: int = 16
     reconstruction_steps: int = 500
-    flow_steps: int = 1800
+    flow_steps: int = 8000
     samples: int = 16
     recorded: float = 60.0
     test_batches: int = 8
     backgrounds: int = 48
     objects: int = 96
+
+    def steps(self, task: str) -> int:
+        """Return the batches of a training."""
+        return self.flow_steps if task == "flow" else self.reconstruction_steps
 
 
 SMALL = Size(
@@ -238,7 +244,7 @@ class Study:
         network = self.train_one(*job)
         seconds = round(time.monotonic() - begin, 1)
         where = torch.cuda.get_device_name() if self.device == "cuda" else self.device
-        steps = self.size.flow_steps if job.task == "flow" else self.size.reconstruction_steps
+        steps = self.size.steps(job.task)
         rows = []
         for tested in [job.target] if job.target else TARGETS:
             found = self.test_one(network, job.task, tested)
@@ -400,8 +406,8 @@ def main() -> None:
     study = Study(train, test, args.out, "cpu", SMALL if args.small else Size(), deadline)
     log = args.out / "results.jsonl"
     lines = log.read_text().splitlines() if log.exists() else []
-    found = map(json.loads, lines)
-    done = {Job(row["task"], row["kind"], row["trained_for"], row["seed"]) for row in found}
+    rows = [row for row in map(json.loads, lines) if row["steps"] == study.size.steps(row["task"])]
+    done = {Job(row["task"], row["kind"], row["trained_for"], row["seed"]) for row in rows}
     done |= {Job(task, "", target, 0) for task, target in study.learned()}
     asked = (one.split(",") for one in (args.tasks, args.kinds, args.targets))
     seeds = [int(seed) for seed in args.seeds.split(",")]
