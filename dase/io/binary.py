@@ -105,10 +105,10 @@ def bridge_gaps(
 
 
 def weave_words(
-    columns: list[tuple[NDArray[np.bool_], NDArray[np.int64]]],
-    before: tuple[NDArray[np.int64], NDArray[np.int64]],
-) -> NDArray[np.int64]:
-    """Return the words of all events in a row.
+    columns: list[tuple[NDArray[np.bool_], NDArray[Any]]],
+    before: tuple[NDArray[np.int64], NDArray[Any]],
+) -> NDArray[Any]:
+    """Return the words of all events in a row, of the type in which they are given.
 
     Args:
         columns: Which events want a word (N,), and the words (N,), in the order they take within an event.

@@ -224,8 +224,9 @@ class _Writer(EventWriter):
         return weave_words(columns, (at, _make_words(Word.TIME_HIGH, between & 4095))).astype("<u2").tobytes()
 
 
-def _make_words(kind: Word, value: NDArray[np.int64]) -> NDArray[np.int64]:
-    return (kind << 12) | value
+def _make_words(kind: Word, value: NDArray[np.int64]) -> NDArray[np.uint16]:
+    # of the size in the file: all words of all events are woven together, where memory is what costs
+    return ((kind << 12) | value).astype(np.uint16)
 
 
 def create(path: Path) -> AbstractContextManager[Writer]:
