@@ -48,13 +48,13 @@ learning() { # SECONDS [CORES]
 
 matrix() { # SECONDS JOBS [CORES]
     local end=$((SECONDS + $1)) where=${3:-0-$((cores - 1))}
-    local blind=("$python" -m perf.experiments.blind_diagnosis.run --log "$out/hidden_effects.jsonl" --out "$out/docs")
+    local blind=("$python" -m perf.experiments.blind_diagnosis.run --log "$out/hidden_effects.jsonl" --key "${KEY:-development}")
     export OMP_NUM_THREADS=1
     # one run alone compiles what the others would all compile at the same time
-    run warm on "$where" timeout -k 5 "$1" "${blind[@]}" --kinds nothing --nothing 1
+    run warm on "$where" timeout -k 5 "$1" "${blind[@]}" --kinds nothing --minutes 0.1
     # `timeout` ends its whole group; every line of the log is one whole run
     run matrix on "$where" timeout -k 5 $((end - SECONDS > 0 ? end - SECONDS : 1)) "${blind[@]}" \
-        --kinds single,nothing,pairs,unknown,included --jobs "$2"
+        --jobs "$2"
     echo "matrix: $(wc -l <"$out/hidden_effects.jsonl") runs in the log"
     unset OMP_NUM_THREADS
 }
@@ -90,7 +90,7 @@ for step in "${steps[@]}"; do
         --images "${PHOTOS:-builtin}" --commit "$commit" --out "$out/training.json" ;;
     v2e) for name in v2e_cold v2e; do # the first compiles
         [ -z "${HIDDEN:-}" ] || run $name "$python" -m perf.experiments.blind_diagnosis.run --kinds other --hidden "$HIDDEN" \
-            --device "$first" --jobs 1 --log "$out/$name.jsonl" --out "$out/docs"
+            --device "$first" --jobs 1 --log "$out/$name.jsonl"
     done ;;
     *) echo "there is no step '$step'" && exit 2 ;;
     esac

@@ -24,7 +24,7 @@ NAME = "hot pixels"
 class HotSettings:
     """What makes a pixel hot."""
 
-    least: int = 2  # pixels: one alone may be a spot in the scene
+    least: int = 3  # pixels: one may be a spot in the scene, two have low thresholds in a simulated sensor
     ratio: float = 2.0  # times the usual count of its neighbours
     share: float = 0.15  # of its calm events at least in each half of the time
     chance: float = 1e-3  # over all pixels, below which one is counted
@@ -138,7 +138,7 @@ def find_hot_pixels(
             "busiest": float(rate),
         },
     )  # fmt: skip
-    unseen = f"no two pixels stand out; {usually} of calm events per pixel"
+    unseen = f"no {s.least} pixels stand out; {usually} of calm events per pixel"
     if follow:
         unseen += f"; {follow} would, but follow the light that flickers"
     entry = judge_signature(entry, level, unseen)

@@ -120,8 +120,8 @@ def test_a_lamp_is_found_beside_bursts_of_frames():
 @pytest.mark.parametrize(("corner", "there"), [((40, 30), True), ((0, 1), False)])
 def test_pixels_at_the_edge_are_not_called_hot(plain, corner, there):
     """What passes outside nobody sees: an edge that comes no further looks calm."""
-    x, y = np.repeat([corner[0], corner[0] + 7], 20), np.repeat([corner[1], corner[1]], 20)
-    t = np.tile(np.linspace(plain.t[0], plain.t[-1], 20), 2)
+    x, y = np.repeat(corner[0] + np.array([0, 7, 14]), 20), np.repeat([corner[1]] * 3, 20)
+    t = np.tile(np.linspace(plain.t[0], plain.t[-1], 20), 3)
     calm = plain.select((plain.x > 80) & (plain.y > 60))
     t, x, y = (np.concatenate(pair) for pair in ((t, calm.t), (x, calm.x), (y, calm.y)))
     order = np.argsort(t)

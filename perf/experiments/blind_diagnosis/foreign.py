@@ -59,7 +59,7 @@ class Habits:
 
     def named(self) -> set[str]:
         """Return the effects of dase that this world does have by habit, and that may be named."""
-        out = {"timestamp"} if self.style != "lines" else set[str]()
+        out = {"timestamp"} if self.style != "lines" or self.tick > 1e-6 else set[str]()
         if self.knee:
             out |= {"linlog"}
         return out | {"linlog", "dark"} if self.floor > 2e-3 else out

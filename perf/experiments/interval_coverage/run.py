@@ -25,9 +25,8 @@ from typing import Any
 import numpy as np
 
 from perf.benchmarks.kernels import commit
-from perf.experiments.blind_diagnosis.report import HIDDEN, STRENGTHS
+from perf.experiments.blind_diagnosis.run import HIDDEN, STRENGTHS, Case, number_of, truth_of
 from perf.experiments.blind_diagnosis.scenes import draw_scene
-from perf.experiments.blind_diagnosis.sealed import Case, number_of, truth_of
 
 Line = dict[str, Any]
 
