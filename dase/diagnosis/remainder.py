@@ -12,6 +12,7 @@ from dase.diagnosis.settings import DEFAULTS
 from dase.diagnosis.state import DiagnosisState
 from dase.fitting.model import FittedModel
 from dase.fitting.scene_doubt import is_guessed
+from dase.fitting.time_window import is_constant
 from dase.formatting import format_metric
 from dase.probes.distance import Judgement, pseudo_huber
 from dase.probes.random_streams import SimulationStream
@@ -134,7 +135,7 @@ def what_to_record(
     guessed = is_guessed(scene) and isinstance(scene, CameraScene)
     if guessed and (unexplained.of_scene >= settings.much or places.get("moving", 0.0) >= settings.much):
         out += _better_frames(scene, settings)
-    if places.get("resting", 0.0) >= settings.much:
+    if places.get("resting", 0.0) >= settings.much and not is_constant(scene):
         out.append(
             "the camera with its lens cap on, 10 s (`--scene static`): what pixels at rest send is then seen "
             "without any scene"

@@ -170,6 +170,11 @@ share of the value for what is positive, else half of the plausible range. Bias 
 widths.
 
 {table}
+
+Before the estimate was tried at simulations with known parameters, a lamp's phase was in its interval
+in 26 % of the benchmark's cases, the damping in 31 %, the latency in 51 %, the spread of hot pixels in
+55 %. Intervals of key 2026-11-a were wider by a tenth than they are now: with what they are now, 91 %
+of its 579 would have held. So that key is a development set, and another one has not been run yet.
 """
 
 
