@@ -48,9 +48,9 @@ class FrameReader:
         self._count = len(self._files) if self._files is not None else self._count_frames()
         if self._count < 2:
             raise InputError(f"video {path} must have at least 2 frames, got {self._count}")
-        # of the last few calls: frames are also stored, which are asked for after those of the next chunk
-        # where pixels are ahead of their events
-        self._kept: deque[dict[int, NDArray[np.float32]]] = deque(maxlen=4)
+        # of the last two calls that decoded: frames are also stored, which are asked for after those of the
+        # next chunk where pixels are ahead of their events
+        self._kept: deque[dict[int, NDArray[np.float32]]] = deque(maxlen=2)
         self._next = 0
         if self._files is not None:
             self._first = decode_file(self._files[0]).shape[:2]
@@ -80,7 +80,8 @@ class FrameReader:
             frame = self._decode(i)
             if i in place:
                 out[place[i]] = frame
-        self._kept.append(dict(zip(wanted, out, strict=True)))
+        if missing:
+            self._kept.append(dict(zip(wanted, out, strict=True)))
         return out
 
     def levels(self) -> Iterator[NDArray[np.uint8]]:

@@ -87,6 +87,13 @@ def test_a_video_file_is_read_frame_by_frame(tmp_path, suffix, code):
     reader = FrameReader(path)
     for index in ([0, 1, 2], [2, 3], [5, 8], [0], [8], [3, 4, 7]):
         np.testing.assert_array_equal(reader[np.array(index)], whole[index])
+    # pixels that are a chunk ahead ask for frames of the chunk before: nothing is decoded twice
+    reader, decoded = FrameReader(path), []
+    decode = reader._decode
+    reader._decode = lambda index: decoded.append(index) or decode(index)
+    for index in ([0, 1, 2], [2, 3, 4, 5], [1], [5, 6, 7], [3], [7, 8], [6]):
+        np.testing.assert_array_equal(reader[np.array(index)], whole[index])
+    assert decoded == list(range(9))
 
 
 def test_what_is_no_video_is_refused(tmp_path):
