@@ -29,7 +29,7 @@ from dase.fitting.subset import CalibratedSubset
 from dase.formatting import format_metric
 from dase.probes.distance import Judgement, leaves_nothing, pseudo_huber, reaches_floor
 from dase.probes.random_streams import SimulationStream
-from dase.probes.statistics import LAYOUT, compute_statistics
+from dase.probes.statistics import LAYOUT
 from dase.results import DetectionLimit, Grade
 
 Array = NDArray[np.float64]
@@ -181,33 +181,49 @@ def _limit_work(
     column = [a.name for a in other.space.axes].index(axis.name)
     weak, strong = _range_of(axis)
 
-    def statistics_work(strength: float, turn: int, repeats: int) -> Work[Array]:
-        place = other.place.copy()
-        place[column] = strength
-        places = np.repeat(place[None], repeats, 0)
-        seed = SimulationStream.DETECTION.seed(state.seed, turn)
-        (sums,) = yield [SimulationRequest(known.half, other.space, places, seed, repeats=True)]
-        return compute_statistics(sums, known.half.frame)[0]
+    def done_work(strengths: Array, turn: int) -> Work[Array]:
+        """Return what some strengths do to the statistics, shape (S, R, J) for R repeats."""
+        places = np.repeat(other.place[None], len(strengths) + 1, 0)
+        # what the effect does to events by its place in the kernel alone, however weak it is, is not its
+        # strength; all see the same random numbers, so that few repeats tell them apart
+        places[:, column] = [weak, *strengths]
+        seeds = [SimulationStream.DETECTION.seed(state.seed, settings.repeats * turn + n)
+                 for n in range(settings.repeats)]  # fmt: skip
+        values = yield [SimulationRequest(known.half, other.space, places, seed) for seed in seeds]
+        found = np.stack(values, 1)
+        done: Array = found[1:] - found[0]
+        return done
 
-    # what the effect does to events by its place in the kernel alone, however weak it is, is not its strength
-    slow = known.half.slow(other.space)
-    nothing = yield from statistics_work(weak, 0, settings.repeats if slow else settings.baseline)
-    offset = nothing.mean(0) - known.half.repeats.mean(0)
+    # measurements are repeats of the last model, to which what the effect did in one repeat is added: which
+    # pixels are hot is chance, too
+    chance = known.half.repeats[: settings.measurements]
+    turns = np.arange(len(chance)) % settings.repeats
 
-    def seen_work(strength: float, turn: int) -> Work[bool]:
-        values = yield from statistics_work(strength, turn, settings.repeats)
-        return float(np.mean(would_be_seen(known, values - offset, state.settings))) >= settings.power
+    def seen(done: Array) -> bool:
+        return float(np.mean(would_be_seen(known, chance + done[turns], state.settings))) >= settings.power
 
-    if not (yield from seen_work(strong, 1)):
-        return None
-    steps = settings.slow_steps if slow else settings.steps
-    for turn in range(steps):
-        middle = 0.5 * (weak + strong)
-        if (yield from seen_work(middle, turn + 2)):
-            strong = middle
+    places, done = np.array([weak]), np.zeros((1, settings.repeats, known.half.repeats.shape[1]))
+    low, high = weak, strong
+    for turn in range(settings.turns):
+        # the strongest of the first turn may not be seen, that of a later one is known
+        inside = low + (high - low) * np.linspace(0, 1, settings.strengths + 1 + (turn > 0))
+        inside = inside[1 : settings.strengths + 1]
+        more = yield from done_work(inside, turn)
+        order = np.argsort(np.abs(np.concatenate([places, inside]) - weak), kind="stable")
+        places, done = np.concatenate([places, inside])[order], np.concatenate([done, more])[order]
+        first = next((n for n in range(1, len(places)) if seen(done[n])), 0)
+        if not first:
+            return None
+        low, high = places[first - 1], places[first]
+    # between two strengths what they do hardly bends
+    share_low, share_high = 0.0, 1.0
+    for _ in range(settings.halvings):
+        middle = 0.5 * (share_low + share_high)
+        if seen(done[first - 1] + middle * (done[first] - done[first - 1])):
+            share_high = middle
         else:
-            weak = middle
-    return strong
+            share_low = middle
+    return float(low + share_high * (high - low))
 
 
 def would_be_seen(known: ReportedModel, values: Array, settings: DiagnosisSettings) -> NDArray[np.bool_]:
