@@ -10,14 +10,14 @@ END = 2**62
 NEVER = -END
 """A time that always was [ps]."""
 
-LAST, FREED, DUE, INTERVAL = 0, 1, 2, 3
-"""Columns of the times of a pixel: its last event, when it was let go, when its late request comes, from the
-event before to the last one where both had one polarity, else 0 [ps]."""
+LAST, FREED, INTERVAL = 0, 1, 2
+"""Columns of what is known of a pixel: its last event, when it was let go, from the event before to the last
+one where both had one polarity, else 0 [ps]; the last column is bytes."""
 
-STATUS, LAST_POLARITY, POLARITY, LABEL = 0, 1, 2, 3
-"""Columns of the flags of a pixel."""
+OTHER_BYTE = 31
+"""Byte of a pixel that is 1 where its events are not sent."""
 
-FREE, FIRST_LINE, QUEUED, HEAPED, LAST_OTHER, GHOSTS, OTHERS, SENT = range(8)
+FREE, FIRST_LINE, QUEUED, HEAPED, LAST_OTHER, GHOSTS, OTHERS, SENT, HELD = range(9)
 """Places of single numbers that an arbiter remembers."""
 
 RECENT = 64
@@ -28,14 +28,23 @@ RECENT = 64
     """
     const long long END = 1ll << 62;
     const long long LONGEST_GAP = 100000000ll;  // [ps] others' requests that stand for several spread over it
-    long long* const pixel_time = times.data;
-    unsigned char* const flag = flags.data;
+    // half a cache line for all that an event needs to know
+    struct Pixel {
+        long long last, freed, interval;  // [ps]
+        unsigned char status;  // 1: asks late, 2: waits
+        unsigned char last_polarity, polarity, label;
+        unsigned short turn;  // of the late requests
+        unsigned char spare, other;
+    };
+    static_assert(sizeof(Pixel) == 32, "a pixel is four numbers of 64 bits");
+    Pixel* const pixels = (Pixel*)known.data;
+    const int mask = (1 << shift) - 1;
     long long* const bits = waiting.data;
     long long* const since = line_since.data;
     int* const many_in = line_count.data;
     int* const queue = line_queue.data;
     long long* const heap_at = heap_due.data;
-    int* const heap_who = heap_what.data;
+    long long* const heap_who = heap_what.data;
     long long* const number = numbers.data;
     const int lines = line_count.shape[0];
     const int words = waiting.shape[1];
@@ -43,18 +52,20 @@ RECENT = 64
     long long free = number[0];
     int first = (int)number[1], queued = (int)number[2], heaped = (int)number[3];
     long long last_other = number[4], ghosts = number[5], other_requests = number[6];
+    long long held_pixels = number[8];
     int out = 0;
 
+    long long soonest = 0;  // when anybody else may ask
     auto into_line = [&](int line, long long t) {
         if (many_in[line]++ == 0) {
             since[line] = t;
             queue[(first + queued++) % lines] = line;
         }
     };
-    auto sooner = [&](long long t, int who, int at) {
+    auto sooner = [&](long long t, long long who, int at) {
         return t < heap_at[at] || (t == heap_at[at] && who < heap_who[at]);
     };
-    auto push_heap = [&](long long t, int who) {
+    auto push_heap = [&](long long t, long long who) {
         int at = heaped++;
         while (at > 0 && sooner(t, who, (at - 1) / 2)) {
             heap_at[at] = heap_at[(at - 1) / 2];
@@ -66,7 +77,7 @@ RECENT = 64
     };
     auto pop_heap = [&]() {
         const long long t = heap_at[--heaped];
-        const int who = heap_who[heaped];
+        const long long who = heap_who[heaped];
         int at = 0;
         for (;;) {
             int below = 2 * at + 1;
@@ -81,14 +92,14 @@ RECENT = 64
         heap_who[at] = who;
     };
     auto request = [&](int pixel, long long t) {
-        unsigned char* const mine = flag + 4 * (size_t)pixel;
-        const int line = pixel / across;
-        if (is_other.data[pixel]) {
+        Pixel& mine = pixels[pixel];
+        const int line = pixel >> shift;
+        if (mine.other) {
             // the golden ratio, so that any run of numbers is spread evenly: whole, right in the mean
             const long long many =
-                (weight.data[mine[2]] + ((other_requests++ * 2654435769ll) & 0xffffffffll)) >> 32;
+                (weight.data[mine.polarity] + ((other_requests++ * 2654435769ll) & 0xffffffffll)) >> 32;
             if (many == 0) {
-                mine[0] = 0;
+                mine.status = 0;
                 return;
             }
             // what it stands for beside itself asks in lines that others asked in lately, soon after it
@@ -104,15 +115,30 @@ RECENT = 64
                 else into_line(there, t);
             }
         }
-        mine[0] = 2;
-        bits[(size_t)line * words + (pixel % across) / 64] |= 1ll << ((pixel % across) % 64);
+        if (queued == 0 && free <= t && t < soonest) {
+            // most often nobody else asks: it is read at once
+            const long long whole = t / 1000 - (t % 1000 < 0);
+            free = t + per_line + per_event;
+            mine.status = 0;
+            mine.freed = free;
+            if (mine.other) return;
+            --held_pixels;
+            out_time.data[out] = 1e-9 * (double)whole;
+            out_pixel.data[out] = pixel;
+            out_polarity.data[out] = mine.polarity;
+            out_label.data[out++] = (signed char)mine.label;
+            return;
+        }
+        mine.status = 2;
+        bits[(size_t)line * words + (pixel & mask) / 64] |= 1ll << (pixel & mask & 63);
         into_line(line, t);
     };
     // time from an event until the light has gone on by the share held / interval of a threshold, on the
     // parabola through the last three events [ps]; END where it turns before. Events that no parabola goes
     // through, as of noise, are taken to go on as they did.
-    auto until_share = [&](long long held, long long interval, long long one_before) {
+    auto until_share = [&](long long held, long long interval, long long one_before) -> long long {
         const double second = (double)interval;
+        if (1000 * held < interval) return 0;  // not worth a place in the heap
         if (one_before <= 0 || second > 2.414 * (double)one_before) return held;
         const double share = (double)held / second;
         const double first = (double)one_before / second;  // in units of the last interval
@@ -128,44 +154,49 @@ RECENT = 64
         return (long long)(ratio * second);
     };
     auto arrive = [&](int pixel, long long t, unsigned char polarity, unsigned char label) {
-        unsigned char* const mine = flag + 4 * (size_t)pixel;
-        long long* const my_time = pixel_time + 4 * (size_t)pixel;
-        const long long before = my_time[0], freed = my_time[1];
-        const bool goes_on = before > -END && mine[1] == polarity;
-        const long long interval = goes_on ? t - before : 0, one_before = my_time[3];
-        my_time[0] = t;
-        my_time[3] = interval;
-        mine[1] = polarity;
-        if (mine[0] == 2 || t < freed) return;  // held: it sees nothing
-        if (mine[0] == 1) {
+        Pixel& mine = pixels[pixel];
+        const long long before = mine.last;
+        const bool goes_on = before > -END && mine.last_polarity == polarity;
+        const long long interval = goes_on ? t - before : 0, one_before = mine.interval;
+        mine.last = t;
+        mine.interval = interval;
+        mine.last_polarity = polarity;
+        if (mine.status == 2 || t < mine.freed) return;  // held: it sees nothing
+        if (mine.status == 1) {
             // the light has gone on beyond the next threshold, or turned back before it
-            mine[0] = 0;
-            if (mine[2] == polarity) request(pixel, t);
+            if (mine.polarity == polarity) {
+                request(pixel, t);
+            } else {
+                mine.status = 0;
+                held_pixels -= !mine.other;
+            }
             return;
         }
-        mine[2] = polarity;
-        mine[3] = label;
+        held_pixels += !mine.other;
+        mine.polarity = polarity;
+        mine.label = label;
         // let go a share of an interval after the event before, it asks that share of a threshold later
-        const long long held = goes_on && freed > before ? freed - before : 0;
+        const long long held = goes_on && mine.freed > before ? mine.freed - before : 0;
         const long long late = held > 0 ? until_share(held, interval, one_before) : 0;
-        if (late == 0) {
+        if (late == 0 || (late < END && heaped >= room)) {
             request(pixel, t);
-        } else {
-            mine[0] = 1;
-            my_time[2] = late == END ? END : t + late;
-            if (late == END) return;  // it asks if the light goes on beyond its next event after all
-            if (heaped < room) push_heap(t + late, pixel);
-            else request(pixel, t);
+            return;
         }
+        mine.status = 1;
+        ++mine.turn;
+        // where the light turns before, it asks only if it goes on beyond its next event after all
+        if (late < END) push_heap(t + late, pixel | (long long)mine.turn << 32);
     };
 
     int i = 0, j = 0;
     const int count = arrival.shape[0], others = other.shape[0];
     for (;;) {
         // a request that was taken back leaves its place in the heap
-        while (heaped > 0 && heap_who[0] >= 0 &&
-               (flag[4 * (size_t)heap_who[0]] != 1 || pixel_time[4 * (size_t)heap_who[0] + 2] != heap_at[0]))
+        while (heaped > 0 && heap_who[0] >= 0) {
+            const Pixel& mine = pixels[heap_who[0] & 0xffffffffll];
+            if (mine.status == 1 && mine.turn == (heap_who[0] >> 32)) break;
             pop_heap();
+        }
         const long long raw_t = i < count ? arrival.data[i] : END;
         const long long other_t = j < others ? other.data[j] : END;
         const long long due_t = heaped > 0 ? heap_at[0] : END;
@@ -184,15 +215,16 @@ RECENT = 64
                     if (left == 0) continue;
                     bits[(size_t)line * words + w] = 0;
                     for (; left != 0; left &= left - 1) {
-                        const int pixel = line * across + 64 * w + __builtin_ctzll(left);
-                        unsigned char* const mine = flag + 4 * (size_t)pixel;
-                        mine[0] = 0;
-                        pixel_time[4 * (size_t)pixel + 1] = end;
-                        if (is_other.data[pixel]) continue;
+                        const int pixel = (line << shift) + 64 * w + __builtin_ctzll(left);
+                        Pixel& mine = pixels[pixel];
+                        mine.status = 0;
+                        mine.freed = end;
+                        if (mine.other) continue;
+                        --held_pixels;
                         out_time.data[out] = 1e-9 * (double)whole;
                         out_pixel.data[out] = pixel;
-                        out_polarity.data[out] = mine[2];
-                        out_label.data[out++] = (signed char)mine[3];
+                        out_polarity.data[out] = mine.polarity;
+                        out_label.data[out++] = (signed char)mine.label;
                     }
                 }
                 many_in[line] = 0;
@@ -205,11 +237,20 @@ RECENT = 64
         if (ask == END) break;
         if (due_t <= next) {
             if (next == END && due_t >= until) break;
-            const int who = heap_who[0];
+            const long long who = heap_who[0];
             pop_heap();
-            if (who < 0) into_line(-1 - who, due_t);
-            else request(who, due_t);
-        } else if (raw_t <= other_t) {
+            soonest = next < until ? next : until;
+            if (heaped > 0 && heap_at[0] < soonest) soonest = heap_at[0];
+            if (who < 0) into_line((int)(-1 - who), due_t);
+            else request((int)(who & 0xffffffffll), due_t);
+            continue;
+        }
+        const long long after_raw = i + (raw_t <= other_t) < count ? arrival.data[i + (raw_t <= other_t)] : END;
+        const long long after_other = j + (other_t < raw_t) < others ? other.data[j + (other_t < raw_t)] : END;
+        soonest = after_raw < after_other ? after_raw : after_other;
+        if (due_t < soonest) soonest = due_t;
+        if (until < soonest) soonest = until;
+        if (raw_t <= other_t) {
             arrive(place.data[i], raw_t, polarity.data[i], (unsigned char)label.data[i]);
             ++i;
         } else {
@@ -225,6 +266,7 @@ RECENT = 64
     number[5] = ghosts;
     number[6] = other_requests;
     number[7] = out;
+    number[8] = held_pixels;
 """
 )
 def arbitrate(
@@ -237,18 +279,16 @@ def arbitrate(
     other_polarity: wp.array[wp.uint8],
     weight: wp.array[wp.int64],
     until: wp.int64,
-    across: int,
+    shift: int,
     per_line: wp.int64,
     per_event: wp.int64,
-    is_other: wp.array[wp.uint8],
-    times: wp.array2d[wp.int64],
-    flags: wp.array2d[wp.uint8],
+    known: wp.array2d[wp.int64],
     waiting: wp.array2d[wp.int64],
     line_since: wp.array[wp.int64],
     line_count: wp.array[int],
     line_queue: wp.array[int],
     heap_due: wp.array[wp.int64],
-    heap_what: wp.array[int],
+    heap_what: wp.array[wp.int64],
     recent: wp.array[int],
     numbers: wp.array[wp.int64],
     out_time: wp.array[wp.float64],
@@ -264,7 +304,7 @@ def arbitrate(
 def send_by_lines(
     # in
     arrival: wp.array[wp.int64],  # (N,) [ps], not decreasing
-    place: wp.array[int],  # (N,) pixel, line after line
+    place: wp.array[int],  # (N,) line * 2**shift + place in the line
     polarity: wp.array[wp.uint8],  # (N,) 1 for ON
     label: wp.array[wp.int8],  # (N,)
     other: wp.array[wp.int64],  # (M,) [ps], not decreasing: events that take room and time and are not sent
@@ -272,21 +312,19 @@ def send_by_lines(
     other_polarity: wp.array[wp.uint8],  # (M,) of those
     weight: wp.array[wp.int64],  # (2,) how many events one of those stands for, times ONE, by polarity
     until: wp.int64,  # nothing is read from here on while later requests may come [ps]
-    across: int,  # pixels of a line
+    shift: int,  # a line has room for 2**shift pixels
     per_line: wp.int64,  # time to take a line [ps]
     per_event: wp.int64,  # time to send one event of it [ps]
-    is_other: wp.array[wp.uint8],  # (lines * across,)
     # in and out
-    times: wp.array2d[wp.int64],  # (lines * across, 4) LAST, FREED, DUE, INTERVAL [ps]
-    flags: wp.array2d[wp.uint8],  # (lines * across, 4) STATUS (1 late, 2 waiting) and so on
+    known: wp.array2d[wp.int64],  # (lines * 2**shift, 4) LAST and so on
     waiting: wp.array2d[wp.int64],  # (lines, words) bit of each pixel that waits
     line_since: wp.array[wp.int64],  # (lines,) first request of a line [ps]
     line_count: wp.array[int],  # (lines,) requests of a line
     line_queue: wp.array[int],  # (lines,) ring of lines with requests, in order of their first
     heap_due: wp.array[wp.int64],  # (K,) [ps] a heap: the children of k are 2 k + 1 and 2 k + 2
-    heap_what: wp.array[int],  # (K,) pixel, or -1 - line for a request of no pixel of its own
+    heap_what: wp.array[wp.int64],  # (K,) turn * 2**32 + pixel, or -1 - line for a request of no pixel
     recent: wp.array[int],  # (RECENT,) lines of the last others' requests
-    numbers: wp.array[wp.int64],  # (8,) FREE and so on
+    numbers: wp.array[wp.int64],  # (9,) FREE and so on
     # out
     out_time: wp.array[wp.float64],  # (L,) when the line was taken [s], in whole nanoseconds
     out_pixel: wp.array[int],  # (L,)
@@ -298,7 +336,7 @@ def send_by_lines(
     Who waits depends on all that was read before, so this is no scan. Times are whole picoseconds of 64 bits.
     """
     arbitrate(
-        arrival, place, polarity, label, other, other_place, other_polarity, weight, until, across, per_line,
-        per_event, is_other, times, flags, waiting, line_since, line_count, line_queue, heap_due, heap_what,
-        recent, numbers, out_time, out_pixel, out_polarity, out_label,
+        arrival, place, polarity, label, other, other_place, other_polarity, weight, until, shift, per_line,
+        per_event, known, waiting, line_since, line_count, line_queue, heap_due, heap_what, recent, numbers,
+        out_time, out_pixel, out_polarity, out_label,
     )  # fmt: skip

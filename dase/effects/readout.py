@@ -65,21 +65,20 @@ class LineArbiter(SharedReader):
     def __init__(self, per_line: int, per_event: int, width: int, height: int, by_columns: bool):
         self._per_line, self._per_event, self._by_columns = per_line, per_event, by_columns
         self._width, self._height = width, height
-        lines, self._across = (width, height) if by_columns else (height, width)
-        size = width * height
+        lines, across = (width, height) if by_columns else (height, width)
+        self._shift = (across - 1).bit_length()
+        size = lines << self._shift
         self._labelled = False
-        times = np.full((size, 4), line_arbiter.NEVER, np.int64)
-        times[:, line_arbiter.INTERVAL] = 0
-        numbers = np.zeros(8, np.int64)
+        known, numbers = np.zeros((size, 4), np.int64), np.zeros(9, np.int64)
+        known[:, [line_arbiter.LAST, line_arbiter.FREED]] = line_arbiter.NEVER
         numbers[line_arbiter.FREE] = line_arbiter.NEVER
-        self._other = np.zeros(size, np.uint8)
+        room = 2 * width * height + 64  # requests that come late, those taken back among them
         self._state: dict[str, NDArray[Any]] = {
-            "times": times, "flags": np.zeros((size, 4), np.uint8),
-            "waiting": np.zeros((lines, -(-self._across // 64)), np.int64),
+            "known": known, "waiting": np.zeros((lines, -(-across // 64)), np.int64),
             "line_since": np.zeros(lines, np.int64), "line_count": np.zeros(lines, np.int32),
-            "line_queue": np.zeros(lines, np.int32), "heap_due": np.zeros(2 * size + 64, np.int64),
-            "heap_what": np.zeros(2 * size + 64, np.int32),
-            "recent": np.zeros(line_arbiter.RECENT, np.int32), "numbers": numbers,
+            "line_queue": np.zeros(lines, np.int32), "heap_due": np.zeros(room, np.int64),
+            "heap_what": np.zeros(room, np.int64), "recent": np.zeros(line_arbiter.RECENT, np.int32),
+            "numbers": numbers,
         }  # fmt: skip
 
     def push(self, events: Events, until: float) -> tuple[Events, float]:
@@ -93,9 +92,10 @@ class LineArbiter(SharedReader):
     def _read(self, events: Events, others: Others, weight: NDArray[np.float64], until: float) -> Events:
         self._labelled |= events.label is not None
         label = np.zeros(len(events), np.int8) if events.label is None else events.label
-        self._other[self._places(others.x, others.y)] = 1
-        held = int(np.count_nonzero(self._state["flags"][:, line_arbiter.STATUS]))
-        room = len(events) + held
+        if len(others.time):
+            pixel_bytes = self._state["known"].view(np.uint8)
+            pixel_bytes[self._places(others.x, others.y), line_arbiter.OTHER_BYTE] = 1
+        room = len(events) + int(self._state["numbers"][line_arbiter.HELD])
         out_time, out_place = np.empty(room, np.float64), np.empty(room, np.int32)
         out_polarity, out_label = np.empty(room, np.uint8), np.empty(room, np.int8)
         end = line_arbiter.END if until == math.inf else 1000 * to_nanosecond(until)
@@ -109,15 +109,15 @@ class LineArbiter(SharedReader):
             array(self._places(events.x, events.y), wp.int32), array(events.p.astype(np.uint8), wp.uint8),
             array(label, wp.int8), array(others.time, wp.int64),
             array(self._places(others.x, others.y), wp.int32), array(others.polarity, wp.uint8),
-            array(np.rint(weight * ONE).astype(np.int64), wp.int64), wp.int64(end), self._across,
-            wp.int64(self._per_line), wp.int64(self._per_event), array(self._other, wp.uint8),
+            array(np.rint(weight * ONE).astype(np.int64), wp.int64), wp.int64(end), self._shift,
+            wp.int64(self._per_line), wp.int64(self._per_event),
             *(array(v, wp.dtype_from_numpy(v.dtype)) for v in self._state.values()),
             array(out_time, wp.float64), array(out_place, wp.int32), array(out_polarity, wp.uint8),
             array(out_label, wp.int8),
         ]  # fmt: skip
         wp.launch(line_arbiter.send_by_lines, dim=1, inputs=inputs, device=device)
         sent = int(self._state["numbers"][line_arbiter.SENT])
-        line, across = np.divmod(out_place[:sent], self._across)
+        line, across = out_place[:sent] >> self._shift, out_place[:sent] & ((1 << self._shift) - 1)
         x, y = (line, across) if self._by_columns else (across, line)
         return Events(
             out_time[:sent], x.astype(np.uint16), y.astype(np.uint16), out_polarity[:sent].astype(np.bool_),
@@ -126,7 +126,7 @@ class LineArbiter(SharedReader):
 
     def _places(self, x: NDArray[np.uint16], y: NDArray[np.uint16]) -> NDArray[np.int32]:
         line, across = (x, y) if self._by_columns else (y, x)
-        return line.astype(np.int32) * self._across + across
+        return (line.astype(np.int32) << self._shift) + across
 
 
 @dataclass(frozen=True, kw_only=True)

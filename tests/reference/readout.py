@@ -28,7 +28,10 @@ def until_share(held: Fraction, interval: Fraction, one_before: Fraction) -> Fra
     """Return in how long light goes on by held / interval of a threshold, None where it turns before [ns].
 
     The thresholds at -2, -1 and 0 were crossed after `one_before` and `interval`; a parabola goes through.
+    Less than a thousandth of a threshold is no matter.
     """
+    if 1000 * held < interval:
+        return Fraction(0)
     if not one_before or float(interval) > 2.414 * float(one_before):
         return held
     times = np.array([-float((interval + one_before) / interval), -1.0, 0.0])
@@ -88,7 +91,10 @@ def read_by_lines(events: list[Event], line: Fraction, event: Fraction, across: 
                     ask(place, raw, polarity)
             elif before is not None and again and pixel.freed > before:
                 late = until_share(pixel.freed - before, pixel.interval, one_before)
-                pixel.asks = (math.inf if late is None else raw + late, polarity)
+                if late == 0:
+                    ask(place, raw, polarity)
+                else:
+                    pixel.asks = (math.inf if late is None else raw + late, polarity)
             else:
                 ask(place, raw, polarity)
         else:
