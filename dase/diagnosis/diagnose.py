@@ -41,6 +41,7 @@ from dase.fitting.measurement import Measured, Measurement, SceneChoice, as_meas
 from dase.fitting.model import (
     FittedModel,
     fit_present_model,
+    free_where_measured,
     model_of,
     refit_model,
     refit_work,
@@ -125,6 +126,7 @@ def diagnose(
         frames=frames, unbroken=given.unbroken, pixels=pixels, seed=seed, device=device,
     )  # fmt: skip
     given = put_in_step(given, evidence)
+    free = free_where_measured(evidence, given, free)
     tell("fitting the present model", 0.0, float("nan"))
     names = frozenset(effect.name for effect in given.effects)
     # what is left out of all that is compared cannot be tried

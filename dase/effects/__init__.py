@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
+from dase.effects.anti_flicker import AntiFlicker
 from dase.effects.bandwidth import Bandwidth
 from dase.effects.base import Effect as Effect
 from dase.effects.base import Observations as Observations
@@ -27,6 +28,7 @@ from dase.effects.linlog import Linlog
 from dase.effects.mismatch import Mismatch
 from dase.effects.optics import SceneEffect as SceneEffect
 from dase.effects.optics_blur import OpticsBlur
+from dase.effects.rate_control import RateControl
 from dase.effects.readout import Readout
 from dase.effects.refractory import Refractory
 from dase.effects.row_scan import RowScan
@@ -36,6 +38,7 @@ from dase.effects.stream import Reader as Reader
 from dase.effects.stream import StreamEffect as StreamEffect
 from dase.effects.threshold import Threshold
 from dase.effects.timestamp import Timestamp
+from dase.effects.trail_filter import TrailFilter
 from dase.effects.vignetting import Vignetting
 from dase.effects.voltage_noise import VoltageNoise
 from dase.errors import InputError, nearest
@@ -68,6 +71,10 @@ _ORDER = (
     RowScan,
     Readout,
     Timestamp,
+    # filters of the camera's own logic, on stamped events
+    AntiFlicker,
+    TrailFilter,
+    RateControl,
 )
 
 EFFECTS: dict[str, type[Effect]] = {effect.name: effect for effect in _ORDER}

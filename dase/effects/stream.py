@@ -116,6 +116,13 @@ class StreamEffect(Effect):
         """
         return math.inf
 
+    def is_idle(self, highest_rate: float) -> bool:
+        """Whether it does nothing that statistics see while events never come faster than this [Hz].
+
+        A fit then leaves the effect out, and its parameters as they are unless they are named.
+        """
+        return False
+
     def for_share(self, share: float) -> StreamEffect:
         """Return this effect as a share of the pixels feels it, where all others are left out."""
         return self

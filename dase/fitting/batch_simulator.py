@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
@@ -101,6 +102,7 @@ class BatchSimulator:
         stimulus: What the pixels see.
         middle: Typical change of the light between two events, shape (4 CLASSES,) [log intensity].
         structure: Regularities of the measured time stamps.
+        highest_rate: Most events per second that were measured, of the whole sensor [Hz].
         evaluations: Models run so far.
         work: Pixels times seconds run so far [px s].
         settings: How launches are made up; None for what suits the device.
@@ -109,6 +111,7 @@ class BatchSimulator:
     stimulus: Stimulus
     middle: NDArray[np.float32] = field(default_factory=lambda: np.zeros(4 * kernels.CLASSES, np.float32))
     structure: TimestampStructure = field(default_factory=TimestampStructure)
+    highest_rate: float = math.inf
     evaluations: int = 0
     work: float = 0.0
     settings: SimulatorSettings | None = None
@@ -278,7 +281,7 @@ class BatchSimulator:
 
     def noticeable_effects(self, sensor: Sensor) -> tuple[StreamEffect, ...]:
         """Return the effects behind the pixels that the probes can feel."""
-        return noticeable_effects(self.stimulus, self.structure, sensor)
+        return noticeable_effects(self.stimulus, self.structure, sensor, highest_rate=self.highest_rate)
 
     def has_free_readout(self, sensor: Sensor, axes: Iterable[SearchAxis]) -> bool:
         """Whether a fit along some axes changes an effect behind the pixels that the probes can feel."""

@@ -320,6 +320,8 @@ def split_measurement(
         for half in halves
     )
     rates = highest_event_rate(events), least_bus_rate(events, structure)
+    for half in (train, held, last_part, scout):
+        half.trials.highest_rate = rates[0]
     contradiction = contradiction_of_rest(events, light[:, :1] if still else light)
     if contradiction:
         notes.insert(0, contradiction)

@@ -14,7 +14,13 @@ from dase.fitting.burst_strength import find_frame_times, follows_frames, put_in
 from dase.fitting.confidence_intervals import REPEATS, estimate_parameters
 from dase.fitting.data_split import SPLIT, SplitMeasurement, split_measurement
 from dase.fitting.measurement import Measured, SceneChoice, as_measurement
-from dase.fitting.model import FittedModel, fit_present_model, model_of, refit_model
+from dase.fitting.model import (
+    FittedModel,
+    fit_present_model,
+    free_where_measured,
+    model_of,
+    refit_model,
+)
 from dase.fitting.parameter_space import SearchAxis
 from dase.fitting.plain_numbers import plain_numbers
 from dase.fitting.screen_limits import limits_of_screen
@@ -101,6 +107,7 @@ def fit(
         pixels=pixels, seed=seed, device=device,
     )  # fmt: skip
     start = put_in_step(start, evidence)
+    free = free_where_measured(evidence, start, free)
     given = model_of(start, free)
     # by the part that nothing is chosen by: the starts that are compared below are chosen by another
     before = given.judge(evidence.report, repeats=REPEATS // 2, seed=SimulationStream.JUDGE.seed(seed)).error

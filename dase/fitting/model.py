@@ -128,6 +128,22 @@ def model_of(sensor: Sensor, free: Sequence[str] | None = None) -> FittedModel:
     return FittedModel(space, space.places())
 
 
+def free_where_measured(
+    evidence: SplitMeasurement, sensor: Sensor, free: Sequence[str] | None
+) -> Sequence[str] | None:
+    """Return what is free in a fit to a measurement: where nothing is named, not a bus that was idle.
+
+    Args:
+        evidence: The measurement.
+        sensor: Its parameters.
+        free: Those that are named; None for all.
+    """
+    idle = {e.name for e in sensor.readout_effects() if e.is_idle(evidence.highest_event_rate)}
+    if free is not None or not idle:
+        return free
+    return [axis.name for axis in axes_of(sensor) if axis.effect.name not in idle]
+
+
 def with_phase(model: FittedModel, phase: float) -> FittedModel:
     """Return the model with another spread of the pixels' memories at the start."""
     sensor = with_values(model.space.sensor, {"threshold.phase": phase})

@@ -25,7 +25,12 @@ from dase.simulation.sensor_run import SensorRun
 
 
 def noticeable_effects(
-    stimulus: Stimulus, structure: TimestampStructure, sensor: Sensor, *, least_delay: float = 0.25
+    stimulus: Stimulus,
+    structure: TimestampStructure,
+    sensor: Sensor,
+    *,
+    highest_rate: float = math.inf,
+    least_delay: float = 0.25,
 ) -> tuple[StreamEffect, ...]:
     """Return the effects behind the pixels that the probes can feel.
 
@@ -36,12 +41,17 @@ def noticeable_effects(
         stimulus: What the pixels see.
         structure: Regularities of the measured time stamps.
         sensor: Whose effects.
+        highest_rate: Most events per second that were measured, of the whole sensor [Hz].
         least_delay: Delays up to this are not felt, in steps of the grid.
     """
     fine = least_delay * stimulus.grid.step
     lines = max(stimulus.width, stimulus.height)
     compared = structure.step > 0 or structure.line > 0
-    return tuple(e for e in sensor.readout_effects() if compared or e.longest_delay(lines) > fine)
+    return tuple(
+        e
+        for e in sensor.readout_effects()
+        if not e.is_idle(highest_rate) and (compared or e.longest_delay(lines) > fine)
+    )
 
 
 def clock_of(effects: tuple[StreamEffect, ...], structure: TimestampStructure) -> float | None:

@@ -138,3 +138,64 @@ def watch_light(
             asks[i] = int(np.sign(change[i]))
             since.setdefault(i // width, t)
     return out
+
+
+def places_in_bursts(events: list[Event], gap: int) -> list[int]:
+    """Return each event's place in the burst of its pixel; `gap` [ns] at most between two of a burst."""
+    last: dict[tuple[int, int], tuple[int, int, int]] = {}
+    out = []
+    for t, x, y, p in events:
+        before = last.get((x, y))
+        place = before[2] + 1 if before and before[1] == p and t - before[0] <= gap else 1
+        last[x, y] = t, p, place
+        out.append(place)
+    return out
+
+
+def flickering(events: list[Event], low: float, high: float, start: int, stop: int) -> list[bool]:
+    """Return of each event whether its region of 4x4 pixels flickers at `low` to `high` [Hz]."""
+    regions: dict[tuple[int, int], dict] = {}
+    out = []
+    for t, x, y, p in events:
+        region = regions.setdefault((x // 4, y // 4), {"p": None, "begin": None, "count": 0, "on": False})
+        if p and region["p"] != 1:
+            if region["begin"] is not None:
+                period = (t - region["begin"]) * 1e-9
+                fits = 1 / high - 2e-9 <= period <= 1 / low + 2e-9
+                region["count"] = min(max(region["count"] + (1 if fits else -1), 0), max(7, start))
+            region["begin"] = t
+            if region["count"] >= start:
+                region["on"] = True
+            elif region["count"] < stop:
+                region["on"] = False
+        region["p"] = p
+        out.append(region["on"])
+    return out
+
+
+def within_rate(events: list[Event], most: float, period: int, drop: str, draws: np.ndarray) -> list[bool]:
+    """Return of each event whether a controller passes it.
+
+    Args:
+        events: In order of time.
+        most: Events that may pass in a period.
+        period: [ns]
+        drop: even, random or last.
+        draws: A random number in 0..1 for each event.
+    """
+    came: dict[int, int] = {}
+    out = []
+    for (t, *_), draw in zip(events, draws, strict=True):
+        turn = t // period
+        n = came.get(turn, 0)
+        share = Fraction(1)
+        if came.get(turn - 1, 0) > most:
+            share = Fraction(most) / came[turn - 1]
+        if drop == "last":
+            out.append(n < most)
+        elif drop == "random":
+            out.append(bool(draw < share))
+        else:
+            out.append(math.floor((n + 1) * share) > math.floor(n * share))
+        came[turn] = n + 1
+    return out
