@@ -245,12 +245,14 @@ RECENT = 64
             else request((int)(who & 0xffffffffll), due_t);
             continue;
         }
-        const long long after_raw = i + (raw_t <= other_t) < count ? arrival.data[i + (raw_t <= other_t)] : END;
-        const long long after_other = j + (other_t < raw_t) < others ? other.data[j + (other_t < raw_t)] : END;
+        const bool mine_first = raw_t <= other_t;
+        const int after_i = i + mine_first, after_j = j + !mine_first;
+        const long long after_raw = after_i < count ? arrival.data[after_i] : END;
+        const long long after_other = after_j < others ? other.data[after_j] : END;
         soonest = after_raw < after_other ? after_raw : after_other;
         if (due_t < soonest) soonest = due_t;
         if (until < soonest) soonest = until;
-        if (raw_t <= other_t) {
+        if (mine_first) {
             arrive(place.data[i], raw_t, polarity.data[i], (unsigned char)label.data[i]);
             ++i;
         } else {

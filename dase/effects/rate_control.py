@@ -139,7 +139,7 @@ class RateControl(StreamEffect):
         return []
 
     def is_idle(self, highest_rate: float) -> bool:
-        """Whether it lets everything pass, also in periods with several times as many events as on average."""
+        """Whether it lets everything pass, in periods with several times the mean of events, too."""
         return highest_rate < 0.2 * self.rate
 
     def for_share(self, share: float) -> RateControl:

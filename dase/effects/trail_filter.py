@@ -58,8 +58,8 @@ class TrailFilter(StreamEffect):
     users often have switched on. A burst goes on as long as the next event of the pixel has the same polarity
     and comes within `threshold` of the last one, whether that passed or not.
 
-    With `mode = "trail"` the first event of each burst passes. With `"stc_cut"` (spatio-temporal contrast) the
-    second passes alone, with `"stc_keep"` the second and all that follow: single events are lost. Of
+    With `mode = "trail"` the first event of each burst passes. With `"stc_cut"` (spatio-temporal contrast)
+    the second passes alone, with `"stc_keep"` the second and all that follow: single events are lost. Of
     independent ON and OFF events with shares s and 1 - s, R per second in all, the shares that pass are
     1 - J with J = (s² + (1 - s)²) (1 - exp(-R `threshold`)) for trail, J for stc_keep, and the sum over
     polarities of s q (1 - q), q = s (1 - exp(-R `threshold`)), for stc_cut.
