@@ -8,7 +8,8 @@ from typing import ClassVar, Self
 
 import warp as wp
 
-from dase.effects.base import Effect, Observations, parameter
+from dase.effects.base import Effect, Observations, choice, parameter
+from dase.kernels.pixel_stages import EffectStages
 from dase.kernels.vector_math import cosine_and_sine
 
 
@@ -22,6 +23,71 @@ def flickering_light(intensity: float, t64: wp.float64, frequency: float, depth:
     return intensity * (1.0 + depth * sine)
 
 
+@wp.func
+def turn_of_lamp(
+    t64: wp.float64, frequency: float, phase: float, region: float, apart: float, x: float, y: float
+):
+    """Part of a period that has passed at a pixel's lamp, 0 to 1."""
+    turns = wp.float64(frequency) * t64
+    lamp = wp.floor(x / region) + wp.floor(y / region)
+    turn = float(turns - wp.floor(turns)) + phase + apart * lamp
+    return turn - wp.floor(turn)
+
+
+@wp.func
+def light_of_lamps(
+    intensity: float,
+    t64: wp.float64,
+    frequency: float,
+    depth: float,
+    phase: float,
+    region: float,
+    apart: float,
+    x: float,
+    y: float,
+):
+    """Intensity under lamps whose flux is 1 + depth · sin, each a region of its own."""
+    _cosine, sine = cosine_and_sine(turn_of_lamp(t64, frequency, phase, region, apart, x, y))
+    return intensity * (1.0 + depth * sine)
+
+
+@wp.func
+def rectified_light(
+    intensity: float,
+    t64: wp.float64,
+    frequency: float,
+    depth: float,
+    phase: float,
+    region: float,
+    apart: float,
+    x: float,
+    y: float,
+):
+    """Intensity under lamps whose flux follows the rectified mains."""
+    # half a turn of the mains is a period of the light
+    half = 0.5 * turn_of_lamp(t64, frequency, phase, region, apart, x, y)
+    _cosine, sine = cosine_and_sine(half)
+    return intensity * (1.0 + depth * (2.0 * wp.abs(sine) - 1.0))
+
+
+@wp.func
+def switched_light(
+    intensity: float,
+    t64: wp.float64,
+    frequency: float,
+    depth: float,
+    phase: float,
+    region: float,
+    apart: float,
+    duty: float,
+    x: float,
+    y: float,
+):
+    """Intensity under lamps that are switched on for a share of each period."""
+    turn = turn_of_lamp(t64, frequency, phase, region, apart, x, y)
+    return intensity * (1.0 + wp.where(turn < duty, depth, -depth))
+
+
 @dataclass(frozen=True, kw_only=True)
 class Flicker(Effect):
     """Light that flickers.
@@ -30,16 +96,25 @@ class Flicker(Effect):
     second; screens and dimmed LEDs flicker too. Pixels that see nothing move then send ON and OFF events in
     turns, all of them together.
 
-    The intensity is multiplied by 1 + depth · sin(2π (frequency · t + phase)). The modulation multiplies, so
-    in the logarithm it is the same at every intensity. A scene must be sampled several times per period:
-    moving textures and videos are, by themselves.
+    The intensity is multiplied by 1 + depth · w(frequency · t + phase), where w goes from -1 to 1 in each
+    turn. With `shape = "sine"` it is sin(2π turn). With `"rectified"` it is 2 |sin(π turn)| - 1: an LED
+    without a capacitor behind a bridge of diodes, with a sharp dip at each zero of the mains and a round
+    top. With `"pwm"` it is 1 for the share `duty` of each period and -1 for the rest: a dimmed LED or a
+    screen's backlight; all pixels send their ON events at one moment and their OFF events at another.
+    Whatever the shape, the logarithm swings by log((1 + depth) / (1 - depth)), at every intensity alike.
+
+    Where several lamps hang, each lights a region: squares of `region` pixels, of which neighbours to the
+    right and below are `apart` turns later. Lamps on the three phases of the mains are 1/3 of a turn of the
+    light apart. Lights do not mix at the borders.
+
+    A scene must be sampled several times per period: moving textures and videos are, by themselves.
     """
 
     name: ClassVar[str] = "flicker"
     unbroken: ClassVar[bool] = True
     source: ClassVar[str] = (
         "IEEE Std 1789: Recommended practices for modulating current in high-brightness LEDs, 2015 "
-        "(depth and frequency of lamps)"
+        "(depth, frequency and waveforms of lamps: rectified mains, pulse width modulation)"
     )
     stages: ClassVar = {"light": flickering_light}
 
@@ -69,10 +144,46 @@ class Flicker(Effect):
         periodic=True,
     )
 
+    duty: float = parameter(
+        0.5,
+        unit="1",
+        bounds=(0.001, 0.999),
+        plausible=(0.05, 0.95),
+        about="share of a period for which a lamp is on, in shape pwm",
+        fitted=False,  # of other shapes nothing tells it
+    )
+    region: float = parameter(
+        math.inf,
+        unit="px",
+        bounds=(1.0, math.inf),
+        plausible=(20.0, 1000.0),
+        about="side of the squares that one lamp lights; infinite for a single lamp",
+        fitted=False,  # a border half a pixel off changes few pixels
+    )
+    apart: float = parameter(
+        1 / 3,
+        unit="turns",
+        bounds=(-1.0, 1.0),
+        plausible=(0.0, 1.0),
+        about="by which the lamp of the next region is later",
+        fitted=False,  # of a single lamp nothing tells it
+    )
+    shape: str = choice("sine", among=("sine", "rectified", "pwm"), about="how the light swings")
+
     @classmethod
     def candidates(cls, observed: Observations) -> list[Self]:
-        """Return a lamp of the frequency at which the event rate swings most."""
-        return [cls(frequency=observed.peak_frequency)]
+        """Return lamps of the frequency at which the event rate swings most, as bulbs and LEDs have it."""
+        return [cls(frequency=observed.peak_frequency, shape=shape) for shape in ("sine", "rectified")]
+
+    def compiled(self) -> EffectStages:
+        """Return what the kernel composer needs to know: the shape is a function of its own."""
+        single = self.region == math.inf
+        light = {
+            "sine": flickering_light if single else light_of_lamps,
+            "rectified": rectified_light,
+            "pwm": switched_light,
+        }[self.shape]
+        return replace(super().compiled(), functions=(("light", light),))
 
     def shifted(self, seconds: float) -> Flicker:
         """Return the lamp on a clock that shows `seconds` less; its phase stays within the bounds."""
@@ -80,4 +191,8 @@ class Flicker(Effect):
 
     def longest_step(self) -> float:
         """Return the longest time between samples that still shows the effect [s]."""
-        return 1 / (16 * self.frequency) if self.depth and self.frequency else math.inf
+        if not (self.depth and self.frequency):
+            return math.inf
+        # the dips of rectified light are sharp, and the shorter part of a period is not to be missed
+        part = {"sine": 1 / 16, "rectified": 1 / 32, "pwm": min(1 / 16, self.duty / 4, (1 - self.duty) / 4)}
+        return part[self.shape] / self.frequency

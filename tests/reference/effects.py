@@ -25,8 +25,11 @@ def light(sensor: dase.Sensor, times: np.ndarray, frames: np.ndarray, seed: int)
     out = frames.astype(np.float64)
     if "flicker" in sensor:
         lamp = sensor["flicker"]
-        turns = 2 * np.pi * (lamp.frequency * times + lamp.phase)
-        out = out * (1 + lamp.depth * np.sin(turns))[:, None, None]
+        for row in range(height):
+            for column in range(width):
+                number = row // lamp.region + column // lamp.region
+                turns = lamp.frequency * times + lamp.phase + lamp.apart * number
+                out[:, row, column] *= 1 + lamp.depth * waveform(lamp, turns)
     y, x = np.mgrid[:height, :width]
     square = ((2 * x - width + 1) ** 2 + (2 * y - height + 1) ** 2) / (width**2 + height**2)
     corner = np.arccos((1 - setting(sensor, "vignetting", "loss", 0.0)) ** 0.25)
@@ -35,6 +38,15 @@ def light(sensor: dase.Sensor, times: np.ndarray, frames: np.ndarray, seed: int)
     current, spread = (setting(sensor, "dark", name, 0.0) for name in ("current", "spread"))
     normal = [Stream("dark_current_pixel_normal", seed, i).normal() for i in range(width * height)]
     return out + current * np.exp(spread * np.array(normal))
+
+
+def waveform(lamp: dase.Effect, turns: np.ndarray) -> np.ndarray:
+    """Return how the flux of a lamp swings, -1 to 1."""
+    if lamp.shape == "rectified":
+        return 2 * np.abs(np.sin(np.pi * turns)) - 1
+    if lamp.shape == "pwm":
+        return np.where(turns % 1 < lamp.duty, 1.0, -1.0)
+    return np.sin(2 * np.pi * turns)
 
 
 def linlog(voltage: np.ndarray, knee: float, slope: float, eps: float) -> np.ndarray:
