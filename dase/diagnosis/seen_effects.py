@@ -33,11 +33,11 @@ KINDS: dict[str, tuple[str, ...]] = {
     "fixed pattern": ("mismatch", "dead"),
     "grouping": ("readout", "row_scan"),
     "frame coupling": ("exposure",),
-    "double events": (),
+    "double events": ("double_events",),
 }
 """Signature to the effects that make it; nothing where the library has none that does."""
 
-NAMED = ("flicker", "hot pixels", "full bus", "time stamps", "frame coupling")
+NAMED = ("flicker", "hot pixels", "full bus", "time stamps", "frame coupling", "double events")
 """Signatures that tell which effect it is; the others tell what there is, and not what makes it."""
 
 

@@ -16,6 +16,7 @@ from dase.effects.base import choice as choice
 from dase.effects.base import parameter as parameter
 from dase.effects.dark import Dark
 from dase.effects.dead import Dead
+from dase.effects.double_events import DoubleEvents
 from dase.effects.exposure import Exposure
 from dase.effects.flicker import Flicker
 from dase.effects.high_pass import HighPass
@@ -70,6 +71,7 @@ _ORDER = (
     Latency,
     RowScan,
     Readout,
+    DoubleEvents,
     Timestamp,
     # filters of the camera's own logic, on stamped events
     AntiFlicker,

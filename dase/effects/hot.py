@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import ClassVar
+from dataclasses import dataclass, replace
+from typing import ClassVar, Self
 
 import warp as wp
 
-from dase.effects.base import Effect, parameter
+from dase.effects.base import Effect, Observations, choice, parameter
+from dase.kernels.pixel_stages import EffectStages
 
 
 @wp.func
@@ -21,6 +22,29 @@ def hot_rates(
     return total * balance, total * (1.0 - balance)
 
 
+@wp.func
+def hot_drift(
+    nominal_on: float,
+    nominal_off: float,
+    share: float,
+    rate: float,
+    spread: float,
+    balance: float,
+    pixel_uniform: float,
+    pixel_uniform_2: float,
+    pixel_normal: float,
+):
+    """Speed at which the memory of a hot pixel drifts, towards ON or OFF [log intensity/s]."""
+    speed = float(0.0)
+    if pixel_uniform < share:
+        speed = (
+            rate
+            * wp.exp(spread * pixel_normal)
+            * wp.where(pixel_uniform_2 < balance, nominal_on, -nominal_off)
+        )
+    return speed
+
+
 @dataclass(frozen=True, kw_only=True)
 class Hot(Effect):
     """Pixels that fire by themselves.
@@ -29,7 +53,14 @@ class Hot(Effect):
     time, whatever they see, some of them thousands per second.
 
     Each pixel is hot with the probability `share`. Rates are log-normally distributed over hot pixels, with
-    median `rate`; events come at random times, and each makes the pixel remember the present log intensity.
+    median `rate`. With `mode = "noise"` events come at random times, ON and OFF mixed, and each makes the
+    pixel remember the present log intensity: the scatter of intervals is their mean. With `mode = "leak"` the
+    pixel's memory drifts, by the nominal threshold in 1/rate seconds, towards ON in the share `balance` of hot
+    pixels and towards OFF in the others: events of one polarity at even intervals, as far as the light rests.
+    The hottest five pixels of a DAVIS240B recording are of this kind (one polarity each, intervals that
+    scatter by 7 to 21 % of their mean; `jitter` makes them scatter), as is that of a DVXplorer; other hot
+    pixels of the DVXplorer and those of a DAVIS346 are of the first. Drifts are labelled as leak.
+    A dead time adds to each interval.
     """
 
     name: ClassVar[str] = "hot"
@@ -70,5 +101,18 @@ class Hot(Effect):
         unit="1",
         bounds=(0.0, 1.0),
         plausible=(0.0, 1.0),
-        about="share of ON events",
+        about="share of ON events, in mode leak of pixels that send ON events",
     )
+    mode: str = choice(
+        "noise", among=("noise", "leak"), about="events at random times, or a drift that makes them"
+    )
+
+    @classmethod
+    def candidates(cls, observed: Observations) -> list[Self]:
+        """Return noise: which of the two it is, the events of the few hot pixels tell without a search."""
+        return [cls()]
+
+    def compiled(self) -> EffectStages:
+        """Return what the kernel composer needs to know: each mode acts at a stage of its own."""
+        stage = ("drift", hot_drift) if self.mode == "leak" else ("noise", hot_rates)
+        return replace(super().compiled(), functions=(stage,))

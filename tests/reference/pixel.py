@@ -184,12 +184,21 @@ def detector(sensor: dase.Sensor, index: int, seed: int) -> Detector:
     start, noise, polarity, leak, dead = (Stream(name, seed, index) for name in names)
     dead_spread = setting(sensor, "refractory", "spread", 0.0)
     rate, nominal_on = setting(sensor, "leak", "rate", 0.0), sensor["threshold"].on
+    leaks = max(rate * (1 + setting(sensor, "leak", "spread", 0.0) * leak.normal()), 0.0) * nominal_on
+    if setting(sensor, "hot", "mode", "noise") == "leak":
+        hot = sensor["hot"]
+        drawn, way, size = (
+            Stream(f"hot_drift_pixel_{name}", seed, index) for name in ("uniform", "uniform_2", "normal")
+        )
+        if drawn.uniform(0) < hot.share:
+            toward = nominal_on if way.uniform(0) < hot.balance else -sensor["threshold"].off
+            leaks += hot.rate * np.exp(hot.spread * size.normal()) * toward
     return Detector(
         on=on,
         off=off,
         lead=sensor["threshold"].phase * start.uniform(0),
         falls=start.uniform(1) < 0.5,
-        leak=max(rate * (1 + setting(sensor, "leak", "spread", 0.0) * leak.normal()), 0.0) * nominal_on,
+        leak=leaks,
         period=setting(sensor, "refractory", "period", 0.0) * max(1 + dead.normal() * dead_spread, 0.0),
         after_off=setting(sensor, "refractory", "after_off", 1.0),
         delays=setting(sensor, "refractory", "mode", "drop") == "delay",

@@ -199,3 +199,23 @@ def within_rate(events: list[Event], most: float, period: int, drop: str, draws:
             out.append(math.floor((n + 1) * share) > math.floor(n * share))
         came[turn] = n + 1
     return out
+
+
+def doubled(
+    events: list[Event], shares: tuple[float, float], delay: float, tail: float, draws: np.ndarray
+) -> list[Event]:
+    """Return events and the doubles of some.
+
+    Args:
+        events: In order of time.
+        shares: Of OFF and ON events that have a double.
+        delay: From an event to its double [ns].
+        tail: Mean of what is added to it [ns].
+        draws: Two random numbers for each event, shape (N, 2).
+    """
+    out = [(event[0], 0, n, event) for n, event in enumerate(events)]
+    for n, (event, (chance, more)) in enumerate(zip(events, draws, strict=True)):
+        if chance < shares[event[3]]:
+            later = event[0] + max(round(delay + min(-math.log(1 - more), 20.0) * tail), 1)
+            out.append((later, 1, n, (later, *event[1:])))
+    return [event for *_, event in sorted(out)]
