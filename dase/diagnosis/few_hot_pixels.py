@@ -91,7 +91,10 @@ def hot_effect_of(
         "spread": estimate("spread", spread, *ends),
         "balance": estimate("balance", balance, balance - beside, balance + beside),
     }
-    effect = Hot(**{name: one.value for name, one in found.items()})
+    values = {name: one.value for name, one in found.items()}
+    effect = Hot(
+        share=values["share"], rate=values["rate"], spread=values["spread"], balance=values["balance"]
+    )
     return effect, {f"{NAME}.{name}": one for name, one in found.items()}
 
 

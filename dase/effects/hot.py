@@ -55,11 +55,11 @@ class Hot(Effect):
     Each pixel is hot with the probability `share`. Rates are log-normally distributed over hot pixels, with
     median `rate`. With `mode = "noise"` events come at random times, ON and OFF mixed, and each makes the
     pixel remember the present log intensity: the scatter of intervals is their mean. With `mode = "leak"` the
-    pixel's memory drifts, by the nominal threshold in 1/rate seconds, towards ON in the share `balance` of hot
-    pixels and towards OFF in the others: events of one polarity at even intervals, as far as the light rests.
-    The hottest five pixels of a DAVIS240B recording are of this kind (one polarity each, intervals that
-    scatter by 7 to 21 % of their mean; `jitter` makes them scatter), as is that of a DVXplorer; other hot
-    pixels of the DVXplorer and those of a DAVIS346 are of the first. Drifts are labelled as leak.
+    pixel's memory drifts, by the nominal threshold in 1/rate seconds, towards ON in the share `balance` of
+    hot pixels and towards OFF in the others: events of one polarity at even intervals, as far as the light
+    rests. The hottest five pixels of a DAVIS240B recording are of this kind (one polarity each, intervals
+    that scatter by 7 to 21 % of their mean; `jitter` makes them scatter), as is that of a DVXplorer; other
+    hot pixels of the DVXplorer and those of a DAVIS346 are of the first. Drifts are labelled as leak.
     A dead time adds to each interval.
     """
 

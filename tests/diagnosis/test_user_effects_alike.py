@@ -29,13 +29,21 @@ from dase.simulation.sensor import Sensor
 OBSERVED = Observations(100.0, 1e-3, 3e-6, "left", 1e6, 0.0, 0.01)
 
 
+@wp.func
+def even_voltage(
+    voltage: float, intensity: float, dt: float, cutoff: float, dark: float, input: float, output: float
+):
+    """The bandwidth of pixels that are all alike."""
+    return lowpass_voltage(voltage, intensity, dt, cutoff, dark, 0.0, input, output, 0.0)
+
+
 @dataclass(frozen=True, kw_only=True)
 class Sluggish(Effect):
     """A copy of the bandwidth that keeps the names of its parameters."""
 
     name: ClassVar[str] = "sluggish"
     source: ClassVar[str] = "this test"
-    stages: ClassVar = {"respond": lowpass_voltage}
+    stages: ClassVar = {"respond": even_voltage}
     states: ClassVar = ("input", "output")
 
     cutoff: float = parameter(
@@ -51,7 +59,7 @@ def renamed_voltage(
     voltage: float, intensity: float, dt: float, pace: float, night: float, input: float, output: float
 ):
     """The same by other names."""
-    return lowpass_voltage(voltage, intensity, dt, pace, night, input, output)
+    return even_voltage(voltage, intensity, dt, pace, night, input, output)
 
 
 @dataclass(frozen=True, kw_only=True)

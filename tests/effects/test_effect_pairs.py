@@ -9,20 +9,24 @@ from helpers.sensors import STRONG, every
 from helpers.small_scenes import flicker, still
 
 import dase
+from dase.effects.anti_flicker import AntiFlicker
 from dase.effects.bandwidth import Bandwidth
 from dase.effects.dark import Dark
+from dase.effects.double_events import DoubleEvents
 from dase.effects.flicker import Flicker
 from dase.effects.latency import Latency
 from dase.effects.leak import Leak
 from dase.effects.learned_threshold import LearnedThreshold
 from dase.effects.mismatch import Mismatch
 from dase.effects.optics_blur import OpticsBlur
+from dase.effects.rate_control import RateControl
 from dase.effects.readout import Readout
 from dase.effects.refractory import Refractory
 from dase.effects.row_scan import RowScan
 from dase.effects.shot import Shot
 from dase.effects.threshold import Threshold
 from dase.effects.timestamp import Timestamp
+from dase.effects.trail_filter import TrailFilter
 from dase.effects.vignetting import Vignetting
 
 FINE = Threshold(on=0.01, off=0.01, phase=0.0)
@@ -44,6 +48,10 @@ def all_on(mode: str) -> dase.Sensor:
         RowScan(line=1e-4),
         Readout(rate=3e4, depth=20),
         Timestamp(jitter=2e-3, step=1e-5),
+        DoubleEvents(share=0.1, delay=2e-6),
+        AntiFlicker(low=30.0, high=100.0, start=1.0, stop=1.0),
+        TrailFilter(threshold=2e-4),
+        RateControl(rate=2e4, period=1e-3),
     )
     sensor = every(Threshold(), *STRONG.values(), *more, mode=mode)
     assert not any(effect.is_off() for effect in sensor.effects if effect.name != "threshold")
