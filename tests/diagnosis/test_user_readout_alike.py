@@ -95,6 +95,9 @@ class Post(StreamEffect):
     def candidates(cls, observed: Observations) -> list[Self]:
         return [] if observed.bus_is_idle else [cls(pace=observed.highest_event_rate)]
 
+    def is_idle(self, highest_rate: float) -> bool:
+        return Readout(rate=self.pace, depth=self.places).is_idle(highest_rate)
+
     def for_share(self, share: float) -> Post:
         return replace(self, pace=self.pace * share, places=max(1.0, self.places * share))
 
