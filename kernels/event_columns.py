@@ -56,7 +56,7 @@ class EventColumns:
         }
 
     def bring(self, count: int) -> dict[str, NDArray[Any]]:
-        """Return what `take` gave as arrays of the host; on a GPU a copy, for which it waits."""
+        """Return what `take` gave as arrays (count,) of the host; on a GPU a copy, for which it waits."""
         offsets, size = self._offsets(count)
         if self.device.is_cpu:
             # the caller's from now on, who may let go of it before the next chunk

@@ -33,7 +33,7 @@ class BlockPool:
         self._idle: dict[int, deque[wp.array]] = {}
 
     def lend(self, size: int) -> tuple[wp.array, NDArray[np.uint8]]:
-        """Return `size` bytes for a device to copy to, and the same as an array whose life is the loan."""
+        """Return `size` bytes for a device to copy to, and as an array (size,) whose life is the loan."""
         whole = max(SMALLEST_BLOCK, 1 << (size - 1).bit_length())
         idle = self._idle.setdefault(whole, deque())
         try:
@@ -77,12 +77,15 @@ _pool = BlockPool()
 
 
 def lend_block(size: int) -> tuple[wp.array, NDArray[np.uint8]]:
-    """Return a block of the pool that all simulations of this process share, as `BlockPool.lend` does."""
+    """Return `size` bytes, also as an array (size,), of the pool that all share: `BlockPool.lend`."""
     return _pool.lend(size)
 
 
 def copy_to_host(values: wp.array) -> NDArray[Any]:
-    """Return an array of a device as one of the host: of a GPU a copy, on a CPU the memory itself."""
+    """Return an array of a device as one of the host: of a GPU a copy, on a CPU the memory itself.
+
+    Its shape is the same.
+    """
     if values.device.is_cpu:
         return np.asarray(values.numpy())
     kind = np.dtype(wp.dtype_to_numpy(values.dtype))

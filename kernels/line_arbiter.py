@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from enum import IntEnum
+
 import warp as wp
 
 END = 2**62
@@ -10,15 +12,43 @@ END = 2**62
 NEVER = -END
 """A time that always was [ps]."""
 
-LAST, FREED, INTERVAL = 0, 1, 2
-"""Columns of what is known of a pixel: its last event, when it was let go, from the event before to the last
-one where both had one polarity, else 0 [ps]; the last column is bytes."""
 
-OTHER_BYTE = 31
-"""Byte of a pixel that is 1 where its events are not sent."""
+class PixelColumn(IntEnum):
+    """What is known of a pixel, [ps] but for the last column, whose bytes `arbitrate` names."""
 
-FREE, FIRST_LINE, QUEUED, HEAPED, LAST_OTHER, GHOSTS, OTHERS, SENT, HELD = range(9)
-"""Places of single numbers that an arbiter remembers."""
+    LAST = 0
+    """Its last event."""
+
+    FREED = 1
+    """When it was let go."""
+
+
+class PixelByte(IntEnum):
+    """Bytes of a pixel that are set from outside."""
+
+    OTHER = 31
+    """1 where its events are not sent."""
+
+
+class ArbiterNumber(IntEnum):
+    """Places of single numbers that an arbiter remembers, in the order of `arbitrate`."""
+
+    FREE = 0
+    """When the bus is free [ps]."""
+
+    FIRST_LINE = 1
+    QUEUED = 2
+    HEAPED = 3
+    LAST_OTHER = 4
+    GHOSTS = 5
+    OTHERS = 6
+
+    SENT = 7
+    """Events that the last call wrote."""
+
+    HELD = 8
+    """Pixels of the recording that wait or will ask late."""
+
 
 RECENT = 64
 """Requests of others whose lines are remembered, a power of 2."""
@@ -318,7 +348,7 @@ def send_by_lines(
     per_line: wp.int64,  # time to take a line [ps]
     per_event: wp.int64,  # time to send one event of it [ps]
     # in and out
-    known: wp.array2d[wp.int64],  # (lines * 2**shift, 4) LAST and so on
+    known: wp.array2d[wp.int64],  # (lines * 2**shift, 4) `PixelColumn`
     waiting: wp.array2d[wp.int64],  # (lines, words) bit of each pixel that waits
     line_since: wp.array[wp.int64],  # (lines,) first request of a line [ps]
     line_count: wp.array[int],  # (lines,) requests of a line
@@ -326,7 +356,7 @@ def send_by_lines(
     heap_due: wp.array[wp.int64],  # (K,) [ps] a heap: the children of k are 2 k + 1 and 2 k + 2
     heap_what: wp.array[wp.int64],  # (K,) turn * 2**32 + pixel, or -1 - line for a request of no pixel
     recent: wp.array[int],  # (RECENT,) lines of the last others' requests
-    numbers: wp.array[wp.int64],  # (9,) FREE and so on
+    numbers: wp.array[wp.int64],  # (9,) `ArbiterNumber`
     # out
     out_time: wp.array[wp.float64],  # (L,) when the line was taken [s], in whole nanoseconds
     out_pixel: wp.array[int],  # (L,)

@@ -42,7 +42,13 @@ class Dropper(SharedReader):
         return self.beside(events, Others.none(), np.ones(2)), until
 
     def beside(self, events: Events, others: Others, weight: NDArray[np.float64]) -> Events:
-        """Return those of some events that pass beside others, see `SharedReader.beside`."""
+        """Return those of some events that pass beside others, see `SharedReader.beside`.
+
+        Args:
+            events: Sorted by time.
+            others: They count for the rate, and are not returned.
+            weight: How many OFF and ON events each of the others stands for, shape (2,).
+        """
         draws = self._random.random(len(events))
         own = to_nanoseconds(events.t)
         at = np.concatenate([own, others.time // 1000])

@@ -15,6 +15,7 @@ from dase.effects.stream import Others, SharedReader, StreamEffect, to_nanosecon
 from dase.events import Events
 from dase.kernels import launch, line_arbiter
 from dase.kernels.event_queue import NEVER, ONE, send_over_bus
+from dase.kernels.line_arbiter import ArbiterNumber, PixelByte, PixelColumn
 
 
 class Bus(SharedReader):
@@ -70,8 +71,8 @@ class LineArbiter(SharedReader):
         size = lines << self._shift
         self._labelled = False
         known, numbers = np.zeros((size, 4), np.int64), np.zeros(9, np.int64)
-        known[:, [line_arbiter.LAST, line_arbiter.FREED]] = line_arbiter.NEVER
-        numbers[line_arbiter.FREE] = line_arbiter.NEVER
+        known[:, [PixelColumn.LAST, PixelColumn.FREED]] = line_arbiter.NEVER
+        numbers[ArbiterNumber.FREE] = line_arbiter.NEVER
         room = 2 * width * height + 64  # requests that come late, those taken back among them
         self._state: dict[str, NDArray[Any]] = {
             "known": known, "waiting": np.zeros((lines, -(-across // 64)), np.int64),
@@ -86,7 +87,13 @@ class LineArbiter(SharedReader):
         return self._read(events, Others.none(), np.ones(2), until), until
 
     def beside(self, events: Events, others: Others, weight: NDArray[np.float64]) -> Events:
-        """Return those of some events that find room beside others, see `SharedReader.beside`."""
+        """Return those of some events that find room beside others, see `SharedReader.beside`.
+
+        Args:
+            events: Sorted by time.
+            others: Their pixels wait and are read as well, and are not returned.
+            weight: How many OFF and ON events each of the others stands for, shape (2,).
+        """
         return self._read(events, others, weight, math.inf)
 
     def _read(self, events: Events, others: Others, weight: NDArray[np.float64], until: float) -> Events:
@@ -94,8 +101,8 @@ class LineArbiter(SharedReader):
         label = np.zeros(len(events), np.int8) if events.label is None else events.label
         if len(others.time):
             pixel_bytes = self._state["known"].view(np.uint8)
-            pixel_bytes[self._places(others.x, others.y), line_arbiter.OTHER_BYTE] = 1
-        room = len(events) + int(self._state["numbers"][line_arbiter.HELD])
+            pixel_bytes[self._places(others.x, others.y), PixelByte.OTHER] = 1
+        room = len(events) + int(self._state["numbers"][ArbiterNumber.HELD])
         out_time, out_place = np.empty(room, np.float64), np.empty(room, np.int32)
         out_polarity, out_label = np.empty(room, np.uint8), np.empty(room, np.int8)
         end = line_arbiter.END if until == math.inf else 1000 * to_nanosecond(until)
@@ -116,7 +123,7 @@ class LineArbiter(SharedReader):
             array(out_label, wp.int8),
         ]  # fmt: skip
         wp.launch(line_arbiter.send_by_lines, dim=1, inputs=inputs, device=device)
-        sent = int(self._state["numbers"][line_arbiter.SENT])
+        sent = int(self._state["numbers"][ArbiterNumber.SENT])
         line, across = out_place[:sent] >> self._shift, out_place[:sent] & ((1 << self._shift) - 1)
         x, y = (line, across) if self._by_columns else (across, line)
         return Events(

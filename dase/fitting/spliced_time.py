@@ -89,7 +89,7 @@ class SplicedScene(Scene):
         return self._time.grid.times
 
     def source(self, times: Array, pixels: NDArray[np.int32], device: Any) -> tuple[str, Any]:
-        """Return the scene's own source at these times; see `Scene.source`."""
+        """Return the scene's source at spliced times (K,) [s] for pixels (N,); see `Scene.source`."""
         return self._scene.source(self._time.real(times), pixels, device)
 
     def frames(self, times: Array, device: str = "cpu") -> NDArray[np.float32]:

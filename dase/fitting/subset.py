@@ -68,7 +68,7 @@ class PixelSubset:
         return found
 
     def run_repeats(self, space: ParameterSpace, places: Array, *, seed: int) -> Array:
-        """Do what `run` does, where each model has random numbers of its own."""
+        """Do what `run` does, shape (B, J), where each model has random numbers of its own."""
         request = SimulationRequest(self, space, np.atleast_2d(places), seed, repeats=True)
         found: Array = compute_statistics(answer_requests([request])[0], self.frame)[0]
         return found

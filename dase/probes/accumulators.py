@@ -116,7 +116,11 @@ class ProbeSums:
         )  # fmt: skip
 
     def select(self, rows: NDArray[np.int64]) -> ProbeSums:
-        """Return some rows (B',) in a new order; groups stay those of the first row there was."""
+        """Return some rows in a new order; groups stay those of the first row there was.
+
+        Args:
+            rows: Their numbers, shape (N,).
+        """
         pixels = wp.empty((len(rows), *self.pixels.shape[1:]), dtype=float, device=self.pixels.device)
         for to, row in enumerate(rows.tolist()):
             wp.copy(pixels[to : to + 1], self.pixels[row : row + 1])

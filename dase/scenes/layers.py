@@ -332,7 +332,7 @@ class LayerScene(Scene):
         return lit.reshape(len(times), self.height, self.width)
 
     def grey_frames(self, times: NDArray[np.float64], device: str = "cpu") -> NDArray[np.uint8]:
-        """Return frames of 8 bits, rendered as such; see `Scene.grey_frames`."""
+        """Return frames of 8 bits, rendered as such, shape (K, height, width); see `Scene.grey_frames`."""
         if self.lighting is not None:
             return super().grey_frames(times, device)
         where = launch.find_device(device)
