@@ -95,6 +95,17 @@ class Hdf5Group:
             raise InputError(f"has no '{name}'")
         return found
 
+    def names(self, group: str) -> list[str]:
+        """Return the sorted names in a group, none where there is no such group.
+
+        Raises:
+            InputError: It is a dataset: its values, which it would yield, may be as many as it claims.
+        """
+        found = self.get(group)
+        if found is not None and not isinstance(found, Hdf5Group):
+            raise InputError(f"'{group}' is a dataset, and must be a group")
+        return sorted(found or ())
+
     def __contains__(self, name: str) -> bool:
         return self.get(name) is not None
 

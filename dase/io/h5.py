@@ -395,9 +395,7 @@ def numbered_members(file: Any, group: str) -> dict[str, Any]:
     Raises:
         InputError: Together they unpack to something absurd: many names may be links to one dataset.
     """
-    if group not in file:
-        return {}
-    found = {name[-9:]: columns.checked_dataset(file[group], name) for name in sorted(file[group])}
+    found = {name[-9:]: columns.checked_dataset(file[group], name) for name in file.names(group)}
     unpacked = sum(member.size * member.dtype.itemsize for member in found.values())
     length = next((member.file.id.get_filesize() for member in found.values()), 0)
     try:

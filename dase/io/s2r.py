@@ -52,7 +52,7 @@ def _read_size(source: Source) -> Size | None:
     with open_hdf5(source.path) as file:
         _check_layout(file)
         for group in ("images", "flow"):
-            for name in file.get(group, ()):
+            for name in file.names(group):
                 shape = checked_dataset(file, f"{group}/{name}").shape
                 if len(shape) >= 2:
                     return shape[-1], shape[-2]

@@ -129,6 +129,19 @@ def test_many_names_of_one_image_count_as_many(tmp_path, rng):
     assert time.process_time() - began < 5
 
 
+@pytest.mark.parametrize("group", ["images", "flow"])
+def test_a_dataset_in_place_of_a_group_is_refused_before_it_is_read(tmp_path, rng, group):
+    path = tmp_path / "a.h5"
+    reference_io.SAMPLES["HDF5"][1](path, reference_io.events(rng, 300, 48, 36))
+    with h5py.File(path, "a") as file:
+        if group in file:
+            del file[group]
+        file.create_dataset(group, (1 << 40,), np.uint8, chunks=(1 << 20,))  # all zeros, stored in no bytes
+    for act in (io.read, lambda one: list(io.pictures(one)), lambda one: list(io.stream(one))):
+        with pytest.raises(InputError, match=f"'{group}' is a dataset"):
+            act(path)
+
+
 def test_groups_nested_deeply_take_no_time(tmp_path, rng):
     path = tmp_path / "a.h5"
     e = reference_io.events(rng, 300, 48, 36)
