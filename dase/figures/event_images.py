@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import warp as wp
 from numpy.typing import NDArray
 
 from dase.errors import InputError
@@ -16,6 +17,8 @@ from dase.figures import contact_sheet
 from dase.figures.style import Colour
 from dase.io.sequence import Sequence, replacing
 from dase.io.video_writer import VideoCodec, open_video_writer
+from dase.kernels import launch
+from dase.kernels.event_neighbours import list_intervals
 from dase.recordings.statistics import Statistics, sequence_statistics
 
 if TYPE_CHECKING:
@@ -27,12 +30,16 @@ DEFAULT_FRAME_RATE = 30.0
 
 def pixel_intervals(events: Events) -> NDArray[np.float64]:
     """Return the times between successive events of one pixel [s], over all pixels, in no useful order."""
-    # one sort of (pixel, index) in 64 bits is several times faster than a stable argsort of the pixels
-    key = ((events.y.astype(np.int64) * events.width + events.x) << 32) | np.arange(len(events))
-    key.sort()
-    pixel, time = key >> 32, events.t[key & 0xFFFFFFFF]
-    between: NDArray[np.float64] = np.diff(time)[pixel[1:] == pixel[:-1]]
-    return between
+    between = np.empty(len(events))
+    found = np.zeros(1, np.int64)
+    last = np.full(events.width * events.height, np.nan)
+    cpu = launch.find_device("cpu")
+    columns = ((events.t, wp.float64), (events.x, wp.uint16), (events.y, wp.uint16))
+    seen = [wp.array(values, dtype=kind, device=cpu, copy=False) for values, kind in columns]
+    kept = ((last, wp.float64), (found, wp.int64), (between, wp.float64))
+    out = [wp.array(values, dtype=kind, device=cpu, copy=False) for values, kind in kept]
+    wp.launch(list_intervals, dim=1, inputs=[*seen, events.width, *out], device=cpu)
+    return between[: int(found[0])]
 
 
 def default_window(sequence: Sequence) -> float:

@@ -14,6 +14,7 @@ from typing import Any, BinaryIO
 
 import h5py
 import numpy as np
+from isal import isal_zlib
 from numpy.typing import NDArray
 
 from dase.errors import InputError
@@ -49,6 +50,9 @@ class Hdf5Checks:
 
     settled: int = 2_000_000_000
     """Age of a change from which on the next has another time, however coarse the clock of the disk [ns]."""
+
+    slack: int = 1 << 10
+    """Bytes by which what is packed may be longer than twice what it holds."""
 
 
 CHECKS = Hdf5Checks()
@@ -382,8 +386,61 @@ def read_columns(
         if len(column) != length:
             raise InputError(f"'{name}' has {len(column)} entries, '{names[0]}' {length}")
     for i in range(0, length, PART):
-        t, x, y, *others = (column[i : i + PART] for column in found)
+        t, x, y, *others = (read_slice(column, i, i + PART) for column in found)
         yield t, checked_coordinates(x, names[1]), checked_coordinates(y, names[2]), *others
+
+
+def read_slice(column: Any, begin: int = 0, end: int | None = None) -> NDArray[Any]:
+    """Return values of a column of h5py, shape (n,), as `column[begin:end]` does."""
+    end = len(column) if end is None else min(end, len(column))
+    with suppress(Exception):  # whatever is damaged: HDF5 finds it, too, and says what it is
+        values = unpack_chunks(column, begin, end)
+        if values is not None:
+            return values
+    return np.asarray(column[begin:end])
+
+
+def unpack_chunks(column: Any, begin: int, end: int) -> NDArray[Any] | None:
+    """Return values of a column that is deflated, unpacked by ISA-L in a third of the time that HDF5 takes.
+
+    Args:
+        column: Of h5py, shape (N,).
+        begin: First value.
+        end: Last value and one, at most N.
+
+    Returns:
+        Shape (end - begin,); None where the column is packed in another way, or its packing is damaged.
+    """
+    properties, kind = column.id.get_create_plist(), column.dtype
+    filters = [properties.get_filter(k)[0] for k in range(properties.get_nfilters())]
+    shuffled = filters == [h5py.h5z.FILTER_SHUFFLE, h5py.h5z.FILTER_DEFLATE]
+    plain = column.id.get_type() == h5py.h5t.py_create(kind, logical=True) and kind.isnative
+    if not (shuffled or filters == [h5py.h5z.FILTER_DEFLATE]) or column.ndim != 1 or not plain:
+        return None
+    size = column.chunks[0]
+    length, first = size * kind.itemsize, begin // size * size
+    chunks = range(first, end, size)
+    out = np.empty((len(chunks), size, kind.itemsize), np.uint8)
+    for number, start in enumerate(chunks):
+        # a length that is damaged would be taken as memory
+        if column.id.get_chunk_info_by_coord((start,)).size > 2 * length + CHECKS.slack:
+            return None
+        skipped, data = column.id.read_direct_chunk((start,))
+        unpacker = isal_zlib.decompressobj()
+        # one byte more shows what is too long, and asks for the checksum behind the last one
+        unpacked = unpacker.decompress(data, length + 1)
+        if skipped or len(unpacked) != length or not unpacker.eof:
+            return None
+        values = np.frombuffer(unpacked, np.uint8)
+        if shuffled:
+            for place, plane in enumerate(values.reshape(kind.itemsize, size)):
+                out[number, :, place] = plane
+        else:
+            out[number] = values.reshape(size, kind.itemsize)
+    if kind.kind == "b" and out.max(initial=0) > 1:
+        return None
+    unpacked_values: NDArray[Any] = out.reshape(-1).view(kind)
+    return unpacked_values[begin - first : end - first]
 
 
 def find_largest(file: Any, x: str, y: str) -> Size:
@@ -391,7 +448,7 @@ def find_largest(file: Any, x: str, y: str) -> Size:
     out = []
     for name in (x, y):
         column = checked_dataset(file, name, 1)
-        parts = (column[i : i + PART] for i in range(0, len(column), PART))
+        parts = (read_slice(column, i, i + PART) for i in range(0, len(column), PART))
         out.append(max((int(part.max()) for part in parts), default=0) + 1)
     return out[0], out[1]
 

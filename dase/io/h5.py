@@ -348,8 +348,9 @@ def read(source: Source) -> Sequence:
 
 
 def _parse_file(source: Source, file: Any) -> Sequence:
-    t, x, y, p = (columns.checked_dataset(file, f"events/{name}")[:] for name in EVENT_TYPES)
-    label = columns.checked_dataset(file, "events/labels")[:] if "events/labels" in file else None
+    t, x, y, p = (columns.read_slice(columns.checked_dataset(file, f"events/{name}")) for name in EVENT_TYPES)
+    labels = columns.checked_dataset(file, "events/labels") if "events/labels" in file else None
+    label = None if labels is None else columns.read_slice(labels)
     images, flows = numbered_members(file, "images"), numbered_members(file, "flow")
     frames = _stack_members(images, GREYS, 2) if images else None
     flow = _stack_flow(images, flows)

@@ -5,12 +5,14 @@ from __future__ import annotations
 import os
 import struct
 import time
+import zlib
 
 import h5py
 import numpy as np
 import pytest
 from helpers.ecf_files import ecf_buffer
 from helpers.sample_files import H, W, dsec, ecf, events, measured, mvsec, v2e, written
+from isal import isal_zlib
 
 from dase import io
 from dase.errors import InputError
@@ -39,6 +41,64 @@ def test_dsec_with_blosc(tmp_path, rng):
     np.testing.assert_array_equal(got.t, e.t)
     assert (got.width, got.height) == (640, 480)
     assert "t_offset: add 49599.300523 s for the clock of the frames" in notes
+
+
+@pytest.mark.parametrize("shuffle", [True, False])
+@pytest.mark.parametrize("kind", [np.float64, np.int16, np.uint8, np.bool_])
+def test_chunks_are_unpacked_as_by_hdf5(tmp_path, rng, kind, shuffle):
+    values = (200 * rng.random(2500)).astype(kind)
+    with h5py.File(tmp_path / "a.h5", "w") as file:
+        file.create_dataset("a", data=values, chunks=(1000,), compression="gzip", shuffle=shuffle)
+    with h5py.File(tmp_path / "a.h5", "r") as file:
+        for begin, end in ((0, 2500), (0, 1), (999, 2001), (1000, 2000), (2400, 2500), (7, 7)):
+            got = columns.unpack_chunks(file["a"], begin, end)
+            assert got.dtype == values.dtype
+            np.testing.assert_array_equal(got, values[begin:end])
+        np.testing.assert_array_equal(columns.read_slice(file["a"], 2000, 5000), values[2000:])
+        np.testing.assert_array_equal(columns.read_slice(file["a"]), values)
+
+
+@pytest.mark.parametrize("kind", [">i2", "<i4"])
+def test_other_packings_are_left_to_hdf5(tmp_path, rng, kind):
+    values = rng.integers(0, 200, 2500).astype(kind)
+    options = {"compression": "gzip" if kind == ">i2" else "lzf", "shuffle": True, "chunks": (1000,)}
+    with h5py.File(tmp_path / "a.h5", "w") as file:
+        file.create_dataset("a", data=values, **options)
+    with h5py.File(tmp_path / "a.h5", "r") as file:
+        assert columns.unpack_chunks(file["a"], 0, 2500) is None
+        np.testing.assert_array_equal(columns.read_slice(file["a"], 5, 1200), values[5:1200])
+
+
+@pytest.mark.parametrize("damage", ["checksum", "long", "short"])
+def test_damaged_chunks_are_left_to_hdf5(tmp_path, rng, damage):
+    values = rng.integers(0, 200, 1000).astype(np.int16)
+    packed = zlib.compress(values.tobytes()[: {"short": 1998}.get(damage)])
+    packed = zlib.compress(values.tobytes() + b"more") if damage == "long" else packed
+    packed = packed[:-1] + bytes([packed[-1] ^ 1]) if damage == "checksum" else packed
+    with h5py.File(tmp_path / "a.h5", "w") as file:
+        found = file.create_dataset("a", (1000,), np.int16, chunks=(1000,), compression="gzip")
+        found.id.write_direct_chunk((0,), packed)
+    with h5py.File(tmp_path / "a.h5", "r") as file:
+
+        def by_hdf5():
+            try:
+                return file["a"][:]
+            except OSError as error:
+                return str(error)
+
+        def by_us():
+            try:
+                return columns.read_slice(file["a"])
+            except OSError as error:
+                return str(error)
+
+        if damage == "checksum":
+            with pytest.raises(isal_zlib.error):
+                columns.unpack_chunks(file["a"], 0, 1000)
+        else:
+            assert columns.unpack_chunks(file["a"], 0, 1000) is None
+        if damage != "short":  # of which HDF5 leaves the rest as it is in memory
+            np.testing.assert_array_equal(by_us(), by_hdf5())
 
 
 def test_without_the_filter_the_extra_is_named(tmp_path, rng, monkeypatch):
