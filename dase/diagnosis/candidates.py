@@ -25,6 +25,7 @@ from dase.fitting.model import (
 )
 from dase.fitting.scheduler import SimulationRequest, Work, run_side_by_side, run_work, side_by_side_work
 from dase.fitting.subset import CalibratedSubset
+from dase.fitting.trial_sampling import samples_of_screening
 from dase.probes.distance import ErrorScale, Judgement
 from dase.probes.random_streams import SimulationStream
 
@@ -109,6 +110,7 @@ class Screening:
         before: Statistics of the present model there, shape (J,).
         places: In order of their loss, shape (M, P).
         losses: Shape (M,).
+        most: Samples per step that no model exceeded.
     """
 
     effect: Effect
@@ -117,6 +119,7 @@ class Screening:
     before: Array
     places: Array
     losses: Array
+    most: int
 
     @property
     def relative_loss(self) -> float:
@@ -164,10 +167,12 @@ def screen_effect(
     model = with_effect_added(present, effect)
     (before,) = yield [SimulationRequest(half, present.space, present.place[None], seed)]
     few = half.slow(model.space)
+    # most candidates are nothing: the finalists alone are sampled as finely as they need
+    most = samples_of_screening(present.sensor, half.frame.step)
     places, losses = yield from ranking_work(
-        half, model.space, starting_places(model, effect, few=few), seed=seed
+        half, model.space, starting_places(model, effect, few=few), seed=seed, most=most
     )
-    return Screening(effect, model, half, before[0], places, losses)
+    return Screening(effect, model, half, before[0], places, losses, most)
 
 
 def screen_and_descend(
@@ -207,7 +212,9 @@ def descend_from_screening(
     begins = places[[0, *others[: 0 if slow else 1]]]
     ends = yield from side_by_side_work(
         [
-            descent_work(half, space, begin, seed=seed, iterations=3, over=race.over(name, unit))
+            descent_work(
+                half, space, begin, seed=seed, iterations=3, over=race.over(name, unit), most=screening.most
+            )
             for begin in begins
         ]
     )

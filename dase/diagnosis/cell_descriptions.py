@@ -146,7 +146,7 @@ def _ring_words(evidence: SplitMeasurement, n: int) -> StatisticWords:
 
 def _spectrum_words(evidence: SplitMeasurement, n: int) -> StatisticWords:
     if n >= SPECTRUM.count:
-        return "all pixels", f"swing of the net rate at {evidence.peak:.4g} Hz", "share"
+        return "all pixels", f"swing of the net rate at {evidence.peak.frequency:.4g} Hz", "share"
     ends = SPECTRUM.edges(evidence.held.frame.step)
     return "all pixels", f"power of the net rate from {ends[n]:.3g} to {ends[n + 1]:.3g} Hz", "log power"
 

@@ -26,6 +26,7 @@ from dase.fitting.parameter_space import SearchAxis
 from dase.fitting.scene_doubt import misfit_beyond_chance
 from dase.fitting.scheduler import SimulationRequest, Work, run_side_by_side
 from dase.fitting.subset import CalibratedSubset
+from dase.fitting.trial_sampling import samples_of_screening
 from dase.formatting import format_metric
 from dase.probes.distance import Judgement, leaves_nothing, pseudo_huber, reaches_floor
 from dase.probes.random_streams import SimulationStream
@@ -180,6 +181,8 @@ def _limit_work(
     other = with_effect_added(known.model, effect)
     column = [a.name for a in other.space.axes].index(axis.name)
     weak, strong = _range_of(axis)
+    # what an effect does is a difference between two strengths that are sampled alike
+    most = samples_of_screening(known.model.sensor, known.half.frame.step)
 
     def done_work(strengths: Array, turn: int) -> Work[Array]:
         """Return what some strengths do to the statistics, shape (S, R, J) for R repeats."""
@@ -189,7 +192,7 @@ def _limit_work(
         places[:, column] = [weak, *strengths]
         seeds = [SimulationStream.DETECTION.seed(state.seed, settings.repeats * turn + n)
                  for n in range(settings.repeats)]  # fmt: skip
-        values = yield [SimulationRequest(known.half, other.space, places, seed) for seed in seeds]
+        values = yield [SimulationRequest(known.half, other.space, places, seed, most=most) for seed in seeds]
         found = np.stack(values, 1)
         done: Array = found[1:] - found[0]
         return done

@@ -209,7 +209,7 @@ class _StimulusTest:
         found = [self._recordings(number, repeats) for number in range(2)]
         expected = sum(sums.halves.mean(0, dtype=np.float64) for sums in found) / 2
         step = self.standard.step
-        peak = peak_of(sum(sums.clock.sum(0) for sums in found), step)
+        peak = peak_of(sum(sums.clock.sum(0) for sums in found), step).frequency
         frame = StatisticsFrame(np.asarray(expected), self.zone, self.seconds, 0, step, peak, self.regular)
         (a, events), (b, more) = (compute_statistics(sums, frame) for sums in found)
         used = is_compared(a.mean(0), events.mean(0)) | is_compared(b.mean(0), more.mean(0))

@@ -125,6 +125,7 @@ class Observations:
         frame_interval: Time between bursts of the whole array in step with frames [s], 0 for none.
         frame_begin: When one of the bursts of ON events comes [s].
         frame_exposure: From there to the next burst of OFF events [s].
+        peak_chance: Probability that independent events swing as much as these do at `peak_frequency`.
     """
 
     peak_frequency: float
@@ -137,6 +138,7 @@ class Observations:
     frame_interval: float = 0.0
     frame_begin: float = 0.0
     frame_exposure: float = 0.0
+    peak_chance: float = 0.0
 
     @property
     def bus_is_idle(self) -> bool:

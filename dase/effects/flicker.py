@@ -172,7 +172,13 @@ class Flicker(Effect):
 
     @classmethod
     def candidates(cls, observed: Observations) -> list[Self]:
-        """Return lamps of the frequency at which the event rate swings most, as bulbs and LEDs have it."""
+        """Return lamps of the frequency at which the event rate swings most, as bulbs and LEDs have it.
+
+        None where chance alone swings as much. All pixels see a lamp together, so what it does to any of them
+        stands far above chance; and a search among lamps takes longest where events are few.
+        """
+        if observed.peak_chance > 0.01:
+            return []
         return [cls(frequency=observed.peak_frequency, shape=shape) for shape in ("sine", "rectified")]
 
     def compiled(self) -> EffectStages:

@@ -20,7 +20,7 @@ from dase.events import Events
 from dase.fitting.bus_load import BusLoad
 from dase.fitting.parameter_space import SearchAxis
 from dase.fitting.readout_simulator import clock_of, noticeable_effects, pass_readout, simulate_pixels
-from dase.fitting.trial_sampling import samples_per_step_of_rows
+from dase.fitting.trial_sampling import SAMPLES, samples_per_step_of_rows
 from dase.kernels import event_probes as kernels
 from dase.kernels import launch, pixel_codegen_trials
 from dase.probes.accumulators import (
@@ -70,6 +70,7 @@ class SimulationOrder:
         finer: Samples per step; None chooses by each model, and by the one that needs most for repeats.
         frame: What the counts of pixels are folded for; None where that is not known yet.
         ticks: From tick to tick of the clock that stamps the events [s], 0 for none.
+        most: Samples per step that no model exceeds, whatever it needs.
     """
 
     sensor: Sensor
@@ -79,13 +80,14 @@ class SimulationOrder:
     finer: int | None = None
     frame: StatisticsFrame | None = None
     ticks: float = 0.0
+    most: int = SAMPLES[-1]
 
     def samples_per_step(self, step: float) -> NDArray[np.int64]:
         """Return how many samples each vector takes per step of the grid, shape (B,)."""
         rows = len(self.vectors)
         if self.finer is not None:
             return np.full(rows, self.finer)
-        found = samples_per_step_of_rows(self.sensor, self.vectors, step)
+        found = np.minimum(samples_per_step_of_rows(self.sensor, self.vectors, step), self.most)
         return np.full(rows, found.max(initial=0)) if self.reseed else found
 
     def seeds(self) -> NDArray[np.int64]:

@@ -32,7 +32,7 @@ from dase.kernels import event_probes as kernels
 from dase.kernels import launch
 from dase.probes.accumulators import ProbeSums, StatisticsFrame
 from dase.probes.random_streams import Draw
-from dase.probes.statistics import peak_of, refine_frequency, ring_of_pixels
+from dase.probes.statistics import RatePeak, peak_of, refine_frequency, ring_of_pixels
 from dase.probes.stimulus import (
     MASKED,
     STIMULUS,
@@ -95,7 +95,7 @@ class SplitMeasurement:
         scout: Some of the pixels that are fitted, for what need not be exact.
         bands: Intensities between the bands, shape (BANDS - 1,).
         structure: Regularities of the time stamps.
-        peak: Frequency at which the rate swings most [Hz].
+        peak: Frequency at which the rate swings most [Hz], and what chance says of it.
         busiest: Most events per second of all pixels [Hz].
         fastest: Events per second that a bus, if there is one, can send at least [Hz].
         when: Times of the points of the grid on the clock of the scene [s], shape (T,): windows of a long
@@ -111,7 +111,7 @@ class SplitMeasurement:
     scout: PixelSubset
     bands: Array
     structure: TimestampStructure
-    peak: float
+    peak: RatePeak
     highest_event_rate: float
     least_bus_rate: float
     when: Array
@@ -123,7 +123,8 @@ class SplitMeasurement:
         """Return what effects may choose their candidates by, see `Observations`."""
         frames = self.frames
         return Observations(
-            peak_frequency=self.peak,
+            peak_frequency=self.peak.frequency,
+            peak_chance=self.peak.chance,
             clock_period=self.structure.step,
             line_time=self.structure.line,
             scan_direction=self.structure.direction,
@@ -307,13 +308,14 @@ def split_measurement(
     # seen in the fitted half: what judges must not choose
     peak = peak_of(halves[0].found.clock[0], grid.step)
     if lamp is not None:
-        peak = lamp
+        peak = RatePeak(lamp, 0.0)
     elif trust is None:  # else most events are where the scene is not known
-        peak = refine_frequency(events, grid.begin, grid.begin + cut * grid.step, peak)
+        end = grid.begin + cut * grid.step
+        peak = peak._replace(frequency=refine_frequency(events, grid.begin, end, peak.frequency))
     train, held, last_part, scout = (
         replace(
             half,
-            frame=replace(half.frame, peak=peak),
+            frame=replace(half.frame, peak=peak.frequency),
             # where the scene is trusted here and there only, nobody knows what all pixels send
             around=WholeSensor(scene, times_of_grid(scene, grid), seed, device) if trust is None else None,
         )

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from dase.fitting.parameter_space import ParameterSpace
 from dase.fitting.scheduler import SimulationRequest, Work
 from dase.fitting.subset import CalibratedSubset
+from dase.fitting.trial_sampling import SAMPLES
 from dase.probes.distance import ErrorScale
 from dase.probes.random_streams import Draw
 
@@ -100,6 +101,7 @@ def descent_work(
     radius: float = 0.25,
     patient: bool = False,
     over: StopRule | None = None,
+    most: int = SAMPLES[-1],
     settings: DescentSettings = DESCENT,
 ) -> Work[DescentEnd]:
     """Descend from one start, see `run_side_by_side`.
@@ -117,6 +119,7 @@ def descent_work(
         radius: Reach of the first, in the units of `SearchAxis.to_place`.
         patient: Whether populations that still bring the loss down much do not count either.
         over: Asked after each population, with the loss and that before, whether to stop.
+        most: Samples per step that no model exceeds.
         settings: How populations are laid.
     """
     rng = Draw.POPULATION.generator(seed)
@@ -131,7 +134,7 @@ def descent_work(
         # the middle comes first: what a step promised is seen, and it is a place of the next lines as well
         population = np.concatenate([centre[None], centre + reach * _cross_population(rng, len(centre))])
         population = np.clip(population, low, high)
-        (values,) = yield [SimulationRequest(half, space, population, seed)]
+        (values,) = yield [SimulationRequest(half, space, population, seed, most=most)]
         # random numbers are common to all populations, so places of former ones stay comparable
         places, tried = np.concatenate([places, population]), np.concatenate([tried, values])
         losses = half.scale.loss(tried) + distance_penalty(places, start, settings.prior)
@@ -161,7 +164,7 @@ def descent_work(
         if left <= 0:
             break
     # the last step has not been tried yet; it counts only if it is better than all before
-    (final,) = yield [SimulationRequest(half, space, centre[None], seed)]
+    (final,) = yield [SimulationRequest(half, space, centre[None], seed, most=most)]
     places, tried = np.concatenate([places, centre[None]]), np.concatenate([tried, final])
     losses = half.scale.loss(tried) + distance_penalty(places, start, settings.prior)
     leader = int(np.argmin(losses))
@@ -274,11 +277,16 @@ def robust_step(
 
 
 def ranking_work(
-    half: CalibratedSubset, space: ParameterSpace, starts: Sequence[Array] | Array, *, seed: int
+    half: CalibratedSubset,
+    space: ParameterSpace,
+    starts: Sequence[Array] | Array,
+    *,
+    seed: int,
+    most: int = SAMPLES[-1],
 ) -> Work[tuple[Array, Array]]:
     """Return places in order of their loss, shape (M, P), and the losses, (M,); see `scheduler`."""
     places = np.atleast_2d(np.asarray(starts))
-    (values,) = yield [SimulationRequest(half, space, places, seed)]
+    (values,) = yield [SimulationRequest(half, space, places, seed, most=most)]
     losses = half.scale.loss(values)
     order = np.argsort(losses)
     return places[order], losses[order]

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from dase.fitting.batch_simulator import BatchSimulator, SimulationOrder
 from dase.fitting.parameter_space import ParameterSpace
+from dase.fitting.trial_sampling import SAMPLES
 from dase.probes.accumulators import ProbeSums, ProbeTotals, compute_totals
 from dase.probes.statistics import compute_statistics
 
@@ -38,6 +39,7 @@ class SimulationRequest:
         seed: Of the random numbers.
         repeats: Whether each model gets random numbers of its own. Then the answer is sums, else statistics,
             shape (B, J).
+        most: Samples per step that no model exceeds, whatever it needs.
     """
 
     half: PixelSubset
@@ -45,6 +47,7 @@ class SimulationRequest:
     places: Array
     seed: int
     repeats: bool = False
+    most: int = SAMPLES[-1]
 
 
 Work = Generator[list[SimulationRequest], list[Any], Result]
@@ -106,7 +109,8 @@ def answer_requests(asks: Sequence[SimulationRequest]) -> list[Any]:
         if ticks and trials.has_free_readout(ask.space.sensor, ask.space.axes):
             ticks = None
         vectors = ask.space.vectors(ask.places)
-        order = SimulationOrder(ask.space.sensor, vectors, ask.seed, ask.repeats, None, frame, ticks or 0.0)
+        sensor, clock = ask.space.sensor, ticks or 0.0
+        order = SimulationOrder(sensor, vectors, ask.seed, ask.repeats, None, frame, clock, ask.most)
         # events have to go through a readout, which takes ten times as long
         if ticks is None:
             effects = [trials.noticeable_effects(ask.space.at(place)) for place in np.atleast_2d(ask.places)]

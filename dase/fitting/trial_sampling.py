@@ -15,6 +15,9 @@ from dase.simulation.sensor import Sensor
 SAMPLES = (1, 2, 3, 4, 6, 8, 12, 16, 24)
 """Samples per step that are taken: few numbers, so that models run together, and that neighbours of a descent
 mostly share their random numbers. The most shows voltage noise of 3 kHz and lamps of 1.5 kHz at 1 ms."""
+SCREENING_SAMPLES = 4
+"""The most by which candidates are screened: right for voltage noise of 500 Hz and lamps of 250 Hz at 1 ms,
+rough for faster ones. Those that go on are sampled as they need when they are fitted and judged."""
 
 
 def samples_per_step(sensor: Sensor, step: float) -> int:
@@ -25,6 +28,19 @@ def samples_per_step(sensor: Sensor, step: float) -> int:
         step: Of the grid [s].
     """
     return _samples(sensor.longest_step(), step)
+
+
+def samples_of_screening(present: Sensor, step: float) -> int:
+    """Return the most samples per step that models beside a present one take while they are screened.
+
+    No fewer than the present model needs, by whose statistics they are measured: it has lost no events, and
+    candidates that made up for events lost between samples would look better than they are.
+
+    Args:
+        present: The present model.
+        step: Of the grid [s].
+    """
+    return max(SCREENING_SAMPLES, samples_per_step(present, step))
 
 
 def samples_per_step_of_rows(sensor: Sensor, vectors: NDArray[Any], step: float) -> NDArray[np.int64]:

@@ -6,8 +6,10 @@ measurement are compared. Each belongs to a family, a row of `FAMILIES`.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from functools import lru_cache
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -234,8 +236,25 @@ def _swing_basis(peak: float, first: int, count: int, step: float) -> NDArray[np
     return np.stack([np.cos(turn), -np.sin(turn)], 1).astype(np.float32)
 
 
-def peak_of(clock: NDArray[np.int64], step: float) -> float:
-    """Return the frequency at which the net rate swings most above what is usual about it [Hz]."""
+class RatePeak(NamedTuple):
+    """Where the net rate swings most above what is usual about it.
+
+    Args:
+        frequency: There [Hz].
+        chance: Probability that events which know nothing of each other swing as much anywhere.
+    """
+
+    frequency: float
+    chance: float
+
+
+def peak_of(clock: NDArray[np.int64], step: float) -> RatePeak:
+    """Return where the net rate swings most above what is usual about it.
+
+    Args:
+        clock: OFF, then ON events of each step, shape (..., 2 T).
+        step: Of the clock [s].
+    """
     steps = clock.shape[-1] // 2
     net = (clock[..., steps:] - clock[..., :steps]).reshape(-1).astype(np.float64)
     net -= net.mean()
@@ -244,8 +263,16 @@ def peak_of(clock: NDArray[np.int64], step: float) -> float:
     frequency = np.fft.rfftfreq(size, step)
     usual = median_filter(power, 8 * 25, mode="nearest")
     above = power / (usual + 1e-3 * power.max() + 1e-9)
-    above[(frequency < 20.0) | (frequency > 0.48 / step)] = 0.0
-    return float(frequency[int(above.argmax())])
+    inside = (frequency >= 20.0) & (frequency <= 0.48 / step)
+    above[~inside] = 0.0
+    top = int(above.argmax())
+    # the top is chosen where the usual is low by chance as well: what it is compared with is wider
+    around = power[max(top - 8 * 200, 0) : top + 8 * 200]
+    # the power of independent events is exponential, with a median of log 2 means; padded, a maximum lies
+    # between bins, and is that of about twice as many
+    power_in_means = power[top] * math.log(2.0) / (float(np.median(around)) + 1e-9)
+    tones = 2.0 * np.count_nonzero(inside) * steps / size
+    return RatePeak(float(frequency[top]), -math.expm1(-tones * math.exp(-min(power_in_means, 700.0))))
 
 
 def refine_frequency(events: Events, begin: float, end: float, near: float) -> float:

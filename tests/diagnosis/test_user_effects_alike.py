@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import math
 import re
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import ClassVar
 
 import numpy as np
@@ -117,6 +117,8 @@ def test_no_candidate_where_the_measurement_shows_none():
     nothing = Observations(100.0, 0.0, 0.0, "down", 1e3, 1e6, 0.01)
     for effect in (Timestamp, RowScan, Readout):
         assert effect.candidates(nothing) == []
+    assert len(Flicker.candidates(nothing)) > 0
+    assert Flicker.candidates(replace(nothing, peak_chance=0.5)) == []
 
 
 @pytest.mark.parametrize("name", ["flicker", "bandwidth", "hot", "readout", "voltage_noise"])

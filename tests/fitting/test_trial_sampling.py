@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
@@ -11,7 +13,9 @@ from dase.effects.readout import Readout
 from dase.effects.threshold import Threshold
 from dase.effects.voltage_noise import VoltageNoise
 from dase.fitting.batch_simulator import BatchSimulator, SimulationOrder
-from dase.fitting.trial_sampling import samples_per_step, samples_per_step_of_rows
+from dase.fitting.descent import descent_work, ranking_work
+from dase.fitting.parameter_space import ParameterSpace, axes_of
+from dase.fitting.trial_sampling import samples_of_screening, samples_per_step, samples_per_step_of_rows
 from dase.kernels import launch
 from dase.probes.stimulus import Grid, Stimulus, sort_into_cells
 
@@ -85,3 +89,25 @@ def test_models_are_sampled_as_each_of_them_needs(trials):
     # repeats of a model all take the same samples, each with random numbers of its own
     repeats = SimulationOrder(sensor, vectors, 5, reseed=True)
     assert repeats.samples_per_step(STEP).tolist() == [24] * 4
+
+
+def test_screening_samples_no_finer_than_it_has_to(trials):
+    fast = VoltageNoise(cutoff=3000.0)
+    sensor = sensor_with(fast)
+    needed = SimulationOrder(sensor, sensor.parameters()[None]).samples_per_step(STEP)
+    coarse = samples_of_screening(sensor_with(), STEP)
+    assert coarse < needed[0]
+    vector = sensor.parameters()[None]
+    got = trials.run_all([SimulationOrder(sensor, vector, 5, most=coarse)])[0]
+    want = trials.run(sensor, vector, seed=5, finer=coarse)
+    np.testing.assert_array_equal(got.halves, want.halves)
+    # beside a present model that is sampled finely, candidates that are not would lack its events
+    assert samples_of_screening(sensor, STEP) == needed[0]
+
+
+def test_a_search_asks_for_no_more_samples_than_it_was_told(trials):
+    space = ParameterSpace(sensor_with(NOISES[0]), axes_of(sensor_with(NOISES[0]), ["voltage_noise.sigma"]))
+    half = SimpleNamespace(scale=SimpleNamespace(target=np.zeros(3)))
+    works = [descent_work(half, space, np.zeros(1), seed=0, most=n) for n in (3, 24)]
+    works += [ranking_work(half, space, np.zeros((2, 1)), seed=0, most=3)]
+    assert [next(work)[0].most for work in works] == [3, 24, 3]

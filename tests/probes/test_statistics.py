@@ -20,7 +20,7 @@ from dase.fitting.scheduler import answer_requests, run_side_by_side, run_work
 from dase.fitting.trial_sampling import samples_per_step
 from dase.kernels import event_probes as kernels
 from dase.probes.accumulators import GROUP, PROBE_TIMES, compute_totals, leave_groups_out
-from dase.probes.statistics import FAMILIES, LAYOUT, compute_statistics, refine_frequency
+from dase.probes.statistics import FAMILIES, LAYOUT, compute_statistics, peak_of, refine_frequency
 from dase.probes.timestamp_patterns import TimestampStructure, find_structure
 from dase.simulation.sensor import Sensor
 
@@ -373,6 +373,20 @@ def test_a_lamp_is_known_better_than_a_turn_of_the_window(rng, frequency):
     for off in (-0.6, 0.0, 0.8):
         # a window of 0.6 s has frequencies 1.7 Hz apart
         assert refine_frequency(events, 0.0, 0.6, frequency + off) == pytest.approx(frequency, abs=0.08)
+
+
+def test_how_likely_chance_makes_the_highest_peak_of_the_rate(rng):
+    steps, step = 4000, 1e-3
+    chances = np.array([peak_of(rng.poisson(0.5, 2 * steps), step).chance for _ in range(40)])
+    # of independent events a probability is exceeded as often as it says, or less often
+    assert (chances < 0.2).mean() < 0.4
+    assert (chances < 0.01).sum() < 3
+    swing = 0.3 * np.sin(2 * np.pi * 137.3 * step * np.arange(steps))
+    lamp = rng.poisson(0.5 * np.concatenate([1.0 - swing, 1.0 + swing]))
+    found = peak_of(lamp, step)
+    assert found.frequency == pytest.approx(137.3, abs=0.2)
+    assert found.chance < 1e-6
+    assert peak_of(np.zeros(2 * steps, np.int64), step).chance == 1.0
 
 
 def test_slow_clocks_are_seen_in_busy_recordings(rng):
