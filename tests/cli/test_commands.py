@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 import pytest
 from click.testing import CliRunner
-from helpers.command_line import SMALL, dase, one_sentence
+from helpers.command_line import SMALL, dase, one_sentence, refusal
 
 from dase import Events, InputError, io
 from dase.cli import dase_group
@@ -48,7 +48,7 @@ def toml(tmp_path: Path, text: str) -> Path:
 )
 def test_wrong_option(options, message, tmp_path):
     out = tmp_path / "out"
-    assert message in one_sentence(dase("synth", out, *SMALL, *options))
+    assert message in refusal("synth", out, *SMALL, *options)
     assert not out.exists() or not list(out.glob("*"))
 
 
@@ -78,7 +78,7 @@ def test_cuda_without_a_gpu(tmp_path):
     ],
 )
 def test_wrong_sensor(text, message, tmp_path):
-    said = one_sentence(dase("synth", tmp_path / "out", *SMALL, "--sensor", toml(tmp_path, text)))
+    said = refusal("synth", tmp_path / "out", *SMALL, "--sensor", toml(tmp_path, text))
     assert message in said
     assert "sensor.toml" in said
 

@@ -79,7 +79,7 @@ def hidden(scene, device, *effects: Effect, seed: int = 3) -> dase.Events:
     [
         EFFECTS["leak"](rate=4.0),
         pytest.param(EFFECTS["mismatch"](spread=0.25), marks=pytest.mark.slow),
-        EFFECTS["bandwidth"](cutoff=60.0),
+        pytest.param(EFFECTS["bandwidth"](cutoff=60.0), marks=pytest.mark.slow),
     ],
     ids=lambda e: e.name,
 )

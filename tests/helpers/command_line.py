@@ -2,9 +2,14 @@
 
 from __future__ import annotations
 
+import io
 import re
 import subprocess
 import sys
+from contextlib import chdir, redirect_stderr, redirect_stdout
+from unittest.mock import patch
+
+from dase.cli import main
 
 SMALL = ("--size", "32x24", "--duration", "0.1", "--sequences", "1", "--jobs", "1", "--regime", "slow")
 
@@ -20,3 +25,16 @@ def one_sentence(done: subprocess.CompletedProcess[str], code: int = 2) -> str:
     said = [line for line in done.stderr.splitlines() if not re.match(r"Usage:|Try |$", line)]
     assert len(said) == 1, done.stderr
     return said[0]
+
+
+def refusal(*arguments: object, cwd: object = ".") -> str:
+    """Return the one sentence with which a command ends; it runs in this process, which saves a second."""
+    out, err = io.StringIO(), io.StringIO()
+    command = ["dase", *map(str, arguments)]
+    with patch.object(sys, "argv", command), redirect_stdout(out), redirect_stderr(err), chdir(str(cwd)):
+        try:
+            main()
+            code = 0
+        except SystemExit as end:
+            code = end.code
+    return one_sentence(subprocess.CompletedProcess(command, code, out.getvalue(), err.getvalue()))

@@ -35,7 +35,14 @@ def test_one_line_of_50_mb(tmp_path, content):
         io.read(tmp_path / "a.txt")
 
 
-@pytest.mark.parametrize("name", ["a{}.txt", "a{}.npy", "frame_{}.png"])
+@pytest.mark.parametrize(
+    "name",
+    [
+        pytest.param("a{}.txt", marks=pytest.mark.slow),
+        "a{}.npy",
+        pytest.param("frame_{}.png", marks=pytest.mark.slow),
+    ],
+)
 def test_a_zip_of_60_000_members(tmp_path, rng, name):
     e = reference_io.events(rng, 300)
     with zipfile.ZipFile(tmp_path / "a.zip", "w") as archive:

@@ -53,7 +53,12 @@ def test_plain_kernels(name, tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("source", "sink"), [("frames", "counts"), ("layers", "labels"), ("background", "keys")]
+    ("source", "sink"),
+    [
+        pytest.param("frames", "counts", marks=pytest.mark.slow),
+        ("layers", "labels"),
+        pytest.param("background", "keys", marks=pytest.mark.slow),
+    ],
 )
 def test_pixels_with_every_effect(source, sink, tmp_path):
     compiles(pixel_compile.compose_pixels(every().stages(), source, sink).module, tmp_path)
@@ -87,7 +92,7 @@ def test_pictures_of_layers(tmp_path):
     compiles(scene_render.flow_kernel(1).module, tmp_path)
 
 
-@pytest.mark.parametrize("half", [True, False])
+@pytest.mark.parametrize("half", [True, pytest.param(False, marks=pytest.mark.slow)])
 def test_critics(half, tmp_path):
     for kernel in (critic_products.adam_kernels[half], *vars(critic_layers.layer_kernels[half]).values()):
         compiles(kernel.module, tmp_path)

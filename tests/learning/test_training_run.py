@@ -25,7 +25,7 @@ def scenes() -> scene_batches.Scenery:
     return small_scenes()
 
 
-@pytest.mark.parametrize("start", [(0.45, 0.12), (0.09, 0.02)])
+@pytest.mark.parametrize("start", [(0.45, 0.12), pytest.param((0.09, 0.02), marks=pytest.mark.slow)])
 def test_a_wrong_start_is_left_behind(scenes, start):
     training = a_run(scenes, mu=start[0], sigma=start[1], steps=60, warmup=10)
     exam = MapEvaluation(scenes, training.target, scenes=4)
@@ -99,7 +99,13 @@ KINDS = {
 }
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize(
+    "kind",
+    [
+        kind if kind in ("moments", "critics") else pytest.param(kind, marks=pytest.mark.slow)
+        for kind in KINDS
+    ],
+)
 def test_steps_leave_everything_where_it_was(scenes, kind):
     # what is replayed reads and writes the memory of the step that was recorded
     training = a_run(scenes, **KINDS[kind], steps=80, warmup=4)
@@ -155,7 +161,7 @@ def same(one, other) -> bool:
     "changes",
     [
         {"network": NetworkShape(channels=4, depth=1, table=(3, 2), split=True, pattern=(SIDE, SIDE))},
-        WGAN,
+        pytest.param(WGAN, marks=pytest.mark.slow),
         {**WGAN, "optimizer": "adabelief", "adversarial": replace(CRITICS, critic_image=True)},
     ],
     ids=["moments", "wgan", "adabelief"],

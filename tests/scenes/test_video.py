@@ -256,7 +256,7 @@ def test_good_videos_of_every_codec_open(tmp_path, suffix, code):
     [
         ("webm", "VP80", (3840, 2160)),
         ("avi", "MJPG", (3840, 2160)),
-        ("webm", "VP90", (2560, 2556)),
+        pytest.param("webm", "VP90", (2560, 2556), marks=pytest.mark.slow),
     ],
 )
 def test_the_largest_plain_frames_take_little_memory(tmp_path, suffix, code, size):
@@ -275,7 +275,9 @@ print(*shape, peak() - before)
     assert float(grown) < 200
 
 
-@pytest.mark.parametrize(("suffix", "code"), [("webm", "VP80"), ("webm", "VP90")])
+@pytest.mark.parametrize(
+    ("suffix", "code"), [("webm", "VP80"), pytest.param("webm", "VP90", marks=pytest.mark.slow)]
+)
 def test_small_files_of_huge_frames_are_refused_before_decoding(tmp_path, suffix, code):
     path = written(tmp_path / f"a.{suffix}", code, (8192, 4096), (0,))
     script = """

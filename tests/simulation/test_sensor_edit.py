@@ -7,7 +7,7 @@ import datetime
 import cv2
 import numpy as np
 import pytest
-from helpers.command_line import dase, one_sentence
+from helpers.command_line import dase, one_sentence, refusal
 
 from dase import InputError, Sensor, VideoScene, dump_sensor, io, load_sensor, simulate
 from dase.diagnosis.sensor_update import round_parameters
@@ -207,7 +207,7 @@ def test_values():
 )
 def test_wrong_command(arguments, message, tmp_path):
     (tmp_path / "mine.toml").write_text(MINE)
-    assert message in one_sentence(dase(*arguments, cwd=tmp_path))
+    assert message in refusal(*arguments, cwd=tmp_path)
     assert [p.name for p in tmp_path.iterdir()] == ["mine.toml"]
     assert (tmp_path / "mine.toml").read_text() == MINE
 
