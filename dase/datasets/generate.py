@@ -26,6 +26,7 @@ from dase.files.folder_lock import locking_folder
 from dase.files.text_files import read_text_file
 from dase.io.source import Source
 from dase.kernels import launch
+from dase.kernels.threads import thread_count
 from dase.scenes import image_sources, random_scenes
 from dase.scenes.layers import LayerScene
 from dase.scenes.scene import Scene
@@ -257,8 +258,10 @@ def _make_sequences(
     _warm_up(job)
     context = get_context("spawn")
     stop = context.RawValue("b", 0)  # no lock with it, which a worker that is killed could hold for ever
+    # what cores are left beside the processes pack; a GPU leaves nearly all of them
+    threads = max(thread_count() // jobs, 1)
     pool = ProcessPoolExecutor(
-        jobs, mp_context=context, initializer=_begin_worker, initargs=(os.getpid(), stop)
+        jobs, mp_context=context, initializer=_begin_worker, initargs=(os.getpid(), stop, threads)
     )
     try:
         with ignore_interrupt():
@@ -294,10 +297,10 @@ def _warm_up(job: DatasetJob) -> None:
     run.thresholds()
 
 
-def _begin_worker(parent: int, stop: Any) -> None:
+def _begin_worker(parent: int, stop: Any, threads: int) -> None:
     global _life
-    # the processes share the cores already; threads of each would compete for them
-    launch.set_threads(1)
+    # the processes share the cores: more threads of each would compete for them
+    launch.set_threads(threads)
     _life = WorkerLife(parent, stop)
 
 
