@@ -324,6 +324,8 @@ def run_files(name: str, folder: Path, files: int, seed: int, keep: Path, told, 
             outcome = read_any(name, sample, number)
             if opened():
                 raise AssertionError("another file was opened")
+            if h5py.h5f.get_obj_count(h5py.h5f.OBJ_ALL, h5py.h5f.OBJ_FILE):
+                raise AssertionError("the file was left open")
         except BaseException as error:
             errors.put(f"file {number}: {type(error).__name__}: {error}")
         end, grown = time.process_time(), memory.peak() - before

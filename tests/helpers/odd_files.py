@@ -115,7 +115,8 @@ def tangle(path: Path, target: Path, rng: np.random.Generator) -> None:
         target: A file that must not be opened; links lead to it.
         rng: Random numbers.
     """
-    with h5py.File(path, "a") as file:
+    # in memory, and written once: thousands of links one by one are as many system calls
+    with h5py.File(path, "a", driver="core") as file:
         names: list[str] = []
         file.visit(names.append)
         for _ in range(rng.integers(1, 5)):
