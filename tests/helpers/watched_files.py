@@ -5,6 +5,7 @@ from __future__ import annotations
 import ctypes
 import os
 import sys
+import weakref
 from collections.abc import Callable
 from pathlib import Path
 
@@ -18,7 +19,7 @@ def opens_of(path: Path) -> Callable[[], bool]:
         return lambda: False
     libc = ctypes.CDLL(None, use_errno=True)
     watch = libc.inotify_init1(os.O_NONBLOCK)
-    if libc.inotify_add_watch(watch, os.fsencode(path), 0x20) < 0:  # IN_OPEN
+    if watch < 0 or libc.inotify_add_watch(watch, os.fsencode(path), 0x20) < 0:  # IN_OPEN
         raise OSError(ctypes.get_errno(), f"cannot watch {path}")
 
     def opened() -> bool:
@@ -27,4 +28,6 @@ def opens_of(path: Path) -> Callable[[], bool]:
         except BlockingIOError:
             return False
 
+    # a user has 128 of them at once, in all processes
+    weakref.finalize(opened, os.close, watch)
     return opened
