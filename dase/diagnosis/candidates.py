@@ -25,7 +25,7 @@ from dase.fitting.model import (
 )
 from dase.fitting.scheduler import SimulationRequest, Work, run_side_by_side, run_work, side_by_side_work
 from dase.fitting.subset import CalibratedSubset
-from dase.fitting.trial_sampling import samples_of_screening
+from dase.fitting.trial_sampling import SAMPLES, samples_of_screening, samples_per_step
 from dase.probes.distance import ErrorScale, Judgement
 from dase.probes.random_streams import SimulationStream
 
@@ -227,7 +227,12 @@ def descend_from_screening(
 
 
 def refine_candidate(
-    evidence: CalibratedSplit, tried: Candidate, race: CandidateRace, *, seed: int
+    evidence: CalibratedSplit,
+    tried: Candidate,
+    race: CandidateRace,
+    *,
+    seed: int,
+    most: int = SAMPLES[-1],
 ) -> Work[Candidate]:
     """Fit a candidate to all pixels of the training half, by the sampling errors of the present model."""
     # a finalist that is still on its way would be judged by where it happens to be
@@ -238,7 +243,15 @@ def refine_candidate(
         over = race.over(tried.name)
         works.append(
             descent_work(
-                half, way.space, way.place, seed=seed, iterations=3, radius=0.2, patient=True, over=over
+                half,
+                way.space,
+                way.place,
+                seed=seed,
+                iterations=3,
+                radius=0.2,
+                patient=True,
+                over=over,
+                most=most,
             )
         )
     ends = yield from side_by_side_work(works)
@@ -343,8 +356,7 @@ def try_effects(
     first = order[: settings.finalists]
     chosen = [*first, *family_specialists(order, first, worst)]
     report(f"fitting {', '.join(one.name for one in chosen)}", 0.5)
-    last = CandidateRace(1, settings.gives_up)
-    refined = run_side_by_side([refine_candidate(evidence, one, last, seed=seed) for one in chosen])
+    refined, behind = _refine_candidates(evidence, present, chosen, seed=seed, settings=settings)
     finalists = with_p_values(evidence, present, refined, seed=seed)
     # what chance does as well is not added, whatever its error; few repeats cannot give a small p-value
     significant = max(settings.significant, 1.01 / (1 + len(evidence.train.repeats)))
@@ -353,7 +365,38 @@ def try_effects(
     done = refit_and_judge(evidence, certain, seed=seed, settings=settings) if certain else []
     done += [one for one in finalists if one not in certain]
     done.sort(key=lambda one: (one.error if one.judgement else np.inf, one.p_value))
-    return [*done, *(one for one in order if one not in chosen), *left]
+    return [*done, *behind, *(one for one in order if one not in chosen), *left]
+
+
+def _refine_candidates(
+    evidence: CalibratedSplit,
+    present: FittedModel,
+    chosen: Sequence[Candidate],
+    *,
+    seed: int,
+    settings: CandidateSettings,
+) -> tuple[list[Candidate], list[Candidate]]:
+    """Fit candidates, sampled as finely as each needs; return them and those that are far behind.
+
+    A candidate that needs many samples, fast voltage noise above all, takes longer than all others together.
+    It is fitted with few of them first, and goes on where that takes it near the best.
+    """
+    step = evidence.train.frame.step
+    most = samples_of_screening(present.sensor, step)
+
+    def refined(candidates: Sequence[Candidate], samples: int) -> list[Candidate]:
+        race = CandidateRace(1, settings.gives_up)
+        works = [refine_candidate(evidence, one, race, seed=seed, most=samples) for one in candidates]
+        return run_side_by_side(works)
+
+    first = refined(chosen, most)
+    rough = [one for one in first if samples_per_step(one.model.sensor, step) > most]
+    limit = settings.gives_up * min((one.training_loss for one in first), default=np.inf)
+    finer = refined([one for one in rough if one.training_loss <= limit], SAMPLES[-1])
+    return (
+        [one for one in first if one not in rough] + finer,
+        [one for one in rough if one.training_loss > limit],
+    )
 
 
 def _screen_variants(
