@@ -392,11 +392,10 @@ def _refine_candidates(
     first = refined(chosen, most)
     rough = [one for one in first if samples_per_step(one.model.sensor, step) > most]
     limit = settings.gives_up * min((one.training_loss for one in first), default=np.inf)
-    finer = refined([one for one in rough if one.training_loss <= limit], SAMPLES[-1])
-    return (
-        [one for one in first if one not in rough] + finer,
-        [one for one in rough if one.training_loss > limit],
-    )
+    behind = [one for one in rough if one.training_loss > limit]
+    # from where screening left them: a coarse fit has made up for events that it had lost between samples
+    again = [was for was, one in zip(chosen, first, strict=True) if one in rough and one not in behind]
+    return [one for one in first if one not in rough] + refined(again, SAMPLES[-1]), behind
 
 
 def _screen_variants(
