@@ -71,6 +71,7 @@ def test_pixels_differ_as_the_maps_say(scenes):
     assert not torch.equal(plain.count(log, maps), plain.count(log, maps))
 
 
+@pytest.mark.slow
 def test_thresholds_beside_a_slow_photoreceptor(scenes, tmp_path):
     """With what is known of the camera the thresholds are its own, without they make up for it."""
     target = simulate_target(SLOW, scenes, 24, seed=5)
