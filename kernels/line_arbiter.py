@@ -22,6 +22,9 @@ class PixelColumn(IntEnum):
     FREED = 1
     """When it was let go."""
 
+    INTERVAL = 2
+    """From the event before to the last one where both had one polarity, else 0."""
+
 
 class PixelByte(IntEnum):
     """Bytes of a pixel that are set from outside."""

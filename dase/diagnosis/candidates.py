@@ -227,14 +227,17 @@ def descend_from_screening(
 
 
 def refine_candidate(
-    evidence: CalibratedSplit,
-    tried: Candidate,
-    race: CandidateRace,
-    *,
-    seed: int,
-    most: int = SAMPLES[-1],
+    evidence: CalibratedSplit, tried: Candidate, race: CandidateRace, *, seed: int, most: int
 ) -> Work[Candidate]:
-    """Fit a candidate to all pixels of the training half, by the sampling errors of the present model."""
+    """Fit a candidate to all pixels of the training half, by the sampling errors of the present model.
+
+    Args:
+        evidence: The measurement.
+        tried: The candidate.
+        race: By which it is stopped where it is far behind.
+        seed: Of the random numbers.
+        most: Samples per step that no model exceeds.
+    """
     # a finalist that is still on its way would be judged by where it happens to be
     half = evidence.train.loaded(tried.model.space, tried.model.place)
     ways = shift_periodic_effects(tried.model, half.frame.step)

@@ -70,7 +70,7 @@ class LineArbiter(SharedReader):
         self._shift = (across - 1).bit_length()
         size = lines << self._shift
         self._labelled = False
-        known, numbers = np.zeros((size, 4), np.int64), np.zeros(9, np.int64)
+        known, numbers = np.zeros((size, 4), np.int64), np.zeros(len(ArbiterNumber), np.int64)
         known[:, [PixelColumn.LAST, PixelColumn.FREED]] = line_arbiter.NEVER
         numbers[ArbiterNumber.FREE] = line_arbiter.NEVER
         room = 2 * width * height + 64  # requests that come late, those taken back among them

@@ -9,6 +9,8 @@ import sys
 from contextlib import chdir, redirect_stderr, redirect_stdout
 from unittest.mock import patch
 
+import pytest
+
 from dase.cli import main
 
 SMALL = ("--size", "32x24", "--duration", "0.1", "--sequences", "1", "--jobs", "1", "--regime", "slow")
@@ -31,10 +33,13 @@ def refusal(*arguments: object, cwd: object = ".") -> str:
     """Return the one sentence with which a command ends; it runs in this process, which saves a second."""
     out, err = io.StringIO(), io.StringIO()
     command = ["dase", *map(str, arguments)]
-    with patch.object(sys, "argv", command), redirect_stdout(out), redirect_stderr(err), chdir(str(cwd)):
-        try:
-            main()
-            code = 0
-        except SystemExit as end:
-            code = end.code
-    return one_sentence(subprocess.CompletedProcess(command, code, out.getvalue(), err.getvalue()))
+    with (
+        patch.object(sys, "argv", command),
+        redirect_stdout(out),
+        redirect_stderr(err),
+        chdir(str(cwd)),
+        pytest.raises(SystemExit) as end,
+    ):
+        main()
+    done = subprocess.CompletedProcess(command, end.value.code, out.getvalue(), err.getvalue())
+    return one_sentence(done)

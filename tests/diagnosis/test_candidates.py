@@ -1,0 +1,51 @@
+"""Candidates that need many samples in time: how they are fitted."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from types import SimpleNamespace
+
+from dase.diagnosis import candidates
+from dase.diagnosis.candidates import Candidate
+from dase.diagnosis.settings import DEFAULTS
+from dase.effects.leak import Leak
+from dase.effects.threshold import Threshold
+from dase.effects.voltage_noise import VoltageNoise
+from dase.fitting.trial_sampling import SAMPLES, samples_of_screening
+from dase.simulation.sensor import Sensor
+
+STEP = 1e-3
+COARSE_LOSS = {"leak": 5.0, "near": 6.0, "far": 100.0}
+"""Of each candidate where it is sampled coarsely; only `near` is worth being sampled finely."""
+
+
+def test_what_a_coarse_fit_takes_near_the_best_is_fitted_again_from_where_screening_left_it(monkeypatch):
+    """A coarse fit makes up for events that are lost between samples: it is no place to begin from."""
+    fast = VoltageNoise(cutoff=2500.0)
+    effects = {"leak": Leak(), "near": fast, "far": fast}
+    chosen = [
+        Candidate(name, SimpleNamespace(sensor=Sensor((Threshold(), effect)), place="screened"), 50.0)
+        for name, effect in effects.items()
+    ]
+    begun = []
+
+    def fit(evidence, tried, race, *, seed, most):
+        begun.append((tried.name, tried.model.place, most))
+        ended = SimpleNamespace(sensor=tried.model.sensor, place=f"fitted with {most}")
+        return replace(tried, model=ended, training_loss=COARSE_LOSS[tried.name])
+        yield
+
+    monkeypatch.setattr(candidates, "refine_candidate", fit)
+    evidence = SimpleNamespace(train=SimpleNamespace(frame=SimpleNamespace(step=STEP)))
+    present = SimpleNamespace(sensor=Sensor((Threshold(),)))
+    coarse = samples_of_screening(present.sensor, STEP)
+    refined, behind = candidates._refine_candidates(
+        evidence, present, chosen, seed=0, settings=DEFAULTS.candidates
+    )
+    assert sorted(begun[:3]) == sorted((name, "screened", coarse) for name in effects)
+    assert begun[3:] == [("near", "screened", SAMPLES[-1])]
+    assert [(one.name, one.model.place) for one in refined] == [
+        ("leak", f"fitted with {coarse}"),
+        ("near", f"fitted with {SAMPLES[-1]}"),
+    ]
+    assert [one.name for one in behind] == ["far"]
