@@ -319,7 +319,7 @@ def run_files(name: str, folder: Path, files: int, seed: int, keep: Path, told, 
         path = write_damaged(name, inner, number, seed)
         opened()  # by the making
         memory.forget()  # what making it took
-        begin, outcome = time.process_time(), FAILED
+        begin = time.process_time()
         try:
             outcome = read_any(name, sample, number)
             if opened():
@@ -327,6 +327,7 @@ def run_files(name: str, folder: Path, files: int, seed: int, keep: Path, told, 
             if h5py.h5f.get_obj_count(h5py.h5f.OBJ_ALL, h5py.h5f.OBJ_FILE):
                 raise AssertionError("the file was left open")
         except BaseException as error:
+            outcome = FAILED
             errors.put(f"file {number}: {type(error).__name__}: {error}")
         end, grown = time.process_time(), memory.peak() - before
         if end - begin > SLOW or grown > MEMORY:

@@ -48,7 +48,7 @@ from dase.io import (
 from dase.io import h5 as h5
 from dase.io import npz as npz
 from dase.io.format import Format as Format
-from dase.io.format import collect_pictures, sequence_of
+from dase.io.format import closed_after, collect_pictures, sequence_of
 from dase.io.parts import cut_beside, cut_motion, cut_pictures, cut_sequence, cut_stream, note_part
 from dase.io.rules import TooLateError
 from dase.io.sequence import Sequence as Sequence
@@ -137,10 +137,12 @@ def read(
         if "flow" in format.keeps:  # which a stream does not give without frames
             return cut_sequence(source, format.read(source), part)
         try:
-            events = Events.concatenate(cut_stream(format.stream(source, CHUNK), part, CHUNK))
+            with closed_after(format.stream(source, CHUNK)) as chunks:
+                events = Events.concatenate(cut_stream(chunks, part, CHUNK))
         except TooLateError:
             return cut_sequence(source, format.read(source), part)
-        frames = collect_pictures(cut_pictures(source, format.pictures(source), part))
+        with closed_after(format.pictures(source)) as pictures:
+            frames = collect_pictures(cut_pictures(source, pictures, part))
         return sequence_of(events, frames)
 
 
@@ -175,8 +177,8 @@ def _stream_part(format: Format, source: Source, chunk: int) -> Iterator[Events]
         yield from format.stream(source, chunk)
         return
     note_part(source, source.part)
-    with reading_file(source.path, format.name):
-        yield from cut_stream(format.stream(source, chunk), source.part, chunk)
+    with reading_file(source.path, format.name), closed_after(format.stream(source, chunk)) as chunks:
+        yield from cut_stream(chunks, source.part, chunk)
 
 
 def pictures(
@@ -201,8 +203,8 @@ def _picture_part(format: Format, source: Source) -> Iterator[Picture]:
     if source.part is None:
         yield from format.pictures(source)
         return
-    with reading_file(source.path, format.name):
-        yield from cut_pictures(source, format.pictures(source), source.part)
+    with reading_file(source.path, format.name), closed_after(format.pictures(source)) as pictures:
+        yield from cut_pictures(source, pictures, source.part)
 
 
 def motion(

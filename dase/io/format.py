@@ -7,11 +7,11 @@ sorted within `LATENESS`, in memory that does not grow with the file. Frames com
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator
-from contextlib import AbstractContextManager
+from collections.abc import Callable, Generator, Iterable, Iterator
+from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,6 +23,22 @@ from dase.io.sequence import Sequence, Writer, reading_file
 from dase.io.source import Beside, Motion, Picture, Piece, Size, Source, checked_size, guess_size, join_pieces
 
 LIMIT = 4 << 30  # [bytes] of frames, or of flow, taken into memory
+
+Read = TypeVar("Read")
+
+
+@contextmanager
+def closed_after(items: Iterator[Read]) -> Iterator[Iterator[Read]]:
+    """Let go of the file that is being read, at the end of a block.
+
+    Where a later step refuses what was read, the error holds all steps, and the first one the file: until
+    the error is forgotten, and from Python 3.12 on until cycles are collected.
+    """
+    try:
+        yield items
+    finally:
+        if isinstance(items, Generator):
+            items.close()
 
 
 def no_pictures(source: Source) -> Iterator[Picture]:
@@ -98,17 +114,19 @@ class _Reader:
     def read(self, source: Source) -> Sequence:
         with reading_file(source.path, self.name):
             size = self._sensor(source)
-            frames = collect_pictures(_keep_fitting(source, self.pictures(source), size))
-            return _read_whole(source, self.pieces(source), frames, size, self.ticks)
+            with closed_after(self.pictures(source)) as pictures:
+                frames = collect_pictures(_keep_fitting(source, pictures, size))
+            with closed_after(self.pieces(source)) as pieces:
+                return _read_whole(source, pieces, frames, size, self.ticks)
 
     def stream(self, source: Source, chunk: int) -> Iterator[Events]:
-        with reading_file(source.path, self.name):
-            yield from _stream_events(source, self.pieces(source), self._sensor(source), self.ticks, chunk)
+        with reading_file(source.path, self.name), closed_after(self.pieces(source)) as pieces:
+            yield from _stream_events(source, pieces, self._sensor(source), self.ticks, chunk)
 
     def shown(self, source: Source) -> Iterator[Picture]:
-        with reading_file(source.path, self.name):
+        with reading_file(source.path, self.name), closed_after(self.pictures(source)) as pictures:
             size, zero = self._sensor(source), None
-            for picture in _keep_fitting(source, self.pictures(source), size):
+            for picture in _keep_fitting(source, pictures, size):
                 zero = self._begin(source, size, np.array([picture.t])) if zero is None else zero
                 yield picture._replace(t=(picture.t - zero) / self.ticks)
 
@@ -117,7 +135,8 @@ class _Reader:
             found = self.motion(source)
             if found is None:
                 return None
-            first = next(iter(self.pictures(source)), None)
+            with closed_after(self.pictures(source)) as pictures:
+                first = next(pictures, None)
             times = found.t if first is None else np.array([first.t])
             zero = self._begin(source, self._sensor(source), times)
             return found._replace(t=(found.t - zero) / self.ticks)
@@ -129,12 +148,15 @@ class _Reader:
         return checked_size(known)
 
     def _extent(self, source: Source) -> Size:
-        return find_extent(self.pieces(source))
+        with closed_after(self.pieces(source)) as pieces:
+            return find_extent(pieces)
 
     def _begin(self, source: Source, size: Size, without_events: NDArray[Any]) -> Any:
         """Return the tick of time zero: of the first event, else of these times."""
-        settled = rules.settle_pieces(source, self.pieces(source), size, self.ticks)
-        first = next((piece.t for piece in rules.order_pieces(source, settled, self.ticks)), without_events)
+        with closed_after(self.pieces(source)) as pieces:
+            settled = rules.settle_pieces(source, pieces, size, self.ticks)
+            ordered = rules.order_pieces(source, settled, self.ticks)
+            first = next((piece.t for piece in ordered), without_events)
         return rules.find_origin(source, first, self.ticks)
 
 

@@ -272,6 +272,21 @@ def test_layouts_nobody_knows(tmp_path):
 
 
 @pytest.mark.parametrize(
+    "act", [io.read, lambda path: list(io.stream(path)), lambda path: list(io.pictures(path))]
+)
+def test_a_refused_file_is_let_go_of(tmp_path, rng, act):
+    """Not when the error, which holds the frames of all functions, is forgotten."""
+    frames = np.array([0.1, 0.2]), np.zeros((2, H, W), np.uint8)
+    mvsec(tmp_path / "a.hdf5", events(rng, 500), frames=frames)
+    with h5py.File(tmp_path / "a.hdf5", "r+") as file:
+        file["davis/left/events"][490, 2] = np.nan
+    with pytest.raises(InputError, match="a time is not a finite number") as held:
+        act(tmp_path / "a.hdf5")
+    assert held.value.__traceback__ is not None
+    assert h5py.h5f.get_obj_count(h5py.h5f.OBJ_ALL, h5py.h5f.OBJ_FILE) == 0
+
+
+@pytest.mark.parametrize(
     ("make", "change", "match"),
     [
         (dsec, ("events/x", np.zeros(7, np.uint16)), "'events/x' has 7 entries"),
