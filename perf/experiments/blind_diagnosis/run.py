@@ -258,7 +258,10 @@ def run_case(job: Job) -> Line:
 
 
 def cases(options: argparse.Namespace) -> Iterator[Case]:
-    """Yield the runs that are asked for: kinds take turns, each in proportion to what it has to do."""
+    """Yield the runs that are asked for: rows of the table take turns, each in an order that the key draws.
+
+    So what was reached in some minutes has its share of every row, and is no choice of effects.
+    """
     from perf.experiments.blind_diagnosis import foreign
 
     rng = np.random.default_rng([number_of(options.key), 4])
@@ -292,10 +295,14 @@ def cases(options: argparse.Namespace) -> Iterator[Case]:
             add("foreign", _together(rng, list(foreign.HIDEABLE), 2), "drawn")
     found = sorted(options.hidden.glob("[a-z]_*.npz")) if options.hidden else ()
     kinds["other"] = [Case("other", (), path.stem, 0) for path in found]
-    asked = options.kinds.split(",")
+    rows: dict[str, list[Case]] = {}
+    for kind in (kind for kind in KINDS if kind in options.kinds.split(",")):
+        for case in kinds[kind]:
+            part = case.strength if kind in ("single", "unknown") else str(len(case.effects))
+            rows.setdefault(f"{kind} {part}", []).append(case)
     turns = [
-        ((n + 0.5) / len(group), kind, case)
-        for kind, group in kinds.items() if kind in asked for n, case in enumerate(group)
+        ((n + 0.5) / len(row), name, row[k])
+        for name, row in rows.items() for n, k in enumerate(rng.permutation(len(row)))
     ]  # fmt: skip
     yield from (case for _, _, case in sorted(turns, key=lambda turn: turn[:2]))
 
