@@ -6,9 +6,11 @@
     python -m perf.fuzz_io --jobs 16 --minutes 9 --state out/fuzz.json   call again to go on
 
 Files are damaged in memory, lie on a disk in memory, and are read whole and as a stream by turns. Every
-format runs in a process of its own that a second one watches: a crash, or a file that takes too long or too
-much memory, is counted and kept as `fuzz_FORMAT_N` in the folder named by --keep, and the run goes on with
-the next file. Each file has random numbers of its own, so any one can be made again. Prints Markdown.
+block of files runs in a process of its own that a second one watches: a crash, or a file that takes too long
+or too much memory, is counted and kept as `fuzz_FORMAT_N` in the folder named by --keep, and the run goes on
+with the next file. Processes are forked from one that has imported everything: importing would take as long
+as a block does. Formats are read in the order of --format. Each file has random numbers of its own, so any
+one can be made again. Prints Markdown.
 """
 
 from __future__ import annotations
@@ -183,6 +185,11 @@ NEEDS = {
 """Packages without which a sample cannot be made or read."""
 BLOCK = 2500
 """Files that a process reads before it ends, where several work side by side."""
+IMPORTED = (
+    *("perf.benchmarks.kernels", "cv2", "pytest", "dase.scenes.image_sources", "dase.networks.weights_file"),
+    *sorted(set(NEEDS.values())),
+)
+"""What a process finds imported when it begins, where there is such a package."""
 W, H = 48, 36
 
 
@@ -191,6 +198,7 @@ class Memory:
 
     def __init__(self) -> None:
         self._status = os.open("/proc/self/status", os.O_RDONLY)
+        self._clear = os.open("/proc/self/clear_refs", os.O_WRONLY)
 
     def peak(self) -> float:
         """Return the largest so far."""
@@ -199,7 +207,7 @@ class Memory:
 
     def forget(self) -> None:
         """Begin anew with what there is now."""
-        Path("/proc/self/clear_refs").write_text("5")
+        os.pwrite(self._clear, b"5", 0)
 
 
 def read_file(path: Path, turn: int) -> int:
@@ -281,10 +289,8 @@ def write_damaged(name: str, inner: list[tuple[Path, bytes]], number: int, seed:
     rng = np.random.default_rng([seed, number, *name.encode()])
     path, content = inner[int(rng.integers(0, len(inner))) if len(inner) > 1 else 0]
     if "tangled" in name:
-        path.write_bytes(content)
-        odd_files.tangle(path, secret_of(path), rng)
-        if rng.random() < 0.3:
-            path.write_bytes(reference_io.mutated(path.read_bytes(), rng))
+        new = odd_files.tangled(content, secret_of(path), rng)
+        path.write_bytes(reference_io.mutated(new, rng) if rng.random() < 0.3 else new)
     elif name in OTHER_READERS and rng.random() < 0.7:
         odd = content.decode("utf-8", "replace") if name != "safetensors" else ""
         new = odd_files.odd_weights(content, rng) if not odd else odd_files.odd_text(odd, rng).encode()
@@ -469,7 +475,8 @@ def run_rows(rows: dict[str, Row], options: argparse.Namespace) -> None:
                 part.replace(options.state)
 
     tasks = [(name, n) for name in rows for n in range(0, options.files, BLOCK) if n not in rows[name].blocks]
-    tasks.sort(key=lambda task: "tangled" not in task[0])  # what takes longest first
+    if not options.format:
+        tasks.sort(key=lambda task: "tangled" not in task[0])  # what takes longest first
     with ThreadPoolExecutor(options.jobs) as pool:
         list(pool.map(run_block, tasks))
 
@@ -503,7 +510,8 @@ def watch_block(name: str, folder: Path, first: int, end: int, seed: int, keep: 
         seed: Of all of them.
         keep: A folder for those that fail.
     """
-    context = multiprocessing.get_context("spawn")
+    context = multiprocessing.get_context("forkserver")
+    context.set_forkserver_preload(list(IMPORTED))
     told = context.Array("d", 8, lock=False)
     told[NEXT] = first
     errors, said = context.SimpleQueue(), []

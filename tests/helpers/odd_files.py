@@ -58,12 +58,16 @@ VALUES = (
 """What takes the place of a value of a text."""
 
 
+PLACES = re.compile(r'"[^"\n]*"|-?\d[\d.e-]*|\[[^\[\]]*\]')
+
+
 def odd_text(text: str, rng: np.random.Generator) -> str:
     """Return a text of JSON or TOML with some values replaced, lines doubled, or brackets added."""
     for _ in range(rng.integers(1, 3)):
         kind = rng.integers(0, 6)
-        places = list(re.finditer(r'"[^"\n]*"|-?\d[\d.e-]*|\[[^\[\]]*\]', text))
-        if kind < 3 and places:
+        begin = int(rng.integers(max(len(text) - 10_000, 1)))  # a part of what has become long is enough
+        places = list(PLACES.finditer(text, begin, begin + 10_000)) if kind < 3 else []
+        if places:
             found = places[int(rng.integers(len(places)))]
             value = (
                 str(rng.choice(VALUES))
@@ -107,22 +111,30 @@ def odd_weights(data: bytes, rng: np.random.Generator) -> bytes:
     return len(head).to_bytes(8, "little") + head + data[8 + length :]
 
 
-def tangle(path: Path, target: Path, rng: np.random.Generator) -> None:
+def tangled(data: bytes, target: Path, rng: np.random.Generator) -> bytes:
     """Put links, values that lie elsewhere, many names of one thing, and deep groups into an HDF5 file.
 
     Args:
-        path: The file, of any layout.
+        data: The file, of any layout.
         target: A file that must not be opened; links lead to it.
         rng: Random numbers.
     """
-    # in memory, and written once: thousands of links one by one are as many system calls
-    with h5py.File(path, "a", driver="core") as file:
+    # in memory: thousands of links one by one are as many system calls
+    fapl = h5py.h5p.create(h5py.h5p.FILE_ACCESS)
+    fapl.set_fapl_core(block_size=1 << 16, backing_store=False)
+    fapl.set_fclose_degree(h5py.h5f.CLOSE_STRONG)
+    fapl.set_file_image(data)
+    opened = h5py.h5f.open(b"tangled", h5py.h5f.ACC_RDWR, fapl)
+    with h5py.File(opened) as file:
         names: list[str] = []
         file.visit(names.append)
         for _ in range(rng.integers(1, 5)):
             name = names[int(rng.integers(len(names)))]
             with suppress(Exception):  # what an operation before it left may not let it
                 OPERATIONS[int(rng.integers(len(OPERATIONS)))](file, name, target, rng)
+        file.flush()
+        # the image begins behind what a program of its own may have put before it
+        return data[: opened.get_create_plist().get_userblock()] + opened.get_file_image()
 
 
 def _external(file: h5py.File, name: str, target: Path, rng: np.random.Generator) -> None:
@@ -157,17 +169,18 @@ def _virtual(file: h5py.File, name: str, target: Path, rng: np.random.Generator)
 
 
 def _many_names(file: h5py.File, name: str, target: Path, rng: np.random.Generator) -> None:
-    node = file[name]
-    parent = node.parent
-    for k in range(int(rng.choice([2, 50, 3000]))):
-        parent[f"image{k + 100:09d}"] = node
+    node = file[name].id
+    parent = file[name].parent.id
+    for k in range(int(rng.choice([2, 50, 3000]))):  # past the layers of h5py, which take ten times as long
+        h5py.h5o.link(node, parent, b"image%09d" % (k + 100))
 
 
 def _nested(file: h5py.File, name: str, target: Path, rng: np.random.Generator) -> None:
     node = file[name] if isinstance(file[name], h5py.Group) else file[name].parent
+    inner = node.id
     for _ in range(int(rng.choice([3, 100, 1000]))):
-        node = node.create_group(f"g{rng.integers(1 << 30)}")
-    node["back"] = file["/"]
+        inner = h5py.h5g.create(inner, b"g%d" % rng.integers(1 << 30))
+    h5py.h5o.link(file.id, inner, b"back")
 
 
 def _huge(file: h5py.File, name: str, target: Path, rng: np.random.Generator) -> None:
