@@ -182,7 +182,12 @@ class Effect:
             if isinstance(value, bool) or not isinstance(value, int | float | np.number):
                 raise InputError(f"{where} must be a number [{p.unit}], got {value!r}")
             low, high = p.bounds
-            if math.isnan(value) or not low <= value <= high:
+            try:
+                value = float(value)
+            except OverflowError:
+                digits = round(math.log10(abs(value))) + 1
+                raise InputError(f"{where}: a whole number of {digits} digits is too large") from None
+            if not low <= value <= high:
                 raise InputError(f"{where} must lie in [{low:g}, {high:g}] {p.unit}, got {value:g}")
         for name, among in self.choices().items():
             if getattr(self, name) not in among:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 from dataclasses import asdict
 from functools import lru_cache
 from pathlib import Path
@@ -34,7 +35,7 @@ def save_net(path: Path, net: ThresholdNet) -> None:
 
 def load_net(path: Path) -> ThresholdNet:
     """Read a network; raises InputError where the file holds none."""
-    if not path.is_file():
+    if not os.path.isfile(path):
         raise InputError(f"the weights {path} do not exist; they belong beside the sensor file")
     with path.open("rb") as head:
         pointer = stands_for(head.read(1024))
@@ -96,7 +97,7 @@ def predict_thresholds(
     Raises:
         InputError: The file holds no network, or one for a sensor of another size.
     """
-    net = _load_cached(path, path.stat().st_mtime_ns) if path.is_file() else load_net(path)
+    net = _load_cached(path, path.stat().st_mtime_ns) if os.path.isfile(path) else load_net(path)
     size = grey.shape[1], grey.shape[0]
     if net.shape.pattern not in (None, size):
         made = "x".join(map(str, net.shape.pattern or ()))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import warnings
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
@@ -180,7 +181,8 @@ class CocoImages(ImageSource):
         self._file, self._folder = annotations, directory
         images, instances = _read_annotations(annotations)
         self._images, self._instances = list(images.values()), instances
-        missing = [i["file_name"] for i in self._images if not (directory / i["file_name"]).is_file()]
+        # not `Path.is_file`, to which a name can be too long
+        missing = [i["file_name"] for i in self._images if not os.path.isfile(directory / i["file_name"])]
         if missing:
             raise InputError(
                 f"images: '{directory}' must hold every image that '{annotations}' lists, "
@@ -344,9 +346,9 @@ def _is_usable_instance(instance: dict[str, Any], image: dict[str, Any]) -> bool
 
 
 def _existing_folder(name: str) -> Path:
-    if not name or not Path(name).exists():
+    if not os.path.exists(name):
         raise InputError(f"images: folder '{name}' is missing (or write builtin, or coco:FILE.json,DIR)")
-    if not Path(name).is_dir():
+    if not os.path.isdir(name):
         raise InputError(f"images: must be a folder, '{name}' is a file")
     return Path(name)
 

@@ -261,6 +261,7 @@ def test_only_a_spread_phase_counts_without_bias(device):
 OUTSIDE = [
     (lambda: Threshold(on=0.0), r"threshold\.on must lie in \[0\.01, 10\] log intensity, got 0"),
     (lambda: Bandwidth(cutoff=-1.0), r"bandwidth\.cutoff must lie in \[0\.01, inf\] Hz, got -1"),
+    (lambda: Bandwidth(cutoff=10**400), r"bandwidth\.cutoff: a whole number of 401 digits is too large"),
     (lambda: Leak(rate=float("nan")), r"leak\.rate must lie in \[0, 100000\] Hz, got nan"),
     (lambda: Shot(balance=1.1), r"shot\.balance must lie in \[0, 1\] 1, got 1\.1"),
     (lambda: Mismatch(spread="wide"), r"mismatch\.spread must be a number \[1\], got 'wide'"),

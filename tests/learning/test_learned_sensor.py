@@ -177,7 +177,11 @@ def test_bad_weights_are_named(folder, scene):
     file.unlink()
     with pytest.raises(dase.InputError, match="do not exist; they belong beside the sensor file"):
         dase.simulate(scene, sensor)
-    path.write_text(path.read_text().replace('"learned.safetensors"', "3"))
+    text = path.read_text()
+    path.write_text(text.replace("learned.safetensors", 300 * "l"))  # more than a name may have
+    with pytest.raises(dase.InputError, match="do not exist; they belong beside the sensor file"):
+        dase.simulate(scene, load_sensor(path))
+    path.write_text(text.replace('"learned.safetensors"', "3"))
     with pytest.raises(
         dase.InputError, match=r"learned_threshold\.weights must be the path of a file, got 3"
     ):

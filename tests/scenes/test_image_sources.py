@@ -290,6 +290,10 @@ def test_coco_outline_is_shrunk_with_its_picture(tmp_path, rng):
             {"images": [{"id": 4, "file_name": "b.png", "width": 9, "height": 9}]},
             "lacks 1 of 1, first 'b.png'",
         ),
+        (  # more than a file system allows for a name
+            {"images": [{"id": 4, "file_name": "b" * 300, "width": 9, "height": 9}]},
+            "lacks 1 of 1, first 'bbbb",
+        ),
     ],
 )
 def test_bad_annotations_are_refused(tmp_path, changes, said):
