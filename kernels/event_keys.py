@@ -250,7 +250,9 @@ def keys_in_order(
         out[: len(late)].assign(late)
     if used.any():
         start = room.take("start", len(counts), device, wp.int32)
-        wp.utils.array_scan(counts, start, inclusive=False)
+        # not by Warp's sum on the device: memory that Warp lets go of makes all streams wait for each other,
+        # and this one would wait for the pixels of the next chunk
+        start.assign(np.cumsum(used, dtype=np.int32) - used.ravel())
         arguments = [flat, counts, start, len(late), out]
         launch.run_kernel(close_gaps, len(counts) * GAP_THREADS, arguments, device)
     # Warp's sort takes numbers along with the keys; nobody reads these

@@ -155,6 +155,19 @@ def run_concurrently(works: Sequence[Callable[[], Result]]) -> list[Result]:
         return [first, *pool.map(lambda work: work(), works[1:])]
 
 
+def copy_to_host(values: wp.array) -> np.ndarray:
+    """Return a copy of an array of any shape, once the stream that is current on its device came so far.
+
+    `wp.array.numpy` would wait for all streams of the device.
+    """
+    if values.device.is_cpu:
+        return np.array(values.numpy())
+    host = wp.empty(values.shape, dtype=values.dtype, device="cpu")
+    wp.copy(host, values)
+    wp.synchronize_stream(values.device.stream)
+    return np.asarray(host.numpy())
+
+
 def new_array(shape: int | tuple[int, ...], dtype: Any, device: wp.Device) -> wp.array:
     """Return new memory of a shape; on a CPU NumPy's, with large pages: small ones cost as much as work."""
     if device.is_cuda:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from dase.kernels.pixel_codegen import (
     Block,
@@ -16,7 +16,7 @@ from dase.kernels.pixel_codegen import (
     print_kernel,
     resolve_guards,
 )
-from dase.kernels.pixel_codegen_model import PixelModel
+from dase.kernels.pixel_codegen_model import Outlet, PixelModel
 from dase.kernels.pixel_codegen_program import (
     VOLTAGE,
     Program,
@@ -65,6 +65,12 @@ class OnePixel:
 
 def print_pixel_kernel(model: PixelModel) -> str:
     """Return the text of the kernel of a sensor, over (B, N) threads."""
+    emits = model.sink != "counts"
+    if emits:
+        # threads of a warp that reach an atomic addition one by one do not meet again behind it, and the rest
+        # of the sample then runs once for each: events wait for the end of the sample, where all are together
+        hold = "first_key = hold(sink, row, i, size, {time}, {code}, held, first_key)"
+        model = replace(model, outlet=Outlet(emit=hold, emitted=lines("held += 1")))
     program, layout = make_program(model), OnePixel()
     samples = (
         *_look(model),
@@ -75,6 +81,7 @@ def print_pixel_kernel(model: PixelModel) -> str:
         *layout.lay_out_all(program.respond),
         *layout.lay_out_all(program.change),
         *layout.lay_out_events(program),
+        *((if_block("held > 0", "keep_held(sink, row, i, held, first_key)", "held = 0"),) if emits else ()),
         *layout.lay_out(program.settle),
     )
     windows = loop_over_windows(
@@ -89,6 +96,7 @@ def print_pixel_kernel(model: PixelModel) -> str:
         Line("size = pixels.shape[0]"),
         *_prepare_look(model),
         *resolve_guards(program.begin, ask=False),
+        *(lines("held = int(0)", "first_key = wp.int64(0)") if emits else ()),
     )
     return print_kernel(kernel_head(model), (*begin, windows, *layout.lay_out(keep_states(model))))
 

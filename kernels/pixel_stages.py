@@ -128,6 +128,10 @@ class EventKeys:
 
     keys: wp.array3d[wp.int64]  # (B, slabs, capacity)
     used: wp.array2d[int]  # (B, slabs) events met; more than the capacity asks for another run
+    # where a thread has one pixel: what a sample gives after its first event waits here for its end
+    later: wp.array3d[wp.int64]  # (B, slabs, room · pixels of a slab), all second events, then all third ones
+    most: wp.array[int]  # (1,) events of a pixel in a sample, where there were more than 1 + room
+    room: int  # later events of a pixel
     slab: int  # pixels per slab, as a power of 2
     bits: int  # of row · N + i
     low: int  # bits below: 1 of the polarity, 2 more of the label
@@ -174,11 +178,90 @@ def append_key(
 
 
 @wp.func
-def deposit_event(sink: EventKeys, row: int, i: int, size: int, time: wp.int64, code: int):
-    """Keep one event that leaves its pixel at `time` [ns since the chunk's begin]."""
+def key_of(sink: EventKeys, row: int, i: int, size: int, time: wp.int64, code: int) -> wp.int64:
+    """Return the key of an event that leaves its pixel at `time` [ns since the chunk's begin]."""
     place = wp.int64(row) * wp.int64(size) + wp.int64(i)
     place |= time << wp.int64(sink.bits)
-    append_key(sink.keys, sink.used, row, i, sink.slab, (place << wp.int64(sink.low)) | wp.int64(code))
+    return (place << wp.int64(sink.low)) | wp.int64(code)
+
+
+@wp.func
+def deposit_event(sink: EventKeys, row: int, i: int, size: int, time: wp.int64, code: int):
+    """Keep one event that leaves its pixel at `time` [ns since the chunk's begin]."""
+    append_key(sink.keys, sink.used, row, i, sink.slab, key_of(sink, row, i, size, time, code))
+
+
+@wp.func_native(
+    """
+    const int slab = i >> shift;
+    const size_t plane = ((size_t)row * later.shape[1] + slab) * room + number;
+    later.data[(plane << shift) + (i - (slab << shift))] = key;
+"""
+)
+def put_later_key(
+    later: wp.array3d[wp.int64], room: int, number: int, row: int, i: int, shift: int, key: wp.int64
+):
+    """Write the later key of this number, from 0 on and below `room`; later (B, slabs, room · pixels)."""
+    ...
+
+
+@wp.func
+def hold_event(
+    sink: EventKeys, row: int, i: int, size: int, time: wp.int64, code: int, held: int, first: wp.int64
+) -> wp.int64:
+    """Hold an event that leaves at `time` [ns since the chunk's begin] until the end of its sample.
+
+    Returns:
+        Key of the sample's first event, which stays in a register: most samples have no other.
+    """
+    key = key_of(sink, row, i, size, time, code)
+    if held == 0:
+        return key
+    if held <= sink.room:
+        put_later_key(sink.later, sink.room, held - 1, row, i, sink.slab, key)
+    return first
+
+
+@wp.func_native(
+    """
+    const int slab = i >> shift;
+    int* met = used.data + row * used.shape[1] + slab;
+#ifdef __CUDA_ARCH__
+    const int slot = atomicAdd(met, held);
+    if (held > room + 1) atomicMax(most.data, held);
+#else
+    const int slot = *met;  // a slab has one thread
+    *met += held;
+    if (held > room + 1 && held > most.data[0]) most.data[0] = held;
+#endif
+    const int capacity = keys.shape[2];
+    long long* to = keys.data + ((size_t)row * keys.shape[1] + slab) * capacity;
+    if (slot < capacity) to[slot] = first;
+    const size_t plane = ((size_t)row * later.shape[1] + slab) * room;
+    for (int n = 1; n < held && n <= room && slot + n < capacity; ++n)
+        to[slot + n] = later.data[((plane + n - 1) << shift) + (i - (slab << shift))];
+"""
+)
+def append_held(
+    keys: wp.array3d[wp.int64],
+    used: wp.array2d[int],
+    later: wp.array3d[wp.int64],
+    most: wp.array[int],
+    room: int,
+    row: int,
+    i: int,
+    shift: int,
+    held: int,
+    first: wp.int64,
+):
+    """Append the events of a sample to those of the pixel's slab; arrays have the shapes of `EventKeys`."""
+    ...
+
+
+@wp.func
+def keep_held(sink: EventKeys, row: int, i: int, held: int, first: wp.int64):
+    """Keep the events of a sample, of which there is at least one."""
+    append_held(sink.keys, sink.used, sink.later, sink.most, sink.room, row, i, sink.slab, held, first)
 
 
 SINKS = {"counts": EventCounts, "keys": EventKeys, "labels": EventKeys}

@@ -149,6 +149,8 @@ class PixelArray:
             events_per_pixel = KeyRoom().per_pixel(self.batch * self.count, on_gpu=self.device.is_cuda)
         self._capacity = events_per_pixel * self.slab
         self._buffers: list[Any] = [None, None]  # of keys, kept from chunk to chunk, in turns
+        self._later: Any = None  # keys of a sample's second event and those after it, see `EventKeys`
+        self._later_room = 3
         self._room = ordering.KeyBuffer()
         self._ordering: Any = None  # stream of a GPU on which events are ordered, decoded and copied
         # nothing but a change detector: counted by a kernel of its own, several pixels per thread
@@ -366,7 +368,11 @@ class PixelArray:
             # a second run is rare: the buffers that are kept stay those of their turns
             keys = launch.new_array(shape, wp.int64, self.device)
         sink = pixel_stages.EventKeys()
-        sink.keys = keys
+        room = self._later_room * self.slab if self._one_pixel_per_thread else 0
+        if self._later is None or self._later.shape[2] != room:
+            self._later = launch.new_array((*shape[:2], room), wp.int64, self.device)
+        sink.keys, sink.later, sink.room = keys, self._later, self._later_room
+        sink.most = wp.zeros(1, dtype=int, device=self.device)
         sink.used = wp.zeros(shape[:2], dtype=int, device=self.device)
         sink.slab, sink.bits, sink.low = self.slab.bit_length() - 1, self._pixel_bits, self._low_bits
         launched.run(sink)
@@ -375,15 +381,15 @@ class PixelArray:
 
     def _collect(self, launched: _Launched) -> EventsOfChunk:
         """Return the events of a chunk, once its pixels are done with it."""
-        with self._ordering_after(launched):
-            used = launched.sink.used.numpy()
-        while used.max() > launched.sink.keys.shape[2]:
+        used, most = self._number_of_events(launched)
+        # what there was room for is the sink's to say: a chunk before may have asked for more since
+        while used.max() > launched.sink.keys.shape[2] or most > launched.sink.room + 1:
+            self._later_room = max(self._later_room, most)
             # a quarter more spares the next, slightly busier chunk the same
             self._capacity = max(self._capacity, int(1.25 * used.max()) + 1)
             self.emitted_again += 1
             self._fill(launched)
-            with self._ordering_after(launched):
-                used = launched.sink.used.numpy()
+            used, most = self._number_of_events(launched)
         with self._ordering_after(launched):
             top = self._check_length(launched.begin, launched.end)
             sink = launched.sink
@@ -398,9 +404,15 @@ class PixelArray:
             end = round(launched.end * 1e9)
             now = int(np.searchsorted(events.t, 1e-9 * float(end), side="right"))
             span = end - round(launched.begin * 1e9)
-            late = found[now:].numpy() if now < len(events) else np.empty(0, np.int64)
+            late = launch.copy_to_host(found[now:]) if now < len(events) else np.empty(0, np.int64)
             self._late = late - (span << (self._pixel_bits + self._low_bits))
             return events.select(slice(now)), None if row is None else row[:now]
+
+    def _number_of_events(self, launched: _Launched) -> tuple[NDArray[np.int32], int]:
+        """Return the events of each slab, (B, slabs), and most of a pixel in a sample, if too many."""
+        with self._ordering_after(launched):
+            used, most = (launch.copy_to_host(a) for a in (launched.sink.used, launched.sink.most))
+            return used, int(most[0])
 
     def _ordering_after(self, launched: _Launched) -> AbstractContextManager[Any]:
         """Return what lets a GPU do what follows once a chunk is done, beside the pixels of the next."""
@@ -479,8 +491,15 @@ class PixelArray:
         )
 
     def _count_lanes(self, source_name: str) -> int:
-        """Return how many pixels a thread of the composed kernel works on; 0 for CUDA's kernel."""
-        return 0 if self.device.is_cuda else counting.widest_block(self.count, self.device, source_name)
+        """Return how many pixels a thread of the composed kernel works on; 0 for the kernel of one."""
+        return (
+            0 if self._one_pixel_per_thread else counting.widest_block(self.count, self.device, source_name)
+        )
+
+    @property
+    def _one_pixel_per_thread(self) -> bool:
+        """Whether threads of the composed kernel have one pixel each."""
+        return bool(self.device.is_cuda)
 
     def _step_edges(self, times: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the end of the last step and the samples that follow [s], shape (K + 1,)."""

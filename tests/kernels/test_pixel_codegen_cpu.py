@@ -54,6 +54,7 @@ def sensor_of(name, kind):
 def run(sensor, scene, lanes, monkeypatch, *, labels):
     """Return events by chunks of 17 samples, then counts of the same sensor, and the last states."""
     monkeypatch.setattr(PixelArray, "_count_lanes", lambda self, source: lanes)
+    monkeypatch.setattr(PixelArray, "_one_pixel_per_thread", lanes == 0)
     times, out = scene.sample_times(), []
     array = PixelArray(sensor, scene.width, scene.height, seed=3, labels=labels)
     for begin in range(0, len(times), 17):

@@ -5,8 +5,10 @@ import pytest
 
 import dase
 from dase.effects.latency import Latency
+from dase.effects.threshold import Threshold
 from dase.scenes.image_sources import open_images
 from dase.scenes.layers import Layer, LayerScene, Motion
+from dase.simulation.pixel_array import PixelArray
 from dase.simulation.sensor_run import ChunkSettings, SensorRun
 
 
@@ -55,4 +57,16 @@ def test_a_batch_does_not_depend_on_pixels_being_ahead(device, scene):
     got, _ = run_events(scene, sensor, device, settings=ChunkSettings(ahead=True), parameters=vectors)
     assert len(got) == 3
     assert len(got[1]) != len(got[0])
+    assert_same(got, want)
+
+
+@pytest.mark.parametrize("ahead", [False, True])
+def test_threads_of_one_pixel_keep_all_events_of_a_sample(device, scene, monkeypatch, ahead):
+    """As a GPU's do: events wait for the end of their sample, with room that grows."""
+    sensor = dase.load_sensor("davis346").without("refractory").with_effect(Threshold(on=0.02, off=0.02))
+    want, _ = run_events(scene, sensor, device)
+    monkeypatch.setattr(PixelArray, "_one_pixel_per_thread", True)
+    got, array = run_events(scene, sensor, device, settings=ChunkSettings(ahead=ahead))
+    assert array._later_room > 4
+    assert array.emitted_again > 0
     assert_same(got, want)
