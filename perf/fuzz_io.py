@@ -334,7 +334,7 @@ def run_files(name: str, folder: Path, files: int, seed: int, keep: Path, told, 
                 raise AssertionError("the file was left open")
         except BaseException as error:
             outcome = FAILED
-            errors.put(f"file {number}: {type(error).__name__}: {error}")
+            errors.put(f"file {number}: {type(error).__name__}: {str(error)[:300]}")
         end, grown = time.process_time(), memory.peak() - before
         if end - begin > SLOW or grown > MEMORY:
             errors.put(f"file {number} took {end - begin:.1f} s and {grown:.0f} MB")

@@ -38,17 +38,28 @@ def read_text_file(path: Path, what: str, largest: int = 1 << 18) -> str:
 
 
 def parse_toml(text: str, where: str) -> dict[str, Any]:
-    """Return the tables of a TOML text; raises InputError where it is none, or nested too deeply."""
+    """Return the tables of a TOML text; raises InputError where it is none, or nested too deeply.
+
+    Whole numbers have 64 bits, as TOML says; Python's have no end, and no real number stands for the largest.
+    """
     # a name of 100 000 parts, as in `a.b.c = 1`, takes tomllib minutes, and each part nests one table more
     most = 100
     if any(line.count(".") > most for line in text.splitlines()):
         raise InputError(f"{where} is not TOML that can be read: a line has more than {most} points")
     try:
-        return tomllib.loads(text)
+        table = tomllib.loads(text)
     except RecursionError:
         raise InputError(f"{where} is not TOML that can be read: it is nested too deeply") from None
     except ValueError as error:
         raise InputError(f"{where} is not TOML: {error}") from error
+    left: list[Any] = [table]
+    while left:
+        value = left.pop()
+        if isinstance(value, dict | list):
+            left += value.values() if isinstance(value, dict) else value
+        elif type(value) is int and not -(1 << 63) <= value < 1 << 63:
+            raise InputError(f"{where} is not TOML: a whole number of {value.bit_length()} bits, 64 at most")
+    return table
 
 
 def parse_json(text: str | bytes, where: str) -> Any:

@@ -186,7 +186,7 @@ class CocoImages(ImageSource):
         if missing:
             raise InputError(
                 f"images: '{directory}' must hold every image that '{annotations}' lists, "
-                f"lacks {len(missing)} of {len(images)}, first '{missing[0]}'"
+                f"lacks {len(missing)} of {len(images)}, first '{missing[0][:100]}'"
             )
         self._coco = COCO()  # given a file, it would print; an outline needs nothing but the image sizes
         self._coco.imgs = images
@@ -235,10 +235,10 @@ def _read_annotations(path: Path) -> tuple[dict[int, dict[str, Any]], list[dict[
     content = parse_json(data, f"images: annotations '{path}'")
     try:
         images = {image["id"]: image for image in content["images"]}
-        instances = [a for a in content["annotations"] if _is_usable_instance(a, images[a["image_id"]])]
         for image in images.values():
             _check_file_name(image["file_name"], path)
             _check_image_size(image, path)
+        instances = [a for a in content["annotations"] if _is_usable_instance(a, images[a["image_id"]])]
     except (KeyError, TypeError) as error:
         raise InputError(
             f"images: annotations '{path}' must list images (id, file_name, width, height) and annotations "
@@ -255,8 +255,9 @@ def _read_annotations(path: Path) -> tuple[dict[int, dict[str, Any]], list[dict[
 
 def _check_file_name(name: Any, annotations: Path) -> None:
     """Raise InputError where the name of a picture leads out of the folder of pictures."""
-    if not isinstance(name, str) or not name or "\0" in name:
-        raise InputError(f"images: annotations '{annotations}' must name files, got {name!r}")
+    most = 4096  # which no file system goes beyond; many stop at 255 bytes between two slashes
+    if not isinstance(name, str) or not name or "\0" in name or len(name) > most:
+        raise InputError(f"images: annotations '{annotations}' must name files, got {repr(name)[:100]}")
     for kind in (PurePosixPath, PureWindowsPath):
         parts = kind(name)
         if parts.is_absolute() or parts.drive or ".." in parts.parts:

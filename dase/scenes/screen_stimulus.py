@@ -301,7 +301,7 @@ def read_stimulus(path: Path) -> ScreenStimulus:
         )  # fmt: skip
         told = [(s["kind"], round(s["begin"] * made.refresh), round(s["end"] * made.refresh))
                 for s in truth["segments"]]  # fmt: skip
-    except (KeyError, TypeError, ValueError) as error:
+    except (KeyError, TypeError, ValueError, OverflowError) as error:
         if isinstance(error, InputError):
             raise InputError(f"stimulus {path}: {error}") from None
         raise InputError(f"stimulus {path}: a value is missing or of the wrong type: {error}") from None

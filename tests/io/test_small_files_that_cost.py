@@ -81,6 +81,8 @@ def toml(tmp_path, text):
         (b'name = "\xff\xfe"', "is not UTF-8"),
         ("size = [99999999999, 1]\n[threshold]\non = 0.2", "size must lie between"),
         ("size = " + "9" * 5000, "is not TOML"),
+        ("[threshold]\non = 1" + "0" * 400, "a whole number of 1329 bits"),
+        ('[[history]]\ndid = "x"\nerror_before = -1' + "0" * 400, "a whole number of 1329 bits"),
         ('"\x1b[31mred" = 1', "is not TOML"),
         ('"\\u001b[31mred" = 1', r"\\x1b\[31mred"),
         ('[[history]]\n"a\\u009bb" = 1', r"\\x9bb"),

@@ -467,13 +467,22 @@ def test_coco_outlines_of_every_kind_are_cut_out(tmp_path, rng):
         "",
         "a\0.png",
         5,
+        "a" * 30_000 + ".png",  # refused by the file system with an error of its own, as is the next
+        "a" * 300 + ".png",
     ],
 )
 def test_coco_names_that_lead_out_are_refused(tmp_path, name):
     pytest.importorskip("pycocotools")
     write(tmp_path / "a.png", noise(np.random.default_rng(0), 60, 90, 3))
-    with pytest.raises(InputError, match=r"leads out of the folder|must name files"):
+    with pytest.raises(InputError, match=r"leads out of the folder|must name files|lacks 1 of 1") as found:
         open_images(annotated(tmp_path, [SQUARE], file_name=name))
+    assert len(str(found.value)) < 1000
+
+
+def test_a_coco_width_without_end_is_refused(tmp_path):
+    pytest.importorskip("pycocotools")
+    with pytest.raises(InputError, match=r"width of 'a\.png' must be a whole number"):
+        open_images(annotated(tmp_path, [SQUARE], width=10**400))
 
 
 @pytest.mark.parametrize(

@@ -136,6 +136,8 @@ def test_the_file_tells_the_same(tmp_path):
         ({"format": "video"}, "is not the JSON that dase stimulus writes"),
         ({"version": 99}, "is of version 99"),
         ({"refresh": "x"}, "a value is missing or of the wrong type"),
+        ({"refresh": 10**400}, "a value is missing or of the wrong type"),
+        ({"size": [float("inf"), 1]}, "a value is missing or of the wrong type"),
         ({"gamma": 40.0}, "gamma must lie in"),
         ({"parts": ["song"]}, "parts must be of"),
         ({"segments": []}, "its segments are not those"),
