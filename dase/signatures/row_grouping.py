@@ -1,7 +1,9 @@
 """Events that leave together share a row, or a column: how the sensor is read.
 
 An arbiter takes a row with events and sends all of them; so the next event is far more often of the same row
-than one some dozen events later.
+than one some dozen events later. An edge along a row that moves makes its pixels send together, too, if they
+are alike: at one instant, as a row with one time stamp for all. It leaves out no pixel between two of them,
+so events count only where the pixels beside them on the line are silent.
 """
 
 from __future__ import annotations
@@ -29,7 +31,8 @@ class GroupingSettings:
     beside: int = 2  # [px] lines that an edge along them has events of, too; a bus takes one at a time
     away: int = 4  # [px] neighbours fire together because the scene is smooth
     run: int = 1 << 14  # events of a run; the scene of one run says nothing of that of another
-    most: int = 1 << 20  # events in all, of runs spread evenly
+    together: int = 4  # runs that are looked at together: what is beside an event may lie in another one
+    most: int = 1 << 20  # events in all, spread evenly
     fewest: int = 20  # pairs of one row or column
 
 
@@ -60,42 +63,65 @@ class GroupCounts:
     def push(self, events: Events) -> None:
         """Take events."""
         joined = events if self._held is None else Events.concatenate([self._held, events])
-        whole = len(joined) // self._run
+        block = self._run * self.settings.together
+        whole = len(joined) // block
         for i in range(whole):
             if self._turn % self._stride == 0:
-                self._count_run(joined.select(slice(i * self._run, (i + 1) * self._run)))
+                self._count_block(joined.select(slice(i * block, (i + 1) * block)))
             self._turn += 1
-        self._held = joined.select(slice(whole * self._run, None))
+        self._held = joined.select(slice(whole * block, None))
 
-    def _count_run(self, run: Events) -> None:
+    def _count_block(self, block: Events) -> None:
         s = self.settings
-        pixel = run.y.astype(np.int64) * run.width + run.x
-        kept = ~self._hot[pixel]
-        t, x, y = run.t[kept], run.x[kept].astype(np.int64), run.y[kept].astype(np.int64)
+        kept = ~self._hot[block.y.astype(np.int64) * block.width + block.x]
+        t, x, y = block.t[kept], block.x[kept].astype(np.int64), block.y[kept].astype(np.int64)
+        if len(t) <= s.lags[-1]:
+            return
         # files sort events of one stamp as they like: that is no readout
         order = np.lexsort((self._random.random(len(t)), t))
         x, y = x[order], y[order]
+        free = [~_may_be_of_an_edge(t, *axes, s) for axes in ((x, y), (y, x))]
+        for i in range(s.together):
+            run = slice(i * len(t) // s.together, (i + 1) * len(t) // s.together)
+            tables = [
+                self._count_pairs(t[run], along[run], across[run], some[run])
+                for along, across, some in ((x, y, free[0]), (y, x, free[1]))
+            ]
+            if any(pairs for _, _, pairs in tables):
+                self._next.append(np.array([one for one, _, _ in tables]))
+                self._later.append(np.array([later for _, later, _ in tables]))
 
-        def shared(lag: int) -> tuple[NDArray[np.int64], int]:
-            """Return pairs of one row and of rows near by, the same of columns, and all pairs soon enough."""
+    def _count_pairs(
+        self,
+        t: NDArray[np.float64],
+        along: NDArray[np.int64],
+        across: NDArray[np.int64],
+        free: NDArray[np.bool_],
+    ) -> tuple[NDArray[np.int64], NDArray[np.float64], int]:
+        """Return pairs of successive events, mean pairs of later ones, each (2,), and all later pairs.
+
+        Of events that are `free`, in places along and numbers of their lines, all of shape (N,).
+        """
+        s = self.settings
+        nothing = np.zeros(2, np.int64), np.zeros(2), 0
+
+        def shared(lag: int) -> tuple[NDArray[np.int64], int, float]:
+            """Return pairs of one line and of lines near by, all pairs soon enough, and their share."""
             soon = t[lag:] - t[:-lag] < s.span
-            dx, dy = np.abs(x[lag:] - x[:-lag])[soon], np.abs(y[lag:] - y[:-lag])[soon]
-            many = np.zeros((2, 2), np.int64)
-            for axis, (along, across) in enumerate(((dx, dy), (dy, dx))):
-                line = across[(along > s.away) & (across <= s.beside)]
-                same = np.count_nonzero(line == 0)
-                many[axis] = same, len(line) - same
-            return many, int(soon.sum())
+            kept = soon & free[lag:] & free[:-lag]
+            far, apart = np.abs(along[lag:] - along[:-lag])[kept], np.abs(across[lag:] - across[:-lag])[kept]
+            line = apart[(far > s.away) & (apart <= s.beside)]
+            same = np.count_nonzero(line == 0)
+            return np.array([same, len(line) - same]), int(kept.sum()), float(soon.mean())
 
         if len(t) <= s.lags[-1]:
-            return
-        one, count = shared(1)
+            return nothing
+        one, count, _ = shared(1)
         others = [shared(lag) for lag in s.lags]
-        pairs = sum(n for _, n in others)
-        if pairs < 0.5 * count * len(s.lags):
-            return  # too few events for any to come soon
-        self._next.append(one)
-        self._later.append(np.sum([many for many, _ in others], axis=0) * (count / pairs))
+        pairs = sum(n for _, n, _ in others)
+        if pairs == 0 or np.mean([share for _, _, share in others]) < 0.5:
+            return nothing
+        return one, np.sum([many for many, _, _ in others], axis=0) * (count / pairs), pairs
 
     @property
     def runs(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -107,6 +133,49 @@ class GroupCounts:
         if not self._next:
             return empty, empty
         return np.array(self._next, np.float64), np.array(self._later, np.float64)
+
+
+def _may_be_of_an_edge(
+    t: NDArray[np.float64], along: NDArray[np.int64], across: NDArray[np.int64], settings: GroupingSettings
+) -> NDArray[np.bool_]:
+    """Return which events an edge along their line may have made, shape (N,).
+
+    Pixels of such an edge see the same light. Where they are alike and each has sent before, each sends once
+    between two events of one of them, all at one instant if their memories were set in the same light. So an
+    event counts as of an edge if a pixel beside it on its line sends within the time to the nearer of its own
+    pixel's other events.
+
+    Args:
+        t: Times, sorted [s], shape (N,).
+        along: Places along the lines [px].
+        across: Numbers of the lines.
+        settings: How near is beside; the longest time.
+    """
+    count, index = len(t), np.arange(len(t))
+    pixel = across * (1 << 16) + along
+    order = np.lexsort((index, pixel))
+    gaps = np.where(np.diff(pixel[order]) == 0, np.diff(t[order]), settings.span)
+    alone = np.full(1, settings.span)
+    own = np.empty(count)
+    own[order] = np.minimum(np.concatenate((alone, gaps)), np.concatenate((gaps, alone)))
+    own = np.minimum(own, settings.span)
+    # at least as far as the events with which successive ones are compared, and all of one stamp
+    reach = settings.lags[-1]
+    low = np.minimum(np.searchsorted(t, t - own), np.searchsorted(t, t) - reach)
+    high = np.maximum(np.searchsorted(t, t + own, "right"), np.searchsorted(t, t, "right") + reach) - 1
+    cut = (t - own < t[0]) | (t + own > t[-1])  # what is beside them is not at hand
+    low, high = np.maximum(low, 0), np.minimum(high, count - 1)
+    keys = (pixel * count + index)[order]
+    pixel, low, high = pixel[order], low[order], high[order]
+    near = np.zeros(count, bool)
+    for step in range(1, settings.away + 1):
+        for place in (pixel - step, pixel + step):
+            at = place * count
+            near |= np.searchsorted(keys, at + low) < np.searchsorted(keys, at + high, "right")
+    near |= cut[order]
+    out = np.empty(count, np.bool_)
+    out[order] = near
+    return out
 
 
 def _test_line(
@@ -139,10 +208,10 @@ def _test_line(
 def find_grouping(groups: GroupCounts, level: float) -> Signature:
     """Look for rows or columns that are read together.
 
-    Two nulls, each binomial for all pairs together and by the signs of the runs' differences, which knows
-    that pairs of one run depend on each other. Successive events share a line no more often than those 20 to
-    60 later; and no more often, compared with lines beside, than those. The largest p and the smallest size
-    count.
+    Only events count that no edge along the line can have made. Two nulls, each binomial for all pairs
+    together and by the signs of the runs' differences, which knows that pairs of one run depend on each
+    other. Successive events share a line no more often than those 20 to 60 later; and no more often, compared
+    with lines beside, than those. The largest p and the smallest size count.
 
     Args:
         groups: Counted pairs.
@@ -170,6 +239,8 @@ def find_grouping(groups: GroupCounts, level: float) -> Signature:
         if best is None or (entry.p, -entry.size) < (best.p, -best.size):
             best = entry
     if best is None:
-        return without_answer(NAME, "too few successive events share a row or column")
+        return without_answer(
+            NAME, "too few successive events share a row or column that no moving edge could have made"
+        )
     unseen = f"the next event shares a {best.details['line']} {best.size:.2f} times as often as by chance"
     return judge_signature(best, level, unseen)
