@@ -5,9 +5,14 @@ from __future__ import annotations
 from dataclasses import replace
 from types import SimpleNamespace
 
+import pytest
+
+import dase
 from dase.diagnosis import candidates
 from dase.diagnosis.candidates import Candidate
+from dase.diagnosis.explain_effect import moving_bars
 from dase.diagnosis.settings import DEFAULTS
+from dase.effects import EFFECTS
 from dase.effects.leak import Leak
 from dase.effects.threshold import Threshold
 from dase.effects.voltage_noise import VoltageNoise
@@ -49,3 +54,19 @@ def test_what_a_coarse_fit_takes_near_the_best_is_fitted_again_from_where_screen
         ("near", f"fitted with {SAMPLES[-1]}"),
     ]
     assert [one.name for one in behind] == ["far"]
+
+
+@pytest.mark.slow
+def test_a_diagnosis_finds_noise_that_is_faster_than_screening_samples():
+    """Sampled four times a step at most, its cutoff comes out at 5 kHz; once, nothing is found at all."""
+    truth = VoltageNoise(sigma=0.08, cutoff=2500.0)
+    scene = moving_bars(duration=0.3)
+    events = dase.simulate(scene, Sensor().with_effect(truth), seed=6)
+    library = {name: EFFECTS[name] for name in ("threshold", "voltage_noise", "shot")}
+    found = dase.diagnose(events, scene=scene, effects=library, pixels=120)
+    assert found.selected == ("voltage_noise",)
+    assert found.unexplained is None
+    assert found.errors[1] < 2 < 20 < found.errors[0]
+    cutoff, sigma = found.parameters["voltage_noise.cutoff"], found.parameters["voltage_noise.sigma"]
+    assert 500 < cutoff.low < truth.cutoff < cutoff.high < 2 * truth.cutoff
+    assert sigma.value == pytest.approx(truth.sigma, rel=0.1)
