@@ -107,7 +107,7 @@ class StreamEffect(Effect):
     stages: ClassVar = {}
     per_pixel: ClassVar[bool] = True
     """Whether what becomes of an event does not depend on other pixels, so that some of them can be
-    simulated alone."""
+    simulated alone; what all pixels share is left out where events are counted pixel by pixel."""
 
     def longest_delay(self, lines: int) -> float:
         """Return about how late it makes events of a sensor of so many lines [s]; infinity for any time.
@@ -130,7 +130,8 @@ class StreamEffect(Effect):
     def clock_period(self) -> float | None:
         """Return the ticks to which times are rounded down [s], None where the effect does anything else.
 
-        Kernels stamp events by such a clock themselves, ten times as fast as events are stored and read out.
+        Kernels stamp events by such a clock themselves, ten times as fast as events are stored and read out;
+        counts leave it out.
         """
         return None
 

@@ -143,6 +143,15 @@ class Sensor:
         values = [effect.map_values(pixels) for effect in self.effects if effect.maps]
         return [wp.array(np.concatenate(values), dtype=float, device=device)] if values else []
 
+    def by_single_pixels(self) -> Sensor:
+        """Return the sensor as each pixel by itself counts its events.
+
+        That is without effects in which what becomes of an event depends on other pixels, such as a bus, and
+        without a clock, which moves no event by more than a tick.
+        """
+        left_out = [e.name for e in self.readout_effects() if not e.per_pixel or e.clock_period() is not None]
+        return replace(self, effects=tuple(e for e in self.effects if e.name not in left_out))
+
     def changes_event_stream(self) -> bool:
         """Whether events leave at other times than their crossings', or not all of them leave."""
         late = (e for e in self.effects if isinstance(e, StreamEffect) or "delay" in e.stages)

@@ -104,9 +104,13 @@ class SensorRun:
 
         Events that leave the sensor late come with a later chunk, or in one more chunk without samples.
         """
+        return self._chunks_behind(self.sensor)
+
+    def _chunks_behind(self, sensor: Sensor) -> Iterator[RunChunk]:
+        """Yield what leaves the readout of a sensor that has these pixels."""
         array = self.pixel_array
         readouts = [
-            ReadoutChain(self.sensor, array.width, array.height, pixels=array.count, seed=array.seed)
+            ReadoutChain(sensor, array.width, array.height, pixels=array.count, seed=array.seed)
             for _ in range(array.batch)
         ]
         for times, found in array.emit_chunks(self.scene, self._cut_times(), ahead=self.ahead):
@@ -130,7 +134,9 @@ class SensorRun:
         return [Events.concatenate(row) if len(row) > 1 else row[0] for row in zip(*parts, strict=True)]
 
     def count(self, edges: ArrayLike) -> NDArray[np.int32]:
-        """Count events per window, on the way and without storing them where the readout allows it.
+        """Count what each pixel sends per window, without storing it where its readout allows that.
+
+        What all pixels share is left out, see `Sensor.by_single_pixels`.
 
         Args:
             edges: Window edges [s], increasing, shape (W + 1,); a window holds edge < t <= next edge.
@@ -141,20 +147,22 @@ class SensorRun:
         Raises:
             InputError: Edges do not increase, or there are fewer than two.
         """
-        edges = np.asarray(edges, np.float64)
-        if edges.ndim != 1 or len(edges) < 2 or not np.all(np.diff(edges) > 0):
-            raise InputError("window edges must increase, and there must be at least 2")
-        if self.sensor.changes_event_stream():
-            return self._count_leaving(edges)
+        edges, sensor = _checked_edges(edges), self.sensor.by_single_pixels()
+        if sensor.changes_event_stream():
+            return self._count_behind(sensor, edges)
         return self._count_at_pixels(edges)
 
-    def _count_leaving(self, edges: NDArray[np.float64]) -> NDArray[np.int32]:
-        """Count what leaves the camera, shape (B, W, 2, N)."""
+    def count_leaving(self, edges: ArrayLike) -> NDArray[np.int32]:
+        """Count what leaves the camera behind its whole readout; for all else see `count`."""
+        return self._count_behind(self.sensor, _checked_edges(edges))
+
+    def _count_behind(self, sensor: Sensor, edges: NDArray[np.float64]) -> NDArray[np.int32]:
+        """Count what leaves the readout of a sensor that has these pixels, shape (B, W, 2, N)."""
         array = self.pixel_array
         counters = [
             WindowCounter(edges, array.pixels, array.width * array.height) for _ in range(array.batch)
         ]
-        for chunk in self.chunks():
+        for chunk in self._chunks_behind(sensor):
             for counter, part in zip(counters, chunk.events, strict=True):
                 counter.add(part)
         return np.stack([counter.counts for counter in counters])
@@ -182,6 +190,14 @@ class SensorRun:
         """Cut the samples into chunks [s], each of shape (K,)."""
         for i in range(0, len(self.times), self.chunk):
             yield self.times[i : i + self.chunk]
+
+
+def _checked_edges(edges: ArrayLike) -> NDArray[np.float64]:
+    """Return window edges [s], shape (W + 1,), unless they do not increase."""
+    edges = np.asarray(edges, np.float64)
+    if edges.ndim != 1 or len(edges) < 2 or not np.all(np.diff(edges) > 0):
+        raise InputError("window edges must increase, and there must be at least 2")
+    return edges
 
 
 def sample_times(scene: Scene, sensor: Sensor) -> NDArray[np.float64]:

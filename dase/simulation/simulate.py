@@ -103,10 +103,15 @@ def count(
     pixels: ArrayLike | None = None,
     parameters: ArrayLike | None = None,
 ) -> NDArray[np.int32]:
-    """Simulate a scene and count events, without ever storing a frame.
+    """Simulate a scene and count what each pixel sends, without ever storing a frame.
 
-    Events are not stored either, but where the sensor has effects that move or lose them behind the change
-    detector, latency and readout effects; then a window holds the events with edge < t <= next edge.
+    Where what becomes of an event depends on other pixels, counts are taken before: `readout`, `rate_control`
+    and `anti_flicker` are left out, so that any pixels can be counted alone, and so are the ticks of a clock,
+    `timestamp` without jitter. `simulate(scene, sensor).counts(edges)` counts what is left behind them, much
+    less where a bus is full.
+
+    Events are not stored either, but where the sensor has other effects that move or lose them behind the
+    change detector, such as latency; then a window holds the events with edge < t <= next edge.
 
     Args:
         scene: What the sensor sees, a scene or frames; see `stream`.

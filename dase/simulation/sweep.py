@@ -73,7 +73,8 @@ def sweep(
 
     All values share their random numbers, so that differences are the parameter's. They run in one launch
     where they can be sampled at the same times and act in the pixels; readout, optics, and whatever asks for
-    finer sampling run one value after the other, with the same result.
+    finer sampling run one value after the other, with the same result. What all pixels share (`dase.count`
+    says what) is left out, unless its own parameters are swept.
 
     Args:
         scene: What the sensor sees: a scene, or frames; see `dase.stream`.
@@ -99,9 +100,12 @@ def sweep(
     if not span[1] > span[0]:
         raise InputError("sweep: the scene must last longer than 0 s")
 
+    effect = name.partition(".")[0]
+    is_left_out = effect in model and not all(effect in one.by_single_pixels() for one in variants)
+
     def count(given: Sensor, parameters: NDArray[np.float32] | None) -> NDArray[np.int32]:
         run = SensorRun(seen, given, pixels=pixels, parameters=parameters, seed=seed, device=device)
-        return run.count(span)[:, 0]
+        return (run.count_leaving if is_left_out else run.count)(span)[:, 0]
 
     if _can_run_at_once(seen, variants, name):
         counts = count(variants[0], np.stack([variant.parameters() for variant in variants]))

@@ -17,6 +17,7 @@ from dase.effects import Reader, StreamEffect, parameter
 from dase.effects.latency import Latency
 from dase.effects.leak import Leak
 from dase.effects.mismatch import Mismatch
+from dase.effects.rate_control import RateControl
 from dase.effects.readout import Readout
 from dase.effects.refractory import Refractory
 from dase.effects.row_scan import RowScan
@@ -158,9 +159,9 @@ def test_indices_that_sort(rng):
 # ---- counting
 
 
-def test_counts_are_those_of_what_leaves(device, rng):
+def test_counts_are_those_of_what_each_pixel_sends(device, rng):
     scene, sensor = moving(rng), everything()
-    events = dase.simulate(scene, sensor, device=device)
+    events = dase.simulate(scene, sensor.without("readout"), device=device)
     edges = np.unique(events.t[[100, 700, 710, 1200]])
     later = np.array(ns(events))
     want = np.zeros((3, 2, WIDTH * HEIGHT), int)
@@ -170,6 +171,19 @@ def test_counts_are_those_of_what_leaves(device, rng):
         np.add.at(want[w], (events.p[inside].astype(int), place[inside]), 1)
     np.testing.assert_array_equal(dase.count(scene, sensor, edges, device=device)[0], want)
     assert want.sum() > 500
+
+
+def test_counts_leave_out_what_pixels_share_and_the_ticks_of_a_clock(device, rng):
+    scene, plain, edges = moving(rng), camera(Shot(rate=30.0)), [0.0, 0.2, 0.9]
+    sensor = plain
+    for effect in (Readout(rate=1e3, mode="drop"), Timestamp(jitter=0.0, step=1e-4), RateControl(rate=1e4)):
+        sensor = sensor.with_effect(effect)
+    assert not sensor.by_single_pixels().changes_event_stream()
+    want = dase.count(scene, plain, edges, device=device)
+    np.testing.assert_array_equal(dase.count(scene, sensor, edges, device=device), want)
+    assert len(dase.simulate(scene, sensor, device=device)) < 0.8 * want.sum()
+    alone = dase.count(scene, sensor, edges, device=device, pixels=[50, 3])
+    np.testing.assert_array_equal(alone, want[..., [50, 3]])
 
 
 def test_a_batch_has_an_outlet_for_each_row(device, rng):

@@ -88,7 +88,6 @@ def one_by_one(frames: np.ndarray, sensors: list[dase.Sensor]) -> np.ndarray:
         ("shot.rate", [0.0, 5.0, 500.0]),
         ("bandwidth.cutoff", [50.0, 5000.0]),  # asks for finer samples
         ("latency.delay", [0.0, 1e-3]),  # moves events
-        ("readout.rate", [1e5, 1e9]),  # behind the pixels
         ("sensor.log_eps", [1e-3, 0.1]),
     ],
 )
@@ -111,6 +110,23 @@ def test_a_sweep_is_what_its_values_give_one_by_one(frames, name, values, device
         np.testing.assert_allclose(found.counts.sum(), want.sum(), rtol=1e-3)
     np.testing.assert_allclose(found.on, found.counts[:, 1].mean(-1) / 0.011)
     np.testing.assert_allclose(found.off, found.counts[:, 0].mean(-1) / 0.011)
+
+
+def test_a_bus_is_counted_behind_where_it_is_swept_itself(frames):
+    sensor = dase.Sensor((EFFECTS["threshold"](),)).with_effect(EFFECTS["readout"](mode="drop"))
+    rates = [2e4, 1e9]
+    found = dase.sweep(frames, sensor, "readout.rate", rates, fps=1000)
+    streams = [
+        dase.simulate(frames, sensor.with_effect(replace(sensor["readout"], rate=rate)), fps=1000)
+        for rate in rates
+    ]
+    want = [events.slice(-1.0, 0.011 + 1e-9).counts([-1.0, 1.0])[0] for events in streams]
+    np.testing.assert_array_equal(found.counts.sum(2), np.sum(want, (2, 3)))
+    assert found.counts[0].sum() < 0.5 * found.counts[1].sum()
+    np.testing.assert_array_equal(
+        dase.sweep(frames, sensor, "threshold.on", [0.2], fps=1000).counts[0],
+        dase.sweep(frames, sensor.without("readout"), "threshold.on", [0.2], fps=1000).counts[0],
+    )
 
 
 def test_a_sweep_is_a_short_table(frames):

@@ -144,7 +144,7 @@ def test_a_lens(device, windows, monkeypatch):
 
 def test_readout_effects_are_left_out():
     stream = streamed(sensor=NOISY.with_effect(Readout(rate=1e4)), batch=1, steps=1)
-    assert set(stream.left_out) == {"readout"}
+    assert set(stream.left_out) == {"readout", "timestamp"}
     assert_same(next(iter(stream)), stream, 0, slots=(0,))
 
 
