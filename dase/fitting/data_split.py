@@ -83,6 +83,11 @@ PARTS = 3
 """Groups of pixels: those that are fitted, that choose between models, and that report."""
 
 
+NO_THRESHOLDS = (
+    "the light never changes: nothing tells how much change an event takes, and thresholds are not fitted"
+)
+
+
 @dataclass(frozen=True, eq=False)
 class SplitMeasurement:
     """A measurement and the scene it is of.
@@ -135,6 +140,11 @@ class SplitMeasurement:
             frame_begin=frames.begin if frames else 0.0,
             frame_exposure=frames.exposure if frames else 0.0,
         )
+
+    @property
+    def light_never_changes(self) -> bool:
+        """Whether no pixel sees a change of light, so that nothing tells how much change an event takes."""
+        return all(half.trials.stimulus.never_changes for half in (self.train, self.held, self.report))
 
     @property
     def evaluations(self) -> int:
@@ -327,10 +337,11 @@ def split_measurement(
     contradiction = contradiction_of_rest(events, light[:, :1] if still else light)
     if contradiction:
         notes.insert(0, contradiction)
-    return SplitMeasurement(
+    out = SplitMeasurement(
         train, held, last_part, scout, bands, structure, peak, *rates, when, tuple(notes),
         contradiction, frames,
     )  # fmt: skip
+    return replace(out, notes=(*notes, NO_THRESHOLDS)) if out.light_never_changes else out
 
 
 def _within(events: Events, grid: Grid) -> Events:

@@ -131,7 +131,11 @@ def model_of(sensor: Sensor, free: Sequence[str] | None = None) -> FittedModel:
 def free_where_measured(
     evidence: SplitMeasurement, sensor: Sensor, free: Sequence[str] | None
 ) -> Sequence[str] | None:
-    """Return what is free in a fit to a measurement: where nothing is named, not a bus that was idle.
+    """Return what is free in a fit to a measurement: where nothing is named, not what it cannot show.
+
+    That is a bus that was idle, and thresholds where light never changes: they only set the unit of what
+    crosses them there. Noise, drift and lamps make the same events with thresholds as much larger, and the
+    rate of shot noise is in hertz.
 
     Args:
         evidence: The measurement.
@@ -139,9 +143,10 @@ def free_where_measured(
         free: Those that are named; None for all.
     """
     idle = {e.name for e in sensor.readout_effects() if e.is_idle(evidence.highest_event_rate)}
-    if free is not None or not idle:
+    unseen = {"threshold.on", "threshold.off"} if evidence.light_never_changes else set()
+    if free is not None or not (idle or unseen):
         return free
-    return [axis.name for axis in axes_of(sensor) if axis.effect.name not in idle]
+    return [a.name for a in axes_of(sensor) if a.effect.name not in idle and a.name not in unseen]
 
 
 def with_phase(model: FittedModel, phase: float) -> FittedModel:

@@ -109,6 +109,11 @@ class Stimulus:
         return self.intensity.strides[1] == 0
 
     @property
+    def never_changes(self) -> bool:
+        """Whether the light of every pixel stays within what counts as at rest."""
+        return self.at_rest or bool(np.ptp(self.level, axis=1).max() < STIMULUS.still)
+
+    @property
     def level(self) -> NDArray[np.float32]:
         """Log intensity, shape (N, T), or (N, 1) where it never changes."""
         light = self.intensity[:, :1] if self.at_rest else self.intensity

@@ -165,3 +165,17 @@ def test_intervals_hold_where_slopes_are_noisy_and_parameters_make_up_for_each_o
     assert np.all(np.mean(inside, axis=0) > 0.8)
     # and is not much wider than it must be
     assert np.all(np.median(width, axis=0) < 2)
+
+
+def test_thresholds_of_light_that_never_changes_are_no_claim():
+    """Noise alone fitted them to 0.24 and 0.78 (0.42 to 0.94) where both were 0.2."""
+    light = np.linspace(0.05, 0.9, 32 * 24, dtype=np.float32).reshape(24, 32)
+    scene = dase.VideoScene(np.broadcast_to(light, (600, 24, 32)), np.arange(600) * 2e-3)
+    true = Sensor().with_effect(EFFECTS["shot"](rate=8.0))
+    found = dase.fit(dase.simulate(scene, true, seed=1), true, scene=scene, pixels=200)
+    assert {"shot.rate", "shot.balance"} <= set(found.parameters)
+    assert not any(name.startswith("threshold") for name in found.parameters)
+    assert found.sensor["threshold"] == replace(true["threshold"], phase=found.sensor["threshold"].phase)
+    assert any("thresholds are not fitted" in note for note in found.notes)
+    asked = dase.fit(dase.simulate(scene, true, seed=1), true, scene=scene, free=["threshold.on"], pixels=200)
+    assert set(asked.parameters) == {"threshold.on"}
