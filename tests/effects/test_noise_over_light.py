@@ -38,6 +38,22 @@ def test_shot_noise_falls_with_the_light(device, knee, bright):
     assert np.all(np.abs(got.reshape(5, pixels).sum(1) - want) <= 4 * np.sqrt(want))
 
 
+@pytest.mark.parametrize("spread", [0.0, 0.4, 0.8])
+def test_some_pixels_are_noisier_than_others(device, spread):
+    """Counts of a pixel are Poisson about its rate, so their moments tell those of a log-normal rate."""
+    pixels, seconds, rate = 4000, 10.0, 2.0
+    scene = still(np.full(pixels, 0.3), seconds, 11)
+    shot = Shot(rate=rate, bright=1.0, balance=0.5, spread=spread)
+    got = counts(scene, every(shot), seconds, device).sum(0).astype(float)
+    mean, wide = rate * seconds, np.exp(spread**2) - 1
+    assert got.mean() == pytest.approx(mean, abs=4 * np.sqrt((mean + mean**2 * wide) / pixels))
+    assert (got.var() - got.mean()) / got.mean() ** 2 == pytest.approx(wide, rel=0.2, abs=0.005)
+    halves = counts(scene, every(shot), seconds / 2, device).sum(0)
+    assert np.corrcoef(halves, got - halves)[0, 1] == pytest.approx(
+        mean / 2 * wide / (1 + mean / 2 * wide), abs=0.06
+    )
+
+
 @pytest.mark.parametrize("change", [0.5, 2.0])
 def test_noise_follows_the_thresholds_of_biases(device, change):
     """Where the rate was measured at a threshold, lower thresholds of all pixels make it higher."""

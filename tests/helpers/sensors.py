@@ -32,7 +32,7 @@ def full(mode: str = "reset") -> dase.Sensor:
         Mismatch(spread=0.1),
         Bandwidth(cutoff=400.0),
         Leak(rate=8.0, spread=0.3),
-        Shot(rate=60.0, balance=0.6),
+        Shot(rate=60.0, balance=0.6, spread=0.5),
         Refractory(period=3e-3, mode=mode),
     )
 

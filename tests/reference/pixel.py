@@ -228,6 +228,9 @@ def events(sensor: dase.Sensor, times: np.ndarray, intensity: np.ndarray, seed: 
     knee = setting(sensor, "shot", "knee", np.inf)
     total = rate * (bright + (1 - bright) * (1 - light) / (1 + light / knee) ** 2)
     rates = np.stack([total * (1 - balance), total * balance], -1)
+    spread = setting(sensor, "shot", "spread", 0.0)
+    drawn = [Stream("shot_noise_pixel_normal", seed, i).normal() for i in range(intensity.shape[1])]
+    rates *= np.exp(spread * (np.array(drawn) - spread / 2))[:, None]
     nominal = np.array([sensor["threshold"].off, sensor["threshold"].on])
     own = np.array([thresholds(sensor, i, seed) for i in range(intensity.shape[1])])
     rates *= nominal / own
