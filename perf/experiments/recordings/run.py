@@ -45,6 +45,10 @@ BANDS = (0, 4, 10, 20, 40, 256)
 """Grey levels of 255 between which rates of resting pixels are averaged."""
 REST = 6
 """Most grey levels by which the frames of a resting pixel change, within 7 pixels."""
+MANY = (1, 2, 4, 8)
+"""Events of a pixel that is counted among those that send much."""
+RUNS = 4
+"""Simulations of resting pixels."""
 FEWEST = 300
 """Resting pixels, and intervals, without which no number stands."""
 
@@ -116,21 +120,49 @@ def share_of_ties(events: Events) -> tuple[float, float]:
     return float(tie.mean()), float((tie & (np.diff(events.y.astype(int)) == 0)).mean())
 
 
-def rates_at_rest(events: Events, frames: NDArray[Any] | None, seconds: float) -> list[float | None]:
-    """Return the rate of resting pixels [Hz] in bands of their brightness; None where they are too few."""
-    counts = np.bincount(
-        events.y.astype(np.int64) * events.width + events.x, minlength=events.width * events.height
-    ).reshape(events.height, events.width)
-    if frames is None:
-        return [float(counts.mean() / seconds)]
+def pixels_at_rest(frames: NDArray[Any]) -> tuple[NDArray[np.bool_], NDArray[np.float64]]:
+    """Return which pixels rest, and their brightness [grey levels], shape (H, W) each."""
     change = frames.max(0).astype(int) - frames.min(0)
-    rest = cv2.dilate(change.astype(np.float32), np.ones((15, 15))) <= REST
-    level = frames.mean(0)
-    out: list[float | None] = []
+    rest: NDArray[np.bool_] = cv2.dilate(change.astype(np.float32), np.ones((15, 15))) <= REST
+    return rest, frames.mean(0)
+
+
+def counts_of_pixels(events: Events) -> NDArray[np.int64]:
+    """Return the events of each pixel, shape (H, W)."""
+    pixel = events.y.astype(np.int64) * events.width + events.x
+    return np.bincount(pixel, minlength=events.width * events.height).reshape(events.height, events.width)
+
+
+def noise_at_rest(
+    streams: list[Events], frames: NDArray[Any] | None, seconds: float
+) -> dict[str, list[float | None]]:
+    """Return the rates of resting pixels [Hz] in bands of brightness, and shares of pixels that send much.
+
+    Args:
+        streams: Of the same pixels for as long.
+        frames: What says which pixels rest; None where all do.
+        seconds: Length of each stream.
+    """
+    counts = np.stack([counts_of_pixels(events) for events in streams])
+    if frames is None:
+        return {"rest": [float(counts.mean() / seconds)], "tail": []}
+    rest, level = pixels_at_rest(frames)
+    rates: list[float | None] = []
     for low, high in pairwise(BANDS):
         mine = rest & (level >= low) & (level < high)
-        out.append(float(counts[mine].mean() / seconds) if mine.sum() >= FEWEST else None)
-    return out
+        rates.append(float(counts[:, mine].mean() / seconds) if mine.sum() >= FEWEST else None)
+    tail: list[float | None] = []
+    for mine in (rest & (level < BANDS[1]), rest & (level >= BANDS[3])):
+        enough = mine.sum() >= FEWEST
+        tail += [float((counts[:, mine] >= n).mean()) if enough else None for n in MANY]
+    return {"rest": rates, "tail": tail}
+
+
+def simulate_rest(sensor: Sensor, frames: NDArray[Any], seconds: float, seed: int) -> list[Events]:
+    """Return what a sensor sends before the mean of the frames, which has none of their noise."""
+    light = np.repeat(frames.mean(0, keepdims=True) / 255, 2, 0).astype(np.float32)
+    still = dase.VideoScene(light, [0.0, seconds])
+    return [dase.simulate(still, sensor, seed=seed + n) for n in range(RUNS)]
 
 
 def signature(entries: tuple[Signature, ...], name: str) -> Signature | None:
@@ -138,8 +170,8 @@ def signature(entries: tuple[Signature, ...], name: str) -> Signature | None:
     return next((one for one in entries if one.name == name and one.found), None)
 
 
-def describe(events: Events, scene: Any, frames: NDArray[Any] | None) -> dict[str, Any]:
-    """Return all that is compared."""
+def describe(events: Events, scene: Any) -> dict[str, Any]:
+    """Return all that is compared but noise at rest."""
     begins = scene.begin if isinstance(scene, CameraScene) else None
     entries = find_signatures(events, begins=begins).entries
     bursts, lamp = (signature(entries, name) for name in ("frame coupling", "flicker"))
@@ -148,7 +180,6 @@ def describe(events: Events, scene: Any, frames: NDArray[Any] | None) -> dict[st
     return {
         "rate": len(events) / seconds / (events.width * events.height),
         "intervals": interval_quantiles(events),
-        "rest": rates_at_rest(events, frames, seconds),
         "ties": ties,
         "row ties": in_row,
         "bursts": bursts.details["share"] if bursts else 0.0,
@@ -173,7 +204,7 @@ def look_at(source: Source, folder: Path, seed: int = 0) -> dict[str, Any]:
     recording = dase.open_recording(folder / source.path)
     recording = recording.slice(recording.begin, recording.begin + source.longest)
     if not source.scene:
-        return {"measured": describe(recording.events, None, None)}
+        return {"measured": describe(recording.events, None)}
     if source.scene == "static":
         measured = Measurement(recording.events, static_scene(recording.events))
     else:
@@ -181,7 +212,8 @@ def look_at(source: Source, folder: Path, seed: int = 0) -> dict[str, Any]:
     scene, frames = measured.scene, recording.frames
     times = scene.sample_times()
     inside = measured.events.slice(float(times[0]), float(times[-1]))
-    out = {"measured": describe(inside, scene, frames)}
+    seconds = float(times[-1] - times[0])
+    out = {"measured": describe(inside, scene) | noise_at_rest([inside], frames, seconds)}
     now = load_sensor(source.preset)
     seen = with_frames(now, measured, seed)
     sensors = {"before": preset_before(source.preset), "after": now}
@@ -189,7 +221,8 @@ def look_at(source: Source, folder: Path, seed: int = 0) -> dict[str, Any]:
         sensors["after, frames fitted"] = seen
     for name, sensor in sensors.items():
         made = dase.simulate(scene, sensor, seed=seed)
-        out[name] = describe(made, scene, frames)
+        still = [made] if frames is None else simulate_rest(sensor, frames, seconds, seed)
+        out[name] = describe(made, scene) | noise_at_rest(still, frames, seconds)
         print(f"  {name}: {len(made):,} events for {len(inside):,}", flush=True)
     return out
 
