@@ -450,6 +450,21 @@ def main() -> None:
         _run(options)
     lines = [json.loads(text) for text in options.log.read_text().splitlines() if text.strip()]
     print("\n".join(table(lines)))
+    print(f"\n{reached(lines, options)}")
+
+
+def reached(lines: list[Line], options: argparse.Namespace) -> str:
+    """Return how far a log goes in the order that its key draws; the slowest cases are those it lacks."""
+    done = {line["name"] for line in lines if "failed" not in line and line["key"] == options.key}
+    order = [case.name for case in cases(options)]
+    last = max((n + 1 for n, name in enumerate(order) if name in done), default=0)
+    begun = [name for name in order[:last] if name not in done]
+    failed = len({line["name"] for line in lines if "failed" in line} - done)
+    missing = f"{len(begun)} have no answer{': ' if begun else ''}{', '.join(begun[:12])}"
+    return (
+        f"key {options.key}: {len(done)} of {len(order)} cases finished, {failed} failed; of the first "
+        f"{last} in the order of the key {missing}"
+    )
 
 
 def _run(options: argparse.Namespace) -> None:
