@@ -75,12 +75,17 @@ def static(path: Path) -> Measurement:
 
 
 def without_times(path: Path) -> Measurement:
-    """Open a recording whose frames have no times: equal steps, as long and as late as fits best."""
+    """Open a recording whose frames have no times: equal steps, as late as fits best.
+
+    As long as from burst to burst where the events show bursts at even times, else as long as fits best.
+    """
     with np.load(path) as data:
         frames = data["frames"]
     events = dase.io.read(path).events
     best: Any = None
-    for step in np.arange(0.046, 0.0581, 0.001):
+    bursts = dase.find_signatures(events)["frame coupling"]
+    steps = [bursts.details["interval"]] if bursts.found else np.arange(0.046, 0.0581, 0.001)
+    for step in steps:
         times = events.t[0] + step * np.arange(len(frames))
         found = align(events, frames, times)
         if best is None or found.score > best[0].score:
@@ -88,7 +93,7 @@ def without_times(path: Path) -> Measurement:
     found, times, step = best
     frames, begin, _ = found.apply(frames, times, times)
     notes = [
-        f"the frames have no times: {1e3 * step:.0f} ms apart, {1e3 * found.offset:.0f} ms after the first "
+        f"the frames have no times: {1e3 * step:.2f} ms apart, {1e3 * found.offset:.0f} ms after the first "
         f"event they correlate best with the events, at {found.score:.2f}"
     ]
     begin = times + found.offset if "offset" not in found.clear else begin
