@@ -54,11 +54,16 @@ def test_targets_have_physics_beyond_thresholds():
     assert all({effect.name for effect in sensor.effects} > plain for sensor in TARGETS.values())
 
 
-def test_seeds_come_one_after_the_other():
-    plan = study_plan(("reconstruction", "flow"), ("esim", "fitted", "true"), ("slow", "all"), (0, 1))
-    assert plan[:2] == [Job("fit", "", "slow", 0), Job("fit", "", "all", 0)]
-    half = 2 * (2 * 2 + 1)
-    assert [job.seed for job in plan[2:]] == [0] * half + [1] * half
+def test_what_waits_for_no_fit_comes_first_and_seed_by_seed():
+    tasks, kinds = ("reconstruction", "flow"), ("esim", "tuned", "fitted", "true")
+    plan = study_plan(tasks, kinds, ("slow", "all"), (0, 1))
+    assert plan[:2] == [Job("tune", "", "slow", 0), Job("tune", "", "all", 0)]
+    quick = 2 * (1 + 2 * 2)  # of a seed: esim, and two kinds for two targets
+    assert [job.seed for job in plan[2 : 2 + 2 * quick]] == [0] * quick + [1] * quick
+    fits = 2 + 2 * quick
+    assert plan[fits : fits + 2] == [Job("fit", "", "slow", 0), Job("fit", "", "all", 0)]
+    assert {job.kind for job in plan[fits + 2 :]} == {"fitted"}
+    assert [job.seed for job in plan[fits + 2 :]] == [0] * 4 + [1] * 4
     assert len(set(plan)) == len(plan)
     assert Job("flow", "esim", "", 1) in plan
     assert not any(job.task == "fit" for job in study_plan(("flow",), ("esim", "true"), ("slow",), (0,)))

@@ -9,8 +9,9 @@ trained on ESIM's default, on broad randomisation, and for each target on S2R's 
 of photographs that no training has seen. The same seed has the same first weights and scenes whatever
 the sensor. Each training stands alone: it is checkpointed, `--minutes` ends a call, the same call goes
 on, and several machines may take `--seeds` apart. `--jobs` trainings share a device: each is small, and
-waits for Python more than for the GPU. Seeds come one after the other, so that a call that ends early
-leaves whole tables of fewer seeds. `results.jsonl` has a line for each network and target, `sensors/`
+waits for Python more than for the GPU. What waits for no fit comes first and seed by seed, so that a
+call that ends early leaves whole tables of fewer seeds; a fit takes up to an hour of a core, which
+machines without a GPU can spend. `results.jsonl` has a line for each network and target, `sensors/`
 what was tuned and fitted: with both in OUT, another machine goes on. `results.jsonl` and
 `learned_sensors/` of this folder are of photographs that are no part of the project. `--photos` may be a
 tar of pictures.
@@ -284,15 +285,26 @@ class Job(NamedTuple):
 def study_plan(
     tasks: Sequence[str], kinds: Sequence[str], targets: Sequence[str], seeds: Sequence[int]
 ) -> list[Job]:
-    """Return all jobs in the order in which they are wanted: what others wait for, then seed by seed."""
-    known = [kind for kind in kinds if kind not in OF_NO_TARGET]
-    tasks_before = [LEARNED_BY[kind] for kind in kinds if kind in LEARNED_BY]
-    jobs = [Job(task, "", target, 0) for task in tasks_before for target in targets]
-    for seed in seeds:
-        each = [(kind, target) for target in targets for kind in known]
-        each += [(kind, "") for kind in kinds if kind in OF_NO_TARGET]
-        jobs += [Job(task, kind, target, seed) for kind, target in each for task in tasks]
-    return jobs
+    """Return all jobs in the order in which they are wanted.
+
+    What is quick and others wait for comes first, then seed by seed what waits for no fit; fits take up to
+    an hour each, and they and what waits for them come last, again seed by seed.
+    """
+
+    def of_kinds(some: Sequence[str]) -> list[Job]:
+        known = [kind for kind in some if kind not in OF_NO_TARGET]
+        each = [(kind, "") for kind in some if kind in OF_NO_TARGET]
+        each += [(kind, target) for target in targets for kind in known]
+        return [Job(task, kind, target, seed) for seed in seeds for kind, target in each for task in tasks]
+
+    def learning(some: Sequence[str]) -> list[Job]:
+        return [
+            Job(LEARNED_BY[kind], "", target, 0) for kind in some if kind in LEARNED_BY for target in targets
+        ]
+
+    slow = [kind for kind in kinds if LEARNED_BY.get(kind) == "fit"]
+    quick = [kind for kind in kinds if kind not in slow]
+    return learning(quick) + of_kinds(quick) + learning(slow) + of_kinds(slow)
 
 
 def next_job(
