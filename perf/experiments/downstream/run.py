@@ -89,7 +89,7 @@ class Size:
     flow_batch: int = 16
     flow_windows: int = 3
     reconstruction_channels: int = 16
-    flow_channels: int = 16
+    flow_channels: int = 32
     reconstruction_steps: int = 500
     flow_steps: int = 8000
     samples: int = 16
