@@ -9,6 +9,7 @@ from typing import ClassVar, Self
 import warp as wp
 
 from dase.effects.base import Effect, Observations, choice, parameter
+from dase.effects.photocurrent import dark_share, relative_photocurrent
 from dase.kernels.pixel_stages import EffectStages
 from dase.kernels.vector_math import exponential, logarithm
 
@@ -18,7 +19,7 @@ def time_constants(
     intensity: float, dt: float, cutoff: float, dark: float, spread: float, pixel_normal: float
 ):
     """Length of a step in time constants of the pixel's photoreceptor."""
-    x = 2.0 * wp.pi * cutoff * (dark + (1.0 - dark) * wp.clamp(intensity, 0.0, 1.0)) * dt
+    x = 2.0 * wp.pi * cutoff * relative_photocurrent(intensity, dark) * dt
     # a pixel of hardly any bandwidth would be a dead one
     return x * wp.max(1.0 + spread * pixel_normal, 0.1)
 
@@ -109,13 +110,8 @@ class Bandwidth(Effect):
         plausible=(3.0, 3000.0),
         about="-3 dB frequency at intensity 1",
     )
-    dark: float = parameter(
-        20 / 275,
-        unit="1",
-        bounds=(1e-4, 1.0),
-        plausible=(0.01, 1.0),
-        about="cutoff at intensity 0 relative to that at intensity 1; 1 makes the bandwidth constant",
-        starts="ends",
+    dark: float = dark_share(
+        "cutoff at intensity 0 relative to that at intensity 1; 1 makes the bandwidth constant"
     )
     spread: float = parameter(
         0.0,

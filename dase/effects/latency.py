@@ -8,13 +8,13 @@ from typing import ClassVar
 import warp as wp
 
 from dase.effects.base import Effect, parameter
+from dase.effects.photocurrent import dark_share, relative_photocurrent
 
 
 @wp.func
 def event_delay(intensity: float, delay: float, light: float, dark: float):
     """Time from a crossing to its event's leaving the pixel [s]."""
-    current = dark + (1.0 - dark) * wp.clamp(intensity, 0.0, 1.0)
-    return delay * (1.0 - light + light / current)
+    return delay * (1.0 - light + light / relative_photocurrent(intensity, dark))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -53,11 +53,6 @@ class Latency(Effect):
         plausible=(0.0, 1.0),
         about="share of the delay at intensity 1 that grows as 1/intensity",
     )
-    dark: float = parameter(
-        20 / 275,
-        unit="1",
-        bounds=(1e-4, 1.0),
-        plausible=(0.01, 1.0),
-        about="photocurrent at intensity 0 relative to that at intensity 1; 1 makes the delay constant",
-        starts="ends",
+    dark: float = dark_share(
+        "photocurrent at intensity 0 relative to that at intensity 1; 1 makes the delay constant"
     )

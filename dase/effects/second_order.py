@@ -10,6 +10,7 @@ import warp as wp
 
 from dase.effects.bandwidth import Bandwidth
 from dase.effects.base import Effect, parameter
+from dase.effects.photocurrent import dark_share, relative_photocurrent
 from dase.kernels.vector_math import cosine_and_sine, exponential
 
 
@@ -72,7 +73,7 @@ def second_order_voltage(
     pixel_normal: float,
 ):
     """Second-order low-pass, exact for an input that runs straight between samples."""
-    omega = 2.0 * wp.pi * cutoff * (dark + (1.0 - dark) * wp.clamp(intensity, 0.0, 1.0))
+    omega = 2.0 * wp.pi * cutoff * relative_photocurrent(intensity, dark)
     omega *= wp.max(1.0 + spread * pixel_normal, 0.1)
     x = omega * dt
     step = voltage - input
@@ -130,13 +131,8 @@ class SecondOrder(Effect):
         about="below 1 the response overshoots",
         starts="ends",
     )
-    dark: float = parameter(
-        20 / 275,
-        unit="1",
-        bounds=(1e-4, 1.0),
-        plausible=(0.01, 1.0),
-        about="natural frequency at intensity 0 relative to that at intensity 1; 1 makes it constant",
-        starts="ends",
+    dark: float = dark_share(
+        "natural frequency at intensity 0 relative to that at intensity 1; 1 makes it constant"
     )
     spread: float = parameter(
         0.0,
