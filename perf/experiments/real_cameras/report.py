@@ -285,8 +285,8 @@ named; the fifth (27, 70) sends 990 events per second where edges pass all the t
 
 Rows of `psee_gen31_dot` and columns of `davis346_cuke_cradle` were called grouped until signatures knew
 edges that move, which make the same; of either too few events are left beside edges to say anything.
-The cradle's below is from before. So are the thresholds of `dvx_noise_static` and `noise_iebcs`: where the
-light never changes none is fitted any more (bcf49ae), and what stands below of them is no claim.
+The cradle's below is from before. So are the thresholds of `dvx_noise_static`: where the light never
+changes none is fitted any more (bcf49ae), and what stands below of them is no claim.
 
 `noise_iebcs` has ON events alone in the light, 0.06 Hz at 161 and 0.13 Hz at 3,000 lux, beside 9.7 Hz at 0.1
 lux. Two seconds have some 25 of them among the pixels that are compared, and no leak is found. Tried and
