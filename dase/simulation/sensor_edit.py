@@ -80,23 +80,25 @@ class SensorText:
         return self._checked(new, after)
 
     def with_values_of(self, effect: Effect) -> SensorText:
-        """Return the text with the values of an effect that it has.
+        """Return the text with values that were fitted for an effect that it has.
 
-        Comments stay. One that is about a value that changes, and not about the parameter, says which it was:
-        `on = 0.23 # from the data sheet (was 0.2)`.
+        Comments stay. One that is about a value that changes, and not about the parameter or its unit, was
+        true of the old one: `on = 0.2 # a guess` becomes `on = 0.23 # fitted (was 0.2: a guess)`.
         """
         document = tomlkit.parse(self.text)
         table: Any = document[effect.name]
         before = self.sensor()
         about: Any = effect_table(effect)
+        units = {p.name: f"# {p.unit}" for p in effect.parameters()}
         for name in effect.settings():
             value, old = getattr(effect, name), getattr(before[effect.name], name)
             if value == old:
                 continue
             table[name] = value
             comment = table[name].trivia.comment
-            if comment and comment != about[name].trivia.comment and " (was " not in comment:
-                table[name].trivia.comment = f"{comment} (was {old})"
+            known = comment in ("", about[name].trivia.comment, units.get(name))
+            if not known and not comment.startswith("# fitted (was "):
+                table[name].trivia.comment = f"# fitted (was {old}: {comment.lstrip('# ')})"
         return self._checked(tomlkit.dumps(document), before.with_effect(effect))
 
     def in_folder(self, folder: Path) -> SensorText:

@@ -98,7 +98,7 @@ def test_comments_of_a_fitted_file_are_about_its_values():
     )
     sensor = text.sensor()
     fitted = text.describing(sensor.with_effect(type(sensor["threshold"])(on=0.25, off=0.2)))
-    assert "# ON first\non = 0.25 # measured in May (was 0.2)\n" in fitted.text
+    assert "# ON first\non = 0.25 # fitted (was 0.2: measured in May)\n" in fitted.text
     assert "off = 0.2 # stays" in fitted.text
     again = fitted.describing(sensor.with_effect(type(sensor["threshold"])(on=0.3, off=0.2)))
     assert again.text == fitted.text.replace("on = 0.25", "on = 0.3")

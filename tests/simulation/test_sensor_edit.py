@@ -99,7 +99,7 @@ def test_changed_values_keep_their_comments():
     text = SensorText(MINE, "mine")
     new = text.with_values_of(EFFECTS["threshold"](on=0.3, off=0.22, phase=0.5))
     assert new.sensor()["threshold"].on == 0.3
-    assert "on   = 0.3       # strange spacing" in new.text
+    assert "on   = 0.3       # fitted (was 0.25: strange spacing)" in new.text
     assert "phase = 0.5" in new.text
     old = [line for line in MINE.splitlines() if not line.startswith("on ")]
     assert kept("\n".join(old), new.text)
@@ -111,8 +111,8 @@ def test_becomes_another_sensor():
     want = want.with_effect(EFFECTS["refractory"](period=0.002)).with_effect(EFFECTS["threshold"](on=0.3))
     new = text.describing(want)
     assert new.sensor() == want
-    assert "period = 0.002    # s" in new.text
-    assert "on   = 0.3       # strange spacing" in new.text
+    assert "period = 0.002    # s\n" in new.text
+    assert "on   = 0.3       # fitted (was 0.25: strange spacing)" in new.text
     assert text.describing(text.sensor()).text == MINE
 
 
@@ -253,6 +253,6 @@ def test_add_and_fit(tmp_path, rng):
     assert entry.recording == "recording.h5"
     assert entry.error_before > 2 * entry.error_after
     assert f"error {entry.error_before:.2f} before" in done.stdout
-    assert "# mine" in (tmp_path / "mine.toml").read_text()
+    assert "# fitted (was 0.2: mine)" in (tmp_path / "mine.toml").read_text()
     wrong = dase("add", "mine.toml", "shot", "--fit", "none.h5", cwd=tmp_path)
     assert "none.h5" in one_sentence(wrong)
