@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
@@ -45,6 +46,10 @@ class SimulatorSettings:
     """Effects up to which a sensor has a kernel of its own, up to twice as fast. Those with more share one
     that has all effects: it is compiled once, and not for each of hundreds of combinations."""
 
+    own_work: float
+    """Samples of pixels [models x pixels x samples] from which on such a sensor has one, too: those of the
+    shared kernel have then cost about as much more as compiling another takes, and as many may come."""
+
     sums_bytes: int
     """Memory for the sums of one launch [bytes]."""
 
@@ -53,8 +58,10 @@ class SimulatorSettings:
 
 
 LAUNCHES = {
-    "cpu": SimulatorSettings(own_kernel=1, sums_bytes=1 << 26),  # the sums should stay in the caches
-    "cuda": SimulatorSettings(own_kernel=0, sums_bytes=1 << 31),  # so that all candidates run in one launch
+    # the sums should stay in the caches
+    "cpu": SimulatorSettings(own_kernel=1, own_work=5e8, sums_bytes=1 << 26),
+    # so that all candidates run in one launch
+    "cuda": SimulatorSettings(own_kernel=0, own_work=math.inf, sums_bytes=1 << 31),
 }
 
 
@@ -121,6 +128,8 @@ class BatchSimulator:
         default_factory=dict, repr=False
     )
 
+    _kernel_work: Counter[Any] = field(default_factory=Counter, repr=False)
+
     def __post_init__(self) -> None:
         self.device = self.stimulus.device
         self._middle: tuple[Any, Any] | None = None
@@ -144,6 +153,7 @@ class BatchSimulator:
     def run_all(self, orders: Sequence[SimulationOrder]) -> list[ProbeSums]:
         """Simulate many models; those that have a kernel in common run together, whatever their effects."""
         together: dict[Any, list[tuple[int, NDArray[np.int64]]]] = {}
+        done = Counter[Any]()
         for n, order in enumerate(orders):
             each = order.samples_per_step(self.stimulus.grid.step)
             kernel = self._kernel(order.sensor)[0]
@@ -157,6 +167,11 @@ class BatchSimulator:
             cut = [replace(orders[n], vectors=orders[n].vectors[rows], finer=finer) for n, rows in members]
             for (n, rows), sums in zip(members, self._run(cut, self.stimulus.history(finer)), strict=True):
                 parts[n].append((rows, sums))
+            for order in cut:
+                samples = self.stimulus.grid.steps * max(finer, 1)
+                done[_kernel_key(order.sensor)] += len(order.vectors) * len(self.stimulus.pixels) * samples
+        # only now: launches have been put together by kernels
+        self._kernel_work.update(done)
         out = []
         for found in parts:
             joined = ProbeSums.join([sums for _, sums in found])
@@ -240,12 +255,13 @@ class BatchSimulator:
 
     def _kernel(self, sensor: Sensor) -> tuple[wp.Kernel, NDArray[np.float32], list[int]]:
         """Return the kernel of a sensor, a parameter vector for it, and the places of the sensor's own."""
-        # words choose what is compiled, numbers do not: they come with the parameter vector
-        key = tuple((e.name, *(getattr(e, name) for name in e.choices())) for e in sensor.effects)
+        stages, of_effects = sensor.stages(), _kernel_key(sensor)
+        rare = self._kernel_work[of_effects] < self._launches.own_work
+        share = len(stages) > self._launches.own_kernel and rare
+        key = of_effects, share
         if key not in self._kernels:
-            stages = sensor.stages()
-            wide = with_every_effect(sensor) if len(stages) > self._launches.own_kernel else sensor
             # what the sensor lacks is off in the wide one, and off changes nothing, bit for bit
+            wide = with_every_effect(sensor) if share else sensor
             names = wide.parameter_names()
             at = [names.index(name) for name in sensor.parameter_names()]
             self._kernels[key] = (
@@ -406,6 +422,11 @@ def _fold_for_frames(orders: Sequence[SimulationOrder], pixels: Any) -> NDArray[
 def _groups_of_row(grouped: Any, clock: Any, row: int) -> tuple[NDArray[np.float32], NDArray[np.int32]]:
     """Return sums and events of each step of the groups of one row."""
     return grouped[row].numpy().copy(), clock[row].numpy().copy()
+
+
+def _kernel_key(sensor: Sensor) -> tuple[Any, ...]:
+    """Return what chooses a sensor's kernel: words do, numbers come with the parameter vector."""
+    return tuple((e.name, *(getattr(e, name) for name in e.choices())) for e in sensor.effects)
 
 
 def with_every_effect(sensor: Sensor) -> Sensor:

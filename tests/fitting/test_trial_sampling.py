@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -9,10 +10,12 @@ import pytest
 
 import dase
 from dase.effects.flicker import Flicker
+from dase.effects.leak import Leak
 from dase.effects.readout import Readout
+from dase.effects.refractory import Refractory
 from dase.effects.threshold import Threshold
 from dase.effects.voltage_noise import VoltageNoise
-from dase.fitting.batch_simulator import BatchSimulator, SimulationOrder
+from dase.fitting.batch_simulator import LAUNCHES, BatchSimulator, SimulationOrder
 from dase.fitting.descent import descent_work, ranking_work
 from dase.fitting.parameter_space import ParameterSpace, axes_of
 from dase.fitting.trial_sampling import samples_of_screening, samples_per_step, samples_per_step_of_rows
@@ -111,3 +114,20 @@ def test_a_search_asks_for_no_more_samples_than_it_was_told(trials):
     works = [descent_work(half, space, np.zeros(1), seed=0, most=n) for n in (3, 24)]
     works += [ranking_work(half, space, np.zeros((2, 1)), seed=0, most=3)]
     assert [next(work)[0].most for work in works] == [3, 24, 3]
+
+
+def test_a_kernel_of_its_own_gives_the_same_bits(trials):
+    """A sensor that many models of were simulated gets one, and leaves the one that has all effects."""
+    if trials.device.is_cuda:
+        pytest.skip("on a GPU all candidates share a kernel")
+    sensor = sensor_with(Leak(rate=2.0), Refractory(period=4e-3))
+    vectors = np.repeat(sensor.parameters()[None], 3, 0)
+    settings = replace(
+        LAUNCHES["cpu"], own_work=3.0 * trials.stimulus.grid.steps * len(trials.stimulus.pixels)
+    )
+    few = BatchSimulator(trials.stimulus, settings=settings)
+    first, second = (few.run(sensor, vectors, seed=5) for _ in range(2))
+    assert len(few._kernels) == 2
+    assert first.halves.sum() > 300
+    np.testing.assert_array_equal(second.halves, first.halves)
+    np.testing.assert_array_equal(second.sums, first.sums)
