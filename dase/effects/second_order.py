@@ -40,6 +40,15 @@ def impulse_response(x: float, damping: float):
 
 
 @wp.func
+def settled_share(x: float):
+    """Mean of e^-t for t from 0 to x: (1 - e^-x) / x, with all digits."""
+    mean = 1.0 - 0.5 * x * (1.0 - x / 3.0 * (1.0 - 0.25 * x))
+    if x > 0.05:
+        mean = (1.0 - exponential(-x)) / x
+    return mean
+
+
+@wp.func
 def ramp_lag(x: float, damping: float, h: float, rest: float):
     """Shares of a ramp's step by which the output lags, and by which it has got up to speed.
 
@@ -55,6 +64,15 @@ def ramp_lag(x: float, damping: float, h: float, rest: float):
         c = -(8.0 * damping * b + a) / 20.0
         behind = 1.0 + x * x * (-1.0 / 6.0 + x * (a / 4.0 + x * (b / 5.0 + x * c / 6.0)))
         speed = x * (0.5 - x * (a + x * (b + x * c)))
+    if damping >= 1.5:
+        # two real poles, whose sums lose no digits when one is much slower than the other
+        w = wp.sqrt((damping - 1.0) * (damping + 1.0))
+        quick = damping + w
+        slow = 1.0 / quick
+        mean_quick = settled_share(quick * x)
+        mean_slow = settled_share(slow * x)
+        behind = (quick * mean_slow - slow * mean_quick) / (2.0 * w)
+        speed = (mean_slow - mean_quick) / (2.0 * w)
     return behind, speed
 
 

@@ -82,7 +82,9 @@ def answers(x: wp.array[float], damping: wp.array[float], out: wp.array2d[float]
 
 
 def test_closed_forms_keep_their_digits(device):
-    x, damping = np.meshgrid(np.geomspace(1e-4, 50, 60), [0.05, 0.4, 0.999, 1.0, 1.0001, 1.05, 3.0, 20.0])
+    x, damping = np.meshgrid(
+        np.geomspace(1e-4, 50, 60), [0.05, 0.4, 0.999, 1.0, 1.0001, 1.05, 1.5, 3.0, 20.0]
+    )
     x, damping = x.ravel().astype(np.float32), damping.ravel().astype(np.float32)
     out = wp.empty((len(x), 4), dtype=float, device=device)
     inputs = [wp.array(a, dtype=float, device=device) for a in (x, damping)]
@@ -92,7 +94,7 @@ def test_closed_forms_keep_their_digits(device):
         flow = expm(at * np.array([[0, 1, 0], [-1, -2 * zeta, 0], [1, 0, 0]]))
         want = [flow[0, 1], flow[1, 1], flow[2, 0] / at, (1 - flow[0, 0]) / at]
         # float32 rounds shares of a step of 1 after a division by x
-        slack = 3e-6 + 3e-7 * (2 * zeta / at if 2 * zeta * at > 0.09 else 1)
+        slack = 3e-6 + 3e-7 * (2 * zeta / at if zeta < 1.5 and 2 * zeta * at > 0.09 else 1)
         np.testing.assert_allclose(got, want, atol=slack)
 
 
