@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import signal
+import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -54,13 +55,34 @@ class DeferredInterrupt:
 
 @contextmanager
 def raising_signals() -> Iterator[None]:
-    """Raise `Terminated` where SIGTERM or SIGHUP would end the process at once: files are put away."""
+    """Raise `Terminated` where SIGTERM or SIGHUP would end the process at once: files are put away.
+
+    What is raised inside of a destructor or of a weak reference's callback is dropped by Python. Such a
+    signal, and Ctrl-C, is sent again until it is raised where somebody hears it.
+    """
 
     def end(number: int, frame: Any) -> None:
         raise Terminated(number)
 
+    before = sys.unraisablehook
+
+    def send_again(lost: Any) -> None:
+        if isinstance(lost.exc_value, Terminated):
+            number = lost.exc_value.number
+        elif isinstance(lost.exc_value, KeyboardInterrupt):
+            number = signal.SIGINT
+        else:
+            before(lost)
+            return
+        # from a thread: sent from here, it would be raised here, and dropped once more
+        threading.Timer(0.01, os.kill, (os.getpid(), number)).start()
+
     with _handling(ENDING_SIGNALS, end):
-        yield
+        sys.unraisablehook = send_again
+        try:
+            yield
+        finally:
+            sys.unraisablehook = before
 
 
 @contextmanager

@@ -294,3 +294,28 @@ def test_nohup_is_respected():
     )
     done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=False)
     assert done.stdout == "goes on\n", done.stderr
+
+
+@pytest.mark.parametrize(("name", "code"), [("SIGTERM", 143), ("SIGHUP", 129), ("SIGINT", 130)])
+@pytest.mark.parametrize("place", ["callback", "destructor"])
+def test_signal_in_a_destructor_is_not_lost(name, code, place):
+    script = (
+        "import os, signal, sys, time, weakref\n"
+        "from dase.datasets.interrupt import raising_signals\n"
+        "def signalled(_=None):\n"
+        f"    os.kill(os.getpid(), signal.{name})\n"
+        "    for _ in range(1000): pass\n"
+        "class Held:\n"
+        f"    {'__del__ = signalled' if place == 'destructor' else 'pass'}\n"
+        "held = Held()\n"
+        f"{'watch = weakref.ref(held, signalled)' if place == 'callback' else ''}\n"
+        "with raising_signals():\n"
+        "    try:\n"
+        "        del held\n"
+        "        time.sleep(20)\n"
+        "    except KeyboardInterrupt:\n"
+        "        sys.exit(130)\n"
+        "print('lost')"
+    )
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stdout, done.stderr) == (code, "", "")
