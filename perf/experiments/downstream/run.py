@@ -91,7 +91,7 @@ class Size:
     reconstruction_channels: int = 16
     flow_channels: int = 32
     reconstruction_steps: int = 500
-    flow_steps: int = 8000
+    flow_steps: int = 12000
     samples: int = 16
     recorded: float = 60.0
     test_batches: int = 8
@@ -101,6 +101,15 @@ class Size:
     def steps(self, task: str) -> int:
         """Return the batches of a training."""
         return self.flow_steps if task == "flow" else self.reconstruction_steps
+
+    def channels(self, task: str) -> int:
+        """Return the channels of a network."""
+        return self.flow_channels if task == "flow" else self.reconstruction_channels
+
+    def is_of(self, row: dict[str, Any]) -> bool:
+        """Return whether a line of results is of networks and trainings of this size."""
+        task = row["task"]
+        return (row["steps"], row["channels"]) == (self.steps(task), self.channels(task))
 
 
 SMALL = Size(
@@ -245,14 +254,14 @@ class Study:
         network = self.train_one(*job)
         seconds = round(time.monotonic() - begin, 1)
         where = torch.cuda.get_device_name() if self.device == "cuda" else self.device
-        steps = self.size.steps(job.task)
+        steps, channels = self.size.steps(job.task), self.size.channels(job.task)
         rows = []
         for tested in [job.target] if job.target else TARGETS:
             found = self.test_one(network, job.task, tested)
             rows.append(
                 {"task": job.task, "kind": job.kind, "trained_for": job.target, "target": tested,
                  "seed": job.seed, **{name: round(value, 5) for name, value in found.items()}, "steps": steps,
-                 "seconds": seconds, "device": where, "torch": torch.__version__}
+                 "channels": channels, "seconds": seconds, "device": where, "torch": torch.__version__}
             )  # fmt: skip
         return rows
 
@@ -418,7 +427,7 @@ def main() -> None:
     study = Study(train, test, args.out, "cpu", SMALL if args.small else Size(), deadline)
     log = args.out / "results.jsonl"
     lines = log.read_text().splitlines() if log.exists() else []
-    rows = [row for row in map(json.loads, lines) if row["steps"] == study.size.steps(row["task"])]
+    rows = [row for row in map(json.loads, lines) if study.size.is_of(row)]
     done = {Job(row["task"], row["kind"], row["trained_for"], row["seed"]) for row in rows}
     done |= {Job(task, "", target, 0) for task, target in study.learned()}
     asked = (one.split(",") for one in (args.tasks, args.kinds, args.targets))
