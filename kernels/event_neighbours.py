@@ -57,21 +57,29 @@ def count_short_intervals(
     # in
     time: wp.array[wp.float64],  # (N,) [s], not decreasing
     pixel: wp.array[int],  # (N,) row-major
+    polarity: wp.array[wp.uint8],  # (N,) 1 for ON
+    tie: wp.float64,  # [s]
     near: wp.float64,  # [s]
     far: wp.float64,  # [s]
     # in and out
     last: wp.array[wp.float64],  # (H * W,) [s], when each pixel was last seen
-    count_out: wp.array2d[int],  # (2, H * W) intervals below `near`, and from it to below `far`
+    last_polarity: wp.array[wp.uint8],  # (H * W,)
+    count_out: wp.array3d[int],  # (3, 2, H * W) below `tie`, then `near`, then `far`; OFF, ON
 ):
-    """Count how often a pixel is soon seen again. Called with dim=1."""
+    """Count how often a pixel is soon seen again with the same polarity. Called with dim=1."""
     for i in range(time.shape[0]):
         place = pixel[i]
-        interval = time[i] - last[place]
-        if interval < near:
-            count_out[0, place] += 1
-        elif interval < far:
-            count_out[1, place] += 1
+        sign = polarity[i]
+        if sign == last_polarity[place]:
+            interval = time[i] - last[place]
+            if interval < tie:
+                count_out[0, int(sign), place] += 1
+            elif interval < near:
+                count_out[1, int(sign), place] += 1
+            elif interval < far:
+                count_out[2, int(sign), place] += 1
         last[place] = time[i]
+        last_polarity[place] = sign
 
 
 @wp.kernel

@@ -28,7 +28,7 @@ KINDS: dict[str, tuple[str, ...]] = {
     "flicker": ("flicker",),
     "hot pixels": ("hot",),
     "full bus": ("readout",),
-    "time stamps": ("timestamp", "row_scan"),
+    "time stamps": ("timestamp", "row_scan", "readout"),
     "opposite pairs": ("shot", "voltage_noise"),
     "fixed pattern": ("mismatch", "dead"),
     "grouping": ("readout", "row_scan"),

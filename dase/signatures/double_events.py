@@ -1,12 +1,15 @@
-"""Double events: a pixel sends twice within some microseconds, sooner than its dead time allows.
+"""Double events: a pixel sends the same twice within some microseconds, sooner than its dead time allows.
 
 A handshake that is answered twice. Where the light jumps, events also follow each other fast, but then as
-many per microsecond a little later.
+many per microsecond a little later. Where a delay falls as the light rises, ON events catch up with those
+before them, and OFF events do not: doubles are there if OFF events have them, as in all cameras that were
+seen to have any. Events of one pixel at one time have waited for each other, or share a slow clock's tick,
+and are no doubles.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import warp as wp
@@ -29,6 +32,7 @@ class DoubleSettings:
     """What is a double event."""
 
     least: float = 1e-3  # share of the events
+    tie: float = 1e-8  # [s] at one time; a handshake takes longer
     near: float = 20e-6  # [s]
     far: float = 400e-6  # [s] dead times begin to show beyond it
     ratio: float = (
@@ -48,10 +52,12 @@ class IntervalCounts:
 
     def __init__(self, width: int, height: int, settings: DoubleSettings | None = None):
         self.settings = settings or DoubleSettings()
-        self.counts = np.zeros((2, width * height), np.int32)
-        """Intervals below `near`, and from it to below `far`, shape (2, H * W)."""
-        self.events = np.zeros(width * height, np.int64)
+        self.counts = np.zeros((3, 2, width * height), np.int32)
+        """Intervals below `tie`, `near` and `far` of OFF and of ON events, shape (3, 2, H * W)."""
+        self.events = np.zeros((2, width * height), np.int64)
+        """OFF and ON events."""
         self._last = np.full(width * height, -np.inf)
+        self._polarity = np.zeros(width * height, np.uint8)
         self._cpu = launch.find_device("cpu")
 
     def push(self, events: Events) -> None:
@@ -59,14 +65,17 @@ class IntervalCounts:
         if not len(events):
             return
         pixel = row_major_pixels(events)
-        self.events += np.bincount(pixel, minlength=len(self.events))
-        time, place, last, out = (
-            wp.array(a, dtype=d, device=self._cpu, copy=False)
-            for a, d in ((events.t, wp.float64), (pixel, int), (self._last, wp.float64), (self.counts, int))
-        )
+        for polarity, row in enumerate(self.events):
+            row += np.bincount(pixel[events.p == polarity], minlength=len(row))
+        columns = (
+            (events.t, wp.float64), (pixel, int), (events.p.astype(np.uint8), wp.uint8),
+            (self._last, wp.float64), (self._polarity, wp.uint8), (self.counts, int),
+        )  # fmt: skip
+        arrays = [wp.array(a, dtype=d, device=self._cpu, copy=False) for a, d in columns]
         # whole microseconds as floating point numbers: 20 of them are not less than 20
-        near, far = (wp.float64(value - 1e-9) for value in (self.settings.near, self.settings.far))
-        inputs = [time, place, near, far, last, out]
+        s = self.settings
+        limits = [wp.float64(value - 1e-9) for value in (s.tie, s.near, s.far)]
+        inputs = [*arrays[:3], *limits, *arrays[3:]]
         wp.launch(count_short_intervals, dim=1, inputs=inputs, device=self._cpu)
 
 
@@ -75,8 +84,8 @@ def find_double_events(
 ) -> Signature:
     """Look for pixels that send twice.
 
-    The null has as many intervals per second below 20 µs as from there to 400 µs: binomial. It must fail
-    without the busiest pixels, too: where thresholds differ, a few send dozens of events at a jump.
+    The null has as many intervals per second below 20 µs as from there to 400 µs: binomial. It must fail for
+    OFF events, and without the busiest pixels, too: where thresholds differ, a few send dozens at a jump.
 
     Args:
         intervals: Counted intervals.
@@ -87,9 +96,9 @@ def find_double_events(
     s = intervals.settings
     if tick >= s.near:
         return without_answer(NAME, f"stamps are {format_seconds(tick)} apart, which hides what is sooner")
-    count = intervals.events
+    count = intervals.events.sum(0)
     busy = float(np.quantile(count[~hot], s.bulk)) if np.any(~hot) else 0.0
-    near, rest = (int(row[~hot].sum()) for row in intervals.counts)
+    ties, near, rest = (int(row[:, ~hot].sum()) for row in intervals.counts)
     events = int(count[~hot].sum())
     if events * s.least < 20:
         return without_answer(
@@ -97,21 +106,28 @@ def find_double_events(
         )
     chance = s.near / s.far
     p = 0.0
+    _, soon_off, later_off = (row[0] for row in intervals.counts)
     for some in (~hot, ~hot & (count <= busy)):
-        soon, later = (int(row[some].sum()) for row in intervals.counts)
+        soon, later = int(soon_off[some].sum()), int(later_off[some].sum())
         p = max(p, float(stats.binom.sf(soon - 1, soon + later, chance)) if soon else 1.0)
         if soon * (1 / chance - 1) < s.ratio * later:
             p = 1.0  # fast, but no faster than fast
+        if soon < s.least * intervals.events[0, some].sum():
+            p = 1.0  # ON events have caught up with each other
     low, high = (limit / events for limit in poisson_interval(near))
     share = near / events
     entry = Signature(
         name=NAME, answer=Answer.NOT_SEEN, p=p, size=share, low=low, high=high,
         unit="share of the events", least=s.least,
-        sentence=f"{format_count(near)} events ({format_percent(share)}) within 20 µs of the same pixel's "
-        f"last, {format_count(rest)} from there to 400 µs",
-        details={"near": near, "later": rest},
+        sentence=f"{format_count(near)} events ({format_percent(share)}) within 20 µs of the same "
+        f"pixel's last of the same polarity, {format_count(rest)} from there to 400 µs",
+        details={"near": near, "later": rest, "at_once": ties},
     )  # fmt: skip
     unseen = f"{format_percent(share)} of the events within 20 µs of the same pixel's last"
     if rest > 2 * near * (1 / chance - 1) / s.ratio:
         unseen += f"; many more, {format_count(rest)}, within 400 µs"
-    return judge_signature(entry, level, unseen)
+    found = judge_signature(entry, level, unseen)
+    if found.answer is Answer.NOT_SEEN and ties > max(near, s.least * events):
+        reason = f"{format_percent(ties / events)} of the events come at the time of the same pixel's last"
+        return replace(found, answer=Answer.CANNOT_SAY, sentence=f"{reason}: a delay or a slow clock")
+    return found

@@ -39,6 +39,8 @@ class FlickerSettings:
     tiles: int = 4  # on each side: what moves is larger than the tiles of the clock
     agree: float = 0.125  # turns by which a tile may differ from the others
     spacing: float = 0.25  # of tried frequencies, relative to what the length resolves
+    periods: int = 6  # at most, of the tone, in one of what it may be an overtone of
+    between: float = 0.25  # of the tone's amplitude, at a frequency between its multiples: no lamp's
 
 
 @dataclass(frozen=True)
@@ -176,6 +178,38 @@ def _find_tone(
     return float(tones[np.where(clear, power, -1.0).argmax()] * spacing), chance, many
 
 
+def _longer_period(
+    v: NDArray[np.float64], step: float, frequency: float, level: float, s: FlickerSettings
+) -> float:
+    """Return the period of which a tone is an overtone [s], 0 where it is the tone's own.
+
+    A lamp has multiples of its frequency and nothing between. Bursts of the array have all multiples of their
+    rate, and where ON and OFF bursts take turns, any of them may be the strongest.
+    """
+    length = round(s.block / step)
+    segments = max(1, math.ceil(len(v) * step / s.segment))
+    size = len(v) // segments // length * length
+    parts = [_sum_blocks(v[i * size : (i + 1) * size], step, s) for i in range(segments)]
+    rayleigh = np.sum([part.rayleigh for part in parts], axis=0)
+    power = np.sum([part.power for part in parts], axis=0)
+    at = round(frequency / parts[0].spacing)
+    near = 4 * s.spacing  # cells by which the tone may be off
+    strongest = float(power[max(at - round(near / s.spacing), 0) : at + round(near / s.spacing) + 1].max())
+    for many in range(2, s.periods + 1):
+        lines = np.arange(1, int(many * s.fastest / frequency)) * (frequency / many)
+        lines = lines[(lines >= s.slowest / 2) & (np.arange(1, len(lines) + 1) % many != 0)]
+        # blocks see a strong tone in step at other frequencies as well
+        apart = (lines - frequency) * s.block
+        lines = lines[np.abs(apart - np.round(apart)) > 2 / max(size // length, 1)]
+        cells = np.rint(lines / parts[0].spacing).astype(np.int64)
+        if not len(cells):
+            continue
+        p = float(stats.gamma.sf(rayleigh[cells].sum(), segments * len(cells)))
+        if p * s.periods < level and power[cells].max() > s.between**2 * strongest:
+            return many / frequency
+    return 0.0
+
+
 def _refine_tone(
     rates: _Rates, step: float, frequency: float, s: FlickerSettings
 ) -> tuple[float, float, NDArray[np.float64]]:
@@ -293,6 +327,10 @@ def find_flicker(
     if not found.found:
         return found, None
     turns = frequency * doubtful
+    longer = 0.0 if bursts is not None else _longer_period(v, step, frequency, level, s)
+    if longer:
+        reason = f"{frequency:.2f} Hz, of what repeats after {format_seconds(longer)} only: no lamp's light"
+        return replace(found, answer=Answer.CANNOT_SAY, sentence=reason), None
     if doubtful and abs(turns - round(turns)) < 0.75 * doubtful / duration:
         reason = f"{frequency:.2f} Hz, or bursts every {format_seconds(doubtful)} of which it is a multiple"
         return replace(found, answer=Answer.CANNOT_SAY, sentence=reason), None

@@ -52,15 +52,19 @@ def test_calm_share_equals_a_loop(rng, size):
 @pytest.mark.parametrize("size", [600, 7])
 def test_short_intervals_equal_a_loop(rng, size):
     e = some(rng, width=3, height=2)
-    looked = IntervalCounts(3, 2, DoubleSettings(near=1e-3, far=5e-3))
+    looked = IntervalCounts(3, 2, DoubleSettings(tie=1e-4, near=1e-3, far=5e-3))
     for part in pieces(e, size):
         looked.push(part)
     pixel = e.y.astype(int) * 3 + e.x
     for k in range(6):
-        gaps = np.diff(e.t[pixel == k])
-        near, far = np.count_nonzero(gaps < 1e-3 - 1e-9), np.count_nonzero(gaps < 5e-3 - 1e-9)
-        assert looked.counts[:, k].tolist() == [near, far - near]
-        assert looked.events[k] == np.count_nonzero(pixel == k)
+        t, p = e.t[pixel == k], e.p[pixel == k]
+        gaps, same = np.diff(t), p[1:] == p[:-1]
+        for polarity in (False, True):
+            own = gaps[same & (p[1:] == polarity)]
+            below = [np.count_nonzero(own < limit - 1e-9) for limit in (1e-4, 1e-3, 5e-3)]
+            assert looked.counts[:, int(polarity), k].tolist() == np.diff(below, prepend=0).tolist()
+        assert looked.events[:, k].sum() == np.count_nonzero(pixel == k)
+        assert looked.events[1, k] == np.count_nonzero(e.p[pixel == k])
 
 
 @pytest.mark.parametrize("size", [600, 13])

@@ -135,6 +135,31 @@ def test_what_is_put_into_the_events_shows(plain):
     assert found(experiment.double_events(rng, plain)) == {"double events"}
 
 
+def test_events_that_a_delay_lets_catch_up_are_not_double():
+    """ON events catch up where the delay falls as light rises, OFF ones do not; doubles show beside them."""
+    late = {"latency": {"delay": 8e-3}}
+    events = made(**late)
+    entry = dase.find_signatures(events)["double events"]
+    assert entry.details["at_once"] > 0.005 * len(events)
+    assert not entry.found
+    # a bus sends those of one time one after the other
+    again = dase.find_signatures(made(**late, timestamp={"jitter": 5e-6, "step": 1e-6}))["double events"]
+    assert again.details["near"] > 0.001 * len(events)
+    assert not again.found
+    assert found(made(**late, double_events={"share": 0.02})) == {"double events"}
+
+
+def test_weak_bursts_that_take_turns_are_no_lamp():
+    """ON and OFF bursts half a frame's exposure apart are strongest at twice the frame rate."""
+    events = made(kind="objects", exposure={"amplitude": 0.1, "period": 0.04, "exposure": 0.01})
+    entry = dase.find_signatures(events)["flicker"]
+    assert entry.p < 1e-6
+    assert entry.details["frequency"] == pytest.approx(50, abs=0.2)
+    assert entry.answer is Answer.CANNOT_SAY
+    lamp = made(kind="objects", flicker={"frequency": 50.0, "depth": 0.1, "duty": 0.3})
+    assert "flicker" in found(lamp)
+
+
 @pytest.mark.parametrize("turned", [False, True])
 def test_bars_that_move_are_no_readout(turned):
     """Shot events set memories of pixels in even light: all those of an edge send at one instant."""
