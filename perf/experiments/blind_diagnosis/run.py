@@ -104,7 +104,10 @@ class Case:
 
 @dataclass(frozen=True)
 class Job:
-    """A case, and how it is run; `until` is when no case may begin any more [s since 1970]."""
+    """A case, and how it is run.
+
+    From `until` on [s since 1970] no case may begin; names of those that did go to the file `begun`.
+    """
 
     case: Case
     key: int
@@ -112,6 +115,7 @@ class Job:
     threads: int
     folder: Path | None = None
     until: float = float("inf")
+    begun: Path | None = None
 
 
 def number_of(key: str) -> int:
@@ -380,9 +384,14 @@ def interval(good: int, count: int) -> str:
     return f"{good} of {count} ({100 * low:.0f} to {100 * high:.0f} %)"
 
 
-def table(lines: list[Line]) -> list[str]:
-    """Return the table of results: a row for each kind of case."""
-    good = [line for line in lines if "failed" not in line]
+def table(lines: list[Line], open_: list[Case]) -> list[str]:
+    """Return the table of results: a row for each kind of case.
+
+    Args:
+        lines: Of the log.
+        open_: Cases that were begun and have no answer.
+    """
+    good = [line for line in lines if "failed" not in line] + [{"case": asdict(case)} for case in open_]
 
     def of(kind: str, strength: str = "", **more: Any) -> list[Line]:
         return [
@@ -415,18 +424,19 @@ def table(lines: list[Line]) -> list[str]:
         for x in letters
     ]
     out = [
-        "| cases | of them with something wrong announced | announced and true | hidden effects announced "
-        "| ... or in an either ... or |", "|---|---|---|---|---|",
+        "| cases | answered | of them with something wrong announced | announced and true "
+        "| hidden effects announced | ... or in an either ... or |", "|---|---|---|---|---|---|",
     ]  # fmt: skip
     for words, mine in rows:
-        scores = [score(line) for line in mine]
-        if scores:
+        scores = [score(line) for line in mine if "answer" in line]
+        if mine:
             announced, wrong = (sum(getattr(s, n) for s in scores) for n in ("announced", "wrong"))
             hidden, found, offered = (
                 sum(getattr(s, n) for s in scores) for n in ("hidden", "found", "offered")
             )
             out.append(
-                f"| {words} | {interval(sum(s.wrong > 0 for s in scores), len(scores))} "
+                f"| {words} | {len(scores)} of {len(mine)} "
+                f"| {interval(sum(s.wrong > 0 for s in scores), len(scores))} "
                 f"| {interval(announced - wrong, announced)} | {interval(found, hidden)} "
                 f"| {interval(found + offered, hidden)} |"
             )
@@ -444,26 +454,43 @@ def main() -> None:
     parser.add_argument("--device", default="cpu", help="or some, which share the runs: cuda:0,cuda:1")
     parser.add_argument("--jobs", type=int, default=1)
     parser.add_argument("--minutes", type=float, default=float("inf"), help="no run begins after these")
+    parser.add_argument(
+        "--longest-first", action="store_true", help="begin with what takes long, where all can be done"
+    )
     parser.add_argument("--report", action="store_true", help="only print the table of the log")
     options = parser.parse_args()
     if not options.report:
         _run(options)
     lines = [json.loads(text) for text in options.log.read_text().splitlines() if text.strip()]
-    print("\n".join(table(lines)))
+    print("\n".join(table(lines, unanswered(lines, options))))
     print(f"\n{reached(lines, options)}")
 
 
+def begun_file(log: Path) -> Path:
+    """Return the file that names the cases of a log that were begun: those that never ended among them."""
+    return log.with_suffix(".begun")
+
+
+def unanswered(lines: list[Line], options: argparse.Namespace) -> list[Case]:
+    """Return the cases that were begun and have no answer, because they failed or time was over."""
+    done = {line["name"] for line in lines if "failed" not in line and line["key"] == options.key}
+    file, key = begun_file(options.log), str(number_of(options.key))
+    text = file.read_text().splitlines() if file.exists() else []
+    begun = {name for number, name in (line.split(" ", 1) for line in text) if number == key}
+    return [case for case in cases(options) if case.name in begun - done]
+
+
 def reached(lines: list[Line], options: argparse.Namespace) -> str:
-    """Return how far a log goes in the order that its key draws; the slowest cases are those it lacks."""
+    """Return how far a log goes in the order that its key draws, and which cases have no answer."""
     done = {line["name"] for line in lines if "failed" not in line and line["key"] == options.key}
     order = [case.name for case in cases(options)]
-    last = max((n + 1 for n, name in enumerate(order) if name in done), default=0)
-    begun = [name for name in order[:last] if name not in done]
-    failed = len({line["name"] for line in lines if "failed" in line} - done)
-    missing = f"{len(begun)} have no answer{': ' if begun else ''}{', '.join(begun[:12])}"
+    open_ = [case.name for case in unanswered(lines, options)]
+    failed = {line["name"] for line in lines if "failed" in line} - done
+    never = [name for name in order if name not in done and name not in open_]
     return (
-        f"key {options.key}: {len(done)} of {len(order)} cases finished, {failed} failed; of the first "
-        f"{last} in the order of the key {missing}"
+        f"key {options.key}: {len(done)} of {len(order)} cases were answered, {len(never)} were never begun; "
+        f"{len(open_)} were begun and have no answer, {len(failed)} of them failed"
+        f"{': ' if open_ else ''}{', '.join(open_)}"
     )
 
 
@@ -475,14 +502,16 @@ def _run(options: argparse.Namespace) -> None:
         lines = [json.loads(text) for text in options.log.read_text().splitlines() if text.strip()]
         done = {line["name"] for line in lines if "failed" not in line and line["key"] == options.key}
     todo = [case for case in cases(options) if case.name not in done]
-    threads = max(1, (os.cpu_count() or 1) // options.jobs)
+    threads = max(1, len(os.sched_getaffinity(0)) // options.jobs)
     if options.jobs > 1:  # processes that are started: libraries must not take all cores in each
         os.environ.update(dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"), str(threads)))
     devices = options.device.split(",")
     make = partial(
         Job, key=number_of(options.key), device=devices[0], threads=threads, folder=options.hidden,
-        until=begin + 60 * options.minutes,
+        until=begin + 60 * options.minutes, begun=begun_file(options.log),
     )  # fmt: skip
+    if options.longest_first:  # which end last, whatever the order; a scene known by frames takes longest
+        todo.sort(key=lambda case: (not case.frames, not case.noisy))
     jobs = [make(case) for case in todo]
     print(f"{len(done)} runs in the log, {len(jobs)} to do", flush=True)
     note = partial(_note, options=options)
@@ -539,6 +568,9 @@ def _safely(job: Job, run: Callable[[Job], Line] = run_case) -> Line:
     if time.time() > job.until:
         return {"late": job.case.name}
     job = replace(job, device=_place[0]) if _place else job
+    if job.begun:
+        with job.begun.open("a") as names:
+            names.write(f"{job.key} {job.case.name}\n")
     try:
         return run(job)
     except Exception as error:  # one bad run must not end the others
