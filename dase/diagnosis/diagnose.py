@@ -37,6 +37,7 @@ from dase.effects import EFFECTS, Effect
 from dase.fitting.burst_strength import follows_frames, put_in_step
 from dase.fitting.confidence_intervals import estimate_parameters
 from dase.fitting.data_split import SPLIT, split_measurement
+from dase.fitting.early_stopping import CandidateRace
 from dase.fitting.measurement import Measured, Measurement, SceneChoice, as_measurement
 from dase.fitting.model import (
     FittedModel,
@@ -354,16 +355,18 @@ def _add_pair(
         evidence.scout, repeats=settings.scout_repeats, seed=SimulationStream.CALIBRATE_SCOUT.seed(seed)
     )
     pairs = list(combinations(singles, 2))
-    works = []
+    # only the first are fitted to all pixels
+    race, works = CandidateRace(settings.fitted_pairs), []
     for one, two in pairs:
         both = one.model.sensor.with_effect(two.model.sensor[two.name])
         pair = with_same_freedom(both, start, (one.name, two.name))
-        works.append(pair.search_work(scout, seed=seed, iterations=4, radius=0.3))
+        over = race.over(f"{one.name} + {two.name}")
+        works.append(pair.search_work(scout, seed=seed, iterations=4, radius=0.3, over=over))
     ends = run_side_by_side(works, lambda share: state.progress("trying pairs", share, state.error))
     tried = [
         (pair.loss, f"{one.name} + {two.name}", pair) for (one, two), pair in zip(pairs, ends, strict=True)
     ]
-    first = sorted(tried, key=lambda t: t[0])[:2]
+    first = sorted(tried, key=lambda t: t[0])[: settings.fitted_pairs]
     settled = run_side_by_side([refit_work(evidence, pair, seed=seed) for _, _, pair in first])
     ranking: list[Rank] = []
     for (_, name, _), pair in zip(first, settled, strict=True):

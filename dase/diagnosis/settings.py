@@ -245,6 +245,9 @@ class DiagnosisSettings:
     paired: int = 6
     """Candidates that are tried two at a time where one after the other is not enough."""
 
+    fitted_pairs: int = 2
+    """Pairs that are fitted to all pixels; others stop where they will not come near these on the scout."""
+
     pair_helps_alone: float = 0.98
     """Only those whose screening brought the loss below this, in units of the present model's."""
 
