@@ -67,7 +67,7 @@ class Raster:
 
 @dataclass(frozen=True)
 class Lines:
-    """Rows of a whole sensor, one dot for each event over some milliseconds.
+    """Rows of a whole sensor, one dot for every sixteenth event over some milliseconds.
 
     Args:
         shown: First and last time [s].
@@ -85,7 +85,8 @@ class Lines:
     def draw(self, axes: Axes, events: Events) -> None:
         """Draw the events."""
         seen = events.select((events.t >= self.shown[0]) & (events.t <= self.shown[1]))
-        seen = seen.select(np.random.default_rng(0).permutation(len(seen))[:6000])
+        # the same share on both sides, so that they can be compared
+        seen = seen.select(np.random.default_rng(0).permutation(len(seen))[: len(seen) // 16])
         for polarity, colour in ((False, Colour.OFF), (True, Colour.ON)):
             mine = seen.p == polarity
             axes.scatter(1e3 * seen.t[mine], seen.y[mine], s=1.2, c=colour, lw=0)
@@ -177,6 +178,17 @@ def ramps(times: Array) -> Array:
     """Return light that rises and falls again, every pixel at a slope of its own."""
     around = np.abs((RAMPS * times[:, None] + 2) % 8 - 4)
     return 0.01 * np.exp(around - 2)
+
+
+def half_lit(times: Array) -> Array:
+    """Return the same, with a lamp of 100 Hz over the brighter half of the pixels."""
+    lamp = 1 + 0.5 * np.sin(2 * np.pi * 100 * times)[:, None]
+    return steps(times) * np.where(np.arange(len(LIGHT)) < len(LIGHT) // 2, 1.0, lamp)
+
+
+def falls(times: Array) -> Array:
+    """Return light that falls fast, the same everywhere."""
+    return 0.9 * np.exp(-3e3 * times)[:, None] * np.ones(30)
 
 
 STEPS = Raster(steps, 0.2, LIGHT)
@@ -305,6 +317,24 @@ def shown() -> dict[str, Shown]:
         "readout": Shown(
             e["readout"](rate=2.5e7, depth=1000000), Lines((4.5e-3, 10e-3)),
             "Light rises everywhere from 5 to 6 ms: the bus is full, and events leave later and later.",
+        ),
+        "double_events": Shown(
+            e["double_events"](share=0.5, delay=1e-5),
+            Raster(falls, 1e-3, np.arange(30.0), "pixel", shown=(4e-4, 5e-4), log=False, step=2e-5),
+            "A tenth of a millisecond of falling light: half of the events are sent again 10 us later.",
+        ),
+        "anti_flicker": Shown(
+            e["anti_flicker"](low=50.0, high=520.0), Raster(half_lit, 0.2, LIGHT),
+            f"{step_words}, the upper half under a lamp: after 7 periods nothing is seen there any more.",
+        ),
+        "trail_filter": Shown(
+            e["trail_filter"](threshold=0.02), STEPS,
+            f"{step_words}: of each burst of one polarity the first event passes.",
+            beside=(e["bandwidth"](cutoff=300.0, dark=0.01),),
+        ),
+        "rate_control": Shown(
+            e["rate_control"](rate=1e7), Lines((4.5e-3, 7e-3)),
+            "Light rises everywhere from 5 to 6 ms: after 0.2 ms the controller leaves most events out.",
         ),
         "timestamp": Shown(
             e["timestamp"](jitter=0.0, step=2.5e-4), Lines((4.5e-3, 7e-3)),

@@ -29,7 +29,7 @@ def test_python():
     before = dase.simulate(scope["scene"], scope["sensor"].without("readout").without("timestamp"), seed=1)
     # an event in the first nanosecond of a window may count for the one before
     assert abs(int(scope["counts"].sum()) - len(before)) <= 2
-    assert 0.5 * len(before) < len(scope["events"]) < len(before)  # so much finds the bus busy
+    assert 0.5 * len(before) < len(scope["events"]) <= len(before)  # what finds the bus busy may be lost
     assert scope["grid"].shape == (5, 260, 346)
 
 
