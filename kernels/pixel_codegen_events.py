@@ -62,7 +62,10 @@ def sleep_condition(model: PixelModel) -> tuple[Statements, str]:
     if model.resets:
         # seen to in all steps alike: the end of a dead time has no event, and a step that counts as busy is
         # dear, on a GPU for all pixels of a group
-        asleep.append(if_block("asleep > 0.0", *_follow_signal(model)))
+        gates = tuple(effect for effect, _ in model.calls("gate"))
+        # lanes of which none has a dead time are spared a division, behind which their next sample waited
+        asked = gates if all(effect.off for effect in gates) else ()
+        asleep.append(Block("if asleep > 0.0:", tuple(_follow_signal(model)), acting=asked))
     if model.delays:
         # a crossing that waits for the end of the dead time may come although the signal returns
         crossed += " or before >= on or before <= -off"
