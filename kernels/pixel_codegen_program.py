@@ -112,19 +112,19 @@ def draw_numbers(draws: Iterable[Draw], *, presets: bool = False) -> tuple[State
 
     Args:
         draws: Random numbers that are asked for.
-        presets: Whether a number is drawn only where its effect acts, which most do not.
+        presets: Whether keys are made and numbers drawn only where their effect acts, which most do not.
     """
     found: list[Statement] = []
     for draw in draws:
-        found.append(Line(f"{draw.key} = key(seed, {stream_number(draw.name)}, pixel)"))
-        if not draw.per_pixel:
-            continue
-        number = Line(f"{draw.name} = {draw.kind}({draw.key}, 0)")
+        made = [Line(f"{draw.key} = key(seed, {stream_number(draw.name)}, pixel)")]
+        made += [Line(f"{draw.name} = {draw.kind}({draw.key}, 0)")] if draw.per_pixel else []
         if presets and draw.effect is not None and draw.effect.off:
             # a name must have a value on every way through a Warp kernel
-            found += [Line(f"{draw.name} = float(0.0)"), Guarded(draw.effect, (number,))]
+            found.append(Line(f"{draw.key} = int(0)"))
+            found += [Line(f"{draw.name} = float(0.0)")] if draw.per_pixel else []
+            found.append(Guarded(draw.effect, tuple(made)))
         else:
-            found.append(number)
+            found += made
     return tuple(found)
 
 

@@ -247,7 +247,9 @@ def _samples(program: Program, layout: OnePixel | Lanes) -> tuple[Statement, ...
     stored = (
         *lines("gap = source.stamp[k] * wp.max(source.finer, 1) - stamp"),
         # a pixel's first sample is at time 0
-        *lines("parts = wp.where(source.finer == 0, 1, wp.max(gap, 1))", "steps = gap / parts"),
+        Line("parts = wp.where(source.finer == 0, 1, wp.max(gap, 1))"),
+        # gap / parts, without a division for which all lanes would wait
+        Line("steps = wp.where(source.finer == 0, gap, wp.min(gap, 1))"),
         Block("for part in range(parts):", body),
         Line("level_before = source.voltage[k]"),
     )
