@@ -60,6 +60,7 @@ RECENT = 64
 @wp.func_native(
     """
     const long long END = 1ll << 62;
+    const int AHEAD = 16;  // events whose pixels are on their way from memory: some 50 ns each, as long as one
     const long long LONGEST_GAP = 100000000ll;  // [ps] others' requests that stand for several spread over it
     // half a cache line for all that an event needs to know
     struct Pixel {
@@ -286,6 +287,7 @@ RECENT = 64
         if (due_t < soonest) soonest = due_t;
         if (until < soonest) soonest = until;
         if (mine_first) {
+            if (i + AHEAD < count) __builtin_prefetch(pixels + place.data[i + AHEAD], 1);
             arrive(place.data[i], raw_t, polarity.data[i], (unsigned char)label.data[i]);
             ++i;
         } else {
