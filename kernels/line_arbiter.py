@@ -60,7 +60,7 @@ RECENT = 64
 @wp.func_native(
     """
     const long long END = 1ll << 62;
-    const int AHEAD = 16;  // events whose pixels are on their way from memory: some 50 ns each, as long as one
+    const int AHEAD = 16;  // events whose pixels are on their way from memory
     const long long LONGEST_GAP = 100000000ll;  // [ps] others' requests that stand for several spread over it
     // half a cache line for all that an event needs to know
     struct Pixel {
