@@ -54,6 +54,12 @@ if TYPE_CHECKING:
 @click.option(
     "--frame-rate", default=60.0, show_default=True, help="Of the frames and the flow that are stored [Hz]."
 )
+@click.option(
+    "--exposure",
+    default=0.0,
+    show_default=True,
+    help="Of each stored frame [s], which blurs it; the sensor's effect `exposure` is then in step with it.",
+)
 @click.option("--labels", is_flag=True, help="Mark events as signal, leak, shot noise or hot pixel.")
 @device_or_backend_option
 @click.option(
@@ -88,6 +94,7 @@ def synth_command(
     jobs: int | None,
     format_: str,
     frame_rate: float,
+    exposure: float,
     labels: bool,
     device: str,
     video: Path | None,
@@ -105,7 +112,9 @@ def synth_command(
     """
     if video is not None:
         refuse_beside("--video", "images", "sequences", "duration", "regime", "jobs", "format_", "resume")
-        _synth_video(out, video, fps, sensor, effects, size, seed, device, frame_rate, labels, gamma, between)
+        _synth_video(
+            out, video, fps, sensor, effects, size, seed, device, frame_rate, exposure, labels, gamma, between
+        )
         return
     given = {"--fps": fps is not None, "--gamma": gamma is not None, "--between": between != "auto"}
     for option in (name for name in given if given[name]):
@@ -128,6 +137,7 @@ def synth_command(
         format=format_,
         backend=device,
         frame_rate=frame_rate,
+        exposure=exposure,
         labels=labels,
         effects=tuple(map(str, effects)),
     )
@@ -150,6 +160,7 @@ def _synth_video(
     seed: int,
     device: str,
     frame_rate: float,
+    exposure: float,
     labels: bool,
     gamma: float | None,
     between: str,
@@ -176,6 +187,7 @@ def _synth_video(
             model,
             out,
             frame_rate=frame_rate,
+            exposure=exposure,
             seed=seed,
             device=device,
             labels=labels,

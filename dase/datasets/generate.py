@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 
 from dase import io
 from dase.datasets.interrupt import DeferredInterrupt, WorkerLife, defer_interrupt, ignore_interrupt
+from dase.effects.exposure import Exposure
 from dase.errors import InputError, checked_integer, nearest
 from dase.files.folder_lock import locking_folder
 from dase.files.text_files import read_text_file
@@ -29,7 +30,7 @@ from dase.kernels import launch
 from dase.kernels.threads import thread_count
 from dase.scenes import image_sources, random_scenes
 from dase.scenes.layers import LayerScene
-from dase.scenes.scene import Scene
+from dase.scenes.scene import Scene, to_grey
 from dase.simulation.pixel_array import PixelArray
 from dase.simulation.sensor import Sensor
 from dase.simulation.sensor_file import dump_sensor, parse_sensor
@@ -63,6 +64,8 @@ class DatasetJob:
         frame_rate: Of frames and flow [Hz].
         labels: Whether events are marked with what they came from.
         effects: Files with effects of the user's own that the sensor names.
+        exposure: Of each frame [s], at most a frame's period; 0 for frames taken in an instant. The frames
+            are blurred as they would be, and the effect `exposure` of the sensor is in step with them.
     """
 
     images: str
@@ -78,6 +81,7 @@ class DatasetJob:
     frame_rate: float = 60.0
     labels: bool = False
     effects: tuple[str, ...] = ()
+    exposure: float = 0.0
 
     def __post_init__(self) -> None:
         if self.sequences < 1:
@@ -97,6 +101,11 @@ class DatasetJob:
                 f"frame rate must give at most {MOST_FRAMES:,} frames in {self.duration:g} s, "
                 f"got {self.frame_rate:g}"
             )
+        if self.exposure > self.duration:
+            raise InputError(
+                f"exposure must be at most the duration, {self.duration:g} s, got {self.exposure:g}"
+            )
+        _check_exposure(self.exposure, self.frame_rate)
         if self.regime not in random_scenes.REGIME_NAMES:
             raise InputError(
                 f"there is no regime '{self.regime}': {nearest(self.regime, random_scenes.REGIME_NAMES)}"
@@ -108,13 +117,15 @@ class DatasetJob:
         document = tomlkit.document()
         document.add("dase", __version__)
         for name, value in asdict(self).items():
-            if name not in ("sensor", "effects"):
+            # what is off is not said, so that a record stays what it was before there was such a thing
+            if name not in ("sensor", "effects") and (name != "exposure" or value):
                 document.add(name, value)
         if self.effects:  # what is in the files determines the bytes, not where they lie
             files = (Path(path) for path in self.effects)
             document.add("effects", [f"{f.name} sha256:{sha256(f.read_bytes()).hexdigest()}" for f in files])
         sensor = tomlkit.table(is_super_table=False)
-        for key, item in tomlkit.parse(self.sensor).items():
+        used = dump_sensor(_sensor_of(self)) if self.exposure else self.sensor
+        for key, item in tomlkit.parse(used).items():
             sensor.add(key, item)
         document.add("sensor", sensor)
         return tomlkit.dumps(document)
@@ -292,7 +303,10 @@ def _warm_up(job: DatasetJob) -> None:
     )
     run = SensorRun(scene, _sensor_of(job), device=job.backend, labels=job.labels)
     run.events()
-    scene.grey_frames(np.zeros(1), job.backend)
+    if job.exposure:
+        scene.exposed_frames(np.zeros(1), scene.duration, job.backend)
+    else:
+        scene.grey_frames(np.zeros(1), job.backend)
     scene.flow(np.zeros(1), job.backend)
     run.thresholds()
 
@@ -321,7 +335,40 @@ def _open_images_once(spec: str) -> image_sources.ImageSource:
 
 @lru_cache(maxsize=1)  # a file of effects is read once, whatever becomes of it meanwhile
 def _sensor_of(job: DatasetJob) -> Sensor:
-    return parse_sensor(job.sensor, "sensor", known_effects(job.effects))
+    sensor = parse_sensor(job.sensor, "sensor", known_effects(job.effects))
+    return _couple_frames(sensor, job.frame_rate, job.exposure, 0.0)
+
+
+def _couple_frames(sensor: Sensor, frame_rate: float, exposure: float, begin: float) -> Sensor:
+    """Return the sensor with its frame coupling, if it has one, in step with the frames that are stored."""
+    if not exposure:
+        return sensor
+    # pixels know it in float32; rounded down, the first sample would already be exposed, without a burst
+    known = np.float32(begin)
+    begin = float(known if float(known) >= begin else np.nextafter(known, np.float32(np.inf)))
+    effects = (
+        effect.at_frames(1 / frame_rate, exposure, begin) if isinstance(effect, Exposure) else effect
+        for effect in sensor.effects
+    )
+    return replace(sensor, effects=tuple(effects))
+
+
+def _check_exposure(exposure: float, frame_rate: float) -> None:
+    if not (np.isfinite(exposure) and exposure >= 0):
+        raise InputError(f"exposure must be a number >= 0 s, got {exposure:g}")
+    if exposure * frame_rate > 1 + 1e-9:
+        raise InputError(
+            f"exposure must be at most the frames' period, {1 / frame_rate:g} s, got {exposure:g}: "
+            "expose shorter, or lower the frame rate"
+        )
+
+
+def _exposure_begins(
+    first: float, duration: float, frame_rate: float, exposure: float
+) -> NDArray[np.float64]:
+    """Return when frames begin [s] whose exposures end within a scene of `duration` [s] from `first` on."""
+    begins = np.arange(0, duration, 1 / frame_rate)
+    return first + begins[begins + exposure <= duration * (1 + 1e-9)]
 
 
 def make_scene(job: DatasetJob, index: int) -> LayerScene:
@@ -356,15 +403,16 @@ def make_sequence(job: DatasetJob, out: Path, index: int, interrupt: DeferredInt
     run = SensorRun(scene, sensor, seed=seed, device=job.backend, labels=job.labels)
     with io.create(job.path(out, index)) as writer:
         writer.configuration(_configuration(job, index))
-        frame_times = np.arange(0, scene.duration, 1 / job.frame_rate)
-        report = _record_into(writer, run, frame_times, lambda done: interrupt.check())
+        begins = _exposure_begins(0.0, scene.duration, job.frame_rate, job.exposure)
+        report = _record_into(writer, run, begins, job.exposure, lambda done: interrupt.check())
     return replace(report, seconds=time.perf_counter() - begin)
 
 
 def _record_into(
     writer: io.Writer,
     run: SensorRun,
-    frame_times: NDArray[np.float64],
+    begins: NDArray[np.float64],
+    exposure: float,
     progress: Callable[[WorkReport], None],
 ) -> WorkReport:
     """Write thresholds, frames, flow and events of a run, in order of time.
@@ -372,18 +420,19 @@ def _record_into(
     Args:
         writer: Of the file.
         run: Sensor and scene.
-        frame_times: When to store frames and flow [s], increasing, shape (F,).
+        begins: When the frames' exposures begin [s], increasing, shape (F,).
+        exposure: Of each frame [s]; frames and flow are stored at the middle of it.
         progress: Called with the report of each finished chunk.
     """
     scene, array = run.scene, run.pixel_array
     writer.thresholds(run.thresholds()[0].reshape(2, scene.height, scene.width))
-    total, shown = WorkReport(sequences=1), 0
+    total, shown, frame_times = WorkReport(sequences=1), 0, begins + exposure / 2
     for chunk in run.chunks():
         (events,), samples = chunk.events, len(chunk.times)
         # frames go before the events of their chunk, so that readers of the file meet both in order of time
         due = int(np.searchsorted(frame_times, chunk.times[-1], side="right")) if samples else shown
         if due > shown:
-            _write_frames(scene, writer, frame_times[shown:due], array.device.alias)
+            _write_frames(scene, writer, begins[shown:due], exposure, array.device.alias)
             shown = due
         writer.events(events)
         done = WorkReport(0, len(events), samples, samples * array.count)
@@ -393,11 +442,17 @@ def _record_into(
     return total
 
 
-def _write_frames(scene: Scene, writer: io.Writer, times: np.ndarray, device: str) -> None:
-    frames = scene.grey_frames(times, device)
-    flow = scene.flow(times, device)
-    for i, at in enumerate(times):
-        writer.frame(float(at), frames[i], None if flow is None else flow[i])
+def _write_frames(
+    scene: Scene, writer: io.Writer, begins: NDArray[np.float64], exposure: float, device: str
+) -> None:
+    middles = begins + exposure / 2
+    if exposure:
+        frames = to_grey(scene.exposed_frames(begins, exposure, device))
+    else:
+        frames = scene.grey_frames(begins, device)
+    flow = scene.flow(middles, device)
+    for i, at in enumerate(middles):
+        writer.frame(float(at), frames[i], None if flow is None else flow[i], exposure=exposure)
 
 
 def record_scene(
@@ -409,6 +464,7 @@ def record_scene(
     seed: int = 0,
     device: str = "cpu",
     labels: bool = False,
+    exposure: float = 0.0,
     progress: Callable[[WorkReport], None] = lambda report: None,
 ) -> WorkReport:
     """Simulate any scene into one file.
@@ -421,16 +477,23 @@ def record_scene(
         seed: Of every random number.
         device: `cpu`, `cuda` or a Warp name.
         labels: Whether events are marked with what they came from.
+        exposure: Of each frame [s], see `DatasetJob`. Frames then begin at the first sample and every
+            1 / frame_rate behind it.
         progress: Called with the report of each finished chunk.
     """
     begin = time.perf_counter()
     if not np.isfinite(frame_rate) or frame_rate <= 0:
         raise InputError(f"frame rate must be a number > 0, got {frame_rate:g}")
+    _check_exposure(exposure, frame_rate)
     times = scene.sample_times()
     # the first sample of each frame period; a slack of 1e-6 of it keeps equal rates equal
     period = np.floor((times - times[0]) * frame_rate + 1e-6)
     # samples themselves, as a scene of frames is not known between them
-    frame_times = times[np.concatenate([[True], np.diff(period) > 0])]
+    begins = times[np.concatenate([[True], np.diff(period) > 0])]
+    if exposure:
+        first = float(times[0])
+        begins = _exposure_begins(first, scene.duration, frame_rate, exposure)
+        sensor = _couple_frames(sensor, frame_rate, exposure, first)
     run = SensorRun(scene, sensor, seed=seed, device=device, labels=labels)
     with defer_interrupt() as interrupt, io.create(path) as writer:
 
@@ -441,5 +504,5 @@ def record_scene(
         # its history says how the sensor came to be, which no event depends on
         model = dump_sensor(replace(sensor, history=()))
         writer.configuration(model + f'\n[run]\ndase = "{__version__}"\nseed = {seed}\n')
-        report = _record_into(writer, run, frame_times, advance)
+        report = _record_into(writer, run, begins, exposure, advance)
     return replace(report, seconds=time.perf_counter() - begin)

@@ -110,8 +110,12 @@ class Exposure(Effect):
     def in_step(self, observed: Observations) -> Exposure:
         """Return the same coupling at the times of the frames that are seen; as it is where none are."""
         for seen in type(self).candidates(observed):
-            return replace(self, period=seen.period, exposure=seen.exposure, begin=seen.begin)
+            return self.at_frames(seen.period, seen.exposure, seen.begin)
         return self
+
+    def at_frames(self, period: float, exposure: float, begin: float) -> Exposure:
+        """Return the same coupling at frames [s] that begin at `begin` and every `period` behind it."""
+        return replace(self, period=period, exposure=exposure, begin=begin)
 
     def shifted(self, seconds: float) -> Exposure:
         """Return the frames on a clock that shows `seconds` less."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -339,6 +339,19 @@ class LayerScene(Scene):
         layers = self.arrays(times, where)
         out = scene_render.render_frames(layers, self.width, self.height, where, grey=True)
         return host_blocks.copy_to_host(out).reshape(len(times), self.height, self.width)
+
+    def _exposure_edges(self, begins: NDArray[np.float64], exposure: float) -> Iterator[NDArray[np.float64]]:
+        """Yield the edges of even sub-frames of each exposure [s], in which nothing moves over `travel`.
+
+        Samples may lie further apart, for want of time; a blur would show them as ghosts.
+        """
+        for begin in begins:
+            looks = np.linspace(begin, begin + exposure, 17)
+            way = float(self.speed(looks).max()) * exposure
+            yield np.linspace(begin, begin + exposure, max(int(np.ceil(way / self.travel)), 16) + 1)
+
+    def _first_time(self) -> float:
+        return 0.0
 
     def _lit_frames(self, times: NDArray[np.float64], device: wp.Device) -> NDArray[np.float32]:
         """Return intensities at `times` [s], shape (K, height · width)."""

@@ -21,7 +21,7 @@ from dase.kernels.stored_levels import LEVELS, light_of_levels, upload_levels
 from dase.scenes.between_frames import CameraScene
 from dase.scenes.light import SRGB_GAMMA, check_gamma, check_light, to_light
 from dase.scenes.scene import LOG_EPS as LOG_EPS
-from dase.scenes.scene import Scene
+from dase.scenes.scene import Scene, check_exposures
 
 
 class VideoScene(Scene):
@@ -84,6 +84,33 @@ class VideoScene(Scene):
     def frames(self, times: NDArray[np.float64], device: str = "cpu") -> NDArray[np.float32]:
         """Return the frames at `times`, which must be times of frames, shape (K, height, width)."""
         return to_light(self._at(times), gamma=self.gamma)
+
+    def exposed_frames(
+        self, begins: NDArray[np.float64], exposure: float, device: str = "cpu"
+    ) -> NDArray[np.float32]:
+        """Return frames with their blur, exactly: the mean of the exponentials of straight lines.
+
+        Arguments and result are those of `Scene.exposed_frames`.
+        """
+        check_exposures(self, begins, exposure)
+        out = np.empty((len(begins), self.height, self.width), np.float32)
+        for frame, edges in zip(out, self._exposure_edges(begins, exposure), strict=True):
+            light = self._light_between(edges) + LOG_EPS
+            step = np.log(light[1:] / light[:-1])
+            steep = np.abs(step) > 1e-6  # below, the mean of both ends is as exact as float64
+            mean = np.where(steep, np.diff(light, axis=0), 0.0) / np.where(steep, step, 1.0)
+            mean = np.where(steep, mean, (light[1:] + light[:-1]) / 2)
+            frame[:] = np.tensordot(np.diff(edges) / (edges[-1] - edges[0]), mean, 1) - LOG_EPS
+        return np.maximum(out, 0, out=out)
+
+    def _light_between(self, times: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the intensities at any `times` [s] of the video, float64, shape (K, height, width)."""
+        above = np.clip(np.searchsorted(self._times, times), 1, len(self._times) - 1)
+        share = (times - self._times[above - 1]) / (self._times[above] - self._times[above - 1])
+        needed, at = np.unique(np.concatenate([above - 1, above]), return_inverse=True)
+        level = np.log(to_light(self._frames[needed], gamma=self.gamma).astype(np.float64) + LOG_EPS)
+        below, over = level[at[: len(times)]], level[at[len(times) :]]
+        return np.asarray(np.exp(below + share[:, None, None] * (over - below)) - LOG_EPS)
 
     def _values(self, index: NDArray[np.int64], pixels: NDArray[np.int32]) -> NDArray[Any]:
         """Return frames as they are given, for these pixels, shape (K, N)."""
