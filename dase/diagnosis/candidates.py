@@ -207,7 +207,7 @@ def descend_from_screening(
     name, unit, space = screening.effect.name, screening.present_loss, screening.model.space
     # one start is enough where a second takes too long
     slow = half.slow(space) or acts_on_few_pixels(screening.effect)
-    elsewhere = np.abs(places - places[0]).max(1) > settings.apart
+    elsewhere = np.abs(places - places[0]).max(1, initial=0.0) > settings.apart  # none may be free
     others = np.flatnonzero(elsewhere & (losses < settings.second_start * losses[0]))
     begins = places[[0, *others[: 0 if slow else 1]]]
     ends = yield from side_by_side_work(

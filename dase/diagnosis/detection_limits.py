@@ -157,11 +157,12 @@ def _reported_model(
     tight = [axis.of_threshold for axis in model.space.axes]
     reach = np.diag(np.where(tight, hidden.threshold_reach, hidden.reach))
     sides = np.concatenate([model.place + reach, model.place - reach])
-    seed = SimulationStream.DIRECTIONS.seed(state.seed)
-    values = half.run_repeats(model.space, np.repeat(sides, count, 0), seed=seed)
-    plus, minus = np.split(values.reshape(len(sides), count, -1).mean(1), 2)
-    slopes = _in_standard_errors(half, plus - minus).T
-    frame = np.linalg.qr(slopes)[0] if slopes.shape[1] else np.zeros((slopes.shape[0], 0))
+    frame = np.zeros((len(half.scale.target), 0))
+    if tight:  # something is free
+        seed = SimulationStream.DIRECTIONS.seed(state.seed)
+        values = half.run_repeats(model.space, np.repeat(sides, count, 0), seed=seed)
+        plus, minus = np.split(values.reshape(len(sides), count, -1).mean(1), 2)
+        frame = np.linalg.qr(_in_standard_errors(half, plus - minus).T)[0]
     off = half.scale.target - half.repeats.mean(0)
     doubt = misfit_beyond_chance(half)
     misfit = np.where(half.seen.used, np.sign(off) * np.minimum(np.abs(off), doubt), 0.0)

@@ -361,3 +361,14 @@ def test_little_is_added_only_where_it_accounts_for_most():
     assert not explains_remainder(judged(0.45), judged(0.6))  # 0.25 of 0.4
     assert not explains_remainder(judged(0.6), judged(1.3))  # more than chance is left
     assert explains_remainder(judged(0.6, reach=0.7), judged(1.3))
+
+
+def test_nothing_is_free_where_light_never_changes_and_only_the_readout_is_tried():
+    """Thresholds are not fitted there, and a scan is read off the events."""
+    bright = np.random.default_rng(1).uniform(0.1, 0.9, (1, 24, 32)).astype(np.float32)
+    scene = dase.VideoScene(np.repeat(bright, 2, 0), np.array([0.0, 1.0]))
+    sensor = dase.Sensor().with_effect(EFFECTS["shot"](rate=20.0)).with_effect(EFFECTS["row_scan"](line=2e-4))
+    library = {name: EFFECTS[name] for name in ("row_scan", "timestamp")}
+    found = diagnose(dase.simulate(scene, sensor, seed=1), scene=scene, effects=library, pixels=200, most=1)
+    assert "row_scan" in {one.effect for one in found.findings if one.grade == "certain"}
+    assert not found.parameters
