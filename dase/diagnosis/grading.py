@@ -9,7 +9,8 @@ part, by which nothing was chosen. Each effect has to earn its grade there:
   well the rest is fitted again; nothing else does nearly as well in its place; and of the error of the model
   before the search next to nothing is left.
 - *either ... or*: the same, but another effect does nearly as well in its place, or so little was there to be
-  explained that something which is not in the library could look like it.
+  explained that something which is not in the library could look like it, or it had to go to an end of what
+  it can be, beyond all that is plausible: shot noise that is all ON is another effect.
 
 An effect that earns neither is a stand-in: it is named as what comes nearest, and not found.
 """
@@ -93,6 +94,8 @@ def grade_effects(
         grade, unknown = grade_of(
             start.judgement, bare.judgement, last, deviation, has_rivals=bool(rivals[name]), settings=settings
         )
+        if grade is Grade.SUPPORTED and any(is_strained(model, *one) for one in mine.items()):
+            grade, unknown = Grade.EITHER, True
         out[name] = Finding(
             effect=name,
             grade=Grade.STAND_IN if stopped else grade,
@@ -104,6 +107,15 @@ def grade_effects(
             parameters=mine,
         )
     return out
+
+
+def is_strained(model: FittedModel, name: str, value: Estimate) -> bool:
+    """Return whether a parameter may be at an end of all its values, and cannot be plausible."""
+    fact = next((axis.fact for axis in model.space.axes if axis.name == name), None)
+    if fact is None:  # read off the events, not fitted
+        return False
+    (least, most), (low, high) = fact.bounds, fact.plausible
+    return value.high >= most > high < value.low or value.low <= least < low > value.high
 
 
 def grade_of(

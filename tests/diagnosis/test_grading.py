@@ -10,7 +10,7 @@ import pytest
 import dase
 from dase.diagnosis.diagnose import diagnose
 from dase.diagnosis.explain_effect import moving_bars
-from dase.diagnosis.grading import grade_of
+from dase.diagnosis.grading import grade_of, is_strained
 from dase.diagnosis.seen_effects import (
     SeenEffects,
     find_seen_effects,
@@ -22,8 +22,9 @@ from dase.diagnosis.settings import GradeSettings
 from dase.effects import EFFECTS
 from dase.fitting.data_split import split_measurement
 from dase.fitting.measurement import Measurement
+from dase.fitting.model import model_of
 from dase.probes.distance import Judgement
-from dase.results import Finding, Grade
+from dase.results import Estimate, Finding, Grade
 from dase.scenes.video import VideoScene
 from dase.signatures.result import Answer, Signature
 from dase.simulation.sensor import Sensor
@@ -75,6 +76,21 @@ def test_grades(start, without, last, deviation, rivals, grade, unknown):
         judged(start), judged(without), last_one, deviation, has_rivals=rivals, settings=GradeSettings()
     )
     assert found == (grade, unknown)
+
+
+@pytest.mark.parametrize(
+    ("low", "value", "high", "strained"),
+    [
+        (0.95, 1.0, 1.0, True),  # all ON: that is a leak
+        (0.0, 0.0, 0.1, True),
+        (0.7, 1.0, 1.0, False),  # might be as usual
+        (0.85, 0.9, 0.95, False),  # unusual, and still shot noise
+        (0.48, 0.5, 0.52, False),
+    ],
+)
+def test_an_effect_at_the_end_of_what_it_can_be_is_strained(low, value, high, strained):
+    model = model_of(Sensor().with_effect(EFFECTS["shot"]()))
+    assert is_strained(model, "shot.balance", Estimate(value, low, high)) is strained
 
 
 def test_what_reports_has_pixels_of_its_own_at_the_later_time(scene):
