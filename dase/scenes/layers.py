@@ -163,6 +163,7 @@ class LayerScene(Scene):
         travel: Share of a pixel that anything may move between two samples (λ of Eq. 5 of the paper).
         shortest: Lower bound of the time between samples [s] (δ of Eq. 5).
         longest: Upper bound of it [s]; S2R samples at 72 Hz at least.
+        shifts: How far to the right each layer is seen, behind all motion [px], shape (L,); None for nowhere.
     """
 
     anytime = True
@@ -179,6 +180,7 @@ class LayerScene(Scene):
         travel: float = SamplingSettings.travel,
         shortest: float = SamplingSettings.shortest,
         longest: float = SamplingSettings.longest,
+        shifts: Sequence[float] | None = None,
     ):
         if not 1 <= len(layers) <= kernels.MAX_LAYERS:
             raise InputError(f"a scene needs 1 to {kernels.MAX_LAYERS} layers, got {len(layers)}")
@@ -191,6 +193,9 @@ class LayerScene(Scene):
                 "sampling needs 0 < shortest <= longest and travel > 0, "
                 f"got {shortest:g}, {longest:g} and {travel:g}"
             )
+        if shifts is not None and not (len(shifts) == len(layers) and np.all(np.isfinite(shifts))):
+            raise InputError(f"a scene of {len(layers)} layers needs as many finite shifts, got {shifts}")
+        self.shifts = None if shifts is None else tuple(map(float, shifts))
         self.layers = tuple(layers)
         self.width, self.height, self.duration = width, height, duration
         self.camera, self.lighting = camera, lighting
@@ -203,6 +208,8 @@ class LayerScene(Scene):
         if self.camera is not None:
             camera, camera_rate = _affine_maps([self.camera], times, self.duration)
             m, d = camera @ m, camera_rate @ m + camera @ d
+        if self.shifts is not None:
+            m[..., 0, 2] += np.array(self.shifts) / self.width
         # motions are in units of the sensor's width, so a scene looks the same at any size
         to_sensor = _unit_plane_to_pixels(self.width, self.height, self.width)
         from_texture = np.stack(
@@ -361,8 +368,28 @@ class LayerScene(Scene):
 
     def flow(self, times: NDArray[np.float64], device: str = "cpu") -> NDArray[np.float32]:
         """Return the flow of the foremost layer at `times` [px/s], shape (K, 2, height, width)."""
+        return self._of_foremost(times, self.velocity(times), device)
+
+    def values_of_foremost(
+        self, times: NDArray[np.float64], values: NDArray[np.float64], device: str = "cpu"
+    ) -> NDArray[np.float32]:
+        """Return two numbers of the layer that is foremost at each pixel, shape (K, 2, height, width).
+
+        Args:
+            times: When [s], shape (K,).
+            values: Of each layer, shape (L, 2).
+            device: `cpu`, `cuda` or a Warp name.
+        """
+        maps = np.zeros((len(times), len(self.layers), 2, 3))
+        maps[..., 2] = values
+        return self._of_foremost(times, maps, device)
+
+    def _of_foremost(
+        self, times: NDArray[np.float64], affine: NDArray[np.float64], device: str
+    ) -> NDArray[np.float32]:
+        """Return what the maps of the foremost layer, (K, L, 2, 3), make of each pixel's place."""
         where = launch.find_device(device)
-        maps = wp.array(self.velocity(times).astype(np.float32), dtype=kernels.Affine, device=where)
+        maps = wp.array(affine.astype(np.float32), dtype=kernels.Affine, device=where)
         out = scene_render.render_flow(self.arrays(times, where), maps, self.width, self.height, where)
         return host_blocks.copy_to_host(out).reshape(len(times), 2, self.height, self.width)
 
