@@ -13,6 +13,29 @@ Built-in sensors: every value with its unit, and where it comes from. `docs/pres
 the files in `dase/presets`, which `dase presets show NAME` prints, too; edit them. What no source
 is given for beside a value is said in the text above its table. How close presets come to recordings is in
 [effects.md](effects.md). A preset is where to begin: `dase fit` fits it to a recording of your own camera.
+
+## Other biases than the default
+
+Nothing takes biases yet: change the values themselves. What is known of how they follow for the DAVIS346:
+
+- `OnBn`, `OffBn`, `DiffBn`: `threshold.on` goes with abs(ln(I_on / I_diff)), `threshold.off` with
+  abs(ln(I_off / I_diff)); the capacitors and slopes before it cancel against those at the preset's own biases
+  (Nozaki, Delbruck: Temperature and parasitic photocurrent effects in dynamic vision sensors, 2017; not
+  verified at the source).
+- `RefrBp`: `refractory.period` goes with 1 / current, as a constant current charges a capacitor. This is a
+  derivation, measured with no recording at hand.
+- `PrBp`, `PrSFBp`: nothing to be said of `bandwidth.cutoff`. A pole goes with its current only where neither
+  the photocurrent nor another pole is slower, and which one limits the preset is not known.
+- `leak` and `shot` follow the thresholds by themselves, as their `threshold` says at which one they were
+  measured.
+
+How far currents on a chip are from those asked for has not been measured here.
+
+For the IMX636 and the Gen4.1, `bias_diff_on` and `bias_diff_off` set `threshold.on` and `threshold.off`,
+`bias_fo` sets `bandwidth.cutoff`, `bias_hpf` sets `high_pass.cutoff` (an effect that no preset has), and
+`bias_refr` sets `refractory.period`. No curve from any of these settings to a value was found in the parts of
+Prophesee's public documentation that could be read, and none is invented: fit the values to a recording.
+Their presets' `leak` and `shot` do not follow the thresholds.
 """
 
 
