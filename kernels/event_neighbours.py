@@ -63,21 +63,28 @@ def count_short_intervals(
     far: wp.float64,  # [s]
     # in and out
     last: wp.array[wp.float64],  # (H * W,) [s], when each pixel was last seen
+    last_interval: wp.array[wp.float64],  # (H * W,) [s], from the event before to that
     last_polarity: wp.array[wp.uint8],  # (H * W,)
-    count_out: wp.array3d[int],  # (3, 2, H * W) below `tie`, then `near`, then `far`; OFF, ON
+    count_out: wp.array3d[int],  # (5, 2, H * W) below `tie`, then `near`, then `far`; calm: `near`, `far`
 ):
-    """Count how often a pixel is soon seen again with the same polarity. Called with dim=1."""
+    """Count how often a pixel is soon seen again with the same polarity. Called with dim=1.
+
+    OFF and ON. Calm is what follows an event before which the pixel was silent for `far`.
+    """
     for i in range(time.shape[0]):
         place = pixel[i]
         sign = polarity[i]
-        if sign == last_polarity[place]:
-            interval = time[i] - last[place]
+        interval = time[i] - last[place]
+        if sign == last_polarity[place] and interval < far:
+            kind = int(2)
             if interval < tie:
-                count_out[0, int(sign), place] += 1
+                kind = int(0)
             elif interval < near:
-                count_out[1, int(sign), place] += 1
-            elif interval < far:
-                count_out[2, int(sign), place] += 1
+                kind = int(1)
+            count_out[kind, int(sign), place] += 1
+            if kind > 0 and last_interval[place] >= far:
+                count_out[kind + 2, int(sign), place] += 1
+        last_interval[place] = interval
         last[place] = time[i]
         last_polarity[place] = sign
 

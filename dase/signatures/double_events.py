@@ -1,10 +1,10 @@
 """Double events: a pixel sends the same twice within some microseconds, sooner than its dead time allows.
 
 A handshake that is answered twice. Where the light jumps, events also follow each other fast, but then as
-many per microsecond a little later. Where a delay falls as the light rises, ON events catch up with those
-before them, and OFF events do not: doubles are there if OFF events have them, as in all cameras that were
-seen to have any. Events of one pixel at one time have waited for each other, or share a slow clock's tick,
-and are no doubles.
+many per microsecond a little later. Where a delay falls as the light rises, events catch up with those before
+them: ON events, and OFF events that follow such ON events. So doubles are there if OFF events have them whose
+pixel was silent before, as in all cameras that were seen to have any. Events of one pixel at one time have
+waited for each other, or share a slow clock's tick, and are no doubles.
 """
 
 from __future__ import annotations
@@ -52,11 +52,15 @@ class IntervalCounts:
 
     def __init__(self, width: int, height: int, settings: DoubleSettings | None = None):
         self.settings = settings or DoubleSettings()
-        self.counts = np.zeros((3, 2, width * height), np.int32)
-        """Intervals below `tie`, `near` and `far` of OFF and of ON events, shape (3, 2, H * W)."""
+        self.counts = np.zeros((5, 2, width * height), np.int32)
+        """Intervals below `tie`, `near` and `far`, and below `near` and `far` after as long a silence.
+
+        Of OFF and of ON events, shape (5, 2, H * W).
+        """
         self.events = np.zeros((2, width * height), np.int64)
         """OFF and ON events."""
         self._last = np.full(width * height, -np.inf)
+        self._interval = np.full(width * height, np.inf)
         self._polarity = np.zeros(width * height, np.uint8)
         self._cpu = launch.find_device("cpu")
 
@@ -69,7 +73,8 @@ class IntervalCounts:
             row += np.bincount(pixel[events.p == polarity], minlength=len(row))
         columns = (
             (events.t, wp.float64), (pixel, int), (events.p.astype(np.uint8), wp.uint8),
-            (self._last, wp.float64), (self._polarity, wp.uint8), (self.counts, int),
+            (self._last, wp.float64), (self._interval, wp.float64), (self._polarity, wp.uint8),
+            (self.counts, int),
         )  # fmt: skip
         arrays = [wp.array(a, dtype=d, device=self._cpu, copy=False) for a, d in columns]
         # whole microseconds as floating point numbers: 20 of them are not less than 20
@@ -85,7 +90,8 @@ def find_double_events(
     """Look for pixels that send twice.
 
     The null has as many intervals per second below 20 µs as from there to 400 µs: binomial. It must fail for
-    OFF events, and without the busiest pixels, too: where thresholds differ, a few send dozens at a jump.
+    pairs of OFF events before which the pixel was silent for 400 µs, and without the busiest pixels, too:
+    where thresholds differ, a few send dozens at a jump.
 
     Args:
         intervals: Counted intervals.
@@ -98,7 +104,7 @@ def find_double_events(
         return without_answer(NAME, f"stamps are {format_seconds(tick)} apart, which hides what is sooner")
     count = intervals.events.sum(0)
     busy = float(np.quantile(count[~hot], s.bulk)) if np.any(~hot) else 0.0
-    ties, near, rest = (int(row[:, ~hot].sum()) for row in intervals.counts)
+    ties, near, rest = (int(row[:, ~hot].sum()) for row in intervals.counts[:3])
     events = int(count[~hot].sum())
     if events * s.least < 20:
         return without_answer(
@@ -106,14 +112,14 @@ def find_double_events(
         )
     chance = s.near / s.far
     p = 0.0
-    _, soon_off, later_off = (row[0] for row in intervals.counts)
+    soon_off, later_off = (row[0] for row in intervals.counts[3:])
     for some in (~hot, ~hot & (count <= busy)):
         soon, later = int(soon_off[some].sum()), int(later_off[some].sum())
         p = max(p, float(stats.binom.sf(soon - 1, soon + later, chance)) if soon else 1.0)
         if soon * (1 / chance - 1) < s.ratio * later:
             p = 1.0  # fast, but no faster than fast
         if soon < s.least * intervals.events[0, some].sum():
-            p = 1.0  # ON events have caught up with each other
+            p = 1.0  # others have caught up with each other
     low, high = (limit / events for limit in poisson_interval(near))
     share = near / events
     entry = Signature(
@@ -124,6 +130,8 @@ def find_double_events(
         details={"near": near, "later": rest, "at_once": ties},
     )  # fmt: skip
     unseen = f"{format_percent(share)} of the events within 20 µs of the same pixel's last"
+    if share >= s.least and p == 1.0:
+        unseen += ", which have caught up or follow each other fast"
     if rest > 2 * near * (1 / chance - 1) / s.ratio:
         unseen += f"; many more, {format_count(rest)}, within 400 µs"
     found = judge_signature(entry, level, unseen)

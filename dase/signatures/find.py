@@ -226,19 +226,21 @@ def find_signatures(
     # bursts alone that nearly keep time: p decides between them and a lamp no better than that
     doubtful = coupling.details.get("interval", 0.0) if bursts is None and begins is None else 0.0
     flicker, lamp = find_flicker(first.clock, each, bursts, doubtful if coupling.p < 0.01 else 0.0)
+    # what the whole array follows confounds in the same way, be it a lamp or bursts that are hardly seen
+    lit = lamp is not None or (flicker.p < each and flicker.size >= flicker.least)
     second = _SecondPass(first, bursts, lamp.frequency if lamp else 0.0)
     for part in passes.parts(chunk, progress):
         second.push(part)
     second.finish()
     hot, hot_pixels = find_hot_pixels(second.calm, second.quiet.share(first.end), duration, each)
-    stamps = find_time_stamps(first.first_events(), hot_pixels, each, lamp=lamp is not None)
+    stamps = find_time_stamps(first.first_events(), hot_pixels, each, lamp=lit)
     tick = max(stamps.details.get(name, 0.0) for name in ("step", "period")) if stamps.found else 0.0
     entries = (
         coupling,
         flicker,
         hot,
-        find_opposite_pairs(second.pairs, hot_pixels, duration, each, lamp=lamp is not None),
-        find_fixed_pattern(second.halves, hot_pixels, each, lamp=lamp is not None),
+        find_opposite_pairs(second.pairs, hot_pixels, duration, each, lamp=lit),
+        find_fixed_pattern(second.halves, hot_pixels, each, lamp=lit),
         find_grouping(second.groups, each),
         stamps,
         find_double_events(second.intervals, hot_pixels, each, tick),

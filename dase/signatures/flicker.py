@@ -29,6 +29,7 @@ class FlickerSettings:
 
     least: float = 0.02  # swing, share of the rate
     slowest: float = 20.0  # [Hz] one cycle in a block
+    slowest_lamp: float = 45.0  # [Hz] mains have 50 or 60; frames, whose times are not known, have less
     fastest: float = 450.0  # [Hz]
     block: float = 0.05  # [s] longer than a lamp's cycles, shorter than what moves keeps its phase
     smooth: float = 0.03  # [s] over which the usual rate is taken
@@ -327,6 +328,9 @@ def find_flicker(
     if not found.found:
         return found, None
     turns = frequency * doubtful
+    if frequency < s.slowest_lamp:
+        reason = f"{frequency:.2f} Hz: no lamp is as slow, frames are"
+        return replace(found, answer=Answer.CANNOT_SAY, sentence=reason), None
     longer = 0.0 if bursts is not None else _longer_period(v, step, frequency, level, s)
     if longer:
         reason = f"{frequency:.2f} Hz, of what repeats after {format_seconds(longer)} only: no lamp's light"
