@@ -90,7 +90,8 @@ class VideoScene(Scene):
     ) -> NDArray[np.float32]:
         """Return frames with their blur, exactly: the mean of the exponentials of straight lines.
 
-        Arguments and result are those of `Scene.exposed_frames`.
+        Times `begins` and `exposure` [s], and the result of shape (K, height, width), are those of
+        `Scene.exposed_frames`.
         """
         check_exposures(self, begins, exposure)
         out = np.empty((len(begins), self.height, self.width), np.float32)

@@ -153,7 +153,7 @@ class SensorRun:
         return self._count_at_pixels(edges)
 
     def count_leaving(self, edges: ArrayLike) -> NDArray[np.int32]:
-        """Count what leaves the camera behind its whole readout; for all else see `count`."""
+        """Count what leaves the camera behind its whole readout, shape (B, W, 2, N); see `count`."""
         return self._count_behind(self.sensor, _checked_edges(edges))
 
     def _count_behind(self, sensor: Sensor, edges: NDArray[np.float64]) -> NDArray[np.int32]:
