@@ -110,12 +110,12 @@ def grade_effects(
 
 
 def is_strained(model: FittedModel, name: str, value: Estimate) -> bool:
-    """Return whether a parameter may be at an end of all its values, and cannot be plausible."""
+    """Return whether a value may be at an end of what it can be, and none of its interval is plausible."""
     fact = next((axis.fact for axis in model.space.axes if axis.name == name), None)
     if fact is None:  # read off the events, not fitted
         return False
     (least, most), (low, high) = fact.bounds, fact.plausible
-    return value.high >= most > high < value.low or value.low <= least < low > value.high
+    return (value.high >= most and value.low > high) or (value.low <= least and value.high < low)
 
 
 def grade_of(
