@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import time
+from collections import deque
 from collections.abc import Callable, Generator
 from concurrent.futures import FIRST_COMPLETED, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
@@ -21,6 +22,7 @@ from numpy.typing import NDArray
 
 from dase import io
 from dase.datasets.interrupt import DeferredInterrupt, WorkerLife, defer_interrupt, ignore_interrupt
+from dase.datasets.steps_in_order import StepsInOrder
 from dase.effects.exposure import Exposure
 from dase.errors import InputError, checked_integer, nearest
 from dase.files.folder_lock import locking_folder
@@ -34,7 +36,7 @@ from dase.scenes.scene import Scene, to_grey
 from dase.simulation.pixel_array import PixelArray
 from dase.simulation.sensor import Sensor
 from dase.simulation.sensor_file import dump_sensor, parse_sensor
-from dase.simulation.sensor_run import SensorRun
+from dase.simulation.sensor_run import SensorRun, UnreadChunk
 from dase.simulation.user_effects import known_effects
 from dase.version import __version__
 
@@ -262,11 +264,8 @@ def _make_sequences(
     job: DatasetJob, out: Path, todo: list[int], jobs: int, interrupt: DeferredInterrupt
 ) -> Generator[WorkReport, None, None]:
     if jobs == 1:
-        for index in todo:
-            yield make_sequence(job, out, index, interrupt)
+        yield from _make_here(job, out, todo, interrupt)
         return
-    # compiles the kernels once, before the processes race for it
-    _warm_up(job)
     context = get_context("spawn")
     stop = context.RawValue("b", 0)  # no lock with it, which a worker that is killed could hold for ever
     # what cores are left beside the processes pack; a GPU leaves nearly all of them
@@ -276,7 +275,12 @@ def _make_sequences(
     )
     try:
         with ignore_interrupt():
-            left = {pool.submit(_in_worker, job, out, index) for index in todo}
+            early = [pool.submit(_open_device, job) for _ in range(jobs)]
+        # compiles the kernels once, before the processes race for it, while these start
+        _warm_up(job)
+        left = {pool.submit(_in_worker, job, out, index) for index in todo}
+        for started in early:
+            started.result()
         while left:
             # not longer, so that Ctrl-C is obeyed at once although nothing finishes
             done, left = wait(left, timeout=0.1, return_when=FIRST_COMPLETED)
@@ -294,6 +298,28 @@ def _make_sequences(
         # workers end at their next chunk and leave no half-written file behind
         stop.value = 1
         pool.shutdown(cancel_futures=True)
+
+
+def _make_here(
+    job: DatasetJob, out: Path, todo: list[int], interrupt: DeferredInterrupt, most_open: int = 4
+) -> Generator[WorkReport, None, None]:
+    """Make sequences in this process; pixels of one work while those before it are read out and written."""
+    begun: deque[_Recording] = deque()
+    try:
+        for index in todo:
+            begun.append(_begin_sequence(job, out, index))
+            begun[-1].simulate(lambda done: interrupt.check())
+            # each holds its events until they are written
+            if len(begun) >= min(thread_count(), most_open):
+                yield begun[0].finish(lambda done: interrupt.check())
+                begun.popleft()
+        while begun:
+            yield begun[0].finish(lambda done: interrupt.check())
+            begun.popleft()
+    except BaseException as error:
+        for recording in begun:
+            recording.abandon(error)
+        raise
 
 
 def _warm_up(job: DatasetJob) -> None:
@@ -316,6 +342,11 @@ def _begin_worker(parent: int, stop: Any, threads: int) -> None:
     # the processes share the cores: more threads of each would compete for them
     launch.set_threads(threads)
     _life = WorkerLife(parent, stop)
+
+
+def _open_device(job: DatasetJob) -> None:
+    """Have the device of a worker ready before there is work: a GPU's needs half a second."""
+    PixelArray(_sensor_of(job), 1, 1, device=job.backend)
 
 
 _life: WorkerLife | None = None
@@ -396,63 +427,134 @@ def _configuration(job: DatasetJob, index: int) -> str:
 
 def make_sequence(job: DatasetJob, out: Path, index: int, interrupt: DeferredInterrupt) -> WorkReport:
     """Simulate one sequence and write its file; an interrupt leaves nothing and raises KeyboardInterrupt."""
+    return _begin_sequence(job, out, index).record(lambda done: interrupt.check())
+
+
+def _begin_sequence(job: DatasetJob, out: Path, index: int) -> _Recording:
     begin = time.perf_counter()
-    sensor = _sensor_of(job)
     scene = make_scene(job, index)
-    seed = _sensor_seed(job, index)
-    run = SensorRun(scene, sensor, seed=seed, device=job.backend, labels=job.labels)
-    with io.create(job.path(out, index)) as writer:
-        writer.configuration(_configuration(job, index))
-        begins = _exposure_begins(0.0, scene.duration, job.frame_rate, job.exposure)
-        report = _record_into(writer, run, begins, job.exposure, lambda done: interrupt.check())
-    return replace(report, seconds=time.perf_counter() - begin)
+    run = SensorRun(
+        scene, _sensor_of(job), seed=_sensor_seed(job, index), device=job.backend, labels=job.labels
+    )
+    begins = _exposure_begins(0.0, scene.duration, job.frame_rate, job.exposure)
+    return _Recording(job.path(out, index), _configuration(job, index), run, begins, job.exposure, begin)
 
 
-def _record_into(
-    writer: io.Writer,
-    run: SensorRun,
-    begins: NDArray[np.float64],
-    exposure: float,
-    progress: Callable[[WorkReport], None],
-) -> WorkReport:
-    """Write thresholds, frames, flow and events of a run, in order of time.
+class _Recording:
+    """A file with thresholds, frames, flow and events of a run, in order of time.
+
+    The caller's thread does what may need a GPU: the pixels, frames and flow. What leaves the pixels is read
+    out and written beside that.
 
     Args:
-        writer: Of the file.
+        path: File to write.
+        configuration: TOML text of everything that made it.
         run: Sensor and scene.
         begins: When the frames' exposures begin [s], increasing, shape (F,).
         exposure: Of each frame [s]; frames and flow are stored at the middle of it.
-        progress: Called with the report of each finished chunk.
+        begin: When the work on it began, by `time.perf_counter` [s].
     """
-    scene, array = run.scene, run.pixel_array
-    writer.thresholds(run.thresholds()[0].reshape(2, scene.height, scene.width))
-    total, shown, frame_times = WorkReport(sequences=1), 0, begins + exposure / 2
-    for chunk in run.chunks():
-        (events,), samples = chunk.events, len(chunk.times)
-        # frames go before the events of their chunk, so that readers of the file meet both in order of time
-        due = int(np.searchsorted(frame_times, chunk.times[-1], side="right")) if samples else shown
-        if due > shown:
-            _write_frames(scene, writer, begins[shown:due], exposure, array.device.alias)
+
+    def __init__(
+        self,
+        path: Path,
+        configuration: str,
+        run: SensorRun,
+        begins: NDArray[np.float64],
+        exposure: float,
+        begin: float,
+    ):
+        self._run, self._begins, self._exposure, self._begin = run, begins, exposure, begin
+        self._total = WorkReport(sequences=1)
+        self._steps: StepsInOrder[io.Writer, WorkReport] = StepsInOrder(io.create(path))
+        self._configuration = configuration
+
+    def record(self, progress: Callable[[WorkReport], None]) -> WorkReport:
+        """Do all of it; `progress` is called with the report of each chunk, on this thread."""
+        try:
+            self.simulate(progress)
+            return self.finish(progress)
+        except BaseException as error:
+            self.abandon(error)
+            raise
+
+    def simulate(self, progress: Callable[[WorkReport], None]) -> None:
+        """Go through the scene. The end may still have to be read out and written then."""
+        run, scene = self._run, self._run.scene
+        thresholds = run.thresholds()[0].reshape(2, scene.height, scene.width)
+
+        def begin(writer: io.Writer) -> WorkReport:
+            writer.configuration(self._configuration)
+            writer.thresholds(thresholds)
+            return WorkReport()
+
+        self._add(begin, progress)
+        shown, frame_times = 0, self._begins + self._exposure / 2
+        for chunk in run.unread_chunks():
+            # frames go before the events of their chunk: readers of the file meet both in order of time
+            due = (
+                int(np.searchsorted(frame_times, chunk.times[-1], side="right"))
+                if len(chunk.times)
+                else shown
+            )
+            self._add(self._write_chunk(chunk, *self._render(self._begins[shown:due])), progress)
             shown = due
-        writer.events(events)
-        done = WorkReport(0, len(events), samples, samples * array.count)
-        total = total.plus(done)
-        if samples:  # what comes behind the last sample is no work of its own
-            progress(done)
-    return total
+        self._steps.end()
 
+    def _add(self, step: Callable[[io.Writer], WorkReport], progress: Callable[[WorkReport], None]) -> None:
+        self._steps.add(step)
+        for done in self._steps.results():
+            self._count(done, progress)
 
-def _write_frames(
-    scene: Scene, writer: io.Writer, begins: NDArray[np.float64], exposure: float, device: str
-) -> None:
-    middles = begins + exposure / 2
-    if exposure:
-        frames = to_grey(scene.exposed_frames(begins, exposure, device))
-    else:
-        frames = scene.grey_frames(begins, device)
-    flow = scene.flow(middles, device)
-    for i, at in enumerate(middles):
-        writer.frame(float(at), frames[i], None if flow is None else flow[i], exposure=exposure)
+    def _count(self, done: WorkReport, progress: Callable[[WorkReport], None]) -> None:
+        self._total = self._total.plus(done)
+        progress(done)
+
+    def _render(
+        self, begins: NDArray[np.float64]
+    ) -> tuple[NDArray[np.float64], NDArray[Any], NDArray[np.float32] | None]:
+        """Return times [s], frames and flow of the frames that begin at `begins` [s], each of length F."""
+        scene, device = self._run.scene, self._run.pixel_array.device.alias
+        middles = begins + self._exposure / 2
+        if not len(begins):
+            return middles, np.empty(0), None
+        if self._exposure:
+            frames = to_grey(scene.exposed_frames(begins, self._exposure, device))
+        else:
+            frames = scene.grey_frames(begins, device)
+        return middles, frames, scene.flow(middles, device)
+
+    def _write_chunk(
+        self,
+        chunk: UnreadChunk,
+        times: NDArray[np.float64],
+        frames: NDArray[Any],
+        flow: NDArray[np.float32] | None,
+    ) -> Callable[[io.Writer], WorkReport]:
+        samples, pixels = len(chunk.times), self._run.pixel_array.count
+
+        def write(writer: io.Writer) -> WorkReport:
+            (events,) = chunk.read()
+            for i, at in enumerate(times):
+                writer.frame(float(at), frames[i], None if flow is None else flow[i], exposure=self._exposure)
+            if samples or len(events):
+                writer.events(events)
+            return WorkReport(0, len(events), samples, samples * pixels)
+
+        return write
+
+    def finish(self, progress: Callable[[WorkReport], None]) -> WorkReport:
+        """Wait until the file is whole and under its name, and return what it cost and gave."""
+        while not self._steps.is_done():
+            for done in self._steps.results():
+                self._count(done, progress)
+        for done in self._steps.results():
+            self._count(done, progress)
+        return replace(self._total, seconds=time.perf_counter() - self._begin)
+
+    def abandon(self, error: BaseException) -> None:
+        """Leave no file behind, as after `error`."""
+        self._steps.abandon(error)
 
 
 def record_scene(
@@ -495,14 +597,13 @@ def record_scene(
         begins = _exposure_begins(first, scene.duration, frame_rate, exposure)
         sensor = _couple_frames(sensor, frame_rate, exposure, first)
     run = SensorRun(scene, sensor, seed=seed, device=device, labels=labels)
-    with defer_interrupt() as interrupt, io.create(path) as writer:
+    # its history says how the sensor came to be, which no event depends on
+    model = dump_sensor(replace(sensor, history=()))
+    configuration = model + f'\n[run]\ndase = "{__version__}"\nseed = {seed}\n'
+    with defer_interrupt() as interrupt:
 
         def advance(done: WorkReport) -> None:
             interrupt.check()
             progress(done)
 
-        # its history says how the sensor came to be, which no event depends on
-        model = dump_sensor(replace(sensor, history=()))
-        writer.configuration(model + f'\n[run]\ndase = "{__version__}"\nseed = {seed}\n')
-        report = _record_into(writer, run, begins, exposure, advance)
-    return replace(report, seconds=time.perf_counter() - begin)
+        return _Recording(path, configuration, run, begins, exposure, begin).record(advance)

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -11,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 from dase.errors import InputError
 from dase.events import Events
 from dase.scenes.scene import Scene
-from dase.simulation.pixel_array import PixelArray
+from dase.simulation.pixel_array import EventsOfChunk, PixelArray
 from dase.simulation.readout_chain import ReadoutChain, WindowCounter, split_by_row
 from dase.simulation.sensor import Sensor
 
@@ -43,6 +44,21 @@ class RunChunk:
 
     times: NDArray[np.float64]
     events: list[Events]
+
+
+@dataclass(frozen=True)
+class UnreadChunk:
+    """What the pixels of a run gave at once, before the readout.
+
+    Args:
+        times: Samples of the chunk [s], shape (K,); empty for what comes after the last sample.
+        read: Returns the events that leave the sensor during the chunk, a stream for each parameter vector.
+            To be called once for each chunk in their order, on any thread: it needs neither the pixels nor
+            a GPU.
+    """
+
+    times: NDArray[np.float64]
+    read: Callable[[], list[Events]]
 
 
 class SensorRun:
@@ -106,26 +122,35 @@ class SensorRun:
         """
         return self._chunks_behind(self.sensor)
 
+    def unread_chunks(self) -> Iterator[UnreadChunk]:
+        """Yield what the pixels give chunk after chunk, for who reads it while the next is simulated."""
+        return self._unread_behind(self.sensor)
+
     def _chunks_behind(self, sensor: Sensor) -> Iterator[RunChunk]:
         """Yield what leaves the readout of a sensor that has these pixels."""
+        for chunk in self._unread_behind(sensor):
+            events = chunk.read()
+            if len(chunk.times) or any(len(part) for part in events):
+                yield RunChunk(chunk.times, events)
+
+    def _unread_behind(self, sensor: Sensor) -> Iterator[UnreadChunk]:
         array = self.pixel_array
         readouts = [
             ReadoutChain(sensor, array.width, array.height, pixels=array.count, seed=array.seed)
             for _ in range(array.batch)
         ]
+
+        def read(found: EventsOfChunk, end: float, last: bool) -> list[Events]:
+            parts = zip(readouts, split_by_row(*found, array.batch), strict=True)
+            if last:
+                return [Events.concatenate([readout.push(p, end), readout.flush()]) for readout, p in parts]
+            return [readout.push(part, end) for readout, part in parts]
+
         for times, found in array.emit_chunks(self.scene, self._cut_times(), ahead=self.ahead):
-            parts, end = split_by_row(*found, array.batch), float(times[-1])
             # nothing emitted later is earlier than the last sample, which lets the readout hand events on
-            yield RunChunk(
-                times, [readout.push(part, end) for readout, part in zip(readouts, parts, strict=True)]
-            )
+            yield UnreadChunk(times, partial(read, found, float(times[-1]), False))
         # first the pixels give up what they hold back, then the readout
-        rest = zip(readouts, split_by_row(*array.flush(), array.batch), strict=True)
-        last = [
-            Events.concatenate([readout.push(part, array.begin), readout.flush()]) for readout, part in rest
-        ]
-        if any(len(part) for part in last):
-            yield RunChunk(np.empty(0, np.float64), last)
+        yield UnreadChunk(np.empty(0, np.float64), partial(read, array.flush(), array.begin, True))
 
     def events(self) -> list[Events]:
         """Return all events that leave the sensor, a stream for each parameter vector."""
