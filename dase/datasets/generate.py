@@ -6,7 +6,7 @@ import os
 import time
 from collections import deque
 from collections.abc import Callable, Generator
-from concurrent.futures import FIRST_COMPLETED, ProcessPoolExecutor, wait
+from concurrent.futures import FIRST_COMPLETED, ProcessPoolExecutor, ThreadPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import closing
 from dataclasses import asdict, dataclass, replace
@@ -36,7 +36,7 @@ from dase.scenes.scene import Scene, to_grey
 from dase.simulation.pixel_array import PixelArray
 from dase.simulation.sensor import Sensor
 from dase.simulation.sensor_file import dump_sensor, parse_sensor
-from dase.simulation.sensor_run import SensorRun, UnreadChunk
+from dase.simulation.sensor_run import SensorRun, UnreadChunk, sample_times
 from dase.simulation.user_effects import known_effects
 from dase.version import __version__
 
@@ -305,21 +305,27 @@ def _make_here(
 ) -> Generator[WorkReport, None, None]:
     """Make sequences in this process; pixels of one work while those before it are read out and written."""
     begun: deque[_Recording] = deque()
-    try:
-        for index in todo:
-            begun.append(_begin_sequence(job, out, index))
-            begun[-1].simulate(lambda done: interrupt.check())
-            # each holds its events until they are written
-            if len(begun) >= min(thread_count(), most_open):
+    # the next scene is drawn while this one is before the sensor
+    with ThreadPoolExecutor(1, thread_name_prefix="dase scenes") as drawing:
+        try:
+            drawn = [drawing.submit(_draw_sequence, job, index) for index in todo[:1]]
+            for index, after in zip(todo, [*todo[1:], None], strict=True):
+                scene, times = drawn.pop().result()
+                if after is not None:
+                    drawn.append(drawing.submit(_draw_sequence, job, after))
+                begun.append(_begin_sequence(job, out, index, scene, times))
+                begun[-1].simulate(lambda done: interrupt.check())
+                # each holds its events until they are written
+                if len(begun) >= min(thread_count(), most_open):
+                    yield begun[0].finish(lambda done: interrupt.check())
+                    begun.popleft()
+            while begun:
                 yield begun[0].finish(lambda done: interrupt.check())
                 begun.popleft()
-        while begun:
-            yield begun[0].finish(lambda done: interrupt.check())
-            begun.popleft()
-    except BaseException as error:
-        for recording in begun:
-            recording.abandon(error)
-        raise
+        except BaseException as error:
+            for recording in begun:
+                recording.abandon(error)
+            raise
 
 
 def _warm_up(job: DatasetJob) -> None:
@@ -427,15 +433,24 @@ def _configuration(job: DatasetJob, index: int) -> str:
 
 def make_sequence(job: DatasetJob, out: Path, index: int, interrupt: DeferredInterrupt) -> WorkReport:
     """Simulate one sequence and write its file; an interrupt leaves nothing and raises KeyboardInterrupt."""
-    return _begin_sequence(job, out, index).record(lambda done: interrupt.check())
+    recording = _begin_sequence(job, out, index, *_draw_sequence(job, index))
+    return recording.record(lambda done: interrupt.check())
 
 
-def _begin_sequence(job: DatasetJob, out: Path, index: int) -> _Recording:
-    begin = time.perf_counter()
+def _draw_sequence(job: DatasetJob, index: int) -> tuple[LayerScene, NDArray[np.float64]]:
+    """Return the scene of a sequence, and when the sensor samples it [s], shape (K,)."""
     scene = make_scene(job, index)
+    return scene, sample_times(scene, _sensor_of(job))
+
+
+def _begin_sequence(
+    job: DatasetJob, out: Path, index: int, scene: LayerScene, times: NDArray[np.float64]
+) -> _Recording:
+    begin = time.perf_counter()
     run = SensorRun(
-        scene, _sensor_of(job), seed=_sensor_seed(job, index), device=job.backend, labels=job.labels
-    )
+        scene, _sensor_of(job), times=times, seed=_sensor_seed(job, index), device=job.backend,
+        labels=job.labels,
+    )  # fmt: skip
     begins = _exposure_begins(0.0, scene.duration, job.frame_rate, job.exposure)
     return _Recording(job.path(out, index), _configuration(job, index), run, begins, job.exposure, begin)
 

@@ -237,9 +237,14 @@ class LayerScene(Scene):
         at a corner of it. Layers hidden behind others count as well: an upper bound of max|v| of Eq. 5.
         """
         m, d = self.forward(times)
-        points, inside = self._corners(m)
-        v = np.einsum("tlij,tlpj->tlpi", (d @ np.linalg.inv(m))[..., :2, :], points)
-        return np.asarray(np.where(inside, np.linalg.norm(v, axis=-1), 0.0).max(axis=(1, 2)))
+        inverse: NDArray[np.float64] = np.asarray(np.linalg.inv(m), np.float64)
+        points, inside = self._corners(m, inverse)
+        at, layer, _ = np.nonzero(inside)
+        # most candidates are no corners
+        v = np.einsum("nij,nj->ni", (d @ inverse)[at, layer, :2, :], points[inside])
+        highest = np.zeros(len(m))
+        np.maximum.at(highest, at, np.linalg.norm(v, axis=-1))
+        return highest
 
     def _outlines(self, m: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the corners of all layers on the sensor [px], shape (T, L, 4, 2)."""
@@ -250,12 +255,13 @@ class LayerScene(Scene):
             out.append(np.einsum("tij,pj->tpi", m[:, i, :2], corners))
         return np.stack(out, 1)
 
-    def _corners(self, m: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+    def _corners(
+        self, m: NDArray[np.float64], inverse: NDArray[np.float64]
+    ) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
         """Return candidates for corners of layer ∩ picture, homogeneous (T, L, P, 3), and which are."""
         w, h = self.width - 1, self.height - 1
         quad = self._outlines(m)
         frame = np.array([[0, 0], [w, 0], [w, h], [0, h]], np.float64)
-        inverse = np.linalg.inv(m)
         back = np.einsum("tlij,pj->tlpi", inverse[..., :2, :], np.c_[frame, np.ones(4)])
         sizes = np.array([layer.picture.grey.shape[::-1] for layer in self.layers])[None, :, None]
         frame_in = np.all((back >= -1) & (back <= sizes), -1)
