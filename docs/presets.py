@@ -35,7 +35,8 @@ For the IMX636 and the Gen4.1, `bias_diff_on` and `bias_diff_off` set `threshold
 `bias_fo` sets `bandwidth.cutoff`, `bias_hpf` sets `high_pass.cutoff` (an effect that no preset has), and
 `bias_refr` sets `refractory.period`. No curve from any of these settings to a value was found in the parts of
 Prophesee's public documentation that could be read, and none is invented: fit the values to a recording.
-Their presets' `leak` and `shot` do not follow the thresholds.
+Their presets' `leak` and `shot` follow the thresholds, too, as those of all presets of cameras do, except the
+`shot` of the Gen3, which has two thresholds where that effect knows one.
 """
 
 

@@ -67,6 +67,15 @@ def test_noise_follows_the_thresholds_of_biases(device, change):
         assert leak[1].mean() == pytest.approx(4.0 * seconds * factor, abs=0.6)
 
 
+@pytest.mark.parametrize("name", ["davis240c", "davis346", "dvs128", "dvxplorer", "gen3", "gen41", "imx636"])
+def test_noise_of_cameras_was_measured_at_their_own_thresholds(name):
+    """So lower thresholds make more noise; one number cannot stand for two thresholds, as those of gen3."""
+    sensor = dase.load_sensor(name)
+    theta = sensor["threshold"]
+    assert sensor["leak"].threshold == theta.on
+    assert sensor["shot"].threshold == (theta.on if theta.on == theta.off else 0.0)
+
+
 def test_parasitic_photocurrent_is_of_light_alone(device):
     """The photodiode's dark current flows in another junction than the leak; before, it raised the leak."""
     light = np.array([0.0, 0.3])
