@@ -13,54 +13,77 @@ ONE = 1 << 32
 
 @wp.func_native(
     """
+    const long long ONE = 1ll << 32;
     // picoseconds in 64 bits: buses send an event in fractions of a nanosecond, for hours
+    const int NEAR = 16;  // others before and after a moment by which their rate is told there
     const long long* __restrict__ due = other.data;
     const unsigned char* __restrict__ sign = polarity.data;
     const int count = other.shape[0];
+    // what an event stands for beside itself comes at random times: evenly spread, it would meet a full queue
+    // more rarely and a busy bus more often than events of pixels that know nothing of each other
+    long long beside[2], excess = 0;
+    for (int p = 0; p < 2; ++p) beside[p] = weight.data[p] > ONE ? weight.data[p] - ONE : 0;
+    const bool alone = beside[0] == 0 && beside[1] == 0;
+    unsigned long long drawn = 0x9e3779b97f4a7c15ull;
+    auto wait = [&]() {
+        // an exponential of mean 1
+        drawn ^= drawn << 13;
+        drawn ^= drawn >> 7;
+        drawn ^= drawn << 17;
+        return -log(((double)(drawn >> 11) + 0.5) * 0x1p-53);
+    };
     long long free = busy.data[0];
+    auto take = [&](long long at) {
+        const long long after = (free > at ? free : at) + service;
+        free = free - at <= patience ? after : free;
+    };
     int turn = 0;  // of the others
-    long long sent = 0;  // copies of the one whose turn it is
-    long long at = count > 0 ? due[0] : 0;  // when the last copy got there
-    long long step = 0, rest = 0, part = 0;  // from copy to copy, and what is left over by whole numbers
+    int low = 0, high = 0;  // the first and the last that tell the rate
+    bool begun = alone;  // whether it is known how many come since the other before
+    double many = 0.0, gone = 0.0, left = wait();  // in the mean; up to now; until the next
     for (int i = 0; i < arrival.shape[0]; ++i) {
         // all others that come before, or at the same time, go first
         const long long mine = 1000 * (long long)rint(1e9 * arrival.data[i]);
         while (turn < count) {
-            // the golden ratio, so that any run of numbers is spread evenly: whole, right in the mean
-            const long long many = (weight.data[sign[turn]] + ((turn * 2654435769ll) & 0xffffffffll)) >> 32;
-            if (many <= 1) {
-                // the common case without a loop over copies, and without a branch on what is lost
-                if (due[turn] > mine) break;
-                at = due[turn++];
-                const long long after = (free > at ? free : at) + service;
-                free = ((many == 1) & (free - at <= patience)) ? after : free;
-                continue;
+            const long long now = due[turn];
+            if (!begun) {
+                for (; high + 1 < count && high < turn + NEAR - 1; ++high) excess += beside[sign[high + 1]];
+                for (; low < turn - NEAR; ++low) excess -= beside[sign[low + 1]];
+                const long long before = turn > 0 ? due[turn - 1] : now;
+                const double span = (double)(due[high] - due[low]);
+                const double share = span > 0.0 ? (double)(now - before) / span : 1.0 / (high - low + 1);
+                many = share * (double)excess / (double)ONE;
+                gone = 0.0;
+                begun = true;
+                if (free - now > patience) {
+                    // the queue is full all the time: all are lost
+                    many = 0.0;
+                }
             }
-            // the queue is full until after its last copy: all are lost
-            if (sent == 0 && free - due[turn] > patience && due[turn] <= mine) {
-                at = due[turn++];
-                continue;
+            if (many > 0.0) {
+                const long long before = turn > 0 ? due[turn - 1] : now;
+                bool later = false;
+                while (gone + left <= many) {
+                    const long long at = before + (long long)((gone + left) / many * (double)(now - before));
+                    later = at > mine;
+                    if (later) break;
+                    gone += left;
+                    left = wait();
+                    take(at);
+                }
+                if (later) break;
+                // waiting has no memory
+                left -= many - gone;
+                gone = many = 0.0;
             }
-            // copies keep apart: events at one time would collide more often than the events they stand for
-            if (sent == 0) {
-                step = (due[turn] - at) / many;
-                rest = (due[turn] - at) % many;
-                part = 0;
-            }
-            // the copies are interrupted by an event that comes between them, and go on after it
-            while (sent < many) {
-                const bool over = part + rest >= many;
-                const long long next = at + step + over;
-                if (next > mine) break;
-                at = next;
-                part += rest - (over ? many : 0);
-                const long long after = (free > at ? free : at) + service;
-                free = free - at <= patience ? after : free;
-                ++sent;
-            }
-            if (sent < many) break;
-            sent = 0;
+            if (now > mine) break;
+            // the golden ratio, so that any run of numbers is spread evenly: right in the mean
+            const long long whole = (weight.data[sign[turn]] + ((turn * 2654435769ll) & 0xffffffffll)) >> 32;
+            // without a branch on what is lost
+            const long long after = (free > now ? free : now) + service;
+            free = ((whole >= 1) & (free - now <= patience)) ? after : free;
             ++turn;
+            begun = alone;
         }
         if (free - mine > patience) {
             through.data[i] = NAN;
