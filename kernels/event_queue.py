@@ -8,14 +8,16 @@ NEVER = -(2**62)
 """Time until when a bus is busy that has not sent anything yet [ps]: far from any overflow."""
 
 ONE = 1 << 32
-"""A weight of 1; weights have 32 binary places, so that sums and copies are exact."""
+"""A weight of 1; weights have 32 binary places, so that sums are exact."""
 
 
 @wp.func_native(
     """
     const long long ONE = 1ll << 32;
     // picoseconds in 64 bits: buses send an event in fractions of a nanosecond, for hours
-    const int NEAR = 16;  // others before and after a moment by which their rate is told there
+    // others before and after a moment by which their rate is told there: of fewer the rate is chance, which
+    // lets too much through, of more the ends of bursts are smeared
+    const int NEAR = 32;
     const long long* __restrict__ due = other.data;
     const unsigned char* __restrict__ sign = polarity.data;
     const int count = other.shape[0];
@@ -55,10 +57,8 @@ ONE = 1 << 32
                 many = share * (double)excess / (double)ONE;
                 gone = 0.0;
                 begun = true;
-                if (free - now > patience) {
-                    // the queue is full all the time: all are lost
-                    many = 0.0;
-                }
+                // where the queue is full all the time, all are lost
+                if (free - now > patience) many = 0.0;
             }
             if (many > 0.0) {
                 const long long before = turn > 0 ? due[turn - 1] : now;

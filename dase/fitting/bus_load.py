@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -30,6 +31,9 @@ class WholeSensor:
         most_samples: Pixels times points of time that are simulated: of a larger sensor or a longer time,
             some pixels stand for all.
         most_events: Events that all of them send: of a model that sends more, some stand for all, too.
+        counted: Events of the pixels that are looked at which tell how many those send: they are simulated
+            again, at most `repeats` times, until there are as many.
+        repeats: See `counted`.
         kept: Present models whose load is kept.
     """
 
@@ -39,6 +43,8 @@ class WholeSensor:
     device: str
     most_samples: float = 2.5e7
     most_events: float = 6e6
+    counted: float = 2e4
+    repeats: int = 8
     kept: int = 3
     _loads: list[BusLoad] = field(default_factory=list, repr=False)
 
@@ -63,24 +69,30 @@ class WholeSensor:
             steps: Of the grid.
             sent: Events that those send.
         """
-        size = self.scene.width * self.scene.height
-        rng = Draw.OTHER_PIXELS.generator(self.seed)
-        rest = np.setdiff1d(rng.permutation(size), chosen, assume_unique=True).astype(np.int32)
+        rest = np.setdiff1d(np.arange(self.scene.width * self.scene.height, dtype=np.int32), chosen)
         by_events = int(self.most_events / max(sent, 1) * len(chosen))
         room = min(int(self.most_samples / steps), by_events) - len(chosen)
-        return np.sort(rest[: max(len(chosen), room)])
+        few = max(len(chosen), room)
+        if few >= len(rest):
+            return rest
+        # one of each stretch of pixels, so that all parts of the picture have their share
+        ends = np.arange(few + 1) * len(rest) // few
+        within = Draw.OTHER_PIXELS.generator(self.seed).random(few) * np.diff(ends)
+        return rest[ends[:-1] + within.astype(np.int64)]
 
-    def emitted(self, sensor: Sensor, pixels: NDArray[np.int32], steps: int) -> Events:
+    def emitted(self, sensor: Sensor, pixels: NDArray[np.int32], steps: int, repeat: int = 0) -> Events:
         """Return what leaves some pixels in the first steps, in times [s] from the first sample on.
 
         Args:
             sensor: With the effects behind the pixels.
             pixels: Row-major indices, shape (N,).
             steps: Samples of the scene that are run.
+            repeat: Each has random numbers of its own.
         """
         (events,) = SensorRun(
-            self.scene, sensor, times=self.times[:steps], pixels=pixels, seed=self.seed, device=self.device
-        ).events()
+            self.scene, sensor, times=self.times[:steps], pixels=pixels, seed=self.seed + repeat,
+            device=self.device,
+        ).events()  # fmt: skip
         return replace(events, t=events.t - float(self.times[0]))
 
 
@@ -123,14 +135,19 @@ class BusLoad:
         return self._before[key]
 
     @cached_property
-    def _events(self) -> tuple[Events, NDArray[np.int64], float]:
+    def _events(self) -> tuple[Events, NDArray[np.float64], float]:
         """The others' events, how many those looked at have, and how many of the others one stands for."""
-        chosen, steps = self.stimulus.pixels, self.stimulus.grid.steps
-        mine = self.around.emitted(self.sensor, chosen, steps)
-        others = self.around.others(chosen, steps, len(mine))
-        events = self.around.emitted(self.sensor, others, steps)
+        around, chosen, steps = self.around, self.stimulus.pixels, self.stimulus.grid.steps
+        counts = [_count_polarities(around.emitted(self.sensor, chosen, steps))]
+        sent = int(counts[0].sum())
+        # of few events the number is chance, and with it the load of every model under trial
+        repeats = min(math.ceil(around.counted / max(sent, 1)), around.repeats)
+        for repeat in range(1, repeats):
+            counts.append(_count_polarities(around.emitted(self.sensor, chosen, steps, repeat)))
+        others = around.others(chosen, steps, sent)
+        events = around.emitted(self.sensor, others, steps)
         each = (self.stimulus.width * self.stimulus.height - len(chosen)) / len(others)
-        return events, _count_polarities(mine), each
+        return events, np.mean(counts, axis=0), each
 
 
 def _count_polarities(events: Events) -> NDArray[np.int64]:

@@ -133,6 +133,51 @@ def test_some_of_many_pixels_stand_for_all(evidence, true, limit):
     assert total[0] == pytest.approx(total[1], rel=0.2)
 
 
+@pytest.fixture(scope="module")
+def lamp() -> dase.VideoScene:
+    """Return light that makes all pixels send at once, and none in between."""
+    times = np.arange(round(SECONDS * 1000) + 1) / 1000
+    light = 0.2 * np.exp(0.9 * np.sin(2 * np.pi * 10 * times))
+    across = 0.5 + np.arange(WIDTH) / WIDTH
+    frames = np.tile(light[:, None, None] * across, (1, HEIGHT, 1))
+    return dase.VideoScene(frames.astype(np.float32), times)
+
+
+@pytest.mark.parametrize("mode", ["delay", "drop", "rows"])
+@pytest.mark.parametrize("fullness", [0.5, 1.0, 2.0])
+def test_the_rate_in_trials_is_that_of_a_simulation(lamp, device, mode, fullness):
+    """Where all others are simulated, and where each of some stands for three."""
+    free, repeats = Sensor().with_effect(EFFECTS["shot"](rate=5.0)), 6
+    rate = len(dase.simulate(lamp, free, seed=4, device=device)) / SECONDS / fullness
+    true = free.with_effect(Readout(rate=rate, mode=mode, depth=300.0))
+    found = dase.simulate(lamp, true, seed=4, device=device)
+    half = split_measurement(found, lamp, pixels=300, seed=1, device=device).train
+    looked_at, grid = half.trials.stimulus.pixels, half.trials.stimulus.grid
+    want = np.zeros(repeats)
+    for n in range(repeats):
+        events = dase.simulate(lamp, true, seed=100 + n, device=device)
+        mine = np.isin(events.y.astype(int) * WIDTH + events.x, looked_at)
+        want[n] = np.count_nonzero(mine & (events.t >= grid.begin) & (events.t <= grid.times[-1]))
+    order = SimulationOrder(true, np.repeat(true.parameters()[None], repeats, 0), 9, reseed=True)
+    for others in (WIDTH * HEIGHT, 300):
+        limited = replace(half.around, most_samples=(300 + others) * grid.steps, _loads=[])
+        load = replace(half, around=limited).loaded(*place(true)).load
+        sent = half.trials.simulate_streams(order, [true.readout_effects()] * repeats, load).clock.sum(1)
+        assert sent.mean() == pytest.approx(want.mean(), rel=0.03)
+
+
+def test_others_that_stand_for_all_are_spread_over_the_picture(evidence):
+    chosen = evidence.train.trials.stimulus.pixels
+    around = replace(evidence.train.around, most_samples=400.0)
+    others = around.others(chosen, 1, 1)
+    assert len(others) == 400 - len(chosen)
+    assert len(np.unique(others)) == len(others)
+    assert not np.isin(others, chosen).any()
+    parts = np.bincount(others // (WIDTH * HEIGHT // 10), minlength=10)
+    rest = np.bincount(np.setdiff1d(np.arange(WIDTH * HEIGHT), chosen) // (WIDTH * HEIGHT // 10))
+    np.testing.assert_allclose(parts, rest * len(others) / rest.sum(), atol=2)
+
+
 def test_what_others_send_is_worked_out_once_for_each_model_of_their_pixels(evidence, true):
     half = evidence.train
     first = half.loaded(*place(true)).load
