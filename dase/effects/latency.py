@@ -28,7 +28,8 @@ class Latency(Effect):
     At intensity 1 (white) an event leaves its pixel `delay` after the crossing, at intensity 0
     `delay * (1 - light + light / dark)`, never more than 1 s. The intensity is that of the sample which ends
     the step of the crossing. The events of one pixel do not overtake each other: one that is due before the
-    last one has left leaves at the same time as that.
+    last one has left leaves at the same time as that. A readout by lines sends one of those that leave at the
+    same time, as a pixel asks once.
     """
 
     name: ClassVar[str] = "latency"

@@ -106,13 +106,17 @@ class LineArbiter(SharedReader):
         out_time, out_place = np.empty(room, np.float64), np.empty(room, np.int32)
         out_polarity, out_label = np.empty(room, np.uint8), np.empty(room, np.int8)
         end = line_arbiter.END if until == math.inf else 1000 * to_nanosecond(until)
+        arrival = 1000 * to_nanoseconds(events.t)
+        if len(arrival):
+            # pixels with a latency hold events back, and give them up at the end: later than is simulated
+            end = max(end, int(arrival[-1]))
         device = launch.find_device("cpu")
 
         def array(values: NDArray[Any], dtype: Any) -> Any:
             return wp.array(np.ascontiguousarray(values), dtype=dtype, device=device, copy=False)
 
         inputs = [
-            array(1000 * to_nanoseconds(events.t), wp.int64),
+            array(arrival, wp.int64),
             array(self._places(events.x, events.y), wp.int32), array(events.p.astype(np.uint8), wp.uint8),
             array(label, wp.int8), array(others.time, wp.int64),
             array(self._places(others.x, others.y), wp.int32), array(others.polarity, wp.uint8),

@@ -13,6 +13,7 @@ from reference import readout as twin
 
 import dase
 from dase.effects.bandwidth import Bandwidth
+from dase.effects.latency import Latency
 from dase.effects.readout import Readout
 from dase.effects.shot import Shot
 from dase.effects.threshold import Threshold
@@ -52,6 +53,20 @@ def test_it_is_its_twin_behind_noisy_slow_pixels(device, rng, mode):
     assert rows_of(got) == twin_of(plain, bus)
     assert 100 < len(got) < 0.9 * len(plain)
     parts = dase.Events.concatenate(dase.stream(scene, pixels.with_effect(bus), device=device, chunk=7))
+    same(replace(parts, label=got.label), got)
+
+
+@pytest.mark.parametrize("mode", ["rows", "columns"])
+def test_what_a_latency_holds_back_at_the_end_leaves_too(device, rng, mode):
+    """A latency that is the same in any light makes all later, and nothing else."""
+    scene, bus, delay = moving(rng, 60), Readout(rate=2e5, line=1e-5, mode=mode), 0.02
+    prompt = dase.simulate(scene, camera(bus), device=device)
+    late = camera(Latency(delay=delay, light=0.0), bus)
+    got = dase.simulate(scene, late, device=device)
+    assert np.count_nonzero(got.t > scene.duration) > 100
+    assert [e[1:] for e in rows_of(got)] == [e[1:] for e in rows_of(prompt)]
+    np.testing.assert_allclose(got.t, prompt.t + delay, atol=2e-9)
+    parts = dase.Events.concatenate(dase.stream(scene, late, device=device, chunk=7))
     same(replace(parts, label=got.label), got)
 
 
