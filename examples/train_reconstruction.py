@@ -4,6 +4,7 @@
 from pathlib import Path
 
 import numpy as np
+import torch
 
 import dase
 
@@ -25,22 +26,26 @@ fitted = dase.fit(dase.open_recording(RECORDING), start, free=free, pixels=200)
 Path("fitted.toml").write_text(dase.dump_sensor(fitted.sensor))
 print(fitted.sensor)
 
-# %% Training on endless scenes before that sensor. So small it teaches little: on a GPU take an E2VidNet,
-# batches of 12 sequences of 24 windows of 128x128 pixels, 7000 steps, device="cuda"
+# %% Training on endless scenes before that sensor: a minute of one core for a small network, which shows that
+# it works; good ones take an E2VidNet, batches of 12 sequences of 24 windows of 128x128 pixels, 7000 steps
+device = "cuda" if torch.cuda.is_available() else "cpu"
+torch.set_num_threads(1)  # more gain nothing for networks this small, and lose much on a busy machine
 network = dase.tasks.FireNet()
-settings = dase.tasks.ReconstructionTraining(steps=40, warm_up=10, average=0.95, log_every=10)
+settings = dase.tasks.ReconstructionTraining(
+    steps=1000 if device == "cuda" else 200, warm_up=20, average=0.97, learning_rate=4e-3, device=device
+)
 
 
 def batches(first):
     """Return batches from a number on."""
     return dase.torch.Stream(
-        "builtin", "fitted.toml", batch=2, steps=8, size=(48, 48), first_batch=first, augment=dase.torch.S2R,
-        backgrounds=8, objects=8, device="cpu",
+        "builtin", "fitted.toml", batch=3, steps=12, size=(48, 48), first_batch=first, augment=dase.torch.S2R,
+        backgrounds=8, objects=8, device=device,
     )  # fmt: skip
 
 
 dase.tasks.train_reconstruction(network, batches, "reconstruction", settings)
 
 # %% The recording as a video, beside the camera's own frames
-found = dase.tasks.evaluate("reconstruction/checkpoint.pt", RECORDING, out="reconstruction", device="cpu")
+found = dase.tasks.evaluate("reconstruction/checkpoint.pt", RECORDING, out="reconstruction", device=device)
 print(found)

@@ -104,9 +104,6 @@ def open_video(path: Path) -> Any:
 
 
 def _open_capture(path: Path, with_options: str | None = None) -> Any:
-    os.environ.setdefault(
-        ENVIRONMENT.log_level, str(ENVIRONMENT.quiet)
-    )  # says nothing of its own about damaged files
     # each thread of a decoder keeps frames of its own, and there would be as many as processors
     parameters = [cv2.CAP_PROP_N_THREADS, 1]
     before = os.environ.get(ENVIRONMENT.options)
@@ -204,6 +201,8 @@ def _at_once(most: int) -> Iterator[None]:
 @contextmanager
 def quiet_ffmpeg() -> Iterator[None]:
     """Keep FFmpeg quiet, also where it was used before it could be told so by its environment."""
+    # where it is used for the first time, OpenCV asks this and else sets a level of its own
+    os.environ.setdefault(ENVIRONMENT.log_level, str(ENVIRONMENT.quiet))
     library = _find_libavutil()
     if library is not None:
         library.av_log_set_level(ENVIRONMENT.quiet)

@@ -57,7 +57,9 @@ def test_a_network_for_reconstruction(run):
     found, out = run("train_reconstruction.py")
     assert found["fitted"].sensor["threshold"].on == pytest.approx(0.3, rel=0.1)
     assert "recording.h5: reconstruction, 74 judged" in out
-    assert found["found"].metrics["mse_affine"] < found["found"].metrics["mse"]
+    # better than any one grey: 0.25 and 0.2 are the swings of the two waves
+    assert found["found"].metrics["mse_affine"] < 0.7 * (0.25**2 + 0.2**2) / 2
+    assert found["found"].metrics["ssim"] > 0.3
     assert cv2.imread("reconstruction/recording.h5.png").shape == (6 * 48, 2 * 64, 3)
     assert Path("reconstruction/recording.h5.mp4").stat().st_size > 0
 
@@ -67,8 +69,8 @@ def test_a_network_for_flow(run):
     pytest.importorskip("torch")
     found, out = run("train_flow.py")
     assert "recording.h5: flow" in out
-    assert found["found"].metrics["aee_zero"] == pytest.approx(2.0, rel=1e-3)  # 60 px/s in 1/30 s
-    assert found["found"].metrics["aee"] < 4
+    assert found["found"].metrics["aee_zero"] == pytest.approx(2.0, rel=1e-3)  # 240 px/s in 1/120 s
+    assert found["found"].metrics["aee"] < 0.8 * found["found"].metrics["aee_zero"]
 
 
 def test_all_of_them_are_named():
