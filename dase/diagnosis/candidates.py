@@ -335,6 +335,7 @@ def try_effects(
     worst: Sequence[str],
     seed: int,
     report: StepProgress,
+    far: bool = False,
     settings: CandidateSettings = DEFAULTS.candidates,
 ) -> list[Candidate]:
     """Try each effect: screen all, fit the best, judge those that chance does not explain.
@@ -347,6 +348,8 @@ def try_effects(
         worst: Families in which the present model fails: who helps there is looked at more closely.
         seed: Of every random number.
         report: Told how far it is.
+        far: Whether the present model is so far off that candidates are fitted to the scout before they
+            are judged.
         settings: Numbers by which candidates are chosen.
 
     Returns:
@@ -358,11 +361,13 @@ def try_effects(
     order, left = _screen_variants(evidence, present, variants, seed=seed, report=report, settings=settings)
     first = order[: settings.finalists]
     chosen = [*first, *family_specialists(order, first, worst)]
+    rare = any(acts_on_few_pixels(one.model.sensor[one.name]) for one in chosen)
+    fitted = replace(evidence, train=evidence.scout) if far and not rare else evidence
     report(f"fitting {', '.join(one.name for one in chosen)}", 0.5)
-    refined, behind = _refine_candidates(evidence, present, chosen, seed=seed, settings=settings)
-    finalists = with_p_values(evidence, present, refined, seed=seed)
+    refined, behind = _refine_candidates(fitted, present, chosen, seed=seed, settings=settings)
+    finalists = with_p_values(fitted, present, refined, seed=seed)
     # what chance does as well is not added, whatever its error; few repeats cannot give a small p-value
-    significant = max(settings.significant, 1.01 / (1 + len(evidence.train.repeats)))
+    significant = max(settings.significant, 1.01 / (1 + len(fitted.train.repeats)))
     certain = [one for one in finalists if one.p_value <= significant]
     report(f"judging {', '.join(one.name for one in certain)}", 0.75)
     done = refit_and_judge(evidence, certain, seed=seed, settings=settings) if certain else []

@@ -9,7 +9,7 @@ graded.
 
 from __future__ import annotations
 
-from collections.abc import Collection
+from collections.abc import Callable, Collection
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -75,8 +75,7 @@ def find_detection_limits(
         last: Error of the last model.
         named: Effects that are found, or named as what comes nearest.
     """
-    known = _reported_model(state, model, report, start, last)
-    works, asked = [], []
+    asked = []
     for name in effects_to_try(state.effects, model):
         if name in named:
             continue
@@ -90,7 +89,10 @@ def find_detection_limits(
         if report.streams(with_effect_added(model, tried[0]).space):
             continue
         asked.append((tried[0], axis))
-        works.append(_limit_work(state, known, tried[0], axis))
+    if not asked:
+        return ()
+    known = _reported_model(state, model, report, start, last)
+    works = [_limit_work(state, known, effect, axis) for effect, axis in asked]
     # a few at a time: all of them side by side would hold the events of hundreds of simulations
     size, places = state.settings.detection.side_by_side, list[float | None]()
     for n in range(0, len(works), size):
@@ -185,49 +187,53 @@ def _limit_work(
     # what an effect does is a difference between two strengths that are sampled alike
     most = samples_of_screening(known.model.sensor, known.half.frame.step)
 
-    def done_work(strengths: Array, turn: int) -> Work[Array]:
-        """Return what some strengths do to the statistics, shape (S, R, J) for R repeats."""
-        places = np.repeat(other.place[None], len(strengths) + 1, 0)
-        # what the effect does to events by its place in the kernel alone, however weak it is, is not its
-        # strength; all see the same random numbers, so that few repeats tell them apart
-        places[:, column] = [weak, *strengths]
-        seeds = [SimulationStream.DETECTION.seed(state.seed, settings.repeats * turn + n)
-                 for n in range(settings.repeats)]  # fmt: skip
+    seeds = [SimulationStream.DETECTION.seed(state.seed, n) for n in range(settings.repeats)]
+
+    def simulated_work(strengths: Array) -> Work[Array]:
+        """Return the statistics at some strengths, shape (S, R, J) for R repeats."""
+        places = np.repeat(other.place[None], len(strengths), 0)
+        places[:, column] = strengths
+        # all strengths see the same random numbers, so that few repeats tell them apart
         values = yield [SimulationRequest(known.half, other.space, places, seed, most=most) for seed in seeds]
-        found = np.stack(values, 1)
-        done: Array = found[1:] - found[0]
-        return done
+        return np.stack(values, 1)
 
     # measurements are repeats of the last model, to which what the effect did in one repeat is added: which
     # pixels are hot is chance, too
     chance = known.half.repeats[: settings.measurements]
     turns = np.arange(len(chance)) % settings.repeats
 
-    def seen(done: Array) -> bool:
+    def is_seen(done: Array) -> bool:
         return float(np.mean(would_be_seen(known, chance + done[turns], state.settings))) >= settings.power
 
-    places, done = np.array([weak]), np.zeros((1, settings.repeats, known.half.repeats.shape[1]))
-    low, high = weak, strong
+    # what the effect does to events by its place in the kernel alone, however weak it is, is not its strength
+    places = np.linspace(weak, strong, settings.strengths + 1)
+    found = yield from simulated_work(places)
+    done = found - found[0]
+    first = next((n for n in range(1, len(places)) if is_seen(done[n])), 0)
+    if not first:
+        return None
+    low, high, below, above = places[first - 1], places[first], done[first - 1], done[first]
     for turn in range(settings.turns):
-        # the strongest of the first turn may not be seen, that of a later one is known
-        inside = low + (high - low) * np.linspace(0, 1, settings.strengths + 1 + (turn > 0))
-        inside = inside[1 : settings.strengths + 1]
-        more = yield from done_work(inside, turn)
-        order = np.argsort(np.abs(np.concatenate([places, inside]) - weak), kind="stable")
-        places, done = np.concatenate([places, inside])[order], np.concatenate([done, more])[order]
-        first = next((n for n in range(1, len(places)) if seen(done[n])), 0)
-        if not first:
-            return None
-        low, high = places[first - 1], places[first]
-    # between two strengths what they do hardly bends
-    share_low, share_high = 0.0, 1.0
-    for _ in range(settings.halvings):
-        middle = 0.5 * (share_low + share_high)
-        if seen(done[first - 1] + middle * (done[first] - done[first - 1])):
-            share_high = middle
+        share = _least_share(is_seen, below, above, settings.halvings)
+        middle = float(low + share * (high - low))
+        if turn == settings.turns - 1 or share == 1.0:
+            return middle
+        # between two strengths what they do hardly bends; where it does, the next look tells
+        here = (yield from simulated_work(np.array([middle])))[0] - found[0]
+        if is_seen(here):
+            high, above = middle, here
         else:
-            share_low = middle
-    return float(low + share_high * (high - low))
+            low, below = middle, here
+    return float(high)
+
+
+def _least_share(is_seen: Callable[[Array], bool], below: Array, above: Array, halvings: int) -> float:
+    """Return the least share of the way between what two strengths do that is seen; the whole way is."""
+    low, high = 0.0, 1.0
+    for _ in range(halvings):
+        middle = 0.5 * (low + high)
+        low, high = (low, middle) if is_seen(below + middle * (above - below)) else (middle, high)
+    return high
 
 
 def would_be_seen(known: ReportedModel, values: Array, settings: DiagnosisSettings) -> NDArray[np.bool_]:

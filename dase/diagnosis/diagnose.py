@@ -124,7 +124,8 @@ def diagnose(
     evidence = split_measurement(
         measurement.events, measurement.scene, log_eps=given.log_eps, trust=measurement.trust,
         span=measurement.span, left_out=bursts.contains if bursts else None, odd_pixels=hot, lamp=seen.lamp,
-        frames=frames, unbroken=given.unbroken, pixels=pixels, seed=seed, device=device,
+        frames=frames, unbroken=given.unbroken, plenty=settings.plenty, pixels=pixels, seed=seed,
+        device=device,
     )  # fmt: skip
     given = put_in_step(given, evidence)
     free = free_where_measured(evidence, given, free)
@@ -160,7 +161,8 @@ def diagnose(
             f"{len(hot)} hot pixels are left out of all that is compared, and counted among all pixels"
         )
     strength = None if evidence.contradiction else strength_of_bursts(
-        seen, measurement, start.sensor, effects, pixels=pixels, seed=seed, device=device
+        seen, measurement, start.sensor, effects, pixels=pixels, plenty=settings.plenty, seed=seed,
+        device=device,
     )  # fmt: skip
     if strength is not None:
         # pixels remember the bursts between them, too
@@ -183,7 +185,7 @@ def diagnose(
         # beside other effects it may be another
         last = strength_of_bursts(
             seen, measurement, found.sensor.without(strength.effect.name), effects,
-            pixels=pixels, seed=seed, device=device,
+            pixels=pixels, plenty=settings.plenty, seed=seed, device=device,
         )  # fmt: skip
         found = with_effect_of_bursts(found, last or strength)
     return measurement.noted(replace(found, seconds=time.perf_counter() - begin))
@@ -259,11 +261,13 @@ def _look_for_effect(
     open_names = certain or open_names
     if not open_names:
         return step, None, False
+    far = judgement.error > settings.far * judgement.gate
     present = calibrate_split(
-        evidence, model, repeats=settings.repeats, scout_repeats=settings.scout_repeats, seed=seed
-    )
+        evidence, model, repeats=settings.scout_repeats if far else settings.repeats,
+        scout_repeats=settings.scout_repeats, seed=seed,
+    )  # fmt: skip
     tried = try_effects(
-        present, model, state.effects, open_names, worst=worst_families(judgement),
+        present, model, state.effects, open_names, worst=worst_families(judgement), far=far,
         seed=seed, report=lambda text, share: state.progress(text, share, state.error),
         settings=settings.candidates,
     )  # fmt: skip
@@ -277,8 +281,8 @@ def _look_for_effect(
         return step, None, False
     state.note_addition(best, [one for one in tried if one.judgement], ties, judgement)
     step = replace(step, chosen=best.name, ties=ties)
-    far = best.error > settings.on_its_way * judgement.gate
-    return step, refit_model(evidence, best.model, seed=seed, rounds=1), far
+    on_its_way = best.error > settings.on_its_way * judgement.gate
+    return step, refit_model(evidence, best.model, seed=seed, rounds=1), on_its_way
 
 
 def _best_candidate(

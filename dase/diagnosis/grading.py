@@ -17,6 +17,7 @@ An effect that earns neither is a stand-in: it is named as what comes nearest, a
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
@@ -82,31 +83,66 @@ def grade_effects(
     if not found:
         return {}
     settings = state.settings.grades
+    mine = {n: {axis: v for axis, v in values.items() if axis.split(".")[0] == n} for n in found}
+    if not leaves_little(start.judgement, last, settings):
+        # whatever is left without them, none is found: only what the search knows by the way is said
+        alone = {name: way.get(frozenset(found) - {name}) for name in found}
+        return {
+            name: Finding(
+                name, Grade.STAND_IN, error_without=bare.judgement.error if bare else math.nan,
+                error_with=last.error, parameters=mine[name],
+            ) for name, bare in alone.items()
+        }  # fmt: skip
     without = _models_without(state, model, found, {frozenset(): start, **way})
-    rivals = _equally_good_rivals(state, model, found)
     misfit = misfit_beyond_chance(report)
+    deviations = {
+        name: deviation_towards(state, state.evidence.report, without[name].model, model, doubt=misfit)
+        for name in found
+    }
+
+    def graded(name: str, has_rivals: bool) -> tuple[Grade, bool]:
+        bare = without[name].judgement
+        return grade_of(
+            start.judgement, bare, last, deviations[name], has_rivals=has_rivals, settings=settings
+        )
+
+    shown = [name for name in found if graded(name, False)[0] is not Grade.STAND_IN]
+    rivals = _equally_good_rivals(state, model, shown)
     out: dict[str, Finding] = {}
     for name in found:
-        bare = without[name]
-        deviation = deviation_towards(state, state.evidence.report, bare.model, model, doubt=misfit)
-        mine = {axis: value for axis, value in values.items() if axis.split(".")[0] == name}
+        others = rivals.get(name, ())
         stopped = any(text.startswith((f"{name}.", "threshold.")) for text in at_bounds)
-        grade, unknown = grade_of(
-            start.judgement, bare.judgement, last, deviation, has_rivals=bool(rivals[name]), settings=settings
-        )
-        if grade is Grade.SUPPORTED and any(is_strained(model, *one) for one in mine.items()):
+        grade, unknown = graded(name, bool(others))
+        if grade is Grade.SUPPORTED and any(is_strained(model, *one) for one in mine[name].items()):
             grade, unknown = Grade.EITHER, True
         out[name] = Finding(
             effect=name,
             grade=Grade.STAND_IN if stopped else grade,
-            alternatives=rivals[name],
+            alternatives=others,
             unknown=unknown,
-            error_without=bare.judgement.error,
+            error_without=without[name].judgement.error,
             error_with=last.error,
-            deviation=deviation,
-            parameters=mine,
+            deviation=deviations[name],
+            parameters=mine[name],
         )
     return out
+
+
+def leaves_little(start: Judgement, last: Judgement, settings: GradeSettings) -> bool:
+    """Return whether any effect can be found: the last model is right, or leaves little of the first error.
+
+    Args:
+        start: Error of the model before the search.
+        last: Error of the last model.
+        settings: Limits.
+    """
+    return may_be_announced(last) or _share_left(start, last, settings) <= settings.total_left
+
+
+def _share_left(other: Judgement, last: Judgement, settings: GradeSettings) -> float:
+    """Return what the last model leaves, in units of what another does, above the level of chance."""
+    level = max(last.level, settings.usual)
+    return max(last.error - level, 0.0) / max(other.error - level, 1e-9)
 
 
 def is_strained(model: FittedModel, name: str, value: Estimate) -> bool:
@@ -137,10 +173,7 @@ def grade_of(
         has_rivals: Whether another effect does nearly as well in its place.
         settings: Limits.
     """
-    level = max(last.level, settings.usual)
-    left = max(last.error - level, 0.0)
-    total = left / max(start.error - level, 1e-9)
-    own = left / max(without.error - level, 1e-9)
+    total, own = _share_left(start, last, settings), _share_left(without, last, settings)
     at_floor = may_be_announced(last)
     clear = without.error > last.gate and own <= settings.clear_left
     if without.error <= last.error or (deviation < settings.away and not clear):
@@ -151,7 +184,7 @@ def grade_of(
         return Grade.STAND_IN, False
     # at the floor, but not within chance: what is left tells that the world is another than the model's
     sure = chance or (explained and total <= settings.sure_left)
-    weak = without.error - level < settings.weak
+    weak = without.error - max(last.level, settings.usual) < settings.weak
     if has_rivals or weak or not sure:
         return Grade.EITHER, weak or not sure
     return Grade.SUPPORTED, False

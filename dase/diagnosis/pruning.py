@@ -28,7 +28,9 @@ def prune_model(
     model, judgement = _drop_needless(state, model, judgement)
     before = model
     for name in (n for n in state.added_to(model) if n not in state.certain):
-        for other, swap in _keep_near_models(state, _rival_models(state, model, name), judgement).items():
+        rivals = _rival_models(state, model, name)
+        # a rival has to reach the floor, however far off the present model is
+        for other, swap in _keep_near_models(state, rivals, judgement.gate).items():
             swapped = refit_model(state.evidence, swap, seed=state.seed)
             judged = state.judge(swapped)
             without = state.without.get(name)
@@ -55,7 +57,8 @@ def _drop_needless(
 ) -> tuple[FittedModel, Judgement]:
     """Drop effects that are not needed any more."""
     whole = model
-    for name, less in _keep_near_models(state, _droppable_models(state, model), judgement).items():
+    near = max(judgement.gate, judgement.error)
+    for name, less in _keep_near_models(state, _droppable_models(state, model), near).items():
         if name not in model.sensor or name in state.certain or len(state.added_to(model)) == 1:
             continue
         less = less if model is whole else with_same_freedom(model.sensor.without(name), model, ())
@@ -72,17 +75,17 @@ def _drop_needless(
 
 
 def _keep_near_models(
-    state: DiagnosisState, ways: Mapping[str, FittedModel], judgement: Judgement
+    state: DiagnosisState, ways: Mapping[str, FittedModel], error: float
 ) -> dict[str, FittedModel]:
-    """Return those models that one descent takes near enough to be fitted in full, fitted by it."""
+    """Return those models that one descent takes near an error, fitted by it: these are worth a full fit."""
     evidence, seed, pruning = state.evidence, state.seed, state.settings.pruning
     stream = SimulationStream.JUDGE.seed(seed)
     ends = run_side_by_side([refit_work(evidence, way, seed=seed, rounds=1) for way in ways.values()])
     judged = run_side_by_side(
         [m.judgement_work(evidence.held, repeats=pruning.repeats, seed=stream) for m in ends]
     )
-    limit = pruning.near * max(judgement.gate, judgement.error)
-    return {name: m for name, m, j in zip(ways, ends, judged, strict=True) if j.error < limit}
+    near = (j.error < pruning.near * error for j in judged)
+    return {name: m for name, m, keep in zip(ways, ends, near, strict=True) if keep}
 
 
 def _droppable_models(state: DiagnosisState, model: FittedModel) -> dict[str, FittedModel]:

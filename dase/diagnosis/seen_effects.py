@@ -177,6 +177,7 @@ def strength_of_bursts(
     library: Mapping[str, type[Effect]],
     *,
     pixels: int,
+    plenty: float,
     seed: int,
     device: str,
 ) -> BurstStrength | None:
@@ -188,6 +189,7 @@ def strength_of_bursts(
         sensor: Without the effect.
         library: Effects, name to class.
         pixels: In each part of the measurement.
+        plenty: Events about the bursts from which on a longer time is not looked at.
         seed: Of every random number.
         device: Where kernels run.
     """
@@ -198,7 +200,7 @@ def strength_of_bursts(
         if name in library and name not in sensor:
             return fit_bursts(
                 measurement, sensor, library[name], times,
-                pixels=pixels, seed=seed, device=device,
+                pixels=pixels, plenty=plenty, seed=seed, device=device,
             )  # fmt: skip
     return None
 

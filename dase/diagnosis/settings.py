@@ -117,10 +117,10 @@ class PruningSettings:
     [gates]."""
 
     near: float = 1.5
-    """A model is fitted in full where one descent takes its held-out error below this, in units of the gate
-    or of the present model's error."""
+    """A model is fitted in full where one descent takes its held-out error below this, in units of the gate,
+    or of the present model's error where it need only do as well."""
 
-    lost: float = 4.0
+    lost: float = 3.0
     """A model that is farther off than this is not reviewed [gates]. In the blind benchmark one was taken
     from 2.9 to the floor, and none of 24 that were beyond 3."""
 
@@ -199,14 +199,13 @@ class DetectionSettings:
     """Share of them that must show it."""
 
     strengths: int = 3
-    """That are simulated in a turn. With next to nothing of the effect, the weakest of all, and three repeats
-    twelve models are simulated at once, of which a CPU takes sixteen in the time of one."""
+    """That are simulated first, beside next to nothing of the effect: with three repeats twelve models."""
 
     turns: int = 2
-    """The first divides the range of strengths by 3, the next what is left by 4."""
+    """Times that the least strength is worked out between two: after the first it is simulated, too."""
 
-    halvings: int = 3
-    """Of what is left then, by what lies between what two strengths do."""
+    halvings: int = 4
+    """Of what lies between two strengths, by what lies between what they do."""
 
     side_by_side: int = 4
     """Effects that are looked at in one launch."""
@@ -239,8 +238,17 @@ class DiagnosisSettings:
     tie_share: float = 0.1
     """The same far from the floor, as a share of the best's error."""
 
+    plenty: float = 20_000
+    """Events of the pixels of one part from which on a longer time is not compared: other simulators' clips,
+    in which most effects are found, have 6,000 to 100,000, and what takes longest are long recordings."""
+
     on_its_way: float = 2.0
     """A model with one effect more is judged by fewer simulations where its error is above this [gates]."""
+
+    far: float = 3.0
+    """Where the error is above this [gates], candidates are fitted to the scout before they are judged: what
+    more pixels would tell is less than what most candidates leave. Judged as well after a fit to the scout, a
+    bandwidth was left behind a second pole (1.57 and 0.36 in place of 0.30 and 0.39)."""
 
     paired: int = 6
     """Candidates that are tried two at a time where one after the other is not enough."""

@@ -199,6 +199,14 @@ class Flicker(Effect):
         """Return the longest time between samples that still shows the effect [s]."""
         if not (self.depth and self.frequency):
             return math.inf
-        # the dips of rectified light are sharp, and the shorter part of a period is not to be missed
-        part = {"sine": 1 / 16, "rectified": 1 / 32, "pwm": min(1 / 16, self.duty / 4, (1 - self.duty) / 4)}
-        return part[self.shape] / self.frequency
+        # between samples the light runs straight, which is off by depth / samples² where it is round and by
+        # depth / samples at the sharp dips of rectified light: 0.006 and 0.015 at most up to a depth of 0.3;
+        # ten samples of a period keep 97 % of a sine's swing
+        share = min(abs(self.depth) / 0.3, 1.0)
+        if self.shape == "sine":
+            part = 1 / max(10, 16 * share**0.5)
+        elif self.shape == "rectified":
+            part = 1 / 32 if share > 0.5 else 1 / 16
+        else:  # the shorter part of a period is not to be missed
+            part = min(1 / 16, self.duty / 4, (1 - self.duty) / 4)
+        return part / self.frequency

@@ -6,6 +6,7 @@ badly does not hide them. Everything else is better fitted without them.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
@@ -104,6 +105,7 @@ def fit_bursts(
     times: BurstTimes,
     *,
     pixels: int = SPLIT.pixels,
+    plenty: float = math.inf,
     seed: int = 0,
     device: str = "cpu",
 ) -> BurstStrength | None:
@@ -115,6 +117,7 @@ def fit_bursts(
         kind: The effect.
         times: When the bursts come; little else is compared.
         pixels: In each part of the measurement.
+        plenty: Events about the bursts, of one part, from which on a longer time is not looked at.
         seed: Of every random number.
         device: Where kernels run.
     """
@@ -124,6 +127,9 @@ def fit_bursts(
         trust = everywhere
     bursts = times.around(float(events.t[0]), float(events.t[-1]), REACH)
 
+    # of a longer time, so many lie about the bursts
+    plenty /= max(float(bursts.contains(events.t).mean()), 1e-6)
+
     def between_bursts(t: NDArray[np.float64]) -> NDArray[np.bool_]:
         return ~bursts.contains(t)
 
@@ -131,7 +137,7 @@ def fit_bursts(
         evidence = split_measurement(
             events, scene, log_eps=sensor.log_eps, trust=trust,
             span=measurement.span, left_out=between_bursts, frames=times,
-            pixels=pixels, seed=seed, device=device,
+            plenty=plenty, pixels=pixels, seed=seed, device=device,
         )  # fmt: skip
     except InputError:
         return None

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
@@ -172,6 +173,7 @@ def split_measurement(
     lamp: float | None = None,
     frames: BurstTimes | None = None,
     unbroken: bool = False,
+    plenty: float = math.inf,
     pixels: int = SPLIT.pixels,
     seed: int = 0,
     device: str = "cpu",
@@ -194,6 +196,7 @@ def split_measurement(
         unbroken: Whether a long recording is compared in one window, not in several over its length, as
             models with a clock of their own need it, see `Sensor.unbroken`; so it is where there is a lamp
             or bursts with frames, where times are left out, and where time stamps follow a regularity.
+        plenty: Events of the pixels of one part from which on a longer time is not compared.
         pixels: In each part.
         seed: Of the choice of pixels.
         device: Where kernels run.
@@ -210,9 +213,13 @@ def split_measurement(
     asked = within_span(whole, span)
     # the phase of what goes by a clock of its own would not go on from window to window
     unbroken = unbroken or lamp is not None or left_out is not None or frames is not None
-    windows = choose_windows(events, scene, asked, pixels, unbroken=unbroken)
+    shorter = partial(
+        choose_windows, events, scene, asked, pixels, plenty=plenty,
+        compared=_share_compared(events, scene, asked, trust) if plenty < math.inf else 1.0,
+    )  # fmt: skip
+    windows = shorter(unbroken=unbroken)
     if len(windows) > 1 and find_structure(_within(events, windows[0])) != TimestampStructure():
-        windows = choose_windows(events, scene, asked, pixels, unbroken=True)
+        windows = shorter(unbroken=True)
     grid = windows[0]
     when = times_of_grid(scene, grid)
     # light that does not change is not stored step by step
@@ -342,6 +349,13 @@ def split_measurement(
         contradiction, frames,
     )  # fmt: skip
     return replace(out, notes=(*notes, NO_THRESHOLDS)) if out.light_never_changes else out
+
+
+def _share_compared(events: Events, scene: Scene, grid: Grid, trust: Trust | None, looks: int = 40) -> float:
+    """Return about which share of the events lies where a scene is trusted."""
+    if trust is None:
+        return 1.0
+    return find_trusted_parts(events, scene, times_of_grid(scene, grid), 0, trust, most=looks).events
 
 
 def _within(events: Events, grid: Grid) -> Events:

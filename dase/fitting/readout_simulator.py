@@ -92,12 +92,15 @@ def simulate_pixels(
     room = 64 if kind == "cuda" else 2048  # events per pixel
 
     def out(rows: slice) -> list[Events]:
-        scene = _StimulusScene(stimulus, int(finer[rows.start]))
+        scene = scenes[int(finer[rows.start])]
         return SensorRun(
             scene, bare, pixels=stimulus.pixels, parameters=vectors[rows],
             seed=int(seeds[rows.start]), device=str(stimulus.device), events_per_pixel=room,
-            chunk=stimulus.grid.steps,
+            chunk=len(scene.times) if scene.light is not None else stimulus.grid.steps,
         ).events()  # fmt: skip
+
+    # the light between the steps is worked out once for all models that take as many samples
+    scenes = {each: _StimulusScene(stimulus, each) for each in np.unique(finer).tolist()}
 
     if kind == "cuda" and np.all(seeds == seeds[0]) and np.all(finer == finer[0]):
         return out(slice(0, len(seeds)))
@@ -145,18 +148,18 @@ class _StimulusScene(Scene):
         points = (stimulus.grid.steps - 1) * finer + 1
         self.times: NDArray[np.float64] = np.float64(stimulus.grid.step / finer) * np.arange(points)
         self.duration = float(self.times[-1])
+        self.light = stimulus.finer_light(finer)
 
     def sample_times(self) -> NDArray[np.float64]:
         return self.times
 
     def source(self, times: NDArray[np.float64], pixels: NDArray[np.int32], device: Any) -> tuple[str, Any]:
         out = pixel_stages.Frames()
-        stimulus = self._stimulus
-        if self._finer == 1 and len(times) == len(self.times):
-            out.values = stimulus.array("light", lambda: stimulus.intensity.T)
+        if self.light is not None and len(times) == len(self.times):
+            out.values = self.light
         else:
             points = np.searchsorted(self.times, times)
-            light = np.ascontiguousarray(stimulus.light_at(points, self._finer).T)
+            light = np.ascontiguousarray(self._stimulus.light_at(points, self._finer).T)
             out.values = wp.array(light, dtype=float, device=device)
         return "frames", out
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 
@@ -89,6 +90,8 @@ def choose_windows(
     pixels: int,
     *,
     unbroken: bool = False,
+    compared: float = 1.0,
+    plenty: float = math.inf,
     settings: WindowSettings = WindowSettings(),
 ) -> tuple[Grid, ...]:
     """Return the windows of a grid of time that are compared, in order: all of it where it is short.
@@ -99,14 +102,18 @@ def choose_windows(
         grid: All time that both have.
         pixels: That are looked at, in each part.
         unbroken: Whether time must go on without a break, so that there is one window.
+        compared: Share of the events that lie where the scene is trusted.
+        plenty: Events of the pixels that are looked at from which on a longer time tells little more;
+            `settings.shortest` it is at least.
         settings: How much is compared.
     """
-    most = settings.longest
+    usual_rate = len(events) / (grid.step * grid.steps * scene.width * scene.height)
+    each = max(compared * usual_rate * pixels, 1e-9)
+    most = int(min(settings.longest, max(settings.shortest, plenty / each) / grid.step))
     if is_constant(scene):
-        rate = len(events) / (grid.step * grid.steps * scene.width * scene.height)
         # the later 40 % judge
-        needed = settings.enough / max(0.4 * pixels * rate, 1e-9)
-        most = int(min(max(settings.rest, needed) / grid.step, 2.5 * most))
+        needed = settings.enough / max(0.4 * pixels * usual_rate, 1e-9)
+        most = int(min(max(settings.rest, needed) / grid.step, 2.5 * settings.longest))
     if grid.steps <= 1.25 * most:
         return (grid,)
     count = 1 if unbroken else max(1, min(settings.windows, int(most * grid.step / settings.shortest)))

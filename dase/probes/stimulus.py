@@ -173,6 +173,25 @@ class Stimulus:
         out: NDArray[np.float32] = np.where(share == 0, low, np.where(share == 1, high, between))
         return np.maximum(np.where(low == high, low, out), 0)
 
+    def finer_light(self, finer: int, most_bytes: int = 1 << 28) -> Any | None:
+        """Return the intensity at the points of a finer grid on the device, shape (K, N); the last is kept.
+
+        Args:
+            finer: Points per step.
+            most_bytes: What it may take.
+
+        Returns:
+            None where it takes more.
+        """
+        points = np.arange((self.grid.steps - 1) * finer + 1)
+        if 4 * len(points) * len(self.pixels) > most_bytes:
+            return None
+        name = f"light {finer}"
+        if name not in self._kept:
+            for other in [one for one in self._kept if one.startswith("light ")]:
+                del self._kept[other]
+        return self.array(name, lambda: self.light_at(points, finer).T)
+
     def array(self, name: str, make: Callable[[], NDArray[Any]]) -> Any:
         """Return an array on the device, of the shape that `make` gives it; made and moved there once."""
         if name not in self._kept:

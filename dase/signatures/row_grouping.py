@@ -166,13 +166,14 @@ def _may_be_of_an_edge(
     cut = (t - own < t[0]) | (t + own > t[-1])  # what is beside them is not at hand
     low, high = np.maximum(low, 0), np.minimum(high, count - 1)
     keys = (pixel * count + index)[order]
-    pixel, low, high = pixel[order], low[order], high[order]
-    near = np.zeros(count, bool)
+    low, high = keys + (low[order] - index[order]), keys + (high[order] - index[order])
+    near = cut[order]
     for step in range(1, settings.away + 1):
-        for place in (pixel - step, pixel + step):
-            at = place * count
-            near |= np.searchsorted(keys, at + low) < np.searchsorted(keys, at + high, "right")
-    near |= cut[order]
+        for away in (-step * count, step * count):
+            open_ = np.flatnonzero(~near)
+            first = np.searchsorted(keys, low[open_] + away)
+            first[first == count] = count - 1  # the last key is below what is looked for, then
+            near[open_] = (keys[first] >= low[open_] + away) & (keys[first] <= high[open_] + away)
     out = np.empty(count, np.bool_)
     out[order] = near
     return out

@@ -162,9 +162,10 @@ def test_what_is_not_needed_is_dropped(monkeypatch):
 
 
 def test_what_is_far_from_the_floor_is_not_reviewed(monkeypatch):
-    errors = {"ab": 4.5, "a": 0.3, "b": 6.0}  # the gate is at 1.15
-    assert reviewing.prune_model(*fake("ab", errors, monkeypatch))[0].names == "a"
-    assert reviewing.prune_model(*fake("ab", {**errors, "ab": 4.7}, monkeypatch))[0].names == "ab"
+    far = DEFAULTS.pruning.lost * judged(0.3).gate
+    errors = {"a": 0.3, "b": 6.0}
+    assert reviewing.prune_model(*fake("ab", {**errors, "ab": far - 0.1}, monkeypatch))[0].names == "a"
+    assert reviewing.prune_model(*fake("ab", {**errors, "ab": far + 0.1}, monkeypatch))[0].names == "ab"
 
 
 def test_what_accounts_for_most_stays_and_so_does_what_only_a_closer_look_shows(monkeypatch):

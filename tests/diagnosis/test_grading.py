@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 import dase
+from dase.diagnosis import grading
 from dase.diagnosis.diagnose import diagnose
 from dase.diagnosis.explain_effect import moving_bars
 from dase.diagnosis.grading import grade_of, is_strained
@@ -18,7 +20,7 @@ from dase.diagnosis.seen_effects import (
     without_the_explained,
     without_the_scene,
 )
-from dase.diagnosis.settings import GradeSettings
+from dase.diagnosis.settings import DEFAULTS, GradeSettings
 from dase.effects import EFFECTS
 from dase.fitting.data_split import split_measurement
 from dase.fitting.measurement import Measurement
@@ -134,6 +136,23 @@ def test_each_model_has_one_error(found):
     assert found.findings[0].error_with == found.errors[1]
     assert found.finding() == "missing: leak (supported)"
     assert found.to_json()["findings"][0]["grade"] == "supported"
+
+
+def test_nothing_is_fitted_to_grade_effects_of_a_model_that_leaves_too_much(monkeypatch):
+    monkeypatch.setattr(grading, "_models_without", lambda *args: pytest.fail("it was fitted"))
+
+    bare = SimpleNamespace(judgement=judged(8.0))
+    state = SimpleNamespace(settings=DEFAULTS)
+    # 0.2 of the first error is left above what chance makes
+    told = grading.grade_effects(
+        state, None, ["leak", "shot"], {frozenset({"shot"}): bare}, SimpleNamespace(judgement=judged(10.25)),
+        judged(2.25), report=None, values={}, at_bounds=(),
+    )  # fmt: skip
+    assert [one.grade for one in told.values()] == [Grade.STAND_IN] * 2
+    assert told["leak"].error_without == 8.0
+    assert np.isnan(told["shot"].error_without)
+    assert grading.leaves_little(judged(10.25), judged(1.74), DEFAULTS.grades)
+    assert not grading.leaves_little(judged(10.25), judged(1.76), DEFAULTS.grades)
 
 
 def test_what_the_last_model_shows_as_well_is_explained(scene):

@@ -19,7 +19,6 @@ from dase.fitting.descent import descent_work
 from dase.fitting.early_stopping import CandidateRace, stop_unless_below
 from dase.fitting.model import model_of
 from dase.fitting.scheduler import run_work
-from dase.probes.distance import Judgement
 from dase.simulation.sensor import Sensor
 
 THRESHOLD = EFFECTS["threshold"](on=0.18, off=0.2)
@@ -99,9 +98,8 @@ def test_what_chance_does_as_well_is_not_judged(search, lacks):
 def test_only_what_one_descent_takes_near_is_fitted_in_full(search):
     slow = TRUE.with_effect(EFFECTS["bandwidth"](cutoff=10.0))
     ways = {"far": model_of(slow, ["threshold"]), "near": model_of(TRUE)}
-    present = Judgement(0.3, 1.15, 0.5, 0.2, {}, {}, np.zeros(1), 1.0)
-    assert list(_keep_near_models(search, ways, present)) == ["near"]
-    assert _keep_near_models(search, {}, present) == {}
+    assert list(_keep_near_models(search, ways, 1.15)) == ["near"]
+    assert _keep_near_models(search, {}, 1.15) == {}
 
 
 def test_a_search_that_is_over_stops(search):

@@ -61,6 +61,20 @@ def test_a_short_recording_is_compared_whole_and_a_clock_is_not_broken(rng):
     assert one.steps == SHORT.longest
 
 
+def test_no_longer_time_is_compared_than_has_plenty_of_events(rng):
+    events, long = events_at(rng.uniform(0, 60, 48_000)), Grid(0.0, STEP, 60_000)
+    # 48 pixels send 800 events per second; 12 of them, trusted for half of the events, 100
+    (one,) = choose_windows(events, Ramp(), long, 12, unbroken=True, compared=0.5, plenty=150, settings=SHORT)
+    assert one.steps == pytest.approx(1500, abs=1)
+    windows = choose_windows(events, Ramp(), long, 12, compared=0.5, plenty=150, settings=SHORT)
+    assert sum(each.steps for each in windows) == pytest.approx(1500, abs=2)
+    # never shorter than what is slow needs, nor longer than without
+    (one,) = choose_windows(events, Ramp(), long, 12, unbroken=True, plenty=1, settings=SHORT)
+    assert one.steps == SHORT.shortest / STEP
+    (one,) = choose_windows(events, Ramp(), long, 12, unbroken=True, plenty=1e9, settings=SHORT)
+    assert one.steps == SHORT.longest
+
+
 def spliced(*begins: float, steps: int = 500) -> SplicedTime:
     windows = tuple(Grid(begin, STEP, steps) for begin in begins)
     return SplicedTime(windows, np.concatenate([one.times for one in windows]), 100)
