@@ -8,7 +8,14 @@ pytest.importorskip("torch")
 
 from perf.experiments.downstream.run import Job, next_job, study_plan
 from perf.experiments.downstream.sensors import TARGETS, tuned_thresholds
-from perf.experiments.downstream.table import mean_text, paired_gaps, share_interval, share_text, tables
+from perf.experiments.downstream.table import (
+    mean_text,
+    paired_gaps,
+    share_interval,
+    share_text,
+    tables,
+    turned_rows,
+)
 
 
 def test_gaps_are_of_pairs():
@@ -22,7 +29,17 @@ def test_gaps_are_of_pairs():
     assert mean_text([], 2) == "–"
     rows = [{"task": "flow", "kind": kind, "target": "slow", "seed": seed, "aee": value}
             for (kind, _), values in found.items() for seed, value in values.items()]  # fmt: skip
-    assert "| tuned | 0.550 ± 0.635 | – | – | – |" in tables(rows)
+    assert "| tuned | 0.55 ± 0.64 | – | – | – |" in tables(rows)
+
+
+def test_networks_on_real_rotation_have_tables_of_their_own():
+    rows = [{"network": "flow-true-all-1", "excerpt": "boxes", "aee": 1.0, "share": 0.25},
+            {"network": "flow-esim-0", "excerpt": "boxes", "aee": 2.0, "share": 0.5}]  # fmt: skip
+    found = tables(turned_rows(rows))
+    assert "boxes, seeds 0, 1" in found
+    assert "| true | – | – | – | 0.250 |" in found
+    assert "| esim | 0.500 | 0.500 | 0.500 | 0.500 |" in found
+    assert "gap" not in found  # their cameras are none of the targets
 
 
 def test_intervals_of_shares_hold_the_truth_as_often_as_they_say(rng):

@@ -1,10 +1,12 @@
 """Tables of the study: means over seeds, and the share of the gap that each sensor closes.
 
-    python -m perf.experiments.downstream.table RESULTS.jsonl
+    python -m perf.experiments.downstream.table RESULTS.jsonl [ROTATION.jsonl]
 
 The gap is that between the tuned and the true sensor of the same seed; 100 % is as good as the true one.
 Intervals are those of the mean over seeds (Student's t, 95 %), none for one seed; those of shares are
-Fieller's, of paired seeds, and there is none where the gap itself may be 0. Prints Markdown.
+Fieller's, of paired seeds, and there is none where the gap itself may be 0. With what
+`perf.experiments.downstream.rotation` prints, networks of flow on real excerpts, too: their cameras are
+none of the targets, so there is no gap. `share` is an error over that of no flow. Prints Markdown.
 """
 
 from __future__ import annotations
@@ -16,12 +18,15 @@ from pathlib import Path
 import numpy as np
 from scipy.stats import t as student
 
-from perf.experiments.downstream.sensors import KINDS, TARGETS
+from perf.experiments.downstream.sensors import KINDS, OF_NO_TARGET, TARGETS
 
 MEASURES = (
-    ("reconstruction", "l1", "l1_grey", 4), ("reconstruction", "ssim", "", 3), ("flow", "aee", "aee_zero", 3),
+    ("reconstruction", "l1", "l1_grey", 4), ("reconstruction", "ssim", "", 3), ("flow", "aee", "aee_zero", 2),
+    ("flow", "share", "", 3),
 )  # fmt: skip
 """Task, column, column of what is to be had without a network, and decimals of each table."""
+TURNED = "flow on real rotation"
+"""Task of the lines of `turned_rows`."""
 
 Found = dict[tuple[str, str], dict[int, float]]
 """Values by kind and target, and by seed."""
@@ -84,10 +89,28 @@ def values_of(rows: list[dict], task: str, column: str) -> Found:
     return found
 
 
+def with_shares(rows: list[dict]) -> list[dict]:
+    """Return rows, those of flow with their error over that of no flow."""
+    return [{**row, "share": row["aee"] / row["aee_zero"]} if "aee_zero" in row else row for row in rows]
+
+
+def turned_rows(rows: list[dict]) -> list[dict]:
+    """Return lines of `rotation` as those of results: an excerpt is a column; of no target is for all."""
+    out = []
+    for row in rows:
+        _, kind, *target, seed = row["network"].split("-")
+        for one in TARGETS if kind in OF_NO_TARGET else target:
+            found = {"task": TURNED, "kind": kind, "target": one, "seed": int(seed)}
+            out.append({**found, row["excerpt"]: row["share"]})
+    return out
+
+
 def tables(rows: list[dict]) -> str:
     """Return all tables in Markdown."""
     out = []
-    for task, column, without, decimals in MEASURES:
+    names = {name for row in rows if row["task"] == TURNED for name in row}
+    excerpts = sorted(names - {"task", "kind", "target", "seed"})
+    for task, column, without, decimals in (*MEASURES, *((TURNED, one, "", 3) for one in excerpts)):
         found = values_of(rows, task, column)
         if not found:
             continue
@@ -104,11 +127,18 @@ def tables(rows: list[dict]) -> str:
                     for target in TARGETS]  # fmt: skip
             cells = [mean_text(values[:1], decimals) for values in each]
             out.append(f"| nothing ({without}) | {' | '.join(cells)} |")
-        gaps = [paired_gaps(found, "fitted", t) for t in TARGETS]
-        out.append(f"| gap closed by fitted [%] | {' | '.join(share_text(*gap) for gap in gaps)} |")
+        if task != TURNED:
+            gaps = [paired_gaps(found, "fitted", t) for t in TARGETS]
+            out.append(f"| gap closed by fitted [%] | {' | '.join(share_text(*gap) for gap in gaps)} |")
         out.append("")
     return "\n".join(out)
 
 
+def read_rows(path: str) -> list[dict]:
+    """Return the lines of a file."""
+    return [json.loads(line) for line in Path(path).read_text("utf-8").splitlines()]
+
+
 if __name__ == "__main__":
-    print(tables([json.loads(line) for line in Path(sys.argv[1]).read_text().splitlines()]))
+    results, *turned = map(read_rows, sys.argv[1:])
+    print(tables([*with_shares(results), *(row for rows in turned for row in turned_rows(rows))]))
