@@ -19,6 +19,7 @@ from dase.effects.refractory import Refractory
 from dase.effects.second_order import SecondOrder
 from dase.effects.threshold import Threshold
 from dase.effects.voltage_noise import VoltageNoise
+from perf.experiments.noise.rice import CUTOFFS, rice_rate, simulated_rate
 
 
 @pytest.mark.parametrize("damping", [0.2, 0.5, 1.0, 3.0])
@@ -228,24 +229,27 @@ def test_levels_are_passed_as_often_as_rice_says(device, per_period):
         assert passed == pytest.approx(want, rel=0.03 + 3 / np.sqrt(want))
 
 
-def noise_events(thresholds: np.ndarray, time: float, rng: np.random.Generator) -> np.ndarray:
+def noise_events(
+    thresholds: np.ndarray, time: float, rng: np.random.Generator, before: float = 0.0
+) -> np.ndarray:
     """Return events per time constant of a change detector under noise of deviation 1, in small steps.
 
     Args:
         thresholds: Shape (P,).
         time: Looked at [time constants].
         rng: Draws the noise and where the memories begin.
+        before: Not looked at, in which memories find their places [time constants].
     """
     fine = 0.05
     step = expm(np.array([[0, 1], [-1, -2]]) * fine)
     fresh = np.linalg.cholesky(np.eye(2) - step @ step.T)
     state = rng.standard_normal((2, len(thresholds)))
     memory, events = state[0] - rng.uniform(-1, 1, len(thresholds)) * thresholds, np.zeros(len(thresholds))
-    for _ in range(round(time / fine)):
+    for k in range(-round(before / fine), round(time / fine)):
         state = step @ state + fresh @ rng.standard_normal(state.shape)
         crossed = np.trunc((state[0] - memory) / thresholds)
         memory += crossed * thresholds
-        events += np.abs(crossed)
+        events += np.abs(crossed) * (k >= 0)
     return events / time
 
 
@@ -260,6 +264,19 @@ def test_events_of_noise_are_those_of_small_steps(device, rng):
         got = counts(scene, sensor, time / pole, device).sum(0) / time
         error = np.hypot(got.std(), want.std()) / np.sqrt(pixels)
         assert got.mean() == pytest.approx(want.mean(), rel=0.03, abs=3 * error)
+
+
+def test_rates_are_those_of_rice_where_thresholds_are_far_above_the_noise(device, rng):
+    """Nearer ones are passed again before the voltage forgets: there small steps tell the rate."""
+    pole = 2 * np.pi / np.sqrt(np.sqrt(2) - 1)
+    small_steps = pole * noise_events(np.full(3000, 3.0), 100.0, rng, before=50.0).mean()
+    for ratio in (3.0, 5.0, 6.0):
+        seen = [simulated_rate(cutoff, ratio, pixels=4000, device=device) for cutoff in CUTOFFS]
+        rates, errors = np.array(seen).T / (0.5 * np.array(CUTOFFS))
+        # a noise twice as fast sends twice as much
+        np.testing.assert_allclose(rates, rates[0], rtol=0.01)
+        want, slack = (small_steps, 0.03) if ratio < 5 else (rice_rate(1.0, ratio), 0.1)
+        assert rates[0] == pytest.approx(want, rel=slack, abs=3 * errors[0])
 
 
 def likeness_of_halves(sensor: dase.Sensor, device: str) -> float:
