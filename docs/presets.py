@@ -16,18 +16,25 @@ is given for beside a value is said in the text above its table. How close prese
 
 ## Other biases than the default
 
-Nothing takes biases yet: change the values themselves. What is known of how they follow for the DAVIS346:
+Nothing takes biases: change the values themselves. What is known of how they follow for the DAVIS346:
 
 - `OnBn`, `OffBn`, `DiffBn`: `threshold.on` goes with abs(ln(I_on / I_diff)), `threshold.off` with
-  abs(ln(I_off / I_diff)); the capacitors and slopes before it cancel against those at the preset's own biases
-  (Nozaki, Delbruck: Temperature and parasitic photocurrent effects in dynamic vision sensors, 2017; not
-  verified at the source).
-- `RefrBp`: `refractory.period` goes with 1 / current, as a constant current charges a capacitor. This is a
-  derivation, measured with no recording at hand.
-- `PrBp`, `PrSFBp`: nothing to be said of `bandwidth.cutoff`. A pole goes with its current only where neither
-  the photocurrent nor another pole is slower, and which one limits the preset is not known.
+  abs(ln(I_off / I_diff)); capacitors and slopes before it cancel against those at the preset's own biases
+  (Nozaki, Delbruck: Temperature and parasitic photocurrent effects in dynamic vision sensors, 2017). The
+  article itself could not be read; jAER, the software of its authors, estimates thresholds by this law and
+  cites it, with 0.7 / 0.7² / 20 = 0.071 before the logarithm.
+- `RefrBp`: `refractory.period` goes with 1 / current, as a constant current charges a capacitor. So does
+  jAER, whose own numbers for capacitor and voltage are guesses and say so. No recording at hand measures
+  it.
+- `PrBp`, `PrSFBp`: nothing to be said of `bandwidth.cutoff`. A pole goes with its current only where
+  neither the photocurrent nor another pole is slower, and which one limits the preset is not known.
 - `leak` and `shot` follow the thresholds by themselves, as their `threshold` says at which one they were
   measured.
+
+These are laws of ratios. Which currents the recordings were made with that gave the preset its thresholds
+is not known, so no table from currents to values is given: with your own currents before and after a
+change, multiply `threshold.on` by ln(I_on / I_diff) after over before, and `refractory.period` by the
+current before over after.
 
 How far currents on a chip are from those asked for has not been measured here.
 
