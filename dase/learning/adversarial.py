@@ -133,6 +133,7 @@ class AdversarialSettings:
         critic_cosine: Whether it falls as the generator's does, so that critics settle with it.
         critic_steps: Steps of the critics in a step; more keep up with the generator better.
         penalty: Weight of the gradient penalty.
+        steepness: Length of the gradient that it asks for: 0, or 1 as WGAN-GP (Gulrajani et al., 2017).
         uniform: α of Eq. 13: share of the weights that all classes have alike; 1 turns re-weighting off.
         critic_image: Whether critics see the image too.
         plain_counts: Whether they see counts, as in the paper, and not logarithms of them.
@@ -143,6 +144,7 @@ class AdversarialSettings:
     critic_cosine: bool = False
     critic_steps: int = 1
     penalty: float = 1.0
+    steepness: float = 0.0
     uniform: float = 0.5
     critic_image: bool = False
     plain_counts: bool = False
@@ -239,7 +241,8 @@ class AdversarialObjective:
         for _ in range(self.settings.critic_steps):
             found = self.bank.step(
                 patches.detach(), ours, others, theirs, weights,
-                rate=rate, penalty=self.settings.penalty, generator=self.generator,
+                rate=rate, penalty=self.settings.penalty, steepness=self.settings.steepness,
+                generator=self.generator,
             )  # fmt: skip
         both = (number > 0) & (real_number > 0)
         distance, lies = (

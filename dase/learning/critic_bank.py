@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import Any
 
@@ -62,7 +62,7 @@ class CriticStep:
 
     Args:
         distance: Weighted difference of the critics' means, real minus fake, a scalar: what Eq. 10 maximises.
-        penalty: Weighted mean squared gradient between the domains, a scalar.
+        penalty: Weighted mean of (|∇D| - steepness)² between the domains, a scalar.
     """
 
     distance: torch.Tensor
@@ -227,12 +227,13 @@ class CriticBank:
         *,
         rate: float | torch.Tensor,
         penalty: float = 1.0,
+        steepness: float = 0.0,
         generator: torch.Generator | None = None,
     ) -> CriticStep:
         """Move the critics of the classes that both domains have, once.
 
-        The loss is Σ weight · (mean fake score - mean real score + penalty · mean |∇D|²), the gradient taken
-        half way (by a uniform share) between the i-th fake and the i-th real patch of the class.
+        The loss is Σ weight · (mean fake score - mean real score + penalty · mean (|∇D| - steepness)²), the
+        gradient taken half way (by a uniform share) between the i-th fake and real patch of the class.
 
         Args:
             fake: Patches of the simulator, shape (N, inputs).
@@ -242,12 +243,13 @@ class CriticBank:
             weights: Of each class, shape (C,), Eq. 13.
             rate: Learning rate.
             penalty: Weight of the penalty.
+            steepness: Length of the gradient that is not penalised.
             generator: Draws the shares.
         """
         # as many numbers whatever the classes, so that a step that is replayed draws as one that is not
         share = torch.rand(len(fake), 1, device=self.device, generator=generator)
         batch = CriticBatch(self, fake, fake_classes, real, real_classes, weights, share)
-        critique = batch.differentiate(penalty)
+        critique = batch.differentiate(penalty, steepness)
         speed = rate if isinstance(rate, torch.Tensor) else torch.full((1,), rate, device=self.device)
         paces = bridge.count_steps(batch.layout, speed, self.steps, decay=self.decay)
         for name, (left, right) in batch.outer.items():
@@ -306,11 +308,12 @@ class CriticBatch:
         self.bank, self.layout = bank, bridge.lay_out_rows(fake_classes, real_classes, weights)
         self.rows = bridge.gather_rows(fake, real, share, self.layout, bank.working)
 
-    def differentiate(self, penalty: float) -> CriticStep:
+    def differentiate(self, penalty: float, steepness: float = 0.0) -> CriticStep:
         """Set `outer` and `sums`; return the distance and the penalty.
 
         Args:
             penalty: Weight of the gradient penalty.
+            steepness: Length of the gradient that is not penalised.
         """
         bank, layout, working = self.bank, self.layout, self.bank.working
         w1, w2 = bank._working_weights("w1"), bank._working_weights("w2")
@@ -319,11 +322,12 @@ class CriticBatch:
         left_first, left_second, last = bridge.weigh_rows(
             at.second, at.by_first, at.by_second, layout, slope=LEAKY_SLOPE, penalty=penalty
         )
-        # the penalty: g = slope of the first layer times its weights, loss = penalty · held |g|²; what comes
-        # back from it passes the same matrices as the scores, and the kinks add nothing
+        # the penalty: g = slope of the first layer times its weights, loss = penalty · held (|g| - s)²;
+        # what comes back from it passes the same matrices as the scores, and the kinks add nothing
         ends = layout.end[1]
         g = multiply_groups(bridge.rows_half_way(at.by_first, layout, working), w1, ends)
-        by_g = bridge.penalise_gradient(g, layout, self.rows)
+        bent, rest = _pull_towards(steepness, g, layout)
+        by_g = bridge.penalise_gradient(g, bent, self.rows)
         product = multiply_groups(by_g, w1.transpose(1, 2), ends)
         by_first, square = bridge.penalty_through_first_layer(
             product, at.first, at.by_first, layout, at.hidden, slope=LEAKY_SLOPE, penalty=penalty
@@ -337,7 +341,28 @@ class CriticBatch:
             "w3": bridge.sum_rows(last, layout, between=True),
             "b3": bridge.sum_rows(layout.gain[:, None], layout, between=False),
         }
-        return CriticStep(distance, square.sum())
+        return CriticStep(distance, square.sum() + rest)
+
+
+def _pull_towards(
+    steepness: float, gradient: torch.Tensor, layout: bridge.RowLayout
+) -> tuple[bridge.RowLayout, torch.Tensor]:
+    """Return a layout whose mean square of g has the derivative of (|g| - steepness)², and what it lacks.
+
+    The derivative of held (|g| - s)² is that of a square, 2 held g, times 1 - s / |g|.
+
+    Args:
+        steepness: s.
+        gradient: g half way, shape (N, K).
+        layout: Where rows lie.
+    """
+    if steepness == 0:
+        return layout, gradient.new_zeros((), dtype=torch.float32)
+    there = layout.place >= 0  # of other rows the gradient is anything
+    length = torch.linalg.vector_norm(gradient, dim=1, dtype=torch.float32).clamp_min(1e-12)
+    bent = torch.where(there, layout.held * (1 - steepness / length), 0.0)
+    rest = torch.where(there, layout.held * steepness * (steepness - length), 0.0).sum()
+    return replace(layout, held=bent), rest
 
 
 def multiply_groups(

@@ -49,7 +49,9 @@ def networks(bank: CriticBank) -> list[nn.Sequential]:
     return out
 
 
-def loss_of(critics: list[nn.Sequential], batch: dict[str, torch.Tensor], penalty: float) -> torch.Tensor:
+def loss_of(
+    critics: list[nn.Sequential], batch: dict[str, torch.Tensor], penalty: float, steepness: float = 0.0
+) -> torch.Tensor:
     """Return the loss, the penalty by double backward."""
     total = torch.zeros(())
     for critic in BOTH:
@@ -60,15 +62,18 @@ def loss_of(critics: list[nn.Sequential], batch: dict[str, torch.Tensor], penalt
         between.requires_grad_()
         (slope,) = torch.autograd.grad(critics[critic](between).sum(), between, create_graph=True)
         distance = critics[critic](fake).mean() - critics[critic](real).mean()
-        total = total + batch["weights"][critic] * (distance + penalty * slope.square().sum(1).mean())
+        total = total + batch["weights"][critic] * (
+            distance + penalty * (slope.square().sum(1).sqrt() - steepness).square().mean()
+        )
     return total
 
 
-def test_gradients_are_those_of_double_backward(bank, batch):
+@pytest.mark.parametrize("steepness", [0.0, 1.0])
+def test_gradients_are_those_of_double_backward(bank, batch, steepness):
     critics = networks(bank)
-    loss_of(critics, batch, 1.5).backward()
+    loss_of(critics, batch, 1.5, steepness).backward()
     work = CriticBatch(bank, batch["fake"], FAKE, batch["real"], REAL, batch["weights"], batch["share"])
-    found = work.differentiate(1.5)
+    found = work.differentiate(1.5, steepness)
     gradients = dict(work.sums)
     for name, (left, right) in work.outer.items():
         gradients[name], begin = torch.zeros_like(getattr(bank, name)), 0
@@ -91,7 +96,7 @@ def test_gradients_are_those_of_double_backward(bank, batch):
         for c in BOTH
     )
     close(found.distance, plain)
-    close(found.penalty * 1.5 - found.distance, loss_of(critics, batch, 1.5))
+    close(found.penalty * 1.5 - found.distance, loss_of(critics, batch, 1.5, steepness))
 
 
 def close(got: torch.Tensor, want: torch.Tensor) -> None:
