@@ -198,15 +198,21 @@ class Study:
             return Training(plain_sensor(base), tuned_thresholds(base))
         return Training(dase.load_sensor(self.learned_file("fit", target)))
 
-    def train_one(self, task: str, kind: str, target: str, seed: int) -> torch.nn.Module:
-        """Return a trained network, gone on with where the last call stopped."""
-        how, size = self.training(kind, target), self.size
-        folder = self.out / "runs" / "-".join(filter(None, (task, kind, target, str(seed))))
+    def folder(self, job: Job) -> Path:
+        """Return where a training is kept."""
+        return (
+            self.out / "runs" / "-".join(filter(None, map(str, (job.task, job.kind, job.target, job.seed))))
+        )
+
+    def train_one(self, job: Job, stop_at: int | None = None) -> torch.nn.Module:
+        """Return a trained network, gone on with where the last call stopped, up to `stop_at` steps."""
+        task, kind, target, seed = job
+        how, size, folder = self.training(kind, target), self.size, self.folder(job)
 
         def batches(first: int) -> Iterator[Batch]:
             return self.timed(self.stream(task, how, self.train, seed, first))
 
-        options = {"seed": seed, "device": self.device, "save_every": 100}
+        options = {"seed": seed, "device": self.device, "save_every": 100, "stop_at": stop_at}
         if task == "flow":
             settings = dase.tasks.FlowTraining(steps=size.flow_steps, average=0.998, **options)
             return dase.tasks.train_flow(
@@ -251,7 +257,7 @@ class Study:
             self.learn(job.task, job.target)
             return []
         begin = time.monotonic()
-        network = self.train_one(*job)
+        network = self.train_one(job)
         seconds = round(time.monotonic() - begin, 1)
         where = torch.cuda.get_device_name() if self.device == "cuda" else self.device
         steps, channels = self.size.steps(job.task), self.size.channels(job.task)
