@@ -380,9 +380,6 @@ def _couple_frames(sensor: Sensor, frame_rate: float, exposure: float, begin: fl
     """Return the sensor with its frame coupling, if it has one, in step with the frames that are stored."""
     if not exposure:
         return sensor
-    # pixels know it in float32; rounded down, the first sample would already be exposed, without a burst
-    known = np.float32(begin)
-    begin = float(known if float(known) >= begin else np.nextafter(known, np.float32(np.inf)))
     effects = (
         effect.at_frames(1 / frame_rate, exposure, begin) if isinstance(effect, Exposure) else effect
         for effect in sensor.effects

@@ -30,8 +30,13 @@ def coupled(
     since = t64 - wp.float64(begin)
     frames = since / wp.float64(period)
     into = float((frames - wp.floor(frames)) * wp.float64(period))
-    # the edges lie between two samples: a sample at the very begin of an exposure is before it
-    if into > 0.0 and into <= exposure:
+    # what float32 may have rounded off the period, in every frame so far, and off the other times; far less
+    # than the time between samples, as after hours it would itself put the edges out of step
+    slack = wp.min(7.0e-8 * (float(wp.abs(since)) + wp.abs(begin) + period + exposure), 2.0e-5)
+    # the edges lie between two samples: a sample at the very begin of an exposure is of the frame before
+    if into <= slack:
+        into += period
+    if into <= exposure + slack:
         voltage += amplitude * (1.0 + spread * pixel_normal)
     return voltage
 

@@ -72,6 +72,21 @@ def test_frames_hours_later_are_in_step(device):
     assert np.all(np.minimum(late, 0.0511 - late) < 1.1e-3)
 
 
+@pytest.mark.parametrize(("period", "exposure"), [(40, 20), (20, 7), (33, 12)])  # rounded down, up, down
+@pytest.mark.parametrize("start", [0, 60_000])
+def test_edges_on_samples_lie_behind_them(device, period, exposure, start):
+    """Integers of milliseconds say which samples are exposed; float32 knows none of these times."""
+    at = start // period * period + np.arange(301)
+    exposed = (at - 1) % period < exposure  # a sample at the begin is not yet, one at the end still is
+    scene = dase.VideoScene(np.full((301, 1, 4), 0.3, np.float32), at * 1e-3)
+    frames = Exposure(amplitude=0.3, spread=0.0, period=period * 1e-3, exposure=exposure * 1e-3)
+    events = dase.simulate(scene, sensor(frames, off=0.199), device=device)
+    for polarity, step in ((True, 1), (False, -1)):
+        before = at[:-1][np.diff(exposed.astype(int)) == step]
+        t = events.t[(events.x == 0) & (events.p == polarity)] * 1e3
+        np.testing.assert_array_equal(np.floor(t + 1e-3), before)
+
+
 def test_a_search_tries_the_frames_that_are_seen_and_none_where_none_are():
     seen = Observations(100.0, 0.0, 0.0, "down", 1e5, 1e6, 0.1)
     assert Exposure.candidates(seen) == []
