@@ -7,6 +7,7 @@ import pytest
 from helpers import small_scenes
 
 import dase
+from dase.datasets.generate import record_scene
 from dase.effects.threshold import Threshold
 from dase.scenes.stereo import stereo_pair
 
@@ -59,6 +60,26 @@ def test_labels_are_those_of_the_foremost_layer(device, rng):
         want = np.einsum("kij,jhw->kihw", maps[:, layer], np.stack([columns, rows, np.ones((20, 24))]))
         here = np.broadcast_to((depth == far)[:, None], flow.shape)
         np.testing.assert_allclose(flow[here], want[here], rtol=1e-3, atol=1e-2)
+
+
+def test_files_of_a_pair_show_the_disparity_of_the_labels(tmp_path, rng):
+    """Blocks of the left file's frames are searched in the right one's."""
+    pair = stereo_pair(plane(rng), [4.0], baseline=0.1, focal=240.0)
+    files = []
+    for seed, view in enumerate(pair):
+        path = tmp_path / f"{seed}.h5"
+        record_scene(view, dase.Sensor(), path, frame_rate=50.0, exposure=0.004, seed=seed)
+        files.append(dase.io.read(path))
+    left, right = files
+    np.testing.assert_array_equal(left.frame_times, right.frame_times)
+    disparity, _ = pair.labels(left.frame_times)
+    assert len(left.frames) == 5
+    frames = zip(left.frames.astype(float), right.frames.astype(float), disparity, strict=True)
+    for ours, theirs, truth in frames:
+        for row, column in ((4, 16), (12, 24), (20, 36)):
+            block = np.s_[row : row + 8, column : column + 8]
+            errors = [np.mean((ours[block] - np.roll(theirs, d, axis=1)[block]) ** 2) for d in range(16)]
+            assert np.argmin(errors) == np.rint(truth[row + 4, column + 4])
 
 
 def test_without_a_baseline_both_see_the_same(rng):
