@@ -139,14 +139,15 @@ def without_the_scene(seen: SeenEffects, measurement: Measurement, sensor: Senso
 
     Args:
         seen: In the events of the measurement.
-        measurement: Its scene is simulated where it is known at each step of time.
+        measurement: Its scene is simulated.
         sensor: The model before the search.
         seed: Of its random numbers.
     """
-    if not seen.entries or isinstance(measurement.scene, CameraScene):
+    asked = _asked_of_scene(seen.entries, measurement.scene)
+    if not asked:
         return seen
     made = _signatures_of(measurement.scene, sensor, seed)
-    kept = tuple(entry for entry in seen.entries if not shows_in(made, entry))
+    kept = tuple(entry for entry in seen.entries if entry not in asked or not shows_in(made, entry))
     coupled = any(entry.name == "frame coupling" for entry in kept)
     return replace(seen, entries=kept, bursts=seen.bursts if coupled else None)
 
@@ -158,12 +159,13 @@ def without_the_explained(
 
     Args:
         seen: In the events of the measurement.
-        measurement: Its scene is simulated where it is known at each step of time.
+        measurement: Its scene is simulated.
         sensor: The model after the search.
         seed: Of its random numbers.
     """
     open_ = [entry for entry in seen.entries if not seen.named_by(entry)]
-    if not open_ or isinstance(measurement.scene, CameraScene):
+    open_ = _asked_of_scene(open_, measurement.scene)
+    if not open_:
         return seen
     made = _signatures_of(measurement.scene, sensor, seed)
     kept = tuple(entry for entry in seen.entries if entry not in open_ or not shows_in(made, entry))
@@ -225,6 +227,17 @@ def with_effect_of_bursts(found: Diagnosis, strength: BurstStrength) -> Diagnosi
         parameters={**found.parameters, **strength.parameters},
         findings=findings,
     )
+
+
+def _asked_of_scene(entries: Collection[Signature], scene: Scene) -> list[Signature]:
+    """Return the signatures of which a simulation of the scene tells whether they are the scene's.
+
+    Between a camera's frames light is a guess in time: it tells nothing of lamps, pairs or stamps. But where
+    the same edges come back is in the frames, and so is a pattern of pixels that they make.
+    """
+    if not isinstance(scene, CameraScene):
+        return list(entries)
+    return [entry for entry in entries if entry.name == "fixed pattern"]
 
 
 def _signatures_of(scene: Scene, sensor: Sensor, seed: int) -> tuple[Signature, ...]:

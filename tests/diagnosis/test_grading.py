@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 from types import SimpleNamespace
 
+import cv2
 import numpy as np
 import pytest
 
@@ -27,6 +28,7 @@ from dase.fitting.measurement import Measurement
 from dase.fitting.model import model_of
 from dase.probes.distance import Judgement
 from dase.results import Estimate, Finding, Grade
+from dase.scenes.between_frames import CameraScene
 from dase.scenes.video import VideoScene
 from dase.signatures.result import Answer, Signature
 from dase.simulation.sensor import Sensor
@@ -196,6 +198,26 @@ def test_light_that_flickers_in_the_clip_is_not_of_the_camera(scene):
         assert seen.lamp == pytest.approx(100.0, abs=0.3)
         kept = without_the_scene(seen, measurement, Sensor(), 5)
         assert ("flicker" in kept.effects) == left
+
+
+@pytest.mark.parametrize("swings", [True, False])
+def test_a_pattern_that_returning_edges_make_is_not_of_the_camera(swings):
+    """Edges that come back to the same pixels make a pattern; they come back in a camera's frames, too."""
+    rng = np.random.default_rng(1)
+    texture = cv2.GaussianBlur(rng.random((96, 808)), (0, 0), 1.2)
+    texture = np.clip((texture - texture.min()) / np.ptp(texture), 0.03, 1)
+    times = np.arange(0, 1.001, 0.001)
+    places = 15 * np.sin(2 * np.pi * 1.3 * times) if swings else 600 * (times - 0.5)
+    frames = np.stack(
+        [cv2.warpAffine(texture, np.array([[1.0, 0, x - 330], [0, 1.0, 0]]), (128, 96)) for x in places]
+    ).astype(np.float32)
+    sensor = Sensor() if swings else Sensor().with_effect(EFFECTS["mismatch"](spread=0.25))
+    events = dase.simulate(VideoScene(frames, times), sensor, seed=2)
+    known = CameraScene(np.rint(255 * frames[::10]).astype(np.uint8), times[::10])
+    seen = find_seen_effects(Measurement(events, known), EFFECTS)
+    assert "fixed pattern" in [one.name for one in seen.entries]
+    kept = without_the_scene(seen, Measurement(events, known), Sensor(), 5)
+    assert ("fixed pattern" in [one.name for one in kept.entries]) == (not swings)
 
 
 def test_a_hint_of_a_far_smaller_size_explains_nothing():
