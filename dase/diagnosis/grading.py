@@ -10,7 +10,8 @@ part, by which nothing was chosen. Each effect has to earn its grade there:
   before the search next to nothing is left.
 - *either ... or*: the same, but another effect does nearly as well in its place, or so little was there to be
   explained that something which is not in the library could look like it, or it had to go to an end of what
-  it can be, beyond all that is plausible: shot noise that is all ON is another effect.
+  it can be, beyond all that is plausible: shot noise that is all ON is another effect. So is it with a dead
+  time far shorter than the steps in which light is known: a memory that is set a little later looks like it.
 
 An effect that earns neither is a stand-in: it is named as what comes nearest, and not found.
 """
@@ -106,6 +107,7 @@ def grade_effects(
             start.judgement, bare, last, deviations[name], has_rivals=has_rivals, settings=settings
         )
 
+    step = float(np.median(np.diff(state.evidence.when)))
     shown = [name for name in found if graded(name, False)[0] is not Grade.STAND_IN]
     rivals = _equally_good_rivals(state, model, shown)
     out: dict[str, Finding] = {}
@@ -113,7 +115,11 @@ def grade_effects(
         others = rivals.get(name, ())
         stopped = any(text.startswith((f"{name}.", "threshold.")) for text in at_bounds)
         grade, unknown = graded(name, bool(others))
-        if grade is Grade.SUPPORTED and any(is_strained(model, *one) for one in mine[name].items()):
+        doubtful = any(
+            is_strained(model, *one) or is_between_samples(model, *one, step=step, settings=settings)
+            for one in mine[name].items()
+        )
+        if grade is Grade.SUPPORTED and doubtful:
             grade, unknown = Grade.EITHER, True
         out[name] = Finding(
             effect=name,
@@ -152,6 +158,22 @@ def is_strained(model: FittedModel, name: str, value: Estimate) -> bool:
         return False
     (least, most), (low, high) = fact.bounds, fact.plausible
     return (value.high >= most and value.low > high) or (value.low <= least and value.high < low)
+
+
+def is_between_samples(
+    model: FittedModel, name: str, value: Estimate, *, step: float, settings: GradeSettings
+) -> bool:
+    """Return whether a time is so short that it is told by what light does between two samples.
+
+    Args:
+        model: Has the parameter.
+        name: Of the parameter.
+        value: Its estimate [s].
+        step: From sample to sample of the light [s].
+        settings: Limits.
+    """
+    fact = next((axis.fact for axis in model.space.axes if axis.name == name), None)
+    return fact is not None and fact.between_samples and value.high < settings.shortest_time * step
 
 
 def grade_of(

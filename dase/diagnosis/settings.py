@@ -164,6 +164,11 @@ class GradeSettings:
     """Error above which chance alone is no excuse for what is left, however far repeats are apart: hot or
     dead pixels as stand-ins make them so."""
 
+    shortest_time: float = 0.2
+    """Share of a step of the light below which a dead time or a latency may be the way in which memories are
+    set within the step: a world that sets them at each tenth of a step looks like a dead time of a
+    twentieth."""
+
     weak: float = 0.5
     """What is left without an effect below which something that is not in the library
     could look like it."""

@@ -54,6 +54,8 @@ class Parameter:
         nearby: Relative range about its value to which a fit keeps, for what is read off the measurement
             better than a fit can find it; such a parameter stays as it is while its effect is tried. None
             for the whole range.
+        between_samples: Whether a time that is short beside the steps in which light is known is told by what
+            light does between them, where it is a guess: so is what a memory does there.
     """
 
     name: str
@@ -67,6 +69,7 @@ class Parameter:
     periodic: bool = False
     fitted: bool = True
     nearby: float | None = None
+    between_samples: bool = False
 
     @property
     def search_starts(self) -> Starts:
@@ -86,11 +89,12 @@ def parameter(
     periodic: bool = False,
     fitted: bool = True,
     nearby: float | None = None,
+    between_samples: bool = False,
 ) -> Any:
     """Declare a parameter of an effect; see `Parameter`."""
     facts = dict(
         unit=unit, default=default, off=off, bounds=bounds, plausible=plausible, about=about, starts=starts,
-        periodic=periodic, fitted=fitted, nearby=nearby,
+        periodic=periodic, fitted=fitted, nearby=nearby, between_samples=between_samples,
     )  # fmt: skip
     return field(default=default, metadata={"parameter": facts})
 

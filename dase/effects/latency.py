@@ -46,6 +46,7 @@ class Latency(Effect):
         bounds=(0.0, 0.1),
         plausible=(3e-6, 1e-2),
         about="from a crossing to its event at intensity 1",
+        between_samples=True,
     )
     light: float = parameter(
         0.5,

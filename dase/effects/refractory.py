@@ -52,6 +52,7 @@ class Refractory(Effect):
         bounds=(0.0, 1.0),
         plausible=(1e-5, 2e-2),
         about="dead time after an ON event",
+        between_samples=True,
     )
     after_off: float = parameter(
         1.0,

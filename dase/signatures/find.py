@@ -244,6 +244,6 @@ def find_signatures(
         find_grouping(second.groups, each),
         stamps,
         find_double_events(second.intervals, hot_pixels, each, tick),
-        find_full_bus(first.clock, each),
+        find_full_bus(first.clock, first.first_events(), each, tick),
     )
     return Signatures(width, height, first.count, duration, level, entries)

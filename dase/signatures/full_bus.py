@@ -2,6 +2,10 @@
 
 Below the ceiling, counts of events scatter as the scene and chance have it. At the ceiling one event follows
 the other as fast as the bus sends, and hardly anything scatters.
+
+Where time stamps are fine enough, a bus shows however full it is: it sends one event at a time, so events of
+different pixels never come closer than the time it takes for one. Pixels know nothing of each other: without
+a bus, how far apart they send is as in a Poisson process over any short time.
 """
 
 from __future__ import annotations
@@ -12,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import stats
 
+from dase.events import Events
 from dase.formatting import format_count, format_metric, format_percent
 from dase.signatures.clock import ClockCounts
 from dase.signatures.result import Answer, Signature, judge_signature, without_answer
@@ -33,6 +38,11 @@ class BusSettings:
     steps: int = 8  # of the clock at most that are taken together where fewer events come
     enough: float = 400.0  # events per step for a ceiling that is narrow
     scatter: float = 0.2  # of that of chance or below the ceiling, at most: a full bus leaves hardly any
+    closer: float = 0.001  # share of the intervals that may be shorter than the time for one event
+    expected: float = 0.05  # share of them that must be shorter by chance, for their absence to be seen
+    missing: float = 0.1  # of those expected that may be there
+    ticks: float = 2.5  # of the time stamps that the time for one event must last
+    local: int = 64  # intervals over which the rate is taken as even
 
 
 def _scatter_of(counts: NDArray[np.float64], chosen: NDArray[np.bool_]) -> tuple[float, int]:
@@ -42,17 +52,71 @@ def _scatter_of(counts: NDArray[np.float64], chosen: NDArray[np.bool_]) -> tuple
     return float(((a - b) ** 2 / np.maximum(a + b, 1)).mean()) if len(a) else 1.0, len(a)
 
 
-def find_full_bus(clock: ClockCounts, level: float, settings: BusSettings | None = None) -> Signature:
-    """Look for a ceiling of the rate.
+def find_full_bus(
+    clock: ClockCounts, first: Events, level: float, tick: float = 0.0, settings: BusSettings | None = None
+) -> Signature:
+    """Look for a ceiling of the rate, or else for a time within which no second event comes.
 
-    The null has counts at the ceiling scatter, relative to chance, as those below: an F distribution.
+    The null of the ceiling has counts there scatter, relative to chance, as those below: an F distribution.
 
     Args:
         clock: The events by time.
+        first: The first events, of which intervals are looked at.
         level: p below which it is there.
-        settings: What is a ceiling.
+        tick: Of the time stamps [s], if they are known to have one.
+        settings: What is a ceiling, and what a time for one event.
     """
     s = settings or BusSettings()
+    ceiling = _find_ceiling(clock, level, s)
+    if ceiling.found:
+        return ceiling
+    spacing = _find_spacing(first, level, tick, s)
+    return ceiling if spacing is None else spacing
+
+
+def _find_spacing(events: Events, level: float, tick: float, s: BusSettings) -> Signature | None:
+    """Return the signature of a bus that sends one event at a time; None where none is seen.
+
+    The null is a Poisson process whose rate is even over `local` intervals. One that is not even there has
+    more short intervals, not fewer. Events of one pixel are left out: its dead time keeps them apart.
+    """
+    intervals = np.diff(events.t)
+    apart = (np.diff(events.x.astype(np.int64)) != 0) | (np.diff(events.y.astype(np.int64)) != 0)
+    many = len(intervals) // s.local * s.local
+    if many < 4 * s.fewest * s.local:
+        return None
+    intervals, apart = intervals[:many], apart[:many]
+    slot = float(np.quantile(intervals[apart], s.closer)) if apart.any() else 0.0
+    if not slot > s.ticks * max(tick, _file_tick(events)):
+        return None
+    rate = s.local / np.maximum(intervals.reshape(-1, s.local).sum(1), 1e-12)
+    pairs = apart.reshape(-1, s.local).sum(1)
+    expected = float((pairs * -np.expm1(-rate * slot)).sum())
+    closer = int((intervals[apart] < 0.99 * slot).sum())
+    share = expected / max(int(pairs.sum()), 1)
+    if share < s.expected or closer > s.missing * expected:
+        return None
+    p = float(stats.poisson.cdf(closer, expected))
+    low, high = stats.beta.interval(0.9, expected + 0.5, max(pairs.sum() - expected, 0) + 0.5)
+    entry = Signature(
+        name=NAME, answer=Answer.NOT_SEEN, p=p, size=share, low=float(low), high=float(high),
+        unit="share of the intervals that would be shorter by chance", least=s.expected,
+        sentence=f"one event at a time: no two pixels send within {format_metric(slot, 's')}, as of a bus of "
+        f"{format_metric(1 / slot, 'events/s')}",
+        details={"rate": 1 / slot, "closer": closer, "expected": expected},
+    )  # fmt: skip
+    entry = judge_signature(entry, level, "")
+    return entry if entry.found else None
+
+
+def _file_tick(events: Events) -> float:
+    """Return the tick of whole microseconds [s], as most files have it; 0 where stamps are finer."""
+    us = 1e6 * (events.t - events.t[0])
+    return 1e-6 if np.all(np.abs(us - np.rint(us)) < 0.01) else 0.0
+
+
+def _find_ceiling(clock: ClockCounts, level: float, s: BusSettings) -> Signature:
+    """Return the signature of a rate that stays at a ceiling."""
     step = clock.settings.step
     counts = clock.counts.sum((1, 2), dtype=np.float64)[:-1]  # the last step is not whole
     if len(counts) < 4 * s.fewest:

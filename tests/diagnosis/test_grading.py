@@ -13,7 +13,7 @@ import dase
 from dase.diagnosis import grading
 from dase.diagnosis.diagnose import diagnose
 from dase.diagnosis.explain_effect import moving_bars
-from dase.diagnosis.grading import grade_of, is_strained
+from dase.diagnosis.grading import grade_of, is_between_samples, is_strained
 from dase.diagnosis.seen_effects import (
     SeenEffects,
     find_seen_effects,
@@ -95,6 +95,22 @@ def test_grades(start, without, last, deviation, rivals, grade, unknown):
 def test_an_effect_at_the_end_of_what_it_can_be_is_strained(low, value, high, strained):
     model = model_of(Sensor().with_effect(EFFECTS["shot"]()))
     assert is_strained(model, "shot.balance", Estimate(value, low, high)) is strained
+
+
+@pytest.mark.parametrize(
+    ("effect", "value", "short"),
+    [
+        ("refractory.period", 5e-5, True),  # the half of a tenth of a step
+        ("refractory.period", 5e-4, False),
+        ("latency.delay", 1e-4, True),
+        ("refractory.after_off", 0.05, False),  # no time
+    ],
+)
+def test_a_time_far_shorter_than_a_step_of_light_may_be_a_memory_set_later(effect, value, short):
+    model = model_of(Sensor().with_effect(EFFECTS[effect.split(".")[0]]()), free=(effect,))
+    estimate = Estimate(value, 0.9 * value, 1.1 * value)
+    told = is_between_samples(model, effect, estimate, step=1e-3, settings=GradeSettings())
+    assert told is short
 
 
 def test_what_reports_has_pixels_of_its_own_at_the_later_time(scene):

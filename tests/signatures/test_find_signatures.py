@@ -185,6 +185,35 @@ def test_a_full_bus_shows():
     assert not dase.find_signatures(events)["full bus"].found
 
 
+@pytest.mark.parametrize(("share", "tick"), [(3.0, 0.0), (0.8, 0.0), (0.8, 1e-6), (3.0, 1e-6)])
+def test_a_bus_shows_that_is_never_or_always_full(share, tick):
+    """Independent pixels in even light: the rate tells nothing, the shortest intervals do."""
+    rng = np.random.default_rng(5)
+    rate, count = 2e5, 60_000
+
+    def stamped(t):
+        t = np.rint(t / tick) * tick if tick else t
+        some = [rng.integers(0, size, len(t)).astype(np.uint16) for size in (64, 48)]
+        return dase.Events(t, *some, rng.random(len(t)) < 0.5, 64, 48)
+
+    wanted = stamped(np.sort(rng.uniform(0, count / (share * rate), count)))
+    sent, _ = Readout(rate=rate).reader(64, 48, 0).push(wanted, np.inf)
+    entry = dase.find_signatures(stamped(sent.t))["full bus"]
+    assert entry.found
+    assert entry.details["rate"] == pytest.approx(rate, rel=0.01 if not tick else 0.3)
+    assert not dase.find_signatures(wanted)["full bus"].found
+
+
+def test_stamps_made_to_increase_are_no_bus():
+    """Some converters move equal stamps apart by one tick."""
+    rng = np.random.default_rng(5)
+    t = np.sort(rng.uniform(0, 0.2, 60_000))
+    ticks = np.maximum.accumulate(np.floor(t * 1e6) - np.arange(len(t))) + np.arange(len(t))
+    x, y = (rng.integers(0, size, len(t)).astype(np.uint16) for size in (64, 48))
+    events = dase.Events(ticks * 1e-6, x, y, rng.random(len(t)) < 0.5, 64, 48)
+    assert not dase.find_signatures(events)["full bus"].found
+
+
 def test_order_within_a_stamp_is_no_readout(plain):
     coarse = replace(plain, t=np.floor(plain.t / 5e-4) * 5e-4)
     order = np.lexsort((coarse.x, coarse.y, coarse.t))
