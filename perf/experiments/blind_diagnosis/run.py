@@ -453,6 +453,9 @@ def main() -> None:
     parser.add_argument("--repeats", type=int, default=1, help="of every kind and effect")
     parser.add_argument("--device", default="cpu", help="or some, which share the runs: cuda:0,cuda:1")
     parser.add_argument("--jobs", type=int, default=1)
+    parser.add_argument(
+        "--part", default="1/1", help="K/N: each Nth case from the Kth on, for machines that share"
+    )
     parser.add_argument("--minutes", type=float, default=float("inf"), help="no run begins after these")
     parser.add_argument(
         "--longest-first", action="store_true", help="begin with what takes long, where all can be done"
@@ -501,7 +504,8 @@ def _run(options: argparse.Namespace) -> None:
     if options.log.exists():
         lines = [json.loads(text) for text in options.log.read_text().splitlines() if text.strip()]
         done = {line["name"] for line in lines if "failed" not in line and line["key"] == options.key}
-    todo = [case for case in cases(options) if case.name not in done]
+    first, step = (int(number) for number in options.part.split("/"))
+    todo = [case for case in list(cases(options))[first - 1 :: step] if case.name not in done]
     threads = max(1, len(os.sched_getaffinity(0)) // options.jobs)
     if options.jobs > 1:  # processes that are started: libraries must not take all cores in each
         os.environ.update(dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"), str(threads)))
