@@ -116,16 +116,22 @@ def main() -> None:
     ask.add_argument("--jobs", type=int, default=1, help="trainings side by side on each device")
     ask.add_argument("--minutes", type=float, default=1e6)
     ask.add_argument("--seeds", type=int, default=5)
+    ask.add_argument("--steps", type=int, default=Size.reconstruction_steps, help="batches of a training")
     ask.add_argument("--small", action="store_true", help="Do all parts work?")
     args = ask.parse_args()
+    deadline = time.monotonic() + 60 * args.minutes
     args.out.mkdir(parents=True, exist_ok=True)
     train, test = unpack_photos(args.photos, args.out)
+    size = SMALL if args.small else Size(reconstruction_steps=args.steps)
     study = RealStudy(
-        train, test, args.out, "cpu", SMALL if args.small else Size(), time.monotonic() + 60 * args.minutes,
+        train, test, args.out, "cpu", size, deadline,
         recording=str(args.recording), camera=args.camera, offset=args.offset,
     )  # fmt: skip
     log = args.out / "results.jsonl"
     rows = read_rows(str(log)) if log.exists() else []
+    # trainings of other lengths are neither done nor to be averaged with these
+    if {row["steps"] for row in rows} - {size.reconstruction_steps}:
+        ask.error(f"{log} has trainings of another number of steps than {size.reconstruction_steps}")
     done = {(row["kind"], row["seed"]) for row in rows}
     # the quickest first: what is tuned is waited for
     plan = [] if study.learned() else [Job("tune", "", args.camera, 0)]
