@@ -39,19 +39,20 @@ moved` makes the pictures itself, `counted` keeps counts only. The settings are 
 v2e's `clean`, its lin-log response and its spread of thresholds, for the number of events. OpenEB has no
 floor below its logarithm, so black pixels send more events.
 
-`video to HDF5` and `video to DAT` are whole jobs, from an AVI (MJPG) to a file of events. Intel Xeon
-(family 6, model 167), processor time of one thread, 346x260, 200 pictures, at 0c92321, others at work: dase
-beside v2e, both into HDF5, 80 and 12 Mpx-samples/s clean, 70 and 4.7 noisy (7 and 15 times; in a second,
-busier run 8 and 10 times). OpenEB's sample empties its memory, room for 10^8 events, at every 50,000
-events: 1.5 and 3.0 Mpx-samples/s, 50 and 23 times slower than dase. With that left out and all events
-written at the end, OpenEB is **faster than dase** for the ideal pixel, 95 for 72, and slower for the noisy
-one, 31 for 46. Reading the video alone runs at 360: dase decodes a video twice, as it counts the frames and
-their times first, and makes real numbers of colours, where the kernels alone run at 500 and more from
-pictures.
+`video to HDF5` and `video to DAT` are whole jobs, from an AVI (MJPG) to a file of events. On the AMD EPYC,
+clean and noisy, dase is 8.0 and 10.9 times as fast as v2e, both into HDF5, and 97 and 21 times as fast as
+OpenEB's sample, both into DAT, because that empties its memory, room for 10^8 events, at every 50,000 events.
+With that left out and all events written at the end, dase is 1.1 and 1.9 times as fast as OpenEB. On an Intel
+Xeon (family 6, model 167), at 0c92321, others at work: 7 and 15 times v2e (8 and 10 in a second, busier run),
+57 and 25 times OpenEB's sample; with its events at the end OpenEB takes 0.6 times as long as dase for the
+ideal pixel and 1.3 times for the noisy one.
+
+In memory on the AMD EPYC, one run: the ideal pixel from pictures is 3.6 times as fast as OpenEB and 2.9 times
+as the NumPy pipeline (the photograph moved and counted: 1.2 times as the tuned one), the noisy pixel 2.98
+times as OpenEB, where 3 is the goal, and 23 times as v2e.
 
 To run it: check out prophesee-ai/openeb (5.1 here; Numba is all it needs) and SensorsINI/v2e (cac6384 here),
-give their folders as `--openeb` and `--v2e`, and `--processor-time` on a machine that others use, too. On the
-AMD EPYC, at 0a91c46, dase and NumPy still got real numbers for bytes, made outside of what is timed."""
+give their folders as `--openeb` and `--v2e`, and `--processor-time` on a machine that others use, too."""
 
 
 def powers(most: int) -> list[int]:
