@@ -44,9 +44,13 @@ def to_grey(pixels: NDArray[Any]) -> tuple[NDArray[np.float32], NDArray[np.float
     weights = (0.07, 0.72, 0.21) if len(planes) == 3 else (1.0,)  # of BGR; S2R takes luma for intensity
     grey = np.empty(planes[0].shape, np.float32)
     for band in _row_bands(grey.shape):
-        np.multiply(planes[0][band], np.float32(weights[0]) / full, out=grey[band])
+        grey[band] = planes[0][band]
+        grey[band] *= np.float32(weights[0]) / full
         for weight, plane in zip(weights[1:], planes[1:], strict=True):
-            grey[band] += np.float32(weight) / full * plane[band]
+            # real numbers first: mixed types are multiplied piece by piece
+            more = plane[band].astype(np.float32)
+            more *= np.float32(weight) / full
+            grey[band] += more
     return grey, alpha
 
 

@@ -16,9 +16,14 @@ from dase.files.text_files import stands_for
 from dase.io.ffmpeg import bounded_decoding, decoding_memory, open_video, pixel_format, refuse_titles, size_of
 from dase.io.image_files import cut_and_resize, decode_file, list_pictures, to_grey, to_levels
 
+KEPT = 64 << 20
+"""Bytes of frames that are kept as they were decoded while they were counted."""
+
 
 class FrameReader:
     """Frames of a file or folder, decoded when they are asked for, so that long videos need no memory.
+
+    A video is gone through to count its frames; a short one, of at most `KEPT` bytes, is not decoded again.
 
     Args:
         path: Video file, or folder of pictures in the order of their names.
@@ -45,6 +50,7 @@ class FrameReader:
         self.decoding = 0
         """Bytes of memory that decoding takes at most, beside the frames after the first `capture.TAKEN`."""
         self._first: tuple[int, ...] = ()
+        self._short: list[NDArray[np.uint8]] = []  # all frames of a short video
         self._count = len(self._files) if self._files is not None else self._count_frames()
         if self._count < 2:
             raise InputError(f"video {path} must have at least 2 frames, got {self._count}")
@@ -90,7 +96,7 @@ class FrameReader:
             for file in self._files:
                 yield to_levels(self._checked(decode_file(file), file))
             return
-        capture = self._open()
+        capture = None if self._short else self._open()
         for index in range(self._count):
             yield to_levels(self._checked(self._next_of(capture, index), self._path))
 
@@ -115,12 +121,26 @@ class FrameReader:
             return 0
         self.decoding = decoding_memory(capture)
         self._first = frame.shape[:2]
-        del frame
-        times = [float(capture.get(cv2.CAP_PROP_POS_MSEC))]  # the number in the header is often wrong
-        while self._grab(capture) if self._plain is None else self._read(capture) is not None:
-            times.append(float(capture.get(cv2.CAP_PROP_POS_MSEC)))
+        times, there, keeps = [], True, True
+        while there:
+            times.append(float(capture.get(cv2.CAP_PROP_POS_MSEC)))  # the number in the header is often wrong
+            keeps = keeps and self._keep(frame)
+            if self._plain is not None:
+                frame = self._read(capture)
+                there = frame is not None
+            else:
+                there = self._grab(capture)
+                frame = self._retrieve(capture) if there and keeps else None
         self.times = _uneven_times(np.array(times) * 1e-3, self.rate)
         return len(times)
+
+    def _keep(self, frame: NDArray[np.uint8] | None) -> bool:
+        """Keep a frame behind those before it; without it, or where they are too many, keep none."""
+        if frame is None or (len(self._short) + 1) * frame.nbytes > KEPT:
+            self._short.clear()
+            return False
+        self._short.append(frame)
+        return True
 
     def _grab(self, capture: Any) -> bool:
         """Decode the next frame; what is far larger than the head of the file says cannot be decoded."""
@@ -129,22 +149,28 @@ class FrameReader:
 
     def _read(self, capture: Any) -> NDArray[np.uint8] | None:
         while self._grab(capture):
-            good, frame = capture.retrieve()
-            if good and self._plain is not None:
+            frame = self._retrieve(capture)
+            if frame is not None and self._plain is not None:
                 frame = _unpack_avi_frame(capture, frame.ravel(), self._plain)
                 if frame is None:
                     continue  # a packet of a dropped frame is empty
-            return frame if good else None
+            return frame
         return None
 
+    @staticmethod
+    def _retrieve(capture: Any) -> NDArray[np.uint8] | None:
+        """Return the frame that was decoded last as blue, green and red, None where it cannot be had."""
+        good, frame = capture.retrieve()
+        return frame if good else None
+
     def _next_of(self, capture: Any, index: int) -> NDArray[np.uint8]:
-        frame = self._read(capture)
+        frame = self._short[index] if self._short else self._read(capture)
         if frame is None:
             raise InputError(f"video {self._path}: frame {index} cannot be decoded")
         return frame
 
     def _decode(self, index: int) -> NDArray[np.float32]:
-        if self._capture is None:
+        if self._capture is None and not self._short:
             self._capture = self._open()
         frame = self._next_of(self._capture, index)
         self._next = index + 1

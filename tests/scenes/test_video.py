@@ -16,6 +16,7 @@ from helpers.sample_files import PEAK, measured
 import dase
 import dase.io
 from dase.io import ffmpeg
+from dase.io.image_files import to_grey
 from dase.io.video_file import FrameReader
 from dase.kernels import launch
 from dase.scenes.video import as_scene, open_video
@@ -94,6 +95,25 @@ def test_a_video_file_is_read_frame_by_frame(tmp_path, suffix, code):
     for index in ([0, 1, 2], [2, 3, 4, 5], [1], [5, 6, 7], [3], [7, 8], [6]):
         np.testing.assert_array_equal(reader[np.array(index)], whole[index])
     assert decoded == list(range(9))
+
+
+@pytest.mark.parametrize("kept", [0, 5 * 24 * 32 * 3, 9 * 24 * 32 * 3])
+def test_a_short_video_is_decoded_once_and_a_long_one_is_the_same(tmp_path, monkeypatch, rng, kept):
+    path = tmp_path / "film.avi"
+    writer = cv2.VideoWriter(str(path), cv2.VideoWriter_fourcc(*"MJPG"), 50.0, (32, 24))
+    for picture in rng.integers(0, 256, (9, 24, 32, 3), dtype=np.uint8):
+        writer.write(picture)
+    writer.release()
+    capture = cv2.VideoCapture(str(path))
+    want = np.stack([to_grey(capture.read()[1])[0] for _ in range(9)])
+    grabs = []
+    grab = FrameReader._grab
+    monkeypatch.setattr(FrameReader, "_grab", lambda self, capture: grabs.append(0) or grab(self, capture))
+    monkeypatch.setattr("dase.io.video_file.KEPT", kept)
+    reader = FrameReader(path)
+    for index in ([0, 1, 2], [2, 5, 8], [0, 8]):
+        np.testing.assert_array_equal(reader[np.array(index)], want[index])
+    assert (len(grabs) > 10) == (kept < 9 * 24 * 32 * 3)  # the end of the video is found by one more
 
 
 def test_what_is_no_video_is_refused(tmp_path):
