@@ -19,12 +19,14 @@ from collections import deque
 from collections.abc import Callable, Iterable
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import AbstractContextManager, suppress
+from functools import lru_cache
 from io import FileIO
 from pathlib import Path
 from typing import Any
 
 import h5py
 import numpy as np
+from h5py import h5a, h5d, h5p, h5s, h5t
 from isal import isal_zlib
 from numpy.typing import NDArray
 
@@ -185,6 +187,67 @@ class _PackingLine:
         write([chunk.result() for chunk in packed])
 
 
+class _NumberedMembers:
+    """Datasets `images/image%09d` and `flow/flow%09d`, made by HDF5's own calls with types made once.
+
+    h5py's `create_dataset` and `attrs` make the same bytes and take four times as long, with Python's lock
+    held, which what goes on beside wants, too.
+
+    Args:
+        file: Open for writing.
+    """
+
+    def __init__(self, file: h5py.File) -> None:
+        self._file = file
+        self._groups: dict[str, h5py.h5g.GroupID] = {}
+        self._made: dict[tuple[str, tuple[int, ...], np.dtype[Any]], tuple[Any, Any, Any]] = {}
+
+    def create(
+        self, group: str, index: int, shape: tuple[int, ...], kind: np.dtype[Any]
+    ) -> h5py.h5d.DatasetID:
+        """Return a new dataset; those of `flow` are one chunk, packed as `COMPRESSION` says."""
+        if group not in self._groups:
+            self._groups[group] = self._file.require_group(group).id
+        key = (group, shape, kind)
+        if key not in self._made:
+            how = h5p.create(h5p.DATASET_CREATE)
+            if group == "flow":
+                how.set_chunk(shape)
+                how.set_shuffle()
+                how.set_deflate(COMPRESSION["compression_opts"])
+            how.set_obj_track_times(False)
+            self._made[key] = h5t.py_create(kind, logical=True), h5s.create_simple(shape), how
+        type_, space, how = self._made[key]
+        return h5d.create(self._groups[group], _member_name(group, index), type_, space, dcpl=how)
+
+    def find(self, index: int) -> list[h5py.h5d.DatasetID]:
+        """Return the datasets of a number that are there."""
+        names = [(found, _member_name(name, index)) for name, found in self._groups.items()]
+        return [h5d.open(group, name) for group, name in names if name in group]
+
+
+def _member_name(group: str, index: int) -> bytes:
+    return b"%s%09d" % ({"images": b"image", "flow": b"flow"}[group], index)
+
+
+def set_attributes(member: h5py.h5d.DatasetID, values: dict[str, Any]) -> None:
+    """Give a dataset attributes that it does not have yet: numbers of NumPy with their shape, or texts."""
+    for name, value in values.items():
+        kind = TEXT if isinstance(value, str) else value.dtype
+        array = np.asarray(value, kind)
+        logical, stored, space = _attribute_types(kind, array.shape)
+        h5a.create(member, name.encode(), logical, space).write(array, mtype=stored)
+
+
+TEXT = h5py.string_dtype()
+
+
+@lru_cache(maxsize=64)
+def _attribute_types(kind: np.dtype[Any], shape: tuple[int, ...]) -> tuple[Any, Any, Any]:
+    """Return the type of an attribute in a file and in memory, and its space."""
+    return h5t.py_create(kind, logical=True), h5t.py_create(kind), h5s.create_simple(shape)
+
+
 class _Writer(Writer):
     """Appends whole blocks of events, and frames as they come."""
 
@@ -197,6 +260,7 @@ class _Writer(Writer):
         for name in EVENT_TYPES:
             self._create(name)
         self._file.create_group("images")  # readers list it even where it is empty
+        self._numbered = _NumberedMembers(self._file)
         self._parts: list[tuple[NDArray[Any], ...]] = []
         self._waiting = 0
         self._written = 0
@@ -269,20 +333,16 @@ class _Writer(Writer):
         fields = [] if flow is None else [self._line.keep(flow.astype(np.float32, copy=False))]
 
         def write(packed: list[bytes]) -> None:
-            image = self._file.create_dataset(f"images/image{index:09d}", data=grey)
-            image.attrs["size"] = grey.shape
-            image.attrs["timestamp"] = float(time)
-            image.attrs["type"] = "greyscale"
+            numbered, said = self._numbered, {"timestamp": np.float64(time)}
+            image = numbered.create("images", index, grey.shape, grey.dtype)
+            image.write(h5s.ALL, h5s.ALL, np.ascontiguousarray(grey))
+            set_attributes(image, {"size": np.array(grey.shape), **said, "type": "greyscale"})
             if exposure:
-                image.attrs["exposure"] = float(exposure)
+                set_attributes(image, {"exposure": np.float64(exposure)})
             for values, chunk in zip(fields, packed, strict=True):
-                shape = values.shape
-                field = self._file.create_dataset(
-                    f"flow/flow{index:09d}", shape, np.float32, chunks=shape, **COMPRESSION
-                )
-                field.id.write_direct_chunk((0, 0, 0), chunk)
-                field.attrs["size"] = shape
-                field.attrs["timestamp"] = float(time)
+                field = numbered.create("flow", index, values.shape, values.dtype)
+                field.write_direct_chunk((0, 0, 0), chunk)
+                set_attributes(field, {"size": np.array(values.shape), **said})
 
         self._times.append(float(time))
         self._before.append(self._written if time > self._last_written else LATE)
@@ -313,9 +373,8 @@ class _Writer(Writer):
                 np.zeros(len(self._times), np.int64),
             ).tolist()
         for index, count in enumerate(self._before):
-            for name in (f"images/image{index:09d}", f"flow/flow{index:09d}"):
-                if name in self._file:
-                    self._file[name].attrs["event_idx"] = max(count - 1, 0)
+            for member in self._numbered.find(index):
+                set_attributes(member, {"event_idx": np.int64(max(count - 1, 0))})
         t0, tk = (float(ts[0]), float(ts[-1])) if written else (0.0, 0.0)
         flows = len(self._times) if self._with_flow else 0
         self._file.attrs.update(
