@@ -178,7 +178,10 @@ def _synth_video(
     find_writable_format(out)
     model = load_sensor(sensor, known_effects(effects))
     notes: list[str] = []
-    scene = open_video(video, fps=fps, size=size or model.size, gamma=gamma, between=between, notes=notes)
+    scene = open_video(
+        video, fps=fps, size=size or model.size, gamma=gamma, between=between, colour=model.sees_colour(),
+        notes=notes,
+    )  # fmt: skip
     for note in notes:
         click.echo(note)
     with _progress_bar(len(sample_times(scene, model)), "frames") as advance:

@@ -102,11 +102,13 @@ class Picture:
         window: For so long [s].
         speed: Of the drawing [px/s]; 0 for light that is the same everywhere and always.
         size: Columns and rows [px].
+        coloured: Whether what is brightest is red instead, of the grey of the ground.
     """
 
     window: float = 0.012
     speed: float = 160.0
     size: tuple[int, int] = (160, 100)
+    coloured: bool = False
 
     def scene(self) -> dase.VideoScene:
         """Return the drawing, moving to the left."""
@@ -118,7 +120,8 @@ class Picture:
             cv2.warpAffine(drawing, np.float32([[1, 0, -self.speed * t], [0, 1, 0]]), self.size)
             for t in times
         ]
-        return dase.VideoScene(np.clip(frames, 0.002, 1).astype(np.float32), times)
+        light = np.clip(frames, 0.002, 1).astype(np.float32)
+        return dase.VideoScene(turn_red(light) if self.coloured else light, times)
 
     def draw(self, axes: Axes, events: Events) -> None:
         """Draw the events, the more of a pixel the darker."""
@@ -150,6 +153,13 @@ def draw_shapes(size: tuple[int, int], more: int) -> NDArray[np.float32]:
             left = (x + 14 + 5 * bar) * fine
             cv2.rectangle(out, (left, (low - 12) * fine), (left + 2 * fine, (low + 12) * fine), 0.4, -1)
     return cv2.resize(out, None, fx=1 / fine, fy=1 / fine, interpolation=cv2.INTER_AREA)
+
+
+def turn_red(light: NDArray[np.float32], ground: float = 0.15) -> NDArray[np.float32]:
+    """Return red, green and blue, shape (F, H, W, 3): what is bright is red, of the luma of the ground."""
+    share = np.clip((light - ground) / 0.25, 0, 1)[..., None]
+    red = np.float32([0.35, -0.35 * 0.21 / 0.72, 0.0])
+    return np.minimum(light, ground)[..., None] + share * red
 
 
 def steps(times: Array) -> Array:
@@ -231,6 +241,10 @@ def shown() -> dict[str, Shown]:
     return {
         "optics_blur": Shown(
             e["optics_blur"](sigma=2.0), Picture(), "Edges are wider and fine texture is gone: fewer events."
+        ),
+        "bayer": Shown(
+            e["bayer"](), Picture(size=(80, 50), speed=80.0, coloured=True),
+            "Red shapes on a ground of the same grey: only pixels behind filters see them."
         ),
         "flicker": Shown(
             e["flicker"](frequency=100.0, depth=0.5), STEPS,

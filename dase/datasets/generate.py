@@ -366,8 +366,8 @@ def _in_worker(job: DatasetJob, out: Path, index: int) -> WorkReport:
 
 
 @lru_cache(maxsize=1)
-def _open_images_once(spec: str) -> image_sources.ImageSource:
-    return image_sources.open_images(spec)
+def _open_images_once(spec: str, colour: bool) -> image_sources.ImageSource:
+    return image_sources.open_images(spec, colour=colour)
 
 
 @lru_cache(maxsize=1)  # a file of effects is read once, whatever becomes of it meanwhile
@@ -410,7 +410,7 @@ def make_scene(job: DatasetJob, index: int) -> LayerScene:
     rng = np.random.default_rng([job.seed, index])
     return random_scenes.draw_scene(
         rng,
-        _open_images_once(job.images),
+        _open_images_once(job.images, _sensor_of(job).sees_colour()),
         job.regime,
         width=job.width,
         height=job.height,
@@ -477,6 +477,7 @@ class _Recording:
         begin: float,
     ):
         self._run, self._begins, self._exposure, self._begin = run, begins, exposure, begin
+        self._shown = run.sensor.in_frames(run.scene)
         self._total = WorkReport(sequences=1)
         self._steps: StepsInOrder[io.Writer, WorkReport] = StepsInOrder(io.create(path))
         self._configuration = configuration
@@ -526,7 +527,7 @@ class _Recording:
         self, begins: NDArray[np.float64]
     ) -> tuple[NDArray[np.float64], NDArray[Any], NDArray[np.float32] | None]:
         """Return times [s], frames and flow of the frames that begin at `begins` [s], each of length F."""
-        scene, device = self._run.scene, self._run.pixel_array.device.alias
+        scene, device = self._shown, self._run.pixel_array.device.alias
         middles = begins + self._exposure / 2
         if not len(begins):
             return middles, np.empty(0), None

@@ -14,6 +14,7 @@ from dase.effects.base import Observations as Observations
 from dase.effects.base import Parameter as Parameter
 from dase.effects.base import choice as choice
 from dase.effects.base import parameter as parameter
+from dase.effects.bayer import Bayer
 from dase.effects.dark import Dark
 from dase.effects.dead import Dead
 from dase.effects.double_events import DoubleEvents
@@ -47,6 +48,7 @@ from dase.errors import InputError, nearest
 _ORDER = (
     # light
     OpticsBlur,
+    Bayer,
     Flicker,
     Vignetting,
     Dark,

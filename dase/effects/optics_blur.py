@@ -11,12 +11,9 @@ import warp as wp
 from numpy.typing import NDArray
 
 from dase.effects.base import parameter
-from dase.effects.optics import SceneEffect
-from dase.errors import InputError
+from dase.effects.optics import SceneEffect, rendered_pictures
 from dase.kernels import launch, pixel_stages
 from dase.kernels.scene_blur import blur_frames
-from dase.kernels.scene_render import render_frames
-from dase.kernels.stored_levels import light_of_levels
 from dase.scenes.scene import Scene
 
 
@@ -47,7 +44,7 @@ class Unsharp(Scene):
         self.scene = scene
         self.width, self.height, self.duration = scene.width, scene.height, scene.duration
         self.anytime = scene.anytime
-        self._weights = blur_weights(sigma)
+        self._sigma, self._weights = sigma, blur_weights(sigma)
         self._every = np.arange(scene.width * scene.height, dtype=np.int32)
 
     def sample_times(self) -> NDArray[np.float64]:
@@ -56,15 +53,7 @@ class Unsharp(Scene):
 
     def source(self, times: NDArray[np.float64], pixels: NDArray[np.int32], device: Any) -> tuple[str, Any]:
         """Return the blurred intensities of these pixels, shape (K, N); see `Scene.source`."""
-        kind, source = self.scene.source(times, self._every, device)
-        if kind in ("layers", "background"):
-            pictures = render_frames(source, self.width, self.height, device)
-        elif kind == "frames":
-            pictures = source.values
-        elif kind == "levels":
-            pictures = light_of_levels(source, device)
-        else:
-            raise InputError("optics_blur needs intensities, and this scene gives log intensities")
+        pictures = rendered_pictures(self.scene, times, device)
         frames = pixel_stages.Frames()
         frames.values = blur_frames(pictures, self._weights, self.width, pixels, device)
         return "frames", frames
@@ -77,6 +66,14 @@ class Unsharp(Scene):
             wp.array(flat, dtype=float, device=where), self._weights, self.width, self._every, where
         )
         return np.asarray(found.numpy().reshape(len(times), self.height, self.width))
+
+    def filtered(self, purity: float) -> tuple[Scene, Scene, Scene] | None:
+        """Return the blurred scene behind a red, a green and a blue filter; see `Scene.filtered`."""
+        found = self.scene.filtered(purity)
+        if found is None:
+            return None
+        red, green, blue = (Unsharp(scene, self._sigma) for scene in found)
+        return red, green, blue
 
     def flow(self, times: NDArray[np.float64], device: str = "cpu") -> NDArray[np.float32] | None:
         """Return the flow of the scene itself [px/s], shape (K, 2, height, width)."""

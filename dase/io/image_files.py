@@ -20,6 +20,8 @@ SUFFIXES = ("jpg", "jpeg", "png", "bmp", "tif", "tiff", "webp", "ppm", "pgm")
 """Picture files, whatever their case."""
 
 PNG = b"\x89PNG\r\n\x1a\n"
+LUMA = (0.21, 0.72, 0.07)
+"""Of red, green and blue; S2R takes luma for intensity."""
 BAND = 1 << 18
 """Pixels turned to grey at once: the numbers in between take little memory, and stay in the cache."""
 
@@ -35,13 +37,13 @@ def to_grey(pixels: NDArray[Any]) -> tuple[NDArray[np.float32], NDArray[np.float
     """Return grey values and alpha in [0, 1].
 
     Args:
-        pixels: (H, W) or (H, W, channels), uint8 or uint16, BGR or BGRA.
+        pixels: (H, W) or (H, W, channels), BGR or BGRA, uint8 or uint16, or real numbers in [0, 1].
     """
     # each plane by itself: numbers that lie side by side become vectors, every third one does not
     planes = list(cv2.split(pixels))
-    full = np.float32(np.iinfo(pixels.dtype).max)
+    full = _full_scale(pixels)
     alpha = planes.pop() / full if len(planes) in (2, 4) else None
-    weights = (0.07, 0.72, 0.21) if len(planes) == 3 else (1.0,)  # of BGR; S2R takes luma for intensity
+    weights = LUMA[::-1] if len(planes) == 3 else (1.0,)  # of BGR
     grey = np.empty(planes[0].shape, np.float32)
     for band in _row_bands(grey.shape):
         grey[band] = planes[0][band]
@@ -52,6 +54,42 @@ def to_grey(pixels: NDArray[Any]) -> tuple[NDArray[np.float32], NDArray[np.float
             more *= np.float32(weight) / full
             grey[band] += more
     return grey, alpha
+
+
+def to_colour(pixels: NDArray[Any], grey: NDArray[np.float32]) -> NDArray[np.float32] | None:
+    """Return red, green and blue in [0, 1], shape (3, H, W), None where a picture has no colour.
+
+    Where the three are equal they are `grey` to the bit: what differs from it is worked out by itself.
+
+    Args:
+        pixels: As `to_grey` takes them.
+        grey: What it made of them, shape (H, W).
+    """
+    if pixels.ndim != 3 or pixels.shape[2] < 3:
+        return None
+    full = _full_scale(pixels)
+    colours = [plane / full for plane in reversed(cv2.split(pixels)[:3])]
+    out = np.zeros((3, *grey.shape), np.float32)
+    for plane, own in zip(out, colours, strict=True):
+        for weight, other in zip(LUMA, colours, strict=True):
+            plane += np.float32(weight) * (own - other)
+    return np.clip(out + grey, 0, 1) if out.any() else None
+
+
+def _full_scale(pixels: NDArray[Any]) -> np.float32:
+    """Return the value of white of an array of any shape."""
+    return np.float32(np.iinfo(pixels.dtype).max if pixels.dtype.kind == "u" else 1)
+
+
+def grey_and_colour(pixels: NDArray[Any]) -> NDArray[np.float32]:
+    """Return grey, red, green and blue in [0, 1], shape (4, H, W); all are the grey where there is no colour.
+
+    Args:
+        pixels: As `to_grey` takes them.
+    """
+    grey, _ = to_grey(pixels)
+    colour = to_colour(pixels, grey)
+    return np.stack([grey] * 4) if colour is None else np.concatenate([grey[None], colour])
 
 
 def to_levels(pixels: NDArray[Any]) -> NDArray[np.uint8]:

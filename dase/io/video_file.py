@@ -14,7 +14,14 @@ from numpy.typing import NDArray
 from dase.errors import InputError
 from dase.files.text_files import stands_for
 from dase.io.ffmpeg import bounded_decoding, decoding_memory, open_video, pixel_format, refuse_titles, size_of
-from dase.io.image_files import cut_and_resize, decode_file, list_pictures, to_grey, to_levels
+from dase.io.image_files import (
+    cut_and_resize,
+    decode_file,
+    grey_and_colour,
+    list_pictures,
+    to_grey,
+    to_levels,
+)
 
 KEPT = 64 << 20
 """Bytes of frames that are kept as they were decoded while they were counted."""
@@ -28,10 +35,11 @@ class FrameReader:
     Args:
         path: Video file, or folder of pictures in the order of their names.
         size: Columns and rows to cut the middle to and resize to, or None.
+        colour: Whether `planes` has colours beside the grey.
     """
 
-    def __init__(self, path: Path, size: tuple[int, int] | None = None):
-        self._path, self._size = path, size
+    def __init__(self, path: Path, size: tuple[int, int] | None = None, *, colour: bool = False):
+        self._path, self._size, self.colour = path, size, colour
         if not path.exists():
             raise InputError(f"video {path} does not exist")
         self._files = list_pictures(path) if path.is_dir() else None
@@ -71,11 +79,20 @@ class FrameReader:
 
         They are not to be changed: later calls take from them.
         """
+        return self.planes(index)[:, 0]
+
+    def planes(self, index: NDArray[np.int64]) -> NDArray[np.float32]:
+        """Return frames in [0, 1], shape (K, 1, height, width): grey; with colour (K, 4, ...): R, G, B, too.
+
+        Args:
+            index: Increasing, shape (K,). What is returned is not to be changed: later calls take from it.
+        """
         wanted = [int(i) for i in index]
         if self._files is not None:
-            return np.stack([self._grey(decode_file(self._files[i]), self._files[i]) for i in wanted])
+            files = [self._files[i] for i in wanted]
+            return np.stack([self._planes_of(decode_file(file), file) for file in files])
         place = {i: n for n, i in enumerate(wanted)}
-        out = np.empty((len(wanted), *self.shape[1:]), np.float32)
+        out = np.empty((len(wanted), 4 if self.colour else 1, *self.shape[1:]), np.float32)
         known = {i: frame for kept in self._kept for i, frame in kept.items() if i in place}
         for i, frame in known.items():
             out[place[i]] = frame
@@ -174,7 +191,7 @@ class FrameReader:
             self._capture = self._open()
         frame = self._next_of(self._capture, index)
         self._next = index + 1
-        return self._grey(frame, self._path)
+        return self._planes_of(frame, self._path)
 
     def _checked(self, pixels: NDArray[Any], path: Path) -> NDArray[Any]:
         """Return pixels; raises InputError where their size is not that of the first frame."""
@@ -184,10 +201,13 @@ class FrameReader:
             raise InputError(f"video: all frames must have one size, {path} has {sizes}")
         return pixels
 
-    def _grey(self, pixels: NDArray[Any], path: Path) -> NDArray[np.float32]:
+    def _planes_of(self, pixels: NDArray[Any], path: Path) -> NDArray[np.float32]:
+        """Return the planes of a frame, shape (1 or 4, height, width)."""
+        pixels = self._checked(pixels, path)
+        planes = grey_and_colour(pixels) if self.colour else to_grey(pixels)[0][None]
         if self._size is None:
-            return to_grey(self._checked(pixels, path))[0]
-        return cut_and_resize(to_grey(self._checked(pixels, path))[0], self._size)
+            return planes
+        return np.stack([cut_and_resize(plane, self._size) for plane in planes])
 
 
 def _uneven_times(times: NDArray[np.float64], rate: float) -> NDArray[np.float64] | None:

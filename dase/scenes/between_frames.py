@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import OrderedDict
+from copy import copy
 from dataclasses import dataclass
 from typing import Any
 
@@ -67,6 +68,8 @@ class CameraScene(Scene):
         longest: Upper bound of it [s].
         matching: What is kept of matches, and how they set the sampling.
         trust: Up to which expected error intensities are trusted.
+        colours: Red, green and blue of the frames, of their type, shape (F, 3, height, width), for sensors
+            with colour filters; the motion is that of the frames. None where there are none.
     """
 
     anytime = True
@@ -86,6 +89,7 @@ class CameraScene(Scene):
         longest: float = SamplingSettings.longest,
         matching: MatchSettings = MatchSettings(),
         trust: TrustSettings = TrustSettings(),
+        colours: NDArray[Any] | None = None,
     ):
         self._raw = np.asarray(frames)
         self.begin = np.asarray(begin, np.float64)
@@ -118,6 +122,11 @@ class CameraScene(Scene):
         self._speed: dict[int, float] = {}
         self._loaded: tuple[Any, Any] = (None, None)
         self._trusted: NDArray[np.bool_] | None = None
+        self._colours = colours
+        if colours is not None and colours.shape != (len(self._raw), 3, *self._raw.shape[1:]):
+            raise InputError(f"camera: colours must have shape (F, 3, height, width), got {colours.shape}")
+        self._filter: tuple[int, float] | None = None
+        """Colour and purity of what the light that is shown has passed."""
 
     def __len__(self) -> int:
         return len(self._raw)
@@ -129,12 +138,34 @@ class CameraScene(Scene):
             self._raw[kept], self.begin[kept], self.end[kept], gamma=self.gamma, black=self.black,
             white=self.white, gains=self._gains[kept], travel=self.travel, shortest=self.shortest,
             longest=self.longest, matching=self.matching, trust=self.trust,
+            colours=None if self._colours is None else self._colours[kept],
         )  # fmt: skip
 
     def intensity(self, index: int) -> NDArray[np.float32]:
         """Return the linear intensity of a frame in [0, 1], shape (height, width)."""
+        return self._light_of(self._raw[index], index)
+
+    def filtered(self, purity: float) -> tuple[Scene, Scene, Scene] | None:
+        """Return the scene behind a red, a green and a blue filter; see `Scene.filtered`."""
+        if self._colours is None:
+            return None
+        red, green, blue = (copy(self) for _ in range(3))  # they share what is known of the motion
+        for colour, scene in enumerate((red, green, blue)):
+            scene._filter, scene._loaded = (colour, purity), (None, None)
+        return red, green, blue
+
+    def _shown(self, index: int) -> NDArray[np.float32]:
+        """Return the intensity of a frame behind the filter, if there is one, shape (height, width)."""
+        grey = self.intensity(index)
+        if self._filter is None or self._colours is None:
+            return grey
+        colour, purity = self._filter
+        return grey + np.float32(purity) * (self._light_of(self._colours[index, colour], index) - grey)
+
+    def _light_of(self, raw: NDArray[Any], index: int) -> NDArray[np.float32]:
+        """Return the linear intensity of values (height, width) of a frame."""
         span = np.float32(self.white - self.black)
-        value = np.clip((self._raw[index].astype(np.float32) - np.float32(self.black)) / span, 0, 1)
+        value = np.clip((raw.astype(np.float32) - np.float32(self.black)) / span, 0, 1)
         gain, offset = self._gains[index].astype(np.float32)
         return np.asarray(np.maximum(gain * value ** np.float32(self.gamma) + offset, 0))
 
@@ -324,7 +355,7 @@ class CameraScene(Scene):
         key = (first, final, device.alias)
         if self._loaded[0] != key:
             found = [self.matched(k) for k in range(first, final + 1)]
-            frames = np.stack([self.intensity(k) for k in range(first, final + 2)])
+            frames = np.stack([self._shown(k) for k in range(first, final + 2)])
             ahead, back = (np.stack([getattr(m, name) for m in found]) for name in ("ahead", "back"))
             self._loaded = key, scene_frames.upload_matches(frames, ahead, back, LOG_EPS, device)
         return self._loaded[1], first, (at - first).astype(np.int32), share.astype(np.float32)

@@ -6,7 +6,7 @@ import os
 import warnings
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from importlib.util import find_spec
 from pathlib import Path, PurePosixPath, PureWindowsPath
@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from dase.errors import InputError, checked_integer, how_to_install
 from dase.files.text_files import parse_json, stands_for
-from dase.io.image_files import SUFFIXES, decode_file, list_pictures, to_grey
+from dase.io.image_files import SUFFIXES, decode_file, list_pictures, to_colour, to_grey
 
 # fmt: off
 PHOTOGRAPHS = (  # inside the wheel of scikit-image; its other files are silhouettes, charts and duplicates
@@ -28,6 +28,8 @@ PHOTOGRAPHS = (  # inside the wheel of scikit-image; its other files are silhoue
 )
 # fmt: on
 Grey = NDArray[np.float32]
+WHOLE = slice(None), slice(None)
+"""Rows and columns of a picture as a whole."""
 
 
 @dataclass(frozen=True)
@@ -61,10 +63,26 @@ class Picture:
     Args:
         grey: Intensity in [0, 1], float32, shape (H, W).
         alpha: Opacity in [0, 1], float32, shape (H, W); None is opaque.
+        colour: Intensity of red, green and blue in [0, 1], float32, shape (3, H, W), of which `grey` is the
+            luma; None where all three are `grey`.
     """
 
     grey: Grey
     alpha: Grey | None = None
+    colour: NDArray[np.float32] | None = None
+
+    def cut(self, box: tuple[slice, slice]) -> Picture:
+        """Return the rows and columns of a box, opaque, as arrays of their own."""
+        colour = None if self.colour is None else self.colour[:, *box].copy()
+        return Picture(self.grey[box].copy(), None, colour)
+
+    def filtered(self, colour: int, purity: float) -> Picture:
+        """Return the picture in red (0), green (1) or blue (2) light, see `Scene.filtered`."""
+        if self.colour is None:
+            return self
+        # where a colour is the grey, it stays so to the bit
+        grey = self.grey + np.float32(purity) * (self.colour[colour] - self.grey)
+        return Picture(grey, self.alpha)
 
 
 class ImageSource(ABC):
@@ -93,12 +111,14 @@ class ImageSource(ABC):
         """
 
 
-def open_images(spec: str) -> ImageSource:
+def open_images(spec: str, *, colour: bool = False) -> ImageSource:
     """Open a source of pictures.
 
     Args:
         spec: "builtin"; a folder, searched recursively; or "coco:ANNOTATIONS.json,DIR", split at the last
             comma, which needs the extra `coco`.
+        colour: Whether pictures carry their colours, which take three times the memory again. The same
+            random numbers draw the same pictures, with the same grey.
 
     Raises:
         InputError: The folder or the annotations are missing or hold nothing to draw.
@@ -107,16 +127,16 @@ def open_images(spec: str) -> ImageSource:
         package = find_spec("skimage")
         folder = Path(package.origin if package and package.origin else "skimage").parent / "data"
         files = [folder / name for name in PHOTOGRAPHS]
-        return FolderImages(spec, files, drawn_share=ImageSettings.drawn_share)
+        return FolderImages(spec, files, drawn_share=ImageSettings.drawn_share, colour=colour)
     if spec.startswith("coco:"):
         annotations, _, directory = spec.removeprefix("coco:").rpartition(",")
         if not annotations or not directory:
             raise InputError(f"images: write coco:ANNOTATIONS.json,DIR with one comma between, got '{spec}'")
-        return CocoImages(spec, Path(annotations), _existing_folder(directory))
+        return CocoImages(spec, Path(annotations), _existing_folder(directory), colour=colour)
     found = list_pictures(_existing_folder(spec))
     if not found:
         raise InputError(f"images: folder '{spec}' must hold a {', '.join(SUFFIXES)} file, found none")
-    return FolderImages(spec, found)
+    return FolderImages(spec, found, colour=colour)
 
 
 class FolderImages(ImageSource):
@@ -128,34 +148,34 @@ class FolderImages(ImageSource):
     Args:
         name: What `open_images` was given.
         paths: The files; they are decoded when they are drawn.
-        drawn_share: Share of procedural textures in [0, 1].
+        drawn_share: Share of procedural textures in [0, 1], which are grey.
+        colour: Whether pictures carry their colours.
     """
 
-    def __init__(self, name: str, paths: Sequence[Path], *, drawn_share: float = 0.0):
+    def __init__(self, name: str, paths: Sequence[Path], *, drawn_share: float = 0.0, colour: bool = False):
         self.name = name
         self._paths = paths
         self._drawn_share = drawn_share
+        self._colour = colour
 
     def __len__(self) -> int:
         return len(self._paths)
 
     def background(self, rng: np.random.Generator) -> Picture:
         """Draw a whole picture; what its alpha channel hides has the mean grey of what it shows."""
-        return Picture(self._draw(rng).grey.copy())
+        return self._draw(rng).cut(WHOLE)
 
     def foreground(self, rng: np.random.Generator) -> Picture:
         """Draw the cut-out of a file, or cut a shape from it."""
         picture = self._draw(rng)
-        return (
-            cut_random_shape(picture.grey, rng)
-            if picture.alpha is None
-            else _crop_to_alpha(picture.grey, picture.alpha)
-        )
+        if picture.alpha is None:
+            return cut_random_shape(picture, rng)
+        return _crop_to_alpha(picture, picture.alpha)
 
     def _draw(self, rng: np.random.Generator) -> Picture:
         if rng.random() < self._drawn_share:
             return Picture(draw_texture(rng))
-        return _read_picture(self._paths[int(rng.integers(len(self._paths)))])
+        return _read_picture(self._paths[int(rng.integers(len(self._paths)))], self._colour)
 
 
 class CocoImages(ImageSource):
@@ -167,18 +187,19 @@ class CocoImages(ImageSource):
         name: What `open_images` was given.
         annotations: JSON file with `images` and `annotations`.
         directory: Folder of the images.
+        colour: Whether pictures carry their colours.
 
     Raises:
         InputError: A file is missing or the annotations hold no usable instance.
     """
 
-    def __init__(self, name: str, annotations: Path, directory: Path):
+    def __init__(self, name: str, annotations: Path, directory: Path, *, colour: bool = False):
         try:
             from pycocotools.coco import COCO
         except ImportError:
             raise InputError(f"images: coco: needs pycocotools: {how_to_install('coco')}") from None
         self.name = name
-        self._file, self._folder = annotations, directory
+        self._file, self._folder, self._colour = annotations, directory, colour
         images, instances = _read_annotations(annotations)
         self._images, self._instances = list(images.values()), instances
         # not `Path.is_file`, to which a name can be too long
@@ -197,13 +218,14 @@ class CocoImages(ImageSource):
     def background(self, rng: np.random.Generator) -> Picture:
         """Draw a whole image."""
         image = self._images[rng.integers(len(self._images))]
-        return Picture(_read_picture(self._folder / image["file_name"]).grey.copy())
+        return _read_picture(self._folder / image["file_name"], self._colour).cut(WHOLE)
 
     def foreground(self, rng: np.random.Generator) -> Picture:
         """Draw an instance; raises InputError if its outline does not fit its image."""
         instance = self._instances[rng.integers(len(self._instances))]
         image = self._coco.imgs[instance["image_id"]]
-        grey = _read_picture(self._folder / image["file_name"]).grey
+        picture = _read_picture(self._folder / image["file_name"], self._colour)
+        grey = picture.grey
         what = f"images: '{self._file}': annotation {instance.get('id')} of '{image['file_name']}'"
         size = image["width"], image["height"]
         if _shrunk_size(*size) != grey.shape[::-1]:
@@ -220,7 +242,7 @@ class CocoImages(ImageSource):
         if not mask.any():
             raise InputError(f"{what} must enclose a pixel, encloses none")
         mask = cv2.resize(mask, grey.shape[::-1], interpolation=cv2.INTER_AREA)
-        return _crop_to_alpha(grey, cv2.GaussianBlur(mask, (3, 3), 0))
+        return _crop_to_alpha(picture, cv2.GaussianBlur(mask, (3, 3), 0))
 
 
 def _read_annotations(path: Path) -> tuple[dict[int, dict[str, Any]], list[dict[str, Any]]]:
@@ -353,21 +375,30 @@ def _existing_folder(name: str) -> Path:
     return Path(name)
 
 
-@lru_cache(maxsize=64)  # per process: at most 4 MiB each, 8 MiB with alpha
-def _read_picture(path: Path) -> Picture:
+@lru_cache(maxsize=64)  # per process: at most 4 MiB each, 8 MiB with alpha, 12 MiB more with colour
+def _read_picture(path: Path, with_colour: bool = False) -> Picture:
     """Decode, grey, shrink and median-filter a file; the arrays are shared, hence read-only."""
-    grey, alpha = to_grey(decode_file(path))
-    if alpha is not None and (alpha > 0).any():
-        grey[alpha == 0] = grey[alpha > 0].mean()  # what is hidden must not leak into edges and backgrounds
+    pixels = decode_file(path)
+    grey, alpha = to_grey(pixels)
+    colour = to_colour(pixels, grey) if with_colour else None
+    planes = [grey] if colour is None else [grey, *colour]
     size = _shrunk_size(*grey.shape[::-1])
-    grey = cv2.resize(grey, size, interpolation=cv2.INTER_AREA)
+    for n, plane in enumerate(planes):
+        if alpha is not None and (alpha > 0).any():
+            # what is hidden must not leak into edges and backgrounds
+            plane[alpha == 0] = plane[alpha > 0].mean()
+        plane = cv2.resize(plane, size, interpolation=cv2.INTER_AREA)
+        planes[n] = cv2.medianBlur(np.clip(plane, 0, 1), 3)
+        planes[n].flags.writeable = False
+    grey, colour = planes[0], np.stack(planes[1:]) if len(planes) > 1 else None
+    if colour is not None:
+        colour.flags.writeable = False
     alpha = None if alpha is None else cv2.resize(alpha, size, interpolation=cv2.INTER_AREA)
-    grey = cv2.medianBlur(np.clip(grey, 0, 1), 3)
-    grey.flags.writeable = False
     if alpha is None or not 0.005 < float((alpha > 0.5).mean()) < 0.995:
-        return Picture(grey)  # an alpha channel that shows or hides everything is no cut-out
+        # an alpha channel that shows or hides everything is no cut-out
+        return Picture(grey, None, colour)
     alpha.flags.writeable = False
-    return Picture(grey, alpha)
+    return Picture(grey, alpha, colour)
 
 
 def _shrunk_size(width: int, height: int, longest: int = ImageSettings.longest_side) -> tuple[int, int]:
@@ -376,33 +407,36 @@ def _shrunk_size(width: int, height: int, longest: int = ImageSettings.longest_s
     return max(1, round(width * scale)), max(1, round(height * scale))
 
 
-def _crop_to_alpha(grey: Grey, alpha: Grey) -> Picture:
+def _crop_to_alpha(picture: Picture, alpha: Grey) -> Picture:
     """Crop to alpha > 0 and put a border of alpha 0 around."""
     rows, columns = (np.flatnonzero((alpha > 0).any(axis)) for axis in (1, 0))
     box = slice(rows[0], rows[-1] + 1), slice(columns[0], columns[-1] + 1)
-    return Picture(np.pad(grey[box], 1, mode="edge"), np.clip(np.pad(alpha[box], 1), 0, 1))
+    part = picture.cut(box)
+    colour = None if part.colour is None else np.pad(part.colour, ((0, 0), (1, 1), (1, 1)), mode="edge")
+    return Picture(np.pad(part.grey, 1, mode="edge"), np.clip(np.pad(alpha[box], 1), 0, 1), colour)
 
 
 def cut_random_shape(
-    grey: Grey, rng: np.random.Generator, smallest: int = ImageSettings.smallest_cut
+    picture: Picture, rng: np.random.Generator, smallest: int = ImageSettings.smallest_cut
 ) -> Picture:
     """Cut a random shape from a random place of a picture.
 
     Three in ten are rectangles, as many blobs; the rest are ellipses and polygons, with an edge 2 px soft.
 
     Args:
-        grey: Intensity in [0, 1], shape (H, W).
+        picture: Its alpha does not matter.
         rng: Random numbers.
         smallest: No side of the shape's box is shorter, unless the picture is [px].
     """
-    sides = [max(min(n, smallest), round(n * rng.uniform(0.3, 1))) for n in grey.shape]
-    top, left = (int(rng.integers(n - side + 1)) for n, side in zip(grey.shape, sides, strict=True))
-    part = grey[top : top + sides[0], left : left + sides[1]].copy()
+    shape = picture.grey.shape
+    sides = [max(min(n, smallest), round(n * rng.uniform(0.3, 1))) for n in shape]
+    top, left = (int(rng.integers(n - side + 1)) for n, side in zip(shape, sides, strict=True))
+    part = picture.cut((slice(top, top + sides[0]), slice(left, left + sides[1])))
     kind = rng.choice(4, p=(0.3, 0.3, 0.2, 0.2))
     if kind == 0 or min(sides) < smallest:
-        return Picture(part, np.ones_like(part))
+        return replace(part, alpha=np.ones_like(part.grey))
     outline = (_blob_outline, _ellipse_outline, _polygon_outline)[kind - 1](rng)
-    mask = np.zeros(part.shape, np.uint8)
+    mask = np.zeros(part.grey.shape, np.uint8)
     _fill_polygon(mask, 2.0 + outline * np.subtract(mask.shape[::-1], 5), 255)  # 2 px for the soft edge
     return _crop_to_alpha(part, cv2.GaussianBlur(mask, (3, 3), 0) / np.float32(255))
 

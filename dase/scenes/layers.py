@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -201,6 +201,26 @@ class LayerScene(Scene):
         self.camera, self.lighting = camera, lighting
         self.travel, self.shortest, self.longest = travel, shortest, longest
         self._uploaded: dict[str, Any] = {}
+
+    def like(
+        self, *, layers: Sequence[Layer] | None = None, shifts: Sequence[float] | None = None
+    ) -> LayerScene:
+        """Return the same scene with other layers or shifts."""
+        return LayerScene(
+            self.layers if layers is None else layers, width=self.width, height=self.height,
+            duration=self.duration, camera=self.camera, lighting=self.lighting, travel=self.travel,
+            shortest=self.shortest, longest=self.longest, shifts=self.shifts if shifts is None else shifts,
+        )  # fmt: skip
+
+    def filtered(self, purity: float) -> tuple[Scene, Scene, Scene] | None:
+        """Return the scene behind a red, a green and a blue filter; see `Scene.filtered`."""
+        if all(layer.picture.colour is None for layer in self.layers):
+            return None
+        red, green, blue = (
+            self.like(layers=[replace(one, picture=one.picture.filtered(c, purity)) for one in self.layers])
+            for c in range(3)
+        )
+        return red, green, blue
 
     def forward(self, times: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return texture-to-sensor maps M(t) and their time derivatives, each of shape (T, L, 3, 3)."""

@@ -78,6 +78,16 @@ class Scene(ABC):
     def frames(self, times: NDArray[np.float64], device: str = "cpu") -> NDArray[np.float32]:
         """Return intensities in [0, 1] at `times` [s], shape (K, height, width)."""
 
+    def filtered(self, purity: float) -> tuple[Scene, Scene, Scene] | None:
+        """Return the scene behind a red, a green and a blue filter; None where it has no colour.
+
+        Behind a filter linear intensity is (1 - purity) · grey + purity · colour.
+
+        Args:
+            purity: Share of the light of a filter's own colour, in [0, 1].
+        """
+        return None
+
     def grey_frames(self, times: NDArray[np.float64], device: str = "cpu") -> NDArray[np.uint8]:
         """Return frames of 8 bits at `times` [s], shape (K, height, width): 255 is intensity 1 and above."""
         return to_grey(self.frames(times, device))

@@ -71,9 +71,5 @@ def stereo_pair(scene: LayerScene, depths: Sequence[float], *, baseline: float, 
         raise InputError(f"stereo: baseline must be >= 0 m and focal > 0 px, got {baseline:g} and {focal:g}")
     disparities = focal * baseline / far
     shifts = np.zeros(len(far)) if scene.shifts is None else np.array(scene.shifts)
-    right = LayerScene(
-        scene.layers, width=scene.width, height=scene.height, duration=scene.duration, camera=scene.camera,
-        lighting=scene.lighting, travel=scene.travel, shortest=scene.shortest, longest=scene.longest,
-        shifts=(shifts - disparities).tolist(),
-    )  # fmt: skip
+    right = scene.like(shifts=(shifts - disparities).tolist())
     return StereoPair(scene, right, tuple(far.tolist()), tuple(disparities.tolist()))

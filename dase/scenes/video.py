@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 from dase import io
 from dase.errors import InputError
 from dase.io import frames as picture_frames
-from dase.io.image_files import cut_and_resize, list_pictures
+from dase.io.image_files import cut_and_resize, grey_and_colour, list_pictures
 from dase.io.video_file import FrameReader
 from dase.kernels import pixel_stages
 from dase.kernels.scene_layers import interpolate_frames
@@ -24,12 +24,63 @@ from dase.scenes.scene import LOG_EPS as LOG_EPS
 from dase.scenes.scene import Scene, check_exposures
 
 
+class ColourFrames:
+    """Frames with colours, turned to planes when they are asked for.
+
+    Args:
+        frames: Red, green and blue, shape (F, height, width, 3), of the types that `VideoScene` takes.
+    """
+
+    def __init__(self, frames: NDArray[Any]):
+        self._frames = frames
+
+    def planes(self, index: NDArray[np.int64]) -> NDArray[np.float32]:
+        """Return grey, red, green and blue in [0, 1] of frames (K,), shape (K, 4, height, width)."""
+        turned = (np.ascontiguousarray(self._frames[i][..., ::-1]) for i in index)
+        return np.stack([grey_and_colour(frame) for frame in turned])
+
+
+class FilteredFrames:
+    """Frames behind a colour filter, worked out when they are asked for: linear intensity.
+
+    Args:
+        frames: With their colours.
+        shape: Frames, rows and columns.
+        gamma: Linear intensity is value ** gamma.
+        colour: Of the filter, 0 for red, 1 for green, 2 for blue.
+        purity: As `Scene.filtered` takes it.
+    """
+
+    ndim = 3
+
+    def __init__(
+        self,
+        frames: ColourFrames | FrameReader,
+        shape: tuple[int, ...],
+        gamma: float,
+        colour: int,
+        purity: float,
+    ):
+        self._frames, self.shape, self._gamma, self._colour = frames, shape, gamma, colour
+        self._purity = np.float32(purity)
+
+    def __len__(self) -> int:
+        return self.shape[0]
+
+    def __getitem__(self, index: NDArray[np.int64]) -> NDArray[np.float32]:
+        """Return the frames of increasing indices (K,), shape (K, height, width)."""
+        planes = self._frames.planes(index)
+        grey, own = (to_light(planes[:, n], gamma=self._gamma) for n in (0, 1 + self._colour))
+        return grey + self._purity * (own - grey)
+
+
 class VideoScene(Scene):
     """Frames at given times; between two frames the log intensity of a pixel runs straight.
 
     Args:
-        frames: Intensity, shape (F, height, width). Whole numbers without a sign are taken by the range of
-            their type (255 or 65535 is white), real numbers by 1.
+        frames: Intensity, shape (F, height, width), or red, green and blue, shape (F, height, width, 3), of
+            which sensors without colour filters see the luma. Whole numbers without a sign are taken by the
+            range of their type (255 or 65535 is white), real numbers by 1.
         times: Times of the frames [s], increasing, shape (F,); the scene begins with the first.
         gamma: Linear intensity is value ** gamma: 1 for linear values, 2.2 for pictures and videos.
 
@@ -39,12 +90,25 @@ class VideoScene(Scene):
 
     anytime = True
 
-    def __init__(self, frames: ArrayLike | FrameReader, times: ArrayLike, *, gamma: float = 1.0):
+    def __init__(
+        self, frames: ArrayLike | FrameReader | FilteredFrames, times: ArrayLike, *, gamma: float = 1.0
+    ):
         self.gamma = check_gamma(gamma)
-        self._frames = frames if isinstance(frames, FrameReader) else np.asarray(frames)
+        self._frames = frames if isinstance(frames, FrameReader | FilteredFrames) else np.asarray(frames)
+        self._colours: ColourFrames | FrameReader | None = None
+        if isinstance(frames, FrameReader) and frames.colour:
+            self._colours = frames
+        elif isinstance(self._frames, np.ndarray) and self._frames.ndim == 4 and self._frames.shape[3] == 3:
+            check_light(self._frames, "video")
+            self._colours = ColourFrames(self._frames)
+            every = np.arange(len(self._frames))
+            self._frames = np.stack([self._colours.planes(every[i : i + 1])[0, 0] for i in every])
         self._times = np.asarray(times, np.float64)
         if self._frames.ndim != 3 or min(self._frames.shape) < 1:
-            raise InputError(f"video: frames must have shape (F, height, width), got {self._frames.shape}")
+            shape = self._frames.shape
+            raise InputError(
+                f"video: frames must have shape (F, height, width), got {shape}; colours add a 3 at its end"
+            )
         if self._times.shape != (len(self._frames),):
             raise InputError(f"video: {len(self._frames)} frames need as many times, got {self._times.shape}")
         if not np.all(np.isfinite(self._times)) or not np.all(np.diff(self._times) > 0):
@@ -84,6 +148,16 @@ class VideoScene(Scene):
     def frames(self, times: NDArray[np.float64], device: str = "cpu") -> NDArray[np.float32]:
         """Return the frames at `times`, which must be times of frames, shape (K, height, width)."""
         return to_light(self._at(times), gamma=self.gamma)
+
+    def filtered(self, purity: float) -> tuple[Scene, Scene, Scene] | None:
+        """Return the video behind a red, a green and a blue filter; see `Scene.filtered`."""
+        if self._colours is None:
+            return None
+        red, green, blue = (
+            VideoScene(FilteredFrames(self._colours, self._frames.shape, self.gamma, c, purity), self._times)
+            for c in range(3)
+        )
+        return red, green, blue
 
     def exposed_frames(
         self, begins: NDArray[np.float64], exposure: float, device: str = "cpu"
@@ -151,6 +225,7 @@ def as_scene(scene: Scene | ArrayLike, *, fps: float | None = None, times: Array
     Args:
         scene: A `Scene`, or frames of linear intensity, shape (F, height, width). Whole numbers without a
             sign are taken by the range of their type (255 or 65535 is white), others must lie in [0, 1].
+            Red, green and blue have the shape (F, height, width, 3).
         fps: Frames per second; the first frame is at 0 s. For frames only.
         times: Times of the frames [s], increasing, shape (F,), instead of `fps`.
 
@@ -164,7 +239,8 @@ def as_scene(scene: Scene | ArrayLike, *, fps: float | None = None, times: Array
     if isinstance(scene, str | PathLike):
         raise InputError(f"scene: '{scene}' is a path; dase.open_video(path) makes a scene of a video")
     frames: NDArray[Any] = np.asarray(scene)
-    if frames.ndim != 3 or frames.dtype.kind not in "uf":
+    coloured = frames.ndim == 4 and frames.shape[3] == 3
+    if not (frames.ndim == 3 or coloured) or frames.dtype.kind not in "uf":
         raise InputError(
             "scene: must be a dase.Scene, or frames of shape (F, height, width), uint8, uint16 or float, "
             f"got {type(scene).__name__} of type {frames.dtype} and shape {frames.shape}"
@@ -194,6 +270,7 @@ def open_video(
     size: tuple[int, int] | None = None,
     gamma: float | None = None,
     between: str = "auto",
+    colour: bool = False,
     notes: list[str] | None = None,
 ) -> VideoScene | CameraScene:
     """Return the scene of a video file, of a folder of frames, or of the frames of a recording.
@@ -206,6 +283,7 @@ def open_video(
             they say otherwise, 1 for recordings.
         between: `lines` joins the frames by straight lines, `motion` follows the motion from frame to frame,
             `auto` takes motion where frames are more than 2 ms apart.
+        colour: Whether colours are kept, for sensors with colour filters. Frames of recordings have none.
         notes: Gets sentences about what was assumed.
 
     Raises:
@@ -220,7 +298,7 @@ def open_video(
         frames, times = _frames_of_recording(path, fps, size)
         found = 1.0
     else:
-        frames = FrameReader(path, size)
+        frames = FrameReader(path, size, colour=colour)
         times = _video_times(path, frames, fps)
         found = _file_gamma(path)
     if gamma is None:
@@ -255,8 +333,8 @@ def join_frames(
             gap = 1e3 * float(np.median(np.diff(times)))
             notes.append(f"frames are {gap:.1f} ms apart and joined by straight lines")
         return VideoScene(frames, times, gamma=gamma)
-    kept = _all_frames(frames) if isinstance(frames, FrameReader) else frames
-    scene = CameraScene(kept, times, gamma=gamma)
+    kept, colours = _all_frames(frames) if isinstance(frames, FrameReader) else (frames, None)
+    scene = CameraScene(kept, times, gamma=gamma, colours=colours)
     share = scene.trusted().mean()
     gap = 1e3 * float(np.median(np.diff(times)))
     notes.append(
@@ -306,19 +384,26 @@ def _file_gamma(path: Path) -> float:
     return 1 / said if isinstance(said, float) and 0.1 <= said <= 10 else SRGB_GAMMA
 
 
-def _all_frames(reader: FrameReader, most: int = 8 << 30) -> NDArray[np.uint16]:
-    """Return all frames, of 16 bits, as motion is looked for in all of them."""
-    size = 2 * int(np.prod(reader.shape))
+def _all_frames(
+    reader: FrameReader, most: int = 8 << 30
+) -> tuple[NDArray[np.uint16], NDArray[np.uint16] | None]:
+    """Return all frames, of 16 bits, as motion is looked for in all of them, and their colours if kept."""
+    planes = 4 if reader.colour else 1
+    size = 2 * planes * int(np.prod(reader.shape))
     if size > most:
         raise InputError(
             f"video: its frames need {size / (1 << 30):.1f} GiB of memory to follow their motion, more than "
             f"{most >> 30}: cut it into parts, give a smaller size, or join frames by lines",
             argument="between",
         )
-    out = np.empty(reader.shape, np.uint16)
+    grey = np.empty(reader.shape, np.uint16)
+    colours = np.empty((reader.shape[0], 3, *reader.shape[1:]), np.uint16) if reader.colour else None
     for index in range(len(reader)):
-        out[index] = np.rint(np.float32(65535) * reader[np.array([index])][0])
-    return out
+        levels = np.rint(np.float32(65535) * reader.planes(np.array([index]))[0])
+        grey[index] = levels[0]
+        if colours is not None:
+            colours[index] = levels[1:]
+    return grey, colours
 
 
 def _is_recording(path: Path) -> bool:

@@ -124,6 +124,17 @@ class Sensor:
             scene = effect.seen(scene) if isinstance(effect, SceneEffect) else scene
         return scene
 
+    def in_frames(self, scene: Scene) -> Scene:
+        """Return what frames show of `scene` that are taken beside the events."""
+        for effect in self.effects:
+            if isinstance(effect, SceneEffect) and effect.in_frames:
+                scene = effect.seen(scene)
+        return scene
+
+    def sees_colour(self) -> bool:
+        """Whether it matters to the pixels what colour light has."""
+        return any(isinstance(e, SceneEffect) and e.needs_colour and not e.is_off() for e in self.effects)
+
     def readout_effects(self) -> tuple[StreamEffect, ...]:
         """Return the effects behind the pixels that are not off."""
         return tuple(e for e in self.effects if isinstance(e, StreamEffect) and not e.is_off())

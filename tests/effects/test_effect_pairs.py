@@ -11,6 +11,7 @@ from helpers.small_scenes import flicker, still
 import dase
 from dase.effects.anti_flicker import AntiFlicker
 from dase.effects.bandwidth import Bandwidth
+from dase.effects.bayer import Bayer
 from dase.effects.dark import Dark
 from dase.effects.double_events import DoubleEvents
 from dase.effects.flicker import Flicker
@@ -36,6 +37,7 @@ def all_on(mode: str) -> dase.Sensor:
     """Return a sensor on which every effect there is is on, and seen."""
     more = (
         OpticsBlur(sigma=0.4),
+        Bayer(purity=0.8),
         Bandwidth(cutoff=400.0),
         LearnedThreshold(
             weights="stands for a file", bound=np.full((2, 8, 10), [[[1.1]], [[0.2]]], np.float32)
@@ -61,7 +63,10 @@ def all_on(mode: str) -> dase.Sensor:
 
 @pytest.mark.parametrize("mode", ["reset", "drop", "delay"])
 def test_all_effects_on(device, rng, mode):
-    scene, sensor = flicker(rng), all_on(mode)
+    grey, sensor = flicker(rng), all_on(mode)
+    times = grey.sample_times()
+    tint = np.float32([1.0, 0.8, 0.5])
+    scene = dase.VideoScene(grey.frames(times)[..., None] * tint, times)
     whole = dase.Events.concatenate(dase.stream(scene, sensor, seed=3, device=device, chunk=10**6))
     for chunk in (7, 64):
         same(dase.Events.concatenate(dase.stream(scene, sensor, seed=3, device=device, chunk=chunk)), whole)

@@ -147,5 +147,5 @@ def test_fine_texture_fades(device):
 def test_stored_logarithms_are_refused(rng):
     scene = flicker(rng)
     scene.source = lambda times, pixels, device: ("log", pixel_stages.Frames())
-    with pytest.raises(dase.InputError, match="optics_blur needs intensities"):
+    with pytest.raises(dase.InputError, match="optics_blur and bayer need intensities"):
         dase.simulate(scene, dase.Sensor((OpticsBlur(), Threshold())))

@@ -103,7 +103,7 @@ def test_cut_outs_carry_the_pixels_of_the_picture(rng):
     y, x = np.mgrid[:80, :120].astype(np.float32)
     grey = (y * 120 + x) / 9600  # every value names its place
     for _ in range(30):
-        picture = image_sources.cut_random_shape(grey, rng)
+        picture = image_sources.cut_random_shape(Picture(grey), rng)
         inside = picture.alpha > 0
         at = np.round(picture.grey * 9600).astype(int)
         rows, columns = np.nonzero(inside)
