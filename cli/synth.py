@@ -60,6 +60,17 @@ if TYPE_CHECKING:
     show_default=True,
     help="Of each stored frame [s], which blurs it; the sensor's effect `exposure` is then in step with it.",
 )
+@click.option(
+    "--stereo",
+    type=float,
+    default=0.0,
+    show_default=True,
+    help="Baseline of a pair of cameras [m]: files of both, and disparity and depth beside each.",
+)
+@click.option("--focal", default=0.0, help="Of the pair [px].  [default: the width]")
+@click.option(
+    "--depths", type=(float, float), default=(1.0, 10.0), show_default=True, help="Nearest, farthest [m]."
+)
 @click.option("--labels", is_flag=True, help="Mark events as signal, leak, shot noise or hot pixel.")
 @device_or_backend_option
 @click.option(
@@ -95,6 +106,9 @@ def synth_command(
     format_: str,
     frame_rate: float,
     exposure: float,
+    stereo: float,
+    focal: float,
+    depths: tuple[float, float],
     labels: bool,
     device: str,
     video: Path | None,
@@ -111,7 +125,10 @@ def synth_command(
     With --video, the events of your own high-speed video are written to the file OUT instead.
     """
     if video is not None:
-        refuse_beside("--video", "images", "sequences", "duration", "regime", "jobs", "format_", "resume")
+        refuse_beside(
+            "--video", "images", "sequences", "duration", "regime", "jobs", "format_", "resume", "stereo",
+            "focal", "depths",
+        )  # fmt: skip
         _synth_video(
             out, video, fps, sensor, effects, size, seed, device, frame_rate, exposure, labels, gamma, between
         )
@@ -138,11 +155,14 @@ def synth_command(
         backend=device,
         frame_rate=frame_rate,
         exposure=exposure,
+        stereo=stereo,
+        focal=focal,
+        depths=depths,
         labels=labels,
         effects=tuple(map(str, effects)),
     )
     count = jobs if jobs is not None else (1 if device.startswith("cuda") else os.cpu_count() or 1)
-    with _progress_bar(sequences, "sequences") as advance:
+    with _progress_bar(job.files, "sequences") as advance:
         report = generate.generate_dataset(
             job, out, jobs=count, resume=resume, progress=advance, say=lambda line: click.echo(line, err=True)
         )

@@ -15,6 +15,7 @@ from hashlib import sha256
 from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
+from zipfile import BadZipFile
 
 import numpy as np
 import tomlkit
@@ -33,6 +34,7 @@ from dase.kernels.threads import thread_count
 from dase.scenes import image_sources, random_scenes
 from dase.scenes.layers import LayerScene
 from dase.scenes.scene import Scene, to_grey
+from dase.scenes.stereo import StereoPair, stereo_pair
 from dase.simulation.pixel_array import PixelArray
 from dase.simulation.sensor import Sensor
 from dase.simulation.sensor_file import dump_sensor, parse_sensor
@@ -68,6 +70,10 @@ class DatasetJob:
         effects: Files with effects of the user's own that the sensor names.
         exposure: Of each frame [s], at most a frame's period; 0 for frames taken in an instant. The frames
             are blurred as they would be, and the effect `exposure` of the sensor is in step with them.
+        stereo: Baseline of a pair of cameras [m], 0 for one camera. Each sequence then has a file for the
+            left and one for the right camera, with disparity and depth at the frames' times beside each.
+        focal: Focal length of the pair [px], 0 for as long as the picture is wide.
+        depths: Of the nearest and the farthest layer of a pair [m]; layers lie at random between.
     """
 
     images: str
@@ -84,6 +90,9 @@ class DatasetJob:
     labels: bool = False
     effects: tuple[str, ...] = ()
     exposure: float = 0.0
+    stereo: float = 0.0
+    focal: float = 0.0
+    depths: tuple[float, float] = (1.0, 10.0)
 
     def __post_init__(self) -> None:
         if self.sequences < 1:
@@ -108,6 +117,12 @@ class DatasetJob:
                 f"exposure must be at most the duration, {self.duration:g} s, got {self.exposure:g}"
             )
         _check_exposure(self.exposure, self.frame_rate)
+        if not (np.isfinite((self.stereo, self.focal)).all() and min(self.stereo, self.focal) >= 0):
+            raise InputError(
+                f"stereo: baseline and focal must be numbers >= 0, got {self.stereo:g} and {self.focal:g}"
+            )
+        if not 0 < self.depths[0] <= self.depths[1] < np.inf:
+            raise InputError(f"depths must be 0 < nearest <= farthest, got {self.depths}")
         if self.regime not in random_scenes.REGIME_NAMES:
             raise InputError(
                 f"there is no regime '{self.regime}': {nearest(self.regime, random_scenes.REGIME_NAMES)}"
@@ -120,8 +135,10 @@ class DatasetJob:
         document.add("dase", __version__)
         for name, value in asdict(self).items():
             # what is off is not said, so that a record stays what it was before there was such a thing
-            if name not in ("sensor", "effects") and (name != "exposure" or value):
-                document.add(name, value)
+            off = name in ("exposure", "stereo") and not value
+            off = off or (name in ("focal", "depths") and not self.stereo)
+            if name not in ("sensor", "effects") and not off:
+                document.add(name, list(value) if isinstance(value, tuple) else value)
         if self.effects:  # what is in the files determines the bytes, not where they lie
             files = (Path(path) for path in self.effects)
             document.add("effects", [f"{f.name} sha256:{sha256(f.read_bytes()).hexdigest()}" for f in files])
@@ -132,9 +149,26 @@ class DatasetJob:
         document.add("sensor", sensor)
         return tomlkit.dumps(document)
 
+    @property
+    def files(self) -> int:
+        """How many files of events there are: one of each sequence and camera."""
+        return self.sequences * (2 if self.stereo else 1)
+
+    def view(self, index: int) -> tuple[int, str]:
+        """Return the sequence of a file and its camera, left or right, "" where there is only one."""
+        if not self.stereo:
+            return index, ""
+        return index // 2, ("left", "right")[index % 2]
+
     def path(self, out: Path, index: int) -> Path:
-        """Return the file of one sequence."""
-        return out / f"sequence_{index:05d}.{self.format}"
+        """Return a file of events by its number, that of its sequence where there is one camera."""
+        sequence, view = self.view(index)
+        return out / f"sequence_{sequence:05d}{'_' * bool(view)}{view}.{self.format}"
+
+    def truth_path(self, out: Path, index: int) -> Path:
+        """Return the file of disparity and depth beside that of the events of one camera of a pair."""
+        path = self.path(out, index)
+        return path.with_name(f"{path.stem}_truth.npz")
 
 
 @dataclass(frozen=True)
@@ -220,7 +254,7 @@ def _check_record(job: DatasetJob, out: Path, resume: bool) -> None:
                 f"{out} was begun with other options (see {record}); to resume takes the same ones"
             )
     elif not resume:
-        there = next((path for i in range(job.sequences) if (path := job.path(out, i)).exists()), None)
+        there = next((path for i in range(job.files) if (path := job.path(out, i)).exists()), None)
         if there is not None:
             raise InputError(
                 f"{out} holds '{there.name}', but no {RECORD_FILE} that says what made it: "
@@ -233,13 +267,13 @@ def _prepare_folder(job: DatasetJob, out: Path, resume: bool, say: Callable[[str
     _check_record(job, out, resume)  # again: another run may just have ended
     with io.replacing(out / RECORD_FILE) as temporary:
         temporary.write_bytes(job.text().encode())
-    return [i for i in range(job.sequences) if not _is_made(job, out, i, say)]
+    return [i for i in range(job.files) if not _is_made(job, out, i, say)]
 
 
 def _is_made(job: DatasetJob, out: Path, index: int, say: Callable[[str], object]) -> bool:
     """Whether a sequence is there: whole, and by its own record of this job."""
     path = job.path(out, index)
-    if not path.exists():
+    if not path.exists() or (job.stereo and not _is_truth(job.truth_path(out, index))):
         return False
     try:
         for _ in io.stream(path):
@@ -258,6 +292,15 @@ def _is_made(job: DatasetJob, out: Path, index: int, say: Callable[[str], object
     os.rename(path, aside)
     say(f"{path} is of another job: set aside as '{aside.name}', and made again")
     return False
+
+
+def _is_truth(path: Path) -> bool:
+    """Whether a file of disparity and depth is whole."""
+    try:
+        with np.load(path) as found:
+            return all(len(found[name]) == len(found["times"]) for name in ("disparity", "depth"))
+    except (OSError, ValueError, KeyError, EOFError, BadZipFile):
+        return False
 
 
 def _make_sequences(
@@ -406,8 +449,32 @@ def _exposure_begins(
 
 
 def make_scene(job: DatasetJob, index: int) -> LayerScene:
-    """Return the scene of one sequence."""
-    rng = np.random.default_rng([job.seed, index])
+    """Return the scene of one file of events."""
+    sequence, view = job.view(index)
+    if view:
+        return getattr(make_pair(job, sequence), view)  # type: ignore[no-any-return]
+    return _draw_scene(job, sequence)
+
+
+def make_pair(job: DatasetJob, sequence: int) -> StereoPair:
+    """Return what both cameras see of one sequence, its layers at random depths."""
+    scene = _draw_scene(job, sequence)
+    rng = np.random.default_rng([job.seed, sequence, 2])
+    near, far = np.log(job.depths)
+    depths = np.sort(np.exp(rng.uniform(near, far, len(scene.layers))))[::-1]
+    return stereo_pair(scene, depths.tolist(), baseline=job.stereo, focal=job.focal or job.width)
+
+
+def _write_truth(job: DatasetJob, out: Path, index: int, times: NDArray[np.float64]) -> None:
+    """Write disparity and depth of one camera at `times` [s], shape (F,)."""
+    sequence, view = job.view(index)
+    disparity, depth = make_pair(job, sequence).labels(times, job.backend, right=view == "right")
+    with io.replacing(job.truth_path(out, index)) as temporary, temporary.open("wb") as file:
+        np.savez_compressed(file, times=times, disparity=disparity, depth=depth)
+
+
+def _draw_scene(job: DatasetJob, sequence: int) -> LayerScene:
+    rng = np.random.default_rng([job.seed, sequence])
     return random_scenes.draw_scene(
         rng,
         _open_images_once(job.images, _sensor_of(job).sees_colour()),
@@ -425,7 +492,10 @@ def _sensor_seed(job: DatasetJob, index: int) -> int:
 
 def _configuration(job: DatasetJob, index: int) -> str:
     """Return the text in the file of a sequence, which says of what job it is."""
-    return job.text() + f"\n[sequence]\nindex = {index}\nsensor_seed = {_sensor_seed(job, index)}\n"
+    sequence, view = job.view(index)
+    camera = f'camera = "{view}"\n' if view else ""
+    seed = _sensor_seed(job, index)
+    return job.text() + f"\n[sequence]\nindex = {sequence}\n{camera}sensor_seed = {seed}\n"
 
 
 def make_sequence(job: DatasetJob, out: Path, index: int, interrupt: DeferredInterrupt) -> WorkReport:
@@ -449,6 +519,8 @@ def _begin_sequence(
         labels=job.labels,
     )  # fmt: skip
     begins = _exposure_begins(0.0, scene.duration, job.frame_rate, job.exposure)
+    if job.stereo:
+        _write_truth(job, out, index, begins + job.exposure / 2)
     return _Recording(job.path(out, index), _configuration(job, index), run, begins, job.exposure, begin)
 
 
