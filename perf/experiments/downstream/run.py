@@ -5,16 +5,16 @@
 
 Four targets with physics beyond thresholds (`sensors.py`) are recorded for 60 s each. Networks are
 trained on ESIM's default, on broad randomisation, and for each target on S2R's tuned threshold, on what
-`dase.fit` makes of the recording, and on the true sensor; then tested on each target's simulated scenes
-of photographs that no training has seen. The same seed has the same first weights and scenes whatever
-the sensor. Each training stands alone: it is checkpointed, `--minutes` ends a call, the same call goes
-on, and several machines may take `--seeds` apart. `--jobs` trainings share a device: each is small, and
-waits for Python more than for the GPU. What waits for no fit comes first and seed by seed, so that a
-call that ends early leaves whole tables of fewer seeds; a fit takes up to an hour of a core, which
-machines without a GPU can spend. `results.jsonl` has a line for each network and target, `sensors/`
-what was tuned and fitted: with both in OUT, another machine goes on. `results.jsonl` and
-`learned_sensors/` of this folder are of photographs that are no part of the project. `--photos` may be a
-tar of pictures.
+`dase.fit` makes of the recording, on volumes of EventGAN (reconstruction alone), and on the true sensor;
+then tested on each target's simulated scenes of photographs that no training has seen. The same seed has
+the same first weights and scenes whatever the sensor. Each training stands alone: it is checkpointed,
+`--minutes` ends a call, the same call goes on, and several machines may take `--seeds` apart. `--jobs`
+trainings share a device: each is small, and waits for Python more than for the GPU. What waits for no fit
+comes first and seed by seed, so that a call that ends early leaves whole tables of fewer seeds; a fit
+takes up to an hour of a core, which machines without a GPU can spend. `results.jsonl` has a line for each
+network and target, `sensors/` what was tuned and fitted: with both in OUT, another machine goes on.
+`results.jsonl` and `learned_sensors/` of this folder are of photographs that are no part of the project.
+`--photos` may be a tar of pictures.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ import time
 import traceback
 from collections.abc import Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -41,6 +41,7 @@ from dase.files.atomic_file import replacing
 from dase.tasks.flow_metrics import flow_errors
 from dase.tasks.image_metrics import structural_similarity
 from dase.torch import Batch
+from perf.experiments.downstream.eventgan import EventGan, GanTraining, save_eventgan, train_eventgan
 from perf.experiments.downstream.sensors import (
     FAST,
     KINDS,
@@ -48,6 +49,7 @@ from perf.experiments.downstream.sensors import (
     OF_NO_TARGET,
     TARGETS,
     VIEW,
+    WITHOUT_FLOW,
     Training,
     broad_thresholds,
     fit_target,
@@ -56,6 +58,9 @@ from perf.experiments.downstream.sensors import (
     tune_threshold,
     tuned_thresholds,
 )
+
+FILES = {"tune": ".json", "fit": ".toml", "gan": ".pt"}
+"""Ends of the names of what is learned from a target's recording."""
 
 
 class OutOfTime(Exception):
@@ -77,6 +82,7 @@ class Size:
         reconstruction_steps: Batches of a training.
         flow_steps: Batches of a training.
         samples: Of a window.
+        gan_steps: Of the generator of EventGAN.
         recorded: Duration of a target's recording [s].
         test_batches: On each target.
         backgrounds: Pictures in a pool.
@@ -93,6 +99,7 @@ class Size:
     reconstruction_steps: int = 500
     flow_steps: int = 12000
     samples: int = 16
+    gan_steps: int = 3000
     recorded: float = 60.0
     test_batches: int = 8
     backgrounds: int = 48
@@ -116,7 +123,7 @@ SMALL = Size(
     crop=(32, 32), windows=4, batch=2, flow_batch=2, flow_windows=2, reconstruction_channels=4,
     flow_channels=4,
     reconstruction_steps=4,
-    flow_steps=4, samples=8, recorded=1.0, test_batches=1, backgrounds=3, objects=4,
+    flow_steps=4, samples=8, gan_steps=2, recorded=1.0, test_batches=1, backgrounds=3, objects=4,
 )  # fmt: skip
 """As little as shows that all parts work together."""
 
@@ -153,16 +160,20 @@ class Study:
             first_batch=first,
         )  # fmt: skip
 
+    def check_time(self) -> None:
+        """Raise OutOfTime where the call is to end."""
+        if time.monotonic() > self.deadline:
+            raise OutOfTime
+
     def timed(self, batches: dase.torch.Stream) -> Iterator[Batch]:
         """Yield batches until the call ends."""
         for batch in batches:
-            if time.monotonic() > self.deadline:
-                raise OutOfTime
+            self.check_time()
             yield batch
 
     def learned_file(self, task: str, target: str) -> Path:
-        """Return the file of what `tune` or `fit` has learned from a target's recording."""
-        return self.out / "sensors" / f"{target}{'.json' if task == 'tune' else '.toml'}"
+        """Return the file of what a task of LEARNED_BY has learned from a target's recording."""
+        return self.out / "sensors" / f"{target}{FILES[task]}"
 
     def learned(self) -> set[tuple[str, str]]:
         """Return the tasks of LEARNED_BY that are done, each with its target."""
@@ -174,6 +185,14 @@ class Study:
         path = self.learned_file(task, target)
         path.parent.mkdir(parents=True, exist_ok=True)
         recorded = record_target(TARGETS[target], self.train, self.size.recorded, self.device)
+        if task == "gan":
+            settings = GanTraining(steps=self.size.gan_steps, crop=self.size.crop)
+            made = train_eventgan(
+                recorded.events, recorded.frames, recorded.times, self.device, settings, self.check_time
+            )
+            print(f"eventgan {target}: scale {made['scale']}, {json.dumps(made['log'])}", flush=True)
+            save_eventgan(path, made)
+            return
         if task == "fit":
             text = dase.dump_sensor(fit_target(recorded, self.device))
         else:
@@ -196,6 +215,9 @@ class Study:
         if kind == "tuned":
             base = json.loads(self.learned_file("tune", target).read_text("utf-8"))["tuned"]
             return Training(plain_sensor(base), tuned_thresholds(base))
+        if kind == "eventgan":
+            # its scenes are taken, and not its events
+            return Training(plain_sensor(0.2), remake=EventGan(self.learned_file("gan", target)))
         return Training(dase.load_sensor(self.learned_file("fit", target)))
 
     def folder(self, job: Job) -> Path:
@@ -210,7 +232,8 @@ class Study:
         how, size, folder = self.training(kind, target), self.size, self.folder(job)
 
         def batches(first: int) -> Iterator[Batch]:
-            return self.timed(self.stream(task, how, self.train, seed, first))
+            for batch in self.timed(self.stream(task, how, self.train, seed, first)):
+                yield batch if how.remake is None else replace(batch, inputs=how.remake(batch))
 
         options = {"seed": seed, "device": self.device, "save_every": 100, "stop_at": stop_at}
         if task == "flow":
@@ -310,7 +333,10 @@ def study_plan(
         known = [kind for kind in some if kind not in OF_NO_TARGET]
         each = [(kind, "") for kind in some if kind in OF_NO_TARGET]
         each += [(kind, target) for target in targets for kind in known]
-        return [Job(task, kind, target, seed) for seed in seeds for kind, target in each for task in tasks]
+        return [
+            Job(task, kind, target, seed) for seed in seeds for kind, target in each for task in tasks
+            if task != "flow" or kind not in WITHOUT_FLOW
+        ]  # fmt: skip
 
     def learning(some: Sequence[str]) -> list[Job]:
         return [

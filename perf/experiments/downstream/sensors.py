@@ -11,6 +11,7 @@ import torch
 
 import dase
 from dase.effects import EFFECTS
+from dase.torch import Batch
 
 VIEW = (240, 180)
 """Columns and rows of the targets."""
@@ -48,11 +49,13 @@ START = sensor_with(
 )  # fmt: skip
 """From which fits set out: every effect that a user would try, at usual values; the same for all targets."""
 
-KINDS = ("esim", "broad", "tuned", "fitted", "true")
+KINDS = ("esim", "broad", "tuned", "eventgan", "fitted", "true")
 """What is trained on; the first two do not know their target."""
 OF_NO_TARGET = KINDS[:2]
-LEARNED_BY = {"tuned": "tune", "fitted": "fit"}
+LEARNED_BY = {"tuned": "tune", "eventgan": "gan", "fitted": "fit"}
 """What is learned from a target's recording, and the task that does so."""
+WITHOUT_FLOW = ("eventgan",)
+"""Kinds that are not trained for flow: windows are few there, and the first has no frame before it."""
 
 FLIPS = dase.torch.Augment(flips=0.5)
 
@@ -65,11 +68,13 @@ class Training:
         sensor: As it is, or its middle.
         randomise: As `dase.torch.Stream` takes it.
         augment: As `dase.torch.Stream` takes it.
+        remake: Returns the inputs of a batch, where those of the sensor are not taken.
     """
 
     sensor: dase.Sensor
     randomise: Callable[[np.random.Generator, int], dict[str, Any]] | None = None
     augment: dase.torch.Augment = FLIPS
+    remake: Callable[[Batch], torch.Tensor] | None = None
 
 
 def tuned_thresholds(base: float) -> Callable[[np.random.Generator, int], dict[str, Any]]:
