@@ -272,21 +272,20 @@ between two frames of a camera is a guess: only where it can be trusted anything
 Thresholds are no claim where more than a tenth of the error is left. [How to read
 this](reading-a-diagnosis.md).
 
-What is certain is looked for in all events. `davis240c_camerashake` shows frame coupling that way (every
-138.07 ms, 15 times the rate, 13 % of the events), light at 100.15 Hz (swing 0.25) and rows read together 8
-times as often as by chance (`dase info --signatures`, b58310e); at c1cbc74 its first second alone was
-looked at, and seven frames are too few for bursts to be seen in step with them.
+What is certain is looked for in all events. In `davis240c_camerashake` that is all that can be seen by eye:
+frame coupling, the lamps at 100.15 Hz and rows that are read together. Its first second alone, which was looked
+at until c1cbc74, has seven frames, too few for bursts to be seen in step with them.
 
 The frames of `davis240b_evbench1` have no times: they are set as far apart as its bursts are, 50.96 ms. At
 whole milliseconds (51 ms) the bursts that are left out drifted by 0.8 ms, and its light at 120 Hz was too
-little to tell from chance; so it is below, at c1cbc74. (A diagnosis with even bursts, in which the lamp is
-certain, took more than nine minutes on one busy core and was stopped.) Four of its five hot pixels are
-named; the fifth (27, 70) sends 990 events per second where edges pass all the time, so none of them is calm.
+little to tell from chance. Four of its five hot pixels are named; the fifth (27, 70) sends 990 events per
+second where edges pass all the time, so none of them is calm.
 
 Rows of `psee_gen31_dot` and columns of `davis346_cuke_cradle` were called grouped until signatures knew
 edges that move, which make the same; of either too few events are left beside edges to say anything.
-The cradle's below is from before. So are the thresholds of `dvx_noise_static`: where the light never
-changes none is fitted any more (bcf49ae), and what stands below of them is no claim.
+
+Times are of a core of an AMD EPYC that other programs used as well, that of `noise_iebcs` with a pause of six
+minutes in it: of no use as a speed.
 
 `noise_iebcs` has ON events alone in the light, 0.06 Hz at 161 and 0.13 Hz at 3,000 lux, beside 9.7 Hz at 0.1
 lux. Two seconds have some 25 of them among the pixels that are compared, and no leak is found. Tried and
