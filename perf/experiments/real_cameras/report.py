@@ -273,8 +273,8 @@ Thresholds are no claim where more than a tenth of the error is left. [How to re
 this](reading-a-diagnosis.md).
 
 What is certain is looked for in all events. In `davis240c_camerashake` that is all that can be seen by eye:
-frame coupling, the lamps at 100.15 Hz and rows that are read together. Its first second alone, which was looked
-at until c1cbc74, has seven frames, too few for bursts to be seen in step with them.
+frame coupling, the lamps at 100.15 Hz and rows that are read together. Its first second alone, which was
+looked at until c1cbc74, has seven frames, too few for bursts to be seen in step with them.
 
 The frames of `davis240b_evbench1` have no times: they are set as far apart as its bursts are, 50.96 ms. At
 whole milliseconds (51 ms) the bursts that are left out drifted by 0.8 ms, and its light at 120 Hz was too
