@@ -254,10 +254,13 @@ def _asked_of_scene(entries: Collection[Signature], scene: Scene) -> list[Signat
 
 
 def _with_thresholds(sensor: Sensor, times: float) -> Sensor:
-    """Return a sensor whose thresholds are some times as high."""
+    """Return a sensor whose thresholds are some times as high, but not below the least that there are."""
     now = sensor["threshold"]
     assert isinstance(now, Threshold)
-    return sensor.with_effect(replace(now, on=times * now.on, off=times * now.off))
+    least = {p.name: p.bounds[0] for p in now.parameters()}
+    return sensor.with_effect(
+        replace(now, on=max(times * now.on, least["on"]), off=max(times * now.off, least["off"]))
+    )
 
 
 def _signatures_of(scene: Scene, sensor: Sensor, seed: int) -> tuple[Signature, ...]:

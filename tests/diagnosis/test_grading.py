@@ -216,6 +216,16 @@ def test_light_that_flickers_in_the_clip_is_not_of_the_camera(scene):
         assert ("flicker" in kept.effects) == left
 
 
+def test_a_lamp_is_asked_of_a_model_with_the_least_thresholds(scene):
+    """It is asked with lower thresholds, too; a sensor cannot have a quarter of the least that there are."""
+    lit = Sensor().with_effect(EFFECTS["flicker"](frequency=100.0, depth=0.3))
+    measurement = Measurement(dase.simulate(scene, lit, seed=1), scene)
+    seen = find_seen_effects(measurement, EFFECTS)
+    least = Sensor().with_effect(EFFECTS["threshold"](on=0.02, off=0.01))
+    kept = without_the_scene(seen, measurement, least, 5)
+    assert "flicker" in kept.effects
+
+
 @pytest.mark.parametrize("swings", [True, False])
 def test_a_pattern_that_returning_edges_make_is_not_of_the_camera(swings):
     """Edges that come back to the same pixels make a pattern; they come back in a camera's frames, too."""
