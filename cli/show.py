@@ -52,7 +52,7 @@ def show_command(
     from dase.errors import InputError, printable
     from dase.figures import event_images
     from dase.recordings import summary
-    from dase.recordings.statistics import sequence_statistics
+    from dase.recordings.statistics import survey_sequence
 
     if file.is_dir() and (file / "job.json").is_file():
         _draw_run(file, output or file / "learned.png")
@@ -66,7 +66,7 @@ def show_command(
     if trust and (suffix == ".mp4" or at is not None):
         raise InputError("trust: is a picture of several moments, which takes neither --at nor .mp4")
     sequence = io.read(file, **reading)
-    statistics = sequence_statistics(sequence)
+    survey = survey_sequence(sequence)
     if trust:
         _draw_trust(sequence, output, printable(file.stem), window)
     elif suffix == ".mp4":
@@ -76,11 +76,11 @@ def show_command(
             )
     else:
         figure = event_images.draw_sequence(
-            sequence, title=printable(file.stem), at=at, window=window, statistics=statistics
+            sequence, title=printable(file.stem), at=at, window=window, survey=survey
         )
         with io.replacing(output) as temporary:
             figure.savefig(temporary)
-    for name, value in summary.statistics_table(statistics):
+    for name, value in summary.statistics_table(survey.statistics()):
         click.echo(f"{name:<18}{value}")
     click.echo(f"{'written':<18}{output}")
 

@@ -87,27 +87,3 @@ def count_short_intervals(
         last_interval[place] = interval
         last[place] = time[i]
         last_polarity[place] = sign
-
-
-@wp.kernel
-def list_intervals(
-    # in
-    time: wp.array[wp.float64],  # (N,) [s], not decreasing
-    x: wp.array[wp.uint16],  # (N,)
-    y: wp.array[wp.uint16],  # (N,)
-    width: int,
-    # in and out
-    last: wp.array[wp.float64],  # (H * W,) [s], when each pixel was last seen; not a number for never
-    found: wp.array[wp.int64],  # (1,) how many intervals there are
-    interval_out: wp.array[wp.float64],  # (N,) [s], as many as are found
-):
-    """List the times since the event before of the same pixel, event by event. Called with dim=1."""
-    count = found[0]
-    for i in range(time.shape[0]):
-        place = int(y[i]) * width + int(x[i])
-        interval = time[i] - last[place]
-        if interval == interval:
-            interval_out[int(count)] = interval
-            count += wp.int64(1)
-        last[place] = time[i]
-    found[0] = count

@@ -30,12 +30,13 @@ from dase.kernels.pixel_codegen_cuda import kernel_head, loop_over_windows, step
 from dase.kernels.pixel_codegen_model import PixelModel
 from dase.kernels.pixel_codegen_program import (
     Program,
-    draw_numbers,
     intensity_of_log,
     keep_states,
     make_program,
+    numbers_drawn_once,
     pixel_places,
     put_counts,
+    take_numbers,
     zero_counts,
 )
 from dase.kernels.threshold_counts import block_functions, light_of
@@ -250,7 +251,7 @@ def print_block_kernel(model: PixelModel, lanes: int) -> str:
         layout.lay_out_all(put_counts(model)),
     )
     body = (*_prepare_block(program, layout), windows, *layout.lay_out(keep_states(model)))
-    return print_kernel(kernel_head(model), body)
+    return print_kernel(kernel_head(model, drawn=bool(numbers_drawn_once(program.draws))), body)
 
 
 def _prepare_block(program: Program, layout: Lanes) -> tuple[Statement, ...]:
@@ -262,7 +263,8 @@ def _prepare_block(program: Program, layout: Lanes) -> tuple[Statement, ...]:
     own = (
         *lines("pixel = pixels[i]", "on = nominal_on", "off = nominal_off"),
         *pixel_places(model),
-        *draw_numbers(program.draws),
+        # cosines and logarithms of the C library, one pixel after the other, took a fifth of a chunk
+        *take_numbers(program.draws),
         *program.begin,
     )
     return (

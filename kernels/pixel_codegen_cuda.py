@@ -122,12 +122,18 @@ def print_threshold_kernel(model: PixelModel) -> str:
     return print_kernel(head, body)
 
 
-def kernel_head(model: PixelModel) -> list[str]:
-    """Return the lines that name the kernel of a sensor and its arguments, whatever its threads do."""
+def kernel_head(model: PixelModel, *, drawn: bool = False) -> list[str]:
+    """Return the lines that name the kernel of a sensor and its arguments, whatever its threads do.
+
+    Args:
+        model: What the pixels are made from.
+        drawn: Whether numbers that a pixel draws once are handed over, see `numbers_drawn_once`.
+    """
     return [
         "def pixel_events(first: int, source: Source, clock: Clock, pixels: wp.array[int], width: int,",
         "                 height: int, begin: int, seed: int, parameters: wp.array2d[float],",
         *(["                 maps: wp.array2d[float],"] if model.maps else []),
+        *(["                 numbers: wp.array2d[float],"] if drawn else []),
         "                 state_in: wp.array3d[float], state_out: wp.array3d[float], sink: Sink):",
     ]
 

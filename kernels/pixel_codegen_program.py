@@ -107,6 +107,19 @@ def pixel_places(model: PixelModel) -> tuple[Statement, ...]:
     return lines(*found)
 
 
+def numbers_drawn_once(draws: Iterable[Draw]) -> tuple[Draw, ...]:
+    """Return the random numbers that a pixel draws once."""
+    return tuple(draw for draw in draws if draw.per_pixel)
+
+
+def take_numbers(draws: Iterable[Draw]) -> tuple[Statement, ...]:
+    """Return the statements that make the keys of a pixel's streams, and take what was drawn before."""
+    draws = tuple(draws)
+    once = numbers_drawn_once(draws)
+    keys = (f"{d.key} = key(seed, {stream_number(d.name)}, pixel)" for d in draws if not d.per_pixel)
+    return lines(*keys, *(f"{draw.name} = numbers[{at}, i]" for at, draw in enumerate(once)))
+
+
 def draw_numbers(draws: Iterable[Draw], *, presets: bool = False) -> tuple[Statement, ...]:
     """Return the statements that make the keys of a pixel's streams, and its numbers that are drawn once.
 

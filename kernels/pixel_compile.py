@@ -10,7 +10,9 @@ import warp as wp
 from dase.kernels.pixel_codegen_cpu import lane_scope, print_block_kernel
 from dase.kernels.pixel_codegen_cuda import print_pixel_kernel, print_threshold_kernel
 from dase.kernels.pixel_codegen_model import PixelModel, pixel_scope
+from dase.kernels.pixel_codegen_program import make_program, numbers_drawn_once
 from dase.kernels.pixel_stages import EffectStages
+from dase.kernels.random import normal, stream_key, stream_number, uniform
 from dase.kernels.vector_math import function_from_text, lane_options
 
 
@@ -26,13 +28,53 @@ def compose_pixels(stages: tuple[EffectStages, ...], source: str, sink: str, *, 
 
     Returns:
         A kernel over (B, N) threads, or (B, blocks of pixels); `kernel_head` of
-        `dase.kernels.pixel_codegen_cuda` names its arguments.
+        `dase.kernels.pixel_codegen_cuda` names its arguments. With lanes it takes what `streams_drawn_once`
+        says and `draw_once` draws, if that is anything.
     """
     scope = pixel_scope(PixelModel(stages, source, sink))
     scope |= lane_scope(lanes, source) if lanes else {}
     options = lane_options() if lanes else {}
     text, registers = source_text(stages, source, sink, lanes=lanes), register_bound(stages, lanes)
     return compile_text(text, "pixel_events", scope, registers=registers, **options)
+
+
+@lru_cache(maxsize=256)
+def streams_drawn_once(
+    stages: tuple[EffectStages, ...], source: str, sink: str
+) -> tuple[tuple[int, bool], ...]:
+    """Return the streams of which a pixel takes one number for good, and whether that is a normal one.
+
+    A GPU draws them anew in every chunk, which costs it no more than to read them would.
+    """
+    draws = numbers_drawn_once(make_program(PixelModel(stages, source, sink)).draws)
+    return tuple((stream_number(draw.name), draw.kind == "normal") for draw in draws)
+
+
+@lru_cache(maxsize=1)
+def drawing_kernel() -> wp.Kernel:
+    """Return the kernel of the numbers that pixels draw once, over (D, N) threads."""
+
+    @wp.kernel(enable_backward=False, module="unique", module_options=lane_options())
+    def draw_once(
+        first: int,
+        # in
+        pixels: wp.array[int],  # (N,) row-major indices
+        seed: int,
+        stream: wp.array[int],  # (D,)
+        is_normal: wp.array[int],  # (D,) 0 for a uniform number
+        # out
+        drawn_out: wp.array2d[float],  # (D, N)
+    ):
+        """Draw the number of one stream and pixel."""
+        d, i = wp.tid()
+        i += first
+        key = stream_key(seed, stream[d], pixels[i])
+        if is_normal[d] != 0:
+            drawn_out[d, i] = normal(key, 0)
+        else:
+            drawn_out[d, i] = uniform(key, 0)
+
+    return draw_once
 
 
 def register_bound(stages: tuple[EffectStages, ...], lanes: int) -> int | None:

@@ -62,7 +62,7 @@ def light_of(lanes: int, source: str, *, aligned: bool = False) -> Any:
     """Return the Warp function from a source to the intensity of `lanes` neighbouring pixels."""
     f = lane_functions(lanes)
     Source, Lanes = SOURCES[source], f.Lanes
-    load, background, foreground = f.load_aligned if aligned else f.load, f.background, f.foreground
+    load, background, layered = f.load_aligned if aligned else f.load, f.background, f.layered
 
     if source in ("frames", "log"):
 
@@ -81,13 +81,16 @@ def light_of(lanes: int, source: str, *, aligned: bool = False) -> Any:
 
         @wp.func
         def light(seen: Source, ground: BackgroundGeometry, k: int, n: int, x: Lanes, y: Lanes, near: int):
-            light = background(
-                x, y, seen.grey, seen.place[k, 0], ground.last, ground.corner, ground.step, ground.inverse,
-                ground.width,
-            )  # fmt: skip
             if wp.static(source == "layers"):
-                light = foreground(light, x, y, seen.texels, seen.start, seen.size, seen.place, k, near)
-            return light
+                return layered(
+                    x, y, seen.grey, ground.last, ground.corner, ground.step, ground.inverse, ground.width,
+                    seen.texels, seen.start, seen.size, seen.place, k, near,
+                )  # fmt: skip
+            else:
+                return background(
+                    x, y, seen.grey, ground.last, ground.corner, ground.step, ground.inverse, ground.width,
+                    seen.place, k,
+                )  # fmt: skip
 
     return light
 
@@ -116,7 +119,7 @@ def log_light_of(lanes: int, source: str, *, aligned: bool = False) -> Any:
 def block_functions(lanes: int) -> SimpleNamespace:
     """Return Warp functions for what `lanes` neighbouring pixels know before their first sample."""
     f = lane_functions(lanes)
-    Lanes, load = f.Lanes, f.load
+    Lanes, load, near_any = f.Lanes, f.load, f.layers_of
 
     @wp.func
     def thresholds(threshold: wp.array3d[float], b: int, p: int, n: int):
@@ -140,10 +143,7 @@ def block_functions(lanes: int) -> SimpleNamespace:
 
     @wp.func
     def layers_of(seen: Layers, x: Lanes, y: Lanes):
-        near = int(0)
-        for lane in range(wp.static(lanes)):
-            near |= layers_near(seen, x[lane], y[lane])
-        return near
+        return near_any(seen.box, seen.count, x, y)
 
     return SimpleNamespace(thresholds=thresholds, columns=columns, rows=rows, layers_of=layers_of)
 

@@ -31,7 +31,7 @@ def lane_options() -> dict[str, Any]:
     return {"fuse_fp": False, "cpu_compiler_flags": wide}
 
 
-# `background` and `foreground` compute what `dase.kernels.scene_layers` has as Warp functions, and both
+# `background` and `layered` compute what `dase.kernels.scene_layers` has as Warp functions, and both
 # must stay: compilers make no vectors of Warp's functions, which have a branch wherever a texel may be
 # missing; and one lane of the texts below would lack just these branches, which spare a GPU's thread masked
 # looks at texels, and give the gradient, which goes to texels one by one, nothing to build on.
@@ -185,10 +185,10 @@ V result = ABS(near * threshold) > ABS(change) ? near - step : near;
 """
     """Events of a change, below 2^21 of them: a division, and a floor on a GPU, are slow."""
 
-    background = """
-// place times (x, y, 1), then reflected, as in dase.kernels.scene_layers.background_at
-V u = (x * place.data[0][0] + y * place.data[0][1]) + place.data[0][2];
-V v = (x * place.data[1][0] + y * place.data[1][1]) + place.data[1][2];
+    look_at_ground = """
+// `ground` times (x, y, 1), then reflected, as in dase.kernels.scene_layers.background_at
+V u = (x * ground.data[0][0] + y * ground.data[0][1]) + ground.data[0][2];
+V v = (x * ground.data[1][0] + y * ground.data[1][1]) + ground.data[1][2];
 u = ABS(u - FLOOR(u * inverse[0] + 0.5f) * (2.0f * last[0]));
 v = ABS(v - FLOOR(v * inverse[1] + 0.5f) * (2.0f * last[1]));
 // rounding may end just beyond the last texel
@@ -204,7 +204,13 @@ V top = PAIR(grey.data, i, right);
 top = top + fu * (right - top);
 V bottom = PAIR(grey.data + step[1], i, right);
 bottom = bottom + fu * (right - bottom);
-V result = top + fv * (bottom - top);
+V light = top + fv * (bottom - top);
+"""
+
+    background = f"""
+const auto& ground = wp::index(place, k, 0);
+{look_at_ground}
+V result = light;
 """
 
     walk_layers = """
@@ -258,7 +264,7 @@ while (left != 0) {
 """
     """Goes through the layers in front of the background, the foremost first: `color` and `alpha` of each."""
 
-    foreground = f"""
+    layered = f"""
 V sum = x * 0.0f;
 V through = sum + 1.0f;
 {walk_layers}
@@ -267,7 +273,13 @@ V through = sum + 1.0f;
     // nothing behind an opaque layer is seen
     if (!ANY(through != 0.0f)) break;
 }}
-V result = sum + through * light;
+V result = sum;
+// last, as most blocks behind objects see nothing of it, and a look that waits keeps 32 texels somewhere
+if (ANY(through != 0.0f)) {{
+    const auto& ground = wp::index(place, k, 0);
+{look_at_ground}
+    result = sum + through * light;
+}}
 """
 
     foremost = f"""
@@ -321,6 +333,20 @@ if ({length} == 4 && ((size_t)to & 15) == 0) {{
 for (int lane = 0; lane < {length}; ++lane) to[lane] = lanes[lane];
 """
     # halves to even, as NumPy's rint has it
+    layers_of = """
+int near = 0;
+for (int layer = 1; layer < count; ++layer) {{
+    const auto& b = wp::index(box, layer);
+    // no branch for each lane, so that all are compared at once
+    int any = 0;
+    for (int l = 0; l < {length}; ++l) {{
+        any |= (x[l] >= b[0]) & (y[l] >= b[1]) & (x[l] <= b[2]) & (y[l] <= b[3]);
+    }}
+    near |= any << layer;
+}}
+return near;
+"""
+
     store_grey = """
 for (int lane = 0; lane < {length}; ++lane) {{
     const float level = rintf(lanes[lane] * 255.0f);
@@ -400,7 +426,8 @@ def lane_functions(length: int) -> SimpleNamespace:
     layers = "texels: wp.array[wp.vec2], start: wp.array[int], size: wp.array[wp.vec2i], "
     layers += "place: wp.array2d[Affine], k: int, near: int"
     rows = "values: wp.array2d[float], k: int, n: int"
-    ground = "grey: wp.array[float], place: Affine, last: wp.vec2, corner: wp.vec2i, step: wp.vec2i"
+    ground = "grey: wp.array[float], last: wp.vec2, corner: wp.vec2i, step: wp.vec2i, inverse: wp.vec2, "
+    ground += "width: int"
     return SimpleNamespace(
         Lanes=scope["Lanes"],
         load=plain("load", _Cpp.load, rows, "Lanes"),
@@ -410,6 +437,9 @@ def lane_functions(length: int) -> SimpleNamespace:
             "store_grey", _Cpp.store_grey, "values: wp.array[wp.uint8], n: int, lanes: Lanes", "None"
         ),
         store_whole=plain("store_whole", _Cpp.store, "values: wp.array[int], n: int, lanes: Lanes", "None"),
+        layers_of=plain(
+            "layers_of", _Cpp.layers_of, "box: wp.array[wp.vec4], count: int, x: Lanes, y: Lanes", "int"
+        ),
         minus=lanewise("minus", "V result = a - b;", "a b"),
         plus=lanewise("plus", "V result = a + b;", "a b"),
         plus_abs=lanewise("plus_abs", "V result = a + ABS(b);", "a b"),
@@ -428,9 +458,11 @@ def lane_functions(length: int) -> SimpleNamespace:
         ),
         natural=lanewise("natural", "V x = a;" + _Cpp.logarithm, "a", cuda="V result = logf(a);"),
         exponential=lanewise("exponential", _Cpp.exponential, "x", cuda="V result = expf(x);"),
-        foreground=lanewise("foreground", _Cpp.foreground, "light x y", layers),
+        layered=lanewise("layered", _Cpp.layered, "x y", f"{ground}, {layers}"),
         foremost=lanewise("foremost", _Cpp.foremost, "x y", layers),
-        background=lanewise("background", _Cpp.background, "x y", f"{ground}, inverse: wp.vec2, width: int"),
+        background=lanewise(
+            "background", _Cpp.background, "x y", f"{ground}, place: wp.array2d[Affine], k: int"
+        ),
     )
 
 

@@ -6,6 +6,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from collections.abc import Sequence as Items
+from itertools import pairwise
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -17,14 +18,14 @@ from numpy.typing import NDArray
 from dase.figures.style import Colour, ShownFigure
 from dase.formatting import format_seconds
 from dase.io.sequence import Sequence
-from dase.recordings.statistics import Statistics
+from dase.recordings.interval_statistics import IntervalStatistics
+from dase.recordings.statistics import RecordingSurvey, Statistics
 from dase.recordings.summary import statistics_table
 
 
 def draw_contact_sheet(
     sequence: Sequence,
-    statistics: Statistics,
-    between: NDArray[np.float64],
+    survey: RecordingSurvey,
     panels: Items[NDArray[np.uint8]],
     times: Items[float],
     window: float,
@@ -34,8 +35,7 @@ def draw_contact_sheet(
 
     Args:
         sequence: What is shown.
-        statistics: Its statistics.
-        between: Intervals between events of one pixel [s], in any order.
+        survey: What is in it.
         panels: Pictures, each (H, W, 3), red, green, blue.
         times: Their times [s].
         window: Span of the events in each [s].
@@ -46,7 +46,11 @@ def draw_contact_sheet(
     figure, pictures, (rate, histogram) = _lay_out(len(times), aspect)
     unknown = sequence.frames is not None and sequence.frame_times is None
     _draw_header(
-        figure, statistics, title, window, "times of frames unknown, spread evenly" if unknown else ""
+        figure,
+        survey.statistics(),
+        title,
+        window,
+        "times of frames unknown, spread evenly" if unknown else "",
     )
     for axes, panel, time in zip(pictures, panels, times, strict=True):
         # three dots per pixel keep single events sharp where matplotlib interpolates
@@ -54,7 +58,7 @@ def draw_contact_sheet(
         axes.set(xticks=[], yticks=[])
         axes.set_title(_time_label(time, end - begin), fontsize=9, color=Colour.INK, loc="left", pad=3)
     _draw_rate(rate, sequence, times)
-    _draw_intervals(histogram, between)
+    _draw_intervals(histogram, survey.intervals)
     return figure
 
 
@@ -133,7 +137,7 @@ def _draw_rate(axes: Axes, sequence: Sequence, times: Items[float]) -> None:
         return _say_nothing(axes, "no events")
     edges = np.linspace(begin, end, 201)
     bounds = np.searchsorted(events.t, np.append(edges[:-1], np.nextafter(end, math.inf)))
-    on = np.diff(np.append(0, np.cumsum(events.p))[bounds])
+    on = np.array([np.count_nonzero(events.p[i:j]) for i, j in pairwise(bounds)])
     for counts, colour, name in ((on, Colour.ON, "ON"), (np.diff(bounds) - on, Colour.OFF, "OFF")):
         axes.stairs(counts / np.diff(edges), edges, baseline=None, color=colour, linewidth=1.0, label=name)
     axes.set_xlim(begin, end)
@@ -147,19 +151,24 @@ def _draw_rate(axes: Axes, sequence: Sequence, times: Items[float]) -> None:
         text.set_color(Colour.INK)
 
 
-def _draw_intervals(axes: Axes, between: NDArray[np.float64]) -> None:
+def _draw_intervals(axes: Axes, intervals: IntervalStatistics) -> None:
     axes.set_xlabel("time between events of one pixel", fontsize=9, color=Colour.INK)
     axes.set_ylabel("share of intervals [%]", fontsize=9, color=Colour.INK)
-    positive = between[between > 0]
-    if not len(positive):
+    bins = intervals.histogram(12)
+    if not bins:
         return _say_nothing(axes, "no pixel with two events")
-    least, most = np.log10(np.percentile(positive, (0.1, 99.9)))
+    least, most = (math.log10(intervals.quantile(share, positive=True)) for share in (0.001, 0.999))
     first, last = math.floor(least), math.floor(most) + 1
     edges = np.logspace(first, last, 12 * (last - first) + 1)
-    counts, _ = np.histogram(np.clip(between, edges[0], edges[-1]), edges)  # outliers: in the outer bins
-    axes.stairs(100 * counts / len(between), edges, color=Colour.INK, fill=True, alpha=0.25)
-    axes.stairs(100 * counts / len(between), edges, color=Colour.INK, linewidth=0.8)
-    low, median, high = np.percentile(between, (1, 50, 99))
+    begin, _, counts = np.array(bins).T
+    # outliers, and pairs at one time, which are in no bin of the histogram: in the outer bins
+    place = np.clip(np.rint(12 * (np.log10(begin) - first)), 0, len(edges) - 2).astype(np.int64)
+    shares = np.bincount(place, counts, minlength=len(edges) - 1).astype(np.float64)
+    shares[0] += intervals.zeros
+    shares = 100 * shares / intervals.count
+    axes.stairs(shares, edges, color=Colour.INK, fill=True, alpha=0.25)
+    axes.stairs(shares, edges, color=Colour.INK, linewidth=0.8)
+    low, median, high = (intervals.quantile(share) for share in (0.01, 0.5, 0.99))
     axes.axvline(median, color=Colour.INK, linewidth=1.0, linestyle="--")
     axes.set_xscale("log")
     axes.set_xlim(edges[0], edges[-1])

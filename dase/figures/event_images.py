@@ -8,38 +8,20 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import warp as wp
 from numpy.typing import NDArray
 
 from dase.errors import InputError
-from dase.events import Events
 from dase.figures import contact_sheet
 from dase.figures.style import Colour
 from dase.io.sequence import Sequence, replacing
 from dase.io.video_writer import VideoCodec, open_video_writer
-from dase.kernels import launch
-from dase.kernels.event_neighbours import list_intervals
-from dase.recordings.statistics import Statistics, sequence_statistics
+from dase.recordings.statistics import RecordingSurvey, survey_sequence
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 DEFAULT_FRAME_RATE = 30.0
 """Pictures per second of a video where the sequence does not say better [Hz]."""
-
-
-def pixel_intervals(events: Events) -> NDArray[np.float64]:
-    """Return the times between successive events of one pixel [s], over all pixels, in no useful order."""
-    between = np.empty(len(events))
-    found = np.zeros(1, np.int64)
-    last = np.full(events.width * events.height, np.nan)
-    cpu = launch.find_device("cpu")
-    columns = ((events.t, wp.float64), (events.x, wp.uint16), (events.y, wp.uint16))
-    seen = [wp.array(values, dtype=kind, device=cpu, copy=False) for values, kind in columns]
-    kept = ((last, wp.float64), (found, wp.int64), (between, wp.float64))
-    out = [wp.array(values, dtype=kind, device=cpu, copy=False) for values, kind in kept]
-    wp.launch(list_intervals, dim=1, inputs=[*seen, events.width, *out], device=cpu)
-    return between[: int(found[0])]
 
 
 def default_window(sequence: Sequence) -> float:
@@ -89,7 +71,7 @@ def draw_sequence(
     at: float | None = None,
     window: float | None = None,
     moments: int = 6,
-    statistics: Statistics | None = None,
+    survey: RecordingSurvey | None = None,
 ) -> Figure:
     """Draw moments of a sequence, its event rate and the intervals between events of one pixel.
 
@@ -99,7 +81,7 @@ def draw_sequence(
         at: Show this time only [s].
         window: Events of this span around each moment are shown [s]; default: `default_window`.
         moments: How many moments to show.
-        statistics: Of the sequence, where they are known; else they are worked out.
+        survey: Of the sequence, where it was looked at before; else it is now.
 
     Raises:
         InputError: `at` lies outside the sequence, or `window` is not positive.
@@ -108,13 +90,12 @@ def draw_sequence(
     if at is not None and not begin <= at <= end:
         raise InputError(f"at: must lie in {begin:g}..{end:g} s, got {at:g} s")
     window = _checked_window(sequence, window)
-    between = pixel_intervals(sequence.events)
     times = [at] if at is not None else moment_times(sequence, moments)
     dots = 360 if len(times) > 1 else 1300  # dots across a picture that stay visible on the sheet
     shrink = math.ceil(sequence.events.width / dots)
     panels = [moment_picture(sequence, time, window, shrink=shrink) for time in times]
-    statistics = sequence_statistics(sequence) if statistics is None else statistics
-    return contact_sheet.draw_contact_sheet(sequence, statistics, between, panels, times, window, title)
+    survey = survey_sequence(sequence) if survey is None else survey
+    return contact_sheet.draw_contact_sheet(sequence, survey, panels, times, window, title)
 
 
 def moment_picture(sequence: Sequence, time: float, window: float, *, shrink: int = 1) -> NDArray[np.uint8]:

@@ -76,10 +76,17 @@ class IntervalStatistics:
         short = np.rint(positive[positive < (settings.short - 1) * 1e-6] * 1e6).astype(np.int64)
         self._short += np.bincount(short, minlength=settings.short)
 
-    def quantile(self, share: float) -> float:
-        """Return the interval [s] below which a share of them lies; not a number without any."""
-        if not self.count:
+    def quantile(self, share: float, *, positive: bool = False) -> float:
+        """Return the interval [s] below which a share of them lies; not a number without any.
+
+        Args:
+            share: Of all intervals, or of those that are not 0.
+            positive: Whether pairs of events at one time are left out.
+        """
+        if not self.count or (positive and self.count == self.zeros):
             return math.nan
+        if positive and self.zeros:
+            share = (self.zeros + share * (self.count - self.zeros - 1)) / (self.count - 1)
         if self.count <= self.settings.exact:
             return float(np.quantile(np.concatenate(self._exact), share))
         total = np.cumsum(self._bins) + self.zeros

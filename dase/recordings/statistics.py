@@ -183,9 +183,8 @@ class RecordingSurvey:
     def _add_part(self, part: Events) -> None:
         t = part.t
         pixel = part.y.astype(np.int64) * self.width + part.x
-        # one sort of 64 bits is faster than a stable one of pixels
-        key = (pixel << self.settings.place_bits) | np.arange(len(t))
-        key.sort()
+        order = _stable_order(pixel)
+        key = (pixel[order] << self.settings.place_bits) | order
         self._look_at_stamps(t)
         self._ask_whether_alone(part, key)
         self._count_by_pixel(part, key)
@@ -318,6 +317,15 @@ class RecordingSurvey:
         if self._labels is None or not events:
             return None
         return tuple(float(count) / events for count in self._labels)
+
+
+def _stable_order(pixel: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Return the order of pixels below 2^32, (N,), in which those of one stay in order."""
+    # NumPy sorts numbers of 8 and 16 bits by their digits, in half of the time that one sort of 64 bits takes
+    order = np.argsort(pixel.astype(np.uint16), kind="stable")
+    high = (pixel >> 16).astype(np.uint16)
+    high = high.astype(np.uint8) if high.max(initial=0) < 256 else high
+    return order[np.argsort(high[order], kind="stable")]
 
 
 def _ratio_or_nan(a: float, b: float) -> float:

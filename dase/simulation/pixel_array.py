@@ -161,6 +161,7 @@ class PixelArray:
         self._levels: tuple[Any, Any] | None = None
         self._logs: tuple[NDArray[np.float32], Any] | None = None  # light of levels, and its logarithms
         self._maps_of_scene: list[Any] | None = None
+        self._drawn: dict[tuple[tuple[int, bool], ...], Any] = {}  # numbers of pixels, by their streams
         # a key is an integer: time since the begin of the chunk [ns], pixel of the batch, label and polarity;
         # sorted keys are events sorted by time, and of one time by pixel, whatever the device did first
         self._pixel_bits = max((self.batch * self.count - 1).bit_length(), 1)
@@ -481,7 +482,8 @@ class PixelArray:
         clock = self._upload_clock(times, windows)
         inputs = [
             source, clock, self._pixels, self.width, self.height, self.samples, self.seed,
-            self._parameters, *self._maps(), self._state, self._next,
+            self._parameters, *self._maps(), *(self._numbers_drawn(source_name, sink_name) if lanes else ()),
+            self._state, self._next,
         ]  # fmt: skip
         size, align = (
             (counting.block_count(self.count, lanes), align // lanes) if lanes else (self.count, align)
@@ -489,6 +491,20 @@ class PixelArray:
         return lambda sink: launch.run_kernel(
             kernel, size, [*inputs, sink], self.device, batch=self.batch, align=align
         )
+
+    def _numbers_drawn(self, source_name: str, sink_name: str) -> list[Any]:
+        """Return the numbers that pixels draw once, one array of shape (D, N), or none."""
+        streams = pixel_compile.streams_drawn_once(self.stages, source_name, sink_name)
+        if not streams:
+            return []
+        if streams not in self._drawn:
+            out = launch.new_array((len(streams), self.count), wp.float32, self.device)
+            given = [wp.array(of_all, dtype=int, device=self.device) for of_all in zip(*streams, strict=True)]
+            inputs = [self._pixels, self.seed, *given, out]
+            kernel = pixel_compile.drawing_kernel()
+            launch.run_kernel(kernel, self.count, inputs, self.device, batch=len(streams))
+            self._drawn[streams] = out
+        return [self._drawn[streams]]
 
     def _count_lanes(self, source_name: str) -> int:
         """Return how many pixels a thread of the composed kernel works on; 0 for the kernel of one."""

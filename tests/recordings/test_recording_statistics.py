@@ -15,7 +15,7 @@ from helpers.sample_files import aedat4
 from dase import io
 from dase.events import Events
 from dase.io.sequence import Sequence
-from dase.recordings import summary
+from dase.recordings import statistics, summary
 from dase.recordings.anomalies import find_anomalies
 from dase.recordings.interval_statistics import IntervalSettings, IntervalStatistics
 from dase.recordings.statistics import (
@@ -316,3 +316,10 @@ def test_gaps_do_not_fill_the_memory(rng):
     x = np.zeros(len(t), np.uint16)
     found = sequence_statistics(Sequence(Events(t, x, x, x > 0, 64, 64)))
     assert len(found.gaps) == 1000
+
+
+@pytest.mark.parametrize("pixels", [1, 3000, 1 << 20, 1 << 31])
+def test_pixels_in_order_are_those_of_a_stable_sort(pixels, rng):
+    # each several times, so that it shows where equal ones change places
+    pixel = rng.permutation(np.repeat(rng.integers(0, pixels, 500), 4))
+    np.testing.assert_array_equal(statistics._stable_order(pixel), np.argsort(pixel, kind="stable"))
