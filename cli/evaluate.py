@@ -30,6 +30,7 @@ if TYPE_CHECKING:
     help="From the frames' times to the middles of their exposures; auto reads it off events and frames.",
 )
 @click.option("--lpips", type=click.Path(path_type=Path), help="Weights of LPIPS, an npz.")
+@click.option("--normalise", is_flag=True, help="The network was trained on normalised voxels.")
 @click.option("--device", help="cpu or cuda.  [default: cuda where it is]")
 @reading_options
 def evaluate_command(
@@ -38,6 +39,7 @@ def evaluate_command(
     output: Path | None,
     offset: str,
     lpips: Path | None,
+    normalise: bool,
     device: str | None,
     reading: ReadOptions,
 ) -> None:
@@ -58,7 +60,8 @@ def evaluate_command(
         raise InputError(f"--offset must be seconds or auto, got '{offset}'") from None
     for file in files:
         found = evaluate(
-            checkpoint, file, out=output, offset=late, lpips=lpips, device=device, **reading
+            checkpoint, file, out=output, offset=late, lpips=lpips, normalise=normalise, device=device,
+            **reading,
         )  # fmt: skip
         click.echo(repr(found))
         if output is not None:

@@ -197,13 +197,21 @@ def open_target(
             found.append(cut_windows(recording, window=window, samples=samples, progress=progress))
         except InputError as error:
             raise InputError(f"{path}: {error}") from error
-    return _join_recordings(found, held_out, window, device)
+    return join_windows(found, window=window, held_out=held_out, device=device)
 
 
-def _join_recordings(
-    found: list[RecordedWindows], held_out: float, window: float, device: str | torch.device
-) -> tuple[FiniteTarget, ReplayedScenes]:
-    """Return target and scenes, the held-out windows of all recordings last."""
+def join_windows(
+    found: Sequence[RecordedWindows], *, window: float, held_out: float = 0.2,
+    device: str | torch.device = "cpu",
+) -> tuple[FiniteTarget, ReplayedScenes]:  # fmt: skip
+    """Return the windows of recordings as a target, and as scenes, the held-out ones of all recordings last.
+
+    Args:
+        found: Windows of each recording.
+        window: Duration of a window [s].
+        held_out: Share of the windows, the last ones of each recording, kept for choosing between models.
+        device: PyTorch device.
+    """
     order: list[int] = []
     rest: list[int] = []
     start = 0

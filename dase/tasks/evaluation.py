@@ -76,6 +76,7 @@ def evaluate(
     out: str | PathLike[str] | None = None,
     offset: float | None = 0.0,
     lpips: str | PathLike[str] | None = None,
+    normalise: bool = False,
     device: str | None = None,
     **reading: Any,
 ) -> Evaluation:
@@ -93,6 +94,7 @@ def evaluate(
         offset: Time to add to those of the frames [s], which should be the middles of their exposures on the
             clock of the events; None reads it off, see `dase.align`.
         lpips: Weights of LPIPS, see `dase.tasks.image_metrics.Lpips`; None for none.
+        normalise: Whether the network was trained on voxels that are normalised, `Voxels(5, normalise=True)`.
         device: PyTorch's; None for a GPU where there is one.
         **reading: What is known of the file, see `dase.io.ReadOptions`.
 
@@ -107,8 +109,9 @@ def evaluate(
     late = _read_off_offset(sequence, str(file)) if offset is None else offset
     judge = _judge_flow if network.task == "flow" else _judge_reconstruction
     perceptual = None if lpips is None else image_metrics.Lpips(Path(lpips)).to(where)
+    represent = Voxels(network.shape["bins"], normalise)
     with torch.no_grad():
-        rows, pictures, rate = judge(network, sequence, window, late, perceptual, where)
+        rows, pictures, rate = judge(network, represent, sequence, window, late, perceptual, where)
     if out is not None:
         _write_pictures(Path(out), Path(file).name, pictures, rate)
     names = dict.fromkeys(name for row in rows for name in row)
@@ -130,9 +133,11 @@ def _read_off_offset(sequence: Sequence, name: str) -> float:
     return found.offset if "offset" in found.clear else 0.0
 
 
-def _grids(events: Events, edges: NDArray[np.float64], bins: int, device: torch.device) -> torch.Tensor:
+def _grids(
+    events: Events, edges: NDArray[np.float64], represent: Voxels, device: torch.device
+) -> torch.Tensor:
     """Return voxel grids of windows between edges [s], shape (W, 1, C, H, W)."""
-    return torch.from_numpy(Voxels(bins)(events.slice(edges[0], edges[-1]), edges=edges))[:, None].to(device)
+    return torch.from_numpy(represent(events.slice(edges[0], edges[-1]), edges=edges))[:, None].to(device)
 
 
 def _to_light(frame: NDArray[Any]) -> NDArray[np.float32]:
@@ -146,7 +151,7 @@ def _grey_bytes(image: NDArray[np.float32]) -> NDArray[np.uint8]:
 
 
 def _judge_reconstruction(
-    network: EventNetwork, sequence: Sequence, window: float, late: float,
+    network: EventNetwork, represent: Voxels, sequence: Sequence, window: float, late: float,
     perceptual: image_metrics.Lpips | None, device: torch.device,
 ) -> tuple[list[dict[str, float]], Pictures, float]:  # fmt: skip
     """Return metrics of every frame, pictures and their rate [Hz]."""
@@ -162,7 +167,7 @@ def _judge_reconstruction(
         begin, end = times[index], times[index + 1]
         parts = max(1, round((end - begin) / window))
         edges = np.linspace(begin, end, parts + 1)
-        made, memory = network.sequence(_grids(events, edges, network.shape["bins"], device), memory=memory)
+        made, memory = network.sequence(_grids(events, edges, represent, device), memory=memory)
         image = made[-1].float().clamp(0, 1)
         shown = _grey_bytes(image[0, 0].cpu().numpy())
         if frames is not None:
@@ -194,7 +199,7 @@ def picture_metrics(
 
 
 def _judge_flow(
-    network: EventNetwork, sequence: Sequence, window: float, late: float,
+    network: EventNetwork, represent: Voxels, sequence: Sequence, window: float, late: float,
     perceptual: image_metrics.Lpips | None, device: torch.device,
 ) -> tuple[list[dict[str, float]], Pictures, float]:  # fmt: skip
     """Return metrics of every window, pictures and their rate [Hz]."""
@@ -210,7 +215,7 @@ def _judge_flow(
         part = events.slice(end - window, end)
         if len(part) < 2:
             continue
-        grid = _grids(part, np.array([end - window, end]), network.shape["bins"], device)[0]
+        grid = _grids(part, np.array([end - window, end]), represent, device)[0]
         flow = network(grid)[0].float()
         columns = [torch.from_numpy(np.asarray(one)).to(device) for one in (part.x.astype(np.int64),
                    part.y.astype(np.int64), (end - part.t) / window, part.p.astype(bool))]  # fmt: skip

@@ -73,6 +73,25 @@ def test_one_grey_beside_frames(sequence, grey, tmp_path):
     json.dumps(found.to_json())
 
 
+def test_windows_are_normalised_if_asked_for(sequence, tmp_path):
+    torch.manual_seed(0)
+    network = FireNet(5, 16)
+    torch.nn.init.constant_(network.last.bias, 0.5)  # in [0, 1], where nothing is cut
+    optimizer = torch.optim.AdamW(network.parameters())
+    save_checkpoint(tmp_path / "net.pt", network, network, optimizer, step=1, steps=1, window=WINDOW)
+    io.write(tmp_path / "a.h5", sequence)
+    real = torch.from_numpy(sequence.frames[1:] / 255)
+    found = {}
+    for normalise in (False, True):
+        windows = dase.Voxels(5, normalise)(sequence.events, edges=sequence.frame_times)
+        with torch.no_grad():
+            made = network.sequence(torch.from_numpy(windows)[:, None])[0][:, 0, 0].clamp(0, 1)
+        found[normalise] = float(((made - real) ** 2).mean())
+        judged = evaluate(tmp_path / "net.pt", tmp_path / "a.h5", device="cpu", normalise=normalise)
+        assert judged.metrics["mse"] == pytest.approx(found[normalise], rel=1e-4)
+    assert found[True] != pytest.approx(found[False], rel=2e-4)
+
+
 def test_true_flow_of_files_of_dase(sequence, flowing, tmp_path):
     io.write(tmp_path / "a.h5", sequence)
     found = evaluate(flowing, tmp_path / "a.h5", device="cpu", out=tmp_path / "out")

@@ -6,8 +6,15 @@ import pytest
 
 pytest.importorskip("torch")
 
+import dase
 from perf.experiments.downstream.run import Job, next_job, study_plan
-from perf.experiments.downstream.sensors import TARGETS, tuned_thresholds
+from perf.experiments.downstream.sensors import (
+    TARGETS,
+    LearnSettings,
+    record_target,
+    train_on,
+    tuned_thresholds,
+)
 from perf.experiments.downstream.table import (
     mean_text,
     paired_gaps,
@@ -84,6 +91,31 @@ def test_what_waits_for_no_fit_comes_first_and_seed_by_seed():
     assert len(set(plan)) == len(plan)
     assert Job("flow", "esim", "", 1) in plan
     assert not any(job.task == "fit" for job in study_plan(("flow",), ("esim", "true"), ("slow",), (0,)))
+
+
+def test_thresholds_on_top_of_a_fit_wait_for_it():
+    plan = study_plan(("reconstruction",), ("learned", "learned_on_fitted", "fitted"), ("slow",), (0,))
+    assert plan[:2] == [Job("train", "", "slow", 0), Job("reconstruction", "learned", "slow", 0)]
+    on_top = Job("train_on_fit", "", "slow", 0)
+    assert set(plan[2:4]) == {Job("fit", "", "slow", 0), on_top}
+    assert next_job([on_top], set(), 100.0, {}) is None
+    assert next_job([on_top], {("train", "slow")}, 100.0, {}) is None
+    assert next_job([on_top], {("fit", "slow")}, 100.0, {}) == on_top
+
+
+def test_thresholds_are_learned_from_a_recording_and_loaded_again(tmp_path):
+    """Two steps of the default recipe on top of a cutoff: it stays, thresholds become learned ones."""
+    target = TARGETS["slow"]
+    recorded = record_target(target, "builtin", 1.0, "cpu")
+    settings = LearnSettings(steps=2, windows=4, batch=2)
+    sensor = dase.load_sensor(
+        train_on(recorded, tmp_path / "run", "default", "cpu", known=target, settings=settings)
+    )
+    assert sensor["bandwidth"] == target["bandwidth"]
+    assert "mismatch" not in sensor
+    assert (sensor.size, sensor["learned_threshold"].is_off()) == ((240, 180), False)
+    batch = next(iter(dase.torch.Stream("builtin", sensor, batch=1, steps=2, size=(32, 32), device="cpu")))
+    assert batch.inputs.abs().sum() > 0
 
 
 def test_what_is_not_known_yet_or_takes_too_long_waits():

@@ -6,6 +6,7 @@ Reconstruction as in `run`: the same size, scenes and seeds, trained on ESIM's d
 S2R's threshold tuned to the recording's rate of events, and the preset of its camera. Each network is judged
 half way and at the end of its training, as `dase evaluate` does, and all on the same frames. The same call
 goes on where it stopped. `results.jsonl` has a line for each network; the table is printed at the end.
+`published` judges a published network beside them.
 """
 
 from __future__ import annotations
@@ -128,7 +129,8 @@ def main() -> None:
         recording=str(args.recording), camera=args.camera, offset=args.offset,
     )  # fmt: skip
     log = args.out / "results.jsonl"
-    rows = read_rows(str(log)) if log.exists() else []
+    # published networks have rows, and no trainings
+    rows = [row for row in read_rows(str(log)) if row["kind"] in KINDS] if log.exists() else []
     # trainings of other lengths are neither done nor to be averaged with these
     if {row["steps"] for row in rows} - {size.reconstruction_steps}:
         ask.error(f"{log} has trainings of another number of steps than {size.reconstruction_steps}")

@@ -5,7 +5,8 @@
 
 Four targets with physics beyond thresholds (`sensors.py`) are recorded for 60 s each. Networks are
 trained on ESIM's default, on broad randomisation, and for each target on S2R's tuned threshold, on what
-`dase.fit` makes of the recording, on volumes of EventGAN (reconstruction alone), and on the true sensor;
+`dase.fit` makes of the recording, on thresholds that `dase train` learns of it (alone, by the paper's preset,
+and on top of the fit), on volumes of EventGAN (reconstruction alone), and on the true sensor;
 then tested on each target's simulated scenes of photographs that no training has seen. The same seed has
 the same first weights and scenes whatever the sensor. Each training stands alone: it is checkpointed,
 `--minutes` ends a call, the same call goes on, and several machines may take `--seeds` apart. `--jobs`
@@ -26,6 +27,7 @@ import multiprocessing
 import os
 import sys
 import tarfile
+import tempfile
 import time
 import traceback
 from collections.abc import Iterator, Sequence
@@ -45,21 +47,28 @@ from perf.experiments.downstream.eventgan import EventGan, GanTraining, save_eve
 from perf.experiments.downstream.sensors import (
     FAST,
     KINDS,
+    LEARNED_AFTER,
     LEARNED_BY,
+    LEARNED_WITH,
     OF_NO_TARGET,
     TARGETS,
     VIEW,
     WITHOUT_FLOW,
+    LearnSettings,
+    TargetRecording,
     Training,
     broad_thresholds,
     fit_target,
     plain_sensor,
     record_target,
+    train_on,
     tune_threshold,
     tuned_thresholds,
 )
 
-FILES = {"tune": ".json", "fit": ".toml", "gan": ".pt"}
+FILES = {
+    "tune": ".json", "fit": ".toml", "gan": ".pt", **{task: f"-{task}/sensor.toml" for task in LEARNED_WITH},
+}  # fmt: skip
 """Ends of the names of what is learned from a target's recording."""
 
 
@@ -83,6 +92,8 @@ class Size:
         flow_steps: Batches of a training.
         samples: Of a window.
         gan_steps: Of the generator of EventGAN.
+        learning: Of thresholds by `dase train`.
+        learning_paper: Of thresholds by `dase train --preset paper`.
         recorded: Duration of a target's recording [s].
         test_batches: On each target.
         backgrounds: Pictures in a pool.
@@ -100,6 +111,8 @@ class Size:
     flow_steps: int = 12000
     samples: int = 16
     gan_steps: int = 3000
+    learning: LearnSettings = field(default_factory=LearnSettings)
+    learning_paper: LearnSettings = field(default_factory=lambda: LearnSettings(seconds=60.0))
     recorded: float = 60.0
     test_batches: int = 8
     backgrounds: int = 48
@@ -124,6 +137,8 @@ SMALL = Size(
     flow_channels=4,
     reconstruction_steps=4,
     flow_steps=4, samples=8, gan_steps=2, recorded=1.0, test_batches=1, backgrounds=3, objects=4,
+    learning=LearnSettings(steps=2, windows=4, batch=2),
+    learning_paper=LearnSettings(steps=1, windows=4, batch=1),
 )  # fmt: skip
 """As little as shows that all parts work together."""
 
@@ -193,6 +208,9 @@ class Study:
             print(f"eventgan {target}: scale {made['scale']}, {json.dumps(made['log'])}", flush=True)
             save_eventgan(path, made)
             return
+        if task in LEARNED_WITH:
+            self.learn_thresholds(task, target, recorded)
+            return
         if task == "fit":
             text = dase.dump_sensor(fit_target(recorded, self.device))
         else:
@@ -202,6 +220,29 @@ class Study:
             text = json.dumps(found, indent=1) + "\n"
         with replacing(path) as temporary:
             temporary.write_text(text, "utf-8")
+
+    def learn_thresholds(self, task: str, target: str, recorded: TargetRecording) -> None:
+        """Learn thresholds from a target's recording, and leave their sensor, its weights and the log."""
+        folder = self.learned_file(task, target).parent
+        before = LEARNED_AFTER.get(task)
+        known = dase.load_sensor(self.learned_file(before, target)) if before else None
+        how = self.size.learning_paper if task == "train_paper" else self.size.learning
+        begin = time.monotonic()
+        with tempfile.TemporaryDirectory(dir=folder.parent) as work:
+            run = Path(work) / folder.name
+            made = train_on(
+                recorded,
+                run,
+                LEARNED_WITH[task],
+                self.device,
+                known=known,
+                settings=how,
+                keep_going=self.check_time,
+            )
+            (made.parent / "result.pt").unlink()  # the weights again
+            (made.parent / "best.pt").unlink(missing_ok=True)
+            made.parent.replace(folder)
+        print(f"{task} {target}: {time.monotonic() - begin:.0f} s after the recording", flush=True)
 
     def training(self, kind: str, target: str) -> Training:
         """Return what is trained on."""
@@ -218,7 +259,7 @@ class Study:
         if kind == "eventgan":
             # its scenes are taken, and not its events
             return Training(plain_sensor(0.2), remake=EventGan(self.learned_file("gan", target)))
-        return Training(dase.load_sensor(self.learned_file("fit", target)))
+        return Training(dase.load_sensor(self.learned_file(LEARNED_BY[kind], target)))
 
     def folder(self, job: Job) -> Path:
         """Return where a training is kept."""
@@ -343,7 +384,8 @@ def study_plan(
             Job(LEARNED_BY[kind], "", target, 0) for kind in some if kind in LEARNED_BY for target in targets
         ]
 
-    slow = [kind for kind in kinds if LEARNED_BY.get(kind) == "fit"]
+    after_fit = ["fit", *(task for task, before in LEARNED_AFTER.items() if before == "fit")]
+    slow = [kind for kind in kinds if LEARNED_BY.get(kind) in after_fit]
     quick = [kind for kind in kinds if kind not in slow]
     return learning(quick) + of_kinds(quick) + learning(slow) + of_kinds(slow)
 
@@ -360,7 +402,7 @@ def next_job(
         longest: Time that a job of a task took [s]; one that cannot come to its end is not begun.
     """
     for job in waiting:
-        needs = LEARNED_BY.get(job.kind)
+        needs = LEARNED_BY.get(job.kind) if job.kind else LEARNED_AFTER.get(job.task)
         if (needs is None or (needs, job.target) in learned) and longest.get(job.task, 0.0) < left:
             return job
     return None

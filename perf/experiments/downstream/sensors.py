@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -11,6 +12,11 @@ import torch
 
 import dase
 from dase.effects import EFFECTS
+from dase.io.sequence import Sequence
+from dase.learning import job
+from dase.learning.recorded_target import cut_windows, join_windows
+from dase.learning.run import RunSchedule, train_in_folder
+from dase.recordings.recording import Recording
 from dase.torch import Batch
 
 VIEW = (240, 180)
@@ -49,11 +55,20 @@ START = sensor_with(
 )  # fmt: skip
 """From which fits set out: every effect that a user would try, at usual values; the same for all targets."""
 
-KINDS = ("esim", "broad", "tuned", "eventgan", "fitted", "true")
+KINDS = (
+    "esim", "broad", "tuned", "eventgan", "learned", "learned_paper", "learned_on_fitted", "fitted", "true",
+)  # fmt: skip
 """What is trained on; the first two do not know their target."""
 OF_NO_TARGET = KINDS[:2]
-LEARNED_BY = {"tuned": "tune", "eventgan": "gan", "fitted": "fit"}
+LEARNED_BY = {
+    "tuned": "tune", "eventgan": "gan", "learned": "train", "learned_paper": "train_paper",
+    "learned_on_fitted": "train_on_fit", "fitted": "fit",
+}  # fmt: skip
 """What is learned from a target's recording, and the task that does so."""
+LEARNED_WITH = {"train": "default", "train_paper": "paper", "train_on_fit": "default"}
+"""Tasks that do as `dase train` does, and the presets of its recipe."""
+LEARNED_AFTER = {"train_on_fit": "fit"}
+"""Tasks that another one of the same target comes before."""
 WITHOUT_FLOW = ("eventgan",)
 """Kinds that are not trained for flow: windows are few there, and the first has no frame before it."""
 
@@ -100,6 +115,25 @@ def plain_sensor(threshold: float) -> dase.Sensor:
 
 
 @dataclass(frozen=True)
+class LearnSettings:
+    """How much `train_on` learns from.
+
+    Args:
+        steps: Of the recipe; 0 for those of its preset.
+        seconds: Of the learning itself [s], which sets the number of steps; None for `steps`.
+        windows: Of the recording, evenly chosen.
+        window: Duration of each [s], that of `dase train`.
+        batch: Scenes of a step; 0 for those of the preset.
+    """
+
+    steps: int = 0
+    seconds: float | None = None
+    windows: int = 400
+    window: float = 0.05
+    batch: int = 0
+
+
+@dataclass(frozen=True)
 class TargetRecording:
     """What is known of a target: events and 8-bit frames of a camera that is shaken before photographs.
 
@@ -114,6 +148,12 @@ class TargetRecording:
     frames: np.ndarray
     times: np.ndarray
     rate: float
+
+    def opened(self) -> Recording:
+        """Return it as a file of it would be opened."""
+        shown = Sequence(self.events, frames=self.frames, frame_times=self.times)
+        recording = Recording.of(shown)
+        return recording.masked(~recording.hot)
 
 
 def record_target(target: dase.Sensor, images: str, seconds: float, device: str) -> TargetRecording:
@@ -135,6 +175,37 @@ def record_target(target: dase.Sensor, images: str, seconds: float, device: str)
     frames = np.round(255 * np.clip(made.scene.frames(times), 0, 1)).astype(np.uint8)
     pieces = np.histogram(events.t, np.arange(0, max(seconds, 1) + 0.5))[0] / min(seconds, 1)
     return TargetRecording(events, frames, times, float(np.median(pieces)) / (VIEW[0] * VIEW[1]))
+
+
+def train_on(
+    recorded: TargetRecording, folder: Path, preset: str, device: str, *, known: dase.Sensor | None = None,
+    settings: LearnSettings = LearnSettings(), keep_going: Callable[[], None] = lambda: None,
+) -> Path:  # fmt: skip
+    """Learn thresholds from a recording as `dase train` does, and return the sensor file.
+
+    The recording's windows are both what its events are taken from and the simulator's scenes, as with
+    `dase train FILE`.
+
+    Args:
+        recorded: Of the target.
+        folder: Of the run: sensor file, weights, log.
+        preset: Of the recipe.
+        device: Where is learned.
+        known: What thresholds are learned on top of; None for nothing.
+        settings: How much is learned from.
+        keep_going: Called now and then; what it raises ends the run.
+    """
+    # the name of a recording makes it the recipe of recordings; none is opened
+    recipe = job.Job(targets=("recording.npz",), preset=preset, steps=settings.steps, backend=device).recipe()
+    if settings.batch:
+        recipe = replace(recipe, batch=settings.batch)
+    windows = cut_windows(recorded.opened(), window=settings.window, most=settings.windows)
+    target, scenes = join_windows([windows], window=settings.window, device=device)
+    training = job.compose_training(recipe, target, scenes, known)
+    schedule = RunSchedule(seconds=settings.seconds, save_every=float("inf"), result_every=1.0)
+    size = recorded.events.width, recorded.events.height
+    last = train_in_folder(training, folder, schedule=schedule, on_result=lambda row: keep_going())
+    return job.write_sensor(folder, training.mean, mu=last["mu"], name=folder.name, size=size, known=known)
 
 
 def fit_target(recorded: TargetRecording, device: str) -> dase.Sensor:
