@@ -29,7 +29,7 @@ def light(sensor: dase.Sensor, times: np.ndarray, frames: np.ndarray, seed: int)
             for column in range(width):
                 number = row // lamp.region + column // lamp.region
                 turns = lamp.frequency * times + lamp.phase + lamp.apart * number
-                out[:, row, column] *= 1 + lamp.depth * waveform(lamp, turns)
+                out[:, row, column] *= 1 + lamp.depth * waveform(lamp, shown_turns(lamp, turns))
     y, x = np.mgrid[:height, :width]
     square = ((2 * x - width + 1) ** 2 + (2 * y - height + 1) ** 2) / (width**2 + height**2)
     corner = np.arccos((1 - setting(sensor, "vignetting", "loss", 0.0)) ** 0.25)
@@ -38,6 +38,17 @@ def light(sensor: dase.Sensor, times: np.ndarray, frames: np.ndarray, seed: int)
     current, spread = (setting(sensor, "dark", name, 0.0) for name in ("current", "spread"))
     normal = [Stream("dark_current_pixel_normal", seed, i).normal() for i in range(width * height)]
     return out + current * np.exp(spread * np.array(normal))
+
+
+def shown_turns(lamp: dase.Effect, turns: np.ndarray) -> np.ndarray:
+    """Return the turns that samples show: an extreme of the light within half the step before them.
+
+    The first sample shows its own moment, and so do samples of which a period has fewer than two.
+    """
+    half = np.diff(turns, prepend=-np.inf) / 2
+    brightest = {"sine": 0.25, "rectified": 0.5, "pwm": 0.5 * lamp.duty}[lamp.shape]
+    extreme = brightest + np.round(2 * (turns - brightest)) / 2
+    return np.where((np.abs(turns - extreme) <= half) & (half <= 0.25), extreme, turns)
 
 
 def waveform(lamp: dase.Effect, turns: np.ndarray) -> np.ndarray:
