@@ -14,12 +14,34 @@ from dase.kernels.vector_math import cosine_and_sine
 
 
 @wp.func
-def flickering_light(intensity: float, t64: wp.float64, frequency: float, depth: float, phase: float):
+def shown_turn(turn: float, brightest: float, frequency: float, dt: float):
+    """Part of a period that a sample shows: the brightest or the darkest within half a step, else its own.
+
+    Of even samples that is the one next to it. Between samples light runs straight, so what it reaches
+    between two of them would be cut off, and events come of the extremes. The darkest is half a turn from
+    the brightest. `dt` is the step before [s].
+    """
+    half = 0.5 * frequency * dt
+    away = turn - brightest
+    away -= wp.floor(away + 0.5)
+    # of two samples just as near both are
+    near = 1.0001 * half
+    shown = wp.where(wp.abs(away) <= near, brightest, turn)
+    shown = wp.where(0.5 - wp.abs(away) <= near, brightest + 0.5, shown)
+    # fewer than two samples per period show none of it, and the first of all has no step
+    shown = wp.where(half <= 0.25, shown, turn)
+    return shown - wp.floor(shown)
+
+
+@wp.func
+def flickering_light(
+    intensity: float, t64: wp.float64, dt: float, frequency: float, depth: float, phase: float
+):
     """Intensity under a lamp whose flux is 1 + depth · sin."""
     # float32 resolves no more than a quarter of a millisecond after an hour
     turns = wp.float64(frequency) * t64
     turn = float(turns - wp.floor(turns)) + phase
-    _cosine, sine = cosine_and_sine(turn - wp.floor(turn))
+    _cosine, sine = cosine_and_sine(shown_turn(turn - wp.floor(turn), 0.25, frequency, dt))
     return intensity * (1.0 + depth * sine)
 
 
@@ -38,6 +60,7 @@ def turn_of_lamp(
 def light_of_lamps(
     intensity: float,
     t64: wp.float64,
+    dt: float,
     frequency: float,
     depth: float,
     phase: float,
@@ -47,7 +70,8 @@ def light_of_lamps(
     y: float,
 ):
     """Intensity under lamps whose flux is 1 + depth · sin, each a region of its own."""
-    _cosine, sine = cosine_and_sine(turn_of_lamp(t64, frequency, phase, region, apart, x, y))
+    turn = turn_of_lamp(t64, frequency, phase, region, apart, x, y)
+    _cosine, sine = cosine_and_sine(shown_turn(turn, 0.25, frequency, dt))
     return intensity * (1.0 + depth * sine)
 
 
@@ -55,6 +79,7 @@ def light_of_lamps(
 def rectified_light(
     intensity: float,
     t64: wp.float64,
+    dt: float,
     frequency: float,
     depth: float,
     phase: float,
@@ -65,7 +90,8 @@ def rectified_light(
 ):
     """Intensity under lamps whose flux follows the rectified mains."""
     # half a turn of the mains is a period of the light
-    half = 0.5 * turn_of_lamp(t64, frequency, phase, region, apart, x, y)
+    turn = turn_of_lamp(t64, frequency, phase, region, apart, x, y)
+    half = 0.5 * shown_turn(turn, 0.5, frequency, dt)
     _cosine, sine = cosine_and_sine(half)
     return intensity * (1.0 + depth * (2.0 * wp.abs(sine) - 1.0))
 
@@ -74,6 +100,7 @@ def rectified_light(
 def switched_light(
     intensity: float,
     t64: wp.float64,
+    dt: float,
     frequency: float,
     depth: float,
     phase: float,
@@ -85,6 +112,8 @@ def switched_light(
 ):
     """Intensity under lamps that are switched on for a share of each period."""
     turn = turn_of_lamp(t64, frequency, phase, region, apart, x, y)
+    # the middle of a part, so that the shorter one is not missed
+    turn = shown_turn(turn, 0.5 * duty, frequency, dt)
     return intensity * (1.0 + wp.where(turn < duty, depth, -depth))
 
 
@@ -107,7 +136,9 @@ class Flicker(Effect):
     right and below are `apart` turns later. Lamps on the three phases of the mains are 1/3 of a turn of the
     light apart. Lights do not mix at the borders.
 
-    A scene must be sampled several times per period: moving textures and videos are, by themselves.
+    A scene must be sampled several times per period: moving textures and videos are, by themselves. The
+    samples next to the brightest and to the darkest moment of a period show that moment: events come of the
+    extremes, and are as many as in light that is sampled without end.
     """
 
     name: ClassVar[str] = "flicker"
@@ -199,14 +230,14 @@ class Flicker(Effect):
         """Return the longest time between samples that still shows the effect [s]."""
         if not (self.depth and self.frequency):
             return math.inf
-        # between samples the light runs straight, which is off by depth / samples² where it is round and by
-        # depth / samples at the sharp dips of rectified light: 0.006 and 0.015 at most up to a depth of 0.3;
-        # ten samples of a period keep 97 % of a sine's swing
-        share = min(abs(self.depth) / 0.3, 1.0)
+        # extremes are shown whatever the sampling, see `shown_turn`; in between the light runs straight, and
+        # what smooths it behind feels that: the fundamental is within 3 % of the true one, 5 % where shallow
+        depth = abs(self.depth)
         if self.shape == "sine":
-            part = 1 / max(10, 16 * share**0.5)
+            part = 1 / max(10, 16 * min(depth / 0.3, 1.0) ** 0.5)
         elif self.shape == "rectified":
-            part = 1 / 32 if share > 0.5 else 1 / 16
+            # of its logarithm the dip is the narrower, the deeper
+            part = 1 / 16 if depth <= 0.15 else max(1 - depth, 0.05) ** 0.5 / 20
         else:  # the shorter part of a period is not to be missed
             part = min(1 / 16, self.duty / 4, (1 - self.duty) / 4)
         return part / self.frequency

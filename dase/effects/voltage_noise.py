@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
-from typing import ClassVar
+from dataclasses import dataclass, replace
+from typing import ClassVar, Self
 
 import warp as wp
 
-from dase.effects.base import Effect, parameter
+from dase.effects.bandwidth import Bandwidth
+from dase.effects.base import Effect, Observations, choice, parameter
+from dase.kernels.pixel_stages import EffectStages
 from dase.kernels.vector_math import cosine_and_sine, exponential, logarithm
 
 POLE = wp.constant(2.0 * math.pi / math.sqrt(math.sqrt(2.0) - 1.0))
@@ -100,6 +102,91 @@ def noisy_voltage(
     return voltage + top, now, speed_now
 
 
+@wp.func
+def shock_share(a: float, b: float):
+    """Share of a shock to a node that is behind a low-pass after a time: b (e^-a - e^-b) / (b - a).
+
+    The node forgets it at rate a, the low-pass follows at rate b, both per that time.
+    """
+    apart = wp.abs(b - a)
+    # series; the closed form loses digits
+    mean = 1.0 - 0.5 * apart * (1.0 - apart / 3.0)
+    if apart > 0.02:
+        mean = (1.0 - exponential(-apart)) / apart
+    return b * exponential(-wp.min(a, b)) * mean
+
+
+@wp.func
+def fresh_node_variance(a: float, b: float, settled: float):
+    """Variances of a node and of a low-pass behind it that are new after a step, and their covariance.
+
+    In units of the node's stationary variance, of which `settled`, b / (a + b), is behind the low-pass.
+    """
+    kept = exponential(-a)
+    share = shock_share(a, b)
+    followed = exponential(-b)
+    node = 1.0 - kept * kept
+    mixed = settled - kept * (share + followed * settled)
+    behind = settled - share * share - followed * (2.0 * share + followed) * settled
+    if a < 0.02:
+        node = 2.0 * a * (1.0 - a * (1.0 - a / 1.5))
+    if a + b < 2.0:
+        # the closed forms lose digits; four Gauss points of a, h e^-a and h², h the share of earlier shocks
+        mixed = float(0.0)
+        behind = float(0.0)
+        for n in range(4):
+            away = wp.where(n == 0 or n == 3, 0.4305681557970263, 0.1699905217924281)
+            weight = wp.where(n == 0 or n == 3, 0.1739274225687269, 0.3260725774312731)
+            ago = 0.5 + wp.where(n < 2, -away, away)
+            h = shock_share(ago * a, ago * b)
+            mixed += 2.0 * a * weight * h * exponential(-ago * a)
+            behind += 2.0 * a * weight * h * h
+    return wp.max(node, 1.0e-30), mixed, behind
+
+
+@wp.func
+def photoreceptor_noise(
+    voltage: float,
+    intensity: float,
+    dt: float,
+    sigma: float,
+    cutoff: float,
+    knee: float,
+    dark: float,
+    noise: float,
+    speed: float,
+    uniform: float,
+    uniform_2: float,
+):
+    """Voltage with noise of a node that the photocurrent charges, behind a fixed pole; turns as above.
+
+    `speed` is what the fixed pole has yet to follow: the slope in units of that pole.
+    """
+    light = wp.max(intensity, 0.0) + dark
+    share = light / (light + knee)
+    b_whole = 2.0 * wp.pi * cutoff * dt
+    # beyond 100 time constants nothing is remembered
+    a = wp.min(b_whole * (light / knee), 100.0)
+    b = wp.min(b_whole, 100.0)
+    settled = 1.0 - share
+    node_var, mixed, behind = fresh_node_variance(a, b, settled)
+    first = wp.sqrt(node_var)
+    cross = mixed / first
+    then = wp.sqrt(wp.max(behind - cross * cross, 0.0))
+    # both normals of one Box-Muller pair
+    normal, normal_2 = cosine_and_sine(uniform_2)
+    scale = sigma * wp.sqrt(-2.0 * logarithm(1.0 - uniform))
+    node = noise + speed
+    now = exponential(-b) * noise + shock_share(a, b) * node + scale * (cross * normal + then * normal_2)
+    speed_now = exponential(-a) * node + scale * first * normal - now
+    # slopes of steps so long that they tell nothing of the way would lead astray
+    near = wp.min(1.0, STEEP / wp.max(wp.max(a, b), 1.0e-6))
+    top, way = turning_voltage(noise, near * b * speed, now, near * b * speed_now)
+    # of equal poles this is `CREST` as above: white noise moves the slope by 2 a b² sigma² in a step
+    top += way * CREST * near * b * wp.sqrt(0.5 * near * a) * sigma
+    return voltage + top, now, speed_now
+
+
 @dataclass(frozen=True, kw_only=True)
 class VoltageNoise(Effect):
     """Noise of the photoreceptor's voltage.
@@ -118,6 +205,15 @@ class VoltageNoise(Effect):
     and a turn of the voltage between two samples is seen, too: event rates are right within 3 % from
     thresholds of one standard deviation on. A level far above its rest the voltage passes
     1.55 · corner · exp(-level² / 2 variance) times per second (Rice's formula).
+
+    With `poles = "apart"` the noise has the photoreceptor's own two poles: that of its node, which the
+    photocurrent charges, at cutoff · I / knee, and the fixed one at `cutoff`. The variance is as above, and
+    the voltage passes its mean sqrt(I / knee) · cutoff times per second upwards. Its covariance is exact
+    at any sampling. Event rates are 0.7 to 1.1 of Rice's up to the knee, 0.3 to 0.5 at ten times the knee,
+    where the node is too fast for the samples: a fifth of the events of fine sampling are lost. The node's
+    pole is
+    that of `bandwidth` where that has cutoff · (1 + dark) / knee and dark / (1 + dark), see
+    `of_photoreceptor`.
 
     An ideal memory moves by whole thresholds, so a pixel keeps the phase that it began with, and pixels which
     are alike differ in their rates. One that is held in reset after its events (`refractory`) memorises the
@@ -164,6 +260,40 @@ class VoltageNoise(Effect):
         about="dark current, as the intensity that makes as much; keeps the corner above 0",
         fitted=False,  # it shows in the darkest pixels only, which hardly send events
     )
+
+    poles: str = choice(
+        "alike",
+        among=("alike", "apart"),
+        about="two equal ones at the corner of both, or one that follows the light and a fixed one",
+    )
+
+    @classmethod
+    def candidates(cls, observed: Observations) -> list[Self]:
+        """Return the noise of equal poles: spectra of both differ less than recordings tell."""
+        return [cls()]
+
+    @classmethod
+    def of_photoreceptor(cls, pole: Bandwidth, *, sigma: float, cutoff: float) -> Self:
+        """Return the noise of a photoreceptor whose one pole follows the same photocurrent as a `Bandwidth`.
+
+        Args:
+            pole: Its cutoff and its dark current.
+            sigma: Standard deviation in the dark [log intensity].
+            cutoff: Of the fixed pole [Hz].
+        """
+        # pole.cutoff (dark + (1 - dark) light) is cutoff (light + dark current) / knee
+        slope = pole.cutoff * (1 - pole.dark)
+        dark = pole.dark / (1 - pole.dark)
+        return cls(sigma=sigma, cutoff=cutoff, knee=cutoff / slope, dark=dark, poles="apart")
+
+    def compiled(self) -> EffectStages:
+        """Return what the kernel composer needs to know."""
+        stages = super().compiled()
+        return (
+            replace(stages, functions=(("respond", photoreceptor_noise),))
+            if self.poles == "apart"
+            else stages
+        )
 
     def longest_step(self) -> float:
         """Return the longest time between samples that still shows the effect [s]."""

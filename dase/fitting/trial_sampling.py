@@ -12,9 +12,13 @@ from numpy.typing import NDArray
 from dase.effects.base import Effect
 from dase.simulation.sensor import Sensor
 
-SAMPLES = (1, 2, 3, 4, 6, 8, 12, 16, 24)
+SAMPLES = (1, 2, 3, 4, 6, 8, 12, 16, 24, 32, 48)
 """Samples per step that are taken: few numbers, so that models run together, and that neighbours of a descent
-mostly share their random numbers. The most shows voltage noise of 3 kHz and lamps of 1.5 kHz at 1 ms."""
+mostly share their random numbers."""
+DENSEST = 24e3
+"""Samples per second that are not exceeded [Hz]: voltage noise of 3 kHz and lamps of 1.5 kHz are shown."""
+FINE = 24
+"""Samples per step that are taken in short steps, too, whatever comes of it per second."""
 SCREENING_SAMPLES = 4
 """The most by which candidates are screened: right for voltage noise of 500 Hz and lamps of 250 Hz at 1 ms,
 rough for faster ones. Those that go on are sampled as they need when they are fitted and judged."""
@@ -71,4 +75,9 @@ def _samples(longest: float, step: float) -> int:
     if longest == math.inf:
         return 0
     # a ratio that is whole but for rounding does not take one sample more
-    return next((n for n in SAMPLES if n >= step / longest - 1e-6), SAMPLES[-1])
+    return _at_least(min(step / longest, max(FINE, DENSEST * step)))
+
+
+def _at_least(samples: float) -> int:
+    """Return the fewest samples per step that are as many, the most there are if none is."""
+    return next((n for n in SAMPLES if n >= samples - 1e-6), SAMPLES[-1])

@@ -88,6 +88,7 @@ TWINS = {
     "critical": (SecondOrder(cutoff=50.0, damping=1.0),),
     "overdamped": (SecondOrder(cutoff=200.0, damping=6.0),),
     "noise": (VoltageNoise(sigma=0.2, cutoff=30.0),),
+    "noise of two poles": (VoltageNoise(sigma=0.2, cutoff=30.0, poles="apart"),),
     "uneven": (Bandwidth(cutoff=60.0, spread=0.4), SecondOrder(cutoff=90.0, spread=0.3)),
     "follower": (Bandwidth(cutoff=200.0, dark=0.02, signal="large"),),
     "noisy follower": (

@@ -138,3 +138,24 @@ def test_one_lamp_is_as_before_and_off_is_off(device):
         for region in (np.inf, 1e6)
     )
     np.testing.assert_array_equal(one.t, wide.t)
+
+
+@pytest.mark.parametrize("shape", SHAPES)
+@pytest.mark.parametrize("step", [1e-3, 4e-3])
+@pytest.mark.parametrize("frequency", [97.0, 100.0, 333.0, 1000.0])
+def test_extremes_between_samples_are_not_cut_off(device, shape, step, frequency):
+    """Two events per period, as light without samples has, where a swing is hardly a threshold."""
+    depth, seconds, spare = 0.15, 0.4, 0.03
+    low, high = np.log([0.5 * (1 - depth) + 1e-3, 0.5 * (1 + depth) + 1e-3])
+    theta = (1 - spare) * (high - low)
+    # the memory begins half of what is spare below the brightest: the swing reaches as far beyond both levels
+    wave = ((np.exp(high - 0.5 * spare * (high - low)) - 1e-3) / 0.5 - 1) / depth
+    sine, rectified = np.arcsin(wave) / (2 * np.pi), np.arcsin((wave + 1) / 2) / np.pi
+    phase = {"sine": sine, "rectified": rectified, "pwm": 0.0}[shape]
+    lamp = Flicker(depth=depth, frequency=frequency, shape=shape, duty=0.1, phase=phase)
+    # two levels have no place between them: there the memory goes down a little with each pair of events
+    on = theta * (1 - 1e-5 * (shape == "pwm"))
+    sensor = dase.Sensor((Threshold(on=on, off=theta, phase=0.0), lamp))
+    scene = still(0.5, seconds, round(seconds / step) + 1)
+    got = dase.count(scene, sensor, [0.0, seconds], device=device)[0, 0]
+    np.testing.assert_allclose(got, seconds * frequency, atol=1.01)

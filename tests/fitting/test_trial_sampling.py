@@ -20,7 +20,7 @@ from dase.fitting.descent import descent_work, ranking_work
 from dase.fitting.parameter_space import ParameterSpace, axes_of
 from dase.fitting.trial_sampling import samples_of_screening, samples_per_step, samples_per_step_of_rows
 from dase.kernels import launch
-from dase.probes.stimulus import Grid, Stimulus, sort_into_cells
+from dase.probes.stimulus import STIMULUS, Grid, Stimulus, sort_into_cells
 
 STEP, SIZE, SECONDS = 1e-3, (20, 16), 0.3
 
@@ -52,6 +52,11 @@ SPEEDS = ((0.4, 10.0), (0.17, 120.0), (0.12, 700.0), (0.1, 3000.0))
 NOISES = [VoltageNoise(sigma=sigma, cutoff=cutoff) for sigma, cutoff in SPEEDS]
 DEPTHS = ((0.9, 50.0), (0.3, 100.0), (0.25, 333.0), (0.5, 1000.0))
 LAMPS = [Flicker(depth=depth, frequency=frequency) for depth, frequency in DEPTHS]
+# a dip between two samples, and pulses between them
+LAMPS += [
+    Flicker(depth=0.15, frequency=333.0, shape="rectified"),
+    Flicker(depth=0.4, frequency=1000.0, shape="pwm", duty=0.05),
+]
 
 
 @pytest.mark.parametrize("effect", [*NOISES, *LAMPS], ids=lambda effect: effect.name)
@@ -92,6 +97,17 @@ def test_models_are_sampled_as_each_of_them_needs(trials):
     # repeats of a model all take the same samples, each with random numbers of its own
     repeats = SimulationOrder(sensor, vectors, 5, reseed=True)
     assert repeats.samples_per_step(STEP).tolist() == [24] * 4
+
+
+def test_the_coarsest_steps_of_a_fit_are_cut_as_finely_as_others():
+    """A trial is the simulation in time, however long the steps of its grid are."""
+    fast, faster = sensor_with(VoltageNoise(cutoff=3000.0)), sensor_with(VoltageNoise(cutoff=2e4))
+    for step in (STIMULUS.common_step, STIMULUS.coarsest_step):
+        assert step / samples_per_step(fast, step) <= fast.longest_step() * (1 + 1e-9)
+        # noise that nothing is known to have does not make all fits slow
+        assert samples_per_step(faster, step) == samples_per_step(fast, step)
+    # shorter steps are cut into as many at most, however fine that is
+    assert samples_per_step(faster, 5e-4) == samples_per_step(faster, STIMULUS.common_step)
 
 
 def test_screening_samples_no_finer_than_it_has_to(trials):

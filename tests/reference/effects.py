@@ -29,7 +29,7 @@ def light(sensor: dase.Sensor, times: np.ndarray, frames: np.ndarray, seed: int)
             for column in range(width):
                 number = row // lamp.region + column // lamp.region
                 turns = lamp.frequency * times + lamp.phase + lamp.apart * number
-                out[:, row, column] *= 1 + lamp.depth * waveform(lamp, turns)
+                out[:, row, column] *= 1 + lamp.depth * waveform(lamp, shown_turns(lamp, turns))
     y, x = np.mgrid[:height, :width]
     square = ((2 * x - width + 1) ** 2 + (2 * y - height + 1) ** 2) / (width**2 + height**2)
     corner = np.arccos((1 - setting(sensor, "vignetting", "loss", 0.0)) ** 0.25)
@@ -38,6 +38,17 @@ def light(sensor: dase.Sensor, times: np.ndarray, frames: np.ndarray, seed: int)
     current, spread = (setting(sensor, "dark", name, 0.0) for name in ("current", "spread"))
     normal = [Stream("dark_current_pixel_normal", seed, i).normal() for i in range(width * height)]
     return out + current * np.exp(spread * np.array(normal))
+
+
+def shown_turns(lamp: dase.Effect, turns: np.ndarray) -> np.ndarray:
+    """Return the turns that samples show: an extreme of the light within half the step before them.
+
+    The first sample shows its own moment, and so do samples of which a period has fewer than two.
+    """
+    half = np.diff(turns, prepend=-np.inf) / 2
+    brightest = {"sine": 0.25, "rectified": 0.5, "pwm": 0.5 * lamp.duty}[lamp.shape]
+    extreme = brightest + np.round(2 * (turns - brightest)) / 2
+    return np.where((np.abs(turns - extreme) <= half) & (half <= 0.25), extreme, turns)
 
 
 def waveform(lamp: dase.Effect, turns: np.ndarray) -> np.ndarray:
@@ -121,6 +132,8 @@ def voltage_noise(
         normals: Standard normal, shape (2, K, N).
     """
     effect = sensor["voltage_noise"]
+    if effect.poles == "apart":
+        return photoreceptor_noise(times, intensity, effect, normals)
     total = intensity + effect.dark
     corner = effect.cutoff * total / (total + effect.knee)
     sigma = effect.sigma * np.sqrt(effect.knee / (total + effect.knee))
@@ -141,6 +154,41 @@ def voltage_noise(
                 way = CubicHermiteSpline([0.0, 1.0], [before[0], state[0]], slopes)
                 (turn,) = (t for t in way.derivative().roots() if 0 <= t <= 1)
                 out[k, i] = way(turn) + np.sign(before[1]) * 0.05 * constants**1.5 * sigma[k, i]
+    return out
+
+
+def photoreceptor_noise(
+    times: np.ndarray, intensity: np.ndarray, effect: dase.Effect, normals: np.ndarray
+) -> np.ndarray:
+    """Return the noise of a node whose pole follows the light, behind a fixed pole; as `voltage_noise`.
+
+    Its covariance after a step is from Van Loan's matrix exponential, in the order node, voltage.
+    """
+    out, fixed = np.zeros_like(intensity), 2 * np.pi * effect.cutoff
+    for i in range(intensity.shape[1]):
+        for k in range(len(times)):
+            moving = fixed * (intensity[k, i] + effect.dark) / effect.knee
+            drift = np.array([[-moving, 0.0], [fixed, -fixed]])
+            share = fixed / (fixed + moving)
+            if k == 0:
+                spread = np.array([[1.0, share], [share, share]])
+                state = effect.sigma * cholesky(spread, lower=True) @ normals[:, k, i]
+                out[k, i] = state[1]
+                continue
+            dt, before = times[k] - times[k - 1], state
+            white = np.diag([2 * moving, 0.0])
+            block = expm(np.block([[-drift, white], [np.zeros((2, 2)), drift.T]]) * dt)
+            step = block[2:, 2:].T
+            spread = step @ block[:2, 2:]
+            state = step @ state + effect.sigma * cholesky(spread, lower=True) @ normals[:, k, i]
+            out[k, i] = state[1]
+            slopes = [fixed * dt * (s[0] - s[1]) for s in (before, state)]
+            if slopes[0] * slopes[1] < 0:
+                near = min(1.0, 2.0 / (dt * max(moving, fixed)))
+                way = CubicHermiteSpline([0.0, 1.0], [before[1], state[1]], np.multiply(slopes, near))
+                (turn,) = (t for t in way.derivative().roots() if 0 <= t <= 1)
+                pace = np.sqrt(moving * fixed**2 / 2 * (near * dt) ** 3)
+                out[k, i] = way(turn) + np.sign(slopes[0]) * 0.05 * pace * effect.sigma
     return out
 
 

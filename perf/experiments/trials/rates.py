@@ -19,13 +19,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 import dase
+from dase.effects.bandwidth import Bandwidth
 from dase.effects.flicker import Flicker
 from dase.effects.readout import Readout
 from dase.effects.shot import Shot
 from dase.effects.threshold import Threshold
 from dase.effects.voltage_noise import VoltageNoise
 from dase.fitting.batch_simulator import BatchSimulator, SimulationOrder
-from dase.fitting.data_split import split_measurement
+from dase.fitting.data_split import common_grid, split_measurement
 from dase.fitting.model import model_of
 from dase.kernels import launch
 from dase.probes.stimulus import Grid, Stimulus, sort_into_cells
@@ -33,8 +34,9 @@ from perf.benchmarks.compare_commits import commit_of, device_name
 
 WIDTH, HEIGHT = 40, 30
 
-STEPS = (1e-3, 4e-3)
-"""Steps of the grid of time [s]: a clip at 1 kHz, and one at 250 frames per second."""
+STEPS = (1e-3, 2e-3, 4e-3)
+"""Between frames [s]: clips at 1 kHz, at the least that a fit takes as they are, and at 250 frames per
+second, whose time it cuts finer."""
 
 THRESHOLD = Threshold(on=0.2, off=0.2, phase=1.0)
 """Where a pixel begins between two levels is by chance, so that rates are smooth in all parameters."""
@@ -44,6 +46,12 @@ CUTOFFS = (10.0, 50.0, 200.0, 1000.0, 3000.0)
 KNEES = (0.1,)
 """One, as pixels see light of 0.1 to 10 times that."""
 DEPTHS = (0.15, 0.3, 0.6, 0.9)
+LAMPS = (
+    Flicker(shape="sine"),
+    Flicker(shape="rectified"),
+    Flicker(shape="pwm", duty=0.5),
+    Flicker(shape="pwm", duty=0.05),
+)
 FREQUENCIES = (50.0, 100.0, 333.0, 1000.0)
 FULLNESS = (0.3, 0.7, 1.0, 1.5, 3.0)
 """Mean rate of what pixels send to what the bus can: below 1 it is full in bursts only."""
@@ -94,35 +102,45 @@ def compare(effect: str, case: str, pair: Callable[[int], tuple[float, float]], 
             return row
 
 
-def pixel_rates(effect: VoltageNoise | Flicker, step: float, seconds: float, device: str) -> Row:
+def pixel_rates(
+    effect: VoltageNoise | Flicker, step: float, seconds: float, device: str, cutoff: float = np.inf
+) -> Row:
     """Return how often pixels at rest send in trials, against a simulation.
 
     Args:
         effect: What makes them send.
-        step: Of the grid of the trials, and of the frames of the simulation [s].
+        step: Between frames [s].
         seconds: Length.
         device: Where kernels run.
+        cutoff: Of a photoreceptor [Hz] that smooths it; infinite for none.
     """
-    pixels, steps = WIDTH * HEIGHT, round(seconds / step) + 1
-    levels = np.geomspace(0.01, 1, pixels)
-    light = np.repeat(levels[:, None], steps, 1).astype(np.float32)
-    cell = sort_into_cells(light, step, np.array([0.05, 0.2, 0.5]), 1e-3)
-    grid = Grid(0.0, step, steps)
+    pixels = WIDTH * HEIGHT
+    levels = np.geomspace(0.01, 1, pixels).astype(np.float32)
+    times = np.arange(round(seconds / step) + 1, dtype=np.float64) * step
+    scene = dase.VideoScene(np.tile(levels.reshape(HEIGHT, WIDTH), (len(times), 1, 1)), times)
+    first = np.zeros(1, np.uint16)
+    last = dase.Events(times[-1:], first, first, np.ones(1, np.bool_), WIDTH, HEIGHT)
+    grid = common_grid(last, scene)
+    light = np.repeat(levels[:, None], grid.steps, 1)
+    cell = sort_into_cells(light, grid.step, np.array([0.05, 0.2, 0.5]), 1e-3)
     numbers = np.arange(pixels, dtype=np.int32)
     trials = BatchSimulator(
         Stimulus(numbers, WIDTH, HEIGHT, grid, light, cell, 1e-3, launch.find_device(device))
     )
-    scene = dase.VideoScene(light.T.reshape(-1, HEIGHT, WIDTH), grid.times)
     sensor = dase.Sensor((THRESHOLD, effect))
+    if np.isfinite(cutoff):
+        sensor = sensor.with_effect(Bandwidth(cutoff=cutoff, dark=1.0))
 
     def pair(seed: int) -> tuple[float, float]:
         got = trials.run(sensor, sensor.parameters()[None], seed=seed).halves.sum()
         return float(got), float(len(dase.simulate(scene, sensor, seed=seed, device=device)))
 
     if isinstance(effect, Flicker):
-        said = f"{effect.shape}, depth {effect.depth:g}, {effect.frequency:g} Hz"
+        duty = f" of duty {effect.duty:g}" if effect.shape == "pwm" else ""
+        said = f"{effect.shape}{duty}, depth {effect.depth:g}, {effect.frequency:g} Hz"
     else:
         said = f"sigma {effect.sigma:g}, cutoff {effect.cutoff:g} Hz, knee {effect.knee:g}"
+    said += f", smoothed at {cutoff:g} Hz" if np.isfinite(cutoff) else ""
     return compare(effect.name, f"{said}, step {1e3 * step:g} ms", pair)
 
 
@@ -196,11 +214,12 @@ def noise_rows(device: str) -> Iterator[Row]:
 
 
 def flicker_rows(device: str) -> Iterator[Row]:
-    """Compare lamps."""
-    for shape, depth, frequency, step in itertools.product(
-        ("sine", "rectified", "pwm"), DEPTHS, FREQUENCIES, STEPS
+    """Compare lamps, by themselves and behind a photoreceptor whose cutoff is their frequency."""
+    for waveform, depth, frequency, step, cutoffs in itertools.product(
+        LAMPS, DEPTHS, FREQUENCIES, STEPS, (np.inf, 1.0)
     ):
-        yield pixel_rates(Flicker(shape=shape, depth=depth, frequency=frequency), step, 0.3, device)
+        lamp = replace(waveform, depth=depth, frequency=frequency)
+        yield pixel_rates(lamp, step, 0.3, device, cutoffs * frequency)
 
 
 def readout_rows(device: str) -> Iterator[Row]:
