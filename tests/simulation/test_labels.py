@@ -24,9 +24,9 @@ from dase.effects.refractory import Refractory
 from dase.effects.shot import Shot
 from dase.effects.threshold import Threshold
 from dase.events import LABELS
-from dase.figures import event_images
 from dase.io.sequence import Sequence
 from dase.recordings import summary
+from dase.recordings.statistics import sequence_statistics
 
 SIGNAL, LEAK, SHOT, HOT = range(4)
 
@@ -284,14 +284,14 @@ def test_unknown_labels_are_refused(tmp_path, rng):
 
 def test_shares_add_up(rng):
     events = some(rng)
-    statistics = event_images.sequence_statistics(Sequence(events))
+    statistics = sequence_statistics(Sequence(events))
     assert statistics.label_shares == pytest.approx(np.bincount(events.label, minlength=4) / len(events))
     assert sum(statistics.label_shares) == pytest.approx(1.0)
     said = dict(summary.statistics_table(statistics))["labels"]
     assert said.startswith("signal ")
     assert sum(float(part.split()[1]) for part in said.split(", ")) == pytest.approx(100, abs=0.2)
     assert "labels" not in dict(
-        summary.statistics_table(event_images.sequence_statistics(Sequence(replace(events, label=None))))
+        summary.statistics_table(sequence_statistics(Sequence(replace(events, label=None))))
     )
 
 
