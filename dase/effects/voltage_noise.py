@@ -208,12 +208,12 @@ class VoltageNoise(Effect):
 
     With `poles = "apart"` the noise has the photoreceptor's own two poles: that of its node, which the
     photocurrent charges, at cutoff · I / knee, and the fixed one at `cutoff`. The variance is as above, and
-    the voltage passes its mean sqrt(I / knee) · cutoff times per second upwards. Its covariance is exact
-    at any sampling. Event rates are 0.7 to 1.1 of Rice's up to the knee, 0.3 to 0.5 at ten times the knee,
-    where the node is too fast for the samples: a fifth of the events of fine sampling are lost. The node's
-    pole is
-    that of `bandwidth` where that has cutoff · (1 + dark) / knee and dark / (1 + dark), see
-    `of_photoreceptor`.
+    the voltage passes its mean sqrt(I / knee) · cutoff times per second upwards. Its crossings come in
+    clusters where the node is the faster one, and most of a cluster make no event, so events are fewer than
+    Rice's formula has crossings. Scenes are sampled so finely that at intensity 1 the node has at most two
+    time constants between samples: pi / knee samples per period of `cutoff`, which costs much for a low knee.
+    The node's pole is that of `bandwidth` where that has cutoff · (1 + dark) / knee and dark / (1 + dark),
+    see `of_photoreceptor`.
 
     An ideal memory moves by whole thresholds, so a pixel keeps the phase that it began with, and pixels which
     are alike differ in their rates. One that is held in reset after its events (`refractory`) memorises the
@@ -260,7 +260,6 @@ class VoltageNoise(Effect):
         about="dark current, as the intensity that makes as much; keeps the corner above 0",
         fitted=False,  # it shows in the darkest pixels only, which hardly send events
     )
-
     poles: str = choice(
         "alike",
         among=("alike", "apart"),
@@ -289,12 +288,16 @@ class VoltageNoise(Effect):
     def compiled(self) -> EffectStages:
         """Return what the kernel composer needs to know."""
         stages = super().compiled()
-        return (
-            replace(stages, functions=(("respond", photoreceptor_noise),))
-            if self.poles == "apart"
-            else stages
-        )
+        if self.poles == "alike":
+            return stages
+        return replace(stages, functions=(("respond", photoreceptor_noise),))
 
     def longest_step(self) -> float:
         """Return the longest time between samples that still shows the effect [s]."""
-        return 1 / (8 * self.cutoff) if self.sigma else math.inf
+        if not self.sigma:
+            return math.inf
+        step = 1 / (8 * self.cutoff)
+        if self.poles == "alike":
+            return step
+        # slopes tell where the voltage turns up to so many time constants of the node; in the brightest light
+        return min(step, STEEP * self.knee / (2 * math.pi * self.cutoff * (1 + self.dark)))

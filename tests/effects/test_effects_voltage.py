@@ -290,3 +290,53 @@ def test_a_pixel_held_in_reset_forgets_its_phase(device):
     assert likeness_of_halves(noisy, device) > 0.7
     # a time constant
     assert likeness_of_halves(noisy.with_effect(Refractory(period=5e-3)), device) < 0.3
+
+
+def fine_rate(ratio: float, level: float, cutoff: float, rng: np.random.Generator) -> float:
+    """Return events per second and pixel of a node's noise behind a fixed pole, sampled 400 times a period.
+
+    Args:
+        ratio: Pole of the node in units of the fixed one.
+        level: Both thresholds, in standard deviations of the voltage.
+        cutoff: Of the fixed pole [Hz].
+        rng: Random numbers.
+    """
+    fixed, seconds, pixels = 2 * np.pi * cutoff, 4.0, 800
+    share, step = 1 / (1 + ratio), 1 / (400 * cutoff)
+    drift = np.array([[-ratio * fixed, 0.0], [fixed, -fixed]])
+    kept = expm(drift * step)
+    stationary = np.array([[1.0, share], [share, share]])
+    root = np.linalg.cholesky(stationary - kept @ stationary @ kept.T)
+    state = np.linalg.cholesky(stationary) @ rng.standard_normal((2, pixels))
+    theta, events, steps = level * np.sqrt(share), 0.0, round(seconds / step)
+    memory = state[1] + theta * rng.uniform(-1, 1, pixels)
+    for n in range(steps):
+        state = kept @ state + root @ rng.standard_normal((2, pixels))
+        moved = np.trunc((state[1] - memory) / theta)
+        memory += moved * theta
+        events += np.abs(moved).sum() * (n >= steps // 2)
+    return events / (pixels * seconds / 2)
+
+
+@pytest.mark.parametrize("level", [2.0, 3.0])
+@pytest.mark.parametrize("ratio", [1.0, 10.0])
+def test_the_photoreceptors_noise_sends_as_often_as_finely_sampled_noise(device, ratio, level, rng):
+    """In light of ten times the knee 0.57 of the events were left at eight samples per period."""
+    cutoff, sigma, dark, seconds = 10.0, 0.1, 0.003, 12.0
+    light = 0.9
+    noise = VoltageNoise(sigma=sigma, cutoff=cutoff, knee=(light + dark) / ratio, dark=dark, poles="apart")
+    theta = level * sigma / np.sqrt(1 + ratio)
+    sensor = every(Threshold(on=theta, off=theta), noise)
+    scene = dase.VideoScene(np.full((481, 40, 60), light, np.float32), np.linspace(0, seconds, 481))
+    got = dase.count(scene, sensor, [seconds / 2, seconds], device=device).sum() / (2400 * seconds / 2)
+    assert got == pytest.approx(fine_rate(ratio, level, cutoff, rng), rel=0.09)
+
+
+@pytest.mark.parametrize("dark", [0.02, 0.5])
+def test_noise_of_a_photoreceptor_has_its_pole(dark):
+    pole = Bandwidth(cutoff=150.0, dark=dark)
+    noise = VoltageNoise.of_photoreceptor(pole, sigma=0.05, cutoff=800.0)
+    light = np.array([0.0, 0.01, 0.3, 1.0])
+    expected = pole.cutoff * (pole.dark + (1 - pole.dark) * light)
+    np.testing.assert_allclose(noise.cutoff * (light + noise.dark) / noise.knee, expected, rtol=1e-12)
+    assert (noise.sigma, noise.cutoff, noise.poles) == (0.05, 800.0, "apart")
