@@ -54,8 +54,8 @@ to 50 ms. What `learned_threshold` does is in [adaptation.md](adaptation.md).
 def pictures() -> str:
     """Return the pictures of all effects that have one."""
     folder = Path(__file__).parent / "effects"
-    names = (name for name in dase.EFFECTS if (folder / f"{name}.png").is_file())
-    return PICTURES + "".join(f"\n![{name}: without and with](effects/{name}.png)\n" for name in names)
+    found = [(name, path) for name in dase.EFFECTS for path in sorted(folder.glob(f"{name}*.png"))]
+    return PICTURES + "".join(f"\n![{name}: without and with](effects/{path.name})\n" for name, path in found)
 
 
 def recordings() -> str:
@@ -241,6 +241,50 @@ formula for pixels that keep their phase holds then.
 """
 
 
+def poles_apart() -> str:
+    """Return the table of events of noise of two poles against those in small steps."""
+    found = json.loads(APART.read_text("utf-8"))
+    levels = list(dict.fromkeys(row["level"] for row in found))
+    heads = [f"{level:g} sigma: in small steps | dase | Rice" for level in levels]
+    head = "| node's pole | samples per period, processor time | " + " | ".join(heads) + " |"
+    lines = [head, "|---" * (2 + 3 * len(levels)) + "|"]
+    for ratio in dict.fromkeys(row["ratio"] for row in found):
+        rows = [row for row in found if row["ratio"] == ratio]
+        cells = [
+            f"{row['fine']:.3g} | {row['rate'] / row['fine']:.3f} ± {row['error']:.3f} | "
+            f"{row['rice'] / row['fine']:.2f}"
+            for row in rows
+        ]
+        # 5000 pixels over 60 periods
+        spent = sum(row["seconds"] for row in rows) / len(rows) / (5000 * 60) * 1e6
+        cost = f"{rows[0]['samples']:.0f}, {spent:.2g} us"
+        lines.append(f"| {ratio:g} | {cost} | " + " | ".join(cells) + " |")
+    return POLES_APART.format(table="\n".join(lines))
+
+
+APART = RICE.with_name("apart.json")
+
+POLES_APART = """
+## Noise of two poles against small steps
+
+`voltage_noise` with `poles = "apart"`: events per period of the fixed pole in an independent NumPy process
+of steps of a twentieth of the faster pole's time constant (5000 pixels, 40 periods after 20 others), and
+those of `dase.count` and of Rice's formula relative to these. The node's pole is that at the light looked
+at, in units of the fixed one: from light of a tenth of the knee to a hundred times the knee. Samples are per
+period of the fixed pole, and processor time is per pixel and such period, of one core of an AMD EPYC.
+`python -m perf.experiments.noise.rice --poles apart` computes it anew.
+
+{table}
+
+All are within 2.2 % of the small steps. Rice's formula is the same as above, with a mean that is passed
+sqrt(a b) / 2π times a second upwards, a and b the poles. The faster the node, the rougher the voltage, and
+the more crossings come in clusters, of which hardly any but the first makes an event. The fixed pole's
+frequency sets the pace and nothing else (the same within 1 % at 10 to 3000 Hz, `pytest
+tests/effects/test_effects_voltage.py -k pace`). What a low knee costs are samples, π (1 + dark) / knee per
+period of the fixed pole, whatever the light in the scene.
+"""
+
+
 def fitted_and_simulated() -> str:
     """Return the table of rates in trials against those of simulations."""
     table = json.loads(TRIALS.read_text("utf-8"))
@@ -309,6 +353,7 @@ def page() -> str:
         + recordings()
         + RECORDINGS
         + rice()
+        + poles_apart()
         + fitted_and_simulated()
     )
 

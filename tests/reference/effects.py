@@ -66,16 +66,19 @@ def linlog(voltage: np.ndarray, knee: float, slope: float, eps: float) -> np.nda
     return np.where(np.exp(voltage) - eps < knee, line, voltage)
 
 
-def second_order(times: np.ndarray, level: np.ndarray, omega: np.ndarray, damping: float) -> np.ndarray:
+def second_order(
+    times: np.ndarray, level: np.ndarray, omega: np.ndarray, damping: float | np.ndarray
+) -> np.ndarray:
     """Return level behind ω² / (s² + 2 damping ω s + ω²), settled at the first sample.
 
     Args:
         times: Samples [s], shape (K,).
         level: Straight between samples, shape (K, N).
         omega: Natural frequency during the step that ends at each sample [rad/s], shape (K, N).
-        damping: Of the filter.
+        damping: Of the filter during the step that ends at each sample, shape (K, N) or the same for all.
     """
     out = np.array(level, np.float64)
+    damping = np.broadcast_to(damping, level.shape)
     for i in range(level.shape[1]):
         state = np.array([level[0, i], 0.0, level[0, i], 0.0])  # output, its slope, input, its slope
         for k in range(1, len(times)):
@@ -83,7 +86,7 @@ def second_order(times: np.ndarray, level: np.ndarray, omega: np.ndarray, dampin
             state[2:] = level[k - 1, i], (level[k, i] - level[k - 1, i]) / dt
             flow = np.zeros((4, 4))
             flow[0, 1] = flow[2, 3] = 1
-            flow[1] = [-w * w, -2 * damping * w, w * w, 0]
+            flow[1] = [-w * w, -2 * damping[k, i] * w, w * w, 0]
             state = expm(flow * dt) @ state
             out[k, i] = state[0]
     return out
@@ -225,9 +228,13 @@ def voltage(sensor: dase.Sensor, times: np.ndarray, intensity: np.ndarray, seed:
         level = (follower if slow.signal == "large" else reference.lowpass)(times, level, cutoff)
     if np.isfinite(setting(sensor, "second_order", "cutoff", np.inf)):
         slow = sensor["second_order"]
-        omega = 2 * np.pi * slow.cutoff * (slow.dark + (1 - slow.dark) * bright)
-        omega = omega * own_speed(slow, intensity.shape[1], seed)
-        level = second_order(times, level, omega, slow.damping)
+        current = slow.dark + (1 - slow.dark) * bright
+        omega = 2 * np.pi * slow.cutoff * own_speed(slow, intensity.shape[1], seed)
+        if slow.poles == "apart":
+            damping = slow.damping * (slow.fixed / np.sqrt(current) + (1 - slow.fixed) * np.sqrt(current))
+            level = second_order(times, level, omega * np.sqrt(current), damping)
+        else:
+            level = second_order(times, level, omega * current, slow.damping)
     if setting(sensor, "voltage_noise", "sigma", 0.0) > 0:
         streams = ("voltage_noise_respond_uniform", "voltage_noise_respond_uniform_2")
         pixels = range(intensity.shape[1])
