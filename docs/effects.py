@@ -88,8 +88,12 @@ MEASURED = """
 
 Presets on recordings of their cameras, nothing fitted: those of commit 3859195 (before) and those of now
 (after). The scene is what the camera's own frames tell, or constant light where nothing moved; where no scene
-is known, only the measurement stands. `python -m perf.experiments.recordings.run $DASE_DATA/recordings`
-measures anew, `python docs/effects.py` writes these tables.
+is known, only the measurement stands. *With its lamp and frames*: the preset of now with `flicker` and
+`exposure` at the frequency and the times that the events tell, and both strengths and the threshold set by
+three totals, the event rate, the share in bursts and the swing; all else is left to compare. `python -m
+perf.experiments.recordings.run $DASE_DATA/recordings` measures anew (2992312, the line with the lamp after
+79c3e70), `python docs/effects.py` writes these tables. Noise of another camera at three illuminances is in
+[noise.md](noise.md).
 
 Intervals of a pixel [ms] by its polarities: 0.1 / 1 / 10 % are shorter. Empty where there are fewer than 300.
 
@@ -123,13 +127,18 @@ the cradle has too many is noise of the frames that make the scene, most of all 
 level is more than a threshold.
 
 What is not: the shaken DAVIS240C has more events than its preset makes, and fewer with the reset, as its
-thresholds are lower, and neither its lamp nor its frames are in a preset. Frames can be fitted (`exposure`),
-but not by this recording: see [reading-a-diagnosis.md](reading-a-diagnosis.md). Its ties in one row (43 %),
-like those of the DAVIS240B and the Gen3, are of rows that send many events at once, as in its bursts in step
-with the frames; a preset that reads by rows but has no such bursts makes none. The DAVIS346 shows no such
-rows: its ties are of different rows. Intervals of 0 to 1 us of two OFF events of the DVS128 and the DAVIS240B
-are double events. Pixels of the DVXplorer at rest send bursts of noise at intervals of its scan, and those of
-the HD sensor flip their polarity sooner than independent noise does.
+thresholds are lower, and neither its lamp nor its frames are in a preset. With both, and with thresholds of
+0.108, steps of 0.067 by the frames and a lamp of 1.0 % depth, it has the lamp's swing, the bursts and the
+events, as it was set to; and of what was not set, intervals of one polarity come nearer (a tenth of those of
+ON-ON are below 3.5 ms; 9.9 and 5.9 ms, without and with both), and so do ties (62 %; 7 and 30 %) and those
+in one row (43 %; 0.04 and 16 %). Intervals between the polarities stay too long (ON-OFF 4.1 ms; 57 and 30
+ms): frames 138 ms apart do not tell the fine turns of a shaking hand. `dase.fit` finds no strength of the
+frames here, see [reading-a-diagnosis.md](reading-a-diagnosis.md). Ties in one row, of the DAVIS240B and the
+Gen3, too, are of rows that send many events at once, as in bursts in step with the frames; a preset that
+reads by rows but has no such bursts makes none. The DAVIS346 shows no such rows: its ties are of different
+rows. Intervals of 0 to 1 us of two OFF events of the DVS128 and the DAVIS240B are double events. Pixels of
+the DVXplorer at rest send bursts of noise at intervals of its scan, and those of the HD sensor flip their
+polarity sooner than independent noise does.
 """
 
 RECORDINGS = """
