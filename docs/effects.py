@@ -255,10 +255,10 @@ def poles_apart() -> str:
     found = json.loads(APART.read_text("utf-8"))
     levels = list(dict.fromkeys(row["level"] for row in found))
     heads = [f"{level:g} sigma: in small steps | dase | Rice" for level in levels]
-    head = "| node's pole | samples per period, processor time | " + " | ".join(heads) + " |"
+    head = "| node's pole, gain | samples per period, processor time | " + " | ".join(heads) + " |"
     lines = [head, "|---" * (2 + 3 * len(levels)) + "|"]
-    for ratio in dict.fromkeys(row["ratio"] for row in found):
-        rows = [row for row in found if row["ratio"] == ratio]
+    for ratio, gain in dict.fromkeys((row["ratio"], row["gain"]) for row in found):
+        rows = [row for row in found if (row["ratio"], row["gain"]) == (ratio, gain)]
         cells = [
             f"{row['fine']:.3g} | {row['rate'] / row['fine']:.3f} ± {row['error']:.3f} | "
             f"{row['rice'] / row['fine']:.2f}"
@@ -267,7 +267,7 @@ def poles_apart() -> str:
         # 5000 pixels over 60 periods
         spent = sum(row["seconds"] for row in rows) / len(rows) / (5000 * 60) * 1e6
         cost = f"{rows[0]['samples']:.0f}, {spent:.2g} us"
-        lines.append(f"| {ratio:g} | {cost} | " + " | ".join(cells) + " |")
+        lines.append(f"| {ratio:g}, {gain:g} | {cost} | " + " | ".join(cells) + " |")
     return POLES_APART.format(table="\n".join(lines))
 
 
@@ -279,18 +279,20 @@ POLES_APART = """
 `voltage_noise` with `poles = "apart"`: events per period of the fixed pole in an independent NumPy process
 of steps of a twentieth of the faster pole's time constant (5000 pixels, 40 periods after 20 others), and
 those of `dase.count` and of Rice's formula relative to these. The node's pole is that at the light looked
-at, in units of the fixed one: from light of a tenth of the knee to a hundred times the knee. Samples are per
-period of the fixed pole, and processor time is per pixel and such period, of one core of an AMD EPYC.
-`python -m perf.experiments.noise.rice --poles apart` computes it anew.
+at, in units of the fixed one: from light of a tenth of the knee to a hundred times the knee; the gain is
+that of a loop around both. Samples are per period of the fixed pole, and processor time is per pixel and
+such period, of one core of an AMD EPYC. `python -m perf.experiments.noise.rice --poles apart` computes it
+anew.
 
 {table}
 
-All are within 2.2 % of the small steps. Rice's formula is the same as above, with a mean that is passed
-sqrt(a b) / 2π times a second upwards, a and b the poles. The faster the node, the rougher the voltage, and
-the more crossings come in clusters, of which hardly any but the first makes an event. The fixed pole's
-frequency sets the pace and nothing else (the same within 1 % at 10 to 3000 Hz, `pytest
-tests/effects/test_effects_voltage.py -k pace`). What a low knee costs are samples, π (1 + dark) / knee per
-period of the fixed pole, whatever the light in the scene.
+Without a loop all are within 2.0 % of the small steps, with one within 3.2 %, which is two errors. Rice's
+formula is the same as above, with a mean that is passed sqrt((1 + gain) a b) / 2π times a second upwards, a
+and b the poles. The faster the node, the rougher the voltage, and the more crossings come in clusters, of
+which hardly any but the first makes an event. The fixed pole's frequency sets the pace and nothing else (the
+same within 1 % at 10 to 3000 Hz, `pytest tests/effects/test_effects_voltage.py -k pace`). What a low knee
+costs are samples, π (1 + dark) / knee per period of the fixed pole, whatever the light in the scene; a loop
+asks for some sqrt(25 (1 + gain) / knee), where that is more.
 """
 
 
@@ -319,9 +321,9 @@ sqrt((1 + A) a b L) and the damping (a L + b) / 2 over that: in the light it may
 `second_order` with `poles = "apart"` is that circuit: its events are within a threshold and a half of the
 voltage of an independent integration of node and amplifier, in light that goes up and down by 30, at five
 pairs of poles and gains of 0 to 60 (`pytest tests/effects/test_photoreceptor.py -k circuit`). Special cases
-are `bandwidth` (b far above the rest), a low-pass behind another (A = 0, the photoreceptor of
-`voltage_noise` with `poles = "apart"`) and `poles = "alike"` in light that is the same everywhere. With a
-gain noise is not shaped by the loop: `voltage_noise` has two real poles.
+are `bandwidth` (b far above the rest), a low-pass behind another (A = 0), and `poles = "alike"` in light
+that is the same everywhere. `voltage_noise` with `poles = "apart"` is the noise of the same circuit, with
+the same `gain` (above); `SecondOrder.of_poles` and `VoltageNoise.of_photoreceptor` take the same numbers.
 
 Does it matter? Events of the circuit with thresholds of 0.2, cutoff 60 Hz and dark 0.01, before waves 20
 times as bright on one side as on the other (64x48, 0.6 s, 1 kHz, nothing else on), fitted with either law

@@ -99,6 +99,28 @@ def test_closed_forms_keep_their_digits(device):
         np.testing.assert_allclose(got, want, atol=slack)
 
 
+@wp.kernel(enable_backward=False)
+def variances(x: wp.array[float], damping: wp.array[float], out: wp.array2d[float]):
+    i = wp.tid()
+    h, dh = second_order.impulse_response(x[i], damping[i])
+    var, mixed, speed = voltage_noise.fresh_variance_of_poles(x[i], damping[i], h, dh)
+    out[i, 0] = var
+    out[i, 1] = mixed
+    out[i, 2] = speed
+
+
+def test_variances_of_noise_keep_their_digits(device):
+    x, damping = np.meshgrid(np.geomspace(1e-3, 50, 50), [0.05, 0.4, 1.0, 1.2, 3.0, 20.0, 50.0])
+    x, damping = x.ravel().astype(np.float32), damping.ravel().astype(np.float32)
+    out = wp.empty((len(x), 3), dtype=float, device=device)
+    inputs = [wp.array(a, dtype=float, device=device) for a in (x, damping)]
+    wp.launch(variances, len(x), inputs=[*inputs, out], device=device)
+    for got, at, zeta in zip(out.numpy().astype(float), x.astype(float), damping.astype(float), strict=True):
+        flow = expm(at * np.array([[0, 1], [-1, -2 * zeta]]))
+        fresh = np.eye(2) - flow @ flow.T
+        np.testing.assert_allclose(got, [fresh[0, 0], fresh[0, 1], fresh[1, 1]], rtol=2e-3, atol=1e-9)
+
+
 @pytest.mark.parametrize("damping", [0.05, 1.0, 20.0])
 def test_a_second_order_pixel_starts_settled(device, damping):
     sensor = every(Threshold(on=0.01, off=0.01), SecondOrder(cutoff=0.01, damping=damping, dark=1e-4))
@@ -292,13 +314,15 @@ def test_a_pixel_held_in_reset_forgets_its_phase(device):
     assert likeness_of_halves(noisy.with_effect(Refractory(period=5e-3)), device) < 0.3
 
 
-@pytest.mark.parametrize("ratio", [0.1, 1.0, 10.0, 30.0])
-def test_the_photoreceptors_noise_sends_as_often_as_finely_sampled_noise(device, ratio, rng):
+@pytest.mark.parametrize(
+    ("ratio", "gain"), [(0.1, 0.0), (1.0, 0.0), (10.0, 0.0), (30.0, 0.0), (0.02, 50.0), (0.2, 50.0)]
+)
+def test_the_photoreceptors_noise_sends_as_often_as_finely_sampled_noise(device, ratio, gain, rng):
     """In light of ten times the knee 0.57 of the events were left at eight samples per period."""
     span = dict(pixels=2500, periods=12.0, before=8.0)
-    wanted, errors = fine_rates(ratio, rng, **span)
+    wanted, errors = fine_rates(ratio, rng, gain=gain, **span)
     for level, want, error in zip(LEVELS, wanted, errors, strict=True):
-        got, spread = apart_rate(ratio, level, device=device, **span)
+        got, spread = apart_rate(ratio, level, gain=gain, device=device, **span)
         assert got == pytest.approx(want, rel=0.03, abs=3 * np.hypot(error, spread))
 
 

@@ -178,7 +178,7 @@ def test_damping_falls_as_light_rises(device):
     assert overshoots[2] < 0
 
 
-def test_a_far_fixed_pole_leaves_a_bandwidth_and_its_noise(device):
+def test_a_far_fixed_pole_leaves_a_bandwidth(device):
     pole = Bandwidth(cutoff=4.0, dark=0.02)
     whole = SecondOrder.of_poles(pole, cutoff=1500 * 4.0)
     times = np.linspace(0, 0.4, 801)
@@ -190,11 +190,17 @@ def test_a_far_fixed_pole_leaves_a_bandwidth_and_its_noise(device):
     )
     assert want[-1].sum() > 300
     assert np.abs(got - want).max() <= 1
-    noise = VoltageNoise.of_photoreceptor(pole, sigma=0.1, cutoff=6000.0)
-    at = np.array([0.0, 0.1, 1.0])
-    current = whole.dark + (1 - whole.dark) * at
-    # product and sum of the poles, of the signal's and of the noise's photoreceptor
-    node = noise.cutoff * (at + noise.dark) / noise.knee
-    np.testing.assert_allclose(node * noise.cutoff, whole.cutoff**2 * current, rtol=1e-12)
-    twice = 2 * whole.cutoff * whole.damping * (whole.fixed + (1 - whole.fixed) * current)
+
+
+@pytest.mark.parametrize("gain", [0.0, 30.0])
+def test_signal_and_noise_are_of_one_photoreceptor(gain):
+    """Product and sum of the poles are the same at any light."""
+    pole = Bandwidth(cutoff=4.0, dark=0.02)
+    signal = SecondOrder.of_poles(pole, cutoff=600.0, gain=gain)
+    noise = VoltageNoise.of_photoreceptor(pole, sigma=0.1, cutoff=600.0, gain=gain)
+    light = np.array([0.0, 0.1, 1.0])
+    current = signal.dark + (1 - signal.dark) * light
+    node = noise.cutoff * (light + noise.dark) / noise.knee
+    np.testing.assert_allclose((1 + noise.gain) * node * noise.cutoff, signal.cutoff**2 * current, rtol=1e-12)
+    twice = 2 * signal.cutoff * signal.damping * (signal.fixed + (1 - signal.fixed) * current)
     np.testing.assert_allclose(node + noise.cutoff, twice, rtol=1e-12)

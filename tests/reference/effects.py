@@ -7,7 +7,7 @@ from reference import pixel as reference
 from reference.pixel import Stream, setting
 from scipy.integrate import solve_ivp
 from scipy.interpolate import CubicHermiteSpline
-from scipy.linalg import cholesky, expm
+from scipy.linalg import cholesky, expm, solve_continuous_lyapunov
 
 import dase
 
@@ -163,34 +163,35 @@ def voltage_noise(
 def photoreceptor_noise(
     times: np.ndarray, intensity: np.ndarray, effect: dase.Effect, normals: np.ndarray
 ) -> np.ndarray:
-    """Return the noise of a node whose pole follows the light, behind a fixed pole; as `voltage_noise`.
+    """Return the noise of a node whose pole follows the light, in a loop with a fixed pole.
 
-    Its covariance after a step is from Van Loan's matrix exponential, in the order node, voltage.
+    Turns are those of `voltage_noise`. The covariance after a step is from Van Loan's matrix exponential, in
+    the order voltage, slope.
     """
-    out, fixed = np.zeros_like(intensity), 2 * np.pi * effect.cutoff
+    out, fixed, more = np.zeros_like(intensity), 2 * np.pi * effect.cutoff, 1 + effect.gain
     for i in range(intensity.shape[1]):
         for k in range(len(times)):
             moving = fixed * (intensity[k, i] + effect.dark) / effect.knee
-            drift = np.array([[-moving, 0.0], [fixed, -fixed]])
-            share = fixed / (fixed + moving)
+            # of the voltage, and of its slope over the fixed pole
+            drift = np.array([[0.0, fixed], [-more * moving, -(moving + fixed)]])
+            white = np.diag([0.0, 2 * more * moving])
             if k == 0:
-                spread = np.array([[1.0, share], [share, share]])
+                spread = solve_continuous_lyapunov(drift, -white)
                 state = effect.sigma * cholesky(spread, lower=True) @ normals[:, k, i]
-                out[k, i] = state[1]
+                out[k, i] = state[0]
                 continue
             dt, before = times[k] - times[k - 1], state
-            white = np.diag([2 * moving, 0.0])
             block = expm(np.block([[-drift, white], [np.zeros((2, 2)), drift.T]]) * dt)
             step = block[2:, 2:].T
             spread = step @ block[:2, 2:]
             state = step @ state + effect.sigma * cholesky(spread, lower=True) @ normals[:, k, i]
-            out[k, i] = state[1]
-            slopes = [fixed * dt * (s[0] - s[1]) for s in (before, state)]
+            out[k, i] = state[0]
+            slopes = [fixed * dt * s[1] for s in (before, state)]
             if slopes[0] * slopes[1] < 0:
-                near = min(1.0, 2.0 / (dt * max(moving, fixed)))
-                way = CubicHermiteSpline([0.0, 1.0], [before[1], state[1]], np.multiply(slopes, near))
+                near = min(1.0, 2.0 / (dt * max(moving, fixed, np.sqrt(more * moving * fixed))))
+                way = CubicHermiteSpline([0.0, 1.0], [before[0], state[0]], np.multiply(slopes, near))
                 (turn,) = (t for t in way.derivative().roots() if 0 <= t <= 1)
-                pace = np.sqrt(moving * fixed**2 / 2 * (near * dt) ** 3)
+                pace = np.sqrt(more * moving * fixed**2 / 2 * (near * dt) ** 3)
                 out[k, i] = way(turn) + np.sign(slopes[0]) * 0.05 * pace * effect.sigma
     return out
 

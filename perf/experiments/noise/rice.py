@@ -16,7 +16,7 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import expm
+from scipy.linalg import expm, solve_continuous_lyapunov
 
 import dase
 from dase.effects.refractory import Refractory
@@ -93,8 +93,9 @@ def simulated_rate(
     return float(rates.mean()), float(rates.std() / math.sqrt(pixels))
 
 
-RATIOS = (0.1, 1.0, 10.0, 30.0, 100.0)
-"""Poles of the node in units of the fixed one: light from a tenth of the knee to a hundred times it."""
+POLES = ((0.1, 0.0), (1.0, 0.0), (10.0, 0.0), (30.0, 0.0), (100.0, 0.0), (0.02, 50.0), (0.2, 50.0))
+"""Poles of the node in units of the fixed one, from light of a tenth of the knee to a hundred times it, and
+gains of the loop around both: dampings of 1 to 5, and of 0.50 and 0.19."""
 
 LEVELS = (1.0, 2.0, 3.0)
 """Thresholds in standard deviations of the voltage."""
@@ -107,18 +108,22 @@ def fine_rates(
     ratio: float,
     rng: np.random.Generator,
     *,
+    gain: float = 0.0,
     pixels: int = 5000,
     periods: float = 40.0,
     before: float = 20.0,
     step: float = 0.05,
 ) -> NDArray[np.float64]:
-    """Return events per period of the fixed pole, of a node's noise behind that pole, in small steps.
+    """Return events per period of the fixed pole, of a photoreceptor's noise in small steps.
+
+    A node behind which there is a fixed pole, or which drives an amplifier that drives it back.
 
     The process is exact at any step; this is NumPy alone and shares nothing with the effect.
 
     Args:
         ratio: Pole of the node in units of the fixed one.
         rng: Draws the noise and where the memories begin.
+        gain: Of the amplifier.
         pixels: How many, each with a memory for each of `LEVELS`.
         periods: That are counted.
         before: Periods not counted, in which memories find their places.
@@ -127,13 +132,14 @@ def fine_rates(
     Returns:
         Means over pixels and their standard errors, shape (2, levels).
     """
-    share, dt = 1 / (1 + ratio), step / (2 * math.pi * max(ratio, 1.0))
-    drift = 2 * math.pi * np.array([[-ratio, 0.0], [1.0, -1.0]])
+    dt = step / (2 * math.pi * max(ratio, 1.0, math.sqrt((1 + gain) * ratio)))
+    node, output = ([-ratio, ratio], [-gain, -1.0]) if gain else ([-ratio, 0.0], [1.0, -1.0])
+    drift = 2 * math.pi * np.array([node, output])
     kept = expm(drift * dt)
-    stationary = np.array([[1.0, share], [share, share]])
+    stationary = solve_continuous_lyapunov(drift, -np.diag([1.0, 0.0]))
     root = np.linalg.cholesky(stationary - kept @ stationary @ kept.T).astype(np.float32)
     state = (np.linalg.cholesky(stationary) @ rng.standard_normal((2, pixels))).astype(np.float32)
-    theta = (np.array(LEVELS) * math.sqrt(share)).astype(np.float32)[:, None]
+    theta = (np.array(LEVELS) * math.sqrt(stationary[1, 1])).astype(np.float32)[:, None]
     memory = state[1] + theta * rng.uniform(-1, 1, (len(LEVELS), pixels)).astype(np.float32)
     events = np.zeros((len(LEVELS), pixels))
     kept = kept.astype(np.float32)
@@ -146,15 +152,17 @@ def fine_rates(
     return np.stack([events.mean(1), events.std(1) / math.sqrt(pixels)]) / periods
 
 
-def noise_of_poles(ratio: float, cutoff: float = FIXED) -> VoltageNoise:
+def noise_of_poles(ratio: float, gain: float, cutoff: float = FIXED) -> VoltageNoise:
     """Return noise whose node has so many times the fixed pole at `LIGHT`."""
-    return VoltageNoise(sigma=1.0, cutoff=cutoff, knee=(LIGHT + DARK) / ratio, dark=DARK, poles="apart")
+    knee = (LIGHT + DARK) / ratio
+    return VoltageNoise(sigma=1.0, cutoff=cutoff, knee=knee, dark=DARK, gain=gain, poles="apart")
 
 
 def apart_rate(
     ratio: float,
     level: float,
     *,
+    gain: float = 0.0,
     cutoff: float = FIXED,
     pixels: int = 5000,
     periods: float = 40.0,
@@ -167,6 +175,7 @@ def apart_rate(
     Args:
         ratio: Pole of the node in units of the fixed one.
         level: Threshold over the standard deviation of the voltage.
+        gain: Of the loop around both poles.
         cutoff: The fixed pole [Hz].
         pixels: How many.
         periods: That are counted.
@@ -174,7 +183,7 @@ def apart_rate(
         device: Where kernels run.
         seed: Of the noise.
     """
-    noise = noise_of_poles(ratio, cutoff)
+    noise = noise_of_poles(ratio, gain, cutoff)
     theta = level * noise.sigma / math.sqrt(1 + ratio)
     sensor = dase.Sensor((Threshold(on=theta, off=theta), noise))
     edges = np.array([before, before + periods]) / cutoff
@@ -187,20 +196,23 @@ def compare_poles() -> None:
     """Write what noise of two poles sends, in small steps of its own and in the samples of `dase.count`."""
     rows, rng = [], np.random.default_rng(0)
     apart_rate(1.0, 1.0, pixels=10, periods=1.0)  # compiles
-    for ratio in RATIOS:
-        fine, errors = fine_rates(ratio, rng)
+    for ratio, gain in POLES:
+        fine, errors = fine_rates(ratio, rng, gain=gain)
         for level, want, error in zip(LEVELS, fine, errors, strict=True):
             begin = time.process_time()
-            rate, spread = apart_rate(ratio, level)
+            rate, spread = apart_rate(ratio, level, gain=gain)
             spent = time.process_time() - begin
             row = {
-                "ratio": ratio, "level": level, "rate": rate, "fine": want,
+                "ratio": ratio, "gain": gain, "level": level, "rate": rate, "fine": want,
                 "error": rate / want * math.hypot(spread / rate, error / want),
-                "rice": rice_events(math.sqrt(ratio), level),
-                "samples": 1 / (FIXED * noise_of_poles(ratio).longest_step()),
+                "rice": rice_events(math.sqrt((1 + gain) * ratio), level),
+                "samples": 1 / (FIXED * noise_of_poles(ratio, gain).longest_step()),
                 "seconds": spent,
             }  # fmt: skip
-            print(f"{ratio:g}, {level:g} sigma: {rate / want:.3f} of {want:.4g}, {spent:.1f} s", flush=True)
+            print(
+                f"{ratio:g}, {gain:g}, {level:g} sigma: {rate / want:.3f} of {want:.4g}, {spent:.1f} s",
+                flush=True,
+            )
             rows.append({name: float(f"{value:.4g}") for name, value in row.items()})
     Path(__file__).with_name("apart.json").write_text(json.dumps(rows, indent=1) + "\n", "utf-8")
 
