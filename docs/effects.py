@@ -327,7 +327,7 @@ the same `gain` (above); `SecondOrder.of_poles` and `VoltageNoise.of_photorecept
 
 Does it matter? Events of the circuit with thresholds of 0.2, cutoff 60 Hz and dark 0.01, before waves 20
 times as bright on one side as on the other (64x48, 0.6 s, 1 kHz, nothing else on), fitted with either law
-(`dase.fit`, 400 pixels, AMD EPYC, cbf6799; `python -m perf.experiments.photoreceptor.run` computes it anew):
+(`dase.fit`, 400 pixels, AMD EPYC, 13e41f6; `python -m perf.experiments.photoreceptor.run` computes it anew):
 
 {table}
 
