@@ -12,6 +12,7 @@ from contextlib import closing
 from dataclasses import asdict, dataclass, replace
 from functools import lru_cache
 from hashlib import sha256
+from itertools import zip_longest
 from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
@@ -352,7 +353,7 @@ def _make_here(
     with ThreadPoolExecutor(1, thread_name_prefix="dase scenes") as drawing:
         try:
             drawn = [drawing.submit(_draw_sequence, job, index) for index in todo[:1]]
-            for index, after in zip(todo, [*todo[1:], None], strict=True):
+            for index, after in zip_longest(todo, todo[1:]):
                 scene, times = drawn.pop().result()
                 if after is not None:
                     drawn.append(drawing.submit(_draw_sequence, job, after))
