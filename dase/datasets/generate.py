@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import os
 import time
 from collections import deque
@@ -12,7 +13,7 @@ from contextlib import closing
 from dataclasses import asdict, dataclass, replace
 from functools import lru_cache
 from hashlib import sha256
-from multiprocessing import get_context
+from itertools import zip_longest
 from pathlib import Path
 from typing import Any
 from zipfile import BadZipFile
@@ -24,6 +25,7 @@ from numpy.typing import NDArray
 from dase import io
 from dase.datasets.interrupt import DeferredInterrupt, WorkerLife, defer_interrupt, ignore_interrupt
 from dase.datasets.steps_in_order import StepsInOrder
+from dase.datasets.worker_start import worker_context
 from dase.effects.exposure import Exposure
 from dase.errors import InputError, checked_integer, nearest
 from dase.files.folder_lock import locking_folder
@@ -309,13 +311,11 @@ def _make_sequences(
     if jobs == 1:
         yield from _make_here(job, out, todo, interrupt)
         return
-    context = get_context("spawn")
+    context = worker_context()
     stop = context.RawValue("b", 0)  # no lock with it, which a worker that is killed could hold for ever
     # what cores are left beside the processes pack; a GPU leaves nearly all of them
     threads = max(thread_count() // jobs, 1)
-    pool = ProcessPoolExecutor(
-        jobs, mp_context=context, initializer=_begin_worker, initargs=(os.getpid(), stop, threads)
-    )
+    pool = ProcessPoolExecutor(jobs, mp_context=context, initializer=_begin_worker, initargs=(stop, threads))
     try:
         with ignore_interrupt():
             early = [pool.submit(_open_device, job) for _ in range(jobs)]
@@ -352,7 +352,7 @@ def _make_here(
     with ThreadPoolExecutor(1, thread_name_prefix="dase scenes") as drawing:
         try:
             drawn = [drawing.submit(_draw_sequence, job, index) for index in todo[:1]]
-            for index, after in zip(todo, [*todo[1:], None], strict=True):
+            for index, after in zip_longest(todo, todo[1:]):
                 scene, times = drawn.pop().result()
                 if after is not None:
                     drawn.append(drawing.submit(_draw_sequence, job, after))
@@ -386,11 +386,12 @@ def _warm_up(job: DatasetJob) -> None:
     run.thresholds()
 
 
-def _begin_worker(parent: int, stop: Any, threads: int) -> None:
+def _begin_worker(stop: Any, threads: int) -> None:
     global _life
+    gc.freeze()  # what was imported stays: no collection has to go through it again
     # the processes share the cores: more threads of each would compete for them
     launch.set_threads(threads)
-    _life = WorkerLife(parent, stop)
+    _life = WorkerLife(stop)
 
 
 def _open_device(job: DatasetJob) -> None:
