@@ -313,15 +313,17 @@ def _make_sequences(
         return
     context = worker_context()
     stop = context.RawValue("b", 0)  # no lock with it, which a worker that is killed could hold for ever
-    # what cores are left beside the processes pack; a GPU leaves nearly all of them
-    threads = max(thread_count() // jobs, 1)
-    pool = ProcessPoolExecutor(jobs, mp_context=context, initializer=_begin_worker, initargs=(stop, threads))
+    pool = ProcessPoolExecutor(jobs, mp_context=context, initializer=_begin_worker, initargs=(stop,))
     try:
         with ignore_interrupt():
             early = [pool.submit(_open_device, job) for _ in range(jobs)]
         # compiles the kernels once, before the processes race for it, while these start
         _warm_up(job)
-        left = {pool.submit(_in_worker, job, out, index) for index in todo}
+        left = {
+            # the last ones get the cores of processes that find nothing more to do
+            pool.submit(_in_worker, job, out, index, max(thread_count() // min(jobs, len(todo) - n), 1))
+            for n, index in enumerate(todo)
+        }
         for started in early:
             started.result()
         while left:
@@ -386,11 +388,9 @@ def _warm_up(job: DatasetJob) -> None:
     run.thresholds()
 
 
-def _begin_worker(stop: Any, threads: int) -> None:
+def _begin_worker(stop: Any) -> None:
     global _life
     gc.freeze()  # what was imported stays: no collection has to go through it again
-    # the processes share the cores: more threads of each would compete for them
-    launch.set_threads(threads)
     _life = WorkerLife(stop)
 
 
@@ -403,9 +403,11 @@ _life: WorkerLife | None = None
 """In a worker process: what ends it."""
 
 
-def _in_worker(job: DatasetJob, out: Path, index: int) -> WorkReport:
+def _in_worker(job: DatasetJob, out: Path, index: int, threads: int) -> WorkReport:
     assert _life is not None
     with _life.busy:
+        # the processes share the cores: more threads of each would compete for them
+        launch.set_threads(threads)
         return make_sequence(job, out, index, _life.interrupt)
 
 
