@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import gc
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from functools import wraps
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -12,6 +14,20 @@ import click
 
 if TYPE_CHECKING:
     from dase.fitting.measurement import Measurement
+
+
+@contextmanager
+def importing() -> Iterator[None]:
+    """Import what a command needs without collections of garbage, then and later on.
+
+    They would go through the half a million objects of Warp and others again and again, and find nothing.
+    """
+    gc.disable()
+    try:
+        yield
+        gc.freeze()
+    finally:
+        gc.enable()
 
 
 def parse_size(ctx: click.Context, param: click.Parameter, value: str | None) -> tuple[int, int] | None:

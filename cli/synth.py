@@ -12,7 +12,14 @@ from typing import TYPE_CHECKING
 
 import click
 
-from dase.cli.options import device_or_backend_option, effects_option, parse_size, refuse_beside
+from dase.cli.options import (
+    device_or_backend_option,
+    effects_option,
+    importing,
+    parse_size,
+    refuse_beside,
+)
+from dase.datasets.worker_start import start_importing
 
 if TYPE_CHECKING:
     from dase.datasets.generate import WorkReport
@@ -136,9 +143,13 @@ def synth_command(
     given = {"--fps": fps is not None, "--gamma": gamma is not None, "--between": between != "auto"}
     for option in (name for name in given if given[name]):
         raise click.UsageError(f"{option} goes with --video")
-    from dase.datasets import generate
-    from dase.simulation.sensor_file import dump_sensor, load_sensor
-    from dase.simulation.user_effects import known_effects
+    count = jobs if jobs is not None else (1 if device.startswith("cuda") else os.cpu_count() or 1)
+    if count > 1 and sequences > 1:
+        start_importing()  # beside the imports here
+    with importing():
+        from dase.datasets import generate
+        from dase.simulation.sensor_file import dump_sensor, load_sensor
+        from dase.simulation.user_effects import known_effects
 
     chosen = replace(load_sensor(sensor, known_effects(effects)), history=())
     width, height = size or chosen.size or (346, 260)
@@ -161,7 +172,6 @@ def synth_command(
         labels=labels,
         effects=tuple(map(str, effects)),
     )
-    count = jobs if jobs is not None else (1 if device.startswith("cuda") else os.cpu_count() or 1)
     with _progress_bar(job.files, "sequences") as advance:
         report = generate.generate_dataset(
             job, out, jobs=count, resume=resume, progress=advance, say=lambda line: click.echo(line, err=True)

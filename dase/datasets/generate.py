@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import os
 import time
 from collections import deque
@@ -13,7 +14,10 @@ from dataclasses import asdict, dataclass, replace
 from functools import lru_cache
 from hashlib import sha256
 from itertools import zip_longest
+<<<<<<< HEAD
 from multiprocessing import get_context
+=======
+>>>>>>> speed5
 from pathlib import Path
 from typing import Any
 from zipfile import BadZipFile
@@ -25,6 +29,7 @@ from numpy.typing import NDArray
 from dase import io
 from dase.datasets.interrupt import DeferredInterrupt, WorkerLife, defer_interrupt, ignore_interrupt
 from dase.datasets.steps_in_order import StepsInOrder
+from dase.datasets.worker_start import worker_context
 from dase.effects.exposure import Exposure
 from dase.errors import InputError, checked_integer, nearest
 from dase.files.folder_lock import locking_folder
@@ -310,19 +315,19 @@ def _make_sequences(
     if jobs == 1:
         yield from _make_here(job, out, todo, interrupt)
         return
-    context = get_context("spawn")
+    context = worker_context()
     stop = context.RawValue("b", 0)  # no lock with it, which a worker that is killed could hold for ever
-    # what cores are left beside the processes pack; a GPU leaves nearly all of them
-    threads = max(thread_count() // jobs, 1)
-    pool = ProcessPoolExecutor(
-        jobs, mp_context=context, initializer=_begin_worker, initargs=(os.getpid(), stop, threads)
-    )
+    pool = ProcessPoolExecutor(jobs, mp_context=context, initializer=_begin_worker, initargs=(stop,))
     try:
         with ignore_interrupt():
             early = [pool.submit(_open_device, job) for _ in range(jobs)]
         # compiles the kernels once, before the processes race for it, while these start
         _warm_up(job)
-        left = {pool.submit(_in_worker, job, out, index) for index in todo}
+        left = {
+            # the last ones get the cores of processes that find nothing more to do
+            pool.submit(_in_worker, job, out, index, max(thread_count() // min(jobs, len(todo) - n), 1))
+            for n, index in enumerate(todo)
+        }
         for started in early:
             started.result()
         while left:
@@ -387,11 +392,10 @@ def _warm_up(job: DatasetJob) -> None:
     run.thresholds()
 
 
-def _begin_worker(parent: int, stop: Any, threads: int) -> None:
+def _begin_worker(stop: Any) -> None:
     global _life
-    # the processes share the cores: more threads of each would compete for them
-    launch.set_threads(threads)
-    _life = WorkerLife(parent, stop)
+    gc.freeze()  # what was imported stays: no collection has to go through it again
+    _life = WorkerLife(stop)
 
 
 def _open_device(job: DatasetJob) -> None:
@@ -403,9 +407,11 @@ _life: WorkerLife | None = None
 """In a worker process: what ends it."""
 
 
-def _in_worker(job: DatasetJob, out: Path, index: int) -> WorkReport:
+def _in_worker(job: DatasetJob, out: Path, index: int, threads: int) -> WorkReport:
     assert _life is not None
     with _life.busy:
+        # the processes share the cores: more threads of each would compete for them
+        launch.set_threads(threads)
         return make_sequence(job, out, index, _life.interrupt)
 
 

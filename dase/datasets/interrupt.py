@@ -131,15 +131,14 @@ class WorkerLife:
     not come there within `grace` is left behind.
 
     Args:
-        parent: Process id of the parent.
         stop: Shared number, not 0 when the workers are to end; read without a lock, as a worker that is
             killed would never release it.
         grace: Time that a task gets to end [s].
         every: Time between looks [s].
     """
 
-    def __init__(self, parent: int, stop: Any, *, grace: float = 3.0, every: float = 0.1):
-        self._parent, self._stop, self._grace, self._every = parent, stop, grace, every
+    def __init__(self, stop: Any, *, grace: float = 3.0, every: float = 0.1):
+        self._stop, self._grace, self._every = stop, grace, every
         self.interrupt = DeferredInterrupt(lambda: bool(self._stop.value))
         self.busy = threading.Lock()
         """Held while a task runs."""
@@ -155,6 +154,5 @@ class WorkerLife:
         os._exit(1)  # the main thread may wait for a task for ever: nobody will send one
 
     def _is_wanted(self) -> bool:
-        parent = parent_process()
-        alive = parent is None or parent.is_alive()
-        return alive and os.getppid() == self._parent and self.interrupt.number is None
+        parent = parent_process()  # who asked for this process, not the server that it was forked from
+        return (parent is None or parent.is_alive()) and self.interrupt.number is None

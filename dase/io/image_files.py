@@ -43,17 +43,27 @@ def to_grey(pixels: NDArray[Any]) -> tuple[NDArray[np.float32], NDArray[np.float
     planes = list(cv2.split(pixels))
     full = _full_scale(pixels)
     alpha = planes.pop() / full if len(planes) in (2, 4) else None
-    weights = LUMA[::-1] if len(planes) == 3 else (1.0,)  # of BGR
+    weights = weights_of(pixels)
     grey = np.empty(planes[0].shape, np.float32)
     for band in _row_bands(grey.shape):
         grey[band] = planes[0][band]
-        grey[band] *= np.float32(weights[0]) / full
+        grey[band] *= weights[0]
         for weight, plane in zip(weights[1:], planes[1:], strict=True):
             # real numbers first: mixed types are multiplied piece by piece
             more = plane[band].astype(np.float32)
-            more *= np.float32(weight) / full
+            more *= weight
             grey[band] += more
     return grey, alpha
+
+
+def weights_of(pixels: NDArray[Any]) -> list[np.float32]:
+    """Return what blue, green and red, or the only value, weigh in the grey of pixels.
+
+    Args:
+        pixels: As `to_grey` takes them.
+    """
+    luma = LUMA[::-1] if pixels.ndim == 3 and pixels.shape[2] >= 3 else (1.0,)
+    return [np.float32(weight) / _full_scale(pixels) for weight in luma]
 
 
 def to_colour(pixels: NDArray[Any], grey: NDArray[np.float32]) -> NDArray[np.float32] | None:

@@ -21,10 +21,14 @@ from dase.io.image_files import (
     list_pictures,
     to_grey,
     to_levels,
+    weights_of,
 )
 
 KEPT = 64 << 20
 """Bytes of frames that are kept as they were decoded while they were counted."""
+
+TOGETHER = 16 << 20
+"""Bytes of decoded frames that are turned to grey at once, at most one frame more."""
 
 
 class FrameReader:
@@ -88,22 +92,28 @@ class FrameReader:
             index: Increasing, shape (K,). What is returned is not to be changed: later calls take from it.
         """
         wanted = [int(i) for i in index]
+        out = np.empty((len(wanted), 4 if self.colour else 1, *self.shape[1:]), np.float32)
         if self._files is not None:
             files = [self._files[i] for i in wanted]
-            return np.stack([self._planes_of(decode_file(file), file) for file in files])
+            for planes, file in zip(out, files, strict=True):
+                planes[:] = self._planes_of(decode_file(file), file)
+            return out
         place = {i: n for n, i in enumerate(wanted)}
-        out = np.empty((len(wanted), 4 if self.colour else 1, *self.shape[1:]), np.float32)
         known = {i: frame for kept in self._kept for i, frame in kept.items() if i in place}
         for i, frame in known.items():
             out[place[i]] = frame
         missing = sorted(place.keys() - known.keys())
         if missing and missing[0] < self._next:
             self._capture, self._next = None, 0
+        waiting: list[tuple[NDArray[np.uint8], NDArray[np.float32]]] = []
         for i in range(self._next, missing[-1] + 1 if missing else 0):
-            frame = self._decode(i)
+            pixels = self._checked(self._decode(i), self._path)
             if i in place:
-                out[place[i]] = frame
+                waiting.append((pixels, out[place[i]]))
+                if len(waiting) * pixels.nbytes >= TOGETHER:
+                    self._write_planes(waiting)
         if missing:
+            self._write_planes(waiting)
             self._kept.append(dict(zip(wanted, out, strict=True)))
         return out
 
@@ -186,12 +196,12 @@ class FrameReader:
             raise InputError(f"video {self._path}: frame {index} cannot be decoded")
         return frame
 
-    def _decode(self, index: int) -> NDArray[np.float32]:
+    def _decode(self, index: int) -> NDArray[np.uint8]:
         if self._capture is None and not self._short:
             self._capture = self._open()
         frame = self._next_of(self._capture, index)
         self._next = index + 1
-        return self._planes_of(frame, self._path)
+        return frame
 
     def _checked(self, pixels: NDArray[Any], path: Path) -> NDArray[Any]:
         """Return pixels; raises InputError where their size is not that of the first frame."""
@@ -200,6 +210,20 @@ class FrameReader:
             sizes = f"{got[1]}x{got[0]}, the frames before {want[1]}x{want[0]}"
             raise InputError(f"video: all frames must have one size, {path} has {sizes}")
         return pixels
+
+    def _write_planes(self, frames: list[tuple[NDArray[np.uint8], NDArray[np.float32]]]) -> None:
+        """Write planes (1 or 4, height, width) of a video's frames to their places, and empty the list."""
+        plain = self._size is None and not self.colour
+        if plain and frames and all(pixels.ndim == 3 and pixels.flags.c_contiguous for pixels, _ in frames):
+            # here alone, as Warp takes longer to start than to look at a file
+            from dase.kernels.picture_grey import write_greys
+
+            pictures, planes = zip(*frames, strict=True)
+            write_greys(pictures, weights_of(pictures[0]), [plane[0] for plane in planes])
+        else:
+            for pixels, there in frames:
+                there[:] = self._planes_of(pixels, self._path)
+        frames.clear()
 
     def _planes_of(self, pixels: NDArray[Any], path: Path) -> NDArray[np.float32]:
         """Return the planes of a frame, shape (1 or 4, height, width)."""

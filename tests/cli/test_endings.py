@@ -42,6 +42,16 @@ def wait_for(what, seconds: float = 120.0):
     return found
 
 
+def workers_of(pid: int) -> list[int]:
+    """Return the processes that a server of workers has forked, which is a child of `pid`."""
+
+    def stands(one: int) -> tuple[int, bool]:
+        parent = int(Path(f"/proc/{one}/stat").read_text("latin-1").rpartition(")")[2].split()[1])
+        return parent, b"forkserver" in Path(f"/proc/{one}/cmdline").read_bytes()
+
+    return [one for one in group_members(pid) if stands(one)[1] and stands(one)[0] != pid]
+
+
 def dead_identity() -> ProcessIdentity:
     """Return a process of this machine that has ended."""
     code = "from dase.files.processes import ProcessIdentity as P; print(P.own())"
@@ -78,6 +88,14 @@ def test_resume_makes_damaged_sequences_again(whole, tmp_path, spoil):
     assert report.sequences == 1
     assert len(said) == 1
     assert re.search(r"sequence_00001\.h5.*: made again$", said[0])
+    assert contents(out) == contents(whole)
+
+
+def test_resume_of_what_is_whole_makes_nothing(whole, tmp_path):
+    out = tmp_path / "out"
+    shutil.copytree(whole, out)
+    for jobs in (1, 2):
+        assert generate.generate_dataset(JOB, out, jobs=jobs, resume=True).sequences == 0
     assert contents(out) == contents(whole)
 
 
@@ -268,13 +286,7 @@ def test_a_signal_to_the_workers(tmp_path, victims):
     if victims == "group":
         os.killpg(process.pid, signal.SIGTERM)
     else:
-        workers = wait_for(
-            lambda: [
-                pid
-                for pid in group_members(process.pid)
-                if b"spawn_main" in Path(f"/proc/{pid}/cmdline").read_bytes()
-            ]
-        )
+        workers = wait_for(lambda: workers_of(process.pid))
         os.kill(workers[0], signal.SIGKILL)
     said = process.communicate(timeout=60)[1]
     assert "Traceback" not in said

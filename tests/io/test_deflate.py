@@ -11,7 +11,7 @@ import pytest
 
 from dase import io
 from dase.events import Events
-from dase.io.h5 import deflate_bytes
+from dase.io.h5 import deflate_bytes, shuffle_bytes
 from dase.kernels.threads import keep_thread_count, thread_count
 
 
@@ -100,3 +100,11 @@ def begin_and_fail(path):
         for k in range(40):
             writer.frame(float(k), np.zeros((30, 40), np.uint8), np.zeros((2, 30, 40), np.float32))
         raise RuntimeError("enough")
+
+
+@pytest.mark.parametrize("kind", [np.float64, np.int16, np.float32, np.bool_, np.int8])
+@pytest.mark.parametrize("shape", [(1,), (7,), (2, 5, 3), (4096,)])
+def test_shuffled_bytes_are_the_first_of_all_then_the_second(rng, kind, shape):
+    values = rng.integers(-100, 100, shape).astype(kind)
+    want = [values.tobytes()[n :: values.itemsize] for n in range(values.itemsize)]
+    assert shuffle_bytes(values).tobytes() == b"".join(want)

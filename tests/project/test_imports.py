@@ -22,6 +22,7 @@ HEAVY = {
     "safetensors",
     "skimage",
     "torch",
+    "warp",
 }
 """Packages that are optional or slow to load: for their sake an import may wait until it is needed."""
 
