@@ -14,10 +14,6 @@ from dataclasses import asdict, dataclass, replace
 from functools import lru_cache
 from hashlib import sha256
 from itertools import zip_longest
-<<<<<<< HEAD
-from multiprocessing import get_context
-=======
->>>>>>> speed5
 from pathlib import Path
 from typing import Any
 from zipfile import BadZipFile
