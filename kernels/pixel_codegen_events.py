@@ -292,8 +292,8 @@ def _pending_crossings(model: PixelModel) -> Statements:
 def _dead_time(model: PixelModel, share: str, *, of_noise: bool = False) -> Statements:
     """Return the statements that set `wait` to the time the pixel stays dead after `share` of the step [s].
 
-    Of noise that is the time for which gates hold it that do not let it pass. Gates ask for the time since the last event by the name of `age`, which a pixel keeps as of the begin of
-    the step.
+    Of noise that is the time for which gates hold it that do not let it pass. Gates ask for the time since
+    the last event by the name of `age`, which a pixel keeps as of the begin of the step.
     """
     gates = [
         Guarded(effect, (Line(f"wait = wp.max(wait, {call.text})", call.draws),))
