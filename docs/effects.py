@@ -373,8 +373,9 @@ Events in the trials of a fit relative to those of `dase.simulate`. Buses of fou
 a third of what pixels send, in two scenes, where 900 other pixels are simulated or each of 300 stands for
 three. Voltage noise and lamps are seen at rest, in scenes of 1000, 500 and 250 frames per second, whose time
 a fit cuts into steps of 1, 2 and 1 ms; lamps by themselves, where all are within 3 %, and behind a
-photoreceptor whose cutoff is their frequency. Left out are models with no event or whose ratio has an error
-above 0.015. `python -m perf.experiments.trials.rates` computes it anew.
+photoreceptor whose cutoff is their frequency; noise of two poles (`poles = "apart"`) at two knees. Left out
+are models with no event or whose ratio has an error above 0.015. `python -m perf.experiments.trials.rates`
+computes it anew.
 
 {table}
 
@@ -387,7 +388,8 @@ sample that shows a dip makes it wider. Two corners are left. Where a smoothed s
 threshold, 1 % of it is a sixth of the events. And of pulses of 50 µs (1000 Hz, duty 0.05) trials have one or
 two samples where a simulation has four, so their areas differ; trials take 24 samples per millisecond at
 most, which would have to be 80. Voltage noise had nothing to mend: it is off by a fifth (3 kHz) where 24
-samples are taken in 4 ms, but no fit has steps above 2 ms, and those are now cut into up to 48.
+samples are taken in 4 ms, but no fit has steps above 2 ms, and those are now cut into up to 48. Noise of two
+poles wants 105 samples per millisecond at 3 kHz and a knee of a tenth of the brightest light, and gets 48.
 """
 
 
