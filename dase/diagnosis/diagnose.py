@@ -52,6 +52,7 @@ from dase.fitting.model import (
     model_of,
     refit_model,
     refit_work,
+    ways_otherwise,
     with_fixed_effect,
 )
 from dase.fitting.plain_numbers import plain_numbers
@@ -408,20 +409,23 @@ def _add_pair(
     )
     pairs = list(combinations(singles, 2))
     # only the first are fitted to all pixels
-    race, works = CandidateRace(settings.fitted_pairs), []
+    race, works, names = CandidateRace(settings.fitted_pairs), [], []
     for one, two in pairs:
         both = one.model.sensor.with_effect(two.model.sensor[two.name])
         pair = with_same_freedom(both, start, (one.name, two.name))
-        over = race.over(f"{one.name} + {two.name}")
-        works.append(pair.search_work(scout, seed=seed, iterations=4, radius=0.3, over=over))
+        name = f"{one.name} + {two.name}"
+        # which rule is best for an effect alone need not be best beside the other
+        for way in (pair, *ways_otherwise(pair, (one.name, two.name))):
+            works.append(way.search_work(scout, seed=seed, iterations=4, radius=0.3, over=race.over(name)))
+            names.append(name)
     ends = run_side_by_side(works, lambda share: state.progress("trying pairs", share, state.error))
-    tried = [
-        (pair.loss, f"{one.name} + {two.name}", pair) for (one, two), pair in zip(pairs, ends, strict=True)
-    ]
-    first = sorted(tried, key=lambda t: t[0])[: settings.fitted_pairs]
-    settled = run_side_by_side([refit_work(evidence, pair, seed=seed) for _, _, pair in first])
+    best = dict[str, FittedModel]()
+    for name, pair in sorted(zip(names, ends, strict=True), key=lambda named: named[1].loss):
+        best.setdefault(name, pair)
+    first = list(best.items())[: settings.fitted_pairs]
+    settled = run_side_by_side([refit_work(evidence, pair, seed=seed) for _, pair in first])
     ranking: list[Rank] = []
-    for (_, name, _), pair in zip(first, settled, strict=True):
+    for (name, _), pair in zip(first, settled, strict=True):
         judged = state.judge(pair)
         ranking = sorted([*ranking, _rank_of_pair(name, pair, judged, before)], key=_error_of_rank)
         if judged.error < judgement.error * (1.0 if reaches_floor(judged) else settings.pair_gain):

@@ -298,13 +298,13 @@ class Effect:
         """Whether random events pass while this effect holds the others back, and begin no dead time."""
         return False
 
-    def otherwise(self, beside: Collection[str]) -> Self | None:
-        """Return this effect by another rule that a fit has to try, too, as no descent gets there.
+    def otherwise(self, beside: Collection[str]) -> list[Self]:
+        """Return this effect by the other rules that a fit has to try, too, as no descent gets there.
 
         Args:
             beside: Names of the effects that are on beside it.
         """
-        return None
+        return []
 
     def longest_step(self) -> float:
         """Return the longest time between samples that still shows the effect [s]."""

@@ -90,11 +90,12 @@ class Refractory(Effect):
         """Return the three rules; whether noise passes is asked once there is noise."""
         return [effect for effect in cls.variants() if effect.noise == "held"]
 
-    def otherwise(self, beside: Collection[str]) -> Self | None:
-        """Return the other rule for noise, where there is any."""
+    def otherwise(self, beside: Collection[str]) -> list[Self]:
+        """Return the other rules for changes in the dead time, and for noise where there is any."""
+        modes = [dataclasses.replace(self, mode=mode) for mode in self.choices()["mode"] if mode != self.mode]
         if not {"shot", "hot"} & set(beside):
-            return None
-        return dataclasses.replace(self, noise="held" if self.noise == "passes" else "passes")
+            return modes
+        return [*modes, dataclasses.replace(self, noise="held" if self.noise == "passes" else "passes")]
 
     def spares_noise(self) -> bool:
         """Whether random events come in the dead time, too."""

@@ -53,6 +53,6 @@ class Threshold(Effect):
         fitted=False,  # both ends are tried instead
     )
 
-    def otherwise(self, beside: Collection[str]) -> Self:
+    def otherwise(self, beside: Collection[str]) -> list[Self]:
         """Return the thresholds with the other end of the phase."""
-        return replace(self, phase=1.0 - self.phase)
+        return [replace(self, phase=1.0 - self.phase)]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
 from itertools import product
 
@@ -213,7 +213,7 @@ def refit_model(evidence: SplitMeasurement, model: FittedModel, *, seed: int, ro
     works = [refit_work(evidence, model, seed=each, rounds=rounds) for each in seeds[:-1]]
     works += [
         _refit_otherwise_work(evidence, other, model, seed=seeds[-1], rounds=rounds)
-        for other in _ways_otherwise(model)
+        for other in ways_otherwise(model)
     ]
     ends = run_side_by_side(works)
     half = ends[0].calibrate(
@@ -248,15 +248,20 @@ def calibration_while_fitting(
     )
 
 
-def _ways_otherwise(model: FittedModel) -> list[FittedModel]:
-    """Return the model by other rules of its effects, one at a time; other phases first."""
-    sensor, out = model.space.sensor, list[FittedModel]()
+def ways_otherwise(model: FittedModel, names: Collection[str] | None = None) -> list[FittedModel]:
+    """Return the model by other rules of its effects, one at a time.
+
+    Args:
+        model: At its place.
+        names: Of the effects whose rules are changed; None for all.
+    """
+    sensor = model.space.sensor
     acting = [effect.name for effect in model.sensor.effects if not effect.is_off()]
-    for effect in sensor.effects:
-        other = effect.otherwise([name for name in acting if name != effect.name])
-        if other is not None:
-            out.append(replace(model, space=replace(model.space, sensor=sensor.with_effect(other))))
-    return out
+    return [
+        replace(model, space=replace(model.space, sensor=sensor.with_effect(other)))
+        for effect in sensor.effects if names is None or effect.name in names
+        for other in effect.otherwise([name for name in acting if name != effect.name])
+    ]  # fmt: skip
 
 
 def refit_work(
@@ -272,7 +277,7 @@ def refit_work(
     for turn in range(rounds):
         if half is None or turn > 0:
             half = yield from calibration_while_fitting(evidence, model, seed=seed)
-        ways = [model, *_ways_otherwise(model)]
+        ways = [model, *ways_otherwise(model)]
         values = yield [SimulationRequest(half, m.space, m.place[None], seed) for m in ways]
         losses = [float(half.scale.loss(value)[0]) for value in values]
         other = ways[int(np.argmin(losses))]
