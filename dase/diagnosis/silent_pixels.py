@@ -20,6 +20,8 @@ from dase.fitting.data_split import common_grid, times_of_grid
 from dase.fitting.measurement import Measurement
 from dase.fitting.time_window import is_constant, within_span
 from dase.results import DetectionLimit, Diagnosis, Estimate, Finding, Grade
+from dase.scenes.between_frames import CameraScene
+from dase.scenes.scene import Scene
 
 NAME = Dead.name
 
@@ -118,8 +120,7 @@ def find_silent_pixels(
     if min(scene.width, scene.height) < 3 or is_constant(scene):
         return SilentPixels(np.zeros(0, np.int64), 0)
     times = times_of_grid(scene, within_span(whole, measurement.span))
-    at = np.unique(np.linspace(0, len(times) - 1, settings.times).round().astype(np.int64))
-    light = np.asarray(scene.frames(times[at]), np.float32)
+    light = _light_over_time(scene, times, settings.times)
     level = np.log(light + log_eps)
     change, mean = np.ptp(level, axis=0), light.mean(0) + log_eps
     events = events.select((events.t >= times[0]) & (events.t <= times[-1]))
@@ -136,6 +137,20 @@ def find_silent_pixels(
     )  # fmt: skip
     rows, columns = np.nonzero(asked & (counts[inside] == 0))
     return SilentPixels((rows + 1) * np.int64(events.width) + columns + 1, int(np.count_nonzero(asked)))
+
+
+def _light_over_time(scene: Scene, times: NDArray[np.float64], most: int) -> NDArray[np.float32]:
+    """Return the light of all pixels at some moments of a time, at most `most` of them, shape (K, H, W)."""
+
+    def some(count: int) -> NDArray[np.int64]:
+        return np.unique(np.linspace(0, count - 1, most).round().astype(np.int64))
+
+    if not isinstance(scene, CameraScene):
+        return np.asarray(scene.frames(times[some(len(times))]), np.float32)
+    # the frames are at hand; what is between them is a guess
+    inside = np.flatnonzero((scene.times >= times[0]) & (scene.times <= times[-1]))
+    chosen = inside[some(len(inside))] if len(inside) else [0]  # one frame shows no change
+    return np.stack([scene.intensity(int(n)) for n in chosen])
 
 
 def _neighbours(values: NDArray[Any]) -> NDArray[Any]:

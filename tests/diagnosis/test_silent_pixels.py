@@ -72,6 +72,20 @@ def test_no_other_effect_silences_single_pixels(scene, effect):
         assert found.limit().strength == pytest.approx(3 / found.asked)
 
 
+@pytest.mark.parametrize("span", [None, (0.1605, 0.1795)])
+def test_frames_of_a_camera_tell_dead_pixels_as_well(scene, span):
+    sensor = Sensor().with_effect(EFFECTS["dead"](share=0.02))
+    begins = scene.sample_times()[::20]
+    grey = np.rint(255 * scene.frames(begins) / scene.frames(begins).max()).astype(np.uint8)
+    known = dase.CameraScene(grey, begins)
+    found = find_silent_pixels(
+        Measurement(dase.simulate(scene, sensor, seed=5), known, span=span), log_eps=1e-3
+    )
+    # between two frames no change of light is known
+    assert found.found == (span is None)
+    assert found.decides == (span is None)
+
+
 def test_a_region_that_is_switched_off_has_no_dead_pixels(scene):
     events = dase.simulate(scene, Sensor(), seed=5)
     found = find_silent_pixels(Measurement(events.select(events.x > 40), scene), log_eps=1e-3)
