@@ -51,15 +51,17 @@ class Raster:
         times = np.arange(round(self.seconds / self.step) + 1) * self.step
         return dase.VideoScene(self.light(times)[:, None].astype(np.float32), times)
 
-    def draw(self, axes: Axes, events: Events) -> None:
-        """Draw the events."""
+    def draw(self, axes: Axes, events: Events, most: int) -> None:
+        """Draw the events, with dots as large as those of the busier side can be."""
         first, last = self.shown[0], min(self.shown[1], self.seconds)
         seen = events.select((events.t >= first) & (events.t <= last))
-        size = float(np.clip(6e3 / max(len(seen), 1), 0.7, 5.0))
+        size = float(np.clip(6e3 * self.seconds / (last - first) / max(most, 1), 0.7, 9.0))
         for polarity, colour in ((False, Colour.OFF), (True, Colour.ON)):
             mine = seen.select(seen.p == polarity)
             axes.scatter(1e3 * mine.t, self.places[mine.x], s=size, c=colour, lw=0)
         axes.set(xlim=(1e3 * first, 1e3 * last), ylim=(self.places[0], self.places[-1]))
+        if not self.log:
+            axes.set(ylim=(self.places[0] - 0.5, self.places[-1] + 0.5))
         if self.log:
             log_axis(axes, "y")
         label_axes(axes, "time [ms]", self.label)
@@ -82,7 +84,7 @@ class Lines:
         light = 0.2 * np.exp(1.0 * rise)[:, None, None] * np.ones((1, 120, 160))
         return dase.VideoScene(light.astype(np.float32), times)
 
-    def draw(self, axes: Axes, events: Events) -> None:
+    def draw(self, axes: Axes, events: Events, most: int) -> None:
         """Draw the events."""
         seen = events.select((events.t >= self.shown[0]) & (events.t <= self.shown[1]))
         # the same share on both sides, so that they can be compared
@@ -123,7 +125,7 @@ class Picture:
         light = np.clip(frames, 0.002, 1).astype(np.float32)
         return dase.VideoScene(turn_red(light) if self.coloured else light, times)
 
-    def draw(self, axes: Axes, events: Events) -> None:
+    def draw(self, axes: Axes, events: Events, most: int) -> None:
         """Draw the events, the more of a pixel the darker."""
         middle = 0.06 - self.window / 2
         counts = events.counts([middle - self.window / 2, middle + self.window / 2])[0]
@@ -168,6 +170,12 @@ def steps(times: Array) -> Array:
     return LIGHT[None] * np.where(bright, 3.0, 1.0)[:, None]
 
 
+def slopes(times: Array) -> Array:
+    """Return light that slowly becomes three times as bright, and falls back, so that events lie apart."""
+    way = np.interp(times, [0.02, 0.08, 0.12, 0.18], [0.0, 1.0, 1.0, 0.0])
+    return LIGHT[None] * 3.0 ** way[:, None]
+
+
 def rest(times: Array) -> Array:
     """Return light that does not change."""
     return np.broadcast_to(LIGHT, (len(times), len(LIGHT)))
@@ -202,9 +210,10 @@ def falls(times: Array) -> Array:
 
 
 STEPS = Raster(steps, 0.2, LIGHT)
+SLOPES = Raster(slopes, 0.2, LIGHT)
 ALIKE = Raster(
-    lambda times: 0.1 * np.exp(0.7 * np.sin(2 * np.pi * 10 * times))[:, None] * np.ones(50),
-    0.2, np.arange(50.0), "pixel", log=False,
+    lambda times: 0.1 * np.exp(0.7 * np.sin(2 * np.pi * 10 * times))[:, None] * np.ones(10),
+    0.4, np.arange(10.0), "pixel", log=False,
 )  # fmt: skip
 REST = Raster(rest, 4.0, LIGHT, step=2e-3)
 
@@ -238,6 +247,7 @@ def shown() -> dict[str, Shown]:
     """Return how each effect is shown."""
     e = EFFECTS
     step_words = "Light triples at 40 ms and falls back at 120 ms"
+    slope_words = "Light triples from 20 to 80 ms and falls back from 120 to 180 ms"
     return {
         "optics_blur": Shown(
             e["optics_blur"](sigma=2.0), Picture(), "Edges are wider and fine texture is gone: fewer events."
@@ -256,12 +266,12 @@ def shown() -> dict[str, Shown]:
             beside=(e["shot"](rate=60.0, bright=0.0, knee=0.05),),
         ),
         "dark": Shown(
-            e["dark"](current=0.03), STEPS,
-            f"{step_words}: pixels whose light is below the dark current see less of it, or nothing.",
+            e["dark"](current=0.03), SLOPES,
+            f"{slope_words}: below the dark current, 0.03, the same contrast makes fewer events, or none.",
         ),
         "linlog": Shown(
-            e["linlog"](knee=0.0784), STEPS,
-            f"{step_words}: below the knee the response is linear, so the same contrast makes fewer events.",
+            e["linlog"](knee=0.0784), SLOPES,
+            f"{slope_words}: below the knee, 0.08, the response is linear: fewer events.",
         ),
         "bandwidth": Shown(
             e["bandwidth"](cutoff=300.0, dark=0.01), STEPS,
@@ -271,9 +281,15 @@ def shown() -> dict[str, Shown]:
             e["second_order"](cutoff=300.0, damping=0.3, dark=0.01), STEPS,
             f"{step_words}: with little damping the response overshoots and rings.",
         ),
+        "second_order_apart": Shown(
+            e["second_order"](cutoff=150.0, damping=0.3, dark=0.01, poles="apart"), STEPS,
+            f"{step_words}: with a fixed pole only bright pixels ring.",
+            other=e["second_order"](cutoff=150.0, damping=0.3, dark=0.01),
+            left="poles alike", right="poles apart",
+        ),
         "voltage_noise": Shown(
             e["voltage_noise"](sigma=0.08, cutoff=100.0, knee=0.03), REST,
-            "Light that does not change: noise crosses thresholds, most often in the dark.",
+            "Light that does not change: noise crosses levels, often in pixels that began near one.",
         ),
         "high_pass": Shown(
             e["high_pass"](cutoff=2.0),
@@ -292,12 +308,12 @@ def shown() -> dict[str, Shown]:
         ),
         "mismatch": Shown(
             e["mismatch"](spread=0.2), ALIKE,
-            "All pixels see the same light; one with low thresholds is early in every cycle.",
+            "All pixels see the same light, which swings: each is early or late in all cycles alike.",
             phase=0.0,
         ),
         "jitter": Shown(
             e["jitter"](spread=0.2), ALIKE,
-            "All pixels see the same light, which swings; none is early in every cycle.",
+            "All pixels see the same light, which swings: early or late anew at each event.",
             phase=0.0,
         ),
         "leak": Shown(
@@ -367,12 +383,12 @@ def draw(name: str, how: Shown) -> None:
     figure = titled_figure(3.35, name, how.words)
     add_legend(figure, (("dot", Colour.ON, "ON"), ("dot", Colour.OFF, "OFF")))
     scene = how.view.scene()
-    for side, sensor in enumerate(sides):
+    streams = [dase.simulate(scene, sensor, seed=2) for sensor in sides]
+    for side, events in enumerate(streams):
         is_picture = isinstance(how.view, Picture)
         left = (0.3 + 4.6 * side) if is_picture else (0.75 + 4.65 * side)
         axes = place_axes(figure, left, 0.95, 4.4 if is_picture else 3.85, 2.3 if is_picture else 1.9)
-        events = dase.simulate(scene, sensor, seed=2)
-        how.view.draw(axes, events)
+        how.view.draw(axes, events, max(map(len, streams)))
         axes.set_title((how.left, how.right)[side], fontsize=9.5, color=Colour.INK, loc="left", pad=5)
     FOLDER.mkdir(exist_ok=True)
     figure.savefig(FOLDER / f"{name}.png", dpi=90)

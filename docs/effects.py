@@ -54,8 +54,8 @@ to 50 ms. What `learned_threshold` does is in [adaptation.md](adaptation.md).
 def pictures() -> str:
     """Return the pictures of all effects that have one."""
     folder = Path(__file__).parent / "effects"
-    names = (name for name in dase.EFFECTS if (folder / f"{name}.png").is_file())
-    return PICTURES + "".join(f"\n![{name}: without and with](effects/{name}.png)\n" for name in names)
+    found = [(name, path) for name in dase.EFFECTS for path in sorted(folder.glob(f"{name}*.png"))]
+    return PICTURES + "".join(f"\n![{name}: without and with](effects/{path.name})\n" for name, path in found)
 
 
 def recordings() -> str:
@@ -88,8 +88,12 @@ MEASURED = """
 
 Presets on recordings of their cameras, nothing fitted: those of commit 3859195 (before) and those of now
 (after). The scene is what the camera's own frames tell, or constant light where nothing moved; where no scene
-is known, only the measurement stands. `python -m perf.experiments.recordings.run $DASE_DATA/recordings`
-measures anew, `python docs/effects.py` writes these tables.
+is known, only the measurement stands. *With its lamp and frames*: the preset of now with `flicker` and
+`exposure` at the frequency and the times that the events tell, and both strengths and the threshold set by
+three totals, the event rate, the share in bursts and the swing; all else is left to compare. `python -m
+perf.experiments.recordings.run $DASE_DATA/recordings` measures anew (2992312, the line with the lamp after
+79c3e70), `python docs/effects.py` writes these tables. Noise of another camera at three illuminances is in
+[noise.md](noise.md).
 
 Intervals of a pixel [ms] by its polarities: 0.1 / 1 / 10 % are shorter. Empty where there are fewer than 300.
 
@@ -123,13 +127,18 @@ the cradle has too many is noise of the frames that make the scene, most of all 
 level is more than a threshold.
 
 What is not: the shaken DAVIS240C has more events than its preset makes, and fewer with the reset, as its
-thresholds are lower, and neither its lamp nor its frames are in a preset. Frames can be fitted (`exposure`),
-but not by this recording: see [reading-a-diagnosis.md](reading-a-diagnosis.md). Its ties in one row (43 %),
-like those of the DAVIS240B and the Gen3, are of rows that send many events at once, as in its bursts in step
-with the frames; a preset that reads by rows but has no such bursts makes none. The DAVIS346 shows no such
-rows: its ties are of different rows. Intervals of 0 to 1 us of two OFF events of the DVS128 and the DAVIS240B
-are double events. Pixels of the DVXplorer at rest send bursts of noise at intervals of its scan, and those of
-the HD sensor flip their polarity sooner than independent noise does.
+thresholds are lower, and neither its lamp nor its frames are in a preset. With both, and with thresholds of
+0.108, steps of 0.067 by the frames and a lamp of 1.0 % depth, it has the lamp's swing, the bursts and the
+events, as it was set to; and of what was not set, intervals of one polarity come nearer (a tenth of those of
+ON-ON are below 3.5 ms; 9.9 and 5.9 ms, without and with both), and so do ties (62 %; 7 and 30 %) and those
+in one row (43 %; 0.04 and 16 %). Intervals between the polarities stay too long (ON-OFF 4.1 ms; 57 and 30
+ms): frames 138 ms apart do not tell the fine turns of a shaking hand. `dase.fit` finds no strength of the
+frames here, see [reading-a-diagnosis.md](reading-a-diagnosis.md). Ties in one row, of the DAVIS240B and the
+Gen3, too, are of rows that send many events at once, as in bursts in step with the frames; a preset that
+reads by rows but has no such bursts makes none. The DAVIS346 shows no such rows: its ties are of different
+rows. Intervals of 0 to 1 us of two OFF events of the DVS128 and the DAVIS240B are double events. Pixels of
+the DVXplorer at rest send bursts of noise at intervals of its scan, and those of the HD sensor flip their
+polarity sooner than independent noise does.
 """
 
 RECORDINGS = """
@@ -241,6 +250,93 @@ formula for pixels that keep their phase holds then.
 """
 
 
+def poles_apart() -> str:
+    """Return the table of events of noise of two poles against those in small steps."""
+    found = json.loads(APART.read_text("utf-8"))
+    levels = list(dict.fromkeys(row["level"] for row in found))
+    heads = [f"{level:g} sigma: in small steps | dase | Rice" for level in levels]
+    head = "| node's pole, gain | samples per period, processor time | " + " | ".join(heads) + " |"
+    lines = [head, "|---" * (2 + 3 * len(levels)) + "|"]
+    for ratio, gain in dict.fromkeys((row["ratio"], row["gain"]) for row in found):
+        rows = [row for row in found if (row["ratio"], row["gain"]) == (ratio, gain)]
+        cells = [
+            f"{row['fine']:.3g} | {row['rate'] / row['fine']:.3f} ± {row['error']:.3f} | "
+            f"{row['rice'] / row['fine']:.2f}"
+            for row in rows
+        ]
+        # 5000 pixels over 60 periods
+        spent = sum(row["seconds"] for row in rows) / len(rows) / (5000 * 60) * 1e6
+        cost = f"{rows[0]['samples']:.0f}, {spent:.2g} us"
+        lines.append(f"| {ratio:g}, {gain:g} | {cost} | " + " | ".join(cells) + " |")
+    return POLES_APART.format(table="\n".join(lines))
+
+
+APART = RICE.with_name("apart.json")
+
+POLES_APART = """
+## Noise of two poles against small steps
+
+`voltage_noise` with `poles = "apart"`: events per period of the fixed pole in an independent NumPy process
+of steps of a twentieth of the faster pole's time constant (5000 pixels, 40 periods after 20 others), and
+those of `dase.count` and of Rice's formula relative to these. The node's pole is that at the light looked
+at, in units of the fixed one: from light of a tenth of the knee to a hundred times the knee; the gain is
+that of a loop around both. Samples are per period of the fixed pole, and processor time is per pixel and
+such period, of one core of an AMD EPYC. `python -m perf.experiments.noise.rice --poles apart` computes it
+anew.
+
+{table}
+
+Without a loop all are within 2.0 % of the small steps, with one within 3.2 %, which is two errors. Rice's
+formula is the same as above, with a mean that is passed sqrt((1 + gain) a b) / 2π times a second upwards, a
+and b the poles. The faster the node, the rougher the voltage, and the more crossings come in clusters, of
+which hardly any but the first makes an event. The fixed pole's frequency sets the pace and nothing else (the
+same within 1 % at 10 to 3000 Hz, `pytest tests/effects/test_effects_voltage.py -k pace`). What a low knee
+costs are samples, π (1 + dark) / knee per period of the fixed pole, whatever the light in the scene; a loop
+asks for some sqrt(25 (1 + gain) / knee), where that is more.
+"""
+
+
+def damping() -> str:
+    """Return the table of fits of the photoreceptor's circuit."""
+    lines = [
+        "| true damping | fitted with poles | error | cutoff [Hz] | damping | dark | thresholds |",
+        "|---" * 7 + "|",
+    ]
+    lines += [
+        f"| {row['damping']:g} | {row['poles']} | {row['error']:.2f} | {row['cutoff']:.3g} | "
+        f"{row['fitted damping']:.3g} | {row['dark']:.2g} | {row['on']:.3f}, {row['off']:.3f} |"
+        for row in json.loads(CIRCUIT.read_text("utf-8"))
+    ]
+    return DAMPING.format(table="\n".join(lines))
+
+
+CIRCUIT = Path(__file__).parents[1] / "perf" / "experiments" / "photoreceptor" / "fits.json"
+
+DAMPING = """
+## Damping that follows the light
+
+The photoreceptor's node has a pole that follows the photocurrent, its amplifier a fixed one, and a loop of
+gain A goes round both. Of poles a L and b in light of which L is left, the loop has the natural frequency
+sqrt((1 + A) a b L) and the damping (a L + b) / 2 over that: in the light it may ring, in the dark it creeps.
+`second_order` with `poles = "apart"` is that circuit: its events are within a threshold and a half of the
+voltage of an independent integration of node and amplifier, in light that goes up and down by 30, at five
+pairs of poles and gains of 0 to 60 (`pytest tests/effects/test_photoreceptor.py -k circuit`). Special cases
+are `bandwidth` (b far above the rest), a low-pass behind another (A = 0), and `poles = "alike"` in light
+that is the same everywhere. `voltage_noise` with `poles = "apart"` is the noise of the same circuit, with
+the same `gain` (above); `SecondOrder.of_poles` and `VoltageNoise.of_photoreceptor` take the same numbers.
+
+Does it matter? Events of the circuit with thresholds of 0.2, cutoff 60 Hz and dark 0.01, before waves 20
+times as bright on one side as on the other (64x48, 0.6 s, 1 kHz, nothing else on), fitted with either law
+(`dase.fit`, 400 pixels, AMD EPYC, 13e41f6; `python -m perf.experiments.photoreceptor.run` computes it anew):
+
+{table}
+
+With poles that are alike no error tells that something is wrong (what repeats have is 1), and yet thresholds
+are up to 13 % too low, and cutoff and damping are other numbers. A diagnosis tries poles that are alike
+alone, so its thresholds have this error beside `second_order` where the light goes over decades.
+"""
+
+
 def fitted_and_simulated() -> str:
     """Return the table of rates in trials against those of simulations."""
     table = json.loads(TRIALS.read_text("utf-8"))
@@ -277,8 +373,9 @@ Events in the trials of a fit relative to those of `dase.simulate`. Buses of fou
 a third of what pixels send, in two scenes, where 900 other pixels are simulated or each of 300 stands for
 three. Voltage noise and lamps are seen at rest, in scenes of 1000, 500 and 250 frames per second, whose time
 a fit cuts into steps of 1, 2 and 1 ms; lamps by themselves, where all are within 3 %, and behind a
-photoreceptor whose cutoff is their frequency. Left out are models with no event or whose ratio has an error
-above 0.015. `python -m perf.experiments.trials.rates` computes it anew.
+photoreceptor whose cutoff is their frequency; noise of two poles (`poles = "apart"`) at two knees. Left out
+are models with no event or whose ratio has an error above 0.015. `python -m perf.experiments.trials.rates`
+computes it anew.
 
 {table}
 
@@ -291,7 +388,8 @@ sample that shows a dip makes it wider. Two corners are left. Where a smoothed s
 threshold, 1 % of it is a sixth of the events. And of pulses of 50 µs (1000 Hz, duty 0.05) trials have one or
 two samples where a simulation has four, so their areas differ; trials take 24 samples per millisecond at
 most, which would have to be 80. Voltage noise had nothing to mend: it is off by a fifth (3 kHz) where 24
-samples are taken in 4 ms, but no fit has steps above 2 ms, and those are now cut into up to 48.
+samples are taken in 4 ms, but no fit has steps above 2 ms, and those are now cut into up to 48. Noise of two
+poles wants 105 samples per millisecond at 3 kHz and a knee of a tenth of the brightest light, and gets 48.
 """
 
 
@@ -309,6 +407,8 @@ def page() -> str:
         + recordings()
         + RECORDINGS
         + rice()
+        + poles_apart()
+        + damping()
         + fitted_and_simulated()
     )
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from dase.simulation.biases import DAVIS_LAWS
 from dase.simulation.preset_sources import preset_sources
 from dase.simulation.sensor_file import read_presets
 
@@ -16,40 +17,48 @@ is given for beside a value is said in the text above its table. How close prese
 
 ## Other biases than the default
 
-Nothing takes biases: change the values themselves. What is known of how they follow for the DAVIS346:
+For the DAVIS346 laws of ratios are published. `dase.simulation.biases.with_biases` changes a sensor by them,
+from currents before to currents after:
 
-- `OnBn`, `OffBn`, `DiffBn`: `threshold.on` goes with abs(ln(I_on / I_diff)), `threshold.off` with
-  abs(ln(I_off / I_diff)); capacitors and slopes before it cancel against those at the preset's own biases
-  (Nozaki, Delbruck: Temperature and parasitic photocurrent effects in dynamic vision sensors, 2017). The
-  article itself could not be read; jAER, the software of its authors, estimates thresholds by this law and
-  cites it, with 0.7 / 0.7² / 20 = 0.071 before the logarithm.
-- `RefrBp`: `refractory.period` goes with 1 / current, as a constant current charges a capacitor. So does
-  jAER, whose own numbers for capacitor and voltage are guesses and say so. No recording at hand measures
-  it.
-- `PrBp`, `PrSFBp`: nothing to be said of `bandwidth.cutoff`. A pole goes with its current only where
-  neither the photocurrent nor another pole is slower, and which one limits the preset is not known.
-- `leak` and `shot` follow the thresholds by themselves, as their `threshold` says at which one they were
-  measured.
+```python
+from dase.simulation.biases import bias_current, with_biases
 
-These are laws of ratios. Which currents the recordings were made with that gave the preset its thresholds
-is not known, so no table from currents to values is given: with your own currents before and after a
-change, multiply `threshold.on` by ln(I_on / I_diff) after over before, and `refractory.period` by the
-current before over after.
+before = {{"ONBn": bias_current(5, 255), "OFFBn": bias_current(4, 1), "DiffBn": bias_current(4, 39)}}
+after = before | {{"ONBn": bias_current(6, 200)}}  # coarse and fine setting
+less_sensitive = with_biases(fitted, before, after)
+```
 
-How far currents on a chip are from those asked for has not been measured here.
+| biases | what follows | law | source | not known |
+|---|---|---|---|---|
+{laws}
 
-For the IMX636 and the Gen4.1, `bias_diff_on` and `bias_diff_off` set `threshold.on` and `threshold.off`,
-`bias_fo` sets `bandwidth.cutoff`, `bias_hpf` sets `high_pass.cutoff` (an effect that no preset has), and
-`bias_refr` sets `refractory.period`. No curve from any of these settings to a value was found in the parts of
-Prophesee's public documentation that could be read, and none is invented: fit the values to a recording.
-Their presets' `leak` and `shot` follow the thresholds, too, as those of all presets of cameras do, except the
-`shot` of the Gen3, which has two thresholds where that effect knows one.
+The sensor must be one that was fitted to a recording with the biases before: with which currents the
+recordings were made that gave the presets their values is not known (their files do not say), so no table
+from currents to values is given. How far currents on a chip are from those asked for has not been measured
+here.
+
+For the IMX636, the Gen4.1 and the Gen3, `bias_diff_on` and `bias_diff_off` (relative to `bias_diff`) set
+`threshold.on` and `threshold.off`, `bias_fo` sets `bandwidth.cutoff`, `bias_hpf` sets `high_pass.cutoff` (an
+effect that no preset has), and `bias_refr` sets `refractory.period`. Prophesee's public page of biases, of
+which we could read the beginning, says what each does and in which direction; no curve from any of these
+settings to a value was found, jAER has none either (it answers "not a number" for these cameras), and none
+is invented: fit the values to a recording. Step responses of the IMX636 are measured in McReynolds, Graca,
+Kulesza, McMahon-Crabtree: Re-interpreting the step-response probability curve to extract fundamental
+physical parameters of event-based vision sensors, 2024 (arXiv 2404.07656); beyond its summary it could not be
+read, so whether it has thresholds by setting is not known. Their presets' `leak` and `shot` follow the
+thresholds, too, as those of all presets of cameras do, except the `shot` of the Gen3, which has two
+thresholds where that effect knows one.
 """
 
 
 def page() -> str:
     """Return the page."""
-    parts = [HEAD]
+    laws = (
+        f"| {', '.join(law.biases)} | {', '.join(f'`{v}`' for v in law.values) or 'nothing'} | {law.law} | "
+        f"{law.source} | {law.uncertainty} |"
+        for law in DAVIS_LAWS
+    )
+    parts = [HEAD.format(laws="\n".join(laws))]
     for name in sorted(read_presets()):
         found = preset_sources(name)
         parts.append(f"\n## {name}\n\n{found.about}\n\n| | value | source |\n|---|---|---|\n")

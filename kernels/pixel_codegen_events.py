@@ -289,15 +289,16 @@ def _pending_crossings(model: PixelModel) -> Statements:
     return (*_dead_time(model, "at"), Block("while wait > 0.0:", body))
 
 
-def _dead_time(model: PixelModel, share: str) -> Statements:
+def _dead_time(model: PixelModel, share: str, *, of_noise: bool = False) -> Statements:
     """Return the statements that set `wait` to the time the pixel stays dead after `share` of the step [s].
 
-    Gates ask for the time since the last event by the name of `age`, which a pixel keeps as of the begin of
-    the step.
+    Of noise that is the time for which gates hold it that do not let it pass. Gates ask for the time since
+    the last event by the name of `age`, which a pixel keeps as of the begin of the step.
     """
     gates = [
         Guarded(effect, (Line(f"wait = wp.max(wait, {call.text})", call.draws),))
         for effect, call in model.calls("gate")
+        if not (of_noise and effect.spares_noise)
     ]
     return (*lines("wait = float(0.0)", "now = age", f"age = now + {share} * dt"), *gates, Line("age = now"))
 
@@ -339,11 +340,11 @@ def _leave_pixel(model: PixelModel, share: str) -> tuple[str, Statements]:
     )
 
 
-def _event(model: PixelModel, share: str, label: str) -> Statements:
-    """Return the emission of an event after `share` of the step."""
+def _event(model: PixelModel, share: str, label: str, *, tires: bool = True) -> Statements:
+    """Return the emission of an event after `share` of the step, and whether a dead time begins with it."""
     # negative, as the whole step is added to the age when it is over
-    aged = lines(f"age = -{share} * dt") if "age" in model.states else ()
-    aged += lines("fired_on = float(polarity)") if "fired_on" in model.states else ()
+    aged = lines(f"age = -{share} * dt") if tires and "age" in model.states else ()
+    aged += lines("fired_on = float(polarity)") if tires and "fired_on" in model.states else ()
     if model.sink == "counts":
         return (*lines("on_count += polarity", "off_count += 1 - polarity"), *aged, *model.outlet.emitted)
     time, asked = _leave_pixel(model, share)
@@ -367,15 +368,24 @@ def _noise_event(model: PixelModel, effect: EffectStages) -> Statements:
     is_on = f"uniform({polarity.key}, int({n}_events)) * ({n}_on + {n}_off) < {n}_on"
     # only what leaves the pixel resets it: a dead pixel's noise changes nothing
     then: Statements = (Line("moved = value"), *_memorise_leak(model), *thresholds_after_event(model))
-    if model.resets:
+    code = f"{effect.label:d}"
+    if model.spares_noise:
+        # what is held in reset memorises nothing, whatever is sent on top
+        then = (Block("if stop >= at:", then),) if model.resets else then
+        sent = (*_event(model, "stop", code, tires=False), *then)
+        if not all(effect.spares_noise for effect, _ in model.of("gate")):
+            sent = (*_dead_time(model, "stop", of_noise=True), if_block("wait <= 0.0", *sent))
+    elif model.resets:
         held = if_block("wait > 0.0", *_memorise_at_end(model, "stop + wait / dt"))
-        then = (*then, *_dead_time(model, "stop"), held)
+        sent = _unless_dead(model, "stop", code, *then, *_dead_time(model, "stop"), held)
+    else:
+        sent = _unless_dead(model, "stop", code, *then)
     slipped = "slipped = leaked_before + (leaked - leaked_before) * stop"
     return (
         Line("polarity = int(0)"),
         Block(f"if {is_on}:", lines("polarity = 1"), draws=(polarity,)),
         *(lines(slipped) if model.labelled else ()),
-        *_unless_dead(model, "stop", f"{effect.label:d}", *then),
+        *sent,
         Line(f"{n}_hazard += waiting({noise.key}, int({n}_events))", (noise,)),
         count_on(f"{n}_events"),
     )

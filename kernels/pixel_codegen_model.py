@@ -171,6 +171,11 @@ class PixelModel:
         """Whether a pixel memorises the signal when its dead time ends."""
         return any(effect.resets for effect, _ in self.of("gate"))
 
+    @property
+    def spares_noise(self) -> bool:
+        """Whether noise passes a gate, and begins no dead time."""
+        return any(effect.spares_noise for effect, _ in self.of("gate"))
+
     def of(self, stage: str) -> list[tuple[EffectStages, Any]]:
         """Return the functions of a stage with their effects."""
         return [(effect, f) for effect in self.stages for kind, f in effect.functions if kind == stage]

@@ -85,6 +85,7 @@ class EffectStages:
         states: Names of what a pixel remembers from sample to sample; all zero at the start.
         delays: Whether the events that `gate` holds back come later; otherwise they are lost.
         resets: Whether the pixel memorises the signal at the end of the time for which `gate` holds it.
+        spares_noise: Whether events that `noise` makes pass `gate`, and begin no dead time.
         label: Of the events that `noise` makes.
         off: (parameter, value) pairs; an effect with all of them changes nothing.
         maps: Names of quantities that every pixel has its own value of, handed over as arrays.
@@ -96,6 +97,7 @@ class EffectStages:
     states: tuple[str, ...] = ()
     delays: bool = False
     resets: bool = False
+    spares_noise: bool = False
     label: int = Label.SHOT
     off: tuple[tuple[str, float], ...] = ()
     maps: tuple[str, ...] = ()

@@ -1,6 +1,6 @@
 """Kill small runs at random moments and resume them: the same bytes, no process and no temporary left.
 
-    python perf/kills.py --kills 20 --starts 20              of synth, convert and train each; --only convert
+    python perf/kills.py --kills 20 --starts 20              of synth, stereo, convert and train each
     python perf/kills.py --kills 100 --starts 60 --jobs 6 --minutes 9    six at once; says how to go on
     python perf/kills.py --only train --first 17 --kills 1   one round again
 
@@ -49,6 +49,7 @@ class Subject:
 SYNTH = ("synth", "{out}", "--size", "64x48", "--duration", "0.3", "--regime", "slow")
 SUBJECTS = {
     "synth": Subject((*SYNTH, "--sequences", "6", "--jobs", "2"), ("--resume",)),
+    "stereo": Subject((*SYNTH, "--sequences", "4", "--jobs", "2", "--stereo", "0.1"), ("--resume",)),
     "convert": Subject(("convert", "{source}", "{out}/events.npz")),
     "train": Subject(
         ("train", "davis346", "-o", "{out}", "--preset", "tiny", "--steps", "12", "--size", "48x36",

@@ -5,8 +5,12 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 from itertools import combinations
 from os import PathLike
+
+import numpy as np
+from numpy.typing import NDArray
 
 from dase.diagnosis.candidates import (
     Candidate,
@@ -32,11 +36,13 @@ from dase.diagnosis.seen_effects import (
     without_the_scene,
 )
 from dase.diagnosis.settings import DEFAULTS, DiagnosisSettings
+from dase.diagnosis.silent_pixels import NAME as DEAD
+from dase.diagnosis.silent_pixels import SilentPixels, find_silent_pixels, with_dead_pixels
 from dase.diagnosis.state import DiagnosisState, explains_remainder, with_same_freedom
 from dase.effects import EFFECTS, Effect
 from dase.fitting.burst_strength import follows_frames, put_in_step
 from dase.fitting.confidence_intervals import estimate_parameters
-from dase.fitting.data_split import SPLIT, split_measurement
+from dase.fitting.data_split import SPLIT, SplitMeasurement, split_measurement
 from dase.fitting.early_stopping import CandidateRace
 from dase.fitting.measurement import Measured, Measurement, SceneChoice, as_measurement
 from dase.fitting.model import (
@@ -46,6 +52,7 @@ from dase.fitting.model import (
     model_of,
     refit_model,
     refit_work,
+    ways_otherwise,
     with_fixed_effect,
 )
 from dase.fitting.plain_numbers import plain_numbers
@@ -121,18 +128,23 @@ def diagnose(
     frames = seen.times_of_bursts(measurement) if follows_frames(given) else None
     bursts = None if "exposure" in given else seen.bursts
     hot = few_hot_pixels(seen, measurement.events, pixels) if HOT not in given else None
-    evidence = split_measurement(
-        measurement.events, measurement.scene, log_eps=given.log_eps, trust=measurement.trust,
-        span=measurement.span, left_out=bursts.contains if bursts else None, odd_pixels=hot, lamp=seen.lamp,
-        frames=frames, unbroken=given.unbroken, plenty=settings.plenty, pixels=pixels, seed=seed,
-        device=device,
+    silent = None if DEAD in given else find_silent_pixels(measurement, log_eps=given.log_eps)
+    dead = silent if silent is not None and silent.found and DEAD in effects else None
+    split = partial(
+        split_measurement, measurement.events, measurement.scene, log_eps=given.log_eps,
+        trust=measurement.trust, span=measurement.span, left_out=bursts.contains if bursts else None,
+        odd_pixels=_odd_pixels(hot, dead), lamp=seen.lamp, frames=frames, unbroken=given.unbroken,
+        plenty=settings.plenty, pixels=pixels, seed=seed, device=device,
     )  # fmt: skip
+    evidence = split()
     given = put_in_step(given, evidence)
     free = free_where_measured(evidence, given, free)
     tell("fitting the present model", 0.0, float("nan"))
     names = frozenset(effect.name for effect in given.effects)
-    # what is left out of all that is compared cannot be tried
-    tried = {name: effect for name, effect in effects.items() if hot is None or name != HOT}
+    # what is left out of all that is compared cannot be tried, nor what all pixels contradict
+    known = {HOT} if hot is not None else set[str]()
+    known |= {DEAD} if silent is not None and silent.decides else set()
+    tried = {name: effect for name, effect in effects.items() if name not in known}
     state = DiagnosisState(evidence, tried, seed, tell, names, settings)
     if so_far is not None:
         state.after_step = lambda model, errors: so_far(
@@ -145,10 +157,16 @@ def diagnose(
     )
     start = _fitted_unless_worse(state, given, free)
     seen = without_the_scene(seen, measurement, start.sensor, seed)
+
+    def with_doubt(split: SplitMeasurement, model: FittedModel) -> SplitMeasurement:
+        scene = measurement.scene
+        if not isinstance(scene, CameraScene) or not is_guessed(scene):
+            return split
+        return with_scene_doubt(split, scene, model, seed=seed)
+
     if isinstance(measurement.scene, CameraScene) and is_guessed(measurement.scene):
         tell("how well the scene is known", 0.0, before)
-        evidence = with_scene_doubt(evidence, measurement.scene, start, seed=seed)
-        state.evidence = evidence
+        state.evidence = evidence = with_doubt(evidence, start)
         before = (
             model_of(given, free)
             .judge(evidence.report, repeats=settings.repeats // 2, seed=SimulationStream.JUDGE.seed(seed))
@@ -168,16 +186,28 @@ def diagnose(
         # pixels remember the bursts between them, too
         start = with_fixed_effect(start, strength.effect)
         state.given |= {strength.effect.name}
+    if dead is not None:
+        state.notes.append(f"{len(dead.pixels)} dead pixels are left out of all that is compared")
     if bursts is not None:
         state.notes.append("the bursts that come with the frames are left out of all that is compared")
     # what is not of this scene has no effects to be found
     limit = 0 if evidence.contradiction else most
     model, judgement = _add_one_by_one(state, start, limit)
+    if limit > 0 and _shows_later_alone(state, model, judgement):
+        tell("fitting all of the time", 0.0, judgement.error)
+        state.evidence = evidence = with_doubt(split(all_time=True), model)
+        state.notes.append(
+            "what is left comes late in the recording: all of its time is fitted, and other pixels judge"
+        )
+        model = refit_model(evidence, model, seed=seed)
+        model, judgement = _add_one_by_one(state, model, limit - len(state.added_to(model)))
     if not reaches_floor(judgement) and limit > 0:
         model, judgement = _add_pair(state, model, judgement)
     if len(state.added_to(model)) > 1:
         model, judgement = prune_model(state, model, judgement)
     found = _conclude_diagnosis(state, start, model, before, seen, names, measurement)
+    if silent is not None and silent.decides and not evidence.contradiction and DEAD in effects:
+        found = with_dead_pixels(found, silent)
     if hot is not None:
         found = with_hot_pixels(found, *hot_effect_of(measurement.events, hot))
     if strength is not None:
@@ -189,6 +219,12 @@ def diagnose(
         )  # fmt: skip
         found = with_effect_of_bursts(found, last or strength)
     return measurement.noted(replace(found, seconds=time.perf_counter() - begin))
+
+
+def _odd_pixels(hot: NDArray[np.int64] | None, dead: SilentPixels | None) -> NDArray[np.int64] | None:
+    """Return the pixels that are left out of all that is compared, row-major, shape (K,); None for none."""
+    some = [*([] if hot is None else [hot]), *([] if dead is None else [dead.pixels])]
+    return np.unique(np.concatenate(some)) if some else None
 
 
 def _fitted_unless_worse(state: DiagnosisState, given: Sensor, free: Sequence[str] | None) -> FittedModel:
@@ -233,6 +269,19 @@ def _add_one_by_one(state: DiagnosisState, model: FittedModel, most: int) -> tup
             break
         model = better
     return model, judgement
+
+
+def _shows_later_alone(state: DiagnosisState, model: FittedModel, judgement: Judgement) -> bool:
+    """Whether a model that fails where it is judged is nearly right where it was fitted.
+
+    What comes late in a recording, as the first events of a slow leak do, no fit to its first part can find.
+    """
+    if reaches_floor(judgement):
+        return False
+    repeats, stream = state.settings.candidates.few_repeats, SimulationStream.JUDGE.seed(state.seed)
+    fitted = model.judge(state.evidence.train, repeats=repeats, seed=stream)
+    excess = max(fitted.error - fitted.level, 0.0) / max(judgement.error - judgement.level, 1e-9)
+    return excess < state.settings.later
 
 
 def _look_for_effect(
@@ -360,20 +409,23 @@ def _add_pair(
     )
     pairs = list(combinations(singles, 2))
     # only the first are fitted to all pixels
-    race, works = CandidateRace(settings.fitted_pairs), []
+    race, works, names = CandidateRace(settings.fitted_pairs), [], []
     for one, two in pairs:
         both = one.model.sensor.with_effect(two.model.sensor[two.name])
         pair = with_same_freedom(both, start, (one.name, two.name))
-        over = race.over(f"{one.name} + {two.name}")
-        works.append(pair.search_work(scout, seed=seed, iterations=4, radius=0.3, over=over))
+        name = f"{one.name} + {two.name}"
+        # which rule is best for an effect alone need not be best beside the other
+        for way in (pair, *ways_otherwise(pair, (one.name, two.name))):
+            works.append(way.search_work(scout, seed=seed, iterations=4, radius=0.3, over=race.over(name)))
+            names.append(name)
     ends = run_side_by_side(works, lambda share: state.progress("trying pairs", share, state.error))
-    tried = [
-        (pair.loss, f"{one.name} + {two.name}", pair) for (one, two), pair in zip(pairs, ends, strict=True)
-    ]
-    first = sorted(tried, key=lambda t: t[0])[: settings.fitted_pairs]
-    settled = run_side_by_side([refit_work(evidence, pair, seed=seed) for _, _, pair in first])
+    best = dict[str, FittedModel]()
+    for name, pair in sorted(zip(names, ends, strict=True), key=lambda named: named[1].loss):
+        best.setdefault(name, pair)
+    first = list(best.items())[: settings.fitted_pairs]
+    settled = run_side_by_side([refit_work(evidence, pair, seed=seed) for _, pair in first])
     ranking: list[Rank] = []
-    for (_, name, _), pair in zip(first, settled, strict=True):
+    for (name, _), pair in zip(first, settled, strict=True):
         judged = state.judge(pair)
         ranking = sorted([*ranking, _rank_of_pair(name, pair, judged, before)], key=_error_of_rank)
         if judged.error < judgement.error * (1.0 if reaches_floor(judged) else settings.pair_gain):

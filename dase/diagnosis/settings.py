@@ -247,6 +247,10 @@ class DiagnosisSettings:
     """Events of the pixels of one part from which on a longer time is not compared: other simulators' clips,
     in which most effects are found, have 6,000 to 100,000, and what takes longest are long recordings."""
 
+    later: float = 0.3
+    """Error above the level of chance where the model was fitted, as a share of that where it is judged,
+    below which what is missing comes late in the recording, and all of its time is fitted."""
+
     on_its_way: float = 2.0
     """A model with one effect more is judged by fewer simulations where its error is above this [gates]."""
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import inspect
 import math
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field
 from functools import cache
 from pathlib import Path
@@ -294,6 +294,18 @@ class Effect:
         """Whether this effect holds a pixel in reset: it memorises the light at the end of its dead time."""
         return False
 
+    def spares_noise(self) -> bool:
+        """Whether random events pass while this effect holds the others back, and begin no dead time."""
+        return False
+
+    def otherwise(self, beside: Collection[str]) -> list[Self]:
+        """Return this effect by the other rules that a fit has to try, too, as no descent gets there.
+
+        Args:
+            beside: Names of the effects that are on beside it.
+        """
+        return []
+
     def longest_step(self) -> float:
         """Return the longest time between samples that still shows the effect [s]."""
         return math.inf
@@ -311,6 +323,7 @@ class Effect:
             states=self.states,
             delays=self.delays(),
             resets=self.resets(),
+            spares_noise=self.spares_noise(),
             label=LABELS.index(self.label),
             maps=self.maps,
             off=tuple((p.name, p.off) for p in self.parameters() if p.off is not None),

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import dataclasses
+from collections.abc import Collection
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import ClassVar, Self
 
 import warp as wp
 
-from dase.effects.base import Effect, choice, parameter
+from dase.effects.base import Effect, Observations, choice, parameter
 
 
 @wp.func
@@ -35,13 +37,18 @@ class Refractory(Effect):
     lost although the memory follows them, one threshold each (ESIM): the ramp has an event at the first
     crossing after the dead time, whatever was left of the way. With `mode = "delay"`, the pixel sends a
     crossing that still stands when the dead time ends: every max(threshold / s, period).
+
+    Random events of `shot` and hot pixels are held back, too, and begin a dead time. Other simulators add
+    them on top (v2e, OpenEB): with `noise = "passes"` they come in the dead time as at any other, set the
+    memory, and begin no dead time.
     """
 
     name: ClassVar[str] = "refractory"
     source: ClassVar[str] = (
         "Lichtsteiner, Posch, Delbruck: A 128x128 120 dB 15 us latency asynchronous "
         "temporal contrast vision sensor, 2008 (reset); "
-        "Rebecq, Gehrig, Scaramuzza: ESIM, an open event camera simulator, 2018 (drop)"
+        "Rebecq, Gehrig, Scaramuzza: ESIM, an open event camera simulator, 2018 (drop); "
+        "Hu, Liu, Delbruck: v2e, from video frames to realistic DVS events, 2021 (noise on top)"
     )
     stages: ClassVar = {"gate": dead_time_left}
 
@@ -73,6 +80,26 @@ class Refractory(Effect):
     mode: str = choice(
         "reset", among=("reset", "drop", "delay"), about="what becomes of changes in the dead time"
     )
+
+    noise: str = choice(
+        "held", among=("held", "passes"), about="what becomes of random events in the dead time"
+    )
+
+    @classmethod
+    def candidates(cls, observed: Observations) -> list[Self]:
+        """Return the three rules; whether noise passes is asked once there is noise."""
+        return [effect for effect in cls.variants() if effect.noise == "held"]
+
+    def otherwise(self, beside: Collection[str]) -> list[Self]:
+        """Return the other rules for changes in the dead time, and for noise where there is any."""
+        modes = [dataclasses.replace(self, mode=mode) for mode in self.choices()["mode"] if mode != self.mode]
+        if not {"shot", "hot"} & set(beside):
+            return modes
+        return [*modes, dataclasses.replace(self, noise="held" if self.noise == "passes" else "passes")]
+
+    def spares_noise(self) -> bool:
+        """Whether random events come in the dead time, too."""
+        return self.noise == "passes"
 
     def delays(self) -> bool:
         """Whether crossings in the dead time come later instead of being lost."""

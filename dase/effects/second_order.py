@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
-from typing import ClassVar
+from dataclasses import dataclass, replace
+from typing import ClassVar, Self
 
 import warp as wp
 
 from dase.effects.bandwidth import Bandwidth
-from dase.effects.base import Effect, parameter
+from dase.effects.base import Effect, Observations, choice, parameter
 from dase.effects.photocurrent import dark_share, relative_photocurrent
+from dase.kernels.pixel_stages import EffectStages
 from dase.kernels.vector_math import cosine_and_sine, exponential
 
 
@@ -77,6 +78,25 @@ def ramp_lag(x: float, damping: float, h: float, rest: float):
 
 
 @wp.func
+def behind_two_poles(
+    voltage: float, dt: float, omega: float, damping: float, input: float, output: float, slope: float
+):
+    """Output of a second-order low-pass after a step, and its slope; exact for a straight input."""
+    x = omega * dt
+    step = voltage - input
+    settled = voltage
+    speed = step / dt
+    # beyond this it follows at once; infinity would make not-a-numbers below
+    if x < 1.0e8:
+        h, dh = impulse_response(x, damping)
+        rest = dh + 2.0 * damping * h
+        behind, reached = ramp_lag(x, damping, h, rest)
+        settled = voltage - step * behind + (output - input) * rest + slope / omega * h
+        speed = omega * (step * reached - (output - input) * h) + slope * dh
+    return settled, speed
+
+
+@wp.func
 def second_order_voltage(
     voltage: float,
     intensity: float,
@@ -90,20 +110,36 @@ def second_order_voltage(
     slope: float,
     pixel_normal: float,
 ):
-    """Second-order low-pass, exact for an input that runs straight between samples."""
+    """Two poles that follow the photocurrent alike."""
     omega = 2.0 * wp.pi * cutoff * relative_photocurrent(intensity, dark)
     omega *= wp.max(1.0 + spread * pixel_normal, 0.1)
-    x = omega * dt
-    step = voltage - input
-    settled = voltage
-    speed = step / dt
-    # beyond this it follows at once; infinity would make not-a-numbers below
-    if x < 1.0e8:
-        h, dh = impulse_response(x, damping)
-        rest = dh + 2.0 * damping * h
-        behind, reached = ramp_lag(x, damping, h, rest)
-        settled = voltage - step * behind + (output - input) * rest + slope / omega * h
-        speed = omega * (step * reached - (output - input) * h) + slope * dh
+    settled, speed = behind_two_poles(voltage, dt, omega, damping, input, output, slope)
+    return settled, voltage, settled, speed
+
+
+@wp.func
+def photoreceptor_voltage(
+    voltage: float,
+    intensity: float,
+    dt: float,
+    cutoff: float,
+    damping: float,
+    dark: float,
+    fixed: float,
+    spread: float,
+    input: float,
+    output: float,
+    slope: float,
+    pixel_normal: float,
+):
+    """A pole that follows the photocurrent and a fixed one: damping changes with the light."""
+    light = relative_photocurrent(intensity, dark)
+    root = wp.sqrt(light)
+    omega = 2.0 * wp.pi * cutoff * root
+    omega *= wp.max(1.0 + spread * pixel_normal, 0.1)
+    # the sum of the poles, of which one share follows the light, over that of two equal ones
+    damped = damping * (fixed + (1.0 - fixed) * light) / root
+    settled, speed = behind_two_poles(voltage, dt, omega, damped, input, output, slope)
     return settled, voltage, settled, speed
 
 
@@ -115,12 +151,22 @@ class SecondOrder(Effect):
     current of its amplifier. When they are alike the response is steeper than that of one low-pass, and in
     bright light it may overshoot, so that a sharp edge is followed by a few events of the other polarity.
 
-    H(s) = ω² / (s² + 2 damping ω s + ω²). The natural frequency ω/2π is `cutoff` at intensity 1 (white) and
-    falls linearly to `dark * cutoff` at intensity 0; the damping is held constant, although in the circuit
-    it changes with the light. The quality factor is Q = 1 / (2 damping); at damping 0.71 the natural
-    frequency is the -3 dB frequency. Exact at any sampling, for under-, over- and critical damping. Strongly
-    damped it is one low-pass with the cutoff `cutoff / (2 damping)`: `bandwidth`. The natural frequency
-    differs from pixel to pixel by `spread`.
+    H(s) = ω² / (s² + 2 damping ω s + ω²), with ω/2π = `cutoff` and the damping `damping` at intensity 1
+    (white). The quality factor is Q = 1 / (2 damping); at damping 0.71 the natural frequency is the -3 dB
+    frequency. Exact at any sampling, for under-, over- and critical damping. Strongly damped it is one
+    low-pass with the cutoff `cutoff / (2 damping)`: `bandwidth`. The natural frequency differs from pixel to
+    pixel by `spread`.
+
+    With `poles = "alike"` both poles follow the photocurrent, of which L is left (1 at intensity 1, `dark` at
+    intensity 0): ω goes with L and the damping is the same in all light, as other simulators have it.
+
+    With `poles = "apart"` it is the circuit. Its node, which the photocurrent charges, has the pole a L, its
+    amplifier the fixed pole b, and a loop of gain A goes round both: v'' + (a L + b) v' =
+    (1 + A) a b L (u - v) for the logarithm u of the light. So ω goes with sqrt(L), and the damping is that at
+    intensity 1 times (`fixed` + (1 - `fixed`) L) / sqrt(L), where `fixed` = b / (a + b) is the amplifier's
+    share of it: with a high gain nearly all, and damping falls as light rises. Without a loop it is one
+    low-pass behind another, such as a buffer. `of_poles` takes the poles and the gain. With a fixed pole far
+    above the other it is `bandwidth` in all light.
     """
 
     name: ClassVar[str] = "second_order"
@@ -150,7 +196,8 @@ class SecondOrder(Effect):
         starts="ends",
     )
     dark: float = dark_share(
-        "natural frequency at intensity 0 relative to that at intensity 1; 1 makes it constant"
+        "photocurrent at intensity 0 relative to that at intensity 1, which the poles follow; 1 makes them "
+        "constant"
     )
     spread: float = parameter(
         0.0,
@@ -160,6 +207,46 @@ class SecondOrder(Effect):
         about="standard deviation of the natural frequency over pixels, relative to it",
         fitted=False,  # as that of `bandwidth`
     )
+    fixed: float = parameter(
+        1.0,
+        unit="1",
+        bounds=(0.0, 1.0),
+        plausible=(0.1, 1.0),
+        about="share of the damping at intensity 1 that is the fixed pole's, if poles are apart",
+        fitted=False,  # it shows only where the response rings or not by the light
+    )
+    poles: str = choice(
+        "alike",
+        among=("alike", "apart"),
+        about="both follow the light, or one does and one is fixed, so that damping changes with light",
+    )
+
+    @classmethod
+    def candidates(cls, observed: Observations) -> list[Self]:
+        """Return that of constant damping: recordings hardly tell how damping changes with light."""
+        return [cls()]
+
+    @classmethod
+    def of_poles(cls, pole: Bandwidth, *, cutoff: float, gain: float = 0.0) -> Self:
+        """Return the photoreceptor of a pole that follows the light, as a `Bandwidth`, and a fixed one.
+
+        Args:
+            pole: That of the node; of a loop, that without the loop.
+            cutoff: Of the fixed pole [Hz].
+            gain: Of the loop around both; 0 for one low-pass behind the other.
+        """
+        natural = math.sqrt((1 + gain) * pole.cutoff * cutoff)
+        return cls(
+            cutoff=natural, damping=(pole.cutoff + cutoff) / (2 * natural), dark=pole.dark,
+            spread=pole.spread, fixed=cutoff / (pole.cutoff + cutoff), poles="apart",
+        )  # fmt: skip
+
+    def compiled(self) -> EffectStages:
+        """Return what the kernel composer needs to know."""
+        stages = super().compiled()
+        if self.poles == "alike":
+            return stages
+        return replace(stages, functions=(("respond", photoreceptor_voltage),))
 
     def simpler(self) -> tuple[Effect, ...]:
         """Return the one low-pass that is as late behind a ramp: by 2 damping / (2π cutoff)."""

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import ClassVar
+from collections.abc import Collection
+from dataclasses import dataclass, replace
+from typing import ClassVar, Self
 
 from dase.effects.base import Effect, parameter
 
@@ -51,3 +52,7 @@ class Threshold(Effect):
         about="spread of the pixels' memories at the start, as a share of the threshold",
         fitted=False,  # both ends are tried instead
     )
+
+    def otherwise(self, beside: Collection[str]) -> list[Self]:
+        """Return the thresholds with the other end of the phase."""
+        return [replace(self, phase=1.0 - self.phase)]

@@ -10,6 +10,7 @@ import warp as wp
 
 from dase.effects.bandwidth import Bandwidth
 from dase.effects.base import Effect, Observations, choice, parameter
+from dase.effects.second_order import impulse_response
 from dase.kernels.pixel_stages import EffectStages
 from dase.kernels.vector_math import cosine_and_sine, exponential, logarithm
 
@@ -103,45 +104,27 @@ def noisy_voltage(
 
 
 @wp.func
-def shock_share(a: float, b: float):
-    """Share of a shock to a node that is behind a low-pass after a time: b (e^-a - e^-b) / (b - a).
+def fresh_variance_of_poles(x: float, damping: float, h: float, dh: float):
+    """Variance, covariance and variance of noise and its speed that are new after x, behind any two poles.
 
-    The node forgets it at rate a, the low-pass follows at rate b, both per that time.
+    In units of the stationary variance; x and the speed in units of the natural frequency. `h` and `dh` are
+    the impulse response there.
     """
-    apart = wp.abs(b - a)
-    # series; the closed form loses digits
-    mean = 1.0 - 0.5 * apart * (1.0 - apart / 3.0)
-    if apart > 0.02:
-        mean = (1.0 - exponential(-apart)) / apart
-    return b * exponential(-wp.min(a, b)) * mean
-
-
-@wp.func
-def fresh_node_variance(a: float, b: float, settled: float):
-    """Variances of a node and of a low-pass behind it that are new after a step, and their covariance.
-
-    In units of the node's stationary variance, of which `settled`, b / (a + b), is behind the low-pass.
-    """
-    kept = exponential(-a)
-    share = shock_share(a, b)
-    followed = exponential(-b)
-    node = 1.0 - kept * kept
-    mixed = settled - kept * (share + followed * settled)
-    behind = settled - share * share - followed * (2.0 * share + followed) * settled
-    if a < 0.02:
-        node = 2.0 * a * (1.0 - a * (1.0 - a / 1.5))
-    if a + b < 2.0:
-        # the closed forms lose digits; four Gauss points of a, h e^-a and h², h the share of earlier shocks
-        mixed = float(0.0)
-        behind = float(0.0)
+    rest = dh + 2.0 * damping * h
+    mixed = 2.0 * damping * h * h
+    var = 1.0 - rest * rest - h * h
+    speed_var = 1.0 - h * h - dh * dh
+    if x * wp.max(2.0 * damping, 1.0) < 2.0:
+        # the closed forms lose digits; four Gauss points of h² and dh², of which they are the integrals
+        var = float(0.0)
+        speed_var = float(0.0)
         for n in range(4):
             away = wp.where(n == 0 or n == 3, 0.4305681557970263, 0.1699905217924281)
             weight = wp.where(n == 0 or n == 3, 0.1739274225687269, 0.3260725774312731)
-            ago = 0.5 + wp.where(n < 2, -away, away)
-            h = shock_share(ago * a, ago * b)
-            mixed += 2.0 * a * weight * h * exponential(-ago * a)
-            behind += 2.0 * a * weight * h * h
-    return wp.max(node, 1.0e-30), mixed, behind
+            g, dg = impulse_response((0.5 + wp.where(n < 2, -away, away)) * x, damping)
+            var += 4.0 * damping * x * weight * g * g
+            speed_var += 4.0 * damping * x * weight * dg * dg
+    return wp.max(var, 1.0e-30), mixed, speed_var
 
 
 @wp.func
@@ -153,37 +136,42 @@ def photoreceptor_noise(
     cutoff: float,
     knee: float,
     dark: float,
+    gain: float,
     noise: float,
     speed: float,
     uniform: float,
     uniform_2: float,
 ):
-    """Voltage with noise of a node that the photocurrent charges, behind a fixed pole; turns as above.
+    """Voltage with noise of a node that the light charges, in a loop with a fixed pole; turns as above.
 
-    `speed` is what the fixed pole has yet to follow: the slope in units of that pole.
+    `speed` is the slope in units of the fixed pole, which goes on where the light changes.
     """
     light = wp.max(intensity, 0.0) + dark
     share = light / (light + knee)
-    b_whole = 2.0 * wp.pi * cutoff * dt
-    # beyond 100 time constants nothing is remembered
-    a = wp.min(b_whole * (light / knee), 100.0)
-    b = wp.min(b_whole, 100.0)
-    settled = 1.0 - share
-    node_var, mixed, behind = fresh_node_variance(a, b, settled)
-    first = wp.sqrt(node_var)
+    fixed = 2.0 * wp.pi * cutoff
+    node = fixed * (light / knee)
+    omega = wp.sqrt((1.0 + gain) * fixed * node)
+    damping = 0.5 * (fixed + node) / omega
+    # beyond this nothing is remembered
+    x = wp.min(omega * dt, 1.0e8)
+    h, dh = impulse_response(x, damping)
+    var, mixed, speed_var = fresh_variance_of_poles(x, damping, h, dh)
+    first = wp.sqrt(var)
     cross = mixed / first
-    then = wp.sqrt(wp.max(behind - cross * cross, 0.0))
+    then = wp.sqrt(wp.max(speed_var - cross * cross, 0.0))
     # both normals of one Box-Muller pair
     normal, normal_2 = cosine_and_sine(uniform_2)
-    scale = sigma * wp.sqrt(-2.0 * logarithm(1.0 - uniform))
-    node = noise + speed
-    now = exponential(-b) * noise + shock_share(a, b) * node + scale * (cross * normal + then * normal_2)
-    speed_now = exponential(-a) * node + scale * first * normal - now
+    scale = sigma * wp.sqrt(-2.0 * logarithm(1.0 - uniform) * (1.0 - share))
+    unit = fixed / omega
+    now = (dh + 2.0 * damping * h) * noise + h * unit * speed + scale * first * normal
+    speed_now = dh * speed + (scale * (cross * normal + then * normal_2) - h * noise) / unit
+    a = wp.min(node * dt, 100.0)
+    b = wp.min(fixed * dt, 100.0)
     # slopes of steps so long that they tell nothing of the way would lead astray
-    near = wp.min(1.0, STEEP / wp.max(wp.max(a, b), 1.0e-6))
+    near = wp.min(1.0, STEEP / wp.max(wp.max(a, b), wp.max(x, 1.0e-6)))
     top, way = turning_voltage(noise, near * b * speed, now, near * b * speed_now)
-    # of equal poles this is `CREST` as above: white noise moves the slope by 2 a b² sigma² in a step
-    top += way * CREST * near * b * wp.sqrt(0.5 * near * a) * sigma
+    # of equal poles this is `CREST` as above: in a step white noise moves the slope by 2 a b² sigma²
+    top += way * CREST * near * b * wp.sqrt(0.5 * near * a * (1.0 + gain)) * sigma
     return voltage + top, now, speed_now
 
 
@@ -207,13 +195,14 @@ class VoltageNoise(Effect):
     1.55 · corner · exp(-level² / 2 variance) times per second (Rice's formula).
 
     With `poles = "apart"` the noise has the photoreceptor's own two poles: that of its node, which the
-    photocurrent charges, at cutoff · I / knee, and the fixed one at `cutoff`. The variance is as above, and
-    the voltage passes its mean sqrt(I / knee) · cutoff times per second upwards. Its crossings come in
+    photocurrent charges, at cutoff · I / knee, and the fixed one at `cutoff`, with a loop of `gain` around
+    both, as `second_order` with `poles = "apart"` has them. The variance is as above, and the voltage passes
+    its mean sqrt((1 + gain) I / knee) · cutoff times per second upwards. Its crossings come in
     clusters where the node is the faster one, and most of a cluster make no event, so events are fewer than
     Rice's formula has crossings. Scenes are sampled so finely that at intensity 1 the node has at most two
     time constants between samples: pi / knee samples per period of `cutoff`, which costs much for a low knee.
-    The node's pole is that of `bandwidth` where that has cutoff · (1 + dark) / knee and dark / (1 + dark),
-    see `of_photoreceptor`.
+    A loop asks for some sqrt(25 (1 + gain) / knee) samples, where that is more. The node's pole is that of
+    `bandwidth` where that has cutoff · (1 + dark) / knee and dark / (1 + dark), see `of_photoreceptor`.
 
     An ideal memory moves by whole thresholds, so a pixel keeps the phase that it began with, and pixels which
     are alike differ in their rates. One that is held in reset after its events (`refractory`) memorises the
@@ -260,6 +249,14 @@ class VoltageNoise(Effect):
         about="dark current, as the intensity that makes as much; keeps the corner above 0",
         fitted=False,  # it shows in the darkest pixels only, which hardly send events
     )
+    gain: float = parameter(
+        0.0,
+        unit="1",
+        bounds=(0.0, 1e4),
+        plausible=(0.0, 300.0),
+        about="of the loop around both poles, if they are apart; 0 for one behind the other",
+        fitted=False,  # it shows in the spectrum alone
+    )
     poles: str = choice(
         "alike",
         among=("alike", "apart"),
@@ -272,18 +269,19 @@ class VoltageNoise(Effect):
         return [cls()]
 
     @classmethod
-    def of_photoreceptor(cls, pole: Bandwidth, *, sigma: float, cutoff: float) -> Self:
-        """Return the noise of a photoreceptor whose one pole follows the same photocurrent as a `Bandwidth`.
+    def of_photoreceptor(cls, pole: Bandwidth, *, sigma: float, cutoff: float, gain: float = 0.0) -> Self:
+        """Return the noise of the photoreceptor that `SecondOrder.of_poles` returns.
 
         Args:
-            pole: Its cutoff and its dark current.
+            pole: That of the node, its cutoff and its dark current.
             sigma: Standard deviation in the dark [log intensity].
             cutoff: Of the fixed pole [Hz].
+            gain: Of the loop around both.
         """
         # pole.cutoff (dark + (1 - dark) light) is cutoff (light + dark current) / knee
         slope = pole.cutoff * (1 - pole.dark)
         dark = pole.dark / (1 - pole.dark)
-        return cls(sigma=sigma, cutoff=cutoff, knee=cutoff / slope, dark=dark, poles="apart")
+        return cls(sigma=sigma, cutoff=cutoff, knee=cutoff / slope, dark=dark, gain=gain, poles="apart")
 
     def compiled(self) -> EffectStages:
         """Return what the kernel composer needs to know."""
@@ -299,5 +297,7 @@ class VoltageNoise(Effect):
         step = 1 / (8 * self.cutoff)
         if self.poles == "alike":
             return step
-        # slopes tell where the voltage turns up to so many time constants of the node; in the brightest light
-        return min(step, STEEP * self.knee / (2 * math.pi * self.cutoff * (1 + self.dark)))
+        # slopes tell where the voltage turns up to so many time constants of the node, in the brightest
+        # light; the loop's pace is the geometric mean of those of the poles, and faster by the gain
+        node = STEEP * self.knee / (2 * math.pi * self.cutoff * (1 + self.dark))
+        return min(step, node, math.sqrt(step * node / (1 + self.gain)))

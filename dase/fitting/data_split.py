@@ -173,6 +173,7 @@ def split_measurement(
     lamp: float | None = None,
     frames: BurstTimes | None = None,
     unbroken: bool = False,
+    all_time: bool = False,
     plenty: float = math.inf,
     pixels: int = SPLIT.pixels,
     seed: int = 0,
@@ -196,6 +197,8 @@ def split_measurement(
         unbroken: Whether a long recording is compared in one window, not in several over its length, as
             models with a clock of their own need it, see `Sensor.unbroken`; so it is where there is a lamp
             or bursts with frames, where times are left out, and where time stamps follow a regularity.
+        all_time: Whether all of the time is fitted, not its first part alone: what judges still are other
+            pixels at a later time.
         plenty: Events of the pixels of one part from which on a longer time is not compared.
         pixels: In each part.
         seed: Of the choice of pixels.
@@ -309,17 +312,17 @@ def split_measurement(
         # what judges is simulated over all of the time and compared in the later part only
         if n > 0:
             cells[:, :cut] = MASKED
-    train_grid = replace(grid, steps=cut)
-    pieces = [(first, train_grid, cell[0][:, :cut].copy())]
-    pieces += [(part, grid, cells) for part, cells in zip(last, cell[1:], strict=True)]
+    fitted = grid if all_time else replace(grid, steps=cut)
+    pieces = [(first, fitted, cell[0][:, : fitted.steps].copy(), 0)]
+    pieces += [(part, grid, cells, cut) for part, cells in zip(last, cell[1:], strict=True)]
     del cell, cells, works, good  # large, and no longer needed
     halves: list[PixelSubset] = []
-    for part, stretch, cells in pieces:
+    for part, stretch, cells, begins in pieces:
         stimulus = Stimulus(
             chosen[part], scene.width, scene.height, stretch, light[part, : stretch.steps], cells, log_eps,
             to, trust is not None or len(gaps) > 0 or left_out is not None or settled is not None,
         )  # fmt: skip
-        halves.append(make_subset(stimulus, events, cut if stretch is grid else 0, structure))
+        halves.append(make_subset(stimulus, events, begins, structure))
     _require_enough_events(halves, events, grid, notes, settings.least_events)
     halves.append(make_subset(halves[0].trials.stimulus.part(settings.scouts), events, 0, structure))
     # seen in the fitted half: what judges must not choose

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
 from itertools import product
 
@@ -10,7 +10,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dase.effects.base import Effect
-from dase.effects.threshold import Threshold
 from dase.fitting.data_split import SplitMeasurement
 from dase.fitting.descent import DESCENT, DescentSettings, StopRule, descent_work, ranking_work
 from dase.fitting.parameter_space import ParameterSpace, SearchAxis, axes_of, with_values
@@ -207,11 +206,15 @@ def refit_model(evidence: SplitMeasurement, model: FittedModel, *, seed: int, ro
     """Refit a model by its own sampling errors, which change with it.
 
     Each of some descents has random numbers of its own, because they end where those happen to lead, and the
-    last one begins with the other phase; the best of them by the random numbers of all is taken.
+    last ones begin with the other phase, or another rule of an effect; the best of them by the random numbers
+    of all is taken.
     """
     seeds = [SimulationStream.DESCENT.seed(seed, n) for n in range(REFIT.descents)]
     works = [refit_work(evidence, model, seed=each, rounds=rounds) for each in seeds[:-1]]
-    works.append(_refit_from_other_phase_work(evidence, model, seed=seeds[-1], rounds=rounds))
+    works += [
+        _refit_otherwise_work(evidence, other, model, seed=seeds[-1], rounds=rounds)
+        for other in ways_otherwise(model)
+    ]
     ends = run_side_by_side(works)
     half = ends[0].calibrate(
         evidence.train, repeats=REFIT.repeats, seed=SimulationStream.CALIBRATE_FIT.seed(seed)
@@ -223,16 +226,16 @@ def refit_model(evidence: SplitMeasurement, model: FittedModel, *, seed: int, ro
     return ends[int(losses.mean(1).argmin())]
 
 
-def _refit_from_other_phase_work(
-    evidence: SplitMeasurement, model: FittedModel, *, seed: int, rounds: int
+def _refit_otherwise_work(
+    evidence: SplitMeasurement, other: FittedModel, model: FittedModel, *, seed: int, rounds: int
 ) -> Work[FittedModel]:
-    """Refit a model from what pixels may have seen otherwise before the start.
+    """Refit a model by another rule, such as what pixels may have seen before the start.
 
     Where that is wrong, all else is bent to make up for it, and the right one looks no better before all is
     fitted again.
     """
     half = yield from calibration_while_fitting(evidence, model, seed=seed)
-    other = yield from _with_other_phase(model).search_work(half, seed=seed, iterations=3, patient=True)
+    other = yield from other.search_work(half, seed=seed, iterations=3, patient=True)
     return (yield from refit_work(evidence, other, seed=seed, rounds=rounds))
 
 
@@ -245,10 +248,20 @@ def calibration_while_fitting(
     )
 
 
-def _with_other_phase(model: FittedModel) -> FittedModel:
-    threshold = model.space.sensor["threshold"]
-    assert isinstance(threshold, Threshold)
-    return with_phase(model, 1.0 - threshold.phase)
+def ways_otherwise(model: FittedModel, names: Collection[str] | None = None) -> list[FittedModel]:
+    """Return the model by other rules of its effects, one at a time.
+
+    Args:
+        model: At its place.
+        names: Of the effects whose rules are changed; None for all.
+    """
+    sensor = model.space.sensor
+    acting = [effect.name for effect in model.sensor.effects if not effect.is_off()]
+    return [
+        replace(model, space=replace(model.space, sensor=sensor.with_effect(other)))
+        for effect in sensor.effects if names is None or effect.name in names
+        for other in effect.otherwise([name for name in acting if name != effect.name])
+    ]  # fmt: skip
 
 
 def refit_work(
@@ -264,10 +277,11 @@ def refit_work(
     for turn in range(rounds):
         if half is None or turn > 0:
             half = yield from calibration_while_fitting(evidence, model, seed=seed)
-        other = _with_other_phase(model)
-        values = yield [SimulationRequest(half, m.space, m.place[None], seed) for m in (model, other)]
+        ways = [model, *ways_otherwise(model)]
+        values = yield [SimulationRequest(half, m.space, m.place[None], seed) for m in ways]
         losses = [float(half.scale.loss(value)[0]) for value in values]
-        if losses[1] < losses[0] and (yield from _as_good_work(evidence, other, losses[0], seed=seed)):
+        other = ways[int(np.argmin(losses))]
+        if other is not model and (yield from _as_good_work(evidence, other, losses[0], seed=seed)):
             model = other
         model = yield from model.search_work(
             half,

@@ -53,3 +53,6 @@ def test_pairs_and_their_truth_are_the_same_bytes(tmp_path):
     (tmp_path / "a" / "sequence_00001_right.h5").unlink()
     (tmp_path / "a" / "sequence_00000_left_truth.npz").write_bytes(b"rubbish")
     assert make(tmp_path / "a", "--resume", "--jobs", "1") == whole
+    # one that lacks nothing, killed when all was written, has nothing to do
+    for jobs in ("1", "2"):
+        assert make(tmp_path / "a", "--resume", "--jobs", jobs) == whole

@@ -87,8 +87,14 @@ TWINS = {
     "underdamped": (SecondOrder(cutoff=50.0, damping=0.2),),
     "critical": (SecondOrder(cutoff=50.0, damping=1.0),),
     "overdamped": (SecondOrder(cutoff=200.0, damping=6.0),),
+    "damping by light": (
+        Bandwidth(cutoff=300.0),
+        SecondOrder(cutoff=120.0, damping=0.3, dark=0.01, fixed=0.8, spread=0.2, poles="apart"),
+        VoltageNoise(sigma=0.2, cutoff=30.0, poles="apart"),
+    ),
     "noise": (VoltageNoise(sigma=0.2, cutoff=30.0),),
     "noise of two poles": (VoltageNoise(sigma=0.2, cutoff=30.0, poles="apart"),),
+    "noise of a loop": (VoltageNoise(sigma=0.2, cutoff=20.0, gain=15.0, poles="apart"),),
     "uneven": (Bandwidth(cutoff=60.0, spread=0.4), SecondOrder(cutoff=90.0, spread=0.3)),
     "follower": (Bandwidth(cutoff=200.0, dark=0.02, signal="large"),),
     "noisy follower": (

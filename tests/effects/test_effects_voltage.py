@@ -19,7 +19,7 @@ from dase.effects.refractory import Refractory
 from dase.effects.second_order import SecondOrder
 from dase.effects.threshold import Threshold
 from dase.effects.voltage_noise import VoltageNoise
-from perf.experiments.noise.rice import CUTOFFS, rice_rate, simulated_rate
+from perf.experiments.noise.rice import CUTOFFS, LEVELS, apart_rate, fine_rates, rice_rate, simulated_rate
 
 
 @pytest.mark.parametrize("damping", [0.2, 0.5, 1.0, 3.0])
@@ -84,7 +84,7 @@ def answers(x: wp.array[float], damping: wp.array[float], out: wp.array2d[float]
 
 def test_closed_forms_keep_their_digits(device):
     x, damping = np.meshgrid(
-        np.geomspace(1e-4, 50, 60), [0.05, 0.4, 0.999, 1.0, 1.0001, 1.05, 1.5, 3.0, 20.0]
+        np.geomspace(1e-4, 50, 60), [0.05, 0.4, 0.999, 1.0, 1.0001, 1.05, 1.5, 3.0, 20.0, 200.0, 2000.0]
     )
     x, damping = x.ravel().astype(np.float32), damping.ravel().astype(np.float32)
     out = wp.empty((len(x), 4), dtype=float, device=device)
@@ -97,6 +97,28 @@ def test_closed_forms_keep_their_digits(device):
         # float32 rounds shares of a step of 1 after a division by x
         slack = 3e-6 + 3e-7 * (2 * zeta / at if zeta < 1.5 and 2 * zeta * at > 0.09 else 1)
         np.testing.assert_allclose(got, want, atol=slack)
+
+
+@wp.kernel(enable_backward=False)
+def variances(x: wp.array[float], damping: wp.array[float], out: wp.array2d[float]):
+    i = wp.tid()
+    h, dh = second_order.impulse_response(x[i], damping[i])
+    var, mixed, speed = voltage_noise.fresh_variance_of_poles(x[i], damping[i], h, dh)
+    out[i, 0] = var
+    out[i, 1] = mixed
+    out[i, 2] = speed
+
+
+def test_variances_of_noise_keep_their_digits(device):
+    x, damping = np.meshgrid(np.geomspace(1e-3, 50, 50), [0.05, 0.4, 1.0, 1.2, 3.0, 20.0, 50.0])
+    x, damping = x.ravel().astype(np.float32), damping.ravel().astype(np.float32)
+    out = wp.empty((len(x), 3), dtype=float, device=device)
+    inputs = [wp.array(a, dtype=float, device=device) for a in (x, damping)]
+    wp.launch(variances, len(x), inputs=[*inputs, out], device=device)
+    for got, at, zeta in zip(out.numpy().astype(float), x.astype(float), damping.astype(float), strict=True):
+        flow = expm(at * np.array([[0, 1], [-1, -2 * zeta]]))
+        fresh = np.eye(2) - flow @ flow.T
+        np.testing.assert_allclose(got, [fresh[0, 0], fresh[0, 1], fresh[1, 1]], rtol=2e-3, atol=1e-9)
 
 
 @pytest.mark.parametrize("damping", [0.05, 1.0, 20.0])
@@ -292,44 +314,24 @@ def test_a_pixel_held_in_reset_forgets_its_phase(device):
     assert likeness_of_halves(noisy.with_effect(Refractory(period=5e-3)), device) < 0.3
 
 
-def fine_rate(ratio: float, level: float, cutoff: float, rng: np.random.Generator) -> float:
-    """Return events per second and pixel of a node's noise behind a fixed pole, sampled 400 times a period.
-
-    Args:
-        ratio: Pole of the node in units of the fixed one.
-        level: Both thresholds, in standard deviations of the voltage.
-        cutoff: Of the fixed pole [Hz].
-        rng: Random numbers.
-    """
-    fixed, seconds, pixels = 2 * np.pi * cutoff, 4.0, 800
-    share, step = 1 / (1 + ratio), 1 / (400 * cutoff)
-    drift = np.array([[-ratio * fixed, 0.0], [fixed, -fixed]])
-    kept = expm(drift * step)
-    stationary = np.array([[1.0, share], [share, share]])
-    root = np.linalg.cholesky(stationary - kept @ stationary @ kept.T)
-    state = np.linalg.cholesky(stationary) @ rng.standard_normal((2, pixels))
-    theta, events, steps = level * np.sqrt(share), 0.0, round(seconds / step)
-    memory = state[1] + theta * rng.uniform(-1, 1, pixels)
-    for n in range(steps):
-        state = kept @ state + root @ rng.standard_normal((2, pixels))
-        moved = np.trunc((state[1] - memory) / theta)
-        memory += moved * theta
-        events += np.abs(moved).sum() * (n >= steps // 2)
-    return events / (pixels * seconds / 2)
-
-
-@pytest.mark.parametrize("level", [2.0, 3.0])
-@pytest.mark.parametrize("ratio", [1.0, 10.0])
-def test_the_photoreceptors_noise_sends_as_often_as_finely_sampled_noise(device, ratio, level, rng):
+@pytest.mark.parametrize(
+    ("ratio", "gain"), [(0.1, 0.0), (1.0, 0.0), (10.0, 0.0), (30.0, 0.0), (0.02, 50.0), (0.2, 50.0)]
+)
+def test_the_photoreceptors_noise_sends_as_often_as_finely_sampled_noise(device, ratio, gain, rng):
     """In light of ten times the knee 0.57 of the events were left at eight samples per period."""
-    cutoff, sigma, dark, seconds = 10.0, 0.1, 0.003, 12.0
-    light = 0.9
-    noise = VoltageNoise(sigma=sigma, cutoff=cutoff, knee=(light + dark) / ratio, dark=dark, poles="apart")
-    theta = level * sigma / np.sqrt(1 + ratio)
-    sensor = every(Threshold(on=theta, off=theta), noise)
-    scene = dase.VideoScene(np.full((481, 40, 60), light, np.float32), np.linspace(0, seconds, 481))
-    got = dase.count(scene, sensor, [seconds / 2, seconds], device=device).sum() / (2400 * seconds / 2)
-    assert got == pytest.approx(fine_rate(ratio, level, cutoff, rng), rel=0.09)
+    span = dict(pixels=2500, periods=12.0, before=8.0)
+    wanted, errors = fine_rates(ratio, rng, gain=gain, **span)
+    for level, want, error in zip(LEVELS, wanted, errors, strict=True):
+        got, spread = apart_rate(ratio, level, gain=gain, device=device, **span)
+        assert got == pytest.approx(want, rel=0.03, abs=3 * np.hypot(error, spread))
+
+
+def test_the_fixed_pole_sets_the_pace_of_the_photoreceptors_noise(device):
+    rates = [
+        apart_rate(10.0, 2.0, cutoff=cutoff, pixels=1500, periods=12.0, before=4.0, device=device)[0]
+        for cutoff in CUTOFFS
+    ]
+    np.testing.assert_allclose(rates, rates[0], rtol=0.01)
 
 
 @pytest.mark.parametrize("dark", [0.02, 0.5])

@@ -86,6 +86,27 @@ def test_a_phase_that_looks_no_better_at_the_same_place_is_found(device, monkeyp
     assert refit_model(found, start, seed=0, rounds=1).sensor["threshold"].phase == 0
 
 
+@pytest.mark.parametrize(("rule", "other"), [("drop", "delay"), ("delay", "drop"), ("reset", "delay")])
+def test_another_rule_of_a_dead_time_is_found(device, rule, other):
+    scene, dead = moving_bars(), EFFECTS["refractory"](period=6e-3, mode=rule)
+    events = dase.simulate(scene, Sensor().with_effect(dead), seed=4, device=device)
+    found = split_measurement(events, scene, pixels=300, seed=1, device=device)
+    start = model_of(Sensor().with_effect(replace(dead, mode=other)))
+    assert refit_model(found, start, seed=0, rounds=1).sensor["refractory"].mode == rule
+
+
+def test_noise_passes_the_dead_time_of_a_fit_where_it_does(device):
+    scene, noise = moving_bars(), EFFECTS["shot"](rate=30.0)
+    dead = EFFECTS["refractory"](period=1e-2, mode="delay", noise="passes")
+    events = dase.simulate(scene, Sensor().with_effect(noise).with_effect(dead), seed=4, device=device)
+    found = split_measurement(events, scene, pixels=300, seed=1, device=device)
+    start = model_of(Sensor().with_effect(noise).with_effect(replace(dead, noise="held")))
+    assert refit_model(found, start, seed=0, rounds=1).sensor["refractory"].noise == "passes"
+    # without noise it is no question
+    modes = {(one.mode, one.noise) for one in dead.otherwise(["bandwidth"])}
+    assert modes == {("reset", "passes"), ("drop", "passes")}
+
+
 @pytest.fixture(scope="module")
 def evidence(lit, device):
     scene = moving_bars()

@@ -25,7 +25,7 @@ from dase.effects.vignetting import Vignetting
 from dase.effects.voltage_noise import VoltageNoise
 
 
-def full(mode: str = "reset") -> dase.Sensor:
+def full(mode: str = "reset", noise: str = "held") -> dase.Sensor:
     """Return a sensor on which every effect is strong."""
     return reference.only(
         Threshold(on=0.17, off=0.23),
@@ -33,7 +33,7 @@ def full(mode: str = "reset") -> dase.Sensor:
         Bandwidth(cutoff=400.0),
         Leak(rate=8.0, spread=0.3),
         Shot(rate=60.0, balance=0.6, spread=0.5),
-        Refractory(period=3e-3, mode=mode),
+        Refractory(period=3e-3, mode=mode, noise=noise),
     )
 
 

@@ -52,9 +52,10 @@ def test_counts_are_the_recursion_of_the_paper(device, rng, kind):
             np.testing.assert_array_equal(got[:, :, i], reference_counts.exact(whole, 48, 80))
 
 
+@pytest.mark.parametrize("noise", ["held", "passes"])
 @pytest.mark.parametrize("mode", ["reset", "drop", "delay"])
-def test_emission_gives_the_counts_of_counting(device, rng, mode):
-    scene, sensor = flicker(rng), full(mode)
+def test_emission_gives_the_counts_of_counting(device, rng, mode, noise):
+    scene, sensor = flicker(rng), full(mode, noise)
     parts = list(dase.stream(scene, sensor, seed=3, device=device, chunk=1))[1:]
     emitted = np.stack([part.counts([0.0, 9.0])[0].reshape(2, -1) for part in parts])
     counted = dase.count(scene, sensor, scene.sample_times(), seed=3, device=device)[0]
@@ -90,9 +91,10 @@ def test_times_are_linear_interpolations(device, rng, kind, error):
         assert np.all(got[:, 0] >= scene.times[want[:, 0].astype(int) - 1] - 1e-9)
 
 
+@pytest.mark.parametrize("noise", ["held", "passes"])
 @pytest.mark.parametrize("mode", ["reset", "drop", "delay"])
-def test_all_effects_match_the_twin(device, rng, mode):
-    scene, sensor = flicker(rng), full(mode)
+def test_all_effects_match_the_twin(device, rng, mode, noise):
+    scene, sensor = flicker(rng), full(mode, noise)
     times = scene.sample_times()
     got = by_pixel(dase.simulate(scene, sensor, seed=11, device=device))
     want = reference.events(sensor, times, scene.frames(times).reshape(len(times), -1), seed=11)

@@ -7,7 +7,7 @@ from reference import pixel as reference
 from reference.pixel import Stream, setting
 from scipy.integrate import solve_ivp
 from scipy.interpolate import CubicHermiteSpline
-from scipy.linalg import cholesky, expm
+from scipy.linalg import cholesky, expm, solve_continuous_lyapunov
 
 import dase
 
@@ -66,16 +66,19 @@ def linlog(voltage: np.ndarray, knee: float, slope: float, eps: float) -> np.nda
     return np.where(np.exp(voltage) - eps < knee, line, voltage)
 
 
-def second_order(times: np.ndarray, level: np.ndarray, omega: np.ndarray, damping: float) -> np.ndarray:
+def second_order(
+    times: np.ndarray, level: np.ndarray, omega: np.ndarray, damping: float | np.ndarray
+) -> np.ndarray:
     """Return level behind ω² / (s² + 2 damping ω s + ω²), settled at the first sample.
 
     Args:
         times: Samples [s], shape (K,).
         level: Straight between samples, shape (K, N).
         omega: Natural frequency during the step that ends at each sample [rad/s], shape (K, N).
-        damping: Of the filter.
+        damping: Of the filter during the step that ends at each sample, shape (K, N) or the same for all.
     """
     out = np.array(level, np.float64)
+    damping = np.broadcast_to(damping, level.shape)
     for i in range(level.shape[1]):
         state = np.array([level[0, i], 0.0, level[0, i], 0.0])  # output, its slope, input, its slope
         for k in range(1, len(times)):
@@ -83,7 +86,7 @@ def second_order(times: np.ndarray, level: np.ndarray, omega: np.ndarray, dampin
             state[2:] = level[k - 1, i], (level[k, i] - level[k - 1, i]) / dt
             flow = np.zeros((4, 4))
             flow[0, 1] = flow[2, 3] = 1
-            flow[1] = [-w * w, -2 * damping * w, w * w, 0]
+            flow[1] = [-w * w, -2 * damping[k, i] * w, w * w, 0]
             state = expm(flow * dt) @ state
             out[k, i] = state[0]
     return out
@@ -160,34 +163,35 @@ def voltage_noise(
 def photoreceptor_noise(
     times: np.ndarray, intensity: np.ndarray, effect: dase.Effect, normals: np.ndarray
 ) -> np.ndarray:
-    """Return the noise of a node whose pole follows the light, behind a fixed pole; as `voltage_noise`.
+    """Return the noise of a node whose pole follows the light, in a loop with a fixed pole.
 
-    Its covariance after a step is from Van Loan's matrix exponential, in the order node, voltage.
+    Turns are those of `voltage_noise`. The covariance after a step is from Van Loan's matrix exponential, in
+    the order voltage, slope.
     """
-    out, fixed = np.zeros_like(intensity), 2 * np.pi * effect.cutoff
+    out, fixed, more = np.zeros_like(intensity), 2 * np.pi * effect.cutoff, 1 + effect.gain
     for i in range(intensity.shape[1]):
         for k in range(len(times)):
             moving = fixed * (intensity[k, i] + effect.dark) / effect.knee
-            drift = np.array([[-moving, 0.0], [fixed, -fixed]])
-            share = fixed / (fixed + moving)
+            # of the voltage, and of its slope over the fixed pole
+            drift = np.array([[0.0, fixed], [-more * moving, -(moving + fixed)]])
+            white = np.diag([0.0, 2 * more * moving])
             if k == 0:
-                spread = np.array([[1.0, share], [share, share]])
+                spread = solve_continuous_lyapunov(drift, -white)
                 state = effect.sigma * cholesky(spread, lower=True) @ normals[:, k, i]
-                out[k, i] = state[1]
+                out[k, i] = state[0]
                 continue
             dt, before = times[k] - times[k - 1], state
-            white = np.diag([2 * moving, 0.0])
             block = expm(np.block([[-drift, white], [np.zeros((2, 2)), drift.T]]) * dt)
             step = block[2:, 2:].T
             spread = step @ block[:2, 2:]
             state = step @ state + effect.sigma * cholesky(spread, lower=True) @ normals[:, k, i]
-            out[k, i] = state[1]
-            slopes = [fixed * dt * (s[0] - s[1]) for s in (before, state)]
+            out[k, i] = state[0]
+            slopes = [fixed * dt * s[1] for s in (before, state)]
             if slopes[0] * slopes[1] < 0:
-                near = min(1.0, 2.0 / (dt * max(moving, fixed)))
-                way = CubicHermiteSpline([0.0, 1.0], [before[1], state[1]], np.multiply(slopes, near))
+                near = min(1.0, 2.0 / (dt * max(moving, fixed, np.sqrt(more * moving * fixed))))
+                way = CubicHermiteSpline([0.0, 1.0], [before[0], state[0]], np.multiply(slopes, near))
                 (turn,) = (t for t in way.derivative().roots() if 0 <= t <= 1)
-                pace = np.sqrt(moving * fixed**2 / 2 * (near * dt) ** 3)
+                pace = np.sqrt(more * moving * fixed**2 / 2 * (near * dt) ** 3)
                 out[k, i] = way(turn) + np.sign(slopes[0]) * 0.05 * pace * effect.sigma
     return out
 
@@ -225,9 +229,13 @@ def voltage(sensor: dase.Sensor, times: np.ndarray, intensity: np.ndarray, seed:
         level = (follower if slow.signal == "large" else reference.lowpass)(times, level, cutoff)
     if np.isfinite(setting(sensor, "second_order", "cutoff", np.inf)):
         slow = sensor["second_order"]
-        omega = 2 * np.pi * slow.cutoff * (slow.dark + (1 - slow.dark) * bright)
-        omega = omega * own_speed(slow, intensity.shape[1], seed)
-        level = second_order(times, level, omega, slow.damping)
+        current = slow.dark + (1 - slow.dark) * bright
+        omega = 2 * np.pi * slow.cutoff * own_speed(slow, intensity.shape[1], seed)
+        if slow.poles == "apart":
+            damping = slow.damping * (slow.fixed / np.sqrt(current) + (1 - slow.fixed) * np.sqrt(current))
+            level = second_order(times, level, omega * np.sqrt(current), damping)
+        else:
+            level = second_order(times, level, omega * current, slow.damping)
     if setting(sensor, "voltage_noise", "sigma", 0.0) > 0:
         streams = ("voltage_noise_respond_uniform", "voltage_noise_respond_uniform_2")
         pixels = range(intensity.shape[1])

@@ -84,6 +84,7 @@ class Detector:
         period: Dead time [s].
         delays: Whether a dead pixel looks again when the dead time ends; else its memory goes on.
         resets: Whether it memorises the signal of that moment.
+        spares_noise: Whether noise comes in the dead time, too, and begins none.
         after_off: Dead time after an OFF event, relative to that after an ON event.
         waiting: Hazard before noise event n.
         bright: Uniform number that decides the polarity of noise event n >= 1.
@@ -97,6 +98,7 @@ class Detector:
     period: float = 0.0
     delays: bool = False
     resets: bool = False
+    spares_noise: bool = False
     after_off: float = 1.0
     waiting: Callable[[int], float] = lambda n: np.inf
     bright: Callable[[int], float] = lambda n: 0.0
@@ -152,7 +154,11 @@ class Detector:
                     row = (k, now, float(self.bright(drawn) * total < rates[k, 1]), np.inf)
                     memory = level[k] + slope * (now - end) if alive else memory
                     noise, drawn = now + self.waiting(drawn) / total, drawn + 1
-                if alive:
+                if self.spares_noise and now != crossing:
+                    # what is held in reset memorises nothing, whatever is sent on top
+                    memory = memory if held else level[k] + slope * (now - end)
+                    out.append(row)
+                elif alive:
                     out.append(row)
                     alive_from = now + self.period * (1.0 if row[2] else self.after_off)
                     held = self.resets and alive_from > now
@@ -203,6 +209,7 @@ def detector(sensor: dase.Sensor, index: int, seed: int) -> Detector:
         after_off=setting(sensor, "refractory", "after_off", 1.0),
         delays=setting(sensor, "refractory", "mode", "drop") == "delay",
         resets=setting(sensor, "refractory", "mode", "drop") == "reset",
+        spares_noise=setting(sensor, "refractory", "noise", "held") == "passes",
         waiting=noise.waiting,
         bright=polarity.uniform,
     )

@@ -4,7 +4,8 @@
     python -m perf.experiments.recordings.run $DASE_DATA/recordings --only dvs128_flip
 
 Presets of the commit `BEFORE` and of now run without any fit, over what the camera's own frames tell of the
-scene, or over constant light where nothing moved. Where no scene is known, only the measurement stands.
+scene, or over constant light where nothing moved. Where no scene is known, only the measurement stands. Where
+a recording has a lamp or frames that couple, which no preset has, they stand in one more line.
 """
 
 from __future__ import annotations
@@ -22,11 +23,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 import dase
-from dase.effects import EFFECTS
+from dase.effects.exposure import Exposure
+from dase.effects.flicker import Flicker
 from dase.effects.refractory import Refractory
+from dase.effects.threshold import Threshold
 from dase.errors import InputError
 from dase.events import Events
-from dase.fitting.burst_strength import burst_times_of, fit_bursts
+from dase.fitting.burst_strength import burst_times_of
 from dase.fitting.measurement import Measurement, as_measurement, static_scene
 from dase.scenes.between_frames import CameraScene
 from dase.signatures.find import find_signatures
@@ -187,16 +190,48 @@ def describe(events: Events, scene: Any) -> dict[str, Any]:
     }
 
 
-def with_frames(sensor: Sensor, measured: Measurement, seed: int) -> Sensor:
-    """Return the sensor with the frames whose bursts are seen, fitted to these."""
+def with_lamp_and_frames(sensor: Sensor, measured: Measurement, seed: int) -> Sensor:
+    """Return the sensor with the lamp and the frames whose signatures a recording has, if it has any.
+
+    When frames are exposed and how often the lamp flickers the events tell. The strength of both, and the
+    threshold, which hides or shows them, are set so that the simulation has as many events, as many of them
+    in bursts, and as large a swing as the recording. All else is left to compare.
+    """
+    wanted = describe(measured.events, measured.scene)
     scene = measured.scene
     begins = scene.begin if isinstance(scene, CameraScene) else None
-    coupling = signature(find_signatures(measured.events, begins=begins).entries, "frame coupling")
+    entries = find_signatures(measured.events, begins=begins).entries
+    coupling, lamp = signature(entries, "frame coupling"), signature(entries, "flicker")
     times = burst_times_of(measured, coupling) if coupling else None
-    if coupling is None or times is None:
+    if times is None and lamp is None:
         return sensor
-    fitted = fit_bursts(measured, sensor, EFFECTS["exposure"], times, pixels=400, seed=seed)
-    return sensor.with_effect(fitted.effect) if fitted else sensor
+    threshold, amplitude, depth, found = 0.15, 0.08, 0.03, sensor
+    for _ in range(ROUNDS):
+        found = sensor.with_effect(Threshold(on=threshold, off=threshold))
+        if times is not None:
+            found = found.with_effect(
+                Exposure(
+                    amplitude=amplitude, period=times.interval, exposure=times.exposure, begin=times.begin
+                )
+            )
+        if lamp is not None:
+            found = found.with_effect(Flicker(frequency=lamp.details["frequency"], depth=depth))
+        seen = describe(dase.simulate(scene, found, seed=seed), scene)
+        swing = seen["lamp"][1] if seen["lamp"] else LEAST_SWING
+        got = f"{seen['rate']:.4g} Hz, {seen['bursts']:.3g} in bursts, swing {swing:.3g}"
+        print(f"    {threshold:.4g}, {amplitude:.4g}, {depth:.4g}: {got}", flush=True)
+        threshold *= float(np.clip(seen["rate"] / wanted["rate"], 0.5, 2)) ** 0.5
+        if wanted["bursts"]:
+            amplitude *= float(np.clip(wanted["bursts"] / max(seen["bursts"], 0.01), 0.3, 3)) ** 0.4
+        if lamp is not None:
+            depth *= float(np.clip(lamp.size / swing, 0.3, 3)) ** 0.7
+    return found
+
+
+ROUNDS = 14
+"""Simulations by which strengths of a lamp and of frames are set."""
+LEAST_SWING = 0.02
+"""What a lamp that is not found is taken to swing by."""
 
 
 def look_at(source: Source, folder: Path, seed: int = 0) -> dict[str, Any]:
@@ -215,10 +250,10 @@ def look_at(source: Source, folder: Path, seed: int = 0) -> dict[str, Any]:
     seconds = float(times[-1] - times[0])
     out = {"measured": describe(inside, scene) | noise_at_rest([inside], frames, seconds)}
     now = load_sensor(source.preset)
-    seen = with_frames(now, measured, seed)
+    seen = with_lamp_and_frames(now, measured, seed)
     sensors = {"before": preset_before(source.preset), "after": now}
     if seen != now:
-        sensors["after, frames fitted"] = seen
+        sensors["after, with its lamp and frames"] = seen
     for name, sensor in sensors.items():
         made = dase.simulate(scene, sensor, seed=seed)
         still = [made] if frames is None else simulate_rest(sensor, frames, seconds, seed)

@@ -45,6 +45,8 @@ SIGMAS = (0.05, 0.1, 0.2)
 CUTOFFS = (10.0, 50.0, 200.0, 1000.0, 3000.0)
 KNEES = (0.1,)
 """One, as pixels see light of 0.1 to 10 times that."""
+NODE_KNEES = (0.1, 1.0)
+"""Where the node's pole is ten times the fixed one in the brightest light, and as fast."""
 DEPTHS = (0.15, 0.3, 0.6, 0.9)
 LAMPS = (
     Flicker(shape="sine"),
@@ -213,6 +215,13 @@ def noise_rows(device: str) -> Iterator[Row]:
         yield pixel_rates(VoltageNoise(sigma=sigma, cutoff=cutoff, knee=knee), step, seconds, device)
 
 
+def two_pole_noise_rows(device: str) -> Iterator[Row]:
+    """Compare noise whose one pole follows the light, likewise."""
+    for cutoff, knee, step in itertools.product(CUTOFFS[1::2] + CUTOFFS[-1:], NODE_KNEES, STEPS):
+        noise = VoltageNoise(sigma=SIGMAS[-1], cutoff=cutoff, knee=knee, poles="apart")
+        yield pixel_rates(noise, step, float(np.clip(60 / cutoff, 0.06, 6.0)), device)
+
+
 def flicker_rows(device: str) -> Iterator[Row]:
     """Compare lamps, by themselves and behind a photoreceptor whose cutoff is their frequency."""
     for waveform, depth, frequency, step, cutoffs in itertools.product(
@@ -230,7 +239,12 @@ def readout_rows(device: str) -> Iterator[Row]:
         yield readout_rate(scene, mode, fullness, shares, device)
 
 
-TABLES = {"voltage_noise": noise_rows, "flicker": flicker_rows, "readout": readout_rows}
+TABLES = {
+    "voltage_noise": noise_rows,
+    "two_pole_noise": two_pole_noise_rows,
+    "flicker": flicker_rows,
+    "readout": readout_rows,
+}
 
 
 def main() -> None:

@@ -1,0 +1,166 @@
+"""Dead pixels, told one by one: they send nothing where their light changes and their neighbours send.
+
+A fit looks at some thousand pixels, of which a few are dead; their share then is mostly chance, and makes all
+else look like chance beside it. What makes pixels differ a little looks like a few dead ones, too. All pixels
+together tell at once: one that is silent while all around it the same light makes events is dead.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import stats
+
+from dase.effects.dead import Dead
+from dase.fitting.data_split import common_grid, times_of_grid
+from dase.fitting.measurement import Measurement
+from dase.fitting.time_window import is_constant, within_span
+from dase.results import DetectionLimit, Diagnosis, Estimate, Finding, Grade
+
+NAME = Dead.name
+
+
+@dataclass(frozen=True)
+class SilentPixelSettings:
+    """Of which pixels events are expected, and how many silent ones there must be of them.
+
+    Chosen on scenes of keys `dev1` and `dev2` of the blind benchmark.
+    """
+
+    times: int = 64
+    """Moments at which the light of all pixels is looked at."""
+
+    sent: float = 8.0
+    """Events that all of the eight neighbours must have but one, which may be dead, too: of pixels that are
+    alive, chance silences one in 3,000 where 8 are expected, and more at the edge of what moves."""
+
+    change: float = 0.6
+    """Range of the log intensity that a pixel must see: most thresholds are far below it."""
+
+    alike: float = 0.7
+    """The range, in units of the neighbours' median; and the mean light, either way: an edge that rests lets
+    one pixel see less than those beside it."""
+
+    least: int = 3
+    """Silent pixels that there must be."""
+
+    enough: int = 1000
+    """Pixels of which events are expected, from which on the lack of silent ones says that none are dead."""
+
+
+SILENT_PIXELS = SilentPixelSettings()
+
+
+@dataclass(frozen=True, eq=False)
+class SilentPixels:
+    """What all pixels say of dead ones.
+
+    Args:
+        pixels: Those that are silent where events are expected, row-major, shape (K,).
+        asked: Pixels of which events are expected.
+    """
+
+    pixels: NDArray[np.int64]
+    asked: int
+
+    @property
+    def found(self) -> bool:
+        """Whether some pixels are dead."""
+        return len(self.pixels) >= SILENT_PIXELS.least
+
+    @property
+    def decides(self) -> bool:
+        """Whether it is known if pixels are dead."""
+        return self.found or self.asked >= SILENT_PIXELS.enough
+
+    @property
+    def share(self) -> Estimate:
+        """Share of pixels that are dead, with its 90 % interval by Clopper and Pearson."""
+        silent, alive = len(self.pixels), self.asked - len(self.pixels)
+        low = stats.beta.ppf(0.05, silent, alive + 1) if silent else 0.0
+        high = stats.beta.ppf(0.95, silent + 1, alive) if alive else 1.0
+        return Estimate(silent / max(self.asked, 1), float(low), float(high))
+
+    @property
+    def sentence(self) -> str:
+        """What is seen."""
+        return (
+            f"{len(self.pixels)} of {self.asked} pixels send nothing where their light changes and their "
+            f"neighbours send"
+        )
+
+    def limit(self) -> DetectionLimit:
+        """Return the share of dead pixels that would have been seen."""
+        share = SILENT_PIXELS.least / self.asked
+        sentence = f"dead pixels: {self.sentence}; a share above {share:.2g} would have been seen"
+        return DetectionLimit(NAME, f"{NAME}.share", share, "1", True, sentence)
+
+
+def find_silent_pixels(
+    measurement: Measurement, *, log_eps: float, settings: SilentPixelSettings = SILENT_PIXELS
+) -> SilentPixels:
+    """Return the pixels that are silent where events are expected.
+
+    Args:
+        measurement: Events of the whole sensor, and what it saw.
+        log_eps: Added to intensities before the logarithm.
+        settings: Where events are expected.
+
+    Raises:
+        InputError: Events and scene have different sizes, or no time in common.
+    """
+    events, scene = measurement.events, measurement.scene
+    whole = common_grid(events, scene)
+    if min(scene.width, scene.height) < 3 or is_constant(scene):
+        return SilentPixels(np.zeros(0, np.int64), 0)
+    times = times_of_grid(scene, within_span(whole, measurement.span))
+    at = np.unique(np.linspace(0, len(times) - 1, settings.times).round().astype(np.int64))
+    light = np.asarray(scene.frames(times[at]), np.float32)
+    level = np.log(light + log_eps)
+    change, mean = np.ptp(level, axis=0), light.mean(0) + log_eps
+    events = events.select((events.t >= times[0]) & (events.t <= times[-1]))
+    counts = np.bincount(
+        events.y.astype(np.int64) * events.width + events.x, minlength=events.width * events.height
+    ).reshape(events.height, events.width)
+    inside = (slice(1, -1), slice(1, -1))
+    around = _neighbours(counts)
+    brightness = mean[inside] / np.median(_neighbours(mean), 0)
+    asked = (
+        ((around >= settings.sent).sum(0) >= len(around) - 1)
+        & (change[inside] >= np.maximum(settings.change, settings.alike * np.median(_neighbours(change), 0)))
+        & (brightness >= settings.alike) & (brightness <= 1 / settings.alike)
+    )  # fmt: skip
+    rows, columns = np.nonzero(asked & (counts[inside] == 0))
+    return SilentPixels((rows + 1) * np.int64(events.width) + columns + 1, int(np.count_nonzero(asked)))
+
+
+def _neighbours(values: NDArray[Any]) -> NDArray[Any]:
+    """Return the eight neighbours of the pixels that have them all, shape (8, H - 2, W - 2)."""
+    height, width = values.shape
+    around = [
+        values[1 + dy : height - 1 + dy, 1 + dx : width - 1 + dx]
+        for dy in (-1, 0, 1) for dx in (-1, 0, 1) if dy or dx
+    ]  # fmt: skip
+    return np.stack(around)
+
+
+def with_dead_pixels(found: Diagnosis, silent: SilentPixels) -> Diagnosis:
+    """Return a diagnosis that knew nothing of dead pixels with what all pixels say of them."""
+    limits = tuple(one for one in found.not_seen if one.effect != NAME)
+    if not silent.found:
+        return replace(found, not_seen=(*limits, silent.limit()))
+    parameters: Mapping[str, Estimate] = {f"{NAME}.share": silent.share}
+    finding = Finding(NAME, Grade.CERTAIN, parameters=dict(parameters), seen=silent.sentence)
+    return replace(
+        found,
+        sensor=found.sensor.with_effect(Dead(share=silent.share.value)),
+        selected=(*found.selected, NAME),
+        errors=(*found.errors, found.errors[-1]),
+        parameters={**found.parameters, **parameters},
+        findings=(*found.findings, finding),
+        not_seen=limits,
+    )

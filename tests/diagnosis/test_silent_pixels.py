@@ -1,0 +1,124 @@
+"""Dead pixels are told one by one, and what comes late in a recording is fitted there."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+import dase
+from dase.diagnosis.diagnose import diagnose
+from dase.diagnosis.silent_pixels import find_silent_pixels
+from dase.effects import EFFECTS
+from dase.fitting.measurement import Measurement
+from dase.results import Grade
+from dase.simulation.sensor import Sensor
+
+WIDTH, HEIGHT = 96, 72
+
+
+def moving(
+    seconds: float = 0.5, *, until: float = np.inf, speed: float = 1.0, seed: int = 1
+) -> dase.VideoScene:
+    """Return smooth random light that moves to and fro until a time, and rests from then on."""
+    rng = np.random.default_rng(seed)
+    waves = rng.uniform(-0.3, 0.3, (12, 2)), rng.uniform(0, 6.28, 12), rng.uniform(0.1, 0.4, 12)
+    y, x = np.mgrid[:HEIGHT, :WIDTH].astype(float)
+    times = np.arange(round(1000 * seconds) + 1) * 1e-3
+    frames = np.empty((len(times), HEIGHT, WIDTH), np.float32)
+    for k, time in enumerate(speed * np.minimum(times, until)):
+        at = x - 12 * np.sin(2 * np.pi * 2.0 * time), y - 9 * np.sin(2 * np.pi * 1.3 * time)
+        level = sum(
+            a * np.sin(w[0] * at[0] + w[1] * at[1] + p) for w, p, a in zip(*waves, strict=True)
+        )  # fmt: skip
+        frames[k] = np.exp(level - 1.5)
+    return dase.VideoScene(frames, times)
+
+
+@pytest.fixture(scope="module")
+def scene() -> dase.VideoScene:
+    return moving()
+
+
+def counts_of(events: dase.Events) -> np.ndarray:
+    """Return the events of each pixel, row-major."""
+    return np.bincount(events.y.astype(np.int64) * WIDTH + events.x, minlength=WIDTH * HEIGHT)
+
+
+def test_silent_pixels_are_the_dead_ones(scene):
+    sensor = Sensor().with_effect(EFFECTS["mismatch"](spread=0.2))
+    alive = counts_of(dase.simulate(scene, sensor, seed=5))
+    events = dase.simulate(scene, sensor.with_effect(EFFECTS["dead"](share=0.02)), seed=5)
+    dead = np.flatnonzero((counts_of(events) == 0) & (alive > 0))
+    found = find_silent_pixels(Measurement(events, scene), log_eps=1e-3)
+    assert found.found
+    assert np.isin(found.pixels, dead).all()
+    # of those that have all neighbours, most lie where all is busy
+    assert len(found.pixels) > 0.5 * len(dead) > 20
+    assert found.share.low < 0.02 < found.share.high
+    assert str(len(found.pixels)) in found.sentence
+
+
+@pytest.mark.parametrize("effect", [
+    EFFECTS["mismatch"](spread=0.3), EFFECTS["jitter"](spread=0.4), EFFECTS["dark"](current=0.05),
+    EFFECTS["bandwidth"](cutoff=20.0), EFFECTS["refractory"](period=0.02), EFFECTS["readout"](rate=2e5),
+    EFFECTS["linlog"](knee=0.15, slope=3.0), EFFECTS["vignetting"](loss=0.8),
+], ids=lambda effect: effect.name)  # fmt: skip
+def test_no_other_effect_silences_single_pixels(scene, effect):
+    events = dase.simulate(scene, Sensor().with_effect(effect), seed=5)
+    found = find_silent_pixels(Measurement(events, scene), log_eps=1e-3)
+    assert not found.found
+    if effect.name != "bandwidth":  # which leaves few events to be expected
+        assert found.decides
+        assert found.limit().strength == pytest.approx(3 / found.asked)
+
+
+def test_a_region_that_is_switched_off_has_no_dead_pixels(scene):
+    events = dase.simulate(scene, Sensor(), seed=5)
+    found = find_silent_pixels(Measurement(events.select(events.x > 40), scene), log_eps=1e-3)
+    assert len(found.pixels) == 0
+
+
+def test_rest_tells_nothing_of_dead_pixels():
+    still = dase.VideoScene(np.full((2, HEIGHT, WIDTH), 0.5, np.float32), [0.0, 2.0])
+    noisy = Sensor().with_effect(EFFECTS["shot"](rate=30.0)).with_effect(EFFECTS["dead"](share=0.02))
+    found = find_silent_pixels(Measurement(dase.simulate(still, noisy), still), log_eps=1e-3)
+    assert not found.decides
+
+
+LIBRARY = {name: EFFECTS[name] for name in ("threshold", "mismatch", "dead")}
+
+
+def test_dead_pixels_are_certain_and_left_out_of_the_search(scene):
+    true = Sensor().with_effect(EFFECTS["mismatch"](spread=0.2)).with_effect(EFFECTS["dead"](share=0.02))
+    found = diagnose(dase.simulate(scene, true, seed=5), scene=scene, effects=LIBRARY, pixels=400, most=2)
+    grades = {one.effect: one.grade for one in found.findings}
+    assert grades["dead"] is Grade.CERTAIN
+    assert grades["mismatch"] is Grade.SUPPORTED
+    share = found.parameters["dead.share"]
+    assert share.low < 0.02 < share.high
+    assert found.sensor["dead"].share == share.value
+    assert any("dead pixels are left out" in note for note in found.notes)
+
+
+def test_without_silent_pixels_nothing_is_taken_for_dead_ones(scene):
+    lacking = {name: EFFECTS[name] for name in ("threshold", "dead")}
+    true = Sensor().with_effect(EFFECTS["mismatch"](spread=0.12))
+    found = diagnose(dase.simulate(scene, true, seed=5), scene=scene, effects=lacking, pixels=400, most=2)
+    assert not any(one.effect == "dead" for one in (*found.findings, *found.stand_ins))
+    (limit,) = (one for one in found.not_seen if one.effect == "dead")
+    assert limit.strength < 2e-3
+
+
+def test_what_comes_late_is_fitted_there():
+    # what the first part shows is little beside what comes when light rests, and a leak is not seen in it
+    scene = moving(1.2, until=0.78, speed=3.0)
+    threshold = EFFECTS["threshold"](on=0.22, off=0.25, phase=0.0)
+    true = Sensor((threshold, EFFECTS["mismatch"](spread=0.15), EFFECTS["leak"](rate=2.5, spread=0.1)))
+    silent = Sensor((threshold, EFFECTS["mismatch"](spread=0.15)))
+    late, early = (dase.simulate(scene, one, seed=3) for one in (true, silent))
+    events = dase.Events.concatenate([early.select(early.t < 0.73), late.select(late.t >= 0.73)])
+    library = {name: EFFECTS[name] for name in ("threshold", "mismatch", "leak")}
+    found = diagnose(events, scene=scene, effects=library, pixels=400, most=2)
+    assert any("all of its time is fitted" in note for note in found.notes)
+    assert "leak" in found.sensor
+    assert found.errors[-1] < 0.5 * found.errors[0]
