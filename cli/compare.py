@@ -13,6 +13,7 @@ from dase.cli.options import (
     device_option,
     effects_option,
     fps_option,
+    importing,
     open_recorded,
     part_options,
     scene_option,
@@ -59,11 +60,12 @@ def compare_command(
 
     1 is the error that two repeats of the recording would have. Nothing is fitted: `dase fit` does that.
     """
-    from dase.cli.diagnose import plates_or_note, print_plain_numbers, progress_bar
-    from dase.diagnosis.compare import compare
-    from dase.io import replacing
-    from dase.simulation.sensor_file import load_sensor
-    from dase.simulation.user_effects import known_effects
+    with importing():
+        from dase.cli.diagnose import plates_or_note, print_plain_numbers, progress_bar
+        from dase.diagnosis.compare import compare
+        from dase.io import replacing
+        from dase.simulation.sensor_file import load_sensor
+        from dase.simulation.user_effects import known_effects
 
     model = load_sensor(sensor, known_effects(effects))
     measured = open_recorded(recording, scene, file, fps, compared, stimulus)

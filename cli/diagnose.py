@@ -20,6 +20,7 @@ from dase.cli.options import (
     device_option,
     effects_option,
     fps_option,
+    importing,
     open_recorded,
     part_options,
     scene_option,
@@ -117,10 +118,11 @@ def diagnose_command(
     announced where the events alone show it (certain), or where next to nothing of the error is left with it
     and its own test holds (supported); else what it cannot be told apart from is said.
     """
-    from dase.diagnosis import sensor_update
-    from dase.diagnosis.diagnose import diagnose
-    from dase.simulation import sensor_edit
-    from dase.simulation.user_effects import known_effects
+    with importing():
+        from dase.diagnosis import sensor_update
+        from dase.diagnosis.diagnose import diagnose
+        from dase.simulation import sensor_edit
+        from dase.simulation.user_effects import known_effects
 
     library = known_effects(effects)
     text = sensor_edit.read_sensor_text(sensor, library)

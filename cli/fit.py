@@ -12,6 +12,7 @@ from dase.cli.options import (
     device_option,
     effects_option,
     fps_option,
+    importing,
     open_recorded,
     part_options,
     scene_option,
@@ -68,11 +69,12 @@ def fit_command(
     Where only one of the starts came to the error of the best, the minimum may be a poor one: the file is
     written, this is said, and the exit code is 1.
     """
-    from dase.cli.diagnose import print_plain_numbers, progress_bar
-    from dase.diagnosis import sensor_update
-    from dase.fitting.fit import fit
-    from dase.simulation import sensor_edit
-    from dase.simulation.user_effects import known_effects
+    with importing():
+        from dase.cli.diagnose import print_plain_numbers, progress_bar
+        from dase.diagnosis import sensor_update
+        from dase.fitting.fit import fit
+        from dase.simulation import sensor_edit
+        from dase.simulation.user_effects import known_effects
 
     text = sensor_edit.read_sensor_text(sensor, known_effects(effects))
     model = text.sensor()

@@ -70,6 +70,8 @@ if hasattr(os, "register_at_fork"):
 
 def _start_warp() -> None:
     """Start Warp without its line on standard error that a machine has no NVIDIA driver."""
+    if wp._src.context.runtime is not None:
+        return  # asked on every launch, by threads that need not wait for each other
     # two threads that hold the file descriptor back at once would restore it in the wrong order
     with _starting:
         if wp._src.context.runtime is None:

@@ -143,7 +143,7 @@ def open_measurement(path: Path, scene: SceneChoice = "frames") -> Measurement:
     """
     notes: list[str] = []
     # not `open_recording`: its survey of all events would be thrown away here
-    return measurement_of(io.read(path, notes=notes), scene, notes=notes, name=str(path))
+    return measurement_of(io.read(path, notes=notes, flow=False), scene, notes=notes, name=str(path))
 
 
 def measurement_of(

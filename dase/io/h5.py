@@ -424,7 +424,7 @@ def _parse_file(source: Source, file: Any) -> Sequence:
     label = None if labels is None else columns.read_slice(labels)
     images, flows = numbered_members(file, "images"), numbered_members(file, "flow")
     frames = _stack_members(images, GREYS, 2) if images else None
-    flow = _stack_flow(images, flows)
+    flow = _stack_flow(images, flows) if source.flow or not images else None
     exposure = np.array([exposure_of(image) for image in images.values()])
     size = columns.size_attribute(file, "sensor_resolution")
     x, y = checked_coordinates(x, "events/xs"), checked_coordinates(y, "events/ys")

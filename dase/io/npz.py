@@ -134,7 +134,9 @@ def create(path: Path) -> AbstractContextManager[Writer]:
 def read(source: Source) -> Sequence:
     """Read an archive; raises InputError where it is damaged or incomplete. Pickled members are refused."""
     with reading_file(source.path, "NumPy archive"), zipfile.ZipFile(source.path) as archive:
-        known = (name for name in KEYS if f"{name}.npy" in archive.namelist())
+        there = set(archive.namelist())
+        idle = {"flow"} if not source.flow and "frames.npy" in there else set()
+        known = (name for name in KEYS if f"{name}.npy" in there and name not in idle)
         return _parse_members(source, {name: load_member(archive, name) for name in known})
 
 

@@ -103,6 +103,8 @@ class ReadOptions(TypedDict, total=False):
     """Order of the columns, as txyp or xytp, of a table whose columns have no names."""
     part: Part | None
     """The part of time and sensor to read; None for all."""
+    flow: bool
+    """Whether flow is read that belongs to frames: it may take more memory and time than all else."""
 
 
 @dataclass(frozen=True)
@@ -116,6 +118,7 @@ class Source:
         chip: Name of the chip where the user says so, for AEDAT 1 and 2.
         columns: Order of columns without names where the user says so, four letters of t, x, y and p.
         part: The part to read; readers may leave out what lies outside, `dase.io` does.
+        flow: Whether somebody wants flow that belongs to frames; readers that keep it need not leave it out.
     """
 
     path: Path
@@ -124,6 +127,7 @@ class Source:
     chip: str | None = None
     columns: str | None = None
     part: Part | None = None
+    flow: bool = True
 
     def note(self, sentence: str, kind: Kind = "said", rule: str = "", number: int = 0) -> None:
         """Append a note, once."""

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from collections import OrderedDict
 from copy import copy
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -15,6 +14,7 @@ from dase.events import Events
 from dase.kernels import launch, scene_frames
 from dase.kernels.pixel_stages import Frames
 from dase.scenes.frame_motion import FrameMatch, match_frames
+from dase.scenes.match_store import MatchStore, StoreSettings
 from dase.scenes.scene import LOG_EPS, SamplingSettings, Scene
 
 
@@ -36,10 +36,8 @@ class TrustSettings:
 class MatchSettings:
     """What is kept of the matches of frames, and how they set the sampling."""
 
-    kept: int = 1 << 28
-    """Matches kept in memory [bytes]; others are computed anew when they are asked for."""
-    fewest_kept: int = 4
-    """Matches that are kept whatever their size: what a chunk of samples touches must not thrash."""
+    kept: StoreSettings = field(default_factory=StoreSettings)
+    """How many matches are kept."""
     speed_percentile: float = 99.8
     """Percentile of the lengths of all ways that sets how often to sample: single wild ways do not count."""
 
@@ -118,7 +116,7 @@ class CameraScene(Scene):
         self.height, self.width = self._raw.shape[1:]
         self.duration = float(self.times[-1] - self.times[0])
         self.matching, self.trust = matching, trust
-        self._matches: OrderedDict[int, FrameMatch] = OrderedDict()
+        self._matches = MatchStore(matching.kept)
         self._speed: dict[int, float] = {}
         self._loaded: tuple[Any, Any] = (None, None)
         self._trusted: NDArray[np.bool_] | None = None
@@ -176,23 +174,20 @@ class CameraScene(Scene):
 
     def matched(self, interval: int) -> FrameMatch:
         """Return the motion between frame `interval` and the next."""
-        if interval not in self._matches:
+        found = self._matches.find(interval)
+        if found is None:
             gap = self.times[interval + 1] - self.times[interval]
             exposure = (self.end - self.begin)[interval : interval + 2] / gap
             pair = interval, interval + 1
-            self._matches[interval] = match_frames(
+            found = match_frames(
                 self.intensity(pair[0]),
                 self.intensity(pair[1]),
                 eps=LOG_EPS,
                 exposure=(float(exposure[0]), float(exposure[1])),
                 usable=(self.usable(pair[0]), self.usable(pair[1])),
             )
-            found = self._matches[interval]
-            size = found.ahead.nbytes + found.back.nbytes + found.doubt.nbytes
-            while len(self._matches) > max(self.matching.kept // size, self.matching.fewest_kept):
-                self._matches.popitem(last=False)
-        self._matches.move_to_end(interval)
-        return self._matches[interval]
+            self._matches.keep(interval, found)
+        return found
 
     def sample_times(self) -> NDArray[np.float64]:
         """Return times [s] between which nothing moves by more than `travel`; those of the frames are in."""

@@ -201,6 +201,7 @@ class LayerScene(Scene):
         self.camera, self.lighting = camera, lighting
         self.travel, self.shortest, self.longest = travel, shortest, longest
         self._uploaded: dict[str, Any] = {}
+        self._placed: tuple[tuple[str, bytes], kernels.Layers] | None = None  # at the times asked for last
 
     def like(
         self, *, layers: Sequence[Layer] | None = None, shifts: Sequence[float] | None = None
@@ -330,7 +331,14 @@ class LayerScene(Scene):
         return np.array(times)
 
     def arrays(self, times: NDArray[np.float64], device: wp.Device) -> kernels.Layers:
-        """Return textures and motion at `times` [s], shape (K,), on a Warp device."""
+        """Return textures and motion at `times` [s], shape (K,), on a Warp device; not to be changed."""
+        # frames and the flow in them ask one after the other
+        asked = device.alias, np.asarray(times, np.float64).tobytes()
+        if self._placed is None or self._placed[0] != asked:
+            self._placed = asked, self._layers_at(times, device)
+        return self._placed[1]
+
+    def _layers_at(self, times: NDArray[np.float64], device: wp.Device) -> kernels.Layers:
         if device.alias not in self._uploaded:
             textures = [(layer.picture.grey, layer.picture.alpha) for layer in self.layers]
             self._uploaded[device.alias] = kernels.upload_textures(textures, device)

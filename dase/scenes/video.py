@@ -419,7 +419,7 @@ def _frames_of_recording(
     path: Path, fps: float | None, size: tuple[int, int] | None
 ) -> tuple[NDArray[Any], NDArray[np.float64]]:
     """Return a recording's frames and their times [s] from 0."""
-    sequence = io.read(path)
+    sequence = io.read(path, flow=False)
     if sequence.frames is None or len(sequence.frames) < 2:
         raise InputError(f"video {path}: the recording must have at least 2 frames to be taken for a video")
     frames: NDArray[Any] = sequence.frames

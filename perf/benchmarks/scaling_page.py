@@ -40,17 +40,18 @@ v2e's `clean`, its lin-log response and its spread of thresholds, for the number
 floor below its logarithm, so black pixels send more events.
 
 `video to HDF5` and `video to DAT` are whole jobs, from an AVI (MJPG) to a file of events. On the AMD EPYC,
-clean and noisy, dase is 9.3 and 12.9 times as fast as v2e, both into HDF5, and 118 and 17 times as fast as
+clean and noisy, dase is 11.8 and 14.5 times as fast as v2e, both into HDF5, and 149 and 23 times as fast as
 OpenEB's sample, both into DAT, because that empties its memory, room for 10^8 events, at every 50,000 events.
-With that left out and all events written at the end, dase is 1.4 and 2.2 times as fast as OpenEB. On an Intel
+With that left out and all events written at the end, dase is 1.8 and 2.8 times as fast as OpenEB. On an Intel
 Xeon (family 6, model 167), at 0c92321, others at work: 7 and 15 times v2e (8 and 10 in a second, busier run),
 57 and 25 times OpenEB's sample; with its events at the end OpenEB takes 0.6 times as long as dase for the
 ideal pixel and 1.3 times for the noisy one.
 
-In memory on the AMD EPYC, one run: the ideal pixel from pictures is 5.2 times as fast as OpenEB and 4.1 times
-as the NumPy pipeline (the photograph moved and counted: 1.25 times as the tuned one), the noisy pixel 3.2
-times as OpenEB and 23 times as v2e. In two runs before it, with other programs about, the noisy pixel was at
-2.98 and 3.03 times OpenEB, where 3 is the goal, and the ideal one at 3.6 and 4.5.
+In memory on the AMD EPYC, one run: the ideal pixel from pictures is 4.5 times as fast as OpenEB and 3.5 times
+as the NumPy pipeline (the photograph moved and counted: 1.18 times as the tuned one), the noisy pixel 3.3
+times as OpenEB and 23 times as v2e. At 07707fe it was 5.2, 4.1, 1.25, 3.2 and 23 times, and in two runs
+before that, with other programs about, the noisy pixel was at 2.98 and 3.03 times OpenEB, where 3 is the
+goal, and the ideal one at 3.6 and 4.5.
 
 To run it: check out prophesee-ai/openeb (5.1 here; Numba is all it needs) and SensorsINI/v2e (cac6384 here),
 give their folders as `--openeb` and `--v2e`, and `--processor-time` on a machine that others use, too."""
@@ -59,8 +60,8 @@ WHOLE_JOB = """`python -m perf.benchmarks.synth --images FOLDER --jobs 2`, 200 p
 s, 640x480, `mixed`, frames and flow at 60 Hz, HDF5. Two quiet cores of an AMD EPYC (family
 25, model 17), by the clock: the present `davis346` takes 35 s at 56c6730 (88,096,752 events;
 47 and 45 s at d01e7e2 in the same run), that of 3859195 takes 33 s (163,618,642 events; 59 s
-at 3859195 in the same run). The goal of 25 s is missed; `perf/RESULTS.md` has the stages, and
-the figures of GPUs."""
+at 3859195 in the same run). In a later run, at 2f4580b, these were 38 and 33 s, and 61 s at 3859195. The
+goal of 25 s is missed; `perf/RESULTS.md` has the stages, and the figures of GPUs."""
 
 
 def powers(most: int) -> list[int]:

@@ -154,3 +154,17 @@ def test_commands(tmp_path, rng):
     assert "not of the form x,y,w,h" in done.output
     done = CliRunner().invoke(dase_group, ["info", str(path), "--chip", "davis240"])
     assert "takes no chip" in str(done.exception)
+
+
+@pytest.mark.parametrize("suffix", [".h5", ".npz"])
+def test_flow_that_nobody_wants_is_not_read(tmp_path, rng, suffix):
+    whole, path = sequence(rng), tmp_path / f"a{suffix}"
+    io.write(path, whole)
+    read, less = io.read(path), io.read(path, flow=False)
+    assert read.flow is not None
+    assert less.flow is None
+    for name in "txyp":
+        np.testing.assert_array_equal(getattr(less.events, name), getattr(read.events, name))
+    for name in ("frames", "frame_times", "frame_exposure", "thresholds"):
+        np.testing.assert_array_equal(getattr(less, name), getattr(read, name))
+    assert io.read(path, flow=False, part=PART).flow is None
