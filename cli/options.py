@@ -22,12 +22,14 @@ def importing() -> Iterator[None]:
 
     They would go through the half a million objects of Warp and others again and again, and find nothing.
     """
+    enabled = gc.isenabled()
     gc.disable()
     try:
         yield
         gc.freeze()
     finally:
-        gc.enable()
+        if enabled:
+            gc.enable()
 
 
 def parse_size(ctx: click.Context, param: click.Parameter, value: str | None) -> tuple[int, int] | None:

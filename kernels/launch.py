@@ -27,6 +27,7 @@ Result = TypeVar("Result")
 
 _pool: ThreadPoolExecutor | None = None
 _starting = threading.Lock()
+_started = False
 
 
 def set_threads(count: int) -> None:
@@ -70,12 +71,15 @@ if hasattr(os, "register_at_fork"):
 
 def _start_warp() -> None:
     """Start Warp without its line on standard error that a machine has no NVIDIA driver."""
-    if wp._src.context.runtime is not None:
+    global _started
+    if _started:
         return  # asked on every launch, by threads that need not wait for each other
     # two threads that hold the file descriptor back at once would restore it in the wrong order
     with _starting:
         if wp._src.context.runtime is None:
             _init_quietly()
+        # only now: Warp shows a runtime before its modules are ready
+        _started = True
 
 
 def _init_quietly() -> None:

@@ -340,11 +340,11 @@ def _leave_pixel(model: PixelModel, share: str) -> tuple[str, Statements]:
     )
 
 
-def _event(model: PixelModel, share: str, label: str, *, tires: bool = True) -> Statements:
+def _event(model: PixelModel, share: str, label: str, *, begins_dead_time: bool = True) -> Statements:
     """Return the emission of an event after `share` of the step, and whether a dead time begins with it."""
     # negative, as the whole step is added to the age when it is over
-    aged = lines(f"age = -{share} * dt") if tires and "age" in model.states else ()
-    aged += lines("fired_on = float(polarity)") if tires and "fired_on" in model.states else ()
+    aged = lines(f"age = -{share} * dt") if begins_dead_time and "age" in model.states else ()
+    aged += lines("fired_on = float(polarity)") if begins_dead_time and "fired_on" in model.states else ()
     if model.sink == "counts":
         return (*lines("on_count += polarity", "off_count += 1 - polarity"), *aged, *model.outlet.emitted)
     time, asked = _leave_pixel(model, share)
@@ -372,7 +372,7 @@ def _noise_event(model: PixelModel, effect: EffectStages) -> Statements:
     if model.spares_noise:
         # what is held in reset memorises nothing, whatever is sent on top
         then = (Block("if stop >= at:", then),) if model.resets else then
-        sent = (*_event(model, "stop", code, tires=False), *then)
+        sent = (*_event(model, "stop", code, begins_dead_time=False), *then)
         if not all(effect.spares_noise for effect, _ in model.of("gate")):
             sent = (*_dead_time(model, "stop", of_noise=True), if_block("wait <= 0.0", *sent))
     elif model.resets:

@@ -42,7 +42,7 @@ from dase.diagnosis.state import DiagnosisState, explains_remainder, with_same_f
 from dase.effects import EFFECTS, Effect
 from dase.fitting.burst_strength import follows_frames, put_in_step
 from dase.fitting.confidence_intervals import estimate_parameters
-from dase.fitting.data_split import SPLIT, SplitMeasurement, split_measurement
+from dase.fitting.data_split import SPLIT, split_measurement
 from dase.fitting.early_stopping import CandidateRace
 from dase.fitting.measurement import Measured, Measurement, SceneChoice, as_measurement
 from dase.fitting.model import (
@@ -128,8 +128,9 @@ def diagnose(
     frames = seen.times_of_bursts(measurement) if follows_frames(given) else None
     bursts = None if "exposure" in given else seen.bursts
     hot = few_hot_pixels(seen, measurement.events, pixels) if HOT not in given else None
-    silent = None if DEAD in given else find_silent_pixels(measurement, log_eps=given.log_eps)
-    dead = silent if silent is not None and silent.found and DEAD in effects else None
+    asked = DEAD in effects and DEAD not in given
+    silent = find_silent_pixels(measurement, log_eps=given.log_eps) if asked else None
+    dead = silent if silent is not None and silent.found else None
     split = partial(
         split_measurement, measurement.events, measurement.scene, log_eps=given.log_eps,
         trust=measurement.trust, span=measurement.span, left_out=bursts.contains if bursts else None,
@@ -158,15 +159,11 @@ def diagnose(
     start = _fitted_unless_worse(state, given, free)
     seen = without_the_scene(seen, measurement, start.sensor, seed)
 
-    def with_doubt(split: SplitMeasurement, model: FittedModel) -> SplitMeasurement:
-        scene = measurement.scene
-        if not isinstance(scene, CameraScene) or not is_guessed(scene):
-            return split
-        return with_scene_doubt(split, scene, model, seed=seed)
-
-    if isinstance(measurement.scene, CameraScene) and is_guessed(measurement.scene):
+    scene = measurement.scene
+    guessed = scene if isinstance(scene, CameraScene) and is_guessed(scene) else None
+    if guessed is not None:
         tell("how well the scene is known", 0.0, before)
-        state.evidence = evidence = with_doubt(evidence, start)
+        state.evidence = evidence = with_scene_doubt(evidence, guessed, start, seed=seed)
         before = (
             model_of(given, free)
             .judge(evidence.report, repeats=settings.repeats // 2, seed=SimulationStream.JUDGE.seed(seed))
@@ -193,9 +190,13 @@ def diagnose(
     # what is not of this scene has no effects to be found
     limit = 0 if evidence.contradiction else most
     model, judgement = _add_one_by_one(state, start, limit)
+    run = 0  # models before the measurement was split anew
     if limit > 0 and _shows_later_alone(state, model, judgement):
         tell("fitting all of the time", 0.0, judgement.error)
-        state.evidence = evidence = with_doubt(split(all_time=True), model)
+        run, evidence = evidence.evaluations, split(all_time=True)
+        if guessed is not None:
+            evidence = with_scene_doubt(evidence, guessed, model, seed=seed)
+        state.evidence = evidence
         state.notes.append(
             "what is left comes late in the recording: all of its time is fitted, and other pixels judge"
         )
@@ -206,7 +207,8 @@ def diagnose(
     if len(state.added_to(model)) > 1:
         model, judgement = prune_model(state, model, judgement)
     found = _conclude_diagnosis(state, start, model, before, seen, names, measurement)
-    if silent is not None and silent.decides and not evidence.contradiction and DEAD in effects:
+    found = replace(found, evaluations=found.evaluations + run)
+    if silent is not None and silent.decides and not evidence.contradiction:
         found = with_dead_pixels(found, silent)
     if hot is not None:
         found = with_hot_pixels(found, *hot_effect_of(measurement.events, hot))

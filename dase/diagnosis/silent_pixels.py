@@ -19,6 +19,7 @@ from dase.effects.dead import Dead
 from dase.fitting.data_split import common_grid, times_of_grid
 from dase.fitting.measurement import Measurement
 from dase.fitting.time_window import is_constant, within_span
+from dase.probes.stimulus import Trust, light_of
 from dase.results import DetectionLimit, Diagnosis, Estimate, Finding, Grade
 from dase.scenes.between_frames import CameraScene
 from dase.scenes.scene import Scene
@@ -56,6 +57,12 @@ class SilentPixelSettings:
 
 SILENT_PIXELS = SilentPixelSettings()
 
+BLOCK = 1 << 16
+"""Pixels whose light is looked at together, for the memory that takes."""
+
+TRUST_LOOKS = 8
+"""Moments at which it is asked whether a pixel is trusted."""
+
 
 @dataclass(frozen=True, eq=False)
 class SilentPixels:
@@ -64,20 +71,22 @@ class SilentPixels:
     Args:
         pixels: Those that are silent where events are expected, row-major, shape (K,).
         asked: Pixels of which events are expected.
+        settings: How many there must be.
     """
 
     pixels: NDArray[np.int64]
     asked: int
+    settings: SilentPixelSettings = SILENT_PIXELS
 
     @property
     def found(self) -> bool:
         """Whether some pixels are dead."""
-        return len(self.pixels) >= SILENT_PIXELS.least
+        return len(self.pixels) >= self.settings.least
 
     @property
     def decides(self) -> bool:
         """Whether it is known if pixels are dead."""
-        return self.found or self.asked >= SILENT_PIXELS.enough
+        return self.found or self.asked >= self.settings.enough
 
     @property
     def share(self) -> Estimate:
@@ -97,7 +106,7 @@ class SilentPixels:
 
     def limit(self) -> DetectionLimit:
         """Return the share of dead pixels that would have been seen."""
-        share = SILENT_PIXELS.least / self.asked
+        share = self.settings.least / max(self.asked, 1)
         sentence = f"dead pixels: {self.sentence}; a share above {share:.2g} would have been seen"
         return DetectionLimit(NAME, f"{NAME}.share", share, "1", True, sentence)
 
@@ -118,11 +127,9 @@ def find_silent_pixels(
     events, scene = measurement.events, measurement.scene
     whole = common_grid(events, scene)
     if min(scene.width, scene.height) < 3 or is_constant(scene):
-        return SilentPixels(np.zeros(0, np.int64), 0)
+        return SilentPixels(np.zeros(0, np.int64), 0, settings)
     times = times_of_grid(scene, within_span(whole, measurement.span))
-    light = _light_over_time(scene, times, settings.times)
-    level = np.log(light + log_eps)
-    change, mean = np.ptp(level, axis=0), light.mean(0) + log_eps
+    change, mean = _range_and_mean(scene, times, log_eps, settings.times)
     events = events.select((events.t >= times[0]) & (events.t <= times[-1]))
     counts = np.bincount(
         events.y.astype(np.int64) * events.width + events.x, minlength=events.width * events.height
@@ -135,22 +142,57 @@ def find_silent_pixels(
         & (change[inside] >= np.maximum(settings.change, settings.alike * np.median(_neighbours(change), 0)))
         & (brightness >= settings.alike) & (brightness <= 1 / settings.alike)
     )  # fmt: skip
+    if measurement.trust is not None:
+        asked &= _ever_trusted(measurement.trust, scene, times)[inside]
     rows, columns = np.nonzero(asked & (counts[inside] == 0))
-    return SilentPixels((rows + 1) * np.int64(events.width) + columns + 1, int(np.count_nonzero(asked)))
+    pixels = (rows + 1) * np.int64(events.width) + columns + 1
+    return SilentPixels(pixels, int(np.count_nonzero(asked)), settings)
 
 
-def _light_over_time(scene: Scene, times: NDArray[np.float64], most: int) -> NDArray[np.float32]:
-    """Return the light of all pixels at some moments of a time, at most `most` of them, shape (K, H, W)."""
+def _range_and_mean(
+    scene: Scene, times: NDArray[np.float64], log_eps: float, most: int
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Return the range of the log intensity and the mean intensity of all pixels, each (H, W).
 
-    def some(count: int) -> NDArray[np.int64]:
-        return np.unique(np.linspace(0, count - 1, most).round().astype(np.int64))
+    Looked at are at most `most` moments of a time.
+    """
+    size = scene.width * scene.height
+    low, high, total = (
+        np.full(size, np.inf, np.float32),
+        np.zeros(size, np.float32),
+        np.zeros(size, np.float32),
+    )
+    if isinstance(scene, CameraScene):
+        # the frames are at hand; what is between them is a guess
+        found = np.flatnonzero((scene.times >= times[0]) & (scene.times <= times[-1]))
+        looks = found[_evenly(len(found), most)] if len(found) else np.zeros(1, np.int64)
+        for n in looks:
+            light = scene.intensity(int(n)).reshape(-1)
+            low, high, total = np.minimum(low, light), np.maximum(high, light), total + light
+    else:
+        looks = _evenly(len(times), most)
+        for first in range(0, size, BLOCK):
+            part = slice(first, min(first + BLOCK, size))
+            light = light_of(scene, times[looks], np.arange(part.start, part.stop, dtype=np.int32))
+            low[part], high[part], total[part] = light.min(1), light.max(1), light.sum(1)
+    shape = scene.height, scene.width
+    change = np.log(high + log_eps) - np.log(low + log_eps)
+    mean = (total / len(looks) + log_eps).astype(np.float32)
+    return change.reshape(shape), mean.reshape(shape)
 
-    if not isinstance(scene, CameraScene):
-        return np.asarray(scene.frames(times[some(len(times))]), np.float32)
-    # the frames are at hand; what is between them is a guess
-    inside = np.flatnonzero((scene.times >= times[0]) & (scene.times <= times[-1]))
-    chosen = inside[some(len(inside))] if len(inside) else [0]  # one frame shows no change
-    return np.stack([scene.intensity(int(n)) for n in chosen])
+
+def _ever_trusted(trust: Trust, scene: Scene, times: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """Return which pixels are trusted at one of some moments, shape (H, W); those of a mask never are."""
+    looks, size = times[_evenly(len(times), TRUST_LOOKS)], scene.width * scene.height
+    found = [
+        trust(looks, np.arange(first, min(first + BLOCK, size), dtype=np.int32)).any(0)
+        for first in range(0, size, BLOCK)
+    ]
+    return np.concatenate(found).reshape(scene.height, scene.width)
+
+
+def _evenly(count: int, most: int) -> NDArray[np.int64]:
+    return np.unique(np.linspace(0, count - 1, most).round().astype(np.int64))
 
 
 def _neighbours(values: NDArray[Any]) -> NDArray[Any]:

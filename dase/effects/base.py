@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import inspect
 import math
-from collections.abc import Collection, Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cache
 from pathlib import Path
@@ -298,11 +298,11 @@ class Effect:
         """Whether random events pass while this effect holds the others back, and begin no dead time."""
         return False
 
-    def otherwise(self, beside: Collection[str]) -> list[Self]:
+    def otherwise(self, beside: Sequence[Effect]) -> list[Self]:
         """Return this effect by the other rules that a fit has to try, too, as no descent gets there.
 
         Args:
-            beside: Names of the effects that are on beside it.
+            beside: The effects that are on beside it.
         """
         return []
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Collection
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import ClassVar, Self
 
@@ -90,10 +90,10 @@ class Refractory(Effect):
         """Return the three rules; whether noise passes is asked once there is noise."""
         return [effect for effect in cls.variants() if effect.noise == "held"]
 
-    def otherwise(self, beside: Collection[str]) -> list[Self]:
+    def otherwise(self, beside: Sequence[Effect]) -> list[Self]:
         """Return the other rules for changes in the dead time, and for noise where there is any."""
         modes = [dataclasses.replace(self, mode=mode) for mode in self.choices()["mode"] if mode != self.mode]
-        if not {"shot", "hot"} & set(beside):
+        if not any("noise" in effect.stages for effect in beside):
             return modes
         return [*modes, dataclasses.replace(self, noise="held" if self.noise == "passes" else "passes")]
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import ClassVar, Self
 
@@ -53,6 +53,6 @@ class Threshold(Effect):
         fitted=False,  # both ends are tried instead
     )
 
-    def otherwise(self, beside: Collection[str]) -> list[Self]:
+    def otherwise(self, beside: Sequence[Effect]) -> list[Self]:
         """Return the thresholds with the other end of the phase."""
         return [replace(self, phase=1.0 - self.phase)]

@@ -95,7 +95,8 @@ class SplitMeasurement:
 
     Args:
         train: Pixels and time that are fitted.
-        held: Other pixels, at a later time, which choose between models.
+        held: Other pixels, at a later time, which choose between models; with `all_time`, that time is
+            fitted, too.
         report: Again other pixels, at that later time: nothing is chosen by them, so what they say of the
             chosen model is not better than it is.
         scout: Some of the pixels that are fitted, for what need not be exact.
@@ -197,8 +198,8 @@ def split_measurement(
         unbroken: Whether a long recording is compared in one window, not in several over its length, as
             models with a clock of their own need it, see `Sensor.unbroken`; so it is where there is a lamp
             or bursts with frames, where times are left out, and where time stamps follow a regularity.
-        all_time: Whether all of the time is fitted, not its first part alone: what judges still are other
-            pixels at a later time.
+        all_time: Whether all of the time is fitted, not its first part alone. What judges are other pixels
+            in the later part all the same, but no other time.
         plenty: Events of the pixels of one part from which on a longer time is not compared.
         pixels: In each part.
         seed: Of the choice of pixels.

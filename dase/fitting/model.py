@@ -30,13 +30,17 @@ class RefitSettings:
     """Simulations that give a model's sampling errors while it is fitted."""
 
     descents: int = 3
-    """Descents of which the best is taken: each ends where its random numbers happen to lead."""
+    """Random numbers of the descents of which the best is taken, as each ends where its own happen to lead;
+    by the last ones other rules are tried."""
 
     alike: float = 2.0
-    """Most by which the loss of another phase may grow where it becomes the present one."""
+    """Most by which the loss of another phase or rule may grow where it becomes the present one."""
 
 
 REFIT = RefitSettings()
+
+PHASED = "threshold"
+"""Effect that has the phase with which pixels begin."""
 
 
 @dataclass(frozen=True)
@@ -253,14 +257,16 @@ def ways_otherwise(model: FittedModel, names: Collection[str] | None = None) -> 
 
     Args:
         model: At its place.
-        names: Of the effects whose rules are changed; None for all.
+        names: Of the effects whose rules are changed; None for all of which something is free, and for the
+            phase, which belongs to no camera.
     """
     sensor = model.space.sensor
-    acting = [effect.name for effect in model.sensor.effects if not effect.is_off()]
+    acting = [effect for effect in model.sensor.effects if not effect.is_off() or effect.name == PHASED]
+    free = {PHASED, *(axis.effect.name for axis in model.space.axes)} if names is None else set(names)
     return [
         replace(model, space=replace(model.space, sensor=sensor.with_effect(other)))
-        for effect in sensor.effects if names is None or effect.name in names
-        for other in effect.otherwise([name for name in acting if name != effect.name])
+        for effect in acting if effect.name in free
+        for other in sensor[effect.name].otherwise([one for one in acting if one.name != effect.name])
     ]  # fmt: skip
 
 

@@ -148,6 +148,8 @@ def shuffle_bytes(values: NDArray[Any]) -> NDArray[np.uint8]:
     flat, each = values.reshape(-1), values.itemsize
     if each == 1:
         return flat.view(np.uint8)
+    if each not in (2, 4, 8) or not len(flat):
+        return np.ascontiguousarray(flat.view(np.uint8).reshape(-1, each).T).reshape(-1)
     parts = cv2.split(flat.view(np.int32).reshape(-1, 1, 2)) if each == 8 else [flat]
     whole = [part.reshape(-1).view(np.uint8).reshape(-1, 1, min(each, 4)) for part in parts]
     return np.concatenate([plane.reshape(-1) for part in whole for plane in cv2.split(part)])

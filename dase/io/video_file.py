@@ -214,7 +214,7 @@ class FrameReader:
     def _write_planes(self, frames: list[tuple[NDArray[np.uint8], NDArray[np.float32]]]) -> None:
         """Write planes (1 or 4, height, width) of a video's frames to their places, and empty the list."""
         plain = self._size is None and not self.colour
-        if plain and frames and all(pixels.ndim == 3 and pixels.flags.c_contiguous for pixels, _ in frames):
+        if plain and frames and all(_is_packed(pixels) for pixels, _ in frames):
             # here alone, as Warp takes longer to start than to look at a file
             from dase.kernels.picture_grey import write_greys
 
@@ -257,3 +257,8 @@ def _unpack_avi_frame(
     _, more = capture.retrieve(flag=int(capture.get(cv2.CAP_PROP_CODEC_EXTRADATA_INDEX)))
     upward = more is not None and more.tobytes().endswith(b"BottomUp\0")  # what FFmpeg calls it
     return frame[::-1] if upward else frame
+
+
+def _is_packed(pixels: NDArray[Any]) -> bool:
+    """Whether pixels are three bytes each without gaps, of which a kernel is given the address."""
+    return pixels.dtype == np.uint8 and pixels.shape[2:] == (3,) and pixels.flags.c_contiguous

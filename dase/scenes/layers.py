@@ -334,9 +334,10 @@ class LayerScene(Scene):
         """Return textures and motion at `times` [s], shape (K,), on a Warp device; not to be changed."""
         # frames and the flow in them ask one after the other
         asked = device.alias, np.asarray(times, np.float64).tobytes()
-        if self._placed is None or self._placed[0] != asked:
-            self._placed = asked, self._layers_at(times, device)
-        return self._placed[1]
+        placed = self._placed  # another thread may ask for other times meanwhile
+        if placed is None or placed[0] != asked:
+            self._placed = placed = asked, self._layers_at(times, device)
+        return placed[1]
 
     def _layers_at(self, times: NDArray[np.float64], device: wp.Device) -> kernels.Layers:
         if device.alias not in self._uploaded:

@@ -90,7 +90,8 @@ def bias_current(coarse: int, fine: int) -> float:
     Raises:
         InputError: Not 0 to 7 and 1 to 255; a fine setting of 0 switches a bias off.
     """
-    if coarse not in range(8) or fine not in range(1, 256):
+    whole = isinstance(coarse, int) and isinstance(fine, int)
+    if not whole or coarse not in range(8) or fine not in range(1, 256):
         raise InputError(
             f"bias: must have a coarse setting of 0 to 7 and a fine one of 1 to 255, got {coarse}, {fine}"
         )

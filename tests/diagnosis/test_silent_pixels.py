@@ -67,9 +67,8 @@ def test_no_other_effect_silences_single_pixels(scene, effect):
     events = dase.simulate(scene, Sensor().with_effect(effect), seed=5)
     found = find_silent_pixels(Measurement(events, scene), log_eps=1e-3)
     assert not found.found
-    if effect.name != "bandwidth":  # which leaves few events to be expected
-        assert found.decides
-        assert found.limit().strength == pytest.approx(3 / found.asked)
+    assert found.decides
+    assert found.limit().strength == pytest.approx(3 / found.asked)
 
 
 @pytest.mark.parametrize("span", [None, (0.1605, 0.1795)])
@@ -84,6 +83,39 @@ def test_frames_of_a_camera_tell_dead_pixels_as_well(scene, span):
     # between two frames no change of light is known
     assert found.found == (span is None)
     assert found.decides == (span is None)
+
+
+@pytest.mark.parametrize("every", [33, 7, "uneven"])
+def test_clips_of_any_frame_rate_tell_dead_pixels(scene, every):
+    times = scene.sample_times()
+    chosen = (
+        np.unique(np.geomspace(1, len(times), 90).astype(int)) - 1
+        if every == "uneven"
+        else slice(None, None, every)
+    )
+    clip = dase.VideoScene(scene.frames(times)[chosen], times[chosen])
+    sensor = Sensor().with_effect(EFFECTS["dead"](share=0.02))
+    events = dase.simulate(clip, sensor, seed=5)
+    found = find_silent_pixels(Measurement(events, clip), log_eps=1e-3)
+    assert found.found
+    assert found.share.low < 0.02 < found.share.high
+
+
+def test_pixels_that_are_masked_are_not_dead(scene):
+    events = dase.simulate(scene, Sensor(), seed=5)
+    counts = counts_of(events).reshape(HEIGHT, WIDTH)
+    busy = [(y, x) for y in range(3, HEIGHT - 3, 6) for x in range(3, WIDTH - 3, 6) if counts[y, x] > 20][:20]
+    mask = np.ones((HEIGHT, WIDTH), bool)
+    mask[tuple(np.array(busy).T)] = False
+    left = events.select(mask[events.y, events.x])
+    assert find_silent_pixels(Measurement(left, scene), log_eps=1e-3).found
+
+    def trust(times, pixels):
+        return np.broadcast_to(mask.reshape(-1)[pixels], (len(times), len(pixels)))
+
+    masked = find_silent_pixels(Measurement(left, scene, trust), log_eps=1e-3)
+    assert len(masked.pixels) == 0
+    assert masked.decides
 
 
 def test_a_region_that_is_switched_off_has_no_dead_pixels(scene):

@@ -9,6 +9,7 @@ from reference import pixel as reference
 from reference.pixel import Stream
 
 import dase
+from dase.effects import EFFECTS
 from dase.effects.refractory import Refractory
 from dase.effects.threshold import Threshold
 
@@ -104,3 +105,24 @@ def test_dead_times_differ_from_pixel_to_pixel(device):
     own = [Stream("refractory_gate_pixel_normal", 4, i).normal() for i in range(pixels)]
     np.testing.assert_allclose(dead, period * np.maximum(1 + 0.3 * np.array(own), 0), atol=2e-6)
     assert dead.std() == pytest.approx(0.3 * period, rel=4 / np.sqrt(2 * pixels))
+
+
+@pytest.mark.parametrize("mode", ["reset", "drop", "delay"])
+def test_noise_that_passes_comes_as_often_as_without_a_dead_time(device, mode):
+    rate, seconds, pixels = 80.0, 1.0, 900
+    level = np.zeros((101, 1, pixels))
+    scene = reference.LogScene(level, np.linspace(0, seconds, 101))
+    noise = EFFECTS["shot"](rate=rate, bright=1.0)
+
+    def sent(**rule):
+        dead = Refractory(period=20e-3, mode=mode, **rule)
+        return dase.simulate(scene, reference.only(Threshold(), noise, dead, mode=mode), device=device)
+
+    passing, held = sent(noise="passes"), sent(noise="held")
+    want = rate * seconds * pixels
+    assert abs(len(passing) - want) < 4 * np.sqrt(want)
+    # a dead time after each event: a renewal process of period and mean waiting time
+    assert abs(len(held) / (want / (1 + rate * 20e-3)) - 1) < 0.05
+    order = np.lexsort((passing.t, passing.x))
+    gaps = np.diff(passing.t[order])[np.diff(passing.x[order].astype(int)) == 0]
+    assert abs(np.mean(gaps < 20e-3) - (1 - np.exp(-rate * 20e-3))) < 0.02

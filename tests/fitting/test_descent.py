@@ -20,6 +20,7 @@ from dase.fitting.model import (
     refit_work,
     shift_periodic_effects,
     starting_places,
+    ways_otherwise,
     with_effect_added,
     with_phase,
 )
@@ -103,8 +104,24 @@ def test_noise_passes_the_dead_time_of_a_fit_where_it_does(device):
     start = model_of(Sensor().with_effect(noise).with_effect(replace(dead, noise="held")))
     assert refit_model(found, start, seed=0, rounds=1).sensor["refractory"].noise == "passes"
     # without noise it is no question
-    modes = {(one.mode, one.noise) for one in dead.otherwise(["bandwidth"])}
+    modes = {(one.mode, one.noise) for one in dead.otherwise([EFFECTS["bandwidth"]()])}
     assert modes == {("reset", "passes"), ("drop", "passes")}
+
+
+def test_rules_of_what_is_not_free_are_left_alone():
+    sensor = Sensor().with_effect(EFFECTS["refractory"](period=6e-3, mode="reset"))
+
+    def rules(free):
+        return {
+            (one.sensor["threshold"].phase, one.sensor["refractory"].mode)
+            for one in ways_otherwise(model_of(sensor, free))
+        }
+
+    assert rules(["threshold.on"]) == {(0.0, "reset")}
+    assert rules(None) == {(0.0, "reset"), (1.0, "drop"), (1.0, "delay")}
+    # nor of what is off
+    off = Sensor().with_effect(EFFECTS["refractory"](period=0.0))
+    assert len(ways_otherwise(model_of(off))) == 1
 
 
 @pytest.fixture(scope="module")
