@@ -129,6 +129,7 @@ def fit(
         *_notes_on_held_out_error(judgement, before),
         *evidence.notes,
         *([NO_FRAME_TIMES] if follows and frames is None else []),
+        *_notes_on_rules(start, model.sensor),
         *apart,
         *(["no descent left the start: the values are those that were given"] if stuck else []),
         *parameters_at_bounds(model, values),
@@ -188,6 +189,16 @@ def _equally_good_models(ends: Ends) -> list[FittedModel]:
     """Return the ends whose error is about that of the best."""
     least = _best_end(ends)[0].error
     return [model for judged, model in ends if judged.error < max(1.25 * least, least + 0.25)]
+
+
+def _notes_on_rules(before: Sensor, after: Sensor) -> list[str]:
+    """Return a sentence for each word of an effect that the fit has changed."""
+    return [
+        f"{effect.name}.{name} is {getattr(after[effect.name], name)} instead of {getattr(effect, name)}, "
+        "which fits better"
+        for effect in before.effects for name in effect.choices()
+        if getattr(after[effect.name], name) != getattr(effect, name)
+    ]  # fmt: skip
 
 
 def _notes_on_minimum(judgement: Judgement, starts: int, good: int) -> list[str]:

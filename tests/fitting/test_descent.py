@@ -96,6 +96,17 @@ def test_another_rule_of_a_dead_time_is_found(device, rule, other):
     assert refit_model(found, start, seed=0, rounds=1).sensor["refractory"].mode == rule
 
 
+def test_a_fit_says_which_rule_it_has_changed(device):
+    scene, dead = moving_bars(), EFFECTS["refractory"](period=6e-3, mode="drop")
+    events = dase.simulate(scene, Sensor().with_effect(dead), seed=4, device=device)
+    given = Sensor().with_effect(replace(dead, mode="delay"))
+    found = dase.fit(events, given, scene=scene, pixels=300, device=device)
+    assert found.sensor["refractory"].mode == "drop"
+    assert any(note.startswith("refractory.mode is drop instead of delay") for note in found.notes)
+    kept = dase.fit(events, given, scene=scene, free=["threshold"], pixels=300, device=device)
+    assert kept.sensor["refractory"].mode == "delay"
+
+
 def test_noise_passes_the_dead_time_of_a_fit_where_it_does(device):
     scene, noise = moving_bars(), EFFECTS["shot"](rate=30.0)
     dead = EFFECTS["refractory"](period=1e-2, mode="delay", noise="passes")
