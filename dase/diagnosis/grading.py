@@ -12,6 +12,8 @@ part, by which nothing was chosen. Each effect has to earn its grade there:
   explained that something which is not in the library could look like it, or it had to go to an end of what
   it can be, beyond all that is plausible: shot noise that is all ON is another effect. So is it with a dead
   time far shorter than the steps in which light is known: a memory that is set a little later looks like it.
+  A little jitter beside a dead time is in doubt, too: a world that looks for crossings at steps of time makes
+  it when a dead time ends.
 
 An effect that earns neither is a stand-in: it is named as what comes nearest, and not found.
 """
@@ -116,7 +118,9 @@ def grade_effects(
         stopped = any(text.startswith((f"{name}.", "threshold.")) for text in at_bounds)
         grade, unknown = graded(name, bool(others))
         doubtful = any(
-            is_strained(model, *one) or is_between_samples(model, *one, step=step, settings=settings)
+            is_strained(model, *one)
+            or is_between_samples(model, *one, step=step, settings=settings)
+            or is_small_beside_another(model, *one)
             for one in mine[name].items()
         )
         if grade is Grade.SUPPORTED and doubtful:
@@ -174,6 +178,18 @@ def is_between_samples(
     """
     fact = next((axis.fact for axis in model.space.axes if axis.name == name), None)
     return fact is not None and fact.between_samples and value.high < settings.shortest_time * step
+
+
+def is_small_beside_another(model: FittedModel, name: str, value: Estimate) -> bool:
+    """Return whether another way of an effect beside it looks like one as weak as this."""
+    fact = next((axis.fact for axis in model.space.axes if axis.name == name), None)
+    if fact is None:
+        return False
+    sensor = model.sensor
+    return any(
+        other in sensor and not sensor[other].is_off() and value.value < least
+        for other, least in fact.clear_beside
+    )
 
 
 def grade_of(

@@ -56,6 +56,8 @@ class Parameter:
             for the whole range.
         between_samples: Whether a time that is short beside the steps in which light is known is told by what
             light does between them, where it is a guess: so is what a memory does there.
+        clear_beside: (name, value) pairs of effects beside which a smaller value is in doubt: another way in
+            which a world does those looks like it.
     """
 
     name: str
@@ -70,6 +72,7 @@ class Parameter:
     fitted: bool = True
     nearby: float | None = None
     between_samples: bool = False
+    clear_beside: tuple[tuple[str, float], ...] = ()
 
     @property
     def search_starts(self) -> Starts:
@@ -90,11 +93,13 @@ def parameter(
     fitted: bool = True,
     nearby: float | None = None,
     between_samples: bool = False,
+    clear_beside: tuple[tuple[str, float], ...] = (),
 ) -> Any:
     """Declare a parameter of an effect; see `Parameter`."""
     facts = dict(
         unit=unit, default=default, off=off, bounds=bounds, plausible=plausible, about=about, starts=starts,
         periodic=periodic, fitted=fitted, nearby=nearby, between_samples=between_samples,
+        clear_beside=clear_beside,
     )  # fmt: skip
     return field(default=default, metadata={"parameter": facts})
 

@@ -39,4 +39,7 @@ class Jitter(Effect):
         bounds=(0.0, 1.0),
         plausible=(0.02, 0.5),
         about="standard deviation over events, relative to the threshold of the pixel",
+        # a world that looks for crossings at steps of time sends the first after a dead time a little late,
+        # beyond the threshold by chance
+        clear_beside=(("refractory", 0.15),),
     )

@@ -13,7 +13,7 @@ import dase
 from dase.diagnosis import grading
 from dase.diagnosis.diagnose import diagnose
 from dase.diagnosis.explain_effect import moving_bars
-from dase.diagnosis.grading import grade_of, is_between_samples, is_strained
+from dase.diagnosis.grading import grade_of, is_between_samples, is_small_beside_another, is_strained
 from dase.diagnosis.seen_effects import (
     SeenEffects,
     find_seen_effects,
@@ -253,3 +253,16 @@ def test_a_hint_of_a_far_smaller_size_explains_nothing():
         seen = SeenEffects((replace(lamp({"frequency": frequency}), size=size),))
         entries = tuple(one for one in seen.entries if not shows_in([small], one))
         assert len(entries) == left
+
+
+@pytest.mark.parametrize(("spread", "period", "in_doubt"), [
+    (0.05, 5e-3, True), (0.2, 5e-3, False), (0.05, 0.0, False), (0.05, None, False),
+])  # fmt: skip
+def test_a_little_jitter_beside_a_dead_time_is_in_doubt(spread, period, in_doubt):
+    sensor = Sensor().with_effect(EFFECTS["jitter"](spread=spread))
+    if period is not None:
+        sensor = sensor.with_effect(EFFECTS["refractory"](period=period))
+    model = model_of(sensor)
+    got = is_small_beside_another(model, "jitter.spread", Estimate(spread, 0.9 * spread, 1.1 * spread))
+    assert got == in_doubt
+    assert not is_small_beside_another(model, "threshold.on", Estimate(0.1, 0.1, 0.1))
