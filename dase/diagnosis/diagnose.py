@@ -138,6 +138,13 @@ def diagnose(
         plenty=settings.plenty, pixels=pixels, seed=seed, device=device,
     )  # fmt: skip
     evidence = split()
+    notes = list[str]()
+    if evidence.parts_differ:
+        evidence = split(all_time=True)
+        notes.append(
+            "light rests in one part of the time and not in the other: all of it is fitted, and other pixels "
+            "judge"
+        )
     given = put_in_step(given, evidence)
     free = free_where_measured(evidence, given, free)
     tell("fitting the present model", 0.0, float("nan"))
@@ -146,7 +153,7 @@ def diagnose(
     known = {HOT} if hot is not None else set[str]()
     known |= {DEAD} if silent is not None and silent.decides else set()
     tried = {name: effect for name, effect in effects.items() if name not in known}
-    state = DiagnosisState(evidence, tried, seed, tell, names, settings)
+    state = DiagnosisState(evidence, tried, seed, tell, names, settings, notes=notes)
     if so_far is not None:
         state.after_step = lambda model, errors: so_far(
             measurement.noted(_known_so_far(state, model, errors, before, time.perf_counter() - begin))

@@ -70,6 +70,13 @@ class SplitSettings:
     least_events: int = 300
     """Events that a part must have for anything to be said."""
 
+    large: float = 0.25
+    """Share of the pixels' time at rest, or not at rest, that the later part of the time must have for the
+    fitted part to lack it."""
+
+    small: float = 0.25
+    """What the fitted part has of it at most, in units of that."""
+
     burst: float = 2e-3
     """Events are counted for so long to see how fast they come at most [s]: long enough for many of them,
     and short enough for a bus to be full all the time."""
@@ -147,6 +154,18 @@ class SplitMeasurement:
     def light_never_changes(self) -> bool:
         """Whether no pixel sees a change of light, so that nothing tells how much change an event takes."""
         return all(half.trials.stimulus.never_changes for half in (self.train, self.held, self.report))
+
+    @property
+    def parts_differ(self) -> bool:
+        """Whether the time that is fitted hardly has the rest, or the change, of light that the later has.
+
+        What a sensor sends at rest cannot be fitted where nothing rests.
+        """
+        fitted, later = (half.trials.stimulus.share_at_rest() for half in (self.train, self.held))
+        return any(
+            there > SPLIT.large and here < SPLIT.small * there
+            for here, there in ((fitted, later), (1.0 - fitted, 1.0 - later))
+        )
 
     @property
     def evaluations(self) -> int:

@@ -120,6 +120,11 @@ class Stimulus:
         out: NDArray[np.float32] = np.log(light + np.float32(self.log_eps))
         return out
 
+    def share_at_rest(self) -> float:
+        """Return the share of the compared time of all pixels in which light has been at rest for a while."""
+        time = self.exposure().reshape(KINDS, BANDS)
+        return float(time[:RESTING].sum() / max(float(time.sum()), 1e-12))
+
     def exposure(self) -> NDArray[np.float64]:
         """Return the time spent in each cell, summed over pixels [px s], shape (CELLS,)."""
         # counting makes 8 bytes of each, so some pixels at a time
