@@ -139,7 +139,8 @@ def diagnose(
     )  # fmt: skip
     evidence = split()
     notes = list[str]()
-    if evidence.parts_differ:
+    all_time = evidence.parts_differ
+    if all_time:
         evidence = split(all_time=True)
         notes.append(
             "light rests in one part of the time and not in the other: all of it is fitted, and other pixels "
@@ -165,7 +166,6 @@ def diagnose(
     )
     start = _fitted_unless_worse(state, given, free)
     seen = without_the_scene(seen, measurement, start.sensor, seed)
-
     scene = measurement.scene
     guessed = scene if isinstance(scene, CameraScene) and is_guessed(scene) else None
     if guessed is not None:
@@ -198,7 +198,7 @@ def diagnose(
     limit = 0 if evidence.contradiction else most
     model, judgement = _add_one_by_one(state, start, limit)
     run = 0  # models before the measurement was split anew
-    if limit > 0 and _shows_later_alone(state, model, judgement):
+    if limit > 0 and not all_time and _shows_later_alone(state, model, judgement):
         tell("fitting all of the time", 0.0, judgement.error)
         run, evidence = evidence.evaluations, split(all_time=True)
         if guessed is not None:

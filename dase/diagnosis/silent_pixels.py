@@ -31,7 +31,7 @@ NAME = Dead.name
 class SilentPixelSettings:
     """Of which pixels events are expected, and how many silent ones there must be of them.
 
-    Chosen on scenes of keys `dev1` and `dev2` of the blind benchmark.
+    Chosen on scenes of key `dev1` of the blind benchmark.
     """
 
     times: int = 64
