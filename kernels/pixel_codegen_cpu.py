@@ -164,8 +164,22 @@ class Lanes:
             found += [self.loop(together)] if together else []
             together = []
             some = " or ".join(f"{effect.name}_some != 0" for effect in statement.acting)
-            found.append(if_block(some, self.loop((statement,))))
+            found.append(if_block(some, self.loop(self._chosen_by_lane(statement))))
         return (*found, self.loop(together)) if together else tuple(found)
+
+    def _chosen_by_lane(self, statement: Block) -> tuple[Statement, ...]:
+        """Return a condition as statements for all lanes, of which each then takes the new values or the old.
+
+        Left as a condition, it becomes stores of some lanes alone, and the next loop, which loads the whole
+        vector, would have to wait until they are in the cache.
+        """
+        condition = statement.head.removeprefix("if ").removesuffix(":")
+        changed = [name for name in names_written(statement.body) if name in self.kinds]
+        return (
+            *lines(*(f"{name}_was = {name}" for name in sorted(changed))),
+            *statement.body,
+            *lines(*(f"{name} = wp.where({condition}, {name}, {name}_was)" for name in sorted(changed))),
+        )
 
 
 def lane_scope(lanes: int, source: str) -> dict[str, Any]:

@@ -30,6 +30,7 @@ from numpy.typing import NDArray
 from dase.diagnosis.directional_test import deviation_towards
 from dase.diagnosis.settings import GradeSettings
 from dase.diagnosis.state import DiagnosisState, with_same_freedom
+from dase.fitting.early_stopping import CandidateRace
 from dase.fitting.model import FittedModel, refit_work
 from dase.fitting.scene_doubt import misfit_beyond_chance
 from dase.fitting.scheduler import run_side_by_side
@@ -271,8 +272,13 @@ def _equally_good_rivals(
             asked.append((name, other.name, with_same_freedom(sensor, model, [other.name])))
     out: dict[str, list[str]] = {name: [] for name in found}
     if asked:
+        # one that will not come near the model in its fit is none; the slowest take longer than all else
+        race = CandidateRace(1, settings.rival_loses, best={"": model.loss})
         fitted = run_side_by_side(
-            [refit_work(state.evidence, one, seed=seed, rounds=2) for _, _, one in asked]
+            [
+                refit_work(state.evidence, one, seed=seed, rounds=2, over=race.over(f"{name} {other}"))
+                for name, other, one in asked
+            ]
         )
         stream = SimulationStream.JUDGE.seed(seed)
         works = [

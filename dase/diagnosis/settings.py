@@ -180,6 +180,9 @@ class GradeSettings:
     rivals: int = 3
     """Rivals tried at most for each effect."""
 
+    rival_loses: float = 2.0
+    """A rival is fitted no further where its loss will not come below this, in units of the best's."""
+
     tie: float = 0.15
     """A rival that leaves no more than this beyond what the effect leaves is not told apart from it."""
 

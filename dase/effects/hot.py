@@ -9,6 +9,7 @@ import warp as wp
 
 from dase.effects.base import Effect, Observations, choice, parameter
 from dase.kernels.pixel_stages import EffectStages
+from dase.kernels.vector_math import exponential
 
 
 @wp.func
@@ -18,7 +19,7 @@ def hot_rates(
     """ON and OFF rates [Hz], none for a sound pixel."""
     total = float(0.0)
     if pixel_uniform < share:
-        total = rate * wp.exp(spread * pixel_normal)
+        total = rate * exponential(spread * pixel_normal)
     return total * balance, total * (1.0 - balance)
 
 
@@ -39,7 +40,7 @@ def hot_drift(
     if pixel_uniform < share:
         speed = (
             rate
-            * wp.exp(spread * pixel_normal)
+            * exponential(spread * pixel_normal)
             * wp.where(pixel_uniform_2 < balance, nominal_on, -nominal_off)
         )
     return speed

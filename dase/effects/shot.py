@@ -9,6 +9,7 @@ from typing import ClassVar, Self
 import warp as wp
 
 from dase.effects.base import Effect, Observations, parameter
+from dase.kernels.vector_math import exponential
 
 
 @wp.func
@@ -30,9 +31,8 @@ def shot_rates(
     light = wp.clamp(intensity, 0.0, 1.0)
     near = 1.0 / (1.0 + light / knee)
     total = rate * (bright + (1.0 - bright) * (1.0 - light) * near * near)
-    if spread > 0.0:
-        # the half square keeps the mean over pixels at the rate
-        total = total * wp.exp(spread * (pixel_normal - 0.5 * spread))
+    # the half square keeps the mean over pixels at the rate; without a spread this is 1 to the bit
+    total = total * exponential(spread * (pixel_normal - 0.5 * spread))
     way_on = wp.where(threshold > 0.0, threshold, nominal_on)
     way_off = wp.where(threshold > 0.0, threshold, nominal_off)
     return total * balance * (way_on / on), total * (1.0 - balance) * (way_off / off)

@@ -21,6 +21,7 @@ from dase.events import Events
 from dase.fitting.bus_load import BusLoad
 from dase.fitting.parameter_space import SearchAxis
 from dase.fitting.readout_simulator import clock_of, noticeable_effects, pass_readout, simulate_pixels
+from dase.fitting.trial_kernels import CHOICE, KERNELS, KernelChoice, KernelSettings
 from dase.fitting.trial_sampling import SAMPLES, samples_per_step_of_rows
 from dase.kernels import event_probes as kernels
 from dase.kernels import launch, pixel_codegen_trials
@@ -42,16 +43,11 @@ from dase.simulation.sensor import Sensor
 class SimulatorSettings:
     """How launches are made up; speed and memory depend on it, results do not."""
 
-    own_kernel: int
-    """Effects up to which a sensor has a kernel of its own, up to twice as fast. Those with more share one
-    that has all effects: it is compiled once, and not for each of hundreds of combinations."""
-
-    own_work: float
-    """Samples of pixels [models x pixels x samples] from which on such a sensor has one, too: those of the
-    shared kernel have then cost about as much more as compiling another takes, and as many may come."""
-
     sums_bytes: int
     """Memory for the sums of one launch [bytes]."""
+
+    kernels: KernelSettings
+    """When a sensor's own kernel is taken."""
 
     streamed: int = 32
     """Models whose events are stored at a time: some hundred megabytes where each sends millions."""
@@ -59,9 +55,8 @@ class SimulatorSettings:
 
 LAUNCHES = {
     # the sums should stay in the caches
-    "cpu": SimulatorSettings(own_kernel=1, own_work=5e8, sums_bytes=1 << 26),
-    # so that all candidates run in one launch
-    "cuda": SimulatorSettings(own_kernel=0, own_work=math.inf, sums_bytes=1 << 31),
+    "cpu": SimulatorSettings(sums_bytes=1 << 26, kernels=KERNELS["cpu"]),
+    "cuda": SimulatorSettings(sums_bytes=1 << 31, kernels=KERNELS["cuda"]),
 }
 
 
@@ -74,7 +69,8 @@ class SimulationOrder:
         vectors: Shape (B, P).
         seed: Of the random numbers.
         reseed: Whether each vector gets random numbers of its own.
-        finer: Samples per step; None chooses by each model, and by the one that needs most for repeats.
+        finer: Samples per step; None chooses by what models need, see `in_whole_blocks`; repeats take what
+            the one of them needs that needs most.
         frame: What the counts of pixels are folded for; None where that is not known yet.
         ticks: From tick to tick of the clock that stamps the events [s], 0 for none.
         most: Samples per step that no model exceeds, whatever it needs.
@@ -95,7 +91,7 @@ class SimulationOrder:
         if self.finer is not None:
             return np.full(rows, self.finer)
         found = np.minimum(samples_per_step_of_rows(self.sensor, self.vectors, step), self.most)
-        return np.full(rows, found.max(initial=0)) if self.reseed else found
+        return np.full(rows, found.max(initial=0)) if self.reseed else in_whole_blocks(found)
 
     def seeds(self) -> NDArray[np.int64]:
         """Return the seed of each vector, shape (B,)."""
@@ -115,6 +111,7 @@ class BatchSimulator:
         evaluations: Models run so far.
         work: Pixels times seconds run so far [px s].
         settings: How launches are made up; None for what suits the device.
+        choice: Which sensors have kernels of their own.
     """
 
     stimulus: Stimulus
@@ -124,11 +121,10 @@ class BatchSimulator:
     evaluations: int = 0
     work: float = 0.0
     settings: SimulatorSettings | None = None
+    choice: KernelChoice = CHOICE
     _kernels: dict[Any, tuple[wp.Kernel, NDArray[np.float32], list[int]]] = field(
         default_factory=dict, repr=False
     )
-
-    _kernel_work: Counter[Any] = field(default_factory=Counter, repr=False)
 
     def __post_init__(self) -> None:
         self.device = self.stimulus.device
@@ -152,26 +148,16 @@ class BatchSimulator:
 
     def run_all(self, orders: Sequence[SimulationOrder]) -> list[ProbeSums]:
         """Simulate many models; those that have a kernel in common run together, whatever their effects."""
-        together: dict[Any, list[tuple[int, NDArray[np.int64]]]] = {}
-        done = Counter[Any]()
-        for n, order in enumerate(orders):
-            each = order.samples_per_step(self.stimulus.grid.step)
-            kernel = self._kernel(order.sensor)[0]
-            # maps are of one sensor, so a launch has either none or those of a single order
-            maps = n if any(effect.maps for effect in order.sensor.effects) else -1
-            for finer in np.unique(each).tolist():
-                # the same stages give the same kernel object, whatever the sensor
-                together.setdefault((finer, id(kernel), maps), []).append((n, np.flatnonzero(each == finer)))
         parts: list[list[tuple[NDArray[np.int64], ProbeSums]]] = [[] for _ in orders]
-        for (finer, _, _), members in together.items():
+        for finer, share, members in self._launches_of(orders):
             cut = [replace(orders[n], vectors=orders[n].vectors[rows], finer=finer) for n, rows in members]
-            for (n, rows), sums in zip(members, self._run(cut, self.stimulus.history(finer)), strict=True):
+            done = self._run(cut, self.stimulus.history(finer), share=share)
+            for (n, rows), sums in zip(members, done, strict=True):
                 parts[n].append((rows, sums))
             for order in cut:
                 samples = self.stimulus.grid.steps * max(finer, 1)
-                done[_kernel_key(order.sensor)] += len(order.vectors) * len(self.stimulus.pixels) * samples
-        # only now: launches have been put together by kernels
-        self._kernel_work.update(done)
+                work = len(order.vectors) * len(self.stimulus.pixels) * samples
+                self.choice.work[_kernel_key(order.sensor)] += work
         out = []
         for found in parts:
             joined = ProbeSums.join([sums for _, sums in found])
@@ -179,14 +165,44 @@ class BatchSimulator:
             out.append(joined if len(found) == 1 else joined.select(order_of_rows))
         return out
 
-    def _run(self, orders: Sequence[SimulationOrder], history: Any) -> list[ProbeSums]:
-        """Simulate models that have a kernel in common."""
+    def _launches_of(
+        self, orders: Sequence[SimulationOrder]
+    ) -> list[tuple[int, bool, list[tuple[int, NDArray[np.int64]]]]]:
+        """Return what runs in one launch: samples per step, whether in the kernel of all effects, orders.
+
+        Of each order the rows that take part.
+        """
+        # of one number of samples and one combination of effects
+        pieces: dict[tuple[int, Any, int], list[tuple[int, NDArray[np.int64]]]] = {}
+        for n, order in enumerate(orders):
+            each = order.samples_per_step(self.stimulus.grid.step)
+            # maps are of one sensor, so a launch has either none or those of a single order
+            maps = n if any(effect.maps for effect in order.sensor.effects) else -1
+            for finer in np.unique(each).tolist():
+                key = finer, _kernel_key(order.sensor), maps
+                pieces.setdefault(key, []).append((n, np.flatnonzero(each == finer)))
+        beside = Counter((finer, maps) for finer, _, maps in pieces)
+        out: dict[Any, tuple[int, bool, list[tuple[int, NDArray[np.int64]]]]] = {}
+        for (finer, key, maps), members in pieces.items():
+            stages, settings = orders[members[0][0]].sensor.stages(), self._launches.kernels
+            share = not self.choice.has_own(key, stages, settings, lanes=self._lanes)
+            rows = sum(len(of) for _, of in members)
+            # few models fill the lanes only beside others, with which they have the kernel of all effects in
+            # common
+            filled = rows / (self._lanes * -(-rows // self._lanes))
+            share |= len(stages) > settings.effects and beside[finer, maps] > 1 and filled < settings.filled
+            launch_key = (finer, maps, None if share else key)
+            out.setdefault(launch_key, (finer, share, []))[2].extend(members)
+        return list(out.values())
+
+    def _run(self, orders: Sequence[SimulationOrder], history: Any, *, share: bool) -> list[ProbeSums]:
+        """Simulate models through a kernel that they have in common: that of all effects, or their own."""
         kernel, maps = (
-            self._kernel(orders[0].sensor)[0],
+            self._kernel(orders[0].sensor, share)[0],
             orders[0].sensor.maps(self.stimulus.pixels, self.device),
         )
         count, seeds = len(self.stimulus.pixels), np.concatenate([order.seeds() for order in orders])
-        rows = np.concatenate([self._kernel_vectors(order) for order in orders])
+        rows = np.concatenate([self._kernel_vectors(order, share) for order in orders])
         ends = np.cumsum([len(order.vectors) for order in orders])
         begins = np.concatenate([[0], ends[:-1]])
         # in whole picoseconds, as the clock of a readout has them: the same stamps to the bit
@@ -235,9 +251,9 @@ class BatchSimulator:
         out[:, 0] = order.ticks > 0 and self.structure.step > 0
         return out
 
-    def _kernel_vectors(self, order: SimulationOrder) -> NDArray[np.float32]:
+    def _kernel_vectors(self, order: SimulationOrder, share: bool) -> NDArray[np.float32]:
         """Return parameter vectors as the kernel takes them, shape (B, all parameters of the kernel)."""
-        _, base, at = self._kernel(order.sensor)
+        _, base, at = self._kernel(order.sensor, share)
         out = np.repeat(base[None], len(order.vectors), 0)
         out[:, at] = order.vectors
         return out
@@ -251,14 +267,12 @@ class BatchSimulator:
         )
         numbers += count * (kernels.MEMORY + kernels.HALVES)
         # a thread takes as long for one model as for all its lanes
-        return max(self._lanes, self._launches.sums_bytes // (4 * numbers))
+        blocks = self._launches.sums_bytes // (4 * numbers * self._lanes)
+        return self._lanes * max(1, blocks)
 
-    def _kernel(self, sensor: Sensor) -> tuple[wp.Kernel, NDArray[np.float32], list[int]]:
+    def _kernel(self, sensor: Sensor, share: bool) -> tuple[wp.Kernel, NDArray[np.float32], list[int]]:
         """Return the kernel of a sensor, a parameter vector for it, and the places of the sensor's own."""
-        stages, of_effects = sensor.stages(), _kernel_key(sensor)
-        rare = self._kernel_work[of_effects] < self._launches.own_work
-        share = len(stages) > self._launches.own_kernel and rare
-        key = of_effects, share
+        key = _kernel_key(sensor), share
         if key not in self._kernels:
             # what the sensor lacks is off in the wide one, and off changes nothing, bit for bit
             wide = with_every_effect(sensor) if share else sensor
@@ -405,6 +419,27 @@ class BatchSimulator:
         launch.run_kernel(kernels.sum_group_counts, steps, [teams, out], self.device, batch=rows, slabs=1)
         found: NDArray[np.int32] = out.numpy()
         return found
+
+
+def in_whole_blocks(needed: NDArray[np.int64], most: float = 2.0) -> NDArray[np.int64]:
+    """Return the samples per step that models take who need so many, shape (B,).
+
+    A thread of a CPU takes as long for one model as for all its lanes, so some take part in finer sampling,
+    which is as right, where their lanes would lie empty. So do they on a GPU, for the same results. More
+    neighbours of a descent have their random numbers in common then, too.
+
+    Args:
+        needed: Samples per step, shape (B,).
+        most: A model takes at most so many times what it needs, for rows of other orders that need as many
+            may fill its lanes.
+    """
+    out, order, first = needed.copy(), np.argsort(-needed, kind="stable"), 0
+    while first < len(order):
+        block = order[first : first + kernels.LANES]
+        block = block[most * needed[block] >= needed[block[0]]]
+        out[block] = needed[block[0]]
+        first += len(block)
+    return out
 
 
 def _fold_for_frames(orders: Sequence[SimulationOrder], pixels: Any) -> NDArray[np.float64] | None:

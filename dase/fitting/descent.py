@@ -12,6 +12,7 @@ from dase.fitting.parameter_space import ParameterSpace
 from dase.fitting.scheduler import SimulationRequest, Work
 from dase.fitting.subset import CalibratedSubset
 from dase.fitting.trial_sampling import SAMPLES
+from dase.kernels.event_probes import LANES
 from dase.probes.distance import ErrorScale
 from dase.probes.random_streams import Draw
 
@@ -186,11 +187,16 @@ def distance_penalty(places: Array, start: Array, prior: float = DESCENT.prior) 
 
 
 def _cross_population(rng: np.random.Generator, size: int) -> Array:
-    """Return both ways along the axes of a random frame, and some directions more, shape (2 P + 2, P)."""
+    """Return both ways along the axes of a random frame, and one direction more, shape (2 P + 2, P).
+
+    Where that and the middle fill one block of a CPU's lanes but for the last direction, it is left out.
+    """
     # along the axes themselves, two parameters that make up for each other would look like none
     frame, _ = np.linalg.qr(rng.standard_normal((size, size)))
     # each direction goes as far as the reach along the axis on which it goes farthest
     frame *= np.sqrt(size) / np.maximum(np.abs(frame).max(1, keepdims=True) * np.sqrt(size), 1e-9)
+    if -(-(2 * size + 1) // LANES) < -(-(2 * size + 3) // LANES):
+        return np.concatenate([frame, -frame])
     more = rng.standard_normal((1, size))
     more /= np.abs(more).max()
     return np.concatenate([frame, -frame, more, -more])

@@ -7,6 +7,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+import warp as wp
 
 import dase
 from dase.effects.flicker import Flicker
@@ -18,8 +19,10 @@ from dase.effects.voltage_noise import VoltageNoise
 from dase.fitting.batch_simulator import LAUNCHES, BatchSimulator, SimulationOrder
 from dase.fitting.descent import descent_work, ranking_work
 from dase.fitting.parameter_space import ParameterSpace, axes_of
+from dase.fitting.trial_kernels import KernelChoice, KernelSettings
 from dase.fitting.trial_sampling import samples_of_screening, samples_per_step, samples_per_step_of_rows
 from dase.kernels import launch
+from dase.kernels.event_probes import LANES
 from dase.probes.stimulus import STIMULUS, Grid, Stimulus, sort_into_cells
 
 STEP, SIZE, SECONDS = 1e-3, (20, 16), 0.3
@@ -88,9 +91,14 @@ def test_models_are_sampled_as_each_of_them_needs(trials):
     vectors[:, at] = 3000.0, 20.0, 400.0, 1000.0
     assert samples_per_step_of_rows(sensor, vectors, STEP).tolist() == [24, 1, 4, 8]
     assert samples_per_step(sensor, STEP) == 2
+    # lanes of one thread take as long for one model as for all, so what is nearly as fine is sampled alike
+    taken = SimulationOrder(sensor, vectors, 5).samples_per_step(STEP)
+    assert taken.tolist() == [24, 1, 8, 8]
+    many = SimulationOrder(sensor, np.concatenate([np.repeat(vectors[3:], LANES, 0), vectors]), 5)
+    assert many.samples_per_step(STEP).tolist() == [8] * LANES + [24, 1, 8, 8]
     together = trials.run(sensor, vectors, seed=5)
     for n in range(4):
-        alone = trials.run(sensor, vectors[n : n + 1], seed=5)
+        alone = trials.run(sensor, vectors[n : n + 1], seed=5, finer=taken[n])
         np.testing.assert_array_equal(together.sums[n], alone.sums[0])
         np.testing.assert_array_equal(together.halves[n], alone.halves[0])
         np.testing.assert_array_equal(together.clock[n], alone.clock[0])
@@ -138,12 +146,40 @@ def test_a_kernel_of_its_own_gives_the_same_bits(trials):
         pytest.skip("on a GPU all candidates share a kernel")
     sensor = sensor_with(Leak(rate=2.0), Refractory(period=4e-3))
     vectors = np.repeat(sensor.parameters()[None], 3, 0)
-    settings = replace(
-        LAUNCHES["cpu"], own_work=3.0 * trials.stimulus.grid.steps * len(trials.stimulus.pixels)
-    )
-    few = BatchSimulator(trials.stimulus, settings=settings)
+    once = 3.0 * trials.stimulus.grid.steps * len(trials.stimulus.pixels)
+    settings = replace(LAUNCHES["cpu"], kernels=KernelSettings(effects=1, ask=np.inf, compile=once))
+    few = BatchSimulator(trials.stimulus, settings=settings, choice=KernelChoice())
     first, second = (few.run(sensor, vectors, seed=5) for _ in range(2))
     assert len(few._kernels) == 2
     assert first.halves.sum() > 300
     np.testing.assert_array_equal(second.halves, first.halves)
     np.testing.assert_array_equal(second.sums, first.sums)
+
+
+def test_parts_of_a_measurement_share_what_is_known_of_kernels(trials):
+    """A kernel that was compiled before is taken once it is asked for, by all simulators of a process."""
+    if trials.device.is_cuda:
+        pytest.skip("on a GPU all candidates share a kernel")
+    sensor = sensor_with(Leak(rate=2.0), Refractory(period=4e-3))
+    vectors = np.repeat(sensor.parameters()[None], 3, 0)
+    compile_text = KernelSettings(effects=len(sensor.stages()), ask=0, compile=np.inf)
+    own = BatchSimulator(trials.stimulus, settings=replace(LAUNCHES["cpu"], kernels=compile_text))
+    own.run(sensor, vectors, seed=5)  # compiles it
+    choice, ask = KernelChoice(), replace(LAUNCHES["cpu"], kernels=KernelSettings(1, 1.0, np.inf))
+    first, second = (BatchSimulator(trials.stimulus, settings=ask, choice=choice) for _ in range(2))
+    for simulator in (first, second):
+        simulator.run(sensor, vectors, seed=5)
+    assert [shared for _, shared in (*first._kernels, *second._kernels)] == [True, False]
+
+
+def test_what_no_process_has_compiled_is_not_compiled_to_find_out(trials, tmp_path, monkeypatch):
+    if trials.device.is_cuda:
+        pytest.skip("on a GPU all candidates share a kernel")
+    sensor = sensor_with(Leak(rate=2.0), Refractory(period=4e-3))
+    vectors = np.repeat(sensor.parameters()[None], 3, 0)
+    monkeypatch.setattr(wp.config, "kernel_cache_dir", str(tmp_path))
+    ask = replace(LAUNCHES["cpu"], kernels=KernelSettings(1, 1.0, np.inf))
+    simulator = BatchSimulator(trials.stimulus, settings=ask, choice=KernelChoice())
+    for _ in range(2):
+        simulator.run(sensor, vectors, seed=5)
+    assert [shared for _, shared in simulator._kernels] == [True]
