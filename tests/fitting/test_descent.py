@@ -119,6 +119,17 @@ def test_noise_passes_the_dead_time_of_a_fit_where_it_does(device):
     assert modes == {("reset", "passes"), ("drop", "passes")}
 
 
+def test_a_fit_tells_offsets_of_comparators_from_shares_of_thresholds(device):
+    scene, base = moving_bars(), Sensor().with_effect(EFFECTS["threshold"](on=0.15, off=0.45))
+    true = EFFECTS["mismatch"](spread=0.2, relative_to="mean")
+    events = dase.simulate(scene, base.with_effect(true), seed=4, device=device)
+    found = split_measurement(events, scene, pixels=300, seed=1, device=device)
+    start = model_of(base.with_effect(replace(true, relative_to="own")))
+    assert refit_model(found, start, seed=0, rounds=1).sensor["mismatch"].relative_to == "mean"
+    # with thresholds alike it is no question
+    assert not true.otherwise([EFFECTS["threshold"](on=0.2, off=0.21)])
+
+
 def test_rules_of_what_is_not_free_are_left_alone():
     sensor = Sensor().with_effect(EFFECTS["refractory"](period=6e-3, mode="reset"))
 
