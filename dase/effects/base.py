@@ -311,6 +311,10 @@ class Effect:
         """
         return []
 
+    def idle(self) -> tuple[str, ...]:
+        """Return the names of the parameters that change nothing by the words that this effect has."""
+        return ()
+
     def longest_step(self) -> float:
         """Return the longest time between samples that still shows the effect [s]."""
         return math.inf

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import ClassVar, Self
 
@@ -32,6 +33,12 @@ def fresh_variance(x: float, kept: float):
         var = y * y * y * (1.0 / 6.0 - y * (1.0 / 8.0 - y * (1.0 / 20.0 - y / 72.0)))
     return wp.max(var, 1.0e-30), mixed, 1.0 - kept * (1.0 - y + 0.5 * y * y)
 
+
+USUAL = 0.2
+"""Light in which noise of both kinds is alike where one takes the place of the other [intensity]."""
+
+ANY_SAMPLES = 1e6
+"""Time between samples [s] of noise that is drawn at those of the scene, at all of them: in finite time."""
 
 STEEP = wp.constant(2.0)
 """Time constants in a step up to which the speeds at its ends tell where the voltage has been in between."""
@@ -101,6 +108,18 @@ def noisy_voltage(
     top, way = turning_voltage(noise, near * speed, now, near * speed_now)
     top += way * CREST * near * wp.sqrt(near * (1.0 - share)) * sigma
     return voltage + top, now, speed_now
+
+
+@wp.func
+def noise_by_samples(
+    voltage: float, dt: float, sigma: float, cutoff: float, noise: float, uniform: float, uniform_2: float
+):
+    """Voltage with noise behind one pole as it is at the samples, whatever the light."""
+    kept = exponential(-wp.min(2.0 * wp.pi * cutoff * dt, 100.0))
+    normal, _ = cosine_and_sine(uniform_2)
+    scale = sigma * wp.sqrt(-2.0 * logarithm(1.0 - uniform) * (1.0 - kept * kept))
+    now = kept * noise + scale * normal
+    return voltage + now, now, float(0.0)
 
 
 @wp.func
@@ -204,6 +223,11 @@ class VoltageNoise(Effect):
     A loop asks for some sqrt(25 (1 + gain) / knee) samples, where that is more. The node's pole is that of
     `bandwidth` where that has cutoff · (1 + dark) / knee and dark / (1 + dark), see `of_photoreceptor`.
 
+    With `poles = "one"` it is what other simulators draw (v2e's photoreceptor noise): noise behind one pole
+    at `cutoff`, of the same variance sigma² in all light, drawn once at each sample of the scene, and a
+    straight line in between. Noise of one pole is so rough that its events depend on the sampling: it belongs
+    to scenes whose frames are those that the other simulator has seen.
+
     An ideal memory moves by whole thresholds, so a pixel keeps the phase that it began with, and pixels which
     are alike differ in their rates. One that is held in reset after its events (`refractory`) memorises the
     noise of a later moment: a dead time of a time constant, 1 / (9.8 · corner), forgets the phase within some
@@ -259,14 +283,40 @@ class VoltageNoise(Effect):
     )
     poles: str = choice(
         "alike",
-        among=("alike", "apart"),
-        about="two equal ones at the corner of both, or one that follows the light and a fixed one",
+        among=("alike", "apart", "one"),
+        about="two equal ones at the corner of both, or one that follows the light and a fixed one, or a "
+        "single fixed one whose noise is drawn at each sample of the scene",
     )
 
     @classmethod
     def candidates(cls, observed: Observations) -> list[Self]:
-        """Return the noise of equal poles: spectra of both differ less than recordings tell."""
+        """Return the noise of equal poles: spectra of both differ less than recordings tell.
+
+        A fit asks whether it is that of another simulator.
+        """
         return [cls()]
+
+    def otherwise(self, beside: Sequence[Effect]) -> list[Self]:
+        """Return noise of one pole for that of two equal ones, and the other way round.
+
+        Both have the same variance and corner in light of `USUAL`.
+        """
+        if self.poles == "apart":
+            return []  # is named by who has it, and never found by a search
+        share = USUAL / (USUAL + self.knee)
+        if self.poles == "alike":
+            return [
+                replace(
+                    self, sigma=self.sigma * math.sqrt(1 - share), cutoff=self.cutoff * share, poles="one"
+                )
+            ]
+        return [
+            replace(self, sigma=self.sigma / math.sqrt(1 - share), cutoff=self.cutoff / share, poles="alike")
+        ]
+
+    def idle(self) -> tuple[str, ...]:
+        """Return the names of the parameters that change nothing by its rule."""
+        return {"alike": ("gain",), "apart": (), "one": ("knee", "dark", "gain")}[self.poles]
 
     @classmethod
     def of_photoreceptor(cls, pole: Bandwidth, *, sigma: float, cutoff: float, gain: float = 0.0) -> Self:
@@ -285,10 +335,8 @@ class VoltageNoise(Effect):
 
     def compiled(self) -> EffectStages:
         """Return what the kernel composer needs to know."""
-        stages = super().compiled()
-        if self.poles == "alike":
-            return stages
-        return replace(stages, functions=(("respond", photoreceptor_noise),))
+        respond = {"alike": noisy_voltage, "apart": photoreceptor_noise, "one": noise_by_samples}[self.poles]
+        return replace(super().compiled(), functions=(("respond", respond),))
 
     def longest_step(self) -> float:
         """Return the longest time between samples that still shows the effect [s]."""
@@ -297,6 +345,8 @@ class VoltageNoise(Effect):
         step = 1 / (8 * self.cutoff)
         if self.poles == "alike":
             return step
+        if self.poles == "one":
+            return ANY_SAMPLES
         # slopes tell where the voltage turns up to so many time constants of the node, in the brightest
         # light; the loop's pace is the geometric mean of those of the poles, and faster by the gain
         node = STEEP * self.knee / (2 * math.pi * self.cutoff * (1 + self.dark))

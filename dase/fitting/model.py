@@ -260,14 +260,26 @@ def ways_otherwise(model: FittedModel, names: Collection[str] | None = None) -> 
         names: Of the effects whose rules are changed; None for all of which something is free, and for the
             phase, which belongs to no camera.
     """
-    sensor = model.space.sensor
     acting = [effect for effect in model.sensor.effects if not effect.is_off() or effect.name == PHASED]
     free = {PHASED, *(axis.effect.name for axis in model.space.axes)} if names is None else set(names)
     return [
-        replace(model, space=replace(model.space, sensor=sensor.with_effect(other)))
+        _with_rule(model, other)
         for effect in acting if effect.name in free
-        for other in sensor[effect.name].otherwise([one for one in acting if one.name != effect.name])
+        for other in effect.otherwise([one for one in acting if one.name != effect.name])
     ]  # fmt: skip
+
+
+def _with_rule(model: FittedModel, other: Effect) -> FittedModel:
+    """Return a model with one of its effects by another rule, and what is idle by it not free."""
+    name, before = other.name, model.sensor[other.name]
+    same = model.space.sensor.with_effect(other)
+    if set(before.idle()) == set(other.idle()):
+        return replace(model, space=replace(model.space, sensor=same))
+    sensor = model.sensor.with_effect(other)
+    usual = free_of(sensor, name)
+    free = [a.name for a in model.space.axes if a.effect is not type(other) or a.name in usual]
+    whole = {a.name for a in model.space.axes} >= set(free_of(model.sensor, name))
+    return replace(model_of(sensor, [*free, *usual] if whole else free), loss=model.loss)
 
 
 def refit_work(

@@ -130,6 +130,19 @@ def test_a_fit_tells_offsets_of_comparators_from_shares_of_thresholds(device):
     assert not true.otherwise([EFFECTS["threshold"](on=0.2, off=0.21)])
 
 
+def test_what_is_idle_by_another_rule_is_not_free_there():
+    sensor = Sensor().with_effect(EFFECTS["voltage_noise"](sigma=0.1, cutoff=200.0, knee=0.1))
+    model = model_of(sensor)
+    (other,) = (one for one in ways_otherwise(model) if one.sensor["voltage_noise"].poles == "one")
+    assert set(model.space.names) - set(other.space.names) == {"voltage_noise.knee"}
+    (back,) = (one for one in ways_otherwise(other) if one.sensor["voltage_noise"].poles == "alike")
+    assert back.space.names == model.space.names
+    np.testing.assert_allclose(back.place, model.place, atol=1e-12)
+    # of what is named no more is free than was
+    few = model_of(sensor, ["voltage_noise.sigma"])
+    assert all(len(one.place) == 1 for one in ways_otherwise(few))
+
+
 def test_rules_of_what_is_not_free_are_left_alone():
     sensor = Sensor().with_effect(EFFECTS["refractory"](period=6e-3, mode="reset"))
 

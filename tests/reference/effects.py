@@ -137,6 +137,13 @@ def voltage_noise(
     effect = sensor["voltage_noise"]
     if effect.poles == "apart":
         return photoreceptor_noise(times, intensity, effect, normals)
+    if effect.poles == "one":
+        # an autoregressive process of first order, once a sample
+        kept = np.exp(-2 * np.pi * effect.cutoff * np.diff(times))
+        out = effect.sigma * normals[0]
+        for k, share in enumerate(kept, 1):
+            out[k] = share * out[k - 1] + np.sqrt(1 - share**2) * out[k]
+        return out
     total = intensity + effect.dark
     corner = effect.cutoff * total / (total + effect.knee)
     sigma = effect.sigma * np.sqrt(effect.knee / (total + effect.knee))
