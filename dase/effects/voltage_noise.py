@@ -12,7 +12,7 @@ import warp as wp
 from dase.effects.bandwidth import Bandwidth
 from dase.effects.base import Effect, Observations, choice, parameter
 from dase.effects.second_order import impulse_response
-from dase.kernels.pixel_stages import EffectStages
+from dase.kernels.pixel_stages import REST, EffectStages
 from dase.kernels.vector_math import cosine_and_sine, exponential, logarithm
 
 POLE = wp.constant(2.0 * math.pi / math.sqrt(math.sqrt(2.0) - 1.0))
@@ -118,7 +118,8 @@ def noise_by_samples(
     kept = exponential(-wp.min(2.0 * wp.pi * cutoff * dt, 100.0))
     normal, _ = cosine_and_sine(uniform_2)
     scale = sigma * wp.sqrt(-2.0 * logarithm(1.0 - uniform) * (1.0 - kept * kept))
-    now = kept * noise + scale * normal
+    # the memory begins at the light alone: there is no noise before the first sample
+    now = wp.where(dt < REST, kept * noise + scale * normal, 0.0)
     return voltage + now, now, float(0.0)
 
 
@@ -224,9 +225,10 @@ class VoltageNoise(Effect):
     `bandwidth` where that has cutoff · (1 + dark) / knee and dark / (1 + dark), see `of_photoreceptor`.
 
     With `poles = "one"` it is what other simulators draw (v2e's photoreceptor noise): noise behind one pole
-    at `cutoff`, of the same variance sigma² in all light, drawn once at each sample of the scene, and a
-    straight line in between. Noise of one pole is so rough that its events depend on the sampling: it belongs
-    to scenes whose frames are those that the other simulator has seen.
+    at `cutoff`, of the same variance sigma² in all light, drawn once at each sample of the scene but the
+    first, where memories begin at the light alone; in between it goes in a straight line. Noise of one pole
+    is so rough that its events depend on the sampling: it belongs to scenes whose frames are those that the
+    other simulator has seen.
 
     An ideal memory moves by whole thresholds, so a pixel keeps the phase that it began with, and pixels which
     are alike differ in their rates. One that is held in reset after its events (`refractory`) memorises the

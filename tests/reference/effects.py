@@ -138,9 +138,10 @@ def voltage_noise(
     if effect.poles == "apart":
         return photoreceptor_noise(times, intensity, effect, normals)
     if effect.poles == "one":
-        # an autoregressive process of first order, once a sample
+        # an autoregressive process of first order, once a sample, from nothing
         kept = np.exp(-2 * np.pi * effect.cutoff * np.diff(times))
         out = effect.sigma * normals[0]
+        out[0] = 0
         for k, share in enumerate(kept, 1):
             out[k] = share * out[k - 1] + np.sqrt(1 - share**2) * out[k]
         return out
