@@ -22,6 +22,9 @@ if TYPE_CHECKING:
     from dase.scenes.scene import Scene
 
 
+ANY_SAMPLES = 1e6
+"""Time between samples [s] of what goes on at each sample of the scene, however far apart they are."""
+
 Starts = Literal["value", "ends", "spread", "turn", "above"]
 """Where a search begins along a parameter of an effect that is tried:
 
@@ -310,6 +313,10 @@ class Effect:
             beside: The effects that are on beside it.
         """
         return []
+
+    def begins_at_the_light(self) -> bool:
+        """Whether this effect belongs to a world whose memories begin at the first light, all alike."""
+        return False
 
     def idle(self) -> tuple[str, ...]:
         """Return the names of the parameters that change nothing by the words that this effect has."""

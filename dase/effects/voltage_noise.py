@@ -10,7 +10,7 @@ from typing import ClassVar, Self
 import warp as wp
 
 from dase.effects.bandwidth import Bandwidth
-from dase.effects.base import Effect, Observations, choice, parameter
+from dase.effects.base import ANY_SAMPLES, Effect, Observations, choice, parameter
 from dase.effects.second_order import impulse_response
 from dase.kernels.pixel_stages import REST, EffectStages
 from dase.kernels.vector_math import cosine_and_sine, exponential, logarithm
@@ -36,9 +36,6 @@ def fresh_variance(x: float, kept: float):
 
 USUAL = 0.2
 """Light in which noise of both kinds is alike where one takes the place of the other [intensity]."""
-
-ANY_SAMPLES = 1e6
-"""Time between samples [s] of noise that is drawn at those of the scene, at all of them: in finite time."""
 
 STEEP = wp.constant(2.0)
 """Time constants in a step up to which the speeds at its ends tell where the voltage has been in between."""
@@ -115,7 +112,8 @@ def noise_by_samples(
     voltage: float, dt: float, sigma: float, cutoff: float, noise: float, uniform: float, uniform_2: float
 ):
     """Voltage with noise behind one pole as it is at the samples, whatever the light."""
-    kept = exponential(-wp.min(2.0 * wp.pi * cutoff * dt, 100.0))
+    # steps of Euler's; beyond the time constant the noise turns at each sample, beyond two it would grow
+    kept = wp.max(1.0 - 2.0 * wp.pi * cutoff * dt, -0.9)
     normal, _ = cosine_and_sine(uniform_2)
     scale = sigma * wp.sqrt(-2.0 * logarithm(1.0 - uniform) * (1.0 - kept * kept))
     # the memory begins at the light alone: there is no noise before the first sample
@@ -225,10 +223,10 @@ class VoltageNoise(Effect):
     `bandwidth` where that has cutoff · (1 + dark) / knee and dark / (1 + dark), see `of_photoreceptor`.
 
     With `poles = "one"` it is what other simulators draw (v2e's photoreceptor noise): noise behind one pole
-    at `cutoff`, of the same variance sigma² in all light, drawn once at each sample of the scene but the
-    first, where memories begin at the light alone; in between it goes in a straight line. Noise of one pole
-    is so rough that its events depend on the sampling: it belongs to scenes whose frames are those that the
-    other simulator has seen.
+    at `cutoff` in Euler's steps, of the same variance sigma² in all light, drawn once at each sample of the
+    scene but the first, where memories begin at the light alone; in between it goes in a straight line. Noise
+    of one pole is so rough that its events depend on the sampling: it belongs to scenes whose frames are
+    those that the other simulator has seen.
 
     An ideal memory moves by whole thresholds, so a pixel keeps the phase that it began with, and pixels which
     are alike differ in their rates. One that is held in reset after its events (`refractory`) memorises the
@@ -292,11 +290,11 @@ class VoltageNoise(Effect):
 
     @classmethod
     def candidates(cls, observed: Observations) -> list[Self]:
-        """Return the noise of equal poles: spectra of both differ less than recordings tell.
+        """Return the noise of equal poles and that of other simulators.
 
-        A fit asks whether it is that of another simulator.
+        Spectra of poles alike and apart differ less than recordings tell.
         """
-        return [cls()]
+        return [cls(), cls(poles="one")]
 
     def otherwise(self, beside: Sequence[Effect]) -> list[Self]:
         """Return noise of one pole for that of two equal ones, and the other way round.
@@ -315,6 +313,10 @@ class VoltageNoise(Effect):
         return [
             replace(self, sigma=self.sigma / math.sqrt(1 - share), cutoff=self.cutoff / share, poles="alike")
         ]
+
+    def begins_at_the_light(self) -> bool:
+        """Whether memories begin at the first light, as where noise is drawn from then on."""
+        return self.poles == "one"
 
     def idle(self) -> tuple[str, ...]:
         """Return the names of the parameters that change nothing by its rule."""

@@ -208,7 +208,7 @@ def test_voltage_noise_events_rise_as_light_falls(device):
 def test_noise_of_one_pole_is_that_of_a_simulator_which_draws_it_once_a_frame(device):
     # v2e's loop: noise, low-pass, whole thresholds since the memory, all of it once a frame
     pixels, frames, step, sigma, cutoff, on, off = 3000, 400, 1e-3, 0.08, 120.0, 0.2, 0.25
-    rng, kept = np.random.default_rng(5), np.exp(-2 * np.pi * cutoff * step)
+    rng, kept = np.random.default_rng(5), 1 - 2 * np.pi * cutoff * step
     noise, memory, want = np.zeros(pixels), np.zeros(pixels), np.zeros(2)
     for _ in range(frames):
         noise = kept * noise + sigma * np.sqrt(1 - kept**2) * rng.standard_normal(pixels)
