@@ -130,6 +130,25 @@ def test_a_fit_tells_offsets_of_comparators_from_shares_of_thresholds(device):
     assert not true.otherwise([EFFECTS["threshold"](on=0.2, off=0.21)])
 
 
+def test_a_fit_tells_a_low_pass_in_steps(device):
+    scene = moving_bars()
+    step = float(np.median(np.diff(scene.sample_times())))
+    true = EFFECTS["bandwidth"](cutoff=0.12 / step, dark=0.1, signal="steps")
+    events = dase.simulate(scene, Sensor().with_effect(true), seed=4, device=device)
+    found = split_measurement(events, scene, pixels=300, seed=1, device=device)
+    start = model_of(Sensor().with_effect(replace(true, signal="small")))
+    fitted = refit_model(found, start, seed=0, rounds=1).sensor["bandwidth"]
+    assert fitted.signal == "steps"
+    assert fitted.cutoff == pytest.approx(true.cutoff, rel=0.15)
+
+
+def test_noise_that_begins_with_the_scene_is_tried_where_memories_do():
+    noise = EFFECTS["voltage_noise"]
+    for poles, phase in (("alike", 1.0), ("one", 0.0)):
+        (effect,) = (one for one in noise.candidates(None) if one.poles == poles)
+        assert with_effect_added(model_of(Sensor()), effect).sensor["threshold"].phase == phase
+
+
 def test_what_is_idle_by_another_rule_is_not_free_there():
     sensor = Sensor().with_effect(EFFECTS["voltage_noise"](sigma=0.1, cutoff=200.0, knee=0.1))
     model = model_of(sensor)
