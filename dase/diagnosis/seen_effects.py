@@ -136,7 +136,7 @@ def find_seen_effects(measurement: Measurement, library: Collection[str]) -> See
     step = frame_step_of(events, scene)
     entries = tuple(
         entry for entry in found.found
-        if step is None or entry.name != "flicker" or not is_in_step(entry.details["frequency"], step)
+        if not step or entry.name != "flicker" or not is_in_step(entry.details["frequency"], step)
     )  # fmt: skip
     coupling = [entry for entry in entries if entry.name == "frame coupling"]
     bursts = None

@@ -154,14 +154,13 @@ class Bandwidth(Effect):
     def candidates(cls, observed: Observations) -> list[Self]:
         """Return the low-pass that is linear: contrasts at which the other differs are rare.
 
-        A fit asks whether it goes in steps.
+        Where events are of a simulator that works frame by frame, it goes in steps.
         """
-        return [cls()]
+        return [cls(signal="steps" if observed.clip_step else "small")]
 
     def otherwise(self, beside: Sequence[Effect]) -> list[Self]:
-        """Return the low-pass in steps for the linear one, and the other way round."""
-        others = {"small": ["steps"], "steps": ["small"], "large": []}[self.signal]
-        return [replace(self, signal=signal) for signal in others]
+        """Return the linear low-pass for the one in steps."""
+        return [replace(self, signal="small")] if self.signal == "steps" else []
 
     def longest_step(self) -> float:
         """Return the longest time between samples that still shows the effect [s]."""

@@ -138,6 +138,8 @@ class Observations:
         frame_begin: When one of the bursts of ON events comes [s].
         frame_exposure: From there to the next burst of OFF events [s].
         peak_chance: Probability that independent events swing as much as these do at `peak_frequency`.
+        clip_step: From frame to frame of a clip in step with which all events come [s], as those of a
+            simulator that works frame by frame do; 0 for none.
     """
 
     peak_frequency: float
@@ -151,6 +153,7 @@ class Observations:
     frame_begin: float = 0.0
     frame_exposure: float = 0.0
     peak_chance: float = 0.0
+    clip_step: float = 0.0
 
     @property
     def bus_is_idle(self) -> bool:

@@ -290,26 +290,17 @@ class VoltageNoise(Effect):
 
     @classmethod
     def candidates(cls, observed: Observations) -> list[Self]:
-        """Return the noise of equal poles and that of other simulators.
+        """Return the noise of equal poles: spectra of poles alike and apart differ less than recordings tell.
 
-        Spectra of poles alike and apart differ less than recordings tell.
+        Where events are of a simulator that works frame by frame, that which it draws once a frame.
         """
-        return [cls(), cls(poles="one")]
+        return [cls(poles="one" if observed.clip_step else "alike")]
 
     def otherwise(self, beside: Sequence[Effect]) -> list[Self]:
-        """Return noise of one pole for that of two equal ones, and the other way round.
-
-        Both have the same variance and corner in light of `USUAL`.
-        """
-        if self.poles == "apart":
-            return []  # is named by who has it, and never found by a search
+        """Return noise of two equal poles for that of one, of the same variance and corner in usual light."""
+        if self.poles != "one":
+            return []
         share = USUAL / (USUAL + self.knee)
-        if self.poles == "alike":
-            return [
-                replace(
-                    self, sigma=self.sigma * math.sqrt(1 - share), cutoff=self.cutoff * share, poles="one"
-                )
-            ]
         return [
             replace(self, sigma=self.sigma / math.sqrt(1 - share), cutoff=self.cutoff / share, poles="alike")
         ]

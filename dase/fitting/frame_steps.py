@@ -55,7 +55,7 @@ FRAME_STEPS = FrameStepSettings()
 def frame_step_of(events: Events, scene: Scene, settings: FrameStepSettings = FRAME_STEPS) -> float | None:
     """Return the time from frame to frame of a clip in step with which events come [s]; None if they do not.
 
-    Asked only of clips whose frames are even, and too far apart to be the steps of a comparison anyway.
+    Asked only of clips whose frames are even.
 
     Args:
         events: Sorted.
@@ -67,7 +67,7 @@ def frame_step_of(events: Events, scene: Scene, settings: FrameStepSettings = FR
     times = scene.sample_times()
     gaps = np.diff(times)
     step = float(gaps.mean()) if len(gaps) else 0.0
-    if not STIMULUS.coarsest_step < step <= settings.slowest or np.ptp(gaps) >= 1e-3 * step:
+    if not 0 < step <= settings.slowest or np.ptp(gaps) >= 1e-3 * step:
         return None
     t = events.t[(events.t >= times[0]) & (events.t <= times[-1])][: settings.events]
     if len(t) < settings.least:
@@ -81,6 +81,11 @@ def frame_step_of(events: Events, scene: Scene, settings: FrameStepSettings = FR
     emptiest = float(counts.min()) * settings.parts / len(t)
     together = float(np.abs(np.exp(2j * np.pi * phase).mean()))
     return step if emptiest < settings.empty and together > settings.together else None
+
+
+def is_too_slow(step: float) -> bool:
+    """Return whether frames [s] are farther apart than the steps of a comparison are otherwise."""
+    return step > STIMULUS.coarsest_step
 
 
 def is_in_step(frequency: float, step: float, near: float = 0.02) -> bool:
