@@ -70,7 +70,8 @@ def compare(
     )  # fmt: skip
     tell("simulating", 0.3, float("nan"))
     stream = SimulationStream.JUDGE.seed(seed)
-    held = model_of(model).calibrate(evidence.held, repeats=settings.repeats, seed=stream)
+    # nothing is free: a value beyond all that a search would try is compared as it is
+    held = model_of(model, []).calibrate(evidence.held, repeats=settings.repeats, seed=stream)
     judgement = held.judge(stream)
     tell("comparing", 1.0, judgement.error)
     found = comparison_of(evidence, held, judgement, model, seconds=time.perf_counter() - begin)

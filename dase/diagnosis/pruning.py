@@ -43,6 +43,9 @@ def prune_model(
                 continue
             if lacks_effect_of(state, swapped, judged, model):
                 continue
+            if _is_no_better_than_a_part_of_it(state, name, other, judgement, judged):
+                state.ties.setdefault(name, set()).add(other)
+                continue
             simpler = len(swapped.place) < len(model.place)
             if simpler or not reaches_floor(judgement):
                 model, judgement = swapped, judged
@@ -50,6 +53,27 @@ def prune_model(
                 break
             state.ties.setdefault(name, set()).add(other)
     return _drop_needless(state, model, judgement) if model is not before else (model, judgement)
+
+
+def _is_no_better_than_a_part_of_it(
+    state: DiagnosisState, name: str, other: str, mine: Judgement, others: Judgement
+) -> bool:
+    """Whether an effect does hardly better than one that it becomes at the end of its range.
+
+    Before a slightly wrong world the simple one may stay above the floor, and the freedom of the other, which
+    has no meaning there, may take it below.
+
+    Args:
+        state: Effects and settings.
+        name: Of the simple one.
+        other: Of the one that may include it.
+        mine: Error of the model with the simple one.
+        others: The same with the other in its place.
+    """
+    if other not in state.effects or name not in state.effects[other].includes:
+        return False
+    reach = max(state.settings.tie, state.settings.tie_share * others.error)
+    return mine.error <= others.error + reach
 
 
 def _drop_needless(

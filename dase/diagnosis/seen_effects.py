@@ -14,6 +14,7 @@ from dase.effects.threshold import Threshold
 from dase.errors import InputError
 from dase.events import Events
 from dase.fitting.burst_strength import BurstStrength, burst_times_of, fit_bursts
+from dase.fitting.frame_steps import frame_step_of, is_in_step
 from dase.fitting.measurement import Measurement
 from dase.results import DetectionLimit, Diagnosis, Finding, Grade
 from dase.scenes.between_frames import CameraScene
@@ -132,7 +133,11 @@ def find_seen_effects(measurement: Measurement, library: Collection[str]) -> See
         found = find_signatures(events, begins=begins)
     except InputError:
         return SeenEffects()
-    entries = found.found
+    step = frame_step_of(events, scene)
+    entries = tuple(
+        entry for entry in found.found
+        if not step or entry.name != "flicker" or not is_in_step(entry.details["frequency"], step)
+    )  # fmt: skip
     coupling = [entry for entry in entries if entry.name == "frame coupling"]
     bursts = None
     if coupling:

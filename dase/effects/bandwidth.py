@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import ClassVar, Self
 
 import warp as wp
 
-from dase.effects.base import Effect, Observations, choice, parameter
+from dase.effects.base import ANY_SAMPLES, Effect, Observations, choice, parameter
 from dase.effects.photocurrent import dark_share, relative_photocurrent
 from dase.kernels.pixel_stages import EffectStages
 from dase.kernels.vector_math import exponential, logarithm
@@ -74,6 +75,23 @@ def follower_voltage(
     return settled, voltage, settled
 
 
+@wp.func
+def stepped_voltage(
+    voltage: float,
+    intensity: float,
+    dt: float,
+    cutoff: float,
+    dark: float,
+    spread: float,
+    output: float,
+    pixel_normal: float,
+):
+    """Low-pass that goes a share of the way at each sample, all of it where a step has a time constant."""
+    x = time_constants(intensity, dt, cutoff, dark, spread, pixel_normal)
+    settled = output + wp.min(x, 1.0) * (voltage - output)
+    return settled, voltage, settled
+
+
 @dataclass(frozen=True, kw_only=True)
 class Bandwidth(Effect):
     """The photoreceptor's limited speed, slower in the dark.
@@ -91,6 +109,11 @@ class Bandwidth(Effect):
     follower, whose node is charged by the photocurrent and discharged by one that grows as e^v: dv/dt =
     w (1 - e^(v - u)). Half way through an edge of a decade it is after 0.143 / w upwards and 0.274 / w
     downwards, w at the darker light: 1.9 times as long. Small contrasts it treats alike.
+
+    With `signal = "steps"` it is what another simulator makes of the first (v2e): from one sample of the
+    scene to the next the voltage goes w dt of the way to the light of the later one, and all of it where that
+    is above 1. At frames of 1 kHz and 100 Hz it is as fast as 160 Hz are, and 200 Hz are not seen in bright
+    light. It belongs to scenes whose frames are those that the other simulator has seen.
     """
 
     name: ClassVar[str] = "bandwidth"
@@ -122,17 +145,28 @@ class Bandwidth(Effect):
         fitted=False,  # it shows as blurred edges do, which a fit takes for another cutoff
     )
     signal: str = choice(
-        "small", among=("small", "large"), about="equation: linear in log light, or a source follower's"
+        "small",
+        among=("small", "large", "steps"),
+        about="equation: linear in log light, or a source follower's, or the first in steps of a sample",
     )
 
     @classmethod
     def candidates(cls, observed: Observations) -> list[Self]:
-        """Return the low-pass that is linear: contrasts at which the other differs are rare."""
-        return [cls()]
+        """Return the low-pass that is linear: contrasts at which the other differs are rare.
+
+        Where events are of a simulator that works frame by frame, it goes in steps.
+        """
+        return [cls(signal="steps" if observed.clip_step else "small")]
+
+    def otherwise(self, beside: Sequence[Effect]) -> list[Self]:
+        """Return the linear low-pass for the one in steps."""
+        return [replace(self, signal="small")] if self.signal == "steps" else []
+
+    def longest_step(self) -> float:
+        """Return the longest time between samples that still shows the effect [s]."""
+        return ANY_SAMPLES if self.signal == "steps" and self.cutoff < math.inf else math.inf
 
     def compiled(self) -> EffectStages:
         """Return what the kernel composer needs to know."""
-        stages = super().compiled()
-        return (
-            replace(stages, functions=(("respond", follower_voltage),)) if self.signal == "large" else stages
-        )
+        respond = {"small": lowpass_voltage, "large": follower_voltage, "steps": stepped_voltage}[self.signal]
+        return replace(super().compiled(), functions=(("respond", respond),))

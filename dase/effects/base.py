@@ -22,6 +22,9 @@ if TYPE_CHECKING:
     from dase.scenes.scene import Scene
 
 
+ANY_SAMPLES = 1e6
+"""Time between samples [s] of what goes on at each sample of the scene, however far apart they are."""
+
 Starts = Literal["value", "ends", "spread", "turn", "above"]
 """Where a search begins along a parameter of an effect that is tried:
 
@@ -135,6 +138,8 @@ class Observations:
         frame_begin: When one of the bursts of ON events comes [s].
         frame_exposure: From there to the next burst of OFF events [s].
         peak_chance: Probability that independent events swing as much as these do at `peak_frequency`.
+        clip_step: From frame to frame of a clip in step with which all events come [s], as those of a
+            simulator that works frame by frame do; 0 for none.
     """
 
     peak_frequency: float
@@ -148,6 +153,7 @@ class Observations:
     frame_begin: float = 0.0
     frame_exposure: float = 0.0
     peak_chance: float = 0.0
+    clip_step: float = 0.0
 
     @property
     def bus_is_idle(self) -> bool:
@@ -310,6 +316,14 @@ class Effect:
             beside: The effects that are on beside it.
         """
         return []
+
+    def begins_at_the_light(self) -> bool:
+        """Whether this effect belongs to a world whose memories begin at the first light, all alike."""
+        return False
+
+    def idle(self) -> tuple[str, ...]:
+        """Return the names of the parameters that change nothing by the words that this effect has."""
+        return ()
 
     def longest_step(self) -> float:
         """Return the longest time between samples that still shows the effect [s]."""

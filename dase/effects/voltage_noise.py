@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import ClassVar, Self
 
 import warp as wp
 
 from dase.effects.bandwidth import Bandwidth
-from dase.effects.base import Effect, Observations, choice, parameter
+from dase.effects.base import ANY_SAMPLES, Effect, Observations, choice, parameter
 from dase.effects.second_order import impulse_response
-from dase.kernels.pixel_stages import EffectStages
+from dase.kernels.pixel_stages import REST, EffectStages
 from dase.kernels.vector_math import cosine_and_sine, exponential, logarithm
 
 POLE = wp.constant(2.0 * math.pi / math.sqrt(math.sqrt(2.0) - 1.0))
@@ -32,6 +33,9 @@ def fresh_variance(x: float, kept: float):
         var = y * y * y * (1.0 / 6.0 - y * (1.0 / 8.0 - y * (1.0 / 20.0 - y / 72.0)))
     return wp.max(var, 1.0e-30), mixed, 1.0 - kept * (1.0 - y + 0.5 * y * y)
 
+
+USUAL = 0.2
+"""Light in which noise of both kinds is alike where one takes the place of the other [intensity]."""
 
 STEEP = wp.constant(2.0)
 """Time constants in a step up to which the speeds at its ends tell where the voltage has been in between."""
@@ -101,6 +105,20 @@ def noisy_voltage(
     top, way = turning_voltage(noise, near * speed, now, near * speed_now)
     top += way * CREST * near * wp.sqrt(near * (1.0 - share)) * sigma
     return voltage + top, now, speed_now
+
+
+@wp.func
+def noise_by_samples(
+    voltage: float, dt: float, sigma: float, cutoff: float, noise: float, uniform: float, uniform_2: float
+):
+    """Voltage with noise behind one pole as it is at the samples, whatever the light."""
+    # steps of Euler's; beyond the time constant the noise turns at each sample, beyond two it would grow
+    kept = wp.max(1.0 - 2.0 * wp.pi * cutoff * dt, -0.9)
+    normal, _ = cosine_and_sine(uniform_2)
+    scale = sigma * wp.sqrt(-2.0 * logarithm(1.0 - uniform) * (1.0 - kept * kept))
+    # the memory begins at the light alone: there is no noise before the first sample
+    now = wp.where(dt < REST, kept * noise + scale * normal, 0.0)
+    return voltage + now, now, float(0.0)
 
 
 @wp.func
@@ -204,6 +222,12 @@ class VoltageNoise(Effect):
     A loop asks for some sqrt(25 (1 + gain) / knee) samples, where that is more. The node's pole is that of
     `bandwidth` where that has cutoff · (1 + dark) / knee and dark / (1 + dark), see `of_photoreceptor`.
 
+    With `poles = "one"` it is what other simulators draw (v2e's photoreceptor noise): noise behind one pole
+    at `cutoff` in Euler's steps, of the same variance sigma² in all light, drawn once at each sample of the
+    scene but the first, where memories begin at the light alone; in between it goes in a straight line. Noise
+    of one pole is so rough that its events depend on the sampling: it belongs to scenes whose frames are
+    those that the other simulator has seen.
+
     An ideal memory moves by whole thresholds, so a pixel keeps the phase that it began with, and pixels which
     are alike differ in their rates. One that is held in reset after its events (`refractory`) memorises the
     noise of a later moment: a dead time of a time constant, 1 / (9.8 · corner), forgets the phase within some
@@ -259,14 +283,35 @@ class VoltageNoise(Effect):
     )
     poles: str = choice(
         "alike",
-        among=("alike", "apart"),
-        about="two equal ones at the corner of both, or one that follows the light and a fixed one",
+        among=("alike", "apart", "one"),
+        about="two equal ones at the corner of both, or one that follows the light and a fixed one, or a "
+        "single fixed one whose noise is drawn at each sample of the scene",
     )
 
     @classmethod
     def candidates(cls, observed: Observations) -> list[Self]:
-        """Return the noise of equal poles: spectra of both differ less than recordings tell."""
-        return [cls()]
+        """Return the noise of equal poles: spectra of poles alike and apart differ less than recordings tell.
+
+        Where events are of a simulator that works frame by frame, that which it draws once a frame.
+        """
+        return [cls(poles="one" if observed.clip_step else "alike")]
+
+    def otherwise(self, beside: Sequence[Effect]) -> list[Self]:
+        """Return noise of two equal poles for that of one, of the same variance and corner in usual light."""
+        if self.poles != "one":
+            return []
+        share = USUAL / (USUAL + self.knee)
+        return [
+            replace(self, sigma=self.sigma / math.sqrt(1 - share), cutoff=self.cutoff / share, poles="alike")
+        ]
+
+    def begins_at_the_light(self) -> bool:
+        """Whether memories begin at the first light, as where noise is drawn from then on."""
+        return self.poles == "one"
+
+    def idle(self) -> tuple[str, ...]:
+        """Return the names of the parameters that change nothing by its rule."""
+        return {"alike": ("gain",), "apart": (), "one": ("knee", "dark", "gain")}[self.poles]
 
     @classmethod
     def of_photoreceptor(cls, pole: Bandwidth, *, sigma: float, cutoff: float, gain: float = 0.0) -> Self:
@@ -285,10 +330,8 @@ class VoltageNoise(Effect):
 
     def compiled(self) -> EffectStages:
         """Return what the kernel composer needs to know."""
-        stages = super().compiled()
-        if self.poles == "alike":
-            return stages
-        return replace(stages, functions=(("respond", photoreceptor_noise),))
+        respond = {"alike": noisy_voltage, "apart": photoreceptor_noise, "one": noise_by_samples}[self.poles]
+        return replace(super().compiled(), functions=(("respond", respond),))
 
     def longest_step(self) -> float:
         """Return the longest time between samples that still shows the effect [s]."""
@@ -297,6 +340,8 @@ class VoltageNoise(Effect):
         step = 1 / (8 * self.cutoff)
         if self.poles == "alike":
             return step
+        if self.poles == "one":
+            return ANY_SAMPLES
         # slopes tell where the voltage turns up to so many time constants of the node, in the brightest
         # light; the loop's pace is the geometric mean of those of the poles, and faster by the gain
         node = STEEP * self.knee / (2 * math.pi * self.cutoff * (1 + self.dark))

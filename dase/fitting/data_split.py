@@ -17,6 +17,7 @@ from dase.events import Events
 from dase.fitting.batch_simulator import BatchSimulator
 from dase.fitting.bus_load import WholeSensor
 from dase.fitting.contradictions import contradiction_of_rest
+from dase.fitting.frame_steps import frame_step_of, is_too_slow
 from dase.fitting.pixel_selection import choose_trusted_pixels, find_trusted_parts
 from dase.fitting.spliced_time import SplicedScene, SplicedTime
 from dase.fitting.subset import Array, CalibratedSubset, PixelSubset
@@ -117,6 +118,8 @@ class SplitMeasurement:
         notes: What the data cannot show.
         contradiction: Why the events cannot be of the scene, in a sentence; empty where they may.
         frames: When the bursts come that are in step with frames, where they are compared.
+        frame_step: Time from frame to frame of a clip in step with which all events come [s], 0 if they do
+            not, see `frame_step_of`.
     """
 
     train: PixelSubset
@@ -132,6 +135,7 @@ class SplitMeasurement:
     notes: tuple[str, ...] = ()
     contradiction: str = ""
     frames: BurstTimes | None = None
+    frame_step: float = 0.0
 
     def observe(self, *, idle_bus: float) -> Observations:
         """Return what effects may choose their candidates by, see `Observations`."""
@@ -148,6 +152,7 @@ class SplitMeasurement:
             frame_interval=frames.interval if frames else 0.0,
             frame_begin=frames.begin if frames else 0.0,
             frame_exposure=frames.exposure if frames else 0.0,
+            clip_step=self.frame_step,
         )
 
     @property
@@ -233,6 +238,8 @@ def split_measurement(
     if trust is None and isinstance(scene, CameraScene):
         trust = scene.is_trusted
     whole = common_grid(events, scene)
+    frame_step = frame_step_of(events, scene) or 0.0
+    driven = is_too_slow(frame_step)
     asked = within_span(whole, span)
     # the phase of what goes by a clock of its own would not go on from window to window
     unbroken = unbroken or lamp is not None or left_out is not None or frames is not None
@@ -260,7 +267,7 @@ def split_measurement(
             trust = partial(_trust_on_clock, trust, spliced)
     elif grid is not whole:
         events = _within(events, grid)
-    gaps = np.zeros((0, 2)) if pauses else repeated_gaps(events.t)
+    gaps = np.zeros((0, 2)) if pauses or driven else repeated_gaps(events.t)
     try:
         to = launch.find_device(device)
     except ValueError as error:
@@ -274,6 +281,11 @@ def split_measurement(
         )
     # a stream of its own: the same pixels are chosen whatever else is drawn from the seed
     rng, notes = Draw.PIXELS.generator(seed), list[str]()
+    if driven:
+        notes.append(
+            "events come in step with the frames of the clip, as a simulator makes them that knows these "
+            "frames alone: compared is from frame to frame"
+        )
     if windows != (asked,):
         notes.append(sentence_of_windows(asked, windows))
     # time is cut, not drawn: moments between fitted ones would be known from these
@@ -369,7 +381,7 @@ def split_measurement(
         notes.insert(0, contradiction)
     out = SplitMeasurement(
         train, held, last_part, scout, bands, structure, peak, *rates, when, tuple(notes),
-        contradiction, frames,
+        contradiction, frames, frame_step,
     )  # fmt: skip
     return replace(out, notes=(*notes, NO_THRESHOLDS)) if out.light_never_changes else out
 
@@ -434,6 +446,8 @@ def common_grid(events: Events, scene: Scene) -> Grid:
     step = np.diff(times)
     even = len(step) > 0 and np.ptp(step) < 1e-3 * step.mean()
     own = even and STIMULUS.finest_step <= step.mean() <= STIMULUS.coarsest_step
+    # nor does a simulator that knows its frames alone show anything between them
+    own = own or (frame_step_of(events, scene) is not None and is_too_slow(float(step.mean())))
     h = float(step.mean()) if own else STIMULUS.common_step
     # after the last event a step or two of silence count, not minutes: the recording may have ended there
     last = min(end, float(events.t[-1]) + 2 * h)

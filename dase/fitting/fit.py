@@ -114,7 +114,7 @@ def fit(
     ends = _descend_from_starts(evidence, start, free, seed, lambda text, share: tell(text, share, before))
     judgement, model = _best_end(ends)
     tell("confidence intervals", 0.9, judgement.error)
-    good = _equally_good_models(ends)
+    good = [one for one in _equally_good_models(ends) if one.space.names == model.space.names]
     model, values = estimate_parameters(evidence, model, seed=seed)
     stream = SimulationStream.JUDGE.seed(seed)
     report = model.calibrate(evidence.report, repeats=REPEATS, seed=stream)

@@ -264,14 +264,26 @@ def ways_otherwise(model: FittedModel, names: Collection[str] | None = None) -> 
         names: Of the effects whose rules are changed; None for all of which something is free, and for the
             phase, which belongs to no camera.
     """
-    sensor = model.space.sensor
     acting = [effect for effect in model.sensor.effects if not effect.is_off() or effect.name == PHASED]
     free = {PHASED, *(axis.effect.name for axis in model.space.axes)} if names is None else set(names)
     return [
-        replace(model, space=replace(model.space, sensor=sensor.with_effect(other)))
+        _with_rule(model, other)
         for effect in acting if effect.name in free
-        for other in sensor[effect.name].otherwise([one for one in acting if one.name != effect.name])
+        for other in effect.otherwise([one for one in acting if one.name != effect.name])
     ]  # fmt: skip
+
+
+def _with_rule(model: FittedModel, other: Effect) -> FittedModel:
+    """Return a model with one of its effects by another rule, and what is idle by it not free."""
+    name, before = other.name, model.sensor[other.name]
+    same = model.space.sensor.with_effect(other)
+    if set(before.idle()) == set(other.idle()):
+        return replace(model, space=replace(model.space, sensor=same))
+    sensor = _with_its_phase(model.sensor.with_effect(other), other)
+    usual = free_of(sensor, name)
+    free = [a.name for a in model.space.axes if a.effect is not type(other) or a.name in usual]
+    whole = {a.name for a in model.space.axes} >= set(free_of(model.sensor, name))
+    return replace(model_of(sensor, [*free, *usual] if whole else free), loss=model.loss)
 
 
 def refit_work(
@@ -334,11 +346,20 @@ def free_of(sensor: Sensor, name: str) -> list[str]:
 
 def with_effect_added(present: FittedModel, effect: Effect) -> FittedModel:
     """Return the present model with an effect added, all of whose parameters are free."""
-    sensor = present.sensor.with_effect(effect)
+    sensor = _with_its_phase(present.sensor.with_effect(effect), effect)
     old = [axis.name for axis in present.space.axes]
     # read off the events of all pixels, what a fit finds only nearby is better than a fit to a few makes it
     new = [axis.name for axis in axes_of(sensor) if axis.effect is type(effect) and axis.fact.nearby is None]
     return model_of(sensor, [*old, *new])
+
+
+def _with_its_phase(sensor: Sensor, effect: Effect) -> Sensor:
+    """Return a sensor with the memories' begin that an effect goes with.
+
+    A model without the effect may have them spread, to make up for it, and with that no place of the effect
+    looks right.
+    """
+    return with_values(sensor, {"threshold.phase": 0.0}) if effect.begins_at_the_light() else sensor
 
 
 def with_fixed_effect(present: FittedModel, effect: Effect) -> FittedModel:

@@ -111,6 +111,11 @@ class ParameterSpace:
     sensor: Sensor
     axes: tuple[SearchAxis, ...]
 
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the axes."""
+        return tuple(axis.name for axis in self.axes)
+
     def places(self) -> Array:
         """Return where the sensor lies, shape (P,)."""
         return np.array([axis.to_place(value_of(self.sensor, axis.name)) for axis in self.axes])
@@ -157,7 +162,8 @@ def axes_of(sensor: Sensor, names: Iterable[str] | None = None) -> tuple[SearchA
     Args:
         sensor: Whose parameters.
         names: Effects or `effect.parameter`; None for all effects that are not off. Of an effect all
-            parameters but those with `Parameter.fitted` False, which must be named.
+            parameters but those with `Parameter.fitted` False, which must be named, and those that change
+            nothing by its words.
 
     Raises:
         InputError: A name that the sensor does not have.
@@ -167,13 +173,15 @@ def axes_of(sensor: Sensor, names: Iterable[str] | None = None) -> tuple[SearchA
         for effect in sensor.effects
         for p in effect.parameters()
     }
+    idle = {f"{effect.name}.{name}" for effect in sensor.effects for name in effect.idle()}
+    usual = {name for name, axis in every.items() if axis.fact.fitted and name not in idle}
     if names is None:
         # a change detector whose phase is 0 is not off
         off = {e.name for e in sensor.effects if e.is_off() and not isinstance(e, Threshold)}
-        return tuple(a for a in every.values() if a.fact.fitted and a.effect.name not in off)
+        return tuple(a for name, a in every.items() if name in usual and a.effect.name not in off)
     chosen = []
     for name in names:
-        found = [n for n in every if n == name or (n.split(".")[0] == name and every[n].fact.fitted)]
+        found = [n for n in every if n == name or (n.split(".")[0] == name and n in usual)]
         if not found:
             known = [*every, *(e.name for e in sensor.effects)]
             raise InputError(f"free: the sensor has no parameter '{name}': {nearest(name, known)}")

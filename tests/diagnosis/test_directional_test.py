@@ -135,6 +135,7 @@ def fake(names: str, errors: dict[str, float], monkeypatch, **more) -> tuple:
         evidence=None,
         seed=0,
         certain=frozenset(),
+        effects={},
     )
     search = SimpleNamespace(
         judge=lambda m: judged(errors[m.names]), added_to=lambda m: tuple(m.names), **(defaults | more)
@@ -187,6 +188,19 @@ def test_a_simpler_rival_takes_the_place_and_the_tie_is_told(monkeypatch):
     search, model, judgement = fake("ac", errors, monkeypatch, rivals={"c": "b"})
     assert reviewing.prune_model(search, model, judgement)[0].names == "ac"
     assert search.ties == {"c": {"b"}}
+
+
+def test_what_includes_an_effect_must_do_better_than_it(monkeypatch):
+    """A second order so damped that it is one pole came to 1.1 where a clip of v2e had the pole at 1.4."""
+    errors = {"ab": 1.4, "a": 9.0, "b": 9.0, "aZ": 1.1, "Z": 9.0}
+    includes = {"Z": SimpleNamespace(includes=("b",))}
+    search, model, judgement = fake("ab", errors, monkeypatch, rivals={"b": "Z"}, effects=includes)
+    assert reviewing.prune_model(search, model, judgement)[0].names == "ab"
+    assert search.ties == {"b": {"Z"}}
+    for more, error in ((includes, 0.9), ({}, 1.1)):
+        errors["aZ"] = error
+        search, model, judgement = fake("ab", errors, monkeypatch, rivals={"b": "Z"}, effects=more)
+        assert reviewing.prune_model(search, model, judgement)[0].names == "aZ"
 
 
 def test_no_rival_takes_the_place_of_what_a_closer_look_shows(monkeypatch):

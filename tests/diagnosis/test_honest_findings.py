@@ -91,6 +91,14 @@ def test_a_model_that_sends_hardly_an_event_is_the_worst():
     assert errors[-1] > 0.98 * max(errors)  # the last two send next to nothing
 
 
+def test_a_sensor_beyond_all_that_is_tried_is_compared_as_it_is():
+    scene = moving_bars()
+    noise = EFFECTS["voltage_noise"](sigma=0.15, cutoff=200.0, knee=10.0, dark=10.0)  # searches end at 3
+    sensor = Sensor().with_effect(noise)
+    found = compare(dase.simulate(scene, sensor, seed=1), sensor, scene=scene, pixels=300)
+    assert found.error < found.gate
+
+
 def test_events_that_a_model_does_not_send_are_a_difference():
     measured, sent = np.full(SIZE, 400.0), np.full(SIZE, 400.0)
     assert not lacks_events(measured, sent).any()

@@ -177,6 +177,17 @@ def test_mismatch_spreads_thresholds(device):
     assert wide.min() == np.float32(0.01)
 
 
+def test_mismatch_of_comparators_moves_both_thresholds_alike(device):
+    sensor = reference.only(Threshold(on=0.2, off=0.3), Mismatch(spread=0.12, relative_to="mean"))
+    off, on = PixelArray(sensor, 60, 50, seed=5, device=device).thresholds()[0].astype(float)
+    for got, nominal in ((on, 0.2), (off, 0.3)):
+        assert got.mean() == pytest.approx(nominal, abs=3 * 0.03 / np.sqrt(3000))
+        assert got.std() == pytest.approx(0.03, abs=3 * 0.03 / np.sqrt(6000))
+    assert abs(np.corrcoef(on, off)[0, 1]) < 3 / np.sqrt(3000)
+    twin = np.array([reference.thresholds(sensor, i, 5) for i in range(200)]).T
+    np.testing.assert_allclose([off[:200], on[:200]], twin, rtol=2e-6)
+
+
 def test_mismatched_rates_follow_the_inverse_threshold(device):
     sensor = reference.only(Threshold(on=0.06, off=0.09, phase=0.0), Mismatch(spread=0.2))
     off, on = PixelArray(sensor, 200, 1, seed=2, device=device).thresholds()[0]

@@ -205,6 +205,29 @@ def test_voltage_noise_events_rise_as_light_falls(device):
     assert np.all(np.diff(dim) < -0.5)
 
 
+def test_noise_of_one_pole_is_that_of_a_simulator_which_draws_it_once_a_frame(device):
+    # v2e's loop: noise, low-pass, whole thresholds since the memory, all of it once a frame
+    pixels, frames, step, sigma, cutoff, on, off = 3000, 400, 1e-3, 0.08, 120.0, 0.2, 0.25
+    rng, kept = np.random.default_rng(5), 1 - 2 * np.pi * cutoff * step
+    noise, memory, want = np.zeros(pixels), np.zeros(pixels), np.zeros(2)
+    for _ in range(frames):
+        noise = kept * noise + sigma * np.sqrt(1 - kept**2) * rng.standard_normal(pixels)
+        up, down = np.maximum(noise - memory, 0) // on, np.maximum(memory - noise, 0) // off
+        memory += up * on - down * off
+        want += down.sum(), up.sum()
+    sensor = every(
+        Threshold(on=on, off=off, phase=0.0), VoltageNoise(sigma=sigma, cutoff=cutoff, poles="one")
+    )
+    scene = still(np.full(pixels, 0.3), frames * step, frames + 1)
+    got = counts(scene, sensor, frames * step, device).sum(-1)
+    np.testing.assert_allclose(got, want, rtol=0.06)
+    # the same in all light
+    dark = counts(still(np.full(pixels, 0.01), frames * step, frames + 1), sensor, frames * step, device).sum(
+        -1
+    )
+    np.testing.assert_allclose(dark, got, rtol=0.06)
+
+
 def test_voltage_noise_is_stationary_and_returns(device):
     effect = VoltageNoise(sigma=0.12, cutoff=50.0, knee=0.1)
     sensor = every(effect)

@@ -10,6 +10,7 @@ import pytest
 import dase
 from dase.diagnosis.explain_effect import moving_bars
 from dase.effects import EFFECTS
+from dase.effects.base import Observations
 from dase.fitting import confidence_intervals
 from dase.fitting import model as model_module
 from dase.fitting.confidence_intervals import estimate_parameters
@@ -117,6 +118,55 @@ def test_noise_passes_the_dead_time_of_a_fit_where_it_does(device):
     # without noise it is no question
     modes = {(one.mode, one.noise) for one in dead.otherwise([EFFECTS["bandwidth"]()])}
     assert modes == {("reset", "passes"), ("drop", "passes")}
+
+
+def test_a_fit_tells_offsets_of_comparators_from_shares_of_thresholds(device):
+    scene, base = moving_bars(), Sensor().with_effect(EFFECTS["threshold"](on=0.15, off=0.45))
+    true = EFFECTS["mismatch"](spread=0.2, relative_to="mean")
+    events = dase.simulate(scene, base.with_effect(true), seed=4, device=device)
+    found = split_measurement(events, scene, pixels=300, seed=1, device=device)
+    start = model_of(base.with_effect(replace(true, relative_to="own")))
+    assert refit_model(found, start, seed=0, rounds=1).sensor["mismatch"].relative_to == "mean"
+    # with thresholds alike it is no question
+    assert not true.otherwise([EFFECTS["threshold"](on=0.2, off=0.21)])
+
+
+def test_a_fit_leaves_a_low_pass_in_steps_where_it_is_none(device):
+    scene = moving_bars()
+    step = float(np.median(np.diff(scene.sample_times())))
+    true = EFFECTS["bandwidth"](cutoff=0.12 / step, dark=0.1)
+    for signal in ("small", "steps"):
+        sensor = Sensor().with_effect(replace(true, signal=signal))
+        events = dase.simulate(scene, sensor, seed=4, device=device)
+        found = split_measurement(events, scene, pixels=300, seed=1, device=device)
+        start = model_of(Sensor().with_effect(replace(true, signal="steps")))
+        fitted = refit_model(found, start, seed=0, rounds=1).sensor["bandwidth"]
+        assert fitted.signal == signal
+        assert fitted.cutoff == pytest.approx(true.cutoff, rel=0.15)
+
+
+@pytest.mark.parametrize(
+    ("clip_step", "signal", "poles", "phase"), [(0.0, "small", "alike", 1.0), (1e-3, "steps", "one", 0.0)]
+)
+def test_what_a_simulator_does_frame_by_frame_is_tried_where_events_show_one(clip_step, signal, poles, phase):
+    seen = Observations(100.0, 0.0, 0.0, "down", 1e5, 1e6, 0.1, clip_step=clip_step)
+    (slow,), (noise,) = (EFFECTS[name].candidates(seen) for name in ("bandwidth", "voltage_noise"))
+    assert (slow.signal, noise.poles) == (signal, poles)
+    assert with_effect_added(model_of(Sensor()), noise).sensor["threshold"].phase == phase
+
+
+def test_what_is_idle_by_another_rule_is_not_free_there():
+    sensor = Sensor().with_effect(EFFECTS["voltage_noise"](sigma=0.05, cutoff=60.0, poles="one"))
+    model = model_of(sensor)
+    assert "voltage_noise.knee" not in model.space.names
+    (other,) = (one for one in ways_otherwise(model) if one.sensor["voltage_noise"].poles == "alike")
+    assert set(other.space.names) - set(model.space.names) == {"voltage_noise.knee"}
+    noise, light = other.sensor["voltage_noise"], 0.2
+    assert noise.sigma**2 * noise.knee / (light + noise.knee) == pytest.approx(0.05**2)
+    assert noise.cutoff * light / (light + noise.knee) == pytest.approx(60.0)
+    # of what is named no more is free than was
+    few = model_of(sensor, ["voltage_noise.sigma"])
+    assert all(len(one.place) == 1 for one in ways_otherwise(few))
 
 
 def test_rules_of_what_is_not_free_are_left_alone():

@@ -121,6 +121,15 @@ def follower(times: np.ndarray, level: np.ndarray, cutoff: np.ndarray) -> np.nda
     return out
 
 
+def stepped(times: np.ndarray, level: np.ndarray, cutoff: np.ndarray) -> np.ndarray:
+    """Return a low-pass by Euler's method, no step beyond its end; arguments as those of `follower`."""
+    share = np.minimum(2 * np.pi * cutoff[1:] * np.diff(times)[:, None], 1.0)
+    out = np.array(level, np.float64)
+    for k, part in enumerate(share, 1):
+        out[k] = (1 - part) * out[k - 1] + part * level[k]
+    return out
+
+
 def voltage_noise(
     times: np.ndarray, intensity: np.ndarray, sensor: dase.Sensor, normals: np.ndarray
 ) -> np.ndarray:
@@ -137,6 +146,14 @@ def voltage_noise(
     effect = sensor["voltage_noise"]
     if effect.poles == "apart":
         return photoreceptor_noise(times, intensity, effect, normals)
+    if effect.poles == "one":
+        # an autoregressive process of first order, once a sample, from nothing
+        kept = np.maximum(1 - 2 * np.pi * effect.cutoff * np.diff(times), -0.9)
+        out = effect.sigma * normals[0]
+        out[0] = 0
+        for k, share in enumerate(kept, 1):
+            out[k] = share * out[k - 1] + np.sqrt(1 - share**2) * out[k]
+        return out
     total = intensity + effect.dark
     corner = effect.cutoff * total / (total + effect.knee)
     sigma = effect.sigma * np.sqrt(effect.knee / (total + effect.knee))
@@ -226,7 +243,8 @@ def voltage(sensor: dase.Sensor, times: np.ndarray, intensity: np.ndarray, seed:
         cutoff = (
             slow.cutoff * (slow.dark + (1 - slow.dark) * bright) * own_speed(slow, intensity.shape[1], seed)
         )
-        level = (follower if slow.signal == "large" else reference.lowpass)(times, level, cutoff)
+        equations = {"small": reference.lowpass, "large": follower, "steps": stepped}
+        level = equations[slow.signal](times, level, cutoff)
     if np.isfinite(setting(sensor, "second_order", "cutoff", np.inf)):
         slow = sensor["second_order"]
         current = slow.dark + (1 - slow.dark) * bright

@@ -172,7 +172,12 @@ def thresholds(sensor: dase.Sensor, index: int, seed: int) -> tuple[float, float
     name = "mismatch_threshold_pixel_normal"
     on, off = (Stream(n, seed, index).normal() for n in (name, f"{name}_2"))
     nominal = sensor["threshold"]
-    return max(nominal.off * (1 + spread * off), 0.01), max(nominal.on * (1 + spread * on), 0.01)
+    alike = setting(sensor, "mismatch", "relative_to", "own") == "mean"
+    unit = {
+        name: (nominal.on + nominal.off) / 2 if alike else getattr(nominal, name) for name in ("on", "off")
+    }
+    low, high = nominal.off + unit["off"] * spread * off, nominal.on + unit["on"] * spread * on
+    return max(low, 0.01), max(high, 0.01)
 
 
 def setting(sensor: dase.Sensor, effect: str, name: str, missing: Any) -> Any:

@@ -1,0 +1,93 @@
+"""Events of simulators that know the frames of a clip alone, and all others."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+import dase
+from dase.diagnosis import seen_effects
+from dase.diagnosis.seen_effects import find_seen_effects
+from dase.effects import EFFECTS
+from dase.fitting.data_split import split_measurement
+from dase.fitting.frame_steps import frame_step_of, is_in_step
+from dase.fitting.measurement import Measurement
+from dase.scenes.video import VideoScene
+from dase.signatures.result import Answer, Signature
+from dase.simulation.sensor import Sensor
+
+STEP, SIZE = 0.01, (40, 50)
+
+
+@pytest.fixture(scope="module")
+def clip() -> VideoScene:
+    """Waves that go over the picture, 100 frames a second."""
+    x = np.arange(SIZE[1]) + 0.7 * np.arange(SIZE[0])[:, None]
+    turns = np.arange(120)[:, None, None] * 0.013
+    light = np.exp(0.9 * np.sin(x / 4 + 2 * np.pi * turns) + 0.5 * np.sin(x / 9 - 4 * np.pi * turns))
+    return VideoScene((light / light.max()).astype(np.float32), np.arange(120) * STEP)
+
+
+def frame_by_frame(clip: VideoScene, theta: float = 0.1) -> dase.Events:
+    """Return events as v2e makes them: whole thresholds from frame to frame, at times that pixels share."""
+    times = clip.sample_times()
+    level = np.log(clip.frames(times).astype(float) + 1e-3)
+    memory, rows = level[0].copy(), []
+    for k in range(1, len(times)):
+        change = (level[k] - memory) / theta
+        count = np.trunc(change).astype(int)
+        most = max(int(np.abs(count).max()), 1)
+        for n in range(most):
+            y, x = np.nonzero(np.abs(count) > n)
+            when = np.full(len(y), times[k - 1] + STEP * (n + 1) / most)
+            rows.append(np.stack([when, x, y, count[y, x] > 0], 1))
+        memory += count * theta
+    t, x, y, p = np.concatenate(rows).T
+    return dase.Events(t, x.astype(np.uint16), y.astype(np.uint16), p.astype(bool), SIZE[1], SIZE[0])
+
+
+def test_events_of_a_simulator_that_knows_frames_alone_are_compared_from_frame_to_frame(clip):
+    events = frame_by_frame(clip)
+    assert frame_step_of(events, clip) == pytest.approx(STEP)
+    found = split_measurement(events, clip, pixels=300, seed=1)
+    assert np.diff(found.when).mean() == pytest.approx(STEP)
+    assert any("in step with the frames" in note for note in found.notes)
+
+
+@pytest.mark.parametrize(("frequency", "lamp"), [(99.96, None), (200.0, None), (120.0, 120.0)])
+def test_frames_in_step_are_no_lamp(clip, monkeypatch, frequency, lamp):
+    seen = Signature(name="flicker", answer=Answer.FOUND, details={"frequency": frequency})
+    found = SimpleNamespace(found=(seen,), entries=(seen,))
+    monkeypatch.setattr(seen_effects, "find_signatures", lambda events, begins: found)
+    events = frame_by_frame(clip)
+    assert find_seen_effects(Measurement(events, clip), EFFECTS).lamp == lamp
+    other = dase.simulate(clip, "ideal", seed=2)
+    assert find_seen_effects(Measurement(other, clip), EFFECTS).lamp == frequency
+
+
+@pytest.mark.parametrize(
+    "effects",
+    [
+        (),
+        ("shot", "leak", "bandwidth"),
+        (EFFECTS["flicker"](frequency=1 / STEP, depth=0.6),),
+        (EFFECTS["timestamp"](step=1e-3, jitter=0.0),),
+        (EFFECTS["row_scan"](line=1e-5),),
+    ],
+)
+def test_events_of_cameras_are_not(clip, effects):
+    sensor = Sensor()
+    for effect in effects:
+        sensor = sensor.with_effect(EFFECTS[effect]() if isinstance(effect, str) else effect)
+    events = dase.simulate(clip, sensor, seed=2)
+    assert len(events) > 2_000
+    assert frame_step_of(events, clip) is None
+
+
+def test_tones_of_frames():
+    assert is_in_step(99.9, 0.01)
+    assert is_in_step(200.0, 0.01)
+    assert not is_in_step(120.0, 0.01)
+    assert not is_in_step(100.0, 1e-3)  # far below the frames
