@@ -267,7 +267,8 @@ def split_measurement(
             trust = partial(_trust_on_clock, trust, spliced)
     elif grid is not whole:
         events = _within(events, grid)
-    gaps = np.zeros((0, 2)) if pauses or driven else repeated_gaps(events.t)
+    # a simulator by frames loses nothing: it waits for a frame, or all of its pixels for their dead time
+    gaps = np.zeros((0, 2)) if pauses or frame_step else repeated_gaps(events.t)
     try:
         to = launch.find_device(device)
     except ValueError as error:

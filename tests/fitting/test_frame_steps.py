@@ -11,6 +11,7 @@ import dase
 from dase.diagnosis import seen_effects
 from dase.diagnosis.seen_effects import find_seen_effects
 from dase.effects import EFFECTS
+from dase.fitting import data_split
 from dase.fitting.data_split import split_measurement
 from dase.fitting.frame_steps import frame_step_of, is_in_step
 from dase.fitting.measurement import Measurement
@@ -54,6 +55,14 @@ def test_events_of_a_simulator_that_knows_frames_alone_are_compared_from_frame_t
     found = split_measurement(events, clip, pixels=300, seed=1)
     assert np.diff(found.when).mean() == pytest.approx(STEP)
     assert any("in step with the frames" in note for note in found.notes)
+
+
+def test_what_a_simulator_waits_between_frames_is_no_loss_of_data(clip, monkeypatch):
+    gaps = np.array([[0.1, 0.11], [0.3, 0.31], [0.5, 0.51]])
+    monkeypatch.setattr(data_split, "repeated_gaps", lambda t: gaps)
+    for events, lost in ((frame_by_frame(clip), False), (dase.simulate(clip, "ideal", seed=2), True)):
+        found = split_measurement(events, clip, pixels=300, seed=1)
+        assert any("data are missing" in note for note in found.notes) is lost
 
 
 @pytest.mark.parametrize(("frequency", "lamp"), [(99.96, None), (200.0, None), (120.0, 120.0)])
