@@ -346,12 +346,10 @@ def _make_sequences(
 
 
 def _make_here(
-    job: DatasetJob, out: Path, todo: list[int], interrupt: DeferredInterrupt
+    job: DatasetJob, out: Path, todo: list[int], interrupt: DeferredInterrupt, most_open: int = 4
 ) -> Generator[WorkReport, None, None]:
     """Make sequences in this process; pixels of one work while those before it are read out and written."""
     begun: deque[_Recording] = deque()
-    # each is read out on one thread, and holds its events until they are written
-    most_open = min(thread_count(), max(4, thread_count() // 2), 8)
     # the next scene is drawn while this one is before the sensor
     with ThreadPoolExecutor(1, thread_name_prefix="dase scenes") as drawing:
         try:
@@ -362,7 +360,8 @@ def _make_here(
                     drawn.append(drawing.submit(_draw_sequence, job, after))
                 begun.append(_begin_sequence(job, out, index, scene, times))
                 begun[-1].simulate(lambda done: interrupt.check())
-                if len(begun) >= most_open:
+                # each holds its events until they are written
+                if len(begun) >= min(thread_count(), most_open):
                     yield begun[0].finish(lambda done: interrupt.check())
                     begun.popleft()
             while begun:

@@ -15,10 +15,9 @@ to the events, and `exposure` [s] to the attributes of an image that was not tak
 from __future__ import annotations
 
 import math
-import os
 from collections import deque
 from collections.abc import Callable, Iterable
-from concurrent.futures import Future, ThreadPoolExecutor, wait
+from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import AbstractContextManager, suppress
 from functools import lru_cache
 from io import FileIO
@@ -156,27 +155,11 @@ def shuffle_bytes(values: NDArray[Any]) -> NDArray[np.uint8]:
     return np.concatenate([plane.reshape(-1) for part in whole for plane in cv2.split(part)])
 
 
-@lru_cache(maxsize=1)
-def _packing_threads(count: int) -> ThreadPoolExecutor:
-    """Return the threads on which the chunks of all files are packed.
-
-    Threads of each file's own would be some hundred where several files are open, and most of their time
-    they would wait for Python's lock.
-    """
-    return ThreadPoolExecutor(count, thread_name_prefix="dase pack")
-
-
-if hasattr(os, "register_at_fork"):
-    # a process that is forked has the object, but not its threads
-    os.register_at_fork(after_in_child=_packing_threads.cache_clear)
-
-
 class _PackingLine:
     """Steps that write to a file, in the order in which they came, each as soon as its chunks are packed.
 
-    Chunks are packed on as many threads as kernels use, which all files share, beside whatever the caller
-    does next; the steps themselves run on the caller's thread. With one thread all is done at once. The file
-    is the same.
+    Chunks are packed on as many threads as kernels use, beside whatever the caller does next; the steps
+    themselves run on the caller's thread. With one thread all is done at once. The file is the same.
 
     Args:
         most: Steps that may wait; more hold the caller up, so that memory does not grow.
@@ -184,7 +167,7 @@ class _PackingLine:
 
     def __init__(self, most: int = 16) -> None:
         threads = thread_count()
-        self._pool = _packing_threads(threads) if threads > 1 else None
+        self._pool = ThreadPoolExecutor(threads, thread_name_prefix="dase pack") if threads > 1 else None
         self._most = most
         self._steps: deque[tuple[list[Future[bytes]], Callable[[list[bytes]], None]]] = deque()
 
@@ -209,11 +192,9 @@ class _PackingLine:
 
     def abandon(self) -> None:
         """Forget what still waits."""
-        waiting = [chunk for packed, _ in self._steps for chunk in packed]
         self._steps.clear()
-        for chunk in waiting:
-            chunk.cancel()
-        wait(waiting)  # nobody reads the caller's arrays any more
+        if self._pool is not None:
+            self._pool.shutdown(cancel_futures=True)
 
     def _write_next(self) -> None:
         packed, write = self._steps.popleft()
