@@ -11,7 +11,7 @@ import warp as wp
 from numpy.typing import NDArray
 
 from dase.effects.base import Observations, choice, parameter
-from dase.effects.stream import Others, SharedReader, StreamEffect, to_nanosecond, to_nanoseconds
+from dase.effects.stream import Others, SharedReader, StreamEffect, to_nanosecond
 from dase.events import Events
 from dase.kernels import launch, line_arbiter
 from dase.kernels.event_queue import NEVER, ONE, send_over_bus
@@ -70,15 +70,22 @@ class LineArbiter(SharedReader):
         self._shift = (across - 1).bit_length()
         size = lines << self._shift
         self._labelled = False
-        known, numbers = np.zeros((size, 4), np.int64), np.zeros(len(ArbiterNumber), np.int64)
+        numbers = np.zeros(len(ArbiterNumber), np.int64)
+        # pixels of half a cache line, none of which lies in two
+        store = np.zeros(4 * size + 7, np.int64)
+        known = store[-(store.ctypes.data // 8) % 8 :][: 4 * size].reshape(size, 4)
         known[:, [PixelColumn.LAST, PixelColumn.FREED]] = line_arbiter.NEVER
         numbers[ArbiterNumber.FREE] = line_arbiter.NEVER
         room = 2 * width * height + 64  # requests that come late, those taken back among them
+        slots, nodes = line_arbiter.SLOTS, line_arbiter.NODES
         self._state: dict[str, NDArray[Any]] = {
             "known": known, "waiting": np.zeros((lines, -(-across // 64)), np.int64),
-            "line_since": np.zeros(lines, np.int64), "line_count": np.zeros(lines, np.int32),
-            "line_queue": np.zeros(lines, np.int32), "heap_due": np.zeros(room, np.int64),
-            "heap_what": np.zeros(room, np.int64), "recent": np.zeros(line_arbiter.RECENT, np.int32),
+            "line_words": np.zeros(lines, np.int64), "line_since": np.zeros(lines, np.int64),
+            "line_count": np.zeros(lines, np.int32), "line_queue": np.zeros(lines, np.int32),
+            "heap_due": np.zeros(room, np.int64), "heap_what": np.zeros(room, np.int64),
+            "wheel": np.zeros(slots, np.int32), "wheel_bits": np.zeros(slots // 64, np.int64),
+            "node_due": np.zeros(nodes, np.int64), "node_what": np.zeros(nodes, np.int64),
+            "node_after": np.zeros(nodes, np.int32), "recent": np.zeros(line_arbiter.RECENT, np.int32),
             "numbers": numbers,
         }  # fmt: skip
 
@@ -98,41 +105,39 @@ class LineArbiter(SharedReader):
 
     def _read(self, events: Events, others: Others, weight: NDArray[np.float64], until: float) -> Events:
         self._labelled |= events.label is not None
-        label = np.zeros(len(events), np.int8) if events.label is None else events.label
+        label = np.empty(0, np.int8) if events.label is None else events.label
         if len(others.time):
             pixel_bytes = self._state["known"].view(np.uint8)
             pixel_bytes[self._places(others.x, others.y), PixelByte.OTHER] = 1
         room = len(events) + int(self._state["numbers"][ArbiterNumber.HELD])
-        out_time, out_place = np.empty(room, np.float64), np.empty(room, np.int32)
-        out_polarity, out_label = np.empty(room, np.uint8), np.empty(room, np.int8)
+        out_time, out_label = np.empty(room, np.float64), np.empty(room, np.int8)
+        out_x, out_y = np.empty(room, np.uint16), np.empty(room, np.uint16)
+        out_polarity = np.empty(room, np.bool_)
         end = line_arbiter.END if until == math.inf else 1000 * to_nanosecond(until)
-        arrival = 1000 * to_nanoseconds(events.t)
-        if len(arrival):
+        if len(events):
             # pixels with a latency hold events back, and give them up at the end: later than is simulated
-            end = max(end, int(arrival[-1]))
+            end = max(end, 1000 * to_nanosecond(float(events.t[-1])))
         device = launch.find_device("cpu")
 
         def array(values: NDArray[Any], dtype: Any) -> Any:
             return wp.array(np.ascontiguousarray(values), dtype=dtype, device=device, copy=False)
 
         inputs = [
-            array(arrival, wp.int64),
-            array(self._places(events.x, events.y), wp.int32), array(events.p.astype(np.uint8), wp.uint8),
-            array(label, wp.int8), array(others.time, wp.int64),
+            array(events.t, wp.float64), array(events.x, wp.uint16), array(events.y, wp.uint16),
+            array(events.p.view(np.uint8), wp.uint8), array(label, wp.int8), array(others.time, wp.int64),
             array(self._places(others.x, others.y), wp.int32), array(others.polarity, wp.uint8),
             array(np.rint(weight * ONE).astype(np.int64), wp.int64), wp.int64(end), self._shift,
-            wp.int64(self._per_line), wp.int64(self._per_event),
+            self._by_columns, wp.int64(self._per_line), wp.int64(self._per_event),
+            line_arbiter.slot_shift(self._per_line, self._per_event),
             *(array(v, wp.dtype_from_numpy(v.dtype)) for v in self._state.values()),
-            array(out_time, wp.float64), array(out_place, wp.int32), array(out_polarity, wp.uint8),
-            array(out_label, wp.int8),
+            array(out_time, wp.float64), array(out_x, wp.uint16), array(out_y, wp.uint16),
+            array(out_polarity.view(np.uint8), wp.uint8), array(out_label, wp.int8),
         ]  # fmt: skip
         wp.launch(line_arbiter.send_by_lines, dim=1, inputs=inputs, device=device)
-        sent = int(self._state["numbers"][ArbiterNumber.SENT])
-        line, across = out_place[:sent] >> self._shift, out_place[:sent] & ((1 << self._shift) - 1)
-        x, y = (line, across) if self._by_columns else (across, line)
+        sent = slice(int(self._state["numbers"][ArbiterNumber.SENT]))
         return Events(
-            out_time[:sent], x.astype(np.uint16), y.astype(np.uint16), out_polarity[:sent].astype(np.bool_),
-            self._width, self._height, out_label[:sent] if self._labelled else None,
+            out_time[sent], out_x[sent], out_y[sent], out_polarity[sent], self._width, self._height,
+            out_label[sent] if self._labelled else None,
         )  # fmt: skip
 
     def _places(self, x: NDArray[np.uint16], y: NDArray[np.uint16]) -> NDArray[np.int32]:

@@ -21,6 +21,8 @@ from dase.effects.timestamp import Timestamp
 from dase.fitting.data_split import split_measurement
 from dase.fitting.model import model_of
 from dase.fitting.readout_simulator import pass_readout, simulate_pixels
+from dase.kernels import line_arbiter
+from dase.kernels.line_arbiter import ArbiterNumber
 
 
 def rows_of(events: dase.Events) -> list[tuple[int, int, int, int]]:
@@ -42,6 +44,31 @@ def test_it_is_its_twin(rng, mode, rate, line):
     np.testing.assert_array_equal(whole.label, whole.x % 4)
     for count in (1, 5, 200):
         same(through(camera(bus), events, np.sort(rng.integers(0, len(events), count)).tolist()), whole)
+
+
+@pytest.mark.parametrize("nodes", [1, 3, 1000])
+@pytest.mark.parametrize("slots", [64, 4096])
+def test_where_late_requests_wait_changes_nothing(rng, monkeypatch, slots, nodes):
+    """Without nodes all are in the heap; with few slots most are due later than a turn of the wheel."""
+    monkeypatch.setattr(line_arbiter, "SLOTS", slots)
+    monkeypatch.setattr(line_arbiter, "NODES", nodes)
+    pushed = set()
+    events, bus = bunched(rng, 1000), Readout(rate=1e6, line=3e-7, mode="rows")
+    reader = bus.reader(WIDTH, HEIGHT, 0)
+    for begin in range(0, len(events), 50):
+        part = events.select(slice(begin, begin + 50))
+        later = events.t[begin + 50] if begin + 50 < len(events) else np.inf
+        pushed.update(rows_of(reader.push(part, float(later))[0]))
+    assert sorted(pushed) == sorted(twin_of(events, bus))
+    assert (int(reader._state["numbers"][ArbiterNumber.NODES]) > 0) == (nodes > 1)
+
+
+@pytest.mark.parametrize("width", [64, 65, 4096, 4097, 10000])
+def test_wide_lines_are_read_as_their_twin_says(rng, width):
+    events, bus = bunched(rng, 1000), Readout(rate=1e6, line=3e-7, mode="rows")
+    x = rng.integers(0, 6, len(events)) * (width - 1) // 5
+    wide = replace(events, x=x.astype(np.uint16), y=events.y % 3, width=width, height=3)
+    assert rows_of(through(camera(bus), wide)) == twin_of(wide, bus)
 
 
 @pytest.mark.parametrize("mode", ["rows", "columns"])
