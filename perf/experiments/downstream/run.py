@@ -226,7 +226,7 @@ class Study:
         """Learn thresholds from a target's recording, and leave their sensor, its weights and the log."""
         folder = self.learned_file(task, target).parent
         before = LEARNED_AFTER.get(task)
-        known = dase.load_sensor(self.learned_file(before, target)) if before else None
+        known = in_midst(dase.load_sensor(self.learned_file(before, target))) if before else None
         how = self.size.learning_paper if task == "train_paper" else self.size.learning
         begin = time.monotonic()
         with tempfile.TemporaryDirectory(dir=folder.parent) as work:
