@@ -81,12 +81,18 @@ def gather_rows(
 
 
 def count_steps(
-    layout: RowLayout, rate: torch.Tensor, steps: torch.Tensor, *, decay: float
+    layout: RowLayout, rate: torch.Tensor, steps: torch.Tensor, *, decay: float, momentum: float = 0.0
 ) -> tuple[torch.Tensor, torch.Tensor]:
-    """Count a step of the critics that have rows in `steps` (C,); return their rates and corrections."""
+    """Count a step of the critics that have rows in `steps` (C,); return their rates and corrections.
+
+    Rates are those of `move_critics`: they make up for a mean that began at 0.
+    """
     rates, correction = torch.empty_like(steps), torch.empty_like(steps)
     launch_on_tensors(
-        _rows.count_steps, [layout.number, rate.view(1), decay], [steps, rates, correction], over=steps[None]
+        _rows.count_steps,
+        [layout.number, rate.view(1), decay, momentum],
+        [steps, rates, correction],
+        over=steps[None],
     )
     return rates, correction
 
@@ -240,27 +246,38 @@ def move_critics(
     correction: torch.Tensor,
     *,
     decay: float,
+    mean: torch.Tensor | None = None,
+    momentum: float = 0.0,
     tiny: float = 1e-8,
 ) -> None:
-    """Move weights by Adam without momentum along the sum of outer products of `left` and `right` rows.
+    """Move weights along the sum of outer products of `left` and `right` rows, by Adam without momentum.
+
+    With `mean` by AdaBelief (Zhuang et al., 2020): along the running mean, over the root of how far
+    gradients stray from it.
 
     Args:
         weight: Changed in place, float32 (C, J, K); J and K are multiples of 4.
-        square: Running mean of squared gradients, changed in place, shaped alike.
+        square: Running mean of squared gradients, or of what they stray by squared, changed in place, shaped
+            alike.
         copy: Set to the weights in bfloat16, (C, J, K).
         left: float32 (R, J), the rows of critic 0 first.
         right: bfloat16 or float32 (R, K), in the same order.
         end: Where the rows of each critic end, int32 (C,).
         rate: Learning rate of each critic, float32 (C,); those at 0 are not touched.
         correction: 1 / (1 - decay^steps) of each critic, float32 (C,).
-        decay: Of the running mean.
-        tiny: Added to the root of the mean square.
+        decay: Of `square`.
+        mean: Running mean of gradients, changed in place, shaped as the weights; None for Adam.
+        momentum: Decay of `mean`.
+        tiny: Added to the root of the mean square, and to this itself by AdaBelief.
     """
     half = right.dtype == torch.bfloat16
-    inputs = [left, _as_words(right), end, rate, correction, decay, tiny]
-    outputs = [weight.flatten(0, 1), square.flatten(0, 1), _as_words(copy).flatten(0, 1)]
+    inputs = [left, _as_words(right), end, rate, correction, decay, momentum, tiny]
+    known = square if mean is None else mean
+    outputs = [*(one.flatten(0, 1) for one in (weight, square, known)), _as_words(copy).flatten(0, 1)]
     strips = -(-weight.shape[1] // (_bank.TILE * _bank.STRIP)) * weight.shape[2] // _bank.TILE
-    launch_on_tensors(_bank.adam_kernels[half], inputs, outputs, over=rate[:, None], size=strips)
+    launch_on_tensors(
+        _bank.step_kernels[half, mean is not None], inputs, outputs, over=rate[:, None], size=strips
+    )
 
 
 def move_sums(
@@ -271,12 +288,16 @@ def move_sums(
     correction: torch.Tensor,
     *,
     decay: float,
+    mean: torch.Tensor | None = None,
+    momentum: float = 0.0,
     tiny: float = 1e-8,
 ) -> None:
-    """Move weights by Adam without momentum along a gradient, all float32 (C, J); see `move_critics`."""
+    """Move weights along a gradient, all float32 (C, J); see `move_critics`."""
+    known = square if mean is None else mean
     launch_on_tensors(
-        _bank.adam_step, [gradient, rate, correction, decay, tiny], [weight, square], over=gradient
-    )
+        _bank.sum_kernels[mean is not None], [gradient, rate, correction, decay, momentum, tiny],
+        [weight, square, known], over=gradient,
+    )  # fmt: skip
 
 
 def multiply_by_critic(rows: torch.Tensor, weights: torch.Tensor, end: torch.Tensor) -> torch.Tensor:

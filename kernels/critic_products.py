@@ -106,12 +106,12 @@ def outer_full(
     ...
 
 
-def _make_adam_kernel(half: bool) -> wp.Kernel:
-    """Return the kernel for right rows in bfloat16, or in float32."""
+def _make_step_kernel(half: bool, belief: bool) -> wp.Kernel:
+    """Return the kernel for right rows in bfloat16 or float32, and for AdaBelief or Adam without momentum."""
     outer = outer_half if half else outer_full
 
     @wp.kernel(enable_backward=False, module="unique")
-    def adam(
+    def step(
         first: int,
         # in
         left: wp.array2d[float],  # (R, J) rows of the outer products, critic by critic
@@ -120,14 +120,18 @@ def _make_adam_kernel(half: bool) -> wp.Kernel:
         rate: wp.array[float],  # (C,) learning rate, 0 leaves a critic alone
         correction: wp.array[float],  # (C,) 1 / (1 - decay^steps)
         decay: float,  # of the mean square
+        momentum: float,  # decay of the mean
         tiny: float,  # added to the root
         # inout
         weight: wp.array2d[float],  # (C J, K)
-        square: wp.array2d[float],  # (C J, K) running mean of the gradient's square
+        square: wp.array2d[
+            float
+        ],  # (C J, K) running mean of the square: of the gradient, or of what it strays by
+        mean: wp.array2d[float],  # (C J, K) running mean of the gradient; not looked at by Adam
         # out
         copy: wp.array2d[int],  # (C J, K) the weights in bfloat16, as words
     ):
-        """Adam without momentum (Kingma and Ba, Adam, 2015), a strip of tiles per thread."""
+        """One step, a strip of tiles per thread (Kingma, Ba: Adam, 2015; Zhuang et al.: AdaBelief, 2020)."""
         c, i = wp.tid()
         speed, unbias = float(rate[c]), float(correction[c])
         if speed == 0.0:
@@ -143,47 +147,72 @@ def _make_adam_kernel(half: bool) -> wp.Kernel:
         above = c * left.shape[1]
         for j in range(strip, wp.min(strip + TILE * STRIP, left.shape[1]), TILE):
             # everything is asked for before anything is worked out: no load may pass a store
+            squares = wp.mat44()
             means = wp.mat44()
             weights = wp.mat44()
             for n in range(TILE):
-                means[n] = load_vec4(square, above + j + n, k)
+                squares[n] = load_vec4(square, above + j + n, k)
                 weights[n] = load_vec4(weight, above + j + n, k)
+                if wp.static(belief):
+                    means[n] = load_vec4(mean, above + j + n, k)
             gradient = outer(left, right, begin, stop, j, k)
             for n in range(TILE):
-                slope = gradient[n]
-                mean = decay * means[n] + (1.0 - decay) * wp.cw_mul(slope, slope)
-                store_vec4(square, above + j + n, k, mean)
+                way = gradient[n]
+                stray = gradient[n]
+                least = float(0.0)
+                if wp.static(belief):
+                    way = momentum * means[n] + (1.0 - momentum) * gradient[n]
+                    stray = gradient[n] - way
+                    least = tiny
+                    store_vec4(mean, above + j + n, k, way)
+                spread = decay * squares[n] + (1.0 - decay) * wp.cw_mul(stray, stray)
                 w = weights[n]
                 for m in range(TILE):
-                    w[m] = w[m] - speed * over_root(slope[m], mean[m] * unbias, tiny)
+                    spread[m] = spread[m] + least
+                    w[m] = w[m] - speed * over_root(way[m], spread[m] * unbias, tiny)
+                store_vec4(square, above + j + n, k, spread)
                 store_vec4(weight, above + j + n, k, w)
                 store_half(copy, above + j + n, k, w)
 
-    return adam
+    return step
 
 
-@wp.kernel(enable_backward=False)
-def adam_step(
-    first: int,
-    # in
-    gradient: wp.array2d[float],  # (C, J)
-    rate: wp.array[float],  # (C,) learning rate, 0 leaves a critic alone
-    correction: wp.array[float],  # (C,) 1 / (1 - decay^steps)
-    decay: float,  # of the mean square
-    tiny: float,  # added to the root
-    # inout
-    weight: wp.array2d[float],  # (C, J)
-    square: wp.array2d[float],  # (C, J) running mean of the gradient's square
-):
-    """The step of `adam_kernels` where the gradient is known."""
-    c, i = wp.tid()
-    if rate[c] == 0.0:
-        return
-    i += first
-    slope = gradient[c, i]
-    mean = decay * square[c, i] + (1.0 - decay) * slope * slope
-    square[c, i] = mean
-    weight[c, i] = weight[c, i] - rate[c] * slope / (wp.sqrt(mean * correction[c]) + tiny)
+def _make_sum_kernel(belief: bool) -> wp.Kernel:
+    """Return the kernel of the same step where the gradient is known."""
+
+    @wp.kernel(enable_backward=False, module="unique")
+    def step(
+        first: int,
+        # in
+        gradient: wp.array2d[float],  # (C, J)
+        rate: wp.array[float],  # (C,) learning rate, 0 leaves a critic alone
+        correction: wp.array[float],  # (C,) 1 / (1 - decay^steps)
+        decay: float,  # of the mean square
+        momentum: float,  # decay of the mean
+        tiny: float,  # added to the root
+        # inout
+        weight: wp.array2d[float],  # (C, J)
+        square: wp.array2d[float],  # (C, J) running mean of the square
+        mean: wp.array2d[float],  # (C, J) running mean of the gradient; not looked at by Adam
+    ):
+        """One step of each weight."""
+        c, i = wp.tid()
+        if rate[c] == 0.0:
+            return
+        i += first
+        way = gradient[c, i]
+        stray = gradient[c, i]
+        least = float(0.0)
+        if wp.static(belief):
+            way = momentum * mean[c, i] + (1.0 - momentum) * gradient[c, i]
+            stray = gradient[c, i] - way
+            least = tiny
+            mean[c, i] = way
+        spread = decay * square[c, i] + (1.0 - decay) * stray * stray + least
+        square[c, i] = spread
+        weight[c, i] = weight[c, i] - rate[c] * way / (wp.sqrt(spread * correction[c]) + tiny)
+
+    return step
 
 
 @wp.kernel(enable_backward=False)
@@ -240,5 +269,9 @@ def multiply_parts(
             store_half(out, row + n, k, total[n])
 
 
-adam_kernels = {half: _make_adam_kernel(half) for half in (True, False)}
-"""Kernels by whether the right rows are bfloat16."""
+step_kernels = {
+    (half, belief): _make_step_kernel(half, belief) for half in (True, False) for belief in (True, False)
+}
+"""Kernels by whether the right rows are bfloat16, and whether the optimiser is AdaBelief."""
+sum_kernels = {belief: _make_sum_kernel(belief) for belief in (True, False)}
+"""Those of gradients that are known, by the latter."""

@@ -128,10 +128,11 @@ def count_steps(
     number: wp.array2d[int],  # (2, C)
     rate: wp.array[float],  # (1,) learning rate
     decay: float,  # of the mean square
+    momentum: float,  # decay of the mean
     # inout
     steps: wp.array[float],  # (C,) that each critic has made
     # out
-    rates: wp.array[float],  # (C,) 0 for critics without rows
+    rates: wp.array[float],  # (C,) rate / (1 - momentum^steps), 0 for critics without rows
     correction: wp.array[float],  # (C,) 1 / (1 - decay^steps)
 ):
     """Count the step of the critics that make one."""
@@ -140,5 +141,6 @@ def count_steps(
     moves = pairs_of(number, c) > 0
     made = steps[c] + wp.where(moves, 1.0, 0.0)
     steps[c] = made
-    rates[c] = wp.where(moves, rate[0], 0.0)
-    correction[c] = 1.0 / (1.0 - wp.pow(decay, wp.max(made, 1.0)))
+    count = wp.max(made, 1.0)
+    rates[c] = wp.where(moves, rate[0] / (1.0 - wp.pow(momentum, count)), 0.0)
+    correction[c] = 1.0 / (1.0 - wp.pow(decay, count))

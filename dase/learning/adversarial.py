@@ -14,7 +14,7 @@ import torch
 
 from dase.kernels import autograd_training as bridge
 from dase.learning import distributed
-from dase.learning.critic_bank import BankShape, CriticBank
+from dase.learning.critic_bank import OPTIMIZERS, BankShape, CriticBank
 from dase.learning.targets import Pairs, PixelNoise
 from dase.networks.threshold_network import gradient_magnitude
 
@@ -130,6 +130,7 @@ class AdversarialSettings:
 
     Args:
         critic_rate: Learning rate of the critics.
+        critic_optimizer: `adam`, without momentum, or `adabelief` (0.9, 0.999).
         critic_cosine: Whether it falls as the generator's does, so that critics settle with it.
         critic_steps: Steps of the critics in a step; more keep up with the generator better.
         penalty: Weight of the gradient penalty.
@@ -141,6 +142,7 @@ class AdversarialSettings:
     """
 
     critic_rate: float = 2e-4
+    critic_optimizer: Literal["adam", "adabelief"] = "adam"
     critic_cosine: bool = False
     critic_steps: int = 1
     penalty: float = 1.0
@@ -175,7 +177,10 @@ class AdversarialObjective:
         # counts and gradient magnitudes of both polarities, and the image
         channels = 4 + settings.critic_image
         shape = BankShape(classes=how.classes, inputs=channels * how.size**2)
-        self.bank = CriticBank(shape, device=self.device, generator=self.generator)
+        self.bank = CriticBank(
+            shape, device=self.device, generator=self.generator,
+            optimizer=OPTIMIZERS[self.settings.critic_optimizer],
+        )  # fmt: skip
 
     def calibrate(self, sets: list[tuple[Pairs, Pairs]], held_out: Iterable[Pairs] = ()) -> None:
         """Place the boundaries of the hash; held-out pairs are not looked at."""
@@ -282,7 +287,7 @@ class AdversarialObjective:
         """Return the state of all critics, each from the process that looks after it."""
         state = self.bank.state()
         out: dict[str, Any] = {"steps": distributed.gather_from_owners(state["steps"])}
-        for kind in ("weights", "square"):
+        for kind in ("weights", "square", "mean"):
             out[kind] = {name: distributed.gather_from_owners(value) for name, value in state[kind].items()}
         return out
 

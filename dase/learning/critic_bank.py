@@ -88,6 +88,30 @@ class Activations:
     by_second: torch.Tensor
 
 
+@dataclass(frozen=True)
+class CriticOptimizer:
+    """How critics are moved.
+
+    Args:
+        decay: Of the mean square of gradients, or of what they stray from their mean by.
+        momentum: Decay of the mean of gradients.
+        belief: Whether it is AdaBelief, along the mean, and not Adam without momentum.
+        tiny: Added to the root of the mean square.
+    """
+
+    decay: float = 0.9
+    momentum: float = 0.0
+    belief: bool = False
+    tiny: float = 1e-8
+
+
+OPTIMIZERS = {
+    "adam": CriticOptimizer(),
+    "adabelief": CriticOptimizer(decay=0.999, momentum=0.9, belief=True, tiny=1e-16),
+}
+"""By their names in recipes; AdaBelief as its paper has it."""
+
+
 class CriticBank:
     """Critics inputs→wide→narrow→1 with leaky rectifiers, one for each class of patches, worked as one.
 
@@ -100,13 +124,14 @@ class CriticBank:
         shape: Sizes.
         device: PyTorch device.
         generator: Draws the weights.
-        decay: Of Adam's mean square; there is no momentum.
+        optimizer: How they are moved.
 
     Attributes:
         w1, b1: Weights and biases of the first layer, float32 (C, wide, inputs) and (C, wide).
         w2, b2: Those of the second layer, (C, narrow, wide) and (C, narrow).
         w3, b3: Those of the last layer, (C, narrow) and (C, 1).
-        square: Adam's mean square of the gradient of each, by its name and of its shape.
+        square: The optimiser's mean square of each, by its name and of its shape.
+        mean: AdaBelief's mean of the gradient of each, likewise; nothing for Adam.
         steps: Steps that each critic has made, float32 (C,).
         copies: w1 and w2 as bfloat16, which products on a GPU read; as new as the weights after every step.
     """
@@ -117,9 +142,9 @@ class CriticBank:
         *,
         device: str | torch.device = "cpu",
         generator: torch.Generator | None = None,
-        decay: float = 0.9,
+        optimizer: CriticOptimizer = OPTIMIZERS["adam"],
     ):
-        self.shape, self.device, self.decay = shape, torch.device(device), decay
+        self.shape, self.device, self.optimizer = shape, torch.device(device), optimizer
         self.working = torch.bfloat16 if self.device.type == "cuda" else torch.float32
 
         def drawn(outputs: int, inputs: int) -> tuple[torch.Tensor, torch.Tensor]:
@@ -136,6 +161,7 @@ class CriticBank:
         w3, self.b3 = drawn(1, shape.narrow)
         self.w3 = w3[:, 0].contiguous()
         self.square = {name: torch.zeros_like(getattr(self, name)) for name in self.parameter_names()}
+        self.mean = {name: torch.zeros_like(one) for name, one in self.square.items() if optimizer.belief}
         self.steps = torch.zeros(shape.classes, device=self.device)
         self._refresh_copies()
 
@@ -150,13 +176,15 @@ class CriticBank:
     def state(self) -> dict[str, Any]:
         """Return everything that the next step depends on."""
         weights = {name: getattr(self, name) for name in self.parameter_names()}
-        return {"weights": weights, "square": self.square, "steps": self.steps}
+        return {"weights": weights, "square": self.square, "mean": self.mean, "steps": self.steps}
 
     def load(self, state: dict[str, Any]) -> None:
         """Take over what `state` returned."""
         for name in self.parameter_names():
             getattr(self, name).copy_(state["weights"][name])
             self.square[name].copy_(state["square"][name])
+        for name, mean in self.mean.items():
+            mean.copy_(state["mean"][name])
         self.steps.copy_(state["steps"])
         self._refresh_copies()
 
@@ -251,14 +279,19 @@ class CriticBank:
         batch = CriticBatch(self, fake, fake_classes, real, real_classes, weights, share)
         critique = batch.differentiate(penalty, steepness)
         speed = rate if isinstance(rate, torch.Tensor) else torch.full((1,), rate, device=self.device)
-        paces = bridge.count_steps(batch.layout, speed, self.steps, decay=self.decay)
+        how = self.optimizer
+        decays = {"decay": how.decay, "momentum": how.momentum}
+        paces = bridge.count_steps(batch.layout, speed, self.steps, **decays)
         for name, (left, right) in batch.outer.items():
             bridge.move_critics(
                 getattr(self, name), self.square[name], self.copies[name], left, right, batch.layout.end[0],
-                *paces, decay=self.decay,
+                *paces, mean=self.mean.get(name), tiny=how.tiny, **decays,
             )  # fmt: skip
         for name, gradient in batch.sums.items():
-            bridge.move_sums(getattr(self, name), self.square[name], gradient, *paces, decay=self.decay)
+            bridge.move_sums(
+                getattr(self, name), self.square[name], gradient, *paces,
+                mean=self.mean.get(name), tiny=how.tiny, **decays,
+            )  # fmt: skip
         return critique
 
     def one_launch(self) -> bool:
@@ -269,10 +302,12 @@ class CriticBank:
         """Return the bytes that one step has to move at least, `active` critics being in use.
 
         Per weight of the first two layers: the forward pass, the penalty's gradient and its derivative read a
-        bfloat16 copy, the update reads and writes the weight and its mean square and writes the copy.
+        bfloat16 copy, the update reads and writes the weight, its mean square and the mean of AdaBelief, and
+        writes the copy.
         """
         layers = self.shape.wide * (self.shape.inputs + self.shape.narrow)
-        return active * layers * (3 * 2 + 4 * 4 + 2)
+        kept = 3 if self.mean else 2
+        return active * layers * (3 * 2 + 2 * 4 * kept + 2)
 
 
 class CriticBatch:

@@ -61,13 +61,13 @@ PRESETS: dict[str, Recipe] = {
         objective="wgan", steps=20_000, warmup=0, batch=48, optimizer="adabelief", rate=4e-4,
         rate_scalars=4e-4, anchor=0.0, average=0.0, surrogate="interval", network=NetworkShape(literal=True),
         adversarial=AdversarialSettings(
-            critic_rate=4e-4, critic_cosine=True, steepness=1.0, plain_counts=True,
-            hash=PatchHash(contrast_from="events"),
+            critic_rate=4e-4, critic_optimizer="adabelief", critic_cosine=True, steepness=1.0,
+            plain_counts=True, hash=PatchHash(contrast_from="events"),
         ),
     ),
 }  # fmt: skip
-"""Recipes by name. `default` is the best found, `tiny` for a CPU; `paper` is the paper's setting but for its
-critics, which Adam moves; the penalty is that of WGAN-GP, where the paper tells none."""
+"""Recipes by name. `default` is the best found, `tiny` for a CPU; `paper` is the paper's setting;
+the penalty is that of WGAN-GP, where the paper tells none."""
 
 SHORTEST_STEP = 1e-3
 """δ of Eq. 5: however fast things move, its samples do not follow each other faster [s]."""

@@ -101,8 +101,39 @@ def evaluate(
     Raises:
         InputError: A file cannot be read, or there is nothing to judge.
     """
-    where = choose_device(device)
-    network, window = load_network(Path(checkpoint), where)
+    network, window = load_network(Path(checkpoint), choose_device(device))
+    return judge_network(
+        network, window, file, out=out, offset=offset, lpips=lpips, normalise=normalise, **reading
+    )
+
+
+def judge_network(
+    network: EventNetwork,
+    window: float,
+    file: str | PathLike[str],
+    *,
+    out: str | PathLike[str] | None = None,
+    offset: float | None = 0.0,
+    lpips: str | PathLike[str] | None = None,
+    normalise: bool = False,
+    **reading: Any,
+) -> Evaluation:
+    """Return what `evaluate` returns, of a network at hand.
+
+    Args:
+        network: On its device.
+        window: Duration of its windows [s].
+        file: See `evaluate`, as all that follow.
+        out: Folder.
+        offset: Of the frames [s].
+        lpips: Weights.
+        normalise: Of the voxels.
+        **reading: What is known of the file.
+
+    Raises:
+        InputError: The file cannot be read, or there is nothing to judge.
+    """
+    where = next(network.parameters()).device
     sequence = io.read(file, **reading)
     if not len(sequence.events):
         raise InputError(f"{file}: has no events")

@@ -149,7 +149,7 @@ class Padded:
 
 def _adam(parameters: list[torch.Tensor], bank: CriticBank) -> torch.optim.Optimizer:
     """Return the optimiser of the bank, as PyTorch has it."""
-    return torch.optim.Adam(parameters, lr=1e-9, betas=(0.0, bank.decay))
+    return torch.optim.Adam(parameters, lr=1e-9, betas=(0.0, bank.optimizer.decay))
 
 
 def _rows_of(classes: torch.Tensor, number: int) -> list[torch.Tensor]:

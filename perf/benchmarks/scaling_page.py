@@ -62,8 +62,8 @@ WHOLE_JOB = """\
 17), by the clock: the present `davis346` takes 35 s at 56c6730 (88,096,752 events; 47 and 45 s at
 d01e7e2 in the same run), that of 3859195 takes 33 s (163,618,642 events; 59 s at 3859195 in the
 same run). In a later run, at 2f4580b, these were 38 and 33 s, and 61 s at 3859195; the first was 36 and
-35 s at 12886e8. The goal of 25 s is missed. On an H100 with 16 cores of an Intel Xeon, at 12886e8 and a5feef4,
-each time with 3859195 in one run, the sensor of 3859195 and the same 163,618,663 events: 15.5 and
+35 s at 12886e8. The goal of 25 s is missed. On an H100 with 16 cores of an Intel Xeon, at 12886e8 and
+a5feef4, each time with 3859195 in one run, the sensor of 3859195 and the same 163,618,663 events: 15.5 and
 14.5 s with one process for 27.5 and 26.7, 8.3 and 7.7 s with eight for 10.6 and 9.5; the present
 `davis346`, whose bus the processor reads out, 15.3 and 12.7 s, and 9.2 and 8.3 s.
 The goals of 6 and 3 s are missed. `dase.simulate` of the

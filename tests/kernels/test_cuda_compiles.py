@@ -94,5 +94,6 @@ def test_pictures_of_layers(tmp_path):
 
 @pytest.mark.parametrize("half", [True, pytest.param(False, marks=pytest.mark.slow)])
 def test_critics(half, tmp_path):
-    for kernel in (critic_products.adam_kernels[half], *vars(critic_layers.layer_kernels[half]).values()):
+    steps = [critic_products.step_kernels[half, belief] for belief in (False, True)]
+    for kernel in (*steps, *vars(critic_layers.layer_kernels[half]).values()):
         compiles(kernel.module, tmp_path)

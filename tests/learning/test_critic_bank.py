@@ -12,7 +12,15 @@ import torch
 from torch import nn
 
 from dase.kernels import autograd_critics as bridge
-from dase.learning.critic_bank import BankShape, CriticBank, CriticBatch, SortedRows, multiply_groups
+from dase.learning.adabelief import AdaBelief
+from dase.learning.critic_bank import (
+    OPTIMIZERS,
+    BankShape,
+    CriticBank,
+    CriticBatch,
+    SortedRows,
+    multiply_groups,
+)
 
 SHAPE = BankShape(classes=5, inputs=64, wide=16, narrow=8)
 FAKE = torch.tensor([0, 0, 1, 1, 1, 3, 3, 0, 4])  # class 2 has no fake patches, 4 no real ones
@@ -185,6 +193,37 @@ def test_moving_by_outer_products(device, dtype):
     assert torch.equal(copy[rate > 0], weight[rate > 0].bfloat16())
 
 
+@pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16])
+def test_moving_by_adabelief(device, dtype):
+    """Over several steps as the optimiser that is written from its paper, critics without rows left alone."""
+    place = torch.device("cuda" if device.startswith("cuda") else "cpu")
+    generator = torch.Generator().manual_seed(4)
+    weight, bias = (torch.randn(*shape, generator=generator).to(place) for shape in ((3, 8, 32), (3, 8)))
+    kept = [torch.zeros_like(one) for one in (weight, weight, bias, bias)]
+    wants = [[torch.nn.Parameter(one[c].clone()) for one in (weight, bias)] for c in range(3)]
+    steps = [AdaBelief(want, lr=0.1, betas=(0.9, 0.999)) for want in wants]
+    end = torch.tensor([2, 6, 6], dtype=torch.int32, device=place)
+    copy = weight.bfloat16()
+    for turn in range(1, 5):
+        left = torch.randn(6, 8, generator=generator).to(place)
+        right = torch.randn(6, 32, generator=generator).to(place, dtype)
+        gradient = torch.randn(3, 8, generator=generator).to(place)
+        rate = torch.tensor([0.1, 0.1, 0.0], device=place) / (1 - 0.9**turn)
+        correction = torch.full((3,), 1 / (1 - 0.999**turn), device=place)
+        how = {"decay": 0.999, "momentum": 0.9, "tiny": 1e-16}
+        bridge.move_critics(weight, kept[0], copy, left, right, end, rate, correction, mean=kept[1], **how)
+        bridge.move_sums(bias, kept[2], gradient, rate, correction, mean=kept[3], **how)
+        for c, (begin, stop) in enumerate(((0, 2), (2, 6))):
+            wants[c][0].grad = left[begin:stop].T @ right[begin:stop].float()
+            wants[c][1].grad = gradient[c].clone()
+            steps[c].step()
+    for c, want in enumerate(wants):
+        torch.testing.assert_close(weight[c], want[0].detach(), rtol=1e-3, atol=1e-5)
+        torch.testing.assert_close(bias[c], want[1].detach(), rtol=1e-3, atol=1e-5)
+    assert not kept[1][2].any()
+    assert torch.equal(copy[:2], weight[:2].bfloat16())
+
+
 def test_grouped_products_and_order(rng):
     classes = torch.from_numpy(rng.integers(0, 4, 20))
     by = SortedRows.of_classes(classes, 3)  # class 3 is none
@@ -215,5 +254,9 @@ def test_traffic_counts_what_has_to_move():
     bank = CriticBank(BankShape(classes=2, inputs=16, wide=8, narrow=8))
     assert bank.least_traffic(1) == 8 * (16 + 8) * (3 * 2 + 4 * 4 + 2)
     assert bank.least_traffic(2) == 2 * bank.least_traffic(1)
+    believing = CriticBank(
+        BankShape(classes=2, inputs=16, wide=8, narrow=8), optimizer=OPTIMIZERS["adabelief"]
+    )
+    assert believing.least_traffic(1) == 8 * (16 + 8) * (3 * 2 + 6 * 4 + 2)
     assert BankShape(classes=216).weights() == pytest.approx(361e6, rel=0.01)  # the paper's bank
     assert np.isclose(BankShape(classes=1).weights(), 6400 * 256 + 256 + 256 * 128 + 128 + 128 + 1)

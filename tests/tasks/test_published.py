@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+import pickle
+from pathlib import Path
+
 import pytest
 
 torch = pytest.importorskip("torch")
 
 import torch.nn.functional as F
 
-from dase.tasks.checkpoints import load_network
-from perf.experiments.downstream.published import firenet_of, save_published
+from perf.experiments.downstream.published import LAYERS, PieNet, firenet_of, open_network
 
 CHANNELS = 3
 
@@ -60,20 +62,80 @@ def run_published(weights, windows):
     return torch.stack(made)
 
 
-def test_published_weights_say_the_same_in_our_network(tmp_path):
+RENAMED = {
+    "net.head.conv.": "head.", "net.head.recurrent_block.": "G1.", "net.resblocks.0.recurrent_block.": "G2.",
+    "net.resblocks.0.conv.": "R1.", "net.resblocks.1.": "R2.", "net.pred.": "pred.",
+}  # fmt: skip
+"""Beginnings of names in the file of FireNet, and in that of FireNet+."""
+
+
+def renamed(weights):
+    """Return weights by the names of FireNet+."""
+    return {
+        next(new + name[len(old) :] for old, new in RENAMED.items() if name.startswith(old)): weight
+        for name, weight in weights.items()
+    }
+
+
+class ConfigParser:
+    """What a file of FireNet+ holds beside weights; a program that loads it must not run its code."""
+
+    def __reduce__(self):
+        return pytest.fail, ("code of a file was run",)
+
+
+@pytest.mark.parametrize("name", ["firenet", "firenet+"])
+def test_published_weights_say_the_same_in_our_network(tmp_path, name):
     weights, windows = published_weights(), torch.randn(4, 1, 5, 9, 7)
-    torch.save({"state_dict": weights, "epoch": 1}, tmp_path / "theirs.pth")
-    save_published(tmp_path / "theirs.pth", tmp_path / "ours.pt", 0.02)
-    network, window = load_network(tmp_path / "ours.pt")
-    assert (network.kind, network.shape, window) == ("firenet", {"bins": 5, "channels": CHANNELS}, 0.02)
+    held = renamed(weights) if name == "firenet+" else weights
+    torch.save({"state_dict": held, "epoch": 1, "save_dir": Path("kept")}, tmp_path / "theirs.pth")
+    network = open_network(name, tmp_path / "theirs.pth")
+    assert (network.kind, network.shape) == ("firenet", {"bins": 5, "channels": CHANNELS})
     with torch.no_grad():
         torch.testing.assert_close(network.sequence(windows)[0], run_published(weights, windows))
 
 
+def test_no_code_of_a_file_is_run(tmp_path):
+    torch.save({"state_dict": published_weights(), "config": ConfigParser()}, tmp_path / "theirs.pth")
+    with pytest.raises(pickle.UnpicklingError, match=r"fail"):
+        open_network("firenet", tmp_path / "theirs.pth")
+
+
 def test_other_networks_are_refused():
     weights = published_weights()
+    more = {**weights, "net.resblocks.2.conv1.weight": weights["net.resblocks.1.conv1.weight"]}
     with pytest.raises(ValueError, match=r"net\.resblocks\.2"):
-        firenet_of({**weights, "net.resblocks.2.conv1.weight": weights["net.resblocks.1.conv1.weight"]})
+        firenet_of(more, LAYERS["firenet"])
     weights.pop("net.pred.conv2d.bias")
     with pytest.raises(KeyError, match=r"net\.pred\.conv2d\.bias"):
-        firenet_of(weights)
+        firenet_of(weights, LAYERS["firenet"])
+
+
+class Counter(torch.nn.Module):
+    """In place of a network of event-pienet: keeps what it has seen as that does."""
+
+    def __init__(self):
+        super().__init__()
+        self.reset_states()
+
+    def reset_states(self):
+        self.f0 = self.prev_var = self.p_states = None
+
+    def forward(self, events):
+        mean = events.mean(1, keepdim=True)
+        self.f0 = mean if self.f0 is None else self.f0 + mean
+        self.prev_var = 2 * self.f0
+        self.p_states = [(self.f0 + n, self.f0 - n) for n in range(3)]
+        return {"image": self.f0 + self.p_states[2][0]}
+
+
+def test_what_pie_net_remembers_is_handed_in_and_out():
+    windows = torch.randn(6, 1, 5, 4, 3)
+    network = PieNet(Counter())
+    whole, _ = network.sequence(windows)
+    first, memory = network.sequence(windows[:2])
+    network.sequence(torch.randn(1, 1, 5, 4, 3))  # another recording in between
+    second, _ = network.sequence(windows[2:], memory=memory)
+    torch.testing.assert_close(torch.cat([first, second]), whole)
+    sums = windows.mean(2, keepdim=True).cumsum(0)
+    torch.testing.assert_close(whole, 2 * sums + 2)

@@ -7,7 +7,7 @@ import pytest
 pytest.importorskip("torch")
 
 import dase
-from perf.experiments.downstream.run import Job, next_job, study_plan
+from perf.experiments.downstream.run import SMALL, Job, Study, next_job, study_plan
 from perf.experiments.downstream.sensors import (
     TARGETS,
     LearnSettings,
@@ -130,3 +130,14 @@ def test_what_is_not_known_yet_or_takes_too_long_waits():
     assert next_job(waiting, learned, 100.0, {}) == waiting[0]
     assert next_job(waiting, set(), 100.0, {"reconstruction": 120.0}) == waiting[2]
     assert next_job(waiting, learned, 100.0, {"reconstruction": 120.0, "flow": 101.0}) is None
+
+
+def test_fitted_sensors_are_trained_on_in_the_midst_of_things(tmp_path):
+    """What a fit says of the phase is of its recording: with 0, first windows have too few events."""
+    fitted = TARGETS["tired"].with_effect(dase.effects.Threshold(on=0.2, off=0.3, phase=0.0))
+    study = Study("", "", tmp_path, "cpu", SMALL, 0.0)
+    path = study.learned_file("fit", "tired")
+    path.parent.mkdir()
+    path.write_text(dase.dump_sensor(fitted), "utf-8")
+    trained_on = study.training("fitted", "tired").sensor
+    assert trained_on == fitted.with_effect(dase.effects.Threshold(on=0.2, off=0.3, phase=1.0))

@@ -3,9 +3,10 @@
     python -m perf.experiments.downstream.real RECORDING --camera davis240c --photos FOLDER --out OUT
 
 Reconstruction as in `run`: the same size, scenes and seeds, trained on ESIM's default, broad randomisation,
-S2R's threshold tuned to the recording's rate of events, and the preset of its camera. Each network is judged
-half way and at the end of its training, as `dase evaluate` does, and all on the same frames. The same call
-goes on where it stopped. `results.jsonl` has a line for each network; the table is printed at the end.
+S2R's threshold tuned to the recording's rate of events, the preset of its camera, and with `--fitted` what
+`dase fit` made of the recording. Each network is judged half way and at the end of its training, as
+`dase evaluate` does, and all on the same frames. The same call goes on where it stopped. `results.jsonl` has
+a line for each network; the table is printed at the end.
 `published` judges a published network beside them.
 """
 
@@ -24,10 +25,16 @@ import numpy as np
 
 import dase
 from perf.experiments.downstream.run import SMALL, Job, Size, Study, run_jobs, unpack_photos
-from perf.experiments.downstream.sensors import Training, plain_sensor, tune_threshold, tuned_thresholds
+from perf.experiments.downstream.sensors import (
+    Training,
+    in_midst,
+    plain_sensor,
+    tune_threshold,
+    tuned_thresholds,
+)
 from perf.experiments.downstream.table import mean_text, read_rows
 
-KINDS = ("esim", "broad", "tuned", "camera")
+KINDS = ("esim", "broad", "tuned", "camera", "fitted")
 """What is trained on."""
 METRICS = ("mse", "mse_affine", "mse_histogram", "ssim", "ms_ssim")
 """What the table has."""
@@ -41,15 +48,18 @@ class RealStudy(Study):
         recording: File with frames.
         camera: Preset of its camera.
         offset: From the frames' times to the middles of their exposures [s].
+        fitted: Sensor that was fitted to the recording.
     """
 
     recording: str = ""
     camera: str = ""
     offset: float = 0.0
+    fitted: str = ""
 
     def learned(self) -> set[tuple[str, str]]:
-        """Return whether the threshold is tuned."""
-        return {("tune", self.camera)} if self.learned_file("tune", self.camera).exists() else set()
+        """Return what has been learned of the recording: a threshold that is tuned, and what was fitted."""
+        tuned = self.learned_file("tune", self.camera).exists()
+        return {(task, self.camera) for task, there in (("tune", tuned), ("fit", self.fitted)) if there}
 
     def learn(self, task: str, target: str) -> None:
         """Tune a threshold to the rate of the recording."""
@@ -67,6 +77,8 @@ class RealStudy(Study):
         """Return what is trained on."""
         if kind == "camera":
             return Training(dase.load_sensor(self.camera))
+        if kind == "fitted":
+            return Training(in_midst(dase.load_sensor(self.fitted)))
         if kind == "tuned":
             base = json.loads(self.learned_file("tune", target).read_text("utf-8"))["tuned"]
             return Training(plain_sensor(base), tuned_thresholds(base))
@@ -117,6 +129,8 @@ def main() -> None:
     ask.add_argument("--jobs", type=int, default=1, help="trainings side by side on each device")
     ask.add_argument("--minutes", type=float, default=1e6)
     ask.add_argument("--seeds", type=int, default=5)
+    ask.add_argument("--fitted", default="", help="sensor file that was fitted to the recording")
+    ask.add_argument("--kinds", default=",".join(KINDS))
     ask.add_argument("--steps", type=int, default=Size.reconstruction_steps, help="batches of a training")
     ask.add_argument("--small", action="store_true", help="Do all parts work?")
     args = ask.parse_args()
@@ -126,7 +140,7 @@ def main() -> None:
     size = SMALL if args.small else Size(reconstruction_steps=args.steps)
     study = RealStudy(
         train, test, args.out, "cpu", size, deadline,
-        recording=str(args.recording), camera=args.camera, offset=args.offset,
+        recording=str(args.recording), camera=args.camera, offset=args.offset, fitted=args.fitted,
     )  # fmt: skip
     log = args.out / "results.jsonl"
     # published networks have rows, and no trainings
@@ -136,8 +150,10 @@ def main() -> None:
         ask.error(f"{log} has trainings of another number of steps than {size.reconstruction_steps}")
     done = {(row["kind"], row["seed"]) for row in rows}
     # the quickest first: what is tuned is waited for
-    plan = [] if study.learned() else [Job("tune", "", args.camera, 0)]
-    each = itertools.product(range(args.seeds), KINDS)
+    kinds = [kind for kind in args.kinds.split(",") if kind != "fitted" or args.fitted]
+    plan = [Job("tune", "", args.camera, 0)] if "tuned" in kinds else []
+    plan = [job for job in plan if (job.task, job.target) not in study.learned()]
+    each = itertools.product(range(args.seeds), kinds)
     plan += [
         Job("reconstruction", kind, args.camera, seed) for seed, kind in each if (kind, seed) not in done
     ]

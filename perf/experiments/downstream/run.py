@@ -59,6 +59,7 @@ from perf.experiments.downstream.sensors import (
     Training,
     broad_thresholds,
     fit_target,
+    in_midst,
     plain_sensor,
     record_target,
     train_on,
@@ -225,7 +226,7 @@ class Study:
         """Learn thresholds from a target's recording, and leave their sensor, its weights and the log."""
         folder = self.learned_file(task, target).parent
         before = LEARNED_AFTER.get(task)
-        known = dase.load_sensor(self.learned_file(before, target)) if before else None
+        known = in_midst(dase.load_sensor(self.learned_file(before, target))) if before else None
         how = self.size.learning_paper if task == "train_paper" else self.size.learning
         begin = time.monotonic()
         with tempfile.TemporaryDirectory(dir=folder.parent) as work:
@@ -259,7 +260,8 @@ class Study:
         if kind == "eventgan":
             # its scenes are taken, and not its events
             return Training(plain_sensor(0.2), remake=EventGan(self.learned_file("gan", target)))
-        return Training(dase.load_sensor(self.learned_file(LEARNED_BY[kind], target)))
+        sensor = dase.load_sensor(self.learned_file(LEARNED_BY[kind], target))
+        return Training(in_midst(sensor) if kind == "fitted" else sensor)
 
     def folder(self, job: Job) -> Path:
         """Return where a training is kept."""

@@ -156,6 +156,16 @@ class TargetRecording:
         return recording.masked(~recording.hot)
 
 
+def in_midst(sensor: dase.Sensor) -> dase.Sensor:
+    """Return a fitted sensor whose pixels have seen something before a scene begins.
+
+    The phase that a fit finds tells how its recording began and belongs to no camera. Scenes of a training
+    are cut out of time, as are windows that thresholds are learned from: with a phase of 0 pixels make too
+    few events in the first of three windows.
+    """
+    return sensor.with_effect(replace(sensor["threshold"], phase=1.0))
+
+
 def record_target(target: dase.Sensor, images: str, seconds: float, device: str) -> TargetRecording:
     """Return a recording of a target.
 
