@@ -191,8 +191,9 @@ class BatchSimulator:
             # common
             filled = rows / (self._lanes * -(-rows // self._lanes))
             share |= len(stages) > settings.effects and beside[finer, maps] > 1 and filled < settings.filled
-            launch_key = (finer, maps, None if share else key)
-            out.setdefault(launch_key, (finer, share, []))[2].extend(members)
+            # kernels of all effects differ by the words of a sensor's own, and by effects that are a user's
+            kernel = id(self._kernel(orders[members[0][0]].sensor, share)[0])
+            out.setdefault((finer, maps, kernel), (finer, share, []))[2].extend(members)
         return list(out.values())
 
     def _run(self, orders: Sequence[SimulationOrder], history: Any, *, share: bool) -> list[ProbeSums]:

@@ -183,3 +183,14 @@ def test_what_no_process_has_compiled_is_not_compiled_to_find_out(trials, tmp_pa
     for _ in range(2):
         simulator.run(sensor, vectors, seed=5)
     assert [shared for _, shared in simulator._kernels] == [True]
+
+
+def test_models_whose_effects_differ_by_words_do_not_share_a_kernel(trials):
+    """Side by side they are what each of them is alone, though few models fill no lanes."""
+    sensors = [sensor_with(Leak(rate=9.0), Refractory(period=0.03, mode=mode)) for mode in ("reset", "drop")]
+    orders = [SimulationOrder(one, one.parameters()[None], 5) for one in (*sensors, sensor_with(Leak()))]
+    together = trials.run_all(orders)
+    for order, sums in zip(orders, together, strict=True):
+        alone = trials.run(order.sensor, order.vectors, seed=5)
+        np.testing.assert_array_equal(sums.sums, alone.sums)
+    assert together[0].halves.sum() != together[1].halves.sum()
