@@ -69,8 +69,7 @@ class SimulationOrder:
         vectors: Shape (B, P).
         seed: Of the random numbers.
         reseed: Whether each vector gets random numbers of its own.
-        finer: Samples per step; None chooses by what models need, see `in_whole_blocks`; repeats take what
-            the one of them needs that needs most.
+        finer: Samples per step; None chooses by each model, and by the one that needs most for repeats.
         frame: What the counts of pixels are folded for; None where that is not known yet.
         ticks: From tick to tick of the clock that stamps the events [s], 0 for none.
         most: Samples per step that no model exceeds, whatever it needs.
@@ -91,7 +90,7 @@ class SimulationOrder:
         if self.finer is not None:
             return np.full(rows, self.finer)
         found = np.minimum(samples_per_step_of_rows(self.sensor, self.vectors, step), self.most)
-        return np.full(rows, found.max(initial=0)) if self.reseed else in_whole_blocks(found)
+        return np.full(rows, found.max(initial=0)) if self.reseed else found
 
     def seeds(self) -> NDArray[np.int64]:
         """Return the seed of each vector, shape (B,)."""
@@ -420,27 +419,6 @@ class BatchSimulator:
         launch.run_kernel(kernels.sum_group_counts, steps, [teams, out], self.device, batch=rows, slabs=1)
         found: NDArray[np.int32] = out.numpy()
         return found
-
-
-def in_whole_blocks(needed: NDArray[np.int64], most: float = 2.0) -> NDArray[np.int64]:
-    """Return the samples per step that models take who need so many, shape (B,).
-
-    A thread of a CPU takes as long for one model as for all its lanes, so some take part in finer sampling,
-    which is as right, where their lanes would lie empty. So do they on a GPU, for the same results. More
-    neighbours of a descent have their random numbers in common then, too.
-
-    Args:
-        needed: Samples per step, shape (B,).
-        most: A model takes at most so many times what it needs, for rows of other orders that need as many
-            may fill its lanes.
-    """
-    out, order, first = needed.copy(), np.argsort(-needed, kind="stable"), 0
-    while first < len(order):
-        block = order[first : first + kernels.LANES]
-        block = block[most * needed[block] >= needed[block[0]]]
-        out[block] = needed[block[0]]
-        first += len(block)
-    return out
 
 
 def _fold_for_frames(orders: Sequence[SimulationOrder], pixels: Any) -> NDArray[np.float64] | None:

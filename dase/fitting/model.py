@@ -33,9 +33,6 @@ class RefitSettings:
     """Random numbers of the descents of which the best is taken, as each ends where its own happen to lead;
     by the last ones other rules are tried."""
 
-    slow_descents: int = 2
-    """The same of models that take many samples, or whose events go through a readout."""
-
     alike: float = 2.0
     """Most by which the loss of another phase or rule may grow where it becomes the present one."""
 
@@ -216,8 +213,7 @@ def refit_model(evidence: SplitMeasurement, model: FittedModel, *, seed: int, ro
     last ones begin with the other phase, or another rule of an effect; the best of them by the random numbers
     of all is taken.
     """
-    descents = REFIT.slow_descents if evidence.train.slow(model.space) else REFIT.descents
-    seeds = [SimulationStream.DESCENT.seed(seed, n) for n in range(descents)]
+    seeds = [SimulationStream.DESCENT.seed(seed, n) for n in range(REFIT.descents)]
     works = [refit_work(evidence, model, seed=each, rounds=rounds) for each in seeds[:-1]]
     works += [
         _refit_otherwise_work(evidence, other, model, seed=seeds[-1], rounds=rounds)

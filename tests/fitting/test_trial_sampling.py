@@ -22,7 +22,6 @@ from dase.fitting.parameter_space import ParameterSpace, axes_of
 from dase.fitting.trial_kernels import KernelChoice, KernelSettings
 from dase.fitting.trial_sampling import samples_of_screening, samples_per_step, samples_per_step_of_rows
 from dase.kernels import launch
-from dase.kernels.event_probes import LANES
 from dase.probes.stimulus import STIMULUS, Grid, Stimulus, sort_into_cells
 
 STEP, SIZE, SECONDS = 1e-3, (20, 16), 0.3
@@ -91,14 +90,9 @@ def test_models_are_sampled_as_each_of_them_needs(trials):
     vectors[:, at] = 3000.0, 20.0, 400.0, 1000.0
     assert samples_per_step_of_rows(sensor, vectors, STEP).tolist() == [24, 1, 4, 8]
     assert samples_per_step(sensor, STEP) == 2
-    # lanes of one thread take as long for one model as for all, so what is nearly as fine is sampled alike
-    taken = SimulationOrder(sensor, vectors, 5).samples_per_step(STEP)
-    assert taken.tolist() == [24, 1, 8, 8]
-    many = SimulationOrder(sensor, np.concatenate([np.repeat(vectors[3:], LANES, 0), vectors]), 5)
-    assert many.samples_per_step(STEP).tolist() == [8] * LANES + [24, 1, 8, 8]
     together = trials.run(sensor, vectors, seed=5)
     for n in range(4):
-        alone = trials.run(sensor, vectors[n : n + 1], seed=5, finer=taken[n])
+        alone = trials.run(sensor, vectors[n : n + 1], seed=5)
         np.testing.assert_array_equal(together.sums[n], alone.sums[0])
         np.testing.assert_array_equal(together.halves[n], alone.halves[0])
         np.testing.assert_array_equal(together.clock[n], alone.clock[0])
