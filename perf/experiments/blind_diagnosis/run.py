@@ -320,8 +320,13 @@ def _together(rng: np.random.Generator, names: list[str], many: int) -> tuple[st
 
 
 def true_effects(folder: Path, name: str) -> tuple[tuple[str, ...], tuple[str, ...]]:
-    """Return what is hidden in a case of another simulator by dase's names, and what may be named beside."""
+    """Return what is hidden in a case of another simulator by dase's names, and what may be named beside.
+
+    A set says it by `effects` and `allowed`, or by the parameters that v2e was given.
+    """
     case = json.loads((folder / "truth.json").read_text())[name]
+    if "effects" in case:
+        return tuple(sorted(case["effects"])), tuple(sorted(case.get("allowed", ())))
     values = {key: float(value or 0) for key, value in case["params"].items() if not isinstance(value, str)}
     of = {
         "sigma_thres": "mismatch", "cutoff_hz": "bandwidth", "leak_rate_hz": "leak",
