@@ -278,14 +278,19 @@ class Study:
             for batch in self.timed(self.stream(task, how, self.train, seed, first)):
                 yield batch if how.remake is None else replace(batch, inputs=how.remake(batch))
 
-        options = {"seed": seed, "device": self.device, "save_every": 100, "stop_at": stop_at}
+        options = {"seed": seed, "device": self.device, "stop_at": stop_at}
         if task == "flow":
-            settings = dase.tasks.FlowTraining(steps=size.flow_steps, average=0.998, **options)
+            # 57 MB, which are flushed to the disk: every 100 steps that is a tenth of the time
+            settings = dase.tasks.FlowTraining(
+                steps=size.flow_steps, average=0.998, save_every=1000, **options
+            )
             return dase.tasks.train_flow(
                 dase.tasks.EvFlowNet(5, size.flow_channels), batches, folder, settings
             )
         steps = size.reconstruction_steps
-        settings = dase.tasks.ReconstructionTraining(steps=steps, average=0.995, **options)
+        settings = dase.tasks.ReconstructionTraining(
+            steps=steps, average=0.995, save_every=100, **options
+        )
         network = dase.tasks.E2VidNet(5, size.reconstruction_channels)
         return dase.tasks.train_reconstruction(network, batches, folder, settings)
 
