@@ -37,6 +37,13 @@ def _polarities(values: NDArray[Any]) -> NDArray[np.bool_]:
     return values.astype(np.bool_)
 
 
+def read_only(values: NDArray[Any]) -> NDArray[Any]:
+    """Return the same array, of any shape, as one that cannot be changed: who keeps it need not copy it."""
+    view = values.view()
+    view.flags.writeable = False
+    return view
+
+
 @dataclass(frozen=True, repr=False)
 class Events:
     """A stream of events of one sensor, sorted by time.
@@ -135,6 +142,12 @@ class Events:
             index = np.flatnonzero(index)  # once, not for each column
         label = None if self.label is None else self.label[index]
         t, x, y, p = (getattr(self, name)[index] for name in "txyp")
+        return Events(t, x, y, p, self.width, self.height, label)
+
+    def read_only(self) -> Events:
+        """Return the same events in columns that cannot be changed through it."""
+        label = None if self.label is None else read_only(self.label)
+        t, x, y, p = (read_only(getattr(self, name)) for name in "txyp")
         return Events(t, x, y, p, self.width, self.height, label)
 
     def slice(self, begin: float, end: float) -> Events:

@@ -28,6 +28,7 @@ from dase.datasets.steps_in_order import StepsInOrder
 from dase.datasets.worker_start import worker_context
 from dase.effects.exposure import Exposure
 from dase.errors import InputError, checked_integer, nearest
+from dase.events import read_only
 from dase.files.folder_lock import locking_folder
 from dase.files.text_files import read_text_file
 from dase.io.source import Source
@@ -610,7 +611,8 @@ class _Recording:
             frames = to_grey(scene.exposed_frames(begins, self._exposure, device))
         else:
             frames = scene.grey_frames(begins, device)
-        return middles, frames, scene.flow(middles, device)
+        flow = scene.flow(middles, device)
+        return middles, read_only(frames), None if flow is None else read_only(flow)
 
     def _write_chunk(
         self,
@@ -623,6 +625,7 @@ class _Recording:
 
         def write(writer: io.Writer) -> WorkReport:
             (events,) = chunk.read()
+            events = events.read_only()
             for i, at in enumerate(times):
                 writer.frame(float(at), frames[i], None if flow is None else flow[i], exposure=self._exposure)
             if samples or len(events):

@@ -22,7 +22,7 @@ from contextlib import AbstractContextManager, suppress
 from functools import lru_cache
 from io import FileIO
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeAlias
 
 import cv2
 import h5py
@@ -181,8 +181,8 @@ class _PackingLine:
             self._write_next()
 
     def keep(self, values: NDArray[Any]) -> NDArray[Any]:
-        """Return values that stay as they are although the caller may change his."""
-        return values if self._pool is None else values.copy()
+        """Return values that stay as they are, although the caller may change his if they can be changed."""
+        return values.copy() if self._pool is not None and values.flags.writeable else values
 
     def finish(self) -> None:
         """Write what still waits."""
@@ -262,6 +262,47 @@ def _attribute_types(kind: np.dtype[Any], shape: tuple[int, ...]) -> tuple[Any, 
     return h5t.py_create(kind, logical=True), h5t.py_create(kind), h5s.create_simple(shape)
 
 
+Columns: TypeAlias = tuple[NDArray[Any], ...]
+"""Columns of some events, each of shape (N,)."""
+
+
+def _own_column(values: NDArray[Any], kind: np.dtype[Any]) -> NDArray[Any]:
+    """Return a column of a type, (N,), that nobody changes: read-only ones as they are."""
+    if values.flags.writeable:
+        return values.astype(kind)
+    # coordinates are below the greatest number of either type
+    same = values.dtype.kind in "iu" and kind.kind in "iu" and values.dtype.itemsize == kind.itemsize
+    return values.view(kind) if same else values.astype(kind, copy=False)
+
+
+def _split_parts(parts: list[Columns], count: int) -> tuple[list[Columns], list[Columns]]:
+    """Return parts with the first `count` events, and what is left, as copies: it is little."""
+    taken: list[Columns] = []
+    for n, part in enumerate(parts):
+        here = min(len(part[0]), count)
+        count -= here
+        taken.append(tuple(column[:here] for column in part))
+        if not count:
+            left = [tuple(column[here:].copy() for column in part), *parts[n + 1 :]]
+            return taken, [some for some in left if len(some[0])]
+    raise AssertionError("fewer events than asked for")
+
+
+def _cut_chunks(pieces: Iterable[NDArray[Any]]) -> list[NDArray[Any]]:
+    """Return a column cut into chunks, copied only where two pieces meet in one; the last may be short."""
+    chunks: list[list[NDArray[Any]]] = []
+    room = 0  # in the last chunk
+    for piece in pieces:
+        begin = 0
+        while begin < len(piece):
+            if not room:
+                chunks.append([])
+                room = CHUNK
+            chunks[-1].append(piece[begin : begin + room])
+            begin, room = begin + len(chunks[-1][-1]), room - len(chunks[-1][-1])
+    return [some[0] if len(some) == 1 else np.concatenate(some) for some in chunks]
+
+
 class _Writer(Writer):
     """Appends whole blocks of events, and frames as they come."""
 
@@ -275,7 +316,7 @@ class _Writer(Writer):
             self._create(name)
         self._file.create_group("images")  # readers list it even where it is empty
         self._numbered = _NumberedMembers(self._file)
-        self._parts: list[tuple[NDArray[Any], ...]] = []
+        self._parts: list[Columns] = []
         self._waiting = 0
         self._written = 0
         self._on = 0
@@ -292,13 +333,12 @@ class _Writer(Writer):
     def _put_events(self, part: Events) -> None:
         if max(part.width, part.height) > 32767:
             raise InputError(f"HDF5: the sensor must be at most 32767 wide, got {part.width}x{part.height}")
-        columns = [part.t, part.x, part.y, part.p]
+        columns: list[NDArray[Any]] = [part.t, part.x, part.y, part.p]
         if part.label is not None:
             self._types = EVENT_TYPES | LABEL_TYPE
             columns.append(part.label)
-        self._parts.append(
-            tuple(np.asarray(a).astype(kind) for a, kind in zip(columns, self._types.values(), strict=True))
-        )
+        kinds: list[np.dtype[Any]] = [np.dtype(kind) for kind in self._types.values()]
+        self._parts.append(tuple(_own_column(a, kind) for a, kind in zip(columns, kinds, strict=True)))
         self._on += int(np.count_nonzero(part.p))
         self._waiting += len(part)
         if self._waiting >= BLOCK:
@@ -308,31 +348,31 @@ class _Writer(Writer):
         """Write the first `count` of the events waiting; whole chunks are compressed once only."""
         if not count:
             return
-        columns = [np.concatenate(column) for column in zip(*self._parts, strict=True)]
+        parts, rest = _split_parts(self._parts, count)
         end = self._written + count
-        for index, more in enumerate(np.searchsorted(columns[0][:count], self._times)):
-            self._before[index] += int(more) if self._before[index] != LATE else 0
-        whole = count // CHUNK * CHUNK
-        cuts = [slice(begin, begin + CHUNK) for begin in range(0, whole, CHUNK)]
-        named = dict(zip(self._types, columns, strict=True))
-        written = self._written
+        for t, *_ in parts:
+            for index, more in enumerate(np.searchsorted(t, self._times)):
+                self._before[index] += int(more) if self._before[index] != LATE else 0
+        chunks = [_cut_chunks(column) for column in zip(*parts, strict=True)]
+        whole, written = count // CHUNK, self._written
+        tails = {name: column[whole:] for name, column in zip(self._types, chunks, strict=True)}
 
         def write(packed: list[bytes]) -> None:
             left = iter(packed)
-            for name, column in named.items():
+            for name, tail in tails.items():
                 if f"events/{name}" not in self._file:
                     self._create(name)
                 dataset = self._file[f"events/{name}"]
                 dataset.resize((end,))
-                for cut in cuts:
-                    dataset.id.write_direct_chunk((written + cut.start,), next(left))
-                if whole < count:
-                    dataset[written + whole : end] = column[whole:count]
+                for begin in range(written, written + whole * CHUNK, CHUNK):
+                    dataset.id.write_direct_chunk((begin,), next(left))
+                for values in tail:
+                    dataset[written + whole * CHUNK : end] = values
 
-        self._line.add((column[cut] for column in columns for cut in cuts), write)
-        self._written, self._last_written = end, float(columns[0][count - 1])
+        self._line.add((chunk for column in chunks for chunk in column[:whole]), write)
+        self._written, self._last_written = end, float(parts[-1][0][-1])
         self._waiting -= count
-        self._parts = [tuple(column[count:].copy() for column in columns)] if self._waiting else []
+        self._parts = rest
         self._disk.check()
 
     def _put_frame(

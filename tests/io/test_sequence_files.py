@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from dase.errors import InputError
-from dase.events import Events
+from dase.events import Events, read_only
 from dase.io import create, h5, npz, read, write
 from dase.io.sequence import Sequence
 
@@ -126,6 +126,33 @@ def test_the_caller_may_reuse_its_arrays(tmp_path, rng):
                 array[...] = 0
         got = read(tmp_path / f"a{suffix}")
         assert_same(got, Sequence(want.events, want.frames[:1], np.zeros(1)))
+
+
+@pytest.mark.parametrize("threads", [1, 3])
+def test_what_nobody_can_change_is_packed_where_it_lies(tmp_path, rng, monkeypatch, threads):
+    monkeypatch.setattr(h5, "CHUNK", 64)
+    monkeypatch.setattr(h5, "BLOCK", 256)
+    monkeypatch.setattr(h5, "thread_count", lambda: threads)
+    want, packed = everything(rng), []
+    pack = h5.pack_chunk
+    monkeypatch.setattr(h5, "pack_chunk", lambda values: (packed.append(values), pack(values))[1])
+    files = []
+    for fixed in (False, True):
+        packed.clear()
+        stream, flow = want.events, want.flow
+        if fixed:
+            stream, flow = stream.read_only(), read_only(flow)
+        files.append(tmp_path / f"{fixed}.h5")
+        with create(files[-1]) as writer:
+            for begin, end in itertools.pairwise((0, 320, 500, 1000)):
+                writer.events(stream.select(slice(begin, end)))
+            for k in range(4):
+                writer.frame(want.frame_times[k], want.frames[k], flow[k])
+        there = [a for a in (*(getattr(want.events, name) for name in "txyp"), want.flow)]
+        shared = sum(any(np.shares_memory(chunk, a) for a in there) for chunk in packed)
+        # 4 columns of 15 chunks, of which one has events of two parts, and 4 fields of flow
+        assert shared == (4 * 14 + 4 if fixed else 4 * (threads == 1))
+    assert files[0].read_bytes() == files[1].read_bytes()
 
 
 def test_s2r_layout(tmp_path, rng):
