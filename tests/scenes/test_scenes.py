@@ -12,7 +12,7 @@ from reference import pixel as reference
 
 import dase
 from dase.kernels import launch, scene_render
-from dase.scenes import random_scenes
+from dase.scenes import layers, random_scenes
 from dase.scenes.image_sources import ImageSource
 
 SIZES = [(12, 9), (7, 13), (10, 10), (1, 6), (15, 4)]
@@ -221,6 +221,19 @@ def test_sampling_obeys_equation_5(rng, kind):
         bound = steps <= made.shortest * (1 + 1e-6)
         # speed is looked up on a grid of `shortest`, so it may grow a little within a cell
         assert np.all((ways[:-1] <= 1.05 * made.travel) | bound[:-1])
+
+
+def test_steps_are_interpolated_as_numpy_does(rng):
+    x = np.cumsum(rng.uniform(0.1, 1, 50)).tolist()
+    y = rng.normal(size=50).tolist()
+    for at in [*rng.uniform(x[0] - 1, x[-1] + 1, 200), *x]:
+        assert layers._interpolated(at, x, y, np.inf) == np.interp(at, x, y, right=np.inf)
+
+
+def test_points_are_mapped_as_a_product_of_matrices(rng):
+    maps, (x, y) = rng.normal(size=(7, 3, 3, 3)), rng.normal(size=(2, 3))
+    want = np.einsum("tlij,lj->tli", maps[..., :2, :], np.stack([x, y, np.ones(3)], -1))
+    np.testing.assert_allclose(layers._mapped(maps, x, y), want, rtol=1e-12)
 
 
 def test_sampling_is_no_denser_than_needed(rng):
