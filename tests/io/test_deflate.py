@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+import time
 import zlib
 from collections.abc import Callable
 
@@ -11,6 +12,7 @@ import pytest
 
 from dase import io
 from dase.events import Events
+from dase.io import h5
 from dase.io.h5 import deflate_bytes, shuffle_bytes
 from dase.kernels.threads import keep_thread_count, thread_count
 
@@ -83,21 +85,34 @@ def test_files_do_not_depend_on_how_many_threads_pack_them(tmp_path):
     np.testing.assert_array_equal(sequence.frames[0], rng.integers(0, 256, (30, 40), dtype=np.uint8))
 
 
-def test_an_abandoned_file_leaves_nothing_to_wait_for(tmp_path):
+def test_nothing_of_an_abandoned_file_is_packed_any_more(tmp_path, monkeypatch):
+    packed, pack = [], h5.pack_chunk
+
+    def slowly(chunk):
+        packed.append(len(chunk))
+        time.sleep(0.05)
+        return pack(chunk)
+
+    monkeypatch.setattr(h5, "pack_chunk", slowly)
     before = thread_count()
     keep_thread_count(3)
     try:
         with pytest.raises(RuntimeError, match="enough"):
             begin_and_fail(tmp_path / "a.h5")
+        count = len(packed)
+        # the threads of all files take chunks in turn: what was left of the first would come before these
+        write_sequence(tmp_path / "b.h5", np.random.default_rng(5), 3)
     finally:
         keep_thread_count(before)
-    assert list(tmp_path.iterdir()) == []
-    assert not [t for t in threading.enumerate() if t.name.startswith("dase pack")]
+    assert not (tmp_path / "a.h5").exists()
+    of_flow = 2  # first axis of a chunk of flow; chunks of events have one axis of thousands
+    assert packed[:count].count(of_flow) < 12
+    assert packed[count:].count(of_flow) == 6
 
 
 def begin_and_fail(path):
     with io.create(path) as writer:
-        for k in range(40):
+        for k in range(12):
             writer.frame(float(k), np.zeros((30, 40), np.uint8), np.zeros((2, 30, 40), np.float32))
         raise RuntimeError("enough")
 
