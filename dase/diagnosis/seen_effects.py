@@ -14,7 +14,7 @@ from dase.effects.threshold import Threshold
 from dase.errors import InputError
 from dase.events import Events
 from dase.fitting.burst_strength import BurstStrength, burst_times_of, fit_bursts
-from dase.fitting.frame_steps import frame_step_of, is_in_step
+from dase.fitting.frame_steps import frame_step_of, is_in_step, ticks_are_of_frames
 from dase.fitting.measurement import Measurement
 from dase.results import DetectionLimit, Diagnosis, Finding, Grade
 from dase.scenes.between_frames import CameraScene
@@ -136,7 +136,7 @@ def find_seen_effects(measurement: Measurement, library: Collection[str]) -> See
     step = frame_step_of(events, scene)
     entries = tuple(
         entry for entry in found.found
-        if not step or entry.name != "flicker" or not is_in_step(entry.details["frequency"], step)
+        if not step or not _is_of_frames(entry, step, events, scene)
     )  # fmt: skip
     coupling = [entry for entry in entries if entry.name == "frame coupling"]
     bursts = None
@@ -146,6 +146,14 @@ def find_seen_effects(measurement: Measurement, library: Collection[str]) -> See
             bursts = bursts.extend(float(events.t[-1]))
     absent = tuple(entry for entry in found.entries if entry.answer is Answer.NOT_SEEN)
     return SeenEffects(entries, bursts, absent, frozenset(library))
+
+
+def _is_of_frames(entry: Signature, step: float, events: Events, scene: Scene) -> bool:
+    """Return whether a signature of events in step with frames, every `step` [s], is made by these."""
+    if entry.name == "flicker":
+        return is_in_step(entry.details["frequency"], step)
+    tick = entry.details.get("step", 0.0) if entry.name == "time stamps" else 0.0
+    return ticks_are_of_frames(tick, step, events, scene)
 
 
 def without_the_scene(seen: SeenEffects, measurement: Measurement, sensor: Sensor, seed: int) -> SeenEffects:

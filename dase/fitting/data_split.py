@@ -17,7 +17,7 @@ from dase.events import Events
 from dase.fitting.batch_simulator import BatchSimulator
 from dase.fitting.bus_load import WholeSensor
 from dase.fitting.contradictions import contradiction_of_rest
-from dase.fitting.frame_steps import frame_step_of, is_too_slow
+from dase.fitting.frame_steps import frame_step_of, is_too_slow, ticks_are_of_frames
 from dase.fitting.pixel_selection import choose_trusted_pixels, find_trusted_parts
 from dase.fitting.spliced_time import SplicedScene, SplicedTime
 from dase.fitting.subset import Array, CalibratedSubset, PixelSubset
@@ -30,6 +30,7 @@ from dase.fitting.time_window import (
     sentence_of_windows,
     within_span,
 )
+from dase.formatting import format_seconds
 from dase.kernels import event_probes as kernels
 from dase.kernels import launch
 from dase.probes.accumulators import ProbeSums, StatisticsFrame
@@ -336,6 +337,14 @@ def split_measurement(
     ]
     works.append(partial(find_structure, events))
     *_, structure = launch.run_concurrently(works)
+    # a clock would show the tick before each event of a model, often in the frame before
+    if ticks_are_of_frames(structure.step, frame_step, events, scene):
+        notes.append(
+            f"time stamps are multiples of {format_seconds(structure.step)} in step with the frames of the "
+            "clip: times between frames are made by a simulator that knows these frames alone, and are not "
+            "compared"
+        )
+        structure = TimestampStructure()
     for n, cells in enumerate(cell):
         if len(good) == 1:
             cells[:, ~good[0]] = MASKED

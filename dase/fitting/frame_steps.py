@@ -3,7 +3,8 @@
 Cameras and simulators that know the light at all times send events at any time between two frames. One that
 looks at frames alone gives events times of its own making: all of those of a frame share a few time stamps,
 at the same places from frame to frame. What is asked of these times between frames is no matter of physics;
-from frame to frame it is.
+from frame to frame it is. Their ticks are no clock of a camera's either: that shows the tick before an event,
+and such a simulator says what went on since the last frame at the next one or at some part of the way to it.
 """
 
 from __future__ import annotations
@@ -48,6 +49,12 @@ class FrameStepSettings:
     together: float = 0.3
     """Length of the mean of all phases: a camera's coarse clock alone has ticks all round."""
 
+    looked: int = 60
+    """Frames at which it is asked whether events tell of the light before them or after them."""
+
+    near: float = 0.02
+    """How far from a frame an event is of it, in steps from frame to frame."""
+
 
 FRAME_STEPS = FrameStepSettings()
 
@@ -81,6 +88,39 @@ def frame_step_of(events: Events, scene: Scene, settings: FrameStepSettings = FR
     emptiest = float(counts.min()) * settings.parts / len(t)
     together = float(np.abs(np.exp(2j * np.pi * phase).mean()))
     return step if emptiest < settings.empty and together > settings.together else None
+
+
+def ticks_are_of_frames(
+    tick: float, frame_step: float, events: Events, scene: Scene, settings: FrameStepSettings = FRAME_STEPS
+) -> bool:
+    """Return whether the ticks of time stamps are made from frame to frame, and are not those of a clock.
+
+    Ticks of a clock that are finer than frames come at all parts of a frame alike, and such events are not in
+    step with frames. One whose ticks are frames is in step, too, but tells at a frame of the light after it,
+    where a simulator by frames tells of the light before.
+
+    Args:
+        tick: Time from tick to tick [s].
+        frame_step: What `frame_step_of` says of the events, 0 or None where they are not in step.
+        events: Sorted.
+        scene: What they are of.
+        settings: How many frames are looked at.
+    """
+    if not tick or not frame_step or tick > (1 + settings.near) * frame_step:
+        return False
+    if tick < (1 - settings.near) * frame_step:
+        return True
+    times = scene.sample_times()
+    inner = np.unique(np.linspace(1, len(times) - 2, settings.looked).astype(int))
+    before = after = 0
+    for at in inner if len(times) > 2 else ():
+        first, last = np.searchsorted(events.t, times[at] + np.array([-1, 1]) * settings.near * frame_step)
+        y, x = events.y[first:last], events.x[first:last]
+        light = scene.frames(times[at - 1 : at + 2])[:, y, x]
+        ways = np.where(events.p[first:last], 1, -1) * np.sign(np.diff(light, axis=0))
+        before += int(np.count_nonzero(ways[0] > 0))
+        after += int(np.count_nonzero(ways[1] > 0))
+    return before > after
 
 
 def is_too_slow(step: float) -> bool:

@@ -13,8 +13,9 @@ from dase.diagnosis.seen_effects import find_seen_effects
 from dase.effects import EFFECTS
 from dase.fitting import data_split
 from dase.fitting.data_split import split_measurement
-from dase.fitting.frame_steps import frame_step_of, is_in_step
+from dase.fitting.frame_steps import frame_step_of, is_in_step, ticks_are_of_frames
 from dase.fitting.measurement import Measurement
+from dase.probes.timestamp_patterns import find_structure
 from dase.scenes.video import VideoScene
 from dase.signatures.result import Answer, Signature
 from dase.simulation.sensor import Sensor
@@ -93,6 +94,41 @@ def test_events_of_cameras_are_not(clip, effects):
     events = dase.simulate(clip, sensor, seed=2)
     assert len(events) > 2_000
     assert frame_step_of(events, clip) is None
+
+
+@pytest.fixture(scope="module")
+def fine_clip(clip) -> VideoScene:
+    """The same, 1000 frames a second and as fast for each frame."""
+    return VideoScene(clip.frames(clip.sample_times()), np.arange(120) * 1e-3)
+
+
+def at_times(events: dase.Events, t: np.ndarray) -> dase.Events:
+    order = np.argsort(t, kind="stable")
+    return dase.Events(t[order], *(getattr(events, n)[order] for n in "xyp"), events.width, events.height)
+
+
+@pytest.mark.parametrize("ticks", [1, 2])
+def test_ticks_of_a_simulator_that_knows_frames_alone_are_no_clock(fine_clip, ticks):
+    exact = dase.simulate(fine_clip, "ideal", seed=2)
+    # what a frame changes is told at its end, the half of it that most pixels have no event in, sooner
+    part = np.where((exact.x + exact.y) % 5 > 0, 1, ticks)
+    told = np.ceil(part * exact.t / 1e-3 - 1e-6) / part * 1e-3
+    events = at_times(exact, told)
+    assert frame_step_of(events, fine_clip) == pytest.approx(1e-3)
+    assert find_structure(events).step == pytest.approx(1e-3 / ticks, rel=1e-3)
+    found = split_measurement(events, fine_clip, pixels=300, seed=1)
+    assert found.structure.step == 0
+    assert any("times between frames are made by a simulator" in note for note in found.notes)
+    assert "timestamp" not in find_seen_effects(Measurement(events, fine_clip), EFFECTS).effects
+
+
+def test_a_clock_that_ticks_as_often_as_frames_come_is_one(fine_clip):
+    sensor = Sensor().with_effect(EFFECTS["timestamp"](step=1e-3, jitter=0.0))
+    events = dase.simulate(fine_clip, sensor, seed=2)
+    assert frame_step_of(events, fine_clip) == pytest.approx(1e-3)
+    assert split_measurement(events, fine_clip, pixels=300, seed=1).structure.step == pytest.approx(1e-3)
+    assert "timestamp" in find_seen_effects(Measurement(events, fine_clip), EFFECTS).effects
+    assert not ticks_are_of_frames(1e-3, 0.0, events, fine_clip)
 
 
 def test_tones_of_frames():
