@@ -210,9 +210,17 @@ def diagnose(
         model = refit_model(evidence, model, seed=seed)
         model, judgement = _add_one_by_one(state, model, limit - len(state.added_to(model)))
     if not reaches_floor(judgement) and limit > 0:
+        single = model
         model, judgement = _add_pair(state, model, judgement)
+        if model is not single and not leaves_nothing(judgement):
+            # beside a right pair shows what no effect alone did
+            model, judgement = _add_one_by_one(state, model, limit - len(state.added_to(model)))
     if len(state.added_to(model)) > 1:
+        whole = model
         model, judgement = prune_model(state, model, judgement)
+        if model is not whole and not leaves_nothing(judgement):
+            # a stand-in that was dropped may have hidden what it stood for
+            model, judgement = _add_one_by_one(state, model, limit - len(state.added_to(model)))
     found = _conclude_diagnosis(state, start, model, before, seen, names, measurement)
     found = replace(found, evaluations=found.evaluations + run)
     if silent is not None and silent.decides and not evidence.contradiction:

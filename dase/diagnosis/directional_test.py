@@ -19,7 +19,7 @@ from dase.diagnosis.state import DiagnosisState
 from dase.fitting.model import FittedModel, refit_model, with_effect_added
 from dase.fitting.scheduler import SimulationRequest, answer_requests
 from dase.fitting.subset import CalibratedSubset, PixelSubset
-from dase.probes.distance import Judgement, reaches_floor
+from dase.probes.distance import Judgement, leaves_nothing, reaches_floor
 from dase.probes.random_streams import SimulationStream
 from dase.probes.statistics import compute_statistics
 
@@ -76,6 +76,8 @@ def find_hidden_effect(
     hides = judgement.level >= hidden.hides or state.evidence.train.doubt is not None
     # nor does chance explain what is left, though it is little
     hides = hides or (judgement.level >= hidden.some and judgement.error > judgement.reach)
+    # and right models leave less than this
+    hides = hides or not leaves_nothing(judgement)
     if not hides or not reaches_floor(judgement):
         return None
     state.progress("looking closer", 0.0, state.error)

@@ -43,8 +43,8 @@ NAMED = ("flicker", "hot pixels", "full bus", "time stamps", "frame coupling", "
 """Signatures that tell which effect it is; the others tell what there is, and not what makes it."""
 
 
-MADE_BY_LIGHT = ("flicker", "fixed pattern")
-"""Signatures that light makes by itself, if it goes to and fro."""
+MADE_BY_LIGHT = ("flicker",)
+"""Signatures that light makes by itself."""
 
 SHARPER = (1.0, 0.5, 0.25)
 """Thresholds of the model of which it is asked what light does, relative to those of the model before the

@@ -104,12 +104,12 @@ class _FirstPass:
 class _SecondPass:
     """What is counted by pixel, free of bursts that come with frames."""
 
-    def __init__(self, first: _FirstPass, bursts: BurstClock | None, tone: float):
+    def __init__(self, first: _FirstPass, bursts: BurstClock | None):
         width, height = first.width, first.height
         self._bursts = bursts
         self._filter = CalmFilter(width, height)
         self.quiet = CalmShare(width, height, first.begin, self._filter)
-        self.calm = CalmCounts(width, height, (first.begin + first.end) / 2, tone)
+        self.calm = CalmCounts(width, height, (first.begin + first.end) / 2)
         self.pairs = PairCounts(width, height)
         self.halves = HalfCounts(width, height, first.begin, first.end)
         self.groups = GroupCounts(first.count, first.flooding())
@@ -228,11 +228,13 @@ def find_signatures(
     flicker, lamp = find_flicker(first.clock, each, bursts, doubtful if coupling.p < 0.01 else 0.0)
     # what the whole array follows confounds in the same way, be it a lamp or bursts that are hardly seen
     lit = lamp is not None or (flicker.p < each and flicker.size >= flicker.least)
-    second = _SecondPass(first, bursts, lamp.frequency if lamp else 0.0)
+    second = _SecondPass(first, bursts)
     for part in passes.parts(chunk, progress):
         second.push(part)
     second.finish()
-    hot, hot_pixels = find_hot_pixels(second.calm, second.quiet.share(first.end), duration, each)
+    hot, hot_pixels = find_hot_pixels(
+        second.calm, second.quiet.share(first.end), duration, each, lamp=lamp.frequency if lamp else 0.0
+    )
     stamps = find_time_stamps(first.first_events(), hot_pixels, each, lamp=lit)
     tick = max(stamps.details.get(name, 0.0) for name in ("step", "period")) if stamps.found else 0.0
     entries = (
@@ -240,7 +242,7 @@ def find_signatures(
         flicker,
         hot,
         find_opposite_pairs(second.pairs, hot_pixels, duration, each, lamp=lit),
-        find_fixed_pattern(second.halves, hot_pixels, each, lamp=lit),
+        find_fixed_pattern(second.halves, hot_pixels, each, first.first_events()),
         find_grouping(second.groups, each),
         stamps,
         find_double_events(second.intervals, hot_pixels, each, tick),

@@ -5,17 +5,22 @@ Only calm events count, with nothing near them in space and time: an edge that p
 
 from __future__ import annotations
 
+import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 from scipy import stats
+from scipy.fft import next_fast_len
 
 from dase.events import Events
 from dase.formatting import format_count, format_metric, format_percent
 from dase.signatures.calm_events import row_major_pixels
 from dase.signatures.result import Answer, Signature, judge_signature, without_answer
+
+Array = NDArray[np.float64]
 
 NAME = "hot pixels"
 
@@ -29,27 +34,34 @@ class HotSettings:
     share: float = 0.15  # of its calm events at least in each half of the time
     chance: float = 1e-3  # over all pixels, below which one is counted
     bulk: float = 0.995  # share of the pixels of which the usual spread is taken
-    in_phase: float = 0.5  # of its events, with a lamp: a pixel that follows it is not hot
+    in_phase: float = 0.5  # of its events, beside a lamp: a pixel that follows it is not hot
+    most: int = 1_000_000  # calm events of which times are kept
+    asked: int = 100  # pixels at most that are asked for a tone in common
+    slowest: float = 45.0  # [Hz] of such a tone, as of lamps
+    fastest: float = 450.0
+    step: float = 5e-4  # [s]
+    span: float = 16.0  # [s] the mains keep their phase no longer
+    in_common: float = 1e-3  # chance of a tone below which pixels have it in common
+    overtones: int = 4  # a pixel with a low threshold sends several times in a cycle
     border: int = 2  # pixels from the edge: what passes outside nobody sees, and there it looks calm
     calm: float = 0.05  # share of places and times in which a hot pixel would have been seen alone
 
 
 class CalmCounts:
-    """Counts the calm events of each pixel.
+    """Counts the calm events of each pixel, and keeps the first of them.
 
     Args:
         width: Columns of the sensor.
         height: Rows of the sensor.
         middle: The time that divides the recording in halves [s].
-        frequency: Of a lamp [Hz]; 0 for none.
     """
 
-    def __init__(self, width: int, height: int, middle: float, frequency: float = 0.0):
+    def __init__(self, width: int, height: int, middle: float):
         self.width, self.height = width, height
-        self._middle, self._frequency = middle, frequency
+        self._middle = middle
         self.halves = np.zeros((2, width * height), np.int64)
-        self.phase = np.zeros(width * height, np.complex128)
-        """Sums of the events' signs times their turn of the lamp."""
+        self._first = [Events.empty(width, height)]
+        self._room = HotSettings.most
 
     def push(self, calm: Events) -> None:
         """Take calm events."""
@@ -57,9 +69,81 @@ class CalmCounts:
         cut = int(np.searchsorted(calm.t, self._middle))
         for half, part in enumerate((pixel[:cut], pixel[cut:])):
             self.halves[half] += np.bincount(part, minlength=self.width * self.height)
-        if self._frequency:
-            turn = np.exp(-2j * np.pi * self._frequency * calm.t) * np.where(calm.p, 1.0, -1.0)
-            np.add.at(self.phase, pixel, turn)
+        if self._room > 0 and len(calm):
+            self._first.append(calm.select(slice(0, self._room)))
+            self._room -= len(self._first[-1])
+
+    def first_of(self, pixels: NDArray[np.int64], span: float) -> list[tuple[Array, Array]]:
+        """Return times [s] and signs of the first calm events of some pixels, no longer than a span [s]."""
+        events = Events.concatenate(self._first)
+        place = row_major_pixels(events)
+        known = np.isin(place, pixels)
+        if known.any():
+            known &= events.t < events.t[known][0] + span
+        t, sign, place = events.t[known], np.where(events.p[known], 1.0, -1.0), place[known]
+        return [(t[place == one], sign[place == one]) for one in pixels]
+
+
+def _tone_in_common(trains: Sequence[tuple[Array, Array]], s: HotSettings) -> float:
+    """Return the tone [Hz] that pixels have in common, 0 where there is none.
+
+    Noise of a pixel knows nothing of the others'. Light that swings, be it in a corner of the view, is
+    followed by pixels with low thresholds alone, in one rhythm. Rayleigh statistics of independent pixels add
+    up to a gamma law; the pixel that says most is left out of the sum, as one that sends at even times has a
+    tone of its own.
+    """
+    trains = [one for one in trains if len(one[0])]
+    if len(trains) < s.least:
+        return 0.0
+    begin = min(float(t[0]) for t, _ in trains)
+    span = max(float(t[-1]) for t, _ in trains) - begin
+    pad = next_fast_len(4 * (int(span / s.step) + 1), real=True)
+    cells = np.arange(math.ceil(s.slowest * pad * s.step), int(s.fastest * pad * s.step) + 1)
+    power = np.empty((len(trains), len(cells)))
+    for row, (t, sign) in zip(power, trains, strict=True):
+        train = np.bincount(((t - begin) / s.step).astype(np.int64), sign)
+        row[:] = np.abs(np.fft.rfft(train, pad)[cells]) ** 2 / len(t)
+    others = power.sum(0) - power.max(0)
+    best = int(others.argmax())
+    tests = 2 * (s.fastest - s.slowest) * max(span, s.step)
+    if tests * stats.gamma.sf(others[best], len(trains) - 1) > s.in_common:
+        return 0.0
+    return float(cells[best] / (pad * s.step))
+
+
+def _follow(trains: Sequence[tuple[Array, Array]], tone: float, s: HotSettings) -> NDArray[np.bool_]:
+    """Return which pixels follow a tone [Hz], or one of which it is an overtone, shape (K,)."""
+    orders = np.arange(1, s.overtones + 1)
+    tones = np.unique(np.outer(tone / orders, orders))
+    tones = tones[(tones >= s.slowest) & (tones <= s.fastest), None]
+    sums = [np.abs(np.exp(-2j * np.pi * tones * t) @ sign).max(initial=0.0) for t, sign in trains]
+    return np.array(
+        [0 < s.in_phase * len(t) <= one for one, (t, _) in zip(sums, trains, strict=True)], np.bool_
+    )
+
+
+def _led_pixels(calm: CalmCounts, chance: Array, lamp: float, s: HotSettings) -> NDArray[np.int64]:
+    """Return the pixels that stand out by following light that swings, row-major, shape (K,).
+
+    Where that are half of those that stand out, all are in doubt; of fewer a rhythm in common tells nothing,
+    if no lamp is known, for so fast as some hot pixels send they have any.
+
+    Args:
+        calm: The calm events.
+        chance: Of as many of an ordinary pixel, shape (H * W,).
+        lamp: A frequency that is known [Hz], or 0.
+        s: What makes a pixel hot.
+    """
+    out = np.flatnonzero(chance < s.chance / len(chance))
+    out = out[np.argsort(chance[out], kind="stable")]
+    trains = calm.first_of(out, s.span)
+    tone = lamp or _tone_in_common(trains[: s.asked], s)
+    if not tone:
+        return out[:0]
+    led = _follow(trains, tone, s)
+    if 2 * np.count_nonzero(led) >= len(led):
+        return out
+    return out[led] if lamp else out[:0]
 
 
 def _usual_counts(total: NDArray[np.int64], width: int, height: int) -> NDArray[np.float64]:
@@ -95,7 +179,13 @@ def _pixel_chances(
 
 
 def find_hot_pixels(
-    calm: CalmCounts, quiet: float, duration: float, level: float, settings: HotSettings | None = None
+    calm: CalmCounts,
+    quiet: float,
+    duration: float,
+    level: float,
+    *,
+    lamp: float = 0.0,
+    settings: HotSettings | None = None,
 ) -> tuple[Signature, NDArray[np.bool_]]:
     """Look for pixels that send by themselves.
 
@@ -104,6 +194,7 @@ def find_hot_pixels(
         quiet: Share of places and times with nothing going on.
         duration: Of the recording [s].
         level: p below which there are any.
+        lamp: Frequency of light that flickers [Hz]; 0 where none was found.
         settings: What makes a pixel hot.
 
     Returns:
@@ -114,12 +205,12 @@ def find_hot_pixels(
     nothing = np.zeros(len(total), np.bool_)
     chance, usual = _pixel_chances(total, calm.width, calm.height, s)
     steady = calm.halves.min(0) >= np.maximum(2, s.share * total)
-    alone = steady & (total >= s.ratio * usual)
-    led = alone & (np.abs(calm.phase) >= s.in_phase * total)
-    follow = int(np.count_nonzero(led & (chance < s.chance / len(chance))))
-    alone &= ~led & _has_all_neighbours(calm.width, calm.height, s.border)
-    chance = np.where(alone, chance, 1.0)
+    alone = steady & (total >= s.ratio * usual) & _has_all_neighbours(calm.width, calm.height, s.border)
     pixels = len(chance)
+    led = _led_pixels(calm, np.where(alone, chance, 1.0), lamp, s)
+    follow = len(led)
+    alone[led] = False
+    chance = np.where(alone, chance, 1.0)
     found = chance < s.chance / pixels
     # as many as are announced must each be beyond chance
     p = min(1.0, pixels * float(np.partition(chance, s.least - 1)[s.least - 1])) if pixels >= s.least else 1.0
@@ -140,7 +231,7 @@ def find_hot_pixels(
     )  # fmt: skip
     unseen = f"no {s.least} pixels stand out; {usually} of calm events per pixel"
     if follow:
-        unseen += f"; {follow} would, but follow the light that flickers"
+        unseen += f"; {follow} would, but follow light that flickers"
     entry = judge_signature(entry, level, unseen)
     if not entry.found and quiet < s.calm:
         reason = (

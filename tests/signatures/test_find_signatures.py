@@ -6,6 +6,7 @@ import json
 import tracemalloc
 from dataclasses import replace
 
+import cv2
 import numpy as np
 import pytest
 from click.testing import CliRunner
@@ -121,12 +122,64 @@ def test_a_lamp_is_found_beside_bursts_of_frames():
 def test_pixels_at_the_edge_are_not_called_hot(plain, corner, there):
     """What passes outside nobody sees: an edge that comes no further looks calm."""
     x, y = np.repeat(corner[0] + np.array([0, 7, 14]), 20), np.repeat([corner[1]] * 3, 20)
-    t = np.tile(np.linspace(plain.t[0], plain.t[-1], 20), 3)
+    # each by itself: what three pixels do at the same times is no noise of theirs
+    t = np.random.default_rng(4).uniform(plain.t[0], plain.t[-1], 60)
     calm = plain.select((plain.x > 80) & (plain.y > 60))
     t, x, y = (np.concatenate(pair) for pair in ((t, calm.t), (x, calm.x), (y, calm.y)))
     order = np.argsort(t)
     events = dase.Events(t[order], x[order], y[order], t[order] > 0.5, plain.width, plain.height)
     assert ("hot pixels" in found(events)) == there
+
+
+@pytest.mark.parametrize(("rhythm", "there"), [(0.0, True), (100.0, False)])
+def test_pixels_that_follow_a_lamp_which_is_not_found_are_not_hot(plain, rhythm, there):
+    """Of a lamp in a corner of the view only pixels with low thresholds tell, in one rhythm."""
+    rng = np.random.default_rng(6)
+    calm = plain.select((plain.x > 80) & (plain.y > 60))
+    places = np.array([(20, 20), (35, 30), (50, 20), (65, 40)])
+    t = rng.uniform(plain.t[0], plain.t[-1], (len(places), 80))
+    p = rng.random(t.shape) < 0.5
+    if rhythm:
+        turns = np.floor(t * rhythm) + 0.05 * rng.standard_normal(t.shape)
+        t = np.clip((turns + np.where(p, 0.25, 0.75)) / rhythm, plain.t[0], plain.t[-1])
+    x, y = (np.repeat(places[:, k], t.shape[1]) for k in (0, 1))
+    t, x, y, p = (
+        np.concatenate(pair) for pair in ((t.ravel(), calm.t), (x, calm.x), (y, calm.y), (p.ravel(), calm.p))
+    )
+    order = np.argsort(t)
+    events = dase.Events(t[order], x[order], y[order], p[order], plain.width, plain.height)
+    looked = dase.find_signatures(events)
+    assert not looked["flicker"].found
+    assert looked["hot pixels"].found == there
+    assert ("follow light" in looked["hot pixels"].sentence) != there
+
+
+@pytest.fixture(scope="module")
+def returning():
+    """Sharp edges that go to and fro over the same pixels."""
+    texture = cv2.GaussianBlur(np.random.default_rng(1).random((96, 808)), (0, 0), 1.2)
+    texture = np.clip((texture - texture.min()) / np.ptp(texture), 0.03, 1)
+    times = np.arange(0, 1.001, 0.001)
+    places = 15 * np.sin(2 * np.pi * 1.3 * times) - 330
+    frames = [cv2.warpAffine(texture, np.array([[1.0, 0, x], [0, 1.0, 0]]), (128, 96)) for x in places]
+    return dase.VideoScene(np.stack(frames).astype(np.float32), times)
+
+
+@pytest.mark.parametrize(
+    ("effects", "answer"),
+    [
+        ({}, "not seen"),
+        ({"mismatch": {"spread": 0.15}}, "found"),
+        ({"mismatch": {"spread": 0.3}, "refractory": {"period": 0.015}}, "cannot say"),
+    ],
+)
+def test_edges_that_come_back_are_no_pattern_of_the_pixels(returning, effects, answer):
+    """They leave like counts in both halves, but as many thresholds up as down, unless pixels are deaf."""
+    sensor = dase.Sensor()
+    for name, values in effects.items():
+        sensor = sensor.with_effect(EFFECTS[name](**values))
+    looked = dase.find_signatures(dase.simulate(returning, sensor, seed=2))
+    assert looked["fixed pattern"].answer == answer
 
 
 def test_what_is_put_into_the_events_shows(plain):
