@@ -258,8 +258,8 @@ def with_effect_of_bursts(found: Diagnosis, strength: BurstStrength) -> Diagnosi
 def _asked_of_scene(entries: Collection[Signature], scene: Scene) -> list[Signature]:
     """Return the signatures of which a simulation of the scene tells whether they are the scene's.
 
-    Between a camera's frames light is a guess in time: it tells nothing of lamps, pairs or stamps. But where
-    the same edges come back is in the frames, and so is a pattern of pixels that they make.
+    Between a camera's frames light is a guess in time: it tells nothing of lamps, pairs or stamps. But a
+    pattern is of the pixels: a sensor that makes one makes it whatever light does.
     """
     if not isinstance(scene, CameraScene):
         return list(entries)
