@@ -65,6 +65,9 @@ def add_command(
         fitted, entry = _fit_effect(text.sensor(), chosen, recording, scene, device, seed)
         more = more.describing(fitted)
     sensor_edit.write_sensor_text(more.with_history(entry), output)
+    for name in sorted(more.sensor().idle_parameters() - text.sensor().idle_parameters()):
+        if not name.startswith(f"{effect}."):
+            click.echo(f"note: {name} changes nothing beside {effect}", err=True)
     if output is None:
         return
     click.echo(f"{output}: {effect} added ({describe_values(more.sensor()[effect])})")

@@ -269,6 +269,12 @@ def shown() -> dict[str, Shown]:
             e["dark"](current=0.03), SLOPES,
             f"{slope_words}: below the dark current, 0.03, the same contrast makes fewer events, or none.",
         ),
+        "dark_shared": Shown(
+            e["dark"](current=0.01), STEPS,
+            f"{step_words}, with a bandwidth of 300 Hz: its speed in the dark is that of the dark current.",
+            beside=(e["bandwidth"](cutoff=300.0),),
+            other=e["dark"](current=0.01, speed="own"), left="speed own, 0.07 beside", right="speed shared",
+        ),
         "linlog": Shown(
             e["linlog"](knee=0.0784), SLOPES,
             f"{slope_words}: below the knee, 0.08, the response is linear: fewer events.",

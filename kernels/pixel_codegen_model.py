@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import inspect
 import re
-from collections.abc import Iterable
+from collections.abc import Collection, Iterable
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -15,6 +15,7 @@ from dase.kernels.pixel_codegen import Draw, Statement
 from dase.kernels.pixel_stages import (
     ANYWHERE,
     CORE,
+    LENT,
     QUANTITIES,
     SINKS,
     EffectStages,
@@ -57,15 +58,21 @@ def call_name(stage: str, effect: EffectStages) -> str:
     return f"{stage}_of_{effect.name}"
 
 
-def call_stage(stage: str, effect: EffectStages, function: Any) -> Call:
+def call_stage(stage: str, effect: EffectStages, function: Any, lent: Collection[str] = ()) -> Call:
     """Return the call of a stage function.
+
+    Args:
+        stage: At which it is called.
+        effect: Whose function it is.
+        function: Of Warp.
+        lent: What other effects lend, of `LENT`.
 
     Raises:
         ValueError: It asks for a quantity that the stage does not have.
     """
     # a Warp function keeps the Python function it was made from, whose names are all that is asked for
     names = inspect.signature(function.func).parameters
-    arguments = [_argument(stage, effect, name) for name in names]
+    arguments = [_argument(stage, effect, name, lent) for name in names]
     text = f"{call_name(stage, effect)}({', '.join(argument.text for argument in arguments)})"
     return Call(text, tuple(draw for argument in arguments for draw in argument.draws))
 
@@ -76,7 +83,7 @@ def random_number(name: str) -> re.Match[str] | None:
     return re.fullmatch(r"(pixel_)?(uniform|normal)(_\d)?", name)
 
 
-def _argument(stage: str, effect: EffectStages, name: str) -> Call:
+def _argument(stage: str, effect: EffectStages, name: str, lent: Collection[str]) -> Call:
     """Return what a stage function gets for an argument of this name."""
     # an effect's own names first: it may call a parameter like a quantity
     if name in (*effect.parameters, *effect.states, *effect.maps):
@@ -86,6 +93,8 @@ def _argument(stage: str, effect: EffectStages, name: str) -> Call:
         return Call(f"float({name})", ())
     if name in (*QUANTITIES[stage], *ANYWHERE):
         return Call(name, ())
+    if name in LENT:
+        return Call(name if name in lent else "0.0", ())
     number = random_number(name)
     if number:
         per_pixel, kind = number.group(1) is not None, number.group(2)
@@ -95,7 +104,7 @@ def _argument(stage: str, effect: EffectStages, name: str) -> Call:
         index = "int(redraws)" if stage == "redraw" else "sample"
         return Call(draw.name if per_pixel else f"{kind}({draw.key}, {index})", (draw,))
     quantities = *effect.parameters, *effect.states, *effect.maps, *QUANTITIES[stage]
-    known = *quantities, *ANYWHERE, "normal", "uniform"
+    known = *quantities, *ANYWHERE, *LENT, "normal", "uniform"
     # a misspelt argument of a user's effect ends here
     raise ValueError(
         f"effect '{effect.name}': stage '{stage}' has no quantity '{name}'; there are {', '.join(known)}"
@@ -156,6 +165,11 @@ class PixelModel:
         """Names of quantities that are handed over for each pixel, in the order of the array of maps."""
         return [f"{effect.name}_{name}" for effect in self.stages for name in effect.maps]
 
+    @cached_property
+    def lent(self) -> list[str]:
+        """Names of parameters that functions of other effects may ask for."""
+        return [f"{effect.name}_{name}" for effect in self.stages for name in effect.lends]
+
     @property
     def labelled(self) -> bool:
         """Whether events say what they came from, and a pixel remembers what the leak has done."""
@@ -182,7 +196,9 @@ class PixelModel:
 
     def calls(self, stage: str) -> list[tuple[EffectStages, Call]]:
         """Return the calls of a stage with their effects."""
-        return [(effect, call_stage(stage, effect, function)) for effect, function in self.of(stage)]
+        return [
+            (effect, call_stage(stage, effect, function, self.lent)) for effect, function in self.of(stage)
+        ]
 
     def asks(self, *names: str, stages: Iterable[str] = ()) -> bool:
         """Return whether any function, of some stages or of all, asks for one of these quantities."""

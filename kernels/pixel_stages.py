@@ -17,10 +17,11 @@ A pixel turns light into events in this order; each effect adds Warp functions a
 
 A stage function asks for what it needs by the names of its arguments: the quantities above, `t`, `dt`, `x`,
 `y`, `t64` (t in double precision, for phases of long recordings), `radius` (distance from the middle of the
-sensor to its corner is 1), `nominal_on`, `nominal_off` (thresholds before any effect), parameters and states
-of its effect, random numbers (`uniform`, `normal`: new ones at every sample; `pixel_uniform`, `pixel_normal`:
-one for each pixel; `_2` and so on for more), maps of its effect (one value for each pixel). It returns its
-quantity, then the new values of its states.
+sensor to its corner is 1), `nominal_on`, `nominal_off` (thresholds before any effect), `dark_current` (what
+the effect `dark` lends all others, 0 where it lends nothing), parameters and states of its effect, random
+numbers (`uniform`, `normal`: new ones at every sample; `pixel_uniform`, `pixel_normal`: one for each pixel;
+`_2` and so on for more), maps of its effect (one value for each pixel). It returns its quantity, then the new
+values of its states.
 `dase.kernels.pixel_compile` makes the kernel that calls all of them, one line each, so that a sensor costs
 one pass over its samples whatever effects it has. Random numbers are counter-based, keyed by seed, effect,
 pixel and sample: they do not depend on the other effects, on chunks, threads or the batch.
@@ -73,6 +74,9 @@ QUANTITIES = {
 ANYWHERE = ("x", "y", "t", "dt", "t64", "radius", "nominal_on", "nominal_off")
 """What the functions of every stage may ask for; `t`, `dt` and `t64` only where there are samples."""
 
+LENT = ("dark_current",)
+"""What they may ask for of another effect, as `effect_parameter`; 0 where none of the sensor lends it."""
+
 
 @dataclass(frozen=True)
 class EffectStages:
@@ -89,6 +93,7 @@ class EffectStages:
         label: Of the events that `noise` makes.
         off: (parameter, value) pairs; an effect with all of them changes nothing.
         maps: Names of quantities that every pixel has its own value of, handed over as arrays.
+        lends: Names of the parameters that functions of other effects follow, see `LENT`.
     """
 
     name: str
@@ -101,6 +106,7 @@ class EffectStages:
     label: int = Label.SHOT
     off: tuple[tuple[str, float], ...] = ()
     maps: tuple[str, ...] = ()
+    lends: tuple[str, ...] = ()
 
 
 @wp.struct

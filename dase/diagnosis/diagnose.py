@@ -55,6 +55,7 @@ from dase.fitting.model import (
     ways_otherwise,
     with_fixed_effect,
 )
+from dase.fitting.parameter_space import refuse_idle
 from dase.fitting.plain_numbers import plain_numbers
 from dase.fitting.scene_doubt import is_guessed, with_scene_doubt
 from dase.fitting.scheduler import run_side_by_side
@@ -120,6 +121,7 @@ def diagnose(
     begin = time.perf_counter()
     tell = progress or (lambda text, share, error: None)
     given = Sensor() if sensor is None else as_sensor(sensor)
+    refuse_idle(given, free)
     measurement = as_measurement(measured, scene, trust)
     given = given.bound_to(measurement.scene)
     tell("looking at the events alone", 0.0, float("nan"))

@@ -9,7 +9,7 @@ from dase.diagnosis.candidates import Candidate
 from dase.diagnosis.settings import DEFAULTS, DiagnosisSettings
 from dase.effects import Effect
 from dase.fitting.data_split import SplitMeasurement
-from dase.fitting.model import FittedModel, free_of, model_of
+from dase.fitting.model import FittedModel, free_of, model_of, still_free
 from dase.probes.distance import LIMITS, Judgement, reaches_floor
 from dase.probes.random_streams import SimulationStream
 from dase.results import Progress, Step
@@ -115,6 +115,5 @@ def with_same_freedom(sensor: Sensor, model: FittedModel, more: Sequence[str]) -
         model: The other model.
         more: Names of the effects whose parameters are free beside.
     """
-    names = [a.name for a in model.space.axes if a.name.split(".")[0] in sensor]
     mine = [name for effect in more for name in free_of(sensor, effect)]
-    return model_of(sensor, list(dict.fromkeys([*names, *mine])))
+    return model_of(sensor, list(dict.fromkeys([*still_free(sensor, model), *mine])))

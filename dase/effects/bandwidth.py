@@ -10,17 +10,23 @@ from typing import ClassVar, Self
 import warp as wp
 
 from dase.effects.base import ANY_SAMPLES, Effect, Observations, choice, parameter
-from dase.effects.photocurrent import dark_share, relative_photocurrent
+from dase.effects.photocurrent import dark_share, idle_beside, relative_photocurrent
 from dase.kernels.pixel_stages import EffectStages
 from dase.kernels.vector_math import exponential, logarithm
 
 
 @wp.func
 def time_constants(
-    intensity: float, dt: float, cutoff: float, dark: float, spread: float, pixel_normal: float
+    intensity: float,
+    dt: float,
+    cutoff: float,
+    dark: float,
+    dark_current: float,
+    spread: float,
+    pixel_normal: float,
 ):
     """Length of a step in time constants of the pixel's photoreceptor."""
-    x = 2.0 * wp.pi * cutoff * relative_photocurrent(intensity, dark) * dt
+    x = 2.0 * wp.pi * cutoff * relative_photocurrent(intensity, dark, dark_current) * dt
     # a pixel of hardly any bandwidth would be a dead one
     return x * wp.max(1.0 + spread * pixel_normal, 0.1)
 
@@ -32,13 +38,14 @@ def lowpass_voltage(
     dt: float,
     cutoff: float,
     dark: float,
+    dark_current: float,
     spread: float,
     input: float,
     output: float,
     pixel_normal: float,
 ):
     """First-order low-pass, exact for an input that runs straight between samples."""
-    x = time_constants(intensity, dt, cutoff, dark, spread, pixel_normal)
+    x = time_constants(intensity, dt, cutoff, dark, dark_current, spread, pixel_normal)
     decay = exponential(-x)
     # share of the input's step by which the output lags behind a ramp; (1 - e^-x)/x loses digits near 0
     lag = 1.0 - 0.5 * x
@@ -55,6 +62,7 @@ def follower_voltage(
     dt: float,
     cutoff: float,
     dark: float,
+    dark_current: float,
     spread: float,
     input: float,
     output: float,
@@ -64,7 +72,7 @@ def follower_voltage(
 
     Its equation is linear in e^(input - output): the photocurrent over what the voltage lets through.
     """
-    x = time_constants(intensity, dt, cutoff, dark, spread, pixel_normal)
+    x = time_constants(intensity, dt, cutoff, dark, dark_current, spread, pixel_normal)
     # in a ramp upwards the photocurrent runs away from that current
     left = x - (voltage - input)
     decay = exponential(-left)
@@ -82,12 +90,13 @@ def stepped_voltage(
     dt: float,
     cutoff: float,
     dark: float,
+    dark_current: float,
     spread: float,
     output: float,
     pixel_normal: float,
 ):
     """Low-pass that goes a share of the way at each sample, all of it where a step has a time constant."""
-    x = time_constants(intensity, dt, cutoff, dark, spread, pixel_normal)
+    x = time_constants(intensity, dt, cutoff, dark, dark_current, spread, pixel_normal)
     settled = output + wp.min(x, 1.0) * (voltage - output)
     return settled, voltage, settled
 
@@ -100,8 +109,10 @@ class Bandwidth(Effect):
     the light. Fast changes are smoothed and come late, most of all in dark pixels, where edges trail long
     tails of events.
 
-    The cutoff is `cutoff` at intensity 1 (white) and falls linearly to `dark * cutoff` at intensity 0. It
-    differs from pixel to pixel by `spread`.
+    The cutoff is `cutoff` at intensity 1 (white) and falls linearly to `dark * cutoff` at intensity 0: what
+    flows without light, dark current, charges the node as photocurrent does. A sensor with the effect `dark`
+    has that current, pixel by pixel, and `dark` here changes nothing: the cutoff is `cutoff` · (I + current)
+    / (1 + median current), at most `cutoff`. It differs from pixel to pixel by `spread`, too.
 
     With `signal = "small"` the voltage v follows the logarithm u of the light by dv/dt = w (u - v), where
     w is 2π times the cutoff at the present light: an edge of a factor c downwards is slower than one upwards
@@ -161,6 +172,10 @@ class Bandwidth(Effect):
     def otherwise(self, beside: Sequence[Effect]) -> list[Self]:
         """Return the linear low-pass for the one in steps."""
         return [replace(self, signal="small")] if self.signal == "steps" else []
+
+    def idle(self, beside: Sequence[Effect]) -> tuple[str, ...]:
+        """Return the names of the parameters that change nothing."""
+        return idle_beside(beside)
 
     def longest_step(self) -> float:
         """Return the longest time between samples that still shows the effect [s]."""

@@ -321,8 +321,19 @@ class Effect:
         """Whether this effect belongs to a world whose memories begin at the first light, all alike."""
         return False
 
-    def idle(self) -> tuple[str, ...]:
-        """Return the names of the parameters that change nothing by the words that this effect has."""
+    def idle(self, beside: Sequence[Effect]) -> tuple[str, ...]:
+        """Return the names of the parameters that change nothing, by the words that this effect has.
+
+        Args:
+            beside: The effects of the same sensor.
+        """
+        return ()
+
+    def lends(self) -> tuple[str, ...]:
+        """Return the names of the parameters that other effects follow, see `dase.kernels.pixel_stages.LENT`.
+
+        They do where this effect is on.
+        """
         return ()
 
     def longest_step(self) -> float:
@@ -345,6 +356,7 @@ class Effect:
             spares_noise=self.spares_noise(),
             label=LABELS.index(self.label),
             maps=self.maps,
+            lends=self.lends(),
             off=tuple((p.name, p.off) for p in self.parameters() if p.off is not None),
         )
 

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import ClassVar
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import ClassVar, Self
 
 import warp as wp
 
-from dase.effects.base import Effect, parameter
+from dase.effects.base import Effect, Observations, choice, parameter
 from dase.kernels.vector_math import exponential
 
 
@@ -25,14 +26,25 @@ class Dark(Effect):
     the darkest parts of a scene shrink and make fewer events. Warmth doubles it every few degrees.
 
     The current is given as the intensity that makes as much photocurrent. It is log-normally distributed over
-    pixels. Every later stage, such as the bandwidth, sees the sum; the parasitic photocurrent of `leak` flows
-    in another junction.
+    pixels.
+
+    It is the dark current of the whole pixel: the node of the photoreceptor is charged by all that flows in
+    the photodiode, so the speed of `bandwidth` and `second_order`, the delay of `latency`, and corner and
+    variance of `voltage_noise` follow intensity + current, too, as C dV/dt = I + current - what the feedback
+    takes away has it. Their own `dark`, the dark current of a sensor without this effect, then changes
+    nothing. A pole of them has its cutoff at intensity 1, and in complete darkness current / (1 + current) of
+    it. (`log_eps` of a sensor is no current: it keeps the logarithm of black finite, which this does, too.)
+    The parasitic photocurrent of `leak` flows in another junction.
+
+    With `speed = "own"` the poles keep a floor of their own, `dark`, beneath the sum: two numbers for one
+    current, as other simulators have it whose light and whose cutoff have each a floor.
     """
 
     name: ClassVar[str] = "dark"
     source: ClassVar[str] = (
         "Lichtsteiner, Posch, Delbruck: A 128x128 120 dB 15 us latency asynchronous "
-        "temporal contrast vision sensor, 2008; "
+        "temporal contrast vision sensor, 2008; Delbruck, Mead: Analog VLSI adaptive, logarithmic, "
+        "wide-dynamic-range photoreceptor, 1994 (the node's time constant goes as 1 / current); "
         "Nozaki, Delbruck: Temperature and parasitic photocurrent effects in dynamic vision sensors, 2017"
     )
     stages: ClassVar = {"current": add_dark_current}
@@ -52,3 +64,28 @@ class Dark(Effect):
         plausible=(0.0, 1.0),
         about="standard deviation of its natural logarithm over pixels",
     )
+    speed: str = choice(
+        "shared",
+        among=("shared", "own"),
+        about="poles, latency and noise of the voltage follow it, or have a dark current of their own beside",
+    )
+
+    @property
+    def share(self) -> float:
+        """Share of the current at intensity 1 that flows without light, as poles by themselves have it."""
+        return self.current / (1.0 + self.current)
+
+    @classmethod
+    def candidates(cls, observed: Observations) -> list[Self]:
+        """Return the current that all share; of a simulator that works frame by frame, that of the light."""
+        return [cls(speed="own" if observed.clip_step else "shared")]
+
+    def otherwise(self, beside: Sequence[Effect]) -> list[Self]:
+        """Return the current that all share for that of the light, where there is anything to share it."""
+        shared = replace(self, speed="shared")
+        follow = any(set(e.idle([shared])) > set(e.idle([self])) for e in beside)
+        return [shared] if self.speed == "own" and follow else []
+
+    def lends(self) -> tuple[str, ...]:
+        """Return the current, which poles, latency and noise of the voltage follow."""
+        return ("current",) if self.speed == "shared" else ()

@@ -2,19 +2,20 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import ClassVar
 
 import warp as wp
 
 from dase.effects.base import Effect, parameter
-from dase.effects.photocurrent import dark_share, relative_photocurrent
+from dase.effects.photocurrent import dark_share, idle_beside, relative_photocurrent
 
 
 @wp.func
-def event_delay(intensity: float, delay: float, light: float, dark: float):
+def event_delay(intensity: float, delay: float, light: float, dark: float, dark_current: float):
     """Time from a crossing to its event's leaving the pixel [s]."""
-    return delay * (1.0 - light + light / relative_photocurrent(intensity, dark))
+    return delay * (1.0 - light + light / relative_photocurrent(intensity, dark, dark_current))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -25,8 +26,9 @@ class Latency(Effect):
     it is the longer the smaller the photocurrent: it grows as 1/intensity, until the dark current takes over.
     Unlike a limited bandwidth, a latency does not smooth: every event comes, only later.
 
-    At intensity 1 (white) an event leaves its pixel `delay` after the crossing, at intensity 0
-    `delay * (1 - light + light / dark)`, never more than 1 s. The intensity is that of the sample which ends
+    At intensity 1 (white) an event leaves its pixel `delay` after the crossing, at intensity 0 `delay * (1 -
+    light + light / dark)`, never more than 1 s. Of a sensor with the effect `dark` the dark current is that
+    one: 1 / dark is then (1 + median current) / current there. The intensity is that of the sample which ends
     the step of the crossing. The events of one pixel do not overtake each other: one that is due before the
     last one has left leaves at the same time as that. A readout by lines sends one of those that leave at the
     same time, as a pixel asks once.
@@ -58,3 +60,7 @@ class Latency(Effect):
     dark: float = dark_share(
         "photocurrent at intensity 0 relative to that at intensity 1; 1 makes the delay constant"
     )
+
+    def idle(self, beside: Sequence[Effect]) -> tuple[str, ...]:
+        """Return the names of the parameters that change nothing."""
+        return idle_beside(beside)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import ClassVar, Self
 
@@ -10,7 +11,7 @@ import warp as wp
 
 from dase.effects.bandwidth import Bandwidth
 from dase.effects.base import Effect, Observations, choice, parameter
-from dase.effects.photocurrent import dark_share, relative_photocurrent
+from dase.effects.photocurrent import dark_share, idle_beside, relative_photocurrent
 from dase.kernels.pixel_stages import EffectStages
 from dase.kernels.vector_math import cosine_and_sine, exponential
 
@@ -104,6 +105,7 @@ def second_order_voltage(
     cutoff: float,
     damping: float,
     dark: float,
+    dark_current: float,
     spread: float,
     input: float,
     output: float,
@@ -111,7 +113,7 @@ def second_order_voltage(
     pixel_normal: float,
 ):
     """Two poles that follow the photocurrent alike."""
-    omega = 2.0 * wp.pi * cutoff * relative_photocurrent(intensity, dark)
+    omega = 2.0 * wp.pi * cutoff * relative_photocurrent(intensity, dark, dark_current)
     omega *= wp.max(1.0 + spread * pixel_normal, 0.1)
     settled, speed = behind_two_poles(voltage, dt, omega, damping, input, output, slope)
     return settled, voltage, settled, speed
@@ -125,6 +127,7 @@ def photoreceptor_voltage(
     cutoff: float,
     damping: float,
     dark: float,
+    dark_current: float,
     fixed: float,
     spread: float,
     input: float,
@@ -133,7 +136,7 @@ def photoreceptor_voltage(
     pixel_normal: float,
 ):
     """A pole that follows the photocurrent and a fixed one: damping changes with the light."""
-    light = relative_photocurrent(intensity, dark)
+    light = relative_photocurrent(intensity, dark, dark_current)
     root = wp.sqrt(light)
     omega = 2.0 * wp.pi * cutoff * root
     omega *= wp.max(1.0 + spread * pixel_normal, 0.1)
@@ -158,7 +161,8 @@ class SecondOrder(Effect):
     pixel by `spread`.
 
     With `poles = "alike"` both poles follow the photocurrent, of which L is left (1 at intensity 1, `dark` at
-    intensity 0): ω goes with L and the damping is the same in all light, as other simulators have it.
+    intensity 0; of a sensor with the effect `dark` (I + current) / (1 + median current)): ω goes with L and
+    the damping is the same in all light, as other simulators have it.
 
     With `poles = "apart"` it is the circuit. Its node, which the photocurrent charges, has the pole a L, its
     amplifier the fixed pole b, and a loop of gain A goes round both: v'' + (a L + b) v' =
@@ -240,6 +244,10 @@ class SecondOrder(Effect):
             cutoff=natural, damping=(pole.cutoff + cutoff) / (2 * natural), dark=pole.dark,
             spread=pole.spread, fixed=cutoff / (pole.cutoff + cutoff), poles="apart",
         )  # fmt: skip
+
+    def idle(self, beside: Sequence[Effect]) -> tuple[str, ...]:
+        """Return the names of the parameters that change nothing."""
+        return idle_beside(beside)
 
     def compiled(self) -> EffectStages:
         """Return what the kernel composer needs to know."""

@@ -11,6 +11,7 @@ import warp as wp
 
 from dase.effects.bandwidth import Bandwidth
 from dase.effects.base import ANY_SAMPLES, Effect, Observations, choice, parameter
+from dase.effects.photocurrent import idle_beside, photocurrent
 from dase.effects.second_order import impulse_response
 from dase.kernels.pixel_stages import REST, EffectStages
 from dase.kernels.vector_math import cosine_and_sine, exponential, logarithm
@@ -76,6 +77,7 @@ def noisy_voltage(
     cutoff: float,
     knee: float,
     dark: float,
+    dark_current: float,
     noise: float,
     speed: float,
     uniform: float,
@@ -86,7 +88,7 @@ def noisy_voltage(
     The noise at the samples is exact at any sampling. Where it has turned in between, the step ends at the
     turn instead of at the sample, since events come of the extremes.
     """
-    light = wp.max(intensity, 0.0) + dark
+    light = photocurrent(intensity, dark, dark_current)
     share = light / (light + knee)
     # beyond 100 time constants nothing is remembered
     x = wp.min(POLE * cutoff * share * dt, 100.0)
@@ -154,6 +156,7 @@ def photoreceptor_noise(
     cutoff: float,
     knee: float,
     dark: float,
+    dark_current: float,
     gain: float,
     noise: float,
     speed: float,
@@ -164,7 +167,7 @@ def photoreceptor_noise(
 
     `speed` is the slope in units of the fixed pole, which goes on where the light changes.
     """
-    light = wp.max(intensity, 0.0) + dark
+    light = photocurrent(intensity, dark, dark_current)
     share = light / (light + knee)
     fixed = 2.0 * wp.pi * cutoff
     node = fixed * (light / knee)
@@ -203,7 +206,8 @@ class VoltageNoise(Effect):
 
     Two poles filter the white shot noise: one grows with the photocurrent, the other is fixed by the bias at
     `cutoff`; they are alike at intensity `knee`. The corner is cutoff · I / (I + knee), the variance
-    sigma² · knee / (I + knee), where I includes the dark current. In light above the knee the amplitude falls
+    sigma² · knee / (I + knee), where I includes the dark current: that of the effect `dark`, pixel by pixel,
+    or where the sensor has none `dark` here. In light above the knee the amplitude falls
     with the light, and noise events become rarer; far below it the amplitude is constant, and noise events
     become rarer with the bandwidth. In between they are most frequent. The spectrum is that of two equal
     poles which together lose 3 dB at the corner: noise of a single pole would be so rough that its event rate
@@ -270,7 +274,8 @@ class VoltageNoise(Effect):
         unit="intensity",
         bounds=(1e-6, 10.0),
         plausible=(1e-4, 0.1),
-        about="dark current, as the intensity that makes as much; keeps the corner above 0",
+        about="dark current, as the intensity that makes as much; keeps the corner above 0; unused "
+        "beside `dark`",
         fitted=False,  # it shows in the darkest pixels only, which hardly send events
     )
     gain: float = parameter(
@@ -309,9 +314,10 @@ class VoltageNoise(Effect):
         """Whether memories begin at the first light, as where noise is drawn from then on."""
         return self.poles == "one"
 
-    def idle(self) -> tuple[str, ...]:
+    def idle(self, beside: Sequence[Effect]) -> tuple[str, ...]:
         """Return the names of the parameters that change nothing by its rule."""
-        return {"alike": ("gain",), "apart": (), "one": ("knee", "dark", "gain")}[self.poles]
+        by_rule = {"alike": ("gain",), "apart": (), "one": ("knee", "dark", "gain")}[self.poles]
+        return tuple(dict.fromkeys((*by_rule, *idle_beside(beside))))
 
     @classmethod
     def of_photoreceptor(cls, pole: Bandwidth, *, sigma: float, cutoff: float, gain: float = 0.0) -> Self:

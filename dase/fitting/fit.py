@@ -21,7 +21,7 @@ from dase.fitting.model import (
     model_of,
     refit_model,
 )
-from dase.fitting.parameter_space import SearchAxis
+from dase.fitting.parameter_space import SearchAxis, refuse_idle
 from dase.fitting.plain_numbers import plain_numbers
 from dase.fitting.screen_limits import limits_of_screen
 from dase.fitting.search_ends import is_where_it_began, parameters_at_bounds
@@ -96,6 +96,7 @@ def fit(
     tell = progress or (lambda text, share, error: None)
     start = as_sensor(sensor)
     model_of(start, free)  # refuses names that are not there before anything takes time
+    refuse_idle(start, free)
     measurement = as_measurement(measured, scene, trust)
     scene = measurement.scene
     start = start.bound_to(scene)

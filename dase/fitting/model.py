@@ -271,15 +271,11 @@ def ways_otherwise(model: FittedModel, names: Collection[str] | None = None) -> 
 
 def _with_rule(model: FittedModel, other: Effect) -> FittedModel:
     """Return a model with one of its effects by another rule, and what is idle by it not free."""
-    name, before = other.name, model.sensor[other.name]
     same = model.space.sensor.with_effect(other)
-    if set(before.idle()) == set(other.idle()):
+    if model.space.sensor.idle_parameters() == same.idle_parameters():
         return replace(model, space=replace(model.space, sensor=same))
     sensor = _with_its_phase(model.sensor.with_effect(other), other)
-    usual = free_of(sensor, name)
-    free = [a.name for a in model.space.axes if a.effect is not type(other) or a.name in usual]
-    whole = {a.name for a in model.space.axes} >= set(free_of(model.sensor, name))
-    return replace(model_of(sensor, [*free, *usual] if whole else free), loss=model.loss)
+    return replace(model_of(sensor, still_free(sensor, model)), loss=model.loss)
 
 
 def refit_work(
@@ -340,10 +336,25 @@ def free_of(sensor: Sensor, name: str) -> list[str]:
     return [axis.name for axis in axes_of(sensor) if axis.name.split(".")[0] == name]
 
 
+def still_free(sensor: Sensor, model: FittedModel) -> list[str]:
+    """Return the names of what is free in a model and is there in another sensor.
+
+    What changes nothing there is left out, such as a second dark current. Of an effect all of which is free,
+    what changes something there alone is in.
+    """
+    names, idle, before = {axis.name for axis in model.space.axes}, sensor.idle_parameters(), model.sensor
+    out = [a.name for a in model.space.axes if a.name.split(".")[0] in sensor and a.name not in idle]
+    for effect in sensor.effects:
+        usual = free_of(before, effect.name) if effect.name in before else []
+        if usual and names.issuperset(usual):
+            out += free_of(sensor, effect.name)
+    return list(dict.fromkeys(out))
+
+
 def with_effect_added(present: FittedModel, effect: Effect) -> FittedModel:
     """Return the present model with an effect added, all of whose parameters are free."""
     sensor = _with_its_phase(present.sensor.with_effect(effect), effect)
-    old = [axis.name for axis in present.space.axes]
+    old = still_free(sensor, present)
     # read off the events of all pixels, what a fit finds only nearby is better than a fit to a few makes it
     new = [axis.name for axis in axes_of(sensor) if axis.effect is type(effect) and axis.fact.nearby is None]
     return model_of(sensor, [*old, *new])

@@ -142,6 +142,14 @@ class ParameterSpace:
         )
 
 
+def refuse_idle(sensor: Sensor, names: Iterable[str] | None) -> None:
+    """Raise InputError where a user names a parameter as free that changes nothing."""
+    for name in sensor.idle_parameters().intersection(names or ()):
+        shared = name.endswith(".dark") and "dark" in sensor
+        why = "beside the effect 'dark': name dark.current" if shared else "by the words of its effect"
+        raise InputError(f"free: {name} changes nothing {why}")
+
+
 def value_of(sensor: Sensor, name: str) -> float:
     """Return the parameter `effect.parameter` of a sensor."""
     effect, parameter = name.split(".")
@@ -173,7 +181,7 @@ def axes_of(sensor: Sensor, names: Iterable[str] | None = None) -> tuple[SearchA
         for effect in sensor.effects
         for p in effect.parameters()
     }
-    idle = {f"{effect.name}.{name}" for effect in sensor.effects for name in effect.idle()}
+    idle = sensor.idle_parameters()
     usual = {name for name, axis in every.items() if axis.fact.fitted and name not in idle}
     if names is None:
         # a change detector whose phase is 0 is not off

@@ -173,6 +173,10 @@ class Sensor:
         core = ["threshold.on", "threshold.off", "threshold.phase", "sensor.log_eps"]
         return core + [f"{s.name}.{p}" for s in self.stages() for p in s.parameters]
 
+    def idle_parameters(self) -> set[str]:
+        """Return `effect.parameter` of all that changes nothing, by an effect's words or beside another."""
+        return {f"{effect.name}.{name}" for effect in self.effects for name in effect.idle(self.effects)}
+
     def parameters(self) -> NDArray[np.float32]:
         """Return the parameter vector of this sensor, shape (P,)."""
         values = [

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from importlib import resources
 from os import PathLike, fspath
 from pathlib import Path
@@ -129,16 +129,22 @@ def dump_sensor(sensor: Sensor) -> str:
         document.add(name, value)
     for effect in sensor.effects:
         document.add(tomlkit.nl())
-        document.add(effect.name, effect_table(effect))
+        document.add(effect.name, effect_table(effect, beside=sensor.effects))
     return tomlkit.dumps(document) + "".join(f"\n{entry.text()}" for entry in sensor.history)
 
 
-def effect_table(effect: Effect) -> Table:
-    """Return the table of an effect as it stands in a sensor file, with comments."""
+def effect_table(effect: Effect, *, beside: Sequence[Effect] = ()) -> Table:
+    """Return the table of an effect as it stands in a sensor file, with comments.
+
+    Args:
+        effect: To write.
+        beside: The effects of the same sensor, to say of what it has that it changes nothing beside them.
+    """
     table = tomlkit.table()
     about = {p.name: f"{p.about} [{p.unit}]" for p in effect.parameters()}
     about |= {name: " or ".join(among) for name, among in effect.choices().items()}
     about |= effect.assets()
+    about |= {name: f"changes nothing here: {about[name]}" for name in effect.idle(beside) if beside}
     for name in effect.settings():
         table.add(name, tomlkit.item(getattr(effect, name)).comment(about[name]))
     return table

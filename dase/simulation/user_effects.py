@@ -191,7 +191,8 @@ class _EffectDefinition:
         for f in dataclasses.fields(effect):
             if f.name not in known:
                 raise self.wrong(f"{effect.name}.{f.name} must be made by parameter(...) or choice(...)")
-        taken = {q for qs in pixel_stages.QUANTITIES.values() for q in qs} | set(pixel_stages.ANYWHERE)
+        taken = {q for qs in pixel_stages.QUANTITIES.values() for q in qs}
+        taken |= {*pixel_stages.ANYWHERE, *pixel_stages.LENT}
         if "noise" in effect.stages:
             # what the composed kernel itself keeps for an effect with noise events
             taken |= {"hazard", "rest", "events", "spend", "left"}

@@ -103,6 +103,11 @@ TWINS = {
         Bandwidth(cutoff=30.0, spread=0.3, signal="large"),
         VoltageNoise(sigma=0.2, cutoff=30.0),
     ),
+    "two dark currents": (
+        Dark(current=0.02, spread=0.5, speed="own"),
+        Bandwidth(cutoff=200.0, dark=0.1),
+        VoltageNoise(sigma=0.2, cutoff=30.0, dark=0.02),
+    ),
     "all": (*(STRONG[n] for n in ("flicker", "vignetting", "dark", "linlog", "second_order")), Mismatch()),
 }
 

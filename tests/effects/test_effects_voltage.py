@@ -252,7 +252,7 @@ def noise_paths(step: float, sigma: float, samples: int, out: wp.array2d[float])
             dt = 1.0e30
         first, second = wp.randf(key), wp.randf(key)
         voltage, noise, speed = voltage_noise.noisy_voltage(
-            0.0, 1.0, dt, sigma, 1.0, 1.0e6, 999999.0, noise, speed, first, second
+            0.0, 1.0, dt, sigma, 1.0, 1.0e6, 999999.0, 0.0, noise, speed, first, second
         )
         out[k, i] = voltage
 

@@ -92,6 +92,25 @@ def second_order(
     return out
 
 
+def current_left(sensor: dase.Sensor, effect: dase.Effect, intensity: np.ndarray) -> np.ndarray:
+    """Return the current of a photodiode relative to a median one at intensity 1, at most 1, (K, N).
+
+    Args:
+        sensor: Whose dark current is in the intensity.
+        effect: The pole, whose own dark current flows where the sensor has none.
+        intensity: Shape (K, N).
+    """
+    if shares_dark_current(sensor):
+        most = 1 + sensor["dark"].current
+        return np.minimum(np.maximum(intensity, 1e-6 * most), most) / most
+    return effect.dark + (1 - effect.dark) * np.clip(intensity, 0, 1)
+
+
+def shares_dark_current(sensor: dase.Sensor) -> bool:
+    """Return whether one dark current reaches light and speed."""
+    return setting(sensor, "dark", "current", 0.0) > 0 and sensor["dark"].speed == "shared"
+
+
 def own_speed(slow: dase.Effect, pixels: int, seed: int) -> np.ndarray:
     """Return the cutoff of each pixel relative to the nominal one, shape (N,)."""
     name = f"{slow.name}_respond_pixel_normal"
@@ -145,7 +164,8 @@ def voltage_noise(
     """
     effect = sensor["voltage_noise"]
     if effect.poles == "apart":
-        return photoreceptor_noise(times, intensity, effect, normals)
+        own = 0.0 if shares_dark_current(sensor) else effect.dark
+        return photoreceptor_noise(times, intensity + own, effect, normals)
     if effect.poles == "one":
         # an autoregressive process of first order, once a sample, from nothing
         kept = np.maximum(1 - 2 * np.pi * effect.cutoff * np.diff(times), -0.9)
@@ -154,7 +174,7 @@ def voltage_noise(
         for k, share in enumerate(kept, 1):
             out[k] = share * out[k - 1] + np.sqrt(1 - share**2) * out[k]
         return out
-    total = intensity + effect.dark
+    total = intensity + (0.0 if shares_dark_current(sensor) else effect.dark)
     corner = effect.cutoff * total / (total + effect.knee)
     sigma = effect.sigma * np.sqrt(effect.knee / (total + effect.knee))
     pole = 2 * np.pi * corner / np.sqrt(np.sqrt(2) - 1)
@@ -178,17 +198,17 @@ def voltage_noise(
 
 
 def photoreceptor_noise(
-    times: np.ndarray, intensity: np.ndarray, effect: dase.Effect, normals: np.ndarray
+    times: np.ndarray, current: np.ndarray, effect: dase.Effect, normals: np.ndarray
 ) -> np.ndarray:
     """Return the noise of a node whose pole follows the light, in a loop with a fixed pole.
 
     Turns are those of `voltage_noise`. The covariance after a step is from Van Loan's matrix exponential, in
     the order voltage, slope.
     """
-    out, fixed, more = np.zeros_like(intensity), 2 * np.pi * effect.cutoff, 1 + effect.gain
-    for i in range(intensity.shape[1]):
+    out, fixed, more = np.zeros_like(current), 2 * np.pi * effect.cutoff, 1 + effect.gain
+    for i in range(current.shape[1]):
         for k in range(len(times)):
-            moving = fixed * (intensity[k, i] + effect.dark) / effect.knee
+            moving = fixed * current[k, i] / effect.knee
             # of the voltage, and of its slope over the fixed pole
             drift = np.array([[0.0, fixed], [-more * moving, -(moving + fixed)]])
             white = np.diag([0.0, 2 * more * moving])
@@ -235,19 +255,17 @@ def exposed(times: np.ndarray, period: float, exposure: float, begin: float) -> 
 def voltage(sensor: dase.Sensor, times: np.ndarray, intensity: np.ndarray, seed: int) -> np.ndarray:
     """Return the voltage at the change detector, shape (K, N), of the intensity at the photodiode."""
     level = np.log(intensity + sensor.log_eps)
-    bright = np.clip(intensity, 0, 1)
     if "linlog" in sensor:
         level = linlog(level, sensor["linlog"].knee, sensor["linlog"].slope, sensor.log_eps)
     if np.isfinite(setting(sensor, "bandwidth", "cutoff", np.inf)):
         slow = sensor["bandwidth"]
-        cutoff = (
-            slow.cutoff * (slow.dark + (1 - slow.dark) * bright) * own_speed(slow, intensity.shape[1], seed)
-        )
+        cutoff = slow.cutoff * current_left(sensor, slow, intensity)
+        cutoff = cutoff * own_speed(slow, intensity.shape[1], seed)
         equations = {"small": reference.lowpass, "large": follower, "steps": stepped}
         level = equations[slow.signal](times, level, cutoff)
     if np.isfinite(setting(sensor, "second_order", "cutoff", np.inf)):
         slow = sensor["second_order"]
-        current = slow.dark + (1 - slow.dark) * bright
+        current = current_left(sensor, slow, intensity)
         omega = 2 * np.pi * slow.cutoff * own_speed(slow, intensity.shape[1], seed)
         if slow.poles == "apart":
             damping = slow.damping * (slow.fixed / np.sqrt(current) + (1 - slow.fixed) * np.sqrt(current))

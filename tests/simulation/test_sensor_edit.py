@@ -256,3 +256,9 @@ def test_add_and_fit(tmp_path, rng):
     assert "# fitted (was 0.2: mine)" in (tmp_path / "mine.toml").read_text()
     wrong = dase("add", "mine.toml", "shot", "--fit", "none.h5", cwd=tmp_path)
     assert "none.h5" in one_sentence(wrong)
+
+
+def test_adding_a_dark_current_says_what_it_takes_the_place_of(tmp_path):
+    said = dase("add", "davis346", "dark", "-o", tmp_path / "dark.toml").stderr
+    assert "note: bandwidth.dark changes nothing beside dark" in said
+    assert not dase("add", "davis346", "linlog", "-o", tmp_path / "linlog.toml").stderr
