@@ -15,6 +15,7 @@ if __name__ != "dase.cli":
 
 COMMANDS = (
     "add",
+    "bias",
     "compare",
     "convert",
     "demo",

@@ -100,6 +100,16 @@ effects_option = click.option(
 )
 """`--effects FILE`: a command gets a tuple of paths, for `dase.simulation.user_effects.known_effects`."""
 
+bias_option = click.option(
+    "--bias",
+    "biases",
+    multiple=True,
+    metavar="NAME=BEFORE:AFTER",
+    help="Another bias of a DAVIS346 than it was fitted with, as ONBn=5/255:6/200 (`dase bias`). "
+    "May be given again.",
+)
+"""`--bias NAME=BEFORE:AFTER`: a command gets a tuple of texts, for `dase.simulation.biases.parse_biases`."""
+
 scene_option = click.option(
     "--scene",
     default="frames",

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING
 import click
 
 from dase.cli.options import (
+    bias_option,
     device_or_backend_option,
     effects_option,
     importing,
@@ -31,6 +32,7 @@ if TYPE_CHECKING:
     "--images", default="builtin", show_default=True, help="Folder, coco:ANNOTATIONS,FOLDER or builtin."
 )
 @click.option("--sensor", default="davis346", show_default=True, help="Preset or TOML file.")
+@bias_option
 @effects_option
 @click.option("--sequences", default=10, show_default=True, help="How many sequences.")
 @click.option(
@@ -103,6 +105,7 @@ def synth_command(
     out: Path,
     images: str,
     sensor: str,
+    biases: tuple[str, ...],
     effects: tuple[Path, ...],
     sequences: int,
     size: tuple[int, int] | None,
@@ -137,8 +140,9 @@ def synth_command(
             "focal", "depths",
         )  # fmt: skip
         _synth_video(
-            out, video, fps, sensor, effects, size, seed, device, frame_rate, exposure, labels, gamma, between
-        )
+            out, video, fps, sensor, biases, effects, size, seed, device, frame_rate, exposure, labels, gamma,
+            between,
+        )  # fmt: skip
         return
     given = {"--fps": fps is not None, "--gamma": gamma is not None, "--between": between != "auto"}
     for option in (name for name in given if given[name]):
@@ -148,10 +152,12 @@ def synth_command(
         start_importing()  # beside the imports here
     with importing():
         from dase.datasets import generate
+        from dase.simulation.biases import parse_biases, with_biases
         from dase.simulation.sensor_file import dump_sensor, load_sensor
         from dase.simulation.user_effects import known_effects
 
-    chosen = replace(load_sensor(sensor, known_effects(effects)), history=())
+    chosen = with_biases(load_sensor(sensor, known_effects(effects)), *parse_biases(biases))
+    chosen = replace(chosen, history=())
     width, height = size or chosen.size or (346, 260)
     job = generate.DatasetJob(
         images=images,
@@ -185,6 +191,7 @@ def _synth_video(
     video: Path,
     fps: float | None,
     sensor: str,
+    biases: tuple[str, ...],
     effects: tuple[Path, ...],
     size: tuple[int, int] | None,
     seed: int,
@@ -200,13 +207,14 @@ def _synth_video(
     from dase.files.atomic_file import refuse_unwritable
     from dase.io import find_writable_format
     from dase.scenes.video import open_video
+    from dase.simulation.biases import parse_biases, with_biases
     from dase.simulation.sensor_file import load_sensor
     from dase.simulation.sensor_run import sample_times
     from dase.simulation.user_effects import known_effects
 
     refuse_unwritable(out)
     find_writable_format(out)
-    model = load_sensor(sensor, known_effects(effects))
+    model = with_biases(load_sensor(sensor, known_effects(effects)), *parse_biases(biases))
     notes: list[str] = []
     scene = open_video(
         video, fps=fps, size=size or model.size, gamma=gamma, between=between, colour=model.sees_colour(),

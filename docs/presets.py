@@ -17,8 +17,17 @@ is given for beside a value is said in the text above its table. How close prese
 
 ## Other biases than the default
 
-For the DAVIS346 laws of ratios are published. `dase.simulation.biases.with_biases` changes a sensor by them,
-from currents before to currents after:
+For the DAVIS346 laws of ratios are published. `dase bias` changes a sensor file by them, from settings before
+to settings after, and `dase synth --bias` simulates with others, in the same words:
+
+```sh
+dase bias                                                        # what is known of biases
+dase bias fitted.toml ONBn=5/255:6/200 DiffBn=4/39 -o dull.toml  # coarse/fine; DiffBn has not changed
+dase bias fitted.toml RefrBp=2nA:8nA -o quick.toml               # or currents; +20% for one a fifth larger
+dase synth dull --sensor fitted.toml --bias ONBn=5/255:6/200 --bias DiffBn=4/39
+```
+
+In Python `dase.simulation.biases.with_biases` takes currents:
 
 ```python
 from dase.simulation.biases import bias_current, with_biases
@@ -34,8 +43,8 @@ less_sensitive = with_biases(fitted, before, after)
 
 The sensor must be one that was fitted to a recording with the biases before: with which currents the
 recordings were made that gave the presets their values is not known (their files do not say), so no table
-from currents to values is given. How far currents on a chip are from those asked for has not been measured
-here.
+from currents to values is given. A bias of which no law is published is refused, and what it sets is said.
+How far currents on a chip are from those asked for has not been measured here.
 
 For the IMX636, the Gen4.1 and the Gen3, `bias_diff_on` and `bias_diff_off` (relative to `bias_diff`) set
 `threshold.on` and `threshold.off`, `bias_fo` sets `bandwidth.cutoff`, `bias_hpf` sets `high_pass.cutoff` (an

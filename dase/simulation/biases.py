@@ -6,7 +6,8 @@ For other cameras no such law was found; docs/presets.md says what is known of t
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+import re
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 
 from dase.effects.leak import Leak
@@ -83,6 +84,21 @@ DAVIS_LAWS = (
 
 _APPLIED = ("ONBn", "OFFBn", "DiffBn", "RefrBp")
 
+_NO_LAW = {
+    "PrBp": "bandwidth.cutoff",
+    "PrSFBp": "bandwidth.cutoff",
+    "bias_diff": "threshold.on and threshold.off",
+    "bias_diff_on": "threshold.on",
+    "bias_diff_off": "threshold.off",
+    "bias_fo": "bandwidth.cutoff",
+    "bias_hpf": "high_pass.cutoff",
+    "bias_refr": "refractory.period",
+}
+"""Biases of which it is known what they set, but no law: of a DAVIS346, and of Prophesee's cameras."""
+
+_CURRENT = re.compile(r"([0-9]*\.?[0-9]+(?:e[+-]?[0-9]+)?) ?([fpnuµm]?)A", re.IGNORECASE)
+_PREFIXES = {"": 1.0, "m": 1e-3, "u": 1e-6, "µ": 1e-6, "n": 1e-9, "p": 1e-12, "f": 1e-15}
+
 
 def bias_current(coarse: int, fine: int) -> float:
     """Return the current of a coarse and a fine setting [A].
@@ -96,6 +112,58 @@ def bias_current(coarse: int, fine: int) -> float:
             f"bias: must have a coarse setting of 0 to 7 and a fine one of 1 to 255, got {coarse}, {fine}"
         )
     return COARSE_CURRENTS[coarse] * fine / 255
+
+
+def parse_biases(texts: Iterable[str]) -> tuple[dict[str, float], dict[str, float]]:
+    """Return currents [A] before and after from texts such as `ONBn=5/255:6/200`.
+
+    A setting is coarse/fine, as the camera's software shows it, or a current with its unit, `8nA`; that after
+    may also be relative, `+20%`. One alone has not changed. What follows in proportion needs none before:
+    `RefrBp=+20%`.
+
+    Raises:
+        InputError: Not of that form, or a bias is named twice.
+    """
+    before, after = dict[str, float](), dict[str, float]()
+    for text in texts:
+        name, equals, settings = text.partition("=")
+        name = name.strip()
+        first, colon, second = settings.partition(":")
+        if not equals or not name or not first.strip() or (colon and not second.strip()):
+            raise InputError(
+                f"bias: '{text}' is not of the form NAME=BEFORE:AFTER, such as ONBn=5/255:6/200 or "
+                "RefrBp=2nA:+20%"
+            )
+        if name in before:
+            raise InputError(f"bias: {name} is given twice")
+        if _share(first) is not None and not colon:
+            if name in ("ONBn", "OFFBn", "DiffBn"):
+                raise InputError(
+                    f"bias: thresholds follow ratios of currents, so {name} needs its setting before, as in "
+                    f"{name}=5/255:{first.strip()}"
+                )
+            first, second, colon = "1A", first, ":"
+        before[name] = _parse_current(first, text)
+        share = _share(second) if colon else 1.0
+        after[name] = before[name] * share if share is not None else _parse_current(second, text)
+    return before, after
+
+
+def _share(text: str) -> float | None:
+    """Return the factor of a text such as `+20%`, None of any other."""
+    found = re.fullmatch(r"([+-][0-9]*\.?[0-9]+) ?%", text.strip())
+    return 1 + float(found.group(1)) / 100 if found else None
+
+
+def _parse_current(setting: str, text: str) -> float:
+    """Return the current [A] of a setting, coarse/fine or with its unit."""
+    if found := re.fullmatch(r"([0-9]+) ?/ ?([0-9]+)", setting.strip()):
+        return bias_current(int(found.group(1)), int(found.group(2)))
+    if found := _CURRENT.fullmatch(setting.strip()):
+        return float(found.group(1)) * _PREFIXES[found.group(2).lower()]
+    raise InputError(
+        f"bias: '{setting.strip()}' of '{text}' is neither coarse/fine (5/255) nor a current (8nA)"
+    )
 
 
 def with_biases(sensor: Sensor, before: Mapping[str, float], after: Mapping[str, float]) -> Sensor:
@@ -114,9 +182,9 @@ def with_biases(sensor: Sensor, before: Mapping[str, float], after: Mapping[str,
     """
     for name in (*before, *after):
         if name not in _APPLIED:
-            why = (
-                "no law of the cutoff is published" if name in ("PrBp", "PrSFBp") else nearest(name, _APPLIED)
-            )
+            why = nearest(name, _APPLIED)
+            if name in _NO_LAW:
+                why = f"no law of it is published; it sets {_NO_LAW[name]}: fit that, or set it in the file"
             raise InputError(f"biases: nothing follows '{name}': {why}")
     if missing := set(before) ^ set(after):
         raise InputError(

@@ -79,8 +79,8 @@ class SensorText:
         new = "\n\n".join(part for part in (head, tail.rstrip()) if part) + "\n"
         return self._checked(new, after)
 
-    def with_values_of(self, effect: Effect) -> SensorText:
-        """Return the text with values that were fitted for an effect that it has.
+    def with_values_of(self, effect: Effect, *, because: str = "fitted") -> SensorText:
+        """Return the text with other values of an effect that it has, and `because` as their reason.
 
         Comments stay. One that is about a value that changes, and not about the parameter or its unit, was
         true of the old one: `on = 0.2 # a guess` becomes `on = 0.23 # fitted (was 0.2: a guess)`.
@@ -97,8 +97,8 @@ class SensorText:
             table[name] = value
             comment = table[name].trivia.comment
             known = comment in ("", about[name].trivia.comment, units.get(name))
-            if not known and not comment.startswith("# fitted (was "):
-                table[name].trivia.comment = f"# fitted (was {old}: {comment.lstrip('# ')})"
+            if not known and not comment.startswith(f"# {because} (was "):
+                table[name].trivia.comment = f"# {because} (was {old}: {comment.lstrip('# ')})"
         return self._checked(tomlkit.dumps(document), before.with_effect(effect))
 
     def in_folder(self, folder: Path) -> SensorText:
@@ -113,8 +113,13 @@ class SensorText:
             table[name] = Path(os.path.relpath(getattr(effect, name), folder.resolve())).as_posix()
         return replace(self, folder=folder)._checked(tomlkit.dumps(document), sensor)
 
-    def describing(self, sensor: Sensor) -> SensorText:
-        """Return the text that describes another sensor: effects added, removed, or with other values."""
+    def describing(self, sensor: Sensor, *, because: str = "fitted") -> SensorText:
+        """Return the text that describes another sensor: effects added, removed, or with other values.
+
+        Args:
+            sensor: The other one.
+            because: Why values are others, for their comments.
+        """
         text = self
         for effect in self.sensor().effects:
             if effect.name not in sensor:
@@ -123,7 +128,7 @@ class SensorText:
             if effect.name not in text.sensor():
                 text = text.with_effect(effect)
             elif text.sensor()[effect.name] != effect:
-                text = text.with_values_of(effect)
+                text = text.with_values_of(effect, because=because)
         return text
 
     def with_history(self, entry: HistoryEntry) -> SensorText:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -14,7 +15,7 @@ from dase.effects.leak import Leak
 from dase.effects.shot import Shot
 from dase.effects.threshold import Threshold
 from dase.errors import InputError
-from dase.simulation.biases import DAVIS_LAWS, bias_current, with_biases
+from dase.simulation.biases import DAVIS_LAWS, bias_current, parse_biases, with_biases
 
 BEFORE = {"ONBn": bias_current(5, 255), "OFFBn": bias_current(4, 1), "DiffBn": bias_current(4, 39)}
 
@@ -74,7 +75,7 @@ def test_noise_is_that_of_the_same_pixels(device):
 @pytest.mark.parametrize(
     ("before", "after", "words"),
     [
-        ({"PrSFBp": 1e-9}, {"PrSFBp": 2e-9}, "no law of the cutoff"),
+        ({"PrSFBp": 1e-9}, {"PrSFBp": 2e-9}, "no law of it is published; it sets bandwidth.cutoff"),
         ({"OnBn": 1e-9}, {"OnBn": 2e-9}, "ONBn"),
         (BEFORE, {"ONBn": 1e-6}, "before and after"),
         ({"ONBn": 1e-6}, {"ONBn": 2e-6}, "relative to DiffBn"),
@@ -99,3 +100,55 @@ def test_each_law_says_what_is_not_known():
     followed = {value for law in DAVIS_LAWS for value in law.values}
     names = {f"{effect.name}.{p.name}" for effect in dase.EFFECTS.values() for p in effect.parameters()}
     assert followed <= names
+
+
+@pytest.mark.parametrize(
+    ("text", "currents"),
+    [
+        ("ONBn=5/255:6/200", (387.5e-9, 3.1e-6 * 200 / 255)),
+        ("DiffBn=4/39", (48.437e-9 * 39 / 255,) * 2),
+        ("RefrBp = 2 nA : 8nA", (2e-9, 8e-9)),
+        ("OFFBn=1.5e-10A:2uA", (1.5e-10, 2e-6)),
+        ("ONBn=8nA:+20%", (8e-9, 9.6e-9)),
+        ("OFFBn=4/1:-50%", (48.437e-9 / 255, 48.437e-9 / 510)),
+        ("RefrBp=+25%", (1.0, 1.25)),
+    ],
+)
+def test_settings_are_read_from_texts(text, currents):
+    before, after = parse_biases([text])
+    (name,) = before
+    assert name == text.split("=")[0].strip()
+    assert (before[name], after[name]) == pytest.approx(currents)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("ONBn", "is not of the form NAME=BEFORE:AFTER"),
+        ("ONBn=5/255:", "is not of the form NAME=BEFORE:AFTER"),
+        ("ONBn=5/300:5/2", "a fine one of 1 to 255, got 5, 300"),
+        ("ONBn=5/x", "'5/x' of 'ONBn=5/x' is neither coarse/fine"),
+        ("ONBn=8", "'8' of 'ONBn=8' is neither coarse/fine"),
+        ("ONBn=1.2.3nA", "neither coarse/fine"),
+        ("ONBn=+20%", "needs its setting before, as in ONBn=5/255:+20%"),
+    ],
+)
+def test_other_texts_are_refused(text, message):
+    with pytest.raises(InputError, match=re.escape(message)):
+        parse_biases([text])
+
+
+def test_a_bias_has_one_setting():
+    with pytest.raises(InputError, match="RefrBp is given twice"):
+        parse_biases(["RefrBp=+20%", "RefrBp=-20%"])
+
+
+@pytest.mark.parametrize(("name", "sets"), [("bias_diff_on", "threshold.on"), ("PrBp", "bandwidth.cutoff")])
+def test_a_bias_without_a_law_says_what_it_sets(name, sets):
+    with pytest.raises(InputError, match=re.escape(f"no law of it is published; it sets {sets}")):
+        with_biases(dase.load_sensor("imx636"), {name: 1.0}, {name: 1.2})
+
+
+def test_no_bias_is_the_sensor_itself():
+    sensor = dase.load_sensor("imx636")
+    assert with_biases(sensor, *parse_biases([])) == sensor
