@@ -328,13 +328,17 @@ the same `gain` (above); `SecondOrder.of_poles` and `VoltageNoise.of_photorecept
 
 Does it matter? Events of the circuit with thresholds of 0.2, cutoff 60 Hz and dark 0.01, before waves 20
 times as bright on one side as on the other (64x48, 0.6 s, 1 kHz, nothing else on), fitted with either law
-(`dase.fit`, 400 pixels, AMD EPYC, 13e41f6; `python -m perf.experiments.photoreceptor.run` computes it anew):
+(`dase.fit`, 400 pixels, AMD EPYC, 13e41f6, when a fit kept to the law that it began with; `python -m
+perf.experiments.photoreceptor.run` computes it anew):
 
 {table}
 
 With poles that are alike no error tells that something is wrong (what repeats have is 1), and yet thresholds
-are up to 13 % too low, and cutoff and damping are other numbers. A diagnosis tries poles that are alike
-alone, so its thresholds have this error beside `second_order` where the light goes over decades.
+are up to 13 % too low, and cutoff and damping are other numbers. Now `dase.fit` fits the other law, too, and
+keeps the better: of the first truth it ends with poles apart from either (`pytest
+tests/effects/test_photoreceptor.py -k finds_the_law`). A diagnosis tries poles that are alike alone ([what
+was tried](diagnosis.md)), so its thresholds have this error beside `second_order` where the light goes over
+decades: fit its sensor again.
 """
 
 

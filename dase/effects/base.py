@@ -317,6 +317,13 @@ class Effect:
         """
         return []
 
+    def by_other_laws(self) -> list[Self]:
+        """Return this effect by other laws that `dase.fit` has to fit, too, before any of them looks better.
+
+        A diagnosis, which fits many models, has no time for them.
+        """
+        return []
+
     def begins_at_the_light(self) -> bool:
         """Whether this effect belongs to a world whose memories begin at the first light, all alike."""
         return False

@@ -13,6 +13,10 @@ LEAST = wp.constant(1e-6)
 """Least current that is left in the dark, as intensity: a pixel without any would stand still."""
 
 
+USUAL = 0.2
+"""Light in which an effect by another law is alike where it takes the place of the present [intensity]."""
+
+
 @wp.func
 def relative_photocurrent(intensity: float, dark: float, dark_current: float):
     """Current of an intensity relative to that of intensity 1, at most 1.

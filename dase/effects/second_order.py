@@ -11,7 +11,7 @@ import warp as wp
 
 from dase.effects.bandwidth import Bandwidth
 from dase.effects.base import Effect, Observations, choice, parameter
-from dase.effects.photocurrent import dark_share, idle_beside, relative_photocurrent
+from dase.effects.photocurrent import USUAL, dark_share, idle_beside, relative_photocurrent
 from dase.kernels.pixel_stages import EffectStages
 from dase.kernels.vector_math import cosine_and_sine, exponential
 
@@ -227,8 +227,23 @@ class SecondOrder(Effect):
 
     @classmethod
     def candidates(cls, observed: Observations) -> list[Self]:
-        """Return that of constant damping: recordings hardly tell how damping changes with light."""
+        """Return that of constant damping: `dase.fit` asks for the circuit's, too."""
         return [cls()]
+
+    def by_other_laws(self) -> list[Self]:
+        """Return the other law of the poles, of the same frequency and damping in usual light."""
+        root = math.sqrt(USUAL)
+        if self.poles == "alike":
+            return [self._changed(self.cutoff * root, self.damping * root / self._share(), "apart")]
+        return [self._changed(self.cutoff / root, self.damping * self._share() / root, "alike")]
+
+    def _share(self) -> float:
+        """Return the sum of the poles in usual light relative to that at intensity 1, if poles are apart."""
+        return self.fixed + (1 - self.fixed) * USUAL
+
+    def _changed(self, cutoff: float, damping: float, poles: str) -> Self:
+        low, high = next(p.bounds for p in self.parameters() if p.name == "damping")
+        return replace(self, cutoff=max(cutoff, 0.01), damping=min(max(damping, low), high), poles=poles)
 
     @classmethod
     def of_poles(cls, pole: Bandwidth, *, cutoff: float, gain: float = 0.0) -> Self:
@@ -246,8 +261,8 @@ class SecondOrder(Effect):
         )  # fmt: skip
 
     def idle(self, beside: Sequence[Effect]) -> tuple[str, ...]:
-        """Return the names of the parameters that change nothing."""
-        return idle_beside(beside)
+        """Return the names of the parameters that change nothing by its law."""
+        return (*(("fixed",) if self.poles == "alike" else ()), *idle_beside(beside))
 
     def compiled(self) -> EffectStages:
         """Return what the kernel composer needs to know."""

@@ -11,7 +11,7 @@ import warp as wp
 
 from dase.effects.bandwidth import Bandwidth
 from dase.effects.base import ANY_SAMPLES, Effect, Observations, choice, parameter
-from dase.effects.photocurrent import idle_beside, photocurrent
+from dase.effects.photocurrent import USUAL, idle_beside, photocurrent
 from dase.effects.second_order import impulse_response
 from dase.kernels.pixel_stages import REST, EffectStages
 from dase.kernels.vector_math import cosine_and_sine, exponential, logarithm
@@ -34,9 +34,6 @@ def fresh_variance(x: float, kept: float):
         var = y * y * y * (1.0 / 6.0 - y * (1.0 / 8.0 - y * (1.0 / 20.0 - y / 72.0)))
     return wp.max(var, 1.0e-30), mixed, 1.0 - kept * (1.0 - y + 0.5 * y * y)
 
-
-USUAL = 0.2
-"""Light in which noise of both kinds is alike where one takes the place of the other [intensity]."""
 
 STEEP = wp.constant(2.0)
 """Time constants in a step up to which the speeds at its ends tell where the voltage has been in between."""

@@ -20,6 +20,7 @@ from dase.fitting.model import (
     free_where_measured,
     model_of,
     refit_model,
+    ways_by_other_laws,
 )
 from dase.fitting.parameter_space import SearchAxis, refuse_idle
 from dase.fitting.plain_numbers import plain_numbers
@@ -169,7 +170,10 @@ def _descend_from_starts(
     """Return where several starts end, each with its held-out error."""
     tell("a wide look", 0.1)
     model = refit_model(evidence, fit_present_model(evidence, sensor, free, seed=seed), seed=seed)
-    ends = [(model.judge(evidence.held, repeats=REPEATS, seed=SimulationStream.JUDGE.seed(seed)), model)]
+    ways = [model, *(refit_model(evidence, way, seed=seed) for way in ways_by_other_laws(model))]
+    # starts that end alike are starts by one law: the others are given up here
+    stream = SimulationStream.JUDGE.seed(seed)
+    ends = [_best_end([(way.judge(evidence.held, repeats=REPEATS, seed=stream), way) for way in ways])]
     for n in range(FIT.most_starts):
         if n >= FIT.other_starts and len(_equally_good_models(ends)) > 1:
             break

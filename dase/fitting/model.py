@@ -278,6 +278,13 @@ def _with_rule(model: FittedModel, other: Effect) -> FittedModel:
     return replace(model_of(sensor, still_free(sensor, model)), loss=model.loss)
 
 
+def ways_by_other_laws(model: FittedModel) -> list[FittedModel]:
+    """Return the model by other laws of those of its effects of which something is free, one at a time."""
+    free = {axis.effect.name for axis in model.space.axes}
+    acting = [effect for effect in model.sensor.effects if effect.name in free and not effect.is_off()]
+    return [_with_rule(model, other) for effect in acting for other in effect.by_other_laws()]
+
+
 def refit_work(
     evidence: SplitMeasurement,
     model: FittedModel,

@@ -11,9 +11,11 @@ from helpers.small_scenes import ramp, still
 
 import dase
 from dase.effects.bandwidth import Bandwidth
+from dase.effects.photocurrent import USUAL
 from dase.effects.second_order import SecondOrder
 from dase.effects.threshold import Threshold
 from dase.effects.voltage_noise import VoltageNoise
+from perf.experiments.photoreceptor.run import waves
 
 FINE = Threshold(on=0.01, off=0.01, phase=0.0)
 
@@ -204,3 +206,31 @@ def test_signal_and_noise_are_of_one_photoreceptor(gain):
     np.testing.assert_allclose((1 + noise.gain) * node * noise.cutoff, signal.cutoff**2 * current, rtol=1e-12)
     twice = 2 * signal.cutoff * signal.damping * (signal.fixed + (1 - signal.fixed) * current)
     np.testing.assert_allclose(node + noise.cutoff, twice, rtol=1e-12)
+
+
+@pytest.mark.parametrize("poles", ["alike", "apart"])
+def test_the_other_law_is_the_same_in_usual_light(poles):
+    slow = SecondOrder(cutoff=80.0, damping=0.6, fixed=0.8, poles=poles)
+    (other,) = slow.by_other_laws()
+    assert {slow.poles, other.poles} == {"alike", "apart"}
+    alike, apart = (next(one for one in (slow, other) if one.poles == word) for word in ("alike", "apart"))
+    # the sum and the product of the circuit's poles in light of which L is left, and those of equal ones
+    left = USUAL
+    omega = apart.cutoff * np.sqrt(left)
+    total = 2 * apart.cutoff * apart.damping * (apart.fixed + (1 - apart.fixed) * left)
+    assert omega == pytest.approx(alike.cutoff * left)
+    assert total == pytest.approx(2 * alike.damping * alike.cutoff * left)
+    (back,) = other.by_other_laws()
+    assert (back.cutoff, back.damping, back.poles) == (pytest.approx(80.0), pytest.approx(0.6), poles)
+
+
+@pytest.mark.slow
+def test_a_fit_finds_the_law_of_the_poles():
+    """Begun with poles alike, whose thresholds would be 12 % too low at an error that says nothing."""
+    true = dase.Sensor((SecondOrder(cutoff=60.0, damping=0.35, dark=0.01, poles="apart"), Threshold()))
+    scene = waves(48, 32)
+    guess = dase.Sensor((SecondOrder(cutoff=120.0, damping=0.8, dark=0.01), Threshold(on=0.25, off=0.25)))
+    found = dase.fit(dase.simulate(scene, true, seed=1), guess, scene=scene, pixels=300)
+    assert found.sensor["second_order"].poles == "apart"
+    assert any("second_order.poles is apart instead of alike" in note for note in found.notes)
+    np.testing.assert_allclose([found.sensor["threshold"].on, found.sensor["threshold"].off], 0.2, rtol=0.04)
