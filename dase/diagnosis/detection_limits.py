@@ -26,7 +26,7 @@ from dase.fitting.parameter_space import SearchAxis
 from dase.fitting.scene_doubt import misfit_beyond_chance
 from dase.fitting.scheduler import SimulationRequest, Work, run_side_by_side
 from dase.fitting.subset import CalibratedSubset
-from dase.fitting.trial_sampling import samples_of_screening
+from dase.fitting.trial_sampling import samples_of_screening, samples_per_step
 from dase.formatting import format_metric
 from dase.probes.distance import Judgement, leaves_nothing, pseudo_huber, reaches_floor
 from dase.probes.random_streams import SimulationStream
@@ -161,9 +161,8 @@ def _reported_model(
     sides = np.concatenate([model.place + reach, model.place - reach])
     frame = np.zeros((len(half.scale.target), 0))
     if tight:  # something is free
-        seed = SimulationStream.DIRECTIONS.seed(state.seed)
-        values = half.run_repeats(model.space, np.repeat(sides, count, 0), seed=seed)
-        plus, minus = np.split(values.reshape(len(sides), count, -1).mean(1), 2)
+        seeds = [SimulationStream.DIRECTIONS.seed(state.seed, n) for n in range(count)]
+        plus, minus = np.split(np.mean([half.run(model.space, sides, seed=one) for one in seeds], 0), 2)
         frame = np.linalg.qr(_in_standard_errors(half, plus - minus).T)[0]
     off = half.scale.target - half.repeats.mean(0)
     doubt = misfit_beyond_chance(half)
@@ -184,42 +183,55 @@ def _limit_work(
     other = with_effect_added(known.model, effect)
     column = [a.name for a in other.space.axes].index(axis.name)
     weak, strong = _range_of(axis)
-    # what an effect does is a difference between two strengths that are sampled alike
-    most = samples_of_screening(known.model.sensor, known.half.frame.step)
-
     seeds = [SimulationStream.DETECTION.seed(state.seed, n) for n in range(settings.repeats)]
+    # models that need more samples than the last one share them with no others: they fill a CPU's lanes alone
+    slow = known.half.slow(other.space) and not known.half.slow(known.model.space)
+    places = np.linspace(weak, strong, (settings.strengths_at_once if slow else settings.strengths) + 1)
+    # what an effect does is a difference between two strengths that are sampled alike
+    step = known.half.frame.step
+    strongest = other.place.copy()
+    strongest[column] = strong
+    most = samples_of_screening(known.model.sensor, step)
+    finer = min(samples_per_step(other.space.at(strongest), step), most) or None
 
     def simulated_work(strengths: Array) -> Work[Array]:
         """Return the statistics at some strengths, shape (S, R, J) for R repeats."""
         places = np.repeat(other.place[None], len(strengths), 0)
         places[:, column] = strengths
         # all strengths see the same random numbers, so that few repeats tell them apart
-        values = yield [SimulationRequest(known.half, other.space, places, seed, most=most) for seed in seeds]
+        values = yield [
+            SimulationRequest(known.half, other.space, places, seed, most=most, finer=finer) for seed in seeds
+        ]
         return np.stack(values, 1)
 
     # measurements are repeats of the last model, to which what the effect did in one repeat is added: which
     # pixels are hot is chance, too
     chance = known.half.repeats[: settings.measurements]
-    turns = np.arange(len(chance)) % settings.repeats
+    mine = np.arange(len(chance)) % settings.repeats
 
     def is_seen(done: Array) -> bool:
-        return float(np.mean(would_be_seen(known, chance + done[turns], state.settings))) >= settings.power
+        return float(np.mean(would_be_seen(known, chance + done[mine], state.settings))) >= settings.power
 
     # what the effect does to events by its place in the kernel alone, however weak it is, is not its strength
-    places = np.linspace(weak, strong, settings.strengths + 1)
-    found = yield from simulated_work(places)
-    done = found - found[0]
-    first = next((n for n in range(1, len(places)) if is_seen(done[n])), 0)
-    if not first:
-        return None
+    nothing, *found = yield from simulated_work(places if slow else places[:2])
+    first = 1
+    # the strongest send most events, and take longest
+    while not is_seen(found[first - 1] - nothing):
+        first += 1
+        if first == len(places):
+            return None
+        if first > len(found):
+            found += list((yield from simulated_work(places[first : first + 1])))
+    done = [nothing - nothing, *(one - nothing for one in found)]
     low, high, below, above = places[first - 1], places[first], done[first - 1], done[first]
-    for turn in range(settings.turns):
+    turns = 1 if slow else settings.turns
+    for turn in range(turns):
         share = _least_share(is_seen, below, above, settings.halvings)
         middle = float(low + share * (high - low))
-        if turn == settings.turns - 1 or share == 1.0:
+        if turn == turns - 1 or share == 1.0:
             return middle
         # between two strengths what they do hardly bends; where it does, the next look tells
-        here = (yield from simulated_work(np.array([middle])))[0] - found[0]
+        here = (yield from simulated_work(np.array([middle])))[0] - nothing
         if is_seen(here):
             high, above = middle, here
         else:

@@ -21,7 +21,6 @@ from dase.fitting.scheduler import SimulationRequest, answer_requests
 from dase.fitting.subset import CalibratedSubset, PixelSubset
 from dase.probes.distance import Judgement, leaves_nothing, reaches_floor
 from dase.probes.random_streams import SimulationStream
-from dase.probes.statistics import compute_statistics
 
 Array = NDArray[np.float64]
 
@@ -241,13 +240,6 @@ def _mean_statistics(
 ) -> list[Array]:
     """Return the mean statistics of models at some places, (M, J) each, their random numbers in common."""
     count = state.settings.hidden.repeats_of_mean
-    seed = SimulationStream.DIRECTIONS.seed(state.seed)
-    sums = answer_requests(
-        [
-            SimulationRequest(half, m.space, np.repeat(places, count, 0), seed, repeats=True)
-            for m, places in models
-        ]
-    )
-    return [
-        compute_statistics(one, half.frame)[0].reshape(-1, count, len(half.tolerance)).mean(1) for one in sums
-    ]
+    seeds = [SimulationStream.DIRECTIONS.seed(state.seed, n) for n in range(count)]
+    values = answer_requests([SimulationRequest(half, m.space, p, seed) for m, p in models for seed in seeds])
+    return [np.mean(values[n : n + count], 0) for n in range(0, len(values), count)]

@@ -74,8 +74,8 @@ class HiddenEffectSettings:
     strengths: tuple[float, ...] = (0.2, 0.5, 0.8)
     """At which an effect is looked at, as shares of the plausible range."""
 
-    repeats_of_mean: int = 8
-    """Simulations whose mean is looked at."""
+    repeats_of_mean: int = 4
+    """Simulations whose mean is looked at, with the same random numbers at all places."""
 
     away: float = 3.5
     """Standard deviations by which a measurement must be away from repeats of a model, on the way to an
@@ -207,7 +207,11 @@ class DetectionSettings:
     """Share of them that must show it."""
 
     strengths: int = 3
-    """That are simulated first, beside next to nothing of the effect: with three repeats twelve models."""
+    """That are simulated beside next to nothing of the effect: the weakest, then the next until one shows."""
+
+    strengths_at_once: int = 4
+    """The same of an effect that needs many samples, all of them in one launch: with three repeats 15 models,
+    which fill a CPU's lanes. Between two of them the limit is worked out without another look."""
 
     turns: int = 2
     """Times that the least strength is worked out between two: after the first it is simulated, too."""
@@ -215,7 +219,7 @@ class DetectionSettings:
     halvings: int = 4
     """Of what lies between two strengths, by what lies between what they do."""
 
-    side_by_side: int = 4
+    side_by_side: int = 16
     """Effects that are looked at in one launch."""
 
 

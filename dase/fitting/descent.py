@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from dase.fitting.parameter_space import ParameterSpace
 from dase.fitting.scheduler import SimulationRequest, Work
 from dase.fitting.subset import CalibratedSubset
-from dase.fitting.trial_sampling import SAMPLES
+from dase.fitting.trial_sampling import SAMPLES, samples_per_step
 from dase.kernels.event_probes import LANES
 from dase.probes.distance import ErrorScale
 from dase.probes.random_streams import Draw
@@ -135,7 +135,10 @@ def descent_work(
         # the middle comes first: what a step promised is seen, and it is a place of the next lines as well
         population = np.concatenate([centre[None], centre + reach * _cross_population(rng, len(centre))])
         population = np.clip(population, low, high)
-        (values,) = yield [SimulationRequest(half, space, population, seed, most=most)]
+        # all with the samples of the middle: their random numbers are the same, and they fill a CPU's lanes
+        needed = min(samples_per_step(space.at(centre), half.frame.step), most)
+        asked = SimulationRequest(half, space, population, seed, most=most, finer=needed or None)
+        (values,) = yield [asked]
         # random numbers are common to all populations, so places of former ones stay comparable
         places, tried = np.concatenate([places, population]), np.concatenate([tried, values])
         losses = half.scale.loss(tried) + distance_penalty(places, start, settings.prior)

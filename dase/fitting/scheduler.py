@@ -40,6 +40,7 @@ class SimulationRequest:
         repeats: Whether each model gets random numbers of its own. Then the answer is sums, else statistics,
             shape (B, J).
         most: Samples per step that no model exceeds, whatever it needs.
+        finer: Samples per step of all models; None for as many as each needs.
     """
 
     half: PixelSubset
@@ -48,6 +49,7 @@ class SimulationRequest:
     seed: int
     repeats: bool = False
     most: int = SAMPLES[-1]
+    finer: int | None = None
 
 
 Work = Generator[list[SimulationRequest], list[Any], Result]
@@ -110,7 +112,7 @@ def answer_requests(asks: Sequence[SimulationRequest]) -> list[Any]:
             ticks = None
         vectors = ask.space.vectors(ask.places)
         sensor, clock = ask.space.sensor, ticks or 0.0
-        order = SimulationOrder(sensor, vectors, ask.seed, ask.repeats, None, frame, clock, ask.most)
+        order = SimulationOrder(sensor, vectors, ask.seed, ask.repeats, ask.finer, frame, clock, ask.most)
         # events have to go through a readout, which takes ten times as long
         if ticks is None:
             effects = [trials.noticeable_effects(ask.space.at(place)) for place in np.atleast_2d(ask.places)]

@@ -29,8 +29,8 @@ class SimulationStream(Enum):
     """Repeats of a model on the held-out half."""
     CLOUD = (700, 0)
     """Repeats in which a closer look sees what chance does."""
-    DIRECTIONS = (900, 0)
-    """Means of models, which give the ways on which a closer look is taken."""
+    DIRECTIONS = (900, 1)
+    """Means of models, which give the ways on which a closer look is taken; a turn is a simulation of it."""
     CONFIDENCE = (900, 100)
     """Repeats of the fitted model that give its intervals; a turn is a last step."""
     SLOPES = (0, 10)

@@ -10,13 +10,23 @@ import pytest
 
 import dase
 from dase.diagnosis.cell_descriptions import kind_of_pixels
-from dase.diagnosis.detection_limits import describe_limit, main_axis, would_be_added
+from dase.diagnosis.detection_limits import (
+    _limit_work,
+    _range_of,
+    _reported_model,
+    describe_limit,
+    main_axis,
+    would_be_added,
+)
 from dase.diagnosis.diagnose import diagnose
 from dase.diagnosis.explain_effect import moving_bars
 from dase.diagnosis.remainder import shares_by_pixels, what_to_record
 from dase.diagnosis.settings import DEFAULTS
+from dase.diagnosis.state import DiagnosisState
 from dase.effects import EFFECTS
+from dase.fitting.data_split import split_measurement
 from dase.fitting.model import model_of
+from dase.fitting.scheduler import answer_requests
 from dase.probes.distance import Judgement
 from dase.probes.statistics import LAYOUT, SIZE
 from dase.results import Finding, Grade, Unexplained
@@ -75,6 +85,43 @@ def test_limits_agree_with_simulation(scene, name):
         named[share] = sum(bool(one.findings) for one in found)
     assert named[2.0] >= 3
     assert named[0.25] <= 1
+
+
+@pytest.mark.parametrize("name", ["leak", "voltage_noise"])
+def test_stronger_is_tried_only_where_weaker_is_not_seen(scene, name):
+    """But where a model needs samples of its own, all strengths fill one launch."""
+    sensor = Sensor()
+    evidence = split_measurement(dase.simulate(scene, sensor, seed=3), scene, pixels=200, seed=3)
+    state = DiagnosisState(evidence, EFFECTS, 3, lambda text, share, error: None, frozenset({"threshold"}))
+    model = model_of(sensor)
+    half = model.calibrate(evidence.report, repeats=20, seed=5)
+    known = _reported_model(state, model, half, half.judge(1), half.judge(1))
+    effect = EFFECTS[name].candidates(evidence.observe(idle_bus=0.01))[0]
+    axis = main_axis(model, effect)
+    work = _limit_work(state, known, effect, axis)
+    asked, asks = [], next(work)
+    while True:
+        asked.append(asks)
+        try:
+            asks = work.send(answer_requests(asks))
+        except StopIteration as stop:
+            place = stop.value
+            break
+    first = asked[0]
+    assert len(first) == state.settings.detection.repeats
+    column = [a.name for a in first[0].space.axes].index(axis.name)
+    tried = [np.unique(np.concatenate([ask.places[:, column] for ask in asks])) for asks in asked]
+    assert place is not None
+    if name == "voltage_noise":
+        assert len(asked) == 1
+        assert len({ask.finer for ask in first}) == 1
+        assert first[0].finer
+        assert sum(len(ask.places) for ask in first) <= 16
+    else:
+        # the strongest, which takes longest, is not simulated where a weaker one is seen
+        assert len(tried[0]) == 2
+        assert max(t.max() for t in tried) < _range_of(axis)[1]
+        assert place <= max(t.max() for t in tried)
 
 
 def test_limits_in_words():

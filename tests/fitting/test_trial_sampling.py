@@ -128,7 +128,7 @@ def test_screening_samples_no_finer_than_it_has_to(trials):
 
 def test_a_search_asks_for_no_more_samples_than_it_was_told(trials):
     space = ParameterSpace(sensor_with(NOISES[0]), axes_of(sensor_with(NOISES[0]), ["voltage_noise.sigma"]))
-    half = SimpleNamespace(scale=SimpleNamespace(target=np.zeros(3)))
+    half = SimpleNamespace(frame=SimpleNamespace(step=STEP), scale=SimpleNamespace(target=np.zeros(3)))
     works = [descent_work(half, space, np.zeros(1), seed=0, most=n) for n in (3, 24)]
     works += [ranking_work(half, space, np.zeros((2, 1)), seed=0, most=3)]
     assert [next(work)[0].most for work in works] == [3, 24, 3]
@@ -188,3 +188,17 @@ def test_models_whose_effects_differ_by_words_do_not_share_a_kernel(trials):
         alone = trials.run(order.sensor, order.vectors, seed=5)
         np.testing.assert_array_equal(sums.sums, alone.sums)
     assert together[0].halves.sum() != together[1].halves.sum()
+
+
+def test_a_population_has_the_samples_of_its_middle(trials):
+    """However fast the noise of each is: random numbers are in common, and no launch is split."""
+    sensor = sensor_with(VoltageNoise(sigma=0.1, cutoff=700.0))
+    space = ParameterSpace(sensor, axes_of(sensor, ["voltage_noise.cutoff"]))
+    start = space.places()
+    half = SimpleNamespace(frame=SimpleNamespace(step=STEP), scale=SimpleNamespace(target=np.zeros(3)))
+    (ask,) = next(descent_work(half, space, start, seed=1, radius=0.8))
+    needed = samples_per_step_of_rows(sensor, space.vectors(ask.places), STEP)
+    assert len(set(needed.tolist())) > 1
+    assert ask.finer == samples_per_step(sensor, STEP)
+    (ask,) = next(descent_work(half, space, start, seed=1, most=4))
+    assert ask.finer == 4

@@ -288,9 +288,7 @@ class Study:
                 dase.tasks.EvFlowNet(5, size.flow_channels), batches, folder, settings
             )
         steps = size.reconstruction_steps
-        settings = dase.tasks.ReconstructionTraining(
-            steps=steps, average=0.995, save_every=100, **options
-        )
+        settings = dase.tasks.ReconstructionTraining(steps=steps, average=0.995, save_every=100, **options)
         network = dase.tasks.E2VidNet(5, size.reconstruction_channels)
         return dase.tasks.train_reconstruction(network, batches, folder, settings)
 
