@@ -61,6 +61,8 @@ class Mismatch(Effect):
         bounds=(0.0, 1.0),
         plausible=(0.02, 0.5),
         about="standard deviation over pixels, relative to the threshold",
+        # a world that sets its memory at steps of time, beyond the threshold by chance, has such pixels
+        clear_beside=(("refractory", 0.05),),
     )
     relative_to: str = choice(
         "own",

@@ -257,14 +257,16 @@ def test_a_hint_of_a_far_smaller_size_explains_nothing():
         assert len(entries) == left
 
 
-@pytest.mark.parametrize(("spread", "period", "in_doubt"), [
-    (0.05, 5e-3, True), (0.2, 5e-3, False), (0.05, 0.0, False), (0.05, None, False),
+@pytest.mark.parametrize(("name", "spread", "period", "in_doubt"), [
+    ("jitter", 0.05, 5e-3, True), ("jitter", 0.2, 5e-3, False), ("jitter", 0.05, 0.0, False),
+    ("jitter", 0.05, None, False), ("mismatch", 0.03, 1e-4, True), ("mismatch", 0.08, 1e-4, False),
+    ("mismatch", 0.03, None, False),
 ])  # fmt: skip
-def test_a_little_jitter_beside_a_dead_time_is_in_doubt(spread, period, in_doubt):
-    sensor = Sensor().with_effect(EFFECTS["jitter"](spread=spread))
+def test_little_that_differs_beside_a_dead_time_is_in_doubt(name, spread, period, in_doubt):
+    sensor = Sensor().with_effect(EFFECTS[name](spread=spread))
     if period is not None:
         sensor = sensor.with_effect(EFFECTS["refractory"](period=period))
     model = model_of(sensor)
-    got = is_small_beside_another(model, "jitter.spread", Estimate(spread, 0.9 * spread, 1.1 * spread))
+    got = is_small_beside_another(model, f"{name}.spread", Estimate(spread, 0.9 * spread, 1.1 * spread))
     assert got == in_doubt
     assert not is_small_beside_another(model, "threshold.on", Estimate(0.1, 0.1, 0.1))
