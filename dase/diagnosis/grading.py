@@ -12,8 +12,8 @@ part, by which nothing was chosen. Each effect has to earn its grade there:
   explained that something which is not in the library could look like it, or it had to go to an end of what
   it can be, beyond all that is plausible: shot noise that is all ON is another effect. So is it with a dead
   time far shorter than the steps in which light is known: a memory that is set a little later looks like it.
-  A little jitter or mismatch beside a dead time is in doubt, too: a world that looks for crossings at steps of
-  time makes it when a dead time ends, or by how far beyond the threshold a memory is set.
+  A little jitter or mismatch beside a dead time is in doubt, too: a world that looks for crossings at steps
+  of time makes it when a dead time ends, or by how far beyond the threshold a memory is set.
 
 An effect that earns neither is a stand-in: it is named as what comes nearest, and not found.
 """
