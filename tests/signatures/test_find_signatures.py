@@ -170,16 +170,29 @@ def returning():
     [
         ({}, "not seen"),
         ({"mismatch": {"spread": 0.15}}, "found"),
-        ({"mismatch": {"spread": 0.3}, "refractory": {"period": 0.015}}, "cannot say"),
     ],
 )
 def test_edges_that_come_back_are_no_pattern_of_the_pixels(returning, effects, answer):
-    """They leave like counts in both halves, but as many thresholds up as down, unless pixels are deaf."""
+    """They leave like counts in both halves, but as many thresholds up as down."""
     sensor = dase.Sensor()
     for name, values in effects.items():
         sensor = sensor.with_effect(EFFECTS[name](**values))
     looked = dase.find_signatures(dase.simulate(returning, sensor, seed=2))
     assert looked["fixed pattern"].answer == answer
+
+
+@pytest.mark.parametrize(("deaf", "answer"), [(0.0, "found"), (0.01, "cannot say")])
+def test_a_pattern_beside_a_dead_time_that_many_events_wait_for_is_in_doubt(deaf, answer):
+    rng = np.random.default_rng(5)
+    gaps = deaf + rng.exponential(0.014 - deaf, (2304, 70))
+    times = np.cumsum(gaps, axis=1)
+    on = rng.random(times.shape) < np.clip(0.5 + 0.2 * rng.standard_normal((2304, 1)), 0.1, 0.9)
+    kept = times < 1
+    pixel = np.repeat(np.arange(2304), 70).reshape(times.shape)[kept]
+    order = np.argsort(times[kept])
+    x, y = (pixel % 48).astype(np.uint16), (pixel // 48).astype(np.uint16)
+    events = dase.Events(times[kept][order], x[order], y[order], on[kept][order], 48, 48)
+    assert dase.find_signatures(events)["fixed pattern"].answer == answer
 
 
 def test_what_is_put_into_the_events_shows(plain):
