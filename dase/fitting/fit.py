@@ -15,15 +15,19 @@ from dase.fitting.confidence_intervals import REPEATS, estimate_parameters
 from dase.fitting.data_split import SPLIT, SplitMeasurement, split_measurement
 from dase.fitting.measurement import Measured, SceneChoice, as_measurement
 from dase.fitting.model import (
+    PHASED,
+    REFIT,
     FittedModel,
     fit_present_model,
     free_where_measured,
     model_of,
     refit_model,
     ways_by_other_laws,
+    with_phase,
 )
 from dase.fitting.parameter_space import SearchAxis, refuse_idle
 from dase.fitting.plain_numbers import plain_numbers
+from dase.fitting.scheduler import SimulationRequest, answer_requests
 from dase.fitting.screen_limits import limits_of_screen
 from dase.fitting.search_ends import is_where_it_began, parameters_at_bounds
 from dase.probes.distance import Judgement
@@ -50,6 +54,9 @@ class FitSettings:
 
     near: float = 0.08
     """They agree as well where they lie within this of each other, in the units of `SearchAxis.to_place`."""
+
+    phase_told: float = 1.05
+    """A measurement tells the phase where the other makes the error or the loss so many times as large."""
 
 
 FIT = FitSettings()
@@ -115,6 +122,7 @@ def fit(
     before = given.judge(evidence.report, repeats=REPEATS // 2, seed=SimulationStream.JUDGE.seed(seed)).error
     ends = _descend_from_starts(evidence, start, free, seed, lambda text, share: tell(text, share, before))
     judgement, model = _best_end(ends)
+    model = with_phase_given(evidence, model, start, seed=seed)
     tell("confidence intervals", 0.9, judgement.error)
     good = [one for one in _equally_good_models(ends) if one.space.names == model.space.names]
     model, values = estimate_parameters(evidence, model, seed=seed)
@@ -132,6 +140,7 @@ def fit(
         *evidence.notes,
         *([NO_FRAME_TIMES] if follows and frames is None else []),
         *_notes_on_rules(start, model.sensor),
+        *_notes_on_phase(start, model.sensor),
         *apart,
         *(["no descent left the start: the values are those that were given"] if stuck else []),
         *parameters_at_bounds(model, values),
@@ -204,6 +213,48 @@ def _notes_on_rules(before: Sensor, after: Sensor) -> list[str]:
         for effect in before.effects for name in effect.choices()
         if getattr(after[effect.name], name) != getattr(effect, name)
     ]  # fmt: skip
+
+
+def with_phase_given(
+    evidence: SplitMeasurement, model: FittedModel, given: Sensor, *, seed: int
+) -> FittedModel:
+    """Return a model with the phase of the sensor that was given, unless the measurement tells another.
+
+    The phase acts at the start alone. Of a long recording that is so little that chance leads a search to
+    either, while other scenes, which may be short, are simulated with the sensor that is found. It is judged
+    by the sampling errors of both: those of pixels that begin alike are small, and where memories are spread
+    a model without looks no worse.
+    """
+    phase = _phase_of(given)
+    if _phase_of(model.sensor) == phase:
+        return model
+    ways = model, with_phase(model, phase)
+    stream = SimulationStream.JUDGE.seed(seed)
+    halves = [one.calibrate(evidence.held, repeats=REPEATS, seed=stream) for one in ways]
+    here, there = (half.judge(stream).error for half in halves)
+    seeds = [SimulationStream.DESCENT.seed(seed, n) for n in range(REFIT.descents)]
+    values = answer_requests(
+        [SimulationRequest(halves[0], one.space, one.place[None], each) for one in ways for each in seeds]
+    )
+    losses = np.reshape([float(halves[0].scale.loss(value)[0]) for value in values], (2, -1)).mean(1)
+    told = there > FIT.phase_told * here or losses[1] > FIT.phase_told * losses[0]
+    return ways[0] if told else ways[1]
+
+
+def _phase_of(sensor: Sensor) -> float:
+    phase: float = sensor[PHASED].phase  # type: ignore[attr-defined]
+    return phase
+
+
+def _notes_on_phase(before: Sensor, after: Sensor) -> list[str]:
+    """Return what is to be said of a phase that the fit has changed."""
+    phase, given = _phase_of(after), _phase_of(before)
+    if phase == given:
+        return []
+    return [
+        f"threshold.phase is {phase:g} instead of {given:g}: so the recording began, which is no property of "
+        "the camera; set it to 1 for scenes that are cut out of time"
+    ]
 
 
 def _notes_on_minimum(judgement: Judgement, starts: int, good: int) -> list[str]:

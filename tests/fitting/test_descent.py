@@ -15,6 +15,7 @@ from dase.fitting import confidence_intervals
 from dase.fitting import model as model_module
 from dase.fitting.confidence_intervals import estimate_parameters
 from dase.fitting.data_split import split_measurement
+from dase.fitting.fit import with_phase_given
 from dase.fitting.model import (
     model_of,
     refit_model,
@@ -86,6 +87,30 @@ def test_a_phase_that_looks_no_better_at_the_same_place_is_found(device, monkeyp
     start = with_phase(model_of(true), 1.0)
     assert run_work(refit_work(found, start, seed=0, rounds=1)).sensor["threshold"].phase == 1
     assert refit_model(found, start, seed=0, rounds=1).sensor["threshold"].phase == 0
+
+
+@pytest.mark.parametrize(
+    ("others", "found", "given", "kept"), [((), 0.0, 1.0, 0.0), (("mismatch", "shot"), 0.0, 1.0, 1.0),
+                                           (("mismatch", "shot"), 1.0, 0.0, 0.0)]
+)  # fmt: skip
+def test_a_phase_stays_as_it_was_given_where_nothing_tells_another(device, others, found, given, kept):
+    """Pixels that all begin at the light are told where they are alike; not beside mismatch and noise."""
+    scene, true = moving_bars(), Sensor().with_effect(EFFECTS["threshold"](phase=0.0))
+    for name, value in (("mismatch", {"spread": 0.15}), ("shot", {"rate": 2.0})):
+        true = true.with_effect(EFFECTS[name](**value)) if name in others else true
+    events = dase.simulate(scene, true, seed=4, device=device)
+    evidence = split_measurement(events, scene, pixels=300, seed=1, device=device)
+    end, start = with_phase(model_of(true), found), with_phase(model_of(true), given).sensor
+    assert with_phase_given(evidence, end, start, seed=0).sensor["threshold"].phase == kept
+
+
+def test_a_fit_says_that_the_phase_is_the_recordings(device):
+    scene, true = moving_bars(), Sensor().with_effect(EFFECTS["threshold"](phase=0.0))
+    events = dase.simulate(scene, true, seed=4, device=device)
+    found = dase.fit(events, Sensor(), scene=scene, pixels=300, device=device)
+    assert found.sensor["threshold"].phase == 0
+    assert any(note.startswith("threshold.phase is 0 instead of 1") for note in found.notes)
+    assert not any("phase" in note for note in dase.fit(events, true, scene=scene, pixels=300).notes)
 
 
 @pytest.mark.parametrize(("rule", "other"), [("drop", "delay"), ("delay", "drop"), ("reset", "delay")])
@@ -274,7 +299,7 @@ def test_thresholds_of_light_that_never_changes_are_no_claim():
     found = dase.fit(dase.simulate(scene, true, seed=1), true, scene=scene, pixels=200)
     assert {"shot.rate", "shot.balance"} <= set(found.parameters)
     assert not any(name.startswith("threshold") for name in found.parameters)
-    assert found.sensor["threshold"] == replace(true["threshold"], phase=found.sensor["threshold"].phase)
+    assert found.sensor["threshold"] == true["threshold"]
     assert any("thresholds are not fitted" in note for note in found.notes)
     asked = dase.fit(dase.simulate(scene, true, seed=1), true, scene=scene, free=["threshold.on"], pixels=200)
     assert set(asked.parameters) == {"threshold.on"}

@@ -159,9 +159,9 @@ class TargetRecording:
 def in_midst(sensor: dase.Sensor) -> dase.Sensor:
     """Return a fitted sensor whose pixels have seen something before a scene begins.
 
-    The phase that a fit finds tells how its recording began and belongs to no camera. Scenes of a training
-    are cut out of time, as are windows that thresholds are learned from: with a phase of 0 pixels make too
-    few events in the first of three windows.
+    The phase tells how a recording began and belongs to no camera; fits of before ended with either, by
+    chance. Scenes of a training are cut out of time, as are windows that thresholds are learned from: with
+    a phase of 0 pixels make too few events in the first of three windows.
     """
     return sensor.with_effect(replace(sensor["threshold"], phase=1.0))
 
