@@ -34,7 +34,7 @@ def even_voltage(
     voltage: float, intensity: float, dt: float, cutoff: float, dark: float, input: float, output: float
 ):
     """The bandwidth of pixels that are all alike."""
-    return lowpass_voltage(voltage, intensity, dt, cutoff, dark, 0.0, input, output, 0.0)
+    return lowpass_voltage(voltage, intensity, dt, cutoff, dark, 0.0, 0.0, input, output, 0.0)
 
 
 @dataclass(frozen=True, kw_only=True)
