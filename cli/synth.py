@@ -80,6 +80,12 @@ if TYPE_CHECKING:
 @click.option(
     "--depths", type=(float, float), default=(1.0, 10.0), show_default=True, help="Nearest, farthest [m]."
 )
+@click.option(
+    "--travel",
+    default=0.5,
+    show_default=True,
+    help="Pixels that things move between two samples of the light: less is more exact, and takes longer.",
+)
 @click.option("--labels", is_flag=True, help="Mark events as signal, leak, shot noise or hot pixel.")
 @device_or_backend_option
 @click.option(
@@ -119,6 +125,7 @@ def synth_command(
     stereo: float,
     focal: float,
     depths: tuple[float, float],
+    travel: float,
     labels: bool,
     device: str,
     video: Path | None,
@@ -137,7 +144,7 @@ def synth_command(
     if video is not None:
         refuse_beside(
             "--video", "images", "sequences", "duration", "regime", "jobs", "format_", "resume", "stereo",
-            "focal", "depths",
+            "focal", "depths", "travel",
         )  # fmt: skip
         _synth_video(
             out, video, fps, sensor, biases, effects, size, seed, device, frame_rate, exposure, labels, gamma,
@@ -175,6 +182,7 @@ def synth_command(
         stereo=stereo,
         focal=focal,
         depths=depths,
+        travel=travel,
         labels=labels,
         effects=tuple(map(str, effects)),
     )

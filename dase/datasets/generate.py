@@ -36,7 +36,7 @@ from dase.kernels import launch
 from dase.kernels.threads import thread_count
 from dase.scenes import image_sources, random_scenes
 from dase.scenes.layers import LayerScene
-from dase.scenes.scene import Scene, to_grey
+from dase.scenes.scene import SamplingSettings, Scene, to_grey
 from dase.scenes.stereo import StereoPair, stereo_pair
 from dase.simulation.pixel_array import PixelArray
 from dase.simulation.sensor import Sensor
@@ -51,6 +51,8 @@ LONGEST_SEQUENCE = 36000.0
 """Of one sequence [s]: times of all samples are held in memory, up to 1000 of them in a second."""
 MOST_FRAMES = 10_000_000
 """Stored with one sequence."""
+LEAST_TRAVEL = 0.01
+"""Between two samples [px]: a sixteenth has the events of a fiftieth within a two-hundredth already."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -77,6 +79,8 @@ class DatasetJob:
             left and one for the right camera, with disparity and depth at the frames' times beside each.
         focal: Focal length of the pair [px], 0 for as long as the picture is wide.
         depths: Of the nearest and the farthest layer of a pair [m]; layers lie at random between.
+        travel: Share of a pixel that anything moves between two samples of the light: less is nearer to the
+            light itself, and takes as much longer.
     """
 
     images: str
@@ -96,6 +100,7 @@ class DatasetJob:
     stereo: float = 0.0
     focal: float = 0.0
     depths: tuple[float, float] = (1.0, 10.0)
+    travel: float = SamplingSettings.travel
 
     def __post_init__(self) -> None:
         if self.sequences < 1:
@@ -126,6 +131,8 @@ class DatasetJob:
             )
         if not 0 < self.depths[0] <= self.depths[1] < np.inf:
             raise InputError(f"depths must be 0 < nearest <= farthest, got {self.depths}")
+        if not LEAST_TRAVEL <= self.travel <= 1:
+            raise InputError(f"travel must be {LEAST_TRAVEL:g} to 1 px, got {self.travel:g}")
         if self.regime not in random_scenes.REGIME_NAMES:
             raise InputError(
                 f"there is no regime '{self.regime}': {nearest(self.regime, random_scenes.REGIME_NAMES)}"
@@ -140,6 +147,7 @@ class DatasetJob:
             # what is off is not said, so that a record stays what it was before there was such a thing
             off = name in ("exposure", "stereo") and not value
             off = off or (name in ("focal", "depths") and not self.stereo)
+            off = off or (name == "travel" and value == SamplingSettings.travel)
             if name not in ("sensor", "effects") and not off:
                 document.add(name, list(value) if isinstance(value, tuple) else value)
         if self.effects:  # what is in the files determines the bytes, not where they lie
@@ -486,6 +494,7 @@ def _draw_scene(job: DatasetJob, sequence: int) -> LayerScene:
         width=job.width,
         height=job.height,
         duration=job.duration,
+        travel=job.travel,
     )
 
 

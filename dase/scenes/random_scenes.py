@@ -16,6 +16,7 @@ from dase.errors import InputError, nearest
 from dase.scenes.camera_motions import Shake, draw_cameras
 from dase.scenes.image_sources import ImageSource
 from dase.scenes.layers import Layer, LayerScene, Motion
+from dase.scenes.scene import SamplingSettings
 
 
 @dataclass(frozen=True)
@@ -62,7 +63,14 @@ REGIME_NAMES = (*REGIMES, MIXED, *SHAKEN)
 
 
 def draw_scene(
-    rng: np.random.Generator, images: ImageSource, regime: str, *, width: int, height: int, duration: float
+    rng: np.random.Generator,
+    images: ImageSource,
+    regime: str,
+    *,
+    width: int,
+    height: int,
+    duration: float,
+    travel: float = SamplingSettings.travel,
 ) -> LayerScene:
     """Return a random scene of a regime.
 
@@ -73,6 +81,8 @@ def draw_scene(
         width: Columns [px].
         height: Rows [px].
         duration: Length [s].
+        travel: Share of a pixel that anything moves between two samples; the shortest time between them goes
+            with it.
 
     Raises:
         InputError: There is no such regime.
@@ -92,7 +102,10 @@ def draw_scene(
         camera = draw_cameras(rng, [how.shake], width=width, duration=duration).motion(0)
         # in a pause everything stands still
         layers = [replace(one, motion=replace(one.motion, pauses=camera.pauses)) for one in layers]
-    return LayerScene(layers, width=width, height=height, duration=duration, camera=camera)
+    return LayerScene(
+        layers, width=width, height=height, duration=duration, camera=camera, travel=travel,
+        shortest=SamplingSettings.shortest * travel / SamplingSettings.travel,
+    )  # fmt: skip
 
 
 def draw_speed(rng: np.random.Generator, deviation: float, most: float) -> float:

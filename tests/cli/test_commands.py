@@ -36,6 +36,7 @@ def toml(tmp_path: Path, text: str) -> Path:
         (("--sequences", "-3"), "sequences must be >= 1, got -3"),
         (("--duration", "nan"), "duration must be a number > 0, got nan"),
         (("--duration", "0"), "duration must be a number > 0, got 0"),
+        (("--travel", "0"), "travel must be 0.01 to 1 px, got 0"),
         (("--frame-rate", "-1"), "frame rate must be a number > 0, got -1"),
         (("--seed", "-1"), "seed must be a whole number >= 0, got -1"),
         (("--jobs", "0"), "jobs must be >= 1, got 0"),

@@ -11,6 +11,7 @@ import warp as wp
 from reference import pixel as reference
 
 import dase
+from dase.datasets.generate import DatasetJob, make_scene
 from dase.kernels import launch, scene_render
 from dase.scenes import layers, random_scenes
 from dase.scenes.image_sources import ImageSource
@@ -87,6 +88,40 @@ def test_flow_before_a_moving_camera_is_the_derivative_of_the_motion(device, rng
     assert wrong.mean() < 0.003
     assert np.abs(want).max() > 20
     assert np.all(np.abs(made.flow(times, device)).max((1, 2, 3)) <= made.speed(times).max() * 1.001)
+
+
+def test_less_travel_between_samples_is_nearer_to_the_light(device):
+    """Events of the same scene come to those of the light itself, which coarse samples cut the corners of."""
+
+    def of_travel(travel: float) -> tuple[dase.LayerScene, int]:
+        images = dase.open_images("builtin")
+        rng = np.random.default_rng(5)
+        made = random_scenes.draw_scene(
+            rng, images, "shake", width=64, height=48, duration=0.2, travel=travel
+        )
+        return made, len(dase.simulate(made, "ideal", device=device))
+
+    (coarse, fewer), (usual, some), (fine, more), (_, all_) = map(of_travel, (1.0, 0.5, 0.125, 0.02))
+    at = np.linspace(0, 0.2, 5)
+    np.testing.assert_array_equal(coarse.frames(at, device), fine.frames(at, device))
+    assert len(coarse.sample_times()) < len(usual.sample_times()) < len(fine.sample_times())
+    assert fewer < some < more < all_
+    assert all_ - more < 0.25 * (all_ - some)
+
+
+def test_travel_of_a_data_set_is_recorded_where_it_is_not_the_usual():
+    job = DatasetJob(
+        images="builtin", sensor="[threshold]", sequences=1, width=32, height=24, duration=0.1, regime="fast"
+    )
+    assert "travel" not in job.text()
+    finer = replace(job, travel=0.125)
+    assert "travel = 0.125" in finer.text()
+    assert make_scene(job, 0).travel == 0.5
+    assert make_scene(finer, 0).travel == 0.125
+    assert make_scene(finer, 0).shortest == pytest.approx(2.5e-4)
+    for wrong in (0.0, 1.5, float("nan")):
+        with pytest.raises(dase.InputError, match=r"travel must be 0\.01 to 1 px"):
+            replace(job, travel=wrong)
 
 
 def test_shake_is_a_regime(rng):
