@@ -29,8 +29,8 @@ Path("fitted.toml").write_text(dase.dump_sensor(fitted.sensor))
 print(fitted.sensor)
 
 # %% Training on endless scenes before that sensor, shaken by a hand, in windows of 1/120 s: things move about
-# 3 px in one, and a network learns fastest from few pixels of motion. A minute or two of one core, and one of a
-# GPU for a larger network; better ones take 32 to 64 channels, 112x112 pixels, 12000 steps
+# 3 px in one, and a network learns fastest from few pixels of motion. A minute or two of one core, and one of
+# a GPU for a larger network; better ones take 32 to 64 channels, 112x112 pixels, 12000 steps
 device = "cuda" if torch.cuda.is_available() else "cpu"
 torch.set_num_threads(1)  # more gain nothing for networks this small, and lose much on a busy machine
 channels, batch, side, steps = (16, 32, 64, 4000) if device == "cuda" else (8, 16, 48, 1000)
