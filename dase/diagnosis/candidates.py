@@ -84,12 +84,12 @@ def variants_to_try(
 
     No descent finds the frequency of a lamp or the ticks of a clock, but they can be seen, as can the rate of
     a bus where it is full. Where no regularity is seen in the time stamps, the effects that make one are not
-    tried; nor is a bus that is known to be free nearly always.
+    tried; nor is a bus that is known to be free when nearly all events come.
 
     Args:
         evidence: The measurement.
         effect: The class.
-        idle_bus: Share of what a bus can send below which a readout is no candidate.
+        idle_bus: Share of the events that found a bus busy at most, below which it is none without a queue.
     """
     return list(effect.candidates(evidence.observe(idle_bus=idle_bus)))
 

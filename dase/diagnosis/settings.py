@@ -55,7 +55,8 @@ class CandidateSettings:
     """Its training loss, in units of that of the finalist with the least held-out error."""
 
     idle_bus: float = 0.01
-    """Share of what a bus can send below which a readout is no candidate: it would lose less than that."""
+    """Share of the events that found a bus busy at most, below which one without a queue is no candidate: it
+    would lose less than that."""
 
     significant: float = 0.05
     """Largest p-value of an effect that is added; 1 / (repeats + 1) is the smallest there is."""

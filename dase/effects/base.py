@@ -132,14 +132,18 @@ class Observations:
         line_time: Time from line to line of a readout that visits them in turn [s], 0 for none.
         scan_direction: Where that readout goes: down, up, right or left.
         highest_event_rate: Most events per second of all pixels together, over some milliseconds [Hz].
-        least_bus_rate: Events per second that a bus, if there is one, can send at least [Hz].
-        idle_bus: Share of what a bus can send below which it is idle: it would hardly lose anything.
+        bus_loss: Share of the events that found a bus busy, if there is one, at most.
+        idle_bus: Largest such share of a bus that is idle: without a queue it would hardly lose anything.
         frame_interval: Time between bursts of the whole array in step with frames [s], 0 for none.
         frame_begin: When one of the bursts of ON events comes [s].
         frame_exposure: From there to the next burst of OFF events [s].
         peak_chance: Probability that independent events swing as much as these do at `peak_frequency`.
         clip_step: From frame to frame of a clip in step with which all events come [s], as those of a
             simulator that works frame by frame do; 0 for none.
+        bus_load: Largest share of some milliseconds for which a bus that sends one event after the other, if
+            there is one, was busy at most.
+        row_load: The same of an arbiter that takes rows.
+        column_load: The same of one that takes columns.
     """
 
     peak_frequency: float
@@ -147,18 +151,21 @@ class Observations:
     line_time: float
     scan_direction: str
     highest_event_rate: float
-    least_bus_rate: float
+    bus_loss: float
     idle_bus: float
     frame_interval: float = 0.0
     frame_begin: float = 0.0
     frame_exposure: float = 0.0
     peak_chance: float = 0.0
     clip_step: float = 0.0
+    bus_load: float = math.inf
+    row_load: float = math.inf
+    column_load: float = math.inf
 
     @property
     def bus_is_idle(self) -> bool:
         """Whether a bus, if there is one, is free nearly always."""
-        return self.highest_event_rate < self.idle_bus * self.least_bus_rate
+        return self.bus_loss < self.idle_bus
 
 
 @dataclass(frozen=True, kw_only=True)

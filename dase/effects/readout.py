@@ -17,6 +17,10 @@ from dase.kernels import launch, line_arbiter
 from dase.kernels.event_queue import NEVER, ONE, send_over_bus
 from dase.kernels.line_arbiter import ArbiterNumber, PixelByte, PixelColumn
 
+BUSY = 0.8
+"""Share of the time for which a bus that makes events wait is busy before that shows: with random arrivals an
+event waits for two others on average there, and ever longer above."""
+
 
 class Bus(SharedReader):
     """Sends events one after the other."""
@@ -213,22 +217,28 @@ class Readout(StreamEffect):
 
     @classmethod
     def candidates(cls, observed: Observations) -> list[Self]:
-        """Return buses of the highest rate that was seen, none where even that leaves any bus idle."""
-        if observed.bus_is_idle:
-            return []
+        """Return buses of the highest rate that was seen, without those that the time stamps show idle."""
         rate = observed.highest_event_rate
         # taking lines must leave time for as many events as were seen
-        return [replace(bus, rate=rate, line=min(bus.line, 0.1 / rate)) for bus in cls.variants()]
+        buses = [replace(bus, rate=rate, line=min(bus.line, 0.1 / rate)) for bus in cls.variants()]
+        return [bus for bus in buses if bus.is_seen_busy(observed)]
+
+    def is_seen_busy(self, observed: Observations) -> bool:
+        """Whether a bus of its kind can have been busy enough to lose events or to make them late.
+
+        However fast the bus is: as it has sent some events in a short time, it can send others as fast.
+        """
+        if not self.makes_wait:
+            return not observed.bus_is_idle
+        loads = {"rows": observed.row_load, "columns": observed.column_load}
+        return loads.get(self.mode, observed.bus_load) >= BUSY
 
     def is_idle(self, highest_rate: float) -> bool:
-        """Whether the bus is free so often that a wait is some events long, and none is lost.
-
-        With random arrivals at four fifths of what it can send, an event waits for two others on average.
-        """
-        if self.mode == "drop" or (self.mode == "delay" and self.depth < 32):
+        """Whether the bus is free so often that a wait is some events long, and none is lost."""
+        if not self.makes_wait:
             return False  # what finds it busy is lost
         line = self.line if self.by_lines else 0.0
-        return highest_rate * (line + 1 / self.rate) < 0.8
+        return highest_rate * (line + 1 / self.rate) < BUSY
 
     def for_share(self, share: float) -> Readout:
         """Return the bus with as much of its bandwidth and of its queue as a share of the pixels has.
@@ -236,6 +246,11 @@ class Readout(StreamEffect):
         Lines are taken as often: while the bus is full, each has fewer events.
         """
         return replace(self, rate=self.rate * share, depth=max(1.0, self.depth * share))
+
+    @property
+    def makes_wait(self) -> bool:
+        """Whether events that find it busy wait, and are hardly ever lost before it is full."""
+        return self.by_lines or (self.mode == "delay" and self.depth >= 32)
 
     @property
     def by_lines(self) -> bool:

@@ -16,6 +16,7 @@ from dase.errors import InputError, checked_seed
 from dase.events import Events
 from dase.fitting.batch_simulator import BatchSimulator
 from dase.fitting.bus_load import WholeSensor
+from dase.fitting.bus_use import BusUse, highest_event_rate
 from dase.fitting.contradictions import contradiction_of_rest
 from dase.fitting.frame_steps import frame_step_of, is_too_slow, ticks_are_of_frames
 from dase.fitting.pixel_selection import choose_trusted_pixels, find_trusted_parts
@@ -46,7 +47,7 @@ from dase.probes.stimulus import (
     light_of,
     sort_into_cells,
 )
-from dase.probes.timestamp_patterns import PATTERNS, TimestampStructure, find_structure
+from dase.probes.timestamp_patterns import TimestampStructure, find_structure
 from dase.scenes.between_frames import CameraScene
 from dase.scenes.scene import Scene
 from dase.scenes.screen_scene import ScreenScene
@@ -112,8 +113,8 @@ class SplitMeasurement:
         bands: Intensities between the bands, shape (BANDS - 1,).
         structure: Regularities of the time stamps.
         peak: Frequency at which the rate swings most [Hz], and what chance says of it.
-        busiest: Most events per second of all pixels [Hz].
-        fastest: Events per second that a bus, if there is one, can send at least [Hz].
+        highest_event_rate: Most events per second of all pixels [Hz].
+        bus: How busy a bus, if there is one, can have been.
         when: Times of the points of the grid on the clock of the scene [s], shape (T,): windows of a long
             recording are laid end to end.
         notes: What the data cannot show.
@@ -131,7 +132,7 @@ class SplitMeasurement:
     structure: TimestampStructure
     peak: RatePeak
     highest_event_rate: float
-    least_bus_rate: float
+    bus: BusUse
     when: Array
     notes: tuple[str, ...] = ()
     contradiction: str = ""
@@ -148,7 +149,10 @@ class SplitMeasurement:
             line_time=self.structure.line,
             scan_direction=self.structure.direction,
             highest_event_rate=self.highest_event_rate,
-            least_bus_rate=self.least_bus_rate,
+            bus_loss=self.bus.loss,
+            bus_load=self.bus.load,
+            row_load=self.bus.row_load,
+            column_load=self.bus.column_load,
             idle_bus=idle_bus,
             frame_interval=frames.interval if frames else 0.0,
             frame_begin=frames.begin if frames else 0.0,
@@ -383,15 +387,16 @@ def split_measurement(
         )
         for half in halves
     )
-    rates = highest_event_rate(events), least_bus_rate(events, structure)
+    highest = highest_event_rate(events, SPLIT.burst)
+    bus = BusUse.of(events, structure, span=SPLIT.burst)
     for half in (train, held, last_part, scout):
-        half.trials.highest_rate = rates[0]
+        half.trials.highest_rate = highest
     contradiction = contradiction_of_rest(events, light[:, :1] if still else light)
     if contradiction:
         notes.insert(0, contradiction)
     out = SplitMeasurement(
-        train, held, last_part, scout, bands, structure, peak, *rates, when, tuple(notes),
-        contradiction, frames, frame_step,
+        train, held, last_part, scout, bands, structure, peak, highest, bus, when,
+        tuple(notes), contradiction, frames, frame_step,
     )  # fmt: skip
     return replace(out, notes=(*notes, NO_THRESHOLDS)) if out.light_never_changes else out
 
@@ -463,22 +468,6 @@ def common_grid(events: Events, scene: Scene) -> Grid:
     last = min(end, float(events.t[-1]) + 2 * h)
     steps = int(np.floor((last - begin) / h + 1e-6)) + 1
     return Grid(begin, h, max(steps, 2))
-
-
-def highest_event_rate(events: Events) -> float:
-    """Return the most events per second [Hz]: the rate of a bus, if it ever was full for long enough."""
-    counts = np.bincount(((events.t - events.t[0]) / SPLIT.burst).astype(np.int64))
-    return float(counts.max()) / SPLIT.burst
-
-
-def least_bus_rate(events: Events, structure: TimestampStructure) -> float:
-    """Return the events per second that a bus can send at least [Hz], as it has sent some as fast as that."""
-    if structure.line:
-        return 0.0  # stamps tell when a line was read
-    slack = max(PATTERNS.file_step, structure.step)
-    # runs of all lengths: the time of short ones is rounded by the clock, long ones have pauses
-    runs = (2**n for n in range(13) if 2**n < len(events))
-    return max((n / (float((events.t[n:] - events.t[:-n]).min()) + slack) for n in runs), default=0.0)
 
 
 def times_of_grid(scene: Scene, grid: Grid) -> NDArray[np.float64]:

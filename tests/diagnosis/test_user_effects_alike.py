@@ -26,7 +26,7 @@ from dase.effects.timestamp import Timestamp
 from dase.fitting.model import model_of, shift_periodic_effects, starting_places, with_effect_added
 from dase.simulation.sensor import Sensor
 
-OBSERVED = Observations(100.0, 1e-3, 3e-6, "left", 1e6, 0.0, 0.01)
+OBSERVED = Observations(100.0, 1e-3, 3e-6, "left", 1e6, 1.0, 0.01)
 
 
 @wp.func
@@ -114,7 +114,9 @@ def test_what_is_read_off_the_measurement_goes_by_the_effect(effect):
 
 
 def test_no_candidate_where_the_measurement_shows_none():
-    nothing = Observations(100.0, 0.0, 0.0, "down", 1e3, 1e6, 0.01)
+    nothing = Observations(
+        100.0, 0.0, 0.0, "down", 1e3, 0.001, 0.01, bus_load=0.001, row_load=0.002, column_load=0.002
+    )
     for effect in (Timestamp, RowScan, Readout):
         assert effect.candidates(nothing) == []
     assert len(Flicker.candidates(nothing)) > 0

@@ -88,7 +88,7 @@ def test_edges_on_samples_lie_behind_them(device, period, exposure, start):
 
 
 def test_a_search_tries_the_frames_that_are_seen_and_none_where_none_are():
-    seen = Observations(100.0, 0.0, 0.0, "down", 1e5, 1e6, 0.1)
+    seen = Observations(100.0, 0.0, 0.0, "down", 1e5, 0.1, 0.1)
     assert Exposure.candidates(seen) == []
     seen = replace(seen, frame_interval=0.1, frame_begin=7.23, frame_exposure=0.04)
     (found,) = Exposure.candidates(seen)

@@ -14,7 +14,8 @@ from dase.effects.readout import Readout
 from dase.effects.row_scan import RowScan
 from dase.effects.stream import Others
 from dase.fitting.batch_simulator import SimulationOrder
-from dase.fitting.data_split import SPLIT, least_bus_rate, split_measurement
+from dase.fitting.bus_use import BusUse, least_bus_rate
+from dase.fitting.data_split import SPLIT, split_measurement
 from dase.fitting.model import model_of
 from dase.fitting.readout_simulator import simulate_pixels
 from dase.fitting.scheduler import SimulationRequest, answer_requests
@@ -241,8 +242,79 @@ def test_a_bus_is_no_candidate_where_it_is_known_to_be_free(evidence, rng):
     # what shares a tick may have been sent at any time of it
     assert least_bus_rate(bursts, TimestampStructure(step=1e-3)) == pytest.approx(512 / 1e-3)
     assert least_bus_rate(bursts, TimestampStructure(line=1e-5)) == 0
-    assert evidence.least_bus_rate <= 1.2 * BUS.rate  # it was full
-    assert variants_to_try(replace(evidence, least_bus_rate=200 * evidence.highest_event_rate), Readout) == []
+    assert evidence.bus.load >= 0.8  # it was full
+    free = BusUse(loss=0.001, load=0.05, row_load=0.05, column_load=0.05)
+    assert variants_to_try(replace(evidence, bus=free), Readout) == []
+
+
+@pytest.mark.parametrize(
+    ("use", "modes"),
+    [
+        # what waits shows near a load of 1 alone, what is lost wherever a hundredth finds the bus busy
+        pytest.param(
+            BusUse(loss=0.02, load=0.3, row_load=0.7, column_load=0.3), {"drop"}, id="some are lost"
+        ),
+        pytest.param(
+            BusUse(loss=0.005, load=0.9, row_load=0.3, column_load=0.3), {"delay"}, id="seldom full"
+        ),
+        pytest.param(
+            BusUse(loss=0.005, load=0.1, row_load=0.9, column_load=0.1), {"rows"}, id="rows take long"
+        ),
+        pytest.param(BusUse(loss=0.005, load=0.1, row_load=0.1, column_load=0.9), {"columns"}, id="columns"),
+        pytest.param(BusUse(), {"delay", "drop", "rows", "columns"}, id="nothing is known"),
+    ],
+)
+def test_a_bus_is_a_candidate_in_the_modes_in_which_it_would_show(evidence, use, modes):
+    assert {one.mode for one in variants_to_try(replace(evidence, bus=use), Readout)} == modes
+
+
+def by_chance(rng, rate: float, seconds: float = 0.2) -> dase.Events:
+    """Return a Poisson process of pixels anywhere."""
+    t = np.sort(rng.uniform(0, seconds, round(rate * seconds)))
+    x, y = rng.integers(0, 50, (2, len(t)), dtype=np.uint16)
+    return dase.Events(1e-9 * np.rint(1e9 * t), x, y, x > 20, 50, 50)
+
+
+@pytest.mark.parametrize("load", [0.05, 0.3, 0.7, 1.5])
+@pytest.mark.parametrize("mode", ["delay", "drop", "rows", "columns"])
+def test_no_bus_is_busier_than_the_time_stamps_say(rng, mode, load):
+    bus = Readout(rate=2e6, line=5e-7, mode=mode)
+    busy = 1e-6 if bus.by_lines else 5e-7  # for one event
+    before = by_chance(rng, load / busy)
+    sent, _ = bus.reader(50, 50, 1).push(before, np.inf)
+    sent = replace(sent, t=1e-6 * np.rint(1e6 * sent.t))
+    use = BusUse.of(sent, TimestampStructure(), span=SPLIT.burst)
+    lines = {"rows": sent.y, "columns": sent.x}.get(mode)
+    starts = (
+        len(sent) if lines is None else len(np.unique(np.stack([np.rint(1e6 * sent.t), lines]), axis=1).T)
+    )
+    true = (starts * bus.line * bus.by_lines + len(sent) / bus.rate) / np.ptp(sent.t)
+    known = {"rows": use.row_load, "columns": use.column_load}.get(mode, use.load)
+    assert known >= 0.97 * true
+    assert known >= 0.8 or load < 1 or mode == "drop"  # a full bus is seen to be full
+    if mode == "drop":
+        lost = 1 - len(sent) / len(before)
+        assert use.loss >= 0.9 * lost
+
+
+def test_a_bus_that_sends_far_faster_than_events_come_is_seen_idle(rng):
+    quiet, rush = by_chance(rng, 2e4), by_chance(rng, 1e5, 0.002)
+    # 64 events that the bus sent in a microsecond tell how fast it is
+    n = np.arange(64, dtype=np.uint16)
+    fast = dase.Events(np.full(64, 0.1), n % 50, n % 7, n > 20, 50, 50)
+    events = dase.Events.concatenate([quiet, rush, fast])
+    events = events.select(np.argsort(events.t, kind="stable"))
+    use = BusUse.of(events, TimestampStructure(), span=SPLIT.burst)
+    assert use.load < 0.01
+    assert use.loss < 0.001
+    assert use.row_load > use.load  # of 7 rows in a microsecond, not of 64 events
+    # an arbiter of columns took all 50 in a microsecond
+    assert use.column_load < 0.2
+    # of events that a readout stamps line by line nothing is known
+    assert BusUse.of(events, TimestampStructure(line=1e-5), span=SPLIT.burst) == BusUse()
+    # a clock hides how often a line was taken
+    ticks = replace(events, t=1e-3 * np.floor(1e3 * events.t))
+    assert BusUse.of(ticks, TimestampStructure(step=1e-3), span=SPLIT.burst).row_load > 0.8
 
 
 def test_a_bus_that_is_never_free_is_no_clock(rng):

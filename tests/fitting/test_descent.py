@@ -174,7 +174,7 @@ def test_a_fit_leaves_a_low_pass_in_steps_where_it_is_none(device):
     ("clip_step", "signal", "poles", "phase"), [(0.0, "small", "alike", 1.0), (1e-3, "steps", "one", 0.0)]
 )
 def test_what_a_simulator_does_frame_by_frame_is_tried_where_events_show_one(clip_step, signal, poles, phase):
-    seen = Observations(100.0, 0.0, 0.0, "down", 1e5, 1e6, 0.1, clip_step=clip_step)
+    seen = Observations(100.0, 0.0, 0.0, "down", 1e5, 0.1, 0.1, clip_step=clip_step)
     (slow,), (noise,) = (EFFECTS[name].candidates(seen) for name in ("bandwidth", "voltage_noise"))
     assert (slow.signal, noise.poles) == (signal, poles)
     assert with_effect_added(model_of(Sensor()), noise).sensor["threshold"].phase == phase
