@@ -519,7 +519,7 @@ def _conclude_diagnosis(
     for name, one in judged_effects.items():
         # a stand-in explains nothing that the events show
         explained = explained.without(name) if one.grade is Grade.STAND_IN else explained
-    seen = without_the_explained(seen, measurement, explained, state.seed)
+    seen = without_the_explained(seen, measurement, explained, state.seed, before=start.sensor)
     said = seen.findings(judged_effects.values(), names)
     findings = {one.effect: one for one in said if one.grade is not Grade.STAND_IN}
     kept = tuple(n for n in order if n in findings and findings[n].grade is not Grade.EITHER)

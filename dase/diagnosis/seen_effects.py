@@ -179,7 +179,7 @@ def without_the_scene(seen: SeenEffects, measurement: Measurement, sensor: Senso
 
 
 def without_the_explained(
-    seen: SeenEffects, measurement: Measurement, sensor: Sensor, seed: int
+    seen: SeenEffects, measurement: Measurement, sensor: Sensor, seed: int, *, before: Sensor
 ) -> SeenEffects:
     """Return what is seen less what tells no single effect and is there with the last model, too.
 
@@ -188,7 +188,11 @@ def without_the_explained(
         measurement: Its scene is simulated.
         sensor: The model after the search.
         seed: Of its random numbers.
+        before: The model before the search, which shows none of it.
     """
+    gained = {effect.name for effect in sensor.effects} - {effect.name for effect in before.effects}
+    if gained <= set(MADE_BY_LIGHT):
+        return seen  # what comes with the light is the same for all pixels
     open_ = [entry for entry in seen.entries if not seen.named_by(entry)]
     open_ = _asked_of_scene(open_, measurement.scene)
     if not open_:

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import dase
-from dase.diagnosis import grading
+from dase.diagnosis import grading, seen_effects
 from dase.diagnosis.diagnose import diagnose
 from dase.diagnosis.explain_effect import moving_bars
 from dase.diagnosis.grading import grade_of, is_between_samples, is_small_beside_another, is_strained
@@ -179,8 +179,21 @@ def test_what_the_last_model_shows_as_well_is_explained(scene):
     pairs = Signature(name="opposite pairs", answer=Answer.FOUND)
     measurement = Measurement(dase.simulate(scene, noisy, seed=3), scene)
     seen = SeenEffects((pairs, lamp({"frequency": 100.0})))
-    assert without_the_explained(seen, measurement, noisy, 5).entries == seen.entries[1:]
-    assert without_the_explained(seen, measurement, Sensor(), 5).entries == seen.entries
+    bare = Sensor()
+    assert without_the_explained(seen, measurement, noisy, 5, before=bare).entries == seen.entries[1:]
+    late = bare.with_effect(EFFECTS["latency"](delay=1e-3))
+    assert without_the_explained(seen, measurement, late, 5, before=bare).entries == seen.entries
+
+
+def test_what_a_search_did_not_add_explains_nothing(scene, monkeypatch):
+    """The model before the search was asked already, and a lamp is the same for all pixels."""
+    pairs = Signature(name="opposite pairs", answer=Answer.FOUND)
+    measurement = Measurement(dase.simulate(scene, Sensor(), seed=3), scene)
+    seen = SeenEffects((pairs,))
+    monkeypatch.setattr(seen_effects, "simulate", lambda *args, **more: pytest.fail("it was simulated"))
+    lit = Sensor().with_effect(EFFECTS["flicker"](frequency=100.0, depth=0.3))
+    for after in (Sensor(), lit):
+        assert without_the_explained(seen, measurement, after, 5, before=Sensor()) == seen
 
 
 def lamp(details: dict[str, float]) -> Signature:
@@ -244,7 +257,8 @@ def test_a_pattern_that_the_model_makes_is_explained_over_a_guessed_scene(given)
     known = CameraScene(np.rint(255 * frames[::10]).astype(np.uint8), times[::10])
     seen = find_seen_effects(Measurement(events, known), EFFECTS)
     assert "fixed pattern" in [one.name for one in seen.entries]
-    kept = without_the_explained(seen, Measurement(events, known), unlike if given else Sensor(), 5)
+    model = unlike if given else Sensor().with_effect(EFFECTS["leak"](rate=0.1))
+    kept = without_the_explained(seen, Measurement(events, known), model, 5, before=Sensor())
     assert ("fixed pattern" in [one.name for one in kept.entries]) == (not given)
 
 
