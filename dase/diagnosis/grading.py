@@ -235,13 +235,18 @@ def _models_without(
     found: Sequence[str],
     way: Mapping[frozenset[str], ModelOnReport],
 ) -> dict[str, ModelOnReport]:
-    """Return for each effect the best model without it: the last one, fitted again, or one of the search."""
+    """Return for each effect the best model without it: the last one, fitted again or not, or of the search.
+
+    What is fitted anew has chance of its own: beside hot pixels, of which a dozen tell the share, a model
+    without an effect that does nothing may end with half of them, and the effect would look needed.
+    """
     wanted = {name: frozenset(found) - {name} for name in found}
     missing = [name for name in found if wanted[name] not in way]
     less = [with_same_freedom(model.sensor.without(name), model, ()) for name in missing]
     fitted = run_side_by_side([refit_work(state.evidence, one, seed=state.seed, rounds=2) for one in less])
-    judged = judge_on_report(state, fitted, repeats=state.settings.grades.repeats)
-    every = [*way.items(), *((wanted[n], one) for n, one in zip(missing, judged, strict=True))]
+    bare = [with_same_freedom(model.sensor.without(name), model, ()) for name in found]
+    judged = judge_on_report(state, [*fitted, *bare], repeats=state.settings.grades.repeats)
+    every = [*way.items(), *((wanted[n], one) for n, one in zip([*missing, *found], judged, strict=True))]
     return {
         name: min((one for names, one in every if names <= wanted[name]), key=lambda one: one.judgement.error)
         for name in found

@@ -85,9 +85,13 @@ def _drop_needless(
     for name, less in _keep_near_models(state, _droppable_models(state, model), near).items():
         if name not in model.sensor or name in state.certain or len(state.added_to(model)) == 1:
             continue
-        less = less if model is whole else with_same_freedom(model.sensor.without(name), model, ())
-        fitted = refit_model(state.evidence, less, seed=state.seed)
+        bare = with_same_freedom(model.sensor.without(name), model, ())
+        fitted = refit_model(state.evidence, less if model is whole else bare, seed=state.seed)
         without = state.judge(fitted)
+        # what is fitted anew has chance of its own: a share of hot pixels, known by a dozen of them
+        as_it_was = state.judge(bare)
+        if as_it_was.error < without.error:
+            fitted, without = bare, as_it_was
         # what would not be added now is not kept
         needless = may_be_announced(without) and without.error < judgement.error + state.settings.material
         if reaches_floor(without):
@@ -101,14 +105,18 @@ def _drop_needless(
 def _keep_near_models(
     state: DiagnosisState, ways: Mapping[str, FittedModel], error: float
 ) -> dict[str, FittedModel]:
-    """Return those models that one descent takes near an error, fitted by it: these are worth a full fit."""
+    """Return those models that are near an error, or that one descent takes there: worth a full fit."""
     evidence, seed, pruning = state.evidence, state.seed, state.settings.pruning
     stream = SimulationStream.JUDGE.seed(seed)
     ends = run_side_by_side([refit_work(evidence, way, seed=seed, rounds=1) for way in ways.values()])
     judged = run_side_by_side(
-        [m.judgement_work(evidence.held, repeats=pruning.repeats, seed=stream) for m in ends]
+        [
+            m.judgement_work(evidence.held, repeats=pruning.repeats, seed=stream)
+            for m in (*ways.values(), *ends)
+        ]
     )
-    near = (j.error < pruning.near * error for j in judged)
+    begins, fitted = judged[: len(ends)], judged[len(ends) :]
+    near = (min(a.error, b.error) < pruning.near * error for a, b in zip(begins, fitted, strict=True))
     return {name: m for name, m, keep in zip(ways, ends, near, strict=True) if keep}
 
 

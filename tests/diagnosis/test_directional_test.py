@@ -162,6 +162,16 @@ def test_what_is_not_needed_is_dropped(monkeypatch):
     assert (left.names, after.error) == ("a", 0.35)
 
 
+def test_what_is_not_needed_is_dropped_although_a_fit_without_it_ends_worse_by_chance(monkeypatch):
+    """A share of hot pixels, fitted anew to a dozen, was half of what it was beside the other effect."""
+    errors = {"ab": 0.3, "a": 0.35, "a again": 1.7, "b": 6.0, "b again": 6.0}
+    search, model, judgement = fake("ab", errors, monkeypatch)
+    again = lambda evidence, m, seed: SimpleNamespace(names=f"{m.names} again")  # noqa: E731
+    monkeypatch.setattr(reviewing, "refit_model", again)
+    left, after = reviewing.prune_model(search, model, judgement)
+    assert (left.names, after.error) == ("a", 0.35)
+
+
 def test_what_is_far_from_the_floor_is_not_reviewed(monkeypatch):
     far = DEFAULTS.pruning.lost * judged(0.3).gate
     errors = {"a": 0.3, "b": 6.0}

@@ -173,6 +173,34 @@ def test_nothing_is_fitted_to_grade_effects_of_a_model_that_leaves_too_much(monk
     assert not grading.leaves_little(judged(10.25), judged(1.76), DEFAULTS.grades)
 
 
+def test_an_effect_is_not_needed_where_the_last_model_does_as_well_once_it_is_taken_out(monkeypatch):
+    """The model of the search without it had half of the hot pixels, by chance: an error of 1.7."""
+
+    def model_with(*effects):
+        return model_of(Sensor(effects=(*Sensor().effects, *effects)))
+
+    fast = EFFECTS["bandwidth"](cutoff=2e4)
+    few, many = (EFFECTS["hot"](share=share) for share in (0.005, 0.01))
+
+    def error_of(sensor):
+        return 4.0 if "hot" not in sensor else 1.7 if sensor["hot"].share < 0.0075 else 0.5
+
+    def judged_by_share(state, models, *, repeats):
+        return [grading.ModelOnReport(m, judged(error_of(m.sensor))) for m in models]
+
+    monkeypatch.setattr(grading, "judge_on_report", judged_by_share)
+    ways = ((), (few,), (fast,))
+    models = [model_with(*some) for some in ways]
+    way = {
+        frozenset(e.name for e in some): one
+        for some, one in zip(ways, judged_by_share(None, models, repeats=1), strict=True)
+    }
+    state = SimpleNamespace(settings=DEFAULTS, evidence=None, seed=0)
+    without = grading._models_without(state, model_with(many, fast), ["hot", "bandwidth"], way)
+    assert without["bandwidth"].judgement.error == 0.5
+    assert without["hot"].judgement.error == 4.0
+
+
 def test_what_the_last_model_shows_as_well_is_explained(scene):
     """Noise of the voltage sends opposite pairs, and does not tell by them which noise it is."""
     noisy = Sensor().with_effect(EFFECTS["voltage_noise"](sigma=0.065, cutoff=300.0))
