@@ -20,6 +20,9 @@ from dase.diagnosis.candidates import (
     variants_to_try,
 )
 from dase.diagnosis.cell_descriptions import worst_cells
+from dase.diagnosis.dead_time import EFFECT as REFRACTORY
+from dase.diagnosis.dead_time import NAME as DEAD_TIME
+from dase.diagnosis.dead_time import add_dead_time, find_dead_time, with_dead_time
 from dase.diagnosis.detection_limits import find_detection_limits
 from dase.diagnosis.directional_test import find_hidden_effect
 from dase.diagnosis.few_hot_pixels import NAME as HOT
@@ -179,6 +182,7 @@ def diagnose(
             .error
         )
         start = _fitted_unless_worse(state, start.sensor, free)
+    seen = _look_for_dead_time(state, seen, measurement, start)
     state.certain = frozenset(seen.effects) & frozenset(tried) - names
     if hot is not None:
         state.notes.append(
@@ -223,8 +227,15 @@ def diagnose(
         if model is not whole and not leaves_nothing(judgement):
             # a stand-in that was dropped may have hidden what it stood for
             model, judgement = _add_one_by_one(state, model, limit - len(state.added_to(model)))
+    seen = _look_for_dead_time(state, seen, measurement, model)
+    ended = seen.entry_of(DEAD_TIME)
+    if ended is not None and REFRACTORY in tried and REFRACTORY not in model.sensor:
+        state.certain |= {REFRACTORY}
+        model, judgement = add_dead_time(state, model, judgement, ended)
     found = _conclude_diagnosis(state, start, model, before, seen, names, measurement)
     found = replace(found, evaluations=found.evaluations + run)
+    if ended is not None and REFRACTORY in tried:
+        found = with_dead_time(found, ended)
     if silent is not None and silent.decides and not evidence.contradiction:
         found = with_dead_pixels(found, silent)
     if hot is not None:
@@ -238,6 +249,19 @@ def diagnose(
         )  # fmt: skip
         found = with_effect_of_bursts(found, last or strength)
     return measurement.noted(replace(found, seconds=time.perf_counter() - begin))
+
+
+def _look_for_dead_time(
+    state: DiagnosisState, seen: SeenEffects, measurement: Measurement, model: FittedModel
+) -> SeenEffects:
+    """Return what is seen, with the end of the intervals if there is one that a model has not."""
+    if seen.entry_of(DEAD_TIME) or REFRACTORY in state.given or state.evidence.contradiction:
+        return seen
+    found = find_dead_time(
+        measurement, model.sensor,
+        frame_step=state.evidence.frame_step or 0.0, structure=state.evidence.structure, seed=state.seed,
+    )  # fmt: skip
+    return seen if found is None else replace(seen, entries=(*seen.entries, found))
 
 
 def _odd_pixels(hot: NDArray[np.int64] | None, dead: SilentPixels | None) -> NDArray[np.int64] | None:

@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass, replace
 
+from dase.diagnosis.dead_time import NAME as DEAD_TIME
 from dase.effects import EFFECTS, Effect
 from dase.effects.threshold import Threshold
 from dase.errors import InputError
@@ -36,10 +37,11 @@ KINDS: dict[str, tuple[str, ...]] = {
     "grouping": ("readout", "row_scan"),
     "frame coupling": ("exposure",),
     "double events": ("double_events",),
+    DEAD_TIME: ("refractory",),
 }
 """Signature to the effects that make it; nothing where the library has none that does."""
 
-NAMED = ("flicker", "hot pixels", "full bus", "time stamps", "frame coupling", "double events")
+NAMED = ("flicker", "hot pixels", "full bus", "time stamps", "frame coupling", "double events", DEAD_TIME)
 """Signatures that tell which effect it is; the others tell what there is, and not what makes it."""
 
 
@@ -116,6 +118,10 @@ class SeenEffects:
                 out.append(Finding(name, Grade.CERTAIN, seen=entry.sentence))
         return out
 
+    def entry_of(self, name: str) -> Signature | None:
+        """Return the signature of a name; None where it was not seen."""
+        return next((entry for entry in self.entries if entry.name == name), None)
+
     def limits(self, named: Collection[str]) -> tuple[DetectionLimit, ...]:
         """Return what the events alone would have shown of effects; of none of those that are named."""
         return tuple(
@@ -127,7 +133,7 @@ class SeenEffects:
 
 def find_seen_effects(measurement: Measurement, library: Collection[str]) -> SeenEffects:
     """Return what the events of a measurement show by themselves; only effects of a library are named."""
-    events, scene = _compared_events(measurement), measurement.scene
+    events, scene = measurement.compared_events(), measurement.scene
     begins = scene.begin if isinstance(scene, CameraScene) else None
     try:
         found = find_signatures(events, begins=begins)
@@ -305,13 +311,6 @@ def shows_in(made: Collection[Signature], seen: Signature, share: float = 0.3) -
             continue
         return not entry.size < share * seen.size  # sizes may be unknown
     return False
-
-
-def _compared_events(measurement: Measurement) -> Events:
-    events = measurement.events
-    if measurement.span is None:
-        return events
-    return events.select((events.t >= measurement.span[0]) & (events.t <= measurement.span[1]))
 
 
 def _effects_of(entry: Signature) -> tuple[str, ...]:

@@ -87,6 +87,13 @@ class Measurement:
             out = replace(out, trust=_trust_within(mask, out.trust))
         return out
 
+    def compared_events(self) -> Events:
+        """Return the events of the time that is compared."""
+        if self.span is None:
+            return self.events
+        begin, end = self.span
+        return self.events.select((self.events.t >= begin) & (self.events.t <= end))
+
     def noted(self, found: Found) -> Found:
         """Return a finding with what was noticed while reading before its own notes."""
         return replace(found, notes=(*self.notes, *found.notes))

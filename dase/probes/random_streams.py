@@ -41,6 +41,8 @@ class SimulationStream(Enum):
     """Events of a model over its own scene, and with a turn more the model over half of the frames."""
     DETECTION = (1300, 1)
     """Measurements with an effect that was not found; a turn is a strength."""
+    DEAD_TIME = (1500, 0)
+    """Events of a model without a dead time, of which short intervals are counted."""
     STIMULUS = (0, 1000)
     """Standard recordings; a turn is a stimulus."""
     RECORDING = (1, 500_000)
@@ -69,6 +71,9 @@ class Draw(IntEnum):
     """Where further starts of a fit begin."""
     SLOPES = 13
     """Places at which slopes of statistics are seen."""
+
+    PIXELS_OF_INTERVALS = 17
+    """Pixels whose intervals are looked at one by one."""
 
     def generator(self, seed: int) -> np.random.Generator:
         """Return the random numbers of this purpose for a user's seed."""

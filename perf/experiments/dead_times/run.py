@@ -1,0 +1,98 @@
+"""How often intervals end as if cut off where there is a dead time, and where there is none.
+
+    python -m perf.experiments.dead_times.run --key KEY --scenes 6
+
+Each effect alone at its strong strength, a noisy base, and worlds slightly off; the model lacks what is
+hidden, and has the true thresholds. That is harsher than a diagnosis, which asks after its search, too.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+
+import dase
+from dase.diagnosis.dead_time import find_dead_time
+from dase.effects import EFFECTS, Threshold
+from dase.fitting.frame_steps import frame_step_of
+from dase.fitting.measurement import Measurement
+from dase.probes.timestamp_patterns import find_structure
+from dase.simulation.sensor import Sensor
+from perf.experiments.blind_diagnosis import foreign
+from perf.experiments.blind_diagnosis.run import HIDDEN, number_of, truth_of
+from perf.experiments.blind_diagnosis.run import Case as BlindCase
+from perf.experiments.blind_diagnosis.scenes import draw_scene
+
+PERIODS = (2e-3, 5e-3, 15e-3)
+"""Dead times [s]."""
+
+
+def rows(key: int, scenes: int) -> Iterator[tuple[str, float, Measurement, Sensor]]:
+    """Yield what is hidden, a dead time or 0, the measurement, and the model that lacks it."""
+    for number in range(scenes):
+        scene = draw_scene(np.random.default_rng([key, number, 1]))
+        for name in (*HIDDEN, "nothing"):
+            effects = () if name == "nothing" else (name,)
+            for noisy in (False, True) if name == "nothing" else (False,):
+                if name == "refractory":
+                    continue
+                true, _ = truth_of(BlindCase("single", effects, "strong", number, noisy=noisy), key)
+                events = dase.simulate(scene, true, seed=number)
+                model = true if not effects else true.without(name)
+                words = "a noisy sensor with 1 ms" if noisy else name
+                yield words, 1e-3 if noisy else 0.0, Measurement(events, scene), model
+        true, _ = truth_of(BlindCase("single", (), "none", number), key)
+        for period in PERIODS:
+            for mode in EFFECTS["refractory"].choices()["mode"]:
+                sensor = true.with_effect(EFFECTS["refractory"](period=period, mode=mode))
+                events = dase.simulate(scene, sensor, seed=number)
+                yield f"{mode}, {1e3 * period:g} ms", period, Measurement(events, scene), true
+        rng = np.random.default_rng([key, number, 5])
+        habits, (on, off) = foreign.draw_habits(rng), 0.2 * np.exp(rng.uniform(-0.25, 0.25, 2))
+        frames, times = foreign.clip_of(scene.frames(scene.sample_times()), scene.sample_times(), habits, rng)
+        seen = type(scene)(frames.astype(np.float32), times)
+        model = Sensor(effects=(Threshold(on=float(on), off=float(off)),))
+        for name in ("nothing", *foreign.HIDEABLE):
+            hidden: dict[str, Any] = {}
+            if name != "nothing":
+                low, high = foreign.HIDEABLE[name]
+                hidden[name] = float(np.exp(rng.uniform(np.log(low), np.log(high))))
+            events = foreign.simulate(frames, times, float(on), float(off), hidden, habits, number)
+            yield (
+                f"world slightly off: {name}",
+                hidden.get("refractory", 0.0),
+                Measurement(events, seen),
+                model,
+            )
+
+
+def main() -> None:
+    """Print the table."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
+    parser.add_argument("--key", required=True, help="draws scenes, thresholds and habits")
+    parser.add_argument("--scenes", type=int, default=6)
+    options = parser.parse_args()
+    found: dict[str, list[str]] = {}
+    count: dict[str, int] = {}
+    for name, period, measurement, model in rows(number_of(options.key), options.scenes):
+        events, scene = measurement.events, measurement.scene
+        count[name] = count.get(name, 0) + 1
+        if len(events) < 2:
+            continue
+        entry = find_dead_time(
+            measurement, model,
+            frame_step=frame_step_of(events, scene) or 0.0, structure=find_structure(events), seed=0,
+        )  # fmt: skip
+        if entry is not None:
+            found.setdefault(name, []).append(f"{1e3 * entry.details['period']:.3g}/{1e3 * period:.3g}")
+    print("| hidden | found | its end, and the dead time [ms] |\n|---|---|---|")
+    for name, many in count.items():
+        some = found.get(name, [])
+        print(f"| {name} | {len(some)} of {many} | {', '.join(some) or '-'} |")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,145 @@
+"""A dead time is told by where intervals end, also where the error is blind to it."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+import dase
+from dase.diagnosis.dead_time import DEAD_TIME, end_of_intervals, find_dead_time, intervals_of
+from dase.effects import EFFECTS
+from dase.events import Events
+from dase.fitting.measurement import Measurement
+from dase.probes.timestamp_patterns import TimestampStructure
+from dase.scenes.video import VideoScene
+from dase.simulation.sensor import Sensor
+
+NO_STRUCTURE = TimestampStructure()
+
+
+def drifting_texture(seed: int = 0, gap: float = 1e-3, speed: float = 120.0) -> VideoScene:
+    """Return a texture that drifts ever faster, from a speed [px/s] on, of 48x40 pixels."""
+    rng = np.random.default_rng(seed)
+    wide = rng.standard_normal((40, 400))
+    kernel = np.hanning(9) / np.hanning(9).sum()
+    smooth = np.apply_along_axis(np.convolve, 1, wide, kernel, "same")
+    texture = np.exp(1.2 * smooth / smooth.std())
+    times = np.arange(0.0, 0.6, gap)
+    at = speed * (times + 1.5 * times**2)
+    columns = np.arange(400.0)
+    frames = np.stack([[np.interp(x + np.arange(48), columns, row) for row in texture] for x in at])
+    return VideoScene(frames.astype(np.float32) / frames.max(), times)
+
+
+def found(scene, events, sensor, **more):
+    given = {"frame_step": 0.0, "structure": NO_STRUCTURE, "seed": 0} | more
+    return find_dead_time(Measurement(events, scene), sensor, **given)
+
+
+@pytest.fixture(scope="module")
+def scene():
+    return drifting_texture()
+
+
+@pytest.mark.parametrize("mode", ["reset", "drop", "delay"])
+def test_the_end_of_intervals_is_the_dead_time(scene, mode):
+    period = 6e-3
+    sensor = Sensor().with_effect(EFFECTS["refractory"](period=period, mode=mode))
+    entry = found(scene, dase.simulate(scene, sensor, seed=1), Sensor())
+    assert entry is not None
+    assert entry.found
+    assert entry.details["period"] == pytest.approx(period, rel=0.05)
+    assert entry.details["low"] <= period * 1.001
+    # what the model has of itself is not compared with it
+    assert found(scene, dase.simulate(scene, sensor, seed=1), sensor).details == entry.details
+
+
+@pytest.mark.parametrize(
+    ("name", "values"),
+    [
+        ("bandwidth", {"cutoff": 20.0}),
+        ("mismatch", {"spread": 0.3}),
+        ("shot", {"rate": 5.0}),
+        ("jitter", {"spread": 0.3}),
+        ("latency", {"delay": 5e-3}),
+        ("linlog", {"knee": 0.1, "slope": 2.5}),
+    ],
+)
+def test_what_makes_no_dead_time_has_no_end(scene, name, values):
+    events = dase.simulate(scene, Sensor().with_effect(EFFECTS[name](**values)), seed=1)
+    assert found(scene, events, Sensor()) is None
+
+
+def test_intervals_of_another_threshold_have_no_end(scene):
+    """A model with lower thresholds has shorter intervals."""
+    threshold = EFFECTS["threshold"]
+    events = dase.simulate(scene, Sensor(effects=(threshold(on=0.4, off=0.4),)), seed=1)
+    assert found(scene, events, Sensor(effects=(threshold(on=0.2, off=0.2),))) is None
+
+
+def test_an_end_at_frames_or_ticks_says_nothing(scene):
+    sensor = Sensor().with_effect(EFFECTS["refractory"](period=6e-3, mode="drop"))
+    slow = drifting_texture(gap=5e-3)
+    assert found(slow, dase.simulate(slow, sensor, seed=1), Sensor()) is None
+    events = dase.simulate(scene, sensor, seed=1)
+    assert found(scene, events, Sensor()) is not None
+    assert found(scene, events, Sensor(), structure=TimestampStructure(step=5e-3)) is None
+    assert found(scene, events, Sensor(), structure=TimestampStructure(line=5e-5)) is not None
+    assert found(scene, events, Sensor(), structure=TimestampStructure(line=2e-4)) is None
+
+
+def test_a_few_random_events_in_the_dead_time_hide_it_not():
+    rng = np.random.default_rng(1)
+    modelled = np.sort(rng.gamma(3.0, 4e-3, 20_000))
+    seen = np.sort(np.concatenate([modelled[modelled > 5e-3], rng.uniform(0, 5e-3, 5)]))
+    lost = np.searchsorted(modelled, 5e-3)
+    entry = end_of_intervals(seen, modelled)
+    assert entry is not None
+    assert entry.details["period"] == pytest.approx(5e-3, rel=0.01)
+    assert entry.details["here"] <= DEAD_TIME.left * lost
+    many = np.sort(np.concatenate([seen, rng.uniform(0, 5e-3, int(0.05 * lost))]))
+    assert end_of_intervals(many, modelled) is None
+
+
+def test_few_intervals_tell_nothing():
+    rng = np.random.default_rng(1)
+    modelled = np.sort(rng.gamma(3.0, 4e-3, 400))
+    assert np.searchsorted(modelled, 5e-3) < DEAD_TIME.lost
+    assert end_of_intervals(modelled[modelled > 5e-3], modelled) is None
+    assert end_of_intervals(np.empty(0), modelled) is None
+
+
+def test_in_step_with_frames_more_is_asked():
+    rng = np.random.default_rng(1)
+    modelled = np.sort(rng.gamma(3.0, 4e-3, 1_500))
+    seen = modelled[modelled > 5e-3]
+    assert DEAD_TIME.lost <= np.searchsorted(modelled, 5e-3) < DEAD_TIME.lost_in_step
+    assert end_of_intervals(seen, modelled) is not None
+    assert end_of_intervals(seen, modelled, in_step=True) is None
+
+
+def test_intervals_are_those_of_each_pixel():
+    events = Events(
+        np.array([0.0, 0.1, 0.3, 0.35, 0.7]), np.array([0, 1, 0, 1, 0]), np.zeros(5, int),
+        np.array([True, True, False, True, True]), 2, 1,
+    )  # fmt: skip
+    np.testing.assert_allclose(intervals_of(events), [0.25, 0.3, 0.4])
+    np.testing.assert_allclose(intervals_of(events, np.array([1])), [0.25])
+
+
+def test_a_dead_time_that_hardly_loses_events_is_certain():
+    """The error is blind to it: of 75,000 intervals some 700 are gone."""
+    scene = drifting_texture(3, speed=20.0)
+    base = Sensor().with_effect(EFFECTS["mismatch"](spread=0.12))
+    period = 2.2e-3
+    events = dase.simulate(scene, base.with_effect(EFFECTS["refractory"](period=period, mode="drop")), seed=1)
+    assert abs(len(events) / len(dase.simulate(scene, base, seed=1)) - 1) < 0.02
+    diagnosis = dase.diagnose(events, base, scene=scene, seed=0)
+    grades = {one.effect: one for one in diagnosis.findings}
+    assert grades["refractory"].grade.value == "certain"
+    assert "within" in grades["refractory"].seen
+    assert diagnosis.sensor["refractory"].period == pytest.approx(period, rel=0.05)
+    estimate = diagnosis.parameters["refractory.period"]
+    assert estimate.low <= period * 1.001
+    assert estimate.high >= period * 0.95
+    assert "refractory" in diagnosis.finding()
