@@ -25,6 +25,7 @@ from dase.diagnosis.dead_time import NAME as DEAD_TIME
 from dase.diagnosis.dead_time import add_dead_time, find_dead_time, with_dead_time
 from dase.diagnosis.detection_limits import find_detection_limits
 from dase.diagnosis.directional_test import find_hidden_effect
+from dase.diagnosis.events_at_rest import find_events_at_rest
 from dase.diagnosis.few_hot_pixels import NAME as HOT
 from dase.diagnosis.few_hot_pixels import few_hot_pixels, hot_effect_of, with_hot_pixels
 from dase.diagnosis.grading import ModelOnReport, grade_effects, judge_on_report
@@ -43,6 +44,7 @@ from dase.diagnosis.silent_pixels import NAME as DEAD
 from dase.diagnosis.silent_pixels import SilentPixels, find_silent_pixels, with_dead_pixels
 from dase.diagnosis.state import DiagnosisState, explains_remainder, with_same_freedom
 from dase.effects import EFFECTS, Effect
+from dase.effects.threshold import Threshold
 from dase.fitting.burst_strength import follows_frames, put_in_step
 from dase.fitting.confidence_intervals import estimate_parameters
 from dase.fitting.data_split import SPLIT, split_measurement
@@ -182,6 +184,7 @@ def diagnose(
             .error
         )
         start = _fitted_unless_worse(state, start.sensor, free)
+    seen = _look_where_light_rests(state, seen, measurement, start)
     seen = _look_for_dead_time(state, seen, measurement, start)
     state.certain = frozenset(seen.effects) & frozenset(tried) - names
     if hot is not None:
@@ -249,6 +252,21 @@ def diagnose(
         )  # fmt: skip
         found = with_effect_of_bursts(found, last or strength)
     return measurement.noted(replace(found, seconds=time.perf_counter() - begin))
+
+
+def _look_where_light_rests(
+    state: DiagnosisState, seen: SeenEffects, measurement: Measurement, model: FittedModel
+) -> SeenEffects:
+    """Return what is seen, with the noise or the leak of pixels at rest that a model has not."""
+    if state.evidence.contradiction or seen.lamp or seen.bursts is not None:
+        return seen
+    threshold = model.sensor["threshold"]
+    assert isinstance(threshold, Threshold)
+    found = find_events_at_rest(
+        measurement, model.sensor, thresholds=(threshold.on, threshold.off),
+        frame_step=state.evidence.frame_step or 0.0, seed=state.seed,
+    )  # fmt: skip
+    return seen if found is None else replace(seen, entries=(*seen.entries, found))
 
 
 def _look_for_dead_time(

@@ -6,10 +6,11 @@ certain. What the scene itself does, such as light that flickers in a clip, is n
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 from dase.diagnosis.dead_time import NAME as DEAD_TIME
+from dase.diagnosis.events_at_rest import LEAK, NOISE
 from dase.effects import EFFECTS, Effect
 from dase.effects.threshold import Threshold
 from dase.errors import InputError
@@ -38,10 +39,21 @@ KINDS: dict[str, tuple[str, ...]] = {
     "frame coupling": ("exposure",),
     "double events": ("double_events",),
     DEAD_TIME: ("refractory",),
+    LEAK: ("leak",),
+    NOISE: ("shot", "voltage_noise"),
 }
 """Signature to the effects that make it; nothing where the library has none that does."""
 
-NAMED = ("flicker", "hot pixels", "full bus", "time stamps", "frame coupling", "double events", DEAD_TIME)
+NAMED = (
+    "flicker",
+    "hot pixels",
+    "full bus",
+    "time stamps",
+    "frame coupling",
+    "double events",
+    DEAD_TIME,
+    LEAK,
+)
 """Signatures that tell which effect it is; the others tell what there is, and not what makes it."""
 
 
@@ -113,10 +125,30 @@ class SeenEffects:
         for entry in self.entries:
             if named.intersection(KINDS[entry.name]) or set(given).intersection(KINDS[entry.name]):
                 continue
+            if entry.name == NOISE and not self.named_by(entry):
+                out = self._with_noise(entry, out)
+                continue
             for name in self.named_by(entry) or (entry.name,):
                 out = [one for one in out if one.effect != name]
                 out.append(Finding(name, Grade.CERTAIN, seen=entry.sentence))
         return out
+
+    def _with_noise(self, entry: Signature, findings: Sequence[Finding]) -> list[Finding]:
+        """Return findings with one of noise that is there and may be of two kinds.
+
+        Args:
+            entry: What shows it.
+            findings: In which neither of the two is announced.
+        """
+        kinds = [name for name in KINDS[NOISE] if name in self.library]
+        if not kinds:
+            return [*findings, Finding(entry.name, Grade.CERTAIN, seen=entry.sentence)]
+        nearest = next((one for one in findings if one.effect in kinds), Finding(kinds[0], Grade.EITHER))
+        others = tuple(name for name in kinds if name != nearest.effect)
+        said = replace(
+            nearest, grade=Grade.EITHER, alternatives=others, unknown=not others, seen=entry.sentence
+        )
+        return [*(one for one in findings if one.effect not in kinds), said]
 
     def entry_of(self, name: str) -> Signature | None:
         """Return the signature of a name; None where it was not seen."""
@@ -319,4 +351,6 @@ def _effects_of(entry: Signature) -> tuple[str, ...]:
         if "line" in entry.details:
             return ("row_scan",)
         return ("timestamp",) if "step" in entry.details else ()
+    if "effect" in entry.details:
+        return (entry.details["effect"],)
     return KINDS[entry.name] if entry.name in NAMED else ()

@@ -43,6 +43,8 @@ class SimulationStream(Enum):
     """Measurements with an effect that was not found; a turn is a strength."""
     DEAD_TIME = (1500, 0)
     """Events of a model without a dead time, of which short intervals are counted."""
+    EVENTS_AT_REST = (1700, 0)
+    """Events of a model where light rests."""
     STIMULUS = (0, 1000)
     """Standard recordings; a turn is a stimulus."""
     RECORDING = (1, 500_000)
@@ -74,6 +76,9 @@ class Draw(IntEnum):
 
     PIXELS_OF_INTERVALS = 17
     """Pixels whose intervals are looked at one by one."""
+
+    PIXELS_OF_RESTS = 19
+    """Pixels of which it is asked when their light rests."""
 
     def generator(self, seed: int) -> np.random.Generator:
         """Return the random numbers of this purpose for a user's seed."""

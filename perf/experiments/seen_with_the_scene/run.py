@@ -1,6 +1,6 @@
-"""How often intervals end as if cut off where there is a dead time, and where there is none.
+"""How often a dead time, noise or a leak is told by intervals and rests, and where none is there.
 
-    python -m perf.experiments.dead_times.run --key KEY --scenes 6
+    python -m perf.experiments.seen_with_the_scene.run --key KEY --scenes 6
 
 Each effect alone at its strong strength, a noisy base, and worlds slightly off; the model lacks what is
 hidden, and has the true thresholds. That is harsher than a diagnosis, which asks after its search, too.
@@ -16,6 +16,7 @@ import numpy as np
 
 import dase
 from dase.diagnosis.dead_time import find_dead_time
+from dase.diagnosis.events_at_rest import find_events_at_rest
 from dase.effects import EFFECTS, Threshold
 from dase.fitting.frame_steps import frame_step_of
 from dase.fitting.measurement import Measurement
@@ -77,21 +78,31 @@ def main() -> None:
     options = parser.parse_args()
     found: dict[str, list[str]] = {}
     count: dict[str, int] = {}
+    rests: dict[str, dict[str, int]] = {}
     for name, period, measurement, model in rows(number_of(options.key), options.scenes):
         events, scene = measurement.events, measurement.scene
         count[name] = count.get(name, 0) + 1
         if len(events) < 2:
             continue
+        frame_step = frame_step_of(events, scene) or 0.0
         entry = find_dead_time(
-            measurement, model,
-            frame_step=frame_step_of(events, scene) or 0.0, structure=find_structure(events), seed=0,
-        )  # fmt: skip
+            measurement, model, frame_step=frame_step, structure=find_structure(events), seed=0
+        )
+        threshold = model["threshold"]
+        assert isinstance(threshold, Threshold)
+        thresholds = threshold.on, threshold.off
+        rest = find_events_at_rest(measurement, model, thresholds=thresholds, frame_step=frame_step, seed=0)
+        if rest is not None:
+            said = " ".join([rest.name, *([rest.details["effect"]] if "effect" in rest.details else [])])
+            many = rests.setdefault(name, {})
+            many[said] = many.get(said, 0) + 1
         if entry is not None:
             found.setdefault(name, []).append(f"{1e3 * entry.details['period']:.3g}/{1e3 * period:.3g}")
-    print("| hidden | found | its end, and the dead time [ms] |\n|---|---|---|")
-    for name, many in count.items():
+    print("| hidden | dead time | its end, and the true one [ms] | at rest |\n|---|---|---|---|")
+    for name, many_of_it in count.items():
         some = found.get(name, [])
-        print(f"| {name} | {len(some)} of {many} | {', '.join(some) or '-'} |")
+        at_rest = ", ".join(f"{n} of {many_of_it}: {said}" for said, n in rests.get(name, {}).items())
+        print(f"| {name} | {len(some)} of {many_of_it} | {', '.join(some) or '-'} | {at_rest or '-'} |")
 
 
 if __name__ == "__main__":

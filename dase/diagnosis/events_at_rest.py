@@ -1,0 +1,351 @@
+"""What pixels send while their light rests, against a model without noise: background activity.
+
+Light that rests sends nothing, whatever a simulator or a camera does with light that moves. So ON and OFF
+events that go on for as long as it rests are noise, and ON events alone are a leak, however badly a model
+describes the rest. Noise of the voltage crosses a threshold and returns, so its events take turns; those of
+shot noise know nothing of each other. A low-pass, a dead time or a full bus send some events after the light
+has come to rest, soon and of one polarity; hot pixels are a few that send much; a lamp makes all pixels send
+together. None of these is taken for noise.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import stats
+
+from dase.errors import InputError
+from dase.events import Events
+from dase.fitting.measurement import Measurement
+from dase.formatting import format_count, format_metric, format_percent
+from dase.probes.random_streams import Draw, SimulationStream
+from dase.probes.stimulus import light_of
+from dase.scenes.between_frames import CameraScene
+from dase.signatures.chance import poisson_interval
+from dase.signatures.result import Answer, Signature
+from dase.simulation.sensor import Sensor
+from dase.simulation.simulate import simulate
+
+Array = NDArray[np.float64]
+
+NOISE = "noise at rest"
+LEAK = "leak events"
+
+
+@dataclass(frozen=True)
+class RestSettings:
+    """What is at rest, and what counts there.
+
+    Chosen on sets a to s of other simulators: noise sends hundreds to thousands there, what has none a few.
+    """
+
+    still: float = 0.1
+    """How far light at rest goes, as a share of the lower threshold."""
+
+    least: float = 0.15
+    """Time for which light must rest [s]."""
+
+    settle: float = 0.08
+    """Time after it came to rest in which nothing counts [s]."""
+
+    samples: int = 40_000_000
+    """Intensities that are looked at, pixels times instants, at most."""
+
+    instants: int = 4_000
+    """Instants that are looked at, at most."""
+
+    events: int = 40
+    """Events in the later half of the rests that noise has, at least; half as many of a leak."""
+
+    more: float = 5.0
+    """Times as many as the model without it."""
+
+    both: float = 0.2
+    """Share of the rarer polarity of noise, at least."""
+
+    one: float = 0.04
+    """Share of OFF events beside a leak, at most."""
+
+    goes_on: float = 0.35
+    """Share of the events in the later half of the rests: what is left of motion comes soon."""
+
+    spread: float = 0.5
+    """Pixels that send, as a share of as many as have events if all send alike: hot pixels are few."""
+
+    together: float = 1.5
+    """How much more events come together in time than independent ones: a lamp's come at once."""
+
+    beat: float = 0.002
+    """Time in which they come together [s]."""
+
+    pairs: int = 60
+    """Successive events of one pixel from which on these tell which noise it is."""
+
+    near: float = 0.1
+    """Time from one to the next of such a pair, at most [s]."""
+
+    turns: float = 0.8
+    """Share of pairs of opposite polarity of noise that returns, at least: it had 0.9 and more."""
+
+    by_chance: float = 0.1
+    """How far from the share of independent polarities that of shot noise is, at most: it was 0.02."""
+
+
+AT_REST = RestSettings()
+
+
+@dataclass(frozen=True)
+class Rests:
+    """The longest rest of each of some pixels.
+
+    Args:
+        pixels: Row-major indices of those that rest long enough, shape (K,).
+        begin: From when on their events count [s], shape (K,).
+        end: Until when [s], shape (K,).
+    """
+
+    pixels: NDArray[np.int32]
+    begin: Array
+    end: Array
+
+    @property
+    def seconds(self) -> float:
+        """Time of all pixels together [s]."""
+        return float((self.end - self.begin).sum())
+
+    def events_in(
+        self, events: Events
+    ) -> tuple[Array, NDArray[np.bool_], NDArray[np.int64], NDArray[np.bool_]]:
+        """Return the events that come in the rests.
+
+        Returns:
+            Times [s], polarities, places in `pixels`, and whether each comes in the later half of its rest,
+            shape (N,).
+        """
+        place = np.full(events.width * events.height, -1, np.int64)
+        place[self.pixels] = np.arange(len(self.pixels))
+        at = place[events.y.astype(np.int64) * events.width + events.x]
+        inside = at >= 0
+        t, p, at = events.t[inside], events.p[inside], at[inside]
+        inside = (t >= self.begin[at]) & (t < self.end[at])
+        t, p, at = t[inside], p[inside], at[inside]
+        later = t >= 0.5 * (self.begin[at] + self.end[at])
+        return t, p, at, later
+
+
+def find_rests(
+    measurement: Measurement, *, still: float, log_eps: float, seed: int, settings: RestSettings = AT_REST
+) -> Rests:
+    """Return where the light of a scene rests longest, for some pixels if there are many.
+
+    Args:
+        measurement: Of a scene that is known at all times.
+        still: How far light at rest goes [log intensity].
+        log_eps: Added to intensities before the logarithm.
+        seed: Of which pixels are looked at.
+        settings: How long a rest is.
+    """
+    scene = measurement.scene
+    times = scene.sample_times()
+    if measurement.span is not None:
+        times = times[(times >= measurement.span[0]) & (times <= measurement.span[1])]
+    times = times[:: max(1, math.ceil(len(times) / settings.instants))]
+    size = scene.width * scene.height
+    pixels = np.arange(size, dtype=np.int32)
+    if len(times) < 2:
+        return Rests(pixels[:0], np.empty(0), np.empty(0))
+    if size * len(times) > settings.samples:
+        count = max(1, settings.samples // len(times))
+        draw = Draw.PIXELS_OF_RESTS.generator(seed)
+        pixels = np.sort(draw.choice(size, count, replace=False)).astype(np.int32)
+    level = np.log(light_of(scene, times, pixels) + np.float32(log_eps))
+    first, last = longest_rest(level, times, still)
+    # noise of the voltage is new to a memory at the first sample, too
+    begin, end = times[first] + settings.settle, times[last]
+    long = end - times[first] >= settings.least
+    return Rests(pixels[long], begin[long], end[long])
+
+
+def longest_rest(
+    level: NDArray[np.float32], times: Array, still: float
+) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Return between which instants the light of each pixel stays longest within a range.
+
+    Args:
+        level: Logarithms of intensities, shape (N, T).
+        times: Of the instants [s], ascending, shape (T,).
+        still: The range.
+
+    Returns:
+        The first and the last instant of the longest rest, shape (N,) each.
+    """
+    count = len(level)
+    begin = np.zeros(count, np.int64)
+    low, high = level[:, 0].copy(), level[:, 0].copy()
+    first, last = np.zeros(count, np.int64), np.zeros(count, np.int64)
+
+    def keep(ended: NDArray[np.bool_], at: int) -> None:
+        longer = ended & (times[at] - times[begin] > times[last] - times[first])
+        first[longer], last[longer] = begin[longer], at
+
+    for k in range(1, len(times)):
+        now = level[:, k]
+        np.minimum(low, now, out=low)
+        np.maximum(high, now, out=high)
+        moved = high - low > still
+        keep(moved, k - 1)
+        begin[moved] = k
+        low[moved] = high[moved] = now[moved]
+    keep(np.ones(count, bool), len(times) - 1)
+    return first, last
+
+
+def find_events_at_rest(
+    measurement: Measurement,
+    sensor: Sensor,
+    *,
+    thresholds: tuple[float, float],
+    frame_step: float,
+    seed: int,
+    settings: RestSettings = AT_REST,
+) -> Signature | None:
+    """Return the noise, or the leak, of pixels whose light rests; None where a model lacks neither.
+
+    Args:
+        measurement: Its scene is simulated. Nothing is said where light is known in part only.
+        sensor: The model.
+        thresholds: Of the model, ON and OFF [log intensity].
+        frame_step: Time between the frames of a clip in step with which events come [s], 0 if they do not.
+        seed: Of every random number.
+        settings: What is at rest.
+    """
+    if isinstance(measurement.scene, CameraScene) or measurement.trust is not None:
+        return None
+    still = settings.still * min(thresholds)
+    rests = find_rests(measurement, still=still, log_eps=sensor.log_eps, seed=seed, settings=settings)
+    if not len(rests.pixels):
+        return None
+    try:
+        made = simulate(
+            measurement.scene, sensor, seed=SimulationStream.EVENTS_AT_REST.seed(seed), pixels=rests.pixels
+        )
+    except InputError:
+        return None
+    model = int(rests.events_in(made)[3].sum())
+    return judge_events_at_rest(
+        rests, measurement.compared_events(), model, frame_step=frame_step, settings=settings
+    )
+
+
+def judge_events_at_rest(
+    rests: Rests, events: Events, model: int, *, frame_step: float = 0.0, settings: RestSettings = AT_REST
+) -> Signature | None:
+    """Return what events in rests are; None where they are few, or not noise.
+
+    Args:
+        rests: Of the pixels.
+        events: Of all pixels.
+        model: Events of the model in the later halves of the rests.
+        frame_step: Time between the frames of a clip in step with which events come [s], 0 if they do not.
+        settings: What noise is.
+    """
+    t, p, at, later = rests.events_in(events)
+    count, many = int(later.sum()), len(t)
+    on = int(p[later].sum())
+    if count < settings.events // 2 or count < settings.more * (model + 1) or count < settings.goes_on * many:
+        return None
+    if not _sent_by_all(at, rests, settings):
+        return None
+    rarer, off = min(on, count - on) / count, 1 - on / count
+    rate = 2 * count / rests.seconds
+    low, high = (2 * end / rests.seconds for end in poisson_interval(count))
+    details: dict[str, Any] = {"on": on, "off": count - on, "model": model, "seconds": rests.seconds / 2}
+    if rarer >= settings.both and count >= settings.events:
+        if not _independent(t, rests, frame_step, settings):
+            return None
+        name, words = NOISE, f"{format_percent(on / count)} of them ON"
+        effect, why = _which_noise(t, p, at, settings)
+        if effect:
+            details["effect"] = effect
+            words += f"; {why}"
+    elif off <= settings.one:
+        name, words = LEAK, "all of them ON" if not off else f"{format_percent(1 - off)} of them ON"
+    else:
+        return None
+    sentence = (
+        f"pixels whose light rests send {format_metric(rate, 'Hz')}, {words} ({format_count(count)} events, "
+        f"where the model has {format_count(model)})"
+    )
+    return Signature(
+        name=name, answer=Answer.FOUND, p=float(stats.poisson.sf(count - 1, model + 1)), size=rate,
+        low=low, high=high, unit="events per second of a pixel at rest", sentence=sentence, details=details,
+    )  # fmt: skip
+
+
+def _which_noise(
+    t: Array, p: NDArray[np.bool_], at: NDArray[np.int64], settings: RestSettings
+) -> tuple[str, str]:
+    """Return the effect that makes noise, and why in words; empty where pairs of events do not tell.
+
+    Args:
+        t: Of the events [s], ascending, shape (N,).
+        p: Whether each is ON, shape (N,).
+        at: Which pixel sent it, shape (N,).
+        settings: What pairs tell.
+    """
+    order = np.argsort(at, kind="stable")
+    t, p, at = t[order], p[order], at[order]
+    pair = (at[1:] == at[:-1]) & (np.diff(t) < settings.near)
+    count = int(pair.sum())
+    if count < settings.pairs:
+        return "", ""
+    opposite = float((p[1:] != p[:-1])[pair].mean())
+    on = float(p.mean())
+    words = f"{format_percent(opposite)} of {format_count(count)} successive events of a pixel are opposite"
+    if opposite >= settings.turns:
+        return "voltage_noise", words
+    if abs(opposite - 2 * on * (1 - on)) <= settings.by_chance:
+        return "shot", words
+    return "", ""
+
+
+def _sent_by_all(at: NDArray[np.int64], rests: Rests, settings: RestSettings) -> bool:
+    """Whether about as many pixels send as if all sent alike, by the length of their rests.
+
+    Args:
+        at: Which pixel sent each event, shape (N,).
+        rests: Of the pixels.
+        settings: How many they must be.
+    """
+    expected = len(at) * (rests.end - rests.begin) / rests.seconds
+    alike = float(-np.expm1(-expected).sum())
+    return len(np.unique(at)) >= settings.spread * alike
+
+
+def _independent(t: Array, rests: Rests, frame_step: float, settings: RestSettings) -> bool:
+    """Whether events come by themselves: their number in short times varies as independent ones do.
+
+    Args:
+        t: Of the events [s], shape (N,).
+        rests: Of the pixels.
+        frame_step: Time from frame to frame in step with which events come [s], or 0.
+        settings: How much more it may vary.
+    """
+    # those of one frame come together
+    beat = max(settings.beat, frame_step)
+    begin, end = float(rests.begin.min()), float(rests.end.max())
+    edges = np.arange(begin - 0.5 * beat, end + beat, beat)  # frames in the middle
+    resting = np.interp(edges, np.sort(rests.begin), np.arange(len(rests.begin)))
+    resting -= np.interp(edges, np.sort(rests.end), np.arange(len(rests.end)))
+    share = np.maximum(0.5 * (resting[1:] + resting[:-1]), 0.0)
+    counts = np.histogram(t, edges)[0]
+    expected = share * len(t) / max(share.sum(), 1e-12)
+    used = expected > 0
+    if used.sum() < 10:
+        return False
+    excess = float(((counts[used] - expected[used]) ** 2 / np.maximum(expected[used], 0.05)).mean())
+    return excess < settings.together + 0.02 * float(expected[used].mean()) * settings.together

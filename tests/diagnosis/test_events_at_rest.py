@@ -1,0 +1,168 @@
+"""Noise and leak are told by what pixels send while their light rests."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+import dase
+from dase.diagnosis.events_at_rest import (
+    LEAK,
+    NOISE,
+    Rests,
+    find_events_at_rest,
+    find_rests,
+    judge_events_at_rest,
+    longest_rest,
+)
+from dase.diagnosis.seen_effects import SeenEffects
+from dase.effects import EFFECTS
+from dase.events import Events
+from dase.fitting.measurement import Measurement
+from dase.results import Finding, Grade
+from dase.scenes.video import VideoScene
+from dase.signatures.result import Answer, Signature
+from dase.simulation.sensor import Sensor
+
+SIDE = 40
+
+
+def passing_bar(seconds: float = 0.8, gap: float = 2e-3) -> VideoScene:
+    """Return a bar that passes before a wall that rests, of 40x40 pixels."""
+    rng = np.random.default_rng(4)
+    wall = rng.uniform(0.2, 0.8, (SIDE, SIDE))
+    times = np.arange(0.0, seconds, gap)
+    columns = np.arange(SIDE)
+    frames = []
+    for t in times:
+        bar = np.clip(4 - np.abs(columns - 60 * t), 0, 1)
+        frames.append(wall * (1 - 0.8 * bar))
+    return VideoScene(np.array(frames, np.float32), times)
+
+
+@pytest.fixture(scope="module")
+def scene():
+    return passing_bar()
+
+
+def found(scene, events, sensor=None, **more):
+    given = {"thresholds": (0.2, 0.2), "frame_step": 0.0, "seed": 0} | more
+    return find_events_at_rest(Measurement(events, scene), sensor or Sensor(), **given)
+
+
+def seen_by(scene, **effects):
+    sensor = Sensor()
+    for name, values in effects.items():
+        sensor = sensor.with_effect(EFFECTS[name](**values))
+    return dase.simulate(scene, sensor, seed=3)
+
+
+def test_shot_noise_is_noise_whose_events_know_nothing_of_each_other(scene):
+    entry = found(scene, seen_by(scene, shot=dict(rate=3.0)))
+    assert entry.name == NOISE
+    assert entry.details["effect"] == "shot"
+    assert entry.low < entry.size < entry.high
+
+
+def test_noise_of_the_voltage_takes_turns(scene):
+    entry = found(scene, seen_by(scene, voltage_noise=dict(sigma=0.1, cutoff=50.0)))
+    assert entry.name == NOISE
+    assert entry.details["effect"] == "voltage_noise"
+
+
+def test_few_pairs_do_not_tell_which_noise_it_is(scene):
+    entry = found(scene, seen_by(scene, shot=dict(rate=0.4)))
+    assert entry.name == NOISE
+    assert "effect" not in entry.details
+
+
+def test_a_leak_sends_on_events_alone(scene):
+    entry = found(scene, seen_by(scene, leak=dict(rate=1.0)))
+    assert entry.name == LEAK
+    assert entry.details["off"] == 0
+
+
+@pytest.mark.parametrize(
+    ("name", "values"),
+    [
+        ("bandwidth", {"cutoff": 8.0}),
+        ("hot", {"share": 0.01, "rate": 100.0}),
+        ("flicker", {"frequency": 100.0, "depth": 0.4}),
+        ("mismatch", {"spread": 0.3}),
+        ("jitter", {"spread": 0.3}),
+        ("latency", {"delay": 8e-3}),
+        ("refractory", {"period": 15e-3}),
+        ("high_pass", {"cutoff": 0.5}),
+    ],
+)
+def test_what_is_no_noise_is_not_taken_for_it(scene, name, values):
+    assert found(scene, seen_by(scene, **{name: values})) is None
+
+
+def test_noise_that_the_model_has_is_not_missing(scene):
+    noisy = Sensor().with_effect(EFFECTS["shot"](rate=3.0))
+    assert found(scene, dase.simulate(scene, noisy, seed=3), noisy) is None
+
+
+def test_a_rest_is_the_longest_time_within_a_range():
+    times = np.arange(8.0)
+    level = np.array([[0, 0, 1, 1.05, 1.1, 1.15, 3, 3], [0, 1, 2, 3, 4, 5, 6, 7]], np.float32)
+    first, last = longest_rest(level, times, 0.2)
+    assert (first[0], last[0]) == (2, 5)
+    assert first[1] == last[1]
+
+
+def test_rests_leave_out_what_comes_soon_after_motion(scene):
+    rests = find_rests(Measurement(Events.empty(SIDE, SIDE), scene), still=0.02, log_eps=1e-3, seed=0)
+    assert len(rests.pixels) > SIDE * SIDE // 2
+    columns = rests.pixels % SIDE
+    late = rests.begin > 0.1  # begins after the bar has passed
+    passed = (columns[late] + 4) / 60
+    assert (rests.begin[late] > passed + 0.05).all()
+
+
+def at_random(count: int, on: float, seed: int = 0, together: bool = False) -> tuple[Events, Rests]:
+    """Return events of 1,000 pixels that rest for a second, at a few times if they come together."""
+    rng = np.random.default_rng(seed)
+    t = np.sort(np.repeat(rng.uniform(0, 1, count // 20), 20) if together else rng.uniform(0, 1, count))
+    pixels = rng.integers(0, 1000, len(t))
+    events = Events(t, pixels % 50, pixels // 50, rng.random(len(t)) < on, 50, 20)
+    return events, Rests(np.arange(1000, dtype=np.int32), np.zeros(1000), np.ones(1000))
+
+
+def test_events_of_all_pixels_at_once_are_a_lamp_and_no_noise():
+    events, rests = at_random(2000, 0.5)
+    assert judge_events_at_rest(rests, events, 0).name == NOISE
+    events, rests = at_random(2000, 0.5, together=True)
+    assert judge_events_at_rest(rests, events, 0) is None
+
+
+def test_polarities_that_are_neither_both_nor_one_tell_nothing():
+    events, rests = at_random(2000, 0.9)
+    assert judge_events_at_rest(rests, events, 0) is None
+
+
+def test_noise_of_two_kinds_is_said_to_be_either():
+    entry = Signature(name=NOISE, answer=Answer.FOUND, sentence="pixels at rest send")
+    seen = SeenEffects((entry,))
+    (said,) = seen.findings([], ())
+    assert (said.effect, said.grade, said.alternatives, said.unknown) == (
+        "shot", Grade.EITHER, ("voltage_noise",), False,
+    )  # fmt: skip
+    assert said.words() == "either shot or voltage_noise"
+    # what the search came nearest with is named first
+    (said,) = seen.findings([Finding("voltage_noise", Grade.STAND_IN, error_with=1.0)], ())
+    assert (said.effect, said.alternatives, said.error_with) == ("voltage_noise", ("shot",), 1.0)
+    # and what it announced stays
+    sure = Finding("voltage_noise", Grade.SUPPORTED)
+    assert seen.findings([sure], ()) == [sure]
+    (said,) = SeenEffects((entry,), library=frozenset({"shot"})).findings([], ())
+    assert said.words() == "either shot or something that is not in the library"
+    (said,) = SeenEffects((entry,), library=frozenset()).findings([], ())
+    assert (said.effect, said.grade) == (NOISE, Grade.CERTAIN)
+
+
+def test_noise_that_events_name_is_certain():
+    entry = Signature(name=NOISE, answer=Answer.FOUND, sentence="at rest", details={"effect": "shot"})
+    (said,) = SeenEffects((entry,)).findings([Finding("shot", Grade.EITHER, unknown=True)], ())
+    assert (said.effect, said.grade, said.unknown) == ("shot", Grade.CERTAIN, False)
