@@ -16,6 +16,7 @@ from dase.diagnosis.candidates import (
     Candidate,
     calibrate_split,
     effects_to_try,
+    refit_and_judge,
     try_effects,
     variants_to_try,
 )
@@ -187,6 +188,7 @@ def diagnose(
     seen = _look_where_light_rests(state, seen, measurement, start)
     seen = _look_for_dead_time(state, seen, measurement, start)
     state.certain = frozenset(seen.effects) & frozenset(tried) - names
+    state.at_rest = state.certain & seen.shown_at_rest
     if hot is not None:
         state.notes.append(
             f"{len(hot)} hot pixels are left out of all that is compared, and counted among all pixels"
@@ -263,9 +265,8 @@ def _look_where_light_rests(
     threshold = model.sensor["threshold"]
     assert isinstance(threshold, Threshold)
     found = find_events_at_rest(
-        measurement, model.sensor, thresholds=(threshold.on, threshold.off),
-        frame_step=state.evidence.frame_step or 0.0, seed=state.seed,
-    )  # fmt: skip
+        measurement, model.sensor, thresholds=(threshold.on, threshold.off), seed=state.seed
+    )
     return seen if found is None else replace(seen, entries=(*seen.entries, found))
 
 
@@ -386,13 +387,32 @@ def _look_for_effect(
         state.first, state.first_step = sorted(tried, key=lambda one: one.screened_loss), len(state.history)
     best, ties = _best_candidate(state, tried, judgement)
     if best is None and certain:
-        return _look_for_effect(state, model, judgement, more)
+        best = _seen_at_rest(state, tried, judgement)
+        if best is None:
+            return _look_for_effect(state, model, judgement, more)
     if best is None:
         return step, None, False
     state.note_addition(best, [one for one in tried if one.judgement], ties, judgement)
     step = replace(step, chosen=best.name, ties=ties)
     on_its_way = best.error > settings.on_its_way * judgement.gate
     return step, refit_model(evidence, best.model, seed=seed, rounds=1), on_its_way
+
+
+def _seen_at_rest(
+    state: DiagnosisState, tried: Sequence[Candidate], judgement: Judgement
+) -> Candidate | None:
+    """Return the noise or leak that pixels at rest show, if the model is no worse with it.
+
+    However little the error falls, it is there, and all else is to be judged beside it.
+    """
+    shown = [one for one in tried if one.name in state.at_rest]
+    if not shown:
+        return None
+    judged = [one for one in shown if one.judgement] or refit_and_judge(
+        state.evidence, shown, seed=state.seed, settings=state.settings.candidates
+    )
+    best = min(judged, key=lambda one: one.error)
+    return best if best.judgement and best.error <= judgement.error else None
 
 
 def _best_candidate(

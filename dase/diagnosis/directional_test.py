@@ -175,6 +175,8 @@ def _most_deviating_effect(
 def _starting_model(model: FittedModel, other: FittedModel, place: Array, step: Array) -> FittedModel:
     """Return the model with an effect more where the rest has given way to it.
 
+    What the effect takes the place of, as a second pole does of a bandwidth, has gone.
+
     Args:
         model: Without the effect, P free parameters.
         other: With the effect.
@@ -184,7 +186,8 @@ def _starting_model(model: FittedModel, other: FittedModel, place: Array, step: 
     names = [axis.name for axis in other.space.axes]
     place = place.copy()
     for axis, change in zip(model.space.axes, step, strict=True):
-        place[names.index(axis.name)] += change
+        if axis.name in names:
+            place[names.index(axis.name)] += change
     return FittedModel(other.space, place)
 
 

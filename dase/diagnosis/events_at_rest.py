@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 from scipy import stats
+from scipy.ndimage import uniform_filter1d
 
 from dase.errors import InputError
 from dase.events import Events
@@ -25,6 +26,7 @@ from dase.formatting import format_count, format_metric, format_percent
 from dase.probes.random_streams import Draw, SimulationStream
 from dase.probes.stimulus import light_of
 from dase.scenes.between_frames import CameraScene
+from dase.scenes.video import VideoScene
 from dase.signatures.chance import poisson_interval
 from dase.signatures.result import Answer, Signature
 from dase.simulation.sensor import Sensor
@@ -81,6 +83,9 @@ class RestSettings:
 
     beat: float = 0.002
     """Time in which they come together [s]."""
+
+    beats: int = 25
+    """Such times over which the mean is taken that they are compared with."""
 
     pairs: int = 60
     """Successive events of one pixel from which on these tell which noise it is."""
@@ -209,7 +214,6 @@ def find_events_at_rest(
     sensor: Sensor,
     *,
     thresholds: tuple[float, float],
-    frame_step: float,
     seed: int,
     settings: RestSettings = AT_REST,
 ) -> Signature | None:
@@ -219,7 +223,6 @@ def find_events_at_rest(
         measurement: Its scene is simulated. Nothing is said where light is known in part only.
         sensor: The model.
         thresholds: Of the model, ON and OFF [log intensity].
-        frame_step: Time between the frames of a clip in step with which events come [s], 0 if they do not.
         seed: Of every random number.
         settings: What is at rest.
     """
@@ -236,13 +239,14 @@ def find_events_at_rest(
     except InputError:
         return None
     model = int(rests.events_in(made)[3].sum())
+    gaps = np.diff(measurement.scene.sample_times()) if isinstance(measurement.scene, VideoScene) else [0.0]
     return judge_events_at_rest(
-        rests, measurement.compared_events(), model, frame_step=frame_step, settings=settings
+        rests, measurement.compared_events(), model, frame_gap=float(np.max(gaps)), settings=settings
     )
 
 
 def judge_events_at_rest(
-    rests: Rests, events: Events, model: int, *, frame_step: float = 0.0, settings: RestSettings = AT_REST
+    rests: Rests, events: Events, model: int, *, frame_gap: float = 0.0, settings: RestSettings = AT_REST
 ) -> Signature | None:
     """Return what events in rests are; None where they are few, or not noise.
 
@@ -250,7 +254,7 @@ def judge_events_at_rest(
         rests: Of the pixels.
         events: Of all pixels.
         model: Events of the model in the later halves of the rests.
-        frame_step: Time between the frames of a clip in step with which events come [s], 0 if they do not.
+        frame_gap: Time from frame to frame of a clip [s], 0 for a scene that has none.
         settings: What noise is.
     """
     t, p, at, later = rests.events_in(events)
@@ -265,7 +269,7 @@ def judge_events_at_rest(
     low, high = (2 * end / rests.seconds for end in poisson_interval(count))
     details: dict[str, Any] = {"on": on, "off": count - on, "model": model, "seconds": rests.seconds / 2}
     if rarer >= settings.both and count >= settings.events:
-        if not _independent(t, rests, frame_step, settings):
+        if not _independent(t[_is_first(t, at, settings.near)], rests, frame_gap, settings):
             return None
         name, words = NOISE, f"{format_percent(on / count)} of them ON"
         effect, why = _which_noise(t, p, at, settings)
@@ -326,24 +330,40 @@ def _sent_by_all(at: NDArray[np.int64], rests: Rests, settings: RestSettings) ->
     return len(np.unique(at)) >= settings.spread * alike
 
 
-def _independent(t: Array, rests: Rests, frame_step: float, settings: RestSettings) -> bool:
+def _is_first(t: Array, at: NDArray[np.int64], near: float) -> NDArray[np.bool_]:
+    """Return which events have no other of their pixel shortly before: noise that returns sends in pairs.
+
+    Args:
+        t: Of the events [s], ascending, shape (N,).
+        at: Which pixel sent each, shape (N,).
+        near: How shortly [s].
+    """
+    order = np.argsort(at, kind="stable")
+    out = np.ones(len(t), bool)
+    out[order[1:]] = (at[order][1:] != at[order][:-1]) | (np.diff(t[order]) >= near)
+    return out
+
+
+def _independent(t: Array, rests: Rests, frame_gap: float, settings: RestSettings) -> bool:
     """Whether events come by themselves: their number in short times varies as independent ones do.
 
     Args:
         t: Of the events [s], shape (N,).
         rests: Of the pixels.
-        frame_step: Time from frame to frame in step with which events come [s], or 0.
+        frame_gap: Time from frame to frame of a clip [s], 0 for a scene that has none.
         settings: How much more it may vary.
     """
-    # those of one frame come together
-    beat = max(settings.beat, frame_step)
+    # what a simulator makes of a frame may come together
+    beat = max(settings.beat, frame_gap)
     begin, end = float(rests.begin.min()), float(rests.end.max())
     edges = np.arange(begin - 0.5 * beat, end + beat, beat)  # frames in the middle
     resting = np.interp(edges, np.sort(rests.begin), np.arange(len(rests.begin)))
     resting -= np.interp(edges, np.sort(rests.end), np.arange(len(rests.end)))
     share = np.maximum(0.5 * (resting[1:] + resting[:-1]), 0.0)
     counts = np.histogram(t, edges)[0]
-    expected = share * len(t) / max(share.sum(), 1e-12)
+    # after motion all pixels begin anew, and what they send rises and falls; a lamp's swing is faster
+    smooth = [uniform_filter1d(values.astype(np.float64), settings.beats) for values in (counts, share)]
+    expected = share * smooth[0] / np.maximum(smooth[1], 1e-12)
     used = expected > 0
     if used.sum() < 10:
         return False

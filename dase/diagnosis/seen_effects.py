@@ -94,6 +94,12 @@ class SeenEffects:
         """Effects of the library that are certain, each to what shows it."""
         return {name: entry.sentence for entry in self.entries for name in self.named_by(entry)}
 
+    @property
+    def shown_at_rest(self) -> frozenset[str]:
+        """Effects of the library that pixels at rest show."""
+        entries = (entry for entry in self.entries if entry.name in (LEAK, NOISE))
+        return frozenset(name for entry in entries for name in self.named_by(entry))
+
     def times_of_bursts(self, measurement: Measurement) -> BurstTimes | None:
         """Return when the bursts of a measurement come; None where there are none at even times."""
         for entry in self.entries:

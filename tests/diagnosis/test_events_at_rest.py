@@ -46,7 +46,7 @@ def scene():
 
 
 def found(scene, events, sensor=None, **more):
-    given = {"thresholds": (0.2, 0.2), "frame_step": 0.0, "seed": 0} | more
+    given = {"thresholds": (0.2, 0.2), "seed": 0} | more
     return find_events_at_rest(Measurement(events, scene), sensor or Sensor(), **given)
 
 

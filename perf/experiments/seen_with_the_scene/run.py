@@ -91,7 +91,7 @@ def main() -> None:
         threshold = model["threshold"]
         assert isinstance(threshold, Threshold)
         thresholds = threshold.on, threshold.off
-        rest = find_events_at_rest(measurement, model, thresholds=thresholds, frame_step=frame_step, seed=0)
+        rest = find_events_at_rest(measurement, model, thresholds=thresholds, seed=0)
         if rest is not None:
             said = " ".join([rest.name, *([rest.details["effect"]] if "effect" in rest.details else [])])
             many = rests.setdefault(name, {})
