@@ -9,7 +9,7 @@ graded.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -75,7 +75,7 @@ def find_detection_limits(
         last: Error of the last model.
         named: Effects that are found, or named as what comes nearest.
     """
-    asked = []
+    asked = list[tuple[Effect, SearchAxis, str]]()
     for name in effects_to_try(state.effects, model):
         if name in named:
             continue
@@ -88,18 +88,19 @@ def find_detection_limits(
         # event by event through a readout, one effect would take as long as the whole search
         if report.streams(with_effect_added(model, tried[0]).space):
             continue
-        asked.append((tried[0], axis))
+        asked.append((tried[0], axis, _rule_of_first(tried)))
     if not asked:
         return ()
     known = _reported_model(state, model, report, start, last)
-    works = [_limit_work(state, known, effect, axis) for effect, axis in asked]
+    works = [_limit_work(state, known, effect, axis) for effect, axis, _ in asked]
     # a few at a time: all of them side by side would hold the events of hundreds of simulations
     size, places = state.settings.detection.side_by_side, list[float | None]()
     for n in range(0, len(works), size):
         state.progress("what would have been seen", n / len(works), last.error)
         places += run_side_by_side(works[n : n + size])
     return tuple(
-        describe_limit(effect, axis, place) for (effect, axis), place in zip(asked, places, strict=True)
+        describe_limit(effect, axis, place, rule)
+        for (effect, axis, rule), place in zip(asked, places, strict=True)
     )
 
 
@@ -110,18 +111,29 @@ def main_axis(model: FittedModel, effect: Effect) -> SearchAxis | None:
     return mine[0] if mine else None
 
 
-def describe_limit(effect: Effect, axis: SearchAxis, place: float | None) -> DetectionLimit:
+def _rule_of_first(variants: Sequence[Effect]) -> str:
+    """Return which of the rules of an effect the first of its variants follows; empty where it has one only.
+
+    A limit holds for that rule alone: a dead time in which the memory follows the light is seen far less.
+    """
+    first = variants[0]
+    names = [name for name in first.choices() if len({getattr(one, name) for one in variants}) > 1]
+    return ", ".join(getattr(first, name) for name in names)
+
+
+def describe_limit(effect: Effect, axis: SearchAxis, place: float | None, rule: str = "") -> DetectionLimit:
     """Return a limit in words.
 
     Args:
         effect: Which one.
         axis: Of its strength.
         place: Of the smallest strength that would have been seen; None for none.
+        rule: Of the effect for which that holds; empty where it has one only.
     """
     above = _rises(axis)
     weak, strong = _range_of(axis)
     unit = "" if axis.fact.unit == "1" else axis.fact.unit
-    words = axis.name.replace(".", " ")
+    words = axis.name.replace(".", " ") + (f" ({rule})" if rule else "")
     side = "above" if above else "below"
     end = _number(float(axis.to_value(strong)), unit)
     if place is None:

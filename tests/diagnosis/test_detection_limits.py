@@ -14,6 +14,7 @@ from dase.diagnosis.detection_limits import (
     _limit_work,
     _range_of,
     _reported_model,
+    _rule_of_first,
     describe_limit,
     main_axis,
     would_be_added,
@@ -199,3 +200,15 @@ def test_parameters_of_a_model_that_leaves_too_much_are_no_claim(leaky):
     assert off.to_json()["parameters_hold"] is False
     # next to nothing of much is left: another world's habits
     assert replace(found, errors=(40.0, 2.0)).parameters_hold
+
+
+def test_a_limit_names_the_rule_for_which_it_holds():
+    refractory = EFFECTS["refractory"](mode="reset")
+    model = model_of(Sensor())
+    axis = main_axis(model, refractory)
+    assert axis is not None
+    limit = describe_limit(refractory, axis, axis.to_place(2e-3), "reset")
+    assert limit.sentence == "refractory period (reset) above 2 ms would have been seen"
+    variants = [EFFECTS["refractory"](mode=mode) for mode in ("reset", "drop")]
+    assert _rule_of_first(variants) == "reset"
+    assert _rule_of_first(variants[:1]) == ""
