@@ -29,7 +29,7 @@ from dase.diagnosis.directional_test import find_hidden_effect
 from dase.diagnosis.events_at_rest import find_events_at_rest
 from dase.diagnosis.few_hot_pixels import NAME as HOT
 from dase.diagnosis.few_hot_pixels import few_hot_pixels, hot_effect_of, with_hot_pixels
-from dase.diagnosis.grading import ModelOnReport, grade_effects, judge_on_report
+from dase.diagnosis.grading import ModelOnReport, grade_effects, judge_on_report, leaves_little
 from dase.diagnosis.pruning import prune_model
 from dase.diagnosis.remainder import describe_unexplained, share_of_scene, what_to_record
 from dase.diagnosis.seen_effects import (
@@ -589,7 +589,9 @@ def _conclude_diagnosis(
     limits: tuple[DetectionLimit, ...] = ()
     if not state.evidence.contradiction:
         named = {*state.given, *findings, *nearest}
-        limits = find_detection_limits(state, model, report, first.judgement, last, named)
+        if leaves_little(first.judgement, last, state.settings.grades):
+            # beside a model that is too far off for any finding, nothing can be promised
+            limits = find_detection_limits(state, model, report, first.judgement, last, named)
         limits += seen.limits({*named, *(one.effect for one in limits)})
     final, error, estimates, plain = model, last.error, values, plain_numbers(report)
     if set(kept) != set(order):
