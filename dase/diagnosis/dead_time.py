@@ -80,6 +80,9 @@ class DeadTimeSettings:
     events: int = 500_000
     """Events that are looked at, at about as many pixels as that takes."""
 
+    pixels: int = 100_000
+    """Pixels that are looked at, at most."""
+
     rules: tuple[str, ...] = ("reset", "drop", "delay")
     """What may become of changes in the dead time."""
 
@@ -115,7 +118,7 @@ def find_dead_time(
     events = measurement.compared_events()
     if not len(events):
         return None
-    pixels = _some_pixels(events, settings.events, seed)
+    pixels = _some_pixels(events, settings, seed)
     without = sensor.without(EFFECT) if EFFECT in sensor else sensor
     try:
         made = simulate(scene, without, seed=SimulationStream.DEAD_TIME.seed(seed), pixels=pixels)
@@ -254,10 +257,11 @@ def with_dead_time(diagnosis: Diagnosis, found: Signature) -> Diagnosis:
     )
 
 
-def _some_pixels(events: Events, most: int, seed: int) -> NDArray[np.int64] | None:
-    """Return pixels with about as many events, row-major, shape (K,); None for all."""
-    if len(events) <= most:
-        return None
+def _some_pixels(events: Events, settings: DeadTimeSettings, seed: int) -> NDArray[np.int64] | None:
+    """Return pixels that have as many events as are looked at, row-major, shape (K,); None for all."""
     size = events.width * events.height
-    count = max(1, size * most // len(events))
-    return np.sort(Draw.PIXELS_OF_INTERVALS.generator(seed).choice(size, count, replace=False))
+    count = min(settings.pixels, size * settings.events // len(events))
+    if count >= size:
+        return None
+    draw = Draw.PIXELS_OF_INTERVALS.generator(seed)
+    return np.sort(draw.choice(size, max(count, 1), replace=False))

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -75,6 +77,17 @@ def test_intervals_of_another_threshold_have_no_end(scene):
     threshold = EFFECTS["threshold"]
     events = dase.simulate(scene, Sensor(effects=(threshold(on=0.4, off=0.4),)), seed=1)
     assert found(scene, events, Sensor(effects=(threshold(on=0.2, off=0.2),))) is None
+
+
+def test_some_pixels_tell_as_well(scene):
+    sensor = Sensor().with_effect(EFFECTS["refractory"](period=6e-3, mode="drop"))
+    events = dase.simulate(scene, sensor, seed=1)
+    for some in (replace(DEAD_TIME, events=len(events) // 4), replace(DEAD_TIME, pixels=500)):
+        entry = found(scene, events, Sensor(), settings=some)
+        assert entry is not None
+        assert entry.details["period"] == pytest.approx(6e-3, rel=0.01)
+        whole = found(scene, events, Sensor())
+        assert entry.details["without"] < 0.4 * whole.details["without"]
 
 
 def test_an_end_at_frames_or_ticks_says_nothing(scene):
