@@ -54,6 +54,9 @@ class RestSettings:
     settle: float = 0.08
     """Time after it came to rest in which nothing counts [s]."""
 
+    lead: float = 0.02
+    """Time before it moves again in which nothing counts [s]: a slow clock shows the tick before an event."""
+
     samples: int = 40_000_000
     """Intensities that are looked at, pixels times instants, at most."""
 
@@ -170,8 +173,8 @@ def find_rests(
     level = np.log(light_of(scene, times, pixels) + np.float32(log_eps))
     first, last = longest_rest(level, times, still)
     # noise of the voltage is new to a memory at the first sample, too
-    begin, end = times[first] + settings.settle, times[last]
-    long = end - times[first] >= settings.least
+    begin, end = times[first] + settings.settle, times[last] - settings.lead
+    long = times[last] - times[first] >= settings.least
     return Rests(pixels[long], begin[long], end[long])
 
 

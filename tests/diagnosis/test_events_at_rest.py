@@ -7,6 +7,7 @@ import pytest
 
 import dase
 from dase.diagnosis.events_at_rest import (
+    AT_REST,
     LEAK,
     NOISE,
     Rests,
@@ -166,3 +167,12 @@ def test_noise_that_events_name_is_certain():
     entry = Signature(name=NOISE, answer=Answer.FOUND, sentence="at rest", details={"effect": "shot"})
     (said,) = SeenEffects((entry,)).findings([Finding("shot", Grade.EITHER, unknown=True)], ())
     assert (said.effect, said.grade, said.unknown) == ("shot", Grade.CERTAIN, False)
+
+
+def test_what_a_slow_clock_stamps_early_is_no_leak(scene):
+    """The tick before an event may be before its light began to move."""
+    ticks = seen_by(scene, timestamp=dict(step=5e-3))
+    rests = find_rests(Measurement(ticks, scene), still=0.02, log_eps=1e-3, seed=0)
+    late = Rests(rests.pixels, rests.begin, rests.end + AT_REST.lead)
+    assert len(late.events_in(ticks)[0]) > len(rests.events_in(ticks)[0]) + AT_REST.events
+    assert found(scene, ticks) is None
