@@ -57,6 +57,9 @@ NAMED = (
 """Signatures that tell which effect it is; the others tell what there is, and not what makes it."""
 
 
+WITH_A_SCENE = (DEAD_TIME, LEAK, NOISE)
+"""Signatures for which a model over the scene is asked."""
+
 MADE_BY_LIGHT = ("flicker",)
 """Signatures that light makes by itself."""
 
@@ -109,6 +112,8 @@ class SeenEffects:
 
     def named_by(self, entry: Signature) -> tuple[str, ...]:
         """Return the effects of the library that a signature names; there may be none."""
+        if entry.name in WITH_A_SCENE and self.library - set(EFFECTS):
+            return ()  # one of the user's own may make it as well
         return tuple(name for name in _effects_of(entry) if name in self.library)
 
     def findings(self, graded: Collection[Finding], given: Collection[str]) -> list[Finding]:
@@ -121,7 +126,10 @@ class SeenEffects:
         seen = self.effects
         out = []
         for one in graded:
-            if one.effect in seen:
+            if one.effect in self._noise and one.grade is Grade.STAND_IN:
+                # noise that comes so is there, but the model with it is another's
+                one = replace(one, grade=Grade.EITHER, unknown=True, seen=seen[one.effect])
+            elif one.effect in seen:
                 one = Finding(
                     one.effect, Grade.CERTAIN, (), False, one.error_without, one.error_with, one.deviation,
                     one.parameters, seen[one.effect],
@@ -131,7 +139,9 @@ class SeenEffects:
         for entry in self.entries:
             if named.intersection(KINDS[entry.name]) or set(given).intersection(KINDS[entry.name]):
                 continue
-            if entry.name == NOISE and not self.named_by(entry):
+            if entry.name in WITH_A_SCENE and named - set(EFFECTS):
+                continue  # one of the user's own, which was found, makes it
+            if entry.name == NOISE:
                 out = self._with_noise(entry, out)
                 continue
             for name in self.named_by(entry) or (entry.name,):
@@ -139,14 +149,19 @@ class SeenEffects:
                 out.append(Finding(name, Grade.CERTAIN, seen=entry.sentence))
         return out
 
+    @property
+    def _noise(self) -> frozenset[str]:
+        """Effects of the library that make the noise of pixels at rest."""
+        return frozenset(name for one in self.entries if one.name == NOISE for name in self.named_by(one))
+
     def _with_noise(self, entry: Signature, findings: Sequence[Finding]) -> list[Finding]:
-        """Return findings with one of noise that is there and may be of two kinds.
+        """Return findings with one of noise that is there, and that the search has not announced.
 
         Args:
             entry: What shows it.
-            findings: In which neither of the two is announced.
+            findings: In which no noise is announced.
         """
-        kinds = [name for name in KINDS[NOISE] if name in self.library]
+        kinds = [name for name in _effects_of(entry) or KINDS[NOISE] if name in self.library]
         if not kinds:
             return [*findings, Finding(entry.name, Grade.CERTAIN, seen=entry.sentence)]
         nearest = next((one for one in findings if one.effect in kinds), Finding(kinds[0], Grade.EITHER))

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 import dase
+from dase.diagnosis.dead_time import NAME as DEAD_TIME
 from dase.diagnosis.events_at_rest import (
     AT_REST,
     LEAK,
@@ -163,8 +164,14 @@ def test_noise_of_two_kinds_is_said_to_be_either():
     assert (said.effect, said.grade) == (NOISE, Grade.CERTAIN)
 
 
-def test_noise_that_events_name_is_certain():
+def test_noise_that_events_name_is_certain_if_the_search_agrees():
     entry = Signature(name=NOISE, answer=Answer.FOUND, sentence="at rest", details={"effect": "shot"})
+    # a model with shot noise that explains little: another noise may come so
+    for search in ([Finding("shot", Grade.STAND_IN)], []):
+        (said,) = SeenEffects((entry,)).findings(search, ())
+        assert said.words() == "either shot or something that is not in the library"
+    (said,) = SeenEffects((entry,), library=frozenset({"voltage_noise"})).findings([], ())
+    assert (said.effect, said.grade) == (NOISE, Grade.CERTAIN)
     (said,) = SeenEffects((entry,)).findings([Finding("shot", Grade.EITHER, unknown=True)], ())
     assert (said.effect, said.grade, said.unknown) == ("shot", Grade.CERTAIN, False)
 
@@ -176,3 +183,12 @@ def test_what_a_slow_clock_stamps_early_is_no_leak(scene):
     late = Rests(rests.pixels, rests.begin, rests.end + AT_REST.lead)
     assert len(late.events_in(ticks)[0]) > len(rests.events_in(ticks)[0]) + AT_REST.events
     assert found(scene, ticks) is None
+
+
+@pytest.mark.parametrize("name", [NOISE, LEAK, DEAD_TIME])
+def test_what_an_effect_of_the_user_may_make_is_not_called_after_one_of_dase(name):
+    entry = Signature(name=name, answer=Answer.FOUND, sentence="seen", details={})
+    seen = SeenEffects((entry,), library=frozenset(EFFECTS) | {"popping"})
+    assert seen.named_by(entry) == ()
+    mine = Finding("popping", Grade.SUPPORTED)
+    assert seen.findings([mine], ()) == [mine]
