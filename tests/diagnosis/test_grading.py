@@ -148,12 +148,14 @@ def test_what_reports_chooses_nothing(scene, events, found):
 
 
 def test_each_model_has_one_error(found):
-    assert [one.grade for one in found.findings] == [Grade.SUPPORTED]
+    # pixels whose light rests show a leak
+    assert [one.grade for one in found.findings] == [Grade.CERTAIN]
+    assert "all of them ON" in found.findings[0].seen
     assert found.history[0].error == found.errors[0]
     assert found.findings[0].error_without == found.errors[0]
     assert found.findings[0].error_with == found.errors[1]
-    assert found.finding() == "missing: leak (supported)"
-    assert found.to_json()["findings"][0]["grade"] == "supported"
+    assert found.finding() == "missing: leak (certain)"
+    assert found.to_json()["findings"][0]["grade"] == "certain"
 
 
 def test_nothing_is_fitted_to_grade_effects_of_a_model_that_leaves_too_much(monkeypatch):

@@ -215,9 +215,11 @@ def test_what_is_at_the_end_of_its_search_is_not_announced(monkeypatch):
     assert len(said) == 1
     assert said[0].startswith("threshold.on = 3 ")
     scene = moving_bars()
-    events = dase.simulate(scene, sensor, seed=4)
+    events = dase.simulate(scene, Sensor().with_effect(EFFECTS["bandwidth"](cutoff=60.0)), seed=4)
+    library = {name: EFFECTS[name] for name in ("threshold", "bandwidth")}
+    announced = diagnose(events, scene=scene, effects=library, pixels=300)
+    assert announced.selected == ("bandwidth",)
     monkeypatch.setattr("dase.diagnosis.diagnose.parameters_at_bounds", lambda model, values: said)
-    library = {name: EFFECTS[name] for name in ("threshold", "leak")}
     found = diagnose(events, scene=scene, effects=library, pixels=300)
     assert found.selected == ()
     assert "nothing is announced: threshold.on = 3" in found.finding()
