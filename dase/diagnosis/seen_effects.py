@@ -144,6 +144,8 @@ class SeenEffects:
             if entry.name == NOISE:
                 out = self._with_noise(entry, out)
                 continue
+            if KINDS[entry.name] == KINDS[NOISE] and self.entry_of(NOISE):
+                continue  # pairs of opposite events are said with the noise that sends them
             for name in self.named_by(entry) or (entry.name,):
                 out = [one for one in out if one.effect != name]
                 out.append(Finding(name, Grade.CERTAIN, seen=entry.sentence))

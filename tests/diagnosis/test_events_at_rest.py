@@ -192,3 +192,12 @@ def test_what_an_effect_of_the_user_may_make_is_not_called_after_one_of_dase(nam
     assert seen.named_by(entry) == ()
     mine = Finding("popping", Grade.SUPPORTED)
     assert seen.findings([mine], ()) == [mine]
+
+
+def test_pairs_are_said_with_the_noise_that_sends_them():
+    noise = Signature(name=NOISE, answer=Answer.FOUND, sentence="at rest")
+    pairs = Signature(name="opposite pairs", answer=Answer.FOUND, sentence="pairs")
+    (said,) = SeenEffects((pairs, noise)).findings([], ())
+    assert said.words() == "either shot or voltage_noise"
+    (said,) = SeenEffects((pairs,)).findings([], ())
+    assert (said.effect, said.grade) == ("opposite pairs", Grade.CERTAIN)
