@@ -83,9 +83,6 @@ class DeadTimeSettings:
     pixels: int = 100_000
     """Pixels that are looked at, at most."""
 
-    rules: tuple[str, ...] = ("reset", "drop", "delay")
-    """What may become of changes in the dead time."""
-
     worse: float = 0.1
     """By how much a dead time that is certain may raise the error: the data may follow none of the rules."""
 
@@ -220,10 +217,10 @@ def add_dead_time(
         model: Without a dead time.
         judgement: Its held-out error.
         found: Where the intervals end.
-        settings: The rules.
+        settings: By how much the error may rise.
     """
     end, shortest = (float(found.details[key]) for key in ("period", "shortest"))
-    effects = [Refractory(period=end, mode=mode) for mode in settings.rules]
+    effects = [Refractory(period=end, mode=mode) for mode in Refractory.choices()["mode"]]
     effects = [
         replace(one, period=max(end - shortest, 0.5 * end)) if one.resets() else one for one in effects
     ]

@@ -232,7 +232,8 @@ def diagnose(
         if model is not whole and not leaves_nothing(judgement):
             # a stand-in that was dropped may have hidden what it stood for
             model, judgement = _add_one_by_one(state, model, limit - len(state.added_to(model)))
-    seen = _look_for_dead_time(state, seen, measurement, model)
+    if state.added_to(model):  # else it was asked before
+        seen = _look_for_dead_time(state, seen, measurement, model)
     ended = seen.entry_of(DEAD_TIME)
     if ended is not None and REFRACTORY in tried and REFRACTORY not in model.sensor:
         state.certain |= {REFRACTORY}

@@ -84,6 +84,9 @@ class RestSettings:
     together: float = 1.5
     """How much more events come together in time than independent ones: a lamp's come at once."""
 
+    swing: float = 0.03
+    """Variance, relative to the square of the mean, by which that mean may be off: it rises and falls."""
+
     beat: float = 0.002
     """Time in which they come together [s]."""
 
@@ -371,4 +374,4 @@ def _independent(t: Array, rests: Rests, frame_gap: float, settings: RestSetting
     if used.sum() < 10:
         return False
     excess = float(((counts[used] - expected[used]) ** 2 / np.maximum(expected[used], 0.05)).mean())
-    return excess < settings.together + 0.02 * float(expected[used].mean()) * settings.together
+    return excess < settings.together + settings.swing * float(expected[used].mean())

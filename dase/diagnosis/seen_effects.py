@@ -87,10 +87,8 @@ class SeenEffects:
     @property
     def lamp(self) -> float | None:
         """Frequency of light that flickers [Hz]; None where there is none."""
-        for entry in self.entries:
-            if entry.name == "flicker":
-                return float(entry.details["frequency"])
-        return None
+        entry = self.entry_of("flicker")
+        return float(entry.details["frequency"]) if entry else None
 
     @property
     def effects(self) -> dict[str, str]:
@@ -105,10 +103,8 @@ class SeenEffects:
 
     def times_of_bursts(self, measurement: Measurement) -> BurstTimes | None:
         """Return when the bursts of a measurement come; None where there are none at even times."""
-        for entry in self.entries:
-            if entry.name == "frame coupling":
-                return burst_times_of(measurement, entry)
-        return None
+        entry = self.entry_of("frame coupling")
+        return burst_times_of(measurement, entry) if entry else None
 
     def named_by(self, entry: Signature) -> tuple[str, ...]:
         """Return the effects of the library that a signature names; there may be none."""
@@ -254,7 +250,8 @@ def without_the_explained(
     gained = {effect.name for effect in sensor.effects} - {effect.name for effect in before.effects}
     if gained <= set(MADE_BY_LIGHT):
         return seen  # what comes with the light is the same for all pixels
-    open_ = [entry for entry in seen.entries if not seen.named_by(entry)]
+    # what a model was asked for already, signatures of its events do not show
+    open_ = [one for one in seen.entries if not seen.named_by(one) and one.name not in WITH_A_SCENE]
     open_ = _asked_of_scene(open_, measurement.scene)
     if not open_:
         return seen
