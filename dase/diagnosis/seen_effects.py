@@ -11,6 +11,7 @@ from dataclasses import dataclass, replace
 
 from dase.diagnosis.dead_time import NAME as DEAD_TIME
 from dase.diagnosis.events_at_rest import LEAK, NOISE
+from dase.diagnosis.frames_at_rest import events_where_frames_rest
 from dase.effects import EFFECTS, Effect
 from dase.effects.threshold import Threshold
 from dase.errors import InputError
@@ -24,6 +25,7 @@ from dase.scenes.scene import Scene
 from dase.signatures.burst_times import BurstTimes
 from dase.signatures.find import find_signatures
 from dase.signatures.frame_coupling import BurstClock
+from dase.signatures.opposite_pairs import NAME as OPPOSITE_PAIRS
 from dase.signatures.result import Answer, Signature
 from dase.simulation.sensor import Sensor
 from dase.simulation.simulate import simulate
@@ -222,14 +224,19 @@ def without_the_scene(seen: SeenEffects, measurement: Measurement, sensor: Senso
         sensor: The model before the search.
         seed: Of its random numbers.
     """
-    asked = _asked_of_scene(seen.entries, measurement.scene)
+    scene = measurement.scene
+    if isinstance(scene, CameraScene):
+        seen = replace(
+            seen, entries=tuple(one for one in seen.entries if _is_at_rest(one, measurement, scene))
+        )
+    asked = _asked_of_scene(seen.entries, scene)
     if not asked:
         return seen
     kept = seen.entries
     for sharper in SHARPER:
         more = asked if sharper == 1 else [entry for entry in asked if entry.name in MADE_BY_LIGHT]
         if any(entry in kept for entry in more):
-            made = _signatures_of(measurement.scene, _with_thresholds(sensor, sharper), seed)
+            made = _signatures_of(scene, _with_thresholds(sensor, sharper), seed)
             kept = tuple(entry for entry in kept if entry not in more or not shows_in(made, entry))
     coupled = any(entry.name == "frame coupling" for entry in kept)
     return replace(seen, entries=kept, bursts=seen.bursts if coupled else None)
@@ -326,6 +333,14 @@ def _asked_of_scene(entries: Collection[Signature], scene: Scene) -> list[Signat
     if not isinstance(scene, CameraScene):
         return list(entries)
     return [entry for entry in entries if entry.name == "fixed pattern"]
+
+
+def _is_at_rest(entry: Signature, measurement: Measurement, scene: CameraScene) -> bool:
+    """Return whether a signature of pixels at rest is there where a camera's frames rest; others are."""
+    if entry.name != OPPOSITE_PAIRS:
+        return True
+    resting = events_where_frames_rest(measurement.compared_events(), scene)
+    return len(resting) > 0 and find_signatures(resting)[OPPOSITE_PAIRS].found
 
 
 def _with_thresholds(sensor: Sensor, times: float) -> Sensor:

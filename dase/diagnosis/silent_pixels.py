@@ -2,7 +2,8 @@
 
 A fit looks at some thousand pixels, of which a few are dead; their share then is mostly chance, and makes all
 else look like chance beside it. What makes pixels differ a little looks like a few dead ones, too. All pixels
-together tell at once: one that is silent while all around it the same light makes events is dead.
+together tell at once: one that is silent while all around it the same light makes events is dead. Where
+others there send hardly anything, silence is the end of a range: of slow pixels in the dark, say.
 """
 
 from __future__ import annotations
@@ -51,6 +52,13 @@ class SilentPixelSettings:
     least: int = 3
     """Silent pixels that there must be."""
 
+    hardly: int = 3
+    """Events of a pixel that sends hardly anything, at most."""
+
+    apart: float = 3.0
+    """Silent pixels, as times those that send hardly anything: 157 to 269 dead ones had one of these beside
+    them at most, 12 that a slow second pole had silenced had ten."""
+
     enough: int = 1000
     """Pixels of which events are expected, from which on the lack of silent ones says that none are dead."""
 
@@ -72,16 +80,23 @@ class SilentPixels:
         pixels: Those that are silent where events are expected, row-major, shape (K,).
         asked: Pixels of which events are expected.
         settings: How many there must be.
+        hardly: Pixels of which events are expected, and that send hardly any.
     """
 
     pixels: NDArray[np.int64]
     asked: int
     settings: SilentPixelSettings = SILENT_PIXELS
+    hardly: int = 0
+
+    @property
+    def needed(self) -> float:
+        """Silent pixels from which on some are dead."""
+        return max(self.settings.least, self.settings.apart * self.hardly)
 
     @property
     def found(self) -> bool:
         """Whether some pixels are dead."""
-        return len(self.pixels) >= self.settings.least
+        return len(self.pixels) >= self.needed
 
     @property
     def decides(self) -> bool:
@@ -106,7 +121,7 @@ class SilentPixels:
 
     def limit(self) -> DetectionLimit:
         """Return the share of dead pixels that would have been seen."""
-        share = self.settings.least / max(self.asked, 1)
+        share = self.needed / max(self.asked, 1)
         sentence = f"dead pixels: {self.sentence}; a share above {share:.2g} would have been seen"
         return DetectionLimit(NAME, f"{NAME}.share", share, "1", True, sentence)
 
@@ -144,9 +159,11 @@ def find_silent_pixels(
     )  # fmt: skip
     if measurement.trust is not None:
         asked &= _ever_trusted(measurement.trust, scene, times)[inside]
-    rows, columns = np.nonzero(asked & (counts[inside] == 0))
+    sent = counts[inside]
+    rows, columns = np.nonzero(asked & (sent == 0))
     pixels = (rows + 1) * np.int64(events.width) + columns + 1
-    return SilentPixels(pixels, int(np.count_nonzero(asked)), settings)
+    hardly = np.count_nonzero(asked & (sent > 0) & (sent <= settings.hardly))
+    return SilentPixels(pixels, int(np.count_nonzero(asked)), settings, int(hardly))
 
 
 def _range_and_mean(

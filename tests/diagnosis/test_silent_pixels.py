@@ -72,6 +72,23 @@ def test_no_other_effect_silences_single_pixels(scene, effect):
     assert found.limit().strength == pytest.approx(3 / found.asked)
 
 
+def test_silence_at_the_end_of_a_range_is_no_death(scene):
+    """Where as many pixels send one to three events as none, what silences them does so by degrees."""
+    events = dase.simulate(scene, Sensor(), seed=5)
+    order = np.lexsort((events.t, events.y.astype(np.int64) * WIDTH + events.x))
+    pixel = (events.y.astype(np.int64) * WIDTH + events.x)[order]
+    begin = np.searchsorted(pixel, pixel)
+    middle = (np.indices((HEIGHT, WIDTH))[:, 8:-8:7, 8:-8:7].reshape(2, -1) * [[WIDTH], [1]]).sum(0)[:40]
+    for some, dead in (((0,), True), ((0, 1, 2, 3), False)):
+        allowed = np.full(WIDTH * HEIGHT, np.iinfo(np.int64).max)
+        allowed[middle] = np.resize(some, len(middle))
+        kept = np.sort(order[np.arange(len(order)) - begin < allowed[pixel]])
+        found = find_silent_pixels(Measurement(events.select(kept), scene), log_eps=1e-3)
+        assert (found.found, found.decides) == (dead, True)
+        assert len(found.pixels) >= 3
+        assert found.limit().strength == pytest.approx(found.needed / found.asked)
+
+
 @pytest.mark.parametrize("span", [None, (0.1605, 0.1795)])
 def test_frames_of_a_camera_tell_dead_pixels_as_well(scene, span):
     sensor = Sensor().with_effect(EFFECTS["dead"](share=0.02))
