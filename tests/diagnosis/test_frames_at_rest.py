@@ -42,7 +42,7 @@ def pairs_at(columns: np.ndarray, seconds: tuple[float, float], rng: np.random.G
     )
 
 
-@pytest.mark.parametrize("columns, seconds, rest", [
+@pytest.mark.parametrize(("columns", "seconds", "rest"), [
     (np.arange(4, 18), (1.1, 1.9), False),
     (np.arange(4, 18), (0.1, 0.85), True),
     (np.arange(30, 44), (1.1, 1.9), True),
