@@ -237,7 +237,7 @@ def diagnose(
     if len(state.added_to(model)) > 1:
         whole = model
         model, judgement = prune_model(state, model, judgement)
-        if model is not whole and not leaves_nothing(judgement):
+        if model is not whole and not leaves_nothing(judgement) and not state.has_asked(model):
             # a stand-in that was dropped may have hidden what it stood for
             model, judgement = _add_one_by_one(state, model, limit - len(state.added_to(model)))
     if state.added_to(model):  # else it was asked before
