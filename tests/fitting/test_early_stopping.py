@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -25,6 +26,7 @@ from dase.fitting.descent import descent_work
 from dase.fitting.early_stopping import CandidateRace, stop_unless_below
 from dase.fitting.model import model_of
 from dase.fitting.scheduler import run_work
+from dase.results import Rank, Step
 from dase.simulation.sensor import Sensor
 
 THRESHOLD = EFFECTS["threshold"](on=0.18, off=0.2)
@@ -122,6 +124,18 @@ def test_beside_a_model_far_off_only_what_comes_near_the_floor_is_fitted_to_all_
     assert min(one.error for one in judged if one.judgement) < 0.8
     assert train.evaluations > before
     assert refit_and_judge_far_off(search.evidence, [], seed=1) == []
+
+
+def test_all_effects_are_tried_once_beside_the_same_ones(search):
+    def tried(*names: str) -> Step:
+        ranking = tuple(Rank(name, 1.0, 0.5, 0.5, 0.01, {}, True) for name in names)
+        return Step(("threshold", "mismatch"), 1.5, 1.15, {}, ranking, None, (), ())
+
+    state = replace(search, certain=frozenset({"hot"}), history=[])
+    for history, asked in (([], False), ([tried()], False), ([tried("hot")], False), ([tried("leak")], True)):
+        state.history = history
+        assert state.has_asked(model_of(TRUE)) is asked
+        assert not state.has_asked(model_of(Sensor((THRESHOLD,))))
 
 
 def test_only_what_one_descent_takes_near_is_fitted_in_full(search):
