@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,6 +31,8 @@ from dase.probes.distance import ErrorScale, Judgement
 from dase.probes.random_streams import SimulationStream
 
 Array = NDArray[np.float64]
+
+Split = TypeVar("Split", bound=SplitMeasurement)
 
 
 @dataclass(frozen=True, eq=False)
@@ -240,7 +243,8 @@ def refine_candidate(
     """
     # a finalist that is still on its way would be judged by where it happens to be
     half = evidence.train.loaded(tried.model.space, tried.model.place)
-    ways = shift_periodic_effects(tried.model, half.frame.step)
+    # those of the present model were shifted when they were tried
+    ways = shift_periodic_effects(tried.model, half.frame.step, [tried.name])
     works = []
     for way in ways:
         over = race.over(tried.name)
@@ -277,6 +281,8 @@ def refit_and_judge(
     they would look worse than they are. The repeats that give those of a candidate also tell its error where
     it was fitted so far; candidates far behind the best by that measure go no further.
     """
+    if not candidates:
+        return []
     found = run_side_by_side([_error_where_fitted(evidence, one, seed=seed) for one in candidates])
     limit = settings.behind * min(error for error, _ in found) + settings.close
     race = CandidateRace(1, settings.loses)
@@ -296,6 +302,39 @@ def refit_and_judge(
         again = _settle_and_judge(evidence, least, half, settings.repeats, None, seed=seed)
         done[least.name] = run_work(again)
     return [done.get(one.name, one) for one in candidates]
+
+
+def refit_and_judge_far_off(
+    evidence: SplitMeasurement,
+    candidates: Sequence[Candidate],
+    *,
+    seed: int,
+    settings: CandidateSettings = DEFAULTS.candidates,
+) -> list[Candidate]:
+    """Do what `refit_and_judge` does beside a present model that is far off, by fits to the scout.
+
+    What more pixels would tell is less than what most candidates leave. Where one comes near the floor, it
+    and those that are not clearly behind it are fitted to all pixels of the training half before they are
+    judged. So is an effect of few pixels, of which the scout knows nothing.
+    """
+    many = [one for one in candidates if not is_rare(one)]
+    few = [one for one in candidates if is_rare(one)]
+    done = refit_and_judge(scout_of(evidence), many, seed=seed, settings=settings)
+    least = min((one.error for one in done if one.judgement), default=np.inf)
+    limit = max(settings.far, settings.behind * least + settings.close) if least <= settings.far else 0.0
+    again = [one for one in done if one.judgement and one.error <= limit]
+    known = [one for one in done if one not in again]
+    return known + refit_and_judge(evidence, [*again, *few], seed=seed, settings=settings)
+
+
+def scout_of(evidence: Split) -> Split:
+    """Return a measurement of which only the pixels of the scout are fitted."""
+    return replace(evidence, train=evidence.scout)
+
+
+def is_rare(tried: Candidate) -> bool:
+    """Whether a candidate acts on so few pixels that the scout does not show it."""
+    return acts_on_few_pixels(tried.model.sensor[tried.name])
 
 
 def _held_out_error(tried: Candidate) -> float:
@@ -348,8 +387,7 @@ def try_effects(
         worst: Families in which the present model fails: who helps there is looked at more closely.
         seed: Of every random number.
         report: Told how far it is.
-        far: Whether the present model is so far off that candidates are fitted to the scout before they
-            are judged.
+        far: Whether the present model is so far off that candidates are fitted to the scout.
         settings: Numbers by which candidates are chosen.
 
     Returns:
@@ -361,16 +399,23 @@ def try_effects(
     order, left = _screen_variants(evidence, present, variants, seed=seed, report=report, settings=settings)
     first = order[: settings.finalists]
     chosen = [*first, *family_specialists(order, first, worst)]
-    rare = any(acts_on_few_pixels(one.model.sensor[one.name]) for one in chosen)
-    fitted = replace(evidence, train=evidence.scout) if far and not rare else evidence
     report(f"fitting {', '.join(one.name for one in chosen)}", 0.5)
-    refined, behind = _refine_candidates(fitted, present, chosen, seed=seed, settings=settings)
-    finalists = with_p_values(fitted, present, refined, seed=seed)
-    # what chance does as well is not added, whatever its error; few repeats cannot give a small p-value
-    significant = max(settings.significant, 1.01 / (1 + len(fitted.train.repeats)))
-    certain = [one for one in finalists if one.p_value <= significant]
+    parts = [(evidence, chosen)]
+    if far:
+        few = [one for one in chosen if is_rare(one)]
+        parts = [(scout_of(evidence), [one for one in chosen if one not in few]), (evidence, few)]
+    finalists, behind, certain = list[Candidate](), list[Candidate](), list[Candidate]()
+    for fitted, some in (part for part in parts if part[1]):
+        refined, left_behind = _refine_candidates(fitted, present, some, seed=seed, settings=settings)
+        behind += left_behind
+        tested = with_p_values(fitted, present, refined, seed=seed)
+        # what chance does as well is not added, whatever its error; few repeats cannot give a small p-value
+        significant = max(settings.significant, 1.01 / (1 + len(fitted.train.repeats)))
+        certain += [one for one in tested if one.p_value <= significant]
+        finalists += tested
     report(f"judging {', '.join(one.name for one in certain)}", 0.75)
-    done = refit_and_judge(evidence, certain, seed=seed, settings=settings) if certain else []
+    judge = refit_and_judge_far_off if far else refit_and_judge
+    done = judge(evidence, certain, seed=seed, settings=settings)
     done += [one for one in finalists if one not in certain]
     done.sort(key=lambda one: (one.error if one.judgement else np.inf, one.p_value))
     return [*done, *behind, *(one for one in order if one not in chosen), *left]

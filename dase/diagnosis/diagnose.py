@@ -16,7 +16,9 @@ from dase.diagnosis.candidates import (
     Candidate,
     calibrate_split,
     effects_to_try,
+    is_rare,
     refit_and_judge,
+    scout_of,
     try_effects,
     variants_to_try,
 )
@@ -35,6 +37,7 @@ from dase.diagnosis.remainder import describe_unexplained, share_of_scene, what_
 from dase.diagnosis.seen_effects import (
     SeenEffects,
     find_seen_effects,
+    part_to_simulate,
     strength_of_bursts,
     with_effect_of_bursts,
     without_the_explained,
@@ -130,6 +133,14 @@ def diagnose(
     refuse_idle(given, free)
     measurement = as_measurement(measured, scene, trust)
     given = given.bound_to(measurement.scene)
+    scene = measurement.scene
+    guessed = scene if isinstance(scene, CameraScene) and is_guessed(scene) else None
+    plenty, parts = settings.plenty, SPLIT
+    if guessed is not None and pixels > settings.guessed_pixels:
+        # fewer pixels over the same time
+        fewer = settings.guessed_pixels / pixels
+        plenty, pixels = fewer * plenty, settings.guessed_pixels
+        parts = replace(parts, scouts=round(fewer * parts.scouts))
     tell("looking at the events alone", 0.0, float("nan"))
     seen = find_seen_effects(measurement, effects)
     # a sensor that has them already is compared with them
@@ -143,7 +154,7 @@ def diagnose(
         split_measurement, measurement.events, measurement.scene, log_eps=given.log_eps,
         trust=measurement.trust, span=measurement.span, left_out=bursts.contains if bursts else None,
         odd_pixels=_odd_pixels(hot, dead), lamp=seen.lamp, frames=frames, unbroken=given.unbroken,
-        plenty=settings.plenty, pixels=pixels, seed=seed, device=device,
+        plenty=plenty, pixels=pixels, seed=seed, device=device, settings=parts,
     )  # fmt: skip
     evidence = split()
     notes = list[str]()
@@ -173,9 +184,7 @@ def diagnose(
         .error
     )
     start = _fitted_unless_worse(state, given, free)
-    seen = without_the_scene(seen, measurement, start.sensor, seed)
-    scene = measurement.scene
-    guessed = scene if isinstance(scene, CameraScene) and is_guessed(scene) else None
+    seen = without_the_scene(seen, part_to_simulate(measurement, evidence.when), start.sensor, seed)
     if guessed is not None:
         tell("how well the scene is known", 0.0, before)
         state.evidence = evidence = with_scene_doubt(evidence, guessed, start, seed=seed)
@@ -194,8 +203,7 @@ def diagnose(
             f"{len(hot)} hot pixels are left out of all that is compared, and counted among all pixels"
         )
     strength = None if evidence.contradiction else strength_of_bursts(
-        seen, measurement, start.sensor, effects, pixels=pixels, plenty=settings.plenty, seed=seed,
-        device=device,
+        seen, measurement, start.sensor, effects, pixels=pixels, plenty=plenty, seed=seed, device=device,
     )  # fmt: skip
     if strength is not None:
         # pixels remember the bursts between them, too
@@ -229,7 +237,7 @@ def diagnose(
     if len(state.added_to(model)) > 1:
         whole = model
         model, judgement = prune_model(state, model, judgement)
-        if model is not whole and not leaves_nothing(judgement):
+        if model is not whole and not leaves_nothing(judgement) and not state.has_asked(model):
             # a stand-in that was dropped may have hidden what it stood for
             model, judgement = _add_one_by_one(state, model, limit - len(state.added_to(model)))
     if state.added_to(model):  # else it was asked before
@@ -251,7 +259,7 @@ def diagnose(
         # beside other effects it may be another
         last = strength_of_bursts(
             seen, measurement, found.sensor.without(strength.effect.name), effects,
-            pixels=pixels, plenty=settings.plenty, seed=seed, device=device,
+            pixels=pixels, plenty=plenty, seed=seed, device=device,
         )  # fmt: skip
         found = with_effect_of_bursts(found, last or strength)
     return measurement.noted(replace(found, seconds=time.perf_counter() - begin))
@@ -396,7 +404,10 @@ def _look_for_effect(
     state.note_addition(best, [one for one in tried if one.judgement], ties, judgement)
     step = replace(step, chosen=best.name, ties=ties)
     on_its_way = best.error > settings.on_its_way * judgement.gate
-    return step, refit_model(evidence, best.model, seed=seed, rounds=1), on_its_way
+    # what is added next moves all of it again
+    enough = far and best.error > settings.far * judgement.gate and not is_rare(best)
+    fitted = scout_of(evidence) if enough else evidence
+    return step, refit_model(fitted, best.model, seed=seed, rounds=1), on_its_way
 
 
 def _seen_at_rest(
@@ -490,8 +501,11 @@ def _add_pair(
         evidence.scout, repeats=settings.scout_repeats, seed=SimulationStream.CALIBRATE_SCOUT.seed(seed)
     )
     pairs = list(combinations(singles, 2))
+    # a pair has to do better than what was found one by one
+    present = scout.run(model.space, model.place[None], seed=seed)[0]
+    goal = settings.pair_behind * float(scout.scale.loss(present))
     # only the first are fitted to all pixels
-    race, works, names = CandidateRace(settings.fitted_pairs), [], []
+    race, works, names = CandidateRace(settings.fitted_pairs, goal=goal), [], []
     for one, two in pairs:
         both = one.model.sensor.with_effect(two.model.sensor[two.name])
         pair = with_same_freedom(both, start, (one.name, two.name))
@@ -504,7 +518,7 @@ def _add_pair(
     best = dict[str, FittedModel]()
     for name, pair in sorted(zip(names, ends, strict=True), key=lambda named: named[1].loss):
         best.setdefault(name, pair)
-    first = list(best.items())[: settings.fitted_pairs]
+    first = [(name, pair) for name, pair in best.items() if pair.loss <= goal][: settings.fitted_pairs]
     settled = run_side_by_side([refit_work(evidence, pair, seed=seed) for _, pair in first])
     ranking: list[Rank] = []
     for (name, _), pair in zip(first, settled, strict=True):
@@ -582,7 +596,8 @@ def _conclude_diagnosis(
     for name, one in judged_effects.items():
         # a stand-in explains nothing that the events show
         explained = explained.without(name) if one.grade is Grade.STAND_IN else explained
-    seen = without_the_explained(seen, measurement, explained, state.seed, before=start.sensor)
+    part = part_to_simulate(measurement, state.evidence.when)
+    seen = without_the_explained(seen, part, explained, state.seed, before=start.sensor)
     said = seen.findings(judged_effects.values(), names)
     findings = {one.effect: one for one in said if one.grade is not Grade.STAND_IN}
     kept = tuple(n for n in order if n in findings and findings[n].grade is not Grade.EITHER)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
+from dase.diagnosis.candidates import scout_of
 from dase.diagnosis.directional_test import lacks_effect_of
 from dase.diagnosis.state import DiagnosisState, explains_remainder, with_same_freedom
 from dase.fitting.early_stopping import stop_unless_below
@@ -105,10 +106,13 @@ def _drop_needless(
 def _keep_near_models(
     state: DiagnosisState, ways: Mapping[str, FittedModel], error: float
 ) -> dict[str, FittedModel]:
-    """Return those models that are near an error, or that one descent takes there: worth a full fit."""
+    """Return those models that are near an error, or that one descent takes there: worth a full fit.
+
+    The descent sees the pixels of the scout alone: what more would tell is far less than the limit leaves.
+    """
     evidence, seed, pruning = state.evidence, state.seed, state.settings.pruning
-    stream = SimulationStream.JUDGE.seed(seed)
-    ends = run_side_by_side([refit_work(evidence, way, seed=seed, rounds=1) for way in ways.values()])
+    stream, scout = SimulationStream.JUDGE.seed(seed), scout_of(evidence)
+    ends = run_side_by_side([refit_work(scout, way, seed=seed, rounds=1) for way in ways.values()])
     judged = run_side_by_side(
         [
             m.judgement_work(evidence.held, repeats=pruning.repeats, seed=stream)

@@ -9,6 +9,9 @@ from __future__ import annotations
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 
+import numpy as np
+from numpy.typing import NDArray
+
 from dase.diagnosis.dead_time import NAME as DEAD_TIME
 from dase.diagnosis.events_at_rest import LEAK, NOISE
 from dase.diagnosis.frames_at_rest import events_where_frames_rest
@@ -240,6 +243,22 @@ def without_the_scene(seen: SeenEffects, measurement: Measurement, sensor: Senso
             kept = tuple(entry for entry in kept if entry not in more or not shows_in(made, entry))
     coupled = any(entry.name == "frame coupling" for entry in kept)
     return replace(seen, entries=kept, bursts=seen.bursts if coupled else None)
+
+
+def part_to_simulate(measurement: Measurement, when: NDArray[np.float64]) -> Measurement:
+    """Return a measurement whose scene, if it is between a camera's frames, lasts as long as is compared.
+
+    Of such a scene only patterns of the pixels are asked, which show in any part of the time; to simulate all
+    pixels over minutes would take longer than the search.
+
+    Args:
+        measurement: All of it.
+        when: Times that are compared [s], increasing, shape (T,).
+    """
+    scene = measurement.scene
+    if not isinstance(scene, CameraScene):
+        return measurement
+    return replace(measurement, scene=scene.within(float(when[0]), float(when[-1])))
 
 
 def without_the_explained(

@@ -255,6 +255,10 @@ class DiagnosisSettings:
     """Events of the pixels of one part from which on a longer time is not compared: other simulators' clips,
     in which most effects are found, have 6,000 to 100,000, and what takes longest are long recordings."""
 
+    guessed_pixels: int = 500
+    """Pixels in each part of a measurement whose scene is guessed between a camera's frames: there what the
+    scene is not known to outweighs what more pixels would tell."""
+
     later: float = 0.3
     """Error above the level of chance where the model was fitted, as a share of that where it is judged,
     below which what is missing comes late in the recording, and all of its time is fitted."""
@@ -272,6 +276,10 @@ class DiagnosisSettings:
 
     fitted_pairs: int = 2
     """Pairs that are fitted to all pixels; others stop where they will not come near these on the scout."""
+
+    pair_behind: float = 2.0
+    """A pair goes no further where its loss on the scout will not come below this, in units of that of the
+    model to which effects were added one by one: both by the sampling errors of the model before any."""
 
     pair_helps_alone: float = 0.98
     """Only those whose screening brought the loss below this, in units of the present model's."""

@@ -92,6 +92,14 @@ class DiagnosisState:
         if reaches_floor(without):
             self.without[best.name] = without
 
+    def has_asked(self, model: FittedModel) -> bool:
+        """Whether all effects were tried beside those of a model before, wherever its values were."""
+        mine = {effect.name for effect in model.space.sensor.effects}
+        return any(
+            set(step.model) == mine and not self.certain.issuperset(rank.effect for rank in step.ranking)
+            for step in self.history
+        )
+
     def added_to(self, model: FittedModel) -> tuple[str, ...]:
         """Return the effects of a model that the given sensor did not have."""
         return tuple(e.name for e in model.space.sensor.effects if e.name not in self.given)

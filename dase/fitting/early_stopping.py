@@ -15,12 +15,14 @@ class CandidateRace:
         places: Candidates that go on.
         lags: A search stops where its loss will stay above this, relative to that of the last of those.
         own_lags: The same relative to another search of its own candidate.
+        goal: A search stops where its loss will stay above this, whatever others reach.
         best: The least loss of each candidate.
     """
 
     places: int
     lags: float = 1.1
     own_lags: float = 1.1
+    goal: float = float("inf")
     best: dict[str, float] = field(default_factory=dict)
 
     def over(self, name: str, unit: float = 1.0) -> StopRule:
@@ -31,7 +33,7 @@ class CandidateRace:
             first = sorted(self.best.values())[: self.places]
             last = first[-1] if len(first) == self.places else float("inf")
             soon = expected_loss(loss, before) / unit
-            return soon > min(self.lags * last, self.own_lags * self.best[name])
+            return soon > min(self.lags * last, self.own_lags * self.best[name], self.goal)
 
         return over
 

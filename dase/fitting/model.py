@@ -158,7 +158,9 @@ def with_phase(model: FittedModel, phase: float) -> FittedModel:
     return replace(model, space=replace(model.space, sensor=sensor))
 
 
-def shift_periodic_effects(model: FittedModel, step: float) -> list[FittedModel]:
+def shift_periodic_effects(
+    model: FittedModel, step: float, names: Collection[str] | None = None
+) -> list[FittedModel]:
     """Return a model, and for each effect that repeats in time those with it earlier and later.
 
     What probes tell by steps hardly changes when all events are a step off, so a fit may end there.
@@ -166,9 +168,12 @@ def shift_periodic_effects(model: FittedModel, step: float) -> list[FittedModel]
     Args:
         model: Whose effects are shifted.
         step: Of the grid of time [s].
+        names: Of the effects that are; None for all.
     """
     out = [model]
     for effect in model.sensor.effects:
+        if names is not None and effect.name not in names:
+            continue
         for seconds in (-step, step):
             place, moved = model.place.copy(), effect.shifted(seconds)
             for n, axis in enumerate(model.space.axes):

@@ -131,7 +131,15 @@ class CameraScene(Scene):
 
     def every(self, step: int) -> CameraScene:
         """Return the scene between each `step`-th frame only."""
-        kept = slice(None, None, step)
+        return self._of_frames(slice(None, None, step))
+
+    def within(self, first: float, last: float) -> CameraScene:
+        """Return the scene between the frames about a stretch of time, from `first` to `last` [s]."""
+        begin = int(np.clip(np.searchsorted(self.times, first, "right") - 1, 0, len(self) - 2))
+        end = int(np.clip(np.searchsorted(self.times, last), begin + 1, len(self) - 1))
+        return self._of_frames(slice(begin, end + 1))
+
+    def _of_frames(self, kept: slice) -> CameraScene:
         return CameraScene(
             self._raw[kept], self.begin[kept], self.end[kept], gamma=self.gamma, black=self.black,
             white=self.white, gains=self._gains[kept], travel=self.travel, shortest=self.shortest,

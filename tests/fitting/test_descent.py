@@ -48,6 +48,9 @@ def test_a_lamp_is_also_looked_for_one_step_earlier_and_later(lit):
     np.testing.assert_allclose(got, [0.05, 0.95, 0.15], atol=1e-6)
     bare = model_of(Sensor())
     assert shift_periodic_effects(bare, 1e-3) == [bare]
+    present = model_of(lit)
+    assert shift_periodic_effects(present, 1e-3, ["bandwidth"]) == [present]
+    assert len(shift_periodic_effects(present, 1e-3, ["flicker"])) == 3
 
 
 def test_a_lamp_at_the_end_of_the_range_of_phases_stays_within(lit):

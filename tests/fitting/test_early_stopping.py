@@ -2,13 +2,20 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 import dase
-from dase.diagnosis.candidates import calibrate_split, try_effects, worth_descending
+from dase.diagnosis.candidates import (
+    Candidate,
+    calibrate_split,
+    refit_and_judge_far_off,
+    try_effects,
+    worth_descending,
+)
 from dase.diagnosis.explain_effect import moving_bars
 from dase.diagnosis.pruning import _keep_near_models
 from dase.diagnosis.settings import DEFAULTS
@@ -19,6 +26,7 @@ from dase.fitting.descent import descent_work
 from dase.fitting.early_stopping import CandidateRace, stop_unless_below
 from dase.fitting.model import model_of
 from dase.fitting.scheduler import run_work
+from dase.results import Rank, Step
 from dase.simulation.sensor import Sensor
 
 THRESHOLD = EFFECTS["threshold"](on=0.18, off=0.2)
@@ -43,6 +51,13 @@ def test_of_two_searches_of_a_candidate_the_one_behind_stops():
     assert not other(1.4, np.inf)
     assert other(1.3, 1.4)
     assert not one(0.99, 1.0)
+
+
+def test_what_comes_to_the_front_stops_where_even_that_is_not_enough():
+    over = CandidateRace(1, goal=2.0).over("a")
+    assert not over(9.0, np.inf)
+    assert not over(4.0, 8.0)  # at 1 after two more
+    assert over(3.9, 4.0)
 
 
 def test_a_goal_out_of_reach():
@@ -93,6 +108,34 @@ def test_what_chance_does_as_well_is_not_judged(search, lacks):
         assert tried[0].error < 0.8
     else:
         assert all(t.judgement is None for t in tried)
+
+
+def test_beside_a_model_far_off_only_what_comes_near_the_floor_is_fitted_to_all_pixels(search):
+    train = search.evidence.train.trials
+    wrong = Sensor((EFFECTS["threshold"](on=0.5, off=0.5),)).with_effect(EFFECTS["leak"](rate=1.0))
+    far = Candidate("leak", model_of(wrong, ["leak.rate"]), 1.0)
+    near = Candidate("mismatch", model_of(TRUE), 1.0)
+    before = train.evaluations
+    (judged,) = refit_and_judge_far_off(search.evidence, [far], seed=1)
+    assert judged.error > DEFAULTS.candidates.far
+    assert train.evaluations == before
+    judged = refit_and_judge_far_off(search.evidence, [far, near], seed=1)
+    assert {one.name for one in judged} == {"leak", "mismatch"}
+    assert min(one.error for one in judged if one.judgement) < 0.8
+    assert train.evaluations > before
+    assert refit_and_judge_far_off(search.evidence, [], seed=1) == []
+
+
+def test_all_effects_are_tried_once_beside_the_same_ones(search):
+    def tried(*names: str) -> Step:
+        ranking = tuple(Rank(name, 1.0, 0.5, 0.5, 0.01, {}, True) for name in names)
+        return Step(("threshold", "mismatch"), 1.5, 1.15, {}, ranking, None, (), ())
+
+    state = replace(search, certain=frozenset({"hot"}), history=[])
+    for history, asked in (([], False), ([tried()], False), ([tried("hot")], False), ([tried("leak")], True)):
+        state.history = history
+        assert state.has_asked(model_of(TRUE)) is asked
+        assert not state.has_asked(model_of(Sensor((THRESHOLD,))))
 
 
 def test_only_what_one_descent_takes_near_is_fitted_in_full(search):

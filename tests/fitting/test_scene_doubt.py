@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from types import SimpleNamespace
+from typing import Any
 
 import cv2
 import numpy as np
@@ -96,3 +97,33 @@ def test_every_second_frame_is_the_same_camera():
     np.testing.assert_array_equal(half.times, camera.times[::2])
     np.testing.assert_array_equal(half.intensity(1), camera.intensity(2))
     assert half.trust == camera.trust
+
+
+def test_a_part_of_the_time_is_the_same_scene():
+    camera = filmed(shaking(0.5))
+    first, last = camera.times[3] + 0.01, camera.times[6] - 0.01
+    part = camera.within(first, last)
+    np.testing.assert_array_equal(part.times, camera.times[3:7])
+    times = np.linspace(first, last, 5)
+    np.testing.assert_allclose(part.frames(times), camera.frames(times), atol=1e-6)
+    np.testing.assert_array_equal(camera.within(-1.0, 9.0).times, camera.times)
+    np.testing.assert_array_equal(camera.within(0.2, 0.2).times, camera.within(0.19, 0.21).times)
+
+
+def test_fewer_pixels_are_compared_where_the_scene_is_guessed(monkeypatch):
+    """Over the same time, and with a third of them in the scout."""
+    asked: list[dict[str, Any]] = []
+
+    def split(*args: Any, **options: Any) -> Any:
+        asked.append(options)
+        raise dase.InputError("enough")
+
+    monkeypatch.setattr("dase.diagnosis.diagnose.split_measurement", split)
+    scene = shaking(0.5)
+    events = dase.simulate(scene, TRUE, seed=1)
+    for known, fewer in ((scene, 1.0), (filmed(scene), 1 / 3)):
+        with pytest.raises(dase.InputError, match="enough"):
+            dase.diagnose(events, TRUE, scene=known, pixels=1500)
+        assert asked[-1]["pixels"] == round(1500 * fewer)
+        assert asked[-1]["plenty"] == pytest.approx(DEFAULTS.plenty * fewer)
+        assert asked[-1]["settings"].scouts == round(500 * fewer)
