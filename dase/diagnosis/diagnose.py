@@ -44,6 +44,9 @@ from dase.diagnosis.settings import DEFAULTS, DiagnosisSettings
 from dase.diagnosis.silent_pixels import NAME as DEAD
 from dase.diagnosis.silent_pixels import SilentPixels, find_silent_pixels, with_dead_pixels
 from dase.diagnosis.state import DiagnosisState, explains_remainder, with_same_freedom
+from dase.diagnosis.unequal_thresholds import EFFECT as MISMATCH
+from dase.diagnosis.unequal_thresholds import NAME as UNEQUAL
+from dase.diagnosis.unequal_thresholds import find_unequal_thresholds, with_unequal_thresholds
 from dase.effects import EFFECTS, Effect
 from dase.effects.threshold import Threshold
 from dase.fitting.burst_strength import follows_frames, put_in_step
@@ -187,8 +190,9 @@ def diagnose(
         start = _fitted_unless_worse(state, start.sensor, free)
     seen = _look_where_light_rests(state, seen, measurement, start)
     seen = _look_for_dead_time(state, seen, measurement, start)
+    seen = _look_at_thresholds(state, seen, measurement, start)
     state.certain = frozenset(seen.effects) & frozenset(tried) - names
-    state.at_rest = state.certain & seen.shown_at_rest
+    state.shown = state.certain & seen.shown_whatever_fits
     if hot is not None:
         state.notes.append(
             f"{len(hot)} hot pixels are left out of all that is compared, and counted among all pixels"
@@ -242,6 +246,8 @@ def diagnose(
     found = replace(found, evaluations=found.evaluations + run)
     if ended is not None and REFRACTORY in tried:
         found = with_dead_time(found, ended)
+    if (unequal := seen.entry_of(UNEQUAL)) is not None and MISMATCH in tried:
+        found = with_unequal_thresholds(found, unequal)
     if silent is not None and silent.decides and not evidence.contradiction:
         found = with_dead_pixels(found, silent)
     if hot is not None:
@@ -281,6 +287,16 @@ def _look_for_dead_time(
         measurement, model.sensor,
         frame_step=state.evidence.frame_step or 0.0, structure=state.evidence.structure, seed=state.seed,
     )  # fmt: skip
+    return seen if found is None else replace(seen, entries=(*seen.entries, found))
+
+
+def _look_at_thresholds(
+    state: DiagnosisState, seen: SeenEffects, measurement: Measurement, model: FittedModel
+) -> SeenEffects:
+    """Return what is seen, with how much the thresholds of pixels differ if they do."""
+    if MISMATCH in state.given or state.evidence.contradiction or seen.lamp:
+        return seen
+    found = find_unequal_thresholds(measurement, model.sensor, seed=state.seed)
     return seen if found is None else replace(seen, entries=(*seen.entries, found))
 
 
@@ -388,7 +404,7 @@ def _look_for_effect(
         state.first, state.first_step = sorted(tried, key=lambda one: one.screened_loss), len(state.history)
     best, ties = _best_candidate(state, tried, judgement)
     if best is None and certain:
-        best = _seen_at_rest(state, tried, judgement)
+        best = _shown_whatever_fits(state, tried, judgement)
         if best is None:
             return _look_for_effect(state, model, judgement, more)
     if best is None:
@@ -399,14 +415,14 @@ def _look_for_effect(
     return step, refit_model(evidence, best.model, seed=seed, rounds=1), on_its_way
 
 
-def _seen_at_rest(
+def _shown_whatever_fits(
     state: DiagnosisState, tried: Sequence[Candidate], judgement: Judgement
 ) -> Candidate | None:
-    """Return the noise or leak that pixels at rest show, if the model is no worse with it.
+    """Return the noise, leak or mismatch that is there, if the model is no worse with it.
 
     However little the error falls, it is there, and all else is to be judged beside it.
     """
-    shown = [one for one in tried if one.name in state.at_rest]
+    shown = [one for one in tried if one.name in state.shown]
     if not shown:
         return None
     judged = [one for one in shown if one.judgement] or refit_and_judge(
