@@ -19,13 +19,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from dase.diagnosis.light_between_events import busiest_rows, light_steps, times_that_are_compared
 from dase.effects.mismatch import Mismatch
 from dase.errors import InputError
 from dase.events import Events
 from dase.fitting.measurement import Measurement
 from dase.formatting import format_percent
 from dase.probes.random_streams import SimulationStream
-from dase.probes.stimulus import light_of
 from dase.results import Diagnosis, Estimate
 from dase.scenes.between_frames import CameraScene
 from dase.scenes.scene import Scene
@@ -65,10 +65,6 @@ class UnequalSettings:
     longest: float = 0.05
     """Time from one event to the next that counts, at most [s]: leaks differ from pixel to pixel, too."""
 
-    darkest: float = 0.1
-    """Light from which on events count, relative to the brightest: in the dark steps of 8 bits are as large as
-    a threshold."""
-
     bins: int = 10
     """Of light and of its speed, with as many events in each."""
 
@@ -84,12 +80,6 @@ class UnequalSettings:
 
     block: int = 8
     """[px] Neighbours share the scene: blocks are independent, pixels are not."""
-
-    samples: int = 40_000_000
-    """Intensities that are looked at, pixels times instants, at most."""
-
-    events: int = 2_000_000
-    """Events that are looked at, at most."""
 
 
 UNEQUAL = UnequalSettings()
@@ -150,12 +140,10 @@ def find_unequal_thresholds(
     if isinstance(scene, CameraScene) or measurement.trust is not None:
         return None
     events = measurement.compared_events()
-    times = scene.sample_times()
-    if measurement.span is not None:
-        times = times[(times >= measurement.span[0]) & (times <= measurement.span[1])]
+    times = times_that_are_compared(measurement)
     if len(times) < 2 or not len(events):
         return None
-    rows = _rows_to_look_at(events, len(times), settings)
+    rows = busiest_rows(events, len(times))
     eps = sensor.log_eps
     seen = patterns_of(events, scene, times, rows=rows, log_eps=eps, settings=settings)
     if not seen or not all(one.differs(settings) for one in seen):
@@ -208,74 +196,24 @@ def patterns_of(
         log_eps: Added to intensities before the logarithm.
         settings: What counts.
     """
-    width = scene.width
-    events = events.select((events.y >= rows[0]) & (events.y < rows[1]))
-    pixel = (events.y.astype(np.int64) - rows[0]) * width + events.x
-    order = np.argsort(pixel, kind="stable")
-    pixel, t, p = pixel[order], events.t[order], np.asarray(events.p, bool)[order]
-    level, speed = _light_at(scene, times, pixel + rows[0] * width, t, log_eps, settings)
-    change = np.diff(level)
-    gap = np.diff(t)
-    darker = np.minimum(level[1:], level[:-1])
-    darkest = np.quantile(level, 0.99) + math.log(settings.darkest) if len(level) else 0.0
-    counts = (pixel[1:] == pixel[:-1]) & (gap > 0) & (gap < settings.longest) & (darker > darkest)
-    again = p[1:] == p[:-1]
+    steps = light_steps(events, scene, times, rows=rows, log_eps=log_eps)
+    counts = steps.counts & (steps.gap < settings.longest)
     out = []
-    for sign, polarity in ((1, p[1:]), (-1, ~p[1:])):
-        used = counts & polarity
-        moved = sign * change[used]
+    for sign in (1, -1):
+        used = counts & (steps.on == (sign > 0))
+        moved = sign * steps.change[used]
         threshold = float(np.median(moved)) if len(moved) else 0.0
         if threshold <= 0:
             return ()
         off = np.clip(moved / threshold - 1, -settings.reach, settings.reach)
-        fast = sign * speed[1:][used]
-        off = _beyond_those_alike(off, level[1:][used], fast, again[used], settings)
-        shape = rows[1] - rows[0], width
-        found = _pattern_of(pixel[1:][used], off, shape, settings)
+        fast = sign * steps.speed[used]
+        off = _beyond_those_alike(off, steps.level[used], fast, steps.again[used], settings)
+        shape = rows[1] - rows[0], scene.width
+        found = _pattern_of(steps.pixel[used], off, shape, settings)
         if found.pixels < settings.pixels:
             return ()
         out.append(found)
     return tuple(out)
-
-
-def _rows_to_look_at(events: Events, instants: int, settings: UnequalSettings) -> tuple[int, int]:
-    """Return the rows with the most events: the first, and the one after the last that is looked at."""
-    per_row = np.bincount(events.y, minlength=events.height)
-    most = settings.samples // (instants * events.width)
-    most = min(most, int(events.height * settings.events / len(events)), events.height)
-    most = max(most, min(events.height, settings.block))
-    total = np.concatenate([[0], np.cumsum(per_row)])
-    first = int(np.argmax(total[most:] - total[:-most]))
-    return first, first + most
-
-
-def _light_at(
-    scene: Scene, times: Array, pixel: NDArray[np.int64], t: Array, log_eps: float, settings: UnequalSettings
-) -> tuple[Array, Array]:
-    """Return the log intensity at events, and how fast it changes [1/s], shape (N,) each.
-
-    Args:
-        scene: What they are of.
-        times: At which its light is known, ascending [s], shape (T,).
-        pixel: Of each event, row-major, ascending, shape (N,).
-        t: Time of each [s], shape (N,).
-        log_eps: Added to intensities before the logarithm.
-        settings: How many intensities are held at once.
-    """
-    at = np.clip(np.searchsorted(times, t, side="right") - 1, 0, len(times) - 2)
-    share = np.clip((t - times[at]) / (times[at + 1] - times[at]), 0.0, 1.0)
-    level, speed = np.empty(len(t)), np.empty(len(t))
-    asked = np.unique(pixel)
-    many = max(1, settings.samples // (8 * len(times)))
-    for n in range(0, len(asked), many):
-        some = asked[n : n + many].astype(np.int32)
-        first, last = np.searchsorted(pixel, [some[0], some[-1] + 1])
-        row = np.searchsorted(some, pixel[first:last])
-        known = np.log(light_of(scene, times, some) + np.float32(log_eps))
-        here, there = known[row, at[first:last]], known[row, at[first:last] + 1]
-        level[first:last] = here + (there - here) * share[first:last]
-        speed[first:last] = (there - here) / (times[at[first:last] + 1] - times[at[first:last]])
-    return level, speed
 
 
 def _beyond_those_alike(
