@@ -26,7 +26,9 @@ from dase.diagnosis.dead_time import NAME as DEAD_TIME
 from dase.diagnosis.dead_time import add_dead_time, find_dead_time, with_dead_time
 from dase.diagnosis.detection_limits import find_detection_limits
 from dase.diagnosis.directional_test import find_hidden_effect
-from dase.diagnosis.events_at_rest import find_events_at_rest
+from dase.diagnosis.drifting_memory import EFFECT as LEAKING
+from dase.diagnosis.drifting_memory import find_drifting_memory
+from dase.diagnosis.events_at_rest import LEAK, find_events_at_rest
 from dase.diagnosis.few_hot_pixels import NAME as HOT
 from dase.diagnosis.few_hot_pixels import few_hot_pixels, hot_effect_of, with_hot_pixels
 from dase.diagnosis.grading import ModelOnReport, grade_effects, judge_on_report, leaves_little
@@ -293,11 +295,15 @@ def _look_for_dead_time(
 def _look_at_thresholds(
     state: DiagnosisState, seen: SeenEffects, measurement: Measurement, model: FittedModel
 ) -> SeenEffects:
-    """Return what is seen, with how much the thresholds of pixels differ if they do."""
-    if MISMATCH in state.given or state.evidence.contradiction or seen.lamp:
+    """Return what is seen, with how much the thresholds of pixels differ, or drift, if they do."""
+    if state.evidence.contradiction or seen.lamp:
         return seen
-    found = find_unequal_thresholds(measurement, model.sensor, seed=state.seed)
-    return seen if found is None else replace(seen, entries=(*seen.entries, found))
+    found = []
+    if MISMATCH not in state.given:
+        found.append(find_unequal_thresholds(measurement, model.sensor, seed=state.seed))
+    if LEAKING not in state.given and not seen.entry_of(LEAK):
+        found.append(find_drifting_memory(measurement, model.sensor, seed=state.seed))
+    return replace(seen, entries=(*seen.entries, *(one for one in found if one is not None)))
 
 
 def _odd_pixels(hot: NDArray[np.int64] | None, dead: SilentPixels | None) -> NDArray[np.int64] | None:

@@ -10,6 +10,7 @@ from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 from dase.diagnosis.dead_time import NAME as DEAD_TIME
+from dase.diagnosis.drifting_memory import NAME as DRIFT
 from dase.diagnosis.events_at_rest import LEAK, NOISE
 from dase.diagnosis.unequal_thresholds import NAME as UNEQUAL
 from dase.effects import EFFECTS, Effect
@@ -43,6 +44,7 @@ KINDS: dict[str, tuple[str, ...]] = {
     LEAK: ("leak",),
     NOISE: ("shot", "voltage_noise"),
     UNEQUAL: ("mismatch",),
+    DRIFT: ("leak",),
 }
 """Signature to the effects that make it; nothing where the library has none that does."""
 
@@ -56,11 +58,12 @@ NAMED = (
     DEAD_TIME,
     LEAK,
     UNEQUAL,
+    DRIFT,
 )
 """Signatures that tell which effect it is; the others tell what there is, and not what makes it."""
 
 
-WITH_A_SCENE = (DEAD_TIME, LEAK, NOISE, UNEQUAL)
+WITH_A_SCENE = (DEAD_TIME, LEAK, NOISE, UNEQUAL, DRIFT)
 """Signatures for which a model over the scene is asked."""
 
 MADE_BY_LIGHT = ("flicker",)
@@ -101,7 +104,7 @@ class SeenEffects:
     @property
     def shown_whatever_fits(self) -> frozenset[str]:
         """Effects of the library that pixels at rest show, or what light does from event to event."""
-        entries = (entry for entry in self.entries if entry.name in (LEAK, NOISE, UNEQUAL))
+        entries = (entry for entry in self.entries if entry.name in (LEAK, NOISE, UNEQUAL, DRIFT))
         return frozenset(name for entry in entries for name in self.named_by(entry))
 
     def times_of_bursts(self, measurement: Measurement) -> BurstTimes | None:
