@@ -28,7 +28,9 @@ from dase.diagnosis.dead_time import NAME as DEAD_TIME
 from dase.diagnosis.dead_time import add_dead_time, find_dead_time, with_dead_time
 from dase.diagnosis.detection_limits import find_detection_limits
 from dase.diagnosis.directional_test import find_hidden_effect
-from dase.diagnosis.events_at_rest import find_events_at_rest
+from dase.diagnosis.drifting_memory import EFFECT as LEAKING
+from dase.diagnosis.drifting_memory import find_drifting_memory
+from dase.diagnosis.events_at_rest import LEAK, find_events_at_rest
 from dase.diagnosis.few_hot_pixels import NAME as HOT
 from dase.diagnosis.few_hot_pixels import few_hot_pixels, hot_effect_of, with_hot_pixels
 from dase.diagnosis.grading import ModelOnReport, grade_effects, judge_on_report, leaves_little
@@ -47,6 +49,9 @@ from dase.diagnosis.settings import DEFAULTS, DiagnosisSettings
 from dase.diagnosis.silent_pixels import NAME as DEAD
 from dase.diagnosis.silent_pixels import SilentPixels, find_silent_pixels, with_dead_pixels
 from dase.diagnosis.state import DiagnosisState, explains_remainder, with_same_freedom
+from dase.diagnosis.unequal_thresholds import EFFECT as MISMATCH
+from dase.diagnosis.unequal_thresholds import NAME as UNEQUAL
+from dase.diagnosis.unequal_thresholds import find_unequal_thresholds, with_unequal_thresholds
 from dase.effects import EFFECTS, Effect
 from dase.effects.threshold import Threshold
 from dase.fitting.burst_strength import follows_frames, put_in_step
@@ -196,8 +201,9 @@ def diagnose(
         start = _fitted_unless_worse(state, start.sensor, free)
     seen = _look_where_light_rests(state, seen, measurement, start)
     seen = _look_for_dead_time(state, seen, measurement, start)
+    seen = _look_at_thresholds(state, seen, measurement, start)
     state.certain = frozenset(seen.effects) & frozenset(tried) - names
-    state.at_rest = state.certain & seen.shown_at_rest
+    state.shown = state.certain & seen.shown_whatever_fits
     if hot is not None:
         state.notes.append(
             f"{len(hot)} hot pixels are left out of all that is compared, and counted among all pixels"
@@ -250,6 +256,8 @@ def diagnose(
     found = replace(found, evaluations=found.evaluations + run)
     if ended is not None and REFRACTORY in tried:
         found = with_dead_time(found, ended)
+    if (unequal := seen.entry_of(UNEQUAL)) is not None and MISMATCH in tried:
+        found = with_unequal_thresholds(found, unequal)
     if silent is not None and silent.decides and not evidence.contradiction:
         found = with_dead_pixels(found, silent)
     if hot is not None:
@@ -290,6 +298,20 @@ def _look_for_dead_time(
         frame_step=state.evidence.frame_step or 0.0, structure=state.evidence.structure, seed=state.seed,
     )  # fmt: skip
     return seen if found is None else replace(seen, entries=(*seen.entries, found))
+
+
+def _look_at_thresholds(
+    state: DiagnosisState, seen: SeenEffects, measurement: Measurement, model: FittedModel
+) -> SeenEffects:
+    """Return what is seen, with how much the thresholds of pixels differ, or drift, if they do."""
+    if state.evidence.contradiction or seen.lamp:
+        return seen
+    found = []
+    if MISMATCH not in state.given:
+        found.append(find_unequal_thresholds(measurement, model.sensor, seed=state.seed))
+    if LEAKING not in state.given and not seen.entry_of(LEAK):
+        found.append(find_drifting_memory(measurement, model.sensor, seed=state.seed))
+    return replace(seen, entries=(*seen.entries, *(one for one in found if one is not None)))
 
 
 def _odd_pixels(hot: NDArray[np.int64] | None, dead: SilentPixels | None) -> NDArray[np.int64] | None:
@@ -396,7 +418,7 @@ def _look_for_effect(
         state.first, state.first_step = sorted(tried, key=lambda one: one.screened_loss), len(state.history)
     best, ties = _best_candidate(state, tried, judgement)
     if best is None and certain:
-        best = _seen_at_rest(state, tried, judgement)
+        best = _shown_whatever_fits(state, tried, judgement)
         if best is None:
             return _look_for_effect(state, model, judgement, more)
     if best is None:
@@ -410,14 +432,14 @@ def _look_for_effect(
     return step, refit_model(fitted, best.model, seed=seed, rounds=1), on_its_way
 
 
-def _seen_at_rest(
+def _shown_whatever_fits(
     state: DiagnosisState, tried: Sequence[Candidate], judgement: Judgement
 ) -> Candidate | None:
-    """Return the noise or leak that pixels at rest show, if the model is no worse with it.
+    """Return the noise, leak or mismatch that is there, if the model is no worse with it.
 
     However little the error falls, it is there, and all else is to be judged beside it.
     """
-    shown = [one for one in tried if one.name in state.at_rest]
+    shown = [one for one in tried if one.name in state.shown]
     if not shown:
         return None
     judged = [one for one in shown if one.judgement] or refit_and_judge(

@@ -13,8 +13,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dase.diagnosis.dead_time import NAME as DEAD_TIME
+from dase.diagnosis.drifting_memory import NAME as DRIFT
 from dase.diagnosis.events_at_rest import LEAK, NOISE
 from dase.diagnosis.frames_at_rest import events_where_frames_rest
+from dase.diagnosis.unequal_thresholds import NAME as UNEQUAL
 from dase.effects import EFFECTS, Effect
 from dase.effects.threshold import Threshold
 from dase.errors import InputError
@@ -46,6 +48,8 @@ KINDS: dict[str, tuple[str, ...]] = {
     DEAD_TIME: ("refractory",),
     LEAK: ("leak",),
     NOISE: ("shot", "voltage_noise"),
+    UNEQUAL: ("mismatch",),
+    DRIFT: ("leak",),
 }
 """Signature to the effects that make it; nothing where the library has none that does."""
 
@@ -58,11 +62,13 @@ NAMED = (
     "double events",
     DEAD_TIME,
     LEAK,
+    UNEQUAL,
+    DRIFT,
 )
 """Signatures that tell which effect it is; the others tell what there is, and not what makes it."""
 
 
-WITH_A_SCENE = (DEAD_TIME, LEAK, NOISE)
+WITH_A_SCENE = (DEAD_TIME, LEAK, NOISE, UNEQUAL, DRIFT)
 """Signatures for which a model over the scene is asked."""
 
 MADE_BY_LIGHT = ("flicker",)
@@ -101,9 +107,9 @@ class SeenEffects:
         return {name: entry.sentence for entry in self.entries for name in self.named_by(entry)}
 
     @property
-    def shown_at_rest(self) -> frozenset[str]:
-        """Effects of the library that pixels at rest show."""
-        entries = (entry for entry in self.entries if entry.name in (LEAK, NOISE))
+    def shown_whatever_fits(self) -> frozenset[str]:
+        """Effects of the library that pixels at rest show, or what light does from event to event."""
+        entries = (entry for entry in self.entries if entry.name in (LEAK, NOISE, UNEQUAL, DRIFT))
         return frozenset(name for entry in entries for name in self.named_by(entry))
 
     def times_of_bursts(self, measurement: Measurement) -> BurstTimes | None:
@@ -147,10 +153,17 @@ class SeenEffects:
                 continue
             if KINDS[entry.name] == KINDS[NOISE] and self.entry_of(NOISE):
                 continue  # pairs of opposite events are said with the noise that sends them
+            if entry.name == "fixed pattern" and self._names(UNEQUAL):
+                continue  # which it is, is known
             for name in self.named_by(entry) or (entry.name,):
                 out = [one for one in out if one.effect != name]
                 out.append(Finding(name, Grade.CERTAIN, seen=entry.sentence))
         return out
+
+    def _names(self, name: str) -> bool:
+        """Whether a signature was seen and names effects of the library."""
+        entry = self.entry_of(name)
+        return entry is not None and bool(self.named_by(entry))
 
     @property
     def _noise(self) -> frozenset[str]:

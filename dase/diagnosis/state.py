@@ -36,7 +36,7 @@ class DiagnosisState:
             pairs are made.
         first_step: Which step that was.
         certain: Effects that the events alone show; they are not dropped.
-        at_rest: Those of them that pixels at rest show.
+        shown: Those of them that are there however badly any model fits.
         tried_alone: Those of them that were tried before all others.
         path: Models that were fitted in full on the way, the first one without any addition.
         notes: What the user should know of the search.
@@ -57,7 +57,7 @@ class DiagnosisState:
     without: dict[str, Judgement] = field(default_factory=dict)
     first: list[Candidate] = field(default_factory=list)
     certain: frozenset[str] = frozenset()
-    at_rest: frozenset[str] = frozenset()
+    shown: frozenset[str] = frozenset()
     tried_alone: frozenset[str] = frozenset()
     first_step: int = 0
     path: list[FittedModel] = field(default_factory=list)

@@ -45,6 +45,10 @@ class SimulationStream(Enum):
     """Events of a model without a dead time, of which short intervals are counted."""
     EVENTS_AT_REST = (1700, 0)
     """Events of a model where light rests."""
+    UNEQUAL_THRESHOLDS = (1900, 0)
+    """Events of a model with equal thresholds."""
+    DRIFTING_MEMORY = (2100, 0)
+    """Events of a model without a leak."""
     STIMULUS = (0, 1000)
     """Standard recordings; a turn is a stimulus."""
     RECORDING = (1, 500_000)

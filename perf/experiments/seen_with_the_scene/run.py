@@ -1,4 +1,4 @@
-"""How often a dead time, noise or a leak is told by intervals and rests, and where none is there.
+"""How often a dead time, noise, a leak or a mismatch is told with the scene, and where none is there.
 
     python -m perf.experiments.seen_with_the_scene.run --key KEY --scenes 6
 
@@ -17,6 +17,7 @@ import numpy as np
 import dase
 from dase.diagnosis.dead_time import find_dead_time
 from dase.diagnosis.events_at_rest import find_events_at_rest
+from dase.diagnosis.unequal_thresholds import find_unequal_thresholds
 from dase.effects import EFFECTS, Threshold
 from dase.fitting.frame_steps import frame_step_of
 from dase.fitting.measurement import Measurement
@@ -79,6 +80,7 @@ def main() -> None:
     found: dict[str, list[str]] = {}
     count: dict[str, int] = {}
     rests: dict[str, dict[str, int]] = {}
+    spreads: dict[str, list[float]] = {}
     for name, period, measurement, model in rows(number_of(options.key), options.scenes):
         events, scene = measurement.events, measurement.scene
         count[name] = count.get(name, 0) + 1
@@ -96,13 +98,21 @@ def main() -> None:
             said = " ".join([rest.name, *([rest.details["effect"]] if "effect" in rest.details else [])])
             many = rests.setdefault(name, {})
             many[said] = many.get(said, 0) + 1
+        unequal = find_unequal_thresholds(measurement, model, seed=0)
+        if unequal is not None:
+            spreads.setdefault(name, []).append(unequal.size)
         if entry is not None:
             found.setdefault(name, []).append(f"{1e3 * entry.details['period']:.3g}/{1e3 * period:.3g}")
-    print("| hidden | dead time | its end, and the true one [ms] | at rest |\n|---|---|---|---|")
+    print("| hidden | dead time | its end, and the true one [ms] | at rest | spread of thresholds |")
+    print("|---|---|---|---|---|")
     for name, many_of_it in count.items():
         some = found.get(name, [])
         at_rest = ", ".join(f"{n} of {many_of_it}: {said}" for said, n in rests.get(name, {}).items())
-        print(f"| {name} | {len(some)} of {many_of_it} | {', '.join(some) or '-'} | {at_rest or '-'} |")
+        unlike = spreads.get(name, [])
+        told = f"{len(unlike)} of {many_of_it}: {min(unlike):.3f} to {max(unlike):.3f}" if unlike else "-"
+        print(
+            f"| {name} | {len(some)} of {many_of_it} | {', '.join(some) or '-'} | {at_rest or '-'} | {told} |"
+        )
 
 
 if __name__ == "__main__":

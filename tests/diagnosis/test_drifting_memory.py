@@ -1,0 +1,101 @@
+"""A leak of pixels that hardly rest is told by how far light goes from event to event."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+from helpers.frame_simulator import HEIGHT, WIDTH, counted_between_frames, shaken_texture
+
+import dase
+from dase.diagnosis.drifting_memory import DRIFT, NAME, Drift, find_drifting_memory
+from dase.diagnosis.events_at_rest import find_events_at_rest
+from dase.diagnosis.seen_effects import SeenEffects
+from dase.effects import EFFECTS
+from dase.events import Events
+from dase.fitting.measurement import Measurement
+from dase.results import Grade
+from dase.signatures.result import Answer, Signature
+from dase.simulation.sensor import Sensor
+
+
+@pytest.fixture(scope="module")
+def scene():
+    return shaken_texture(length=1.2)
+
+
+def found(scene, events, sensor=None):
+    return find_drifting_memory(Measurement(events, scene), sensor or Sensor(), seed=0)
+
+
+@pytest.mark.parametrize("rate", [2.0, 4.0])
+def test_the_drift_is_the_leak(scene, rate):
+    for events in (
+        dase.simulate(scene, Sensor().with_effect(EFFECTS["leak"](rate=rate)), seed=1),
+        counted_between_frames(scene, 0.1, leak=rate),
+    ):
+        entry = found(scene, events)
+        assert entry.name == NAME
+        assert entry.size == pytest.approx(rate, rel=0.35)
+    # no pixel rests for long enough to tell it so
+    rest = find_events_at_rest(Measurement(events, scene), Sensor(), thresholds=(0.2, 0.2), seed=0)
+    assert rest is None
+
+
+def test_noise_beside_it_hides_it_not(scene):
+    entry = found(scene, counted_between_frames(scene, 0.1, leak=3.0, shot=3.0))
+    assert entry is not None
+    assert found(scene, counted_between_frames(scene, 0.1, shot=3.0)) is None
+
+
+@pytest.mark.parametrize(
+    ("name", "values"),
+    [
+        ("bandwidth", {"cutoff": 20.0}),
+        ("dark", {"current": 0.05, "spread": 0.5}),
+        ("high_pass", {"cutoff": 1.0}),
+        ("hot", {"share": 0.02, "rate": 200.0}),
+        ("jitter", {"spread": 0.3}),
+        ("latency", {"delay": 5e-3}),
+        ("linlog", {"knee": 0.16, "slope": 2.5}),
+        ("mismatch", {"spread": 0.3}),
+        ("refractory", {"period": 8e-3, "mode": "reset"}),
+        ("refractory", {"period": 8e-3, "mode": "drop"}),
+        ("shot", {"rate": 10.0}),
+        ("voltage_noise", {"sigma": 0.1, "cutoff": 50.0}),
+    ],
+)
+def test_what_is_no_leak_is_not_taken_for_it(scene, name, values):
+    assert found(scene, dase.simulate(scene, Sensor().with_effect(EFFECTS[name](**values)), seed=1)) is None
+
+
+def test_a_model_that_drifts_by_itself_says_it_is_no_leak(scene, monkeypatch):
+    events = counted_between_frames(scene, 0.0, leak=2.0)
+    assert found(scene, events) is not None
+    monkeypatch.setattr("dase.diagnosis.drifting_memory.simulate", lambda *_, **__: events)
+    assert found(scene, events) is None
+
+
+def test_what_saturates_or_is_slow_or_uncertain_is_no_drift():
+    drift = Drift(rate=0.8, error=0.05, goes=0.4, from_none=0.75, bins=8)
+    assert drift.is_leak(DRIFT)
+    assert replace(drift, rate=2.0, from_none=2.0, goes=0.1).is_leak(DRIFT)
+    assert not replace(drift, from_none=0.1).is_leak(DRIFT)
+    assert not replace(drift, goes=0.2).is_leak(DRIFT)
+    assert not replace(drift, error=0.2).is_leak(DRIFT)
+    assert not replace(drift, bins=3).is_leak(DRIFT)
+    assert not replace(drift, rate=0.3, from_none=0.3).is_leak(DRIFT)
+
+
+def test_few_events_tell_nothing(scene):
+    events = counted_between_frames(scene, 0.0, leak=2.0)
+    assert found(scene, events.select(events.p)) is None
+    assert found(scene, events.select((events.x < 6) & (events.y < 6))) is None
+    assert found(scene, Events.empty(WIDTH, HEIGHT)) is None
+
+
+def test_it_names_the_leak():
+    entry = Signature(name=NAME, answer=Answer.FOUND, sentence="drifts")
+    (said,) = SeenEffects((entry,)).findings([], ())
+    assert (said.effect, said.grade, said.seen) == ("leak", Grade.CERTAIN, "drifts")
+    assert SeenEffects((entry,), library=frozenset(EFFECTS) | {"popping"}).named_by(entry) == ()
