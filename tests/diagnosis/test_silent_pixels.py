@@ -157,7 +157,7 @@ def test_dead_pixels_are_certain_and_left_out_of_the_search(scene):
     found = diagnose(dase.simulate(scene, true, seed=5), scene=scene, effects=LIBRARY, pixels=400, most=2)
     grades = {one.effect: one.grade for one in found.findings}
     assert grades["dead"] is Grade.CERTAIN
-    assert grades["mismatch"] is Grade.SUPPORTED
+    assert grades["mismatch"] is Grade.CERTAIN
     share = found.parameters["dead.share"]
     assert share.low < 0.02 < share.high
     assert found.sensor["dead"].share == share.value

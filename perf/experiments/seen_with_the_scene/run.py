@@ -16,6 +16,7 @@ import numpy as np
 
 import dase
 from dase.diagnosis.dead_time import find_dead_time
+from dase.diagnosis.drifting_memory import find_drifting_memory
 from dase.diagnosis.events_at_rest import find_events_at_rest
 from dase.diagnosis.unequal_thresholds import find_unequal_thresholds
 from dase.effects import EFFECTS, Threshold
@@ -81,6 +82,7 @@ def main() -> None:
     count: dict[str, int] = {}
     rests: dict[str, dict[str, int]] = {}
     spreads: dict[str, list[float]] = {}
+    drifts: dict[str, list[float]] = {}
     for name, period, measurement, model in rows(number_of(options.key), options.scenes):
         events, scene = measurement.events, measurement.scene
         count[name] = count.get(name, 0) + 1
@@ -101,18 +103,24 @@ def main() -> None:
         unequal = find_unequal_thresholds(measurement, model, seed=0)
         if unequal is not None:
             spreads.setdefault(name, []).append(unequal.size)
+        drift = find_drifting_memory(measurement, model, seed=0)
+        if drift is not None:
+            drifts.setdefault(name, []).append(drift.size)
         if entry is not None:
             found.setdefault(name, []).append(f"{1e3 * entry.details['period']:.3g}/{1e3 * period:.3g}")
-    print("| hidden | dead time | its end, and the true one [ms] | at rest | spread of thresholds |")
-    print("|---|---|---|---|---|")
+    print("| hidden | dead time | its end, and the true one [ms] | at rest | spread of thresholds | drift |")
+    print("|---|---|---|---|---|---|")
     for name, many_of_it in count.items():
         some = found.get(name, [])
         at_rest = ", ".join(f"{n} of {many_of_it}: {said}" for said, n in rests.get(name, {}).items())
-        unlike = spreads.get(name, [])
-        told = f"{len(unlike)} of {many_of_it}: {min(unlike):.3f} to {max(unlike):.3f}" if unlike else "-"
-        print(
-            f"| {name} | {len(some)} of {many_of_it} | {', '.join(some) or '-'} | {at_rest or '-'} | {told} |"
-        )
+        unlike, drift = (_sizes(sizes.get(name, []), many_of_it) for sizes in (spreads, drifts))
+        ends = ", ".join(some) or "-"
+        print(f"| {name} | {len(some)} of {many_of_it} | {ends} | {at_rest or '-'} | {unlike} | {drift} |")
+
+
+def _sizes(sizes: list[float], many: int) -> str:
+    """Return in how many of recordings something is seen, and from which size to which."""
+    return f"{len(sizes)} of {many}: {min(sizes):.3g} to {max(sizes):.3g}" if sizes else "-"
 
 
 if __name__ == "__main__":
