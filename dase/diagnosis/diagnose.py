@@ -47,7 +47,12 @@ from dase.diagnosis.seen_effects import (
 )
 from dase.diagnosis.settings import DEFAULTS, DiagnosisSettings
 from dase.diagnosis.silent_pixels import NAME as DEAD
-from dase.diagnosis.silent_pixels import SilentPixels, find_silent_pixels, with_dead_pixels
+from dase.diagnosis.silent_pixels import (
+    SilentPixels,
+    find_silent_pixels,
+    with_dead_pixels,
+    without_the_explained_silence,
+)
 from dase.diagnosis.state import DiagnosisState, explains_remainder, with_same_freedom
 from dase.diagnosis.unequal_thresholds import EFFECT as MISMATCH
 from dase.diagnosis.unequal_thresholds import NAME as UNEQUAL
@@ -248,6 +253,7 @@ def diagnose(
             model, judgement = _add_one_by_one(state, model, limit - len(state.added_to(model)))
     if state.added_to(model):  # else it was asked before
         seen = _look_for_dead_time(state, seen, measurement, model)
+        seen, model, judgement = _without_needless_dead_time(state, seen, measurement, model, judgement)
     ended = seen.entry_of(DEAD_TIME)
     if ended is not None and REFRACTORY in tried and REFRACTORY not in model.sensor:
         state.certain |= {REFRACTORY}
@@ -259,6 +265,7 @@ def diagnose(
     if (unequal := seen.entry_of(UNEQUAL)) is not None and MISMATCH in tried:
         found = with_unequal_thresholds(found, unequal)
     if silent is not None and silent.decides and not evidence.contradiction:
+        silent = without_the_explained_silence(silent, measurement, model.sensor, seed=seed)
         found = with_dead_pixels(found, silent)
     if hot is not None:
         found = with_hot_pixels(found, *hot_effect_of(measurement.events, hot))
@@ -300,6 +307,39 @@ def _look_for_dead_time(
     return seen if found is None else replace(seen, entries=(*seen.entries, found))
 
 
+def _without_needless_dead_time(
+    state: DiagnosisState,
+    seen: SeenEffects,
+    measurement: Measurement,
+    model: FittedModel,
+    judgement: Judgement,
+) -> tuple[SeenEffects, FittedModel, Judgement]:
+    """Return what is seen, and the last model, without a dead time that this has no need of.
+
+    A model before the search that lacks a slow low-pass has bursts of events that are not there, and their
+    intervals look as if they were cut off. What was found since may leave none.
+
+    Args:
+        state: Forgets that the dead time is certain, if it is not.
+        seen: With the end of the intervals beside the model before the search, if there is one.
+        measurement: Its intervals are looked at.
+        model: The last one.
+        judgement: Its held-out error.
+    """
+    if seen.entry_of(DEAD_TIME) is None or REFRACTORY not in state.added_to(model):
+        return seen, model, judgement
+    bare = with_same_freedom(model.sensor.without(REFRACTORY), model, ())
+    without = state.judge(bare)
+    if is_worse(without.error, judgement.error, judgement.gate):
+        return seen, model, judgement
+    entries = tuple(one for one in seen.entries if one.name != DEAD_TIME)
+    again = _look_for_dead_time(state, replace(seen, entries=entries), measurement, bare)
+    if again.entry_of(DEAD_TIME) is not None:
+        return seen, model, judgement
+    state.certain -= {REFRACTORY}
+    return again, bare, without
+
+
 def _look_at_thresholds(
     state: DiagnosisState, seen: SeenEffects, measurement: Measurement, model: FittedModel
 ) -> SeenEffects:
@@ -310,7 +350,8 @@ def _look_at_thresholds(
     if MISMATCH not in state.given:
         found.append(find_unequal_thresholds(measurement, model.sensor, seed=state.seed))
     if LEAKING not in state.given and not seen.entry_of(LEAK):
-        found.append(find_drifting_memory(measurement, model.sensor, seed=state.seed))
+        structure = state.evidence.structure
+        found.append(find_drifting_memory(measurement, model.sensor, structure=structure, seed=state.seed))
     return replace(seen, entries=(*seen.entries, *(one for one in found if one is not None)))
 
 

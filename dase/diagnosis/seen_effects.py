@@ -136,6 +136,8 @@ class SeenEffects:
             if one.effect in self._noise and one.grade is Grade.STAND_IN:
                 # noise that comes so is there, but the model with it is another's
                 one = replace(one, grade=Grade.EITHER, unknown=True, seen=seen[one.effect])
+            elif one.effect in self._noise_that_it_is_not and one.grade is Grade.SUPPORTED:
+                one = replace(one, grade=Grade.EITHER, unknown=True)
             elif one.effect in seen:
                 one = Finding(
                     one.effect, Grade.CERTAIN, (), False, one.error_without, one.error_with, one.deviation,
@@ -169,6 +171,12 @@ class SeenEffects:
     def _noise(self) -> frozenset[str]:
         """Effects of the library that make the noise of pixels at rest."""
         return frozenset(name for one in self.entries if one.name == NOISE for name in self.named_by(one))
+
+    @property
+    def _noise_that_it_is_not(self) -> frozenset[str]:
+        """Effects that make noise of pixels at rest, but not as its successive events are."""
+        told = [_effects_of(one) for one in self.entries if one.name == NOISE]
+        return frozenset(name for one in told if one for name in KINDS[NOISE] if name not in one)
 
     def _with_noise(self, entry: Signature, findings: Sequence[Finding]) -> list[Finding]:
         """Return findings with one of noise that is there, and that the search has not announced.

@@ -20,10 +20,13 @@ from dase.effects.dead import Dead
 from dase.fitting.data_split import common_grid, times_of_grid
 from dase.fitting.measurement import Measurement
 from dase.fitting.time_window import is_constant, within_span
+from dase.probes.random_streams import SimulationStream
 from dase.probes.stimulus import Trust, light_of
 from dase.results import DetectionLimit, Diagnosis, Estimate, Finding, Grade
 from dase.scenes.between_frames import CameraScene
 from dase.scenes.scene import Scene
+from dase.simulation.sensor import Sensor
+from dase.simulation.simulate import simulate
 
 NAME = Dead.name
 
@@ -58,6 +61,9 @@ class SilentPixelSettings:
     apart: float = 3.0
     """Silent pixels, as times those that send hardly anything: 157 to 269 dead ones had one of these beside
     them at most, 12 that a slow second pole had silenced had ten."""
+
+    repeats: int = 4
+    """Of a model that is asked whether a pixel may be silent: its memory begins anywhere."""
 
     enough: int = 1000
     """Pixels of which events are expected, from which on the lack of silent ones says that none are dead."""
@@ -164,6 +170,31 @@ def find_silent_pixels(
     pixels = (rows + 1) * np.int64(events.width) + columns + 1
     hardly = np.count_nonzero(asked & (sent > 0) & (sent <= settings.hardly))
     return SilentPixels(pixels, int(np.count_nonzero(asked)), settings, int(hardly))
+
+
+def without_the_explained_silence(
+    silent: SilentPixels, measurement: Measurement, sensor: Sensor, *, seed: int
+) -> SilentPixels:
+    """Return the silent pixels without those that may hardly send anything in a model either.
+
+    Args:
+        silent: Pixels that send nothing.
+        measurement: Its scene is simulated.
+        sensor: The model; that it may have dead pixels does not count.
+        seed: Of its random numbers.
+    """
+    if not len(silent.pixels):
+        return silent
+    alive = sensor.without(NAME) if NAME in sensor else sensor
+    size = measurement.events.width * measurement.events.height
+    least = np.full(len(silent.pixels), np.inf)
+    for turn in range(silent.settings.repeats):
+        stream = SimulationStream.SILENT_PIXELS.seed(seed, turn)
+        made = simulate(measurement.scene, alive, seed=stream, pixels=silent.pixels)
+        made = replace(measurement, events=made).compared_events()
+        sent = np.bincount(made.y.astype(np.int64) * made.width + made.x, minlength=size)
+        least = np.minimum(least, sent[silent.pixels])
+    return replace(silent, pixels=silent.pixels[least > silent.settings.hardly])
 
 
 def _range_and_mean(

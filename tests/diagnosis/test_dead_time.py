@@ -2,19 +2,27 @@
 
 from __future__ import annotations
 
+import importlib
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 import dase
-from dase.diagnosis.dead_time import DEAD_TIME, end_of_intervals, find_dead_time, intervals_of
+from dase.diagnosis.dead_time import DEAD_TIME, NAME, end_of_intervals, find_dead_time, intervals_of
+from dase.diagnosis.seen_effects import SeenEffects
 from dase.effects import EFFECTS
 from dase.events import Events
 from dase.fitting.measurement import Measurement
+from dase.fitting.model import model_of
+from dase.probes.distance import Judgement
 from dase.probes.timestamp_patterns import TimestampStructure
 from dase.scenes.video import VideoScene
+from dase.signatures.result import Answer, Signature
 from dase.simulation.sensor import Sensor
+
+diagnose_module = importlib.import_module("dase.diagnosis.diagnose")
 
 NO_STRUCTURE = TimestampStructure()
 
@@ -156,3 +164,36 @@ def test_a_dead_time_that_hardly_loses_events_is_certain():
     assert estimate.low <= period * 1.001
     assert estimate.high >= period * 0.95
     assert "refractory" in diagnosis.finding()
+
+
+@pytest.mark.parametrize(
+    ("error", "ends", "dropped"), [(0.3, False, True), (0.3, True, False), (2.0, False, False)]
+)
+def test_a_dead_time_is_dropped_that_the_last_model_has_no_need_of(monkeypatch, error, ends, dropped):
+    """Beside the model before the search, which lacked a slow low-pass, intervals looked as if cut off."""
+    entry = Signature(name=NAME, answer=Answer.FOUND, sentence="seen", details={"period": 2e-3})
+    sensor = Sensor().with_effect(EFFECTS["bandwidth"](cutoff=40.0))
+    model = model_of(sensor.with_effect(EFFECTS["refractory"](period=2e-3)), None)
+    state = SimpleNamespace(
+        added_to=lambda one: tuple(e.name for e in one.sensor.effects if e.name != "threshold"),
+        judge=lambda one: judged(error), certain=frozenset({"refractory", "hot"}),
+    )  # fmt: skip
+    asked = []
+
+    def look(state, seen, measurement, one):
+        asked.append(one.sensor)
+        return replace(seen, entries=(*seen.entries, entry)) if ends else seen
+
+    monkeypatch.setattr(diagnose_module, "_look_for_dead_time", look)
+    seen, last, judgement = diagnose_module._without_needless_dead_time(
+        state, SeenEffects((entry,)), None, model, judged(0.31)
+    )
+    assert ("refractory" not in last.sensor) == dropped
+    assert (seen.entry_of(NAME) is None) == dropped
+    assert state.certain == (frozenset({"hot"}) if dropped else frozenset({"refractory", "hot"}))
+    assert judgement.error == (error if dropped else 0.31)
+    assert all("refractory" not in one and "bandwidth" in one for one in asked)
+
+
+def judged(error: float) -> Judgement:
+    return Judgement(error, 1.15, 0.4, 0.25, {}, {}, np.zeros(1), 1.0)

@@ -14,9 +14,13 @@ from dase.diagnosis.seen_effects import SeenEffects
 from dase.effects import EFFECTS
 from dase.events import Events
 from dase.fitting.measurement import Measurement
+from dase.probes.timestamp_patterns import TimestampStructure
 from dase.results import Grade
 from dase.signatures.result import Answer, Signature
 from dase.simulation.sensor import Sensor
+
+
+NO_STRUCTURE = TimestampStructure()
 
 
 @pytest.fixture(scope="module")
@@ -24,8 +28,8 @@ def scene():
     return shaken_texture(length=1.2)
 
 
-def found(scene, events, sensor=None):
-    return find_drifting_memory(Measurement(events, scene), sensor or Sensor(), seed=0)
+def found(scene, events, sensor=None, structure=NO_STRUCTURE):
+    return find_drifting_memory(Measurement(events, scene), sensor or Sensor(), structure=structure, seed=0)
 
 
 @pytest.mark.parametrize("rate", [2.0, 4.0])
@@ -85,6 +89,14 @@ def test_what_saturates_or_is_slow_or_uncertain_is_no_drift():
     assert not replace(drift, error=0.2).is_leak(DRIFT)
     assert not replace(drift, bins=3).is_leak(DRIFT)
     assert not replace(drift, rate=0.3, from_none=0.3).is_leak(DRIFT)
+
+
+def test_events_that_wait_for_their_row_tell_nothing(scene):
+    """Meanwhile light goes on, one way before ON events and the other before OFF events."""
+    events = dase.simulate(scene, Sensor().with_effect(EFFECTS["leak"](rate=3.0)), seed=1)
+    slow, quick = (TimestampStructure(line=line) for line in (1.2e-3 / WIDTH, 0.5e-3 / WIDTH))
+    assert found(scene, events, structure=slow) is None
+    assert found(scene, events, structure=quick) is not None
 
 
 def test_few_events_tell_nothing(scene):

@@ -201,3 +201,16 @@ def test_pairs_are_said_with_the_noise_that_sends_them():
     assert said.words() == "either shot or voltage_noise"
     (said,) = SeenEffects((pairs,)).findings([], ())
     assert (said.effect, said.grade) == ("opposite pairs", Grade.CERTAIN)
+
+
+@pytest.mark.parametrize(
+    ("told", "grade"), [("voltage_noise", Grade.CERTAIN), ("shot", Grade.EITHER), ("", Grade.SUPPORTED)]
+)
+def test_noise_is_not_supported_that_its_events_contradict(told, grade):
+    """Successive events know nothing of each other: that is no noise of the voltage, however well it fits."""
+    details = {"effect": told} if told else {}
+    entry = Signature(name=NOISE, answer=Answer.FOUND, sentence="seen", details=details)
+    seen = SeenEffects((entry,), library=frozenset(EFFECTS) - {"shot"})
+    (mine, *_) = seen.findings([Finding("voltage_noise", Grade.SUPPORTED)], ())
+    assert (mine.effect, mine.grade) == ("voltage_noise", grade)
+    assert mine.unknown == (grade is Grade.EITHER)

@@ -7,7 +7,11 @@ import pytest
 
 import dase
 from dase.diagnosis.diagnose import diagnose
-from dase.diagnosis.silent_pixels import find_silent_pixels
+from dase.diagnosis.silent_pixels import (
+    SilentPixels,
+    find_silent_pixels,
+    without_the_explained_silence,
+)
 from dase.effects import EFFECTS
 from dase.fitting.data_split import split_measurement
 from dase.fitting.measurement import Measurement
@@ -87,6 +91,23 @@ def test_silence_at_the_end_of_a_range_is_no_death(scene):
         assert (found.found, found.decides) == (dead, True)
         assert len(found.pixels) >= 3
         assert found.limit().strength == pytest.approx(found.needed / found.asked)
+
+
+def test_what_a_model_silences_too_is_not_dead(scene):
+    """Where a model sends nothing either, silence tells nothing."""
+    events = dase.simulate(scene, Sensor(), seed=5)
+    alive = np.flatnonzero(counts_of(events) > 8)[:40]
+    calm = np.flatnonzero(counts_of(events) == 0)[:10]
+    silent = SilentPixels(np.sort(np.concatenate((alive, calm))), 5000)
+    measurement = Measurement(events, scene)
+    left = without_the_explained_silence(silent, measurement, Sensor(), seed=1)
+    assert set(left.pixels) <= set(alive)
+    assert len(left.pixels) > 0.8 * len(alive)
+    slow = Sensor().with_effect(EFFECTS["bandwidth"](cutoff=0.2))
+    assert not len(without_the_explained_silence(silent, measurement, slow, seed=1).pixels)
+    dead = Sensor().with_effect(EFFECTS["dead"](share=1.0))
+    again = without_the_explained_silence(silent, measurement, dead, seed=1)
+    np.testing.assert_array_equal(again.pixels, left.pixels)
 
 
 @pytest.mark.parametrize("span", [None, (0.1605, 0.1795)])

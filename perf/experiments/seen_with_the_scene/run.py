@@ -89,9 +89,8 @@ def main() -> None:
         if len(events) < 2:
             continue
         frame_step = frame_step_of(events, scene) or 0.0
-        entry = find_dead_time(
-            measurement, model, frame_step=frame_step, structure=find_structure(events), seed=0
-        )
+        structure = find_structure(events)
+        entry = find_dead_time(measurement, model, frame_step=frame_step, structure=structure, seed=0)
         threshold = model["threshold"]
         assert isinstance(threshold, Threshold)
         thresholds = threshold.on, threshold.off
@@ -103,7 +102,7 @@ def main() -> None:
         unequal = find_unequal_thresholds(measurement, model, seed=0)
         if unequal is not None:
             spreads.setdefault(name, []).append(unequal.size)
-        drift = find_drifting_memory(measurement, model, seed=0)
+        drift = find_drifting_memory(measurement, model, structure=structure, seed=0)
         if drift is not None:
             drifts.setdefault(name, []).append(drift.size)
         if entry is not None:
