@@ -19,7 +19,6 @@ from dase.results import Grade
 from dase.signatures.result import Answer, Signature
 from dase.simulation.sensor import Sensor
 
-
 NO_STRUCTURE = TimestampStructure()
 
 
