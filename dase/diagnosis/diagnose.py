@@ -183,7 +183,9 @@ def diagnose(
     known = {HOT} if hot is not None else set[str]()
     known |= {DEAD} if silent is not None and silent.decides else set()
     tried = {name: effect for name, effect in effects.items() if name not in known}
-    state = DiagnosisState(evidence, tried, seed, tell, names, settings, notes=notes)
+    state = DiagnosisState(
+        evidence, tried, seed, tell, names, settings, notes=notes, held=measurement.held
+    )  # fmt: skip
     if so_far is not None:
         state.after_step = lambda model, errors: so_far(
             measurement.noted(_known_so_far(state, model, errors, before, time.perf_counter() - begin))

@@ -12,6 +12,7 @@ part, by which nothing was chosen. Each effect has to earn its grade there:
   explained that something which is not in the library could look like it, or it had to go to an end of what
   it can be, beyond all that is plausible: shot noise that is all ON is another effect. So is it with a dead
   time far shorter than the steps in which light is known: a memory that is set a little later looks like it.
+  So is it with one shorter than a frame of a clip that holds its frames.
   A little jitter or mismatch beside a dead time is in doubt, too: a world that looks for crossings at steps
   of time makes it when a dead time ends, or by how far beyond the threshold a memory is set.
 
@@ -111,6 +112,7 @@ def grade_effects(
         )
 
     step = float(np.median(np.diff(state.evidence.when)))
+    shortest = max(settings.shortest_time * step, state.held)
     shown = [name for name in found if graded(name, False)[0] is not Grade.STAND_IN]
     rivals = _equally_good_rivals(state, model, shown)
     out: dict[str, Finding] = {}
@@ -120,7 +122,7 @@ def grade_effects(
         grade, unknown = graded(name, bool(others))
         doubtful = any(
             is_strained(model, *one)
-            or is_between_samples(model, *one, step=step, settings=settings)
+            or is_between_samples(model, *one, shortest=shortest)
             or is_small_beside_another(model, *one)
             for one in mine[name].items()
         )
@@ -165,20 +167,17 @@ def is_strained(model: FittedModel, name: str, value: Estimate) -> bool:
     return (value.high >= most and value.low > high) or (value.low <= least and value.high < low)
 
 
-def is_between_samples(
-    model: FittedModel, name: str, value: Estimate, *, step: float, settings: GradeSettings
-) -> bool:
+def is_between_samples(model: FittedModel, name: str, value: Estimate, *, shortest: float) -> bool:
     """Return whether a time is so short that it is told by what light does between two samples.
 
     Args:
         model: Has the parameter.
         name: Of the parameter.
         value: Its estimate [s].
-        step: From sample to sample of the light [s].
-        settings: Limits.
+        shortest: That samples tell [s].
     """
     fact = next((axis.fact for axis in model.space.axes if axis.name == name), None)
-    return fact is not None and fact.between_samples and value.high < settings.shortest_time * step
+    return fact is not None and fact.between_samples and value.high < shortest
 
 
 def is_small_beside_another(model: FittedModel, name: str, value: Estimate) -> bool:

@@ -38,6 +38,7 @@ class DiagnosisState:
         certain: Effects that the events alone show; they are not dropped.
         shown: Those of them that are there however badly any model fits.
         tried_alone: Those of them that were tried before all others.
+        held: See `Measurement.held`.
         path: Models that were fitted in full on the way, the first one without any addition.
         notes: What the user should know of the search.
         after_step: Told the model and the errors so far after each step.
@@ -59,6 +60,7 @@ class DiagnosisState:
     certain: frozenset[str] = frozenset()
     shown: frozenset[str] = frozenset()
     tried_alone: frozenset[str] = frozenset()
+    held: float = 0.0
     first_step: int = 0
     path: list[FittedModel] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)

@@ -18,8 +18,9 @@ from numpy.typing import NDArray
 from dase import io
 from dase.errors import InputError
 from dase.events import Events
+from dase.fitting.clip_lead import is_shown_early
 from dase.fitting.screen_alignment import screen_scene
-from dase.formatting import fit_to_screen
+from dase.formatting import fit_to_screen, format_seconds
 from dase.io.arrays import check_archive
 from dase.io.sequence import Sequence
 from dase.probes.stimulus import Trust
@@ -47,6 +48,8 @@ class Measurement:
         trust: Where and when the scene is to be trusted; None for everywhere.
         notes: What was noticed while reading.
         span: First and last time that is compared [s]; None for all.
+        held: Time for which each frame of a clip is held by the simulator that sent the events [s], 0 where
+            that is not seen: what takes less cannot be told.
     """
 
     events: Events
@@ -54,6 +57,7 @@ class Measurement:
     trust: Trust | None = None
     notes: tuple[str, ...] = ()
     span: tuple[float, float] | None = None
+    held: float = 0.0
 
     def __repr__(self) -> str:
         trust = "everywhere" if self.trust is None else "in part"
@@ -139,7 +143,19 @@ def as_measurement(
         found = open_measurement(Path(measured), "frames" if scene is None else scene)
     else:
         raise TypeError(f"expected a recording, its path, or events, got {type(measured).__name__}")
-    return found if trust is None else replace(found, trust=trust)
+    return _as_shown(found if trust is None else replace(found, trust=trust))
+
+
+def _as_shown(measurement: Measurement) -> Measurement:
+    """Return a measurement with its clip at the times at which its frames were shown, by the events."""
+    scene = measurement.scene
+    if not isinstance(scene, VideoScene) or not is_shown_early(measurement.events, scene):
+        return measurement
+    times = scene.sample_times()
+    gap = float(np.median(np.diff(times)))
+    note = f"events tell of each frame at the one before: the clip is taken {format_seconds(gap)} earlier"
+    scene = scene.at_times(np.concatenate(([times[0] - gap], times[:-1])))
+    return replace(measurement, scene=scene, held=gap, notes=(*measurement.notes, note))
 
 
 def open_measurement(path: Path, scene: SceneChoice = "frames") -> Measurement:

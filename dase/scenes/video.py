@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from copy import copy
 from os import PathLike
 from pathlib import Path
 from typing import Any
@@ -124,6 +125,13 @@ class VideoScene(Scene):
     def sample_times(self) -> NDArray[np.float64]:
         """Return the times of the frames [s]."""
         return self._times
+
+    def at_times(self, times: NDArray[np.float64]) -> VideoScene:
+        """Return the same frames at other times [s], increasing, shape (F,)."""
+        other = copy(self)
+        other._times = np.asarray(times, np.float64)
+        other.duration = float(other._times[-1] - other._times[0])
+        return other
 
     def source(self, times: NDArray[np.float64], pixels: NDArray[np.int32], device: Any) -> tuple[str, Any]:
         """Return the stored intensities of these pixels, shape (K, N); see `Scene.source`.

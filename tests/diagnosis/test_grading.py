@@ -109,7 +109,7 @@ def test_an_effect_at_the_end_of_what_it_can_be_is_strained(low, value, high, st
 def test_a_time_far_shorter_than_a_step_of_light_may_be_a_memory_set_later(effect, value, short):
     model = model_of(Sensor().with_effect(EFFECTS[effect.split(".")[0]]()), free=(effect,))
     estimate = Estimate(value, 0.9 * value, 1.1 * value)
-    told = is_between_samples(model, effect, estimate, step=1e-3, settings=GradeSettings())
+    told = is_between_samples(model, effect, estimate, shortest=GradeSettings().shortest_time * 1e-3)
     assert told is short
 
 

@@ -1,0 +1,96 @@
+"""A clip whose frames a simulator shows a frame early is taken to be earlier."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from helpers.frame_simulator import HEIGHT, WIDTH, counted_between_frames, shaken_texture
+
+import dase
+from dase.effects import EFFECTS
+from dase.events import Events
+from dase.fitting.clip_lead import is_shown_early
+from dase.fitting.measurement import as_measurement
+from dase.scenes.video import VideoScene
+from dase.simulation.sensor import Sensor
+
+
+def held_frames(scene: VideoScene, *, early: bool, late: float = 0.0, threshold: float = 0.2) -> Events:
+    """Return events of light that jumps from frame to frame; a pixel that sends forgets the rest of it.
+
+    Args:
+        scene: Frames of light.
+        early: Whether a frame is shown from the time of the one before on, or from its own.
+        late: From the jump to the event [s]; two microseconds apart from pixel to pixel.
+        threshold: ON and OFF [log intensity].
+    """
+    times = scene.sample_times()
+    level = np.log(scene.frames(times) + 1e-3)
+    memory, out = level[0].copy(), []
+    for begin, now in zip(times[:-1] if early else times[1:], level[1:], strict=True):
+        y, x = np.nonzero(np.abs(now - memory) >= threshold)
+        apart = 1e-6 * np.round(2 * np.random.default_rng(x).uniform(size=len(x)))
+        out.append((begin + late + apart, x, y, now[y, x] > memory[y, x]))
+        memory[y, x] = now[y, x]
+    t, x, y, p = (np.concatenate(part) for part in zip(*out, strict=True))
+    order = np.argsort(t, kind="stable")
+    return Events(t[order], x[order], y[order], p[order], WIDTH, HEIGHT)
+
+
+@pytest.fixture(scope="module", params=[1e-3, 5e-3])
+def scene(request) -> VideoScene:
+    return shaken_texture(gap=request.param)
+
+
+@pytest.mark.parametrize("late", [0.0, 0.4])
+def test_events_before_their_light_are_of_a_clip_that_is_shown_early(scene, late):
+    gap = float(np.diff(scene.sample_times())[0])
+    events = held_frames(scene, early=True, late=late * gap)
+    measured = as_measurement(events, scene)
+    assert measured.held == pytest.approx(gap)
+    assert any("earlier" in note for note in measured.notes)
+    np.testing.assert_allclose(measured.scene.sample_times(), scene.sample_times() - gap)
+    np.testing.assert_array_equal(
+        measured.scene.frames(measured.scene.sample_times()[5:7]), scene.frames(scene.sample_times()[5:7])
+    )
+    # it is moved once
+    again = as_measurement(measured)
+    assert again.notes == measured.notes
+    np.testing.assert_array_equal(again.scene.sample_times(), measured.scene.sample_times())
+
+
+def test_a_frame_at_its_own_time_is_not_early(scene):
+    events = held_frames(scene, early=False)
+    assert not is_shown_early(events, scene)
+    measured = as_measurement(events, scene)
+    assert measured.scene is scene
+    assert (measured.held, measured.notes) == (0.0, ())
+
+
+def test_simulators_of_light_between_frames_are_not_early(scene):
+    gap = float(np.diff(scene.sample_times())[0])
+    clock = Sensor().with_effect(EFFECTS["timestamp"](step=gap))
+    slow = Sensor().with_effect(EFFECTS["latency"](delay=0.5 * gap))
+    for events in (
+        counted_between_frames(scene, 0.1),
+        *(dase.simulate(scene, sensor, seed=1) for sensor in (Sensor(), clock, slow)),
+    ):
+        assert len(events) > 2000
+        assert not is_shown_early(events, scene)
+
+
+def test_few_events_tell_nothing(scene):
+    events = held_frames(scene, early=True)
+    assert is_shown_early(events, scene)
+    assert not is_shown_early(events.select(slice(0, 500)), scene)
+    assert not is_shown_early(Events.empty(WIDTH, HEIGHT), scene)
+
+
+def test_a_model_comes_nearer(scene, monkeypatch):
+    """The dead time stands for what is left of a frame's change when a pixel has sent."""
+    gap = float(np.diff(scene.sample_times())[0])
+    events = held_frames(scene, early=True)
+    sensor = Sensor().with_effect(EFFECTS["refractory"](period=0.5 * gap, mode="reset"))
+    moved = dase.compare(events, sensor, scene=scene).error
+    monkeypatch.setattr("dase.fitting.measurement.is_shown_early", lambda *_: False)
+    assert moved < 0.5 * dase.compare(events, sensor, scene=scene).error
