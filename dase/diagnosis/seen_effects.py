@@ -22,7 +22,7 @@ from dase.effects.threshold import Threshold
 from dase.errors import InputError
 from dase.events import Events
 from dase.fitting.burst_strength import BurstStrength, burst_times_of, fit_bursts
-from dase.fitting.frame_steps import frame_step_of, is_in_step, ticks_are_of_frames
+from dase.fitting.frame_steps import clip_step_of, frame_step_of, is_in_step, ticks_are_of_frames
 from dase.fitting.measurement import Measurement
 from dase.results import DetectionLimit, Diagnosis, Finding, Grade
 from dase.scenes.between_frames import CameraScene
@@ -216,10 +216,10 @@ def find_seen_effects(measurement: Measurement, library: Collection[str]) -> See
         found = find_signatures(events, begins=begins)
     except InputError:
         return SeenEffects()
-    step = frame_step_of(events, scene)
+    step, clip_step = frame_step_of(events, scene), clip_step_of(scene)
     entries = tuple(
         entry for entry in found.found
-        if not step or not _is_of_frames(entry, step, events, scene)
+        if not (step and _is_of_frames(entry, step, events, scene)) and not _is_tone_of_clip(entry, clip_step)
     )  # fmt: skip
     coupling = [entry for entry in entries if entry.name == "frame coupling"]
     bursts = None
@@ -232,11 +232,17 @@ def find_seen_effects(measurement: Measurement, library: Collection[str]) -> See
 
 
 def _is_of_frames(entry: Signature, step: float, events: Events, scene: Scene) -> bool:
-    """Return whether a signature of events in step with frames, every `step` [s], is made by these."""
-    if entry.name == "flicker":
-        return is_in_step(entry.details["frequency"], step)
+    """Return whether ticks of events in step with frames, every `step` [s], are made by these."""
     tick = entry.details.get("step", 0.0) if entry.name == "time stamps" else 0.0
     return ticks_are_of_frames(tick, step, events, scene)
+
+
+def _is_tone_of_clip(entry: Signature, step: float) -> bool:
+    """Return whether light flickers as often as the frames of a clip come, every `step` [s], or in overtones.
+
+    Light that changes its way at each frame does so, and what a simulator makes of it.
+    """
+    return entry.name == "flicker" and step > 0 and is_in_step(entry.details["frequency"], step)
 
 
 def without_the_scene(seen: SeenEffects, measurement: Measurement, sensor: Sensor, seed: int) -> SeenEffects:

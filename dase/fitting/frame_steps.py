@@ -69,12 +69,8 @@ def frame_step_of(events: Events, scene: Scene, settings: FrameStepSettings = FR
         scene: What they are of.
         settings: When they are in step.
     """
-    if not isinstance(scene, VideoScene):
-        return None
-    times = scene.sample_times()
-    gaps = np.diff(times)
-    step = float(gaps.mean()) if len(gaps) else 0.0
-    if not 0 < step <= settings.slowest or np.ptp(gaps) >= 1e-3 * step:
+    step, times = clip_step_of(scene), scene.sample_times()
+    if not 0 < step <= settings.slowest:
         return None
     t = events.t[(events.t >= times[0]) & (events.t <= times[-1])][: settings.events]
     if len(t) < settings.least:
@@ -88,6 +84,13 @@ def frame_step_of(events: Events, scene: Scene, settings: FrameStepSettings = FR
     emptiest = float(counts.min()) * settings.parts / len(t)
     together = float(np.abs(np.exp(2j * np.pi * phase).mean()))
     return step if emptiest < settings.empty and together > settings.together else None
+
+
+def clip_step_of(scene: Scene) -> float:
+    """Return the time from frame to frame of a clip [s]; 0 for another scene, or if frames are not even."""
+    gaps = np.diff(scene.sample_times()) if isinstance(scene, VideoScene) else np.empty(0)
+    step = float(gaps.mean()) if len(gaps) else 0.0
+    return step if len(gaps) and np.ptp(gaps) < 1e-3 * step else 0.0
 
 
 def ticks_are_of_frames(

@@ -79,6 +79,16 @@ def test_simulators_of_light_between_frames_are_not_early(scene):
         assert not is_shown_early(events, scene)
 
 
+def test_the_first_of_some_events_that_share_a_frame_is_not_early(scene):
+    """A simulator that knows frames alone puts the events of a frame at equal parts of it."""
+    gap = float(np.diff(scene.sample_times())[0])
+    events = held_frames(scene, early=True)
+    frame = np.round(events.t / gap)
+    part = np.where(frame % 2, 4, 5)
+    first = Events(gap * (frame + 1 / part), events.x, events.y, events.p, WIDTH, HEIGHT)
+    assert not is_shown_early(first, scene)
+
+
 def test_few_events_tell_nothing(scene):
     events = held_frames(scene, early=True)
     assert is_shown_early(events, scene)

@@ -13,7 +13,7 @@ from dase.diagnosis.seen_effects import find_seen_effects
 from dase.effects import EFFECTS
 from dase.fitting import data_split
 from dase.fitting.data_split import split_measurement
-from dase.fitting.frame_steps import frame_step_of, is_in_step, ticks_are_of_frames
+from dase.fitting.frame_steps import clip_step_of, frame_step_of, is_in_step, ticks_are_of_frames
 from dase.fitting.measurement import Measurement
 from dase.probes.timestamp_patterns import find_structure
 from dase.scenes.video import VideoScene
@@ -67,14 +67,20 @@ def test_what_a_simulator_waits_between_frames_is_no_loss_of_data(clip, monkeypa
 
 
 @pytest.mark.parametrize(("frequency", "lamp"), [(99.96, None), (200.0, None), (120.0, 120.0)])
-def test_frames_in_step_are_no_lamp(clip, monkeypatch, frequency, lamp):
+def test_a_tone_of_the_frames_of_a_clip_is_no_lamp(clip, monkeypatch, frequency, lamp):
+    """Whatever sends the events: light between frames goes straight, and changes its way at each of them."""
     seen = Signature(name="flicker", answer=Answer.FOUND, details={"frequency": frequency})
     found = SimpleNamespace(found=(seen,), entries=(seen,))
     monkeypatch.setattr(seen_effects, "find_signatures", lambda events, begins: found)
     events = frame_by_frame(clip)
     assert find_seen_effects(Measurement(events, clip), EFFECTS).lamp == lamp
     other = dase.simulate(clip, "ideal", seed=2)
-    assert find_seen_effects(Measurement(other, clip), EFFECTS).lamp == frequency
+    assert find_seen_effects(Measurement(other, clip), EFFECTS).lamp == lamp
+    times = clip.sample_times()
+    assert clip_step_of(clip) == pytest.approx(0.01)
+    uneven = VideoScene(clip.frames(times), times + 1e-3 * (np.arange(len(times)) % 2))
+    assert clip_step_of(uneven) == 0
+    assert find_seen_effects(Measurement(other, uneven), EFFECTS).lamp == frequency
 
 
 @pytest.mark.parametrize(
