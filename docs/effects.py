@@ -328,7 +328,7 @@ the same `gain` (above); `SecondOrder.of_poles` and `VoltageNoise.of_photorecept
 
 Does it matter? Events of the circuit with thresholds of 0.2, cutoff 60 Hz and dark 0.01, before waves 20
 times as bright on one side as on the other (64x48, 0.6 s, 1 kHz, nothing else on), fitted from either law
-(`dase.fit`, 400 pixels, Intel Xeon, 4b70082; `python -m perf.experiments.photoreceptor.run` computes it anew):
+(`dase.fit`, 400 pixels, Intel Xeon, 4b70082; `python -m perf.experiments.photoreceptor.run` makes it anew):
 
 {table}
 
