@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
-import subprocess
 import sys
 from pathlib import Path
 
@@ -20,16 +18,7 @@ from dase.learning.moment_matching import Moments
 from dase.learning.scene_batches import Scenery, SceneSettings, middle_intensity
 from dase.learning.targets import Pairs, draw_noise, simulate_counts
 from dase.scenes.image_sources import open_images
-
-LAUNCH = [sys.executable, "-m", "torch.distributed.run", "--nproc-per-node", "2"]
-
-
-def launched(*words: str) -> None:
-    alone = {"OMP_NUM_THREADS": "1", "DASE_THREADS": "1"}
-    done = subprocess.run(
-        [*LAUNCH, *words], env=os.environ | alone, capture_output=True, text=True, timeout=600
-    )
-    assert done.returncode == 0, done.stderr[-3000:]
+from tests.helpers.two_processes import run_as_two_processes
 
 
 def batches() -> tuple[Pairs, Pairs]:
@@ -90,7 +79,7 @@ def flat(value, at=""):
 
 @pytest.mark.slow
 def test_two_processes_do_what_one_does_with_all_scenes(tmp_path):
-    launched(str(Path(__file__)), str(tmp_path / "two.pt"))
+    run_as_two_processes(str(Path(__file__)), str(tmp_path / "two.pt"))
     two = torch.load(tmp_path / "two.pt", weights_only=True)
     one = steps(slice(None))
     found, wanted = dict(flat(two)), dict(flat(one))
@@ -109,12 +98,12 @@ def test_the_command_on_two_processes(objective, tmp_path):
     command = str(Path(sys.executable).parent / "dase")
     words = ("--no-python", command, "train", "esim", "-o", str(out), "--preset", "tiny", "--steps", "6")
     words = (*words, "--objective", objective, "--sequences", "8", "--size", "48x48")
-    launched(*words)
+    run_as_two_processes(*words)
     assert (out / "sensor.toml").is_file()
     assert json.loads((out / "recipe.json").read_text())["steps"] == 6
     log = (out / "log.csv").read_text().splitlines()
     assert log[-1].startswith("6,")
-    launched(*words, "--resume")
+    run_as_two_processes(*words, "--resume")
     assert torch.load(out / "checkpoint.pt", weights_only=True)["step"] == 6
 
 
