@@ -103,7 +103,7 @@ def find_dead_time(
 
     Args:
         measurement: Its scene is simulated. Nothing is said where light is known in part only.
-        sensor: The model, taken without any dead time.
+        sensor: The model, taken without any dead time but one that frames which are held ask for.
         frame_step: Time between the frames of a clip in step with which events come [s], 0 if they do not.
         structure: Regularities of the time stamps: of what comes at ticks or scans, intervals end at these.
         seed: Of every random number.
@@ -116,7 +116,8 @@ def find_dead_time(
     if not len(events):
         return None
     pixels = _some_pixels(events, settings, seed)
-    without = sensor.without(EFFECT) if EFFECT in sensor else sensor
+    # of held frames a pixel forgets the rest of one, which is no dead time of its own
+    without = sensor.without(EFFECT) if EFFECT in sensor and not measurement.held else sensor
     try:
         made = simulate(scene, without, seed=SimulationStream.DEAD_TIME.seed(seed), pixels=pixels)
     except InputError:
@@ -125,7 +126,7 @@ def find_dead_time(
     seen, modelled = (intervals_of(one, pixels) for one in (events, made))
     step = max(structure.step, structure.line * max(events.width, events.height))
     if isinstance(scene, VideoScene):
-        step = max(step, float(np.diff(scene.sample_times()).max(initial=0.0)))
+        step = max(step, scene.longest_gap())
     shortest = settings.frames * step
     return end_of_intervals(seen, modelled, shortest=shortest, in_step=frame_step > 0, settings=settings)
 

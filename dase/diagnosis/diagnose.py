@@ -34,6 +34,7 @@ from dase.diagnosis.events_at_rest import LEAK, find_events_at_rest
 from dase.diagnosis.few_hot_pixels import NAME as HOT
 from dase.diagnosis.few_hot_pixels import few_hot_pixels, hot_effect_of, with_hot_pixels
 from dase.diagnosis.grading import ModelOnReport, grade_effects, judge_on_report, leaves_little
+from dase.diagnosis.held_frames import held_behind_low_pass, with_frame_as_memory, with_longer_dead_time
 from dase.diagnosis.pruning import prune_model
 from dase.diagnosis.remainder import describe_unexplained, share_of_scene, what_to_record
 from dase.diagnosis.seen_effects import (
@@ -74,7 +75,7 @@ from dase.fitting.model import (
     ways_otherwise,
     with_fixed_effect,
 )
-from dase.fitting.parameter_space import refuse_idle
+from dase.fitting.parameter_space import axes_of, refuse_idle
 from dase.fitting.plain_numbers import plain_numbers
 from dase.fitting.scene_doubt import is_guessed, with_scene_doubt
 from dase.fitting.scheduler import run_side_by_side
@@ -139,6 +140,10 @@ def diagnose(
     """
     begin = time.perf_counter()
     tell = progress or (lambda text, share, error: None)
+    again = partial(
+        diagnose, sensor=sensor, effects=effects, free=free, most=most, pixels=pixels, seed=seed,
+        device=device, progress=progress, so_far=so_far, settings=settings,
+    )  # fmt: skip
     given = Sensor() if sensor is None else as_sensor(sensor)
     refuse_idle(given, free)
     measurement = as_measurement(measured, scene, trust)
@@ -160,12 +165,13 @@ def diagnose(
     asked = DEAD in effects and DEAD not in given
     silent = find_silent_pixels(measurement, log_eps=given.log_eps) if asked else None
     dead = silent if silent is not None and silent.found else None
-    split = partial(
-        split_measurement, measurement.events, measurement.scene, log_eps=given.log_eps,
+    split_of = partial(
+        split_measurement, measurement.events, log_eps=given.log_eps,
         trust=measurement.trust, span=measurement.span, left_out=bursts.contains if bursts else None,
         odd_pixels=_odd_pixels(hot, dead), lamp=seen.lamp, frames=frames, unbroken=given.unbroken,
         plenty=plenty, pixels=pixels, seed=seed, device=device, settings=parts,
     )  # fmt: skip
+    split = partial(split_of, measurement.scene)
     evidence = split()
     notes = list[str]()
     all_time = evidence.parts_differ
@@ -177,6 +183,11 @@ def diagnose(
         )
     given = put_in_step(given, evidence)
     free = free_where_measured(evidence, given, free)
+    bare, given = given, with_frame_as_memory(given, measurement, evidence, free, seed=seed)
+    forgets = given is not bare
+    if forgets:
+        # how often a held frame makes pixels send is counted, and no fit tells it better
+        free = [axis.name for axis in axes_of(bare, free)]
     tell("fitting the present model", 0.0, float("nan"))
     names = frozenset(effect.name for effect in given.effects)
     # what is left out of all that is compared cannot be tried, nor what all pixels contradict
@@ -196,6 +207,10 @@ def diagnose(
         .error
     )
     start = _fitted_unless_worse(state, given, free)
+    shown = held_behind_low_pass(measurement, evidence, start, split_of, seed=seed)
+    if shown is not None:
+        found = again(shown)
+        return replace(found, seconds=time.perf_counter() - begin)
     seen = without_the_scene(seen, part_to_simulate(measurement, evidence.when), start.sensor, seed)
     if guessed is not None:
         tell("how well the scene is known", 0.0, before)
@@ -264,6 +279,8 @@ def diagnose(
     found = replace(found, evaluations=found.evaluations + run)
     if ended is not None and REFRACTORY in tried:
         found = with_dead_time(found, ended)
+    if forgets and REFRACTORY in tried and not evidence.contradiction:
+        found = with_longer_dead_time(found, state, measurement, model)
     if (unequal := seen.entry_of(UNEQUAL)) is not None and MISMATCH in tried:
         found = with_unequal_thresholds(found, unequal)
     if silent is not None and silent.decides and not evidence.contradiction:

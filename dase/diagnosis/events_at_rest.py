@@ -245,10 +245,8 @@ def find_events_at_rest(
     except InputError:
         return None
     model = int(rests.events_in(made)[3].sum())
-    gaps = np.diff(measurement.scene.sample_times()) if isinstance(measurement.scene, VideoScene) else [0.0]
-    return judge_events_at_rest(
-        rests, measurement.compared_events(), model, frame_gap=float(np.max(gaps)), settings=settings
-    )
+    gap = measurement.scene.longest_gap() if isinstance(measurement.scene, VideoScene) else 0.0
+    return judge_events_at_rest(rests, measurement.compared_events(), model, frame_gap=gap, settings=settings)
 
 
 def judge_events_at_rest(

@@ -219,7 +219,7 @@ def find_seen_effects(measurement: Measurement, library: Collection[str]) -> See
     step, clip_step = frame_step_of(events, scene), clip_step_of(scene)
     entries = tuple(
         entry for entry in found.found
-        if not (step and _is_of_frames(entry, step, events, scene)) and not _is_tone_of_clip(entry, clip_step)
+        if not _is_of_frames(entry, step or 0.0, events, scene) and not _is_tone_of_clip(entry, clip_step)
     )  # fmt: skip
     coupling = [entry for entry in entries if entry.name == "frame coupling"]
     bursts = None

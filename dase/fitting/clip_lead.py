@@ -1,9 +1,10 @@
-"""Whether events come before the light of a clip that makes them.
+"""Whether a simulator held the frames of a clip, each from the time of the one before on.
 
-A simulator that is given a frame and the time since the last one shows the frame for that time: from the time
-of the frame before on. Written beside the times of the frames, its events then come up to a frame before the
-light changes, which no pixel can do, and no effect explains. It is seen where all events come at the same
-time after a frame, as light that is held from frame to frame makes them, and tell of the frame that follows.
+A simulator that is given a frame and the time since the last one shows the frame for that time: light
+jumps, and it does so a frame before the time that is written beside the frame. Its events then come up to a
+frame before the light changes, which no pixel can do, and no effect explains; or all at the same time after a
+frame, which light that goes straight from frame to frame does not make. Held light does: events begin at once
+with the jump, and behind a low-pass thin out until the next one.
 """
 
 from __future__ import annotations
@@ -11,6 +12,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from dase.events import Events
 from dase.probes.stimulus import light_of
@@ -20,7 +22,7 @@ from dase.scenes.video import VideoScene
 
 @dataclass(frozen=True)
 class ClipLeadSettings:
-    """When a clip is shown a frame early.
+    """When a clip is held.
 
     Chosen on sets a to c, x, y, z, k and g to j of other simulators: of IEBCS 0.92 to 1.00 of the events come
     in 0.06 of a frame, of all others 0.70 at most but for those that stamp events by the frame they tell of.
@@ -39,7 +41,16 @@ class ClipLeadSettings:
     """Such parts beside each other in which events come alike."""
 
     together: float = 0.85
-    """Share of the events in these, at least."""
+    """Share of the events in these, at least, where light is seen at once."""
+
+    begun: float = 0.3
+    """Share of the events in these, at least, where a low-pass or noise spreads the others."""
+
+    sudden: float = 0.1
+    """Events of as many parts before these, at most, relative to them, where events are spread."""
+
+    filled: float = 0.5
+    """Share of the parts that then have events: of a clock's ticks few have."""
 
     shares: int = 12
     """Into how many parts of a frame, at most, a simulator that knows frames alone puts the events of one,
@@ -49,12 +60,22 @@ class ClipLeadSettings:
     """Share of the events at such parts, to the microsecond, from which on it is one of these: clips of v2e
     in which most pixels send the first of four or five events had 0.9 and more."""
 
+    clear: float = 0.08
+    """Times after a frame, relative to that to the next, from which on such parts are told from others."""
+
+    at_parts: float = 0.3
+    """Share of those events at such parts from which on nothing is held, where events are spread: 0.56 to
+    0.73 in clips of v2e with a dead time, which send the first of many; 0.01 and 0.04 of IEBCS."""
+
     tick: float = 0.02
     """Of a frame before its end: rounded stamps of the next frame's time."""
 
     exact: float = 0.98
     """Share of the events that have the time of a frame to the microsecond, from which on that is a clock
     whose ticks are frames: it shows the tick before an event. IEBCS has 0.94 at most."""
+
+    late: tuple[float, float] = (0.1, 0.9)
+    """Times after a frame at which events that tell of it have waited: from frame to frame."""
 
     sooner: float = 1.03
     """How much farther light goes after the frame than before it, at least, in the direction of events."""
@@ -66,15 +87,15 @@ class ClipLeadSettings:
 CLIP_LEAD = ClipLeadSettings()
 
 
-def is_shown_early(events: Events, scene: Scene, settings: ClipLeadSettings = CLIP_LEAD) -> bool:
-    """Return whether events tell of a clip's next frame at one phase of the time before it.
+def holds_frames(events: Events, scene: Scene, settings: ClipLeadSettings = CLIP_LEAD) -> bool:
+    """Return whether events are of the frames of a clip held each from the time of the one before on.
 
     Args:
         events: Sorted.
-        scene: What they are of; only clips are asked.
-        settings: When a clip is early.
+        scene: What they are of; only clips are asked, and none whose frames are held already.
+        settings: When a clip is held.
     """
-    if not isinstance(scene, VideoScene) or len(scene.sample_times()) < 4:
+    if not isinstance(scene, VideoScene) or scene.held_for or len(scene.sample_times()) < 4:
         return False
     times = scene.sample_times()
     first, last = np.searchsorted(events.t, [times[1], times[-2]])
@@ -85,16 +106,20 @@ def is_shown_early(events: Events, scene: Scene, settings: ClipLeadSettings = CL
     pixel = events.y[chosen].astype(np.int64) * events.width + events.x[chosen]
     frame = np.searchsorted(times, t, side="right") - 1
     late, gap = t - times[frame], times[frame + 1] - times[frame]
-    phase = late / gap
     parts = np.round(gap / np.maximum(late, 1e-9))
     even = (parts <= settings.shares) & (np.abs(late * parts - gap) < 1.1e-6 * parts)
     if (late < 0.6e-6).mean() >= settings.exact or even.mean() >= settings.spread_out:
         return False
-    frame += phase > 1 - settings.tick
-    counts = np.histogram(phase % 1.0, settings.parts, (0.0, 1.0))[0]
-    around = sum(np.roll(counts, shift) for shift in range(settings.near))
-    if np.max(around) < settings.together * len(t):
+    phase = late / gap
+    begin, spread = begin_of_events(phase % 1.0, settings)
+    # soon after a frame all parts lie close together
+    clear = phase > settings.clear
+    if begin is None or (spread and even[clear].mean() >= settings.at_parts):
         return False
+    if settings.late[0] < begin < settings.late[1]:
+        return True
+    # at about the time of a frame it may be this one or the next of which they tell
+    frame += phase > 1 - settings.tick
     before = after = 0.0
     for one in np.unique(frame[(frame > 0) & (frame < len(times) - 1)]):
         here = frame == one
@@ -104,3 +129,29 @@ def is_shown_early(events: Events, scene: Scene, settings: ClipLeadSettings = CL
         ways = np.clip(ways, -settings.change, settings.change)[place] * np.where(p[here], 1, -1)[:, None]
         before, after = before + float(ways[:, 0].sum()), after + float(ways[:, 1].sum())
     return after > settings.sooner * max(before, 0.0)
+
+
+def begin_of_events(
+    phase: NDArray[np.float64], settings: ClipLeadSettings = CLIP_LEAD
+) -> tuple[float | None, bool]:
+    """Return at which share of the time from frame to frame most events begin, and whether others follow.
+
+    None if they come at any time.
+
+    Args:
+        phase: Of the events, in 0..1, shape (N,).
+        settings: What a begin is.
+    """
+    counts = np.histogram(phase, settings.parts, (0.0, 1.0))[0]
+    near = settings.near
+    around = sum(np.roll(counts, -shift) for shift in range(near))
+    first = int(np.argmax(around))
+    most = float(np.max(around))
+    begin = (first + np.argmax(np.roll(counts, -first)[:near] > 0)) % settings.parts / settings.parts
+    if most >= settings.together * len(phase):
+        return float(begin), False
+    ahead = float(np.roll(counts, near - first)[:near].sum())
+    spread = np.count_nonzero(counts > 1e-4 * len(phase)) >= settings.filled * settings.parts
+    is_sudden = ahead <= settings.sudden * most
+    begins = most >= settings.begun * len(phase) and is_sudden and spread
+    return (float(begin) if begins else None), True

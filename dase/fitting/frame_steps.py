@@ -62,7 +62,8 @@ FRAME_STEPS = FrameStepSettings()
 def frame_step_of(events: Events, scene: Scene, settings: FrameStepSettings = FRAME_STEPS) -> float | None:
     """Return the time from frame to frame of a clip in step with which events come [s]; None if they do not.
 
-    Asked only of clips whose frames are even.
+    Asked only of clips whose frames are even, and of none whose frames are held: of these it is known what
+    goes on between them.
 
     Args:
         events: Sorted.
@@ -70,7 +71,7 @@ def frame_step_of(events: Events, scene: Scene, settings: FrameStepSettings = FR
         settings: When they are in step.
     """
     step, times = clip_step_of(scene), scene.sample_times()
-    if not 0 < step <= settings.slowest:
+    if not 0 < step <= settings.slowest or is_held(scene):
         return None
     t = events.t[(events.t >= times[0]) & (events.t <= times[-1])][: settings.events]
     if len(t) < settings.least:
@@ -88,6 +89,8 @@ def frame_step_of(events: Events, scene: Scene, settings: FrameStepSettings = FR
 
 def clip_step_of(scene: Scene) -> float:
     """Return the time from frame to frame of a clip [s]; 0 for another scene, or if frames are not even."""
+    if isinstance(scene, VideoScene) and scene.held_for:
+        return scene.held_for
     gaps = np.diff(scene.sample_times()) if isinstance(scene, VideoScene) else np.empty(0)
     step = float(gaps.mean()) if len(gaps) else 0.0
     return step if len(gaps) and np.ptp(gaps) < 1e-3 * step else 0.0
@@ -100,7 +103,8 @@ def ticks_are_of_frames(
 
     Ticks of a clock that are finer than frames come at all parts of a frame alike, and such events are not in
     step with frames. One whose ticks are frames is in step, too, but tells at a frame of the light after it,
-    where a simulator by frames tells of the light before.
+    where a simulator by frames tells of the light before. Of frames that are held all events come so long
+    after one, whatever the clock.
 
     Args:
         tick: Time from tick to tick [s].
@@ -109,6 +113,8 @@ def ticks_are_of_frames(
         scene: What they are of.
         settings: How many frames are looked at.
     """
+    if is_held(scene):
+        return tick > settings.near * clip_step_of(scene)
     if not tick or not frame_step or tick > (1 + settings.near) * frame_step:
         return False
     if tick < (1 - settings.near) * frame_step:
@@ -124,6 +130,11 @@ def ticks_are_of_frames(
         before += int(np.count_nonzero(ways[0] > 0))
         after += int(np.count_nonzero(ways[1] > 0))
     return before > after
+
+
+def is_held(scene: Scene) -> bool:
+    """Whether the light of a clip goes from frame to frame in jumps."""
+    return isinstance(scene, VideoScene) and scene.held_for > 0
 
 
 def is_too_slow(step: float) -> bool:

@@ -18,12 +18,12 @@ from numpy.typing import NDArray
 from dase import io
 from dase.errors import InputError
 from dase.events import Events
-from dase.fitting.clip_lead import is_shown_early
+from dase.fitting.clip_lead import holds_frames
 from dase.fitting.screen_alignment import screen_scene
 from dase.formatting import fit_to_screen, format_seconds
 from dase.io.arrays import check_archive
 from dase.io.sequence import Sequence
-from dase.probes.stimulus import Trust
+from dase.probes.stimulus import STIMULUS, Trust
 from dase.recordings.recording import Recording, mask_of_region
 from dase.results import Comparison, Diagnosis, Fit
 from dase.scenes.between_frames import CameraScene
@@ -48,8 +48,6 @@ class Measurement:
         trust: Where and when the scene is to be trusted; None for everywhere.
         notes: What was noticed while reading.
         span: First and last time that is compared [s]; None for all.
-        held: Time for which each frame of a clip is held by the simulator that sent the events [s], 0 where
-            that is not seen: what takes less cannot be told.
     """
 
     events: Events
@@ -57,7 +55,11 @@ class Measurement:
     trust: Trust | None = None
     notes: tuple[str, ...] = ()
     span: tuple[float, float] | None = None
-    held: float = 0.0
+
+    @property
+    def held(self) -> float:
+        """Time for which the simulator of the events held each frame of a clip [s]; 0 if it did not."""
+        return self.scene.held_for if isinstance(self.scene, VideoScene) else 0.0
 
     def __repr__(self) -> str:
         trust = "everywhere" if self.trust is None else "in part"
@@ -149,13 +151,18 @@ def as_measurement(
 def _as_shown(measurement: Measurement) -> Measurement:
     """Return a measurement with its clip at the times at which its frames were shown, by the events."""
     scene = measurement.scene
-    if not isinstance(scene, VideoScene) or not is_shown_early(measurement.events, scene):
+    if not isinstance(scene, VideoScene) or not holds_frames(measurement.events, scene):
         return measurement
-    times = scene.sample_times()
-    gap = float(np.median(np.diff(times)))
-    note = f"events tell of each frame at the one before: the clip is taken {format_seconds(gap)} earlier"
-    scene = scene.at_times(np.concatenate(([times[0] - gap], times[:-1])))
-    return replace(measurement, scene=scene, held=gap, notes=(*measurement.notes, note))
+    shown = scene.held(STIMULUS.common_step)
+    return replace(measurement, scene=shown, notes=(*measurement.notes, note_of_held_frames(shown)))
+
+
+def note_of_held_frames(scene: VideoScene) -> str:
+    """Return what a user should know of a clip whose frames are held."""
+    return (
+        f"events tell of each frame at the one before: the clip is taken {format_seconds(scene.held_for)} "
+        "earlier, and each of its frames is held"
+    )
 
 
 def open_measurement(path: Path, scene: SceneChoice = "frames") -> Measurement:

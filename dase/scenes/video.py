@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from copy import copy
 from os import PathLike
 from pathlib import Path
 from typing import Any
@@ -75,6 +74,38 @@ class FilteredFrames:
         return grey + self._purity * (own - grey)
 
 
+class RepeatedFrames:
+    """Frames of which each is there several times, without a copy.
+
+    Args:
+        frames: Of shape (F, height, width).
+        index: Which frame each is, not decreasing, shape (N,).
+    """
+
+    ndim = 3
+
+    def __init__(self, frames: Frames, index: NDArray[np.int64]):
+        self._frames, self._index = frames, index
+        self.shape: tuple[int, ...] = (len(index), *frames.shape[1:])
+        self.dtype = getattr(frames, "dtype", None)
+
+    def __len__(self) -> int:
+        return len(self._index)
+
+    def __getitem__(self, index: NDArray[np.int64]) -> NDArray[Any]:
+        """Return the frames of increasing indices (K,), shape (K, height, width)."""
+        needed, place = np.unique(self._index[index], return_inverse=True)
+        out: NDArray[Any] = self._frames[needed][place]
+        return out
+
+
+EARLY = 5e-6
+"""Begin of a held frame's light before its time [s]: what comes at once is stamped with that time."""
+
+Frames = NDArray[Any] | FrameReader | FilteredFrames | RepeatedFrames
+"""What a `VideoScene` takes frames from, shape (F, height, width)."""
+
+
 class VideoScene(Scene):
     """Frames at given times; between two frames the log intensity of a pixel runs straight.
 
@@ -90,12 +121,22 @@ class VideoScene(Scene):
     """
 
     anytime = True
+    held_for = 0.0
+    """Time for which each frame is shown unchanged [s]; 0 where light goes straight from frame to frame."""
 
     def __init__(
-        self, frames: ArrayLike | FrameReader | FilteredFrames, times: ArrayLike, *, gamma: float = 1.0
+        self,
+        frames: ArrayLike | FrameReader | FilteredFrames | RepeatedFrames,
+        times: ArrayLike,
+        *,
+        gamma: float = 1.0,
     ):
         self.gamma = check_gamma(gamma)
-        self._frames = frames if isinstance(frames, FrameReader | FilteredFrames) else np.asarray(frames)
+        self._frames: Frames = (
+            frames
+            if isinstance(frames, FrameReader | FilteredFrames | RepeatedFrames)
+            else np.asarray(frames)
+        )
         self._colours: ColourFrames | FrameReader | None = None
         if isinstance(frames, FrameReader) and frames.colour:
             self._colours = frames
@@ -117,7 +158,7 @@ class VideoScene(Scene):
         if isinstance(self._frames, np.ndarray):
             check_light(self._frames, "video")
         self._light_of_level: NDArray[np.float32] | None = None
-        if isinstance(self._frames, np.ndarray) and self._frames.dtype == np.uint8:
+        if getattr(self._frames, "dtype", None) == np.uint8:
             self._light_of_level = to_light(np.arange(LEVELS, dtype=np.uint8), gamma=self.gamma)
         self.height, self.width = self._frames.shape[1:]
         self.duration = float(self._times[-1] - self._times[0])
@@ -126,12 +167,27 @@ class VideoScene(Scene):
         """Return the times of the frames [s]."""
         return self._times
 
-    def at_times(self, times: NDArray[np.float64]) -> VideoScene:
-        """Return the same frames at other times [s], increasing, shape (F,)."""
-        other = copy(self)
-        other._times = np.asarray(times, np.float64)
-        other.duration = float(other._times[-1] - other._times[0])
-        return other
+    def longest_gap(self) -> float:
+        """Return the longest time from frame to frame [s]; 0 for one frame."""
+        return self.held_for or float(np.diff(self._times).max(initial=0.0))
+
+    def held(self, step: float) -> VideoScene:
+        """Return the light of each frame shown from the time of the one before on, unchanged until its own.
+
+        Light goes over to a frame in the first part of the time that it is shown, and is at rest in the last.
+
+        Args:
+            step: Length of the parts, about [s]; there are two of each frame at least.
+        """
+        gaps = np.diff(self._times)
+        parts = max(2, round(float(np.median(gaps)) / step)) if len(gaps) else 1
+        inner = self._times[:-1, None] + gaps[:, None] * (np.arange(parts) + 1) / parts
+        inner[:, -1] = self._times[1:]
+        index = np.concatenate(([0], np.repeat(np.arange(1, len(self._times)), parts)))
+        times = np.concatenate((self._times[:1], inner.ravel())) - EARLY
+        out = VideoScene(RepeatedFrames(self._frames, index), times, gamma=self.gamma)
+        out.held_for = self.longest_gap()
+        return out
 
     def source(self, times: NDArray[np.float64], pixels: NDArray[np.int32], device: Any) -> tuple[str, Any]:
         """Return the stored intensities of these pixels, shape (K, N); see `Scene.source`.

@@ -1,4 +1,4 @@
-"""A clip whose frames a simulator shows a frame early is taken to be earlier."""
+"""A clip whose frames a simulator held is taken as it was shown: each frame from the one before on."""
 
 from __future__ import annotations
 
@@ -8,8 +8,9 @@ from helpers.frame_simulator import HEIGHT, WIDTH, counted_between_frames, shake
 
 import dase
 from dase.effects import EFFECTS
+from dase.effects.threshold import Threshold
 from dase.events import Events
-from dase.fitting.clip_lead import is_shown_early
+from dase.fitting.clip_lead import holds_frames
 from dase.fitting.measurement import as_measurement
 from dase.scenes.video import VideoScene
 from dase.simulation.sensor import Sensor
@@ -43,15 +44,20 @@ def scene(request) -> VideoScene:
 
 
 @pytest.mark.parametrize("late", [0.0, 0.4])
-def test_events_before_their_light_are_of_a_clip_that_is_shown_early(scene, late):
+def test_events_before_their_light_are_of_a_clip_that_holds_frames(scene, late):
     gap = float(np.diff(scene.sample_times())[0])
     events = held_frames(scene, early=True, late=late * gap)
     measured = as_measurement(events, scene)
     assert measured.held == pytest.approx(gap)
     assert any("earlier" in note for note in measured.notes)
-    np.testing.assert_allclose(measured.scene.sample_times(), scene.sample_times() - gap)
+    times, shown = scene.sample_times(), measured.scene
+    # each frame is there from half a frame before its time on, at the latest, and until just before it
+    inner = shown.sample_times()
+    held = inner[(inner > times[4] + 0.47 * gap) & (inner < times[5])]
+    assert held[-1] > times[5] - 0.03 * gap
+    assert len(held) >= 2
     np.testing.assert_array_equal(
-        measured.scene.frames(measured.scene.sample_times()[5:7]), scene.frames(scene.sample_times()[5:7])
+        shown.frames(held), np.broadcast_to(scene.frames(times[5:6]), (len(held), HEIGHT, WIDTH))
     )
     # it is moved once
     again = as_measurement(measured)
@@ -61,7 +67,7 @@ def test_events_before_their_light_are_of_a_clip_that_is_shown_early(scene, late
 
 def test_a_frame_at_its_own_time_is_not_early(scene):
     events = held_frames(scene, early=False)
-    assert not is_shown_early(events, scene)
+    assert not holds_frames(events, scene)
     measured = as_measurement(events, scene)
     assert measured.scene is scene
     assert (measured.held, measured.notes) == (0.0, ())
@@ -76,7 +82,7 @@ def test_simulators_of_light_between_frames_are_not_early(scene):
         *(dase.simulate(scene, sensor, seed=1) for sensor in (Sensor(), clock, slow)),
     ):
         assert len(events) > 2000
-        assert not is_shown_early(events, scene)
+        assert not holds_frames(events, scene)
 
 
 def test_the_first_of_some_events_that_share_a_frame_is_not_early(scene):
@@ -86,21 +92,23 @@ def test_the_first_of_some_events_that_share_a_frame_is_not_early(scene):
     frame = np.round(events.t / gap)
     part = np.where(frame % 2, 4, 5)
     first = Events(gap * (frame + 1 / part), events.x, events.y, events.p, WIDTH, HEIGHT)
-    assert not is_shown_early(first, scene)
+    assert not holds_frames(first, scene)
 
 
 def test_few_events_tell_nothing(scene):
     events = held_frames(scene, early=True)
-    assert is_shown_early(events, scene)
-    assert not is_shown_early(events.select(slice(0, 500)), scene)
-    assert not is_shown_early(Events.empty(WIDTH, HEIGHT), scene)
+    assert holds_frames(events, scene)
+    assert not holds_frames(events.select(slice(0, 500)), scene)
+    assert not holds_frames(Events.empty(WIDTH, HEIGHT), scene)
 
 
 def test_a_model_comes_nearer(scene, monkeypatch):
     """The dead time stands for what is left of a frame's change when a pixel has sent."""
     gap = float(np.diff(scene.sample_times())[0])
     events = held_frames(scene, early=True)
-    sensor = Sensor().with_effect(EFFECTS["refractory"](period=0.5 * gap, mode="reset"))
+    begun = Sensor().with_effect(Threshold(on=0.2, off=0.2, phase=0.0))
+    sensor = begun.with_effect(EFFECTS["refractory"](period=0.5 * gap, mode="reset"))
     moved = dase.compare(events, sensor, scene=scene).error
-    monkeypatch.setattr("dase.fitting.measurement.is_shown_early", lambda *_: False)
-    assert moved < 0.5 * dase.compare(events, sensor, scene=scene).error
+    monkeypatch.setattr("dase.fitting.measurement.holds_frames", lambda *_: False)
+    assert moved < 1
+    assert moved < 0.1 * dase.compare(events, sensor, scene=scene).error

@@ -22,8 +22,9 @@ def run_as_two_processes(*words: str) -> None:
     The place to meet is given, as another launcher may hold the usual port, and the name of a machine need
     not lead to it. A port that somebody took meanwhile is no failure of the program: another is tried.
     """
-    root = str(Path(__file__).parents[2])  # a test file that is its own program imports what tests share
-    told = {"OMP_NUM_THREADS": "1", "DASE_THREADS": "1", "PYTHONPATH": root}
+    # a test file that is its own program imports what tests share
+    places = [str(Path(__file__).parents[1]), *filter(None, [os.environ.get("PYTHONPATH")])]
+    told = {"OMP_NUM_THREADS": "1", "DASE_THREADS": "1", "PYTHONPATH": os.pathsep.join(places)}
     for _ in range(3):
         place = ["--master-addr", "127.0.0.1", "--master-port", str(free_port())]
         command = [sys.executable, "-m", "torch.distributed.run", "--nproc-per-node", "2", *place, *words]

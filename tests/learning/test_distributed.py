@@ -12,13 +12,14 @@ import pytest
 torch = pytest.importorskip("torch")
 pytest.importorskip("safetensors")
 
+from helpers.two_processes import run_as_two_processes
+
 from dase.learning import distributed
 from dase.learning.adversarial import AdversarialObjective, AdversarialSettings, PatchHash
 from dase.learning.moment_matching import Moments
 from dase.learning.scene_batches import Scenery, SceneSettings, middle_intensity
 from dase.learning.targets import Pairs, draw_noise, simulate_counts
 from dase.scenes.image_sources import open_images
-from tests.helpers.two_processes import run_as_two_processes
 
 
 def batches() -> tuple[Pairs, Pairs]:

@@ -12,6 +12,8 @@ import pytest
 
 torch = pytest.importorskip("torch")
 
+from helpers.two_processes import run_as_two_processes
+
 from dase.errors import InputError
 from dase.tasks.checkpoints import load_network, read_checkpoint
 from dase.tasks.event_networks import E2VidNet, EvFlowNet, FireNet
@@ -20,7 +22,6 @@ from dase.tasks.optimisation import Optimisation
 from dase.tasks.reconstruction_training import ReconstructionTraining, train_reconstruction
 from dase.tasks.training_step import TrainingStep
 from dase.torch.batch import Batch
-from tests.helpers.two_processes import run_as_two_processes
 
 RECONSTRUCTION = ReconstructionTraining(steps=6, warm_up=2, average=0.5, save_every=2, log_every=1)
 FLOW = FlowTraining(steps=6, warm_up=2, average=0.5, save_every=2, log_every=1)

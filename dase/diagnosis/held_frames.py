@@ -1,0 +1,271 @@
+"""What a simulator that holds the frames of a clip makes of a pixel, and the dead time beyond that.
+
+Where light jumps from frame to frame, a pixel that sends takes the light of the frame for its memory: it
+sends once for a frame, and the rest of the change is lost (IEBCS). That is a dead time of a part of a frame,
+in which the pixel is held in reset. It is no property of a camera, so the model has it before anything is
+searched. A dead time of the simulator's own shows where a pixel's intervals begin: at two frames or more.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dase.diagnosis.dead_time import find_dead_time, intervals_of
+from dase.diagnosis.grading import grade_of, judge_on_report
+from dase.diagnosis.state import DiagnosisState, with_same_freedom
+from dase.effects.bandwidth import Bandwidth
+from dase.effects.latency import Latency
+from dase.effects.refractory import Refractory
+from dase.fitting.clip_lead import begin_of_events
+from dase.fitting.data_split import SplitMeasurement
+from dase.fitting.measurement import Measurement, note_of_held_frames
+from dase.fitting.model import FittedModel, fit_present_model, refit_model
+from dase.fitting.parameter_space import axes_of
+from dase.formatting import format_seconds
+from dase.probes.random_streams import SimulationStream
+from dase.probes.stimulus import STIMULUS
+from dase.results import Diagnosis, Estimate, Finding, Grade
+from dase.scenes.scene import Scene
+from dase.scenes.video import VideoScene
+from dase.simulation.sensor import Sensor
+
+EFFECT = Refractory.name
+
+
+@dataclass(frozen=True)
+class HeldFrameSettings:
+    """When a pixel's intervals begin."""
+
+    usual: float = 0.1
+    """Intervals of as many frames as the first that has this share of the most frequent one's: random events
+    come sooner."""
+
+    clear: float = 0.5
+    """Share of the next one's below which that may be the first, too: a dead time of whole frames ends at
+    about the time of a frame."""
+
+    at_once: float = 0.1
+    """Times after a frame, relative to that to the next, at which events are not late."""
+
+    longest: int = 1000
+    """Frames up to which is counted."""
+
+    repeats: int = 12
+    """Simulations that judge."""
+
+    missing: float = 3.0
+    """Error of the model before the search below which no low-pass is looked for that hides jumps."""
+
+    slow: float = 0.5
+    """Share of that error that a low-pass leaves of light that goes straight, at most."""
+
+    better: float = 0.5
+    """Share of what then is left that it leaves of light that is held, at most."""
+
+
+HELD_FRAMES = HeldFrameSettings()
+
+
+def fewest_frames(measurement: Measurement, settings: HeldFrameSettings = HELD_FRAMES) -> tuple[int, ...]:
+    """Return after how many held frames pixels can send again: what that may be, most likely first.
+
+    0 stands for pixels that may send again within their frame: behind a low-pass events come at any time.
+
+    Args:
+        measurement: The light and the events.
+        settings: What counts as the first.
+    """
+    intervals = intervals_of(measurement.compared_events()) / measurement.held
+    counts = np.bincount(np.minimum(np.round(intervals), settings.longest).astype(np.int64), minlength=3)
+    counts[0] = 0
+    first = int(np.argmax(counts >= settings.usual * counts.max())) if counts.any() else 1
+    out = [first]
+    if first + 1 < len(counts) and counts[first] < settings.clear * counts[first + 1]:
+        out.append(first + 1)
+    _, are_spread = begin_of_events(_phases(measurement))
+    return (*out, 0) if are_spread else tuple(out)
+
+
+def with_frame_as_memory(
+    sensor: Sensor,
+    measurement: Measurement,
+    evidence: SplitMeasurement,
+    free: Sequence[str] | None,
+    *,
+    seed: int,
+    settings: HeldFrameSettings = HELD_FRAMES,
+) -> Sensor:
+    """Return a sensor whose pixels take the light of a held frame for their memory, if they do.
+
+    Args:
+        sensor: One with a dead time of its own is left as it is.
+        measurement: The light and the events.
+        evidence: The same, split.
+        free: Parameters of the sensor that may be fitted.
+        seed: Of every random number.
+        settings: What is counted.
+    """
+    if not measurement.held or EFFECT in sensor:
+        return sensor
+    waits = [
+        sensor.with_effect(Refractory(period=(frames - 0.5) * measurement.held, mode="reset"))
+        for frames in fewest_frames(measurement, settings)
+        if frames
+    ]
+    if len(waits) == 1 and 0 not in fewest_frames(measurement, settings):
+        return waits[0]
+    errors = [_error_of(evidence, one, sensor, free, seed=seed, settings=settings) for one in waits]
+    if 0 in fewest_frames(measurement, settings):
+        for one in (_waiting_for_jump(sensor, evidence), sensor):
+            slow = _slow(one, measurement.held)
+            errors.append(_error_of(evidence, slow, slow.without(EFFECT), None, seed=seed, settings=settings))
+            waits.append(one)
+    return waits[int(np.argmin(errors))]
+
+
+def _waiting_for_jump(sensor: Sensor, evidence: SplitMeasurement) -> Sensor:
+    """Return a sensor whose pixels wait until a held frame's light is there."""
+    step = float(np.median(np.diff(evidence.when)))
+    return sensor.with_effect(Refractory(period=step, mode="reset"))
+
+
+def _slow(sensor: Sensor, gap: float) -> Sensor:
+    """Return a sensor behind a low-pass: as slow as frames, every `gap` [s], if it has none of its own."""
+    return sensor if Bandwidth.name in sensor else sensor.with_effect(Bandwidth(cutoff=0.5 / gap))
+
+
+def _error_of(
+    evidence: SplitMeasurement,
+    sensor: Sensor,
+    varied: Sensor,
+    free: Sequence[str] | None,
+    *,
+    seed: int,
+    settings: HeldFrameSettings,
+) -> float:
+    """Return the error of a sensor that was fitted, of the part that chooses.
+
+    Args:
+        evidence: The measurement.
+        sensor: What is fitted.
+        varied: It, without what is known.
+        free: What of that may be fitted; None for all.
+        seed: Of every random number.
+        settings: How often it is simulated.
+    """
+    axes = [axis.name for axis in axes_of(varied, free)]
+    fitted = fit_present_model(evidence, sensor, axes, seed=seed)
+    stream = SimulationStream.JUDGE.seed(seed)
+    return fitted.judge(evidence.held, repeats=settings.repeats, seed=stream).error
+
+
+def held_behind_low_pass(
+    measurement: Measurement,
+    evidence: SplitMeasurement,
+    start: FittedModel,
+    split: Callable[[Scene], SplitMeasurement],
+    *,
+    seed: int,
+    settings: HeldFrameSettings = HELD_FRAMES,
+) -> Measurement | None:
+    """Return a measurement whose clip was held, where only a low-pass hides that; None if it was not.
+
+    Behind a slow low-pass events come at any time from frame to frame. But light that is held explains them,
+    and light that goes straight does not.
+
+    Args:
+        measurement: Of a clip.
+        evidence: The same, split.
+        start: The model before the search.
+        split: Splits the measurement with another scene.
+        seed: Of every random number.
+        settings: How much better is enough.
+    """
+    scene = measurement.scene
+    if not isinstance(scene, VideoScene) or scene.held_for or evidence.frame_step or evidence.contradiction:
+        return None
+    if EFFECT in start.sensor or Bandwidth.name in start.sensor or measurement.trust is not None:
+        return None
+    stream = SimulationStream.JUDGE.seed(seed)
+    before = start.judge(evidence.held, repeats=settings.repeats, seed=stream).error
+    if before < settings.missing:
+        return None
+    error = partial(_error_of, seed=seed, settings=settings)
+    slow = _slow(start.sensor, scene.longest_gap())
+    straight = error(evidence, slow, slow, None)
+    if straight > settings.slow * before:
+        return None
+    shown = scene.held(STIMULUS.common_step)
+    again = split(shown)
+    errors = (error(again, one, slow, None) for one in (_waiting_for_jump(slow, again), slow))
+    if min(errors) > settings.better * straight:
+        return None
+    return replace(measurement, scene=shown, notes=(*measurement.notes, note_of_held_frames(shown)))
+
+
+def with_longer_dead_time(
+    diagnosis: Diagnosis, state: DiagnosisState, measurement: Measurement, model: FittedModel
+) -> Diagnosis:
+    """Return a diagnosis that says so where pixels wait for longer than their frame.
+
+    A simulator that waits until a late event is out does so, too: what a latency explains is none.
+
+    Args:
+        diagnosis: Made with a model that waits.
+        state: What it was made with.
+        measurement: The light and the events.
+        model: The last one.
+    """
+    effect, gap = model.sensor[EFFECT], measurement.held
+    assert isinstance(effect, Refractory)
+    explained = sum(one.delay for one in model.sensor.effects if isinstance(one, Latency))
+    if effect.period < gap + explained:
+        return diagnosis
+    sensor = model.sensor.with_effect(Refractory(period=0.5 * gap, mode="reset"))
+    bare = refit_model(state.evidence, with_same_freedom(sensor, model, ()), seed=state.seed)
+    without, last = (
+        one.judgement for one in judge_on_report(state, [bare, model], repeats=state.settings.repeats)
+    )
+    ended = find_dead_time(
+        measurement, bare.sensor, frame_step=0.0, structure=state.evidence.structure, seed=state.seed
+    )
+    grade, unknown = grade_of(
+        without, without, last, np.inf, has_rivals=False, settings=state.settings.grades
+    )
+    if ended is not None and without.error > last.error:
+        grade, unknown = Grade.CERTAIN, False
+    if grade is Grade.STAND_IN:
+        return diagnosis
+    others = (Latency.name,) if not explained and _come_late(measurement) else ()
+    grade = Grade.EITHER if others else grade
+    fewest = round(effect.period / gap + 0.5)
+    low, high = (fewest - 1) * gap, fewest * gap
+    mine = {f"{EFFECT}.period": Estimate(effect.period, low, high)}
+    words = f"pixels send again {format_seconds(high)} after an event at the soonest, {fewest} frames later"
+    found = Finding(
+        EFFECT, grade, others, unknown, error_without=without.error, error_with=last.error, parameters=mine,
+        seen=ended.sentence if ended else words,
+    )  # fmt: skip
+    out = replace(
+        diagnosis, findings=(*diagnosis.findings, found), parameters={**diagnosis.parameters, **mine}
+    )
+    if grade is Grade.EITHER:
+        return out
+    return replace(out, selected=(*out.selected, EFFECT), errors=(*out.errors, out.errors[-1]))
+
+
+def _come_late(measurement: Measurement, settings: HeldFrameSettings = HELD_FRAMES) -> bool:
+    """Return whether most events come long after a frame is shown; pixels wait for late ones."""
+    begin, _ = begin_of_events(_phases(measurement))
+    return begin is not None and settings.at_once < begin < 1 - settings.at_once
+
+
+def _phases(measurement: Measurement) -> NDArray[np.float64]:
+    """Return when events come, in times from frame to frame after the one that is shown, shape (N,)."""
+    events = measurement.compared_events()
+    return np.asarray((events.t - measurement.scene.sample_times()[0]) / measurement.held % 1.0)

@@ -1,0 +1,108 @@
+"""Clips whose frames a simulator held: its pixels' habit is no effect, and what they have beside is found."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from helpers.frame_simulator import HEIGHT, WIDTH, shaken_texture
+
+import dase
+from dase.diagnosis.held_frames import fewest_frames
+from dase.effects import EFFECTS
+from dase.events import Events
+from dase.fitting.measurement import as_measurement
+from dase.scenes.video import VideoScene
+
+GAP = 4e-3
+TRIED = {name: EFFECTS[name] for name in ("bandwidth", "latency", "refractory", "mismatch", "leak", "shot")}
+
+
+def held_with_low_pass(
+    scene: VideoScene, *, cutoff: float = np.inf, late: float = 0.0, dead: float = 0.0, threshold: float = 0.2
+) -> Events:
+    """Return events of frames that are held, each from the one before on, exactly: e-functions, one by one.
+
+    After an event a pixel waits until that is out and for the dead time, and takes what it sees then for its
+    memory.
+
+    Args:
+        scene: Frames of light.
+        cutoff: Of a low-pass, at intensity 1 and as much lower as light is [Hz].
+        late: From the crossing to the event [s].
+        dead: From the event on [s].
+        threshold: ON and OFF [log intensity].
+    """
+    times = scene.sample_times()
+    light = scene.frames(times).astype(np.float64) + 1e-3
+    value = np.log(light[0])
+    memory, free = value.copy(), np.zeros(value.shape)
+    out = []
+    for begin, end, now in zip(times[:-1], times[1:], light[1:], strict=True):
+        target = np.log(now)
+        rate = 2 * np.pi * min(cutoff, 1e7) * now
+        at = np.full(value.shape, begin)
+        todo = free < end
+        while todo.any():
+            # memories are taken anew where a pixel becomes free within this frame
+            fresh = todo & (free > at)
+            seen = target + (value - target) * np.exp(-rate * (np.maximum(free, at) - begin))
+            memory[fresh] = seen[fresh]
+            at = np.where(fresh, free, at)
+            goal = memory + np.sign(target - memory) * threshold
+            left = (goal - target) / np.where(value == target, np.inf, value - target)
+            ok = todo & (np.abs(target - memory) > threshold) & (left > 0)
+            cross = np.where(ok, begin - np.log(np.where(ok, left, 1.0)) / rate, np.inf)
+            sends = ok & (cross < end)
+            y, x = np.nonzero(sends)
+            t = np.maximum(cross[y, x], at[y, x])
+            out.append((t + late, x, y, target[y, x] > memory[y, x]))
+            free[y, x] = t + late + dead + 1e-6
+            at[y, x] = t
+            todo = sends & (free < end)
+        value = target + (value - target) * np.exp(-rate * (end - begin))
+    t, x, y, p = (np.concatenate(part) for part in zip(*out, strict=True))
+    order = np.argsort(t, kind="stable")
+    t = np.round(1e6 * t[order]) / 1e6
+    return Events(t, x[order], y[order], p[order], WIDTH, HEIGHT)
+
+
+@pytest.fixture(scope="module")
+def scene() -> VideoScene:
+    return shaken_texture(gap=GAP)
+
+
+def test_a_pixel_that_forgets_the_rest_of_a_frame_lacks_nothing(scene):
+    events = held_with_low_pass(scene)
+    assert fewest_frames(as_measurement(events, scene)) == (1,)
+    found = dase.diagnose(events, "ideal", scene=scene, effects=TRIED, most=2)
+    assert found.findings == ()
+    assert found.unexplained is None
+    assert found.errors[-1] < 0.5
+    assert found.parameters["threshold.on"].value == pytest.approx(0.2, rel=0.01)
+
+
+def test_a_dead_time_of_several_frames_is_certain(scene):
+    found = dase.diagnose(held_with_low_pass(scene, dead=0.01), "ideal", scene=scene, effects=TRIED, most=2)
+    assert [(one.effect, one.grade) for one in found.findings] == [("refractory", "certain")]
+    period = found.parameters["refractory.period"]
+    assert period.low <= 0.01 <= period.high
+    assert found.selected == ("refractory",)
+    assert len(found.errors) == 2
+
+
+def test_what_waits_for_late_events_has_no_dead_time(scene):
+    found = dase.diagnose(held_with_low_pass(scene, late=6.3e-3), "ideal", scene=scene, effects=TRIED, most=2)
+    assert [one.effect for one in found.findings] == ["latency"]
+    assert found.parameters["latency.delay"].value == pytest.approx(6.3e-3, rel=0.1)
+
+
+def test_a_slow_low_pass_hides_no_held_frame(scene):
+    """Events come at any time then, and light that goes straight explains them worse."""
+    events = held_with_low_pass(scene, cutoff=60.0)
+    assert not as_measurement(events, scene).held
+    found = dase.diagnose(events, "ideal", scene=scene, effects=TRIED, most=2)
+    # the jump takes a millisecond in the model, which leaves a little
+    assert found.selected == ("bandwidth",)
+    assert found.errors[-1] < 0.7
+    assert found.parameters["bandwidth.cutoff"].value == pytest.approx(60, rel=0.05)
+    assert any("held" in note for note in found.notes)
