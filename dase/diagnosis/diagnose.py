@@ -34,7 +34,12 @@ from dase.diagnosis.events_at_rest import LEAK, find_events_at_rest
 from dase.diagnosis.few_hot_pixels import NAME as HOT
 from dase.diagnosis.few_hot_pixels import few_hot_pixels, hot_effect_of, with_hot_pixels
 from dase.diagnosis.grading import ModelOnReport, grade_effects, judge_on_report, leaves_little
-from dase.diagnosis.held_frames import held_behind_low_pass, with_frame_as_memory, with_longer_dead_time
+from dase.diagnosis.held_frames import (
+    held_behind_low_pass,
+    known_at_frames_alone,
+    with_frame_as_memory,
+    with_longer_dead_time,
+)
 from dase.diagnosis.pruning import prune_model
 from dase.diagnosis.remainder import describe_unexplained, share_of_scene, what_to_record
 from dase.diagnosis.seen_effects import (
@@ -268,6 +273,10 @@ def diagnose(
         if model is not whole and not leaves_nothing(judgement) and not state.has_asked(model):
             # a stand-in that was dropped may have hidden what it stood for
             model, judgement = _add_one_by_one(state, model, limit - len(state.added_to(model)))
+    if not may_be_announced(judgement):
+        shown = known_at_frames_alone(measurement, evidence, model, judgement.error, split_of, seed=seed)
+        if shown is not None:
+            return replace(again(shown), seconds=time.perf_counter() - begin)
     if state.added_to(model):  # else it was asked before
         seen = _look_for_dead_time(state, seen, measurement, model)
         seen, model, judgement = _without_needless_dead_time(state, seen, measurement, model, judgement)

@@ -21,8 +21,10 @@ from dase.diagnosis.state import DiagnosisState, with_same_freedom
 from dase.effects.bandwidth import Bandwidth
 from dase.effects.latency import Latency
 from dase.effects.refractory import Refractory
+from dase.effects.second_order import SecondOrder
 from dase.fitting.clip_lead import begin_of_events
 from dase.fitting.data_split import SplitMeasurement
+from dase.fitting.frame_steps import clip_step_of
 from dase.fitting.measurement import Measurement, note_of_held_frames
 from dase.fitting.model import FittedModel, fit_present_model, refit_model
 from dase.fitting.parameter_space import axes_of
@@ -48,6 +50,9 @@ class HeldFrameSettings:
     clear: float = 0.5
     """Share of the next one's below which that may be the first, too: a dead time of whole frames ends at
     about the time of a frame."""
+
+    by_frames: float = 0.7
+    """Share of the error of a last model with a low-pass that one from frame to frame leaves, at most."""
 
     at_once: float = 0.1
     """Times after a frame, relative to that to the next, at which events are not late."""
@@ -206,6 +211,54 @@ def held_behind_low_pass(
     if min(errors) > settings.better * straight:
         return None
     return replace(measurement, scene=shown, notes=(*measurement.notes, note_of_held_frames(shown)))
+
+
+def known_at_frames_alone(
+    measurement: Measurement,
+    evidence: SplitMeasurement,
+    model: FittedModel,
+    error: float,
+    split: Callable[[Scene], SplitMeasurement],
+    *,
+    seed: int,
+    settings: HeldFrameSettings = HELD_FRAMES,
+) -> Measurement | None:
+    """Return a measurement of a simulator that filters from frame to frame; None where that says no more.
+
+    Asked where a low-pass leaves too much. Between its frames the events may come at any time.
+
+    Args:
+        measurement: Of a clip.
+        evidence: The same, split.
+        model: The last one, which has a low-pass.
+        error: Its error, of the part that chooses.
+        split: Splits the measurement with another scene.
+        seed: Of every random number.
+        settings: How much better is enough.
+    """
+    scene = measurement.scene
+    if not isinstance(scene, VideoScene) or scene.held_for or evidence.frame_step or evidence.contradiction:
+        return None
+    slow = [one for one in model.sensor.effects if isinstance(one, Bandwidth | SecondOrder)]
+    if len(slow) != 1 or measurement.trust is not None or not clip_step_of(scene):
+        return None
+    rest = model.sensor.without(slow[0].name)
+    shown = scene.known_at_frames()
+    again = split(shown)
+    stream = SimulationStream.JUDGE.seed(seed)
+    for one in _in_steps(slow[0]):
+        way = with_same_freedom(rest.with_effect(one), model, [one.name])
+        fitted = refit_model(again, way, seed=seed)
+        if fitted.judge(again.held, repeats=settings.repeats, seed=stream).error < settings.by_frames * error:
+            return replace(measurement, scene=shown)
+    return None
+
+
+def _in_steps(effect: Bandwidth | SecondOrder) -> tuple[Bandwidth, SecondOrder]:
+    """Return a low-pass from frame to frame, and two in a row, about as late as a continuous one."""
+    later = 1 / effect.cutoff if isinstance(effect, Bandwidth) else 2 * effect.damping / effect.cutoff
+    one = Bandwidth(cutoff=1 / later, dark=effect.dark, signal="steps")
+    return one, SecondOrder(cutoff=2 / later, damping=1.0, dark=effect.dark, poles="steps")
 
 
 def with_longer_dead_time(

@@ -9,8 +9,8 @@ from typing import ClassVar, Self
 
 import warp as wp
 
-from dase.effects.bandwidth import Bandwidth
-from dase.effects.base import Effect, Observations, choice, parameter
+from dase.effects.bandwidth import Bandwidth, time_constants
+from dase.effects.base import ANY_SAMPLES, Effect, Observations, choice, parameter
 from dase.effects.photocurrent import USUAL, dark_share, idle_beside, relative_photocurrent
 from dase.kernels.pixel_stages import EffectStages
 from dase.kernels.vector_math import cosine_and_sine, exponential
@@ -146,6 +146,26 @@ def photoreceptor_voltage(
     return settled, voltage, settled, speed
 
 
+@wp.func
+def stepped_voltage_twice(
+    voltage: float,
+    intensity: float,
+    dt: float,
+    cutoff: float,
+    dark: float,
+    dark_current: float,
+    spread: float,
+    input: float,
+    output: float,
+    pixel_normal: float,
+):
+    """Two low-passes in a row that go a share of the way at each sample; `input` is the first one's state."""
+    x = time_constants(intensity, dt, cutoff, dark, dark_current, spread, pixel_normal)
+    between = input + wp.min(x, 1.0) * (voltage - input)
+    settled = output + wp.min(x, 1.0) * (between - output)
+    return settled, between, settled, 0.0
+
+
 @dataclass(frozen=True, kw_only=True)
 class SecondOrder(Effect):
     """A photoreceptor of two poles.
@@ -171,6 +191,10 @@ class SecondOrder(Effect):
     share of it: with a high gain nearly all, and damping falls as light rises. Without a loop it is one
     low-pass behind another, such as a buffer. `of_poles` takes the poles and the gain. With a fixed pole far
     above the other it is `bandwidth` in all light.
+
+    With `poles = "steps"` it is what another simulator makes of two equal ones (Metavision): two low-passes
+    in a row, each of which goes ω dt of the way from one sample of the scene to the next, and all of it where
+    that is above 1. It belongs to scenes whose frames are those that the other simulator has seen.
     """
 
     name: ClassVar[str] = "second_order"
@@ -221,17 +245,23 @@ class SecondOrder(Effect):
     )
     poles: str = choice(
         "alike",
-        among=("alike", "apart"),
-        about="both follow the light, or one does and one is fixed, so that damping changes with light",
+        among=("alike", "apart", "steps"),
+        about="both follow the light; one does and one is fixed, so that damping changes with light; or two "
+        "equal ones in steps of a sample",
     )
 
     @classmethod
     def candidates(cls, observed: Observations) -> list[Self]:
-        """Return that of constant damping: `dase.fit` asks for the circuit's, too."""
-        return [cls()]
+        """Return that of constant damping: `dase.fit` asks for the circuit's, too.
+
+        Where events are of a simulator that works frame by frame, it goes in steps.
+        """
+        return [cls(poles="steps", damping=1.0) if observed.clip_step else cls()]
 
     def by_other_laws(self) -> list[Self]:
         """Return the other law of the poles, of the same frequency and damping in usual light."""
+        if self.poles == "steps":
+            return [replace(self, poles="alike")]
         root = math.sqrt(USUAL)
         if self.poles == "alike":
             return [self._changed(self.cutoff * root, self.damping * root / self._share(), "apart")]
@@ -262,16 +292,22 @@ class SecondOrder(Effect):
 
     def idle(self, beside: Sequence[Effect]) -> tuple[str, ...]:
         """Return the names of the parameters that change nothing by its law."""
-        return (*(("fixed",) if self.poles == "alike" else ()), *idle_beside(beside))
+        idle = {"alike": ("fixed",), "apart": (), "steps": ("fixed", "damping")}[self.poles]
+        return (*idle, *idle_beside(beside))
+
+    def longest_step(self) -> float:
+        """Return the longest time between samples that still shows the effect [s]."""
+        return ANY_SAMPLES if self.poles == "steps" and self.cutoff < math.inf else math.inf
 
     def compiled(self) -> EffectStages:
         """Return what the kernel composer needs to know."""
-        stages = super().compiled()
-        if self.poles == "alike":
-            return stages
-        return replace(stages, functions=(("respond", photoreceptor_voltage),))
+        respond = {
+            "alike": second_order_voltage, "apart": photoreceptor_voltage, "steps": stepped_voltage_twice
+        }[self.poles]  # fmt: skip
+        return replace(super().compiled(), functions=(("respond", respond),))
 
     def simpler(self) -> tuple[Effect, ...]:
         """Return the one low-pass that is as late behind a ramp: by 2 damping / (2π cutoff)."""
         cutoff = max(self.cutoff / (2 * self.damping), 0.01)
-        return (Bandwidth(cutoff=cutoff, dark=self.dark, spread=self.spread),)
+        signal = "steps" if self.poles == "steps" else "small"
+        return (Bandwidth(cutoff=cutoff, dark=self.dark, spread=self.spread, signal=signal),)

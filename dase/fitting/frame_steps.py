@@ -73,6 +73,8 @@ def frame_step_of(events: Events, scene: Scene, settings: FrameStepSettings = FR
     step, times = clip_step_of(scene), scene.sample_times()
     if not 0 < step <= settings.slowest or is_held(scene):
         return None
+    if isinstance(scene, VideoScene) and scene.by_frames:
+        return step
     t = events.t[(events.t >= times[0]) & (events.t <= times[-1])][: settings.events]
     if len(t) < settings.least:
         return None

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from copy import copy
 from os import PathLike
 from pathlib import Path
 from typing import Any
@@ -124,6 +125,9 @@ class VideoScene(Scene):
     held_for = 0.0
     """Time for which each frame is shown unchanged [s]; 0 where light goes straight from frame to frame."""
 
+    by_frames = False
+    """Whether a simulator has filtered light from frame to frame, and knows none between them."""
+
     def __init__(
         self,
         frames: ArrayLike | FrameReader | FilteredFrames | RepeatedFrames,
@@ -166,6 +170,12 @@ class VideoScene(Scene):
     def sample_times(self) -> NDArray[np.float64]:
         """Return the times of the frames [s]."""
         return self._times
+
+    def known_at_frames(self) -> VideoScene:
+        """Return the light as a simulator takes it that knows the frames alone."""
+        other = copy(self)
+        other.by_frames = True
+        return other
 
     def longest_gap(self) -> float:
         """Return the longest time from frame to frame [s]; 0 for one frame."""

@@ -106,3 +106,49 @@ def test_a_slow_low_pass_hides_no_held_frame(scene):
     assert found.errors[-1] < 0.7
     assert found.parameters["bandwidth.cutoff"].value == pytest.approx(60, rel=0.05)
     assert any("held" in note for note in found.notes)
+
+
+def filtered_at_frames(scene: VideoScene, *, cutoff: float, spread: float, threshold: float = 0.2) -> Events:
+    """Return events of two low-passes in a row from frame to frame, straight between them, as Metavision's.
+
+    Args:
+        scene: Frames of light.
+        cutoff: Of each low-pass at full light; it goes with (light + 0.08) / 1.08 [Hz].
+        spread: Of the thresholds, which are those of a pixel for good, relative.
+        threshold: ON and OFF, their mean [log intensity].
+    """
+    times = scene.sample_times()
+    light = scene.frames(times).astype(np.float64)
+    rng = np.random.default_rng(1)
+    on, off = (threshold * (1 + spread * rng.standard_normal(light.shape[1:])) for _ in "+-")
+    first = second = np.log(light[0] + 1e-3)
+    memory, out = second.copy(), []
+    for begin, end, now in zip(times[:-1], times[1:], light[1:], strict=True):
+        share = np.minimum(2 * np.pi * cutoff * (now + 0.08) / 1.08 * (end - begin), 1.0)
+        first = first + share * (np.log(now + 1e-3) - first)
+        then = second + share * (first - second)
+        for sign, size in ((1, on), (-1, off)):
+            count = np.floor(np.maximum(sign * (then - memory), 0) / size).astype(int)
+            for n in range(count.max(initial=0)):
+                y, x = np.nonzero(count > n)
+                level = memory[y, x] + sign * (n + 1) * size[y, x]
+                t = begin + (end - begin) * (level - second[y, x]) / (then - second)[y, x]
+                out.append((t, x, y, np.full(len(x), sign > 0)))
+            memory = memory + sign * count * size
+        second = then
+    t, x, y, p = (np.concatenate(part) for part in zip(*out, strict=True))
+    order = np.argsort(t, kind="stable")
+    return Events(np.round(1e6 * t[order]) / 1e6, x[order], y[order], p[order], WIDTH, HEIGHT)
+
+
+@pytest.mark.slow
+def test_a_low_pass_from_frame_to_frame_is_asked_for_where_another_leaves_too_much():
+    scene = shaken_texture(gap=6e-3)
+    events = filtered_at_frames(scene, cutoff=60.0, spread=0.0)
+    tried = {name: EFFECTS[name] for name in ("bandwidth", "second_order", "latency", "leak")}
+    found = dase.diagnose(events, "ideal", scene=scene, effects=tried, most=2)
+    assert found.selected == ("second_order",)
+    assert found.errors[-1] < 1
+    slow = found.sensor["second_order"]
+    assert slow.poles == "steps"
+    assert slow.cutoff == pytest.approx(60, rel=0.1)

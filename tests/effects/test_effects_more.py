@@ -95,6 +95,7 @@ TWINS = {
     "noise": (VoltageNoise(sigma=0.2, cutoff=30.0),),
     "noise of two poles": (VoltageNoise(sigma=0.2, cutoff=30.0, poles="apart"),),
     "steps": (Bandwidth(cutoff=60.0, dark=0.02, spread=0.2, signal="steps"),),
+    "steps of two poles": (SecondOrder(cutoff=60.0, dark=0.02, spread=0.2, poles="steps"),),
     "noise of one pole": (Bandwidth(cutoff=60.0), VoltageNoise(sigma=0.2, cutoff=30.0, poles="one")),
     "noise of a loop": (VoltageNoise(sigma=0.2, cutoff=20.0, gain=15.0, poles="apart"),),
     "uneven": (Bandwidth(cutoff=60.0, spread=0.4), SecondOrder(cutoff=90.0, spread=0.3)),

@@ -270,6 +270,9 @@ def voltage(sensor: dase.Sensor, times: np.ndarray, intensity: np.ndarray, seed:
         if slow.poles == "apart":
             damping = slow.damping * (slow.fixed / np.sqrt(current) + (1 - slow.fixed) * np.sqrt(current))
             level = second_order(times, level, omega * np.sqrt(current), damping)
+        elif slow.poles == "steps":
+            for _ in range(2):
+                level = stepped(times, level, omega * current / (2 * np.pi))
         else:
             level = second_order(times, level, omega * current, slow.damping)
     if setting(sensor, "voltage_noise", "sigma", 0.0) > 0:
