@@ -25,7 +25,7 @@ LONGEST = (
     *("test_examples", "test_detection_limits", "test_training_run", "test_diagnose", "test_grading"),
     *("test_tutorial", "test_distributed", "test_study", "test_unequal_thresholds", "test_silent_pixels"),
     *("test_learned_sensor", "test_measurement", "test_video", "test_training", "test_commands"),
-    *("test_user_effects", "test_sensor_edit"),
+    *("test_user_effects", "test_sensor_edit", "test_held_frames"),
 )
 """Files that take longest, in this order: where processes share the work, these are begun first."""
 

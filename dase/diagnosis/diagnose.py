@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from itertools import combinations
@@ -33,7 +33,7 @@ from dase.diagnosis.drifting_memory import find_drifting_memory
 from dase.diagnosis.events_at_rest import LEAK, find_events_at_rest
 from dase.diagnosis.few_hot_pixels import NAME as HOT
 from dase.diagnosis.few_hot_pixels import few_hot_pixels, hot_effect_of, with_hot_pixels
-from dase.diagnosis.grading import ModelOnReport, grade_effects, judge_on_report, leaves_little
+from dase.diagnosis.grading import ModelOnReport, grade_effects, is_far_off, judge_on_report, leaves_little
 from dase.diagnosis.held_frames import (
     held_behind_low_pass,
     known_at_frames_alone,
@@ -273,10 +273,9 @@ def diagnose(
         if model is not whole and not leaves_nothing(judgement) and not state.has_asked(model):
             # a stand-in that was dropped may have hidden what it stood for
             model, judgement = _add_one_by_one(state, model, limit - len(state.added_to(model)))
-    if not may_be_announced(judgement):
-        shown = known_at_frames_alone(measurement, evidence, model, judgement.error, split_of, seed=seed)
-        if shown is not None:
-            return replace(again(shown), seconds=time.perf_counter() - begin)
+    shown = known_at_frames_alone(measurement, evidence, model, judgement.error, split_of, seed=seed)
+    if shown is not None:
+        return replace(again(shown), seconds=time.perf_counter() - begin)
     if state.added_to(model):  # else it was asked before
         seen = _look_for_dead_time(state, seen, measurement, model)
         seen, model, judgement = _without_needless_dead_time(state, seen, measurement, model, judgement)
@@ -568,13 +567,8 @@ def _rank_of(candidate: Candidate, judgement: Judgement) -> Rank:
     """Return a candidate as the user sees it."""
     fall = judgement.error - candidate.error
     share = fall / max(judgement.error - 1.0, 1e-9)
-    names = candidate.name.split(" + ")
     # before it is the model, an effect has values without intervals
-    mine = {
-        axis.name: Estimate(*(3 * (float(axis.to_value(place)),)))
-        for axis, place in zip(candidate.model.space.axes, candidate.model.place, strict=True)
-        if axis.name.split(".")[0] in names
-    }
+    mine = _values_of(candidate.model, candidate.name.split(" + "))
     refined = candidate.judgement is not None
     return Rank(candidate.name, candidate.error, fall, min(share, 1.0), candidate.p_value, mine, refined)
 
@@ -625,12 +619,16 @@ def _rank_of_pair(name: str, pair: FittedModel, judged: Judgement, first: Step) 
     """Return two effects that came in at once as the user sees them; there is no null of pairs, so no p."""
     fall = first.error - judged.error
     share = min(fall / max(first.error - 1.0, 1e-9), 1.0)
-    mine = {
+    return Rank(name, judged.error, fall, share, float("nan"), _values_of(pair, name.split(" + ")))
+
+
+def _values_of(model: FittedModel, effects: Collection[str]) -> dict[str, Estimate]:
+    """Return the fitted values of some effects, without intervals."""
+    return {
         axis.name: Estimate(*(3 * (float(axis.to_value(place)),)))
-        for axis, place in zip(pair.space.axes, pair.place, strict=True)
-        if axis.name.split(".")[0] in name.split(" + ")
+        for axis, place in zip(model.space.axes, model.place, strict=True)
+        if axis.effect.name in effects
     }
-    return Rank(name, judged.error, fall, share, float("nan"), mine)
 
 
 def _error_of_rank(rank: Rank) -> float:
@@ -671,12 +669,17 @@ def _conclude_diagnosis(
     found = state.added_to(model)
     chosen = [n for s in state.history if s.chosen for n in s.chosen.split(" + ")]
     order = tuple(dict.fromkeys([*(n for n in chosen if n in found), *found]))
-    model, values = estimate_parameters(state.evidence, model, seed=state.seed)
     stream, repeats = SimulationStream.JUDGE.seed(state.seed), state.settings.repeats
-    report = model.calibrate(state.evidence.report, repeats=repeats, seed=stream)
-    last = report.judge(stream)
     way = _judged_way(state)
     first = way.get(frozenset()) or judge_on_report(state, [start], repeats=repeats)[0]
+    mine = way.get(frozenset(found)) or judge_on_report(state, [model], repeats=repeats)[0]
+    # what is far too wrong makes no claim about the camera, and steps nearer to it would lead nowhere
+    if is_far_off(first.judgement, mine.judgement, state.settings.grades):
+        values = _values_of(model, [axis.effect.name for axis in model.space.axes])
+    else:
+        model, values = estimate_parameters(state.evidence, model, seed=state.seed)
+    report = model.calibrate(state.evidence.report, repeats=repeats, seed=stream)
+    last = report.judge(stream)
     at_bounds = parameters_at_bounds(model, values)
     judged_effects: dict[str, Finding] = {}
     if not state.evidence.contradiction:

@@ -23,7 +23,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -150,6 +150,18 @@ def leaves_little(start: Judgement, last: Judgement, settings: GradeSettings) ->
         settings: Limits.
     """
     return may_be_announced(last) or _share_left(start, last, settings) <= settings.total_left
+
+
+def is_far_off(start: Judgement, last: Judgement, settings: GradeSettings) -> bool:
+    """Return whether no last steps of a model's parameters could make it leave little.
+
+    Args:
+        start: Error of the model before the search.
+        last: Error of the last model.
+        settings: Limits.
+    """
+    nearer = replace(last, error=last.error / settings.far_off)
+    return nearer.error > nearer.gate and not leaves_little(start, nearer, settings)
 
 
 def _share_left(other: Judgement, last: Judgement, settings: GradeSettings) -> float:

@@ -22,7 +22,7 @@ from dase.effects.threshold import Threshold
 from dase.errors import InputError
 from dase.events import Events
 from dase.fitting.burst_strength import BurstStrength, burst_times_of, fit_bursts
-from dase.fitting.frame_steps import clip_step_of, frame_step_of, is_in_step, ticks_are_of_frames
+from dase.fitting.frame_steps import clip_step_of, frame_step_of, is_held, is_in_step, ticks_are_of_frames
 from dase.fitting.measurement import Measurement
 from dase.results import DetectionLimit, Diagnosis, Finding, Grade
 from dase.scenes.between_frames import CameraScene
@@ -30,6 +30,7 @@ from dase.scenes.scene import Scene
 from dase.signatures.burst_times import BurstTimes
 from dase.signatures.find import find_signatures
 from dase.signatures.frame_coupling import BurstClock
+from dase.signatures.hot_pixels import NAME as HOT_PIXELS
 from dase.signatures.opposite_pairs import NAME as OPPOSITE_PAIRS
 from dase.signatures.result import Answer, Signature
 from dase.simulation.sensor import Sensor
@@ -136,7 +137,7 @@ class SeenEffects:
             if one.effect in self._noise and one.grade is Grade.STAND_IN:
                 # noise that comes so is there, but the model with it is another's
                 one = replace(one, grade=Grade.EITHER, unknown=True, seen=seen[one.effect])
-            elif one.effect in self._noise_that_it_is_not and one.grade is Grade.SUPPORTED:
+            elif one.effect in self._contradicted and one.grade is Grade.SUPPORTED:
                 one = replace(one, grade=Grade.EITHER, unknown=True)
             elif one.effect in seen:
                 one = Finding(
@@ -173,10 +174,12 @@ class SeenEffects:
         return frozenset(name for one in self.entries if one.name == NOISE for name in self.named_by(one))
 
     @property
-    def _noise_that_it_is_not(self) -> frozenset[str]:
-        """Effects that make noise of pixels at rest, but not as its successive events are."""
+    def _contradicted(self) -> frozenset[str]:
+        """Noise of pixels at rest whose events are not so one by one; hot pixels of which none stands out."""
         told = [_effects_of(one) for one in self.entries if one.name == NOISE]
-        return frozenset(name for one in told if one for name in KINDS[NOISE] if name not in one)
+        noise = {name for one in told if one for name in KINDS[NOISE] if name not in one}
+        hot = {name for one in self.absent if one.name == HOT_PIXELS for name in KINDS[HOT_PIXELS]}
+        return frozenset(noise | hot)
 
     def _with_noise(self, entry: Signature, findings: Sequence[Finding]) -> list[Finding]:
         """Return findings with one of noise that is there, and that the search has not announced.
@@ -232,8 +235,14 @@ def find_seen_effects(measurement: Measurement, library: Collection[str]) -> See
 
 
 def _is_of_frames(entry: Signature, step: float, events: Events, scene: Scene) -> bool:
-    """Return whether ticks of events in step with frames, every `step` [s], are made by these."""
-    tick = entry.details.get("step", 0.0) if entry.name == "time stamps" else 0.0
+    """Return whether ticks of events in step with frames, every `step` [s], are made by these.
+
+    Of frames that are held all events come so long after one.
+    """
+    if entry.name == "time stamps" and is_held(scene):
+        return True
+    said = entry.details if entry.name == "time stamps" and "line" not in entry.details else {}
+    tick = said.get("step", said.get("period", 0.0))
     return ticks_are_of_frames(tick, step, events, scene)
 
 

@@ -144,6 +144,9 @@ class GradeSettings:
     """Error that true models have in the median; what is left is what is above it, or above the level of
     chance where that is higher."""
 
+    far_off: float = 1.6
+    """Times by which last steps of a model's parameters could lower its error, at most."""
+
     total_left: float = 0.15
     """Share of the error before the search up to which a model that is not at the floor may be the right one
     before a slightly wrong world: right effects left 2 to 10 %, stand-ins for strong effects that were not in

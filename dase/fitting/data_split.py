@@ -18,7 +18,7 @@ from dase.fitting.batch_simulator import BatchSimulator
 from dase.fitting.bus_load import WholeSensor
 from dase.fitting.bus_use import BusUse, highest_event_rate
 from dase.fitting.contradictions import contradiction_of_rest
-from dase.fitting.frame_steps import frame_step_of, is_too_slow, ticks_are_of_frames
+from dase.fitting.frame_steps import frame_step_of, is_held, is_too_slow, ticks_are_of_frames
 from dase.fitting.pixel_selection import choose_trusted_pixels, find_trusted_parts
 from dase.fitting.spliced_time import SplicedScene, SplicedTime
 from dase.fitting.subset import Array, CalibratedSubset, PixelSubset
@@ -341,6 +341,8 @@ def split_measurement(
     ]
     works.append(partial(find_structure, events))
     *_, structure = launch.run_concurrently(works)
+    # of frames that are held all events come so long after one
+    structure = TimestampStructure() if is_held(scene) else structure
     # a clock would show the tick before each event of a model, often in the frame before
     if ticks_are_of_frames(structure.step, frame_step, events, scene):
         notes.append(

@@ -49,6 +49,14 @@ class FrameStepSettings:
     together: float = 0.3
     """Length of the mean of all phases: a camera's coarse clock alone has ticks all round."""
 
+    most: float = 1.4
+    """Events of the fullest part from which on few parts do as well, relative to what each of those with
+    events would have if they were alike, as ticks of a clock are: a clip of v2e had half of its events at
+    frames, a third in the middle between two, and a tenth at a third of the way."""
+
+    few: float = 0.3
+    """Share of the parts that then have events, at most."""
+
     looked: int = 60
     """Frames at which it is asked whether events tell of the light before them or after them."""
 
@@ -83,10 +91,15 @@ def frame_step_of(events: Events, scene: Scene, settings: FrameStepSettings = FR
     if len(np.unique(np.round(1e6 * t))) > settings.distinct * anywhere:
         return None
     phase = ((t - times[0]) / step) % 1.0
-    counts = np.histogram(phase, settings.parts, (0.0, 1.0))[0]
+    # frames and the middle between two lie in the middle of parts
+    counts = np.histogram((phase + 0.5 / settings.parts) % 1.0, settings.parts, (0.0, 1.0))[0]
     emptiest = float(counts.min()) * settings.parts / len(t)
     together = float(np.abs(np.exp(2j * np.pi * phase).mean()))
-    return step if emptiest < settings.empty and together > settings.together else None
+    filled = counts > settings.empty * len(t) / settings.parts
+    uneven = counts.max() * np.count_nonzero(filled) > settings.most * len(t)
+    few = np.count_nonzero(filled) <= settings.few * settings.parts
+    in_step = together > settings.together or (uneven and few)
+    return step if emptiest < settings.empty and in_step else None
 
 
 def clip_step_of(scene: Scene) -> float:
@@ -105,8 +118,7 @@ def ticks_are_of_frames(
 
     Ticks of a clock that are finer than frames come at all parts of a frame alike, and such events are not in
     step with frames. One whose ticks are frames is in step, too, but tells at a frame of the light after it,
-    where a simulator by frames tells of the light before. Of frames that are held all events come so long
-    after one, whatever the clock.
+    where a simulator by frames tells of the light before.
 
     Args:
         tick: Time from tick to tick [s].
@@ -115,8 +127,6 @@ def ticks_are_of_frames(
         scene: What they are of.
         settings: How many frames are looked at.
     """
-    if is_held(scene):
-        return tick > settings.near * clip_step_of(scene)
     if not tick or not frame_step or tick > (1 + settings.near) * frame_step:
         return False
     if tick < (1 - settings.near) * frame_step:

@@ -8,9 +8,11 @@ import pytest
 import dase
 from dase.diagnosis.diagnose import diagnose
 from dase.diagnosis.few_hot_pixels import few_hot_pixels, hot_effect_of
-from dase.diagnosis.seen_effects import find_seen_effects
+from dase.diagnosis.seen_effects import SeenEffects, find_seen_effects
 from dase.effects import EFFECTS
 from dase.fitting.measurement import Measurement, static_scene
+from dase.results import Finding, Grade
+from dase.signatures.result import Answer, Signature
 from dase.simulation.sensor import Sensor
 
 LIBRARY = {name: EFFECTS[name] for name in ("threshold", "shot", "leak", "hot")}
@@ -52,3 +54,11 @@ def test_noise_is_found_beside_a_few_hot_pixels(events):
     assert "shot" in found.selected
     assert found.errors[-1] < found.gate
     assert any("left out" in note for note in found.notes)
+
+
+def test_hot_pixels_of_which_none_stands_out_may_be_something_else():
+    fitted = Finding("hot", Grade.SUPPORTED)
+    entry = Signature(name="hot pixels", answer=Answer.NOT_SEEN, sentence="none")
+    for absent, grade in (((entry,), Grade.EITHER), ((), Grade.SUPPORTED)):
+        (said,) = SeenEffects(absent=absent).findings([fitted], ())
+        assert (said.grade, said.unknown) == (grade, grade is Grade.EITHER)

@@ -194,6 +194,7 @@ def test_without_silent_pixels_nothing_is_taken_for_dead_ones(scene):
     assert limit.strength < 2e-3
 
 
+@pytest.mark.slow
 def test_all_of_the_time_is_fitted_where_light_comes_to_rest():
     scene = moving(1.2, until=0.78)
     true = Sensor().with_effect(EFFECTS["leak"](rate=2.0, spread=0.2))
@@ -208,6 +209,7 @@ def test_all_of_the_time_is_fitted_where_light_comes_to_rest():
     assert any("all of it is fitted" in note for note in found.notes)
 
 
+@pytest.mark.slow
 def test_what_comes_late_is_fitted_there():
     # what the first part shows is little beside what comes when light rests, and a leak is not seen in it
     whole = moving(1.2, until=0.78, speed=3.0)

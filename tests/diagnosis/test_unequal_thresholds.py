@@ -144,6 +144,7 @@ def test_it_is_said_in_place_of_the_fixed_pattern():
     assert seen.findings([mine], ()) == [mine]
 
 
+@pytest.mark.slow
 def test_a_mismatch_beside_a_leak_of_another_simulator_is_certain(scene):
     events = counted_between_frames(scene, 0.06, leak=2.0)
     library = {name: EFFECTS[name] for name in ("threshold", "mismatch", "leak", "jitter", "linlog", "shot")}

@@ -107,6 +107,7 @@ def test_a_phase_stays_as_it_was_given_where_nothing_tells_another(device, other
     assert with_phase_given(evidence, end, start, seed=0).sensor["threshold"].phase == kept
 
 
+@pytest.mark.slow
 def test_a_fit_says_that_the_phase_is_the_recordings(device):
     scene, true = moving_bars(), Sensor().with_effect(EFFECTS["threshold"](phase=0.0))
     events = dase.simulate(scene, true, seed=4, device=device)
@@ -125,6 +126,7 @@ def test_another_rule_of_a_dead_time_is_found(device, rule, other):
     assert refit_model(found, start, seed=0, rounds=1).sensor["refractory"].mode == rule
 
 
+@pytest.mark.slow
 def test_a_fit_says_which_rule_it_has_changed(device):
     scene, dead = moving_bars(), EFFECTS["refractory"](period=6e-3, mode="drop")
     events = dase.simulate(scene, Sensor().with_effect(dead), seed=4, device=device)
@@ -136,6 +138,7 @@ def test_a_fit_says_which_rule_it_has_changed(device):
     assert kept.sensor["refractory"].mode == "delay"
 
 
+@pytest.mark.slow
 def test_noise_passes_the_dead_time_of_a_fit_where_it_does(device):
     scene, noise = moving_bars(), EFFECTS["shot"](rate=30.0)
     dead = EFFECTS["refractory"](period=1e-2, mode="delay", noise="passes")

@@ -58,6 +58,17 @@ def test_events_of_a_simulator_that_knows_frames_alone_are_compared_from_frame_t
     assert any("in step with the frames" in note for note in found.notes)
 
 
+def test_events_at_few_parts_of_a_frame_are_in_step_with_it_unless_these_are_alike(clip):
+    rng = np.random.default_rng(3)
+    frame, x, y = (rng.integers(1, most, 20_000) for most in (110, SIZE[1], SIZE[0]))
+    for shares, told in (((0.54, 0.36, 0.1), True), ((0.5, 0.5, 0.0), False)):
+        part = rng.choice([0.0, 0.5, 1 / 3], 20_000, p=shares)
+        t = np.round(1e6 * STEP * (frame + part)) / 1e6
+        order = np.argsort(t, kind="stable")
+        events = dase.Events(t[order], x[order], y[order], rng.random(20_000) < 0.5, SIZE[1], SIZE[0])
+        assert (frame_step_of(events, clip) is not None) is told
+
+
 def test_what_a_simulator_waits_between_frames_is_no_loss_of_data(clip, monkeypatch):
     gaps = np.array([[0.1, 0.11], [0.3, 0.31], [0.5, 0.51]])
     monkeypatch.setattr(data_split, "repeated_gaps", lambda t: gaps)

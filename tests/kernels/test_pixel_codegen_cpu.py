@@ -70,8 +70,8 @@ def run(sensor, scene, lanes, monkeypatch, *, labels):
     [
         ("threshold, leak", "log"),
         ("davis", "background"),
-        ("all, drop", "layers"),
-        ("all, delay, jitter", "frames"),
+        pytest.param("all, drop", "layers", marks=pytest.mark.slow),
+        pytest.param("all, delay, jitter", "frames", marks=pytest.mark.slow),
     ],
 )
 def test_any_number_of_pixels_at_once_gives_the_same_bits(name, kind, device, rng, monkeypatch):

@@ -300,6 +300,7 @@ def test_pieces_and_files_give_what_the_whole_gives(plain, tmp_path):
     assert dase.find_signatures(dase.Recording.of(Sequence(events))) == whole
 
 
+@pytest.mark.slow
 def test_memory_does_not_grow_with_the_recording(rng):
     def peak(seconds):
         count = int(5e5 * seconds)

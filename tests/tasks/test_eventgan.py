@@ -41,6 +41,7 @@ def test_volumes_of_events_become_exactly_the_inputs_of_networks(rng):
     np.testing.assert_allclose(network_inputs(volumes.float()).numpy(), real, atol=5e-3)  # of float16
 
 
+@pytest.mark.slow
 def test_a_generator_is_trained_on_what_is_between_its_frames(rng, tmp_path, monkeypatch):
     """A critic that scores how far volumes are from the real ones of those frames teaches the generator them.
 

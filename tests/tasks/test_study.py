@@ -103,6 +103,7 @@ def test_thresholds_on_top_of_a_fit_wait_for_it():
     assert next_job([on_top], {("fit", "slow")}, 100.0, {}) == on_top
 
 
+@pytest.mark.slow
 def test_thresholds_are_learned_from_a_recording_and_loaded_again(tmp_path):
     """Two steps of the default recipe on top of a cutoff: it stays, thresholds become learned ones."""
     target = TARGETS["slow"]
