@@ -71,6 +71,11 @@ class DeadTimeSettings:
     left_in_step: float = 0.002
     """As `left`, where events come in step with the frames."""
 
+    longest: float = 0.03
+    """Ends above which no dead time lies [s]: 20 ms are plausible, and then a threshold must be crossed.
+    In slow light the shortest intervals of spread thresholds are rare as well, such as one of 36 ms in 75,000
+    events of a rule of ESIM with a jitter."""
+
     ends: int = 60
     """Intervals that are tried as the end, from the shortest on."""
 
@@ -173,7 +178,7 @@ def end_of_intervals(
     places = np.unique(np.geomspace(1, settings.rarest * len(seen) + 1, settings.ends).astype(int)) - 1
     best: tuple[float, float, int, int, int] | None = None
     for end in np.unique(seen[places[places < len(seen)]]):
-        if end <= shortest:
+        if not shortest < end <= settings.longest:
             continue
         here, seen_above = (int(n) for n in np.searchsorted(seen, [end, settings.above * end]))
         there, modelled_above = (int(n) for n in np.searchsorted(modelled, [end, settings.above * end]))

@@ -122,6 +122,13 @@ def test_a_few_random_events_in_the_dead_time_hide_it_not():
     assert end_of_intervals(many, modelled) is None
 
 
+def test_an_end_later_than_any_dead_time_tells_nothing():
+    rng = np.random.default_rng(1)
+    modelled = np.sort(rng.gamma(3.0, 2e-2, 20_000))
+    for end, told in ((0.02, True), (0.036, False)):
+        assert (end_of_intervals(modelled[modelled > end], modelled) is not None) is told
+
+
 def test_few_intervals_tell_nothing():
     rng = np.random.default_rng(1)
     modelled = np.sort(rng.gamma(3.0, 4e-3, 400))
