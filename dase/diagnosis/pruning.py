@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
+import numpy as np
+
 from dase.diagnosis.candidates import scout_of
 from dase.diagnosis.directional_test import lacks_effect_of
 from dase.diagnosis.state import DiagnosisState, explains_remainder, with_same_freedom
@@ -32,7 +34,8 @@ def prune_model(
         rivals = _rival_models(state, model, name)
         # a rival has to reach the floor, however far off the present model is
         for other, swap in _keep_near_models(state, rivals, judgement.gate).items():
-            swapped = refit_model(state.evidence, swap, seed=state.seed)
+            much = _is_much_to_simulate(state, swap)
+            swapped = swap if much else refit_model(state.evidence, swap, seed=state.seed)
             judged = state.judge(swapped)
             without = state.without.get(name)
             if not reaches_floor(judged):
@@ -87,10 +90,12 @@ def _drop_needless(
     # first what needs the finest steps: all else is fitted faster without it
     for name in sorted(ways, key=lambda name: model.sensor[name].longest_step()):
         less = ways[name]
+        much = _is_much_to_simulate(state, less)
         if name not in model.sensor or name in state.certain or len(state.added_to(model)) == 1:
             continue
         bare = with_same_freedom(model.sensor.without(name), model, ())
-        fitted = refit_model(state.evidence, less if model is whole else bare, seed=state.seed)
+        start = less if model is whole else bare
+        fitted = start if much else refit_model(state.evidence, start, seed=state.seed)
         without = state.judge(fitted)
         # what is fitted anew has chance of its own: a share of hot pixels, known by a dozen of them
         as_it_was = state.judge(bare)
@@ -104,6 +109,15 @@ def _drop_needless(
         if needless and not lacks_effect_of(state, fitted, without, model):
             model, judgement = fitted, without
     return model, judgement
+
+
+def _is_much_to_simulate(state: DiagnosisState, model: FittedModel) -> bool:
+    """Whether a model needs so fine steps that fitting it in full takes minutes, as noise of some kHz does.
+
+    What the scout has made of it then must do.
+    """
+    step = float(np.median(np.diff(state.evidence.when)))
+    return step > state.settings.pruning.finest * model.sensor.longest_step()
 
 
 def _keep_near_models(

@@ -128,6 +128,9 @@ class PruningSettings:
     repeats: int = 16
     """Simulations by which a model is judged that is not fitted in full."""
 
+    finest: float = 6.0
+    """Samples per step from which on it never is: with noise of some kHz one fit took two minutes."""
+
 
 @dataclass(frozen=True)
 class GradeSettings:
