@@ -117,7 +117,7 @@ def _is_much_to_simulate(state: DiagnosisState, model: FittedModel) -> bool:
     What the scout has made of it then must do.
     """
     step = float(np.median(np.diff(state.evidence.when)))
-    return step > state.settings.pruning.finest * model.sensor.longest_step()
+    return bool(step > state.settings.pruning.finest * model.sensor.longest_step())
 
 
 def _keep_near_models(

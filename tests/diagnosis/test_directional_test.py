@@ -126,6 +126,10 @@ def fake(names: str, errors: dict[str, float], monkeypatch, **more) -> tuple:
         def without(self, name: str) -> str:
             return self.replace(name, "")
 
+        def __getitem__(self, name: str) -> SimpleNamespace:
+            return SimpleNamespace(longest_step=lambda: steps.get(name, 1.0))
+
+    steps: dict[str, float] = more.pop("steps", {})
     defaults = dict(
         settings=DEFAULTS,
         without={},
@@ -141,6 +145,7 @@ def fake(names: str, errors: dict[str, float], monkeypatch, **more) -> tuple:
         judge=lambda m: judged(errors[m.names]), added_to=lambda m: tuple(m.names), **(defaults | more)
     )
     monkeypatch.setattr(reviewing, "refit_model", lambda evidence, m, seed: m)
+    monkeypatch.setattr(reviewing, "_is_much_to_simulate", lambda search, m: False)
     monkeypatch.setattr(reviewing, "_keep_near_models", lambda search, ways, judgement: ways)
     monkeypatch.setattr(reviewing, "with_same_freedom", lambda sensor, m, more: model(str(sensor)))
     monkeypatch.setattr(
@@ -160,6 +165,26 @@ def test_what_is_not_needed_is_dropped(monkeypatch):
     search, model, judgement = fake("ab", {"ab": 0.3, "a": 0.35, "b": 6.0}, monkeypatch)
     left, after = reviewing.prune_model(search, model, judgement)
     assert (left.names, after.error) == ("a", 0.35)
+
+
+def test_what_needs_the_finest_steps_is_tried_without_first_and_no_fine_model_is_fitted(monkeypatch):
+    errors = {"abc": 0.3, "ab": 6.0, "ac": 6.0, "bc": 6.0}
+    search, model, judgement = fake("abc", errors, monkeypatch, steps={"b": 1e-3})
+    fitted = []
+    monkeypatch.setattr(reviewing, "refit_model", lambda evidence, m, seed: fitted.append(m.names) or m)
+    reviewing.prune_model(search, model, judgement)
+    assert fitted == ["ac", "bc", "ab"]
+    monkeypatch.setattr(reviewing, "_is_much_to_simulate", lambda search, m: "b" in m.names)
+    fitted.clear()
+    reviewing.prune_model(search, model, judgement)
+    assert fitted == ["ac"]
+
+
+def test_noise_of_some_kilohertz_is_much_to_simulate():
+    search = SimpleNamespace(evidence=SimpleNamespace(when=1e-3 * np.arange(9)), settings=DEFAULTS)
+    for cutoff, much in ((100.0, False), (3000.0, True)):
+        noisy = model_of(TRUE.with_effect(EFFECTS["voltage_noise"](cutoff=cutoff)))
+        assert reviewing._is_much_to_simulate(search, noisy) is much
 
 
 def test_what_is_not_needed_is_dropped_although_a_fit_without_it_ends_worse_by_chance(monkeypatch):
