@@ -269,7 +269,7 @@ def test_a_lamp_is_asked_of_a_model_with_the_least_thresholds(scene):
     assert "flicker" in kept.effects
 
 
-@pytest.mark.parametrize("given", [False, True])
+@pytest.mark.parametrize("given", [pytest.param(False, marks=pytest.mark.slow), True])
 def test_a_pattern_that_the_model_makes_is_explained_over_a_guessed_scene(given):
     """How ON and OFF events balance is the pixels', however badly light is known between frames."""
     rng = np.random.default_rng(1)

@@ -90,12 +90,14 @@ def test_a_dead_time_of_several_frames_is_certain(scene):
     assert len(found.errors) == 2
 
 
+@pytest.mark.slow
 def test_what_waits_for_late_events_has_no_dead_time(scene):
     found = dase.diagnose(held_with_low_pass(scene, late=6.3e-3), "ideal", scene=scene, effects=TRIED, most=2)
     assert [one.effect for one in found.findings] == ["latency"]
     assert found.parameters["latency.delay"].value == pytest.approx(6.3e-3, rel=0.1)
 
 
+@pytest.mark.slow
 def test_a_slow_low_pass_hides_no_held_frame(scene):
     """Events come at any time then, and light that goes straight explains them worse."""
     events = held_with_low_pass(scene, cutoff=60.0)

@@ -199,6 +199,7 @@ def test_noise_at_rest_contradicts_nothing(noise, rng):
     assert motion_at_rest(dase.simulate(scene, sensor, seed=2)) == 0
 
 
+@pytest.mark.slow
 def test_what_is_at_the_end_of_its_search_is_not_announced(monkeypatch):
     sensor = Sensor().with_effect(EFFECTS["leak"](rate=5.0))
     model = model_of(sensor)

@@ -299,6 +299,7 @@ def call(*arguments: str):
     return CliRunner().invoke(dase_group, arguments, catch_exceptions=True)
 
 
+@pytest.mark.slow
 def test_the_command_learns_from_a_sensor_and_goes_on(tmp_path, monkeypatch):
     sensor = tmp_path / "target.toml"
     sensor.write_text(dump_sensor(dase.Sensor((Threshold(on=0.2, off=0.2), Mismatch(spread=0.25)))))
