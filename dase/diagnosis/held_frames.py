@@ -117,15 +117,16 @@ def with_frame_as_memory(
     """
     if not measurement.held or EFFECT in sensor:
         return sensor
+    fewest = fewest_frames(measurement, settings)
     waits = [
         sensor.with_effect(Refractory(period=(frames - 0.5) * measurement.held, mode="reset"))
-        for frames in fewest_frames(measurement, settings)
+        for frames in fewest
         if frames
     ]
-    if len(waits) == 1 and 0 not in fewest_frames(measurement, settings):
+    if len(fewest) == 1:
         return waits[0]
     errors = [_error_of(evidence, one, sensor, free, seed=seed, settings=settings) for one in waits]
-    if 0 in fewest_frames(measurement, settings):
+    if 0 in fewest:
         for one in (_waiting_for_jump(sensor, evidence), sensor):
             slow = _slow(one, measurement.held)
             errors.append(_error_of(evidence, slow, slow.without(EFFECT), None, seed=seed, settings=settings))
@@ -191,10 +192,8 @@ def held_behind_low_pass(
         seed: Of every random number.
         settings: How much better is enough.
     """
-    scene = measurement.scene
-    if not isinstance(scene, VideoScene) or scene.held_for or evidence.frame_step or evidence.contradiction:
-        return None
-    if EFFECT in start.sensor or Bandwidth.name in start.sensor or measurement.trust is not None:
+    scene = _clip_with_straight_light(measurement, evidence)
+    if scene is None or EFFECT in start.sensor or Bandwidth.name in start.sensor:
         return None
     stream = SimulationStream.JUDGE.seed(seed)
     before = start.judge(evidence.held, repeats=settings.repeats, seed=stream).error
@@ -236,11 +235,9 @@ def known_at_frames_alone(
         seed: Of every random number.
         settings: How much better is enough.
     """
-    scene = measurement.scene
-    if not isinstance(scene, VideoScene) or scene.held_for or evidence.frame_step or evidence.contradiction:
-        return None
+    scene = _clip_with_straight_light(measurement, evidence)
     slow = [one for one in model.sensor.effects if isinstance(one, Bandwidth | SecondOrder)]
-    if len(slow) != 1 or measurement.trust is not None or not clip_step_of(scene):
+    if scene is None or len(slow) != 1 or not clip_step_of(scene):
         return None
     rest = model.sensor.without(slow[0].name)
     shown = scene.known_at_frames()
@@ -250,8 +247,20 @@ def known_at_frames_alone(
         way = with_same_freedom(rest.with_effect(one), model, [one.name])
         fitted = refit_model(again, way, seed=seed)
         if fitted.judge(again.held, repeats=settings.repeats, seed=stream).error < settings.by_frames * error:
-            return replace(measurement, scene=shown)
+            note = "a low-pass from frame to frame of the clip leaves far less than one in time"
+            return replace(measurement, scene=shown, notes=(*measurement.notes, note))
     return None
+
+
+def _clip_with_straight_light(measurement: Measurement, evidence: SplitMeasurement) -> VideoScene | None:
+    """Return the clip of a measurement whose light goes straight between frames, as far as is known yet.
+
+    None for another scene, one that is trusted in part, or events in step with the frames.
+    """
+    scene = measurement.scene
+    if not isinstance(scene, VideoScene) or scene.held_for or measurement.trust is not None:
+        return None
+    return None if evidence.frame_step or evidence.contradiction else scene
 
 
 def _in_steps(effect: Bandwidth | SecondOrder) -> tuple[Bandwidth, SecondOrder]:

@@ -51,6 +51,7 @@ from dase.probes.timestamp_patterns import TimestampStructure, find_structure
 from dase.scenes.between_frames import CameraScene
 from dase.scenes.scene import Scene
 from dase.scenes.screen_scene import ScreenScene
+from dase.scenes.video import VideoScene
 from dase.signatures.burst_times import BurstTimes
 
 
@@ -287,7 +288,7 @@ def split_measurement(
         )
     # a stream of its own: the same pixels are chosen whatever else is drawn from the seed
     rng, notes = Draw.PIXELS.generator(seed), list[str]()
-    if driven:
+    if driven and not (isinstance(scene, VideoScene) and scene.by_frames):
         notes.append(
             "events come in step with the frames of the clip, as a simulator makes them that knows these "
             "frames alone: compared is from frame to frame"

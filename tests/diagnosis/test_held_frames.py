@@ -154,4 +154,6 @@ def test_a_low_pass_from_frame_to_frame_is_asked_for_where_another_leaves_too_mu
     assert found.errors[-1] < 1
     slow = found.sensor["second_order"]
     assert slow.poles == "steps"
+    assert any("from frame to frame" in note for note in found.notes)
+    assert not any("come in step" in note for note in found.notes)
     assert slow.cutoff == pytest.approx(60, rel=0.1)
