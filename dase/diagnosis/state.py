@@ -39,6 +39,8 @@ class DiagnosisState:
         shown: Those of them that are there however badly any model fits.
         tried_alone: Those of them that were tried before all others.
         held: See `Measurement.held`.
+        all_time: Whether all of the time is fitted, not its first part alone.
+        evaluations_before: Simulations that were run before the measurement was split anew.
         path: Models that were fitted in full on the way, the first one without any addition.
         notes: What the user should know of the search.
         after_step: Told the model and the errors so far after each step.
@@ -61,6 +63,8 @@ class DiagnosisState:
     shown: frozenset[str] = frozenset()
     tried_alone: frozenset[str] = frozenset()
     held: float = 0.0
+    all_time: bool = False
+    evaluations_before: int = 0
     first_step: int = 0
     path: list[FittedModel] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -10,6 +9,7 @@ import numpy as np
 import pytest
 
 import dase
+from dase.diagnosis import seen_beside_model
 from dase.diagnosis.dead_time import DEAD_TIME, NAME, end_of_intervals, find_dead_time, intervals_of
 from dase.diagnosis.seen_effects import SeenEffects
 from dase.effects import EFFECTS
@@ -21,8 +21,6 @@ from dase.probes.timestamp_patterns import TimestampStructure
 from dase.scenes.video import VideoScene
 from dase.signatures.result import Answer, Signature
 from dase.simulation.sensor import Sensor
-
-diagnose_module = importlib.import_module("dase.diagnosis.diagnose")
 
 NO_STRUCTURE = TimestampStructure()
 
@@ -191,8 +189,8 @@ def test_a_dead_time_is_dropped_that_the_last_model_has_no_need_of(monkeypatch, 
         asked.append(one.sensor)
         return replace(seen, entries=(*seen.entries, entry)) if ends else seen
 
-    monkeypatch.setattr(diagnose_module, "_look_for_dead_time", look)
-    seen, last, judgement = diagnose_module._without_needless_dead_time(
+    monkeypatch.setattr(seen_beside_model, "_look_for_dead_time", look)
+    seen, last, judgement = seen_beside_model._without_needless_dead_time(
         state, SeenEffects((entry,)), None, model, judged(0.31)
     )
     assert ("refractory" not in last.sensor) == dropped

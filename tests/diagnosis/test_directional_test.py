@@ -10,13 +10,13 @@ import pytest
 import dase
 from dase.diagnosis import pruning as reviewing
 from dase.diagnosis.candidates import Candidate
-from dase.diagnosis.diagnose import _simplest_of_the_best
 from dase.diagnosis.directional_test import (
     RepeatCloud,
     _most_deviating_effect,
     deviation_towards,
     find_hidden_effect,
 )
+from dase.diagnosis.effect_search import _simplest_of_the_best
 from dase.diagnosis.explain_effect import moving_bars
 from dase.diagnosis.settings import DEFAULTS
 from dase.diagnosis.state import DiagnosisState

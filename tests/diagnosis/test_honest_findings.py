@@ -14,8 +14,9 @@ import dase
 from dase.cli import dase_group
 from dase.cli.diagnose import progress_bar
 from dase.diagnosis.compare import compare
-from dase.diagnosis.diagnose import _rank_of_pair, diagnose
+from dase.diagnosis.diagnose import diagnose
 from dase.diagnosis.explain_effect import moving_bars
+from dase.diagnosis.ranking import rank_of_pair
 from dase.effects import EFFECTS
 from dase.figures import report
 from dase.fitting.contradictions import motion_at_rest
@@ -220,7 +221,7 @@ def test_what_is_at_the_end_of_its_search_is_not_announced(monkeypatch):
     library = {name: EFFECTS[name] for name in ("threshold", "bandwidth")}
     announced = diagnose(events, scene=scene, effects=library, pixels=300)
     assert announced.selected == ("bandwidth",)
-    monkeypatch.setattr("dase.diagnosis.diagnose.parameters_at_bounds", lambda model, values: said)
+    monkeypatch.setattr("dase.diagnosis.conclusion.parameters_at_bounds", lambda model, values: said)
     found = diagnose(events, scene=scene, effects=library, pixels=300)
     assert found.selected == ()
     assert "nothing is announced: threshold.on = 3" in found.finding()
@@ -268,7 +269,7 @@ def test_a_pair_that_was_found_is_in_the_table():
     step = Step(("threshold",), 6.0, 1.3, {"rate": 6.0}, (), None, (), ())
     model = model_of(Sensor().with_effect(EFFECTS["leak"](rate=5.0)).with_effect(EFFECTS["shot"](rate=2.0)))
     judged = Judgement(1.0, 1.2, 0.5, 0.3, {}, {}, np.zeros(1), 1.0)
-    rank = _rank_of_pair("leak + shot", model, judged, step)
+    rank = rank_of_pair("leak + shot", model, judged, step)
     assert rank.share == 1.0
     assert rank.parameters["leak.rate"].value == pytest.approx(5.0)
     assert "nan" not in repr(rank)

@@ -119,7 +119,7 @@ def test_fewer_pixels_are_compared_where_the_scene_is_guessed(monkeypatch):
         asked.append(options)
         raise dase.InputError("enough")
 
-    monkeypatch.setattr("dase.diagnosis.diagnose.split_measurement", split)
+    monkeypatch.setattr("dase.diagnosis.compared_measurement.split_measurement", split)
     scene = shaking(0.5)
     events = dase.simulate(scene, TRUE, seed=1)
     for known, fewer in ((scene, 1.0), (filmed(scene), 1 / 3)):

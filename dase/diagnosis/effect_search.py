@@ -1,0 +1,236 @@
+"""The search for effects that a model lacks: one by one, two at once, and which of them are needed.
+
+What is added on the way is provisional, see `dase.diagnosis.conclusion`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+from dase.diagnosis.candidates import (
+    Candidate,
+    calibrate_split,
+    effects_to_try,
+    is_rare,
+    refit_and_judge,
+    scout_of,
+    try_effects,
+    variants_to_try,
+)
+from dase.diagnosis.cell_descriptions import worst_cells
+from dase.diagnosis.compared_measurement import ComparedMeasurement
+from dase.diagnosis.directional_test import find_hidden_effect
+from dase.diagnosis.effect_pairs import add_pair
+from dase.diagnosis.pruning import prune_model
+from dase.diagnosis.ranking import rank_of
+from dase.diagnosis.settings import DEFAULTS, DiagnosisSettings
+from dase.diagnosis.state import DiagnosisState, explains_remainder
+from dase.fitting.model import FittedModel, refit_model
+from dase.fitting.scene_doubt import with_scene_doubt
+from dase.probes.distance import Judgement, leaves_nothing, reaches_floor, worst_families
+from dase.probes.random_streams import SimulationStream
+from dase.results import Step
+
+
+def search_effects(
+    state: DiagnosisState, compared: ComparedMeasurement, start: FittedModel, most: int
+) -> tuple[FittedModel, Judgement]:
+    """Add effects to a model until none is missing, and drop those that are not needed.
+
+    Args:
+        state: Gets the steps of the search; its evidence becomes that of all of the time where what is left
+            comes late.
+        compared: The measurement.
+        start: The model before the search.
+        most: Effects that are added at most; 0 for none.
+
+    Returns:
+        The last model and its held-out error.
+    """
+    # what is not of this scene has no effects to be found
+    most = 0 if state.evidence.contradiction else most
+    model, judgement = _add_one_by_one(state, start, most)
+    if most > 0 and not state.all_time and _shows_later_alone(state, model, judgement):
+        model = _fit_all_of_the_time(state, compared, model, judgement)
+        model, judgement = _add_one_by_one(state, model, most - len(state.added_to(model)))
+    if not reaches_floor(judgement) and most > 0:
+        single = model
+        model, judgement = add_pair(state, model, judgement)
+        if model is not single and not leaves_nothing(judgement):
+            # beside a right pair shows what no effect alone did
+            model, judgement = _add_one_by_one(state, model, most - len(state.added_to(model)))
+    if len(state.added_to(model)) > 1:
+        whole = model
+        model, judgement = prune_model(state, model, judgement)
+        if model is not whole and not leaves_nothing(judgement) and not state.has_asked(model):
+            # a stand-in that was dropped may have hidden what it stood for
+            model, judgement = _add_one_by_one(state, model, most - len(state.added_to(model)))
+    return model, judgement
+
+
+def _add_one_by_one(state: DiagnosisState, model: FittedModel, most: int) -> tuple[FittedModel, Judgement]:
+    """Add the best effect as long as one is missing; return the model and its held-out error."""
+    errors, far = list[float](), False
+    for _ in range(most + 1):
+        state.path.append(model)
+        # what is far from the floor needs no exact error
+        judgement = state.judge(model, repeats=state.settings.candidates.few_repeats if far else None)
+        errors.append(judgement.error)
+        more = len(errors) <= most
+        step, better, far = _look_for_effect(state, model, judgement, more)
+        if better is None and more and (hidden := find_hidden_effect(state, model, judgement)) is not None:
+            step, better = _note_hidden_effect(state, *hidden, step, judgement), hidden[0].model
+        state.history.append(step)
+        state.after_step(model if better is None else better, errors)
+        if better is None:
+            break
+        model = better
+    return model, judgement
+
+
+def _shows_later_alone(state: DiagnosisState, model: FittedModel, judgement: Judgement) -> bool:
+    """Whether a model that fails where it is judged is nearly right where it was fitted.
+
+    What comes late in a recording, as the first events of a slow leak do, no fit to its first part can find.
+    """
+    if reaches_floor(judgement):
+        return False
+    repeats, stream = state.settings.candidates.few_repeats, SimulationStream.JUDGE.seed(state.seed)
+    fitted = model.judge(state.evidence.train, repeats=repeats, seed=stream)
+    excess = max(fitted.error - fitted.level, 0.0) / max(judgement.error - judgement.level, 1e-9)
+    return excess < state.settings.later
+
+
+def _fit_all_of_the_time(
+    state: DiagnosisState, compared: ComparedMeasurement, model: FittedModel, judgement: Judgement
+) -> FittedModel:
+    """Split the measurement anew, so that all of its time is fitted; return the model, fitted to that."""
+    state.progress("fitting all of the time", 0.0, judgement.error)
+    state.evaluations_before += state.evidence.evaluations
+    evidence = compared.split(all_time=True)
+    if compared.guessed is not None:
+        evidence = with_scene_doubt(evidence, compared.guessed, model, seed=state.seed)
+    state.evidence, state.all_time = evidence, True
+    state.notes.append(
+        "what is left comes late in the recording: all of its time is fitted, and other pixels judge"
+    )
+    return refit_model(evidence, model, seed=state.seed)
+
+
+def _look_for_effect(
+    state: DiagnosisState, model: FittedModel, judgement: Judgement, more: bool
+) -> tuple[Step, FittedModel | None, bool]:
+    """Try all effects.
+
+    Returns:
+        What was found, the model with the best of them, None if there is none, and whether that is still far
+        from the floor.
+    """
+    evidence, seed, settings = state.evidence, state.seed, state.settings
+    names = tuple(e.name for e in model.space.sensor.effects)
+    cells = worst_cells(evidence, judgement)
+    step = Step(names, judgement.error, judgement.gate, judgement.families, (), None, (), cells)
+    if leaves_nothing(judgement) or not more:
+        return step, None, False
+    open_names = effects_to_try(state.effects, model)
+    # what is certain comes first, and by itself: everything else is judged beside it
+    certain = [
+        name for name in open_names
+        if name in state.certain - state.tried_alone
+        and variants_to_try(evidence, state.effects[name], idle_bus=settings.candidates.idle_bus)
+    ]  # fmt: skip
+    state.tried_alone |= frozenset(certain)
+    open_names = certain or open_names
+    if not open_names:
+        return step, None, False
+    far = judgement.error > settings.far * judgement.gate
+    present = calibrate_split(
+        evidence, model, repeats=settings.scout_repeats if far else settings.repeats,
+        scout_repeats=settings.scout_repeats, seed=seed,
+    )  # fmt: skip
+    tried = try_effects(
+        present, model, state.effects, open_names, worst=worst_families(judgement), far=far,
+        seed=seed, report=lambda text, share: state.progress(text, share, state.error),
+        settings=settings.candidates,
+    )  # fmt: skip
+    step = replace(step, ranking=tuple(rank_of(one, judgement) for one in tried))
+    if not state.first and not certain:
+        state.first, state.first_step = sorted(tried, key=lambda one: one.screened_loss), len(state.history)
+    best, ties = _best_candidate(state, tried, judgement)
+    if best is None and certain:
+        best = _shown_whatever_fits(state, tried, judgement)
+        if best is None:
+            return _look_for_effect(state, model, judgement, more)
+    if best is None:
+        return step, None, False
+    state.note_addition(best, [one for one in tried if one.judgement], ties, judgement)
+    step = replace(step, chosen=best.name, ties=ties)
+    on_its_way = best.error > settings.on_its_way * judgement.gate
+    # what is added next moves all of it again
+    enough = far and best.error > settings.far * judgement.gate and not is_rare(best)
+    fitted = scout_of(evidence) if enough else evidence
+    return step, refit_model(fitted, best.model, seed=seed, rounds=1), on_its_way
+
+
+def _shown_whatever_fits(
+    state: DiagnosisState, tried: Sequence[Candidate], judgement: Judgement
+) -> Candidate | None:
+    """Return the noise, leak or mismatch that is there, if the model is no worse with it.
+
+    However little the error falls, it is there, and all else is to be judged beside it.
+    """
+    shown = [one for one in tried if one.name in state.shown]
+    if not shown:
+        return None
+    judged = [one for one in shown if one.judgement] or refit_and_judge(
+        state.evidence, shown, seed=state.seed, settings=state.settings.candidates
+    )
+    best = min(judged, key=lambda one: one.error)
+    return best if best.judgement and best.error <= judgement.error else None
+
+
+def _best_candidate(
+    state: DiagnosisState, tried: Sequence[Candidate], judgement: Judgement
+) -> tuple[Candidate | None, tuple[str, ...]]:
+    """Return the candidate that is to be added, None if there is none, and those not told apart from it."""
+    settings = state.settings
+    finalists = [one for one in tried if one.judgement]
+    right = reaches_floor(judgement)
+    if right:
+        finalists = [
+            one for one in finalists
+            if one.judgement and explains_remainder(one.judgement, judgement, settings)
+        ]  # fmt: skip
+    if not finalists:
+        return None, ()
+    best, ties = _simplest_of_the_best(finalists, settings)
+    rank = rank_of(best, judgement)
+    if not right and (rank.fall < settings.material or rank.share < settings.share):
+        return None, ()
+    return best, ties
+
+
+def _simplest_of_the_best(
+    finalists: Sequence[Candidate], settings: DiagnosisSettings = DEFAULTS
+) -> tuple[Candidate, tuple[str, ...]]:
+    """Return the best candidate, the simplest of those that are not told apart, and the others of those."""
+    first = finalists[0]
+    reach = max(settings.tie, settings.tie_share * first.error)
+    good = first.judgement is not None and reaches_floor(first.judgement)
+    like = [
+        one for one in finalists
+        if one.error <= first.error + reach and one.judgement and (reaches_floor(one.judgement) or not good)
+    ]  # fmt: skip
+    best = min(like, key=lambda one: (len(one.model.place), one.error))
+    return best, tuple(one.name for one in like if one.name != best.name)
+
+
+def _note_hidden_effect(
+    state: DiagnosisState, hidden: Candidate, p_value: float, step: Step, judgement: Judgement
+) -> Step:
+    """Return a step with an effect that only a closer look shows as the chosen one."""
+    state.note_addition(hidden, [hidden], (), judgement)
+    rank = rank_of(replace(hidden, p_value=p_value), judgement)
+    others = tuple(r for r in step.ranking if r.effect != hidden.name)
+    return replace(step, ranking=(rank, *others), chosen=hidden.name)
