@@ -22,9 +22,9 @@ from dase.effects.bandwidth import Bandwidth
 from dase.effects.latency import Latency
 from dase.effects.refractory import Refractory
 from dase.effects.second_order import SecondOrder
-from dase.fitting.clip_lead import begin_of_events
 from dase.fitting.data_split import SplitMeasurement
 from dase.fitting.frame_steps import clip_step_of
+from dase.fitting.held_clips import begin_of_events
 from dase.fitting.measurement import Measurement, note_of_held_frames
 from dase.fitting.model import FittedModel, fit_present_model, refit_model
 from dase.fitting.parameter_space import axes_of

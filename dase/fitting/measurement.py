@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from dase import io
 from dase.errors import InputError
 from dase.events import Events
-from dase.fitting.clip_lead import holds_frames
+from dase.fitting.held_clips import holds_frames
 from dase.fitting.screen_alignment import screen_scene
 from dase.formatting import fit_to_screen, format_seconds
 from dase.io.arrays import check_archive

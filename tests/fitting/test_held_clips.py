@@ -10,7 +10,7 @@ import dase
 from dase.effects import EFFECTS
 from dase.effects.threshold import Threshold
 from dase.events import Events
-from dase.fitting.clip_lead import holds_frames
+from dase.fitting.held_clips import holds_frames
 from dase.fitting.measurement import as_measurement
 from dase.scenes.video import VideoScene
 from dase.simulation.sensor import Sensor

@@ -21,7 +21,7 @@ from dase.scenes.video import VideoScene
 
 
 @dataclass(frozen=True)
-class ClipLeadSettings:
+class HeldClipSettings:
     """When a clip is held.
 
     Chosen on sets a to c, x, y, z, k and g to j of other simulators: of IEBCS 0.92 to 1.00 of the events come
@@ -84,10 +84,10 @@ class ClipLeadSettings:
     """Of the logarithm that counts, at most: edges say no more than slopes."""
 
 
-CLIP_LEAD = ClipLeadSettings()
+HELD_CLIPS = HeldClipSettings()
 
 
-def holds_frames(events: Events, scene: Scene, settings: ClipLeadSettings = CLIP_LEAD) -> bool:
+def holds_frames(events: Events, scene: Scene, settings: HeldClipSettings = HELD_CLIPS) -> bool:
     """Return whether events are of the frames of a clip held each from the time of the one before on.
 
     Args:
@@ -132,7 +132,7 @@ def holds_frames(events: Events, scene: Scene, settings: ClipLeadSettings = CLIP
 
 
 def begin_of_events(
-    phase: NDArray[np.float64], settings: ClipLeadSettings = CLIP_LEAD
+    phase: NDArray[np.float64], settings: HeldClipSettings = HELD_CLIPS
 ) -> tuple[float | None, bool]:
     """Return at which share of the time from frame to frame most events begin, and whether others follow.
 
