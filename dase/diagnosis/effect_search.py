@@ -53,20 +53,25 @@ def search_effects(
     model, judgement = _add_one_by_one(state, start, most)
     if most > 0 and not state.all_time and _shows_later_alone(state, model, judgement):
         model = _fit_all_of_the_time(state, compared, model, judgement)
-        model, judgement = _add_one_by_one(state, model, most - len(state.added_to(model)))
-    if not reaches_floor(judgement) and most > 0:
+        model, judgement = _add_one_by_one(state, model, _left_to_add(state, model, most))
+    if not reaches_floor(judgement) and most > 1:
         single = model
         model, judgement = add_pair(state, model, judgement)
         if model is not single and not leaves_nothing(judgement):
             # beside a right pair shows what no effect alone did
-            model, judgement = _add_one_by_one(state, model, most - len(state.added_to(model)))
+            model, judgement = _add_one_by_one(state, model, _left_to_add(state, model, most))
     if len(state.added_to(model)) > 1:
         whole = model
         model, judgement = prune_model(state, model, judgement)
         if model is not whole and not leaves_nothing(judgement) and not state.has_asked(model):
             # a stand-in that was dropped may have hidden what it stood for
-            model, judgement = _add_one_by_one(state, model, most - len(state.added_to(model)))
+            model, judgement = _add_one_by_one(state, model, _left_to_add(state, model, most))
     return model, judgement
+
+
+def _left_to_add(state: DiagnosisState, model: FittedModel, most: int) -> int:
+    """Return how many effects may be added yet; a pair beside what is certain may have taken one too many."""
+    return max(most - len(state.added_to(model)), 0)
 
 
 def _add_one_by_one(state: DiagnosisState, model: FittedModel, most: int) -> tuple[FittedModel, Judgement]:

@@ -372,3 +372,17 @@ def test_nothing_is_free_where_light_never_changes_and_only_the_readout_is_tried
     found = diagnose(dase.simulate(scene, sensor, seed=1), scene=scene, effects=library, pixels=200, most=1)
     assert "row_scan" in {one.effect for one in found.findings if one.grade == "certain"}
     assert not found.parameters
+
+
+@pytest.mark.slow
+def test_no_pair_is_added_where_one_effect_is_the_most(scene):
+    """A pair took two, and what was left to add was negative: a traceback."""
+    sensor = Sensor().with_effect(EFFECTS["bandwidth"](cutoff=40.0))
+    sensor = sensor.with_effect(EFFECTS["refractory"](period=0.008)).with_effect(
+        EFFECTS["mismatch"](spread=0.2)
+    )
+    library = {name: EFFECTS[name] for name in ("threshold", "latency", "leak", "shot", "linlog")}
+    events = dase.simulate(scene, sensor, seed=4)
+    found = diagnose(events, scene=scene, effects=library, pixels=200, most=1)
+    assert len(found.sensor.effects) <= 2
+    assert found.unexplained is not None
