@@ -75,7 +75,7 @@ class RestSettings:
     one: float = 0.04
     """Share of OFF events beside a leak, at most."""
 
-    goes_on: float = 0.35
+    goes_on: float = 0.25
     """Share of the events in the later half of the rests: what is left of motion comes soon."""
 
     spread: float = 0.5
@@ -273,7 +273,8 @@ def judge_events_at_rest(
     low, high = (2 * end / rests.seconds for end in poisson_interval(count))
     details: dict[str, Any] = {"on": on, "off": count - on, "model": model, "seconds": rests.seconds / 2}
     if rarer >= settings.both and count >= settings.events:
-        if not _independent(t[_is_first(t, at, settings.near)], rests, frame_gap, settings):
+        alone = _is_first(t, at, settings.near)
+        if not _independent(t[alone], p[alone], rests, frame_gap, settings):
             return None
         name, words = NOISE, f"{format_percent(on / count)} of them ON"
         effect, why = _which_noise(t, p, at, settings)
@@ -348,11 +349,17 @@ def _is_first(t: Array, at: NDArray[np.int64], near: float) -> NDArray[np.bool_]
     return out
 
 
-def _independent(t: Array, rests: Rests, frame_gap: float, settings: RestSettings) -> bool:
+def _independent(
+    t: Array, p: NDArray[np.bool_], rests: Rests, frame_gap: float, settings: RestSettings
+) -> bool:
     """Whether events come by themselves: their number in short times varies as independent ones do.
+
+    Or their polarities do, where a simulator draws more noise for some frames of a clip than for others
+    (Metavision's): what a lamp, or light that moves, sends at one time is of one polarity.
 
     Args:
         t: Of the events [s], shape (N,).
+        p: Whether each is ON, shape (N,).
         rests: Of the pixels.
         frame_gap: Time from frame to frame of a clip [s], 0 for a scene that has none.
         settings: How much more it may vary.
@@ -372,4 +379,10 @@ def _independent(t: Array, rests: Rests, frame_gap: float, settings: RestSetting
     if used.sum() < 10:
         return False
     excess = float(((counts[used] - expected[used]) ** 2 / np.maximum(expected[used], 0.05)).mean())
-    return excess < settings.together + settings.swing * float(expected[used].mean())
+    if excess < settings.together + settings.swing * float(expected[used].mean()):
+        return True
+    if not frame_gap:
+        return False
+    on, share, some = np.histogram(t[p], edges)[0], float(p.mean()), counts > 0
+    mixing = float(((on - share * counts)[some] ** 2 / counts[some]).mean())
+    return mixing < settings.together * share * (1 - share)

@@ -124,6 +124,7 @@ def grade_effects(
             is_strained(model, *one)
             or is_between_samples(model, *one, shortest=shortest)
             or is_small_beside_another(model, *one)
+            or is_below_black(model, *one)
             for one in mine[name].items()
         )
         if grade is Grade.SUPPORTED and doubtful:
@@ -202,6 +203,18 @@ def is_small_beside_another(model: FittedModel, name: str, value: Estimate) -> b
         other in sensor and not sensor[other].is_off() and value.value < least
         for other, least in fact.clear_beside
     )
+
+
+def is_below_black(model: FittedModel, name: str, value: Estimate) -> bool:
+    """Return whether an intensity is below what the logarithm adds to black: what black is nobody knows.
+
+    A simulator adds a constant of its own there, such as one of 10,000 grey values, which acts in the darkest
+    pixels as a dark current does.
+    """
+    fact = next((axis.fact for axis in model.space.axes if axis.name == name), None)
+    if fact is None or fact.off is None or fact.unit != "intensity":
+        return False
+    return value.high < model.sensor.log_eps
 
 
 def grade_of(

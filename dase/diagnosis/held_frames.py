@@ -1,9 +1,10 @@
 """What a simulator that holds the frames of a clip makes of a pixel, and the dead time beyond that.
 
-Where light jumps from frame to frame, a pixel that sends takes the light of the frame for its memory: it
-sends once for a frame, and the rest of the change is lost (IEBCS). That is a dead time of a part of a frame,
-in which the pixel is held in reset. It is no property of a camera, so the model has it before anything is
-searched. A dead time of the simulator's own shows where a pixel's intervals begin: at two frames or more.
+Where light jumps from frame to frame, a pixel sends as many events as the jump has thresholds, and goes on
+from there (IEBCS), or it takes the light of the frame for its memory: it sends once for a frame, and the rest
+of the change is lost. The latter is a dead time of a part of a frame, in which the pixel is held in reset. It
+is no property of a camera, so the model has it before anything is searched. A dead time of the simulator's
+own shows where a pixel's intervals begin: at two frames or more.
 """
 
 from __future__ import annotations
@@ -105,7 +106,7 @@ def with_frame_as_memory(
     seed: int,
     settings: HeldFrameSettings = HELD_FRAMES,
 ) -> Sensor:
-    """Return a sensor whose pixels take the light of a held frame for their memory, if they do.
+    """Return a sensor whose pixels take the light of a held frame for their memory, if that does better.
 
     Args:
         sensor: One with a dead time of its own is left as it is.
@@ -118,13 +119,12 @@ def with_frame_as_memory(
     if not measurement.held or EFFECT in sensor:
         return sensor
     fewest = fewest_frames(measurement, settings)
-    waits = [
+    # or it goes on from where it has sent, as often in a frame as that asks for
+    waits = [sensor] + [
         sensor.with_effect(Refractory(period=(frames - 0.5) * measurement.held, mode="reset"))
         for frames in fewest
         if frames
     ]
-    if len(fewest) == 1:
-        return waits[0]
     errors = [_error_of(evidence, one, sensor, free, seed=seed, settings=settings) for one in waits]
     if 0 in fewest:
         for one in (_waiting_for_jump(sensor, evidence), sensor):

@@ -237,9 +237,9 @@ def find_seen_effects(measurement: Measurement, library: Collection[str]) -> See
 def _is_of_frames(entry: Signature, step: float, events: Events, scene: Scene) -> bool:
     """Return whether ticks of events in step with frames, every `step` [s], are made by these.
 
-    Of frames that are held all events come so long after one.
+    Of frames that are held all events come so long after one, and a jump sends many at once.
     """
-    if entry.name == "time stamps" and is_held(scene):
+    if entry.name in ("time stamps", "double events") and is_held(scene):
         return True
     said = entry.details if entry.name == "time stamps" and "line" not in entry.details else {}
     tick = said.get("step", said.get("period", 0.0))

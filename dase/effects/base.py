@@ -59,6 +59,8 @@ class Parameter:
             for the whole range.
         between_samples: Whether a time that is short beside the steps in which light is known is told by what
             light does between them, where it is a guess: so is what a memory does there.
+        farthest: Largest value to which a search goes, or the effect's own if that is larger, where less than
+            three times the plausible range does: what is beyond would cost much and tell nothing more.
         clear_beside: (name, value) pairs of effects beside which a smaller value is in doubt: another way in
             which a world does those looks like it.
     """
@@ -75,6 +77,7 @@ class Parameter:
     fitted: bool = True
     nearby: float | None = None
     between_samples: bool = False
+    farthest: float = math.inf
     clear_beside: tuple[tuple[str, float], ...] = ()
 
     @property
@@ -96,13 +99,14 @@ def parameter(
     fitted: bool = True,
     nearby: float | None = None,
     between_samples: bool = False,
+    farthest: float = math.inf,
     clear_beside: tuple[tuple[str, float], ...] = (),
 ) -> Any:
     """Declare a parameter of an effect; see `Parameter`."""
     facts = dict(
         unit=unit, default=default, off=off, bounds=bounds, plausible=plausible, about=about, starts=starts,
         periodic=periodic, fitted=fitted, nearby=nearby, between_samples=between_samples,
-        clear_beside=clear_beside,
+        farthest=farthest, clear_beside=clear_beside,
     )  # fmt: skip
     return field(default=default, metadata={"parameter": facts})
 

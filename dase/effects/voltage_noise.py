@@ -257,6 +257,8 @@ class VoltageNoise(Effect):
         plausible=(10.0, 3000.0),
         about="corner frequency in bright light, set by the bias",
         starts="ends",
+        # light is known each millisecond: faster noise of as many events looks the same, and costs more
+        farthest=1000.0,
     )
     knee: float = parameter(
         0.1,

@@ -274,7 +274,8 @@ def split_measurement(
     elif grid is not whole:
         events = _within(events, grid)
     # a simulator by frames loses nothing: it waits for a frame, or all of its pixels for their dead time
-    gaps = np.zeros((0, 2)) if pauses or frame_step else repeated_gaps(events.t)
+    in_step = frame_step or is_held(scene)
+    gaps = np.zeros((0, 2)) if pauses or in_step else repeated_gaps(events.t)
     try:
         to = launch.find_device(device)
     except ValueError as error:

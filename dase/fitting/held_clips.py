@@ -108,10 +108,13 @@ def holds_frames(events: Events, scene: Scene, settings: HeldClipSettings = HELD
     late, gap = t - times[frame], times[frame + 1] - times[frame]
     parts = np.round(gap / np.maximum(late, 1e-9))
     even = (parts <= settings.shares) & (np.abs(late * parts - gap) < 1.1e-6 * parts)
-    if (late < 0.6e-6).mean() >= settings.exact or even.mean() >= settings.spread_out:
+    at_frame = late < 0.6e-6
+    if at_frame.mean() >= settings.exact or even.mean() >= settings.spread_out:
         return False
     phase = late / gap
     begin, spread = begin_of_events(phase % 1.0, settings)
+    if at_frame.any() and begin_of_events(phase[~at_frame] % 1.0, settings)[0] is None:
+        return False  # noise that is drawn at each frame, and light that goes from frame to frame
     # soon after a frame all parts lie close together
     clear = phase > settings.clear
     if begin is None or (spread and even[clear].mean() >= settings.at_parts):

@@ -91,10 +91,11 @@ def make_axis(effect: type[Effect], fact: Parameter) -> SearchAxis:
 
 def axis_of(effect: Effect, fact: Parameter) -> SearchAxis:
     """Return the axis of one parameter of an effect, as far from its present value as a fit may go."""
-    axis = make_axis(type(effect), fact)
+    axis, value = make_axis(type(effect), fact), float(getattr(effect, fact.name))
+    if axis.high > fact.farthest:
+        axis = replace(axis, high=min(axis.high, max(fact.farthest, value)))
     if fact.nearby is None:
         return axis
-    value = float(getattr(effect, fact.name))
     low, high = value * (1 - fact.nearby), value * (1 + fact.nearby)
     return replace(axis, low=low, high=high, log=False, span=2.0 / PHASE)
 

@@ -139,6 +139,14 @@ def test_events_of_all_pixels_at_once_are_a_lamp_and_no_noise():
     assert judge_events_at_rest(rests, events, 0) is None
 
 
+def test_noise_that_is_drawn_for_some_frames_more_than_for_others_is_told_by_its_polarities():
+    events, rests = at_random(2000, 0.5, together=True)
+    assert judge_events_at_rest(rests, events, 0, frame_gap=1e-4).name == NOISE
+    alike = (np.unique(events.t, return_inverse=True)[1] % 2).astype(bool)  # of one time, of one polarity
+    lamp = Events(events.t, events.x, events.y, alike, 50, 20)
+    assert judge_events_at_rest(rests, lamp, 0, frame_gap=1e-4) is None
+
+
 def test_polarities_that_are_neither_both_nor_one_tell_nothing():
     events, rests = at_random(2000, 0.9)
     assert judge_events_at_rest(rests, events, 0) is None

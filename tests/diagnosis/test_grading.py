@@ -13,7 +13,13 @@ import dase
 from dase.diagnosis import grading, seen_effects
 from dase.diagnosis.diagnose import diagnose
 from dase.diagnosis.explain_effect import moving_bars
-from dase.diagnosis.grading import grade_of, is_between_samples, is_small_beside_another, is_strained
+from dase.diagnosis.grading import (
+    grade_of,
+    is_below_black,
+    is_between_samples,
+    is_small_beside_another,
+    is_strained,
+)
 from dase.diagnosis.seen_effects import (
     SeenEffects,
     find_seen_effects,
@@ -314,3 +320,13 @@ def test_little_that_differs_beside_a_dead_time_is_in_doubt(name, spread, period
     got = is_small_beside_another(model, f"{name}.spread", Estimate(spread, 0.9 * spread, 1.1 * spread))
     assert got == in_doubt
     assert not is_small_beside_another(model, "threshold.on", Estimate(0.1, 0.1, 0.1))
+
+
+def test_a_dark_current_below_what_the_logarithm_adds_is_in_doubt():
+    """IEBCS adds one of 10,000 grey values before its logarithm: a dark current of 0.00018 was supported."""
+    model = model_of(Sensor().with_effect(EFFECTS["dark"](current=2e-4)))
+    little, more = Estimate(2e-4, 1.8e-4, 2.2e-4), Estimate(9e-4, 8e-4, 1.1e-3)
+    assert is_below_black(model, "dark.current", little)
+    assert not is_below_black(model, "dark.current", more)
+    assert not is_below_black(model, "dark.spread", little)
+    assert not is_below_black(model, "threshold.on", little)

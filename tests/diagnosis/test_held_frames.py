@@ -18,7 +18,13 @@ TRIED = {name: EFFECTS[name] for name in ("bandwidth", "latency", "refractory", 
 
 
 def held_with_low_pass(
-    scene: VideoScene, *, cutoff: float = np.inf, late: float = 0.0, dead: float = 0.0, threshold: float = 0.2
+    scene: VideoScene,
+    *,
+    cutoff: float = np.inf,
+    late: float = 0.0,
+    dead: float = 0.0,
+    threshold: float = 0.2,
+    goes_on: bool = False,
 ) -> Events:
     """Return events of frames that are held, each from the one before on, exactly: e-functions, one by one.
 
@@ -31,6 +37,7 @@ def held_with_low_pass(
         late: From the crossing to the event [s].
         dead: From the event on [s].
         threshold: ON and OFF [log intensity].
+        goes_on: Whether it does not wait, and takes what it sends for.
     """
     times = scene.sample_times()
     light = scene.frames(times).astype(np.float64) + 1e-3
@@ -56,8 +63,11 @@ def held_with_low_pass(
             y, x = np.nonzero(sends)
             t = np.maximum(cross[y, x], at[y, x])
             out.append((t + late, x, y, target[y, x] > memory[y, x]))
-            free[y, x] = t + late + dead + 1e-6
             at[y, x] = t
+            if goes_on:
+                memory[y, x] = goal[y, x]
+            else:
+                free[y, x] = t + late + dead + 1e-6
             todo = sends & (free < end)
         value = target + (value - target) * np.exp(-rate * (end - begin))
     t, x, y, p = (np.concatenate(part) for part in zip(*out, strict=True))
@@ -79,6 +89,20 @@ def test_a_pixel_that_forgets_the_rest_of_a_frame_lacks_nothing(scene):
     assert found.unexplained is None
     assert found.errors[-1] < 0.5
     assert found.parameters["threshold.on"].value == pytest.approx(0.2, rel=0.01)
+
+
+def test_a_pixel_that_goes_on_within_a_frame_lacks_nothing(scene):
+    """Several events of a jump: with a memory of the frame the error was 10, and the answer mute."""
+    few = VideoScene(scene.frames(scene.sample_times()[::2]), scene.sample_times()[::2])
+    events = held_with_low_pass(few, cutoff=5e4, goes_on=True, threshold=0.15)
+    measured = as_measurement(events, few)
+    assert measured.held == pytest.approx(2 * GAP)
+    found = dase.diagnose(events, "ideal", scene=few, effects=TRIED, most=2)
+    assert found.findings == ()
+    assert found.unexplained is None
+    assert found.errors[-1] < 0.8
+    assert found.parameters["threshold.on"].value == pytest.approx(0.15, rel=0.01)
+    assert not [note for note in found.notes if "missing" in note]  # frames are held between jumps
 
 
 def test_a_dead_time_of_several_frames_is_certain(scene):

@@ -112,3 +112,18 @@ def test_a_model_comes_nearer(scene, monkeypatch):
     monkeypatch.setattr("dase.fitting.measurement.holds_frames", lambda *_: False)
     assert moved < 1
     assert moved < 0.1 * dase.compare(events, sensor, scene=scene).error
+
+
+def test_noise_that_is_drawn_at_each_frame_is_not_early(scene):
+    """Ten times as many events at frames as others, which come at any time: Metavision's shot noise."""
+    rng, times = np.random.default_rng(1), scene.sample_times()
+    sent = dase.simulate(scene, Sensor(), seed=1)
+    count = 10 * len(sent)
+    x, y = (rng.integers(0, size, count) for size in (WIDTH, HEIGHT))
+    noise = Events(np.sort(rng.choice(times[1:-1], count)), x, y, rng.random(count) < 0.5, WIDTH, HEIGHT)
+    t, x, y, p = (
+        np.concatenate([getattr(one, name) for one in (sent, noise)]) for name in ("t", "x", "y", "p")
+    )
+    order = np.argsort(t, kind="stable")
+    both = Events(t[order], x[order], y[order], p[order], WIDTH, HEIGHT)
+    assert not holds_frames(both, scene)

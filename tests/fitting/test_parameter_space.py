@@ -6,7 +6,9 @@ import numpy as np
 import pytest
 
 from dase.effects import EFFECTS
-from dase.fitting.parameter_space import make_axis
+from dase.effects.voltage_noise import VoltageNoise
+from dase.fitting.parameter_space import axes_of, make_axis
+from dase.simulation.sensor import Sensor
 
 FACTS = [(name, fact) for name, effect in EFFECTS.items() for fact in effect.parameters()]
 
@@ -20,3 +22,12 @@ def test_every_place_has_a_value_that_the_effect_takes(name, fact):
         EFFECTS[name](**{fact.name: float(value)})
     middle = 0.3 * low + 0.7 * high
     assert line.to_place(line.to_value(middle)) == pytest.approx(middle)
+
+
+@pytest.mark.parametrize(("cutoff", "high"), [(200.0, 1000.0), (2500.0, 2500.0)])
+def test_a_search_goes_no_farther_than_what_costs_much_and_tells_nothing(cutoff, high):
+    """Noise of some kHz took minutes; what was given stays in reach."""
+    sensor = Sensor().with_effect(VoltageNoise(cutoff=cutoff))
+    (axis,) = axes_of(sensor, ["voltage_noise.cutoff"])
+    assert axis.high == high
+    assert axis.to_value(axis.to_place(cutoff)) == pytest.approx(cutoff)
