@@ -242,7 +242,10 @@ def _is_of_frames(entry: Signature, step: float, events: Events, scene: Scene) -
     if entry.name in ("time stamps", "double events") and is_held(scene):
         return True
     said = entry.details if entry.name == "time stamps" and "line" not in entry.details else {}
-    tick = said.get("step", said.get("period", 0.0))
+    period, gap = said.get("period", 0.0), clip_step_of(scene)
+    if period and gap and is_in_step(1 / period, gap):
+        return True  # of noise that is drawn once a frame, or of pixels that send some time after each
+    tick = said.get("step", period)
     return ticks_are_of_frames(tick, step, events, scene)
 
 

@@ -57,6 +57,11 @@ class FrameStepSettings:
     few: float = 0.3
     """Share of the parts that then have events, at most."""
 
+    follow: float = 0.7
+    """Share of the events at a later part of a frame whose pixel has sent at the part before, from which on
+    few parts do as well: a simulator that knows how many events a pixel sends in a frame goes through them in
+    turn. Clips of v2e had 1.0 where it matters, clocks of a half or a third of a frame 0.46 at most."""
+
     looked: int = 60
     """Frames at which it is asked whether events tell of the light before them or after them."""
 
@@ -98,8 +103,31 @@ def frame_step_of(events: Events, scene: Scene, settings: FrameStepSettings = FR
     filled = counts > settings.empty * len(t) / settings.parts
     uneven = counts.max() * np.count_nonzero(filled) > settings.most * len(t)
     few = np.count_nonzero(filled) <= settings.few * settings.parts
-    in_step = together > settings.together or (uneven and few)
+    in_step = together > settings.together or (
+        few and (uneven or _in_turn(events, times[0], step) > settings.follow)
+    )
     return step if emptiest < settings.empty and in_step else None
+
+
+def _in_turn(events: Events, begin: float, step: float, most: int = 300_000) -> float:
+    """Return the share of events at a later time stamp of a frame whose pixel has sent at the stamp before.
+
+    Args:
+        events: Sorted.
+        begin: Time of a frame [s].
+        step: From frame to frame [s].
+        most: Events that are looked at.
+    """
+    t, pixels = events.t[:most], events.width * events.height
+    pixel = events.y[:most].astype(np.int64) * events.width + events.x[:most]
+    # a frame's time is the last stamp of what went on before it
+    frame = np.ceil((t - begin) / step - 1e-3).astype(np.int64)
+    stamp = np.cumsum(np.diff(t, prepend=t[0]) > 1e-6)
+    first = np.searchsorted(frame, frame)  # the first event of the same frame
+    later = stamp > stamp[first]
+    if not later.any():
+        return 0.0
+    return float(np.isin((stamp - 1)[later] * pixels + pixel[later], stamp * pixels + pixel).mean())
 
 
 def clip_step_of(scene: Scene) -> float:

@@ -69,6 +69,27 @@ def test_events_at_few_parts_of_a_frame_are_in_step_with_it_unless_these_are_ali
         assert (frame_step_of(events, clip) is not None) is told
 
 
+def test_events_at_halves_of_frames_are_in_step_if_pixels_send_them_in_turn(clip):
+    """A clip of v2e, two events in nearly every frame: a clock of half a frame was certain."""
+    change = np.abs(np.diff(np.log(clip.frames(clip.sample_times()) + 1e-3), axis=0)).max((1, 2))
+    events = frame_by_frame(clip, theta=float(np.median(change)) / 1.4)
+    halves = np.round((events.t % STEP) / STEP * 6).astype(int) % 6
+    assert np.isin(halves, (0, 3)).mean() > 0.9
+    assert frame_step_of(events, clip) == pytest.approx(STEP)
+    clock = Sensor().with_effect(EFFECTS["timestamp"](step=STEP / 2))
+    assert frame_step_of(dase.simulate(clip, clock, seed=1), clip) is None
+
+
+@pytest.mark.parametrize(("period", "kept"), [(STEP, False), (STEP / 2, False), (0.7 * STEP, True)])
+def test_intervals_of_frames_are_of_no_clock(clip, monkeypatch, period, kept):
+    """Noise that is drawn once a frame, beside events that come at any time: time stamps were certain."""
+    entry = Signature(name="time stamps", answer=Answer.FOUND, sentence="", details={"period": period})
+    found = SimpleNamespace(found=(entry,), entries=(entry,))
+    monkeypatch.setattr(seen_effects, "find_signatures", lambda *args, **more: found)
+    seen = find_seen_effects(Measurement(dase.simulate(clip, "ideal", seed=2), clip), EFFECTS)
+    assert bool(seen.entries) is kept
+
+
 def test_what_a_simulator_waits_between_frames_is_no_loss_of_data(clip, monkeypatch):
     gaps = np.array([[0.1, 0.11], [0.3, 0.31], [0.5, 0.51]])
     monkeypatch.setattr(data_split, "repeated_gaps", lambda t: gaps)
