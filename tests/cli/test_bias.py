@@ -43,6 +43,7 @@ def test_a_sensor_file_keeps_its_comments(tmp_path: Path):
     assert "# as on: 52 % of the events" in text
 
 
+@pytest.mark.slow
 def test_synth_takes_the_same_words(tmp_path: Path):
     given = [word for text in WORDS for word in ("--bias", text)]
     run("synth", tmp_path / "out", *SMALL, "--sensor", "davis346", *given)

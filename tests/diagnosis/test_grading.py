@@ -265,6 +265,7 @@ def test_light_that_flickers_in_the_clip_is_not_of_the_camera(scene):
         assert ("flicker" in kept.effects) == left
 
 
+@pytest.mark.slow
 def test_a_lamp_is_asked_of_a_model_with_the_least_thresholds(scene):
     """It is asked with lower thresholds, too; a sensor cannot have a quarter of the least that there are."""
     lit = Sensor().with_effect(EFFECTS["flicker"](frequency=100.0, depth=0.3))
@@ -275,7 +276,8 @@ def test_a_lamp_is_asked_of_a_model_with_the_least_thresholds(scene):
     assert "flicker" in kept.effects
 
 
-@pytest.mark.parametrize("given", [pytest.param(False, marks=pytest.mark.slow), True])
+@pytest.mark.slow
+@pytest.mark.parametrize("given", [False, True])
 def test_a_pattern_that_the_model_makes_is_explained_over_a_guessed_scene(given):
     """How ON and OFF events balance is the pixels', however badly light is known between frames."""
     rng = np.random.default_rng(1)

@@ -81,6 +81,7 @@ def scene() -> VideoScene:
     return shaken_texture(gap=GAP)
 
 
+@pytest.mark.slow
 def test_a_pixel_that_forgets_the_rest_of_a_frame_lacks_nothing(scene):
     events = held_with_low_pass(scene)
     assert fewest_frames(as_measurement(events, scene)) == (1,)
@@ -105,6 +106,7 @@ def test_a_pixel_that_goes_on_within_a_frame_lacks_nothing(scene):
     assert not [note for note in found.notes if "missing" in note]  # frames are held between jumps
 
 
+@pytest.mark.slow
 def test_a_dead_time_of_several_frames_is_certain(scene):
     found = dase.diagnose(held_with_low_pass(scene, dead=0.01), "ideal", scene=scene, effects=TRIED, most=2)
     assert [(one.effect, one.grade) for one in found.findings] == [("refractory", "certain")]

@@ -226,6 +226,7 @@ def test_a_davis_and_its_frames(shared):
     assert 5 < events < 40
 
 
+@pytest.mark.slow
 def test_a_recording_its_path_and_its_measurement_give_the_same(recording, measured):
     path, events = recording
     opened = dase.open_recording(path)

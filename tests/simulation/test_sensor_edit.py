@@ -229,6 +229,7 @@ def test_commands(tmp_path):
     assert sorted(p.name for p in tmp_path.iterdir()) == ["mine.toml", "more.toml"]
 
 
+@pytest.mark.slow
 def test_add_and_fit(tmp_path, rng):
     """What is added to the model is found in a recording of it, and the fall of the error is written down."""
     t = np.arange(600) * 1e-3
