@@ -162,7 +162,8 @@ def choose_compared(
         plenty, pixels = fewer * plenty, settings.guessed_pixels
         parts = replace(parts, scouts=round(fewer * parts.scouts))
     seen = find_seen_effects(measurement, effects)
-    asked = DEAD in effects and DEAD not in given
+    # a lamp makes neighbours send whatever light does between frames
+    asked = DEAD in effects and DEAD not in given and not (guessed is not None and seen.lamp)
     return ComparedMeasurement(
         measurement=measurement,
         given=given,

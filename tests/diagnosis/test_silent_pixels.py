@@ -6,7 +6,10 @@ import numpy as np
 import pytest
 
 import dase
+from dase.diagnosis import compared_measurement
 from dase.diagnosis.diagnose import diagnose
+from dase.diagnosis.seen_effects import SeenEffects
+from dase.diagnosis.settings import DEFAULTS
 from dase.diagnosis.silent_pixels import (
     SilentPixels,
     find_silent_pixels,
@@ -16,6 +19,7 @@ from dase.effects import EFFECTS
 from dase.fitting.data_split import split_measurement
 from dase.fitting.measurement import Measurement
 from dase.results import Grade
+from dase.signatures.result import Answer, Signature
 from dase.simulation.sensor import Sensor
 
 WIDTH, HEIGHT = 96, 72
@@ -122,6 +126,22 @@ def test_frames_of_a_camera_tell_dead_pixels_as_well(scene, span):
     # between two frames no change of light is known
     assert found.found == (span is None)
     assert found.decides == (span is None)
+
+
+@pytest.mark.parametrize("lit", [False, True])
+def test_dead_pixels_are_not_asked_for_beside_a_lamp_and_light_that_is_a_guess(scene, lit, monkeypatch):
+    """It makes neighbours send whatever the light does: six dead pixels of a sealed case were none."""
+    begins = scene.sample_times()[::40]
+    grey = np.rint(255 * scene.frames(begins) / scene.frames(begins).max()).astype(np.uint8)
+    known = dase.CameraScene(grey, begins)
+    lamp = Signature(name="flicker", answer=Answer.FOUND, details={"frequency": 120.0})
+    seen = SeenEffects((lamp,) if lit else ())
+    monkeypatch.setattr(compared_measurement, "find_seen_effects", lambda *args: seen)
+    found = compared_measurement.choose_compared(
+        Measurement(dase.simulate(scene, "ideal", seed=5), known), Sensor(), EFFECTS,
+        pixels=200, seed=0, device="cpu", settings=DEFAULTS,
+    )  # fmt: skip
+    assert (found.silent is None) is lit
 
 
 @pytest.mark.parametrize("every", [33, 7, "uneven"])
