@@ -20,6 +20,7 @@ from dase.diagnosis.candidates import (
 )
 from dase.diagnosis.cell_descriptions import worst_cells
 from dase.diagnosis.compared_measurement import ComparedMeasurement
+from dase.diagnosis.dead_time import EFFECT as REFRACTORY
 from dase.diagnosis.directional_test import find_hidden_effect
 from dase.diagnosis.effect_pairs import add_pair
 from dase.diagnosis.pruning import prune_model
@@ -190,6 +191,12 @@ def _look_for_effect(
     if not state.first and not certain:
         state.first, state.first_step = sorted(tried, key=lambda one: one.screened_loss), len(state.history)
     best, ties = _best_candidate(state, tried, judgement)
+    if certain == [REFRACTORY] and not reaches_floor(judgement):
+        share = rank_of(best, judgement).share if best is not None else 0.0
+        if share < settings.dead_time_share:
+            state.certain -= {REFRACTORY}
+            state.put_off |= {REFRACTORY}
+            return _look_for_effect(state, model, judgement, more)
     if best is None and certain:
         best = _shown_whatever_fits(state, tried, judgement)
         if best is None:

@@ -61,7 +61,12 @@ def settle_dead_time(
         model: The last one.
         judgement: Its held-out error.
     """
-    if state.added_to(model):  # else it was asked before
+    if REFRACTORY in state.put_off:
+        # beside what was found instead of it the intervals may end nowhere
+        seen = replace(seen, entries=tuple(one for one in seen.entries if one.name != DEAD_TIME))
+        bare = with_same_freedom(model.sensor.without(REFRACTORY), model, ())
+        seen = _look_for_dead_time(state, seen, measurement, bare)
+    elif state.added_to(model):  # else it was asked before
         seen = _look_for_dead_time(state, seen, measurement, model)
         seen, model, judgement = _without_needless_dead_time(state, seen, measurement, model, judgement)
     ended = seen.entry_of(DEAD_TIME)

@@ -246,6 +246,11 @@ class DiagnosisSettings:
     share: float = 0.1
     """Least share of the way to the floor for which an effect is added."""
 
+    dead_time_share: float = 0.25
+    """Least share of the way to the floor for which a dead time that was seen beside the model before the
+    search is put in before all else: 36 and 39 % in clips of v2e with one, 14 % where a response that is
+    linear in the dark was missing. One that explains less is asked for again at the end."""
+
     remainder: float = 0.5
     """Where the model counts as right without it, an effect is added only if it leaves no more than chance
     may, and at most this share of what was left above the level of chance."""

@@ -38,6 +38,8 @@ class DiagnosisState:
         certain: Effects that the events alone show; they are not dropped.
         shown: Those of them that are there however badly any model fits.
         tried_alone: Those of them that were tried before all others.
+        put_off: Those that were seen beside the model before the search, and explain too little of its error
+            to be put in before all others: they are asked for again at the end.
         held: See `Measurement.held`.
         all_time: Whether all of the time is fitted, not its first part alone.
         evaluations_before: Simulations that were run before the measurement was split anew.
@@ -62,6 +64,7 @@ class DiagnosisState:
     certain: frozenset[str] = frozenset()
     shown: frozenset[str] = frozenset()
     tried_alone: frozenset[str] = frozenset()
+    put_off: frozenset[str] = frozenset()
     held: float = 0.0
     all_time: bool = False
     evaluations_before: int = 0

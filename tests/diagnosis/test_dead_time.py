@@ -202,3 +202,27 @@ def test_a_dead_time_is_dropped_that_the_last_model_has_no_need_of(monkeypatch, 
 
 def judged(error: float) -> Judgement:
     return Judgement(error, 1.15, 0.4, 0.25, {}, {}, np.zeros(1), 1.0)
+
+
+@pytest.mark.parametrize("added", [False, True])
+def test_a_dead_time_that_was_put_off_is_asked_for_beside_the_last_model(monkeypatch, added):
+    """Beside a model without a linear response in the dark 2,500 intervals were too short: no dead time."""
+    entry = Signature(name=NAME, answer=Answer.FOUND, sentence="seen", details={"period": 2e-3})
+    sensor = Sensor().with_effect(EFFECTS["linlog"]())
+    model = model_of(sensor.with_effect(EFFECTS["refractory"](period=2e-3)) if added else sensor, None)
+    state = SimpleNamespace(
+        added_to=lambda one: ("linlog",), put_off=frozenset({"refractory"}), effects=EFFECTS,
+        certain=frozenset(), judge=lambda one: judged(0.3),
+    )  # fmt: skip
+    asked = []
+
+    def look(state, seen, measurement, one):
+        asked.append(one.sensor)
+        assert seen.entry_of(NAME) is None
+        return seen
+
+    monkeypatch.setattr(seen_beside_model, "_look_for_dead_time", look)
+    seen, last = seen_beside_model.settle_dead_time(state, SeenEffects((entry,)), None, model, judged(0.3))
+    assert seen.entry_of(NAME) is None
+    assert last is model  # what the error asks for stays, and is graded by it
+    assert [("refractory" in one, "linlog" in one) for one in asked] == [(False, True)]
