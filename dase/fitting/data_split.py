@@ -95,11 +95,6 @@ PARTS = 3
 """Groups of pixels: those that are fitted, that choose between models, and that report."""
 
 
-NO_THRESHOLDS = (
-    "the light never changes: nothing tells how much change an event takes, and thresholds are not fitted"
-)
-
-
 @dataclass(frozen=True, eq=False)
 class SplitMeasurement:
     """A measurement and the scene it is of.
@@ -402,7 +397,12 @@ def split_measurement(
         train, held, last_part, scout, bands, structure, peak, highest, bus, when,
         tuple(notes), contradiction, frames, frame_step,
     )  # fmt: skip
-    return replace(out, notes=(*notes, NO_THRESHOLDS)) if out.light_never_changes else out
+    if out.light_never_changes:
+        notes.append(
+            "the light never changes: nothing tells how much change an event takes, and thresholds are not "
+            "fitted"
+        )
+    return replace(out, notes=tuple(notes))
 
 
 def _share_compared(events: Events, scene: Scene, grid: Grid, trust: Trust | None, looks: int = 40) -> float:

@@ -61,10 +61,6 @@ class FitSettings:
 
 FIT = FitSettings()
 
-NO_FRAME_TIMES = (
-    "no bursts at even times in step with frames are seen: the times of `exposure` stay as they were given"
-)
-
 STANDARD_ERRORS_OF_90 = 1.6448536269514722
 """Half of an interval of 90 % of a normal distribution, in standard errors."""
 
@@ -110,6 +106,7 @@ def fit(
     start = start.bound_to(scene)
     follows = follows_frames(start)
     frames = find_frame_times(measurement) if follows else None
+    untold = follows and frames is None
     evidence = split_measurement(
         measurement.events, scene, log_eps=start.log_eps, trust=measurement.trust,
         span=measurement.span, frames=frames, unbroken=start.unbroken,
@@ -138,7 +135,7 @@ def fit(
     notes = [
         *_notes_on_held_out_error(judgement, before),
         *evidence.notes,
-        *([NO_FRAME_TIMES] if follows and frames is None else []),
+        *(["no bursts come in step with frames: the times of `exposure` stay as given"] if untold else []),
         *_notes_on_rules(start, model.sensor),
         *_notes_on_phase(start, model.sensor),
         *apart,

@@ -7,8 +7,6 @@ import torch.nn.functional as F
 
 OUTLIER = 3.0
 """Endpoint error above which a pixel is an outlier [px]."""
-BLUR = 1.0
-"""Standard deviation by which both images of events are blurred [px] before their variances are compared."""
 
 
 def endpoint_errors(flow: torch.Tensor, truth: torch.Tensor) -> torch.Tensor:
@@ -88,7 +86,7 @@ def flow_warp_loss(
 def blurred(image: torch.Tensor) -> torch.Tensor:
     """Return an image (H, W) blurred by a Gaussian of 1 px, zeros around it."""
     x = torch.arange(-3.0, 4.0, device=image.device)
-    weights = torch.exp(-0.5 * (x / BLUR) ** 2)
+    weights = torch.exp(-0.5 * x**2)
     weights = weights / weights.sum()
     rows = F.conv2d(image[None, None], weights.view(1, 1, 1, -1), padding=(0, 3))
     return F.conv2d(rows, weights.view(1, 1, -1, 1), padding=(3, 0))[0, 0]
