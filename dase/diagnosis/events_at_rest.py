@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from scipy import stats
 from scipy.ndimage import uniform_filter1d
 
+from dase.effects.threshold import Threshold
 from dase.errors import InputError
 from dase.events import Events
 from dase.fitting.measurement import Measurement
@@ -101,6 +102,15 @@ class RestSettings:
 
     turns: float = 0.8
     """Share of pairs of opposite polarity of noise that returns, at least: it had 0.9 and more."""
+
+    apart: float = 0.6
+    """By how much noise of the two polarities differs from pixel to pixel, at least, each relative to its
+    mean, where a pattern of ON and OFF events may be the noise's: 0.82 in IEBCS's, whose pixels have rates of
+    their own for either; 0.05 of Metavision's where thresholds differ by 55 %, and no more than chance of
+    v2e's."""
+
+    sure: float = 5.0
+    """The same, in its standard errors."""
 
     by_chance: float = 0.1
     """How far from the share of independent polarities that of shot noise is, at most: it was 0.02."""
@@ -247,6 +257,48 @@ def find_events_at_rest(
     model = int(rests.events_in(made)[3].sum())
     gap = measurement.scene.longest_gap() if isinstance(measurement.scene, VideoScene) else 0.0
     return judge_events_at_rest(rests, measurement.compared_events(), model, frame_gap=gap, settings=settings)
+
+
+def noise_is_a_pattern(
+    measurement: Measurement, sensor: Sensor, *, seed: int, settings: RestSettings = AT_REST
+) -> bool:
+    """Whether pixels at rest have noise of either polarity at rates of their own.
+
+    They then differ in the balance of ON and OFF, as if by their thresholds, whatever these are.
+
+    Args:
+        measurement: Its events are counted where its light rests.
+        sensor: The model, whose thresholds say what rest is.
+        seed: Of which pixels are looked at.
+        settings: How much they differ.
+    """
+    threshold = sensor["threshold"]
+    assert isinstance(threshold, Threshold)
+    still = settings.still * min(threshold.on, threshold.off)
+    rests = find_rests(measurement, still=still, log_eps=sensor.log_eps, seed=seed, settings=settings)
+    _, p, at, _ = rests.events_in(measurement.compared_events())
+    return differ_by_polarity(p, at, rests, settings)
+
+
+def differ_by_polarity(
+    p: NDArray[np.bool_], at: NDArray[np.int64], rests: Rests, settings: RestSettings = AT_REST
+) -> bool:
+    """Whether a pixel's share of the ON events in rests is not its share of the OFF events.
+
+    Args:
+        p: Polarities of the events, shape (N,).
+        at: Places in `rests.pixels`, shape (N,).
+        rests: Of the pixels.
+        settings: How far apart they are.
+    """
+    on, off = (np.bincount(at[which], minlength=len(rests.pixels)) for which in (p, ~p))
+    if min(on.sum(), off.sum()) < settings.events:
+        return False
+    share = (rests.end - rests.begin) / rests.seconds
+    # less what chance makes of both
+    excess = (on / on.sum() - off / off.sum()) ** 2 - (on / on.sum() ** 2 + off / off.sum() ** 2)
+    total, error = float(excess.sum()), math.sqrt(float((excess**2).sum()))
+    return total > settings.sure * error and total > settings.apart**2 * float((share**2).sum())
 
 
 def judge_events_at_rest(

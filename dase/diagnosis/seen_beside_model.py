@@ -14,16 +14,18 @@ from dase.diagnosis.dead_time import NAME as DEAD_TIME
 from dase.diagnosis.dead_time import add_dead_time, find_dead_time
 from dase.diagnosis.drifting_memory import EFFECT as LEAKING
 from dase.diagnosis.drifting_memory import find_drifting_memory
-from dase.diagnosis.events_at_rest import LEAK, find_events_at_rest
+from dase.diagnosis.events_at_rest import LEAK, NOISE, find_events_at_rest, noise_is_a_pattern
 from dase.diagnosis.seen_effects import SeenEffects
 from dase.diagnosis.state import DiagnosisState, with_same_freedom
 from dase.diagnosis.unequal_thresholds import EFFECT as MISMATCH
+from dase.diagnosis.unequal_thresholds import NAME as UNEQUAL
 from dase.diagnosis.unequal_thresholds import find_unequal_thresholds
 from dase.effects.threshold import Threshold
 from dase.fitting.measurement import Measurement
 from dase.fitting.model import FittedModel
 from dase.probes.distance import Judgement
 from dase.results import is_worse
+from dase.signatures.fixed_pattern import NAME as PATTERN
 
 
 def look_beside_model(
@@ -40,6 +42,7 @@ def look_beside_model(
     seen = _look_where_light_rests(state, seen, measurement, model)
     seen = _look_for_dead_time(state, seen, measurement, model)
     seen = _look_at_thresholds(state, seen, measurement, model)
+    seen = _without_pattern_of_noise(state, seen, measurement, model)
     state.certain = frozenset(seen.effects) & frozenset(state.effects) - state.given
     state.shown = state.certain & seen.shown_whatever_fits
     return seen
@@ -116,6 +119,24 @@ def _look_at_thresholds(
         structure = state.evidence.structure
         found.append(find_drifting_memory(measurement, model.sensor, structure=structure, seed=state.seed))
     return replace(seen, entries=(*seen.entries, *(one for one in found if one is not None)))
+
+
+def _without_pattern_of_noise(
+    state: DiagnosisState, seen: SeenEffects, measurement: Measurement, model: FittedModel
+) -> SeenEffects:
+    """Return what is seen, without a pattern of ON and OFF events that noise at rest may make.
+
+    Thresholds that differ are told by what light does between events, too.
+    """
+    if not (seen.entry_of(PATTERN) and seen.entry_of(NOISE)) or seen.entry_of(UNEQUAL):
+        return seen
+    if not noise_is_a_pattern(measurement, model.sensor, seed=state.seed):
+        return seen
+    state.notes.append(
+        "pixels at rest send ON and OFF noise at rates of their own: that they differ tells nothing of their "
+        "thresholds"
+    )
+    return replace(seen, entries=tuple(one for one in seen.entries if one.name != PATTERN))
 
 
 def _without_needless_dead_time(

@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
 import dase
+from dase.diagnosis import seen_beside_model
 from dase.diagnosis.dead_time import NAME as DEAD_TIME
 from dase.diagnosis.events_at_rest import (
     AT_REST,
     LEAK,
     NOISE,
     Rests,
+    differ_by_polarity,
     find_events_at_rest,
     find_rests,
     judge_events_at_rest,
@@ -150,6 +154,31 @@ def test_noise_that_is_drawn_for_some_frames_more_than_for_others_is_told_by_its
 def test_polarities_that_are_neither_both_nor_one_tell_nothing():
     events, rests = at_random(2000, 0.9)
     assert judge_events_at_rest(rests, events, 0) is None
+
+
+@pytest.mark.parametrize("own", [False, True])
+def test_noise_of_either_polarity_may_be_a_pattern_of_its_own(own):
+    """IEBCS gives each pixel a rate for ON and one for OFF: a fixed pattern was certain of its thresholds."""
+    rng = np.random.default_rng(4)
+    rates = np.exp(0.55 * rng.standard_normal((2, 1000)))
+    on, off = rng.poisson(5 * rates[0]), rng.poisson(4 * rates[int(own)])
+    at = np.repeat(np.tile(np.arange(1000), 2), np.concatenate([on, off]))
+    p = np.repeat([True, False], [on.sum(), off.sum()])
+    rests = Rests(np.arange(1000, dtype=np.int32), np.zeros(1000), np.ones(1000))
+    assert differ_by_polarity(p, at, rests) is own
+
+
+@pytest.mark.parametrize(("differs", "unequal", "kept"), [
+    (True, False, False), (False, False, True), (True, True, True),
+])  # fmt: skip
+def test_a_pattern_that_noise_makes_is_none_of_thresholds(monkeypatch, differs, unequal, kept):
+    names = ("fixed pattern", NOISE, *(["unequal thresholds"] if unequal else []))
+    seen = SeenEffects(tuple(Signature(name=name, answer=Answer.FOUND, sentence="") for name in names))
+    monkeypatch.setattr(seen_beside_model, "noise_is_a_pattern", lambda *args, **more: differs)
+    state = SimpleNamespace(notes=[], seed=0)
+    left = seen_beside_model._without_pattern_of_noise(state, seen, None, SimpleNamespace(sensor=Sensor()))
+    assert (left.entry_of("fixed pattern") is not None) is kept
+    assert bool(state.notes) is not kept
 
 
 def test_noise_of_two_kinds_is_said_to_be_either():
