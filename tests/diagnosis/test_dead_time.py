@@ -153,6 +153,7 @@ def test_intervals_are_those_of_each_pixel():
     np.testing.assert_allclose(intervals_of(events, np.array([1])), [0.25])
 
 
+@pytest.mark.slow
 def test_a_dead_time_that_hardly_loses_events_is_certain():
     """The error is blind to it: of 75,000 intervals some 700 are gone."""
     scene = drifting_texture(3, speed=20.0)

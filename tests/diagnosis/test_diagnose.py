@@ -125,6 +125,7 @@ def test_an_unknown_effect_is_unexplained_until_it_is_given(scene, device):
     assert known.parameters["popping.rate"].value == pytest.approx(25.0, rel=0.15)
 
 
+@pytest.mark.slow
 def test_the_same_seed_gives_the_same_findings(scene, device):
     events = hidden(scene, device, EFFECTS["leak"](rate=4.0))
     one, two = (

@@ -153,6 +153,7 @@ def test_wrong_arguments(a, b, options, message):
         distinguish(a, b, **options)
 
 
+@pytest.mark.slow
 def test_command(tmp_path):
     for name, rate in (("one", 0.0), ("two", 5.0)):
         (tmp_path / f"{name}.toml").write_text(f"[threshold]\n[shot]\nrate = {rate}\n")

@@ -250,6 +250,7 @@ def test_what_the_events_show_is_certain_whatever_the_search_says():
     assert [one.effect for one in seen.findings([], ("flicker",))] == ["exposure"]
 
 
+@pytest.mark.slow
 def test_light_that_flickers_in_the_clip_is_not_of_the_camera(scene):
     """The events show it, but the sensor without any effect would show it as well."""
     times = scene.sample_times()

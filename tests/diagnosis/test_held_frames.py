@@ -92,6 +92,7 @@ def test_a_pixel_that_forgets_the_rest_of_a_frame_lacks_nothing(scene):
     assert found.parameters["threshold.on"].value == pytest.approx(0.2, rel=0.01)
 
 
+@pytest.mark.slow
 def test_a_pixel_that_goes_on_within_a_frame_lacks_nothing(scene):
     """Several events of a jump: with a memory of the frame the error was 10, and the answer mute."""
     few = VideoScene(scene.frames(scene.sample_times()[::2]), scene.sample_times()[::2])

@@ -79,6 +79,7 @@ class Weary(Effect):
     )
 
 
+@pytest.mark.slow
 def test_names_of_an_effect_and_its_parameters_do_not_matter(device):
     scene = moving_bars()
     true = Sensor((EFFECTS["threshold"](on=0.18, off=0.22), EFFECTS["bandwidth"](cutoff=60.0)))

@@ -363,6 +363,7 @@ def test_results_plot_themselves(tmp_path):
         assert (tmp_path / "plot.png").stat().st_size > 10_000
 
 
+@pytest.mark.slow
 def test_compare_writes_a_report(tmp_path, rng):
     texture = cv2.GaussianBlur(rng.random((24, 300)).astype(np.float32), (0, 0), 2)
     texture = np.clip((texture - texture.min()) / np.ptp(texture), 0.05, 1)

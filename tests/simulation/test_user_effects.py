@@ -198,6 +198,7 @@ def test_new_effect_refuses(name, file, message, tmp_path):
     assert [p.name for p in tmp_path.iterdir()] == ["there.py"]
 
 
+@pytest.mark.slow
 def test_commands(tmp_path):
     """What `dase effects new` says to try works, in worker processes too."""
     written_by = dase("effects", "new", "afterglow", cwd=tmp_path)
