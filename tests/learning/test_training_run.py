@@ -25,7 +25,8 @@ def scenes() -> scene_batches.Scenery:
     return small_scenes()
 
 
-@pytest.mark.parametrize("start", [(0.45, 0.12), pytest.param((0.09, 0.02), marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("start", [(0.45, 0.12), (0.09, 0.02)])
 def test_a_wrong_start_is_left_behind(scenes, start):
     training = a_run(scenes, mu=start[0], sigma=start[1], steps=60, warmup=10)
     exam = MapEvaluation(scenes, training.target, scenes=4)

@@ -194,7 +194,7 @@ def test_the_same_seed_gives_the_same_batches():
 
 
 @pytest.mark.filterwarnings("ignore:This DataLoader will create")  # where the machine has one processor
-@pytest.mark.parametrize("method", ["fork", "spawn"])
+@pytest.mark.parametrize("method", ["fork", pytest.param("spawn", marks=pytest.mark.slow)])
 def test_workers(method):
     """Several processes give the batches of one, in the same order."""
     stream = streamed(batch=1, steps=2, sensor="ideal")
