@@ -284,7 +284,8 @@ second where edges pass all the time, so none of them is calm.
 Rows of `psee_gen31_dot` and columns of `davis346_cuke_cradle` were called grouped until signatures knew
 edges that move, which make the same; of either too few events are left beside edges to say anything.
 
-Times are of two cores of an AMD EPYC (family 25, model 17): 15 to 121 s. At 2323c88 they were 51 to 706 s, on a core of an AMD EPYC (family 25) that was shared. Since then pixels and
+Times are of two cores of an AMD EPYC (family 25, model 17): 15 to 121 s. At 2323c88 they
+were 51 to 706 s, on a core of an AMD EPYC (family 25) that was shared. Since then pixels and
 models are fewer far from the floor and where light between frames is a guess, and a bus is no rival where the
 stamps say that it was never busy.
 
