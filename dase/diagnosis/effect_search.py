@@ -27,8 +27,7 @@ from dase.diagnosis.pruning import prune_model
 from dase.diagnosis.ranking import rank_of
 from dase.diagnosis.settings import DEFAULTS, DiagnosisSettings
 from dase.diagnosis.state import DiagnosisState, explains_remainder
-from dase.fitting.model import FittedModel, refit_model
-from dase.fitting.parameter_space import with_full_range
+from dase.fitting.model import FittedModel, refit_model, with_full_range
 from dase.fitting.scene_doubt import with_scene_doubt
 from dase.probes.distance import Judgement, leaves_nothing, reaches_floor, worst_families
 from dase.probes.random_streams import SimulationStream
@@ -81,18 +80,12 @@ def _fit_beyond_the_search(
         model: The last one.
         judgement: Its held-out error.
     """
-    axes, ends = model.space.axes, model.space.bounds()[1]
-    stopped = [
-        axis.high >= axis.fact.farthest and place > end - 0.05
-        for axis, place, end in zip(axes, model.place, ends, strict=True)
-    ]
     far = judgement.error > state.settings.pruning.lost * judgement.gate
-    if far or not any(stopped) or leaves_nothing(judgement):
+    wide = None if far or leaves_nothing(judgement) else with_full_range(model)
+    if wide is None:
         return model, judgement
-    wide = tuple(with_full_range(axis) if over else axis for axis, over in zip(axes, stopped, strict=True))
     state.progress("fitting beyond the search", 0.9, judgement.error)
-    space = replace(model.space, axes=wide)
-    found = refit_model(state.evidence, replace(model, space=space), seed=state.seed)
+    found = refit_model(state.evidence, wide, seed=state.seed)
     judged = state.judge(found)
     return (found, judged) if judged.error < judgement.error else (model, judgement)
 

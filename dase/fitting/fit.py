@@ -23,6 +23,7 @@ from dase.fitting.model import (
     model_of,
     refit_model,
     ways_by_other_laws,
+    with_full_range,
     with_phase,
 )
 from dase.fitting.parameter_space import SearchAxis, refuse_idle
@@ -118,6 +119,11 @@ def fit(
     # by the part that nothing is chosen by: the starts that are compared below are chosen by another
     before = given.judge(evidence.report, repeats=REPEATS // 2, seed=SimulationStream.JUDGE.seed(seed)).error
     ends = _descend_from_starts(evidence, start, free, seed, lambda text, share: tell(text, share, before))
+    if (wide := with_full_range(_best_end(ends)[1])) is not None:
+        # where a search stops for the time it takes, a fit goes on
+        wide = refit_model(evidence, wide, seed=seed)
+        judged = wide.judge(evidence.held, repeats=REPEATS, seed=SimulationStream.JUDGE.seed(seed))
+        ends.append((judged, wide))
     judgement, model = _best_end(ends)
     model = with_phase_given(evidence, model, start, seed=seed)
     tell("confidence intervals", 0.9, judgement.error)

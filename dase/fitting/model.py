@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from dase.effects.base import Effect
 from dase.fitting.data_split import SplitMeasurement
 from dase.fitting.descent import DESCENT, DescentSettings, StopRule, descent_work, ranking_work
-from dase.fitting.parameter_space import ParameterSpace, SearchAxis, axes_of, with_values
+from dase.fitting.parameter_space import ParameterSpace, SearchAxis, axes_of, full_axis, with_values
 from dase.fitting.scheduler import SimulationRequest, Work, answer_requests, run_side_by_side, run_work
 from dase.fitting.subset import CalibratedSubset, PixelSubset
 from dase.probes.distance import Judgement
@@ -129,6 +129,22 @@ def model_of(sensor: Sensor, free: Sequence[str] | None = None) -> FittedModel:
     """Return the model of a sensor at its own parameters."""
     space = ParameterSpace(sensor, axes_of(sensor, free))
     return FittedModel(space, space.places())
+
+
+def with_full_range(model: FittedModel) -> FittedModel | None:
+    """Return a model whose values may go as far as a fit goes, where one ended where the search for it does.
+
+    None if none did.
+    """
+    axes, ends = model.space.axes, model.space.bounds()[1]
+    stopped = [
+        axis.high >= axis.fact.farthest and place > end - 0.05
+        for axis, place, end in zip(axes, model.place, ends, strict=True)
+    ]
+    if not any(stopped):
+        return None
+    wide = tuple(full_axis(axis) if over else axis for axis, over in zip(axes, stopped, strict=True))
+    return replace(model, space=replace(model.space, axes=wide))
 
 
 def free_where_measured(

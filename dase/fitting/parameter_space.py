@@ -100,7 +100,7 @@ def axis_of(effect: Effect, fact: Parameter) -> SearchAxis:
     return replace(axis, low=low, high=high, log=False, span=2.0 / PHASE)
 
 
-def with_full_range(axis: SearchAxis) -> SearchAxis:
+def full_axis(axis: SearchAxis) -> SearchAxis:
     """Return an axis that goes as far as a fit may, where a search goes less far."""
     return replace(axis, high=max(axis.high, make_axis(axis.effect, axis.fact).high))
 

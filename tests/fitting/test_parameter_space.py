@@ -7,6 +7,7 @@ import pytest
 
 from dase.effects import EFFECTS
 from dase.effects.voltage_noise import VoltageNoise
+from dase.fitting.model import model_of, with_full_range
 from dase.fitting.parameter_space import axes_of, make_axis
 from dase.simulation.sensor import Sensor
 
@@ -31,3 +32,13 @@ def test_a_search_goes_no_farther_than_what_costs_much_and_tells_nothing(cutoff,
     (axis,) = axes_of(sensor, ["voltage_noise.cutoff"])
     assert axis.high == high
     assert axis.to_value(axis.to_place(cutoff)) == pytest.approx(cutoff)
+
+
+def test_a_model_that_ended_where_its_search_does_may_go_on():
+    """`fit` and a diagnosis go on from there; what ended elsewhere stays as it is."""
+    sensor = Sensor().with_effect(VoltageNoise(cutoff=1000.0))
+    wide = with_full_range(model_of(sensor, ["voltage_noise.cutoff", "voltage_noise.sigma"]))
+    highs = {axis.name: axis.high for axis in wide.space.axes}
+    assert highs["voltage_noise.cutoff"] == 9000.0
+    assert wide.sensor["voltage_noise"].cutoff == pytest.approx(1000.0)
+    assert with_full_range(model_of(sensor.with_effect(VoltageNoise(cutoff=300.0)))) is None
