@@ -21,7 +21,7 @@ from dase.diagnosis.held_frames import (
     with_frame_as_memory,
     with_longer_dead_time,
 )
-from dase.diagnosis.seen_beside_model import look_beside_model, settle_dead_time
+from dase.diagnosis.seen_beside_model import look_beside_model, settle_dead_time, settle_jitter
 from dase.diagnosis.seen_effects import (
     SeenEffects,
     part_to_simulate,
@@ -132,6 +132,7 @@ def diagnose(
     if shown is not None:
         return replace(again(shown), seconds=time.perf_counter() - begin)
     seen, model = settle_dead_time(state, seen, measurement, model, judgement)
+    seen = settle_jitter(state, seen, measurement, model, judgement)
     found = conclude_diagnosis(state, start, model, before, seen, names, measurement)
     found = _with_what_pixels_show(found, state, compared, seen, model, strength)
     return measurement.noted(replace(found, seconds=time.perf_counter() - begin))

@@ -25,6 +25,9 @@ from dase.diagnosis.directional_test import find_hidden_effect
 from dase.diagnosis.effect_pairs import add_pair
 from dase.diagnosis.pruning import prune_model
 from dase.diagnosis.ranking import rank_of
+from dase.diagnosis.redrawn_thresholds import EFFECT as JITTER
+from dase.diagnosis.redrawn_thresholds import NAME as REDRAWN
+from dase.diagnosis.redrawn_thresholds import add_jitter, find_jitter_beside
 from dase.diagnosis.settings import DEFAULTS, DiagnosisSettings
 from dase.diagnosis.state import DiagnosisState, explains_remainder
 from dase.fitting.model import FittedModel, refit_model, with_full_range
@@ -51,22 +54,22 @@ def search_effects(
     """
     # what is not of this scene has no effects to be found
     most = 0 if state.evidence.contradiction else most
-    model, judgement = _add_one_by_one(state, start, most)
+    model, judgement = _add_one_by_one(state, compared, start, most)
     if most > 0 and not state.all_time and _shows_later_alone(state, model, judgement):
         model = _fit_all_of_the_time(state, compared, model, judgement)
-        model, judgement = _add_one_by_one(state, model, _left_to_add(state, model, most))
+        model, judgement = _add_one_by_one(state, compared, model, _left_to_add(state, model, most))
     if not reaches_floor(judgement) and most > 1:
         single = model
         model, judgement = add_pair(state, model, judgement)
         if model is not single and not leaves_nothing(judgement):
             # beside a right pair shows what no effect alone did
-            model, judgement = _add_one_by_one(state, model, _left_to_add(state, model, most))
+            model, judgement = _add_one_by_one(state, compared, model, _left_to_add(state, model, most))
     if len(state.added_to(model)) > 1:
         whole = model
         model, judgement = prune_model(state, model, judgement)
         if model is not whole and not leaves_nothing(judgement) and not state.has_asked(model):
             # a stand-in that was dropped may have hidden what it stood for
-            model, judgement = _add_one_by_one(state, model, _left_to_add(state, model, most))
+            model, judgement = _add_one_by_one(state, compared, model, _left_to_add(state, model, most))
     return _fit_beyond_the_search(state, model, judgement)
 
 
@@ -95,7 +98,9 @@ def _left_to_add(state: DiagnosisState, model: FittedModel, most: int) -> int:
     return max(most - len(state.added_to(model)), 0)
 
 
-def _add_one_by_one(state: DiagnosisState, model: FittedModel, most: int) -> tuple[FittedModel, Judgement]:
+def _add_one_by_one(
+    state: DiagnosisState, compared: ComparedMeasurement, model: FittedModel, most: int
+) -> tuple[FittedModel, Judgement]:
     """Add the best effect as long as one is missing; return the model and its held-out error."""
     errors, far = list[float](), False
     for _ in range(most + 1):
@@ -105,14 +110,44 @@ def _add_one_by_one(state: DiagnosisState, model: FittedModel, most: int) -> tup
         errors.append(judgement.error)
         more = len(errors) <= most
         step, better, far = _look_for_effect(state, model, judgement, more)
-        if better is None and more and (hidden := find_hidden_effect(state, model, judgement)) is not None:
-            step, better = _note_hidden_effect(state, *hidden, step, judgement), hidden[0].model
+        if better is None and more:
+            hidden = find_hidden_effect(state, model, judgement)
+            hidden = hidden or _find_jitter(state, compared, model, judgement)
+            if hidden is not None:
+                step, better = _note_hidden_effect(state, *hidden, step, judgement), hidden[0].model
         state.history.append(step)
         state.after_step(model if better is None else better, errors)
         if better is None:
             break
         model = better
     return model, judgement
+
+
+def _find_jitter(
+    state: DiagnosisState, compared: ComparedMeasurement, model: FittedModel, judgement: Judgement
+) -> tuple[Candidate, float] | None:
+    """Return the jitter that light shows from event to event, fitted and judged, and its p-value.
+
+    It is little of an error, and what is the error's is more than it where anything else is missing.
+
+    Args:
+        state: Gets that the jitter is certain, if it is found.
+        compared: The measurement.
+        model: The last one.
+        judgement: Its held-out error.
+    """
+    if JITTER not in effects_to_try(state.effects, model) or compared.seen.lamp:
+        return None
+    # where events come at fractions of frames, light between them says little of thresholds
+    if state.evidence.frame_step or not compared.seen.may_name(REDRAWN):
+        return None
+    state.progress("looking at thresholds", 0.0, state.error)
+    found = find_jitter_beside(compared.measurement, model, judgement, seed=state.seed)
+    better = None if found is None else add_jitter(state, model, judgement, found)
+    if found is None or better is None:
+        return None
+    state.certain |= {JITTER}
+    return better, found.p
 
 
 def _shows_later_alone(state: DiagnosisState, model: FittedModel, judgement: Judgement) -> bool:

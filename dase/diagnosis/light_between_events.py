@@ -30,6 +30,9 @@ class StepSettings:
     events: int = 2_000_000
     """Events that are looked at, at most."""
 
+    bins: int = 10
+    """Of light and of its speed, with as many events in each."""
+
 
 STEPS = StepSettings()
 
@@ -113,6 +116,32 @@ def light_steps(
     gap = np.diff(t)
     counts = (pixel[1:] == pixel[:-1]) & (gap > 0) & (np.minimum(level[1:], level[:-1]) > darkest)
     return LightSteps(pixel[1:], np.diff(level), gap, level[1:], speed[1:], p[1:], p[1:] == p[:-1], counts)
+
+
+def beyond_those_alike(
+    off: Array, level: Array, speed: Array, again: NDArray[np.bool_], settings: StepSettings = STEPS
+) -> Array:
+    """Return values less the mean of the events that are alike in light, its speed, and the event before.
+
+    Args:
+        off: Of each event, shape (N,).
+        level: Log intensity there, shape (N,).
+        speed: How fast it changes there [1/s], shape (N,).
+        again: Whether the event before had the same polarity, shape (N,).
+        settings: How finely light and its speed are told apart.
+    """
+    bins = settings.bins
+
+    def bin_of(values: Array) -> NDArray[np.int64]:
+        edges = np.quantile(values, np.arange(1, bins) / bins)
+        out: NDArray[np.int64] = np.searchsorted(edges, values)
+        return out
+
+    cell = (bin_of(level) * bins + bin_of(speed)) * 2 + again
+    count = np.bincount(cell, minlength=2 * bins * bins)
+    mean = np.bincount(cell, off, minlength=2 * bins * bins) / np.maximum(count, 1)
+    out: Array = off - mean[cell]
+    return out
 
 
 def _light_at(

@@ -15,6 +15,8 @@ from dase.diagnosis.dead_time import add_dead_time, find_dead_time
 from dase.diagnosis.drifting_memory import EFFECT as LEAKING
 from dase.diagnosis.drifting_memory import find_drifting_memory
 from dase.diagnosis.events_at_rest import LEAK, NOISE, find_events_at_rest, noise_is_a_pattern
+from dase.diagnosis.redrawn_thresholds import EFFECT as JITTER
+from dase.diagnosis.redrawn_thresholds import find_jitter_beside
 from dase.diagnosis.seen_effects import SeenEffects
 from dase.diagnosis.state import DiagnosisState, with_same_freedom
 from dase.diagnosis.unequal_thresholds import EFFECT as MISMATCH
@@ -77,6 +79,34 @@ def settle_dead_time(
         state.certain |= {REFRACTORY}
         model, _ = add_dead_time(state, model, judgement, ended)
     return seen, model
+
+
+def settle_jitter(
+    state: DiagnosisState,
+    seen: SeenEffects,
+    measurement: Measurement,
+    model: FittedModel,
+    judgement: Judgement,
+) -> SeenEffects:
+    """Return what is seen, with thresholds that are drawn anew at each event if the last model needs that.
+
+    Args:
+        state: Gets that the jitter is certain, or forgets it.
+        seen: What the events show beside other models.
+        measurement: The light between its events is looked at.
+        model: The last one; a jitter of its own is left out.
+        judgement: Its held-out error.
+    """
+    if JITTER in state.given or state.evidence.contradiction or seen.lamp or JITTER not in state.effects:
+        return seen
+    if state.evidence.frame_step:
+        return seen
+    found = find_jitter_beside(measurement, model, judgement, seed=state.seed)
+    if found is None or JITTER not in state.added_to(model):
+        state.certain -= {JITTER}
+        return seen
+    state.certain |= {JITTER}
+    return replace(seen, entries=(*seen.entries, found))
 
 
 def _look_where_light_rests(

@@ -16,6 +16,7 @@ from dase.diagnosis.dead_time import NAME as DEAD_TIME
 from dase.diagnosis.drifting_memory import NAME as DRIFT
 from dase.diagnosis.events_at_rest import LEAK, NOISE
 from dase.diagnosis.frames_at_rest import events_where_frames_rest
+from dase.diagnosis.redrawn_thresholds import NAME as REDRAWN
 from dase.diagnosis.unequal_thresholds import NAME as UNEQUAL
 from dase.effects import EFFECTS, Effect
 from dase.effects.threshold import Threshold
@@ -51,6 +52,7 @@ KINDS: dict[str, tuple[str, ...]] = {
     NOISE: ("shot", "voltage_noise"),
     UNEQUAL: ("mismatch",),
     DRIFT: ("leak",),
+    REDRAWN: ("jitter",),
 }
 """Signature to the effects that make it; nothing where the library has none that does."""
 
@@ -65,11 +67,12 @@ NAMED = (
     LEAK,
     UNEQUAL,
     DRIFT,
+    REDRAWN,
 )
 """Signatures that tell which effect it is; the others tell what there is, and not what makes it."""
 
 
-WITH_A_SCENE = (DEAD_TIME, LEAK, NOISE, UNEQUAL, DRIFT)
+WITH_A_SCENE = (DEAD_TIME, LEAK, NOISE, UNEQUAL, DRIFT, REDRAWN)
 """Signatures for which a model over the scene is asked."""
 
 MADE_BY_LIGHT = ("flicker",)
@@ -118,10 +121,14 @@ class SeenEffects:
         entry = self.entry_of("frame coupling")
         return burst_times_of(measurement, entry) if entry else None
 
+    def may_name(self, name: str) -> bool:
+        """Whether a signature tells which effect makes it: one of the user's own may make it as well."""
+        return name not in WITH_A_SCENE or not self.library - set(EFFECTS)
+
     def named_by(self, entry: Signature) -> tuple[str, ...]:
         """Return the effects of the library that a signature names; there may be none."""
-        if entry.name in WITH_A_SCENE and self.library - set(EFFECTS):
-            return ()  # one of the user's own may make it as well
+        if not self.may_name(entry.name):
+            return ()
         return tuple(name for name in _effects_of(entry) if name in self.library)
 
     def findings(self, graded: Collection[Finding], given: Collection[str]) -> list[Finding]:

@@ -19,7 +19,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from dase.diagnosis.light_between_events import busiest_rows, light_steps, times_that_are_compared
+from dase.diagnosis.light_between_events import (
+    beyond_those_alike,
+    busiest_rows,
+    light_steps,
+    times_that_are_compared,
+)
 from dase.effects.mismatch import Mismatch
 from dase.errors import InputError
 from dase.events import Events
@@ -64,9 +69,6 @@ class UnequalSettings:
 
     longest: float = 0.05
     """Time from one event to the next that counts, at most [s]: leaks differ from pixel to pixel, too."""
-
-    bins: int = 10
-    """Of light and of its speed, with as many events in each."""
 
     reach: float = 1.0
     """What one event may be off, relative to the threshold: noise comes however far light went."""
@@ -207,31 +209,13 @@ def patterns_of(
             return ()
         off = np.clip(moved / threshold - 1, -settings.reach, settings.reach)
         fast = sign * steps.speed[used]
-        off = _beyond_those_alike(off, steps.level[used], fast, steps.again[used], settings)
+        off = beyond_those_alike(off, steps.level[used], fast, steps.again[used])
         shape = rows[1] - rows[0], scene.width
         found = _pattern_of(steps.pixel[used], off, shape, settings)
         if found.pixels < settings.pixels:
             return ()
         out.append(found)
     return tuple(out)
-
-
-def _beyond_those_alike(
-    off: Array, level: Array, speed: Array, again: NDArray[np.bool_], settings: UnequalSettings
-) -> Array:
-    """Return values less the mean of the events that are alike in light, its speed, and the event before."""
-    bins = settings.bins
-
-    def bin_of(values: Array) -> NDArray[np.int64]:
-        edges = np.quantile(values, np.arange(1, bins) / bins)
-        out: NDArray[np.int64] = np.searchsorted(edges, values)
-        return out
-
-    cell = (bin_of(level) * bins + bin_of(speed)) * 2 + again
-    count = np.bincount(cell, minlength=2 * bins * bins)
-    mean = np.bincount(cell, off, minlength=2 * bins * bins) / np.maximum(count, 1)
-    out: Array = off - mean[cell]
-    return out
 
 
 def _pattern_of(

@@ -49,6 +49,8 @@ class SimulationStream(Enum):
     """Events of a model with equal thresholds."""
     DRIFTING_MEMORY = (2100, 0)
     """Events of a model without a leak."""
+    REDRAWN_THRESHOLDS = (2500, 0)
+    """Events of a model whose thresholds stay as they are."""
     SILENT_PIXELS = (2300, 1)
     """Events of a model at pixels that are silent; a turn is a repeat."""
     STIMULUS = (0, 1000)

@@ -1,6 +1,8 @@
 """How often a dead time, noise, a leak or a mismatch is told with the scene, and where none is there.
 
     python -m perf.experiments.seen_with_the_scene.run --key KEY --scenes 6
+    # the same of a jitter, which is asked of a model that has all else
+    python -m perf.experiments.seen_with_the_scene.run --key KEY --scenes 6 --jitter
 
 Each effect alone at its strong strength, a noisy base, and worlds slightly off; the model lacks what is
 hidden, and has the true thresholds. That is harsher than a diagnosis, which asks after its search, too.
@@ -18,6 +20,7 @@ import dase
 from dase.diagnosis.dead_time import find_dead_time
 from dase.diagnosis.drifting_memory import find_drifting_memory
 from dase.diagnosis.events_at_rest import find_events_at_rest
+from dase.diagnosis.redrawn_thresholds import find_redrawn_thresholds
 from dase.diagnosis.unequal_thresholds import find_unequal_thresholds
 from dase.effects import EFFECTS, Threshold
 from dase.fitting.frame_steps import frame_step_of
@@ -31,6 +34,10 @@ from perf.experiments.blind_diagnosis.scenes import draw_scene
 
 PERIODS = (2e-3, 5e-3, 15e-3)
 """Dead times [s]."""
+
+
+JITTERS = (0.0, 0.1, 0.2)
+"""Spreads of thresholds from event to event, relative; 0 for none."""
 
 
 def rows(key: int, scenes: int) -> Iterator[tuple[str, float, Measurement, Sensor]]:
@@ -72,12 +79,49 @@ def rows(key: int, scenes: int) -> Iterator[tuple[str, float, Measurement, Senso
             )
 
 
+def jitter_rows(key: int, scenes: int) -> Iterator[tuple[str, float, Measurement, Sensor]]:
+    """Yield what is there beside a jitter, its spread or 0, the measurement, and the model without one."""
+    for number in range(scenes):
+        rng = np.random.default_rng([key, number, 1])
+        scene = draw_scene(rng)
+        for name in (*HIDDEN, "a noisy sensor", "nothing"):
+            if name == "jitter":
+                continue
+            effects = (name,) if name in HIDDEN else ()
+            case = BlindCase("single", effects, "strong", number, noisy=name == "a noisy sensor")
+            model, _ = truth_of(case, key)
+            for spread in JITTERS:
+                true = model.with_effect(EFFECTS["jitter"](spread=spread)) if spread else model
+                events = dase.simulate(scene, true, seed=number)
+                yield name, spread, Measurement(events, scene), model
+
+
+def print_jitters(key: int, scenes: int) -> None:
+    """Print in how many recordings a jitter is told, and which."""
+    told: dict[tuple[str, float], list[float]] = {}
+    count: dict[str, int] = {}
+    for name, spread, measurement, model in jitter_rows(key, scenes):
+        count[name] = count.get(name, 0) + (spread == 0)
+        frames = frame_step_of(measurement.events, measurement.scene)
+        jitter = None if frames else find_redrawn_thresholds(measurement, model, right=True, seed=0)
+        if jitter is not None:
+            told.setdefault((name, spread), []).append(jitter.size)
+    print("| beside | " + " | ".join(f"{spread:.0%}" if spread else "no jitter" for spread in JITTERS) + " |")
+    print("|---" * (len(JITTERS) + 1) + "|")
+    for name, many in count.items():
+        print(f"| {name} | " + " | ".join(_sizes(told.get((name, s), []), many) for s in JITTERS) + " |")
+
+
 def main() -> None:
     """Print the table."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument("--key", required=True, help="draws scenes, thresholds and habits")
     parser.add_argument("--scenes", type=int, default=6)
+    parser.add_argument("--jitter", action="store_true", help="ask for a jitter alone")
     options = parser.parse_args()
+    if options.jitter:
+        print_jitters(number_of(options.key), options.scenes)
+        return
     found: dict[str, list[str]] = {}
     count: dict[str, int] = {}
     rests: dict[str, dict[str, int]] = {}

@@ -1,0 +1,361 @@
+"""Thresholds that are drawn anew at each event, by how far light goes from one event of a pixel to the next.
+
+That is the threshold, and what it differs by from event to event is a jitter if it is independent each time.
+Time stamps, latencies and noise that are off at an event make the step before it longer and the next one
+shorter, or the other way round; thresholds of a pixel's own make all of its steps longer; what a scene leaves
+is alike in steps that follow each other. So of steps d that follow each other the variance of what is drawn
+anew is <d_k²> + 2 <d_k d_k+1> - 3 <d_k d_k+2>: of errors of single events it is 0, and of what stays, too.
+
+What else is as irregular, such as noise that makes an event before light has gone far enough, is in the last
+model, whose own events over the same scene are asked the same.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import stats
+
+from dase.diagnosis.candidates import Candidate
+from dase.diagnosis.light_between_events import (
+    LightSteps,
+    beyond_those_alike,
+    busiest_rows,
+    light_steps,
+    times_that_are_compared,
+)
+from dase.diagnosis.state import DiagnosisState, with_same_freedom
+from dase.effects.jitter import Jitter
+from dase.errors import InputError
+from dase.fitting.frame_steps import is_held
+from dase.fitting.measurement import Measurement
+from dase.fitting.model import FittedModel, refit_model, with_fixed_effect
+from dase.formatting import format_percent
+from dase.probes.distance import Judgement, reaches_floor
+from dase.probes.random_streams import SimulationStream
+from dase.scenes.between_frames import CameraScene
+from dase.signatures.chance import NINETY
+from dase.signatures.result import Answer, Signature
+from dase.simulation.sensor import Sensor
+from dase.simulation.simulate import simulate
+
+Array = NDArray[np.float64]
+
+NAME = "redrawn thresholds"
+EFFECT = Jitter.name
+
+
+@dataclass(frozen=True)
+class RedrawnSettings:
+    """When thresholds are drawn anew."""
+
+    least: float = 0.05
+    """Spread from event to event, relative: steps of 8 bits look like 0.02, other worlds' frames 0.04."""
+
+    clear: float = 0.1
+    """The same beside a model that is not right: one without a lin-log response looked like 0.064."""
+
+    far: float = 2.5
+    """Error of the model up to which it is asked: without a low-pass, a dead time or noise steps are as
+    irregular as with a strong jitter."""
+
+    errors: float = 5.0
+    """Standard errors that it is above what the model shows, at least; half of them in either polarity."""
+
+    white: float = 0.6
+    """Share of all that steps differ by that is drawn anew, at least."""
+
+    model: float = 0.5
+    """Variance that a model without it may show, relative to what is seen."""
+
+    near: float = 0.85
+    """The same of a model that counts as right but for a jitter: of those the two agreed within two standard
+    errors where none was hidden."""
+
+    even: float = 0.6
+    """Reach of the shorter tail relative to that of the longer, at least: noise that sends events early makes
+    steps shorter only, a dead time longer only."""
+
+    worse: float = 0.1
+    """By how much the held-out error may rise with a jitter that is seen."""
+
+    runs: int = 300
+    """Runs of four events of a polarity, at least."""
+
+    blocks: int = 10
+    """Blocks of pixels that have such runs, at least: what is independent is they."""
+
+    longest: float = 0.05
+    """Time from one event to the next that counts, at most [s]: noise and leaks grow with time."""
+
+    reach: float = 3.0
+    """What a step may be off to count, in standard deviations of the middle two thirds: noise that makes an
+    event before light has gone far enough is rare, and far off."""
+
+    samples: float = 6.0
+    """Times from one sample of the scene to the next that a run lasts, at least: simulators differ in where
+    in between an event comes."""
+
+    bins: int = 6
+    """Of how long runs last, with as many runs in each: what time stamps and scans do to them is least where
+    they last long, what noise does where they are short."""
+
+    halves: float = 0.5
+    """What the shorter runs and the longer ones show each, relative to all, at least: what events are late by
+    is of no concern where light is slow."""
+
+    block: int = 8
+    """[px] Neighbours see the same edges: blocks are independent, events are not."""
+
+
+REDRAWN = RedrawnSettings()
+
+
+@dataclass(frozen=True, eq=False)
+class Runs:
+    """Runs of four events of one polarity, and so of three steps.
+
+    Args:
+        drawn: What was drawn anew, relative to the threshold squared; its mean is a variance, shape (N,).
+        whole: All that the steps differ by, squared, shape (N,).
+        lasts: Time from the first event to the last [s], shape (N,).
+        block: Where they are: neighbours see the same edges, so blocks are independent, shape (N,).
+        even: Reach of the shorter tail relative to that of the longer.
+    """
+
+    drawn: Array
+    whole: Array
+    lasts: Array
+    block: NDArray[np.int64]
+    even: float
+
+    def variances(self, edges: Array) -> tuple[Array, Array, Array]:
+        """Return the mean of `drawn`, its standard error and the mean of `whole` of runs that last alike.
+
+        Args:
+            edges: Between the bins of how long they last [s], shape (B,).
+
+        Returns:
+            Shape (B + 1,) each; NaN where a bin is empty.
+        """
+        at = np.searchsorted(edges, self.lasts)
+        out = np.full((3, len(edges) + 1), np.nan)
+        for n in np.unique(at):
+            used = at == n
+            mean = float(self.drawn[used].mean())
+            sums = np.bincount(self.block[used], self.drawn[used] - mean)
+            out[:, n] = mean, np.sqrt((sums**2).sum()) / used.sum(), self.whole[used].mean()
+        return out[0], out[1], out[2]
+
+
+@dataclass(frozen=True)
+class Excess:
+    """By how much the runs of a measurement are more irregular than those of a model, in one polarity.
+
+    Args:
+        drawn: Variance of what is drawn anew in the measurement, relative to the threshold squared.
+        model: The same in the model.
+        error: Standard error of their difference.
+        whole: Variance of all that steps differ by in the measurement.
+        least: The lesser of what the model lacks in the shorter runs and in the longer ones.
+    """
+
+    drawn: float
+    model: float
+    error: float
+    whole: float
+    least: float
+
+    @classmethod
+    def of(cls, seen: Runs, made: Runs, bins: int) -> Excess | None:
+        """Return the mean over runs that last alike, where it is known best; None where too few compare."""
+        edges = np.quantile(seen.lasts, np.arange(1, bins) / bins)
+        (drawn, error, whole), (model, model_error, _) = (one.variances(edges) for one in (seen, made))
+        errors = np.hypot(error, model_error)
+        known = np.isfinite(errors) & (errors > 0)
+        if not known.all():
+            return None
+        weight = 1 / errors**2
+
+        def mean(values: Array, part: slice = slice(None)) -> float:
+            return float((weight[part] * values[part]).sum() / weight[part].sum())
+
+        lacks, half = drawn - np.maximum(model, 0.0), bins // 2
+        least = min(mean(lacks, slice(half)), mean(lacks, slice(half, None)))
+        return cls(mean(drawn), mean(model), float(1 / math.sqrt(weight.sum())), mean(whole), least)
+
+    @property
+    def variance(self) -> float:
+        """What the model lacks."""
+        return self.drawn - max(self.model, 0.0)
+
+    def is_jitter(self, settings: RedrawnSettings, *, least: float, most: float) -> bool:
+        """Whether it is large, sure, most of what there is, and not of the model.
+
+        Args:
+            settings: How sure.
+            least: Spread, relative to the threshold.
+            most: Variance that the model may show, relative to what is seen.
+        """
+        return (
+            self.variance >= max(least**2, 0.5 * settings.errors * self.error)
+            and self.model <= most * self.drawn
+            and self.drawn >= settings.white * self.whole
+            and self.least >= settings.halves * self.variance
+        )
+
+
+def find_jitter_beside(
+    measurement: Measurement, model: FittedModel, judgement: Judgement, *, seed: int
+) -> Signature | None:
+    """Return the jitter that a model lacks, however little of its error that is; None where it is far off.
+
+    Args:
+        measurement: Its scene is simulated.
+        model: A jitter of its own is left out.
+        judgement: Its held-out error.
+        seed: Of every random number.
+    """
+    right = reaches_floor(judgement)
+    if not right and judgement.error > REDRAWN.far:
+        return None
+    return find_redrawn_thresholds(measurement, model.sensor, right=right, seed=seed)
+
+
+def find_redrawn_thresholds(
+    measurement: Measurement,
+    sensor: Sensor,
+    *,
+    right: bool = False,
+    seed: int,
+    settings: RedrawnSettings = REDRAWN,
+) -> Signature | None:
+    """Return by how much thresholds differ from event to event; None where a model lacks no such jitter.
+
+    Args:
+        measurement: Its scene is simulated. Nothing is said where light is known in part only.
+        sensor: The model, taken without a jitter.
+        right: Whether the model counts as right, but for a jitter.
+        seed: Of every random number.
+        settings: When they differ.
+    """
+    scene, events = measurement.scene, measurement.compared_events()
+    if isinstance(scene, CameraScene) or measurement.trust is not None or is_held(scene):
+        return None
+    times = times_that_are_compared(measurement)
+    if len(times) < 2 or not len(events):
+        return None
+    rows = busiest_rows(events, len(times))
+    eps, width = sensor.log_eps, scene.width
+    shortest = settings.samples * float(np.median(np.diff(times)))
+    steps = light_steps(events, scene, times, rows=rows, log_eps=eps)
+    seen = runs_of(steps, width, shortest=shortest, settings=settings)
+    if not seen or (not right and any(one.even < settings.even for one in seen.values())):
+        return None
+    pixels = np.arange(rows[0] * width, rows[1] * width, dtype=np.int64)
+    without = sensor.without(EFFECT) if EFFECT in sensor else sensor
+    try:
+        made = simulate(scene, without, seed=SimulationStream.REDRAWN_THRESHOLDS.seed(seed), pixels=pixels)
+    except InputError:
+        return None
+    made = replace(measurement, events=made).compared_events()
+    steps = light_steps(made, scene, times, rows=rows, log_eps=eps)
+    modelled = runs_of(steps, width, shortest=shortest, settings=settings)
+    excess = [
+        Excess.of(one, modelled[sign], settings.bins) if sign in modelled else None
+        for sign, one in seen.items()
+    ]
+    least, most = (settings.least, settings.near) if right else (settings.clear, settings.model)
+    told = [one for one in excess if one is not None and one.is_jitter(settings, least=least, most=most)]
+    if len(told) < len(excess):
+        return None
+    weight = np.array([1 / one.error**2 for one in told])
+    mean = float(weight @ [one.variance for one in told] / weight.sum())
+    error = float(1 / math.sqrt(weight.sum()))
+    if mean < settings.errors * error:
+        return None
+    spread, low, high = (math.sqrt(max(mean + k * NINETY * error, 0.0)) for k in (0, -1, 1))
+    sentence = (
+        f"thresholds are drawn anew at each event, with a spread of {format_percent(spread)}: light goes as "
+        f"much farther or less far from one event to the next, independently each time"
+    )
+    return Signature(
+        name=NAME, answer=Answer.FOUND, p=float(stats.norm.sf(mean / error)), size=spread, low=low, high=high,
+        unit="spread of thresholds over events, relative", least=least, sentence=sentence,
+        details={"runs": min(len(one.drawn) for one in seen.values())},
+    )  # fmt: skip
+
+
+def runs_of(
+    steps: LightSteps, width: int, *, shortest: float, settings: RedrawnSettings = REDRAWN
+) -> dict[int, Runs]:
+    """Return the runs of ON (1) and of OFF events (-1); none of a polarity that has too few.
+
+    Args:
+        steps: From event to event.
+        width: Columns of the sensor.
+        shortest: Time that a run lasts, at least [s].
+        settings: What counts.
+    """
+    rows, columns = np.divmod(steps.pixel, width)
+    block = rows // settings.block * (width // settings.block + 1) + columns // settings.block
+    counts = steps.counts & (steps.gap < settings.longest)
+    out = {}
+    for sign in (1, -1):
+        of_sign = counts & (steps.on == (sign > 0))
+        used = of_sign & steps.again
+        moved = sign * steps.change[of_sign]
+        threshold = float(np.median(moved)) if len(moved) else 0.0
+        if threshold <= 0 or not used.any():
+            continue
+        off = np.zeros(len(steps.pixel))
+        near = np.clip(moved / threshold - 1, -1.0, 1.0)
+        off[of_sign] = beyond_those_alike(
+            near, steps.level[of_sign], sign * steps.speed[of_sign], steps.again[of_sign]
+        )
+        low, middle, high = np.quantile(off[used], [0.16, 0.5, 0.84])
+        used &= np.abs(off - middle) <= settings.reach * 0.5 * (high - low)
+        first = np.flatnonzero(used[:-2] & used[1:-1] & used[2:] & (steps.pixel[:-2] == steps.pixel[2:]))
+        first = first[steps.gap[first] + steps.gap[first + 1] + steps.gap[first + 2] >= shortest]
+        if len(first) < settings.runs or len(np.unique(block[first])) < settings.blocks:
+            continue
+        a, b, c = (off[first + n] - middle for n in range(3))
+        whole = (a * a + b * b + c * c) / 3
+        tails = sorted([float(middle - low), float(high - middle)])
+        out[sign] = Runs(
+            drawn=whole + (a * b + b * c) - 3 * a * c,
+            whole=whole,
+            lasts=steps.gap[first] + steps.gap[first + 1] + steps.gap[first + 2],
+            block=block[first],
+            even=tails[0] / tails[1] if tails[1] > 0 else 0.0,
+        )
+    return out
+
+
+def add_jitter(
+    state: DiagnosisState,
+    model: FittedModel,
+    judgement: Judgement,
+    found: Signature,
+    settings: RedrawnSettings = REDRAWN,
+) -> Candidate | None:
+    """Return a model with the jitter that was seen, fitted and judged; None where it is worse with it.
+
+    Args:
+        state: What the diagnosis works on.
+        model: Without a jitter.
+        judgement: Its held-out error.
+        found: By how much thresholds differ from event to event.
+        settings: By how much the error may rise.
+    """
+    sensor = with_fixed_effect(model, Jitter(spread=min(found.size, 1.0))).sensor
+    fitted = refit_model(
+        state.evidence, with_same_freedom(sensor, model, (EFFECT,)), seed=state.seed, rounds=1
+    )
+    judged = state.judge(fitted)
+    if judged.error > judgement.error + settings.worse:
+        return None
+    return Candidate(EFFECT, fitted, fitted.loss, judgement=judged)

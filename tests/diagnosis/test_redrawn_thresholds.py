@@ -1,0 +1,150 @@
+"""Thresholds that are drawn anew at each event are told by how far light goes from event to event."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from helpers.frame_simulator import counted_between_frames, shaken_texture
+
+import dase
+from dase.diagnosis.light_between_events import LightSteps
+from dase.diagnosis.redrawn_thresholds import NAME, REDRAWN, find_redrawn_thresholds, runs_of
+from dase.diagnosis.seen_effects import SeenEffects
+from dase.effects import EFFECTS
+from dase.events import Events
+from dase.fitting.measurement import Measurement
+from dase.results import Finding, Grade
+from dase.signatures.result import Answer, Signature
+from dase.simulation.sensor import Sensor
+
+
+def found(scene, events, sensor=None, **more):
+    return find_redrawn_thresholds(Measurement(events, scene), sensor or Sensor(), seed=0, **more)
+
+
+def sensor_with(**effects):
+    """Return a sensor with effects, each a dict of its values."""
+    sensor = Sensor()
+    for name, values in effects.items():
+        sensor = sensor.with_effect(EFFECTS[name](**values))
+    return sensor
+
+
+@pytest.fixture(scope="module")
+def scene():
+    return shaken_texture(gap=1e-3)
+
+
+@pytest.mark.parametrize("spread", [0.1, 0.2, 0.35])
+def test_the_spread_is_that_from_event_to_event(scene, spread):
+    entry = found(scene, dase.simulate(scene, sensor_with(jitter={"spread": spread}), seed=1), right=True)
+    assert entry.found
+    assert entry.name == NAME
+    assert entry.size == pytest.approx(spread, rel=0.2)
+    assert entry.low < entry.size < entry.high
+
+
+@pytest.mark.parametrize(
+    "beside",
+    [
+        {"mismatch": {"spread": 0.2}},
+        {"shot": {"rate": 5.0}},
+        {"refractory": {"period": 2e-3}},
+        {"row_scan": {"line": 1e-5}},
+        {"bandwidth": {"cutoff": 300.0}},
+    ],
+    ids=lambda beside: next(iter(beside)),
+)
+def test_what_the_model_has_hides_it_not_and_is_not_taken_for_it(scene, beside):
+    model = sensor_with(**beside)
+    assert found(scene, dase.simulate(scene, model, seed=1), model, right=True) is None
+    entry = found(
+        scene, dase.simulate(scene, sensor_with(**beside, jitter={"spread": 0.25}), seed=1), model, right=True
+    )
+    assert entry is not None
+    assert entry.size == pytest.approx(0.25, rel=0.35)
+
+
+@pytest.mark.parametrize(
+    ("name", "values"),
+    [
+        ("dark", {"current": 0.05, "spread": 0.5}),
+        ("dead", {"share": 0.03}),
+        ("hot", {"share": 0.02, "rate": 200.0}),
+        ("leak", {"rate": 4.0}),
+        ("linlog", {"knee": 0.16, "slope": 2.5}),
+        ("mismatch", {"spread": 0.3}),
+        ("shot", {"rate": 5.0}),
+        ("timestamp", {"step": 1e-3}),
+    ],
+)
+def test_what_draws_no_thresholds_is_not_taken_for_it(scene, name, values):
+    """Though the model lacks it; noise of the voltage, a low-pass or a dead time would look like it."""
+    assert found(scene, dase.simulate(scene, sensor_with(**{name: values}), seed=1)) is None
+
+
+@pytest.mark.parametrize("spread", [0.0, 0.12])
+def test_another_simulator_without_it_does_not_show_it(scene, spread):
+    assert found(scene, counted_between_frames(scene, spread)) is None
+
+
+def steps_of(change: np.ndarray) -> LightSteps:
+    """Return steps of pixels that send ON events alone, shape (pixels, steps), evenly in time."""
+    pixel = np.arange(len(change)).repeat(change.shape[1])
+    many = len(pixel)
+    true = np.ones(many, bool)
+    rng = np.random.default_rng(0)
+    level, speed = rng.normal(size=many), rng.normal(1, 0.1, many)
+    return LightSteps(pixel, change.reshape(-1), np.full(many, 0.01), level, speed, true, true, true)
+
+
+def test_errors_of_single_events_and_thresholds_of_pixels_cancel():
+    rng = np.random.default_rng(1)
+    pixels, many = 4000, 12
+    late = rng.normal(0, 0.15, (pixels, many + 1))
+    own = rng.normal(0, 0.15, (pixels, 1))
+    anew = rng.normal(0, 0.1, (pixels, many))
+
+    def drawn(change):
+        runs = runs_of(steps_of(0.2 * (1 + change)), 64, shortest=0.0, settings=replace(REDRAWN, reach=10.0))[
+            1
+        ]
+        return runs.drawn.mean(), runs.whole.mean()
+
+    for other in (np.diff(late), own + np.zeros((1, many)), np.diff(late) + own):
+        alone, whole = drawn(other)
+        assert abs(alone) < 0.05 * whole
+        both, _ = drawn(other + anew)
+        assert both == pytest.approx(0.01, rel=0.15)
+
+
+def test_few_events_tell_nothing(scene):
+    events = dase.simulate(scene, sensor_with(jitter={"spread": 0.3}), seed=1)
+    assert found(scene, events.select((events.x < 8) & (events.y < 8))) is None
+    assert found(scene, Events.empty(scene.width, scene.height)) is None
+
+
+def test_one_of_the_users_own_may_make_it():
+    own = Signature(name=NAME, answer=Answer.FOUND, sentence="own")
+    (said,) = SeenEffects((own,)).findings([], ())
+    assert (said.effect, said.grade, said.seen) == ("jitter", Grade.CERTAIN, "own")
+    seen = SeenEffects((own,), library=frozenset(EFFECTS) | {"popping"})
+    assert not seen.may_name(NAME)
+    mine = Finding("popping", Grade.SUPPORTED)
+    assert seen.findings([mine], ()) == [mine]
+
+
+@pytest.mark.slow
+def test_a_diagnosis_names_it_where_the_error_hardly_shows_it(scene):
+    """Beside noise its part of the error is below what chance leaves, or tells of something unknown."""
+    true = sensor_with(shot={"rate": 5.0}, jitter={"spread": 0.1})
+    events = dase.simulate(scene, true, seed=3)
+    library = {name: EFFECTS[name] for name in ("threshold", "shot", "jitter", "mismatch")}
+    noisy = sensor_with(shot={"rate": 4.0})
+    diagnosis = dase.diagnose(events, noisy, scene=scene, effects=library, pixels=400, seed=0)
+    said = {one.effect: one for one in diagnosis.findings}
+    assert said["jitter"].grade is Grade.CERTAIN
+    assert "mismatch" not in said
+    assert diagnosis.sensor["jitter"].spread == pytest.approx(0.1, rel=0.25)
