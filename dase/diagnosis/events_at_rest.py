@@ -82,6 +82,12 @@ class RestSettings:
     spread: float = 0.5
     """Pixels that send, as a share of as many as have events if all send alike: hot pixels are few."""
 
+    hot: float = 10.0
+    """Times as many events as others by which a pixel is a hot one, beyond ..."""
+
+    hot_count: int = 5
+    """... so many, which chance may make."""
+
     together: float = 1.5
     """How much more events come together in time than independent ones: a lamp's come at once."""
 
@@ -314,6 +320,8 @@ def judge_events_at_rest(
         settings: What noise is.
     """
     t, p, at, later = rests.events_in(events)
+    alike = ~_sent_by_hot_pixels(at, rests, settings)
+    t, p, at, later = t[alike], p[alike], at[alike], later[alike]
     count, many = int(later.sum()), len(t)
     on = int(p[later].sum())
     if count < settings.events // 2 or count < settings.more * (model + 1) or count < settings.goes_on * many:
@@ -372,6 +380,26 @@ def _which_noise(
     if abs(opposite - 2 * on * (1 - on)) <= settings.by_chance:
         return "shot", words
     return "", ""
+
+
+def _sent_by_hot_pixels(at: NDArray[np.int64], rests: Rests, settings: RestSettings) -> NDArray[np.bool_]:
+    """Return which events are of pixels that send far more than others, by the length of their rests.
+
+    Their events are of both polarities, and a few of them hide that all others' are of one.
+
+    Args:
+        at: Which pixel sent each event, shape (N,).
+        rests: Of the pixels.
+        settings: How much more that is.
+    """
+    sent = np.bincount(at, minlength=len(rests.pixels))
+    length = rests.end - rests.begin
+    hot = np.zeros(len(sent), bool)
+    for _ in range(2):  # a few hot pixels may send most of what is counted first
+        usual = sent[~hot].sum() / length[~hot].sum()
+        hot = sent > settings.hot_count + settings.hot * usual * length
+    out: NDArray[np.bool_] = hot[at]
+    return out
 
 
 def _sent_by_all(at: NDArray[np.int64], rests: Rests, settings: RestSettings) -> bool:

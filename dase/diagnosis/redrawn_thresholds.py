@@ -66,7 +66,8 @@ class RedrawnSettings:
     """Standard errors that it is above what the model shows, at least; half of them in either polarity."""
 
     white: float = 0.6
-    """Share of all that steps differ by that is drawn anew, at least."""
+    """Share of all that steps differ by that is drawn anew, at least, beside a model that is not right:
+    beside one that is, pixels may differ by more than events."""
 
     model: float = 0.5
     """Variance that a model without it may show, relative to what is seen."""
@@ -192,18 +193,18 @@ class Excess:
         """What the model lacks."""
         return self.drawn - max(self.model, 0.0)
 
-    def is_jitter(self, settings: RedrawnSettings, *, least: float, most: float) -> bool:
+    def is_jitter(self, settings: RedrawnSettings, *, right: bool) -> bool:
         """Whether it is large, sure, most of what there is, and not of the model.
 
         Args:
-            settings: How sure.
-            least: Spread, relative to the threshold.
-            most: Variance that the model may show, relative to what is seen.
+            settings: How large and how sure.
+            right: Whether the model counts as right, but for a jitter.
         """
+        least, most = (settings.least, settings.near) if right else (settings.clear, settings.model)
         return (
             self.variance >= max(least**2, 0.5 * settings.errors * self.error)
             and self.model <= most * self.drawn
-            and self.drawn >= settings.white * self.whole
+            and (right or self.drawn >= settings.white * self.whole)
             and self.least >= settings.halves * self.variance
         )
 
@@ -268,8 +269,7 @@ def find_redrawn_thresholds(
         Excess.of(one, modelled[sign], settings.bins) if sign in modelled else None
         for sign, one in seen.items()
     ]
-    least, most = (settings.least, settings.near) if right else (settings.clear, settings.model)
-    told = [one for one in excess if one is not None and one.is_jitter(settings, least=least, most=most)]
+    told = [one for one in excess if one is not None and one.is_jitter(settings, right=right)]
     if len(told) < len(excess):
         return None
     weight = np.array([1 / one.error**2 for one in told])
@@ -284,7 +284,8 @@ def find_redrawn_thresholds(
     )
     return Signature(
         name=NAME, answer=Answer.FOUND, p=float(stats.norm.sf(mean / error)), size=spread, low=low, high=high,
-        unit="spread of thresholds over events, relative", least=least, sentence=sentence,
+        unit="spread of thresholds over events, relative", sentence=sentence,
+        least=settings.least if right else settings.clear,
         details={"runs": min(len(one.drawn) for one in seen.values())},
     )  # fmt: skip
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -52,7 +53,7 @@ def scene():
 
 
 def found(scene, events, sensor=None, **more):
-    given = {"thresholds": (0.2, 0.2), "seed": 0} | more
+    given = {"thresholds": (0.2, 0.2), "seed": 0, "settings": replace(AT_REST, **more)}
     return find_events_at_rest(Measurement(events, scene), sensor or Sensor(), **given)
 
 
@@ -86,6 +87,15 @@ def test_a_leak_sends_on_events_alone(scene):
     entry = found(scene, seen_by(scene, leak=dict(rate=1.0)))
     assert entry.name == LEAK
     assert entry.details["off"] == 0
+
+
+def test_hot_pixels_hide_no_leak(scene):
+    """Their OFF events would be too many for one."""
+    hot = dict(share=0.01, rate=100.0)
+    entry = found(scene, seen_by(scene, leak=dict(rate=1.0), hot=hot))
+    assert entry.name == LEAK
+    both = found(scene, seen_by(scene, leak=dict(rate=1.0), hot=hot), hot_count=AT_REST.events * 1000)
+    assert both.name == NOISE
 
 
 @pytest.mark.parametrize(
