@@ -19,6 +19,7 @@ from dase.fitting.early_stopping import CandidateRace
 from dase.fitting.model import (
     FittedModel,
     calibration_while_fitting,
+    places_between,
     refit_work,
     shift_periodic_effects,
     starting_places,
@@ -175,6 +176,12 @@ def screen_effect(
     places, losses = yield from ranking_work(
         half, model.space, starting_places(model, effect, few=few), seed=seed, most=most
     )
+    between = places_between(model, effect, places[0])
+    if len(between) and not few:
+        more, their_losses = yield from ranking_work(half, model.space, between, seed=seed, most=most)
+        places, losses = np.concatenate([places, more]), np.concatenate([losses, their_losses])
+        order = np.argsort(losses, kind="stable")
+        places, losses = places[order], losses[order]
     return Screening(effect, model, half, before[0], places, losses, most)
 
 

@@ -142,7 +142,7 @@ def _find_jitter(
     if state.evidence.frame_step or not compared.seen.may_name(REDRAWN):
         return None
     state.progress("looking at thresholds", 0.0, state.error)
-    found = find_jitter_beside(compared.measurement, model, judgement, seed=state.seed)
+    found = find_jitter_beside(state, compared.measurement, model, judgement)
     better = None if found is None else add_jitter(state, model, judgement, found)
     if found is None or better is None:
         return None

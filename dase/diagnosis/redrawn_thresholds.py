@@ -104,9 +104,12 @@ class RedrawnSettings:
     """Of how long runs last, with as many runs in each: what time stamps and scans do to them is least where
     they last long, what noise does where they are short."""
 
-    halves: float = 0.5
-    """What the shorter runs and the longer ones show each, relative to all, at least: what events are late by
-    is of no concern where light is slow."""
+    shorter: float = 0.5
+    """What the shorter half of the runs shows, relative to all, at least."""
+
+    longer: float = 0.75
+    """The same of the longer half, and a standard error of it: where light is slow it is of no concern what
+    events are late by. A world whose events come at other places within a step showed 0.61."""
 
     block: int = 8
     """[px] Neighbours see the same edges: blocks are independent, events are not."""
@@ -161,14 +164,16 @@ class Excess:
         model: The same in the model.
         error: Standard error of their difference.
         whole: Variance of all that steps differ by in the measurement.
-        least: The lesser of what the model lacks in the shorter runs and in the longer ones.
+        shorter: What the model lacks in the shorter half of the runs.
+        longer: The same in the longer half, and a standard error more.
     """
 
     drawn: float
     model: float
     error: float
     whole: float
-    least: float
+    shorter: float
+    longer: float
 
     @classmethod
     def of(cls, seen: Runs, made: Runs, bins: int) -> Excess | None:
@@ -185,8 +190,11 @@ class Excess:
             return float((weight[part] * values[part]).sum() / weight[part].sum())
 
         lacks, half = drawn - np.maximum(model, 0.0), bins // 2
-        least = min(mean(lacks, slice(half)), mean(lacks, slice(half, None)))
-        return cls(mean(drawn), mean(model), float(1 / math.sqrt(weight.sum())), mean(whole), least)
+        error_of_longer = float(1 / math.sqrt(weight[half:].sum()))
+        return cls(
+            mean(drawn), mean(model), float(1 / math.sqrt(weight.sum())), mean(whole),
+            mean(lacks, slice(half)), mean(lacks, slice(half, None)) + error_of_longer,
+        )  # fmt: skip
 
     @property
     def variance(self) -> float:
@@ -205,25 +213,26 @@ class Excess:
             self.variance >= max(least**2, 0.5 * settings.errors * self.error)
             and self.model <= most * self.drawn
             and (right or self.drawn >= settings.white * self.whole)
-            and self.least >= settings.halves * self.variance
+            and self.shorter >= settings.shorter * self.variance
+            and self.longer >= settings.longer * self.variance
         )
 
 
 def find_jitter_beside(
-    measurement: Measurement, model: FittedModel, judgement: Judgement, *, seed: int
+    state: DiagnosisState, measurement: Measurement, model: FittedModel, judgement: Judgement
 ) -> Signature | None:
     """Return the jitter that a model lacks, however little of its error that is; None where it is far off.
 
     Args:
+        state: Whether noise was seen, which a model that is not right may lack, and the seed.
         measurement: Its scene is simulated.
         model: A jitter of its own is left out.
         judgement: Its held-out error.
-        seed: Of every random number.
     """
     right = reaches_floor(judgement)
-    if not right and judgement.error > REDRAWN.far:
+    if not right and (state.noisy or judgement.error > REDRAWN.far):
         return None
-    return find_redrawn_thresholds(measurement, model.sensor, right=right, seed=seed)
+    return find_redrawn_thresholds(measurement, model.sensor, right=right, seed=state.seed)
 
 
 def find_redrawn_thresholds(

@@ -101,7 +101,7 @@ def settle_jitter(
         return seen
     if state.evidence.frame_step:
         return seen
-    found = find_jitter_beside(measurement, model, judgement, seed=state.seed)
+    found = find_jitter_beside(state, measurement, model, judgement)
     if found is None or JITTER not in state.added_to(model):
         state.certain -= {JITTER}
         return seen
@@ -120,6 +120,7 @@ def _look_where_light_rests(
     found = find_events_at_rest(
         measurement, model.sensor, thresholds=(threshold.on, threshold.off), seed=state.seed
     )
+    state.noisy = found is not None and found.name == NOISE
     return seen if found is None else replace(seen, entries=(*seen.entries, found))
 
 

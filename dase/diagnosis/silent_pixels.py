@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from scipy import stats
 
 from dase.effects.dead import Dead
+from dase.effects.stream import StreamEffect
 from dase.fitting.data_split import common_grid, times_of_grid
 from dase.fitting.measurement import Measurement
 from dase.fitting.time_window import is_constant, within_span
@@ -186,6 +187,8 @@ def without_the_explained_silence(
     if not len(silent.pixels):
         return silent
     alive = sensor.without(NAME) if NAME in sensor else sensor
+    # a bus needs the events of all pixels, and leaves of these what tells of them
+    alive = replace(alive, effects=tuple(e for e in alive.effects if not isinstance(e, StreamEffect)))
     size = measurement.events.width * measurement.events.height
     least = np.full(len(silent.pixels), np.inf)
     for turn in range(silent.settings.repeats):

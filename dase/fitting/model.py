@@ -56,6 +56,9 @@ class StartSettings:
     shifts: tuple[float, ...] = (-0.7, -0.4, -0.15, 0.0, 0.35)
     """Of the logarithm of the thresholds, when an effect is tried: most effects make events more or fewer."""
 
+    between: float = 0.125
+    """Of the same, beside the best of all that were tried: half of the way from one of them to the next."""
+
     strengths: int = 6
     """Places along a parameter that switches its effect off."""
 
@@ -431,6 +434,38 @@ def starting_places(model: FittedModel, effect: Effect, *, few: bool = False) ->
             place[columns] = combination
             place[thresholds] += shift
             out.append(place)
+    return np.array(out)
+
+
+def places_between(model: FittedModel, effect: Effect, place: Array) -> Array:
+    """Return places between that from which an effect is best tried and those beside it.
+
+    An effect that changes thresholds as well as something else, as a dark current does, fits along a narrow
+    valley, which the steps of thresholds and those of its strength may miss.
+
+    Args:
+        model: With the effect.
+        effect: What is tried.
+        place: The best of those that `starting_places` returns, shape (P,).
+
+    Returns:
+        M places, shape (M, P); none where its strength is not searched along its range.
+    """
+    axes = model.space.axes
+    strengths = [
+        n for n, axis in enumerate(axes)
+        if axis.effect is type(effect) and axis.main and axis.fact.search_starts == "spread"
+    ]  # fmt: skip
+    if len(strengths) != 1:
+        return np.empty((0, len(axes)))
+    low, high = (float(axes[strengths[0]].to_place(v)) for v in axes[strengths[0]].fact.plausible)
+    half = 0.5 * (1 - 2 * STARTS.margin) * (high - low) / (STARTS.strengths - 1)
+    thresholds = [n for n, axis in enumerate(axes) if axis.is_threshold]
+    out = []
+    for along, shift in product((-half, 0.0, half), (-STARTS.between, STARTS.between)):
+        out.append(place.copy())
+        out[-1][strengths] += along
+        out[-1][thresholds] += shift
     return np.array(out)
 
 

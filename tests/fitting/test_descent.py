@@ -18,6 +18,7 @@ from dase.fitting.data_split import split_measurement
 from dase.fitting.fit import with_phase_given
 from dase.fitting.model import (
     model_of,
+    places_between,
     refit_model,
     refit_work,
     shift_periodic_effects,
@@ -74,6 +75,29 @@ def test_thresholds_are_tried_on_both_sides_of_the_present_ones():
     tried = starting_places(model, EFFECTS["linlog"]())[:, n] - model.place[n]
     assert tried.min() < -0.5
     assert tried.max() > 0.3
+
+
+def test_the_best_start_has_places_half_way_to_its_neighbours():
+    """A dark current makes thresholds lower: between the steps of both its narrow valley would be missed."""
+    effect = EFFECTS["dark"]()
+    model = with_effect_added(model_of(Sensor()), effect)
+    names = [axis.name for axis in model.space.axes]
+    current, on, off = (names.index(n) for n in ("dark.current", "threshold.on", "threshold.off"))
+    starts = starting_places(model, effect)
+    place = starts[len(starts) // 2]
+    between = places_between(model, effect, place)
+    steps = np.diff(np.unique(starts[:, current].round(9)))
+    away = between - place
+    assert {abs(x) for x in away[:, current].round(6)} == {0.0, round(float(steps[0]) / 2, 6)}
+    assert np.all(away[:, on] == away[:, off])
+    assert {*np.sign(away[:, on])} == {-1, 1}
+    shifts = np.diff(np.unique(starts[:, on].round(9)))
+    assert np.all(np.abs(away[:, on]) < shifts.max())
+    still = np.delete(away, [current, on, off], axis=1)
+    assert not still.any()
+    # the phase of a lamp goes round, and a bus is seen: neither has a strength along a range
+    lit = with_effect_added(model_of(Sensor()), EFFECTS["readout"]())
+    assert not len(places_between(lit, EFFECTS["readout"](), lit.place))
 
 
 def test_a_phase_that_looks_no_better_at_the_same_place_is_found(device, monkeypatch):
