@@ -40,6 +40,8 @@ from dase.simulation.sensor import Sensor
 FEW = ("bandwidth", "mismatch", "leak", "shot")
 LIBRARY = {name: effect for name, effect in EFFECTS.items() if name in (*FEW, "threshold")}
 PIXELS = 900
+FEWER = 450
+"""Where an effect is far above chance, and how exactly it is measured is not asked."""
 
 
 @wp.func
@@ -75,17 +77,17 @@ def hidden(scene, device, *effects: Effect, seed: int = 3) -> dase.Events:
 
 
 @pytest.mark.parametrize(
-    "effect",
+    ("effect", "pixels"),
     [
-        EFFECTS["leak"](rate=4.0),
-        pytest.param(EFFECTS["mismatch"](spread=0.25), marks=pytest.mark.slow),
-        pytest.param(EFFECTS["bandwidth"](cutoff=60.0), marks=pytest.mark.slow),
+        pytest.param(EFFECTS["leak"](rate=4.0), FEWER, id="leak"),
+        # thresholds are fitted less well beside it
+        pytest.param(EFFECTS["mismatch"](spread=0.25), PIXELS, id="mismatch", marks=pytest.mark.slow),
+        pytest.param(EFFECTS["bandwidth"](cutoff=60.0), FEWER, id="bandwidth", marks=pytest.mark.slow),
     ],
-    ids=lambda e: e.name,
 )
-def test_a_hidden_effect_is_named(scene, device, effect):
+def test_a_hidden_effect_is_named(scene, device, effect, pixels):
     events = hidden(scene, device, effect)
-    found = diagnose(events, scene=scene, effects=LIBRARY, pixels=PIXELS, device=device)
+    found = diagnose(events, scene=scene, effects=LIBRARY, pixels=pixels, device=device)
     assert found.selected == (effect.name,)
     assert found.unexplained is None
     assert found.errors[1] - 1 < 0.1 * (found.errors[0] - 1)
@@ -107,7 +109,7 @@ def test_nothing_is_invented(scene, device):
 @pytest.mark.slow
 def test_two_hidden_effects_are_both_found(scene, device):
     events = hidden(scene, device, EFFECTS["mismatch"](spread=0.25), EFFECTS["leak"](rate=5.0))
-    found = diagnose(events, scene=scene, effects=LIBRARY, pixels=PIXELS, device=device)
+    found = diagnose(events, scene=scene, effects=LIBRARY, pixels=FEWER, device=device)
     assert sorted(found.selected) == ["leak", "mismatch"]
     assert len(found.errors) == 3
     assert found.errors[0] > 2 > found.errors[2]
@@ -129,7 +131,7 @@ def test_an_unknown_effect_is_unexplained_until_it_is_given(scene, device):
 def test_the_same_seed_gives_the_same_findings(scene, device):
     events = hidden(scene, device, EFFECTS["leak"](rate=4.0))
     one, two = (
-        diagnose(events, scene=scene, effects=LIBRARY, pixels=300, most=1, seed=5, device=device).to_json()
+        diagnose(events, scene=scene, effects=LIBRARY, pixels=150, most=1, seed=5, device=device).to_json()
         for _ in range(2)
     )
     if device == "cpu":

@@ -277,10 +277,9 @@ def test_a_lamp_is_asked_of_a_model_with_the_least_thresholds(scene):
     assert "flicker" in kept.effects
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("given", [False, True])
-def test_a_pattern_that_the_model_makes_is_explained_over_a_guessed_scene(given):
-    """How ON and OFF events balance is the pixels', however badly light is known between frames."""
+@pytest.fixture(scope="module")
+def unlike() -> tuple[Sensor, Measurement, SeenEffects]:
+    """Pixels that are unlike before a scene of which few frames are known, and what is seen of them."""
     rng = np.random.default_rng(1)
     texture = cv2.GaussianBlur(rng.random((96, 808)), (0, 0), 1.2)
     texture = np.clip((texture - texture.min()) / np.ptp(texture), 0.03, 1)
@@ -291,13 +290,21 @@ def test_a_pattern_that_the_model_makes_is_explained_over_a_guessed_scene(given)
             for t in times
         ]
     ).astype(np.float32)
-    unlike = Sensor().with_effect(EFFECTS["mismatch"](spread=0.25))
-    events = dase.simulate(VideoScene(frames, times), unlike, seed=2)
+    sensor = Sensor().with_effect(EFFECTS["mismatch"](spread=0.25))
+    events = dase.simulate(VideoScene(frames, times), sensor, seed=2)
     known = CameraScene(np.rint(255 * frames[::10]).astype(np.uint8), times[::10])
-    seen = find_seen_effects(Measurement(events, known), EFFECTS)
+    measurement = Measurement(events, known)
+    return sensor, measurement, find_seen_effects(measurement, EFFECTS)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("given", [False, True])
+def test_a_pattern_that_the_model_makes_is_explained_over_a_guessed_scene(unlike, given):
+    """How ON and OFF events balance is the pixels', however badly light is known between frames."""
+    sensor, measurement, seen = unlike
     assert "fixed pattern" in [one.name for one in seen.entries]
-    model = unlike if given else Sensor().with_effect(EFFECTS["leak"](rate=0.1))
-    kept = without_the_explained(seen, Measurement(events, known), model, 5, before=Sensor())
+    model = sensor if given else Sensor().with_effect(EFFECTS["leak"](rate=0.1))
+    kept = without_the_explained(seen, measurement, model, 5, before=Sensor())
     assert ("fixed pattern" in [one.name for one in kept.entries]) == (not given)
 
 

@@ -15,6 +15,8 @@ from dase.scenes.video import VideoScene
 
 GAP = 4e-3
 TRIED = {name: EFFECTS[name] for name in ("bandwidth", "latency", "refractory", "mismatch", "leak", "shot")}
+PIXELS = 400
+"""In each part: errors go with their root, and that of another memory is many times what counts as right."""
 
 
 def held_with_low_pass(
@@ -85,7 +87,7 @@ def scene() -> VideoScene:
 def test_a_pixel_that_forgets_the_rest_of_a_frame_lacks_nothing(scene):
     events = held_with_low_pass(scene)
     assert fewest_frames(as_measurement(events, scene)) == (1,)
-    found = dase.diagnose(events, "ideal", scene=scene, effects=TRIED, most=2)
+    found = dase.diagnose(events, "ideal", scene=scene, effects=TRIED, most=2, pixels=PIXELS)
     assert found.findings == ()
     assert found.unexplained is None
     assert found.errors[-1] < 0.5
@@ -99,7 +101,7 @@ def test_a_pixel_that_goes_on_within_a_frame_lacks_nothing(scene):
     events = held_with_low_pass(few, cutoff=5e4, goes_on=True, threshold=0.15)
     measured = as_measurement(events, few)
     assert measured.held == pytest.approx(2 * GAP)
-    found = dase.diagnose(events, "ideal", scene=few, effects=TRIED, most=2)
+    found = dase.diagnose(events, "ideal", scene=few, effects=TRIED, most=2, pixels=PIXELS)
     assert found.findings == ()
     assert found.unexplained is None
     assert found.errors[-1] < 0.8
@@ -109,7 +111,8 @@ def test_a_pixel_that_goes_on_within_a_frame_lacks_nothing(scene):
 
 @pytest.mark.slow
 def test_a_dead_time_of_several_frames_is_certain(scene):
-    found = dase.diagnose(held_with_low_pass(scene, dead=0.01), "ideal", scene=scene, effects=TRIED, most=2)
+    events = held_with_low_pass(scene, dead=0.01)
+    found = dase.diagnose(events, "ideal", scene=scene, effects=TRIED, most=2, pixels=PIXELS)
     assert [(one.effect, one.grade) for one in found.findings] == [("refractory", "certain")]
     period = found.parameters["refractory.period"]
     assert period.low <= 0.01 <= period.high
@@ -119,7 +122,8 @@ def test_a_dead_time_of_several_frames_is_certain(scene):
 
 @pytest.mark.slow
 def test_what_waits_for_late_events_has_no_dead_time(scene):
-    found = dase.diagnose(held_with_low_pass(scene, late=6.3e-3), "ideal", scene=scene, effects=TRIED, most=2)
+    events = held_with_low_pass(scene, late=6.3e-3)
+    found = dase.diagnose(events, "ideal", scene=scene, effects=TRIED, most=2, pixels=PIXELS)
     assert [one.effect for one in found.findings] == ["latency"]
     assert found.parameters["latency.delay"].value == pytest.approx(6.3e-3, rel=0.1)
 

@@ -219,10 +219,10 @@ def test_what_is_at_the_end_of_its_search_is_not_announced(monkeypatch):
     scene = moving_bars()
     events = dase.simulate(scene, Sensor().with_effect(EFFECTS["bandwidth"](cutoff=60.0)), seed=4)
     library = {name: EFFECTS[name] for name in ("threshold", "bandwidth")}
-    announced = diagnose(events, scene=scene, effects=library, pixels=300)
+    announced = diagnose(events, scene=scene, effects=library, pixels=150)
     assert announced.selected == ("bandwidth",)
     monkeypatch.setattr("dase.diagnosis.conclusion.parameters_at_bounds", lambda model, values: said)
-    found = diagnose(events, scene=scene, effects=library, pixels=300)
+    found = diagnose(events, scene=scene, effects=library, pixels=150)
     assert found.selected == ()
     assert "nothing is announced: threshold.on = 3" in found.finding()
 

@@ -81,13 +81,13 @@ class Weary(Effect):
 
 @pytest.mark.slow
 def test_names_of_an_effect_and_its_parameters_do_not_matter(device):
-    scene = moving_bars()
+    scene = moving_bars(duration=0.5)
     true = Sensor((EFFECTS["threshold"](on=0.18, off=0.22), EFFECTS["bandwidth"](cutoff=60.0)))
     events = dase.simulate(scene, true, seed=3, device=device)
     found = []
     for effect in (Sluggish, Weary):
         library = {n: EFFECTS[n] for n in ("threshold", "linlog")} | {effect.name: effect}
-        out = diagnose(events, scene=scene, effects=library, pixels=200, most=1, seed=1, device=device)
+        out = diagnose(events, scene=scene, effects=library, pixels=100, most=1, seed=1, device=device)
         assert out.selected == (effect.name,)
         found.append(json.dumps({**out.to_json(), "seconds": 0}))
     for old, new in (("sluggish", "weary"), ("cutoff", "pace"), ("dark", "night")):

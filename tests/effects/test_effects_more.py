@@ -113,11 +113,7 @@ TWINS = {
 }
 
 
-@pytest.mark.parametrize(
-    "name",
-    # the noisy follower has the same law, and its twin is done in half the time
-    [pytest.param(name, marks=pytest.mark.slow) if name == "follower" else name for name in TWINS],
-)
+@pytest.mark.parametrize("name", TWINS)
 def test_photoreceptors_match_their_twins(device, rng, name):
     scene = flicker(rng, size=(5, 6), step=0.5)
     times = scene.sample_times()

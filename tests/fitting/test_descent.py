@@ -135,10 +135,10 @@ def test_a_phase_stays_as_it_was_given_where_nothing_tells_another(device, other
 def test_a_fit_says_that_the_phase_is_the_recordings(device):
     scene, true = moving_bars(), Sensor().with_effect(EFFECTS["threshold"](phase=0.0))
     events = dase.simulate(scene, true, seed=4, device=device)
-    found = dase.fit(events, Sensor(), scene=scene, pixels=300, device=device)
+    found = dase.fit(events, Sensor(), scene=scene, pixels=150, device=device)
     assert found.sensor["threshold"].phase == 0
     assert any(note.startswith("threshold.phase is 0 instead of 1") for note in found.notes)
-    assert not any("phase" in note for note in dase.fit(events, true, scene=scene, pixels=300).notes)
+    assert not any("phase" in note for note in dase.fit(events, true, scene=scene, pixels=150).notes)
 
 
 @pytest.mark.parametrize(("rule", "other"), [("drop", "delay"), ("delay", "drop"), ("reset", "delay")])
@@ -155,10 +155,10 @@ def test_a_fit_says_which_rule_it_has_changed(device):
     scene, dead = moving_bars(), EFFECTS["refractory"](period=6e-3, mode="drop")
     events = dase.simulate(scene, Sensor().with_effect(dead), seed=4, device=device)
     given = Sensor().with_effect(replace(dead, mode="delay"))
-    found = dase.fit(events, given, scene=scene, pixels=300, device=device)
+    found = dase.fit(events, given, scene=scene, pixels=150, device=device)
     assert found.sensor["refractory"].mode == "drop"
     assert any(note.startswith("refractory.mode is drop instead of delay") for note in found.notes)
-    kept = dase.fit(events, given, scene=scene, free=["threshold"], pixels=300, device=device)
+    kept = dase.fit(events, given, scene=scene, free=["threshold"], pixels=150, device=device)
     assert kept.sensor["refractory"].mode == "delay"
 
 

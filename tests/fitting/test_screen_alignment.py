@@ -184,7 +184,7 @@ def test_thresholds_are_fitted_within_their_intervals(tmp_path):
         bandwidth={"cutoff": 150.0},
         shot={"rate": 1.0},
     )
-    found = dase.fit(events, start, scene=path, free=["threshold", "bandwidth.cutoff"], pixels=300)
+    found = dase.fit(events, start, scene=path, free=["threshold", "bandwidth.cutoff"], pixels=150)
     assert any("marks of the screen are found" in note for note in found.notes)
     for name, true in (("threshold.on", 0.22), ("threshold.off", 0.18)):
         estimate = found.parameters[name]

@@ -97,7 +97,7 @@ def test_the_command_on_two_processes(tmp_path):
     out = tmp_path / "run"
     command = str(Path(sys.executable).parent / "dase")
     words = ("--no-python", command, "train", "esim", "-o", str(out), "--preset", "tiny", "--steps", "6")
-    words = (*words, "--objective", "wgan", "--sequences", "8", "--size", "48x48")
+    words = (*words, "--objective", "wgan", "--sequences", "8", "--size", "24x24")
     run_as_two_processes(*words)
     assert (out / "sensor.toml").is_file()
     assert json.loads((out / "recipe.json").read_text())["steps"] == 6

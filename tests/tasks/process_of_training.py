@@ -31,6 +31,12 @@ def batches(first):
         first += 1
 
 
-torch.set_num_threads(1)
-settings = ReconstructionTraining(steps=3, warm_up=1, average=0.5)
-train_reconstruction(FireNet(5, 4), batches, sys.argv[1], settings)
+def train(folder):
+    """Train for three steps into a folder."""
+    settings = ReconstructionTraining(steps=3, warm_up=1, average=0.5)
+    train_reconstruction(FireNet(5, 4), batches, folder, settings)
+
+
+if __name__ == "__main__":
+    torch.set_num_threads(1)
+    train(sys.argv[1])

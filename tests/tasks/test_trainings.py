@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import json
-import subprocess
-import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -12,6 +10,7 @@ import pytest
 
 torch = pytest.importorskip("torch")
 
+from helpers.scripts import load_script
 from helpers.two_processes import run_as_two_processes
 
 from dase.errors import InputError
@@ -180,7 +179,7 @@ def test_a_loss_that_is_no_number_ends_the_training(train, network, settings, tm
 @pytest.mark.slow
 def test_two_processes_are_one_with_all_slots(tmp_path):
     script = str(Path(__file__).with_name("process_of_training.py"))
-    subprocess.run([sys.executable, script, str(tmp_path / "one")], check=True, capture_output=True)
+    load_script("tests/tasks/process_of_training.py").train(tmp_path / "one")
     run_as_two_processes(script, str(tmp_path / "two"))
     one, two = (weights(load_network(tmp_path / name / "checkpoint.pt")[0]) for name in ("one", "two"))
     assert torch.allclose(one, two, atol=2e-5)
