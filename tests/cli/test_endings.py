@@ -254,7 +254,7 @@ def test_threads_may_replace_one_file_at_once(tmp_path):
 @pytest.mark.parametrize(
     ("number", "code"),
     [
-        (signal.SIGTERM, 143),
+        pytest.param(signal.SIGTERM, 143, marks=pytest.mark.slow),
         pytest.param(signal.SIGHUP, 129, marks=pytest.mark.slow),
         (signal.SIGKILL, -9),
         pytest.param(signal.SIGINT, 130, marks=pytest.mark.slow),

@@ -276,6 +276,7 @@ def test_bad_input_is_one_sentence(tmp_path, scene):
     assert not (tmp_path / "o.toml").exists()
 
 
+@pytest.mark.slow
 def test_the_commands_agree_with_python(tmp_path, scene):
     events = dase.simulate(scene, Sensor(), seed=1)
     save(tmp_path / "r.npz", events)

@@ -201,6 +201,7 @@ def test_events_that_are_believed(measured):
     assert [row in kept for row in zip(events.t[some], events.x[some], events.y[some], strict=True)] == want
 
 
+@pytest.mark.slow
 def test_the_commands_say_what_is_compared(tmp_path, recording):
     report = tmp_path / "report.html"
     arguments = ["compare", "ideal", str(recording[0]), "--pixels", "300", "-o", str(report), "--quiet"]

@@ -117,7 +117,7 @@ class OneMode(Readout):
 @pytest.mark.parametrize(
     ("hidden", "own", "users"),
     [
-        pytest.param(Timestamp(step=5e-4, jitter=0.0), Timestamp, Ticker, id="clock"),
+        pytest.param(Timestamp(step=5e-4, jitter=0.0), Timestamp, Ticker, id="clock", marks=pytest.mark.slow),
         pytest.param(
             RowScan(line=1e-5, direction="right"), RowScan, Sweep, id="scan", marks=pytest.mark.slow
         ),

@@ -311,6 +311,7 @@ def test_events_of_noise_are_those_of_small_steps(device, rng):
         assert got.mean() == pytest.approx(want.mean(), rel=0.03, abs=3 * error)
 
 
+@pytest.mark.slow
 def test_rates_are_those_of_rice_where_thresholds_are_far_above_the_noise(device, rng):
     """Nearer ones are passed again before the voltage forgets: there small steps tell the rate."""
     pole = 2 * np.pi / np.sqrt(np.sqrt(2) - 1)

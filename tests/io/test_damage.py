@@ -64,6 +64,7 @@ def test_zip_bombs(tmp_path, name):
             act(tmp_path / name)
 
 
+@pytest.mark.slow
 def test_memory_does_not_grow_with_the_file(tmp_path):
     """A file of five million events is converted by a process that may use little more than at its start."""
     script = """

@@ -197,6 +197,7 @@ def test_matlab_files_that_are_refused(tmp_path, rng):
             io.read(tmp_path / "a.mat")
 
 
+@pytest.mark.slow
 def test_a_matlab_file_that_unpacks_to_too_much_takes_no_memory(tmp_path):
     packed = zlib.compress(bytes(1 << 30), 9)
     head = b"MATLAB 5.0 MAT-file".ljust(124) + struct.pack("<H2s", 0x0100, b"IM")
@@ -265,6 +266,7 @@ def test_aedat_3_cut_short(tmp_path, rng):
     assert any("cut short" in note for note in notes)
 
 
+@pytest.mark.slow
 def test_many_small_packets_take_no_time(tmp_path):
     head = reference_io.AEDAT3_HEAD.replace(b"{}", b"DAVIS240C")
     empty = struct.pack("<hh6i", 1, 1, 8, 4, 0, 0, 0, 0)

@@ -255,7 +255,9 @@ def test_nothing_is_left_when_a_write_fails(tmp_path, rng, monkeypatch, suffix, 
     assert list(tmp_path.iterdir()) == []
 
 
-@pytest.mark.parametrize("suffix", SUFFIXES)
+@pytest.mark.parametrize(
+    "suffix", [pytest.param(s, marks=pytest.mark.slow) if s == ".h5" else s for s in SUFFIXES]
+)
 def test_damaged_files_are_one_sentence(tmp_path, rng, suffix):
     """Cut anywhere: InputError. Flipped anywhere: InputError or a sequence, never another error."""
     path = tmp_path / f"a{suffix}"

@@ -39,7 +39,7 @@ def test_one_line_of_50_mb(tmp_path, content):
     "name",
     [
         pytest.param("a{}.txt", marks=pytest.mark.slow),
-        "a{}.npy",
+        pytest.param("a{}.npy", marks=pytest.mark.slow),
         pytest.param("frame_{}.png", marks=pytest.mark.slow),
     ],
 )

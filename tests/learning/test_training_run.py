@@ -221,7 +221,7 @@ def test_a_folder_is_not_begun_twice(scenes, tmp_path):
         train_in_folder(a_run(scenes), tmp_path, resume=True)
 
 
-@pytest.mark.parametrize("slow_from", [-100, 5])
+@pytest.mark.parametrize("slow_from", [-100, pytest.param(5, marks=pytest.mark.slow)])
 def test_the_time_is_kept_where_steps_are_slow(scenes, tmp_path, monkeypatch, slow_from):
     """The clock was looked at after 30 steps, however long those took."""
     training = a_run(scenes, steps=500, warmup=0)

@@ -302,6 +302,7 @@ def run(*arguments: object) -> str:
     return done.stdout
 
 
+@pytest.mark.slow
 def test_synth_marks_events_when_asked(tmp_path):
     sensor = tmp_path / "noisy.toml"
     sensor.write_text("[threshold]\n[leak]\nrate = 20.0\n[shot]\nrate = 50.0\n[row_scan]\n[timestamp]\n")
