@@ -97,12 +97,10 @@ def settle_jitter(
         model: The last one; a jitter of its own is left out.
         judgement: Its held-out error.
     """
-    if JITTER in state.given or state.evidence.contradiction or seen.lamp or JITTER not in state.effects:
-        return seen
-    if state.evidence.frame_step:
+    if JITTER not in state.added_to(model) or seen.lamp or state.evidence.frame_step:
         return seen
     found = find_jitter_beside(state, measurement, model, judgement)
-    if found is None or JITTER not in state.added_to(model):
+    if found is None:
         state.certain -= {JITTER}
         return seen
     state.certain |= {JITTER}
