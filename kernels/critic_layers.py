@@ -9,9 +9,10 @@ from types import SimpleNamespace
 
 import warp as wp
 
+from dase.kernels.compiler_flags import CPU_FLAGS
 from dase.kernels.vec4 import read_vec4, word_functions
 
-wp.set_module_options({"enable_backward": False})
+wp.set_module_options({"cpu_compiler_flags": CPU_FLAGS, "enable_backward": False})
 
 
 @wp.func

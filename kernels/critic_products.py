@@ -8,9 +8,10 @@ registers only: a weight is read, moved and written once.
 # no postponed annotations: those of the kernels made here name types of the functions around them
 import warp as wp
 
+from dase.kernels.compiler_flags import CPU_FLAGS
 from dase.kernels.vec4 import load_vec4, read_half, store_half, store_vec4
 
-wp.set_module_options({"enable_backward": False})
+wp.set_module_options({"cpu_compiler_flags": CPU_FLAGS, "enable_backward": False})
 
 TILE = 4
 """A thread works on TILE x TILE weights at a time."""

@@ -8,7 +8,9 @@ from __future__ import annotations
 
 import warp as wp
 
-wp.set_module_options({"enable_backward": False})
+from dase.kernels.compiler_flags import CPU_FLAGS
+
+wp.set_module_options({"cpu_compiler_flags": CPU_FLAGS, "enable_backward": False})
 
 
 @wp.func

@@ -4,6 +4,10 @@ from __future__ import annotations
 
 import warp as wp
 
+from dase.kernels.compiler_flags import CPU_FLAGS
+
+wp.set_module_options({"cpu_compiler_flags": CPU_FLAGS})
+
 
 @wp.kernel(enable_backward=False)
 def place_in_bursts(

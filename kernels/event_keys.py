@@ -6,6 +6,9 @@ import numpy as np
 import warp as wp
 
 from dase.kernels import launch
+from dase.kernels.compiler_flags import CPU_FLAGS
+
+wp.set_module_options({"cpu_compiler_flags": CPU_FLAGS})
 
 GAP_THREADS = 64
 """Threads that copy the keys of one slab: neighbours take neighbouring keys, as a GPU's memory wants it."""

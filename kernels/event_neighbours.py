@@ -5,7 +5,9 @@ Events are looked at one after the other, as they come, by one thread: each need
 
 import warp as wp
 
-wp.set_module_options({"enable_backward": False})
+from dase.kernels.compiler_flags import CPU_FLAGS
+
+wp.set_module_options({"cpu_compiler_flags": CPU_FLAGS, "enable_backward": False})
 
 
 @wp.func

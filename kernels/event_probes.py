@@ -13,6 +13,10 @@ from enum import IntEnum
 
 import warp as wp
 
+from dase.kernels.compiler_flags import CPU_FLAGS
+
+wp.set_module_options({"cpu_compiler_flags": CPU_FLAGS})
+
 KINDS = 7
 """At rest for long, at rest for a short time, and five bins of the change."""
 

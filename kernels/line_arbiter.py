@@ -6,6 +6,10 @@ from enum import IntEnum
 
 import warp as wp
 
+from dase.kernels.compiler_flags import CPU_FLAGS
+
+wp.set_module_options({"cpu_compiler_flags": CPU_FLAGS})
+
 END = 2**62
 """A time that never comes [ps]."""
 

@@ -7,7 +7,9 @@ row i // columns and column i % columns of the grid. Nothing here is differentia
 
 import warp as wp
 
-wp.set_module_options({"enable_backward": False})
+from dase.kernels.compiler_flags import CPU_FLAGS
+
+wp.set_module_options({"cpu_compiler_flags": CPU_FLAGS, "enable_backward": False})
 
 BINS = wp.constant(16)  # of the histogram of gradient magnitudes, 1 count wide, the last open
 Bins = wp.types.vector(length=16, dtype=float)

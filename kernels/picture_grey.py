@@ -9,9 +9,10 @@ import warp as wp
 from numpy.typing import NDArray
 
 from dase.kernels import launch
+from dase.kernels.compiler_flags import CPU_FLAGS
 
 # as NumPy has it: each product is rounded, then each sum
-wp.set_module_options({"fuse_fp": False})
+wp.set_module_options({"cpu_compiler_flags": CPU_FLAGS, "fuse_fp": False})
 
 
 @wp.func_native(

@@ -27,7 +27,7 @@ from dase.kernels.pixel_compile import compile_text, register_bound
 from dase.kernels.pixel_stages import EffectStages
 from dase.kernels.scene_layers import Frames
 from dase.kernels.scene_windows import LayerScenes, layers_of_scene
-from dase.kernels.vector_math import lane_functions, lane_options
+from dase.kernels.vector_math import lane_functions
 from dase.kernels.window_sinks import DEPOSITS, WindowGrids
 
 
@@ -75,10 +75,9 @@ def compose_scenes(
     if lanes:
         scope |= lane_scope(lanes, source) | {"store": lane_functions(lanes).store}
     scope |= {"Scenes": kind, "scene_of": of_row, "Sink": WindowGrids, "deposit": DEPOSITS[deposit]}
-    options = lane_options() if lanes else {}
     registers = register_bound(stages, lanes)
     text = source_text(stages, source, lanes=lanes)
-    return compile_text(text, "pixel_scenes", scope, registers=registers, **options)
+    return compile_text(text, "pixel_scenes", scope, registers=registers)
 
 
 def source_text(stages: tuple[EffectStages, ...], source: str, *, lanes: int = 0) -> str:

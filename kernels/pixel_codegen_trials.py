@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import math
 from functools import lru_cache
-from typing import Any
 
 import warp as wp
 
@@ -62,13 +61,9 @@ def compose_trials(stages: tuple[EffectStages, ...], *, lanes: int = 1) -> wp.Ke
     Its arguments are `first`, a `LightHistory`, pixels (N,), width, height, seeds (B,), parameters (B, P),
     maps (M, N) where an effect has any, `ProbeSums`.
     """
-    options: dict[str, Any] = {}
     scope = pixel_scope(_model(stages, lanes))
     if lanes > 1:
         scope |= lane_scope(LANES, "frames")
-        # 16 lanes fill a CPU's longest vectors, which compilers shun by themselves, and what looks at events
-        # is not copied to all places where there are some; the bits are the same
-        options["cpu_compiler_flags"] = "-march=native -mprefer-vector-width=512 -mllvm=-inline-threshold=400"
     scope |= {
         "Source": LightHistory,
         "Sink": ProbeSums,
@@ -77,7 +72,7 @@ def compose_trials(stages: tuple[EffectStages, ...], *, lanes: int = 1) -> wp.Ke
         "look_back": observe_queued_events,
         "instant": event_instant,
     }
-    return compile_text(source_text(stages, lanes=lanes), "pixel_trials", scope, **options)
+    return compile_text(source_text(stages, lanes=lanes), "pixel_trials", scope)
 
 
 def source_text(stages: tuple[EffectStages, ...], *, lanes: int = 1) -> str:

@@ -7,6 +7,7 @@ from typing import Any
 
 import warp as wp
 
+from dase.kernels.compiler_flags import CPU_FLAGS
 from dase.kernels.pixel_codegen_cpu import lane_scope, print_block_kernel
 from dase.kernels.pixel_codegen_cuda import print_pixel_kernel, print_threshold_kernel
 from dase.kernels.pixel_codegen_model import PixelModel, pixel_scope
@@ -33,9 +34,8 @@ def compose_pixels(stages: tuple[EffectStages, ...], source: str, sink: str, *, 
     """
     scope = pixel_scope(PixelModel(stages, source, sink))
     scope |= lane_scope(lanes, source) if lanes else {}
-    options = lane_options() if lanes else {}
     text, registers = source_text(stages, source, sink, lanes=lanes), register_bound(stages, lanes)
-    return compile_text(text, "pixel_events", scope, registers=registers, **options)
+    return compile_text(text, "pixel_events", scope, registers=registers)
 
 
 @lru_cache(maxsize=256)
@@ -107,7 +107,7 @@ def compile_text(
     """
     # contraction: see dase.kernels.vector_math; loops over lanes stay loops, which the compiler turns into
     # vectors
-    options = {"fuse_fp": False, "max_unroll": 0, **more}
+    options = {"fuse_fp": False, "max_unroll": 0, "cpu_compiler_flags": CPU_FLAGS, **more}
     kernel: wp.Kernel = wp.kernel(
         function_from_text(text, name, scope), enable_backward=False, module="unique", module_options=options,
         cuda_max_registers=registers,

@@ -8,7 +8,10 @@ from __future__ import annotations
 
 import warp as wp
 
+from dase.kernels.compiler_flags import CPU_FLAGS
 from dase.kernels.scene_layers import Affine, Layers, background_geometry, layer_intensity, layers_near
+
+wp.set_module_options({"cpu_compiler_flags": CPU_FLAGS})
 
 
 @wp.kernel(enable_backward=False)

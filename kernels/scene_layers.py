@@ -12,9 +12,10 @@ import warp as wp
 from numpy.typing import NDArray
 
 from dase.kernels import launch
+from dase.kernels.compiler_flags import CPU_FLAGS
 
 # as in the kernels of `dase.kernels.scene_render`: pictures are the same, to the last bit, on a GPU as well
-wp.set_module_options({"fuse_fp": False})
+wp.set_module_options({"cpu_compiler_flags": CPU_FLAGS, "fuse_fp": False})
 
 MAX_LAYERS = 32
 """A pixel keeps one bit per layer."""

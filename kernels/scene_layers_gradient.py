@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import warp as wp
 
+from dase.kernels.compiler_flags import CPU_FLAGS
 from dase.kernels.scene_layers import (
     MAX_LAYERS,
     Affine,
@@ -13,6 +14,8 @@ from dase.kernels.scene_layers import (
     foreground_at,
     reflected_coordinate,
 )
+
+wp.set_module_options({"cpu_compiler_flags": CPU_FLAGS})
 
 PerLayer = wp.types.vector(length=MAX_LAYERS, dtype=wp.float32)
 

@@ -10,7 +10,10 @@ from __future__ import annotations
 
 import warp as wp
 
+from dase.kernels.compiler_flags import CPU_FLAGS
 from dase.kernels.scene_layers import Affine
+
+wp.set_module_options({"cpu_compiler_flags": CPU_FLAGS})
 
 POSE = 12
 """Numbers of a pose: 5 quantities of a camera, their rates [1/s], the share of the way that things have made

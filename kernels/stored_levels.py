@@ -10,6 +10,9 @@ import warp as wp
 from numpy.typing import NDArray
 
 from dase.kernels import launch
+from dase.kernels.compiler_flags import CPU_FLAGS
+
+wp.set_module_options({"cpu_compiler_flags": CPU_FLAGS})
 
 LEVELS = 256
 

@@ -15,10 +15,11 @@ from __future__ import annotations
 
 import warp as wp
 
+from dase.kernels.compiler_flags import CPU_FLAGS
 from dase.kernels.vector_math import whole_quotient
 
 # the adjoints are written by hand; fused multiply-adds would move events between intervals
-wp.set_module_options({"enable_backward": False, "fuse_fp": False})
+wp.set_module_options({"cpu_compiler_flags": CPU_FLAGS, "enable_backward": False, "fuse_fp": False})
 
 
 @wp.func

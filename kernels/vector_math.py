@@ -20,15 +20,13 @@ from typing import Any
 
 import warp as wp
 
+from dase.kernels.compiler_flags import CPU_FLAGS
 from dase.kernels.scene_layers import Affine
 
 
 def lane_options() -> dict[str, Any]:
-    """Return the options of a module whose kernels work on lanes: no contraction, vectors of any width."""
-    flags = wp.config.cpu_compiler_flags
-    # LLVM shuns vectors of 512 bits on Intel by itself, and needs twice the instructions; bits are the same
-    wide = f"{'-march=native' if flags is None else flags} -mprefer-vector-width=512"
-    return {"fuse_fp": False, "cpu_compiler_flags": wide}
+    """Return the options of a module whose kernels work on lanes: no contraction."""
+    return {"fuse_fp": False, "cpu_compiler_flags": CPU_FLAGS}
 
 
 # `background` and `layered` compute what `dase.kernels.scene_layers` has as Warp functions, and both
