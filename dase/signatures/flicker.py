@@ -235,10 +235,15 @@ def _refine_tone(
             near = (np.abs(turn) < 0.25) & (count[i : i + size] > 0)
             if near.sum() < 4:
                 continue
-            away = at[near] - at[near].mean()
-            slope = float((away * turn[near]).sum() / (away**2).sum())
-            rest = turn[near] - turn[near].mean() - slope * away
-            weights.append(float((away**2).sum() / max((rest**2).sum() / max(near.sum() - 2, 1), 1e-12)))
+            # a phase of n independent events whose sum is z is uncertain by sqrt(n / 2) / |z|: at the end of
+            # a recording some late events would turn the line
+            sure = np.abs(part[near]) ** 2 / count[i : i + size][near]
+            sure /= sure.mean()
+            away = at[near] - np.average(at[near], weights=sure)
+            spread = float((sure * away**2).sum())
+            slope = float((sure * away * turn[near]).sum() / spread)
+            rest = turn[near] - np.average(turn[near], weights=sure) - slope * away
+            weights.append(spread / max(float((sure * rest**2).sum()) / max(near.sum() - 2, 1), 1e-12))
             slopes.append(slope)
         if not slopes:
             break

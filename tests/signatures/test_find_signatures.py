@@ -76,6 +76,17 @@ def test_an_effect_of_the_sensor_shows(name):
     assert name in found(made(**CASES[name]))
 
 
+def test_a_few_late_events_do_not_turn_the_frequency_of_a_lamp():
+    """As where a latency lets some come after the end, in a phase of their own."""
+    lamp = made(**CASES["flicker"])
+    late = np.flatnonzero(lamp.t > 0.85)[::50]
+    some = np.concatenate([np.flatnonzero(lamp.t <= 0.85), late])
+    shifted = np.where(lamp.t[some] > 0.85, 0.002, 0.0)
+    events = Events(lamp.t[some] + shifted, lamp.x[some], lamp.y[some], lamp.p[some], lamp.width, lamp.height)
+    entry = dase.find_signatures(events)["flicker"]
+    assert entry.details["frequency"] == pytest.approx(100.14, abs=0.05)
+
+
 def test_frequency_and_swing_of_a_lamp():
     entry = dase.find_signatures(made(**CASES["flicker"]))["flicker"]
     assert entry.details["frequency"] == pytest.approx(100.14, abs=0.15)
