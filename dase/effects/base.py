@@ -320,6 +320,13 @@ class Effect:
         """Whether random events pass while this effect holds the others back, and begin no dead time."""
         return False
 
+    def stood_in_for(self, beside: Sequence[Effect]) -> dict[str, float]:
+        """Return values of parameters that those of other effects stand for where this one is missing.
+
+        A search begins there, too: with this effect those others change nothing any more.
+        """
+        return {}
+
     def otherwise(self, beside: Sequence[Effect]) -> list[Self]:
         """Return this effect by the other rules that a fit has to try, too, as no descent gets there.
 

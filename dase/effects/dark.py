@@ -86,6 +86,16 @@ class Dark(Effect):
         follow = any(set(e.idle([shared])) > set(e.idle([self])) for e in beside)
         return [shared] if self.speed == "own" and follow else []
 
+    def stood_in_for(self, beside: Sequence[Effect]) -> dict[str, float]:
+        """Return the current that has the share with which others were slow in the dark."""
+        following = [e for e in beside if set(e.idle([self])) > set(e.idle([]))]
+        shares = [
+            float(getattr(e, p.name)) for e in following for p in e.parameters()
+            if p.name == "dark" and p.unit == "1"
+        ]  # fmt: skip
+        inside = [share for share in shares if share < 0.5]
+        return {"current": inside[0] / (1 - inside[0])} if inside else {}
+
     def lends(self) -> tuple[str, ...]:
         """Return the current, which poles, latency and noise of the voltage follow."""
         return ("current",) if self.speed == "shared" else ()

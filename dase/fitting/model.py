@@ -419,13 +419,16 @@ def starting_places(model: FittedModel, effect: Effect, *, few: bool = False) ->
         M places, shape (M, P).
     """
     axes = model.space.axes
+    others = [e for e in model.space.sensor.effects if e.name != effect.name]
+    known = {f"{effect.name}.{name}": value for name, value in effect.stood_in_for(others).items()}
     columns, choices, observed = [], [], False
     for n, axis in enumerate(axes):
         if axis.effect is type(effect):
             columns.append(n)
             observed |= axis.fact.search_starts == "above"
             tried = _starting_places_of_axis(axis, float(model.place[n]))
-            choices.append(tried[::2] if few and axis.main and len(tried) > 2 else tried)
+            tried = tried[::2] if few and axis.main and len(tried) > 2 else tried
+            choices.append([*tried, float(axis.to_place(known[axis.name]))] if axis.name in known else tried)
     thresholds = [n for n, axis in enumerate(axes) if axis.is_threshold]
     out = []
     for combination in product(*choices):

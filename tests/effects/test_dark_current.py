@@ -20,7 +20,7 @@ from dase.effects.second_order import SecondOrder
 from dase.effects.threshold import Threshold
 from dase.effects.voltage_noise import VoltageNoise
 from dase.errors import InputError
-from dase.fitting.model import model_of, still_free, with_effect_added
+from dase.fitting.model import model_of, starting_places, still_free, with_effect_added
 from dase.fitting.parameter_space import axes_of, refuse_idle
 from dase.simulation.pixel_array import PixelArray
 from dase.simulation.sensor_file import dump_sensor, parse_sensor
@@ -163,6 +163,23 @@ def test_a_fit_has_one_dark_current():
     assert shared == Dark()
     assert not Dark(speed="own").otherwise([Threshold()])
     assert not Dark().otherwise(sensor.effects)
+
+
+@pytest.mark.parametrize("slow", [Bandwidth(dark=0.02), Latency(dark=0.02)], ids=lambda e: e.name)
+def test_a_search_begins_with_the_current_that_others_stand_for(slow):
+    """A latency or a pole that was fitted without it has a dark current of its own."""
+    present = model_of(dase.Sensor((Threshold(), slow)))
+
+    def tried(effect, few):
+        model = with_effect_added(present, effect)
+        n = model.space.names.index("dark.current")
+        return np.unique(model.space.axes[n].to_value(starting_places(model, effect, few=few)[:, n]).round(6))
+
+    for few in (False, True):
+        # one that is of the light alone follows nobody
+        more = np.setdiff1d(tried(Dark(), few), tried(Dark(speed="own"), few))
+        assert more == pytest.approx([0.02 / 0.98], rel=1e-3)
+    assert Dark().stood_in_for([VoltageNoise()]) == {}  # its own is an intensity, and not fitted
 
 
 def test_a_pole_added_to_a_sensor_with_a_dark_current_has_none_to_fit():
