@@ -118,7 +118,7 @@ def _look_where_light_rests(
     found = find_events_at_rest(
         measurement, model.sensor, thresholds=(threshold.on, threshold.off), seed=state.seed
     )
-    state.noisy = found is not None and found.name == NOISE
+    state.noise = found.size if found is not None and found.name == NOISE else 0.0
     return seen if found is None else replace(seen, entries=(*seen.entries, found))
 
 
@@ -144,7 +144,8 @@ def _look_at_thresholds(
     found = []
     if MISMATCH not in state.given:
         found.append(find_unequal_thresholds(measurement, model.sensor, seed=state.seed))
-    if LEAKING not in state.given and not seen.entry_of(LEAK):
+    # light that goes on in a dead time counts for nothing, and the less the longer the time between events is
+    if LEAKING not in state.given and not (seen.entry_of(LEAK) or seen.entry_of(DEAD_TIME)):
         structure = state.evidence.structure
         found.append(find_drifting_memory(measurement, model.sensor, structure=structure, seed=state.seed))
     return replace(seen, entries=(*seen.entries, *(one for one in found if one is not None)))

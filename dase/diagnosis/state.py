@@ -40,7 +40,7 @@ class DiagnosisState:
         tried_alone: Those of them that were tried before all others.
         put_off: Those that were seen beside the model before the search, and explain too little of its error
             to be put in before all others: they are asked for again at the end.
-        noisy: Whether pixels at rest send noise that the model before the search has not.
+        noise: Rate of the noise that pixels at rest send and the model before the search has not [Hz].
         held: See `Measurement.held`.
         all_time: Whether all of the time is fitted, not its first part alone.
         evaluations_before: Simulations that were run before the measurement was split anew.
@@ -66,7 +66,7 @@ class DiagnosisState:
     shown: frozenset[str] = frozenset()
     tried_alone: frozenset[str] = frozenset()
     put_off: frozenset[str] = frozenset()
-    noisy: bool = False
+    noise: float = 0.0
     held: float = 0.0
     all_time: bool = False
     evaluations_before: int = 0

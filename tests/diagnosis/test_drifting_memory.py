@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import pytest
 from helpers.frame_simulator import HEIGHT, WIDTH, counted_between_frames, shaken_texture
 
 import dase
+from dase.diagnosis.dead_time import NAME as DEAD_TIME
 from dase.diagnosis.drifting_memory import DRIFT, NAME, Drift, find_drifting_memory
 from dase.diagnosis.events_at_rest import find_events_at_rest
+from dase.diagnosis.seen_beside_model import _look_at_thresholds
 from dase.diagnosis.seen_effects import SeenEffects
 from dase.effects import EFFECTS
 from dase.events import Events
@@ -110,3 +113,19 @@ def test_it_names_the_leak():
     (said,) = SeenEffects((entry,)).findings([], ())
     assert (said.effect, said.grade, said.seen) == ("leak", Grade.CERTAIN, "drifts")
     assert SeenEffects((entry,), library=frozenset(EFFECTS) | {"popping"}).named_by(entry) == ()
+
+
+def test_beside_a_dead_time_it_is_not_asked(scene):
+    """Light that goes on in a dead time counts for nothing: of long times between events it is a small part.
+
+    So a strong dead time looked like a leak of 2.8 Hz in a scene of drifting waves.
+    """
+    events = counted_between_frames(scene, 0.0, leak=4.0)
+    state = SimpleNamespace(
+        evidence=SimpleNamespace(contradiction="", structure=NO_STRUCTURE), given=frozenset(), seed=0
+    )
+    measurement, model = Measurement(events, scene), SimpleNamespace(sensor=Sensor())
+    ended = Signature(name=DEAD_TIME, answer=Answer.FOUND, sentence="ends")
+    for entries, leaks in (((), True), ((ended,), False)):
+        seen = _look_at_thresholds(state, SeenEffects(entries), measurement, model)
+        assert (seen.entry_of(NAME) is not None) == leaks

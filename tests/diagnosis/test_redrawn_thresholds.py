@@ -46,6 +46,14 @@ def test_the_spread_is_that_from_event_to_event(scene, spread):
     assert entry.low < entry.size < entry.high
 
 
+def test_where_most_runs_have_a_noise_event_nothing_is_said(scene):
+    events = dase.simulate(scene, sensor_with(jitter={"spread": 0.2}, shot={"rate": 4.0}), seed=1)
+    model = sensor_with(shot={"rate": 4.0})
+    assert found(scene, events, model, right=True, noise=4.0) is not None
+    # a run lasts 12 ms here
+    assert found(scene, events, model, right=True, noise=100.0) is None
+
+
 @pytest.mark.parametrize(
     "beside",
     [
