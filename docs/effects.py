@@ -92,8 +92,8 @@ Presets on recordings of their cameras, nothing fitted: those of commit 3859195 
 is known, only the measurement stands. *With its lamp and frames*: the preset of now with `flicker` and
 `exposure` at the frequency and the times that the events tell, and both strengths and the threshold set by
 three totals, the event rate, the share in bursts and the swing; all else is left to compare. `python -m
-perf.experiments.recordings.run $DASE_DATA/recordings` measures anew (2992312, the line with the lamp after
-79c3e70), `python docs/effects.py` writes these tables. Noise of another camera at three illuminances is in
+perf.experiments.recordings.run $DASE_DATA/recordings` measures anew (all at ef55f93),
+`python docs/effects.py` writes these tables. Noise of another camera at three illuminances is in
 [noise.md](noise.md).
 
 Intervals of a pixel [ms] by its polarities: 0.1 / 1 / 10 % are shorter. Empty where there are fewer than 300.
