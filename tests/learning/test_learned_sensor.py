@@ -117,6 +117,7 @@ def test_a_sensor_file_finds_its_weights_wherever_it_lies(folder, scene, monkeyp
     assert "bound" not in dump_sensor(sensor.bound_to(scene))
 
 
+@pytest.mark.slow
 def test_an_effect_is_fitted_beside_learned_thresholds(folder, rng, monkeypatch):
     """From anywhere, and into another folder, from which the weights are still found."""
     t = np.arange(500) * 1e-3
