@@ -66,12 +66,13 @@ same run). In a later run, at 2f4580b, these were 38 and 33 s, and 61 s at 38591
 a5feef4, each time with 3859195 in one run, the sensor of 3859195 and the same 163,618,663 events: 15.5 and
 14.5 s with one process for 27.5 and 26.7, 8.3 and 7.7 s with eight for 10.6 and 9.5; the present
 `davis346`, whose bus the processor reads out, 15.3 and 12.7 s, and 9.2 and 8.3 s.
-At 3bf798f, again with 3859195 in one run, two rounds: 11.5 and 10.2 s with one process for 32.2 and 27.7, 7.7 and
-7.0 s with eight for 9.9 and 9.7; the present `davis346` 13.1 and 10.9 s, and 9.6 and 8.8 s. To import dase and begin
-with the GPU takes 1.9 s of each.
+At 3bf798f, again with 3859195 in one run, two rounds: 11.5 and 10.2 s with one process for 32.2 and 27.7,
+7.7 and 7.0 s with eight for 9.9 and 9.7; the present `davis346` 13.1 and 10.9 s, and 9.6 and 8.8 s. To import
+dase and begin with the GPU takes 1.9 s of each.
 The goals of 6 and 3 s are missed. `dase.simulate` of the
-noisy `davis346` (346x260) alone takes 7.6 times as long there (7.2 to 7.9, 230 ms for 30, 3bf798f) as at 3859195,
-which had no bus; the goal was 1.3. `perf/RESULTS.md` has the stages, and why the bus is no work for a GPU as it is."""
+noisy `davis346` (346x260) alone takes 7.6 times as long there (7.2 to 7.9, 230 ms for 30, 3bf798f) as at
+3859195, which had no bus; the goal was 1.3. `perf/RESULTS.md` has the stages, and why the bus is no work for
+a GPU as it is."""
 
 
 def powers(most: int) -> list[int]:
