@@ -93,9 +93,7 @@ def compose_thresholds(stages: tuple[EffectStages, ...]) -> wp.Kernel:
     return compile_text(thresholds_text(stages), "pixel_thresholds", scope)
 
 
-def compile_text(
-    text: str, name: str, scope: dict[str, Any], *, registers: int | None = None, **more: Any
-) -> wp.Kernel:
+def compile_text(text: str, name: str, scope: dict[str, Any], *, registers: int | None = None) -> wp.Kernel:
     """Return the kernel of a text.
 
     Args:
@@ -103,11 +101,10 @@ def compile_text(
         name: Of the function.
         scope: What its names mean.
         registers: Most registers of a thread on a GPU; None for as many as the compiler takes.
-        **more: Options of its module.
     """
     # contraction: see dase.kernels.vector_math; loops over lanes stay loops, which the compiler turns into
     # vectors
-    options = {"fuse_fp": False, "max_unroll": 0, "cpu_compiler_flags": CPU_FLAGS, **more}
+    options = {"fuse_fp": False, "max_unroll": 0, "cpu_compiler_flags": CPU_FLAGS}
     kernel: wp.Kernel = wp.kernel(
         function_from_text(text, name, scope), enable_backward=False, module="unique", module_options=options,
         cuda_max_registers=registers,

@@ -88,13 +88,12 @@ class Dark(Effect):
 
     def stood_in_for(self, beside: Sequence[Effect]) -> dict[str, float]:
         """Return the current that has the share with which others were slow in the dark."""
-        following = [e for e in beside if set(e.idle([self])) > set(e.idle([]))]
         shares = [
-            float(getattr(e, p.name)) for e in following for p in e.parameters()
-            if p.name == "dark" and p.unit == "1"
+            float(getattr(e, p.name)) for e in beside for p in e.parameters()
+            if p.unit == "1" and p.name in set(e.idle([self])) - set(e.idle([]))
         ]  # fmt: skip
-        inside = [share for share in shares if share < 0.5]
-        return {"current": inside[0] / (1 - inside[0])} if inside else {}
+        share = next((share for share in shares if share < 0.5), None)
+        return {} if share is None else {"current": share / (1 - share)}
 
     def lends(self) -> tuple[str, ...]:
         """Return the current, which poles, latency and noise of the voltage follow."""

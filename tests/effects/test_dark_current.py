@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from typing import ClassVar
 
 import numpy as np
 import pytest
@@ -14,6 +15,7 @@ from reference.pixel import Stream
 
 import dase
 from dase.effects.bandwidth import Bandwidth
+from dase.effects.base import Effect, parameter
 from dase.effects.dark import Dark
 from dase.effects.latency import Latency
 from dase.effects.second_order import SecondOrder
@@ -26,6 +28,18 @@ from dase.simulation.pixel_array import PixelArray
 from dase.simulation.sensor_file import dump_sensor, parse_sensor
 
 FINE = Threshold(on=0.01, off=0.01, phase=0.0)
+
+
+@dataclass(frozen=True, kw_only=True)
+class SlowInTheDark(Effect):
+    """What a user may write, with a share of the current by a name of its own."""
+
+    name: ClassVar[str] = "slow_in_the_dark"
+    least: float = parameter(0.1, unit="1", plausible=(0.01, 1.0), about="share in the dark")
+
+    def idle(self, beside):
+        return ("least",) if any("current" in e.lends() for e in beside) else ()
+
 
 SLOW = {
     "one pole": (Bandwidth(cutoff=150.0, dark=0.4),),
@@ -180,6 +194,9 @@ def test_a_search_begins_with_the_current_that_others_stand_for(slow):
         more = np.setdiff1d(tried(Dark(), few), tried(Dark(speed="own"), few))
         assert more == pytest.approx([0.02 / 0.98], rel=1e-3)
     assert Dark().stood_in_for([VoltageNoise()]) == {}  # its own is an intensity, and not fitted
+    # it goes by what a current changes, not by a name
+    assert Dark().stood_in_for([replace(slow, dark=0.6)]) == {}
+    assert Dark().stood_in_for([SlowInTheDark(least=0.02)]) == Dark().stood_in_for([slow])
 
 
 def test_a_pole_added_to_a_sensor_with_a_dark_current_has_none_to_fit():
