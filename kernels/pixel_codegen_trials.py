@@ -14,6 +14,7 @@ from functools import lru_cache
 
 import warp as wp
 
+from dase.kernels.compiler_flags import CPU_FLAGS
 from dase.kernels.event_probes import (
     LANES,
     QUEUE,
@@ -39,6 +40,8 @@ from dase.kernels.pixel_codegen_model import Outlet, PixelModel, pixel_scope
 from dase.kernels.pixel_codegen_program import VOLTAGE, Program, draw_numbers, make_program, pixel_places
 from dase.kernels.pixel_compile import compile_text
 from dase.kernels.pixel_stages import REST, EffectStages
+
+wp.set_module_options({"cpu_compiler_flags": CPU_FLAGS})
 
 
 @wp.struct
