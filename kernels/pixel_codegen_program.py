@@ -156,6 +156,8 @@ def make_program(model: PixelModel) -> Program:
     light += _keep_illumination(model) if model.source != "log" else ()
     light += pass_through(model, "current", "intensity")
     respond = pass_through(model, "respond", "voltage")
+    if model.asks("before", stages=("respond",)):
+        respond = (Part((_change(model, "before", "signal"),)), *respond)
     change = change_since_event(model)
     asleep, busy = sleep_condition(model)
     events, settle, begin = step_events(model), settle_step(model), begin_chunk(model)

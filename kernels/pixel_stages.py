@@ -5,7 +5,8 @@ A pixel turns light into events in this order; each effect adds Warp functions a
     light      (intensity, ...)           -> intensity            what reaches the photodiode
     current    (intensity, ...)           -> intensity            what flows in it, as the light that makes it
     log        voltage = log(intensity + log_eps)
-    respond    (voltage, intensity, log_eps, ...) -> voltage      photoreceptor
+    respond    (voltage, intensity, log_eps, ...) -> voltage      photoreceptor; it may ask for the voltage at
+               the end of the last step, `signal`, and for what that is above the memory, `before`
     threshold  (on, off, ...)             -> on, off              once per pixel [log intensity]
     redraw     (on, off, ...)             -> on, off              anew after each event; random numbers too
     drift      (intensity, on, off, ...)  -> drift                of the change towards ON [log intensity/s]
@@ -61,7 +62,7 @@ CORE = ("on", "off", "phase", "log_eps")
 QUANTITIES = {
     "light": ("intensity",),
     "current": ("intensity",),
-    "respond": ("voltage", "intensity", "log_eps"),
+    "respond": ("voltage", "intensity", "log_eps", "signal", "before", "on", "off"),
     "threshold": ("on", "off"),
     "redraw": ("on", "off"),
     "drift": ("intensity", "illumination", "on", "off"),

@@ -144,6 +144,7 @@ class Observations:
         peak_chance: Probability that independent events swing as much as these do at `peak_frequency`.
         clip_step: From frame to frame of a clip in step with which all events come [s], as those of a
             simulator that works frame by frame do; 0 for none.
+        clip_frames: From frame to frame of a clip [s], whatever the events; 0 for other scenes.
         bus_load: Largest share of some milliseconds for which a bus that sends one event after the other, if
             there is one, was busy at most.
         row_load: The same of an arbiter that takes rows.
@@ -162,6 +163,7 @@ class Observations:
     frame_exposure: float = 0.0
     peak_chance: float = 0.0
     clip_step: float = 0.0
+    clip_frames: float = 0.0
     bus_load: float = math.inf
     row_load: float = math.inf
     column_load: float = math.inf

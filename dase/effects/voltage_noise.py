@@ -120,6 +120,104 @@ def noise_by_samples(
     return voltage + now, now, float(0.0)
 
 
+STILL = wp.constant(1.0e-6)
+"""Change of light in a step below which there is none [log intensity]; float32 resolves 5e-7 of voltages."""
+
+DRAWN_BY = 4
+"""Samples in the period of a walk: with one, strong noise has a tenth too few events, and most at its end."""
+
+PAST = wp.constant(1.0e-5)
+"""How far the line of a step goes beyond a threshold that it passes [log intensity]."""
+
+
+@wp.func
+def walked_voltage(
+    voltage: float,
+    intensity: float,
+    dt: float,
+    signal: float,
+    before: float,
+    on: float,
+    off: float,
+    sigma: float,
+    knee: float,
+    dark: float,
+    dark_current: float,
+    period: float,
+    floor: float,
+    walked: float,
+    pace: float,
+    left: float,
+    was: float,
+    slip: float,
+    uniform: float,
+    uniform_2: float,
+    uniform_3: float,
+):
+    """Voltage at the end of a step in which it walks at random, beside steady changes of the light.
+
+    At the begin of each period, and after each event for what is left of it, it is drawn which threshold a
+    Brownian motion with drift passes first, and when; up to then the voltage goes there in a straight line.
+    `walked` is how far it is from the light, `pace` at what rate it leaves it, `left` the time to the end of
+    the period, `was` what it was above the memory at the end of the last step, and `slip` the rate at which
+    a leak has moved the memory since, which the walk knows as it knows the light.
+    """
+    light = photocurrent(intensity, dark, dark_current)
+    # an event moves the memory by more than any leak in a step
+    event = wp.abs(before - was) > 0.5 * wp.min(on, off)
+    slip_now = wp.where(event, slip, (before - was) / dt)
+    steady = voltage + walked - signal
+    move = steady + slip_now * dt
+    fresh = left < 0.5 * dt
+    horizon = wp.max(wp.where(fresh, period, left), dt)
+    share = floor + (1.0 - floor) * knee / (light + knee)
+    spread = wp.max(sigma * wp.sqrt(share * horizon / period), 1.0e-6)
+    drift = wp.abs(move) * (horizon / dt)
+    way_on = wp.max(on - before, 1.0e-6)
+    way_off = wp.max(off + before, 1.0e-6)
+    # exponents of one sign, as the others overflow
+    steep = 2.0 * drift / (spread * spread)
+    way_along = wp.where(move > 0.0, way_on, way_off)
+    way_back = wp.where(move > 0.0, way_off, way_on)
+    never_back = exponential(-steep * way_back)
+    neither = never_back * exponential(-steep * way_along)
+    still = wp.abs(move) < STILL
+    along = wp.where(still, 0.5, (1.0 - never_back) / wp.max(1.0 - neither, 1.0e-30))
+    goes_along = uniform_3 < along
+    # what is left of a number that has decided is as good as another
+    again = wp.where(goes_along, uniform_3, uniform_3 - along) / wp.where(goes_along, along, 1.0 - along)
+    sign = wp.where(goes_along, 1.0, -1.0) * wp.where(move > 0.0, 1.0, -1.0)
+    way = wp.where(sign > 0.0, way_on, way_off)
+    # the way over an inverse Gaussian time (Michael, Schucany, Haas 1976); a walk that has come against the
+    # drift has taken as long as one along it
+    cosine, _ = cosine_and_sine(uniform_2)
+    square = -2.0 * logarithm(1.0 - uniform) * cosine * cosine  # of a normal number
+    half = wp.where(still, 0.25, 0.5) * square * spread * spread / way
+    fast = drift + half + wp.sqrt(half * (half + 2.0 * drift))
+    slow = drift * drift / wp.max(fast, 1.0e-30)
+    part = wp.where(again * (fast + drift) < fast, fast, slow)
+    drawn = (sign * part - move * (horizon / dt)) / horizon
+    pace_now = wp.where(fresh, drawn, wp.where(event, drawn, pace))
+    change = steady + pace_now * dt
+    ends = before + change
+    # beyond a threshold that it passes the light alone goes on
+    rest = wp.abs(steady) * (1.0 - wp.where(change > 0.0, way_on, way_off) / wp.max(wp.abs(change), 1.0e-12))
+    passes = wp.where(ends > on, 1.0, wp.where(ends < -off, 1.0, 0.0))
+    rest = wp.where(steady * change > 0.0, rest, 0.0) + PAST
+    ends = wp.where(passes > 0.0, wp.where(ends > on, on + rest, -off - rest), ends)
+    now = signal + (ends - before)
+    begins = dt >= REST
+    # a pace that an event has ended is drawn anew: `was` is beyond the threshold, where the memory comes to
+    return (
+        wp.where(begins, voltage, now),
+        wp.where(begins, 0.0, now - voltage),
+        wp.where(begins, 0.0, pace_now),
+        wp.where(begins, 0.0, horizon - dt),
+        wp.where(begins, 0.0, ends),
+        wp.where(begins, 0.0, slip_now),
+    )
+
+
 @wp.func
 def fresh_variance_of_poles(x: float, damping: float, h: float, dh: float):
     """Variance, covariance and variance of noise and its speed that are new after x, behind any two poles.
@@ -229,6 +327,13 @@ class VoltageNoise(Effect):
     of one pole is so rough that its events depend on the sampling: it belongs to scenes whose frames are
     those that the other simulator has seen.
 
+    With `poles = "none"` it is what DVS-Voltmeter draws: the voltage does a random walk that never returns.
+    Its variance after one `period` is the one above, of which no light takes away the share `floor`; from
+    period to period, which are the frames of a clip, and from event to event it goes straight to where and
+    when it would pass a threshold next. Walks get to a threshold that light comes near, so slow changes make
+    their events early, and more of them. A leak counts as light here. At rest the walk has half the variance,
+    as the code of that simulator has.
+
     An ideal memory moves by whole thresholds, so a pixel keeps the phase that it began with, and pixels which
     are alike differ in their rates. One that is held in reset after its events (`refractory`) memorises the
     noise of a later moment: a dead time of a time constant, 1 / (9.8 · corner), forgets the phase within some
@@ -237,7 +342,8 @@ class VoltageNoise(Effect):
 
     name: ClassVar[str] = "voltage_noise"
     source: ClassVar[str] = (
-        "Graca, Delbruck: Unraveling the paradox of intensity-dependent DVS pixel noise, 2021"
+        "Graca, Delbruck: Unraveling the paradox of intensity-dependent DVS pixel noise, 2021; "
+        "Lin, Ma, Guo, Wen: DVS-Voltmeter, stochastic process-based event simulator, 2022 (walk)"
     )
     stages: ClassVar = {"respond": noisy_voltage}
     states: ClassVar = ("noise", "speed")
@@ -285,20 +391,42 @@ class VoltageNoise(Effect):
         about="of the loop around both poles, if they are apart; 0 for one behind the other",
         fitted=False,  # it shows in the spectrum alone
     )
+    period: float = parameter(
+        0.01,
+        unit="s",
+        bounds=(1e-6, 1.0),
+        plausible=(1e-3, 0.1),
+        about="from draw to draw of a walk: the time between frames",
+        fitted=False,  # it is that of the clip
+    )
+    floor: float = parameter(
+        0.0,
+        unit="1",
+        bounds=(0.0, 1.0),
+        plausible=(0.0, 1.0),
+        about="share of the variance of a walk in the dark that no light takes away",
+    )
     poles: str = choice(
         "alike",
-        among=("alike", "apart", "one"),
+        among=("alike", "apart", "one", "none"),
         about="two equal ones at the corner of both, or one that follows the light and a fixed one, or a "
-        "single fixed one whose noise is drawn at each sample of the scene",
+        "single fixed one whose noise is drawn at each sample of the scene, or none and a walk from "
+        "period to period",
     )
 
     @classmethod
     def candidates(cls, observed: Observations) -> list[Self]:
         """Return the noise of equal poles: spectra of poles alike and apart differ less than recordings tell.
 
-        Where events are of a simulator that works frame by frame, that which it draws once a frame.
+        Where events are of a simulator that works frame by frame, that which it draws once a frame. Beside
+        other clips a walk from frame to frame, too, that light takes nothing away of, and one that it does.
         """
-        return [cls(poles="one" if observed.clip_step else "alike")]
+        if observed.clip_step:
+            return [cls(poles="one")]
+        if not observed.clip_frames:
+            return [cls()]
+        walk = cls(poles="none", sigma=0.03, period=observed.clip_frames)
+        return [cls(), replace(walk, floor=1.0), replace(walk, sigma=0.1, knee=0.03)]
 
     def otherwise(self, beside: Sequence[Effect]) -> list[Self]:
         """Return noise of two equal poles for that of one, of the same variance and corner in usual light."""
@@ -311,11 +439,17 @@ class VoltageNoise(Effect):
 
     def begins_at_the_light(self) -> bool:
         """Whether memories begin at the first light, as where noise is drawn from then on."""
-        return self.poles == "one"
+        return self.poles in ("one", "none")
 
     def idle(self, beside: Sequence[Effect]) -> tuple[str, ...]:
         """Return the names of the parameters that change nothing by its rule."""
-        by_rule = {"alike": ("gain",), "apart": (), "one": ("knee", "dark", "gain")}[self.poles]
+        walks = ("period", "floor")
+        by_rule = {
+            "alike": ("gain", *walks),
+            "apart": walks,
+            "one": ("knee", "dark", "gain", *walks),
+            "none": ("cutoff", "gain"),
+        }[self.poles]
         return tuple(dict.fromkeys((*by_rule, *idle_beside(beside))))
 
     @classmethod
@@ -335,6 +469,12 @@ class VoltageNoise(Effect):
 
     def compiled(self) -> EffectStages:
         """Return what the kernel composer needs to know."""
+        if self.poles == "none":
+            return replace(
+                super().compiled(),
+                functions=(("respond", walked_voltage),),
+                states=("walked", "pace", "left", "was", "slip"),
+            )
         respond = {"alike": noisy_voltage, "apart": photoreceptor_noise, "one": noise_by_samples}[self.poles]
         return replace(super().compiled(), functions=(("respond", respond),))
 
@@ -347,6 +487,8 @@ class VoltageNoise(Effect):
             return step
         if self.poles == "one":
             return ANY_SAMPLES
+        if self.poles == "none":
+            return self.period / DRAWN_BY
         # slopes tell where the voltage turns up to so many time constants of the node, in the brightest
         # light; the loop's pace is the geometric mean of those of the poles, and faster by the gain
         node = STEEP * self.knee / (2 * math.pi * self.cutoff * (1 + self.dark))

@@ -18,7 +18,7 @@ from dase.fitting.batch_simulator import BatchSimulator
 from dase.fitting.bus_load import WholeSensor
 from dase.fitting.bus_use import BusUse, highest_event_rate
 from dase.fitting.contradictions import contradiction_of_rest
-from dase.fitting.frame_steps import frame_step_of, is_held, is_too_slow, ticks_are_of_frames
+from dase.fitting.frame_steps import clip_step_of, frame_step_of, is_held, is_too_slow, ticks_are_of_frames
 from dase.fitting.pixel_selection import choose_trusted_pixels, find_trusted_parts
 from dase.fitting.spliced_time import SplicedScene, SplicedTime
 from dase.fitting.subset import Array, CalibratedSubset, PixelSubset
@@ -118,6 +118,7 @@ class SplitMeasurement:
         frames: When the bursts come that are in step with frames, where they are compared.
         frame_step: Time from frame to frame of a clip in step with which all events come [s], 0 if they do
             not, see `frame_step_of`.
+        clip_frames: Time from frame to frame of a clip [s], 0 of another scene.
     """
 
     train: PixelSubset
@@ -134,6 +135,7 @@ class SplitMeasurement:
     contradiction: str = ""
     frames: BurstTimes | None = None
     frame_step: float = 0.0
+    clip_frames: float = 0.0
 
     def observe(self, *, idle_bus: float) -> Observations:
         """Return what effects may choose their candidates by, see `Observations`."""
@@ -154,6 +156,7 @@ class SplitMeasurement:
             frame_begin=frames.begin if frames else 0.0,
             frame_exposure=frames.exposure if frames else 0.0,
             clip_step=self.frame_step,
+            clip_frames=self.clip_frames,
         )
 
     @property
@@ -239,7 +242,7 @@ def split_measurement(
     if trust is None and isinstance(scene, CameraScene):
         trust = scene.is_trusted
     whole = common_grid(events, scene)
-    frame_step = frame_step_of(events, scene) or 0.0
+    frame_step, clip_frames = frame_step_of(events, scene) or 0.0, clip_step_of(scene)
     driven = is_too_slow(frame_step)
     asked = within_span(whole, span)
     # the phase of what goes by a clock of its own would not go on from window to window
@@ -395,7 +398,7 @@ def split_measurement(
         notes.insert(0, contradiction)
     out = SplitMeasurement(
         train, held, last_part, scout, bands, structure, peak, highest, bus, when,
-        tuple(notes), contradiction, frames, frame_step,
+        tuple(notes), contradiction, frames, frame_step, clip_frames,
     )  # fmt: skip
     if out.light_never_changes:
         notes.append(

@@ -228,6 +228,70 @@ def test_noise_of_one_pole_is_that_of_a_simulator_which_draws_it_once_a_frame(de
     np.testing.assert_allclose(dark, got, rtol=0.06)
 
 
+def first_passages(logs, spread, on, off, rng):
+    """Return OFF and ON events of DVS-Voltmeter's rule and the time of each in its frame, in float64.
+
+    In each frame it is drawn which threshold Brownian motion with drift passes first, and when; an event
+    begins it anew, and the rest of the frame goes straight. `logs` (K, N) are log intensities at the frames,
+    `spread` the standard deviation that a walk has after one.
+    """
+    above, counts, times = np.zeros(logs.shape[1]), np.zeros(2), []
+    for drift in np.diff(logs, axis=0):
+        left, going = np.ones(len(drift)), np.arange(len(drift))
+        while len(going):
+            m, a, b = drift[going], on - above[going], off + above[going]
+            rate = np.where(m == 0, 1.0, 2 * m / spread**2)
+            with np.errstate(over="ignore", invalid="ignore"):
+                up = np.where(rate > 0, -np.expm1(-rate * b), np.expm1(rate * b) * np.exp(rate * a))
+                up = up / np.where(rate > 0, -np.expm1(-rate * (a + b)), np.expm1(rate * (a + b)))
+            up = rng.random(len(going)) < np.where(m == 0, 0.5, np.nan_to_num(up))
+            way = np.where(up, a, b)
+            # without drift its times are of a Lévy law, in its code of twice the scale
+            still = 2 * (way / spread) ** 2 / rng.standard_normal(len(going)) ** 2
+            moving = rng.wald(way / np.maximum(np.abs(m), 1e-12), (way / spread) ** 2)
+            took = np.where(m == 0, still, moving)
+            sent = took < left[going]
+            counts += (~up & sent).sum(), (up & sent).sum()
+            times.append(1 - left[going][sent] + took[sent])
+            above[going[~sent]] += (np.where(up, way, -way) * left[going] / took)[~sent]
+            above[going[sent]] = 0.0
+            left[going[sent]] -= took[sent]
+            going = going[sent]
+    return counts, np.concatenate(times)
+
+
+@pytest.mark.parametrize(("spread", "swing"), [(0.02, 0.2), (0.05, 0.2), (0.05, 1.0), (0.1, 0.0), (0.1, 0.5)])
+def test_a_walk_is_that_of_a_simulator_of_brownian_motion(spread, swing, device):
+    pixels, frames, step, on, off = 2000, 121, 0.005, 0.25, 0.2
+    phase = np.random.default_rng(1).uniform(0, 2 * np.pi, pixels)
+    logs = np.log(0.3) + swing * np.sin(2 * np.pi * np.arange(frames)[:, None] / 40 + phase)
+    want, times = first_passages(logs, spread, on, off, np.random.default_rng(5))
+    scene = dase.VideoScene(np.exp(logs).astype(np.float32).reshape(frames, 40, 50), np.arange(frames) * step)
+    walk = VoltageNoise(poles="none", sigma=spread, period=step, floor=1.0)
+    events = dase.simulate(scene, every(Threshold(on=on, off=off, phase=0.0), walk), device=device)
+    got = np.bincount(events.p.astype(int), minlength=2)
+    assert want.sum() > 500
+    np.testing.assert_allclose(got, want, rtol=0.05, atol=4 * np.sqrt(want.max()))
+    # without it another number, unless the change of light makes most of them
+    if swing < 1.0:
+        bare = dase.simulate(scene, every(Threshold(on=on, off=off, phase=0.0)), device=device)
+        assert len(bare.t) < 0.93 * want.sum()
+    shares = np.histogram((events.t / step) % 1.0, 4, (0, 1))[0] / len(events.t)
+    np.testing.assert_allclose(shares, np.histogram(times, 4, (0, 1))[0] / len(times), atol=0.06)
+
+
+def test_a_walk_falls_with_the_light_to_a_floor(device):
+    pixels, frames, step, sigma, knee, floor = 4000, 101, 0.01, 0.12, 0.05, 0.2
+    for light in (0.02, 0.3):
+        share = floor + (1 - floor) * knee / (light + 0.003 + knee)
+        walk = VoltageNoise(poles="none", sigma=sigma, knee=knee, floor=floor, period=step)
+        alike = VoltageNoise(poles="none", sigma=sigma * np.sqrt(share), floor=1.0, period=step)
+        scene = still(np.full(pixels, light), (frames - 1) * step, frames)
+        got, want = (counts(scene, every(one), (frames - 1) * step, device).sum() for one in (walk, alike))
+        assert want > 1000
+        assert got == pytest.approx(want, rel=0.05)
+
+
 def test_voltage_noise_is_stationary_and_returns(device):
     effect = VoltageNoise(sigma=0.12, cutoff=50.0, knee=0.1)
     sensor = every(effect)

@@ -210,6 +210,17 @@ def test_what_a_simulator_does_frame_by_frame_is_tried_where_events_show_one(cli
     assert with_effect_added(model_of(Sensor()), noise).sensor["threshold"].phase == phase
 
 
+def test_a_walk_from_frame_to_frame_is_tried_beside_clips_of_other_simulators():
+    seen = Observations(100.0, 0.0, 0.0, "down", 1e5, 0.1, 0.1, clip_frames=4e-3)
+    own, *walks = EFFECTS["voltage_noise"].candidates(seen)
+    assert own == EFFECTS["voltage_noise"]()
+    assert {(walk.poles, walk.period) for walk in walks} == {("none", 4e-3)}
+    added = with_effect_added(model_of(Sensor()), walks[0])
+    assert added.sensor["threshold"].phase == 0.0
+    assert {"voltage_noise.sigma", "voltage_noise.floor", "voltage_noise.knee"} <= set(added.space.names)
+    assert not {"voltage_noise.cutoff", "voltage_noise.period"} & set(added.space.names)
+
+
 def test_what_is_idle_by_another_rule_is_not_free_there():
     sensor = Sensor().with_effect(EFFECTS["voltage_noise"](sigma=0.05, cutoff=60.0, poles="one"))
     model = model_of(sensor)
