@@ -203,9 +203,14 @@ def worth_descending(
         best[name] = min(one.relative_loss, best.get(name, np.inf))
     first = sorted(best.values())[: settings.followed]
     clear = first[0] < settings.clear_lead
+    # variants that come near the best of their effect are followed with it
+    last = {
+        name: settings.second_start * loss if loss <= first[-1] else first[-1] for name, loss in best.items()
+    }
     return [
         one for one in screenings
-        if one.relative_loss <= first[-1] or not (clear or one.half.streams(one.model.space))
+        if one.relative_loss <= max(first[-1], last[one.effect.name])
+        or not (clear or one.half.streams(one.model.space))
     ]  # fmt: skip
 
 
@@ -414,7 +419,9 @@ def try_effects(
     finalists, behind, certain = list[Candidate](), list[Candidate](), list[Candidate]()
     for fitted, some in (part for part in parts if part[1]):
         refined, left_behind = _refine_candidates(fitted, present, some, seed=seed, settings=settings)
-        behind += left_behind
+        refined = _best_of_each_effect(refined)
+        fitted_names = {one.name for one in refined}
+        behind += [one for one in left_behind if one.name not in fitted_names]
         tested = with_p_values(fitted, present, refined, seed=seed)
         # what chance does as well is not added, whatever its error; few repeats cannot give a small p-value
         significant = max(settings.significant, 1.01 / (1 + len(fitted.train.repeats)))
@@ -425,7 +432,8 @@ def try_effects(
     done = judge(evidence, certain, seed=seed, settings=settings)
     done += [one for one in finalists if one not in certain]
     done.sort(key=lambda one: (one.error if one.judgement else np.inf, one.p_value))
-    return [*done, *behind, *(one for one in order if one not in chosen), *left]
+    names_of_chosen = {one.name for one in chosen}
+    return [*done, *behind, *(one for one in order if one.name not in names_of_chosen), *left]
 
 
 def _refine_candidates(
@@ -472,18 +480,32 @@ def _screen_variants(
         [screen_effect(evidence, present, effect, seed=seed) for effect in variants],
         lambda share: report("looking at all effects", 0.2 * share),
     )
-    race, found = CandidateRace(settings.finalists), dict[str, Candidate]()
+    race, found = CandidateRace(settings.finalists), dict[tuple[str, int], Candidate]()
+    step = evidence.train.frame.step
+    most = samples_of_screening(present.sensor, step)
     works = [
         descend_from_screening(one, race, seed=seed, settings=settings)
         for one in worth_descending(screenings, settings)
     ]
     for tried in run_side_by_side(works, lambda share: report("trying all effects", 0.2 + 0.3 * share)):
-        # of the variants of an effect the best stands for it
-        if tried.name not in found or tried.screened_loss < found[tried.name].screened_loss:
-            found[tried.name] = tried
+        # of the variants of an effect the best stands for it, but one that lost events between the samples of
+        # screening is not to be measured by one that lost fewer
+        wanted = samples_per_step(tried.model.sensor, step)
+        kind = tried.name, wanted if wanted > most else 0
+        if kind not in found or tried.screened_loss < found[kind].screened_loss:
+            found[kind] = tried
     left = {one.effect.name: one.candidate_at(one.places[0], float(one.losses[0])) for one in screenings}
     first = sorted(found.values(), key=lambda one: one.screened_loss)
-    return first, [tried for name, tried in left.items() if name not in found]
+    names = {one.name for one in first}
+    return first, [tried for name, tried in left.items() if name not in names]
+
+
+def _best_of_each_effect(candidates: Sequence[Candidate]) -> list[Candidate]:
+    """Return the candidates without those that another variant of the same effect fits better than."""
+    best = dict[str, Candidate]()
+    for one in sorted(candidates, key=lambda one: one.training_loss):
+        best.setdefault(one.name, one)
+    return [one for one in candidates if best[one.name] is one]
 
 
 def family_specialists(

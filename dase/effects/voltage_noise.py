@@ -126,6 +126,9 @@ STILL = wp.constant(1.0e-6)
 DRAWN_BY = 4
 """Samples in the period of a walk: with one, strong noise has a tenth too few events, and most at its end."""
 
+SHORTEST_PERIOD = 1.5e-3
+"""Time between frames from which on walks are tried [s]: others take many samples and are like fast noise."""
+
 PAST = wp.constant(1.0e-5)
 """How far the line of a step goes beyond a threshold that it passes [log intensity]."""
 
@@ -419,11 +422,12 @@ class VoltageNoise(Effect):
         """Return the noise of equal poles: spectra of poles alike and apart differ less than recordings tell.
 
         Where events are of a simulator that works frame by frame, that which it draws once a frame. Beside
-        other clips a walk from frame to frame, too, that light takes nothing away of, and one that it does.
+        slower clips a walk from frame to frame, too, that light takes nothing away of, and one that
+        it does.
         """
         if observed.clip_step:
             return [cls(poles="one")]
-        if not observed.clip_frames:
+        if observed.clip_frames < SHORTEST_PERIOD:
             return [cls()]
         walk = cls(poles="none", sigma=0.03, period=observed.clip_frames)
         return [cls(), replace(walk, floor=1.0), replace(walk, sigma=0.1, knee=0.03)]
