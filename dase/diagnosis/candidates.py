@@ -409,7 +409,9 @@ def try_effects(
         v for name in names for v in variants_to_try(evidence, effects[name], idle_bus=settings.idle_bus)
     ]
     order, left = _screen_variants(evidence, present, variants, seed=seed, report=report, settings=settings)
-    first = order[: settings.finalists]
+    # two variants of an effect take the place of one
+    names_of_first = list(dict.fromkeys(one.name for one in order))[: settings.finalists]
+    first = [one for one in order if one.name in names_of_first]
     chosen = [*first, *family_specialists(order, first, worst)]
     report(f"fitting {', '.join(one.name for one in chosen)}", 0.5)
     parts = [(evidence, chosen)]
@@ -421,7 +423,7 @@ def try_effects(
         refined, left_behind = _refine_candidates(fitted, present, some, seed=seed, settings=settings)
         refined = _best_of_each_effect(refined)
         fitted_names = {one.name for one in refined}
-        behind += [one for one in left_behind if one.name not in fitted_names]
+        behind += [one for one in _best_of_each_effect(left_behind) if one.name not in fitted_names]
         tested = with_p_values(fitted, present, refined, seed=seed)
         # what chance does as well is not added, whatever its error; few repeats cannot give a small p-value
         significant = max(settings.significant, 1.01 / (1 + len(fitted.train.repeats)))
