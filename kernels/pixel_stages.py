@@ -6,7 +6,8 @@ A pixel turns light into events in this order; each effect adds Warp functions a
     current    (intensity, ...)           -> intensity            what flows in it, as the light that makes it
     log        voltage = log(intensity + log_eps)
     respond    (voltage, intensity, log_eps, ...) -> voltage      photoreceptor; it may ask for the voltage at
-               the end of the last step, `signal`, and for what that is above the memory, `before`
+               the end of the last step, `signal`, for what that is above the memory, `before`, and for the
+               thresholds
     threshold  (on, off, ...)             -> on, off              once per pixel [log intensity]
     redraw     (on, off, ...)             -> on, off              anew after each event; random numbers too
     drift      (intensity, on, off, ...)  -> drift                of the change towards ON [log intensity/s]

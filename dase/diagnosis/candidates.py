@@ -203,13 +203,15 @@ def worth_descending(
         best[name] = min(one.relative_loss, best.get(name, np.inf))
     first = sorted(best.values())[: settings.followed]
     clear = first[0] < settings.clear_lead
-    # variants that come near the best of their effect are followed with it
-    last = {
-        name: settings.second_start * loss if loss <= first[-1] else first[-1] for name, loss in best.items()
-    }
+
+    def near_what_is_followed(one: Screening) -> bool:
+        """Return whether a variant comes near the best of its effect, which is followed."""
+        leader = best[one.effect.name]
+        return leader <= first[-1] and one.relative_loss <= settings.second_start * leader
+
     return [
         one for one in screenings
-        if one.relative_loss <= max(first[-1], last[one.effect.name])
+        if one.relative_loss <= first[-1] or near_what_is_followed(one)
         or not (clear or one.half.streams(one.model.space))
     ]  # fmt: skip
 

@@ -123,8 +123,8 @@ def noise_by_samples(
 STILL = wp.constant(1.0e-6)
 """Change of light in a step below which there is none [log intensity]; float32 resolves 5e-7 of voltages."""
 
-DRAWN_BY = 4
-"""Samples in the period of a walk: with one, strong noise has a tenth too few events, and most at its end."""
+SAMPLES_PER_PERIOD = 4
+"""Of a walk: with one, strong noise has a tenth too few events, and most at its end."""
 
 SHORTEST_PERIOD = 1.5e-3
 """Time between frames from which on walks are tried [s]: others take many samples and are like fast noise."""
@@ -162,8 +162,9 @@ def walked_voltage(
     At the begin of each period, and after each event for what is left of it, it is drawn which threshold a
     Brownian motion with drift passes first, and when; up to then the voltage goes there in a straight line.
     `walked` is how far it is from the light, `pace` at what rate it leaves it, `left` the time to the end of
-    the period, `was` what it was above the memory at the end of the last step, and `slip` the rate at which
-    a leak has moved the memory since, which the walk knows as it knows the light.
+    the period [s], `was` what it was above the memory at the end of the last step, and `slip` the rate at
+    which a leak has moved the memory since, which the walk knows as it knows the light; voltages are
+    log intensities, rates per second.
     """
     light = photocurrent(intensity, dark, dark_current)
     # an event moves the memory by more than any leak in a step
@@ -492,7 +493,7 @@ class VoltageNoise(Effect):
         if self.poles == "one":
             return ANY_SAMPLES
         if self.poles == "none":
-            return self.period / DRAWN_BY
+            return self.period / SAMPLES_PER_PERIOD
         # slopes tell where the voltage turns up to so many time constants of the node, in the brightest
         # light; the loop's pace is the geometric mean of those of the poles, and faster by the gain
         node = STEEP * self.knee / (2 * math.pi * self.cutoff * (1 + self.dark))
