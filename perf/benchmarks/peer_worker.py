@@ -196,14 +196,14 @@ def v2e_runs(clip: Clip, options: argparse.Namespace) -> dict[str, dict[str, Run
     }
 
 
-def openeb_runs(clip: Clip, options: argparse.Namespace) -> dict[str, dict[str, Run]]:
-    """Return what the simulator of Prophesee's OpenEB does (`metavision_core_ml.video_to_event`)."""
-    inside = options.path / "sdk/modules/core_ml/python/pypkg"
-    folder = (inside if inside.is_dir() else options.path) / "metavision_core_ml"
+def find_openeb(path: Path) -> None:
+    """Let `metavision_core_ml.video_to_event` be imported, from a checkout or the folder of its Python."""
+    inside = path / "sdk/modules/core_ml/python/pypkg"
+    folder = (inside if inside.is_dir() else path) / "metavision_core_ml"
     # its packages import the whole SDK, which the simulator does not need
-    for name, path in (("metavision_core_ml", folder), ("metavision_core_ml.video_to_event", None)):
+    for name, at in (("metavision_core_ml", folder), ("metavision_core_ml.video_to_event", None)):
         package = types.ModuleType(name)
-        package.__path__ = [str(path or folder / "video_to_event")]
+        package.__path__ = [str(at or folder / "video_to_event")]
         sys.modules[name] = package
     try:
         import_module("metavision_sdk_base")
@@ -212,6 +212,11 @@ def openeb_runs(clip: Clip, options: argparse.Namespace) -> dict[str, dict[str, 
         names, formats = ["x", "y", "p", "t"], ["<u2", "<u2", "<i2", "<i8"]
         event = np.dtype({"names": names, "formats": formats, "offsets": [0, 2, 4, 8], "itemsize": 16})
         sys.modules["metavision_sdk_base"] = types.SimpleNamespace(EventCD=event)
+
+
+def openeb_runs(clip: Clip, options: argparse.Namespace) -> dict[str, dict[str, Run]]:
+    """Return what the simulator of Prophesee's OpenEB does (`metavision_core_ml.video_to_event`)."""
+    find_openeb(options.path)
     from metavision_core_ml.video_to_event.simulator import EventSimulator
 
     def start(setting: dict[str, float]) -> Any:

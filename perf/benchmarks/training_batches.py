@@ -2,10 +2,15 @@
 
     python -m perf.benchmarks.training_batches --device cuda --batch 64 --steps 24
     python -m perf.benchmarks.training_batches --device cpu --batch 4 --steps 6 --regimes shake
+    python -m perf.benchmarks.training_batches --device cuda --batch 64 --steps 24 --openeb PATH
     python -m perf.benchmarks.training_batches --device cuda --memory 10000
 
 A line of JSON each. A GPU is measured by the clock on the wall, several batches in a row; a CPU, which others
 may share, by the time that this process worked, on one thread.
+
+`--openeb` puts OpenEB's simulator beside it in the same run (`openeb_batches`). It is given pictures that lie
+on the device: making scenes and labels is in the time of `dase.torch.Stream`, not in its own. The ratios are
+of samples per second, to its speed with the same slots and all windows at once, and to its best.
 """
 
 from __future__ import annotations
@@ -15,6 +20,7 @@ import json
 import time
 from collections import Counter
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -23,22 +29,35 @@ import torch
 import dase
 from dase.kernels import launch
 from dase.torch.stream import BatchMaker
+from perf.benchmarks.openeb_batches import measure_openeb, nearest_settings
+
+
+def timer(device: torch.device) -> tuple[Callable[[], float], Callable[[], None]]:
+    """Return the clock [s] that a device is measured by, and what waits for all that it has to do."""
+    if device.type == "cuda":
+        return time.perf_counter, torch.cuda.synchronize
+    return time.process_time, lambda: None
+
+
+def seconds_each(work: Callable[[int], Any], *, device: torch.device, repeats: int) -> float:
+    """Return how long `work`, which is given numbers from 0 on, takes [s] after it was done three times."""
+    clock, wait = timer(device)
+    for number in range(3):
+        work(number)
+    wait()
+    begin = clock()
+    for number in range(3, 3 + repeats):
+        work(number)
+    wait()
+    return (clock() - begin) / repeats
 
 
 def measure_speed(stream: dase.torch.Stream, repeats: int) -> dict[str, Any]:
     """Return windows and pixel samples per second, and what the kernels cost [ms per batch]."""
-    on_gpu = stream.device.type == "cuda"
-    clock: Callable[[], float] = time.perf_counter if on_gpu else time.process_time
-    wait: Callable[[], None] = torch.cuda.synchronize if on_gpu else lambda: None
+    clock, wait = timer(stream.device)
     maker = BatchMaker(stream)
-    for number in range(3):
-        maker.make(number)
-    wait()
-    begin = clock()
-    for number in range(3, 3 + repeats):
-        batch = maker.make(number)
-    wait()
-    each = (clock() - begin) / repeats
+    each = seconds_each(maker.make, device=stream.device, repeats=repeats)
+    batch = maker.make(2 + repeats)
     mass = float(batch.inputs.abs().sum() / batch.frames.numel())
     spent: Counter[str] = Counter()
     plain = launch.run_kernel
@@ -95,6 +114,7 @@ def main() -> None:
     ask.add_argument("--regimes", default="shake,mixed")
     ask.add_argument("--repeats", type=int, default=10)
     ask.add_argument("--memory", type=int, default=0, help="batches to watch the memory over, instead")
+    ask.add_argument("--openeb", type=Path, help="checkout of prophesee-ai/openeb, or folder of its Python")
     args = ask.parse_args()
     if args.device == "cpu":
         launch.set_threads(1)
@@ -104,7 +124,13 @@ def main() -> None:
         regimes=tuple(args.regimes.split(",")), device=args.device, renew=500 if args.memory else 0,
     )  # fmt: skip
     found = watch_memory(stream, args.memory) if args.memory else measure_speed(stream, args.repeats)
-    print(json.dumps(vars(args) | found))
+    if args.openeb and not args.memory:
+        measured = partial(seconds_each, device=stream.device, repeats=args.repeats)
+        rows = measure_openeb(args.openeb, stream, measured)
+        found |= {"openeb": rows, "openeb_settings": nearest_settings(stream.sensor)}
+        ratios = [found["Gsample_per_s"] / row["Gsample_per_s"] for row in rows]
+        found |= {"times_openeb": round(ratios[0], 2), "times_openeb_at_its_best": round(min(ratios), 2)}
+    print(json.dumps(vars(args) | found, default=str))
 
 
 if __name__ == "__main__":
