@@ -59,6 +59,8 @@ def search_effects(
         model = _fit_all_of_the_time(state, compared, model, judgement)
         model, judgement = _add_one_by_one(state, compared, model, _left_to_add(state, model, most))
     if not reaches_floor(judgement) and most > 1:
+        model, judgement = _go_the_other_way(state, compared, model, judgement, most)
+    if not reaches_floor(judgement) and most > 1:
         single = model
         model, judgement = add_pair(state, model, judgement)
         if model is not single and not leaves_nothing(judgement):
@@ -71,6 +73,46 @@ def search_effects(
             # a stand-in that was dropped may have hidden what it stood for
             model, judgement = _add_one_by_one(state, compared, model, _left_to_add(state, model, most))
     return _fit_beyond_the_search(state, model, judgement)
+
+
+def _go_the_other_way(
+    state: DiagnosisState, compared: ComparedMeasurement, model: FittedModel, judgement: Judgement, most: int
+) -> tuple[FittedModel, Judgement]:
+    """Add one effect after the other once more, beginning with the one that came next in the first step.
+
+    What stands in for two effects may leave less than either, and hides what shows beside the right one.
+
+    Args:
+        state: Its steps become those of this way, where it is the better one.
+        compared: The measurement.
+        model: The last one of the first way.
+        judgement: Its held-out error.
+        most: Effects that are added at most.
+    """
+    settings, at = state.settings, state.first_step
+    if not state.first:
+        return model, judgement
+    first = state.history[at]
+    reach = settings.other_way * state.first[0].screened_loss
+    open_ = [
+        one for one in state.first
+        if one.name != first.chosen and one.name not in state.added_to(model)
+        and one.screened_loss < min(reach, settings.pair_helps_alone)
+    ]  # fmt: skip
+    if not open_:
+        return model, judgement
+    other, before = open_[0], state.ways()
+    state.history, state.path = state.history[:at], state.path[: at + 1]
+    state.history.append(replace(first, chosen=other.name, ties=()))
+    judged_with_it = [one for one in state.first if one.judgement]
+    state.note_addition(other, judged_with_it, (), state.judge(state.path[at]))
+    begin = refit_model(state.evidence, other.model, seed=state.seed, rounds=1)
+    found, judged = _add_one_by_one(state, compared, begin, _left_to_add(state, begin, most))
+    gain = 1.0 if reaches_floor(judged) else settings.pair_gain
+    if judged.error < gain * judgement.error:
+        return found, judged
+    state.go_back(before)
+    return model, judgement
 
 
 def _fit_beyond_the_search(

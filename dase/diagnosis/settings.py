@@ -282,6 +282,10 @@ class DiagnosisSettings:
     more pixels would tell is less than what most candidates leave. Judged as well after a fit to the scout, a
     bandwidth was left behind a second pole (1.57 and 0.36 in place of 0.30 and 0.39)."""
 
+    other_way: float = 1.5
+    """Where one effect after the other does not reach the floor, they are tried once more with another first
+    one, if that one's screening left less than this, in units of the best's."""
+
     paired: int = 6
     """Candidates that are tried two at a time where one after the other is not enough."""
 

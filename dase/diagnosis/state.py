@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from typing import NamedTuple
 
 from dase.diagnosis.candidates import Candidate
 from dase.diagnosis.settings import DEFAULTS, DiagnosisSettings
@@ -103,6 +104,19 @@ class DiagnosisState:
         if reaches_floor(without):
             self.without[best.name] = without
 
+    def ways(self) -> _Ways:
+        """Return how this model was come to, for `go_back`."""
+        return _Ways(
+            list(self.history), list(self.path), dict(self.alternatives), dict(self.error_of),
+            dict(self.ties), dict(self.without), self.certain,
+        )  # fmt: skip
+
+    def go_back(self, ways: _Ways) -> None:
+        """Forget what was tried since."""
+        self.history, self.path, self.alternatives, self.error_of, self.ties, self.without, self.certain = (
+            ways
+        )
+
     def has_asked(self, model: FittedModel) -> bool:
         """Whether all effects were tried beside those of a model before, wherever its values were."""
         mine = {effect.name for effect in model.space.sensor.effects}
@@ -114,6 +128,18 @@ class DiagnosisState:
     def added_to(self, model: FittedModel) -> tuple[str, ...]:
         """Return the effects of a model that the given sensor did not have."""
         return tuple(e.name for e in model.space.sensor.effects if e.name not in self.given)
+
+
+class _Ways(NamedTuple):
+    """What a search changes of a state."""
+
+    history: list[Step]
+    path: list[FittedModel]
+    alternatives: dict[str, list[Candidate]]
+    error_of: dict[str, float]
+    ties: dict[str, set[str]]
+    without: dict[str, Judgement]
+    certain: frozenset[str]
 
 
 def explains_remainder(

@@ -1,0 +1,105 @@
+"""A search that does not reach the floor begins once more with what came next in its first step."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+
+from dase.diagnosis import effect_search
+from dase.diagnosis.effect_search import _go_the_other_way
+from dase.diagnosis.settings import DEFAULTS
+from dase.diagnosis.state import DiagnosisState
+from dase.effects import EFFECTS
+from dase.fitting.model import FittedModel, model_of
+from dase.results import Step
+from dase.simulation.sensor import Sensor
+
+GATE = 1.2
+
+
+def model_with(*names: str) -> FittedModel:
+    sensor = Sensor()
+    for name in names:
+        sensor = sensor.with_effect(EFFECTS[name]())
+    return model_of(sensor)
+
+
+def judged(error: float) -> Any:
+    return SimpleNamespace(error=error, gate=GATE, level=1.0, reach=GATE, families={}, family_gate=GATE)
+
+
+def tried(name: str, loss: float) -> Any:
+    return SimpleNamespace(
+        name=name, screened_loss=loss, error=loss, judgement=judged(loss), model=model_with(name)
+    )
+
+
+def step(chosen: str | None, *effects: str) -> Step:
+    return Step(("threshold", *effects), 5.0, GATE, {}, (), chosen, (), ())
+
+
+@pytest.fixture
+def state(monkeypatch) -> DiagnosisState:
+    """A search that took `linlog` first, beside which nothing helps; `dark` came next."""
+    monkeypatch.setattr(effect_search, "refit_model", lambda evidence, model, **how: model)
+    monkeypatch.setattr(DiagnosisState, "judge", lambda self, model, **how: judged(5.0))
+    found = DiagnosisState(
+        SimpleNamespace(), EFFECTS, 0, lambda *told: None, frozenset({"threshold"}),
+        first=[tried("linlog", 0.60), tried("dark", 0.62), tried("leak", 0.95), tried("shot", 0.99)],
+        history=[step("linlog"), step(None, "linlog")], path=[model_with(), model_with("linlog")],
+    )  # fmt: skip
+    found.alternatives["linlog"] = list(found.first[1:])
+    return found
+
+
+def searched(monkeypatch, state: DiagnosisState, end: float) -> tuple[list[tuple[str, ...]], tuple[Any, Any]]:
+    """Return from which effects the search began once more, and its result, if a leak beside leaves `end`."""
+    begun = []
+
+    def add_leak(state, compared, model, most):
+        begun.append((state.added_to(model), most))
+        state.path += [model, model_with("dark", "leak")]
+        state.history += [step("leak", "dark"), step(None, "dark", "leak")]
+        return state.path[-1], judged(end)
+
+    monkeypatch.setattr(effect_search, "_add_one_by_one", add_leak)
+    return begun, _go_the_other_way(state, None, model_with("linlog"), judged(2.0), 4)
+
+
+def test_the_better_way_is_taken(monkeypatch, state):
+    begun, (model, judgement) = searched(monkeypatch, state, 1.1)
+    assert begun == [(("dark",), 3)]
+    assert state.added_to(model) == ("dark", "leak")
+    assert judgement.error == 1.1
+    assert [one.chosen for one in state.history] == ["dark", "leak", None]
+    assert [state.added_to(one) for one in state.path] == [(), ("dark",), ("dark", "leak")]
+    assert [one.name for one in state.alternatives["dark"]] == ["linlog", "leak", "shot"]
+
+
+@pytest.mark.parametrize("end", [1.9, 3.0])
+def test_a_way_that_gains_little_is_forgotten(monkeypatch, state, end):
+    before = state.ways()
+    _, (model, judgement) = searched(monkeypatch, state, end)
+    assert state.added_to(model) == ("linlog",)
+    assert judgement.error == 2.0
+    assert state.ways() == before
+    assert "dark" not in state.alternatives
+
+
+@pytest.mark.parametrize("loss", [0.91, 0.985])
+def test_what_explains_far_less_begins_no_other_way(monkeypatch, state, loss):
+    state.first[1] = tried("dark", loss)
+    begun, (model, _) = searched(monkeypatch, state, 1.1)
+    assert not begun
+    assert state.added_to(model) == ("linlog",)
+    assert loss > 0.6 * DEFAULTS.other_way or loss > DEFAULTS.pair_helps_alone
+
+
+def test_what_the_first_way_found_begins_no_other(monkeypatch, state):
+    begun = []
+    monkeypatch.setattr(effect_search, "_add_one_by_one", lambda *given: begun.append(given))
+    both = model_with("linlog", "dark")
+    assert _go_the_other_way(state, None, both, judged(2.0), 4)[0] is both
+    assert not begun
