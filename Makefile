@@ -6,17 +6,22 @@ JOBS ?= 2
 # a file's tests stay in one process, where they share what they compile and simulate
 PYTEST := $(BIN)/python -m pytest -q -n $(JOBS) --dist loadfile --no-loadscope-reorder
 
+# tests start some 150 processes: the first of them that imports a module compiles it, not each, and not pip,
+# which would compile many more
+unexport PYTHONDONTWRITEBYTECODE
+INSTALL := $(PIP) install --quiet --no-compile --no-deps
+
 .PHONY: demo test test-all lint perf clean
 
 .venv/ready: pyproject.toml constraints.txt constraints-cuda.txt
 	$(PYTHON) -m venv .venv
 	# PyTorch without CUDA, a tenth of the size, where pip is told of a place that has it; else what comes next
 	sed -n '/^torch==/,/[^\\]$$/p' constraints.txt | sed '1s/ /+cpu /' > .venv/torch-cpu.txt
-	$(PIP) install --quiet --no-deps --require-hashes --requirement .venv/torch-cpu.txt 2>/dev/null || true
-	$(PIP) install --quiet --no-deps --require-hashes --requirement constraints.txt
+	$(INSTALL) --require-hashes --requirement .venv/torch-cpu.txt 2>/dev/null || true
+	$(INSTALL) --require-hashes --requirement constraints.txt
 	if $(BIN)/python -c "import importlib.metadata as m, sys; sys.exit('cuda' not in str(m.requires('torch')))"; then \
-	    $(PIP) install --quiet --no-deps --require-hashes --requirement constraints-cuda.txt; fi
-	$(PIP) install --quiet --no-deps --no-build-isolation --editable .
+	    $(INSTALL) --require-hashes --requirement constraints-cuda.txt; fi
+	$(INSTALL) --no-build-isolation --editable .
 	$(PIP) check
 	touch $@
 
