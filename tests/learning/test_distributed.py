@@ -80,9 +80,9 @@ def flat(value, at=""):
 
 @pytest.mark.slow
 def test_two_processes_do_what_one_does_with_all_scenes(tmp_path):
+    one = steps(slice(None))  # which compiles what both processes then load
     run_as_two_processes(str(Path(__file__)), str(tmp_path / "two.pt"))
     two = torch.load(tmp_path / "two.pt", weights_only=True)
-    one = steps(slice(None))
     found, wanted = dict(flat(two)), dict(flat(one))
     assert found.keys() == wanted.keys()
     assert sum("gradients" in name for name in wanted) == 4
