@@ -74,11 +74,11 @@ class GroupCounts:
     def _count_block(self, block: Events) -> None:
         s = self.settings
         kept = ~self._hot[block.y.astype(np.int64) * block.width + block.x]
-        t, x, y = block.t[kept], block.x[kept].astype(np.int64), block.y[kept].astype(np.int64)
+        t, x, y = block.t[kept], block.x[kept].astype(np.int32), block.y[kept].astype(np.int32)
         if len(t) <= s.lags[-1]:
             return
         # files sort events of one stamp as they like: that is no readout
-        order = np.lexsort((self._random.random(len(t)), t))
+        order = _shuffled_within_stamps(t, self._random)
         x, y = x[order], y[order]
         free = [~_may_be_of_an_edge(t, *axes, s) for axes in ((x, y), (y, x))]
         for i in range(s.together):
@@ -94,8 +94,8 @@ class GroupCounts:
     def _count_pairs(
         self,
         t: NDArray[np.float64],
-        along: NDArray[np.int64],
-        across: NDArray[np.int64],
+        along: NDArray[np.int32],
+        across: NDArray[np.int32],
         free: NDArray[np.bool_],
     ) -> tuple[NDArray[np.int64], NDArray[np.float64], int]:
         """Return pairs of successive events, mean pairs of later ones, each (2,), and all later pairs.
@@ -108,11 +108,13 @@ class GroupCounts:
         def shared(lag: int) -> tuple[NDArray[np.int64], int, float]:
             """Return pairs of one line and of lines near by, all pairs soon enough, and their share."""
             soon = t[lag:] - t[:-lag] < s.span
-            kept = soon & free[lag:] & free[:-lag]
-            far, apart = np.abs(along[lag:] - along[:-lag])[kept], np.abs(across[lag:] - across[:-lag])[kept]
-            line = apart[(far > s.away) & (apart <= s.beside)]
+            kept = np.flatnonzero(soon & free[lag:] & free[:-lag])
+            apart = np.abs(across[kept + lag] - across[kept])
+            near = kept[apart <= s.beside]
+            far = np.abs(along[near + lag] - along[near]) > s.away
+            line = apart[apart <= s.beside][far]
             same = np.count_nonzero(line == 0)
-            return np.array([same, len(line) - same]), int(kept.sum()), float(soon.mean())
+            return np.array([same, len(line) - same]), len(kept), float(soon.mean())
 
         if len(t) <= s.lags[-1]:
             return nothing
@@ -135,8 +137,18 @@ class GroupCounts:
         return np.array(self._next, np.float64), np.array(self._later, np.float64)
 
 
+def _shuffled_within_stamps(t: NDArray[np.float64], random: np.random.Generator) -> NDArray[np.int64]:
+    """Return an order of events, sorted by time, in which those of one stamp come as they like."""
+    draws = random.random(len(t))
+    order = np.arange(len(t))
+    alike = t[1:] == t[:-1]
+    shared = np.flatnonzero(np.append(alike, False) | np.append(False, alike))
+    order[shared] = shared[np.lexsort((draws[shared], t[shared]))]
+    return order
+
+
 def _may_be_of_an_edge(
-    t: NDArray[np.float64], along: NDArray[np.int64], across: NDArray[np.int64], settings: GroupingSettings
+    t: NDArray[np.float64], along: NDArray[np.int32], across: NDArray[np.int32], settings: GroupingSettings
 ) -> NDArray[np.bool_]:
     """Return which events an edge along their line may have made, shape (N,).
 
@@ -152,8 +164,9 @@ def _may_be_of_an_edge(
         settings: How near is beside; the longest time.
     """
     count, index = len(t), np.arange(len(t))
-    pixel = across * (1 << 16) + along
-    order = np.lexsort((index, pixel))
+    pixel = across.astype(np.int64) * (1 << 16) + along
+    # lexsort keeps what is alike in its order, and counts numbers of 16 bits instead of comparing them
+    order = np.lexsort((along.astype(np.uint16), across.astype(np.uint16)))
     gaps = np.where(np.diff(pixel[order]) == 0, np.diff(t[order]), settings.span)
     alone = np.full(1, settings.span)
     own = np.empty(count)
