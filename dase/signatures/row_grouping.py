@@ -174,10 +174,15 @@ def _may_be_of_an_edge(
     own = np.minimum(own, settings.span)
     # at least as far as the events with which successive ones are compared, and all of one stamp
     reach = settings.lags[-1]
-    low = np.minimum(np.searchsorted(t, t - own), np.searchsorted(t, t) - reach)
-    high = np.maximum(np.searchsorted(t, t + own, "right"), np.searchsorted(t, t, "right") + reach) - 1
+    begins = np.flatnonzero(np.append(True, np.diff(t) > 0))  # of stamps
+    lengths = np.diff(np.append(begins, count))
+    low = np.maximum(np.repeat(begins, lengths) - reach, 0)
+    high = np.minimum(np.repeat(begins + lengths, lengths) + reach, count) - 1
+    # times are searched only where they lie further off than that
+    early, late = t[low] >= t - own, t[high] <= t + own
+    low[early] = np.searchsorted(t, (t - own)[early])
+    high[late] = np.searchsorted(t, (t + own)[late], "right") - 1
     cut = (t - own < t[0]) | (t + own > t[-1])  # what is beside them is not at hand
-    low, high = np.maximum(low, 0), np.minimum(high, count - 1)
     keys = (pixel * count + index)[order]
     low, high = keys + (low[order] - index[order]), keys + (high[order] - index[order])
     near = cut[order]
