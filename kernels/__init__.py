@@ -2,7 +2,8 @@
 
 In the order of the pipeline:
 
-- `compiler_flags`, `launch`, `threads`: how and where work runs, and how CPU work is spread over threads;
+- `compiler_flags`, `kept_headers`, `launch`, `threads`: how and where work runs and kernels are compiled, and
+  how CPU work is spread over threads;
 - `vector_math`, `vec4`, `random`: arithmetic on several pixels at once, loads and stores, random numbers;
 - `scene_layers`, `scene_batch`, `scene_frames`, `scene_blur`, `scene_render`: scenes to intensity and flow;
 - `stored_levels`: pictures of 8 bits, which a CPU's kernels look up as they are;

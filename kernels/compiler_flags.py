@@ -1,7 +1,7 @@
 """The flags with which all kernels are compiled for a CPU.
 
-Clang reads Warp's headers once for each set of flags in each process, which takes 1.5 to 3 s: as long as
-several kernels. So there is one set.
+Clang reads Warp's headers anew for each set of flags, which takes 1.5 to 3 s: as long as several kernels. So
+there is one set.
 """
 
 import warp as wp

@@ -18,6 +18,7 @@ from typing import Any, TypeVar
 import numpy as np
 import warp as wp
 
+from dase.kernels.kept_headers import keep_headers
 from dase.kernels.threads import keep_thread_count
 from dase.kernels.threads import thread_count as thread_count
 
@@ -78,6 +79,7 @@ def _start_warp() -> None:
     with _starting:
         if wp._src.context.runtime is None:
             _init_quietly()
+        keep_headers(wp._src.context.runtime)
         # only now: Warp shows a runtime before its modules are ready
         _started = True
 
