@@ -125,7 +125,7 @@ class OneMode(Readout):
     ],
 )
 def test_a_users_readout_is_diagnosed_as_that_of_dase(hidden, own, users, device):
-    scene = moving_bars(duration=0.5)
+    scene = moving_bars(duration=0.3)
     events = dase.simulate(scene, Sensor((THRESHOLD,)).with_effect(hidden), seed=3, device=device)
     found = [
         diagnose(
