@@ -87,9 +87,9 @@ def test_wrong_sensor(text, message, tmp_path):
 def test_wrong_pictures(tmp_path):
     folder = tmp_path / "pictures"
     folder.mkdir()
-    assert "found none" in one_sentence(dase("synth", tmp_path / "out", *SMALL, "--images", folder))
+    assert "found none" in refusal("synth", tmp_path / "out", *SMALL, "--images", folder)
     (folder / "broken.png").write_bytes(b"\x89PNG\r\n\x1a\n but no picture")
-    said = one_sentence(dase("synth", tmp_path / "out", *SMALL, "--images", folder))
+    said = refusal("synth", tmp_path / "out", *SMALL, "--images", folder)
     assert "broken.png" in said
     assert not list((tmp_path / "out").glob("*sequence*"))
 
@@ -109,8 +109,8 @@ def test_synth_then_show(tmp_path):
     assert shown.returncode == 0, shown.stderr
     assert cv2.imread(str(out / "sequence_00000.png")) is not None
     # a second run must not overwrite the first
-    assert "resume it" in one_sentence(dase("synth", out, *SMALL))
-    assert "other options" in one_sentence(dase("synth", out, *SMALL, "--resume", "--seed", "9"))
+    assert "resume it" in refusal("synth", out, *SMALL)
+    assert "other options" in refusal("synth", out, *SMALL, "--resume", "--seed", "9")
 
 
 def test_video(tmp_path):
@@ -120,9 +120,9 @@ def test_video(tmp_path):
         picture = np.full((24, 32), 60, np.uint8)
         picture[:, i : i + 8] = 220
         cv2.imwrite(str(folder / f"{i:03d}.png"), picture)
-    said = one_sentence(dase("synth", tmp_path / "v.npz", "--video", "nowhere.mp4"))
+    said = refusal("synth", tmp_path / "v.npz", "--video", "nowhere.mp4")
     assert "nowhere.mp4 does not exist" in said
-    assert "give its frame rate" in one_sentence(dase("synth", tmp_path / "v.npz", "--video", folder))
+    assert "give its frame rate" in refusal("synth", tmp_path / "v.npz", "--video", folder)
     done = dase(
         "synth", tmp_path / "v.npz", "--video", folder, "--fps", "1000", "--sensor", "ideal", "--gamma", "1"
     )
@@ -182,7 +182,7 @@ def test_effects():
     assert "Hz" in shown.stdout
     assert "plausible" in shown.stdout
     assert "Source: " in shown.stdout
-    assert "did you mean 'leak'?" in one_sentence(dase("effects", "show", "leek"))
+    assert "did you mean 'leak'?" in refusal("effects", "show", "leek")
 
 
 @pytest.mark.parametrize("suffix", [".npz", ".raw", ".txt"])
@@ -204,7 +204,7 @@ def test_convert_and_info(suffix, tmp_path, rng):
     told = dase("info", target)
     assert told.returncode == 0, told.stderr
     assert "64 x 48" in told.stdout
-    assert "unknown format '.xyz'" in one_sentence(dase("convert", tmp_path / "a.h5", tmp_path / "b.xyz"))
+    assert "unknown format '.xyz'" in refusal("convert", tmp_path / "a.h5", tmp_path / "b.xyz")
 
 
 BROKEN = [

@@ -85,15 +85,19 @@ def test_limits_agree_with_simulation(name, pixels):
     field = limit.parameter.split(".")[1]
     # what else would have been seen in these is not asked
     brief = replace(DEFAULTS, detection=replace(DEFAULTS.detection, repeats=1, measurements=2, strengths=1))
-    named = {}
-    for share in (2.0, 0.25):
-        effect = EFFECTS[name](**{field: share * limit.strength})
-        found = [
-            look(scene, effect, seed=20 + k, library=library, settings=brief, pixels=pixels) for k in range(4)
-        ]
-        named[share] = sum(bool(one.findings) for one in found)
-    assert named[2.0] >= 3
-    assert named[0.25] <= 1
+
+    def three_of_four(share: float, *, named: bool) -> bool:
+        """Return whether it is named, or not, in three of four recordings; those that decide are made."""
+        effect, agree = EFFECTS[name](**{field: share * limit.strength}), 0
+        for k in range(4):
+            found = look(scene, effect, seed=20 + k, library=library, settings=brief, pixels=pixels)
+            agree += bool(found.findings) == named
+            if agree == 3 or agree < k:
+                break
+        return agree == 3
+
+    assert three_of_four(2.0, named=True)
+    assert three_of_four(0.25, named=False)
 
 
 @pytest.mark.parametrize("name", ["leak", "voltage_noise"])

@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 import pytest
-from helpers.command_line import dase, one_sentence
+from helpers.command_line import dase, refusal
 from scipy.stats import norm
 
 from dase import InputError, Sensor
@@ -163,8 +163,6 @@ def test_command(tmp_path):
     assert "Record static dark for 0.2 s" in done.stdout
     assert "one and two differ" in done.stdout
     assert (tmp_path / "powers.png").stat().st_size > 10_000
-    assert "none.toml does not exist" in one_sentence(
-        dase("distinguish", "one.toml", "none.toml", cwd=tmp_path)
-    )
-    wrong = dase("distinguish", "one.toml", "two.toml", "-o", "powers.gif", cwd=tmp_path)
-    assert "must end with .png" in one_sentence(wrong)
+    assert "none.toml does not exist" in refusal("distinguish", "one.toml", "none.toml", cwd=tmp_path)
+    wrong = refusal("distinguish", "one.toml", "two.toml", "-o", "powers.gif", cwd=tmp_path)
+    assert "must end with .png" in wrong

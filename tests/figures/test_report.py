@@ -12,7 +12,7 @@ from html.parser import HTMLParser
 import cv2
 import numpy as np
 import pytest
-from helpers.command_line import dase, one_sentence
+from helpers.command_line import dase, refusal
 
 from dase import Events, InputError, Sensor, VideoScene, io, simulate
 from dase.effects import EFFECTS
@@ -385,5 +385,5 @@ def test_compare_writes_a_report(tmp_path, rng):
     numbers = json.loads((tmp_path / "report.json").read_text())
     assert f"{format_number(numbers['error'])} times the noise floor" in page.words
     for name in ("report.txt", "nowhere/report.html"):
-        said = one_sentence(dase("compare", "mine.toml", "a.h5", "-o", name, cwd=tmp_path))
+        said = refusal("compare", "mine.toml", "a.h5", "-o", name, cwd=tmp_path)
         assert "must end with .html" in said or "folder 'nowhere' does not exist" in said

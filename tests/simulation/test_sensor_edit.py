@@ -7,7 +7,7 @@ import datetime
 import cv2
 import numpy as np
 import pytest
-from helpers.command_line import dase, one_sentence, refusal
+from helpers.command_line import dase, refusal
 
 from dase import InputError, Sensor, VideoScene, dump_sensor, io, load_sensor, simulate
 from dase.diagnosis.sensor_update import round_parameters
@@ -255,8 +255,7 @@ def test_add_and_fit(tmp_path, rng):
     assert entry.error_before > 2 * entry.error_after
     assert f"error {entry.error_before:.2f} before" in done.stdout
     assert "# fitted (was 0.2: mine)" in (tmp_path / "mine.toml").read_text()
-    wrong = dase("add", "mine.toml", "shot", "--fit", "none.h5", cwd=tmp_path)
-    assert "none.h5" in one_sentence(wrong)
+    assert "none.h5" in refusal("add", "mine.toml", "shot", "--fit", "none.h5", cwd=tmp_path)
 
 
 def test_adding_a_dark_current_says_what_it_takes_the_place_of(tmp_path):

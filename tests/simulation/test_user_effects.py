@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from helpers.command_line import SMALL, dase, one_sentence
+from helpers.command_line import SMALL, dase, refusal
 
 from dase import InputError, Sensor, VideoScene, io, load_sensor, simulate
 from dase.effects import EFFECTS
@@ -206,7 +206,7 @@ def test_commands(tmp_path):
     assert "afterglow.py written" in written_by.stdout
     shown = dase("effects", "show", "afterglow", "--effects", "afterglow.py", cwd=tmp_path)
     assert "strength = 0.5" in shown.stdout
-    assert "(--effects)" in one_sentence(dase("effects", "show", "afterglow", cwd=tmp_path))
+    assert "(--effects)" in refusal("effects", "show", "afterglow", cwd=tmp_path)
     listed = dase("effects", "list", "--effects", "afterglow.py", cwd=tmp_path)
     assert listed.stdout.splitlines()[-1].startswith("afterglow")
 
@@ -214,7 +214,7 @@ def test_commands(tmp_path):
     sensor.write_text("[threshold]\n[afterglow]\nstrength = 3.0\n")
     with pytest.raises(InputError, match=re.escape("(your own needs its file)")):
         load_sensor(sensor)
-    assert "(--effects)" in one_sentence(dase("synth", "out", *SMALL, "--sensor", sensor, cwd=tmp_path))
+    assert "(--effects)" in refusal("synth", "out", *SMALL, "--sensor", sensor, cwd=tmp_path)
     small = (
         *SMALL[:4],
         "--regime",
