@@ -144,14 +144,12 @@ def intervals_of(events: Events, pixels: NDArray[np.int64] | None = None) -> Arr
         pixels: Row-major indices of those that count, shape (K,); None for all.
     """
     at = events.y.astype(np.int64) * events.width + events.x
-    t = events.t
+    order = np.lexsort((events.x, events.y))
     if pixels is not None:
         counts = np.zeros(events.width * events.height, bool)
         counts[pixels] = True
-        kept = counts[at]
-        at, t = at[kept], t[kept]
-    order = np.argsort(at, kind="stable")
-    at, t = at[order], t[order]
+        order = order[counts[at][order]]
+    at, t = at[order], events.t[order]
     out: Array = np.sort(np.diff(t)[at[1:] == at[:-1]])
     return out
 

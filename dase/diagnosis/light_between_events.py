@@ -109,7 +109,7 @@ def light_steps(
     width = scene.width
     events = events.select((events.y >= rows[0]) & (events.y < rows[1]))
     pixel = (events.y.astype(np.int64) - rows[0]) * width + events.x
-    order = np.argsort(pixel, kind="stable")
+    order = np.lexsort((events.x, events.y))
     pixel, t, p = pixel[order], events.t[order], np.asarray(events.p, bool)[order]
     level, speed = _light_at(scene, times, pixel + rows[0] * width, t, log_eps, settings)
     darkest = np.quantile(level, 0.99) + math.log(settings.darkest) if len(level) else 0.0

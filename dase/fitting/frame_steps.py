@@ -93,7 +93,7 @@ def frame_step_of(events: Events, scene: Scene, settings: FrameStepSettings = FR
         return None
     microseconds = max(1e6 * float(t[-1] - t[0]), 1.0)
     anywhere = microseconds * -np.expm1(-len(t) / microseconds)
-    if len(np.unique(np.round(1e6 * t))) > settings.distinct * anywhere:
+    if 1 + np.count_nonzero(np.diff(np.round(1e6 * t))) > settings.distinct * anywhere:
         return None
     phase = ((t - times[0]) / step) % 1.0
     # frames and the middle between two lie in the middle of parts

@@ -99,9 +99,10 @@ def holds_frames(events: Events, scene: Scene, settings: HeldClipSettings = HELD
         return False
     times = scene.sample_times()
     first, last = np.searchsorted(events.t, [times[1], times[-2]])
-    chosen = np.unique(np.linspace(first, last - 1, settings.events).astype(np.int64))
     if last - first < settings.least:
         return False
+    chosen = np.linspace(first, last - 1, settings.events).astype(np.int64)
+    chosen = chosen[np.diff(chosen, prepend=-1) > 0]
     t, p = events.t[chosen], np.asarray(events.p, bool)[chosen]
     pixel = events.y[chosen].astype(np.int64) * events.width + events.x[chosen]
     frame = np.searchsorted(times, t, side="right") - 1

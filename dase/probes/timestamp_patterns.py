@@ -157,7 +157,7 @@ def spread_over(t: NDArray[np.float64], step: float) -> bool:
 def line_time(events: Events, direction: str) -> float:
     """Return the time from line to line of a readout [s], 0 where there is none in this direction."""
     lines, place = readout_lines(events, direction)
-    order = np.lexsort((events.t, place))
+    order = np.argsort(place.astype(np.uint16), kind="stable")  # times are in order
     t, where = events.t[order], place[order]
     gaps = np.diff(t)[where[1:] == where[:-1]]
     gaps = gaps[gaps > PATTERNS.shortest]
