@@ -176,7 +176,7 @@ def test_intervals_cover_the_truth(scene, device):
 def test_a_fit_from_far_away(scene, device):
     events = hidden(scene, device, EFFECTS["leak"](rate=4.0))
     given = Sensor(effects=(EFFECTS["threshold"](on=0.5, off=0.1),)).with_effect(EFFECTS["leak"](rate=0.3))
-    got = fit(events, given, scene=scene, pixels=PIXELS, device=device)
+    got = fit(events, given, scene=scene, pixels=FEWER, device=device)
     assert got.error < 1 < got.before
     assert got.sensor["threshold"].off == pytest.approx(0.22, rel=0.05)
     assert got.parameters["leak.rate"].value == pytest.approx(4.0, rel=0.15)
