@@ -90,7 +90,8 @@ def _go_the_other_way(
         most: Effects that are added at most.
     """
     settings, at = state.settings, state.first_step
-    if not state.first:
+    # a number of samples and no time, so that what is found does not hang on the machine
+    if not state.first or state.samples > settings.other_way_samples:
         return model, judgement
     first = state.history[at]
     reach = settings.other_way * state.first[0].screened_loss
@@ -211,6 +212,7 @@ def _fit_all_of_the_time(
     """Split the measurement anew, so that all of its time is fitted; return the model, fitted to that."""
     state.progress("fitting all of the time", 0.0, judgement.error)
     state.evaluations_before += state.evidence.evaluations
+    state.samples_before += state.evidence.samples
     evidence = compared.split(all_time=True)
     if compared.guessed is not None:
         evidence = with_scene_doubt(evidence, compared.guessed, model, seed=state.seed)

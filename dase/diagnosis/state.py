@@ -45,6 +45,7 @@ class DiagnosisState:
         held: See `Measurement.held`.
         all_time: Whether all of the time is fitted, not its first part alone.
         evaluations_before: Simulations that were run before the measurement was split anew.
+        samples_before: Pixels times samples of those.
         path: Models that were fitted in full on the way, the first one without any addition.
         notes: What the user should know of the search.
         after_step: Told the model and the errors so far after each step.
@@ -71,11 +72,17 @@ class DiagnosisState:
     held: float = 0.0
     all_time: bool = False
     evaluations_before: int = 0
+    samples_before: int = 0
     first_step: int = 0
     path: list[FittedModel] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
     after_step: Callable[[FittedModel, list[float]], None] = lambda model, errors: None
     error: float = float("nan")
+
+    @property
+    def samples(self) -> int:
+        """Pixels times samples of all simulations so far."""
+        return self.samples_before + self.evidence.samples
 
     def judge(self, model: FittedModel, *, repeats: int | None = None) -> Judgement:
         """Return the held-out error of a model."""

@@ -109,6 +109,7 @@ class BatchSimulator:
         highest_rate: Most events per second that were measured, of the whole sensor [Hz].
         evaluations: Models run so far.
         work: Pixels times seconds run so far [px s].
+        samples: Pixels times samples run so far.
         settings: How launches are made up; None for what suits the device.
         choice: Which sensors have kernels of their own.
     """
@@ -119,6 +120,7 @@ class BatchSimulator:
     highest_rate: float = math.inf
     evaluations: int = 0
     work: float = 0.0
+    samples: int = 0
     settings: SimulatorSettings | None = None
     choice: KernelChoice = CHOICE
     _kernels: dict[Any, tuple[wp.Kernel, NDArray[np.float32], list[int]]] = field(
@@ -154,15 +156,19 @@ class BatchSimulator:
             for (n, rows), sums in zip(members, done, strict=True):
                 parts[n].append((rows, sums))
             for order in cut:
-                samples = self.stimulus.grid.steps * max(finer, 1)
-                work = len(order.vectors) * len(self.stimulus.pixels) * samples
-                self.choice.work[_kernel_key(order.sensor)] += work
+                samples = len(order.vectors) * self._samples_of_a_model(finer)
+                self.samples += samples
+                self.choice.work[_kernel_key(order.sensor)] += samples
         out = []
         for found in parts:
             joined = ProbeSums.join([sums for _, sums in found])
             order_of_rows = np.argsort(np.concatenate([rows for rows, _ in found]))
             out.append(joined if len(found) == 1 else joined.select(order_of_rows))
         return out
+
+    def _samples_of_a_model(self, finer: int) -> int:
+        """Return pixels times samples of one model that takes so many samples per step of the grid."""
+        return len(self.stimulus.pixels) * self.stimulus.grid.steps * max(finer, 1)
 
     def _launches_of(
         self, orders: Sequence[SimulationOrder]
@@ -343,6 +349,7 @@ class BatchSimulator:
         seeds, rows, found = order.seeds(), len(order.vectors), []
         finer = np.maximum(order.samples_per_step(self.stimulus.grid.step), 1)
         self.evaluations += rows
+        self.samples += sum(self._samples_of_a_model(each) for each in finer.tolist())
         for first in range(0, rows, self._launches.streamed):
             cut = slice(first, first + self._launches.streamed)
             left = simulate_pixels(self.stimulus, order.sensor, order.vectors[cut], seeds[cut], finer[cut])

@@ -181,6 +181,11 @@ class SplitMeasurement:
         """Models run so far."""
         return sum(half.trials.evaluations for half in (self.train, self.held, self.report, self.scout))
 
+    @property
+    def samples(self) -> int:
+        """Pixels times samples of all models run so far."""
+        return sum(half.trials.samples for half in (self.train, self.held, self.report, self.scout))
+
 
 @dataclass(frozen=True, eq=False)
 class CalibratedSplit(SplitMeasurement):

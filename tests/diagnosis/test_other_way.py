@@ -45,7 +45,7 @@ def state(monkeypatch) -> DiagnosisState:
     monkeypatch.setattr(effect_search, "refit_model", lambda evidence, model, **how: model)
     monkeypatch.setattr(DiagnosisState, "judge", lambda self, model, **how: judged(5.0))
     found = DiagnosisState(
-        SimpleNamespace(), EFFECTS, 0, lambda *told: None, frozenset({"threshold"}),
+        SimpleNamespace(samples=1e9), EFFECTS, 0, lambda *told: None, frozenset({"threshold"}),
         first=[tried("linlog", 0.60), tried("dark", 0.62), tried("leak", 0.95), tried("shot", 0.99)],
         history=[step("linlog"), step(None, "linlog")], path=[model_with(), model_with("linlog")],
     )  # fmt: skip
@@ -90,6 +90,13 @@ def test_a_way_that_gains_little_is_forgotten(monkeypatch, state, end):
 @pytest.mark.parametrize("loss", [0.91, 0.985])
 def test_what_explains_far_less_begins_no_other_way(monkeypatch, state, loss):
     state.first[1] = tried("dark", loss)
+    begun, (model, _) = searched(monkeypatch, state, 1.1)
+    assert not begun
+    assert state.added_to(model) == ("linlog",)
+
+
+def test_a_long_way_begins_no_other(monkeypatch, state):
+    state.samples_before = int(5e9)
     begun, (model, _) = searched(monkeypatch, state, 1.1)
     assert not begun
     assert state.added_to(model) == ("linlog",)
