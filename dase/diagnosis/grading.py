@@ -22,12 +22,13 @@ An effect that earns neither is a stand-in: it is named as what comes nearest, a
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
+from dase.diagnosis.candidates import Candidate
 from dase.diagnosis.directional_test import deviation_towards
 from dase.diagnosis.settings import GradeSettings
 from dase.diagnosis.state import DiagnosisState, with_same_freedom
@@ -113,8 +114,9 @@ def grade_effects(
 
     step = float(np.median(np.diff(state.evidence.when)))
     shortest = max(settings.shortest_time * step, state.held)
-    shown = [name for name in found if graded(name, False)[0] is not Grade.STAND_IN]
-    rivals = _equally_good_rivals(state, model, shown)
+    grades = {name: graded(name, False) for name in found}
+    shown = [name for name, (grade, _) in grades.items() if grade is not Grade.STAND_IN]
+    rivals = _equally_good_rivals(state, model, shown, {name for name in shown if grades[name][1]})
     out: dict[str, Finding] = {}
     for name in found:
         others = rivals.get(name, ())
@@ -277,26 +279,49 @@ def _models_without(
     }
 
 
+def _rivals_to_try(
+    state: DiagnosisState, model: FittedModel, name: str, *, doubtful: bool
+) -> list[Candidate]:
+    """Return the candidates that did nearly as well when an effect was added.
+
+    One that includes the effect as a special case is none, for the simpler of the two is said; but where
+    something unknown may look like the simple one, that may well be the other.
+
+    Args:
+        state: What the search has found.
+        model: With the effect.
+        name: Of the effect.
+        doubtful: Whether something unknown may look like it.
+    """
+    settings, out = state.settings.grades, list[Candidate]()
+    for other in state.alternatives.get(name, []):
+        includes = name in state.effects[other.name].includes if other.name in state.effects else False
+        if other.name in model.space.sensor or (includes and not doubtful) or other.judgement is None:
+            continue
+        level = max(other.judgement.level, settings.usual)
+        if (
+            other.error - level
+            <= settings.rival * max(state.error_of.get(name, 0.0) - level, 0.0) + settings.tie
+        ):
+            out.append(other)
+    return out[: settings.rivals]
+
+
 def _equally_good_rivals(
-    state: DiagnosisState, model: FittedModel, found: Sequence[str]
+    state: DiagnosisState, model: FittedModel, found: Sequence[str], doubtful: Collection[str]
 ) -> dict[str, tuple[str, ...]]:
     """Return for each effect those that do nearly as well in its place, the rest fitted again.
 
-    An effect that includes it as a special case is none: the simpler of the two is said.
+    Args:
+        state: What the search has found.
+        model: With all effects.
+        found: Names of those that are asked about.
+        doubtful: Those of them that something unknown may look like, see `_rivals_to_try`.
     """
     settings, seed = state.settings.grades, state.seed
     asked: list[tuple[str, str, FittedModel]] = []
     for name in found:
-        tried = 0
-        for other in state.alternatives.get(name, []):
-            includes = name in state.effects[other.name].includes if other.name in state.effects else False
-            if other.name in model.space.sensor or includes or other.judgement is None:
-                continue
-            level = max(other.judgement.level, settings.usual)
-            near = settings.rival * max(state.error_of.get(name, 0.0) - level, 0.0) + settings.tie
-            if other.error - level > near or tried >= settings.rivals:
-                continue
-            tried += 1
+        for other in _rivals_to_try(state, model, name, doubtful=name in doubtful):
             sensor = model.sensor.without(name).with_effect(other.model.sensor[other.name])
             asked.append((name, other.name, with_same_freedom(sensor, model, [other.name])))
     out: dict[str, list[str]] = {name: [] for name in found}

@@ -14,6 +14,7 @@ from dase.diagnosis import grading, seen_effects
 from dase.diagnosis.diagnose import diagnose
 from dase.diagnosis.explain_effect import moving_bars
 from dase.diagnosis.grading import (
+    _rivals_to_try,
     grade_of,
     is_below_black,
     is_between_samples,
@@ -340,3 +341,21 @@ def test_a_dark_current_below_what_the_logarithm_adds_is_in_doubt():
     assert not is_below_black(model, "dark.current", more)
     assert not is_below_black(model, "dark.spread", little)
     assert not is_below_black(model, "threshold.on", little)
+
+
+def test_what_includes_an_effect_is_its_rival_where_something_unknown_may_look_like_it():
+    """Two poles of another simulator were told as one pole or something that is not in the library."""
+
+    def tried(name: str, error: float):
+        return SimpleNamespace(name=name, error=error, judgement=judged(error), model=None)
+
+    candidates = [tried("second_order", 3.0), tried("latency", 3.2), tried("linlog", 9.0)]
+    state = SimpleNamespace(
+        settings=DEFAULTS,
+        effects=EFFECTS,
+        alternatives={"bandwidth": candidates},
+        error_of={"bandwidth": 3.1},
+    )
+    model = model_of(Sensor().with_effect(EFFECTS["bandwidth"]()))
+    for doubtful, names in ((False, ["latency"]), (True, ["second_order", "latency"])):
+        assert [one.name for one in _rivals_to_try(state, model, "bandwidth", doubtful=doubtful)] == names
