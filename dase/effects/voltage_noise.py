@@ -422,25 +422,32 @@ class VoltageNoise(Effect):
     def candidates(cls, observed: Observations) -> list[Self]:
         """Return the noise of equal poles: spectra of poles alike and apart differ less than recordings tell.
 
-        Where events are of a simulator that works frame by frame, that which it draws once a frame. Beside
+        Where events are of a simulator that works frame by frame, that which it draws once a frame, from a
+        slow and a usual corner on: a descent that begins with a fast one ends with white noise. Beside
         slower clips a walk from frame to frame, too, that light takes nothing away of, and one that
         it does.
         """
         if observed.clip_step:
-            return [cls(poles="one")]
+            return [cls(poles="one"), cls(poles="one", cutoff=30.0)]
         if observed.clip_frames < SHORTEST_PERIOD:
             return [cls()]
         walk = cls(poles="none", sigma=0.03, period=observed.clip_frames)
         return [cls(), replace(walk, floor=1.0), replace(walk, sigma=0.1, knee=0.03)]
 
     def otherwise(self, beside: Sequence[Effect]) -> list[Self]:
-        """Return noise of two equal poles for that of one, of the same variance and corner in usual light."""
-        if self.poles != "one":
-            return []
+        """Return noise of two equal poles for that of one, of the same variance and corner in usual light.
+
+        And the other way round beside what goes on at each sample of the scene: another simulator's low-pass
+        that was not there yet may have made its noise look like that of two poles.
+        """
         share = USUAL / (USUAL + self.knee)
-        return [
-            replace(self, sigma=self.sigma / math.sqrt(1 - share), cutoff=self.cutoff / share, poles="alike")
-        ]
+        if self.poles == "one":
+            sigma, cutoff = self.sigma / math.sqrt(1 - share), self.cutoff / share
+            return [replace(self, sigma=sigma, cutoff=cutoff, poles="alike")]
+        if self.poles == "alike" and any(effect.longest_step() == ANY_SAMPLES for effect in beside):
+            sigma, cutoff = self.sigma * math.sqrt(1 - share), self.cutoff * share
+            return [replace(self, sigma=sigma, cutoff=cutoff, poles="one")]
+        return []
 
     def begins_at_the_light(self) -> bool:
         """Whether memories begin at the first light, as where noise is drawn from then on."""

@@ -9,7 +9,7 @@ from itertools import product
 import numpy as np
 from numpy.typing import NDArray
 
-from dase.effects.base import Effect
+from dase.effects.base import ANY_SAMPLES, Effect
 from dase.fitting.data_split import SplitMeasurement
 from dase.fitting.descent import DESCENT, DescentSettings, StopRule, descent_work, ranking_work
 from dase.fitting.parameter_space import ParameterSpace, SearchAxis, axes_of, full_axis, with_values
@@ -384,7 +384,7 @@ def still_free(sensor: Sensor, model: FittedModel) -> list[str]:
 
 def with_effect_added(present: FittedModel, effect: Effect) -> FittedModel:
     """Return the present model with an effect added, all of whose parameters are free."""
-    sensor = _with_its_phase(present.sensor.with_effect(effect), effect)
+    sensor = _in_step(_with_its_phase(present.sensor.with_effect(effect), effect), effect)
     old = still_free(sensor, present)
     # read off the events of all pixels, what a fit finds only nearby is better than a fit to a few makes it
     new = [axis.name for axis in axes_of(sensor) if axis.effect is type(effect) and axis.fact.nearby is None]
@@ -405,6 +405,20 @@ def with_fixed_effect(present: FittedModel, effect: Effect) -> FittedModel:
     return replace(
         present, space=replace(present.space, sensor=present.space.sensor.with_effect(effect)), loss=np.inf
     )
+
+
+def _in_step(sensor: Sensor, effect: Effect) -> Sensor:
+    """Return a sensor whose effects go on at each sample of the scene, where they can, if a new one does.
+
+    Where one rule of another simulator is seen its others are likely, too.
+    """
+    if effect.longest_step() != ANY_SAMPLES:
+        return sensor
+    for one in sensor.effects:
+        in_step = [other for other in one.otherwise([effect]) if other.longest_step() == ANY_SAMPLES]
+        if in_step and one.longest_step() != ANY_SAMPLES:
+            sensor = _with_its_phase(sensor.with_effect(in_step[0]), in_step[0])
+    return sensor
 
 
 def starting_places(model: FittedModel, effect: Effect, *, few: bool = False) -> Array:

@@ -78,8 +78,8 @@ class PixelSubset:
         return self.trials.ticks(space.sensor) is None
 
     def slow(self, space: ParameterSpace) -> bool:
-        """Whether models take many samples, or their events go through a readout."""
-        return self.streams(space) or samples_per_step(space.sensor, self.frame.step) > 0
+        """Whether models take several samples per step, or their events go through a readout."""
+        return self.streams(space) or samples_per_step(space.sensor, self.frame.step) > 1
 
     def calibration_work(
         self, space: ParameterSpace, place: Array, *, repeats: int, seed: int, few_repeats: int = 24

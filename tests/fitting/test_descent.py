@@ -205,9 +205,41 @@ def test_a_fit_leaves_a_low_pass_in_steps_where_it_is_none(device):
 )
 def test_what_a_simulator_does_frame_by_frame_is_tried_where_events_show_one(clip_step, signal, poles, phase):
     seen = Observations(100.0, 0.0, 0.0, "down", 1e5, 0.1, 0.1, clip_step=clip_step)
-    (slow,), (noise,) = (EFFECTS[name].candidates(seen) for name in ("bandwidth", "voltage_noise"))
-    assert (slow.signal, noise.poles) == (signal, poles)
-    assert with_effect_added(model_of(Sensor()), noise).sensor["threshold"].phase == phase
+    (slow,), noises = (EFFECTS[name].candidates(seen) for name in ("bandwidth", "voltage_noise"))
+    assert slow.signal == signal
+    assert {noise.poles for noise in noises} == {poles}
+    # a descent that begins with a fast corner ends with white noise
+    assert (min(noise.cutoff for noise in noises) < 50.0) == (clip_step > 0)
+    for noise in noises:
+        assert with_effect_added(model_of(Sensor()), noise).sensor["threshold"].phase == phase
+
+
+@pytest.mark.parametrize(
+    ("effect", "slow"),
+    [
+        (EFFECTS["bandwidth"](), False),
+        (EFFECTS["bandwidth"](signal="steps"), False),
+        (EFFECTS["voltage_noise"](poles="one"), False),
+        (EFFECTS["voltage_noise"](cutoff=3000.0), True),
+    ],
+    ids=["low-pass", "low-pass in steps", "noise at each frame", "fast noise"],
+)
+def test_what_is_looked_at_once_a_step_is_not_slow(evidence, effect, slow):
+    """Slow ones are tried from few places; what other simulators do at each frame was taken for them."""
+    assert evidence.train.slow(model_of(Sensor().with_effect(effect)).space) == slow
+
+
+def test_noise_is_drawn_at_each_frame_beside_what_goes_in_steps():
+    """A low-pass of another simulator is seen beside its noise, not beside one that looks like both."""
+    noise = EFFECTS["voltage_noise"](sigma=0.05, cutoff=60.0, knee=0.1)
+    present = model_of(Sensor().with_effect(noise))
+    added = with_effect_added(present, EFFECTS["bandwidth"](cutoff=50.0)).sensor
+    assert added["voltage_noise"].poles == "alike"
+    added = with_effect_added(present, EFFECTS["bandwidth"](cutoff=50.0, signal="steps")).sensor
+    assert added["voltage_noise"].poles == "one"
+    (back,) = added["voltage_noise"].otherwise([])
+    assert (back.sigma, back.cutoff, back.poles) == (pytest.approx(0.05), pytest.approx(60.0), "alike")
+    assert added["threshold"].phase == 0.0
 
 
 def test_a_walk_from_frame_to_frame_is_tried_beside_clips_of_other_simulators():
