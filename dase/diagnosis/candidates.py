@@ -65,6 +65,11 @@ class Candidate:
         """The held-out error, NaN where it was only screened."""
         return self.judgement.error if self.judgement else float("nan")
 
+    @property
+    def includes(self) -> tuple[str, ...]:
+        """Names of the effects that it has as special cases."""
+        return self.model.space.sensor[self.name].includes
+
 
 StepProgress = Callable[[str, float], None]
 """Told what is being done, and the share of the step that is done."""

@@ -58,7 +58,7 @@ def search_effects(
     if most > 0 and not state.all_time and _shows_later_alone(state, model, judgement):
         model = _fit_all_of_the_time(state, compared, model, judgement)
         model, judgement = _add_one_by_one(state, compared, model, _left_to_add(state, model, most))
-    if not reaches_floor(judgement) and most > 1:
+    if not leaves_nothing(judgement) and most > 1:
         model, judgement = _go_the_other_way(state, compared, model, judgement, most)
     if not reaches_floor(judgement) and most > 1:
         single = model
@@ -80,7 +80,8 @@ def _go_the_other_way(
 ) -> tuple[FittedModel, Judgement]:
     """Add one effect after the other once more, beginning with the one that came next in the first step.
 
-    What stands in for two effects may leave less than either, and hides what shows beside the right one.
+    What stands in for two effects may leave less than either, and hides what shows beside the right one. A
+    way that has reached the floor is left only for one that leaves no more than chance may.
 
     Args:
         state: Its steps become those of this way, where it is the better one.
@@ -109,8 +110,12 @@ def _go_the_other_way(
     state.note_addition(other, judged_with_it, (), state.judge(state.path[at]))
     begin = refit_model(state.evidence, other.model, seed=state.seed, rounds=1)
     found, judged = _add_one_by_one(state, compared, begin, _left_to_add(state, begin, most))
-    gain = 1.0 if reaches_floor(judged) else settings.pair_gain
-    if judged.error < gain * judgement.error:
+    if reaches_floor(judgement):
+        better = explains_remainder(judged, judgement, settings)
+    else:
+        gain = 1.0 if reaches_floor(judged) else settings.pair_gain
+        better = judged.error < gain * judgement.error
+    if better:
         return found, judged
     state.go_back(before)
     return model, judgement
@@ -333,7 +338,13 @@ def _simplest_of_the_best(
         one for one in finalists
         if one.error <= first.error + reach and one.judgement and (reaches_floor(one.judgement) or not good)
     ]  # fmt: skip
-    best = min(like, key=lambda one: (len(one.model.place), one.error))
+    names = {one.name for one in like}
+
+    def complexity(one: Candidate) -> tuple[int, bool, float]:
+        """Return by what the simplest comes first: freedom, whether it includes another, its error."""
+        return len(one.model.place), not names.isdisjoint(one.includes), one.error
+
+    best = min(like, key=complexity)
     return best, tuple(one.name for one in like if one.name != best.name)
 
 

@@ -286,7 +286,7 @@ class DiagnosisSettings:
     """Where one effect after the other does not reach the floor, they are tried once more with another first
     one, if that one's screening left less than this, in units of the best's."""
 
-    other_way_samples: float = 5e9
+    other_way_samples: float = 6e9
     """Pixels times samples that were simulated until then beyond which they are not, for that way is slow: of
     41 clips that the first one did not explain, the six that the other one explained better had 4.6e9."""
 

@@ -91,8 +91,9 @@ def test_nothing_is_looked_at_where_chance_hides_nothing(searches):
     assert search.evidence.evaluations == before
 
 
-def tried(name: str, error: float, parameters: int = 2) -> Candidate:
-    return Candidate(name, FittedModel(None, np.zeros(parameters)), 0.0, judgement=judged(error))
+def tried(name: str, error: float, parameters: int = 2, includes: tuple[str, ...] = ()) -> Candidate:
+    space = SimpleNamespace(sensor={name: SimpleNamespace(includes=includes)})
+    return Candidate(name, FittedModel(space, np.zeros(parameters)), 0.0, judgement=judged(error))
 
 
 def test_the_simplest_of_those_that_are_not_told_apart_is_chosen():
@@ -109,6 +110,12 @@ def test_the_simplest_of_those_that_are_not_told_apart_is_chosen():
         [tried("a", 5.0, 4), tried("b", 5.4, 2)]
     )  # far off, a tenth is no difference
     assert (best.name, ties) == ("b", ("a",))
+    for includes, name in (
+        ((), "a"),
+        (("b",), "b"),
+        (("c",), "a"),
+    ):  # two poles in steps have no more freedom
+        assert _simplest_of_the_best([tried("a", 3.0, 2, includes), tried("b", 3.3)])[0].name == name
 
 
 def fake(names: str, errors: dict[str, float], monkeypatch, **more) -> tuple:

@@ -26,7 +26,7 @@ def model_with(*names: str) -> FittedModel:
 
 
 def judged(error: float) -> Any:
-    return SimpleNamespace(error=error, gate=GATE, level=1.0, reach=GATE, families={})
+    return SimpleNamespace(error=error, gate=GATE, level=0.2, reach=0.5, families={})
 
 
 def tried(name: str, loss: float) -> Any:
@@ -96,10 +96,19 @@ def test_what_explains_far_less_begins_no_other_way(monkeypatch, state, loss):
 
 
 def test_a_long_way_begins_no_other(monkeypatch, state):
-    state.samples_before = int(5e9)
+    state.samples_before = int(6e9)
     begun, (model, _) = searched(monkeypatch, state, 1.1)
     assert not begun
     assert state.added_to(model) == ("linlog",)
+
+
+@pytest.mark.parametrize(("end", "taken"), [(0.3, True), (0.7, False)])
+def test_a_way_at_the_floor_is_left_for_one_that_leaves_chance_alone(monkeypatch, state, end, taken):
+    monkeypatch.setattr(
+        effect_search, "_add_one_by_one", lambda *given: (model_with("dark", "leak"), judged(end))
+    )
+    model, _ = _go_the_other_way(state, None, model_with("linlog"), judged(1.1), 4)
+    assert state.added_to(model) == (("dark", "leak") if taken else ("linlog",))
 
 
 def test_what_the_first_way_found_begins_no_other(monkeypatch, state):
