@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 
 from dase.diagnosis import effect_search
-from dase.diagnosis.effect_search import _go_the_other_way
+from dase.diagnosis.effect_search import _go_the_other_way, _is_enough
 from dase.diagnosis.state import DiagnosisState
 from dase.effects import EFFECTS
 from dase.fitting.model import FittedModel, model_of
@@ -109,6 +109,14 @@ def test_a_way_at_the_floor_is_left_for_one_that_leaves_chance_alone(monkeypatch
     )
     model, _ = _go_the_other_way(state, None, model_with("linlog"), judged(1.1), 4)
     assert state.added_to(model) == (("dark", "leak") if taken else ("linlog",))
+
+
+@pytest.mark.parametrize(("error", "doubt", "enough"), [
+    (0.4, None, True), (1.1, None, False), (1.1, 0.5, True), (2.0, 0.5, False),
+])  # fmt: skip
+def test_what_guessed_light_leaves_begins_no_other_way(state, error, doubt, enough):
+    state.evidence.held = SimpleNamespace(doubt=doubt)
+    assert _is_enough(state, judged(error)) == enough
 
 
 def test_what_the_first_way_found_begins_no_other(monkeypatch, state):
