@@ -31,13 +31,21 @@ from dase.signatures.frame_coupling import NAME
 from dase.signatures.result import Signature
 from dase.simulation.sensor import Sensor
 
-REACH = 5e-3
-"""Compared before and after an edge [s]: recorded bursts last 1 to 3 ms, and what pixels do without one
-has to be seen, too."""
 
-LEAST_FALL = 0.9
-"""Share of the bursts' error that may be left: where it hardly falls, the model is too far off all else for
-the strength to mean anything."""
+@dataclass(frozen=True)
+class BurstFitSettings:
+    """What of a recording a burst is fitted to, and when its strength means something."""
+
+    reach: float = 5e-3
+    """Compared before and after an edge [s]: recorded bursts last 1 to 3 ms, and what pixels do without one
+    has to be seen, too."""
+
+    left: float = 0.9
+    """Share of the bursts' error that may be left: where it hardly falls, the model is too far off all else
+    for the strength to mean anything."""
+
+
+BURST_FIT = BurstFitSettings()
 
 
 @dataclass(frozen=True)
@@ -125,7 +133,7 @@ def fit_bursts(
     if isinstance(scene, CameraScene):
         # what is wrong between frames is little beside a burst, and where it is trusted are few of these
         trust = everywhere
-    bursts = times.around(float(events.t[0]), float(events.t[-1]), REACH)
+    bursts = times.around(float(events.t[0]), float(events.t[-1]), BURST_FIT.reach)
 
     # of a longer time, so many lie about the bursts
     plenty /= max(float(bursts.contains(events.t).mean()), 1e-6)
@@ -150,7 +158,7 @@ def fit_bursts(
         one.judge(evidence.report, repeats=REPEATS // 2, seed=SimulationStream.JUDGE.seed(seed)).error
         for one in (model_of(sensor, ()), model)
     )
-    if not with_it < LEAST_FALL * without:
+    if not with_it < BURST_FIT.left * without:
         return None
     return BurstStrength(model.sensor[kind.name], values, without, with_it)
 

@@ -7,6 +7,7 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from os import PathLike
+from statistics import NormalDist
 
 import numpy as np
 
@@ -61,9 +62,6 @@ class FitSettings:
 
 
 FIT = FitSettings()
-
-STANDARD_ERRORS_OF_90 = 1.6448536269514722
-"""Half of an interval of 90 % of a normal distribution, in standard errors."""
 
 
 def fit(
@@ -330,7 +328,8 @@ def widen_by_gamma(values: dict[str, Estimate], scene: ScreenScene) -> dict[str,
 
     All changes of log light go in proportion to the gamma, and so do thresholds.
     """
-    out, share = dict(values), STANDARD_ERRORS_OF_90 * scene.gamma_error / scene.gamma
+    # an interval of 90 % goes that many standard errors to either side
+    out, share = dict(values), NormalDist().inv_cdf(0.95) * scene.gamma_error / scene.gamma
     for name in ("threshold.on", "threshold.off"):
         if name in out and share > 0:
             e = out[name]

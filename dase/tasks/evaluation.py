@@ -30,8 +30,6 @@ from dase.torch.stream import choose_device
 
 Pictures = list[NDArray[np.uint8]]
 """Each (H, W, 3), blue, green, red."""
-SHOWN = 6
-"""Moments of a contact sheet."""
 
 
 @dataclass(frozen=True)
@@ -282,10 +280,10 @@ def _flow_picture(events: Events, flow: NDArray[np.float32]) -> NDArray[np.uint8
     return np.concatenate([left, cv2.cvtColor(colours.astype(np.uint8), cv2.COLOR_HSV2BGR)], 1)
 
 
-def _write_pictures(folder: Path, name: str, pictures: Pictures, rate: float) -> None:
-    """Write moments below each other, and all as a video."""
+def _write_pictures(folder: Path, name: str, pictures: Pictures, rate: float, *, moments: int = 6) -> None:
+    """Write some moments below each other, and all as a video."""
     folder.mkdir(parents=True, exist_ok=True)
-    some = np.unique(np.linspace(0, len(pictures) - 1, SHOWN + 1).astype(int)[1:])
+    some = np.unique(np.linspace(0, len(pictures) - 1, moments + 1).astype(int)[1:])
     packed, png = cv2.imencode(".png", np.concatenate([pictures[k] for k in some]))
     if not packed:
         raise InputError(f"{folder / name}.png cannot be written")

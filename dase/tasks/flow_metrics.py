@@ -5,16 +5,15 @@ from __future__ import annotations
 import torch
 import torch.nn.functional as F
 
-OUTLIER = 3.0
-"""Endpoint error above which a pixel is an outlier [px]."""
-
 
 def endpoint_errors(flow: torch.Tensor, truth: torch.Tensor) -> torch.Tensor:
     """Return the distance of flow from the true one, both (N, 2, H, W), of shape (N, H, W), in their unit."""
     return (flow - truth).square().sum(1).sqrt()
 
 
-def flow_errors(flow: torch.Tensor, truth: torch.Tensor, mask: torch.Tensor) -> dict[str, torch.Tensor]:
+def flow_errors(
+    flow: torch.Tensor, truth: torch.Tensor, mask: torch.Tensor, *, outlier: float = 3.0
+) -> dict[str, torch.Tensor]:
     """Return the mean endpoint error and the share of outliers over some pixels of all pictures.
 
     Pixels whose true flow is not finite are left out.
@@ -23,15 +22,16 @@ def flow_errors(flow: torch.Tensor, truth: torch.Tensor, mask: torch.Tensor) -> 
         flow: Displacements [px], shape (N, 2, H, W).
         truth: True ones [px], shape (N, 2, H, W).
         mask: Pixels that count, as those with events, bool, shape (N, H, W).
+        outlier: Endpoint error above which a pixel is one [px].
 
     Returns:
-        `aee` [px], `outliers` (share above 3 px) and `aee_zero` [px], the error of no flow at all; scalars,
+        `aee` [px], `outliers` (share above that) and `aee_zero` [px], the error of no flow at all; scalars,
         not a number where no pixel counts.
     """
     counted = mask & truth.isfinite().all(1)
     errors = endpoint_errors(flow, truth)[counted]
     still = endpoint_errors(torch.zeros_like(truth), truth)[counted]
-    return {"aee": errors.mean(), "outliers": (errors > OUTLIER).float().mean(), "aee_zero": still.mean()}
+    return {"aee": errors.mean(), "outliers": (errors > outlier).float().mean(), "aee_zero": still.mean()}
 
 
 def image_of_warped_events(

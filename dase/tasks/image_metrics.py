@@ -20,8 +20,6 @@ SSIM_SIDE = 11
 """Side of the Gaussian window [px]."""
 SCALE_WEIGHTS = (0.0448, 0.2856, 0.3001, 0.2363, 0.1333)
 """Exponents of the scales of MS-SSIM from fine to coarse; Wang et al., 2003."""
-TRUST = 50.0
-"""Decay of the trust in a warped pixel with the squared error of the true one, as E2VID and S2R have it."""
 
 
 def mean_squared_error(made: torch.Tensor, real: torch.Tensor) -> torch.Tensor:
@@ -121,12 +119,12 @@ def warped(pictures: torch.Tensor, displacement: torch.Tensor) -> torch.Tensor:
 
 def temporal_inconsistency(
     made: torch.Tensor, made_before: torch.Tensor, real: torch.Tensor, real_before: torch.Tensor,
-    displacement: torch.Tensor,
+    displacement: torch.Tensor, *, decay: float = 50.0,
 ) -> torch.Tensor:  # fmt: skip
     """Return by how much pictures change beyond the motion, shape (N,); S2R's temporal loss.
 
-    The picture before is warped by the flow; pixels count by exp(-50 d²), d the same difference of the real
-    pictures, so that what is covered or changes its light does not.
+    The picture before is warped by the flow; pixels count by exp(-decay d²), d the same difference of the
+    real pictures, so that what is covered or changes its light does not.
 
     Args:
         made: Pictures, shape (N, 1, H, W).
@@ -134,8 +132,9 @@ def temporal_inconsistency(
         real: Labels, shape (N, 1, H, W).
         real_before: Labels of the window before, shape (N, 1, H, W).
         displacement: Motion since then, x and y [px], shape (N, 2, H, W).
+        decay: Of the trust in a pixel with that difference; E2VID and S2R have 50.
     """
-    trust = torch.exp(-TRUST * (real - warped(real_before, displacement)).square())
+    trust = torch.exp(-decay * (real - warped(real_before, displacement)).square())
     return (trust * (made - warped(made_before, displacement)).abs()).mean((1, 2, 3))
 
 
