@@ -58,8 +58,7 @@ def search_effects(
     if most > 0 and not state.all_time and _shows_later_alone(state, model, judgement):
         model = _fit_all_of_the_time(state, compared, model, judgement)
         model, judgement = _add_one_by_one(state, compared, model, _left_to_add(state, model, most))
-    # what light that is guessed leaves is its own, and does not say that another way would lead farther
-    if state.evidence.held.doubt is None and not leaves_nothing(judgement) and most > 1:
+    if not _is_enough(state, judgement) and most > 1:
         model, judgement = _go_the_other_way(state, compared, model, judgement, most)
     if not reaches_floor(judgement) and most > 1:
         single = model
@@ -74,6 +73,12 @@ def search_effects(
             # a stand-in that was dropped may have hidden what it stood for
             model, judgement = _add_one_by_one(state, compared, model, _left_to_add(state, model, most))
     return _fit_beyond_the_search(state, model, judgement)
+
+
+def _is_enough(state: DiagnosisState, judgement: Judgement) -> bool:
+    """Whether another way would lead no farther; what guessed light leaves does not say that it would."""
+    guessed = state.evidence.held.doubt is not None
+    return reaches_floor(judgement) if guessed else leaves_nothing(judgement)
 
 
 def _go_the_other_way(

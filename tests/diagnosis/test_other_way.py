@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 
 from dase.diagnosis import effect_search
-from dase.diagnosis.effect_search import _go_the_other_way, search_effects
+from dase.diagnosis.effect_search import _go_the_other_way, _is_enough
 from dase.diagnosis.state import DiagnosisState
 from dase.effects import EFFECTS
 from dase.fitting.model import FittedModel, model_of
@@ -111,23 +111,12 @@ def test_a_way_at_the_floor_is_left_for_one_that_leaves_chance_alone(monkeypatch
     assert state.added_to(model) == (("dark", "leak") if taken else ("linlog",))
 
 
-@pytest.mark.parametrize(("error", "doubt", "begun"), [
-    (0.4, None, False), (1.1, None, True), (2.0, None, True), (1.1, 0.5, False), (2.0, 0.5, False),
+@pytest.mark.parametrize(("error", "doubt", "enough"), [
+    (0.4, None, True), (1.1, None, False), (1.1, 0.5, True), (2.0, 0.5, False),
 ])  # fmt: skip
-def test_light_that_is_guessed_begins_no_other_way(monkeypatch, state, error, doubt, begun):
-    ways = []
+def test_what_guessed_light_leaves_begins_no_other_way(state, error, doubt, enough):
     state.evidence.held = SimpleNamespace(doubt=doubt)
-    state.evidence.contradiction, state.all_time = "", True
-
-    def ends(*given):
-        return model_with("linlog"), judged(error)
-
-    monkeypatch.setattr(effect_search, "_add_one_by_one", ends)
-    monkeypatch.setattr(effect_search, "_go_the_other_way", lambda *given: ways.append(given) or ends())
-    monkeypatch.setattr(effect_search, "add_pair", lambda state, model, judgement: (model, judgement))
-    monkeypatch.setattr(effect_search, "_fit_beyond_the_search", lambda state, model, judgement: None)
-    search_effects(state, None, model_with(), 4)
-    assert bool(ways) == begun
+    assert _is_enough(state, judged(error)) == enough
 
 
 def test_what_the_first_way_found_begins_no_other(monkeypatch, state):
