@@ -299,10 +299,8 @@ def _rivals_to_try(
         if other.name in model.space.sensor or (includes and not doubtful) or other.judgement is None:
             continue
         level = max(other.judgement.level, settings.usual)
-        if (
-            other.error - level
-            <= settings.rival * max(state.error_of.get(name, 0.0) - level, 0.0) + settings.tie
-        ):
+        near = settings.rival * max(state.error_of.get(name, 0.0) - level, 0.0) + settings.tie
+        if other.error - level <= near:
             out.append(other)
     return out[: settings.rivals]
 

@@ -108,7 +108,6 @@ class BatchSimulator:
         structure: Regularities of the measured time stamps.
         highest_rate: Most events per second that were measured, of the whole sensor [Hz].
         evaluations: Models run so far.
-        work: Pixels times seconds run so far [px s].
         samples: Pixels times samples run so far.
         settings: How launches are made up; None for what suits the device.
         choice: Which sensors have kernels of their own.
@@ -119,7 +118,6 @@ class BatchSimulator:
     structure: TimestampStructure = field(default_factory=TimestampStructure)
     highest_rate: float = math.inf
     evaluations: int = 0
-    work: float = 0.0
     samples: int = 0
     settings: SimulatorSettings | None = None
     choice: KernelChoice = CHOICE
@@ -238,7 +236,6 @@ class BatchSimulator:
             mine = [n for n in apart if part.start <= n < part.stop]
             groups |= {n: _groups_of_row(grouped, sink.clock, n - first) for n in mine}
         self.evaluations += len(rows)
-        self.work += len(rows) * count * self.stimulus.grid.step * (self.stimulus.grid.steps - 1)
         folded, both, clocks = _fold_for_frames(orders, pixels), np.concatenate(sums), np.concatenate(clock)
         out = []
         for order, begin, end in zip(orders, begins.tolist(), ends.tolist(), strict=True):
