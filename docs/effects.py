@@ -92,7 +92,7 @@ Presets on recordings of their cameras, nothing fitted: those of commit 3859195 
 is known, only the measurement stands. *With its lamp and frames*: the preset of now with `flicker` and
 `exposure` at the frequency and the times that the events tell, and both strengths and the threshold set by
 three totals, the event rate, the share in bursts and the swing; all else is left to compare. `python -m
-perf.experiments.recordings.run $DASE_DATA/recordings` measures anew (all at ef55f93),
+perf.experiments.recordings.run $DASE_DATA/recordings` measures anew (all at a4b5fa2, the same to the last digit at ef55f93),
 `python docs/effects.py` writes these tables. Noise of another camera at three illuminances is in
 [noise.md](noise.md).
 
@@ -451,12 +451,14 @@ computes it anew.
 Lamps had been 17 % off, in simulations more than in trials: dips of rectified light and tops of sines fell
 between samples, and the two sample at other moments. Now the sample nearest to an extreme shows it, so that
 counts do not depend on sampling. What is smoothed behind them feels the way between the extremes, too, and a
-sample that shows a dip makes it wider. Two corners are left. Where a smoothed swing is 6 % longer than the
-threshold, 1 % of it is a sixth of the events. And of pulses of 50 µs (1000 Hz, duty 0.05) trials have one or
-two samples where a simulation has four, so their areas differ; trials take 24 samples per millisecond at
-most, which would have to be 80. Voltage noise had nothing to mend: it is off by a fifth (3 kHz) where 24
-samples are taken in 4 ms, but no fit has steps above 2 ms, and those are now cut into up to 48. Noise of two
-poles wants 105 samples per millisecond at 3 kHz and a knee of a tenth of the brightest light, and gets 48.
+sample that shows a dip makes it wider. Where a smoothed swing is 6 % longer than the threshold, 1 % of it is
+a sixth of the events. Pulses of 50 µs (1000 Hz, duty 0.05) were up to half off behind a photoreceptor, for
+trials had one or two samples of each and simulations four or five; now trials have as many, and samples at a
+pulse's ends show the share of it around them: events of pulses of four and a half samples had depended on
+where samples fall by a fifth, of both, and are 10 to 15 % below those of light that is sampled without end.
+Voltage noise had nothing to mend: it is off by a fifth (3 kHz) where 24 samples are taken in 4 ms, but no fit
+has steps above 2 ms, and those are now cut into as many as it needs. Noise of two poles wants 94 samples per
+millisecond at 3 kHz and a knee of a tenth of the brightest light, and was 4 % off with 48 in 2 ms.
 """
 
 

@@ -10,7 +10,7 @@ import warp as wp
 
 from dase.effects.base import Effect, Observations, choice, parameter
 from dase.kernels.pixel_stages import EffectStages
-from dase.kernels.vector_math import cosine_and_sine
+from dase.kernels.vector_math import cosine_and_sine, exponential, logarithm
 
 
 @wp.func
@@ -113,8 +113,18 @@ def switched_light(
     """Intensity under lamps that are switched on for a share of each period."""
     turn = turn_of_lamp(t64, frequency, phase, region, apart, x, y)
     # the middle of a part, so that the shorter one is not missed
-    turn = shown_turn(turn, 0.5 * duty, frequency, dt)
-    return intensity * (1.0 + wp.where(turn < duty, depth, -depth))
+    shown = shown_turn(turn, 0.5 * duty, frequency, dt)
+    light = 1.0 + wp.where(shown < duty, depth, -depth)
+    # of a part with few samples one more or less would be much to what smooths it: those at its ends show the
+    # share of on and off that lies around them, in the logarithm, and those in between it alone
+    step = frequency * dt
+    shorter = wp.min(duty, 1.0 - duty)
+    away = turn - 0.5 * duty
+    on = (0.5 * duty - wp.abs(away - wp.floor(away + 0.5))) / step + 0.5
+    if 2.0 * step <= shorter and shorter < 7.5 * step and on > 0.0 and on < 1.0:
+        least = wp.max((1.0 - depth) / (1.0 + depth), 1.0e-6)
+        light = (1.0 + depth) * exponential((1.0 - on) * logarithm(least))
+    return intensity * light
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -138,7 +148,8 @@ class Flicker(Effect):
 
     A scene must be sampled several times per period: moving textures and videos are, by themselves. The
     samples next to the brightest and to the darkest moment of a period show that moment: events come of the
-    extremes, and are as many as in light that is sampled without end.
+    extremes, and are as many as in light that is sampled without end. Of a part of a period that has few
+    samples, those at its ends show the share of it that lies around them.
     """
 
     name: ClassVar[str] = "flicker"

@@ -74,6 +74,18 @@ def test_a_switched_lamp_makes_all_events_at_two_moments(device, duty):
     assert {True, False} == set(events.p.tolist())
 
 
+def test_what_smooths_short_pulses_feels_as_much_of_them_wherever_samples_fall(device):
+    """Pulses of four and a half samples are all of one length, not some of four and some of five."""
+    times = np.arange(1801) / 90e3
+    scene = dase.VideoScene(np.full((len(times), 4, 4), 0.5, np.float32), times)
+    counts = []
+    for phase in np.arange(6) / 6 / 90:
+        lamp = Flicker(frequency=1000.0, depth=0.6, phase=phase, shape="pwm", duty=0.05)
+        sensor = dase.Sensor((Threshold(on=0.02, off=0.02), lamp, Bandwidth(cutoff=1000.0, dark=1.0)))
+        counts.append(len(dase.simulate(scene, sensor, device=device)))
+    assert max(counts) < 1.05 * min(counts)
+
+
 def test_rectified_light_dips_once_a_period(device):
     """ON and OFF events crowd at the zeros of the mains, where the light turns sharply."""
     sensor = dase.Sensor((Threshold(on=0.02, off=0.02), Flicker(depth=0.6, shape="rectified")))

@@ -10,6 +10,7 @@ import pytest
 import warp as wp
 
 import dase
+from dase.effects.bandwidth import Bandwidth
 from dase.effects.flicker import Flicker
 from dase.effects.leak import Leak
 from dase.effects.readout import Readout
@@ -61,9 +62,18 @@ LAMPS += [
 ]
 
 
-@pytest.mark.parametrize("effect", [*NOISES, *LAMPS], ids=lambda effect: effect.name)
-def test_a_trial_sends_as_many_events_as_a_simulation(trials, scene, device, effect):
-    sensor = sensor_with(effect)
+# what is sampled most finely of all that is plausible
+FINEST = [
+    (Flicker(depth=0.6, frequency=1000.0, shape="pwm", duty=0.05), Bandwidth(cutoff=1000.0, dark=1.0)),
+    (VoltageNoise(sigma=0.2, cutoff=3000.0, knee=0.1, poles="apart"),),
+]
+
+
+@pytest.mark.parametrize(
+    "effects", [*((one,) for one in NOISES + LAMPS), *FINEST], ids=lambda effects: effects[0].name
+)
+def test_a_trial_sends_as_many_events_as_a_simulation(trials, scene, device, effects):
+    sensor = sensor_with(*effects)
     got = trials.run(sensor, sensor.parameters()[None], seed=3).halves.sum()
     stored = trials.stream(sensor, sensor.parameters(), (), seed=3).halves.sum()
     want = len(dase.simulate(scene, sensor, seed=3, device=device))
