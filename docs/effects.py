@@ -92,7 +92,8 @@ Presets on recordings of their cameras, nothing fitted: those of commit 3859195 
 is known, only the measurement stands. *With its lamp and frames*: the preset of now with `flicker` and
 `exposure` at the frequency and the times that the events tell, and both strengths and the threshold set by
 three totals, the event rate, the share in bursts and the swing; all else is left to compare. `python -m
-perf.experiments.recordings.run $DASE_DATA/recordings` measures anew (all at a4b5fa2, the same to the last digit at ef55f93),
+perf.experiments.recordings.run $DASE_DATA/recordings` measures anew (all at a4b5fa2, with the same
+result to the last digit as at ef55f93),
 `python docs/effects.py` writes these tables. Noise of another camera at three illuminances is in
 [noise.md](noise.md).
 
