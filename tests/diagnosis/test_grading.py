@@ -76,6 +76,8 @@ def judged(error: float, *, level: float = 0.25, reach: float = 0.4) -> Judgemen
         (8.0, 0.2, 0.3, 6.0, False, Grade.STAND_IN, False),
         # so little that something unknown may look like it
         (0.7, 0.7, 0.3, 6.0, False, Grade.EITHER, True),
+        (0.94, 0.85, 0.3, 6.0, False, Grade.EITHER, True),
+        (0.94, 0.94, 0.3, 6.0, False, Grade.SUPPORTED, False),
         # at the floor, but neither within chance nor near to nothing of what there was
         (4.0, 4.0, 1.0, 6.0, False, Grade.EITHER, True),
     ],
