@@ -149,6 +149,7 @@ def every_line(statements: Iterable[Statement]) -> Iterator[Line]:
             yield statement
             continue
         if isinstance(statement, Block):
+            # conditions read names, and may ask for random numbers, as lines do
             yield Line(statement.head, statement.draws)
         yield from every_line(statement.body)
         if isinstance(statement, Block):
@@ -204,6 +205,7 @@ def resolve_guards(statements: Iterable[Statement], *, ask: bool) -> tuple[State
         if isinstance(statement, Block):
             otherwise = resolve_guards(statement.otherwise, ask=ask)
             found.append(replace(statement, body=body, otherwise=otherwise))
+        # the same numbers come out either way: a guard saves the time of what would change nothing
         elif ask and statement.effect.off:
             # `acting` stays behind: a layout with lanes asks once for all of them
             found.append(Block(f"if {acting(statement.effect)}:", body, acting=(statement.effect,)))

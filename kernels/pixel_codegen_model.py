@@ -93,6 +93,7 @@ def _argument(stage: str, effect: EffectStages, name: str, lent: Collection[str]
         return Call(f"float({name})", ())
     if name in (*QUANTITIES[stage], *ANYWHERE):
         return Call(name, ())
+    # without a lender the argument is there all the same: a function has one signature in all sensors
     if name in LENT:
         return Call(name if name in lent else "0.0", ())
     number = random_number(name)

@@ -85,6 +85,7 @@ def intensity_of_log(model: PixelModel) -> tuple[Part, ...]:
 
 def _keep_illumination(model: PixelModel) -> tuple[Part, ...]:
     """Return the part that keeps the light before currents of the dark are added, none if nobody asks."""
+    # added to, for a plain copy would be the same variable to Warp
     return (Part(lines("illumination = intensity + 0.0")),) if model.asks("illumination") else ()
 
 
@@ -99,6 +100,7 @@ def assign_thresholds(model: PixelModel) -> tuple[Statement, ...]:
 def pixel_places(model: PixelModel) -> tuple[Statement, ...]:
     """Return the statements of what depends on where a pixel `i` at column `x` and row `y` is."""
     found = [f"{name} = maps[{at}, i]" for at, name in enumerate(model.maps)]
+    # a square root for each pixel, which most sensors do not need
     if model.asks("radius"):
         found += [
             "middle = wp.vec2(float(x) - 0.5 * float(width - 1), float(y) - 0.5 * float(height - 1))",

@@ -41,7 +41,7 @@ class StoredScenes:
 
 @wp.func
 def frames_of_scene(scenes: StoredScenes, row: int) -> Frames:
-    """Stored intensities of one scene."""
+    """Stored intensities of one scene, shape (K, N)."""
     frames = Frames()
     frames.values = scenes.values[row]
     return frames

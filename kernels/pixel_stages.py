@@ -264,7 +264,7 @@ def append_held(
     held: int,
     first: wp.int64,
 ):
-    """Append the events of a sample to those of the pixel's slab; arrays have the shapes of `EventKeys`."""
+    """Append the events of a sample to those of the pixel's slab, keys (B, slabs, capacity): `EventKeys`."""
     ...
 
 

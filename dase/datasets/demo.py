@@ -94,7 +94,7 @@ def _is_job_of_demo(job: generate.DatasetJob, text: str | None) -> bool:
 
 def _software_of(picture: Path) -> str:
     """Return which program a PNG says it was made with."""
-    from PIL import Image
+    from PIL import Image  # only where a folder is there already
 
     with Image.open(picture) as opened:
         return str(opened.info.get("Software"))

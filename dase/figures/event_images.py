@@ -192,7 +192,7 @@ def _video_times(
 def _video_pictures(
     sequence: Sequence, begins: NDArray[np.float64], ends: NDArray[np.float64], scale: int
 ) -> Iterator[NDArray[np.uint8]]:
-    import cv2
+    import cv2  # only videos of sequences need it
 
     for index, (begin, end) in enumerate(zip(begins, ends, strict=True)):
         frame = None if sequence.frames is None else sequence.frames[index]

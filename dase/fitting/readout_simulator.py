@@ -86,6 +86,7 @@ def simulate_pixels(
     """
     if finer is None:
         finer = np.maximum(samples_per_step_of_rows(sensor, vectors, stimulus.grid.step), 1)
+    # what is behind the pixels goes over all of them, see `pass_readout`
     bare = replace(sensor, effects=tuple(e for e in sensor.effects if not isinstance(e, StreamEffect)))
     kind = "cuda" if stimulus.device.is_cuda else "cpu"
     # a model that sends more is run again; on a CPU room costs nothing before it is used
@@ -102,6 +103,7 @@ def simulate_pixels(
     # the light between the steps is worked out once for all models that take as many samples
     scenes = {each: _StimulusScene(stimulus, each) for each in np.unique(finer).tolist()}
 
+    # a GPU takes all models in one launch, if they have one clock and one seed
     if kind == "cuda" and np.all(seeds == seeds[0]) and np.all(finer == finer[0]):
         return out(slice(0, len(seeds)))
     # on a CPU one after the other: the events of a model are sorted in its caches, those of all are not
@@ -130,6 +132,7 @@ def pass_readout(
     before: list[StreamEffect] = []
     for effect in effects:
         reader = effect.reader(stimulus.width, stimulus.height, seed)
+        # what others send holds these up, in the order of time; else a part of the bus is theirs alone
         if load is not None and weight is not None and isinstance(reader, SharedReader):
             events = reader.beside(events, load.others(before, seed), weight)
         else:
@@ -155,6 +158,7 @@ class _StimulusScene(Scene):
 
     def source(self, times: NDArray[np.float64], pixels: NDArray[np.int32], device: Any) -> tuple[str, Any]:
         out = pixel_stages.Frames()
+        # a run that is not cut into chunks takes the light as it lies on the device
         if self.light is not None and len(times) == len(self.times):
             out.values = self.light
         else:

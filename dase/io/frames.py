@@ -35,7 +35,7 @@ a video repeat each other. Moving scenes stay far below."""
 
 def decode_grey(data: bytes, name: str) -> NDArray[Any]:
     """Decode a picture to grey of 8 or 16 bits, (H, W); raises InputError where it is damaged or huge."""
-    import cv2
+    import cv2  # a quarter of a second that reading events alone need not wait for
 
     pointer = stands_for(data[:1024])
     if pointer:

@@ -57,10 +57,10 @@ def to_grey(pixels: NDArray[Any]) -> tuple[NDArray[np.float32], NDArray[np.float
 
 
 def weights_of(pixels: NDArray[Any]) -> list[np.float32]:
-    """Return what blue, green and red, or the only value, weigh in the grey of pixels.
+    """Return what blue, green and red, or the only value, weigh in the grey of pixels [1 / full scale].
 
     Args:
-        pixels: As `to_grey` takes them.
+        pixels: As `to_grey` takes them, shape (H, W) or (H, W, C).
     """
     luma = LUMA[::-1] if pixels.ndim == 3 and pixels.shape[2] >= 3 else (1.0,)
     return [np.float32(weight) / _full_scale(pixels) for weight in luma]
@@ -157,7 +157,7 @@ def head_size(data: bytes) -> tuple[int, int] | None:
     Args:
         data: The content of a file.
     """
-    from PIL import Image
+    from PIL import Image  # events have no pictures, and most recordings no folder of them
 
     size: tuple[int, int] | None
     limit, Image.MAX_IMAGE_PIXELS = Image.MAX_IMAGE_PIXELS, None  # ours goes with the size of the file
@@ -184,6 +184,7 @@ def head_size(data: bytes) -> tuple[int, int] | None:
 
 def _tiff_size(data: bytes) -> tuple[int, int] | None:
     """Return columns and rows of a TIFF that Pillow cannot decode, as of three colours of 16 bits."""
+    # as above
     from PIL.TiffImagePlugin import IMAGELENGTH, IMAGEWIDTH, ImageFileDirectory_v2
 
     if not data.startswith((b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")):  # + in those of 64 bits

@@ -79,6 +79,7 @@ def _open_counted(file: Any, mode: str) -> Iterator[_Counted]:
 def bounded_bags() -> Iterator[None]:
     """While this is open, rosbags unpacks chunks, messages and files only to what is sensible."""
     global _open_bags
+    # an extra, and only bags need it
     from rosbags.rosbag1 import reader as rosbag1
     from rosbags.rosbag2 import reader as rosbag2
     from rosbags.rosbag2 import storage_mcap

@@ -23,9 +23,6 @@ from dase.scenes.scene_motions import SceneSettings as SceneSettings
 from dase.scenes.scene_motions import draw_motion as draw_motion
 from dase.scenes.scene_motions import most_layers
 
-BACKGROUND = (320, 480)
-"""Rows and columns of the backgrounds in the pool [texel]."""
-
 
 class Scenery:
     """A pool of textures on a device, and random scenes made of them.
@@ -52,7 +49,8 @@ class Scenery:
         self.scene_settings, self.device = looks, torch.device(device)
         rng = np.random.default_rng([seed, 0])
         grounds = [
-            image_sources.fit_picture(source.background(rng).grey, *BACKGROUND) for _ in range(backgrounds)
+            image_sources.fit_picture(source.background(rng).grey, *image_sources.BACKGROUND)
+            for _ in range(backgrounds)
         ]
         self._fill(grounds, [source.foreground(rng) for _ in range(objects)])
 
@@ -100,7 +98,7 @@ class Scenery:
         front = rng.integers(len(self.size) - 1, size=(count, layers)) if len(self.size) > 1 else 0
         which = np.where(motion.there, front, len(self.size) - 1)
         size = self.size[which]
-        size[:, 0] = BACKGROUND[::-1]
+        size[:, 0] = image_sources.BACKGROUND[::-1]
         place, box = motion.texture_maps(looks, size)
         ground = rng.integers(len(self.grey), size=count).astype(np.int32)
         return pack_words(ground, self.start[which], size, place, box)

@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from dase.errors import InputError, checked_seed
 from dase.events import Events
+from dase.formatting import fit_to_screen, format_seconds
 from dase.scenes.between_frames import CameraScene
 
 
@@ -54,7 +55,7 @@ PARTS = ("flip", "shift", "offset")
 """Corrections, in the order in which they are applied."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Alignment:
     """What brings frames onto events.
 
@@ -84,6 +85,22 @@ class Alignment:
     shifts: NDArray[np.float64]
     offsets: NDArray[np.float64]
     intervals: int
+
+    def __repr__(self) -> str:
+        """Return the corrections and how sure they are; all correlations are in `shifts` and `offsets`."""
+        (x, y), (late, apart_x, apart_y) = self.shift, self.spread
+        ways = ["left to right"] * self.flip_x + ["top to bottom"] * self.flip_y
+        mirrored = f"mirrored {' and '.join(ways)}" if ways else "not mirrored"
+        return fit_to_screen(
+            [
+                f"Alignment of {self.intervals} times between frames",
+                f"  offset {format_seconds(self.offset)} ± {format_seconds(late)}",
+                f"  {mirrored}",
+                f"  shift {x:.2f} ± {apart_x:.2f}, {y:.2f} ± {apart_y:.2f} px",
+                f"  correlation {self.score:.3f}, {self.score_as_is:.3f} as it is",
+                f"  clear: {', '.join(sorted(self.clear)) or 'nothing'}",
+            ]
+        )
 
     def apply(
         self, frames: NDArray[Any], begin: ArrayLike, end: ArrayLike, parts: Iterable[str] | None = None

@@ -30,6 +30,8 @@ PHOTOGRAPHS = (  # inside the wheel of scikit-image; its other files are silhoue
 Grey = NDArray[np.float32]
 WHOLE = slice(None), slice(None)
 """Rows and columns of a picture as a whole."""
+BACKGROUND = (320, 480)
+"""Rows and columns of the backgrounds of a pool [texel]: its kernels want one size."""
 
 
 @dataclass(frozen=True)

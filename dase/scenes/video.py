@@ -445,7 +445,7 @@ def _video_times(path: Path, reader: FrameReader, fps: float | None) -> NDArray[
 
 def _file_gamma(path: Path) -> float:
     """Return the gamma that the first picture of a folder says, else that of sRGB."""
-    from PIL import Image
+    from PIL import Image  # only folders of pictures say one
 
     first = next(iter(list_pictures(path)), None) if path.is_dir() else None
     if first is None:

@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from dase.effects import EFFECTS
 from dase.errors import InputError, nearest
+from dase.formatting import fit_to_screen
 from dase.scenes.scene import Scene
 from dase.scenes.video import as_scene
 from dase.simulation.sensor import Sensor
@@ -49,7 +50,7 @@ class Sweep:
             for row in zip(self.values, self.on, self.off, strict=True)
         ]
         widths = [max(map(len, column)) for column in zip(head, *rows, strict=True)]
-        return "\n".join(
+        return fit_to_screen(
             "  ".join(f"{cell:>{width}}" for cell, width in zip(row, widths, strict=True))
             for row in (head, *rows)
         )

@@ -8,8 +8,10 @@ from typing import Any
 
 import torch
 
+from dase.formatting import fit_to_screen
 
-@dataclass(frozen=True)
+
+@dataclass(frozen=True, repr=False)
 class Batch:
     """B slots of T windows of time that follow each other, all tensors of one device.
 
@@ -33,6 +35,17 @@ class Batch:
     thresholds: torch.Tensor
     parameters: dict[str, torch.Tensor] = field(default_factory=dict)
     valid: torch.Tensor | None = None
+
+    def __repr__(self) -> str:
+        """Return the shapes of all tensors."""
+        lines = [f"Batch on {self.inputs.device}"]
+        for item in dataclasses.fields(self):
+            value = getattr(self, item.name)
+            if isinstance(value, dict):
+                lines += [f"  {item.name}['{name}']  {tuple(one.shape)}" for name, one in value.items()]
+            elif value is not None:
+                lines.append(f"  {item.name}  {tuple(value.shape)} {str(value.dtype).removeprefix('torch.')}")
+        return fit_to_screen(lines)
 
     def map(self, change: Any) -> Batch:
         """Return the batch with `change` done to every tensor."""

@@ -8,10 +8,7 @@ import numpy as np
 import warp as wp
 from numpy.typing import NDArray
 
-from dase.scenes.image_sources import ImageSource, Picture, fit_picture
-
-BACKGROUND = (320, 480)
-"""Rows and columns of the backgrounds [texel]: kernels want one size."""
+from dase.scenes.image_sources import BACKGROUND, ImageSource, Picture, fit_picture
 
 
 @dataclass(frozen=True)

@@ -27,7 +27,7 @@ from dase.kernels.scene_layers import Affine
 from dase.kernels.scene_windows import LayerScenes, flow_kernel, rendering_kernel
 from dase.networks.weights_file import load_net
 from dase.representations import Representation, Voxels
-from dase.scenes.image_sources import ImageSource, open_images
+from dase.scenes.image_sources import BACKGROUND, ImageSource, open_images
 from dase.scenes.layers import LayerScene
 from dase.scenes.static import StaticScene
 from dase.simulation.pixel_batch import PixelBatch
@@ -35,7 +35,7 @@ from dase.simulation.sensor import Sensor
 from dase.simulation.sensor_file import as_sensor
 from dase.torch.augmentation import augmented
 from dase.torch.batch import Batch
-from dase.torch.pictures import BACKGROUND, DecodedPictures, TexturePool, decode_pictures
+from dase.torch.pictures import DecodedPictures, TexturePool, decode_pictures
 from dase.torch.rendered_scene import RenderedScene
 from dase.torch.scene_numbers import (
     Augment,

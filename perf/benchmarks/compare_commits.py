@@ -15,7 +15,7 @@ processes of the same code differ by some per cent as long as they live. A figur
 is named and left out.
 
 `--hidden FOLDER --case a_01` diagnoses a case of another simulator, `a_01.npz` with `clip_a.npz` beside it,
-as hidden_effects.py reads them, instead of a made one.
+as `perf.experiments.blind_diagnosis.run` reads them, instead of a made one.
 """
 
 from __future__ import annotations

@@ -56,7 +56,9 @@ def test_packages_are_there_without_an_import_of_their_own():
 
 
 def test_everything_prints_on_a_screen(events):
-    for shown in (events, dase.load_sensor("v2e-noisy"), dase.Sensor(), dase.find_signatures(events)):
+    scene = dase.VideoScene(FRAMES, np.arange(len(FRAMES)) / 1000)
+    sweep = dase.sweep(scene, "ideal", "threshold.on", np.linspace(0.1, 0.9, 200))
+    for shown in (events, dase.load_sensor("v2e-noisy"), dase.Sensor(), dase.find_signatures(events), sweep):
         lines = repr(shown).splitlines()
         assert len(lines) <= 30
         assert max(map(len, lines)) <= 100

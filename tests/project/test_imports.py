@@ -103,6 +103,36 @@ def test_imports_are_put_off_for_a_reason(module):
             assert said_why(module, one.line), f"{module} line {one.line}: say why {one.module} is put off"
 
 
+def other_packages_put_off(module: str) -> list[tuple[str, int]]:
+    """Return what functions of a module import of others than dase, but for extras that may be missing."""
+    tree = ast.parse(file_of(module).read_text("utf-8"))
+    tried = {
+        id(node)
+        for one in ast.walk(tree)
+        if isinstance(one, ast.Try) and any("ImportError" in ast.dump(h) for h in one.handlers)
+        for node in ast.walk(one)
+    }
+    functions = [n for n in ast.walk(tree) if isinstance(n, (ast.FunctionDef, ast.AsyncFunctionDef))]
+    inside = {id(node): node for one in functions for node in ast.walk(one)}
+    found = []
+    for node in inside.values():
+        if id(node) in tried:
+            continue
+        if isinstance(node, ast.Import):
+            found += [(alias.name, node.lineno) for alias in node.names]
+        elif isinstance(node, ast.ImportFrom):
+            found.append((node.module or "", node.lineno))
+    return [(name, line) for name, line in found if name.split(".")[0] not in ("dase", "__future__")]
+
+
+@pytest.mark.parametrize(
+    "module", [m for m in GRAPH if not m.startswith("dase.cli") and other_packages_put_off(m)]
+)
+def test_other_packages_are_put_off_for_a_reason(module):
+    for name, line in other_packages_put_off(module):
+        assert said_why(module, line), f"{module} line {line}: say why {name} is put off"
+
+
 def test_pytorch_is_asked_for_where_networks_are_trained():
     for module in GRAPH:
         if not re.match(OF_TORCH, module):

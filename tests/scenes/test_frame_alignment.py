@@ -53,6 +53,10 @@ def test_mirror_and_shift_are_found_and_undone(recorded, flip, shift):
     np.testing.assert_allclose(found.shift, shift, atol=0.2)
     assert found.score_as_is < 0.75 * found.score
     assert found.clear == ({"flip", "shift"} if any(flip) else {"shift"})
+    said = repr(found).splitlines()
+    assert len(said) < 10
+    assert max(map(len, said)) <= 100
+    assert f"  clear: {', '.join(sorted(found.clear))}" in said
     again = dase.align(events, *found.apply(wrong, begin, end))
     assert again.clear == frozenset()
     assert again.score_as_is > 0.97 * found.score

@@ -69,6 +69,7 @@ def test_online_equals_stored(device):
     batch = next(iter(stream))
     assert_same(batch, stream, 0)
     assert batch.inputs.shape == (3, 3, 5, 24, 32)
+    assert "  inputs  (3, 3, 5, 24, 32) float32" in repr(batch).splitlines()
     assert batch.frames.shape == (3, 3, 1, 24, 32)
     assert batch.flow.shape == (3, 3, 2, 24, 32)
     assert 0 <= batch.frames.min() < 0.5 < batch.frames.max() <= 1
