@@ -109,8 +109,8 @@ def main() -> None:
     Wrong input is one sentence and exit code 2; an interrupt is exit code 130, SIGTERM 143, SIGHUP 129.
     """
     _open_closed_streams()
-    from dase.datasets.interrupt import Terminated, raising_signals
     from dase.errors import InputError
+    from dase.files.interrupt import Terminated, raising_signals
 
     try:
         with raising_signals():

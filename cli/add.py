@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 import click
 
 from dase.cli.options import device_option, effects_option, sensor_output
+from dase.cli.output import progress_bar
 
 if TYPE_CHECKING:
     from dase.effects import Effect
@@ -80,7 +81,6 @@ def _fit_effect(
     sensor: Sensor, effect: Effect, recording: Path, scene: str, device: str, seed: int
 ) -> tuple[Sensor, HistoryEntry]:
     """Return the sensor with the effect, fitted to a recording, and what is to be noted."""
-    from dase.cli.diagnose import progress_bar
     from dase.diagnosis import sensor_update
     from dase.diagnosis.add_effect import fit_added
     from dase.fitting.measurement import open_measurement

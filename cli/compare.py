@@ -19,6 +19,7 @@ from dase.cli.options import (
     scene_option,
     stimulus_option,
 )
+from dase.cli.output import plates_or_note, print_plain_numbers, progress_bar
 
 
 @click.command()
@@ -61,7 +62,6 @@ def compare_command(
     1 is the error that two repeats of the recording would have. Nothing is fitted: `dase fit` does that.
     """
     with importing():
-        from dase.cli.diagnose import plates_or_note, print_plain_numbers, progress_bar
         from dase.diagnosis.compare import compare
         from dase.io import replacing
         from dase.simulation.sensor_file import load_sensor

@@ -18,6 +18,7 @@ from dase.cli.options import (
     scene_option,
     stimulus_option,
 )
+from dase.cli.output import print_plain_numbers, progress_bar
 
 
 @click.command()
@@ -70,7 +71,6 @@ def fit_command(
     written, this is said, and the exit code is 1.
     """
     with importing():
-        from dase.cli.diagnose import print_plain_numbers, progress_bar
         from dase.diagnosis import sensor_update
         from dase.fitting.fit import fit
         from dase.simulation import sensor_edit

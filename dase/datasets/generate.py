@@ -23,13 +23,13 @@ import tomlkit
 from numpy.typing import NDArray
 
 from dase import io
-from dase.datasets.interrupt import DeferredInterrupt, WorkerLife, defer_interrupt, ignore_interrupt
 from dase.datasets.steps_in_order import StepsInOrder
 from dase.datasets.worker_start import worker_context
 from dase.effects.exposure import Exposure
 from dase.errors import InputError, checked_integer, nearest
 from dase.events import read_only
 from dase.files.folder_lock import locking_folder
+from dase.files.interrupt import DeferredInterrupt, WorkerLife, defer_interrupt, ignore_interrupt
 from dase.files.text_files import read_text_file
 from dase.io.source import Source
 from dase.kernels import launch

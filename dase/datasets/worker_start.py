@@ -11,7 +11,7 @@ import sys
 from multiprocessing import forkserver, get_all_start_methods, get_context
 from typing import Any
 
-from dase.datasets.interrupt import ignore_interrupt
+from dase.files.interrupt import ignore_interrupt
 
 WORK = "dase.datasets.generate"
 """Module of what workers do."""

@@ -170,7 +170,7 @@ def choose_compared(
         seen=seen,
         guessed=guessed,
         # a sensor that has them already is compared with them
-        bursts=None if "exposure" in given else seen.bursts,
+        bursts=None if follows_frames(given) else seen.bursts,
         frames=seen.times_of_bursts(measurement) if follows_frames(given) else None,
         hot=few_hot_pixels(seen, measurement.events, pixels) if HOT not in given else None,
         silent=find_silent_pixels(measurement, log_eps=given.log_eps) if asked else None,

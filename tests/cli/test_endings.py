@@ -300,7 +300,7 @@ def test_a_signal_to_the_workers(tmp_path, victims):
 def test_nohup_is_respected():
     script = (
         "import os, signal, sys\nsignal.signal(signal.SIGHUP, signal.SIG_IGN)\n"
-        "from dase.datasets.interrupt import raising_signals, defer_interrupt\n"
+        "from dase.files.interrupt import raising_signals, defer_interrupt\n"
         "with raising_signals(), defer_interrupt() as interrupt:\n"
         "    os.kill(os.getpid(), signal.SIGHUP)\n    interrupt.check()\nprint('goes on')"
     )
@@ -313,7 +313,7 @@ def test_nohup_is_respected():
 def test_signal_in_a_destructor_is_not_lost(name, code, place):
     script = (
         "import os, signal, sys, time, weakref\n"
-        "from dase.datasets.interrupt import raising_signals\n"
+        "from dase.files.interrupt import raising_signals\n"
         "def signalled(_=None):\n"
         f"    os.kill(os.getpid(), signal.{name})\n"
         "    for _ in range(1000): pass\n"

@@ -12,7 +12,7 @@ from scipy.ndimage import gaussian_filter
 
 import dase
 from dase.cli import dase_group
-from dase.cli.diagnose import progress_bar
+from dase.cli.output import progress_bar
 from dase.diagnosis.compare import compare
 from dase.diagnosis.diagnose import diagnose
 from dase.diagnosis.explain_effect import moving_bars
