@@ -88,6 +88,7 @@ class Detector:
         after_off: Dead time after an OFF event, relative to that after an ON event.
         waiting: Hazard before noise event n.
         bright: Uniform number that decides the polarity of noise event n >= 1.
+        anew: Factors of the OFF and ON thresholds after n events.
     """
 
     on: float
@@ -102,23 +103,31 @@ class Detector:
     after_off: float = 1.0
     waiting: Callable[[int], float] = lambda n: np.inf
     bright: Callable[[int], float] = lambda n: 0.0
+    anew: Callable[[int], tuple[float, float]] = lambda n: (1.0, 1.0)
+
+    def thresholds(self, sent: int) -> tuple[float, float]:
+        """Return the OFF and ON thresholds after some events."""
+        off, on = self.anew(sent)
+        return max(self.off * off, 0.01), max(self.on * on, 0.01)
 
     def start(self, first: float, second: float) -> float:
         """Return what the pixel remembers at the first sample."""
+        off, on = self.thresholds(0)
         if second < first or (second == first and self.falls):
-            return first + self.lead * self.off
-        return first - self.lead * self.on
+            return first + self.lead * off
+        return first - self.lead * on
 
-    def crossing(self, begin: float, change: float, slope: float) -> tuple[float, float]:
+    def crossing(self, begin: float, change: float, slope: float, sent: int) -> tuple[float, float]:
         """Return when the change passes a threshold, at `begin` or later, and the signed threshold."""
-        if change >= self.on:
-            return begin, self.on
-        if change <= -self.off:
-            return begin, -self.off
+        off, on = self.thresholds(sent)
+        if change >= on:
+            return begin, on
+        if change <= -off:
+            return begin, -off
         if slope > 0:
-            return begin + (self.on - change) / slope, self.on
+            return begin + (on - change) / slope, on
         if slope < 0:
-            return begin + (self.off + change) / -slope, -self.off
+            return begin + (off + change) / -slope, -off
         return np.inf, 0.0
 
     def run(self, times: np.ndarray, signal: np.ndarray, rates: np.ndarray) -> np.ndarray:
@@ -142,7 +151,7 @@ class Detector:
                     memory, held, now = level[k] + slope * (alive_from - end), False, alive_from
                 look = max(now, alive_from) if self.delays else now
                 change = level[k] + slope * (look - end) - memory
-                crossing, theta = (np.inf, 0.0) if held else self.crossing(look, change, slope)
+                crossing, theta = (np.inf, 0.0) if held else self.crossing(look, change, slope, len(out))
                 now = min(crossing, noise)
                 if now > end:
                     break
@@ -171,13 +180,18 @@ def thresholds(sensor: dase.Sensor, index: int, seed: int) -> tuple[float, float
     spread = setting(sensor, "mismatch", "spread", 0.0)
     name = "mismatch_threshold_pixel_normal"
     on, off = (Stream(n, seed, index).normal() for n in (name, f"{name}_2"))
-    nominal = sensor["threshold"]
-    alike = setting(sensor, "mismatch", "relative_to", "own") == "mean"
-    unit = {
-        name: (nominal.on + nominal.off) / 2 if alike else getattr(nominal, name) for name in ("on", "off")
-    }
-    low, high = nominal.off + unit["off"] * spread * off, nominal.on + unit["on"] * spread * on
-    return max(low, 0.01), max(high, 0.01)
+    nominal = np.array([sensor["threshold"].off, sensor["threshold"].on])
+    if setting(sensor, "learned_threshold", "bound", None) is not None:
+        learned = sensor["learned_threshold"]
+        factor, scatter = learned.bound.reshape(2, -1)[:, index].astype(float)
+        own = factor * (
+            1 + scatter * Stream("learned_threshold_threshold_pixel_normal", seed, index).normal()
+        )
+        # so much of the way from 1 to what was learned
+        nominal = np.maximum(nominal * ((1 - learned.strength) + learned.strength * own), 0.01)
+    unit = nominal.mean() if setting(sensor, "mismatch", "relative_to", "own") == "mean" else nominal
+    low, high = np.maximum(nominal + unit * spread * np.array([off, on]), 0.01).tolist()
+    return low, high
 
 
 def setting(sensor: dase.Sensor, effect: str, name: str, missing: Any) -> Any:
@@ -204,6 +218,8 @@ def detector(sensor: dase.Sensor, index: int, seed: int) -> Detector:
         if drawn.uniform(0) < hot.share:
             toward = nominal_on if way.uniform(0) < hot.balance else -sensor["threshold"].off
             leaks += hot.rate * np.exp(hot.spread * size.normal()) * toward
+    jitter = setting(sensor, "jitter", "spread", 0.0)
+    redraw = [Stream(f"jitter_redraw_{name}", seed, index) for name in ("normal_2", "normal")]
     return Detector(
         on=on,
         off=off,
@@ -217,6 +233,7 @@ def detector(sensor: dase.Sensor, index: int, seed: int) -> Detector:
         spares_noise=setting(sensor, "refractory", "noise", "held") == "passes",
         waiting=noise.waiting,
         bright=polarity.uniform,
+        anew=lambda sent: tuple(1 + jitter * stream.normal(sent) for stream in redraw) if jitter else (1, 1),
     )
 
 
