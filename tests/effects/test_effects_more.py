@@ -153,7 +153,7 @@ STRENGTHS = (
     Jitter(spread=0.1), Jitter(spread=0.5),
     learned(0.4), learned(1.0),
 )  # fmt: skip
-BUSY = (Bandwidth(cutoff=90.0, spread=0.2), VoltageNoise(sigma=0.2, cutoff=30.0))
+BUSY = (Bandwidth(cutoff=90.0, spread=0.2), VoltageNoise(sigma=0.2, cutoff=30.0), Mismatch(spread=0.1))
 
 
 @pytest.mark.parametrize("others", [(), BUSY], ids=["alone", "with bandwidth and noise"])

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from helpers.event_comparison import KS, distance, tracks
+from helpers.event_comparison import KS, by_pixel, distance, tracks
 from helpers.sensors import counts, every
-from helpers.small_scenes import ramp, still
+from helpers.small_scenes import flicker, ramp, still
 from reference import pixel as reference
 
 import dase
@@ -35,6 +35,25 @@ def test_thresholds_are_drawn_anew_after_each_event(device, spread, mode):
             np.testing.assert_allclose(6.0 * times, np.cumsum(want), atol=2e-5)
     got = counts(ramp(-6.0, 1.0, pixels, samples=7), sensor, 1.0, device, seed=5)[0]
     np.testing.assert_array_equal(got, [len(t) for t in tracks(events)])
+
+
+@pytest.mark.parametrize("noise", ["held", "passes"])
+@pytest.mark.parametrize("mode", ["reset", "drop", "delay"])
+@pytest.mark.parametrize("spread", [0.1, 0.4])
+def test_thresholds_of_noisy_slow_pixels_are_drawn_anew(device, rng, spread, mode, noise):
+    """Whenever the memory is set, be it by an event that a dead time loses."""
+    scene = flicker(rng, size=(4, 5))
+    times = scene.sample_times()
+    others = Bandwidth(cutoff=90.0), Shot(rate=60.0), Refractory(period=3e-3, mode=mode, noise=noise)
+    sensor = every(Threshold(on=0.17, off=0.23), Jitter(spread=spread), *others, mode=mode)
+    got = by_pixel(PixelArray(sensor, 5, 4, seed=5, device=device).emit(scene, times)[0])
+    want = reference.events(sensor, times, scene.frames(times).reshape(len(times), -1), 5)
+    alike = [
+        np.array_equal(g[:, 1], w[:, 2]) and np.allclose(g[:, 0], w[:, 1], atol=1e-5)
+        for g, w in zip(got, want, strict=True)
+    ]
+    assert np.mean(alike) >= 0.9
+    assert np.mean([len(w) for w in want]) > 10
 
 
 @pytest.mark.parametrize("spread", [0.1, 0.2, 0.3])

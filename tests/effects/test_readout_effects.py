@@ -251,7 +251,7 @@ def test_the_clock_shows_its_last_tick(rng):
 
 
 def stamped(events: dase.Events, jitter: float, step: int, seed: int) -> list[tuple[int, int, int, int]]:
-    """Return (t [ns], x, y, p) with stamps that err by jitter [ns] and are whole steps [ns], in their order."""
+    """Return (t [ns], x, y, p) in order of stamps, which err by jitter [ns] and are whole steps [ns]."""
     errors = np.random.default_rng([seed, zlib.crc32(b"timestamp")]).standard_normal(len(events))
     out = []
     for (t, *rest), error in zip(rows_of(events), errors, strict=True):

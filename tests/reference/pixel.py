@@ -88,7 +88,7 @@ class Detector:
         after_off: Dead time after an OFF event, relative to that after an ON event.
         waiting: Hazard before noise event n.
         bright: Uniform number that decides the polarity of noise event n >= 1.
-        anew: Factors of the OFF and ON thresholds after n events.
+        anew: Factors of the OFF and ON thresholds after the memory was set n times.
     """
 
     on: float
@@ -105,9 +105,9 @@ class Detector:
     bright: Callable[[int], float] = lambda n: 0.0
     anew: Callable[[int], tuple[float, float]] = lambda n: (1.0, 1.0)
 
-    def thresholds(self, sent: int) -> tuple[float, float]:
-        """Return the OFF and ON thresholds after some events."""
-        off, on = self.anew(sent)
+    def thresholds(self, memorised: int) -> tuple[float, float]:
+        """Return the OFF and ON thresholds after the memory was set so many times."""
+        off, on = self.anew(memorised)
         return max(self.off * off, 0.01), max(self.on * on, 0.01)
 
     def start(self, first: float, second: float) -> float:
@@ -117,9 +117,9 @@ class Detector:
             return first + self.lead * off
         return first - self.lead * on
 
-    def crossing(self, begin: float, change: float, slope: float, sent: int) -> tuple[float, float]:
+    def crossing(self, begin: float, change: float, slope: float, memorised: int) -> tuple[float, float]:
         """Return when the change passes a threshold, at `begin` or later, and the signed threshold."""
-        off, on = self.thresholds(sent)
+        off, on = self.thresholds(memorised)
         if change >= on:
             return begin, on
         if change <= -off:
@@ -136,14 +136,18 @@ class Detector:
         Args:
             times: Samples [s], shape (K,).
             signal: Log intensity at the samples, shape (K,); runs straight between them.
-            rates: OFF and ON noise rates during the step that ends at a sample [Hz], shape (K, 2).
+            rates: OFF and ON noise rates during the step that ends at a sample [Hz], shape (K, 2), at the
+                pixel's mean thresholds; they follow those that it has when the step begins.
         """
         level = signal + self.leak * (times - times[0])
         memory = self.start(level[0], level[1])
-        alive_from, held, hazard, drawn = -np.inf, False, self.waiting(0), 1
+        alive_from, held, hazard, drawn, memorised = -np.inf, False, self.waiting(0), 1, 0
         out: list[tuple[float, ...]] = []
         for k in range(1, len(times)):
-            now, end, total = times[k - 1], times[k], rates[k].sum()
+            now, end = times[k - 1], times[k]
+            low, high = self.thresholds(memorised)
+            off_rate, on_rate = rates[k, 0] * self.off / low, rates[k, 1] * self.on / high
+            total = off_rate + on_rate
             slope = (level[k] - level[k - 1]) / (end - now)
             noise = now + hazard / total if total > 0 else np.inf
             while True:
@@ -151,21 +155,23 @@ class Detector:
                     memory, held, now = level[k] + slope * (alive_from - end), False, alive_from
                 look = max(now, alive_from) if self.delays else now
                 change = level[k] + slope * (look - end) - memory
-                crossing, theta = (np.inf, 0.0) if held else self.crossing(look, change, slope, len(out))
+                crossing, theta = (np.inf, 0.0) if held else self.crossing(look, change, slope, memorised)
                 now = min(crossing, noise)
                 if now > end:
                     break
                 alive = self.delays * (now == crossing) or now >= alive_from
-                if now == crossing:
+                is_noise = now != crossing
+                # of noise that is spared the dead time, what is held in reset memorises nothing
+                sees = not held if self.spares_noise else alive
+                if is_noise:
+                    row = (k, now, float(self.bright(drawn) * total < on_rate), np.inf)
+                    memory = level[k] + slope * (now - end) if sees else memory
+                    noise, drawn = now + self.waiting(drawn) / total, drawn + 1
+                else:
                     memory += theta
                     row = (k, now, float(theta > 0), abs(slope))
-                else:
-                    row = (k, now, float(self.bright(drawn) * total < rates[k, 1]), np.inf)
-                    memory = level[k] + slope * (now - end) if alive else memory
-                    noise, drawn = now + self.waiting(drawn) / total, drawn + 1
-                if self.spares_noise and now != crossing:
-                    # what is held in reset memorises nothing, whatever is sent on top
-                    memory = memory if held else level[k] + slope * (now - end)
+                memorised += not is_noise or sees
+                if is_noise and self.spares_noise:
                     out.append(row)
                 elif alive:
                     out.append(row)
@@ -233,7 +239,7 @@ def detector(sensor: dase.Sensor, index: int, seed: int) -> Detector:
         spares_noise=setting(sensor, "refractory", "noise", "held") == "passes",
         waiting=noise.waiting,
         bright=polarity.uniform,
-        anew=lambda sent: tuple(1 + jitter * stream.normal(sent) for stream in redraw) if jitter else (1, 1),
+        anew=lambda n: tuple(1 + jitter * stream.normal(n) for stream in redraw) if jitter else (1.0, 1.0),
     )
 
 
