@@ -17,9 +17,12 @@ import dase
 from dase.effects.bandwidth import Bandwidth
 from dase.effects.dark import Dark
 from dase.effects.dead import Dead
+from dase.effects.exposure import Exposure
 from dase.effects.flicker import Flicker
+from dase.effects.high_pass import HighPass
 from dase.effects.jitter import Jitter
 from dase.effects.leak import Leak
+from dase.effects.learned_threshold import LearnedThreshold
 from dase.effects.linlog import Linlog
 from dase.effects.mismatch import Mismatch
 from dase.effects.refractory import Refractory
@@ -113,20 +116,56 @@ TWINS = {
 }
 
 
-@pytest.mark.parametrize("name", TWINS)
-def test_photoreceptors_match_their_twins(device, rng, name):
-    scene = flicker(rng, size=(5, 6), step=0.5)
+def match_twin(scene: dase.Scene, sensor: dase.Sensor, device: str) -> list[np.ndarray]:
+    """Assert that events of nearly all pixels are those of the twin, and return those of the twin."""
     times = scene.sample_times()
-    sensor = every(Threshold(on=0.17, off=0.23), *TWINS[name])
-    array = PixelArray(sensor, 6, 5, seed=11, device=device)
+    array = PixelArray(sensor, scene.width, scene.height, seed=11, device=device)
     got = by_pixel(array.emit(scene, times)[0])
     want = reference_effects.events(sensor, times, scene.frames(times), 11)
     equal = [np.array_equal(g[:, 1], w[:, 2]) for g, w in zip(got, want, strict=True)]
     assert np.mean(equal) >= 0.9
-    assert np.mean([len(w) for w in want]) > 5
     for g, w, alike in zip(got, want, equal, strict=True):
         if alike:
             np.testing.assert_array_less(np.abs(g[:, 0] - w[:, 1]) * w[:, 3], 5e-5 + 3e-9 * w[:, 3])
+    return want
+
+
+@pytest.mark.parametrize("name", TWINS)
+def test_photoreceptors_match_their_twins(device, rng, name):
+    scene = flicker(rng, size=(5, 6), step=0.5)
+    want = match_twin(scene, every(Threshold(on=0.17, off=0.23), *TWINS[name]), device)
+    assert np.mean([len(w) for w in want]) > 5
+
+
+def learned(strength: float) -> LearnedThreshold:
+    """Return thresholds that grow from column to column, as a network might tell."""
+    maps = np.stack([np.tile(np.linspace(0.6, 1.8, 6), (5, 1)), np.full((5, 6), 0.3)])
+    return LearnedThreshold(strength=strength, weights="stands for a file", bound=maps.astype(np.float32))
+
+
+STRENGTHS = (
+    Flicker(frequency=23.0, depth=0.2, phase=0.3), Flicker(frequency=60.0, depth=0.9, region=2, apart=0.2),
+    Vignetting(loss=0.3), Vignetting(loss=0.95),
+    Linlog(knee=0.1, slope=1.2), Linlog(knee=0.5, slope=2.0),
+    HighPass(cutoff=2.0), HighPass(cutoff=40.0),
+    Exposure(amplitude=0.3, spread=0.5, period=0.031, exposure=0.011, begin=0.004),
+    Exposure(amplitude=-1.2, spread=0.2, period=0.05, exposure=0.03, begin=-0.013),
+    Jitter(spread=0.1), Jitter(spread=0.5),
+    learned(0.4), learned(1.0),
+)  # fmt: skip
+BUSY = (Bandwidth(cutoff=90.0, spread=0.2), VoltageNoise(sigma=0.2, cutoff=30.0), Mismatch(spread=0.1))
+
+
+@pytest.mark.parametrize("others", [(), BUSY], ids=["alone", "with bandwidth and noise"])
+@pytest.mark.parametrize("effect", STRENGTHS, ids=repr)
+def test_each_strength_matches_its_twin(device, rng, effect, others):
+    scene = flicker(rng, size=(5, 6), step=0.5)
+    want = match_twin(scene, every(Threshold(on=0.17, off=0.23), *others, effect), device)
+    off = every(Threshold(on=0.17, off=0.23), *others)
+    plain = reference_effects.events(off, scene.sample_times(), scene.frames(scene.sample_times()), 11)
+    # had the effect none of its strength, the twin would send other events
+    alike = [len(w) == len(p) and np.allclose(w[:, :3], p[:, :3]) for w, p in zip(want, plain, strict=True)]
+    assert np.mean(alike) < 0.3
 
 
 def test_a_lamp_makes_events_of_both_polarities_in_turns(device):

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from helpers.event_comparison import KS, distance, tracks
+from helpers.event_comparison import KS, by_pixel, distance, tracks
 from helpers.sensors import counts, every
-from helpers.small_scenes import ramp, still
+from helpers.small_scenes import flicker, ramp, still
 from reference import pixel as reference
 
 import dase
+from dase.effects.bandwidth import Bandwidth
 from dase.effects.dead import Dead
 from dase.effects.hot import Hot
 from dase.effects.jitter import Jitter
@@ -22,29 +23,50 @@ from dase.simulation.pixel_array import PixelArray
 
 
 @pytest.mark.parametrize("mode", ["drop", "delay"])
-def test_thresholds_are_drawn_anew_after_each_event(device, mode):
-    spread, pixels = 0.25, 60
+@pytest.mark.parametrize("spread", [0.05, 0.25, 0.5])
+def test_thresholds_are_drawn_anew_after_each_event(device, spread, mode):
+    pixels = 60
     sensor = every(Threshold(on=0.3, off=0.1, phase=0.0), Jitter(spread=spread), mode=mode)
     for sign, theta, name in ((1, 0.3, "normal"), (-1, 0.1, "normal_2")):
         events = dase.simulate(ramp(sign * 6.0, 1.0, pixels, samples=7), sensor, seed=5, device=device)
         for pixel, times in enumerate(tracks(events)):
             stream = reference.Stream(f"jitter_redraw_{name}", 5, pixel)
-            want = [theta * (1 + spread * stream.normal(n)) for n in range(len(times))]
+            want = [max(theta * (1 + spread * stream.normal(n)), 0.01) for n in range(len(times))]
             np.testing.assert_allclose(6.0 * times, np.cumsum(want), atol=2e-5)
     got = counts(ramp(-6.0, 1.0, pixels, samples=7), sensor, 1.0, device, seed=5)[0]
     np.testing.assert_array_equal(got, [len(t) for t in tracks(events)])
 
 
-def test_jitter_averages_out_and_mismatch_does_not(device):
+@pytest.mark.parametrize("noise", ["held", "passes"])
+@pytest.mark.parametrize("mode", ["reset", "drop", "delay"])
+@pytest.mark.parametrize("spread", [0.1, 0.4])
+def test_thresholds_of_noisy_slow_pixels_are_drawn_anew(device, rng, spread, mode, noise):
+    """Whenever the memory is set, be it by an event that a dead time loses."""
+    scene = flicker(rng, size=(4, 5))
+    times = scene.sample_times()
+    others = Bandwidth(cutoff=90.0), Shot(rate=60.0), Refractory(period=3e-3, mode=mode, noise=noise)
+    sensor = every(Threshold(on=0.17, off=0.23), Jitter(spread=spread), *others, mode=mode)
+    got = by_pixel(PixelArray(sensor, 5, 4, seed=5, device=device).emit(scene, times)[0])
+    want = reference.events(sensor, times, scene.frames(times).reshape(len(times), -1), 5)
+    alike = [
+        np.array_equal(g[:, 1], w[:, 2]) and np.allclose(g[:, 0], w[:, 1], atol=1e-5)
+        for g, w in zip(got, want, strict=True)
+    ]
+    assert np.mean(alike) >= 0.9
+    assert np.mean([len(w) for w in want]) > 10
+
+
+@pytest.mark.parametrize("spread", [0.1, 0.2, 0.3])
+def test_jitter_averages_out_and_mismatch_does_not(device, spread):
     scene = ramp(9.0, 1.0, 500)
     quiet = Threshold(on=0.1, off=0.1, phase=0.0)
     spreads = []
-    for effect in (Jitter(spread=0.2), Mismatch(spread=0.2)):
+    for effect in (Jitter(spread=spread), Mismatch(spread=spread)):
         on = counts(scene, every(quiet, effect), 1.0, device)[1]
         spreads.append(on.std() / on.mean())
-    # a sum of 90 intervals varies by 0.2 / √90
-    assert spreads[0] == pytest.approx(0.2 / np.sqrt(90), rel=0.15)
-    assert spreads[1] > 0.15
+    # a sum of 90 intervals varies by spread / √90
+    assert spreads[0] == pytest.approx(spread / np.sqrt(90), rel=0.15)
+    assert spreads[1] > 0.75 * spread
 
 
 def test_noise_events_draw_new_thresholds_too(device):
@@ -113,6 +135,31 @@ def test_hot_pixels_are_few_and_log_normal(device):
     assert log_rate.mean() == pytest.approx(np.log(rate), abs=3 * spread / np.sqrt(len(hot)))
     assert log_rate.std() == pytest.approx(spread, rel=3 / np.sqrt(2 * len(hot)))
     assert abs(np.corrcoef(hot[:-1], hot[1:] - hot[:-1])[0, 1]) < 0.15  # scattered evenly
+
+
+@pytest.mark.parametrize("others", [(), (Bandwidth(cutoff=50.0), Shot(rate=20.0, balance=0.3))])
+@pytest.mark.parametrize(
+    ("share", "rate", "spread", "balance"),
+    [(0.1, 40.0, 1.0, 0.5), (0.5, 8.0, 0.4, 0.9), (1.0, 100.0, 0.0, 0.0)],
+)
+def test_each_pixel_has_the_rate_of_its_twin(device, share, rate, spread, balance, others):
+    seconds, pixels = 20.0, 1000
+    sensor = every(Hot(share=share, rate=rate, spread=spread, balance=balance), *others)
+    got = counts(still(np.zeros(pixels), seconds, 3), sensor, seconds, device, seed=4)
+    uniform, normal = (
+        np.array([draw(reference.Stream(f"hot_noise_pixel_{name}", 4, i)) for i in range(pixels)])
+        for name, draw in (("uniform", reference.Stream.uniform), ("normal", reference.Stream.normal))
+    )
+    total = np.where(uniform < share, rate * np.exp(spread * normal), 0.0)
+    assert 0.8 * share * pixels < np.count_nonzero(total) <= pixels
+    for on, mine in enumerate(got):
+        noise = (0.3, 0.7)[1 - on] * 20.0 if others else 0.0
+        want = seconds * (total * (balance if on else 1 - balance) + noise)
+        assert mine[want == 0].sum() == 0
+        deviation = (mine - want)[want > 0] / np.sqrt(want[want > 0])  # Poisson counts
+        if len(deviation):
+            assert abs(deviation.mean()) < 3.5 / np.sqrt(len(deviation))
+            assert deviation.std() == pytest.approx(1, abs=3.5 / np.sqrt(2 * len(deviation)))
 
 
 def test_hot_intervals_are_exponential(device):

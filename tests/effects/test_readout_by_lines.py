@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from fractions import Fraction
 
@@ -81,6 +82,17 @@ def test_it_is_its_twin_behind_noisy_slow_pixels(device, rng, mode):
     assert 100 < len(got) < 0.9 * len(plain)
     parts = dase.Events.concatenate(dase.stream(scene, pixels.with_effect(bus), device=device, chunk=7))
     same(replace(parts, label=got.label), got)
+
+
+@pytest.mark.parametrize("mode", ["rows", "columns"])
+def test_without_a_limit_of_the_rate_it_changes_nothing(device, rng, mode):
+    """Whatever a line would take."""
+    scene, pixels = moving(rng, 60), camera(Bandwidth(cutoff=100.0), Shot(rate=60.0))
+    plain = dase.simulate(scene, pixels, device=device, labels=True)
+    off = pixels.with_effect(Readout(rate=math.inf, line=1e-4, mode=mode))
+    same(dase.simulate(scene, off, device=device, labels=True), plain)
+    parts = dase.Events.concatenate(dase.stream(scene, off, device=device, chunk=7))
+    same(replace(parts, label=plain.label), plain)
 
 
 @pytest.mark.parametrize("mode", ["rows", "columns"])

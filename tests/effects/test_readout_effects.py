@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import zlib
 from collections import deque
 from fractions import Fraction
 
@@ -11,6 +12,7 @@ from helpers.readout_streams import HEIGHT, WIDTH, bunched, camera, moving, ns, 
 from reference import pixel as reference
 
 import dase
+from dase.effects.bandwidth import Bandwidth
 from dase.effects.latency import Latency
 from dase.effects.readout import Readout
 from dase.effects.row_scan import RowScan
@@ -18,6 +20,14 @@ from dase.effects.shot import Shot
 from dase.effects.threshold import Threshold
 from dase.effects.timestamp import Timestamp
 from dase.simulation.pixel_array import PixelArray
+
+SLOW_AND_NOISY = (Bandwidth(cutoff=100.0), Shot(rate=60.0))
+
+
+def rows_of(events: dase.Events) -> list[tuple[int, int, int, int]]:
+    """Return (t [ns], x, y, p) of all events."""
+    return list(zip(ns(events), events.x.tolist(), events.y.tolist(), events.p.tolist(), strict=True))
+
 
 # ---- latency
 
@@ -32,14 +42,16 @@ def test_a_constant_latency_shifts_all_events(device, rng):
             np.testing.assert_array_equal(getattr(got, name), getattr(want, name))
 
 
-def test_latency_grows_with_the_inverse_intensity(device, rng):
+@pytest.mark.parametrize("others", [(), SLOW_AND_NOISY], ids=["alone", "behind noisy slow pixels"])
+@pytest.mark.parametrize(("delay", "share", "dark"), [(1e-3, 0.6, 0.02), (1e-2, 0.9, 0.2)])
+def test_latency_grows_with_the_inverse_intensity(device, rng, delay, share, dark, others):
     scene = moving(rng)
     times = scene.sample_times()
-    effect = Latency(delay=1e-3, light=0.6, dark=0.02)
-    plain = dase.simulate(scene, camera(Latency.identity()), device=device)
-    got = dase.simulate(scene, camera(effect), device=device)
+    effect = Latency(delay=delay, light=share, dark=dark)
+    plain = dase.simulate(scene, camera(*others, Latency.identity()), device=device)
+    got = dase.simulate(scene, camera(*others, effect), device=device)
     light = scene.frames(times)[np.searchsorted(times, plain.t - 1e-9), plain.y, plain.x]
-    due = plain.t + 1e-3 * (0.4 + 0.6 / (0.02 + 0.98 * light))
+    due = plain.t + delay * (1 - share + share / (dark + (1 - dark) * light))
     held = 0
     for y in range(HEIGHT):
         for x in range(WIDTH):
@@ -94,10 +106,9 @@ def scanned(events: dase.Events, line_ps: int, direction: str) -> list[tuple[int
     """Return (t [ns], x, y, p) as a scan reads them, found by walking from line to line."""
     lines = {"down": HEIGHT, "up": HEIGHT, "right": WIDTH, "left": WIDTH}[direction]
     requests: dict[tuple[int, int], deque] = {}
-    rows = list(zip(ns(events), events.x.tolist(), events.y.tolist(), events.p.tolist(), strict=True))
     out = []
     line = 0
-    waiting = deque(rows)
+    waiting = deque(rows_of(events))
     while waiting or requests:
         now = line * line_ps
         while waiting and waiting[0][0] * 1000 <= now:
@@ -118,9 +129,8 @@ def scanned(events: dase.Events, line_ps: int, direction: str) -> list[tuple[int
 def test_row_scan_reads_line_after_line(rng, direction, line_ps, tick):
     events = bunched(rng, 1500, tick)
     got = through(camera(RowScan(line=line_ps * 1e-12, direction=direction)), events)
-    rows = list(zip(ns(got), got.x.tolist(), got.y.tolist(), got.p.tolist(), strict=True))
-    assert rows == scanned(events, line_ps, direction)
-    assert len(rows) < 0.95 * len(events)
+    assert rows_of(got) == scanned(events, line_ps, direction)
+    assert len(got) < 0.95 * len(events)
 
 
 def test_row_scan_of_a_simulation(device, rng):
@@ -159,7 +169,7 @@ def test_row_scan_of_a_real_camera(shared):
 def queued(events: dase.Events, rate: Fraction, depth: int) -> list[tuple[int, int, int, int]]:
     """Return (t [ns], x, y, p) that leave a queue, in exact fractions, keeping the list of who is in it."""
     service, inside, out = Fraction(10**9) / rate, deque(), []
-    for t, x, y, p in zip(ns(events), events.x.tolist(), events.y.tolist(), events.p.tolist(), strict=True):
+    for t, x, y, p in rows_of(events):
         while inside and inside[0] <= t:
             inside.popleft()
         if len(inside) < depth:
@@ -173,7 +183,7 @@ def test_readout_is_a_queue(rng, rate, depth):
     events = bunched(rng)
     got = through(camera(Readout(rate=float(rate), depth=float(depth))), events)
     want = queued(events, Fraction(rate), depth)
-    assert list(zip(ns(got), got.x.tolist(), got.y.tolist(), got.p.tolist(), strict=True)) == want
+    assert rows_of(got) == want
     assert len(want) == len(events) if depth == 10**6 else len(want) < 0.9 * len(events)
     if depth == 1:
         same(through(camera(Readout(rate=float(rate), depth=77.0, mode="drop")), events), got)
@@ -238,3 +248,39 @@ def test_the_clock_shows_its_last_tick(rng):
         ticks = np.array(ns(events)) // round(step * 1e9)
         np.testing.assert_array_equal(ns(got), ticks * round(step * 1e9))
         np.testing.assert_array_equal(got.x, events.x)
+
+
+def stamped(events: dase.Events, jitter: float, step: int, seed: int) -> list[tuple[int, int, int, int]]:
+    """Return (t [ns], x, y, p) in order of stamps, which err by jitter [ns] and are whole steps [ns]."""
+    errors = np.random.default_rng([seed, zlib.crc32(b"timestamp")]).standard_normal(len(events))
+    out = []
+    for (t, *rest), error in zip(rows_of(events), errors, strict=True):
+        out.append((t + round(jitter * min(max(error, -5.0), 5.0)), *rest))
+    out.sort(key=lambda event: event[0])  # those of one time stay in order; the clock keeps the order too
+    return [(t // step * step if step else t, *rest) for t, *rest in out]
+
+
+# ---- behind noisy slow pixels
+
+MOVED = {
+    "a slow scan": (RowScan(line=1e-4, direction="up"), lambda e: scanned(e, 10**8, "up")),
+    "a fast scan": (RowScan(line=3e-6, direction="right"), lambda e: scanned(e, 3 * 10**6, "right")),
+    "a queue": (Readout(rate=2e4, depth=30), lambda e: queued(e, Fraction(20_000), 30)),
+    "a long queue": (Readout(rate=8e3, depth=1e6), lambda e: queued(e, Fraction(8000), 10**6)),
+    "a busy bus": (Readout(rate=2e4, mode="drop"), lambda e: queued(e, Fraction(20_000), 1)),
+    "a slow bus": (Readout(rate=4e3, mode="drop"), lambda e: queued(e, Fraction(4000), 1)),
+    "jitter": (Timestamp(jitter=1e-5, step=0.0), lambda e: stamped(e, 1e4, 0, 3)),
+    "a clock": (Timestamp(jitter=0.0, step=1e-4), lambda e: stamped(e, 0.0, 100_000, 3)),
+    "jitter and a clock": (Timestamp(jitter=1e-3, step=3.3e-5), lambda e: stamped(e, 1e6, 33_000, 3)),
+}
+
+
+@pytest.mark.parametrize("name", MOVED)
+def test_behind_noisy_slow_pixels_it_is_its_twin(device, rng, name):
+    scene, pixels, (effect, twin) = moving(rng, 60), camera(*SLOW_AND_NOISY), MOVED[name]
+    plain = dase.simulate(scene, pixels, seed=3, device=device)
+    got = dase.simulate(scene, pixels.with_effect(effect), seed=3, device=device)
+    want = twin(plain)
+    assert rows_of(got) == want
+    assert len(want) > 500
+    assert want != rows_of(plain)

@@ -88,6 +88,7 @@ class Detector:
         after_off: Dead time after an OFF event, relative to that after an ON event.
         waiting: Hazard before noise event n.
         bright: Uniform number that decides the polarity of noise event n >= 1.
+        anew: Factors of the OFF and ON thresholds after the memory was set n times.
     """
 
     on: float
@@ -102,23 +103,31 @@ class Detector:
     after_off: float = 1.0
     waiting: Callable[[int], float] = lambda n: np.inf
     bright: Callable[[int], float] = lambda n: 0.0
+    anew: Callable[[int], tuple[float, float]] = lambda n: (1.0, 1.0)
+
+    def thresholds(self, memorised: int) -> tuple[float, float]:
+        """Return the OFF and ON thresholds after the memory was set so many times."""
+        off, on = self.anew(memorised)
+        return max(self.off * off, 0.01), max(self.on * on, 0.01)
 
     def start(self, first: float, second: float) -> float:
         """Return what the pixel remembers at the first sample."""
+        off, on = self.thresholds(0)
         if second < first or (second == first and self.falls):
-            return first + self.lead * self.off
-        return first - self.lead * self.on
+            return first + self.lead * off
+        return first - self.lead * on
 
-    def crossing(self, begin: float, change: float, slope: float) -> tuple[float, float]:
+    def crossing(self, begin: float, change: float, slope: float, memorised: int) -> tuple[float, float]:
         """Return when the change passes a threshold, at `begin` or later, and the signed threshold."""
-        if change >= self.on:
-            return begin, self.on
-        if change <= -self.off:
-            return begin, -self.off
+        off, on = self.thresholds(memorised)
+        if change >= on:
+            return begin, on
+        if change <= -off:
+            return begin, -off
         if slope > 0:
-            return begin + (self.on - change) / slope, self.on
+            return begin + (on - change) / slope, on
         if slope < 0:
-            return begin + (self.off + change) / -slope, -self.off
+            return begin + (off + change) / -slope, -off
         return np.inf, 0.0
 
     def run(self, times: np.ndarray, signal: np.ndarray, rates: np.ndarray) -> np.ndarray:
@@ -127,14 +136,18 @@ class Detector:
         Args:
             times: Samples [s], shape (K,).
             signal: Log intensity at the samples, shape (K,); runs straight between them.
-            rates: OFF and ON noise rates during the step that ends at a sample [Hz], shape (K, 2).
+            rates: OFF and ON noise rates during the step that ends at a sample [Hz], shape (K, 2), at the
+                pixel's mean thresholds; they follow those that it has when the step begins.
         """
         level = signal + self.leak * (times - times[0])
         memory = self.start(level[0], level[1])
-        alive_from, held, hazard, drawn = -np.inf, False, self.waiting(0), 1
+        alive_from, held, hazard, drawn, memorised = -np.inf, False, self.waiting(0), 1, 0
         out: list[tuple[float, ...]] = []
         for k in range(1, len(times)):
-            now, end, total = times[k - 1], times[k], rates[k].sum()
+            now, end = times[k - 1], times[k]
+            low, high = self.thresholds(memorised)
+            off_rate, on_rate = rates[k, 0] * self.off / low, rates[k, 1] * self.on / high
+            total = off_rate + on_rate
             slope = (level[k] - level[k - 1]) / (end - now)
             noise = now + hazard / total if total > 0 else np.inf
             while True:
@@ -142,21 +155,23 @@ class Detector:
                     memory, held, now = level[k] + slope * (alive_from - end), False, alive_from
                 look = max(now, alive_from) if self.delays else now
                 change = level[k] + slope * (look - end) - memory
-                crossing, theta = (np.inf, 0.0) if held else self.crossing(look, change, slope)
+                crossing, theta = (np.inf, 0.0) if held else self.crossing(look, change, slope, memorised)
                 now = min(crossing, noise)
                 if now > end:
                     break
                 alive = self.delays * (now == crossing) or now >= alive_from
-                if now == crossing:
+                is_noise = now != crossing
+                # of noise that is spared the dead time, what is held in reset memorises nothing
+                sees = not held if self.spares_noise else alive
+                if is_noise:
+                    row = (k, now, float(self.bright(drawn) * total < on_rate), np.inf)
+                    memory = level[k] + slope * (now - end) if sees else memory
+                    noise, drawn = now + self.waiting(drawn) / total, drawn + 1
+                else:
                     memory += theta
                     row = (k, now, float(theta > 0), abs(slope))
-                else:
-                    row = (k, now, float(self.bright(drawn) * total < rates[k, 1]), np.inf)
-                    memory = level[k] + slope * (now - end) if alive else memory
-                    noise, drawn = now + self.waiting(drawn) / total, drawn + 1
-                if self.spares_noise and now != crossing:
-                    # what is held in reset memorises nothing, whatever is sent on top
-                    memory = memory if held else level[k] + slope * (now - end)
+                memorised += not is_noise or sees
+                if is_noise and self.spares_noise:
                     out.append(row)
                 elif alive:
                     out.append(row)
@@ -171,13 +186,18 @@ def thresholds(sensor: dase.Sensor, index: int, seed: int) -> tuple[float, float
     spread = setting(sensor, "mismatch", "spread", 0.0)
     name = "mismatch_threshold_pixel_normal"
     on, off = (Stream(n, seed, index).normal() for n in (name, f"{name}_2"))
-    nominal = sensor["threshold"]
-    alike = setting(sensor, "mismatch", "relative_to", "own") == "mean"
-    unit = {
-        name: (nominal.on + nominal.off) / 2 if alike else getattr(nominal, name) for name in ("on", "off")
-    }
-    low, high = nominal.off + unit["off"] * spread * off, nominal.on + unit["on"] * spread * on
-    return max(low, 0.01), max(high, 0.01)
+    nominal = np.array([sensor["threshold"].off, sensor["threshold"].on])
+    if setting(sensor, "learned_threshold", "bound", None) is not None:
+        learned = sensor["learned_threshold"]
+        factor, scatter = learned.bound.reshape(2, -1)[:, index].astype(float)
+        own = factor * (
+            1 + scatter * Stream("learned_threshold_threshold_pixel_normal", seed, index).normal()
+        )
+        # so much of the way from 1 to what was learned
+        nominal = np.maximum(nominal * ((1 - learned.strength) + learned.strength * own), 0.01)
+    unit = nominal.mean() if setting(sensor, "mismatch", "relative_to", "own") == "mean" else nominal
+    low, high = np.maximum(nominal + unit * spread * np.array([off, on]), 0.01).tolist()
+    return low, high
 
 
 def setting(sensor: dase.Sensor, effect: str, name: str, missing: Any) -> Any:
@@ -204,6 +224,8 @@ def detector(sensor: dase.Sensor, index: int, seed: int) -> Detector:
         if drawn.uniform(0) < hot.share:
             toward = nominal_on if way.uniform(0) < hot.balance else -sensor["threshold"].off
             leaks += hot.rate * np.exp(hot.spread * size.normal()) * toward
+    jitter = setting(sensor, "jitter", "spread", 0.0)
+    redraw = [Stream(f"jitter_redraw_{name}", seed, index) for name in ("normal_2", "normal")]
     return Detector(
         on=on,
         off=off,
@@ -217,6 +239,7 @@ def detector(sensor: dase.Sensor, index: int, seed: int) -> Detector:
         spares_noise=setting(sensor, "refractory", "noise", "held") == "passes",
         waiting=noise.waiting,
         bright=polarity.uniform,
+        anew=lambda n: tuple(1 + jitter * stream.normal(n) for stream in redraw) if jitter else (1.0, 1.0),
     )
 
 
