@@ -363,7 +363,7 @@ def test_each_step_of_a_search_is_told():
 
 def test_progress_in_a_pipe_is_a_line_now_and_then(capsys, monkeypatch):
     now = [0.0]
-    monkeypatch.setattr("dase.cli.diagnose.time.monotonic", lambda: now[0])
+    monkeypatch.setattr("dase.cli.output.time.monotonic", lambda: now[0])
     with progress_bar(False) as tell:
         for second in range(35):
             now[0] = float(second)
