@@ -58,12 +58,12 @@ class Shot(Effect):
     events per second in the dark differ by 0.5: the rarer noise crosses a threshold, the more a little
     mismatch matters.
 
-    A pixel whose threshold is lower than the nominal one is noisier, in proportion to
-    nominal / threshold for each polarity, as in v2e. Real rates fall faster with the threshold, like the tail
-    of a normal distribution, and depend on the bandwidth: `voltage_noise` makes both by itself, at the cost
-    of fine sampling. Thresholds that `jitter` draws count as well, so noise beside it is more than `rate`: 2 %
-    for a spread of 0.2, 14 % for 0.5. `rate` belongs to the sensor's own thresholds, so changing those leaves it as it is,
-    unless `threshold` says at which one it was measured.
+    A pixel whose threshold is lower than the nominal one is noisier, in proportion to nominal / threshold
+    for each polarity, as in v2e. Real rates fall faster with the threshold, like the tail of a normal
+    distribution, and depend on the bandwidth: `voltage_noise` makes both by itself, at the cost of fine
+    sampling. Thresholds that `jitter` draws count as well, so noise beside it is more than `rate`: 2 % for
+    a spread of 0.2, 14 % for 0.5. `rate` belongs to the sensor's own thresholds, so changing those leaves
+    it as it is, unless `threshold` says at which one it was measured.
     """
 
     name: ClassVar[str] = "shot"
