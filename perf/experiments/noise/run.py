@@ -10,6 +10,7 @@ least as long as 1 / frequency, shape (50, 50, 72): noise recordings that come w
 from __future__ import annotations
 
 import argparse
+from dataclasses import replace
 from pathlib import Path
 
 import matplotlib
@@ -109,7 +110,7 @@ def draw(columns: dict[str, dict[str, np.ndarray]], path: Path) -> None:
     figure, axes = plt.subplots(1, 3, figsize=(10, 3.5), sharey=True, layout="constrained")
     share = np.linspace(0.05, 0.95, 19)
     for axis, level in zip(axes, LEVELS, strict=True):
-        for (name, data), style in zip(columns.items(), ("o", "-", ":"), strict=False):
+        for (name, data), style in zip(columns.items(), ("o", "-", ":", "--"), strict=True):
             for polarity, colour in ((1, "tab:red"), (0, "tab:blue")):
                 rate = np.maximum(np.quantile(rates(data[level])[polarity], share), 0.01)
                 label = f"{'ON' if polarity else 'OFF'}, {name}"
@@ -124,7 +125,7 @@ def draw(columns: dict[str, dict[str, np.ndarray]], path: Path) -> None:
         axis.grid(alpha=0.25, linewidth=0.5)
     axes[0].set_ylabel("share of pixels below")
     lines, labels = axes[0].get_legend_handles_labels()
-    figure.legend(lines, labels, ncols=6, loc="outside lower center", fontsize=9, frameon=False)
+    figure.legend(lines, labels, ncols=4, loc="outside lower center", fontsize=9, frameon=False)
     figure.savefig(path, dpi=130)
     plt.close(figure)
 
@@ -168,7 +169,8 @@ dark and 25 s else agree with the sums of the intervals.
 - `voltage_noise` does all three levels with one set of parameters. `shot` cannot while its rate falls in a
   straight line, as v2e's does: at 161 of 3000 lux it is hardly lower. With a knee of 3 lux it has the OFF
   events of all three levels, and needs no fine sampling. The column *shot* has
-  `shot` with rate {rate:g} Hz and bright 0 in place of the voltage noise.
+  `shot` with rate {rate:g} Hz and bright 0 in place of the voltage noise, the column *shot, knee* the same
+  with a knee of 0.001, which is 3 lux.
 
 The numbers of the sensor were set by hand, so this shows that the effects can be like a camera, not that a
 fit finds them. Threshold, cutoff and noise are not told apart by static noise: only their ratios are.
@@ -183,11 +185,12 @@ def main() -> None:
     options.out.mkdir(parents=True, exist_ok=True)
     sensor = parse_sensor(SENSOR, "sensor")
     shot = Shot(rate=10.5, bright=0.0, balance=0.57)
-    poisson = sensor.without("voltage_noise").with_effect(shot)
+    bare = sensor.without("voltage_noise")
     columns = {
         "measured": measured(options.measured),
         "simulated": {level: simulated(sensor, level) for level in LEVELS},
-        "shot": {level: simulated(poisson, level) for level in LEVELS},
+        "shot": {level: simulated(bare.with_effect(shot), level) for level in LEVELS},
+        "shot, knee": {level: simulated(bare.with_effect(replace(shot, knee=0.001)), level) for level in LEVELS},
     }
     text = TEXT.format(sensor=SENSOR, table=table(columns), rate=shot.rate)
     (options.out / "noise.md").write_text(text)
