@@ -190,7 +190,9 @@ def main() -> None:
         "measured": measured(options.measured),
         "simulated": {level: simulated(sensor, level) for level in LEVELS},
         "shot": {level: simulated(bare.with_effect(shot), level) for level in LEVELS},
-        "shot, knee": {level: simulated(bare.with_effect(replace(shot, knee=0.001)), level) for level in LEVELS},
+        "shot, knee": {
+            level: simulated(bare.with_effect(replace(shot, knee=0.001)), level) for level in LEVELS
+        },
     }
     text = TEXT.format(sensor=SENSOR, table=table(columns), rate=shot.rate)
     (options.out / "noise.md").write_text(text)
