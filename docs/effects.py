@@ -445,7 +445,8 @@ Events in the trials of a fit relative to those of `dase.simulate`. Buses of fou
 a third of what pixels send, in two scenes, where 900 other pixels are simulated or each of 300 stands for
 three. Voltage noise and lamps are seen at rest, in scenes of 1000, 500 and 250 frames per second, whose time
 a fit cuts into steps of 1, 2 and 1 ms; lamps by themselves, where all are within 3 %, and behind a
-photoreceptor whose cutoff is their frequency; noise of two poles (`poles = "apart"`) at two knees. Left out
+photoreceptor whose cutoff is their frequency; noise at three knees; noise of two poles (`poles = "apart"`)
+at three knees, with and without a loop that rings (a gain of 50). Left out
 are models with no event, and those whose ratio has an error above 0.015 and may be within 3 %.
 `python -m perf.experiments.trials.rates` computes it anew.
 

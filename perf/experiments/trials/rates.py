@@ -46,7 +46,7 @@ CUTOFFS = (10.0, 50.0, 200.0, 1000.0, 3000.0)
 KNEES = (0.01, 0.1, 1.0)
 """Pixels see light of 0.01 to 1."""
 NODE_KNEES = (0.01, 0.1, 1.0)
-"""Where the node's pole is a hundred and ten times as fast as the fixed one in the brightest light, and as fast."""
+"""In the brightest light the node is 100, 10 and 1 times as fast as the fixed pole."""
 GAINS = (0.0, 50.0)
 """Of the loop of two poles: none, and one that rings."""
 DEPTHS = (0.15, 0.3, 0.6, 0.9)
