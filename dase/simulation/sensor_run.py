@@ -64,8 +64,9 @@ class UnreadChunk:
 class SensorRun:
     """A sensor before a scene while time passes. A run goes over its scene once.
 
-    It owns the pixels, the readout behind them and the chunks, so that every way to simulate (`dase.stream`,
-    `dase.count`, data sets, fits) cuts time in the same way and ends in the same way.
+    It owns the pixels, the readout behind them and the chunks, so that every way to simulate one scene
+    (`dase.stream`, `dase.count`, data sets, fits) cuts time in the same way and ends in the same way. Many
+    scenes at once, for training, go through `PixelBatch`, whose steps their makers count.
 
     Args:
         scene: What the pixels see.
