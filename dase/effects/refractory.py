@@ -67,7 +67,7 @@ class Refractory(Effect):
         bounds=(0.01, 100.0),
         plausible=(0.3, 3.0),
         about="dead time after an OFF event, relative to that after an ON event",
-        fitted=False,  # a fit asks for it where the measurement has fast events of both polarities
+        fitted=False,  # two recordings do not tell it by the error of a fit: docs/effects.md
     )
     spread: float = parameter(
         0.0,
