@@ -157,8 +157,8 @@ def layers_near(layers: Layers, x: float, y: float) -> int:
 @wp.func
 def in_front(layers: Layers, near: int, k: int, x: float, y: float) -> wp.vec2:
     """Intensity of the layers in front of the background, and how much of it they let through."""
-    # the same law stands in `vector_math` for blocks of pixels, layer by layer, and in the gradient, which has
-    # to remember every layer: one loop for all three would make this one slow
+    # the same law stands in `vector_math` for blocks of pixels, layer by layer, and in the gradient, which
+    # has to remember every layer: one loop for all three would make this one slow
     light = float(0.0)
     through = float(1.0)
     left = int(near)
