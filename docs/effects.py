@@ -544,7 +544,7 @@ a third of what pixels send, in two scenes, where 900 other pixels are simulated
 three. Voltage noise and lamps are seen at rest, in scenes of 1000, 500 and 250 frames per second, whose time
 a fit cuts into steps of 1, 2 and 1 ms; lamps by themselves, where all are within 3 %, and behind a
 photoreceptor whose cutoff is their frequency; noise at three knees; noise of two poles (`poles = "apart"`)
-at three knees, with and without a loop that rings (a gain of 50). Left out
+at two. Left out
 are models with no event, and those whose ratio has an error above 0.015 and may be within 3 %.
 `python -m perf.experiments.trials.rates` computes it anew.
 
