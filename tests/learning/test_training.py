@@ -54,7 +54,7 @@ from dase.networks.threshold_network import (
     edge_strength,
     interpolate_table,
 )
-from dase.scenes.image_sources import Picture
+from dase.scenes.image_sources import BACKGROUND, Picture
 from dase.scenes.layers import Layer, LayerScene, Motion
 
 
@@ -74,7 +74,7 @@ def test_batches_show_what_layer_scenes_show(scenes):
         for n in np.flatnonzero(motion.there[b]):
             names = ("x", "y", "angle", "scale_x", "scale_y")
             how = Motion(**{name: tuple(getattr(motion, name)[b, n]) for name in names})
-            grey = scenes.grey[ground[b]].numpy().reshape(scene_batches.BACKGROUND)
+            grey = scenes.grey[ground[b]].numpy().reshape(BACKGROUND)
             picture = Picture(grey)
             if n:
                 (width, height), start = scenes.size[front[b, n]], int(scenes.start[front[b, n]])
