@@ -129,6 +129,9 @@ SAMPLES_PER_PERIOD = 4
 SHORTEST_PERIOD = 1.5e-3
 """Time between frames from which on walks are tried [s]: others take many samples and are like fast noise."""
 
+LONGEST_PERIOD = 0.1
+"""Time between frames up to which walks are tried [s]: pictures further apart show no motion."""
+
 PAST = wp.constant(1.0e-5)
 """How far the line of a step goes beyond a threshold that it passes [log intensity]."""
 
@@ -429,7 +432,7 @@ class VoltageNoise(Effect):
         """
         if observed.clip_step:
             return [cls(poles="one"), cls(poles="one", cutoff=30.0)]
-        if observed.clip_frames < SHORTEST_PERIOD:
+        if not SHORTEST_PERIOD <= observed.clip_frames <= LONGEST_PERIOD:
             return [cls()]
         walk = cls(poles="none", sigma=0.03, period=observed.clip_frames)
         return [cls(), replace(walk, floor=1.0), replace(walk, sigma=0.1, knee=0.03)]

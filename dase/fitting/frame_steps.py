@@ -131,12 +131,17 @@ def _in_turn(events: Events, begin: float, step: float, most: int = 300_000) -> 
 
 
 def clip_step_of(scene: Scene) -> float:
-    """Return the time from frame to frame of a clip [s]; 0 for another scene, or if frames are not even."""
+    """Return the time from frame to frame of a clip [s]; 0 for another scene, or if frames are not even.
+
+    Two pictures are no clip: light that does not change is given as the same one at both ends.
+    """
     if isinstance(scene, VideoScene) and scene.held_for:
         return scene.held_for
     gaps = np.diff(scene.sample_times()) if isinstance(scene, VideoScene) else np.empty(0)
-    step = float(gaps.mean()) if len(gaps) else 0.0
-    return step if len(gaps) and np.ptp(gaps) < 1e-3 * step else 0.0
+    if len(gaps) < 2:
+        return 0.0
+    step = float(gaps.mean())
+    return step if np.ptp(gaps) < 1e-3 * step else 0.0
 
 
 def ticks_are_of_frames(

@@ -44,3 +44,12 @@ def test_a_diagnosis_tells_which_noise_it_is(true):
         assert noise.cutoff == pytest.approx(true.cutoff, rel=0.1)
     else:
         assert noise.period == pytest.approx(0.005)
+
+
+def test_light_that_does_not_change_for_seconds_is_no_clip():
+    """Two equal pictures stand for it, seconds apart: no walk goes from one to the other."""
+    scene = dase.VideoScene(np.full((2, 24, 32), 0.3, np.float32), [0.0, 3.0])
+    events = dase.simulate(scene, dase.Sensor().with_effect(dase.EFFECTS["shot"](rate=4.0)), seed=2)
+    library = {name: dase.EFFECTS[name] for name in ("threshold", "shot", "voltage_noise")}
+    found = dase.diagnose(events, scene="static", effects=library, pixels=200, most=1)
+    assert found.selected == ("shot",)

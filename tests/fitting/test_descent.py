@@ -251,6 +251,8 @@ def test_a_walk_from_frame_to_frame_is_tried_beside_clips_of_other_simulators():
     assert added.sensor["threshold"].phase == 0.0
     assert {"voltage_noise.sigma", "voltage_noise.floor", "voltage_noise.knee"} <= set(added.space.names)
     assert not {"voltage_noise.cutoff", "voltage_noise.period"} & set(added.space.names)
+    for none in (0.0, 1e-4, 2.0):  # another scene, frames as close as samples, pictures of a slide show
+        assert EFFECTS["voltage_noise"].candidates(replace(seen, clip_frames=none)) == [own]
 
 
 def test_what_is_idle_by_another_rule_is_not_free_there():

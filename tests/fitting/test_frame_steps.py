@@ -14,7 +14,7 @@ from dase.effects import EFFECTS
 from dase.fitting import data_split
 from dase.fitting.data_split import split_measurement
 from dase.fitting.frame_steps import clip_step_of, frame_step_of, is_in_step, ticks_are_of_frames
-from dase.fitting.measurement import Measurement
+from dase.fitting.measurement import Measurement, static_scene
 from dase.probes.timestamp_patterns import find_structure
 from dase.scenes.video import VideoScene
 from dase.signatures.result import Answer, Signature
@@ -112,6 +112,7 @@ def test_a_tone_of_the_frames_of_a_clip_is_no_lamp(clip, monkeypatch, frequency,
     assert clip_step_of(clip) == pytest.approx(0.01)
     uneven = VideoScene(clip.frames(times), times + 1e-3 * (np.arange(len(times)) % 2))
     assert clip_step_of(uneven) == 0
+    assert clip_step_of(static_scene(other)) == 0
     assert find_seen_effects(Measurement(other, uneven), EFFECTS).lamp == frequency
 
 
