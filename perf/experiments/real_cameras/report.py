@@ -33,9 +33,12 @@ def write_page(cameras: Mapping[str, Any], log: Path, out: Path) -> None:
     names = ", ".join(name for name in cameras if name not in found)
     left = f"\nNot diagnosed yet: {names}.\n" if names else ""
     parts = [section(name, cameras[name], *found[name]) for name in found]
-    (out / "real-cameras.md").write_text(
-        PAGE.format(table=table(cameras, found), parts="\n\n".join(parts), left=left, made=made_at(found))
-    )
+    seconds = [what["seconds"] for what, _ in found.values()]
+    page = PAGE.format(
+        table=table(cameras, found), parts="\n\n".join(parts), left=left, made=made_at(found),
+        times=f"{min(seconds):.0f} to {max(seconds):.0f}",
+    )  # fmt: skip
+    (out / "real-cameras.md").write_text(page)
 
 
 def made_at(found: Mapping[str, Any]) -> str:
@@ -66,12 +69,17 @@ def answer(found: dict[str, Any]) -> str:
 
 
 def path_of(found: dict[str, Any]) -> tuple[list[str], list[float], int]:
-    """Return steps, their errors, and how many of the last are stand-ins."""
+    """Return steps, their errors, and how many of the last are not announced: offered, or stand-ins."""
     steps, errors = ["thresholds"], list(found["errors"])
     steps += [f"+ {name}" for name in found["selected"]]
     left = found["unexplained"]
     if left is None or not left["nearest"]:
-        return steps, errors, 0
+        all_of = found["findings"]
+        offered = [one for one in all_of if one["grade"] == "either" and one["error_with"] is not None]
+        if not offered:
+            return steps, errors, 0
+        last = "+ " + " + ".join(one["effect"] for one in offered)
+        return [*steps, last], [*errors, offered[0]["error_with"]], 1
     history = found["history"]
     after = {a["chosen"]: b["error"] for a, b in pairwise(history) if a["chosen"]}
     names = left["nearest"]
@@ -245,7 +253,7 @@ def staircase(axis: Axes, found: dict[str, Any]) -> None:
     axis.yaxis.set_minor_formatter(NullFormatter())
     axis.spines[["top", "right"]].set_visible(False)
     axis.set_title(
-        "error on held-out pixels and time" + (" (dashed: stand-ins)" if stand_ins else ""),
+        "error on held-out pixels and time" + (" (dashed: not announced)" if stand_ins else ""),
         fontsize=8.5, color=Colour.QUIET, pad=4,
     )  # fmt: skip
 
@@ -284,7 +292,7 @@ second where edges pass all the time, so none of them is calm.
 Rows of `psee_gen31_dot` and columns of `davis346_cuke_cradle` were called grouped until signatures knew
 edges that move, which make the same; of either too few events are left beside edges to say anything.
 
-Times are of two cores of an AMD EPYC (family 25, model 17): 15 to 121 s. At 2323c88 they
+Times are of two cores of an AMD EPYC (family 25, model 17): {times} s. At 2323c88 they
 were 51 to 706 s, on a core of an AMD EPYC (family 25) that was shared. Since then pixels and
 models are fewer far from the floor and where light between frames is a guess, and a bus is no rival where the
 stamps say that it was never busy.
