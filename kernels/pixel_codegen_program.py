@@ -85,7 +85,6 @@ def intensity_of_log(model: PixelModel) -> tuple[Part, ...]:
 
 def _keep_illumination(model: PixelModel) -> tuple[Part, ...]:
     """Return the part that keeps the light before currents of the dark are added, none if nobody asks."""
-    # added to, for a plain copy would be the same variable to Warp
     return (Part(lines("illumination = intensity + 0.0")),) if model.asks("illumination") else ()
 
 
