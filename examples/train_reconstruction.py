@@ -32,7 +32,7 @@ device = "cuda" if torch.cuda.is_available() else "cpu"
 torch.set_num_threads(1)  # more gain nothing for networks this small, and lose much on a busy machine
 network = dase.tasks.FireNet()
 settings = dase.tasks.ReconstructionTraining(
-    steps=1000 if device == "cuda" else 200, warm_up=20, average=0.97, learning_rate=4e-3, device=device
+    steps=1000 if device == "cuda" else 200, warm_up=20, average=0.97, learning_rate=8e-3, device=device
 )
 
 
