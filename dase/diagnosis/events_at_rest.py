@@ -40,7 +40,7 @@ LEAK = "leak events"
 
 
 @dataclass(frozen=True)
-class RestSettings:
+class EventsAtRestSettings:
     """What is at rest, and what counts there.
 
     Chosen on sets a to s of other simulators: noise sends hundreds to thousands there, what has none a few.
@@ -122,7 +122,7 @@ class RestSettings:
     """How far from the share of independent polarities that of shot noise is, at most: it was 0.02."""
 
 
-AT_REST = RestSettings()
+AT_REST = EventsAtRestSettings()
 
 
 @dataclass(frozen=True)
@@ -165,7 +165,12 @@ class Rests:
 
 
 def find_rests(
-    measurement: Measurement, *, still: float, log_eps: float, seed: int, settings: RestSettings = AT_REST
+    measurement: Measurement,
+    *,
+    still: float,
+    log_eps: float,
+    seed: int,
+    settings: EventsAtRestSettings = AT_REST,
 ) -> Rests:
     """Return where the light of a scene rests longest, for some pixels if there are many.
 
@@ -237,7 +242,7 @@ def find_events_at_rest(
     *,
     thresholds: tuple[float, float],
     seed: int,
-    settings: RestSettings = AT_REST,
+    settings: EventsAtRestSettings = AT_REST,
 ) -> Signature | None:
     """Return the noise, or the leak, of pixels whose light rests; None where a model lacks neither.
 
@@ -266,7 +271,7 @@ def find_events_at_rest(
 
 
 def noise_is_a_pattern(
-    measurement: Measurement, sensor: Sensor, *, seed: int, settings: RestSettings = AT_REST
+    measurement: Measurement, sensor: Sensor, *, seed: int, settings: EventsAtRestSettings = AT_REST
 ) -> bool:
     """Whether pixels at rest have noise of either polarity at rates of their own.
 
@@ -287,7 +292,7 @@ def noise_is_a_pattern(
 
 
 def differ_by_polarity(
-    p: NDArray[np.bool_], at: NDArray[np.int64], rests: Rests, settings: RestSettings = AT_REST
+    p: NDArray[np.bool_], at: NDArray[np.int64], rests: Rests, settings: EventsAtRestSettings = AT_REST
 ) -> bool:
     """Whether a pixel's share of the ON events in rests is not its share of the OFF events.
 
@@ -308,7 +313,12 @@ def differ_by_polarity(
 
 
 def judge_events_at_rest(
-    rests: Rests, events: Events, model: int, *, frame_gap: float = 0.0, settings: RestSettings = AT_REST
+    rests: Rests,
+    events: Events,
+    model: int,
+    *,
+    frame_gap: float = 0.0,
+    settings: EventsAtRestSettings = AT_REST,
 ) -> Signature | None:
     """Return what events in rests are; None where they are few, or not noise.
 
@@ -356,7 +366,7 @@ def judge_events_at_rest(
 
 
 def _which_noise(
-    t: Array, p: NDArray[np.bool_], at: NDArray[np.int64], settings: RestSettings
+    t: Array, p: NDArray[np.bool_], at: NDArray[np.int64], settings: EventsAtRestSettings
 ) -> tuple[str, str]:
     """Return the effect that makes noise, and why in words; empty where pairs of events do not tell.
 
@@ -382,7 +392,9 @@ def _which_noise(
     return "", ""
 
 
-def _sent_by_hot_pixels(at: NDArray[np.int64], rests: Rests, settings: RestSettings) -> NDArray[np.bool_]:
+def _sent_by_hot_pixels(
+    at: NDArray[np.int64], rests: Rests, settings: EventsAtRestSettings
+) -> NDArray[np.bool_]:
     """Return which events are of pixels that send far more than others, by the length of their rests.
 
     Their events are of both polarities, and a few of them hide that all others' are of one.
@@ -402,7 +414,7 @@ def _sent_by_hot_pixels(at: NDArray[np.int64], rests: Rests, settings: RestSetti
     return out
 
 
-def _sent_by_all(at: NDArray[np.int64], rests: Rests, settings: RestSettings) -> bool:
+def _sent_by_all(at: NDArray[np.int64], rests: Rests, settings: EventsAtRestSettings) -> bool:
     """Whether about as many pixels send as if all sent alike, by the length of their rests.
 
     Args:
@@ -430,7 +442,7 @@ def _is_first(t: Array, at: NDArray[np.int64], near: float) -> NDArray[np.bool_]
 
 
 def _independent(
-    t: Array, p: NDArray[np.bool_], rests: Rests, frame_gap: float, settings: RestSettings
+    t: Array, p: NDArray[np.bool_], rests: Rests, frame_gap: float, settings: EventsAtRestSettings
 ) -> bool:
     """Whether events come by themselves: their number in short times varies as independent ones do.
 

@@ -11,7 +11,7 @@ from dase.events import Events
 
 
 @dataclass(frozen=True)
-class RestSettings:
+class MotionAtRestSettings:
     """When events contradict light that does not change.
 
     Pixels at rest send events each for itself. What moves passes over neighbours: of the pixels of a small
@@ -35,7 +35,7 @@ class RestSettings:
     """It must also be so many of its standard errors."""
 
 
-def motion_at_rest(events: Events, settings: RestSettings = RestSettings()) -> float:
+def motion_at_rest(events: Events, settings: MotionAtRestSettings = MotionAtRestSettings()) -> float:
     """Return the correlation of neighbours beyond what all pixels share; 0 where it may be chance.
 
     What the whole array does at once, as under a lamp, and what single pixels do does not count.
