@@ -28,7 +28,14 @@ from dase.fitting.scheduler import SimulationRequest, Work, run_side_by_side
 from dase.fitting.subset import CalibratedSubset
 from dase.fitting.trial_sampling import samples_of_screening, samples_per_step
 from dase.formatting import format_metric
-from dase.probes.distance import Judgement, leaves_nothing, pseudo_huber, reaches_floor
+from dase.probes.distance import (
+    Judgement,
+    compared_in_standard_errors,
+    in_standard_errors,
+    leaves_nothing,
+    pseudo_huber,
+    reaches_floor,
+)
 from dase.probes.random_streams import SimulationStream
 from dase.probes.statistics import LAYOUT
 from dase.results import DetectionLimit, Grade
@@ -175,16 +182,11 @@ def _reported_model(
     if tight:  # something is free
         seeds = [SimulationStream.DIRECTIONS.seed(state.seed, n) for n in range(count)]
         plus, minus = np.split(np.mean([half.run(model.space, sides, seed=one) for one in seeds], 0), 2)
-        frame = np.linalg.qr(_in_standard_errors(half, plus - minus).T)[0]
+        frame = np.linalg.qr(in_standard_errors(plus - minus, half.seen).T)[0]
     off = half.scale.target - half.repeats.mean(0)
     doubt = misfit_beyond_chance(half)
     misfit = np.where(half.seen.used, np.sign(off) * np.minimum(np.abs(off), doubt), 0.0)
     return ReportedModel(half, model, start, last, frame, misfit)
-
-
-def _in_standard_errors(half: CalibratedSubset, apart: Array) -> Array:
-    out: Array = np.where(half.seen.used, apart / half.seen.sigma, 0.0)
-    return out
 
 
 def _limit_work(
@@ -270,21 +272,21 @@ def would_be_seen(known: ReportedModel, values: Array, settings: DiagnosisSettin
     """
     half, last = known.half, known.last
     middle = half.repeats.mean(0)
-    apart = _in_standard_errors(half, values - middle)
+    apart = in_standard_errors(values - middle, half.seen)
     # the free parameters give way to the effect before anything is missing
     apart = apart - (apart @ known.absorbed) @ known.absorbed.T
     used = half.chance.used
     ratio = half.seen.sigma / half.chance.sigma
     cloud = RepeatCloud(
-        ((half.repeats - middle) / half.chance.sigma)[:, used],
+        compared_in_standard_errors(half.repeats - middle, half.chance),
         np.zeros(np.count_nonzero(used)),
         settings.hidden.most_of_one,
-        doubt=(misfit_beyond_chance(half) / half.chance.sigma)[used],
-        drift=None if half.drift is None else (half.drift / half.chance.sigma)[used],
+        doubt=compared_in_standard_errors(misfit_beyond_chance(half), half.chance),
+        drift=None if half.drift is None else compared_in_standard_errors(half.drift, half.chance),
     )
     out = np.zeros(len(values), np.bool_)
     weights = half.seen.weights()
-    left = _in_standard_errors(half, known.misfit)
+    left = in_standard_errors(known.misfit, half.seen)
     for n, one in enumerate(apart):
         rho = pseudo_huber(one + left)
         families = {name: float(rho[part][half.seen.used[part]].mean()) / last.unit

@@ -19,7 +19,7 @@ from dase.diagnosis.state import DiagnosisState
 from dase.fitting.model import FittedModel, refit_model, with_effect_added
 from dase.fitting.scheduler import SimulationRequest, answer_requests
 from dase.fitting.subset import CalibratedSubset, PixelSubset
-from dase.probes.distance import Judgement, leaves_nothing, reaches_floor
+from dase.probes.distance import Judgement, compared_in_standard_errors, leaves_nothing, reaches_floor
 from dase.probes.random_streams import SimulationStream
 
 Array = NDArray[np.float64]
@@ -129,10 +129,12 @@ def deviation_towards(
     """
     half, cloud = _repeat_cloud(state, subset, model)
     if doubt is not None:
-        cloud = replace(cloud, doubt=_in_standard_errors(half, doubt))
+        cloud = replace(cloud, doubt=compared_in_standard_errors(doubt, half.chance))
     one, two = _mean_statistics(state, half, [(model, model.place[None]), (other, other.place[None])])
     # a way far along few statistics would count only these, of which none may decide
-    return float(cloud.deviations_along(cloud.clipped(_in_standard_errors(half, two - one)))[0])
+    return float(
+        cloud.deviations_along(cloud.clipped(compared_in_standard_errors(two - one, half.chance)))[0]
+    )
 
 
 def _most_deviating_effect(
@@ -152,8 +154,8 @@ def _most_deviating_effect(
         return None
     here, *there = _mean_statistics(state, half, [(model, sides), *((m, places) for _, m, places in probed)])
     plus, minus = np.split(here[1:], 2)
-    slopes = _in_standard_errors(half, 0.5 * (plus - minus)).T
-    ways = cloud.clipped(_in_standard_errors(half, np.concatenate(there) - here[0]))
+    slopes = compared_in_standard_errors(0.5 * (plus - minus), half.chance).T
+    ways = cloud.clipped(compared_in_standard_errors(np.concatenate(there) - here[0], half.chance))
     frame, _ = np.linalg.qr(slopes)
     # what the free parameters can do as well tells nothing
     bare = ways - (ways @ frame) @ frame.T
@@ -223,19 +225,15 @@ def _repeat_cloud(
     )
     repeats = half.repeats
     middle = repeats.mean(0)
-    seen = _in_standard_errors(half, half.chance.target - middle)
-    drift = None if half.drift is None else _in_standard_errors(half, half.drift)
+    seen = compared_in_standard_errors(half.chance.target - middle, half.chance)
+    drift = None if half.drift is None else compared_in_standard_errors(half.drift, half.chance)
     cloud = RepeatCloud(
-        _in_standard_errors(half, repeats - middle), seen, state.settings.hidden.most_of_one, drift=drift
+        compared_in_standard_errors(repeats - middle, half.chance),
+        seen,
+        state.settings.hidden.most_of_one,
+        drift=drift,
     )
     return half, cloud
-
-
-def _in_standard_errors(half: CalibratedSubset, apart: Array) -> Array:
-    """Return differences (..., J) in standard errors, only those that are compared."""
-    used = half.chance.used
-    out: Array = apart[..., used] / half.chance.sigma[used]
-    return out
 
 
 def _mean_statistics(

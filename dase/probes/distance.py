@@ -186,6 +186,12 @@ def in_standard_errors(apart: Array, scale: ErrorScale) -> Array:
     return out
 
 
+def compared_in_standard_errors(apart: Array, scale: ErrorScale) -> Array:
+    """Return differences (..., J) in standard errors, only those that are compared, shape (..., K)."""
+    out: Array = apart[..., scale.used] / scale.sigma[scale.used]
+    return out
+
+
 def pseudo_huber(z: Array) -> Array:
     """Return the pseudo-Huber loss, of any shape: z² for small z, 2 |z| for large; it never gets flat."""
     out: Array = 2.0 * (np.sqrt(1.0 + z * z) - 1.0)
