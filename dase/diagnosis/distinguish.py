@@ -205,7 +205,7 @@ class _StimulusTest:
     def judge(self, repeats: int) -> Answer:
         """Say how well recordings of the two models are told apart."""
         first = self.trials.run(self.models[0], self.models[0].parameters()[None], finer=self.finer)
-        self.trials.middle = typical_changes(first)
+        self.trials = self.trials.with_middle(typical_changes(first))
         found = [self._recordings(number, repeats) for number in range(2)]
         expected = sum(sums.halves.mean(0, dtype=np.float64) for sums in found) / 2
         step = self.standard.step

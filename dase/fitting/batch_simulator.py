@@ -104,7 +104,8 @@ class BatchSimulator:
 
     Args:
         stimulus: What the pixels see.
-        middle: Typical change of the light between two events, shape (4 CLASSES,) [log intensity].
+        middle: Typical change of the light between two events, shape (4 CLASSES,) [log intensity]; 0 until a
+            first look has told it, see `with_middle`.
         structure: Regularities of the measured time stamps.
         highest_rate: Most events per second that were measured, of the whole sensor [Hz].
         evaluations: Models run so far.
@@ -127,11 +128,16 @@ class BatchSimulator:
 
     def __post_init__(self) -> None:
         self.device = self.stimulus.device
-        self._middle: tuple[Any, Any] | None = None
         self._launches = self.settings or LAUNCHES["cuda" if self.device.is_cuda else "cpu"]
         # a CPU works on several models of one pixel in a vector, a GPU has a thread for each
         self._lanes = 1 if self.device.is_cuda else kernels.LANES
+        # moved once, for no launch changes them
         self._pixels = wp.array(self.stimulus.pixels, dtype=int, device=self.device)
+        self._middle = wp.array(self.middle, dtype=float, device=self.device)
+
+    def with_middle(self, middle: NDArray[np.float32]) -> BatchSimulator:
+        """Return a simulator of another typical change (4 CLASSES,) [log intensity]; kernels are shared."""
+        return replace(self, middle=middle)
 
     def run(
         self,
@@ -382,10 +388,7 @@ class BatchSimulator:
         out.classes = stimulus.array(
             "classes", lambda: np.rint(np.array(PROBE_TIMES.classes) / step).astype(np.int32)
         )
-        # moved once for each `middle`, which is set anew after a first look at the measurement
-        if self._middle is None or self._middle[0] is not self.middle:
-            self._middle = self.middle, wp.array(self.middle, dtype=float, device=self.device)
-        out.middle = self._middle[1]
+        out.middle = self._middle
         out.half = max(1, round(PROBE_TIMES.half / step))
         out.step, out.slack = wp.float64(step * 1e9), wp.float64(PROBE_TIMES.slack * 1e9)
         out.ticks = wp.array(ticks.astype(np.int64), dtype=wp.int64, device=self.device)

@@ -369,15 +369,17 @@ def split_measurement(
     pieces = [(first, fitted, cell[0][:, : fitted.steps].copy(), 0)]
     pieces += [(part, grid, cells, cut) for part, cells in zip(last, cell[1:], strict=True)]
     del cell, cells, works, good  # large, and no longer needed
+    highest = highest_event_rate(events, SPLIT.burst)
     halves: list[PixelSubset] = []
     for part, stretch, cells, begins in pieces:
         stimulus = Stimulus(
             chosen[part], scene.width, scene.height, stretch, light[part, : stretch.steps], cells, log_eps,
             to, trust is not None or len(gaps) > 0 or left_out is not None or settled is not None,
         )  # fmt: skip
-        halves.append(make_subset(stimulus, events, begins, structure))
+        halves.append(make_subset(stimulus, events, begins, structure, highest_rate=highest))
     _require_enough_events(halves, events, grid, notes, settings.least_events)
-    halves.append(make_subset(halves[0].trials.stimulus.part(settings.scouts), events, 0, structure))
+    few = halves[0].trials.stimulus.part(settings.scouts)
+    halves.append(make_subset(few, events, 0, structure, highest_rate=highest))
     # seen in the fitted half: what judges must not choose
     peak = peak_of(halves[0].found.clock[0], grid.step)
     if lamp is not None:
@@ -394,10 +396,7 @@ def split_measurement(
         )
         for half in halves
     )
-    highest = highest_event_rate(events, SPLIT.burst)
     bus = BusUse.of(events, structure, span=SPLIT.burst)
-    for half in (train, held, last_part, scout):
-        half.trials.highest_rate = highest
     contradiction = contradiction_of_rest(events, light[:, :1] if still else light)
     if contradiction:
         notes.insert(0, contradiction)
@@ -495,7 +494,9 @@ def times_of_grid(scene: Scene, grid: Grid) -> NDArray[np.float64]:
     return inside
 
 
-def make_subset(stimulus: Stimulus, events: Events, first: int, structure: TimestampStructure) -> PixelSubset:
+def make_subset(
+    stimulus: Stimulus, events: Events, first: int, structure: TimestampStructure, *, highest_rate: float
+) -> PixelSubset:
     """Return what was measured of some pixels.
 
     Args:
@@ -503,10 +504,11 @@ def make_subset(stimulus: Stimulus, events: Events, first: int, structure: Times
         events: Of the whole sensor, or of these pixels.
         first: Step from which on they are compared.
         structure: Regularities of the time stamps.
+        highest_rate: Most events per second of the whole sensor [Hz].
     """
-    trials = BatchSimulator(stimulus, structure=structure)
+    trials = BatchSimulator(stimulus, structure=structure, highest_rate=highest_rate)
     # looked at twice: sums of deviations from the typical change need that change, which the first look tells
-    trials.middle = typical_changes(trials.look(events))
+    trials = trials.with_middle(typical_changes(trials.look(events)))
     found = trials.look(events)
     seconds = stimulus.grid.step * (stimulus.grid.steps - first)
     # no model has been run yet; `calibrate` puts what the present one expects in place of these zeros

@@ -114,8 +114,9 @@ def _differences(
     other = Stimulus(
         seen.pixels, seen.width, seen.height, seen.grid, light, cell, seen.log_eps, seen.device, True
     )
-    subset = make_subset(other, events, part.frame.first, TimestampStructure())
-    subset.trials.highest_rate = part.trials.highest_rate
+    subset = make_subset(
+        other, events, part.frame.first, TimestampStructure(), highest_rate=part.trials.highest_rate
+    )
     subset = replace(subset, frame=replace(subset.frame, peak=part.frame.peak))
     judged = model.calibrate(
         subset, repeats=settings.repeats, seed=SimulationStream.SCENE_DOUBT.seed(seed, 1)
