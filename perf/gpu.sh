@@ -76,7 +76,7 @@ for step in "${steps[@]}"; do
         run kernels_4k "$python" -m perf.benchmarks.kernels --device cuda --size 3840x2160
         run kernels_vga "$python" -m perf.benchmarks.kernels --device cuda --size 640x480 ;;
     synth) for jobs in 1 8; do
-        run "synth_$jobs" "$python" -m perf.benchmarks.synth --images "${PHOTOS:-builtin}" --backend cuda \
+        run "synth_$jobs" "$python" -m perf.benchmarks.synth --images "${PHOTOS:-builtin}" --device cuda \
             --jobs "$jobs"
     done ;;
     scaling) run scaling "$python" -m perf.benchmarks.scaling --device cuda --out "$out/docs" ;;

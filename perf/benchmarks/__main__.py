@@ -19,11 +19,10 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--device", default="cpu")
     device = parser.parse_args().device
-    backend = "cuda" if device.startswith("cuda") else "cpu"
     begin = time.perf_counter()
     for title, name, *options in (
         ("Kernels", "kernels", "--device", device, "--samples", "32", "--repeats", "3"),
-        ("A whole `dase synth`", "synth", "--backend", backend, "--sequences", "2"),
+        ("A whole `dase synth`", "synth", "--device", device, "--sequences", "2"),
         ("Beside others", "peers", "--samples", "50", "--rounds", "1"),
     ):
         print(f"\n## {title}: python -m perf.benchmarks.{name} {' '.join(options)}\n", flush=True)

@@ -1,6 +1,6 @@
 """A whole `dase synth` run, timed from outside: sequences, events, samples, seconds, peak memory.
 
-python -m perf.benchmarks.synth --images FOLDER --backend cpu --jobs 2
+python -m perf.benchmarks.synth --images FOLDER --device cpu --jobs 2
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from perf.kills import group_members
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--images", default="builtin")
-    parser.add_argument("--backend", default="cpu")
+    parser.add_argument("--device", default="cpu")
     parser.add_argument("--jobs", default="2")
     parser.add_argument("--size", default="640x480")
     parser.add_argument("--sequences", default="20")

@@ -1,6 +1,6 @@
 """Where the time of a whole `dase synth` goes: seconds of each stage on each kind of thread, in one process.
 
-python -m perf.benchmarks.synth_stages --images FOLDER --backend cuda
+python -m perf.benchmarks.synth_stages --images FOLDER --device cuda
 
 Seconds are exclusive: what a stage calls that is a stage itself is counted there alone. Beside those on the
 clock are those of the processor: what lies between is waiting, for another thread, Python's lock, the GPU or
@@ -109,7 +109,7 @@ def watch_stages(timer: StageTimer, *, launches: bool) -> None:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--images", default="builtin")
-    parser.add_argument("--backend", default="cpu")
+    parser.add_argument("--device", default="cpu")
     parser.add_argument("--size", default="640x480")
     parser.add_argument("--sequences", default=20, type=int)
     parser.add_argument("--duration", default=1.0, type=float)
@@ -122,13 +122,13 @@ def main() -> None:
 
     imported = since_start()
     timer = StageTimer()
-    watch_stages(timer, launches=options.backend != "cpu")
+    watch_stages(timer, launches=options.device != "cpu")
     width, height = map(int, options.size.split("x"))
     with tempfile.TemporaryDirectory() as folder:
         job = generate.DatasetJob(
             images=options.images, sensor=dump_sensor(load_sensor(options.sensor)),
             sequences=options.sequences, width=width, height=height, duration=options.duration,
-            regime="mixed", backend=options.backend,
+            regime="mixed", backend=options.device,
         )  # fmt: skip
         begin = time.perf_counter()
         report = generate.generate_dataset(job, Path(folder) / "out")
