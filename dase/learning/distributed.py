@@ -47,12 +47,6 @@ def process_rank() -> int:
     return dist.get_rank() if dist.is_initialized() else 0
 
 
-def process_seed(seed: int) -> int:
-    """Return the seed of this process's own random numbers; the first has `seed` itself."""
-    # far apart, so that no process has the numbers of another run whose seed is a little larger
-    return seed + 1_000_003 * process_rank()
-
-
 def gather_values(values: torch.Tensor) -> torch.Tensor:
     """Return the values of all processes, those of the first in front; (N, ...) becomes (size · N, ...).
 

@@ -23,6 +23,7 @@ from dase.learning.adversarial import AdversarialObjective, AdversarialSettings,
 from dase.learning.baselines import RandomThresholds, esim_thresholds, match_event_rate
 from dase.learning.known_physics import KnownPhysics, with_learned_thresholds
 from dase.learning.moment_objective import MomentObjective
+from dase.learning.random_streams import TrainingDraw, TrainingStream
 from dase.learning.recipe import Recipe
 from dase.learning.recorded_target import ReplayedScenes, open_target
 from dase.learning.run import RunFile
@@ -234,18 +235,19 @@ def compose_training(
     """
     physics = None
     if sensor is not None:
-        # the loop and the objective draw with the seeds up to this one; processes differ as their scenes do
+        # processes differ as their scenes do
         physics = KnownPhysics(
             sensor, scenery.scene_settings, batch=recipe.batch, device=scenery.device,
-            seed=distributed.process_seed(recipe.seed + 3),
+            seed=TrainingStream.KNOWN_PHYSICS.seed(recipe.seed, distributed.process_rank()),
         )  # fmt: skip
     net = make_network(recipe, scenery.device)
     objective: Objective
     if recipe.objective == "moments":
         objective = MomentObjective(recipe.moments, net, scenes=target.scenes, trains_network=recipe.rate > 0)
     else:
-        # the loop draws with the seeds up to this one
-        objective = AdversarialObjective(recipe.adversarial, device=scenery.device, seed=recipe.seed + 2)
+        objective = AdversarialObjective(
+            recipe.adversarial, device=scenery.device, seed=TrainingStream.CRITICS.seed(recipe.seed)
+        )
     return Training(recipe, net, objective, target, scenery, physics)
 
 
@@ -293,7 +295,7 @@ def simulate_target(
 
     Its thresholds are known where it has no effect but `threshold` and `mismatch`.
     """
-    rng = np.random.default_rng([seed, 4])
+    rng = TrainingDraw.SIMULATED_TARGET.generator(seed)
     looks = scenery.scene_settings
     times = np.linspace(0, looks.window, looks.samples)
     grey, counts = [], []

@@ -16,6 +16,7 @@ import torch
 from numpy.typing import NDArray
 
 from dase.kernels import autograd_training as bridge
+from dase.learning.random_streams import TrainingDraw
 from dase.scenes import image_sources
 from dase.scenes.scene import LOG_EPS
 from dase.scenes.scene_motions import LayerMotions as LayerMotions
@@ -47,7 +48,7 @@ class Scenery:
         objects: int = 96,
     ):
         self.scene_settings, self.device = looks, torch.device(device)
-        rng = np.random.default_rng([seed, 0])
+        rng = TrainingDraw.TEXTURES.generator(seed)
         grounds = [
             image_sources.fit_picture(source.background(rng).grey, *image_sources.BACKGROUND)
             for _ in range(backgrounds)

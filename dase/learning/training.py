@@ -22,6 +22,7 @@ from dase.learning import distributed
 from dase.learning.adabelief import AdaBelief
 from dase.learning.cuda_graph import GraphReplay
 from dase.learning.known_physics import KnownPhysics
+from dase.learning.random_streams import TrainingDraw, TrainingStream
 from dase.learning.scene_batches import Scenery, middle_intensity, pack_words, send_words, unpack_words
 from dase.learning.targets import Pairs, PixelNoise, Target, draw_noise, simulate_counts
 from dase.networks.threshold_network import NetworkShape, ThresholdMaps, ThresholdNet
@@ -162,7 +163,7 @@ class Objective(Protocol):
 
 def make_network(settings: TrainingSettings, device: torch.device) -> ThresholdNet:
     """Return the network at its beginning; its weights depend on the seed only."""
-    torch.manual_seed(settings.seed)
+    torch.manual_seed(TrainingStream.WEIGHTS.seed(settings.seed))
     net = ThresholdNet(settings.network, mu=settings.mu, sigma=settings.sigma)
     net.to(device)
     net.to(memory_format=torch.channels_last)
@@ -200,12 +201,12 @@ class Training:
             torch.backends.cudnn.benchmark = True
         self.optimizer = self._make_optimizer()
         distributed.broadcast_tensors(self.net.state_dict().values())
-        self.generator = torch.Generator(self.device).manual_seed(distributed.process_seed(recipe.seed + 1))
         # other processes have scenes and phases of their own
-        apart = [distributed.process_rank()] if distributed.process_rank() else []
-        self.scenes = np.random.default_rng([recipe.seed, 1, *apart])
-        self.reals = np.random.default_rng([recipe.seed, 2, *apart])
-        target.set_process(distributed.process_rank())
+        seed, process = recipe.seed, distributed.process_rank()
+        self.generator = torch.Generator(self.device).manual_seed(TrainingStream.NOISE.seed(seed, process))
+        self.scenes = TrainingDraw.SCENES.generator(seed, process)
+        self.reals = TrainingDraw.TARGETS_SCENES.generator(seed, process)
+        target.set_process(process)
         self.replay = GraphReplay(self.device, self.generators())
         self.inputs: torch.Tensor | None = None
         self.step = -recipe.warmup
