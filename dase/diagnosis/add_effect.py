@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from os import PathLike
 
 from dase.diagnosis.candidates import calibrate_split, screen_and_descend
 from dase.diagnosis.settings import DEFAULTS
 from dase.effects import Effect
-from dase.fitting.data_split import SPLIT, split_measurement
+from dase.fitting.data_split import SPLIT, ModelPremises, split_measurement
 from dase.fitting.fit import fit
 from dase.fitting.measurement import Measured, SceneChoice, as_measurement
 from dase.fitting.model import fit_present_model
@@ -53,10 +54,10 @@ def fit_added(
     without = as_sensor(sensor)
     measurement = as_measurement(measured, scene, trust)
     without, effect = without.bound_to(measurement.scene), effect.bound_to(measurement.scene)
-    evidence = split_measurement(
-        measurement.events, measurement.scene, log_eps=without.log_eps, trust=measurement.trust,
-        unbroken=without.unbroken or effect.unbroken, pixels=pixels, seed=seed, device=device,
-    )  # fmt: skip
+    premises = ModelPremises(without.log_eps, unbroken=without.unbroken or effect.unbroken)
+    # of all of its time, whatever part of it is asked for
+    whole = replace(measurement, span=None)
+    evidence = split_measurement(whole, models=premises, pixels=pixels, seed=seed, device=device)
     tell("fitting without the effect", 0.0, float("nan"))
     present = fit_present_model(evidence, without, None, seed=seed)
     before = present.judge(

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from dase.diagnosis.cell_descriptions import band_in_words, worst_cells
 from dase.diagnosis.settings import DEFAULTS, DiagnosisSettings
-from dase.fitting.data_split import SPLIT, SplitMeasurement, split_measurement
+from dase.fitting.data_split import SPLIT, ModelPremises, SplitMeasurement, split_measurement
 from dase.fitting.measurement import Measured, SceneChoice, as_measurement
 from dase.fitting.model import model_of
 from dase.fitting.plain_numbers import family_counts, octave_ends, plain_numbers, rate_counts
@@ -64,10 +64,8 @@ def compare(
     model = as_sensor(sensor)
     measurement = as_measurement(measured, scene, trust)
     model = model.bound_to(measurement.scene)
-    evidence = split_measurement(
-        measurement.events, measurement.scene, log_eps=model.log_eps, trust=measurement.trust,
-        span=measurement.span, unbroken=model.unbroken, pixels=pixels, seed=seed, device=device,
-    )  # fmt: skip
+    premises = ModelPremises(model.log_eps, unbroken=model.unbroken)
+    evidence = split_measurement(measurement, models=premises, pixels=pixels, seed=seed, device=device)
     tell("simulating", 0.3, float("nan"))
     stream = SimulationStream.JUDGE.seed(seed)
     # nothing is free: a value beyond all that a search would try is compared as it is

@@ -20,7 +20,14 @@ from dase.diagnosis.silent_pixels import NAME as DEAD
 from dase.diagnosis.silent_pixels import SilentPixels, find_silent_pixels
 from dase.effects import Effect
 from dase.fitting.burst_strength import BurstStrength, follows_frames
-from dase.fitting.data_split import SPLIT, SplitMeasurement, SplitSettings, split_measurement
+from dase.fitting.data_split import (
+    SPLIT,
+    LeftOut,
+    ModelPremises,
+    SplitMeasurement,
+    SplitSettings,
+    split_measurement,
+)
 from dase.fitting.measurement import Measurement
 from dase.fitting.scene_doubt import is_guessed
 from dase.scenes.between_frames import CameraScene
@@ -44,7 +51,6 @@ class ComparedMeasurement:
         hot: Hot pixels that are too few for a fit, which are left out, row-major, shape (K,); None for none.
         silent: What all pixels say of dead ones; None where that is not asked.
         pixels: In each part of the measurement.
-        plenty: Events of the pixels of one part from which on a longer time is not compared.
         parts: How the measurement is split.
         seed: Of the choice of pixels.
         device: Where kernels run.
@@ -59,7 +65,6 @@ class ComparedMeasurement:
     hot: NDArray[np.int64] | None
     silent: SilentPixels | None
     pixels: int
-    plenty: float
     parts: SplitSettings
     seed: int
     device: str
@@ -107,14 +112,16 @@ class ComparedMeasurement:
             scene: In place of the measurement's own; None for that.
             all_time: Whether all of the time is fitted, not its first part alone.
         """
-        measurement, bursts = self.measurement, self.bursts
+        measurement, given = self.measurement, self.given
         return split_measurement(
-            measurement.events, measurement.scene if scene is None else scene, log_eps=self.given.log_eps,
-            trust=measurement.trust, span=measurement.span, left_out=bursts.contains if bursts else None,
-            odd_pixels=self.odd_pixels, lamp=self.seen.lamp, frames=self.frames,
-            unbroken=self.given.unbroken, all_time=all_time, plenty=self.plenty, pixels=self.pixels,
-            seed=self.seed, device=self.device, settings=self.parts,
-        )  # fmt: skip
+            measurement if scene is None else replace(measurement, scene=scene),
+            left_out=LeftOut(self.bursts.contains if self.bursts else None, self.odd_pixels),
+            models=ModelPremises(given.log_eps, self.seen.lamp, self.frames, given.unbroken),
+            pixels=self.pixels,
+            seed=self.seed,
+            device=self.device,
+            settings=replace(self.parts, all_time=all_time),
+        )
 
     def strength_of_bursts(
         self, seen: SeenEffects, sensor: Sensor, library: Mapping[str, type[Effect]]
@@ -128,7 +135,7 @@ class ComparedMeasurement:
         """
         return strength_of_bursts(
             seen, self.measurement, sensor, library,
-            pixels=self.pixels, plenty=self.plenty, seed=self.seed, device=self.device,
+            pixels=self.pixels, plenty=self.parts.plenty, seed=self.seed, device=self.device,
         )  # fmt: skip
 
 
@@ -155,12 +162,12 @@ def choose_compared(
     """
     scene = measurement.scene
     guessed = scene if isinstance(scene, CameraScene) and is_guessed(scene) else None
-    plenty, parts = settings.plenty, SPLIT
+    parts = replace(SPLIT, plenty=settings.plenty)
     if guessed is not None and pixels > settings.guessed_pixels:
         # fewer pixels over the same time
         fewer = settings.guessed_pixels / pixels
-        plenty, pixels = fewer * plenty, settings.guessed_pixels
-        parts = replace(parts, scouts=round(fewer * parts.scouts))
+        pixels = settings.guessed_pixels
+        parts = replace(parts, plenty=fewer * parts.plenty, scouts=round(fewer * parts.scouts))
     seen = find_seen_effects(measurement, effects)
     # a lamp makes neighbours send whatever light does between frames
     asked = DEAD in effects and DEAD not in given and not (guessed is not None and seen.lamp)
@@ -175,7 +182,6 @@ def choose_compared(
         hot=few_hot_pixels(seen, measurement.events, pixels) if HOT not in given else None,
         silent=find_silent_pixels(measurement, log_eps=given.log_eps) if asked else None,
         pixels=pixels,
-        plenty=plenty,
         parts=parts,
         seed=seed,
         device=device,

@@ -11,6 +11,7 @@ from dase.diagnosis.cell_descriptions import worst_cells
 from dase.effects import EFFECTS, Effect
 from dase.errors import InputError, nearest
 from dase.fitting.data_split import split_measurement
+from dase.fitting.measurement import Measurement
 from dase.fitting.model import model_of
 from dase.probes.statistics import FAMILIES
 from dase.results import Cell
@@ -63,7 +64,7 @@ def changes_by_effect(effect: Effect) -> tuple[dict[str, float], tuple[Cell, ...
     scene = moving_bars()
     plain = Sensor(name="without")
     events = simulate(scene, plain.with_effect(effect), seed=1)
-    evidence = split_measurement(events, scene, pixels=scene.width * scene.height // 2)
+    evidence = split_measurement(Measurement(events, scene), pixels=scene.width * scene.height // 2)
     judgement = model_of(plain).judge(evidence.held, repeats=24, seed=2)
     return judgement.families, worst_cells(evidence, judgement)
 

@@ -18,7 +18,7 @@ from scipy import stats
 
 from dase.effects.dead import Dead
 from dase.effects.stream import StreamEffect
-from dase.fitting.data_split import common_grid, times_of_grid
+from dase.fitting.compared_time import common_grid, times_of_grid
 from dase.fitting.measurement import Measurement
 from dase.fitting.time_window import is_constant, within_span
 from dase.probes.random_streams import SimulationStream

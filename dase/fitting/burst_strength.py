@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,7 +16,13 @@ from numpy.typing import NDArray
 from dase.effects.base import Effect
 from dase.errors import InputError
 from dase.fitting.confidence_intervals import REPEATS, estimate_parameters
-from dase.fitting.data_split import SPLIT, SplitMeasurement, split_measurement
+from dase.fitting.data_split import (
+    SPLIT,
+    LeftOut,
+    ModelPremises,
+    SplitMeasurement,
+    split_measurement,
+)
 from dase.fitting.descent import ranking_work
 from dase.fitting.measurement import Measurement
 from dase.fitting.model import FittedModel, model_of, refit_model, starting_places
@@ -129,23 +135,22 @@ def fit_bursts(
         seed: Of every random number.
         device: Where kernels run.
     """
-    events, scene, trust = measurement.events, measurement.scene, measurement.trust
-    if isinstance(scene, CameraScene):
+    events = measurement.events
+    if isinstance(measurement.scene, CameraScene):
         # what is wrong between frames is little beside a burst, and where it is trusted are few of these
-        trust = everywhere
+        measurement = replace(measurement, trust=everywhere)
     bursts = times.around(float(events.t[0]), float(events.t[-1]), BURST_FIT.reach)
 
     # of a longer time, so many lie about the bursts
-    plenty /= max(float(bursts.contains(events.t).mean()), 1e-6)
+    settings = replace(SPLIT, plenty=plenty / max(float(bursts.contains(events.t).mean()), 1e-6))
 
     def between_bursts(t: NDArray[np.float64]) -> NDArray[np.bool_]:
         return ~bursts.contains(t)
 
     try:
         evidence = split_measurement(
-            events, scene, log_eps=sensor.log_eps, trust=trust,
-            span=measurement.span, left_out=between_bursts, frames=times,
-            plenty=plenty, pixels=pixels, seed=seed, device=device,
+            measurement, left_out=LeftOut(between_bursts), models=ModelPremises(sensor.log_eps, frames=times),
+            pixels=pixels, seed=seed, device=device, settings=settings,
         )  # fmt: skip
     except InputError:
         return None

@@ -17,41 +17,20 @@ from dase.events import Events
 from dase.fitting.batch_simulator import BatchSimulator
 from dase.fitting.bus_load import WholeSensor
 from dase.fitting.bus_use import BusUse, highest_event_rate
+from dase.fitting.compared_time import ComparedTime, choose_compared_time
 from dase.fitting.contradictions import contradiction_of_rest
-from dase.fitting.frame_steps import clip_step_of, frame_step_of, is_held, is_too_slow, ticks_are_of_frames
-from dase.fitting.pixel_selection import choose_trusted_pixels, find_trusted_parts
-from dase.fitting.spliced_time import SplicedScene, SplicedTime
+from dase.fitting.frame_steps import is_held, ticks_are_of_frames
+from dase.fitting.measurement import Measurement
+from dase.fitting.pixels_of_parts import PARTS, PixelsOfParts, choose_pixels
 from dase.fitting.subset import Array, CalibratedSubset, PixelSubset
-from dase.fitting.time_window import (
-    WindowSettings,
-    choose_windows,
-    is_constant,
-    outside_gaps,
-    repeated_gaps,
-    sentence_of_windows,
-    within_span,
-)
+from dase.fitting.time_window import outside_gaps
 from dase.formatting import format_seconds
 from dase.kernels import event_probes as kernels
 from dase.kernels import launch
 from dase.probes.accumulators import ProbeSums, StatisticsFrame
-from dase.probes.random_streams import Draw
 from dase.probes.statistics import RatePeak, peak_of, refine_frequency, ring_of_pixels
-from dase.probes.stimulus import (
-    MASKED,
-    STIMULUS,
-    Grid,
-    Stimulus,
-    Trust,
-    band_edges,
-    light_of,
-    sort_into_cells,
-)
+from dase.probes.stimulus import MASKED, Grid, Stimulus, band_edges, light_of, sort_into_cells
 from dase.probes.timestamp_patterns import TimestampStructure, find_structure
-from dase.scenes.between_frames import CameraScene
-from dase.scenes.scene import Scene
-from dase.scenes.screen_scene import ScreenScene
-from dase.scenes.video import VideoScene
 from dase.signatures.burst_times import BurstTimes
 
 
@@ -81,6 +60,13 @@ class SplitSettings:
     small: float = 0.25
     """What the fitted part has of it at most, in units of that."""
 
+    all_time: bool = False
+    """Whether all of the time is fitted, not its first part alone. What judges are other pixels in the later
+    part all the same, but no other time."""
+
+    plenty: float = math.inf
+    """Events of the pixels of one part from which on a longer time is not compared."""
+
     burst: float = 2e-3
     """Events are counted for so long to see how fast they come at most [s]: long enough for many of them,
     and short enough for a bus to be full all the time."""
@@ -90,9 +76,6 @@ SPLIT = SplitSettings()
 
 ROWS = 512
 """Pixels whose steps are sorted into cells at a time, for the memory that takes."""
-
-PARTS = 3
-"""Groups of pixels: those that are fitted, that choose between models, and that report."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -195,20 +178,43 @@ class CalibratedSplit(SplitMeasurement):
     scout: CalibratedSubset
 
 
+@dataclass(frozen=True, eq=False)
+class LeftOut:
+    """What of a measurement is compared with no model.
+
+    Args:
+        times: Tells which times [s], shape (T,), are left out; None for none.
+        pixels: Row-major indices of pixels that are left out, shape (K,); None for none.
+    """
+
+    times: Callable[[Array], NDArray[np.bool_]] | None = None
+    pixels: NDArray[np.int64] | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class ModelPremises:
+    """What the models that are compared are told before they run, and what they need of the time.
+
+    Args:
+        log_eps: Added to intensities before the logarithm.
+        lamp: Frequency of light that flickers [Hz] where all events have told it; None to look for it here.
+        frames: When the bursts come that are in step with frames; None where there are none, or left out.
+        unbroken: Whether a long recording is compared in one window, not in several over its length, as
+            models with a clock of their own need it, see `Sensor.unbroken`; so it is where there is a lamp
+            or bursts with frames, where times are left out, and where time stamps follow a regularity.
+    """
+
+    log_eps: float = 1e-3
+    lamp: float | None = None
+    frames: BurstTimes | None = None
+    unbroken: bool = False
+
+
 def split_measurement(
-    events: Events,
-    scene: Scene,
+    measurement: Measurement,
     *,
-    log_eps: float = 1e-3,
-    trust: Trust | None = None,
-    span: tuple[float, float] | None = None,
-    left_out: Callable[[Array], NDArray[np.bool_]] | None = None,
-    odd_pixels: NDArray[np.int64] | None = None,
-    lamp: float | None = None,
-    frames: BurstTimes | None = None,
-    unbroken: bool = False,
-    all_time: bool = False,
-    plenty: float = math.inf,
+    left_out: LeftOut = LeftOut(),
+    models: ModelPremises = ModelPremises(),
     pixels: int = SPLIT.pixels,
     seed: int = 0,
     device: str = "cpu",
@@ -217,23 +223,11 @@ def split_measurement(
     """Split a measurement into what is fitted, what chooses between models, and what reports.
 
     Args:
-        events: What was measured.
-        scene: What the camera saw, on the clock of the events.
-        log_eps: Added to intensities before the logarithm.
-        trust: Where and when the scene is to be trusted, all else is left out; None for everywhere, and for
-            what a `CameraScene` trusts of itself.
-        span: First and last time that is compared [s]; None for all. Of a long time windows are chosen, see
+        measurement: Events and scene, where that is trusted, and which time is compared: None for all, and
+            everywhere but where a `CameraScene` does not trust itself. Of a long time windows are chosen, see
             `choose_windows`.
-        left_out: Tells which times [s], shape (T,), are left out; None for none.
-        odd_pixels: Row-major indices of pixels that are left out, shape (K,); None for none.
-        lamp: Frequency of light that flickers [Hz] where all events have told it; None to look for it here.
-        frames: When the bursts come that are in step with frames; None where there are none, or left out.
-        unbroken: Whether a long recording is compared in one window, not in several over its length, as
-            models with a clock of their own need it, see `Sensor.unbroken`; so it is where there is a lamp
-            or bursts with frames, where times are left out, and where time stamps follow a regularity.
-        all_time: Whether all of the time is fitted, not its first part alone. What judges are other pixels
-            in the later part all the same, but no other time.
-        plenty: Events of the pixels of one part from which on a longer time is not compared.
+        left_out: What is not compared.
+        models: What is known of the models beforehand.
         pixels: In each part.
         seed: Of the choice of pixels.
         device: Where kernels run.
@@ -244,199 +238,154 @@ def split_measurement(
     """
     # offsets are added for further random numbers, and batches count in 30 bits
     checked_seed(seed, 1 << 30)
-    if trust is None and isinstance(scene, CameraScene):
-        trust = scene.is_trusted
-    whole = common_grid(events, scene)
-    frame_step, clip_frames = frame_step_of(events, scene) or 0.0, clip_step_of(scene)
-    driven = is_too_slow(frame_step)
-    asked = within_span(whole, span)
-    # the phase of what goes by a clock of its own would not go on from window to window
-    unbroken = unbroken or lamp is not None or left_out is not None or frames is not None
-    shorter = partial(
-        choose_windows, events, scene, asked, pixels, plenty=plenty,
-        compared=_share_compared(events, scene, asked, trust) if plenty < math.inf else 1.0,
+    plan = _plan_split(measurement, left_out, models, pixels=pixels, seed=seed, settings=settings)
+    time, to = plan.time, _found_device(device)
+    light = _light_of_pixels(plan)
+    good = _compared_steps(plan)
+    bands = _bands_of_all_parts(plan, light, good)
+    cells, found = _cells_and_structure(plan, light, bands, models.log_eps)
+    _mask_cells(cells, good, plan.cut)
+    stimuli = _stimuli_of_parts(plan, light, cells, models.log_eps, to, all_time=settings.all_time)
+    del cells, good  # large, and no longer needed
+    structure, ticks = _structure_of_a_clock(found, time)
+    # in the order of the steps, which an error for too few events repeats
+    notes = [*time.notes(), *plan.pixels.notes, *time.notes_on_gaps(), *ticks]
+    highest = highest_event_rate(time.events, settings.burst)
+    # those that judge and report are compared from the cut on
+    parts = [
+        make_subset(stimulus, time.events, first, structure, highest_rate=highest)
+        for stimulus, first in zip(stimuli, (0, plan.cut, plan.cut), strict=True)
+    ]
+    _require_enough_events(parts, time.events, time.grid, notes, settings.least_events)
+    # the scout sees what is fitted, never what judges
+    few = stimuli[0].part(settings.scouts)
+    parts.append(make_subset(few, time.events, 0, structure, highest_rate=highest))
+    peak = _peak_of(plan, parts[0], models.lamp)
+    train, held, report, scout = (_with_surroundings(plan, one, peak, seed, device) for one in parts)
+    bus = BusUse.of(time.events, structure, span=settings.burst)
+    contradiction = contradiction_of_rest(time.events, light[:, :1] if time.still else light)
+    out = SplitMeasurement(
+        train, held, report, scout, bands, structure, peak, highest, bus, time.when, (), contradiction,
+        models.frames, time.frame_step, time.clip_frames,
     )  # fmt: skip
-    windows = shorter(unbroken=unbroken)
-    if len(windows) > 1 and find_structure(_within(events, windows[0])) != TimestampStructure():
-        windows = shorter(unbroken=True)
-    grid = windows[0]
-    when = times_of_grid(scene, grid)
-    # light that does not change is not stored step by step
-    still = is_constant(scene)
-    # a stimulus pauses by the clock
-    pauses = isinstance(scene, ScreenScene)
-    settled = None
-    if len(windows) > 1:
-        when = np.concatenate([times_of_grid(scene, one) for one in windows])
-        settle = 2 if still else round(WindowSettings.settle / grid.step)
-        spliced = SplicedTime(windows, when, settle)
-        events, scene, grid = spliced.events(events), SplicedScene(scene, spliced), spliced.grid
-        settled = spliced.settled
-        if trust is not None:
-            trust = partial(_trust_on_clock, trust, spliced)
-    elif grid is not whole:
-        events = _within(events, grid)
-    # a simulator by frames loses nothing: it waits for a frame, or all of its pixels for their dead time
-    in_step = frame_step or is_held(scene)
-    gaps = np.zeros((0, 2)) if pauses or in_step else repeated_gaps(events.t)
+    return replace(out, notes=(*_notes_before(out), *notes, *_notes_after(out)))
+
+
+@dataclass(frozen=True, eq=False)
+class SplitPlan:
+    """Which time and which pixels of a measurement are in which part.
+
+    Args:
+        time: That is compared.
+        pixels: Of all parts.
+        cut: The step at which the time begins that judges.
+        left_out: What is not compared.
+    """
+
+    time: ComparedTime
+    pixels: PixelsOfParts
+    cut: int
+    left_out: LeftOut
+
+    @property
+    def trusts_all(self) -> bool:
+        """Whether the scene is trusted everywhere."""
+        return self.pixels.trust is None
+
+    @property
+    def has_holes(self) -> bool:
+        """Whether parts of the time of some pixels are not compared, and others after them are."""
+        return self.time.has_holes or not self.trusts_all or self.left_out.times is not None
+
+
+def _plan_split(
+    measurement: Measurement,
+    left_out: LeftOut,
+    models: ModelPremises,
+    *,
+    pixels: int,
+    seed: int,
+    settings: SplitSettings,
+) -> SplitPlan:
+    """Choose time and pixels; arguments and errors are those of `split_measurement`."""
+    time = choose_compared_time(
+        measurement, unbroken=_is_unbroken(models, left_out), pixels=pixels, plenty=settings.plenty
+    )
+    # time is cut, not drawn: moments between fitted ones would be known from these
+    cut = max(2, round(settings.fitted_share * time.grid.steps))
+    chosen = choose_pixels(
+        time, cut, odd_pixels=left_out.pixels, most=pixels, least=settings.least_pixels, seed=seed
+    )
+    return SplitPlan(time, chosen, cut, left_out)
+
+
+def _is_unbroken(models: ModelPremises, left_out: LeftOut) -> bool:
+    """Return whether time must go on without a break."""
+    # the phase of what goes by a clock of its own would not go on from window to window
+    told = models.lamp is not None or models.frames is not None or left_out.times is not None
+    return models.unbroken or told
+
+
+def _found_device(name: str) -> Any:
+    """Return a Warp device; raises InputError where there is none of that name."""
     try:
-        to = launch.find_device(device)
+        return launch.find_device(name)
     except ValueError as error:
         raise InputError(str(error)) from error
-    size = scene.width * scene.height
-    each = min(pixels, (size - (0 if odd_pixels is None else len(odd_pixels))) // PARTS)
-    if each < settings.least_pixels:
-        raise InputError(
-            f"a diagnosis needs at least {settings.least_pixels} pixels to fit, as many to choose by and as "
-            f"many to report by, got {pixels} of {scene.width}x{scene.height}"
-        )
-    # a stream of its own: the same pixels are chosen whatever else is drawn from the seed
-    rng, notes = Draw.PIXELS.generator(seed), list[str]()
-    if driven and not (isinstance(scene, VideoScene) and scene.by_frames):
-        notes.append(
-            "events come in step with the frames of the clip, as a simulator makes them that knows these "
-            "frames alone: compared is from frame to frame"
-        )
-    if windows != (asked,):
-        notes.append(sentence_of_windows(asked, windows))
-    # time is cut, not drawn: moments between fitted ones would be known from these
-    cut = max(2, round(settings.fitted_share * grid.steps))
-    if trust is None:
-        # other pixels judge: fixed patterns, such as mismatch, would be known from the fitted ones
-        order = rng.permutation(size)
-        if odd_pixels is not None:
-            order = order[~np.isin(order, odd_pixels)]
-        chosen = order[: PARTS * each].astype(np.int32)
-    else:
-        if odd_pixels is not None:
-            trust = partial(_trust_but_in, odd_pixels, trust)
-        looks = find_trusted_parts(events, scene, times_of_grid(scene, grid), cut, trust)
-        chosen = choose_trusted_pixels(looks, each, rng, least=settings.least_pixels)
-        each = len(chosen) // PARTS
-        notes.append(looks.sentence())
-    # from the begin of the scene also for the half that judges: filters and memories are settled there
-    times = times_of_grid(scene, grid)
-    light = light_of(scene, times[:1] if still else times, chosen)
+
+
+def _light_of_pixels(plan: SplitPlan) -> NDArray[np.float32]:
+    """Return the light of all parts, shape (PARTS N, T), where it never changes as a view of one column."""
+    # from the begin of the scene also for the parts that judge: filters and memories are settled there
+    time, times, numbers = plan.time, plan.time.times, plan.pixels.numbers
+    light = light_of(time.scene, times[:1] if time.still else times, numbers)
     if not np.all(np.isfinite(light)) or light.min() < 0:
         raise InputError("scene: intensities must be finite and >= 0")
-    light = np.broadcast_to(light, (len(chosen), len(times))) if still else light
-    # a row for all pixels where all are trusted alike
-    good = np.ones((1, len(times)), np.bool_) if trust is None else trust(times, chosen).T.copy()
-    if len(gaps):
-        good &= outside_gaps(gaps)(times)
-        length = 1e3 * float(np.median(np.diff(gaps, axis=1)))
-        notes.append(f"{len(gaps)} gaps of {length:.3g} ms without any event: data are missing, and left out")
-    if left_out is not None:
-        good &= ~left_out(times)
-    if settled is not None:
-        good &= settled(times)
-    good[:, 1:] &= good[:, :-1]  # a step is what lies between two points of the grid
-    # all parts have the same bands, or a cell would mean another brightness in each; what reports has no say
-    several = light[: 2 * each]
-    bands = band_edges(several, np.broadcast_to(good[: 2 * each], several.shape))
-    sorting = partial(sort_into_cells, step=grid.step, bands=bands, log_eps=log_eps)
-    first, *last = (slice(n * each, (n + 1) * each) for n in range(PARTS))
-    # filters over time go pixel by pixel, so parts of the pixels give the same as all of them
-    cell = [np.empty((each, len(times)), np.uint8) for _ in range(PARTS)]
+    return np.broadcast_to(light, (len(numbers), len(times))) if time.still else light
 
+
+def _compared_steps(plan: SplitPlan) -> NDArray[np.bool_]:
+    """Return which steps of pixels are compared, shape (N, T), or (1, T) where those of all are alike."""
+    time, times, trust = plan.time, plan.time.times, plan.pixels.trust
+    # a row for all pixels where all are trusted alike
+    good: NDArray[np.bool_] = (
+        np.ones((1, len(times)), np.bool_) if trust is None else trust(times, plan.pixels.numbers).T.copy()
+    )
+    if len(time.gaps):
+        good &= outside_gaps(time.gaps)(times)
+    if plan.left_out.times is not None:
+        good &= ~plan.left_out.times(times)
+    if time.spliced is not None:
+        good &= time.spliced.settled(times)
+    good[:, 1:] &= good[:, :-1]  # a step is what lies between two points of the grid
+    return good
+
+
+def _bands_of_all_parts(plan: SplitPlan, light: NDArray[np.float32], good: NDArray[np.bool_]) -> Array:
+    """Return the edges of the bands, shape (BANDS - 1,), from light and compared steps of pixels (N, T)."""
+    # all parts have the same bands, or a cell would mean another brightness in each; what reports has no say
+    count = 2 * plan.pixels.each
+    several = light[:count]
+    return band_edges(several, np.broadcast_to(good[:count], several.shape))
+
+
+def _cells_and_structure(
+    plan: SplitPlan, light: NDArray[np.float32], bands: Array, log_eps: float
+) -> tuple[list[NDArray[np.uint8]], TimestampStructure]:
+    """Return the cells of the steps of each part, shape (N, T), and the regularities of time stamps."""
+    time, each, steps = plan.time, plan.pixels.each, light.shape[1]
+    sorting = partial(sort_into_cells, step=time.grid.step, bands=bands, log_eps=log_eps)
+    # filters over time go pixel by pixel, so parts of the pixels give the same as all of them
+    cells = [np.empty((each, steps), np.uint8) for _ in range(PARTS)]
     works: list[Callable[[], Any]] = [
-        partial(_sort_into, cells[n : n + ROWS], light[part * each + n :], sorting)
-        for part, cells in enumerate(cell)
+        partial(_sort_into, of_part[n : n + ROWS], light[part * each + n :], sorting)
+        for part, of_part in enumerate(cells)
         for n in range(0, each, ROWS)
     ]
-    works.append(partial(find_structure, events))
+    # beside them, for all events are gone through and no pixel is waited for
+    works.append(partial(find_structure, time.events))
     *_, structure = launch.run_concurrently(works)
-    # of frames that are held all events come so long after one
-    structure = TimestampStructure() if is_held(scene) else structure
-    # a clock would show the tick before each event of a model, often in the frame before
-    if ticks_are_of_frames(structure.step, frame_step, events, scene):
-        notes.append(
-            f"time stamps are multiples of {format_seconds(structure.step)} in step with the frames of the "
-            "clip: times between frames are made by a simulator that knows these frames alone, and are not "
-            "compared"
-        )
-        structure = TimestampStructure()
-    for n, cells in enumerate(cell):
-        if len(good) == 1:
-            cells[:, ~good[0]] = MASKED
-        else:
-            cells[~good[n * each : (n + 1) * each]] = MASKED
-        cells[:, 0] = MASKED  # no step ends at the first point
-        # what judges is simulated over all of the time and compared in the later part only
-        if n > 0:
-            cells[:, :cut] = MASKED
-    fitted = grid if all_time else replace(grid, steps=cut)
-    pieces = [(first, fitted, cell[0][:, : fitted.steps].copy(), 0)]
-    pieces += [(part, grid, cells, cut) for part, cells in zip(last, cell[1:], strict=True)]
-    del cell, cells, works, good  # large, and no longer needed
-    highest = highest_event_rate(events, SPLIT.burst)
-    halves: list[PixelSubset] = []
-    for part, stretch, cells, begins in pieces:
-        stimulus = Stimulus(
-            chosen[part], scene.width, scene.height, stretch, light[part, : stretch.steps], cells, log_eps,
-            to, trust is not None or len(gaps) > 0 or left_out is not None or settled is not None,
-        )  # fmt: skip
-        halves.append(make_subset(stimulus, events, begins, structure, highest_rate=highest))
-    _require_enough_events(halves, events, grid, notes, settings.least_events)
-    few = halves[0].trials.stimulus.part(settings.scouts)
-    halves.append(make_subset(few, events, 0, structure, highest_rate=highest))
-    # seen in the fitted half: what judges must not choose
-    peak = peak_of(halves[0].found.clock[0], grid.step)
-    if lamp is not None:
-        peak = RatePeak(lamp, 0.0)
-    elif trust is None:  # else most events are where the scene is not known
-        end = grid.begin + cut * grid.step
-        peak = peak._replace(frequency=refine_frequency(events, grid.begin, end, peak.frequency))
-    train, held, last_part, scout = (
-        replace(
-            half,
-            frame=replace(half.frame, peak=peak.frequency),
-            # where the scene is trusted here and there only, nobody knows what all pixels send
-            around=WholeSensor(scene, times_of_grid(scene, grid), seed, device) if trust is None else None,
-        )
-        for half in halves
-    )
-    bus = BusUse.of(events, structure, span=SPLIT.burst)
-    contradiction = contradiction_of_rest(events, light[:, :1] if still else light)
-    if contradiction:
-        notes.insert(0, contradiction)
-    out = SplitMeasurement(
-        train, held, last_part, scout, bands, structure, peak, highest, bus, when,
-        tuple(notes), contradiction, frames, frame_step, clip_frames,
-    )  # fmt: skip
-    if out.light_never_changes:
-        notes.append(
-            "the light never changes: nothing tells how much change an event takes, and thresholds are not "
-            "fitted"
-        )
-    return replace(out, notes=tuple(notes))
-
-
-def _share_compared(events: Events, scene: Scene, grid: Grid, trust: Trust | None, looks: int = 40) -> float:
-    """Return about which share of the events lies where a scene is trusted."""
-    if trust is None:
-        return 1.0
-    return find_trusted_parts(events, scene, times_of_grid(scene, grid), 0, trust, most=looks).events
-
-
-def _within(events: Events, grid: Grid) -> Events:
-    """Return the events of a stretch of time."""
-    inside = (events.t >= grid.begin) & (events.t <= grid.begin + grid.step * (grid.steps + 1))
-    return events.select(inside)
-
-
-def _trust_on_clock(
-    trust: Trust, clock: SplicedTime, times: Array, pixels: NDArray[np.int32]
-) -> NDArray[np.bool_]:
-    """Return where a scene is trusted, shape (K, N), at times of the spliced clock [s], shape (K,)."""
-    return trust(clock.real(times), pixels)
-
-
-def _trust_but_in(
-    odd_pixels: NDArray[np.int64], trust: Trust, times: Array, pixels: NDArray[np.int32]
-) -> NDArray[np.bool_]:
-    """Return what a trust says, and that some pixels are not to be trusted, shape (T, N)."""
-    return trust(times, pixels) & ~np.isin(pixels, odd_pixels)
+    return cells, structure
 
 
 def _sort_into(
@@ -448,50 +397,115 @@ def _sort_into(
     cells[:] = sorting(light[: len(cells)])
 
 
-def common_grid(events: Events, scene: Scene) -> Grid:
-    """Return the time that scene and events have in common, in equal steps [s].
+def _structure_of_a_clock(
+    found: TimestampStructure, time: ComparedTime
+) -> tuple[TimestampStructure, tuple[str, ...]]:
+    """Return the regularities of time stamps that a camera's clock makes, and what is said of others."""
+    # of frames that are held all events come so long after one
+    structure = TimestampStructure() if is_held(time.scene) else found
+    # a clock would show the tick before each event of a model, often in the frame before
+    if not ticks_are_of_frames(structure.step, time.frame_step, time.events, time.scene):
+        return structure, ()
+    return TimestampStructure(), (
+        f"time stamps are multiples of {format_seconds(structure.step)} in step with the frames of the "
+        "clip: times between frames are made by a simulator that knows these frames alone, and are not "
+        "compared",
+    )
 
-    Raises:
-        InputError: Different sizes, no events, or no time in common.
+
+def _mask_cells(cells: list[NDArray[np.uint8]], good: NDArray[np.bool_], cut: int) -> None:
+    """Mask the steps of each part, shape (N, T), that are not compared.
+
+    Args:
+        cells: Of each part, shape (N, T).
+        good: Which steps are compared, shape (PARTS N, T), or (1, T) for all pixels.
+        cut: Step at which the time begins that judges.
     """
-    if (events.width, events.height) != (scene.width, scene.height):
-        raise InputError(
-            f"recording and scene must have one size, got {events.width}x{events.height} "
-            f"and {scene.width}x{scene.height}"
-        )
-    times = scene.sample_times()
-    if len(events) == 0:
-        raise InputError("the recording has no events, so there is nothing to compare")
-    begin, end = float(times[0]), float(times[-1])
-    if events.t[-1] < begin or events.t[0] > end:
-        raise InputError(
-            f"recording and scene must overlap in time, got events from {events.t[0]:.6g} s to "
-            f"{events.t[-1]:.6g} s and a scene from {begin:.6g} s to {end:.6g} s"
-        )
-    # steps of the scene itself need no interpolation, which would smooth what happens between them
-    step = np.diff(times)
-    even = len(step) > 0 and np.ptp(step) < 1e-3 * step.mean()
-    own = even and STIMULUS.finest_step <= step.mean() <= STIMULUS.coarsest_step
-    # nor does a simulator that knows its frames alone show anything between them
-    own = own or (frame_step_of(events, scene) is not None and is_too_slow(float(step.mean())))
-    h = float(step.mean()) if own else STIMULUS.common_step
-    # after the last event a step or two of silence count, not minutes: the recording may have ended there
-    last = min(end, float(events.t[-1]) + 2 * h)
-    steps = int(np.floor((last - begin) / h + 1e-6)) + 1
-    return Grid(begin, h, max(steps, 2))
+    for n, of_part in enumerate(cells):
+        if len(good) == 1:
+            of_part[:, ~good[0]] = MASKED
+        else:
+            of_part[~good[n * len(of_part) : (n + 1) * len(of_part)]] = MASKED
+        of_part[:, 0] = MASKED  # no step ends at the first point
+        # what judges is simulated over all of the time and compared in the later part only
+        if n > 0:
+            of_part[:, :cut] = MASKED
 
 
-def times_of_grid(scene: Scene, grid: Grid) -> NDArray[np.float64]:
-    """Return the times of the grid [s], shape (T,), the scene's own where they differ by rounding only."""
-    own = scene.sample_times()
-    first = int(np.searchsorted(own, grid.begin - 0.5 * grid.step))
-    own = own[first : first + grid.steps]
-    if len(own) == grid.steps and np.allclose(own, grid.times, rtol=0, atol=1e-3 * grid.step):
-        return own
-    # the last point may lie beyond the scene by a rounding
-    begin, end = (float(time) for time in scene.sample_times()[[0, -1]])
-    inside: NDArray[np.float64] = np.clip(grid.times, begin, end)
-    return inside
+def _stimuli_of_parts(
+    plan: SplitPlan,
+    light: NDArray[np.float32],
+    cells: list[NDArray[np.uint8]],
+    log_eps: float,
+    device: Any,
+    *,
+    all_time: bool,
+) -> list[Stimulus]:
+    """Return what the pixels of each part see, over the time for which they are simulated.
+
+    Args:
+        plan: Which time and pixels.
+        light: Of all parts, shape (PARTS N, T).
+        cells: Of each part, shape (N, T).
+        log_eps: Added to intensities before the logarithm.
+        device: Where kernels run.
+        all_time: Whether all of the time is fitted.
+    """
+    grid, scene = plan.time.grid, plan.time.scene
+    fitted = grid if all_time else replace(grid, steps=plan.cut)
+    # a copy of the cells that are fitted, as a view would keep the others in memory
+    stretches = [(fitted, cells[0][:, : fitted.steps].copy()), *((grid, of_part) for of_part in cells[1:])]
+    return [
+        Stimulus(
+            plan.pixels.numbers[part], scene.width, scene.height, stretch, light[part, : stretch.steps],
+            of_part, log_eps, device, plan.has_holes,
+        )
+        for part, (stretch, of_part) in zip(plan.pixels.parts(), stretches, strict=True)
+    ]  # fmt: skip
+
+
+def _peak_of(plan: SplitPlan, train: PixelSubset, lamp: float | None) -> RatePeak:
+    """Return the frequency at which the rate swings most.
+
+    Args:
+        plan: Which time and pixels.
+        train: What is fitted.
+        lamp: The frequency [Hz] where all events have told it.
+    """
+    if lamp is not None:
+        return RatePeak(lamp, 0.0)
+    grid = plan.time.grid
+    # seen in the fitted part: what judges must not choose
+    peak = peak_of(train.found.clock[0], grid.step)
+    if not plan.trusts_all:  # most events are where the scene is not known
+        return peak
+    end = grid.begin + plan.cut * grid.step
+    return peak._replace(frequency=refine_frequency(plan.time.events, grid.begin, end, peak.frequency))
+
+
+def _with_surroundings(
+    plan: SplitPlan, part: PixelSubset, peak: RatePeak, seed: int, device: str
+) -> PixelSubset:
+    """Return the same pixels, told where the rate of events swings and what all pixels see."""
+    time = plan.time
+    # where the scene is trusted here and there only, nobody knows what all pixels send; no two parts share
+    # one, for it keeps what is beside the pixels of one of them
+    around = WholeSensor(time.scene, time.times, seed, device) if plan.trusts_all else None
+    return replace(part, frame=replace(part.frame, peak=peak.frequency), around=around)
+
+
+def _notes_before(split: SplitMeasurement) -> list[str]:
+    """Return what is to be read before all other notes."""
+    return [split.contradiction] if split.contradiction else []
+
+
+def _notes_after(split: SplitMeasurement) -> list[str]:
+    """Return what is to be read after all other notes."""
+    if not split.light_never_changes:
+        return []
+    return [
+        "the light never changes: nothing tells how much change an event takes, and thresholds are not fitted"
+    ]
 
 
 def make_subset(

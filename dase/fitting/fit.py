@@ -13,7 +13,7 @@ import numpy as np
 
 from dase.fitting.burst_strength import find_frame_times, follows_frames, put_in_step
 from dase.fitting.confidence_intervals import REPEATS, estimate_parameters
-from dase.fitting.data_split import SPLIT, SplitMeasurement, split_measurement
+from dase.fitting.data_split import SPLIT, ModelPremises, SplitMeasurement, split_measurement
 from dase.fitting.measurement import Measured, SceneChoice, as_measurement
 from dase.fitting.model import (
     PHASED,
@@ -106,11 +106,8 @@ def fit(
     follows = follows_frames(start)
     frames = find_frame_times(measurement) if follows else None
     untold = follows and frames is None
-    evidence = split_measurement(
-        measurement.events, scene, log_eps=start.log_eps, trust=measurement.trust,
-        span=measurement.span, frames=frames, unbroken=start.unbroken,
-        pixels=pixels, seed=seed, device=device,
-    )  # fmt: skip
+    premises = ModelPremises(start.log_eps, frames=frames, unbroken=start.unbroken)
+    evidence = split_measurement(measurement, models=premises, pixels=pixels, seed=seed, device=device)
     start = put_in_step(start, evidence)
     free = free_where_measured(evidence, start, free)
     given = model_of(start, free)

@@ -26,6 +26,7 @@ from dase.diagnosis.settings import DEFAULTS
 from dase.diagnosis.state import DiagnosisState
 from dase.effects import EFFECTS
 from dase.fitting.data_split import split_measurement
+from dase.fitting.measurement import Measurement
 from dase.fitting.model import model_of
 from dase.fitting.scheduler import answer_requests
 from dase.probes.distance import Judgement
@@ -104,7 +105,7 @@ def test_limits_agree_with_simulation(name, pixels):
 def test_stronger_is_tried_only_where_weaker_is_not_seen(scene, name):
     """But where a model needs samples of its own, all strengths fill one launch."""
     sensor = Sensor()
-    evidence = split_measurement(dase.simulate(scene, sensor, seed=3), scene, pixels=200, seed=3)
+    evidence = split_measurement(Measurement(dase.simulate(scene, sensor, seed=3), scene), pixels=200, seed=3)
     state = DiagnosisState(evidence, EFFECTS, 3, lambda text, share, error: None, frozenset({"threshold"}))
     model = model_of(sensor)
     half = model.calibrate(evidence.report, repeats=20, seed=5)

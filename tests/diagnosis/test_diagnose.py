@@ -23,6 +23,7 @@ from dase.effects import EFFECTS, Effect, parameter
 from dase.fitting.confidence_intervals import estimate_parameters
 from dase.fitting.data_split import split_measurement
 from dase.fitting.fit import _equally_good_models, _notes_on_minimum, fit
+from dase.fitting.measurement import Measurement
 from dase.fitting.model import model_of, refit_model
 from dase.probes.distance import (
     ErrorScale,
@@ -164,7 +165,7 @@ def test_intervals_cover_the_truth(scene, device):
     inside = []
     for seed in range(8):
         events = hidden(scene, device, EFFECTS["leak"](rate=4.0, spread=0.1), seed=20 + seed)
-        evidence = split_measurement(events, scene, pixels=500, seed=seed, device=device)
+        evidence = split_measurement(Measurement(events, scene), pixels=500, seed=seed, device=device)
         model = refit_model(evidence, model_of(given, list(true)), seed=seed)
         _, got = estimate_parameters(evidence, model, seed=seed)
         inside += [got[n].low <= v <= got[n].high for n, v in true.items()]
@@ -344,7 +345,7 @@ def test_an_effect_of_the_user_is_explained_wherever_its_file_is_named(tmp_path,
 def test_too_small_a_scene_is_refused(scene):
     tiny = VideoScene(scene.frames(scene.sample_times())[:, :4, :4], scene.sample_times())
     with pytest.raises(dase.InputError, match="16 pixels"):
-        split_measurement(dase.simulate(tiny, Sensor()), tiny)
+        split_measurement(Measurement(dase.simulate(tiny, Sensor()), tiny))
 
 
 def judged(error: float, reach: float = 0.4, level: float = 0.2, **families: float) -> Judgement:

@@ -22,6 +22,7 @@ from dase.diagnosis.settings import DEFAULTS
 from dase.diagnosis.state import DiagnosisState
 from dase.effects import EFFECTS
 from dase.fitting.data_split import split_measurement
+from dase.fitting.measurement import Measurement
 from dase.fitting.model import FittedModel, model_of
 from dase.probes.distance import Judgement
 from dase.simulation.sensor import Sensor
@@ -62,7 +63,7 @@ def searches(device) -> dict[str, DiagnosisState]:
     out = {}
     for name, sensor in (("plain", TRUE), ("uneven", TRUE.with_effect(JITTER))):
         events = dase.simulate(scene, sensor, seed=4, device=device)
-        evidence = split_measurement(events, scene, pixels=900, seed=1, device=device)
+        evidence = split_measurement(Measurement(events, scene), pixels=900, seed=1, device=device)
         out[name] = DiagnosisState(
             evidence, LIBRARY, 1, lambda text, share, error: None, frozenset({"threshold"})
         )

@@ -124,7 +124,7 @@ def test_a_time_far_shorter_than_a_step_of_light_may_be_a_memory_set_later(effec
 
 def test_what_reports_has_pixels_of_its_own_at_the_later_time(scene):
     events = dase.simulate(scene, Sensor(), seed=1)
-    evidence = split_measurement(events, scene, pixels=700)
+    evidence = split_measurement(Measurement(events, scene), pixels=700)
     parts = [evidence.train, evidence.held, evidence.report]
     pixels = [set(part.trials.stimulus.pixels.tolist()) for part in parts]
     assert [len(some) for some in pixels] == [700] * 3
@@ -144,7 +144,7 @@ def found(scene, events) -> dase.Diagnosis:
 
 def test_what_reports_chooses_nothing(scene, events, found):
     """The search goes the same way whatever the pixels saw that report; what is said of its end differs."""
-    apart = split_measurement(events, scene, pixels=400).report.trials.stimulus.pixels
+    apart = split_measurement(Measurement(events, scene), pixels=400).report.trials.stimulus.pixels
     rng = np.random.default_rng(0)
     mine = np.isin(events.y.astype(np.int64) * scene.width + events.x, apart)
     # at the time that reports; what comes before tells how fast a lamp flickers, wherever it is seen

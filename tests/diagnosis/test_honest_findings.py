@@ -19,10 +19,11 @@ from dase.diagnosis.explain_effect import moving_bars
 from dase.diagnosis.ranking import rank_of_pair
 from dase.effects import EFFECTS
 from dase.figures import report
+from dase.fitting.compared_time import common_grid, times_of_grid
 from dase.fitting.contradictions import motion_at_rest
-from dase.fitting.data_split import common_grid, split_measurement, times_of_grid
+from dase.fitting.data_split import split_measurement
 from dase.fitting.fit import notes_on_disagreement, widen_intervals
-from dase.fitting.measurement import as_measurement
+from dase.fitting.measurement import Measurement, as_measurement
 from dase.fitting.model import model_of
 from dase.fitting.search_ends import is_where_it_began, parameters_at_bounds
 from dase.fitting.time_window import repeated_gaps
@@ -243,7 +244,7 @@ def test_too_few_events_says_what_helps():
     def sentence(of: dase.Events, pixels: int, length: float = 1.0) -> str:
         scene = StaticScene(of.width, of.height, length)
         with pytest.raises(dase.InputError, match="too few events") as caught:
-            split_measurement(of, scene, pixels=pixels)
+            split_measurement(Measurement(of, scene), pixels=pixels)
         return str(caught.value)
 
     assert "looking at more pixels helps" in sentence(events(20_000), 32)
@@ -286,11 +287,11 @@ def at_rest(length: float, rate: float, side: int = 64) -> dase.Events:
 def test_of_a_long_recording_a_part_is_compared():
     """Memory and time do not grow with the recording; which part it was is said."""
     events = at_rest(60.0, 2.0)
-    evidence = split_measurement(events, StaticScene(64, 64, 60.0), pixels=600)
+    evidence = split_measurement(Measurement(events, StaticScene(64, 64, 60.0)), pixels=600)
     assert evidence.held.trials.stimulus.grid.steps <= 5000
     assert " s of 60 s are compared" in evidence.notes[0]
     assert int(evidence.held.found.halves.sum()) > 1000
-    few = split_measurement(at_rest(60.0, 0.1), StaticScene(64, 64, 60.0), pixels=600)
+    few = split_measurement(Measurement(at_rest(60.0, 0.1), StaticScene(64, 64, 60.0)), pixels=600)
     assert few.held.trials.stimulus.grid.steps > 20_000  # so that there are enough events
 
 
@@ -298,7 +299,7 @@ def test_the_part_that_is_compared_can_be_chosen():
     events = at_rest(3.0, 20.0)
     part = as_measurement(events, "static").part(1.0, 2.5, (8, 4, 32, 40))
     assert part.trust is not None
-    evidence = split_measurement(part.events, part.scene, trust=part.trust, span=part.span, pixels=300)
+    evidence = split_measurement(part, pixels=300)
     stimulus = evidence.held.trials.stimulus
     assert stimulus.grid.begin == pytest.approx(1.0, abs=2e-3)
     assert stimulus.grid.times[-1] == pytest.approx(2.5, abs=2e-3)
@@ -311,7 +312,7 @@ def test_the_part_that_is_compared_can_be_chosen():
     with pytest.raises(dase.InputError, match="must not be empty"):
         part.part(2.0, 1.0)
     with pytest.raises(dase.InputError, match="in common"):
-        split_measurement(events, part.scene, span=(9.0, 10.0))
+        split_measurement(Measurement(events, part.scene, span=(9.0, 10.0)))
 
 
 def test_gaps_that_repeat_are_left_out():
@@ -323,7 +324,7 @@ def test_gaps_that_repeat_are_left_out():
     assert len(gaps) == 13  # the first is before the first event
     assert np.diff(gaps, axis=1) == pytest.approx(0.018, rel=0.05)
     scene, sensor = StaticScene(64, 64, 4.0), Sensor().with_effect(EFFECTS["shot"](rate=20.0))
-    evidence = split_measurement(cut, scene, pixels=600)
+    evidence = split_measurement(Measurement(cut, scene), pixels=600)
     assert any("13 gaps of 18" in note for note in evidence.notes)
     found = compare(cut, sensor, scene=scene, pixels=600)
     assert found.error < found.gate

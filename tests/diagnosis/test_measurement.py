@@ -61,7 +61,7 @@ def test_frames_far_apart_make_a_scene_with_trust(measured):
     assert isinstance(measured.scene, dase.CameraScene)
     assert measured.trust is not None
     assert any("after the frames" in note and "nothing was corrected" in note for note in measured.notes)
-    evidence = split_measurement(measured.events, measured.scene, trust=measured.trust, pixels=PIXELS)
+    evidence = split_measurement(measured, pixels=PIXELS)
     for half in (evidence.train, evidence.held):
         stimulus = half.trials.stimulus
         compared = stimulus.cell != MASKED
@@ -184,10 +184,10 @@ def test_next_to_nothing_to_trust_is_said(measured):
         return np.broadcast_to(few[pixels], (len(times), len(pixels)))
 
     with pytest.raises(dase.InputError, match=r"trusted in 0\.16 % of pixels and times only"):
-        split_measurement(measured.events, measured.scene, trust=nearly_nowhere)
+        split_measurement(Measurement(measured.events, measured.scene, trust=nearly_nowhere))
     still = measured.events.select(slice(None, None, 200))
     with pytest.raises(dase.InputError, match=r"too few events .* compared is only where the scene can be"):
-        split_measurement(still, measured.scene, pixels=PIXELS)
+        split_measurement(Measurement(still, measured.scene), pixels=PIXELS)
 
 
 def test_events_that_are_believed(measured):
@@ -219,7 +219,7 @@ def test_a_davis_and_its_frames(shared):
     path = shared / "recordings" / "native" / "davis346_cuke_cradle.aedat4"
     found = open_measurement(path)
     assert isinstance(found.scene, dase.CameraScene)
-    evidence = split_measurement(found.events, found.scene, trust=found.trust)
+    evidence = split_measurement(found)
     assert min(int(h.found.halves.sum()) for h in (evidence.train, evidence.held)) > 1000
     told = next(note for note in evidence.notes if note.startswith("compared is only"))
     pixels, events = (float(word) for word in told.replace("%", " ").split() if word[0].isdigit())

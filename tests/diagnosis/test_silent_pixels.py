@@ -227,9 +227,11 @@ def test_all_of_the_time_is_fitted_where_light_comes_to_rest():
     true = Sensor().with_effect(EFFECTS["leak"](rate=2.0, spread=0.2))
     true = true.with_effect(EFFECTS["mismatch"](spread=0.2))
     events = dase.simulate(scene, true, seed=3)
-    assert split_measurement(events, scene, pixels=400).parts_differ
+    assert split_measurement(Measurement(events, scene), pixels=400).parts_differ
     restless = moving(1.2)
-    assert not split_measurement(dase.simulate(restless, true), restless, pixels=400).parts_differ
+    assert not split_measurement(
+        Measurement(dase.simulate(restless, true), restless), pixels=400
+    ).parts_differ
     library = {name: EFFECTS[name] for name in ("threshold", "mismatch", "leak", "hot")}
     found = diagnose(events, scene=scene, effects=library, pixels=400, most=3)
     assert set(found.selected) == {"leak", "mismatch"}

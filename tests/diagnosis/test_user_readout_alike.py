@@ -18,6 +18,7 @@ from dase.effects.row_scan import RowScan, Scan
 from dase.effects.stream import StampPattern, random_numbers
 from dase.effects.timestamp import Stamp, Timestamp
 from dase.fitting.data_split import split_measurement
+from dase.fitting.measurement import Measurement
 from dase.simulation.sensor import Sensor
 
 THRESHOLD = EFFECTS["threshold"](on=0.18, off=0.22)
@@ -154,7 +155,7 @@ def test_kernels_stamp_by_a_users_clock(device):
     scene = moving_bars(duration=0.3)
     clock = Ticker(grain=5e-4)
     events = dase.simulate(scene, Sensor((THRESHOLD,)).with_effect(clock), seed=3, device=device)
-    trials = split_measurement(events, scene, pixels=64, device=device).scout.trials
+    trials = split_measurement(Measurement(events, scene), pixels=64, device=device).scout.trials
 
     def ticks(*effects: Effect) -> float | None:
         return trials.ticks(Sensor((THRESHOLD, *effects)))

@@ -14,6 +14,7 @@ from dase.effects.shot import Shot
 from dase.effects.threshold import Threshold
 from dase.effects.vignetting import Vignetting
 from dase.fitting.data_split import split_measurement
+from dase.fitting.measurement import Measurement
 from dase.simulation.sensor_run import sample_times
 
 SHAPES = ("sine", "rectified", "pwm")
@@ -126,7 +127,7 @@ def test_as_many_events_in_trials_as_when_simulated(device, shape, depth):
     waves = np.exp(-1.0 + 0.5 * np.sin(0.4 * x + 0.3 * y - 40 * times[:, None, None]))
     scene = dase.VideoScene(waves.astype(np.float32), times)
     events = dase.simulate(scene, sensor, seed=3, device=device)
-    trials = split_measurement(events, scene, pixels=100, seed=1, device=device).train.trials
+    trials = split_measurement(Measurement(events, scene), pixels=100, seed=1, device=device).train.trials
     stimulus = trials.stimulus
     span = stimulus.grid.begin, stimulus.grid.begin + stimulus.grid.step * (stimulus.grid.steps - 1)
     runs = trials.run(sensor, np.repeat(sensor.parameters()[None], 8, 0), reseed=True)

@@ -20,6 +20,7 @@ from dase.effects.shot import Shot
 from dase.effects.threshold import Threshold
 from dase.effects.timestamp import Timestamp
 from dase.fitting.data_split import split_measurement
+from dase.fitting.measurement import Measurement
 from dase.fitting.model import model_of
 from dase.fitting.readout_simulator import pass_readout, simulate_pixels
 from dase.kernels import line_arbiter
@@ -191,7 +192,10 @@ def test_as_many_leave_in_trials_as_when_simulated(textured, mode, fill, others)
     sensor = pixels.with_effect(bus)
     runs = [dase.simulate(textured, sensor, seed=seed) for seed in (3, 4)]
     assert (len(runs[0]) < 0.95 * len(plain)) == (fill > 1)
-    model, half = model_of(sensor), split_measurement(runs[0], textured, pixels=200, seed=1).train
+    model, half = (
+        model_of(sensor),
+        split_measurement(Measurement(runs[0], textured), pixels=200, seed=1).train,
+    )
     stimulus, own = half.trials.stimulus, np.zeros(48 * 24, bool)
     own[stimulus.pixels] = True
     room = (own.size / others + len(stimulus.pixels)) * stimulus.grid.steps

@@ -12,7 +12,7 @@ from dase.effects import EFFECTS
 from dase.effects.exposure import Exposure
 from dase.events import Events
 from dase.fitting.burst_strength import fit_bursts, follows_frames, put_in_step
-from dase.fitting.data_split import split_measurement
+from dase.fitting.data_split import ModelPremises, split_measurement
 from dase.fitting.measurement import Measurement
 from dase.results import Grade
 from dase.scenes import image_sources, random_scenes
@@ -96,10 +96,10 @@ def test_a_sensor_takes_the_times_of_the_measurement(scene, device):
     events = dase.simulate(scene, dase.Sensor(), seed=1, device=device)
     assert follows_frames(wrong)
     assert not follows_frames(dase.Sensor())
-    evidence = split_measurement(events, scene, frames=TIMES, pixels=100)
+    evidence = split_measurement(Measurement(events, scene), models=ModelPremises(frames=TIMES), pixels=100)
     moved = put_in_step(wrong, evidence)["exposure"]
     assert moved == replace(FRAMES, amplitude=0.4)
-    without = split_measurement(events, scene, pixels=100)
+    without = split_measurement(Measurement(events, scene), pixels=100)
     assert put_in_step(wrong, without) == wrong
 
 

@@ -16,6 +16,7 @@ from dase.effects.stream import Others
 from dase.fitting.batch_simulator import SimulationOrder
 from dase.fitting.bus_use import BusUse, least_bus_rate
 from dase.fitting.data_split import SPLIT, split_measurement
+from dase.fitting.measurement import Measurement
 from dase.fitting.model import model_of
 from dase.fitting.readout_simulator import simulate_pixels
 from dase.fitting.scheduler import SimulationRequest, answer_requests
@@ -45,7 +46,9 @@ def true() -> Sensor:
 
 @pytest.fixture(scope="module")
 def evidence(scene, true, device):
-    return split_measurement(dase.simulate(scene, true, seed=4), scene, pixels=150, seed=1, device=device)
+    return split_measurement(
+        Measurement(dase.simulate(scene, true, seed=4), scene), pixels=150, seed=1, device=device
+    )
 
 
 def stream(rng, count: int) -> dase.Events:
@@ -152,7 +155,7 @@ def test_the_rate_in_trials_is_that_of_a_simulation(lamp, device, mode, fullness
     rate = len(dase.simulate(lamp, free, seed=4, device=device)) / SECONDS / fullness
     true = free.with_effect(Readout(rate=rate, mode=mode, depth=300.0))
     found = dase.simulate(lamp, true, seed=4, device=device)
-    half = split_measurement(found, lamp, pixels=300, seed=1, device=device).train
+    half = split_measurement(Measurement(found, lamp), pixels=300, seed=1, device=device).train
     looked_at, grid = half.trials.stimulus.pixels, half.trials.stimulus.grid
     want = np.zeros(repeats)
     for n in range(repeats):

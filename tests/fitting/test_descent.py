@@ -16,6 +16,7 @@ from dase.fitting import model as model_module
 from dase.fitting.confidence_intervals import estimate_parameters
 from dase.fitting.data_split import split_measurement
 from dase.fitting.fit import with_phase_given
+from dase.fitting.measurement import Measurement
 from dase.fitting.model import (
     model_of,
     places_between,
@@ -110,7 +111,7 @@ def test_a_phase_that_looks_no_better_at_the_same_place_is_found(device, monkeyp
     monkeypatch.setattr(model_module, "_as_good_work", never)
     scene, true = moving_bars(), Sensor().with_effect(EFFECTS["threshold"](on=0.2, off=0.2, phase=0.0))
     events = dase.simulate(scene, true, seed=4, device=device)
-    found = split_measurement(events, scene, pixels=200, seed=1, device=device)
+    found = split_measurement(Measurement(events, scene), pixels=200, seed=1, device=device)
     start = with_phase(model_of(true), 1.0)
     assert run_work(refit_work(found, start, seed=0, rounds=1)).sensor["threshold"].phase == 1
     assert refit_model(found, start, seed=0, rounds=1).sensor["threshold"].phase == 0
@@ -126,7 +127,7 @@ def test_a_phase_stays_as_it_was_given_where_nothing_tells_another(device, other
     for name, value in (("mismatch", {"spread": 0.15}), ("shot", {"rate": 2.0})):
         true = true.with_effect(EFFECTS[name](**value)) if name in others else true
     events = dase.simulate(scene, true, seed=4, device=device)
-    evidence = split_measurement(events, scene, pixels=300, seed=1, device=device)
+    evidence = split_measurement(Measurement(events, scene), pixels=300, seed=1, device=device)
     end, start = with_phase(model_of(true), found), with_phase(model_of(true), given).sensor
     assert with_phase_given(evidence, end, start, seed=0).sensor["threshold"].phase == kept
 
@@ -145,7 +146,7 @@ def test_a_fit_says_that_the_phase_is_the_recordings(device):
 def test_another_rule_of_a_dead_time_is_found(device, rule, other):
     scene, dead = moving_bars(), EFFECTS["refractory"](period=6e-3, mode=rule)
     events = dase.simulate(scene, Sensor().with_effect(dead), seed=4, device=device)
-    found = split_measurement(events, scene, pixels=300, seed=1, device=device)
+    found = split_measurement(Measurement(events, scene), pixels=300, seed=1, device=device)
     start = model_of(Sensor().with_effect(replace(dead, mode=other)))
     assert refit_model(found, start, seed=0, rounds=1).sensor["refractory"].mode == rule
 
@@ -167,7 +168,7 @@ def test_noise_passes_the_dead_time_of_a_fit_where_it_does(device):
     scene, noise = moving_bars(), EFFECTS["shot"](rate=30.0)
     dead = EFFECTS["refractory"](period=1e-2, mode="delay", noise="passes")
     events = dase.simulate(scene, Sensor().with_effect(noise).with_effect(dead), seed=4, device=device)
-    found = split_measurement(events, scene, pixels=300, seed=1, device=device)
+    found = split_measurement(Measurement(events, scene), pixels=300, seed=1, device=device)
     start = model_of(Sensor().with_effect(noise).with_effect(replace(dead, noise="held")))
     assert refit_model(found, start, seed=0, rounds=1).sensor["refractory"].noise == "passes"
     # without noise it is no question
@@ -179,7 +180,7 @@ def test_a_fit_tells_offsets_of_comparators_from_shares_of_thresholds(device):
     scene, base = moving_bars(), Sensor().with_effect(EFFECTS["threshold"](on=0.15, off=0.45))
     true = EFFECTS["mismatch"](spread=0.2, relative_to="mean")
     events = dase.simulate(scene, base.with_effect(true), seed=4, device=device)
-    found = split_measurement(events, scene, pixels=300, seed=1, device=device)
+    found = split_measurement(Measurement(events, scene), pixels=300, seed=1, device=device)
     start = model_of(base.with_effect(replace(true, relative_to="own")))
     assert refit_model(found, start, seed=0, rounds=1).sensor["mismatch"].relative_to == "mean"
     # with thresholds alike it is no question
@@ -193,7 +194,7 @@ def test_a_fit_leaves_a_low_pass_in_steps_where_it_is_none(device):
     for signal in ("small", "steps"):
         sensor = Sensor().with_effect(replace(true, signal=signal))
         events = dase.simulate(scene, sensor, seed=4, device=device)
-        found = split_measurement(events, scene, pixels=300, seed=1, device=device)
+        found = split_measurement(Measurement(events, scene), pixels=300, seed=1, device=device)
         start = model_of(Sensor().with_effect(replace(true, signal="steps")))
         fitted = refit_model(found, start, seed=0, rounds=1).sensor["bandwidth"]
         assert fitted.signal == signal
@@ -289,7 +290,10 @@ def test_rules_of_what_is_not_free_are_left_alone():
 def evidence(lit, device):
     scene = moving_bars()
     return split_measurement(
-        dase.simulate(scene, lit, seed=4, device=device), scene, pixels=200, seed=1, device=device
+        Measurement(dase.simulate(scene, lit, seed=4, device=device), scene),
+        pixels=200,
+        seed=1,
+        device=device,
     )
 
 

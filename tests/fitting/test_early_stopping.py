@@ -24,6 +24,7 @@ from dase.effects import EFFECTS
 from dase.fitting.data_split import split_measurement
 from dase.fitting.descent import descent_work
 from dase.fitting.early_stopping import CandidateRace, stop_unless_below
+from dase.fitting.measurement import Measurement
 from dase.fitting.model import model_of
 from dase.fitting.scheduler import run_work
 from dase.results import Rank, Step
@@ -88,7 +89,7 @@ def test_where_one_is_clearly_ahead_the_turn_of_others_comes():
 def search(device) -> DiagnosisState:
     scene = moving_bars()
     events = dase.simulate(scene, TRUE, seed=4, device=device)
-    evidence = split_measurement(events, scene, pixels=600, seed=1, device=device)
+    evidence = split_measurement(Measurement(events, scene), pixels=600, seed=1, device=device)
     return DiagnosisState(evidence, LIBRARY, 1, lambda text, share, error: None, frozenset({"threshold"}))
 
 

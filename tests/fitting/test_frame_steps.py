@@ -11,7 +11,7 @@ import dase
 from dase.diagnosis import seen_effects
 from dase.diagnosis.seen_effects import find_seen_effects
 from dase.effects import EFFECTS
-from dase.fitting import data_split
+from dase.fitting import compared_time
 from dase.fitting.data_split import split_measurement
 from dase.fitting.frame_steps import clip_step_of, frame_step_of, is_in_step, ticks_are_of_frames
 from dase.fitting.measurement import Measurement, static_scene
@@ -53,7 +53,7 @@ def frame_by_frame(clip: VideoScene, theta: float = 0.1) -> dase.Events:
 def test_events_of_a_simulator_that_knows_frames_alone_are_compared_from_frame_to_frame(clip):
     events = frame_by_frame(clip)
     assert frame_step_of(events, clip) == pytest.approx(STEP)
-    found = split_measurement(events, clip, pixels=300, seed=1)
+    found = split_measurement(Measurement(events, clip), pixels=300, seed=1)
     assert np.diff(found.when).mean() == pytest.approx(STEP)
     assert any("in step with the frames" in note for note in found.notes)
 
@@ -92,9 +92,9 @@ def test_intervals_of_frames_are_of_no_clock(clip, monkeypatch, period, kept):
 
 def test_what_a_simulator_waits_between_frames_is_no_loss_of_data(clip, monkeypatch):
     gaps = np.array([[0.1, 0.11], [0.3, 0.31], [0.5, 0.51]])
-    monkeypatch.setattr(data_split, "repeated_gaps", lambda t: gaps)
+    monkeypatch.setattr(compared_time, "repeated_gaps", lambda t: gaps)
     for events, lost in ((frame_by_frame(clip), False), (dase.simulate(clip, "ideal", seed=2), True)):
-        found = split_measurement(events, clip, pixels=300, seed=1)
+        found = split_measurement(Measurement(events, clip), pixels=300, seed=1)
         assert any("data are missing" in note for note in found.notes) is lost
 
 
@@ -155,7 +155,7 @@ def test_ticks_of_a_simulator_that_knows_frames_alone_are_no_clock(fine_clip, ti
     events = at_times(exact, told)
     assert frame_step_of(events, fine_clip) == pytest.approx(1e-3)
     assert find_structure(events).step == pytest.approx(1e-3 / ticks, rel=1e-3)
-    found = split_measurement(events, fine_clip, pixels=300, seed=1)
+    found = split_measurement(Measurement(events, fine_clip), pixels=300, seed=1)
     assert found.structure.step == 0
     assert any("times between frames are made by a simulator" in note for note in found.notes)
     assert "timestamp" not in find_seen_effects(Measurement(events, fine_clip), EFFECTS).effects
@@ -165,7 +165,9 @@ def test_a_clock_that_ticks_as_often_as_frames_come_is_one(fine_clip):
     sensor = Sensor().with_effect(EFFECTS["timestamp"](step=1e-3, jitter=0.0))
     events = dase.simulate(fine_clip, sensor, seed=2)
     assert frame_step_of(events, fine_clip) == pytest.approx(1e-3)
-    assert split_measurement(events, fine_clip, pixels=300, seed=1).structure.step == pytest.approx(1e-3)
+    assert split_measurement(
+        Measurement(events, fine_clip), pixels=300, seed=1
+    ).structure.step == pytest.approx(1e-3)
     assert "timestamp" in find_seen_effects(Measurement(events, fine_clip), EFFECTS).effects
     assert not ticks_are_of_frames(1e-3, 0.0, events, fine_clip)
 

@@ -15,7 +15,7 @@ from dase.diagnosis.directional_test import deviation_towards
 from dase.diagnosis.settings import DEFAULTS
 from dase.effects import EFFECTS
 from dase.fitting.data_split import SplitMeasurement, split_measurement
-from dase.fitting.measurement import camera_scene
+from dase.fitting.measurement import Measurement, camera_scene
 from dase.fitting.model import FittedModel, fit_present_model, with_effect_added
 from dase.fitting.scene_doubt import is_guessed, with_scene_doubt
 from dase.scenes.between_frames import CameraScene
@@ -54,7 +54,7 @@ def filmed(scene: VideoScene) -> CameraScene:
 def measured() -> tuple[SplitMeasurement, CameraScene, FittedModel]:
     scene = shaking()
     camera = filmed(scene)
-    evidence = split_measurement(dase.simulate(scene, TRUE, seed=1), camera, pixels=500)
+    evidence = split_measurement(Measurement(dase.simulate(scene, TRUE, seed=1), camera), pixels=500)
     return evidence, camera, fit_present_model(evidence, Sensor(), None, seed=0)
 
 
@@ -73,7 +73,7 @@ def test_what_a_scene_does_not_explain_is_still_seen(measured):
     evidence, camera, model = measured
     doubted = with_scene_doubt(evidence, camera, model, seed=0)
     slow = TRUE.with_effect(EFFECTS["refractory"](period=0.01))
-    other = split_measurement(dase.simulate(shaking(), slow, seed=1), camera, pixels=500)
+    other = split_measurement(Measurement(dase.simulate(shaking(), slow, seed=1), camera), pixels=500)
     same = replace(other.report, doubt=doubted.report.doubt, drift=doubted.report.drift)
     looks = SimpleNamespace(seed=0, settings=DEFAULTS)
     there = with_effect_added(model, EFFECTS["refractory"](period=0.01))
@@ -126,5 +126,5 @@ def test_fewer_pixels_are_compared_where_the_scene_is_guessed(monkeypatch):
         with pytest.raises(dase.InputError, match="enough"):
             dase.diagnose(events, TRUE, scene=known, pixels=1500)
         assert asked[-1]["pixels"] == round(1500 * fewer)
-        assert asked[-1]["plenty"] == pytest.approx(DEFAULTS.plenty * fewer)
+        assert asked[-1]["settings"].plenty == pytest.approx(DEFAULTS.plenty * fewer)
         assert asked[-1]["settings"].scouts == round(500 * fewer)

@@ -12,7 +12,7 @@ import dase
 from dase import EFFECTS, Events, InputError, Sensor
 from dase.fitting.data_split import split_measurement
 from dase.fitting.fit import widen_by_gamma
-from dase.fitting.measurement import as_measurement
+from dase.fitting.measurement import Measurement, as_measurement
 from dase.fitting.screen_alignment import align_screen
 from dase.fitting.screen_limits import SCREEN_LIMITS, limits_of_screen
 from dase.fitting.time_window import repeated_gaps
@@ -148,7 +148,7 @@ def test_pauses_of_a_stimulus_are_not_missing_data(short):
     true = view_of("straight", offset=0.4)
     events = recorded(short, true, shot={"rate": 0.01})
     assert len(repeated_gaps(events.t))
-    split = split_measurement(events, ScreenScene(short, true), pixels=100)
+    split = split_measurement(Measurement(events, ScreenScene(short, true)), pixels=100)
     assert not any("data are missing" in note for note in split.notes)
 
 

@@ -8,6 +8,7 @@ import pytest
 import dase
 from dase.effects import EFFECTS
 from dase.fitting.data_split import split_measurement
+from dase.fitting.measurement import Measurement
 from dase.fitting.spliced_time import SplicedScene, SplicedTime
 from dase.fitting.time_window import WindowSettings, choose_windows
 from dase.probes.stimulus import MASKED, Grid
@@ -103,7 +104,7 @@ def test_memory_does_not_grow_with_the_recording_and_no_pair_reaches_over_a_seam
     for length in (60.0, 120.0):
         scene = StaticScene(16, 16, length)
         events = dase.simulate(scene, sensor, seed=3)
-        evidence = split_measurement(events, scene, pixels=80)
+        evidence = split_measurement(Measurement(events, scene), pixels=80)
         sizes.append(evidence.held.trials.stimulus.grid.steps)
         assert evidence.notes[0].count(", from ") == 3
         cell = evidence.held.trials.stimulus.cell

@@ -15,6 +15,7 @@ from dase.effects import EFFECTS, StreamEffect
 from dase.fitting.batch_simulator import SimulationOrder
 from dase.fitting.data_split import split_measurement
 from dase.fitting.descent import DESCENT
+from dase.fitting.measurement import Measurement
 from dase.fitting.model import model_of
 from dase.fitting.scheduler import answer_requests, run_side_by_side, run_work
 from dase.fitting.trial_sampling import samples_per_step
@@ -45,7 +46,7 @@ def events(scene) -> dase.Events:
 
 @pytest.fixture(scope="module")
 def evidence(events, scene, device):
-    return split_measurement(events, scene, pixels=300, seed=1, device=device)
+    return split_measurement(Measurement(events, scene), pixels=300, seed=1, device=device)
 
 
 def reference(events, stimulus, middle) -> np.ndarray:
@@ -113,7 +114,7 @@ def test_no_pair_of_events_reaches_across_what_is_not_compared(scene, device):
     def trust(times, pixels):
         return spans[np.floor(times / 0.02).astype(int)][:, pixels]
 
-    half = split_measurement(events, scene, trust=trust, pixels=300, seed=1, device=device).train
+    half = split_measurement(Measurement(events, scene, trust=trust), pixels=300, seed=1, device=device).train
     stimulus = half.trials.stimulus
     want = reference(events, stimulus, half.trials.middle)
     np.testing.assert_allclose(half.found.sums[0], want, rtol=2e-4, atol=2e-3)

@@ -9,6 +9,7 @@ import pytest
 
 import dase
 from dase.fitting.data_split import split_measurement
+from dase.fitting.measurement import Measurement
 from dase.probes.stimulus import Grid, Stimulus, band_edges, light_of, sort_into_cells
 
 
@@ -62,7 +63,7 @@ def test_memory_of_a_long_rest_is_that_of_its_cells_and_levels():
     scene = dase.StaticScene(24, 24, 40.0, 0.5)
     events = dase.simulate(scene, dase.Sensor().with_effect(dase.EFFECTS["shot"](rate=0.5)), seed=2)
     tracemalloc.start()
-    evidence = split_measurement(events, scene, pixels=250, seed=1)
+    evidence = split_measurement(Measurement(events, scene), pixels=250, seed=1)
     peak = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
     stored = sum(len(half.trials.stimulus.pixels) * half.trials.stimulus.grid.steps

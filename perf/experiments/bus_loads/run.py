@@ -19,6 +19,7 @@ from dase.diagnosis.candidates import variants_to_try
 from dase.effects import EFFECTS, Readout
 from dase.figures.style import format_number
 from dase.fitting.data_split import SPLIT, split_measurement
+from dase.fitting.measurement import Measurement
 from dase.fitting.model import model_of
 from dase.simulation.sensor import Sensor
 from perf.experiments.blind_diagnosis.run import number_of
@@ -59,7 +60,7 @@ def main() -> None:
             events = dase.simulate(scene, sensor.with_effect(bus), seed=1)
             # files have whole microseconds
             events = replace(events, t=1e-6 * np.rint(1e6 * events.t))
-            evidence = split_measurement(events, scene, seed=1)
+            evidence = split_measurement(Measurement(events, scene), seed=1)
             judged = model_of(sensor, ()).judge(evidence.report, repeats=30, seed=2)
             tried = bus.mode in {one.mode for one in variants_to_try(evidence, Readout)}
             print(

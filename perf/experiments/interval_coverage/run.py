@@ -70,7 +70,7 @@ def run_job(job: Job) -> Line | None:
     from dase.diagnosis.seen_effects import find_seen_effects
     from dase.effects import EFFECTS
     from dase.fitting.confidence_intervals import estimate_parameters
-    from dase.fitting.data_split import split_measurement
+    from dase.fitting.data_split import ModelPremises, split_measurement
     from dase.fitting.measurement import Measurement
     from dase.fitting.model import free_of, model_of, refit_model
     from dase.kernels import launch
@@ -82,7 +82,7 @@ def run_job(job: Job) -> Line | None:
     true, _ = truth_of(case, job.key)
     events = dase.simulate(scene, true, seed=job.number + job.key % 100_000)
     lamp = find_seen_effects(Measurement(events, scene), EFFECTS).lamp
-    evidence = split_measurement(events, scene, lamp=lamp, seed=job.number)
+    evidence = split_measurement(Measurement(events, scene), models=ModelPremises(lamp=lamp), seed=job.number)
     start = true
     if job.effect == "flicker" and lamp is not None:
         start = start.with_effect(replace(start["flicker"], frequency=lamp))

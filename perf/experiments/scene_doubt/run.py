@@ -55,7 +55,7 @@ def errors_of(number: int, gap: float, pixels: int, device: str) -> dict[str, An
     from dase.effects import EFFECTS
     from dase.fitting import scene_doubt
     from dase.fitting.data_split import split_measurement
-    from dase.fitting.measurement import camera_scene
+    from dase.fitting.measurement import Measurement, camera_scene
     from dase.fitting.model import fit_present_model
 
     rng = np.random.default_rng([number, 555])
@@ -73,7 +73,7 @@ def errors_of(number: int, gap: float, pixels: int, device: str) -> dict[str, An
     ]  # fmt: skip
     grey = np.clip(np.rint(255 * np.array(shown)), 0, 255).astype(np.uint8)
     camera = camera_scene(grey, begins, begins + exposure, [])
-    evidence = split_measurement(events, camera, pixels=pixels, seed=number, device=device)
+    evidence = split_measurement(Measurement(events, camera), pixels=pixels, seed=number, device=device)
     model = fit_present_model(evidence, dase.Sensor(), None, seed=number)
     whole = replace(scene_doubt.SCENE_DOUBT, share=1.0)
     full = scene_doubt.with_scene_doubt(evidence, camera, model, seed=number, settings=whole).report

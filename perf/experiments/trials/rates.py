@@ -26,7 +26,9 @@ from dase.effects.shot import Shot
 from dase.effects.threshold import Threshold
 from dase.effects.voltage_noise import VoltageNoise
 from dase.fitting.batch_simulator import BatchSimulator, SimulationOrder
-from dase.fitting.data_split import common_grid, split_measurement
+from dase.fitting.compared_time import common_grid
+from dase.fitting.data_split import split_measurement
+from dase.fitting.measurement import Measurement
 from dase.fitting.model import model_of
 from dase.kernels import launch
 from dase.probes.stimulus import Grid, Stimulus, sort_into_cells
@@ -184,7 +186,7 @@ def readout_rate(scene_name: str, mode: str, fullness: float, shares: int, devic
     rate = len(dase.simulate(scene, free, seed=4, device=device)) / scene.duration / fullness
     true = free.with_effect(Readout(rate=rate, mode=mode, depth=300.0))
     found = dase.simulate(scene, true, seed=4, device=device)
-    half = split_measurement(found, scene, pixels=300, seed=1, device=device).train
+    half = split_measurement(Measurement(found, scene), pixels=300, seed=1, device=device).train
     grid, looked_at = half.trials.stimulus.grid, half.trials.stimulus.pixels
     if shares > 1 and half.around is not None:
         others = (WIDTH * HEIGHT - 300) / shares
