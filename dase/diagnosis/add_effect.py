@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
 from os import PathLike
 
 from dase.diagnosis.candidates import calibrate_split, screen_and_descend
@@ -55,9 +54,7 @@ def fit_added(
     measurement = as_measurement(measured, scene, trust)
     without, effect = without.bound_to(measurement.scene), effect.bound_to(measurement.scene)
     premises = ModelPremises(without.log_eps, unbroken=without.unbroken or effect.unbroken)
-    # of all of its time, whatever part of it is asked for
-    whole = replace(measurement, span=None)
-    evidence = split_measurement(whole, models=premises, pixels=pixels, seed=seed, device=device)
+    evidence = split_measurement(measurement, models=premises, pixels=pixels, seed=seed, device=device)
     tell("fitting without the effect", 0.0, float("nan"))
     present = fit_present_model(evidence, without, None, seed=seed)
     before = present.judge(

@@ -242,12 +242,15 @@ def find_seen_effects(measurement: Measurement, library: Collection[str]) -> See
 
 
 def _is_of_frames(entry: Signature, step: float, events: Events, scene: Scene) -> bool:
-    """Return whether ticks of events in step with frames, every `step` [s], are made by these.
+    """Return whether ticks or bursts of events in step with frames, every `step` [s], are made by these.
 
-    Of frames that are held all events come so long after one, and a jump sends many at once.
+    Of frames that are held all events come so long after one, and a jump sends many at once. Where all events
+    come in step with frames, all are in bursts: a simulator that knows these frames alone sends no others.
     """
     if entry.name in ("time stamps", "double events") and is_held(scene):
         return True
+    if entry.name == "frame coupling":
+        return step > 0 and is_in_step(1 / entry.details["interval"], step)
     said = entry.details if entry.name == "time stamps" and "line" not in entry.details else {}
     period, gap = said.get("period", 0.0), clip_step_of(scene)
     if period and gap and is_in_step(1 / period, gap):

@@ -477,7 +477,8 @@ def _peak_of(plan: SplitPlan, train: PixelSubset, lamp: float | None) -> RatePea
     grid = plan.time.grid
     # seen in the fitted part: what judges must not choose
     peak = peak_of(train.found.clock[0], grid.step)
-    if not plan.trusts_all:  # most events are where the scene is not known
+    # most events are where the scene is not known, or no frequency is to be seen
+    if not plan.trusts_all or not peak.frequency:
         return peak
     end = grid.begin + plan.cut * grid.step
     return peak._replace(frequency=refine_frequency(plan.time.events, grid.begin, end, peak.frequency))

@@ -240,7 +240,7 @@ class RatePeak(NamedTuple):
     """Where the net rate swings most above what is usual about it.
 
     Args:
-        frequency: There [Hz].
+        frequency: There [Hz]; 0 where steps are too long for any that is looked for.
         chance: Probability that events which know nothing of each other swing as much anywhere.
     """
 
@@ -264,6 +264,8 @@ def peak_of(clock: NDArray[np.int64], step: float) -> RatePeak:
     usual = median_filter(power, 8 * 25, mode="nearest")
     above = power / (usual + 1e-3 * power.max() + 1e-9)
     inside = (frequency >= 20.0) & (frequency <= 0.48 / step)
+    if not inside.any():  # steps of more than 24 ms show none of them
+        return RatePeak(0.0, 1.0)
     above[~inside] = 0.0
     top = int(above.argmax())
     # the top is chosen where the usual is low by chance as well: what it is compared with is wider

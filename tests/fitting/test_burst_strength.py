@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 import dase
+from dase.diagnosis.seen_effects import find_seen_effects
 from dase.effects import EFFECTS
 from dase.effects.exposure import Exposure
 from dase.events import Events
@@ -123,3 +124,26 @@ def test_a_diagnosis_finds_and_measures_the_coupling(scene):
     interval = again.parameters["exposure.amplitude"]
     assert interval.low < 0.25 * 1.03
     assert interval.high > 0.25 * 0.97
+
+
+def test_a_simulator_that_sends_at_the_frames_of_its_clip_alone_has_no_coupling():
+    """All of its events are bursts in step with frames; without them nothing was left to compare."""
+    y, x = np.mgrid[:48, :64]
+    times = np.arange(75) / 25
+    logs = np.array(
+        [0.8 * np.sin(0.15 * x - 2 * t) + 0.6 * np.sin(0.12 * y + 1.5 * t) for t in times], np.float32
+    )
+    # events of a pixel so far: as many thresholds as its light has changed by, to the last that was crossed
+    level = [np.zeros((48, 64))]
+    for change in (logs[1:] - logs[0]) / 0.2:
+        level.append(np.minimum(np.maximum(level[-1], np.floor(change)), np.ceil(change)))
+    steps = np.diff(level, axis=0).astype(np.int64)
+    frame, row, column = np.nonzero(steps)
+    count, on = np.abs(steps[frame, row, column]), steps[frame, row, column] > 0
+    events = dase.Events(*(np.repeat(v, count) for v in (times[frame + 1], column, row, on)), 64, 48)
+    assert any(entry.name == "frame coupling" for entry in find_signatures(events).found)
+    seen = find_seen_effects(Measurement(events, dase.VideoScene(0.4 * np.exp(logs), times)), EFFECTS)
+    assert not seen.entries
+    assert seen.bursts is None
+    found = dase.fit(events, "ideal", scene=dase.VideoScene(0.4 * np.exp(logs), times), pixels=300)
+    assert found.sensor["threshold"].on == pytest.approx(0.2, rel=0.05)

@@ -388,6 +388,8 @@ def test_how_likely_chance_makes_the_highest_peak_of_the_rate(rng):
     assert found.frequency == pytest.approx(137.3, abs=0.2)
     assert found.chance < 1e-6
     assert peak_of(np.zeros(2 * steps, np.int64), step).chance == 1.0
+    # from frame to frame of a clip at 25 Hz no frequency that is looked for shows
+    assert peak_of(rng.poisson(3.0, 100), 0.04) == (0.0, 1.0)
 
 
 def test_slow_clocks_are_seen_in_busy_recordings(rng):
