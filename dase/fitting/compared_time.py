@@ -47,6 +47,8 @@ class ComparedTime:
         frame_step: Time from frame to frame of a clip in step with which all events come [s], 0 if they do
             not, see `frame_step_of`.
         clip_frames: Time from frame to frame of a clip [s], 0 of another scene.
+        held: Whether the frames of a clip are held, see `VideoScene.held`.
+        by_frames: Whether it is known that nobody knows the light between them, see `VideoScene`.
         asked: All time that was asked for, on the clock of the recording.
         windows: Those of it that are compared, in order.
         spliced: The windows laid end to end; None where there is one, and the clock is the recording's.
@@ -60,6 +62,8 @@ class ComparedTime:
     gaps: Array
     frame_step: float
     clip_frames: float
+    held: bool
+    by_frames: bool
     asked: Grid
     windows: tuple[Grid, ...]
     spliced: SplicedTime | None
@@ -82,7 +86,7 @@ class ComparedTime:
     def notes(self) -> list[str]:
         """Return what is said of frames and windows."""
         out = []
-        if is_too_slow(self.frame_step) and not (isinstance(self.scene, VideoScene) and self.scene.by_frames):
+        if is_too_slow(self.frame_step) and not self.by_frames:
             out.append(
                 "events come in step with the frames of the clip, as a simulator makes them that knows these "
                 "frames alone: compared is from frame to frame"
@@ -139,11 +143,14 @@ def choose_compared_time(
     elif grid is not whole:
         events = _within(events, grid)
     # a simulator by frames loses nothing: it waits for a frame, or all of its pixels for their dead time
-    in_step = frame_step or is_held(scene)
+    held = is_held(measurement.scene)
+    in_step = frame_step or held
     gaps = np.zeros((0, 2)) if pauses or in_step else repeated_gaps(events.t)
+    by_frames = isinstance(measurement.scene, VideoScene) and measurement.scene.by_frames
     return ComparedTime(
-        events, scene, trust, grid, still, gaps, frame_step, clip_frames, asked, windows, spliced
-    )
+        events, scene, trust, grid, still, gaps, frame_step, clip_frames, held, by_frames, asked, windows,
+        spliced,
+    )  # fmt: skip
 
 
 def _splice(scene: Scene, windows: tuple[Grid, ...], *, still: bool) -> SplicedTime:

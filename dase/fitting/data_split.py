@@ -19,7 +19,7 @@ from dase.fitting.bus_load import WholeSensor
 from dase.fitting.bus_use import BusUse, highest_event_rate
 from dase.fitting.compared_time import ComparedTime, choose_compared_time
 from dase.fitting.contradictions import contradiction_of_rest
-from dase.fitting.frame_steps import is_held, ticks_are_of_frames
+from dase.fitting.frame_steps import ticks_are_of_frames
 from dase.fitting.measurement import Measurement
 from dase.fitting.pixels_of_parts import PARTS, PixelsOfParts, choose_pixels
 from dase.fitting.subset import Array, CalibratedSubset, PixelSubset
@@ -402,7 +402,7 @@ def _structure_of_a_clock(
 ) -> tuple[TimestampStructure, tuple[str, ...]]:
     """Return the regularities of time stamps that a camera's clock makes, and what is said of others."""
     # of frames that are held all events come so long after one
-    structure = TimestampStructure() if is_held(time.scene) else found
+    structure = TimestampStructure() if time.held else found
     # a clock would show the tick before each event of a model, often in the frame before
     if not ticks_are_of_frames(structure.step, time.frame_step, time.events, time.scene):
         return structure, ()

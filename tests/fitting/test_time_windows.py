@@ -7,6 +7,7 @@ import pytest
 
 import dase
 from dase.effects import EFFECTS
+from dase.fitting.compared_time import choose_compared_time
 from dase.fitting.data_split import split_measurement
 from dase.fitting.measurement import Measurement
 from dase.fitting.spliced_time import SplicedScene, SplicedTime
@@ -123,3 +124,12 @@ def test_the_true_sensor_is_right_over_several_windows(rng):
     found = dase.compare(events, true, scene=scene, pixels=60)
     assert found.notes[0].count(", from ") == 4
     assert found.error < found.gate
+
+
+def test_a_long_clip_whose_frames_are_held_is_one_over_several_windows(rng):
+    times = np.arange(0, 60, 0.01)
+    scene = dase.VideoScene(rng.random((len(times), 6, 8), np.float32), times).held(STEP)
+    events = events_at(rng.uniform(0, 59, 20_000))
+    time = choose_compared_time(Measurement(events, scene), unbroken=False, pixels=10)
+    assert time.held
+    assert len(time.windows) > 1
