@@ -228,7 +228,7 @@ def find_seen_effects(measurement: Measurement, library: Collection[str]) -> See
         return SeenEffects()
     step, clip_step = frame_step_of(events, scene), clip_step_of(scene)
     entries = tuple(
-        entry for entry in found.found
+        slowest_image(entry, step or 0.0) for entry in found.found
         if not _is_of_frames(entry, step or 0.0, events, scene) and not _is_tone_of_clip(entry, clip_step)
     )  # fmt: skip
     coupling = [entry for entry in entries if entry.name == "frame coupling"]
@@ -265,6 +265,26 @@ def _is_tone_of_clip(entry: Signature, step: float) -> bool:
     Light that changes its way at each frame does so, and what a simulator makes of it.
     """
     return entry.name == "flicker" and step > 0 and is_in_step(entry.details["frequency"], step)
+
+
+def slowest_image(entry: Signature, step: float) -> Signature:
+    """Return flicker at the slowest frequency that looks alike where events come in step with frames.
+
+    Who knows light at frames alone cannot tell a tone from its sum and difference with their rate, and what
+    is sent at frames may show any of them most: of a lamp of 100 Hz in a clip of 500 Hz that of 400 Hz.
+
+    Args:
+        entry: Any signature; others stay as they are.
+        step: Time from frame to frame in step with which all events come [s]; 0 if they do not.
+    """
+    fast = entry.details["frequency"] if entry.name == "flicker" else 0.0
+    if fast * step <= 0.5:
+        return entry
+    slow = abs(fast - round(fast * step) / step)
+    half = 0.5 * (entry.details["frequency_high"] - entry.details["frequency_low"])
+    details = {"frequency": slow, "frequency_low": slow - half, "frequency_high": slow + half}
+    said = entry.sentence.replace(f"{fast:.2f} Hz", f"{slow:.2f} Hz")
+    return replace(entry, sentence=said, details={**entry.details, **details})
 
 
 def without_the_scene(seen: SeenEffects, measurement: Measurement, sensor: Sensor, seed: int) -> SeenEffects:

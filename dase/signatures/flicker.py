@@ -170,10 +170,13 @@ def _find_tone(
         if chance <= best[1]:
             best = base[total >= 0.8 * total[p.argmin()]], chance, many
     # blocks 50 ms apart see a strong tone in step at every 20 Hz from it, and half a tone has its overtones:
-    # of all that are clear, the strongest is meant
+    # of all that are clear, the strongest is meant, 20 Hz from those that chance has put first, too
     candidates, chance, many = best
-    tones = np.unique(np.concatenate([h * candidates for h in range(1, many + 1)]))
+    apart = round(1 / (s.block * spacing))
+    tones = np.concatenate([h * candidates for h in range(1, many + 1)])
+    tones = np.unique(np.concatenate([tones - apart, tones, tones + apart]))
     tones = tones[(tones >= base[0]) & (tones <= base[-1])]
+    tones = tones[~lines[tones - base[0]]]
     power = np.sum([part.power for part in parts], axis=0)[tones]
     clear = rayleigh[tones] > 0.5 * rayleigh[tones].max()
     return float(tones[np.where(clear, power, -1.0).argmax()] * spacing), chance, many

@@ -25,6 +25,7 @@ from dase.diagnosis.seen_effects import (
     SeenEffects,
     find_seen_effects,
     shows_in,
+    slowest_image,
     without_the_explained,
     without_the_scene,
 )
@@ -237,6 +238,17 @@ def test_what_a_search_did_not_add_explains_nothing(scene, monkeypatch):
 
 def lamp(details: dict[str, float]) -> Signature:
     return Signature(name="flicker", answer=Answer.FOUND, sentence="light at 100 Hz", details=details)
+
+
+def test_a_lamp_has_the_slowest_frequency_that_looks_alike_to_frames():
+    """At frames of 500 Hz 400 and 600 Hz are what 100 Hz is."""
+    for seen, step, meant in ((400, 2e-3, 100), (600, 2e-3, 100), (100, 2e-3, 100), (400, 0.0, 400)):
+        details = {"frequency": float(seen), "frequency_low": seen - 0.1, "frequency_high": seen + 0.1}
+        entry = replace(lamp(details), sentence=f"light at {seen:.2f} Hz, swing 0.1 of the rate")
+        found = slowest_image(entry, step)
+        low, high = found.details["frequency_low"], found.details["frequency_high"]
+        assert (found.details["frequency"], low, high) == pytest.approx((meant, meant - 0.1, meant + 0.1))
+        assert found.sentence == f"light at {meant:.2f} Hz, swing 0.1 of the rate"
 
 
 def test_what_the_events_show_is_certain_whatever_the_search_says():

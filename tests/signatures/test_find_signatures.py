@@ -240,6 +240,19 @@ def test_weak_bursts_that_take_turns_are_no_lamp():
     assert "flicker" in found(lamp)
 
 
+def test_the_strongest_lamp_is_named_beside_weak_tones_of_another(rng):
+    """Blocks of 50 ms see 100 Hz in step at 120 Hz, too, which with 240 and 360 Hz looked like one lamp."""
+    t = np.sort(rng.uniform(0, 2, 60_000))
+    tones = ((100.0, 0.4, 0.3), (240.0, 0.15, 1.0), (360.0, 0.15, 2.0))
+    net = sum(swing * np.sin(2 * np.pi * frequency * t + phase) for frequency, swing, phase in tones)
+    x, y = rng.integers(0, 64, (2, len(t)))
+    entry = dase.find_signatures(dase.Events(t, x, y, rng.random(len(t)) < 0.5 + 0.5 * net, 64, 64))[
+        "flicker"
+    ]
+    assert entry.found
+    assert entry.details["frequency"] == pytest.approx(100, abs=0.05)
+
+
 @pytest.mark.parametrize("turned", [False, True])
 def test_bars_that_move_are_no_readout(turned):
     """Shot events set memories of pixels in even light: all those of an edge send at one instant."""
