@@ -181,6 +181,10 @@ class GradeSettings:
     five effects that had been supported above 0.5 and below this in three sealed runs one was there; of those
     above it 173 of 176."""
 
+    sure_away: float = 4.0
+    """As `away`, below which something that is not in the library could look like it: of four effects that
+    had been supported with less one was there, of 145 with more 143."""
+
     rival: float = 2.0
     """A rival is tried in the place of an effect if it left no more than this times what the effect left when
     it was added."""

@@ -72,7 +72,8 @@ def judged(error: float, *, level: float = 0.25, reach: float = 0.4) -> Judgemen
         # it does not hold where nothing was chosen
         (8.0, 1.1, 0.3, 1.0, False, Grade.STAND_IN, False),
         # ... but no single statistic may decide along a way, and nothing is left of 8
-        (8.0, 8.0, 0.3, 1.0, False, Grade.SUPPORTED, False),
+        (8.0, 8.0, 0.3, 1.0, False, Grade.EITHER, True),
+        (8.0, 8.0, 0.3, 3.9, False, Grade.EITHER, True),
         (8.0, 8.0, 1.7, 1.0, False, Grade.STAND_IN, False),
         (8.0, 0.2, 0.3, 6.0, False, Grade.STAND_IN, False),
         # so little that something unknown may look like it
