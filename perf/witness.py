@@ -60,8 +60,8 @@ EXCLUDED = {"seconds", "dase", "date"}
 
 UNSTEADY: dict[str, tuple[str, ...]] = {"cpu": (), "cuda": ("train/",)}
 """Prefixes of results that are not the same twice on a kind of device; they are not recorded. On a GPU
-PyTorch adds up gradients in an order of its own: of 333 results of trainings 7 to 62 differed between two runs
-of one commit."""
+PyTorch adds up gradients in an order of its own: of 333 results of trainings 7 to 62 differed between two
+runs of one commit."""
 
 TIMES = re.compile(r"\d[\d.,]* (?:Mevents/s|Gsample/s|m?s(?=[:,]|$)|min)", re.MULTILINE)
 """Run times, and rates derived from them, in printed lines."""
