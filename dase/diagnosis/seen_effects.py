@@ -30,6 +30,7 @@ from dase.scenes.between_frames import CameraScene
 from dase.scenes.scene import Scene
 from dase.signatures.burst_times import BurstTimes
 from dase.signatures.find import find_signatures
+from dase.signatures.flicker import FlickerSettings
 from dase.signatures.frame_coupling import BurstClock
 from dase.signatures.hot_pixels import NAME as HOT_PIXELS
 from dase.signatures.opposite_pairs import NAME as OPPOSITE_PAIRS
@@ -271,7 +272,8 @@ def slowest_image(entry: Signature, step: float) -> Signature:
     """Return flicker at the slowest frequency that looks alike where events come in step with frames.
 
     Who knows light at frames alone cannot tell a tone from its sum and difference with their rate, and what
-    is sent at frames may show any of them most: of a lamp of 100 Hz in a clip of 500 Hz that of 400 Hz.
+    is sent at frames may show any of them most: of a lamp of 100 Hz in a clip of 500 Hz that of 400 Hz. No
+    lamp is as slow as what 120 Hz looks like at frames of 100 Hz.
 
     Args:
         entry: Any signature; others stay as they are.
@@ -281,6 +283,8 @@ def slowest_image(entry: Signature, step: float) -> Signature:
     if fast * step <= 0.5:
         return entry
     slow = abs(fast - round(fast * step) / step)
+    if slow < FlickerSettings.slowest_lamp:
+        return entry
     half = 0.5 * (entry.details["frequency_high"] - entry.details["frequency_low"])
     details = {"frequency": slow, "frequency_low": slow - half, "frequency_high": slow + half}
     said = entry.sentence.replace(f"{fast:.2f} Hz", f"{slow:.2f} Hz")

@@ -243,7 +243,13 @@ def lamp(details: dict[str, float]) -> Signature:
 
 def test_a_lamp_has_the_slowest_frequency_that_looks_alike_to_frames():
     """At frames of 500 Hz 400 and 600 Hz are what 100 Hz is."""
-    for seen, step, meant in ((400, 2e-3, 100), (600, 2e-3, 100), (100, 2e-3, 100), (400, 0.0, 400)):
+    for seen, step, meant in (
+        (400, 2e-3, 100),
+        (600, 2e-3, 100),
+        (100, 2e-3, 100),
+        (400, 0.0, 400),
+        (120, 0.01, 120),
+    ):
         details = {"frequency": float(seen), "frequency_low": seen - 0.1, "frequency_high": seen + 0.1}
         entry = replace(lamp(details), sentence=f"light at {seen:.2f} Hz, swing 0.1 of the rate")
         found = slowest_image(entry, step)
