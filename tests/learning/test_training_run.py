@@ -234,11 +234,9 @@ def test_the_time_is_kept_where_steps_are_slow(scenes, tmp_path, monkeypatch, sl
 
     monkeypatch.setattr(training, "advance", slow_advance)
     results = []
-    began = time.monotonic()
     schedule = RunSchedule(seconds=3.0, result_every=0.5, score_every=0)
     row = train_in_folder(training, tmp_path, schedule=schedule, on_result=results.append)
-    assert time.monotonic() - began < 9
-    assert 1 <= training.step < 100
+    assert 1 <= training.step < 40
     assert row["step"] == training.step == training.recipe.steps
     assert results  # long before the end
     assert all("mu" in found for found in results)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import sys
-import time
 from pathlib import Path
 from typing import Any
 
@@ -430,11 +429,9 @@ def runs(mask):
 )  # fmt: skip
 def test_coco_outlines_that_would_crash_are_refused(tmp_path, rng, segmentation, match):
     pytest.importorskip("pycocotools")
-    begin = time.process_time()
     source = open_images(annotated(tmp_path, segmentation))
     with pytest.raises(InputError, match=rf"annotation 7 of 'a.png'.*{match}"):
         source.foreground(rng)
-    assert time.process_time() - begin < 5
 
 
 def test_coco_outlines_of_every_kind_are_cut_out(tmp_path, rng):
