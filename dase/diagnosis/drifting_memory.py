@@ -13,17 +13,14 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import stats
 
-from dase.diagnosis.light_between_events import LightSteps, busiest_rows, light_steps, times_that_are_compared
+from dase.diagnosis.light_between_events import LightBetweenEvents, LightSteps
 from dase.effects.leak import Leak
 from dase.errors import InputError
-from dase.fitting.measurement import Measurement
 from dase.probes.random_streams import SimulationStream
 from dase.probes.timestamp_patterns import TimestampStructure
-from dase.scenes.between_frames import CameraScene
 from dase.signatures.chance import NINETY
 from dase.signatures.result import Answer, Signature
 from dase.simulation.sensor import Sensor
-from dase.simulation.simulate import simulate
 
 Array = NDArray[np.float64]
 
@@ -114,7 +111,7 @@ class Drift:
 
 
 def find_drifting_memory(
-    measurement: Measurement,
+    light: LightBetweenEvents,
     sensor: Sensor,
     *,
     structure: TimestampStructure,
@@ -124,32 +121,24 @@ def find_drifting_memory(
     """Return the leak of pixels whose light moves; None where a model lacks none.
 
     Args:
-        measurement: Its scene is simulated. Nothing is said where light is known in part only.
+        light: Of the measurement, whose scene is simulated.
         sensor: The model, taken without a leak.
         structure: Regularities of the time stamps.
         seed: Of every random number.
         settings: What a drift is.
     """
-    scene, events = measurement.scene, measurement.compared_events()
-    if isinstance(scene, CameraScene) or measurement.trust is not None:
+    scene = light.measurement.scene
+    if max(structure.step, structure.line * max(scene.width, scene.height)) > settings.late:
         return None
-    if max(structure.step, structure.line * max(events.width, events.height)) > settings.late:
-        return None
-    times = times_that_are_compared(measurement)
-    if len(times) < 2 or not len(events):
-        return None
-    rows = busiest_rows(events, len(times))
-    eps = sensor.log_eps
-    seen = drift_of(light_steps(events, scene, times, rows=rows, log_eps=eps), scene.width, settings)
+    seen = drift_of(light.seen, scene.width, settings)
     if seen is None or not seen.is_leak(settings):
         return None
-    pixels = np.arange(rows[0] * scene.width, rows[1] * scene.width, dtype=np.int64)
     without = sensor.without(EFFECT) if EFFECT in sensor else sensor
     try:
-        made = simulate(scene, without, seed=SimulationStream.DRIFTING_MEMORY.seed(seed), pixels=pixels)
+        made = light.of_model(without, seed=SimulationStream.DRIFTING_MEMORY.seed(seed))
     except InputError:
         return None
-    modelled = drift_of(light_steps(made, scene, times, rows=rows, log_eps=eps), scene.width, settings)
+    modelled = drift_of(made, scene.width, settings)
     if modelled is not None and modelled.rate > settings.model * seen.rate:
         return None
     sentence = (

@@ -25,7 +25,7 @@ from dase.events import Events
 from dase.fitting.measurement import Measurement
 from dase.formatting import format_count, format_metric, format_percent
 from dase.probes.random_streams import Draw, SimulationStream
-from dase.probes.stimulus import light_of
+from dase.probes.stimulus import log_light_of
 from dase.scenes.between_frames import CameraScene
 from dase.scenes.video import VideoScene
 from dase.signatures.chance import poisson_interval
@@ -194,7 +194,7 @@ def find_rests(
         count = max(1, settings.samples // len(times))
         draw = Draw.PIXELS_OF_RESTS.generator(seed)
         pixels = np.sort(draw.choice(size, count, replace=False)).astype(np.int32)
-    level = np.log(light_of(scene, times, pixels) + np.float32(log_eps))
+    level = log_light_of(scene, times, pixels, log_eps=log_eps)
     first, last = longest_rest(level, times, still)
     # noise of the voltage is new to a memory at the first sample, too
     begin, end = times[first] + settings.settle, times[last] - settings.lead
@@ -208,31 +208,31 @@ def longest_rest(
     """Return between which instants the light of each pixel stays longest within a range.
 
     Args:
-        level: Logarithms of intensities, shape (N, T).
+        level: Logarithms of intensities, shape (T, N).
         times: Of the instants [s], ascending, shape (T,).
         still: The range.
 
     Returns:
         The first and the last instant of the longest rest, shape (N,) each.
     """
-    count = len(level)
+    count = level.shape[1]
     begin = np.zeros(count, np.int64)
-    low, high = level[:, 0].copy(), level[:, 0].copy()
+    low, high = level[0].copy(), level[0].copy()
     first, last = np.zeros(count, np.int64), np.zeros(count, np.int64)
 
-    def keep(ended: NDArray[np.bool_], at: int) -> None:
-        longer = ended & (times[at] - times[begin] > times[last] - times[first])
+    def keep(ended: NDArray[np.int64], at: int) -> None:
+        longer = ended[times[at] - times[begin[ended]] > times[last[ended]] - times[first[ended]]]
         first[longer], last[longer] = begin[longer], at
 
     for k in range(1, len(times)):
-        now = level[:, k]
+        now = level[k]
         np.minimum(low, now, out=low)
         np.maximum(high, now, out=high)
-        moved = high - low > still
+        moved = np.flatnonzero(high - low > still)
         keep(moved, k - 1)
         begin[moved] = k
         low[moved] = high[moved] = now[moved]
-    keep(np.ones(count, bool), len(times) - 1)
+    keep(np.arange(count), len(times) - 1)
     return first, last
 
 

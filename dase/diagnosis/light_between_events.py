@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
 from dase.events import Events
 from dase.fitting.measurement import Measurement
-from dase.probes.stimulus import light_of
-from dase.scenes.scene import Scene
+from dase.probes.stimulus import log_light_of
+from dase.scenes.between_frames import CameraScene
+from dase.simulation.sensor import Sensor
+from dase.simulation.simulate import simulate
 
 Array = NDArray[np.float64]
 
@@ -62,6 +65,113 @@ class LightSteps:
     counts: NDArray[np.bool_]
 
 
+@dataclass(frozen=True, eq=False)
+class LightBetweenEvents:
+    """The light of the rows of a measurement that are looked at, and how far it goes between events there.
+
+    Args:
+        measurement: Its scene is known at all times.
+        times: At which light is known, ascending [s], shape (T,).
+        rows: First row that is looked at, and the row after the last.
+        log_eps: Added to intensities before the logarithm.
+        settings: What counts.
+    """
+
+    measurement: Measurement
+    times: Array
+    rows: tuple[int, int]
+    log_eps: float
+    settings: StepSettings = STEPS
+
+    @classmethod
+    def of(
+        cls, measurement: Measurement, *, log_eps: float, settings: StepSettings = STEPS
+    ) -> LightBetweenEvents | None:
+        """Return that of the rows with the most events; None where light is known in part, or none is sent.
+
+        Args:
+            measurement: Of which the time that is compared is looked at.
+            log_eps: Added to intensities before the logarithm.
+            settings: What counts.
+        """
+        if isinstance(measurement.scene, CameraScene) or measurement.trust is not None:
+            return None
+        events, times = measurement.compared_events(), times_that_are_compared(measurement)
+        if len(times) < 2 or not len(events):
+            return None
+        return cls(measurement, times, busiest_rows(events, len(times), settings), log_eps, settings)
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Rows that are looked at, and columns."""
+        return self.rows[1] - self.rows[0], self.measurement.scene.width
+
+    @cached_property
+    def level(self) -> NDArray[np.float32]:
+        """Log intensity of the pixels of the rows, shape (T, P)."""
+        return log_light_of(
+            self.measurement.scene, self.times, self._pixels.astype(np.int32), log_eps=self.log_eps
+        )
+
+    @cached_property
+    def seen(self) -> LightSteps:
+        """What light does between the events of the measurement."""
+        return self.steps_between(self.measurement.compared_events())
+
+    def of_model(self, sensor: Sensor, *, seed: int) -> LightSteps:
+        """Return what light does between the events that a model sends over the same scene.
+
+        Args:
+            sensor: The model.
+            seed: Of its random numbers.
+
+        Raises:
+            InputError: It cannot be simulated.
+        """
+        made = simulate(self.measurement.scene, sensor, seed=seed, pixels=self._pixels)
+        return self.steps_between(replace(self.measurement, events=made).compared_events())
+
+    def steps_between(self, events: Events) -> LightSteps:
+        """Return how far light went from each event of a pixel to the next.
+
+        Args:
+            events: Of the whole sensor, in order of time.
+        """
+        first, after = self.rows
+        events = events.select((events.y >= first) & (events.y < after))
+        pixel = (events.y.astype(np.int64) - first) * events.width + events.x
+        order = np.lexsort((events.x, events.y))
+        pixel, t, p = pixel[order], events.t[order], np.asarray(events.p, bool)[order]
+        level, speed = self._level_and_speed(pixel, t)
+        darkest = np.quantile(level, 0.99) + math.log(self.settings.darkest) if len(level) else 0.0
+        gap = np.diff(t)
+        counts = (pixel[1:] == pixel[:-1]) & (gap > 0) & (np.minimum(level[1:], level[:-1]) > darkest)
+        return LightSteps(
+            pixel[1:], np.diff(level), gap, level[1:], speed[1:], p[1:], p[1:] == p[:-1], counts
+        )
+
+    @property
+    def _pixels(self) -> NDArray[np.int64]:
+        """Row-major indices of the pixels of the rows, shape (P,)."""
+        width = self.measurement.scene.width
+        return np.arange(self.rows[0] * width, self.rows[1] * width, dtype=np.int64)
+
+    def _level_and_speed(self, pixel: NDArray[np.int64], t: Array) -> tuple[Array, Array]:
+        """Return the log intensity at events, and how fast it changes [1/s], shape (N,) each.
+
+        Args:
+            pixel: Of each event, row-major within the rows, shape (N,).
+            t: Time of each [s], shape (N,).
+        """
+        times = self.times
+        at = np.clip(np.searchsorted(times, t, side="right") - 1, 0, len(times) - 2)
+        gap = times[at + 1] - times[at]
+        share = np.clip((t - times[at]) / gap, 0.0, 1.0)
+        here = self.level[at, pixel]
+        step = self.level[at + 1, pixel] - here
+        return here + step * share, step / gap
+
+
 def times_that_are_compared(measurement: Measurement) -> Array:
     """Return the instants at which the light of the time that is compared is known [s], shape (T,)."""
     times = measurement.scene.sample_times()
@@ -85,37 +195,6 @@ def busiest_rows(events: Events, instants: int, settings: StepSettings = STEPS) 
     total = np.concatenate([[0], np.cumsum(per_row)])
     first = int(np.argmax(total[most:] - total[:-most]))
     return first, first + most
-
-
-def light_steps(
-    events: Events,
-    scene: Scene,
-    times: Array,
-    *,
-    rows: tuple[int, int],
-    log_eps: float,
-    settings: StepSettings = STEPS,
-) -> LightSteps:
-    """Return how far light went from each event of a pixel to the next.
-
-    Args:
-        events: In order of time.
-        scene: What they are of.
-        times: At which its light is known, ascending [s], shape (T,).
-        rows: First row that is looked at, and the row after the last.
-        log_eps: Added to intensities before the logarithm.
-        settings: What counts.
-    """
-    width = scene.width
-    events = events.select((events.y >= rows[0]) & (events.y < rows[1]))
-    pixel = (events.y.astype(np.int64) - rows[0]) * width + events.x
-    order = np.lexsort((events.x, events.y))
-    pixel, t, p = pixel[order], events.t[order], np.asarray(events.p, bool)[order]
-    level, speed = _light_at(scene, times, pixel + rows[0] * width, t, log_eps, settings)
-    darkest = np.quantile(level, 0.99) + math.log(settings.darkest) if len(level) else 0.0
-    gap = np.diff(t)
-    counts = (pixel[1:] == pixel[:-1]) & (gap > 0) & (np.minimum(level[1:], level[:-1]) > darkest)
-    return LightSteps(pixel[1:], np.diff(level), gap, level[1:], speed[1:], p[1:], p[1:] == p[:-1], counts)
 
 
 def beyond_those_alike(
@@ -142,32 +221,3 @@ def beyond_those_alike(
     mean = np.bincount(cell, off, minlength=2 * bins * bins) / np.maximum(count, 1)
     out: Array = off - mean[cell]
     return out
-
-
-def _light_at(
-    scene: Scene, times: Array, pixel: NDArray[np.int64], t: Array, log_eps: float, settings: StepSettings
-) -> tuple[Array, Array]:
-    """Return the log intensity at events, and how fast it changes [1/s], shape (N,) each.
-
-    Args:
-        scene: What they are of.
-        times: At which its light is known, ascending [s], shape (T,).
-        pixel: Of each event, row-major, ascending, shape (N,).
-        t: Time of each [s], shape (N,).
-        log_eps: Added to intensities before the logarithm.
-        settings: How many intensities are held at once.
-    """
-    at = np.clip(np.searchsorted(times, t, side="right") - 1, 0, len(times) - 2)
-    share = np.clip((t - times[at]) / (times[at + 1] - times[at]), 0.0, 1.0)
-    level, speed = np.empty(len(t)), np.empty(len(t))
-    asked = np.unique(pixel)
-    many = max(1, settings.samples // (8 * len(times)))
-    for n in range(0, len(asked), many):
-        some = asked[n : n + many].astype(np.int32)
-        first, last = np.searchsorted(pixel, [some[0], some[-1] + 1])
-        row = np.searchsorted(some, pixel[first:last])
-        known = np.log(light_of(scene, times, some) + np.float32(log_eps))
-        here, there = known[row, at[first:last]], known[row, at[first:last] + 1]
-        level[first:last] = here + (there - here) * share[first:last]
-        speed[first:last] = (there - here) / (times[at[first:last] + 1] - times[at[first:last]])
-    return level, speed

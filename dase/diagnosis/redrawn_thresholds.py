@@ -13,20 +13,14 @@ model, whose own events over the same scene are asked the same.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy import stats
 
 from dase.diagnosis.candidates import Candidate
-from dase.diagnosis.light_between_events import (
-    LightSteps,
-    beyond_those_alike,
-    busiest_rows,
-    light_steps,
-    times_that_are_compared,
-)
+from dase.diagnosis.light_between_events import LightBetweenEvents, LightSteps, beyond_those_alike
 from dase.diagnosis.state import DiagnosisState, with_same_freedom
 from dase.effects.jitter import Jitter
 from dase.errors import InputError
@@ -36,11 +30,9 @@ from dase.fitting.model import FittedModel, refit_model, with_fixed_effect
 from dase.formatting import format_percent
 from dase.probes.distance import Judgement, reaches_floor
 from dase.probes.random_streams import SimulationStream
-from dase.scenes.between_frames import CameraScene
 from dase.signatures.chance import NINETY
 from dase.signatures.result import Answer, Signature
 from dase.simulation.sensor import Sensor
-from dase.simulation.simulate import simulate
 
 Array = NDArray[np.float64]
 
@@ -236,11 +228,14 @@ def find_jitter_beside(
     right = reaches_floor(judgement)
     if not right and (state.noise or judgement.error > REDRAWN.far):
         return None
-    return find_redrawn_thresholds(measurement, model.sensor, right=right, noise=state.noise, seed=state.seed)
+    light = LightBetweenEvents.of(measurement, log_eps=model.sensor.log_eps)
+    if light is None:
+        return None
+    return find_redrawn_thresholds(light, model.sensor, right=right, noise=state.noise, seed=state.seed)
 
 
 def find_redrawn_thresholds(
-    measurement: Measurement,
+    light: LightBetweenEvents,
     sensor: Sensor,
     *,
     right: bool = False,
@@ -251,37 +246,28 @@ def find_redrawn_thresholds(
     """Return by how much thresholds differ from event to event; None where a model lacks no such jitter.
 
     Args:
-        measurement: Its scene is simulated. Nothing is said where light is known in part only.
+        light: Of the measurement, whose scene is simulated.
         sensor: The model, taken without a jitter.
         right: Whether the model counts as right, but for a jitter.
         noise: Rate of the events that a pixel sends without a change [Hz].
         seed: Of every random number.
         settings: When they differ.
     """
-    scene, events = measurement.scene, measurement.compared_events()
-    if isinstance(scene, CameraScene) or measurement.trust is not None or is_held(scene):
+    if is_held(light.measurement.scene):
         return None
-    times = times_that_are_compared(measurement)
-    if len(times) < 2 or not len(events):
-        return None
-    rows = busiest_rows(events, len(times))
-    eps, width = sensor.log_eps, scene.width
-    shortest = settings.samples * float(np.median(np.diff(times)))
-    steps = light_steps(events, scene, times, rows=rows, log_eps=eps)
-    seen = runs_of(steps, width, shortest=shortest, settings=settings)
+    width = light.measurement.scene.width
+    shortest = settings.samples * float(np.median(np.diff(light.times)))
+    seen = runs_of(light.seen, width, shortest=shortest, settings=settings)
     if not seen or (not right and any(one.even < settings.even for one in seen.values())):
         return None
     if any(noise * float(np.median(one.lasts)) > settings.noise for one in seen.values()):
         return None
-    pixels = np.arange(rows[0] * width, rows[1] * width, dtype=np.int64)
     without = sensor.without(EFFECT) if EFFECT in sensor else sensor
     try:
-        made = simulate(scene, without, seed=SimulationStream.REDRAWN_THRESHOLDS.seed(seed), pixels=pixels)
+        made = light.of_model(without, seed=SimulationStream.REDRAWN_THRESHOLDS.seed(seed))
     except InputError:
         return None
-    made = replace(measurement, events=made).compared_events()
-    steps = light_steps(made, scene, times, rows=rows, log_eps=eps)
-    modelled = runs_of(steps, width, shortest=shortest, settings=settings)
+    modelled = runs_of(made, width, shortest=shortest, settings=settings)
     excess = [
         Excess.of(one, modelled[sign], settings.bins) if sign in modelled else None
         for sign, one in seen.items()

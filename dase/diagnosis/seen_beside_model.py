@@ -15,6 +15,7 @@ from dase.diagnosis.dead_time import add_dead_time, find_dead_time
 from dase.diagnosis.drifting_memory import EFFECT as LEAKING
 from dase.diagnosis.drifting_memory import find_drifting_memory
 from dase.diagnosis.events_at_rest import LEAK, NOISE, find_events_at_rest, noise_is_a_pattern
+from dase.diagnosis.light_between_events import LightBetweenEvents
 from dase.diagnosis.redrawn_thresholds import EFFECT as JITTER
 from dase.diagnosis.redrawn_thresholds import find_jitter_beside
 from dase.diagnosis.seen_effects import SeenEffects
@@ -141,13 +142,16 @@ def _look_at_thresholds(
     """Return what is seen, with how much the thresholds of pixels differ, or drift, if they do."""
     if state.evidence.contradiction or seen.lamp:
         return seen
+    light = LightBetweenEvents.of(measurement, log_eps=model.sensor.log_eps)
+    if light is None:
+        return seen
     found = []
     if MISMATCH not in state.given:
-        found.append(find_unequal_thresholds(measurement, model.sensor, seed=state.seed))
+        found.append(find_unequal_thresholds(light, model.sensor, seed=state.seed))
     # light that goes on in a dead time counts for nothing, and the less the longer the time between events is
     if LEAKING not in state.given and not (seen.entry_of(LEAK) or seen.entry_of(DEAD_TIME)):
         structure = state.evidence.structure
-        found.append(find_drifting_memory(measurement, model.sensor, structure=structure, seed=state.seed))
+        found.append(find_drifting_memory(light, model.sensor, structure=structure, seed=state.seed))
     return replace(seen, entries=(*seen.entries, *(one for one in found if one is not None)))
 
 

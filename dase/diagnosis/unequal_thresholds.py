@@ -19,25 +19,15 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from dase.diagnosis.light_between_events import (
-    beyond_those_alike,
-    busiest_rows,
-    light_steps,
-    times_that_are_compared,
-)
+from dase.diagnosis.light_between_events import LightBetweenEvents, LightSteps, beyond_those_alike
 from dase.effects.mismatch import Mismatch
 from dase.errors import InputError
-from dase.events import Events
-from dase.fitting.measurement import Measurement
 from dase.formatting import format_percent
 from dase.probes.random_streams import SimulationStream
 from dase.results import Diagnosis, Estimate
-from dase.scenes.between_frames import CameraScene
-from dase.scenes.scene import Scene
 from dase.signatures.chance import NINETY, sign_flip_tail
 from dase.signatures.result import Answer, Signature
 from dase.simulation.sensor import Sensor
-from dase.simulation.simulate import simulate
 
 Array = NDArray[np.float64]
 
@@ -128,38 +118,27 @@ class Pattern:
 
 
 def find_unequal_thresholds(
-    measurement: Measurement, sensor: Sensor, *, seed: int, settings: UnequalSettings = UNEQUAL
+    light: LightBetweenEvents, sensor: Sensor, *, seed: int, settings: UnequalSettings = UNEQUAL
 ) -> Signature | None:
     """Return how much the thresholds of pixels differ; None where they do not, or where nothing tells.
 
     Args:
-        measurement: Its scene is simulated. Nothing is said where light is known in part only.
+        light: Of the measurement, whose scene is simulated.
         sensor: The model, taken with equal thresholds.
         seed: Of every random number.
         settings: When they differ.
     """
-    scene = measurement.scene
-    if isinstance(scene, CameraScene) or measurement.trust is not None:
-        return None
-    events = measurement.compared_events()
-    times = times_that_are_compared(measurement)
-    if len(times) < 2 or not len(events):
-        return None
-    rows = busiest_rows(events, len(times))
-    eps = sensor.log_eps
-    seen = patterns_of(events, scene, times, rows=rows, log_eps=eps, settings=settings)
+    seen = patterns_of(light.seen, light.shape, settings)
     if not seen or not all(one.differs(settings) for one in seen):
         return None
     if seen[0].shared_with(seen[1]) > settings.both:
         return None
-    pixels = np.arange(rows[0] * scene.width, rows[1] * scene.width, dtype=np.int64)
     without = sensor.without(EFFECT) if EFFECT in sensor else sensor
     try:
-        made = simulate(scene, without, seed=SimulationStream.UNEQUAL_THRESHOLDS.seed(seed), pixels=pixels)
+        made = light.of_model(without, seed=SimulationStream.UNEQUAL_THRESHOLDS.seed(seed))
     except InputError:
         return None
-    made = replace(measurement, events=made).compared_events()
-    modelled = patterns_of(made, scene, times, rows=rows, log_eps=eps, settings=settings)
+    modelled = patterns_of(made, light.shape, settings)
     # a model that sends too little to tell says nothing against it
     if any(
         one.p <= 0.01 and one.spread > settings.model * other.spread
@@ -180,25 +159,15 @@ def find_unequal_thresholds(
 
 
 def patterns_of(
-    events: Events,
-    scene: Scene,
-    times: Array,
-    *,
-    rows: tuple[int, int],
-    log_eps: float,
-    settings: UnequalSettings = UNEQUAL,
+    steps: LightSteps, shape: tuple[int, int], settings: UnequalSettings = UNEQUAL
 ) -> tuple[Pattern, ...]:
     """Return what stays of the thresholds of pixels for ON and OFF; empty where either has too few events.
 
     Args:
-        events: In order of time.
-        scene: What they are of.
-        times: At which its light is known, ascending [s], shape (T,).
-        rows: First row that is looked at, and the row after the last.
-        log_eps: Added to intensities before the logarithm.
+        steps: From event to event.
+        shape: Rows that are looked at, and columns.
         settings: What counts.
     """
-    steps = light_steps(events, scene, times, rows=rows, log_eps=log_eps)
     counts = steps.counts & (steps.gap < settings.longest)
     out = []
     for sign in (1, -1):
@@ -210,7 +179,6 @@ def patterns_of(
         off = np.clip(moved / threshold - 1, -settings.reach, settings.reach)
         fast = sign * steps.speed[used]
         off = beyond_those_alike(off, steps.level[used], fast, steps.again[used])
-        shape = rows[1] - rows[0], scene.width
         found = _pattern_of(steps.pixel[used], off, shape, settings)
         if found.pixels < settings.pixels:
             return ()

@@ -261,16 +261,50 @@ def light_of(
     """
     out = np.empty((len(pixels), len(times)), np.float32)
     for first in range(0, len(times), at_once):
-        part = times[first : first + at_once]
-        name, source = scene.source(part, pixels, launch.find_device("cpu"))
-        if name == "frames":
-            values = source.values.numpy()
-        elif name == "levels":
-            values = source.light.numpy()[source.values.numpy()]
-        else:
-            values = scene.frames(part).reshape(len(part), -1)[:, pixels]
-        out[:, first : first + at_once] = values.T
+        values, light = _values_of(scene, times[first : first + at_once], pixels)
+        out[:, first : first + at_once] = (values if light is None else light[values]).T
     return out
+
+
+def log_light_of(
+    scene: Scene,
+    times: NDArray[np.float64],
+    pixels: NDArray[np.int32],
+    *,
+    log_eps: float,
+    at_once: int = 256,
+) -> NDArray[np.float32]:
+    """Return the log intensity of some pixels at some times, shape (T, N): one instant after the other.
+
+    Args:
+        scene: What they see.
+        times: Increasing [s], shape (T,).
+        pixels: Row-major indices, shape (N,).
+        log_eps: Added to intensities before the logarithm.
+        at_once: Frames that are rendered together, for their memory.
+    """
+    eps = np.float32(log_eps)
+    out = np.empty((len(times), len(pixels)), np.float32)
+    for first in range(0, len(times), at_once):
+        values, light = _values_of(scene, times[first : first + at_once], pixels)
+        part = out[first : first + at_once]
+        if light is None:
+            np.log(np.add(values, eps, out=part), out=part)
+        else:
+            np.take(np.log(light + eps), values, out=part)
+    return out
+
+
+def _values_of(
+    scene: Scene, times: NDArray[np.float64], pixels: NDArray[np.int32]
+) -> tuple[NDArray[Any], NDArray[np.float32] | None]:
+    """Return the intensities of some pixels at some times (T, N), or their levels and the light of each."""
+    name, source = scene.source(times, pixels, launch.find_device("cpu"))
+    if name == "frames":
+        return source.values.numpy(), None
+    if name == "levels":
+        return source.values.numpy(), source.light.numpy()
+    return scene.frames(times).reshape(len(times), -1)[:, pixels], None
 
 
 def sort_into_cells(

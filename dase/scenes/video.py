@@ -268,8 +268,10 @@ class VideoScene(Scene):
         else:
             frames = self._frames[index]
         flat = frames.reshape(len(index), -1)
-        every = np.array_equal(pixels, np.arange(flat.shape[1]))
-        return np.ascontiguousarray(flat if every else flat[:, pixels])
+        first = int(pixels[0]) if len(pixels) else 0
+        if np.array_equal(pixels, np.arange(first, first + len(pixels))):
+            return np.ascontiguousarray(flat[:, first : first + len(pixels)])
+        return np.take(flat, pixels, axis=1)
 
     def _rows(self, index: NDArray[np.int64], pixels: NDArray[np.int32]) -> NDArray[np.float32]:
         return to_light(self._values(index, pixels), gamma=self.gamma)

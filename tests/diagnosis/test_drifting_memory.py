@@ -12,6 +12,7 @@ import dase
 from dase.diagnosis.dead_time import NAME as DEAD_TIME
 from dase.diagnosis.drifting_memory import DRIFT, NAME, Drift, find_drifting_memory
 from dase.diagnosis.events_at_rest import find_events_at_rest
+from dase.diagnosis.light_between_events import LightBetweenEvents
 from dase.diagnosis.seen_beside_model import _look_at_thresholds
 from dase.diagnosis.seen_effects import SeenEffects
 from dase.effects import EFFECTS
@@ -31,7 +32,9 @@ def scene():
 
 
 def found(scene, events, sensor=None, structure=NO_STRUCTURE):
-    return find_drifting_memory(Measurement(events, scene), sensor or Sensor(), structure=structure, seed=0)
+    sensor = sensor or Sensor()
+    light = LightBetweenEvents.of(Measurement(events, scene), log_eps=sensor.log_eps)
+    return light and find_drifting_memory(light, sensor, structure=structure, seed=0)
 
 
 @pytest.mark.parametrize("rate", [2.0, 4.0])
@@ -78,7 +81,7 @@ def test_what_is_no_leak_is_not_taken_for_it(scene, name, values):
 def test_a_model_that_drifts_by_itself_says_it_is_no_leak(scene, monkeypatch):
     events = counted_between_frames(scene, 0.0, leak=2.0)
     assert found(scene, events) is not None
-    monkeypatch.setattr("dase.diagnosis.drifting_memory.simulate", lambda *_, **__: events)
+    monkeypatch.setattr("dase.diagnosis.light_between_events.simulate", lambda *_, **__: events)
     assert found(scene, events) is None
 
 

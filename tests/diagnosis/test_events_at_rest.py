@@ -122,7 +122,7 @@ def test_noise_that_the_model_has_is_not_missing(scene):
 
 def test_a_rest_is_the_longest_time_within_a_range():
     times = np.arange(8.0)
-    level = np.array([[0, 0, 1, 1.05, 1.1, 1.15, 3, 3], [0, 1, 2, 3, 4, 5, 6, 7]], np.float32)
+    level = np.array([[0, 0, 1, 1.05, 1.1, 1.15, 3, 3], [0, 1, 2, 3, 4, 5, 6, 7]], np.float32).T
     first, last = longest_rest(level, times, 0.2)
     assert (first[0], last[0]) == (2, 5)
     assert first[1] == last[1]

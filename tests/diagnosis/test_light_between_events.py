@@ -6,7 +6,12 @@ from dataclasses import replace
 
 import numpy as np
 
-from dase.diagnosis.light_between_events import STEPS, busiest_rows, light_steps, times_that_are_compared
+from dase.diagnosis.light_between_events import (
+    STEPS,
+    LightBetweenEvents,
+    busiest_rows,
+    times_that_are_compared,
+)
 from dase.events import Events
 from dase.fitting.measurement import Measurement
 from dase.scenes.video import VideoScene
@@ -25,7 +30,8 @@ def test_light_goes_as_far_as_the_scene_says():
         np.array([0.1, 0.2, 0.3, 0.7, 0.9]), np.array([1, 2, 1, 2, 1]), np.array([0, 1, 0, 1, 0]),
         np.array([True, True, True, False, False]), 3, 2,
     )  # fmt: skip
-    steps = light_steps(events, scene, scene.sample_times(), rows=(0, 2), log_eps=0.0)
+    light = LightBetweenEvents(Measurement(events, scene), scene.sample_times(), (0, 2), 0.0)
+    steps = light.seen
     same = steps.gap > 0  # from one pixel to the next time goes back here
     np.testing.assert_array_equal(steps.pixel[same], [1, 1, 5])
     np.testing.assert_allclose(steps.change[same], [0.2, 0.6, 2.5], atol=1e-5)
@@ -33,7 +39,7 @@ def test_light_goes_as_far_as_the_scene_says():
     np.testing.assert_allclose(steps.speed[same], [1, 1, 5], atol=1e-4)
     np.testing.assert_array_equal(steps.on[same], [True, False, False])
     np.testing.assert_array_equal(steps.again[same], [True, False, False])
-    part = light_steps(events, scene, scene.sample_times(), rows=(1, 2), log_eps=0.0)
+    part = replace(light, rows=(1, 2)).seen
     np.testing.assert_array_equal(part.pixel, [2])
     np.testing.assert_allclose(part.change, [2.5], atol=1e-5)
 
@@ -42,14 +48,10 @@ def test_light_in_the_dark_does_not_count():
     scene = brightening()
     t = np.array([0.1, 0.2, 0.7, 0.9])
     x, y = np.array([2, 0, 2, 0]), np.array([1, 0, 1, 0])
-    steps = light_steps(
-        Events(t, x, y, np.ones(4, bool), 3, 2), scene, scene.sample_times(), rows=(0, 2), log_eps=0.0
-    )
-    np.testing.assert_array_equal(steps.pixel[steps.counts], [])
-    bright = light_steps(
-        Events(t, x, y, np.ones(4, bool), 3, 2), scene, scene.sample_times(), rows=(0, 2), log_eps=0.0,
-        settings=replace(STEPS, darkest=1e-9),
-    )  # fmt: skip
+    events = Events(t, x, y, np.ones(4, bool), 3, 2)
+    light = LightBetweenEvents(Measurement(events, scene), scene.sample_times(), (0, 2), 0.0)
+    np.testing.assert_array_equal(light.seen.pixel[light.seen.counts], [])
+    bright = replace(light, settings=replace(STEPS, darkest=1e-9)).seen
     np.testing.assert_array_equal(bright.pixel[bright.counts], [0, 5])
 
 
@@ -67,3 +69,13 @@ def test_times_are_those_that_are_compared():
     measurement = Measurement(Events.empty(3, 2), scene)
     np.testing.assert_array_equal(times_that_are_compared(measurement), scene.sample_times())
     np.testing.assert_array_equal(times_that_are_compared(measurement.part(0.2, 0.6)), [0.25, 0.5])
+
+
+def test_light_that_is_known_in_part_or_sends_nothing_tells_nothing():
+    scene = brightening()
+    events = Events(np.array([0.1, 0.9]), np.array([1, 1]), np.array([0, 1]), np.ones(2, bool), 3, 2)
+    light = LightBetweenEvents.of(Measurement(events, scene), log_eps=0.0)
+    assert light.rows == (0, 2)
+    np.testing.assert_allclose(light.level, light.times[:, None] * np.arange(6) - 5, atol=1e-5)
+    assert LightBetweenEvents.of(Measurement(Events.empty(3, 2), scene), log_eps=0.0) is None
+    assert LightBetweenEvents.of(Measurement(events, scene).part(0.1, 0.3), log_eps=0.0) is None

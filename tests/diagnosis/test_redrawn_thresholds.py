@@ -9,7 +9,7 @@ import pytest
 from helpers.frame_simulator import counted_between_frames, shaken_texture
 
 import dase
-from dase.diagnosis.light_between_events import LightSteps
+from dase.diagnosis.light_between_events import LightBetweenEvents, LightSteps
 from dase.diagnosis.redrawn_thresholds import NAME, REDRAWN, find_redrawn_thresholds, runs_of
 from dase.diagnosis.seen_effects import SeenEffects
 from dase.effects import EFFECTS
@@ -21,7 +21,9 @@ from dase.simulation.sensor import Sensor
 
 
 def found(scene, events, sensor=None, **more):
-    return find_redrawn_thresholds(Measurement(events, scene), sensor or Sensor(), seed=0, **more)
+    sensor = sensor or Sensor()
+    light = LightBetweenEvents.of(Measurement(events, scene), log_eps=sensor.log_eps)
+    return light and find_redrawn_thresholds(light, sensor, seed=0, **more)
 
 
 def sensor_with(**effects):

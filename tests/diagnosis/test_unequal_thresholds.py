@@ -9,6 +9,7 @@ import pytest
 from helpers.frame_simulator import HEIGHT, WIDTH, counted_between_frames, shaken_texture
 
 import dase
+from dase.diagnosis.light_between_events import LightBetweenEvents
 from dase.diagnosis.seen_effects import SeenEffects
 from dase.diagnosis.unequal_thresholds import (
     NAME,
@@ -26,7 +27,15 @@ from dase.simulation.sensor import Sensor
 
 
 def found(scene, events, sensor=None, **more):
-    return find_unequal_thresholds(Measurement(events, scene), sensor or Sensor(), seed=0, **more)
+    sensor = sensor or Sensor()
+    light = LightBetweenEvents.of(Measurement(events, scene), log_eps=sensor.log_eps)
+    return light and find_unequal_thresholds(light, sensor, seed=0, **more)
+
+
+def patterns(scene, events):
+    light = LightBetweenEvents.of(Measurement(events, scene), log_eps=1e-3)
+    assert light.shape == (HEIGHT, WIDTH)
+    return patterns_of(light.seen, light.shape)
 
 
 @pytest.fixture(scope="module")
@@ -78,20 +87,18 @@ def test_what_leaves_thresholds_alike_is_not_taken_for_it(scene, name, values):
 def test_what_both_polarities_share_may_be_of_the_light(scene):
     """A dark current that differs from pixel to pixel looks like it."""
     events = counted_between_frames(scene, 0.12, same=True)
-    patterns = patterns_of(events, scene, scene.sample_times(), rows=(0, HEIGHT), log_eps=1e-3)
-    assert all(one.differs(UNEQUAL) for one in patterns)
-    assert patterns[0].shared_with(patterns[1]) > 0.8
+    same = patterns(scene, events)
+    assert all(one.differs(UNEQUAL) for one in same)
+    assert same[0].shared_with(same[1]) > 0.8
     assert found(scene, events) is None
-    apart = patterns_of(
-        counted_between_frames(scene, 0.12), scene, scene.sample_times(), rows=(0, HEIGHT), log_eps=1e-3
-    )
+    apart = patterns(scene, counted_between_frames(scene, 0.12))
     assert apart[0].shared_with(apart[1]) < 0.3
 
 
 def test_a_model_that_shows_it_by_itself_says_it_is_no_mismatch(scene, monkeypatch):
     events = counted_between_frames(scene, 0.12)
     assert found(scene, events) is not None
-    monkeypatch.setattr("dase.diagnosis.unequal_thresholds.simulate", lambda *_, **__: events)
+    monkeypatch.setattr("dase.diagnosis.light_between_events.simulate", lambda *_, **__: events)
     assert found(scene, events) is None
 
 
@@ -126,7 +133,7 @@ def test_few_pixels_or_small_spreads_tell_nothing(scene):
 def test_a_part_of_the_rows_tells_as_well(scene, monkeypatch):
     events = counted_between_frames(scene, 0.12)
     whole = found(scene, events)
-    monkeypatch.setattr("dase.diagnosis.unequal_thresholds.busiest_rows", lambda *_: (9, 33))
+    monkeypatch.setattr("dase.diagnosis.light_between_events.busiest_rows", lambda *_: (9, 33))
     entry = found(scene, events)
     assert entry.details["pixels"] < 0.6 * whole.details["pixels"]
     assert entry.size == pytest.approx(0.12, rel=0.3)

@@ -20,6 +20,7 @@ import dase
 from dase.diagnosis.dead_time import find_dead_time
 from dase.diagnosis.drifting_memory import find_drifting_memory
 from dase.diagnosis.events_at_rest import find_events_at_rest
+from dase.diagnosis.light_between_events import LightBetweenEvents
 from dase.diagnosis.redrawn_thresholds import find_redrawn_thresholds
 from dase.diagnosis.unequal_thresholds import find_unequal_thresholds
 from dase.effects import EFFECTS, Threshold
@@ -103,7 +104,8 @@ def print_jitters(key: int, scenes: int) -> None:
     for name, spread, measurement, model in jitter_rows(key, scenes):
         count[name] = count.get(name, 0) + (spread == 0)
         frames = frame_step_of(measurement.events, measurement.scene)
-        jitter = None if frames else find_redrawn_thresholds(measurement, model, right=True, seed=0)
+        light = None if frames else LightBetweenEvents.of(measurement, log_eps=model.log_eps)
+        jitter = light and find_redrawn_thresholds(light, model, right=True, seed=0)
         if jitter is not None:
             told.setdefault((name, spread), []).append(jitter.size)
     print("| beside | " + " | ".join(f"{spread:.0%}" if spread else "no jitter" for spread in JITTERS) + " |")
@@ -143,10 +145,11 @@ def main() -> None:
             said = " ".join([rest.name, *([rest.details["effect"]] if "effect" in rest.details else [])])
             many = rests.setdefault(name, {})
             many[said] = many.get(said, 0) + 1
-        unequal = find_unequal_thresholds(measurement, model, seed=0)
+        light = LightBetweenEvents.of(measurement, log_eps=model.log_eps)
+        unequal = light and find_unequal_thresholds(light, model, seed=0)
         if unequal is not None:
             spreads.setdefault(name, []).append(unequal.size)
-        drift = find_drifting_memory(measurement, model, structure=structure, seed=0)
+        drift = light and find_drifting_memory(light, model, structure=structure, seed=0)
         if drift is not None:
             drifts.setdefault(name, []).append(drift.size)
         if entry is not None:
