@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -54,6 +55,7 @@ class ReportedModel:
         last: Error of the last model.
         absorbed: An orthonormal base of what the free parameters can do, in standard errors, shape (J, P).
         misfit: What the model is off by beyond chance, with its sign, shape (J,).
+        cloud: Repeats of the model, of the statistics that are compared, with the doubt of the scene.
     """
 
     half: CalibratedSubset
@@ -62,6 +64,14 @@ class ReportedModel:
     last: Judgement
     absorbed: Array
     misfit: Array
+    cloud: RepeatCloud
+
+    @cached_property
+    def compared(self) -> dict[str, NDArray[np.int64]]:
+        """Places of the statistics of each family that are compared; none of families without any."""
+        used = self.half.seen.used
+        places = {name: part.start + np.flatnonzero(used[part]) for name, part in LAYOUT.items()}
+        return {name: at for name, at in places.items() if len(at)}
 
 
 def find_detection_limits(
@@ -186,7 +196,13 @@ def _reported_model(
     off = half.scale.target - half.repeats.mean(0)
     doubt = misfit_beyond_chance(half)
     misfit = np.where(half.seen.used, np.sign(off) * np.minimum(np.abs(off), doubt), 0.0)
-    return ReportedModel(half, model, start, last, frame, misfit)
+    cloud = RepeatCloud(
+        compared_in_standard_errors(half.repeats - half.repeats.mean(0), half.chance),
+        hidden.most_of_one,
+        doubt=compared_in_standard_errors(doubt, half.chance),
+        drift=None if half.drift is None else compared_in_standard_errors(half.drift, half.chance),
+    )
+    return ReportedModel(half, model, start, last, frame, misfit, cloud)
 
 
 def _limit_work(
@@ -270,32 +286,23 @@ def would_be_seen(known: ReportedModel, values: Array, settings: DiagnosisSettin
         values: Of simulations with the effect, shape (R, J).
         settings: Of the diagnosis.
     """
-    half, last = known.half, known.last
-    middle = half.repeats.mean(0)
-    apart = in_standard_errors(values - middle, half.seen)
+    half, last, cloud = known.half, known.last, known.cloud
+    apart = in_standard_errors(values - half.repeats.mean(0), half.seen)
     # the free parameters give way to the effect before anything is missing
     apart = apart - (apart @ known.absorbed) @ known.absorbed.T
     used = half.chance.used
     ratio = half.seen.sigma / half.chance.sigma
-    cloud = RepeatCloud(
-        compared_in_standard_errors(half.repeats - middle, half.chance),
-        np.zeros(np.count_nonzero(used)),
-        settings.hidden.most_of_one,
-        doubt=compared_in_standard_errors(misfit_beyond_chance(half), half.chance),
-        drift=None if half.drift is None else compared_in_standard_errors(half.drift, half.chance),
-    )
     out = np.zeros(len(values), np.bool_)
     weights = half.seen.weights()
     left = in_standard_errors(known.misfit, half.seen)
     for n, one in enumerate(apart):
         rho = pseudo_huber(one + left)
-        families = {name: float(rho[part][half.seen.used[part]].mean()) / last.unit
-                    for name, part in LAYOUT.items() if half.seen.used[part].any()}  # fmt: skip
+        families = {name: float(rho[at].mean()) / last.unit for name, at in known.compared.items()}
         without = replace(last, error=float(rho @ weights) / last.unit, families=families)
-        seen = replace(cloud, seen=(one * ratio)[used])
         # the way is that of the other measurements: its own chance would make each lie on it
         way = (apart.sum(0) - one) / max(len(apart) - 1, 1)
-        deviation = float(seen.deviations_along(cloud.clipped((way * ratio)[used])[None])[0])
+        clipped = cloud.clipped((way * ratio)[used])[None]
+        deviation = float(cloud.deviations_along(clipped, (one * ratio)[used])[0])
         # where the scene is guessed a closer look is always taken
         closer = half.doubt is not None and deviation >= settings.hidden.away
         looked = closer or would_be_added(last, without, settings)

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,20 +26,18 @@ from dase.probes.random_streams import SimulationStream
 Array = NDArray[np.float64]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class RepeatCloud:
-    """Repeats of a model and the measurement, in standard errors from the repeats' mean.
+    """Repeats of a model, in standard errors from their mean, beside which measurements are looked at.
 
     Args:
         repeats: Of the model, shape (R, J).
-        seen: The measurement, shape (J,).
         most_of_one: Differences beyond this many standard errors count as this.
         doubt: Standard errors by which each statistic may be off for other reasons than chance, shape (J,).
         drift: The same as one way that all of them may go together, with signs, shape (J,).
     """
 
     repeats: Array
-    seen: Array
     most_of_one: float = DEFAULTS.hidden.most_of_one
     doubt: Array | None = None
     drift: Array | None = None
@@ -47,22 +46,35 @@ class RepeatCloud:
         """Return differences (..., J), none larger than a single statistic may count."""
         return np.clip(differences, -self.most_of_one, self.most_of_one)
 
-    def deviations_along(self, ways: Array) -> Array:
-        """Return how far the measurement is from the repeats along some ways (M, J), in deviations, (M,).
+    def deviations_along(self, ways: Array, seen: Array) -> Array:
+        """Return how far a measurement is from the repeats along some ways (M, J), in deviations, (M,).
 
         The repeats and the measurement may be off by the tolerance, which their standard errors know: without
         it, a model without chance in it would have no deviation.
+
+        Args:
+            ways: In standard errors, shape (M, J).
+            seen: The measurement, in standard errors from the repeats' mean, shape (J,).
         """
-        along = self.clipped(self.repeats) @ ways.T
-        rest = np.maximum(1.0 - self.repeats.var(0), 0.0)
-        if self.doubt is not None:
-            rest = rest + np.minimum(self.doubt, self.most_of_one) ** 2
-        square = along.var(0) + (rest * ways**2).sum(1)
+        along = self._clipped_repeats @ ways.T
+        square = along.var(0) + (self._rest * ways**2).sum(1)
         if self.drift is not None:
             square = square + (self.clipped(self.drift) @ ways.T) ** 2
         spread = np.sqrt(square)
-        out: Array = (self.clipped(self.seen) @ ways.T - along.mean(0)) / np.maximum(spread, 1e-12)
+        out: Array = (self.clipped(seen) @ ways.T - along.mean(0)) / np.maximum(spread, 1e-12)
         return out
+
+    @cached_property
+    def _clipped_repeats(self) -> Array:
+        return self.clipped(self.repeats)
+
+    @cached_property
+    def _rest(self) -> Array:
+        """Variance of each statistic that the repeats do not show, in standard errors, shape (J,)."""
+        rest: Array = np.maximum(1.0 - self.repeats.var(0), 0.0)
+        if self.doubt is not None:
+            rest = rest + np.minimum(self.doubt, self.most_of_one) ** 2
+        return rest
 
 
 def find_hidden_effect(
@@ -127,14 +139,13 @@ def deviation_towards(
         other: Towards which.
         doubt: What each statistic may be off by for other reasons than chance, shape (J,).
     """
-    half, cloud = _repeat_cloud(state, subset, model)
+    half, cloud, seen = _repeat_cloud(state, subset, model)
     if doubt is not None:
         cloud = replace(cloud, doubt=compared_in_standard_errors(doubt, half.chance))
     one, two = _mean_statistics(state, half, [(model, model.place[None]), (other, other.place[None])])
     # a way far along few statistics would count only these, of which none may decide
-    return float(
-        cloud.deviations_along(cloud.clipped(compared_in_standard_errors(two - one, half.chance)))[0]
-    )
+    way = cloud.clipped(compared_in_standard_errors(two - one, half.chance))
+    return float(cloud.deviations_along(way, seen)[0])
 
 
 def _most_deviating_effect(
@@ -145,7 +156,7 @@ def _most_deviating_effect(
     For that, repeats stand in for the measurement, each on the way on which it is farthest.
     """
     hidden = state.settings.hidden
-    half, cloud = _repeat_cloud(state, state.evidence.train, model)
+    half, cloud, seen = _repeat_cloud(state, state.evidence.train, model)
     threshold = [axis.of_threshold for axis in model.space.axes]
     reach = np.where(threshold, hidden.threshold_reach, hidden.reach)
     sides = np.concatenate([model.place[None], model.place + np.diag(reach), model.place - np.diag(reach)])
@@ -159,13 +170,13 @@ def _most_deviating_effect(
     frame, _ = np.linalg.qr(slopes)
     # what the free parameters can do as well tells nothing
     bare = ways - (ways @ frame) @ frame.T
-    far = cloud.deviations_along(bare)
-    chance = np.array([replace(cloud, seen=one).deviations_along(bare).max() for one in cloud.repeats])
+    far = cloud.deviations_along(bare, seen)
+    chance = np.array([cloud.deviations_along(bare, one).max() for one in cloud.repeats])
     first = int(far.argmax())
     if far[first] < hidden.away:
         return None
     name, other, place = [(n, m, place) for n, m, places in probed for place in places][first]
-    step = (cloud.seen - ways[first]) @ np.linalg.pinv(slopes).T * reach
+    step = (seen - ways[first]) @ np.linalg.pinv(slopes).T * reach
     p_value = (1 + np.count_nonzero(chance >= far[first])) / (1 + len(chance))
     return (
         name,
@@ -218,8 +229,11 @@ def _models_to_probe(
 
 def _repeat_cloud(
     state: DiagnosisState, subset: PixelSubset, model: FittedModel
-) -> tuple[CalibratedSubset, RepeatCloud]:
-    """Return a half with a model as its present one, and the repeats of it beside the measurement."""
+) -> tuple[CalibratedSubset, RepeatCloud, Array]:
+    """Return a half with a model as its present one, the repeats of it, and the measurement beside these.
+
+    That is in standard errors from the repeats' mean, shape (J,).
+    """
     half = model.calibrate(
         subset, repeats=state.settings.repeats, seed=SimulationStream.CLOUD.seed(state.seed)
     )
@@ -229,11 +243,10 @@ def _repeat_cloud(
     drift = None if half.drift is None else compared_in_standard_errors(half.drift, half.chance)
     cloud = RepeatCloud(
         compared_in_standard_errors(repeats - middle, half.chance),
-        seen,
         state.settings.hidden.most_of_one,
         drift=drift,
     )
-    return half, cloud
+    return half, cloud, seen
 
 
 def _mean_statistics(

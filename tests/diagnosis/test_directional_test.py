@@ -40,21 +40,21 @@ def test_the_distance_along_a_way_is_in_deviations_of_repeats(rng):
     repeats = 0.8 * rng.standard_normal((400, 60))  # the rest of a standard error is tolerance
     ways = rng.standard_normal((300, 60))
     seen = rng.standard_normal((2000, 60))
-    far = np.array([RepeatCloud(repeats, one).deviations_along(ways[:1])[0] for one in seen])
+    far = np.array([RepeatCloud(repeats).deviations_along(ways[:1], one)[0] for one in seen])
     assert far.std() == pytest.approx(1.0, abs=0.07)
     assert abs(far.mean()) < 0.15
     way = ways[0]
-    moved = RepeatCloud(repeats, 4 * way / np.linalg.norm(way)).deviations_along(ways)
+    moved = RepeatCloud(repeats).deviations_along(ways, 4 * way / np.linalg.norm(way))
     assert moved[0] == pytest.approx(4.0, abs=0.3)
     assert np.abs(moved[1:]).max() < 2.5
 
 
 def test_no_single_statistic_decides_and_no_chance_is_no_certainty():
     way, alike = np.ones((1, 25)), np.zeros((60, 25))
-    assert RepeatCloud(alike, np.eye(25)[0] * 100).deviations_along(way)[0] == pytest.approx(
+    assert RepeatCloud(alike).deviations_along(way, np.eye(25)[0] * 100)[0] == pytest.approx(
         DEFAULTS.hidden.most_of_one / 5
     )
-    assert RepeatCloud(alike, np.full(25, 0.5)).deviations_along(way)[0] == pytest.approx(2.5)
+    assert RepeatCloud(alike).deviations_along(way, np.full(25, 0.5))[0] == pytest.approx(2.5)
 
 
 @pytest.fixture(scope="module")
