@@ -68,7 +68,7 @@ class ReportedModel:
 
     @cached_property
     def compared(self) -> dict[str, NDArray[np.int64]]:
-        """Places of the statistics of each family that are compared; none of families without any."""
+        """Places of the statistics that are compared, by family, shape (K,) each; only families with any."""
         used = self.half.seen.used
         places = {name: part.start + np.flatnonzero(used[part]) for name, part in LAYOUT.items()}
         return {name: at for name, at in places.items() if len(at)}

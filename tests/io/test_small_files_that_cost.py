@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import zipfile
 from contextlib import suppress
 from importlib import import_module
@@ -177,52 +176,6 @@ def test_other_files_that_stand_for_one(tmp_path, content, match):
     ):
         with pytest.raises(InputError, match=match):
             act()
-
-
-def test_weights(tmp_path):
-    pytest.importorskip("torch")
-    from safetensors.torch import save
-
-    from dase.networks import weights_file
-    from dase.networks.threshold_network import NetworkShape, ThresholdNet
-
-    def put(text):
-        (tmp_path / "w.safetensors").write_bytes(save({}, {weights_file.KIND: text}))
-        return tmp_path / "w.safetensors"
-
-    for shape, match in (
-        ({"depth": 10_000}, "depth must be a whole number"),
-        ({"channels": 10**9}, "channels must be a whole number"),
-        ({"depth": 2.5}, "depth must be a whole number"),
-        ({"table": [10**6, 10**6]}, "table must be a whole number"),
-        ({"pattern": [10**9, 2]}, "pattern must be a whole number"),
-        ({"pattern": 5}, "pattern must be two"),
-        ({"split": 5}, "split must be true or false"),
-        ({"channels": 1024, "depth": 8}, "does not hold the weights of the network that it says"),
-        ([1, 2], "must be a table"),
-        ("a", "must be a table"),
-    ):
-        with pytest.raises(InputError, match=match):
-            weights_file.load_net(put(json.dumps(shape)))
-    with pytest.raises(InputError, match="nested too deeply"):
-        weights_file.load_net(put("[" * 100_000))
-    net = ThresholdNet(NetworkShape(channels=4, depth=2))
-    weights_file.save_net(tmp_path / "good.safetensors", net)
-    assert weights_file.load_net(tmp_path / "good.safetensors").shape == net.shape
-    (tmp_path / "p.safetensors").write_text(POINTER)
-    with pytest.raises(InputError, match="Git LFS pointer"):
-        weights_file.load_net(tmp_path / "p.safetensors")
-
-
-def test_metadata_of_weights_that_are_a_list(tmp_path):
-    pytest.importorskip("torch")
-    from dase.networks import weights_file
-
-    for metadata in ([1], {"a": [1]}, 5, {weights_file.KIND: 5}):
-        head = json.dumps({"__metadata__": metadata}).encode()
-        (tmp_path / "w.safetensors").write_bytes(len(head).to_bytes(8, "little") + head)
-        with pytest.raises(InputError, match="does not hold learned thresholds"):
-            weights_file.load_net(tmp_path / "w.safetensors")
 
 
 def test_a_text_file_has_an_end(tmp_path):

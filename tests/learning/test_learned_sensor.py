@@ -155,18 +155,6 @@ def test_a_sensor_file_edited_in_place_keeps_the_name_of_its_weights(folder, mon
         assert ("leak" in load_sensor(path)) == (command == "add")
 
 
-def test_files_of_the_same_weights_are_the_same(folder, tmp_path):
-    """To the byte, and whoever may read the sensor file may read them."""
-    net = weights_file.load_net(folder / learning_job.JobFile.WEIGHTS)
-    written = []
-    for n in range(8):
-        path = tmp_path / f"{n}.safetensors"
-        weights_file.save_net(path, net)
-        written.append(path.read_bytes())
-    assert len(set(written)) == 1
-    assert path.stat().st_mode == (folder / learning_job.JobFile.SENSOR).stat().st_mode
-
-
 def test_bad_weights_are_named(folder, scene):
     path = folder / learning_job.JobFile.SENSOR
     sensor = load_sensor(path)
