@@ -113,7 +113,7 @@ def _go_the_other_way(
     state.history, state.path = state.history[:at], state.path[: at + 1]
     state.history.append(replace(first, chosen=other.name, ties=()))
     judged_with_it = [one for one in state.first if one.judgement]
-    state.note_addition(other, judged_with_it, (), state.judge(state.path[at]))
+    state.note_addition(other, judged_with_it, state.judge(state.path[at]))
     begin = refit_model(state.evidence, other.model, seed=state.seed, rounds=1)
     found, judged = _add_one_by_one(state, compared, begin, _left_to_add(state, begin, most))
     if reaches_floor(judgement):
@@ -286,7 +286,7 @@ def _look_for_effect(
             return _look_for_effect(state, model, judgement, more)
     if best is None:
         return step, None, False
-    state.note_addition(best, [one for one in tried if one.judgement], ties, judgement)
+    state.note_addition(best, [one for one in tried if one.judgement], judgement)
     step = replace(step, chosen=best.name, ties=ties)
     on_its_way = best.error > settings.on_its_way * judgement.gate
     # what is added next moves all of it again
@@ -358,7 +358,7 @@ def _note_hidden_effect(
     state: DiagnosisState, hidden: Candidate, p_value: float, step: Step, judgement: Judgement
 ) -> Step:
     """Return a step with an effect that only a closer look shows as the chosen one."""
-    state.note_addition(hidden, [hidden], (), judgement)
+    state.note_addition(hidden, [hidden], judgement)
     rank = rank_of(replace(hidden, p_value=p_value), judgement)
     others = tuple(r for r in step.ranking if r.effect != hidden.name)
     return replace(step, ranking=(rank, *others), chosen=hidden.name)

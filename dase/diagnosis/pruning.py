@@ -22,7 +22,7 @@ def prune_model(
     """Drop effects that are not needed any more, put simpler ones in place of others, and drop again.
 
     Args:
-        state: What the diagnosis has found so far; gets the ties that show here.
+        state: What the diagnosis has found so far.
         model: With all effects that were added.
         judgement: Its held-out error.
     """
@@ -48,14 +48,11 @@ def prune_model(
             if lacks_effect_of(state, swapped, judged, model):
                 continue
             if _is_no_better_than_a_part_of_it(state, name, other, judgement, judged):
-                state.ties.setdefault(name, set()).add(other)
                 continue
             simpler = len(swapped.place) < len(model.place)
             if simpler or not reaches_floor(judgement):
                 model, judgement = swapped, judged
-                state.ties[other] = {*state.ties.pop(name, set()), name} - {other}
                 break
-            state.ties.setdefault(name, set()).add(other)
     return _drop_needless(state, model, judgement) if model is not before else (model, judgement)
 
 

@@ -31,7 +31,6 @@ class DiagnosisState:
         history: The steps so far, provisional additions included.
         alternatives: Effect that was added to the other candidates that were judged with it.
         error_of: Effect that was added to the held-out error with it.
-        ties: Effect that was added to those that the data cannot tell apart from it.
         without: What the model left before an effect was added to it, where it counted as right already.
         first: Candidates of the first step in which all were tried, in order of their screening, from which
             pairs are made.
@@ -61,7 +60,6 @@ class DiagnosisState:
     history: list[Step] = field(default_factory=list)
     alternatives: dict[str, list[Candidate]] = field(default_factory=dict)
     error_of: dict[str, float] = field(default_factory=dict)
-    ties: dict[str, set[str]] = field(default_factory=dict)
     without: dict[str, Judgement] = field(default_factory=dict)
     first: list[Candidate] = field(default_factory=list)
     certain: frozenset[str] = frozenset()
@@ -94,20 +92,16 @@ class DiagnosisState:
         self.progress("judging", 0.0, self.error)
         return judgement
 
-    def note_addition(
-        self, best: Candidate, finalists: Sequence[Candidate], ties: Sequence[str], without: Judgement
-    ) -> None:
+    def note_addition(self, best: Candidate, finalists: Sequence[Candidate], without: Judgement) -> None:
         """Keep what pruning needs to know of an effect that is added.
 
         Args:
             best: The candidate that is added.
             finalists: All candidates that were judged with it.
-            ties: Those that the data cannot tell apart from it.
             without: The error of the model without it.
         """
         self.alternatives[best.name] = [one for one in finalists if one.name != best.name]
         self.error_of[best.name] = best.error
-        self.ties[best.name] = set(ties)
         if reaches_floor(without):
             self.without[best.name] = without
 
@@ -115,14 +109,12 @@ class DiagnosisState:
         """Return how this model was come to, for `go_back`."""
         return _Ways(
             list(self.history), list(self.path), dict(self.alternatives), dict(self.error_of),
-            dict(self.ties), dict(self.without), self.certain,
+            dict(self.without), self.certain,
         )  # fmt: skip
 
     def go_back(self, ways: _Ways) -> None:
         """Forget what was tried since."""
-        self.history, self.path, self.alternatives, self.error_of, self.ties, self.without, self.certain = (
-            ways
-        )
+        self.history, self.path, self.alternatives, self.error_of, self.without, self.certain = ways
 
     def has_asked(self, model: FittedModel) -> bool:
         """Whether all effects were tried beside those of a model before, wherever its values were."""
@@ -144,7 +136,6 @@ class _Ways(NamedTuple):
     path: list[FittedModel]
     alternatives: dict[str, list[Candidate]]
     error_of: dict[str, float]
-    ties: dict[str, set[str]]
     without: dict[str, Judgement]
     certain: frozenset[str]
 

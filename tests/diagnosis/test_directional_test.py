@@ -138,7 +138,6 @@ def fake(names: str, errors: dict[str, float], monkeypatch, **more) -> tuple:
     defaults = dict(
         settings=DEFAULTS,
         without={},
-        ties={},
         alternatives={},
         error_of={},
         evidence=None,
@@ -217,17 +216,15 @@ def test_what_accounts_for_most_stays_and_so_does_what_only_a_closer_look_shows(
     assert reviewing.prune_model(search, model, judgement)[0].names == "ab"
 
 
-def test_a_simpler_rival_takes_the_place_and_the_tie_is_told(monkeypatch):
+def test_a_simpler_rival_takes_the_place(monkeypatch):
     errors = {"aZ": 0.3, "Z": 9.0, "a": 9.0, "ab": 0.4, "b": 9.0}
     search, model, judgement = fake("aZ", errors, monkeypatch, rivals={"Z": "b"})
     left, after = reviewing.prune_model(search, model, judgement)
     assert (left.names, after.error) == ("ab", 0.4)
-    assert search.ties == {"b": {"Z"}}
-    # one that is no simpler is told, no more
+    # one that is no simpler does not
     errors = {"ac": 0.3, "c": 9.0, "a": 9.0, "ab": 0.4, "b": 9.0}
     search, model, judgement = fake("ac", errors, monkeypatch, rivals={"c": "b"})
     assert reviewing.prune_model(search, model, judgement)[0].names == "ac"
-    assert search.ties == {"c": {"b"}}
 
 
 def test_what_includes_an_effect_must_do_better_than_it(monkeypatch):
@@ -236,7 +233,6 @@ def test_what_includes_an_effect_must_do_better_than_it(monkeypatch):
     includes = {"Z": SimpleNamespace(includes=("b",))}
     search, model, judgement = fake("ab", errors, monkeypatch, rivals={"b": "Z"}, effects=includes)
     assert reviewing.prune_model(search, model, judgement)[0].names == "ab"
-    assert search.ties == {"b": {"Z"}}
     for more, error in ((includes, 0.9), ({}, 1.1)):
         errors["aZ"] = error
         search, model, judgement = fake("ab", errors, monkeypatch, rivals={"b": "Z"}, effects=more)
@@ -248,4 +244,3 @@ def test_no_rival_takes_the_place_of_what_a_closer_look_shows(monkeypatch):
     search, model, judgement = fake("aZ", errors, monkeypatch, rivals={"Z": "b"})
     monkeypatch.setattr(reviewing, "lacks_effect_of", lambda search, less, without, m: less.names == "ab")
     assert reviewing.prune_model(search, model, judgement)[0].names == "aZ"
-    assert search.ties == {}
