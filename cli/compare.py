@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +18,7 @@ from dase.cli.options import (
     scene_option,
     stimulus_option,
 )
-from dase.cli.output import plates_or_note, print_plain_numbers, progress_bar
+from dase.cli.output import plates_or_note, print_plain_numbers, progress_bar, write_json
 
 
 @click.command()
@@ -63,7 +62,6 @@ def compare_command(
     """
     with importing():
         from dase.diagnosis.compare import compare
-        from dase.io import replacing
         from dase.simulation.sensor_file import load_sensor
         from dase.simulation.user_effects import known_effects
 
@@ -86,8 +84,7 @@ def compare_command(
     if output is not None:
         from dase.figures import report
 
-        with replacing(output.with_suffix(".json")) as part:
-            part.write_text(json.dumps(found.to_json(), indent=2) + "\n")
+        write_json(output.with_suffix(".json"), found.to_json())
         plates = plates_or_note(measured, model, seed=seed, device=device)
         page = report.comparison_page(found, recording=recording.name, model=Path(sensor).stem, plates=plates)
         report.write_page(output, page)

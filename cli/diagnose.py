@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 from functools import partial
 from pathlib import Path
@@ -17,12 +16,19 @@ from dase.cli.options import (
     effects_option,
     fps_option,
     importing,
+    json_option,
     open_recorded,
     part_options,
     scene_option,
     stimulus_option,
 )
-from dase.cli.output import plates_or_note, print_plain_numbers, progress_bar
+from dase.cli.output import (
+    STANDARD_OUTPUT,
+    plates_or_note,
+    print_plain_numbers,
+    progress_bar,
+    write_json,
+)
 
 if TYPE_CHECKING:
     from dase.results import Diagnosis
@@ -51,13 +57,7 @@ def print_explanation(ctx: click.Context, parameter: click.Parameter, value: str
 @stimulus_option
 @click.option("--auto", is_flag=True, help="Add what is found and go on until nothing is missing.")
 @click.option("--free", help="Parameters that may be refitted, with commas between.  [default: all]")
-@click.option(
-    "--json",
-    "json_",
-    type=click.Path(path_type=Path),
-    callback=check_output,
-    help="Write the findings to this file.",
-)
+@json_option
 @click.option(
     "-o",
     "--output",
@@ -132,7 +132,8 @@ def diagnose_command(
         if auto:
             if not quiet:
                 click.echo(f"so far: {interim.finding()}", err=True)
-            write_findings(json_, interim)
+            if json_ not in (None, STANDARD_OUTPUT):
+                write_json(json_, interim.to_json())
 
     try:
         with progress_bar(quiet) as tell:
@@ -144,13 +145,11 @@ def diagnose_command(
         if not known:
             raise
         # hours may have gone into it: what is known is said, and nothing is written as if it were found
-        write_findings(json_, known[-1])
-        _print_findings(known[-1], quiet)
+        _say_findings(known[-1], json_, quiet)
         click.get_current_context().exit(130)
-    write_findings(json_, found)
+    _say_findings(found, json_, quiet)
     if output is not None:
         sensor_edit.write_sensor_text(sensor_update.with_diagnosis(text, found, recording.name), output)
-    _print_findings(found, quiet)
     # what was found took minutes and is said and written by now: a picture that fails costs the picture
     drawn = draw is None or draw_or_say(draw, found)
     if report is not None:
@@ -161,15 +160,6 @@ def diagnose_command(
         pages.write_page(report, page)
     if not drawn:
         click.get_current_context().exit(1)
-
-
-def write_findings(path: Path | None, found: Diagnosis) -> None:
-    """Write findings as JSON, if a file for them was asked for."""
-    from dase.io import replacing
-
-    if path is not None:
-        with replacing(path) as part:
-            part.write_text(json.dumps(found.to_json(), indent=2) + "\n")
 
 
 def draw_or_say(path: Path, found: Diagnosis) -> bool:
@@ -184,6 +174,14 @@ def draw_or_say(path: Path, found: Diagnosis) -> bool:
         click.echo(f"dase: {path} could not be drawn: {type(error).__name__}: {error}", err=True)
         return False
     return True
+
+
+def _say_findings(found: Diagnosis, json_: Path | None, quiet: bool) -> None:
+    """Write findings as JSON, if that was asked for, and print them, unless JSON is printed."""
+    if json_ is not None:
+        write_json(json_, found.to_json())
+    if json_ != STANDARD_OUTPUT:
+        _print_findings(found, quiet)
 
 
 def _print_findings(found: Diagnosis, quiet: bool) -> None:

@@ -7,7 +7,8 @@ from typing import TYPE_CHECKING
 
 import click
 
-from dase.cli.options import reading_options
+from dase.cli.options import json_option, reading_options
+from dase.cli.output import STANDARD_OUTPUT, write_json
 
 if TYPE_CHECKING:
     from dase.io.source import ReadOptions
@@ -20,15 +21,13 @@ if TYPE_CHECKING:
     is_flag=True,
     help="Also say which effects FILE shows by itself, without a scene or a model.",
 )
-@click.option("--json", "as_json", is_flag=True, help="Print one JSON object, for programs.")
+@json_option
 @reading_options
-def info_command(file: Path, signatures: bool, as_json: bool, reading: ReadOptions) -> None:
+def info_command(file: Path, signatures: bool, json_: Path | None, reading: ReadOptions) -> None:
     """Say what is in FILE: rates, intervals, hot pixels, frames, what was repaired and what looks odd.
 
     FILE streams through, whatever its size. Isolated events are counted on a sample; all else on all events.
     """
-    import json
-
     from tqdm import tqdm
 
     from dase import io
@@ -47,11 +46,13 @@ def info_command(file: Path, signatures: bool, as_json: bool, reading: ReadOptio
 
             shown = find_signatures(file, progress=bar.update, **reading)
     said = [note for note in (*notes, *find_anomalies(found)) if isinstance(note, io.Note)]
-    if as_json:
+    if json_ is not None:
         content = summary.as_json(name, found, said)
         if shown is not None:
             content["signatures"] = shown.to_json()
-        return click.echo(json.dumps(content, indent=1))
+        write_json(json_, content)
+        if json_ == STANDARD_OUTPUT:
+            return
     click.echo(f"{'format':<18}{name}")
     for key, value in summary.statistics_table(found):
         click.echo(f"{key:<18}{value}")

@@ -155,6 +155,16 @@ sensor_output = click.option(
 """`-o FILE` of commands that write a sensor file; a command gets a path or None."""
 
 
+json_option = click.option(
+    "--json",
+    "json_",
+    type=click.Path(path_type=Path, allow_dash=True),
+    callback=check_output,
+    help="Write what is found as JSON to this file; - prints that and nothing else.",
+)
+"""`--json FILE` of commands that say something; a command gets a path or None, for `write_json`."""
+
+
 class _FirstSpelling(click.Option):
     """An option whose help shows its first spelling only; the others are for those who know them."""
 

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import json
 import sys
 import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
-from typing import TYPE_CHECKING
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import click
 
@@ -14,6 +16,20 @@ if TYPE_CHECKING:
     from dase.figures.style import Plate
     from dase.fitting.measurement import Measurement
     from dase.simulation.sensor import Sensor
+
+STANDARD_OUTPUT = Path("-")
+"""The file that stands for what a command prints, in `--json -`."""
+
+
+def write_json(path: Path, content: Mapping[str, Any]) -> None:
+    """Write a JSON object to a file, or print it."""
+    from dase.io import replacing
+
+    text = json.dumps(content, indent=2)
+    if path == STANDARD_OUTPUT:
+        return click.echo(text)
+    with replacing(path) as part:
+        part.write_text(text + "\n")
 
 
 @contextmanager
@@ -59,5 +75,5 @@ def plates_or_note(measured: Measurement, sensor: Sensor, *, seed: int, device: 
     try:
         return measurement_plates(measured, sensor, seed=seed, device=device)
     except Exception as error:  # whatever a scene or matplotlib stumbles over
-        click.echo(f"note: no pictures of the events: {type(error).__name__}: {error}")
+        click.echo(f"note: no pictures of the events: {type(error).__name__}: {error}", err=True)
         return []

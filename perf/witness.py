@@ -322,6 +322,11 @@ class Bench:
         known = self.python("-c", MAIN, command, "--help")
         return ["--device" if "--device" in known else "--backend", self.device]
 
+    def json(self) -> list[str]:
+        """Return the option by which `info` prints JSON, which took no file at first."""
+        known = self.python("-c", MAIN, "info", "--help")
+        return ["--json", "-"] if "--json PATH" in known else ["--json"]
+
     def worker(self, name: str) -> dict[str, Any]:
         """Return what a worker of this script finds in a process of its own."""
         found: dict[str, Any] = json.loads(self.python(__file__, "--worker", name, "--device", self.device))
@@ -378,7 +383,7 @@ def formats(bench: Bench) -> dict[str, Any]:
 def _read(bench: Bench, name: str, label: str) -> dict[str, Any]:
     """Return what `info` says of a file, and its content as an archive of NumPy."""
     size = ["--size", "128x128"]  # text does not say it
-    told = dict(fields(json.loads(bench.dase("info", name, "--json", *size))))
+    told = dict(fields(json.loads(bench.dase("info", name, *bench.json(), *size))))
     back = f"{name}.back.npz"
     bench.dase("convert", name, back, *size)
     lines = printed(bench.dase("info", name, *size))

@@ -15,7 +15,7 @@ from dase.diagnosis.grading import ModelOnReport, grade_effects, is_far_off, jud
 from dase.diagnosis.ranking import values_of
 from dase.diagnosis.remainder import describe_unexplained, share_of_scene, what_to_record
 from dase.diagnosis.seen_effects import SeenEffects, part_to_simulate, without_the_explained
-from dase.diagnosis.state import DiagnosisState, with_same_freedom
+from dase.diagnosis.state import DiagnosisState, DiagnosisTask, SearchPath, with_same_freedom
 from dase.fitting.confidence_intervals import estimate_parameters
 from dase.fitting.measurement import Measurement
 from dase.fitting.model import FittedModel, refit_model
@@ -47,41 +47,42 @@ def conclude_diagnosis(
         names: Effects that the sensor had before.
         measurement: The light and the events.
     """
-    order = _additions_in_order(state, model)
-    stream, repeats = SimulationStream.JUDGE.seed(state.seed), state.settings.repeats
-    way = _judged_way(state)
-    first = way.get(frozenset()) or judge_on_report(state, [start], repeats=repeats)[0]
-    mine = way.get(frozenset(order)) or judge_on_report(state, [model], repeats=repeats)[0]
+    task, path = state.task, state.path
+    order = _additions_in_order(task, path, model)
+    stream, repeats = SimulationStream.JUDGE.seed(task.seed), task.settings.repeats
+    way = _judged_way(task, path)
+    first = way.get(frozenset()) or judge_on_report(task, [start], repeats=repeats)[0]
+    mine = way.get(frozenset(order)) or judge_on_report(task, [model], repeats=repeats)[0]
     # what is far too wrong makes no claim about the camera, and steps nearer to it would lead nowhere
-    if is_far_off(first.judgement, mine.judgement, state.settings.grades):
+    if is_far_off(first.judgement, mine.judgement, task.settings.grades):
         values = values_of(model, [axis.effect.name for axis in model.space.axes])
     else:
-        model, values = estimate_parameters(state.evidence, model, seed=state.seed)
-    report = model.calibrate(state.evidence.report, repeats=repeats, seed=stream)
+        model, values = estimate_parameters(task.evidence, model, seed=task.seed)
+    report = model.calibrate(task.evidence.report, repeats=repeats, seed=stream)
     last = report.judge(stream)
     at_bounds = parameters_at_bounds(model, values)
     judged_effects: dict[str, Finding] = {}
-    if not state.evidence.contradiction:
+    if not task.evidence.contradiction:
         judged_effects = grade_effects(
-            state, model, order, way, first, last, report=report, values=values, at_bounds=at_bounds
+            task, path, model, order, way, first, last, report=report, values=values, at_bounds=at_bounds
         )
     explained = model.sensor
     for name, one in judged_effects.items():
         # a stand-in explains nothing that the events show
         explained = explained.without(name) if one.grade is Grade.STAND_IN else explained
-    part = part_to_simulate(measurement, state.evidence.when)
-    seen = without_the_explained(seen, part, explained, state.seed, before=start.sensor)
+    part = part_to_simulate(measurement, task.evidence.when)
+    seen = without_the_explained(seen, part, explained, task.seed, before=start.sensor)
     said = seen.findings(judged_effects.values(), names)
     findings = {one.effect: one for one in said if one.grade is not Grade.STAND_IN}
     kept = tuple(n for n in order if n in findings and findings[n].grade is not Grade.EITHER)
-    limits = _limits_beside(state, model, report, first.judgement, last, seen, {*findings, *order})
+    limits = _limits_beside(task, model, report, first.judgement, last, seen, {*findings, *order})
     final, error, estimates, plain = model, last.error, values, plain_numbers(report)
     if set(kept) != set(order):
-        final = _model_with_only(state, start, model, kept)
-        final, estimates = estimate_parameters(state.evidence, final, seed=state.seed)
-        bare = final.calibrate(state.evidence.report, repeats=repeats, seed=stream)
+        final = _model_with_only(task, path, start, model, kept)
+        final, estimates = estimate_parameters(task.evidence, final, seed=task.seed)
+        bare = final.calibrate(task.evidence.report, repeats=repeats, seed=stream)
         error, plain = bare.judge(stream).error, plain_numbers(bare)
-    unexplained = _what_is_left(state, model, order, findings, first.judgement, last, at_bounds)
+    unexplained = _what_is_left(task, model, order, findings, first.judgement, last, at_bounds)
     return Diagnosis(
         sensor=final.sensor,
         selected=kept,
@@ -91,10 +92,10 @@ def conclude_diagnosis(
         gate=last.gate,
         parameters=estimates,
         unexplained=unexplained,
-        history=_with_reported_errors(state, way),
-        notes=(*state.notes, *at_bounds, *state.evidence.notes),
+        history=_with_reported_errors(task, path, way),
+        notes=(*state.notes, *at_bounds, *task.evidence.notes),
         plain=plain,
-        evaluations=state.evaluations_before + state.evidence.evaluations,
+        evaluations=state.evaluations,
         findings=tuple(findings.values()),
         stand_ins=tuple(one for one in said if one.grade is Grade.STAND_IN),
         not_seen=limits,
@@ -102,29 +103,29 @@ def conclude_diagnosis(
             measurement.scene,
             list(findings.values()),
             unexplained,
-            contradiction=bool(state.evidence.contradiction),
+            contradiction=bool(task.evidence.contradiction),
         ),
         level=last.level,
         reach=last.reach,
     )
 
 
-def _additions_in_order(state: DiagnosisState, model: FittedModel) -> tuple[str, ...]:
+def _additions_in_order(task: DiagnosisTask, path: SearchPath, model: FittedModel) -> tuple[str, ...]:
     """Return the effects that were added to a model, in the order in which they were."""
-    found = state.added_to(model)
-    chosen = [n for s in state.history if s.chosen for n in s.chosen.split(" + ")]
+    found = task.added_to(model)
+    chosen = [n for s in path.history if s.chosen for n in s.chosen.split(" + ")]
     return tuple(dict.fromkeys([*(n for n in chosen if n in found), *found]))
 
 
-def _judged_way(state: DiagnosisState) -> dict[frozenset[str], ModelOnReport]:
+def _judged_way(task: DiagnosisTask, path: SearchPath) -> dict[frozenset[str], ModelOnReport]:
     """Return the models of the search by what they had added, on the part that reports."""
-    models = {frozenset(state.added_to(one)): one for one in state.path}
-    judged = judge_on_report(state, list(models.values()), repeats=state.settings.repeats)
+    models = {frozenset(task.added_to(one)): one for one in path.models}
+    judged = judge_on_report(task, list(models.values()), repeats=task.settings.repeats)
     return dict(zip(models, judged, strict=True))
 
 
 def _limits_beside(
-    state: DiagnosisState,
+    task: DiagnosisTask,
     model: FittedModel,
     report: CalibratedSubset,
     first: Judgement,
@@ -135,7 +136,7 @@ def _limits_beside(
     """Return what would have been seen of effects that are neither found nor come nearest.
 
     Args:
-        state: What the search has found.
+        task: What the diagnosis is asked.
         model: The last one.
         report: The part that reports, with that as its present model.
         first: Error of the model before the search.
@@ -143,30 +144,30 @@ def _limits_beside(
         seen: What the events show.
         found: Effects that are found or come nearest.
     """
-    if state.evidence.contradiction:
+    if task.evidence.contradiction:
         return ()
-    named, limits = {*state.given, *found}, tuple[DetectionLimit, ...]()
-    if leaves_little(first, last, state.settings.grades):
+    named, limits = {*task.given, *found}, tuple[DetectionLimit, ...]()
+    if leaves_little(first, last, task.settings.grades):
         # beside a model that is too far off for any finding, nothing can be promised
-        limits = find_detection_limits(state, model, report, first, last, named)
+        limits = find_detection_limits(task, model, report, first, last, named)
     return limits + seen.limits({*named, *(one.effect for one in limits)})
 
 
 def _model_with_only(
-    state: DiagnosisState, start: FittedModel, model: FittedModel, names: tuple[str, ...]
+    task: DiagnosisTask, path: SearchPath, start: FittedModel, model: FittedModel, names: tuple[str, ...]
 ) -> FittedModel:
     """Return the model with only some of the effects that were added, fitted."""
-    for one in (start, *state.path):
-        if set(state.added_to(one)) == set(names):
+    for one in (start, *path.models):
+        if set(task.added_to(one)) == set(names):
             return one
     sensor = model.sensor
-    for name in state.added_to(model):
+    for name in task.added_to(model):
         sensor = sensor if name in names else sensor.without(name)
-    return refit_model(state.evidence, with_same_freedom(sensor, model, ()), seed=state.seed)
+    return refit_model(task.evidence, with_same_freedom(sensor, model, ()), seed=task.seed)
 
 
 def _what_is_left(
-    state: DiagnosisState,
+    task: DiagnosisTask,
     model: FittedModel,
     order: tuple[str, ...],
     findings: Mapping[str, Finding],
@@ -177,7 +178,7 @@ def _what_is_left(
     """Return what stays unexplained, or why nothing is announced; None where all is explained.
 
     Args:
-        state: What the search has found.
+        task: What the diagnosis is asked.
         model: The last one.
         order: Effects that were added to it.
         findings: What was found.
@@ -185,9 +186,9 @@ def _what_is_left(
         last: Error of the last one.
         at_bounds: Sentences on parameters that ended where their search does.
     """
-    cells, of_scene = worst_cells(state.evidence, last), share_of_scene(state, model, last)
+    cells, of_scene = worst_cells(task.evidence, last), share_of_scene(task, model, last)
     nearest = tuple(n for n in order if n not in findings)
-    contradiction = state.evidence.contradiction
+    contradiction = task.evidence.contradiction
     doubts = [contradiction] if contradiction else at_bounds
     if (doubts and order and not findings) or contradiction:
         return replace(
@@ -219,12 +220,12 @@ def _errors_after_additions(
 
 
 def _with_reported_errors(
-    state: DiagnosisState, way: Mapping[frozenset[str], ModelOnReport]
+    task: DiagnosisTask, path: SearchPath, way: Mapping[frozenset[str], ModelOnReport]
 ) -> tuple[Step, ...]:
     """Return the steps of the search with the errors of the part that reports, so that each model has one."""
     out = []
-    for step in state.history:
-        mine = way.get(frozenset(step.model) - state.given)
+    for step in path.history:
+        mine = way.get(frozenset(step.model) - task.given)
         out.append(replace(step, error=mine.judgement.error, gate=mine.judgement.gate) if mine else step)
     return tuple(out)
 
@@ -247,12 +248,12 @@ def known_so_far(
         errors=(errors[0],),
         before=before,
         floor=1.0,
-        gate=state.history[-1].gate,
+        gate=state.path.history[-1].gate,
         parameters={},
         unexplained=None,
-        history=tuple(state.history),
-        notes=(*state.notes, *state.evidence.notes),
-        evaluations=state.evidence.evaluations,
+        history=state.path.history,
+        notes=(*state.notes, *state.task.evidence.notes),
+        evaluations=state.task.evidence.evaluations,
         seconds=seconds,
         finished=False,
     )

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import stats
 
-from dase.diagnosis.state import DiagnosisState, with_same_freedom
+from dase.diagnosis.state import DiagnosisTask, with_same_freedom
 from dase.effects.refractory import Refractory
 from dase.errors import InputError
 from dase.events import Events
@@ -208,7 +208,7 @@ def end_of_intervals(
 
 
 def add_dead_time(
-    state: DiagnosisState,
+    task: DiagnosisTask,
     model: FittedModel,
     judgement: Judgement,
     found: Signature,
@@ -217,7 +217,7 @@ def add_dead_time(
     """Return a model with the dead time that was seen, by the rule that does best; as it was if none will do.
 
     Args:
-        state: What the diagnosis works on.
+        task: What the diagnosis is asked.
         model: Without a dead time.
         judgement: Its held-out error.
         found: Where the intervals end.
@@ -229,8 +229,8 @@ def add_dead_time(
         replace(one, period=max(end - shortest, 0.5 * end)) if one.resets() else one for one in effects
     ]
     ways = [with_same_freedom(with_fixed_effect(model, one).sensor, model, ()) for one in effects]
-    fitted = run_side_by_side([refit_work(state.evidence, way, seed=state.seed, rounds=1) for way in ways])
-    judged = [state.judge(one) for one in fitted]
+    fitted = run_side_by_side([refit_work(task.evidence, way, seed=task.seed, rounds=1) for way in ways])
+    judged = [task.judge(one) for one in fitted]
     first = int(np.argmin([one.error for one in judged]))
     if judged[first].error > judgement.error + settings.worse:
         return model, judgement

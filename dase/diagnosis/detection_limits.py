@@ -20,7 +20,7 @@ from dase.diagnosis.candidates import effects_to_try, variants_to_try
 from dase.diagnosis.directional_test import RepeatCloud
 from dase.diagnosis.grading import grade_of
 from dase.diagnosis.settings import DiagnosisSettings
-from dase.diagnosis.state import DiagnosisState, explains_remainder
+from dase.diagnosis.state import DiagnosisTask, explains_remainder
 from dase.effects.base import Effect
 from dase.fitting.model import FittedModel, with_effect_added
 from dase.fitting.parameter_space import SearchAxis
@@ -75,7 +75,7 @@ class ReportedModel:
 
 
 def find_detection_limits(
-    state: DiagnosisState,
+    task: DiagnosisTask,
     model: FittedModel,
     report: CalibratedSubset,
     start: Judgement,
@@ -85,7 +85,7 @@ def find_detection_limits(
     """Return for each effect that is not found the smallest strength that would have been.
 
     Args:
-        state: What the search has found.
+        task: What the diagnosis is asked.
         model: The last one.
         report: The part that reports, with `model` as its present one.
         start: Error of the model before the search.
@@ -93,12 +93,10 @@ def find_detection_limits(
         named: Effects that are found, or named as what comes nearest.
     """
     asked = list[tuple[Effect, SearchAxis, str]]()
-    for name in effects_to_try(state.effects, model):
+    for name in effects_to_try(task.effects, model):
         if name in named:
             continue
-        tried = variants_to_try(
-            state.evidence, state.effects[name], idle_bus=state.settings.candidates.idle_bus
-        )
+        tried = variants_to_try(task.evidence, task.effects[name], idle_bus=task.settings.candidates.idle_bus)
         # the events show by themselves that there is none
         if not tried or (axis := main_axis(model, tried[0])) is None:
             continue
@@ -108,12 +106,12 @@ def find_detection_limits(
         asked.append((tried[0], axis, _rule_of_first(tried)))
     if not asked:
         return ()
-    known = _reported_model(state, model, report, start, last)
-    works = [_limit_work(state, known, effect, axis) for effect, axis, _ in asked]
+    known = _reported_model(task, model, report, start, last)
+    works = [_limit_work(task, known, effect, axis) for effect, axis, _ in asked]
     # a few at a time: all of them side by side would hold the events of hundreds of simulations
-    size, places = state.settings.detection.side_by_side, list[float | None]()
+    size, places = task.settings.detection.side_by_side, list[float | None]()
     for n in range(0, len(works), size):
-        state.progress("what would have been seen", n / len(works), last.error)
+        task.progress("what would have been seen", n / len(works), last.error)
         places += run_side_by_side(works[n : n + size])
     return tuple(
         describe_limit(effect, axis, place, rule)
@@ -182,15 +180,15 @@ def _range_of(axis: SearchAxis) -> tuple[float, float]:
 
 
 def _reported_model(
-    state: DiagnosisState, model: FittedModel, half: CalibratedSubset, start: Judgement, last: Judgement
+    task: DiagnosisTask, model: FittedModel, half: CalibratedSubset, start: Judgement, last: Judgement
 ) -> ReportedModel:
-    hidden, count = state.settings.hidden, state.settings.hidden.repeats_of_mean
+    hidden, count = task.settings.hidden, task.settings.hidden.repeats_of_mean
     tight = [axis.of_threshold for axis in model.space.axes]
     reach = np.diag(np.where(tight, hidden.threshold_reach, hidden.reach))
     sides = np.concatenate([model.place + reach, model.place - reach])
     frame = np.zeros((len(half.scale.target), 0))
     if tight:  # something is free
-        seeds = [SimulationStream.DIRECTIONS.seed(state.seed, n) for n in range(count)]
+        seeds = [SimulationStream.DIRECTIONS.seed(task.seed, n) for n in range(count)]
         plus, minus = np.split(np.mean([half.run(model.space, sides, seed=one) for one in seeds], 0), 2)
         frame = np.linalg.qr(in_standard_errors(plus - minus, half.seen).T)[0]
     off = half.scale.target - half.repeats.mean(0)
@@ -206,14 +204,14 @@ def _reported_model(
 
 
 def _limit_work(
-    state: DiagnosisState, known: ReportedModel, effect: Effect, axis: SearchAxis
+    task: DiagnosisTask, known: ReportedModel, effect: Effect, axis: SearchAxis
 ) -> Work[float | None]:
     """Return the place of the smallest strength that is seen; None where not even the largest is."""
-    settings = state.settings.detection
+    settings = task.settings.detection
     other = with_effect_added(known.model, effect)
     column = [a.name for a in other.space.axes].index(axis.name)
     weak, strong = _range_of(axis)
-    seeds = [SimulationStream.DETECTION.seed(state.seed, n) for n in range(settings.repeats)]
+    seeds = [SimulationStream.DETECTION.seed(task.seed, n) for n in range(settings.repeats)]
     # models that need more samples than the last one share them with no others: they fill a CPU's lanes alone
     slow = known.half.slow(other.space) and not known.half.slow(known.model.space)
     places = np.linspace(weak, strong, (settings.strengths_at_once if slow else settings.strengths) + 1)
@@ -240,7 +238,7 @@ def _limit_work(
     mine = np.arange(len(chance)) % settings.repeats
 
     def is_seen(done: Array) -> bool:
-        return float(np.mean(would_be_seen(known, chance + done[mine], state.settings))) >= settings.power
+        return float(np.mean(would_be_seen(known, chance + done[mine], task.settings))) >= settings.power
 
     # what the effect does to events by its place in the kernel alone, however weak it is, is not its strength
     nothing, *found = yield from simulated_work(places if slow else places[:2])

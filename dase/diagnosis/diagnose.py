@@ -30,7 +30,7 @@ from dase.diagnosis.seen_effects import (
 )
 from dase.diagnosis.settings import DEFAULTS, DiagnosisSettings
 from dase.diagnosis.silent_pixels import with_dead_pixels, without_the_explained_silence
-from dase.diagnosis.state import DiagnosisState
+from dase.diagnosis.state import DiagnosisState, DiagnosisTask
 from dase.diagnosis.unequal_thresholds import EFFECT as MISMATCH
 from dase.diagnosis.unequal_thresholds import NAME as UNEQUAL
 from dase.diagnosis.unequal_thresholds import with_unequal_thresholds
@@ -107,17 +107,18 @@ def diagnose(
         measurement, given, effects, pixels=pixels, seed=seed, device=device, settings=settings
     )
     state, given, free = _begin_search(compared, effects, free, tell, settings)
-    names = state.given
-    before, start = _error_as_given(state, given, free), _fitted_unless_worse(state, given, free)
-    shown = held_behind_low_pass(measurement, state.evidence, start, compared.split, seed=seed)
+    names = state.task.given
+    before, start = _error_as_given(state.task, given, free), _fitted_unless_worse(state, given, free)
+    shown = held_behind_low_pass(measurement, state.task.evidence, start, compared.split, seed=seed)
     if shown is not None:
         return replace(again(shown), seconds=time.perf_counter() - begin)
-    part = part_to_simulate(measurement, state.evidence.when)
+    part = part_to_simulate(measurement, state.task.evidence.when)
     seen = without_the_scene(compared.seen, part, start.sensor, seed)
     if compared.guessed is not None:
         tell("how well the scene is known", 0.0, before)
-        state.evidence = with_scene_doubt(state.evidence, compared.guessed, start, seed=seed)
-        before, start = _error_as_given(state, given, free), _fitted_unless_worse(state, start.sensor, free)
+        state.doubt_scene(with_scene_doubt(state.task.evidence, compared.guessed, start, seed=seed))
+        before = _error_as_given(state.task, given, free)
+        start = _fitted_unless_worse(state, start.sensor, free)
     seen = look_beside_model(state, seen, measurement, start)
     state.notes += compared.notes
     start, strength = _with_bursts(state, compared, seen, start)
@@ -127,14 +128,14 @@ def diagnose(
         )
     model, judgement = search_effects(state, compared, start, most)
     shown = known_at_frames_alone(
-        measurement, state.evidence, model, judgement.error, compared.split, seed=seed
+        measurement, state.task.evidence, model, judgement.error, compared.split, seed=seed
     )
     if shown is not None:
         return replace(again(shown), seconds=time.perf_counter() - begin)
-    seen, model = settle_dead_time(state, seen, measurement, model, judgement)
-    seen = settle_jitter(state, seen, measurement, model, judgement)
+    seen, model = settle_dead_time(state.task, state.events_alone, seen, measurement, model, judgement)
+    seen = settle_jitter(state.task, state.events_alone, seen, measurement, model, judgement)
     found = conclude_diagnosis(state, start, model, before, seen, names, measurement)
-    found = _with_what_pixels_show(found, state, compared, seen, model, strength)
+    found = _with_what_pixels_show(found, state.task, compared, seen, model, strength)
     return measurement.noted(replace(found, seconds=time.perf_counter() - begin))
 
 
@@ -172,18 +173,18 @@ def _begin_search(
         # how often a held frame makes pixels send is counted, and no fit tells it better
         free = [axis.name for axis in axes_of(bare, free)]
     tell("fitting the present model", 0.0, float("nan"))
-    state = DiagnosisState(
+    task = DiagnosisTask(
         evidence, compared.candidates(effects), compared.seed, tell,
         frozenset(effect.name for effect in given.effects), settings,
-        notes=notes, held=compared.measurement.held, all_time=all_time,
+        frame_held=compared.measurement.held, all_time=all_time,
     )  # fmt: skip
-    return state, given, free
+    return DiagnosisState(task, notes=notes), given, free
 
 
-def _error_as_given(state: DiagnosisState, given: Sensor, free: Sequence[str] | None) -> float:
+def _error_as_given(task: DiagnosisTask, given: Sensor, free: Sequence[str] | None) -> float:
     """Return the error of a sensor before any fit, on the part that reports."""
-    repeats, stream = state.settings.repeats // 2, SimulationStream.JUDGE.seed(state.seed)
-    return model_of(given, free).judge(state.evidence.report, repeats=repeats, seed=stream).error
+    repeats, stream = task.settings.repeats // 2, SimulationStream.JUDGE.seed(task.seed)
+    return model_of(given, free).judge(task.evidence.report, repeats=repeats, seed=stream).error
 
 
 def _fitted_unless_worse(state: DiagnosisState, given: Sensor, free: Sequence[str] | None) -> FittedModel:
@@ -194,12 +195,13 @@ def _fitted_unless_worse(state: DiagnosisState, given: Sensor, free: Sequence[st
         given: The sensor.
         free: Its parameters that may be refitted; None for all.
     """
-    evidence, seed = state.evidence, state.seed
+    evidence, seed = state.task.evidence, state.task.seed
     fitted = fit_present_model(evidence, given, free, seed=seed)
     stream = SimulationStream.JUDGE.seed(seed)
     asked = model_of(given, free)
     judged, as_given = (
-        one.judge(evidence.held, repeats=state.settings.repeats // 2, seed=stream) for one in (fitted, asked)
+        one.judge(evidence.held, repeats=state.task.settings.repeats // 2, seed=stream)
+        for one in (fitted, asked)
     )
     if not is_worse(judged.error, as_given.error, judged.gate):
         return fitted
@@ -214,19 +216,19 @@ def _with_bursts(
     state: DiagnosisState, compared: ComparedMeasurement, seen: SeenEffects, model: FittedModel
 ) -> tuple[FittedModel, BurstStrength | None]:
     """Return a model with the effect that makes the bursts, as they tell it, and that; None without any."""
-    if state.evidence.contradiction:
+    if state.task.evidence.contradiction:
         return model, None
-    strength = compared.strength_of_bursts(seen, model.sensor, state.effects)
+    strength = compared.strength_of_bursts(seen, model.sensor, state.task.effects)
     if strength is None:
         return model, None
     # pixels remember the bursts between them, too
-    state.given |= {strength.effect.name}
+    state.count_as_given(strength.effect.name)
     return with_fixed_effect(model, strength.effect), strength
 
 
 def _with_what_pixels_show(
     found: Diagnosis,
-    state: DiagnosisState,
+    task: DiagnosisTask,
     compared: ComparedMeasurement,
     seen: SeenEffects,
     model: FittedModel,
@@ -236,31 +238,31 @@ def _with_what_pixels_show(
 
     Args:
         found: By the fits alone.
-        state: What it was made with.
+        task: What the diagnosis is asked.
         compared: The measurement, and which pixels were left out.
         seen: What the events show beside the last model.
         model: The last one.
         strength: What the bursts told before the search; None without bursts.
     """
-    measurement, contradicted = compared.measurement, bool(state.evidence.contradiction)
+    measurement, contradicted = compared.measurement, bool(task.evidence.contradiction)
     ended, unequal = seen.entry_of(DEAD_TIME), seen.entry_of(UNEQUAL)
-    if ended is not None and REFRACTORY in state.effects:
+    if ended is not None and REFRACTORY in task.effects:
         found = with_dead_time(found, ended)
-    forgets = REFRACTORY in state.given and REFRACTORY not in compared.given
-    if forgets and REFRACTORY in state.effects and not contradicted:
-        found = with_longer_dead_time(found, state, measurement, model)
-    if unequal is not None and MISMATCH in state.effects:
+    forgets = REFRACTORY in task.given and REFRACTORY not in compared.given
+    if forgets and REFRACTORY in task.effects and not contradicted:
+        found = with_longer_dead_time(found, task, measurement, model)
+    if unequal is not None and MISMATCH in task.effects:
         found = with_unequal_thresholds(found, unequal)
     silent = compared.silent
     if silent is not None and silent.decides and not contradicted:
-        silent = without_the_explained_silence(silent, measurement, model.sensor, seed=state.seed)
+        silent = without_the_explained_silence(silent, measurement, model.sensor, seed=task.seed)
         found = with_dead_pixels(found, silent)
     if compared.hot is not None:
         found = with_hot_pixels(found, *hot_effect_of(measurement.events, compared.hot))
     if strength is not None:
-        state.progress("how strong the bursts are", 0.95, found.errors[-1])
+        task.progress("how strong the bursts are", 0.95, found.errors[-1])
         # beside other effects it may be another
         bare = found.sensor.without(strength.effect.name)
-        last = compared.strength_of_bursts(seen, bare, state.effects)
+        last = compared.strength_of_bursts(seen, bare, task.effects)
         found = with_effect_of_bursts(found, last or strength)
     return found

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from dase.diagnosis.candidates import Candidate, effects_to_try, variants_to_try
 from dase.diagnosis.settings import DEFAULTS
-from dase.diagnosis.state import DiagnosisState
+from dase.diagnosis.state import DiagnosisTask
 from dase.fitting.model import FittedModel, refit_model, with_effect_added
 from dase.fitting.scheduler import SimulationRequest, answer_requests
 from dase.fitting.subset import CalibratedSubset, PixelSubset
@@ -78,30 +78,30 @@ class RepeatCloud:
 
 
 def find_hidden_effect(
-    state: DiagnosisState, model: FittedModel, judgement: Judgement
+    task: DiagnosisTask, model: FittedModel, judgement: Judgement
 ) -> tuple[Candidate, float] | None:
     """Return the effect that chance hid, fitted and judged, and its p-value; None if there is none."""
-    hidden = state.settings.hidden
+    hidden = task.settings.hidden
     # also above what chance does: there no candidate may be certain by the fall of its loss
     # what the scene is not known to hides effects as chance does
-    hides = judgement.level >= hidden.hides or state.evidence.train.doubt is not None
+    hides = judgement.level >= hidden.hides or task.evidence.train.doubt is not None
     # nor does chance explain what is left, though it is little
     hides = hides or (judgement.level >= hidden.some and judgement.error > judgement.reach)
     # and right models leave less than this
     hides = hides or not leaves_nothing(judgement)
     if not hides or not reaches_floor(judgement):
         return None
-    state.progress("looking closer", 0.0, state.error)
-    start = _most_deviating_effect(state, model)
+    task.progress("looking closer", 0.0, judgement.error)
+    start = _most_deviating_effect(task, model)
     if start is None:
         return None
     name, begin, p_value = start
-    fitted = refit_model(state.evidence, begin, seed=state.seed, rounds=1)
-    repeats = state.settings.repeats
-    judged = fitted.judge(state.evidence.held, repeats=repeats, seed=SimulationStream.JUDGE.seed(state.seed))
+    fitted = refit_model(task.evidence, begin, seed=task.seed, rounds=1)
+    repeats = task.settings.repeats
+    judged = fitted.judge(task.evidence.held, repeats=repeats, seed=SimulationStream.JUDGE.seed(task.seed))
     if not reaches_floor(judged):
         return None
-    if deviation_towards(state, state.evidence.held, model, fitted) < hidden.away_held_out:
+    if deviation_towards(task, task.evidence.held, model, fitted) < hidden.away_held_out:
         return None
     return Candidate(name, fitted, fitted.loss, judgement=judged), p_value
 
@@ -112,18 +112,18 @@ def may_hide_effect(judgement: Judgement, hides: float = DEFAULTS.hidden.hides) 
 
 
 def lacks_effect_of(
-    state: DiagnosisState, model: FittedModel, judgement: Judgement, other: FittedModel
+    task: DiagnosisTask, model: FittedModel, judgement: Judgement, other: FittedModel
 ) -> bool:
     """Whether a closer look shows that a model, which leaves what is judged, lacks what another one has."""
-    hidden = state.settings.hidden
+    hidden = task.settings.hidden
     if not may_hide_effect(judgement, hidden.hides):
         return False
-    ways = ((state.evidence.train, hidden.away), (state.evidence.held, hidden.away_held_out))
-    return all(deviation_towards(state, half, model, other) >= least for half, least in ways)
+    ways = ((task.evidence.train, hidden.away), (task.evidence.held, hidden.away_held_out))
+    return all(deviation_towards(task, half, model, other) >= least for half, least in ways)
 
 
 def deviation_towards(
-    state: DiagnosisState,
+    task: DiagnosisTask,
     subset: PixelSubset,
     model: FittedModel,
     other: FittedModel,
@@ -133,37 +133,35 @@ def deviation_towards(
     """Return how far a measurement is from repeats of a model, on the way to another, in their deviations.
 
     Args:
-        state: Seeds and settings.
+        task: Seeds and settings.
         subset: Where both are run.
         model: Whose repeats the measurement is compared with.
         other: Towards which.
         doubt: What each statistic may be off by for other reasons than chance, shape (J,).
     """
-    half, cloud, seen = _repeat_cloud(state, subset, model)
+    half, cloud, seen = _repeat_cloud(task, subset, model)
     if doubt is not None:
         cloud = replace(cloud, doubt=compared_in_standard_errors(doubt, half.chance))
-    one, two = _mean_statistics(state, half, [(model, model.place[None]), (other, other.place[None])])
+    one, two = _mean_statistics(task, half, [(model, model.place[None]), (other, other.place[None])])
     # a way far along few statistics would count only these, of which none may decide
     way = cloud.clipped(compared_in_standard_errors(two - one, half.chance))
     return float(cloud.deviations_along(way, seen)[0])
 
 
-def _most_deviating_effect(
-    state: DiagnosisState, model: FittedModel
-) -> tuple[str, FittedModel, float] | None:
+def _most_deviating_effect(task: DiagnosisTask, model: FittedModel) -> tuple[str, FittedModel, float] | None:
     """Return the effect on whose way the measurement is farthest from the model, where to begin, a p-value.
 
     For that, repeats stand in for the measurement, each on the way on which it is farthest.
     """
-    hidden = state.settings.hidden
-    half, cloud, seen = _repeat_cloud(state, state.evidence.train, model)
+    hidden = task.settings.hidden
+    half, cloud, seen = _repeat_cloud(task, task.evidence.train, model)
     threshold = [axis.of_threshold for axis in model.space.axes]
     reach = np.where(threshold, hidden.threshold_reach, hidden.reach)
     sides = np.concatenate([model.place[None], model.place + np.diag(reach), model.place - np.diag(reach)])
-    probed = _models_to_probe(state, model, half)
+    probed = _models_to_probe(task, model, half)
     if not probed:
         return None
-    here, *there = _mean_statistics(state, half, [(model, sides), *((m, places) for _, m, places in probed)])
+    here, *there = _mean_statistics(task, half, [(model, sides), *((m, places) for _, m, places in probed)])
     plus, minus = np.split(here[1:], 2)
     slopes = compared_in_standard_errors(0.5 * (plus - minus), half.chance).T
     ways = cloud.clipped(compared_in_standard_errors(np.concatenate(there) - here[0], half.chance))
@@ -205,14 +203,14 @@ def _starting_model(model: FittedModel, other: FittedModel, place: Array, step: 
 
 
 def _models_to_probe(
-    state: DiagnosisState, model: FittedModel, half: PixelSubset
+    task: DiagnosisTask, model: FittedModel, half: PixelSubset
 ) -> list[tuple[str, FittedModel, Array]]:
     """Return effects, the models with them, and the places where those are looked at; none that are slow."""
     out = []
-    effects, idle_bus = state.effects, state.settings.candidates.idle_bus
-    strengths = np.array(state.settings.hidden.strengths)
+    effects, idle_bus = task.effects, task.settings.candidates.idle_bus
+    strengths = np.array(task.settings.hidden.strengths)
     names = effects_to_try(effects, model)
-    for effect in (e for n in names for e in variants_to_try(state.evidence, effects[n], idle_bus=idle_bus)):
+    for effect in (e for n in names for e in variants_to_try(task.evidence, effects[n], idle_bus=idle_bus)):
         other = with_effect_added(model, effect)
         columns = [
             n for n, a in enumerate(other.space.axes) if a.name.split(".")[0] == effect.name and a.main
@@ -228,32 +226,30 @@ def _models_to_probe(
 
 
 def _repeat_cloud(
-    state: DiagnosisState, subset: PixelSubset, model: FittedModel
+    task: DiagnosisTask, subset: PixelSubset, model: FittedModel
 ) -> tuple[CalibratedSubset, RepeatCloud, Array]:
     """Return a half with a model as its present one, the repeats of it, and the measurement beside these.
 
     That is in standard errors from the repeats' mean, shape (J,).
     """
-    half = model.calibrate(
-        subset, repeats=state.settings.repeats, seed=SimulationStream.CLOUD.seed(state.seed)
-    )
+    half = model.calibrate(subset, repeats=task.settings.repeats, seed=SimulationStream.CLOUD.seed(task.seed))
     repeats = half.repeats
     middle = repeats.mean(0)
     seen = compared_in_standard_errors(half.chance.target - middle, half.chance)
     drift = None if half.drift is None else compared_in_standard_errors(half.drift, half.chance)
     cloud = RepeatCloud(
         compared_in_standard_errors(repeats - middle, half.chance),
-        state.settings.hidden.most_of_one,
+        task.settings.hidden.most_of_one,
         drift=drift,
     )
     return half, cloud, seen
 
 
 def _mean_statistics(
-    state: DiagnosisState, half: CalibratedSubset, models: Sequence[tuple[FittedModel, Array]]
+    task: DiagnosisTask, half: CalibratedSubset, models: Sequence[tuple[FittedModel, Array]]
 ) -> list[Array]:
     """Return the mean statistics of models at some places, (M, J) each, their random numbers in common."""
-    count = state.settings.hidden.repeats_of_mean
-    seeds = [SimulationStream.DIRECTIONS.seed(state.seed, n) for n in range(count)]
+    count = task.settings.hidden.repeats_of_mean
+    seeds = [SimulationStream.DIRECTIONS.seed(task.seed, n) for n in range(count)]
     values = answer_requests([SimulationRequest(half, m.space, p, seed) for m, p in models for seed in seeds])
     return [np.mean(values[n : n + count], 0) for n in range(0, len(values), count)]

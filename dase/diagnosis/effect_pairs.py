@@ -28,11 +28,12 @@ def add_pair(
     Returns:
         The model with the best pair and its error, the given ones where none is better by enough.
     """
-    evidence, seed, settings = state.evidence, state.seed, state.settings
-    if not state.first:
+    task, path = state.task, state.path
+    evidence, seed, settings = task.evidence, task.seed, task.settings
+    if not path.first:
         return model, judgement
-    before, start = state.history[state.first_step], state.path[state.first_step]
-    singles = [one for one in state.first if one.screened_loss < settings.pair_helps_alone][: settings.paired]
+    before, start = path.history[path.first_step], path.models[path.first_step]
+    singles = [one for one in path.first if one.screened_loss < settings.pair_helps_alone][: settings.paired]
     scout = start.calibrate(
         evidence.scout, repeats=settings.scout_repeats, seed=SimulationStream.CALIBRATE_SCOUT.seed(seed)
     )
@@ -50,7 +51,7 @@ def add_pair(
         for way in (pair, *ways_otherwise(pair, (one.name, two.name))):
             works.append(way.search_work(scout, seed=seed, iterations=4, radius=0.3, over=race.over(name)))
             names.append(name)
-    ends = run_side_by_side(works, lambda share: state.progress("trying pairs", share, state.error))
+    ends = run_side_by_side(works, lambda share: task.progress("trying pairs", share, judgement.error))
     best = dict[str, FittedModel]()
     for name, pair in sorted(zip(names, ends, strict=True), key=lambda named: named[1].loss):
         best.setdefault(name, pair)
@@ -58,11 +59,11 @@ def add_pair(
     settled = run_side_by_side([refit_work(evidence, pair, seed=seed) for _, pair in first])
     ranking: list[Rank] = []
     for (name, _), pair in zip(first, settled, strict=True):
-        judged = state.judge(pair)
+        judged = task.judge(pair)
         ranking = sorted([*ranking, rank_of_pair(name, pair, judged, before)], key=_error_of_rank)
         if judged.error < judgement.error * (1.0 if reaches_floor(judged) else settings.pair_gain):
             model, judgement = pair, judged
-            state.history.append(replace(before, chosen=name, ties=(), ranking=tuple(ranking), cells=()))
+            state.add_step(replace(before, chosen=name, ties=(), ranking=tuple(ranking), cells=()))
     return model, judgement
 
 

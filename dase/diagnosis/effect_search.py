@@ -29,7 +29,7 @@ from dase.diagnosis.redrawn_thresholds import EFFECT as JITTER
 from dase.diagnosis.redrawn_thresholds import NAME as REDRAWN
 from dase.diagnosis.redrawn_thresholds import add_jitter, find_jitter_beside
 from dase.diagnosis.settings import DEFAULTS, DiagnosisSettings
-from dase.diagnosis.state import DiagnosisState, explains_remainder
+from dase.diagnosis.state import DiagnosisState, DiagnosisTask, explains_remainder
 from dase.fitting.model import FittedModel, refit_model, with_full_range
 from dase.fitting.scene_doubt import with_scene_doubt
 from dase.probes.distance import Judgement, leaves_nothing, reaches_floor, worst_families
@@ -43,8 +43,7 @@ def search_effects(
     """Add effects to a model until none is missing, and drop those that are not needed.
 
     Args:
-        state: Gets the steps of the search; its evidence becomes that of all of the time where what is left
-            comes late.
+        state: Its path grows; the measurement is split anew where what is left comes late.
         compared: The measurement.
         start: The model before the search.
         most: Effects that are added at most; 0 for none.
@@ -53,31 +52,32 @@ def search_effects(
         The last model and its held-out error.
     """
     # what is not of this scene has no effects to be found
-    most = 0 if state.evidence.contradiction else most
+    most = 0 if state.task.evidence.contradiction else most
     model, judgement = _add_one_by_one(state, compared, start, most)
-    if most > 0 and not state.all_time and _shows_later_alone(state, model, judgement):
+    if most > 0 and not state.task.all_time and _shows_later_alone(state.task, model, judgement):
         model = _fit_all_of_the_time(state, compared, model, judgement)
-        model, judgement = _add_one_by_one(state, compared, model, _left_to_add(state, model, most))
-    if not _is_enough(state, judgement) and most > 1:
+        model, judgement = _add_one_by_one(state, compared, model, _left_to_add(state.task, model, most))
+    task = state.task  # the measurement is split no more
+    if not _is_enough(task, judgement) and most > 1:
         model, judgement = _go_the_other_way(state, compared, model, judgement, most)
     if not reaches_floor(judgement) and most > 1:
         single = model
         model, judgement = add_pair(state, model, judgement)
         if model is not single and not leaves_nothing(judgement):
             # beside a right pair shows what no effect alone did
-            model, judgement = _add_one_by_one(state, compared, model, _left_to_add(state, model, most))
-    if len(state.added_to(model)) > 1:
+            model, judgement = _add_one_by_one(state, compared, model, _left_to_add(task, model, most))
+    if len(task.added_to(model)) > 1:
         whole = model
-        model, judgement = prune_model(state, model, judgement)
-        if model is not whole and not leaves_nothing(judgement) and not state.has_asked(model):
+        model, judgement = prune_model(task, state.path, model, judgement)
+        if model is not whole and not leaves_nothing(judgement) and not state.path.has_asked(model):
             # a stand-in that was dropped may have hidden what it stood for
-            model, judgement = _add_one_by_one(state, compared, model, _left_to_add(state, model, most))
-    return _fit_beyond_the_search(state, model, judgement)
+            model, judgement = _add_one_by_one(state, compared, model, _left_to_add(task, model, most))
+    return _fit_beyond_the_search(task, model, judgement)
 
 
-def _is_enough(state: DiagnosisState, judgement: Judgement) -> bool:
+def _is_enough(task: DiagnosisTask, judgement: Judgement) -> bool:
     """Whether another way would lead no farther; what guessed light leaves does not say that it would."""
-    guessed = state.evidence.held.doubt is not None
+    guessed = task.evidence.held.doubt is not None
     return reaches_floor(judgement) if guessed else leaves_nothing(judgement)
 
 
@@ -90,32 +90,31 @@ def _go_the_other_way(
     way that has reached the floor is left only for one that leaves no more than chance may.
 
     Args:
-        state: Its steps become those of this way, where it is the better one.
+        state: Its path becomes that of this way, where it is the better one.
         compared: The measurement.
         model: The last one of the first way.
         judgement: Its held-out error.
         most: Effects that are added at most.
     """
-    settings, at = state.settings, state.first_step
+    task, path, settings = state.task, state.path, state.task.settings
     # a number of samples and no time, so that what is found does not hang on the machine
-    if not state.first or state.samples > settings.other_way_samples:
+    if not path.first or state.samples > settings.other_way_samples:
         return model, judgement
-    first = state.history[at]
-    reach = settings.other_way * state.first[0].screened_loss
+    first, start = path.history[path.first_step], path.models[path.first_step]
+    reach = settings.other_way * path.first[0].screened_loss
     open_ = [
-        one for one in state.first
-        if one.name != first.chosen and one.name not in state.added_to(model)
+        one for one in path.first
+        if one.name != first.chosen and one.name not in task.added_to(model)
         and one.screened_loss < min(reach, settings.pair_helps_alone)
     ]  # fmt: skip
     if not open_:
         return model, judgement
-    other, before = open_[0], state.ways()
-    state.history, state.path = state.history[:at], state.path[: at + 1]
-    state.history.append(replace(first, chosen=other.name, ties=()))
-    judged_with_it = [one for one in state.first if one.judgement]
-    state.note_addition(other, judged_with_it, (), state.judge(state.path[at]))
-    begin = refit_model(state.evidence, other.model, seed=state.seed, rounds=1)
-    found, judged = _add_one_by_one(state, compared, begin, _left_to_add(state, begin, most))
+    other = open_[0]
+    state.leave_at_first_step()
+    state.add_step(replace(first, chosen=other.name, ties=()))
+    state.note_addition(other, [one for one in path.first if one.judgement], task.judge(start))
+    begin = refit_model(task.evidence, other.model, seed=task.seed, rounds=1)
+    found, judged = _add_one_by_one(state, compared, begin, _left_to_add(task, begin, most))
     if reaches_floor(judgement):
         better = explains_remainder(judged, judgement, settings)
     else:
@@ -123,53 +122,53 @@ def _go_the_other_way(
         better = judged.error < gain * judgement.error
     if better:
         return found, judged
-    state.go_back(before)
+    state.go_back(path)
     return model, judgement
 
 
 def _fit_beyond_the_search(
-    state: DiagnosisState, model: FittedModel, judgement: Judgement
+    task: DiagnosisTask, model: FittedModel, judgement: Judgement
 ) -> tuple[FittedModel, Judgement]:
     """Return a model fitted over all of the range, if a value ended where the search for it does; else it.
 
     Args:
-        state: The measurement.
+        task: The measurement.
         model: The last one.
         judgement: Its held-out error.
     """
-    far = judgement.error > state.settings.pruning.lost * judgement.gate
+    far = judgement.error > task.settings.pruning.lost * judgement.gate
     wide = None if far or leaves_nothing(judgement) else with_full_range(model)
     if wide is None:
         return model, judgement
-    state.progress("fitting beyond the search", 0.9, judgement.error)
-    found = refit_model(state.evidence, wide, seed=state.seed)
-    judged = state.judge(found)
+    task.progress("fitting beyond the search", 0.9, judgement.error)
+    found = refit_model(task.evidence, wide, seed=task.seed)
+    judged = task.judge(found)
     return (found, judged) if judged.error < judgement.error else (model, judgement)
 
 
-def _left_to_add(state: DiagnosisState, model: FittedModel, most: int) -> int:
+def _left_to_add(task: DiagnosisTask, model: FittedModel, most: int) -> int:
     """Return how many effects may be added yet; a pair beside what is certain may have taken one too many."""
-    return max(most - len(state.added_to(model)), 0)
+    return max(most - len(task.added_to(model)), 0)
 
 
 def _add_one_by_one(
     state: DiagnosisState, compared: ComparedMeasurement, model: FittedModel, most: int
 ) -> tuple[FittedModel, Judgement]:
     """Add the best effect as long as one is missing; return the model and its held-out error."""
-    errors, far = list[float](), False
+    task, errors, far = state.task, list[float](), False
     for _ in range(most + 1):
-        state.path.append(model)
+        state.add_model(model)
         # what is far from the floor needs no exact error
-        judgement = state.judge(model, repeats=state.settings.candidates.few_repeats if far else None)
+        judgement = task.judge(model, repeats=task.settings.candidates.few_repeats if far else None)
         errors.append(judgement.error)
         more = len(errors) <= most
         step, better, far = _look_for_effect(state, model, judgement, more)
         if better is None and more:
-            hidden = find_hidden_effect(state, model, judgement)
+            hidden = find_hidden_effect(task, model, judgement)
             hidden = hidden or _find_jitter(state, compared, model, judgement)
             if hidden is not None:
                 step, better = _note_hidden_effect(state, *hidden, step, judgement), hidden[0].model
-        state.history.append(step)
+        state.add_step(step)
         state.after_step(model if better is None else better, errors)
         if better is None:
             break
@@ -190,48 +189,49 @@ def _find_jitter(
         model: The last one.
         judgement: Its held-out error.
     """
-    if JITTER not in effects_to_try(state.effects, model) or compared.seen.lamp:
+    task = state.task
+    if JITTER not in effects_to_try(task.effects, model) or compared.seen.lamp:
         return None
     # where events come at fractions of frames, light between them says little of thresholds
-    if state.evidence.frame_step or not compared.seen.may_name(REDRAWN):
+    if task.evidence.frame_step or not compared.seen.may_name(REDRAWN):
         return None
-    state.progress("looking at thresholds", 0.0, state.error)
-    found = find_jitter_beside(state, compared.measurement, model, judgement)
-    better = None if found is None else add_jitter(state, model, judgement, found)
+    task.progress("looking at thresholds", 0.0, judgement.error)
+    noise = state.events_alone.noise
+    found = find_jitter_beside(compared.measurement, model, judgement, noise=noise, seed=task.seed)
+    better = None if found is None else add_jitter(task, model, judgement, found)
     if found is None or better is None:
         return None
-    state.certain |= {JITTER}
+    state.make_certain(JITTER)
     return better, found.p
 
 
-def _shows_later_alone(state: DiagnosisState, model: FittedModel, judgement: Judgement) -> bool:
+def _shows_later_alone(task: DiagnosisTask, model: FittedModel, judgement: Judgement) -> bool:
     """Whether a model that fails where it is judged is nearly right where it was fitted.
 
     What comes late in a recording, as the first events of a slow leak do, no fit to its first part can find.
     """
     if reaches_floor(judgement):
         return False
-    repeats, stream = state.settings.candidates.few_repeats, SimulationStream.JUDGE.seed(state.seed)
-    fitted = model.judge(state.evidence.train, repeats=repeats, seed=stream)
+    repeats, stream = task.settings.candidates.few_repeats, SimulationStream.JUDGE.seed(task.seed)
+    fitted = model.judge(task.evidence.train, repeats=repeats, seed=stream)
     excess = max(fitted.error - fitted.level, 0.0) / max(judgement.error - judgement.level, 1e-9)
-    return excess < state.settings.later
+    return excess < task.settings.later
 
 
 def _fit_all_of_the_time(
     state: DiagnosisState, compared: ComparedMeasurement, model: FittedModel, judgement: Judgement
 ) -> FittedModel:
     """Split the measurement anew, so that all of its time is fitted; return the model, fitted to that."""
-    state.progress("fitting all of the time", 0.0, judgement.error)
-    state.evaluations_before += state.evidence.evaluations
-    state.samples_before += state.evidence.samples
+    seed = state.task.seed
+    state.task.progress("fitting all of the time", 0.0, judgement.error)
     evidence = compared.split(all_time=True)
     if compared.guessed is not None:
-        evidence = with_scene_doubt(evidence, compared.guessed, model, seed=state.seed)
-    state.evidence, state.all_time = evidence, True
+        evidence = with_scene_doubt(evidence, compared.guessed, model, seed=seed)
+    state.split_anew(evidence)
     state.notes.append(
         "what is left comes late in the recording: all of its time is fitted, and other pixels judge"
     )
-    return refit_model(evidence, model, seed=state.seed)
+    return refit_model(evidence, model, seed=seed)
 
 
 def _look_for_effect(
@@ -239,24 +239,32 @@ def _look_for_effect(
 ) -> tuple[Step, FittedModel | None, bool]:
     """Try all effects.
 
+    Args:
+        state: Gets which effects were tried alone or put off, the first candidates, and what pruning needs to
+            know of the effect that is added.
+        model: The last one.
+        judgement: Its held-out error.
+        more: Whether any may be added yet.
+
     Returns:
         What was found, the model with the best of them, None if there is none, and whether that is still far
         from the floor.
     """
-    evidence, seed, settings = state.evidence, state.seed, state.settings
+    task = state.task
+    evidence, seed, settings = task.evidence, task.seed, task.settings
     names = tuple(e.name for e in model.space.sensor.effects)
     cells = worst_cells(evidence, judgement)
     step = Step(names, judgement.error, judgement.gate, judgement.families, (), None, (), cells)
     if leaves_nothing(judgement) or not more:
         return step, None, False
-    open_names = effects_to_try(state.effects, model)
+    open_names = effects_to_try(task.effects, model)
     # what is certain comes first, and by itself: everything else is judged beside it
     certain = [
         name for name in open_names
-        if name in state.certain - state.tried_alone
-        and variants_to_try(evidence, state.effects[name], idle_bus=settings.candidates.idle_bus)
+        if name in state.path.certain - state.events_alone.tried_alone
+        and variants_to_try(evidence, task.effects[name], idle_bus=settings.candidates.idle_bus)
     ]  # fmt: skip
-    state.tried_alone |= frozenset(certain)
+    state.try_alone(certain)
     open_names = certain or open_names
     if not open_names:
         return step, None, False
@@ -266,27 +274,27 @@ def _look_for_effect(
         scout_repeats=settings.scout_repeats, seed=seed,
     )  # fmt: skip
     tried = try_effects(
-        present, model, state.effects, open_names, worst=worst_families(judgement), far=far,
-        seed=seed, report=lambda text, share: state.progress(text, share, state.error),
+        present, model, task.effects, open_names, worst=worst_families(judgement), far=far,
+        seed=seed, report=lambda text, share: task.progress(text, share, judgement.error),
         settings=settings.candidates,
     )  # fmt: skip
     step = replace(step, ranking=tuple(rank_of(one, judgement) for one in tried))
-    if not state.first and not certain:
-        state.first, state.first_step = sorted(tried, key=lambda one: one.screened_loss), len(state.history)
-    best, ties = _best_candidate(state, tried, judgement)
+    if not certain:
+        state.keep_first_candidates(tried)
+    best, ties = _best_candidate(settings, tried, judgement)
     if certain == [REFRACTORY] and not reaches_floor(judgement):
         share = rank_of(best, judgement).share if best is not None else 0.0
         if share < settings.dead_time_share:
-            state.certain -= {REFRACTORY}
-            state.put_off |= {REFRACTORY}
+            state.put_off(REFRACTORY)
             return _look_for_effect(state, model, judgement, more)
     if best is None and certain:
-        best = _shown_whatever_fits(state, tried, judgement)
+        shown = [one for one in tried if one.name in state.events_alone.shown]
+        best = _shown_unless_worse(task, shown, judgement)
         if best is None:
             return _look_for_effect(state, model, judgement, more)
     if best is None:
         return step, None, False
-    state.note_addition(best, [one for one in tried if one.judgement], ties, judgement)
+    state.note_addition(best, [one for one in tried if one.judgement], judgement)
     step = replace(step, chosen=best.name, ties=ties)
     on_its_way = best.error > settings.on_its_way * judgement.gate
     # what is added next moves all of it again
@@ -295,28 +303,31 @@ def _look_for_effect(
     return step, refit_model(fitted, best.model, seed=seed, rounds=1), on_its_way
 
 
-def _shown_whatever_fits(
-    state: DiagnosisState, tried: Sequence[Candidate], judgement: Judgement
+def _shown_unless_worse(
+    task: DiagnosisTask, shown: Sequence[Candidate], judgement: Judgement
 ) -> Candidate | None:
     """Return the noise, leak or mismatch that is there, if the model is no worse with it.
 
     However little the error falls, it is there, and all else is to be judged beside it.
+
+    Args:
+        task: What the diagnosis is asked.
+        shown: Candidates that are there whatever fits.
+        judgement: Held-out error of the model without them.
     """
-    shown = [one for one in tried if one.name in state.shown]
     if not shown:
         return None
     judged = [one for one in shown if one.judgement] or refit_and_judge(
-        state.evidence, shown, seed=state.seed, settings=state.settings.candidates
+        task.evidence, shown, seed=task.seed, settings=task.settings.candidates
     )
     best = min(judged, key=lambda one: one.error)
     return best if best.judgement and best.error <= judgement.error else None
 
 
 def _best_candidate(
-    state: DiagnosisState, tried: Sequence[Candidate], judgement: Judgement
+    settings: DiagnosisSettings, tried: Sequence[Candidate], judgement: Judgement
 ) -> tuple[Candidate | None, tuple[str, ...]]:
     """Return the candidate that is to be added, None if there is none, and those not told apart from it."""
-    settings = state.settings
     finalists = [one for one in tried if one.judgement]
     right = reaches_floor(judgement)
     if right:
@@ -358,7 +369,7 @@ def _note_hidden_effect(
     state: DiagnosisState, hidden: Candidate, p_value: float, step: Step, judgement: Judgement
 ) -> Step:
     """Return a step with an effect that only a closer look shows as the chosen one."""
-    state.note_addition(hidden, [hidden], (), judgement)
+    state.note_addition(hidden, [hidden], judgement)
     rank = rank_of(replace(hidden, p_value=p_value), judgement)
     others = tuple(r for r in step.ranking if r.effect != hidden.name)
     return replace(step, ranking=(rank, *others), chosen=hidden.name)

@@ -31,7 +31,7 @@ from numpy.typing import NDArray
 from dase.diagnosis.candidates import Candidate
 from dase.diagnosis.directional_test import deviation_towards
 from dase.diagnosis.settings import GradeSettings
-from dase.diagnosis.state import DiagnosisState, with_same_freedom
+from dase.diagnosis.state import DiagnosisTask, SearchPath, with_same_freedom
 from dase.fitting.early_stopping import CandidateRace
 from dase.fitting.model import FittedModel, refit_work
 from dase.fitting.scene_doubt import misfit_beyond_chance
@@ -53,16 +53,17 @@ class ModelOnReport:
 
 
 def judge_on_report(
-    state: DiagnosisState, models: Sequence[FittedModel], *, repeats: int
+    task: DiagnosisTask, models: Sequence[FittedModel], *, repeats: int
 ) -> list[ModelOnReport]:
     """Return the errors of models on the part by which nothing is chosen."""
-    stream = SimulationStream.JUDGE.seed(state.seed)
-    works = [m.judgement_work(state.evidence.report, repeats=repeats, seed=stream) for m in models]
+    stream = SimulationStream.JUDGE.seed(task.seed)
+    works = [m.judgement_work(task.evidence.report, repeats=repeats, seed=stream) for m in models]
     return [ModelOnReport(m, j) for m, j in zip(models, run_side_by_side(works), strict=True)]
 
 
 def grade_effects(
-    state: DiagnosisState,
+    task: DiagnosisTask,
+    path: SearchPath,
     model: FittedModel,
     found: Sequence[str],
     way: Mapping[frozenset[str], ModelOnReport],
@@ -76,7 +77,8 @@ def grade_effects(
     """Return what is to be said of each effect that a search has added.
 
     Args:
-        state: What the search has found.
+        task: What the diagnosis is asked.
+        path: What did nearly as well as an effect when it was added.
         model: With all effects.
         found: Their names, in the order in which they are announced.
         way: Models of the search by what they had added.
@@ -88,7 +90,7 @@ def grade_effects(
     """
     if not found:
         return {}
-    settings = state.settings.grades
+    settings = task.settings.grades
     mine = {n: {axis: v for axis, v in values.items() if axis.split(".")[0] == n} for n in found}
     if not leaves_little(start.judgement, last, settings):
         # whatever is left without them, none is found: only what the search knows by the way is said
@@ -99,10 +101,10 @@ def grade_effects(
                 error_with=last.error, parameters=mine[name],
             ) for name, bare in alone.items()
         }  # fmt: skip
-    without = _models_without(state, model, found, {frozenset(): start, **way})
+    without = _models_without(task, model, found, {frozenset(): start, **way})
     misfit = misfit_beyond_chance(report)
     deviations = {
-        name: deviation_towards(state, state.evidence.report, without[name].model, model, doubt=misfit)
+        name: deviation_towards(task, task.evidence.report, without[name].model, model, doubt=misfit)
         for name in found
     }
 
@@ -112,11 +114,11 @@ def grade_effects(
             start.judgement, bare, last, deviations[name], has_rivals=has_rivals, settings=settings
         )
 
-    step = float(np.median(np.diff(state.evidence.when)))
-    shortest = max(settings.shortest_time * step, state.held)
+    step = float(np.median(np.diff(task.evidence.when)))
+    shortest = max(settings.shortest_time * step, task.frame_held)
     grades = {name: graded(name, False) for name in found}
     shown = [name for name, (grade, _) in grades.items() if grade is not Grade.STAND_IN]
-    rivals = _equally_good_rivals(state, model, shown, {name for name in shown if grades[name][1]})
+    rivals = _equally_good_rivals(task, path, model, shown, {name for name in shown if grades[name][1]})
     out: dict[str, Finding] = {}
     for name in found:
         others = rivals.get(name, ())
@@ -256,7 +258,7 @@ def grade_of(
 
 
 def _models_without(
-    state: DiagnosisState,
+    task: DiagnosisTask,
     model: FittedModel,
     found: Sequence[str],
     way: Mapping[frozenset[str], ModelOnReport],
@@ -269,9 +271,9 @@ def _models_without(
     wanted = {name: frozenset(found) - {name} for name in found}
     missing = [name for name in found if wanted[name] not in way]
     less = [with_same_freedom(model.sensor.without(name), model, ()) for name in missing]
-    fitted = run_side_by_side([refit_work(state.evidence, one, seed=state.seed, rounds=2) for one in less])
+    fitted = run_side_by_side([refit_work(task.evidence, one, seed=task.seed, rounds=2) for one in less])
     bare = [with_same_freedom(model.sensor.without(name), model, ()) for name in found]
-    judged = judge_on_report(state, [*fitted, *bare], repeats=state.settings.grades.repeats)
+    judged = judge_on_report(task, [*fitted, *bare], repeats=task.settings.grades.repeats)
     every = [*way.items(), *((wanted[n], one) for n, one in zip([*missing, *found], judged, strict=True))]
     return {
         name: min((one for names, one in every if names <= wanted[name]), key=lambda one: one.judgement.error)
@@ -280,7 +282,7 @@ def _models_without(
 
 
 def _rivals_to_try(
-    state: DiagnosisState, model: FittedModel, name: str, *, doubtful: bool
+    task: DiagnosisTask, path: SearchPath, model: FittedModel, name: str, *, doubtful: bool
 ) -> list[Candidate]:
     """Return the candidates that did nearly as well when an effect was added.
 
@@ -288,38 +290,44 @@ def _rivals_to_try(
     something unknown may look like the simple one, that may well be the other.
 
     Args:
-        state: What the search has found.
+        task: What the diagnosis is asked.
+        path: What did nearly as well as an effect when it was added.
         model: With the effect.
         name: Of the effect.
         doubtful: Whether something unknown may look like it.
     """
-    settings, out = state.settings.grades, list[Candidate]()
-    for other in state.alternatives.get(name, []):
-        includes = name in state.effects[other.name].includes if other.name in state.effects else False
+    settings, out = task.settings.grades, list[Candidate]()
+    for other in path.alternatives.get(name, []):
+        includes = name in task.effects[other.name].includes if other.name in task.effects else False
         if other.name in model.space.sensor or (includes and not doubtful) or other.judgement is None:
             continue
         level = max(other.judgement.level, settings.usual)
-        near = settings.rival * max(state.error_of.get(name, 0.0) - level, 0.0) + settings.tie
+        near = settings.rival * max(path.error_of.get(name, 0.0) - level, 0.0) + settings.tie
         if other.error - level <= near:
             out.append(other)
     return out[: settings.rivals]
 
 
 def _equally_good_rivals(
-    state: DiagnosisState, model: FittedModel, found: Sequence[str], doubtful: Collection[str]
+    task: DiagnosisTask,
+    path: SearchPath,
+    model: FittedModel,
+    found: Sequence[str],
+    doubtful: Collection[str],
 ) -> dict[str, tuple[str, ...]]:
     """Return for each effect those that do nearly as well in its place, the rest fitted again.
 
     Args:
-        state: What the search has found.
+        task: What the diagnosis is asked.
+        path: What did nearly as well as an effect when it was added.
         model: With all effects.
         found: Names of those that are asked about.
         doubtful: Those of them that something unknown may look like, see `_rivals_to_try`.
     """
-    settings, seed = state.settings.grades, state.seed
+    settings, seed = task.settings.grades, task.seed
     asked: list[tuple[str, str, FittedModel]] = []
     for name in found:
-        for other in _rivals_to_try(state, model, name, doubtful=name in doubtful):
+        for other in _rivals_to_try(task, path, model, name, doubtful=name in doubtful):
             sensor = model.sensor.without(name).with_effect(other.model.sensor[other.name])
             asked.append((name, other.name, with_same_freedom(sensor, model, [other.name])))
     out: dict[str, list[str]] = {name: [] for name in found}
@@ -328,13 +336,13 @@ def _equally_good_rivals(
         race = CandidateRace(1, settings.rival_loses, best={"": model.loss})
         fitted = run_side_by_side(
             [
-                refit_work(state.evidence, one, seed=seed, rounds=2, over=race.over(f"{name} {other}"))
+                refit_work(task.evidence, one, seed=seed, rounds=2, over=race.over(f"{name} {other}"))
                 for name, other, one in asked
             ]
         )
         stream = SimulationStream.JUDGE.seed(seed)
         works = [
-            m.judgement_work(state.evidence.held, repeats=settings.repeats, seed=stream)
+            m.judgement_work(task.evidence.held, repeats=settings.repeats, seed=stream)
             for m in (model, *fitted)
         ]
         mine, *others = run_side_by_side(works)

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from dase.diagnosis.dead_time import find_dead_time, intervals_of
 from dase.diagnosis.grading import grade_of, judge_on_report
-from dase.diagnosis.state import DiagnosisState, with_same_freedom
+from dase.diagnosis.state import DiagnosisTask, with_same_freedom
 from dase.effects.bandwidth import Bandwidth
 from dase.effects.latency import Latency
 from dase.effects.refractory import Refractory
@@ -271,7 +271,7 @@ def _in_steps(effect: Bandwidth | SecondOrder) -> tuple[Bandwidth, SecondOrder]:
 
 
 def with_longer_dead_time(
-    diagnosis: Diagnosis, state: DiagnosisState, measurement: Measurement, model: FittedModel
+    diagnosis: Diagnosis, task: DiagnosisTask, measurement: Measurement, model: FittedModel
 ) -> Diagnosis:
     """Return a diagnosis that says so where pixels wait for longer than their frame.
 
@@ -279,7 +279,7 @@ def with_longer_dead_time(
 
     Args:
         diagnosis: Made with a model that waits.
-        state: What it was made with.
+        task: What the diagnosis is asked.
         measurement: The light and the events.
         model: The last one.
     """
@@ -289,16 +289,14 @@ def with_longer_dead_time(
     if effect.period < gap + explained:
         return diagnosis
     sensor = model.sensor.with_effect(Refractory(period=0.5 * gap, mode="reset"))
-    bare = refit_model(state.evidence, with_same_freedom(sensor, model, ()), seed=state.seed)
+    bare = refit_model(task.evidence, with_same_freedom(sensor, model, ()), seed=task.seed)
     without, last = (
-        one.judgement for one in judge_on_report(state, [bare, model], repeats=state.settings.repeats)
+        one.judgement for one in judge_on_report(task, [bare, model], repeats=task.settings.repeats)
     )
     ended = find_dead_time(
-        measurement, bare.sensor, frame_step=0.0, structure=state.evidence.structure, seed=state.seed
+        measurement, bare.sensor, frame_step=0.0, structure=task.evidence.structure, seed=task.seed
     )
-    grade, unknown = grade_of(
-        without, without, last, np.inf, has_rivals=False, settings=state.settings.grades
-    )
+    grade, unknown = grade_of(without, without, last, np.inf, has_rivals=False, settings=task.settings.grades)
     if ended is not None and without.error > last.error:
         grade, unknown = Grade.CERTAIN, False
     if grade is Grade.STAND_IN:

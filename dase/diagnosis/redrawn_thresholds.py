@@ -21,7 +21,7 @@ from scipy import stats
 
 from dase.diagnosis.candidates import Candidate
 from dase.diagnosis.light_between_events import LightBetweenEvents, LightSteps, beyond_those_alike
-from dase.diagnosis.state import DiagnosisState, with_same_freedom
+from dase.diagnosis.state import DiagnosisTask, with_same_freedom
 from dase.effects.jitter import Jitter
 from dase.errors import InputError
 from dase.fitting.frame_steps import is_held
@@ -215,23 +215,24 @@ class Excess:
 
 
 def find_jitter_beside(
-    state: DiagnosisState, measurement: Measurement, model: FittedModel, judgement: Judgement
+    measurement: Measurement, model: FittedModel, judgement: Judgement, *, noise: float, seed: int
 ) -> Signature | None:
     """Return the jitter that a model lacks, however little of its error that is; None where it is far off.
 
     Args:
-        state: Which noise was seen, which a model that is not right may lack, and the seed.
         measurement: Its scene is simulated.
         model: A jitter of its own is left out.
         judgement: Its held-out error.
+        noise: Rate of the noise of pixels at rest [Hz], which a model that is not right may lack.
+        seed: Of the simulations.
     """
     right = reaches_floor(judgement)
-    if not right and (state.noise or judgement.error > REDRAWN.far):
+    if not right and (noise or judgement.error > REDRAWN.far):
         return None
     light = LightBetweenEvents.of(measurement, log_eps=model.sensor.log_eps)
     if light is None:
         return None
-    return find_redrawn_thresholds(light, model.sensor, right=right, noise=state.noise, seed=state.seed)
+    return find_redrawn_thresholds(light, model.sensor, right=right, noise=noise, seed=seed)
 
 
 def find_redrawn_thresholds(
@@ -340,7 +341,7 @@ def runs_of(
 
 
 def add_jitter(
-    state: DiagnosisState,
+    task: DiagnosisTask,
     model: FittedModel,
     judgement: Judgement,
     found: Signature,
@@ -349,17 +350,15 @@ def add_jitter(
     """Return a model with the jitter that was seen, fitted and judged; None where it is worse with it.
 
     Args:
-        state: What the diagnosis works on.
+        task: What the diagnosis is asked.
         model: Without a jitter.
         judgement: Its held-out error.
         found: By how much thresholds differ from event to event.
         settings: By how much the error may rise.
     """
     sensor = with_fixed_effect(model, Jitter(spread=min(found.size, 1.0))).sensor
-    fitted = refit_model(
-        state.evidence, with_same_freedom(sensor, model, (EFFECT,)), seed=state.seed, rounds=1
-    )
-    judged = state.judge(fitted)
+    fitted = refit_model(task.evidence, with_same_freedom(sensor, model, (EFFECT,)), seed=task.seed, rounds=1)
+    judged = task.judge(fitted)
     if judged.error > judgement.error + settings.worse:
         return None
     return Candidate(EFFECT, fitted, fitted.loss, judgement=judged)

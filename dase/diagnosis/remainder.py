@@ -9,7 +9,7 @@ import numpy as np
 
 from dase.diagnosis.cell_descriptions import KINDS_OF_PIXELS, kind_of_pixels
 from dase.diagnosis.settings import DEFAULTS
-from dase.diagnosis.state import DiagnosisState
+from dase.diagnosis.state import DiagnosisTask
 from dase.fitting.model import FittedModel
 from dase.fitting.scene_doubt import is_guessed
 from dase.fitting.time_window import is_constant
@@ -83,20 +83,20 @@ def shares_by_pixels(judgement: Judgement) -> dict[str, float]:
     return {kind: out[kind] / whole for kind in sorted(out, key=lambda kind: -out[kind])}
 
 
-def share_of_scene(state: DiagnosisState, model: FittedModel, last: Judgement) -> float:
+def share_of_scene(task: DiagnosisTask, model: FittedModel, last: Judgement) -> float:
     """Return the share of what a model is off by that its scene may be blamed for.
 
     Without what the scene is not known to, the error would be larger: that much of it may be the scene's.
 
     Args:
-        state: What the search has found.
+        task: What the diagnosis is asked.
         model: The last one.
         last: Its error on the part that reports.
     """
-    report = state.evidence.report
+    report = task.evidence.report
     if report.doubt is None:
         return 0.0
-    stream, repeats = SimulationStream.JUDGE.seed(state.seed), state.settings.grades.repeats
+    stream, repeats = SimulationStream.JUDGE.seed(task.seed), task.settings.grades.repeats
     bare = model.judge(replace(report, doubt=None, drift=None), repeats=repeats, seed=stream)
     whole = max(bare.error - bare.level, 1e-9)
     return float(np.clip(1.0 - max(last.error - last.level, 0.0) / whole, 0.0, 1.0))

@@ -19,7 +19,7 @@ from dase.diagnosis.light_between_events import LightBetweenEvents
 from dase.diagnosis.redrawn_thresholds import EFFECT as JITTER
 from dase.diagnosis.redrawn_thresholds import find_jitter_beside
 from dase.diagnosis.seen_effects import SeenEffects
-from dase.diagnosis.state import DiagnosisState, with_same_freedom
+from dase.diagnosis.state import DiagnosisState, DiagnosisTask, EventsAlone, with_same_freedom
 from dase.diagnosis.unequal_thresholds import EFFECT as MISMATCH
 from dase.diagnosis.unequal_thresholds import NAME as UNEQUAL
 from dase.diagnosis.unequal_thresholds import find_unequal_thresholds
@@ -37,22 +37,29 @@ def look_beside_model(
     """Return what is seen, with what the events show that a model before the search has not.
 
     Args:
-        state: Gets which effects are certain: those that are seen, may be added and are not in the sensor.
+        state: Its path begins with the certain effects: those that are seen, may be added and are not in the
+            sensor.
         seen: What the events show by themselves.
         measurement: Its light and its events are looked at.
         model: The one before the search.
     """
-    seen = _look_where_light_rests(state, seen, measurement, model)
-    seen = _look_for_dead_time(state, seen, measurement, model)
-    seen = _look_at_thresholds(state, seen, measurement, model)
+    task = state.task
+    seen = _look_where_light_rests(task, seen, measurement, model)
+    seen = _look_for_dead_time(task, seen, measurement, model)
+    seen = _look_at_thresholds(task, seen, measurement, model)
     seen = _without_pattern_of_noise(state, seen, measurement, model)
-    state.certain = frozenset(seen.effects) & frozenset(state.effects) - state.given
-    state.shown = state.certain & seen.shown_whatever_fits
+    certain, noise = frozenset(seen.effects) & frozenset(task.effects) - task.given, seen.entry_of(NOISE)
+    state.begin_path(
+        certain=certain,
+        shown=certain & seen.shown_whatever_fits,
+        noise=0.0 if noise is None else noise.size,
+    )
     return seen
 
 
 def settle_dead_time(
-    state: DiagnosisState,
+    task: DiagnosisTask,
+    events_alone: EventsAlone,
     seen: SeenEffects,
     measurement: Measurement,
     model: FittedModel,
@@ -61,29 +68,30 @@ def settle_dead_time(
     """Return what is seen, and the last model, with a dead time if the intervals end beside that, too.
 
     Args:
-        state: Gets that the dead time is certain, or forgets it.
+        task: What the diagnosis is asked.
+        events_alone: Whether the dead time was put off.
         seen: What the events show beside the model before the search.
         measurement: Its intervals are looked at.
         model: The last one.
         judgement: Its held-out error.
     """
-    if REFRACTORY in state.put_off:
+    if REFRACTORY in events_alone.put_off:
         # beside what was found instead of it the intervals may end nowhere
         seen = replace(seen, entries=tuple(one for one in seen.entries if one.name != DEAD_TIME))
         bare = with_same_freedom(model.sensor.without(REFRACTORY), model, ())
-        seen = _look_for_dead_time(state, seen, measurement, bare)
-    elif state.added_to(model):  # else it was asked before
-        seen = _look_for_dead_time(state, seen, measurement, model)
-        seen, model, judgement = _without_needless_dead_time(state, seen, measurement, model, judgement)
+        seen = _look_for_dead_time(task, seen, measurement, bare)
+    elif task.added_to(model):  # else it was asked before
+        seen = _look_for_dead_time(task, seen, measurement, model)
+        seen, model, judgement = _without_needless_dead_time(task, seen, measurement, model, judgement)
     ended = seen.entry_of(DEAD_TIME)
-    if ended is not None and REFRACTORY in state.effects and REFRACTORY not in model.sensor:
-        state.certain |= {REFRACTORY}
-        model, _ = add_dead_time(state, model, judgement, ended)
+    if ended is not None and REFRACTORY in task.effects and REFRACTORY not in model.sensor:
+        model, _ = add_dead_time(task, model, judgement, ended)
     return seen, model
 
 
 def settle_jitter(
-    state: DiagnosisState,
+    task: DiagnosisTask,
+    events_alone: EventsAlone,
     seen: SeenEffects,
     measurement: Measurement,
     model: FittedModel,
@@ -92,66 +100,62 @@ def settle_jitter(
     """Return what is seen, with thresholds that are drawn anew at each event if the last model needs that.
 
     Args:
-        state: Gets that the jitter is certain, or forgets it.
+        task: What the diagnosis is asked.
+        events_alone: Which noise was seen.
         seen: What the events show beside other models.
         measurement: The light between its events is looked at.
         model: The last one; a jitter of its own is left out.
         judgement: Its held-out error.
     """
-    if JITTER not in state.added_to(model) or seen.lamp or state.evidence.frame_step:
+    if JITTER not in task.added_to(model) or seen.lamp or task.evidence.frame_step:
         return seen
-    found = find_jitter_beside(state, measurement, model, judgement)
-    if found is None:
-        state.certain -= {JITTER}
-        return seen
-    state.certain |= {JITTER}
-    return replace(seen, entries=(*seen.entries, found))
+    found = find_jitter_beside(measurement, model, judgement, noise=events_alone.noise, seed=task.seed)
+    return seen if found is None else replace(seen, entries=(*seen.entries, found))
 
 
 def _look_where_light_rests(
-    state: DiagnosisState, seen: SeenEffects, measurement: Measurement, model: FittedModel
+    task: DiagnosisTask, seen: SeenEffects, measurement: Measurement, model: FittedModel
 ) -> SeenEffects:
     """Return what is seen, with the noise or the leak of pixels at rest that a model has not."""
-    if state.evidence.contradiction or seen.lamp or seen.bursts is not None:
+    if task.evidence.contradiction or seen.lamp or seen.bursts is not None:
         return seen
     threshold = model.sensor["threshold"]
     assert isinstance(threshold, Threshold)
     found = find_events_at_rest(
-        measurement, model.sensor, thresholds=(threshold.on, threshold.off), seed=state.seed
+        measurement, model.sensor, thresholds=(threshold.on, threshold.off), seed=task.seed
     )
-    state.noise = found.size if found is not None and found.name == NOISE else 0.0
     return seen if found is None else replace(seen, entries=(*seen.entries, found))
 
 
 def _look_for_dead_time(
-    state: DiagnosisState, seen: SeenEffects, measurement: Measurement, model: FittedModel
+    task: DiagnosisTask, seen: SeenEffects, measurement: Measurement, model: FittedModel
 ) -> SeenEffects:
     """Return what is seen, with the end of the intervals if there is one that a model has not."""
-    if seen.entry_of(DEAD_TIME) or REFRACTORY in state.given or state.evidence.contradiction:
+    if seen.entry_of(DEAD_TIME) or REFRACTORY in task.given or task.evidence.contradiction:
         return seen
     found = find_dead_time(
         measurement, model.sensor,
-        frame_step=state.evidence.frame_step or 0.0, structure=state.evidence.structure, seed=state.seed,
+        frame_step=task.evidence.frame_step or 0.0, structure=task.evidence.structure, seed=task.seed,
     )  # fmt: skip
     return seen if found is None else replace(seen, entries=(*seen.entries, found))
 
 
 def _look_at_thresholds(
-    state: DiagnosisState, seen: SeenEffects, measurement: Measurement, model: FittedModel
+    task: DiagnosisTask, seen: SeenEffects, measurement: Measurement, model: FittedModel
 ) -> SeenEffects:
     """Return what is seen, with how much the thresholds of pixels differ, or drift, if they do."""
-    if state.evidence.contradiction or seen.lamp:
+    if task.evidence.contradiction or seen.lamp:
         return seen
     light = LightBetweenEvents.of(measurement, log_eps=model.sensor.log_eps)
     if light is None:
         return seen
     found = []
-    if MISMATCH not in state.given:
-        found.append(find_unequal_thresholds(light, model.sensor, seed=state.seed))
+    if MISMATCH not in task.given:
+        found.append(find_unequal_thresholds(light, model.sensor, seed=task.seed))
     # light that goes on in a dead time counts for nothing, and the less the longer the time between events is
-    if LEAKING not in state.given and not (seen.entry_of(LEAK) or seen.entry_of(DEAD_TIME)):
-        structure = state.evidence.structure
-        found.append(find_drifting_memory(light, model.sensor, structure=structure, seed=state.seed))
+    if LEAKING not in task.given and not (seen.entry_of(LEAK) or seen.entry_of(DEAD_TIME)):
+        structure = task.evidence.structure
+        found.append(find_drifting_memory(light, model.sensor, structure=structure, seed=task.seed))
     return replace(seen, entries=(*seen.entries, *(one for one in found if one is not None)))
 
 
@@ -164,7 +168,7 @@ def _without_pattern_of_noise(
     """
     if not (seen.entry_of(PATTERN) and seen.entry_of(NOISE)) or seen.entry_of(UNEQUAL):
         return seen
-    if not noise_is_a_pattern(measurement, model.sensor, seed=state.seed):
+    if not noise_is_a_pattern(measurement, model.sensor, seed=state.task.seed):
         return seen
     state.notes.append(
         "pixels at rest send ON and OFF noise at rates of their own: that they differ tells nothing of their "
@@ -174,7 +178,7 @@ def _without_pattern_of_noise(
 
 
 def _without_needless_dead_time(
-    state: DiagnosisState,
+    task: DiagnosisTask,
     seen: SeenEffects,
     measurement: Measurement,
     model: FittedModel,
@@ -186,21 +190,20 @@ def _without_needless_dead_time(
     intervals look as if they were cut off. What was found since may leave none.
 
     Args:
-        state: Forgets that the dead time is certain, if it is not.
+        task: What the diagnosis is asked.
         seen: With the end of the intervals beside the model before the search, if there is one.
         measurement: Its intervals are looked at.
         model: The last one.
         judgement: Its held-out error.
     """
-    if seen.entry_of(DEAD_TIME) is None or REFRACTORY not in state.added_to(model):
+    if seen.entry_of(DEAD_TIME) is None or REFRACTORY not in task.added_to(model):
         return seen, model, judgement
     bare = with_same_freedom(model.sensor.without(REFRACTORY), model, ())
-    without = state.judge(bare)
+    without = task.judge(bare)
     if is_worse(without.error, judgement.error, judgement.gate):
         return seen, model, judgement
     entries = tuple(one for one in seen.entries if one.name != DEAD_TIME)
-    again = _look_for_dead_time(state, replace(seen, entries=entries), measurement, bare)
+    again = _look_for_dead_time(task, replace(seen, entries=entries), measurement, bare)
     if again.entry_of(DEAD_TIME) is not None:
         return seen, model, judgement
-    state.certain -= {REFRACTORY}
     return again, bare, without

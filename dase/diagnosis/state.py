@@ -1,10 +1,13 @@
-"""What a diagnosis works on, and what it has found so far."""
+"""What a diagnosis works on, what it knows before its search, and the path of the search.
+
+The parts of a `DiagnosisState` are frozen: a function that takes one of them only reads it. One that takes
+the state itself may change it, and changes those parts by its methods alone.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
-from typing import NamedTuple
+from dataclasses import dataclass, field, replace
 
 from dase.diagnosis.candidates import Candidate
 from dase.diagnosis.settings import DEFAULTS, DiagnosisSettings
@@ -17,39 +20,19 @@ from dase.results import Progress, Step
 from dase.simulation.sensor import Sensor
 
 
-@dataclass
-class DiagnosisState:
-    """What a diagnosis works on, and what it has found so far.
+@dataclass(frozen=True, eq=False)
+class DiagnosisTask:
+    """What a diagnosis is asked.
 
     Args:
         evidence: The measurement, split for fitting and judging.
         effects: All effects that may be added, by name.
         seed: Of every random number.
         progress: Told how far it is.
-        given: Names of the effects of the sensor as it was given.
+        given: Names of the effects that a model has before the search.
         settings: Numbers by which effects are added and dropped.
-        history: The steps so far, provisional additions included.
-        alternatives: Effect that was added to the other candidates that were judged with it.
-        error_of: Effect that was added to the held-out error with it.
-        ties: Effect that was added to those that the data cannot tell apart from it.
-        without: What the model left before an effect was added to it, where it counted as right already.
-        first: Candidates of the first step in which all were tried, in order of their screening, from which
-            pairs are made.
-        first_step: Which step that was.
-        certain: Effects that the events alone show; they are not dropped.
-        shown: Those of them that are there however badly any model fits.
-        tried_alone: Those of them that were tried before all others.
-        put_off: Those that were seen beside the model before the search, and explain too little of its error
-            to be put in before all others: they are asked for again at the end.
-        noise: Rate of the noise that pixels at rest send and the model before the search has not [Hz].
-        held: See `Measurement.held`.
+        frame_held: Time for which each frame of a clip is held [s], see `Measurement.held`.
         all_time: Whether all of the time is fitted, not its first part alone.
-        evaluations_before: Simulations that were run before the measurement was split anew.
-        samples_before: Pixels times samples of those.
-        path: Models that were fitted in full on the way, the first one without any addition.
-        notes: What the user should know of the search.
-        after_step: Told the model and the errors so far after each step.
-        error: Held-out error of the model that was judged last.
     """
 
     evidence: SplitMeasurement
@@ -58,31 +41,8 @@ class DiagnosisState:
     progress: Progress
     given: frozenset[str]
     settings: DiagnosisSettings = DEFAULTS
-    history: list[Step] = field(default_factory=list)
-    alternatives: dict[str, list[Candidate]] = field(default_factory=dict)
-    error_of: dict[str, float] = field(default_factory=dict)
-    ties: dict[str, set[str]] = field(default_factory=dict)
-    without: dict[str, Judgement] = field(default_factory=dict)
-    first: list[Candidate] = field(default_factory=list)
-    certain: frozenset[str] = frozenset()
-    shown: frozenset[str] = frozenset()
-    tried_alone: frozenset[str] = frozenset()
-    put_off: frozenset[str] = frozenset()
-    noise: float = 0.0
-    held: float = 0.0
+    frame_held: float = 0.0
     all_time: bool = False
-    evaluations_before: int = 0
-    samples_before: int = 0
-    first_step: int = 0
-    path: list[FittedModel] = field(default_factory=list)
-    notes: list[str] = field(default_factory=list)
-    after_step: Callable[[FittedModel, list[float]], None] = lambda model, errors: None
-    error: float = float("nan")
-
-    @property
-    def samples(self) -> int:
-        """Pixels times samples of all simulations so far."""
-        return self.samples_before + self.evidence.samples
 
     def judge(self, model: FittedModel, *, repeats: int | None = None) -> Judgement:
         """Return the held-out error of a model."""
@@ -90,39 +50,59 @@ class DiagnosisState:
         judgement = model.judge(
             self.evidence.held, repeats=repeats, seed=SimulationStream.JUDGE.seed(self.seed)
         )
-        self.error = judgement.error
-        self.progress("judging", 0.0, self.error)
+        self.progress("judging", 0.0, judgement.error)
         return judgement
 
-    def note_addition(
-        self, best: Candidate, finalists: Sequence[Candidate], ties: Sequence[str], without: Judgement
-    ) -> None:
-        """Keep what pruning needs to know of an effect that is added.
+    def added_to(self, model: FittedModel) -> tuple[str, ...]:
+        """Return the effects of a model that it did not have before the search."""
+        return tuple(e.name for e in model.space.sensor.effects if e.name not in self.given)
 
-        Args:
-            best: The candidate that is added.
-            finalists: All candidates that were judged with it.
-            ties: Those that the data cannot tell apart from it.
-            without: The error of the model without it.
-        """
-        self.alternatives[best.name] = [one for one in finalists if one.name != best.name]
-        self.error_of[best.name] = best.error
-        self.ties[best.name] = set(ties)
-        if reaches_floor(without):
-            self.without[best.name] = without
 
-    def ways(self) -> _Ways:
-        """Return how this model was come to, for `go_back`."""
-        return _Ways(
-            list(self.history), list(self.path), dict(self.alternatives), dict(self.error_of),
-            dict(self.ties), dict(self.without), self.certain,
-        )  # fmt: skip
+@dataclass(frozen=True)
+class EventsAlone:
+    """What the events alone show, which `look_beside_model` settles before the search.
 
-    def go_back(self, ways: _Ways) -> None:
-        """Forget what was tried since."""
-        self.history, self.path, self.alternatives, self.error_of, self.ties, self.without, self.certain = (
-            ways
-        )
+    Only the last two grow later, in `effect_search`. A search that goes back to an earlier path keeps them.
+
+    Args:
+        shown: Effects that are there however badly any model fits.
+        noise: Rate of the noise that pixels at rest send and the model before the search has not [Hz].
+        tried_alone: Certain effects that were tried before all others.
+        put_off: Those that explain too little of the error of the model before the search to be put in before
+            all others: they are asked for again at the end.
+    """
+
+    shown: frozenset[str] = frozenset()
+    noise: float = 0.0
+    tried_alone: frozenset[str] = frozenset()
+    put_off: frozenset[str] = frozenset()
+
+
+@dataclass(frozen=True, eq=False)
+class SearchPath:
+    """How a search came to its last model.
+
+    Args:
+        history: The steps so far, provisional additions included.
+        models: Models that were fitted in full on the way, the first one without any addition.
+        certain: Effects that are not dropped, for the events alone show them, before the search or beside a
+            model on its path.
+        alternatives: Effect that was added to the other candidates that were judged with it.
+        error_of: Effect that was added to the held-out error with it.
+        without: What the model left before an effect was added to it, where it counted as right already.
+        first: Candidates of the first step in which all were tried, in order of their screening, from which
+            pairs are made, and another way begins.
+        first_step: Which step that was.
+    """
+
+    history: tuple[Step, ...] = ()
+    models: tuple[FittedModel, ...] = ()
+    certain: frozenset[str] = frozenset()
+    alternatives: Mapping[str, Sequence[Candidate]] = field(default_factory=dict)
+    error_of: Mapping[str, float] = field(default_factory=dict)
+    without: Mapping[str, Judgement] = field(default_factory=dict)
+    first: tuple[Candidate, ...] = ()
+    first_step: int = 0
 
     def has_asked(self, model: FittedModel) -> bool:
         """Whether all effects were tried beside those of a model before, wherever its values were."""
@@ -132,21 +112,113 @@ class DiagnosisState:
             for step in self.history
         )
 
-    def added_to(self, model: FittedModel) -> tuple[str, ...]:
-        """Return the effects of a model that the given sensor did not have."""
-        return tuple(e.name for e in model.space.sensor.effects if e.name not in self.given)
 
+@dataclass
+class DiagnosisState:
+    """What a diagnosis works on, and what it has found so far.
 
-class _Ways(NamedTuple):
-    """What a search changes of a state."""
+    Args:
+        task: What it is asked.
+        events_alone: What the events alone show.
+        path: How the search came to its last model; the one to go back to where another is tried.
+        notes: What the user should know of the search.
+        after_step: Told the model and the errors so far after each step.
+        evaluations_before: Simulations that were run before the measurement was split anew.
+        samples_before: Pixels times samples of those.
+    """
 
-    history: list[Step]
-    path: list[FittedModel]
-    alternatives: dict[str, list[Candidate]]
-    error_of: dict[str, float]
-    ties: dict[str, set[str]]
-    without: dict[str, Judgement]
-    certain: frozenset[str]
+    task: DiagnosisTask
+    events_alone: EventsAlone = EventsAlone()
+    path: SearchPath = field(default_factory=SearchPath)
+    notes: list[str] = field(default_factory=list)
+    after_step: Callable[[FittedModel, list[float]], None] = lambda model, errors: None
+    evaluations_before: int = 0
+    samples_before: int = 0
+
+    @property
+    def evaluations(self) -> int:
+        """All simulations so far."""
+        return self.evaluations_before + self.task.evidence.evaluations
+
+    @property
+    def samples(self) -> int:
+        """Pixels times samples of all simulations so far."""
+        return self.samples_before + self.task.evidence.samples
+
+    def doubt_scene(self, evidence: SplitMeasurement) -> None:
+        """Go on with the same parts of the measurement, with what their scene is not known to."""
+        self.task = replace(self.task, evidence=evidence)
+
+    def split_anew(self, evidence: SplitMeasurement) -> None:
+        """Go on with a split of which all of the time is fitted; what was run before counts on."""
+        self.evaluations_before, self.samples_before = self.evaluations, self.samples
+        self.task = replace(self.task, evidence=evidence, all_time=True)
+
+    def count_as_given(self, name: str) -> None:
+        """Count an effect as one that a model has before the search."""
+        self.task = replace(self.task, given=self.task.given | {name})
+
+    def begin_path(self, *, certain: frozenset[str], shown: frozenset[str], noise: float) -> None:
+        """Begin the path of the search with what the events alone show, see there."""
+        self.events_alone = EventsAlone(shown, noise)
+        self.path = SearchPath(certain=certain)
+
+    def try_alone(self, names: Sequence[str]) -> None:
+        """Keep that certain effects are tried before all others, which they are once."""
+        tried = self.events_alone.tried_alone.union(names)
+        self.events_alone = replace(self.events_alone, tried_alone=tried)
+
+    def put_off(self, name: str) -> None:
+        """Take an effect as certain no more, and ask for it again at the end."""
+        self.path = replace(self.path, certain=self.path.certain - {name})
+        self.events_alone = replace(self.events_alone, put_off=self.events_alone.put_off | {name})
+
+    def make_certain(self, name: str) -> None:
+        """Take an effect as certain, so that it is not dropped."""
+        self.path = replace(self.path, certain=self.path.certain | {name})
+
+    def add_model(self, model: FittedModel) -> None:
+        """Add a model that is fitted in full to the path."""
+        self.path = replace(self.path, models=(*self.path.models, model))
+
+    def add_step(self, step: Step) -> None:
+        """Add a step to the path."""
+        self.path = replace(self.path, history=(*self.path.history, step))
+
+    def keep_first_candidates(self, tried: Sequence[Candidate]) -> None:
+        """Keep the candidates of the next step if they are the first of one in which all were tried."""
+        if not self.path.first:
+            first = tuple(sorted(tried, key=lambda one: one.screened_loss))
+            self.path = replace(self.path, first=first, first_step=len(self.path.history))
+
+    def note_addition(self, best: Candidate, finalists: Sequence[Candidate], without: Judgement) -> None:
+        """Keep what pruning and grading need to know of an effect that is added.
+
+        Args:
+            best: The candidate that is added.
+            finalists: All candidates that were judged with it.
+            without: The error of the model without it.
+        """
+        path, name = self.path, best.name
+        others = [one for one in finalists if one.name != name]
+        self.path = replace(
+            path,
+            alternatives={**path.alternatives, name: others},
+            error_of={**path.error_of, name: best.error},
+            without={**path.without, name: without} if reaches_floor(without) else path.without,
+        )
+
+    def leave_at_first_step(self) -> None:
+        """Leave the path at the first step in which all effects were tried, before it added any.
+
+        What is known of the effects that were added stays.
+        """
+        path, at = self.path, self.path.first_step
+        self.path = replace(path, history=path.history[:at], models=path.models[: at + 1])
+
+    def go_back(self, path: SearchPath) -> None:
+        """Go back to an earlier path: forget what was tried since."""
+        self.path = path
 
 
 def explains_remainder(

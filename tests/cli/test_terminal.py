@@ -67,7 +67,7 @@ def evil_head(path):
         (".npy", lambda path: np.save(path, np.zeros(3, [(EVIL[:3], "f8")]))),
     ],
 )
-@pytest.mark.parametrize("words", [["info"], ["info", "--json"], ["convert"]])
+@pytest.mark.parametrize("words", [["info"], ["info", "--json", "-"], ["convert"]])
 def test_names_in_files(tmp_path, suffix, make, words):
     path = tmp_path / f"a{suffix}"
     make(path)

@@ -12,6 +12,7 @@ import dase
 from dase.diagnosis import seen_beside_model
 from dase.diagnosis.dead_time import DEAD_TIME, NAME, end_of_intervals, find_dead_time, intervals_of
 from dase.diagnosis.seen_effects import SeenEffects
+from dase.diagnosis.state import EventsAlone
 from dase.effects import EFFECTS
 from dase.events import Events
 from dase.fitting.measurement import Measurement
@@ -181,23 +182,22 @@ def test_a_dead_time_is_dropped_that_the_last_model_has_no_need_of(monkeypatch, 
     entry = Signature(name=NAME, answer=Answer.FOUND, sentence="seen", details={"period": 2e-3})
     sensor = Sensor().with_effect(EFFECTS["bandwidth"](cutoff=40.0))
     model = model_of(sensor.with_effect(EFFECTS["refractory"](period=2e-3)), None)
-    state = SimpleNamespace(
+    task = SimpleNamespace(
         added_to=lambda one: tuple(e.name for e in one.sensor.effects if e.name != "threshold"),
-        judge=lambda one: judged(error), certain=frozenset({"refractory", "hot"}),
-    )  # fmt: skip
+        judge=lambda one: judged(error),
+    )
     asked = []
 
-    def look(state, seen, measurement, one):
+    def look(task, seen, measurement, one):
         asked.append(one.sensor)
         return replace(seen, entries=(*seen.entries, entry)) if ends else seen
 
     monkeypatch.setattr(seen_beside_model, "_look_for_dead_time", look)
     seen, last, judgement = seen_beside_model._without_needless_dead_time(
-        state, SeenEffects((entry,)), None, model, judged(0.31)
+        task, SeenEffects((entry,)), None, model, judged(0.31)
     )
     assert ("refractory" not in last.sensor) == dropped
     assert (seen.entry_of(NAME) is None) == dropped
-    assert state.certain == (frozenset({"hot"}) if dropped else frozenset({"refractory", "hot"}))
     assert judgement.error == (error if dropped else 0.31)
     assert all("refractory" not in one and "bandwidth" in one for one in asked)
 
@@ -212,19 +212,19 @@ def test_a_dead_time_that_was_put_off_is_asked_for_beside_the_last_model(monkeyp
     entry = Signature(name=NAME, answer=Answer.FOUND, sentence="seen", details={"period": 2e-3})
     sensor = Sensor().with_effect(EFFECTS["linlog"]())
     model = model_of(sensor.with_effect(EFFECTS["refractory"](period=2e-3)) if added else sensor, None)
-    state = SimpleNamespace(
-        added_to=lambda one: ("linlog",), put_off=frozenset({"refractory"}), effects=EFFECTS,
-        certain=frozenset(), judge=lambda one: judged(0.3),
-    )  # fmt: skip
+    task = SimpleNamespace(added_to=lambda one: ("linlog",), effects=EFFECTS, judge=lambda one: judged(0.3))
+    put_off = EventsAlone(put_off=frozenset({"refractory"}))
     asked = []
 
-    def look(state, seen, measurement, one):
+    def look(task, seen, measurement, one):
         asked.append(one.sensor)
         assert seen.entry_of(NAME) is None
         return seen
 
     monkeypatch.setattr(seen_beside_model, "_look_for_dead_time", look)
-    seen, last = seen_beside_model.settle_dead_time(state, SeenEffects((entry,)), None, model, judged(0.3))
+    seen, last = seen_beside_model.settle_dead_time(
+        task, put_off, SeenEffects((entry,)), None, model, judged(0.3)
+    )
     assert seen.entry_of(NAME) is None
     assert last is model  # what the error asks for stays, and is graded by it
     assert [("refractory" in one, "linlog" in one) for one in asked] == [(False, True)]

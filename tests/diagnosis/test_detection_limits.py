@@ -23,7 +23,7 @@ from dase.diagnosis.diagnose import diagnose
 from dase.diagnosis.explain_effect import moving_bars
 from dase.diagnosis.remainder import shares_by_pixels, what_to_record
 from dase.diagnosis.settings import DEFAULTS
-from dase.diagnosis.state import DiagnosisState
+from dase.diagnosis.state import DiagnosisTask
 from dase.effects import EFFECTS
 from dase.fitting.data_split import split_measurement
 from dase.fitting.measurement import Measurement
@@ -106,13 +106,13 @@ def test_stronger_is_tried_only_where_weaker_is_not_seen(scene, name):
     """But where a model needs samples of its own, all strengths fill one launch."""
     sensor = Sensor()
     evidence = split_measurement(Measurement(dase.simulate(scene, sensor, seed=3), scene), pixels=200, seed=3)
-    state = DiagnosisState(evidence, EFFECTS, 3, lambda text, share, error: None, frozenset({"threshold"}))
+    task = DiagnosisTask(evidence, EFFECTS, 3, lambda text, share, error: None, frozenset({"threshold"}))
     model = model_of(sensor)
     half = model.calibrate(evidence.report, repeats=20, seed=5)
-    known = _reported_model(state, model, half, half.judge(1), half.judge(1))
+    known = _reported_model(task, model, half, half.judge(1), half.judge(1))
     effect = EFFECTS[name].candidates(evidence.observe(idle_bus=0.01))[0]
     axis = main_axis(model, effect)
-    work = _limit_work(state, known, effect, axis)
+    work = _limit_work(task, known, effect, axis)
     asked, asks = [], next(work)
     while True:
         asked.append(asks)
@@ -122,7 +122,7 @@ def test_stronger_is_tried_only_where_weaker_is_not_seen(scene, name):
             place = stop.value
             break
     first = asked[0]
-    assert len(first) == state.settings.detection.repeats
+    assert len(first) == task.settings.detection.repeats
     column = [a.name for a in first[0].space.axes].index(axis.name)
     tried = [np.unique(np.concatenate([ask.places[:, column] for ask in asks])) for asks in asked]
     assert place is not None

@@ -19,7 +19,7 @@ from dase.diagnosis.directional_test import (
 from dase.diagnosis.effect_search import _simplest_of_the_best
 from dase.diagnosis.explain_effect import moving_bars
 from dase.diagnosis.settings import DEFAULTS
-from dase.diagnosis.state import DiagnosisState
+from dase.diagnosis.state import DiagnosisTask, SearchPath
 from dase.effects import EFFECTS
 from dase.fitting.data_split import split_measurement
 from dase.fitting.measurement import Measurement
@@ -58,13 +58,13 @@ def test_no_single_statistic_decides_and_no_chance_is_no_certainty():
 
 
 @pytest.fixture(scope="module")
-def searches(device) -> dict[str, DiagnosisState]:
+def searches(device) -> dict[str, DiagnosisTask]:
     scene = moving_bars()
     out = {}
     for name, sensor in (("plain", TRUE), ("uneven", TRUE.with_effect(JITTER))):
         events = dase.simulate(scene, sensor, seed=4, device=device)
         evidence = split_measurement(Measurement(events, scene), pixels=900, seed=1, device=device)
-        out[name] = DiagnosisState(
+        out[name] = DiagnosisTask(
             evidence, LIBRARY, 1, lambda text, share, error: None, frozenset({"threshold"})
         )
     return out
@@ -135,53 +135,43 @@ def fake(names: str, errors: dict[str, float], monkeypatch, **more) -> tuple:
             return SimpleNamespace(longest_step=lambda: steps.get(name, 1.0))
 
     steps: dict[str, float] = more.pop("steps", {})
-    defaults = dict(
-        settings=DEFAULTS,
-        without={},
-        ties={},
-        alternatives={},
-        error_of={},
-        evidence=None,
-        seed=0,
-        certain=frozenset(),
-        effects={},
-    )
-    search = SimpleNamespace(
-        judge=lambda m: judged(errors[m.names]), added_to=lambda m: tuple(m.names), **(defaults | more)
-    )
+    task = SimpleNamespace(
+        judge=lambda m: judged(errors[m.names]), added_to=lambda m: tuple(m.names),
+        settings=DEFAULTS, evidence=None, seed=0, effects=more.pop("effects", {}),
+    )  # fmt: skip
     monkeypatch.setattr(reviewing, "refit_model", lambda evidence, m, seed: m)
-    monkeypatch.setattr(reviewing, "_is_much_to_simulate", lambda search, m: False)
-    monkeypatch.setattr(reviewing, "_keep_near_models", lambda search, ways, judgement: ways)
+    monkeypatch.setattr(reviewing, "_is_much_to_simulate", lambda task, m: False)
+    monkeypatch.setattr(reviewing, "_keep_near_models", lambda task, ways, judgement: ways)
     monkeypatch.setattr(reviewing, "with_same_freedom", lambda sensor, m, more: model(str(sensor)))
     monkeypatch.setattr(
         reviewing, "_droppable_models",
-        lambda search, m: {n: model(m.names.replace(n, "")) for n in m.names},
+        lambda task, m: {n: model(m.names.replace(n, "")) for n in m.names},
     )  # fmt: skip
     monkeypatch.setattr(
         reviewing,
         "_rival_models",
-        lambda search, m, n: {o: model(m.names.replace(n, o)) for o in rivals.get(n, "")},
+        lambda task, path, m, n: {o: model(m.names.replace(n, o)) for o in rivals.get(n, "")},
     )
     rivals: dict[str, str] = more.pop("rivals", {})
-    return search, model(names), judged(errors[names])
+    return task, SearchPath(), model(names), judged(errors[names])
 
 
 def test_what_is_not_needed_is_dropped(monkeypatch):
-    search, model, judgement = fake("ab", {"ab": 0.3, "a": 0.35, "b": 6.0}, monkeypatch)
-    left, after = reviewing.prune_model(search, model, judgement)
+    asked = fake("ab", {"ab": 0.3, "a": 0.35, "b": 6.0}, monkeypatch)
+    left, after = reviewing.prune_model(*asked)
     assert (left.names, after.error) == ("a", 0.35)
 
 
 def test_what_needs_the_finest_steps_is_tried_without_first_and_no_fine_model_is_fitted(monkeypatch):
     errors = {"abc": 0.3, "ab": 6.0, "ac": 6.0, "bc": 6.0}
-    search, model, judgement = fake("abc", errors, monkeypatch, steps={"b": 1e-3})
+    asked = fake("abc", errors, monkeypatch, steps={"b": 1e-3})
     fitted = []
     monkeypatch.setattr(reviewing, "refit_model", lambda evidence, m, seed: fitted.append(m.names) or m)
-    reviewing.prune_model(search, model, judgement)
+    reviewing.prune_model(*asked)
     assert fitted == ["ac", "bc", "ab"]
-    monkeypatch.setattr(reviewing, "_is_much_to_simulate", lambda search, m: "b" in m.names)
+    monkeypatch.setattr(reviewing, "_is_much_to_simulate", lambda task, m: "b" in m.names)
     fitted.clear()
-    reviewing.prune_model(search, model, judgement)
+    reviewing.prune_model(*asked)
     assert fitted == ["ac"]
 
 
@@ -195,10 +185,10 @@ def test_noise_of_some_kilohertz_is_much_to_simulate():
 def test_what_is_not_needed_is_dropped_although_a_fit_without_it_ends_worse_by_chance(monkeypatch):
     """A share of hot pixels, fitted anew to a dozen, was half of what it was beside the other effect."""
     errors = {"ab": 0.3, "a": 0.35, "a again": 1.7, "b": 6.0, "b again": 6.0}
-    search, model, judgement = fake("ab", errors, monkeypatch)
+    asked = fake("ab", errors, monkeypatch)
     again = lambda evidence, m, seed: SimpleNamespace(names=f"{m.names} again")  # noqa: E731
     monkeypatch.setattr(reviewing, "refit_model", again)
-    left, after = reviewing.prune_model(search, model, judgement)
+    left, after = reviewing.prune_model(*asked)
     assert (left.names, after.error) == ("a", 0.35)
 
 
@@ -210,42 +200,38 @@ def test_what_is_far_from_the_floor_is_not_reviewed(monkeypatch):
 
 
 def test_what_accounts_for_most_stays_and_so_does_what_only_a_closer_look_shows(monkeypatch):
-    search, model, judgement = fake("ab", {"ab": 0.3, "a": 0.8, "b": 6.0}, monkeypatch)
-    assert reviewing.prune_model(search, model, judgement)[0].names == "ab"
-    search, model, judgement = fake("ab", {"ab": 0.3, "a": 0.35, "b": 6.0}, monkeypatch)
-    monkeypatch.setattr(reviewing, "lacks_effect_of", lambda search, less, without, m: less.names == "a")
-    assert reviewing.prune_model(search, model, judgement)[0].names == "ab"
+    asked = fake("ab", {"ab": 0.3, "a": 0.8, "b": 6.0}, monkeypatch)
+    assert reviewing.prune_model(*asked)[0].names == "ab"
+    asked = fake("ab", {"ab": 0.3, "a": 0.35, "b": 6.0}, monkeypatch)
+    monkeypatch.setattr(reviewing, "lacks_effect_of", lambda task, less, without, m: less.names == "a")
+    assert reviewing.prune_model(*asked)[0].names == "ab"
 
 
-def test_a_simpler_rival_takes_the_place_and_the_tie_is_told(monkeypatch):
+def test_a_simpler_rival_takes_the_place(monkeypatch):
     errors = {"aZ": 0.3, "Z": 9.0, "a": 9.0, "ab": 0.4, "b": 9.0}
-    search, model, judgement = fake("aZ", errors, monkeypatch, rivals={"Z": "b"})
-    left, after = reviewing.prune_model(search, model, judgement)
+    asked = fake("aZ", errors, monkeypatch, rivals={"Z": "b"})
+    left, after = reviewing.prune_model(*asked)
     assert (left.names, after.error) == ("ab", 0.4)
-    assert search.ties == {"b": {"Z"}}
-    # one that is no simpler is told, no more
+    # one that is no simpler does not
     errors = {"ac": 0.3, "c": 9.0, "a": 9.0, "ab": 0.4, "b": 9.0}
-    search, model, judgement = fake("ac", errors, monkeypatch, rivals={"c": "b"})
-    assert reviewing.prune_model(search, model, judgement)[0].names == "ac"
-    assert search.ties == {"c": {"b"}}
+    asked = fake("ac", errors, monkeypatch, rivals={"c": "b"})
+    assert reviewing.prune_model(*asked)[0].names == "ac"
 
 
 def test_what_includes_an_effect_must_do_better_than_it(monkeypatch):
     """A second order so damped that it is one pole came to 1.1 where a clip of v2e had the pole at 1.4."""
     errors = {"ab": 1.4, "a": 9.0, "b": 9.0, "aZ": 1.1, "Z": 9.0}
     includes = {"Z": SimpleNamespace(includes=("b",))}
-    search, model, judgement = fake("ab", errors, monkeypatch, rivals={"b": "Z"}, effects=includes)
-    assert reviewing.prune_model(search, model, judgement)[0].names == "ab"
-    assert search.ties == {"b": {"Z"}}
+    asked = fake("ab", errors, monkeypatch, rivals={"b": "Z"}, effects=includes)
+    assert reviewing.prune_model(*asked)[0].names == "ab"
     for more, error in ((includes, 0.9), ({}, 1.1)):
         errors["aZ"] = error
-        search, model, judgement = fake("ab", errors, monkeypatch, rivals={"b": "Z"}, effects=more)
-        assert reviewing.prune_model(search, model, judgement)[0].names == "aZ"
+        asked = fake("ab", errors, monkeypatch, rivals={"b": "Z"}, effects=more)
+        assert reviewing.prune_model(*asked)[0].names == "aZ"
 
 
 def test_no_rival_takes_the_place_of_what_a_closer_look_shows(monkeypatch):
     errors = {"aZ": 0.3, "Z": 9.0, "a": 9.0, "ab": 0.4, "b": 9.0}
-    search, model, judgement = fake("aZ", errors, monkeypatch, rivals={"Z": "b"})
-    monkeypatch.setattr(reviewing, "lacks_effect_of", lambda search, less, without, m: less.names == "ab")
-    assert reviewing.prune_model(search, model, judgement)[0].names == "aZ"
-    assert search.ties == {}
+    asked = fake("aZ", errors, monkeypatch, rivals={"Z": "b"})
+    monkeypatch.setattr(reviewing, "lacks_effect_of", lambda task, less, without, m: less.names == "ab")
+    assert reviewing.prune_model(*asked)[0].names == "aZ"

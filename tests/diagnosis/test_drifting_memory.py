@@ -124,11 +124,11 @@ def test_beside_a_dead_time_it_is_not_asked(scene):
     So a strong dead time looked like a leak of 2.8 Hz in a scene of drifting waves.
     """
     events = counted_between_frames(scene, 0.0, leak=4.0)
-    state = SimpleNamespace(
+    task = SimpleNamespace(
         evidence=SimpleNamespace(contradiction="", structure=NO_STRUCTURE), given=frozenset(), seed=0
     )
     measurement, model = Measurement(events, scene), SimpleNamespace(sensor=Sensor())
     ended = Signature(name=DEAD_TIME, answer=Answer.FOUND, sentence="ends")
     for entries, leaks in (((), True), ((ended,), False)):
-        seen = _look_at_thresholds(state, SeenEffects(entries), measurement, model)
+        seen = _look_at_thresholds(task, SeenEffects(entries), measurement, model)
         assert (seen.entry_of(NAME) is not None) == leaks

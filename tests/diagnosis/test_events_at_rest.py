@@ -185,7 +185,7 @@ def test_a_pattern_that_noise_makes_is_none_of_thresholds(monkeypatch, differs, 
     names = ("fixed pattern", NOISE, *(["unequal thresholds"] if unequal else []))
     seen = SeenEffects(tuple(Signature(name=name, answer=Answer.FOUND, sentence="") for name in names))
     monkeypatch.setattr(seen_beside_model, "noise_is_a_pattern", lambda *args, **more: differs)
-    state = SimpleNamespace(notes=[], seed=0)
+    state = SimpleNamespace(notes=[], task=SimpleNamespace(seed=0))
     left = seen_beside_model._without_pattern_of_noise(state, seen, None, SimpleNamespace(sensor=Sensor()))
     assert (left.entry_of("fixed pattern") is not None) is kept
     assert bool(state.notes) is not kept

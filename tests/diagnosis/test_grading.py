@@ -30,6 +30,7 @@ from dase.diagnosis.seen_effects import (
     without_the_scene,
 )
 from dase.diagnosis.settings import DEFAULTS, GradeSettings
+from dase.diagnosis.state import SearchPath
 from dase.effects import EFFECTS
 from dase.fitting.data_split import split_measurement
 from dase.fitting.measurement import Measurement
@@ -173,11 +174,11 @@ def test_nothing_is_fitted_to_grade_effects_of_a_model_that_leaves_too_much(monk
     monkeypatch.setattr(grading, "_models_without", lambda *args: pytest.fail("it was fitted"))
 
     bare = SimpleNamespace(judgement=judged(8.0))
-    state = SimpleNamespace(settings=DEFAULTS)
+    task = SimpleNamespace(settings=DEFAULTS)
     # 0.2 of the first error is left above what chance makes
     told = grading.grade_effects(
-        state, None, ["leak", "shot"], {frozenset({"shot"}): bare}, SimpleNamespace(judgement=judged(10.25)),
-        judged(2.25), report=None, values={}, at_bounds=(),
+        task, SearchPath(), None, ["leak", "shot"], {frozenset({"shot"}): bare},
+        SimpleNamespace(judgement=judged(10.25)), judged(2.25), report=None, values={}, at_bounds=(),
     )  # fmt: skip
     assert [one.grade for one in told.values()] == [Grade.STAND_IN] * 2
     assert told["leak"].error_without == 8.0
@@ -198,7 +199,7 @@ def test_an_effect_is_not_needed_where_the_last_model_does_as_well_once_it_is_ta
     def error_of(sensor):
         return 4.0 if "hot" not in sensor else 1.7 if sensor["hot"].share < 0.0075 else 0.5
 
-    def judged_by_share(state, models, *, repeats):
+    def judged_by_share(task, models, *, repeats):
         return [grading.ModelOnReport(m, judged(error_of(m.sensor))) for m in models]
 
     monkeypatch.setattr(grading, "judge_on_report", judged_by_share)
@@ -208,8 +209,8 @@ def test_an_effect_is_not_needed_where_the_last_model_does_as_well_once_it_is_ta
         frozenset(e.name for e in some): one
         for some, one in zip(ways, judged_by_share(None, models, repeats=1), strict=True)
     }
-    state = SimpleNamespace(settings=DEFAULTS, evidence=None, seed=0)
-    without = grading._models_without(state, model_with(many, fast), ["hot", "bandwidth"], way)
+    task = SimpleNamespace(settings=DEFAULTS, evidence=None, seed=0)
+    without = grading._models_without(task, model_with(many, fast), ["hot", "bandwidth"], way)
     assert without["bandwidth"].judgement.error == 0.5
     assert without["hot"].judgement.error == 4.0
 
@@ -371,12 +372,10 @@ def test_what_includes_an_effect_is_its_rival_where_something_unknown_may_look_l
         return SimpleNamespace(name=name, error=error, judgement=judged(error), model=None)
 
     candidates = [tried("second_order", 3.0), tried("latency", 3.2), tried("linlog", 9.0)]
-    state = SimpleNamespace(
-        settings=DEFAULTS,
-        effects=EFFECTS,
-        alternatives={"bandwidth": candidates},
-        error_of={"bandwidth": 3.1},
-    )
+    task = SimpleNamespace(settings=DEFAULTS, effects=EFFECTS)
+    path = SearchPath(alternatives={"bandwidth": candidates}, error_of={"bandwidth": 3.1})
     model = model_of(Sensor().with_effect(EFFECTS["bandwidth"]()))
     for doubtful, names in ((False, ["latency"]), (True, ["second_order", "latency"])):
-        assert [one.name for one in _rivals_to_try(state, model, "bandwidth", doubtful=doubtful)] == names
+        assert [
+            one.name for one in _rivals_to_try(task, path, model, "bandwidth", doubtful=doubtful)
+        ] == names

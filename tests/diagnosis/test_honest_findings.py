@@ -351,6 +351,20 @@ def test_what_is_known_is_written_as_it_is_found_and_when_the_user_stops(recordi
     assert not (tmp_path / "s.toml").exists()
 
 
+def test_json_is_all_that_is_printed_where_it_is_printed(recording, monkeypatch):
+    def interrupted(*args, so_far, **options):
+        so_far(replace(found_nothing(), finished=False))
+        so_far(replace(found_nothing(), finished=False))
+        raise KeyboardInterrupt
+
+    words = ["diagnose", "ideal", str(recording), "--scene", "static", "--auto", "--quiet", "--json", "-"]
+    for ends, code in ((lambda *args, **options: found_nothing(), 0), (interrupted, 130)):
+        monkeypatch.setattr("dase.diagnosis.diagnose.diagnose", ends)
+        result = CliRunner().invoke(dase_group, words)
+        assert result.exit_code == code
+        assert json.loads(result.stdout)["finished"] is (code == 0)
+
+
 def test_each_step_of_a_search_is_told():
     scene, known = moving_bars(), []
     events = dase.simulate(scene, Sensor().with_effect(EFFECTS["leak"](rate=5.0)), seed=4)

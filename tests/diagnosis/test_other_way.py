@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
 
@@ -9,7 +10,7 @@ import pytest
 
 from dase.diagnosis import effect_search
 from dase.diagnosis.effect_search import _go_the_other_way, _is_enough
-from dase.diagnosis.state import DiagnosisState
+from dase.diagnosis.state import DiagnosisState, DiagnosisTask, SearchPath
 from dase.effects import EFFECTS
 from dase.fitting.model import FittedModel, model_of
 from dase.results import Step
@@ -43,14 +44,17 @@ def step(chosen: str | None, *effects: str) -> Step:
 def state(monkeypatch) -> DiagnosisState:
     """A search that took `linlog` first, beside which nothing helps; `dark` came next."""
     monkeypatch.setattr(effect_search, "refit_model", lambda evidence, model, **how: model)
-    monkeypatch.setattr(DiagnosisState, "judge", lambda self, model, **how: judged(5.0))
-    found = DiagnosisState(
-        SimpleNamespace(samples=1e9), EFFECTS, 0, lambda *told: None, frozenset({"threshold"}),
-        first=[tried("linlog", 0.60), tried("dark", 0.62), tried("leak", 0.95), tried("shot", 0.99)],
-        history=[step("linlog"), step(None, "linlog")], path=[model_with(), model_with("linlog")],
-    )  # fmt: skip
-    found.alternatives["linlog"] = list(found.first[1:])
-    return found
+    monkeypatch.setattr(DiagnosisTask, "judge", lambda self, model, **how: judged(5.0))
+    first = (tried("linlog", 0.60), tried("dark", 0.62), tried("leak", 0.95), tried("shot", 0.99))
+    path = SearchPath(
+        history=(step("linlog"), step(None, "linlog")),
+        models=(model_with(), model_with("linlog")),
+        alternatives={"linlog": first[1:]},
+        first=first,
+    )
+    evidence = SimpleNamespace(samples=1e9, evaluations=100)
+    task = DiagnosisTask(evidence, EFFECTS, 0, lambda *told: None, frozenset({"threshold"}))
+    return DiagnosisState(task, path=path)
 
 
 def searched(monkeypatch, state: DiagnosisState, end: float) -> tuple[list[tuple[str, ...]], tuple[Any, Any]]:
@@ -58,10 +62,12 @@ def searched(monkeypatch, state: DiagnosisState, end: float) -> tuple[list[tuple
     begun = []
 
     def add_leak(state, compared, model, most):
-        begun.append((state.added_to(model), most))
-        state.path += [model, model_with("dark", "leak")]
-        state.history += [step("leak", "dark"), step(None, "dark", "leak")]
-        return state.path[-1], judged(end)
+        begun.append((state.task.added_to(model), most))
+        for one in (model, model_with("dark", "leak")):
+            state.add_model(one)
+        for one in (step("leak", "dark"), step(None, "dark", "leak")):
+            state.add_step(one)
+        return state.path.models[-1], judged(end)
 
     monkeypatch.setattr(effect_search, "_add_one_by_one", add_leak)
     return begun, _go_the_other_way(state, None, model_with("linlog"), judged(2.0), 4)
@@ -70,36 +76,36 @@ def searched(monkeypatch, state: DiagnosisState, end: float) -> tuple[list[tuple
 def test_the_better_way_is_taken(monkeypatch, state):
     begun, (model, judgement) = searched(monkeypatch, state, 1.1)
     assert begun == [(("dark",), 3)]
-    assert state.added_to(model) == ("dark", "leak")
+    assert state.task.added_to(model) == ("dark", "leak")
     assert judgement.error == 1.1
-    assert [one.chosen for one in state.history] == ["dark", "leak", None]
-    assert [state.added_to(one) for one in state.path] == [(), ("dark",), ("dark", "leak")]
-    assert [one.name for one in state.alternatives["dark"]] == ["linlog", "leak", "shot"]
+    assert [one.chosen for one in state.path.history] == ["dark", "leak", None]
+    assert [state.task.added_to(one) for one in state.path.models] == [(), ("dark",), ("dark", "leak")]
+    assert [one.name for one in state.path.alternatives["dark"]] == ["linlog", "leak", "shot"]
 
 
 @pytest.mark.parametrize("end", [1.9, 3.0])
 def test_a_way_that_gains_little_is_forgotten(monkeypatch, state, end):
-    before = state.ways()
+    before = state.path
     _, (model, judgement) = searched(monkeypatch, state, end)
-    assert state.added_to(model) == ("linlog",)
+    assert state.task.added_to(model) == ("linlog",)
     assert judgement.error == 2.0
-    assert state.ways() == before
-    assert "dark" not in state.alternatives
+    assert state.path is before
 
 
 @pytest.mark.parametrize("loss", [0.91, 0.985])
 def test_what_explains_far_less_begins_no_other_way(monkeypatch, state, loss):
-    state.first[1] = tried("dark", loss)
+    first = (state.path.first[0], tried("dark", loss), *state.path.first[2:])
+    state.path = replace(state.path, first=first)
     begun, (model, _) = searched(monkeypatch, state, 1.1)
     assert not begun
-    assert state.added_to(model) == ("linlog",)
+    assert state.task.added_to(model) == ("linlog",)
 
 
 def test_a_long_way_begins_no_other(monkeypatch, state):
     state.samples_before = int(6e9)
     begun, (model, _) = searched(monkeypatch, state, 1.1)
     assert not begun
-    assert state.added_to(model) == ("linlog",)
+    assert state.task.added_to(model) == ("linlog",)
 
 
 @pytest.mark.parametrize(("end", "taken"), [(0.3, True), (0.7, False)])
@@ -108,15 +114,15 @@ def test_a_way_at_the_floor_is_left_for_one_that_leaves_chance_alone(monkeypatch
         effect_search, "_add_one_by_one", lambda *given: (model_with("dark", "leak"), judged(end))
     )
     model, _ = _go_the_other_way(state, None, model_with("linlog"), judged(1.1), 4)
-    assert state.added_to(model) == (("dark", "leak") if taken else ("linlog",))
+    assert state.task.added_to(model) == (("dark", "leak") if taken else ("linlog",))
 
 
 @pytest.mark.parametrize(("error", "doubt", "enough"), [
     (0.4, None, True), (1.1, None, False), (1.1, 0.5, True), (2.0, 0.5, False),
 ])  # fmt: skip
 def test_what_guessed_light_leaves_begins_no_other_way(state, error, doubt, enough):
-    state.evidence.held = SimpleNamespace(doubt=doubt)
-    assert _is_enough(state, judged(error)) == enough
+    state.task.evidence.held = SimpleNamespace(doubt=doubt)
+    assert _is_enough(state.task, judged(error)) == enough
 
 
 def test_what_the_first_way_found_begins_no_other(monkeypatch, state):
@@ -125,3 +131,21 @@ def test_what_the_first_way_found_begins_no_other(monkeypatch, state):
     both = model_with("linlog", "dark")
     assert _go_the_other_way(state, None, both, judged(2.0), 4)[0] is both
     assert not begun
+
+
+def test_a_search_that_goes_back_takes_as_certain_what_was_but_asks_for_what_is_put_off(state):
+    state.begin_path(certain=frozenset({"refractory"}), shown=frozenset(), noise=0.0)
+    before = state.path
+    state.put_off("refractory")
+    state.make_certain("jitter")
+    assert state.path.certain == {"jitter"}
+    state.go_back(before)
+    assert state.path.certain == {"refractory"}
+    assert state.events_alone.put_off == {"refractory"}
+
+
+def test_what_was_simulated_before_a_measurement_is_split_anew_counts(state):
+    state.split_anew(SimpleNamespace(samples=10, evaluations=2))
+    state.split_anew(SimpleNamespace(samples=20, evaluations=3))
+    assert (state.samples, state.evaluations) == (1e9 + 30, 105)
+    assert state.task.all_time

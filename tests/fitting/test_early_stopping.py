@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -19,7 +18,7 @@ from dase.diagnosis.candidates import (
 from dase.diagnosis.explain_effect import moving_bars
 from dase.diagnosis.pruning import _keep_near_models
 from dase.diagnosis.settings import DEFAULTS
-from dase.diagnosis.state import DiagnosisState
+from dase.diagnosis.state import DiagnosisTask, SearchPath
 from dase.effects import EFFECTS
 from dase.fitting.data_split import split_measurement
 from dase.fitting.descent import descent_work
@@ -86,11 +85,11 @@ def test_where_one_is_clearly_ahead_the_turn_of_others_comes():
 
 
 @pytest.fixture(scope="module")
-def search(device) -> DiagnosisState:
+def search(device) -> DiagnosisTask:
     scene = moving_bars()
     events = dase.simulate(scene, TRUE, seed=4, device=device)
     evidence = split_measurement(Measurement(events, scene), pixels=600, seed=1, device=device)
-    return DiagnosisState(evidence, LIBRARY, 1, lambda text, share, error: None, frozenset({"threshold"}))
+    return DiagnosisTask(evidence, LIBRARY, 1, lambda text, share, error: None, frozenset({"threshold"}))
 
 
 @pytest.mark.parametrize("lacks", [True, False], ids=["lacks mismatch", "lacks nothing"])
@@ -127,16 +126,20 @@ def test_beside_a_model_far_off_only_what_comes_near_the_floor_is_fitted_to_all_
     assert refit_and_judge_far_off(search.evidence, [], seed=1) == []
 
 
-def test_all_effects_are_tried_once_beside_the_same_ones(search):
+def test_all_effects_are_tried_once_beside_the_same_ones():
     def tried(*names: str) -> Step:
         ranking = tuple(Rank(name, 1.0, 0.5, 0.5, 0.01, {}, True) for name in names)
         return Step(("threshold", "mismatch"), 1.5, 1.15, {}, ranking, None, (), ())
 
-    state = replace(search, certain=frozenset({"hot"}), history=[])
-    for history, asked in (([], False), ([tried()], False), ([tried("hot")], False), ([tried("leak")], True)):
-        state.history = history
-        assert state.has_asked(model_of(TRUE)) is asked
-        assert not state.has_asked(model_of(Sensor((THRESHOLD,))))
+    for history, asked in (
+        ((), False),
+        ((tried(),), False),
+        ((tried("hot"),), False),
+        ((tried("leak"),), True),
+    ):
+        path = SearchPath(history, certain=frozenset({"hot"}))
+        assert path.has_asked(model_of(TRUE)) is asked
+        assert not path.has_asked(model_of(Sensor((THRESHOLD,))))
 
 
 def test_only_what_one_descent_takes_near_is_fitted_in_full(search):

@@ -145,7 +145,7 @@ def test_commands(tmp_path, rng):
     done = CliRunner().invoke(dase_group, ["convert", str(path), str(tmp_path / "b.raw"), *part])
     assert f"{wanted:,} events written" in done.output, done.output
     assert "read was a part only: from 0.004 s to 0.012 s, 100x90 pixels at (60, 40)" in done.output
-    done = CliRunner().invoke(dase_group, ["info", str(path), "--json", *part])
+    done = CliRunner().invoke(dase_group, ["info", str(path), "--json", "-", *part])
     said = json.loads(done.output)
     assert (said["events"], said["width"], said["height"]) == (wanted, 100, 90)
     done = CliRunner().invoke(dase_group, ["show", str(path), "-o", str(tmp_path / "a.png"), *part])

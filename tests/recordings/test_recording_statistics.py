@@ -249,12 +249,16 @@ def test_info_prints_and_writes_json(tmp_path, rng):
     assert "assumed:  the file does not say how large the sensor is" in done.output
     assert "odd:      100 % of the events are ON" in done.output
     assert "█" in done.output
-    done = CliRunner().invoke(command, [str(tmp_path / "a.txt"), "--size", "64x48", "--json"])
+    words = [str(tmp_path / "a.txt"), "--size", "64x48", "--json"]
+    done = CliRunner().invoke(command, [*words, "-"])
     told = json.loads(done.output)
     assert (told["format"], told["width"], told["height"], told["events"]) == ("text", 64, 48, 5000)
     assert told["on_share"] == 1.0
     assert told["period"] is None
     assert {note["rule"] for note in told["notes"]} == {"polarity"}
+    done = CliRunner().invoke(command, [*words, str(tmp_path / "a.json")])
+    assert "format            text" in done.output
+    assert json.loads((tmp_path / "a.json").read_text()) == told
     done = CliRunner().invoke(command, [str(tmp_path / "a.txt"), "--size", "big"])
     assert done.exit_code == 2
 

@@ -407,7 +407,7 @@ def test_info_prints_signatures(plain, tmp_path):
     done = CliRunner().invoke(dase_group, ["info", str(path), "--signatures", *size])
     assert done.exit_code == 0, done.output
     assert "\nframe coupling  not seen" in done.output
-    done = CliRunner().invoke(dase_group, ["info", str(path), "--signatures", "--json", *size])
+    done = CliRunner().invoke(dase_group, ["info", str(path), "--signatures", "--json", "-", *size])
     assert len(json.loads(done.output)["signatures"]["entries"]) == len(NAMES)
 
 
