@@ -253,7 +253,7 @@ def known_so_far(
         unexplained=None,
         history=state.path.history,
         notes=(*state.notes, *state.task.evidence.notes),
-        evaluations=state.task.evidence.evaluations,
+        evaluations=state.evaluations,
         seconds=seconds,
         finished=False,
     )
