@@ -135,6 +135,7 @@ class Bandwidth(Effect):
     )
     stages: ClassVar = {"respond": lowpass_voltage}
     states: ClassVar = ("input", "output")
+    signatures: ClassVar = ()
 
     cutoff: float = parameter(
         200.0,

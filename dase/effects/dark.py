@@ -48,6 +48,7 @@ class Dark(Effect):
         "Nozaki, Delbruck: Temperature and parasitic photocurrent effects in dynamic vision sensors, 2017"
     )
     stages: ClassVar = {"current": add_dark_current}
+    signatures: ClassVar = ()
 
     current: float = parameter(
         0.003,

@@ -40,6 +40,7 @@ class Latency(Effect):
         "temporal contrast vision sensor, 2008 (latency over illumination)"
     )
     stages: ClassVar = {"delay": event_delay}
+    signatures: ClassVar = ()
 
     delay: float = parameter(
         1e-4,

@@ -40,6 +40,7 @@ class Linlog(Effect):
         "Hu, Liu, Delbruck: v2e, from video frames to realistic DVS events, 2021 (lin-log mapping)"
     )
     stages: ClassVar = {"respond": linlog_voltage}
+    signatures: ClassVar = ()
 
     knee: float = parameter(
         20 / 255,

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dase.effects.base import Observations, choice, parameter
+from dase.effects.made_signatures import Makes
 from dase.effects.stream import (
     Reader,
     StampPattern,
@@ -80,6 +81,11 @@ class RowScan(StreamEffect):
         "Son et al.: A 640x480 dynamic vision sensor with a 9 um pixel and 300 Meps address-event "
         "representation, 2017; default from a recording of a 640x480 camera that visits its 640 columns "
         "every 195.16 us, from right to left"
+    )
+    signatures: ClassVar = (
+        # what waits for the bus afterwards, or for a tick, is not on the scan any more
+        Makes("time stamps", tells=True, by="line", absence=False),
+        Makes("grouping"),
     )
 
     line: float = parameter(

@@ -206,6 +206,7 @@ class SecondOrder(Effect):
     stages: ClassVar = {"respond": second_order_voltage}
     states: ClassVar = ("input", "output", "slope")
     includes: ClassVar = ("bandwidth",)
+    signatures: ClassVar = ()
 
     cutoff: float = parameter(
         300.0,

@@ -33,6 +33,7 @@ class Vignetting(Effect):
     name: ClassVar[str] = "vignetting"
     source: ClassVar[str] = "Goldman, Chen: Vignette and exposure calibration and compensation, 2005"
     stages: ClassVar = {"light": vignetted_light}
+    signatures: ClassVar = ()
 
     loss: float = parameter(
         0.4,

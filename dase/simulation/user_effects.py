@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from dase.effects import EFFECTS, Effect, StreamEffect
+from dase.effects import EFFECTS, Effect, Makes, StreamEffect
 from dase.errors import InputError, nearest
 from dase.events import LABELS
 from dase.files.text_files import read_text_file
@@ -150,6 +150,7 @@ class _EffectDefinition:
     def check(self) -> None:
         """Raise InputError unless this is an effect that can be composed, fitted and switched off."""
         self.check_class()
+        self.check_signatures()
         self.check_name()
         self.check_fields()
         self.check_values()
@@ -173,6 +174,18 @@ class _EffectDefinition:
             raise self.wrong(f"{what} lacks the method {lacking}")
         if self.effect.label not in LABELS:
             raise self.wrong(f"{what}: label must be one of {', '.join(LABELS)}, got {self.effect.label!r}")
+
+    def check_signatures(self) -> None:
+        """Check what the effect says of the signatures that it makes; each checks itself when it is made."""
+        said = self.effect.signatures
+        if said is None:
+            return
+        if not isinstance(said, tuple) or not all(isinstance(one, Makes) for one in said):
+            what = f"effect class '{self.effect.__name__}': signatures"
+            raise self.wrong(f'{what} must be a tuple such as (Makes("hot pixels"),), got {said!r}')
+        names = [one.signature for one in said]
+        if len(set(names)) != len(names):
+            raise self.wrong(f"effect class '{self.effect.__name__}' says twice that it makes a signature")
 
     def check_name(self) -> None:
         """Check the name, which stands in sensor files and in the text of the kernel."""
