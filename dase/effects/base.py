@@ -206,6 +206,10 @@ class Effect:
     signatures: ClassVar[tuple[Makes, ...] | None] = None
     """All signatures that it makes, () for none. None where that is not known: then it may make any that is
     seen beside a model, and these name no effect of a library that it is in."""
+    screen_limits: ClassVar[Mapping[str, str]] = {}
+    """What a test picture on a screen cannot tell of it, and what would: a parameter, or "" for all of it, to
+    half a sentence, in which `{refresh:g}` is how often the screen changes and `{highest_cutoff:g}` up to
+    which frequency it tells a cutoff [Hz]."""
 
     def __post_init__(self) -> None:
         for p in self.parameters():

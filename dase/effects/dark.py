@@ -49,6 +49,11 @@ class Dark(Effect):
     )
     stages: ClassVar = {"current": add_dark_current}
     signatures: ClassVar = ()
+    screen_limits: ClassVar = {
+        "": (
+            "dark current wants a lens cap: black of a screen is some 0.1 % of white, and the room adds to it"
+        ),
+    }
 
     current: float = parameter(
         0.003,

@@ -161,6 +161,9 @@ class Flicker(Effect):
     )
     stages: ClassVar = {"light": flickering_light}
     signatures: ClassVar = (Makes("flicker", tells=True),)
+    screen_limits: ClassVar = {
+        "": "flicker found before a screen may be that of its backlight: it is light, and not of the camera",
+    }
 
     frequency: float = parameter(
         100.0,

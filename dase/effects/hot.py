@@ -75,6 +75,9 @@ class Hot(Effect):
     rare: ClassVar[bool] = True
     stages: ClassVar = {"noise": hot_rates}
     signatures: ClassVar = (Makes("hot pixels", tells=True),)
+    screen_limits: ClassVar = {
+        "": "hot pixels are told best under a lens cap, for some seconds",
+    }
 
     share: float = parameter(
         0.001,

@@ -48,6 +48,10 @@ class Leak(Effect):
     )
     stages: ClassVar = {"drift": leak_drift}
     signatures: ClassVar = (Makes("leak events", tells=True), Makes("drifting memory", tells=True))
+    screen_limits: ClassVar = {
+        "rate": "a leak wants minutes at rest, in even light or under a lens cap",
+        "light": "how leak grows with light wants more light than a screen has: an LED or daylight, at rest",
+    }
 
     rate: float = parameter(
         0.1,

@@ -41,6 +41,9 @@ class Linlog(Effect):
     )
     stages: ClassVar = {"respond": linlog_voltage}
     signatures: ClassVar = ()
+    screen_limits: ClassVar = {
+        "": "the knee wants light far below a screen's black: a lamp and grey filters over four decades",
+    }
 
     knee: float = parameter(
         20 / 255,

@@ -188,6 +188,9 @@ class Readout(StreamEffect):
         Makes("grouping"),
         Makes("time stamps"),
     )
+    screen_limits: ClassVar = {
+        "": "a full bus wants more events at once: flashes of an LED that all pixels see, or a fast print",
+    }
 
     rate: float = parameter(
         1e7,

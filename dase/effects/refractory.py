@@ -53,6 +53,12 @@ class Refractory(Effect):
     )
     stages: ClassVar = {"gate": dead_time_left}
     signatures: ClassVar = (Makes("dead time", tells=True),)
+    screen_limits: ClassVar = {
+        "period": (
+            "a dead time wants steps that are fast and large: an LED, or the edge of a print that is "
+            "moved fast"
+        ),
+    }
 
     period: float = parameter(
         1e-3,

@@ -87,6 +87,9 @@ class RowScan(StreamEffect):
         Makes("time stamps", tells=True, by="line", absence=False),
         Makes("grouping"),
     )
+    screen_limits: ClassVar = {
+        "": "the order of rows wants an LED: a screen is drawn row after row itself",
+    }
 
     line: float = parameter(
         3.05e-7,

@@ -207,6 +207,12 @@ class SecondOrder(Effect):
     states: ClassVar = ("input", "output", "slope")
     includes: ClassVar = ("bandwidth",)
     signatures: ClassVar = ()
+    screen_limits: ClassVar = {
+        "": (
+            "a cutoff above about {highest_cutoff:g} Hz and the damping want an LED, as the screen rings and "
+            "lags itself"
+        ),
+    }
 
     cutoff: float = parameter(
         300.0,

@@ -77,6 +77,12 @@ class Shot(Effect):
         Makes("noise at rest", tells=True, by="independent", usual=True),
         Makes("opposite pairs"),
     )
+    screen_limits: ClassVar = {
+        "rate": "shot noise wants darkness for seconds: a lens cap; a screen's black shows only part of it",
+        "bright": (
+            "how shot noise falls with light wants decades of light: grey filters, or an LED and a lens cap"
+        ),
+    }
 
     rate: float = parameter(
         1.0,

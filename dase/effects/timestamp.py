@@ -80,6 +80,9 @@ class Timestamp(StreamEffect):
         "spatiotemporal vision sensor, 2014"
     )
     signatures: ClassVar = (Makes("time stamps", tells=True, by="step"),)
+    screen_limits: ClassVar = {
+        "": "jitter of time stamps wants an LED, whose edges last less than a microsecond",
+    }
 
     jitter: float = parameter(
         2e-6,

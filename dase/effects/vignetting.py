@@ -34,6 +34,12 @@ class Vignetting(Effect):
     source: ClassVar[str] = "Goldman, Chen: Vignette and exposure calibration and compensation, 2005"
     stages: ClassVar = {"light": vignetted_light}
     signatures: ClassVar = ()
+    screen_limits: ClassVar = {
+        "": (
+            "vignetting cannot be told from a screen that is darker at its corners: an evenly lit sheet "
+            "tells it"
+        ),
+    }
 
     loss: float = parameter(
         0.4,

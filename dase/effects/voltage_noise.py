@@ -359,6 +359,9 @@ class VoltageNoise(Effect):
         Makes("noise at rest", tells=True, by="returning"),
         Makes("opposite pairs"),
     )
+    screen_limits: ClassVar = {
+        "cutoff": "the noise's cutoff wants constant light: an LED on DC, not a backlight",
+    }
 
     sigma: float = parameter(
         0.05,

@@ -151,6 +151,7 @@ class _EffectDefinition:
         """Raise InputError unless this is an effect that can be composed, fitted and switched off."""
         self.check_class()
         self.check_signatures()
+        self.check_screen_limits()
         self.check_name()
         self.check_fields()
         self.check_values()
@@ -186,6 +187,19 @@ class _EffectDefinition:
         names = [one.signature for one in said]
         if len(set(names)) != len(names):
             raise self.wrong(f"effect class '{self.effect.__name__}' says twice that it makes a signature")
+
+    def check_screen_limits(self) -> None:
+        """Check what the effect says of what a screen cannot tell."""
+        said, known = self.effect.screen_limits, {"", *(p.name for p in self.effect.parameters())}
+        if not isinstance(said, Mapping) or not said.keys() <= known:
+            what = f"effect class '{self.effect.__name__}': screen_limits"
+            raise self.wrong(f'{what} must map parameters, or "" for all of it, to texts, got {said!r}')
+        for text in said.values():
+            try:
+                text.format(refresh=60.0, highest_cutoff=15.0)
+            except (AttributeError, IndexError, KeyError, ValueError) as error:
+                what = "screen_limits: only {refresh:g} and {highest_cutoff:g} can stand in braces"
+                raise self.wrong(f"{what}, got {text!r}") from error
 
     def check_name(self) -> None:
         """Check the name, which stands in sensor files and in the text of the kernel."""

@@ -145,6 +145,18 @@ WRONG = [
     ),
     (
         '    source: ClassVar[str] = "nobody"\n',
+        '    source: ClassVar[str] = "nobody"\n    screen_limits: ClassVar = {"power": "wants an LED"}\n',
+        "screen_limits must map parameters",
+        "class Weaker",
+    ),
+    (
+        '    source: ClassVar[str] = "nobody"\n',
+        '    source: ClassVar[str] = "nobody"\n    screen_limits: ClassVar = {"strength": "{rate} Hz"}\n',
+        "can stand in braces, got '{rate} Hz'",
+        "class Weaker",
+    ),
+    (
+        '    source: ClassVar[str] = "nobody"\n',
         '    source: ClassVar[str] = "nobody"\n    signatures: ClassVar = (Makes("hot pixel"),)\n',
         "did you mean 'hot pixels'?",
         "    signatures: ClassVar",
