@@ -30,8 +30,9 @@ def list_effects(effects: tuple[Path, ...]) -> None:
 @click.argument("name")
 @effects_option
 def show_effect(name: str, effects: tuple[Path, ...]) -> None:
-    """Describe the effect NAME: physics, parameters, source."""
+    """Describe the effect NAME: physics, parameters, signatures, source."""
     from dase.effects import SceneEffect, StreamEffect, find_effect
+    from dase.signatures.kinds import KINDS
     from dase.simulation.user_effects import known_effects
 
     effect = find_effect(name, known_effects(effects))
@@ -48,6 +49,8 @@ def show_effect(name: str, effects: tuple[Path, ...]) -> None:
     elsewhere = [place for kind, place in places.items() if issubclass(effect, kind)]
     stages = effect.stages or elsewhere or ["core of the change detector"]
     click.echo(f"\nStages: {', '.join(stages)}")
+    for one in effect.signatures or ():
+        click.echo(f"Signature: {one.signature}, that is, {KINDS[one.signature].about}")
     click.echo(f"Source: {effect.source}")
 
 

@@ -71,11 +71,10 @@ FLOORS: tuple[tuple[tuple[str, ...], str], ...] = (
         ("results", "learning", "torch"),
         "Results hold sensors; learning makes thresholds for them, without any fit; batches need sensors.",
     ),
-    (
-        ("simulation", "signatures"),
-        "A sensor puts effects together and runs them over a scene; signatures need neither.",
-    ),
-    (("probes", "effects"), "An effect knows scenes and kernels, not the sensor; a statistic only events."),
+    (("simulation",), "A sensor puts effects together and runs them over a scene."),
+    (("effects",), "An effect knows scenes, kernels and which signatures it makes, not the sensor."),
+    (("signatures",), "What events show by themselves is found without any sensor."),
+    (("probes",), "A statistic knows only events."),
     (
         ("recordings", "scenes", "representations"),
         "What a camera wrote, what it looks at, and what networks are given of its events.",

@@ -10,9 +10,10 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from dase.effects import EFFECTS
 from dase.errors import InputError
 from dase.figures.printed_sheet import write_sheet
-from dase.fitting.screen_limits import SCREEN_LIMITS
+from dase.fitting.screen_limits import screen_limits_of
 from dase.io.sequence import replacing
 from dase.io.video_writer import VideoCodec, open_video_writer
 from dase.scenes.screen_stimulus import ScreenStimulus, truth_text
@@ -143,7 +144,10 @@ def protocol_text(stimulus: ScreenStimulus) -> str:
             ),
             "## What a screen cannot tell",
             "",
-            *(f"- `{name}`: {say(stimulus)}." for name, say in SCREEN_LIMITS.items()),
+            *(
+                f"- `{name}`: {limit}."
+                for name, limit in screen_limits_of(EFFECTS.values(), stimulus).items()
+            ),
             "",
         )
     )

@@ -32,13 +32,13 @@ from dase.probes.timestamp_patterns import TimestampStructure
 from dase.results import Diagnosis, Estimate
 from dase.scenes.between_frames import CameraScene
 from dase.scenes.video import VideoScene
+from dase.signatures import kinds
 from dase.signatures.result import Answer, Signature
 from dase.simulation.sensor import Sensor
 from dase.simulation.simulate import simulate
 
 Array = NDArray[np.float64]
 
-NAME = "dead time"
 EFFECT = Refractory.name
 
 
@@ -199,7 +199,8 @@ def end_of_intervals(
         f"has {format_count(there)}"
     )
     return Signature(
-        name=NAME, answer=Answer.FOUND, p=float(stats.poisson.cdf(here, there)), size=1 - here / there,
+        name=kinds.DEAD_TIME, answer=Answer.FOUND,
+        p=float(stats.poisson.cdf(here, there)), size=1 - here / there,
         unit="share of the shorter intervals that are not there", least=1 - left, sentence=sentence,
         details={
             "period": end, "low": low, "high": end, "shortest": shortest, "here": here, "without": there

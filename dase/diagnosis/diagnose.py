@@ -11,7 +11,6 @@ from os import PathLike
 from dase.diagnosis.compared_measurement import ComparedMeasurement, choose_compared
 from dase.diagnosis.conclusion import conclude_diagnosis, known_so_far
 from dase.diagnosis.dead_time import EFFECT as REFRACTORY
-from dase.diagnosis.dead_time import NAME as DEAD_TIME
 from dase.diagnosis.dead_time import with_dead_time
 from dase.diagnosis.effect_search import search_effects
 from dase.diagnosis.few_hot_pixels import hot_effect_of, with_hot_pixels
@@ -32,7 +31,6 @@ from dase.diagnosis.settings import DEFAULTS, DiagnosisSettings
 from dase.diagnosis.silent_pixels import with_dead_pixels, without_the_explained_silence
 from dase.diagnosis.state import DiagnosisState, DiagnosisTask
 from dase.diagnosis.unequal_thresholds import EFFECT as MISMATCH
-from dase.diagnosis.unequal_thresholds import NAME as UNEQUAL
 from dase.diagnosis.unequal_thresholds import with_unequal_thresholds
 from dase.effects import EFFECTS, Effect
 from dase.fitting.burst_strength import BurstStrength, put_in_step
@@ -50,6 +48,7 @@ from dase.fitting.scene_doubt import with_scene_doubt
 from dase.probes.random_streams import SimulationStream
 from dase.probes.stimulus import Trust
 from dase.results import Diagnosis, Progress, is_worse
+from dase.signatures.kinds import DEAD_TIME, UNEQUAL_THRESHOLDS
 from dase.simulation.sensor import Sensor
 from dase.simulation.sensor_file import as_sensor
 
@@ -245,7 +244,7 @@ def _with_what_pixels_show(
         strength: What the bursts told before the search; None without bursts.
     """
     measurement, contradicted = compared.measurement, bool(task.evidence.contradiction)
-    ended, unequal = seen.entry_of(DEAD_TIME), seen.entry_of(UNEQUAL)
+    ended, unequal = seen.entry_of(DEAD_TIME), seen.entry_of(UNEQUAL_THRESHOLDS)
     if ended is not None and REFRACTORY in task.effects:
         found = with_dead_time(found, ended)
     forgets = REFRACTORY in task.given and REFRACTORY not in compared.given

@@ -18,13 +18,13 @@ from dase.effects.leak import Leak
 from dase.errors import InputError
 from dase.probes.random_streams import SimulationStream
 from dase.probes.timestamp_patterns import TimestampStructure
+from dase.signatures import kinds
 from dase.signatures.chance import NINETY
 from dase.signatures.result import Answer, Signature
 from dase.simulation.sensor import Sensor
 
 Array = NDArray[np.float64]
 
-NAME = "drifting memory"
 EFFECT = Leak.name
 
 
@@ -147,7 +147,8 @@ def find_drifting_memory(
     )
     reach = NINETY * seen.error
     return Signature(
-        name=NAME, answer=Answer.FOUND, p=float(stats.norm.sf(seen.rate / seen.error)), size=seen.rate,
+        name=kinds.DRIFTING_MEMORY, answer=Answer.FOUND,
+        p=float(stats.norm.sf(seen.rate / seen.error)), size=seen.rate,
         low=seen.rate - reach, high=seen.rate + reach, unit="thresholds per second", sentence=sentence,
         details={"goes": seen.goes, "bins": seen.bins},
     )  # fmt: skip

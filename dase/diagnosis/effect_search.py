@@ -26,7 +26,6 @@ from dase.diagnosis.effect_pairs import add_pair
 from dase.diagnosis.pruning import prune_model
 from dase.diagnosis.ranking import rank_of
 from dase.diagnosis.redrawn_thresholds import EFFECT as JITTER
-from dase.diagnosis.redrawn_thresholds import NAME as REDRAWN
 from dase.diagnosis.redrawn_thresholds import add_jitter, find_jitter_beside
 from dase.diagnosis.settings import DEFAULTS, DiagnosisSettings
 from dase.diagnosis.state import DiagnosisState, DiagnosisTask, explains_remainder
@@ -35,6 +34,7 @@ from dase.fitting.scene_doubt import with_scene_doubt
 from dase.probes.distance import Judgement, leaves_nothing, reaches_floor, worst_families
 from dase.probes.random_streams import SimulationStream
 from dase.results import Step
+from dase.signatures.kinds import REDRAWN_THRESHOLDS
 
 
 def search_effects(
@@ -193,7 +193,7 @@ def _find_jitter(
     if JITTER not in effects_to_try(task.effects, model) or compared.seen.lamp:
         return None
     # where events come at fractions of frames, light between them says little of thresholds
-    if task.evidence.frame_step or not compared.seen.may_name(REDRAWN):
+    if task.evidence.frame_step or not compared.seen.may_name(REDRAWN_THRESHOLDS):
         return None
     task.progress("looking at thresholds", 0.0, judgement.error)
     noise = state.events_alone.noise

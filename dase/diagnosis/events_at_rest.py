@@ -29,14 +29,12 @@ from dase.probes.stimulus import log_light_of
 from dase.scenes.between_frames import CameraScene
 from dase.scenes.video import VideoScene
 from dase.signatures.chance import poisson_interval
+from dase.signatures.kinds import LEAK_EVENTS, NOISE_AT_REST
 from dase.signatures.result import Answer, Signature
 from dase.simulation.sensor import Sensor
 from dase.simulation.simulate import simulate
 
 Array = NDArray[np.float64]
-
-NOISE = "noise at rest"
-LEAK = "leak events"
 
 
 @dataclass(frozen=True)
@@ -346,13 +344,13 @@ def judge_events_at_rest(
         alone = _is_first(t, at, settings.near)
         if not _independent(t[alone], p[alone], rests, frame_gap, settings):
             return None
-        name, words = NOISE, f"{format_percent(on / count)} of them ON"
-        effect, why = _which_noise(t, p, at, settings)
-        if effect:
-            details["effect"] = effect
+        name, words = NOISE_AT_REST, f"{format_percent(on / count)} of them ON"
+        way, share, why = _way_of_noise(t, p, at, settings)
+        if way:
+            details[way] = share
             words += f"; {why}"
     elif off <= settings.one:
-        name, words = LEAK, "all of them ON" if not off else f"{format_percent(1 - off)} of them ON"
+        name, words = LEAK_EVENTS, "all of them ON" if not off else f"{format_percent(1 - off)} of them ON"
     else:
         return None
     sentence = (
@@ -365,10 +363,12 @@ def judge_events_at_rest(
     )  # fmt: skip
 
 
-def _which_noise(
+def _way_of_noise(
     t: Array, p: NDArray[np.bool_], at: NDArray[np.int64], settings: EventsAtRestSettings
-) -> tuple[str, str]:
-    """Return the effect that makes noise, and why in words; empty where pairs of events do not tell.
+) -> tuple[str, float, str]:
+    """Return in which way noise comes, how much of successive events is opposite, and that in words.
+
+    The way is one of `SignatureKind.ways`, "" where pairs of events do not tell.
 
     Args:
         t: Of the events [s], ascending, shape (N,).
@@ -381,15 +381,15 @@ def _which_noise(
     pair = (at[1:] == at[:-1]) & (np.diff(t) < settings.near)
     count = int(pair.sum())
     if count < settings.pairs:
-        return "", ""
+        return "", 0.0, ""
     opposite = float((p[1:] != p[:-1])[pair].mean())
     on = float(p.mean())
     words = f"{format_percent(opposite)} of {format_count(count)} successive events of a pixel are opposite"
     if opposite >= settings.turns:
-        return "voltage_noise", words
+        return "returning", opposite, words
     if abs(opposite - 2 * on * (1 - on)) <= settings.by_chance:
-        return "shot", words
-    return "", ""
+        return "independent", opposite, words
+    return "", opposite, ""
 
 
 def _sent_by_hot_pixels(

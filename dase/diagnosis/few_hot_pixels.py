@@ -19,6 +19,7 @@ from dase.effects.base import Effect
 from dase.effects.hot import Hot
 from dase.events import Events
 from dase.results import Diagnosis, Estimate
+from dase.signatures import kinds
 
 NAME = Hot.name
 
@@ -49,7 +50,7 @@ def few_hot_pixels(
         settings: When they are too few.
     """
     for entry in seen.entries:
-        if entry.name == "hot pixels" and NAME in seen.library:
+        if entry.name == kinds.HOT_PIXELS and NAME in seen.library:
             places = np.array(entry.details["pixels"], np.int64).reshape(-1, 2)
             share = entry.size / (events.width * events.height)
             # the signature lists a thousand at most

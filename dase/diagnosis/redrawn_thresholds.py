@@ -30,13 +30,13 @@ from dase.fitting.model import FittedModel, refit_model, with_fixed_effect
 from dase.formatting import format_percent
 from dase.probes.distance import Judgement, reaches_floor
 from dase.probes.random_streams import SimulationStream
+from dase.signatures import kinds
 from dase.signatures.chance import NINETY
 from dase.signatures.result import Answer, Signature
 from dase.simulation.sensor import Sensor
 
 Array = NDArray[np.float64]
 
-NAME = "redrawn thresholds"
 EFFECT = Jitter.name
 
 
@@ -287,7 +287,8 @@ def find_redrawn_thresholds(
         f"much farther or less far from one event to the next, independently each time"
     )
     return Signature(
-        name=NAME, answer=Answer.FOUND, p=float(stats.norm.sf(mean / error)), size=spread, low=low, high=high,
+        name=kinds.REDRAWN_THRESHOLDS, answer=Answer.FOUND,
+        p=float(stats.norm.sf(mean / error)), size=spread, low=low, high=high,
         unit="spread of thresholds over events, relative", sentence=sentence,
         least=settings.least if right else settings.clear,
         details={"runs": min(len(one.drawn) for one in seen.values())},

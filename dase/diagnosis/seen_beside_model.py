@@ -10,25 +10,29 @@ from __future__ import annotations
 from dataclasses import replace
 
 from dase.diagnosis.dead_time import EFFECT as REFRACTORY
-from dase.diagnosis.dead_time import NAME as DEAD_TIME
 from dase.diagnosis.dead_time import add_dead_time, find_dead_time
 from dase.diagnosis.drifting_memory import EFFECT as LEAKING
 from dase.diagnosis.drifting_memory import find_drifting_memory
-from dase.diagnosis.events_at_rest import LEAK, NOISE, find_events_at_rest, noise_is_a_pattern
+from dase.diagnosis.events_at_rest import find_events_at_rest, noise_is_a_pattern
 from dase.diagnosis.light_between_events import LightBetweenEvents
 from dase.diagnosis.redrawn_thresholds import EFFECT as JITTER
 from dase.diagnosis.redrawn_thresholds import find_jitter_beside
 from dase.diagnosis.seen_effects import SeenEffects
 from dase.diagnosis.state import DiagnosisState, DiagnosisTask, EventsAlone, with_same_freedom
 from dase.diagnosis.unequal_thresholds import EFFECT as MISMATCH
-from dase.diagnosis.unequal_thresholds import NAME as UNEQUAL
 from dase.diagnosis.unequal_thresholds import find_unequal_thresholds
 from dase.effects.threshold import Threshold
 from dase.fitting.measurement import Measurement
 from dase.fitting.model import FittedModel
 from dase.probes.distance import Judgement
 from dase.results import is_worse
-from dase.signatures.fixed_pattern import NAME as PATTERN
+from dase.signatures.kinds import (
+    DEAD_TIME,
+    FIXED_PATTERN,
+    LEAK_EVENTS,
+    NOISE_AT_REST,
+    UNEQUAL_THRESHOLDS,
+)
 
 
 def look_beside_model(
@@ -48,7 +52,8 @@ def look_beside_model(
     seen = _look_for_dead_time(task, seen, measurement, model)
     seen = _look_at_thresholds(task, seen, measurement, model)
     seen = _without_pattern_of_noise(state, seen, measurement, model)
-    certain, noise = frozenset(seen.effects) & frozenset(task.effects) - task.given, seen.entry_of(NOISE)
+    certain = frozenset(seen.effects) & frozenset(task.effects) - task.given
+    noise = seen.entry_of(NOISE_AT_REST)
     state.begin_path(
         certain=certain,
         shown=certain & seen.shown_whatever_fits,
@@ -153,7 +158,7 @@ def _look_at_thresholds(
     if MISMATCH not in task.given:
         found.append(find_unequal_thresholds(light, model.sensor, seed=task.seed))
     # light that goes on in a dead time counts for nothing, and the less the longer the time between events is
-    if LEAKING not in task.given and not (seen.entry_of(LEAK) or seen.entry_of(DEAD_TIME)):
+    if LEAKING not in task.given and not (seen.entry_of(LEAK_EVENTS) or seen.entry_of(DEAD_TIME)):
         structure = task.evidence.structure
         found.append(find_drifting_memory(light, model.sensor, structure=structure, seed=task.seed))
     return replace(seen, entries=(*seen.entries, *(one for one in found if one is not None)))
@@ -166,7 +171,8 @@ def _without_pattern_of_noise(
 
     Thresholds that differ are told by what light does between events, too.
     """
-    if not (seen.entry_of(PATTERN) and seen.entry_of(NOISE)) or seen.entry_of(UNEQUAL):
+    both = seen.entry_of(FIXED_PATTERN) and seen.entry_of(NOISE_AT_REST)
+    if not both or seen.entry_of(UNEQUAL_THRESHOLDS):
         return seen
     if not noise_is_a_pattern(measurement, model.sensor, seed=state.task.seed):
         return seen
@@ -174,7 +180,7 @@ def _without_pattern_of_noise(
         "pixels at rest send ON and OFF noise at rates of their own: that they differ tells nothing of their "
         "thresholds"
     )
-    return replace(seen, entries=tuple(one for one in seen.entries if one.name != PATTERN))
+    return replace(seen, entries=tuple(one for one in seen.entries if one.name != FIXED_PATTERN))
 
 
 def _without_needless_dead_time(

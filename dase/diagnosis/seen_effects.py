@@ -7,18 +7,14 @@ certain. What the scene itself does, such as light that flickers in a clip, is n
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from dase.diagnosis.dead_time import NAME as DEAD_TIME
-from dase.diagnosis.drifting_memory import NAME as DRIFT
-from dase.diagnosis.events_at_rest import LEAK, NOISE
 from dase.diagnosis.frames_at_rest import events_where_frames_rest
-from dase.diagnosis.redrawn_thresholds import NAME as REDRAWN
-from dase.diagnosis.unequal_thresholds import NAME as UNEQUAL
 from dase.effects import EFFECTS, Effect
+from dase.effects.made_signatures import makers_of, told_by
 from dase.effects.threshold import Threshold
 from dase.errors import InputError
 from dase.events import Events
@@ -32,52 +28,20 @@ from dase.signatures.burst_times import BurstTimes
 from dase.signatures.find import find_signatures
 from dase.signatures.flicker import FlickerSettings
 from dase.signatures.frame_coupling import BurstClock
-from dase.signatures.hot_pixels import NAME as HOT_PIXELS
-from dase.signatures.opposite_pairs import NAME as OPPOSITE_PAIRS
+from dase.signatures.kinds import (
+    DOUBLE_EVENTS,
+    FIXED_PATTERN,
+    FLICKER,
+    FRAME_COUPLING,
+    KINDS,
+    NOISE_AT_REST,
+    OPPOSITE_PAIRS,
+    TIME_STAMPS,
+    UNEQUAL_THRESHOLDS,
+)
 from dase.signatures.result import Answer, Signature
 from dase.simulation.sensor import Sensor
 from dase.simulation.simulate import simulate
-
-KINDS: dict[str, tuple[str, ...]] = {
-    "flicker": ("flicker",),
-    "hot pixels": ("hot",),
-    "full bus": ("readout",),
-    "time stamps": ("timestamp", "row_scan", "readout"),
-    "opposite pairs": ("shot", "voltage_noise"),
-    "fixed pattern": ("mismatch", "dead"),
-    "grouping": ("readout", "row_scan"),
-    "frame coupling": ("exposure",),
-    "double events": ("double_events",),
-    DEAD_TIME: ("refractory",),
-    LEAK: ("leak",),
-    NOISE: ("shot", "voltage_noise"),
-    UNEQUAL: ("mismatch",),
-    DRIFT: ("leak",),
-    REDRAWN: ("jitter",),
-}
-"""Signature to the effects that make it; nothing where the library has none that does."""
-
-NAMED = (
-    "flicker",
-    "hot pixels",
-    "full bus",
-    "time stamps",
-    "frame coupling",
-    "double events",
-    DEAD_TIME,
-    LEAK,
-    UNEQUAL,
-    DRIFT,
-    REDRAWN,
-)
-"""Signatures that tell which effect it is; the others tell what there is, and not what makes it."""
-
-
-WITH_A_SCENE = (DEAD_TIME, LEAK, NOISE, UNEQUAL, DRIFT, REDRAWN)
-"""Signatures for which a model over the scene is asked."""
-
-MADE_BY_LIGHT = ("flicker",)
-"""Signatures that light makes by itself."""
 
 SHARPER = (1.0, 0.5, 0.25)
 """Thresholds of the model of which it is asked what light does, relative to those of the model before the
@@ -92,45 +56,54 @@ class SeenEffects:
         entries: The signatures that are there and not of the scene.
         bursts: When the whole array sends in step with the frames, which no model explains; None for never.
         absent: Signatures that would have been there, and are not.
-        library: Effects that may be named.
+        library: Effects that may be named, name to class.
     """
 
     entries: tuple[Signature, ...] = ()
     bursts: BurstClock | None = None
     absent: tuple[Signature, ...] = ()
-    library: frozenset[str] = frozenset(EFFECTS)
+    library: Mapping[str, type[Effect]] = field(default_factory=lambda: EFFECTS)
 
     @property
     def lamp(self) -> float | None:
         """Frequency of light that flickers [Hz]; None where there is none."""
-        entry = self.entry_of("flicker")
+        entry = self.entry_of(FLICKER)
         return float(entry.details["frequency"]) if entry else None
 
     @property
     def effects(self) -> dict[str, str]:
         """Effects of the library that are certain, each to what shows it."""
-        return {name: entry.sentence for entry in self.entries for name in self.named_by(entry)}
+        return {name: entry.sentence for entry in self.entries for name in self.identified_by(entry)}
 
     @property
     def shown_whatever_fits(self) -> frozenset[str]:
-        """Effects of the library that pixels at rest show, or what light does from event to event."""
-        entries = (entry for entry in self.entries if entry.name in (LEAK, NOISE, UNEQUAL, DRIFT))
-        return frozenset(name for entry in entries for name in self.named_by(entry))
+        """Effects of the library that are certain however badly a model fits."""
+        entries = (entry for entry in self.entries if KINDS[entry.name].whatever_fits)
+        return frozenset(name for entry in entries for name in self.identified_by(entry))
 
     def times_of_bursts(self, measurement: Measurement) -> BurstTimes | None:
         """Return when the bursts of a measurement come; None where there are none at even times."""
-        entry = self.entry_of("frame coupling")
+        entry = self.entry_of(FRAME_COUPLING)
         return burst_times_of(measurement, entry) if entry else None
 
     def may_name(self, name: str) -> bool:
-        """Whether a signature tells which effect makes it: one of the user's own may make it as well."""
-        return name not in WITH_A_SCENE or not self.library - set(EFFECTS)
+        """Whether a signature may name effects: any that does not say what it makes may make it as well."""
+        unsaid = any(effect.signatures is None for effect in self.library.values())
+        return not (KINDS[name].beside_model and unsaid)
 
     def named_by(self, entry: Signature) -> tuple[str, ...]:
-        """Return the effects of the library that a signature names; there may be none."""
-        if not self.may_name(entry.name):
-            return ()
-        return tuple(name for name in _effects_of(entry) if name in self.library)
+        """Return the effects of the library that a signature names; there may be none, or several."""
+        return told_by(entry, self.library) if self.may_name(entry.name) else ()
+
+    def identified_by(self, entry: Signature) -> tuple[str, ...]:
+        """Return the effect of the library that a signature names, if it is the only one; else nothing."""
+        named = self.named_by(entry)
+        return named if len(named) == 1 else ()
+
+    @property
+    def _known(self) -> dict[str, type[Effect]]:
+        """The library and the effects of dase, which a sensor may have, too."""
+        return {**EFFECTS, **self.library}
 
     def findings(self, graded: Collection[Finding], given: Collection[str]) -> list[Finding]:
         """Return findings in which all that is seen is certain.
@@ -154,18 +127,20 @@ class SeenEffects:
                 )  # fmt: skip
             out.append(one)
         named = {one.effect for one in out if one.grade in (Grade.CERTAIN, Grade.SUPPORTED)}
+        unsaid = {name for name in named if name in self.library and self.library[name].signatures is None}
         for entry in self.entries:
-            if named.intersection(KINDS[entry.name]) or set(given).intersection(KINDS[entry.name]):
+            makers = makers_of(entry.name, self._known).keys()
+            if makers & named or makers & set(given):
                 continue
-            if entry.name in WITH_A_SCENE and named - set(EFFECTS):
-                continue  # one of the user's own, which was found, makes it
-            if entry.name == NOISE:
-                out = self._with_noise(entry, out)
-                continue
-            if KINDS[entry.name] == KINDS[NOISE] and self.entry_of(NOISE):
-                continue  # pairs of opposite events are said with the noise that sends them
-            if entry.name == "fixed pattern" and self._names(UNEQUAL):
+            if KINDS[entry.name].beside_model and unsaid:
+                continue  # one of the user's own, which was found, may make it
+            if entry.name == OPPOSITE_PAIRS and self.entry_of(NOISE_AT_REST):
+                continue  # they are said with the noise that sends them
+            if entry.name == FIXED_PATTERN and self._names(UNEQUAL_THRESHOLDS):
                 continue  # which it is, is known
+            if entry.name == NOISE_AT_REST or len(self.named_by(entry)) > 1:
+                out = self._with_either(entry, out)
+                continue
             for name in self.named_by(entry) or (entry.name,):
                 out = [one for one in out if one.effect != name]
                 out.append(Finding(name, Grade.CERTAIN, seen=entry.sentence))
@@ -178,25 +153,34 @@ class SeenEffects:
 
     @property
     def _noise(self) -> frozenset[str]:
-        """Effects of the library that make the noise of pixels at rest."""
-        return frozenset(name for one in self.entries if one.name == NOISE for name in self.named_by(one))
+        """The effect of the library that makes the noise of pixels at rest, where that is certain."""
+        entries = (entry for entry in self.entries if entry.name == NOISE_AT_REST)
+        return frozenset(name for entry in entries for name in self.identified_by(entry))
 
     @property
     def _contradicted(self) -> frozenset[str]:
-        """Noise of pixels at rest whose events are not so one by one; hot pixels of which none stands out."""
-        told = [_effects_of(one) for one in self.entries if one.name == NOISE]
-        noise = {name for one in told if one for name in KINDS[NOISE] if name not in one}
-        hot = {name for one in self.absent if one.name == HOT_PIXELS for name in KINDS[HOT_PIXELS]}
-        return frozenset(noise | hot)
+        """Noise of pixels at rest whose events are not so one by one; effects that would have been seen."""
+        out = set[str]()
+        for entry in self.entries:
+            if entry.name == NOISE_AT_REST and told_by(entry, self._known):
+                makers = makers_of(entry.name, self._known).items()
+                out |= {name for name, one in makers if one.by and not one.is_told_by(entry)}
+        for entry in self.absent:
+            if KINDS[entry.name].denies:
+                makers = makers_of(entry.name, self._known).items()
+                out |= {name for name, one in makers if one.is_denied_by_absence}
+        return frozenset(out)
 
-    def _with_noise(self, entry: Signature, findings: Sequence[Finding]) -> list[Finding]:
-        """Return findings with one of noise that is there, and that the search has not announced.
+    def _with_either(self, entry: Signature, findings: Sequence[Finding]) -> list[Finding]:
+        """Return findings with one of several effects that is there, and that the search has not announced.
 
         Args:
             entry: What shows it.
-            findings: In which no noise is announced.
+            findings: In which none of them is announced.
         """
-        kinds = [name for name in _effects_of(entry) or KINDS[NOISE] if name in self.library]
+        # where it tells of some, others do not make it so, even if those are not in the library
+        told = told_by(entry, self._known) or makers_of(entry.name, self.library)
+        kinds = [name for name in told if name in self.library]
         if not kinds:
             return [*findings, Finding(entry.name, Grade.CERTAIN, seen=entry.sentence)]
         nearest = next((one for one in findings if one.effect in kinds), Finding(kinds[0], Grade.EITHER))
@@ -214,32 +198,38 @@ class SeenEffects:
         """Return what the events alone would have shown of effects; of none of those that are named."""
         return tuple(
             DetectionLimit(name, "", None, "", True, f"{entry.name}: {entry.sentence}")
-            for entry in self.absent if entry.name in NAMED
-            for name in KINDS[entry.name][:1] if name in self.library and name not in named
-        )  # fmt: skip
+            for entry in self.absent
+            for name, one in makers_of(entry.name, self.library).items()
+            if one.is_denied_by_absence and name not in named
+        )
 
 
-def find_seen_effects(measurement: Measurement, library: Collection[str]) -> SeenEffects:
-    """Return what the events of a measurement show by themselves; only effects of a library are named."""
+def find_seen_effects(measurement: Measurement, library: Mapping[str, type[Effect]]) -> SeenEffects:
+    """Return what the events of a measurement show by themselves.
+
+    Args:
+        measurement: Its events are looked at.
+        library: Effects that may be named, name to class.
+    """
     events, scene = measurement.compared_events(), measurement.scene
     begins = scene.begin if isinstance(scene, CameraScene) else None
     try:
         found = find_signatures(events, begins=begins)
     except InputError:
-        return SeenEffects()
+        return SeenEffects(library=library)
     step, clip_step = frame_step_of(events, scene), clip_step_of(scene)
     entries = tuple(
         slowest_image(entry, step or 0.0) for entry in found.found
         if not _is_of_frames(entry, step or 0.0, events, scene) and not _is_tone_of_clip(entry, clip_step)
     )  # fmt: skip
-    coupling = [entry for entry in entries if entry.name == "frame coupling"]
+    coupling = [entry for entry in entries if entry.name == FRAME_COUPLING]
     bursts = None
     if coupling:
         bursts = BurstClock.of(coupling[0].details)
         if begins is None:
             bursts = bursts.extend(float(events.t[-1]))
     absent = tuple(entry for entry in found.entries if entry.answer is Answer.NOT_SEEN)
-    return SeenEffects(entries, bursts, absent, frozenset(library))
+    return SeenEffects(entries, bursts, absent, library)
 
 
 def _is_of_frames(entry: Signature, step: float, events: Events, scene: Scene) -> bool:
@@ -248,11 +238,11 @@ def _is_of_frames(entry: Signature, step: float, events: Events, scene: Scene) -
     Of frames that are held all events come so long after one, and a jump sends many at once. Where all events
     come in step with frames, all are in bursts: a simulator that knows these frames alone sends no others.
     """
-    if entry.name in ("time stamps", "double events") and is_held(scene):
+    if entry.name in (TIME_STAMPS, DOUBLE_EVENTS) and is_held(scene):
         return True
-    if entry.name == "frame coupling":
+    if entry.name == FRAME_COUPLING:
         return step > 0 and is_in_step(1 / entry.details["interval"], step)
-    said = entry.details if entry.name == "time stamps" and "line" not in entry.details else {}
+    said = entry.details if entry.name == TIME_STAMPS and "line" not in entry.details else {}
     period, gap = said.get("period", 0.0), clip_step_of(scene)
     if period and gap and is_in_step(1 / period, gap):
         return True  # of noise that is drawn once a frame, or of pixels that send some time after each
@@ -265,7 +255,7 @@ def _is_tone_of_clip(entry: Signature, step: float) -> bool:
 
     Light that changes its way at each frame does so, and what a simulator makes of it.
     """
-    return entry.name == "flicker" and step > 0 and is_in_step(entry.details["frequency"], step)
+    return entry.name == FLICKER and step > 0 and is_in_step(entry.details["frequency"], step)
 
 
 def slowest_image(entry: Signature, step: float) -> Signature:
@@ -279,7 +269,7 @@ def slowest_image(entry: Signature, step: float) -> Signature:
         entry: Any signature; others stay as they are.
         step: Time from frame to frame in step with which all events come [s]; 0 if they do not.
     """
-    fast = entry.details["frequency"] if entry.name == "flicker" else 0.0
+    fast = entry.details["frequency"] if entry.name == FLICKER else 0.0
     if fast * step <= 0.5:
         return entry
     slow = abs(fast - round(fast * step) / step)
@@ -310,11 +300,11 @@ def without_the_scene(seen: SeenEffects, measurement: Measurement, sensor: Senso
         return seen
     kept = seen.entries
     for sharper in SHARPER:
-        more = asked if sharper == 1 else [entry for entry in asked if entry.name in MADE_BY_LIGHT]
+        more = asked if sharper == 1 else [entry for entry in asked if KINDS[entry.name].of_light]
         if any(entry in kept for entry in more):
             made = _signatures_of(scene, _with_thresholds(sensor, sharper), seed)
             kept = tuple(entry for entry in kept if entry not in more or not shows_in(made, entry))
-    coupled = any(entry.name == "frame coupling" for entry in kept)
+    coupled = any(entry.name == FRAME_COUPLING for entry in kept)
     return replace(seen, entries=kept, bursts=seen.bursts if coupled else None)
 
 
@@ -346,11 +336,11 @@ def without_the_explained(
         seed: Of its random numbers.
         before: The model before the search, which shows none of it.
     """
-    gained = {effect.name for effect in sensor.effects} - {effect.name for effect in before.effects}
-    if gained <= set(MADE_BY_LIGHT):
+    gained = [type(effect) for effect in sensor.effects if effect.name not in before]
+    if all(_changes_light(effect) for effect in gained):
         return seen  # what comes with the light is the same for all pixels
     # what a model was asked for already, signatures of its events do not show
-    open_ = [one for one in seen.entries if not seen.named_by(one) and one.name not in WITH_A_SCENE]
+    open_ = [one for one in seen.entries if not seen.named_by(one) and not KINDS[one.name].beside_model]
     open_ = _asked_of_scene(open_, measurement.scene)
     if not open_:
         return seen
@@ -382,10 +372,10 @@ def strength_of_bursts(
         seed: Of every random number.
         device: Where kernels run.
     """
-    times = seen.times_of_bursts(measurement)
-    if seen.bursts is None or times is None:
+    entry, times = seen.entry_of(FRAME_COUPLING), seen.times_of_bursts(measurement)
+    if seen.bursts is None or entry is None or times is None:
         return None
-    for name in KINDS["frame coupling"]:
+    for name in seen.identified_by(entry):
         if name in library and name not in sensor:
             return fit_bursts(
                 measurement, sensor, library[name], times,
@@ -416,6 +406,11 @@ def with_effect_of_bursts(found: Diagnosis, strength: BurstStrength) -> Diagnosi
     )
 
 
+def _changes_light(effect: type[Effect]) -> bool:
+    """Whether an effect makes what light makes by itself."""
+    return any(KINDS[one.signature].of_light for one in effect.signatures or ())
+
+
 def _asked_of_scene(entries: Collection[Signature], scene: Scene) -> list[Signature]:
     """Return the signatures of which a simulation of the scene tells whether they are the scene's.
 
@@ -424,7 +419,7 @@ def _asked_of_scene(entries: Collection[Signature], scene: Scene) -> list[Signat
     """
     if not isinstance(scene, CameraScene):
         return list(entries)
-    return [entry for entry in entries if entry.name == "fixed pattern"]
+    return [entry for entry in entries if entry.name == FIXED_PATTERN]
 
 
 def _is_at_rest(entry: Signature, measurement: Measurement, scene: CameraScene) -> bool:
@@ -465,19 +460,8 @@ def shows_in(made: Collection[Signature], seen: Signature, share: float = 0.3) -
     for entry in made:
         if entry.name != seen.name or not (entry.found or (entry.size >= entry.least and entry.p < 0.05)):
             continue
-        other = entry.details.get("frequency", 0.0) if seen.name == "flicker" else 0.0
+        other = entry.details.get("frequency", 0.0) if seen.name == FLICKER else 0.0
         if other and abs(other / seen.details["frequency"] - 1) > 0.02:
             continue
         return not entry.size < share * seen.size  # sizes may be unknown
     return False
-
-
-def _effects_of(entry: Signature) -> tuple[str, ...]:
-    """Return the effects of dase that a signature names; none where it only tells what there is."""
-    if entry.name == "time stamps":
-        if "line" in entry.details:
-            return ("row_scan",)
-        return ("timestamp",) if "step" in entry.details else ()
-    if "effect" in entry.details:
-        return (entry.details["effect"],)
-    return KINDS[entry.name] if entry.name in NAMED else ()

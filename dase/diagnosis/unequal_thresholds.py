@@ -25,13 +25,13 @@ from dase.errors import InputError
 from dase.formatting import format_percent
 from dase.probes.random_streams import SimulationStream
 from dase.results import Diagnosis, Estimate
+from dase.signatures import kinds
 from dase.signatures.chance import NINETY, sign_flip_tail
 from dase.signatures.result import Answer, Signature
 from dase.simulation.sensor import Sensor
 
 Array = NDArray[np.float64]
 
-NAME = "unequal thresholds"
 EFFECT = Mismatch.name
 
 
@@ -151,7 +151,7 @@ def find_unequal_thresholds(
         f"{format_percent(seen[1].spread)} (OFF): light goes as much farther from one event to the next"
     )
     return Signature(
-        name=NAME, answer=Answer.FOUND, p=max(one.p for one in seen), size=spread,
+        name=kinds.UNEQUAL_THRESHOLDS, answer=Answer.FOUND, p=max(one.p for one in seen), size=spread,
         low=min(one.low for one in seen), high=max(one.high for one in seen),
         unit="spread of thresholds over pixels, relative", least=settings.least, sentence=sentence,
         details={"pixels": min(one.pixels for one in seen), "shared": max(one.shared for one in seen)},

@@ -27,6 +27,7 @@ from dase.effects.latency import Latency
 from dase.effects.leak import Leak
 from dase.effects.learned_threshold import LearnedThreshold
 from dase.effects.linlog import Linlog
+from dase.effects.made_signatures import Makes as Makes
 from dase.effects.mismatch import Mismatch
 from dase.effects.optics import SceneEffect as SceneEffect
 from dase.effects.optics_blur import OpticsBlur

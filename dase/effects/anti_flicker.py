@@ -87,6 +87,7 @@ class AntiFlicker(StreamEffect):
         "I_AntiFlickerModule, 2024"
     )
     per_pixel: ClassVar[bool] = False
+    signatures: ClassVar = ()
 
     low: float = parameter(
         50.0,

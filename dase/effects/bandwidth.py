@@ -135,6 +135,13 @@ class Bandwidth(Effect):
     )
     stages: ClassVar = {"respond": lowpass_voltage}
     states: ClassVar = ("input", "output")
+    signatures: ClassVar = ()
+    screen_limits: ClassVar = {
+        "cutoff": (
+            "a cutoff above about {highest_cutoff:g} Hz wants an LED, as a screen of {refresh:g} Hz needs "
+            "1 to 10 ms for a change itself"
+        ),
+    }
 
     cutoff: float = parameter(
         200.0,

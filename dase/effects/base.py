@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, Literal, Self
 import numpy as np
 from numpy.typing import NDArray
 
+from dase.effects.made_signatures import Makes
 from dase.errors import InputError, nearest
 from dase.events import LABELS
 from dase.kernels import pixel_stages
@@ -202,6 +203,13 @@ class Effect:
     """Whether it acts on so few pixels that some hundred of them do not show it."""
     label: ClassVar[str] = "shot"
     """What the events of its `noise` stage are marked as, one of `dase.events.LABELS`."""
+    signatures: ClassVar[tuple[Makes, ...] | None] = None
+    """All signatures that it makes, () for none. None where that is not known: then it may make any that is
+    seen beside a model, and these name no effect of a library that it is in."""
+    screen_limits: ClassVar[Mapping[str, str]] = {}
+    """What a test picture on a screen cannot tell of it, and what would: a parameter, or "" for all of it, to
+    half a sentence, in which `{refresh:g}` is how often the screen changes and `{highest_cutoff:g}` up to
+    which frequency it tells a cutoff [Hz]."""
 
     def __post_init__(self) -> None:
         for p in self.parameters():

@@ -82,6 +82,7 @@ class Bayer(SceneEffect):
     )
     in_frames: ClassVar[bool] = True
     needs_colour: ClassVar[bool] = True
+    signatures: ClassVar = ()
 
     purity: float = parameter(
         0.8,

@@ -48,6 +48,12 @@ class Dark(Effect):
         "Nozaki, Delbruck: Temperature and parasitic photocurrent effects in dynamic vision sensors, 2017"
     )
     stages: ClassVar = {"current": add_dark_current}
+    signatures: ClassVar = ()
+    screen_limits: ClassVar = {
+        "": (
+            "dark current wants a lens cap: black of a screen is some 0.1 % of white, and the room adds to it"
+        ),
+    }
 
     current: float = parameter(
         0.003,

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dase.effects.base import Observations, parameter
+from dase.effects.made_signatures import Makes
 from dase.effects.stream import (
     FOREVER,
     Reader,
@@ -86,6 +87,7 @@ class DoubleEvents(StreamEffect):
         "Seen in recordings of DVS128 and DAVIS240B; Boahen: Point-to-point connectivity between "
         "neuromorphic chips using address events, 2000 (the handshake)"
     )
+    signatures: ClassVar = (Makes("double events", tells=True),)
 
     share: float = parameter(
         0.02,

@@ -9,6 +9,7 @@ from typing import ClassVar, Self
 import warp as wp
 
 from dase.effects.base import Effect, Observations, parameter
+from dase.effects.made_signatures import Makes
 
 BURST = 1e-3
 """Longest time between samples at an edge [s]: bursts of recorded cameras last 1 to 3 ms."""
@@ -62,6 +63,7 @@ class Exposure(Effect):
         "vision sensor, 2014 (frames and events of one photodiode); seen in recordings of DAVIS240B and 240C"
     )
     stages: ClassVar = {"respond": coupled}
+    signatures: ClassVar = (Makes("frame coupling", tells=True),)
 
     amplitude: float = parameter(
         0.15,

@@ -9,6 +9,7 @@ from typing import ClassVar, Self
 import warp as wp
 
 from dase.effects.base import Effect, Observations, choice, parameter
+from dase.effects.made_signatures import Makes
 from dase.kernels.pixel_stages import EffectStages
 from dase.kernels.vector_math import cosine_and_sine, exponential, logarithm
 
@@ -159,6 +160,10 @@ class Flicker(Effect):
         "(depth, frequency and waveforms of lamps: rectified mains, pulse width modulation)"
     )
     stages: ClassVar = {"light": flickering_light}
+    signatures: ClassVar = (Makes("flicker", tells=True),)
+    screen_limits: ClassVar = {
+        "": "flicker found before a screen may be that of its backlight: it is light, and not of the camera",
+    }
 
     frequency: float = parameter(
         100.0,

@@ -48,6 +48,7 @@ class HighPass(Effect):
     )
     stages: ClassVar = {"respond": highpass}
     states: ClassVar = ("input", "output")
+    signatures: ClassVar = ()
 
     cutoff: float = parameter(
         1.0,

@@ -8,6 +8,7 @@ from typing import ClassVar, Self
 import warp as wp
 
 from dase.effects.base import Effect, Observations, choice, parameter
+from dase.effects.made_signatures import Makes
 from dase.kernels.pixel_stages import EffectStages
 from dase.kernels.vector_math import exponential
 
@@ -73,6 +74,10 @@ class Hot(Effect):
     label: ClassVar[str] = "hot"
     rare: ClassVar[bool] = True
     stages: ClassVar = {"noise": hot_rates}
+    signatures: ClassVar = (Makes("hot pixels", tells=True),)
+    screen_limits: ClassVar = {
+        "": "hot pixels are told best under a lens cap, for some seconds",
+    }
 
     share: float = parameter(
         0.001,

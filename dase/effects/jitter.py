@@ -8,6 +8,7 @@ from typing import ClassVar
 import warp as wp
 
 from dase.effects.base import Effect, parameter
+from dase.effects.made_signatures import Makes
 
 
 @wp.func
@@ -31,6 +32,7 @@ class Jitter(Effect):
     name: ClassVar[str] = "jitter"
     source: ClassVar[str] = "Rebecq, Gehrig, Scaramuzza: ESIM, an open event camera simulator, 2018"
     stages: ClassVar = {"redraw": redraw_thresholds}
+    signatures: ClassVar = (Makes("redrawn thresholds", tells=True),)
 
     spread: float = parameter(
         0.1,

@@ -40,6 +40,13 @@ class Latency(Effect):
         "temporal contrast vision sensor, 2008 (latency over illumination)"
     )
     stages: ClassVar = {"delay": event_delay}
+    signatures: ClassVar = ()
+    screen_limits: ClassVar = {
+        "": (
+            "the delay is not told by a screen: its own lag cannot be known apart; an LED beside a trigger "
+            "input tells it"
+        ),
+    }
 
     delay: float = parameter(
         1e-4,

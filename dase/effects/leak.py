@@ -8,6 +8,7 @@ from typing import ClassVar
 import warp as wp
 
 from dase.effects.base import Effect, parameter
+from dase.effects.made_signatures import Makes
 
 
 @wp.func
@@ -46,6 +47,11 @@ class Leak(Effect):
         "Nozaki, Delbruck: Temperature and parasitic photocurrent effects in dynamic vision sensors, 2017"
     )
     stages: ClassVar = {"drift": leak_drift}
+    signatures: ClassVar = (Makes("leak events", tells=True), Makes("drifting memory", tells=True))
+    screen_limits: ClassVar = {
+        "rate": "a leak wants minutes at rest, in even light or under a lens cap",
+        "light": "how leak grows with light wants more light than a screen has: an LED or daylight, at rest",
+    }
 
     rate: float = parameter(
         0.1,

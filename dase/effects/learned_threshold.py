@@ -41,6 +41,7 @@ class LearnedThreshold(Effect):
     source: ClassVar[str] = "How to Learn a Domain-Adaptive Event Simulator?, 2021"
     stages: ClassVar = {"threshold": learned_thresholds}
     maps: ClassVar = ("factor", "spread")
+    signatures: ClassVar = ()
 
     strength: float = parameter(
         1.0,

@@ -40,6 +40,10 @@ class Linlog(Effect):
         "Hu, Liu, Delbruck: v2e, from video frames to realistic DVS events, 2021 (lin-log mapping)"
     )
     stages: ClassVar = {"respond": linlog_voltage}
+    signatures: ClassVar = ()
+    screen_limits: ClassVar = {
+        "": "the knee wants light far below a screen's black: a lamp and grey filters over four decades",
+    }
 
     knee: float = parameter(
         20 / 255,

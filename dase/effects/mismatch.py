@@ -9,6 +9,7 @@ from typing import ClassVar, Self
 import warp as wp
 
 from dase.effects.base import Effect, Observations, choice, parameter
+from dase.effects.made_signatures import Makes
 from dase.effects.threshold import Threshold
 from dase.kernels.pixel_stages import EffectStages
 
@@ -53,6 +54,7 @@ class Mismatch(Effect):
         "temporal contrast vision sensor, 2008"
     )
     stages: ClassVar = {"threshold": scatter_thresholds}
+    signatures: ClassVar = (Makes("unequal thresholds", tells=True), Makes("fixed pattern"))
 
     spread: float = parameter(
         0.15,

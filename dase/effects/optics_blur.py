@@ -94,6 +94,7 @@ class OpticsBlur(SceneEffect):
 
     name: ClassVar[str] = "optics_blur"
     source: ClassVar[str] = "Pentland: A new sense for depth of field, 1987 (Gaussian point spread of a lens)"
+    signatures: ClassVar = ()
 
     sigma: float = parameter(
         0.7,

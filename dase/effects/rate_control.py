@@ -111,6 +111,7 @@ class RateControl(StreamEffect):
         "programmable event-rate controller and compressive data-formatting pipeline, 2020"
     )
     per_pixel: ClassVar[bool] = False
+    signatures: ClassVar = ()
 
     rate: float = parameter(
         2e7,

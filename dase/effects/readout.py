@@ -11,6 +11,7 @@ import warp as wp
 from numpy.typing import NDArray
 
 from dase.effects.base import Observations, choice, parameter
+from dase.effects.made_signatures import Makes
 from dase.effects.stream import Others, SharedReader, StreamEffect, to_nanosecond
 from dase.events import Events
 from dase.kernels import launch, line_arbiter
@@ -182,6 +183,14 @@ class Readout(StreamEffect):
         "data-formatting pipeline, 2020"
     )
     per_pixel: ClassVar[bool] = False
+    signatures: ClassVar = (
+        Makes("full bus", tells=True),
+        Makes("grouping"),
+        Makes("time stamps"),
+    )
+    screen_limits: ClassVar = {
+        "": "a full bus wants more events at once: flashes of an LED that all pixels see, or a fast print",
+    }
 
     rate: float = parameter(
         1e7,

@@ -10,6 +10,7 @@ from typing import ClassVar, Self
 import warp as wp
 
 from dase.effects.base import Effect, Observations, choice, parameter
+from dase.effects.made_signatures import Makes
 
 
 @wp.func
@@ -51,6 +52,13 @@ class Refractory(Effect):
         "Hu, Liu, Delbruck: v2e, from video frames to realistic DVS events, 2021 (noise on top)"
     )
     stages: ClassVar = {"gate": dead_time_left}
+    signatures: ClassVar = (Makes("dead time", tells=True),)
+    screen_limits: ClassVar = {
+        "period": (
+            "a dead time wants steps that are fast and large: an LED, or the edge of a print that is "
+            "moved fast"
+        ),
+    }
 
     period: float = parameter(
         1e-3,

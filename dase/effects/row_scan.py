@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dase.effects.base import Observations, choice, parameter
+from dase.effects.made_signatures import Makes
 from dase.effects.stream import (
     Reader,
     StampPattern,
@@ -81,6 +82,14 @@ class RowScan(StreamEffect):
         "representation, 2017; default from a recording of a 640x480 camera that visits its 640 columns "
         "every 195.16 us, from right to left"
     )
+    signatures: ClassVar = (
+        # what waits for the bus afterwards, or for a tick, is not on the scan any more
+        Makes("time stamps", tells=True, by="line", absence=False),
+        Makes("grouping"),
+    )
+    screen_limits: ClassVar = {
+        "": "the order of rows wants an LED: a screen is drawn row after row itself",
+    }
 
     line: float = parameter(
         3.05e-7,

@@ -206,6 +206,13 @@ class SecondOrder(Effect):
     stages: ClassVar = {"respond": second_order_voltage}
     states: ClassVar = ("input", "output", "slope")
     includes: ClassVar = ("bandwidth",)
+    signatures: ClassVar = ()
+    screen_limits: ClassVar = {
+        "": (
+            "a cutoff above about {highest_cutoff:g} Hz and the damping want an LED, as the screen rings and "
+            "lags itself"
+        ),
+    }
 
     cutoff: float = parameter(
         300.0,

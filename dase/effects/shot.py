@@ -9,6 +9,7 @@ from typing import ClassVar, Self
 import warp as wp
 
 from dase.effects.base import Effect, Observations, parameter
+from dase.effects.made_signatures import Makes
 from dase.kernels.vector_math import exponential
 
 
@@ -71,6 +72,17 @@ class Shot(Effect):
         "Hu, Liu, Delbruck: v2e, from video frames to realistic DVS events, 2021 (temporal noise)"
     )
     stages: ClassVar = {"noise": shot_rates}
+    signatures: ClassVar = (
+        # every camera has it in the dark
+        Makes("noise at rest", tells=True, by="independent", usual=True),
+        Makes("opposite pairs"),
+    )
+    screen_limits: ClassVar = {
+        "rate": "shot noise wants darkness for seconds: a lens cap; a screen's black shows only part of it",
+        "bright": (
+            "how shot noise falls with light wants decades of light: grey filters, or an LED and a lens cap"
+        ),
+    }
 
     rate: float = parameter(
         1.0,

@@ -28,6 +28,7 @@ class Threshold(Effect):
         "temporal contrast vision sensor, 2008"
     )
     stages: ClassVar = {}
+    signatures: ClassVar = ()
 
     on: float = parameter(
         0.2,

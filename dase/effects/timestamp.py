@@ -9,6 +9,7 @@ from typing import ClassVar, Self
 import numpy as np
 
 from dase.effects.base import Observations, parameter
+from dase.effects.made_signatures import Makes
 from dase.effects.stream import (
     FOREVER,
     Reader,
@@ -78,6 +79,10 @@ class Timestamp(StreamEffect):
         "Brandli, Berner, Yang, Liu, Delbruck: A 240x180 130 dB 3 us latency global shutter "
         "spatiotemporal vision sensor, 2014"
     )
+    signatures: ClassVar = (Makes("time stamps", tells=True, by="step"),)
+    screen_limits: ClassVar = {
+        "": "jitter of time stamps wants an LED, whose edges last less than a microsecond",
+    }
 
     jitter: float = parameter(
         2e-6,

@@ -73,6 +73,7 @@ class TrailFilter(StreamEffect):
         "Prophesee: Metavision documentation, Event Signal Processing (event trail filter), 2024; "
         "OpenEB, facility I_EventTrailFilterModule, 2024"
     )
+    signatures: ClassVar = ()
 
     threshold: float = parameter(
         0.01,

@@ -33,6 +33,13 @@ class Vignetting(Effect):
     name: ClassVar[str] = "vignetting"
     source: ClassVar[str] = "Goldman, Chen: Vignette and exposure calibration and compensation, 2005"
     stages: ClassVar = {"light": vignetted_light}
+    signatures: ClassVar = ()
+    screen_limits: ClassVar = {
+        "": (
+            "vignetting cannot be told from a screen that is darker at its corners: an evenly lit sheet "
+            "tells it"
+        ),
+    }
 
     loss: float = parameter(
         0.4,

@@ -11,6 +11,7 @@ import warp as wp
 
 from dase.effects.bandwidth import Bandwidth
 from dase.effects.base import ANY_SAMPLES, Effect, Observations, choice, parameter
+from dase.effects.made_signatures import Makes
 from dase.effects.photocurrent import USUAL, idle_beside, photocurrent
 from dase.effects.second_order import impulse_response
 from dase.kernels.pixel_stages import REST, EffectStages
@@ -354,6 +355,13 @@ class VoltageNoise(Effect):
     )
     stages: ClassVar = {"respond": noisy_voltage}
     states: ClassVar = ("noise", "speed")
+    signatures: ClassVar = (
+        Makes("noise at rest", tells=True, by="returning"),
+        Makes("opposite pairs"),
+    )
+    screen_limits: ClassVar = {
+        "cutoff": "the noise's cutoff wants constant light: an LED on DC, not a backlight",
+    }
 
     sigma: float = parameter(
         0.05,

@@ -33,7 +33,7 @@ from dase.results import Estimate
 from dase.scenes.between_frames import CameraScene
 from dase.signatures.burst_times import BurstTimes, find_burst_times
 from dase.signatures.find import find_signatures
-from dase.signatures.frame_coupling import NAME
+from dase.signatures.kinds import FRAME_COUPLING
 from dase.signatures.result import Signature
 from dase.simulation.sensor import Sensor
 
@@ -94,7 +94,7 @@ def find_frame_times(measurement: Measurement) -> BurstTimes | None:
     except InputError:
         return None
     for entry in found:
-        if entry.name == NAME:
+        if entry.name == FRAME_COUPLING:
             return burst_times_of(measurement, entry)
     return None
 

@@ -30,7 +30,7 @@ from dase.fitting.model import (
 from dase.fitting.parameter_space import SearchAxis, refuse_idle
 from dase.fitting.plain_numbers import plain_numbers
 from dase.fitting.scheduler import SimulationRequest, answer_requests
-from dase.fitting.screen_limits import limits_of_screen
+from dase.fitting.screen_limits import notes_on_screen
 from dase.fitting.search_ends import is_where_it_began, parameters_at_bounds
 from dase.probes.distance import Judgement
 from dase.probes.random_streams import Draw, SimulationStream
@@ -144,7 +144,7 @@ def fit(
         *parameters_at_bounds(model, values),
         *notes_on_implausible_values(model),
         *_notes_on_minimum(judgement, len(ends), len(good)),
-        *(limits_of_screen(model.sensor, scene.stimulus) if isinstance(scene, ScreenScene) else []),
+        *(notes_on_screen(model.sensor, scene.stimulus) if isinstance(scene, ScreenScene) else []),
     ]
     found = Fit(
         sensor=model.sensor,

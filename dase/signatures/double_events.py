@@ -22,9 +22,8 @@ from dase.kernels import launch
 from dase.kernels.event_neighbours import count_short_intervals
 from dase.signatures.calm_events import row_major_pixels
 from dase.signatures.chance import poisson_interval
+from dase.signatures.kinds import DOUBLE_EVENTS
 from dase.signatures.result import Answer, Signature, judge_signature, without_answer
-
-NAME = "double events"
 
 
 @dataclass(frozen=True)
@@ -101,14 +100,16 @@ def find_double_events(
     """
     s = intervals.settings
     if tick >= s.near:
-        return without_answer(NAME, f"stamps are {format_seconds(tick)} apart, which hides what is sooner")
+        return without_answer(
+            DOUBLE_EVENTS, f"stamps are {format_seconds(tick)} apart, which hides what is sooner"
+        )
     count = intervals.events.sum(0)
     busy = float(np.quantile(count[~hot], s.bulk)) if np.any(~hot) else 0.0
     ties, near, rest = (int(row[:, ~hot].sum()) for row in intervals.counts[:3])
     events = int(count[~hot].sum())
     if events * s.least < 20:
         return without_answer(
-            NAME, f"{format_count(events)} events, too few for a share of {format_percent(s.least)}"
+            DOUBLE_EVENTS, f"{format_count(events)} events, too few for a share of {format_percent(s.least)}"
         )
     chance = s.near / s.far
     p = 0.0
@@ -123,7 +124,7 @@ def find_double_events(
     low, high = (limit / events for limit in poisson_interval(near))
     share = near / events
     entry = Signature(
-        name=NAME, answer=Answer.NOT_SEEN, p=p, size=share, low=low, high=high,
+        name=DOUBLE_EVENTS, answer=Answer.NOT_SEEN, p=p, size=share, low=low, high=high,
         unit="share of the events", least=s.least,
         sentence=f"{format_count(near)} events ({format_percent(share)}) within 20 µs of the same "
         f"pixel's last of the same polarity, {format_count(rest)} from there to 400 µs",

@@ -21,9 +21,8 @@ from dase.events import Events
 from dase.formatting import format_percent, format_seconds
 from dase.signatures.calm_events import row_major_pixels
 from dase.signatures.chance import NINETY, sign_flip_tail
+from dase.signatures.kinds import FIXED_PATTERN
 from dase.signatures.result import Answer, Signature, judge_signature, without_answer
-
-NAME = "fixed pattern"
 
 
 @dataclass(frozen=True)
@@ -166,7 +165,7 @@ def find_fixed_pattern(halves: HalfCounts, hot: NDArray[np.bool_], level: float,
     s = halves.settings
     if halves.duration < s.shortest:
         reason = f"{format_seconds(halves.duration)} of events are one look at the scene, not two"
-        return without_answer(NAME, reason)
+        return without_answer(FIXED_PATTERN, reason)
     spikes = _find_spikes(halves.counts, ~hot.reshape(halves.counts.shape[2:]), s)
     pixels = int(spikes.used.sum())
     if pixels < s.fewest_pixels:
@@ -174,13 +173,13 @@ def find_fixed_pattern(halves: HalfCounts, hot: NDArray[np.bool_], level: float,
             f"{pixels} pixels have {s.fewest_events:g} ON and OFF events in each half, "
             f"fewer than {s.fewest_pixels}"
         )
-        return without_answer(NAME, reason)
+        return without_answer(FIXED_PATTERN, reason)
     p = max(sign_flip_tail(_sum_blocks(field, s.block)) for field in (spikes.signal, spikes.product))
     spread = _sum_blocks(spikes.spread, s.block)
     mean, error = float(spread.sum()) / pixels, math.sqrt(float((spread**2).sum())) / pixels
     size, low, high = (math.sqrt(max(mean + k * NINETY * error, 0.0)) for k in (0, -1, 1))
     entry = Signature(
-        name=NAME, answer=Answer.NOT_SEEN, p=p, size=size, low=low, high=high,
+        name=FIXED_PATTERN, answer=Answer.NOT_SEEN, p=p, size=size, low=low, high=high,
         unit="relative spread of ON per OFF event over pixels", least=s.least,
         sentence="pixels differ from their neighbours for good: ON events for each OFF event spread by "
         f"{format_percent(size)}",

@@ -18,9 +18,8 @@ from dase.formatting import format_percent, format_seconds
 from dase.signatures.chance import NINETY, mean_interval
 from dase.signatures.clock import ClockCounts
 from dase.signatures.frame_coupling import BurstClock
+from dase.signatures.kinds import FLICKER
 from dase.signatures.result import Answer, Signature, judge_signature, without_answer
-
-NAME = "flicker"
 
 
 @dataclass(frozen=True)
@@ -306,21 +305,21 @@ def find_flicker(
     if duration < s.fewest_blocks * s.block:
         blocks = f"{s.fewest_blocks} blocks of {format_seconds(s.block)}"
         reason = f"{format_seconds(duration)} of events: less than {blocks}"
-        return without_answer(NAME, reason), None
+        return without_answer(FLICKER, reason), None
     rates = _net_rates(clock, bursts, s)
     events = int(rates.events.sum())
     if events < s.fewest_events:
-        return without_answer(NAME, f"{events} events, fewer than {s.fewest_events}"), None
+        return without_answer(FLICKER, f"{events} events, fewer than {s.fewest_events}"), None
     v = rates.net.sum(1) / (rates.usual + 1)
     tone, p_tone, many = _find_tone(v, step, bursts, s)
     p_tiles, agree, tiles = _tiles_in_phase(rates, step, tone, s)
     if stats.binom.sf(tiles - 1, tiles, 2 * s.agree) >= level and p_tone < level:
         reason = f"{tone:.1f} Hz, but only {tiles} of {s.tiles**2} tiles have events to agree on it"
-        return without_answer(NAME, reason, p=p_tiles), None
+        return without_answer(FLICKER, reason, p=p_tiles), None
     frequency, error, swings = _refine_tone(rates, step, tone, s)
     mean, low, high = mean_interval(swings)
     entry = Signature(
-        name=NAME, answer=Answer.NOT_SEEN, p=max(p_tone, p_tiles), size=mean, low=low, high=high,
+        name=FLICKER, answer=Answer.NOT_SEEN, p=max(p_tone, p_tiles), size=mean, low=low, high=high,
         unit="swing, share of the rate", least=s.least,
         sentence=f"light at {frequency:.2f} Hz, swing {mean:.2g} of the rate, "
         f"one phase in {agree} of {tiles} tiles",

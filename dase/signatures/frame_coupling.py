@@ -20,9 +20,8 @@ from scipy.ndimage import maximum_filter1d, median_filter
 from dase.formatting import format_percent, format_seconds
 from dase.signatures.chance import mean_interval
 from dase.signatures.clock import ClockCounts
+from dase.signatures.kinds import FRAME_COUPLING
 from dase.signatures.result import Answer, Signature, judge_signature, without_answer
-
-NAME = "frame coupling"
 
 
 @dataclass(frozen=True)
@@ -209,14 +208,16 @@ def find_frame_coupling(
         if found is None:
             if len(counts) * step < 0.3:
                 reason = f"{format_seconds(len(counts) * step)} without known frame times, too short"
-                return without_answer(NAME, reason), None
+                return without_answer(FRAME_COUPLING, reason), None
             unseen = "no frame times known, no regular bursts of the whole array"
-            return Signature(name=NAME, answer=Answer.NOT_SEEN, p=1.0, least=s.least, sentence=unseen), None
+            return Signature(
+                name=FRAME_COUPLING, answer=Answer.NOT_SEEN, p=1.0, least=s.least, sentence=unseen
+            ), None
         begins, interval, p = found
         told = "bursts"
     if interval < s.shortest:
         reason = f"{told} come every {format_seconds(interval)}, as often as lamps flicker"
-        return without_answer(NAME, reason), None
+        return without_answer(FRAME_COUPLING, reason), None
     length = round(interval / step)
     first = np.round((begins - clock.begin) / step).astype(np.int64)
     whole = (first >= 0) & (first + length <= len(counts))
@@ -225,7 +226,7 @@ def find_frame_coupling(
     if not known:
         frames = int(whole.sum())
         reason = f"{frames} whole frames with {s.fewest_events:g} events of a polarity, too few"
-        return without_answer(NAME, reason), None
+        return without_answer(FRAME_COUPLING, reason), None
     return _judge_folds(known, begins, interval, step, p, int(counts.sum()), level, s, told)
 
 
@@ -264,7 +265,8 @@ def _judge_folds(
     p = min(1.0, 2 * best.p) if p is None else p
     mean, low, high = mean_interval(best.score[:, best.at])
     entry = Signature(
-        name=NAME, answer=Answer.NOT_SEEN, p=p, size=math.exp(mean), low=math.exp(low), high=math.exp(high),
+        name=FRAME_COUPLING, answer=Answer.NOT_SEEN,
+        p=p, size=math.exp(mean), low=math.exp(low), high=math.exp(high),
         unit="times the usual rate", least=s.least,
     )  # fmt: skip
     size = f"at most {entry.size:.2f} times the usual rate in step with the {told}"
@@ -272,13 +274,15 @@ def _judge_folds(
     if not entry.found:
         if entry.size >= s.least:
             reason = f"the rate rises {entry.size:.3g} times, in step with the {told} by chance (p {p:.1g})"
-            return without_answer(NAME, reason, p=p, details={"interval": interval, "clock": told}), None
+            return without_answer(
+                FRAME_COUPLING, reason, p=p, details={"interval": interval, "clock": told}
+            ), None
         return entry, None
     if _is_lamp(best.mean, best.at, step, s):
         reason = (
             f"the rate peaks evenly over the {format_seconds(interval)} between frames: light that flickers"
         )
-        return without_answer(NAME, reason, p=p), None
+        return without_answer(FRAME_COUPLING, reason, p=p), None
     return _describe_bursts(entry, known, begins, interval, step, events, told, s)
 
 

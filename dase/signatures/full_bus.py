@@ -19,9 +19,8 @@ from scipy import stats
 from dase.events import Events
 from dase.formatting import format_count, format_metric, format_percent
 from dase.signatures.clock import ClockCounts
+from dase.signatures.kinds import FULL_BUS
 from dase.signatures.result import Answer, Signature, judge_signature, without_answer
-
-NAME = "full bus"
 
 
 @dataclass(frozen=True)
@@ -99,7 +98,7 @@ def _find_spacing(events: Events, level: float, tick: float, s: BusSettings) -> 
     p = float(stats.poisson.cdf(closer, expected))
     low, high = stats.beta.interval(0.9, expected + 0.5, max(pairs.sum() - expected, 0) + 0.5)
     entry = Signature(
-        name=NAME, answer=Answer.NOT_SEEN, p=p, size=share, low=float(low), high=float(high),
+        name=FULL_BUS, answer=Answer.NOT_SEEN, p=p, size=share, low=float(low), high=float(high),
         unit="share of the intervals that would be shorter by chance", least=s.expected,
         sentence=f"one event at a time: no two pixels send within {format_metric(slot, 's')}, as of a bus of "
         f"{format_metric(1 / slot, 'events/s')}",
@@ -120,7 +119,7 @@ def _find_ceiling(clock: ClockCounts, level: float, s: BusSettings) -> Signature
     step = clock.settings.step
     counts = clock.counts.sum((1, 2), dtype=np.float64)[:-1]  # the last step is not whole
     if len(counts) < 4 * s.fewest:
-        return without_answer(NAME, f"{len(counts)} steps of {step * 1e3:g} ms are too few")
+        return without_answer(FULL_BUS, f"{len(counts)} steps of {step * 1e3:g} ms are too few")
     ceiling = float(np.quantile(counts, s.quantile))
     together = int(np.clip(np.ceil(s.enough / max(ceiling, 1.0)), 1, s.steps))
     if together > 1:
@@ -129,7 +128,7 @@ def _find_ceiling(clock: ClockCounts, level: float, s: BusSettings) -> Signature
         ceiling = float(np.quantile(counts, s.quantile))
     most = f"at most {format_metric(ceiling / step, 'events/s')}"
     if ceiling < s.fewest_events:
-        return without_answer(NAME, f"{most}, too few to tell a ceiling from chance")
+        return without_answer(FULL_BUS, f"{most}, too few to tell a ceiling from chance")
     slack = max(s.errors * np.sqrt(ceiling), s.slack * ceiling)
     at = np.abs(counts - ceiling) <= slack
     below = (counts < 0.8 * ceiling) & (counts > 0.1 * ceiling) & ~at
@@ -145,12 +144,12 @@ def _find_ceiling(clock: ClockCounts, level: float, s: BusSettings) -> Signature
     if full < s.scatter and steps >= s.fewest > others:
         rate = format_metric(ceiling / step, "events/s")
         reason = f"the rate hardly leaves {rate}: a full bus, or an even scene"
-        return without_answer(NAME, reason)
+        return without_answer(FULL_BUS, reason)
     if p == 1.0:
         share, at = 0.0, np.zeros_like(at)  # whatever the rate does there, it is no ceiling
     low, high = stats.beta.interval(0.9, at.sum() + 0.5, len(at) - at.sum() + 0.5)
     entry = Signature(
-        name=NAME, answer=Answer.NOT_SEEN, p=p, size=share, low=float(low), high=float(high),
+        name=FULL_BUS, answer=Answer.NOT_SEEN, p=p, size=share, low=float(low), high=float(high),
         unit="share of the time", least=s.least,
         sentence=f"the rate stays at {format_metric(ceiling / step, 'events/s')} "
         f"{format_percent(share)} of the time",

@@ -18,11 +18,10 @@ from scipy.fft import next_fast_len
 from dase.events import Events
 from dase.formatting import format_count, format_metric, format_percent
 from dase.signatures.calm_events import row_major_pixels
+from dase.signatures.kinds import HOT_PIXELS
 from dase.signatures.result import Answer, Signature, judge_signature, without_answer
 
 Array = NDArray[np.float64]
-
-NAME = "hot pixels"
 
 
 @dataclass(frozen=True)
@@ -219,7 +218,8 @@ def find_hot_pixels(
     duration = max(duration, 1e-9)
     rate, usually = total[busiest] / duration, format_metric(total.mean() / duration, "Hz")
     entry = Signature(
-        name=NAME, answer=Answer.NOT_SEEN, p=p, size=float(found.sum()), low=float(low), high=float(high),
+        name=HOT_PIXELS, answer=Answer.NOT_SEEN,
+        p=p, size=float(found.sum()), low=float(low), high=float(high),
         unit="pixels", least=float(s.least),
         sentence=f"{format_count(int(found.sum()))} pixels send by themselves, the busiest "
         f"{format_metric(rate, 'Hz')} at ({busiest % calm.width}, {busiest // calm.width}); "
@@ -237,5 +237,5 @@ def find_hot_pixels(
         reason = (
             f"only {format_percent(quiet)} of the places and times are calm: hot pixels would not stand out"
         )
-        return without_answer(NAME, reason), nothing
+        return without_answer(HOT_PIXELS, reason), nothing
     return entry, found if entry.found else nothing

@@ -19,9 +19,8 @@ from dase.events import Events
 from dase.formatting import format_count, format_seconds
 from dase.signatures.calm_events import row_major_pixels
 from dase.signatures.chance import poisson_interval
+from dase.signatures.kinds import OPPOSITE_PAIRS
 from dase.signatures.result import Answer, Signature, judge_signature, without_answer
-
-NAME = "opposite pairs"
 
 
 @dataclass(frozen=True)
@@ -135,15 +134,17 @@ def find_opposite_pairs(
     }  # fmt: skip
     if duration < s.shortest:
         return without_answer(
-            NAME, f"{format_seconds(duration)} of events: a pixel has no time to rest", **known
+            OPPOSITE_PAIRS, f"{format_seconds(duration)} of events: a pixel has no time to rest", **known
         )
     if lamp:
-        return without_answer(NAME, f"{near} pairs, but light that flickers makes them, too", **known)
+        return without_answer(
+            OPPOSITE_PAIRS, f"{near} pairs, but light that flickers makes them, too", **known
+        )
     # what independent trains would have must be seen
     if stats.poisson.sf(math.ceil(trains) - 1, bound) >= level and p >= level:
         told = f"{near} pairs, independent ones would have {trains:.2g}, too few"
         reason = f"{format_count(events)} calm events: {told}"
-        return without_answer(NAME, reason, **known)
+        return without_answer(OPPOSITE_PAIRS, reason, **known)
     returns = p_more < level and near >= s.returning * expected
     kind = (
         "noise of the pixels at rest that returns"
@@ -154,5 +155,5 @@ def find_opposite_pairs(
     known["details"] |= {"returns": returns}
     unseen = f"{near} opposite pairs at rest, independent events would have {trains:.3g}"
     return judge_signature(
-        Signature(name=NAME, answer=Answer.NOT_SEEN, sentence=said, **known), level, unseen
+        Signature(name=OPPOSITE_PAIRS, answer=Answer.NOT_SEEN, sentence=said, **known), level, unseen
     )

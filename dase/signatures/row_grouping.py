@@ -16,9 +16,8 @@ from scipy import stats
 
 from dase.events import Events
 from dase.signatures.chance import ratio_interval, sign_flip_tail
+from dase.signatures.kinds import GROUPING
 from dase.signatures.result import Answer, Signature, judge_signature, without_answer
-
-NAME = "grouping"
 
 
 @dataclass(frozen=True)
@@ -240,7 +239,7 @@ def find_grouping(groups: GroupCounts, level: float) -> Signature:
     near, later = groups.runs
     if len(near) < 16:
         return without_answer(
-            NAME, f"{len(near)} runs of events that follow each other within {s.span * 1e3:g} ms"
+            GROUPING, f"{len(near)} runs of events that follow each other within {s.span * 1e3:g} ms"
         )
     best: Signature | None = None
     for axis, line in enumerate(("row", "column")):
@@ -249,7 +248,7 @@ def find_grouping(groups: GroupCounts, level: float) -> Signature:
             continue
         p, (size, low, high) = _test_line(near[:, axis], later[:, axis], len(s.lags))
         entry = Signature(
-            name=NAME, answer=Answer.NOT_SEEN, p=min(1.0, 2 * p), size=size, low=low, high=high,
+            name=GROUPING, answer=Answer.NOT_SEEN, p=min(1.0, 2 * p), size=size, low=low, high=high,
             unit="times as often as by chance", least=s.least,
             sentence=f"{line}s are read together: the next event is of the same {line} {size:.3g} times "
             "as often as by chance",
@@ -259,7 +258,7 @@ def find_grouping(groups: GroupCounts, level: float) -> Signature:
             best = entry
     if best is None:
         return without_answer(
-            NAME, "too few successive events share a row or column that no moving edge could have made"
+            GROUPING, "too few successive events share a row or column that no moving edge could have made"
         )
     unseen = f"the next event shares a {best.details['line']} {best.size:.2f} times as often as by chance"
     return judge_signature(best, level, unseen)

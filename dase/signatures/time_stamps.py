@@ -14,9 +14,8 @@ from dase.formatting import format_count, format_percent, format_seconds
 from dase.probes import timestamp_patterns
 from dase.recordings.interval_statistics import IntervalStatistics
 from dase.signatures.calm_events import row_major_pixels
+from dase.signatures.kinds import TIME_STAMPS
 from dase.signatures.result import Answer, Signature, judge_signature, without_answer
-
-NAME = "time stamps"
 
 
 @dataclass(frozen=True)
@@ -60,7 +59,7 @@ def _find_pattern(events: Events) -> Signature | None:
         said = f"stamps are multiples of {format_seconds(pattern.step)}"
         details = {"step": pattern.step}
     return Signature(
-        name=NAME, answer=Answer.NOT_SEEN, p=p, size=share, low=float(low), high=float(high),
+        name=TIME_STAMPS, answer=Answer.NOT_SEEN, p=p, size=share, low=float(low), high=float(high),
         unit="share of the events",
         sentence=f"{said}: {format_percent(share)} of the events", details=details,
     )  # fmt: skip
@@ -88,7 +87,8 @@ def _find_period(events: Events, s: StampSettings) -> Signature | None:
     p = min(1.0, s.tried * math.exp(-min(different * share**2, 700.0)))
     error = 1.645 / math.sqrt(2 * different)
     return Signature(
-        name=NAME, answer=Answer.NOT_SEEN, p=p, size=share, low=share - error, high=min(share + error, 1.0),
+        name=TIME_STAMPS, answer=Answer.NOT_SEEN,
+        p=p, size=share, low=share - error, high=min(share + error, 1.0),
         unit="share of short intervals", details={"period": period},
         sentence=f"short intervals of a pixel are multiples of {format_seconds(period)}: "
         f"{format_percent(share)}",
@@ -118,10 +118,16 @@ def find_time_stamps(
     s = settings or StampSettings()
     kept = events.select(~hot[row_major_pixels(events)])
     if len(kept) < s.fewest:
-        return without_answer(NAME, f"{format_count(len(kept))} events, fewer than {format_count(s.fewest)}")
+        return without_answer(
+            TIME_STAMPS, f"{format_count(len(kept))} events, fewer than {format_count(s.fewest)}"
+        )
     entry = _find_pattern(kept) or (None if lamp else _find_period(kept, s))
     if entry is None:
         return Signature(
-            name=NAME, answer=Answer.NOT_SEEN, p=1.0, least=s.least, sentence="no regularity above 3 µs"
+            name=TIME_STAMPS,
+            answer=Answer.NOT_SEEN,
+            p=1.0,
+            least=s.least,
+            sentence="no regularity above 3 µs",
         )
     return judge_signature(replace(entry, least=s.least), level, "no regularity above 3 µs")

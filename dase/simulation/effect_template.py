@@ -76,6 +76,8 @@ class {cls}(Effect):
     # respond get the states as arguments and return their new values behind their own, such as
     # `return intensity, level`.
     states: ClassVar = ()
+    # Which signatures it makes in recorded events, where you know all of them, such as
+    # `signatures: ClassVar = (Makes("hot pixels", tells=True),)`; see `dase.effects.Makes`.
 
     strength: float = parameter(
         0.5,  # what `dase add` writes

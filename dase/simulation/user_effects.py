@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from dase.effects import EFFECTS, Effect, StreamEffect
+from dase.effects import EFFECTS, Effect, Makes, StreamEffect
 from dase.errors import InputError, nearest
 from dase.events import LABELS
 from dase.files.text_files import read_text_file
@@ -150,6 +150,8 @@ class _EffectDefinition:
     def check(self) -> None:
         """Raise InputError unless this is an effect that can be composed, fitted and switched off."""
         self.check_class()
+        self.check_signatures()
+        self.check_screen_limits()
         self.check_name()
         self.check_fields()
         self.check_values()
@@ -173,6 +175,31 @@ class _EffectDefinition:
             raise self.wrong(f"{what} lacks the method {lacking}")
         if self.effect.label not in LABELS:
             raise self.wrong(f"{what}: label must be one of {', '.join(LABELS)}, got {self.effect.label!r}")
+
+    def check_signatures(self) -> None:
+        """Check what the effect says of the signatures that it makes; each checks itself when it is made."""
+        said = self.effect.signatures
+        if said is None:
+            return
+        if not isinstance(said, tuple) or not all(isinstance(one, Makes) for one in said):
+            what = f"effect class '{self.effect.__name__}': signatures"
+            raise self.wrong(f'{what} must be a tuple such as (Makes("hot pixels"),), got {said!r}')
+        names = [one.signature for one in said]
+        if len(set(names)) != len(names):
+            raise self.wrong(f"effect class '{self.effect.__name__}' says twice that it makes a signature")
+
+    def check_screen_limits(self) -> None:
+        """Check what the effect says of what a screen cannot tell."""
+        said, known = self.effect.screen_limits, {"", *(p.name for p in self.effect.parameters())}
+        if not isinstance(said, Mapping) or not said.keys() <= known:
+            what = f"effect class '{self.effect.__name__}': screen_limits"
+            raise self.wrong(f'{what} must map parameters, or "" for all of it, to texts, got {said!r}')
+        for text in said.values():
+            try:
+                text.format(refresh=60.0, highest_cutoff=15.0)
+            except (AttributeError, IndexError, KeyError, ValueError) as error:
+                what = "screen_limits: only {refresh:g} and {highest_cutoff:g} can stand in braces"
+                raise self.wrong(f"{what}, got {text!r}") from error
 
     def check_name(self) -> None:
         """Check the name, which stands in sensor files and in the text of the kernel."""

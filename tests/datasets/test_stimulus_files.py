@@ -14,7 +14,8 @@ from PIL import Image
 from dase import InputError
 from dase.cli import dase_group
 from dase.datasets.stimulus_files import StimulusJob, protocol_text, write_stimulus
-from dase.fitting.screen_limits import SCREEN_LIMITS
+from dase.effects import EFFECTS
+from dase.fitting.screen_limits import screen_limits_of
 from dase.scenes.screen_stimulus import ScreenStimulus, read_stimulus
 
 SHORT = ScreenStimulus(size=(160, 90), parts=("steps",))
@@ -111,7 +112,9 @@ def test_a_folder_gets_all(tmp_path):
 
 def test_the_protocol_says_what_a_screen_cannot_tell():
     text = protocol_text(SHORT)
-    assert all(f"`{name}`" in text for name in SCREEN_LIMITS)
+    limits = screen_limits_of(EFFECTS.values(), SHORT)
+    assert len(limits) > 10
+    assert all(f"- `{name}`: {limit}.\n" in text for name, limit in limits.items())
     assert "60 Hz" in text
 
 

@@ -10,7 +10,7 @@ import pytest
 
 import dase
 from dase.diagnosis import seen_beside_model
-from dase.diagnosis.dead_time import DEAD_TIME, NAME, end_of_intervals, find_dead_time, intervals_of
+from dase.diagnosis.dead_time import DEAD_TIME, end_of_intervals, find_dead_time, intervals_of
 from dase.diagnosis.seen_effects import SeenEffects
 from dase.diagnosis.state import EventsAlone
 from dase.effects import EFFECTS
@@ -20,6 +20,7 @@ from dase.fitting.model import model_of
 from dase.probes.distance import Judgement
 from dase.probes.timestamp_patterns import TimestampStructure
 from dase.scenes.video import VideoScene
+from dase.signatures import kinds
 from dase.signatures.result import Answer, Signature
 from dase.simulation.sensor import Sensor
 
@@ -179,7 +180,7 @@ def test_a_dead_time_that_hardly_loses_events_is_certain():
 )
 def test_a_dead_time_is_dropped_that_the_last_model_has_no_need_of(monkeypatch, error, ends, dropped):
     """Beside the model before the search, which lacked a slow low-pass, intervals looked as if cut off."""
-    entry = Signature(name=NAME, answer=Answer.FOUND, sentence="seen", details={"period": 2e-3})
+    entry = Signature(name=kinds.DEAD_TIME, answer=Answer.FOUND, sentence="seen", details={"period": 2e-3})
     sensor = Sensor().with_effect(EFFECTS["bandwidth"](cutoff=40.0))
     model = model_of(sensor.with_effect(EFFECTS["refractory"](period=2e-3)), None)
     task = SimpleNamespace(
@@ -197,7 +198,7 @@ def test_a_dead_time_is_dropped_that_the_last_model_has_no_need_of(monkeypatch, 
         task, SeenEffects((entry,)), None, model, judged(0.31)
     )
     assert ("refractory" not in last.sensor) == dropped
-    assert (seen.entry_of(NAME) is None) == dropped
+    assert (seen.entry_of(kinds.DEAD_TIME) is None) == dropped
     assert judgement.error == (error if dropped else 0.31)
     assert all("refractory" not in one and "bandwidth" in one for one in asked)
 
@@ -209,7 +210,7 @@ def judged(error: float) -> Judgement:
 @pytest.mark.parametrize("added", [False, True])
 def test_a_dead_time_that_was_put_off_is_asked_for_beside_the_last_model(monkeypatch, added):
     """Beside a model without a linear response in the dark 2,500 intervals were too short: no dead time."""
-    entry = Signature(name=NAME, answer=Answer.FOUND, sentence="seen", details={"period": 2e-3})
+    entry = Signature(name=kinds.DEAD_TIME, answer=Answer.FOUND, sentence="seen", details={"period": 2e-3})
     sensor = Sensor().with_effect(EFFECTS["linlog"]())
     model = model_of(sensor.with_effect(EFFECTS["refractory"](period=2e-3)) if added else sensor, None)
     task = SimpleNamespace(added_to=lambda one: ("linlog",), effects=EFFECTS, judge=lambda one: judged(0.3))
@@ -218,13 +219,13 @@ def test_a_dead_time_that_was_put_off_is_asked_for_beside_the_last_model(monkeyp
 
     def look(task, seen, measurement, one):
         asked.append(one.sensor)
-        assert seen.entry_of(NAME) is None
+        assert seen.entry_of(kinds.DEAD_TIME) is None
         return seen
 
     monkeypatch.setattr(seen_beside_model, "_look_for_dead_time", look)
     seen, last = seen_beside_model.settle_dead_time(
         task, put_off, SeenEffects((entry,)), None, model, judged(0.3)
     )
-    assert seen.entry_of(NAME) is None
+    assert seen.entry_of(kinds.DEAD_TIME) is None
     assert last is model  # what the error asks for stays, and is graded by it
     assert [("refractory" in one, "linlog" in one) for one in asked] == [(False, True)]

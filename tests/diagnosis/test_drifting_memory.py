@@ -7,10 +7,10 @@ from types import SimpleNamespace
 
 import pytest
 from helpers.frame_simulator import HEIGHT, WIDTH, counted_between_frames, shaken_texture
+from helpers.own_effects import effect_that_makes
 
 import dase
-from dase.diagnosis.dead_time import NAME as DEAD_TIME
-from dase.diagnosis.drifting_memory import DRIFT, NAME, Drift, find_drifting_memory
+from dase.diagnosis.drifting_memory import DRIFT, Drift, find_drifting_memory
 from dase.diagnosis.events_at_rest import find_events_at_rest
 from dase.diagnosis.light_between_events import LightBetweenEvents
 from dase.diagnosis.seen_beside_model import _look_at_thresholds
@@ -20,6 +20,7 @@ from dase.events import Events
 from dase.fitting.measurement import Measurement
 from dase.probes.timestamp_patterns import TimestampStructure
 from dase.results import Grade
+from dase.signatures.kinds import DEAD_TIME, DRIFTING_MEMORY
 from dase.signatures.result import Answer, Signature
 from dase.simulation.sensor import Sensor
 
@@ -44,7 +45,7 @@ def test_the_drift_is_the_leak(scene, rate):
         counted_between_frames(scene, 0.1, leak=rate),
     ):
         entry = found(scene, events)
-        assert entry.name == NAME
+        assert entry.name == DRIFTING_MEMORY
         assert entry.size == pytest.approx(rate, rel=0.35)
     # no pixel rests for long enough to tell it so
     rest = find_events_at_rest(Measurement(events, scene), Sensor(), thresholds=(0.2, 0.2), seed=0)
@@ -112,10 +113,11 @@ def test_few_events_tell_nothing(scene):
 
 
 def test_it_names_the_leak():
-    entry = Signature(name=NAME, answer=Answer.FOUND, sentence="drifts")
+    entry = Signature(name=DRIFTING_MEMORY, answer=Answer.FOUND, sentence="drifts")
     (said,) = SeenEffects((entry,)).findings([], ())
     assert (said.effect, said.grade, said.seen) == ("leak", Grade.CERTAIN, "drifts")
-    assert SeenEffects((entry,), library=frozenset(EFFECTS) | {"popping"}).named_by(entry) == ()
+    beside = SeenEffects((entry,), library=EFFECTS | {"popping": effect_that_makes("popping")})
+    assert beside.named_by(entry) == ()
 
 
 def test_beside_a_dead_time_it_is_not_asked(scene):
@@ -131,4 +133,4 @@ def test_beside_a_dead_time_it_is_not_asked(scene):
     ended = Signature(name=DEAD_TIME, answer=Answer.FOUND, sentence="ends")
     for entries, leaks in (((), True), ((ended,), False)):
         seen = _look_at_thresholds(task, SeenEffects(entries), measurement, model)
-        assert (seen.entry_of(NAME) is not None) == leaks
+        assert (seen.entry_of(DRIFTING_MEMORY) is not None) == leaks

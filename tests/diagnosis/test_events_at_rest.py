@@ -7,14 +7,12 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from helpers.own_effects import effect_that_makes
 
 import dase
 from dase.diagnosis import seen_beside_model
-from dase.diagnosis.dead_time import NAME as DEAD_TIME
 from dase.diagnosis.events_at_rest import (
     AT_REST,
-    LEAK,
-    NOISE,
     Rests,
     differ_by_polarity,
     find_events_at_rest,
@@ -24,10 +22,12 @@ from dase.diagnosis.events_at_rest import (
 )
 from dase.diagnosis.seen_effects import SeenEffects
 from dase.effects import EFFECTS
+from dase.effects.made_signatures import told_by
 from dase.events import Events
 from dase.fitting.measurement import Measurement
 from dase.results import Finding, Grade
 from dase.scenes.video import VideoScene
+from dase.signatures.kinds import DEAD_TIME, FIXED_PATTERN, LEAK_EVENTS, NOISE_AT_REST, OPPOSITE_PAIRS
 from dase.signatures.result import Answer, Signature
 from dase.simulation.sensor import Sensor
 
@@ -66,26 +66,28 @@ def seen_by(scene, **effects):
 
 def test_shot_noise_is_noise_whose_events_know_nothing_of_each_other(scene):
     entry = found(scene, seen_by(scene, shot=dict(rate=3.0)))
-    assert entry.name == NOISE
-    assert entry.details["effect"] == "shot"
+    assert entry.name == NOISE_AT_REST
+    assert told_by(entry, EFFECTS) == ("shot",)
+    assert entry.details["independent"] == pytest.approx(0.5, abs=0.05)
     assert entry.low < entry.size < entry.high
 
 
 def test_noise_of_the_voltage_takes_turns(scene):
     entry = found(scene, seen_by(scene, voltage_noise=dict(sigma=0.1, cutoff=50.0)))
-    assert entry.name == NOISE
-    assert entry.details["effect"] == "voltage_noise"
+    assert entry.name == NOISE_AT_REST
+    assert told_by(entry, EFFECTS) == ("voltage_noise",)
+    assert entry.details["returning"] > 0.8
 
 
 def test_few_pairs_do_not_tell_which_noise_it_is(scene):
     entry = found(scene, seen_by(scene, shot=dict(rate=0.4)))
-    assert entry.name == NOISE
-    assert "effect" not in entry.details
+    assert entry.name == NOISE_AT_REST
+    assert told_by(entry, EFFECTS) == ()
 
 
 def test_a_leak_sends_on_events_alone(scene):
     entry = found(scene, seen_by(scene, leak=dict(rate=1.0)))
-    assert entry.name == LEAK
+    assert entry.name == LEAK_EVENTS
     assert entry.details["off"] == 0
 
 
@@ -93,9 +95,9 @@ def test_hot_pixels_hide_no_leak(scene):
     """Their OFF events would be too many for one."""
     hot = dict(share=0.01, rate=100.0)
     entry = found(scene, seen_by(scene, leak=dict(rate=1.0), hot=hot))
-    assert entry.name == LEAK
+    assert entry.name == LEAK_EVENTS
     both = found(scene, seen_by(scene, leak=dict(rate=1.0), hot=hot), hot_count=AT_REST.events * 1000)
-    assert both.name == NOISE
+    assert both.name == NOISE_AT_REST
 
 
 @pytest.mark.parametrize(
@@ -148,14 +150,14 @@ def at_random(count: int, on: float, seed: int = 0, together: bool = False) -> t
 
 def test_events_of_all_pixels_at_once_are_a_lamp_and_no_noise():
     events, rests = at_random(2000, 0.5)
-    assert judge_events_at_rest(rests, events, 0).name == NOISE
+    assert judge_events_at_rest(rests, events, 0).name == NOISE_AT_REST
     events, rests = at_random(2000, 0.5, together=True)
     assert judge_events_at_rest(rests, events, 0) is None
 
 
 def test_noise_that_is_drawn_for_some_frames_more_than_for_others_is_told_by_its_polarities():
     events, rests = at_random(2000, 0.5, together=True)
-    assert judge_events_at_rest(rests, events, 0, frame_gap=1e-4).name == NOISE
+    assert judge_events_at_rest(rests, events, 0, frame_gap=1e-4).name == NOISE_AT_REST
     alike = (np.unique(events.t, return_inverse=True)[1] % 2).astype(bool)  # of one time, of one polarity
     lamp = Events(events.t, events.x, events.y, alike, 50, 20)
     assert judge_events_at_rest(rests, lamp, 0, frame_gap=1e-4) is None
@@ -182,17 +184,17 @@ def test_noise_of_either_polarity_may_be_a_pattern_of_its_own(own):
     (True, False, False), (False, False, True), (True, True, True),
 ])  # fmt: skip
 def test_a_pattern_that_noise_makes_is_none_of_thresholds(monkeypatch, differs, unequal, kept):
-    names = ("fixed pattern", NOISE, *(["unequal thresholds"] if unequal else []))
+    names = (FIXED_PATTERN, NOISE_AT_REST, *(["unequal thresholds"] if unequal else []))
     seen = SeenEffects(tuple(Signature(name=name, answer=Answer.FOUND, sentence="") for name in names))
     monkeypatch.setattr(seen_beside_model, "noise_is_a_pattern", lambda *args, **more: differs)
     state = SimpleNamespace(notes=[], task=SimpleNamespace(seed=0))
     left = seen_beside_model._without_pattern_of_noise(state, seen, None, SimpleNamespace(sensor=Sensor()))
-    assert (left.entry_of("fixed pattern") is not None) is kept
+    assert (left.entry_of(FIXED_PATTERN) is not None) is kept
     assert bool(state.notes) is not kept
 
 
 def test_noise_of_two_kinds_is_said_to_be_either():
-    entry = Signature(name=NOISE, answer=Answer.FOUND, sentence="pixels at rest send")
+    entry = Signature(name=NOISE_AT_REST, answer=Answer.FOUND, sentence="pixels at rest send")
     seen = SeenEffects((entry,))
     (said,) = seen.findings([], ())
     assert (said.effect, said.grade, said.alternatives, said.unknown) == (
@@ -205,20 +207,22 @@ def test_noise_of_two_kinds_is_said_to_be_either():
     # and what it announced stays
     sure = Finding("voltage_noise", Grade.SUPPORTED)
     assert seen.findings([sure], ()) == [sure]
-    (said,) = SeenEffects((entry,), library=frozenset({"shot"})).findings([], ())
+    (said,) = SeenEffects((entry,), library={"shot": EFFECTS["shot"]}).findings([], ())
     assert said.words() == "either shot or something that is not in the library"
-    (said,) = SeenEffects((entry,), library=frozenset()).findings([], ())
-    assert (said.effect, said.grade) == (NOISE, Grade.CERTAIN)
+    (said,) = SeenEffects((entry,), library={}).findings([], ())
+    assert (said.effect, said.grade) == (NOISE_AT_REST, Grade.CERTAIN)
 
 
 def test_noise_that_events_name_is_certain_if_the_search_agrees():
-    entry = Signature(name=NOISE, answer=Answer.FOUND, sentence="at rest", details={"effect": "shot"})
+    entry = Signature(
+        name=NOISE_AT_REST, answer=Answer.FOUND, sentence="at rest", details={"independent": 0.5}
+    )
     # a model with shot noise that explains little: another noise may come so
     for search in ([Finding("shot", Grade.STAND_IN)], []):
         (said,) = SeenEffects((entry,)).findings(search, ())
         assert said.words() == "either shot or something that is not in the library"
-    (said,) = SeenEffects((entry,), library=frozenset({"voltage_noise"})).findings([], ())
-    assert (said.effect, said.grade) == (NOISE, Grade.CERTAIN)
+    (said,) = SeenEffects((entry,), library={"voltage_noise": EFFECTS["voltage_noise"]}).findings([], ())
+    assert (said.effect, said.grade) == (NOISE_AT_REST, Grade.CERTAIN)
     (said,) = SeenEffects((entry,)).findings([Finding("shot", Grade.EITHER, unknown=True)], ())
     assert (said.effect, said.grade, said.unknown) == ("shot", Grade.CERTAIN, False)
 
@@ -232,32 +236,32 @@ def test_what_a_slow_clock_stamps_early_is_no_leak(scene):
     assert found(scene, ticks) is None
 
 
-@pytest.mark.parametrize("name", [NOISE, LEAK, DEAD_TIME])
+@pytest.mark.parametrize("name", [NOISE_AT_REST, LEAK_EVENTS, DEAD_TIME])
 def test_what_an_effect_of_the_user_may_make_is_not_called_after_one_of_dase(name):
     entry = Signature(name=name, answer=Answer.FOUND, sentence="seen", details={})
-    seen = SeenEffects((entry,), library=frozenset(EFFECTS) | {"popping"})
+    seen = SeenEffects((entry,), library=EFFECTS | {"popping": effect_that_makes("popping")})
     assert seen.named_by(entry) == ()
     mine = Finding("popping", Grade.SUPPORTED)
     assert seen.findings([mine], ()) == [mine]
 
 
 def test_pairs_are_said_with_the_noise_that_sends_them():
-    noise = Signature(name=NOISE, answer=Answer.FOUND, sentence="at rest")
-    pairs = Signature(name="opposite pairs", answer=Answer.FOUND, sentence="pairs")
+    noise = Signature(name=NOISE_AT_REST, answer=Answer.FOUND, sentence="at rest")
+    pairs = Signature(name=OPPOSITE_PAIRS, answer=Answer.FOUND, sentence="pairs")
     (said,) = SeenEffects((pairs, noise)).findings([], ())
     assert said.words() == "either shot or voltage_noise"
     (said,) = SeenEffects((pairs,)).findings([], ())
-    assert (said.effect, said.grade) == ("opposite pairs", Grade.CERTAIN)
+    assert (said.effect, said.grade) == (OPPOSITE_PAIRS, Grade.CERTAIN)
 
 
 @pytest.mark.parametrize(
-    ("told", "grade"), [("voltage_noise", Grade.CERTAIN), ("shot", Grade.EITHER), ("", Grade.SUPPORTED)]
+    ("way", "grade"), [("returning", Grade.CERTAIN), ("independent", Grade.EITHER), ("", Grade.SUPPORTED)]
 )
-def test_noise_is_not_supported_that_its_events_contradict(told, grade):
+def test_noise_is_not_supported_that_its_events_contradict(way, grade):
     """Successive events know nothing of each other: that is no noise of the voltage, however well it fits."""
-    details = {"effect": told} if told else {}
-    entry = Signature(name=NOISE, answer=Answer.FOUND, sentence="seen", details=details)
-    seen = SeenEffects((entry,), library=frozenset(EFFECTS) - {"shot"})
+    details = {way: 0.5} if way else {}
+    entry = Signature(name=NOISE_AT_REST, answer=Answer.FOUND, sentence="seen", details=details)
+    seen = SeenEffects((entry,), library={n: e for n, e in EFFECTS.items() if n != "shot"})
     (mine, *_) = seen.findings([Finding("voltage_noise", Grade.SUPPORTED)], ())
     assert (mine.effect, mine.grade) == ("voltage_noise", grade)
     assert mine.unknown == (grade is Grade.EITHER)

@@ -7,15 +7,17 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from helpers.frame_simulator import counted_between_frames, shaken_texture
+from helpers.own_effects import effect_that_makes
 
 import dase
 from dase.diagnosis.light_between_events import LightBetweenEvents, LightSteps
-from dase.diagnosis.redrawn_thresholds import NAME, REDRAWN, find_redrawn_thresholds, runs_of
+from dase.diagnosis.redrawn_thresholds import REDRAWN, find_redrawn_thresholds, runs_of
 from dase.diagnosis.seen_effects import SeenEffects
 from dase.effects import EFFECTS
 from dase.events import Events
 from dase.fitting.measurement import Measurement
 from dase.results import Finding, Grade
+from dase.signatures.kinds import REDRAWN_THRESHOLDS
 from dase.signatures.result import Answer, Signature
 from dase.simulation.sensor import Sensor
 
@@ -43,7 +45,7 @@ def scene():
 def test_the_spread_is_that_from_event_to_event(scene, spread):
     entry = found(scene, dase.simulate(scene, sensor_with(jitter={"spread": spread}), seed=1), right=True)
     assert entry.found
-    assert entry.name == NAME
+    assert entry.name == REDRAWN_THRESHOLDS
     assert entry.size == pytest.approx(spread, rel=0.2)
     assert entry.low < entry.size < entry.high
 
@@ -137,11 +139,11 @@ def test_few_events_tell_nothing(scene):
 
 
 def test_one_of_the_users_own_may_make_it():
-    own = Signature(name=NAME, answer=Answer.FOUND, sentence="own")
+    own = Signature(name=REDRAWN_THRESHOLDS, answer=Answer.FOUND, sentence="own")
     (said,) = SeenEffects((own,)).findings([], ())
     assert (said.effect, said.grade, said.seen) == ("jitter", Grade.CERTAIN, "own")
-    seen = SeenEffects((own,), library=frozenset(EFFECTS) | {"popping"})
-    assert not seen.may_name(NAME)
+    seen = SeenEffects((own,), library=EFFECTS | {"popping": effect_that_makes("popping")})
+    assert not seen.may_name(REDRAWN_THRESHOLDS)
     mine = Finding("popping", Grade.SUPPORTED)
     assert seen.findings([mine], ()) == [mine]
 

@@ -7,12 +7,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from helpers.frame_simulator import HEIGHT, WIDTH, counted_between_frames, shaken_texture
+from helpers.own_effects import effect_that_makes
 
 import dase
 from dase.diagnosis.light_between_events import LightBetweenEvents
 from dase.diagnosis.seen_effects import SeenEffects
 from dase.diagnosis.unequal_thresholds import (
-    NAME,
     UNEQUAL,
     _pattern_of,
     find_unequal_thresholds,
@@ -22,6 +22,7 @@ from dase.effects import EFFECTS
 from dase.events import Events
 from dase.fitting.measurement import Measurement
 from dase.results import Finding, Grade
+from dase.signatures.kinds import UNEQUAL_THRESHOLDS
 from dase.signatures.result import Answer, Signature
 from dase.simulation.sensor import Sensor
 
@@ -48,7 +49,7 @@ def test_the_spread_is_that_of_the_thresholds(scene, spread):
     sensor = Sensor().with_effect(EFFECTS["mismatch"](spread=spread))
     entry = found(scene, dase.simulate(scene, sensor, seed=1))
     assert entry.found
-    assert entry.name == NAME
+    assert entry.name == UNEQUAL_THRESHOLDS
     assert entry.size == pytest.approx(spread, rel=0.3)
     assert entry.low <= entry.size <= entry.high
 
@@ -140,12 +141,12 @@ def test_a_part_of_the_rows_tells_as_well(scene, monkeypatch):
 
 
 def test_it_is_said_in_place_of_the_fixed_pattern():
-    own = Signature(name=NAME, answer=Answer.FOUND, sentence="own")
+    own = Signature(name=UNEQUAL_THRESHOLDS, answer=Answer.FOUND, sentence="own")
     pattern = Signature(name="fixed pattern", answer=Answer.FOUND, sentence="pattern")
     (said,) = SeenEffects((pattern, own)).findings([], ())
     assert (said.effect, said.grade, said.seen) == ("mismatch", Grade.CERTAIN, "own")
     # an effect of the user's own may make it
-    seen = SeenEffects((own,), library=frozenset(EFFECTS) | {"popping"})
+    seen = SeenEffects((own,), library=EFFECTS | {"popping": effect_that_makes("popping")})
     assert seen.named_by(own) == ()
     mine = Finding("popping", Grade.SUPPORTED)
     assert seen.findings([mine], ()) == [mine]

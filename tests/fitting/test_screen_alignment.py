@@ -7,6 +7,7 @@ import math
 import cv2
 import numpy as np
 import pytest
+from helpers.own_effects import effect_that_makes
 
 import dase
 from dase import EFFECTS, Events, InputError, Sensor
@@ -14,7 +15,7 @@ from dase.fitting.data_split import split_measurement
 from dase.fitting.fit import widen_by_gamma
 from dase.fitting.measurement import Measurement, as_measurement
 from dase.fitting.screen_alignment import align_screen
-from dase.fitting.screen_limits import SCREEN_LIMITS, limits_of_screen
+from dase.fitting.screen_limits import notes_on_screen, screen_limits_of
 from dase.fitting.time_window import repeated_gaps
 from dase.results import Estimate
 from dase.scenes.screen_scene import ScreenScene, ScreenView, apply_homography
@@ -162,14 +163,23 @@ def test_thresholds_are_as_uncertain_as_gamma(short):
 
 
 def test_every_limit_is_of_something_that_is_there(short):
-    for key, say in SCREEN_LIMITS.items():
-        name, _, parameter = key.partition(".")
-        assert name in EFFECTS
-        assert not parameter or parameter in {p.name for p in EFFECTS[name].parameters()}
-        assert len(say(short)) > 20
-    said = limits_of_screen(with_(dark={"current": 0.1}), short)
-    assert len(said) == 1
-    assert "lens cap" in said[0]
+    for effect in EFFECTS.values():
+        assert effect.screen_limits.keys() <= {"", *(p.name for p in effect.parameters())}
+    limits = screen_limits_of(EFFECTS.values(), short)
+    assert all(len(limit) > 20 and "{" not in limit for limit in limits.values())
+    assert f"above about {short.refresh / 4:g} Hz" in limits["bandwidth.cutoff"]
+    (said,) = notes_on_screen(with_(dark={"current": 0.1}), short)
+    assert said.startswith("not told by a screen, dark: ")
+    assert "lens cap" in said
+
+
+def test_an_effect_of_the_user_says_what_a_screen_cannot_tell(short):
+    """A sensor that has it gets a note, whatever the effect is called."""
+    own = effect_that_makes("glow")
+    own.screen_limits = {"": "glow wants more than {refresh:g} Hz"}
+    assert notes_on_screen(Sensor().with_effect(own()), short) == [
+        f"not told by a screen, glow: glow wants more than {short.refresh:g} Hz"
+    ]
 
 
 @pytest.mark.slow

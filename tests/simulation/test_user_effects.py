@@ -21,7 +21,7 @@ from typing import ClassVar
 
 import warp as wp
 
-from dase.effects import Effect, parameter
+from dase.effects import Effect, Makes, parameter
 
 
 @wp.func
@@ -131,6 +131,36 @@ WRONG = [
         "class Weaker",
     ),
     ("strength", "intensity", "one of dase's own", "class Weaker"),
+    (
+        '    source: ClassVar[str] = "nobody"\n',
+        '    source: ClassVar[str] = "nobody"\n    signatures: ClassVar = ("hot pixels",)\n',
+        "must be a tuple such as (Makes(",
+        "class Weaker",
+    ),
+    (
+        '    source: ClassVar[str] = "nobody"\n',
+        '    source: ClassVar[str] = "nobody"\n    signatures: ClassVar = (Makes("grouping"),) * 2\n',
+        "says twice that it makes a signature",
+        "class Weaker",
+    ),
+    (
+        '    source: ClassVar[str] = "nobody"\n',
+        '    source: ClassVar[str] = "nobody"\n    screen_limits: ClassVar = {"power": "wants an LED"}\n',
+        "screen_limits must map parameters",
+        "class Weaker",
+    ),
+    (
+        '    source: ClassVar[str] = "nobody"\n',
+        '    source: ClassVar[str] = "nobody"\n    screen_limits: ClassVar = {"strength": "{rate} Hz"}\n',
+        "can stand in braces, got '{rate} Hz'",
+        "class Weaker",
+    ),
+    (
+        '    source: ClassVar[str] = "nobody"\n',
+        '    source: ClassVar[str] = "nobody"\n    signatures: ClassVar = (Makes("hot pixel"),)\n',
+        "did you mean 'hot pixels'?",
+        "    signatures: ClassVar",
+    ),
 ]
 
 

@@ -27,7 +27,6 @@ from typing import Any
 
 import numpy as np
 
-from dase.diagnosis.seen_effects import KINDS as KINDS_OF_SIGNATURES
 from perf.experiments.blind_diagnosis.scenes import draw_scene
 
 Line = dict[str, Any]
@@ -361,12 +360,15 @@ class Score:
 
 def score(line: Line) -> Score:
     """Compare an answer with the truth; a removed effect need not be found."""
+    from dase.effects import EFFECTS
+    from dase.effects.made_signatures import makers_of
+
     want = set(line["case"]["effects"])
     allowed = want | set(line.get("allowed", ()))
     findings = line["answer"]["findings"]
     sure = {one["effect"] for one in findings if one["grade"] in ("certain", "supported")}
     # "opposite pairs" or "fixed pattern" says what there is, and is true of any effect that makes it
-    sure -= {name for name in sure - want if allowed.intersection(KINDS_OF_SIGNATURES.get(name, ()))}
+    sure -= {name for name in sure - want if allowed & makers_of(name, EFFECTS).keys()}
     offered = {
         n for one in findings if one["grade"] == "either" for n in (one["effect"], *one["alternatives"][:1])
     }

@@ -24,9 +24,11 @@ from dase.diagnosis.light_between_events import LightBetweenEvents
 from dase.diagnosis.redrawn_thresholds import find_redrawn_thresholds
 from dase.diagnosis.unequal_thresholds import find_unequal_thresholds
 from dase.effects import EFFECTS, Threshold
+from dase.effects.made_signatures import told_by
 from dase.fitting.frame_steps import frame_step_of
 from dase.fitting.measurement import Measurement
 from dase.probes.timestamp_patterns import find_structure
+from dase.signatures.kinds import NOISE_AT_REST
 from dase.simulation.sensor import Sensor
 from perf.experiments.blind_diagnosis import foreign
 from perf.experiments.blind_diagnosis.run import HIDDEN, number_of, truth_of
@@ -142,7 +144,8 @@ def main() -> None:
         thresholds = threshold.on, threshold.off
         rest = find_events_at_rest(measurement, model, thresholds=thresholds, seed=0)
         if rest is not None:
-            said = " ".join([rest.name, *([rest.details["effect"]] if "effect" in rest.details else [])])
+            told = told_by(rest, EFFECTS) if rest.name == NOISE_AT_REST else ()
+            said = " ".join([rest.name, *told])
             many = rests.setdefault(name, {})
             many[said] = many.get(said, 0) + 1
         light = LightBetweenEvents.of(measurement, log_eps=model.log_eps)

@@ -3,7 +3,7 @@
     python -m perf.experiments.signatures.effects OUT.jsonl [--seeds 1,2,3] [--only latency,shot]
 
 What shows on a sensor without the effect, too, is the scene's and does not count, as in a diagnosis. A
-signature is right of each effect that `dase.diagnosis.seen_effects.KINDS` has beside it.
+signature is right of each effect that says it makes it.
 """
 
 from __future__ import annotations
@@ -17,8 +17,9 @@ from typing import Any
 import numpy as np
 
 import dase
-from dase.diagnosis.seen_effects import KINDS, shows_in
+from dase.diagnosis.seen_effects import shows_in
 from dase.effects import EFFECTS
+from dase.effects.made_signatures import made_by
 from dase.signatures.result import Signature
 from perf.experiments.blind_diagnosis.run import HIDDEN
 from perf.experiments.signatures import run as experiment
@@ -70,7 +71,7 @@ def false_signatures(
     entries = dase.find_signatures(events).entries if len(events) else ()
     return [
         entry for entry in entries
-        if entry.found and name not in KINDS[entry.name] and not shows_in(plain, entry)
+        if entry.found and not made_by(EFFECTS[name], entry.name) and not shows_in(plain, entry)
     ]  # fmt: skip
 
 

@@ -1,0 +1,102 @@
+"""The signatures that there are, by name, and what holds of each whatever effect makes it.
+
+Which effects make one is said by these, see `dase.effects.Effect.signatures`.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+FLICKER = "flicker"
+HOT_PIXELS = "hot pixels"
+FULL_BUS = "full bus"
+TIME_STAMPS = "time stamps"
+OPPOSITE_PAIRS = "opposite pairs"
+FIXED_PATTERN = "fixed pattern"
+GROUPING = "grouping"
+FRAME_COUPLING = "frame coupling"
+DOUBLE_EVENTS = "double events"
+DEAD_TIME = "dead time"
+LEAK_EVENTS = "leak events"
+NOISE_AT_REST = "noise at rest"
+UNEQUAL_THRESHOLDS = "unequal thresholds"
+DRIFTING_MEMORY = "drifting memory"
+REDRAWN_THRESHOLDS = "redrawn thresholds"
+
+
+@dataclass(frozen=True, kw_only=True)
+class SignatureKind:
+    """What holds of a signature wherever it is seen.
+
+    Args:
+        name: As in `dase.signatures.result.Signature`.
+        about: What events do, in a line.
+        ways: Details that only some of these signatures have, by which they tell effects apart: of time
+            stamps the time between ticks or that of a line [s], of noise the share of successive events that
+            are opposite, where these are independent or return.
+        beside_model: Whether it is what a model over the same scene lacks: events alone do not show it.
+        whatever_fits: Whether it is there however badly that model fits.
+        of_light: Whether light makes it by itself: a scene may show it to any sensor, and an effect that
+            makes it changes the light.
+        denies: Whether effects that make it are in doubt where it would have been seen and is not.
+    """
+
+    name: str
+    about: str
+    ways: tuple[str, ...] = ()
+    beside_model: bool = False
+    whatever_fits: bool = False
+    of_light: bool = False
+    denies: bool = False
+
+
+KINDS: dict[str, SignatureKind] = {
+    kind.name: kind
+    for kind in (
+        SignatureKind(name=FLICKER, about="the rate of all pixels swings at one frequency", of_light=True),
+        SignatureKind(name=HOT_PIXELS, about="some pixels send far more than their neighbours", denies=True),
+        SignatureKind(name=FULL_BUS, about="the event rate has a ceiling, or events keep a distance in time"),
+        SignatureKind(
+            name=TIME_STAMPS,
+            about="times are multiples of a step, or lines of pixels are read in turn",
+            ways=("step", "line"),
+        ),
+        SignatureKind(name=OPPOSITE_PAIRS, about="pixels at rest send an event and then its opposite"),
+        SignatureKind(name=FIXED_PATTERN, about="each pixel has a balance of ON and OFF events of its own"),
+        SignatureKind(name=GROUPING, about="successive events share a row or a column"),
+        SignatureKind(name=FRAME_COUPLING, about="the whole array sends in bursts, in step with frames"),
+        SignatureKind(name=DOUBLE_EVENTS, about="pixels send twice within microseconds"),
+        SignatureKind(name=DEAD_TIME, about="the intervals of a pixel end as if cut off", beside_model=True),
+        SignatureKind(
+            name=LEAK_EVENTS,
+            about="pixels send ON events while their light rests",
+            beside_model=True,
+            whatever_fits=True,
+        ),
+        SignatureKind(
+            name=NOISE_AT_REST,
+            about="pixels send ON and OFF events while their light rests",
+            ways=("independent", "returning"),
+            beside_model=True,
+            whatever_fits=True,
+        ),
+        SignatureKind(
+            name=UNEQUAL_THRESHOLDS,
+            about="how far light goes between two events differs from pixel to pixel",
+            beside_model=True,
+            whatever_fits=True,
+        ),
+        SignatureKind(
+            name=DRIFTING_MEMORY,
+            about="the longer a pixel waits, the less far light goes to ON events, the farther to OFF",
+            beside_model=True,
+            whatever_fits=True,
+        ),
+        SignatureKind(
+            name=REDRAWN_THRESHOLDS,
+            about="how far light goes between two events differs each time",
+            beside_model=True,
+        ),
+    )
+}
+"""Name to what holds of the signature."""
