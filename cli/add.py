@@ -69,6 +69,9 @@ def add_command(
     for name in sorted(more.sensor().idle_parameters() - text.sensor().idle_parameters()):
         if not name.startswith(f"{effect}."):
             click.echo(f"note: {name} changes nothing beside {effect}", err=True)
+    for part, whole in more.sensor().doubled_effects().items():
+        if effect in (part, whole):
+            click.echo(f"note: {part} acts beside {whole}, which does the same and more", err=True)
     if output is None:
         return
     click.echo(f"{output}: {effect} added ({describe_values(more.sensor()[effect])})")

@@ -177,6 +177,15 @@ class Sensor:
         """Return `effect.parameter` of all that changes nothing, by an effect's words or beside another."""
         return {f"{effect.name}.{name}" for effect in self.effects for name in effect.idle(self.effects)}
 
+    def doubled_effects(self) -> dict[str, str]:
+        """Return effects that do what another one of the sensor does as well, each to that one.
+
+        Both act, one behind the other: a `bandwidth` beside a `second_order` is a third pole.
+        """
+        on = [effect for effect in self.effects if not effect.is_off()]
+        names = {effect.name for effect in on}
+        return {part: effect.name for effect in on for part in effect.includes if part in names}
+
     def parameters(self) -> NDArray[np.float32]:
         """Return the parameter vector of this sensor, shape (P,)."""
         values = [

@@ -34,6 +34,11 @@ def test_every_number_of_a_preset_is_there_with_its_unit_and_source(name):
     assert found.about
 
 
+@pytest.mark.parametrize("name", PRESETS)
+def test_no_preset_has_an_effect_twice(name):
+    assert load_sensor(name).doubled_effects() == {}
+
+
 def test_a_comment_on_lines_before_a_value_is_its_source():
     (period,) = (one for one in preset_sources("dvs128").values if one.name == "refractory.period")
     assert period.source.startswith("12 and 15 % of the intervals")

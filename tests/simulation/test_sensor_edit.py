@@ -258,6 +258,15 @@ def test_add_and_fit(tmp_path, rng):
     assert "none.h5" in refusal("add", "mine.toml", "shot", "--fit", "none.h5", cwd=tmp_path)
 
 
+def test_adding_what_another_effect_does_as_well_says_so(tmp_path):
+    said = dase("add", "davis346", "second_order", "-o", tmp_path / "poles.toml").stderr
+    assert "note: bandwidth acts beside second_order, which does the same and more" in said
+    sensor = load_sensor(tmp_path / "poles.toml")
+    assert sensor.doubled_effects() == {"bandwidth": "second_order"}
+    assert not sensor.with_effect(EFFECTS["bandwidth"].identity()).doubled_effects()
+    assert not load_sensor("davis346").doubled_effects()
+
+
 def test_adding_a_dark_current_says_what_it_takes_the_place_of(tmp_path):
     said = dase("add", "davis346", "dark", "-o", tmp_path / "dark.toml").stderr
     assert "note: bandwidth.dark changes nothing beside dark" in said
