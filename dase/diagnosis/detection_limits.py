@@ -290,17 +290,18 @@ def would_be_seen(known: ReportedModel, values: Array, settings: DiagnosisSettin
     apart = apart - (apart @ known.absorbed) @ known.absorbed.T
     used = half.chance.used
     ratio = half.seen.sigma / half.chance.sigma
-    out = np.zeros(len(values), np.bool_)
     weights = half.seen.weights()
-    left = in_standard_errors(known.misfit, half.seen)
-    for n, one in enumerate(apart):
-        rho = pseudo_huber(one + left)
-        families = {name: float(rho[at].mean()) / last.unit for name, at in known.compared.items()}
-        without = replace(last, error=float(rho @ weights) / last.unit, families=families)
-        # the way is that of the other measurements: its own chance would make each lie on it
-        way = (apart.sum(0) - one) / max(len(apart) - 1, 1)
-        clipped = cloud.clipped((way * ratio)[used])[None]
-        deviation = float(cloud.deviations_along(clipped, (one * ratio)[used])[0])
+    rho = pseudo_huber(apart + in_standard_errors(known.misfit, half.seen))
+    errors = rho @ weights / last.unit
+    families = {name: rho[:, at].mean(1) / last.unit for name, at in known.compared.items()}
+    # the way is that of the other measurements: its own chance would make each lie on it
+    ways = (apart.sum(0) - apart) / max(len(apart) - 1, 1)
+    deviations = cloud.deviations_along(cloud.clipped((ways * ratio)[:, used]), (apart * ratio)[:, used])
+    out = np.zeros(len(values), np.bool_)
+    for n, deviation in enumerate(deviations.tolist()):
+        without = replace(
+            last, error=float(errors[n]), families={name: float(of[n]) for name, of in families.items()}
+        )
         # where the scene is guessed a closer look is always taken
         closer = half.doubt is not None and deviation >= settings.hidden.away
         looked = closer or would_be_added(last, without, settings)

@@ -47,21 +47,24 @@ class RepeatCloud:
         return np.clip(differences, -self.most_of_one, self.most_of_one)
 
     def deviations_along(self, ways: Array, seen: Array) -> Array:
-        """Return how far a measurement is from the repeats along some ways (M, J), in deviations, (M,).
+        """Return how far a measurement is from the repeats along some ways, in deviations, shape (M,).
 
         The repeats and the measurement may be off by the tolerance, which their standard errors know: without
         it, a model without chance in it would have no deviation.
 
         Args:
             ways: In standard errors, shape (M, J).
-            seen: The measurement, in standard errors from the repeats' mean, shape (J,).
+            seen: The measurement, in standard errors from the repeats' mean, shape (J,); or one for each way,
+                shape (M, J).
         """
         along = self._clipped_repeats @ ways.T
         square = along.var(0) + (self._rest * ways**2).sum(1)
         if self.drift is not None:
             square = square + (self.clipped(self.drift) @ ways.T) ** 2
         spread = np.sqrt(square)
-        out: Array = (self.clipped(seen) @ ways.T - along.mean(0)) / np.maximum(spread, 1e-12)
+        clipped = self.clipped(seen)
+        here = clipped @ ways.T if clipped.ndim == 1 else np.einsum("mj,mj->m", clipped, ways)
+        out: Array = (here - along.mean(0)) / np.maximum(spread, 1e-12)
         return out
 
     @cached_property
