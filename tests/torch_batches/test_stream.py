@@ -195,8 +195,8 @@ def test_the_same_seed_gives_the_same_batches():
 
 
 @pytest.mark.filterwarnings("ignore:This DataLoader will create")  # where the machine has one processor
-# PyTorch stops the worker of an endless stream wherever it is: one that is just sending a batch may abort (one
-# run in hundreds), which PyTorch says while it throws the loader away, after all batches have come
+# PyTorch stops the worker of an endless stream wherever it is: one that is just sending a batch may abort, in
+# one of hundreds of runs, which PyTorch says while it throws the loader away, after all batches have come
 @pytest.mark.filterwarnings(
     r"ignore:Exception ignored in. <function _MultiProcessing:pytest.PytestUnraisableExceptionWarning"
 )
