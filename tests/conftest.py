@@ -28,10 +28,11 @@ def pytest_addoption(parser: pytest.Parser) -> None:
 
 LONGEST = (
     *("test_examples", "test_diagnose", "test_tutorial", "test_held_frames", "test_distributed"),
-    *("test_cuda_compiles", "test_detection_limits", "test_effects_voltage", "test_effects_more"),
-    *("test_user_readout_alike", "test_grading", "test_training_run", "test_pixel_codegen_cpu"),
-    *("test_silent_pixels", "test_commands", "test_small_files_that_cost", "test_unequal_thresholds"),
-    *("test_descent", "test_effect_pairs", "test_honest_findings", "test_video"),
+    *("test_walk", "test_silent_pixels", "test_commands", "test_training_run", "test_measurement"),
+    *("test_trainings", "test_grading", "test_video", "test_pages", "test_find_signatures"),
+    *("test_cuda_compiles", "test_descent", "test_detection_limits", "test_endings"),
+    *("test_effects_voltage", "test_user_readout_alike", "test_honest_findings", "test_frame_alignment"),
+    *("test_burst_strength", "test_sensor_edit", "test_learned_sensor", "test_unequal_thresholds"),
 )
 """Files that take longest, in this order: where processes share the work, these are begun first."""
 
