@@ -103,6 +103,7 @@ def conclude_diagnosis(
             measurement.scene,
             list(findings.values()),
             unexplained,
+            task.effects,
             contradiction=bool(task.evidence.contradiction),
         ),
         level=last.level,

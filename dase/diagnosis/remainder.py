@@ -10,6 +10,8 @@ import numpy as np
 from dase.diagnosis.cell_descriptions import KINDS_OF_PIXELS, kind_of_pixels
 from dase.diagnosis.settings import DEFAULTS
 from dase.diagnosis.state import DiagnosisTask
+from dase.effects import Effect
+from dase.effects.made_signatures import makers_of
 from dase.fitting.model import FittedModel
 from dase.fitting.scene_doubt import is_guessed
 from dase.fitting.time_window import is_constant
@@ -20,6 +22,7 @@ from dase.probes.statistics import LAYOUT
 from dase.results import Cell, Finding, Grade, Unexplained
 from dase.scenes.between_frames import CameraScene
 from dase.scenes.scene import Scene
+from dase.signatures.kinds import KINDS
 
 
 @dataclass(frozen=True)
@@ -106,6 +109,7 @@ def what_to_record(
     scene: Scene,
     findings: Sequence[Finding],
     unexplained: Unexplained | None,
+    effects: Mapping[str, type[Effect]],
     *,
     contradiction: bool = False,
     settings: AdviceSettings = ADVICE,
@@ -116,6 +120,7 @@ def what_to_record(
         scene: What the camera saw.
         findings: What was found.
         unexplained: What is left; None for nothing.
+        effects: Those that may be found, by name.
         contradiction: Whether the events cannot be of the scene.
         settings: When something is said.
     """
@@ -140,11 +145,13 @@ def what_to_record(
             "the camera with its lens cap on, 10 s (`--scene static`): what pixels at rest send is then seen "
             "without any scene"
         )
+    # what is seen is found by the name of the signature, or of the effect that makes it
     certain = {one.effect for one in findings if one.grade is Grade.CERTAIN}
-    if "flicker" in certain:
-        out.append("the same under light that does not flicker (direct current, daylight)")
-    if certain & {"exposure", "frame coupling"}:
-        out.append("the same with frames off, beside a clip of the scene: bursts come with the frames")
+    out += [
+        kind.without
+        for kind in KINDS.values()
+        if kind.without and not certain.isdisjoint((kind.name, *makers_of(kind.name, effects)))
+    ]
     if not guessed and places.get("moving", 0.0) >= settings.much:
         out.append("steps and edges that are known exactly: `dase stimulus screen.mkv`, then `--stimulus`")
     return tuple(out)

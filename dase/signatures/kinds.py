@@ -39,6 +39,7 @@ class SignatureKind:
         of_light: Whether light makes it by itself: a scene may show it to any sensor, and an effect that
             makes it changes the light.
         denies: Whether effects that make it are in doubt where it would have been seen and is not.
+        without: What to record so that it is not there and hides nothing else; "" where nothing is told.
     """
 
     name: str
@@ -48,12 +49,18 @@ class SignatureKind:
     whatever_fits: bool = False
     of_light: bool = False
     denies: bool = False
+    without: str = ""
 
 
 KINDS: dict[str, SignatureKind] = {
     kind.name: kind
     for kind in (
-        SignatureKind(name=FLICKER, about="the rate of all pixels swings at one frequency", of_light=True),
+        SignatureKind(
+            name=FLICKER,
+            about="the rate of all pixels swings at one frequency",
+            of_light=True,
+            without="the same under light that does not flicker (direct current, daylight)",
+        ),
         SignatureKind(name=HOT_PIXELS, about="some pixels send far more than their neighbours", denies=True),
         SignatureKind(name=FULL_BUS, about="the event rate has a ceiling, or events keep a distance in time"),
         SignatureKind(
@@ -64,7 +71,11 @@ KINDS: dict[str, SignatureKind] = {
         SignatureKind(name=OPPOSITE_PAIRS, about="pixels at rest send an event and then its opposite"),
         SignatureKind(name=FIXED_PATTERN, about="each pixel has a balance of ON and OFF events of its own"),
         SignatureKind(name=GROUPING, about="successive events share a row or a column"),
-        SignatureKind(name=FRAME_COUPLING, about="the whole array sends in bursts, in step with frames"),
+        SignatureKind(
+            name=FRAME_COUPLING,
+            about="the whole array sends in bursts, in step with frames",
+            without="the same with frames off, beside a clip of the scene: bursts come with the frames",
+        ),
         SignatureKind(name=DOUBLE_EVENTS, about="pixels send twice within microseconds"),
         SignatureKind(name=DEAD_TIME, about="the intervals of a pixel end as if cut off", beside_model=True),
         SignatureKind(

@@ -188,19 +188,22 @@ def left(of_scene: float, **places: float) -> Unexplained:
 def test_what_to_record_next(scene):
     lamp = Finding("flicker", Grade.CERTAIN)
     either = Finding("leak", Grade.EITHER, ("shot",))
-    assert what_to_record(scene, [lamp], None) == ()
-    texts = what_to_record(frames(0.02), [lamp], left(0.6, moving=0.3, resting=0.1))
+    assert what_to_record(scene, [lamp], None, EFFECTS) == ()
+    texts = what_to_record(frames(0.02), [lamp], left(0.6, moving=0.3, resting=0.1), EFFECTS)
     assert [text.split(",")[0].split(" (")[0] for text in texts] == [
         "frames more often than every 40 ms", "exposures below 10 ms",
         "the same under light that does not flicker",
     ]  # fmt: skip
-    (text,) = what_to_record(frames(0.001), [], left(0.0, moving=0.1, resting=0.9))
+    for name in ("exposure", "frame coupling"):  # the effect, or what is seen where no effect of it is known
+        (text,) = what_to_record(frames(0.001), [Finding(name, Grade.CERTAIN)], left(0.0), EFFECTS)
+        assert "frames off" in text
+    (text,) = what_to_record(frames(0.001), [], left(0.0, moving=0.1, resting=0.9), EFFECTS)
     assert "lens cap" in text
-    (text,) = what_to_record(scene, [], left(0.0, moving=0.9))
+    (text,) = what_to_record(scene, [], left(0.0, moving=0.9), EFFECTS)
     assert "dase stimulus" in text
-    (text,) = what_to_record(scene, [either], None)
+    (text,) = what_to_record(scene, [either], None, EFFECTS)
     assert "dase distinguish" in text
-    assert "what the camera saw" in what_to_record(scene, [], None, contradiction=True)[0]
+    assert "what the camera saw" in what_to_record(scene, [], None, EFFECTS, contradiction=True)[0]
 
 
 def test_parameters_of_a_model_that_leaves_too_much_are_no_claim(leaky):
