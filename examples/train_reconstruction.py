@@ -39,7 +39,7 @@ settings = dase.tasks.ReconstructionTraining(
 def batches(first):
     """Return batches from a number on."""
     return dase.torch.Stream(
-        "builtin", "fitted.toml", batch=3, steps=8, size=(48, 48), first_batch=first, augment=dase.torch.S2R,
+        "builtin", "fitted.toml", batch=3, steps=8, size=(32, 32), first_batch=first, augment=dase.torch.S2R,
         backgrounds=8, objects=8, device=device,
     )  # fmt: skip
 
