@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from scipy import stats
 from scipy.ndimage import uniform_filter1d
 
+from dase.diagnosis.light_between_events import times_that_are_compared
 from dase.effects.threshold import Threshold
 from dase.errors import InputError
 from dase.events import Events
@@ -180,9 +181,7 @@ def find_rests(
         settings: How long a rest is.
     """
     scene = measurement.scene
-    times = scene.sample_times()
-    if measurement.span is not None:
-        times = times[(times >= measurement.span[0]) & (times <= measurement.span[1])]
+    times = times_that_are_compared(measurement)
     times = times[:: max(1, math.ceil(len(times) / settings.instants))]
     size = scene.width * scene.height
     pixels = np.arange(size, dtype=np.int32)
