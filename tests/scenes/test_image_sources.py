@@ -10,6 +10,7 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
+from helpers.call_counts import counting_calls
 
 from dase.errors import InputError
 from dase.scenes import image_sources
@@ -430,8 +431,9 @@ def runs(mask):
 def test_coco_outlines_that_would_crash_are_refused(tmp_path, rng, segmentation, match):
     pytest.importorskip("pycocotools")
     source = open_images(annotated(tmp_path, segmentation))
-    with pytest.raises(InputError, match=rf"annotation 7 of 'a.png'.*{match}"):
+    with counting_calls() as counted, pytest.raises(InputError, match=rf"annotation 7 of 'a.png'.*{match}"):
         source.foreground(rng)
+    assert counted.calls < 2_000_000
 
 
 def test_coco_outlines_of_every_kind_are_cut_out(tmp_path, rng):
