@@ -251,7 +251,9 @@ def grade_of(
         return Grade.STAND_IN, False
     # at the floor, but not within chance: what is left tells that the world is another than the model's
     sure = chance or (explained and total <= settings.sure_left)
-    weak = without.error - max(last.level, settings.usual) < settings.weak or deviation < settings.sure_away
+    level = max(last.level, settings.usual)
+    least = settings.weak_exact if last.error <= settings.exact * level else settings.weak
+    weak = without.error - level < least or deviation < settings.sure_away
     if has_rivals or weak or not sure:
         return Grade.EITHER, weak or not sure
     return Grade.SUPPORTED, False

@@ -181,6 +181,14 @@ class GradeSettings:
     five effects that had been supported above 0.5 and below this in three sealed runs one was there; of those
     above it 173 of 176."""
 
+    weak_exact: float = 0.3
+    """The same before a model that leaves what chance leaves, see `exact`."""
+
+    exact: float = 1.15
+    """Times what chance leaves in the mean up to which nothing but chance is left. Of 25 effects that were
+    taken for something unknown, 4 deviations off and 0.3 above chance without them, those before such a model
+    were there, 8 of 8; 0 of 17 before one that left 1.5 times as much and more."""
+
     sure_away: float = 4.0
     """As `away`, below which something that is not in the library could look like it: of four effects that
     had been supported with less one was there, of 145 with more 143."""
