@@ -242,4 +242,4 @@ def with_same_freedom(sensor: Sensor, model: FittedModel, more: Sequence[str]) -
         more: Names of the effects whose parameters are free beside.
     """
     mine = [name for effect in more for name in free_of(sensor, effect)]
-    return model_of(sensor, list(dict.fromkeys([*still_free(sensor, model), *mine])))
+    return model_of(sensor, list(dict.fromkeys([*still_free(sensor, model), *mine])), before=model)

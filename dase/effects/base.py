@@ -146,6 +146,8 @@ class Observations:
         clip_step: From frame to frame of a clip in step with which all events come [s], as those of a
             simulator that works frame by frame do; 0 for none.
         clip_frames: From frame to frame of a clip [s], whatever the events; 0 for other scenes.
+        least_bus_rate: Events per second that a bus which sends one event after the other, if there is one,
+            can send at least [Hz]: it has sent some as fast as that.
         bus_load: Largest share of some milliseconds for which a bus that sends one event after the other, if
             there is one, was busy at most.
         row_load: The same of an arbiter that takes rows.
@@ -165,6 +167,7 @@ class Observations:
     peak_chance: float = 0.0
     clip_step: float = 0.0
     clip_frames: float = 0.0
+    least_bus_rate: float = 0.0
     bus_load: float = math.inf
     row_load: float = math.inf
     column_load: float = math.inf

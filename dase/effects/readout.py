@@ -230,6 +230,9 @@ class Readout(StreamEffect):
         rate = observed.highest_event_rate
         # taking lines must leave time for as many events as were seen
         buses = [replace(bus, rate=rate, line=min(bus.line, 0.1 / rate)) for bus in cls.variants()]
+        # one that sends one event after the other is no slower than the closest of them
+        least = max(rate, observed.least_bus_rate)
+        buses = [bus if bus.by_lines else replace(bus, rate=least) for bus in buses]
         return [bus for bus in buses if bus.is_seen_busy(observed)]
 
     def is_seen_busy(self, observed: Observations) -> bool:

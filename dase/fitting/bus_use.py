@@ -17,12 +17,14 @@ class BusUse:
     """What a bus, if there is one, can have done at most: it sends at least as fast as it is seen to.
 
     Args:
+        rate: Events per second that it can send at least, one after the other [Hz].
         loss: Share of the events that found it busy.
         load: Share of the busiest time in which it sent one event after the other.
         row_load: The same of an arbiter that takes rows.
         column_load: The same of one that takes columns.
     """
 
+    rate: float = 0.0
     loss: float = 1.0
     load: float = math.inf
     row_load: float = math.inf
@@ -49,7 +51,7 @@ class BusUse:
             _load_of_lines(events, lines, span, slack, ticks=structure.step > 0)
             for lines in (events.y, events.x)
         )
-        return cls(usual / least, most / least, rows, columns)
+        return cls(least, usual / least, most / least, rows, columns)
 
 
 def highest_event_rate(events: Events, span: float) -> float:

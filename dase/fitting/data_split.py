@@ -130,6 +130,7 @@ class SplitMeasurement:
             line_time=self.structure.line,
             scan_direction=self.structure.direction,
             highest_event_rate=self.highest_event_rate,
+            least_bus_rate=self.bus.rate,
             bus_loss=self.bus.loss,
             bus_load=self.bus.load,
             row_load=self.bus.row_load,

@@ -12,7 +12,14 @@ from numpy.typing import NDArray
 from dase.effects.base import ANY_SAMPLES, Effect
 from dase.fitting.data_split import SplitMeasurement
 from dase.fitting.descent import DESCENT, DescentSettings, StopRule, descent_work, ranking_work
-from dase.fitting.parameter_space import ParameterSpace, SearchAxis, axes_of, full_axis, with_values
+from dase.fitting.parameter_space import (
+    ParameterSpace,
+    SearchAxis,
+    axes_of,
+    full_axis,
+    value_of,
+    with_values,
+)
 from dase.fitting.scheduler import SimulationRequest, Work, answer_requests, run_side_by_side, run_work
 from dase.fitting.subset import CalibratedSubset, PixelSubset
 from dase.probes.distance import Judgement
@@ -73,6 +80,9 @@ class StartSettings:
     """Beside a bound that is seen in a measurement, one higher by this is tried, in the units of
     `SearchAxis.to_place`: of a bus, the most events per second are the least it can send."""
 
+    least: float = 0.95
+    """Of such a bound, below which no search goes: time stamps and counts round it."""
+
 
 STARTS = StartSettings()
 
@@ -128,9 +138,21 @@ class FittedModel:
         return replace(self, place=found.place, loss=found.loss)
 
 
-def model_of(sensor: Sensor, free: Sequence[str] | None = None) -> FittedModel:
-    """Return the model of a sensor at its own parameters."""
-    space = ParameterSpace(sensor, axes_of(sensor, free))
+def model_of(
+    sensor: Sensor, free: Sequence[str] | None = None, *, before: FittedModel | None = None
+) -> FittedModel:
+    """Return the model of a sensor at its own parameters.
+
+    Args:
+        sensor: Its fixed parameters, and where the free ones begin.
+        free: Names of those that are free, see `axes_of`.
+        before: A model whose least values, where a measurement showed them, are kept.
+    """
+    axes = axes_of(sensor, free)
+    if before is not None:
+        least = {one.name: one.low for one in before.space.axes if one.fact.search_starts == "above"}
+        axes = tuple(replace(one, low=max(one.low, least.get(one.name, one.low))) for one in axes)
+    space = ParameterSpace(sensor, axes)
     return FittedModel(space, space.places())
 
 
@@ -299,7 +321,7 @@ def _with_rule(model: FittedModel, other: Effect) -> FittedModel:
     if model.space.sensor.idle_parameters() == same.idle_parameters():
         return replace(model, space=replace(model.space, sensor=same))
     sensor = _with_its_phase(model.sensor.with_effect(other), other)
-    return replace(model_of(sensor, still_free(sensor, model)), loss=model.loss)
+    return replace(model_of(sensor, still_free(sensor, model), before=model), loss=model.loss)
 
 
 def ways_by_other_laws(model: FittedModel) -> list[FittedModel]:
@@ -388,7 +410,18 @@ def with_effect_added(present: FittedModel, effect: Effect) -> FittedModel:
     old = still_free(sensor, present)
     # read off the events of all pixels, what a fit finds only nearby is better than a fit to a few makes it
     new = [axis.name for axis in axes_of(sensor) if axis.effect is type(effect) and axis.fact.nearby is None]
-    return model_of(sensor, [*old, *new])
+    return _with_least_values(model_of(sensor, [*old, *new], before=present), effect)
+
+
+def _with_least_values(model: FittedModel, effect: Effect) -> FittedModel:
+    """Return a model in whose searches no value of an effect is below the least that a measurement showed."""
+    axes = tuple(
+        replace(axis, low=max(axis.low, STARTS.least * value_of(model.space.sensor, axis.name)))
+        if axis.effect is type(effect) and axis.fact.search_starts == "above"
+        else axis
+        for axis in model.space.axes
+    )
+    return replace(model, space=replace(model.space, axes=axes))
 
 
 def _with_its_phase(sensor: Sensor, effect: Effect) -> Sensor:

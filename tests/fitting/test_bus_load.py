@@ -10,6 +10,7 @@ import pytest
 import dase
 from dase.diagnosis.candidates import variants_to_try
 from dase.effects import EFFECTS
+from dase.effects.mismatch import Mismatch
 from dase.effects.readout import Readout
 from dase.effects.row_scan import RowScan
 from dase.effects.stream import Others
@@ -17,7 +18,7 @@ from dase.fitting.batch_simulator import SimulationOrder
 from dase.fitting.bus_use import BusUse, least_bus_rate
 from dase.fitting.data_split import SPLIT, split_measurement
 from dase.fitting.measurement import Measurement
-from dase.fitting.model import model_of
+from dase.fitting.model import FittedModel, model_of, with_effect_added
 from dase.fitting.readout_simulator import simulate_pixels
 from dase.fitting.scheduler import SimulationRequest, answer_requests
 from dase.probes.events_by_pixel import sort_by_pixel
@@ -269,6 +270,33 @@ def test_a_bus_is_no_candidate_where_it_is_known_to_be_free(evidence, rng):
 )
 def test_a_bus_is_a_candidate_in_the_modes_in_which_it_would_show(evidence, use, modes):
     assert {one.mode for one in variants_to_try(replace(evidence, bus=use), Readout)} == modes
+
+
+def test_a_bus_begins_no_slower_than_the_closest_events(evidence):
+    """Slower ones send no two of them; where lines are taken, those of a line come together."""
+    use = BusUse(rate=50 * evidence.highest_event_rate)
+    for one in variants_to_try(replace(evidence, bus=use), Readout):
+        assert one.rate == (evidence.highest_event_rate if one.by_lines else use.rate)
+    # fewer came together than over some milliseconds: that is then the least
+    for one in variants_to_try(replace(evidence, bus=BusUse(rate=1.0)), Readout):
+        assert one.rate == evidence.highest_event_rate
+
+
+def test_no_search_goes_below_what_a_bus_is_seen_to_send():
+    present = model_of(Sensor())
+    bus = with_effect_added(present, Readout(rate=2e6))
+    assert lowest(bus) == pytest.approx(0.95 * 2e6)
+    # nor where another effect comes in beside, or the bus is fitted again
+    faster = replace(bus, place=np.where(np.array(bus.space.names) == "readout.rate", np.log(3e6), bus.place))
+    assert lowest(with_effect_added(faster, Mismatch())) == pytest.approx(0.95 * 2e6)
+    assert lowest(model_of(faster.sensor, faster.space.names, before=faster)) == pytest.approx(0.95 * 2e6)
+    # of a sensor that is given nothing is known
+    assert lowest(model_of(Sensor().with_effect(Readout(rate=2e6)))) < 5e5
+
+
+def lowest(model: FittedModel) -> float:
+    """Return the least rate of a bus that a search tries."""
+    return next(axis.low for axis in model.space.axes if axis.name == "readout.rate")
 
 
 def by_chance(rng, rate: float, seconds: float = 0.2) -> dase.Events:
