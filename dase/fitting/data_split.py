@@ -263,6 +263,7 @@ def split_measurement(
     parts.append(make_subset(few, time.events, 0, structure, highest_rate=highest))
     peak = _peak_of(plan, parts[0], models.lamp)
     train, held, report, scout = (_with_surroundings(plan, one, peak, seed, device) for one in parts)
+    # all pixels share it: those that are compared would leave it idle
     bus = BusUse.of(time.events, structure, span=settings.burst)
     contradiction = contradiction_of_rest(time.events, light[:, :1] if time.still else light)
     out = SplitMeasurement(
