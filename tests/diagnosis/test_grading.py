@@ -277,28 +277,34 @@ def test_what_the_events_show_is_certain_whatever_the_search_says():
     assert [one.effect for one in seen.findings([], ("flicker",))] == ["exposure"]
 
 
+@pytest.fixture(scope="module")
+def lit_by_a_lamp(scene) -> tuple[Measurement, SeenEffects]:
+    """Events of a sensor beneath a lamp of 100 Hz, and what is seen of them."""
+    lit = Sensor().with_effect(EFFECTS["flicker"](frequency=100.0, depth=0.3))
+    measurement = Measurement(dase.simulate(scene, lit, seed=1), scene)
+    return measurement, find_seen_effects(measurement, EFFECTS)
+
+
 @pytest.mark.slow
-def test_light_that_flickers_in_the_clip_is_not_of_the_camera(scene):
+def test_light_that_flickers_in_the_clip_is_not_of_the_camera(scene, lit_by_a_lamp):
     """The events show it, but the sensor without any effect would show it as well."""
     times = scene.sample_times()
     swing = 1 + 0.5 * np.sin(2 * np.pi * 100 * times)
     waving = VideoScene((scene.frames(times) * swing[:, None, None]).astype(np.float32), times)
-    lit = Sensor().with_effect(EFFECTS["flicker"](frequency=100.0, depth=0.3))
     of_scene = Measurement(dase.simulate(waving, Sensor(), seed=1), waving)
-    of_camera = Measurement(dase.simulate(scene, lit, seed=1), scene)
-    for measurement, left in ((of_scene, False), (of_camera, True)):
-        seen = find_seen_effects(measurement, EFFECTS)
+    for measurement, seen, left in (
+        (of_scene, find_seen_effects(of_scene, EFFECTS), False),
+        (*lit_by_a_lamp, True),
+    ):
         assert seen.lamp == pytest.approx(100.0, abs=0.3)
         kept = without_the_scene(seen, measurement, Sensor(), 5)
         assert ("flicker" in kept.effects) == left
 
 
 @pytest.mark.slow
-def test_a_lamp_is_asked_of_a_model_with_the_least_thresholds(scene):
+def test_a_lamp_is_asked_of_a_model_with_the_least_thresholds(lit_by_a_lamp):
     """It is asked with lower thresholds, too; a sensor cannot have a quarter of the least that there are."""
-    lit = Sensor().with_effect(EFFECTS["flicker"](frequency=100.0, depth=0.3))
-    measurement = Measurement(dase.simulate(scene, lit, seed=1), scene)
-    seen = find_seen_effects(measurement, EFFECTS)
+    measurement, seen = lit_by_a_lamp
     least = Sensor().with_effect(EFFECTS["threshold"](on=0.02, off=0.01))
     kept = without_the_scene(seen, measurement, least, 5)
     assert "flicker" in kept.effects
@@ -308,12 +314,12 @@ def test_a_lamp_is_asked_of_a_model_with_the_least_thresholds(scene):
 def unlike() -> tuple[Sensor, Measurement, SeenEffects]:
     """Pixels that are unlike before a scene of which few frames are known, and what is seen of them."""
     rng = np.random.default_rng(1)
-    texture = cv2.GaussianBlur(rng.random((96, 808)), (0, 0), 1.2)
+    texture = cv2.GaussianBlur(rng.random((64, 808)), (0, 0), 1.2)
     texture = np.clip((texture - texture.min()) / np.ptp(texture), 0.03, 1)
-    times = np.arange(0, 1.001, 0.001)
+    times = np.arange(0, 0.601, 0.001)
     frames = np.stack(
         [
-            cv2.warpAffine(texture, np.array([[1.0, 0, 600 * (t - 0.5) - 330], [0, 1.0, 0]]), (128, 96))
+            cv2.warpAffine(texture, np.array([[1.0, 0, 600 * (t - 0.5) - 330], [0, 1.0, 0]]), (96, 64))
             for t in times
         ]
     ).astype(np.float32)

@@ -177,10 +177,10 @@ def filtered_at_frames(scene: VideoScene, *, cutoff: float, spread: float, thres
 
 @pytest.mark.slow
 def test_a_low_pass_from_frame_to_frame_is_asked_for_where_another_leaves_too_much():
-    scene = shaken_texture(gap=6e-3)
+    scene = shaken_texture(gap=6e-3, length=0.5)
     events = filtered_at_frames(scene, cutoff=60.0, spread=0.0)
     tried = {name: EFFECTS[name] for name in ("bandwidth", "second_order", "leak")}
-    found = dase.diagnose(events, "ideal", scene=scene, effects=tried, most=1, pixels=600)
+    found = dase.diagnose(events, "ideal", scene=scene, effects=tried, most=1, pixels=300)
     assert found.selected == ("second_order",)
     assert found.errors[-1] < 1
     slow = found.sensor["second_order"]

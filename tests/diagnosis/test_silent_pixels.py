@@ -202,7 +202,7 @@ LIBRARY = {name: EFFECTS[name] for name in ("threshold", "mismatch", "dead")}
 
 def test_dead_pixels_are_certain_and_left_out_of_the_search(scene):
     true = Sensor().with_effect(EFFECTS["mismatch"](spread=0.2)).with_effect(EFFECTS["dead"](share=0.02))
-    found = diagnose(dase.simulate(scene, true, seed=5), scene=scene, effects=LIBRARY, pixels=400, most=2)
+    found = diagnose(dase.simulate(scene, true, seed=5), scene=scene, effects=LIBRARY, pixels=200, most=2)
     grades = {one.effect: one.grade for one in found.findings}
     assert grades["dead"] is Grade.CERTAIN
     assert grades["mismatch"] is Grade.CERTAIN
@@ -215,7 +215,7 @@ def test_dead_pixels_are_certain_and_left_out_of_the_search(scene):
 def test_without_silent_pixels_nothing_is_taken_for_dead_ones(scene):
     lacking = {name: EFFECTS[name] for name in ("threshold", "dead")}
     true = Sensor().with_effect(EFFECTS["mismatch"](spread=0.12))
-    found = diagnose(dase.simulate(scene, true, seed=5), scene=scene, effects=lacking, pixels=400, most=2)
+    found = diagnose(dase.simulate(scene, true, seed=5), scene=scene, effects=lacking, pixels=200, most=2)
     assert not any(one.effect == "dead" for one in (*found.findings, *found.stand_ins))
     (limit,) = (one for one in found.not_seen if one.effect == "dead")
     assert limit.strength < 2e-3
@@ -227,13 +227,13 @@ def test_all_of_the_time_is_fitted_where_light_comes_to_rest():
     true = Sensor().with_effect(EFFECTS["leak"](rate=2.0, spread=0.2))
     true = true.with_effect(EFFECTS["mismatch"](spread=0.2))
     events = dase.simulate(scene, true, seed=3)
-    assert split_measurement(Measurement(events, scene), pixels=400).parts_differ
+    assert split_measurement(Measurement(events, scene), pixels=200).parts_differ
     restless = moving(1.2)
     assert not split_measurement(
-        Measurement(dase.simulate(restless, true), restless), pixels=400
+        Measurement(dase.simulate(restless, true), restless), pixels=200
     ).parts_differ
     library = {name: EFFECTS[name] for name in ("threshold", "mismatch", "leak", "hot")}
-    found = diagnose(events, scene=scene, effects=library, pixels=400, most=3)
+    found = diagnose(events, scene=scene, effects=library, pixels=200, most=3)
     assert set(found.selected) == {"leak", "mismatch"}
     assert found.errors[-1] < found.gate
     assert any("all of it is fitted" in note for note in found.notes)
@@ -252,7 +252,7 @@ def test_what_comes_late_is_fitted_there():
     late, early = (dase.simulate(scene, one, seed=3) for one in (true, silent))
     events = dase.Events.concatenate([early.select(early.t < 0.73), late.select(late.t >= 0.73)])
     library = {name: EFFECTS[name] for name in ("threshold", "mismatch", "leak")}
-    found = diagnose(events, scene=scene, effects=library, pixels=400, most=2)
+    found = diagnose(events, scene=scene, effects=library, pixels=200, most=2)
     assert any("what is left comes late" in note for note in found.notes)
     # the measurement is of no one sensor, so more than that it is seen is not asked
     assert "leak" in {one.effect for one in found.findings}
