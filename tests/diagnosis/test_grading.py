@@ -81,10 +81,11 @@ def judged(error: float, *, level: float = 0.25, reach: float = 0.4) -> Judgemen
         (0.7, 0.7, 0.3, 6.0, False, Grade.EITHER, True),
         (0.94, 0.85, 0.3, 6.0, False, Grade.EITHER, True),
         (0.94, 0.94, 0.3, 6.0, False, Grade.SUPPORTED, False),
-        # ... less is enough where nothing but chance is left with it
-        (0.6, 0.6, 0.28, 6.0, False, Grade.SUPPORTED, False),
-        (0.6, 0.6, 0.28, 3.9, False, Grade.EITHER, True),
-        (0.54, 0.54, 0.28, 6.0, False, Grade.EITHER, True),
+        # ... less is enough where not even what chance leaves in the mean is left with it
+        (0.6, 0.6, 0.23, 6.0, False, Grade.SUPPORTED, False),
+        (0.6, 0.6, 0.24, 6.0, False, Grade.EITHER, True),
+        (0.6, 0.6, 0.23, 3.9, False, Grade.EITHER, True),
+        (0.54, 0.54, 0.23, 6.0, False, Grade.EITHER, True),
         # at the floor, but neither within chance nor near to nothing of what there was
         (4.0, 4.0, 1.0, 6.0, False, Grade.EITHER, True),
     ],

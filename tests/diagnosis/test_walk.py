@@ -8,12 +8,6 @@ import pytest
 import dase
 from dase.effects.voltage_noise import VoltageNoise
 
-RIVALS = {
-    name: dase.EFFECTS[name]
-    for name in ("threshold", "voltage_noise", "shot", "jitter", "mismatch", "bandwidth")
-}
-"""Noise of either kind, and what comes nearest to it."""
-
 
 def turning_texture(step: float) -> dase.VideoScene:
     """Return a pattern that moves to the right and up and down, for a second."""
@@ -39,7 +33,7 @@ def turning_texture(step: float) -> dase.VideoScene:
 def test_a_diagnosis_tells_which_noise_it_is(true, pixels):
     scene = turning_texture(0.005)
     events = dase.simulate(scene, dase.Sensor().with_effect(true), seed=6)
-    found = dase.diagnose(events, scene=scene, effects=RIVALS, pixels=pixels)
+    found = dase.diagnose(events, scene=scene, pixels=pixels)
     assert found.selected == ("voltage_noise",)
     noise = found.sensor["voltage_noise"]
     assert noise.poles == true.poles
