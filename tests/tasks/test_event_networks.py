@@ -9,7 +9,15 @@ import pytest
 torch = pytest.importorskip("torch")
 
 from dase.errors import InputError
-from dase.tasks.event_networks import ConvGru, ConvLstm, E2VidNet, EvFlowNet, FireNet, enlarged
+from dase.tasks.event_networks import (
+    ConvGru,
+    ConvLstm,
+    E2VidNet,
+    EvFlowNet,
+    FireNet,
+    enlarged,
+    enlarged_by_slices,
+)
 
 
 def small(kind):
@@ -101,10 +109,11 @@ def test_wrong_inputs_are_one_sentence():
 
 
 @pytest.mark.parametrize("size", [(1, 1), (1, 5), (4, 3)])
-def test_enlarged_is_bilinear(size):
+@pytest.mark.parametrize("enlarge", [enlarged, enlarged_by_slices])
+def test_enlarged_is_bilinear(enlarge, size):
     x = torch.randn(2, 3, *size, dtype=torch.float64, requires_grad=True)
     want = torch.nn.functional.interpolate(x, scale_factor=2.0, mode="bilinear", align_corners=False)
-    torch.testing.assert_close(enlarged(x), want)
+    torch.testing.assert_close(enlarge(x), want)
     weight = torch.randn_like(want)
-    (ours,), (theirs,) = (torch.autograd.grad((y * weight).sum(), x) for y in (enlarged(x), want))
+    (ours,), (theirs,) = (torch.autograd.grad((y * weight).sum(), x) for y in (enlarge(x), want))
     torch.testing.assert_close(ours, theirs)
