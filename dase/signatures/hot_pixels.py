@@ -34,6 +34,7 @@ class HotSettings:
     chance: float = 1e-3  # over all pixels, below which one is counted
     bulk: float = 0.995  # share of the pixels of which the usual spread is taken
     in_phase: float = 0.5  # of its events, beside a lamp: a pixel that follows it is not hot
+    of_its_own: float = 0.8  # of its strongest tone at least, for one that sends at even times has its own
     most: int = 1_000_000  # calm events of which times are kept
     asked: int = 100  # pixels at most that are asked for a tone in common
     slowest: float = 45.0  # [Hz] of such a tone, as of lamps
@@ -96,29 +97,53 @@ def _tone_in_common(trains: Sequence[tuple[Array, Array]], s: HotSettings) -> fl
         return 0.0
     begin = min(float(t[0]) for t, _ in trains)
     span = max(float(t[-1]) for t, _ in trains) - begin
-    pad = next_fast_len(4 * (int(span / s.step) + 1), real=True)
-    cells = np.arange(math.ceil(s.slowest * pad * s.step), int(s.fastest * pad * s.step) + 1)
-    power = np.empty((len(trains), len(cells)))
-    for row, (t, sign) in zip(power, trains, strict=True):
-        train = np.bincount(((t - begin) / s.step).astype(np.int64), sign)
-        row[:] = np.abs(np.fft.rfft(train, pad)[cells]) ** 2 / len(t)
+    tones, swings = _swings(trains, begin, span, s)
+    power = swings**2 / np.array([[len(t)] for t, _ in trains])
     others = power.sum(0) - power.max(0)
     best = int(others.argmax())
     tests = 2 * (s.fastest - s.slowest) * max(span, s.step)
     if tests * stats.gamma.sf(others[best], len(trains) - 1) > s.in_common:
         return 0.0
-    return float(cells[best] / (pad * s.step))
+    return float(tones[best])
+
+
+def _swings(
+    trains: Sequence[tuple[Array, Array]], begin: float, span: float, s: HotSettings
+) -> tuple[Array, Array]:
+    """Return tones [Hz], shape (F,), and the sums of the events' signs at them, shape (K, F)."""
+    pad = next_fast_len(4 * (int(span / s.step) + 1), real=True)
+    cells = np.arange(math.ceil(s.slowest * pad * s.step), int(s.fastest * pad * s.step) + 1)
+    sums = np.empty((len(trains), len(cells)))
+    for row, (t, sign) in zip(sums, trains, strict=True):
+        train = np.bincount(((t - begin) / s.step).astype(np.int64), sign)
+        row[:] = np.abs(np.fft.rfft(train, pad)[cells])
+    return cells / (pad * s.step), sums
 
 
 def _follow(trains: Sequence[tuple[Array, Array]], tone: float, s: HotSettings) -> NDArray[np.bool_]:
-    """Return which pixels follow a tone [Hz], or one of which it is an overtone, shape (K,)."""
+    """Return which pixels follow light that swings at a tone [Hz], or of which it is an overtone, shape (K,).
+
+    The light is the same for all. Two hot pixels that send at nearly the same even times have a tone in
+    common, too, and any other is near one of its overtones for some cycles, but has another as its strongest.
+    """
     orders = np.arange(1, s.overtones + 1)
-    tones = np.unique(np.outer(tone / orders, orders))
-    tones = tones[(tones >= s.slowest) & (tones <= s.fastest), None]
-    sums = [np.abs(np.exp(-2j * np.pi * tones * t) @ sign).max(initial=0.0) for t, sign in trains]
-    return np.array(
-        [0 < s.in_phase * len(t) <= one for one, (t, _) in zip(sums, trains, strict=True)], np.bool_
-    )
+    best = np.zeros(len(trains), np.bool_)
+    for order in orders:
+        tones = tone / order * orders
+        tones = tones[(tones >= s.slowest) & (tones <= s.fastest)]
+        led = np.array([_is_led(*train, tones, s) for train in trains], np.bool_)
+        if np.count_nonzero(led) > np.count_nonzero(best):
+            best = led
+    return best
+
+
+def _is_led(t: Array, sign: Array, tones: Array, s: HotSettings) -> bool:
+    """Return whether events, times [s] and signs, are in phase with one of some tones [Hz] above all."""
+    most = float(np.abs(np.exp(-2j * np.pi * tones[:, None] * t) @ sign).max(initial=0.0))
+    if not 0 < s.in_phase * len(t) <= most:
+        return False
+    _, swings = _swings([(t, sign)], float(t[0]), float(t[-1] - t[0]), s)
+    return most >= s.of_its_own * float(swings.max(initial=0.0))
 
 
 def _led_pixels(calm: CalmCounts, chance: Array, lamp: float, s: HotSettings) -> NDArray[np.int64]:

@@ -165,6 +165,28 @@ def test_pixels_that_follow_a_lamp_which_is_not_found_are_not_hot(plain, rhythm,
     assert ("follow light" in looked["hot pixels"].sentence) != there
 
 
+@pytest.mark.parametrize("seed", [1, 14, 36])
+def test_pixels_that_send_at_even_times_of_their_own_follow_no_lamp(plain, seed):
+    """Seen while all around them rests, some cycles at a time, they are near an overtone of two of them."""
+    rng = np.random.default_rng(seed)
+    calm = plain.select((plain.x > 80) & (plain.y > 60))
+    trains = []
+    for _ in range(13):
+        rate = 50 * 10 ** rng.random()
+        even = np.arange(rng.random() / rate, 0.8, 1 / rate)
+        rests = [
+            (begin := rng.uniform(0, 0.75), begin + rng.uniform(0.02, 0.1)) for _ in range(rng.integers(1, 4))
+        ]
+        trains.append(even[np.any([(even >= begin) & (even < end) for begin, end in rests], axis=0)])
+    number = np.repeat(np.arange(13), [len(train) for train in trains])
+    x, y = 8 + 10 * (number % 7), np.where(number < 7, 15, 40)
+    t, x, y = (np.concatenate(pair) for pair in ((*trains, calm.t), (x, calm.x), (y, calm.y)))
+    order = np.argsort(t)
+    p = np.concatenate([np.ones(len(number), bool), calm.p])
+    looked = dase.find_signatures(dase.Events(t[order], x[order], y[order], p[order], 120, 90))
+    assert "follow" not in looked["hot pixels"].sentence
+
+
 @pytest.fixture(scope="module")
 def returning():
     """Sharp edges that go to and fro over the same pixels."""
