@@ -16,7 +16,6 @@ from dase.diagnosis.effect_search import search_effects
 from dase.diagnosis.few_hot_pixels import hot_effect_of, with_hot_pixels
 from dase.diagnosis.held_frames import (
     held_behind_low_pass,
-    known_at_frames_alone,
     with_frame_as_memory,
     with_longer_dead_time,
 )
@@ -126,11 +125,8 @@ def diagnose(
             measurement.noted(known_so_far(state, model, errors, before, time.perf_counter() - begin))
         )
     model, judgement = search_effects(state, compared, start, most)
-    shown = known_at_frames_alone(
-        measurement, state.task.evidence, model, judgement.error, compared.split, seed=seed
-    )
-    if shown is not None:
-        return replace(again(shown), seconds=time.perf_counter() - begin)
+    if state.other_scene is not None:
+        return replace(again(state.other_scene), seconds=time.perf_counter() - begin)
     seen, model = settle_dead_time(state.task, state.events_alone, seen, measurement, model, judgement)
     seen = settle_jitter(state.task, state.events_alone, seen, measurement, model, judgement)
     found = conclude_diagnosis(state, start, model, before, seen, names, measurement)

@@ -23,12 +23,14 @@ from dase.diagnosis.compared_measurement import ComparedMeasurement
 from dase.diagnosis.dead_time import EFFECT as REFRACTORY
 from dase.diagnosis.directional_test import find_hidden_effect
 from dase.diagnosis.effect_pairs import add_pair
+from dase.diagnosis.held_frames import known_at_frames_alone, low_pass_of
 from dase.diagnosis.pruning import prune_model
 from dase.diagnosis.ranking import rank_of
 from dase.diagnosis.redrawn_thresholds import EFFECT as JITTER
 from dase.diagnosis.redrawn_thresholds import add_jitter, find_jitter_beside
 from dase.diagnosis.settings import DEFAULTS, DiagnosisSettings
 from dase.diagnosis.state import DiagnosisState, DiagnosisTask, explains_remainder
+from dase.fitting.measurement import Measurement
 from dase.fitting.model import FittedModel, refit_model, with_full_range
 from dase.fitting.scene_doubt import with_scene_doubt
 from dase.probes.distance import Judgement, leaves_nothing, reaches_floor, worst_families
@@ -49,11 +51,13 @@ def search_effects(
         most: Effects that are added at most; 0 for none.
 
     Returns:
-        The last model and its held-out error.
+        The last model and its held-out error; where the state has another scene, the search ended there.
     """
     # what is not of this scene has no effects to be found
     most = 0 if state.task.evidence.contradiction else most
-    model, judgement = _add_one_by_one(state, compared, start, most)
+    model, judgement = _add_one_by_one(state, compared, start, most, asks=state.task.settings.frames_asked)
+    if state.other_scene is not None:
+        return model, judgement
     if most > 0 and not state.task.all_time and _shows_later_alone(state.task, model, judgement):
         model = _fit_all_of_the_time(state, compared, model, judgement)
         model, judgement = _add_one_by_one(state, compared, model, _left_to_add(state.task, model, most))
@@ -72,7 +76,19 @@ def search_effects(
         if model is not whole and not leaves_nothing(judgement) and not state.path.has_asked(model):
             # a stand-in that was dropped may have hidden what it stood for
             model, judgement = _add_one_by_one(state, compared, model, _left_to_add(task, model, most))
-    return _fit_beyond_the_search(task, model, judgement)
+    model, judgement = _fit_beyond_the_search(task, model, judgement)
+    state.other_scene = _known_at_frames(state, compared, model, judgement)
+    return model, judgement
+
+
+def _known_at_frames(
+    state: DiagnosisState, compared: ComparedMeasurement, model: FittedModel, judgement: Judgement
+) -> Measurement | None:
+    """Return the measurement with its clip known at its frames alone, if that explains more of it."""
+    evidence, seed = state.task.evidence, state.task.seed
+    return known_at_frames_alone(
+        compared.measurement, evidence, model, judgement.error, compared.split, seed=seed
+    )
 
 
 def _is_enough(task: DiagnosisTask, judgement: Judgement) -> bool:
@@ -152,15 +168,34 @@ def _left_to_add(task: DiagnosisTask, model: FittedModel, most: int) -> int:
 
 
 def _add_one_by_one(
-    state: DiagnosisState, compared: ComparedMeasurement, model: FittedModel, most: int
+    state: DiagnosisState, compared: ComparedMeasurement, model: FittedModel, most: int, *, asks: int = 0
 ) -> tuple[FittedModel, Judgement]:
-    """Add the best effect as long as one is missing; return the model and its held-out error."""
+    """Add the best effect as long as one is missing.
+
+    Args:
+        state: Its path grows.
+        compared: The measurement.
+        model: The last one.
+        most: Effects that are added at most.
+        asks: How often a low-pass that leaves too much is taken for one from frame to frame of the clip, at
+            most; the state has that scene then, and nothing more is added.
+
+    Returns:
+        The model and its held-out error.
+    """
     task, errors, far = state.task, list[float](), False
     for _ in range(most + 1):
         state.add_model(model)
         # what is far from the floor needs no exact error
         judgement = task.judge(model, repeats=task.settings.candidates.few_repeats if far else None)
         errors.append(judgement.error)
+        near = not leaves_nothing(judgement) and judgement.error < task.settings.far * judgement.gate
+        if asks and near and low_pass_of(model.sensor) is not None:
+            # what is added beside a low-pass of another law stands in for the difference
+            asks -= 1
+            state.other_scene = _known_at_frames(state, compared, model, judgement)
+            if state.other_scene is not None:
+                break
         more = len(errors) <= most
         step, better, far = _look_for_effect(state, model, judgement, more)
         if better is None and more:

@@ -236,20 +236,26 @@ def known_at_frames_alone(
         settings: How much better is enough.
     """
     scene = _clip_with_straight_light(measurement, evidence)
-    slow = [one for one in model.sensor.effects if isinstance(one, Bandwidth | SecondOrder)]
-    if scene is None or len(slow) != 1 or not clip_step_of(scene):
+    slow = low_pass_of(model.sensor)
+    if scene is None or slow is None or not clip_step_of(scene):
         return None
-    rest = model.sensor.without(slow[0].name)
+    rest = model.sensor.without(slow.name)
     shown = scene.known_at_frames()
     again = split(shown)
     stream = SimulationStream.JUDGE.seed(seed)
-    for one in _in_steps(slow[0]):
+    for one in _in_steps(slow):
         way = with_same_freedom(rest.with_effect(one), model, [one.name])
         fitted = refit_model(again, way, seed=seed)
         if fitted.judge(again.held, repeats=settings.repeats, seed=stream).error < settings.by_frames * error:
             note = "a low-pass from frame to frame of the clip leaves far less than one in time"
             return replace(measurement, scene=shown, notes=(*measurement.notes, note))
     return None
+
+
+def low_pass_of(sensor: Sensor) -> Bandwidth | SecondOrder | None:
+    """Return the low-pass of a sensor; None without one, and of two."""
+    slow = [one for one in sensor.effects if isinstance(one, Bandwidth | SecondOrder)]
+    return slow[0] if len(slow) == 1 else None
 
 
 def _clip_with_straight_light(measurement: Measurement, evidence: SplitMeasurement) -> VideoScene | None:

@@ -296,6 +296,10 @@ class DiagnosisSettings:
     more pixels would tell is less than what most candidates leave. Judged as well after a fit to the scout, a
     bandwidth was left behind a second pole (1.57 and 0.36 in place of 0.30 and 0.39)."""
 
+    frames_asked: int = 2
+    """How often a search asks on its way whether a low-pass goes from frame to frame of a clip, 5 s of a core
+    each: with two poles of another simulator it went on for 150 s before it asked at its end."""
+
     other_way: float = 1.5
     """Where one effect after the other does not reach the floor, they are tried once more with another first
     one, if that one's screening left less than this, in units of the best's."""

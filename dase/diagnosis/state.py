@@ -13,6 +13,7 @@ from dase.diagnosis.candidates import Candidate
 from dase.diagnosis.settings import DEFAULTS, DiagnosisSettings
 from dase.effects import Effect
 from dase.fitting.data_split import SplitMeasurement
+from dase.fitting.measurement import Measurement
 from dase.fitting.model import FittedModel, free_of, model_of, still_free
 from dase.probes.distance import LIMITS, Judgement, reaches_floor
 from dase.probes.random_streams import SimulationStream
@@ -123,6 +124,8 @@ class DiagnosisState:
         path: How the search came to its last model; the one to go back to where another is tried.
         notes: What the user should know of the search.
         after_step: Told the model and the errors so far after each step.
+        other_scene: The measurement with its clip known at its frames alone, which explains it better: what
+            was searched before says nothing then.
         evaluations_before: Simulations that were run before the measurement was split anew.
         samples_before: Pixels times samples of those.
     """
@@ -132,6 +135,7 @@ class DiagnosisState:
     path: SearchPath = field(default_factory=SearchPath)
     notes: list[str] = field(default_factory=list)
     after_step: Callable[[FittedModel, list[float]], None] = lambda model, errors: None
+    other_scene: Measurement | None = None
     evaluations_before: int = 0
     samples_before: int = 0
 
