@@ -19,6 +19,7 @@ from dase.fitting.early_stopping import CandidateRace
 from dase.fitting.model import (
     FittedModel,
     calibration_while_fitting,
+    places_around,
     places_between,
     refit_work,
     shift_periodic_effects,
@@ -241,6 +242,14 @@ def descend_from_screening(
         ]
     )
     best = min(ends, key=lambda found: found.loss)
+    around = places_around(replace(screening.model, place=best.place), name)
+    if len(around):
+        # the phase was found beside other thresholds and another strength
+        around, _ = yield from ranking_work(half, space, around, seed=seed, most=screening.most)
+        turned = yield from descent_work(
+            half, space, around[0], seed=seed, iterations=3, over=race.over(name, unit), most=screening.most
+        )
+        best = min(best, turned, key=lambda found: found.loss)
     was, now = half.scale.families(screening.before), half.scale.families(best.values)
     return replace(
         screening.candidate_at(best.place, best.loss),

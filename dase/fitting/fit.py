@@ -345,12 +345,13 @@ def _notes_on_held_out_error(judgement: Judgement, before: float) -> list[str]:
 
 
 def notes_on_implausible_values(model: FittedModel) -> list[str]:
-    """Return a sentence for each parameter beyond its plausible range."""
+    """Return a sentence for each parameter beyond its plausible range; a phase goes round, and has none."""
     return [
         f"{axis.name} = {value:.3g} {axis.fact.unit} lies outside its plausible range, "
         f"{axis.fact.plausible[0]:g} to {axis.fact.plausible[1]:g}"
         for axis, value in _values_of_axes(model)
-        if not axis.fact.plausible[0] * 0.999 <= value <= axis.fact.plausible[1] * 1.001
+        if not axis.fact.periodic
+        and not axis.fact.plausible[0] * 0.999 <= value <= axis.fact.plausible[1] * 1.001
     ]
 
 

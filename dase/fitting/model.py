@@ -76,6 +76,10 @@ class StartSettings:
     """Phases at which what repeats in time is tried: no farther than a sixteenth of a turn from the right
     one."""
 
+    fine_turns: int = 32
+    """Phases at which what was fitted is tried once more: no farther than a 64th of a turn from the right
+    one."""
+
     above: float = 0.3
     """Beside a bound that is seen in a measurement, one higher by this is tried, in the units of
     `SearchAxis.to_place`: of a bus, the most events per second are the least it can send."""
@@ -519,6 +523,28 @@ def places_between(model: FittedModel, effect: Effect, place: Array) -> Array:
     return np.array(out)
 
 
+def places_around(model: FittedModel, name: str) -> Array:
+    """Return the places of a model with an effect that repeats in time at all phases.
+
+    Along a phase, what events say has a valley for each step of the samples, and a descent that begins with
+    other thresholds ends in any of them.
+
+    Args:
+        model: With the effect, fitted but for its phase.
+        name: Of the effect.
+
+    Returns:
+        M places, shape (M, P); none of an effect that does not repeat.
+    """
+    out = []
+    for n, axis in enumerate(model.space.axes):
+        if axis.effect.name == name and axis.fact.periodic:
+            for turn in np.linspace(*axis.fact.plausible, STARTS.fine_turns, endpoint=False):
+                out.append(model.place.copy())
+                out[-1][n] = axis.to_place(turn)
+    return np.array(out).reshape(-1, len(model.place))
+
+
 def _starting_places_of_axis(axis: SearchAxis, present: float) -> list[float]:
     low, high = (float(axis.to_place(v)) for v in axis.fact.plausible)
     match axis.fact.search_starts:
@@ -527,7 +553,10 @@ def _starting_places_of_axis(axis: SearchAxis, present: float) -> list[float]:
         case "spread":
             return list(low + (high - low) * np.linspace(STARTS.margin, 1 - STARTS.margin, STARTS.strengths))
         case "turn":
-            return [float(axis.to_place(turn)) for turn in np.linspace(0, 1, STARTS.turns, endpoint=False)]
+            # half a turn from the ends of the range, which a descent cannot leave
+            return [
+                float(axis.to_place(turn)) for turn in np.linspace(-0.5, 0.5, STARTS.turns, endpoint=False)
+            ]
         case "ends":
             return [present, low + (1 - STARTS.margin) * (high - low)]
         case "value":

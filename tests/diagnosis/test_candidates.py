@@ -5,19 +5,24 @@ from __future__ import annotations
 from dataclasses import replace
 from types import SimpleNamespace
 
+import numpy as np
 import pytest
 
 import dase
 from dase.diagnosis import candidates
-from dase.diagnosis.candidates import Candidate
+from dase.diagnosis.candidates import Candidate, calibrate_split, screen_and_descend
 from dase.diagnosis.explain_effect import moving_bars
 from dase.diagnosis.settings import DEFAULTS
 from dase.effects import EFFECTS
 from dase.effects.leak import Leak
 from dase.effects.threshold import Threshold
 from dase.effects.voltage_noise import VoltageNoise
+from dase.fitting.data_split import split_measurement
+from dase.fitting.measurement import as_measurement
+from dase.fitting.model import fit_present_model
 from dase.fitting.trial_sampling import SAMPLES, samples_of_screening
 from dase.simulation.sensor import Sensor
+from perf.experiments.signatures.run import draw_scene
 
 STEP = 1e-3
 COARSE_LOSS = {"leak": 5.0, "near": 6.0, "far": 100.0}
@@ -70,3 +75,20 @@ def test_a_diagnosis_finds_noise_that_is_faster_than_screening_samples():
     cutoff, sigma = found.parameters["voltage_noise.cutoff"], found.parameters["voltage_noise.sigma"]
     assert 500 < cutoff.low < truth.cutoff < cutoff.high < 2 * truth.cutoff
     assert sigma.value == pytest.approx(truth.sigma, rel=0.1)
+
+
+def test_the_shape_of_a_lamp_is_told_though_its_phase_was_found_beside_wrong_thresholds():
+    """A fit without the lamp has thresholds far too low, and the other shape's best phase is a valley nearby."""
+    lamp = EFFECTS["flicker"](frequency=120.0, depth=0.132, phase=0.567)
+    sensor = Sensor((Threshold(on=0.23, off=0.28),)).with_effect(lamp)
+    scene = draw_scene(np.random.default_rng(16), "shake", 0.6)
+    measurement = as_measurement(dase.simulate(scene, sensor, seed=16), scene)
+    evidence = split_measurement(measurement, pixels=300, seed=0)
+    present = fit_present_model(evidence, Sensor(), None, seed=0)
+    split = calibrate_split(evidence, present, repeats=12, scout_repeats=12, seed=0)
+    sine, rectified = (
+        screen_and_descend(split, present, EFFECTS["flicker"](frequency=120.0, shape=shape), seed=0)
+        for shape in ("sine", "rectified")
+    )
+    assert sine.screened_loss < 0.9 * rectified.screened_loss
+    assert sine.model.sensor["flicker"].phase % 1.0 == pytest.approx(0.567, abs=0.03)

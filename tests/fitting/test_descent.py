@@ -19,6 +19,7 @@ from dase.fitting.fit import with_phase_given
 from dase.fitting.measurement import Measurement
 from dase.fitting.model import (
     model_of,
+    places_around,
     places_between,
     refit_model,
     refit_work,
@@ -66,7 +67,19 @@ def test_starts_go_once_round_the_lamp():
     model = with_effect_added(model_of(Sensor()), LAMP)
     n = [axis.name for axis in model.space.axes].index("flicker.phase")
     tried = np.unique(model.space.axes[n].to_value(starting_places(model, LAMP)[:, n]).round(6))
-    np.testing.assert_allclose(tried, np.arange(8) / 8)
+    np.testing.assert_allclose(tried, np.arange(8) / 8 - 0.5)
+
+
+def test_what_repeats_is_tried_at_phases_all_round_and_nothing_else_is():
+    model = with_effect_added(with_effect_added(model_of(Sensor()), LAMP), EFFECTS["bandwidth"]())
+    n = [axis.name for axis in model.space.axes].index("flicker.phase")
+    around = places_around(model, "flicker")
+    turns = np.sort(model.space.axes[n].to_value(around[:, n]))
+    assert np.diff(turns).max() <= 1 / 32 + 1e-6
+    assert turns[-1] - turns[0] >= 30 / 32
+    others = np.delete(np.arange(len(model.place)), n)
+    assert (around[:, others] == model.place[others]).all()
+    assert places_around(model, "bandwidth").shape == (0, len(model.place))
 
 
 def test_thresholds_are_tried_on_both_sides_of_the_present_ones():
