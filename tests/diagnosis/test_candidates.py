@@ -78,7 +78,7 @@ def test_a_diagnosis_finds_noise_that_is_faster_than_screening_samples():
 
 
 def test_the_shape_of_a_lamp_is_told_though_its_phase_was_found_beside_wrong_thresholds():
-    """A fit without the lamp has thresholds far too low, and the other shape's best phase is a valley nearby."""
+    """A fit without the lamp has thresholds far too low, and the other shape's best phase is near."""
     lamp = EFFECTS["flicker"](frequency=120.0, depth=0.132, phase=0.567)
     sensor = Sensor((Threshold(on=0.23, off=0.28),)).with_effect(lamp)
     scene = draw_scene(np.random.default_rng(16), "shake", 0.6)
