@@ -542,7 +542,7 @@ def places_around(model: FittedModel, name: str) -> Array:
             for turn in np.linspace(*axis.fact.plausible, STARTS.fine_turns, endpoint=False):
                 out.append(model.place.copy())
                 out[-1][n] = axis.to_place(turn)
-    return np.array(out).reshape(-1, len(model.place))
+    return np.array(out) if out else np.empty((0, len(model.place)))
 
 
 def _starting_places_of_axis(axis: SearchAxis, present: float) -> list[float]:
