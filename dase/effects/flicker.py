@@ -185,7 +185,7 @@ class Flicker(Effect):
         0.0,
         unit="turns",
         bounds=(-1.0, 1.0),
-        plausible=(-0.5, 0.5),
+        plausible=(-0.5, 0.5),  # half a turn from both bounds, which no descent can leave
         about="of the sine at time 0",
         starts="turn",
         periodic=True,

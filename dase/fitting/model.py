@@ -553,10 +553,7 @@ def _starting_places_of_axis(axis: SearchAxis, present: float) -> list[float]:
         case "spread":
             return list(low + (high - low) * np.linspace(STARTS.margin, 1 - STARTS.margin, STARTS.strengths))
         case "turn":
-            # half a turn from the ends of the range, which a descent cannot leave
-            return [
-                float(axis.to_place(turn)) for turn in np.linspace(-0.5, 0.5, STARTS.turns, endpoint=False)
-            ]
+            return [float(place) for place in np.linspace(low, high, STARTS.turns, endpoint=False)]
         case "ends":
             return [present, low + (1 - STARTS.margin) * (high - low)]
         case "value":
