@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from itertools import product
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -270,6 +271,20 @@ def refit_model(evidence: SplitMeasurement, model: FittedModel, *, seed: int, ro
         for other in ways_otherwise(model)
     ]
     ends = run_side_by_side(works)
+    best = _best_of(evidence, ends, seeds, seed=seed)
+    given = _rules_of(model)
+    if all(_rules_of(end) != given for end in ends):
+        # a rule that was left before anything was fitted by it has not been tried
+        back = [way for way in ways_otherwise(best) if _rules_of(way) == given]
+        works = [_refit_otherwise_work(evidence, way, best, seed=seeds[-1], rounds=rounds) for way in back]
+        best = _best_of(evidence, [best, *run_side_by_side(works)], seeds, seed=seed)
+    return best
+
+
+def _best_of(
+    evidence: SplitMeasurement, ends: Sequence[FittedModel], seeds: Sequence[int], *, seed: int
+) -> FittedModel:
+    """Return the best of some fitted models by the random numbers of all of them."""
     half = ends[0].calibrate(
         evidence.train, repeats=REFIT.repeats, seed=SimulationStream.CALIBRATE_FIT.seed(seed)
     )
@@ -278,6 +293,16 @@ def refit_model(evidence: SplitMeasurement, model: FittedModel, *, seed: int, ro
     )
     losses = np.reshape([float(half.scale.loss(value)[0]) for value in values], (len(ends), len(seeds)))
     return ends[int(losses.mean(1).argmin())]
+
+
+def _rules_of(model: FittedModel) -> dict[str, Any]:
+    """Return what of a model's effects is no number under fit, by effect and parameter."""
+    free = {axis.name for axis in model.space.axes}
+    names = ((effect, field.name) for effect in model.sensor.effects for field in fields(effect))
+    return {
+        f"{effect.name}.{name}": getattr(effect, name)
+        for effect, name in names if f"{effect.name}.{name}" not in free
+    }  # fmt: skip
 
 
 def _refit_otherwise_work(

@@ -33,9 +33,10 @@ class StimulusSettings:
     coarsest_step: float = 2e-3
     """Coarsest steps of a scene that are taken [s]: coarser ones miss what fast pixels show."""
 
-    growth: float = 0.3
+    growth: float = 0.1
     """Samples grow apart by this share of the time since the light of a pixel last changed: coarse where
-    nothing happens, yet fine enough for filters that still settle."""
+    nothing happens, yet fine enough for filters that still settle. With 0.3 of it, intervals of two slow
+    poles at rest were 4.6 standard deviations of a recording off, and their damping 1.5; with a tenth 0.5."""
 
     still: float = 0.02
     """Light that changes by less is at rest [log intensity]."""

@@ -130,6 +130,17 @@ def test_a_phase_that_looks_no_better_at_the_same_place_is_found(device, monkeyp
     assert refit_model(found, start, seed=0, rounds=1).sensor["threshold"].phase == 0
 
 
+def test_a_rule_that_was_left_before_it_was_fitted_is_tried_from_the_end(device):
+    """Far from the truth the other phase looks better, and all else is bent to make up for it."""
+    scene, true = moving_bars(), Sensor().with_effect(EFFECTS["leak"](rate=5.0, spread=0.1))
+    events = dase.simulate(scene, true, seed=4, device=device)
+    found = split_measurement(Measurement(events, scene), pixels=300, seed=1, device=device)
+    start = model_of(Sensor().with_effect(EFFECTS["leak"](rate=5.75, spread=0.1, light=3.0)))
+    fitted = refit_model(found, start, seed=0).sensor
+    assert fitted["threshold"].phase == 1
+    assert fitted["leak"].rate == pytest.approx(5.0, rel=0.1)
+
+
 @pytest.mark.parametrize(
     ("others", "found", "given", "kept"), [((), 0.0, 1.0, 0.0), (("mismatch", "shot"), 0.0, 1.0, 1.0),
                                            (("mismatch", "shot"), 1.0, 0.0, 0.0)]

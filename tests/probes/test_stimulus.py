@@ -10,7 +10,7 @@ import pytest
 import dase
 from dase.fitting.data_split import split_measurement
 from dase.fitting.measurement import Measurement
-from dase.probes.stimulus import Grid, Stimulus, band_edges, light_of, sort_into_cells
+from dase.probes.stimulus import STIMULUS, Grid, Stimulus, band_edges, light_of, sort_into_cells
 
 
 @pytest.fixture
@@ -47,7 +47,7 @@ def test_samples_are_those_of_a_plain_loop(rng):
     for i in range(len(steps)):
         kept, gaps = {0, 1, steps.shape[1] - 1}, [0]
         while gaps[-1] < steps.shape[1]:
-            gaps.append(gaps[-1] + max(1, int(0.3 * gaps[-1])))
+            gaps.append(gaps[-1] + max(1, int(STIMULUS.growth * gaps[-1])))
         changed = 0
         for k in range(steps.shape[1]):
             if k and steps[i, k] != steps[i, k - 1]:
@@ -57,6 +57,19 @@ def test_samples_are_those_of_a_plain_loop(rng):
                 kept.add(k)
         assert stamp[start[i] : start[i + 1]].tolist() == sorted(kept)
     np.testing.assert_array_equal(history.intensity.numpy()[: start[1]], steps[0][stamp[: start[1]]])
+
+
+def test_samples_of_a_rest_are_dense_enough_for_whatever_settles():
+    """Events lie on straight lines between them: what is left of a step of the light bends by 0.1 % of it."""
+    light = np.full((1, 2000), 0.5, np.float32)
+    light[:, 0] = 0.1
+    stamp = stimulus_of(light).history().stamp.numpy().astype(float)
+    assert len(stamp) < 100
+    time = np.arange(1, 2000)
+    for constant in (5.0, 20.0, 80.0, 320.0):
+        left = np.exp(-(time - 1) / constant)
+        lines = np.interp(time, stamp[1:], np.exp(-(stamp[1:] - 1) / constant))
+        assert np.abs(lines - left).max() < 1e-3
 
 
 def test_memory_of_a_long_rest_is_that_of_its_cells_and_levels():
