@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 import pytest
 from click.testing import CliRunner
-from helpers.command_line import SMALL, dase, one_sentence, refusal
+from helpers.command_line import SMALL, dase, dase_here, one_sentence, refusal
 
 from dase import Events, InputError, io
 from dase.cli import dase_group
@@ -58,7 +58,7 @@ def test_cuda_without_a_gpu(tmp_path):
 
     if wp.is_cuda_available():
         pytest.skip("needs a machine without a GPU")
-    assert "needs an NVIDIA GPU" in one_sentence(dase("synth", tmp_path / "out", *SMALL, "--device", "cuda"))
+    assert "needs an NVIDIA GPU" in refusal("synth", tmp_path / "out", *SMALL, "--device", "cuda")
 
 
 @pytest.mark.parametrize(
@@ -105,7 +105,7 @@ def test_synth_then_show(tmp_path):
     assert len(sequence.frames) == 6
     assert sequence.configuration is not None
     assert 'regime = "slow"' in sequence.configuration
-    shown = dase("show", out / "sequence_00000.h5")
+    shown = dase_here("show", out / "sequence_00000.h5")
     assert shown.returncode == 0, shown.stderr
     assert cv2.imread(str(out / "sequence_00000.png")) is not None
     # a second run must not overwrite the first
@@ -175,10 +175,10 @@ def test_interrupt_then_resume(jobs, tmp_path):
 
 
 def test_effects():
-    listed = dase("effects", "list")
+    listed = dase_here("effects", "list")
     assert listed.returncode == 0
     assert len(listed.stdout.splitlines()) >= 6
-    shown = dase("effects", "show", "leak")
+    shown = dase_here("effects", "show", "leak")
     assert "Hz" in shown.stdout
     assert "plausible" in shown.stdout
     assert "Source: " in shown.stdout
@@ -194,14 +194,14 @@ def test_convert_and_info(suffix, tmp_path, rng):
     events = Events(t, x, y, rng.random(n) < 0.5, 64, 48)
     io.write(tmp_path / "a.h5", io.Sequence(events))
     target = tmp_path / f"b{suffix}"
-    done = dase("convert", tmp_path / "a.h5", target)
+    done = dase_here("convert", tmp_path / "a.h5", target)
     assert done.returncode == 0, done.stderr
     assert "500 events written" in done.stdout
     back = io.read(target).events
     for name in "xyp":
         np.testing.assert_array_equal(getattr(back, name), getattr(events, name))
     np.testing.assert_allclose(back.t - back.t[0], events.t - events.t[0], atol=1e-9)
-    told = dase("info", target)
+    told = dase_here("info", target)
     assert told.returncode == 0, told.stderr
     assert "64 x 48" in told.stdout
     assert "unknown format '.xyz'" in refusal("convert", tmp_path / "a.h5", tmp_path / "b.xyz")

@@ -7,6 +7,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from helpers.brief_diagnosis import NO_LIMITS
 
 import dase
 from dase.diagnosis import candidates
@@ -68,7 +69,7 @@ def test_a_diagnosis_finds_noise_that_is_faster_than_screening_samples():
     scene = moving_bars(duration=0.3)
     events = dase.simulate(scene, Sensor().with_effect(truth), seed=6)
     library = {name: EFFECTS[name] for name in ("threshold", "voltage_noise", "shot")}
-    found = dase.diagnose(events, scene=scene, effects=library, pixels=120)
+    found = dase.diagnose(events, scene=scene, effects=library, pixels=120, settings=NO_LIMITS)
     assert found.selected == ("voltage_noise",)
     assert found.unexplained is None
     assert found.errors[1] < 2 < 20 < found.errors[0]

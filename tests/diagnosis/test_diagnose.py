@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 import warp as wp
 from click.testing import CliRunner
+from helpers.brief_diagnosis import NO_LIMITS
 
 import dase
 from dase.cli import dase_group
@@ -88,7 +89,7 @@ def hidden(scene, device, *effects: Effect, seed: int = 3) -> dase.Events:
 )
 def test_a_hidden_effect_is_named(scene, device, effect, pixels):
     events = hidden(scene, device, effect)
-    found = diagnose(events, scene=scene, effects=LIBRARY, pixels=pixels, device=device)
+    found = diagnose(events, scene=scene, effects=LIBRARY, pixels=pixels, device=device, settings=NO_LIMITS)
     assert found.selected == (effect.name,)
     assert found.unexplained is None
     assert found.errors[1] - 1 < 0.1 * (found.errors[0] - 1)
@@ -101,7 +102,8 @@ def test_a_hidden_effect_is_named(scene, device, effect, pixels):
 
 
 def test_nothing_is_invented(scene, device):
-    found = diagnose(hidden(scene, device), scene=scene, effects=LIBRARY, pixels=PIXELS, device=device)
+    events = hidden(scene, device)
+    found = diagnose(events, scene=scene, effects=LIBRARY, pixels=PIXELS, device=device, settings=NO_LIMITS)
     assert found.selected == ()
     assert found.unexplained is None
     assert "nothing is missing" in found.finding()
@@ -111,7 +113,7 @@ def test_nothing_is_invented(scene, device):
 def test_two_hidden_effects_are_both_found(scene, device):
     events = hidden(scene, device, EFFECTS["mismatch"](spread=0.25), EFFECTS["leak"](rate=5.0))
     # with fewer, the mismatch is not found beside the leak
-    found = diagnose(events, scene=scene, effects=LIBRARY, pixels=450, device=device)
+    found = diagnose(events, scene=scene, effects=LIBRARY, pixels=450, device=device, settings=NO_LIMITS)
     assert sorted(found.selected) == ["leak", "mismatch"]
     assert len(found.errors) == 3
     assert found.errors[0] > 2 > found.errors[2]
@@ -120,12 +122,13 @@ def test_two_hidden_effects_are_both_found(scene, device):
 @pytest.mark.slow
 def test_an_unknown_effect_is_unexplained_until_it_is_given(scene, device):
     events = hidden(scene, device, Popping(rate=25.0))
-    found = diagnose(events, scene=scene, effects=LIBRARY, pixels=250, device=device, most=1)
+    how = {"scene": scene, "pixels": 150, "device": device, "most": 1, "settings": NO_LIMITS}
+    found = diagnose(events, effects=LIBRARY, **how)
     assert found.selected == ()
     assert found.unexplained is not None
     assert any("bright" in cell.where for cell in found.unexplained.cells[:8])
     more = LIBRARY | {"popping": Popping}
-    known = diagnose(events, scene=scene, effects=more, pixels=250, device=device)
+    known = diagnose(events, effects=more, **how)
     assert known.selected == ("popping",)
     assert known.parameters["popping.rate"].value == pytest.approx(25.0, rel=0.15)
 
@@ -153,7 +156,7 @@ def test_another_simulator(shared, device):
         t, x, y, p = (data[k] for k in ("t_us", "x", "y", "p"))
     events = dase.Events(t * 1e-6, x, y, p.astype(bool), scene.width, scene.height)
     library = LIBRARY | {"linlog": EFFECTS["linlog"]}
-    found = diagnose(events, scene=scene, effects=library, pixels=PIXELS, device=device)
+    found = diagnose(events, scene=scene, effects=library, pixels=450, device=device, settings=NO_LIMITS)
     assert sorted(found.selected) == ["leak", "linlog"]
     assert found.parameters["linlog.knee"].value == pytest.approx(20 / 255, rel=0.05)
     assert found.parameters["linlog.slope"].value == pytest.approx(np.log(20), rel=0.05)
@@ -376,7 +379,14 @@ def test_nothing_is_free_where_light_never_changes_and_only_the_readout_is_tried
     scene = dase.VideoScene(np.repeat(bright, 2, 0), np.array([0.0, 1.0]))
     sensor = dase.Sensor().with_effect(EFFECTS["shot"](rate=20.0)).with_effect(EFFECTS["row_scan"](line=2e-4))
     library = {name: EFFECTS[name] for name in ("row_scan", "timestamp")}
-    found = diagnose(dase.simulate(scene, sensor, seed=1), scene=scene, effects=library, pixels=200, most=1)
+    found = diagnose(
+        dase.simulate(scene, sensor, seed=1),
+        scene=scene,
+        effects=library,
+        pixels=200,
+        most=1,
+        settings=NO_LIMITS,
+    )
     assert "row_scan" in {one.effect for one in found.findings if one.grade == "certain"}
     assert not found.parameters
 
@@ -390,6 +400,6 @@ def test_no_pair_is_added_where_one_effect_is_the_most(scene):
     )
     library = {name: EFFECTS[name] for name in ("threshold", "latency", "leak", "shot", "linlog")}
     events = dase.simulate(scene, sensor, seed=4)
-    found = diagnose(events, scene=scene, effects=library, pixels=200, most=1)
+    found = diagnose(events, scene=scene, effects=library, pixels=200, most=1, settings=NO_LIMITS)
     assert len(found.sensor.effects) <= 2
     assert found.unexplained is not None

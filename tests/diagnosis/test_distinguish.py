@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 import pytest
-from helpers.command_line import dase, refusal
+from helpers.command_line import dase_here, refusal
 from scipy.stats import norm
 
 from dase import InputError, Sensor
@@ -158,7 +158,7 @@ def test_command(tmp_path):
     for name, rate in (("one", 0.0), ("two", 5.0)):
         (tmp_path / f"{name}.toml").write_text(f"[threshold]\n[shot]\nrate = {rate}\n")
     small = ("--longest", 0.2, "--pixels", 100)
-    done = dase("distinguish", "one.toml", "two.toml", *small, "-o", "powers.png", cwd=tmp_path)
+    done = dase_here("distinguish", "one.toml", "two.toml", *small, "-o", "powers.png", cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     assert "Record static dark for 0.2 s" in done.stdout
     assert "one and two differ" in done.stdout

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from helpers.brief_diagnosis import NO_LIMITS
 from helpers.frame_simulator import HEIGHT, WIDTH, shaken_texture
 
 import dase
@@ -15,7 +16,7 @@ from dase.scenes.video import VideoScene
 
 GAP = 4e-3
 TRIED = {name: EFFECTS[name] for name in ("bandwidth", "latency", "refractory", "mismatch", "leak", "shot")}
-PIXELS = 400
+PIXELS = 200
 """In each part: errors go with their root, and that of another memory is many times what counts as right."""
 
 
@@ -87,7 +88,9 @@ def scene() -> VideoScene:
 def test_a_pixel_that_forgets_the_rest_of_a_frame_lacks_nothing(scene):
     events = held_with_low_pass(scene)
     assert fewest_frames(as_measurement(events, scene)) == (1,)
-    found = dase.diagnose(events, "ideal", scene=scene, effects=TRIED, most=2, pixels=PIXELS)
+    found = dase.diagnose(
+        events, "ideal", scene=scene, effects=TRIED, most=2, pixels=PIXELS, settings=NO_LIMITS
+    )
     assert found.findings == ()
     assert found.unexplained is None
     assert found.errors[-1] < 0.5
@@ -101,7 +104,9 @@ def test_a_pixel_that_goes_on_within_a_frame_lacks_nothing(scene):
     events = held_with_low_pass(few, cutoff=5e4, goes_on=True, threshold=0.15)
     measured = as_measurement(events, few)
     assert measured.held == pytest.approx(2 * GAP)
-    found = dase.diagnose(events, "ideal", scene=few, effects=TRIED, most=2, pixels=PIXELS)
+    found = dase.diagnose(
+        events, "ideal", scene=few, effects=TRIED, most=2, pixels=PIXELS, settings=NO_LIMITS
+    )
     assert found.findings == ()
     assert found.unexplained is None
     assert found.errors[-1] < 0.8
@@ -112,7 +117,9 @@ def test_a_pixel_that_goes_on_within_a_frame_lacks_nothing(scene):
 @pytest.mark.slow
 def test_a_dead_time_of_several_frames_is_certain(scene):
     events = held_with_low_pass(scene, dead=0.01)
-    found = dase.diagnose(events, "ideal", scene=scene, effects=TRIED, most=2, pixels=PIXELS)
+    found = dase.diagnose(
+        events, "ideal", scene=scene, effects=TRIED, most=2, pixels=PIXELS, settings=NO_LIMITS
+    )
     assert [(one.effect, one.grade) for one in found.findings] == [("refractory", "certain")]
     period = found.parameters["refractory.period"]
     assert period.low <= 0.01 <= period.high
@@ -123,7 +130,8 @@ def test_a_dead_time_of_several_frames_is_certain(scene):
 @pytest.mark.slow
 def test_what_waits_for_late_events_has_no_dead_time(scene):
     events = held_with_low_pass(scene, late=6.3e-3)
-    found = dase.diagnose(events, "ideal", scene=scene, effects=TRIED, most=2, pixels=PIXELS)
+    # with fewer its light is not told from that of another clip
+    found = dase.diagnose(events, "ideal", scene=scene, effects=TRIED, most=2, pixels=400, settings=NO_LIMITS)
     assert [one.effect for one in found.findings] == ["latency"]
     assert found.parameters["latency.delay"].value == pytest.approx(6.3e-3, rel=0.1)
 
@@ -134,7 +142,7 @@ def test_a_slow_low_pass_hides_no_held_frame(scene):
     events = held_with_low_pass(scene, cutoff=60.0)
     assert not as_measurement(events, scene).held
     tried = {name: EFFECTS[name] for name in ("bandwidth", "latency", "mismatch")}
-    found = dase.diagnose(events, "ideal", scene=scene, effects=tried, most=1, pixels=600)
+    found = dase.diagnose(events, "ideal", scene=scene, effects=tried, most=1, pixels=250, settings=NO_LIMITS)
     # the jump takes a millisecond in the model, which leaves a little
     assert found.selected == ("bandwidth",)
     assert found.errors[-1] < 0.7
@@ -180,7 +188,7 @@ def test_a_low_pass_from_frame_to_frame_is_asked_for_where_another_leaves_too_mu
     scene = shaken_texture(gap=6e-3, length=0.5)
     events = filtered_at_frames(scene, cutoff=60.0, spread=0.0)
     tried = {name: EFFECTS[name] for name in ("bandwidth", "second_order", "leak")}
-    found = dase.diagnose(events, "ideal", scene=scene, effects=tried, most=1, pixels=300)
+    found = dase.diagnose(events, "ideal", scene=scene, effects=tried, most=1, pixels=200, settings=NO_LIMITS)
     assert found.selected == ("second_order",)
     assert found.errors[-1] < 1
     slow = found.sensor["second_order"]

@@ -8,12 +8,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from click.testing import CliRunner
+from helpers.brief_diagnosis import NO_LIMITS
 from scipy.ndimage import gaussian_filter
 
 import dase
 from dase.cli import dase_group
 from dase.cli.output import progress_bar
 from dase.diagnosis.compare import compare
+from dase.diagnosis.conclusion import conclude_diagnosis
 from dase.diagnosis.diagnose import diagnose
 from dase.diagnosis.explain_effect import moving_bars
 from dase.diagnosis.ranking import rank_of_pair
@@ -220,10 +222,17 @@ def test_what_is_at_the_end_of_its_search_is_not_announced(monkeypatch):
     scene = moving_bars()
     events = dase.simulate(scene, Sensor().with_effect(EFFECTS["bandwidth"](cutoff=60.0)), seed=4)
     library = {name: EFFECTS[name] for name in ("threshold", "bandwidth")}
-    announced = diagnose(events, scene=scene, effects=library, pixels=150)
-    assert announced.selected == ("bandwidth",)
-    monkeypatch.setattr("dase.diagnosis.conclusion.parameters_at_bounds", lambda model, values: said)
-    found = diagnose(events, scene=scene, effects=library, pixels=150)
+    announced = []
+
+    def conclude_twice(*args):
+        """Return what the end of one search says where parameters are at their bounds; keep what else."""
+        announced.append(conclude_diagnosis(*args))
+        monkeypatch.setattr("dase.diagnosis.conclusion.parameters_at_bounds", lambda model, values: said)
+        return conclude_diagnosis(*args)
+
+    monkeypatch.setattr("dase.diagnosis.diagnose.conclude_diagnosis", conclude_twice)
+    found = diagnose(events, scene=scene, effects=library, pixels=150, settings=NO_LIMITS)
+    assert announced[0].selected == ("bandwidth",)
     assert found.selected == ()
     assert "nothing is announced: threshold.on = 3" in found.finding()
 

@@ -4,9 +4,17 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from helpers.brief_diagnosis import NO_LIMITS
 
 import dase
+from dase.effects import EFFECTS
 from dase.effects.voltage_noise import VoltageNoise
+
+NOISY = {
+    name: EFFECTS[name]
+    for name in ("voltage_noise", "shot", "leak", "hot", "jitter", "mismatch", "bandwidth", "refractory")
+}
+"""What is random, or makes less of what is: each is tried in the place of the noise."""
 
 
 def turning_texture(step: float) -> dase.VideoScene:
@@ -33,7 +41,7 @@ def turning_texture(step: float) -> dase.VideoScene:
 def test_a_diagnosis_tells_which_noise_it_is(true, pixels):
     scene = turning_texture(0.005)
     events = dase.simulate(scene, dase.Sensor().with_effect(true), seed=6)
-    found = dase.diagnose(events, scene=scene, pixels=pixels)
+    found = dase.diagnose(events, scene=scene, effects=NOISY, pixels=pixels, settings=NO_LIMITS)
     assert found.selected == ("voltage_noise",)
     noise = found.sensor["voltage_noise"]
     assert noise.poles == true.poles
@@ -53,7 +61,7 @@ def test_a_diagnosis_tells_which_noise_it_is(true, pixels):
 def test_light_that_does_not_change_for_seconds_is_no_clip():
     """Two equal pictures stand for it, seconds apart: no walk goes from one to the other."""
     scene = dase.VideoScene(np.full((2, 24, 32), 0.3, np.float32), [0.0, 3.0])
-    events = dase.simulate(scene, dase.Sensor().with_effect(dase.EFFECTS["shot"](rate=4.0)), seed=2)
-    library = {name: dase.EFFECTS[name] for name in ("threshold", "shot", "voltage_noise")}
-    found = dase.diagnose(events, scene="static", effects=library, pixels=200, most=1)
+    events = dase.simulate(scene, dase.Sensor().with_effect(EFFECTS["shot"](rate=4.0)), seed=2)
+    library = {name: EFFECTS[name] for name in ("threshold", "shot", "voltage_noise")}
+    found = dase.diagnose(events, scene="static", effects=library, pixels=200, most=1, settings=NO_LIMITS)
     assert found.selected == ("shot",)

@@ -12,7 +12,7 @@ from html.parser import HTMLParser
 import cv2
 import numpy as np
 import pytest
-from helpers.command_line import dase, refusal
+from helpers.command_line import dase_here, refusal
 
 from dase import Events, InputError, Sensor, VideoScene, io, simulate
 from dase.effects import EFFECTS
@@ -373,7 +373,7 @@ def test_compare_writes_a_report(tmp_path, rng):
     events = simulate(VideoScene(frames / np.float32(255), times), noisy, seed=2)
     io.write(tmp_path / "a.h5", io.Sequence(events, frames=frames, frame_times=times))
     (tmp_path / "mine.toml").write_text("[threshold]\n")
-    done = dase("compare", "mine.toml", "a.h5", "-o", "report.html", cwd=tmp_path)
+    done = dase_here("compare", "mine.toml", "a.h5", "-o", "report.html", cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     page = checked((tmp_path / "report.html").read_text())
     assert "mine against a.h5" in page.words

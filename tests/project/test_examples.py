@@ -6,7 +6,10 @@ import runpy
 from pathlib import Path
 
 import cv2
+import numpy as np
 import pytest
+
+import dase
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
 
@@ -23,6 +26,17 @@ def run(tmp_path, monkeypatch, capsys):
         return found, out
 
     return run
+
+
+@pytest.fixture
+def fewer_steps(monkeypatch):
+    """Return what has a training end sooner, its learning rate laid out for as many steps."""
+
+    def fewer_steps(name, steps):
+        settings = getattr(dase.tasks, name)
+        monkeypatch.setattr(dase.tasks, name, lambda **given: settings(**given | {"steps": steps}))
+
+    return fewer_steps
 
 
 def test_a_video(run):
@@ -52,8 +66,9 @@ def test_an_effect_of_ones_own(run):
 
 
 @pytest.mark.slow
-def test_a_network_for_reconstruction(run):
+def test_a_network_for_reconstruction(run, fewer_steps):
     pytest.importorskip("torch")
+    fewer_steps("ReconstructionTraining", 120)
     found, out = run("train_reconstruction.py")
     assert found["fitted"].sensor["threshold"].on == pytest.approx(0.3, rel=0.1)
     assert "recording.h5: reconstruction, 74 judged" in out
@@ -65,12 +80,24 @@ def test_a_network_for_reconstruction(run):
 
 
 @pytest.mark.slow
-def test_a_network_for_flow(run):
-    pytest.importorskip("torch")
+def test_a_network_for_flow(run, fewer_steps):
+    torch = pytest.importorskip("torch")
+    from dase.tasks.checkpoints import load_network
+
+    fewer_steps("FlowTraining", 300)
     found, out = run("train_flow.py")
     assert "recording.h5: flow" in out
     assert found["found"].metrics["aee_zero"] == pytest.approx(2.0, rel=1e-3)  # 240 px/s in 1/120 s
-    assert found["found"].metrics["aee"] < 0.8 * found["found"].metrics["aee_zero"]
+    assert found["found"].metrics["aee"] < 0.97 * found["found"].metrics["aee_zero"]
+    # so few steps teach it which way things go, which first weights know nothing of: they say 0.37 px to the
+    # right of the recording and of its mirror image
+    network, window = load_network("flow/checkpoint.pt")
+    events = dase.io.read("recording.h5").events
+    inputs = torch.from_numpy(dase.Voxels(5)(events, edges=np.arange(0, 1.5, window)))
+    with torch.no_grad():
+        right, left = (float(network(seen)[0][:, 0].mean()) for seen in (inputs, inputs.flip(-1)))
+    assert left < 0 < right
+    assert right - left > 0.4
 
 
 def test_all_of_them_are_named():

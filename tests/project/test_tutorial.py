@@ -9,7 +9,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from helpers.command_line import dase
+from helpers.command_line import dase_here
 
 from dase import InputError, VideoScene, count, load_effects, load_sensor
 from dase.simulation.sensor import Sensor
@@ -26,7 +26,7 @@ def folder(tmp_path_factory) -> Path:
     """Return the folder after the first part of the tutorial."""
     path = tmp_path_factory.mktemp("tutorial")
     first, *_ = blocks("sh")
-    done = dase(*shlex.split(first)[1:], cwd=path)
+    done = dase_here(*shlex.split(first)[1:], cwd=path)
     assert done.returncode == 0, done.stderr
     (text,) = blocks("python file=adaptation.py")
     (path / "adaptation.py").write_text(text)
@@ -38,7 +38,7 @@ def test_commands(folder):
     lines = [line for block in blocks("sh")[1:] for line in block.splitlines()]
     for line in lines:
         assert line.startswith("dase "), line
-        done = dase(*shlex.split(line)[1:], cwd=folder)
+        done = dase_here(*shlex.split(line)[1:], cwd=folder)
         assert done.returncode == 0, f"{line}: {done.stderr}"
     assert load_sensor(folder / "camera.toml", load_all(folder))["adaptation"].depth == 0.6
     assert cv2.imread(str(folder / "out" / "sequence_00000.png")) is not None

@@ -95,7 +95,7 @@ def test_a_data_set_has_frames_with_blur_and_says_so(tmp_path):
     options = ("--sequences", "1", "--jobs", "1", "--regime", "fast", "--size", "32x24", "--duration", "0.2")
     sensor = tmp_path / "sensor.toml"
     sensor.write_text(dump_sensor(COUPLED))
-    done = command_line.dase(
+    done = command_line.dase_here(
         "synth", tmp_path / "out", *options, "--sensor", sensor, "--frame-rate", "20", "--exposure", "0.03"
     )
     assert done.returncode == 0, done.stderr

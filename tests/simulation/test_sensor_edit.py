@@ -7,7 +7,7 @@ import datetime
 import cv2
 import numpy as np
 import pytest
-from helpers.command_line import dase, refusal
+from helpers.command_line import dase_here, refusal
 
 from dase import InputError, Sensor, VideoScene, dump_sensor, io, load_sensor, simulate
 from dase.diagnosis.sensor_update import round_parameters
@@ -214,17 +214,17 @@ def test_wrong_command(arguments, message, tmp_path):
 
 def test_commands(tmp_path):
     (tmp_path / "mine.toml").write_text(MINE)
-    done = dase("add", "mine.toml", "jitter", "--set", "spread=0.3", "-o", "more.toml", cwd=tmp_path)
+    done = dase_here("add", "mine.toml", "jitter", "--set", "spread=0.3", "-o", "more.toml", cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     assert "more.toml: jitter added (spread 0.3)" in done.stdout
     more = load_sensor(tmp_path / "more.toml")
     assert more["jitter"].spread == 0.3
     assert more.history[-1].did == "add jitter"
     # in place, and to the standard output
-    done = dase("remove", "more.toml", "leak", "-o", "more.toml", cwd=tmp_path)
+    done = dase_here("remove", "more.toml", "leak", "-o", "more.toml", cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     assert "leak" not in load_sensor(tmp_path / "more.toml")
-    printed = dase("add", "dvs128", "flicker", cwd=tmp_path).stdout
+    printed = dase_here("add", "dvs128", "flicker", cwd=tmp_path).stdout
     assert parse_sensor(printed, "printed") == load_sensor("dvs128").with_effect(EFFECTS["flicker"]())
     assert sorted(p.name for p in tmp_path.iterdir()) == ["mine.toml", "more.toml"]
 
@@ -243,7 +243,7 @@ def test_add_and_fit(tmp_path, rng):
     io.write(tmp_path / "recording.h5", io.Sequence(events))
     (tmp_path / "mine.toml").write_text("[threshold]\non = 0.2 # mine\noff = 0.2\n")
     options = ("--fit", "recording.h5", "--scene", "clip.npz", "-o", "mine.toml")
-    done = dase("add", "mine.toml", "leak", *options, cwd=tmp_path)
+    done = dase_here("add", "mine.toml", "leak", *options, cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     sensor = load_sensor(tmp_path / "mine.toml")
     # a share that grows with the light and one that does not are alike where the light is much the same
@@ -259,7 +259,7 @@ def test_add_and_fit(tmp_path, rng):
 
 
 def test_adding_what_another_effect_does_as_well_says_so(tmp_path):
-    said = dase("add", "davis346", "second_order", "-o", tmp_path / "poles.toml").stderr
+    said = dase_here("add", "davis346", "second_order", "-o", tmp_path / "poles.toml").stderr
     assert "note: bandwidth acts beside second_order, which does the same and more" in said
     sensor = load_sensor(tmp_path / "poles.toml")
     assert sensor.doubled_effects() == {"bandwidth": "second_order"}
@@ -268,6 +268,6 @@ def test_adding_what_another_effect_does_as_well_says_so(tmp_path):
 
 
 def test_adding_a_dark_current_says_what_it_takes_the_place_of(tmp_path):
-    said = dase("add", "davis346", "dark", "-o", tmp_path / "dark.toml").stderr
+    said = dase_here("add", "davis346", "dark", "-o", tmp_path / "dark.toml").stderr
     assert "note: bandwidth.dark changes nothing beside dark" in said
-    assert not dase("add", "davis346", "linlog", "-o", tmp_path / "linlog.toml").stderr
+    assert not dase_here("add", "davis346", "linlog", "-o", tmp_path / "linlog.toml").stderr

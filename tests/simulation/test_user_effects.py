@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from helpers.command_line import SMALL, dase, refusal
+from helpers.command_line import SMALL, dase, dase_here, refusal
 
 from dase import InputError, Sensor, VideoScene, io, load_sensor, simulate
 from dase.effects import EFFECTS
@@ -231,13 +231,13 @@ def test_new_effect_refuses(name, file, message, tmp_path):
 @pytest.mark.slow
 def test_commands(tmp_path):
     """What `dase effects new` says to try works, in worker processes too."""
-    written_by = dase("effects", "new", "afterglow", cwd=tmp_path)
+    written_by = dase_here("effects", "new", "afterglow", cwd=tmp_path)
     assert written_by.returncode == 0, written_by.stderr
     assert "afterglow.py written" in written_by.stdout
-    shown = dase("effects", "show", "afterglow", "--effects", "afterglow.py", cwd=tmp_path)
+    shown = dase_here("effects", "show", "afterglow", "--effects", "afterglow.py", cwd=tmp_path)
     assert "strength = 0.5" in shown.stdout
     assert "(--effects)" in refusal("effects", "show", "afterglow", cwd=tmp_path)
-    listed = dase("effects", "list", "--effects", "afterglow.py", cwd=tmp_path)
+    listed = dase_here("effects", "list", "--effects", "afterglow.py", cwd=tmp_path)
     assert listed.stdout.splitlines()[-1].startswith("afterglow")
 
     sensor = tmp_path / "mine.toml"
