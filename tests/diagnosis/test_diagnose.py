@@ -122,7 +122,7 @@ def test_two_hidden_effects_are_both_found(scene, device):
 @pytest.mark.slow
 def test_an_unknown_effect_is_unexplained_until_it_is_given(scene, device):
     events = hidden(scene, device, Popping(rate=25.0))
-    how = {"scene": scene, "pixels": 150, "device": device, "most": 1, "settings": NO_LIMITS}
+    how = {"scene": scene, "pixels": 250, "device": device, "most": 1, "settings": NO_LIMITS}
     found = diagnose(events, effects=LIBRARY, **how)
     assert found.selected == ()
     assert found.unexplained is not None
@@ -170,7 +170,7 @@ def test_intervals_cover_the_truth(scene, device):
     inside = []
     for seed in range(8):
         events = hidden(scene, device, EFFECTS["leak"](rate=4.0, spread=0.1), seed=20 + seed)
-        evidence = split_measurement(Measurement(events, scene), pixels=250, seed=seed, device=device)
+        evidence = split_measurement(Measurement(events, scene), pixels=120, seed=seed, device=device)
         model = refit_model(evidence, model_of(given, list(true)), seed=seed)
         _, got = estimate_parameters(evidence, model, seed=seed)
         inside += [got[n].low <= v <= got[n].high for n, v in true.items()]

@@ -233,7 +233,7 @@ def test_all_of_the_time_is_fitted_where_light_comes_to_rest():
         Measurement(dase.simulate(restless, true), restless), pixels=200
     ).parts_differ
     library = {name: EFFECTS[name] for name in ("threshold", "mismatch", "leak", "hot")}
-    found = diagnose(events, scene=scene, effects=library, pixels=200, most=3)
+    found = diagnose(events, scene=scene, effects=library, pixels=130, most=3)
     assert set(found.selected) == {"leak", "mismatch"}
     assert found.errors[-1] < found.gate
     assert any("all of it is fitted" in note for note in found.notes)

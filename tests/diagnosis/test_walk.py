@@ -17,29 +17,29 @@ NOISY = {
 """What is random, or makes less of what is: each is tried in the place of the noise."""
 
 
-def turning_texture(step: float) -> dase.VideoScene:
-    """Return a pattern that moves to the right and up and down, for a second."""
+def turning_texture(step: float, length: float) -> dase.VideoScene:
+    """Return a pattern that moves to the right and up and down, for so long [s]."""
     rng = np.random.default_rng(3)
     right, down = rng.uniform(-0.5, 0.5, (2, 20, 1, 1))
     phase = rng.uniform(0, 6, (20, 1, 1))
     y, x = np.mgrid[:64, :96]
-    times = np.arange(0, 1, step)
+    times = np.arange(0, length, step)
     waves = [np.sin(right * (x - 40 * t) + down * (y + 15 * np.sin(6 * t)) + phase).mean(0) for t in times]
     return dase.VideoScene(np.clip(0.4 + np.array(waves, np.float32), 0.02, 1), times)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("true", "pixels"),
+    ("true", "pixels", "length"),
     [
-        # its cutoff comes out within a tenth only with more pixels
-        (VoltageNoise(sigma=0.08, cutoff=150.0), 300),
-        (VoltageNoise(poles="none", sigma=0.06, floor=1.0, period=0.005), 200),
+        # its cutoff comes out within a tenth only with more pixels and time
+        (VoltageNoise(sigma=0.08, cutoff=150.0), 300, 1.0),
+        (VoltageNoise(poles="none", sigma=0.06, floor=1.0, period=0.005), 200, 0.7),
     ],
     ids=["returns", "walks"],
 )
-def test_a_diagnosis_tells_which_noise_it_is(true, pixels):
-    scene = turning_texture(0.005)
+def test_a_diagnosis_tells_which_noise_it_is(true, pixels, length):
+    scene = turning_texture(0.005, length)
     events = dase.simulate(scene, dase.Sensor().with_effect(true), seed=6)
     found = dase.diagnose(events, scene=scene, effects=NOISY, pixels=pixels, settings=NO_LIMITS)
     assert found.selected == ("voltage_noise",)

@@ -230,7 +230,7 @@ def test_a_fit_finds_the_law_of_the_poles():
     true = dase.Sensor((SecondOrder(cutoff=60.0, damping=0.35, dark=0.01, poles="apart"), Threshold()))
     scene = waves(48, 32)
     guess = dase.Sensor((SecondOrder(cutoff=120.0, damping=0.8, dark=0.01), Threshold(on=0.25, off=0.25)))
-    found = dase.fit(dase.simulate(scene, true, seed=1), guess, scene=scene, pixels=300)
+    found = dase.fit(dase.simulate(scene, true, seed=1), guess, scene=scene, pixels=120)
     assert found.sensor["second_order"].poles == "apart"
     assert any("second_order.poles is apart instead of alike" in note for note in found.notes)
     np.testing.assert_allclose([found.sensor["threshold"].on, found.sensor["threshold"].off], 0.2, rtol=0.04)

@@ -12,7 +12,7 @@ import pytest
 torch = pytest.importorskip("torch")
 pytest.importorskip("safetensors")
 
-from helpers.two_processes import run_as_two_processes
+from helpers.two_processes import run_as_two_processes, torchrun_two_processes
 
 from dase.learning import distributed
 from dase.learning.adversarial import AdversarialObjective, AdversarialSettings, PatchHash
@@ -96,9 +96,9 @@ def test_two_processes_do_what_one_does_with_all_scenes(tmp_path):
 def test_the_command_on_two_processes(tmp_path):
     out = tmp_path / "run"
     command = str(Path(sys.executable).parent / "dase")
-    words = ("--no-python", command, "train", "esim", "-o", str(out), "--preset", "tiny", "--steps", "6")
+    words = (command, "train", "esim", "-o", str(out), "--preset", "tiny", "--steps", "6")
     words = (*words, "--objective", "wgan", "--sequences", "8", "--size", "24x24")
-    run_as_two_processes(*words)
+    torchrun_two_processes("--no-python", *words)
     assert (out / "sensor.toml").is_file()
     assert json.loads((out / "recipe.json").read_text())["steps"] == 6
     log = (out / "log.csv").read_text().splitlines()
