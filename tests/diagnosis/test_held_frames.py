@@ -130,7 +130,7 @@ def test_a_dead_time_of_several_frames_is_certain(scene):
 @pytest.mark.slow
 def test_what_waits_for_late_events_has_no_dead_time(scene):
     events = held_with_low_pass(scene, late=6.3e-3)
-    # with fewer its light is not told from that of another clip
+    # half as many are too few here
     found = dase.diagnose(events, "ideal", scene=scene, effects=TRIED, most=2, pixels=400, settings=NO_LIMITS)
     assert [one.effect for one in found.findings] == ["latency"]
     assert found.parameters["latency.delay"].value == pytest.approx(6.3e-3, rel=0.1)

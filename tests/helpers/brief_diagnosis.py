@@ -12,4 +12,4 @@ NO_LIMITS = replace(
         DEFAULTS.detection, repeats=1, measurements=2, strengths=1, strengths_at_once=1, turns=1
     ),
 )
-"""What would have been seen beside it is hardly looked for: that is a fifth of the time of a diagnosis."""
+"""What would have been seen beside it is hardly looked for: up to a sixth of the time of a diagnosis."""

@@ -54,12 +54,18 @@ def run_as_two_processes(*words: str) -> None:
                 subprocess.Popen([sys.executable, *words], env=one, stdout=said, stderr=said) for one in told
             ]
             try:
-                # where one has failed the other would wait for it
-                while None in (codes := [process.poll() for process in both]) and not any(codes):
+                # where one has failed the other would wait for it; 600 s are for both that wait for ever
+                end = time.monotonic() + 600
+                while (
+                    time.monotonic() < end
+                    and None in (codes := [process.poll() for process in both])
+                    and not any(codes)
+                ):
                     time.sleep(0.02)
             finally:
                 for process in both:
                     process.kill()
+                    process.wait()
             said.seek(0)
             text = said.read()
         if codes == [0, 0] or "EADDRINUSE" not in text:
