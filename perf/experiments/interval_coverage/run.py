@@ -194,8 +194,8 @@ What earlier keys showed, each run once and a development set since:
   the fit, mended: samples of light at rest grew apart so fast that what two slow poles still did was sent too
   late, and a fit that left the right phase of the pixels before anything else was fitted never came back to
   it, and bent the leak or the noise to make up for that (up to eight half widths off).
-- `intervals-2026-11-27-1`, above, was written down with that mended, before any of its cases was run. The
-  share of weak dead pixels (60 %, four of a thousand pixels) and the rate of hot ones are known by few pixels.
+- `intervals-2026-11-27-1`, above, was written down with that mended, before any of its cases was run. What
+  it has least of, the share of weak dead pixels (60 %) and the rate of hot ones, few pixels tell.
 """
 
 
