@@ -6,7 +6,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from helpers.brief_diagnosis import NO_LIMITS
 
 import dase
 from dase.diagnosis.seen_effects import find_seen_effects
@@ -113,9 +112,7 @@ def test_a_diagnosis_finds_and_measures_the_coupling(scene):
     assert any(entry.name == "frame coupling" for entry in find_signatures(events).found)
     # those that come nearest to it in a diagnosis which is not told of the bursts
     library = {name: EFFECTS[name] for name in ("exposure", *LIKE_BURSTS)}
-    found = dase.diagnose(
-        events, sensor, scene=scene, effects=library, pixels=150, most=1, settings=NO_LIMITS
-    )
+    found = dase.diagnose(events, sensor, scene=scene, effects=library, pixels=300, most=1)
     assert found.selected == ("exposure",)
     assert [one.grade for one in found.findings] == [Grade.CERTAIN]
     got = found.sensor["exposure"]
@@ -123,7 +120,7 @@ def test_a_diagnosis_finds_and_measures_the_coupling(scene):
     assert got.amplitude == pytest.approx(0.25, rel=0.15)
     assert got.period == pytest.approx(0.1, abs=1e-4)
     assert "nan" not in found.findings[0].sentence()
-    again = dase.fit(events, sensor.with_effect(Exposure()), scene=scene, pixels=150)
+    again = dase.fit(events, sensor.with_effect(Exposure()), scene=scene, pixels=300)
     interval = again.parameters["exposure.amplitude"]
     assert interval.low < 0.25 * 1.03
     assert interval.high > 0.25 * 0.97

@@ -6,7 +6,6 @@ import runpy
 from pathlib import Path
 
 import cv2
-import numpy as np
 import pytest
 
 import dase
@@ -80,24 +79,12 @@ def test_a_network_for_reconstruction(run, fewer_steps):
 
 
 @pytest.mark.slow
-def test_a_network_for_flow(run, fewer_steps):
-    torch = pytest.importorskip("torch")
-    from dase.tasks.checkpoints import load_network
-
-    fewer_steps("FlowTraining", 300)
+def test_a_network_for_flow(run):
+    pytest.importorskip("torch")
     found, out = run("train_flow.py")
     assert "recording.h5: flow" in out
     assert found["found"].metrics["aee_zero"] == pytest.approx(2.0, rel=1e-3)  # 240 px/s in 1/120 s
-    assert found["found"].metrics["aee"] < 0.97 * found["found"].metrics["aee_zero"]
-    # so few steps teach it which way things go, which first weights know nothing of: they say 0.37 px to the
-    # right of the recording and of its mirror image
-    network, window = load_network("flow/checkpoint.pt")
-    events = dase.io.read("recording.h5").events
-    inputs = torch.from_numpy(dase.Voxels(5)(events, edges=np.arange(0, 1.5, window)))
-    with torch.no_grad():
-        right, left = (float(network(seen)[0][:, 0].mean()) for seen in (inputs, inputs.flip(-1)))
-    assert left < 0 < right
-    assert right - left > 0.4
+    assert found["found"].metrics["aee"] < 0.8 * found["found"].metrics["aee_zero"]
 
 
 def test_all_of_them_are_named():
