@@ -5,7 +5,6 @@ Only calm events count, with nothing near them in space and time: an edge that p
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -13,13 +12,13 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 from scipy import stats
-from scipy.fft import next_fast_len
 
 from dase.events import Events
 from dase.formatting import format_count, format_metric, format_percent
 from dase.signatures.calm_events import row_major_pixels
 from dase.signatures.kinds import HOT_PIXELS
 from dase.signatures.result import Answer, Signature, judge_signature, without_answer
+from dase.signatures.tones import LAMPS, ToneSettings, swings
 
 Array = NDArray[np.float64]
 
@@ -37,10 +36,7 @@ class HotSettings:
     of_its_own: float = 0.8  # of its strongest tone at least, for one that sends at even times has its own
     most: int = 1_000_000  # calm events of which times are kept
     asked: int = 100  # pixels at most that are asked for a tone in common
-    slowest: float = 45.0  # [Hz] of such a tone, as of lamps
-    fastest: float = 450.0
-    step: float = 5e-4  # [s]
-    span: float = 16.0  # [s] the mains keep their phase no longer
+    tones: ToneSettings = LAMPS
     in_common: float = 1e-3  # chance of a tone below which pixels have it in common
     overtones: int = 4  # a pixel with a low threshold sends several times in a cycle
     border: int = 2  # pixels from the edge: what passes outside nobody sees, and there it looks calm
@@ -97,27 +93,14 @@ def _tone_in_common(trains: Sequence[tuple[Array, Array]], s: HotSettings) -> fl
         return 0.0
     begin = min(float(t[0]) for t, _ in trains)
     span = max(float(t[-1]) for t, _ in trains) - begin
-    tones, swings = _swings(trains, begin, span, s)
-    power = swings**2 / np.array([[len(t)] for t, _ in trains])
+    tones, sums = swings(trains, begin, span, s.tones)
+    power = sums**2 / np.array([[len(t)] for t, _ in trains])
     others = power.sum(0) - power.max(0)
     best = int(others.argmax())
-    tests = 2 * (s.fastest - s.slowest) * max(span, s.step)
+    tests = 2 * (s.tones.fastest - s.tones.slowest) * max(span, s.tones.step)
     if tests * stats.gamma.sf(others[best], len(trains) - 1) > s.in_common:
         return 0.0
     return float(tones[best])
-
-
-def _swings(
-    trains: Sequence[tuple[Array, Array]], begin: float, span: float, s: HotSettings
-) -> tuple[Array, Array]:
-    """Return tones [Hz], shape (F,), and the sums of the events' signs at them, shape (K, F)."""
-    pad = next_fast_len(4 * (int(span / s.step) + 1), real=True)
-    cells = np.arange(math.ceil(s.slowest * pad * s.step), int(s.fastest * pad * s.step) + 1)
-    sums = np.empty((len(trains), len(cells)))
-    for row, (t, sign) in zip(sums, trains, strict=True):
-        train = np.bincount(((t - begin) / s.step).astype(np.int64), sign)
-        row[:] = np.abs(np.fft.rfft(train, pad)[cells])
-    return cells / (pad * s.step), sums
 
 
 def _follow(trains: Sequence[tuple[Array, Array]], tone: float, s: HotSettings) -> NDArray[np.bool_]:
@@ -130,7 +113,7 @@ def _follow(trains: Sequence[tuple[Array, Array]], tone: float, s: HotSettings) 
     best = np.zeros(len(trains), np.bool_)
     for order in orders:
         tones = tone / order * orders
-        tones = tones[(tones >= s.slowest) & (tones <= s.fastest)]
+        tones = tones[(tones >= s.tones.slowest) & (tones <= s.tones.fastest)]
         led = np.array([_is_led(*train, tones, s) for train in trains], np.bool_)
         if np.count_nonzero(led) > np.count_nonzero(best):
             best = led
@@ -142,8 +125,8 @@ def _is_led(t: Array, sign: Array, tones: Array, s: HotSettings) -> bool:
     most = float(np.abs(np.exp(-2j * np.pi * tones[:, None] * t) @ sign).max(initial=0.0))
     if not 0 < s.in_phase * len(t) <= most:
         return False
-    _, swings = _swings([(t, sign)], float(t[0]), float(t[-1] - t[0]), s)
-    return most >= s.of_its_own * float(swings.max(initial=0.0))
+    _, own = swings([(t, sign)], float(t[0]), float(t[-1] - t[0]), s.tones)
+    return most >= s.of_its_own * float(own.max(initial=0.0))
 
 
 def _led_pixels(calm: CalmCounts, chance: Array, lamp: float, s: HotSettings) -> NDArray[np.int64]:
@@ -160,7 +143,7 @@ def _led_pixels(calm: CalmCounts, chance: Array, lamp: float, s: HotSettings) ->
     """
     out = np.flatnonzero(chance < s.chance / len(chance))
     out = out[np.argsort(chance[out], kind="stable")]
-    trains = calm.first_of(out, s.span)
+    trains = calm.first_of(out, s.tones.span)
     tone = lamp or _tone_in_common(trains[: s.asked], s)
     if not tone:
         return out[:0]

@@ -21,6 +21,7 @@ from dase.signatures.calm_events import row_major_pixels
 from dase.signatures.chance import poisson_interval
 from dase.signatures.kinds import OPPOSITE_PAIRS
 from dase.signatures.result import Answer, Signature, judge_signature, without_answer
+from dase.signatures.tones import LAMPS, ToneSettings, swings
 
 
 @dataclass(frozen=True)
@@ -38,6 +39,9 @@ class PairSettings:
     near: float = 0.02  # [s] a pair
     later: tuple[float, float] = (0.1, 0.4)  # [s] no pair any more, but still the same scene
     busiest: float = 4.0  # [Hz] of a pixel at rest; of one that sends more, few intervals are long
+    most: int = 100_000  # pairs of which times are kept
+    in_step: float = 1e-3  # chance below which pairs come in step with one tone
+    tones: ToneSettings = LAMPS
 
 
 class PairCounts:
@@ -58,6 +62,9 @@ class PairCounts:
         """Calm events, OFF and ON."""
         self.opposite = np.zeros((2, pixels), np.int64)
         """Opposite pairs, near and later."""
+        self._near = np.zeros(pixels, np.bool_)
+        self._pairs = [Events.empty(width, height)]
+        self._room = self.settings.most
 
     def push(self, calm: Events) -> None:
         """Take calm events."""
@@ -71,6 +78,9 @@ class PairCounts:
         flips = p != np.where(first, self._polarity[pixel], np.roll(p, 1))
         gap = t - before
         near = gap < self.settings.near
+        # of a pixel that goes on, only the first pair: the others follow from it
+        again = near & np.where(first, self._near[pixel], np.roll(near, 1))
+        self._keep(calm.select(order[near & flips & ~again]))
         begin, end = self.settings.later
         size = len(self._time)
         for row, chosen in ((0, near), (1, (gap >= begin) & (gap < end))):
@@ -79,6 +89,33 @@ class PairCounts:
             self.events[row] += np.bincount(pixel[p == bool(row)], minlength=size)
         last = np.append(first[1:], True)
         self._time[pixel[last]], self._polarity[pixel[last]] = t[last], p[last]
+        self._near[pixel[last]] = near[last]
+
+    def _keep(self, pairs: Events) -> None:
+        if self._room > 0 and len(pairs):
+            self._pairs.append(pairs.select(slice(0, self._room)))
+            self._room -= len(self._pairs[-1])
+
+    def tone(self, pixels: NDArray[np.bool_]) -> tuple[float, float]:
+        """Return the tone [Hz] with which pairs of all pixels come in step, and its chance.
+
+        Noise of a pixel knows nothing of that of others. Light that swings ends pairs with ON while it rises
+        and with OFF while it falls. Time stamps of a coarse clock are no tone: both come at its ticks.
+
+        Args:
+            pixels: Of which the pairs are, shape (H * W,).
+        """
+        pairs, s = Events.concatenate(self._pairs), self.settings.tones
+        pairs = pairs.select(pixels[row_major_pixels(pairs)])
+        t = pairs.t - pairs.t.min(initial=np.inf)
+        if t.max(initial=0.0) < 1 / s.slowest:
+            return 0.0, 1.0
+        known = t < s.span
+        t, sign = t[known], np.where(pairs.p[known], 1.0, -1.0)
+        tones, (swing,) = swings([(t, sign)], 0.0, float(t.max()), s)
+        best = int(swing.argmax())
+        tests = 2 * (s.fastest - s.slowest) * max(float(t.max()), s.step)
+        return float(tones[best]), min(1.0, tests * math.exp(-(float(swing[best]) ** 2) / len(t)))
 
 
 def _pairs_of_trains(events: NDArray[np.int64], duration: float, s: PairSettings) -> float:
@@ -139,6 +176,11 @@ def find_opposite_pairs(
     if lamp:
         return without_answer(
             OPPOSITE_PAIRS, f"{near} pairs, but light that flickers makes them, too", **known
+        )
+    tone, chance = pairs.tone(rest)
+    if chance < s.in_step:
+        return without_answer(
+            OPPOSITE_PAIRS, f"{near} pairs, but in step with light that swings at {tone:.4g} Hz", **known
         )
     # what independent trains would have must be seen
     if stats.poisson.sf(math.ceil(trains) - 1, bound) >= level and p >= level:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import tracemalloc
 from dataclasses import replace
 
@@ -101,6 +102,29 @@ def test_noise_at_rest_shows_and_says_of_which_kind():
     again = dase.find_signatures(made(kind="objects", voltage_noise={"sigma": 0.065, "cutoff": 80.0}))
     assert again["opposite pairs"].found
     assert again["opposite pairs"].details["returns"]
+
+
+@pytest.mark.parametrize("times", ["any", "of a clock", "of a lamp"])
+def test_pairs_in_step_with_a_tone_are_no_noise(rng, times):
+    """That ON and OFF both come at the ticks of a clock is no tone, that ON comes when light rises is one."""
+    count = 150
+    off = rng.uniform(0.0, 3.0, count)
+    on = off + rng.choice([-5e-3, 5e-3], count)
+    if times == "of a lamp":
+        off = rng.integers(1, 300, count) / 100 + rng.normal(0, 3e-4, count)
+        on = off + rng.choice([-5e-3, 5e-3], count)
+    elif times == "of a clock":
+        off, on = np.round(off, 2), np.round(off, 2) + rng.choice([-1e-2, 1e-2], count)
+    place = rng.permutation(20 * 15)[:count]  # 5 pixels apart, so that each is alone
+    x, y = 5 * (place % 20) + 2, 5 * (place // 20) + 2
+    t = np.concatenate([off, on]) + 0.1
+    order = np.argsort(t, kind="stable")
+    polarity = np.repeat([False, True], count)
+    events = Events(t[order], np.tile(x, 2)[order], np.tile(y, 2)[order], polarity[order], 100, 75)
+    entry = dase.find_signatures(events)["opposite pairs"]
+    assert entry.found == (times != "of a lamp")
+    if times == "of a lamp":
+        assert re.search(r"in step with light that swings at (100|99\.\d+|100\.\d+) Hz", entry.sentence)
 
 
 @pytest.mark.parametrize("framed", [False, True])
