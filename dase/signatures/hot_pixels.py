@@ -97,8 +97,7 @@ def _tone_in_common(trains: Sequence[tuple[Array, Array]], s: HotSettings) -> fl
     power = sums**2 / np.array([[len(t)] for t, _ in trains])
     others = power.sum(0) - power.max(0)
     best = int(others.argmax())
-    tests = 2 * (s.tones.fastest - s.tones.slowest) * max(span, s.tones.step)
-    if tests * stats.gamma.sf(others[best], len(trains) - 1) > s.in_common:
+    if s.tones.independent(span) * stats.gamma.sf(others[best], len(trains) - 1) > s.in_common:
         return 0.0
     return float(tones[best])
 

@@ -80,7 +80,7 @@ class PairCounts:
         near = gap < self.settings.near
         # of a pixel that goes on, only the first pair: the others follow from it
         again = near & np.where(first, self._near[pixel], np.roll(near, 1))
-        self._keep(calm.select(order[near & flips & ~again]))
+        self._keep(calm.select(np.sort(order[near & flips & ~again])))
         begin, end = self.settings.later
         size = len(self._time)
         for row, chosen in ((0, near), (1, (gap >= begin) & (gap < end))):
@@ -92,6 +92,7 @@ class PairCounts:
         self._near[pixel[last]] = near[last]
 
     def _keep(self, pairs: Events) -> None:
+        """Keep pairs, in order of time, so that which are the first does not depend on the chunks."""
         if self._room > 0 and len(pairs):
             self._pairs.append(pairs.select(slice(0, self._room)))
             self._room -= len(self._pairs[-1])
@@ -104,6 +105,9 @@ class PairCounts:
 
         Args:
             pixels: Of which the pairs are, shape (H * W,).
+
+        Returns:
+            0 Hz and 1 where they last no cycle of the slowest tone.
         """
         pairs, s = Events.concatenate(self._pairs), self.settings.tones
         pairs = pairs.select(pixels[row_major_pixels(pairs)])
@@ -114,8 +118,8 @@ class PairCounts:
         t, sign = t[known], np.where(pairs.p[known], 1.0, -1.0)
         tones, (swing,) = swings([(t, sign)], 0.0, float(t.max()), s)
         best = int(swing.argmax())
-        tests = 2 * (s.fastest - s.slowest) * max(float(t.max()), s.step)
-        return float(tones[best]), min(1.0, tests * math.exp(-(float(swing[best]) ** 2) / len(t)))
+        chance = s.independent(float(t.max())) * math.exp(-(float(swing[best]) ** 2) / len(t))
+        return float(tones[best]), min(1.0, chance)
 
 
 def _pairs_of_trains(events: NDArray[np.int64], duration: float, s: PairSettings) -> float:

@@ -22,6 +22,10 @@ class ToneSettings:
     step: float = 5e-4  # [s]
     span: float = 16.0  # [s] the mains keep their phase no longer
 
+    def independent(self, span: float) -> float:
+        """Return how many tones are looked for in so long a time [s], by which a chance is multiplied."""
+        return 2 * (self.fastest - self.slowest) * max(span, self.step)
+
 
 LAMPS = ToneSettings()
 """Those that signatures look for."""

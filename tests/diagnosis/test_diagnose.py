@@ -122,8 +122,8 @@ def test_two_hidden_effects_are_both_found(scene, device):
 @pytest.mark.slow
 def test_an_unknown_effect_is_unexplained_until_it_is_given(scene, device):
     events = hidden(scene, device, Popping(rate=25.0))
-    how = {"scene": scene, "pixels": 250, "device": device, "most": 1, "settings": NO_LIMITS}
-    found = diagnose(events, effects=LIBRARY, **how)
+    how = {"scene": scene, "pixels": 250, "device": device, "settings": NO_LIMITS}
+    found = diagnose(events, effects=LIBRARY, most=1, **how)
     assert found.selected == ()
     assert found.unexplained is not None
     assert any("bright" in cell.where for cell in found.unexplained.cells[:8])

@@ -10,12 +10,6 @@ import dase
 from dase.effects import EFFECTS
 from dase.effects.voltage_noise import VoltageNoise
 
-NOISY = {
-    name: EFFECTS[name]
-    for name in ("voltage_noise", "shot", "leak", "hot", "jitter", "mismatch", "bandwidth", "refractory")
-}
-"""What is random, or makes less of what is: each is tried in the place of the noise."""
-
 
 def turning_texture(step: float, length: float) -> dase.VideoScene:
     """Return a pattern that moves to the right and up and down, for so long [s]."""
@@ -41,7 +35,7 @@ def turning_texture(step: float, length: float) -> dase.VideoScene:
 def test_a_diagnosis_tells_which_noise_it_is(true, pixels, length):
     scene = turning_texture(0.005, length)
     events = dase.simulate(scene, dase.Sensor().with_effect(true), seed=6)
-    found = dase.diagnose(events, scene=scene, effects=NOISY, pixels=pixels, settings=NO_LIMITS)
+    found = dase.diagnose(events, scene=scene, pixels=pixels, settings=NO_LIMITS)
     assert found.selected == ("voltage_noise",)
     noise = found.sensor["voltage_noise"]
     assert noise.poles == true.poles
